@@ -1,0 +1,48 @@
+# Two commands for a newcomer: `make demo` and `make test`. Each makes its own .venv from pyproject.toml.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+.DEFAULT_GOAL := help
+
+.PHONY: help demo test test-fast lint format bench clean
+
+help:  ## what can be made
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+
+$(VENV)/.installed: pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null \
+	  || { echo "psotrack: set-up failed: '$(PYTHON)' is not Python 3.11 or newer; name one, e.g. make PYTHON=python3.12" >&2; exit 1; }
+	@if command -v uv >/dev/null 2>&1; then \
+	  { test -d $(VENV) || uv venv --quiet --python $(PYTHON) $(VENV); } \
+	    && uv pip install --quiet --python $(BIN)/python -e '.[test,lint]'; \
+	else \
+	  { test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV); } \
+	    && $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test,lint]'; \
+	fi || { echo "psotrack: set-up failed: the packages of pyproject.toml could not be installed into $(VENV) (see above); remove $(VENV) to start anew" >&2; exit 1; }
+	@touch $@
+
+demo: $(VENV)/.installed  ## simulate four drones, track them from the videos, print the errors, save a picture in demo/
+	@$(BIN)/psotrack demo --out demo --force
+
+test: $(VENV)/.installed  ## all tests
+	@$(BIN)/python -m pytest
+
+test-fast: $(VENV)/.installed  ## all tests but the slow ones
+	@$(BIN)/python -m pytest -m 'not slow'
+
+lint: $(VENV)/.installed  ## ruff, its format check, mypy
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+
+format: $(VENV)/.installed  ## let ruff mend and format
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+bench: $(VENV)/.installed  ## the swarm against pyswarms and evosax
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(BIN)/python -m ensurepip -q
+	@$(BIN)/python -m pip install --quiet -e '.[bench]'
+	@$(BIN)/python experiments/benchmarks/track_stage.py
+
+clean:  ## remove what was built, the environment too
+	rm -rf $(VENV) build dist demo ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,64 @@
+"""Writing files so that nobody ever loses one: beside the target first, then renamed over it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from psotrack.errors import OutputError
+
+
+def refuse_to_overwrite(path: Path, force: bool) -> None:
+    """Raise `OutputError` if `path` exists and `force` is not set."""
+    if path.exists() and not force:
+        raise OutputError(path, expected="no such file yet", found="one", remedy="pass --force to replace it")
+
+
+@contextlib.contextmanager
+def written_whole(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path` (file or folder) that takes its place when the block ends well.
+
+    If the block raises, Ctrl-C included, the temporary is removed and `path` is as it was. The temporary keeps
+    the suffix of `path`, because writers of videos and images choose their format by it.
+
+    Raises:
+        OutputError: the folder cannot be written, or the disk is full.
+    """
+    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.partial{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        _replace(temporary, path)
+    except OSError as error:
+        reason = f"{error.strerror or error} ({temporary.name})"
+        raise OutputError(
+            path, expected="to write it", found=reason, remedy="earlier results are unchanged"
+        ) from error
+    finally:
+        _remove(temporary)
+
+
+def _replace(temporary: Path, path: Path) -> None:
+    if not path.is_dir():
+        os.replace(temporary, path)
+        return
+    # A folder cannot be replaced in one step: move the old one aside, so that it can come back.
+    aside = temporary.with_name(f"{temporary.name}.old")
+    os.replace(path, aside)
+    try:
+        os.replace(temporary, path)
+    except OSError:
+        os.replace(aside, path)
+        raise
+    _remove(aside)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
