@@ -6,12 +6,18 @@ Axis words, the same in every annotation and docstring: `frames`, `cameras`, `dr
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import jax
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray, UInt8
 
 #: NumPy outside of jit, where geometry is float64; JAX inside, where it is float32.
-Array = np.ndarray | jax.Array
+if TYPE_CHECKING:
+    Array = np.ndarray | jax.Array
+else:
+    # NumPy turns arrays without axes into scalars, which to a type checker could not be indexed.
+    Array = np.ndarray | np.generic | jax.Array
 
 Key = PRNGKeyArray
 Coverage = UInt8[Array, "cameras height width"]

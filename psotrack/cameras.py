@@ -123,9 +123,7 @@ def camera(
             "camera.K", expected="focal lengths above 0", found=f"{K[0, 0]:g} and {K[1, 1]:g}"
         )
     if coefficients.shape not in {(0,), (4,), (5,), (8,)}:
-        raise SettingsError(
-            "camera.dist", expected="0, 4, 5 or 8 coefficients", found=f"{coefficients.size}"
-        )
+        raise SettingsError("camera.dist", expected="0, 4, 5 or 8 coefficients", found=f"{coefficients.size}")
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, t_m
     return Camera(T, K, coefficients, np.asarray(image_size_wh, np.float64))
@@ -162,7 +160,7 @@ def look_at(
     return R, -R @ centre
 
 
-def to_camera(cam: Camera, points_world: Float[Array, "*points 3"]) -> Float[Array, "*points 3"]:
+def to_camera(cam: Camera, points_world: Float[Array, "*#points 3"]) -> Float[Array, "*#points 3"]:
     """Camera coordinates of world points; leading axes broadcast against the cameras' axes.
 
     Args:
@@ -174,7 +172,7 @@ def to_camera(cam: Camera, points_world: Float[Array, "*points 3"]) -> Float[Arr
     return sum((R[..., :, j] * points_world[..., None, j] for j in range(3)), start=t)
 
 
-def to_pixels(cam: Camera, points_cam: Float[Array, "*points 3"]) -> Float[Array, "*points 2"]:
+def to_pixels(cam: Camera, points_cam: Float[Array, "*#points 3"]) -> Float[Array, "*#points 2"]:
     """Pixels of points in camera coordinates, lens distortion included (OpenCV's `projectPoints`).
 
     Points behind the camera get the pixels of a point at `NEAR_M`: finite, and of no meaning.
@@ -190,8 +188,8 @@ def to_pixels(cam: Camera, points_cam: Float[Array, "*points 3"]) -> Float[Array
 
 
 def project(
-    cam: Camera, points_world: Float[Array, "*points 3"]
-) -> tuple[Float[Array, "*points 2"], Float[Array, "*points"]]:
+    cam: Camera, points_world: Float[Array, "*#points 3"]
+) -> tuple[Float[Array, "*#points 2"], Float[Array, "*#points"]]:
     """Pixels and depth of world points.
 
     Args:
@@ -203,7 +201,7 @@ def project(
         has no projection and the pixels have no meaning.
 
     Example:
-        >>> R, t = look_at((0, 0, 1), (5, 0, 1))
+        >>> R, t = look_at((0.0, 0.0, 1.0), (5.0, 0.0, 1.0))
         >>> one = camera(R=R, t_m=t, K=np.diag([1000.0, 1000.0, 1.0]), image_size_wh=(1920, 1080))
         >>> project(one, np.array([5.0, -0.5, 1.0]))[0].round(6).tolist()
         [100.0, 0.0]
@@ -213,8 +211,8 @@ def project(
 
 
 def distort(
-    cam: Camera, x: Float[Array, "*points"], y: Float[Array, "*points"]
-) -> tuple[Float[Array, "*points"], Float[Array, "*points"]]:
+    cam: Camera, x: Float[Array, "*#points"], y: Float[Array, "*#points"]
+) -> tuple[Float[Array, "*#points"], Float[Array, "*#points"]]:
     """Normalised image coordinates as the lens bends them: OpenCV's rational and tangential model."""
     coefficients = cam.dist.shape[-1]
     if coefficients == 0:
@@ -231,8 +229,8 @@ def distort(
 
 
 def undistort(
-    cam: Camera, pixels: Float[np.ndarray, "*points 2"], num_iterations: int = 20
-) -> Float[np.ndarray, "*points 2"]:
+    cam: Camera, pixels: Float[np.ndarray, "*#points 2"], num_iterations: int = 20
+) -> Float[np.ndarray, "*#points 2"]:
     """Normalised image coordinates of pixels with the lens undone, by OpenCV's fixed-point iteration, in float64."""
     K = cam.K
     v = (pixels[..., 1] - K[..., 1, 2]) / K[..., 1, 1]

@@ -16,6 +16,10 @@ class PsotrackError(Exception):
         sentence = f"{_place(where)}: expected {expected}, found {found}"
         super().__init__(f"{sentence}; {remedy}" if remedy else sentence)
 
+    def __reduce__(self) -> tuple[object, ...]:
+        # Pickling brings errors out of worker processes, and would call __init__ with the sentence alone.
+        return _restored, (type(self), str(self))
+
 
 class InputError(PsotrackError):
     """A file or folder that was given cannot be used."""
@@ -27,6 +31,10 @@ class SettingsError(PsotrackError):
 
 class OutputError(PsotrackError):
     """A result could not be written; what was there before is untouched."""
+
+
+def _restored(kind: type[PsotrackError], sentence: str) -> PsotrackError:
+    return kind.__new__(kind, sentence)
 
 
 def _place(where: object) -> str:

@@ -1,8 +1,9 @@
-"""`Sequence`: what every source of data yields: videos, calibrated cameras, and a reference where there is one."""
+"""`Sequence`: what every source of data yields: videos, calibrated cameras, and a reference where known."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Ordered
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,8 +18,8 @@ from psotrack.video import VideoInfo
 class Sequence:
     """Synchronised videos of calibrated cameras that stand still.
 
-    Reading is lenient: a camera may have no video, and videos may differ in length. Using is strict: `usable` says
-    what does not fit, and how to leave it out.
+    Reading is lenient: a camera may have no video, and videos may differ in length. Using is strict: `usable`
+    says what does not fit, and how to leave it out.
 
     Attributes:
         name: of the recording.
@@ -44,7 +45,7 @@ class Sequence:
     @property
     def num_frames(self) -> int:
         """Frames that every video has."""
-        return min(video.num_frames for video in self.videos.values())
+        return min((video.num_frames for video in self.videos.values()), default=0)
 
     @property
     def _first(self) -> VideoInfo:
@@ -60,44 +61,68 @@ class Sequence:
             num_frames: leading frames to keep; None keeps all.
 
         Raises:
-            InputError: a camera has no video, or videos differ in length, rate or from their calibration.
+            InputError: a camera has no video, or videos differ in size, rate or length, or in size from
+                their calibration.
             SettingsError: a camera is unknown, or there are not so many frames.
         """
         rig = self.rig if cameras is None else self.rig.select(cameras)
+        self._check_videos_there(rig)
+        videos = {name: self.videos[name] for name in rig.names}
+        for name, video in videos.items():
+            calibrated_wh = rig.cameras.image_size_wh[rig.names.index(name)]
+            _check(
+                video, "calibrated", _size((int(calibrated_wh[0]), int(calibrated_wh[1]))), _size_of(video)
+            )
+        _check_alike(videos, _size_of, remedy="go without it by --cameras")
+        _check_alike(videos, _rate_of, remedy="go without it by --cameras")
+        shortest = min(video.num_frames for video in videos.values())
+        if num_frames is None:
+            _check_alike(videos, _length_of, remedy=f"pass --frames {shortest} to use those that all have")
+            return replace(self, rig=rig, videos=videos)
+        if not 0 < num_frames <= shortest:
+            raise SettingsError(
+                "frames", expected=f"1 to {shortest}, the frames that all cameras have", found=f"{num_frames}"
+            )
+        cut = {name: replace(video, num_frames=num_frames) for name, video in videos.items()}
+        return replace(self, rig=rig, videos=cut)
+
+    def _check_videos_there(self, rig: CameraRig) -> None:
         without = [name for name in rig.names if name not in self.videos]
         if without:
+            rest = ",".join(name for name in rig.names if name in self.videos)
             raise InputError(
                 self.folder,
                 expected=f"a video for each of the cameras {', '.join(rig.names)}",
                 found=f"none for {', '.join(without)}",
-                remedy=f"pass --cameras {','.join(n for n in rig.names if n in self.videos)} to go without",
+                remedy=f"pass --cameras {rest} to go without" if rest else "",
             )
-        videos = {name: self.videos[name] for name in rig.names}
-        first = next(iter(videos.values()))
-        shortest = min(video.num_frames for video in videos.values())
-        for name, video in videos.items():
-            size_wh = tuple(int(side) for side in rig.cameras[rig.names.index(name)].image_size_wh)
-            if video.image_size_wh != size_wh:
-                raise InputError(
-                    video.path,
-                    expected=f"{size_wh[0]} x {size_wh[1]} pixels as calibrated",
-                    found=f"{video.image_size_wh[0]} x {video.image_size_wh[1]}",
-                )
-            if abs(video.fps - first.fps) > 1e-3:
-                raise InputError(
-                    video.path, expected=f"{first.fps:g} frames per second", found=f"{video.fps:g}"
-                )
-            if num_frames is None and video.num_frames != first.num_frames:
-                raise InputError(
-                    video.path,
-                    expected=f"{first.num_frames} frames as in {first.path.name}",
-                    found=f"{video.num_frames}",
-                    remedy=f"pass --frames {shortest} to use those that all cameras have",
-                )
-        if num_frames is not None and not 0 < num_frames <= shortest:
-            raise SettingsError(
-                "frames", expected=f"1 to {shortest}, the frames that all cameras have", found=f"{num_frames}"
-            )
-        if num_frames is not None:
-            videos = {name: replace(video, num_frames=num_frames) for name, video in videos.items()}
-        return replace(self, rig=rig, videos=videos)
+
+
+def _check(video: VideoInfo, standard: str, expected: str, found: str, remedy: str = "") -> None:
+    if found != expected:
+        raise InputError(video.path, expected=f"{expected} as {standard}", found=found, remedy=remedy)
+
+
+def _check_alike(videos: Mapping[str, VideoInfo], aspect: Callable[[VideoInfo], str], remedy: str) -> None:
+    """Raise unless the videos agree; the one that is blamed differs from what most of them have."""
+    usual = Counter(map(aspect, videos.values())).most_common(1)[0][0]
+    model = next(video for video in videos.values() if aspect(video) == usual)
+    for video in videos.values():
+        _check(video, f"in {model.path.name}", usual, aspect(video), remedy)
+
+
+def _size(image_size_wh: tuple[int, int]) -> str:
+    return f"{image_size_wh[0]} x {image_size_wh[1]} pixels"
+
+
+def _size_of(video: VideoInfo) -> str:
+    return _size(video.image_size_wh)
+
+
+def _rate_of(video: VideoInfo) -> str:
+    # Three decimals tell 29.97 from 30, and are what every container holds.
+    return f"{video.fps:.3f} frames per second"
+
+
+def _length_of(video: VideoInfo) -> str:
+    return f"{video.num_frames} frames"

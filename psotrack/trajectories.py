@@ -70,8 +70,14 @@ class Trajectories:
             value = getattr(self, name)
             if value is not None and value.shape != shape:
                 raise InputError(f"trajectories.{name}", expected=f"shape {shape}", found=f"{value.shape}")
+        if len(set(self.drones)) < drones:
+            raise InputError(
+                "trajectories.drones", expected="a name of its own for each", found=f"{self.drones}"
+            )
         if np.any(np.diff(self.frame) <= 0):
-            raise InputError("trajectories.frame", expected="increasing frame numbers", found="repeats or steps back")
+            raise InputError(
+                "trajectories.frame", expected="increasing frame numbers", found="repeats or steps back"
+            )
 
     @property
     def num_frames(self) -> int:
@@ -94,7 +100,9 @@ class Trajectories:
         index = np.searchsorted(self.frame, frame)
         index_in = np.minimum(index, max(self.num_frames - 1, 0))
         if len(frame) and (self.num_frames == 0 or np.any(self.frame[index_in] != frame)):
-            raise InputError("trajectories", expected=f"frames {frame[0]} to {frame[-1]}", found="some missing")
+            raise InputError(
+                "trajectories", expected=f"frames {frame[0]} to {frame[-1]}", found="some missing"
+            )
 
         def rows(value: np.ndarray | None) -> np.ndarray | None:
             return None if value is None else value[index_in]

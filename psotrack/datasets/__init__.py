@@ -1,1 +1,1 @@
-"""."""
+"""Readers and writers of published recordings; each yields a `psotrack.sequence.Sequence`."""

@@ -1,1 +1,8 @@
-"""."""
+"""Judging tracks by a reference. Sees trajectories only, so every method is judged by the same lines.
+
+`evaluate` gives the numbers; `tables` and `plots` show them.
+"""
+
+from psotrack.evaluation.metrics import DroneEvaluation, ErrorSummary, Evaluation, evaluate
+
+__all__ = ["DroneEvaluation", "ErrorSummary", "Evaluation", "evaluate"]

@@ -1,0 +1,209 @@
+"""The same tracking by other people's swarms, as their users would write it for speed.
+
+Each frame is searched as psotrack's tracker does it: as many particles with the same spread about the same
+prediction, within the same bounds, for as many iterations, with the same inertia and pulls. What psotrack does beside
+that (evidence, coasting, losing) is left out, in the peers' favour.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import tempfile
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from _numpy_fitness import NumpyFitness
+
+from psotrack import fitness
+from psotrack.cameras import CameraRig
+from psotrack.initialisation import Start
+from psotrack.pipeline import TrackSettings, on_device, tracker_inputs
+from psotrack.summed_area import summed_area_table
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is tracked, and how."""
+
+    rig: CameraRig
+    reduction: int
+    start: Start
+    settings: TrackSettings
+    fps: float
+    bounds_m: np.ndarray
+
+    @property
+    def score(self) -> fitness.ScoreSettings:
+        """How positions are scored."""
+        program, _ = tracker_inputs(
+            self.reduction, self.start, self.settings, fps=self.fps, bounds_m=self.bounds_m
+        )
+        return program.score
+
+    @property
+    def reach_m(self) -> float:
+        """How far a drone can get in one frame."""
+        return self.settings.max_speed_m_s / self.fps
+
+    def predict(self, position_m: Any, velocity_m_s: Any) -> tuple[Any, Any, Any]:
+        """Where the drones are expected next, and the lowest and highest places that they can reach."""
+        low, high = self.bounds_m.astype(np.float32)
+        lowest = (position_m - self.reach_m).clip(low, high)
+        highest = (position_m + self.reach_m).clip(low, high)
+        return (position_m + velocity_m_s / self.fps).clip(lowest, highest), lowest, highest
+
+    def correct(self, found_m: Any, predicted_m: Any, velocity_m_s: Any) -> tuple[Any, Any]:
+        """Position and velocity by the alpha-beta filter."""
+        innovation = found_m - predicted_m
+        velocity = velocity_m_s + self.settings.velocity_gain * self.fps * innovation
+        speed = (velocity * velocity).sum(axis=-1, keepdims=True) ** 0.5
+        velocity = velocity / (speed / self.settings.max_speed_m_s).clip(1.0)
+        return predicted_m + self.settings.position_gain * innovation, velocity
+
+    def first(self) -> tuple[np.ndarray, np.ndarray]:
+        """Position and velocity before the first frame, so that the first prediction is the start."""
+        velocity = self.start.velocity_m_s.astype(np.float32)
+        return (self.start.position_m - velocity / self.fps).astype(np.float32), velocity
+
+
+class Evosax:
+    """evosax's PSO on psotrack's own fitness: ask and tell in a loop, in a scan over frames, in one jit."""
+
+    def __init__(self, problem: Problem) -> None:
+        from evosax.algorithms import PSO
+
+        self._problem = problem
+        self._cameras = on_device(problem.rig.cameras)
+        self._algorithm = PSO(
+            population_size=problem.settings.particles,
+            solution=jnp.zeros(problem.start.position_m.size),
+            metrics_fn=lambda *_: {},
+        )
+        self._params = self._algorithm.default_params.replace(
+            inertia_coeff=problem.settings.inertia,
+            cognitive_coeff=problem.settings.cognitive,
+            social_coeff=problem.settings.social,
+        )
+        self._track = jax.jit(self._scan)
+
+    def __call__(self, coverage: np.ndarray) -> np.ndarray:
+        """Positions (frames, drones, 3)."""
+        key = jax.random.key(self._problem.settings.seed)
+        return np.asarray(jax.block_until_ready(self._track(key, *self._problem.first(), coverage)))
+
+    def _scan(self, key: jax.Array, position: jax.Array, velocity: jax.Array, coverage: Any) -> jax.Array:
+        def frame(carry: Any, silhouettes: jax.Array) -> tuple[Any, jax.Array]:
+            key, position, velocity = carry
+            key_next, key_frame = jax.random.split(key)
+            predicted, low, high = self._problem.predict(position, velocity)
+            found = self._search(key_frame, silhouettes, position, predicted, low, high)
+            position, velocity = self._problem.correct(found, predicted, velocity)
+            return (key_next, position, velocity), position
+
+        return jax.lax.scan(frame, (key, position, velocity), coverage)[1]
+
+    def _search(
+        self,
+        key: jax.Array,
+        silhouettes: jax.Array,
+        position: jax.Array,
+        predicted: jax.Array,
+        low: jax.Array,
+        high: jax.Array,
+    ) -> jax.Array:
+        settings, algorithm, params = self._problem.settings, self._algorithm, self._params
+        size_m = jnp.asarray(self._problem.start.size_m, jnp.float32)
+        view = fitness.scene(self._cameras, size_m, summed_area_table(silhouettes), self._problem.score)
+        shape = (settings.particles, *predicted.shape)
+
+        def cost(population: jax.Array) -> jax.Array:
+            return -fitness.joint_fitness(view, population.reshape(shape))
+
+        key_spread, key_swarm = jax.random.split(key)
+        spread = settings.spread_m * jax.random.normal(key_spread, shape)
+        particles = (predicted + spread).at[0].set(predicted).at[1].set(position)
+        population = particles.clip(low, high).reshape(settings.particles, -1)
+
+        def iterate(iteration: jax.Array, state: Any) -> Any:
+            key = jax.random.fold_in(key_swarm, iteration)
+            population, state = algorithm.ask(key, state, params)
+            population = population.clip(low.reshape(-1), high.reshape(-1))
+            return algorithm.tell(key, population, cost(population), state, params)[0]
+
+        state = algorithm.init(key_swarm, population, cost(population), params)
+        state = jax.lax.fori_loop(0, settings.iterations, iterate, state)
+        return state.best_solution.reshape(predicted.shape)
+
+
+class PySwarms:
+    """pyswarms' global-best PSO on the NumPy fitness, frame by frame."""
+
+    def __init__(self, problem: Problem) -> None:
+        _silence_pyswarms()
+        from pyswarms.single import GlobalBestPSO
+
+        self._problem = problem
+        self._fitness = NumpyFitness(problem.rig.cameras, problem.start.size_m, problem.score)
+        settings, dims = problem.settings, problem.start.position_m.size
+        # One optimiser for all frames: making one sets up logging four times, which takes longer than a search.
+        self._optimiser = GlobalBestPSO(
+            n_particles=settings.particles,
+            dimensions=dims,
+            options={"w": settings.inertia, "c1": settings.cognitive, "c2": settings.social},
+            bounds=(np.full(dims, -np.inf), np.full(dims, np.inf)),
+            bh_strategy="nearest",
+            velocity_clamp=(-problem.reach_m, problem.reach_m),
+            init_pos=np.zeros((settings.particles, dims)),
+        )
+
+    def __call__(self, coverage: np.ndarray) -> np.ndarray:
+        """Positions (frames, drones, 3)."""
+        # pyswarms draws from NumPy's global generator and no other.
+        np.random.seed(self._problem.settings.seed)  # noqa: NPY002
+        generator = np.random.default_rng(self._problem.settings.seed)
+        position, velocity = self._problem.first()
+        found = np.empty((len(coverage), *position.shape), np.float32)
+        for frame, silhouettes in enumerate(coverage):
+            predicted, low, high = self._problem.predict(position, velocity)
+            best = self._search(generator, silhouettes, position, predicted, low, high)
+            position, velocity = self._problem.correct(best, predicted, velocity)
+            found[frame] = position
+        return found
+
+    def _search(
+        self,
+        generator: np.random.Generator,
+        silhouettes: np.ndarray,
+        position: np.ndarray,
+        predicted: np.ndarray,
+        low: np.ndarray,
+        high: np.ndarray,
+    ) -> np.ndarray:
+        settings = self._problem.settings
+        tables = self._fitness.tables(silhouettes)
+        shape = (settings.particles, *predicted.shape)
+        spread = settings.spread_m * generator.standard_normal(shape, np.float32)
+        particles = predicted + spread
+        particles[:2] = predicted, position
+
+        def cost(population: np.ndarray) -> np.ndarray:
+            return -self._fitness(tables, population.astype(np.float32).reshape(shape))
+
+        optimiser = self._optimiser
+        optimiser.bounds = low.reshape(-1), high.reshape(-1)
+        optimiser.init_pos = particles.clip(low, high).reshape(settings.particles, -1)
+        optimiser.reset()
+        _, best = optimiser.optimize(cost, settings.iterations, verbose=False)
+        return best.reshape(predicted.shape).astype(np.float32)
+
+
+def _silence_pyswarms() -> None:
+    """Keep pyswarms from writing a `report.log` into the working directory, which it does when it is imported."""
+    with tempfile.NamedTemporaryFile("w", suffix=".yaml", delete=False) as file:
+        file.write("version: 1\ndisable_existing_loggers: false\n")
+    atexit.register(os.unlink, file.name)
+    os.environ["LOG_CFG"] = file.name

@@ -1,0 +1,270 @@
+"""Time the track stage: psotrack, evosax's PSO on psotrack's fitness, pyswarms on the same fitness in NumPy.
+
+One process, one run. Every method is warmed up, then timed in turn, over and over, so that whatever else the machine
+does hits all alike; what is timed ends when the result is there. `python experiments/benchmarks/track_stage.py --help`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import _scene
+import click
+import jax
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+from _numpy_fitness import NumpyFitness
+from _peers import Evosax, Problem, PySwarms
+from rich.console import Console
+from rich.table import Table
+
+from psotrack import fitness, tracker
+from psotrack.initialisation import Start
+from psotrack.pipeline import TrackSettings, on_device, tracker_inputs
+from psotrack.summed_area import summed_area_table
+
+PEERS = ("evosax", "pyswarms")
+
+#: Largest difference between the two fitnesses, which lie in [0, 1]. Both are float32; measured: 1e-6.
+TOLERANCE = 1e-5
+
+#: Tracks the silhouettes (frames, cameras, height, width) and returns positions (frames, drones, 3).
+Method = Callable[[np.ndarray], np.ndarray]
+
+
+class Psotrack:
+    """psotrack's own tracker: one jitted scan over the frames."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._program, self._params = tracker_inputs(
+            problem.reduction, problem.start, problem.settings, fps=problem.fps, bounds_m=problem.bounds_m
+        )
+        self._cameras = on_device(problem.rig.cameras)
+        position, velocity = (
+            jnp.asarray(value, jnp.float32)
+            for value in (problem.start.position_m, problem.start.velocity_m_s)
+        )
+        self._state = tracker.init(jax.random.key(problem.settings.seed), position, velocity, self._params)
+
+    def __call__(self, coverage: np.ndarray) -> np.ndarray:
+        """Positions (frames, drones, 3)."""
+        _, info = tracker.track(self._state, coverage, self._cameras, self._params, self._program)
+        return np.asarray(jax.block_until_ready(info).position_m)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """What is said about one method; times per frame, the ratio to the first method of the same repeat."""
+
+    method: str
+    median_ms: float
+    min_ms: float
+    max_ms: float
+    ratio: float
+    mean_error_mm: float
+    warm_up_s: float
+
+
+@click.command(context_settings={"show_default": True})
+@click.option("--frames", default=25, type=click.IntRange(2), help="Frames that are tracked.")
+@click.option("--repeats", default=5, type=click.IntRange(1), help="Timings of every method.")
+@click.option("--particles", default=100, type=click.IntRange(2), help="Of the swarm.")
+@click.option("--iterations", default=70, type=click.IntRange(1), help="Of the swarm, per frame.")
+@click.option("--drones", default=4, type=click.IntRange(1), help="In the room.")
+@click.option("--cameras", default=8, type=click.IntRange(2), help="Around it, 1920 x 1080 pixels each.")
+@click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write header and rows there too.")
+def main(
+    frames: int,
+    repeats: int,
+    particles: int,
+    iterations: int,
+    drones: int,
+    cameras: int,
+    json_path: Path | None,
+) -> None:
+    """Time the track stage of psotrack, evosax and pyswarms on the same silhouettes; print a table."""
+    _require_peers()
+    scene = _scene.scene(frames, drones, cameras)
+    coverage = scene.coverage()
+    joint = _problem(scene, TrackSettings(particles=particles, iterations=iterations, swarm="joint"))
+    per_drone = replace(joint, settings=msgspec.structs.replace(joint.settings, swarm="per-drone"))
+    difference = _check_same_fitness(joint, scene, coverage[0])
+
+    methods: dict[str, Method] = {
+        "psotrack, joint swarm": Psotrack(joint),
+        "psotrack, swarm per drone": Psotrack(per_drone),
+        "evosax PSO, psotrack's fitness": Evosax(joint),
+        "pyswarms, NumPy fitness": PySwarms(joint),
+    }
+    header = _header(
+        {
+            "frames": frames,
+            "repeats": repeats,
+            "particles": particles,
+            "iterations": iterations,
+            "drones": drones,
+            "cameras": cameras,
+            "silhouettes": list(coverage.shape),
+            "reduction": _scene.REDUCTION,
+            "fitness_difference": difference,
+        }
+    )
+    timings = _time(methods, coverage, scene.position_m, repeats)
+    _print(header, timings)
+    if json_path is not None:
+        rows = [vars(timing) for timing in timings]
+        json_path.write_text(json.dumps({**header, "methods": rows}, indent=2) + "\n", encoding="utf-8")
+
+
+def _require_peers() -> None:
+    missing = []
+    for peer in PEERS:
+        try:
+            version(peer)
+        except PackageNotFoundError:
+            missing.append(peer)
+    if missing:
+        click.echo(f"{' and '.join(missing)} not installed; run: pip install '.[bench]'", err=True)
+        sys.exit(2)
+
+
+def _problem(scene: _scene.Scene, settings: TrackSettings) -> Problem:
+    start = Start(
+        position_m=scene.position_m[0],
+        velocity_m_s=scene.velocity_m_s[0],
+        size_m=scene.size_m,
+        num_cameras=np.full(len(scene.size_m), float(len(scene.rig))),
+    )
+    return Problem(scene.rig, _scene.REDUCTION, start, settings, _scene.FPS, _scene.BOUNDS_M)
+
+
+def _check_same_fitness(problem: Problem, scene: _scene.Scene, silhouettes: np.ndarray) -> float:
+    """Largest difference of the two fitnesses, at drones and anywhere, out of the room and of view too."""
+    generator = np.random.default_rng(0)
+    truth = scene.position_m[0]
+    near = truth + generator.normal(scale=0.1, size=(500, *truth.shape))
+    anywhere = generator.uniform(*(1.5 * problem.bounds_m), size=(500, *truth.shape))
+    position = np.concatenate([near, anywhere]).astype(np.float32)
+
+    numpy_fitness = NumpyFitness(problem.rig.cameras, problem.start.size_m, problem.score)
+    size_m = jnp.asarray(problem.start.size_m, jnp.float32)
+    view = fitness.scene(
+        on_device(problem.rig.cameras), size_m, summed_area_table(jnp.asarray(silhouettes)), problem.score
+    )
+    ours = np.asarray(fitness.joint_fitness(view, jnp.asarray(position)))
+    difference = float(np.abs(ours - numpy_fitness(numpy_fitness.tables(silhouettes), position)).max())
+    if not difference <= TOLERANCE:
+        raise click.ClickException(f"the NumPy fitness differs by {difference:g}, more than {TOLERANCE:g}")
+    return difference
+
+
+def _time(
+    methods: dict[str, Method], coverage: np.ndarray, truth_m: np.ndarray, repeats: int
+) -> list[Timing]:
+    errors_mm, warm_up_s = {}, {}
+    for name, method in methods.items():
+        began = time.perf_counter()
+        found_m = method(coverage)
+        warm_up_s[name] = time.perf_counter() - began
+        errors_mm[name] = 1e3 * float(np.linalg.norm(found_m - truth_m, axis=-1).mean())
+
+    names = list(methods)
+    times_ms: dict[str, list[float]] = {name: [] for name in names}
+    for repeat in range(repeats):
+        # Another one goes first each time, so that no method always follows the same one.
+        first = repeat % len(names)
+        for name in names[first:] + names[:first]:
+            began = time.perf_counter()
+            methods[name](coverage)
+            times_ms[name].append(1e3 * (time.perf_counter() - began) / len(coverage))
+    return [
+        Timing(
+            method=name,
+            median_ms=statistics.median(times_ms[name]),
+            min_ms=min(times_ms[name]),
+            max_ms=max(times_ms[name]),
+            ratio=statistics.median(
+                theirs / ours for theirs, ours in zip(times_ms[name], times_ms[names[0]], strict=True)
+            ),
+            mean_error_mm=errors_mm[name],
+            warm_up_s=warm_up_s[name],
+        )
+        for name in names
+    ]
+
+
+def _header(shapes: dict[str, Any]) -> dict[str, Any]:
+    device = jax.devices()[0]
+    packages = ("psotrack", "jax", "jaxlib", "numpy", *PEERS)
+    return {
+        "device": f"{device.platform} ({device.device_kind})",
+        "cpu": _cpu_model(),
+        "processors": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "load_average": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
+        "versions": {"python": platform.python_version()} | {name: version(name) for name in packages},
+        "commit": _commit(),
+        **shapes,
+    }
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.machine()
+
+
+def _commit() -> str:
+    command = ["git", "describe", "--always", "--dirty", "--exclude=*"]
+    try:
+        return subprocess.run(
+            command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
+        ).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def _print(header: dict[str, Any], timings: list[Timing]) -> None:
+    console = Console()
+    versions = ", ".join(f"{name} {number}" for name, number in header["versions"].items())
+    frames, cameras, height, width = header["silhouettes"]
+    for line in (
+        f"device {header['device']}, {header['cpu']}, {header['processors']} processors, "
+        f"load {header['load_average']}",
+        versions,
+        f"commit {header['commit']}",
+        f"{header['particles']} particles x {header['iterations']} iterations, {header['drones']} drones, "
+        f"{cameras} cameras of {width * header['reduction']} x {height * header['reduction']} at reduction "
+        f"{header['reduction']}, {frames} frames, {header['repeats']} repeats",
+        f"NumPy's fitness differs from psotrack's by at most {header['fitness_difference']:.1e}",
+    ):
+        console.print(line, highlight=False, soft_wrap=True)
+    table = Table("method")
+    for column in ("ms/frame", "min", "max", "ratio", "mean error (mm)", "warm-up (s)"):
+        table.add_column(column, justify="right")
+    for timing in timings:
+        table.add_row(
+            timing.method,
+            *(f"{value:.2f}" for value in (timing.median_ms, timing.min_ms, timing.max_ms, timing.ratio)),
+            f"{timing.mean_error_mm:.1f}",
+            f"{timing.warm_up_s:.1f}",
+        )
+    console.print(table)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,483 @@
+"""The command line: thin over functions. Every command says what it needs, what it writes, and shows an example.
+
+Exit codes: 0 only when all was done; 2 for everything that went wrong, with one line on stderr that says what.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, get_args
+
+import click
+import platformdirs
+
+from psotrack import __version__
+from psotrack.errors import PsotrackError, SettingsError
+from psotrack.files import refuse_to_overwrite, written_whole
+from psotrack.foreground import Shadows
+from psotrack.progress import Report, silent, terminal
+from psotrack.settings import Score, SwarmKind, TrackSettings
+from psotrack.silhouette_store import SilhouetteSettings
+
+#: Defaults are written once, in the settings; the command line shows them.
+_TRACK = TrackSettings()
+_SILHOUETTES = SilhouetteSettings()
+
+_Command = Callable[..., None]
+
+
+class _Numbers(click.ParamType):
+    """Numbers with commas between them, such as 0.5,0.5,0.2."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self.name = ",".join(["NUMBER"] * count)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if not isinstance(value, str):
+            return value
+        try:
+            numbers = tuple(float(word) for word in value.split(","))
+        except ValueError:
+            numbers = ()
+        if len(numbers) != self.count:
+            self.fail(f"expected {self.count} numbers with commas between them, found {value!r}", param, ctx)
+        return numbers
+
+
+_SEQUENCE = click.argument("sequence", metavar="SEQ", type=click.Path(path_type=Path))
+_FORCE = click.option("--force", is_flag=True, help="Replace what is there.")
+_QUIET = click.option("--quiet", "-q", is_flag=True, help="No progress, no table: errors only.")
+_JSON = click.option(
+    "--json",
+    "json_path",
+    type=click.Path(path_type=Path),
+    metavar="OUT",
+    help="Write the answer as JSON; - is stdout.",
+)
+_JOBS = click.option(
+    "--jobs", type=click.IntRange(min=1), help="Processes at most.  [default: one per processor]"
+)
+_CACHE = click.option(
+    "--cache",
+    type=click.Path(path_type=Path),
+    envvar="PSOTRACK_CACHE",
+    help="Folder of the stored silhouettes.  [default: $PSOTRACK_CACHE, or psotrack in the user's cache folder]",
+)
+_CAMERAS = click.option(
+    "--cameras", metavar="NAME,NAME...", help="Use these cameras only.  [default: all of the calibration]"
+)
+_FRAMES = click.option(
+    "--frames", "num_frames", type=int, metavar="N", help="Use the first N frames only.  [default: all]"
+)
+
+
+def _silhouette_options(command: _Command) -> _Command:
+    for option in (
+        click.option(
+            "--reduction",
+            type=int,
+            default=_SILHOUETTES.reduction,
+            show_default=True,
+            help="Image pixels per silhouette pixel, along each side.",
+        ),
+        click.option(
+            "--shadows",
+            type=click.Choice(get_args(Shadows)),
+            default=_SILHOUETTES.shadows,
+            show_default=True,
+            help="What becomes of MOG2's shadow label: dark bodies and rotor discs get it as well as shadows.",
+        ),
+        click.option(
+            "--shadow-weight",
+            type=float,
+            default=_SILHOUETTES.shadow_weight,
+            show_default=True,
+            help="Of a shadow pixel, for --shadows weight.",
+        ),
+        click.option(
+            "--var-threshold",
+            type=float,
+            default=_SILHOUETTES.var_threshold,
+            show_default=True,
+            help="Squared distance from the background, in standard deviations, that is foreground.",
+        ),
+        click.option(
+            "--min-blob",
+            "min_blob_px",
+            type=int,
+            default=_SILHOUETTES.min_blob_px,
+            show_default=True,
+            help="Smaller speckle is removed; in pixels.",
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(__version__, prog_name="psotrack")
+@click.option("--verbose", "-v", is_flag=True, help="Log what is done.")
+def cli(verbose: bool) -> None:
+    """3D positions of several drones, in every frame, from calibrated camera videos alone.
+
+    \b
+    Try it:          psotrack demo
+    Step by step:    psotrack simulate S02_D4_A --out data
+                     psotrack track data/Simulated_Data/S02_D4_A --out tracks.csv
+                     psotrack evaluate tracks.csv data/Simulated_Data/S02_D4_A --plot
+    """
+    logging.basicConfig(
+        level=logging.INFO if verbose else logging.WARNING,
+        format="%(levelname)s %(name)s: %(message)s",
+        stream=sys.stderr,
+    )
+
+
+@cli.command()
+@click.argument("name")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="The data's root folder.")
+@click.option("--frames", "num_frames", type=int, metavar="N", help="First N frames only.  [default: all]")
+@click.option("--scale", type=float, default=1.0, show_default=True, help="Of the image size.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Of flights and noise.")
+@_JOBS
+@_FORCE
+@_QUIET
+@_JSON
+def simulate(
+    name: str,
+    out: Path,
+    num_frames: int | None,
+    scale: float,
+    seed: int,
+    jobs: int | None,
+    force: bool,
+    quiet: bool,
+    json_path: Path | None,
+) -> None:
+    """Make a sequence of the dataset's simulated half: videos, calibration and truth.
+
+    Writes OUT/Simulated_Data/NAME. The same seed makes the same flights and the same pixels; an interrupted call goes
+    on where it was.
+
+    \b
+    Examples:
+      psotrack simulate S02_D4_A --out data
+      psotrack simulate S02_D4_A --out small --scale 0.5 --frames 60 --seed 7
+    """
+    from psotrack.simulation import simulate as make
+
+    folder = make(
+        name,
+        out,
+        num_frames=num_frames,
+        scale=scale,
+        seed=seed,
+        force=force,
+        jobs=jobs,
+        report=_report(quiet),
+    )
+    _answer(json_path, {"sequence": str(folder)}, force)
+    _say(quiet, json_path, f"{folder}")
+
+
+@cli.command()
+@_SEQUENCE
+@_silhouette_options
+@_CAMERAS
+@_FRAMES
+@_CACHE
+@_JOBS
+@_QUIET
+@_FORCE
+@_JSON
+def silhouettes(
+    sequence: Path,
+    cameras: str | None,
+    num_frames: int | None,
+    cache: Path | None,
+    jobs: int | None,
+    quiet: bool,
+    force: bool,
+    json_path: Path | None,
+    **settings: Any,
+) -> None:
+    """Make and store the silhouettes of SEQ, which `track` reads.
+
+    They are kept under a key of the video's content and every setting: a second call finds them, a changed setting
+    makes new ones.
+
+    \b
+    Examples:
+      psotrack silhouettes data/Simulated_Data/S02_D4_A
+      psotrack silhouettes data/Simulated_Data/S02_D4_A --shadows drop --json -
+    """
+    from psotrack.silhouettes import compute
+
+    where = _cache_folder(cache)
+    stored = compute(
+        _usable(sequence, cameras, num_frames),
+        SilhouetteSettings(**settings),
+        cache=where,
+        jobs=jobs,
+        report=_report(quiet),
+    )
+    answer = {
+        "cache": str(where),
+        "keys": dict(stored.keys),
+        "frames": stored.num_frames,
+        "shape": list(stored.shape),
+        "seconds": dict(stored.seconds),
+    }
+    _answer(json_path, answer, force)
+    made = "made" if any(stored.seconds.values()) else "already there"
+    _say(quiet, json_path, f"{len(stored.cameras)} cameras, {stored.num_frames} frames: {made}, in {where}")
+
+
+@cli.command()
+@_SEQUENCE
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="The tracks: a file that ends in .csv or .parquet.",
+)
+@click.option("--particles", type=int, default=_TRACK.particles, show_default=True, help="Of every swarm.")
+@click.option("--iterations", type=int, default=_TRACK.iterations, show_default=True, help="Per frame.")
+@click.option(
+    "--swarm",
+    type=click.Choice(get_args(SwarmKind)),
+    default=_TRACK.swarm,
+    show_default=True,
+    help="One swarm over all drones, as in the paper, or one for each.",
+)
+@click.option(
+    "--score",
+    type=click.Choice(get_args(Score)),
+    default=_TRACK.score,
+    show_default=True,
+    help="Concentric windows, or the paper's one box in whole pixels.",
+)
+@click.option("--seed", type=int, default=_TRACK.seed, show_default=True, help="Of the swarm.")
+@click.option(
+    "--init",
+    default=_TRACK.init,
+    show_default=True,
+    metavar="auto|truth|FILE",
+    help="Where the drones are at first: found by themselves, from the reference, or from a file of tracks.",
+)
+@click.option(
+    "--drones", type=int, metavar="N", help="How many there are.  [default: as many as --init finds]"
+)
+@click.option(
+    "--drone-size",
+    "drone_size_m",
+    type=_Numbers(3),
+    metavar="X,Y,Z",
+    help="Full lengths in metres.  [default: from the first frames]",
+)
+@click.option(
+    "--bounds",
+    "bounds_m",
+    type=_Numbers(6),
+    metavar="X0,X1,Y0,Y1,Z0,Z1",
+    help="The room in metres.  [default: what the cameras stand around]",
+)
+@click.option(
+    "--max-speed",
+    "max_speed_m_s",
+    type=float,
+    default=_TRACK.max_speed_m_s,
+    show_default=True,
+    help="Of a drone, in m/s.",
+)
+@_silhouette_options
+@_CAMERAS
+@_FRAMES
+@_CACHE
+@_JOBS
+@_FORCE
+@_QUIET
+@_JSON
+def track(
+    sequence: Path,
+    out: Path,
+    cameras: str | None,
+    num_frames: int | None,
+    cache: Path | None,
+    jobs: int | None,
+    force: bool,
+    quiet: bool,
+    json_path: Path | None,
+    **settings: Any,
+) -> None:
+    """Track the drones of SEQ from its videos.
+
+    Writes OUT, one row per frame and drone, and beside it the same name with .json: every setting, versions, device,
+    input keys, seconds per stage.
+
+    \b
+    Examples:
+      psotrack track data/Simulated_Data/S02_D4_A --out tracks.csv
+      psotrack track data/Simulated_Data/S02_D4_A --out paper.parquet --swarm joint --particles 100 --iterations 70
+    """
+    from psotrack.pipeline import track_sequence
+    from psotrack.trajectory_files import write_trajectories
+
+    if out.suffix not in {".csv", ".parquet"}:
+        raise SettingsError("--out", expected="a file that ends in .csv or .parquet", found=out.name)
+    record_path = out.with_suffix(".json")
+    refuse_to_overwrite(out, force)
+    refuse_to_overwrite(record_path, force)
+    silhouette_names = SilhouetteSettings.__struct_fields__
+    of_silhouettes = {name: settings.pop(name) for name in silhouette_names if name in settings}
+    chosen = TrackSettings(silhouettes=SilhouetteSettings(**of_silhouettes), **settings)
+    tracked = track_sequence(
+        _usable(sequence, cameras, num_frames),
+        chosen,
+        cache=_cache_folder(cache),
+        jobs=jobs,
+        report=_report(quiet),
+    )
+    write_trajectories(out, tracked.trajectories, force=force)
+    _write_json(record_path, tracked.record)
+    _answer(json_path, tracked.record, force)
+    seen = tracked.trajectories.seen.mean()
+    seconds = tracked.record["seconds"]
+    _say(
+        quiet,
+        json_path,
+        f"{out}: {tracked.trajectories.num_drones} drones, {tracked.trajectories.num_frames} frames, "
+        f"{seen:.1%} seen, {seconds['total']:.1f} s",
+    )
+
+
+@cli.command()
+@click.argument("tracks", type=click.Path(path_type=Path))
+@_SEQUENCE
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path),
+    is_flag=False,
+    flag_value="",
+    metavar="[PNG]",
+    help="Save 3D paths and error over time.  [default: beside TRACKS, as .png]",
+)
+@_FORCE
+@_QUIET
+@_JSON
+def evaluate(
+    tracks: Path, sequence: Path, plot: Path | None, force: bool, quiet: bool, json_path: Path | None
+) -> None:
+    """Compare TRACKS with the reference of SEQ.
+
+    \b
+    Examples:
+      psotrack evaluate tracks.csv data/Simulated_Data/S02_D4_A
+      psotrack evaluate tracks.csv data/Simulated_Data/S02_D4_A --json errors.json --plot errors.png
+    """
+    from rich.console import Console
+
+    from psotrack.datasets.dpjait import read_sequence
+    from psotrack.errors import InputError
+    from psotrack.evaluation import evaluate as compare
+    from psotrack.evaluation import plots, tables
+    from psotrack.trajectory_files import read_trajectories
+
+    recording = read_sequence(sequence)
+    if recording.truth is None:
+        raise InputError(sequence, expected="a reference to compare with", found="none")
+    estimate = read_trajectories(tracks, fps=recording.fps)
+    evaluation = compare(estimate, recording.truth)
+    _answer(json_path, evaluation.to_dict(), force)
+    if plot is not None:
+        picture = plot if plot.name else tracks.with_suffix(".png")
+        plots.save_overview(picture, estimate, recording.truth, force=force)
+    if not quiet and json_path != Path("-"):
+        Console().print(tables.render(evaluation, title=recording.name))
+
+
+@cli.command()
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=Path("psotrack-demo"), show_default=True, help="Folder."
+)
+@click.option("--seed", type=int, default=0, show_default=True, help="Of flights, noise and swarm.")
+@_JOBS
+@_FORCE
+@_QUIET
+def demo(out: Path, seed: int, jobs: int | None, force: bool, quiet: bool) -> None:
+    """Simulate four drones, track them from eight videos, print the errors, save a picture.
+
+    \b
+    Example:
+      psotrack demo --out demo
+    """
+    from rich.console import Console
+
+    from psotrack.demo import run
+
+    result = run(out, seed=seed, jobs=jobs, force=force, report=_report(quiet))
+    if not quiet:
+        console = Console()
+        console.print(result.errors)
+        console.print(result.stages)
+        console.print(f"picture: {result.picture}", soft_wrap=True)
+
+
+def main() -> None:
+    """Run the command line; what psotrack raises on purpose becomes one line and exit code 2."""
+    try:
+        cli.main(standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(2)
+    except (click.Abort, KeyboardInterrupt):
+        sys.stderr.write(
+            "psotrack: interrupted; earlier results are unchanged, and the same command goes on\n"
+        )
+        sys.exit(2)
+    except PsotrackError as error:
+        sys.stderr.write(f"psotrack: {error}\n")
+        sys.exit(2)
+    except BrokenPipeError:
+        # Whoever read our output has left, as `head` does.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(2)
+
+
+def _usable(folder: Path, cameras: str | None, num_frames: int | None) -> Any:
+    from psotrack.datasets.dpjait import read_sequence
+
+    return read_sequence(folder).usable(cameras.split(",") if cameras else None, num_frames)
+
+
+def _cache_folder(chosen: Path | None) -> Path:
+    return chosen or platformdirs.user_cache_path("psotrack") / "silhouettes"
+
+
+def _report(quiet: bool) -> Report:
+    return silent if quiet else terminal
+
+
+def _say(quiet: bool, json_path: Path | None, sentence: str) -> None:
+    if not quiet and json_path != Path("-"):
+        click.echo(sentence)
+
+
+def _answer(json_path: Path | None, answer: Any, force: bool) -> None:
+    """The answer for programs: on stdout, or in a file that was not there."""
+    if json_path == Path("-"):
+        click.echo(json.dumps(answer, indent=2, allow_nan=False))
+    elif json_path is not None:
+        refuse_to_overwrite(json_path, force)
+        _write_json(json_path, answer)
+
+
+def _write_json(path: Path, answer: Any) -> None:
+    with written_whole(path) as temporary:
+        temporary.write_text(json.dumps(answer, indent=2, allow_nan=False) + "\n", encoding="utf-8")

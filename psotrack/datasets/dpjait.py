@@ -1,0 +1,183 @@
+"""The DPJAIT dataset (Zenodo, record 14748573): drones in halls, real and simulated, as it is published.
+
+A sequence is a folder: `cameras_calibration.csv`, a video per camera, and a reference: `dronN_pos_25.csv` in
+the simulated half, one `.c3d` in the real one. What it holds is found by looking, never from its name: S05_D8
+has ten drones.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from collections.abc import Sequence as Ordered
+from pathlib import Path
+
+import numpy as np
+
+from psotrack.datasets._calibration import camera_key, read_calibration, read_names, write_calibration
+from psotrack.datasets._marker_corners import read_marker_corners, write_marker_corners
+from psotrack.datasets._poses import pose_file, read_poses, write_poses
+from psotrack.detections import Detections, read_detections, write_detections
+from psotrack.errors import InputError
+from psotrack.mocap import body_trajectories, read_c3d
+from psotrack.sequence import Sequence
+from psotrack.trajectories import Trajectories
+from psotrack.video import VideoInfo, probe
+
+__all__ = [
+    "CALIBRATION",
+    "DETECTIONS",
+    "MARKER_CORNERS",
+    "Detections",
+    "pose_file",
+    "read_calibration",
+    "read_detections",
+    "read_marker_corners",
+    "read_poses",
+    "read_sequence",
+    "write_calibration",
+    "write_detections",
+    "write_marker_corners",
+    "write_poses",
+]
+
+CALIBRATION = "cameras_calibration.csv"
+#: The folder of the detections, one file per camera.
+DETECTIONS = "dl_data"
+MARKER_CORNERS = "aruco_corners.csv"
+
+_logger = logging.getLogger(__name__)
+_VIDEO_SUFFIXES = {".avi", ".mp4"}
+_POSE_FILE = re.compile(r"drone?_?(?P<number>\d+)_pos_(?P<rate>\d+)\.csv", re.IGNORECASE)
+
+
+def read_sequence(folder: Path | str) -> Sequence:
+    """The sequence in a folder of the dataset, simulated or real.
+
+    Cameras may be without video: they get the image size that most videos have. Videos may differ in length;
+    the truth is as long as the longest. `Sequence.usable` is stricter.
+
+    Raises:
+        InputError: the folder is none of the dataset, or one of its files cannot be used.
+    """
+    folder = Path(folder)
+    _check_folder(folder)
+    calibration = folder / CALIBRATION
+    names = read_names(calibration)
+    files = sorted(folder.iterdir())
+    videos = _videos(folder, files, names)
+    rig = read_calibration(calibration, _image_sizes(names, videos))
+    detections = _by_camera((folder / DETECTIONS).glob("*.csv"), names)
+    return Sequence(
+        name=folder.resolve().name,
+        folder=folder,
+        rig=rig,
+        videos=videos,
+        truth=_truth(files, videos),
+        detections=detections or None,
+    )
+
+
+def _check_folder(folder: Path) -> None:
+    if not folder.is_dir():
+        found = "a file" if folder.exists() else "nothing"
+        remedy = "unpack it first" if folder.suffix.lower() == ".zip" and folder.exists() else ""
+        raise InputError(folder, expected="the folder of a sequence", found=found, remedy=remedy)
+    if not os.access(folder, os.R_OK | os.X_OK):
+        raise InputError(folder, expected="the folder of a sequence", found="one that may not be read")
+    if not (folder / CALIBRATION).exists():
+        below = sorted(path.parent for path in folder.glob(f"*/{CALIBRATION}"))
+        remedy = f"did you mean {below[0]}?" if below else "is it a folder of the DPJAIT dataset?"
+        raise InputError(folder, expected=f"the file {CALIBRATION} in it", found="none", remedy=remedy)
+
+
+def _videos(folder: Path, files: Ordered[Path], names: Ordered[str]) -> dict[str, VideoInfo]:
+    candidates = [path for path in files if path.suffix.lower() in _VIDEO_SUFFIXES]
+    found = _by_camera(candidates, names)
+    if not found:
+        raise InputError(
+            folder,
+            expected=f"videos named like the cameras, {names[0]}.avi ...",
+            found=", ".join(path.name for path in candidates) or "no .avi or .mp4 at all",
+        )
+    for path in candidates:
+        if path not in found.values():
+            _logger.info("%s: not used, no camera of %s has this name", path, CALIBRATION)
+    return {name: probe(path) for name, path in found.items()}
+
+
+def _by_camera(paths: Iterable[Path], names: Ordered[str]) -> dict[str, Path]:
+    """The file of each camera, in the order of `names`; cameras without one are absent."""
+    found: dict[str, Path] = {}
+    for path in sorted(paths):
+        key = camera_key(path.stem)
+        if key in found:
+            raise InputError(path, expected="one such file per camera", found=f"{found[key].name} as well")
+        found[key] = path
+    return {name: found[camera_key(name)] for name in names if camera_key(name) in found}
+
+
+def _image_sizes(names: Ordered[str], videos: Mapping[str, VideoInfo]) -> dict[str, tuple[int, int]]:
+    most_wh = Counter(video.image_size_wh for video in videos.values()).most_common(1)[0][0]
+    for name in names:
+        if name not in videos:
+            _logger.info("camera %s has no video: taken to be %d x %d like the others", name, *most_wh)
+    return {name: videos[name].image_size_wh if name in videos else most_wh for name in names}
+
+
+def _truth(files: Ordered[Path], videos: Mapping[str, VideoInfo]) -> Trajectories | None:
+    """The reference at the frames of the longest video; None where there is none."""
+    first = next(iter(videos.values()))
+    num_frames = max(video.num_frames for video in videos.values())
+    poses = _pose_files(files, first)
+    if poses:
+        return _simulated_truth(poses, first.fps, num_frames)
+    recordings = [path for path in files if path.suffix.lower() == ".c3d"]
+    if len(recordings) > 1:
+        names = ", ".join(path.name for path in recordings)
+        raise InputError(recordings[0].parent, expected="one .c3d file", found=names)
+    if recordings:
+        markers = read_c3d(recordings[0])
+        return body_trajectories(markers, fps=first.fps, num_frames=num_frames, where=recordings[0])
+    return None
+
+
+def _pose_files(files: Ordered[Path], video: VideoInfo) -> dict[int, Path]:
+    """The pose files by the number of the drone."""
+    found: dict[int, Path] = {}
+    for path in files:
+        match = _POSE_FILE.fullmatch(path.name)
+        if match is None:
+            continue
+        number = int(match["number"])
+        if number in found:
+            raise InputError(path, expected="one file per drone", found=f"{found[number].name} as well")
+        # 0.1 %: as exact as containers hold a rate. More would drift.
+        if abs(int(match["rate"]) - video.fps) > 1e-3 * video.fps:
+            raise InputError(
+                path, expected=f"poses at the {video.fps:g} Hz of the video", found=f"{match['rate']} Hz"
+            )
+        found[number] = path
+    return dict(sorted(found.items()))
+
+
+def _simulated_truth(poses: Mapping[int, Path], fps: float, num_frames: int) -> Trajectories:
+    position_m = np.full((num_frames, len(poses), 3), np.nan)
+    orientation_wxyz = np.full((num_frames, len(poses), 4), np.nan)
+    for index, path in enumerate(poses.values()):
+        position, orientation = read_poses(path)
+        shared = min(num_frames, len(position))
+        position_m[:shared, index] = position[:shared]
+        if orientation is not None:
+            orientation_wxyz[:shared, index] = orientation[:shared]
+    frame = np.arange(num_frames)
+    return Trajectories(
+        frame,
+        frame / fps,
+        tuple(f"dron{number}" for number in poses),
+        position_m,
+        orientation_wxyz=None if np.isnan(orientation_wxyz).all() else orientation_wxyz,
+    )

@@ -1,0 +1,139 @@
+"""The demonstration: a short S02_D4_A from nothing to a table of errors and a picture."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from psotrack.boxes import Boxes, project_boxes, shape_in_cameras
+from psotrack.datasets.dpjait import read_sequence
+from psotrack.evaluation import evaluate, plots, tables
+from psotrack.files import refuse_to_overwrite, written_whole
+from psotrack.pipeline import TrackedSequence, on_device, track_sequence
+from psotrack.progress import Report, silent
+from psotrack.sequence import Sequence
+from psotrack.settings import TrackSettings
+from psotrack.silhouette_store import SilhouetteSettings
+from psotrack.simulation import simulate
+from psotrack.trajectory_files import write_trajectories
+from psotrack.video import read_frames
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+#: Small enough for a laptop to do all in a minute, long enough for paths to be seen.
+NAME, NUM_FRAMES, SCALE = "S02_D4_A", 75, 0.5
+#: Half the image size needs half the reduction, for drones of as many silhouette pixels.
+SILHOUETTES = SilhouetteSettings(reduction=2, working_reduction=1)
+SHOWN_CAMERAS = 4
+
+
+@dataclass(frozen=True)
+class Demo:
+    """What the demonstration shows: tables for the terminal, and where the picture is."""
+
+    errors: Table
+    stages: Table
+    picture: Path
+
+
+def run(
+    out: Path, *, seed: int = 0, jobs: int | None = None, force: bool = False, report: Report = silent
+) -> Demo:
+    """Simulate, track, evaluate; all files go to `out`.
+
+    Raises:
+        OutputError: there are results in `out` and `force` is not set.
+    """
+    tracks, picture = out / "tracks.csv", out / "demo.png"
+    for path in (tracks, picture):
+        refuse_to_overwrite(path, force)
+    began = time.perf_counter()
+    folder = simulate(
+        NAME, out, num_frames=NUM_FRAMES, scale=SCALE, seed=seed, jobs=jobs, force=force, report=report
+    )
+    simulated = time.perf_counter()
+    sequence = read_sequence(folder).usable()
+    settings = TrackSettings(seed=seed, silhouettes=SILHOUETTES)
+    tracked = track_sequence(sequence, settings, cache=out / "silhouettes", jobs=jobs, report=report)
+    write_trajectories(tracks, tracked.trajectories, force=force)
+    ended = time.perf_counter()
+    assert sequence.truth is not None, "the simulator writes one"
+    evaluation = evaluate(tracked.trajectories, sequence.truth)
+    save_picture(picture, sequence, tracked)
+    seconds = tracked.record["seconds"]
+    stages = {
+        "simulate": simulated - began,
+        "silhouettes": seconds["total"] - seconds["track"] - seconds["compile"],
+        "compile": seconds["compile"],
+        "track": seconds["track"],
+        "evaluate, draw": time.perf_counter() - ended,
+        "all": time.perf_counter() - began,
+    }
+    return Demo(tables.render(evaluation, title=sequence.name), _stage_table(stages), picture)
+
+
+def save_picture(path: Path, sequence: Sequence, tracked: TrackedSequence, frame: int | None = None) -> None:
+    """Save frames of four cameras with the tracked boxes, beside the paths in 3D, as PNG.
+
+    Args:
+        path: of the picture.
+        sequence: with a reference.
+        tracked: what was tracked in it.
+        frame: which is shown; None takes the middle one.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Rectangle
+
+    frame = tracked.trajectories.num_frames // 2 if frame is None else frame
+    assert sequence.truth is not None
+    boxes = _boxes(sequence, tracked, frame)
+    colours = plots.colours_of_estimates(tracked.trajectories, sequence.truth)
+    figure = Figure(figsize=(16, 5.6))
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(2, 2, left=0.005, right=0.55, bottom=0.01, top=0.95, wspace=0.03, hspace=0.12)
+    for shown, name in enumerate(sequence.rig.names[:SHOWN_CAMERAS]):
+        axes = figure.add_subplot(grid[shown // 2, shown % 2])
+        axes.imshow(_frame_of(sequence, name, frame))
+        for drone, colour in enumerate(colours):
+            x0, y0, x1, y1 = (
+                float(getattr(boxes, edge)[drone, shown]) - 0.5 for edge in ("x0", "y0", "x1", "y1")
+            )
+            axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=colour, linewidth=1.6))
+        axes.set_title(f"{name}, frame {frame}", fontsize=9)
+        axes.set_axis_off()
+    paths = figure.add_axes((0.55, 0.0, 0.42, 0.97), projection="3d")
+    plots.draw_trajectories(paths, tracked.trajectories, sequence.truth)
+    with written_whole(path) as temporary:
+        figure.savefig(temporary, dpi=120)
+
+
+def _boxes(sequence: Sequence, tracked: TrackedSequence, frame: int) -> Boxes:
+    cameras = on_device(sequence.rig.cameras)
+    shapes = shape_in_cameras(cameras, np.asarray(tracked.start.size_m, np.float32))
+    position: Float[np.ndarray, "drones 3"] = tracked.trajectories.position_m[frame].astype(np.float32)
+    return project_boxes(cameras, position, shapes)
+
+
+def _frame_of(sequence: Sequence, camera: str, frame: int) -> UInt8[np.ndarray, "height width 3"]:
+    for index, image in enumerate(read_frames(sequence.videos[camera])):
+        if index == frame:
+            return image[:, :, ::-1]
+    raise AssertionError("the tracker has read as many frames")
+
+
+def _stage_table(seconds: dict[str, float]) -> Table:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(title="seconds", box=box.SIMPLE_HEAD, title_justify="left")
+    for stage in seconds:
+        table.add_column(stage, justify="right")
+    table.add_row(*(f"{value:.1f}" for value in seconds.values()))
+    return table

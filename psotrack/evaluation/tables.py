@@ -1,0 +1,111 @@
+"""An evaluation as a table: for the terminal, and as a data frame with one row per drone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+from psotrack.evaluation.metrics import DroneEvaluation, Evaluation
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+_COLUMNS = ("mean", "median", "std", "p95", "max", "missed", "centred", "offset x y z")
+
+
+def render(evaluation: Evaluation, title: str = "") -> Table:
+    """A table of at most 80 columns: a row per drone, one for all, and the scores of identity below.
+
+    Errors are in millimetres, or all in metres where the mean error is a metre or more.
+    """
+    unit = _METRES if (evaluation.mean_error_m or 0) >= 1 else _MILLIMETRES
+    heading = f"{evaluation.frames} frames, {evaluation.drones} drones, errors in {unit.name}"
+    table = Table(
+        title=Text(f"{title}: {heading}" if title else heading, style="bold"),
+        caption=Text(_caption(evaluation), style="default"),
+        box=box.HORIZONTALS,
+        show_edge=False,
+        pad_edge=False,
+        # As wide as the caption, which would wrap otherwise.
+        min_width=76,
+        padding=(0, 0, 0, 1),
+        title_justify="left",
+        caption_justify="left",
+    )
+    # The only column that gives way when the width does not do: numbers are never cut.
+    table.add_column("drone", overflow="ellipsis", max_width=12)
+    for name in _COLUMNS:
+        table.add_column(name, justify="right", no_wrap=True)
+    for drone in evaluation.per_drone:
+        table.add_row(Text(drone.drone), *_cells(drone, unit), unit.vector(drone.offset_m))
+    table.add_section()
+    table.add_row("all", *_cells(evaluation, unit), "", style="bold")
+    return table
+
+
+def to_frame(evaluation: Evaluation) -> DataFrame:
+    """One row per drone: the keys of `per_drone` in `Evaluation.to_dict`, with `offset_x_m` and so on."""
+    import pandas as pd
+
+    rows = []
+    for drone in evaluation.to_dict()["per_drone"]:
+        x_m, y_m, z_m = drone.pop("offset_m") or (None, None, None)
+        rows.append(drone | {"offset_x_m": x_m, "offset_y_m": y_m, "offset_z_m": z_m})
+    words = ("drone", "estimate", "offset_frame")
+    return pd.DataFrame(rows).astype({key: float for key in rows[0] if key not in (*words, "frames")})
+
+
+@dataclass(frozen=True)
+class _Unit:
+    name: str
+    per_metre: float
+    decimals: int
+
+    def number(self, value_m: float | None) -> str:
+        if value_m is None:
+            return "-"
+        value = value_m * self.per_metre
+        return f"{value:.{self.decimals if value < 100 else 0}f}"
+
+    def vector(self, value_m: tuple[float, float, float] | None) -> str:
+        """Signed, a digit less than a number: as fine as an offset is known."""
+        if value_m is None:
+            return "-"
+        return " ".join(f"{part * self.per_metre:+.{self.decimals - 1}f}" for part in value_m)
+
+
+_METRES = _Unit("m", 1.0, 2)
+_MILLIMETRES = _Unit("mm", 1000.0, 1)
+
+
+def _cells(errors: Evaluation | DroneEvaluation, unit: _Unit) -> list[str]:
+    values_m = (
+        errors.mean_error_m,
+        errors.median_error_m,
+        errors.std_error_m,
+        errors.p95_error_m,
+        errors.max_error_m,
+    )
+    return [
+        *map(unit.number, values_m),
+        f"{errors.missed_rate:.1%}",
+        unit.number(errors.offset_removed_mean_error_m),
+    ]
+
+
+def _caption(evaluation: Evaluation) -> str:
+    frames = sorted({drone.offset_frame for drone in evaluation.per_drone if drone.offset_frame})
+    # Within the gate of matching, so always millimetres.
+    motp, matched = (
+        _MILLIMETRES.number(value) for value in (evaluation.motp_m, evaluation.matched_mean_error_m)
+    )
+    return (
+        f"MOTA {evaluation.mota:.3f}, MOTP {motp} mm, IDF1 {evaluation.idf1:.3f}, "
+        f"identity switches {evaluation.id_switches}\n"
+        f"mean when matched anew in each frame: {matched} mm\n"
+        f"centred: mean without each drone's offset, its mean residual ({' or '.join(frames) or 'no'} frame)"
+    )

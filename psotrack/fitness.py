@@ -1,0 +1,155 @@
+"""The soft IoU of boxes against silhouettes: how well positions of drones explain what the cameras see.
+
+For one drone in one camera, with its box scaled about its middle by s (a window) and a larger ring that holds what
+foreground there is around it:
+
+    IoU_s = F_s / (A_s + F_ring - F_s)        score = mean over windows of IoU_s
+
+F is foreground and A is area, both inside the image. One window at s = 1 is the paper's overlap of box and
+silhouette: a plateau, because every box that holds the whole silhouette scores the same. Concentric windows,
+some smaller than the silhouette, have their maximum where the silhouette's middle is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Float, Int
+
+from psotrack._typing import Array
+from psotrack.boxes import Boxes, project_boxes, shape_in_cameras
+from psotrack.cameras import Camera
+from psotrack.summed_area import box_sum
+
+#: What one fully covered pixel of the reduced silhouettes counts.
+FULL = 255
+
+
+@dataclass(frozen=True)
+class ScoreSettings:
+    """What is compiled in.
+
+    Attributes:
+        windows: scales of the box that are compared with the foreground.
+        ring: scale of the box that bounds the foreground which belongs to the drone.
+        whole_pixels: round edges to whole pixels of the reduced silhouettes, as the paper's hard score does.
+        reduction: image pixels per silhouette pixel, along each side.
+        min_cameras: a drone that fewer cameras see has no score.
+    """
+
+    windows: tuple[float, ...] = (0.4, 0.7, 1.0)
+    ring: float = 1.5
+    whole_pixels: bool = False
+    reduction: int = 4
+    min_cameras: int = 2
+
+
+#: The baseline: one box with edges on whole pixels, as in the paper.
+PAPER_SCORE = ScoreSettings(windows=(1.0,), whole_pixels=True)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Scene:
+    """What the score of one frame reads.
+
+    Attributes:
+        cameras: with one leading axis.
+        shapes: (drones, cameras, 3, 3), from `shape_in_cameras`.
+        tables: (cameras, height + 1, width + 1) of the frame's silhouettes.
+        settings: static.
+    """
+
+    cameras: Camera
+    shapes: Float[Array, "drones cameras 3 3"]
+    tables: Int[Array, "cameras height1 width1"]
+    settings: ScoreSettings = field(metadata={"static": True})
+
+
+def scene(
+    cameras: Camera,
+    size_m: Float[Array, "drones 3"],
+    tables: Int[Array, "cameras height1 width1"],
+    settings: ScoreSettings,
+) -> Scene:
+    """The scene of one frame for drones of these sizes (full lengths, metres)."""
+    return Scene(cameras, shape_in_cameras(cameras, size_m), tables, settings)
+
+
+def camera_scores(
+    scene: Scene, position_m: Float[Array, "*batch drones 3"]
+) -> tuple[Float[Array, "*batch drones cameras"], Float[Array, "*batch drones cameras"]]:
+    """Soft IoU of every drone in every camera, and how much each camera counts.
+
+    Args:
+        scene: of one frame, for as many drones.
+        position_m: (..., drones, 3), world.
+
+    Returns:
+        Scores in [0, 1]; and weights, the share of the drone's box that lies inside the image (0 behind the camera).
+    """
+    boxes = project_boxes(scene.cameras, position_m, scene.shapes)
+    foreground, area = _windows(scene, boxes, (*scene.settings.windows, scene.settings.ring))
+    # The maximum is for rounding alone: a window may hold a hair more than the ring.
+    union = area[:-1] + jnp.maximum(foreground[-1] - foreground[:-1], 0.0)
+    score = (foreground[:-1] / jnp.maximum(union, 1e-6)).mean(axis=0)
+    return score, _share_in_image(scene, boxes)
+
+
+def filled(
+    scene: Scene, position_m: Float[Array, "*batch drones 3"]
+) -> Float[Array, "*batch drones cameras"]:
+    """Share of every drone's box that is foreground; 0 where most of the box is outside the image."""
+    boxes = project_boxes(scene.cameras, position_m, scene.shapes)
+    foreground, area = _windows(scene, boxes, (1.0,))
+    in_view = _share_in_image(scene, boxes) > 0.5
+    return jnp.where(in_view, foreground[0] / jnp.maximum(area[0], 1e-6), 0.0)
+
+
+def drone_fitness(scene: Scene, position_m: Float[Array, "*batch drones 3"]) -> Float[Array, "*batch drones"]:
+    """Fitness of each drone: the mean of its scores over the cameras that see it; NaN where too few do.
+
+    A camera counts by the share of the box that its image holds, so that the fitness stays continuous at the border.
+    """
+    score, weight = camera_scores(scene, position_m)
+    mean = (weight * score).sum(axis=-1) / jnp.maximum(weight.sum(axis=-1), 1e-6)
+    enough = (weight > 0.5).sum(axis=-1) >= scene.settings.min_cameras
+    return jnp.where(enough, mean, jnp.nan)
+
+
+def joint_fitness(scene: Scene, position_m: Float[Array, "*batch drones 3"]) -> Float[Array, "*batch"]:
+    """Mean fitness over all drones, the paper's. A drone without a score counts 0: losing one is no gain."""
+    return jnp.nan_to_num(drone_fitness(scene, position_m)).mean(axis=-1)
+
+
+def _windows(
+    scene: Scene, boxes: Boxes, scales: tuple[float, ...]
+) -> tuple[Float[Array, "scales *batch"], Float[Array, "scales *batch"]]:
+    """Foreground and area, in reduced pixels, of the boxes scaled about their middles and cut at the image."""
+    height, width = (side - 1 for side in scene.tables.shape[-2:])
+
+    def interval(low: Array, high: Array, last: int) -> tuple[Array, Array]:
+        middle, half = (
+            (low + high) / (2 * scene.settings.reduction),
+            (high - low) / (2 * scene.settings.reduction),
+        )
+        half = jnp.asarray(scales, half.dtype).reshape(-1, *[1] * half.ndim) * half
+        ends = middle - half, middle + half
+        if scene.settings.whole_pixels:
+            ends = jnp.round(ends[0]), jnp.round(ends[1])
+        return jnp.clip(ends[0], 0, last), jnp.clip(ends[1], 0, last)
+
+    x0, x1 = interval(boxes.x0, boxes.x1, width)
+    y0, y1 = interval(boxes.y0, boxes.y1, height)
+    camera = jnp.arange(scene.tables.shape[0])
+    return box_sum(scene.tables, camera, x0, y0, x1, y1) / FULL, (x1 - x0) * (y1 - y0)
+
+
+def _share_in_image(scene: Scene, boxes: Boxes) -> Float[Array, "*batch drones cameras"]:
+    height, width = ((side - 1) * scene.settings.reduction for side in scene.tables.shape[-2:])
+    inside_x = jnp.clip(boxes.x1, 0, width) - jnp.clip(boxes.x0, 0, width)
+    inside_y = jnp.clip(boxes.y1, 0, height) - jnp.clip(boxes.y0, 0, height)
+    whole = (boxes.x1 - boxes.x0) * (boxes.y1 - boxes.y0)
+    return jnp.where(boxes.in_front, inside_x * inside_y / jnp.maximum(whole, 1e-6), 0.0)

@@ -1,0 +1,95 @@
+"""Light: panels in the ceiling, a share of ambient light from the walls, and the shadows of boxes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+#: Share of the light that comes from everywhere: walls and ceiling of a bright room throw back much of it.
+AMBIENT = 0.4
+
+
+@dataclass(frozen=True)
+class Lamps:
+    """Equal panels in the ceiling, shining down.
+
+    Attributes:
+        centres_m: (lamps, 3).
+        size_m: length along x and along y of each.
+        exposure: scales light so that a white face, lying in the middle of the floor, is 1.
+    """
+
+    centres_m: Float[np.ndarray, "lamps 3"]
+    size_m: tuple[float, float]
+    exposure: float
+
+    def samples_m(self) -> Float[np.ndarray, "lamps samples 3"]:
+        """(lamps, 4, 3): points spread over each panel, for soft shadows."""
+        spread = np.array([(-1, -1, 0), (1, -1, 0), (-1, 1, 0), (1, 1, 0)]) * [*self.size_m, 0.0] / 4
+        return self.centres_m[:, None] + spread
+
+    def direct(
+        self,
+        points_m: Float[np.ndarray, "points 3"],
+        normals: Float[np.ndarray, "points 3"],
+        source_m: Float[np.ndarray, "3"],
+    ) -> Float[np.ndarray, "points"]:
+        """Light on faces from one point of a panel: Lambert on both sides, inverse square."""
+        towards = source_m - points_m
+        distance = np.linalg.norm(towards, axis=-1)
+        towards = towards / distance[:, None]
+        received = np.clip((towards * normals).sum(axis=-1), 0, None)
+        return self.exposure * received * np.clip(towards[:, 2], 0, None) / distance**2
+
+    def on_faces(
+        self, at_m: Float[np.ndarray, "3"], normals: Float[np.ndarray, "faces 3"]
+    ) -> Float[np.ndarray, "faces"]:
+        """Light on the faces of a small thing at `at_m`, without shadows."""
+        points = np.broadcast_to(at_m, normals.shape)
+        direct = sum((self.direct(points, normals, lamp) for lamp in self.centres_m), np.zeros(len(normals)))
+        # Faces that look down see the floor, which is darker than walls and ceiling.
+        return direct + AMBIENT * (0.75 + 0.25 * normals[:, 2])
+
+
+def lamps(centres_m: Float[np.ndarray, "lamps 3"], size_m: tuple[float, float]) -> Lamps:
+    """Panels whose exposure fits: white on the middle of the floor gets 1, ambient light included."""
+    plain = Lamps(centres_m, size_m, 1.0)
+    up = np.array([[0.0, 0.0, 1.0]])
+    middle = sum(float(plain.direct(np.zeros((1, 3)), up, lamp)[0]) for lamp in centres_m)
+    return Lamps(centres_m, size_m, (1.0 - AMBIENT) / middle)
+
+
+def blocked(
+    points_m: Float[np.ndarray, "points 3"],
+    source_m: Float[np.ndarray, "3"],
+    boxes_m: Float[np.ndarray, "boxes 2 3"],
+) -> Bool[np.ndarray, "points"]:
+    """Where a box stands between a point and the source (slab test, Kay and Kajiya, 1986)."""
+    ray = source_m - points_m
+    ray = np.where(np.abs(ray) < 1e-9, 1e-9, ray)
+    result = np.zeros(len(points_m), bool)
+    for lower, upper in boxes_m:
+        a, b = (lower - points_m) / ray, (upper - points_m) / ray
+        enter, leave = np.minimum(a, b).max(axis=-1), np.maximum(a, b).min(axis=-1)
+        # A point on the box itself touches it at 0: let light leave before it counts as blocked.
+        result |= (enter < leave) & (leave > 1e-3) & (enter < 1) & (leave > np.maximum(enter, 0) + 1e-3)
+    return result
+
+
+def bake(
+    points_m: Float[np.ndarray, "points 3"],
+    normal: Float[np.ndarray, "3"],
+    panels: Lamps,
+    boxes_m: Float[np.ndarray, "boxes 2 3"],
+) -> Float[np.ndarray, "points"]:
+    """Light on points of one face, shadows of boxes included."""
+    raised = points_m + 2e-3 * normal
+    normals = np.broadcast_to(normal, points_m.shape)
+    light = np.zeros(len(points_m))
+    for panel in panels.samples_m():
+        for source in panel:
+            seen = ~blocked(raised, source, boxes_m)
+            light += seen * panels.direct(raised, normals, source) / len(panel)
+    return light + AMBIENT * (0.85 + 0.15 * normal[2])

@@ -1,0 +1,154 @@
+"""Projection lines: points in space from the pixels of several cameras, in float64 (paper, equations 1-6).
+
+Each camera that sees a point adds two linear equations in its three unknown coordinates; the overdetermined system is
+solved in the least-squares sense. The lens is undone first, so that the equations are linear.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from psotrack.cameras import Camera, project, undistort
+
+
+def triangulate(
+    cameras: Camera,
+    points_px: Float[np.ndarray, "*points cameras 2"],
+    weights: Float[np.ndarray, "*points cameras"] | None = None,
+) -> Float[np.ndarray, "*points 3"]:
+    """World points from pixels, by the normal equations of (3)-(6) in normalised image coordinates.
+
+    Args:
+        cameras: with one leading axis.
+        points_px: (..., cameras, 2); NaN where a camera does not see the point.
+        weights: (..., cameras), how much each camera's two equations count; 1 where not given.
+
+    Returns:
+        (..., 3), world, metres; NaN where fewer than two cameras see the point, or all their rays are parallel.
+    """
+    normalised = undistort(cameras, points_px)
+    seen = np.isfinite(normalised).all(axis=-1)
+    weights = seen * (1.0 if weights is None else weights)
+    normalised = np.where(seen[..., None], normalised, 0.0)
+    T = cameras.T_cam_world
+    # Rows (3) with K undone: (x r3 - r1) X = t1 - x t3, and the same for y.
+    rows = normalised[..., :, None] * T[:, 2, None, :3] - T[:, :2, :3]
+    right = T[:, :2, 3] - normalised * T[:, 2, None, 3]
+    normal = np.einsum("...c,...cik,...cil->...kl", weights, rows, rows)
+    solvable = (seen.sum(axis=-1) >= 2) & (np.linalg.cond(normal) < 1e12)
+    normal = np.where(solvable[..., None, None], normal, np.eye(3))
+    point = np.linalg.solve(normal, np.einsum("...c,...cik,...ci->...k", weights, rows, right)[..., None])
+    return np.where(solvable[..., None], point[..., 0], np.nan)
+
+
+def viewpoints(cameras: Camera, nearest_m: float = 0.3) -> Int[np.ndarray, "cameras"]:
+    """Number of the viewpoint of each camera: cameras nearer than `nearest_m` to one another share one.
+
+    Two cameras that stand beside each other see a drone twice but locate it hardly better than one.
+    """
+    centre = cameras.centre_world
+    label = np.arange(len(centre))
+    for a, b in combinations(range(len(centre)), 2):
+        if np.linalg.norm(centre[a] - centre[b]) < nearest_m:
+            label[label == label[b]] = label[a]
+    return label
+
+
+def match_views(
+    cameras: Camera,
+    points_px: list[Float[np.ndarray, "_ 2"]],
+    radius_px: list[Float[np.ndarray, "_"]],
+    bounds_m: Float[np.ndarray, "2 3"],
+    *,
+    min_viewpoints: int = 3,
+    separation_m: float = 0.3,
+) -> tuple[Float[np.ndarray, "found 3"], Int[np.ndarray, "found cameras"]]:
+    """Points in space that explain 2D points of several cameras, when nobody says which belong together.
+
+    Every pair of 2D points from two viewpoints proposes a point in space; a proposal is supported by the cameras that
+    have a 2D point within its radius of where it projects to. Proposals are accepted greedily, best supported first.
+    Each must have `min_viewpoints` 2D points of its own that no accepted one has used: two views alone cannot tell
+    real drones from the crossings of different drones' rays.
+
+    Args:
+        cameras: with one leading axis.
+        points_px: for each camera (n, 2), n may be 0.
+        radius_px: for each camera (n,), how far from the 2D point a projection still fits.
+        bounds_m: (2, 3), corners of the region where points are sought.
+        min_viewpoints: least number of viewpoints (see `viewpoints`).
+        separation_m: no two points are nearer than this.
+
+    Returns:
+        (found, 3) points, and (found, cameras) the index of the 2D point that each camera sees it at, or -1.
+    """
+    viewpoint = viewpoints(cameras)
+    proposals = _proposals(cameras, points_px, viewpoint)
+    proposals = proposals[((proposals >= bounds_m[0]) & (proposals <= bounds_m[1])).all(axis=-1)]
+    for _ in range(2):  # Once from two rays, once more from all that agree.
+        support = _support(cameras, proposals, points_px, radius_px)
+        proposals = triangulate(cameras, _pick(points_px, support))
+        kept = np.isfinite(proposals).all(axis=-1)
+        proposals, support = proposals[kept], support[kept]
+
+    found: list[int] = []
+    free = support >= 0
+    while len(proposals):
+        own = np.array([len(set(viewpoint[row])) for row in free])
+        total = (support >= 0).sum(axis=-1)
+        best = int(np.lexsort((total, own))[-1])
+        if own[best] < min_viewpoints:
+            break
+        found.append(best)
+        used = (support == support[best]) & (support[best] >= 0)
+        free &= ~used
+        near = np.linalg.norm(proposals - proposals[best], axis=-1) < separation_m
+        free[near] = False
+    return proposals[found], support[found]
+
+
+def _proposals(
+    cameras: Camera, points_px: list[Float[np.ndarray, "_ 2"]], viewpoint: Int[np.ndarray, "cameras"]
+) -> Float[np.ndarray, "proposals 3"]:
+    """A point for every pair of 2D points from two viewpoints."""
+    proposals = [np.empty((0, 3))]
+    for a, b in combinations(range(len(points_px)), 2):
+        if viewpoint[a] != viewpoint[b] and len(points_px[a]) and len(points_px[b]):
+            first, second = np.meshgrid(np.arange(len(points_px[a])), np.arange(len(points_px[b])))
+            pairs = np.stack([points_px[a][first.ravel()], points_px[b][second.ravel()]], axis=1)
+            proposals.append(triangulate(cameras[np.array([a, b])], pairs))
+    points = np.concatenate(proposals)
+    return points[np.isfinite(points).all(axis=-1)]
+
+
+def _support(
+    cameras: Camera,
+    proposals: Float[np.ndarray, "proposals 3"],
+    points_px: list[Float[np.ndarray, "_ 2"]],
+    radius_px: list[Float[np.ndarray, "_"]],
+) -> Int[np.ndarray, "proposals cameras"]:
+    """Index of the nearest 2D point of each camera that fits the proposal, or -1."""
+    pixels, depth = project(cameras, proposals[:, None, :])
+    support = np.full(depth.shape, -1)
+    for camera, (points, radius) in enumerate(zip(points_px, radius_px, strict=True)):
+        if len(points):
+            distance = np.linalg.norm(pixels[:, camera, None, :] - points, axis=-1)
+            distance = np.where((distance <= radius) & (depth[:, camera, None] > 0), distance, np.inf)
+            nearest = distance.argmin(axis=-1)
+            fits: Bool[np.ndarray, "proposals"] = np.isfinite(distance.min(axis=-1))
+            support[:, camera] = np.where(fits, nearest, -1)
+    return support
+
+
+def _pick(
+    points_px: list[Float[np.ndarray, "_ 2"]], support: Int[np.ndarray, "proposals cameras"]
+) -> Float[np.ndarray, "proposals cameras 2"]:
+    """The 2D points that support each proposal, NaN where a camera has none."""
+    picked = np.full((*support.shape, 2), np.nan)
+    for camera, points in enumerate(points_px):
+        rows = np.flatnonzero(support[:, camera] >= 0)
+        if len(rows):
+            picked[rows, camera] = points[support[rows, camera]]
+    return picked

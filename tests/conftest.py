@@ -1,0 +1,16 @@
+"""Session-wide switches that turn silent trouble into failures.
+
+jaxtyping and beartype check every annotated call of the package (`--jaxtyping-packages` in pyproject.toml).
+"""
+
+import jax
+from hypothesis import settings
+
+# int32 + float32 and the like must be written out: a promotion that nobody meant is how exact sums lose bits.
+# Rank promotion stays allowed: particles x drones x cameras broadcast against cameras everywhere, on purpose.
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+# The same examples in every run: a failure can be repeated, and no test throws a coin. No deadline, because the
+# first example of a compiled function pays for the compiler.
+settings.register_profile("psotrack", derandomize=True, deadline=None, max_examples=40)
+settings.load_profile("psotrack")

@@ -1,0 +1,206 @@
+"""Projection: OpenCV is the oracle of the lens, rigid motions of the world that of the geometry."""
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import LENSES, far_camera, float32, moved, rig_of, ring_rig
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from psotrack.cameras import NEAR_M, camera, look_at, project, stack, to_camera, undistort
+from psotrack.errors import SettingsError
+
+
+def points_in_room(count, seed=0):
+    return np.random.default_rng(seed).uniform((-2, -2, 0.2), (2, 2, 2.5), (count, 3))
+
+
+def opencv_pixels(one, points):
+    R, t = one.T_cam_world[:3, :3], one.T_cam_world[:3, 3]
+    dist = one.dist if one.dist.size else None
+    return cv2.projectPoints(points, cv2.Rodrigues(R)[0], t, one.K, dist)[0][:, 0]
+
+
+@pytest.mark.parametrize("coefficients", sorted(LENSES))
+@pytest.mark.parametrize("num_cameras", [1, 3, 5])
+def test_pixels_are_those_of_opencv(num_cameras, coefficients):
+    rig, points = ring_rig(num_cameras, coefficients=coefficients), points_in_room(7)
+    pixels, depth = project(rig.cameras, points[:, None, :])
+    assert pixels.shape == (7, num_cameras, 2)
+    assert pixels.dtype == np.float64
+    for i in range(num_cameras):
+        # Both are float64; 1e-9 px is a thousand roundings of a number of 300 px, and OpenCV goes through Rodrigues.
+        np.testing.assert_allclose(pixels[:, i], opencv_pixels(rig.cameras[i], points), atol=1e-9)
+        R, t = rig.cameras.T_cam_world[i, :3, :3], rig.cameras.T_cam_world[i, :3, 3]
+        np.testing.assert_allclose(depth[:, i], (points @ R.T + t)[:, 2], atol=1e-12)
+
+
+@pytest.mark.parametrize("coefficients", sorted(LENSES))
+def test_leading_axes_broadcast(coefficients):
+    """(particles, drones, cameras) at once are the same as one camera and one point at a time."""
+    rig = ring_rig(5, coefficients=coefficients)
+    points = points_in_room(2 * 7).reshape(7, 2, 3)
+    pixels, depth = project(rig.cameras, points[..., None, :])
+    assert pixels.shape == (7, 2, 5, 2)
+    for particle, drone, index in np.ndindex(7, 2, 5):
+        pixel, z = project(rig.cameras[index], points[particle, drone])
+        np.testing.assert_allclose(pixels[particle, drone, index], pixel, rtol=1e-13)
+        np.testing.assert_allclose(depth[particle, drone, index], z, rtol=1e-13)
+
+
+@pytest.mark.parametrize("coefficients", sorted(LENSES))
+def test_undistort_is_the_inverse(coefficients):
+    rig, points = ring_rig(3, coefficients=coefficients), points_in_room(31)
+    pixels, _ = project(rig.cameras, points[:, None, :])
+    in_camera = to_camera(rig.cameras, points[:, None, :])
+    # The iteration contracts by about a third per round at the image's corner: 20 rounds leave 1e-9.
+    np.testing.assert_allclose(
+        undistort(rig.cameras, pixels), in_camera[..., :2] / in_camera[..., 2:], atol=1e-8
+    )
+
+
+def test_skew_is_part_of_the_inverse():
+    R, t_m = look_at((0.0, -4.0, 1.0), (0.0, 0.0, 1.0))
+    K = np.array([[300.0, 12.0, 160.0], [0.0, 310.0, 120.0], [0.0, 0.0, 1.0]])
+    one = camera(R=R, t_m=t_m, K=K, image_size_wh=(320, 240))
+    in_camera = to_camera(one, np.array([0.7, 0.3, 1.9]))
+    pixel = K @ in_camera / in_camera[2]
+    np.testing.assert_allclose(project(one, np.array([0.7, 0.3, 1.9]))[0], pixel[:2], rtol=1e-13)
+    np.testing.assert_allclose(undistort(one, pixel[:2]), in_camera[:2] / in_camera[2], rtol=1e-12)
+
+
+@given(
+    st.lists(st.floats(-np.pi, np.pi), min_size=3, max_size=3),
+    st.lists(st.floats(-10, 10), min_size=3, max_size=3),
+    st.sampled_from(sorted(LENSES)),
+)
+def test_moving_world_and_rig_together_changes_no_pixel(turn, shift_m, coefficients):
+    rig, points = ring_rig(3, coefficients=coefficients), points_in_room(5)
+    R = Rotation.from_rotvec(turn).as_matrix()
+    pixels, depth = project(rig.cameras, points[:, None, :])
+    pixels_moved, depth_moved = project(moved(rig, R, shift_m).cameras, (points @ R.T + shift_m)[:, None, :])
+    # Shifts of 10 m cost a digit or two of float64's sixteen.
+    np.testing.assert_allclose(pixels_moved, pixels, atol=1e-9)
+    np.testing.assert_allclose(depth_moved, depth, atol=1e-12)
+
+
+@pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
+def test_points_behind_have_finite_pixels_and_a_depth_that_says_so(xp):
+    rig = ring_rig(3, coefficients=5)
+    cameras = rig.cameras if xp is np else float32(rig.cameras)
+    behind = rig.cameras.centre_world - 0.5 * rig.cameras.T_cam_world[:, 2, :3]
+    at_centre = rig.cameras.centre_world
+    for points, expected in ((behind, -0.5), (at_centre, 0.0)):
+        pixels, depth = project(cameras, xp.asarray(points, xp.float64 if xp is np else xp.float32))
+        assert np.isfinite(pixels).all()
+        # Float32 at coordinates of 4 m: 2e-7 relative.
+        np.testing.assert_allclose(depth, expected, atol=1e-12 if xp is np else 3e-6)
+        assert (np.asarray(depth) < NEAR_M).all()
+
+
+def test_gradients_behind_are_finite():
+    cameras = float32(ring_rig(3, coefficients=8).cameras)
+    points = cameras.centre_world - 0.5 * cameras.T_cam_world[:, 2, :3]
+    gradient = jax.jit(jax.grad(lambda p: project(cameras, p)[0].sum()))(points)
+    assert np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("coefficients", sorted(LENSES))
+def test_float32_is_close_to_float64(coefficients):
+    rig, points = ring_rig(5, coefficients=coefficients), points_in_room(101)
+    expected, _ = project(rig.cameras, points[:, None, :])
+    pixels, _ = jax.jit(project)(float32(rig.cameras), jnp.asarray(points[:, None, :], jnp.float32))
+    assert pixels.dtype == jnp.float32
+    # A coordinate of up to 8 m is rounded to 2.4e-7 m, a few times over; at 1 m and a focal length of 280 px that
+    # is 1e-4 px per rounding. Measured 2e-4, limit 1e-3.
+    np.testing.assert_allclose(pixels, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("centre_m", [(4.0, 0.0, 2.0), (-1.0, 3.0, 0.5), (0.1, 0.0, 9.0)])
+def test_look_at(centre_m):
+    target_m = (0.0, 0.2, 1.0)
+    R, t_m = look_at(centre_m, target_m)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) > 0
+    np.testing.assert_allclose(R @ np.array(centre_m) + t_m, 0, atol=1e-12)
+    distance = np.linalg.norm(np.subtract(target_m, centre_m))
+    np.testing.assert_allclose(R @ np.array(target_m) + t_m, (0, 0, distance), atol=1e-12)
+    # The image is upright: the world's up points to smaller rows and neither left nor right.
+    assert R[1, 2] < 0
+    assert abs(R[0, 2]) < 1e-12
+
+
+def test_centre_of_projection():
+    rig = ring_rig(5)
+    for i in range(5):
+        np.testing.assert_allclose(to_camera(rig.cameras[i], rig.cameras.centre_world[i]), 0, atol=1e-12)
+
+
+def test_stack_pads_short_lenses():
+    named = {
+        name: ring_rig(1, coefficients=n).cameras[0] for name, n in (("a", 0), ("b", 5), ("c", 4), ("d", 8))
+    }
+    rig = stack(named)
+    assert rig.names == ("a", "b", "c", "d")
+    assert rig.cameras.dist.shape == (4, 8)
+    points = points_in_room(7)
+    for i, one in enumerate(named.values()):
+        np.testing.assert_allclose(project(rig.cameras[i], points)[0], project(one, points)[0], rtol=1e-14)
+
+
+def test_select_keeps_the_order_asked_for():
+    rig = ring_rig(5)
+    some = rig.select(["c3", "c0"])
+    assert some.names == ("c3", "c0")
+    assert len(some) == 2
+    np.testing.assert_array_equal(some.cameras.K, rig.cameras.K[[3, 0]])
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [(["c0", "c7", "x"], "expected some of c0, c1, c2, found c7, x"), ([], "found none")],
+)
+def test_select_names_what_is_missing(names, message):
+    with pytest.raises(SettingsError, match=message):
+        ring_rig(3).select(names)
+
+
+def test_a_rig_needs_a_camera():
+    with pytest.raises(SettingsError, match="expected at least one camera, found none"):
+        stack({})
+
+
+GOOD = {
+    "R": np.eye(3),
+    "t_m": np.zeros(3),
+    "K": np.array([[100.0, 0, 50], [0, 100.0, 40], [0, 0, 1]]),
+    "image_size_wh": (100, 80),
+}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"R": np.diag([1.0, 1.0, -1.0])}, r"camera\.R: expected a rotation matrix"),
+        ({"R": 1.001 * np.eye(3)}, r"camera\.R: expected a rotation matrix"),
+        ({"K": np.diag([0.0, 100.0, 1.0])}, r"camera\.K: expected focal lengths above 0, found 0 and 100"),
+        ({"K": np.diag([100.0, -5.0, 1.0])}, r"camera\.K: expected focal lengths above 0, found 100 and -5"),
+        ({"t_m": np.array([0.0, np.nan, 0.0])}, "expected finite numbers, found NaN or infinity"),
+        ({"R": np.full((3, 3), np.inf)}, "expected finite numbers"),
+        ({"dist": (0.1, np.nan, 0.0, 0.0)}, "expected finite numbers"),
+        ({"dist": (0.1, 0.2, 0.3)}, r"camera\.dist: expected 0, 4, 5 or 8 coefficients, found 3"),
+    ],
+)
+def test_a_camera_that_cannot_be(change, message):
+    with pytest.raises(SettingsError, match=message):
+        camera(**(GOOD | change))
+
+
+def test_a_far_camera_makes_metres_pixels():
+    """The rig that the tests of the fitness stand on: 20 pixels a metre, the origin in the middle of the image."""
+    rig = rig_of(far_camera(image_size_wh=(64, 48), pixels_per_m=20))
+    pixels, _ = project(rig.cameras, np.array([[[0.0, 0, 0]], [[1.0, 0, 0.5]]]))
+    np.testing.assert_allclose(pixels[:, 0], [[31.5, 23.5], [51.5, 13.5]], atol=1e-9)

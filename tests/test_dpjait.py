@@ -1,0 +1,391 @@
+"""The published layout: a folder of each half is made here by hand, read, and spoilt in every way we know."""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from psotrack.cameras import project
+from psotrack.datasets import dpjait
+from psotrack.errors import InputError
+from psotrack.mocap import Markers, write_c3d
+from psotrack.video import VideoWriter
+
+WIDTH, HEIGHT, FPS = 64, 48, 25.0
+SIMULATED = "cam_name;cam_x[m];cam_y[m];cam_z[m];cam_or_x[rad];cam_or_y[rad];cam_or_z[rad];focal_length;cx;cy"
+REAL = SIMULATED.replace("[m]", "[mm]") + ";coeff_1;coeff_2;coeff_3;coeff_4"
+POSES = "id;pos_x[m];pos_y[m];pos_z[m];rot_x[rad];rot_y[rad];rot_z[rad];q_w;q_x;q_y;q_z"
+SERIALS = ("55260362", "56339527", "60881257", "61920488")
+
+
+@pytest.fixture(scope="session")
+def video(tmp_path_factory):
+    """One small video per number of frames, made once and copied."""
+    folder = tmp_path_factory.mktemp("videos")
+
+    def make(num_frames: int, size_wh: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
+        path = folder / f"{num_frames}_{size_wh[0]}.avi"
+        if not path.exists():
+            with VideoWriter(path, FPS, size_wh) as writer:
+                for _ in range(num_frames):
+                    writer.write(np.zeros((size_wh[1], size_wh[0], 3), np.uint8))
+        return path
+
+    return make
+
+
+def pose_lines(num_rows: int, x0: float) -> str:
+    rows = ["0;0;0;-0;0;0;0;1;0;0;0"]
+    rows += [f"{i};{x0 + 0.1 * i};2;1.5;0;0;0;0;0;0;1" for i in range(1, num_rows)]
+    return "\n".join([POSES, *rows]) + "\n"
+
+
+@pytest.fixture
+def simulated(tmp_path, video):
+    """Three cameras, two drones, five frames, named for nine drones."""
+    folder = tmp_path / "Simulated_Data" / "S99_D9"
+    folder.mkdir(parents=True)
+    cameras = [f"cam{i}i;{i};0.5;8;1.9;{i / 10};0;{1156.3 + i};32;24" for i in (1, 2, 3)]
+    (folder / "cameras_calibration.csv").write_text("\n".join([SIMULATED, *cameras]) + "\n")
+    for i in (1, 2, 3):
+        shutil.copy(video(5), folder / f"cam{i}i_s.avi")
+    (folder / "dron1_pos_25.csv").write_text(pose_lines(5, 0.0))
+    (folder / "dron2_pos_25.csv").write_text(pose_lines(5, 1.0))
+    return folder
+
+
+@pytest.fixture
+def real(tmp_path, video):
+    """Four cameras by serial number, two drones at 100 Hz, five frames."""
+    folder = tmp_path / "Real_Data" / "R99_D2"
+    folder.mkdir(parents=True)
+    cameras = [f"{name};-100;250.5;6000;1.9;0.1;0;1158.7;32;24;-0.1;0.02;0.001;-0.002" for name in SERIALS]
+    (folder / "cameras_calibration.csv").write_text("\n".join([REAL, *cameras]) + "\n")
+    for name in SERIALS:
+        shutil.copy(video(5), folder / f"{name}.avi")
+    t = np.arange(20)[:, None, None]
+    position_m = np.tile([1.0, 2.0, 1.5], (20, 6, 1)) + 0.01 * t + 0.1 * np.arange(6)[None, :, None]
+    labels = tuple(f"Dron{drone}:Dron{drone}{i}" for drone in (4, 7) for i in (1, 2, 3))
+    write_c3d(folder / "R99.c3d", Markers(labels, position_m, 100.0))
+    return folder
+
+
+def change(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+def test_the_simulated_half(simulated):
+    sequence = dpjait.read_sequence(simulated)
+    assert sequence.name == "S99_D9"
+    assert sequence.rig.names == ("cam1i", "cam2i", "cam3i")
+    assert [sequence.videos[name].path.name for name in sequence.rig.names] == [
+        "cam1i_s.avi",
+        "cam2i_s.avi",
+        "cam3i_s.avi",
+    ]
+    assert (sequence.fps, sequence.num_frames) == (25.0, 5)
+    cameras = sequence.rig.cameras
+    assert cameras.image_size_wh.tolist() == [[64, 48]] * 3
+    assert cameras.K[:, 0, 0].tolist() == [1157.3, 1158.3, 1159.3]  # of each camera's own
+    assert cameras.dist.shape == (3, 0)
+    truth = sequence.truth
+    assert truth.drones == ("dron1", "dron2")  # counted, whatever the folder's name says
+    assert np.isnan(truth.position_m[0]).all()  # the placeholder
+    assert np.isnan(truth.orientation_wxyz[0]).all()
+    np.testing.assert_allclose(truth.position_m[1:, 1, 0], [1.1, 1.2, 1.3, 1.4], rtol=0, atol=1e-12)
+    assert truth.orientation_wxyz[4, 0].tolist() == [0, 0, 0, 1]
+    assert truth.time_s.tolist() == [0, 0.04, 0.08, 0.12, 0.16]
+    assert sequence.detections is None
+    assert sequence.usable().num_frames == 5
+
+
+def test_the_real_half(real):
+    sequence = dpjait.read_sequence(real)
+    assert sequence.rig.names == SERIALS
+    cameras = sequence.rig.cameras
+    np.testing.assert_allclose(cameras.T_cam_world[0, :3, 3], [-0.1, 0.2505, 6.0], rtol=0, atol=1e-12)
+    assert cameras.dist[2].tolist() == [-0.1, 0.02, 0.001, -0.002]
+    truth = sequence.truth
+    assert truth.drones == ("dron4", "dron7")
+    # Frame 3 of the video is frame 12 of the recording; the middle marker of three is the centroid. Float32 mm.
+    np.testing.assert_allclose(truth.position_m[3, 0], np.array([1.0, 2.0, 1.5]) + 0.12 + 0.1, atol=3e-7)
+    assert truth.orientation_wxyz is None
+    assert truth.seen.all()
+
+
+@pytest.mark.parametrize("half", ["simulated", "real"])
+def test_calibration_means_what_opencv_says(half, request):
+    """A point projects where `cv2.projectPoints` puts it with the file's own numbers: t is no centre."""
+    folder = request.getfixturevalue(half)
+    rig = dpjait.read_sequence(folder).rig
+    line = (folder / "cameras_calibration.csv").read_text().splitlines()[2].split(";")
+    t, rvec = np.array(line[1:4], float), np.array(line[4:7], float)
+    f, cx, cy = (float(value) for value in line[7:10])
+    points_m = np.random.default_rng(0).uniform(-2, 2, (7, 3))
+    in_file_units = points_m * (1000 if half == "real" else 1)
+    K = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]])
+    expected, _ = cv2.projectPoints(in_file_units, rvec, t, K, np.array(line[10:], float))
+    pixels, depth_m = project(rig.cameras[1], points_m)
+    assert depth_m.min() > 0
+    # Both in double precision; pixels of up to some thousand.
+    np.testing.assert_allclose(pixels, expected[:, 0], rtol=0, atol=1e-8)
+
+
+def test_the_folder_as_people_type_it(simulated, monkeypatch):
+    monkeypatch.chdir(simulated.parent)
+    for typed in ("S99_D9", "S99_D9/", "./S99_D9//", simulated):
+        assert dpjait.read_sequence(typed).name == "S99_D9"
+    monkeypatch.chdir(simulated)
+    assert dpjait.read_sequence(".").name == "S99_D9"
+
+
+def test_cameras_may_be_without_video(simulated, caplog):
+    (simulated / "cam2i_s.avi").unlink()
+    with caplog.at_level("INFO"):
+        sequence = dpjait.read_sequence(simulated)
+    assert list(sequence.videos) == ["cam1i", "cam3i"]
+    assert sequence.rig.cameras.image_size_wh.tolist() == [[64, 48]] * 3
+    assert "camera cam2i has no video: taken to be 64 x 48 like the others" in caplog.text
+    with pytest.raises(InputError, match="found none for cam2i; pass --cameras cam1i,cam3i"):
+        sequence.usable()
+    assert sequence.usable(["cam3i", "cam1i"]).num_frames == 5
+
+
+def test_videos_may_differ_in_length(simulated, video):
+    shutil.copy(video(7), simulated / "cam2i_s.avi")
+    sequence = dpjait.read_sequence(simulated)
+    assert sequence.num_frames == 5
+    assert sequence.truth.num_frames == 7
+    assert sequence.truth.seen[:, 0].tolist() == [False, True, True, True, True, False, False]
+    with pytest.raises(InputError, match=r"cam2i_s\.avi: expected 5 frames as in cam1i_s\.avi, found 7"):
+        sequence.usable()
+
+
+def test_a_video_of_another_size(simulated, video):
+    shutil.copy(video(5, (96, 64)), simulated / "cam1i_s.avi")
+    sequence = dpjait.read_sequence(simulated)
+    with pytest.raises(
+        InputError, match=r"cam1i_s\.avi: expected 64 x 48 pixels as in cam2i_s\.avi, found 96"
+    ):
+        sequence.usable()
+
+
+def test_poses_beyond_the_videos_are_cut(simulated):
+    (simulated / "dron1_pos_25.csv").write_text(pose_lines(9, 0.0))
+    assert dpjait.read_sequence(simulated).truth.num_frames == 5
+
+
+def test_missing_poses_are_nan(simulated):
+    (simulated / "dron1_pos_25.csv").write_text(pose_lines(3, 0.0))
+    change(simulated / "dron2_pos_25.csv", "\n3;", "\n12;")
+    truth = dpjait.read_sequence(simulated).truth
+    assert truth.seen[:, 0].tolist() == [False, True, True, False, False]
+    assert truth.seen[:, 1].tolist() == [False, True, True, False, True]
+
+
+def test_ten_drones_are_in_the_order_of_their_numbers(simulated):
+    for number in range(3, 11):
+        (simulated / f"drone{number}_pos_25.csv").write_text(pose_lines(5, number))  # spelt as others do
+    truth = dpjait.read_sequence(simulated).truth
+    assert truth.drones == tuple(f"dron{number}" for number in range(1, 11))
+    assert truth.position_m[1, 9, 0] == pytest.approx(10.1)
+
+
+def test_no_reference(simulated):
+    for path in simulated.glob("dron*.csv"):
+        path.unlink()
+    assert dpjait.read_sequence(simulated).truth is None
+
+
+def test_detections_are_found_by_camera(simulated):
+    (simulated / "dl_data").mkdir()
+    (simulated / "dl_data" / "cam2i_s.csv").write_text("1,10,20,4,6,12,23,0.5\n")
+    detections = dpjait.read_sequence(simulated).detections
+    assert list(detections) == ["cam2i"]
+    assert dpjait.read_detections(detections["cam2i"]).xyxy.tolist() == [[10, 20, 14, 26]]
+
+
+def test_other_videos_are_left_alone(simulated, video, caplog):
+    shutil.copy(video(7), simulated / "dron1_fpv.mp4")
+    with caplog.at_level("INFO"):
+        assert dpjait.read_sequence(simulated).truth.num_frames == 5
+    assert "dron1_fpv.mp4: not used" in caplog.text
+
+
+def test_serial_numbers_with_a_prefix(real):
+    (real / f"{SERIALS[0]}.avi").rename(real / f"cam_{SERIALS[0]}.avi")
+    assert list(dpjait.read_sequence(real).videos) == list(SERIALS)
+
+
+def fails(folder, message):
+    with pytest.raises(InputError, match=message):
+        dpjait.read_sequence(folder)
+
+
+def test_no_such_folder(tmp_path):
+    fails(tmp_path / "nix", "nix: expected the folder of a sequence, found nothing")
+
+
+def test_an_archive(tmp_path):
+    (tmp_path / "S01.zip").write_bytes(b"PK")
+    fails(tmp_path / "S01.zip", r"S01\.zip: expected the folder of a sequence, found a file; unpack it first")
+
+
+def test_a_folder_of_something_else(tmp_path):
+    fails(
+        tmp_path, "expected the file cameras_calibration.csv in it, found none; is it a folder of the DPJAIT"
+    )
+
+
+def test_the_folder_above(simulated):
+    fails(simulated.parent, "cameras_calibration.csv in it, found none; did you mean .*/S99_D9")
+
+
+def test_no_videos_at_all(simulated):
+    for path in simulated.glob("*.avi"):
+        path.unlink()
+    fails(simulated, r"S99_D9: expected videos named like the cameras, cam1i\.avi \.\.\., found no \.avi")
+
+
+def test_two_videos_of_one_camera(simulated, video):
+    shutil.copy(video(5), simulated / "cam1i.avi")
+    fails(simulated, r"cam1i_s\.avi: expected one such file per camera, found cam1i\.avi as well")
+
+
+def test_a_broken_video(simulated):
+    (simulated / "cam1i_s.avi").write_bytes(b"")
+    fails(simulated, r"cam1i_s\.avi: expected a video, found an empty file")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (";", ",", ", line 1: expected columns separated by ';', found 'cam_name,cam_x"),
+        ("focal_length", "focus", r": expected a column focal_length, found only cam_name, cam_x\[m\]"),
+        ("cam_x[m]", "cam_x[ft]", r": expected a column cam_x\[m\] or cam_x\[mm\], found cam_x\[ft\]"),
+        ("cam_x[m]", "cam_x", r": expected a column cam_x\[m\] or cam_x\[mm\], found cam_x"),
+        ("cam_y[m]", "cam_x[m]", ", line 1: expected each column once, found cam_x again"),
+        (";cy", ";coeff_1", ": expected a column coeff_2"),
+        ("cam2i;2;0.5", "cam2i;2;x", r", line 3, column cam_y\[m\]: expected a number, found 'x'"),
+        ("cam2i;2;0.5", "cam2i;2;nan", r", line 3, column cam_y\[m\]: expected a finite number, found 'nan'"),
+        ("cam2i;2;0.5", "cam2i;2;0,5", ", line 3.*found '0,5'; write decimals with a point"),
+        ("cam2i;2;0.5", "cam2i;2;", r", line 3, column cam_y\[m\]: expected a value, found nothing"),
+        ("cam2i;2;0.5", "cam2i;0.5", ", line 3: expected 10 values as in the header, found 9"),
+        ("cam2i;2", "cam1i_s;2", ", line 3, column cam_name: expected each camera once, found cam1i_s again"),
+        ("1158.3", "0", ", line 3, column focal_length: expected a focal length above 0 pixels, found 0"),
+        ("1158.3", "-1158.3", ", line 3, column focal_length: expected a focal length above 0"),
+    ],
+)
+def test_an_unreadable_calibration(simulated, old, new, message):
+    path = simulated / "cameras_calibration.csv"
+    text = path.read_text()
+    path.write_text(text.replace(old, new) if len(old) == 1 else text.replace(old, new, 1))
+    fails(simulated, rf"cameras_calibration\.csv{message}")
+
+
+@pytest.mark.parametrize(("text", "found"), [("", "an empty file"), (f"{SIMULATED}\n", "none")])
+def test_an_empty_calibration(simulated, text, found):
+    (simulated / "cameras_calibration.csv").write_text(text)
+    fails(simulated, f"cameras_calibration.csv.*expected .*, found {found}")
+
+
+def test_too_many_coefficients(real):
+    change(real / "cameras_calibration.csv", "coeff_4", "coeff_4;coeff_5")
+    text = (real / "cameras_calibration.csv").read_text()
+    (real / "cameras_calibration.csv").write_text(text.replace("-0.002", "-0.002;0"))
+    fails(real, "expected 4 distortion coefficients, found 5")
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda text: "\ufeff" + text,
+        lambda text: text.replace("\n", "\r\n"),
+        lambda text: text.replace("\n", ";\n"),
+        lambda text: text + "\n\n;;;\n",
+        lambda text: text.replace(";", " ; "),
+        lambda text: text.replace("cam_", "CAM_"),
+    ],
+    ids=["byte order mark", "Windows", "last separator", "blank lines", "spaces", "upper case"],
+)
+def test_harmless_differences(simulated, spoil):
+    before = dpjait.read_sequence(simulated)
+    for name in ("cameras_calibration.csv", "dron1_pos_25.csv"):
+        path = simulated / name
+        path.write_bytes(spoil(path.read_text()).encode())
+    after = dpjait.read_sequence(simulated)
+    assert after.rig.names == before.rig.names
+    np.testing.assert_array_equal(after.rig.cameras.T_cam_world, before.rig.cameras.T_cam_world)
+    np.testing.assert_array_equal(after.truth.position_m, before.truth.position_m)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("\n2;0.2", "\n2;nan", r"line 4, column pos_x\[m\]: expected a finite number, found 'nan'"),
+        ("\n2;0.2", "\n2;inf", r"line 4, column pos_x\[m\]: expected a finite number, found 'inf'"),
+        ("\n2;0.2", "\n2;", r"line 4, column pos_x\[m\]: expected a value, found nothing"),
+        ("\n2;0.2", "\n1;0.2", "line 4, column id: expected each frame once, found 1 again, after line 3"),
+        ("\n2;0.2", "\n2.5;0.2", "line 4, column id: expected a whole number, 0 or more, found '2.5'"),
+        ("\n2;0.2;2;1.5", "\n2;0.2;2", "line 4: expected 11 values as in the header, found 10"),
+        ("0;0;0;1\n2", "0;0;0;7\n2", "line 3, column q_w: expected a quaternion of length 1, found length 7"),
+        ("pos_x", "x", r"csv: expected a column pos_x, found only id, x\[m\]"),
+    ],
+)
+def test_a_broken_reference(simulated, old, new, message):
+    change(simulated / "dron1_pos_25.csv", old, new)
+    fails(simulated, f"dron1_pos_25.*{message}")
+
+
+def test_a_reference_at_another_rate(simulated):
+    (simulated / "dron2_pos_25.csv").rename(simulated / "dron2_pos_100.csv")
+    fails(simulated, r"dron2_pos_100\.csv: expected poses at the 25 Hz of the video, found 100 Hz")
+
+
+def test_a_drone_twice(simulated):
+    shutil.copy(simulated / "dron1_pos_25.csv", simulated / "drone1_pos_25.csv")
+    fails(simulated, r"drone1_pos_25\.csv: expected one file per drone, found dron1_pos_25\.csv as well")
+
+
+def test_two_recordings(real):
+    shutil.copy(real / "R99.c3d", real / "R98.c3d")
+    fails(real, r"R99_D2: expected one \.c3d file, found R98\.c3d, R99\.c3d")
+
+
+def test_a_reference_that_is_no_c3d(real):
+    (real / "R99.c3d").write_text("hello " * 400)
+    fails(real, r"R99\.c3d: expected a C3D file, found one that ezc3d cannot read")
+
+
+@pytest.mark.parametrize(
+    ("names", "known"),
+    [
+        ("q_w;q_x;q_y;q_z", True),
+        ("qw;qx;qy;qz", True),
+        ("quat_w;quat_x;quat_y;quat_z", True),
+        ("quaternion.w;quaternion.x;quaternion.y;quaternion.z", True),
+        ("or_q_w[-];or_q_x[-];or_q_y[-];or_q_z[-]", True),
+        ("Q_W;Q_X;Q_Y;Q_Z", True),
+        ("q1;q2;q3;q4", False),
+        ("a;b;c;d", False),
+    ],
+)
+def test_names_of_the_quaternion(simulated, names, known):
+    for path in simulated.glob("dron*.csv"):
+        change(path, "q_w;q_x;q_y;q_z", names)
+    orientation_wxyz = dpjait.read_sequence(simulated).truth.orientation_wxyz
+    if known:
+        assert orientation_wxyz[1, 0].tolist() == [0, 0, 0, 1]
+    else:
+        assert orientation_wxyz is None
+
+
+def test_quaternion_with_the_scalar_last(simulated):
+    """The names say which is which, not the order."""
+    for path in simulated.glob("dron*.csv"):
+        change(path, "q_w;q_x;q_y;q_z", "q_x;q_y;q_z;q_w")
+    assert dpjait.read_sequence(simulated).truth.orientation_wxyz[1, 0].tolist() == [1, 0, 0, 0]

@@ -1,0 +1,194 @@
+"""What the writers of the published layout write, its reader reads back: rigs, poses, markers."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from psotrack.cameras import CameraRig, camera, project, stack
+from psotrack.datasets import dpjait
+from psotrack.errors import InputError, OutputError, SettingsError
+
+finite = st.floats(-50, 50)
+triples = st.tuples(finite, finite, finite)
+#: All rotations, and those near half a turn, where the Rodrigues vector is delicate.
+rotations = st.one_of(
+    st.tuples(*[st.floats(-4, 4)] * 3).map(Rotation.from_rotvec),
+    st.tuples(*[st.floats(-1e-9, 1e-9)] * 3).map(
+        lambda small: Rotation.from_rotvec(np.array([np.pi, 0, 0]) + small)
+    ),
+)
+SIZE_WH = (1920, 1080)
+
+
+def rig_of(poses, dist=(), focal_length_px=1156.3) -> CameraRig:
+    cameras = {}
+    for index, (rotation, t_m) in enumerate(poses):
+        f = focal_length_px + 10 * index
+        cameras[f"cam{index + 1}i"] = camera(
+            R=rotation.as_matrix(),
+            t_m=np.array(t_m),
+            K=np.array([[f, 0, 960.25], [0, f, 540 + index], [0, 0, 1]]),
+            image_size_wh=SIZE_WH,
+            dist=dist,
+        )
+    return stack(cameras)
+
+
+def read_back(path: Path, rig: CameraRig) -> CameraRig:
+    return dpjait.read_calibration(path, dict.fromkeys(rig.names, SIZE_WH))
+
+
+@given(
+    poses=st.lists(st.tuples(rotations, triples), min_size=1, max_size=5),
+    dist=st.one_of(st.just(()), st.tuples(*[st.floats(-0.5, 0.5)] * 4)),
+    unit=st.sampled_from(["m", "mm"]),
+)
+def test_a_rig_comes_back(tmp_path_factory, poses, dist, unit):
+    path = tmp_path_factory.getbasetemp() / "cameras_calibration.csv"
+    rig = rig_of(poses, dist)
+    dpjait.write_calibration(path, rig, unit)
+    again = read_back(path, rig)
+    assert again.names == rig.names
+    # A rotation through its vector and back, and a length through millimetres: roundings of doubles up to 50.
+    np.testing.assert_allclose(again.cameras.T_cam_world, rig.cameras.T_cam_world, rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(again.cameras.K, rig.cameras.K)
+    coefficients = again.cameras.dist.shape[-1]
+    assert coefficients == (4 if any(dist) else 0)
+    np.testing.assert_array_equal(again.cameras.dist, rig.cameras.dist[:, :coefficients])
+
+
+@given(poses=st.lists(st.tuples(rotations, triples), min_size=1, max_size=3), point=triples)
+def test_a_point_projects_as_before(tmp_path_factory, poses, point):
+    path = tmp_path_factory.getbasetemp() / "cameras_calibration.csv"
+    rig = rig_of(poses, (-0.1, 0.02, 0.001, -0.002))
+    dpjait.write_calibration(path, rig, "mm")
+    points_m = np.tile(point, (len(rig), 1))
+    before, depth_m = project(rig.cameras, points_m)
+    after, _ = project(read_back(path, rig).cameras, points_m)
+    # Points far outside of the image have no useful pixels: the lens's polynomial throws them far away.
+    normal = (depth_m > 0.5) & (np.abs(before) < 1e4).all(axis=-1)
+    np.testing.assert_allclose(after[normal], before[normal], rtol=0, atol=1e-6)
+
+
+def test_the_header_is_the_published_one(tmp_path):
+    path = tmp_path / "cameras_calibration.csv"
+    poses = [(Rotation.identity(), (1.0, 2.0, 3.0))]
+    dpjait.write_calibration(path, rig_of(poses))
+    assert path.read_text().splitlines() == [
+        "cam_name;cam_x[m];cam_y[m];cam_z[m];cam_or_x[rad];cam_or_y[rad];cam_or_z[rad];focal_length;cx;cy",
+        "cam1i;1.0;2.0;3.0;0.0;0.0;0.0;1156.3;960.25;540.0",
+    ]
+    dpjait.write_calibration(path, rig_of(poses, (0.1, 0.0, 0.0, 0.0)), "mm")
+    assert path.read_text().splitlines() == [
+        "cam_name;cam_x[mm];cam_y[mm];cam_z[mm];cam_or_x[rad];cam_or_y[rad];cam_or_z[rad];focal_length;cx;cy"
+        ";coeff_1;coeff_2;coeff_3;coeff_4",
+        "cam1i;1000.0;2000.0;3000.0;0.0;0.0;0.0;1156.3;960.25;540.0;0.1;0.0;0.0;0.0",
+    ]
+
+
+def test_rigs_that_the_layout_cannot_hold(tmp_path):
+    path = tmp_path / "cameras_calibration.csv"
+    pose = [(Rotation.identity(), (0.0, 0.0, 5.0))]
+    with pytest.raises(SettingsError, match="distortion by k1, k2, p1, p2 alone"):
+        dpjait.write_calibration(path, rig_of(pose, (0.1, 0.0, 0.0, 0.0, 0.01)))
+    dpjait.write_calibration(path, rig_of(pose, (0.1, 0.0, 0.0, 0.0, 0.0)))  # a fifth of zero can be left out
+    K = np.array([[1000, 0, 960], [0, 1001, 540], [0, 0, 1.0]])
+    two = stack({"a": camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=SIZE_WH)})
+    with pytest.raises(SettingsError, match="one focal length per camera and no skew"):
+        dpjait.write_calibration(path, two)
+
+
+def test_a_failed_write_leaves_the_file(tmp_path):
+    path = tmp_path / "file" / "cameras_calibration.csv"
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cameras_calibration"):
+        dpjait.write_calibration(path, rig_of([(Rotation.identity(), (0.0, 0.0, 5.0))]))
+
+
+@given(poses=st.lists(st.tuples(triples, rotations), min_size=2, max_size=9))
+def test_poses_come_back(tmp_path_factory, poses):
+    path = tmp_path_factory.getbasetemp() / dpjait.pose_file(1)
+    position_m = np.array([position for position, _ in poses])
+    rotation = Rotation.concatenate([rotation for _, rotation in poses])
+    dpjait.write_poses(path, position_m, rotation.as_quat(scalar_first=True))
+    position_again_m, orientation_again_wxyz = dpjait.read_poses(path)
+    assert np.isnan(position_again_m[0]).all()
+    assert np.isnan(orientation_again_wxyz[0]).all()
+    np.testing.assert_array_equal(position_again_m[1:], position_m[1:])
+    again = Rotation.from_quat(orientation_again_wxyz[1:], scalar_first=True)
+    # Normalised once more: a rounding of the quaternion.
+    assert (again * rotation[1:].inv()).magnitude().max() < 1e-12
+    # The Euler angles of the file, read by another way, are the same rotation: R = Rz Ry Rx.
+    with path.open() as file:
+        rows = list(csv.DictReader(file, delimiter=";"))[1:]
+    angles_rad = np.array([[float(row[f"rot_{axis}[rad]"]) for axis in "xyz"] for row in rows])
+    Rx, Ry, Rz = (Rotation.from_rotvec(np.eye(3)[axis] * angles_rad[:, axis : axis + 1]) for axis in range(3))
+    # Angles lose half of the digits near gimbal lock: 1e-7 rad is 0.02 seconds of arc.
+    assert ((Rz * Ry * Rx) * rotation[1:].inv()).magnitude().max() < 1e-6
+
+
+def test_the_first_row_is_the_placeholder(tmp_path):
+    path = tmp_path / "dron1_pos_25.csv"
+    dpjait.write_poses(path, np.ones((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
+    assert path.read_text().splitlines() == [
+        "id;pos_x[m];pos_y[m];pos_z[m];rot_x[rad];rot_y[rad];rot_z[rad];q_w;q_x;q_y;q_z",
+        "0;0.0;0.0;-0.0;0.0;0.0;0.0;1.0;0.0;0.0;0.0",
+        "1;1.0;1.0;1.0;0.0;0.0;0.0;1.0;0.0;0.0;0.0",
+    ]
+
+
+def test_poses_that_cannot_be_written(tmp_path):
+    path = tmp_path / "dron1_pos_25.csv"
+    upright = np.tile([1.0, 0, 0, 0], (3, 1))
+    position_m = np.ones((3, 3))
+    position_m[2, 1] = np.nan
+    with pytest.raises(
+        SettingsError, match="poses: expected finite numbers, found NaN or infinity at frame 2"
+    ):
+        dpjait.write_poses(path, position_m, upright)
+    with pytest.raises(SettingsError, match="expected as many orientations as positions"):
+        dpjait.write_poses(path, np.ones((0, 3)), np.ones((0, 4)))
+    assert not path.exists()
+
+
+def test_a_first_row_with_a_pose_is_a_pose(tmp_path):
+    path = tmp_path / "dron1_pos_25.csv"
+    path.write_text("id;pos_x[m];pos_y[m];pos_z[m]\n0;1;2;3\n1;1;2;3\n")
+    position_m, orientation_wxyz = dpjait.read_poses(path)
+    assert position_m.tolist() == [[1, 2, 3]] * 2
+    assert orientation_wxyz is None
+
+
+@given(
+    corners=st.dictionaries(
+        st.integers(0, 999), st.lists(triples, min_size=4, max_size=4).map(np.array), min_size=1, max_size=5
+    )
+)
+def test_marker_corners_come_back(tmp_path_factory, corners):
+    path = tmp_path_factory.getbasetemp() / dpjait.MARKER_CORNERS
+    dpjait.write_marker_corners(path, corners)
+    again = dpjait.read_marker_corners(path)
+    assert set(again) == set(corners)
+    for marker, corners_m in corners.items():
+        np.testing.assert_array_equal(again[marker], corners_m)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("7;", "5;", "line 3, column id: expected each marker once, found 5 again"),
+        ("z4[m]", "z5[m]", "expected a column z4"),
+        ("7;0.5", "7;nan", r"line 3, column x1\[m\]: expected a finite number"),
+    ],
+)
+def test_broken_marker_corners(tmp_path, old, new, message):
+    path = tmp_path / dpjait.MARKER_CORNERS
+    dpjait.write_marker_corners(path, {5: np.zeros((4, 3)), 7: np.full((4, 3), 0.5)})
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(InputError, match=message):
+        dpjait.read_marker_corners(path)

@@ -1,0 +1,361 @@
+"""Metrics on flights of five frames whose answers are worked by hand, against brute force, and by their invariants."""
+
+import itertools
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from psotrack.errors import InputError
+from psotrack.evaluation import evaluate
+from psotrack.evaluation.association import (
+    GATE_M,
+    UNASSIGNED,
+    align,
+    fixed_identity,
+    identity_switches,
+    matched_per_frame,
+)
+from psotrack.trajectories import Status, Trajectories
+
+# Two frames per second: frames 0 and 1 are the first second, in which identity is fixed.
+FPS = 2.0
+# Sums of a handful of float64 numbers of a few metres.
+ROUNDING = 1e-12
+
+
+def on_x_axis(*tracks, frame=None, **others) -> Trajectories:
+    """Drones that fly along the x axis: one list of x in metres per drone, None where it is not known."""
+    x_m = np.array([[np.nan if x is None else x for x in track] for track in tracks], float).T
+    frame = np.arange(len(x_m)) if frame is None else np.array(frame)
+    position_m = np.stack([x_m, 0 * x_m, 0 * x_m], axis=-1)
+    names = tuple(f"d{number}" for number in range(len(tracks)))
+    return Trajectories(frame=frame, time_s=frame / FPS, drones=names, position_m=position_m, **others)
+
+
+TRUTH = on_x_axis([0] * 5, [10] * 5)
+
+
+def numbers(evaluation, *names):
+    return {name: getattr(evaluation, name) for name in names}
+
+
+class TestFiveFrames:
+    def test_no_confusion(self):
+        evaluation = evaluate(on_x_axis([0.1] * 5, [10, 10, 10.2, 10.2, 10.4]), TRUTH)
+        errors_m = [0.1] * 5 + [0, 0, 0.2, 0.2, 0.4]
+        assert numbers(evaluation, "frames", "drones", "missed_rate", "id_switches", "mota", "idf1") == {
+            "frames": 5,
+            "drones": 2,
+            "missed_rate": 0.0,
+            "id_switches": 0,
+            "mota": 1.0,
+            "idf1": 1.0,
+        }
+        mean_m = 13 / 100
+        assert evaluation.mean_error_m == pytest.approx(mean_m, abs=ROUNDING)
+        assert evaluation.matched_mean_error_m == pytest.approx(mean_m, abs=ROUNDING)
+        assert evaluation.motp_m == pytest.approx(mean_m, abs=ROUNDING)
+        assert evaluation.median_error_m == pytest.approx(1 / 10, abs=ROUNDING)
+        # Five deviations of 0.03, two of 0.13, two of 0.07, one of 0.27.
+        variance_m2 = (5 * 0.03**2 + 2 * 0.13**2 + 2 * 0.07**2 + 0.27**2) / 10
+        assert evaluation.std_error_m == pytest.approx(variance_m2**0.5, abs=ROUNDING)
+        # Of ten sorted errors, the 95th percentile lies at place 8.55: between 0.2 and 0.4.
+        assert evaluation.p95_error_m == pytest.approx(0.2 + 0.55 * 0.2, abs=ROUNDING)
+        assert evaluation.max_error_m == pytest.approx(max(errors_m), abs=ROUNDING)
+
+    def test_a_swap_costs(self):
+        evaluation = evaluate(on_x_axis([0, 0, 0, 10, 10], [10, 10, 10, 0, 0]), TRUTH)
+        assert evaluation.mean_error_m == pytest.approx(4 * 10 / 10, abs=ROUNDING)
+        assert evaluation.matched_mean_error_m == 0.0
+        assert evaluation.motp_m == 0.0
+        assert evaluation.id_switches == 2
+        assert evaluation.mota == pytest.approx(1 - 2 / 10, abs=ROUNDING)
+        assert evaluation.idf1 == pytest.approx(2 * 6 / (10 + 10), abs=ROUNDING)
+        assert evaluation.missed_rate == 0.0
+
+    def test_missed_drone(self):
+        evaluation = evaluate(on_x_axis([10.2] * 5), TRUTH)
+        assert evaluation.mean_error_m == pytest.approx(1 / 5, abs=ROUNDING)
+        assert evaluation.missed_rate == 5 / 10
+        assert evaluation.mota == 1 - 5 / 10
+        assert evaluation.idf1 == pytest.approx(2 * 5 / (10 + 5), abs=ROUNDING)
+        missed, found = evaluation.per_drone
+        assert (missed.estimate, missed.missed_rate, missed.mean_error_m, missed.offset_m) == (
+            None,
+            1,
+            None,
+            None,
+        )
+        assert (found.estimate, found.missed_rate) == ("d0", 0)
+
+    def test_false_track(self):
+        evaluation = evaluate(on_x_axis([50] * 5, [10] * 5, [0] * 5), TRUTH)
+        assert evaluation.mean_error_m == 0.0
+        assert evaluation.missed_rate == 0.0
+        assert evaluation.mota == 1 - 5 / 10
+        assert evaluation.idf1 == pytest.approx(2 * 10 / (10 + 15), abs=ROUNDING)
+
+    def test_lost_rows_are_missed_and_coasting_ones_are_not(self):
+        status = np.full((5, 2), Status.TRACKED)
+        status[2:4, 1], status[4, 1] = Status.LOST, Status.COASTING
+        evaluation = evaluate(on_x_axis([0] * 5, [10, 10, 99, 99, 10.2], status=status), TRUTH)
+        assert evaluation.missed_rate == 2 / 10
+        assert evaluation.mean_error_m == pytest.approx(0.2 / 8, abs=ROUNDING)
+        assert evaluation.mota == pytest.approx(1 - 2 / 10, abs=ROUNDING)
+        assert evaluation.idf1 == pytest.approx(2 * 8 / (10 + 8), abs=ROUNDING)
+
+    def test_frames_that_the_estimate_does_not_have_are_missed(self):
+        evaluation = evaluate(on_x_axis([0, 0], [10, 10], frame=[1, 3]), TRUTH)
+        assert evaluation.frames == 5
+        assert evaluation.missed_rate == pytest.approx(6 / 10, abs=ROUNDING)
+
+    def test_frames_outside_the_reference_do_not_count(self):
+        outside = on_x_axis([0] * 7, [10] * 5 + [99] * 2)
+        assert evaluate(outside, TRUTH) == evaluate(on_x_axis([0] * 5, [10] * 5), TRUTH)
+
+    def test_unknown_truth_of_one_drone_does_not_count(self):
+        evaluation = evaluate(on_x_axis([0] * 5, [10.2] * 5), on_x_axis([0] * 5, [10, 10, None, None, 10]))
+        assert evaluation.frames == 5
+        assert evaluation.per_drone[1].frames == 3
+        assert evaluation.mean_error_m == pytest.approx(3 * 0.2 / 8, abs=ROUNDING)
+        # The track of the drone that nobody knows is no false positive.
+        assert (evaluation.missed_rate, evaluation.mota, evaluation.idf1) == (0, 1, 1)
+
+    def test_a_track_that_leaves_its_unknown_drone_for_another_is_judged(self):
+        evaluation = evaluate(
+            on_x_axis([0] * 5, [10, 10, 0.3, 0.3, 10]), on_x_axis([0] * 5, [10, 10, None, None, 10])
+        )
+        assert evaluation.mota == pytest.approx(1 - 2 / 8, abs=ROUNDING)
+        assert evaluation.idf1 == pytest.approx(2 * 8 / (8 + 10), abs=ROUNDING)
+
+    def test_frames_and_drones_without_any_truth_do_not_count(self):
+        truth = on_x_axis([0, 0, None, 0, 0], [None] * 5)
+        evaluation = evaluate(on_x_axis([0.1, 0.1, 9, 0.1, 0.1]), truth)
+        assert (evaluation.frames, evaluation.drones, len(evaluation.per_drone)) == (4, 1, 1)
+        assert evaluation.mean_error_m == pytest.approx(1 / 10, abs=ROUNDING)
+
+    def test_outside_the_gate_is_a_miss_and_a_false_positive(self):
+        evaluation = evaluate(on_x_axis([0] * 5, [10, 10, 10, 10, 10.6]), TRUTH)
+        assert evaluation.mean_error_m == pytest.approx(0.6 / 10, abs=ROUNDING)
+        assert evaluation.matched_mean_error_m == 0.0
+        assert evaluation.mota == pytest.approx(1 - 2 / 10, abs=ROUNDING)
+        assert evaluation.idf1 == pytest.approx(2 * 9 / (10 + 10), abs=ROUNDING)
+
+    def test_motp_keeps_pairs_of_the_previous_frame_and_matching_anew_does_not(self):
+        truth = on_x_axis([0] * 5, [0.4] * 5)
+        evaluation = evaluate(on_x_axis([0, 0, 0.3, 0, 0], [0.4, 0.4, 0.1, 0.4, 0.4]), truth)
+        assert evaluation.id_switches == 0
+        assert evaluation.motp_m == pytest.approx((0.3 + 0.3) / 10, abs=ROUNDING)
+        assert evaluation.matched_mean_error_m == pytest.approx((0.1 + 0.1) / 10, abs=ROUNDING)
+
+    def test_another_track_after_a_gap_is_a_switch(self):
+        evaluation = evaluate(
+            on_x_axis([0, 0, None, None, None], [None, None, None, 0, 0]), on_x_axis([0] * 5)
+        )
+        assert evaluation.id_switches == 1
+        assert evaluation.mota == pytest.approx(1 - (1 + 1) / 5, abs=ROUNDING)
+        assert evaluation.idf1 == pytest.approx(2 * 2 / (5 + 4), abs=ROUNDING)
+
+    def test_drones_that_appear_after_the_first_second_are_assigned_to_what_is_left(self):
+        truth = on_x_axis([0] * 5, [None, None, 10, 10, 10])
+        evaluation = evaluate(on_x_axis([None, None, None, 10.1, 10.1], [0.1] * 5), truth)
+        assert [drone.estimate for drone in evaluation.per_drone] == ["d1", "d0"]
+        assert evaluation.missed_rate == 1 / 8
+        assert evaluation.mean_error_m == pytest.approx(1 / 10, abs=ROUNDING)
+
+    def test_identity_is_fixed_by_the_first_second_alone(self):
+        evaluation = evaluate(on_x_axis([0, 0, 10, 10, 10], [10, 10, 0, 0, 0]), TRUTH)
+        assert [drone.estimate for drone in evaluation.per_drone] == ["d0", "d1"]
+
+    def test_offset_in_the_world_without_orientation(self):
+        evaluation = evaluate(on_x_axis([0.1, 0.1, 0.1, 0.2, 0.5], [9] * 5), TRUTH)
+        first, second = evaluation.per_drone
+        assert (first.offset_frame, second.offset_frame) == ("world", "world")
+        np.testing.assert_allclose(first.offset_m, (1 / 5, 0, 0), atol=ROUNDING)
+        np.testing.assert_allclose(second.offset_m, (-1, 0, 0), atol=ROUNDING)
+        assert first.offset_removed_mean_error_m == pytest.approx((3 * 0.1 + 0 + 0.3) / 5, abs=ROUNDING)
+        assert evaluation.offset_removed_mean_error_m == pytest.approx(0.6 / 10, abs=ROUNDING)
+
+    def test_nothing_found(self):
+        evaluation = evaluate(on_x_axis([None] * 5), TRUTH)
+        assert evaluation.missed_rate == 1.0
+        assert evaluation.mota == 0.0
+        assert evaluation.idf1 == 0.0
+        assert evaluation.mean_error_m is None
+        assert evaluation.motp_m is None
+
+    def test_no_estimated_drones_at_all(self):
+        nobody = replace(on_x_axis([0] * 5), drones=(), position_m=np.empty((5, 0, 3)))
+        assert evaluate(nobody, TRUTH).missed_rate == 1.0
+
+
+KEYS = [
+    "frames",
+    "drones",
+    "mean_error_m",
+    "median_error_m",
+    "std_error_m",
+    "p95_error_m",
+    "max_error_m",
+    "missed_rate",
+    "id_switches",
+    "mota",
+    "motp_m",
+    "idf1",
+    "matched_mean_error_m",
+    "offset_removed_mean_error_m",
+    "per_drone",
+]
+
+
+class TestContract:
+    def test_keys_in_order(self):
+        assert list(evaluate(TRUTH, TRUTH).to_dict()) == KEYS
+
+    def test_strict_json_even_where_nothing_is_known(self):
+        text = json.dumps(evaluate(on_x_axis([0] * 5), TRUTH).to_dict(), allow_nan=False)
+        seen, missed = json.loads(text)["per_drone"]
+        assert (seen["drone"], seen["offset_m"]) == ("d0", [0, 0, 0])
+        assert (missed["drone"], missed["offset_m"], missed["mean_error_m"]) == ("d1", None, None)
+
+    def test_no_common_frame(self):
+        with pytest.raises(
+            InputError, match=r"expected frames of the reference.*0 to 4, found frames 7 to 8"
+        ):
+            evaluate(on_x_axis([0, 0], frame=[7, 8]), TRUTH)
+        with pytest.raises(InputError, match="found no frames"):
+            evaluate(on_x_axis([]), TRUTH)
+
+    def test_no_truth(self):
+        with pytest.raises(InputError, match="reference: expected a known position"):
+            evaluate(TRUTH, on_x_axis([None] * 5))
+
+
+def random_flights(seed: int, num_frames: int = 7, num_drones: int = 3, num_estimates: int = 4):
+    """An estimate and a reference in a room of a metre, so that drones are often nearer to another's estimate."""
+    rng = np.random.default_rng(seed)
+
+    def flights(drones: int, prefix: str) -> Trajectories:
+        position_m = rng.uniform(-0.5, 0.5, (num_frames, drones, 3))
+        position_m[rng.random((num_frames, drones)) < 0.15] = np.nan
+        frame = np.arange(num_frames)
+        return Trajectories(frame, frame / FPS, tuple(f"{prefix}{d}" for d in range(drones)), position_m)
+
+    ref = flights(num_drones, "true")
+    # One known position, so that there is always something to judge.
+    ref.position_m[0, 0] = 0.0
+    orientation_wxyz = Rotation.random(num_frames * num_drones, rng=rng).as_quat(scalar_first=True)
+    return flights(num_estimates, "est"), replace(
+        ref, orientation_wxyz=orientation_wxyz.reshape(num_frames, num_drones, 4)
+    )
+
+
+def same(first, second, tolerance: float) -> None:
+    """Equal evaluations, but for rounding and for the names of the estimates."""
+    one, two = first.to_dict(), second.to_dict()
+    for drone in (*one["per_drone"], *two["per_drone"]):
+        del drone["estimate"]
+
+    def flat(value):
+        if isinstance(value, dict):
+            return [leaf for part in value.values() for leaf in flat(part)]
+        if isinstance(value, list | tuple):
+            return [leaf for part in value for leaf in flat(part)]
+        return [value]
+
+    for left, right in zip(flat(one), flat(two), strict=True):
+        assert left == (pytest.approx(right, abs=tolerance) if isinstance(right, float) else right)
+
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+class TestProperties:
+    @given(seeds, st.permutations(range(4)))
+    @settings(max_examples=50, deadline=None)
+    def test_names_and_order_of_the_estimates_do_not_matter(self, seed, order):
+        est, ref = random_flights(seed)
+        shuffled = replace(est, drones=tuple("wxyz"), position_m=est.position_m[:, list(order)])
+        same(evaluate(est, ref), evaluate(shuffled, ref), ROUNDING)
+
+    @given(seeds)
+    @settings(max_examples=30, deadline=None)
+    def test_moving_both_changes_nothing(self, seed):
+        est, ref = random_flights(seed)
+        shift_m = np.array([3.0, -5.0, 7.0])
+        moved = [replace(flight, position_m=flight.position_m + shift_m) for flight in (est, ref)]
+        # Positions of 10 m keep 2e-15 m of a float64; no distance of a random draw lies so near to the gate.
+        same(evaluate(est, ref), evaluate(*moved), 1e-12)
+
+    @given(seeds)
+    @settings(max_examples=30, deadline=None)
+    def test_a_constant_offset_in_the_body_is_found_and_removed(self, seed):
+        _, ref = random_flights(seed)
+        # Apart by more than the offsets are long, so that identities are clear.
+        ref = replace(ref, position_m=ref.position_m + np.arange(3)[:, None] * [5.0, 0.0, 0.0])
+        offset_m = np.random.default_rng(seed).uniform(-0.2, 0.2, (3, 3))
+        body_to_world = Rotation.from_quat(ref.orientation_wxyz.reshape(-1, 4), scalar_first=True)
+        added_m = body_to_world.apply(np.tile(offset_m, (ref.num_frames, 1))).reshape(ref.position_m.shape)
+        evaluation = evaluate(replace(ref, position_m=ref.position_m + added_m, orientation_wxyz=None), ref)
+        assert evaluation.offset_removed_mean_error_m == pytest.approx(0, abs=1e-12)
+        for drone in evaluation.per_drone:
+            assert drone.offset_frame == "body"
+            np.testing.assert_allclose(drone.offset_m, offset_m[ref.drones.index(drone.drone)], atol=1e-12)
+
+    @given(seeds)
+    @settings(max_examples=30, deadline=None)
+    def test_a_track_judged_by_itself_is_perfect(self, seed):
+        _, ref = random_flights(seed)
+        evaluation = evaluate(ref, ref)
+        assert (evaluation.max_error_m, evaluation.missed_rate, evaluation.id_switches) == (0, 0, 0)
+        assert (evaluation.mota, evaluation.idf1, evaluation.motp_m) == (1, 1, 0)
+
+
+def pairings(num_drones: int, num_estimates: int):
+    """All ways to give each drone an estimate of its own, or none."""
+    choices = [*range(num_estimates), *[UNASSIGNED] * num_drones]
+    return set(itertools.permutations(choices, num_drones))
+
+
+class TestAgainstBruteForce:
+    @pytest.mark.parametrize("seed", range(5))
+    def test_matching_of_a_frame(self, seed):
+        est, ref = random_flights(seed)
+        distance_m = align(est, ref).distance_m
+        for here_m, partner in zip(distance_m, matched_per_frame(distance_m, keep=False), strict=True):
+
+            def worth(pairing, here_m=here_m):
+                """Most pairs first, then the least sum of distances; impossible pairs are worth nothing at all."""
+                lengths_m = [here_m[d, e] for d, e in enumerate(pairing) if e != UNASSIGNED]
+                possible = all(length_m <= GATE_M for length_m in lengths_m)
+                return (len(lengths_m), -sum(lengths_m)) if possible else (-1, 0.0)
+
+            assert worth(tuple(partner)) == pytest.approx(max(map(worth, pairings(3, 4))), abs=ROUNDING)
+
+    @pytest.mark.parametrize("seed", range(5))
+    def test_identity_of_the_first_second(self, seed):
+        est, ref = random_flights(seed)
+        est = replace(est, position_m=np.nan_to_num(est.position_m))
+        ref = replace(ref, position_m=np.nan_to_num(ref.position_m))
+        pair = align(est, ref)
+        mean_m = pair.distance_m[:2].mean(axis=0)
+        best = min(itertools.permutations(range(4), 3), key=lambda order: sum(mean_m[range(3), order]))
+        assert tuple(fixed_identity(pair)) == best
+
+    @pytest.mark.parametrize("seed", range(5))
+    def test_idf1(self, seed):
+        est, ref = random_flights(seed)
+        est = replace(est, position_m=np.nan_to_num(est.position_m))
+        ref = replace(ref, position_m=np.nan_to_num(ref.position_m))
+        near = np.linalg.norm(ref.position_m[:, :, None] - est.position_m[:, None], axis=-1) <= GATE_M
+        most = max(near[:, range(3), order].sum() for order in itertools.permutations(range(4), 3))
+        assert evaluate(est, ref).idf1 == pytest.approx(2 * most / (7 * 3 + 7 * 4), abs=ROUNDING)
+
+    def test_switches(self):
+        partners = np.array([[0, 1], [0, -1], [1, 1], [-1, 0], [1, 0]])
+        assert identity_switches(partners).astype(int).tolist() == [[0, 0], [0, 0], [1, 0], [0, 1], [0, 0]]

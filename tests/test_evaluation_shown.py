@@ -1,0 +1,187 @@
+"""Tables and pictures of an evaluation: that they fit, and that what they show are the numbers."""
+
+import io
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from psotrack.errors import InputError, OutputError
+from psotrack.evaluation import evaluate, plots, tables
+from psotrack.trajectories import Status, Trajectories
+
+NUM_FRAMES = 50
+
+
+def flights(num_drones: int = 3, *, swap: bool = False, names: tuple[str, ...] = ()):
+    """Circles in a row; the estimate is 20 mm off, lost for a while, and swapped from frame 40 on."""
+    frame = np.arange(NUM_FRAMES)
+    angle = frame[:, None] / 10 + np.arange(num_drones)
+    ref_m = np.stack([np.cos(angle) + 2 * np.arange(num_drones), np.sin(angle), 1 + 0 * angle], axis=-1)
+    est_m = ref_m + np.array([0.02, 0, 0])
+    if swap:
+        est_m[40:, [0, 1]] = est_m[40:, [1, 0]]
+    status = np.full((NUM_FRAMES, num_drones), Status.TRACKED)
+    status[10:20, 2] = Status.LOST
+    numbers = tuple(str(number) for number in range(num_drones))
+    return (
+        Trajectories(frame, frame / 25, numbers, est_m, status=status),
+        Trajectories(frame, frame / 25, names or tuple(f"dron{number}" for number in numbers), ref_m),
+    )
+
+
+def printed(table) -> list[str]:
+    console = Console(file=io.StringIO(), width=80)
+    console.print(table)
+    return console.file.getvalue().splitlines()
+
+
+class TestTable:
+    def test_rows(self):
+        lines = printed(tables.render(evaluate(*flights()), "S02_D4_A"))
+        assert lines[0].strip() == "S02_D4_A: 50 frames, 3 drones, errors in mm"
+        rows = {words[0]: words[1:] for words in map(str.split, lines) if words}
+        assert rows["dron0"] == ["20.0", "20.0", "0.0", "20.0", "20.0", "0.0%", "0.0", "+20", "+0", "+0"]
+        # Ten frames of 50 are lost; of 150, that is one in fifteen.
+        assert rows["dron2"][5] == "20.0%"
+        assert rows["all"] == ["20.0", "20.0", "0.0", "20.0", "20.0", "6.7%", "0.0"]
+        text = "\n".join(lines)
+        assert "MOTA 0.933, MOTP 20.0 mm, IDF1 0.966, identity switches 0" in text
+        assert "world frame" in text
+
+    def test_eighty_columns_hold_ten_drones_that_are_far_off(self):
+        est, ref = flights(10, swap=True, names=tuple(f"[red]d_{number}" for number in range(10)))
+        est.position_m[30:, :5] += 3.0
+        lines = printed(tables.render(evaluate(est, ref), "S04_D10"))
+        assert max(map(len, lines)) <= 80
+        # Nothing is cut off, and nothing in a name is taken for a style.
+        assert [line.split()[0] for line in lines if "d_" in line] == [f"[red]d_{n}" for n in range(10)]
+        assert sum("…" in line for line in lines) == 0
+
+    def test_metres_where_errors_are_metres(self):
+        est, ref = flights()
+        est.position_m[:, :, 2] += 4.0
+        lines = printed(tables.render(evaluate(est, ref)))
+        assert lines[0].strip() == "50 frames, 3 drones, errors in m"
+        row = next(line for line in lines if line.startswith("dron0")).split()
+        assert (row[1], row[-3:]) == ("4.00", ["+0.0", "+0.0", "+4.0"])
+
+    def test_a_drone_that_was_never_seen(self):
+        est, ref = flights()
+        est.status[:, 2] = Status.LOST
+        row = next(line for line in printed(tables.render(evaluate(est, ref))) if line.startswith("dron2"))
+        assert row.split() == ["dron2", "-", "-", "-", "-", "-", "100.0%", "-", "-"]
+
+    def test_data_frame(self):
+        est, ref = flights()
+        est.status[:, 2] = Status.LOST
+        frame = tables.to_frame(evaluate(est, ref))
+        assert frame["drone"].tolist() == ["dron0", "dron1", "dron2"]
+        np.testing.assert_allclose(frame["offset_x_m"], [0.02, 0.02, np.nan], atol=1e-12)
+        assert frame["mean_error_m"].dtype == float
+        assert frame["missed_rate"].tolist() == [0, 0, 1]
+
+
+def axes_of(projection: str | None = None):
+    figure = Figure()
+    FigureCanvasAgg(figure)
+    return figure.add_subplot(projection=projection)
+
+
+def labels(axes) -> list[str]:
+    return [text.get_text() for text in axes.get_legend().get_texts()]
+
+
+class TestPictures:
+    def test_errors_in_millimetres_with_gaps_where_missed(self):
+        axes = axes_of()
+        plots.draw_errors(axes, *flights())
+        line = next(line for line in axes.lines if line.get_label() == "dron2")
+        expected_mm = np.full(NUM_FRAMES, 20.0)
+        expected_mm[10:20] = np.nan
+        np.testing.assert_allclose(line.get_ydata(), expected_mm, rtol=1e-12)
+        assert labels(axes) == ["dron0", "dron1", "dron2", "missed"]
+        assert axes.get_yscale() == "linear"
+
+    def test_a_swap_is_marked_and_makes_the_scale_logarithmic(self):
+        axes = axes_of()
+        plots.draw_errors(axes, *flights(swap=True))
+        marks = [line for line in axes.lines if line.get_label() == "identity switch"]
+        assert [list(mark.get_xdata()) for mark in marks] == [[40 / 25] * 2]
+        assert axes.get_yscale() == "log"
+
+    def test_no_line_runs_over_frames_without_truth(self):
+        est, ref = flights()
+        ref.position_m[25:30] = np.nan
+        axes = axes_of()
+        plots.draw_errors(axes, est, ref)
+        line = next(line for line in axes.lines if line.get_label() == "dron0")
+        # 45 frames with truth, and one gap between them.
+        assert len(line.get_ydata()) == 46
+        assert np.flatnonzero(np.isnan(line.get_ydata())).tolist() == [25]
+
+    def test_paths_in_one_scale(self):
+        est, ref = flights()
+        axes = axes_of("3d")
+        plots.draw_trajectories(axes, est, ref)
+        paths = [np.array(line.get_data_3d()).T for line in axes.lines]
+        assert any(np.array_equal(path, ref.position_m[:, 0]) for path in paths)
+        assert any(np.array_equal(path, est.position_m[:, 0]) for path in paths)
+        extent_m = np.diff([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()], axis=1)[:, 0]
+        ratio = extent_m / axes.get_box_aspect()
+        np.testing.assert_allclose(ratio, ratio[0], rtol=1e-12)
+        assert axes.get_zlim()[0] == 0.0
+        assert labels(axes) == ["dron0", "dron1", "dron2", "truth"]
+
+    def test_a_false_track_is_grey(self):
+        est, ref = flights()
+        axes = axes_of("3d")
+        two = Trajectories(ref.frame, ref.time_s, ref.drones[:2], ref.position_m[:, :2])
+        plots.draw_trajectories(axes, est, two)
+        assert labels(axes)[-1] == "false track"
+
+    @pytest.mark.parametrize("save", [plots.save_trajectories, plots.save_errors, plots.save_overview])
+    def test_png_with_the_colour_of_each_drone(self, tmp_path, save):
+        path = tmp_path / "picture.png"
+        est, ref = flights()
+        # Errors of their own, so that no line hides another.
+        est.position_m[..., 1] += [0.0, 0.03, 0.06]
+        save(path, est, ref)
+        rgb = cv2.imread(str(path))[..., ::-1].reshape(-1, 3).astype(int)
+        for drone in range(3):
+            colour = np.round(np.array(to_rgb(plots.colour_of(drone))) * 255)
+            # Lines are a few hundred pixels long; one that is hidden behind its truth still has a rim.
+            assert (np.abs(rgb - colour).max(axis=1) <= 2).sum() > 100
+
+    def test_an_existing_picture_is_replaced_only_by_force(self, tmp_path):
+        path = tmp_path / "picture.png"
+        path.write_text("precious")
+        with pytest.raises(OutputError, match="pass --force"):
+            plots.save_errors(path, *flights())
+        assert path.read_text() == "precious"
+        plots.save_errors(path, *flights(), force=True)
+        assert cv2.imread(str(path)) is not None
+
+    def test_what_does_not_fit_together_leaves_no_file(self, tmp_path):
+        est, ref = flights()
+        later = Trajectories(ref.frame + 1000, ref.time_s, ref.drones, ref.position_m)
+        with pytest.raises(InputError, match="frames of the reference"):
+            plots.save_overview(tmp_path / "picture.png", est, later)
+        assert not list(tmp_path.iterdir())
+
+
+def test_importing_draws_nothing_in():
+    """Neither Matplotlib nor pandas comes with the import; drawing does not bring pyplot's global state."""
+    code = (
+        "import sys; from psotrack.evaluation import plots, tables; import psotrack.trajectory_files;"
+        "assert not {'matplotlib', 'pandas', 'pyarrow'} & set(sys.modules), set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    plots.draw_errors(axes_of(), *flights())
+    assert "matplotlib.pyplot" not in sys.modules

@@ -1,0 +1,295 @@
+"""The soft IoU: fractions worked by hand where cameras are so far away that metres are pixels, then its properties."""
+
+from functools import partial
+
+import jax
+import numpy as np
+import pytest
+from helpers import draw_coverage, far_camera, float32, rig_of, ring_rig
+from hypothesis import given
+from hypothesis import strategies as st
+
+from psotrack.fitness import (
+    PAPER_SCORE,
+    ScoreSettings,
+    camera_scores,
+    drone_fitness,
+    filled,
+    joint_fitness,
+    scene,
+)
+from psotrack.summed_area import summed_area_table
+
+#: 64 x 48 pixels, 20 pixels a metre: a drone of 1 m x 0.5 m at the origin has columns 22 to 42, rows 19 to 29.
+FAR = {"image_size_wh": (64, 48), "pixels_per_m": 20.0}
+SIZE_M = np.array([[1.0, 1.0, 0.5]])
+PIXEL_M = 1 / 20
+
+ONE_BOX = ScoreSettings(windows=(1.0,), ring=1.5, reduction=1, min_cameras=1)
+HARD = ScoreSettings(windows=(1.0,), ring=1.5, reduction=1, min_cameras=1, whole_pixels=True)
+
+# Edges of boxes are good to 1e-5 px here (float32 at 1000 m with a focal length of 20000 px); of 200 px that is 1e-5.
+HAND = 1e-4
+
+
+def silhouette(*rectangles, value=255, shape=(48, 64)):
+    """(1, height, width) with filled rectangles (x0, y0, x1, y1)."""
+    image = np.zeros((1, *shape), np.uint8)
+    for x0, y0, x1, y1 in rectangles:
+        image[:, y0:y1, x0:x1] = value
+    return image
+
+
+def evaluate(function, rig, images, position_m, size_m=SIZE_M, settings=ONE_BOX):
+    arrays = float32((rig.cameras, position_m, size_m))
+    return jax.tree.map(np.asarray, _compiled(function, settings, images, *arrays))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _compiled(function, settings, images, cameras, position_m, size_m):
+    return function(scene(cameras, size_m, summed_area_table(images), settings), position_m)
+
+
+def score_at(image, x_px=0.0, settings=ONE_BOX):
+    """Fitness of one drone in one camera, moved to the right by pixels."""
+    rig = rig_of(far_camera(**FAR))
+    return evaluate(drone_fitness, rig, image, np.array([[x_px * PIXEL_M, 0, 0]]), settings=settings).item()
+
+
+DRONE = (22, 19, 42, 29)
+
+
+@pytest.mark.parametrize("settings", [ONE_BOX, HARD], ids=["soft", "hard"])
+@pytest.mark.parametrize(
+    ("image", "expected"),
+    [
+        (silhouette(DRONE), 1),
+        (silhouette((22, 19, 32, 29)), 1 / 2),
+        (silhouette((22, 19, 42, 21), (22, 21, 24, 29)), (40 + 16) / 200),
+        (silhouette((0, 0, 10, 10), (50, 30, 64, 48)), 0),
+        (silhouette(), 0),
+        (silhouette(DRONE, value=51), 1 / 5),
+        # Foreground beside the box, within the ring of 30 x 15 pixels, makes the union larger.
+        (silhouette((12, 19, 52, 29)), 200 / (200 + 300 - 200)),
+        (silhouette((0, 0, 64, 48)), 200 / (200 + 30 * 15 - 200)),
+        # Beside the box, and nothing in it.
+        (silhouette((42, 19, 46, 29)), 0 / (200 + 40)),
+    ],
+    ids=[
+        "perfect",
+        "left half",
+        "an L",
+        "elsewhere",
+        "empty",
+        "a fifth covered",
+        "twice as wide",
+        "all",
+        "beside",
+    ],
+)
+def test_one_box_by_hand(image, expected, settings):
+    if settings.whole_pixels and expected == 200 / 450:
+        # The ring's rows 16.5 to 31.5 are rounded half to even: 16 to 32.
+        expected = 200 / (30 * 16)
+    assert score_at(image, settings=settings) == pytest.approx(expected, abs=HAND)
+
+
+def test_windows_by_hand():
+    """A silhouette that fills the box: each window is compared with all of it."""
+    settings = ScoreSettings(windows=(0.5, 0.8, 1.1), ring=1.5, reduction=1, min_cameras=1)
+    expected = (0.5**2 + 0.8**2 + 1 / 1.1**2) / 3
+    assert score_at(silhouette(DRONE), settings=settings) == pytest.approx(expected, abs=HAND)
+
+
+def test_fractional_edges_by_hand():
+    """A quarter of a pixel to the right: 19.75 of 20 columns overlap, and the ring holds what sticks out."""
+    assert score_at(silhouette(DRONE), 0.25) == pytest.approx(19.75 / 20.25, abs=HAND)
+
+
+def test_hard_edges_are_whole_pixels():
+    assert score_at(silhouette(DRONE), 0.25, HARD) == pytest.approx(1, abs=HAND)
+    assert score_at(silhouette(DRONE), 0.75, HARD) == pytest.approx(19 / 21, abs=HAND)
+
+
+def test_reduced_silhouettes_score_the_same():
+    """Each pixel of a silhouette stands for 4 x 4 pixels of the image."""
+    rig = rig_of(far_camera(image_size_wh=(256, 192), pixels_per_m=80))
+    settings = ScoreSettings(windows=(0.5, 1.1), ring=1.5, reduction=4, min_cameras=1)
+    score = evaluate(drone_fitness, rig, silhouette(DRONE), np.zeros((1, 3)), settings=settings)
+    assert score.item() == pytest.approx((0.5**2 + 1 / 1.1**2) / 2, abs=HAND)
+
+
+def test_one_box_is_a_plateau_and_windows_are_not():
+    """A silhouette of half the width, moved inside the box: the paper's score cannot tell, the soft one can."""
+    image = silhouette((27, 19, 37, 29))
+    windows = ScoreSettings(windows=(0.5, 0.8, 1.1), ring=1.5, reduction=1, min_cameras=1)
+    hard = [score_at(image, x, HARD) for x in (0.0, 1.0, 2.0, 4.0)]
+    np.testing.assert_allclose(hard, 1 / 2, atol=HAND)
+    soft = [score_at(image, x, windows) for x in (0.0, 1.0, 2.0, 4.0)]
+    assert np.all(np.diff(soft) < -0.01)
+
+
+def test_the_papers_score_is_one_box_on_whole_pixels():
+    assert PAPER_SCORE.windows == (1.0,)
+    assert PAPER_SCORE.whole_pixels
+
+
+def test_a_camera_counts_by_what_its_image_holds_of_the_box():
+    """Two cameras see the drone filled; a third, half out of its image, sees nothing: (1 + 1 + 0 / 2) / (5 / 2)."""
+    one = far_camera(**FAR)
+    K = one.K.copy()
+    K[0, 2] += 32
+    at_border = far_camera(**FAR)
+    rig = rig_of(one, one, type(one)(at_border.T_cam_world, K, at_border.dist, at_border.image_size_wh))
+    images = np.concatenate([silhouette(DRONE), silhouette(DRONE), silhouette()])
+    scores, weights = evaluate(camera_scores, rig, images, np.zeros((1, 3)))
+    np.testing.assert_allclose(scores, [[1, 1, 0]], atol=HAND)
+    np.testing.assert_allclose(weights, [[1, 1, 1 / 2]], atol=HAND)
+    fitness = evaluate(drone_fitness, rig, images, np.zeros((1, 3)))
+    assert fitness.item() == pytest.approx(4 / 5, abs=HAND)
+
+
+def test_too_few_cameras_is_undefined():
+    """Outside of both images, or behind both cameras, or seen by one where two are wanted."""
+    one = far_camera(**FAR)
+    K = one.K.copy()
+    K[0, 2] += 200
+    elsewhere = type(one)(one.T_cam_world, K, one.dist, one.image_size_wh)
+    images = np.concatenate([silhouette(DRONE)] * 2)
+    two = ScoreSettings(windows=(1.0,), reduction=1, min_cameras=2)
+    both, blind = rig_of(one, one), rig_of(one, elsewhere)
+    assert evaluate(drone_fitness, both, images, np.zeros((1, 3)), settings=two).item() == pytest.approx(
+        1, abs=HAND
+    )
+    assert np.isnan(evaluate(drone_fitness, blind, images, np.zeros((1, 3)), settings=two))
+    assert evaluate(drone_fitness, blind, images, np.zeros((1, 3))).item() == pytest.approx(1, abs=HAND)
+    for nowhere in ((10.0, 0, 0), (0.0, -1500, 0)):
+        assert np.isnan(evaluate(drone_fitness, both, images, np.array([nowhere]), settings=two))
+
+
+def test_joint_is_the_mean_over_drones_and_undefined_counts_zero():
+    rig = rig_of(far_camera(**FAR))
+    image = silhouette(DRONE, (22, 4, 32, 14))
+    size_m = SIZE_M.repeat(3, axis=0)
+    # The first fills its box, the second half of it, the third is out of the image.
+    position_m = np.array([[0.0, 0, 0], [0.0, 0, 0.75], [40.0, 0, 0]])
+    each = evaluate(drone_fitness, rig, image, position_m, size_m)
+    np.testing.assert_allclose(each, [1, 1 / 2, np.nan], atol=HAND)
+    joint = evaluate(joint_fitness, rig, image, position_m, size_m)
+    assert joint.item() == pytest.approx((1 + 1 / 2 + 0) / 3, abs=HAND)
+
+
+def test_filled_is_the_share_of_the_box_that_is_foreground():
+    one = far_camera(**FAR)
+    rig = rig_of(one, one)
+    images = np.concatenate([silhouette((22, 19, 27, 29)), silhouette(DRONE, value=51)])
+    np.testing.assert_allclose(evaluate(filled, rig, images, np.zeros((1, 3))), [[1 / 4, 1 / 5]], atol=HAND)
+    assert not evaluate(filled, rig, images, np.array([[10.0, 0, 0]])).any()
+
+
+# Properties, in a room.
+
+RIG = ring_rig(5)
+TRUTH_M = np.array([[0.3, -0.2, 1.3], [-0.6, 0.5, 0.9]])
+SIZES_M = np.array([[0.5, 0.5, 0.3], [0.6, 0.6, 0.35]])
+IMAGES = draw_coverage(RIG, TRUTH_M, SIZES_M, reduction=2)
+SOFT = ScoreSettings(reduction=2)
+SETTINGS = pytest.mark.parametrize(
+    "settings", [SOFT, ScoreSettings(windows=(1.0,), whole_pixels=True, reduction=2)]
+)
+
+
+def particles(count, seed=0, spread_m=0.2):
+    return TRUTH_M + spread_m * np.random.default_rng(seed).standard_normal((count, 2, 3))
+
+
+@SETTINGS
+def test_permuting_particles_permutes_fitness(settings):
+    position_m = particles(11)
+    order = np.random.default_rng(1).permutation(11)
+    fitness = evaluate(drone_fitness, RIG, IMAGES, position_m, SIZES_M, settings)
+    permuted = evaluate(drone_fitness, RIG, IMAGES, position_m[order], SIZES_M, settings)
+    assert len(np.unique(fitness)) > 11
+    np.testing.assert_array_equal(permuted, fitness[order])
+
+
+@SETTINGS
+def test_particles_and_drones_do_not_interact(settings):
+    position_m = particles(11)
+    fitness = evaluate(drone_fitness, RIG, IMAGES, position_m, SIZES_M, settings)
+    position_m[4, 1] += 0.1
+    changed = evaluate(drone_fitness, RIG, IMAGES, position_m, SIZES_M, settings)
+    differs = np.zeros((11, 2), bool)
+    differs[4, 1] = True
+    np.testing.assert_array_equal(changed != fitness, differs)
+
+
+@SETTINGS
+def test_a_particle_alone_scores_the_same(settings):
+    position_m = particles(7)
+    together = evaluate(drone_fitness, RIG, IMAGES, position_m, SIZES_M, settings)
+    alone = [evaluate(drone_fitness, RIG, IMAGES, one, SIZES_M, settings) for one in position_m[:3]]
+    # The same float32 arithmetic, perhaps fused otherwise.
+    np.testing.assert_allclose(together[:3], alone, atol=1e-4)
+
+
+@given(st.lists(st.floats(-20, 20, width=32), min_size=6, max_size=6), st.integers(0, 2**16))
+def test_fitness_is_in_0_to_1_or_undefined(position_m, seed):
+    """In the room and out of it, behind cameras and inside of them, for noise as silhouettes."""
+    images = np.random.default_rng(seed).integers(0, 256, (5, 12, 16)).astype(np.uint8)
+    settings = ScoreSettings(reduction=20)
+    position_m = np.array(position_m).reshape(2, 3)
+    for one in (position_m, RIG.cameras.centre_world[seed % 4 : seed % 4 + 2]):
+        fitness = evaluate(drone_fitness, RIG, images, one, SIZES_M, settings)
+        assert not np.isinf(fitness).any()
+        defined = fitness[np.isfinite(fitness)]
+        # Sums are exact to 1e-6 of a box.
+        assert ((defined >= 0) & (defined <= 1 + 1e-5)).all()
+        joint = evaluate(joint_fitness, RIG, images, one, SIZES_M, settings)
+        np.testing.assert_allclose(joint, np.nan_to_num(fitness).mean(), atol=1e-6)
+
+
+def test_gradients_are_finite_everywhere():
+    """Also where fitness is undefined, at a camera, behind one, out of every image, and on whole pixels."""
+
+    def total(position_m):
+        view = scene(float32(RIG.cameras), float32(SIZES_M), summed_area_table(IMAGES), SOFT)
+        return joint_fitness(view, position_m)
+
+    at_cameras = RIG.cameras.centre_world[:4].reshape(2, 2, 3)
+    behind = at_cameras * 1.5
+    places = np.concatenate(
+        [TRUTH_M[None], at_cameras, behind, particles(5, spread_m=2), np.zeros((1, 2, 3))]
+    )
+    gradients = jax.jit(jax.vmap(jax.grad(total)))(float32(places))
+    assert np.isfinite(gradients).all()
+    assert np.abs(gradients[0]).max() > 0
+
+
+def test_gradient_is_that_of_finite_differences():
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
+
+        @jax.jit
+        def joint(position_m):
+            return joint_fitness(scene(RIG.cameras, SIZES_M, summed_area_table(IMAGES), SOFT), position_m)
+
+        position_m = TRUTH_M + 0.07
+        gradient = jax.jit(jax.grad(joint))(position_m)
+        # In float64. Fitness is smooth but for kinks at pixel borders, 2 cm apart: a micrometre meets none of them
+        # with these positions, its square is 1e-12, and rounding costs 1e-16 / 1e-6.
+        steps = 1e-6 * np.eye(6).reshape(6, 2, 3)
+        expected = [(joint(position_m + s) - joint(position_m - s)) / 2e-6 for s in steps]
+        np.testing.assert_allclose(gradient.ravel(), expected, atol=1e-6)
+        assert np.abs(gradient).min() > 1e-3
+
+
+def test_fitness_is_highest_where_the_drone_is():
+    """On a grid about the truth the best place is the truth, to a cell of the grid."""
+    step_m = 0.02
+    offsets = step_m * np.stack(np.meshgrid(*[np.arange(-4, 5)] * 3, indexing="ij"), axis=-1).reshape(
+        -1, 1, 3
+    )
+    fitness = evaluate(drone_fitness, RIG, IMAGES, TRUTH_M + offsets, SIZES_M, SOFT)
+    best = offsets[fitness.argmax(axis=0), 0]
+    # A silhouette pixel is 3 cm wide at 4 m; five cameras place the middle of an ellipse to a third of it.
+    assert np.abs(best).max() <= step_m * 1.001

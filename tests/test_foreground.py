@@ -1,0 +1,214 @@
+"""Foreground against scenes that are drawn from known shapes, and against plain NumPy and SciPy."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from psotrack.errors import SettingsError
+from psotrack.foreground import (
+    ForegroundSettings,
+    classify,
+    coverage,
+    foreground,
+    learn,
+    learning_step,
+    without_speckle,
+)
+
+HEIGHT, WIDTH = 120, 160
+RADIUS_PX = 9.0
+
+
+def _scene(rng: np.random.Generator) -> np.ndarray:
+    """A room: smooth texture, no edges that a pixel's noise could cross."""
+    coarse = rng.integers(90, 190, (HEIGHT // 20, WIDTH // 20, 3)).astype(np.float32)
+    return cv2.resize(coarse, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+
+
+def _frame(
+    scene: np.ndarray,
+    rng: np.random.Generator,
+    *centres_xy: tuple[float, float],
+    radius_px: float = RADIUS_PX,
+) -> np.ndarray:
+    """The room with dark discs, antialiased by their distance to the edge, and noise of 2 grey levels."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    image = scene.copy()
+    for centre_x, centre_y in centres_xy:
+        inside = np.clip(radius_px - np.hypot(x - centre_x, y - centre_y) + 0.5, 0, 1)[..., None]
+        image = image * (1 - inside) + 25.0 * inside
+    return np.clip(image + rng.normal(0, 2, image.shape), 0, 255).round().astype(np.uint8)
+
+
+def _centroid_px(cells: np.ndarray, cell_px: int) -> np.ndarray:
+    """Centre (x, y) of coverage in pixels of the full image, whose first pixel's centre is (0, 0)."""
+    weights = cells.astype(np.float64)
+    y, x = np.indices(cells.shape) * cell_px + (cell_px - 1) / 2
+    return np.array([(x * weights).sum(), (y * weights).sum()]) / weights.sum()
+
+
+@pytest.mark.parametrize(("working_reduction", "reduction"), [(1, 1), (1, 4), (2, 4), (4, 4), (3, 6)])
+def test_a_disc_of_known_centre_stays_where_it_is(working_reduction: int, reduction: int) -> None:
+    rng = np.random.default_rng(5)
+    scene = _scene(rng)
+    knobs = ForegroundSettings(working_reduction=working_reduction)
+    centres = rng.uniform([30, 30], [WIDTH - 30, HEIGHT - 30], (60, 2))
+    frames = [_frame(scene, rng, (x, y)) for x, y in centres]
+    found = [
+        _centroid_px(coverage(mask, reduction // working_reduction), reduction)
+        for mask in foreground(frames, frames, knobs)
+    ]
+    error_px = np.array(found) - centres
+    # One centroid scatters by the rounding of the edge, 0.05 to 0.25 px; a shift shows in the mean of 60.
+    assert np.abs(error_px.mean(axis=0)).max() < 0.1
+    assert error_px.std(axis=0).max() < 0.5
+
+
+def test_silhouette_has_the_area_of_the_shape() -> None:
+    rng = np.random.default_rng(6)
+    scene = _scene(rng)
+    frames = [_frame(scene, rng, (30.0 + 5 * i, 60.0)) for i in range(20)]
+    (mask,) = foreground(frames, frames[7:8], ForegroundSettings(working_reduction=1))
+    # Pixels that the edge crosses count as soon as they differ from the room: up to half a pixel all around.
+    assert np.pi * RADIUS_PX**2 <= np.count_nonzero(mask) <= np.pi * (RADIUS_PX + 1) ** 2
+
+
+@pytest.mark.parametrize("standing", [range(0, 18), range(22, 40)])
+def test_a_drone_that_stands_is_seen_and_leaves_no_ghost(standing: range) -> None:
+    rng = np.random.default_rng(7)
+    scene = _scene(rng)
+    centres = [(40.0, 60.0) if i in standing else (60.0 + 2 * i, 40.0) for i in range(40)]
+    frames = [_frame(scene, rng, centre) for centre in centres]
+    knobs = ForegroundSettings(working_reduction=1)
+    for centre, mask in zip(centres, foreground(frames, frames, knobs), strict=True):
+        area_px = np.pi * RADIUS_PX**2
+        assert np.abs(_centroid_px(mask, 1) - centre).max() < 0.5
+        assert 0.9 * area_px < np.count_nonzero(mask) < 1.4 * area_px
+
+
+def test_order_of_learning_does_not_matter() -> None:
+    rng = np.random.default_rng(8)
+    scene = _scene(rng)
+    frames = [_frame(scene, rng, (20.0 + 3 * i, 60.0)) for i in range(40)]
+    knobs = ForegroundSettings(working_reduction=1)
+    (forward,) = foreground(frames, frames[:1], knobs)
+    (backward,) = foreground(frames[::-1], frames[:1], knobs)
+    # Variances follow a recursion that is not quite a mean: pixels on the disc's edge may differ.
+    assert np.count_nonzero(forward != backward) < 0.1 * np.count_nonzero(forward)
+
+
+def test_without_learning_rate_the_background_stays() -> None:
+    rng = np.random.default_rng(9)
+    scene = _scene(rng)
+    frames = [_frame(scene, rng, (20.0 + 3 * i, 60.0)) for i in range(40)]
+    model = learn(frames, ForegroundSettings())
+    first = classify(model, frames[3], ForegroundSettings())
+    for _ in range(60):
+        again = classify(model, frames[3], ForegroundSettings())
+    np.testing.assert_array_equal(first, again)
+    for _ in range(60):
+        absorbed = classify(model, frames[3], ForegroundSettings(learning_rate=0.05))
+    assert np.count_nonzero(absorbed) == 0
+
+
+@pytest.mark.parametrize(("shadows", "level"), [("keep", 255), ("drop", 0), ("weight", 64)])
+def test_shadow_label_is_kept_dropped_or_weighted(shadows: str, level: int) -> None:
+    rng = np.random.default_rng(10)
+    scene = _scene(rng)
+    empty = [_frame(scene, rng) for _ in range(20)]
+    shaded = scene.copy()
+    shaded[40:80, 60:100] *= 0.65  # the same hue, darker: MOG2's definition of a shadow
+    frame = _frame(shaded, rng, (30.0, 30.0))
+    knobs = ForegroundSettings(working_reduction=1, shadows=shadows, shadow_weight=0.25)
+    (mask,) = foreground(empty, [frame], knobs)
+    # Noise may lift single pixels over the shadow's border in colour.
+    assert np.mean(mask[45:75, 65:95] == level) > 0.95
+    assert mask[30, 30] == 255
+    assert mask[100, 130] == 0
+
+
+@given(
+    pixels=st.lists(st.integers(0, 20 * 30 - 1), max_size=150),
+    min_blob_px=st.integers(0, 12),
+)
+@settings(max_examples=60, deadline=None)
+def test_speckle_goes_and_all_else_stays(pixels: list[int], min_blob_px: int) -> None:
+    """Oracle: SciPy's labels, blob by blob."""
+    mask = np.zeros((20, 30), np.uint8)
+    mask.flat[pixels] = np.arange(len(pixels)) % 2 * 155 + 100
+    labels, count = ndimage.label(mask, np.ones((3, 3)))
+    expected = mask.copy()
+    for label in range(1, count + 1):
+        if np.count_nonzero(labels == label) < min_blob_px:
+            expected[labels == label] = 0
+    np.testing.assert_array_equal(without_speckle(mask, min_blob_px), expected)
+
+
+def test_smallest_blob_is_in_pixels_of_the_full_image() -> None:
+    rng = np.random.default_rng(11)
+    scene = _scene(rng)
+    empty = [_frame(scene, rng) for _ in range(20)]
+    frame = _frame(scene, rng, (40.0, 40.0), radius_px=3.0)  # about 28 px, 7 at half the size
+    for working_reduction in (1, 2):
+        for min_blob_px, seen in ((12, True), (100, False)):
+            knobs = ForegroundSettings(working_reduction=working_reduction, min_blob_px=min_blob_px)
+            (mask,) = foreground(empty, [frame], knobs)
+            assert mask.any() == seen
+
+
+@given(
+    height=st.integers(1, 23), width=st.integers(1, 23), reduction=st.integers(1, 6), seed=st.integers(0, 99)
+)
+@settings(max_examples=100, deadline=None)
+def test_coverage_is_the_mean_of_its_pixels(height: int, width: int, reduction: int, seed: int) -> None:
+    """Oracle: the mean over a NumPy slice, with background beyond the border."""
+    mask = np.random.default_rng(seed).choice(np.array([0, 127, 255], np.uint8), (height, width))
+    cells = coverage(mask, reduction)
+    assert cells.shape == (-(-height // reduction), -(-width // reduction))
+    for i, j in np.ndindex(*cells.shape):
+        inside = mask[reduction * i : reduction * (i + 1), reduction * j : reduction * (j + 1)]
+        # Rounded to a whole number, halves to either side; the rest is float32's.
+        assert abs(float(cells[i, j]) - inside.sum(dtype=int) / reduction**2) <= 0.5 + 1e-4
+
+
+@pytest.mark.parametrize("shape", [(119, 159), (1, 1), (5, 3)])
+def test_any_size_works_at_half_scale(shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(12)
+    empty = rng.integers(100, 110, (9, *shape, 3), dtype=np.uint8)
+    dark = np.full((*shape, 3), 10, np.uint8)
+    (mask,) = foreground(empty, [dark], ForegroundSettings(min_blob_px=0))
+    np.testing.assert_array_equal(mask, np.full((-(-shape[0] // 2), -(-shape[1] // 2)), 255))
+
+
+@given(num_frames=st.integers(1, 5000), num_learning_frames=st.integers(1, 300))
+def test_learning_frames_spread_over_the_video(num_frames: int, num_learning_frames: int) -> None:
+    step = learning_step(num_frames, ForegroundSettings(num_learning_frames=num_learning_frames))
+    used = range(0, num_frames, step)
+    assert 1 <= len(used) <= num_learning_frames
+    # Rounding the step up may cost frames, but never half of them.
+    assert len(used) >= min(num_frames, num_learning_frames) / 2
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"working_reduction": 0}, "working_reduction: expected a whole number of at least 1, found 0"),
+        ({"working_reduction": 1.5}, "working_reduction: expected a whole number of at least 1, found 1.5"),
+        ({"num_learning_frames": 0}, "num_learning_frames: expected a whole number of at least 1, found 0"),
+        ({"min_blob_px": -1}, "min_blob_px: expected a whole number of at least 0, found -1"),
+        ({"learning_rate": -0.1}, "learning_rate: expected a number from 0 to 1, found -0.1"),
+        ({"learning_rate": float("nan")}, "learning_rate: expected a number from 0 to 1, found nan"),
+        ({"shadow_weight": 1.5}, "shadow_weight: expected a number from 0 to 1, found 1.5"),
+        ({"var_threshold": 0.0}, "var_threshold: expected a number above 0, found 0"),
+        ({"shadows": "maybe"}, "shadows: expected one of keep, drop, weight, found maybe"),
+    ],
+)
+def test_settings_that_make_no_sense(setting: dict[str, object], message: str) -> None:
+    with pytest.raises(SettingsError) as raised:
+        ForegroundSettings(**setting)
+    assert str(raised.value) == message

@@ -1,0 +1,104 @@
+"""`Sequence.usable`: what fits passes, what does not is named with the way out."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from psotrack.cameras import camera, stack
+from psotrack.errors import InputError, SettingsError
+from psotrack.sequence import Sequence
+from psotrack.video import VideoInfo
+
+NAMES = ("a", "b", "c", "d", "e")
+
+
+def a_camera(size_wh=(1920, 1080)):
+    K = np.array([[1000, 0, 960], [0, 1000, 540], [0, 0, 1.0]])
+    return camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=size_wh)
+
+
+def a_sequence(**changes) -> Sequence:
+    """Five like cameras; `changes` are to the video of one of them, or None for no video."""
+    videos = {name: VideoInfo(Path(f"{name}.avi"), 250, 25.0, (1920, 1080)) for name in NAMES}
+    for name, change in changes.items():
+        if change is None:
+            del videos[name]
+        else:
+            videos[name] = replace(videos[name], **change)
+    rig = stack({name: a_camera() for name in NAMES})
+    return Sequence(name="S01", folder=Path("S01"), rig=rig, videos=videos)
+
+
+def test_what_fits_is_kept():
+    sequence = a_sequence().usable()
+    assert sequence.rig.names == tuple(sequence.videos) == NAMES
+    assert (sequence.num_frames, sequence.fps) == (250, 25.0)
+
+
+def test_cameras_are_chosen_in_the_order_given():
+    sequence = a_sequence().usable(["d", "b"])
+    assert sequence.rig.names == tuple(sequence.videos) == ("d", "b")
+
+
+def test_an_unknown_camera():
+    with pytest.raises(SettingsError, match="cameras: expected some of a, b, c, d, e, found z"):
+        a_sequence().usable(["a", "z"])
+
+
+def test_a_camera_without_video():
+    with pytest.raises(InputError, match="found none for b, d; pass --cameras a,c,e to go without"):
+        a_sequence(b=None, d=None).usable()
+    assert a_sequence(b=None).usable(["a", "c"]).rig.names == ("a", "c")
+
+
+def test_no_videos():
+    sequence = a_sequence(**dict.fromkeys(NAMES))
+    assert sequence.num_frames == 0
+    with pytest.raises(InputError, match="S01: expected at least one video, found none"):
+        _ = sequence.fps
+    with pytest.raises(InputError, match=r"found none for a, b, c, d, e$"):
+        sequence.usable()
+
+
+@pytest.mark.parametrize("odd", ["a", "c"], ids=["the first", "a later one"])
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"num_frames": 240}, "250 frames as in .*, found 240 frames; pass --frames 240"),
+        ({"num_frames": 260}, "250 frames as in .*, found 260 frames; pass --frames 250"),
+        ({"fps": 29.97}, r"25\.000 frames per second as in .*, found 29\.970"),
+        ({"fps": 24.98}, r"25\.000 frames per second as in .*, found 24\.980"),
+        ({"image_size_wh": (1280, 720)}, "1920 x 1080 pixels as calibrated, found 1280 x 720"),
+    ],
+)
+def test_the_odd_one_is_blamed(odd, change, expected):
+    with pytest.raises(InputError, match=rf"^{odd}\.avi: expected {expected}"):
+        a_sequence(**{odd: change}).usable()
+    rest = [name for name in NAMES if name != odd]
+    assert a_sequence(**{odd: change}).usable(rest).rig.names == tuple(rest)
+
+
+def test_sizes_differ_though_each_is_as_calibrated():
+    sequence = a_sequence(c={"image_size_wh": (1280, 720)})
+    sequence.rig.cameras.image_size_wh[2] = (1280, 720)
+    with pytest.raises(
+        InputError, match=r"^c\.avi: expected 1920 x 1080 pixels as in a\.avi, found 1280 x 720"
+    ):
+        sequence.usable()
+
+
+def test_rates_that_differ_by_rounding_are_one():
+    assert a_sequence(c={"fps": 25.00004}).usable().num_frames == 250
+
+
+def test_leading_frames():
+    sequence = a_sequence(c={"num_frames": 240}).usable(num_frames=240)
+    assert {video.num_frames for video in sequence.videos.values()} == {240}
+
+
+@pytest.mark.parametrize("num_frames", [0, -1, 241])
+def test_frames_that_are_not_there(num_frames):
+    with pytest.raises(SettingsError, match=f"frames: expected 1 to 240, .* found {num_frames}"):
+        a_sequence(c={"num_frames": 240}).usable(num_frames=num_frames)

@@ -1,0 +1,320 @@
+"""The simulator's pictures against independent geometry: `cameras.project`, OpenCV's markers, plane equations."""
+
+from dataclasses import replace
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+
+from psotrack.cameras import camera, look_at, project
+from psotrack.simulation import CameraRenderer, build, drones, raster, rooms, scenario, sensor
+from psotrack.simulation.flights import Flight
+
+S02 = scenario("S02_D4_A")
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return build(S02, scale=0.25)
+
+
+@pytest.fixture(scope="module")
+def renderer(scene):
+    return CameraRenderer(scene, 0)
+
+
+def straight_flight(position_m, velocity_m_s=(0.0, 0.0, 0.0)):
+    """A flight through a point at time 0 at some speed: the middle of a very slow, very long swing."""
+    angular = 1e-3
+    velocity = np.array([velocity_m_s], float)
+    zero = np.zeros((1, 3))
+    return Flight(
+        np.array(position_m, float), velocity / angular, np.array([angular]), zero, (0.0, 0.0, 0.0, 0.0)
+    )
+
+
+def with_drones(scene, *placed):
+    """The scene with only these drones: (model, flight, paint) each."""
+    recipe = msgspec.structs.replace(
+        S02, drones=tuple(msgspec.structs.replace(S02.drones[0], paint_bgr=paint) for _, _, paint in placed)
+    )
+    models, flights = tuple(model for model, _, _ in placed), tuple(flight for _, flight, _ in placed)
+    return replace(scene, scenario=recipe, models=models, flights=flights)
+
+
+def cube(side_m):
+    """A model whose silhouette's middle is its origin: all paint, and rotors too small to be seen."""
+    triangles = drones.box((0.0, 0.0, 0.0), (side_m, side_m, side_m))
+    return drones.DroneModel(triangles, np.ones(len(triangles)), np.zeros((1, 3)), 1e-6)
+
+
+def ray_point(scene, index, pixel, depth_m):
+    """The world point that camera `index` sees in a pixel at a depth."""
+    cam = scene.rig.cameras[index]
+    R, t = cam.T_cam_world[:3, :3], cam.T_cam_world[:3, 3]
+    return R.T @ (depth_m * np.linalg.inv(cam.K) @ [*pixel, 1.0] - t)
+
+
+def pixel_of(scene, index, point_m):
+    return project(scene.rig.cameras[index], np.asarray(point_m, float))[0]
+
+
+# --- the rasteriser behind our camera convention
+
+
+@pytest.mark.parametrize(
+    ("window", "magnification"), [((0, 0, 200, 120), 8), ((37, 21, 90, 70), 8), ((60, 10, 51, 83), 7)]
+)
+def test_a_drawn_square_is_where_the_camera_model_projects_it(window, magnification):
+    rng = np.random.default_rng(5)
+    R, t = look_at((1.0, -4.0, 2.0), (0.2, 0.1, 1.0))
+    K = np.array([[150.0, 0.0, 91.3], [0.0, 150.0, 66.8], [0.0, 0.0, 1.0]])  # well off the image's middle
+    cam = camera(R=R, t_m=t, K=K, image_size_wh=(200, 120))
+    view = raster.View(raster.pinhole(cam), *window, magnification)
+    errors = []
+    while len(errors) < 40:
+        centre = R.T @ (rng.uniform(3, 6) * np.linalg.inv(K) @ [*rng.uniform((70, 35), (100, 75)), 1.0] - t)
+        corners = centre + 0.06 * (np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) @ R[:2])
+        colour, depth = raster.empty_buffers(view)
+        raster.draw(view, corners[[[0, 1, 2], [0, 2, 3]]], np.ones((2, 1, 3)), colour, depth)
+        rows, columns = np.nonzero(colour[..., 0])
+        # A sample's place in the camera's pixels, from the meaning of window and magnification alone.
+        found = [
+            (np.mean(i) + 0.5) / magnification - 0.5 + first
+            for i, first in ((columns, window[0]), (rows, window[1]))
+        ]
+        errors.append(found - project(cam, centre)[0])
+        # OpenCV keeps depth as a float32 between its near and far planes: half a millimetre at 5 m.
+        np.testing.assert_allclose(depth[rows, columns], project(cam, centre)[1], rtol=1e-4)
+    errors = np.array(errors)
+    # One sample is 1/7 or 1/8 px: a square's centroid is uncertain by half of that, the mean of forty by a sixth of it.
+    assert np.abs(errors).max() < 0.5 / 7
+    assert np.abs(errors.mean(axis=0)).max() < 0.5 / 7 / 3
+
+
+def test_a_floor_that_reaches_behind_the_camera_is_cut_there_not_lost():
+    R, t = look_at((0.0, 0.0, 1.5), (3.0, 0.0, 1.2))
+    cam = camera(R=R, t_m=t, K=np.array([[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]]), image_size_wh=(80, 60))
+    view = raster.full_view(raster.pinhole(cam))
+    floor = np.array([(-9.0, -9.0, 0.0), (9.0, -9.0, 0.0), (9.0, 9.0, 0.0), (-9.0, 9.0, 0.0)])
+    colour, depth = raster.empty_buffers(view)
+    raster.draw(view, floor[[[0, 1, 2], [0, 2, 3]]], np.ones((2, 1, 3)), colour, depth)
+    rays = np.stack(np.meshgrid(np.arange(80), np.arange(60)), axis=-1)
+    rays = np.concatenate([rays, np.ones((60, 80, 1))], axis=-1) @ np.linalg.inv(cam.K).T
+    downwards = rays @ R[:, 2]
+    expected = np.where(downwards < 0, -1.5 / np.minimum(downwards, -1e-9), np.inf)
+    at = rays @ R * np.where(np.isfinite(expected), expected, 0)[..., None]
+    # A pixel's width inside the floor's edge, which is 0.15 m away at 9 m here.
+    inside = np.isfinite(expected) & (np.abs(at[..., :2]).max(axis=-1) < 8.7)
+    assert inside.sum() > 1000
+    np.testing.assert_allclose(depth[inside], expected[inside], rtol=1e-4)  # float32 over 9 m
+
+
+def test_what_lies_wholly_behind_the_camera_is_not_drawn():
+    R, t = look_at((0.0, 0.0, 1.5), (3.0, 0.0, 1.5))
+    cam = camera(R=R, t_m=t, K=np.array([[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]]), image_size_wh=(80, 60))
+    view = raster.full_view(raster.pinhole(cam))
+    colour, depth = raster.empty_buffers(view)
+    raster.draw(view, drones.box((-3.0, 0.0, 1.5), (1.0, 1.0, 1.0)), np.ones((12, 1, 3)), colour, depth)
+    assert not colour.any()
+    assert np.all(depth == raster.FAR_M)
+
+
+# --- the backdrop
+
+
+def test_markers_are_seen_where_the_table_says():
+    one = build(S02, scale=0.6)
+    # Linear light: gamma lets white bleed over black, which moves every corner inwards by another 0.2 px.
+    image = np.clip(250 * CameraRenderer(one, 0).backdrop.light, 0, 255).astype(np.uint8)
+    settings = cv2.aruco.DetectorParameters()
+    settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    dictionary = cv2.aruco.getPredefinedDictionary(rooms.MARKER_DICTIONARY)
+    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary, settings).detectMarkers(image)
+    assert set(ids.ravel()) <= set(range(1, 42)) == set(one.room.marker_corners_m)
+    assert len(ids) >= 6
+    errors = [
+        found.reshape(4, 2) - project(one.rig.cameras[0], one.room.marker_corners_m[int(marker)])[0]
+        for marker, found in zip(ids.ravel(), corners, strict=True)
+    ]
+    # OpenCV finds corners of a blurred black square 0.2 to 0.4 px within it (measured median 0.40 px). A shift that
+    # all of them share would be ours; the mean of 60 corners knows it to 0.05 px (measured 0.07 px).
+    assert np.median(np.linalg.norm(errors, axis=-1)) < 0.5
+    assert np.abs(np.mean(errors, axis=(0, 1))).max() < 0.15
+
+
+# --- drones in frames
+
+
+@pytest.mark.parametrize("velocity_m_s", [(0.0, 0.0, 0.0), (1.0, -2.0, 1.0)])
+@pytest.mark.parametrize("index", [0, 3, 6])
+def test_a_drone_of_known_centre_is_drawn_at_its_projection(scene, index, velocity_m_s):
+    """Pixels before the codec have no shift: still, and moving, when the blur must lie evenly about the truth."""
+    centre = np.array([0.3, -0.2, 1.45])
+    black = with_drones(scene, (cube(0.3), straight_flight(centre, velocity_m_s), (0.0, 0.0, 0.0)))
+    one = CameraRenderer(black, index)
+    with_it = sensor.undevelop(one.clean_frame(0)).mean(axis=-1)
+    without = sensor.undevelop(sensor.develop(one.backdrop.light)).mean(axis=-1)
+    x, y = pixel_of(scene, index, centre).round().astype(int)
+    window = np.s_[y - 20 : y + 21, x - 20 : x + 21]
+    # A black body takes away a share of the backdrop's light: the share of each pixel that it covers.
+    covered = 1 - (with_it / without)[window]
+    # Below 0.03 lies the rounding to 8 bits, and the drone's own shadow.
+    covered = np.where(covered > 0.03, covered, 0.0)
+    rows, columns = np.mgrid[y - 20 : y + 21, x - 20 : x + 21]
+    found = np.array([(covered * columns).sum(), (covered * rows).sum()]) / covered.sum()
+    corners = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) * 0.15 + centre
+    hull = cv2.convexHull((64 * project(scene.rig.cameras[index], corners)[0]).round().astype(np.int32))
+    moments = cv2.moments(hull)
+    expected = np.array([moments["m10"], moments["m01"]]) / moments["m00"] / 64
+    # Rounding to 8 bits at the rim, and 8 samples per pixel over a rim of some 60 pixels: a few hundredths.
+    np.testing.assert_allclose(found, expected, atol=0.08)
+    # And the area, which says that edges are covered by halves: within the rim's own uncertainty.
+    assert covered.sum() == pytest.approx(moments["m00"] / 64**2, rel=0.05)
+
+
+@pytest.mark.parametrize("frame", [0, 100, 200])
+@pytest.mark.parametrize("index", [0, 4, 7])
+def test_silhouettes_are_about_their_projected_origins(scene, index, frame):
+    one = CameraRenderer(scene, index)
+    mask = one.drone_mask(frame)
+    origins = project(scene.rig.cameras[index], scene.positions_m(frame + 1)[-1])
+    seen = 0
+    for drone, (pixel, depth_m) in enumerate(zip(*origins, strict=True)):
+        rows, columns = np.nonzero(mask == drone + 1)
+        radius_px = (
+            scene.scenario.cameras[index].focal_length_px
+            * scene.scale
+            * scene.models[drone].radius_m
+            / depth_m
+        )
+        if len(rows) < 0.15 * radius_px**2:
+            continue  # hidden by another drone or a pillar
+        seen += 1
+        assert columns.min() - 1 <= pixel[0] <= columns.max() + 1
+        assert rows.min() - 1 <= pixel[1] <= rows.max() + 1
+        # Bodies and legs are lopsided by up to 5 cm of a radius of 25 to 30 cm, more where a part is hidden.
+        assert np.hypot(columns.mean() - pixel[0], rows.mean() - pixel[1]) < 0.35 * radius_px + 1
+    assert seen >= 2
+
+
+def test_frames_differ_from_the_empty_room_in_the_masks_and_the_shadows_only(renderer):
+    frame = renderer.clean_frame(60).astype(int)
+    changed = np.abs(frame - sensor.develop(renderer.backdrop.light)).max(axis=-1) > 2
+    mask = renderer.drone_mask(60) > 0
+    # Blur of the lens and of motion reach some pixels beyond the mask at mid-exposure.
+    near = cv2.dilate(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    assert not (changed & ~near & ~renderer.backdrop.floor).any()
+    assert (changed & mask).sum() > 0.5 * mask.sum(), "drones must be seen"
+
+
+def test_near_hides_far_whatever_their_order(scene):
+    pixel = (240.0, 150.0)
+    red, blue = (0.02, 0.02, 0.6), (0.6, 0.02, 0.02)
+    near = (cube(0.3), straight_flight(ray_point(scene, 0, pixel, 3.5)), red)
+    far = (cube(0.3), straight_flight(ray_point(scene, 0, pixel, 6.0)), blue)
+    a, b = CameraRenderer(with_drones(scene, near, far), 0), CameraRenderer(with_drones(scene, far, near), 0)
+    alone = CameraRenderer(with_drones(scene, near), 0)
+    x, y = (int(side) for side in pixel)
+    assert a.drone_mask(0)[y, x] == 1
+    assert b.drone_mask(0)[y, x] == 2
+    # The far cube's silhouette lies wholly within the near one's: nothing of it is seen.
+    assert not (a.drone_mask(0) == 2).any()
+    window = np.s_[y - 8 : y + 9, x - 8 : x + 9]
+    np.testing.assert_array_equal(a.clean_frame(0)[window], b.clean_frame(0)[window])
+    np.testing.assert_array_equal(a.clean_frame(0)[window], alone.clean_frame(0)[window])
+    assert a.clean_frame(0)[y, x, 2] > 3 * a.clean_frame(0)[y, x, 0], "the near one is red"
+
+
+def test_a_pillar_hides_a_drone_behind_it(scene):
+    lower, upper = np.array([-2.1, 2.75, 1.4]), np.array([-1.85, 3.0, 1.4])  # a pillar of the laboratory
+    pixel = pixel_of(scene, 3, (lower + upper) / 2)
+    _, depth_m = project(scene.rig.cameras[3], (lower + upper) / 2)
+    small = cube(0.1)
+    for behind_m, visible in ((0.8, False), (-0.8, True)):
+        flight = straight_flight(ray_point(scene, 3, pixel, depth_m + behind_m))
+        one = CameraRenderer(with_drones(scene, (small, flight, (0.0, 0.0, 0.0))), 3)
+        assert one.drone_mask(0).any() == visible
+        x, y = pixel.astype(int)
+        darker = sensor.develop(one.backdrop.light)[y, x].astype(int) - one.clean_frame(0)[y, x]
+        assert (darker.max() > 20) == visible
+
+
+def test_rotor_discs_let_the_backdrop_through(scene):
+    bare = cube(0.02)
+    disc = replace(bare, rotor_radius_m=0.3)
+    centre = np.array([0.0, 0.0, 1.2])
+    one = CameraRenderer(with_drones(scene, (disc, straight_flight(centre), (0.0, 0.0, 0.0))), 0)
+    x, y = pixel_of(scene, 0, centre + np.array([0.1, 0.1, 0.0])).round().astype(int)
+    share = (
+        sensor.undevelop(one.clean_frame(0))[y, x]
+        / sensor.undevelop(sensor.develop(one.backdrop.light))[y, x]
+    )
+    assert np.all((share > 0.4) & (share < 0.9))
+
+
+def test_a_drone_under_a_lamp_has_its_darkest_shadow_at_its_foot(scene):
+    lamp = scene.room.panels.centres_m[3]
+    below = np.array([lamp[0], lamp[1], 1.2])
+    one = CameraRenderer(with_drones(scene, (drones.model("x_frame"), straight_flight(below), (0.1,) * 3)), 0)
+    gain = one.shadows.floor_gain(0.0)
+    row, column = np.unravel_index(gain.argmin(), gain.shape)
+    cell_m = 10.0 / gain.shape[1]
+    at_m = np.array([(column + 0.5) * cell_m - 5.0, 4.0 - (row + 0.5) * cell_m])
+    # The model's own middle is a few centimetres off its origin.
+    np.testing.assert_allclose(at_m, below[:2], atol=0.05)
+    assert 0.5 < gain.min() < 0.95
+    assert gain.max() == 1.0
+
+
+# --- the sensor
+
+
+def test_noise_is_fair_and_grows_with_brightness():
+    eye = sensor.Sensor(0, 0, (120, 160))
+    sigmas = []
+    for level in (20, 120, 220):
+        image = np.full((120, 160, 3), level, np.uint8)
+        frames = np.stack([eye.expose(image, frame, frame / 25) for frame in range(40)]).astype(float)
+        # Flicker and its random part are below a percent, and shift the mean by less than that.
+        assert abs(frames.mean() - level) < 0.01 * level + 0.1
+        sigmas.append(np.std(frames - frames.mean(axis=(1, 2, 3), keepdims=True)))
+    assert sigmas[0] < sigmas[1] < sigmas[2]
+    assert sigmas[0] > 0.8
+    assert sigmas[2] < 3.5
+
+
+def test_noise_is_new_in_every_frame_and_every_camera_and_the_same_again():
+    image = np.full((60, 80, 3), 120, np.uint8)
+
+    def expose(seed, index, frame):
+        return sensor.Sensor(seed, index, (60, 80)).expose(image, frame, 0.0).astype(float)
+
+    np.testing.assert_array_equal(expose(1, 2, 3), expose(1, 2, 3))
+    for other in ((1, 2, 4), (1, 3, 3), (2, 2, 3)):
+        a, b = (shown - shown.mean() for shown in (expose(1, 2, 3), expose(*other)))
+        # 14,400 numbers of which neighbours share some noise: independent ones correlate by about 0.01.
+        assert abs((a * b).mean() / (a.std() * b.std())) < 0.06
+
+
+def test_a_frame_depends_on_nothing_that_was_drawn_before(scene, renderer):
+    renderer.frame(7)
+    np.testing.assert_array_equal(renderer.frame(60), CameraRenderer(scene, 0).frame(60))
+
+
+# --- models
+
+
+@pytest.mark.parametrize("name", drones.MODELS)
+def test_models_are_closed_face_outwards_and_have_sizes_of_drones(name):
+    model = drones.model(name)
+    a, b, c = model.triangles_m.swapaxes(0, 1)
+    # The divergence theorem: faces of closed solids sum to zero, and enclose a volume above 0 if they look outwards.
+    np.testing.assert_allclose(np.cross(b - a, c - a).sum(axis=0), 0.0, atol=1e-9)
+    assert np.einsum("fi,fi->", a, np.cross(b, c)) > 0
+    assert len(model.rotor_centres_m) >= 4
+    span = np.ptp(model.rotor_centres_m, axis=0).max() + 2 * model.rotor_radius_m
+    assert 0.35 <= span <= 0.6
+    assert np.linalg.norm(model.triangles_m, axis=-1).max() <= model.radius_m
+    assert np.all((model.paint >= 0) & (model.paint <= 1))

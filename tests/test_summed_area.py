@@ -1,0 +1,140 @@
+"""Box sums: NumPy slices are the oracle of whole boxes, area weights in float64 that of fractional ones."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from psotrack.summed_area import box_sum, summed_area_table
+
+table_of = jax.jit(summed_area_table)
+sum_of = jax.jit(box_sum)
+
+
+def coverage(shape, seed=0):
+    return np.random.default_rng(seed).integers(0, 256, shape).astype(np.uint8)
+
+
+def area_weighted_sum(image, x0, y0, x1, y1):
+    """The share of every pixel that lies in the box, times the pixel, in float64."""
+    shares = []
+    for low, high, count in ((y0, y1, image.shape[0]), (x0, x1, image.shape[1])):
+        pixel = np.arange(count)
+        shares.append(np.clip(np.minimum(high, pixel + 1) - np.maximum(low, pixel), 0, 1))
+    return shares[0] @ image.astype(np.float64) @ shares[1]
+
+
+def sums(images, camera, boxes):
+    """`box_sum` of (sets, boxes, 4) boxes."""
+    edges = (jnp.asarray(boxes[..., i], jnp.float32) for i in range(4))
+    return np.asarray(sum_of(table_of(images), jnp.asarray(camera, jnp.int32), *edges))
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 5, 7), (3, 13, 11), (5, 2, 17)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.int32, bool])
+def test_table_is_the_cumulative_sum_with_a_border_of_zeros(shape, dtype):
+    images = coverage(shape).astype(dtype)
+    table = table_of(images.astype(np.int32) if dtype is bool else images)
+    assert table.dtype == jnp.int32
+    expected = np.pad(images.astype(np.int64).cumsum(-1).cumsum(-2), ((0, 0), (1, 0), (1, 0)))
+    np.testing.assert_array_equal(table, expected)
+
+
+def test_whole_boxes_are_slice_sums():
+    """Every box with whole edges in a 5 x 7 image, exactly; several cameras at once."""
+    images = coverage((2, 5, 7))
+    edges = [
+        (x0, y0, x1, y1) for x0 in range(8) for x1 in range(x0, 8) for y0 in range(6) for y1 in range(y0, 6)
+    ]
+    boxes = np.array(edges)[:, None, :].repeat(2, axis=1)
+    expected = [[images[c, y0:y1, x0:x1].sum(dtype=int) for c in range(2)] for x0, y0, x1, y1 in edges]
+    np.testing.assert_array_equal(sums(images, np.arange(2), boxes), expected)
+
+
+box_edges = st.tuples(*[st.floats(-5, 25, width=32)] * 4)
+
+
+@given(st.lists(box_edges, min_size=6, max_size=6), st.integers(0, 2**16))
+def test_fractional_boxes_are_area_weighted_sums(edges, seed):
+    """Boxes of any kind, also empty, in the wrong order or outside, in three cameras and two sets."""
+    images = coverage((3, 13, 17), seed)
+    boxes = np.array(edges, np.float32).reshape(2, 3, 4)
+    actual = sums(images, np.arange(3), boxes)
+    for i, c in np.ndindex(2, 3):
+        expected = area_weighted_sum(images[c], *boxes[i, c].astype(np.float64))
+        # An edge's fraction is exact in float32 to 1e-6 of a pixel at 25; it weighs a line of at most 17 x 255.
+        assert actual[i, c] == pytest.approx(expected, abs=0.05, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        (3, 3, 3, 9),
+        (9, 2, 4, 8),
+        (2, 8, 6, 3),
+        (-8, 2, -1, 5),
+        (17, 0, 30, 13),
+        (2, -9, 5, -2),
+        (2, 13, 5, 20),
+        (3.3, 2.2, 3.3, 2.2),
+    ],
+    ids=["no width", "x inverted", "y inverted", "left", "right", "above", "below", "a point"],
+)
+def test_empty_boxes_have_sum_zero(box):
+    images = np.full((1, 13, 17), 255, np.uint8)
+    assert sums(images, np.zeros(1), np.array(box, np.float64).reshape(1, 1, 4)).item() == 0
+
+
+def test_boxes_are_cut_at_the_border():
+    images = coverage((1, 13, 17))
+    whole = np.array([[[-100, -100, 100, 100]], [[0, 0, 17, 13]]])
+    np.testing.assert_array_equal(sums(images, np.zeros(1), whole).ravel(), [images.sum(dtype=int)] * 2)
+
+
+def test_exact_where_sums_exceed_float32():
+    """A full 1080p image sums to 5e8, beyond float32's 2^24: a small box at its end must not feel it."""
+    images = np.full((1, 1080, 1920), 255, np.uint8)
+    boxes = np.array([[[1917, 1078, 1920, 1080]], [[1900.5, 1070.25, 1903.0, 1071.0]]])
+    assert sums(images, np.zeros(1), boxes).ravel().tolist() == [3 * 2 * 255, 2.5 * 0.75 * 255]
+
+
+def test_sets_and_cameras_are_not_mixed_up():
+    """Seven sets of eleven boxes, each in the table of its own camera, against one box at a time."""
+    rng = np.random.default_rng(3)
+    images = coverage((5, 13, 17))
+    camera = rng.integers(0, 5, 11)
+    boxes = rng.uniform(-2, 18, (7, 11, 4))
+    together = sums(images, camera, boxes)
+    for i, j in np.ndindex(7, 11):
+        alone = sums(images, camera[j : j + 1], boxes[i, j].reshape(1, 1, 4)).item()
+        assert together[i, j] == pytest.approx(alone, abs=1e-3)
+
+
+def test_gradient_is_the_line_that_an_edge_sweeps():
+    """The derivative of the area-weighted sum, by central differences of the float64 oracle."""
+    image = coverage((1, 13, 17))
+    edges = np.array([2.3, 3.6, 9.4, 11.2])
+
+    def total(edges):
+        return box_sum(summed_area_table(image), jnp.zeros(1, jnp.int32), *edges.reshape(4, 1, 1)).sum()
+
+    gradient = jax.jit(jax.grad(total))(jnp.asarray(edges, jnp.float32))
+    # The sum is linear while no edge crosses into another pixel, so differences of any such step are exact.
+    steps = 0.1 * np.eye(4)
+    expected = [
+        (area_weighted_sum(image[0], *(edges + s)) - area_weighted_sum(image[0], *(edges - s))) / 0.2
+        for s in steps
+    ]
+    np.testing.assert_allclose(gradient, expected, rtol=1e-4)
+
+
+def test_gradient_is_finite_everywhere():
+    image = coverage((1, 5, 7))
+
+    def total(edges):
+        return box_sum(summed_area_table(image), jnp.zeros(1, jnp.int32), *edges.reshape(4, 1, 1)).sum()
+
+    boxes = jnp.array([[0.0, 0, 7, 5], [3, 3, 3, 3], [5, 4, 1, 1], [-9, -9, -8, -8], [-1e30, 0, 1e30, 5]])
+    assert np.isfinite(jax.jit(jax.vmap(jax.grad(total)))(boxes)).all()

@@ -1,0 +1,306 @@
+"""The swarm: a trace by hand, functions with known maxima, and what must never happen."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_same
+from hypothesis import given
+from hypothesis import strategies as st
+
+from psotrack import swarm
+
+
+def params(
+    groups=1, dims=2, *, inertia=0.6, cognitive=1.5, social=1.5, max_step=10.0, low=-100.0, high=100.0
+):
+    return swarm.SwarmParams(
+        inertia=jnp.float32(inertia),
+        cognitive=jnp.float32(cognitive),
+        social=jnp.float32(social),
+        max_step=jnp.full(dims, max_step, jnp.float32),
+        low=jnp.full((groups, dims), low, jnp.float32),
+        high=jnp.full((groups, dims), high, jnp.float32),
+    )
+
+
+def sphere(position):
+    return -jnp.square(position).sum(axis=-1)
+
+
+def rosenbrock(position):
+    x, y = position[..., ::2], position[..., 1::2]
+    return -(100 * jnp.square(y - x * x) + jnp.square(1 - x)).sum(axis=-1)
+
+
+def undefined(position):
+    return jnp.full(position.shape[:2], jnp.nan, position.dtype)
+
+
+def spread(particles, groups, dims, seed=0, scale=5.0):
+    rng = np.random.default_rng(seed)
+    return jnp.asarray(rng.uniform(-scale, scale, (particles, groups, dims)), jnp.float32)
+
+
+run = jax.jit(swarm.run, static_argnums=1)
+init = jax.jit(swarm.init, static_argnums=0)
+step = jax.jit(swarm.step, static_argnums=1)
+
+
+@pytest.mark.parametrize("max_step", [10.0, 0.75])
+def test_one_step_of_three_particles_by_hand(max_step):
+    """Two groups with different leaders. Catches: r1 and r2 shared over dimensions, the best of another group or of
+    another particle as attractor, bests taken before the move, a clamp before the sum."""
+    position = np.array([[[1, 2], [4, 0]], [[3, -1], [1, 1]], [[-2, 2], [0, 3]]], np.float32)
+    knobs = params(groups=2, inertia=0.5, cognitive=1.2, social=0.8, max_step=max_step)
+    before = init(sphere, position, knobs)
+    # Particle 0 leads group 0 (-5 against -10 and -8), particle 1 group 1 (-2 against -16 and -9).
+    assert before.gbest_fitness.tolist() == [-5, -2]
+    assert before.gbest_position.tolist() == [[1, 2], [1, 1]]
+
+    velocity = np.array([[[0.5, 0], [1, -1]], [[0, 1], [-0.5, 0]], [[0.25, 0.25], [0, -2]]], np.float32)
+    pbest = np.array([[[1, 2], [3, 0]], [[2, -1], [1, 1]], [[-2, 2], [0, 2]]], np.float32)
+    pbest_fitness = -np.square(pbest).sum(axis=-1)
+    before = replace(
+        before,
+        velocity=jnp.asarray(velocity),
+        pbest_position=jnp.asarray(pbest),
+        pbest_fitness=jnp.asarray(pbest_fitness),
+    )
+    key = jax.random.key(7)
+    after = step(key, sphere, before, knobs)
+
+    r1, r2 = np.asarray(jax.random.uniform(key, (2, 3, 2, 2)))
+    gbest = np.array([[1, 2], [1, 1]])
+    expected_velocity, expected_position = np.empty((3, 2, 2)), np.empty((3, 2, 2))
+    expected_pbest = pbest.copy()
+    for particle, group in np.ndindex(3, 2):
+        for dim in range(2):
+            here = position[particle, group, dim]
+            pull = (
+                0.5 * velocity[particle, group, dim]
+                + 1.2 * r1[particle, group, dim] * (pbest[particle, group, dim] - here)
+                + 0.8 * r2[particle, group, dim] * (gbest[group, dim] - here)
+            )
+            expected_velocity[particle, group, dim] = np.clip(pull, -max_step, max_step)
+            expected_position[particle, group, dim] = here + expected_velocity[particle, group, dim]
+        if np.square(expected_position[particle, group]).sum() < np.square(pbest[particle, group]).sum():
+            expected_pbest[particle, group] = expected_position[particle, group]
+    # A handful of float32 operations on numbers below 5: 6e-7 each.
+    np.testing.assert_allclose(after.velocity, expected_velocity, atol=5e-6)
+    np.testing.assert_allclose(after.position, expected_position, atol=5e-6)
+    np.testing.assert_allclose(after.pbest_position, expected_pbest, atol=5e-6)
+    expected_fitness = -np.square(expected_pbest).sum(axis=-1)
+    np.testing.assert_allclose(after.pbest_fitness, expected_fitness, atol=5e-5)
+    leader = expected_fitness.argmax(axis=0)
+    np.testing.assert_allclose(after.gbest_position, expected_pbest[leader, [0, 1]], atol=5e-6)
+    np.testing.assert_allclose(after.gbest_fitness, expected_fitness[leader, [0, 1]], atol=5e-5)
+
+
+@pytest.mark.parametrize(("groups", "dims"), [(1, 6), (2, 3), (5, 2)])
+def test_sphere(groups, dims):
+    final = run(jax.random.key(0), sphere, spread(40, groups, dims), params(groups, dims), 150)
+    # A converging swarm loses about a tenth of its radius per iteration: measured 1e-5, limit 1e-3.
+    np.testing.assert_allclose(final.gbest_position, 0, atol=1e-3)
+    np.testing.assert_allclose(final.gbest_fitness, 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_rosenbrock(seed):
+    final = run(jax.random.key(seed), rosenbrock, spread(50, 2, 2, seed), params(2), 300)
+    # The valley is flat (curvature 1/4 along it), float32 sees 1e-7 of it: measured 1e-3, limit 2e-2.
+    np.testing.assert_allclose(final.gbest_position, 1, atol=2e-2)
+
+
+def ripples(position):
+    """Many maxima, and NaN in stripes."""
+    height = jnp.cos(3 * position).sum(axis=-1) - 0.1 * jnp.square(position).sum(axis=-1)
+    return jnp.where(jnp.sin(7 * position[..., 0]) > 0.5, jnp.nan, height)
+
+
+@jax.jit
+def path_of_bests(key, position, knobs):
+    def one(state, key):
+        state = swarm.step(key, ripples, state, knobs)
+        return state, vars(state)
+
+    start = swarm.init(ripples, position, knobs)
+    _, states = jax.lax.scan(one, start, jax.random.split(key, 25))
+    return {name: jnp.concatenate([vars(start)[name][None], rest]) for name, rest in states.items()}
+
+
+@given(st.integers(0, 2**30), st.floats(0, 1.2), st.floats(0, 3), st.floats(0, 3), st.floats(0.0625, 8))
+def test_what_always_holds(seed, inertia, cognitive, social, max_step):
+    """For any knobs: bests never worsen, are never NaN, are what was evaluated, and nobody leaves the bounds or
+    outruns the clamp."""
+    knobs = params(
+        3, 2, inertia=inertia, cognitive=cognitive, social=social, max_step=max_step, low=-3.0, high=2.0
+    )
+    states = path_of_bests(jax.random.key(seed), spread(7, 3, 2, seed), knobs)
+    states = SimpleNamespace(**jax.tree.map(np.asarray, states))
+    assert (np.diff(np.nan_to_num(states.pbest_fitness, neginf=-1e9), axis=0) >= 0).all()
+    assert (np.diff(np.nan_to_num(states.gbest_fitness, neginf=-1e9), axis=0) >= 0).all()
+    assert not np.isnan(states.pbest_fitness).any()
+    np.testing.assert_array_equal(states.gbest_fitness, states.pbest_fitness.max(axis=1))
+    defined = np.isfinite(states.pbest_fitness)
+    evaluated = np.asarray(jax.vmap(ripples)(states.pbest_position))
+    # Evaluated once inside of the compiled loop and once outside.
+    np.testing.assert_allclose(states.pbest_fitness[defined], evaluated[defined], atol=1e-5)
+    assert (states.position >= -3).all()
+    assert (states.position <= 2).all()
+    assert (np.abs(states.velocity) <= np.float32(max_step)).all()
+    assert (np.abs(np.diff(states.position, axis=0)) <= max_step * (1 + 1e-6) + 1e-6).all()
+
+
+def test_one_defined_particle_leads():
+    """Two of three start undefined: the third is the best, and the others are pulled to it."""
+
+    def right_half(position):
+        return jnp.where(position[..., 0] > 0, sphere(position), jnp.nan)
+
+    position = jnp.array([[[-4.0, 1.0]], [[3.0, 3.0]], [[-2.0, -2.0]]])
+    start = init(right_half, position, params())
+    assert start.gbest_position.tolist() == [[3, 3]]
+    assert np.isneginf(start.pbest_fitness).ravel().tolist() == [True, False, True]
+    final = run(jax.random.key(0), right_half, position, params(), 60)
+    assert np.isfinite(final.gbest_fitness).all()
+    assert final.gbest_position[0, 0] > 0
+    assert final.gbest_fitness[0] > -1
+
+
+def test_undefined_everywhere_stays_undefined_and_finite():
+    final = run(jax.random.key(0), undefined, spread(7, 2, 3), params(2, 3), 10)
+    assert np.isneginf(final.gbest_fitness).all()
+    assert np.isneginf(final.pbest_fitness).all()
+    assert np.isfinite(final.gbest_position).all()
+    assert np.isfinite(final.position).all()
+
+
+def test_an_undefined_start_recovers():
+    """Nobody is defined at first; as soon as one is, it leads."""
+
+    def far_right(position):
+        return jnp.where(position[..., 0] > 4, -position[..., 0], jnp.nan)
+
+    position = jnp.array([[[3.5, 0.0]], [[3.0, 1.0]], [[2.0, -1.0]]])
+    start = init(far_right, position, params())
+    assert np.isneginf(start.gbest_fitness).all()
+    moving = replace(start, velocity=start.velocity + 2.0)
+    after = step(jax.random.key(0), far_right, moving, params(inertia=1.0))
+    assert after.gbest_fitness[0] < -4
+    assert after.gbest_position[0, 0] > 4
+
+
+def test_particles_outside_the_bounds_are_brought_in():
+    start = init(sphere, spread(20, 2, 3, scale=50.0), params(2, 3, low=-1.0, high=2.0))
+    assert start.position.min() == -1
+    assert start.position.max() == 2
+    np.testing.assert_array_equal(start.pbest_position, start.position)
+
+
+def test_nobody_sticks_to_a_bound():
+    """A particle that ran into the bound has no velocity left that would hold it there."""
+    knobs = params(low=-1.0, high=1.0, inertia=1.0, cognitive=0.0, social=0.0)
+    start = init(sphere, jnp.array([[[0.9, 0.0]], [[-0.9, 0.5]]]), knobs)
+    start = replace(start, velocity=jnp.array([[[5.0, 0.25]], [[-5.0, 0.25]]]))
+    after = step(jax.random.key(0), sphere, start, knobs)
+    np.testing.assert_allclose(after.position, [[[1, 0.25]], [[-1, 0.75]]], atol=1e-6)
+    np.testing.assert_allclose(after.velocity, [[[0, 0.25]], [[0, 0.25]]], atol=1e-6)
+    # And it is found again by the pull of the best, which lies inside.
+    final = run(jax.random.key(1), sphere, jnp.ones((10, 1, 2)), params(low=-1.0, high=1.0), 100)
+    # All start in one corner, where nothing pulls: the best is the corner itself.
+    np.testing.assert_allclose(final.gbest_position, 1)
+    final = run(jax.random.key(1), sphere, spread(10, 1, 2, scale=1.0) + 0.9, params(low=-1.0, high=1.0), 100)
+    np.testing.assert_allclose(final.gbest_position, 0, atol=1e-2)
+
+
+def test_a_maximum_on_the_bound_is_reached():
+    final = run(
+        jax.random.key(0), lambda x: x.sum(axis=-1), spread(20, 2, 3), params(2, 3, low=-7.0, high=7.0), 60
+    )
+    np.testing.assert_allclose(final.gbest_position, 7)
+
+
+def test_same_key_same_result_and_another_key_another():
+    def search(seed):
+        return run(jax.random.key(seed), rosenbrock, spread(10, 2, 2), params(2), 20)
+
+    first, second, other = search(3), search(3), search(4)
+    assert_same(first, second)
+    assert not np.array_equal(first.position, other.position)
+
+
+def test_without_jit_the_result_is_the_same():
+    position, knobs = spread(5, 2, 2), params(2)
+    compiled = init(sphere, position, knobs)
+    plain = compiled
+    for i in range(3):
+        compiled = step(jax.random.key(i), sphere, compiled, knobs)
+        with jax.disable_jit():
+            plain = swarm.step(jax.random.key(i), sphere, plain, knobs)
+    # Fused multiply-adds differ in the last bits.
+    assert_same(compiled, plain, atol=1e-4)
+
+
+def test_groups_do_not_interact():
+    """Another objective in the second of three groups changes nothing in the others."""
+
+    def objective(position, weight):
+        return sphere(position - weight[:, None])
+
+    @jax.jit
+    def search(weight):
+        start = spread(9, 3, 2)
+        return swarm.run(
+            jax.random.key(0), lambda position: objective(position, weight), start, params(3), 30
+        )
+
+    final, changed = search(jnp.array([0.0, 0.0, 1.0])), search(jnp.array([0.0, 2.0, 1.0]))
+    for name in ("position", "velocity", "pbest_position", "pbest_fitness"):
+        one, two = np.asarray(getattr(final, name)), np.asarray(getattr(changed, name))
+        np.testing.assert_array_equal(one[:, [0, 2]], two[:, [0, 2]])
+        assert not np.array_equal(one[:, 1], two[:, 1])
+    np.testing.assert_array_equal(
+        final.gbest_position[np.array([0, 2])], changed.gbest_position[np.array([0, 2])]
+    )
+
+
+def test_groups_find_maxima_of_their_own():
+    targets = jnp.array([[1.0, -2.0], [3.0, 0.5], [-4.0, 4.0]])
+    final = run(
+        jax.random.key(0), lambda x: -jnp.square(x - targets).sum(axis=-1), spread(30, 3, 2), params(3), 120
+    )
+    np.testing.assert_allclose(final.gbest_position, targets, atol=1e-3)
+
+
+def test_run_is_init_and_steps():
+    """No iteration is the evaluated start; more of them continue the same path."""
+    position, knobs = spread(6, 2, 2), params(2)
+    start = init(sphere, position, knobs)
+    assert_same(run(jax.random.key(0), sphere, position, knobs, 0), start)
+    fitness = [
+        float(run(jax.random.key(0), sphere, position, knobs, n).gbest_fitness.sum()) for n in range(6)
+    ]
+    assert (np.diff(fitness) >= 0).all()
+
+
+def test_knobs_and_number_of_iterations_compile_nothing_new():
+    traces = 0
+
+    def counted(position):
+        nonlocal traces
+        traces += 1
+        return sphere(position)
+
+    compiled = jax.jit(lambda key, position, knobs, n: swarm.run(key, counted, position, knobs, n))
+    compiled(jax.random.key(0), spread(6, 2, 2), params(2), jnp.int32(3))
+    once = traces
+    compiled(
+        jax.random.key(1), spread(6, 2, 2, 1), params(2, inertia=0.3, low=-1.0, max_step=0.1), jnp.int32(50)
+    )
+    assert traces == once
+    # Once for the start and once for the body of the loop, however many iterations there are.
+    assert once <= 3

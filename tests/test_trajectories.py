@@ -1,0 +1,85 @@
+"""`Trajectories`: what it accepts, what counts as seen, and picking frames."""
+
+import numpy as np
+import pytest
+
+from psotrack.errors import InputError
+from psotrack.trajectories import Status, Trajectories
+
+FRAMES, DRONES = 5, 3
+
+
+def trajectories(**changes) -> Trajectories:
+    frame = np.arange(10, 10 + 2 * FRAMES, 2)
+    position_m = np.arange(FRAMES * DRONES * 3, dtype=float).reshape(FRAMES, DRONES, 3)
+    values = {"frame": frame, "time_s": frame / 25, "drones": ("a", "b", "c"), "position_m": position_m}
+    return Trajectories(**(values | changes))
+
+
+def everything() -> Trajectories:
+    rng = np.random.default_rng(0)
+    return trajectories(
+        velocity_m_s=rng.normal(size=(FRAMES, DRONES, 3)),
+        orientation_wxyz=rng.normal(size=(FRAMES, DRONES, 4)),
+        fitness=rng.random((FRAMES, DRONES)),
+        num_cameras=rng.integers(0, 9, (FRAMES, DRONES)),
+        status=rng.integers(0, 3, (FRAMES, DRONES)),
+    )
+
+
+def test_counts():
+    assert (trajectories().num_frames, trajectories().num_drones) == (FRAMES, DRONES)
+
+
+def test_seen_is_a_whole_position_that_is_not_lost():
+    position_m = np.zeros((FRAMES, DRONES, 3))
+    position_m[1, 0, 2] = np.nan
+    status = np.full((FRAMES, DRONES), Status.TRACKED)
+    status[2, 1], status[3, 1] = Status.LOST, Status.COASTING
+    unseen = np.argwhere(~trajectories(position_m=position_m, status=status).seen)
+    assert unseen.tolist() == [[1, 0], [2, 1]]
+    assert np.argwhere(~trajectories(position_m=position_m).seen).tolist() == [[1, 0]]
+
+
+def test_status_words():
+    assert [status.label for status in Status] == ["tracked", "coasting", "lost"]
+
+
+def test_at_frames_picks_rows_of_everything():
+    full = everything()
+    picked = full.at_frames(np.array([12, 18]))
+    assert picked.frame.tolist() == [12, 18]
+    assert picked.drones == full.drones
+    for name in (
+        "time_s",
+        "position_m",
+        "velocity_m_s",
+        "orientation_wxyz",
+        "fitness",
+        "num_cameras",
+        "status",
+    ):
+        np.testing.assert_array_equal(getattr(picked, name), getattr(full, name)[[1, 4]])
+
+
+def test_at_frames_leaves_out_what_is_unknown():
+    assert trajectories().at_frames(np.array([10])).velocity_m_s is None
+
+
+@pytest.mark.parametrize("wanted", [[11], [10, 20], [8]], ids=["between", "after", "before"])
+def test_at_frames_that_are_not_there(wanted):
+    with pytest.raises(InputError, match=f"expected frames {wanted[0]} to {wanted[-1]}"):
+        trajectories().at_frames(np.array(wanted))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"frame": np.array([0, 1, 1, 2, 3])}, "increasing frame numbers"),
+        ({"frame": np.array([0, 2, 1, 3, 4])}, "increasing frame numbers"),
+        ({"drones": ("a", "b", "a")}, "a name of its own"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(changes, message):
+    with pytest.raises(InputError, match=message):
+        trajectories(**changes)

@@ -1,0 +1,410 @@
+"""Tables and TUM files of trajectories: exact columns, exact round trips, and what is wrong with a file, by line."""
+
+import json
+import resource
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy.spatial.transform import Rotation
+
+from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.trajectories import Status, Trajectories
+from psotrack.trajectory_files import COLUMNS, read_trajectories, write_trajectories
+from psotrack.tum import read_tum, write_tum
+
+SUFFIXES = (".csv", ".parquet")
+HEADER = "frame,time_s,drone,x_m,y_m,z_m,vx_m_s,vy_m_s,vz_m_s,fitness,num_cameras,status"
+
+
+def two_drones(dtype=np.float32) -> Trajectories:
+    """Three frames of two drones; the second is lost in the last one, at an unknown place."""
+    position_m = np.array([[[0.1, -2, 1.5], [3, 4, 1]]] * 3, dtype)
+    position_m[2, 1] = np.nan
+    return Trajectories(
+        frame=np.arange(3),
+        time_s=np.arange(3) / 25,
+        drones=("dron1", "dron2"),
+        position_m=position_m,
+        velocity_m_s=np.full((3, 2, 3), 0.25, dtype),
+        fitness=np.full((3, 2), 0.7, dtype),
+        num_cameras=np.full((3, 2), 8),
+        status=np.array([[Status.TRACKED] * 2, [Status.COASTING] * 2, [Status.TRACKED, Status.LOST]]),
+    )
+
+
+def assert_same(read: Trajectories, written: Trajectories, dtype=np.float64) -> None:
+    """Equal to the last bit in the precision of what was written."""
+    assert read.drones == written.drones
+    for name in ("frame", "time_s", "num_cameras", "status"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(written, name))
+    for name in ("position_m", "velocity_m_s", "fitness"):
+        expected = getattr(written, name)
+        assert (getattr(read, name) is None) == (expected is None)
+        if expected is not None:
+            np.testing.assert_array_equal(getattr(read, name).astype(dtype), expected)
+
+
+class TestRoundTrip:
+    @staticmethod
+    @st.composite
+    def arguments(draw, dtype):
+        # Not yet a `Trajectories`: the type checker samples at random, which a strategy must not.
+        frames, drones = draw(st.integers(1, 4)), draw(st.integers(1, 3))
+        names = st.text("ab 1,;\"'#é", min_size=1, max_size=5).map(str.strip).filter(bool)
+        numbers = st.floats(allow_infinity=False, width=32 if dtype == np.float32 else 64)
+        known = numbers.filter(np.isfinite)
+
+        def floats(*parts):
+            values = draw(hnp.arrays(dtype, (frames, drones, *parts), elements=numbers))
+            # One known number: what is not known at all comes back as None.
+            values[0, 0] = draw(known)
+            return values
+
+        def integers(top):
+            return draw(hnp.arrays(np.int64, (frames, drones), elements=st.integers(0, top)))
+
+        frame = sorted(draw(st.sets(st.integers(0, 10**6), min_size=frames, max_size=frames)))
+        return {
+            "frame": np.array(frame),
+            "time_s": np.array(frame) / draw(st.sampled_from([25, 100, 30000 / 1001])),
+            "drones": tuple(draw(st.lists(names, unique=True, min_size=drones, max_size=drones))),
+            "position_m": floats(3),
+            "velocity_m_s": draw(st.none()) or floats(3),
+            "fitness": floats(),
+            "num_cameras": integers(8),
+            "status": integers(2),
+        }
+
+    @pytest.mark.parametrize("suffix", SUFFIXES)
+    @pytest.mark.parametrize("dtype", [np.float32, np.float64])
+    @given(data=st.data())
+    @settings(max_examples=40, deadline=None)
+    def test_nothing_changes(self, suffix, dtype, data, tmp_path_factory):
+        path = tmp_path_factory.getbasetemp() / f"round_trip_{dtype.__name__}{suffix}"
+        written = Trajectories(**data.draw(self.arguments(dtype)))
+        write_trajectories(path, written, force=True)
+        assert_same(read_trajectories(path), written, dtype)
+
+    @pytest.mark.parametrize("suffix", SUFFIXES)
+    def test_what_is_not_known_at_all(self, tmp_path, suffix):
+        path = tmp_path / f"tracks{suffix}"
+        bare = replace(two_drones(), velocity_m_s=None, fitness=None, num_cameras=None, status=None)
+        write_trajectories(path, bare)
+        read = read_trajectories(path)
+        assert (read.velocity_m_s, read.fitness, read.num_cameras) == (None, None, None)
+        np.testing.assert_array_equal(read.seen, bare.seen)
+        assert read.status.tolist() == [[0, 0], [0, 0], [0, 2]]
+
+
+class TestWriting:
+    def test_csv_to_the_letter(self, tmp_path):
+        write_trajectories(tmp_path / "tracks.csv", two_drones())
+        assert (tmp_path / "tracks.csv").read_bytes().decode().split("\n") == [
+            HEADER,
+            "0,0.0,dron1,0.1,-2.0,1.5,0.25,0.25,0.25,0.7,8,tracked",
+            "0,0.0,dron2,3.0,4.0,1.0,0.25,0.25,0.25,0.7,8,tracked",
+            "1,0.04,dron1,0.1,-2.0,1.5,0.25,0.25,0.25,0.7,8,coasting",
+            "1,0.04,dron2,3.0,4.0,1.0,0.25,0.25,0.25,0.7,8,coasting",
+            "2,0.08,dron1,0.1,-2.0,1.5,0.25,0.25,0.25,0.7,8,tracked",
+            "2,0.08,dron2,,,,0.25,0.25,0.25,0.7,8,lost",
+            "",
+        ]
+
+    def test_parquet_has_the_same_rows_and_says_what_they_mean(self, tmp_path):
+        for suffix in SUFFIXES:
+            write_trajectories(tmp_path / f"tracks{suffix}", two_drones(np.float64))
+        frame = pd.read_parquet(tmp_path / "tracks.parquet")
+        pd.testing.assert_frame_equal(frame, pd.read_csv(tmp_path / "tracks.csv"), check_dtype=False)
+        metadata = pq.read_schema(tmp_path / "tracks.parquet").metadata
+        assert metadata[b"psotrack.schema_version"] == b"1"
+        assert json.loads(metadata[b"psotrack.units"]) == COLUMNS
+        assert list(COLUMNS) == HEADER.split(",")
+
+    @pytest.mark.parametrize("suffix", SUFFIXES)
+    def test_equal_trajectories_give_equal_bytes(self, tmp_path, suffix):
+        paths = [tmp_path / f"{name}{suffix}" for name in "ab"]
+        for path in paths:
+            write_trajectories(path, two_drones())
+        assert paths[0].read_bytes() == paths[1].read_bytes()
+
+    @pytest.mark.parametrize("suffix", SUFFIXES)
+    def test_an_existing_file_is_replaced_only_by_force(self, tmp_path, suffix):
+        path = tmp_path / f"tracks{suffix}"
+        path.write_text("precious")
+        with pytest.raises(OutputError, match="pass --force"):
+            write_trajectories(path, two_drones())
+        assert path.read_text() == "precious"
+        write_trajectories(path, two_drones(), force=True)
+        assert read_trajectories(path).num_frames == 3
+
+    @pytest.mark.parametrize("suffix", SUFFIXES)
+    def test_a_full_disk_leaves_what_was_there(self, tmp_path, suffix):
+        path = tmp_path / f"tracks{suffix}"
+        path.write_text("precious")
+        # No file of this process may grow over 64 bytes: writing fails as on a full disk.
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (64, limits[1]))
+        try:
+            with pytest.raises(OutputError, match="earlier results are unchanged"):
+                write_trajectories(path, two_drones(), force=True)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert path.read_text() == "precious"
+        assert list(tmp_path.iterdir()) == [path]
+
+    def test_other_suffixes(self, tmp_path):
+        with pytest.raises(InputError, match=r"tracks\.txt: expected a name that ends in \.csv or \.parquet"):
+            write_trajectories(tmp_path / "tracks.txt", two_drones())
+
+
+def csv_file(tmp_path, *lines, header="frame,time_s,drone,x_m,y_m,z_m,status,num_cameras"):
+    path = tmp_path / "tracks.csv"
+    path.write_text("\n".join([header, *lines]) + "\n", encoding="utf-8")
+    return path
+
+
+class TestLenientReading:
+    def test_columns_and_rows_in_any_order_some_missing_others_extra(self, tmp_path):
+        path = csv_file(
+            tmp_path,
+            "1.5,2,0.5,3,nice,7",
+            "1.5,1,0,3,,9",
+            "",
+            "1.5,2,-1,3,,9",
+            header="z_m,frame,x_m,y_m,note,drone",
+        )
+        read = read_trajectories(path, fps=25.0)
+        assert read.frame.tolist() == [1, 2]
+        assert read.time_s.tolist() == [1 / 25, 2 / 25]
+        assert read.drones == ("7", "9")
+        np.testing.assert_array_equal(read.position_m[:, 0], [[np.nan] * 3, [0.5, 3, 1.5]])
+        np.testing.assert_array_equal(read.position_m[:, 1], [[0, 3, 1.5], [-1, 3, 1.5]])
+        assert (read.velocity_m_s, read.fitness, read.num_cameras, read.status) == (None, None, None, None)
+
+    def test_missing_rows_are_lost(self, tmp_path):
+        read = read_trajectories(csv_file(tmp_path, "0,0,a,1,1,1,tracked,8", "1,0.04,b,1,1,1,coasting,7"))
+        assert read.status.tolist() == [[Status.TRACKED, Status.LOST], [Status.LOST, Status.COASTING]]
+        assert read.num_cameras.tolist() == [[8, 0], [0, 7]]
+
+    def test_times_may_be_given_once_per_frame(self, tmp_path):
+        read = read_trajectories(csv_file(tmp_path, "3,,a,1,1,1,tracked,8", "3,0.12,b,1,1,1,tracked,8"))
+        assert read.time_s.tolist() == [0.12]
+
+    def test_parquet_with_whole_numbers_for_names(self, tmp_path):
+        path = tmp_path / "tracks.parquet"
+        table = {
+            "frame": [0, 0],
+            "time_s": [0.0, 0.0],
+            "drone": [2, 1],
+            "x_m": [1, 2],
+            "y_m": [1, 2],
+            "z_m": [1, 2],
+        }
+        pd.DataFrame(table).to_parquet(path)
+        read = read_trajectories(path)
+        assert read.drones == ("2", "1")
+        assert read.position_m[0, :, 0].tolist() == [1, 2]
+
+    def test_a_byte_order_mark_is_no_part_of_a_name(self, tmp_path):
+        path = csv_file(tmp_path, "0,0,a,1,1,1,tracked,8")
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+        assert read_trajectories(path).num_frames == 1
+
+
+GOOD = "0,0,a,1,1,1,tracked,8"
+
+
+class TestBadFiles:
+    @pytest.mark.parametrize(
+        ("line", "message"),
+        [
+            ("1,0.04,a,1,1", "line 3: expected 8 fields as in the first line, found 5"),
+            ("1,0.04,a,1,one,1,tracked,8", "line 3: expected a number in y_m, found 'one'"),
+            ("1,0.04,a,1,inf,1,tracked,8", "line 3: expected a finite number, or nothing in y_m, found inf"),
+            ("nan,0.04,a,1,1,1,tracked,8", "line 3: expected a whole number from 0 in frame, found nan"),
+            (",0.04,a,1,1,1,tracked,8", "line 3: expected a whole number from 0 in frame, found nan"),
+            ("inf,0.04,a,1,1,1,tracked,8", "line 3: expected a whole number from 0 in frame, found inf"),
+            ("1.5,0.04,a,1,1,1,tracked,8", "line 3: expected a whole number from 0 in frame, found 1.5"),
+            ("-1,0.04,a,1,1,1,tracked,8", "line 3: expected a whole number from 0 in frame, found -1.0"),
+            ("1,0.04,,1,1,1,tracked,8", "line 3: expected a name in drone, found ''"),
+            (
+                "1,0.04,a,1,1,1,gone,8",
+                "line 3: expected one of tracked, coasting, lost in status, found 'gone'",
+            ),
+            ("1,0.04,a,1,1,1,tracked,x", "line 3: expected a number in num_cameras, found 'x'"),
+            (
+                "1,0.04,a,1,1,1,tracked,2.5",
+                "line 3: expected a whole number from 0, or nothing in num_cameras, found 2.5",
+            ),
+            (
+                "0,0,a,2,2,2,tracked,8",
+                "line 3: expected one row per frame and drone, found a second one for frame 0",
+            ),
+            (
+                "0,0.5,b,1,1,1,tracked,8",
+                "line 3: expected 0 s, as another row of this frame has, found 0.5 s",
+            ),
+            (
+                "1,,a,1,1,1,tracked,8",
+                "line 3: expected a time_s, or the frame rate to know it by, found neither",
+            ),
+            ('1,0.04,"a,1,1,1,tracked,8', "expected a CSV table in UTF-8"),
+        ],
+    )
+    def test_a_line_of_csv(self, tmp_path, line, message):
+        path = csv_file(tmp_path, GOOD, line)
+        with pytest.raises(InputError) as caught:
+            read_trajectories(path)
+        assert str(caught.value).startswith(str(path))
+        assert message in str(caught.value)
+
+    def test_the_line_is_that_of_the_file_not_of_the_row(self, tmp_path):
+        with pytest.raises(InputError, match="line 5: expected a whole number"):
+            read_trajectories(csv_file(tmp_path, GOOD, "", "", "x,0,a,1,1,1,tracked,8".replace("x", "nan")))
+
+    @pytest.mark.parametrize(
+        ("header", "message"),
+        [
+            ("frame,drone,x_m,y_m", "found z_m missing"),
+            ("frame;drone;x_m;y_m;z_m", "found frame, drone, x_m, y_m, z_m missing"),
+            ("frame,drone,x_m,y_m,z_m,x_m", "found x_m twice"),
+            ("", "found frame, drone, x_m, y_m, z_m missing"),
+        ],
+    )
+    def test_a_header(self, tmp_path, header, message):
+        with pytest.raises(InputError, match=message):
+            read_trajectories(csv_file(tmp_path, header=header))
+
+    def test_no_rows(self, tmp_path):
+        with pytest.raises(InputError, match="expected at least one row, found none"):
+            read_trajectories(csv_file(tmp_path))
+
+    @pytest.mark.parametrize("suffix", SUFFIXES)
+    def test_no_such_file(self, tmp_path, suffix):
+        with pytest.raises(InputError, match="no such file"):
+            read_trajectories(tmp_path / f"nowhere{suffix}")
+
+    @pytest.mark.parametrize("suffix", SUFFIXES)
+    def test_bytes_that_are_no_table(self, tmp_path, suffix):
+        path = tmp_path / f"noise{suffix}"
+        path.write_bytes(np.random.default_rng(0).bytes(500))
+        with pytest.raises(InputError, match=f"noise{suffix}: expected a (CSV table in UTF-8|Parquet file)"):
+            read_trajectories(path)
+
+    def test_a_truncated_parquet_file(self, tmp_path):
+        path = tmp_path / "tracks.parquet"
+        write_trajectories(path, two_drones())
+        path.write_bytes(path.read_bytes()[:-100])
+        with pytest.raises(InputError, match="expected a Parquet file"):
+            read_trajectories(path)
+
+    def test_a_row_of_parquet(self, tmp_path):
+        path = tmp_path / "tracks.parquet"
+        write_trajectories(path, two_drones())
+        pd.read_parquet(path).assign(status=["tracked", "tracked", "sunk"] * 2).to_parquet(path)
+        with pytest.raises(
+            InputError, match="row 3: expected one of tracked, coasting, lost in status, found 'sunk'"
+        ):
+            read_trajectories(path)
+
+    def test_a_column_of_parquet(self, tmp_path):
+        path = tmp_path / "tracks.parquet"
+        write_trajectories(path, two_drones())
+        pd.read_parquet(path).assign(x_m=["left"] * 6).to_parquet(path)
+        with pytest.raises(InputError, match="expected numbers in x_m"):
+            read_trajectories(path)
+
+
+class TestTum:
+    def turning(self) -> Trajectories:
+        orientation_wxyz = Rotation.random(6, rng=np.random.default_rng(0)).as_quat(scalar_first=True)
+        return replace(two_drones(np.float64), orientation_wxyz=orientation_wxyz.reshape(3, 2, 4))
+
+    def test_to_the_letter(self, tmp_path):
+        first, second = write_tum(tmp_path / "tum", two_drones())
+        assert (first.name, second.name) == ("dron1.tum", "dron2.tum")
+        assert second.read_text().splitlines() == [
+            "# timestamp tx ty tz qx qy qz qw",
+            "# orientation unknown: 0 0 0 1 in every line",
+            "0.0 3.0 4.0 1.0 0 0 0 1",
+            "0.04 3.0 4.0 1.0 0 0 0 1",
+        ]
+
+    def test_order_of_the_quaternion(self, tmp_path):
+        turning = self.turning()
+        path = write_tum(tmp_path, turning)[0]
+        table = np.loadtxt(path)
+        assert table.shape == (3, 8)
+        np.testing.assert_array_equal(table[:, 4:], turning.orientation_wxyz[:, 0][:, [1, 2, 3, 0]])
+
+    def test_round_trip(self, tmp_path):
+        turning = self.turning()
+        write_tum(tmp_path, turning)
+        read = read_tum(tmp_path, fps=25.0)
+        assert read.drones == turning.drones
+        assert read.frame.tolist() == [0, 1, 2]
+        np.testing.assert_array_equal(read.position_m, turning.position_m)
+        # Reading brings quaternions to length one, which may change the last bit.
+        np.testing.assert_allclose(read.orientation_wxyz[:, 0], turning.orientation_wxyz[:, 0], atol=1e-15)
+        assert np.isnan(read.orientation_wxyz[2, 1]).all()
+
+    def test_unknown_orientations_stay_unknown(self, tmp_path):
+        path = write_tum(tmp_path, two_drones())[1]
+        read = read_tum(path, fps=25.0)
+        assert (read.drones, read.orientation_wxyz) == (("dron2",), None)
+
+    def test_a_drone_that_was_never_seen_has_a_file_too(self, tmp_path):
+        never = two_drones()
+        never.status[:, 1] = Status.LOST
+        write_tum(tmp_path, never)
+        read = read_tum(tmp_path, fps=25.0)
+        assert read.drones == never.drones
+        np.testing.assert_array_equal(read.seen, never.seen)
+
+    def test_existing_files_are_replaced_only_by_force(self, tmp_path):
+        (tmp_path / "dron2.tum").write_text("precious")
+        with pytest.raises(OutputError, match="pass --force"):
+            write_tum(tmp_path, two_drones())
+        assert [path.name for path in tmp_path.iterdir()] == ["dron2.tum"]
+        write_tum(tmp_path, two_drones(), force=True)
+        assert read_tum(tmp_path, fps=25.0).num_drones == 2
+
+    @pytest.mark.parametrize("name", ["a/b", ""])
+    def test_names_that_cannot_be_files(self, tmp_path, name):
+        with pytest.raises(InputError, match="names that can be names of files"):
+            write_tum(tmp_path, replace(two_drones(), drones=("fine", name)))
+        assert not list(tmp_path.iterdir())
+
+    @pytest.mark.parametrize(
+        ("line", "message"),
+        [
+            ("0.04 1 2 3 0 0 0", "line 3: expected 8 finite numbers"),
+            ("0.04 1 2 3 0 0 0 one", "line 3: expected 8 finite numbers"),
+            ("0.04 1 2 nan 0 0 0 1", "line 3: expected 8 finite numbers"),
+            ("0.04 1 2 3 0 0 0 0", "line 3: expected a quaternion"),
+            ("0.06 1 2 3 0 0 0 1", "line 3: expected the time of a frame at 25 fps, found 0.06 s"),
+            ("-0.04 1 2 3 0 0 0 1", "line 3: expected the time of a frame"),
+            ("0.0 1 2 3 0 0 0 1", "line 3: expected one line per frame, found a second one for frame 0"),
+        ],
+    )
+    def test_a_bad_line(self, tmp_path, line, message):
+        path = tmp_path / "dron1.tum"
+        path.write_text(f"# timestamp tx ty tz qx qy qz qw\n0 1 2 3 0 0 0 1\n{line}\n")
+        with pytest.raises(InputError, match=message) as caught:
+            read_tum(path, fps=25.0)
+        assert str(path) in str(caught.value)
+
+    def test_nothing_to_read(self, tmp_path):
+        with pytest.raises(InputError, match="expected a TUM file, or a folder with some"):
+            read_tum(tmp_path, fps=25.0)
+        (tmp_path / "empty.tum").write_text("# nothing\n")
+        with pytest.raises(InputError, match="expected at least one pose"):
+            read_tum(tmp_path, fps=25.0)
+        with pytest.raises(SettingsError, match="fps"):
+            read_tum(tmp_path, fps=0.0)

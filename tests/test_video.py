@@ -1,0 +1,250 @@
+"""Videos: exact counts and rates, broken files, and a writer that never leaves half a file."""
+
+import os
+import re
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
+from psotrack.video import VideoInfo, VideoWriter, probe, read_frames
+
+WIDTH, HEIGHT = 96, 64
+
+
+def grey(level: int) -> np.ndarray:
+    return np.full((HEIGHT, WIDTH, 3), level, np.uint8)
+
+
+def noise(num_frames: int) -> np.ndarray:
+    """Frames that compress badly, so that a cut file loses many of them."""
+    return np.random.default_rng(0).integers(0, 255, (num_frames, HEIGHT, WIDTH, 3), dtype=np.uint8)
+
+
+def write(path: Path, frames: Iterable[np.ndarray], fps: float = 25.0) -> Path:
+    with VideoWriter(path, fps, (WIDTH, HEIGHT)) as writer:
+        for frame in frames:
+            writer.write(frame)
+    return path
+
+
+@pytest.mark.parametrize("fps", [25.0, 24000 / 1001, 29.97, 30000 / 1001, 59.94, 100.0, 12.5])
+def test_frame_rate_is_not_truncated(tmp_path, fps):
+    video = probe(write(tmp_path / "a.avi", noise(2), fps))
+    # The container's clock is a multiple of 0.001 per second.
+    assert video.fps == pytest.approx(fps, abs=1e-3)
+
+
+@pytest.mark.parametrize("num_frames", [1, 2, 13, 61])
+def test_what_is_written_is_read(tmp_path, num_frames):
+    levels = 16 * np.random.default_rng(0).permutation(64)[:num_frames] % 256
+    path = write(tmp_path / "a.avi", [grey(level) for level in levels])
+    video = probe(path)
+    assert video == VideoInfo(path, num_frames, 25.0, (WIDTH, HEIGHT))
+    read = [frame.mean() for frame in read_frames(video)]
+    # The codec moves flat frames by up to 3.7 of 255 (measured); levels differ by 16, so a shift fails.
+    np.testing.assert_allclose(read, levels, atol=6)
+    assert next(read_frames(video)).shape == (HEIGHT, WIDTH, 3)
+
+
+@pytest.mark.parametrize("step", [1, 2, 5, 100])
+def test_a_step_reads_every_nth_frame(tmp_path, step):
+    video = probe(write(tmp_path / "a.avi", noise(11)))
+    every = list(read_frames(video))
+    some = list(read_frames(video, step))
+    assert len(some) == len(range(0, 11, step))
+    np.testing.assert_array_equal(some, every[::step])
+
+
+def test_leading_frames_alone(tmp_path):
+    video = probe(write(tmp_path / "a.avi", noise(11)))
+    assert len(list(read_frames(replace(video, num_frames=4)))) == 4
+
+
+def test_step_of_zero_is_refused(tmp_path):
+    video = probe(write(tmp_path / "a.avi", noise(1)))
+    with pytest.raises(SettingsError, match="step: expected 1 or more, found 0"):
+        next(read_frames(video, 0))
+
+
+def test_mp4_with_29_97_by_another_writer(tmp_path):
+    path = tmp_path / "a.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 29.97, (WIDTH, HEIGHT))
+    for frame in noise(7):
+        writer.write(frame)
+    writer.release()
+    video = probe(path)
+    assert (video.num_frames, video.image_size_wh) == (7, (WIDTH, HEIGHT))
+    assert video.fps == pytest.approx(29.97, abs=1e-3)
+    assert len(list(read_frames(video))) == 7
+
+
+def test_a_name_that_looks_like_a_protocol(tmp_path, monkeypatch):
+    """FFmpeg would take `cam:` for a protocol."""
+    write(tmp_path / "cam:1 %02d.avi", noise(3))
+    monkeypatch.chdir(tmp_path)
+    assert probe(Path("cam:1 %02d.avi")).num_frames == 3
+
+
+@pytest.mark.parametrize("part", [0.2, 0.5, 0.95])
+def test_a_truncated_video_names_file_and_frame(tmp_path, part, capfd):
+    path = write(tmp_path / "cam1i_s.avi", noise(40))
+    content = path.read_bytes()
+    path.write_bytes(content[: int(part * len(content))])
+    video = probe(path)
+    assert video.num_frames == 40  # the header still says so
+    with pytest.raises(InputError) as caught:
+        list(read_frames(video))
+    message = str(caught.value)
+    reached = int(re.search(r"only (\d+) can be decoded", message)[1])
+    assert message.startswith(f"{path}: expected 40 frames, found that only {reached} can be decoded")
+    assert 0 < reached < 40
+    assert f"--frames {reached}" in message
+    # With a step, the same frame is named.
+    with pytest.raises(InputError, match=f"only {reached} can be decoded"):
+        list(read_frames(video, 7))
+    # Its good frames can be used.
+    assert len(list(read_frames(replace(video, num_frames=reached)))) == reached
+    assert capfd.readouterr().err == ""
+
+
+def test_a_hole_in_a_video_is_found(tmp_path, capfd):
+    path = write(tmp_path / "cam1i_s.avi", noise(40))
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + len(content) // 4] = bytes(len(content) // 4)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"cam1i_s\.avi: expected 40 frames, found that only \d+"):
+        list(read_frames(probe(path)))
+    assert capfd.readouterr().err == ""
+
+
+def test_missing(tmp_path):
+    with pytest.raises(InputError, match=r"nix\.avi: expected a video, found no such file"):
+        probe(tmp_path / "nix.avi")
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        (b"", "an empty file"),
+        (b"frame;x;y\n" * 500, "a file that FFmpeg cannot open"),
+        (bytes(5000), "a file that FFmpeg cannot open"),
+        (b"RIFF\x00\x10\x00\x00AVI ", "a file that FFmpeg cannot open"),
+    ],
+)
+def test_no_video(tmp_path, content, found, capfd):
+    path = tmp_path / "a.avi"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=rf"a\.avi: expected a video, found {found}"):
+        probe(path)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_folder_is_no_video(tmp_path):
+    with pytest.raises(InputError, match="expected a video, found is a directory"):
+        probe(tmp_path)
+
+
+def test_a_video_without_frames(tmp_path):
+    path = tmp_path / "a.avi"
+    cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"XVID"), 25, (WIDTH, HEIGHT)).release()
+    with pytest.raises(InputError, match="expected a video with frames, found none"):
+        probe(path)
+
+
+def test_opening_leaves_the_process_as_it_was(tmp_path, monkeypatch):
+    path = write(tmp_path / "a.avi", noise(1))
+    level, environment = cv2.utils.logging.getLogLevel(), dict(os.environ)
+    probe(path)
+    assert (cv2.utils.logging.getLogLevel(), dict(os.environ)) == (level, environment)
+    monkeypatch.setenv("OPENCV_FFMPEG_LOGLEVEL", "16")
+    probe(path)
+    assert os.environ["OPENCV_FFMPEG_LOGLEVEL"] == "16"
+
+
+def test_writer_makes_the_folder_and_replaces_only_when_whole(tmp_path):
+    path = write(tmp_path / "new" / "a.avi", noise(3))
+    before = path.read_bytes()
+
+    def interrupted():
+        yield grey(0)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write(path, interrupted())
+    assert path.read_bytes() == before
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_a_video_of_no_frames_is_not_written(tmp_path):
+    with pytest.raises(OutputError, match="expected at least one frame"):
+        write(tmp_path / "a.avi", [])
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "fps", "size_wh", "where"),
+    [
+        ("a.mkv", 25.0, (WIDTH, HEIGHT), "video"),
+        ("a.avi", 0.0, (WIDTH, HEIGHT), "fps"),
+        ("a.avi", float("nan"), (WIDTH, HEIGHT), "fps"),
+        ("a.avi", 25.0, (WIDTH + 1, HEIGHT), "image size"),
+        ("a.avi", 25.0, (WIDTH, 0), "image size"),
+    ],
+)
+def test_settings_that_cannot_be_written(tmp_path, name, fps, size_wh, where):
+    with pytest.raises(SettingsError, match=f"^{where}: expected"):
+        VideoWriter(tmp_path / name, fps, size_wh)
+
+
+def test_a_frame_of_another_size_is_refused(tmp_path):
+    """OpenCV drops such a frame without a word."""
+    path = tmp_path / "a.avi"
+    with (
+        pytest.raises(SettingsError, match=r"frame: expected shape \(64, 96, 3\)"),
+        VideoWriter(path, 25.0, (WIDTH, HEIGHT)) as writer,
+    ):
+        writer.write(np.zeros((HEIGHT, WIDTH + 2, 3), np.uint8))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_writing_where_a_file_stands_for_a_folder(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(PsotrackError, match=r"a\.avi: expected to write it"):
+        write(tmp_path / "file" / "a.avi", noise(1))
+
+
+def test_a_full_disk_is_an_error_and_costs_nothing(tmp_path):
+    """A file size limit stands for the full disk: FFmpeg's writes fail in the same silence."""
+    path = write(tmp_path / "a.avi", noise(2))
+    before = path.read_bytes()
+    script = textwrap.dedent(
+        """
+        import resource, sys
+        from pathlib import Path
+        import numpy as np
+        from psotrack.errors import OutputError
+        from psotrack.video import VideoWriter
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+        rng = np.random.default_rng(0)
+        try:
+            with VideoWriter(Path(sys.argv[1]), 25.0, (96, 64)) as writer:
+                for _ in range(200):
+                    writer.write(rng.integers(0, 255, (64, 96, 3), dtype=np.uint8))
+        except OutputError as error:
+            print(error)
+        """
+    )
+    done = subprocess.run([sys.executable, "-c", script, path], capture_output=True, text=True, timeout=60)
+    assert "a.avi: expected to write 200 frames, found" in done.stdout, done.stderr
+    assert "is the disk full?" in done.stdout
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
