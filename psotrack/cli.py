@@ -140,6 +140,28 @@ def cli(verbose: bool) -> None:
 
 
 @cli.command()
+@_SEQUENCE
+@_FORCE
+@_JSON
+def info(sequence: Path, force: bool, json_path: Path | None) -> None:
+    """Show what SEQ holds, and read all of it but the videos' frames, so that what is broken shows.
+
+    \b
+    Example:
+      psotrack info data/Simulated_Data/S02_D4_A
+    """
+    from rich.console import Console
+
+    from psotrack.contents import contents, render
+    from psotrack.datasets.dpjait import read_sequence
+
+    content = contents(read_sequence(sequence))
+    _answer(json_path, content, force)
+    if json_path != Path("-"):
+        Console().print(render(content))
+
+
+@cli.command()
 @click.argument("name")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="The data's root folder.")
 @click.option("--frames", "num_frames", type=int, metavar="N", help="First N frames only.  [default: all]")
@@ -432,11 +454,15 @@ def demo(out: Path, seed: int, jobs: int | None, force: bool, quiet: bool) -> No
 def main() -> None:
     """Run the command line; what psotrack raises on purpose becomes one line and exit code 2."""
     try:
-        cli.main(standalone_mode=False)
+        # Not `cli.main`, which would make two lines of Ctrl-C.
+        with cli.make_context("psotrack", sys.argv[1:]) as context:
+            cli.invoke(context)
+    except click.exceptions.Exit as done:
+        sys.exit(done.exit_code)
     except click.ClickException as error:
         error.show()
         sys.exit(2)
-    except (click.Abort, KeyboardInterrupt):
+    except KeyboardInterrupt:
         sys.stderr.write(
             "psotrack: interrupted; earlier results are unchanged, and the same command goes on\n"
         )

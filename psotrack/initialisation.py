@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy.optimize import linear_sum_assignment
 
 from psotrack.cameras import Camera, project
-from psotrack.triangulation import match_views
+from psotrack.triangulation import match_views, triangulate
 
 #: Foreground smaller than this, in pixels of the image, is no drone.
 MIN_BLOB_PX = 60
@@ -124,11 +124,14 @@ def _sightings(
     points, support = match_views(cameras, centres, radius, bounds_m)
     sightings = []
     for row, point in enumerate(points):
-        size_px = np.full((len(blobs), 2), np.nan)
+        centre_px, size_px = np.full((2, len(blobs), 2), np.nan)
         for camera, blob in enumerate(support[row]):
             shared = np.count_nonzero(support[:, camera] == blob) > 1
             if blob >= 0 and not shared and blobs[camera].whole[blob]:
-                size_px[camera] = blobs[camera].size_px[blob]
+                centre_px[camera], size_px[camera] = centres[camera][blob], blobs[camera].size_px[blob]
+        # The middle of a blob that drones share, or that the border cuts, is the middle of none of them.
+        if np.isfinite(centre_px).all(axis=-1).sum() >= 3:
+            point = triangulate(cameras, centre_px)
         sightings.append(_Sighting(frame, point, int((support[row] >= 0).sum()), size_px))
     return sightings
 

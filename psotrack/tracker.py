@@ -178,9 +178,13 @@ def track(
 
 def _reachable(state: TrackerState, params: TrackerParams) -> tuple[Positions, Positions]:
     """Bounds of the search for each drone: where it can have got to since it was last found, within the room."""
-    reach = params.max_speed_m_s * params.dt_s * (1 + state.missed[:, None])
+    reach = params.max_speed_m_s * params.dt_s * _frames_since_found(state)
     low, high = params.bounds_m
     return jnp.clip(state.position_m - reach, low, high), jnp.clip(state.position_m + reach, low, high)
+
+
+def _frames_since_found(state: TrackerState) -> Float[Array, "drones 1"]:
+    return 1.0 + state.missed[:, None].astype(jnp.float32)
 
 
 def _search(
@@ -195,7 +199,7 @@ def _search(
 ) -> Positions:
     """The best positions that the swarm finds about the prediction."""
     particles, drones = program.num_particles, predicted.shape[0]
-    spread = params.spread_m * (1 + state.missed[:, None])
+    spread = params.spread_m * _frames_since_found(state)
     start = predicted + spread * jax.random.normal(key_spread, (particles, drones, 3))
     # The prediction and the last position are particles too: a drone that flies on, or stands, is found at once.
     start = jnp.asarray(start).at[0].set(predicted).at[1].set(state.position_m)

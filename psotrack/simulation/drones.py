@@ -191,8 +191,8 @@ def tall_cross() -> DroneModel:
     for angle in np.radians(arms):
         parts.append((_turned(beam((0.03, 0.0, 0.002), (0.21, 0.0, 0.002), 0.020, 0.018), angle), 0.7))
     for angle in np.radians((45.0, 135.0, 225.0, 315.0)):
-        parts.append((_turned(beam((0.045, 0.0, -0.01), (0.115, 0.0, -0.125), 0.012, 0.012), angle), 0.3))
-        parts.append((_turned(box((0.118, 0.0, -0.13), (0.03, 0.018, 0.012)), angle), 0.2))
+        parts.append((_turned(beam((0.045, 0.0, -0.01), (0.115, 0.0, -0.105), 0.012, 0.012), angle), 0.3))
+        parts.append((_turned(box((0.118, 0.0, -0.11), (0.03, 0.018, 0.012)), angle), 0.2))
     return _assembled(parts, motors, 0.092)
 
 

@@ -1,0 +1,361 @@
+"""The command line as people and programs use it: the contract's commands, and one clear line for bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from psotrack import cli
+from psotrack.video import VideoWriter, probe, read_frames
+
+COLUMNS = [
+    *("frame", "time_s", "drone", "x_m", "y_m", "z_m", "vx_m_s", "vy_m_s", "vz_m_s"),
+    *("fitness", "num_cameras", "status"),
+]
+#: The contract's keys.
+ERRORS = [
+    *("frames", "drones", "mean_error_m", "median_error_m", "std_error_m", "p95_error_m", "max_error_m"),
+    *("missed_rate", "id_switches", "mota", "motp_m", "idf1", "matched_mean_error_m"),
+    *("offset_removed_mean_error_m", "per_drone"),
+]
+NUM_FRAMES = 12
+#: All but the last: drones of a dozen pixels are found by themselves only where many cameras see them.
+CAMERAS = ",".join(f"cam{i}i" for i in range(1, 8))
+
+
+@dataclass(frozen=True)
+class Answer:
+    code: int
+    out: str
+    err: str
+
+
+Run = Callable[..., Answer]
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a small sequence, its silhouettes, and nothing else."""
+    root = tmp_path_factory.mktemp("data")
+    command = ["simulate", "S02_D4_A", "--out", str(root), "--scale", "0.25", "--frames", str(NUM_FRAMES)]
+    subprocess.run([sys.executable, "-m", "psotrack", *command, "--quiet"], check=True)
+    return root
+
+
+@pytest.fixture
+def sequence(data: Path, tmp_path: Path) -> Path:
+    """A copy of the small sequence that a test may spoil."""
+    return shutil.copytree(data / "Simulated_Data" / "S02_D4_A", tmp_path / "S02_D4_A")
+
+
+@pytest.fixture
+def run(data: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Run:
+    """Runs `psotrack` with some arguments in this process; silhouettes are shared by the tests of this file."""
+    monkeypatch.setenv("PSOTRACK_CACHE", str(data / "cache"))
+
+    def call(*arguments: object) -> Answer:
+        monkeypatch.setattr(sys, "argv", ["psotrack", *map(str, arguments)])
+        capfd.readouterr()
+        try:
+            cli.main()
+            code = 0
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        return Answer(code, *capfd.readouterr())
+
+    return call
+
+
+def track(sequence: Path, out: Path, *more: object) -> list[object]:
+    """A quick `track`: the small sequence has large pixels."""
+    return ["track", sequence, "--out", out, "--reduction", 2, "--particles", 20, "--iterations", 15, *more]
+
+
+def assert_one_line(answer: Answer, *words: str) -> None:
+    assert answer.code == 2, answer
+    assert answer.out == ""
+    assert answer.err.count("\n") == 1, answer.err
+    assert answer.err.startswith("psotrack: ")
+    for word in words:
+        assert word in answer.err, answer.err
+
+
+def rewrite_video(path: Path, *, frames: int | None = None, size_wh: tuple[int, int] | None = None) -> None:
+    """The video again, with fewer frames or cut to another size."""
+    video = probe(path)
+    images = list(read_frames(video))[:frames]
+    width, height = size_wh or video.image_size_wh
+    path.unlink()
+    with VideoWriter(path, video.fps, (width, height)) as writer:
+        for image in images:
+            writer.write(np.ascontiguousarray(image[:height, :width]))
+
+
+def test_the_contract_from_videos_to_errors(run: Run, sequence: Path, tmp_path: Path) -> None:
+    tracks, answer = tmp_path / "tracks.csv", tmp_path / "out.json"
+    assert run(*track(sequence, tracks, "--seed", 3)).code == 0
+    table = pd.read_csv(tracks)
+    assert list(table.columns) == COLUMNS
+    assert len(table) == NUM_FRAMES * 4
+    assert set(table["frame"]) == set(range(NUM_FRAMES))
+    assert set(table["status"]) <= {"tracked", "coasting", "lost"}
+    np.testing.assert_allclose(table["time_s"], table["frame"] / 25)
+
+    record = json.loads(tracks.with_suffix(".json").read_text())
+    assert record["seed"] == 3
+    assert record["settings"]["particles"] == 20
+    assert set(record["seconds"]) == {"decode", "foreground", "track", "compile", "total"}
+    assert set(record["input_keys"]) == {f"cam{i}i" for i in range(1, 9)}
+    assert {"python", "jax", "numpy", "psotrack"} <= set(record["versions"])
+    assert record["device"]["platform"]
+
+    assert run("evaluate", tracks, sequence, "--json", answer, "--plot", tmp_path / "p.png").code == 0
+    errors = json.loads(answer.read_text())
+    assert list(errors) == ERRORS
+    assert errors["frames"] == NUM_FRAMES - 1, "frame 0 is the placeholder row"
+    assert errors["drones"] == 4
+    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
+    # A pixel of this small image is 2 to 3 cm at the drones, and a silhouette cell two pixels.
+    assert errors["mean_error_m"] < 0.15
+
+
+def test_parquet_holds_what_csv_holds(run: Run, sequence: Path, tmp_path: Path) -> None:
+    for suffix in ("csv", "parquet"):
+        assert run(*track(sequence, tmp_path / f"{suffix}" / f"tracks.{suffix}")).code == 0
+    csv, parquet = (
+        pd.read_csv(tmp_path / "csv/tracks.csv"),
+        pd.read_parquet(tmp_path / "parquet/tracks.parquet"),
+    )
+    assert list(parquet.columns) == COLUMNS
+    np.testing.assert_array_equal(csv[["x_m", "y_m", "z_m"]], parquet[["x_m", "y_m", "z_m"]])
+
+
+def test_a_second_call_reads_the_stored_silhouettes(run: Run, sequence: Path, tmp_path: Path) -> None:
+    first = run("silhouettes", sequence, "--reduction", 2, "--json", "-")
+    again = run("silhouettes", sequence, "--reduction", 2, "--json", "-")
+    assert first.code == again.code == 0
+    assert json.loads(again.out)["keys"] == json.loads(first.out)["keys"]
+    assert json.loads(again.out)["seconds"] == {"decode": 0.0, "foreground": 0.0}
+
+
+def test_quiet_says_nothing_and_no_terminal_means_no_bars(run: Run, sequence: Path, tmp_path: Path) -> None:
+    tracks = tmp_path / "tracks.csv"
+    assert run(*track(sequence, tracks, "--quiet")) == Answer(0, "", "")
+    loud = run("evaluate", tracks, sequence)
+    assert loud.code == 0
+    assert "MOTA" in loud.out
+    assert loud.err == ""
+
+
+def test_init_from_truth_and_from_tracks(run: Run, sequence: Path, tmp_path: Path) -> None:
+    assert run(*track(sequence, tmp_path / "a.csv", "--init", "truth")).code == 0
+    assert run(*track(sequence, tmp_path / "b.csv", "--init", tmp_path / "a.csv", "--drones", 2)).code == 0
+    first, second = pd.read_csv(tmp_path / "a.csv"), pd.read_csv(tmp_path / "b.csv")
+    assert set(first["drone"]) == {0, 1, 2, 3}
+    assert set(second["drone"]) == {0, 1}
+
+
+def test_the_paper_baseline_runs(run: Run, sequence: Path, tmp_path: Path) -> None:
+    answer = run(*track(sequence, tmp_path / "t.csv", "--swarm", "joint", "--score", "hard"))
+    assert answer.code == 0
+    settings = json.loads((tmp_path / "t.json").read_text())["settings"]
+    assert (settings["swarm"], settings["score"]) == ("joint", "hard")
+
+
+def test_fewer_cameras_and_frames_by_choice(run: Run, sequence: Path, tmp_path: Path) -> None:
+    (sequence / "cam8i_s.avi").unlink()
+    answer = run(*track(sequence, tmp_path / "t.csv", "--cameras", CAMERAS, "--frames", 11))
+    assert answer.code == 0
+    assert json.loads((tmp_path / "t.json").read_text())["cameras"] == CAMERAS.split(",")
+    assert pd.read_csv(tmp_path / "t.csv")["frame"].max() == 10
+
+
+def test_info_shows_what_a_sequence_holds(run: Run, sequence: Path) -> None:
+    answer = run("info", sequence, "--json", "-")
+    assert answer.code == 0
+    content = json.loads(answer.out)
+    assert content["drones"] == ["dron1", "dron2", "dron3", "dron4"]
+    assert content["cameras"]["cam1i"]["frames"] == NUM_FRAMES
+    assert run("info", sequence).out.count("480 x 270") == 8
+
+
+@pytest.mark.parametrize("command", ["simulate", "silhouettes", "track", "evaluate", "demo", "info"])
+def test_help_has_an_example(run: Run, command: str) -> None:
+    answer = run(command, "--help")
+    assert answer.code == 0
+    assert re.search(rf"Examples?:\n +psotrack {command} ", answer.out)
+
+
+def test_command_line_defaults_are_those_of_the_settings() -> None:
+    from psotrack.settings import TrackSettings
+
+    defaults = {option.name: option.default for option in cli.track.params}
+    compared = [name for name in TrackSettings.__struct_fields__ if name in defaults]
+    assert len(compared) > 8
+    for name in compared:
+        default = getattr(TrackSettings(), name)
+        # A flag without a default leaves the setting's own.
+        assert defaults[name] == default or default is None, name
+
+
+def test_results_are_not_overwritten_without_force(run: Run, sequence: Path, tmp_path: Path) -> None:
+    tracks = tmp_path / "tracks.csv"
+    tracks.write_text("precious")
+    assert_one_line(run(*track(sequence, tracks)), "tracks.csv", "--force")
+    assert tracks.read_text() == "precious"
+    assert run(*track(sequence, tracks, "--force")).code == 0
+    assert tracks.read_text() != "precious"
+
+
+class TestBadInput:
+    """Each gets one line that names the file, and leaves an earlier result as it was."""
+
+    @pytest.fixture
+    def fails(self, run: Run, tmp_path: Path) -> Callable[..., None]:
+        out = tmp_path / "tracks.csv"
+        out.write_text("earlier")
+
+        def check(sequence: Path, *words: str, more: tuple[object, ...] = ()) -> None:
+            assert_one_line(run(*track(sequence, out, "--force", *more)), *words)
+            assert out.read_text() == "earlier"
+            assert sorted(path.name for path in tmp_path.glob(".*")) == []
+
+        return check
+
+    def test_no_such_sequence(self, fails: Callable[..., None], tmp_path: Path) -> None:
+        fails(tmp_path / "nowhere", "nowhere")
+
+    def test_missing_video(self, fails: Callable[..., None], sequence: Path) -> None:
+        (sequence / "cam3i_s.avi").unlink()
+        fails(sequence, "cam3i", "--cameras cam1i,cam2i,cam4i")
+
+    def test_truncated_video(self, fails: Callable[..., None], sequence: Path) -> None:
+        path = sequence / "cam2i_s.avi"
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+        fails(sequence, "cam2i_s.avi")
+
+    def test_empty_video(self, fails: Callable[..., None], sequence: Path) -> None:
+        (sequence / "cam2i_s.avi").write_bytes(b"")
+        fails(sequence, "cam2i_s.avi")
+
+    def test_videos_of_different_length(self, fails: Callable[..., None], sequence: Path) -> None:
+        rewrite_video(sequence / "cam5i_s.avi", frames=9)
+        fails(sequence, "cam5i_s.avi", "12", "9", "--frames 9")
+
+    def test_videos_of_different_size(self, fails: Callable[..., None], sequence: Path) -> None:
+        rewrite_video(sequence / "cam5i_s.avi", size_wh=(400, 200))
+        fails(sequence, "cam5i_s.avi", "400 x 200", "480 x 270")
+
+    def test_unreadable_calibration(self, fails: Callable[..., None], sequence: Path) -> None:
+        path = sequence / "cameras_calibration.csv"
+        path.write_text(path.read_text().replace(";", "|"))
+        fails(sequence, "cameras_calibration.csv")
+
+    def test_missing_calibration(self, fails: Callable[..., None], sequence: Path) -> None:
+        (sequence / "cameras_calibration.csv").unlink()
+        fails(sequence, "cameras_calibration.csv")
+
+    def test_nan_in_a_reference(self, fails: Callable[..., None], sequence: Path) -> None:
+        path = sequence / "dron2_pos_25.csv"
+        lines = path.read_text().splitlines()
+        fields = lines[5].split(";")
+        lines[5] = ";".join([fields[0], "nan", *fields[2:]])
+        path.write_text("\n".join(lines) + "\n")
+        fails(sequence, "dron2_pos_25.csv", "line 6", "nan")
+
+    def test_no_drones(self, fails: Callable[..., None], sequence: Path) -> None:
+        fails(sequence, "drones", "at least 1", "0", more=("--drones", 0))
+
+    def test_more_drones_than_are_there(self, fails: Callable[..., None], sequence: Path) -> None:
+        fails(sequence, "7 drones", "4", more=("--drones", 7))
+
+    def test_a_start_that_is_no_file(self, fails: Callable[..., None], sequence: Path) -> None:
+        fails(sequence, "start.csv", more=("--init", "start.csv"))
+
+    def test_unknown_camera(self, fails: Callable[..., None], sequence: Path) -> None:
+        fails(sequence, "cam9", more=("--cameras", "cam1i,cam9"))
+
+    def test_broken_detections(self, run: Run, sequence: Path) -> None:
+        (sequence / "dl_data").mkdir()
+        (sequence / "dl_data" / "cam1i_s.csv").write_text("0,1,2,3,4,2.5,4,0.9\n1,5,6\n")
+        assert_one_line(run("info", sequence), "cam1i_s.csv", "line 2")
+
+    def test_tracks_that_are_none(self, run: Run, sequence: Path, tmp_path: Path) -> None:
+        (tmp_path / "t.csv").write_text("frame,drone\n0,1\n")
+        assert_one_line(run("evaluate", tmp_path / "t.csv", sequence), "t.csv", "x_m")
+
+    def test_wrong_suffix(self, run: Run, sequence: Path, tmp_path: Path) -> None:
+        assert_one_line(run("track", sequence, "--out", tmp_path / "t.xlsx"), ".csv or .parquet", "t.xlsx")
+
+    def test_unknown_scenario(self, run: Run, tmp_path: Path) -> None:
+        assert_one_line(run("simulate", "S99", "--out", tmp_path), "S99", "S02_D4_A")
+
+    @pytest.mark.parametrize("setting", [("--scale", 0), ("--frames", 0), ("--frames", 100000)])
+    def test_impossible_simulation(self, run: Run, tmp_path: Path, setting: tuple[str, object]) -> None:
+        assert_one_line(run("simulate", "S02_D4_A", "--out", tmp_path, *setting), setting[0].strip("-"))
+        assert list(tmp_path.iterdir()) == []
+
+    def test_usage_errors_exit_with_2(self, run: Run) -> None:
+        answer = run("track", "--no-such-flag")
+        assert answer.code == 2
+        assert "no-such-flag" in answer.err
+
+
+def test_a_full_disk_leaves_earlier_results(run: Run, data: Path, sequence: Path, tmp_path: Path) -> None:
+    """A limit on the size of files stands for the full disk: every write beyond it fails."""
+    tracks = tmp_path / "tracks.csv"
+    arguments = [str(word) for word in track(sequence, tracks)]
+    assert run(*arguments).code == 0
+    earlier = tracks.read_bytes(), tracks.with_suffix(".json").read_bytes()
+    limited = (
+        "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (512, 512)); "
+        "from psotrack.cli import main; main()"
+    )
+    answer = subprocess.run(
+        [sys.executable, "-c", limited, *arguments, "--force", "--seed", "9"],
+        env={**os.environ, "PSOTRACK_CACHE": str(data / "cache")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert_one_line(Answer(answer.returncode, answer.stdout, answer.stderr), "tracks.csv", "unchanged")
+    assert (tracks.read_bytes(), tracks.with_suffix(".json").read_bytes()) == earlier
+    assert list(tmp_path.glob(".*")) == []
+
+
+def test_ctrl_c_leaves_earlier_results(sequence: Path, tmp_path: Path) -> None:
+    tracks, cache = tmp_path / "tracks.csv", tmp_path / "cache"
+    tracks.write_text("earlier")
+    process = subprocess.Popen(
+        [
+            sys.executable,
+            "-m",
+            "psotrack",
+            *map(str, track(sequence, tracks, "--force", "--iterations", 100000)),
+        ],
+        env={**os.environ, "PSOTRACK_CACHE": str(cache)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    while not cache.exists():
+        assert process.poll() is None
+        time.sleep(0.05)
+    time.sleep(0.3)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert_one_line(Answer(process.returncode, out, err), "interrupted")
+    assert tracks.read_text() == "earlier"

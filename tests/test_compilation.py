@@ -1,0 +1,68 @@
+"""How often the tracker is compiled: once per shape and `Program`, for whatever numbers it is then called with."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import ROOM_M, float32, ring_rig
+
+from psotrack import tracker
+from psotrack.initialisation import Start
+from psotrack.pipeline import TrackSettings, tracker_inputs
+
+
+def run(*, num_frames=5, num_drones=2, seed=0, size_m=0.4, focal=1.0, **settings):
+    """Track noise, and wait for the result."""
+    rng = np.random.default_rng(seed)
+    start = Start(
+        position_m=rng.uniform(-1, 1, (num_drones, 3)),
+        velocity_m_s=np.zeros((num_drones, 3)),
+        size_m=np.full((num_drones, 3), size_m),
+        num_cameras=np.full(num_drones, 3.0),
+    )
+    settings = TrackSettings(**({"particles": 7, "iterations": 3, "seed": seed} | settings))
+    program, params = tracker_inputs(8, start, settings, fps=25.0 + seed, bounds_m=ROOM_M * (1 + 0.1 * seed))
+    cameras = float32(ring_rig(3).cameras)
+    cameras = replace(cameras, K=cameras.K * focal)
+    state = tracker.init(jax.random.key(seed), *float32((start.position_m, start.velocity_m_s)), params)
+    coverage = rng.integers(0, 256, (num_frames, 3, 30, 40)).astype(np.uint8)
+    state, _ = tracker.track(state, coverage, cameras, params, program)
+    # And the next chunk, whose state comes from the device.
+    return jax.block_until_ready(tracker.track(state, jnp.asarray(coverage), cameras, params, program))
+
+
+@pytest.fixture
+def compiled(caplog):
+    """Call it for the names of what was compiled since the last call."""
+    with jax.log_compiles(), caplog.at_level("WARNING", logger="jax"):
+
+        def since_last():
+            lines = [record.getMessage() for record in caplog.records]
+            caplog.clear()
+            return [line.split()[1] for line in lines if line.startswith("Compiling ")]
+
+        yield since_last
+
+
+def test_a_second_sequence_compiles_nothing(compiled):
+    run()
+    assert any("track" in name for name in compiled())
+    run(seed=1, size_m=0.7, focal=1.1, iterations=9, max_speed_m_s=3.0, inertia=0.4, min_fitness=0.3)
+    run(seed=2, iterations=0, cognitive=2.0, social=0.1, spread_m=0.2, min_cameras=1, max_coasting_s=2.0)
+    run(seed=3, position_gain=0.5, velocity_gain=0.9)
+    assert compiled() == []
+
+
+@pytest.mark.parametrize(
+    "change", [{"num_frames": 6}, {"num_drones": 3}, {"particles": 8}, {"swarm": "joint"}, {"score": "hard"}]
+)
+def test_another_shape_or_program_compiles_once(compiled, change):
+    """Also shows that the count above can see a compilation."""
+    run()
+    compiled()
+    run(**change)
+    assert sum("track" in name for name in compiled()) == 1
+    run(**change, seed=1)
+    assert compiled() == []

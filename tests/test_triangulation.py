@@ -1,0 +1,195 @@
+"""Points from pixels: exact cases, OpenCV for two cameras, least squares written out; and who belongs to whom."""
+
+import cv2
+import numpy as np
+import pytest
+from helpers import LENSES, ROOM_M, rig_of, ring_rig
+
+from psotrack.cameras import project
+from psotrack.triangulation import match_views, triangulate, viewpoints
+
+
+def points_in_room(*shape, seed=0):
+    return np.random.default_rng(seed).uniform((-1.5, -1.5, 0.3), (1.5, 1.5, 2.3), (*shape, 3))
+
+
+def pixels_of(rig, points):
+    return project(rig.cameras, points[..., None, :])[0]
+
+
+@pytest.mark.parametrize("coefficients", sorted(LENSES))
+@pytest.mark.parametrize(("num_cameras", "shape"), [(2, (7,)), (3, (5, 2)), (5, ()), (7, (3,))])
+def test_exact_pixels_give_the_point(num_cameras, shape, coefficients):
+    rig, points = ring_rig(num_cameras, coefficients=coefficients), points_in_room(*shape)
+    found = triangulate(rig.cameras, pixels_of(rig, points))
+    assert found.shape == points.shape
+    # The lens is undone to 1e-8 (see test_cameras), which is 4e-8 m at 4 m; two cameras stretch it a little.
+    np.testing.assert_allclose(found, points, atol=1e-6)
+
+
+def test_two_cameras_agree_with_opencv():
+    rig, points = ring_rig(2), points_in_room(31)
+    noise = np.random.default_rng(1).normal(0, 0.3, (31, 2, 2))
+    pixels = pixels_of(rig, points) + noise
+    projections = rig.cameras.K @ rig.cameras.T_cam_world[:, :3]
+    homogeneous = cv2.triangulatePoints(*projections, pixels[:, 0].T.copy(), pixels[:, 1].T.copy())
+    expected = (homogeneous[:3] / homogeneous[3]).T
+    # Both solve the same four equations, OpenCV with a norm of one on (X, 1), in pixels: with noise of 0.3 px, a point
+    # is off by 5 mm, and the two differ where the rays miss each other: measured 0.2 mm, limit 1 mm.
+    np.testing.assert_allclose(triangulate(rig.cameras, pixels), expected, atol=1e-3)
+    exact = pixels_of(rig, points)
+    homogeneous = cv2.triangulatePoints(*projections, exact[:, 0].T.copy(), exact[:, 1].T.copy())
+    np.testing.assert_allclose(
+        triangulate(rig.cameras, exact), (homogeneous[:3] / homogeneous[3]).T, atol=1e-6
+    )
+
+
+def test_weighted_least_squares():
+    """Equations (3) of the paper, written out and given to `lstsq`, with noise so that no point solves them."""
+    rig, points = ring_rig(5), points_in_room(11)
+    rng = np.random.default_rng(2)
+    pixels = pixels_of(rig, points) + rng.normal(0, 1.0, (11, 5, 2))
+    weights = rng.uniform(0.1, 2, (11, 5))
+    found = triangulate(rig.cameras, pixels, weights)
+    for n in range(11):
+        rows, right = [], []
+        for c in range(5):
+            x, y, _ = np.linalg.inv(rig.cameras.K[c]) @ (*pixels[n, c], 1)
+            r1, r2, r3, _ = rig.cameras.T_cam_world[c]
+            for r, value in ((r1, x), (r2, y)):
+                rows.append(np.sqrt(weights[n, c]) * (value * r3[:3] - r[:3]))
+                right.append(np.sqrt(weights[n, c]) * (r[3] - value * r3[3]))
+        expected = np.linalg.lstsq(np.array(rows), np.array(right))[0]
+        # Normal equations square the condition number, here about 10.
+        np.testing.assert_allclose(found[n], expected, atol=1e-10)
+
+
+def test_a_camera_that_does_not_see_the_point_does_not_count():
+    rig, points = ring_rig(5), points_in_room(7)
+    pixels = pixels_of(rig, points) + np.random.default_rng(3).normal(0, 1, (7, 5, 2))
+    gone = pixels.copy()
+    gone[:, 1] = np.nan
+    gone[:, 3, 0] = np.nan
+    without = rig.select(["c0", "c2", "c4"])
+    expected = triangulate(without.cameras, pixels[:, [0, 2, 4]])
+    np.testing.assert_allclose(triangulate(rig.cameras, gone), expected, atol=1e-12)
+    weights = np.array([1.0, 0.0, 1.0, 0.0, 1.0]) * np.ones((7, 1))
+    np.testing.assert_allclose(triangulate(rig.cameras, pixels, weights), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("num_seeing", [0, 1])
+def test_too_few_cameras_is_nan(num_seeing):
+    rig, points = ring_rig(5), points_in_room(3)
+    pixels = pixels_of(rig, points)
+    pixels[1, num_seeing:] = np.nan
+    found = triangulate(rig.cameras, pixels)
+    assert np.isnan(found[1]).all()
+    np.testing.assert_allclose(found[[0, 2]], points[[0, 2]], atol=1e-6)
+
+
+def test_rays_from_one_spot_are_nan():
+    """Two cameras at one spot see a point along one ray: no depth. Likewise when only one of the weights counts."""
+    one = ring_rig(3).cameras[0]
+    rig = rig_of(one, one)
+    pixels = pixels_of(rig, points_in_room(3))
+    assert np.isnan(triangulate(rig.cameras, pixels)).all()
+    rig = ring_rig(3)
+    weights = np.array([[0.0, 1.0, 0.0]] * 3)
+    assert np.isnan(triangulate(rig.cameras, pixels_of(rig, points_in_room(3)), weights)).all()
+
+
+def test_cameras_side_by_side_share_a_viewpoint():
+    rig = ring_rig(4)
+    doubled = rig_of(*(rig.cameras[i] for i in (0, 1, 0, 2, 1, 3)))
+    label = viewpoints(doubled.cameras)
+    assert label[0] == label[2]
+    assert label[1] == label[4]
+    assert len(set(label.tolist())) == 4
+
+
+def apart(count, seed, least_m=0.6):
+    """Points in the room, none nearer than `least_m` to another."""
+    rng = np.random.default_rng(seed)
+    points = np.empty((0, 3))
+    while len(points) < count:
+        point = rng.uniform((-1.5, -1.5, 0.3), (1.5, 1.5, 2.3))
+        if not len(points) or np.linalg.norm(points - point, axis=-1).min() > least_m:
+            points = np.vstack([points, point])
+    return points
+
+
+def observed(rig, drones, seed, *, missing=0.0, false=0, noise_px=0.5):
+    """For each camera its 2D points in random order, and which drone each is of (-1: of none)."""
+    rng = np.random.default_rng(seed)
+    pixels = pixels_of(rig, drones)
+    points, owners = [], []
+    for c in range(len(rig)):
+        seen = np.flatnonzero(rng.random(len(drones)) >= missing)
+        real = pixels[seen, c] + rng.normal(0, noise_px, (len(seen), 2))
+        ghosts = rng.uniform((0, 0), (320, 240), (false, 2))
+        order = rng.permutation(len(seen) + false)
+        points.append(np.vstack([real, ghosts])[order])
+        owners.append(np.concatenate([seen, np.full(false, -1)])[order])
+    return points, owners
+
+
+def check_match(rig, drones, points, owners, enough):
+    found, support = match_views(rig.cameras, points, [np.full(len(p), 4.0) for p in points], ROOM_M)
+    assert support.shape == (len(found), len(rig))
+    distance = np.linalg.norm(found[:, None] - drones, axis=-1).reshape(len(found), len(drones))
+    nearest = distance.argmin(axis=1) if len(drones) else np.empty(0, int)
+    assert sorted(nearest.tolist()) == np.flatnonzero(enough).tolist()
+    # Noise of 0.5 px at 4 m and 260 px of focal length is 8 mm in each of three or more views; limit 4 sigma.
+    assert (distance.min(axis=1, initial=np.inf) < 0.032).all()
+    for row, drone in enumerate(nearest):
+        owner = [owners[c][index] if index >= 0 else None for c, index in enumerate(support[row])]
+        assert owner.count(int(drone)) >= 3
+
+
+@pytest.mark.parametrize("num_drones", range(1, 7))
+@pytest.mark.parametrize("seed", range(3))
+def test_drones_on_a_ring_of_cameras(num_drones, seed):
+    """Every drone is found once, at its place, and nothing else."""
+    rig, drones = ring_rig(7), apart(num_drones, seed)
+    points, owners = observed(rig, drones, seed)
+    check_match(rig, drones, points, owners, np.ones(num_drones, bool))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_missing_and_false_points(seed):
+    """One in seven is missing, and every camera has a false point: found is who is seen by four cameras or more."""
+    rig, drones = ring_rig(7), apart(3, seed)
+    points, owners = observed(rig, drones, seed, missing=1 / 7, false=1)
+    seen_by = np.array([sum((owner == drone).any() for owner in owners) for drone in range(3)])
+    assert seen_by.min() >= 4
+    check_match(rig, drones, points, owners, seen_by >= 4)
+
+
+def test_two_cameras_at_one_spot_do_not_count_twice():
+    """Three cameras at two spots see a point: that is two viewpoints, too few."""
+    rig, drones = ring_rig(5), points_in_room(1)
+    doubled = rig_of(*(rig.cameras[i] for i in (0, 0, 2)))
+    points, _ = observed(doubled, drones, 0)
+    radius = [np.full(len(p), 4.0) for p in points]
+    assert match_views(doubled.cameras, points, radius, ROOM_M)[0].shape == (0, 3)
+    assert len(match_views(doubled.cameras, points, radius, ROOM_M, min_viewpoints=2)[0]) == 1
+    third = rig_of(*(rig.cameras[i] for i in (0, 1, 2)))
+    points, _ = observed(third, drones, 0)
+    assert len(match_views(third.cameras, points, radius, ROOM_M)[0]) == 1
+
+
+def test_nothing_to_match():
+    rig = ring_rig(3)
+    nothing = [np.empty((0, 2))] * 3
+    found, support = match_views(rig.cameras, nothing, [np.empty(0)] * 3, ROOM_M)
+    assert found.shape == (0, 3)
+    assert support.shape == (0, 3)
+
+
+def test_outside_the_bounds_is_nothing():
+    rig = ring_rig(5)
+    points, _ = observed(rig, np.array([[0.0, 0, 1]]), 0)
+    radius = [np.full(len(p), 4.0) for p in points]
+    upper_half = np.array([[-3.0, -3, 1.5], [3, 3, 3]])
+    assert len(match_views(rig.cameras, points, radius, upper_half)[0]) == 0
+    assert len(match_views(rig.cameras, points, radius, ROOM_M)[0]) == 1
