@@ -18,6 +18,8 @@ from psotrack.triangulation import match_views, triangulate
 
 #: Foreground smaller than this, in pixels of the image, is no drone.
 MIN_BLOB_PX = 60
+#: What has its middle nearer to the floor is a shadow: a drone that stands on its legs is higher.
+FLOOR_CLEARANCE_M = 0.08
 #: A cell of the reduced silhouettes belongs to a blob when so much of it (of 255) is foreground.
 MIN_COVERAGE = 64
 
@@ -93,13 +95,15 @@ def find_drones(
         coverage: (frames, cameras, height, width), silhouettes of the first frames; ten are plenty.
         reduction: image pixels per silhouette pixel, along each side.
         fps: frames per second.
-        bounds_m: (2, 3), corners of the room.
+        bounds_m: (2, 3), corners of the room; its lowest z is the floor, on which shadows lie.
         max_speed_m_s: of a drone.
 
     Returns:
         As many drones as were seen in at least half of the frames; possibly none.
     """
     tracks: list[list[_Sighting]] = []
+    # Shadows on the floor agree between all views as drones do, and they move with them; but they are flat on it.
+    bounds_m = bounds_m + np.array([[0.0, 0.0, FLOOR_CLEARANCE_M], [0.0, 0.0, 0.0]])
     for frame, images in enumerate(coverage):
         sightings = _sightings(frame, cameras, [find_blobs(image, reduction) for image in images], bounds_m)
         _extend(tracks, sightings, max_speed_m_s / fps)

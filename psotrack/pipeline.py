@@ -179,14 +179,14 @@ def on_device(cameras: Camera) -> Camera:
 def room_bounds(rig: CameraRig, settings: TrackSettings) -> Float[np.ndarray, "2 3"]:
     """Lowest and highest corner of the room, metres.
 
-    Where nobody says, the room is what the cameras stand around, a metre wider, from just below the floor or the
-    lowest camera to a metre above the highest one.
+    Where nobody says, the room is what the cameras stand around, a metre wider, from the floor at z = 0 (or below the
+    lowest camera, if that is lower) to a metre above the highest one.
     """
     if settings.bounds_m is not None:
         return np.array(settings.bounds_m, np.float64).reshape(3, 2).T
     centre = rig.cameras.centre_world
     low, high = centre.min(axis=0) - 1.0, centre.max(axis=0) + 1.0
-    low[2] = min(centre[:, 2].min(), 0.0) - 0.2
+    low[2] = 0.0 if centre[:, 2].min() > 0 else low[2]
     return np.stack([low, high])
 
 

@@ -1,0 +1,171 @@
+"""What users see when something is wrong, and that nobody ever loses a file."""
+
+import errno
+import os
+import pickle
+from pathlib import Path
+
+import pytest
+
+from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError, check_positive
+from psotrack.files import refuse_to_overwrite, written_whole
+from psotrack.progress import silent, terminal
+
+
+def test_a_message_is_one_sentence():
+    error = InputError(Path("a/b.csv"), expected="8 columns", found="7", remedy="export it again")
+    assert str(error) == f"{Path('a/b.csv')}: expected 8 columns, found 7; export it again"
+    assert (
+        str(SettingsError("drones", expected="at least 1", found="0"))
+        == "drones: expected at least 1, found 0"
+    )
+
+
+@pytest.mark.parametrize("kind", [InputError, SettingsError, OutputError])
+def test_errors_cross_processes_whole(kind):
+    error = kind("here", expected="this", found="that", remedy="do so")
+    copy = pickle.loads(pickle.dumps(error))
+    assert type(copy) is kind
+    assert str(copy) == str(error)
+    assert isinstance(copy, PsotrackError)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
+def test_check_positive_refuses(value):
+    with pytest.raises(SettingsError, match=r"^fps: expected a number above 0, found \S+; say it$"):
+        check_positive("fps", value, "say it")
+
+
+def test_check_positive_accepts():
+    check_positive("fps", 1e-9)
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".avi", ""])
+def test_written_whole(tmp_path, suffix):
+    """Under its name only when it is whole; the temporary has the same suffix, which writers choose a format by."""
+    path = tmp_path / "new" / f"out{suffix}"
+    with written_whole(path) as temporary:
+        assert temporary.suffix == suffix or not suffix
+        assert temporary.parent == path.parent
+        temporary.write_text("whole")
+        assert not path.exists()
+    assert path.read_text() == "whole"
+    assert names(path.parent) == [path.name]
+
+
+def fail_half_way(path, fault):
+    with written_whole(path) as temporary:
+        temporary.write_text("half")
+        raise fault
+
+
+@pytest.mark.parametrize("fault", [ValueError("no"), KeyboardInterrupt(), SystemExit(1)])
+def test_what_was_there_survives_a_failure(tmp_path, fault):
+    path = tmp_path / "out.csv"
+    path.write_text("before")
+    with pytest.raises(type(fault)):
+        fail_half_way(path, fault)
+    assert path.read_text() == "before"
+    assert names(tmp_path) == ["out.csv"]
+
+
+def test_a_full_disk(tmp_path):
+    path = tmp_path / "out.csv"
+    path.write_text("before")
+    message = r"out\.csv: expected to write it, found No space left .* unchanged"
+    with pytest.raises(OutputError, match=message) as caught:
+        fail_half_way(path, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+    assert caught.value.__cause__.errno == errno.ENOSPC
+    assert path.read_text() == "before"
+    assert names(tmp_path) == ["out.csv"]
+
+
+def test_a_folder_that_cannot_be(tmp_path):
+    """The parent is a file."""
+    (tmp_path / "file").write_text("")
+    with (
+        pytest.raises(OutputError, match="earlier results are unchanged"),
+        written_whole(tmp_path / "file" / "out"),
+    ):
+        raise AssertionError("never entered")
+
+
+def test_nothing_written_is_an_error(tmp_path):
+    path = tmp_path / "out.csv"
+    path.write_text("before")
+    with pytest.raises(OutputError, match="No such file"), written_whole(path):
+        pass
+    assert path.read_text() == "before"
+
+
+def test_a_folder_takes_the_place_of_a_folder(tmp_path):
+    path = tmp_path / "sequence"
+    path.mkdir()
+    (path / "old").write_text("old")
+    with written_whole(path) as temporary:
+        temporary.mkdir()
+        (temporary / "new").write_text("new")
+        assert names(path) == ["old"]
+    assert names(path) == ["new"]
+    assert names(tmp_path) == ["sequence"]
+
+
+def fail_half_way_in_a_folder(path):
+    with written_whole(path) as temporary:
+        temporary.mkdir()
+        (temporary / "new").write_text("half")
+        raise KeyboardInterrupt
+
+
+def test_a_folder_that_fails_leaves_the_old_one(tmp_path):
+    path = tmp_path / "sequence"
+    path.mkdir()
+    (path / "old").write_text("old")
+    with pytest.raises(KeyboardInterrupt):
+        fail_half_way_in_a_folder(path)
+    assert names(path) == ["old"]
+    assert names(tmp_path) == ["sequence"]
+
+
+def test_a_folder_that_was_never_made_leaves_the_old_one(tmp_path):
+    path = tmp_path / "sequence"
+    path.mkdir()
+    (path / "old").write_text("old")
+    with pytest.raises(OutputError), written_whole(path):
+        pass
+    assert names(path) == ["old"]
+    assert names(tmp_path) == ["sequence"]
+
+
+def test_two_writers_at_once(tmp_path):
+    """Each has a temporary of its own; the last to finish is there, whole."""
+    path = tmp_path / "out.csv"
+    with written_whole(path) as first, written_whole(path) as second:
+        assert first != second
+        first.write_text("first")
+        second.write_text("second")
+    assert path.read_text() == "first"
+    assert names(tmp_path) == ["out.csv"]
+
+
+def test_refuse_to_overwrite(tmp_path):
+    path = tmp_path / "out.csv"
+    refuse_to_overwrite(path, force=False)
+    path.write_text("")
+    refuse_to_overwrite(path, force=True)
+    with pytest.raises(OutputError, match=r"out\.csv: expected no such file yet, found one; pass --force"):
+        refuse_to_overwrite(path, force=False)
+
+
+@pytest.mark.parametrize("report", [silent, terminal])
+def test_progress_is_quiet_where_there_is_no_terminal(report, capfd):
+    with report("track", 10) as advance:
+        advance(4)
+        advance(6)
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert err.strip() == ""
