@@ -147,7 +147,8 @@ def interrupted():
 
 
 def test_a_drone_that_vanishes_coasts_is_lost_and_comes_back(interrupted):
-    _, info = track(interrupted, HOVER_M, np.zeros((2, 3)), max_coasting_s=5 / FPS)
+    # Where it is sought grows with the time since it was found: at 1.2 m/s by 0.6 m, short of its neighbour.
+    _, info = track(interrupted, HOVER_M, np.zeros((2, 3)), max_coasting_s=5 / FPS, max_speed_m_s=1.2)
     status = info.status[:, 0]
     assert (status[:GONE] == Status.TRACKED).all()
     assert (status[GONE : GONE + 5] == Status.COASTING).all()
@@ -156,8 +157,8 @@ def test_a_drone_that_vanishes_coasts_is_lost_and_comes_back(interrupted):
     error_m = np.linalg.norm(info.position_m - HOVER_M, axis=-1)
     # Found again at once, though the drift of 5 frames at a few cm/s lies between.
     assert error_m[BACK + 1 :, 0].max() < CELL_M
-    assert (info.num_cameras[GONE:BACK, 0] == 0).all()
-    assert (info.fitness[GONE:BACK, 0] == 0).all()
+    # In one view its neighbour is where it is sought; one view is not enough.
+    assert (info.num_cameras[GONE:BACK, 0] <= 1).all()
     # Its neighbour does not mind.
     assert (info.status[:, 1] == Status.TRACKED).all()
     assert error_m[:, 1].max() < CELL_M
