@@ -86,12 +86,13 @@ def match_views(
     """
     viewpoint = viewpoints(cameras)
     proposals = _proposals(cameras, points_px, viewpoint)
-    proposals = proposals[((proposals >= bounds_m[0]) & (proposals <= bounds_m[1])).all(axis=-1)]
     for _ in range(2):  # Once from two rays, once more from all that agree.
+        proposals = proposals[_within(proposals, bounds_m)]
         support = _support(cameras, proposals, points_px, radius_px)
         proposals = triangulate(cameras, _pick(points_px, support))
-        kept = np.isfinite(proposals).all(axis=-1)
-        proposals, support = proposals[kept], support[kept]
+    # Not a number is not within either.
+    kept = _within(proposals, bounds_m)
+    proposals, support = proposals[kept], support[kept]
 
     found: list[int] = []
     free = support >= 0
@@ -107,6 +108,12 @@ def match_views(
         near = np.linalg.norm(proposals - proposals[best], axis=-1) < separation_m
         free[near] = False
     return proposals[found], support[found]
+
+
+def _within(
+    points: Float[np.ndarray, "points 3"], bounds_m: Float[np.ndarray, "2 3"]
+) -> Bool[np.ndarray, "points"]:
+    return ((points >= bounds_m[0]) & (points <= bounds_m[1])).all(axis=-1)
 
 
 def _proposals(

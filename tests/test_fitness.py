@@ -134,19 +134,25 @@ def test_the_papers_score_is_one_box_on_whole_pixels():
     assert PAPER_SCORE.whole_pixels
 
 
-def test_a_camera_counts_by_what_its_image_holds_of_the_box():
-    """Two cameras see the drone filled; a third, half out of its image, sees nothing: (1 + 1 + 0 / 2) / (5 / 2)."""
+@pytest.mark.parametrize("whole_view", [1, 0])
+def test_a_camera_counts_by_what_its_image_holds_of_the_box(whole_view):
+    """Two cameras see all of the box, a third half of it: its score counts half.
+
+    Either the two see it filled and the third empty, (1 + 1 + 0 / 2) / (5 / 2), or the other way round.
+    """
+    cut_view = 1 - whole_view
     one = far_camera(**FAR)
     K = one.K.copy()
     K[0, 2] += 32
     at_border = far_camera(**FAR)
     rig = rig_of(one, one, type(one)(at_border.T_cam_world, K, at_border.dist, at_border.image_size_wh))
-    images = np.concatenate([silhouette(DRONE), silhouette(DRONE), silhouette()])
+    full, half = silhouette(DRONE), silhouette((54, 19, 64, 29))
+    images = np.concatenate([full * whole_view, full * whole_view, half * cut_view]).astype(np.uint8)
     scores, weights = evaluate(camera_scores, rig, images, np.zeros((1, 3)))
-    np.testing.assert_allclose(scores, [[1, 1, 0]], atol=HAND)
+    np.testing.assert_allclose(scores, [[whole_view, whole_view, cut_view]], atol=HAND)
     np.testing.assert_allclose(weights, [[1, 1, 1 / 2]], atol=HAND)
     fitness = evaluate(drone_fitness, rig, images, np.zeros((1, 3)))
-    assert fitness.item() == pytest.approx(4 / 5, abs=HAND)
+    assert fitness.item() == pytest.approx((2 * whole_view + cut_view / 2) / (5 / 2), abs=HAND)
 
 
 def test_too_few_cameras_is_undefined():

@@ -87,6 +87,16 @@ def test_noise_that_does_not_persist_is_no_drone():
     np.testing.assert_allclose(start.position_m[matched(start, DRONES_M[:1])], DRONES_M[:1], atol=CELL_M)
 
 
+def test_a_shadow_on_the_floor_is_no_drone():
+    """Shadows agree between all views and move as their drones do: only their height tells them."""
+    drone, speed, shadow_size = [0.2, 0.1, 1.5], [1.0, 0.0, 0.0], [0.4, 0.4, 0.02]
+    shadows = [[0.25, 0.1, 0.0], [-0.8, -0.6, 0.0], [0.9, -0.5, 0.0]]
+    path = flight([drone, *shadows], [speed] * 4)
+    start = found_in(drawn(path, [SIZES_M[0], *[shadow_size] * 3]))
+    assert len(start.position_m) == 1
+    np.testing.assert_allclose(start.position_m[0], drone, atol=CELL_M)
+
+
 def test_blobs_at_the_border_do_not_count():
     """A drone that two images cut: its place and size come from the other cameras."""
     height, width = 240, 320

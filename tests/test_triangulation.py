@@ -193,3 +193,15 @@ def test_outside_the_bounds_is_nothing():
     upper_half = np.array([[-3.0, -3, 1.5], [3, 3, 3]])
     assert len(match_views(rig.cameras, points, radius, upper_half)[0]) == 0
     assert len(match_views(rig.cameras, points, radius, ROOM_M)[0]) == 1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_no_point_is_found_out_of_bounds(seed):
+    """A bug of the first version: pairs of noisy points proposed a place in bounds, and all views refined it out."""
+    rig = ring_rig(6)
+    rng = np.random.default_rng(seed)
+    on_the_floor = np.array([[0.3, -0.2, 0.0]])
+    pixels = project(rig.cameras, on_the_floor[:, None, :])[0][0] + rng.normal(scale=3.0, size=(6, 2))
+    bounds_m = np.array([[-3.0, -3.0, 0.05], [3.0, 3.0, 3.0]])
+    points, _ = match_views(rig.cameras, [pixel[None] for pixel in pixels], [np.array([20.0])] * 6, bounds_m)
+    assert (points >= bounds_m[0]).all()

@@ -27,8 +27,6 @@ import msgspec
 import numpy as np
 from _numpy_fitness import NumpyFitness
 from _peers import Evosax, Problem, PySwarms
-from rich.console import Console
-from rich.table import Table
 
 from psotrack import fitness, tracker
 from psotrack.initialisation import Start
@@ -66,12 +64,21 @@ class Psotrack:
 
 @dataclass(frozen=True)
 class Timing:
-    """What is said about one method; times per frame, the ratio to the first method of the same repeat."""
+    """What is said about one method.
+
+    Attributes:
+        median_ms, min_ms, max_ms: per frame, over the repeats.
+        cpu_ms: median processor time per frame, over all threads; a busy machine hardly changes it.
+        ratio: median over the repeats of its time to that of the first method in the same repeat.
+        mean_error_mm: over frames and drones, so that nobody is fast by not converging.
+        warm_up_s: of the first call, which compiles.
+    """
 
     method: str
     median_ms: float
     min_ms: float
     max_ms: float
+    cpu_ms: float
     ratio: float
     mean_error_mm: float
     warm_up_s: float
@@ -182,19 +189,22 @@ def _time(
 
     names = list(methods)
     times_ms: dict[str, list[float]] = {name: [] for name in names}
+    cpu_ms: dict[str, list[float]] = {name: [] for name in names}
     for repeat in range(repeats):
         # Another one goes first each time, so that no method always follows the same one.
         first = repeat % len(names)
         for name in names[first:] + names[:first]:
-            began = time.perf_counter()
+            began, cpu_began = time.perf_counter(), time.process_time()
             methods[name](coverage)
             times_ms[name].append(1e3 * (time.perf_counter() - began) / len(coverage))
+            cpu_ms[name].append(1e3 * (time.process_time() - cpu_began) / len(coverage))
     return [
         Timing(
             method=name,
             median_ms=statistics.median(times_ms[name]),
             min_ms=min(times_ms[name]),
             max_ms=max(times_ms[name]),
+            cpu_ms=statistics.median(cpu_ms[name]),
             ratio=statistics.median(
                 theirs / ours for theirs, ours in zip(times_ms[name], times_ms[names[0]], strict=True)
             ),
@@ -239,31 +249,31 @@ def _commit() -> str:
 
 
 def _print(header: dict[str, Any], timings: list[Timing]) -> None:
-    console = Console()
     versions = ", ".join(f"{name} {number}" for name, number in header["versions"].items())
     frames, cameras, height, width = header["silhouettes"]
-    for line in (
-        f"device {header['device']}, {header['cpu']}, {header['processors']} processors, "
-        f"load {header['load_average']}",
-        versions,
-        f"commit {header['commit']}",
+    reduction = header["reduction"]
+    print(
+        f"{header['device']}, {header['cpu']}, {header['processors']} processors, load {header['load_average']}"
+    )
+    print(versions)
+    print(f"commit {header['commit']}")
+    print(
         f"{header['particles']} particles x {header['iterations']} iterations, {header['drones']} drones, "
-        f"{cameras} cameras of {width * header['reduction']} x {height * header['reduction']} at reduction "
-        f"{header['reduction']}, {frames} frames, {header['repeats']} repeats",
-        f"NumPy's fitness differs from psotrack's by at most {header['fitness_difference']:.1e}",
-    ):
-        console.print(line, highlight=False, soft_wrap=True)
-    table = Table("method")
-    for column in ("ms/frame", "min", "max", "ratio", "mean error (mm)", "warm-up (s)"):
-        table.add_column(column, justify="right")
+        f"{cameras} cameras of {width * reduction} x {height * reduction} pixels at reduction {reduction}, "
+        f"{frames} frames, {header['repeats']} repeats"
+    )
+    print(f"NumPy's fitness differs from psotrack's by at most {header['fitness_difference']:.1e}\n")
+
+    columns = ("ms/frame", "min", "max", "CPU ms", "ratio", "error mm", "warm-up s")
+    print(f"{'method':32}" + "".join(f"{column:>11}" for column in columns))
     for timing in timings:
-        table.add_row(
-            timing.method,
-            *(f"{value:.2f}" for value in (timing.median_ms, timing.min_ms, timing.max_ms, timing.ratio)),
+        numbers = (
+            *(f"{value:.2f}" for value in (timing.median_ms, timing.min_ms, timing.max_ms, timing.cpu_ms)),
+            f"{timing.ratio:.2f}",
             f"{timing.mean_error_mm:.1f}",
             f"{timing.warm_up_s:.1f}",
         )
-    console.print(table)
+        print(f"{timing.method:32}" + "".join(f"{number:>11}" for number in numbers))
 
 
 if __name__ == "__main__":

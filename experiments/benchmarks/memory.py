@@ -1,0 +1,112 @@
+"""Peak resident memory of tracking a long sequence: 3,000 frames of 8 cameras, against a limit of 2 GB.
+
+Silhouettes are drawn, stored as psotrack stores them, and read back and tracked by psotrack's own pipeline. Exit code
+1 when the limit is passed. `python experiments/benchmarks/memory.py --help`.
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import _scene
+import click
+import numpy as np
+import zarr
+from zarr.codecs import ZstdCodec
+
+from psotrack.initialisation import Start
+from psotrack.pipeline import TrackSettings, track_silhouettes
+from psotrack.progress import terminal
+from psotrack.silhouette_store import CHUNK_FRAMES, open_stored
+from psotrack.silhouettes import Silhouettes
+
+
+@click.command(context_settings={"show_default": True})
+@click.option("--frames", default=3000, type=click.IntRange(2), help="Frames that are tracked.")
+@click.option("--cameras", default=8, type=click.IntRange(2), help="Of 1920 x 1080 pixels each.")
+@click.option("--drones", default=4, type=click.IntRange(1), help="In the room.")
+@click.option(
+    "--particles", default=TrackSettings().particles, type=click.IntRange(2), help="Of every swarm."
+)
+@click.option("--iterations", default=TrackSettings().iterations, type=click.IntRange(0), help="Per frame.")
+@click.option("--limit-gb", default=2.0, help="Largest resident memory, 10^9 bytes.")
+def main(frames: int, cameras: int, drones: int, particles: int, iterations: int, limit_gb: float) -> None:
+    """Track a long sequence from stored silhouettes; print the peak of the resident memory."""
+    scene = _scene.scene(frames, drones, cameras)
+    start = Start(scene.position_m[0], scene.velocity_m_s[0], scene.size_m, np.full(drones, float(cameras)))
+    with tempfile.TemporaryDirectory() as folder:
+        silhouettes = _store(scene, Path(folder))
+        before_gb = _peak_gb()
+        began = time.perf_counter()
+        trajectories, compile_s = track_silhouettes(
+            scene.rig,
+            silhouettes,
+            start,
+            TrackSettings(particles=particles, iterations=iterations),
+            fps=_scene.FPS,
+            bounds_m=_scene.BOUNDS_M,
+            report=terminal,
+        )
+        track_s = time.perf_counter() - began - compile_s
+    peak_gb = _peak_gb()
+
+    errors_m = np.linalg.norm(trajectories.position_m - scene.position_m, axis=-1)
+    print(
+        f"{frames} frames of {cameras} cameras, {drones} drones, {particles} particles x {iterations} iterations"
+    )
+    print(
+        f"tracked in {track_s:.1f} s ({1e3 * track_s / frames:.1f} ms per frame), {compile_s:.1f} s to compile"
+    )
+    print(f"mean error {1e3 * errors_m.mean():.1f} mm")
+    print(
+        f"peak resident memory {peak_gb:.2f} GB (before tracking {before_gb:.2f} GB), limit {limit_gb:g} GB"
+    )
+    sys.exit(peak_gb > limit_gb)
+
+
+def _store(scene: _scene.Scene, folder: Path) -> Silhouettes:
+    """The scene's silhouettes in a store; paths are closed, so what is drawn once serves every period."""
+    num_frames, names = len(scene.position_m), scene.rig.names
+    arrays = [
+        zarr.create_array(
+            folder / name,
+            shape=(num_frames, *scene.shape),
+            chunks=(CHUNK_FRAMES, *scene.shape),
+            dtype=np.uint8,
+            compressors=ZstdCodec(level=3, checksum=True),
+            config={"write_empty_chunks": True},
+        )
+        for name in names
+    ]
+    for first in range(0, min(_scene.PERIOD_FRAMES, num_frames), CHUNK_FRAMES):
+        drawn = scene.coverage(slice(first, first + CHUNK_FRAMES))
+        for frame in range(first, num_frames, _scene.PERIOD_FRAMES):
+            for index, array in enumerate(arrays):
+                count = min(len(drawn), num_frames - frame)
+                array[frame : frame + count] = drawn[:count, index]
+    stored = tuple(open_stored(folder / name, num_frames, scene.shape) for name in names)
+    assert None not in stored, "a chunk was not written"
+    return Silhouettes(
+        cameras=names,
+        keys={name: name for name in names},
+        reduction=_scene.REDUCTION,
+        num_frames=num_frames,
+        shape=scene.shape,
+        seconds={"decode": 0.0, "foreground": 0.0},
+        arrays=stored,
+    )
+
+
+def _peak_gb() -> float:
+    """Largest resident memory of this process so far, 10^9 bytes."""
+    # Linux counts in KiB, macOS in bytes.
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
+
+
+if __name__ == "__main__":
+    main()
