@@ -109,8 +109,8 @@ def camera(
         dist: 0, 4, 5 or 8 coefficients in OpenCV's order.
 
     Raises:
-        SettingsError: R is no rotation, a number is not finite, K has no positive focal length, or the number of
-            coefficients is none that OpenCV knows.
+        SettingsError: R is no rotation, a number is not finite, K has no positive focal length, the image has no
+            pixels, or the number of coefficients is none that OpenCV knows.
     """
     R, t_m, K = (np.asarray(value, np.float64) for value in (R, t_m, K))
     coefficients = np.asarray(dist, np.float64)
@@ -122,6 +122,8 @@ def camera(
         raise SettingsError(
             "camera.K", expected="focal lengths above 0", found=f"{K[0, 0]:g} and {K[1, 1]:g}"
         )
+    if min(image_size_wh) < 1:
+        raise SettingsError("camera.image_size_wh", expected="sides of at least 1", found=f"{image_size_wh}")
     if coefficients.shape not in {(0,), (4,), (5,), (8,)}:
         raise SettingsError("camera.dist", expected="0, 4, 5 or 8 coefficients", found=f"{coefficients.size}")
     T = np.eye(4)

@@ -191,6 +191,7 @@ GOOD = {
         ({"t_m": np.array([0.0, np.nan, 0.0])}, "expected finite numbers, found NaN or infinity"),
         ({"R": np.full((3, 3), np.inf)}, "expected finite numbers"),
         ({"dist": (0.1, np.nan, 0.0, 0.0)}, "expected finite numbers"),
+        ({"image_size_wh": (0, 480)}, r"camera\.image_size_wh: expected sides of at least 1"),
         ({"dist": (0.1, 0.2, 0.3)}, r"camera\.dist: expected 0, 4, 5 or 8 coefficients, found 3"),
     ],
 )
