@@ -21,7 +21,7 @@ else:
 
 Key = PRNGKeyArray
 Coverage = UInt8[Array, "cameras height width"]
-Tables = Int[Array, "cameras height1 width1"]
+Tables = Int[Array, "height1 cameras width1"]
 Positions = Float[Array, "drones 3"]
 
 __all__ = ["Array", "Coverage", "Key", "Positions", "Tables"]

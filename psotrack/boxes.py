@@ -24,16 +24,29 @@ from psotrack.cameras import NEAR_M, Camera, distort, to_camera
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Boxes:
-    """Boxes in pixels, `x0 <= x1` and `y0 <= y1`, and whether the camera has the drone in front of it.
+    """Boxes in pixels, and whether the camera has the drone in front of it.
+
+    Kept as middles and halves, because windows scale boxes about their middles.
 
     Attributes are of equal shape: (..., cameras).
     """
 
-    x0: Float[Array, "*batch"]
-    y0: Float[Array, "*batch"]
-    x1: Float[Array, "*batch"]
-    y1: Float[Array, "*batch"]
+    x_middle: Float[Array, "*batch"]
+    y_middle: Float[Array, "*batch"]
+    x_half: Float[Array, "*batch"]
+    y_half: Float[Array, "*batch"]
     in_front: Bool[Array, "*batch"]
+
+    @property
+    def xyxy(self) -> Float[Array, "*batch 4"]:
+        """(..., cameras, 4), left, top, right and bottom edges, half-open."""
+        edges = (
+            self.x_middle - self.x_half,
+            self.y_middle - self.y_half,
+            self.x_middle + self.x_half,
+            self.y_middle + self.y_half,
+        )
+        return jnp.stack(edges, axis=-1)
 
 
 def shape_in_cameras(
@@ -70,22 +83,28 @@ def project_boxes(
     # Behind the camera the quadratic has no meaning; any positive denominator keeps values and gradients finite.
     a = jnp.where(in_front, z * z - s_zz, 1.0)
 
-    def tangents(axis: int) -> tuple[Array, Array, Array]:
+    def tangents(axis: int) -> tuple[Array, Array]:
         along = centre[..., axis]
         b = along * z - shapes[..., axis, 2]
         c = along * along - shapes[..., axis, axis]
         root = jnp.sqrt(jnp.where(in_front, jnp.maximum(b * b - a * c, 1e-12), 1.0))
-        return (b - root) / a, (b + root) / a, b / a
+        return b / a, root / a
 
-    u0, u1, u_mid = tangents(0)
-    v0, v1, v_mid = tangents(1)
+    (u, u_half), (v, v_half) = tangents(0), tangents(1)
     K = cameras.K
+    if cameras.dist.shape[-1] == 0:
+        x = K[..., 0, 0] * u + K[..., 0, 1] * v + K[..., 0, 2]
+        y = K[..., 1, 1] * v + K[..., 1, 2]
+        return Boxes(x + 0.5, y + 0.5, K[..., 0, 0] * u_half, K[..., 1, 1] * v_half, in_front)
 
     def column(u: Array) -> Array:
-        x, y = distort(cameras, u, v_mid)
-        return K[..., 0, 0] * x + K[..., 0, 1] * y + K[..., 0, 2] + 0.5
+        bent_u, bent_v = distort(cameras, u, v)
+        return K[..., 0, 0] * bent_u + K[..., 0, 1] * bent_v + K[..., 0, 2]
 
     def row(v: Array) -> Array:
-        return K[..., 1, 1] * distort(cameras, u_mid, v)[1] + K[..., 1, 2] + 0.5
+        return K[..., 1, 1] * distort(cameras, u, v)[1] + K[..., 1, 2]
 
-    return Boxes(column(u0), row(v0), column(u1), row(v1), in_front)
+    left, right, top, bottom = column(u - u_half), column(u + u_half), row(v - v_half), row(v + v_half)
+    return Boxes(
+        (left + right) / 2 + 0.5, (top + bottom) / 2 + 0.5, (right - left) / 2, (bottom - top) / 2, in_front
+    )

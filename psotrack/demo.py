@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from psotrack.boxes import Boxes, project_boxes, shape_in_cameras
+from psotrack.boxes import project_boxes, shape_in_cameras
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.evaluation import evaluate, plots, tables
 from psotrack.files import refuse_to_overwrite, written_whole
@@ -93,7 +93,7 @@ def save_picture(path: Path, sequence: Sequence, tracked: TrackedSequence, frame
 
     frame = tracked.trajectories.num_frames // 2 if frame is None else frame
     assert sequence.truth is not None
-    boxes = _boxes(sequence, tracked, frame)
+    xyxy_px = _boxes(sequence, tracked, frame)
     colours = plots.colours_of_estimates(tracked.trajectories, sequence.truth)
     figure = Figure(figsize=(16, 5.6))
     FigureCanvasAgg(figure)
@@ -102,9 +102,8 @@ def save_picture(path: Path, sequence: Sequence, tracked: TrackedSequence, frame
         axes = figure.add_subplot(grid[shown // 2, shown % 2])
         axes.imshow(_frame_of(sequence, name, frame))
         for drone, colour in enumerate(colours):
-            x0, y0, x1, y1 = (
-                float(getattr(boxes, edge)[drone, shown]) - 0.5 for edge in ("x0", "y0", "x1", "y1")
-            )
+            # Edges of pixels are half a pixel from their centres, which is what the axes count.
+            x0, y0, x1, y1 = xyxy_px[drone, shown] - 0.5
             axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=colour, linewidth=1.6))
         axes.set_title(f"{name}, frame {frame}", fontsize=9)
         axes.set_axis_off()
@@ -114,11 +113,11 @@ def save_picture(path: Path, sequence: Sequence, tracked: TrackedSequence, frame
         figure.savefig(temporary, dpi=120)
 
 
-def _boxes(sequence: Sequence, tracked: TrackedSequence, frame: int) -> Boxes:
+def _boxes(sequence: Sequence, tracked: TrackedSequence, frame: int) -> Float[np.ndarray, "drones cameras 4"]:
     cameras = on_device(sequence.rig.cameras)
     shapes = shape_in_cameras(cameras, np.asarray(tracked.start.size_m, np.float32))
     position: Float[np.ndarray, "drones 3"] = tracked.trajectories.position_m[frame].astype(np.float32)
-    return project_boxes(cameras, position, shapes)
+    return np.asarray(project_boxes(cameras, position, shapes).xyxy)
 
 
 def _frame_of(sequence: Sequence, camera: str, frame: int) -> UInt8[np.ndarray, "height width 3"]:

@@ -16,9 +16,9 @@ from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from psotrack._typing import Array
+from psotrack._typing import Array, Tables
 from psotrack.boxes import Boxes, project_boxes, shape_in_cameras
 from psotrack.cameras import Camera
 from psotrack.summed_area import box_sum
@@ -58,20 +58,20 @@ class Scene:
     Attributes:
         cameras: with one leading axis.
         shapes: (drones, cameras, 3, 3), from `shape_in_cameras`.
-        tables: (cameras, height + 1, width + 1) of the frame's silhouettes.
+        tables: (height + 1, cameras, width + 1) of the frame's silhouettes.
         settings: static.
     """
 
     cameras: Camera
     shapes: Float[Array, "drones cameras 3 3"]
-    tables: Int[Array, "cameras height1 width1"]
+    tables: Tables
     settings: ScoreSettings = field(metadata={"static": True})
 
 
 def scene(
     cameras: Camera,
     size_m: Float[Array, "drones 3"],
-    tables: Int[Array, "cameras height1 width1"],
+    tables: Tables,
     settings: ScoreSettings,
 ) -> Scene:
     """The scene of one frame for drones of these sizes (full lengths, metres)."""
@@ -92,10 +92,12 @@ def camera_scores(
     """
     boxes = project_boxes(scene.cameras, position_m, scene.shapes)
     foreground, area = _windows(scene, boxes, (*scene.settings.windows, scene.settings.ring))
-    # The maximum is for rounding alone: a window may hold a hair more than the ring.
-    union = area[:-1] + jnp.maximum(foreground[-1] - foreground[:-1], 0.0)
-    score = (foreground[:-1] / jnp.maximum(union, 1e-6)).mean(axis=0)
-    return score, _share_in_image(scene, boxes)
+    score = jnp.zeros_like(foreground[0])
+    for k in range(len(scene.settings.windows)):
+        # The inner maximum is for rounding alone: a window may hold a hair more than the ring.
+        union = area[k] + jnp.maximum(foreground[-1] - foreground[k], 0.0)
+        score += foreground[k] / jnp.maximum(union, 1e-6)
+    return score / len(scene.settings.windows), _share_in_image(scene, boxes)
 
 
 def filled(
@@ -128,28 +130,33 @@ def _windows(
     scene: Scene, boxes: Boxes, scales: tuple[float, ...]
 ) -> tuple[Float[Array, "scales *batch"], Float[Array, "scales *batch"]]:
     """Foreground and area, in reduced pixels, of the boxes scaled about their middles and cut at the image."""
-    height, width = (side - 1 for side in scene.tables.shape[-2:])
+    height, width = _size_of_tables(scene)
 
-    def interval(low: Array, high: Array, last: int) -> tuple[Array, Array]:
-        middle, half = (
-            (low + high) / (2 * scene.settings.reduction),
-            (high - low) / (2 * scene.settings.reduction),
-        )
+    def interval(middle: Array, half: Array, last: int) -> tuple[Array, Array]:
+        middle, half = middle / scene.settings.reduction, half / scene.settings.reduction
         half = jnp.asarray(scales, half.dtype).reshape(-1, *[1] * half.ndim) * half
         ends = middle - half, middle + half
         if scene.settings.whole_pixels:
             ends = jnp.round(ends[0]), jnp.round(ends[1])
         return jnp.clip(ends[0], 0, last), jnp.clip(ends[1], 0, last)
 
-    x0, x1 = interval(boxes.x0, boxes.x1, width)
-    y0, y1 = interval(boxes.y0, boxes.y1, height)
-    camera = jnp.arange(scene.tables.shape[0])
+    x0, x1 = interval(boxes.x_middle, boxes.x_half, width)
+    y0, y1 = interval(boxes.y_middle, boxes.y_half, height)
+    camera = jnp.arange(scene.tables.shape[1])
     return box_sum(scene.tables, camera, x0, y0, x1, y1) / FULL, (x1 - x0) * (y1 - y0)
 
 
 def _share_in_image(scene: Scene, boxes: Boxes) -> Float[Array, "*batch drones cameras"]:
-    height, width = ((side - 1) * scene.settings.reduction for side in scene.tables.shape[-2:])
-    inside_x = jnp.clip(boxes.x1, 0, width) - jnp.clip(boxes.x0, 0, width)
-    inside_y = jnp.clip(boxes.y1, 0, height) - jnp.clip(boxes.y0, 0, height)
-    whole = (boxes.x1 - boxes.x0) * (boxes.y1 - boxes.y0)
-    return jnp.where(boxes.in_front, inside_x * inside_y / jnp.maximum(whole, 1e-6), 0.0)
+    height, width = (side * scene.settings.reduction for side in _size_of_tables(scene))
+
+    def inside(middle: Array, half: Array, last: int) -> Array:
+        return jnp.clip(middle + half, 0, last) - jnp.clip(middle - half, 0, last)
+
+    area = inside(boxes.x_middle, boxes.x_half, width) * inside(boxes.y_middle, boxes.y_half, height)
+    whole = 4 * boxes.x_half * boxes.y_half
+    return jnp.where(boxes.in_front, area / jnp.maximum(whole, 1e-6), 0.0)
+
+
+def _size_of_tables(scene: Scene) -> tuple[int, int]:
+    """Height and width of the silhouettes, in reduced pixels."""
+    return scene.tables.shape[0] - 1, scene.tables.shape[2] - 1

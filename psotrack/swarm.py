@@ -8,7 +8,7 @@ swarm for each of them. Fitness is maximised. An undefined fitness (NaN) never b
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +44,11 @@ class SwarmParams:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SwarmState:
-    """What the next iteration needs. Bests that were never defined have fitness -inf."""
+    """What the next iteration needs.
+
+    `position` is where the particles are going to be evaluated; the bests are of where they have been. Bests that were
+    never defined have fitness -inf.
+    """
 
     position: Float[Array, "particles groups dims"]
     velocity: Float[Array, "particles groups dims"]
@@ -54,13 +58,11 @@ class SwarmState:
     gbest_fitness: Float[Array, "groups"]
 
 
-def init(
-    objective: Objective, position: Float[Array, "particles groups dims"], params: SwarmParams
-) -> SwarmState:
-    """A swarm at rest at the given positions, clipped to the bounds and evaluated once."""
+def init(position: Float[Array, "particles groups dims"], params: SwarmParams) -> SwarmState:
+    """A swarm at rest at the given positions, clipped to the bounds and not evaluated yet."""
     position = jnp.clip(position, params.low, params.high)
     undefined = jnp.full(position.shape[:2], -jnp.inf, position.dtype)
-    state = SwarmState(
+    return SwarmState(
         position=position,
         velocity=jnp.zeros_like(position),
         pbest_position=position,
@@ -68,16 +70,35 @@ def init(
         gbest_position=position[0],
         gbest_fitness=undefined[0],
     )
-    return _remember_bests(state, objective(position))
 
 
-def step(key: Key, objective: Objective, state: SwarmState, params: SwarmParams) -> SwarmState:
-    """One iteration. The key is consumed.
+def evaluate(objective: Objective, state: SwarmState) -> SwarmState:
+    """Personal and global bests after the particles were evaluated where they are.
+
+    Comparisons with NaN are false, so an undefined fitness is never best.
+    """
+    fitness = objective(state.position)
+    better = fitness > state.pbest_fitness
+    pbest_position = jnp.where(better[..., None], state.position, state.pbest_position)
+    pbest_fitness = jnp.where(better, fitness, state.pbest_fitness)
+    leader = jnp.argmax(pbest_fitness, axis=0)
+    groups = jnp.arange(leader.shape[0])
+    return replace(
+        state,
+        pbest_position=pbest_position,
+        pbest_fitness=pbest_fitness,
+        gbest_position=pbest_position[leader, groups],
+        gbest_fitness=pbest_fitness[leader, groups],
+    )
+
+
+def move(key: Key, state: SwarmState, params: SwarmParams) -> SwarmState:
+    """Where the particles go next. The key is consumed.
 
     v <- w v + c1 r1 (pbest - x) + c2 r2 (gbest - x), r1 and r2 uniform in [0, 1) for every dimension, then clamped to
     `max_step`; x <- x + v. A particle that would leave the bounds stops at them, so that it can turn round at once.
     """
-    r1, r2 = jax.random.uniform(key, (2, *state.position.shape), state.position.dtype)
+    r1, r2 = _random_factors(key, state.position.shape)
     velocity = (
         params.inertia * state.velocity
         + params.cognitive * r1 * (state.pbest_position - state.position)
@@ -86,16 +107,16 @@ def step(key: Key, objective: Objective, state: SwarmState, params: SwarmParams)
     velocity = jnp.clip(velocity, -params.max_step, params.max_step)
     wanted = state.position + velocity
     position = jnp.clip(wanted, params.low, params.high)
-    velocity = jnp.where(position == wanted, velocity, 0.0)
-    moved = SwarmState(
-        position=position,
-        velocity=velocity,
-        pbest_position=state.pbest_position,
-        pbest_fitness=state.pbest_fitness,
-        gbest_position=state.gbest_position,
-        gbest_fitness=state.gbest_fitness,
-    )
-    return _remember_bests(moved, objective(position))
+    return replace(state, position=position, velocity=jnp.where(position == wanted, velocity, 0.0))
+
+
+def step(key: Key, objective: Objective, state: SwarmState, params: SwarmParams) -> SwarmState:
+    """One iteration: evaluate, then move. The key is consumed.
+
+    In this order the loop hands finished positions from one iteration to the next. Moving first would have XLA on CPU
+    compute the move, random numbers included, anew in each of the loops that an objective falls apart into.
+    """
+    return move(key, evaluate(objective, state), params)
 
 
 def run(
@@ -105,26 +126,25 @@ def run(
     params: SwarmParams,
     num_iterations: Int[Array, ""] | int,
 ) -> SwarmState:
-    """`init` and `num_iterations` times `step`. The key is consumed; the number of iterations may be traced."""
+    """`num_iterations` times `step` from the given positions, and a last `evaluate`.
+
+    The key is consumed; the number of iterations may be traced.
+    """
 
     def body(iteration: Array, state: SwarmState) -> SwarmState:
         return step(jax.random.fold_in(key, iteration), objective, state, params)
 
-    return jax.lax.fori_loop(0, num_iterations, body, init(objective, position, params))
+    return evaluate(objective, jax.lax.fori_loop(0, num_iterations, body, init(position, params)))
 
 
-def _remember_bests(state: SwarmState, fitness: Float[Array, "particles groups"]) -> SwarmState:
-    """Personal and global bests after an evaluation; comparisons with NaN are false, so NaN is never best."""
-    better = fitness > state.pbest_fitness
-    pbest_position = jnp.where(better[..., None], state.position, state.pbest_position)
-    pbest_fitness = jnp.where(better, fitness, state.pbest_fitness)
-    leader = jnp.argmax(pbest_fitness, axis=0)
-    groups = jnp.arange(leader.shape[0])
-    return SwarmState(
-        position=state.position,
-        velocity=state.velocity,
-        pbest_position=pbest_position,
-        pbest_fitness=pbest_fitness,
-        gbest_position=pbest_position[leader, groups],
-        gbest_fitness=pbest_fitness[leader, groups],
-    )
+def _random_factors(
+    key: Key, shape: tuple[int, ...]
+) -> tuple[Float[Array, "particles groups dims"], Float[Array, "particles groups dims"]]:
+    """Two independent uniform numbers in [0, 1) for every element: the halves of one word, in steps of 2^-16."""
+    words = jax.random.bits(key, shape, jnp.uint32)
+
+    def uniform(half: jax.Array) -> jax.Array:
+        # By way of int32, which CPUs convert in one instruction, unlike uint32.
+        return half.astype(jnp.int32).astype(jnp.float32) * 2.0**-16
+
+    return uniform(words >> 16), uniform(words & 0xFFFF)

@@ -1,7 +1,6 @@
 """Boxes: the oracle is a dense sampling of the ellipsoid's surface, projected by `cameras.project` in float64."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import LENSES, float32, moved, ring_rig, sphere_points
@@ -16,7 +15,7 @@ from psotrack.cameras import project
 @jax.jit
 def boxes_of(cameras, position_m, size_m):
     boxes = project_boxes(cameras, position_m, shape_in_cameras(cameras, size_m))
-    return jnp.stack([boxes.x0, boxes.y0, boxes.x1, boxes.y1], axis=-1), boxes.in_front
+    return boxes.xyxy, boxes.in_front
 
 
 def boxes(rig, position_m, size_m):

@@ -246,6 +246,6 @@ def test_annotations_are_enforced():
     edges = [jnp.zeros((2, 3))] * 3
     with pytest.raises(jaxtyping.TypeCheckError, match="y1"):
         # The last edge has sets and boxes swapped.
-        box_sum(jnp.zeros((3, 5, 5), jnp.int32), jnp.arange(3), *edges, jnp.zeros((3, 2)))
+        box_sum(jnp.zeros((5, 3, 5), jnp.int32), jnp.arange(3), *edges, jnp.zeros((3, 2)))
     with pytest.raises(jaxtyping.TypeCheckError, match="tables"):
-        box_sum(jnp.zeros((3, 5, 5), jnp.float32), jnp.arange(3), *edges, jnp.zeros((2, 3)))
+        box_sum(jnp.zeros((5, 3, 5), jnp.float32), jnp.arange(3), *edges, jnp.zeros((2, 3)))
