@@ -202,7 +202,7 @@ def test_help_has_an_example(run: Run, command: str) -> None:
 def test_command_line_defaults_are_those_of_the_settings() -> None:
     from psotrack.settings import TrackSettings
 
-    defaults = {option.name: option.default for option in cli.track.params}
+    defaults = {option.name: option.default for option in cli.cli.commands["track"].params}
     compared = [name for name in TrackSettings.__struct_fields__ if name in defaults]
     assert len(compared) > 8
     for name in compared:

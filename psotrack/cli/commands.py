@@ -1,15 +1,10 @@
-"""The command line: thin over functions. Every command says what it needs, what it writes, and shows an example.
-
-Exit codes: 0 only when all was done; 2 for everything that went wrong, with one line on stderr that says what.
-"""
+"""The commands: thin over functions, which are imported when they are called, so that `--help` is quick."""
 
 from __future__ import annotations
 
 import json
 import logging
-import os
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, get_args
 
@@ -17,107 +12,24 @@ import click
 import platformdirs
 
 from psotrack import __version__
-from psotrack.errors import PsotrackError, SettingsError
+from psotrack.cli.options import (
+    CACHE,
+    CAMERAS,
+    FORCE,
+    FRAMES,
+    JOBS,
+    JSON,
+    QUIET,
+    SEQUENCE,
+    TRACK,
+    Numbers,
+    silhouette_options,
+)
+from psotrack.errors import SettingsError
 from psotrack.files import refuse_to_overwrite, written_whole
-from psotrack.foreground import Shadows
 from psotrack.progress import Report, silent, terminal
 from psotrack.settings import Score, SwarmKind, TrackSettings
 from psotrack.silhouette_store import SilhouetteSettings
-
-#: Defaults are written once, in the settings; the command line shows them.
-_TRACK = TrackSettings()
-_SILHOUETTES = SilhouetteSettings()
-
-_Command = Callable[..., None]
-
-
-class _Numbers(click.ParamType):
-    """Numbers with commas between them, such as 0.5,0.5,0.2."""
-
-    def __init__(self, count: int) -> None:
-        self.count = count
-        self.name = ",".join(["NUMBER"] * count)
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        if not isinstance(value, str):
-            return value
-        try:
-            numbers = tuple(float(word) for word in value.split(","))
-        except ValueError:
-            numbers = ()
-        if len(numbers) != self.count:
-            self.fail(f"expected {self.count} numbers with commas between them, found {value!r}", param, ctx)
-        return numbers
-
-
-_SEQUENCE = click.argument("sequence", metavar="SEQ", type=click.Path(path_type=Path))
-_FORCE = click.option("--force", is_flag=True, help="Replace what is there.")
-_QUIET = click.option("--quiet", "-q", is_flag=True, help="No progress, no table: errors only.")
-_JSON = click.option(
-    "--json",
-    "json_path",
-    type=click.Path(path_type=Path),
-    metavar="OUT",
-    help="Write the answer as JSON; - is stdout.",
-)
-_JOBS = click.option(
-    "--jobs", type=click.IntRange(min=1), help="Processes at most.  [default: one per processor]"
-)
-_CACHE = click.option(
-    "--cache",
-    type=click.Path(path_type=Path),
-    envvar="PSOTRACK_CACHE",
-    help="Folder of the stored silhouettes.  [default: $PSOTRACK_CACHE, or psotrack in the user's cache folder]",
-)
-_CAMERAS = click.option(
-    "--cameras", metavar="NAME,NAME...", help="Use these cameras only.  [default: all of the calibration]"
-)
-_FRAMES = click.option(
-    "--frames", "num_frames", type=int, metavar="N", help="Use the first N frames only.  [default: all]"
-)
-
-
-def _silhouette_options(command: _Command) -> _Command:
-    for option in (
-        click.option(
-            "--reduction",
-            type=int,
-            default=_SILHOUETTES.reduction,
-            show_default=True,
-            help="Image pixels per silhouette pixel, along each side.",
-        ),
-        click.option(
-            "--shadows",
-            type=click.Choice(get_args(Shadows)),
-            default=_SILHOUETTES.shadows,
-            show_default=True,
-            help="What becomes of MOG2's shadow label: dark bodies and rotor discs get it as well as shadows.",
-        ),
-        click.option(
-            "--shadow-weight",
-            type=float,
-            default=_SILHOUETTES.shadow_weight,
-            show_default=True,
-            help="Of a shadow pixel, for --shadows weight.",
-        ),
-        click.option(
-            "--var-threshold",
-            type=float,
-            default=_SILHOUETTES.var_threshold,
-            show_default=True,
-            help="Squared distance from the background, in standard deviations, that is foreground.",
-        ),
-        click.option(
-            "--min-blob",
-            "min_blob_px",
-            type=int,
-            default=_SILHOUETTES.min_blob_px,
-            show_default=True,
-            help="Smaller speckle is removed; in pixels.",
-        ),
-    ):
-        command = option(command)
-    return command
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -140,9 +52,9 @@ def cli(verbose: bool) -> None:
 
 
 @cli.command()
-@_SEQUENCE
-@_FORCE
-@_JSON
+@SEQUENCE
+@FORCE
+@JSON
 def info(sequence: Path, force: bool, json_path: Path | None) -> None:
     """Show what SEQ holds, and read all of it but the videos' frames, so that what is broken shows.
 
@@ -167,10 +79,10 @@ def info(sequence: Path, force: bool, json_path: Path | None) -> None:
 @click.option("--frames", "num_frames", type=int, metavar="N", help="First N frames only.  [default: all]")
 @click.option("--scale", type=float, default=1.0, show_default=True, help="Of the image size.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Of flights and noise.")
-@_JOBS
-@_FORCE
-@_QUIET
-@_JSON
+@JOBS
+@FORCE
+@QUIET
+@JSON
 def simulate(
     name: str,
     out: Path,
@@ -209,15 +121,15 @@ def simulate(
 
 
 @cli.command()
-@_SEQUENCE
-@_silhouette_options
-@_CAMERAS
-@_FRAMES
-@_CACHE
-@_JOBS
-@_QUIET
-@_FORCE
-@_JSON
+@SEQUENCE
+@silhouette_options
+@CAMERAS
+@FRAMES
+@CACHE
+@JOBS
+@QUIET
+@FORCE
+@JSON
 def silhouettes(
     sequence: Path,
     cameras: str | None,
@@ -262,33 +174,33 @@ def silhouettes(
 
 
 @cli.command()
-@_SEQUENCE
+@SEQUENCE
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
     required=True,
     help="The tracks: a file that ends in .csv or .parquet.",
 )
-@click.option("--particles", type=int, default=_TRACK.particles, show_default=True, help="Of every swarm.")
-@click.option("--iterations", type=int, default=_TRACK.iterations, show_default=True, help="Per frame.")
+@click.option("--particles", type=int, default=TRACK.particles, show_default=True, help="Of every swarm.")
+@click.option("--iterations", type=int, default=TRACK.iterations, show_default=True, help="Per frame.")
 @click.option(
     "--swarm",
     type=click.Choice(get_args(SwarmKind)),
-    default=_TRACK.swarm,
+    default=TRACK.swarm,
     show_default=True,
     help="One swarm over all drones, as in the paper, or one for each.",
 )
 @click.option(
     "--score",
     type=click.Choice(get_args(Score)),
-    default=_TRACK.score,
+    default=TRACK.score,
     show_default=True,
     help="Concentric windows, or the paper's one box in whole pixels.",
 )
-@click.option("--seed", type=int, default=_TRACK.seed, show_default=True, help="Of the swarm.")
+@click.option("--seed", type=int, default=TRACK.seed, show_default=True, help="Of the swarm.")
 @click.option(
     "--init",
-    default=_TRACK.init,
+    default=TRACK.init,
     show_default=True,
     metavar="auto|truth|FILE",
     help="Where the drones are at first: found by themselves, from the reference, or from a file of tracks.",
@@ -299,14 +211,14 @@ def silhouettes(
 @click.option(
     "--drone-size",
     "drone_size_m",
-    type=_Numbers(3),
+    type=Numbers(3),
     metavar="X,Y,Z",
     help="Full lengths in metres.  [default: from the first frames]",
 )
 @click.option(
     "--bounds",
     "bounds_m",
-    type=_Numbers(6),
+    type=Numbers(6),
     metavar="X0,X1,Y0,Y1,Z0,Z1",
     help="The room in metres.  [default: what the cameras stand around]",
 )
@@ -314,18 +226,18 @@ def silhouettes(
     "--max-speed",
     "max_speed_m_s",
     type=float,
-    default=_TRACK.max_speed_m_s,
+    default=TRACK.max_speed_m_s,
     show_default=True,
     help="Of a drone, in m/s.",
 )
-@_silhouette_options
-@_CAMERAS
-@_FRAMES
-@_CACHE
-@_JOBS
-@_FORCE
-@_QUIET
-@_JSON
+@silhouette_options
+@CAMERAS
+@FRAMES
+@CACHE
+@JOBS
+@FORCE
+@QUIET
+@JSON
 def track(
     sequence: Path,
     out: Path,
@@ -381,7 +293,7 @@ def track(
 
 @cli.command()
 @click.argument("tracks", type=click.Path(path_type=Path))
-@_SEQUENCE
+@SEQUENCE
 @click.option(
     "--plot",
     type=click.Path(path_type=Path),
@@ -390,9 +302,9 @@ def track(
     metavar="[PNG]",
     help="Save 3D paths and error over time.  [default: beside TRACKS, as .png]",
 )
-@_FORCE
-@_QUIET
-@_JSON
+@FORCE
+@QUIET
+@JSON
 def evaluate(
     tracks: Path, sequence: Path, plot: Path | None, force: bool, quiet: bool, json_path: Path | None
 ) -> None:
@@ -429,9 +341,9 @@ def evaluate(
     "--out", type=click.Path(path_type=Path), default=Path("psotrack-demo"), show_default=True, help="Folder."
 )
 @click.option("--seed", type=int, default=0, show_default=True, help="Of flights, noise and swarm.")
-@_JOBS
-@_FORCE
-@_QUIET
+@JOBS
+@FORCE
+@QUIET
 def demo(out: Path, seed: int, jobs: int | None, force: bool, quiet: bool) -> None:
     """Simulate four drones, track them from eight videos, print the errors, save a picture.
 
@@ -449,31 +361,6 @@ def demo(out: Path, seed: int, jobs: int | None, force: bool, quiet: bool) -> No
         console.print(result.errors)
         console.print(result.stages)
         console.print(f"picture: {result.picture}", soft_wrap=True)
-
-
-def main() -> None:
-    """Run the command line; what psotrack raises on purpose becomes one line and exit code 2."""
-    try:
-        # Not `cli.main`, which would make two lines of Ctrl-C.
-        with cli.make_context("psotrack", sys.argv[1:]) as context:
-            cli.invoke(context)
-    except click.exceptions.Exit as done:
-        sys.exit(done.exit_code)
-    except click.ClickException as error:
-        error.show()
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.stderr.write(
-            "psotrack: interrupted; earlier results are unchanged, and the same command goes on\n"
-        )
-        sys.exit(2)
-    except PsotrackError as error:
-        sys.stderr.write(f"psotrack: {error}\n")
-        sys.exit(2)
-    except BrokenPipeError:
-        # Whoever read our output has left, as `head` does.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(2)
 
 
 def _usable(folder: Path, cameras: str | None, num_frames: int | None) -> Any:

@@ -1,0 +1,41 @@
+"""The command line. Every command says what it needs, what it writes, and shows an example.
+
+Exit codes: 0 only when all was done; 2 for everything that went wrong, with one line on stderr that says what.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import click
+
+from psotrack.cli.commands import cli
+from psotrack.errors import PsotrackError
+
+__all__ = ["cli", "main"]
+
+
+def main() -> None:
+    """Run the command line; what psotrack raises on purpose becomes one line and exit code 2."""
+    try:
+        # Not `cli.main`, which would make two lines of Ctrl-C.
+        with cli.make_context("psotrack", sys.argv[1:]) as context:
+            cli.invoke(context)
+    except click.exceptions.Exit as done:
+        sys.exit(done.exit_code)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.stderr.write(
+            "psotrack: interrupted; earlier results are unchanged, and the same command goes on\n"
+        )
+        sys.exit(2)
+    except PsotrackError as error:
+        sys.stderr.write(f"psotrack: {error}\n")
+        sys.exit(2)
+    except BrokenPipeError:
+        # Whoever read our output has left, as `head` does.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(2)
