@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
 from psotrack._typing import Array
-from psotrack.cameras import NEAR_M, Camera, distort, to_camera
+from psotrack.cameras import NEAR_M, Camera, distort
 
 
 @jax.tree_util.register_dataclass
@@ -49,62 +49,104 @@ class Boxes:
         return jnp.stack(edges, axis=-1)
 
 
-def shape_in_cameras(
-    cameras: Camera, size_m: Float[Array, "*drones 3"]
-) -> Float[Array, "*drones cameras 3 3"]:
-    """Shape matrices S = R diag(size / 2)² Rᵀ of ellipsoids in each camera's coordinates, m².
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Extents:
+    """Drones of known size as cameras see them: all of their boxes that does not depend on where they are.
+
+    Every number is an array of its own, because positions are tried by the thousand: picked out of matrices within the
+    swarm's loop, they would be picked anew in every iteration.
+
+    Attributes:
+        cameras: with one leading axis.
+        rotation: nine of (cameras,), the rows of R one after the other.
+        translation_m: three of (cameras,).
+        s_xx, s_yy, s_xz, s_yz, s_zz: (..., cameras), of the shape S = R diag(size / 2)² Rᵀ in camera coordinates, m².
+        f_x, f_y, skew, c_x, c_y: (cameras,), intrinsics in pixels; c_x and c_y in the convention of boxes.
+    """
+
+    cameras: Camera
+    rotation: tuple[Float[Array, "cameras"], ...]
+    translation_m: tuple[Float[Array, "cameras"], ...]
+    s_xx: Float[Array, "*drones cameras"]
+    s_yy: Float[Array, "*drones cameras"]
+    s_xz: Float[Array, "*drones cameras"]
+    s_yz: Float[Array, "*drones cameras"]
+    s_zz: Float[Array, "*drones cameras"]
+    f_x: Float[Array, "cameras"]
+    f_y: Float[Array, "cameras"]
+    skew: Float[Array, "cameras"]
+    c_x: Float[Array, "cameras"]
+    c_y: Float[Array, "cameras"]
+
+
+def extents(cameras: Camera, size_m: Float[Array, "*drones 3"]) -> Extents:
+    """Ellipsoids in cameras.
 
     Args:
         cameras: with one leading axis.
         size_m: (..., 3), full lengths of the extent along the world's axes.
     """
-    R = cameras.T_cam_world[:, :3, :3]
-    return jnp.einsum("cij,...j,ckj->...cik", R, jnp.square(size_m / 2), R)
+    R, t, K = cameras.T_cam_world[:, :3, :3], cameras.T_cam_world[:, :3, 3], cameras.K
+    S = jnp.einsum("cij,...j,ckj->...cik", R, jnp.square(size_m / 2), R)
+    return Extents(
+        cameras=cameras,
+        rotation=tuple(R[:, i, j] for i in range(3) for j in range(3)),
+        translation_m=tuple(t[:, i] for i in range(3)),
+        s_xx=S[..., 0, 0],
+        s_yy=S[..., 1, 1],
+        s_xz=S[..., 0, 2],
+        s_yz=S[..., 1, 2],
+        s_zz=S[..., 2, 2],
+        f_x=K[:, 0, 0],
+        f_y=K[:, 1, 1],
+        skew=K[:, 0, 1],
+        c_x=K[:, 0, 2] + 0.5,
+        c_y=K[:, 1, 2] + 0.5,
+    )
 
 
-def project_boxes(
-    cameras: Camera, position_m: Float[Array, "*#drones 3"], shapes: Float[Array, "*#drones cameras 3 3"]
-) -> Boxes:
-    """Boxes of ellipsoids at positions, in every camera.
+def project_boxes(seen: Extents, position_m: Float[Array, "*#drones 3"]) -> Boxes:
+    """Boxes of drones at positions, in every camera.
 
     The lens bends the middles of the box's four sides; at a drone's few degrees that is the box of the bent outline.
 
     Args:
-        cameras: with one leading axis.
+        seen: from `extents`; its leading axes broadcast against those of `position_m`.
         position_m: (..., 3), world.
-        shapes: from `shape_in_cameras`; leading axes broadcast against those of `position_m`.
 
     Returns:
         Boxes with axes (..., cameras).
     """
-    centre = to_camera(cameras, position_m[..., None, :])
-    z, s_zz = centre[..., 2], shapes[..., 2, 2]
-    in_front = z * z * jnp.sign(z) > s_zz + NEAR_M
+    x_world, y_world, z_world = (position_m[..., i : i + 1] for i in range(3))
+    x, y, z = (
+        seen.rotation[3 * i] * x_world
+        + seen.rotation[3 * i + 1] * y_world
+        + seen.rotation[3 * i + 2] * z_world
+        + seen.translation_m[i]
+        for i in range(3)
+    )
+    in_front = z * z * jnp.sign(z) > seen.s_zz + NEAR_M
     # Behind the camera the quadratic has no meaning; any positive denominator keeps values and gradients finite.
-    a = jnp.where(in_front, z * z - s_zz, 1.0)
+    a = jnp.where(in_front, z * z - seen.s_zz, 1.0)
 
-    def tangents(axis: int) -> tuple[Array, Array]:
-        along = centre[..., axis]
-        b = along * z - shapes[..., axis, 2]
-        c = along * along - shapes[..., axis, axis]
+    def tangents(along: Array, s_along_z: Array, s_along: Array) -> tuple[Array, Array]:
+        b = along * z - s_along_z
+        c = along * along - s_along
         root = jnp.sqrt(jnp.where(in_front, jnp.maximum(b * b - a * c, 1e-12), 1.0))
         return b / a, root / a
 
-    (u, u_half), (v, v_half) = tangents(0), tangents(1)
-    K = cameras.K
-    if cameras.dist.shape[-1] == 0:
-        x = K[..., 0, 0] * u + K[..., 0, 1] * v + K[..., 0, 2]
-        y = K[..., 1, 1] * v + K[..., 1, 2]
-        return Boxes(x + 0.5, y + 0.5, K[..., 0, 0] * u_half, K[..., 1, 1] * v_half, in_front)
+    (u, u_half), (v, v_half) = tangents(x, seen.s_xz, seen.s_xx), tangents(y, seen.s_yz, seen.s_yy)
+    if seen.cameras.dist.shape[-1] == 0:
+        x_middle, y_middle = seen.f_x * u + seen.skew * v + seen.c_x, seen.f_y * v + seen.c_y
+        return Boxes(x_middle, y_middle, seen.f_x * u_half, seen.f_y * v_half, in_front)
 
     def column(u: Array) -> Array:
-        bent_u, bent_v = distort(cameras, u, v)
-        return K[..., 0, 0] * bent_u + K[..., 0, 1] * bent_v + K[..., 0, 2]
+        bent_u, bent_v = distort(seen.cameras, u, v)
+        return seen.f_x * bent_u + seen.skew * bent_v + seen.c_x
 
     def row(v: Array) -> Array:
-        return K[..., 1, 1] * distort(cameras, u, v)[1] + K[..., 1, 2]
+        return seen.f_y * distort(seen.cameras, u, v)[1] + seen.c_y
 
     left, right, top, bottom = column(u - u_half), column(u + u_half), row(v - v_half), row(v + v_half)
-    return Boxes(
-        (left + right) / 2 + 0.5, (top + bottom) / 2 + 0.5, (right - left) / 2, (bottom - top) / 2, in_front
-    )
+    return Boxes((left + right) / 2, (top + bottom) / 2, (right - left) / 2, (bottom - top) / 2, in_front)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from psotrack.boxes import project_boxes, shape_in_cameras
+from psotrack.boxes import extents, project_boxes
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.evaluation import evaluate, plots, tables
 from psotrack.files import refuse_to_overwrite, written_whole
@@ -115,9 +115,9 @@ def save_picture(path: Path, sequence: Sequence, tracked: TrackedSequence, frame
 
 def _boxes(sequence: Sequence, tracked: TrackedSequence, frame: int) -> Float[np.ndarray, "drones cameras 4"]:
     cameras = on_device(sequence.rig.cameras)
-    shapes = shape_in_cameras(cameras, np.asarray(tracked.start.size_m, np.float32))
+    seen = extents(cameras, np.asarray(tracked.start.size_m, np.float32))
     position: Float[np.ndarray, "drones 3"] = tracked.trajectories.position_m[frame].astype(np.float32)
-    return np.asarray(project_boxes(cameras, position, shapes).xyxy)
+    return np.asarray(project_boxes(seen, position).xyxy)
 
 
 def _frame_of(sequence: Sequence, camera: str, frame: int) -> UInt8[np.ndarray, "height width 3"]:

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from psotrack._typing import Array, Tables
-from psotrack.boxes import Boxes, project_boxes, shape_in_cameras
+from psotrack.boxes import Boxes, Extents, extents, project_boxes
 from psotrack.cameras import Camera
 from psotrack.summed_area import box_sum
 
@@ -56,14 +56,12 @@ class Scene:
     """What the score of one frame reads.
 
     Attributes:
-        cameras: with one leading axis.
-        shapes: (drones, cameras, 3, 3), from `shape_in_cameras`.
+        extents: of the drones in the cameras.
         tables: (height + 1, cameras, width + 1) of the frame's silhouettes.
         settings: static.
     """
 
-    cameras: Camera
-    shapes: Float[Array, "drones cameras 3 3"]
+    extents: Extents
     tables: Tables
     settings: ScoreSettings = field(metadata={"static": True})
 
@@ -75,7 +73,7 @@ def scene(
     settings: ScoreSettings,
 ) -> Scene:
     """The scene of one frame for drones of these sizes (full lengths, metres)."""
-    return Scene(cameras, shape_in_cameras(cameras, size_m), tables, settings)
+    return Scene(extents(cameras, size_m), tables, settings)
 
 
 def camera_scores(
@@ -90,7 +88,7 @@ def camera_scores(
     Returns:
         Scores in [0, 1]; and weights, the share of the drone's box that lies inside the image (0 behind the camera).
     """
-    boxes = project_boxes(scene.cameras, position_m, scene.shapes)
+    boxes = project_boxes(scene.extents, position_m)
     foreground, area = _windows(scene, boxes, (*scene.settings.windows, scene.settings.ring))
     score = jnp.zeros_like(foreground[0])
     for k in range(len(scene.settings.windows)):
@@ -104,7 +102,7 @@ def filled(
     scene: Scene, position_m: Float[Array, "*batch drones 3"]
 ) -> Float[Array, "*batch drones cameras"]:
     """Share of every drone's box that is foreground; 0 where most of the box is outside the image."""
-    boxes = project_boxes(scene.cameras, position_m, scene.shapes)
+    boxes = project_boxes(scene.extents, position_m)
     foreground, area = _windows(scene, boxes, (1.0,))
     in_view = _share_in_image(scene, boxes) > 0.5
     return jnp.where(in_view, foreground[0] / jnp.maximum(area[0], 1e-6), 0.0)

@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from psotrack.boxes import project_boxes, shape_in_cameras
+from psotrack.boxes import extents, project_boxes
 from psotrack.cameras import project
 
 
 @jax.jit
 def boxes_of(cameras, position_m, size_m):
-    boxes = project_boxes(cameras, position_m, shape_in_cameras(cameras, size_m))
+    boxes = project_boxes(extents(cameras, size_m), position_m)
     return boxes.xyxy, boxes.in_front
 
 

@@ -1,11 +1,12 @@
-"""psotrack's fitness in vectorised NumPy, float32: what pyswarms drives.
+"""psotrack's fitness in vectorised NumPy, which is what pyswarms drives: written plainly, and tuned by hand.
 
-Every operation covers all particles, drones, cameras and windows at once. Written for speed as NumPy allows it:
-cameras last and contiguous, one small matrix product per coordinate, table lookups by `take` of flat indices.
+Both cover all particles, drones, cameras and windows at once, and are the same function of the same silhouettes.
 Cameras have no lens distortion and no skew here, which spares NumPy work that psotrack's general code has to do.
 """
 
 from __future__ import annotations
+
+from typing import Protocol
 
 import numpy as np
 
@@ -13,12 +14,102 @@ from psotrack.cameras import NEAR_M, Camera
 from psotrack.fitness import FULL, ScoreSettings
 
 
-class NumpyFitness:
+class NumpyFitness(Protocol):
     """The mean fitness over drones of whole constellations, as `psotrack.fitness.joint_fitness`."""
 
+    def tables(self, coverage: np.ndarray) -> np.ndarray:
+        """Summed-area tables (cameras, height + 1, width + 1) of silhouettes, in whole pixels."""
+        ...
+
+    def __call__(self, tables: np.ndarray, position_m: np.ndarray) -> np.ndarray:
+        """Fitness (particles,) of positions (particles, drones, 3)."""
+        ...
+
+
+class PlainFitness:
+    """Vectorised NumPy as one writes it first: float64, arrays (windows, particles, drones, cameras)."""
+
     def __init__(self, cameras: Camera, size_m: np.ndarray, settings: ScoreSettings) -> None:
-        if cameras.dist.shape[-1] or np.any(cameras.K[:, 0, 1]):
-            raise ValueError("cameras must have no lens distortion and no skew")
+        _check_pinhole(cameras)
+        self._rotation = cameras.T_cam_world[:, :3, :3]
+        self._t = cameras.T_cam_world[:, :3, 3]
+        self._K = cameras.K
+        self._shapes = np.einsum("cij,dj,ckj->dcik", self._rotation, (size_m / 2) ** 2, self._rotation)
+        self._settings = settings
+
+    @staticmethod
+    def tables(coverage: np.ndarray) -> np.ndarray:
+        """As `NumpyFitness.tables`."""
+        return np.pad(coverage.cumsum(axis=1).cumsum(axis=2) / FULL, [(0, 0), (1, 0), (1, 0)])
+
+    def __call__(self, tables: np.ndarray, position_m: np.ndarray) -> np.ndarray:
+        """As `NumpyFitness`."""
+        settings = self._settings
+        in_front, x, x_half, y, y_half = self._boxes(position_m)
+        height, width = tables.shape[1] - 1, tables.shape[2] - 1
+
+        scales = np.array([*settings.windows, settings.ring]).reshape(-1, 1, 1, 1)
+        x0, x1 = np.clip(x - scales * x_half, 0, width), np.clip(x + scales * x_half, 0, width)
+        y0, y1 = np.clip(y - scales * y_half, 0, height), np.clip(y + scales * y_half, 0, height)
+        foreground = (
+            _bilinear(tables, x1, y1)
+            - _bilinear(tables, x0, y1)
+            - _bilinear(tables, x1, y0)
+            + _bilinear(tables, x0, y0)
+        )
+        area = (x1 - x0) * (y1 - y0)
+        inner, ring = foreground[:-1], foreground[-1]
+        score = (inner / np.maximum(area[:-1] + np.maximum(ring - inner, 0), 1e-6)).mean(axis=0)
+
+        inside_x = np.clip(x + x_half, 0, width) - np.clip(x - x_half, 0, width)
+        inside_y = np.clip(y + y_half, 0, height) - np.clip(y - y_half, 0, height)
+        weight = np.where(in_front, inside_x * inside_y / np.maximum(4 * x_half * y_half, 1e-6), 0)
+        mean = (weight * score).sum(axis=-1) / np.maximum(weight.sum(axis=-1), 1e-6)
+        enough = (weight > 0.5).sum(axis=-1) >= settings.min_cameras
+        return np.where(enough, mean, 0).mean(axis=-1)
+
+    def _boxes(self, position_m: np.ndarray) -> tuple[np.ndarray, ...]:
+        """In front of the camera or not; middle and half of the box along x and along y, in reduced pixels."""
+        centre = np.einsum("cij,pdj->pdci", self._rotation, position_m) + self._t
+        z, s_zz = centre[..., 2], self._shapes[..., 2, 2]
+        in_front = z**2 * np.sign(z) > s_zz + NEAR_M
+        a = np.where(in_front, z**2 - s_zz, 1)
+        edges = []
+        for axis in (0, 1):
+            along = centre[..., axis]
+            b = along * z - self._shapes[..., axis, 2]
+            c = along**2 - self._shapes[..., axis, axis]
+            root = np.sqrt(np.where(in_front, np.maximum(b**2 - a * c, 1e-12), 1))
+            focal, middle = self._K[:, axis, axis], self._K[:, axis, 2] + 0.5
+            edges += [focal * b / a + middle, focal * root / a]
+        return in_front, *(edge / self._settings.reduction for edge in edges)
+
+
+def _bilinear(tables: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Tables read at fractional places (..., cameras), each camera in its own."""
+    camera = np.arange(len(tables))
+    column = np.minimum(x.astype(int), tables.shape[2] - 2)
+    row = np.minimum(y.astype(int), tables.shape[1] - 2)
+    fx, fy = x - column, y - row
+    upper = (1 - fx) * tables[camera, row, column] + fx * tables[camera, row, column + 1]
+    lower = (1 - fx) * tables[camera, row + 1, column] + fx * tables[camera, row + 1, column + 1]
+    return (1 - fy) * upper + fy * lower
+
+
+def _check_pinhole(cameras: Camera) -> None:
+    if cameras.dist.shape[-1] or np.any(cameras.K[:, 0, 1]):
+        raise ValueError("cameras must have no lens distortion and no skew")
+
+
+class TunedFitness:
+    """Written for speed as NumPy allows it.
+
+    float32, cameras last and contiguous, one small matrix product per coordinate, no read computed twice, table lookups
+    by `take` of flat indices.
+    """
+
+    def __init__(self, cameras: Camera, size_m: np.ndarray, settings: ScoreSettings) -> None:
+        _check_pinhole(cameras)
         rotation = cameras.T_cam_world[:, :3, :3]
         shapes = np.einsum("cij,dj,ckj->ikdc", rotation, np.square(size_m / 2), rotation)
         self._rotation_t = [np.ascontiguousarray(rotation[:, axis].T, np.float32) for axis in range(3)]
@@ -34,7 +125,7 @@ class NumpyFitness:
 
     @staticmethod
     def tables(coverage: np.ndarray) -> np.ndarray:
-        """Summed-area tables (cameras, height + 1, width + 1) of silhouettes, in whole pixels, float32."""
+        """As `NumpyFitness.tables`, float32."""
         sums = coverage.astype(np.int32)
         for axis in (1, 2):
             np.cumsum(sums, axis=axis, out=sums)
@@ -44,7 +135,8 @@ class NumpyFitness:
         return tables
 
     def __call__(self, tables: np.ndarray, position_m: np.ndarray) -> np.ndarray:
-        """Fitness (particles,) of positions (particles, drones, 3)."""
+        """As `NumpyFitness`."""
+        position_m = position_m.astype(np.float32)
         x, y, z = (
             position_m @ rotation_t + t for rotation_t, t in zip(self._rotation_t, self._t, strict=True)
         )
@@ -54,7 +146,7 @@ class NumpyFitness:
         (x_low, x_high), whole_x, inside_x = self._extent(x, z, a, s[0, 2], s[0, 0], 0, tables.shape[2] - 1)
         (y_low, y_high), whole_y, inside_y = self._extent(y, z, a, s[1, 2], s[1, 1], 1, tables.shape[1] - 1)
 
-        foreground = _box_sums(tables, x_low, y_low, x_high, y_high)
+        foreground = _tuned_box_sums(tables, x_low, y_low, x_high, y_high)
         area = (x_high[:-1] - x_low[:-1]) * (y_high[:-1] - y_low[:-1])
         inner, ring = foreground[:-1], foreground[-1]
         score = (inner / np.maximum(area + np.maximum(ring - inner, 0), 1e-6)).mean(axis=0)
@@ -84,7 +176,7 @@ class NumpyFitness:
         return (np.clip(middle - halves, 0, last), np.clip(middle + halves, 0, last)), 2 * half, inside
 
 
-def _box_sums(
+def _tuned_box_sums(
     tables: np.ndarray, x0: np.ndarray, y0: np.ndarray, x1: np.ndarray, y1: np.ndarray
 ) -> np.ndarray:
     """Sums over fractional boxes (..., cameras): bilinear reads of the tables at the four corners."""

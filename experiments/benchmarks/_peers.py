@@ -21,7 +21,8 @@ from _numpy_fitness import NumpyFitness
 from psotrack import fitness
 from psotrack.cameras import CameraRig
 from psotrack.initialisation import Start
-from psotrack.pipeline import TrackSettings, on_device, tracker_inputs
+from psotrack.pipeline import on_device, tracker_inputs
+from psotrack.settings import TrackSettings
 from psotrack.summed_area import summed_area_table
 
 
@@ -140,14 +141,14 @@ class Evosax:
 
 
 class PySwarms:
-    """pyswarms' global-best PSO on the NumPy fitness, frame by frame."""
+    """pyswarms' global-best PSO on a NumPy fitness, frame by frame."""
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, fitness: NumpyFitness) -> None:
         _silence_pyswarms()
         from pyswarms.single import GlobalBestPSO
 
         self._problem = problem
-        self._fitness = NumpyFitness(problem.rig.cameras, problem.start.size_m, problem.score)
+        self._fitness = fitness
         settings, dims = problem.settings, problem.start.position_m.size
         # One optimiser for all frames: making one sets up logging four times, which takes longer than a search.
         self._optimiser = GlobalBestPSO(
@@ -191,7 +192,7 @@ class PySwarms:
         particles[:2] = predicted, position
 
         def cost(population: np.ndarray) -> np.ndarray:
-            return -self._fitness(tables, population.astype(np.float32).reshape(shape))
+            return -self._fitness(tables, population.reshape(shape))
 
         optimiser = self._optimiser
         optimiser.bounds = low.reshape(-1), high.reshape(-1)

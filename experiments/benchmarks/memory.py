@@ -19,8 +19,9 @@ import zarr
 from zarr.codecs import ZstdCodec
 
 from psotrack.initialisation import Start
-from psotrack.pipeline import TrackSettings, track_silhouettes
+from psotrack.pipeline import track_silhouettes
 from psotrack.progress import terminal
+from psotrack.settings import TrackSettings
 from psotrack.silhouette_store import CHUNK_FRAMES, open_stored
 from psotrack.silhouettes import Silhouettes
 
