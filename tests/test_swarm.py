@@ -60,6 +60,27 @@ init = jax.jit(begin, static_argnums=0)
 step = jax.jit(advance, static_argnums=1)
 
 
+def random_factors(key, shape):
+    """The hash of the key and the element's number, in Python's own whole numbers."""
+
+    def mixed(word):
+        for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
+            word = ((word ^ (word >> shift)) * factor) % 2**32
+        return word ^ (word >> 16)
+
+    first, last = (int(half) for half in jax.random.key_data(key))
+    words = [mixed(mixed((number * 0x9E3779B9 + first) % 2**32) ^ last) for number in range(np.prod(shape))]
+    return (np.array([half(word) for word in words]).reshape(shape) / 2**16 for half in (high_half, low_half))
+
+
+def high_half(word):
+    return word >> 16
+
+
+def low_half(word):
+    return word % 2**16
+
+
 @pytest.mark.parametrize("max_step", [10.0, 0.75])
 def test_one_step_of_three_particles_by_hand(max_step):
     """Two groups with different leaders. Catches: r1 and r2 shared over dimensions, the best of another group or of
@@ -83,8 +104,7 @@ def test_one_step_of_three_particles_by_hand(max_step):
     key = jax.random.key(7)
     after = step(key, sphere, before, knobs)
 
-    words = np.asarray(jax.random.bits(key, (3, 2, 2), jnp.uint32))
-    r1, r2 = (words >> 16) / 2**16, (words & 0xFFFF) / 2**16
+    r1, r2 = random_factors(key, (3, 2, 2))
     gbest = np.array([[1, 2], [1, 1]])
     expected_velocity, expected_position = np.empty((3, 2, 2)), np.empty((3, 2, 2))
     expected_pbest = pbest.copy()
@@ -313,7 +333,14 @@ def test_random_factors_are_uniform_and_independent():
         assert factor.max() < 1
         assert factor.mean() == pytest.approx(1 / 2, abs=5 * np.sqrt(1 / 12 / 70_000))
         assert factor.var() == pytest.approx(1 / 12, abs=5 * np.sqrt(1 / 180 / 70_000))
-    assert abs(np.corrcoef(r1, r2)[0, 1]) < 5 / np.sqrt(70_000)
+    # Nor do they follow each other, from one element, particle or iteration to the next.
+    later = np.asarray(swarm.move(jax.random.fold_in(jax.random.key(0), 1), pulled, knobs).position).ravel()
+    for one, other in ((r1, r2), (r1[1:], r1[:-1]), (r1[7:], r1[:-7]), (r1[1:], r2[:-1]), (r1, later)):
+        assert abs(np.corrcoef(one, other)[0, 1]) < 5 / np.sqrt(69_000)
+    # As many fall into each of 256 bins as should: chi-squared with 255 degrees, its mean and five deviations.
+    for factor in (r1, r2):
+        counts = np.histogram(factor, bins=256, range=(0, 1))[0]
+        assert (np.square(counts - 70_000 / 256) / (70_000 / 256)).sum() < 255 + 5 * np.sqrt(2 * 255)
 
 
 def test_knobs_and_number_of_iterations_compile_nothing_new():
