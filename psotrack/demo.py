@@ -107,7 +107,7 @@ def save_picture(path: Path, sequence: Sequence, tracked: TrackedSequence, frame
             axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=colour, linewidth=1.6))
         axes.set_title(f"{name}, frame {frame}", fontsize=9)
         axes.set_axis_off()
-    paths = figure.add_axes((0.55, 0.0, 0.42, 0.97), projection="3d")
+    paths = figure.add_axes((0.56, 0.0, 0.42, 0.88), projection="3d")
     plots.draw_trajectories(paths, tracked.trajectories, sequence.truth)
     with written_whole(path) as temporary:
         figure.savefig(temporary, dpi=120)
