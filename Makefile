@@ -3,6 +3,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 .DEFAULT_GOAL := help
+comma := ,
+# The package with some of its extras, by uv where it is and by pip where not; an environment that uv made has no pip.
+install = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python $(BIN)/python -e '.[$(1)]'; \
+	else { test -x $(BIN)/pip || $(BIN)/python -m ensurepip >/dev/null; } \
+	  && $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(1)]'; fi
 
 .PHONY: help demo test test-fast lint format bench clean
 
@@ -12,13 +17,11 @@ help:  ## what can be made
 $(VENV)/.installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null \
 	  || { echo "psotrack: set-up failed: '$(PYTHON)' is not Python 3.11 or newer; name one, e.g. make PYTHON=python3.12" >&2; exit 1; }
-	@if command -v uv >/dev/null 2>&1; then \
-	  { test -d $(VENV) || uv venv --quiet --python $(PYTHON) $(VENV); } \
-	    && uv pip install --quiet --python $(BIN)/python -e '.[test,lint]'; \
-	else \
-	  { test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV); } \
-	    && $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test,lint]'; \
-	fi || { echo "psotrack: set-up failed: the packages of pyproject.toml could not be installed into $(VENV) (see above); remove $(VENV) to start anew" >&2; exit 1; }
+	@{ if command -v uv >/dev/null 2>&1; then \
+	    test -d $(VENV) || uv venv --quiet --python $(PYTHON) $(VENV); \
+	  else \
+	    test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV); \
+	  fi && $(call install,test$(comma)lint); } || { echo "psotrack: set-up failed: the packages of pyproject.toml could not be installed into $(VENV) (see above); remove $(VENV) to start anew" >&2; exit 1; }
 	@touch $@
 
 demo: $(VENV)/.installed  ## simulate four drones, track them from the videos, print the errors, save a picture in demo/
@@ -40,8 +43,7 @@ format: $(VENV)/.installed  ## let ruff mend and format
 	@$(BIN)/ruff format .
 
 bench: $(VENV)/.installed  ## the swarm against pyswarms and evosax
-	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(BIN)/python -m ensurepip -q
-	@$(BIN)/python -m pip install --quiet -e '.[bench]'
+	@$(call install,bench)
 	@$(BIN)/python experiments/benchmarks/track_stage.py
 
 clean:  ## remove what was built, the environment too

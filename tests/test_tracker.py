@@ -84,7 +84,7 @@ def test_velocity_is_estimated(coverage):
     _, info = track(coverage, velocity_m_s=np.zeros((2, 3)))
     error_m_s = np.linalg.norm(info.velocity_m_s - VELOCITY_M_S, axis=-1)
     # The filter averages over a few frames: a third of a cell of noise over three frames is 0.08 m/s, and it lags by
-    # three frames, in which these curves turn by 0.2 m/s. Measured 0.2, limit 0.4.
+    # three frames, in which these curves turn by 0.2 m/s. Measured 0.09, limit 0.4.
     assert np.median(error_m_s[10:]) < 0.4
     assert error_m_s[0].min() > 0.4
 
