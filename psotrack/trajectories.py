@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.errors import InputError
+
+#: Halves of a covariance may differ by this share of its largest entry: some hundred roundings of float32.
+SYMMETRY = 1e-5
 
 
 class Status(IntEnum):
@@ -30,8 +33,9 @@ class Status(IntEnum):
 class Trajectories:
     """Positions of drones over frames, with what is known beside them.
 
-    A reference has positions, and orientations where they were recorded; a tracker adds velocities, fitness, number
-    of cameras and status. What is not known of one drone in one frame is NaN; what is not known at all is None.
+    A reference has positions, and orientations where they were recorded; a tracker adds velocities, covariances,
+    fitness, number of cameras and status. What is not known of one drone in one frame is NaN; what is not known at
+    all is None.
 
     Attributes:
         frame: (frames,), numbers of the video frames, 0-based, increasing.
@@ -39,6 +43,7 @@ class Trajectories:
         drones: one name per drone.
         position_m: (frames, drones, 3), world, metres.
         velocity_m_s: (frames, drones, 3), metres per second.
+        covariance_m2: (frames, drones, 3, 3), of the positions, world, square metres; symmetric.
         orientation_wxyz: (frames, drones, 4), unit quaternions that turn body into world coordinates.
         fitness: (frames, drones), in [0, 1].
         num_cameras: (frames, drones), cameras that see the drone.
@@ -53,7 +58,8 @@ class Trajectories:
     orientation_wxyz: Float[np.ndarray, "frames drones 4"] | None = None
     fitness: Float[np.ndarray, "frames drones"] | None = None
     num_cameras: Int[np.ndarray, "frames drones"] | None = None
-    status: Int[np.ndarray, "frames drones"] | None = field(default=None)
+    status: Int[np.ndarray, "frames drones"] | None = None
+    covariance_m2: Float[np.ndarray, "frames drones 3 3"] | None = None
 
     def __post_init__(self) -> None:
         frames, drones = len(self.frame), len(self.drones)
@@ -65,6 +71,7 @@ class Trajectories:
             "fitness": (frames, drones),
             "num_cameras": (frames, drones),
             "status": (frames, drones),
+            "covariance_m2": (frames, drones, 3, 3),
         }
         for name, shape in expected.items():
             value = getattr(self, name)
@@ -78,6 +85,8 @@ class Trajectories:
             raise InputError(
                 "trajectories.frame", expected="increasing frame numbers", found="repeats or steps back"
             )
+        if self.covariance_m2 is not None:
+            _check_symmetric(self.covariance_m2)
 
     @property
     def num_frames(self) -> int:
@@ -117,4 +126,18 @@ class Trajectories:
             fitness=rows(self.fitness),
             num_cameras=rows(self.num_cameras),
             status=rows(self.status),
+            covariance_m2=rows(self.covariance_m2),
+        )
+
+
+def _check_symmetric(covariance_m2: Float[np.ndarray, "frames drones 3 3"]) -> None:
+    """Refuse matrices whose halves differ by more than the rounding of float32 sums; NaN is not known, and passes."""
+    asymmetry_m2 = np.abs(covariance_m2 - np.swapaxes(covariance_m2, -1, -2)).max(axis=(-2, -1))
+    wrong = asymmetry_m2 > SYMMETRY * np.abs(covariance_m2).max(axis=(-2, -1))
+    if wrong.any():
+        row, drone = np.argwhere(wrong)[0]
+        raise InputError(
+            "trajectories.covariance_m2",
+            expected="symmetric matrices",
+            found=f"{covariance_m2[row, drone].tolist()} in row {row} of drone {drone}",
         )

@@ -1,7 +1,8 @@
 """Trajectories on disk: CSV and Parquet tables with one row per frame and drone.
 
-Writing is strict, so that other programs can rely on the columns of `COLUMNS`, in this order. Reading needs
-`frame`, `drone` and the position, takes rows and columns in any order, and leaves others alone.
+Writing is strict, so that other programs can rely on the columns of `COLUMNS`, in this order, and those of
+`COVARIANCE_COLUMNS` after them where covariances are known. Reading needs `frame`, `drone` and the position, takes
+rows and columns in any order, and leaves others alone.
 """
 
 from __future__ import annotations
@@ -41,8 +42,15 @@ COLUMNS = {
     "num_cameras": "1",
     "status": "tracked, coasting or lost",
 }
+
+#: Columns after those, where covariances of the positions are known: the upper triangle, row by row.
+COVARIANCE_COLUMNS = dict.fromkeys(("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"), "m2")
+_READ = COLUMNS | COVARIANCE_COLUMNS
 _REQUIRED = ("frame", "drone", "x_m", "y_m", "z_m")
 _WORDS = ("drone", "status")
+#: Which of the six columns stands in which place of the matrix.
+_UPPER = np.triu_indices(3)
+_PLACES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 _STATUS = {status.label: status for status in Status}
 
 
@@ -72,7 +80,7 @@ def write_trajectories(path: Path, trajectories: Trajectories, *, force: bool = 
 
 
 def read_trajectories(path: Path, *, fps: float | None = None) -> Trajectories:
-    """Read a table: `frame`, `drone`, `x_m`, `y_m`, `z_m`, and of the other `COLUMNS` those that are there.
+    """Read a table: `frame`, `drone`, `x_m`, `y_m`, `z_m`, and of the other columns those that are there.
 
     A frame and drone without a row, or with an empty position, is NaN and `lost`. Names of drones may be
     numbers; their order is that of first appearance.
@@ -139,7 +147,11 @@ def _to_columns(trajectories: Trajectories) -> dict[str, Shaped[np.ndarray, "row
         "num_cameras": np.full(shape, -1) if trajectories.num_cameras is None else trajectories.num_cameras,
         "status": labels[status],
     }
-    return {name: columns[name].ravel() for name in COLUMNS}
+    columns = {name: columns[name] for name in COLUMNS}
+    if trajectories.covariance_m2 is not None:
+        upper = np.moveaxis(trajectories.covariance_m2[..., *_UPPER], -1, 0)
+        columns |= dict(zip(COVARIANCE_COLUMNS, upper, strict=True))
+    return {name: column.ravel() for name, column in columns.items()}
 
 
 def _write_csv(path: Path, columns: Mapping[str, Shaped[np.ndarray, "rows"]]) -> None:
@@ -160,7 +172,8 @@ def _write_parquet(path: Path, columns: Mapping[str, Shaped[np.ndarray, "rows"]]
         name: pa.array(column, types.get(name, pa.float64()), mask=~_known(column))
         for name, column in columns.items()
     }
-    metadata = {"psotrack.schema_version": str(SCHEMA_VERSION), "psotrack.units": json.dumps(COLUMNS)}
+    units = {name: _READ[name] for name in columns}
+    metadata = {"psotrack.schema_version": str(SCHEMA_VERSION), "psotrack.units": json.dumps(units)}
     pq.write_table(pa.table(arrays).replace_schema_metadata(metadata), path)
 
 
@@ -203,7 +216,7 @@ def _read_csv(path: Path) -> _Table:
             raise InputError(f"{path}, line {line}", expected=f"a number in {name}", found=found) from None
 
     columns: dict[str, np.ndarray] = {}
-    for name in [name for name in COLUMNS if name in header]:
+    for name in [name for name in _READ if name in header]:
         words = [row[header.index(name)].strip() for row in rows]
         if name in _WORDS:
             columns[name] = np.array(words, object)
@@ -221,7 +234,7 @@ def _read_parquet(path: Path) -> _Table:
     except (pa.ArrowException, OSError) as error:
         raise InputError(path, expected="a Parquet file", found=f"{error}".partition("\n")[0]) from error
     _check_columns(path, table.column_names)
-    columns = {name: _parquet_column(path, table, name) for name in COLUMNS if name in table.column_names}
+    columns = {name: _parquet_column(path, table, name) for name in _READ if name in table.column_names}
     return _Table(path, columns, lambda row: f"row {row + 1}")
 
 
@@ -241,7 +254,7 @@ def _parquet_column(path: Path, table: pa.Table, name: str) -> Shaped[np.ndarray
 
 def _check_columns(path: Path, names: list[str]) -> None:
     missing = [name for name in _REQUIRED if name not in names]
-    twice = [name for name in COLUMNS if names.count(name) > 1]
+    twice = [name for name in _READ if names.count(name) > 1]
     if missing or twice:
         raise InputError(
             path,
@@ -278,6 +291,7 @@ def _from_table(table: _Table, fps: float | None) -> Trajectories:
         return grid(*parts, missing=np.nan) if known else None
 
     fitness, num_cameras = optional("fitness"), optional("num_cameras")
+    covariance_m2 = optional(*COVARIANCE_COLUMNS)
     status = np.full(len(frame) * len(names), int(Status.LOST))
     if "status" in columns:
         status[cell] = [_STATUS[word] for word in columns["status"]]
@@ -290,6 +304,7 @@ def _from_table(table: _Table, fps: float | None) -> Trajectories:
         fitness=None if fitness is None else fitness[..., 0],
         num_cameras=None if num_cameras is None else np.nan_to_num(num_cameras[..., 0]).astype(np.int64),
         status=status.reshape(len(frame), len(names)) if "status" in columns else None,
+        covariance_m2=None if covariance_m2 is None else covariance_m2[..., _PLACES],
     )
 
 

@@ -1,5 +1,8 @@
 """`Trajectories`: what it accepts, what counts as seen, and picking frames."""
 
+from dataclasses import fields
+
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -24,7 +27,13 @@ def everything() -> Trajectories:
         fitness=rng.random((FRAMES, DRONES)),
         num_cameras=rng.integers(0, 9, (FRAMES, DRONES)),
         status=rng.integers(0, 3, (FRAMES, DRONES)),
+        covariance_m2=covariances(rng),
     )
+
+
+def covariances(rng):
+    root = rng.normal(size=(FRAMES, DRONES, 3, 3))
+    return root @ np.swapaxes(root, -1, -2)
 
 
 def test_counts():
@@ -50,15 +59,9 @@ def test_at_frames_picks_rows_of_everything():
     picked = full.at_frames(np.array([12, 18]))
     assert picked.frame.tolist() == [12, 18]
     assert picked.drones == full.drones
-    for name in (
-        "time_s",
-        "position_m",
-        "velocity_m_s",
-        "orientation_wxyz",
-        "fitness",
-        "num_cameras",
-        "status",
-    ):
+    rest = {field.name for field in fields(full)} - {"frame", "drones"}
+    assert len(rest) == 8
+    for name in rest:
         np.testing.assert_array_equal(getattr(picked, name), getattr(full, name)[[1, 4]])
 
 
@@ -78,8 +81,30 @@ def test_at_frames_that_are_not_there(wanted):
         ({"frame": np.array([0, 1, 1, 2, 3])}, "increasing frame numbers"),
         ({"frame": np.array([0, 2, 1, 3, 4])}, "increasing frame numbers"),
         ({"drones": ("a", "b", "a")}, "a name of its own"),
+        (
+            {"covariance_m2": np.broadcast_to(np.eye(3) + np.eye(3, k=1), (FRAMES, DRONES, 3, 3))},
+            r"trajectories\.covariance_m2: expected symmetric matrices.*row 0 of drone 0",
+        ),
     ],
 )
 def test_what_makes_no_sense_is_refused(changes, message):
     with pytest.raises(InputError, match=message):
         trajectories(**changes)
+
+
+def test_a_covariance_is_symmetric_within_rounding_where_it_is_known():
+    """Of a matrix that is unknown as a whole or in part there is nothing to compare."""
+    rng = np.random.default_rng(1)
+    # A last bit of float32 in one half only.
+    rounded = covariances(rng).astype(np.float32)
+    rounded[..., 0, 2] = np.nextafter(rounded[..., 2, 0], np.float32(np.inf))
+    rounded[1, 2] = np.nan
+    rounded[2, 0, 0, 1] = np.nan
+    kept = trajectories(covariance_m2=rounded).covariance_m2
+    np.testing.assert_array_equal(kept, rounded)
+
+
+def test_a_covariance_of_another_shape():
+    # The annotations are checked before the shapes under the tests' import hook; both name the field.
+    with pytest.raises((InputError, jaxtyping.TypeCheckError), match="covariance_m2"):
+        trajectories(covariance_m2=np.zeros((FRAMES, DRONES + 1, 3, 3)))

@@ -43,7 +43,7 @@ def assert_same(read: Trajectories, written: Trajectories, dtype=np.float64) -> 
     assert read.drones == written.drones
     for name in ("frame", "time_s", "num_cameras", "status"):
         np.testing.assert_array_equal(getattr(read, name), getattr(written, name))
-    for name in ("position_m", "velocity_m_s", "fitness"):
+    for name in ("position_m", "velocity_m_s", "fitness", "covariance_m2"):
         expected = getattr(written, name)
         assert (getattr(read, name) is None) == (expected is None)
         if expected is not None:
@@ -66,6 +66,9 @@ class TestRoundTrip:
             values[0, 0] = draw(known)
             return values
 
+        def symmetric(values):
+            return np.where(np.tri(3, dtype=bool), np.swapaxes(values, -1, -2), values)
+
         def integers(top):
             return draw(hnp.arrays(np.int64, (frames, drones), elements=st.integers(0, top)))
 
@@ -79,6 +82,7 @@ class TestRoundTrip:
             "fitness": floats(),
             "num_cameras": integers(8),
             "status": integers(2),
+            "covariance_m2": draw(st.none()) or symmetric(floats(3, 3)),
         }
 
     @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -125,6 +129,20 @@ class TestWriting:
         assert metadata[b"psotrack.schema_version"] == b"1"
         assert json.loads(metadata[b"psotrack.units"]) == COLUMNS
         assert list(COLUMNS) == HEADER.split(",")
+
+    def test_covariances_are_six_columns_more(self, tmp_path):
+        covariance_m2 = np.full((3, 2, 3, 3), np.nan)
+        covariance_m2[0, 1] = [[1, 2, 3], [2, 5, 6], [3, 6, 9]]
+        known = replace(two_drones(), covariance_m2=covariance_m2)
+        for suffix in SUFFIXES:
+            write_trajectories(tmp_path / f"tracks{suffix}", known)
+        lines = (tmp_path / "tracks.csv").read_text().splitlines()
+        assert lines[0] == f"{HEADER},cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz"
+        assert lines[1].endswith(",tracked,,,,,,")
+        assert lines[2].endswith(",tracked,1.0,2.0,3.0,5.0,6.0,9.0")
+        units = json.loads(pq.read_schema(tmp_path / "tracks.parquet").metadata[b"psotrack.units"])
+        assert units == COLUMNS | dict.fromkeys(lines[0].split(",")[12:], "m2")
+        np.testing.assert_array_equal(read_trajectories(tmp_path / "tracks.csv").covariance_m2, covariance_m2)
 
     @pytest.mark.parametrize("suffix", SUFFIXES)
     def test_equal_trajectories_give_equal_bytes(self, tmp_path, suffix):
@@ -186,6 +204,7 @@ class TestLenientReading:
         np.testing.assert_array_equal(read.position_m[:, 0], [[np.nan] * 3, [0.5, 3, 1.5]])
         np.testing.assert_array_equal(read.position_m[:, 1], [[0, 3, 1.5], [-1, 3, 1.5]])
         assert (read.velocity_m_s, read.fitness, read.num_cameras, read.status) == (None, None, None, None)
+        assert read.covariance_m2 is None
 
     def test_missing_rows_are_lost(self, tmp_path):
         read = read_trajectories(csv_file(tmp_path, "0,0,a,1,1,1,tracked,8", "1,0.04,b,1,1,1,coasting,7"))

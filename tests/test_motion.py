@@ -1,0 +1,433 @@
+"""The motion model: against a textbook, against statistics, and in float32 for longer than any flight."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import float32
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from motion_textbook import (
+    DT_S,
+    Flown,
+    calm,
+    fly,
+    motion_params,
+    nees,
+    some_unknown,
+    textbook_filter,
+    transition,
+)
+from scipy.integrate import quad_vec
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2, multivariate_normal
+
+from psotrack import motion
+from psotrack.motion import GATE_999
+
+
+def numbers(tree, dtype):
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, bool if leaf.dtype == bool else dtype), tree)
+
+
+@jax.jit
+def filtered(state, params, dt_s, measured_m, covariance_m2, was_measured):
+    """States and NIS of every frame; the state is that of the frame before the first."""
+
+    def step(state, frame):
+        return (lambda result: (result[0], result))(
+            motion.update(motion.predict(state, frame[0], params), *frame[1:])
+        )
+
+    return jax.lax.scan(step, state, (dt_s, measured_m, covariance_m2, was_measured))[1]
+
+
+def run(flown, dtype=jnp.float32):
+    """The filter over frames 1 and on, from a state at the measurement of frame 0, as NumPy."""
+    with jax.enable_x64(dtype == jnp.float64):
+        dt_s = np.diff(flown.time_s)
+        first, covariance, there, params = numbers(
+            (flown.measured_m, flown.covariance_m2, flown.was_measured, flown.params), dtype
+        )
+        state = motion.init(first[0], jnp.zeros_like(first[0]), covariance[0], params)
+        result = filtered(state, params, jnp.asarray(dt_s, dtype), first[1:], covariance[1:], there[1:])
+        states, nis = jax.tree.map(np.array, result)
+    return states, nis
+
+
+# One compilation each instead of one per operation.
+init, predict, update = jax.jit(motion.init), jax.jit(motion.predict), jax.jit(motion.update)
+log_likelihood = jax.jit(motion.log_likelihood)
+
+
+class TestAgainstTheTextbook:
+    @pytest.mark.parametrize("dt_s", [0.01, 0.04, 1.3])
+    def test_noise_is_the_integral_of_jerk(self, dt_s):
+        def response(s):
+            g = np.array([s**2 / 2, s, 1])
+            return np.outer(g, g)
+
+        expected, _ = quad_vec(response, 0, dt_s, epsabs=0, epsrel=1e-13)
+        with jax.enable_x64(True):
+            # Both to float64; the quadrature says 1e-13.
+            np.testing.assert_allclose(motion.jerk_noise(jnp.float64(dt_s)), expected, rtol=1e-12)
+
+    @pytest.mark.parametrize(
+        # float64: sums of a hundred terms, and the textbook's own subtractions. float32: 6e-8 of a position of some
+        # metres per frame, against accelerations that weigh it by 1 / dt^2; measured 4e-6 m and 3e-4 m/s2.
+        ("dtype", "tolerance"),
+        [(jnp.float64, (1e-12, 1e-11, 1e-10)), (jnp.float32, (4e-5, 4e-4, 3e-3))],
+    )
+    def test_means_covariances_and_nis(self, dtype, tolerance):
+        flown = some_unknown(calm(fly(1, frames=60, drones=3)), 2)
+        states, nis = run(flown, dtype)
+        for drone in range(3):
+            means, covariances, expected_nis = textbook_filter(
+                flown.time_s, *(part[:, drone] for part in flown.measurements[1:]), 30.0, 1.0, 2.0
+            )
+            # Nothing here is beyond the gate, of which the textbook knows nothing.
+            assert np.nanmax(expected_nis) < GATE_999
+            parts = (states.position_m, states.velocity_m_s, states.acceleration_m_s2)
+            for part, expected, limit in zip(parts, np.split(means[1:], 3, axis=-1), tolerance, strict=True):
+                np.testing.assert_allclose(part[:, drone], expected, rtol=0, atol=limit)
+            # In units of the standard deviations, so that metres and m/s2 count alike.
+            unit = np.sqrt(np.diagonal(covariances[1:], axis1=1, axis2=2))
+            difference = (states.covariance[:, drone] - covariances[1:]) / (
+                unit[:, :, None] * unit[:, None, :]
+            )
+            # Measured 3e-13 and 1.4e-4.
+            assert np.abs(difference).max() < (1e-11 if dtype == jnp.float64 else 2e-3)
+            # NIS squares an innovation of millimetres, known to micrometres in float32.
+            np.testing.assert_allclose(
+                nis[:, drone], expected_nis[1:], rtol=1e-10 if dtype == jnp.float64 else 5e-3
+            )
+
+    def test_prediction_is_the_flow(self):
+        """Two halves make a whole; nothing moves in no time."""
+        flown = fly(3, frames=2, drones=4)
+        with jax.enable_x64(True):
+            measured, covariance, params = numbers(
+                (flown.measured_m[0], flown.covariance_m2[0], flown.params), jnp.float64
+            )
+            state = init(measured, measured, covariance, params)
+            whole = predict(state, jnp.float64(0.3), params)
+            halves = predict(predict(state, jnp.float64(0.1), params), jnp.float64(0.2), params)
+            still = predict(state, jnp.float64(0.0), params)
+            F, Q = transition(0.3, 30.0)
+            for expected in (halves.covariance, F @ np.asarray(state.covariance) @ F.T + Q):
+                np.testing.assert_allclose(whole.covariance, expected, rtol=1e-12, atol=1e-15)
+            np.testing.assert_allclose(whole.mean, halves.mean, rtol=1e-12)
+            np.testing.assert_array_equal(still.mean, state.mean)
+            np.testing.assert_array_equal(still.covariance, state.covariance)
+
+
+class TestGaps:
+    def test_uncertainty_grows_in_a_gap_and_shrinks_after(self):
+        flown = fly(4, frames=60, drones=3)
+        flown.was_measured[30:50] = False
+        states, nis = run(flown)
+        spread = np.trace(states.position_covariance_m2, axis1=2, axis2=3)
+        # Row k is of frame k + 1.
+        assert (np.diff(spread[28:49], axis=0) > 0).all()
+        # 0.8 s of jerk: by the closed form the root of 3 * 30 * 0.8^5 / 20 is 1.2 m; and what was not known before it.
+        assert (spread[48] > 1.0**2).all()
+        assert (spread[49] < 0.05**2).all()
+        assert np.isnan(nis[29:49]).all()
+        assert np.isfinite(nis[49:]).all()
+
+    def test_what_is_not_measured_changes_nothing(self):
+        flown = fly(5, frames=2, drones=2)
+        measured, covariance, params = float32((flown.measured_m, flown.covariance_m2, flown.params))
+        state = init(measured[0], measured[0], covariance[0], params)
+        state = predict(state, jnp.float32(DT_S), params)
+        unknown = measured[1].at[0].set(jnp.nan), covariance[1].at[0].set(jnp.nan)
+        after, nis = update(state, *unknown, jnp.array([False, True]))
+        for one, other in zip(jax.tree.leaves(after), jax.tree.leaves(state), strict=True):
+            np.testing.assert_array_equal(one[0], other[0])
+            assert not np.array_equal(one[1], other[1])
+        assert np.isnan(nis[0])
+        assert np.isfinite(nis[1])
+
+
+class TestHonesty:
+    """Flights that obey the model: the filter's own numbers must say how far off it is."""
+
+    DRONES, FRAMES = 200, 60
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def flights(cls):
+        flown = fly(6, frames=cls.FRAMES, drones=cls.DRONES)
+        return flown, *run(flown)
+
+    def test_nis(self, flights):
+        """Innovations of frames and drones are independent: their sum is chi-square with 3 degrees for each."""
+        nis = flights[2]
+        # A thousandth is beyond the gate and counts as it is. One seed in a thousand would fail by chance.
+        low, high = chi2.ppf([0.0005, 0.9995], 3 * nis.size) / nis.size
+        assert low < nis.mean() < high
+        assert 0.0003 < np.mean(nis > GATE_999) < 0.002
+
+    @pytest.mark.parametrize("frame", [1, 3, 10, 30, FRAMES - 1])
+    def test_nees(self, flights, frame):
+        """Of all nine numbers of a state; drones are independent, frames are not."""
+        flown, states, _ = flights
+        error = np.asarray(states.mean)[frame - 1] - flown.state[frame]
+        value = nees(error, states.covariance[frame - 1].astype(np.float64))
+        low, high = chi2.ppf([0.0005, 0.9995], 9 * self.DRONES) / self.DRONES
+        assert low < value.mean() < high
+
+    def test_a_wrong_density_would_be_noticed(self, flights):
+        flown = flights[0]
+        for factor in (0.7, 1.4):
+            wrong = replace(flown, params=motion_params(30.0 * factor, self.DRONES))
+            nis = run(wrong)[1]
+            low, high = chi2.ppf([0.0005, 0.9995], 3 * nis.size) / nis.size
+            assert not low < nis.mean() < high
+
+    def test_the_filter_is_better_than_what_it_is_given(self, flights):
+        flown, states, _ = flights
+        error_m = states.position_m[20:] - flown.state[21:, :, :3]
+        raw_m = flown.measured_m[21:] - flown.state[21:, :, :3]
+        # Measured 0.56 of it.
+        assert np.sqrt((error_m**2).mean()) < 0.7 * np.sqrt((raw_m**2).mean())
+
+
+def least_correlation(covariance):
+    """Least eigenvalue of the covariances in units of their standard deviations."""
+    covariance = covariance.astype(np.float64)
+    unit = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    return np.linalg.eigvalsh(covariance / (unit[..., :, None] * unit[..., None, :])).min(axis=-1)
+
+
+class TestFloat32:
+    FRAMES, DRONES = 10_000, 6
+
+    def long_flight(self, decades, flattest):
+        """Measurements of all sizes, gaps of up to four seconds, slow and wild drones."""
+        rng = np.random.default_rng(7)
+        shape = (self.FRAMES, self.DRONES)
+        turn = Rotation.random(self.FRAMES * self.DRONES, rng=rng).as_matrix().reshape(*shape, 3, 3)
+        std_m = 10.0 ** (rng.uniform(*decades, (*shape, 1)) - rng.uniform(0, flattest, (*shape, 3)))
+        was_measured = np.ones(shape, bool)
+        for start in range(500, self.FRAMES, 700):
+            was_measured[start : start + rng.integers(1, 100), rng.integers(self.DRONES)] = False
+        density = jnp.asarray(10.0 ** np.linspace(-2, 4, self.DRONES), jnp.float32)
+        return Flown(
+            time_s=np.arange(self.FRAMES) * DT_S,
+            state=np.zeros((*shape, 9)),
+            # But for the gate, what is measured does not matter to the covariances.
+            measured_m=np.zeros((*shape, 3)),
+            covariance_m2=turn * std_m[..., None, :] ** 2 @ np.swapaxes(turn, -1, -2),
+            was_measured=was_measured,
+            params=replace(motion_params(30.0, self.DRONES), jerk_density_m2_s5=density),
+        )
+
+    def test_positive_definite_for_ten_thousand_frames(self):
+        """From a micrometre to a metre in one measurement: nearer to singular than float32 can say."""
+        flown = self.long_flight((-3, 0), 4)
+        assert np.linalg.cond(flown.covariance_m2).max() > 1 / np.finfo(np.float32).eps
+        states, _ = run(flown)
+        assert least_correlation(states.covariance).min() > 0
+        np.testing.assert_array_equal(states.covariance, np.swapaxes(states.covariance, -1, -2))
+
+    def test_right_for_ten_thousand_frames(self):
+        """A millimetre to a decimetre, up to thirty times as long as wide: cameras of a hall."""
+        flown = self.long_flight((-2, -1), 1.5)
+        variance, expected = (
+            np.diagonal(run(flown, dtype)[0].covariance, axis1=-2, axis2=-1)
+            for dtype in (jnp.float32, jnp.float64)
+        )
+        # Rounding 6e-8 of the largest variance counts a thousandfold for the least. Measured 5e-3 at worst.
+        np.testing.assert_allclose(variance, expected, rtol=1e-2)
+
+    @pytest.mark.parametrize("std_m", [1e-4, 1e-3, 1e-2])
+    def test_a_precise_measurement_after_a_long_gap(self, std_m):
+        """Ten metres of not knowing, then a tenth of a millimetre: P - K S K^T would leave rounding, or less than 0."""
+        results = []
+        for dtype in (jnp.float32, jnp.float64):
+            with jax.enable_x64(dtype == jnp.float64):
+                params = numbers(motion_params(300.0, 1), dtype)
+                known = jnp.eye(3, dtype=dtype)[None] * std_m**2
+                state = init(jnp.zeros((1, 3), dtype), jnp.zeros((1, 3), dtype), known, params)
+                state = predict(state, jnp.asarray(2.5, dtype), params)
+                assert state.covariance[0, 0, 0] > 10.0**2
+                after, _ = update(state, jnp.ones((1, 3), dtype), known, jnp.array([True]))
+                results.append(np.asarray(after.covariance))
+        variance, expected = (np.diagonal(result[0]) for result in results)
+        np.testing.assert_allclose(variance, expected, rtol=1e-4)
+        assert least_correlation(results[0]).min() > 0
+
+    def test_covariances_that_are_flat_in_float32(self):
+        """Two cameras on one side: a millimetre across, metres along. Their sum has no Cholesky factor in float32."""
+        rng = np.random.default_rng(8)
+        turn = Rotation.random(50, rng=rng).as_matrix()
+        flat = turn @ np.diag([1e-7, 1e-7, 1e2]) @ np.swapaxes(turn, -1, -2)
+        measured, covariance, params = float32((np.zeros((50, 3)), flat, motion_params(1.0, 50)))
+        tight = jnp.broadcast_to(jnp.eye(3) * 1e-7, (50, 3, 3))
+        with np.testing.assert_raises(np.linalg.LinAlgError):
+            np.linalg.cholesky(np.asarray(covariance + tight))
+        state = init(measured, measured, tight, params)
+        after, nis = update(state, measured + 1e-4, covariance, jnp.ones(50, bool))
+        assert np.isfinite(nis).all()
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after))
+        assert least_correlation(np.asarray(after.covariance)).min() > 0
+        # A measurement never adds to what is not known, but for rounding: 6e-8 of 100 m2, times gains of some 1e-2.
+        variance, before = (np.diagonal(each.covariance, axis1=1, axis2=2) for each in (after, state))
+        assert (variance <= before * 1.5).all()
+
+
+class TestOutliers:
+    @pytest.fixture(scope="class")
+    @classmethod
+    def expecting(cls):
+        """A state that expects its measurement to a centimetre or so, and R."""
+        flown = fly(9, frames=60, drones=3)
+        states, _ = run(flown)
+        with jax.enable_x64(True):
+            last, covariance, params = numbers(
+                (
+                    jax.tree.map(lambda leaf: leaf[-1, :1], states),
+                    flown.covariance_m2[-1, :1],
+                    motion_params(30.0, 1),
+                ),
+                jnp.float64,
+            )
+            return predict(last, jnp.float64(DT_S), params), covariance
+
+    def at(self, expecting, nis, direction=(0.6, 0.0, 0.8)):
+        """A measurement whose NIS is this."""
+        state, covariance = expecting
+        S = np.asarray(state.position_covariance_m2 + covariance)[0]
+        direction = np.array(direction)
+        return np.asarray(state.position_m) + direction * np.sqrt(
+            nis / (direction @ np.linalg.inv(S) @ direction)
+        ), S
+
+    def test_the_gate(self):
+        assert pytest.approx(chi2.ppf(0.999, 3), rel=1e-12) == GATE_999
+
+    @pytest.mark.parametrize("nis", [1.0, 16.0, 17.0, 100.0, 1e4])
+    def test_what_is_beyond_the_gate_counts_as_if_measured_worse(self, expecting, nis):
+        state, covariance = expecting
+        measured, S = self.at(expecting, nis)
+        excess = max(nis / GATE_999, 1)
+        with jax.enable_x64(True):
+            after, found = update(state, jnp.asarray(measured), covariance, jnp.array([True]))
+            log_density = log_likelihood(state, jnp.asarray(measured), covariance)
+        np.testing.assert_allclose(found, nis, rtol=1e-9)
+        # By the textbook, with R grown such that S is `excess` times itself.
+        P, H = np.asarray(state.covariance)[0], np.eye(3, 9)
+        K = P @ H.T @ np.linalg.inv(excess * S)
+        innovation = measured[0] - np.asarray(state.position_m)[0]
+        np.testing.assert_allclose(after.mean[0], np.asarray(state.mean)[0] + K @ innovation, rtol=1e-9)
+        np.testing.assert_allclose(after.covariance[0], P - K @ H @ P, rtol=1e-7, atol=1e-12)
+        expected = multivariate_normal(np.zeros(3), excess * S).logpdf(innovation)
+        np.testing.assert_allclose(log_density, expected, rtol=1e-9)
+
+    def test_the_farther_off_the_less_it_moves(self, expecting):
+        state, covariance = expecting
+        moved = []
+        for nis in (GATE_999, 100.0, 1e4, 1e6):
+            with jax.enable_x64(True):
+                measured = jnp.asarray(self.at(expecting, nis)[0])
+                after, _ = update(state, measured, covariance, jnp.array([True]))
+            moved.append(float(np.linalg.norm(after.position_m - state.position_m)))
+        assert moved == sorted(moved, reverse=True)
+        # At the gate about four standard deviations of the state; of S the more.
+        assert moved[0] < 4.1 * np.sqrt(np.linalg.eigvalsh(np.asarray(state.position_covariance_m2)[0]).max())
+
+    def test_a_drone_that_did_jump_is_followed(self):
+        """Half a metre along each axis, from frame 50 on."""
+        flown = fly(10, frames=100, drones=20)
+        jump_m = 0.5 * (np.arange(100) >= 50)[:, None, None]
+        states, _ = run(replace(flown, measured_m=flown.measured_m + jump_m))
+        off_m = np.linalg.norm(states.position_m - (flown.state[:, :, :3] + jump_m)[1:], axis=-1)
+        # Not at once, at frame 50 (row 49); but a second later. Measured 0.83, and 0.03 m, as before the jump.
+        assert off_m[49].min() > 0.8
+        assert off_m[80:].max() < 0.06
+
+
+class TestSymmetries:
+    @given(st.integers(0, 2**32 - 1), st.sampled_from([1e-3, 0.05]))
+    @settings(max_examples=25, deadline=None)
+    def test_a_turned_world_gives_turned_states(self, seed, std_m):
+        rng = np.random.default_rng(seed)
+        flown = some_unknown(fly(seed, frames=12, drones=2, std_m=std_m), seed)
+        turn, shift_m = Rotation.random(rng=rng).as_matrix(), rng.uniform(-3, 3, 3)
+        turned = replace(
+            flown,
+            measured_m=flown.measured_m @ turn.T + shift_m,
+            covariance_m2=turn @ flown.covariance_m2 @ turn.T,
+        )
+        (here, nis), (there, nis_there) = run(flown, jnp.float64), run(turned, jnp.float64)
+        # Accelerations are positions of 1e-10 m over dt^2.
+        np.testing.assert_allclose(there.position_m, here.position_m @ turn.T + shift_m, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(there.velocity_m_s, here.velocity_m_s @ turn.T, rtol=0, atol=1e-7)
+        np.testing.assert_allclose(
+            there.acceleration_m_s2, here.acceleration_m_s2 @ turn.T, rtol=0, atol=1e-5
+        )
+        np.testing.assert_allclose(nis_there, nis, rtol=1e-6)
+        expected_m2 = turn @ here.position_covariance_m2 @ turn.T
+        np.testing.assert_allclose(
+            there.position_covariance_m2, expected_m2, rtol=0, atol=1e-6 * expected_m2.max()
+        )
+
+    def test_drones_do_not_know_of_each_other(self):
+        """Alone or in company, bit for bit but for the compiler's choice of order: to float32."""
+        flown = some_unknown(fly(11, frames=60, drones=3), 12)
+        together, _ = run(flown)
+        alone, _ = run(
+            replace(
+                flown,
+                measured_m=flown.measured_m[:, 1:2],
+                covariance_m2=flown.covariance_m2[:, 1:2],
+                was_measured=flown.was_measured[:, 1:2],
+                params=motion_params(30.0, 1),
+            )
+        )
+        np.testing.assert_allclose(alone.position_m[:, 0], together.position_m[:, 1], rtol=0, atol=1e-5)
+
+
+def test_means_come_apart_and_together():
+    mean = jnp.arange(18.0).reshape(2, 9)
+    state = motion.state_of(mean, jnp.zeros((2, 9, 9)))
+    assert state.velocity_m_s.tolist() == [[3, 4, 5], [12, 13, 14]]
+    np.testing.assert_array_equal(state.mean, mean)
+
+
+def test_the_start_is_what_was_given():
+    position, velocity = jnp.ones((2, 3)), 2 * jnp.ones((2, 3))
+    covariance = jnp.broadcast_to(jnp.diag(jnp.array([1.0, 2.0, 3.0])), (2, 3, 3))
+    state = init(position, velocity, covariance, motion_params(30.0, 2, 0.5, 4.0))
+    np.testing.assert_array_equal(state.mean, [[1] * 3 + [2] * 3 + [0] * 3] * 2)
+    expected = np.diag([1, 2, 3, 0.25, 0.25, 0.25, 16, 16, 16])
+    # The position's variances are held above rounding, 1e-6 of their sum.
+    np.testing.assert_allclose(state.covariance, [expected] * 2, rtol=0, atol=1e-5)
+
+
+def test_other_numbers_compile_nothing(caplog):
+    step = jax.jit(lambda state, dt_s, params, *measured: update(predict(state, dt_s, params), *measured))
+
+    def call(seed, density, dt_s):
+        flown = fly(seed, frames=1, drones=3)
+        measured, covariance = float32((flown.measured_m[0], flown.covariance_m2[0]))
+        params = motion_params(density, 3, velocity_std=density)
+        state = init(measured, measured, covariance, params)
+        state, _ = step(
+            state, jnp.float32(dt_s), params, measured, covariance, jnp.array([True, False, True])
+        )
+        return step(state, jnp.float32(dt_s), params, measured, covariance, jnp.array([False, False, True]))
+
+    def compiled():
+        lines = [record.getMessage() for record in caplog.records if "Compiling" in record.getMessage()]
+        caplog.clear()
+        return lines
+
+    with jax.log_compiles(), caplog.at_level("WARNING", logger="jax"):
+        call(0, 1.0, 0.04)
+        assert any("lambda" in line for line in compiled())
+        call(1, 200.0, 0.01)
+        assert compiled() == []
