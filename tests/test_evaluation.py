@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from evaluation_flights import ROUNDING, TRUTH, on_x_axis, pairings, random_flights, seeds
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -20,24 +21,7 @@ from psotrack.evaluation.association import (
     identity_switches,
     matched_per_frame,
 )
-from psotrack.trajectories import Status, Trajectories
-
-# Two frames per second: frames 0 and 1 are the first second, in which identity is fixed.
-FPS = 2.0
-# Sums of a handful of float64 numbers of a few metres.
-ROUNDING = 1e-12
-
-
-def on_x_axis(*tracks, frame=None, **others) -> Trajectories:
-    """Drones that fly along the x axis: one list of x in metres per drone, None where it is not known."""
-    x_m = np.array([[np.nan if x is None else x for x in track] for track in tracks], float).T
-    frame = np.arange(len(x_m)) if frame is None else np.array(frame)
-    position_m = np.stack([x_m, 0 * x_m, 0 * x_m], axis=-1)
-    names = tuple(f"d{number}" for number in range(len(tracks)))
-    return Trajectories(frame=frame, time_s=frame / FPS, drones=names, position_m=position_m, **others)
-
-
-TRUTH = on_x_axis([0] * 5, [10] * 5)
+from psotrack.trajectories import Status
 
 
 def numbers(evaluation, *names):
@@ -209,6 +193,10 @@ KEYS = [
     "idf1",
     "matched_mean_error_m",
     "offset_removed_mean_error_m",
+    *("hota", "deta", "assa", "loca"),
+    *("gospa_m", "gospa_localisation_m", "gospa_missed_m", "gospa_false_m"),
+    *("ate_rmse_m", "ate_aligned_rmse_m", "rpe_1s_rmse_m", "rpe_1s_rotation_rmse_deg"),
+    *("inside_90_rate", "mean_nees", "offset_removed_inside_90_rate", "offset_removed_mean_nees"),
     "per_drone",
 ]
 
@@ -236,30 +224,13 @@ class TestContract:
             evaluate(TRUTH, on_x_axis([None] * 5))
 
 
-def random_flights(seed: int, num_frames: int = 7, num_drones: int = 3, num_estimates: int = 4):
-    """An estimate and a reference in a room of a metre, so that drones are often nearer to another's estimate."""
-    rng = np.random.default_rng(seed)
-
-    def flights(drones: int, prefix: str) -> Trajectories:
-        position_m = rng.uniform(-0.5, 0.5, (num_frames, drones, 3))
-        position_m[rng.random((num_frames, drones)) < 0.15] = np.nan
-        frame = np.arange(num_frames)
-        return Trajectories(frame, frame / FPS, tuple(f"{prefix}{d}" for d in range(drones)), position_m)
-
-    ref = flights(num_drones, "true")
-    # One known position, so that there is always something to judge.
-    ref.position_m[0, 0] = 0.0
-    orientation_wxyz = Rotation.random(num_frames * num_drones, rng=rng).as_quat(scalar_first=True)
-    return flights(num_estimates, "est"), replace(
-        ref, orientation_wxyz=orientation_wxyz.reshape(num_frames, num_drones, 4)
-    )
-
-
 def same(first, second, tolerance: float) -> None:
-    """Equal evaluations, but for rounding and for the names of the estimates."""
+    """Equal evaluations, but for rounding, the names of the estimates and the order of the drones."""
     one, two = first.to_dict(), second.to_dict()
-    for drone in (*one["per_drone"], *two["per_drone"]):
-        del drone["estimate"]
+    for evaluation in (one, two):
+        evaluation["per_drone"].sort(key=lambda drone: drone["drone"])
+        for drone in evaluation["per_drone"]:
+            del drone["estimate"]
 
     def flat(value):
         if isinstance(value, dict):
@@ -272,7 +243,16 @@ def same(first, second, tolerance: float) -> None:
         assert left == (pytest.approx(right, abs=tolerance) if isinstance(right, float) else right)
 
 
-seeds = st.integers(0, 2**32 - 1)
+def with_covariances(est, ref):
+    """The same with orientations and covariances in the estimate, as random as they can be."""
+    rng = np.random.default_rng(est.num_frames)
+    root = rng.normal(0, 0.1, (est.num_frames, est.num_drones, 3, 3))
+    orientation_wxyz = Rotation.random(est.num_frames * est.num_drones, rng=rng).as_quat(scalar_first=True)
+    return replace(
+        est,
+        orientation_wxyz=orientation_wxyz.reshape(est.num_frames, est.num_drones, 4),
+        covariance_m2=root @ root.swapaxes(-1, -2) + 0.01 * np.eye(3),
+    ), ref
 
 
 class TestProperties:
@@ -283,14 +263,46 @@ class TestProperties:
         shuffled = replace(est, drones=tuple("wxyz"), position_m=est.position_m[:, list(order)])
         same(evaluate(est, ref), evaluate(shuffled, ref), ROUNDING)
 
+    @given(seeds, st.permutations(range(3)))
+    @settings(max_examples=30, deadline=None)
+    def test_the_order_of_the_true_drones_does_not_matter(self, seed, order):
+        est, ref = random_flights(seed)
+        shuffled = replace(
+            ref,
+            drones=tuple(ref.drones[drone] for drone in order),
+            position_m=ref.position_m[:, list(order)],
+            orientation_wxyz=ref.orientation_wxyz[:, list(order)],
+        )
+        same(evaluate(est, ref), evaluate(est, shuffled), ROUNDING)
+
     @given(seeds)
     @settings(max_examples=30, deadline=None)
-    def test_moving_both_changes_nothing(self, seed):
-        est, ref = random_flights(seed)
-        shift_m = np.array([3.0, -5.0, 7.0])
-        moved = [replace(flight, position_m=flight.position_m + shift_m) for flight in (est, ref)]
-        # Positions of 10 m keep 2e-15 m of a float64; no distance of a random draw lies so near to the gate.
-        same(evaluate(est, ref), evaluate(*moved), 1e-12)
+    def test_turning_and_moving_the_world_changes_nothing(self, seed):
+        est, ref = with_covariances(*random_flights(seed))
+        turn = Rotation.random(rng=np.random.default_rng(seed))
+        moved = [
+            replace(
+                flight,
+                position_m=flight.position_m @ turn.as_matrix().T + np.array([3.0, -5.0, 7.0]),
+                orientation_wxyz=(
+                    turn * Rotation.from_quat(flight.orientation_wxyz.reshape(-1, 4), scalar_first=True)
+                )
+                .as_quat(scalar_first=True)
+                .reshape(flight.orientation_wxyz.shape),
+            )
+            for flight in (est, ref)
+        ]
+        R = turn.as_matrix()
+        moved[0] = replace(moved[0], covariance_m2=R @ est.covariance_m2 @ R.T)
+        first, second = evaluate(est, ref), evaluate(*moved)
+        # An offset is a vector, of the body here, and turns with nothing; those in the world turn with it.
+        for drone, other in zip(first.per_drone, second.per_drone, strict=True):
+            if drone.offset_m is not None:
+                assert drone.offset_frame == other.offset_frame == "body"
+        # Positions of 10 m keep 2e-15 m of a float64, divided by a standard deviation of 0.1 m, squared, and
+        # turns keep 1e-16 rad but for the arc cosine near 180 degrees: 1e-8. No distance of a random draw lies
+        # so near to the gate.
+        same(first, second, 1e-9)
 
     @given(seeds)
     @settings(max_examples=30, deadline=None)
@@ -314,12 +326,10 @@ class TestProperties:
         evaluation = evaluate(ref, ref)
         assert (evaluation.max_error_m, evaluation.missed_rate, evaluation.id_switches) == (0, 0, 0)
         assert (evaluation.mota, evaluation.idf1, evaluation.motp_m) == (1, 1, 0)
-
-
-def pairings(num_drones: int, num_estimates: int):
-    """All ways to give each drone an estimate of its own, or none."""
-    choices = [*range(num_estimates), *[UNASSIGNED] * num_drones]
-    return set(itertools.permutations(choices, num_drones))
+        hota = (evaluation.hota, evaluation.deta, evaluation.assa, evaluation.loca)
+        assert hota == pytest.approx((1, 1, 1, 1), abs=ROUNDING)
+        assert (evaluation.gospa_m, evaluation.ate_rmse_m, evaluation.rpe_1s_rmse_m) == (0, 0, 0)
+        assert evaluation.ate_aligned_rmse_m == pytest.approx(0, abs=ROUNDING)
 
 
 class TestAgainstBruteForce:

@@ -3,6 +3,7 @@
 import io
 import subprocess
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -53,16 +54,43 @@ class TestTable:
         assert rows["all"] == ["20.0", "20.0", "0.0", "20.0", "20.0", "6.7%", "0.0"]
         text = "\n".join(lines)
         assert "MOTA 0.933, MOTP 20.0 mm, IDF1 0.966, identity switches 0" in text
+        # 0.02 m reaches all thresholds: DetA = 140/150; AssA: 50 + 50 matches of 1 and 40 of 40/50, over 140.
+        assert "HOTA      0.938: DetA 0.933, AssA 0.943, LocA 0.960" in text
+        # Squares: of 2.8 drones by 400 mm2; of 0.2 missed by 125,000 mm2.
+        assert "GOSPA     162 mm: localisation 33.5, missed 158, false 0.0" in text
+        assert "RMSE      ATE 20.0 mm (0.0 aligned), RPE over 1 s 0.0 mm" in text
+        assert "ellipsoid" not in text
         assert "world frame" in text
+
+    def test_covariances(self):
+        est, ref = flights()
+        covariance_m2 = np.broadcast_to(1e-4 * np.eye(3), (NUM_FRAMES, 3, 3, 3))
+        lines = printed(tables.render(evaluate(replace(est, covariance_m2=covariance_m2), ref)))
+        # 20 mm are twice a standard deviation of 10 mm, and an offset.
+        row = "ellipsoid of 90 % holds 100.0% (100.0% centred), mean NEES 4 ("
+        assert any(line.startswith(row) for line in lines)
+
+    def test_orientations(self):
+        est, ref = flights()
+        orientation_wxyz = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (NUM_FRAMES, 3, 4))
+        both = (replace(flight, orientation_wxyz=orientation_wxyz) for flight in (est, ref))
+        text = "\n".join(printed(tables.render(evaluate(*both))))
+        assert "RPE over 1 s 0.0 mm and 0.00 deg" in text
 
     def test_eighty_columns_hold_ten_drones_that_are_far_off(self):
         est, ref = flights(10, swap=True, names=tuple(f"[red]d_{number}" for number in range(10)))
         est.position_m[30:, :5] += 3.0
+        covariance_m2 = np.broadcast_to(1e-8 * np.eye(3), (NUM_FRAMES, 10, 3, 3))
+        est = replace(est, covariance_m2=covariance_m2)
         lines = printed(tables.render(evaluate(est, ref), "S04_D10"))
         assert max(map(len, lines)) <= 80
         # Nothing is cut off, and nothing in a name is taken for a style.
         assert [line.split()[0] for line in lines if "d_" in line] == [f"[red]d_{n}" for n in range(10)]
         assert sum("…" in line for line in lines) == 0
+        # No line of the scores is folded.
+        scores = lines[next(n for n, line in enumerate(lines) if line.startswith("all")) + 1 :]
+        first_words = [line[:10].strip() for line in scores]
+        assert first_words == ["CLEAR", "", "HOTA", "GOSPA", "RMSE", "ellipsoid", "centred"]
 
     def test_metres_where_errors_are_metres(self):
         est, ref = flights()

@@ -3,6 +3,7 @@
 `evaluate` gives the numbers; `tables` and `plots` show them.
 """
 
-from psotrack.evaluation.metrics import DroneEvaluation, ErrorSummary, Evaluation, evaluate
+from psotrack.evaluation.metrics import evaluate
+from psotrack.evaluation.records import DroneEvaluation, ErrorSummary, Evaluation
 
 __all__ = ["DroneEvaluation", "ErrorSummary", "Evaluation", "evaluate"]

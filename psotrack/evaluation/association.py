@@ -35,6 +35,8 @@ class AlignedPair:
         ref_m: (frames, drones, 3), NaN where the truth is unknown.
         est_m: (frames, estimates, 3), NaN where there is no row, or a lost one.
         orientation_wxyz: (frames, drones, 4), of the truth; NaN where unknown.
+        orientation_est_wxyz: (frames, estimates, 4), of the estimates; NaN where unknown.
+        covariance_m2: (frames, estimates, 3, 3), of the estimates' positions; NaN where unknown.
         distance_m: (frames, drones, estimates), NaN where either is.
     """
 
@@ -45,6 +47,8 @@ class AlignedPair:
     ref_m: Float[np.ndarray, "frames drones 3"]
     est_m: Float[np.ndarray, "frames estimates 3"]
     orientation_wxyz: Float[np.ndarray, "frames drones 4"]
+    orientation_est_wxyz: Float[np.ndarray, "frames estimates 4"]
+    covariance_m2: Float[np.ndarray, "frames estimates 3 3"]
     distance_m: Float[np.ndarray, "frames drones estimates"]
 
     @property
@@ -80,8 +84,15 @@ def align(traj_est: Trajectories, traj_ref: Trajectories) -> AlignedPair:
     orientation_wxyz = np.full((*ref_m.shape[:2], 4), np.nan)
     if traj_ref.orientation_wxyz is not None:
         orientation_wxyz = traj_ref.orientation_wxyz[kept].astype(np.float64)
-    est_m = np.full((len(frame), traj_est.num_drones, 3), np.nan)
-    est_m[to] = np.where(traj_est.seen[..., None], traj_est.position_m, np.nan)[source]
+
+    def of_estimates(value: np.ndarray | None, *shape: int) -> np.ndarray:
+        """The estimate's `value` in the reference's frames."""
+        there = np.full((len(frame), traj_est.num_drones, *shape), np.nan)
+        if value is not None:
+            there[to] = value[source]
+        return there
+
+    est_m = of_estimates(np.where(traj_est.seen[..., None], traj_est.position_m, np.nan), 3)
     return AlignedPair(
         frame=frame,
         time_s=traj_ref.time_s[rows].astype(np.float64),
@@ -90,6 +101,8 @@ def align(traj_est: Trajectories, traj_ref: Trajectories) -> AlignedPair:
         ref_m=ref_m,
         est_m=est_m,
         orientation_wxyz=orientation_wxyz,
+        orientation_est_wxyz=of_estimates(traj_est.orientation_wxyz, 4),
+        covariance_m2=of_estimates(traj_est.covariance_m2, 3, 3),
         distance_m=np.linalg.norm(ref_m[:, :, None] - est_m[:, None], axis=-1),
     )
 
@@ -145,14 +158,36 @@ def matched_per_frame(
     return partners
 
 
-def paired_distances(
-    distance_m: Float[np.ndarray, "frames drones estimates"], partners: Int[np.ndarray, "frames drones"]
+def cheapest_partners(cost: Float[np.ndarray, "frames drones estimates"]) -> Int[np.ndarray, "frames drones"]:
+    """(frames, drones), partners of the least sum of costs in each frame, as many as there can be.
+
+    For costs that make a bad pair as good as none.
+    """
+    partners = np.full(cost.shape[:2], UNASSIGNED)
+    for here, partner in zip(cost, partners, strict=True):
+        rows, columns = linear_sum_assignment(here)
+        partner[rows] = columns
+    return partners
+
+
+def paired_values(
+    values: Float[np.ndarray, "frames drones estimates"], partners: Int[np.ndarray, "frames drones"]
 ) -> Float[np.ndarray, "frames drones"]:
-    """(frames, drones), from each true drone to its partner; NaN where it has none, or either is not seen."""
-    if not distance_m.shape[2]:
+    """(frames, drones), between each true drone and its partner; NaN where it has none, or either is not seen."""
+    if not values.shape[2]:
         return np.full(partners.shape, np.nan)
-    picked = np.take_along_axis(distance_m, partners[..., None], axis=2)[..., 0]
+    picked = np.take_along_axis(values, partners[..., None], axis=2)[..., 0]
     return np.where(partners == UNASSIGNED, np.nan, picked)
+
+
+def of_partners(
+    values: Float[np.ndarray, "frames estimates *rest"], partner: Int[np.ndarray, "drones"]
+) -> Float[np.ndarray, "frames drones *rest"]:
+    """What belongs to the estimate that stands for each true drone throughout; NaN where none does."""
+    picked = np.full((len(values), len(partner), *values.shape[2:]), np.nan)
+    assigned = partner != UNASSIGNED
+    picked[:, assigned] = values[:, partner[assigned]]
+    return picked
 
 
 def identity_switches(partners: Int[np.ndarray, "frames drones"]) -> Bool[np.ndarray, "frames drones"]:

@@ -9,7 +9,7 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -25,105 +25,15 @@ from psotrack.evaluation.association import (
     fixed_identity,
     identity_switches,
     matched_per_frame,
-    paired_distances,
+    of_partners,
+    paired_values,
 )
+from psotrack.evaluation.consistency import consistency
+from psotrack.evaluation.gospa import gospa
+from psotrack.evaluation.hota import hota
+from psotrack.evaluation.paths import path_errors, rows_apart
+from psotrack.evaluation.records import DroneEvaluation, ErrorSummary, Evaluation
 from psotrack.trajectories import Trajectories
-
-
-@dataclass(frozen=True)
-class ErrorSummary:
-    """Of the distances between true and estimated positions; all None where there are none.
-
-    The standard deviation is that of the distances about their mean (divided by their number); p95 is the
-    95th percentile, interpolated.
-    """
-
-    mean_error_m: float | None
-    median_error_m: float | None
-    std_error_m: float | None
-    p95_error_m: float | None
-    max_error_m: float | None
-
-
-@dataclass(frozen=True)
-class DroneEvaluation(ErrorSummary):
-    """The errors of one true drone.
-
-    Attributes:
-        drone: its name in the reference.
-        estimate: name of the estimated drone that stands for it, or None.
-        frames: in which its true position is known.
-        missed_rate: share of those frames without a row, or with a lost one.
-        offset_removed_mean_error_m: mean error when the mean residual is taken out; None if never seen.
-        offset_m: that residual, estimate minus truth, (x, y, z); None if never seen.
-        offset_frame: of `offset_m`: the true body's where its orientation is known in every frame of it, else
-            the world's.
-    """
-
-    drone: str
-    estimate: str | None
-    frames: int
-    missed_rate: float
-    offset_removed_mean_error_m: float | None
-    offset_m: tuple[float, float, float] | None
-    offset_frame: Literal["body", "world"] | None
-
-
-@dataclass(frozen=True)
-class Evaluation(ErrorSummary):
-    """An estimate judged by its reference; see `evaluate` for the definitions."""
-
-    frames: int
-    drones: int
-    missed_rate: float
-    id_switches: int
-    mota: float
-    motp_m: float | None
-    idf1: float
-    matched_mean_error_m: float | None
-    offset_removed_mean_error_m: float | None
-    per_drone: tuple[DroneEvaluation, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """The contract for other programs: fit for strict JSON, with null where there is no number."""
-        values = asdict(self)
-        return {key: values[key] for key in _CONTRACT} | {
-            "per_drone": [{key: drone[key] for key in _CONTRACT_DRONE} for drone in values["per_drone"]]
-        }
-
-
-#: Keys of `Evaluation.to_dict`, in this order.
-_CONTRACT = (
-    "frames",
-    "drones",
-    "mean_error_m",
-    "median_error_m",
-    "std_error_m",
-    "p95_error_m",
-    "max_error_m",
-    "missed_rate",
-    "id_switches",
-    "mota",
-    "motp_m",
-    "idf1",
-    "matched_mean_error_m",
-    "offset_removed_mean_error_m",
-    "per_drone",
-)
-_CONTRACT_DRONE = (
-    "drone",
-    "estimate",
-    "frames",
-    "mean_error_m",
-    "median_error_m",
-    "std_error_m",
-    "p95_error_m",
-    "max_error_m",
-    "missed_rate",
-    "offset_removed_mean_error_m",
-    "offset_m",
-    "offset_frame",
-)
 
 
 def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
@@ -145,51 +55,54 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
     - `idf1` = 2 IDTP / (known + estimated), with the one assignment of whole tracks that has the most frames
       within 0.5 m, IDTP (Ristani et al. 2016).
     - An estimate whose own drone is unknown in a frame, and that is near no other, is no false positive.
+    - `hota`, `deta`, `assa`, `loca`: see `hota.hota`; `gospa_*`: see `gospa.gospa`.
     - `offset_removed_mean_error_m`: the mean error after one constant offset per drone, its mean residual, is
       taken out: in the true body's frame where the orientation is known, else in the world's. Silhouettes
       and marker crosses have their middle elsewhere than the body's origin; that is no fault of a tracker.
+    - `ate_*`, `rpe_*`: of the same pairs as the errors; see `paths.path_errors`. Over all drones, `ate_aligned_rmse_m`
+      moves all of them by one rigid motion; in `per_drone`, each by its own.
+    - `inside_90_rate`, `mean_nees`, where the estimate has covariances: see `consistency.consistency`.
 
     Args:
         traj_est: the estimate; its times are not used.
         traj_ref: the reference.
 
     Raises:
-        InputError: nothing is known in the reference, or the two have no frame in common.
+        InputError: nothing is known in the reference, the two have no frame in common, or the estimate has a
+            covariance that is none.
     """
     pair = align(traj_est, traj_ref)
     known = pair.truth_known
     partner = fixed_identity(pair)
-    error_m = paired_distances(pair.distance_m, np.broadcast_to(partner, known.shape))
-    residuals = [_residuals(pair, drone, estimate) for drone, estimate in enumerate(partner.tolist())]
+    followed = _follow(pair, partner)
 
     kept = matched_per_frame(pair.distance_m, keep=True)
-    kept_m = paired_distances(pair.distance_m, kept)
-    matched_m = paired_distances(pair.distance_m, matched_per_frame(pair.distance_m, keep=False))
+    kept_m = paired_values(pair.distance_m, kept)
+    matched_m = paired_values(pair.distance_m, matched_per_frame(pair.distance_m, keep=False))
     id_switches = int(identity_switches(kept).sum())
-    num_known, num_estimated = int(known.sum()), int(_counted_estimates(pair, partner).sum())
+    counted = _counted_estimates(pair, partner)
+    num_known, num_estimated = int(known.sum()), int(counted.sum())
     num_matched = int(np.isfinite(kept_m).sum())
     misses, false_positives = num_known - num_matched, num_estimated - num_matched
     return Evaluation(
-        **_summary(error_m),
+        **_errors(followed, slice(None)),
+        **vars(hota(pair.distance_m, known, counted)),
+        **vars(gospa(pair.distance_m, known, counted)),
         frames=len(pair.frame),
         drones=len(pair.drones),
-        missed_rate=_missed_rate(error_m, known),
         id_switches=id_switches,
         mota=1 - (misses + false_positives + id_switches) / num_known,
         motp_m=_mean(kept_m),
         idf1=2 * _identity_true_positives(pair.distance_m) / (num_known + num_estimated),
         matched_mean_error_m=_mean(matched_m),
-        offset_removed_mean_error_m=_mean(np.concatenate([drone.remaining_m for drone in residuals])),
         per_drone=tuple(
             DroneEvaluation(
-                **_summary(error_m[:, drone]),
+                **_errors(followed, slice(drone, drone + 1)),
                 drone=name,
                 estimate=None if partner[drone] == UNASSIGNED else pair.drones_est[partner[drone]],
                 frames=int(known[:, drone].sum()),
-                missed_rate=_missed_rate(error_m[:, drone], known[:, drone]),
-                offset_removed_mean_error_m=_mean(residuals[drone].remaining_m),
-                offset_m=residuals[drone].offset_m,
-                offset_frame=residuals[drone].offset_frame,
+                offset_m=followed.offsets[drone].offset_m,
+                offset_frame=followed.offsets[drone].offset_frame,
             )
             for drone, name in enumerate(pair.drones)
         ),
@@ -218,46 +131,92 @@ def _identity_true_positives(distance_m: Float[np.ndarray, "frames drones estima
 
 
 @dataclass(frozen=True)
-class _Residuals:
-    """What is between one true drone and its estimate: a constant, and what remains."""
+class _Followed:
+    """Every true drone with the one estimate that stands for it; NaN where either is not known."""
 
-    remaining_m: Float[np.ndarray, "seen"]
+    pair: AlignedPair
+    est_m: Float[np.ndarray, "frames drones 3"]
+    orientation_est_wxyz: Float[np.ndarray, "frames drones 4"]
+    covariance_m2: Float[np.ndarray, "frames drones 3 3"]
+    residual_m: Float[np.ndarray, "frames drones 3"]
+    centred_m: Float[np.ndarray, "frames drones 3"]
+    offsets: tuple[_Offset, ...]
+
+
+@dataclass(frozen=True)
+class _Offset:
+    """The constant part of one drone's residuals."""
+
     offset_m: tuple[float, float, float] | None = None
     offset_frame: Literal["body", "world"] | None = None
 
 
-def _residuals(pair: AlignedPair, drone: int, estimate: int) -> _Residuals:
-    if estimate == UNASSIGNED:
-        return _Residuals(np.empty(0))
-    residual_m = pair.est_m[:, estimate] - pair.ref_m[:, drone]
-    seen = np.isfinite(residual_m).all(axis=-1)
-    residual_m, orientation_wxyz = residual_m[seen], pair.orientation_wxyz[seen, drone]
-    if not len(residual_m):
-        return _Residuals(np.empty(0))
-    in_body = bool(np.isfinite(orientation_wxyz).all())
-    if in_body:
-        world_to_body = Rotation.from_quat(orientation_wxyz, scalar_first=True).inv()
-        residual_m = world_to_body.apply(residual_m)
-    offset_m = residual_m.mean(axis=0)
-    x, y, z = offset_m.tolist()
-    return _Residuals(
-        np.linalg.norm(residual_m - offset_m, axis=-1), (x, y, z), "body" if in_body else "world"
+def _follow(pair: AlignedPair, partner: Int[np.ndarray, "drones"]) -> _Followed:
+    est_m = of_partners(pair.est_m, partner)
+    residual_m = est_m - pair.ref_m
+    offsets, centred_m = zip(
+        *(_centre(residual_m[:, drone], pair.orientation_wxyz[:, drone]) for drone in range(len(partner))),
+        strict=True,
+    )
+    return _Followed(
+        pair=pair,
+        est_m=est_m,
+        orientation_est_wxyz=of_partners(pair.orientation_est_wxyz, partner),
+        covariance_m2=of_partners(pair.covariance_m2, partner),
+        residual_m=residual_m,
+        centred_m=np.stack(centred_m, axis=1),
+        offsets=offsets,
     )
 
 
-def _missed_rate(error_m: Float[np.ndarray, "*shape"], known: Bool[np.ndarray, "*shape"]) -> float:
-    return float((known & np.isnan(error_m)).sum() / known.sum())
+def _centre(
+    residual_m: Float[np.ndarray, "frames 3"], orientation_wxyz: Float[np.ndarray, "frames 4"]
+) -> tuple[_Offset, Float[np.ndarray, "frames 3"]]:
+    """The mean residual of one drone, in its body where that is known, and what remains, in the world."""
+    centred_m = np.full_like(residual_m, np.nan)
+    seen = np.isfinite(residual_m).all(axis=-1)
+    if not seen.any():
+        return _Offset(), centred_m
+    in_body = bool(np.isfinite(orientation_wxyz[seen]).all())
+    frame_to_world = Rotation.identity()
+    if in_body:
+        frame_to_world = Rotation.from_quat(orientation_wxyz[seen], scalar_first=True)
+    offset_m = frame_to_world.inv().apply(residual_m[seen]).mean(axis=0)
+    centred_m[seen] = residual_m[seen] - frame_to_world.apply(offset_m)
+    x, y, z = offset_m.tolist()
+    return _Offset((x, y, z), "body" if in_body else "world"), centred_m
+
+
+def _errors(followed: _Followed, drones: slice) -> dict[str, Any]:
+    """What is said of one drone and of all of them in the same words."""
+    pair = followed.pair
+    residual_m, centred_m = followed.residual_m[:, drones], followed.centred_m[:, drones]
+    error_m = np.linalg.norm(residual_m, axis=-1)
+    paths = path_errors(
+        followed.est_m[:, drones],
+        pair.ref_m[:, drones],
+        followed.orientation_est_wxyz[:, drones],
+        pair.orientation_wxyz[:, drones],
+        rows_apart(pair.frame, pair.time_s),
+    )
+    known = pair.truth_known[:, drones]
+    return {
+        **vars(_summary(error_m)),
+        **vars(paths),
+        **vars(consistency(residual_m, centred_m, followed.covariance_m2[:, drones])),
+        "missed_rate": float((known & np.isnan(error_m)).sum() / known.sum()),
+        "offset_removed_mean_error_m": _mean(np.linalg.norm(centred_m, axis=-1)),
+    }
+
+
+def _summary(error_m: Float[np.ndarray, "*shape"]) -> ErrorSummary:
+    there = error_m[np.isfinite(error_m)]
+    if not len(there):
+        return ErrorSummary(None, None, None, None, None)
+    values = (there.mean(), np.median(there), there.std(), np.percentile(there, 95), there.max())
+    return ErrorSummary(*map(float, values))
 
 
 def _mean(error_m: Float[np.ndarray, "*shape"]) -> float | None:
     there = error_m[np.isfinite(error_m)]
     return float(there.mean()) if len(there) else None
-
-
-def _summary(error_m: Float[np.ndarray, "*shape"]) -> dict[str, float | None]:
-    there = error_m[np.isfinite(error_m)]
-    names = [field.name for field in fields(ErrorSummary)]
-    if not len(there):
-        return dict.fromkeys(names)
-    values = (there.mean(), np.median(there), there.std(), np.percentile(there, 95), there.max())
-    return {name: float(value) for name, value in zip(names, values, strict=True)}

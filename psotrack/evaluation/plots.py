@@ -21,7 +21,7 @@ from psotrack.evaluation.association import (
     fixed_identity,
     identity_switches,
     matched_per_frame,
-    paired_distances,
+    of_partners,
 )
 from psotrack.files import refuse_to_overwrite, written_whole
 from psotrack.trajectories import Trajectories
@@ -123,7 +123,7 @@ def draw_errors(axes: Axes, traj_est: Trajectories, traj_ref: Trajectories) -> N
     is logarithmic where an error exceeds the gate of 0.5 m, so that what came before stays readable.
     """
     pair = align(traj_est, traj_ref)
-    error_m = paired_distances(pair.distance_m, np.broadcast_to(fixed_identity(pair), pair.truth_known.shape))
+    error_m = np.linalg.norm(of_partners(pair.est_m, fixed_identity(pair)) - pair.ref_m, axis=-1)
     missed = pair.truth_known & np.isnan(error_m)
     switches = identity_switches(matched_per_frame(pair.distance_m, keep=True))
     time_s = _with_gaps(pair, pair.time_s)

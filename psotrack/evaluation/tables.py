@@ -9,7 +9,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from psotrack.evaluation.metrics import DroneEvaluation, Evaluation
+from psotrack.evaluation.records import DroneEvaluation, Evaluation
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -18,7 +18,7 @@ _COLUMNS = ("mean", "median", "std", "p95", "max", "missed", "centred", "offset 
 
 
 def render(evaluation: Evaluation, title: str = "") -> Table:
-    """A table of at most 80 columns: a row per drone, one for all, and the scores of identity below.
+    """A table of at most 80 columns: a row per drone, one for all, and below the scores of the whole.
 
     Errors are in millimetres, or all in metres where the mean error is a metre or more.
     """
@@ -26,7 +26,7 @@ def render(evaluation: Evaluation, title: str = "") -> Table:
     heading = f"{evaluation.frames} frames, {evaluation.drones} drones, errors in {unit.name}"
     table = Table(
         title=Text(f"{title}: {heading}" if title else heading, style="bold"),
-        caption=Text(_caption(evaluation), style="default"),
+        caption=Text(_caption(evaluation, unit), style="default"),
         box=box.HORIZONTALS,
         show_edge=False,
         pad_edge=False,
@@ -97,15 +97,67 @@ def _cells(errors: Evaluation | DroneEvaluation, unit: _Unit) -> list[str]:
     ]
 
 
-def _caption(evaluation: Evaluation) -> str:
+def _caption(evaluation: Evaluation, unit: _Unit) -> str:
+    lines = {
+        "CLEAR": _clear(evaluation),
+        "HOTA": (
+            f"{evaluation.hota:.3f}: DetA {evaluation.deta:.3f}, AssA {evaluation.assa:.3f}, "
+            f"LocA {_score(evaluation.loca)}"
+        ),
+        "GOSPA": _gospa(evaluation),
+        "RMSE": _paths(evaluation, unit),
+    }
+    if evaluation.inside_90_rate is not None:
+        lines["ellipsoid"] = (
+            f"of 90 % holds {_percent(evaluation.inside_90_rate)} "
+            f"({_percent(evaluation.offset_removed_inside_90_rate)} centred), "
+            f"mean NEES {_nees(evaluation.mean_nees)} ({_nees(evaluation.offset_removed_mean_nees)})"
+        )
     frames = sorted({drone.offset_frame for drone in evaluation.per_drone if drone.offset_frame})
+    lines["centred"] = f"without each drone's offset, its mean residual ({' or '.join(frames) or 'no'} frame)"
+    return "\n".join(f"{label:<10}{line}" for label, line in lines.items())
+
+
+def _clear(evaluation: Evaluation) -> str:
     # Within the gate of matching, so always millimetres.
-    motp, matched = (
-        _MILLIMETRES.number(value) for value in (evaluation.motp_m, evaluation.matched_mean_error_m)
-    )
+    motp, matched = map(_MILLIMETRES.number, (evaluation.motp_m, evaluation.matched_mean_error_m))
     return (
         f"MOTA {evaluation.mota:.3f}, MOTP {motp} mm, IDF1 {evaluation.idf1:.3f}, "
         f"identity switches {evaluation.id_switches}\n"
-        f"mean when matched anew in each frame: {matched} mm\n"
-        f"centred: mean without each drone's offset, its mean residual ({' or '.join(frames) or 'no'} frame)"
+        f"{'':<10}mean when matched anew in each frame {matched} mm"
     )
+
+
+def _gospa(evaluation: Evaluation) -> str:
+    # Of the size of the cut-off.
+    total, localisation, missed, false = map(
+        _MILLIMETRES.number,
+        (
+            evaluation.gospa_m,
+            evaluation.gospa_localisation_m,
+            evaluation.gospa_missed_m,
+            evaluation.gospa_false_m,
+        ),
+    )
+    return f"{total} mm: localisation {localisation}, missed {missed}, false {false}"
+
+
+def _paths(evaluation: Evaluation, unit: _Unit) -> str:
+    ate, ate_aligned, rpe = map(
+        unit.number, (evaluation.ate_rmse_m, evaluation.ate_aligned_rmse_m, evaluation.rpe_1s_rmse_m)
+    )
+    turn_deg = evaluation.rpe_1s_rotation_rmse_deg
+    turn = "" if turn_deg is None else f" and {turn_deg:.2f} deg"
+    return f"ATE {ate} {unit.name} ({ate_aligned} aligned), RPE over 1 s {rpe} {unit.name}{turn}"
+
+
+def _score(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1%}"
+
+
+def _nees(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2g}"

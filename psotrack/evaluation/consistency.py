@@ -1,0 +1,61 @@
+"""Whether an estimate knows how far off it is: its covariances against its errors.
+
+Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4.2
+(NEES, the normalised estimation error squared).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import gammaincinv
+
+from psotrack.errors import InputError
+from psotrack.evaluation.records import Consistency
+
+#: The chi-square distribution with 3 degrees of freedom is below this with probability 0.9.
+INSIDE_90 = 2.0 * float(gammaincinv(3 / 2, 0.9))
+
+
+def consistency(
+    residual_m: Float[np.ndarray, "frames drones 3"],
+    centred_m: Float[np.ndarray, "frames drones 3"],
+    covariance_m2: Float[np.ndarray, "frames drones 3 3"],
+) -> Consistency:
+    """Share of truths inside of the 90 % ellipsoid, and mean NEES, over all frames and drones with both.
+
+    NEES is r^T C^-1 r with the residual r and its covariance C. For Gaussian errors with that covariance it is
+    distributed as chi-square with 3 degrees of freedom: its mean is 3, and 90 % of it is below `INSIDE_90`.
+
+    Args:
+        residual_m: (frames, drones, 3), estimate minus truth, NaN where either is not known.
+        centred_m: the same without each drone's constant offset.
+        covariance_m2: (frames, drones, 3, 3), of the estimates, in the world; NaN where not known.
+
+    Raises:
+        InputError: a covariance is not positive definite.
+    """
+    there = np.isfinite(residual_m).all(axis=-1) & np.isfinite(covariance_m2).all(axis=(-2, -1))
+    if not there.any():
+        return Consistency(None, None, None, None)
+    smallest_m2 = np.linalg.eigvalsh(covariance_m2[there])[:, 0].min()
+    if not smallest_m2 > 0:
+        raise InputError(
+            "estimate",
+            expected="covariances that are positive definite",
+            found=f"one whose least eigenvalue is {smallest_m2:.3g} m2",
+            remedy="leave a covariance empty (NaN) where it is not known",
+        )
+    raw, centred = (_nees(vector_m[there], covariance_m2[there]) for vector_m in (residual_m, centred_m))
+    return Consistency(
+        inside_90_rate=float(np.mean(raw <= INSIDE_90)),
+        mean_nees=float(raw.mean()),
+        offset_removed_inside_90_rate=float(np.mean(centred <= INSIDE_90)),
+        offset_removed_mean_nees=float(centred.mean()),
+    )
+
+
+def _nees(
+    residual_m: Float[np.ndarray, "points 3"], covariance_m2: Float[np.ndarray, "points 3 3"]
+) -> Float[np.ndarray, "points"]:
+    return np.einsum("ni,ni->n", residual_m, np.linalg.solve(covariance_m2, residual_m[..., None])[..., 0])

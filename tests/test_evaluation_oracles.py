@@ -1,0 +1,139 @@
+"""The same numbers as trackeval and motmetrics give on random flights.
+
+trackeval 1.3.0 is the code of HOTA's authors; motmetrics 1.4.0 implements CLEAR and IDF1 on its own. trackeval asks for
+opencv-python, which takes the place of the headless one; it is no part of the `test` extra for that, and these
+tests of it are skipped where it is not installed.
+"""
+
+from dataclasses import replace
+
+import motmetrics
+import numpy as np
+import pytest
+from evaluation_flights import FPS, ROUNDING, random_flights, seeds
+from hypothesis import given, settings
+
+from psotrack.evaluation import evaluate
+from psotrack.evaluation.association import GATE_M
+from psotrack.trajectories import Trajectories
+
+
+def crowded(seed: int) -> tuple[Trajectories, Trajectories]:
+    """Within a metre, so that many pairs are possible; estimates come and go, all true drones are always known."""
+    est, _ = random_flights(seed, num_frames=12)
+    _, ref = random_flights(seed, num_frames=12, missing=0)
+    return est, ref
+
+
+def apart(seed: int) -> tuple[Trajectories, Trajectories]:
+    """Drones 3 m apart, unknown and missed now and then, and tracks that change hands, drift off or are false."""
+    rng = np.random.default_rng(seed)
+    num_frames, num_drones = 20, 4
+    ref_m = np.zeros((num_frames, num_drones, 3)) + np.arange(num_drones)[:, None] * [3.0, 0.0, 0.0]
+    ref_m += rng.normal(0, 0.1, ref_m.shape)
+    # A third are further off than the gate.
+    est_m = ref_m + rng.normal(0, 0.25, ref_m.shape)
+    known, seen = rng.random((2, num_frames, num_drones)) > 0.15
+    # So that frame 0 says who is who, and every drone is known.
+    known[0], seen[0] = True, True
+    est_m[~seen] = np.nan
+    ref_m[~known] = np.nan
+    for start in rng.integers(3, num_frames, 3):
+        est_m[start:] = est_m[start:, rng.permutation(num_drones)]
+    # A track whose own drone is unknown is absent too: that we do not count it is told by other tests.
+    est_m[~known] = np.nan
+    false_m = np.where(rng.random((num_frames, 1, 1)) < 0.5, 50.0, np.nan) + np.zeros(3)
+    frame = np.arange(num_frames)
+    return (
+        Trajectories(frame, frame / FPS, tuple("abcde"), np.concatenate([est_m, false_m], axis=1)),
+        Trajectories(frame, frame / FPS, tuple("wxyz"), ref_m),
+    )
+
+
+def frames(est: Trajectories, ref: Trajectories):
+    """Per frame: numbers of the known drones, of the estimates that are there, and the distances between them."""
+    for ref_m, est_m, known, seen in zip(ref.position_m, est.position_m, ref.seen, est.seen, strict=True):
+        drones, estimates = np.flatnonzero(known), np.flatnonzero(seen)
+        yield drones, estimates, np.linalg.norm(ref_m[drones, None] - est_m[None, estimates], axis=-1)
+
+
+def for_trackeval(est: Trajectories, ref: Trajectories, zero_at_m: float):
+    """What its metrics take, with the similarity 1 - distance / `zero_at_m`."""
+    drones, estimates, distances_m = zip(*frames(est, ref), strict=True)
+    return {
+        "num_gt_ids": ref.num_drones,
+        "num_tracker_ids": est.num_drones,
+        "num_gt_dets": sum(map(len, drones)),
+        "num_tracker_dets": sum(map(len, estimates)),
+        "gt_ids": list(drones),
+        "tracker_ids": list(estimates),
+        "similarity_scores": [np.maximum(0, 1 - distance_m / zero_at_m) for distance_m in distances_m],
+        "num_timesteps": ref.num_frames,
+    }
+
+
+@pytest.mark.parametrize("flights", [crowded, apart])
+class TestTrackeval:
+    @given(seed=seeds)
+    @settings(max_examples=30)
+    def test_hota(self, flights, seed):
+        metrics = pytest.importorskip("trackeval").metrics
+        est, ref = flights(seed)
+        theirs = metrics.HOTA().eval_sequence(for_trackeval(est, ref, GATE_M))
+        ours = evaluate(est, ref)
+        for name in ("HOTA", "DetA", "AssA", "LocA"):
+            assert getattr(ours, name.lower()) == pytest.approx(theirs[name].mean(), abs=ROUNDING), name
+
+    @given(seed=seeds)
+    @settings(max_examples=30)
+    def test_clear_and_identity(self, flights, seed):
+        metrics = pytest.importorskip("trackeval").metrics
+        est, ref = flights(seed)
+        # It takes the pairs with the most similarity, we the most pairs and then the nearest: the same where one more
+        # pair is always worth more than all distances together.
+        zero_at_m = 100.0
+        config = {"PRINT_CONFIG": False, "THRESHOLD": 1 - GATE_M / zero_at_m}
+        data = for_trackeval(est, ref, zero_at_m)
+        ours = evaluate(est, ref)
+        clear = metrics.CLEAR(config).eval_sequence(data)
+        assert ours.id_switches == clear["IDSW"]
+        assert ours.mota == pytest.approx(clear["MOTA"], abs=ROUNDING)
+        # Distances are 1 - similarity of 100 m, of which float64 keeps 1e-14 m.
+        assert ours.motp_m == pytest.approx(zero_at_m * (1 - clear["MOTP"]), abs=1e-11)
+        identity = metrics.Identity(config).eval_sequence(data)
+        assert ours.idf1 == pytest.approx(identity["IDF1"], abs=ROUNDING)
+
+
+def with_motmetrics(est: Trajectories, ref: Trajectories):
+    accumulator = motmetrics.MOTAccumulator(auto_id=True)
+    for drones, estimates, distance_m in frames(est, ref):
+        accumulator.update(drones, estimates, np.where(distance_m <= GATE_M, distance_m, np.nan))
+    names = ["mota", "motp", "idf1", "num_switches"]
+    return motmetrics.metrics.create().compute(accumulator, metrics=names).iloc[0]
+
+
+class TestMotmetrics:
+    @given(seed=seeds)
+    @settings(max_examples=20)
+    def test_apart(self, seed):
+        est, ref = apart(seed)
+        theirs, ours = with_motmetrics(est, ref), evaluate(est, ref)
+        assert ours.id_switches == theirs["num_switches"]
+        assert ours.mota == pytest.approx(theirs["mota"], abs=ROUNDING)
+        assert ours.motp_m == pytest.approx(theirs["motp"], abs=ROUNDING)
+        assert ours.idf1 == pytest.approx(theirs["idf1"], abs=ROUNDING)
+
+    @given(seed=seeds)
+    @settings(max_examples=20)
+    def test_crowded(self, seed):
+        est, ref = crowded(seed)
+        # It takes up pairs of long ago, we those of the previous frame only: the same where no drone is ever missed,
+        # that is where all estimates are within the gate of all drones, and at least as many.
+        est = replace(est, position_m=0.25 * est.position_m)
+        ref = replace(ref, position_m=0.25 * ref.position_m)
+        est.position_m[est.seen.sum(axis=1) < ref.num_drones] = 0.1
+        theirs, ours = with_motmetrics(est, ref), evaluate(est, ref)
+        assert ours.id_switches == theirs["num_switches"]
+        assert ours.mota == pytest.approx(theirs["mota"], abs=ROUNDING)
+        assert ours.motp_m == pytest.approx(theirs["motp"], abs=ROUNDING)
+        assert ours.idf1 == pytest.approx(theirs["idf1"], abs=ROUNDING)
