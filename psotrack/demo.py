@@ -55,7 +55,16 @@ def run(
         refuse_to_overwrite(path, force)
     began = time.perf_counter()
     folder = simulate(
-        NAME, out, num_frames=NUM_FRAMES, scale=SCALE, seed=seed, jobs=jobs, force=force, report=report
+        NAME,
+        out,
+        num_frames=NUM_FRAMES,
+        scale=SCALE,
+        seed=seed,
+        masks=False,
+        onboard=False,
+        jobs=jobs,
+        force=force,
+        report=report,
     )
     simulated = time.perf_counter()
     sequence = read_sequence(folder).usable()

@@ -8,10 +8,31 @@ from collections.abc import Sequence as Ordered
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float
+
 from psotrack.cameras import CameraRig
 from psotrack.errors import InputError, SettingsError
 from psotrack.trajectories import Trajectories
 from psotrack.video import VideoInfo
+
+
+@dataclass(frozen=True)
+class OnboardVideo:
+    """The video of a drone's own camera, fixed to its body, without lens distortion.
+
+    Attributes:
+        video: the file.
+        K: (3, 3), intrinsics in pixels; None where they are not known.
+        position_m: (frames, 3), the camera's centre, world; NaN where it is not known.
+        orientation_wxyz: (frames, 4), unit quaternions, camera to world, with camera axes x right, y down, z ahead; NaN
+            where they are not known.
+    """
+
+    video: VideoInfo
+    K: Float[np.ndarray, "3 3"] | None
+    position_m: Float[np.ndarray, "frames 3"]
+    orientation_wxyz: Float[np.ndarray, "frames 4"]
 
 
 @dataclass(frozen=True)
@@ -28,6 +49,7 @@ class Sequence:
         videos: by camera name; a camera without video is absent.
         truth: the reference at the video's frames, or None.
         detections: files of 2D boxes by camera name.
+        onboard: videos of drones' own cameras by the drones' names, or None.
     """
 
     name: str
@@ -36,6 +58,7 @@ class Sequence:
     videos: Mapping[str, VideoInfo]
     truth: Trajectories | None = None
     detections: Mapping[str, Path] | None = None
+    onboard: Mapping[str, OnboardVideo] | None = None
 
     @property
     def fps(self) -> float:

@@ -1,4 +1,4 @@
-"""Videos: what is in them, their frames in order, and writing them.
+"""Videos: what is in them, their frames in order, writing them, and joining them.
 
 FFmpeg, inside OpenCV, decodes and encodes. It believes containers, drops frames that it cannot decode and
 fails to write without a word; here each of these is an error that names the file. Frame rates stay as exact
@@ -12,6 +12,7 @@ import math
 import os
 import threading
 from collections.abc import Iterator
+from collections.abc import Sequence as Ordered
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -27,6 +28,8 @@ from psotrack.files import written_whole
 _CODEC = "XVID"
 _FFMPEG_LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
 _FFMPEG_QUIET = "-8"
+#: What makes a writer take coded frames, key frames being those that are said to be.
+_CODED = (cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1, cv2.VIDEOWRITER_PROP_KEY_INTERVAL, 2**31 - 1)
 _opening = threading.Lock()
 
 
@@ -144,13 +147,7 @@ class VideoWriter:
     def __enter__(self) -> VideoWriter:
         with contextlib.ExitStack() as stack:
             self._temporary = stack.enter_context(written_whole(self._path))
-            codec = cv2.VideoWriter.fourcc(*_CODEC)
-            with _quiet():
-                self._writer = cv2.VideoWriter(
-                    os.path.abspath(self._temporary), cv2.CAP_FFMPEG, codec, self._fps, self._size_wh
-                )
-            if not self._writer.isOpened():
-                raise OutputError(self._path, expected="to write a video", found="that it cannot be opened")
+            self._writer = _writer(self._path, self._temporary, self._fps, self._size_wh)
             # From here on __exit__ answers for the temporary file.
             self._open_until_exit = stack.pop_all()
         return self
@@ -173,18 +170,93 @@ class VideoWriter:
             self._writer.release()
             if error is not None:
                 raise error
-            self._check_written()
+            _check_written(self._path, self._temporary, self._num_frames)
 
-    def _check_written(self) -> None:
-        # FFmpeg's failed writes are silent, and the header may promise every frame still: count them.
-        found = _count_packets(self._temporary) if self._num_frames else 0
-        if found != self._num_frames or found == 0:
-            raise OutputError(
-                self._path,
-                expected=f"to write {self._num_frames} frames" if self._num_frames else "at least one frame",
-                found=f"{found} written",
-                remedy="is the disk full? earlier results are unchanged" if self._num_frames else "",
+
+def join_videos(path: Path, parts: Ordered[Path]) -> None:
+    """Write the frames of several videos into one, as they are coded; it appears at `path` when it is whole.
+
+    Decoding it yields what decoding the parts one after the other does, and frames can be sought as in them.
+
+    Args:
+        path: of the new file, ending in .avi.
+        parts: videos of one size and one rate that `VideoWriter` wrote, at least one.
+
+    Raises:
+        InputError: a part cannot be read, ends early, or has another size or rate than the first.
+        OutputError: the file cannot be written, or not wholly: the disk is full.
+    """
+    videos = [probe(part) for part in parts]
+    first = videos[0]
+    for video in videos:
+        if (video.fps, video.image_size_wh) != (first.fps, first.image_size_wh):
+            raise InputError(
+                video.path, expected=f"{_kind(first)} as in {first.path.name}", found=_kind(video)
             )
+    with written_whole(path) as temporary:
+        writer = _writer(path, temporary, first.fps, first.image_size_wh, _CODED)
+        try:
+            for video in videos:
+                _copy_packets(video, writer)
+        finally:
+            writer.release()
+        _check_written(path, temporary, sum(video.num_frames for video in videos))
+
+
+def _writer(
+    path: Path, temporary: Path, fps: float, image_size_wh: tuple[int, int], settings: Ordered[int] = ()
+) -> cv2.VideoWriter:
+    codec = cv2.VideoWriter.fourcc(*_CODEC)
+    with _quiet():
+        writer = cv2.VideoWriter(
+            os.path.abspath(temporary), cv2.CAP_FFMPEG, codec, fps, image_size_wh, settings
+        )
+    if not writer.isOpened():
+        raise OutputError(path, expected="to write a video", found="that it cannot be opened")
+    return writer
+
+
+def _check_written(path: Path, temporary: Path, num_frames: int) -> None:
+    # FFmpeg's failed writes are silent, and the header may promise every frame still: count them.
+    found = _count_packets(temporary) if num_frames else 0
+    if found != num_frames or found == 0 or not _has_its_end(temporary):
+        raise OutputError(
+            path,
+            expected=f"to write {num_frames} frames" if num_frames else "at least one frame",
+            found=f"{found} written" if found != num_frames or found == 0 else "their index cut off",
+            remedy="is the disk full? earlier results are unchanged" if num_frames else "",
+        )
+
+
+def _has_its_end(path: Path) -> bool:
+    """Whether an AVI file is as long as its chunks `RIFF` say; the last thing in them is the index of frames."""
+    size, position = path.stat().st_size, 0
+    with path.open("rb") as file:
+        while position < size:
+            file.seek(position)
+            name, length = file.read(4), file.read(4)
+            if name != b"RIFF":
+                return False
+            position += 8 + int.from_bytes(length, "little")
+    return position == size
+
+
+def _copy_packets(video: VideoInfo, writer: cv2.VideoWriter) -> None:
+    capture = _open(video.path)
+    try:
+        capture.set(cv2.CAP_PROP_FORMAT, -1)
+        for index in range(video.num_frames):
+            there, packet = capture.read()
+            if not there:
+                raise _ended_early(video, index)
+            writer.set(cv2.VIDEOWRITER_PROP_KEY_FLAG, capture.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME))
+            writer.write(packet)
+    finally:
+        capture.release()
+
+
+def _kind(video: VideoInfo) -> str:
+    return "{} x {} pixels at {:g} Hz".format(*video.image_size_wh, video.fps)
 
 
 def _open(path: Path) -> cv2.VideoCapture:

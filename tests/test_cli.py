@@ -29,7 +29,11 @@ COLUMNS = [
 ERRORS = [
     *("frames", "drones", "mean_error_m", "median_error_m", "std_error_m", "p95_error_m", "max_error_m"),
     *("missed_rate", "id_switches", "mota", "motp_m", "idf1", "matched_mean_error_m"),
-    *("offset_removed_mean_error_m", "per_drone"),
+    *("offset_removed_mean_error_m", "hota", "deta", "assa", "loca"),
+    *("gospa_m", "gospa_localisation_m", "gospa_missed_m", "gospa_false_m"),
+    *("ate_rmse_m", "ate_aligned_rmse_m", "rpe_1s_rmse_m", "rpe_1s_rotation_rmse_deg"),
+    *("inside_90_rate", "mean_nees", "offset_removed_inside_90_rate", "offset_removed_mean_nees"),
+    "per_drone",
 ]
 NUM_FRAMES = 12
 #: All but the last: drones of a dozen pixels are found by themselves only where many cameras see them.
@@ -51,6 +55,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a small sequence, its silhouettes, and nothing else."""
     root = tmp_path_factory.mktemp("data")
     command = ["simulate", "S02_D4_A", "--out", str(root), "--scale", "0.25", "--frames", str(NUM_FRAMES)]
+    command += ["--no-onboard"]
     subprocess.run([sys.executable, "-m", "psotrack", *command, "--quiet"], check=True)
     return root
 
@@ -288,7 +293,6 @@ class TestBadInput:
         fails(sequence, "cam9", more=("--cameras", "cam1i,cam9"))
 
     def test_broken_detections(self, run: Run, sequence: Path) -> None:
-        (sequence / "dl_data").mkdir()
         (sequence / "dl_data" / "cam1i_s.csv").write_text("0,1,2,3,4,2.5,4,0.9\n1,5,6\n")
         assert_one_line(run("info", sequence), "cam1i_s.csv", "line 2")
 

@@ -48,7 +48,7 @@ class Lab:
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
     root = tmp_path_factory.mktemp("lab")
-    folder = simulate("S02_D4_A", root, num_frames=50, scale=0.5, seed=0, jobs=1)
+    folder = simulate("S02_D4_A", root, num_frames=50, scale=0.5, seed=0, masks=False, onboard=False, jobs=1)
     return Lab(read_sequence(folder).usable(), root / "cache")
 
 

@@ -1,19 +1,53 @@
-"""Simulated sequences on disk: layout, determinism, resuming, refusing."""
+"""Simulated sequences on disk: layout, determinism, resuming after any interruption, refusing."""
 
 import contextlib
+import hashlib
+import json
 import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+import time
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
-from psotrack.datasets.dpjait import MARKER_CORNERS, read_marker_corners, read_sequence
-from psotrack.errors import OutputError, SettingsError
-from psotrack.simulation import build, generate, scenario, simulate
+from psotrack.cameras import project
+from psotrack.datasets.dpjait import (
+    DETECTIONS,
+    MARKER_CORNERS,
+    read_marker_corners,
+    read_masks,
+    read_mocap_markers,
+    read_sequence,
+)
+from psotrack.detections import read_detections
+from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.simulation import CameraRenderer, build, replaced, scenario, segments, simulate
+from psotrack.simulation.imaging.onboard import OnboardRenderer
+from psotrack.simulation.labels.masks import drone_masks
+from psotrack.simulation.unfinished import unfinished
 from psotrack.video import probe, read_frames
 
 NAME = "S02_D4_A"
 SMALL = {"num_frames": 3, "scale": 0.1}
+#: Two cameras and two drones, for tests that interrupt.
+PAIR = msgspec.structs.replace(
+    replaced(
+        scenario(NAME),
+        {
+            "cameras": [
+                {"position_m": [3.0, -2.5, 2.6], "target_m": [0.0, 0.0, 1.2]},
+                {"position_m": [-3.0, -2.5, 2.6], "target_m": [0.0, 0.0, 1.2]},
+            ]
+        },
+    ),
+    drones=scenario(NAME).drones[:2],
+)
+TINY = {"num_frames": 7, "scale": 0.04}
 #: An encoder of MPEG-4 at its lowest quality in use is above that; a wrong picture is near 15 dB.
 LEAST_PSNR_DB = 28.0
 
@@ -23,8 +57,29 @@ def sequence_folder(tmp_path_factory):
     return simulate(NAME, tmp_path_factory.mktemp("once"), jobs=1, **SMALL)
 
 
+@pytest.fixture(scope="module")
+def pair_folder(tmp_path_factory):
+    """What the interrupted ones must come to."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(segments, "SEGMENT_FRAMES", 2)
+        return simulate(PAIR, tmp_path_factory.mktemp("pair"), jobs=1, **TINY)
+
+
+@pytest.fixture
+def short_segments(monkeypatch):
+    monkeypatch.setattr(segments, "SEGMENT_FRAMES", 2)
+
+
 def contents(folder):
-    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def beside(folder):
+    return sorted(path.name for path in folder.parent.iterdir())
 
 
 def test_the_reader_of_the_published_layout_finds_all_of_it(sequence_folder, tmp_path):
@@ -35,6 +90,10 @@ def test_the_reader_of_the_published_layout_finds_all_of_it(sequence_folder, tmp
     for video in sequence.videos.values():
         assert (video.num_frames, video.fps, video.image_size_wh) == (3, 25.0, (192, 108))
     scene = build(scenario(NAME), scale=0.1)
+    assert {path.name for path in (sequence_folder / DETECTIONS).iterdir()} == {
+        f"cam{i}i_s.csv" for i in range(1, 9)
+    }
+    assert set(sequence.onboard) == {"dron1", "dron2", "dron3", "dron4"}
     for field in ("T_cam_world", "K"):
         np.testing.assert_allclose(
             getattr(sequence.rig.cameras, field), getattr(scene.rig.cameras, field), atol=1e-9
@@ -57,19 +116,94 @@ def test_the_truth_on_disk_is_the_flight_and_frame_0_has_none(sequence_folder):
         )
 
 
-def test_videos_show_what_the_renderer_draws_at_those_frames(sequence_folder):
-    from psotrack.simulation import CameraRenderer
-
+def test_videos_show_what_the_renderers_draw_at_those_frames(sequence_folder):
     scene = build(scenario(NAME), scale=0.1)
-    for index in (1, 6):
-        drawn = CameraRenderer(scene, index)
-        video = probe(sequence_folder / generate.video_file(scene.rig.names[index]))
-        for frame, shown in enumerate(read_frames(video)):
-            assert cv2.PSNR(shown, drawn.frame(frame)) > LEAST_PSNR_DB
+    drawn = {f"cam{i + 1}i_s.avi": CameraRenderer(scene, i) for i in (1, 6)}
+    drawn["dron3_cam_s.avi"] = OnboardRenderer(scene, 2)
+    for name, renderer in drawn.items():
+        frames = list(read_frames(probe(sequence_folder / name)))
+        assert len(frames) == 3
+        for frame, shown in enumerate(frames):
+            assert cv2.PSNR(shown, renderer.frame(frame)) > LEAST_PSNR_DB
 
 
-def test_the_number_of_jobs_changes_no_byte(sequence_folder, tmp_path):
-    assert contents(simulate(NAME, tmp_path, jobs=2, **SMALL)) == contents(sequence_folder)
+def test_masks_are_what_the_renderer_would_draw_for_every_drone_camera_and_frame(sequence_folder):
+    scene = build(scenario(NAME), scale=0.1)
+    with read_masks(sequence_folder) as masks:
+        assert masks.cameras == scene.rig.names
+        assert (masks.drones, masks.frames) == ((1, 2, 3, 4), (0, 1, 2))
+        for index, camera in enumerate(scene.rig.names):
+            one = CameraRenderer(scene, index)
+            for frame in masks.frames:
+                numbers = drone_masks(scene, one.cam, one.backdrop.depth_m, frame)
+                for drone in masks.drones:
+                    np.testing.assert_array_equal(masks.mask(camera, drone, frame), numbers == drone)
+
+
+def test_detections_lie_about_the_drones(sequence_folder):
+    sequence = read_sequence(sequence_folder)
+    assert list(sequence.detections) == list(sequence.rig.names)
+    near = total = 0
+    for index, path in enumerate(sequence.detections.values()):
+        found = read_detections(path)
+        for frame in (1, 2):
+            pixels, _ = project(sequence.rig.cameras[index], sequence.truth.position_m[frame])
+            for box in found.in_frame(frame).xyxy:
+                middle = (box[:2] + box[2:]) / 2 - 0.5
+                total += 1
+                # A box's middle is off the body's origin by a share of its size, jitter and drawing included.
+                near += np.linalg.norm(pixels - middle, axis=-1).min() < np.linalg.norm(box[2:] - box[:2])
+    # 64 drones, boxes of about 10 px: some half are found. A false alarm may be among them.
+    assert total > 15
+    assert near >= total - 2
+
+
+def test_mocap_markers_go_with_the_poses(sequence_folder):
+    truth = read_sequence(sequence_folder).truth
+    for drone in range(4):
+        markers = read_mocap_markers(sequence_folder / f"dron{drone + 1}_markers_25.csv")
+        assert markers.shape == (3, 4, 3)
+        # The cross is above the body, some centimetres to a decimetre from its origin.
+        offset = markers[1:] - truth.position_m[1:, drone, None]
+        assert np.all(np.linalg.norm(offset, axis=-1) < 0.35)
+        assert np.all(offset[..., 2] > 0)
+
+
+def test_the_record_says_how_to_make_it_again(sequence_folder):
+    record = json.loads((sequence_folder / "simulation.json").read_text())
+    assert {key: record[key] for key in ("frames", "scale", "seed", "masks", "onboard")} == {
+        "frames": 3, "scale": 0.1, "seed": 0, "masks": True, "onboard": True,
+    }  # fmt: skip
+    assert msgspec.convert(record["scenario"], type(PAIR)) == scenario(NAME)
+
+
+def test_the_record_knows_the_files_that_a_scenario_names(tmp_path):
+    path = tmp_path / "hover.csv"
+    rows = [f"{k / 10},0.0,0.0,1.5" for k in range(40)]
+    path.write_text("\n".join(["time_s,x_m,y_m,z_m", *rows]) + "\n")
+    recipe = replaced(
+        PAIR, {"drones": [{"flight": {"kind": "recording", "file": str(path)}}], "num_frames": 2}
+    )
+    folder = simulate(recipe, tmp_path, scale=0.04, jobs=1)
+    record = json.loads((folder / "simulation.json").read_text())
+    assert record["sha256"] == {str(path): hashlib.sha256(path.read_bytes()).hexdigest()}
+
+
+def test_parts_can_be_left_out(tmp_path):
+    folder = simulate(PAIR, tmp_path, num_frames=1, scale=0.04, jobs=1, masks=False, onboard=False)
+    names = set(contents(folder))
+    assert "cam1i_s.avi" in names
+    assert "dl_data/cam1i_s.csv" in names
+    assert not any("mask" in name or "_cam" in name or name.startswith("drone") for name in names)
+
+
+def test_another_rate_is_in_the_names_and_is_read(tmp_path):
+    folder = simulate(replaced(PAIR, {"fps": 12.5}), tmp_path, num_frames=2, scale=0.04, jobs=1)
+    assert {"dron1_pos_12.5.csv", "dron1_markers_12.5.csv", "dron1_cam_12.5.csv"} <= set(contents(folder))
+    sequence = read_sequence(folder)
+    assert sequence.videos["cam1i"].fps == 12.5
+    assert sequence.truth.time_s.tolist() == [0.0, 0.08]
+    assert np.isfinite(sequence.onboard["dron1"].position_m[1]).all()
 
 
 def test_fewer_frames_are_the_first_of_the_same_flight(sequence_folder):
@@ -86,6 +220,24 @@ def test_scale_keeps_the_world_and_shrinks_the_pictures():
     # A point's distance from the corner of the image, which is at -0.5, shrinks by the scale.
     np.testing.assert_allclose(small.rig.cameras.K[0, :2, 2] + 0.5, 0.3 * np.array([960.5, 540.5]))
     assert np.all(small.rig.cameras.image_size_wh % 2 == 0)
+
+
+def test_segments_change_no_truth_and_no_picture_before_the_codec(pair_folder, tmp_path):
+    """In one piece, the codec sees other neighbours; everything else is the same to the byte."""
+    whole = contents(simulate(PAIR, tmp_path, jobs=1, **TINY))
+    parts = contents(pair_folder)
+    assert whole.keys() == parts.keys()
+    assert {name for name in whole if whole[name] != parts[name]} == {
+        "cam1i_s.avi", "cam2i_s.avi", "dron1_cam_s.avi", "dron2_cam_s.avi",
+    }  # fmt: skip
+
+
+@pytest.mark.usefixtures("short_segments")
+def test_the_number_of_jobs_changes_no_byte(pair_folder, tmp_path):
+    assert contents(simulate(PAIR, tmp_path, jobs=2, **TINY)) == contents(pair_folder)
+
+
+# --- interruptions
 
 
 def interrupting(after_frames):
@@ -105,35 +257,171 @@ def interrupting(after_frames):
     return report
 
 
-def test_an_interrupted_call_goes_on_where_it_stopped(sequence_folder, tmp_path):
-    with pytest.raises(KeyboardInterrupt):
-        simulate(NAME, tmp_path, jobs=1, report=interrupting(8), **SMALL)
+@pytest.mark.usefixtures("short_segments")
+def test_an_interrupted_call_goes_on_with_the_segment_where_it_stopped(pair_folder, tmp_path):
     place = tmp_path / "Simulated_Data"
-    assert not (place / NAME).exists()
-    (unfinished,) = place.iterdir()
-    kept = {path.name: path.stat().st_mtime_ns for path in unfinished.glob("*.avi")}
-    assert set(kept) == {"cam1i_s.avi", "cam2i_s.avi"}
-    folder = simulate(NAME, tmp_path, jobs=1, **SMALL)
-    assert kept == {name: (folder / name).stat().st_mtime_ns for name in kept}, "they are not drawn again"
-    assert contents(folder) == contents(sequence_folder)
+    with pytest.raises(KeyboardInterrupt):
+        simulate(PAIR, tmp_path, jobs=1, report=interrupting(12), **TINY)
+    assert [path.name for path in place.iterdir()] == [f".{NAME}.unfinished"]
+    # Seven frames of one camera, and five of the next: its segments of frames 0-1 and 2-3.
+    kept = {path: path.stat().st_mtime_ns for path in place.rglob("video.avi")}
+    assert sorted("/".join(path.parts[-3:-1]) for path in kept) == [
+        *(f"cam1i/{start:06d}" for start in (0, 2, 4, 6)), *(f"cam2i/{start:06d}" for start in (0, 2)),
+    ]  # fmt: skip
+    assert not list(place.rglob("*.partial*"))
+    with pytest.raises(KeyboardInterrupt):
+        # What is there is counted at once.
+        simulate(PAIR, tmp_path, jobs=1, report=interrupting(12), **TINY)
+    assert kept == {path: path.stat().st_mtime_ns for path in place.rglob("video.avi")}
+    folder = simulate(PAIR, tmp_path, jobs=1, **TINY)
+    assert contents(folder) == contents(pair_folder)
+    assert beside(folder) == [NAME]
+
+
+@pytest.mark.usefixtures("short_segments")
+@pytest.mark.parametrize("step", ["join_videos", "join_archives", "write_onboard_calibration", "rmtree"])
+def test_an_interruption_after_the_last_frame_costs_no_frame(pair_folder, tmp_path, monkeypatch, step):
+    """While videos or masks are joined, tables written, segments cleared away."""
+    places = {
+        "join_videos": "psotrack.simulation.segments.join_videos",
+        "join_archives": "psotrack.simulation.segments.join_archives",
+        "write_onboard_calibration": "psotrack.simulation.generate.write_onboard_calibration",
+        "rmtree": "psotrack.simulation.unfinished.shutil.rmtree",
+    }
+
+    def interrupt(*arguments, **options):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(places[step], interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            simulate(PAIR, tmp_path, jobs=1, **TINY)
+    monkeypatch.setattr("psotrack.simulation.segments.CameraRenderer", interrupt)
+    folder = simulate(PAIR, tmp_path, jobs=1, **TINY)
+    assert contents(folder) == contents(pair_folder)
+    assert beside(folder) == [NAME]
+
+
+KILLED = """
+    import contextlib
+    import sys
+    from pathlib import Path
+    import msgspec
+    from psotrack.simulation import Scenario, segments, simulate
+
+    @contextlib.contextmanager
+    def report(description, total):
+        yield lambda steps: print("." * steps, end="", flush=True)
+
+    if __name__ == "__main__":
+        segments.SEGMENT_FRAMES = 2
+        recipe = msgspec.json.decode(sys.stdin.buffer.read(), type=Scenario)
+        settings = {"num_frames": 7, "scale": 0.04, "jobs": int(sys.argv[2]), "report": report}
+        simulate(recipe, Path(sys.argv[1]), **settings)
+"""
+
+
+@pytest.mark.usefixtures("short_segments")
+def test_killed_at_random_moments_it_comes_to_the_same_bytes(pair_folder, tmp_path):
+    (tmp_path / "run.py").write_text(textwrap.dedent(KILLED))
+    rng = np.random.default_rng(0)
+    place = tmp_path / "Simulated_Data"
+    made = [0]
+    for jobs in (2, 1):
+        process = subprocess.Popen(
+            [sys.executable, tmp_path / "run.py", tmp_path, str(jobs)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )  # fmt: skip
+        with process:
+            process.stdin.write(msgspec.json.encode(PAIR))
+            process.stdin.close()
+            # Some frames more than there were at its start, and some fraction of the next.
+            process.stdout.read(2 * made[-1] + int(rng.integers(4, 9)))
+            time.sleep(rng.uniform(0, 0.04))
+            process.send_signal(signal.SIGKILL)
+            errors = process.stderr.read()
+        assert process.returncode == -signal.SIGKILL, errors
+        assert [path.name for path in place.iterdir()] == [f".{NAME}.unfinished"]
+        made.append(len(list(place.rglob("[0-9]*/video.avi"))))
+    assert made[-1] > 1, "what was whole has been kept"
+    assert contents(simulate(PAIR, tmp_path, jobs=1, **TINY)) == contents(pair_folder)
     assert [path.name for path in place.iterdir()] == [NAME]
 
 
-def test_what_other_settings_left_unfinished_is_not_used(sequence_folder, tmp_path):
+@pytest.mark.usefixtures("short_segments")
+def test_a_death_between_the_two_moves_of_a_replacement_loses_nothing(pair_folder, tmp_path):
+    """With --force the old sequence steps aside first: whoever comes next puts it back."""
+    folder = tmp_path / "Simulated_Data" / NAME
+    aside = folder.with_name(f".{NAME}.old")
+    shutil.copytree(pair_folder, aside)
+    with pytest.raises(OutputError, match="expected no such file yet, found one"):
+        simulate(PAIR, tmp_path, jobs=1, seed=1, **TINY)
+    assert contents(folder) == contents(pair_folder)
+    assert beside(folder) == [NAME]
+
+
+@pytest.mark.usefixtures("short_segments")
+@pytest.mark.parametrize("other", [{"seed": 5}, {"num_frames": 6}])
+def test_what_other_settings_left_unfinished_is_not_used(pair_folder, tmp_path, other):
     with pytest.raises(KeyboardInterrupt):
-        simulate(NAME, tmp_path, jobs=1, seed=5, report=interrupting(4), **SMALL)
-    assert contents(simulate(NAME, tmp_path, jobs=1, **SMALL)) == contents(sequence_folder)
+        simulate(PAIR, tmp_path, jobs=1, report=interrupting(4), **{**TINY, **other})
+    assert contents(simulate(PAIR, tmp_path, jobs=1, **TINY)) == contents(pair_folder)
 
 
-def test_a_sequence_that_exists_is_left_alone_unless_forced(sequence_folder, tmp_path):
-    folder = shutil.copytree(sequence_folder, tmp_path / "Simulated_Data" / NAME)
+def test_two_calls_at_once_do_not_meet(tmp_path):
+    folder = tmp_path / "Simulated_Data" / NAME
+    with unfinished(folder, b"somebody else's", force=False) as growing:
+        (growing.folder / "half").write_text("")
+        message = r"S02_D4_A: expected to be the only one who writes it, found another simulation at work on it; wait"
+        with pytest.raises(OutputError, match=message):
+            simulate(PAIR, tmp_path, jobs=1, **TINY)
+        assert (growing.folder / "half").exists()
+    # A lock ends with whoever held it.
+    simulate(PAIR, tmp_path, num_frames=1, scale=0.04, jobs=1)
+    assert beside(folder) == [NAME]
+
+
+def test_a_full_disk_leaves_no_sequence_and_keeps_what_was_whole(pair_folder, tmp_path, monkeypatch):
+    """A file size limit stands for the full disk."""
+    script = textwrap.dedent(
+        """
+        import resource, sys
+        from pathlib import Path
+        import msgspec
+        from psotrack.errors import OutputError
+        from psotrack.simulation import Scenario, segments, simulate
+        segments.SEGMENT_FRAMES = 2
+        resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
+        recipe = msgspec.json.decode(sys.stdin.buffer.read(), type=Scenario)
+        try:
+            simulate(recipe, Path(sys.argv[1]), num_frames=7, scale=0.04, jobs=1)
+        except OutputError as error:
+            print(error)
+        """
+    )
+    # Segments of a few kilobytes fit, joined videos do not.
+    limit = str((pair_folder / "cam1i_s.avi").stat().st_size - 1000)
+    command = [sys.executable, "-c", script, tmp_path, limit]
+    done = subprocess.run(command, input=msgspec.json.encode(PAIR), capture_output=True, timeout=60)
+    assert b"expected to write" in done.stdout, done.stderr
+    assert done.stdout.count(b"\n") == 1
+    assert not (tmp_path / "Simulated_Data" / NAME).exists()
+    monkeypatch.setattr(segments, "SEGMENT_FRAMES", 2)
+    assert contents(simulate(PAIR, tmp_path, jobs=1, **TINY)) == contents(pair_folder)
+
+
+# --- refusals
+
+
+def test_a_sequence_that_exists_is_left_alone_unless_forced(pair_folder, tmp_path):
+    folder = shutil.copytree(pair_folder, tmp_path / "Simulated_Data" / NAME)
     before = contents(folder)
     with pytest.raises(OutputError, match=r"S02_D4_A: expected no such file yet, found one; pass --force"):
-        simulate(NAME, tmp_path, jobs=1, **SMALL)
+        simulate(PAIR, tmp_path, jobs=1, **TINY)
     with pytest.raises(KeyboardInterrupt):
-        simulate(NAME, tmp_path, jobs=1, seed=1, force=True, report=interrupting(2), **SMALL)
+        simulate(PAIR, tmp_path, jobs=1, seed=1, force=True, report=interrupting(2), **TINY)
     assert contents(folder) == before, "until the new one is whole, the old one stays"
-    simulate(NAME, tmp_path, jobs=1, seed=1, force=True, **SMALL)
+    simulate(PAIR, tmp_path, jobs=1, seed=1, force=True, **TINY)
     after = contents(folder)
     assert after.keys() == before.keys()
     assert after["dron1_pos_25.csv"] != before["dron1_pos_25.csv"]
@@ -144,7 +432,7 @@ def test_a_sequence_that_exists_is_left_alone_unless_forced(sequence_folder, tmp
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"name": "S99"}, r"^scenario: expected one of .*S02_D4_A.*, found S99$"),
+        ({"scenario": "S99"}, r"^scenario: expected one of .*S02_D4_A.*, found S99$"),
         ({"num_frames": 0}, r"^frames: expected 1 to 250, as many as S02_D4_A has, found 0$"),
         ({"num_frames": -3}, r"^frames: .* found -3$"),
         ({"num_frames": 251}, r"^frames: .* found 251$"),
@@ -158,7 +446,7 @@ def test_a_sequence_that_exists_is_left_alone_unless_forced(sequence_folder, tmp
 )
 def test_settings_that_make_no_sense_are_refused_before_anything_is_written(settings, message, tmp_path):
     with pytest.raises(SettingsError, match=message):
-        simulate(**{"name": NAME, "root": tmp_path, **SMALL, **settings})
+        simulate(**{"scenario": NAME, "root": tmp_path, **SMALL, **settings})
     assert not list(tmp_path.iterdir())
 
 
@@ -168,7 +456,14 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
         simulate(NAME, tmp_path, jobs=1, **SMALL)
 
 
-def test_progress_counts_every_frame(tmp_path):
+def test_a_file_of_the_scenario_that_is_missing_is_named(tmp_path):
+    recipe = replaced(PAIR, {"drones[0].model": {"file": str(tmp_path / "none.ply")}})
+    with pytest.raises(InputError, match=r"none\.ply"):
+        simulate(recipe, tmp_path, **TINY)
+    assert not list(tmp_path.iterdir())
+
+
+def test_progress_counts_every_frame_of_every_video(tmp_path):
     counted = []
 
     @contextlib.contextmanager
@@ -176,6 +471,6 @@ def test_progress_counts_every_frame(tmp_path):
         counted.append(total)
         yield lambda steps: counted.append(-steps)
 
-    simulate(NAME, tmp_path, num_frames=1, scale=0.05, jobs=1, report=report)
-    assert counted[0] == 8
+    simulate(PAIR, tmp_path, num_frames=2, scale=0.05, jobs=1, report=report)
+    assert counted[0] == 2 * (2 + 2)
     assert sum(counted) == 0

@@ -3,13 +3,15 @@
 from dataclasses import replace
 
 import cv2
-import msgspec
 import numpy as np
 import pytest
+from placed_drones import cube, pixel_of, ray_point, straight_flight, with_drones
 
 from psotrack.cameras import camera, look_at, project
-from psotrack.simulation import CameraRenderer, build, drones, raster, rooms, scenario, sensor
-from psotrack.simulation.flights import Flight
+from psotrack.simulation import CameraRenderer, build, scenario
+from psotrack.simulation.imaging import raster, sensor
+from psotrack.simulation.labels.masks import drone_masks
+from psotrack.simulation.world import drones, rooms
 
 S02 = scenario("S02_D4_A")
 
@@ -24,40 +26,8 @@ def renderer(scene):
     return CameraRenderer(scene, 0)
 
 
-def straight_flight(position_m, velocity_m_s=(0.0, 0.0, 0.0)):
-    """A flight through a point at time 0 at some speed: the middle of a very slow, very long swing."""
-    angular = 1e-3
-    velocity = np.array([velocity_m_s], float)
-    zero = np.zeros((1, 3))
-    return Flight(
-        np.array(position_m, float), velocity / angular, np.array([angular]), zero, (0.0, 0.0, 0.0, 0.0)
-    )
-
-
-def with_drones(scene, *placed):
-    """The scene with only these drones: (model, flight, paint) each."""
-    recipe = msgspec.structs.replace(
-        S02, drones=tuple(msgspec.structs.replace(S02.drones[0], paint_bgr=paint) for _, _, paint in placed)
-    )
-    models, flights = tuple(model for model, _, _ in placed), tuple(flight for _, flight, _ in placed)
-    return replace(scene, scenario=recipe, models=models, flights=flights)
-
-
-def cube(side_m):
-    """A model whose silhouette's middle is its origin: all paint, and rotors too small to be seen."""
-    triangles = drones.box((0.0, 0.0, 0.0), (side_m, side_m, side_m))
-    return drones.DroneModel(triangles, np.ones(len(triangles)), np.zeros((1, 3)), 1e-6)
-
-
-def ray_point(scene, index, pixel, depth_m):
-    """The world point that camera `index` sees in a pixel at a depth."""
-    cam = scene.rig.cameras[index]
-    R, t = cam.T_cam_world[:3, :3], cam.T_cam_world[:3, 3]
-    return R.T @ (depth_m * np.linalg.inv(cam.K) @ [*pixel, 1.0] - t)
-
-
-def pixel_of(scene, index, point_m):
-    return project(scene.rig.cameras[index], np.asarray(point_m, float))[0]
+def masks(one, frame):
+    return drone_masks(one.scene, one.cam, one.backdrop.depth_m, frame)
 
 
 # --- the rasteriser behind our camera convention
@@ -178,13 +148,14 @@ def test_a_drone_of_known_centre_is_drawn_at_its_projection(scene, index, veloci
 @pytest.mark.parametrize("index", [0, 4, 7])
 def test_silhouettes_are_about_their_projected_origins(scene, index, frame):
     one = CameraRenderer(scene, index)
-    mask = one.drone_mask(frame)
+    mask = masks(one, frame)
     origins = project(scene.rig.cameras[index], scene.positions_m(frame + 1)[-1])
     seen = 0
     for drone, (pixel, depth_m) in enumerate(zip(*origins, strict=True)):
         rows, columns = np.nonzero(mask == drone + 1)
         radius_px = (
-            scene.scenario.cameras[index].focal_length_px
+            scene.rig.cameras.K[index, 0, 0]
+            / scene.scale
             * scene.scale
             * scene.models[drone].radius_m
             / depth_m
@@ -202,7 +173,7 @@ def test_silhouettes_are_about_their_projected_origins(scene, index, frame):
 def test_frames_differ_from_the_empty_room_in_the_masks_and_the_shadows_only(renderer):
     frame = renderer.clean_frame(60).astype(int)
     changed = np.abs(frame - sensor.develop(renderer.backdrop.light)).max(axis=-1) > 2
-    mask = renderer.drone_mask(60) > 0
+    mask = masks(renderer, 60) > 0
     # Blur of the lens and of motion reach some pixels beyond the mask at mid-exposure.
     near = cv2.dilate(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
     assert not (changed & ~near & ~renderer.backdrop.floor).any()
@@ -217,10 +188,10 @@ def test_near_hides_far_whatever_their_order(scene):
     a, b = CameraRenderer(with_drones(scene, near, far), 0), CameraRenderer(with_drones(scene, far, near), 0)
     alone = CameraRenderer(with_drones(scene, near), 0)
     x, y = (int(side) for side in pixel)
-    assert a.drone_mask(0)[y, x] == 1
-    assert b.drone_mask(0)[y, x] == 2
+    assert masks(a, 0)[y, x] == 1
+    assert masks(b, 0)[y, x] == 2
     # The far cube's silhouette lies wholly within the near one's: nothing of it is seen.
-    assert not (a.drone_mask(0) == 2).any()
+    assert not (masks(a, 0) == 2).any()
     window = np.s_[y - 8 : y + 9, x - 8 : x + 9]
     np.testing.assert_array_equal(a.clean_frame(0)[window], b.clean_frame(0)[window])
     np.testing.assert_array_equal(a.clean_frame(0)[window], alone.clean_frame(0)[window])
@@ -235,7 +206,7 @@ def test_a_pillar_hides_a_drone_behind_it(scene):
     for behind_m, visible in ((0.8, False), (-0.8, True)):
         flight = straight_flight(ray_point(scene, 3, pixel, depth_m + behind_m))
         one = CameraRenderer(with_drones(scene, (small, flight, (0.0, 0.0, 0.0))), 3)
-        assert one.drone_mask(0).any() == visible
+        assert masks(one, 0).any() == visible
         x, y = pixel.astype(int)
         darker = sensor.develop(one.backdrop.light)[y, x].astype(int) - one.clean_frame(0)[y, x]
         assert (darker.max() > 20) == visible
@@ -243,7 +214,7 @@ def test_a_pillar_hides_a_drone_behind_it(scene):
 
 def test_rotor_discs_let_the_backdrop_through(scene):
     bare = cube(0.02)
-    disc = replace(bare, rotor_radius_m=0.3)
+    disc = replace(bare, rotor_radii_m=np.array([0.3]))
     centre = np.array([0.0, 0.0, 1.2])
     one = CameraRenderer(with_drones(scene, (disc, straight_flight(centre), (0.0, 0.0, 0.0))), 0)
     x, y = pixel_of(scene, 0, centre + np.array([0.1, 0.1, 0.0])).round().astype(int)
@@ -272,7 +243,7 @@ def test_a_drone_under_a_lamp_has_its_darkest_shadow_at_its_foot(scene):
 
 
 def test_noise_is_fair_and_grows_with_brightness():
-    eye = sensor.Sensor(0, 0, (120, 160))
+    eye = sensor.Sensor(S02.imaging, 0, 0, (120, 160))
     sigmas = []
     for level in (20, 120, 220):
         image = np.full((120, 160, 3), level, np.uint8)
@@ -289,7 +260,7 @@ def test_noise_is_new_in_every_frame_and_every_camera_and_the_same_again():
     image = np.full((60, 80, 3), 120, np.uint8)
 
     def expose(seed, index, frame):
-        return sensor.Sensor(seed, index, (60, 80)).expose(image, frame, 0.0).astype(float)
+        return sensor.Sensor(S02.imaging, seed, index, (60, 80)).expose(image, frame, 0.0).astype(float)
 
     np.testing.assert_array_equal(expose(1, 2, 3), expose(1, 2, 3))
     for other in ((1, 2, 4), (1, 3, 3), (2, 2, 3)):
@@ -314,7 +285,7 @@ def test_models_are_closed_face_outwards_and_have_sizes_of_drones(name):
     np.testing.assert_allclose(np.cross(b - a, c - a).sum(axis=0), 0.0, atol=1e-9)
     assert np.einsum("fi,fi->", a, np.cross(b, c)) > 0
     assert len(model.rotor_centres_m) >= 4
-    span = np.ptp(model.rotor_centres_m, axis=0).max() + 2 * model.rotor_radius_m
-    assert 0.35 <= span <= 0.6
+    span = np.ptp(model.rotor_centres_m, axis=0).max() + 2 * model.rotor_radii_m.max()
+    assert 0.3 <= span <= 0.85
     assert np.linalg.norm(model.triangles_m, axis=-1).max() <= model.radius_m
     assert np.all((model.paint >= 0) & (model.paint <= 1))

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
-from psotrack.video import VideoInfo, VideoWriter, probe, read_frames
+from psotrack.video import VideoInfo, VideoWriter, join_videos, probe, read_frames
 
 WIDTH, HEIGHT = 96, 64
 
@@ -248,3 +248,117 @@ def test_a_full_disk_is_an_error_and_costs_nothing(tmp_path):
     assert "is the disk full?" in done.stdout
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("missing", [1, 100, 200])
+def test_an_index_that_is_cut_off_is_noticed(tmp_path, missing):
+    """All frames are there then, and can be counted; the index comes last. Measured: 200 frames take 3200 bytes."""
+    whole = write(tmp_path / "whole.avi", [grey(level) for level in range(200)]).stat().st_size
+    script = textwrap.dedent(
+        """
+        import resource, sys
+        from pathlib import Path
+        import numpy as np
+        from psotrack.errors import OutputError
+        from psotrack.video import VideoWriter
+        resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
+        try:
+            with VideoWriter(Path(sys.argv[1]), 25.0, (96, 64)) as writer:
+                for level in range(200):
+                    writer.write(np.full((64, 96, 3), level, np.uint8))
+        except OutputError as error:
+            print(error)
+        """
+    )
+    command = [sys.executable, "-c", script, tmp_path / "a.avi", str(whole - missing)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert "a.avi: expected to write 200 frames, found their index cut off; is the disk full?" in done.stdout
+    assert not (tmp_path / "a.avi").exists()
+
+
+# --- joining
+
+
+def key_frames(path: Path) -> list[bool]:
+    """Which frames a player may start at, as the index of the container (chunk `idx1`) has them."""
+    data = path.read_bytes()
+    start = data.rfind(b"idx1")
+    entries = np.frombuffer(
+        data, "<u4", int.from_bytes(data[start + 4 : start + 8], "little") // 4, start + 8
+    )
+    return (entries.reshape(-1, 4)[:, 1] & 0x10 > 0).tolist()
+
+
+def moving(num_frames: int, start: int = 0) -> list[np.ndarray]:
+    """Frames of a picture that moves: nothing of one is the same in the next."""
+    large = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (64, 400, 3), np.uint8), (0, 0), 2)
+    return [large[:, k : k + WIDTH].copy() for k in range(start, start + num_frames)]
+
+
+@pytest.mark.parametrize("lengths", [(5,), (24, 24, 7), (1, 13, 30, 2)])
+def test_a_joined_video_decodes_as_its_parts_do(tmp_path, lengths, capfd):
+    starts = np.cumsum([0, *lengths])
+    parts = [
+        write(tmp_path / f"{i}.avi", moving(length, start), 29.97)
+        for i, (length, start) in enumerate(zip(lengths, starts, strict=False))
+    ]
+    join_videos(tmp_path / "joined.avi", parts)
+    joined = probe(tmp_path / "joined.avi")
+    assert joined == replace(probe(parts[0]), path=joined.path, num_frames=sum(lengths))
+    expected = [frame for part in parts for frame in read_frames(probe(part))]
+    np.testing.assert_array_equal(list(read_frames(joined)), expected)
+    # Where a player may start is where the encoder said so.
+    assert key_frames(joined.path) == [key for part in parts for key in key_frames(part)]
+    capture = cv2.VideoCapture(str(joined.path), cv2.CAP_FFMPEG)
+    for frame in np.random.default_rng(0).permutation(sum(lengths))[:8].tolist():
+        capture.set(cv2.CAP_PROP_POS_FRAMES, frame)
+        np.testing.assert_array_equal(capture.read()[1], expected[frame])
+    capture.release()
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("fps", "size_wh", "expected", "found"),
+    [
+        (24.0, (WIDTH, HEIGHT), "96 x 64 pixels at 25 Hz as in 0.avi", "96 x 64 pixels at 24 Hz"),
+        (25.0, (48, 32), "96 x 64 pixels at 25 Hz as in 0.avi", "48 x 32 pixels at 25 Hz"),
+    ],
+)
+def test_parts_that_differ_are_not_joined(tmp_path, fps, size_wh, expected, found):
+    first = write(tmp_path / "0.avi", noise(2))
+    with VideoWriter(tmp_path / "1.avi", fps, size_wh) as writer:
+        writer.write(np.zeros((size_wh[1], size_wh[0], 3), np.uint8))
+    with pytest.raises(InputError, match=rf"1\.avi: expected {expected}, found {found}$"):
+        join_videos(tmp_path / "joined.avi", [first, tmp_path / "1.avi"])
+    assert not (tmp_path / "joined.avi").exists()
+
+
+def test_a_part_that_ends_early_is_named(tmp_path):
+    parts = [write(tmp_path / f"{i}.avi", noise(20)) for i in range(2)]
+    parts[1].write_bytes(parts[1].read_bytes()[:60_000])
+    with pytest.raises(InputError, match=r"1\.avi: expected 20 frames, found that only \d+ can be decoded"):
+        join_videos(tmp_path / "joined.avi", parts)
+    assert sorted(tmp_path.iterdir()) == parts
+
+
+def test_a_disk_that_is_full_while_joining_costs_nothing(tmp_path):
+    parts = [write(tmp_path / f"{i}.avi", noise(20)) for i in range(2)]
+    size = parts[0].stat().st_size
+    script = textwrap.dedent(
+        """
+        import resource, sys
+        from pathlib import Path
+        from psotrack.errors import OutputError
+        from psotrack.video import join_videos
+        target, limit, *parts = sys.argv[1:]
+        resource.setrlimit(resource.RLIMIT_FSIZE, (int(limit), int(limit)))
+        try:
+            join_videos(Path(target), [Path(part) for part in parts])
+        except OutputError as error:
+            print(error)
+        """
+    )
+    command = [sys.executable, "-c", script, tmp_path / "joined.avi", str(size * 3 // 2), *parts]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert "joined.avi: expected to write 40 frames, found" in done.stdout, done.stderr
+    assert sorted(tmp_path.iterdir()) == parts

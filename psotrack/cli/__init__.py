@@ -11,9 +11,14 @@ import sys
 import click
 
 from psotrack.cli.commands import cli
+from psotrack.cli.fly import fly
+from psotrack.cli.simulate import simulate
 from psotrack.errors import PsotrackError
 
 __all__ = ["cli", "main"]
+
+cli.add_command(simulate)
+cli.add_command(fly)
 
 
 def main() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import sys
 from pathlib import Path
@@ -12,6 +11,7 @@ import click
 import platformdirs
 
 from psotrack import __version__
+from psotrack.cli.answers import answer, report_to, say, write_json
 from psotrack.cli.options import (
     CACHE,
     CAMERAS,
@@ -26,8 +26,7 @@ from psotrack.cli.options import (
     silhouette_options,
 )
 from psotrack.errors import SettingsError
-from psotrack.files import refuse_to_overwrite, written_whole
-from psotrack.progress import Report, silent, terminal
+from psotrack.files import refuse_to_overwrite
 from psotrack.settings import Score, SwarmKind, TrackSettings
 from psotrack.silhouette_store import SilhouetteSettings
 
@@ -68,56 +67,9 @@ def info(sequence: Path, force: bool, json_path: Path | None) -> None:
     from psotrack.datasets.dpjait import read_sequence
 
     content = contents(read_sequence(sequence))
-    _answer(json_path, content, force)
+    answer(json_path, content, force)
     if json_path != Path("-"):
         Console().print(render(content))
-
-
-@cli.command()
-@click.argument("name")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="The data's root folder.")
-@click.option("--frames", "num_frames", type=int, metavar="N", help="First N frames only.  [default: all]")
-@click.option("--scale", type=float, default=1.0, show_default=True, help="Of the image size.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Of flights and noise.")
-@JOBS
-@FORCE
-@QUIET
-@JSON
-def simulate(
-    name: str,
-    out: Path,
-    num_frames: int | None,
-    scale: float,
-    seed: int,
-    jobs: int | None,
-    force: bool,
-    quiet: bool,
-    json_path: Path | None,
-) -> None:
-    """Make a sequence of the dataset's simulated half: videos, calibration and truth.
-
-    Writes OUT/Simulated_Data/NAME. The same seed makes the same flights and the same pixels; an interrupted call goes
-    on where it was.
-
-    \b
-    Examples:
-      psotrack simulate S02_D4_A --out data
-      psotrack simulate S02_D4_A --out small --scale 0.5 --frames 60 --seed 7
-    """
-    from psotrack.simulation import simulate as make
-
-    folder = make(
-        name,
-        out,
-        num_frames=num_frames,
-        scale=scale,
-        seed=seed,
-        force=force,
-        jobs=jobs,
-        report=_report(quiet),
-    )
-    _answer(json_path, {"sequence": str(folder)}, force)
-    _say(quiet, json_path, f"{folder}")
 
 
 @cli.command()
@@ -159,18 +111,18 @@ def silhouettes(
         SilhouetteSettings(**settings),
         cache=where,
         jobs=jobs,
-        report=_report(quiet),
+        report=report_to(quiet),
     )
-    answer = {
+    content = {
         "cache": str(where),
         "keys": dict(stored.keys),
         "frames": stored.num_frames,
         "shape": list(stored.shape),
         "seconds": dict(stored.seconds),
     }
-    _answer(json_path, answer, force)
+    answer(json_path, content, force)
     made = "made" if any(stored.seconds.values()) else "already there"
-    _say(quiet, json_path, f"{len(stored.cameras)} cameras, {stored.num_frames} frames: {made}, in {where}")
+    say(quiet, json_path, f"{len(stored.cameras)} cameras, {stored.num_frames} frames: {made}, in {where}")
 
 
 @cli.command()
@@ -276,14 +228,14 @@ def track(
         chosen,
         cache=_cache_folder(cache),
         jobs=jobs,
-        report=_report(quiet),
+        report=report_to(quiet),
     )
     write_trajectories(out, tracked.trajectories, force=force)
-    _write_json(record_path, tracked.record)
-    _answer(json_path, tracked.record, force)
+    write_json(record_path, tracked.record)
+    answer(json_path, tracked.record, force)
     seen = tracked.trajectories.seen.mean()
     seconds = tracked.record["seconds"]
-    _say(
+    say(
         quiet,
         json_path,
         f"{out}: {tracked.trajectories.num_drones} drones, {tracked.trajectories.num_frames} frames, "
@@ -328,7 +280,7 @@ def evaluate(
         raise InputError(sequence, expected="a reference to compare with", found="none")
     estimate = read_trajectories(tracks, fps=recording.fps)
     evaluation = compare(estimate, recording.truth)
-    _answer(json_path, evaluation.to_dict(), force)
+    answer(json_path, evaluation.to_dict(), force)
     if plot is not None:
         picture = plot if plot.name else tracks.with_suffix(".png")
         plots.save_overview(picture, estimate, recording.truth, force=force)
@@ -355,7 +307,7 @@ def demo(out: Path, seed: int, jobs: int | None, force: bool, quiet: bool) -> No
 
     from psotrack.demo import run
 
-    result = run(out, seed=seed, jobs=jobs, force=force, report=_report(quiet))
+    result = run(out, seed=seed, jobs=jobs, force=force, report=report_to(quiet))
     if not quiet:
         console = Console()
         console.print(result.errors)
@@ -371,26 +323,3 @@ def _usable(folder: Path, cameras: str | None, num_frames: int | None) -> Any:
 
 def _cache_folder(chosen: Path | None) -> Path:
     return chosen or platformdirs.user_cache_path("psotrack") / "silhouettes"
-
-
-def _report(quiet: bool) -> Report:
-    return silent if quiet else terminal
-
-
-def _say(quiet: bool, json_path: Path | None, sentence: str) -> None:
-    if not quiet and json_path != Path("-"):
-        click.echo(sentence)
-
-
-def _answer(json_path: Path | None, answer: Any, force: bool) -> None:
-    """The answer for programs: on stdout, or in a file that was not there."""
-    if json_path == Path("-"):
-        click.echo(json.dumps(answer, indent=2, allow_nan=False))
-    elif json_path is not None:
-        refuse_to_overwrite(json_path, force)
-        _write_json(json_path, answer)
-
-
-def _write_json(path: Path, answer: Any) -> None:
-    with written_whole(path) as temporary:
-        temporary.write_text(json.dumps(answer, indent=2, allow_nan=False) + "\n", encoding="utf-8")

@@ -88,9 +88,9 @@ def write_poses(path: Path, position_m: Positions, orientation_wxyz: Orientation
     write_rows(path, [header, placeholder, *([frame, *poses[frame]] for frame in range(1, len(poses)))])
 
 
-def pose_file(number: int) -> str:
-    """The name of the file of drone `number`, 1-based."""
-    return f"dron{number}_pos_25.csv"
+def pose_file(number: int, fps: float = 25.0) -> str:
+    """The name of the file of drone `number`, 1-based, with a pose per video frame."""
+    return f"dron{number}_pos_{fps:g}.csv"
 
 
 def _euler_rad(orientation_wxyz: Orientations) -> Positions:

@@ -17,13 +17,27 @@ from pathlib import Path
 
 import numpy as np
 
+from psotrack.datasets._archives import join_archives
 from psotrack.datasets._calibration import camera_key, read_calibration, read_names, write_calibration
 from psotrack.datasets._marker_corners import read_marker_corners, write_marker_corners
+from psotrack.datasets._masks import MASKS, Masks, MaskWriter, read_masks
+from psotrack.datasets._mocap_markers import mocap_markers_file, read_mocap_markers, write_mocap_markers
+from psotrack.datasets._onboard import (
+    ONBOARD_CALIBRATION,
+    check_rate,
+    is_onboard_video,
+    numbered_files,
+    onboard_pose_file,
+    onboard_video_file,
+    read_onboard,
+    read_onboard_calibration,
+    write_onboard_calibration,
+)
 from psotrack.datasets._poses import pose_file, read_poses, write_poses
 from psotrack.detections import Detections, read_detections, write_detections
 from psotrack.errors import InputError
 from psotrack.mocap import body_trajectories, read_c3d
-from psotrack.sequence import Sequence
+from psotrack.sequence import OnboardVideo, Sequence
 from psotrack.trajectories import Trajectories
 from psotrack.video import VideoInfo, probe
 
@@ -31,16 +45,30 @@ __all__ = [
     "CALIBRATION",
     "DETECTIONS",
     "MARKER_CORNERS",
+    "MASKS",
+    "ONBOARD_CALIBRATION",
     "Detections",
+    "MaskWriter",
+    "Masks",
+    "join_archives",
+    "mocap_markers_file",
+    "onboard_pose_file",
+    "onboard_video_file",
     "pose_file",
     "read_calibration",
     "read_detections",
     "read_marker_corners",
+    "read_masks",
+    "read_mocap_markers",
+    "read_onboard",
+    "read_onboard_calibration",
     "read_poses",
     "read_sequence",
     "write_calibration",
     "write_detections",
     "write_marker_corners",
+    "write_mocap_markers",
+    "write_onboard_calibration",
     "write_poses",
 ]
 
@@ -51,14 +79,15 @@ MARKER_CORNERS = "aruco_corners.csv"
 
 _logger = logging.getLogger(__name__)
 _VIDEO_SUFFIXES = {".avi", ".mp4"}
-_POSE_FILE = re.compile(r"drone?_?(?P<number>\d+)_pos_(?P<rate>\d+)\.csv", re.IGNORECASE)
+_POSE_FILE = re.compile(r"drone?_?(?P<number>\d+)_pos_(?P<rate>\d+(?:\.\d+)?)\.csv", re.IGNORECASE)
 
 
 def read_sequence(folder: Path | str) -> Sequence:
     """The sequence in a folder of the dataset, simulated or real.
 
     Cameras may be without video: they get the image size that most videos have. Videos may differ in length;
-    the truth is as long as the longest. `Sequence.usable` is stricter.
+    the truth is as long as the longest. `Sequence.usable` is stricter. Videos of drones' own cameras that cannot be
+    used are left out with a warning: how the dataset publishes them is not known, and tracking does without.
 
     Raises:
         InputError: the folder is none of the dataset, or one of its files cannot be used.
@@ -78,6 +107,7 @@ def read_sequence(folder: Path | str) -> Sequence:
         videos=videos,
         truth=_truth(files, videos),
         detections=detections or None,
+        onboard=_onboard(folder),
     )
 
 
@@ -94,8 +124,17 @@ def _check_folder(folder: Path) -> None:
         raise InputError(folder, expected=f"the file {CALIBRATION} in it", found="none", remedy=remedy)
 
 
+def _onboard(folder: Path) -> Mapping[str, OnboardVideo] | None:
+    try:
+        return read_onboard(folder) or None
+    except InputError as error:
+        _logger.warning("left out, the drones' own cameras: %s", error)
+        return None
+
+
 def _videos(folder: Path, files: Ordered[Path], names: Ordered[str]) -> dict[str, VideoInfo]:
-    candidates = [path for path in files if path.suffix.lower() in _VIDEO_SUFFIXES]
+    videos = [path for path in files if path.suffix.lower() in _VIDEO_SUFFIXES]
+    candidates = [path for path in videos if not is_onboard_video(path)]
     found = _by_camera(candidates, names)
     if not found:
         raise InputError(
@@ -147,21 +186,10 @@ def _truth(files: Ordered[Path], videos: Mapping[str, VideoInfo]) -> Trajectorie
 
 def _pose_files(files: Ordered[Path], video: VideoInfo) -> dict[int, Path]:
     """The pose files by the number of the drone."""
-    found: dict[int, Path] = {}
-    for path in files:
-        match = _POSE_FILE.fullmatch(path.name)
-        if match is None:
-            continue
-        number = int(match["number"])
-        if number in found:
-            raise InputError(path, expected="one file per drone", found=f"{found[number].name} as well")
-        # 0.1 %: as exact as containers hold a rate. More would drift.
-        if abs(int(match["rate"]) - video.fps) > 1e-3 * video.fps:
-            raise InputError(
-                path, expected=f"poses at the {video.fps:g} Hz of the video", found=f"{match['rate']} Hz"
-            )
-        found[number] = path
-    return dict(sorted(found.items()))
+    found = numbered_files(files, _POSE_FILE)
+    for path in found.values():
+        check_rate(path, _POSE_FILE, video.fps)
+    return found
 
 
 def _simulated_truth(poses: Mapping[int, Path], fps: float, num_frames: int) -> Trajectories:

@@ -2,166 +2,196 @@
 
 from __future__ import annotations
 
+import hashlib
+import itertools
 import logging
 import os
-import shutil
-from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import msgspec
+import numpy as np
 
 from psotrack import __version__
 from psotrack.datasets.dpjait import (
     CALIBRATION,
     MARKER_CORNERS,
+    ONBOARD_CALIBRATION,
+    mocap_markers_file,
+    onboard_pose_file,
     pose_file,
     write_calibration,
     write_marker_corners,
+    write_mocap_markers,
+    write_onboard_calibration,
     write_poses,
 )
-from psotrack.errors import OutputError, SettingsError
-from psotrack.files import refuse_to_overwrite, written_whole
+from psotrack.errors import InputError, SettingsError
 from psotrack.processes import map_in_processes
-from psotrack.progress import Advance, Report, silent
-from psotrack.simulation.renderer import CameraRenderer
-from psotrack.simulation.scenarios import Scenario, scenario
+from psotrack.progress import Report, silent
+from psotrack.simulation import scenarios
+from psotrack.simulation.imaging.onboard import intrinsics, onboard_poses
+from psotrack.simulation.labels.mocap import mocap_markers_m
+from psotrack.simulation.scenarios import Mesh, Recording, Scenario
 from psotrack.simulation.scene import Scene, build
-from psotrack.video import VideoWriter
+from psotrack.simulation.segments import Stream, Work, draw, join, join_masks, segment_folder, segments
+from psotrack.simulation.unfinished import Unfinished, unfinished
 
-#: Settings that the videos in an unfinished folder were made with.
-_RECORD = "simulation.json"
+#: Pieces of work per process: few, because each starts with a camera's backdrop, and enough to end together.
+_PIECES_PER_JOB = 4
 
 _logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class _CameraTask:
-    """The video of one camera: what a worker needs to know."""
-
-    scenario: Scenario
-    seed: int
-    scale: float
-    camera_index: int
-    num_frames: int
-    path: Path
-
-
 def simulate(
-    name: str,
+    scenario: str | Scenario,
     root: Path,
     *,
     num_frames: int | None = None,
     scale: float = 1.0,
     seed: int = 0,
+    masks: bool = True,
+    onboard: bool = True,
     force: bool = False,
     jobs: int | None = None,
     report: Report = silent,
 ) -> Path:
     """Simulate a sequence into ROOT/Simulated_Data/NAME, as the published archive would hold it.
 
-    The same name, scale and seed give the same truth and, before the codec, the same pixels, whatever the
-    number of jobs; fewer frames are the first of the same flight. Work goes on in a hidden folder beside the
-    sequence: a call that was interrupted finds there the cameras that it had finished.
+    The same scenario, scale and seed give the same files on one machine, whatever the number of jobs; fewer frames
+    are the first of the same flight. Work goes on in a hidden folder beside the sequence, which becomes the sequence
+    when all of it is there: a call that was interrupted, killed even, finds there what it had finished.
 
     Args:
-        name: of a scenario.
+        scenario: a record, or the name of one that comes with the package.
         root: folder of the dataset.
         num_frames: the first so many frames; None for all of the scenario.
         scale: of the images, 1 is full size.
         seed: varies flights and noise.
+        masks: whether to write `drone_masks.zip`.
+        onboard: whether to make the videos of drones' own cameras, where the scenario has such.
         force: whether to replace a sequence that is there.
-        jobs: cameras that are drawn at once; None for one per processor.
-        report: told of every frame.
+        jobs: processes that draw at once; None for one per processor.
+        report: told of every frame of every video.
 
     Returns:
         The sequence's folder.
 
     Raises:
         SettingsError: there is no such scenario, or a number makes no sense.
-        OutputError: the sequence exists and `force` is not set, or it cannot be written.
+        InputError: a mesh or a recording of the scenario cannot be used.
+        OutputError: the sequence exists and `force` is not set, another call is at work on it, or it cannot be
+            written.
     """
-    recipe = scenario(name)
-    frames = recipe.num_frames if num_frames is None else num_frames
-    if not 0 < frames <= recipe.num_frames:
-        raise SettingsError(
-            "frames", expected=f"1 to {recipe.num_frames}, as many as {name} has", found=f"{frames}"
-        )
+    recipe = scenarios.scenario(scenario) if isinstance(scenario, str) else scenario
+    frames = scenarios.frames_of(recipe, num_frames)
     if jobs is not None and jobs < 1:
         raise SettingsError("jobs", expected="1 or more", found=f"{jobs}")
     scene = build(recipe, scale=scale, seed=seed)
-    folder = Path(root) / "Simulated_Data" / name
-    refuse_to_overwrite(folder, force)
-    unfinished = _unfinished_folder(folder, _record(recipe, frames, scale, seed))
-    _write_videos(scene, unfinished, frames, jobs or os.cpu_count() or 1, report)
-    _write_tables(scene, unfinished, frames)
-    with written_whole(folder) as temporary:
-        os.replace(unfinished, temporary)
+    folder = Path(root) / "Simulated_Data" / recipe.name
+    onboard = onboard and recipe.onboard is not None
+    record = _record(scene, frames, masks, onboard)
+    with unfinished(folder, record, force) as growing:
+        if not growing.whole:
+            _write_streams(scene, growing, frames, masks, onboard, jobs or os.cpu_count() or 1, report)
+            _write_tables(scene, growing.folder, frames)
+            if onboard:
+                _write_onboard_tables(scene, growing.folder, frames)
+        growing.finish()
     return folder
 
 
-def video_file(camera_name: str) -> str:
-    """The name of a camera's video."""
-    return f"{camera_name}_s.avi"
-
-
-def _record(recipe: Scenario, num_frames: int, scale: float, seed: int) -> bytes:
+def _record(scene: Scene, num_frames: int, masks: bool, onboard: bool) -> bytes:
+    """Everything that decides what the files will be."""
     settings = {
         "version": __version__,
+        "libraries": {"numpy": np.__version__, "opencv": cv2.__version__},
         "frames": num_frames,
-        "scale": scale,
-        "seed": seed,
-        "scenario": recipe,
+        "scale": scene.scale,
+        "seed": scene.seed,
+        "masks": masks,
+        "onboard": onboard,
+        "sha256": _digests(scene.scenario),
+        "scenario": scene.scenario,
     }
     return msgspec.json.format(msgspec.json.encode(settings), indent=1)
 
 
-def _unfinished_folder(folder: Path, record: bytes) -> Path:
-    """The hidden folder beside `folder`, with what an earlier call of the same settings finished, or empty."""
-    unfinished = folder.with_name(f".{folder.name}.unfinished")
+def _digests(recipe: Scenario) -> dict[str, str]:
+    """SHA-256 of the files that a scenario names."""
+    parts = itertools.chain.from_iterable((drone.model, drone.flight) for drone in recipe.drones)
+    files = sorted({part.file for part in parts if isinstance(part, Mesh | Recording)})
     try:
-        known = unfinished / _RECORD
-        if known.exists() and known.read_bytes() == record:
-            for leftover in unfinished.glob(".*"):
-                leftover.unlink()
-            return unfinished
-        if unfinished.exists():
-            shutil.rmtree(unfinished)
-        unfinished.mkdir(parents=True)
-        known.write_bytes(record)
+        return {file: hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in files}
     except OSError as error:
-        raise OutputError(unfinished, expected="to write it", found=error.strerror or str(error)) from error
-    return unfinished
+        found = (error.strerror or str(error)).lower()
+        raise InputError(error.filename, expected="a file to read", found=found) from error
 
 
-def _write_videos(scene: Scene, folder: Path, num_frames: int, jobs: int, report: Report) -> None:
-    tasks = [
-        _CameraTask(scene.scenario, scene.seed, scene.scale, index, num_frames, folder / video_file(name))
-        for index, name in enumerate(scene.rig.names)
+def _streams(scene: Scene, onboard: bool) -> list[Stream]:
+    static = [Stream(name, index) for index, name in enumerate(scene.rig.names)]
+    drones = range(len(scene.flights)) if onboard else ()
+    return static + [Stream(f"dron{drone + 1}_cam", drone, onboard=True) for drone in drones]
+
+
+def _write_streams(
+    scene: Scene, growing: Unfinished, num_frames: int, masks: bool, onboard: bool, jobs: int, report: Report
+) -> None:
+    """Draw all segments that are not there yet, and join them."""
+    streams, every = _streams(scene, onboard), segments(num_frames)
+    parts = {
+        stream: [segment_folder(growing.segments / stream.name, frames) for frames in every]
+        for stream in streams
+    }
+    missing = {
+        stream: [frames for frames, part in zip(every, parts[stream], strict=True) if not part.exists()]
+        for stream in streams
+    }
+    pieces = -(-_PIECES_PER_JOB * jobs // len(streams))
+    works = [
+        Work(scene, stream, masks, growing.segments / stream.name, piece)
+        for stream in streams
+        for piece in _cut(missing[stream], pieces)
     ]
-    finished = [task for task in tasks if task.path.exists()]
-    if finished:
+    waiting = sum(len(frames) for work in works for frames in work.segments)
+    total = len(streams) * num_frames
+    if waiting < total:
         _logger.info(
-            "%s: %d of %d cameras were finished by an earlier call", folder, len(finished), len(tasks)
+            "%s: %d of %d frames are there from an earlier call", growing.target, total - waiting, total
         )
-    with report("simulate", len(tasks) * num_frames) as advance:
-        advance(len(finished) * num_frames)
-        waiting = [task for task in tasks if task not in finished]
-        map_in_processes(_write_video, waiting, jobs=jobs, advance=advance)
+    with report("simulate", total) as advance:
+        advance(total - waiting)
+        map_in_processes(draw, works, jobs=jobs, advance=advance)
+    if masks:
+        join_masks(
+            [part for stream in streams if not stream.onboard for part in parts[stream]], growing.folder
+        )
+    for stream in streams:
+        join(stream, parts[stream], growing.folder)
 
 
-def _write_video(task: _CameraTask, advance: Advance) -> None:
-    scene = build(task.scenario, scale=task.scale, seed=task.seed)
-    renderer = CameraRenderer(scene, task.camera_index)
-    with VideoWriter(task.path, task.scenario.fps, (renderer.cam.width, renderer.cam.height)) as video:
-        for frame in range(task.num_frames):
-            video.write(renderer.frame(frame))
-            advance(1)
+def _cut(frames: list[range], pieces: int) -> list[tuple[range, ...]]:
+    """Consecutive segments in up to so many pieces of about equal size."""
+    size = -(-len(frames) // pieces) or 1
+    return [tuple(frames[start : start + size]) for start in range(0, len(frames), size)]
 
 
 def _write_tables(scene: Scene, folder: Path, num_frames: int) -> None:
+    fps = scene.scenario.fps
     write_calibration(folder / CALIBRATION, scene.rig, unit="m")
     position_m, orientation_wxyz = scene.positions_m(num_frames), scene.orientations_wxyz(num_frames)
-    for drone in range(position_m.shape[1]):
-        write_poses(folder / pose_file(drone + 1), position_m[:, drone], orientation_wxyz[:, drone])
+    markers_m = mocap_markers_m(scene, num_frames)
+    for drone in range(len(scene.flights)):
+        number = drone + 1
+        write_poses(folder / pose_file(number, fps), position_m[:, drone], orientation_wxyz[:, drone])
+        write_mocap_markers(folder / mocap_markers_file(number, fps), markers_m[:, drone])
     if scene.scenario.markers:
         write_marker_corners(folder / MARKER_CORNERS, scene.room.marker_corners_m)
+
+
+def _write_onboard_tables(scene: Scene, folder: Path, num_frames: int) -> None:
+    names = [f"dron{drone + 1}" for drone in range(len(scene.flights))]
+    write_onboard_calibration(folder / ONBOARD_CALIBRATION, dict.fromkeys(names, intrinsics(scene)))
+    for drone in range(len(scene.flights)):
+        poses = onboard_poses(scene, drone, num_frames)
+        write_poses(folder / onboard_pose_file(drone + 1, scene.scenario.fps), *poses)

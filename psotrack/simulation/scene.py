@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
 from psotrack.cameras import Camera, CameraRig, camera, look_at, stack
 from psotrack.errors import SettingsError, check_positive
-from psotrack.simulation.drones import DroneModel, model
-from psotrack.simulation.flights import Flight, frame_times_s, plan
-from psotrack.simulation.rooms import Room, room
+from psotrack.simulation.flights.motion import Flight
+from psotrack.simulation.flights.planning import frame_times_s, plan
 from psotrack.simulation.scenarios import CameraPlace, Scenario
+from psotrack.simulation.validation import camera_places, check, check_flights
+from psotrack.simulation.world.drones import DroneModel, model
+from psotrack.simulation.world.rooms import Room, room
 
-#: A texel of the floor at full size; about a pixel at the nearest distance that drones are seen at.
-_TEXEL_M = 0.005
 #: Smaller pictures than this show nothing.
 _MIN_SIDE_PX = 32
+#: Keeps the draws of the cameras apart from those of the flights, whose second number counts attempts.
+_FOR_CAMERAS = 1_000_003
 
 
 @dataclass(frozen=True)
@@ -43,8 +46,7 @@ class Scene:
     @property
     def room(self) -> Room:
         """The room, its textures as fine as the scale needs; built at the first use in a process."""
-        texel_m = round(max(_TEXEL_M, min(_TEXEL_M / self.scale, 0.04)), 3)
-        return room(self.scenario.room, self.scenario.markers, texel_m)
+        return room(self.scenario.hall, self.scenario.markers, self.scale)
 
     def time_s(self, frame: int) -> float:
         """Middle of the exposure of a frame."""
@@ -66,15 +68,43 @@ def build(scenario: Scenario, *, scale: float = 1.0, seed: int = 0) -> Scene:
 
     Raises:
         SettingsError: the scale is not above 0 or gives images of almost no pixels, the seed is negative, or the
-            scenario names what does not exist or cannot keep its limits.
+            scenario names what does not exist, does not fit its hall, or cannot keep its limits.
+        InputError: a mesh or a recording cannot be used.
     """
     check_positive("scale", scale)
     if seed < 0:
         raise SettingsError("seed", expected="0 or more", found=f"{seed}")
-    places = {f"cam{i}i": place for i, place in enumerate(scenario.cameras, start=1)}
-    rig = stack({name: _camera(place, scenario, scale) for name, place in places.items()})
+    check(scenario)
+    rig = _rig(scenario, scale, seed)
     models = tuple(model(drone.model) for drone in scenario.drones)
-    return Scene(scenario, seed, scale, rig, plan(scenario, seed), models)
+    flights = plan(scenario, seed)
+    check_flights(scenario, flights)
+    return Scene(scenario, seed, scale, rig, flights, models)
+
+
+def _rig(scenario: Scenario, scale: float, seed: int) -> CameraRig:
+    """The cameras, each as far from its record as the scenario's spread and the seed have it."""
+    places = camera_places(scenario)
+    spread = scenario.camera_spread
+    normal = np.random.default_rng([seed, _FOR_CAMERAS]).standard_normal((len(places), 3))
+    # Without its tails, so that no lens turns into another or looks out of its side.
+    draws = np.clip(normal, -2.5, 2.5) * [spread.focal_length, *2 * [spread.principal_point_px]]
+    return stack(
+        {
+            f"cam{index}i": _camera(_moved(place, draw), scenario, scale)
+            for index, (place, draw) in enumerate(zip(places, draws, strict=True), start=1)
+        }
+    )
+
+
+def _moved(place: CameraPlace, draw: Float[np.ndarray, "3"]) -> CameraPlace:
+    longer, right_px, down_px = draw.tolist()
+    cx, cy = place.principal_point_px
+    return msgspec.structs.replace(
+        place,
+        focal_length_px=place.focal_length_px * (1 + longer),
+        principal_point_px=(cx + right_px, cy + down_px),
+    )
 
 
 def image_size_wh(scenario: Scenario, scale: float) -> tuple[int, int]:

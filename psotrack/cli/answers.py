@@ -1,0 +1,38 @@
+"""How commands answer: progress and sentences for people, JSON for programs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from psotrack.files import refuse_to_overwrite, written_whole
+from psotrack.progress import Report, silent, terminal
+
+
+def report_to(quiet: bool) -> Report:
+    """Whom long work reports to."""
+    return silent if quiet else terminal
+
+
+def say(quiet: bool, json_path: Path | None, sentence: str) -> None:
+    """One sentence on stdout, unless that is silent or taken by JSON."""
+    if not quiet and json_path != Path("-"):
+        click.echo(sentence)
+
+
+def answer(json_path: Path | None, content: Any, force: bool) -> None:
+    """The answer for programs: on stdout, or in a file that was not there."""
+    if json_path == Path("-"):
+        click.echo(json.dumps(content, indent=2, allow_nan=False))
+    elif json_path is not None:
+        refuse_to_overwrite(json_path, force)
+        write_json(json_path, content)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write a JSON file whole."""
+    with written_whole(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")

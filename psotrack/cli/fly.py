@@ -1,0 +1,92 @@
+"""`psotrack fly`: a flight by hand, recorded for scenarios."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from psotrack.cli.options import FORCE, QUIET, Numbers
+from psotrack.files import refuse_to_overwrite
+
+
+@click.command()
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, metavar="FILE.csv", help="The recording."
+)
+@click.option(
+    "--device",
+    required=True,
+    metavar="gamepad|keyboard|FILE.csv",
+    help="What to fly with; a file has the columns time_s,forward,left,up,turn, each from -1 to 1.",
+)
+@click.option(
+    "--rate",
+    "rate_hz",
+    type=click.FloatRange(1, 1000),
+    default=25.0,
+    show_default=True,
+    help="Samples per second.",
+)
+@click.option("--hall", default="laboratory", show_default=True, help="Where; as in scenarios.")
+@click.option(
+    "--start",
+    "start_m",
+    type=Numbers(3),
+    metavar="X,Y,Z",
+    default=(0.0, 0.0, 1.0),
+    help="Where it hovers at first, in metres.  [default: 0,0,1]",
+)
+@click.option(
+    "--max-seconds",
+    type=click.FloatRange(1),
+    default=300.0,
+    show_default=True,
+    help="Longer flights end here.",
+)
+@FORCE
+@QUIET
+def fly(
+    out: Path,
+    device: str,
+    rate_hz: float,
+    hall: str,
+    start_m: tuple[float, float, float],
+    max_seconds: float,
+    force: bool,
+    quiet: bool,
+) -> None:
+    """Fly a drone by hand and record it for a scenario.
+
+    Writes OUT, position and orientation over time, and beside it the same name with .sticks.csv: what the sticks did,
+    which --device flies again. Start, back or Esc ends the flight; so does Ctrl-C, and what was flown is kept.
+    Controllers and the keyboard need pip install 'psotrack[control]'.
+
+    \b
+    Examples:
+      psotrack fly --out loop.csv --device gamepad
+      psotrack fly --out loop.csv --device keyboard --start -2,0,1.5
+      psotrack fly --out again.csv --device loop.sticks.csv --start -2,0,1.5 --rate 100
+    """
+    import numpy as np
+
+    from psotrack.simulation.flights import devices, piloting
+    from psotrack.simulation.flights.dynamics import space_in
+    from psotrack.simulation.flights.recordings import write_recording
+
+    sticks_path = out.with_suffix(".sticks.csv")
+    refuse_to_overwrite(out, force)
+    refuse_to_overwrite(sticks_path, force)
+    space = space_in(hall)
+    start = np.array(start_m)
+    piloting.check(start, space, rate_hz)
+    with devices.open_device(device, space) as opened:
+        samples = piloting.until(opened.samples(), max_seconds)
+        flown = piloting.fly(samples, start, space, rate_hz=rate_hz, watch=opened.watch)
+    recorded = flown.recorded
+    write_recording(out, recorded.time_s, recorded.position_m, recorded.orientation_wxyz)
+    piloting.write_sticks(sticks_path, flown.samples)
+    if not quiet:
+        click.echo(f"{out}: {len(recorded.time_s)} samples at {rate_hz:g} Hz, {recorded.duration_s:.1f} s")
+        click.echo(f'in a scenario: flight = {{ kind = "recording", file = "{out}" }}')
+        click.echo(f"the same again: --device {sticks_path}, with the same --start and --hall")

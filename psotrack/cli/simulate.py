@@ -1,0 +1,154 @@
+"""`psotrack simulate`: sequences from scenarios, their list, and pages that show them beforehand."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import click
+
+from psotrack.cli.answers import answer, report_to, say
+from psotrack.cli.options import FORCE, JOBS, JSON, QUIET
+from psotrack.errors import SettingsError
+
+
+@click.command()
+@click.argument("name", required=False)
+@click.option("--out", type=click.Path(path_type=Path), help="The data's root folder.")
+@click.option(
+    "--scenario",
+    "scenario_file",
+    type=click.Path(path_type=Path),
+    metavar="FILE.toml",
+    help="A scenario of your own, instead of NAME.",
+)
+@click.option(
+    "--set",
+    "changes",
+    multiple=True,
+    metavar="FIELD=VALUE",
+    help="Change a field of the scenario, e.g. imaging.reflections=0; can be given often.",
+)
+@click.option("--list", "listed", is_flag=True, help="Show the scenarios that there are, and end.")
+@click.option("--show", is_flag=True, help="Print the scenario's file, to start your own from, and end.")
+@click.option(
+    "--preview", is_flag=True, help="Save one page of pictures, OUT/NAME.png, instead of the sequence."
+)
+@click.option("--frames", "num_frames", type=int, metavar="N", help="First N frames only.  [default: all]")
+@click.option("--scale", type=float, default=1.0, show_default=True, help="Of the image size.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Of flights and noise.")
+@click.option("--masks/--no-masks", default=True, show_default=True, help="Write drone_masks.zip.")
+@click.option(
+    "--onboard/--no-onboard", default=True, show_default=True, help="Make the videos of drones' own cameras."
+)
+@JOBS
+@FORCE
+@QUIET
+@JSON
+def simulate(
+    name: str | None,
+    out: Path | None,
+    scenario_file: Path | None,
+    changes: tuple[str, ...],
+    listed: bool,
+    show: bool,
+    preview: bool,
+    num_frames: int | None,
+    scale: float,
+    seed: int,
+    masks: bool,
+    onboard: bool,
+    jobs: int | None,
+    force: bool,
+    quiet: bool,
+    json_path: Path | None,
+) -> None:
+    """Make a sequence of the dataset's simulated half: videos, calibration, truth, masks, detections.
+
+    Writes OUT/Simulated_Data/NAME. The same seed makes the same flights and the same pixels; an interrupted call goes
+    on where it was.
+
+    \b
+    Examples:
+      psotrack simulate --list
+      psotrack simulate S02_D4_A --out data
+      psotrack simulate S04_D10 --out small --scale 0.5 --frames 60 --seed 7
+      psotrack simulate S02_D4_A --out pages --preview
+      psotrack simulate S02_D4_A --show > mine.toml
+      psotrack simulate --scenario mine.toml --out data --set camera_spread.focal_length=0.02
+    """
+    if listed:
+        _list(json_path, quiet, force)
+        return
+    from psotrack.simulation import load, preset_text, replaced, scenario
+    from psotrack.simulation import simulate as make
+
+    if (name is None) == (scenario_file is None):
+        raise SettingsError(
+            "simulate",
+            expected="the NAME of a scenario or --scenario FILE.toml",
+            found="neither" if name is None else "both",
+            remedy="psotrack simulate --list shows the names",
+        )
+    if show:
+        if name is None:
+            raise SettingsError("--show", expected="the NAME of a scenario", found="none")
+        click.echo(preset_text(str(name)), nl=False)
+        return
+    if out is None:
+        raise SettingsError("--out", expected="the folder to write to", found="none")
+    recipe = load(scenario_file) if scenario_file else scenario(str(name))
+    recipe = replaced(recipe, dict(_change(change) for change in changes))
+    if preview:
+        from psotrack.simulation.preview import save_preview
+
+        page = save_preview(
+            out / f"{recipe.name}.png",
+            recipe,
+            num_frames=num_frames,
+            seed=seed,
+            force=force,
+            jobs=jobs or os.cpu_count() or 1,
+            report=report_to(quiet),
+        )
+        answer(json_path, {"preview": str(page)}, force)
+        say(quiet, json_path, f"{page}")
+        return
+    folder = make(
+        recipe,
+        out,
+        num_frames=num_frames,
+        scale=scale,
+        seed=seed,
+        masks=masks,
+        onboard=onboard,
+        force=force,
+        jobs=jobs,
+        report=report_to(quiet),
+    )
+    answer(json_path, {"sequence": str(folder)}, force)
+    say(quiet, json_path, f"{folder}")
+
+
+def _list(json_path: Path | None, quiet: bool, force: bool) -> None:
+    from rich.console import Console
+
+    from psotrack.simulation.catalogue import catalogue, render
+
+    rows = catalogue()
+    answer(json_path, rows, force)
+    if not quiet and json_path != Path("-"):
+        Console().print(render(rows))
+
+
+def _change(text: str) -> tuple[str, Any]:
+    """`FIELD=VALUE`, the value as TOML has it; what is no TOML is a text."""
+    field, equals, value = text.partition("=")
+    if not equals or not field.strip():
+        raise SettingsError("--set", expected="FIELD=VALUE, such as imaging.shutter_s=0.01", found=text)
+    try:
+        return field.strip(), tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return field.strip(), value

@@ -1,0 +1,186 @@
+"""`drone_masks.zip` of the DPJAIT dataset: where each drone is seen, a binary image per camera, drone and frame.
+
+How the published archives look inside is not known. Written is `cam1i/dron1/000000.png` and so on: 1-bit PNGs, white
+where the drone is seen, one for every frame, black ones included. Read is any archive, or folder, of images whose paths
+name a camera (`cam1i`, or a serial number), a drone (`dron1`, `drone_1`) and a frame (the last other number).
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+import struct
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from types import TracebackType
+
+import cv2
+import numpy as np
+from jaxtyping import Bool
+
+from psotrack.datasets._archives import entry
+from psotrack.datasets._calibration import camera_key
+from psotrack.errors import InputError
+
+MASKS = "drone_masks.zip"
+
+Mask = Bool[np.ndarray, "height width"]
+
+_EXPECTED = "images such as cam1i/dron1/000000.png (camera, drone, frame)"
+_IMAGE_SUFFIXES = {".png", ".bmp", ".jpg", ".jpeg", ".tif", ".tiff", ".webp"}
+_CAMERA = re.compile(r"cam[a-z]*_?(?:\d{6,}|\d+i?)|\d{6,}(?=[^\d].*/)", re.IGNORECASE)
+_DRONE = re.compile(r"drone?_?(\d+)", re.IGNORECASE)
+_NUMBER = re.compile(r"\d+")
+
+
+class MaskWriter:
+    """Writes masks into an archive of its own.
+
+    Args:
+        path: of the archive; it is there, half written, from the start, so this wants a folder that nobody reads yet.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __enter__(self) -> MaskWriter:
+        self._archive = zipfile.ZipFile(self._path, "w", zipfile.ZIP_STORED)
+        return self
+
+    def write(self, camera: str, drone: int, frame: int, mask: Mask) -> None:
+        """Append the mask of a drone, numbered from 1, in one frame of a camera."""
+        png = _png(mask) if mask.any() else _empty_png(*mask.shape)
+        self._archive.writestr(entry(f"{camera}/dron{drone}/{frame:06d}.png"), png)
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._archive.close()
+
+
+class Masks:
+    """Masks in an archive or a folder, decoded when they are asked for; a context manager.
+
+    Attributes:
+        cameras: their names, without `_s`.
+        drones: their numbers.
+        frames: the numbers of the frames that have any.
+    """
+
+    def __init__(
+        self, path: Path, names: Mapping[tuple[str, int, int], str], archive: zipfile.ZipFile | None
+    ) -> None:
+        self._path, self._names, self._archive = path, names, archive
+        cameras, drones, frames = (sorted(set(column)) for column in zip(*names, strict=True))
+        self.cameras: tuple[str, ...] = tuple(cameras)
+        self.drones: tuple[int, ...] = tuple(drones)
+        self.frames: tuple[int, ...] = tuple(frames)
+
+    def mask(self, camera: str, drone: int, frame: int) -> Mask:
+        """(height, width), where a drone, numbered from 1, is seen in a frame of a camera.
+
+        Raises:
+            InputError: there is no such mask, or it is no image.
+        """
+        name = self._names.get((camera_key(camera), drone, frame))
+        if name is None:
+            raise InputError(
+                self._path, expected=f"a mask of dron{drone} in frame {frame} of {camera}", found="none"
+            )
+        try:
+            data = self._archive.read(name) if self._archive else (self._path / name).read_bytes()
+        except (OSError, zipfile.BadZipFile, zlib.error) as error:
+            raise InputError(f"{self._path}: {name}", expected="an image", found=str(error)) from error
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
+        if image is None:
+            raise InputError(f"{self._path}: {name}", expected="an image", found="none that can be decoded")
+        return image > 0
+
+    def __enter__(self) -> Masks:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._archive:
+            self._archive.close()
+
+
+def read_masks(path: Path | str) -> Masks:
+    """The masks in an archive or an unpacked folder.
+
+    Args:
+        path: of either, or of the sequence's folder that holds `drone_masks.zip`.
+
+    Raises:
+        InputError: it cannot be read, or the path of an image in it does not name camera, drone and frame once.
+    """
+    path = Path(path)
+    if (path / MASKS).exists():
+        path = path / MASKS
+    if path.is_dir():
+        files = sorted(file.relative_to(path).as_posix() for file in path.rglob("*") if file.is_file())
+        return Masks(path, _by_meaning(path, files), None)
+    try:
+        archive = zipfile.ZipFile(path)
+    except (OSError, zipfile.BadZipFile) as error:
+        found = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise InputError(path, expected="a ZIP archive or a folder of masks", found=found.lower()) from error
+    return Masks(path, _by_meaning(path, archive.namelist()), archive)
+
+
+def _by_meaning(path: Path, files: list[str]) -> dict[tuple[str, int, int], str]:
+    """Camera, drone and frame -> the image's name."""
+    names: dict[tuple[str, int, int], str] = {}
+    for name in files:
+        place = PurePosixPath(name)
+        if place.suffix.lower() not in _IMAGE_SUFFIXES or any(part[0] in "._" for part in place.parts):
+            continue
+        meaning = _meaning(name.removesuffix(place.suffix))
+        if meaning is None:
+            raise InputError(path, expected=_EXPECTED, found=name)
+        if meaning in names:
+            raise InputError(
+                path, expected="one image per camera, drone and frame", found=f"{names[meaning]} and {name}"
+            )
+        names[meaning] = name
+    if not names:
+        raise InputError(path, expected=_EXPECTED, found=", ".join(files[:3]) or "no files")
+    return names
+
+
+def _meaning(name: str) -> tuple[str, int, int] | None:
+    """Camera, drone and frame that a path without suffix names."""
+    camera, drone = _CAMERA.search(name), _DRONE.search(name)
+    if camera is None or drone is None:
+        return None
+    rest = _DRONE.sub("/", _CAMERA.sub("/", name))
+    numbers = _NUMBER.findall(rest.rpartition("/")[2]) or _NUMBER.findall(rest)
+    return (camera_key(camera[0]), int(drone[1]), int(numbers[-1])) if numbers else None
+
+
+def _png(mask: Mask) -> bytes:
+    """The mask as a 1-bit grey PNG (ISO/IEC 15948), 0 or 255 when decoded; five times as fast as OpenCV's own."""
+    height, width = mask.shape
+    rows = np.zeros((height, 1 + (width + 7) // 8), np.uint8)  # each row starts with its filter, 0 for none
+    rows[:, 1:] = np.packbits(mask, axis=1)
+    # Runs of equal bytes are nearly all there is.
+    squeeze = zlib.compressobj(6, zlib.DEFLATED, zlib.MAX_WBITS, 9, zlib.Z_RLE)
+    data = squeeze.compress(rows.tobytes()) + squeeze.flush()
+    header = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + _chunk(b"IHDR", header) + _chunk(b"IDAT", data) + _chunk(b"IEND", b"")
+
+
+def _chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+@functools.lru_cache(maxsize=4)
+def _empty_png(height: int, width: int) -> bytes:
+    return _png(np.zeros((height, width), bool))

@@ -1,0 +1,58 @@
+"""`dronN_markers_25.csv`: where the mocap markers of one simulated drone are, one line per video frame.
+
+How the dataset publishes them is not known; this is the layout that is written here: `id`, the frame's number, then
+`A_x[m]`, `A_y[m]`, `A_z[m]` to `D_x[m]`, `D_y[m]`, `D_z[m]`, world coordinates. Unlike in the pose files, line 0 is
+no placeholder.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.datasets._calibration import LENGTHS
+from psotrack.delimited import read_table, write_rows
+
+#: The names of a drone's markers, in the order of the columns.
+MOCAP_MARKERS = "ABCD"
+_COLUMNS = [f"{marker}_{axis}" for marker in MOCAP_MARKERS for axis in "xyz"]
+
+
+def mocap_markers_file(number: int, fps: float = 25.0) -> str:
+    """The name of the file of drone `number`, 1-based."""
+    return f"dron{number}_markers_{fps:g}.csv"
+
+
+def write_mocap_markers(path: Path, markers_m: Float[np.ndarray, "frames 4 3"]) -> None:
+    """Write the markers of one drone, (frames, 4, 3), world, metres.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    header = ["id", *(f"{column}[m]" for column in _COLUMNS)]
+    rows = ([frame, *values] for frame, values in enumerate(markers_m.reshape(-1, len(_COLUMNS))))
+    write_rows(path, [header, *rows])
+
+
+def read_mocap_markers(path: Path) -> Float[np.ndarray, "frames 4 3"]:
+    """(frames, 4, 3), the markers of one drone at frames 0, 1, ..., world, metres; NaN where there is no row.
+
+    Raises:
+        InputError: the file cannot be read, a column is missing, a frame is there twice, or a value is no number.
+    """
+    table = read_table(path)
+    id_column = table.column("id")
+    columns = [table.column(name.lower()) for name in _COLUMNS]
+    metres = np.array([table.factor(column, LENGTHS) for column in columns])
+    rows: dict[int, np.ndarray] = {}
+    for row in table.rows:
+        frame = row.count(id_column)
+        if frame in rows:
+            raise row.wrong(id_column, "each frame once", f"{frame} again")
+        rows[frame] = np.array([row.number(column) for column in columns]) * metres
+    markers_m = np.full((max(rows) + 1, len(_COLUMNS)), np.nan)
+    for frame, values in rows.items():
+        markers_m[frame] = values
+    return markers_m.reshape(-1, len(MOCAP_MARKERS), 3)

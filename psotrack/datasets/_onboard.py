@@ -1,0 +1,156 @@
+"""The drones' own cameras in the DPJAIT dataset (the `_A` sequences): videos, poses, intrinsics.
+
+How the dataset publishes them is known by the names of the poses alone, `dronN_cam_25.csv`; what is written here:
+
+- `dronN_cam_s.avi`: the video.
+- `dronN_cam_25.csv`: the columns of `dronN_pos_25.csv`. The position is the camera's centre; the rotation turns
+  camera into world coordinates, with camera axes x right, y down, z ahead. Row 0 is a placeholder as there.
+- `drone_cameras_calibration.csv`: `cam_name` (`dronN`), `focal_length_x`, `focal_length_y`, `cx`, `cy`, `width`,
+  `height`; all in pixels, whose centres are at integers, without lens distortion.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.datasets._poses import read_poses
+from psotrack.delimited import read_table, write_rows
+from psotrack.errors import InputError, SettingsError
+from psotrack.sequence import OnboardVideo
+from psotrack.video import VideoInfo, probe
+
+ONBOARD_CALIBRATION = "drone_cameras_calibration.csv"
+
+Intrinsics = Mapping[str, tuple[Float[np.ndarray, "3 3"], tuple[int, int]]]
+
+_VIDEO = re.compile(r"drone?_?(?P<number>\d+)_cam(?:_s)?\.(?:avi|mp4)", re.IGNORECASE)
+_POSES = re.compile(r"drone?_?(?P<number>\d+)_cam_(?P<rate>\d+(?:\.\d+)?)\.csv", re.IGNORECASE)
+_SIZES = ("width", "height")
+
+
+def onboard_video_file(number: int) -> str:
+    """The name of the video of the camera on drone `number`, 1-based."""
+    return f"dron{number}_cam_s.avi"
+
+
+def onboard_pose_file(number: int, fps: float = 25.0) -> str:
+    """The name of the file with the poses of the camera on drone `number`, 1-based; `write_poses` writes it."""
+    return f"dron{number}_cam_{fps:g}.csv"
+
+
+def is_onboard_video(path: Path) -> bool:
+    """Whether a file's name is that of a video from a drone."""
+    return _VIDEO.fullmatch(path.name) is not None
+
+
+def read_onboard(folder: Path) -> dict[str, OnboardVideo]:
+    """The videos of the drones' own cameras in a sequence's folder, by the drones' names; empty without any.
+
+    Poses and intrinsics may be missing; where they are there, they must fit the video.
+
+    Raises:
+        InputError: a file cannot be used. The message names file, line and column.
+    """
+    files = sorted(Path(folder).iterdir())
+    videos, poses = numbered_files(files, _VIDEO), numbered_files(files, _POSES)
+    calibration = Path(folder) / ONBOARD_CALIBRATION
+    intrinsics = read_onboard_calibration(calibration) if videos and calibration.exists() else {}
+    found = {}
+    for number, path in videos.items():
+        video, name = probe(path), f"dron{number}"
+        K, size_wh = intrinsics.get(name, (None, video.image_size_wh))
+        if size_wh != video.image_size_wh:
+            raise InputError(
+                path,
+                expected=f"{size_wh[0]} x {size_wh[1]} pixels as {name} has in {ONBOARD_CALIBRATION}",
+                found=f"{video.image_size_wh[0]} x {video.image_size_wh[1]}",
+            )
+        position_m, orientation_wxyz = _poses_of(poses.get(number), video)
+        found[name] = OnboardVideo(video, K, position_m, orientation_wxyz)
+    return found
+
+
+def read_onboard_calibration(path: Path) -> Intrinsics:
+    """Intrinsics, (3, 3), pixels, with width and height of the image, by the drones' names.
+
+    Raises:
+        InputError: the file cannot be read, a column is missing, a camera is there twice, or a value makes no sense.
+    """
+    table = read_table(path)
+    name_column = table.column("cam_name")
+    focal = [table.column(f"focal_length_{axis}") for axis in "xy"]
+    centre = [table.column(name) for name in ("cx", "cy")]
+    sizes = [table.column(name) for name in _SIZES]
+    found: dict[str, tuple[Float[np.ndarray, "3 3"], tuple[int, int]]] = {}
+    for row in table.rows:
+        name = row.text(name_column).lower()
+        if name in found:
+            raise row.wrong(name_column, "each camera once", f"{name} again")
+        for column in (*focal, *sizes):
+            if row.number(column) <= 0:
+                raise row.wrong(column, "a number of pixels above 0", row.text(column))
+        (fx, fy), (cx, cy) = ([row.number(column) for column in pair] for pair in (focal, centre))
+        width, height = (row.count(column) for column in sizes)
+        found[name] = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), (width, height)
+    return found
+
+
+def write_onboard_calibration(path: Path, intrinsics: Intrinsics) -> None:
+    """Write intrinsics, (3, 3), pixels, with width and height of the image, by the drones' names.
+
+    Raises:
+        SettingsError: there are none, or one has skew.
+        OutputError: the file cannot be written.
+    """
+    if not intrinsics or any(K[0, 1] for K, _ in intrinsics.values()):
+        raise SettingsError("intrinsics", expected="those of some cameras, without skew", found="others")
+    header = ["cam_name", "focal_length_x", "focal_length_y", "cx", "cy", *_SIZES]
+    rows = [[name, K[0, 0], K[1, 1], K[0, 2], K[1, 2], *size_wh] for name, (K, size_wh) in intrinsics.items()]
+    write_rows(path, [header, *rows])
+
+
+def numbered_files(files: Iterable[Path], pattern: re.Pattern[str]) -> dict[int, Path]:
+    """The files whose names match a pattern, by the number of the drone in its group `number`.
+
+    Raises:
+        InputError: a drone has two.
+    """
+    found: dict[int, Path] = {}
+    for path in files:
+        match = pattern.fullmatch(path.name)
+        if match is None:
+            continue
+        number = int(match["number"])
+        if number in found:
+            raise InputError(path, expected="one file per drone", found=f"{found[number].name} as well")
+        found[number] = path
+    return dict(sorted(found.items()))
+
+
+def check_rate(path: Path, pattern: re.Pattern[str], fps: float) -> None:
+    """Raise `InputError` unless the rate in a file's name, group `rate` of its pattern, is that of the video."""
+    match = pattern.fullmatch(path.name)
+    # 0.1 %: as exact as containers hold a rate. More would drift.
+    if match is not None and abs(float(match["rate"]) - fps) > 1e-3 * fps:
+        raise InputError(path, expected=f"poses at the {fps:g} Hz of the video", found=f"{match['rate']} Hz")
+
+
+def _poses_of(
+    path: Path | None, video: VideoInfo
+) -> tuple[Float[np.ndarray, "frames 3"], Float[np.ndarray, "frames 4"]]:
+    """Positions and orientations at the frames of a video, NaN where there is none."""
+    position_m = np.full((video.num_frames, 3), np.nan)
+    orientation_wxyz = np.full((video.num_frames, 4), np.nan)
+    if path is not None:
+        check_rate(path, _POSES, video.fps)
+        position, orientation = read_poses(path)
+        shared = min(video.num_frames, len(position))
+        position_m[:shared] = position[:shared]
+        if orientation is not None:
+            orientation_wxyz[:shared] = orientation[:shared]
+    return position_m, orientation_wxyz

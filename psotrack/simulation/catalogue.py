@@ -1,0 +1,60 @@
+"""The scenarios that there are, as records for programs and as a table for people."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from psotrack.simulation.scenarios import preset_names, scenario
+from psotrack.simulation.scene import build
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+def catalogue() -> list[dict[str, Any]]:
+    """One record per scenario; the speed is the mean over its drones and frames, for seed 0."""
+    rows = []
+    for name in preset_names():
+        recipe = scenario(name)
+        scene = build(recipe)
+        position_m = scene.positions_m(recipe.num_frames)
+        speed = np.linalg.norm(np.diff(position_m, axis=0), axis=-1).mean() * recipe.fps
+        rows.append(
+            {
+                "name": name,
+                "drones": len(recipe.drones),
+                "cameras": len(scene.rig.names),
+                "frames": recipe.num_frames,
+                "seconds": recipe.num_frames / recipe.fps,
+                "hall": recipe.hall,
+                "mean_speed_m_s": round(float(speed), 3),
+                "markers": recipe.markers,
+                "onboard": recipe.onboard is not None,
+                "description": recipe.description,
+            }
+        )
+    return rows
+
+
+def render(rows: list[dict[str, Any]]) -> Table:
+    """The records as a table, one row per scenario."""
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.HORIZONTALS, show_edge=False)
+    for heading in ("name", "drones", "cameras", "frames", "hall", "m/s", "flights"):
+        numeric = heading in {"drones", "cameras", "frames", "m/s"}
+        table.add_column(heading, justify="right" if numeric else "left", no_wrap=heading != "flights")
+    for row in rows:
+        table.add_row(
+            row["name"],
+            f"{row['drones']}",
+            f"{row['cameras']}",
+            f"{row['frames']}",
+            row["hall"].replace("_", " "),
+            f"{row['mean_speed_m_s']:.1f}",
+            row["description"],
+        )
+    return table

@@ -1,0 +1,1 @@
+"""Where drones are at any time: from formulas, from recordings, and from a person at the controls."""

@@ -1,0 +1,107 @@
+"""Whether the flights of a scenario make sense together, before any is made: whom they follow, past whom they fly."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from psotrack.simulation.scenarios import (
+    FlightRecord,
+    Following,
+    Formation,
+    NearPass,
+    Scenario,
+    Waypoints,
+    wrong,
+)
+
+#: Cosine of the angle between a near pass's side and its swing, which should be 0; the distance is short by half of
+#: its square, which is nothing.
+_PERPENDICULAR = 1e-6
+
+
+def followed(record: FlightRecord) -> tuple[str, int] | None:
+    """The field and the number of the drone that a flight is relative to."""
+    if isinstance(record, Formation | Following):
+        return "leader", record.leader
+    if isinstance(record, NearPass):
+        return "other", record.other
+    return None
+
+
+def flying_order(scenario: Scenario) -> tuple[int, ...]:
+    """Indices of the drones, each after the one that its flight is relative to.
+
+    Raises:
+        SettingsError: a flight is relative to a drone that does not exist, or, along a chain, to itself.
+    """
+    order: list[int] = []
+    for index in range(len(scenario.drones)):
+        chain = _chain(scenario, index)
+        order += [link for link in reversed(chain) if link not in order]
+    return tuple(order)
+
+
+def _chain(scenario: Scenario, index: int) -> list[int]:
+    """The drone, the one it is relative to, the one that that is relative to, ..."""
+    chain = [index]
+    while relation := followed(scenario.drones[chain[-1]].flight):
+        name, number = relation
+        field = f"drones[{chain[-1]}].flight.{name}"
+        if number > len(scenario.drones):
+            count = len(scenario.drones)
+            raise wrong(scenario, field, expected=f"a drone's number, 1 to {count}", found=f"{number}")
+        chain.append(number - 1)
+        if chain[-1] in chain[:-1]:
+            loop = " -> ".join(f"{link + 1}" for link in chain)
+            raise wrong(
+                scenario,
+                field,
+                expected="drones that do not follow one another in a ring",
+                found=f"drones {loop}",
+            )
+    return chain
+
+
+def check_records(scenario: Scenario) -> None:
+    """Refuse what no seed can make a flight.
+
+    Raises:
+        SettingsError: a near pass without a side or swing, or one whose side is not perpendicular to its swing; a
+            waypoint that is there twice in a row. The message names the field.
+    """
+    for index, drone in enumerate(scenario.drones):
+        if isinstance(drone.flight, NearPass):
+            _check_near_pass(scenario, f"drones[{index}].flight", drone.flight)
+        elif isinstance(drone.flight, Waypoints):
+            _check_waypoints(scenario, f"drones[{index}].flight", drone.flight)
+
+
+def _check_near_pass(scenario: Scenario, field: str, record: NearPass) -> None:
+    for name, vector in (("side", record.side), ("swing_m", record.swing_m)):
+        if not np.any(vector):
+            raise wrong(scenario, f"{field}.{name}", expected="a direction", found="[0, 0, 0]")
+    side, swing = (np.array(vector) / np.linalg.norm(vector) for vector in (record.side, record.swing_m))
+    cosine = float(side @ swing)
+    if abs(cosine) > _PERPENDICULAR:
+        raise wrong(
+            scenario,
+            f"{field}.side",
+            expected="a direction perpendicular to swing_m",
+            found=f"one at {np.degrees(np.arccos(np.clip(cosine, -1, 1))):.4g} degrees to it",
+            remedy="otherwise distance_m is not where they are nearest",
+        )
+
+
+def _check_waypoints(scenario: Scenario, field: str, record: Waypoints) -> None:
+    for point, (here, there) in enumerate(
+        zip(record.points_m, record.points_m[1:] + record.points_m[:1], strict=True)
+    ):
+        if here == there:
+            following = (point + 1) % len(record.points_m)
+            raise wrong(
+                scenario,
+                f"{field}.points_m[{following}]",
+                expected="another point than the one before (after the last comes the first)",
+                found=f"{list(there)} again",
+                remedy="hover_s is how long it stands still",
+            )

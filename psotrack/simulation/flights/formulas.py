@@ -1,0 +1,145 @@
+"""Flights from formulas, all with exact derivatives: sums of harmonics, sums of flights, and ways from rest to rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.simulation.flights.motion import Flight, Heading
+
+Times = Float[np.ndarray, "times"]
+Vectors = Float[np.ndarray, "times 3"]
+
+
+@dataclass(frozen=True)
+class HarmonicFlight(Flight):
+    """A sum of sinusoids about a centre.
+
+    Attributes:
+        centre_m: (3,).
+        amplitude_m: (harmonics, 3).
+        angular_rad_s: (harmonics,), angular frequencies.
+        phase_rad: (harmonics, 3).
+    """
+
+    centre_m: Float[np.ndarray, "3"]
+    amplitude_m: Float[np.ndarray, "harmonics 3"]
+    angular_rad_s: Float[np.ndarray, "harmonics"]
+    phase_rad: Float[np.ndarray, "harmonics 3"]
+    heading: Heading
+
+    def _derivative(self, time_s: Times, order: int) -> Vectors:
+        w = self.angular_rad_s[:, None]
+        # The n-th derivative of sin is sin a quarter turn per order ahead.
+        angle = w * time_s[:, None, None] + self.phase_rad + order * np.pi / 2
+        return (self.amplitude_m * w**order * np.sin(angle)).sum(axis=1)
+
+    def position_m(self, time_s: Times) -> Vectors:
+        """(times, 3), world, metres."""
+        return self.centre_m + self._derivative(time_s, 0)
+
+    def velocity_m_s(self, time_s: Times) -> Vectors:
+        """(times, 3), world."""
+        return self._derivative(time_s, 1)
+
+    def acceleration_m_s2(self, time_s: Times) -> Vectors:
+        """(times, 3), world, gravity not included."""
+        return self._derivative(time_s, 2)
+
+
+@dataclass(frozen=True)
+class RelativeFlight(Flight):
+    """A flight seen from another: the sum of both.
+
+    Attributes:
+        other: the flight of the other drone.
+        offset: from there, in axes of the world; its heading is not used.
+    """
+
+    other: Flight
+    offset: Flight
+    heading: Heading
+
+    def position_m(self, time_s: Times) -> Vectors:
+        """(times, 3), world, metres."""
+        return self.other.position_m(time_s) + self.offset.position_m(time_s)
+
+    def velocity_m_s(self, time_s: Times) -> Vectors:
+        """(times, 3), world."""
+        return self.other.velocity_m_s(time_s) + self.offset.velocity_m_s(time_s)
+
+    def acceleration_m_s2(self, time_s: Times) -> Vectors:
+        """(times, 3), world, gravity not included."""
+        return self.other.acceleration_m_s2(time_s) + self.offset.acceleration_m_s2(time_s)
+
+
+@dataclass(frozen=True)
+class DelayedFlight(Flight):
+    """Another flight, later.
+
+    Attributes:
+        leader: the flight of the other drone.
+        delay_s: how much later; before time 0 the leader flies by the same formula.
+    """
+
+    leader: Flight
+    delay_s: float
+    heading: Heading
+
+    def position_m(self, time_s: Times) -> Vectors:
+        """(times, 3), world, metres."""
+        return self.leader.position_m(time_s - self.delay_s)
+
+    def velocity_m_s(self, time_s: Times) -> Vectors:
+        """(times, 3), world."""
+        return self.leader.velocity_m_s(time_s - self.delay_s)
+
+    def acceleration_m_s2(self, time_s: Times) -> Vectors:
+        """(times, 3), world, gravity not included."""
+        return self.leader.acceleration_m_s2(time_s - self.delay_s)
+
+
+#: The share of the way after a share t of the time with least jerk, from rest to rest: 10 t^3 - 15 t^4 + 6 t^5
+#: (Flash and Hogan, "The coordination of arm movements", 1985), and its two derivatives.
+_MINIMUM_JERK = tuple(np.polynomial.Polynomial([0.0, 0.0, 0.0, 10.0, -15.0, 6.0]).deriv(n) for n in (0, 1, 2))
+
+
+@dataclass(frozen=True)
+class WaypointFlight(Flight):
+    """Around a closed loop of points, standing still at each, with least jerk between them.
+
+    Attributes:
+        points_m: (points, 3); after the last comes the first again.
+        moving_s: (points,), how long it moves from each point to the next.
+        hover_s: how long it stands still at each point, before it moves.
+    """
+
+    points_m: Float[np.ndarray, "points 3"]
+    moving_s: Float[np.ndarray, "points"]
+    hover_s: float
+    heading: Heading
+
+    def _derivative(self, time_s: Times, order: int) -> Vectors:
+        ends_s = np.cumsum(self.moving_s + self.hover_s)
+        loop_s = time_s % ends_s[-1]
+        # Rounding can put a time at the very end of the loop behind the last leg.
+        leg = np.minimum(np.searchsorted(ends_s, loop_s, side="right"), len(ends_s) - 1)
+        moving_s = self.moving_s[leg]
+        share = np.clip((loop_s - ends_s[leg]) / moving_s + 1, 0, 1)
+        way_m = (np.roll(self.points_m, -1, axis=0) - self.points_m)[leg]
+        moved = (_MINIMUM_JERK[order](share) / moving_s**order)[:, None] * way_m
+        return self.points_m[leg] + moved if order == 0 else moved
+
+    def position_m(self, time_s: Times) -> Vectors:
+        """(times, 3), world, metres."""
+        return self._derivative(time_s, 0)
+
+    def velocity_m_s(self, time_s: Times) -> Vectors:
+        """(times, 3), world."""
+        return self._derivative(time_s, 1)
+
+    def acceleration_m_s2(self, time_s: Times) -> Vectors:
+        """(times, 3), world, gravity not included."""
+        return self._derivative(time_s, 2)

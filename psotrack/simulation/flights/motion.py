@@ -1,0 +1,75 @@
+"""What a flight is: a position with its derivatives at any time, and the attitude that they demand.
+
+A multirotor pushes along its body's z axis only, so that axis points along a + g (Mellinger and Kumar, "Minimum snap
+trajectory generation and control for quadrotors", 2011; drag is left out); the heading is free.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+GRAVITY_M_S2 = 9.81
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A drone that looks around: `yaw + sway sin(angular t + phase)`, radians and rad/s."""
+
+    yaw_rad: float = 0.0
+    sway_rad: float = 0.0
+    angular_rad_s: float = 1.0
+    phase_rad: float = 0.0
+
+    def at(self, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times"]:
+        """(times,), radians."""
+        return self.yaw_rad + self.sway_rad * np.sin(self.angular_rad_s * time_s + self.phase_rad)
+
+
+def attitude(
+    thrust_m_s2: Float[np.ndarray, "times 3"], yaw_rad: Float[np.ndarray, "times"]
+) -> Float[np.ndarray, "times 3 3"]:
+    """(times, 3, 3), body to world: z along the thrust, x as near to the heading as that allows."""
+    body_z = thrust_m_s2 / np.linalg.norm(thrust_m_s2, axis=-1, keepdims=True)
+    ahead = np.stack([np.cos(yaw_rad), np.sin(yaw_rad), np.zeros_like(yaw_rad)], axis=-1)
+    body_y = np.cross(body_z, ahead)
+    body_y /= np.linalg.norm(body_y, axis=-1, keepdims=True)
+    return np.stack([np.cross(body_y, body_z), body_y, body_z], axis=-1)
+
+
+class Flight(ABC):
+    """A position that can be derived twice, at any time.
+
+    Attributes:
+        heading: where its x axis points, seen from above.
+    """
+
+    heading: Heading
+
+    @abstractmethod
+    def position_m(self, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3"]:
+        """(times, 3), world, metres."""
+
+    @abstractmethod
+    def velocity_m_s(self, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3"]:
+        """(times, 3), world."""
+
+    @abstractmethod
+    def acceleration_m_s2(self, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3"]:
+        """(times, 3), world, gravity not included."""
+
+    def rotation(self, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3 3"]:
+        """(times, 3, 3), body to world: z along a + g, x as near to the heading as that allows."""
+        thrust_m_s2 = self.acceleration_m_s2(time_s) + np.array([0.0, 0.0, GRAVITY_M_S2])
+        return attitude(thrust_m_s2, self.heading.at(time_s))
+
+    def orientation_wxyz(self, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 4"]:
+        """(times, 4), unit quaternions body to world, with a sign that does not jump from one time to the next."""
+        xyzw = Rotation.from_matrix(self.rotation(time_s)).as_quat()
+        wxyz = xyzw[:, [3, 0, 1, 2]]
+        flips = np.sign((wxyz[1:] * wxyz[:-1]).sum(axis=-1))
+        return wxyz * np.cumprod(np.concatenate([[1.0], flips]))[:, None]

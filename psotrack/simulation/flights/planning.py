@@ -1,0 +1,80 @@
+"""From a scenario and a seed to flights that keep the scenario's limits for its whole length."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.errors import SettingsError
+from psotrack.simulation.flights.checking import check_records, flying_order
+from psotrack.simulation.flights.limits import Excess, excess
+from psotrack.simulation.flights.motion import Flight
+from psotrack.simulation.flights.recordings import recorded_flight
+from psotrack.simulation.flights.varying import Turn, draws, heading_of, make, no_draws
+from psotrack.simulation.scenarios import Recording, Scenario, wrong
+
+#: Variations are tried in turn until limits hold; a scenario that fails this often cannot keep them.
+NUM_ATTEMPTS = 400
+#: Every so many frames are looked at first: most variations that fail do so there.
+_STRIDE = 6
+
+
+def frame_times_s(scenario: Scenario, num_frames: int) -> Float[np.ndarray, "frames"]:
+    """(frames,), the middle of each frame's exposure."""
+    return np.arange(num_frames) / scenario.fps
+
+
+def plan(scenario: Scenario, seed: int) -> tuple[Flight, ...]:
+    """One flight per drone, varied by the seed, all within the scenario's limits for its whole length.
+
+    Raises:
+        SettingsError: no variation keeps the limits, or flights do not make sense together; the message names the
+            field of the flight.
+        InputError: a recording cannot be used.
+    """
+    check_records(scenario)
+    flying_order(scenario)
+    time_s = frame_times_s(scenario, scenario.num_frames)
+    recorded = _recorded(scenario, time_s)
+    few_s = time_s[::_STRIDE]
+    excesses: list[Excess] = []
+    for attempt in range(NUM_ATTEMPTS):
+        rng = np.random.default_rng([seed, attempt])
+        flights = make(scenario, draws(scenario, rng), recorded)
+        found = excess(flights, scenario, few_s)
+        if not found:
+            found = excess(flights, scenario, time_s)
+            if not found:
+                return flights
+            # What failed at this frame will often fail there again.
+            few_s = np.append(few_s, found.time_s)
+        excesses.append(found)
+    raise _refusal(scenario, excess(make(scenario, no_draws(scenario), recorded), scenario, time_s), excesses)
+
+
+def _refusal(scenario: Scenario, nominal: Excess | None, varied: list[Excess]) -> SettingsError:
+    """Names what is wrong without any variation, or else what is wrong most often."""
+    if nominal:
+        return wrong(scenario, nominal.field, expected=nominal.limit, found=nominal.found)
+    (field, limit), times = Counter((one.field, one.limit) for one in varied).most_common(1)[0]
+    example = next(one for one in varied if (one.field, one.limit) == (field, limit))
+    return wrong(
+        scenario,
+        field,
+        expected=limit,
+        found=example.found,
+        remedy=f"{times} of {len(varied)} variations failed there: lower variation, or leave more room",
+    )
+
+
+def _recorded(scenario: Scenario, time_s: Float[np.ndarray, "frames"]) -> dict[int, Flight]:
+    """The flights that replay a recording, by the index of their drone; each is read once, and has all frames."""
+    recorded: dict[int, Flight] = {}
+    for index, drone in enumerate(scenario.drones):
+        if isinstance(drone.flight, Recording):
+            flight = recorded_flight(drone.flight, heading_of(drone, Turn(), scenario.variation))
+            flight.check(time_s)
+            recorded[index] = flight
+    return recorded

@@ -1,0 +1,205 @@
+"""From the records of a scenario to flights, moved by a draw as far as the scenario's variation allows.
+
+Formulas become sums of harmonics, so one kind of draw fits them all: a shift of phase, a size and a period per
+harmonic, and a shift of the centre. Drones of one group share their draw, headings apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from collections.abc import Sequence as Ordered
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.simulation.flights.checking import flying_order
+from psotrack.simulation.flights.formulas import (
+    DelayedFlight,
+    HarmonicFlight,
+    RelativeFlight,
+    WaypointFlight,
+)
+from psotrack.simulation.flights.motion import Flight, Heading
+from psotrack.simulation.scenarios import (
+    Crossing,
+    Drone,
+    FlightRecord,
+    Following,
+    Formation,
+    Harmonic,
+    Harmonics,
+    NearPass,
+    Orbit,
+    Recording,
+    Scenario,
+    Variation,
+    Vector,
+    Waypoints,
+)
+
+
+@dataclass(frozen=True)
+class Draw:
+    """Where between its extremes, -1 to 1, a seed puts each part of a flight.
+
+    Attributes:
+        phase, size, period: (harmonics,).
+        centre: (3,).
+        points: (points, 3), of waypoints.
+    """
+
+    phase: Float[np.ndarray, "harmonics"]
+    centre: Float[np.ndarray, "3"]
+    size: Float[np.ndarray, "harmonics"]
+    period: Float[np.ndarray, "harmonics"]
+    points: Float[np.ndarray, "points 3"]
+
+
+@dataclass(frozen=True)
+class Turn:
+    """Where between -1 and 1 a seed puts a heading, and where in its sway it begins."""
+
+    yaw: float = 0.0
+    sway_phase_rad: float = 0.0
+
+
+Draws = tuple[tuple[Draw, Turn], ...]
+
+
+def no_draws(scenario: Scenario) -> Draws:
+    """One per drone; they leave flights as the scenario has them."""
+    return tuple((_draw([drone], lambda *shape: np.zeros(shape)), Turn()) for drone in scenario.drones)
+
+
+def draws(scenario: Scenario, rng: np.random.Generator) -> Draws:
+    """One per drone; those of one group are the same, but for the turn."""
+    drawn: dict[str | int, Draw] = {}
+    result = []
+    for index, drone in enumerate(scenario.drones):
+        alike = [other for other in scenario.drones if other.group == drone.group] if drone.group else [drone]
+        group = drone.group or index
+        if group not in drawn:
+            drawn[group] = _draw(alike, lambda *shape: rng.uniform(-1, 1, shape))
+        turn = Turn(float(rng.uniform(-1, 1)), float(rng.uniform(0, 2 * np.pi)))
+        result.append((drawn[group], turn))
+    return tuple(result)
+
+
+def _draw(drones: Ordered[Drone], uniform: Callable[..., Float[np.ndarray, "*shape"]]) -> Draw:
+    """Enough for the longest of their flights."""
+    harmonics = max(_num_harmonics(drone.flight) for drone in drones)
+    points = max(len(drone.flight.points_m) if isinstance(drone.flight, Waypoints) else 0 for drone in drones)
+    return Draw(uniform(harmonics), uniform(3), uniform(harmonics), uniform(harmonics), uniform(points, 3))
+
+
+def _num_harmonics(record: FlightRecord) -> int:
+    if isinstance(record, Recording | Following):
+        return 0
+    # The period of waypoints is varied like that of a harmonic.
+    return 1 if isinstance(record, Waypoints) else len(_as_harmonics(record).terms)
+
+
+def make(scenario: Scenario, drawn: Draws, recorded: Mapping[int, Flight]) -> tuple[Flight, ...]:
+    """The flights, one per drone, moved by their draws.
+
+    Args:
+        drawn: one per drone.
+        recorded: the flights of those drones that replay a recording, by index; they stay as they are.
+
+    Raises:
+        SettingsError: a flight is relative to a drone that does not exist or, along a chain, to itself.
+    """
+    made: dict[int, Flight] = {}
+    for index in flying_order(scenario):
+        drone, (draw, turn) = scenario.drones[index], drawn[index]
+        heading = heading_of(drone, turn, scenario.variation)
+        match drone.flight:
+            case Recording():
+                made[index] = recorded[index]
+            case Following(leader=leader, delay_s=delay_s):
+                made[index] = DelayedFlight(made[leader - 1], delay_s, heading)
+            case Formation(leader=other) | NearPass(other=other) as record:
+                # A stated offset or distance is not varied.
+                unmoved = replace(draw, centre=np.zeros(3))
+                offset = _harmonic_flight(_as_harmonics(record), unmoved, scenario.variation, heading)
+                made[index] = RelativeFlight(made[other - 1], offset, heading)
+            case Waypoints() as record:
+                made[index] = _waypoint_flight(record, draw, scenario.variation, heading)
+            case record:
+                made[index] = _harmonic_flight(_as_harmonics(record), draw, scenario.variation, heading)
+    return tuple(made[index] for index in range(len(scenario.drones)))
+
+
+def heading_of(drone: Drone, turn: Turn, variation: Variation) -> Heading:
+    """Where the drone looks, moved by its draw."""
+    return Heading(
+        float(np.radians(drone.yaw_deg + turn.yaw * variation.yaw_deg)),
+        float(np.radians(drone.yaw_sway_deg)),
+        2 * np.pi / drone.yaw_period_s,
+        turn.sway_phase_rad,
+    )
+
+
+def _harmonic_flight(record: Harmonics, draw: Draw, variation: Variation, heading: Heading) -> HarmonicFlight:
+    amplitude = np.array([term.amplitude_m for term in record.terms], np.float64).reshape(-1, 3)
+    period_s = np.array([term.period_s for term in record.terms], np.float64)
+    phase_deg = np.array([term.phase_deg for term in record.terms], np.float64).reshape(-1, 3)
+    some = slice(len(record.terms))
+    return HarmonicFlight(
+        centre_m=np.array(record.centre_m, np.float64) + draw.centre * variation.centre_m,
+        amplitude_m=amplitude * (1 + variation.size * draw.size[some])[:, None],
+        angular_rad_s=2 * np.pi / (period_s * (1 + variation.period * draw.period[some])),
+        # One shift of phase per harmonic: its axes keep their relation, an orbit stays an orbit.
+        phase_rad=np.radians(phase_deg + (variation.phase_deg * draw.phase[some])[:, None]),
+        heading=heading,
+    )
+
+
+def _waypoint_flight(record: Waypoints, draw: Draw, variation: Variation, heading: Heading) -> WaypointFlight:
+    points_m = np.array(record.points_m, np.float64)
+    points_m = points_m + draw.points[: len(points_m)] * variation.centre_m
+    way_m = np.linalg.norm(np.roll(points_m, -1, axis=0) - points_m, axis=-1)
+    slower = float(1 + variation.period * draw.period[0])
+    return WaypointFlight(points_m, way_m / record.speed_m_s * slower, record.hover_s * slower, heading)
+
+
+def _as_harmonics(record: Harmonics | Orbit | Crossing | Formation | NearPass) -> Harmonics:
+    """The same flight, or offset from another, as a sum of harmonics."""
+    match record:
+        case Harmonics():
+            return record
+        case Orbit():
+            across = 180.0 if record.clockwise else 0.0
+            round_about = Harmonic(
+                amplitude_m=(*record.radius_m, 0.0),
+                period_s=record.period_s,
+                phase_deg=(record.phase_deg + 90.0, record.phase_deg + across, 0.0),
+            )
+            rise = Harmonic(
+                amplitude_m=(0.0, 0.0, record.rise_m),
+                period_s=record.rise_period_s,
+                phase_deg=(0.0, 0.0, record.rise_phase_deg),
+            )
+            return Harmonics(centre_m=record.centre_m, terms=(round_about, rise))
+        case Crossing():
+            start, end = np.array(record.start_m), np.array(record.end_m)
+            to_and_fro = Harmonic(
+                amplitude_m=_vector((end - start) / 2),
+                period_s=record.period_s,
+                phase_deg=(record.phase_deg - 90.0,) * 3,
+            )
+            return Harmonics(centre_m=_vector((start + end) / 2), terms=(to_and_fro,))
+        case Formation():
+            return Harmonics(centre_m=record.offset_m, terms=())
+        case NearPass():
+            side = np.array(record.side) / np.linalg.norm(record.side)
+            swing = Harmonic(
+                amplitude_m=record.swing_m, period_s=record.period_s, phase_deg=(record.phase_deg,) * 3
+            )
+            return Harmonics(centre_m=_vector(side * record.distance_m), terms=(swing,))
+
+
+def _vector(values: Float[np.ndarray, "3"]) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z

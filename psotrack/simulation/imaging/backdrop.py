@@ -1,0 +1,84 @@
+"""What a camera sees of the empty room: colour and depth, drawn once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as Ordered
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from psotrack.simulation.imaging.raster import Pinhole, View, draw, empty_buffers, full_view
+from psotrack.simulation.scenarios import Imaging
+from psotrack.simulation.world.rooms import Room, Surface
+
+#: Samples per pixel along each side, for edges and textures without stairs.
+_MAGNIFICATION = 2
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    """The empty room in one camera.
+
+    Attributes:
+        light: (height, width, 3), linear BGR.
+        depth_m: (height, width), along the optical axis, at pixel centres.
+        floor: (height, width), where the floor is seen.
+    """
+
+    light: Float[np.ndarray, "height width 3"]
+    depth_m: Float[np.ndarray, "height width"]
+    floor: Bool[np.ndarray, "height width"]
+
+
+def render(room: Room, cam: Pinhole, imaging: Imaging) -> Backdrop:
+    """Draw the empty room into one camera."""
+    number, depth = numbers_and_depth(room.surfaces, full_view(cam))
+    light = lens_blur(light_of(room.surfaces, cam, imaging.antialiasing), imaging.lens_blur_px)
+    return Backdrop(light, depth, np.equal(number, 0))
+
+
+def light_of(
+    surfaces: Ordered[Surface], cam: Pinhole, antialiasing: bool
+) -> Float[np.ndarray, "height width 3"]:
+    """(height, width, 3), linear BGR: light of textured surfaces, before the lens blurs it."""
+    view = full_view(cam, _MAGNIFICATION if antialiasing else 1)
+    number, _ = numbers_and_depth(surfaces, view)
+    light = np.zeros((*view.shape, 3), np.float32)
+    for index, surface in enumerate(surfaces):
+        seen = np.equal(number, index).astype(np.uint8)
+        x, y, width, height = cv2.boundingRect(seen)
+        if not width:
+            continue
+        H = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]]) @ view.K @ texel_to_camera(surface, cam)
+        window = cv2.warpPerspective(
+            surface.texture, H, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        cv2.copyTo(window, seen[y : y + height, x : x + width], light[y : y + height, x : x + width])
+    return cv2.resize(light, (cam.width, cam.height), interpolation=cv2.INTER_AREA)
+
+
+def numbers_and_depth(
+    surfaces: Ordered[Surface], view: View
+) -> tuple[Int[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"]]:
+    """Which surface is seen, -1 where none is, and its depth in metres along the optical axis."""
+    corners = np.stack([surface.corners_m for surface in surfaces])
+    triangles = corners[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3)
+    colours = np.repeat(np.arange(1.0, len(corners) + 1), 2)[:, None, None]
+    buffer, depth = empty_buffers(view)
+    draw(view, triangles, np.repeat(colours, 3, axis=-1), buffer, depth)
+    return buffer[..., 0].round().astype(np.int32) - 1, depth
+
+
+def lens_blur(light: Float[np.ndarray, "*shape"], sigma_px: float) -> Float[np.ndarray, "*shape"]:
+    """What the lens makes of light; the same light at 0."""
+    return cv2.GaussianBlur(light, (0, 0), sigma_px) if sigma_px > 0 else light
+
+
+def texel_to_camera(surface: Surface, cam: Pinhole) -> Float[np.ndarray, "3 3"]:
+    """(3, 3), from a texel (column, row, 1) to camera coordinates of that point of the surface."""
+    rows, columns = surface.texture.shape[:2]
+    edges = [cam.R @ edge for edge in (surface.along_m, surface.down_m)]
+    plane = np.column_stack([*edges, cam.R @ surface.corner_m + cam.t_m])
+    return plane @ np.array([[1 / columns, 0, 0.5 / columns], [0, 1 / rows, 0.5 / rows], [0, 0, 1]])

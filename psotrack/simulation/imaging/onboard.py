@@ -1,0 +1,206 @@
+"""The drones' own cameras: action cameras, fixed to the body, that see the room and the other drones.
+
+Every frame is drawn anew, several times: samples that lie elsewhere in the pixel and at another time of the exposure
+make edges without stairs and motion blur in one. The drone that carries the camera is not drawn, but its shadow: a
+camera at its nose sees nothing of it. The floor does not shine here.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import cv2
+import msgspec
+import numpy as np
+from jaxtyping import Float, UInt8, UInt16
+from scipy.spatial.transform import Rotation
+
+from psotrack.simulation.flights.planning import frame_times_s
+from psotrack.simulation.imaging import sensor
+from psotrack.simulation.imaging.backdrop import lens_blur
+from psotrack.simulation.imaging.painter import LIGHT_UNIT, RoomPainter, may_be_seen
+from psotrack.simulation.imaging.posing import PosedDrone, margin_px, pose, sample, windows
+from psotrack.simulation.imaging.raster import Pinhole, View, full_view
+from psotrack.simulation.imaging.shadows import FloorLight
+from psotrack.simulation.scenarios import OnboardCamera
+from psotrack.simulation.scene import Scene, image_size_wh
+from psotrack.simulation.world.rooms import room
+
+Image = UInt8[np.ndarray, "height width 3"]
+
+#: Samples per pixel: no fewer than edges without stairs take, and one for so many pixels of motion blur.
+_MIN_SAMPLES, _MAX_SAMPLES, _BLUR_PER_SAMPLE_PX = 4, 16, 1.5
+#: What is nearer than that may be blurred in steps.
+_NEAR_SCENERY_M = 1.5
+#: Additive recurrence of the plastic number, for points spread evenly over a square whatever their number (Roberts,
+#: "The unreasonable effectiveness of quasirandom sequences", 2018).
+_RECURRENCE = np.array([0.7548776662466927, 0.5698402909980532])
+
+
+def _display_table() -> UInt8[np.ndarray, "steps"]:
+    light = np.arange(np.iinfo(np.uint16).max + 1) / LIGHT_UNIT
+    return sensor.develop(np.tile(light[:, None, None], 3)).reshape(-1, 3)[:, 0]
+
+
+_DISPLAY = _display_table()
+
+
+class OnboardRenderer:
+    """Draws the frames of the camera on one drone of a scene."""
+
+    def __init__(self, scene: Scene, drone_index: int) -> None:
+        self.scene = scene
+        self.drone_index = drone_index
+        self.onboard = camera_record(scene)
+        self.K, (self.width, self.height) = intrinsics(scene)
+        imaging = msgspec.structs.replace(scene.scenario.imaging, shutter_s=self.onboard.shutter_s)
+        stream = sensor.ONBOARD_STREAM + drone_index
+        self.sensor = sensor.Sensor(imaging, scene.seed, stream, (self.height, self.width))
+        self._imaging = imaging
+        self._floor = FloorLight(scene)
+        self._painter = _room_painter(scene.scenario.hall, scene.scenario.markers, scene.scale)
+
+    def cam_at(self, time_s: float) -> Pinhole:
+        """The camera as it is at a time."""
+        return self._cams(np.array([time_s]))[0]
+
+    def frame(self, frame: int) -> Image:
+        """The frame as the sensor yields it, before the codec: BGR, (height, width, 3)."""
+        return self.sensor.expose(self.clean_frame(frame), frame, self.scene.time_s(frame))
+
+    def clean_frame(self, frame: int) -> Image:
+        """The frame without what the sensor adds: BGR, (height, width, 3)."""
+        time_s = self.scene.time_s(frame)
+        samples = self._samples(time_s)
+        during_s = time_s + samples[:, 2] * self.onboard.shutter_s
+        others = [i for i in range(len(self.scene.flights)) if i != self.drone_index]
+        posed = [pose(self.scene, drone, during_s) for drone in others]
+        total = np.zeros((self.height, self.width, 4), np.float32)
+        light = np.empty(total.shape, np.uint16)
+        for index, cam in enumerate(self._cams(during_s)):
+            view = replace(full_view(cam), shift_px=(float(samples[index, 0]), float(samples[index, 1])))
+            self._painter.paint(view, light)
+            self._draw_drones(light, view, [_at(drone, index) for drone in posed])
+            cv2.accumulate(light, total)
+        self._cast_shadows(total, len(samples), time_s)
+        blurred = lens_blur(cv2.cvtColor(total, cv2.COLOR_BGRA2BGR), self._imaging.lens_blur_px)
+        mean = cv2.addWeighted(blurred, 1 / len(samples), blurred, 0.0, 0.0, dtype=cv2.CV_16U)
+        return np.asarray(cv2.LUT(mean, _DISPLAY), np.uint8)
+
+    def _cams(self, time_s: Float[np.ndarray, "times"]) -> list[Pinhole]:
+        position_m, to_world = _poses(self.scene, self.drone_index, time_s)
+        return [
+            Pinhole(turn.T, -turn.T @ centre, self.K, self.width, self.height)
+            for centre, turn in zip(position_m, to_world, strict=True)
+        ]
+
+    def _samples(self, time_s: float) -> Float[np.ndarray, "samples 3"]:
+        """(samples, 3): where in the pixel (x, y) and when in the exposure (-1/2 to 1/2), their mean at 0."""
+        during_s = time_s + np.array([-0.5, 0.5]) * self.onboard.shutter_s
+        blur_px = self._motion_px(during_s)
+        num = int(np.clip(np.ceil(blur_px / _BLUR_PER_SAMPLE_PX), _MIN_SAMPLES, _MAX_SAMPLES))
+        points = np.empty((num, 3))
+        points[:, :2] = (np.arange(num)[:, None] * _RECURRENCE) % 1 * self._imaging.antialiasing
+        points[:, 2] = (np.arange(num) + 0.5) / num
+        return points - points.mean(axis=0)
+
+    def _motion_px(self, during_s: Float[np.ndarray, "2"]) -> float:
+        """How far the picture of scenery moves, at most, between two times."""
+        position_m, to_world = _poses(self.scene, self.drone_index, during_s)
+        turned_rad = Rotation.from_matrix(to_world[0].T @ to_world[1]).magnitude()
+        moved_m = np.linalg.norm(position_m[1] - position_m[0])
+        return float(self.K[0, 0] * (turned_rad + moved_m / _NEAR_SCENERY_M))
+
+    def _draw_drones(
+        self, light: UInt16[np.ndarray, "height width 4"], view: View, posed: list[PosedDrone]
+    ) -> None:
+        # One beside the camera reaches behind it and has no window, but is not seen.
+        visible = [drone for drone in posed if _may_be_seen(drone, view)]
+        for window, drones in windows(view, visible, margin_px(0.0)):
+            behind_m = self._painter.hiding_depth_m(
+                window, np.concatenate([drone.faces_m[0] for drone in drones])
+            )
+            seen = sample(window, drones, 0, behind_m)
+            part = light[window.slices]
+            mixed = seen[..., 3:] * part
+            mixed[..., :3] += LIGHT_UNIT * seen[..., :3]
+            part[...] = (mixed + 0.5).astype(np.uint16)
+
+    def _cast_shadows(
+        self, total: Float[np.ndarray, "height width 4"], num_samples: int, time_s: float
+    ) -> None:
+        """Darken the floor in a sum of samples, as it is in the middle of the exposure."""
+        if not (self._imaging.shadows or self._imaging.contact_shadows):
+            return
+        lost = cv2.convertScaleAbs(self._floor.floor_gain(time_s), alpha=-255, beta=255)
+        H = self._floor.to_image(self.cam_at(time_s))
+        seen = cv2.warpPerspective(lost, H, (self.width, self.height), flags=cv2.INTER_LINEAR)
+        # Above the horizon a pixel's line meets the floor behind the camera; there the floor sends nothing.
+        x, y, width, height = cv2.boundingRect(seen)
+        part = total[y : y + height, x : x + width]
+        floor = part[..., 3:] / np.float32(LIGHT_UNIT * num_samples)
+        part[..., :3] *= 1 - seen[y : y + height, x : x + width, None] / np.float32(255) * floor
+
+
+@functools.lru_cache(maxsize=1)
+def _room_painter(hall: str, with_markers: bool, scale: float) -> RoomPainter:
+    """The same for all drones."""
+    return RoomPainter(room(hall, with_markers, scale).surfaces)
+
+
+def camera_record(scene: Scene) -> OnboardCamera:
+    """The record of the cameras on drones; without one, what such cameras usually are."""
+    return scene.scenario.onboard or OnboardCamera()
+
+
+def intrinsics(scene: Scene) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
+    """(3, 3) intrinsics in pixels, centres at integers, and width and height, at the scene's scale."""
+    record, scale = camera_record(scene), scene.scale
+    sized = msgspec.structs.replace(scene.scenario, image_size_wh=record.image_size_wh)
+    K = np.eye(3)
+    for axis, (side, fov_deg) in enumerate(zip(record.image_size_wh, record.fov_deg, strict=True)):
+        K[axis, axis] = scale * side / 2 / np.tan(np.radians(fov_deg) / 2)
+        # The middle of the image lies between pixels where their number is even.
+        K[axis, 2] = scale * side / 2 - 0.5
+    return K, image_size_wh(sized, scale)
+
+
+def onboard_poses(
+    scene: Scene, drone_index: int, num_frames: int
+) -> tuple[Float[np.ndarray, "frames 3"], Float[np.ndarray, "frames 4"]]:
+    """Where a drone's camera is in the middle of each exposure.
+
+    Returns:
+        (frames, 3), its centre, world, metres; (frames, 4), unit quaternions (w, x, y, z), camera to world; the
+        camera's axes are x right, y down, z ahead.
+    """
+    position_m, to_world = _poses(scene, drone_index, frame_times_s(scene.scenario, num_frames))
+    wxyz = Rotation.from_matrix(to_world).as_quat(scalar_first=True)
+    # A sign that does not jump from one frame to the next.
+    flips = np.sign((wxyz[1:] * wxyz[:-1]).sum(axis=-1))
+    return position_m, wxyz * np.cumprod(np.concatenate([[1.0], flips]))[:, None]
+
+
+def _poses(
+    scene: Scene, drone_index: int, time_s: Float[np.ndarray, "times"]
+) -> tuple[Float[np.ndarray, "times 3"], Float[np.ndarray, "times 3 3"]]:
+    """(times, 3) centres of a drone's camera, and (times, 3, 3) rotations, camera to world."""
+    record, flight = camera_record(scene), scene.flights[drone_index]
+    pitch = np.radians(record.pitch_deg)
+    # Camera axes in the body frame: x ahead, y left, z up.
+    right = np.array([0.0, -1.0, 0.0])
+    ahead = np.array([np.cos(pitch), 0.0, np.sin(pitch)])
+    to_body = np.stack([right, np.cross(ahead, right), ahead], axis=-1)
+    rotation = flight.rotation(time_s)
+    return flight.position_m(time_s) + rotation @ np.array(record.position_m), rotation @ to_body
+
+
+def _may_be_seen(posed: PosedDrone, view: View) -> bool:
+    points = np.concatenate([posed.faces_m, posed.discs_m], axis=1).reshape(-1, 3)
+    return bool(may_be_seen((points @ view.cam.R.T + view.cam.t_m)[None], view.K, view.shape)[0])
+
+
+def _at(posed: PosedDrone, index: int) -> PosedDrone:
+    """A drone at one of its times."""
+    return replace(posed, faces_m=posed.faces_m[index : index + 1], discs_m=posed.discs_m[index : index + 1])

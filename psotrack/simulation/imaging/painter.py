@@ -1,0 +1,222 @@
+"""A room from anywhere, quickly: for cameras that move, whose frames have nothing in common.
+
+Surfaces are painted from far to near, each one a homography of its texture into the window where it is seen. Far parts
+take coarser textures (Williams, "Pyramidal parametrics", 1983). Edges and limits of textures' levels are half planes of
+the image: a piece of a plane is seen in a pixel if the pixel's ray lies in the cone that the piece spans with the eye.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt16
+
+from psotrack.simulation.imaging.backdrop import numbers_and_depth, texel_to_camera
+from psotrack.simulation.imaging.order import Order
+from psotrack.simulation.imaging.raster import View, empty_buffers
+from psotrack.simulation.world.rooms import Surface
+
+#: Light 1 as a number; lamps are three times as bright.
+LIGHT_UNIT = 16384
+
+#: Four channels, because OpenCV maps four faster than three: BGR, and how much of it the floor sends.
+Light = UInt16[np.ndarray, "rows columns 4"]
+#: A texture, and the map from its texels to those of the surface's own.
+Level = tuple[Light, Float[np.ndarray, "3 3"]]
+
+#: A texture is halved until a side is that short.
+_SMALLEST_PX = 8
+#: The largest texel that is taken, in pixels: a frame takes several samples per pixel, so it may be smaller. Where a
+#: surface is foreshortened, so are its texels, and many lie in a pixel; that far across is better than blurred along.
+_TEXEL_PX = 0.6
+_FORESHORTENED = 2.0
+#: Pixels by which pieces are wider than they are, so that no ray passes between two that share an edge.
+_OVERLAP_PX = 1e-6
+
+
+@dataclass(frozen=True)
+class _Spans:
+    """A convex part of an image: which columns of which rows."""
+
+    y: int
+    left: Int[np.ndarray, "rows"]
+    right: Int[np.ndarray, "rows"]
+
+
+class RoomPainter:
+    """Paints the empty room into any view of any camera; holds what this takes, and a buffer to work in."""
+
+    def __init__(self, surfaces: tuple[Surface, ...]) -> None:
+        self.surfaces = surfaces
+        self._order = Order(surfaces)
+        pieces = self._order.pieces
+        self._surface_of = [piece.surface for piece in pieces]
+        self._surface_normals = np.array([surface.normal for surface in surfaces])
+        self._surface_corners_m = np.array([surface.corner_m for surface in surfaces])
+        self._normals = self._surface_normals[self._surface_of]
+        # Corners that are there twice make no difference, and arrays of equal lengths.
+        most = max(len(piece.corners_m) for piece in pieces)
+        self._corners_m = np.stack(
+            [np.pad(p.corners_m, ((0, most - len(p.corners_m)), (0, 0)), mode="edge") for p in pieces]
+        )
+        # The first surface of a room is its floor.
+        self._levels = [_levels(surface, is_floor=not index) for index, surface in enumerate(surfaces)]
+        self._texel_m = [_texel_m(surface) for surface in surfaces]
+        self._buffer = np.empty(0, np.uint16)
+
+    def paint(self, view: View, image: Light) -> None:
+        """Paint what a view sees, one sample per pixel.
+
+        Args:
+            view: of magnification 1.
+            image: (rows, columns, 4), changed: BGR light, and 1 where the floor is seen, in `LIGHT_UNIT`.
+        """
+        cam, K = view.cam, view.K
+        eye_m = -cam.R.T @ cam.t_m
+        height_m = ((eye_m - self._corners_m[:, 0]) * self._normals).sum(axis=-1)
+        corners = self._corners_m @ cam.R.T + cam.t_m
+        seen = (height_m > 0) & may_be_seen(corners, K, view.shape)
+        image[...] = 0
+        for index in self._order.far_to_near(eye_m):
+            if seen[index]:
+                normal = cam.R @ self._normals[index]
+                self._paint_piece(image, view, index, corners[index], normal / height_m[index])
+
+    def hiding_depth_m(
+        self, view: View, faces_m: Float[np.ndarray, "faces 3 3"]
+    ) -> Float[np.ndarray, "rows columns"]:
+        """(rows, columns), depth of what may hide some faces, along the optical axis; very far where nothing does."""
+        points = faces_m.reshape(-1, 3)
+        lower, upper = points.min(axis=0), points.max(axis=0)
+        # The corner of the box around them that is farthest behind each plane.
+        farthest = np.where(self._surface_normals > 0, lower, upper)
+        beyond = ((farthest - self._surface_corners_m) * self._surface_normals).sum(axis=-1) < 0
+        eye_m = -view.cam.R.T @ view.cam.t_m
+        faced = ((eye_m - self._surface_corners_m) * self._surface_normals).sum(axis=-1) > 0
+        hiding = [self.surfaces[index] for index in np.flatnonzero(beyond & faced)]
+        return numbers_and_depth(hiding, view)[1] if hiding else empty_buffers(view)[1]
+
+    def _paint_piece(
+        self,
+        image: Light,
+        view: View,
+        index: int,
+        corners: Float[np.ndarray, "corners 3"],
+        normal_per_height: Float[np.ndarray, "3"],
+    ) -> None:
+        K, surface = view.K, self._surface_of[index]
+        to_rays = np.linalg.inv(K)
+        edges = np.cross(corners, np.roll(corners, -1, axis=0)) @ to_rays
+        # Along a ray (x, y, 1) to the plane, 1 / depth is linear in x and y.
+        nearness = -normal_per_height @ to_rays
+        height_m = 1 / float(np.linalg.norm(normal_per_height))
+        to_image = K @ texel_to_camera(self.surfaces[surface], view.cam)
+        for level, nearest, farthest in self._by_level(surface, corners[:, 2], height_m, K[0, 0]):
+            limits = [nearness - [0, 0, 1 / farthest]] if np.isfinite(farthest) else []
+            limits += [[0, 0, 1 / nearest] - nearness] if nearest > 0 else []
+            spans = _spans(np.vstack([edges, *limits]), view.shape)
+            if spans is not None:
+                texture, to_full_size = level
+                self._fill(image, spans, texture, to_image @ to_full_size)
+
+    def _by_level(
+        self, surface: int, depth_m: Float[np.ndarray, "corners"], height_m: float, focal_px: float
+    ) -> Iterator[tuple[Level, float, float]]:
+        """Levels of a texture that a piece needs, with the depths from which and up to which each is right."""
+        levels = self._levels[surface]
+        texel_px_m = focal_px * self._texel_m[surface]
+        nearest = 0.0
+        for index, level in enumerate(levels):
+            # Where the next level's texels are small enough.
+            scale = texel_px_m * 2 ** (index + 1) / _TEXEL_PX
+            farthest = min(scale, float(np.sqrt(_FORESHORTENED * height_m * scale)))
+            if index == len(levels) - 1 or depth_m.max() <= farthest:
+                yield level, nearest, np.inf
+                return
+            if depth_m.min() < farthest:
+                yield level, nearest, farthest
+                nearest = farthest
+
+    def _fill(
+        self,
+        image: Light,
+        spans: _Spans,
+        level: UInt16[np.ndarray, "texels_y texels_x 4"],
+        H: Float[np.ndarray, "3 3"],
+    ) -> None:
+        """Paint a level of a texture, whose texels H maps to pixels, into some spans."""
+        x1, x2 = int(spans.left.min()), int(spans.right.max()) + 1
+        window = image[spans.y : spans.y + len(spans.left), x1:x2]
+        if self._buffer.size < window.size:
+            self._buffer = np.empty(window.size, np.uint16)
+        # New memory for every piece would take as long as painting it.
+        painted = self._buffer[: window.size].reshape(window.shape)
+        H = np.array([[1, 0, -x1], [0, 1, -spans.y], [0, 0, 1.0]]) @ H
+        cv2.warpPerspective(level, H, window.shape[1::-1], dst=painted, flags=cv2.INTER_LINEAR)
+        column = np.arange(x1, x2, dtype=np.int16)
+        seen = (column >= spans.left[:, None]) & (column <= spans.right[:, None])
+        cv2.copyTo(painted, seen.view(np.uint8), window)
+
+
+def _texel_m(surface: Surface) -> float:
+    """The longer side of a texel."""
+    rows, columns = surface.texture.shape[:2]
+    return max(float(np.linalg.norm(surface.along_m)) / columns, float(np.linalg.norm(surface.down_m)) / rows)
+
+
+def _levels(surface: Surface, is_floor: bool) -> list[Level]:
+    """A texture at full size, half of it, ...; with the map from its texels to those of full size."""
+    rows, columns = surface.texture.shape[:2]
+    full = np.full((rows, columns, 4), LIGHT_UNIT * is_floor, np.uint16)
+    full[..., :3] = np.clip(surface.texture * LIGHT_UNIT + 0.5, 0, np.iinfo(np.uint16).max)
+    levels = []
+    level = full
+    while True:
+        y, x = rows / level.shape[0], columns / level.shape[1]
+        # One texel more around it: what is painted may lie half a texel beyond the middles of the outermost.
+        wider = cv2.copyMakeBorder(level, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
+        to_full = np.array([[x, 0, (x - 1) / 2 - x], [0, y, (y - 1) / 2 - y], [0, 0, 1.0]])
+        levels.append((np.asarray(wider, np.uint16), to_full))
+        half = [-(-side // 2) for side in level.shape[1::-1]]
+        if min(half) < _SMALLEST_PX:
+            return levels
+        level = np.asarray(cv2.resize(level, half, interpolation=cv2.INTER_AREA), np.uint16)
+
+
+def may_be_seen(
+    corners: Float[np.ndarray, "pieces corners 3"], K: Float[np.ndarray, "3 3"], shape: tuple[int, int]
+) -> Bool[np.ndarray, "pieces"]:
+    """(pieces,), whether no side of the image, nor its back, has all corners of a piece beyond it."""
+    x, y, depth = np.moveaxis(corners @ K.T, -1, 0)
+    rows, columns = shape
+    beyond = [
+        x < -0.5 * depth,
+        y < -0.5 * depth,
+        x > (columns - 0.5) * depth,
+        y > (rows - 0.5) * depth,
+        depth <= 0,
+    ]
+    return ~np.any([side.all(axis=-1) for side in beyond], axis=0)
+
+
+def _spans(half_planes: Float[np.ndarray, "edges 3"], shape: tuple[int, int]) -> _Spans | None:
+    """Where a x + b y + c >= 0 for every (a, b, c); None where that is nowhere."""
+    rows, columns = shape
+    a, b, c = half_planes.T[..., None]
+    y = np.arange(rows)
+    steep = np.abs(a) > 1e-12 * np.abs(half_planes).max(axis=1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        bound = -(b * y + c) / a
+    left = np.where(steep & (a > 0), bound, -np.inf).max(axis=0) - _OVERLAP_PX
+    right = np.where(steep & (a < 0), bound, np.inf).min(axis=0) + _OVERLAP_PX
+    seen = (steep | (b * y + c >= 0)).all(axis=0)
+    left = np.ceil(np.clip(left, 0, columns))
+    right = np.floor(np.clip(right, -1, columns - 1))
+    found = np.flatnonzero(seen & (left <= right))
+    if not len(found):
+        return None
+    part = slice(found[0], found[-1] + 1)
+    return _Spans(int(found[0]), left[part].astype(np.int16), right[part].astype(np.int16))

@@ -1,0 +1,138 @@
+"""The glossy floor, a mirror of a few per cent: the room in it is drawn once, drones in every frame.
+
+What the floor z = 0 mirrors is seen as if it were below it, at -z, through the floor. So the mirrored room has a depth
+buffer of its own, and hides the mirrored drones behind its furniture as the room hides the drones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from psotrack.simulation.imaging import sensor
+from psotrack.simulation.imaging.backdrop import Backdrop, lens_blur, light_of, numbers_and_depth
+from psotrack.simulation.imaging.posing import MIRRORED, PosedDrone, average, margin_px, windows
+from psotrack.simulation.imaging.raster import Pinhole, full_view
+from psotrack.simulation.scenarios import Imaging
+from psotrack.simulation.world.rooms import Room
+
+#: Standard deviation of the directions that one direction is mirrored into.
+ROUGHNESS_RAD = 0.006
+#: Of eight passes, those that blurred mirror images are drawn in; their mean is the exposure's middle.
+_PASSES = (0, 3, 4, 7)
+#: The mirrored room is blurred that many times, from not at all to as much as far things are.
+_BLURS = 4
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """The floor's mirror image of the empty room in one camera.
+
+    Attributes:
+        share: (height, width), of light that the floor mirrors; 0 where it is not seen.
+        light: (height, width, 3), linear BGR, of the mirrored room.
+        depth_m: (height, width), of the mirrored room, along the optical axis.
+    """
+
+    cam: Pinhole
+    share: Float[np.ndarray, "height width"]
+    light: Float[np.ndarray, "height width 3"]
+    depth_m: Float[np.ndarray, "height width"]
+
+    def on(self, empty: Backdrop) -> Backdrop:
+        """The room with its mirror image on the floor."""
+        share = self.share[..., None]
+        return replace(empty, light=(1 - share) * empty.light + share * self.light)
+
+    def share_of_rest(self, light: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:
+        """(height, width), how much of the light that comes from each pixel is not mirrored."""
+        return 1 - self.share * self.light.sum(axis=-1) / np.maximum(light.sum(axis=-1), 1e-6)
+
+    def reflect(
+        self,
+        image: UInt8[np.ndarray, "height width 3"],
+        posed: list[PosedDrone],
+        samples: Float[np.ndarray, "passes 3"],
+        lens_blur_px: float,
+    ) -> None:
+        """Add the mirror images of drones to an image of the room and its mirror image."""
+        passes = [index for index in _PASSES if index < len(samples)]
+        samples = samples[passes] - samples[passes].mean(axis=0)
+        below = [drone.mirrored(passes) for drone in posed]
+        widest_px = max((self._blur_px([drone], lens_blur_px) for drone in below), default=0.0)
+        for window, drones in windows(full_view(self.cam), below, margin_px(widest_px)):
+            share = self.share[window.slices][..., None]
+            if not share.any():
+                continue
+            seen = average(window, drones, samples, self.depth_m[window.slices])
+            seen = lens_blur(seen, self._blur_px(drones, lens_blur_px))
+            part = image[window.slices]
+            change = seen[..., :3] + (seen[..., 3:] - 1) * self.light[window.slices]
+            part[...] = sensor.develop(sensor.undevelop(part) + share * change)
+
+    def _blur_px(self, below: list[PosedDrone], lens_blur_px: float) -> float:
+        """Standard deviation of the blur of mirrored drones: the more the farther they are behind the mirror."""
+        depth_m = -float(np.mean([drone.faces_m[0, :, :, 2].mean() for drone in below]))
+        eye_m = -float((self.cam.R.T @ self.cam.t_m)[2])
+        roughness_px = ROUGHNESS_RAD * self.cam.K[0, 0] * depth_m / (depth_m + eye_m)
+        return float(np.hypot(roughness_px, lens_blur_px))
+
+
+def mirror(room: Room, cam: Pinhole, imaging: Imaging, empty: Backdrop) -> Mirror:
+    """The mirror image of a room in one camera.
+
+    Args:
+        room: its first surface is the floor.
+        cam: above the floor.
+        imaging: its `reflections` is the share at normal incidence.
+        empty: the room without reflections, in that camera.
+    """
+    below = [
+        replace(
+            surface,
+            corner_m=surface.corner_m * MIRRORED,
+            along_m=surface.along_m * MIRRORED,
+            down_m=surface.down_m * MIRRORED,
+        )
+        for surface in room.surfaces[1:]
+    ]
+    _, depth = numbers_and_depth(below, full_view(cam))
+    light = light_of(below, cam, imaging.antialiasing)
+    beyond = np.clip(1 - empty.depth_m / depth, 0, 1)
+    share = fresnel(_cosine_to_floor(cam), imaging.reflections) * _cover(empty.floor, imaging)
+    return Mirror(cam, share, _blurred(light, beyond, ROUGHNESS_RAD * cam.K[0, 0], imaging), depth)
+
+
+def fresnel(cosine: Float[np.ndarray, "*shape"], at_normal: float) -> Float[np.ndarray, "*shape"]:
+    """Share of light that is mirrored at an angle of incidence (Schlick, 1994): all of it at grazing incidence."""
+    return at_normal + (1 - at_normal) * (1 - cosine) ** 5
+
+
+def _cover(floor: Bool[np.ndarray, "height width"], imaging: Imaging) -> Float[np.ndarray, "height width"]:
+    """(height, width), how much of a pixel is floor, as far as the lens lets it be told."""
+    return lens_blur(floor.astype(np.float32), imaging.lens_blur_px)
+
+
+def _cosine_to_floor(cam: Pinhole) -> Float[np.ndarray, "height width"]:
+    """(height, width), of the angle between the line of sight and the floor's normal; 0 above the horizon."""
+    to_world = (cam.R.T @ np.linalg.inv(cam.K)).astype(np.float32)
+    x, y = np.arange(cam.width, dtype=np.float32), np.arange(cam.height, dtype=np.float32)[:, None]
+    rays = [row[0] * x + row[1] * y + row[2] for row in to_world]
+    return np.clip(-rays[2] / np.sqrt(rays[0] ** 2 + rays[1] ** 2 + rays[2] ** 2), 0, 1)
+
+
+def _blurred(
+    light: Float[np.ndarray, "height width 3"],
+    beyond: Float[np.ndarray, "height width"],
+    sigma_px: float,
+    imaging: Imaging,
+) -> Float[np.ndarray, "height width 3"]:
+    """The mirrored room, the more blurred the farther behind the mirror: what stands on the floor has a sharp foot."""
+    mixed = np.zeros_like(light)
+    for step in range(_BLURS):
+        blur_px = np.hypot(sigma_px * step / (_BLURS - 1), imaging.lens_blur_px)
+        weight = np.clip(1 - np.abs(beyond * (_BLURS - 1) - step), 0, None)
+        mixed += weight[..., None] * lens_blur(light, float(blur_px))
+    return mixed

@@ -1,0 +1,62 @@
+"""Frames: the backdrop with drones, their shadows and their mirror images drawn into it, then the sensor.
+
+Only windows around drones and their mirror images are drawn anew in each frame.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import UInt8
+
+from psotrack.simulation.imaging import backdrop, reflections, sensor
+from psotrack.simulation.imaging.backdrop import Backdrop, lens_blur
+from psotrack.simulation.imaging.posing import PosedDrone, average, margin_px, pass_samples, pose, windows
+from psotrack.simulation.imaging.raster import Pinhole, View, full_view, pinhole
+from psotrack.simulation.imaging.reflections import Mirror
+from psotrack.simulation.imaging.shadows import FloorShadows
+from psotrack.simulation.scene import Scene
+
+Image = UInt8[np.ndarray, "height width 3"]
+
+
+class CameraRenderer:
+    """Draws the frames of one camera of a scene; holds what stays the same between them."""
+
+    def __init__(self, scene: Scene, camera_index: int) -> None:
+        imaging = scene.scenario.imaging
+        self.scene = scene
+        self.camera_index = camera_index
+        self.cam: Pinhole = pinhole(scene.rig.cameras[camera_index])
+        self.backdrop: Backdrop = backdrop.render(scene.room, self.cam, imaging)
+        self.mirror: Mirror | None = None
+        if imaging.reflections:
+            self.mirror = reflections.mirror(scene.room, self.cam, imaging, self.backdrop)
+            self.backdrop = self.mirror.on(self.backdrop)
+        self.shadows = FloorShadows(scene, self.cam, self.backdrop, self.mirror)
+        self.sensor = sensor.Sensor(imaging, scene.seed, camera_index, self.backdrop.depth_m.shape)
+        self._clean: Image = sensor.develop(self.backdrop.light)
+        self._samples = pass_samples(imaging)
+
+    def clean_frame(self, frame: int) -> Image:
+        """The frame without what the sensor adds: BGR, (height, width, 3)."""
+        image = self._clean.copy()
+        imaging = self.scene.scenario.imaging
+        time_s = self.scene.time_s(frame)
+        self.shadows.cast(image, time_s)
+        during_s = time_s + self._samples[:, 2] * imaging.shutter_s
+        posed = [pose(self.scene, drone, during_s) for drone in range(len(self.scene.flights))]
+        if self.mirror is not None:
+            self.mirror.reflect(image, posed, self._samples, imaging.lens_blur_px)
+        for window, drones in windows(full_view(self.cam), posed, margin_px(imaging.lens_blur_px)):
+            self._draw_drones(image, window, drones)
+        return image
+
+    def frame(self, frame: int) -> Image:
+        """The frame as the sensor yields it, before the codec: BGR, (height, width, 3)."""
+        return self.sensor.expose(self.clean_frame(frame), frame, self.scene.time_s(frame))
+
+    def _draw_drones(self, image: Image, window: View, drones: list[PosedDrone]) -> None:
+        seen = average(window, drones, self._samples, self.backdrop.depth_m[window.slices])
+        seen = lens_blur(seen, self.scene.scenario.imaging.lens_blur_px)
+        part = image[window.slices]
+        part[...] = sensor.develop(seen[..., :3] + seen[..., 3:] * sensor.undevelop(part))

@@ -1,0 +1,1 @@
+"""The thirteen simulated sequences of the dataset, one TOML file each."""

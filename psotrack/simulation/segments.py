@@ -1,0 +1,171 @@
+"""Videos, masks and detections in segments: some frames of one camera, whole or absent, drawn by any process.
+
+A segment depends on the scene and its frames alone, so neither the number of processes nor an interruption changes
+what is joined of them in the end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence as Ordered
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from psotrack.datasets.dpjait import DETECTIONS, MASKS, MaskWriter, join_archives, write_detections
+from psotrack.detections import Detections
+from psotrack.files import written_whole
+from psotrack.progress import Advance
+from psotrack.simulation.imaging.onboard import OnboardRenderer
+from psotrack.simulation.imaging.raster import Pinhole
+from psotrack.simulation.imaging.renderer import CameraRenderer
+from psotrack.simulation.labels.detector import detect
+from psotrack.simulation.labels.masks import Silhouette, silhouettes
+from psotrack.simulation.scene import Scene
+from psotrack.video import VideoWriter, join_videos
+
+#: Frames per segment: ten groups of pictures of the codec, and some ten seconds of work that an interruption costs.
+SEGMENT_FRAMES = 120
+_VIDEO, _BOXES, _MASKS = "video.avi", "detections.csv", "masks.zip"
+
+
+@dataclass(frozen=True)
+class Stream:
+    """What one camera sees over time: a static one, or that of a drone.
+
+    Attributes:
+        name: the camera's.
+        index: of the static camera, or of the drone.
+        onboard: which of the two.
+    """
+
+    name: str
+    index: int
+    onboard: bool = False
+
+    @property
+    def video_file(self) -> str:
+        """The name of its video."""
+        return f"{self.name}_s.avi"
+
+
+@dataclass(frozen=True)
+class Work:
+    """Segments of one stream that one process draws, one after the other.
+
+    Attributes:
+        scene: what is seen.
+        stream: by which camera.
+        masks: whether to write the drones' masks.
+        folder: of the stream's segments.
+        segments: the frames of each.
+    """
+
+    scene: Scene
+    stream: Stream
+    masks: bool
+    folder: Path
+    segments: tuple[range, ...]
+
+
+def segments(num_frames: int) -> list[range]:
+    """The frames of each segment."""
+    starts = range(0, num_frames, SEGMENT_FRAMES)
+    return [range(start, min(start + SEGMENT_FRAMES, num_frames)) for start in starts]
+
+
+def segment_folder(folder: Path, frames: range) -> Path:
+    """Where a segment is, once it is whole."""
+    return folder / f"{frames.start:06d}"
+
+
+def draw(work: Work, advance: Advance) -> None:
+    """Draw segments; `advance` counts frames."""
+    scene, stream = work.scene, work.stream
+    artist = OnboardRenderer(scene, stream.index) if stream.onboard else CameraRenderer(scene, stream.index)
+    for frames in work.segments:
+        with written_whole(segment_folder(work.folder, frames)) as temporary:
+            temporary.mkdir()
+            if isinstance(artist, CameraRenderer):
+                _draw_static(work, artist, temporary, frames, advance)
+            else:
+                _draw_onboard(work, artist, temporary, frames, advance)
+
+
+def join(stream: Stream, parts: Ordered[Path], folder: Path) -> None:
+    """Write a stream's video and, if it is a static camera's, its detections into `folder`, and free the disk.
+
+    Args:
+        stream: whose files they are.
+        parts: its segments, in order.
+        folder: of the sequence.
+
+    Raises:
+        OutputError: a file cannot be written; nothing is freed then.
+    """
+    if not stream.onboard:
+        with written_whole(folder / DETECTIONS / f"{stream.name}_s.csv") as temporary:
+            temporary.write_bytes(b"".join((part / _BOXES).read_bytes() for part in parts))
+    video = folder / stream.video_file
+    if not video.exists():
+        join_videos(video, [part / _VIDEO for part in parts])
+    for part in parts:
+        (part / _VIDEO).unlink(missing_ok=True)
+
+
+def join_masks(parts: Ordered[Path], folder: Path) -> None:
+    """Write the archive of all masks into `folder`.
+
+    Args:
+        parts: the segments of all static cameras, in order.
+        folder: of the sequence.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    join_archives(folder / MASKS, [part / _MASKS for part in parts])
+
+
+def _draw_static(work: Work, renderer: CameraRenderer, folder: Path, frames: range, advance: Advance) -> None:
+    scene, stream, cam = work.scene, work.stream, renderer.cam
+    found = []
+    with contextlib.ExitStack() as stack:
+        video = stack.enter_context(VideoWriter(folder / _VIDEO, scene.scenario.fps, (cam.width, cam.height)))
+        masks = stack.enter_context(MaskWriter(folder / _MASKS)) if work.masks else None
+        for frame in frames:
+            video.write(renderer.frame(frame))
+            drones = silhouettes(scene, cam, renderer.backdrop.depth_m, frame)
+            found.append(detect(scene, stream.index, frame, drones))
+            if masks is not None:
+                _write_masks(masks, stream.name, frame, drones, scene, cam)
+            advance(1)
+    write_detections(folder / _BOXES, _concatenated(found))
+
+
+def _draw_onboard(
+    work: Work, renderer: OnboardRenderer, folder: Path, frames: range, advance: Advance
+) -> None:
+    size_wh = (renderer.width, renderer.height)
+    with VideoWriter(folder / _VIDEO, work.scene.scenario.fps, size_wh) as video:
+        for frame in frames:
+            video.write(renderer.frame(frame))
+            advance(1)
+
+
+def _write_masks(
+    writer: MaskWriter, camera: str, frame: int, drones: Ordered[Silhouette], scene: Scene, cam: Pinhole
+) -> None:
+    """One mask per drone of the scene, black where the camera has none of it."""
+    in_view = {one.number: one.mask() for one in drones}
+    black = np.zeros((cam.height, cam.width), bool)
+    for number in range(1, len(scene.flights) + 1):
+        writer.write(camera, number, frame, in_view.get(number, black))
+
+
+def _concatenated(found: Ordered[Detections]) -> Detections:
+    return Detections(
+        np.concatenate([one.frame for one in found]),
+        np.concatenate([one.xyxy for one in found]),
+        np.concatenate([one.confidence for one in found]),
+    )

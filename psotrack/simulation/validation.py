@@ -1,0 +1,157 @@
+"""What a scenario cannot say of itself: whether it fits the halls, the rigs and the models that there are."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from psotrack.simulation.flights.motion import Flight
+from psotrack.simulation.flights.planning import frame_times_s
+from psotrack.simulation.scenarios import CameraPlace, OnboardCamera, Scenario, Vector, wrong
+from psotrack.simulation.world.drones import MODELS
+from psotrack.simulation.world.halls import HALLS, RIGS, Hall
+
+#: Pixels of a camera are square to within this share; the paper's GoPro is to within 0.0002.
+_SQUARE = 0.05
+
+
+def check(scenario: Scenario) -> None:
+    """Refuse a scenario that cannot be drawn, before flights are planned.
+
+    Raises:
+        SettingsError: hall, rig or model do not exist; a camera is not in the hall, or in a piece of furniture, or
+            looks nowhere; the limits are not in the hall; exposures are longer than a frame, or the camera on board
+            has no pinhole image. The message names the field.
+    """
+    _check_named(scenario)
+    hall = HALLS[scenario.hall]
+    for index, place in enumerate(camera_places(scenario)):
+        _check_camera(scenario, index, place, hall)
+    _check_bounds(scenario, hall)
+    _check_exposure(scenario, "imaging.shutter_s", scenario.imaging.shutter_s)
+    if scenario.onboard:
+        _check_exposure(scenario, "onboard.shutter_s", scenario.onboard.shutter_s)
+        _check_onboard(scenario, scenario.onboard)
+
+
+def check_flights(scenario: Scenario, flights: tuple[Flight, ...]) -> None:
+    """Refuse flights through furniture.
+
+    Raises:
+        SettingsError: which drone's, where and when.
+    """
+    time_s = frame_times_s(scenario, scenario.num_frames)
+    for index, flight in enumerate(flights):
+        position_m = flight.position_m(time_s)
+        hit = _in_furniture(position_m, HALLS[scenario.hall])
+        if hit.any():
+            at = int(np.argmax(hit))
+            x, y, z = position_m[at]
+            raise wrong(
+                scenario,
+                f"drones[{index}].flight",
+                expected="a way around the furniture",
+                found=f"[{x:.3f}, {y:.3f}, {z:.3f}] at {time_s[at]:.2f} s, inside of it",
+            )
+
+
+def camera_places(scenario: Scenario) -> tuple[CameraPlace, ...]:
+    """The cameras of a scenario, those of a named rig looked up.
+
+    Raises:
+        SettingsError: there is no rig of that name; the message lists those there are.
+    """
+    if not isinstance(scenario.cameras, str):
+        return scenario.cameras
+    if scenario.cameras not in RIGS:
+        raise wrong(
+            scenario, "cameras", expected=f"one of {', '.join(RIGS)}, or a list", found=scenario.cameras
+        )
+    return RIGS[scenario.cameras]
+
+
+def _check_named(scenario: Scenario) -> None:
+    if scenario.hall not in HALLS:
+        raise wrong(scenario, "hall", expected=f"one of {', '.join(HALLS)}", found=scenario.hall)
+    for index, drone in enumerate(scenario.drones):
+        if isinstance(drone.model, str) and drone.model not in MODELS:
+            expected = f"one of {', '.join(MODELS)}, or a mesh"
+            raise wrong(scenario, f"drones[{index}].model", expected=expected, found=drone.model)
+
+
+def _check_camera(scenario: Scenario, index: int, place: CameraPlace, hall: Hall) -> None:
+    of_rig = isinstance(scenario.cameras, str)
+    field = "cameras" if of_rig else f"cameras[{index}].position_m"
+    found = f"{list(place.position_m)}" + (f" of camera {index + 1} of {scenario.cameras}" if of_rig else "")
+    if not _inside(place.position_m, hall):
+        raise wrong(scenario, field, expected=f"a place in the hall, {_extent(hall)}", found=found)
+    if _in_furniture(np.array([place.position_m]), hall).any():
+        raise wrong(scenario, field, expected="a place outside of the furniture", found=found)
+    away = np.subtract(place.target_m, place.position_m)
+    if np.hypot(away[0], away[1]) < 1e-6:
+        raise wrong(
+            scenario,
+            f"cameras[{index}].target_m",
+            expected="a point beside the camera, not at its place, above or below",
+            found=f"{list(place.target_m)}",
+        )
+
+
+def _check_bounds(scenario: Scenario, hall: Hall) -> None:
+    limits = scenario.limits
+    for name in ("lower_m", "upper_m"):
+        corner = getattr(limits, name)
+        if not _inside(corner, hall):
+            raise wrong(
+                scenario,
+                f"limits.{name}",
+                expected=f"a point in the hall, {_extent(hall)}",
+                found=f"{list(corner)}",
+            )
+    if not np.all(np.less(limits.lower_m, limits.upper_m)):
+        raise wrong(
+            scenario,
+            "limits.lower_m",
+            expected=f"less than limits.upper_m, {list(limits.upper_m)}, along each axis",
+            found=f"{list(limits.lower_m)}",
+        )
+
+
+def _check_exposure(scenario: Scenario, field: str, shutter_s: float) -> None:
+    if shutter_s > 1 / scenario.fps:
+        expected = f"at most {1 / scenario.fps:g} s, the time between two frames"
+        raise wrong(scenario, field, expected=expected, found=f"{shutter_s:g}")
+
+
+def _check_onboard(scenario: Scenario, camera: OnboardCamera) -> None:
+    if max(camera.fov_deg) >= 180:
+        raise wrong(
+            scenario, "onboard.fov_deg", expected="angles below 180 degrees", found=f"{list(camera.fov_deg)}"
+        )
+    half_width, half_height = np.tan(np.radians(camera.fov_deg) / 2)
+    width, height = camera.image_size_wh
+    if abs(half_width * height / (half_height * width) - 1) > _SQUARE:
+        fits = np.degrees(2 * np.arctan(half_width * height / width))
+        raise wrong(
+            scenario,
+            "onboard.fov_deg",
+            expected=f"angles that fit {width} x {height} square pixels, {camera.fov_deg[0]:g} and {fits:.4g}",
+            found=f"{list(camera.fov_deg)}",
+        )
+
+
+def _inside(point_m: Vector, hall: Hall) -> bool:
+    length, width, height = hall.size_m
+    return abs(point_m[0]) < length / 2 and abs(point_m[1]) < width / 2 and 0 < point_m[2] < height
+
+
+def _extent(hall: Hall) -> str:
+    length, width, height = hall.size_m
+    return f"x within {length / 2:g} m of 0, y within {width / 2:g} m, z from 0 to {height:g} m"
+
+
+def _in_furniture(points_m: Float[np.ndarray, "points 3"], hall: Hall) -> Bool[np.ndarray, "points"]:
+    """(points,), whether a point is in one of the hall's boxes."""
+    corners = np.array([(box.lower_m, box.upper_m) for box in hall.boxes]).reshape(-1, 2, 3)
+    inside = (points_m[:, None] >= corners[:, 0]) & (points_m[:, None] <= corners[:, 1])
+    return np.any(np.all(inside, axis=-1), axis=-1)

@@ -1,0 +1,114 @@
+"""Drones from mesh files: OBJ and PLY."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.errors import InputError
+from psotrack.simulation.scenarios import Mesh
+from psotrack.simulation.world.models import DroneModel
+from psotrack.simulation.world.shapes import Triangles
+
+_SUFFIXES = (".obj", ".ply")
+#: What a drone may measure over all: smaller or larger is a file in other units.
+_SMALLEST_M, _LARGEST_M = 0.02, 3.0
+#: Faces of less are lines or points to any camera, and have no normal.
+_NO_AREA_M2 = 1e-12
+
+
+def load(mesh: Mesh) -> DroneModel:
+    """A user's own drone.
+
+    Polygons become triangles, faces without an area are left out; colours, textures and materials are ignored: all
+    of it has the drone's paint.
+
+    Args:
+        mesh: the file, and how it lies in the body frame.
+
+    Raises:
+        InputError: there is no such file, it is no mesh, has no faces, or is not of a drone's size in metres.
+    """
+    path = Path(mesh.file)
+    triangles = mesh.scale * _read(path) - np.array(mesh.origin_m)
+    if not np.isfinite(triangles).all():
+        raise InputError(
+            path, expected="numbers as vertices", found="NaN or infinity", remedy="export it again"
+        )
+    kept = triangles[_area_m2(triangles) > _NO_AREA_M2]
+    if not len(kept):
+        found = f"{len(triangles)} without" if len(triangles) else "no faces"
+        raise InputError(
+            path, expected="faces with an area", found=found, remedy="export a surface, not points or lines"
+        )
+    _check_size(path, mesh, kept.reshape(-1, 3))
+    hubs = np.array([rotor.centre_m for rotor in mesh.rotors], float).reshape(-1, 3)
+    radii = np.array([rotor.radius_m for rotor in mesh.rotors], float)
+    return DroneModel(kept, np.ones(len(kept)), hubs, radii)
+
+
+def _read(path: Path) -> Triangles:
+    """The triangles of a file, in its own units."""
+    suffix = path.suffix.lower()
+    if suffix not in _SUFFIXES:
+        raise InputError(
+            path,
+            expected="a mesh, .obj or .ply",
+            found=path.suffix or "no suffix",
+            remedy="export the drone as one of these",
+        )
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(
+            path, expected="a mesh file", found=error.strerror or str(error), remedy="check the drone's model"
+        ) from error
+    # It takes a while to import, and few scenarios need it.
+    import trimesh
+
+    try:
+        # Names of parts and comments may be in any encoding; nothing depends on them.
+        file = io.StringIO(content.decode(errors="replace")) if suffix == ".obj" else io.BytesIO(content)
+        read = trimesh.load_mesh(file, file_type=suffix[1:], process=False, skip_materials=True)
+        vertices, faces = np.asarray(read.vertices, float), np.asarray(read.faces, int)
+    # Each of its parsers fails in its own way.
+    except Exception as error:
+        raise InputError(
+            path, expected="a mesh", found=f"what cannot be read as one ({error})", remedy="export it again"
+        ) from error
+    if faces.size and not 0 <= faces.min() <= faces.max() < len(vertices):
+        raise InputError(
+            path,
+            expected=f"faces of its {len(vertices)} vertices",
+            found=f"vertex {faces.min() if faces.min() < 0 else faces.max()}",
+            remedy="export it again",
+        )
+    return vertices[faces].reshape(-1, 3, 3)
+
+
+def _area_m2(triangles: Triangles) -> Float[np.ndarray, "faces"]:
+    a, b, c = triangles.swapaxes(0, 1)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=-1) / 2
+
+
+def _check_size(path: Path, mesh: Mesh, points_m: Float[np.ndarray, "points 3"]) -> None:
+    """Raise `InputError` unless points in the body frame are a drone's."""
+    extent = float(np.ptp(points_m, axis=0).max())
+    if not _SMALLEST_M <= extent <= _LARGEST_M:
+        raise InputError(
+            path,
+            expected=f"a drone of {_SMALLEST_M:g} to {_LARGEST_M:g} m over all",
+            found=f"{extent:.3g} m",
+            remedy="set scale to metres per unit of the file (0.001 for millimetres)",
+        )
+    if np.abs(points_m).max() > _LARGEST_M:
+        middle = (points_m.min(axis=0) + points_m.max(axis=0)) / 2 + mesh.origin_m
+        raise InputError(
+            path,
+            expected="the body origin in or near the drone",
+            found=f"the drone's middle at ({', '.join(f'{at:.3g}' for at in middle)}) m",
+            remedy="set origin_m to about that",
+        )

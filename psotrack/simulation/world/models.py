@@ -1,0 +1,89 @@
+"""What a drone is to the simulator: faces, rotors, and the cross of mocap markers on top of it."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+#: Corners of a rotor disc's rim.
+_DISC_SIDES = 20
+#: Markers stand on masts, clear of everything that could hide them from above.
+_MAST_M = 0.03
+
+
+@dataclass(frozen=True)
+class DroneModel:
+    """A drone's shape in its body frame.
+
+    Attributes:
+        triangles_m: (faces, 3, 3), corners counter-clockwise seen from outside.
+        paint: (faces,), how much of the drone's own paint a face has; the rest is dark plastic.
+        rotor_centres_m: (rotors, 3), hubs; discs lie level in the body frame.
+        rotor_radii_m: (rotors,).
+    """
+
+    triangles_m: Float[np.ndarray, "faces 3 3"]
+    paint: Float[np.ndarray, "faces"]
+    rotor_centres_m: Float[np.ndarray, "rotors 3"]
+    rotor_radii_m: Float[np.ndarray, "rotors"]
+
+    @functools.cached_property
+    def normals(self) -> Float[np.ndarray, "faces 3"]:
+        """(faces, 3), unit vectors out of the faces."""
+        a, b, c = self.triangles_m.swapaxes(0, 1)
+        outwards = np.cross(b - a, c - a)
+        return outwards / np.linalg.norm(outwards, axis=-1, keepdims=True)
+
+    @functools.cached_property
+    def radius_m(self) -> float:
+        """Of the smallest sphere about the origin that holds the drone, rotors included."""
+        body = np.linalg.norm(self.triangles_m, axis=-1).max()
+        reach = np.linalg.norm(self.rotor_centres_m, axis=-1) + self.rotor_radii_m
+        return float(max(body, reach.max(initial=0.0)))
+
+
+def disc_fans(model: DroneModel) -> Float[np.ndarray, "slices 3 3"]:
+    """(slices, 3, 3): the rotor discs as triangles around their hubs, body frame."""
+    angle = 2 * np.pi * np.arange(_DISC_SIDES + 1) / _DISC_SIDES
+    rim = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
+    fan = np.stack([np.zeros_like(rim[:-1]), rim[:-1], rim[1:]], axis=1)
+    discs = model.rotor_centres_m[:, None, None] + model.rotor_radii_m[:, None, None, None] * fan
+    return discs.reshape(-1, 3, 3)
+
+
+#: Arms of the crosses: ahead, left, back, right. The six distances between the markers of one cross differ by at
+#: least 12 mm; those of two crosses, in order of length, somewhere by at least 20 mm. Found by search.
+_CROSS_ARMS_M = (
+    (0.055, 0.085, 0.115, 0.105),
+    (0.115, 0.120, 0.095, 0.060),
+    (0.085, 0.140, 0.040, 0.050),
+    (0.070, 0.050, 0.090, 0.095),
+    (0.135, 0.110, 0.060, 0.045),
+    (0.130, 0.120, 0.110, 0.075),
+    (0.075, 0.095, 0.125, 0.120),
+    (0.095, 0.115, 0.040, 0.050),
+    (0.045, 0.095, 0.135, 0.140),
+    (0.135, 0.120, 0.085, 0.140),
+    (0.075, 0.140, 0.135, 0.040),
+    (0.135, 0.050, 0.085, 0.080),
+    (0.045, 0.125, 0.075, 0.040),
+    (0.135, 0.130, 0.085, 0.110),
+)
+
+
+def marker_cross(model: DroneModel, number: int) -> Float[np.ndarray, "4 3"]:
+    """(4, 3), the mocap markers A, B, C and D of a drone in its body frame: ahead, left, back, right.
+
+    They form an asymmetric cross above the highest point of the model. Its arms depend on the drone's number, so that
+    a motion capture system tells drones from one another by distances between their markers alone.
+
+    Args:
+        model: the drone's shape.
+        number: of the drone in its sequence, from 1; after the last cross comes the first again.
+    """
+    ahead, left, back, right = _CROSS_ARMS_M[(number - 1) % len(_CROSS_ARMS_M)]
+    height = float(model.triangles_m[..., 2].max()) + _MAST_M
+    return np.array([(ahead, 0.0, height), (0.0, left, height), (-back, 0.0, height), (0.0, -right, height)])

@@ -1,0 +1,209 @@
+"""Rooms: textured rectangles (floor, walls, ceiling, furniture, markers), with their light baked in."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from collections.abc import Sequence as Ordered
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.errors import SettingsError
+from psotrack.simulation.scenarios import Vector
+from psotrack.simulation.world import textures
+from psotrack.simulation.world.halls import HALLS as HALLS
+from psotrack.simulation.world.halls import RIGS as RIGS
+from psotrack.simulation.world.halls import Box, Hall
+from psotrack.simulation.world.lighting import Lamps, bake, lamps
+
+MARKER_DICTIONARY = cv2.aruco.DICT_4X4_1000
+#: Textures for small images have texels up to so many times as large.
+_COARSEST = 8
+#: White paper around the black square, as a share of its size.
+_MARKER_MARGIN = 0.2
+#: Upper edges of sheets, from the ceiling, as shares of its height; they take turns.
+_MARKER_TOPS = (0.1875, 0.3625, 0.5375)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A textured rectangle, seen from both sides.
+
+    Attributes:
+        corner_m: (3,), where the texture's first texel lies.
+        along_m, down_m: (3,), edges along the texture's columns and rows.
+        texture: (rows, columns, 3), linear BGR light, 1 is white in the middle of the floor.
+    """
+
+    corner_m: Float[np.ndarray, "3"]
+    along_m: Float[np.ndarray, "3"]
+    down_m: Float[np.ndarray, "3"]
+    texture: textures.Texture
+
+    @property
+    def normal(self) -> Float[np.ndarray, "3"]:
+        """(3,), unit normal, out of the side from which the texture is not mirrored."""
+        n = np.cross(self.down_m, self.along_m)
+        return n / np.linalg.norm(n)
+
+    @property
+    def corners_m(self) -> Float[np.ndarray, "4 3"]:
+        """(4, 3): top left, top right, bottom right, bottom left of the texture."""
+        a, b = self.along_m, self.down_m
+        return self.corner_m + np.stack([np.zeros(3), a, a + b, b])
+
+
+@dataclass(frozen=True)
+class Room:
+    """A lit room.
+
+    Attributes:
+        surfaces: the first is the floor.
+        panels: its lamps.
+        marker_corners_m: (4, 3) per marker: top left, top right, bottom right, bottom left of the black square.
+    """
+
+    surfaces: tuple[Surface, ...]
+    panels: Lamps
+    marker_corners_m: Mapping[int, Float[np.ndarray, "4 3"]]
+
+
+@functools.lru_cache(maxsize=2)
+def room(name: str, with_markers: bool, scale: float) -> Room:
+    """The room of that name, with light and textures ready; the same every time.
+
+    Args:
+        name: in `HALLS`.
+        with_markers: whether ArUco markers hang on its walls.
+        scale: of the images, 1 is full size; textures are as fine as it needs.
+
+    Raises:
+        SettingsError: there is no such room; the message lists those there are.
+    """
+    if name not in HALLS:
+        raise SettingsError("room", expected=f"one of {', '.join(HALLS)}", found=name)
+    hall = HALLS[name]
+    texel_m = hall.texel_m * min(max(1.0, 1 / scale), _COARSEST)
+    return _furnished(hall, with_markers, round(texel_m, 3))
+
+
+def _furnished(hall: Hall, with_markers: bool, texel_m: float) -> Room:
+    length, width, height = hall.size_m
+    x, y = length / 2, width / 2
+    rng = np.random.default_rng(hall.seed)
+    panels = lamps(np.array([(*at, height) for at in hall.lamps_xy_m]), hall.lamp_size_m)
+    walls = [
+        ((-x, y, height), (length, 0.0, 0.0), (0.0, 0.0, -height)),
+        ((x, y, height), (0.0, -width, 0.0), (0.0, 0.0, -height)),
+        ((x, -y, height), (-length, 0.0, 0.0), (0.0, 0.0, -height)),
+        ((-x, -y, height), (0.0, width, 0.0), (0.0, 0.0, -height)),
+    ]
+    surfaces = [
+        _surface(
+            (-x, y, 0.0), (length, 0.0, 0.0), (0.0, -width, 0.0), hall.floor(length, width, texel_m, rng)
+        ),
+        _surface(
+            (-x, -y, height),
+            (length, 0.0, 0.0),
+            (0.0, width, 0.0),
+            hall.ceiling(length, width, texel_m, rng),
+        ),
+        *(_surface(*wall, hall.walls(abs(sum(wall[1])), height, texel_m, rng)) for wall in walls),
+        *(side for box in hall.boxes for side in _sides(box, 2 * texel_m, rng)),
+        *(_underside(box, 2 * texel_m, rng) for box in hall.boxes if box.lower_m[2] > 0),
+    ]
+    marker_corners: dict[int, Float[np.ndarray, "4 3"]] = {}
+    if with_markers:
+        for marker, (corner, along) in enumerate(_marker_places(surfaces[2:6], hall), start=1):
+            surface, marker_corners[marker] = _marker(marker, hall.marker_size_m, corner, along)
+            surfaces.append(surface)
+    boxes_m = np.array([(box.lower_m, box.upper_m) for box in hall.boxes])
+    lit = [_lit(surface, hall.light_step_m, panels, boxes_m) for surface in surfaces]
+    glowing = [_lamp(centre, panels.size_m) for centre in panels.centres_m]
+    return Room((*lit, *glowing), panels, marker_corners)
+
+
+def _surface(corner: Vector, along: Vector, down: Vector, texture: textures.Texture) -> Surface:
+    return Surface(np.array(corner, float), np.array(along, float), np.array(down, float), texture)
+
+
+def _lit(surface: Surface, step_m: float, panels: Lamps, boxes_m: Float[np.ndarray, "boxes 2 3"]) -> Surface:
+    """The surface with its light baked into its texture."""
+    columns, rows = (max(2, int(np.linalg.norm(edge) / step_m)) for edge in (surface.along_m, surface.down_m))
+    u, v = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
+    points = surface.corner_m + u[..., None] * surface.along_m + v[..., None] * surface.down_m
+    light = bake(points, surface.normal, panels, boxes_m)
+    height, width = surface.texture.shape[:2]
+    fine = cv2.resize(light.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+    # In place: textures of a large hall at full size are most of a process's memory.
+    texture = np.multiply(surface.texture, fine[..., None], out=surface.texture)
+    return Surface(surface.corner_m, surface.along_m, surface.down_m, texture)
+
+
+def _lamp(centre: Float[np.ndarray, "3"], size_m: tuple[float, float]) -> Surface:
+    corner = centre - np.array([size_m[0] / 2, size_m[1] / 2, 0.02])
+    glow = np.full((8, 16, 3), 3.0, np.float32)
+    return Surface(corner, np.array([size_m[0], 0.0, 0.0]), np.array([0.0, size_m[1], 0.0]), glow)
+
+
+def _marker_places(
+    walls: Ordered[Surface], hall: Hall
+) -> list[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]]:
+    """Top left corner of each sheet, and the direction along it: spread over the walls, at changing heights."""
+    sheet_m = hall.marker_size_m * (1 + 2 * _MARKER_MARGIN)
+    places = []
+    for wall, count in zip(walls, hall.markers, strict=True):
+        length = float(np.linalg.norm(wall.along_m))
+        along = wall.along_m / length
+        for i in range(count):
+            left = (i + 0.5) * length / count - sheet_m / 2
+            top = hall.size_m[2] * _MARKER_TOPS[i % len(_MARKER_TOPS)]
+            # A little before the wall, so that the depth buffer can tell them apart.
+            corner = wall.corner_m + left * along - np.array([0.0, 0.0, top]) + 0.01 * wall.normal
+            places.append((corner, along))
+    return places
+
+
+def _marker(
+    marker: int, size_m: float, corner: Float[np.ndarray, "3"], along: Float[np.ndarray, "3"]
+) -> tuple[Surface, Float[np.ndarray, "4 3"]]:
+    # As many texels that edges of cells stay edges of texels when the texture is halved, and halved again.
+    per_cell, cells = 20, 6
+    side_px = per_cell * cells
+    margin_px = round(_MARKER_MARGIN * side_px)
+    bits = cv2.aruco.getPredefinedDictionary(MARKER_DICTIONARY).generateImageMarker(marker, side_px)
+    sheet = np.pad(0.05 + 0.8 * (bits.astype(np.float32) / 255), margin_px, constant_values=0.85)
+    sheet_m = size_m * len(sheet) / side_px
+    down = np.array([0.0, 0.0, -1.0])
+    surface = Surface(corner, along * sheet_m, down * sheet_m, np.repeat(sheet[..., None], 3, axis=-1))
+    a, b = (margin_px / len(sheet), 1 - margin_px / len(sheet))
+    inner = [(a, a), (b, a), (b, b), (a, b)]
+    corners = np.stack([corner + u * surface.along_m + v * surface.down_m for u, v in inner])
+    return surface, corners
+
+
+def _sides(box: Box, texel_m: float, rng: np.random.Generator) -> list[Surface]:
+    """The four sides and the top of a box."""
+    (x1, y1, z1), (x2, y2, z2) = box.lower_m, box.upper_m
+    x, y, z = x2 - x1, y2 - y1, z2 - z1
+    sides = (
+        ((x1, y1, z2), (x, 0.0, 0.0), (0.0, 0.0, -z)),
+        ((x2, y1, z2), (0.0, y, 0.0), (0.0, 0.0, -z)),
+        ((x2, y2, z2), (-x, 0.0, 0.0), (0.0, 0.0, -z)),
+        ((x1, y2, z2), (0.0, -y, 0.0), (0.0, 0.0, -z)),
+        ((x1, y2, z2), (x, 0.0, 0.0), (0.0, -y, 0.0)),
+    )
+    return [
+        _surface(corner, along, down, textures.plain(abs(sum(along)), abs(sum(down)), texel_m, box.bgr, rng))
+        for corner, along, down in sides
+    ]
+
+
+def _underside(box: Box, texel_m: float, rng: np.random.Generator) -> Surface:
+    """The bottom of a box that stands on no floor: drones fly below table tops."""
+    (x1, y1, z), (x2, y2, _) = box.lower_m, box.upper_m
+    texture = textures.plain(x2 - x1, y2 - y1, texel_m, box.bgr, rng)
+    return _surface((x1, y1, z), (x2 - x1, 0.0, 0.0), (0.0, y2 - y1, 0.0), texture)

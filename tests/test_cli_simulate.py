@@ -1,0 +1,100 @@
+"""`psotrack simulate` as people type it: the list, pages of pictures, scenarios of one's own, bad input."""
+
+import json
+import re
+import tomllib
+
+import cv2
+import pytest
+from click.testing import CliRunner
+
+from psotrack import cli
+from psotrack.datasets.dpjait import read_sequence
+from psotrack.errors import PsotrackError
+
+SMALL = ("--frames", "2", "--scale", "0.1", "--jobs", "1", "--no-onboard", "--quiet")
+#: What the paper says of its simulated half: frames of all sequences, and frames times drones.
+TOTAL_FRAMES, TOTAL_FLIGHT = (20 * 60 + 3) * 25, (91 * 60 + 25) * 25
+
+
+def run(*arguments):
+    return CliRunner().invoke(cli.cli, ["simulate", *map(str, arguments)], catch_exceptions=False)
+
+
+def refused(*arguments):
+    """The message of what goes wrong on purpose, which `main` prints as one line."""
+    with pytest.raises(PsotrackError) as error:
+        run(*arguments)
+    message = str(error.value)
+    assert "\n" not in message
+    return message
+
+
+def test_the_list_names_all_thirteen_with_what_they_hold():
+    rows = json.loads(run("--list", "--json", "-").stdout)
+    assert [row["name"][:3] for row in rows] == [f"S{number:02d}" for number in range(1, 14)]
+    assert sum(row["frames"] for row in rows) == TOTAL_FRAMES
+    assert sum(row["frames"] * row["drones"] for row in rows) == TOTAL_FLIGHT
+    assert {row["name"]: row["cameras"] for row in rows if row["cameras"] != 8} == {
+        "S11_D4": 4,
+        "S12_D3": 4,
+        "S13_D3": 4,
+    }
+    assert all(row["markers"] == row["onboard"] == row["name"].endswith("_A") for row in rows)
+    shown = run("--list").stdout
+    for row in rows:
+        line = next(line for line in shown.splitlines() if row["name"] in line)
+        assert re.search(rf"{row['drones']} +│? *{row['cameras']} +│? *{row['frames']}\b", line), line
+
+
+def test_a_preset_is_a_file_to_start_ones_own_from(tmp_path):
+    text = run("S01_D2_A", "--show").stdout
+    assert tomllib.loads(text)["name"] == "S01_D2_A"
+    mine = tmp_path / "mine.toml"
+    mine.write_text(text.replace('name = "S01_D2_A"', 'name = "MINE"'))
+    answer = run("--scenario", mine, "--out", tmp_path, "--json", "-", *SMALL)
+    folder = tmp_path / "Simulated_Data" / "MINE"
+    assert json.loads(answer.stdout) == {"sequence": str(folder)}
+    sequence = read_sequence(folder).usable()
+    assert (len(sequence.rig), sequence.num_frames, len(sequence.truth.drones)) == (8, 2, 2)
+
+
+def test_fields_are_changed_from_the_command_line(tmp_path):
+    changes = ("--set", "camera_spread.focal_length=0.05", "--set", "name=OTHER")
+    run("S11_D4", "--out", tmp_path, *changes, *SMALL)
+    rig = read_sequence(tmp_path / "Simulated_Data" / "OTHER").rig
+    assert len({round(float(focal), 3) for focal in rig.cameras.K[:, 0, 0]}) == 4
+
+
+def test_a_page_of_pictures_instead_of_the_sequence(tmp_path):
+    answer = run("S01_D2_A", "--preview", "--out", tmp_path, "--frames", "3", "--jobs", "1", "--json", "-")
+    page = tmp_path / "S01_D2_A.png"
+    assert json.loads(answer.stdout) == {"preview": str(page)}
+    assert [path.name for path in tmp_path.iterdir()] == [page.name]
+    image = cv2.imread(str(page))
+    assert image.shape[1] == 1600
+    # Pictures of rooms have thousands of colours; a page with its pictures left white has some hundreds.
+    assert len(set(map(tuple, image[::4, ::4].reshape(-1, 3).tolist()))) > 5000
+    assert "pass --force" in refused("S01_D2_A", "--preview", "--out", tmp_path, "--frames", "3")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "simulate: expected the NAME of a scenario or --scenario FILE.toml, found neither"),
+        (("S01_D2_A", "--scenario", "x.toml"), "found both"),
+        (("S01_D2_A",), "--out: expected the folder to write to, found none"),
+        (("S99", "--out", "x"), "scenario: expected one of S01_D2_A"),
+        (("S01_D2_A", "--out", "x", "--set", "imaging"), "--set: expected FIELD=VALUE"),
+        (("S01_D2_A", "--out", "x", "--set", "imaging.noise=1"), "imaging.noise"),
+        (("S01_D2_A", "--out", "x", "--set", "drones[0].model=kite"), "drones[0].model"),
+        (("S01_D2_A", "--out", "x", "--set", "cameras=[]"), "cameras"),
+        (("S01_D2_A", "--out", "x", "--preview", "--frames", "501"), "frames: expected 1 to 500"),
+        (("--scenario", "missing.toml", "--out", "x"), "missing.toml"),
+        (("--scenario", "missing.toml", "--show"), "--show: expected the NAME of a scenario"),
+    ],
+)
+def test_bad_input_is_one_line_and_writes_nothing(arguments, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert message in refused(*arguments)
+    assert not list(tmp_path.iterdir())

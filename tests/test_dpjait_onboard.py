@@ -1,0 +1,220 @@
+"""Videos, poses and intrinsics of drones' own cameras: written, read back, and spoilt in every way we know."""
+
+import logging
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+from scipy.spatial.transform import Rotation
+
+from psotrack.cameras import camera, look_at, stack
+from psotrack.contents import contents, render
+from psotrack.datasets import dpjait
+from psotrack.errors import InputError, SettingsError
+from psotrack.video import VideoWriter
+
+WIDTH, HEIGHT, FRAMES = 64, 48, 5
+K = np.array([[30.5, 0.0, 31.5], [0.0, 30.25, 23.5], [0.0, 0.0, 1.0]])
+ORIENTATION_WXYZ = Rotation.from_rotvec(np.linspace(0.1, 0.9, FRAMES)[:, None] * [0.3, 0.2, 1.0]).as_quat(
+    scalar_first=True
+)
+POSITION_M = np.stack([np.linspace(0, 1, FRAMES), np.full(FRAMES, -2.0), np.full(FRAMES, 1.5)], axis=-1)
+
+
+def write_video(path, size_wh=(WIDTH, HEIGHT), num_frames=FRAMES):
+    with VideoWriter(path, 25.0, size_wh) as writer:
+        for _ in range(num_frames):
+            writer.write(np.zeros((size_wh[1], size_wh[0], 3), np.uint8))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Two cameras on walls, two drones, of which both have a camera."""
+    R, t_m = look_at((4.0, 3.0, 2.5), (0.0, 0.0, 1.0))
+    one = camera(R=R, t_m=t_m, K=np.diag([80.0, 80.0, 1.0]), image_size_wh=(WIDTH, HEIGHT))
+    dpjait.write_calibration(tmp_path / dpjait.CALIBRATION, stack({"cam1i": one, "cam2i": one}))
+    for name in ("cam1i_s.avi", "cam2i_s.avi", "dron1_cam_s.avi", "dron2_cam_s.avi"):
+        write_video(tmp_path / name)
+    for number in (1, 2):
+        shifted_m = np.add(POSITION_M, [0.0, number, 0.0])
+        dpjait.write_poses(tmp_path / dpjait.pose_file(number), shifted_m, ORIENTATION_WXYZ)
+        dpjait.write_poses(
+            tmp_path / dpjait.onboard_pose_file(number), np.add(shifted_m, [0.1, 0.0, 0.0]), ORIENTATION_WXYZ
+        )
+    intrinsics = {"dron1": (K, (WIDTH, HEIGHT)), "dron2": (K + np.diag([1.0, 1.0, 0.0]), (WIDTH, HEIGHT))}
+    dpjait.write_onboard_calibration(tmp_path / dpjait.ONBOARD_CALIBRATION, intrinsics)
+    return tmp_path
+
+
+def change(path, old, new):
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+def test_what_is_written_is_read_back(folder):
+    found = dpjait.read_onboard(folder)
+    assert list(found) == ["dron1", "dron2"]
+    one, two = found.values()
+    assert (one.video.path.name, one.video.num_frames) == ("dron1_cam_s.avi", FRAMES)
+    np.testing.assert_array_equal(one.K, K)
+    np.testing.assert_array_equal(two.K - one.K, np.diag([1.0, 1.0, 0.0]))
+    assert np.isnan(one.position_m[0]).all(), "the first row is a placeholder"
+    assert np.isnan(one.orientation_wxyz[0]).all()
+    np.testing.assert_array_equal(one.position_m[1:], np.add(POSITION_M, [0.1, 1.0, 0.0])[1:])
+    # Quaternions are made unit on reading.
+    np.testing.assert_allclose(two.orientation_wxyz[1:], ORIENTATION_WXYZ[1:], atol=1e-15)
+
+
+@given(
+    cameras=st.lists(
+        st.tuples(*[st.floats(1e-3, 1e5)] * 2, *[st.floats(-1e4, 1e4)] * 2, *[st.integers(1, 8000)] * 2),
+        min_size=1,
+        max_size=4,
+    )
+)
+def test_any_intrinsics_come_back(tmp_path_factory, cameras):
+    path = tmp_path_factory.getbasetemp() / dpjait.ONBOARD_CALIBRATION
+    intrinsics = {
+        f"dron{number}": (np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), (width, height))
+        for number, (fx, fy, cx, cy, width, height) in enumerate(cameras, start=1)
+    }
+    dpjait.write_onboard_calibration(path, intrinsics)
+    again = dpjait.read_onboard_calibration(path)
+    assert list(again) == list(intrinsics)
+    for name, (expected, size_wh) in intrinsics.items():
+        np.testing.assert_array_equal(again[name][0], expected)
+        assert again[name][1] == size_wh
+
+
+def test_a_sequence_has_them_beside_its_own_cameras(folder):
+    sequence = dpjait.read_sequence(folder)
+    assert list(sequence.videos) == ["cam1i", "cam2i"]
+    assert sequence.truth.drones == ("dron1", "dron2")
+    # The poses of the drones, not of their cameras, which are 0.1 m ahead.
+    np.testing.assert_array_equal(sequence.truth.position_m[1:, 0], np.add(POSITION_M, [0.0, 1.0, 0.0])[1:])
+    assert list(sequence.onboard) == ["dron1", "dron2"]
+    assert sequence.usable(num_frames=3).onboard == sequence.onboard
+
+
+def test_a_sequence_without_them_is_as_it_was(folder):
+    for path in folder.glob("*cam_*"):
+        path.unlink()
+    # Intrinsics alone are of no use, and do no harm.
+    assert dpjait.read_onboard(folder) == {}
+    sequence = dpjait.read_sequence(folder)
+    assert sequence.onboard is None
+    assert contents(sequence)["onboard"] is None
+
+
+@pytest.mark.parametrize("missing", ["dron1_cam_25.csv", dpjait.ONBOARD_CALIBRATION])
+def test_a_video_alone_is_enough(folder, missing):
+    (folder / missing).unlink()
+    one = dpjait.read_onboard(folder)["dron1"]
+    assert (one.K is None) == (missing == dpjait.ONBOARD_CALIBRATION)
+    assert np.isnan(one.orientation_wxyz).all() == (missing == "dron1_cam_25.csv")
+    assert one.position_m.shape == (FRAMES, 3)
+
+
+@pytest.mark.parametrize(("rows", "known"), [(3, 2), (9, 4)])
+def test_poses_may_be_fewer_or_more_than_frames(folder, rows, known):
+    turns = np.tile([1.0, 0.0, 0.0, 0.0], (rows, 1))
+    dpjait.write_poses(folder / dpjait.onboard_pose_file(1), np.ones((rows, 3)), turns)
+    one = dpjait.read_onboard(folder)["dron1"]
+    assert one.position_m.shape == (FRAMES, 3)
+    assert np.isfinite(one.position_m).all(axis=1).sum() == known
+
+
+@pytest.mark.parametrize("other", ["drone1_cam.avi", "Dron_1_cam_s.AVI", "dron1_cam.mp4"])
+def test_names_that_mean_the_same(folder, other):
+    (folder / "dron1_cam_s.avi").rename(folder / other)
+    assert dpjait.read_onboard(folder)["dron1"].video.path.name == other
+    assert list(dpjait.read_sequence(folder).videos) == ["cam1i", "cam2i"]
+
+
+# --- what does not fit
+
+
+def test_two_videos_of_one_drone(folder):
+    write_video(folder / "drone1_cam.avi")
+    with pytest.raises(
+        InputError, match=r"drone1_cam\.avi: expected one file per drone, found dron1_cam_s\.avi"
+    ):
+        dpjait.read_onboard(folder)
+
+
+def test_a_video_of_another_size_than_its_intrinsics(folder):
+    write_video(folder / "dron2_cam_s.avi", (32, 32))
+    with pytest.raises(InputError, match=r"dron2_cam_s\.avi: expected 64 x 48 pixels .*, found 32 x 32"):
+        dpjait.read_onboard(folder)
+
+
+def test_poses_at_another_rate(folder):
+    (folder / "dron2_cam_25.csv").rename(folder / "dron2_cam_30.csv")
+    with pytest.raises(InputError, match=r"dron2_cam_30\.csv: expected poses at the 25 Hz .*, found 30 Hz"):
+        dpjait.read_onboard(folder)
+
+
+def test_a_pose_that_is_no_number(folder):
+    change(folder / "dron1_cam_25.csv", "1.5", "one and a half")
+    with pytest.raises(InputError, match=r"dron1_cam_25\.csv, line 3, column pos_z\[m\]: expected a number"):
+        dpjait.read_onboard(folder)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("dron2", "dron1", r"line 3, column cam_name: expected each camera once, found dron1 again"),
+        (
+            "30.5",
+            "-30.5",
+            r"line 2, column focal_length_x: expected a number of pixels above 0, found -30\.5",
+        ),
+        ("30.25", "0", r"line 2, column focal_length_y: expected a number of pixels above 0"),
+        (";48", ";0", r"line 2, column height: expected a number of pixels above 0"),
+        (";64", ";64.5", r"line 2, column width: expected a whole number"),
+        ("cx", "c_x", r"expected a column cx, found only"),
+    ],
+)
+def test_broken_intrinsics(folder, old, new, message):
+    change(folder / dpjait.ONBOARD_CALIBRATION, old, new)
+    with pytest.raises(InputError, match=rf"drone_cameras_calibration\.csv.*{message}"):
+        dpjait.read_onboard(folder)
+
+
+def test_a_sequence_does_without_those_that_are_broken(folder, caplog):
+    """Tracking needs the cameras on the walls only."""
+    change(folder / "dron1_cam_25.csv", "1.5", "?")
+    with caplog.at_level(logging.WARNING):
+        sequence = dpjait.read_sequence(folder)
+    assert sequence.onboard is None
+    assert "dron1_cam_25.csv, line 3" in caplog.text
+    assert sequence.truth is not None
+
+
+@pytest.mark.parametrize("intrinsics", [{}, {"dron1": (K + np.eye(3, k=1), (WIDTH, HEIGHT))}])
+def test_intrinsics_that_the_table_cannot_hold(tmp_path, intrinsics):
+    with pytest.raises(SettingsError, match="without skew"):
+        dpjait.write_onboard_calibration(tmp_path / "x.csv", intrinsics)
+
+
+# --- shown
+
+
+def test_the_table_of_contents_has_a_row_for_each(folder):
+    content = contents(dpjait.read_sequence(folder))
+    assert content["onboard"]["dron2"] == {
+        "video": str(folder / "dron2_cam_s.avi"),
+        "frames": FRAMES,
+        "fps": 25.0,
+        "image_size_wh": [WIDTH, HEIGHT],
+        "focal_length_px": 31.5,
+        "frames_with_pose": FRAMES - 1,
+    }
+    console = Console(width=120)
+    with console.capture() as capture:
+        console.print(render(content))
+    row = next(line for line in capture.get().splitlines() if "on dron2" in line)
+    assert row.split() == ["on", "dron2", "5", "25", "64", "x", "48", "31.5", "4", "poses"]
