@@ -21,10 +21,8 @@ from jaxtyping import Float
 from psotrack._typing import Array, Tables
 from psotrack.boxes import Boxes, Extents, extents, project_boxes
 from psotrack.cameras import Camera
+from psotrack.patches import Patches, whole_images
 from psotrack.summed_area import box_sum
-
-#: What one fully covered pixel of the reduced silhouettes counts.
-FULL = 255
 
 
 @dataclass(frozen=True)
@@ -57,12 +55,12 @@ class Scene:
 
     Attributes:
         extents: of the drones in the cameras.
-        tables: (height + 1, cameras, width + 1) of the frame's silhouettes.
+        patches: the frame's silhouettes about the drones.
         settings: static.
     """
 
     extents: Extents
-    tables: Tables
+    patches: Patches
     settings: ScoreSettings = field(metadata={"static": True})
 
 
@@ -72,8 +70,8 @@ def scene(
     tables: Tables,
     settings: ScoreSettings,
 ) -> Scene:
-    """The scene of one frame for drones of these sizes (full lengths, metres)."""
-    return Scene(extents(cameras, size_m), tables, settings)
+    """The scene of one frame, all of its images, for drones of these sizes (full lengths, metres)."""
+    return Scene(extents(cameras, size_m), whole_images(tables, settings.reduction), settings)
 
 
 def camera_scores(
@@ -86,7 +84,8 @@ def camera_scores(
         position_m: (..., drones, 3), world.
 
     Returns:
-        Scores in [0, 1]; and weights, the share of the drone's box that lies inside the image (0 behind the camera).
+        Scores in [0, 1]; and weights: the share of the drone's box that lies inside the image (0 behind the camera),
+        times the share that no other drone claims.
     """
     boxes = project_boxes(scene.extents, position_m)
     foreground, area = _windows(scene, boxes, (*scene.settings.windows, scene.settings.ring))
@@ -95,7 +94,7 @@ def camera_scores(
         # The inner maximum is for rounding alone: a window may hold a hair more than the ring.
         union = area[k] + jnp.maximum(foreground[-1] - foreground[k], 0.0)
         score += foreground[k] / jnp.maximum(union, 1e-6)
-    return score / len(scene.settings.windows), _share_in_image(scene, boxes)
+    return score / len(scene.settings.windows), scene.patches.clear * _share_in_image(scene, boxes)
 
 
 def filled(
@@ -127,34 +126,29 @@ def joint_fitness(scene: Scene, position_m: Float[Array, "*batch drones 3"]) -> 
 def _windows(
     scene: Scene, boxes: Boxes, scales: tuple[float, ...]
 ) -> tuple[Float[Array, "scales *batch"], Float[Array, "scales *batch"]]:
-    """Foreground and area, in reduced pixels, of the boxes scaled about their middles and cut at the image."""
-    height, width = _size_of_tables(scene)
+    """Foreground and area, in pixels of the patches, of the boxes scaled about their middles and cut at the image."""
+    patches = scene.patches
 
-    def interval(middle: Array, half: Array, last: int) -> tuple[Array, Array]:
-        middle, half = middle / scene.settings.reduction, half / scene.settings.reduction
+    def interval(middle: Array, half: Array, length_px: int, first_px: Array) -> tuple[Array, Array]:
         half = jnp.asarray(scales, half.dtype).reshape(-1, *[1] * half.ndim) * half
-        ends = middle - half, middle + half
+        ends = [jnp.clip(end, 0, length_px) for end in (middle - half, middle + half)]
         if scene.settings.whole_pixels:
-            ends = jnp.round(ends[0]), jnp.round(ends[1])
-        return jnp.clip(ends[0], 0, last), jnp.clip(ends[1], 0, last)
+            # Of the silhouettes as they are, however coarse the window is.
+            ends = [scene.settings.reduction * jnp.round(end / scene.settings.reduction) for end in ends]
+        low, high = ((end - first_px) / patches.pixel_px for end in ends)
+        return low, high
 
-    x0, x1 = interval(boxes.x_middle, boxes.x_half, width)
-    y0, y1 = interval(boxes.y_middle, boxes.y_half, height)
-    camera = jnp.arange(scene.tables.shape[1])
-    return box_sum(scene.tables, camera, x0, y0, x1, y1) / FULL, (x1 - x0) * (y1 - y0)
+    x0, x1 = interval(boxes.x_middle, boxes.x_half, patches.size_wh_px[0], patches.x_px)
+    y0, y1 = interval(boxes.y_middle, boxes.y_half, patches.size_wh_px[1], patches.y_px)
+    return box_sum(patches.tables, patches.number, x0, y0, x1, y1) / patches.full, (x1 - x0) * (y1 - y0)
 
 
 def _share_in_image(scene: Scene, boxes: Boxes) -> Float[Array, "*batch drones cameras"]:
-    height, width = (side * scene.settings.reduction for side in _size_of_tables(scene))
+    width_px, height_px = scene.patches.size_wh_px
 
-    def inside(middle: Array, half: Array, last: int) -> Array:
-        return jnp.clip(middle + half, 0, last) - jnp.clip(middle - half, 0, last)
+    def inside(middle: Array, half: Array, length_px: int) -> Array:
+        return jnp.clip(middle + half, 0, length_px) - jnp.clip(middle - half, 0, length_px)
 
-    area = inside(boxes.x_middle, boxes.x_half, width) * inside(boxes.y_middle, boxes.y_half, height)
+    area = inside(boxes.x_middle, boxes.x_half, width_px) * inside(boxes.y_middle, boxes.y_half, height_px)
     whole = 4 * boxes.x_half * boxes.y_half
     return jnp.where(boxes.in_front, area / jnp.maximum(whole, 1e-6), 0.0)
-
-
-def _size_of_tables(scene: Scene) -> tuple[int, int]:
-    """Height and width of the silhouettes, in reduced pixels."""
-    return scene.tables.shape[0] - 1, scene.tables.shape[2] - 1

@@ -150,6 +150,7 @@ def tracker_inputs(
     program = tracker.Program(
         num_particles=settings.particles,
         joint=settings.swarm == "joint",
+        claims=settings.score == "soft",
         score=replace(score, reduction=reduction),
     )
     params = tracker.TrackerParams(

@@ -1,8 +1,9 @@
 """The tracker: where swarm and fitness meet, frame after frame.
 
 Each frame is searched from where the motion model expects the drones (a warm start): particles around the
-prediction, bounded by what a drone can reach and by the room. What the swarm finds corrects position and velocity
-(an alpha-beta filter); where it finds nothing the drone coasts on its prediction, and after a while is lost.
+prediction, bounded by what a drone can reach and by the room, in windows of the silhouettes that are cut there. What
+the swarm finds corrects position and velocity (an alpha-beta filter); where it finds nothing the drone coasts on its
+prediction, and after a while is lost.
 
 `step` does one frame, `track` is a scan of it over a chunk of frames. A live source calls `step`, so online and
 offline are the same code, and the state crosses chunk borders.
@@ -20,13 +21,18 @@ from jaxtyping import Float, Int, UInt8
 
 from psotrack import swarm
 from psotrack._typing import Array, Coverage, Key, Positions
+from psotrack.boxes import extents
 from psotrack.cameras import Camera
-from psotrack.fitness import Scene, ScoreSettings, drone_fitness, filled, joint_fitness, scene
-from psotrack.summed_area import summed_area_table
+from psotrack.fitness import Scene, ScoreSettings, drone_fitness, filled, joint_fitness
+from psotrack.patches import cut
 from psotrack.trajectories import Status
 
 #: Share of a drone's box that must be foreground for its camera to count as seeing it.
 MIN_FILLED = 0.1
+#: Particles start about the prediction; windows reach that many of their standard deviations beyond the ring.
+REACH_SIGMAS = 3.0
+#: A drone that was not found for more frames is not expected anywhere well enough to claim foreground.
+MAX_CLAIMING_FRAMES = 4
 
 
 @dataclass(frozen=True)
@@ -36,11 +42,13 @@ class Program:
     Attributes:
         num_particles: of every swarm.
         joint: one swarm over all drones (the paper's) instead of one per drone.
+        claims: whether foreground that another drone is expected to cover says nothing about a drone.
         score: how positions are scored.
     """
 
     num_particles: int = 100
     joint: bool = False
+    claims: bool = True
     score: ScoreSettings = field(default_factory=ScoreSettings)
 
 
@@ -128,9 +136,9 @@ def step(
         coverage: (cameras, height, width), silhouettes of the frame, 0..255, reduced.
     """
     key_next, key_spread, key_swarm = jax.random.split(state.key, 3)
-    view = scene(cameras, params.size_m, summed_area_table(coverage), program.score)
     low, high = _reachable(state, params)
     predicted = jnp.clip(state.position_m + state.velocity_m_s * params.dt_s, low, high)
+    view = _view(state, coverage, cameras, predicted, params, program)
     found = _search(key_spread, key_swarm, view, predicted, state, params, program, (low, high))
     fitness, num_cameras = _evidence(view, found, params)
     was_found = (fitness >= params.min_fitness) & (num_cameras >= params.min_cameras)
@@ -174,6 +182,28 @@ def track(
         return step(carry, frame, cameras, params, program)
 
     return jax.lax.scan(one, state, coverage)
+
+
+def _view(
+    state: TrackerState,
+    coverage: Coverage,
+    cameras: Camera,
+    predicted: Positions,
+    params: TrackerParams,
+    program: Program,
+) -> Scene:
+    """What the score reads: windows about the predictions."""
+    seen = extents(cameras, params.size_m)
+    patches = cut(
+        coverage,
+        seen,
+        predicted,
+        reach_m=REACH_SIGMAS * params.spread_m * _frames_since_found(state)[:, 0],
+        claiming=(state.missed <= MAX_CLAIMING_FRAMES) & program.claims,
+        reduction=program.score.reduction,
+        ring=program.score.ring,
+    )
+    return Scene(seen, patches, program.score)
 
 
 def _reachable(state: TrackerState, params: TrackerParams) -> tuple[Positions, Positions]:

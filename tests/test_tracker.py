@@ -1,5 +1,7 @@
 """The tracker, from silhouettes that are drawn by casting rays at moving ellipsoids."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -42,16 +44,19 @@ def coverage():
     return images
 
 
-def track(coverage, position_m=TRUTH_M[0], velocity_m_s=VELOCITY_M_S[0], **settings):
+def track(
+    coverage, position_m=TRUTH_M[0], velocity_m_s=VELOCITY_M_S[0], *, size_m=SIZE_M, claims=True, **settings
+):
     """The state at the end and the info of every frame, as NumPy."""
-    state, params, program = prepared(position_m, velocity_m_s, **settings)
+    state, params, program = prepared(position_m, velocity_m_s, size_m=size_m, **settings)
+    program = replace(program, claims=program.claims and claims)
     state, info = tracker.track(state, coverage, CAMERAS, params, program)
     return state, jax.tree.map(np.asarray, info)
 
 
-def prepared(position_m=TRUTH_M[0], velocity_m_s=VELOCITY_M_S[0], **settings):
+def prepared(position_m=TRUTH_M[0], velocity_m_s=VELOCITY_M_S[0], *, size_m=SIZE_M, **settings):
     settings = TrackSettings(**({"particles": 20, "iterations": 20} | settings))
-    start = Start(np.asarray(position_m), np.asarray(velocity_m_s), SIZE_M, np.full(2, 5.0))
+    start = Start(np.asarray(position_m), np.asarray(velocity_m_s), size_m, np.full(2, 5.0))
     program, params = tracker_inputs(REDUCTION, start, settings, fps=FPS, bounds_m=ROOM_M)
     where, speed = float32((start.position_m, start.velocity_m_s))
     return tracker.init(jax.random.key(settings.seed), where, speed, params), params, program
@@ -134,12 +139,36 @@ def test_same_seed_same_result(coverage, swarm):
     np.testing.assert_allclose(other.position_m, first.position_m, atol=CELL_M)
 
 
-def test_drones_of_their_own_swarms_do_not_interact(coverage):
-    """Starting the second drone elsewhere changes no bit of the first."""
-    _, info = track(coverage)
-    _, changed = track(coverage, position_m=TRUTH_M[0] + [[0, 0, 0], [0.1, 0, 0]])
+def test_drones_of_their_own_swarms_interact_by_claims_alone(coverage):
+    """Without claims, starting the second drone elsewhere changes no bit of the first."""
+    elsewhere_m = TRUTH_M[0] + [[0, 0, 0], [0.1, 0, 0]]
+    (_, info), (_, changed) = (
+        track(coverage, position_m=position_m, claims=False) for position_m in (TRUTH_M[0], elsewhere_m)
+    )
     np.testing.assert_array_equal(changed.position_m[:, 0], info.position_m[:, 0])
     assert not np.array_equal(changed.position_m[0, 1], info.position_m[0, 1])
+
+
+def test_drones_that_pass_close_keep_their_identities():
+    """Head on at 1.5 m/s each, 0.3 m between their middles; 0.05 m between their hulls."""
+    along_m = 1.5 * (TIME_S - TIME_S[NUM_FRAMES // 2])
+    beside_m, height_m = np.full(NUM_FRAMES, 0.15), np.full(NUM_FRAMES, 1.3)
+    paths = ([along_m, beside_m, height_m], [-along_m, -beside_m, height_m])
+    truth_m = np.stack([np.stack(path, axis=-1) for path in paths], axis=1)
+    size_m = np.array([[0.25, 0.25, 0.15]] * 2)
+    images = np.stack([draw_coverage(RIG, positions, size_m, REDUCTION) for positions in truth_m])
+    velocity_m_s = np.array([[1.5, 0, 0], [-1.5, 0, 0]])
+    rms_m = {}
+    for claims in (True, False):
+        _, info = track(images, truth_m[0], velocity_m_s, size_m=size_m, claims=claims)
+        error_m = np.linalg.norm(info.position_m - truth_m, axis=-1)
+        assert (info.status == Status.TRACKED).all()
+        # A tenth of the distance at which they pass; measured 11 mm, in any frame.
+        assert error_m.max() < CELL_M
+        passing = np.linalg.norm(truth_m[:, 0] - truth_m[:, 1], axis=-1) < 0.6
+        rms_m[claims] = np.sqrt(np.mean(error_m[passing] ** 2))
+    # While they pass. Measured 6.0 mm with claims and 8.0 mm without, the same for three seeds to 0.3 mm.
+    assert rms_m[True] < 0.9 * rms_m[False]
 
 
 HOVER_M = np.array([[0.3, -0.2, 1.2], [-0.9, 0.7, 0.8]])

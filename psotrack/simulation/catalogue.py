@@ -43,7 +43,7 @@ def render(rows: list[dict[str, Any]]) -> Table:
     from rich import box
     from rich.table import Table
 
-    table = Table(box=box.HORIZONTALS, show_edge=False)
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
     for heading in ("name", "drones", "cameras", "frames", "hall", "m/s", "flights"):
         numeric = heading in {"drones", "cameras", "frames", "m/s"}
         table.add_column(heading, justify="right" if numeric else "left", no_wrap=heading != "flights")
@@ -53,7 +53,7 @@ def render(rows: list[dict[str, Any]]) -> Table:
             f"{row['drones']}",
             f"{row['cameras']}",
             f"{row['frames']}",
-            row["hall"].replace("_", " "),
+            row["hall"].removesuffix("_hall").replace("_", " "),
             f"{row['mean_speed_m_s']:.1f}",
             row["description"],
         )
