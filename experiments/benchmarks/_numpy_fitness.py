@@ -11,7 +11,8 @@ from typing import Protocol
 import numpy as np
 
 from psotrack.cameras import NEAR_M, Camera
-from psotrack.fitness import FULL, ScoreSettings
+from psotrack.fitness import ScoreSettings
+from psotrack.patches import FULL
 
 
 class NumpyFitness(Protocol):

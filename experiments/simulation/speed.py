@@ -1,0 +1,105 @@
+"""Where the simulator's time goes: processor milliseconds per frame of one camera, stage by stage.
+
+    python experiments/simulation/speed.py --scenario S02_D4_A --frames 60
+
+Everything runs on one thread. Cameras and segments are drawn in parallel by `psotrack simulate`, so one second of video
+(25 frames) of eight cameras takes about 200 times the total, divided by the cores.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from psotrack.datasets.dpjait import MaskWriter
+from psotrack.simulation import CameraRenderer, Scene, build, preset_names, scenario
+from psotrack.simulation.imaging.onboard import OnboardRenderer
+from psotrack.simulation.labels.detector import detect
+from psotrack.simulation.labels.masks import silhouettes
+from psotrack.video import VideoWriter
+
+_spent_s: dict[str, float] = defaultdict(float)
+
+
+@contextmanager
+def stage(name: str) -> Iterator[None]:
+    """Add the processor time of the block to a stage."""
+    began = time.process_time()
+    yield
+    _spent_s[name] += time.process_time() - began
+
+
+def static_camera(scene: Scene, frames: range, folder: Path) -> None:
+    """All that is made of one static camera."""
+    with stage("set-up"):
+        renderer = CameraRenderer(scene, 0)
+    size_wh = renderer.cam.width, renderer.cam.height
+    black = np.zeros(size_wh[::-1], bool)
+    with VideoWriter(folder / "static.avi", 25.0, size_wh) as video, MaskWriter(folder / "m.zip") as masks:
+        for frame in frames:
+            with stage("drones, shadows, reflections"):
+                clean = renderer.clean_frame(frame)
+            with stage("sensor"):
+                image = renderer.sensor.expose(clean, frame, scene.time_s(frame))
+            with stage("codec"):
+                video.write(image)
+            with stage("detections"):
+                drones = silhouettes(scene, renderer.cam, renderer.backdrop.depth_m, frame)
+                detect(scene, 0, frame, drones)
+            with stage("masks"):
+                there = {one.number: one.mask() for one in drones}
+                for number in range(1, len(scene.flights) + 1):
+                    masks.write("cam1i", number, frame, there.get(number, black))
+
+
+def onboard_camera(scene: Scene, frames: range, folder: Path) -> None:
+    """The video of the first drone's own camera."""
+    renderer = OnboardRenderer(scene, 0)
+    with VideoWriter(folder / "onboard.avi", 25.0, (renderer.width, renderer.height)) as video:
+        for frame in frames:
+            with stage("on-board video"):
+                video.write(renderer.frame(frame))
+
+
+def main() -> None:
+    """Draw, and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--scenario", choices=preset_names(), default="S02_D4_A")
+    parser.add_argument("--frames", type=int, default=60)
+    parser.add_argument("--scale", type=float, default=1.0)
+    options = parser.parse_args()
+    cv2.setNumThreads(1)
+    recipe = scenario(options.scenario)
+    scene = build(recipe, scale=options.scale)
+    width, height = (int(side) for side in scene.rig.cameras.image_size_wh[0])
+    print(f"{recipe.name}: {len(recipe.drones)} drones, {width} x {height}, {options.frames} frames")
+    print(f"{platform.processor() or platform.machine()}, OpenCV {cv2.__version__}, NumPy {np.__version__}")
+    frames = range(options.frames)
+    with tempfile.TemporaryDirectory() as folder:
+        static_camera(scene, frames, Path(folder))
+        if recipe.onboard is not None:
+            onboard_camera(scene, frames, Path(folder))
+    set_up_s, onboard_s = _spent_s.pop("set-up"), _spent_s.pop("on-board video", None)
+    for name, spent_s in _spent_s.items():
+        print(f"{name:30} {1e3 * spent_s / options.frames:7.1f} ms per frame")
+    total_s = sum(_spent_s.values()) / options.frames
+    print(f"{'total of a static camera':30} {1e3 * total_s:7.1f} ms per frame")
+    print(f"{'one second of eight, two cores':30} {200 * total_s / 2:7.1f} s")
+    if onboard_s is not None:
+        print(f"{'video of an on-board camera':30} {1e3 * onboard_s / options.frames:7.1f} ms per frame")
+    print(f"{'set-up, once per camera':30} {set_up_s:7.1f} s")
+
+
+if __name__ == "__main__":
+    main()
