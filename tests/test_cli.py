@@ -318,13 +318,17 @@ class TestBadInput:
 
 
 def test_a_full_disk_leaves_earlier_results(run: Run, data: Path, sequence: Path, tmp_path: Path) -> None:
-    """A limit on the size of files stands for the full disk: every write beyond it fails."""
+    """A limit on the size of files stands for the full disk: every write beyond it fails.
+
+    No bytecode is written then: modules would be cached cut off, for everybody.
+    """
     tracks = tmp_path / "tracks.csv"
     arguments = [str(word) for word in track(sequence, tracks)]
     assert run(*arguments).code == 0
     earlier = tracks.read_bytes(), tracks.with_suffix(".json").read_bytes()
     limited = (
-        "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (512, 512)); "
+        "import resource, sys; sys.dont_write_bytecode = True; "
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (512, 512)); "
         "from psotrack.cli import main; main()"
     )
     answer = subprocess.run(

@@ -207,6 +207,7 @@ def test_a_full_disk_is_an_error(tmp_path):
         import numpy as np
         from psotrack.errors import OutputError
         from psotrack.mocap import Markers, write_c3d
+        sys.dont_write_bytecode = True  # a cached module would be cut off too, for everybody
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
         try:
             write_c3d(Path(sys.argv[1]), Markers(("Dron1:1",), np.ones((5_000, 1, 3)), 100.0))

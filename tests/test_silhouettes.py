@@ -432,8 +432,10 @@ def test_full_disk(folder: Path, tmp_path: Path) -> None:
     process = _start(
         folder,
         cache,
-        # No file may grow beyond 4 kB, and pure noise does not fit: the write fails as on a full disk.
-        before="import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))",
+        # No file may grow beyond 4 kB, and pure noise does not fit: the write fails as on a full disk. Nor may modules
+        # be cached, which would be cut off for everybody.
+        before="import resource, sys; sys.dont_write_bytecode = True; "
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))",
         settings="SilhouetteSettings(reduction=2, min_blob_px=0, var_threshold=0.1)",
     )
     _, complaints = process.communicate()

@@ -391,6 +391,7 @@ def test_a_full_disk_leaves_no_sequence_and_keeps_what_was_whole(pair_folder, tm
         from psotrack.errors import OutputError
         from psotrack.simulation import Scenario, segments, simulate
         segments.SEGMENT_FRAMES = 2
+        sys.dont_write_bytecode = True  # a cached module would be cut off too, for everybody
         resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
         recipe = msgspec.json.decode(sys.stdin.buffer.read(), type=Scenario)
         try:

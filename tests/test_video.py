@@ -233,6 +233,7 @@ def test_a_full_disk_is_an_error_and_costs_nothing(tmp_path):
         import numpy as np
         from psotrack.errors import OutputError
         from psotrack.video import VideoWriter
+        sys.dont_write_bytecode = True  # a cached module would be cut off too, for everybody
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
         rng = np.random.default_rng(0)
         try:
@@ -261,6 +262,7 @@ def test_an_index_that_is_cut_off_is_noticed(tmp_path, missing):
         import numpy as np
         from psotrack.errors import OutputError
         from psotrack.video import VideoWriter
+        sys.dont_write_bytecode = True  # a cached module would be cut off too, for everybody
         resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
         try:
             with VideoWriter(Path(sys.argv[1]), 25.0, (96, 64)) as writer:
@@ -351,6 +353,7 @@ def test_a_disk_that_is_full_while_joining_costs_nothing(tmp_path):
         from psotrack.errors import OutputError
         from psotrack.video import join_videos
         target, limit, *parts = sys.argv[1:]
+        sys.dont_write_bytecode = True  # a cached module would be cut off too, for everybody
         resource.setrlimit(resource.RLIMIT_FSIZE, (int(limit), int(limit)))
         try:
             join_videos(Path(target), [Path(part) for part in parts])
