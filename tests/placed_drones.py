@@ -8,6 +8,7 @@ import numpy as np
 from psotrack.cameras import project
 from psotrack.simulation.flights.formulas import HarmonicFlight
 from psotrack.simulation.flights.motion import Heading
+from psotrack.simulation.labels.masks import silhouettes
 from psotrack.simulation.world.drones import DroneModel
 from psotrack.simulation.world.shapes import box
 
@@ -45,6 +46,14 @@ def ray_point(scene, index, pixel, depth_m):
     cam = scene.rig.cameras[index]
     R, t = cam.T_cam_world[:3, :3], cam.T_cam_world[:3, 3]
     return R.T @ (depth_m * np.linalg.inv(cam.K) @ [*pixel, 1.0] - t)
+
+
+def drone_masks(scene, cam, backdrop_depth_m, frame):
+    """(height, width): which drone is seen in a pixel in the middle of the exposure, its number from 1, or 0."""
+    numbers = np.zeros((cam.height, cam.width), np.uint8)
+    for one in silhouettes(scene, cam, backdrop_depth_m, frame):
+        numbers[one.window.slices][one.seen] = one.number
+    return numbers
 
 
 def pixel_of(scene, index, point_m):

@@ -11,6 +11,7 @@ from click.testing import CliRunner
 from psotrack import cli
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.errors import PsotrackError
+from psotrack.simulation import build, preview
 
 SMALL = ("--frames", "2", "--scale", "0.1", "--jobs", "1", "--no-onboard", "--quiet")
 #: What the paper says of its simulated half: frames of all sequences, and frames times drones.
@@ -41,6 +42,10 @@ def test_the_list_names_all_thirteen_with_what_they_hold():
         "S13_D3": 4,
     }
     assert all(row["markers"] == row["onboard"] == row["name"].endswith("_A") for row in rows)
+    # As measured on the dataset: fast ones, and those flown by hand.
+    speed = {row["name"][:3]: row["mean_speed_m_s"] for row in rows}
+    assert all(3.4 <= speed[name] <= 4.0 for name in ("S08", "S09", "S10"))
+    assert all(0.25 <= speed[name] <= 0.43 for name in ("S11", "S12", "S13"))
     shown = run("--list").stdout
     for row in rows:
         line = next(line for line in shown.splitlines() if row["name"] in line)
@@ -78,6 +83,20 @@ def test_a_page_of_pictures_instead_of_the_sequence(tmp_path):
     assert "pass --force" in refused("S01_D2_A", "--preview", "--out", tmp_path, "--frames", "3")
 
 
+def test_a_page_is_of_the_seed_that_was_asked_for(tmp_path, monkeypatch):
+    """All of it: its pictures as well as its plans."""
+    seeds = []
+
+    def noting(recipe, *, scale, seed):
+        seeds.append(seed)
+        return build(recipe, scale=scale, seed=seed)
+
+    monkeypatch.setattr(preview, "build", noting)
+    run("S11_D4", "--preview", "--out", tmp_path, "--seed", "7", "--frames", "1", "--jobs", "1", "--quiet")
+    assert len(seeds) == 1 + 4
+    assert set(seeds) == {7}
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -92,6 +111,11 @@ def test_a_page_of_pictures_instead_of_the_sequence(tmp_path):
         (("S01_D2_A", "--out", "x", "--preview", "--frames", "501"), "frames: expected 1 to 500"),
         (("--scenario", "missing.toml", "--out", "x"), "missing.toml"),
         (("--scenario", "missing.toml", "--show"), "--show: expected the NAME of a scenario"),
+        (
+            ("S01_D2_A", "--show", "--set", "fps=50"),
+            "--show: expected no --set, as the file is shown as it is",
+        ),
+        (("S01_D2_A", "--out", "x", "--set", f"fps={'1' * 5000}"), "fps: expected a number, found "),
     ],
 )
 def test_bad_input_is_one_line_and_writes_nothing(arguments, message, tmp_path, monkeypatch):

@@ -1,8 +1,10 @@
 """Simulated sequences on disk: layout, determinism, resuming after any interruption, refusing."""
 
 import contextlib
+import errno
 import hashlib
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -14,7 +16,9 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+from placed_drones import drone_masks
 
+from psotrack import __version__
 from psotrack.cameras import project
 from psotrack.datasets.dpjait import (
     DETECTIONS,
@@ -28,9 +32,8 @@ from psotrack.detections import read_detections
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.simulation import CameraRenderer, build, replaced, scenario, segments, simulate
 from psotrack.simulation.imaging.onboard import OnboardRenderer
-from psotrack.simulation.labels.masks import drone_masks
 from psotrack.simulation.unfinished import unfinished
-from psotrack.video import probe, read_frames
+from psotrack.video import VideoWriter, probe, read_frames
 
 NAME = "S02_D4_A"
 SMALL = {"num_frames": 3, "scale": 0.1}
@@ -174,6 +177,9 @@ def test_the_record_says_how_to_make_it_again(sequence_folder):
     assert {key: record[key] for key in ("frames", "scale", "seed", "masks", "onboard")} == {
         "frames": 3, "scale": 0.1, "seed": 0, "masks": True, "onboard": True,
     }  # fmt: skip
+    # With other versions an unfinished sequence is begun anew: its halves might differ.
+    assert record["version"] == __version__
+    assert record["libraries"] == {"numpy": np.__version__, "opencv": cv2.__version__}
     assert msgspec.convert(record["scenario"], type(PAIR)) == scenario(NAME)
 
 
@@ -296,6 +302,8 @@ def test_an_interruption_after_the_last_frame_costs_no_frame(pair_folder, tmp_pa
         patch.setattr(places[step], interrupt)
         with pytest.raises(KeyboardInterrupt):
             simulate(PAIR, tmp_path, jobs=1, **TINY)
+    # What is joined is not on the disk twice.
+    assert bool(list(tmp_path.rglob("video.avi"))) == step.startswith("join")
     monkeypatch.setattr("psotrack.simulation.segments.CameraRenderer", interrupt)
     folder = simulate(PAIR, tmp_path, jobs=1, **TINY)
     assert contents(folder) == contents(pair_folder)
@@ -360,12 +368,36 @@ def test_a_death_between_the_two_moves_of_a_replacement_loses_nothing(pair_folde
     assert beside(folder) == [NAME]
 
 
+def test_a_replacement_that_cannot_be_moved_leaves_the_old_sequence(pair_folder, tmp_path, monkeypatch):
+    folder = shutil.copytree(pair_folder, tmp_path / "Simulated_Data" / NAME)
+    move = os.replace
+
+    def refuse(source, target):
+        if str(source).endswith(".unfinished"):
+            raise OSError(errno.EIO, "Input/output error")
+        move(source, target)
+
+    monkeypatch.setattr("psotrack.simulation.unfinished.os.replace", refuse)
+    with pytest.raises(OutputError, match=r"S02_D4_A: expected to write it, found Input/output error"):
+        simulate(PAIR, tmp_path, num_frames=1, scale=0.04, jobs=1, force=True)
+    assert contents(folder) == contents(pair_folder)
+    assert beside(folder) == [f".{NAME}.unfinished", NAME]
+
+
 @pytest.mark.usefixtures("short_segments")
 @pytest.mark.parametrize("other", [{"seed": 5}, {"num_frames": 6}])
 def test_what_other_settings_left_unfinished_is_not_used(pair_folder, tmp_path, other):
     with pytest.raises(KeyboardInterrupt):
         simulate(PAIR, tmp_path, jobs=1, report=interrupting(4), **{**TINY, **other})
     assert contents(simulate(PAIR, tmp_path, jobs=1, **TINY)) == contents(pair_folder)
+
+
+def test_a_worker_that_outlives_its_call_leaves_nothing_to_another_record(tmp_path):
+    folders = []
+    for record in (b"one", b"other"):
+        with unfinished(tmp_path / NAME, record, force=False) as growing:
+            folders.append(growing.segments)
+    assert folders[0] != folders[1]
 
 
 def test_two_calls_at_once_do_not_meet(tmp_path):
@@ -379,6 +411,18 @@ def test_two_calls_at_once_do_not_meet(tmp_path):
     # A lock ends with whoever held it.
     simulate(PAIR, tmp_path, num_frames=1, scale=0.04, jobs=1)
     assert beside(folder) == [NAME]
+
+
+@pytest.mark.parametrize("code", [errno.ENOLCK, errno.EIO])
+def test_a_file_system_without_locks_keeps_nobody_out_and_a_broken_one_is_named(tmp_path, monkeypatch, code):
+    def fail(descriptor, operation):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr("psotrack.simulation.unfinished.fcntl.flock", fail)
+    refused = pytest.raises(OutputError, match=r"S02_D4_A: expected to write it, found Input/output error")
+    allowed = contextlib.nullcontext() if code == errno.ENOLCK else refused
+    with allowed, unfinished(tmp_path / NAME, b"record", force=False) as growing:
+        assert growing.folder.is_dir()
 
 
 def test_a_full_disk_leaves_no_sequence_and_keeps_what_was_whole(pair_folder, tmp_path, monkeypatch):
@@ -441,14 +485,25 @@ def test_a_sequence_that_exists_is_left_alone_unless_forced(pair_folder, tmp_pat
         ({"scale": -1.0}, r"^scale: .* found -1$"),
         ({"scale": float("nan")}, r"^scale: .* found nan$"),
         ({"scale": 0.01}, r"^scale: expected images of at least 32 pixels a side, found 20 x 10$"),
+        ({"scale": 5.0}, r"^scale: expected images of at most 8190 pixels a side, found 9600 x 5400$"),
+        ({"scale": 1e308}, r"^scale: expected images of at most 8190 pixels a side, found inf x inf$"),
+        ({"scenario": replaced(PAIR, {"onboard.image_size_wh": [160, 90]})},
+         r"^scale: expected images of at least 32 pixels a side, found 16 x 8$"),
         ({"seed": -1}, r"^seed: expected 0 or more, found -1$"),
         ({"jobs": 0}, r"^jobs: expected 1 or more, found 0$"),
     ],
-)
+)  # fmt: skip
 def test_settings_that_make_no_sense_are_refused_before_anything_is_written(settings, message, tmp_path):
     with pytest.raises(SettingsError, match=message):
         simulate(**{"scenario": NAME, "root": tmp_path, **SMALL, **settings})
     assert not list(tmp_path.iterdir())
+
+
+def test_the_largest_images_are_the_largest_that_a_video_takes(tmp_path):
+    with VideoWriter(tmp_path / "fits.avi", 25.0, (8190, 32)) as video:
+        video.write(np.zeros((32, 8190, 3), np.uint8))
+    with pytest.raises(OutputError), VideoWriter(tmp_path / "wide.avi", 25.0, (8192, 32)):
+        pass
 
 
 def test_a_place_that_cannot_be_written_is_named(tmp_path):

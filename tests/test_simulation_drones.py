@@ -308,6 +308,20 @@ def test_what_is_no_drone_is_refused_in_one_line(name, content, message, tmp_pat
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize(
+    ("rotor", "reach"),
+    [(Rotor(centre_m=(120.0, 80.0, 0.0), radius_m=0.05), 144), (Rotor(centre_m=(0, 0, 0), radius_m=76), 76)],
+)
+def test_rotors_in_the_units_of_the_mesh_are_refused(rotor, reach, cube):
+    path, _ = cube(".obj", 1024)
+    fits = Rotor(centre_m=(0.1, 0.1, 0.0), radius_m=0.05)
+    message = (
+        rf"^{path}: expected rotors within 3 m of the body origin, found rotors\[1\] that reaches {reach} m; "
+    )
+    with pytest.raises(InputError, match=message):
+        drones.model(Mesh(file=str(path), scale=1 / 1024, rotors=(fits, rotor)))
+
+
 def test_a_file_that_is_not_there_is_named(tmp_path):
     for path in (tmp_path / "none.obj", tmp_path):
         expected = "No such file" if path.suffix else "no suffix"

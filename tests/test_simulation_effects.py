@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from placed_drones import cube, pixel_of, straight_flight, with_drones
+from placed_drones import cube, drone_masks, pixel_of, straight_flight, with_drones
 
 from psotrack.cameras import project
 from psotrack.simulation import CameraRenderer, build, scenario
+from psotrack.simulation.flights.motion import Heading
 from psotrack.simulation.imaging import reflections, sensor, shadows
-from psotrack.simulation.labels.masks import drone_masks
 from psotrack.simulation.scenarios import Imaging
 from psotrack.simulation.world.lighting import AMBIENT
 
@@ -238,6 +238,41 @@ def test_a_mirror_image_is_where_the_drone_would_be_below_the_floor(scene, index
     assert drone_masks(one.scene, one.cam, one.backdrop.depth_m, 0)[y, x] == 0
 
 
+@pytest.mark.parametrize("height_m", [0.7, 1.2])
+def test_a_rough_floor_blurs_what_it_mirrors_the_more_the_higher_it_is(scene, monkeypatch, height_m):
+    centre, rough_rad = np.array([0.3, -0.2, height_m]), 0.02
+    x, y = pixel_of(scene, 0, centre * [1, 1, -1]).astype(int)
+    window = np.s_[y - 24 : y + 25, x - 24 : x + 25]
+    widths = []
+    for roughness_rad in (0.0, rough_rad):
+        monkeypatch.setattr(reflections, "ROUGHNESS_RAD", roughness_rad)
+        one = renderer(scene, imaging(reflections=0.5), standing(cube(0.3), centre))
+        change = sensor.undevelop(one.clean_frame(0)) - sensor.undevelop(sensor.develop(one.backdrop.light))
+        covered = -change.sum(axis=-1) / (one.mirror.share * one.mirror.light.sum(axis=-1) + 1e-9)
+        widths.append(moments(covered[window])[1])
+    # A direction that is off by an angle at the floor is off by the floor's share of the way at the eye.
+    eye_m = -one.cam.R.T @ one.cam.t_m
+    sigma_px = rough_rad * one.cam.K[0, 0] * height_m / (height_m + eye_m[2])
+    # The tails of the blur are rounded off with 8 bits: measured 0.92 to 0.95 of the variance.
+    np.testing.assert_allclose(np.subtract(*widths[::-1]), sigma_px**2, rtol=0.15)
+
+
+def test_a_rough_floor_blurs_the_room_the_more_the_farther_behind_it(scene, monkeypatch):
+    """What stands on it not at all; what is half as far behind it as the eye is before it, by a third of the most."""
+    rough = renderer(scene, imaging(reflections=0.5)).mirror
+    monkeypatch.setattr(reflections, "ROUGHNESS_RAD", 0.0)
+    one = renderer(scene, imaging(reflections=0.5))
+    smooth = one.mirror
+    beyond = 1 - one.backdrop.depth_m / smooth.depth_m
+    blurred = cv2.GaussianBlur(smooth.light, (0, 0), 0.006 * one.cam.K[0, 0] / 3)
+    foot, third = (one.backdrop.floor & (np.abs(beyond - share) < 0.01) for share in (0.0, 1 / 3))
+    assert min(foot.sum(), third.sum()) > 100
+    # Within 0.01 of those shares: measured 0.001 and 0.004, of light up to 3.
+    np.testing.assert_allclose(rough.light[foot], smooth.light[foot], atol=0.01)
+    np.testing.assert_allclose(rough.light[third], blurred[third], atol=0.01)
+    assert np.abs(blurred - smooth.light)[third].max() > 0.1, "an edge, or the test would say nothing"
+
+
 @pytest.mark.parametrize(("beyond_m", "seen"), [(-0.6, True), (0.6, False)])
 def test_mirrored_furniture_hides_what_is_behind_it(scene, beyond_m, seen):
     pillar = np.array([-1.975, 2.875, 0.0])
@@ -340,6 +375,32 @@ def test_contact_shadows_are_dark_on_the_floor_and_gone_above(scene):
         assert gain.min() == pytest.approx(expected, abs=0.08 * (1 - expected) + 0.002)
     high = standing(cube(side_m), (*foot[:2], 1.9))
     assert renderer(scene, imaging(contact_shadows=True), high).shadows.floor_gain(0.0).min() == 1.0
+
+
+def test_a_rotor_lets_three_quarters_of_the_light_through(scene):
+    radius_m, height_m, foot = 0.3, 0.3, np.array([0.41, 0.21, 0.0])
+    rotor = replace(cube(0.01), rotor_radii_m=np.array([radius_m]))
+    flying = standing(rotor, (*foot[:2], height_m))
+    gain = renderer(scene, imaging(contact_shadows=True), flying).shadows.floor_gain(0.0)
+    all_light = scene.room.panels.on_faces(foot, np.array([[0.0, 0.0, 1.0]]))[0]
+    expected = 1 - AMBIENT / all_light * 0.25 * radius_m**2 / (radius_m**2 + height_m**2)
+    # A cell of 0.01 m at its rim is 7 % of it.
+    assert gain.min() == pytest.approx(expected, abs=0.08 * (1 - expected))
+
+
+@pytest.mark.parametrize("yaw_rad", [0.0, 0.6, -1.1])
+def test_shadows_turn_with_their_drone(scene, yaw_rad):
+    bar = replace(cube(0.3), triangles_m=cube(0.3).triangles_m * [2.0, 0.2, 0.2])
+    flight = replace(straight_flight((0.4, 0.2, 0.08)), heading=Heading(yaw_rad))
+    one = renderer(scene, imaging(contact_shadows=True), (bar, flight, BLACK))
+    lost = 1 - one.shadows.floor_gain(0.0)
+    assert lost.max() > 0.1
+    # Rows of the floor's map count down where y counts up.
+    rows, columns = np.indices(lost.shape)
+    spread = np.cov(np.stack([columns, -rows]).reshape(2, -1), aweights=lost.ravel())
+    angle_rad = np.arctan2(2 * spread[0, 1], spread[0, 0] - spread[1, 1]) / 2
+    # The axis of a bar of 30 x 3 cells.
+    assert angle_rad == pytest.approx(yaw_rad, abs=0.02)
 
 
 # --- lamps and gains

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import SettingsError
-from psotrack.simulation.flights.motion import GRAVITY_M_S2
+from psotrack.simulation.flights.motion import GRAVITY_M_S2, quaternions_wxyz
 from psotrack.simulation.flights.planning import frame_times_s, plan
 from psotrack.simulation.flights.recordings import write_recording
 from psotrack.simulation.scenarios import (
@@ -151,6 +151,11 @@ def test_orientations_are_those_rotations_and_do_not_change_sign(every_kind, kin
     assert (wxyz[1:] * wxyz[:-1]).sum(axis=-1).min() > 0.99
 
 
+def test_half_a_turn_from_one_time_to_the_next_leaves_a_quaternion_of_length_1():
+    turns = np.stack([np.eye(3), np.diag([-1.0, -1.0, 1.0]), np.eye(3)])
+    np.testing.assert_array_equal(np.abs(quaternions_wxyz(turns)), [[1, 0, 0, 0], [0, 0, 0, 1], [1, 0, 0, 0]])
+
+
 def test_the_x_axis_looks_along_the_heading():
     recipe = replaced(scene_of(ORBIT), {"drones[0].yaw_deg": 70.0, "drones[0].yaw_sway_deg": 30.0})
     (flight,) = plan(recipe, 0)
@@ -257,6 +262,12 @@ def test_a_recording_replays_whatever_the_seed_and_others_fly_relative_to_it(tmp
         )
     with pytest.raises(SettingsError, match=r"r.csv: expected a recording of at least "):
         plan(scene_of(replay, num_frames=300), 0)
+    behind = Following(leader=1, delay_s=1.5)
+    plan(scene_of(msgspec.structs.replace(replay, start_s=1.5), behind), 0)
+    with pytest.raises(
+        SettingsError, match=r"r.csv: expected a start_s of at least 1.5 s, found 1 s; who foll"
+    ):
+        plan(scene_of(replay, behind), 0)
 
 
 # --- what a seed changes
@@ -286,6 +297,11 @@ def test_variation_stays_within_what_the_scenario_allows(seed):
     assert np.all(np.abs(2 * np.pi / orbit.angular_rad_s / [6.3, 5.0] - 1) <= 0.02 + 1e-12)
     assert abs(np.degrees(orbit.heading.yaw_rad)) <= 30.0
     assert np.all(np.abs(hand.points_m - waypoints.points_m) <= 0.1)
+    # The whole way around is slower or faster, hovering too.
+    slower = hand.hover_s / waypoints.hover_s
+    assert abs(slower - 1) <= 0.02 + 1e-12
+    way_m = np.linalg.norm(np.roll(hand.points_m, -1, axis=0) - hand.points_m, axis=-1)
+    np.testing.assert_allclose(hand.moving_s, slower * way_m / waypoints.speed_m_s, rtol=1e-12)
 
 
 def around(phase_deg, **changes):
@@ -308,7 +324,8 @@ def test_drones_of_no_group_drift_apart_and_members_turn_their_heads_alone():
     alone = scene_of(*circle, variation=Variation(), num_frames=9000)
     assert np.ptp(apart(positions(alone, 0, stride=10))) > 0.5
     one, other = plan(scene_of(*circle, groups=("ring",) * 2, variation=Variation()), 0)
-    assert one.heading != other.heading
+    assert one.heading.yaw_rad != other.heading.yaw_rad
+    assert one.heading.phase_rad != other.heading.phase_rad
 
 
 def test_a_group_of_unlike_flights_shares_what_they_have_in_common():
@@ -376,6 +393,26 @@ def test_what_the_record_itself_breaks_is_named_with_its_value_and_when(field, v
     limits = msgspec.structs.replace(WIDE, **{field: value})
     with pytest.raises(SettingsError, match=rf"^scenario T: {sentence}$"):
         plan(scene_of(*LINES, limits=limits), 0)
+
+
+def test_a_leg_that_is_over_between_two_frames_is_refused_all_the_same():
+    """A metre in 10 ms: at frames the drone hovers, here or there."""
+    points_m = ((0.0, 0.0, 1.0), (1.0, 0.0, 1.0))
+    dash = Waypoints(points_m=points_m, speed_m_s=100.0, hover_s=0.99)
+    with pytest.raises(
+        SettingsError,
+        match=r"^scenario T: drones\[0\].flight.speed_m_s: expected at most 9 m/s \(limits.max_speed_m_s\), found 100$",
+    ):
+        plan(scene_of(dash), 0)
+
+
+def test_numbers_that_overflow_keep_no_limit():
+    far = Waypoints(points_m=((0.0, 0.0, 1.0), (1e300, 0.0, 1.0)), speed_m_s=1.0)
+    with (
+        np.errstate(all="ignore"),
+        pytest.raises(SettingsError, match=r"expected positions from .*found \[nan, "),
+    ):
+        plan(scene_of(far), 0)
 
 
 def test_what_only_variation_breaks_is_named_with_how_often():

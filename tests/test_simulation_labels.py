@@ -11,6 +11,7 @@ import pytest
 from helpers import sphere_points
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from placed_drones import drone_masks
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
@@ -29,7 +30,7 @@ from psotrack.simulation.flights.formulas import HarmonicFlight
 from psotrack.simulation.flights.motion import Heading
 from psotrack.simulation.imaging.raster import View, pinhole
 from psotrack.simulation.labels.detector import detect, iou
-from psotrack.simulation.labels.masks import Silhouette, drone_masks, numbered, silhouettes
+from psotrack.simulation.labels.masks import Silhouette, silhouettes
 from psotrack.simulation.labels.mocap import mocap_markers_m
 from psotrack.simulation.scenarios import Mesh
 from psotrack.simulation.world import drones
@@ -201,8 +202,7 @@ def test_masks_of_one_camera_are_disjoint_and_boxes_hold_them(scene):
     one = CameraRenderer(scene, 4)
     for frame in range(0, 250, 25):
         found = silhouettes(scene, one.cam, one.backdrop.depth_m, frame)
-        numbers = numbered(found, one.cam)
-        np.testing.assert_array_equal(numbers, drone_masks(scene, one.cam, one.backdrop.depth_m, frame))
+        numbers = drone_masks(scene, one.cam, one.backdrop.depth_m, frame)
         for single in found:
             np.testing.assert_array_equal(single.mask(), numbers == single.number)
             if single.xyxy is not None:
@@ -432,6 +432,16 @@ def test_misses_and_doubles_are_as_frequent_as_they_are_set(scene, rate):
     for one in doubled:
         # Otherwise a network would have taken both for one (its own threshold is 0.45).
         assert len(one) < 2 or iou(one.xyxy[0], one.xyxy[1]) < 0.45
+
+
+def test_of_a_double_the_detector_is_less_sure_than_of_the_box_it_lies_on(scene):
+    twice = with_detector(scene, double_rate=1.0)
+    found = [detect(twice, 0, frame, [seen_as(scene, LARGE)]) for frame in range(400)]
+    larger = [np.argsort(np.prod(one.xyxy[:, 2:] - one.xyxy[:, :2], axis=1)) for one in found]
+    part, whole = np.mean([one.confidence[order] for one, order in zip(found, larger, strict=True)], axis=0)
+    # The rest above 0.25 is 0.1 + 0.8 q with q = 1 and 0.4; means of 400 are known to 0.004.
+    assert whole == pytest.approx(0.25 + 0.75 * 0.9, abs=0.016)
+    assert part == pytest.approx(0.25 + 0.75 * 0.42, abs=0.016)
 
 
 @pytest.mark.parametrize(

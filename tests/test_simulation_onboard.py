@@ -274,6 +274,19 @@ def test_a_drone_is_seen_at_its_projection(scene, velocity_m_s, speed_rad_s):
     np.testing.assert_allclose(found, expected, atol=0.15)
 
 
+def test_without_antialiasing_pixels_are_of_the_drone_or_of_the_room(scene):
+    hard = msgspec.structs.replace(scene.scenario.imaging, antialiasing=False, lens_blur_px=0.0)
+    sharp = replace(scene, scenario=msgspec.structs.replace(scene.scenario, imaging=hard))
+    cubes = (0.3, straight_flight((1.2, 0.5, 1.7)))
+    frame, room = (
+        OnboardRenderer(carrying(sharp, turning(MIDDLE), *placed, shutter_s=1e-9), 0).clean_frame(0)
+        for placed in ([cubes], [])
+    )
+    changed = (frame != room).any(axis=-1)
+    assert changed.sum() > 200
+    assert not frame[changed].any()
+
+
 def test_a_pillar_hides_a_drone_behind_it(scene):
     pillar = np.array([1.81, -2.89])  # 0.22 m square
     eye = (0.0, -2.89, 1.4)

@@ -188,6 +188,12 @@ def test_rates_that_divide_the_step_record_the_same_flight(rate_hz):
     np.testing.assert_array_equal(coarse.time_s, np.arange(round(2.4 * rate_hz) + 1) / rate_hz)
 
 
+@pytest.mark.parametrize("end_s", [1.4, 1.64, 2.28])
+def test_a_last_time_that_rounds_to_before_its_step_is_recorded(end_s):
+    assert int(end_s / (1 / 250)) < round(end_s * 250), "rounding that does no harm"
+    assert flown((0, 1, 0, 0, 0), (end_s,)).time_s[-1] == end_s
+
+
 def test_a_rate_that_divides_nothing_has_its_own_times_and_the_same_flight():
     rows = [(0, 1, 0.3, 0.1, 0.5), (1.0, -0.4, 1, 0, -1), (3.0,)]
     recorded, fine = flown(*rows, rate_hz=29.97), flown(*rows, rate_hz=STEP_HZ)
@@ -409,6 +415,16 @@ def test_a_slow_machine_samples_less_often_but_keeps_the_time():
     assert len(samples) == 20
     assert samples[-1].time_s == pytest.approx(2.0, rel=0.2)
     assert np.all(np.diff([sample.time_s for sample in samples]) > 0.1)
+
+
+def test_samples_that_a_stall_cost_are_not_made_up_for():
+    panel = FakePanel(lasts=60)
+    panel.on_pump = lambda: panel.sleep(1.0 if panel.lasts == 50 else 1e-4)
+    device = KeyboardDevice(panel, lambda name: name == "W", **panel.timing())
+    gaps_s = np.diff([sample.time_s for sample in device.samples()])
+    assert gaps_s.max() > 0.99
+    # The next two may come early, to be back in step; sixty were missed.
+    assert np.count_nonzero(gaps_s < 1 / 60 - 3e-4) <= 2
 
 
 def test_ctrl_c_ends_a_flight_with_what_was_flown_and_is_itself_again_afterwards():

@@ -5,12 +5,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from placed_drones import cube, pixel_of, ray_point, straight_flight, with_drones
+from placed_drones import cube, drone_masks, pixel_of, ray_point, straight_flight, with_drones
 
 from psotrack.cameras import camera, look_at, project
 from psotrack.simulation import CameraRenderer, build, scenario
-from psotrack.simulation.imaging import raster, sensor
-from psotrack.simulation.labels.masks import drone_masks
+from psotrack.simulation.imaging import posing, raster, sensor
 from psotrack.simulation.world import drones, rooms
 
 S02 = scenario("S02_D4_A")
@@ -223,6 +222,24 @@ def test_rotor_discs_let_the_backdrop_through(scene):
         / sensor.undevelop(sensor.develop(one.backdrop.light))[y, x]
     )
     assert np.all((share > 0.4) & (share < 0.9))
+
+
+def test_rotors_dim_what_is_behind_them_whatever_their_order_and_walls_hide_them(scene):
+    rotor = replace(cube(0.02), rotor_radii_m=np.array([0.3]))
+    places = [straight_flight(ray_point(scene, 0, (240.0, 150.0), depth_m)) for depth_m in (3.5, 6.0)]
+    two = with_drones(scene, *((rotor, flight, (0.0, 0.0, 0.0)) for flight in places))
+    view = raster.full_view(raster.pinhole(scene.rig.cameras[0]))
+    posed = []
+    for drone, light in ((0, 0.0), (1, 1.0)):
+        one = posing.pose(two, drone, np.zeros(1))
+        opacity_light = np.broadcast_to([0.5, light, 0.0], one.disc_opacity_light.shape)
+        posed.append(replace(one, disc_opacity_light=opacity_light))
+    # Beside the hubs. The far one, half of whose light is seen: half of it, and half of the half behind it. Before a
+    # wall that hides it there is the near one, which is dark; before one that hides both, nothing.
+    for wall_m, light, clear in ((raster.FAR_M, 0.25, 0.25), (5.0, 0.0, 0.5), (2.0, 0.0, 1.0)):
+        for order in (posed, posed[::-1]):
+            seen = posing.sample(view, order, 0, np.full(view.shape, wall_m, np.float32))
+            np.testing.assert_allclose(seen[150, 252], [light, light, light, clear], atol=1e-6)
 
 
 def test_a_drone_under_a_lamp_has_its_darkest_shadow_at_its_foot(scene):

@@ -11,6 +11,7 @@ from psotrack.errors import SettingsError
 from psotrack.simulation.imaging import backdrop, raster
 from psotrack.simulation.scenarios import Imaging
 from psotrack.simulation.world import lighting, rooms
+from psotrack.simulation.world.halls import HALLS, RIGS
 
 RIG_OF = {"laboratory": "laboratory", "laboratory_corners": "laboratory", "large_hall": "large_hall"}
 #: Where drones fly, by hall: x, y and z.
@@ -22,7 +23,7 @@ VOLUMES = {
 PLAIN = Imaging(reflections=0.0)
 
 
-@pytest.fixture(scope="module", params=rooms.HALLS)
+@pytest.fixture(scope="module", params=HALLS)
 def hall_name(request):
     return request.param
 
@@ -63,7 +64,7 @@ def test_an_unknown_hall_is_refused_with_the_names_of_those_there_are():
 
 
 def test_furniture_stands_in_the_hall_and_outside_of_where_drones_fly(hall_name):
-    hall = rooms.HALLS[hall_name]
+    hall = HALLS[hall_name]
     length, width, height = hall.size_m
     low, high = VOLUMES[hall_name]
     for box in hall.boxes:
@@ -82,17 +83,15 @@ def test_furniture_stands_in_the_hall_and_outside_of_where_drones_fly(hall_name)
 
 
 def test_the_large_hall_is_twice_the_laboratory():
-    np.testing.assert_array_equal(
-        rooms.HALLS["large_hall"].size_m, 2 * np.array(rooms.HALLS["laboratory"].size_m)
-    )
+    np.testing.assert_array_equal(HALLS["large_hall"].size_m, 2 * np.array(HALLS["laboratory"].size_m))
 
 
 @pytest.mark.parametrize("rig", RIG_OF)
 def test_cameras_hang_in_free_air_and_see_the_middle(rig):
-    hall = rooms.HALLS[RIG_OF[rig]]
-    assert set(RIG_OF) == set(rooms.RIGS)
+    hall = HALLS[RIG_OF[rig]]
+    assert set(RIG_OF) == set(RIGS)
     middle = np.mean(VOLUMES[RIG_OF[rig]], axis=0)
-    for place in rooms.RIGS[rig]:
+    for place in RIGS[rig]:
         eye = np.array(place.position_m)
         assert np.all(np.abs(eye[:2]) < np.array(hall.size_m[:2]) / 2 - 0.1)
         assert 0.5 < eye[2] < hall.size_m[2] - 0.3
@@ -103,14 +102,14 @@ def test_cameras_hang_in_free_air_and_see_the_middle(rig):
 
 
 def test_rigs_have_the_papers_number_of_cameras_and_its_two_close_pairs():
-    assert {name: len(rig) for name, rig in rooms.RIGS.items()} == {
+    assert {name: len(rig) for name, rig in RIGS.items()} == {
         "laboratory": 8,
         "laboratory_corners": 4,
         "large_hall": 8,
     }
-    assert rooms.RIGS["laboratory_corners"] == rooms.RIGS["laboratory"][:4]
+    assert RIGS["laboratory_corners"] == RIGS["laboratory"][:4]
     for name in ("laboratory", "large_hall"):
-        eyes = np.array([place.position_m for place in rooms.RIGS[name]])
+        eyes = np.array([place.position_m for place in RIGS[name]])
         assert np.linalg.norm(eyes[4] - eyes[5]) == pytest.approx(0.02)
         assert np.abs(eyes[6:, 0]).max() <= 0.1
         assert eyes[6, 1] > 0 > eyes[7, 1]
@@ -119,11 +118,11 @@ def test_rigs_have_the_papers_number_of_cameras_and_its_two_close_pairs():
 def test_the_large_hall_is_seen_by_most_cameras_from_10_to_11_m():
     points = np.random.default_rng(4).uniform(*VOLUMES["large_hall"], (1000, 3))
     views, ways, shares_hidden = [], [], []
-    for place in rooms.RIGS["large_hall"]:
+    for place in RIGS["large_hall"]:
         eye = np.array(place.position_m)
         views.append(seen(cam_of(place), points))
         ways.append(np.linalg.norm(points - eye, axis=-1))
-        shares_hidden.append(hidden(points[::4], eye, rooms.HALLS["large_hall"].boxes, 0.1).mean())
+        shares_hidden.append(hidden(points[::4], eye, HALLS["large_hall"].boxes, 0.1).mean())
     cameras_per_point = np.sum(views, axis=0)
     assert cameras_per_point.mean() > 7.5  # measured 7.86
     assert cameras_per_point.min() >= 4
@@ -136,7 +135,7 @@ def test_the_large_hall_is_seen_by_most_cameras_from_10_to_11_m():
 
 
 def test_41_markers_hang_on_the_walls_readable_side_inwards(hall_name):
-    hall = rooms.HALLS[hall_name]
+    hall = HALLS[hall_name]
     corners_m = rooms.room(hall_name, True, 0.1).marker_corners_m
     assert sorted(corners_m) == list(range(1, 42))
     half = np.array(hall.size_m) / 2
@@ -255,7 +254,7 @@ def test_light_is_even_and_textures_are_those_of_a_bright_hall(hall_name):
 
 
 def test_tables_are_closed_from_below(hall_name):
-    hall, room = rooms.HALLS[hall_name], rooms.room(hall_name, True, 0.1)
+    hall, room = HALLS[hall_name], rooms.room(hall_name, True, 0.1)
     raised = [box for box in hall.boxes if box.lower_m[2] > 0]
     assert raised
     for box in raised:

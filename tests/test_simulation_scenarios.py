@@ -342,6 +342,25 @@ def test_a_part_that_is_not_there_yet_begins_with_its_defaults():
         ),
         ("tracker.inertia", 0.5, "tracker: expected one of name, .*, found tracker"),
         ("fps", math.inf, "fps: expected a finite number, found inf"),
+        # What no codec, no memory or no patience is enough for.
+        ("fps", 0.01, "fps: expected a number of at least 0.1, found 0.01"),
+        ("fps", 1e5, "fps: expected a number of at most 1000, found 100000.0"),
+        (
+            "imaging.lens_blur_px",
+            1e6,
+            "imaging.lens_blur_px: expected a number of at most 50, found 1000000.0",
+        ),
+        ("imaging.shot_noise", 300, "imaging.shot_noise: expected a number of at most 255, found 300"),
+        (
+            "detector.false_alarms_per_frame",
+            1e6,
+            "detector.false_alarms_per_frame: expected a number of at most 1000, found 1000000.0",
+        ),
+        (
+            "cameras",
+            [{"position_m": [0, 0, 1], "target_m": [1, 0, 1], "focal_length_px": 1e9}],
+            "cameras[0].focal_length_px: expected a number of at most 100000, found 1000000000.0",
+        ),
     ],
 )
 def test_a_change_that_fits_no_field_is_refused_by_its_path(path, value, sentence):

@@ -121,6 +121,7 @@ def main() -> None:
         grid[row, 0].text(12, 46, f"{x:.0f} x {y:.0f} x {z:.0f} cm over all", fontsize=8, color=INK)
     for axes in grid.flat:
         axes.set(xticks=[], yticks=[])
+    folder.mkdir(parents=True, exist_ok=True)
     path = folder / "drone_models.png"
     figure.savefig(path, dpi=80)
     print(path)

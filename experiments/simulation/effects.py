@@ -274,13 +274,17 @@ def flicker() -> Figure:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("experiments/pictures"))
-    parser.add_argument("--only", nargs="*", help="names of effects")
+    curves_of = {"drift": drift, "flicker": flicker}
+    names = [*(pair.name for pair in PAIRS), *curves_of]
+    parser.add_argument(
+        "--only", nargs="*", choices=names, metavar="NAME", help=f"some of {', '.join(names)}"
+    )
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     for pair in PAIRS:
         if not options.only or pair.name in options.only:
             save_small(picture(pair), options.out / f"effect_{pair.name}.png")
-    for name, draw in (("drift", drift), ("flicker", flicker)):
+    for name, draw in curves_of.items():
         if not options.only or name in options.only:
             canvas = FigureCanvasAgg(draw())
             canvas.draw()

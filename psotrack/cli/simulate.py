@@ -95,6 +95,13 @@ def simulate(
     if show:
         if name is None:
             raise SettingsError("--show", expected="the NAME of a scenario", found="none")
+        if changes:
+            raise SettingsError(
+                "--show",
+                expected="no --set, as the file is shown as it is",
+                found=changes[0],
+                remedy="give --set when the scenario is simulated",
+            )
         click.echo(preset_text(str(name)), nl=False)
         return
     if out is None:
@@ -150,5 +157,6 @@ def _change(text: str) -> tuple[str, Any]:
         raise SettingsError("--set", expected="FIELD=VALUE, such as imaging.shutter_s=0.01", found=text)
     try:
         return field.strip(), tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
+    except ValueError:
+        # No TOML, or an integer of thousands of digits.
         return field.strip(), value

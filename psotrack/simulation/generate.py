@@ -90,6 +90,9 @@ def simulate(
     scene = build(recipe, scale=scale, seed=seed)
     folder = Path(root) / "Simulated_Data" / recipe.name
     onboard = onboard and recipe.onboard is not None
+    if onboard:
+        # Their images have a size of their own, which the scale may not fit: told now, not after hours of drawing.
+        intrinsics(scene)
     record = _record(scene, frames, masks, onboard)
     with unfinished(folder, record, force) as growing:
         if not growing.whole:

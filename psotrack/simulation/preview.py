@@ -18,7 +18,7 @@ from psotrack.simulation.imaging.onboard import OnboardRenderer
 from psotrack.simulation.imaging.renderer import CameraRenderer
 from psotrack.simulation.scenarios import Scenario, frames_of
 from psotrack.simulation.scene import Scene, build
-from psotrack.simulation.world.rooms import HALLS
+from psotrack.simulation.world.halls import HALLS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,7 +37,7 @@ Image = UInt8[np.ndarray, "height width 3"]
 
 @dataclass(frozen=True)
 class _Strip:
-    """What to draw: some frames of one camera, or the same number of first frames of drones' own cameras."""
+    """What to draw: some frames of one camera, or one frame of the own cameras of some drones."""
 
     scenario: Scenario
     seed: int

@@ -22,6 +22,7 @@ Vector = tuple[float, float, float]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+GreyLevels = Annotated[float, msgspec.Meta(ge=0, le=255)]
 #: More than anybody means; beyond it, a slip of the finger would fill the memory.
 Count = Annotated[int, msgspec.Meta(ge=1, le=1_000_000)]
 Reflectance = tuple[Share, Share, Share]
@@ -198,11 +199,11 @@ class Drone(_Record, frozen=True, kw_only=True):
 
 
 class CameraPlace(_Record, frozen=True, kw_only=True):
-    """Where a camera hangs and looks, with intrinsics at full size."""
+    """Where a camera hangs and looks, with intrinsics for pictures of the scenario's `image_size_wh`."""
 
     position_m: Vector
     target_m: Vector
-    focal_length_px: Positive = 1156.3
+    focal_length_px: Annotated[float, msgspec.Meta(ge=1, le=100_000)] = 1156.3
     principal_point_px: tuple[float, float] = (960.0, 540.0)
 
 
@@ -256,7 +257,7 @@ class Imaging(_Record, frozen=True, kw_only=True):
 
     antialiasing: bool = True
     shutter_s: NotNegative = 1 / 125
-    lens_blur_px: NotNegative = 0.3
+    lens_blur_px: Annotated[float, msgspec.Meta(ge=0, le=50)] = 0.3
     shadows: bool = True
     contact_shadows: bool = True
     reflections: Share = 0.04
@@ -264,8 +265,8 @@ class Imaging(_Record, frozen=True, kw_only=True):
     white_balance_drift: Annotated[float, msgspec.Meta(ge=0, le=0.3)] = 0.005
     flicker: Share = 0.1
     mains_hz: Positive = 50.02
-    read_noise: NotNegative = 1.0
-    shot_noise: NotNegative = 3.0
+    read_noise: GreyLevels = 1.0
+    shot_noise: GreyLevels = 3.0
     jpeg_quality: Annotated[int, msgspec.Meta(ge=0, le=100)] = 0
 
 
@@ -283,7 +284,7 @@ class Detector(_Record, frozen=True, kw_only=True):
     jitter: NotNegative = 0.04
     miss_rate: Share = 0.03
     double_rate: Share = 0.01
-    false_alarms_per_frame: NotNegative = 0.02
+    false_alarms_per_frame: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 0.02
     merge_iou: Share = 0.45
 
 
@@ -295,6 +296,7 @@ class Limits(_Record, frozen=True, kw_only=True):
 
     Attributes:
         min_distance_m: between any two drones, except those that the scenario lets pass nearer.
+        lower_m, upper_m: corners of the box that body origins stay in.
     """
 
     max_speed_m_s: Positive
@@ -328,9 +330,13 @@ class Scenario(_Record, frozen=True, kw_only=True):
 
     Attributes:
         description: one line for people.
-        hall: a name in `world.rooms.HALLS`.
-        cameras: where they are, or the name of a rig in `world.rooms.RIGS`.
+        hall: a name in `world.halls.HALLS`.
+        cameras: where they are, or the name of a rig in `world.halls.RIGS`.
         num_frames: as long as flights are planned for.
+        limits: what flights keep to.
+        fps: frames per second.
+        image_size_wh: of the cameras at full size; fewer pixels than their intrinsics are for are a smaller field of
+            view.
         markers: whether ArUco markers hang on the walls.
         onboard: the camera on each drone; none without it.
     """
@@ -342,7 +348,7 @@ class Scenario(_Record, frozen=True, kw_only=True):
     num_frames: Count
     drones: Annotated[tuple[Drone, ...], msgspec.Meta(min_length=1)]
     limits: Limits
-    fps: Positive = 25.0
+    fps: Annotated[float, msgspec.Meta(ge=0.1, le=1000)] = 25.0
     image_size_wh: tuple[Count, Count] = (1920, 1080)
     markers: bool = False
     onboard: OnboardCamera | None = None

@@ -17,8 +17,8 @@ from psotrack.simulation.validation import camera_places, check, check_flights
 from psotrack.simulation.world.drones import DroneModel, model
 from psotrack.simulation.world.rooms import Room, room
 
-#: Smaller pictures than this show nothing.
-_MIN_SIDE_PX = 32
+#: Smaller pictures than this show nothing; larger ones cannot be written, as MPEG-4 counts a side in 13 bits.
+_MIN_SIDE_PX, _MAX_SIDE_PX = 32, 8190
 #: Keeps the draws of the cameras apart from those of the flights, whose second number counts attempts.
 _FOR_CAMERAS = 1_000_003
 
@@ -67,8 +67,8 @@ def build(scenario: Scenario, *, scale: float = 1.0, seed: int = 0) -> Scene:
     """The scene of a scenario.
 
     Raises:
-        SettingsError: the scale is not above 0 or gives images of almost no pixels, the seed is negative, or the
-            scenario names what does not exist, does not fit its hall, or cannot keep its limits.
+        SettingsError: the scale is not above 0 or gives images of almost no pixels or too many, the seed is
+            negative, or the scenario names what does not exist, does not fit its hall, or cannot keep its limits.
         InputError: a mesh or a recording cannot be used.
     """
     check_positive("scale", scale)
@@ -108,8 +108,19 @@ def _moved(place: CameraPlace, draw: Float[np.ndarray, "3"]) -> CameraPlace:
 
 
 def image_size_wh(scenario: Scenario, scale: float) -> tuple[int, int]:
-    """Width and height at a scale, even because video codecs want them so."""
-    width, height = (2 * round(side * scale / 2) for side in scenario.image_size_wh)
+    """Width and height at a scale, even because video codecs want them so.
+
+    Raises:
+        SettingsError: images of that scale have almost no pixels, or more than a video can.
+    """
+    sides = [side * scale for side in scenario.image_size_wh]
+    if max(sides) > _MAX_SIDE_PX:
+        raise SettingsError(
+            "scale",
+            expected=f"images of at most {_MAX_SIDE_PX} pixels a side",
+            found=" x ".join(f"{side:.7g}" for side in sides),
+        )
+    width, height = (2 * round(side / 2) for side in sides)
     if min(width, height) < _MIN_SIDE_PX:
         raise SettingsError(
             "scale", expected=f"images of at least {_MIN_SIDE_PX} pixels a side", found=f"{width} x {height}"

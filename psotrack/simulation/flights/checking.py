@@ -66,8 +66,8 @@ def check_records(scenario: Scenario) -> None:
     """Refuse what no seed can make a flight.
 
     Raises:
-        SettingsError: a near pass without a side or swing, or one whose side is not perpendicular to its swing; a
-            waypoint that is there twice in a row. The message names the field.
+        SettingsError: a near pass without a side or swing, or one whose side is not perpendicular to its swing;
+            waypoints that are flown to too fast, or one that is there twice in a row. The message names the field.
     """
     for index, drone in enumerate(scenario.drones):
         if isinstance(drone.flight, NearPass):
@@ -93,6 +93,14 @@ def _check_near_pass(scenario: Scenario, field: str, record: NearPass) -> None:
 
 
 def _check_waypoints(scenario: Scenario, field: str, record: Waypoints) -> None:
+    # Between two frames, where limits are not looked at, it could be there already.
+    if record.speed_m_s > scenario.limits.max_speed_m_s:
+        raise wrong(
+            scenario,
+            f"{field}.speed_m_s",
+            expected=f"at most {scenario.limits.max_speed_m_s:g} m/s (limits.max_speed_m_s)",
+            found=f"{record.speed_m_s:g}",
+        )
     for point, (here, there) in enumerate(
         zip(record.points_m, record.points_m[1:] + record.points_m[:1], strict=True)
     ):

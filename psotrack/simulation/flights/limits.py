@@ -39,7 +39,8 @@ def excess(
     limits = scenario.limits
     position_m = np.stack([flight.position_m(time_s) for flight in flights])
     outside_m = np.maximum(limits.lower_m - position_m, position_m - limits.upper_m).max(axis=-1)
-    if outside_m.max() > 0:
+    # What overflows is NaN, which is not above any limit.
+    if not outside_m.max() <= 0:
         drone, at = _worst(outside_m)
         x, y, z = position_m[drone, at]
         lower, upper = list(limits.lower_m), list(limits.upper_m)
@@ -58,7 +59,7 @@ def _too_wild(
     ):
         value = np.stack([measure(flight, time_s) for flight in flights])
         most = getattr(limits, name)
-        if value.max() > most:
+        if not value.max() <= most:
             drone, at = _worst(value)
             limit = f"at most {most:g} {unit} (limits.{name})"
             return _excess(drone, limit, f"{value[drone, at]:.4g} {unit}", time_s[at])

@@ -41,6 +41,14 @@ def attitude(
     return np.stack([np.cross(body_y, body_z), body_y, body_z], axis=-1)
 
 
+def quaternions_wxyz(rotation: Float[np.ndarray, "times 3 3"]) -> Float[np.ndarray, "times 4"]:
+    """(times, 4), unit quaternions, scalar first, with a sign that does not jump from one time to the next."""
+    wxyz = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
+    # Not the sign itself, which is 0 after half a turn.
+    flips = np.where((wxyz[1:] * wxyz[:-1]).sum(axis=-1) < 0, -1.0, 1.0)
+    return wxyz * np.cumprod(np.concatenate([[1.0], flips]))[:, None]
+
+
 class Flight(ABC):
     """A position that can be derived twice, at any time.
 
@@ -69,7 +77,4 @@ class Flight(ABC):
 
     def orientation_wxyz(self, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 4"]:
         """(times, 4), unit quaternions body to world, with a sign that does not jump from one time to the next."""
-        xyzw = Rotation.from_matrix(self.rotation(time_s)).as_quat()
-        wxyz = xyzw[:, [3, 0, 1, 2]]
-        flips = np.sign((wxyz[1:] * wxyz[:-1]).sum(axis=-1))
-        return wxyz * np.cumprod(np.concatenate([[1.0], flips]))[:, None]
+        return quaternions_wxyz(self.rotation(time_s))

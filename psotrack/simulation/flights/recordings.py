@@ -28,7 +28,7 @@ _NORM_TOLERANCE = 0.02
 
 _POSITION = ("x_m", "y_m", "z_m")
 _QUATERNION = ("qw", "qx", "qy", "qz")
-_POSE_FILE = re.compile(r".*_pos_(?P<rate_hz>\d+)\.csv", re.IGNORECASE)
+_POSE_FILE = re.compile(r".*_pos_(?P<rate_hz>\d+(\.\d+)?)\.csv", re.IGNORECASE)
 
 Times = Float[np.ndarray, "times"]
 Vectors = Float[np.ndarray, "times 3"]
@@ -126,7 +126,7 @@ _Samples = tuple[Times, Vectors, Float[np.ndarray, "times 4"] | None]
 
 def _from_poses(path: Path) -> _Samples:
     match = _POSE_FILE.fullmatch(path.name)
-    rate_hz = int(match["rate_hz"]) if match else 0
+    rate_hz = float(match["rate_hz"]) if match else 0.0
     if rate_hz == 0:
         raise InputError(
             path, expected="a pose file named like dron1_pos_25.csv, by its rate", found=path.name
@@ -232,6 +232,14 @@ class RecordedFlight(Flight):
     ) -> tuple[Times, Float[np.ndarray, "times 1"]]:
         """Times of the recording, and by how much those that were asked for are beyond its ends."""
         samples_s = self.recorded.time_s
+        first_s = self.start_s + float(np.min(time_s, initial=0.0))
+        if first_s < -beyond_s:
+            raise SettingsError(
+                self.name,
+                expected=f"a start_s of at least {self.start_s - first_s:.6g} s",
+                found=f"{self.start_s:.6g} s",
+                remedy="who follows behind begins where it was before",
+            )
         own_s = samples_s[0] + self.start_s + time_s
         inside_s = np.clip(own_s, samples_s[0], samples_s[-1])
         fit = np.abs(own_s - inside_s) <= beyond_s

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 from scipy.spatial.transform import Rotation
 
+from psotrack.simulation.flights.motion import quaternions_wxyz
 from psotrack.simulation.flights.planning import frame_times_s
 from psotrack.simulation.imaging import sensor
 from psotrack.simulation.imaging.backdrop import lens_blur
@@ -155,7 +156,11 @@ def camera_record(scene: Scene) -> OnboardCamera:
 
 
 def intrinsics(scene: Scene) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
-    """(3, 3) intrinsics in pixels, centres at integers, and width and height, at the scene's scale."""
+    """(3, 3) intrinsics in pixels, centres at integers, and width and height, at the scene's scale.
+
+    Raises:
+        SettingsError: images of that scale have almost no pixels, or more than a video can.
+    """
     record, scale = camera_record(scene), scene.scale
     sized = msgspec.structs.replace(scene.scenario, image_size_wh=record.image_size_wh)
     K = np.eye(3)
@@ -176,10 +181,7 @@ def onboard_poses(
         camera's axes are x right, y down, z ahead.
     """
     position_m, to_world = _poses(scene, drone_index, frame_times_s(scene.scenario, num_frames))
-    wxyz = Rotation.from_matrix(to_world).as_quat(scalar_first=True)
-    # A sign that does not jump from one frame to the next.
-    flips = np.sign((wxyz[1:] * wxyz[:-1]).sum(axis=-1))
-    return position_m, wxyz * np.cumprod(np.concatenate([[1.0], flips]))[:, None]
+    return position_m, quaternions_wxyz(to_world)
 
 
 def _poses(

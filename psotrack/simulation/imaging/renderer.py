@@ -25,7 +25,6 @@ class CameraRenderer:
     def __init__(self, scene: Scene, camera_index: int) -> None:
         imaging = scene.scenario.imaging
         self.scene = scene
-        self.camera_index = camera_index
         self.cam: Pinhole = pinhole(scene.rig.cameras[camera_index])
         self.backdrop: Backdrop = backdrop.render(scene.room, self.cam, imaging)
         self.mirror: Mirror | None = None

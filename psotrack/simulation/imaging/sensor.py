@@ -19,8 +19,6 @@ GAMMA = 2.2
 #: Streams of random numbers of on-board cameras start here; static cameras have their index.
 ONBOARD_STREAM = 1000
 
-#: Light 1 (white in the middle of the floor) is shown as that share of full scale.
-_EXPOSURE = 1.0
 #: Slow changes are sums of that many sinusoids, with periods between these.
 _DRIFT_TERMS, _DRIFT_PERIODS_S = 6, (5.0, 60.0)
 _TILE_MARGIN_PX = 128
@@ -41,12 +39,12 @@ def _display_table() -> UInt8[np.ndarray, "steps"]:
 
 
 _DISPLAY = _display_table()
-_LIGHT = ((np.arange(256) / 255) ** GAMMA / _EXPOSURE).astype(np.float32)
+_LIGHT = ((np.arange(256) / 255) ** GAMMA).astype(np.float32)
 
 
 def develop(light: Float[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
-    """Grey levels of linear light, without noise; what is brighter than full scale is cut off."""
-    steps = np.clip(light * (_EXPOSURE * (_DISPLAY_STEPS - 1)) + 0.5, 0, _DISPLAY_STEPS - 1)
+    """Grey levels of linear light, without noise: 1 is full scale, and what is brighter is cut off."""
+    steps = np.clip(light * (_DISPLAY_STEPS - 1) + 0.5, 0, _DISPLAY_STEPS - 1)
     return _DISPLAY[steps.astype(np.uint16)]
 
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Ordered
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
 from psotrack.simulation.imaging.raster import (
     NEAR_M,
@@ -82,21 +81,6 @@ def silhouettes(
     return [
         Silhouette(one.number, one.window, mask, one.whole_px) for one, mask in zip(there, seen, strict=True)
     ]
-
-
-def drone_masks(
-    scene: Scene, cam: Pinhole, backdrop_depth_m: Float[np.ndarray, "height width"], frame: int
-) -> UInt8[np.ndarray, "height width"]:
-    """(height, width): which drone is seen in a pixel in the middle of the exposure, its number from 1, or 0."""
-    return numbered(silhouettes(scene, cam, backdrop_depth_m, frame), cam)
-
-
-def numbered(seen: Ordered[Silhouette], cam: Pinhole) -> UInt8[np.ndarray, "height width"]:
-    """(height, width): the number of the drone that is seen in a pixel, or 0."""
-    numbers = np.zeros((cam.height, cam.width), np.uint8)
-    for one in seen:
-        numbers[one.window.slices][one.seen] = one.number
-    return numbers
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,8 @@ def load(mesh: Mesh) -> DroneModel:
         mesh: the file, and how it lies in the body frame.
 
     Raises:
-        InputError: there is no such file, it is no mesh, has no faces, or is not of a drone's size in metres.
+        InputError: there is no such file, it is no mesh, has no faces, or it or a rotor is not of a drone's size in
+            metres.
     """
     path = Path(mesh.file)
     triangles = mesh.scale * _read(path) - np.array(mesh.origin_m)
@@ -47,6 +48,7 @@ def load(mesh: Mesh) -> DroneModel:
     _check_size(path, mesh, kept.reshape(-1, 3))
     hubs = np.array([rotor.centre_m for rotor in mesh.rotors], float).reshape(-1, 3)
     radii = np.array([rotor.radius_m for rotor in mesh.rotors], float)
+    _check_rotors(path, np.linalg.norm(hubs, axis=-1) + radii)
     return DroneModel(kept, np.ones(len(kept)), hubs, radii)
 
 
@@ -112,3 +114,15 @@ def _check_size(path: Path, mesh: Mesh, points_m: Float[np.ndarray, "points 3"])
             found=f"the drone's middle at ({', '.join(f'{at:.3g}' for at in middle)}) m",
             remedy="set origin_m to about that",
         )
+
+
+def _check_rotors(path: Path, reach_m: Float[np.ndarray, "rotors"]) -> None:
+    """Raise `InputError` if rotors reach farther from the origin than a drone does."""
+    for number, farthest_m in enumerate(reach_m):
+        if farthest_m > _LARGEST_M:
+            raise InputError(
+                path,
+                expected=f"rotors within {_LARGEST_M:g} m of the body origin",
+                found=f"rotors[{number}] that reaches {farthest_m:.3g} m",
+                remedy="centre_m and radius_m are in metres, whatever the scale of the mesh",
+            )

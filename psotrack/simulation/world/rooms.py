@@ -14,9 +14,7 @@ from jaxtyping import Float
 from psotrack.errors import SettingsError
 from psotrack.simulation.scenarios import Vector
 from psotrack.simulation.world import textures
-from psotrack.simulation.world.halls import HALLS as HALLS
-from psotrack.simulation.world.halls import RIGS as RIGS
-from psotrack.simulation.world.halls import Box, Hall
+from psotrack.simulation.world.halls import HALLS, Box, Hall
 from psotrack.simulation.world.lighting import Lamps, bake, lamps
 
 MARKER_DICTIONARY = cv2.aruco.DICT_4X4_1000
