@@ -59,15 +59,17 @@ class Extents:
 
     Attributes:
         cameras: with one leading axis.
+        size_m: (..., 3), full lengths along the world's axes.
         rotation: nine of (cameras,), the rows of R one after the other.
-        translation_m: three of (cameras,).
+        translation_m: three of (cameras,), or of (..., cameras) where ellipsoids sit beside the positions.
         s_xx, s_yy, s_xz, s_yz, s_zz: (..., cameras), of the shape S = R diag(size / 2)² Rᵀ in camera coordinates, m².
         f_x, f_y, skew, c_x, c_y: (cameras,), intrinsics in pixels; c_x and c_y in the convention of boxes.
     """
 
     cameras: Camera
+    size_m: Float[Array, "*drones 3"]
     rotation: tuple[Float[Array, "cameras"], ...]
-    translation_m: tuple[Float[Array, "cameras"], ...]
+    translation_m: tuple[Float[Array, "*#drones cameras"], ...]
     s_xx: Float[Array, "*drones cameras"]
     s_yy: Float[Array, "*drones cameras"]
     s_xz: Float[Array, "*drones cameras"]
@@ -80,19 +82,27 @@ class Extents:
     c_y: Float[Array, "cameras"]
 
 
-def extents(cameras: Camera, size_m: Float[Array, "*drones 3"]) -> Extents:
+def extents(
+    cameras: Camera, size_m: Float[Array, "*drones 3"], offset_m: Float[Array, "*drones 3"] | None = None
+) -> Extents:
     """Ellipsoids in cameras.
 
     Args:
         cameras: with one leading axis.
         size_m: (..., 3), full lengths of the extent along the world's axes.
+        offset_m: (..., 3), from the positions that are asked about (a body's origin) to the middle of the extent, along
+            the world's axes; None is at the positions.
     """
     R, t, K = cameras.T_cam_world[:, :3, :3], cameras.T_cam_world[:, :3, 3], cameras.K
+    if offset_m is not None:
+        # R (position + offset) + t: part of the translation, so that it costs nothing where positions are tried.
+        t = jnp.einsum("cij,...j->...ci", R, offset_m) + t
     S = jnp.einsum("cij,...j,ckj->...cik", R, jnp.square(size_m / 2), R)
     return Extents(
         cameras=cameras,
+        size_m=size_m,
         rotation=tuple(R[:, i, j] for i in range(3) for j in range(3)),
-        translation_m=tuple(t[:, i] for i in range(3)),
+        translation_m=tuple(t[..., i] for i in range(3)),
         s_xx=S[..., 0, 0],
         s_yy=S[..., 1, 1],
         s_xz=S[..., 0, 2],

@@ -14,12 +14,13 @@ from psotrack.boxes import extents, project_boxes
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.evaluation import evaluate, plots, tables
 from psotrack.files import refuse_to_overwrite, written_whole
-from psotrack.pipeline import TrackedSequence, on_device, track_sequence
+from psotrack.pipeline import TrackedSequence, track_sequence
 from psotrack.progress import Report, silent
 from psotrack.sequence import Sequence
 from psotrack.settings import TrackSettings
 from psotrack.silhouette_store import SilhouetteSettings
 from psotrack.simulation import simulate
+from psotrack.tracking import on_device
 from psotrack.trajectory_files import write_trajectories
 from psotrack.video import read_frames
 
@@ -78,9 +79,9 @@ def run(
     seconds = tracked.record["seconds"]
     stages = {
         "simulate": simulated - began,
-        "silhouettes": seconds["total"] - seconds["track"] - seconds["compile"],
+        "silhouettes": seconds["total"] - sum(seconds[stage] for stage in ("track", "compile", "finish")),
         "compile": seconds["compile"],
-        "track": seconds["track"],
+        "track": seconds["track"] + seconds["finish"],
         "evaluate, draw": time.perf_counter() - ended,
         "all": time.perf_counter() - began,
     }
@@ -124,7 +125,7 @@ def save_picture(path: Path, sequence: Sequence, tracked: TrackedSequence, frame
 
 def _boxes(sequence: Sequence, tracked: TrackedSequence, frame: int) -> Float[np.ndarray, "drones cameras 4"]:
     cameras = on_device(sequence.rig.cameras)
-    seen = extents(cameras, np.asarray(tracked.start.size_m, np.float32))
+    seen = extents(cameras, np.asarray(tracked.size_m, np.float32))
     position: Float[np.ndarray, "drones 3"] = tracked.trajectories.position_m[frame].astype(np.float32)
     return np.asarray(project_boxes(seen, position).xyxy)
 

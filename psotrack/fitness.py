@@ -5,13 +5,18 @@ foreground there is around it:
 
     IoU_s = F_s / (A_s + F_ring - F_s)        score = mean over windows of IoU_s
 
-F is foreground and A is area, both inside the image. One window at s = 1 is the paper's overlap of box and
-silhouette: a plateau, because every box that holds the whole silhouette scores the same. Concentric windows,
-some smaller than the silhouette, have their maximum where the silhouette's middle is.
+F is foreground and A is area, both inside the image and without the foreground that is claimed, by another drone or a
+shadow on the floor: whether that is this drone's nobody knows. Foreground in the ring that the window leaves
+unexplained makes the union larger.
+
+One window at s = 1 is the paper's overlap of box and silhouette: a plateau, because every box that holds the whole
+silhouette scores the same. Concentric windows, some smaller than the silhouette, have their maximum where the
+silhouette's middle is.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import jax
@@ -21,8 +26,13 @@ from jaxtyping import Float
 from psotrack._typing import Array, Tables
 from psotrack.boxes import Boxes, Extents, extents, project_boxes
 from psotrack.cameras import Camera
-from psotrack.patches import Patches, whole_images
-from psotrack.summed_area import box_sum
+from psotrack.patches import FULL, Patches, whole_images
+from psotrack.summed_area import box_sum, of_packed_box_sums
+
+#: So much of a window's area counts in any case: little that agrees, where nearly all is claimed, is no full agreement.
+LEAST_AREA = 0.7
+#: A camera that counts less does not see the drone.
+MIN_WEIGHT = 0.1
 
 
 @dataclass(frozen=True)
@@ -69,9 +79,10 @@ def scene(
     size_m: Float[Array, "drones 3"],
     tables: Tables,
     settings: ScoreSettings,
+    offset_m: Float[Array, "drones 3"] | None = None,
 ) -> Scene:
-    """The scene of one frame, all of its images, for drones of these sizes (full lengths, metres)."""
-    return Scene(extents(cameras, size_m), whole_images(tables, settings.reduction), settings)
+    """The scene of one frame, all of its images, for drones of these sizes and offsets (see `boxes.extents`)."""
+    return Scene(extents(cameras, size_m, offset_m), whole_images(tables, settings.reduction), settings)
 
 
 def camera_scores(
@@ -88,13 +99,14 @@ def camera_scores(
         times the share that no other drone claims.
     """
     boxes = project_boxes(scene.extents, position_m)
-    foreground, area = _windows(scene, boxes, (*scene.settings.windows, scene.settings.ring))
-    score = jnp.zeros_like(foreground[0])
-    for k in range(len(scene.settings.windows)):
+    in_ring = _of_windows(scene, boxes, (scene.settings.ring,), lambda foreground, area: foreground)[0]
+
+    def iou(foreground: Array, area: Array) -> Array:
         # The inner maximum is for rounding alone: a window may hold a hair more than the ring.
-        union = area[k] + jnp.maximum(foreground[-1] - foreground[k], 0.0)
-        score += foreground[k] / jnp.maximum(union, 1e-6)
-    return score / len(scene.settings.windows), scene.patches.clear * _share_in_image(scene, boxes)
+        return foreground / jnp.maximum(area + jnp.maximum(in_ring - foreground, 0.0), 1e-6)
+
+    score = _of_windows(scene, boxes, scene.settings.windows, iou).mean(axis=0)
+    return score, scene.patches.clear * _share_in_image(scene, boxes)
 
 
 def filled(
@@ -102,19 +114,22 @@ def filled(
 ) -> Float[Array, "*batch drones cameras"]:
     """Share of every drone's box that is foreground; 0 where most of the box is outside the image."""
     boxes = project_boxes(scene.extents, position_m)
-    foreground, area = _windows(scene, boxes, (1.0,))
-    in_view = _share_in_image(scene, boxes) > 0.5
-    return jnp.where(in_view, foreground[0] / jnp.maximum(area[0], 1e-6), 0.0)
+    share = _of_windows(scene, boxes, (1.0,), lambda foreground, area: foreground / jnp.maximum(area, 1e-6))
+    return jnp.where(_share_in_image(scene, boxes) > 0.5, share[0], 0.0)
 
 
 def drone_fitness(scene: Scene, position_m: Float[Array, "*batch drones 3"]) -> Float[Array, "*batch drones"]:
     """Fitness of each drone: the mean of its scores over the cameras that see it; NaN where too few do.
 
-    A camera counts by the share of the box that its image holds, so that the fitness stays continuous at the border.
+    A camera counts by the share of the box that its image holds, so that the fitness stays continuous at the border,
+    and by the share that is clear of other drones. Cameras that hardly count do not see it; nor do many that each
+    count for little, if together they are less than half of the least number.
     """
     score, weight = camera_scores(scene, position_m)
-    mean = (weight * score).sum(axis=-1) / jnp.maximum(weight.sum(axis=-1), 1e-6)
-    enough = (weight > 0.5).sum(axis=-1) >= scene.settings.min_cameras
+    total = weight.sum(axis=-1)
+    mean = (weight * score).sum(axis=-1) / jnp.maximum(total, 1e-6)
+    least = scene.settings.min_cameras
+    enough = ((weight > MIN_WEIGHT).sum(axis=-1) >= least) & (total > least / 2)
     return jnp.where(enough, mean, jnp.nan)
 
 
@@ -123,10 +138,13 @@ def joint_fitness(scene: Scene, position_m: Float[Array, "*batch drones 3"]) -> 
     return jnp.nan_to_num(drone_fitness(scene, position_m)).mean(axis=-1)
 
 
-def _windows(
-    scene: Scene, boxes: Boxes, scales: tuple[float, ...]
-) -> tuple[Float[Array, "scales *batch"], Float[Array, "scales *batch"]]:
-    """Foreground and area, in pixels of the patches, of the boxes scaled about their middles and cut at the image."""
+def _of_windows(
+    scene: Scene, boxes: Boxes, scales: tuple[float, ...], then: Callable[[Array, Array], Array]
+) -> Float[Array, "scales *batch"]:
+    """What follows from foreground and area of the boxes scaled about their middles and cut at the image.
+
+    Both are in pixels of the patches, without the foreground that is claimed.
+    """
     patches = scene.patches
 
     def interval(middle: Array, half: Array, length_px: int, first_px: Array) -> tuple[Array, Array]:
@@ -140,7 +158,14 @@ def _windows(
 
     x0, x1 = interval(boxes.x_middle, boxes.x_half, patches.size_wh_px[0], patches.x_px)
     y0, y1 = interval(boxes.y_middle, boxes.y_half, patches.size_wh_px[1], patches.y_px)
-    return box_sum(patches.tables, patches.number, x0, y0, x1, y1) / patches.full, (x1 - x0) * (y1 - y0)
+    area = (x1 - x0) * (y1 - y0)
+    if not patches.packed:
+        return then(box_sum(patches.tables, patches.number, x0, y0, x1, y1) / FULL, area)
+
+    def of_sums(foreground: Array, claimed: Array, area: Array) -> Array:
+        return then(foreground / FULL, jnp.maximum(area - claimed, LEAST_AREA * area))
+
+    return of_packed_box_sums(of_sums, patches.tables, patches.number, x0, y0, x1, y1, area)
 
 
 def _share_in_image(scene: Scene, boxes: Boxes) -> Float[Array, "*batch drones cameras"]:

@@ -1,42 +1,33 @@
 """Where the drones are in the first frames, how fast, and how large: found from the silhouettes alone.
 
-Blobs of foreground are matched over three or more viewpoints in each of the first frames; what persists is a drone.
-Its size comes from the blobs that nobody shares.
+Paths through blobs of foreground that several viewpoints agree on are weighed against one another (see `paths`); what
+explains blobs that nothing else explains, all the time, is a drone. Its size comes from the blobs that nobody shares.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
-from scipy.optimize import linear_sum_assignment
+from jaxtyping import Bool, Float, Int, UInt8
 
-from psotrack.cameras import Camera, project
-from psotrack.triangulation import match_views, triangulate
+from psotrack.blobs import all_blobs, find_blobs
+from psotrack.cameras import Camera
+from psotrack.paths import Paths, by_viewpoint, propose_paths, refine_paths
+from psotrack.triangulation import viewpoints
 
-#: Foreground smaller than this, in pixels of the image, is no drone.
-MIN_BLOB_PX = 60
 #: What has its middle nearer to the floor is a shadow: a drone that stands on its legs is higher.
 FLOOR_CLEARANCE_M = 0.08
-#: A cell of the reduced silhouettes belongs to a blob when so much of it (of 255) is foreground.
-MIN_COVERAGE = 64
-
-
-@dataclass(frozen=True)
-class Blobs:
-    """Connected foreground in one image.
-
-    Attributes:
-        centre_px: (blobs, 2), middles of the boxes, pixel centres at whole numbers.
-        size_px: (blobs, 2), widths and heights of the boxes.
-        whole: (blobs,), whether the blob is clear of the image's border.
-    """
-
-    centre_px: Float[np.ndarray, "blobs 2"]
-    size_px: Float[np.ndarray, "blobs 2"]
-    whole: Bool[np.ndarray, "blobs"]
+#: No two drones are nearer to one another than this, on average.
+SEPARATION_M = 0.3
+#: In fewer frames than this, two viewpoints see rays cross by chance for too long.
+LEAST_FRAMES = 8
+#: An explanation with so much less evidence (of 2 from two viewpoints) is no rival.
+CLEARLY = 0.15
+#: So many paths are weighed against one another.
+MOST_RIVALS = 16
+#: Two viewpoints show a drone in so many of the frames, three in half of them.
+NEARLY_ALWAYS = 0.75
 
 
 @dataclass(frozen=True)
@@ -56,29 +47,6 @@ class Start:
     num_cameras: Float[np.ndarray, "drones"]
 
 
-@dataclass(frozen=True)
-class _Sighting:
-    """A drone in one frame: where, and the size of the blob that each camera sees (NaN where none or shared)."""
-
-    frame: int
-    position_m: Float[np.ndarray, "3"]
-    num_cameras: int
-    size_px: Float[np.ndarray, "cameras 2"]
-
-
-def find_blobs(coverage: UInt8[np.ndarray, "height width"], reduction: int) -> Blobs:
-    """Connected foreground of one silhouette."""
-    foreground = (coverage >= MIN_COVERAGE).astype(np.uint8)
-    # Rotors and arms fall apart in thin silhouettes; a gap of one cell is none.
-    closed = cv2.morphologyEx(foreground, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    _, _, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
-    stats = stats[1:][stats[1:, cv2.CC_STAT_AREA] * reduction**2 >= MIN_BLOB_PX]
-    corner, size = stats[:, :2].astype(float), stats[:, 2:4].astype(float)
-    height, width = coverage.shape
-    whole = ((corner > 0) & (corner + size < (width, height))).all(axis=-1)
-    return Blobs((corner + size / 2) * reduction - 0.5, size * reduction, whole)
-
-
 def find_drones(
     cameras: Camera,
     coverage: UInt8[np.ndarray, "frames cameras height width"],
@@ -87,6 +55,7 @@ def find_drones(
     fps: float,
     bounds_m: Float[np.ndarray, "2 3"],
     max_speed_m_s: float,
+    drones: int | None = None,
 ) -> Start:
     """The drones that are there throughout the first frames, best seen first.
 
@@ -97,97 +66,176 @@ def find_drones(
         fps: frames per second.
         bounds_m: (2, 3), corners of the room; its lowest z is the floor, on which shadows lie.
         max_speed_m_s: of a drone.
+        drones: how many there are, where that is known: never more are found, and the last ones on less evidence.
 
     Returns:
-        As many drones as were seen in at least half of the frames; possibly none.
+        Those for which the frames speak, on the whole; possibly none. Drones that no camera sees by themselves have
+        the usual size of the others, or NaN where there is none.
     """
-    tracks: list[list[_Sighting]] = []
+    seen = all_blobs(
+        [[find_blobs(image, reduction) for image in images] for images in coverage], len(cameras.K)
+    )
+    time_s = np.arange(len(coverage)) / fps
+    if not seen.whole.any():
+        return Start(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
     # Shadows on the floor agree between all views as drones do, and they move with them; but they are flat on it.
     bounds_m = bounds_m + np.array([[0.0, 0.0, FLOOR_CLEARANCE_M], [0.0, 0.0, 0.0]])
-    for frame, images in enumerate(coverage):
-        sightings = _sightings(frame, cameras, [find_blobs(image, reduction) for image in images], bounds_m)
-        _extend(tracks, sightings, max_speed_m_s / fps)
-    tracks = [track for track in tracks if 2 * len(track) >= len(coverage)]
-    seen = np.array([np.sum([one.num_cameras for one in track]) / len(coverage) for track in tracks])
-    tracks = [tracks[i] for i in np.argsort(-seen, kind="stable")]
-    fits = [_fit(track, fps) for track in tracks]
+    paths = propose_paths(cameras, seen, time_s, bounds_m, max_speed_m_s)
+    paths = refine_paths(cameras, seen, time_s, paths[choose_paths(paths, viewpoints(cameras), drones)])
+    num_cameras = paths.covered.any(axis=-1).sum(axis=-1).mean(axis=-1)
+    paths = paths[np.argsort(-num_cameras, kind="stable")]
+    own_m = np.where(paths.alone[..., None], paths.size_m, np.nan)
+    sizes_m = [_size(cameras, *of) for of in zip(paths.position_m, own_m, strict=True)]
     return Start(
-        position_m=np.array([position for position, _ in fits]).reshape(-1, 3),
-        velocity_m_s=np.array([velocity for _, velocity in fits]).reshape(-1, 3),
-        size_m=np.array([_size(cameras, track) for track in tracks]).reshape(-1, 3),
-        num_cameras=np.sort(seen)[::-1],
+        position_m=paths.coefficient[:, 0],
+        velocity_m_s=paths.coefficient[:, 1],
+        size_m=with_usual_size(np.array(sizes_m).reshape(-1, 3)),
+        num_cameras=np.sort(num_cameras)[::-1],
     )
 
 
-def _sightings(
-    frame: int, cameras: Camera, blobs: list[Blobs], bounds_m: Float[np.ndarray, "2 3"]
-) -> list[_Sighting]:
-    centres = [one.centre_px for one in blobs]
-    # Half of the blob's smaller side: the middle of a drone's blob is nearer to its projection than that.
-    radius = [np.maximum(one.size_px.min(axis=-1) / 2, 6.0) for one in blobs]
-    points, support = match_views(cameras, centres, radius, bounds_m)
-    sightings = []
-    for row, point in enumerate(points):
-        centre_px, size_px = np.full((2, len(blobs), 2), np.nan)
-        for camera, blob in enumerate(support[row]):
-            shared = np.count_nonzero(support[:, camera] == blob) > 1
-            if blob >= 0 and not shared and blobs[camera].whole[blob]:
-                centre_px[camera], size_px[camera] = centres[camera][blob], blobs[camera].size_px[blob]
-        # The middle of a blob that drones share, or that the border cuts, is the middle of none of them.
-        if np.isfinite(centre_px).all(axis=-1).sum() >= 3:
-            point = triangulate(cameras, centre_px)
-        sightings.append(_Sighting(frame, point, int((support[row] >= 0).sum()), size_px))
-    return sightings
+def with_usual_size(size_m: Float[np.ndarray, "drones 3"]) -> Float[np.ndarray, "drones 3"]:
+    """Sizes with the median of all for drones whose own is not known; NaN where none is known."""
+    known = np.isfinite(size_m).all(axis=-1)
+    return np.where(known[:, None], size_m, np.median(size_m[known], axis=0)) if known.any() else size_m
 
 
-def _extend(tracks: list[list[_Sighting]], sightings: list[_Sighting], reach_m: float) -> None:
-    """Append each sighting to the track that it continues, or start a new one."""
-    cost = np.array(
-        [
-            [np.linalg.norm(s.position_m - t[-1].position_m) / (s.frame - t[-1].frame) for t in tracks]
-            for s in sightings
-        ]
-    ).reshape(len(sightings), len(tracks))
-    # A blob's middle jumps by centimetres when a rotor appears, so a slow drone may seem faster than it is.
-    gate = reach_m + 0.1
-    rows, columns = linear_sum_assignment(np.minimum(cost, 2 * gate))
-    continued = {
-        int(row): int(column) for row, column in zip(rows, columns, strict=True) if cost[row, column] <= gate
-    }
-    for row, sighting in enumerate(sightings):
-        if row in continued:
-            tracks[continued[row]].append(sighting)
-        else:
-            tracks.append([sighting])
+def choose_paths(
+    paths: Paths, viewpoint: Int[np.ndarray, "cameras"], drones: int | None = None
+) -> Int[np.ndarray, "chosen"]:
+    """The paths that are drones: first those that three viewpoints or more show, then those that two do.
+
+    A path's evidence is how well it fits blobs that no chosen path has, its own, summed over the viewpoints; less
+    the share of frames in which a viewpoint should show something there and does not. The best goes first. Two views
+    alone cannot tell drones from crossings of different drones' rays, except by time: they count where nothing
+    speaks against them, they fit well, and no other path that explains the same blobs is nearly as good.
+
+    Args:
+        paths: of `propose_paths`.
+        viewpoint: (cameras,), of `viewpoints`.
+        drones: how many there are, where that is known.
+    """
+    free = np.ones(paths.covered.shape[1:], bool)
+    left = np.arange(len(paths))
+    chosen: list[int] = []
+    for rule in (_three_views, _two_views, *((_known_to_be_there,) if drones else ())):
+        while len(chosen) != drones:
+            evidence = _evidence(paths[left], viewpoint, free)
+            fits = rule(paths[left], evidence)
+            if not fits.any():
+                break
+            best = int(left[np.where(fits, evidence.total, -np.inf).argmax()])
+            chosen.append(best)
+            frame, camera = np.nonzero(paths.blob[best] >= 0)
+            free[frame, camera, paths.blob[best, frame, camera]] = False
+            left = left[_apart(paths, best)[left] >= SEPARATION_M]
+    return np.array(chosen, int)
 
 
-def _fit(track: list[_Sighting], fps: float) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Position at frame 0 and velocity: a straight line through the sightings."""
-    time = np.array([one.frame for one in track]) / fps
-    points = np.array([one.position_m for one in track])
-    if len(track) < 3:
-        return points[0], np.zeros(3)
-    velocity, position = np.polyfit(time, points, 1)
-    return position, velocity
+@dataclass(frozen=True)
+class _Evidence:
+    """What speaks for each path while some have been chosen.
+
+    Attributes:
+        own: (paths, frames, cameras), whether it fits a blob that no chosen path has.
+        share: (paths, viewpoints), of the frames with such a blob.
+        covered: (paths, viewpoints), share of the frames with anything there.
+        against: (paths,), viewpoints that should show something there and do not, as shares of the frames.
+        total: (paths,), see `choose_paths`.
+    """
+
+    own: Bool[np.ndarray, "paths frames cameras"]
+    share: Float[np.ndarray, "paths viewpoints"]
+    covered: Float[np.ndarray, "paths viewpoints"]
+    against: Float[np.ndarray, "paths"]
+    total: Float[np.ndarray, "paths"]
 
 
-def _size(cameras: Camera, track: list[_Sighting]) -> Float[np.ndarray, "3"]:
+def _evidence(
+    paths: Paths, viewpoint: Int[np.ndarray, "cameras"], free: Bool[np.ndarray, "frames cameras blobs"]
+) -> _Evidence:
+    own = paths.has_one_of(free)
+    fit = by_viewpoint(own * paths.fit, viewpoint).mean(axis=1).sum(axis=-1)
+    share, covered, in_view = (
+        by_viewpoint(of, viewpoint) for of in (own, np.any(paths.covered, axis=-1), paths.in_view)
+    )
+    against = (in_view & ~covered).mean(axis=1).sum(axis=-1)
+    return _Evidence(own, share.mean(axis=1), covered.mean(axis=1), against, fit - against)
+
+
+def _three_views(paths: Paths, evidence: _Evidence) -> Bool[np.ndarray, "paths"]:
+    """Blobs of its own in three viewpoints, in half of the frames, and no more viewpoints speak against it than for it.
+
+    Silhouettes of small or dark drones flicker: that one is not seen says much less than that it is.
+    """
+    views = (evidence.share >= 0.5).sum(axis=-1)
+    return (views >= 3) & (evidence.against <= evidence.share.sum(axis=-1))
+
+
+def _two_views(paths: Paths, evidence: _Evidence) -> Bool[np.ndarray, "paths"]:
+    """Blobs of its own in two viewpoints, nearly always and well fitting, and no other explanation of them."""
+    views = (evidence.share >= NEARLY_ALWAYS).sum(axis=-1)
+    fits = (views >= 2) & (evidence.against < 0.25) & (evidence.total >= 0.75 * evidence.share.sum(axis=-1))
+    fits &= paths.blob.shape[1] >= LEAST_FRAMES
+    rivals = np.flatnonzero(fits)[np.argsort(-evidence.total[fits])][:MOST_RIVALS]
+    weight, own, blob, position_m = (
+        of[rivals] for of in (evidence.total, evidence.own, paths.blob, paths.position_m)
+    )
+    same = np.linalg.norm(position_m[:, None] - position_m, axis=-1).mean(axis=-1) < SEPARATION_M
+    shared = (own & own[:, None] & (blob == blob[:, None])).mean(axis=2).max(axis=-1) >= 0.5
+    best = _best_together(weight, same | shared, weight > 0)
+    needed = [best - _best_together(weight, same | shared, ~near) >= CLEARLY for near in same]
+    fits[:] = False
+    fits[rivals] = needed
+    return fits
+
+
+def _best_together(
+    weight: Float[np.ndarray, "paths"],
+    exclusive: Bool[np.ndarray, "paths paths"],
+    left: Bool[np.ndarray, "paths"],
+) -> float:
+    """The largest total weight of paths of which no two exclude each other."""
+    if not left.any():
+        return 0.0
+    one = int(left.argmax())
+    rest = left.copy()
+    rest[one] = False
+    with_it = weight[one] + _best_together(weight, exclusive, rest & ~exclusive[one])
+    if not (rest & exclusive[one]).any():
+        return with_it
+    return max(with_it, _best_together(weight, exclusive, rest))
+
+
+def _known_to_be_there(paths: Paths, evidence: _Evidence) -> Bool[np.ndarray, "paths"]:
+    """A blob of its own in one viewpoint, and something there in another, in half of the frames."""
+    views = (evidence.covered >= 0.5).sum(axis=-1)
+    return (evidence.share.max(axis=-1) >= 0.5) & (views >= 2) & (evidence.against < 0.5)
+
+
+def _apart(paths: Paths, one: int | np.integer) -> Float[np.ndarray, "paths"]:
+    """Mean distance of every path from one of them, metres."""
+    return np.linalg.norm(paths.position_m - paths.position_m[one], axis=-1).mean(axis=-1)
+
+
+def _size(
+    cameras: Camera, position_m: Float[np.ndarray, "frames 3"], size_m: Float[np.ndarray, "frames cameras 2"]
+) -> Float[np.ndarray, "3"]:
     """Full lengths of an ellipsoid, equal along x and y, whose outlines are as wide and as high as the blobs.
 
     Seen at elevation e, an ellipsoid of semi-axes a (level) and c (upright) is a wide and
-    sqrt(a² sin² e + c² cos² e) high. Medians over cameras and frames, so that a few bad blobs do not count.
+    sqrt(a² sin² e + c² cos² e) high. Medians over frames, so that a few bad blobs do not count. Of the cameras, those
+    that look from the side tell most of the height: they are weighted by the inverse of the variance of c²,
+    where all h and a are off by the same share.
     """
-    position = np.array([one.position_m for one in track])
-    size_px = np.array([one.size_px for one in track])
-    _, depth = project(cameras, position[:, None, :])
-    ray = position[:, None, :] - cameras.centre_world
-    sin2 = (ray[..., 2] / np.linalg.norm(ray, axis=-1)) ** 2
-    semi = size_px / 2 * depth[..., None] / np.stack([cameras.K[:, 0, 0], cameras.K[:, 1, 1]], axis=-1)
-    seen = np.isfinite(semi).all(axis=-1)
+    ray = position_m[:, None, :] - cameras.centre_world
+    sin2 = np.median((ray[..., 2] / np.linalg.norm(ray, axis=-1)) ** 2, axis=0)
+    seen = np.isfinite(size_m).any(axis=(0, 2))
     if not seen.any():
         return np.full(3, np.nan)
-    level = np.median(semi[..., 0][seen])
-    upright2 = (semi[..., 1] ** 2 - level**2 * sin2)[seen] / (1 - sin2)[seen]
+    level = float(np.nanmedian(size_m[..., 0]))
+    high2, sin2 = (np.nanmedian(size_m[:, seen, 1], axis=0) / level) ** 2, sin2[seen]
+    weight = (1 - sin2) ** 2 / (high2**2 + sin2**2)
+    upright2 = np.average((high2 - sin2) / (1 - sin2), weights=weight)
     # Flat drones seen from above say little of their height; it is never below a tenth of the span.
-    upright = np.sqrt(max(float(np.median(upright2)), (0.1 * level) ** 2))
-    return 2 * np.array([level, level, upright])
+    return level * np.array([1.0, 1.0, np.sqrt(max(upright2, 0.01))])

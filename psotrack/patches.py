@@ -3,9 +3,9 @@
 A window is as coarse as it must be to hold drone, ring and search in `SIDE` pixels: silhouettes are halved for drones
 that are near. All that the swarm reads is then a few kilobytes per drone and camera, however large the image is.
 
-Drones share images. What a neighbour is expected to cover (its ellipse, a little enlarged, is its claim) is not this
-drone's: foreground there is left out of the window, but where this drone's own prediction has its core, and the camera
-counts less by as much of the drone as is claimed. So no drone can live on another's silhouette.
+Drones share images. Foreground that something else is expected to cover (see `claims`) is kept apart in the window: it
+may be this drone's or not, so it counts neither for nor against it. And the camera counts less by as much of the drone
+as other drones claim. So no drone can live on another's silhouette.
 """
 
 from __future__ import annotations
@@ -19,18 +19,13 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack._typing import Array, Coverage, Positions, Tables
 from psotrack.boxes import Boxes, Extents, project_boxes
-from psotrack.summed_area import summed_area_table
+from psotrack.claims import Claims, claims_on, clear_share, ellipse_distance2
+from psotrack.summed_area import pack, summed_area_table
 
 #: Pixels of a window, along each side.
 SIDE = 64
 #: Silhouettes as they are, halved, halved again ...
 NUM_LEVELS = 4
-#: Neighbours that are looked at, per drone and camera: those whose ellipses come nearest.
-NUM_NEIGHBOURS = 3
-#: What a drone claims is that much larger than its ellipse along each axis: outlines are no ellipses.
-CLAIM = 1.15
-#: Where this drone is expected to cover what is claimed: its ellipse, that much smaller along each axis.
-CORE = 0.7
 #: What one fully covered pixel of the silhouettes counts.
 FULL = 255
 
@@ -42,21 +37,21 @@ class Patches:
 
     Attributes:
         tables: (height + 1, windows, width + 1), summed-area tables; window (drone, camera) is the
-            (drone x cameras + camera)-th.
+            (drone x cameras + camera)-th. A fully covered pixel counts `FULL`.
         x_px, y_px: left and upper edges in the image.
         pixel_px: pixels of the image per pixel of the window, along each side.
-        full: what a fully covered pixel of the window counts.
-        clear: share of the drone's ellipse that no neighbour claims.
+        clear: share of the drone's ellipse that no other drone claims.
         size_wh_px: of the part of the image that silhouettes cover.
+        packed: whether tables hold, beside the foreground, how many pixels of claimed foreground there are.
     """
 
     tables: Int[Array, "height1 windows width1"]
     x_px: Float[Array, "*drones cameras"]
     y_px: Float[Array, "*drones cameras"]
     pixel_px: Float[Array, "*drones cameras"]
-    full: Float[Array, "*drones cameras"]
     clear: Float[Array, "*drones cameras"]
     size_wh_px: tuple[int, int] = field(metadata={"static": True})
+    packed: bool = field(metadata={"static": True})
 
     @property
     def number(self) -> Int[Array, "*drones cameras"]:
@@ -69,7 +64,7 @@ def whole_images(tables: Tables, reduction: int) -> Patches:
     height1, cameras, width1 = tables.shape
     zero, one = jnp.zeros((1, cameras)), jnp.ones((1, cameras))
     size_wh = ((width1 - 1) * reduction, (height1 - 1) * reduction)
-    return Patches(tables, zero, zero, reduction * one, FULL * one, one, size_wh)
+    return Patches(tables, zero, zero, reduction * one, one, size_wh, packed=False)
 
 
 @jax.tree_util.register_dataclass
@@ -88,9 +83,10 @@ def cut(
     expected_m: Positions,
     *,
     reach_m: Float[Array, "drones"],
-    claiming: Bool[Array, "drones"],
+    claiming: Bool[Array, "drones"] | None,
     reduction: int,
     ring: float,
+    floor_z_m: Float[Array, ""] | None = None,
 ) -> Patches:
     """The windows of one frame.
 
@@ -99,28 +95,32 @@ def cut(
         seen: the drones' extents in the cameras.
         expected_m: (drones, 3), where the drones are expected.
         reach_m: (drones,), how far from there they are searched for.
-        claiming: (drones,), whether a drone's expected place is good enough to claim foreground.
+        claiming: (drones,), whether a drone's expected place is good enough to claim foreground; None: nobody claims.
         reduction: image pixels per silhouette pixel, along each side.
         ring: scale of the largest window that is scored.
+        floor_z_m: height of the floor on which drones that claim also cast shadows; None: they cast none.
     """
     boxes = project_boxes(seen, expected_m)
     grid = _grid(boxes, seen, reach_m, reduction, ring)
     pixel_px = _pixel_px(grid.level, reduction)
-    full = FULL << (2 * grid.level)
     value = _read(_pyramid(coverage), coverage.shape, grid)
-    own, claimed = _claims(boxes, grid, pixel_px, claiming)
-    value = jnp.where(claimed & (own >= CORE**2), 0, value)
-    inside = own < 1
-    ours, theirs = (jnp.sum(of, (-2, -1), dtype=jnp.float32) for of in (inside, inside & claimed))
-    clear = 1 - theirs / jnp.maximum(ours, 1.0)
+    clear: Array = jnp.ones(pixel_px.shape)
+    # With nobody to claim there is nothing to keep apart: the swarm then reads plain tables.
+    packed = claiming is not None and (len(expected_m) > 1 or floor_z_m is not None)
+    if claiming is not None and packed:
+        claims = claims_on(boxes, seen, expected_m, claiming=claiming, floor_z_m=floor_z_m, pixel_px=pixel_px)
+        clear = clear_share(claims, boxes)
+        claimed = _claimed(claims, boxes, grid, pixel_px)
+        # Half covered is covered: what is claimed is only counted.
+        value = pack(jnp.where(claimed, 0, value), claimed & (2 * value > FULL))
     return Patches(
         tables=summed_area_table(value.reshape(-1, SIDE, SIDE)),
         x_px=grid.column[..., 0].astype(jnp.float32) * pixel_px,
         y_px=grid.row[..., 0].astype(jnp.float32) * pixel_px,
         pixel_px=pixel_px,
-        full=full.astype(jnp.float32),
         clear=clear,
         size_wh_px=(reduction * coverage.shape[2], reduction * coverage.shape[1]),
+        packed=packed,
     )
 
 
@@ -149,7 +149,7 @@ def _pixel_px(level: Int[Array, "drones cameras"], reduction: int) -> Float[Arra
 
 
 def _pyramid(coverage: Coverage) -> Int[Array, "pixels"]:
-    """All levels of all cameras, one after the other: sums, not means, so that they stay exact."""
+    """All levels of all cameras, one after the other: means, rounded once from exact sums."""
     step = 2 ** (NUM_LEVELS - 1)
     _, height, width = coverage.shape
     # Boxes end at the image's border, which may divide a coarse pixel. Its share beyond looks like the share inside.
@@ -159,7 +159,8 @@ def _pyramid(coverage: Coverage) -> Int[Array, "pixels"]:
     for _ in range(NUM_LEVELS - 1):
         rows = levels[-1][:, 0::2] + levels[-1][:, 1::2]
         levels.append(rows[..., 0::2] + rows[..., 1::2])
-    return jnp.concatenate([image.reshape(-1) for image in levels])
+    rounded = [(image + ((1 << 2 * n) >> 1)) >> 2 * n for n, image in enumerate(levels)]
+    return jnp.concatenate([image.reshape(-1) for image in rounded])
 
 
 def _read(
@@ -183,41 +184,12 @@ def _read(
     return jnp.where(row_inside[..., None] & column_inside[..., None, :], value, 0)
 
 
-def _claims(
-    boxes: Boxes, grid: _Grid, pixel_px: Float[Array, "drones cameras"], claiming: Bool[Array, "drones"]
-) -> tuple[Float[Array, "drones cameras side side"], Bool[Array, "drones cameras side side"]]:
-    """Squared distance of every pixel from the drone's middle, in halves of its ellipse; and what neighbours claim."""
-    x_px = (grid.column.astype(jnp.float32) + 0.5) * pixel_px[..., None]
-    y_px = (grid.row.astype(jnp.float32) + 0.5) * pixel_px[..., None]
-
-    def distance2(x: Array, y: Array, x_half: Array, y_half: Array) -> Array:
-        across = jnp.square((x_px - x[..., None]) / x_half[..., None])
-        down = jnp.square((y_px - y[..., None]) / y_half[..., None])
-        return down[..., :, None] + across[..., None, :]
-
-    own = distance2(boxes.x_middle, boxes.y_middle, boxes.x_half, boxes.y_half)
-    claimed = jnp.zeros(own.shape, bool)
-    for other, near in _neighbours(boxes, claiming):
-        claim = [
-            jnp.take_along_axis(of, other, axis=0)
-            for of in (boxes.x_middle, boxes.y_middle, CLAIM * boxes.x_half, CLAIM * boxes.y_half)
-        ]
-        claimed |= (distance2(*claim) < 1) & near[..., None, None]
-    return own, claimed
-
-
-def _neighbours(
-    boxes: Boxes, claiming: Bool[Array, "drones"]
-) -> list[tuple[Int[Array, "drones cameras"], Bool[Array, "drones cameras"]]]:
-    """For each rank of nearness, which drone it is for every drone and camera, and whether there is one."""
-    drones = claiming.shape[0]
-
-    def gap2(middle: Array, half: Array) -> Array:
-        return jnp.square((middle[:, None] - middle) / jnp.maximum(half[:, None] + half, 1e-3))
-
-    gap = gap2(boxes.x_middle, boxes.x_half) + gap2(boxes.y_middle, boxes.y_half)
-    others = ~jnp.eye(drones, dtype=bool)[..., None] & claiming[:, None] & boxes.in_front
-    gap = jnp.where(others, gap, jnp.inf)
-    order = jnp.argsort(gap, axis=1)[:, : min(NUM_NEIGHBOURS, drones - 1)]
-    near = jnp.isfinite(jnp.take_along_axis(gap, order, axis=1))
-    return [(order[:, rank], near[:, rank]) for rank in range(order.shape[1])]
+def _claimed(
+    claims: Claims, boxes: Boxes, grid: _Grid, pixel_px: Float[Array, "drones cameras"]
+) -> Bool[Array, "drones cameras side side"]:
+    """The pixels whose middles are claimed and not in the drone's core."""
+    x_px = ((grid.column.astype(jnp.float32) + 0.5) * pixel_px[..., None])[..., None, :]
+    y_px = ((grid.row.astype(jnp.float32) + 0.5) * pixel_px[..., None])[..., :, None]
+    own = [of[..., None, None] for of in (boxes.x_middle, boxes.y_middle, boxes.x_half, boxes.y_half)]
+    beyond_core = ellipse_distance2(x_px, y_px, *own) >= jnp.square(claims.core)[..., None, None]
+    return jnp.any(claims.cover(x_px, y_px) & beyond_core, axis=0)

@@ -47,7 +47,7 @@ class Silhouettes:
         num_frames: of each camera.
         shape: height and width of one silhouette.
         seconds: spent on "decode" and "foreground", summed over workers; 0 for what was read from the store.
-        arrays: one (frames, height, width) per camera.
+        arrays: one (frames, height, width) per camera, stored or in memory.
     """
 
     cameras: tuple[str, ...]
@@ -56,7 +56,7 @@ class Silhouettes:
     num_frames: int
     shape: tuple[int, int]
     seconds: Mapping[str, float]
-    arrays: tuple[zarr.Array, ...]
+    arrays: tuple[zarr.Array | UInt8[np.ndarray, "frames height width"], ...]
 
     def read(self, start: int, stop: int) -> UInt8[np.ndarray, "frames cameras height width"]:
         """Coverage of the frames [start, stop), 0 to 255: (frames, cameras, height, width).

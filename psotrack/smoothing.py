@@ -1,13 +1,15 @@
 """Tracks after the fact: what the frames after say of the frames before.
 
-A forward-backward smoother over the motion model of `motion` (H. E. Rauch, F. Tung, C. T. Striebel, Maximum likelihood
-estimates of linear dynamic systems, AIAA Journal 3(8), 1965), and the strength of the jerk from the measurements
-themselves. In float64, unlike the tracker: the backward pass inverts covariances, and nobody waits for it in a frame.
+A forward-backward smoother over the motion model of `motion`, errors that last included (H. E. Rauch, F. Tung, C. T.
+Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA Journal 3(8), 1965), and the strength of the jerk
+from the measurements themselves. In float64, unlike the tracker: the backward pass inverts covariances, and nobody
+waits for it in a frame.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import jax
 import jax.numpy as jnp
@@ -67,20 +69,15 @@ def smooth(
     Raises:
         InputError: times do not increase, or a measurement is no number or has no positive definite covariance.
     """
-    _check(time_s, measured_m, measured_covariance_m2, was_measured)
+    check_measurements(time_s, measured_m, measured_covariance_m2, was_measured)
     # A scope, not a switch: nothing outside of it computes differently.
     with jax.enable_x64(True):
-        states = _smoothed(*_double((time_s, measured_m, measured_covariance_m2, was_measured, params)))
-        states = jax.tree.map(np.array, states)
+        parts = _smoothed(*_double((time_s, measured_m, measured_covariance_m2, was_measured, params)))
+        smoothed = Smoothed(*(np.array(part) for part in parts))
     unborn = ~np.logical_or.accumulate(was_measured, axis=0)
-    for value in vars(states).values():
+    for value in vars(smoothed).values():
         value[unborn] = np.nan
-    return Smoothed(
-        states.position_m,
-        states.velocity_m_s,
-        states.acceleration_m_s2,
-        states.covariance[..., :3, :3].copy(),
-    )
+    return smoothed
 
 
 def jerk_density(
@@ -99,7 +96,7 @@ def jerk_density(
 
     Args and errors are those of `smooth`.
     """
-    _check(time_s, measured_m, measured_covariance_m2, was_measured)
+    check_measurements(time_s, measured_m, measured_covariance_m2, was_measured)
     expected = np.log10(np.asarray(params.jerk_density_m2_s5, np.float64))
     drones = np.arange(was_measured.shape[1])
     with jax.enable_x64(True):
@@ -121,12 +118,23 @@ def jerk_density(
     return 10.0 ** (decades[best, drones] + vertex * _FINER)
 
 
-def _check(
+def check_measurements(
     time_s: Float[np.ndarray, "frames"],
     measured_m: Float[np.ndarray, "frames drones 3"],
     measured_covariance_m2: Float[np.ndarray, "frames drones 3 3"],
     was_measured: Bool[np.ndarray, "frames drones"],
 ) -> None:
+    """Refuse what no filter can use.
+
+    Args:
+        time_s: (frames,), increasing.
+        measured_m: (frames, drones, 3), numbers where measured.
+        measured_covariance_m2: (frames, drones, 3, 3), symmetric and positive definite where measured.
+        was_measured: (frames, drones).
+
+    Raises:
+        InputError: it is not so; the first place where, and what was found there.
+    """
     if not (np.diff(time_s) > 0).all() or not np.isfinite(time_s).all():
         raise InputError("time_s", expected="increasing times", found="repeats, steps back or no numbers")
     for name, value in (("measured_m", measured_m), ("measured_covariance_m2", measured_covariance_m2)):
@@ -166,8 +174,8 @@ def _filtered(
         state, born = carry
         dt_s, measured, spread, there = frame
         predicted = motion.predict(state, dt_s, params)
-        corrected, _ = motion.update(predicted, measured, spread, there)
-        plausible = motion.log_likelihood(predicted, measured, spread)
+        corrected, _ = motion.update(predicted, measured, spread, there, params)
+        plausible = motion.log_likelihood(predicted, measured, spread, params)
         state = motion.chosen(born, corrected, begun(measured, spread))
         return (state, born | there), (predicted, state, jnp.where(born & there, plausible, 0.0))
 
@@ -185,26 +193,45 @@ def _filtered(
 @jax.jit
 def _smoothed(
     time_s: Array, measured_m: Array, covariance_m2: Array, was_measured: Array, params: MotionParams
-) -> MotionState:
-    """Backward pass: states with a leading axis of frames."""
+) -> tuple[Array, Array, Array, Array]:
+    """Backward pass: positions, velocities, accelerations and covariances of the positions, of all frames."""
     predicted, filtered, _ = _filtered(time_s, measured_m, covariance_m2, was_measured, params)
-    now = (filtered.mean[:-1], filtered.covariance[:-1])
-    ahead = (predicted.mean[1:], predicted.covariance[1:])
-    # P F^T P_ahead^-1, transposed; P is symmetric.
-    moved = jax.vmap(motion.transported)(now[1], jnp.diff(time_s))
-    gain = jnp.swapaxes(jnp.linalg.solve(ahead[1], moved), -1, -2)
 
-    def step(later: tuple, frame: tuple) -> tuple[tuple, tuple]:
-        (mean, spread), (mean_ahead, spread_ahead), gain = frame
-        mean = mean + (gain @ (later[0] - mean_ahead)[..., None])[..., 0]
-        spread = spread + gain @ (later[1] - spread_ahead) @ jnp.swapaxes(gain, -1, -2)
-        smoothed = (mean, (spread + jnp.swapaxes(spread, -1, -2)) / 2)
-        return smoothed, smoothed
+    def step(later: tuple[Array, Array], frame: tuple) -> tuple[tuple[Array, Array], MotionState]:
+        now, ahead, dt_s = frame
+        F = motion.transported(jnp.broadcast_to(jnp.eye(12), now.covariance.shape), dt_s, params)
+        gain = _gain(F @ now.covariance, ahead.covariance)
+        mean = now.mean + (gain @ (later[0] - ahead.mean)[..., None])[..., 0]
+        # P + G (P_later - P_ahead) G^T would be a difference, and negative after many frames. This is a sum.
+        kept = jnp.eye(12) - gain @ F
+        added = motion.process_noise(now.noise_m2, dt_s, params) + later[1]
+        spread = kept @ now.covariance @ _transpose(kept) + gain @ added @ _transpose(gain)
+        spread = (spread + _transpose(spread)) / 2
+        return (mean, spread), motion.state_of(mean, spread, now.noise_m2)
 
-    last = (filtered.mean[-1], filtered.covariance[-1])
-    _, earlier = jax.lax.scan(step, last, (now, ahead, gain), reverse=True)
-    means, spreads = (jnp.concatenate([part, end[None]]) for part, end in zip(earlier, last, strict=True))
-    return motion.state_of(means, spreads)
+    now, end = (jax.tree.map(itemgetter(rows), filtered) for rows in (slice(-1), -1))
+    ahead = jax.tree.map(itemgetter(slice(1, None)), predicted)
+    _, earlier = jax.lax.scan(step, (end.mean, end.covariance), (now, ahead, jnp.diff(time_s)), reverse=True)
+    states = jax.tree.map(lambda part, last: jnp.concatenate([part, last[None]]), earlier, end)
+    return states.position_m, states.velocity_m_s, states.acceleration_m_s2, states.position_covariance_m2
+
+
+def _gain(moved: Array, ahead: Array) -> Array:
+    """(drones, 12, 12), P F^T P_ahead^-1 of `moved`, F P, and `ahead`, P_ahead.
+
+    In units of the standard deviations, so that metres and m/s2 count alike. What has no variance, as the error that
+    lasts where errors are white, is known, takes part in nothing, and is not corrected: a 1 in its place on the
+    diagonal says so.
+    """
+    variance = jnp.diagonal(ahead, axis1=-2, axis2=-1)
+    known = variance == 0
+    unit = jnp.sqrt(jnp.where(known, 1.0, variance))[..., None]
+    correlation = ahead / (unit * _transpose(unit)) + jnp.where(known[..., None], jnp.eye(12), 0.0)
+    return _transpose(jnp.linalg.solve(correlation, moved / unit) / unit)
+
+
+def _transpose(matrix: Array) -> Array:
+    return jnp.swapaxes(matrix, -1, -2)
 
 
 @jax.jit

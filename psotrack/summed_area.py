@@ -8,13 +8,17 @@ integral of a piecewise constant image is piecewise bilinear.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float, Int, Integer
+from jaxtyping import Bool, Float, Int, Integer
 
 from psotrack._typing import Array
+
+#: Of a packed sum, what the first image gets; the second gets the rest of the 32.
+LOW_BITS = 20
 
 
 def summed_area_table(
@@ -47,6 +51,16 @@ def _running_sum(lines: Integer[Array, "lines *line"]) -> Int[Array, "lines *lin
     return jax.lax.scan(add, jnp.zeros(lines.shape[1:], jnp.int32), lines)[1]
 
 
+def pack(low: Integer[Array, "*image"], high: Bool[Array, "*image"]) -> Int[Array, "*image"]:
+    """Two images in one, so that one table holds the sums of both: reading the second costs no memory traffic.
+
+    Args:
+        low: whole numbers of which no box sums to 2^`LOW_BITS` or more (64 x 64 pixels of 0..255 do not).
+        high: of which no box counts 2^(32 - `LOW_BITS`) or more.
+    """
+    return low.astype(jnp.int32) + (high.astype(jnp.int32) << LOW_BITS)
+
+
 def box_sum(
     tables: Int[Array, "height1 cameras width1"],
     camera: Int[Array, "*#boxes"],
@@ -68,6 +82,48 @@ def box_sum(
     Returns:
         (sets, ...), float32, in units of the image times pixels.
     """
+    return _set_by_set(tables, camera, (x0, y0, x1, y1), _whole, lambda total: total)
+
+
+def of_packed_box_sums(
+    then: Callable[..., Array],
+    tables: Int[Array, "height1 cameras width1"],
+    camera: Int[Array, "*#boxes"],
+    x0: Float[Array, "sets *#boxes"],
+    y0: Float[Array, "sets *#boxes"],
+    x1: Float[Array, "sets *#boxes"],
+    y1: Float[Array, "sets *#boxes"],
+    *given: Float[Array, "sets *#boxes"],
+) -> Float[Array, "sets *boxes"]:
+    """What follows from the sums of two images that are packed into one table, boxes as in `box_sum`.
+
+    Args:
+        then: of the low and the high sums of one set, and what is given for it. It is called where they are made: two
+            results would have XLA on CPU read the tables twice.
+    """
+    return _set_by_set(tables, camera, (x0, y0, x1, y1), _unpacked, then, *given)
+
+
+def _whole(total: Array, dtype: Any) -> tuple[Array, ...]:
+    return (total.astype(dtype),)
+
+
+def _unpacked(total: Array, dtype: Any) -> tuple[Array, ...]:
+    # Logically: the highest bit is one of the number's.
+    low, high = total & ((1 << LOW_BITS) - 1), jax.lax.shift_right_logical(total, jnp.int32(LOW_BITS))
+    return low.astype(dtype), high.astype(dtype)
+
+
+def _set_by_set(
+    tables: Int[Array, "height1 cameras width1"],
+    camera: Int[Array, "*#boxes"],
+    edges: tuple[Float[Array, "sets *#boxes"], ...],
+    parts: Callable[[Array, Any], tuple[Array, ...]],
+    then: Callable[..., Array],
+    *given: Float[Array, "sets *#boxes"],
+) -> Float[Array, "sets *boxes"]:
+    """`then` of the sums of one set of boxes after the other; `parts` of a table's number are what is summed."""
+    x0, y0, x1, y1 = edges
     height1, num_cameras, width1 = tables.shape
     flat, row = jnp.reshape(tables, -1), num_cameras * width1
 
@@ -85,21 +141,30 @@ def box_sum(
         # Indices are in bounds by construction; saying so spares a check in the innermost loop of the tracker.
         return flat.at[index].get(mode="promise_in_bounds")
 
-    def corner(index: Array, fx: Array, fy: Array) -> tuple[Array, Array]:
+    def corner(index: Array, fx: Array, fy: Array) -> tuple[Array, tuple[Array, ...]]:
         # The table at the cell's corner, and what bilinear reading adds to it. Whole numbers are differenced before
-        # anything becomes float32, because the sums of a 1080p image exceed 2^24.
+        # anything becomes float32, because the sums of a 1080p image exceed 2^24; and each difference is the sum over
+        # some box, which has parts.
         here, right, below, across = (read(index + step) for step in (0, 1, row, row + 1))
-        to_right, to_below, to_across = (
-            step.astype(fx.dtype) for step in (right - here, below - here, across - below - right + here)
+        steps = (
+            parts(step, fx.dtype) for step in (right - here, below - here, across - below - right + here)
         )
-        return here, fx * to_right + fy * to_below + (fx * fy) * to_across
+        added = tuple(
+            fx * right + fy * below + (fx * fy) * across for right, below, across in zip(*steps, strict=True)
+        )
+        return here, added
 
-    def one_set(edges: tuple[Array, ...]) -> Array:
-        index00, index10, index01, index11, fx0, fx1, fy0, fy1 = edges
+    def one_set(of_set: tuple[Array, ...]) -> Array:
+        index00, index10, index01, index11, fx0, fx1, fy0, fy1, *rest = of_set
         (c00, f00), (c10, f10) = corner(index00, fx0, fy0), corner(index10, fx1, fy0)
         (c01, f01), (c11, f11) = corner(index01, fx0, fy1), corner(index11, fx1, fy1)
-        whole = (c11 - c01) - (c10 - c00)
-        return whole.astype(f00.dtype) + ((f11 - f01) - (f10 - f00))
+        whole = parts((c11 - c01) - (c10 - c00), fx0.dtype)
+        sums = (
+            of + ((a11 - a01) - (a10 - a00))
+            for of, a00, a10, a01, a11 in zip(whole, f00, f10, f01, f11, strict=True)
+        )
+        return then(*sums, *rest)
 
     # Set by set: within one expression XLA on CPU computes all indices anew for each of the sixteen reads.
-    return jax.lax.map(one_set, (row0 + i0, row0 + i1, row1 + i0, row1 + i1, fx0, fx1, fy0, fy1))
+    cells = (row0 + i0, row0 + i1, row1 + i0, row1 + i1)
+    return jax.lax.map(one_set, (*cells, fx0, fx1, fy0, fy1, *given))

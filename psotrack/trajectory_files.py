@@ -79,6 +79,39 @@ def write_trajectories(path: Path, trajectories: Trajectories, *, force: bool = 
         write(temporary, columns)
 
 
+def write_ambiguity(
+    path: Path,
+    time_s: Float[np.ndarray, "frames"],
+    pairs: Int[np.ndarray, "pairs 2"],
+    ambiguity: Float[np.ndarray, "frames pairs"],
+    *,
+    force: bool = False,
+) -> None:
+    """Write which drones may be taken for each other: a row for each frame and pair where that is not impossible.
+
+    Args:
+        path: of the CSV file: `frame`, `time_s`, `drone`, `other`, `ambiguity`.
+        time_s: of the frames.
+        pairs: two drones each.
+        ambiguity: probability that each pair's labels are exchanged.
+        force: replace an existing file.
+
+    Raises:
+        OutputError: the file exists and `force` is not set, or it cannot be written.
+    """
+    refuse_to_overwrite(path, force)
+    frame, pair = np.nonzero(ambiguity)
+    columns = {
+        "frame": frame,
+        "time_s": time_s[frame],
+        "drone": pairs[pair, 0],
+        "other": pairs[pair, 1],
+        "ambiguity": ambiguity[frame, pair].astype(np.float32),
+    }
+    with written_whole(path) as temporary:
+        _write_csv(temporary, columns)
+
+
 def read_trajectories(path: Path, *, fps: float | None = None) -> Trajectories:
     """Read a table: `frame`, `drone`, `x_m`, `y_m`, `z_m`, and of the other columns those that are there.
 

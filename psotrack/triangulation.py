@@ -13,6 +13,11 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack.cameras import Camera, project, undistort
 
+#: Rays that fix a point less well than this are parallel.
+MAX_CONDITION = 1e12
+#: Points in one cube with such sides are the same.
+SAME_M = 0.01
+
 
 def triangulate(
     cameras: Camera,
@@ -29,6 +34,61 @@ def triangulate(
     Returns:
         (..., 3), world, metres; NaN where fewer than two cameras see the point, or all their rays are parallel.
     """
+    normal, right, seen = _normal_equations(cameras, points_px, weights)
+    solvable = (seen.sum(axis=-1) >= 2) & (np.linalg.cond(normal) < MAX_CONDITION)
+    normal = np.where(solvable[..., None, None], normal, np.eye(3))
+    point = np.linalg.solve(normal, right[..., None])
+    return np.where(solvable[..., None], point[..., 0], np.nan)
+
+
+def triangulate_paths(
+    cameras: Camera,
+    points_px: Float[np.ndarray, "*paths frames cameras 2"],
+    time_s: Float[np.ndarray, "frames"],
+    weights: Float[np.ndarray, "*paths frames cameras"] | None = None,
+    *,
+    noise_m: float = 0.02,
+    expected: tuple[float, ...] = (3.0, 2.0),
+) -> Float[np.ndarray, "*paths terms 3"]:
+    """Paths of points that move, X(t) = Σ c_k t^k, from all of their pixels at once.
+
+    The equations of `triangulate` with X(t) in place of X, and one for each motion: c_k is about 0, give or take
+    `expected`. So frames in which fewer than two cameras see the point count too, and short paths are straight.
+
+    Args:
+        cameras: with one leading axis.
+        points_px: (..., frames, cameras, 2); NaN where a camera does not see the point.
+        time_s: (frames,).
+        weights: (..., frames, cameras), how much each camera's two equations count; 1 where not given.
+        noise_m: standard deviation of a camera's equations, in metres at the point.
+        expected: standard deviations of c_1, c_2 ... in m/s, m/s² ...; as many as the path has.
+
+    Returns:
+        (..., 1 + len(expected), 3), c_0, c_1 ..., metres and seconds; NaN where fewer than two cameras see the point
+        at any time, or all their rays are parallel.
+    """
+    normal, right, seen = _normal_equations(cameras, points_px, weights)
+    solvable = seen.any(axis=-2).sum(axis=-1) >= 2
+    solvable &= np.linalg.cond(normal.sum(axis=-3)) < MAX_CONDITION
+    terms = 1 + len(expected)
+    power = time_s[:, None] ** np.arange(terms)
+    whole = np.einsum("fk,fl,...fij->...kilj", power, power, normal)
+    whole = whole.reshape(*whole.shape[:-4], 3 * terms, 3 * terms)
+    stiffness = np.repeat([0.0, *((noise_m / std) ** 2 for std in expected)], 3)
+    whole = np.where(solvable[..., None, None], whole + np.diag(stiffness), np.eye(3 * terms))
+    rights = np.einsum("fk,...fi->...ki", power, right)
+    path = np.linalg.solve(whole, rights.reshape(*rights.shape[:-2], 3 * terms, 1))
+    return np.where(solvable[..., None, None], path.reshape(rights.shape), np.nan)
+
+
+def _normal_equations(
+    cameras: Camera,
+    points_px: Float[np.ndarray, "*points cameras 2"],
+    weights: Float[np.ndarray, "*points cameras"] | None,
+) -> tuple[
+    Float[np.ndarray, "*points 3 3"], Float[np.ndarray, "*points 3"], Bool[np.ndarray, "*points cameras"]
+]:
+    """Left and right side of the normal equations, summed over the cameras, and which cameras see the points."""
     normalised = undistort(cameras, points_px)
     seen = np.isfinite(normalised).all(axis=-1)
     weights = seen * (1.0 if weights is None else weights)
@@ -38,10 +98,7 @@ def triangulate(
     rows = normalised[..., :, None] * T[:, 2, None, :3] - T[:, :2, :3]
     right = T[:, :2, 3] - normalised * T[:, 2, None, 3]
     normal = np.einsum("...c,...cik,...cil->...kl", weights, rows, rows)
-    solvable = (seen.sum(axis=-1) >= 2) & (np.linalg.cond(normal) < 1e12)
-    normal = np.where(solvable[..., None, None], normal, np.eye(3))
-    point = np.linalg.solve(normal, np.einsum("...c,...cik,...ci->...k", weights, rows, right)[..., None])
-    return np.where(solvable[..., None], point[..., 0], np.nan)
+    return normal, np.einsum("...c,...cik,...ci->...k", weights, rows, right), seen
 
 
 def viewpoints(cameras: Camera, nearest_m: float = 0.3) -> Int[np.ndarray, "cameras"]:
@@ -85,15 +142,7 @@ def match_views(
         (found, 3) points, and (found, cameras) the index of the 2D point that each camera sees it at, or -1.
     """
     viewpoint = viewpoints(cameras)
-    proposals = _proposals(cameras, points_px, viewpoint)
-    for _ in range(2):  # Once from two rays, once more from all that agree.
-        proposals = proposals[_within(proposals, bounds_m)]
-        support = _support(cameras, proposals, points_px, radius_px)
-        proposals = triangulate(cameras, _pick(points_px, support))
-    # Not a number is not within either.
-    kept = _within(proposals, bounds_m)
-    proposals, support = proposals[kept], support[kept]
-
+    proposals, support = candidates(cameras, points_px, radius_px, bounds_m)
     found: list[int] = []
     free = support >= 0
     while len(proposals):
@@ -108,6 +157,28 @@ def match_views(
         near = np.linalg.norm(proposals - proposals[best], axis=-1) < separation_m
         free[near] = False
     return proposals[found], support[found]
+
+
+def candidates(
+    cameras: Camera,
+    points_px: list[Float[np.ndarray, "_ 2"]],
+    radius_px: list[Float[np.ndarray, "_"]],
+    bounds_m: Float[np.ndarray, "2 3"],
+) -> tuple[Float[np.ndarray, "candidates 3"], Int[np.ndarray, "candidates cameras"]]:
+    """Every point in space that 2D points of two viewpoints or more agree on; most of them are nothing's place.
+
+    Arguments and results are those of `match_views`; of candidates in one cube with sides of `SAME_M` one is kept.
+    """
+    points = _proposals(cameras, points_px, viewpoints(cameras))
+    # From two rays to all that agree. What fits badly counts little: the middle of a blob that two drones share.
+    for _ in range(3):
+        points = points[_within(points, bounds_m)]
+        support, fit = _support(cameras, points, points_px, radius_px)
+        points = triangulate(cameras, _pick(points_px, support), fit**2)
+    # Not a number is not within either.
+    kept = np.flatnonzero(_within(points, bounds_m))
+    _, first = np.unique(np.round(points[kept] / SAME_M), axis=0, return_index=True)
+    return points[kept[first]], support[kept[first]]
 
 
 def _within(
@@ -135,18 +206,20 @@ def _support(
     proposals: Float[np.ndarray, "proposals 3"],
     points_px: list[Float[np.ndarray, "_ 2"]],
     radius_px: list[Float[np.ndarray, "_"]],
-) -> Int[np.ndarray, "proposals cameras"]:
-    """Index of the nearest 2D point of each camera that fits the proposal, or -1."""
+) -> tuple[Int[np.ndarray, "proposals cameras"], Float[np.ndarray, "proposals cameras"]]:
+    """Index of the nearest 2D point of each camera that fits the proposal, or -1; and how well it fits, 1 to 0."""
     pixels, depth = project(cameras, proposals[:, None, :])
-    support = np.full(depth.shape, -1)
+    support, fit = np.full(depth.shape, -1), np.zeros(depth.shape)
     for camera, (points, radius) in enumerate(zip(points_px, radius_px, strict=True)):
         if len(points):
             distance = np.linalg.norm(pixels[:, camera, None, :] - points, axis=-1)
             distance = np.where((distance <= radius) & (depth[:, camera, None] > 0), distance, np.inf)
             nearest = distance.argmin(axis=-1)
-            fits: Bool[np.ndarray, "proposals"] = np.isfinite(distance.min(axis=-1))
-            support[:, camera] = np.where(fits, nearest, -1)
-    return support
+            distance = distance.min(axis=-1)
+            fits = np.isfinite(distance)
+            support[fits, camera] = nearest[fits]
+            fit[fits, camera] = 1 - (distance[fits] / radius[nearest[fits]]) ** 2
+    return support, fit
 
 
 def _pick(

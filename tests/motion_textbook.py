@@ -1,41 +1,103 @@
-"""Flights with white jerk, and what a textbook makes of them: written without `motion`, in plain float64 NumPy."""
+"""Flights with white jerk, and what a textbook makes of them: written without `motion`, in plain float64 NumPy.
+
+The textbook's state is position, velocity and acceleration, and where errors last, that error: (9,) or (12,). What is
+measured is the sum of the first and the last. `motion` has the sum in its state, instead.
+"""
 
 from dataclasses import dataclass, replace
 from functools import cache
 
-import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import expm
+from scipy.linalg import block_diag, expm
 
 from psotrack.motion import MotionParams
 
 DT_S = 1 / 25
 
+#: From the state of `motion` to the textbook's.
+TO_TEXTBOOK = np.eye(12) - np.eye(12, k=9)
+
+
+@dataclass(frozen=True)
+class Model:
+    """The numbers of `MotionParams`, of one drone."""
+
+    density: float = 30.0
+    velocity_std: float = 1.0
+    acceleration_std: float = 2.0
+    error_share: float = 0.0
+    error_time_s: float = 0.4
+
+    @property
+    def H(self):
+        return np.eye(3, 12) + np.eye(3, 12, k=9) if self.error_share else np.eye(3, 9)
+
+    def start(self, measured_m, covariance_m2):
+        """The first measurement says what it is the sum of, z = p + b + w: nothing is known of p, and b is as it is."""
+        rest = np.diag(np.repeat([self.velocity_std**2, self.acceleration_std**2], 3))
+        spread = block_diag(covariance_m2, rest)
+        mean = np.concatenate([measured_m, np.zeros(len(self.H.T) - 3)])
+        if self.error_share:
+            lasting = self.error_share * covariance_m2
+            spread = block_diag(spread, lasting)
+            # p = z - b - w.
+            spread[:3, 9:] = spread[9:, :3] = -lasting
+        return mean, spread
+
+    def transition(self, dt_s, covariance_m2):
+        """F and Q, where the last measurement had this covariance."""
+        F, Q = transition(dt_s, self.density)
+        if self.error_share:
+            left, begun = decay(dt_s, self.error_time_s)
+            F = block_diag(F, left * np.eye(3))
+            Q = block_diag(Q, begun * self.error_share * covariance_m2)
+        return F, Q
+
+    def white(self, covariance_m2):
+        return (1 - self.error_share) * covariance_m2
+
+    def params(self, drones):
+        """Params of drones that are all alike, float64."""
+        rest = (self.velocity_std, self.acceleration_std, self.error_share, self.error_time_s)
+        return MotionParams(np.full(drones, self.density), *map(np.float64, rest))
+
+
+def van_loan(rate, noise, dt_s):
+    """F and Q of dx = rate x dt + white noise, by the matrix exponential (1978), which knows no closed form."""
+    size = len(rate)
+    both = expm(np.block([[-rate, noise], [np.zeros((size, size)), rate.T]]) * dt_s)
+    F = both[size:, size:].T
+    return F, F @ both[:size, size:]
+
 
 @cache
 def transition(dt_s, density):
-    """F and Q (9, 9) by the matrix exponential (C. F. Van Loan, 1978), which knows no closed form of either."""
-    rate = np.kron(np.eye(3, k=1), np.eye(3))
-    noise = np.kron(np.diag([0.0, 0.0, density]), np.eye(3))
-    both = expm(np.block([[-rate, noise], [np.zeros((9, 9)), rate.T]]) * dt_s)
-    F = both[9:, 9:].T
-    return F, F @ both[:9, 9:]
+    """F and Q (9, 9) of position, velocity and acceleration."""
+    return van_loan(
+        np.kron(np.eye(3, k=1), np.eye(3)), np.kron(np.diag([0.0, 0.0, density]), np.eye(3)), dt_s
+    )
 
 
-def textbook_filter(time_s, measured_m, covariance_m2, was_measured, density, velocity_std, acceleration_std):
-    """One drone, born in frame 0: (9,) means, (9, 9) covariances and NIS of every frame, by inverse and P - K S K^T."""
-    H = np.eye(3, 9)
-    x = np.concatenate([measured_m[0], np.zeros(6)])
-    P = np.diag(np.repeat([0.0, velocity_std**2, acceleration_std**2], 3))
-    P[:3, :3] = covariance_m2[0]
-    means, covariances, nis = [x], [P], [np.nan]
+@cache
+def decay(dt_s, time_s):
+    """What is left of an error of variance 1, and the variance of what is new to it, so that it keeps that variance."""
+    left, begun = van_loan(np.array([[-1 / time_s]]), np.array([[2 / time_s]]), dt_s)
+    return left.item(), begun.item()
+
+
+def textbook_filter(model, time_s, measured_m, covariance_m2, was_measured):
+    """One drone, born in frame 0: means, covariances and NIS of every frame, by inverse and P - K S K^T."""
+    H = model.H
+    x, P = model.start(measured_m[0], covariance_m2[0])
+    means, covariances, nis, last = [x], [P], [np.nan], covariance_m2[0]
     for k in range(1, len(time_s)):
-        F, Q = transition(round(time_s[k] - time_s[k - 1], 12), density)
+        F, Q = model.transition(round(time_s[k] - time_s[k - 1], 12), last)
         x, P = F @ x, F @ P @ F.T + Q
         nis.append(np.nan)
         if was_measured[k]:
+            last = covariance_m2[k]
             innovation = measured_m[k] - H @ x
-            S_inv = np.linalg.inv(H @ P @ H.T + covariance_m2[k])
+            S_inv = np.linalg.inv(H @ P @ H.T + model.white(last))
             K = P @ H.T @ S_inv
             x, P = x + K @ innovation, P - K @ H @ P
             nis[-1] = innovation @ S_inv @ innovation
@@ -44,38 +106,34 @@ def textbook_filter(time_s, measured_m, covariance_m2, was_measured, density, ve
     return np.array(means), np.array(covariances), np.array(nis)
 
 
-def textbook_smoother(
-    time_s, measured_m, covariance_m2, was_measured, density, velocity_std, acceleration_std
-):
+def textbook_smoother(model, time_s, measured_m, covariance_m2, was_measured):
     """The same as `textbook_filter` given all frames, without any recursion: one Gaussian over all states at once.
 
     All states together have a joint normal prior; the measurements condition it. In the first frame the position is
     known by its measurement alone.
     """
     frames = len(time_s)
-    prior = np.zeros((frames, 9, frames, 9))
-    mean = np.zeros((frames, 9))
-    mean[0, :3] = measured_m[0]
-    P = np.diag(np.repeat([0.0, velocity_std**2, acceleration_std**2], 3))
-    P[:3, :3] = covariance_m2[0]
-    prior[0, :, 0] = P
+    start, P = model.start(measured_m[0], covariance_m2[0])
+    size, last = len(start), covariance_m2[0]
+    mean = np.zeros((frames, size))
+    prior = np.zeros((frames, size, frames, size))
+    mean[0], prior[0, :, 0] = start, P
     for k in range(1, frames):
-        F, Q = transition(round(time_s[k] - time_s[k - 1], 12), density)
+        F, Q = model.transition(round(time_s[k] - time_s[k - 1], 12), last)
+        last = covariance_m2[k] if was_measured[k] else last
         mean[k] = F @ mean[k - 1]
         for j in range(k):
             prior[k, :, j] = F @ prior[k - 1, :, j]
             prior[j, :, k] = prior[k, :, j].T
         prior[k, :, k] = F @ prior[k - 1, :, k - 1] @ F.T + Q
-    prior, mean = prior.reshape(9 * frames, 9 * frames), mean.ravel()
+    prior, mean = prior.reshape(size * frames, size * frames), mean.ravel()
     rows = np.flatnonzero(was_measured[1:]) + 1
-    H = np.concatenate([np.eye(3, 9 * frames, k=9 * row) for row in rows])
-    R = np.zeros((3 * len(rows),) * 2)
-    for i, row in enumerate(rows):
-        R[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = covariance_m2[row]
+    H = np.concatenate([np.kron(np.eye(frames)[row], model.H) for row in rows])
+    R = block_diag(*model.white(covariance_m2[rows]))
     gain = np.linalg.solve(H @ prior @ H.T + R, H @ prior).T
     mean = mean + gain @ (measured_m[rows].ravel() - H @ mean)
-    covariance = (prior - gain @ H @ prior).reshape(frames, 9, frames, 9)
-    return mean.reshape(frames, 9), np.stack([covariance[k, :, k] for k in range(frames)])
+    covariance = (prior - gain @ H @ prior).reshape(frames, size, frames, size)
+    return mean.reshape(frames, size), np.stack([covariance[k, :, k] for k in range(frames)])
 
 
 @dataclass(frozen=True)
@@ -87,28 +145,38 @@ class Flown:
     measured_m: np.ndarray
     covariance_m2: np.ndarray
     was_measured: np.ndarray
-    params: MotionParams
+    model: Model
 
     @property
     def measurements(self):
         """What `smooth` and `jerk_density` take, but the params."""
         return self.time_s, self.measured_m, self.covariance_m2, self.was_measured
 
+    @property
+    def params(self):
+        return self.model.params(self.was_measured.shape[1])
 
-def fly(seed, *, frames, drones, density=30.0, std_m=0.01, velocity_std=1.0, acceleration_std=2.0, dt_s=DT_S):
+    def of(self, drone, born=0):
+        """What the textbook takes, from the frame that a drone was born in."""
+        return self.model, self.time_s[born:], *(part[born:, drone] for part in self.measurements[1:])
+
+
+def fly(seed, *, frames, drones, std_m=0.01, dt_s=DT_S, steady=False, **numbers):
     """Flights that obey the model to the letter, measured in every frame with errors that obey their covariances.
 
-    Each measurement has a covariance of its own: ellipsoids that point anywhere, some ten times as long as wide.
+    Each measurement has a covariance of its own, or where `steady` each drone: ellipsoids that point anywhere, some ten
+    times as long as wide. `numbers` are those of `Model`.
     """
     rng = np.random.default_rng(seed)
+    model = Model(**numbers)
     time_s = np.arange(frames) * dt_s
-    F, Q = transition(dt_s, density)
+    F, Q = transition(dt_s, model.density)
     root = np.linalg.cholesky(Q)
     state = np.concatenate(
         [
             rng.uniform(-2, 2, (drones, 3)),
-            velocity_std * rng.normal(size=(drones, 3)),
-            acceleration_std * rng.normal(size=(drones, 3)),
+            model.velocity_std * rng.normal(size=(drones, 3)),
+            model.acceleration_std * rng.normal(size=(drones, 3)),
         ],
         axis=-1,
     )
@@ -117,15 +185,26 @@ def fly(seed, *, frames, drones, density=30.0, std_m=0.01, velocity_std=1.0, acc
         states.append(states[-1] @ F.T + rng.normal(size=(drones, 9)) @ root.T)
     states = np.stack(states)
     shape = std_m * (0.3 * np.eye(3) + 0.6 * rng.normal(size=(frames, drones, 3, 3)))
-    error = np.einsum("tdij,tdj->tdi", shape, rng.normal(size=(frames, drones, 3)))
+    if steady:
+        shape[:] = shape[0]
+    white = np.einsum("tdij,tdj->tdi", shape, rng.normal(size=(frames, drones, 3)))
+    left, begun = decay(dt_s, model.error_time_s)
+    # What is new to the error that lasts is as large as the measurement before.
+    share = np.full(frames, begun * model.error_share)
+    share[0] = model.error_share
+    lasting = np.sqrt(share)[:, None, None] * np.einsum(
+        "tdij,tdj->tdi", shape[[0, *range(frames - 1)]], rng.normal(size=(frames, drones, 3))
+    )
+    for k in range(1, frames):
+        lasting[k] += left * lasting[k - 1]
     return Flown(
         time_s=time_s,
         state=states,
-        measured_m=states[..., :3] + error,
+        measured_m=states[..., :3] + lasting + np.sqrt(1 - model.error_share) * white,
         # No covariance is that of a flat disc.
         covariance_m2=shape @ np.swapaxes(shape, -1, -2) + 1e-12 * np.eye(3),
         was_measured=np.ones((frames, drones), bool),
-        params=motion_params(density, drones, velocity_std, acceleration_std),
+        model=model,
     )
 
 
@@ -151,11 +230,9 @@ def some_unknown(flown, seed, share=0.3):
     return without(flown, unknown)
 
 
-def motion_params(density, drones, velocity_std=1.0, acceleration_std=2.0):
-    """Params of drones that are all alike, float32."""
-    return MotionParams(
-        jnp.full(drones, density, jnp.float32), jnp.float32(velocity_std), jnp.float32(acceleration_std)
-    )
+def motion_params(density, drones, velocity_std=1.0, acceleration_std=2.0, **error):
+    """Params of drones that are all alike, float64."""
+    return Model(density, velocity_std, acceleration_std, **error).params(drones)
 
 
 def nees(error, covariance):

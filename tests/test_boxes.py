@@ -31,6 +31,25 @@ def sampled_boxes(rig, position_m, size_m, num_points=20_000):
     return np.concatenate([pixels.min(axis=1), pixels.max(axis=1)], axis=-1) + 0.5
 
 
+@pytest.mark.parametrize("coefficients", [0, 5])
+def test_an_offset_moves_the_extent_from_the_position(coefficients):
+    """Each drone by its own, whatever the particles: the boxes are those of the extents' middles, without one."""
+    rig = ring_rig(5, coefficients=coefficients)
+    position_m, size_m = drones(2)
+    particles_m = position_m + 0.1 * np.random.default_rng(2).standard_normal((7, 2, 3))
+    offset_m = np.array([[0.02, -0.01, -0.04], [0.0, 0.03, 0.05]])
+
+    @jax.jit
+    def offset_boxes(cameras, position_m, size_m, offset_m):
+        return project_boxes(extents(cameras, size_m, offset_m), position_m).xyxy
+
+    found = offset_boxes(*float32((rig.cameras, particles_m, size_m, offset_m)))
+    expected, _ = boxes(rig, particles_m + offset_m, size_m)
+    # Coordinates of 5 m in float32 are good to 5e-7 m: 1e-4 px, a few times over.
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+    assert np.abs(expected - boxes(rig, particles_m, size_m)[0]).min(axis=(0, 1, 2)).max() > 0.1
+
+
 def drones(count, seed=0):
     rng = np.random.default_rng(seed)
     return rng.uniform((-1, -1, 0.4), (1, 1, 2.2), (count, 3)), rng.uniform(0.2, 0.6, (count, 3))

@@ -10,8 +10,8 @@ from helpers import ROOM_M, float32, ring_rig
 
 from psotrack import tracker
 from psotrack.initialisation import Start
-from psotrack.pipeline import tracker_inputs
 from psotrack.settings import TrackSettings
+from psotrack.tracking import tracker_inputs
 
 
 def run(*, num_frames=5, num_drones=2, seed=0, size_m=0.4, focal=1.0, **settings):
@@ -52,7 +52,7 @@ def test_a_second_sequence_compiles_nothing(compiled):
     assert any("track" in name for name in compiled())
     run(seed=1, size_m=0.7, focal=1.1, iterations=9, max_speed_m_s=3.0, inertia=0.4, min_fitness=0.3)
     run(seed=2, iterations=0, cognitive=2.0, social=0.1, spread_m=0.2, min_cameras=1, max_coasting_s=2.0)
-    run(seed=3, position_gain=0.5, velocity_gain=0.9)
+    run(seed=3, jerk_density_m2_s5=5.0, error_share=0.1, error_time_s=1.0)
     assert compiled() == []
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psotrack.summed_area import box_sum, summed_area_table
+from psotrack.summed_area import LOW_BITS, box_sum, of_packed_box_sums, pack, summed_area_table
 
 table_of = jax.jit(summed_area_table)
 sum_of = jax.jit(box_sum)
@@ -138,3 +138,63 @@ def test_gradient_is_finite_everywhere():
 
     boxes = jnp.array([[0.0, 0, 7, 5], [3, 3, 3, 3], [5, 4, 1, 1], [-9, -9, -8, -8], [-1e30, 0, 1e30, 5]])
     assert np.isfinite(jax.jit(jax.vmap(jax.grad(total)))(boxes)).all()
+
+
+# Two images in one table.
+
+
+def both_sums(low, high, boxes):
+    """(2, sets, boxes), of the low and the high image, from one table; boxes (sets, boxes, 4)."""
+
+    @jax.jit
+    def one(table, part, *edges):
+        def pick(low, high, part):
+            return (1 - part) * low + part * high
+
+        return of_packed_box_sums(pick, table, jnp.zeros(edges[0].shape[1], jnp.int32), *edges, part)
+
+    table = jax.jit(lambda low, high: summed_area_table(pack(low, high)))(low, high)
+    edges = jnp.moveaxis(jnp.asarray(boxes, jnp.float32), -1, 0)
+    return np.stack([one(table, jnp.full_like(edges[0], part), *edges) for part in (0, 1)])
+
+
+def test_packed_sums_are_those_of_either_image():
+    rng = np.random.default_rng(7)
+    low, high = rng.integers(0, 256, (1, 64, 64)), rng.integers(0, 2, (1, 64, 64))
+    boxes = rng.uniform(-5, 69, (3, 40, 4))
+    found = both_sums(low.astype(np.int32), high.astype(bool), boxes)
+    for part, image in zip(found, (low, high), strict=True):
+        expected = [[area_weighted_sum(image[0], *box) for box in one_set] for one_set in boxes]
+        # Sums of up to 64 pixels of 255, weighted in float32: 16320 * 6e-8, a few times over.
+        np.testing.assert_allclose(part, expected, atol=1e-2)
+
+
+def test_packed_sums_are_exact_to_the_last_bit():
+    """Everything at its largest: 64 x 64 pixels of 255 take 20 bits, 4095 of the other image the rest."""
+    low, high = np.full((1, 64, 64), 255, np.int32), np.ones((1, 64, 64), bool)
+    high[0, 5, 9] = False
+    whole = np.array([[[0.0, 0, 64, 64]]])
+    assert 2**LOW_BITS > 64 * 64 * 255
+    assert both_sums(low, high, whole).ravel().tolist() == [64 * 64 * 255, 64 * 64 - 1]
+
+
+def test_gradient_of_packed_sums_is_that_of_either_image():
+    low, high = coverage((1, 13, 17)), coverage((1, 13, 17))[:, ::-1] > 127
+    edges = np.array([2.3, 3.6, 9.4, 11.2])
+
+    def of_packed(edges):
+        table = summed_area_table(pack(jnp.asarray(low), jnp.asarray(high)))
+        return of_packed_box_sums(
+            lambda low, high: low * high, table, jnp.zeros(1, jnp.int32), *edges.reshape(4, 1, 1)
+        ).sum()
+
+    def of_each(edges):
+        sums = (
+            box_sum(summed_area_table(image), jnp.zeros(1, jnp.int32), *edges.reshape(4, 1, 1)).sum()
+            for image in (low, high.astype(np.uint8))
+        )
+        return jnp.prod(jnp.stack(list(sums)))
+
+    found, expected = (jax.jit(jax.grad(of))(jnp.asarray(edges, jnp.float32)) for of in (of_packed, of_each))
+    # The same float32 arithmetic, perhaps fused otherwise.
+    np.testing.assert_allclose(found, expected, rtol=1e-4)

@@ -9,8 +9,8 @@ from helpers import ROOM_M, assert_same, draw_coverage, float32, ring_rig
 
 from psotrack import tracker
 from psotrack.initialisation import Start
-from psotrack.pipeline import tracker_inputs
 from psotrack.settings import TrackSettings
+from psotrack.tracking import tracker_inputs
 from psotrack.trajectories import Status
 
 FPS = 25.0
@@ -272,6 +272,6 @@ def test_no_iterations_still_evaluates_the_start(coverage):
 
 def test_the_state_before_the_first_frame_predicts_the_start():
     state, params, _ = prepared()
-    predicted = state.position_m + state.velocity_m_s * params.dt_s
+    predicted = state.motion.position_m + state.motion.velocity_m_s * params.dt_s
     np.testing.assert_allclose(predicted, TRUTH_M[0], atol=1e-6)
     assert not state.missed.any()

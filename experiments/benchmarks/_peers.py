@@ -21,9 +21,9 @@ from _numpy_fitness import NumpyFitness
 from psotrack import fitness
 from psotrack.cameras import CameraRig
 from psotrack.initialisation import Start
-from psotrack.pipeline import on_device, tracker_inputs
 from psotrack.settings import TrackSettings
 from psotrack.summed_area import summed_area_table
+from psotrack.tracking import on_device, tracker_inputs
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,11 @@ import zarr
 from zarr.codecs import ZstdCodec
 
 from psotrack.initialisation import Start
-from psotrack.pipeline import track_silhouettes
 from psotrack.progress import terminal
 from psotrack.settings import TrackSettings
 from psotrack.silhouette_store import CHUNK_FRAMES, open_stored
 from psotrack.silhouettes import Silhouettes
+from psotrack.tracking import track_silhouettes
 
 
 @click.command(context_settings={"show_default": True})
@@ -43,7 +43,7 @@ def main(frames: int, cameras: int, drones: int, particles: int, iterations: int
         silhouettes = _store(scene, Path(folder))
         before_gb = _peak_gb()
         began = time.perf_counter()
-        trajectories, compile_s = track_silhouettes(
+        tracked = track_silhouettes(
             scene.rig,
             silhouettes,
             start,
@@ -52,15 +52,15 @@ def main(frames: int, cameras: int, drones: int, particles: int, iterations: int
             bounds_m=_scene.BOUNDS_M,
             report=terminal,
         )
-        track_s = time.perf_counter() - began - compile_s
+        track_s = time.perf_counter() - began - tracked.compile_s
     peak_gb = _peak_gb()
 
-    errors_m = np.linalg.norm(trajectories.position_m - scene.position_m, axis=-1)
+    errors_m = np.linalg.norm(tracked.info.position_m - scene.position_m, axis=-1)
     print(
         f"{frames} frames of {cameras} cameras, {drones} drones, {particles} particles x {iterations} iterations"
     )
     print(
-        f"tracked in {track_s:.1f} s ({1e3 * track_s / frames:.1f} ms per frame), {compile_s:.1f} s to compile"
+        f"tracked in {track_s:.1f} s ({1e3 * track_s / frames:.1f} ms per frame), {tracked.compile_s:.1f} s to compile"
     )
     print(f"mean error {1e3 * errors_m.mean():.1f} mm")
     print(

@@ -30,9 +30,9 @@ from _peers import Evosax, Problem, PySwarms
 
 from psotrack import fitness, tracker
 from psotrack.initialisation import Start
-from psotrack.pipeline import on_device, tracker_inputs
 from psotrack.settings import TrackSettings
 from psotrack.summed_area import summed_area_table
+from psotrack.tracking import on_device, tracker_inputs
 
 PEERS = ("evosax", "pyswarms")
 

@@ -136,6 +136,13 @@ def silhouettes(
 @click.option("--particles", type=int, default=TRACK.particles, show_default=True, help="Of every swarm.")
 @click.option("--iterations", type=int, default=TRACK.iterations, show_default=True, help="Per frame.")
 @click.option(
+    "--refinements",
+    type=int,
+    default=TRACK.refinements,
+    show_default=True,
+    help="Gradient steps after the swarm.",
+)
+@click.option(
     "--swarm",
     type=click.Choice(get_args(SwarmKind)),
     default=TRACK.swarm,
@@ -165,7 +172,15 @@ def silhouettes(
     "drone_size_m",
     type=Numbers(3),
     metavar="X,Y,Z",
-    help="Full lengths in metres.  [default: from the first frames]",
+    help="Full lengths in metres.  [default: learned on the way]",
+)
+@click.option(
+    "--body-offset",
+    "body_offset_m",
+    type=Numbers(3),
+    default=TRACK.body_offset_m,
+    metavar="X,Y,Z",
+    help="From a body's origin to the middle of its silhouette, in metres, along the world's axes.  [default: 0,0,0]",
 )
 @click.option(
     "--bounds",
@@ -182,6 +197,7 @@ def silhouettes(
     show_default=True,
     help="Of a drone, in m/s.",
 )
+@click.option("--smooth", is_flag=True, default=TRACK.smooth, help="Let later frames correct earlier ones.")
 @silhouette_options
 @CAMERAS
 @FRAMES
@@ -204,22 +220,24 @@ def track(
 ) -> None:
     """Track the drones of SEQ from its videos.
 
-    Writes OUT, one row per frame and drone, and beside it the same name with .json: every setting, versions, device,
-    input keys, seconds per stage.
+    Writes OUT, one row per frame and drone, and beside it the same name with .json (every setting, what was learned of
+    each drone, who came and who met, versions, device, input keys, seconds per stage) and with .ambiguity.csv (which
+    drones may be taken for each other, frame by frame).
 
     \b
     Examples:
       psotrack track data/Simulated_Data/S02_D4_A --out tracks.csv
+      psotrack track data/Simulated_Data/S02_D4_A --out smooth.csv --smooth
       psotrack track data/Simulated_Data/S02_D4_A --out paper.parquet --swarm joint --particles 100 --iterations 70
     """
     from psotrack.pipeline import track_sequence
-    from psotrack.trajectory_files import write_trajectories
+    from psotrack.trajectory_files import write_ambiguity, write_trajectories
 
     if out.suffix not in {".csv", ".parquet"}:
         raise SettingsError("--out", expected="a file that ends in .csv or .parquet", found=out.name)
-    record_path = out.with_suffix(".json")
-    refuse_to_overwrite(out, force)
-    refuse_to_overwrite(record_path, force)
+    record_path, ambiguity_path = out.with_suffix(".json"), out.with_suffix(".ambiguity.csv")
+    for path in (out, record_path, ambiguity_path):
+        refuse_to_overwrite(path, force)
     silhouette_names = SilhouetteSettings.__struct_fields__
     of_silhouettes = {name: settings.pop(name) for name in silhouette_names if name in settings}
     chosen = TrackSettings(silhouettes=SilhouetteSettings(**of_silhouettes), **settings)
@@ -231,6 +249,8 @@ def track(
         report=report_to(quiet),
     )
     write_trajectories(out, tracked.trajectories, force=force)
+    identities, time_s = tracked.identities, tracked.trajectories.time_s
+    write_ambiguity(ambiguity_path, time_s, identities.pairs, identities.ambiguity, force=force)
     write_json(record_path, tracked.record)
     answer(json_path, tracked.record, force)
     seen = tracked.trajectories.seen.mean()

@@ -1,0 +1,265 @@
+"""Drones that are lost and come back: who a newcomer is, and where the tracker begins it.
+
+A newcomer is one of the lost drones where time, motion and size allow it, and else is born. A drone that stood still
+when it vanished is most probably still there: it has landed, or the background model has swallowed it. When such a
+drone flies off, the place where it stood becomes foreground, a hole in the background that does not move; what flew off
+from there is the drone, even if the hole is taken for it by then.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.optimize import linear_sum_assignment
+
+from psotrack.newcomers import Newcomer
+
+#: In an assignment: a drone that was not there before.
+NEW = -1
+#: In an assignment: no drone, as far as one can tell.
+NOBODY = -2
+
+#: Drones change their velocity within about this time; after it the last one says little of where they are.
+VELOCITY_TIME_S = 1.0
+#: The standard deviation of a drone's velocity along each axis, as a share of its largest speed.
+SPEED_SHARE = 1 / 3
+#: How well places and velocities are measured, along each axis.
+POSITION_STD_M, VELOCITY_STD_M_S = 0.1, 0.3
+#: How well spans are measured (of their logarithm), and what spans there are.
+SPAN_STD, SPANS_M = 0.2, (0.1, 1.5)
+#: A drone that was slower when it vanished stood still, and as likely as this it has stayed until it is seen again.
+STILL_M_S, STAYED_PROBABILITY = 0.2, 0.5
+#: What was so many spans from there, or had been within the last seconds, stayed or flew off from there.
+STAYED_SPANS, FLOWN_OFF_S = 0.6, 0.6
+#: How much likelier a newcomer is a new drone than one that may be anywhere by now; if it does not move, no drone.
+NEW_ODDS, NO_DRONE_ODDS = 0.1, 10.0
+#: A drone that was tracked for so long while the newcomer was there is another one; less, and its track was failing.
+MAX_OVERLAP_S = 0.4
+#: Beyond reach is farther than a drone can fly, and so many standard deviations of the place.
+REACH_SIGMAS = 5.0
+
+#: Logarithms for an assignment: beyond reach, less than that, ruled out.
+_UNREACHABLE, _UNKNOWN_BUT_PINNED, _NEVER = -1e6, -1e7, -1e9
+
+
+@dataclass(frozen=True)
+class Lost:
+    """Drones that may come back, as they were when last seen before the end of a chunk.
+
+    Attributes:
+        drone: (lost,), which of all drones.
+        position_m, velocity_m_s: (lost, 3), when last seen.
+        seconds: (lost,), from then to the first frame of the chunk; below 0 if that was within the chunk.
+        size_m: (lost, 3), full lengths along the world's axes.
+        doubtful: (lost,), whether it is tracked again, but only where it had vanished, and has not moved since: that
+            may be the hole that it left. Such a drone comes back only as what flew off from there.
+    """
+
+    drone: Int[np.ndarray, "lost"]
+    position_m: Float[np.ndarray, "lost 3"]
+    velocity_m_s: Float[np.ndarray, "lost 3"]
+    seconds: Float[np.ndarray, "lost"]
+    size_m: Float[np.ndarray, "lost 3"]
+    doubtful: Bool[np.ndarray, "lost"]
+
+
+@dataclass(frozen=True)
+class Arrivals:
+    """Where in a chunk the tracker begins drones; those that are born come after the known ones.
+
+    Attributes:
+        begin_frame: (drones,), of the chunk; -1 where a drone goes on as it was.
+        begin_position_m, begin_velocity_m_s: (drones, 3), in that frame; 0 where a drone goes on.
+        born_size_m: (born, 3), full lengths of those that are born.
+    """
+
+    begin_frame: Int[np.ndarray, "drones"]
+    begin_position_m: Float[np.ndarray, "drones 3"]
+    begin_velocity_m_s: Float[np.ndarray, "drones 3"]
+    born_size_m: Float[np.ndarray, "born 3"]
+
+
+def lost_drones(
+    position_m: Float[np.ndarray, "frames drones 3"],
+    velocity_m_s: Float[np.ndarray, "frames drones 3"],
+    tracked: Bool[np.ndarray, "frames drones"],
+    size_m: Float[np.ndarray, "drones 3"],
+    *,
+    chunk_frames: int,
+    fps: float,
+) -> Lost:
+    """The drones that may come back at the end of a chunk.
+
+    Args:
+        position_m, velocity_m_s: (frames, drones, 3), from the first frame of the video to the last of the chunk.
+        tracked: (frames, drones), whether a drone was found, not only predicted.
+        size_m: (drones, 3), full lengths along the world's axes.
+        chunk_frames: so many of the frames are the chunk's.
+        fps: frames per second.
+    """
+    drones, last, doubtful = [], [], []
+    for drone in np.flatnonzero(tracked.any(axis=0)).tolist():
+        seen = np.flatnonzero(tracked[:, drone])
+        vanished = seen[np.flatnonzero(np.diff(seen, append=len(tracked)) > 1)]
+        if not len(vanished):
+            continue
+        since = position_m[seen[seen >= vanished[-1]], drone]
+        still = float(np.linalg.norm(np.ptp(since, axis=0))) < STAYED_SPANS * size_m[drone].max()
+        there_now = bool(tracked[-1, drone])
+        if still or not there_now:
+            drones.append(drone)
+            last.append(vanished[-1])
+            doubtful.append(there_now)
+    rows, columns = np.array(last, int), np.array(drones, int)
+    return Lost(
+        drone=columns,
+        position_m=position_m[rows, columns],
+        velocity_m_s=velocity_m_s[rows, columns],
+        seconds=(len(tracked) - chunk_frames - rows) / fps,
+        size_m=size_m[columns],
+        doubtful=np.array(doubtful, bool),
+    )
+
+
+def recognised(
+    newcomers: tuple[Newcomer, ...],
+    lost: Lost,
+    *,
+    fps: float,
+    bounds_m: Float[np.ndarray, "2 3"],
+    max_speed_m_s: float,
+    max_births: int | None = None,
+) -> Int[np.ndarray, "newcomers"]:
+    """Which newcomer is which lost drone: the assignment of the largest likelihood.
+
+    A drone's velocity wanders about 0 (G. E. Uhlenbeck, L. S. Ornstein, On the theory of the Brownian motion, 1930), so
+    that over a short gap it is expected where it was heading, and over a long one anywhere within reach. Or it stayed
+    where it stood. The alternative is a drone that nobody knows, anywhere in the room.
+
+    Args:
+        newcomers: of a chunk.
+        lost: drones that may come back, seen from the same chunk.
+        fps: frames per second.
+        bounds_m: (2, 3), corners of the room.
+        max_speed_m_s: of a drone.
+        max_births: so many drones may be new; None is any number. If it is 0, a newcomer that moves is a lost drone
+            even where that is unlikely.
+
+    Returns:
+        (newcomers,), a row of `lost`, or `NEW`, or `NOBODY`. What does not move is never new.
+    """
+    count = len(lost.drone)
+    log_volume = float(np.log(np.prod(bounds_m[1] - bounds_m[0])))
+    scores = np.full((len(newcomers), count + len(newcomers)), _NEVER)
+    for row, newcomer in enumerate(newcomers):
+        log_anywhere = _log_normal(newcomer.velocity_m_s, (SPEED_SHARE * max_speed_m_s) ** 2) - log_volume
+        odds = NEW_ODDS if newcomer.moves else NO_DRONE_ODDS
+        unknown = log_anywhere + np.log(odds / np.log(SPANS_M[1] / SPANS_M[0]))
+        scores[row, count + row] = _UNKNOWN_BUT_PINNED if newcomer.moves and max_births == 0 else unknown
+        if not newcomer.moves and any(_flew_off(other, newcomer) for other in newcomers):
+            continue
+        for column in range(count):
+            scores[row, column] = _log_likelihood(newcomer, lost, column, fps, log_anywhere, max_speed_m_s)
+    chosen = np.full(len(newcomers), NOBODY)
+    births = 0
+    for row, column in zip(
+        *(each.tolist() for each in linear_sum_assignment(scores, maximize=True)), strict=True
+    ):
+        if column < count:
+            chosen[row] = column
+        elif newcomers[row].moves and (max_births is None or births < max_births):
+            chosen[row] = NEW
+            births += 1
+    return chosen
+
+
+def arrivals_of(
+    newcomers: tuple[Newcomer, ...], assignment: Int[np.ndarray, "newcomers"], lost: Lost, num_drones: int
+) -> Arrivals:
+    """Where the tracker begins the newcomers of a chunk.
+
+    Args:
+        newcomers: of the chunk.
+        assignment: (newcomers,), from `recognised`.
+        lost: what it refers to.
+        num_drones: that the tracker has so far.
+    """
+    again, born = np.flatnonzero(assignment >= 0), np.flatnonzero(assignment == NEW)
+    drones = np.concatenate([lost.drone[assignment[again]], num_drones + np.arange(len(born))])
+    begin_frame = np.full(num_drones + len(born), -1)
+    position, velocity = np.zeros((2, num_drones + len(born), 3))
+    for drone, row in zip(drones.tolist(), [*again.tolist(), *born.tolist()], strict=True):
+        begin_frame[drone] = newcomers[row].frame
+        position[drone], velocity[drone] = newcomers[row].position_m, newcomers[row].velocity_m_s
+    sizes = np.array([newcomers[row].size_m for row in born.tolist()]).reshape(-1, 3)
+    return Arrivals(begin_frame, position, velocity, sizes)
+
+
+def _log_likelihood(
+    newcomer: Newcomer, lost: Lost, row: int, fps: float, log_anywhere: float, max_speed_m_s: float
+) -> float:
+    """Logarithm of how likely a lost drone is seen again as the newcomer: a density over place, velocity and span."""
+    place, velocity, span = lost.position_m[row], lost.velocity_m_s[row], float(lost.size_m[row].max())
+    log_span = _log_normal(np.log(newcomer.size_m.max(keepdims=True) / span), SPAN_STD**2)
+    variance = (SPEED_SHARE * max_speed_m_s) ** 2
+    log_stayed = -np.inf
+    near_m = STAYED_SPANS * span
+    if float(np.linalg.norm(velocity)) < STILL_M_S and _distance_on_the_way(newcomer, place) < near_m:
+        log_stayed = np.log(STAYED_PROBABILITY / (4 / 3 * np.pi * near_m**3))
+        log_stayed += _log_normal(newcomer.velocity_m_s, variance)
+    if lost.doubtful[row]:
+        return log_stayed + log_span if newcomer.moves and log_stayed > -np.inf else _NEVER
+    gap_s = newcomer.frame / fps + float(lost.seconds[row])
+    if gap_s < -MAX_OVERLAP_S:
+        return _NEVER
+    gap_s = max(gap_s, 0.0)
+    distance = float(np.linalg.norm(newcomer.position_m - place))
+    if distance > max_speed_m_s * gap_s + REACH_SIGMAS * POSITION_STD_M:
+        return _UNREACHABLE - distance
+    log_flown = _log_motion(newcomer, place, velocity, gap_s, variance)
+    return max(log_stayed, log_flown, log_anywhere) + log_span
+
+
+def _log_motion(
+    newcomer: Newcomer,
+    position_m: Float[np.ndarray, "3"],
+    velocity_m_s: Float[np.ndarray, "3"],
+    gap_s: float,
+    variance: float,
+) -> float:
+    """Log density of the newcomer's place and velocity after the gap, of a drone whose velocity wanders about 0."""
+    time = VELOCITY_TIME_S
+    left = np.exp(-gap_s / time)
+    to = np.array([[1.0, time * (1 - left)], [0.0, left]])
+    wandered = variance * np.array(
+        [
+            [time**2 * (2 * gap_s / time - 3 + 4 * left - left**2), time * (1 - left) ** 2],
+            [time * (1 - left) ** 2, 1 - left**2],
+        ]
+    )
+    measured = np.diag([POSITION_STD_M**2, VELOCITY_STD_M_S**2])
+    covariance = to @ measured @ to.T + wandered + measured
+    was = np.stack([position_m, velocity_m_s])
+    error = np.stack([newcomer.position_m, newcomer.velocity_m_s]) - to @ was
+    distance2 = (error * np.linalg.solve(covariance, error)).sum()
+    return float(-(distance2 + 3 * np.log(np.linalg.det(2 * np.pi * covariance))) / 2)
+
+
+def _log_normal(value: Float[np.ndarray, "dims"], variance: float) -> float:
+    return float(-(value @ value / variance + len(value) * np.log(2 * np.pi * variance)) / 2)
+
+
+def _flew_off(newcomer: Newcomer, hole: Newcomer) -> bool:
+    """Whether a newcomer that moves flew off from the place of one that does not."""
+    near_m = STAYED_SPANS * float(hole.size_m.max())
+    return newcomer.moves and _distance_on_the_way(newcomer, hole.position_m) < near_m
+
+
+def _distance_on_the_way(newcomer: Newcomer, place_m: Float[np.ndarray, "3"]) -> float:
+    """How near it was to a place when it was first seen, or on a straight way to there."""
+    speed2 = float(newcomer.velocity_m_s @ newcomer.velocity_m_s)
+    off = newcomer.position_m - place_m
+    ago_s = np.clip(off @ newcomer.velocity_m_s / max(speed2, 1e-9), 0.0, FLOWN_OFF_S)
+    return float(np.linalg.norm(off - ago_s * newcomer.velocity_m_s))

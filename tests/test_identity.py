@@ -1,0 +1,702 @@
+"""Who is who after drones have met: against all histories of labels one by one, on flights, and by frequencies."""
+
+from collections import deque
+from dataclasses import dataclass, replace
+from itertools import combinations, pairwise, permutations, product
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from motion_textbook import DT_S, Model
+from scipy.special import logsumexp, softmax
+from scipy.stats import binom
+
+from psotrack.errors import InputError, SettingsError
+from psotrack.identity import IdentityParams, Outcome, labellings, likeness, relabelled, resolve
+from psotrack.simulation.flights import planning
+from psotrack.simulation.scenarios import scenario
+
+ENCOUNTER_M = 0.6
+PARAMS = IdentityParams(encounter_m=ENCOUNTER_M)
+#: As gently as the simulator's drones fly, and those above that meet.
+GENTLE = Model(density=1.0)
+#: What drones that meet are taken to do more than they do all in all.
+AGILITY = 10.0
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a tracker hands over, and which of its tracks each drone is in truth."""
+
+    time_s: np.ndarray
+    measured_m: np.ndarray
+    covariance_m2: np.ndarray
+    was_measured: np.ndarray
+    truth: np.ndarray
+    size_m: np.ndarray | None = None
+
+
+def seen(flown_m, std_m=0.01, seed=0, exchanges=(), size_m=None):
+    """Flights (frames, drones, 3), measured with white errors; from each frame of `exchanges` on, tracks permuted."""
+    frames, drones, _ = flown_m.shape
+    rng = np.random.default_rng(seed)
+    std_m = np.broadcast_to(std_m, (frames, drones))
+    truth = np.tile(np.arange(drones), (frames, 1))
+    for frame, permutation in exchanges:
+        truth[frame:] = np.array(permutation)[truth[frame]]
+    whole = Seen(
+        time_s=np.arange(frames) * DT_S,
+        measured_m=flown_m + std_m[..., None] * rng.normal(size=flown_m.shape),
+        covariance_m2=std_m[..., None, None] ** 2 * np.eye(3),
+        was_measured=np.ones((frames, drones), bool),
+        truth=truth,
+        size_m=size_m,
+    )
+    return by_tracks(whole, truth)
+
+
+def by_tracks(whole, truth):
+    """The same with each drone's columns where the tracks of `truth` are."""
+    column = np.argsort(truth, axis=1)
+
+    def moved(value):
+        return None if value is None else relabelled(value, column)
+
+    return replace(
+        whole,
+        measured_m=moved(whole.measured_m),
+        covariance_m2=moved(whole.covariance_m2),
+        was_measured=moved(whole.was_measured),
+        size_m=moved(whole.size_m),
+    )
+
+
+def resolved(given_tracks, model=GENTLE, params=PARAMS):
+    return resolve(
+        given_tracks.time_s,
+        given_tracks.measured_m,
+        given_tracks.covariance_m2,
+        given_tracks.was_measured,
+        model.params(given_tracks.was_measured.shape[1]),
+        params,
+        given_tracks.size_m,
+    )
+
+
+def outcomes(found):
+    return [encounter.outcome for encounter in found.encounters]
+
+
+def apart_m(flown_m):
+    """(frames, drones), to the nearest other."""
+    distance_m = np.linalg.norm(flown_m[:, :, None] - flown_m[:, None], axis=-1)
+    distance_m[:, np.eye(flown_m.shape[1], dtype=bool)] = np.inf
+    return distance_m.min(axis=-1)
+
+
+def lasting(rng, shape, time_s=0.4):
+    """(frames, ...), errors of variance 1 that last for some time: a first-order autoregression."""
+    left = np.exp(-DT_S / time_s)
+    error = np.empty(shape)
+    error[0] = rng.normal(size=shape[1:])
+    for frame in range(1, shape[0]):
+        error[frame] = left * error[frame - 1] + np.sqrt(1 - left**2) * rng.normal(size=shape[1:])
+    return error
+
+
+SECONDS = (np.arange(100) - 50) * DT_S
+
+
+def passing(side_m=0.3, speed_m_s=1.0):
+    """Two drones that fly straight on, nearest in frame 50."""
+    x, y = speed_m_s * SECONDS, np.full(100, side_m / 2)
+    one = np.stack([x, y, np.ones(100)], axis=-1)
+    return np.stack([one, one * [-1, -1, 1]], axis=1)
+
+
+def turning_back(nearest_m=0.3, speed_m_s=1.0):
+    """Two drones that come head on, and turn back: a hyperbola over time."""
+    x = np.sqrt((speed_m_s * SECONDS) ** 2 + (nearest_m / 2) ** 2)
+    one = np.stack([x, np.zeros(100), np.ones(100)], axis=-1)
+    return np.stack([one, one * [-1, -1, 1]], axis=1)
+
+
+def hovering(together_m=0.15, hover_s=1.4):
+    """Two drones that come together, stay, and go back to where they came from, in 160 frames."""
+    still = np.maximum(np.abs((np.arange(160) - 50) * DT_S) - hover_s / 2, 0.0)
+    x = together_m / 2 + still**2 / (still + 0.3)
+    one = np.stack([x, np.zeros(160), np.ones(160)], axis=-1)
+    return np.stack([one, one * [-1, -1, 1]], axis=1)
+
+
+def merging(flown_m, merge_m=0.3):
+    """What is seen of two drones whose silhouettes are one where they are nearer than this: both are in its middle."""
+    share = np.clip(2 * (1 - apart_m(flown_m) / merge_m), 0, 1)[..., None]
+    return flown_m + share * (flown_m.mean(axis=1, keepdims=True) - flown_m)
+
+
+class TestTwoDrones:
+    @pytest.mark.parametrize("std_m", [0.005, 0.01, 0.02, 0.03])
+    @pytest.mark.parametrize("flight", [passing, turning_back])
+    def test_right_labels_are_kept(self, flight, std_m):
+        tracks = seen(flight(), std_m)
+        found = resolved(tracks)
+        np.testing.assert_array_equal(found.order, tracks.truth)
+        (encounter,) = found.encounters
+        assert encounter.outcome is Outcome.KEPT
+        assert encounter.drones == (0, 1)
+        assert encounter.log_odds < np.log(0.01)
+        # Errors of some hundredths shift the frame where tenths of a metre are the least.
+        assert abs(encounter.closest_frame - 50) <= 3
+        assert encounter.distance_m == pytest.approx(0.3, abs=6 * std_m)
+        assert encounter.first_frame < 45 < 55 < encounter.last_frame < 75
+
+    @pytest.mark.parametrize("std_m", [0.005, 0.03])
+    @pytest.mark.parametrize("frame", [46, 50, 53])
+    @pytest.mark.parametrize("flight", [passing, turning_back])
+    def test_swapped_labels_are_mended(self, flight, frame, std_m):
+        tracks = seen(flight(), std_m, exchanges=[(frame, (1, 0))])
+        found = resolved(tracks)
+        assert outcomes(found) == [Outcome.SWAPPED]
+        assert found.encounters[0].log_odds > np.log(99)
+        # 0.3 m apart and more, one frame tells; of 0.03 m, two.
+        assert (found.order != tracks.truth).any(axis=1).sum() <= 2
+
+    @pytest.mark.parametrize("exchanged", [False, True])
+    def test_who_hovers_together_is_ambiguous(self, exchanged):
+        """Both are on one silhouette for more than a second: nobody can say who comes out on which side."""
+        found = resolved(seen(merging(hovering()), exchanges=[(50, (1, 0))] * exchanged))
+        assert outcomes(found) == [Outcome.UNDECIDED]
+        assert (found.order == [0, 1]).all()
+        last = found.encounters[0].last_frame
+        # Even odds, but for what is left of the course that they had more than a second ago: measured 0.41 to 0.62.
+        assert (np.abs(found.ambiguity[[50, 60, 70, last], 0] - 0.5) < 0.15).all()
+        assert (found.ambiguity[last + 1 :] == 0).all()
+
+    @pytest.mark.parametrize("exchanged", [False, True])
+    def test_sizes_tell_who_hovered(self, exchanged):
+        """One is a fifth larger than the other; as the errors last, that takes some tenths of a second."""
+        flown_m = np.concatenate([np.repeat(hovering()[:1], 200, axis=0), merging(hovering())])
+        usual_m = np.array([[0.36, 0.36, 0.12], [0.30, 0.30, 0.10]])
+        size_m = usual_m + 0.01 * lasting(np.random.default_rng(1), (360, 2, 3))
+        # Where silhouettes merge, sizes are those of both together.
+        size_m[apart_m(flown_m) < 0.3] = 0.5
+        tracks = seen(flown_m, exchanges=[(250, (1, 0))] * exchanged, size_m=size_m)
+        found = resolved(tracks)
+        assert outcomes(found) == [Outcome.SWAPPED if exchanged else Outcome.KEPT]
+        # While they are one silhouette nobody can say which frame it was.
+        apart = apart_m(flown_m) > 0.3
+        np.testing.assert_array_equal(found.order[apart], tracks.truth[apart])
+
+    @pytest.mark.parametrize("exchanged", [False, True])
+    def test_sizes_of_drones_that_are_alike_tell_nothing(self, exchanged):
+        flown_m = np.concatenate([np.repeat(hovering()[:1], 200, axis=0), merging(hovering())])
+        size_m = np.array([0.36, 0.36, 0.12]) + 0.01 * lasting(np.random.default_rng(2), (360, 2, 3))
+        found = resolved(seen(flown_m, exchanges=[(250, (1, 0))] * exchanged, size_m=size_m))
+        assert outcomes(found) == [Outcome.UNDECIDED]
+        assert abs(found.ambiguity[found.encounters[0].last_frame, 0] - 0.5) < 0.2
+
+    def test_ambiguity_begins_with_the_encounter_and_ends_with_it(self):
+        found = resolved(seen(passing(0.2), 0.02))
+        (encounter,) = found.encounters
+        opened = np.zeros(100, bool)
+        opened[encounter.first_frame : encounter.last_frame + 1] = True
+        assert (found.ambiguity[~opened] == 0).all()
+        assert ((found.ambiguity[opened] > 0) & (found.ambiguity[opened] < 1)).all()
+        np.testing.assert_array_equal(found.pairs, [[0, 1]])
+
+    @pytest.mark.parametrize("exchanged", [False, True])
+    def test_a_stretch_without_measurements(self, exchanged):
+        """Neither is seen for eight frames, when they are nearest; or one is, by what is taken for the other."""
+        tracks = seen(passing(0.15), exchanges=[(50, (1, 0))] * exchanged)
+        for hidden in ([0, 1], [0], [1]):
+            was_measured = tracks.was_measured.copy()
+            was_measured[46:54, hidden] = False
+            measured_m = np.where(was_measured[..., None], tracks.measured_m, np.nan)
+            found = resolved(replace(tracks, was_measured=was_measured, measured_m=measured_m))
+            assert outcomes(found) == [Outcome.SWAPPED if exchanged else Outcome.KEPT]
+            # What is not measured is nobody's: only frames outside of the stretch count.
+            assert (found.order == tracks.truth)[was_measured.all(axis=1)].all()
+
+    def test_exchanged_and_back_again(self):
+        """Twenty frames with the wrong labels in an encounter that ends with the right ones."""
+        tracks = seen(passing(0.4, 0.1), exchanges=[(40, (1, 0)), (60, (1, 0))])
+        np.testing.assert_array_equal(resolved(tracks).order, tracks.truth)
+
+    def test_far_apart_nothing_is_said(self):
+        tracks = seen(passing(0.8))
+        found = resolved(tracks)
+        assert found.encounters == ()
+        assert (found.ambiguity == 0).all()
+        np.testing.assert_array_equal(found.order, tracks.truth)
+
+    @pytest.mark.parametrize("exchanged", [False, True])
+    def test_merged_silhouettes_in_a_pass(self, exchanged):
+        """For some tenths of a second both are seen in the same place; their course before tells, or nothing does."""
+        tracks = seen(merging(passing(0.15)), exchanges=[(50, (1, 0))] * exchanged)
+        found = resolved(tracks)
+        assert outcomes(found) == [Outcome.SWAPPED if exchanged else Outcome.KEPT]
+        np.testing.assert_array_equal(found.order[[0, -1]], tracks.truth[[0, -1]])
+
+    def test_a_drone_that_appears_beside_another(self):
+        tracks = seen(passing())
+        was_measured = tracks.was_measured.copy()
+        was_measured[:48, 1] = False
+        found = resolved(replace(tracks, was_measured=was_measured))
+        assert outcomes(found) == [Outcome.KEPT]
+        assert (found.order == [0, 1]).all()
+
+    def test_a_meeting_that_does_not_end(self):
+        tracks = seen(passing()[:51], exchanges=[(48, (1, 0))])
+        found = resolved(tracks)
+        assert outcomes(found) == [Outcome.OPEN]
+        assert found.encounters[0].last_frame == 50
+        np.testing.assert_array_equal(found.order, tracks.truth)
+
+    def test_a_drone_that_never_comes_back(self):
+        """After `patience_s` the encounter is closed, as it is."""
+        tracks = seen(passing())
+        was_measured = tracks.was_measured.copy()
+        was_measured[50:, 1] = False
+        params = IdentityParams(encounter_m=ENCOUNTER_M, patience_s=0.8)
+        found = resolved(replace(tracks, was_measured=was_measured), params=params)
+        (encounter,) = found.encounters
+        assert encounter.last_frame == 49 + round(0.8 / DT_S)
+        assert encounter.outcome is not Outcome.SWAPPED
+
+
+def meeting_in_the_middle(drones, nearest_m=0.25, speed_m_s=1.0):
+    """Drones from all sides that pass one another, all nearest in frame 50."""
+    angle = 2 * np.pi * np.arange(drones) / drones
+    ahead = np.stack([np.cos(angle), np.sin(angle), np.zeros(drones)], axis=-1)
+    aside = np.stack([-np.sin(angle), np.cos(angle), np.zeros(drones)], axis=-1)
+    return speed_m_s * SECONDS[:, None, None] * ahead + nearest_m * aside
+
+
+def assert_mended(found, tracks):
+    """Right labels but about the exchange: which of several tracks went first may be a frame off."""
+    wrong = np.flatnonzero((found.order != tracks.truth).any(axis=1))
+    assert len(wrong) <= 2
+    assert (np.abs(wrong - 50) <= 2).all()
+
+
+class TestMoreDrones:
+    @pytest.mark.parametrize("permutation", list(permutations(range(3))))
+    def test_three_that_meet_at_once(self, permutation):
+        tracks = seen(meeting_in_the_middle(3), exchanges=[(50, permutation)])
+        found = resolved(tracks)
+        assert_mended(found, tracks)
+        assert len(found.encounters) == 3
+        for encounter in found.encounters:
+            one, other = encounter.drones
+            mixed = permutation[one] == other or permutation[other] == one
+            assert encounter.outcome is (Outcome.SWAPPED if mixed else Outcome.KEPT)
+
+    def test_two_exchanges_at_different_times(self):
+        """Three tracks change places in two steps: each is mended where it was."""
+        tracks = seen(meeting_in_the_middle(3), exchanges=[(46, (1, 0, 2)), (54, (0, 2, 1))])
+        np.testing.assert_array_equal(resolved(tracks).order, tracks.truth)
+
+    def test_four_and_a_bystander(self):
+        flown_m = np.concatenate([meeting_in_the_middle(4), np.full((100, 1, 3), 2.0)], axis=1)
+        tracks = seen(flown_m, exchanges=[(50, (2, 3, 1, 0, 4))])
+        found = resolved(tracks)
+        assert_mended(found, tracks)
+        assert (found.ambiguity[:, (found.pairs == 4).any(axis=1)] == 0).all()
+        assert (found.ambiguity[:, (found.pairs != 4).all(axis=1)] > 0).any(axis=0).all()
+
+    def test_two_encounters_become_one(self):
+        """Two pairs meet by themselves, and then one another, while their labels are still in doubt."""
+        one = passing(0.3, 0.3)
+        flown_m = np.concatenate([one, one + np.array([0.0, 1.6, 0.0])], axis=1)
+        flown_m[..., 1] += np.array([1.0, 1.0, -1.0, -1.0]) * np.clip(SECONDS[:, None] + 0.4, 0, 1) * 0.55
+        assert apart_m(flown_m).min() > 0.1
+        tracks = seen(flown_m, exchanges=[(40, (1, 0, 2, 3)), (45, (0, 1, 3, 2)), (63, (2, 1, 0, 3))])
+        found = resolved(tracks)
+        np.testing.assert_array_equal(found.order, tracks.truth)
+        assert {encounter.first_frame for encounter in found.encounters} != {0}
+
+    def test_five_at_once_are_more_than_one_group_holds(self):
+        """Right labels stay right, and what is reported is a probability."""
+        found = resolved(seen(meeting_in_the_middle(5)))
+        assert (found.order == np.arange(5)).all()
+        assert ((found.ambiguity >= 0) & (found.ambiguity <= 1)).all()
+
+    def test_who_leaves_a_group_is_settled_before_those_who_stay(self):
+        """Two fly side by side all the time, a third one passes."""
+        still = np.stack([np.array([[0.0, y, 1.0]]) for y in (0.0, 0.45)], axis=1).repeat(100, axis=0)
+        third = np.stack([2 * SECONDS, np.full(100, -0.3), np.ones(100)], axis=-1)[:, None]
+        tracks = seen(np.concatenate([still, third], axis=1), exchanges=[(50, (2, 1, 0))])
+        found = resolved(tracks)
+        np.testing.assert_array_equal(found.order, tracks.truth)
+        (passed,) = (encounter for encounter in found.encounters if encounter.drones == (0, 2))
+        assert passed.outcome is Outcome.SWAPPED
+        assert passed.last_frame < 70
+        assert found.encounters[-1].outcome is Outcome.OPEN
+
+    @given(st.integers(0, 2**32 - 1))
+    @settings(max_examples=4)
+    def test_names_of_drones_do_not_matter(self, seed):
+        rng = np.random.default_rng(seed)
+        flown_m = meeting_in_the_middle(4, rng.uniform(0.05, 0.4), rng.uniform(0.5, 2.0))
+        tracks = seen(flown_m, rng.uniform(0.005, 0.03), seed, [(rng.integers(44, 57), rng.permutation(4))])
+        tracks.was_measured[rng.random((100, 4)) < 0.1] = False
+        names = rng.permutation(4)
+        found = resolved(tracks)
+        renamed = resolved(
+            replace(
+                tracks,
+                measured_m=tracks.measured_m[:, names],
+                covariance_m2=tracks.covariance_m2[:, names],
+                was_measured=tracks.was_measured[:, names],
+            )
+        )
+        # Drone and track `names[i]` are called i now.
+        np.testing.assert_array_equal(names[renamed.order], found.order[:, names])
+        column = {tuple(sorted(names[pair])): index for index, pair in enumerate(renamed.pairs)}
+        columns = [column[tuple(pair)] for pair in found.pairs]
+        # Sums of 24 terms in another order, over a hundred frames.
+        np.testing.assert_allclose(renamed.ambiguity[:, columns], found.ambiguity, rtol=0, atol=1e-9)
+
+    def test_the_first_frames_by_themselves(self):
+        """Chunk by chunk comes out as all at once does, up to the first frame that is still in doubt."""
+        time_s = np.arange(300) * DT_S
+        x = 1.5 * np.sin(time_s[:, None] * [1.1, 0.9, 1.3] + [0.0, 2.0, 4.0])
+        flown_m = np.stack([x, 0.1 * np.arange(3) * np.ones_like(x), np.ones_like(x)], axis=-1)
+        tracks = seen(flown_m, 0.02, exchanges=[(100, (1, 0, 2)), (200, (0, 2, 1))])
+        whole = resolved(tracks)
+        assert len(whole.encounters) > 8
+        for frames in range(20, 300, 56):
+            names = ("time_s", "measured_m", "covariance_m2", "was_measured")
+            found = resolved(replace(tracks, **{name: getattr(tracks, name)[:frames] for name in names}))
+            still_open = [encounter for encounter in found.encounters if encounter.outcome is Outcome.OPEN]
+            safe = min((encounter.first_frame for encounter in still_open), default=frames)
+            np.testing.assert_array_equal(found.order[:safe], whole.order[:safe])
+            np.testing.assert_array_equal(found.ambiguity[:safe], whole.ambiguity[:safe])
+            settled = len(found.encounters) - len(still_open)
+            assert found.encounters[:settled] == whole.encounters[:settled]
+
+    def test_one_drone(self):
+        found = resolved(seen(passing()[:, :1]))
+        assert (found.order == 0).all()
+        assert found.pairs.shape == (0, 2)
+        assert found.ambiguity.shape == (100, 0)
+
+
+def all_histories(model, start, frames, rate):
+    """Exact posterior of the labels of two drones after the frames, and their mean states, history by history.
+
+    Args:
+        start: per drone, the measurements and covariances that its state is learned from.
+        frames: measurements (2, 3) and covariances (2, 3, 3), by tracks, of every frame.
+    """
+    H, weights, means = model.H, {0: [], 1: []}, {0: [], 1: []}
+    stay, go = -np.log1p(rate), np.log(rate) - np.log1p(rate)
+    for history in product((0, 1), repeat=len(frames)):
+        total, states = sum(go if a != b else stay for a, b in zip((0, *history), history, strict=False)), []
+        for drone in (0, 1):
+            (z, R), *rest = zip(*start[drone], strict=True)
+            x, P = model.start(z, R)
+            measured = [
+                *rest,
+                *(
+                    (m[drone ^ label], c[drone ^ label])
+                    for label, (m, c) in zip(history, frames, strict=True)
+                ),
+            ]
+            for k, (z, R_now) in enumerate(measured):
+                F, Q = model.transition(DT_S, R)
+                R, x, P = R_now, F @ x, F @ P @ F.T + Q
+                S = H @ P @ H.T + model.white(R)
+                if k >= len(rest):
+                    off = z - H @ x
+                    total -= (off @ np.linalg.solve(S, off) + np.linalg.slogdet(2 * np.pi * S)[1]) / 2
+                K = P @ H.T @ np.linalg.inv(S)
+                x, P = x + K @ (z - H @ x), P - K @ S @ K.T
+            states.append(x)
+        weights[history[-1]].append(total)
+        means[history[-1]].append(states)
+    totals = np.array([logsumexp(weights[label]) for label in (0, 1)])
+    mean = [np.einsum("h,hdn->dn", softmax(weights[label]), np.array(means[label])) for label in (0, 1)]
+    return totals - logsumexp(totals), np.array(mean)
+
+
+class TestLabellings:
+    @pytest.mark.parametrize("share", [0.0, 0.5])
+    @pytest.mark.parametrize(("frames", "limit", "limit_m"), [(1, 1e-9, 1e-9), (7, 0.02, 0.003)])
+    def test_all_histories_one_by_one(self, frames, limit, limit_m, share):
+        """Exact after one frame. After seven, of 128 histories, merging costs little: measured 0.8 mm."""
+        model = Model(density=10.0, error_share=share)
+        for seed in range(3):
+            rng = np.random.default_rng(seed)
+            flown_m = np.stack(
+                [np.outer(np.arange(20) * DT_S, 0.1 * rng.normal(size=3)) for _ in range(2)], axis=1
+            )
+            flown_m += 0.01 * rng.normal(size=(2, 3)) - flown_m[13]
+            # Half as far off as it is said to be: nothing is beyond the gate, of which a textbook knows nothing.
+            measured_m = flown_m + 0.01 * rng.normal(size=flown_m.shape)
+            covariance_m2 = np.broadcast_to(0.02**2 * np.eye(3), (20, 2, 3, 3))
+            start = [(measured_m[:10, drone], covariance_m2[:10, drone]) for drone in (0, 1)]
+            rows = range(10, 10 + frames)
+            exact, exact_mean = all_histories(
+                model, start, [(measured_m[k], covariance_m2[k]) for k in rows], 0.2
+            )
+            with jax.enable_x64(True):
+                banks = [
+                    labellings.begin(z, R, np.r_[np.full(9, DT_S), 0.0], np.ones(10, bool), model.params(1))
+                    for z, R in start
+                ]
+                bank = labellings.joined(*banks)
+                change = labellings.change_log_probability(~np.eye(2, dtype=bool), 0.2)
+                for k in rows:
+                    inputs = (measured_m[k], covariance_m2[k], np.ones(2, bool), change, np.zeros((2, 2)))
+                    bank, before = labellings.step(bank, np.float64(DT_S), *inputs, model.params(2))
+            np.testing.assert_allclose(
+                np.exp(np.asarray(bank.log_probability)), np.exp(exact), rtol=0, atol=limit
+            )
+            np.testing.assert_allclose(np.asarray(before).sum(axis=0), 1.0, rtol=0, atol=1e-12)
+            position_m = (exact_mean @ model.H.T) if share == 0 else exact_mean[..., :3]
+            np.testing.assert_allclose(np.asarray(bank.state.position_m), position_m, rtol=0, atol=limit_m)
+
+    @pytest.mark.parametrize("drones", [1, 2, 3, 4])
+    def test_exchanges_are_counted(self, drones):
+        """By trying all exchanges until every labelling has been reached."""
+        all_of = [tuple(row) for row in labellings.labellings(drones).tolist()]
+        assert all_of[0] == tuple(range(drones))
+        assert set(all_of) == set(permutations(range(drones)))
+        for index, origin in enumerate(all_of):
+            steps, left = {origin: 0}, deque([origin])
+            while left:
+                now = left.popleft()
+                for one, other in combinations(range(drones), 2):
+                    later = tuple({one: other, other: one}.get(track, track) for track in now)
+                    if later not in steps:
+                        steps[later] = steps[now] + 1
+                        left.append(later)
+            np.testing.assert_array_equal(labellings.exchanges(drones)[index], [steps[row] for row in all_of])
+
+    def test_changes_are_exchanges_of_tracks_that_may(self):
+        active = np.zeros((3, 3), bool)
+        active[0, 2] = active[2, 0] = True
+        log_change = labellings.change_log_probability(active, 0.25)
+        # Of two outcomes of odds 4 to 1, whatever drones the tracks 0 and 2 are.
+        for before, row in zip(labellings.labellings(3), np.exp(log_change), strict=True):
+            swapped = (labellings.labellings(3) == np.array([2, 1, 0])[before]).all(axis=1)
+            same = (labellings.labellings(3) == before).all(axis=1)
+            np.testing.assert_allclose(row, 0.2 * swapped + 0.8 * same, rtol=0, atol=1e-12)
+
+    def test_confusions_by_hand(self):
+        """Reported 0, 1, 2; in truth drone 0 is on track 1, 1 on 2, and 2 on 0: all are taken for one another."""
+        wrong = labellings.confusions(3)
+        index = {tuple(row): at for at, row in enumerate(labellings.labellings(3).tolist())}
+        assert wrong[0, index[1, 2, 0]].tolist() == [True, True, True]
+        assert wrong[0, index[1, 0, 2]].tolist() == [True, False, False]
+        assert wrong[0, index[2, 1, 0]].tolist() == [False, True, False]
+        # What is reported as it is, is right.
+        assert not wrong[np.arange(6), np.arange(6)].any()
+        # Reported 1, 0, 2, in truth 2, 0, 1: track 1 passes for drone 0 and is 2; track 2 passes for 2 and is 0.
+        assert wrong[index[1, 0, 2], index[2, 0, 1]].tolist() == [False, True, False]
+
+    def test_smoothed_is_bayes_rule_backwards(self):
+        """Against the joint distribution of three frames of a chain of three labellings."""
+        rng = np.random.default_rng(0)
+        before = rng.random((3, 3, 3))
+        before /= before.sum(axis=1, keepdims=True)
+        found = labellings.smoothed(before, 2)
+        joint = np.einsum("ab,b->ab", before[1], before[2][:, 2])
+        np.testing.assert_allclose(
+            found, [joint.sum(axis=1), joint.sum(axis=0), [0, 0, 1]], rtol=0, atol=1e-15
+        )
+
+    def test_path_by_hand(self):
+        """One wrong frame is not worth two changes of cost 1.5 each; four are."""
+        cost = 1.5 * (1 - np.eye(2))
+        for stretch, expected in ((1, [0] * 6), (4, [0, 1, 1, 1, 1, 0])):
+            right = np.eye(2)[[0] + [1] * stretch + [0] * (5 - stretch)]
+            assert labellings.path(right, cost).tolist() == expected
+        assert labellings.path(np.eye(2)[[0, 0, 1, 1]], 10 * cost).tolist()[-1] == 1
+
+    def test_joined_keeps_what_was_known(self):
+        kept, index = labellings.embedding(2, 1)
+        assert kept.tolist() == [True, False, True, False, False, False]
+        np.testing.assert_array_equal(index[kept], [[0, 0], [1, 0]])
+
+
+class TestLikeness:
+    def test_a_second_of_one_look_is_worth_one_look(self):
+        """Errors that stay for 2 s against errors that are new in every frame: fifty frames for one."""
+        rng = np.random.default_rng(0)
+        time_s = np.arange(2000) * DT_S
+        white_m = 0.01 * rng.normal(size=(2000, 2, 3))
+        stuck_m = np.repeat(white_m[::50], 50, axis=0)
+        worth = [
+            np.linalg.inv(likeness.learn(time_s, off_m + 0.3).precision_m2) for off_m in (white_m, stuck_m)
+        ]
+        # Variances of 40 looks each are known to a sixth, three times that is allowed for.
+        for found, times in zip(worth, (1 + 1, 1 + 50), strict=True):
+            np.testing.assert_allclose(np.diag(found), times * 0.01**2, rtol=0.5)
+
+    def test_drones_that_are_alike_are_not_told_apart(self):
+        """Of a hundred pairs with errors that last, the evidence of two seconds is for neither in nearly all."""
+        time_s = np.arange(250) * DT_S
+        evidence = []
+        for seed in range(100):
+            size_m = 0.3 + 0.01 * lasting(np.random.default_rng(seed), (300, 2, 3))
+            known = likeness.learn(time_s, size_m[:250])
+            fit = sum(likeness.log_likelihood(known, row, np.ones(2, bool)) for row in size_m[250:])
+            evidence.append(fit[0, 1] + fit[1, 0] - fit[0, 0] - fit[1, 1])
+        # Measured 97 of 100 below 1.
+        assert (np.abs(evidence) < 1).mean() > 0.9
+
+    def test_what_is_not_clear_says_nothing(self):
+        time_s = np.arange(500) * DT_S
+        size_m = np.array([[0.3], [0.4]]) + 0.01 * np.random.default_rng(1).normal(size=(500, 2, 3))
+        known = likeness.learn(time_s, size_m)
+        assert likeness.log_likelihood(known, size_m[0], np.array([True, False]))[:, 1].tolist() == [0, 0]
+        unknown_m = np.array([[0.3, 0.3, 0.3], [np.nan] * 3])
+        assert likeness.log_likelihood(known, unknown_m, np.ones(2, bool))[:, 1].tolist() == [0, 0]
+        assert likeness.log_likelihood(None, unknown_m, np.ones(2, bool)).tolist() == [[0, 0], [0, 0]]
+
+    def test_too_little_is_nothing(self):
+        time_s = np.arange(500) * DT_S
+        size_m = 0.01 * np.random.default_rng(1).normal(size=(500, 2, 3))
+        assert likeness.learn(time_s, size_m) is not None
+        assert likeness.learn(time_s[:100], size_m[:100]) is None
+        assert likeness.learn(time_s[:0], size_m[:0]) is None
+        size_m[100:, 1] = np.nan
+        assert likeness.learn(time_s, size_m) is None
+
+    def test_a_wild_size_does_not_spoil_what_is_learned(self):
+        time_s = np.arange(500) * DT_S
+        size_m = np.array([[0.3], [0.4]]) + 0.01 * np.random.default_rng(1).normal(size=(500, 2, 3))
+        known = likeness.learn(time_s, size_m)
+        size_m[::50] = 5.0
+        spoilt = likeness.learn(time_s, size_m)
+        # Ten of 500 frames drawn in to four deviations: 0.8 mm at most.
+        np.testing.assert_allclose(spoilt.typical_m, known.typical_m, rtol=0, atol=0.0015)
+
+
+class TestRefusals:
+    @pytest.mark.parametrize(
+        ("name", "value"),
+        [
+            ("encounter_m", 0.0),
+            ("patience_s", -1.0),
+            ("patience_s", float("inf")),
+            ("decision_probability", 0.5),
+            ("decision_probability", 1.0),
+        ],
+    )
+    def test_settings_that_make_no_sense(self, name, value):
+        with pytest.raises(SettingsError, match=name):
+            IdentityParams(**{name: value})
+
+    def test_measurements_that_are_none(self):
+        tracks = seen(passing())
+        tracks.measured_m[7, 1, 2] = np.nan
+        with pytest.raises(InputError, match="row 7, drone 1"):
+            resolved(tracks)
+
+
+class TestFrequencies:
+    def test_probabilities_are_how_often_labels_are_wrong(self):
+        """A hundred encounters whose flights, errors and exchanges obey the model.
+
+        While two are near their tracks are exchanged five times per second, and errors are as large as they are taken
+        to be there. Where something is in doubt, as many labels are wrong as it says, to within 4 standard deviations
+        of the binomial distribution, of which one test in some thousand fails by chance. Where labels are held to be
+        certain, few are wrong: measured 1 and 2 % of four hundred, for the histories that were merged.
+        """
+        rate = 5.0 * DT_S
+        probability, wrong = [], []
+        for seed in range(6):
+            rng = np.random.default_rng(seed)
+            flown_m, near = white_jerk_meetings(rng, pairs=20)
+            std_m = rng.uniform(0.005, 0.03)
+            nearness = np.clip(1 - apart_m(flown_m) / ENCOUNTER_M, 0, 1)
+            noise_m = np.hypot(std_m, 0.1 * ENCOUNTER_M * nearness**2)
+            truth = np.tile(np.arange(40), (len(flown_m), 1))
+            for frame, pair in np.argwhere(near & (rng.random(near.shape) < rate / (1 + rate))):
+                truth[frame:, 2 * pair : 2 * pair + 2] = truth[frame:, 2 * pair : 2 * pair + 2][:, ::-1]
+            tracks = seen(flown_m + noise_m[..., None] * rng.normal(size=flown_m.shape), 0.0)
+            covariance_m2 = np.broadcast_to(std_m**2 * np.eye(3), (*noise_m.shape, 3, 3))
+            found = resolved(by_tracks(replace(tracks, covariance_m2=covariance_m2), truth))
+            for pair in range(20):
+                column = (found.pairs == [2 * pair, 2 * pair + 1]).all(axis=1).argmax()
+                # One frame of each, soon after they were nearest: the next would be no independent case.
+                row = 25 + rng.integers(10)
+                if found.ambiguity[row, column] > 0:
+                    swapped = found.order[row, 2 * pair] != 2 * pair
+                    ambiguity = found.ambiguity[row, column]
+                    probability.append(1 - ambiguity if swapped else ambiguity)
+                    wrong.append(truth[row, 2 * pair] != 2 * pair)
+        probability, wrong = np.array(probability), np.array(wrong)
+        assert len(wrong) > 90
+        edges = [0, 0.02, 0.2, 0.8, 0.98, 1]
+        for low, high in pairwise(edges):
+            inside = (probability >= low) & (probability <= high)
+            number, expected = inside.sum(), np.clip(probability[inside].mean(), 0.04, 0.96)
+            least, most = binom.ppf([3e-5, 1 - 3e-5], number, expected)
+            # Certain labels may be right more often than in 96 of 100.
+            assert wrong[inside].sum() >= (0 if high <= 0.02 else least), (low, high)
+            assert wrong[inside].sum() <= (number if low >= 0.98 else most), (low, high)
+            assert number >= 4, (low, high)
+        # And they tell something: labels that are taken to be right are, and the reverse.
+        assert ((probability > 0.5) == wrong).mean() > 0.85
+
+    @pytest.mark.parametrize("name", ["S01_D2_A", "S04_D10"])
+    def test_flights_of_the_simulator(self, name):
+        """Every exchange is mended and no right label is exchanged, at any noise: passes at 0.3 and 0.4 m."""
+        recipe = scenario(name)
+        flights = planning.plan(recipe, 0)
+        time_s = planning.frame_times_s(recipe, recipe.num_frames)
+        flown_m = np.stack([flight.position_m(time_s) for flight in flights], axis=1)
+        distance_m = np.linalg.norm(flown_m[:, :, None] - flown_m[:, None], axis=-1)
+        for seed, std_m in enumerate((0.005, 0.01, 0.02, 0.03)):
+            rng = np.random.default_rng(seed)
+            exchanges, meetings = [], 0
+            for one, other in combinations(range(flown_m.shape[1]), 2):
+                near = np.flatnonzero(distance_m[:, one, other] < ENCOUNTER_M)
+                for frames in np.split(near, np.flatnonzero(np.diff(near) > 1) + 1) if len(near) else []:
+                    meetings += 1
+                    nearest = frames[distance_m[frames, one, other].argmin()]
+                    # Before the first frame no tracks were exchanged: what it says is who is who.
+                    if nearest > 0 and rng.random() < 0.5:
+                        exchanges.append((nearest, one, other))
+            truth = np.tile(np.arange(flown_m.shape[1]), (len(time_s), 1))
+            for frame, one, other in exchanges:
+                truth[frame:, [one, other]] = truth[frame:, [other, one]]
+            found = resolved(by_tracks(seen(flown_m, std_m, seed), truth))
+            np.testing.assert_array_equal(found.order, truth)
+            assert len(found.encounters) == meetings > len(exchanges) > 0
+            certain = [abs(encounter.log_odds) > np.log(99) for encounter in found.encounters]
+            assert all(certain)
+
+
+def white_jerk_meetings(rng, pairs, frames=50, density=AGILITY):
+    """Flights (frames, 2 * pairs, 3) with white jerk, pairs far from one another, and (frames, pairs) who is near."""
+    F, Q = Model(density=density).transition(DT_S, np.eye(3))
+    root = np.linalg.cholesky(Q)
+    middle = frames // 2
+    start = np.concatenate(
+        [
+            0.1 * rng.normal(size=(2 * pairs, 3)),
+            0.5 * 0.5 * rng.normal(size=(2 * pairs, 3)),
+            rng.normal(size=(2 * pairs, 3)),
+        ],
+        axis=1,
+    )
+    state = np.empty((frames, 2 * pairs, 9))
+    for direction in (1, -1):
+        # Backwards in time, velocities are reversed.
+        mirror = np.repeat([1.0, direction, 1.0], 3)
+        now = start * mirror
+        for frame in range(middle, frames if direction > 0 else -1, direction):
+            state[frame] = now * mirror
+            now = now @ F.T + rng.normal(size=now.shape) @ root.T
+    flown_m = state[..., :3].copy()
+    near = np.linalg.norm(flown_m[:, ::2] - flown_m[:, 1::2], axis=-1) < 0.8 * ENCOUNTER_M
+    flown_m[..., 0] += 100 * (np.arange(2 * pairs) // 2)
+    return flown_m, near

@@ -1,0 +1,127 @@
+"""The paraboloid through the score: against least squares in float64, and on silhouettes of known ellipsoids."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import draw_coverage, float32, ring_rig
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from psotrack.fitness import ScoreSettings, camera_scores, scene
+from psotrack.localisation import SPAN, localise
+from psotrack.summed_area import summed_area_table
+
+REDUCTION = 4
+SIZE_M = np.array([[0.5, 0.5, 0.2]])
+RIG = ring_rig(6, image_size_wh=(960, 720), coefficients=5)
+
+
+def view_of(truth_m, *, rig=RIG, size_m=SIZE_M):
+    coverage = draw_coverage(rig, truth_m, size_m, REDUCTION)
+    tables = summed_area_table(jnp.asarray(coverage))
+    return scene(float32(rig.cameras), float32(size_m), tables, ScoreSettings(reduction=REDUCTION))
+
+
+def found(view, position_m, size_m=SIZE_M):
+    return jax.jit(localise)(view, *float32((np.asarray(position_m, float), size_m)))
+
+
+def test_it_is_the_least_squares_paraboloid():
+    """Vertex, curvature and dispersion from NumPy's least squares through each camera's 27 scores."""
+    truth = np.array([[0.31, -0.22, 1.17]])
+    view = view_of(truth)
+    start = truth + np.array([0.012, -0.008, 0.006])
+    grid = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], float)
+    scores, weights = (
+        np.asarray(of, np.float64)
+        for of in camera_scores(view, float32(start + SPAN * SIZE_M * grid[:, None, :]))
+    )
+    share = weights[13, 0] / weights[13, 0].sum()
+    x, y, z = grid.T
+    terms = np.stack([np.ones(27), x, y, z, x * x / 2, y * y / 2, z * z / 2, x * y, x * z, y * z], axis=-1)
+    solved = np.linalg.lstsq(terms, scores[:, 0], rcond=None)[0]
+    slope = (share * solved[1:4]).T
+    xx, yy, zz, xy, xz, yz = share * solved[4:]
+    bent = -np.stack([np.stack(row, -1) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))], axis=-2)
+    whole = bent.sum(axis=0)
+    to_vertex = np.linalg.solve(whole, slope.sum(axis=0))
+    left = slope - bent @ to_vertex
+    cameras = 1 / np.square(share).sum()
+    phi = np.einsum("ci,ij,cj->", left, np.linalg.inv(whole), left) / 3 * cameras / (cameras - 1.5)
+
+    answer = found(view, start)
+    span = SPAN * SIZE_M[0]
+    # Scores are float32, 1e-7 each; vertex and curvature divide their differences by a curvature of about 0.1.
+    np.testing.assert_allclose(answer.position_m[0], start[0] + span * to_vertex, atol=2e-6)
+    inverse = np.linalg.inv(whole) * np.outer(span, span)
+    np.testing.assert_allclose(
+        answer.inverse_curvature_m2[0], inverse, rtol=1e-3, atol=1e-5 * np.trace(inverse)
+    )
+    # Residual slopes are small differences of large ones.
+    np.testing.assert_allclose(answer.dispersion[0], phi, rtol=0.02)
+
+
+def test_the_vertex_is_the_middle_of_an_ellipsoid():
+    """From anywhere about the truth, and nearer to it than the pixels of the silhouettes are apart."""
+    rng = np.random.default_rng(0)
+    errors_m = []
+    for _ in range(20):
+        truth = rng.uniform([-0.8, -0.8, 0.7], [0.8, 0.8, 1.8])[None]
+        start = truth + rng.uniform(-0.02, 0.02, 3)
+        errors_m.append(np.linalg.norm(found(view_of(truth), start).position_m[0] - truth[0]))
+    # A pixel of the silhouettes is 2 cm at 4 m: measured 2 mm on average, 5 mm at most.
+    assert np.mean(errors_m) < 0.004
+    assert np.max(errors_m) < 0.01
+
+
+def test_it_goes_no_farther_than_the_grid():
+    truth = np.array([[0.1, 0.2, 1.2]])
+    start = truth + np.array([0.3, 0.0, 0.0])
+    moved = np.abs(np.asarray(found(view_of(truth), start).position_m) - start)
+    assert (moved <= SPAN * SIZE_M * (1 + 1e-5)).all()
+
+
+def test_two_views_from_one_side_are_unsure_along_their_rays():
+    truth = np.array([[0.0, 0.0, 1.2]])
+    rig = ring_rig(36, image_size_wh=(960, 720))
+    near = rig.select((rig.names[0], rig.names[2]))
+    inverse = np.asarray(found(view_of(truth, rig=near), truth).inverse_curvature_m2[0], float)
+    axis = np.linalg.eigh(inverse)[1][:, -1]
+    ray = truth[0] - near.cameras.centre_world.mean(axis=0)
+    # The two rays are 20 degrees apart, and the ellipsoid's own shape matters; it is no direction across them.
+    assert abs(axis @ ray) / np.linalg.norm(ray) > 0.8
+    wide = found(view_of(truth), truth).inverse_curvature_m2[0]
+    assert np.linalg.eigvalsh(inverse)[-1] > 3 * np.linalg.eigvalsh(np.asarray(wide, float))[-1]
+
+
+def test_one_camera_alone_has_nobody_to_disagree_with():
+    truth = np.array([[0.0, 0.0, 1.2]])
+    alone = RIG.select(RIG.names[:1])
+    assert np.isinf(found(view_of(truth, rig=alone), truth).dispersion[0])
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.tuples(st.floats(-9, 9), st.floats(-9, 9), st.floats(-3, 6)))
+def test_it_is_finite_everywhere(position_m):
+    """Beside the drone, outside of images, behind cameras: a number, and a positive definite matrix."""
+    answer = found(VIEW, np.array([position_m]))
+    assert np.isfinite(answer.position_m).all()
+    inverse = np.asarray(answer.inverse_curvature_m2[0], float)
+    np.testing.assert_array_equal(inverse, inverse.T)
+    assert np.linalg.eigvalsh(inverse)[0] > 0
+    assert not np.isnan(answer.dispersion).any()
+
+
+VIEW = view_of(np.array([[0.1, 0.2, 1.2]]))
+
+
+@pytest.mark.parametrize("order", [[2, 0, 1], [1, 2, 0]])
+def test_drones_do_not_matter_to_each_other(order):
+    """Whole images claim nothing: each drone's answer is its own, in whatever order they are asked about."""
+    truth = np.array([[0.0, 0.0, 1.2], [0.9, -0.4, 1.0], [-0.8, 0.7, 1.5]])
+    size = np.tile(SIZE_M, (3, 1))
+    one = found(view_of(truth, size_m=size), truth + 0.01, size)
+    other = found(view_of(truth[order], size_m=size[order]), truth[order] + 0.01, size[order])
+    # Sums of as many numbers in another order.
+    np.testing.assert_allclose(other.position_m, np.asarray(one.position_m)[order], atol=1e-6)

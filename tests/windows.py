@@ -1,0 +1,114 @@
+"""Windows of the silhouettes as tests look at them: cut, unpacked, scored, and searched for the best place."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from helpers import far_camera, float32, rig_of
+
+from psotrack.boxes import extents
+from psotrack.fitness import Scene, ScoreSettings, drone_fitness, scene
+from psotrack.patches import SIDE, cut
+from psotrack.summed_area import LOW_BITS, summed_area_table
+
+RING = ScoreSettings().ring
+
+# Cameras so far away that metres are pixels, one per level: 15 to 188 silhouette pixels from the middle of a drone of
+# 1 m to the ring's border. No side of the silhouettes is a multiple of 8.
+SHAPE = (213, 301)
+PIXELS_PER_M = np.array([20.0, 60.0, 120.0, 250.0])
+NOISE = np.random.default_rng(0).integers(0, 256, (4, *SHAPE)).astype(np.uint8)
+
+
+def far_rig(reduction):
+    height, width = SHAPE
+    sides = (width * reduction, height * reduction)
+    return rig_of(*(far_camera(image_size_wh=sides, pixels_per_m=reduction * ppm) for ppm in PIXELS_PER_M))
+
+
+def middle_px(position_m, pixels_per_m):
+    """In silhouette pixels, counted from the left upper corner: x is to the right, z is up."""
+    return SHAPE[1] / 2 + pixels_per_m * position_m[0], SHAPE[0] / 2 - pixels_per_m * position_m[2]
+
+
+def cut_at(
+    rig, images, expected_m, size_m, *, reach_m=0.1, claiming=True, reduction=1, floor_z_m=None, offset_m=None
+):
+    """Windows as NumPy arrays; `claiming` is for one or for each of the drones, or None."""
+    count = len(expected_m)
+    arrays = float32(
+        (rig.cameras, np.asarray(expected_m), np.asarray(size_m), np.broadcast_to(reach_m, count))
+    )
+    claiming = None if claiming is None else np.broadcast_to(claiming, count)
+    return jax.tree.map(
+        np.asarray, _cut(images, *arrays, claiming, reduction, *float32((floor_z_m, offset_m)))
+    )
+
+
+@partial(jax.jit, static_argnames="reduction")
+def _cut(images, cameras, expected_m, size_m, reach_m, claiming, reduction, floor_z_m, offset_m):
+    return cut(
+        images,
+        extents(cameras, size_m, offset_m),
+        expected_m,
+        reach_m=reach_m,
+        claiming=claiming,
+        reduction=reduction,
+        ring=RING,
+        floor_z_m=floor_z_m,
+    )
+
+
+def pixels(patches):
+    """(drones, cameras, rows, columns): the windows' foreground, 0..255, from their tables."""
+    return _words(patches) & (2**LOW_BITS - 1)
+
+
+def claimed_pixels(patches):
+    """(drones, cameras, rows, columns): which pixels of the windows are claimed foreground."""
+    return _words(patches) >> LOW_BITS
+
+
+def _words(patches):
+    # Sums may run over; their differences do not.
+    windows = np.diff(np.diff(patches.tables, axis=0), axis=2).swapaxes(0, 1)
+    return windows.reshape(*patches.x_px.shape, SIDE, SIDE)
+
+
+def each(windows):
+    return (((d, c), windows[d, c]) for d in range(windows.shape[0]) for c in range(windows.shape[1]))
+
+
+def evaluate(function, rig, patches, position_m, size_m, reduction):
+    arrays = float32((rig.cameras, np.asarray(position_m), np.asarray(size_m)))
+    return jax.tree.map(np.asarray, _evaluate(function, ScoreSettings(reduction=reduction), patches, *arrays))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _evaluate(function, settings, patches, cameras, position_m, size_m):
+    return function(Scene(extents(cameras, size_m), patches, settings), position_m)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def evaluate_whole(function, settings, images, cameras, position_m, size_m):
+    return function(scene(cameras, size_m, summed_area_table(images), settings), position_m)
+
+
+def best_place(rig, patches, about_m, size_m, reduction):
+    """Where the fitness of each drone is highest: a grid of 9 x 9 x 9, three times finer each time."""
+    arrays = float32((rig.cameras, np.asarray(about_m), np.asarray(size_m)))
+    return np.asarray(_best_place(ScoreSettings(reduction=reduction), patches, *arrays), np.float64)
+
+
+@partial(jax.jit, static_argnums=0)
+def _best_place(settings, patches, cameras, best_m, size_m):
+    view = Scene(extents(cameras, size_m), patches, settings)
+    unit = np.stack(np.meshgrid(*[np.arange(-4, 5)] * 3, indexing="ij"), axis=-1).reshape(-1, 1, 3)
+
+    def closer(best_m, step_m):
+        places = best_m + step_m * jnp.asarray(unit, jnp.float32)
+        best = jnp.nan_to_num(drone_fitness(view, places)).argmax(axis=0)
+        return places[best, jnp.arange(len(best))], None
+
+    return jax.lax.scan(closer, best_m, jnp.asarray([0.02, 0.006, 0.002, 0.0006], jnp.float32))[0]
