@@ -180,6 +180,41 @@ def test_the_paper_baseline_runs(run: Run, sequence: Path, tmp_path: Path) -> No
     assert (settings["swarm"], settings["score"]) == ("joint", "hard")
 
 
+def test_smoothed_tracks_are_surer(run: Run, sequence: Path, tmp_path: Path) -> None:
+    for name, more in (("filtered", ()), ("smoothed", ("--smooth",))):
+        assert run(*track(sequence, tmp_path / f"{name}.csv", *more)).code == 0
+    filtered, smoothed = (pd.read_csv(tmp_path / f"{name}.csv") for name in ("filtered", "smoothed"))
+    columns = ["cov_xx", "cov_yy", "cov_zz"]
+    assert smoothed[columns].sum(axis=1).mean() < filtered[columns].sum(axis=1).mean()
+    pd.testing.assert_frame_equal(
+        smoothed[["frame", "drone", "status"]], filtered[["frame", "drone", "status"]]
+    )
+
+
+def test_who_met_is_written_beside_the_tracks(run: Run, sequence: Path, tmp_path: Path) -> None:
+    from psotrack.trajectory_files import write_ambiguity
+
+    tracks = tmp_path / "t.csv"
+    assert run(*track(sequence, tracks)).code == 0
+    table = pd.read_csv(tmp_path / "t.ambiguity.csv")
+    assert list(table.columns) == ["frame", "time_s", "drone", "other", "ambiguity"]
+    record = json.loads((tmp_path / "t.json").read_text())
+    assert [drone["drone"] for drone in record["drones"]] == [0, 1, 2, 3]
+    # Nobody is overwritten, and no file half: the three belong together.
+    (tmp_path / "t.csv").unlink()
+    assert_one_line(run(*track(sequence, tracks)), "t.json", "--force")
+    pairs, ambiguity = np.array([[0, 1], [0, 2]]), np.array([[0.0, 0.25], [0.5, 0.0]])
+    write_ambiguity(tmp_path / "a.csv", np.array([0.0, 0.04]), pairs, ambiguity)
+    written = pd.read_csv(tmp_path / "a.csv")
+    assert written.to_dict("list") == {
+        "frame": [0, 1],
+        "time_s": [0.0, 0.04],
+        "drone": [0, 0],
+        "other": [2, 1],
+        "ambiguity": [0.25, 0.5],
+    }
+
+
 def test_drones_that_are_not_there_yet_are_awaited(run: Run, sequence: Path, tmp_path: Path) -> None:
     answer = run(*track(sequence, tmp_path / "t.csv", "--drones", 7))
     assert answer.code == 0

@@ -25,6 +25,9 @@ from psotrack.settings import TrackSettings
 from psotrack.summed_area import summed_area_table
 from psotrack.tracking import on_device, tracker_inputs
 
+#: The peers' motion model, an alpha-beta filter: it costs nothing beside the swarm.
+POSITION_GAIN, VELOCITY_GAIN = 0.8, 0.3
+
 
 @dataclass(frozen=True)
 class Problem:
@@ -60,10 +63,10 @@ class Problem:
     def correct(self, found_m: Any, predicted_m: Any, velocity_m_s: Any) -> tuple[Any, Any]:
         """Position and velocity by the alpha-beta filter."""
         innovation = found_m - predicted_m
-        velocity = velocity_m_s + self.settings.velocity_gain * self.fps * innovation
+        velocity = velocity_m_s + VELOCITY_GAIN * self.fps * innovation
         speed = (velocity * velocity).sum(axis=-1, keepdims=True) ** 0.5
         velocity = velocity / (speed / self.settings.max_speed_m_s).clip(1.0)
-        return predicted_m + self.settings.position_gain * innovation, velocity
+        return predicted_m + POSITION_GAIN * innovation, velocity
 
     def first(self) -> tuple[np.ndarray, np.ndarray]:
         """Position and velocity before the first frame, so that the first prediction is the start."""

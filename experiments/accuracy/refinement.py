@@ -1,0 +1,58 @@
+"""What gradient steps after the swarm, and the paraboloid, do at different sizes of the swarm.
+
+    python experiments/accuracy/refinement.py --data data
+
+Tracks S02_D4_A with one swarm per drone; writes one row per run (CSV) and the machine's description (JSON), and prints
+them. The rows with two particles and no iterations are gradients alone, from the prediction and the last position.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import _runs
+
+from psotrack.pipeline import environment
+from psotrack.settings import TrackSettings
+
+NAME = "S02_D4_A"
+SWARMS = ((30, 20), (10, 5), (2, 0))
+STEPS = (0, 10, 30)
+
+
+def run(particles: int, iterations: int, steps: int, vertex: bool, opened: tuple) -> dict[str, Any]:
+    """One row."""
+    settings = TrackSettings(particles=particles, iterations=iterations, refinements=steps, vertex=vertex)
+    row = {"particles": particles, "iterations": iterations, "gradient_steps": steps, "paraboloid": vertex}
+    return row | _runs.figures(*opened, settings)
+
+
+def main() -> None:
+    """Track, write, print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, default=Path("data"), help="the data's root folder")
+    parser.add_argument("--cache", type=Path, default=Path("data/silhouettes"), help="of the silhouettes")
+    parser.add_argument(
+        "--out", type=Path, default=Path("experiments/accuracy/results"), help="folder of results"
+    )
+    options = parser.parse_args()
+    opened = _runs.opened(NAME, options.data, options.cache)
+    rows = (
+        partial(run, particles, iterations, steps, vertex, opened)
+        for particles, iterations in SWARMS
+        for steps in STEPS
+        for vertex in (False, True)
+    )
+    table = _runs.table(rows, options.out / "refinement.csv")
+    (options.out / "refinement.json").write_text(json.dumps(environment(), indent=2) + "\n")
+    print(table.to_string(float_format="{:.4f}".format, index=False))
+
+
+if __name__ == "__main__":
+    main()
