@@ -151,7 +151,6 @@ def look(
     size_m: Positions,
     cameras: Camera,
     settings: ScoreSettings,
-    offset_m: Positions | None = None,
 ) -> Looks:
     """The size that every frame shows of every drone.
 
@@ -164,14 +163,11 @@ def look(
         size_m: (drones, 3), full lengths that are believed so far; within a factor of 1.5 or so they do not matter.
         cameras: with one leading axis.
         settings: of the score; of its windows the profile is taken.
-        offset_m: (drones, 3), as in `boxes.extents`.
     """
 
     def one(frame: tuple[Array, Array, Array]) -> Looks:
         image, position, seen = frame
-        return _look(
-            image, jnp.where(seen[:, None], position, 0.0), seen, size_m, cameras, settings, offset_m
-        )
+        return _look(image, jnp.where(seen[:, None], position, 0.0), seen, size_m, cameras, settings)
 
     return jax.lax.map(one, (coverage, position_m, well_seen))
 
@@ -183,13 +179,12 @@ def _look(
     size_m: Positions,
     cameras: Camera,
     settings: ScoreSettings,
-    offset_m: Positions | None,
 ) -> Looks:
     """The look of one frame."""
 
     def boxes_of(factors: Float[Array, "2"]) -> Boxes:
         factor = jnp.sqrt(jnp.stack([factors[0], factors[0], factors[1]]))
-        return project_boxes(extents(cameras, size_m * factor, offset_m), position_m)
+        return project_boxes(extents(cameras, size_m * factor), position_m)
 
     def squares(factors: Float[Array, "2"]) -> Float[Array, "drones cameras 2"]:
         boxes = boxes_of(factors)
@@ -200,7 +195,7 @@ def _look(
     design = slope / slope.sum(axis=-1, keepdims=True)
     patches = cut(
         coverage,
-        extents(cameras, size_m, offset_m),
+        extents(cameras, size_m),
         position_m,
         reach_m=jnp.zeros_like(size_m[:, 0]),
         # Views in which a neighbour could claim anything do not count.

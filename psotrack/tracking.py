@@ -292,8 +292,7 @@ def _with_room_for(coming: Arrivals, crew: _Crew, place: _Place) -> _Crew:
     size_m = jnp.concatenate([crew.params.size_m, jnp.asarray(born, jnp.float32)])
     params = replace(crew.params, size_m=size_m, motion=motion_params(settings, len(size_m)))
     added = _sizes(size_m[len(crew) :], place)
-    grown = jax.tree.map(lambda old, new: jnp.concatenate([old, new]), crew.sizes, added)
-    return _Crew(tracker.enlarged(crew.state, params), params, grown)
+    return _Crew(tracker.enlarged(crew.state, params), params, sizes.enlarged(crew.sizes, added))
 
 
 def _learned(

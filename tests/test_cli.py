@@ -356,6 +356,26 @@ class TestBadInput:
         assert "no-such-flag" in answer.err
 
 
+@pytest.mark.slow
+def test_a_second_run_need_not_compile(sequence: Path, tmp_path: Path) -> None:
+    kept = []
+    for name in ("first.csv", "second.csv"):
+        command = [*track(sequence, tmp_path / name, "--frames", 12), "--cache", tmp_path / "cache"]
+        subprocess.run([sys.executable, "-m", "psotrack", *map(str, command)], check=True)
+        kept.append(
+            {path: path.stat().st_mtime_ns for path in (tmp_path / "cache" / "compiled").glob("jit*")}
+        )
+    assert any(path.name.startswith("jit__track-") for path in kept[0])
+    assert kept[0] == kept[1]
+    assert (tmp_path / "first.csv").read_bytes() == (tmp_path / "second.csv").read_bytes()
+
+
+def test_usage_errors_are_one_line(run: Run) -> None:
+    assert_one_line(run("trakc"), "trakc", "track", "psotrack --help")
+    assert_one_line(run("track"), "SEQ", "psotrack track --help")
+    assert_one_line(run("track", "x", "--out", "y", "--body-offset", "1,2"), "--body-offset", "1,2")
+
+
 def test_a_full_disk_leaves_earlier_results(run: Run, data: Path, sequence: Path, tmp_path: Path) -> None:
     """A limit on the size of files stands for the full disk: every write beyond it fails.
 

@@ -27,6 +27,7 @@ PACKAGE = Path(psotrack.__file__).parent
 DEPTH = {
     "__init__": 0,
     "_typing": 0,
+    "compiled": 0,
     "errors": 0,
     "progress": 0,
     "files": 1,

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import argparse
+import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
+from psotrack.compiled import keep_compiled
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.errors import PsotrackError
 from psotrack.evaluation import evaluate
-from psotrack.pipeline import track_from_silhouettes
+from psotrack.pipeline import environment, track_from_silhouettes
 from psotrack.sequence import Sequence
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
@@ -28,14 +31,35 @@ EFFORT: dict[str, dict[str, Any]] = {
 }
 
 
-def opened(name: str, data: Path, cache: Path, data_seed: int = 0) -> tuple[Sequence, Silhouettes]:
-    """A simulated sequence and its silhouettes; both are made if they are not there."""
-    folder = data / f"seed{data_seed}" / "Simulated_Data" / name
+def parser(description: str | None) -> argparse.ArgumentParser:
+    """The options that all studies have."""
+    options = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    options.add_argument("--data", type=Path, default=Path("data"), help="the data's root folder")
+    options.add_argument("--out", type=Path, default=Path("experiments/accuracy/results"), help="of results")
+    return options
+
+
+def cache_of(data: Path) -> Path:
+    """Silhouettes and compiled programs, beside the data."""
+    return data / "silhouettes"
+
+
+def folder_of(name: str, data: Path, seed: int) -> Path:
+    """The folder of a simulated sequence, which is made if it is not there."""
+    folder = data / f"seed{seed}" / "Simulated_Data" / name
     if not folder.exists():
         print(f"simulating {folder}", flush=True)
-        simulate(name, folder.parents[1], seed=data_seed, masks=False, onboard=False)
-    sequence = read_sequence(folder).usable()
-    return sequence, compute(sequence, TrackSettings().silhouettes, cache=cache)
+        simulate(name, folder.parents[1], seed=seed, masks=False, onboard=False)
+    return folder
+
+
+def opened(name: str, data: Path, seed: int = 0) -> tuple[Sequence, Silhouettes]:
+    """A simulated sequence and its silhouettes; both are made if they are not there."""
+    keep_compiled(cache_of(data) / "compiled")
+    sequence = read_sequence(folder_of(name, data, seed)).usable()
+    return sequence, compute(sequence, TrackSettings().silhouettes, cache=cache_of(data))
 
 
 def figures(sequence: Sequence, silhouettes: Silhouettes, settings: TrackSettings) -> dict[str, Any]:
@@ -52,9 +76,13 @@ def figures(sequence: Sequence, silhouettes: Silhouettes, settings: TrackSetting
 
 
 def table(rows: Iterable[Callable[[], dict[str, Any]]], path: Path) -> pd.DataFrame:
-    """One row per run, written after each, so that a study that was interrupted leaves what it has."""
+    """One row per run, written after each, so that a study that was interrupted leaves what it has.
+
+    Beside it, with the suffix .json, is what the results depend on: versions and the machine.
+    """
     done: list[dict[str, Any]] = []
     path.parent.mkdir(parents=True, exist_ok=True)
+    path.with_suffix(".json").write_text(json.dumps(environment(), indent=2) + "\n")
     for row in rows:
         done.append(row())
         print(

@@ -1,15 +1,13 @@
-"""What each part of the tracker contributes: each is left out in turn, on three sequences, with three seeds.
+"""What each part of the tracker contributes: each is left out in turn, on three sequences, three flights of each.
 
     python experiments/accuracy/ablation.py --data data
 
 Simulates what is not there, tracks, writes one row per run (CSV), the machine's description (JSON), and a figure
-(PNG); prints the means. A quarter of an hour on two cores once the videos are simulated, which takes longer.
+(PNG); prints the means.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +16,6 @@ import _runs
 import pandas as pd
 
 from psotrack.files import written_whole
-from psotrack.pipeline import environment
 from psotrack.settings import TrackSettings
 
 #: Settings that leave a part out, or add one that is off by default.
@@ -82,32 +79,22 @@ def draw(table: pd.DataFrame, path: Path) -> None:
 
 def main() -> None:
     """Track, write, print, draw."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", type=Path, default=Path("data"), help="the data's root folder")
-    parser.add_argument("--cache", type=Path, default=Path("data/silhouettes"), help="of the silhouettes")
-    parser.add_argument(
-        "--out", type=Path, default=Path("experiments/accuracy/results"), help="folder of results"
-    )
+    parser = _runs.parser(__doc__)
     parser.add_argument("--picture", type=Path, default=Path("experiments/pictures/ablation.png"))
     parser.add_argument("--sequence", choices=_runs.EFFORT, action="append", help="[default: all of them]")
     parser.add_argument("--variant", choices=VARIANTS, action="append", help="[default: all of them]")
-    parser.add_argument("--seeds", type=int, default=3, help="seeds of the swarm: 0, 1, ...")
+    parser.add_argument("--seeds", type=int, default=3, help="seeds of flight and swarm: 0, 1, ...")
     options = parser.parse_args()
 
-    def rows() -> Any:
-        opened = {
-            name: _runs.opened(name, options.data, options.cache) for name in options.sequence or _runs.EFFORT
-        }
-        # One seed after the other, so that a study that is interrupted has something of everything.
-        for seed in range(options.seeds):
-            for name, data in opened.items():
-                for variant in options.variant or VARIANTS:
-                    yield partial(run, name, variant, seed, data)
-
-    table = _runs.table(rows(), options.out / "ablation.csv")
-    (options.out / "ablation.json").write_text(json.dumps(environment(), indent=2) + "\n")
+    # One flight after the other, so that a study that is interrupted has something of everything.
+    rows = (
+        partial(run, name, variant, seed, opened)
+        for seed in range(options.seeds)
+        for name in options.sequence or _runs.EFFORT
+        for opened in [_runs.opened(name, options.data, seed)]
+        for variant in options.variant or VARIANTS
+    )
+    table = _runs.table(rows, options.out / "ablation.csv")
     means = (
         table.drop(columns=["seed", "note"], errors="ignore")
         .groupby(["sequence", "variant"], sort=False)

@@ -1,23 +1,21 @@
 """The accuracy that the README states: simulated sequences, full size, silhouettes from the videos.
 
     python experiments/accuracy/measure.py --data data
-    python experiments/accuracy/measure.py --data data --sequence S02_D4_A --data-seed 1
 
-Simulates each sequence into --data if it is not there, tracks it with three seeds of the swarm for each method, each by
-the very command that it prints, and writes one row per run (CSV), with the machine's description beside it (JSON).
+Simulates three flights of each sequence into --data if they are not there, tracks them with each method by the very
+commands that it prints, and writes one row per run (CSV), with the machine's description beside it (JSON).
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-import pandas as pd
-
-from psotrack.pipeline import environment
+import _runs
 
 JOINT, HARD = ("--swarm", "joint"), ("--score", "hard")
 
@@ -45,7 +43,7 @@ METHODS = {
     },
 }
 KEPT = ["mean_error_m", "median_error_m", "p95_error_m", "max_error_m", "offset_removed_mean_error_m"]
-KEPT += ["missed_rate", "id_switches", "mota", "idf1", "hota"]
+KEPT += ["offset_removed_inside_90_rate", "missed_rate", "id_switches", "mota", "idf1", "hota"]
 
 
 def psotrack(*words: str) -> str:
@@ -56,50 +54,34 @@ def psotrack(*words: str) -> str:
     ).stdout
 
 
-def measure(name: str, data: Path, data_seed: int, seeds: int) -> pd.DataFrame:
-    """One row per method and seed of the swarm."""
-    sequence = data / f"seed{data_seed}" / "Simulated_Data" / name
-    if not sequence.exists():
-        made = ("--out", str(sequence.parents[1]), "--seed", str(data_seed))
-        psotrack("simulate", name, *made, "--no-masks", "--no-onboard")
-    rows = []
-    for method, flags in METHODS[name].items():
-        for seed in range(seeds):
-            tracks = str(data / "tracks" / f"{name}-{data_seed}-{len(rows)}.csv")
-            psotrack("track", str(sequence), "--out", tracks, "--seed", str(seed), *flags, "--force")
-            errors = json.loads(psotrack("evaluate", tracks, str(sequence), "--json", "-"))
-            record = json.loads(Path(tracks).with_suffix(".json").read_text())
-            rows.append(
-                {"sequence": name, "data_seed": data_seed, "method": method, "seed": seed}
-                | {key: errors[key] for key in KEPT}
-                | {"track_ms_per_frame": 1e3 * record["seconds"]["track"] / record["frames"]}
-            )
-    return pd.DataFrame(rows)
+def measured(name: str, method: str, seed: int, data: Path) -> dict[str, Any]:
+    """One row."""
+    sequence = str(_runs.folder_of(name, data, seed))
+    number = list(METHODS[name]).index(method)
+    tracks = data / "tracks" / f"{name}-{seed}-{number}.csv"
+    effort = (*METHODS[name][method], "--seed", str(seed), "--cache", str(_runs.cache_of(data)))
+    psotrack("track", sequence, "--out", str(tracks), *effort, "--force", "--quiet")
+    errors = json.loads(psotrack("evaluate", str(tracks), sequence, "--json", "-"))
+    record = json.loads(tracks.with_suffix(".json").read_text())
+    row = {"sequence": name, "method": method, "seed": seed} | {key: errors[key] for key in KEPT}
+    return row | {"track_ms_per_frame": 1e3 * record["seconds"]["track"] / record["frames"]}
 
 
 def main() -> None:
-    """Simulate, track, evaluate, and print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", type=Path, default=Path("data"), help="the data's root folder")
-    parser.add_argument(
-        "--out", type=Path, default=Path("experiments/accuracy/results"), help="folder of results"
-    )
+    """Simulate, track, evaluate, and print the table."""
+    parser = _runs.parser(__doc__)
     parser.add_argument("--sequence", choices=METHODS, action="append", help="[default: all of them]")
-    parser.add_argument("--data-seed", type=int, default=0, help="of the simulated flights")
-    parser.add_argument("--seeds", type=int, default=3, help="seeds of the swarm: 0, 1, ...")
+    parser.add_argument("--seeds", type=int, default=3, help="seeds of flight and swarm: 0, 1, ...")
     options = parser.parse_args()
-    for name in options.sequence or METHODS:
-        table = measure(name, options.data, options.data_seed, options.seeds)
-        options.out.mkdir(parents=True, exist_ok=True)
-        stem = f"{name.lower()}_seed{options.data_seed}"
-        table.to_csv(options.out / f"{stem}.csv", index=False, float_format="%.6g")
-        (options.out / f"{stem}.json").write_text(json.dumps(environment(), indent=2) + "\n")
-        numbers = table.drop(columns=["sequence", "data_seed", "seed"])
-        print(f"{name}, flight {options.data_seed}, mean of {options.seeds} seeds")
-        means = numbers.groupby("method", sort=False).mean().T
-        print(means.to_string(float_format="{:.4f}".format), flush=True)
+    rows = (
+        partial(measured, name, method, seed, options.data)
+        for seed in range(options.seeds)
+        for name in options.sequence or METHODS
+        for method in METHODS[name]
+    )
+    table = _runs.table(rows, options.out / "measure.csv")
+    means = table.drop(columns="seed").groupby(["sequence", "method"], sort=False).mean()
+    print(f"mean of {options.seeds} flights", means.T.to_string(float_format="{:.4f}".format), sep="\n")
 
 
 if __name__ == "__main__":

@@ -2,21 +2,18 @@
 
     python experiments/accuracy/perturbations.py --data data
 
-Tracks S02_D4_A (joint swarm, 100 x 70, drones found by themselves) without each of its cameras, from four and three
-of them, with camera clocks that are off by up to a frame, with cameras turned by 0.2 degrees, and with 3 % of the
-full-size silhouettes' pixels flipped. Writes one row per run (CSV) and the machine's description (JSON); prints means
-and the worst.
+Tracks three flights of S02_D4_A (joint swarm, 100 x 70, drones found by themselves) without each of the cameras, from
+four and three of them, with camera clocks that are off by up to a frame, with cameras turned by 0.2 degrees, and with
+3 % of the full-size silhouettes' pixels flipped. Writes one row per run (CSV) and the machine's description (JSON);
+prints means and the worst.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
-from pathlib import Path
 from typing import Any
 
 import _runs
@@ -24,7 +21,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from psotrack.cameras import CameraRig
-from psotrack.pipeline import environment
 from psotrack.sequence import Sequence
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes
@@ -97,47 +93,25 @@ def flipped(silhouettes: Silhouettes, rng: np.random.Generator) -> Silhouettes:
 
 
 def cases(
-    sequence: Sequence, silhouettes: Silhouettes, subsets: int, seeds: int
-) -> Iterator[tuple[str, str, int, Sequence, Silhouettes]]:
-    """What is done, in words and in detail, a seed, and what is tracked."""
-    names = silhouettes.cameras
-    rng = np.random.default_rng(0)
-    for seed in range(seeds):
-        yield "as it is", "", seed, sequence, silhouettes
+    sequence: Sequence, silhouettes: Silhouettes, subsets: int, seed: int
+) -> Iterator[tuple[str, str, Sequence, Silhouettes]]:
+    """What is done to a flight, in words and in detail, and what is tracked."""
+    rng = np.random.default_rng(seed)
+    yield "as it is", "", sequence, silhouettes
     for count in (7, 4, 3):
-        every = list(combinations(names, count))
+        every = list(combinations(silhouettes.cameras, count))
         chosen = every if len(every) <= subsets else [every[i] for i in rng.permutation(len(every))[:subsets]]
         label = "one camera missing" if count == 7 else f"{count} of 8 cameras"
         for subset in chosen:
-            yield label, "+".join(subset), 0, *of_cameras(sequence, silhouettes, subset)
-    for seed in range(seeds):
-        chance = np.random.default_rng(seed)
-        yield (
-            "half of the cameras one frame late",
-            f"draw {seed}",
-            seed,
-            sequence,
-            whole_frames_late(silhouettes, chance),
-        )
-        yield "clocks 0 to 1 frame late", f"draw {seed}", seed, sequence, off_clocks(silhouettes, chance)
-        rig = turned(sequence.rig, chance)
-        yield (
-            f"cameras turned by {EXTRINSICS_DEG} degrees",
-            f"draw {seed}",
-            seed,
-            replace(sequence, rig=rig),
-            silhouettes,
-        )
-        yield (
-            f"{FLIPPED:.0%} of the pixels flipped",
-            f"draw {seed}",
-            seed,
-            sequence,
-            flipped(silhouettes, chance),
-        )
+            yield label, "+".join(subset), *of_cameras(sequence, silhouettes, subset)
+    yield "half of the cameras one frame late", "", sequence, whole_frames_late(silhouettes, rng)
+    yield "clocks 0 to 1 frame late", "", sequence, off_clocks(silhouettes, rng)
+    rig = turned(sequence.rig, rng)
+    yield f"cameras turned by {EXTRINSICS_DEG} degrees", "", replace(sequence, rig=rig), silhouettes
+    yield f"{FLIPPED:.0%} of the pixels flipped", "", sequence, flipped(silhouettes, rng)
 
 
-def run(label: str, detail: str, seed: int, sequence: Sequence, silhouettes: Silhouettes) -> dict[str, Any]:
+def run(seed: int, label: str, detail: str, sequence: Sequence, silhouettes: Silhouettes) -> dict[str, Any]:
     """One row."""
     settings = TrackSettings(seed=seed, **EFFORT)
     return {"case": label, "detail": detail, "seed": seed} | _runs.figures(sequence, silhouettes, settings)
@@ -145,23 +119,20 @@ def run(label: str, detail: str, seed: int, sequence: Sequence, silhouettes: Sil
 
 def main() -> None:
     """Track, write, print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", type=Path, default=Path("data"), help="the data's root folder")
-    parser.add_argument("--cache", type=Path, default=Path("data/silhouettes"), help="of the silhouettes")
+    parser = _runs.parser(__doc__)
     parser.add_argument(
-        "--out", type=Path, default=Path("experiments/accuracy/results"), help="folder of results"
+        "--subsets", type=int, default=8, help="of each number of cameras, drawn by chance for each flight"
     )
     parser.add_argument(
-        "--subsets", type=int, default=16, help="of four and of three cameras, drawn by chance"
+        "--seeds", type=int, default=3, help="seeds of flight, perturbation and swarm: 0, 1, ..."
     )
-    parser.add_argument("--seeds", type=int, default=3, help="seeds of swarm and perturbation: 0, 1, ...")
     options = parser.parse_args()
-    opened = _runs.opened(NAME, options.data, options.cache)
-    rows = (partial(run, *case) for case in cases(*opened, options.subsets, options.seeds))
+    rows = (
+        partial(run, seed, *case)
+        for seed in range(options.seeds)
+        for case in cases(*_runs.opened(NAME, options.data, seed), options.subsets, seed)
+    )
     table = _runs.table(rows, options.out / "perturbations.csv")
-    (options.out / "perturbations.json").write_text(json.dumps(environment(), indent=2) + "\n")
     grouped = table.groupby("case", sort=False)[[*_runs.KEPT, "drones_found"]]
     print("mean", grouped.mean().T.to_string(float_format="{:.4f}".format), sep="\n")
     print("worst", grouped.max().T.to_string(float_format="{:.4f}".format), sep="\n")

@@ -8,15 +8,11 @@ them. The rows with two particles and no iterations are gradients alone, from th
 
 from __future__ import annotations
 
-import argparse
-import json
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import _runs
 
-from psotrack.pipeline import environment
 from psotrack.settings import TrackSettings
 
 NAME = "S02_D4_A"
@@ -33,16 +29,9 @@ def run(particles: int, iterations: int, steps: int, vertex: bool, opened: tuple
 
 def main() -> None:
     """Track, write, print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", type=Path, default=Path("data"), help="the data's root folder")
-    parser.add_argument("--cache", type=Path, default=Path("data/silhouettes"), help="of the silhouettes")
-    parser.add_argument(
-        "--out", type=Path, default=Path("experiments/accuracy/results"), help="folder of results"
-    )
+    parser = _runs.parser(__doc__)
     options = parser.parse_args()
-    opened = _runs.opened(NAME, options.data, options.cache)
+    opened = _runs.opened(NAME, options.data)
     rows = (
         partial(run, particles, iterations, steps, vertex, opened)
         for particles, iterations in SWARMS
@@ -50,7 +39,6 @@ def main() -> None:
         for vertex in (False, True)
     )
     table = _runs.table(rows, options.out / "refinement.csv")
-    (options.out / "refinement.json").write_text(json.dumps(environment(), indent=2) + "\n")
     print(table.to_string(float_format="{:.4f}".format, index=False))
 
 

@@ -25,12 +25,18 @@ def main() -> None:
     """Run the command line; what psotrack raises on purpose becomes one line and exit code 2."""
     try:
         # Not `cli.main`, which would make two lines of Ctrl-C.
-        with cli.make_context("psotrack", sys.argv[1:]) as context:
-            cli.invoke(context)
+        with cli.make_context("psotrack", sys.argv[1:]) as started:
+            cli.invoke(started)
     except click.exceptions.Exit as done:
         sys.exit(done.exit_code)
-    except click.ClickException as error:
+    except click.exceptions.NoArgsIsHelpError as error:
         error.show()
+        sys.exit(2)
+    except click.ClickException as error:
+        # Not `error.show`, which says it in four lines.
+        context = error.ctx if isinstance(error, click.UsageError) else None
+        remedy = f"; see `{context.command_path} --help`" if context else ""
+        sys.stderr.write(f"psotrack: {error.format_message().rstrip('.')}{remedy}\n")
         sys.exit(2)
     except KeyboardInterrupt:
         sys.stderr.write(

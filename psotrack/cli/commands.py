@@ -30,6 +30,9 @@ from psotrack.files import refuse_to_overwrite
 from psotrack.settings import Score, SwarmKind, TrackSettings
 from psotrack.silhouette_store import SilhouetteSettings
 
+#: Within the folder of the stored silhouettes.
+COMPILED = "compiled"
+
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(__version__, prog_name="psotrack")
@@ -230,6 +233,7 @@ def track(
       psotrack track data/Simulated_Data/S02_D4_A --out smooth.csv --smooth
       psotrack track data/Simulated_Data/S02_D4_A --out paper.parquet --swarm joint --particles 100 --iterations 70
     """
+    from psotrack.compiled import keep_compiled
     from psotrack.pipeline import track_sequence
     from psotrack.trajectory_files import write_ambiguity, write_trajectories
 
@@ -241,10 +245,12 @@ def track(
     silhouette_names = SilhouetteSettings.__struct_fields__
     of_silhouettes = {name: settings.pop(name) for name in silhouette_names if name in settings}
     chosen = TrackSettings(silhouettes=SilhouetteSettings(**of_silhouettes), **settings)
+    where = _cache_folder(cache)
+    keep_compiled(where / COMPILED)
     tracked = track_sequence(
         _usable(sequence, cameras, num_frames),
         chosen,
-        cache=_cache_folder(cache),
+        cache=where,
         jobs=jobs,
         report=report_to(quiet),
     )
@@ -325,8 +331,10 @@ def demo(out: Path, seed: int, jobs: int | None, force: bool, quiet: bool) -> No
     """
     from rich.console import Console
 
+    from psotrack.compiled import keep_compiled
     from psotrack.demo import run
 
+    keep_compiled(_cache_folder(None) / COMPILED)
     result = run(out, seed=seed, jobs=jobs, force=force, report=report_to(quiet))
     if not quiet:
         console = Console()

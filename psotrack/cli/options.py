@@ -56,7 +56,7 @@ CACHE = click.option(
     "--cache",
     type=click.Path(path_type=Path),
     envvar="PSOTRACK_CACHE",
-    help="Folder of the stored silhouettes.  [default: $PSOTRACK_CACHE, or psotrack in the user's cache folder]",
+    help="Of silhouettes and compiled programs.  [default: $PSOTRACK_CACHE, or psotrack in the user's cache folder]",
 )
 CAMERAS = click.option(
     "--cameras", metavar="NAME,NAME...", help="Use these cameras only.  [default: all of the calibration]"
