@@ -1,35 +1,27 @@
-"""Whose foreground it is: what neighbours, and shadows on the floor, are expected to cover of a drone's window.
+"""Whose foreground it is: what neighbours are expected to cover of a drone's window.
 
-A neighbour claims its ellipse, a little enlarged. A drone also claims the floor below it for its shadow: a disc that
-grows with height, because nobody says where the lamps hang. Claimed foreground is no evidence of this drone, except in
-the core of its own ellipse, which it is expected to cover itself.
+A neighbour claims its ellipse, a little enlarged. Claimed foreground is no evidence of this drone, except in the core
+of its own ellipse, which it is expected to cover itself.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack._typing import Array, Positions
-from psotrack.boxes import Boxes, Extents, extents, project_boxes
+from psotrack._typing import Array
+from psotrack.boxes import Boxes
 
-#: Other drones and shadows that are looked at, per drone and camera: those whose ellipses come nearest.
-NUM_NEIGHBOURS, NUM_SHADOWS = 3, 2
+#: Other drones that are looked at, per drone and camera: those whose ellipses come nearest.
+NUM_NEIGHBOURS = 3
 #: What a drone claims is that much larger than its ellipse along each axis: outlines are no ellipses.
 CLAIM = 1.15
 #: Where this drone is expected to cover what is claimed: its ellipse, that much smaller along each axis.
 CORE = 0.7
-#: The same before another drone's shadow, which is behind this drone wherever both are seen.
-SHADOW_CORE = 1.0
-#: A shadow is wider than its drone by that much of the height, to every side: lamps do not all hang overhead, and are
-#: no points.
-SHADOW_SPREAD = 0.25
-#: Height of a shadow's ellipsoid: none, but for what keeps its outline a curve.
-_SHADOW_HEIGHT_M = 0.01
 #: Points of an ellipse that are asked about: a power of two, so that shares of them are exact.
 _NUM_POINTS = 128
 
@@ -42,8 +34,6 @@ class Claims:
     Attributes:
         x_middle, y_middle, x_half, y_half: in pixels of the image.
         near: whether there is one of this rank.
-        solid: whether it is a drone and no shadow.
-        core: scale of the drone's own ellipse within which it claims nothing.
     """
 
     x_middle: Float[Array, "ranks drones cameras"]
@@ -51,8 +41,6 @@ class Claims:
     x_half: Float[Array, "ranks drones cameras"]
     y_half: Float[Array, "ranks drones cameras"]
     near: Bool[Array, "ranks drones cameras"]
-    solid: Bool[Array, "ranks drones cameras"]
-    core: Float[Array, "ranks drones cameras"]
 
     def cover(
         self, x_px: Float[Array, "drones cameras *#points"], y_px: Float[Array, "drones cameras *#points"]
@@ -73,45 +61,32 @@ def ellipse_distance2(
 
 
 def claims_on(
-    boxes: Boxes,
-    seen: Extents,
-    expected_m: Positions,
-    *,
-    claiming: Bool[Array, "drones"],
-    floor_z_m: Float[Array, ""] | None,
-    pixel_px: Float[Array, "drones cameras"],
+    boxes: Boxes, *, claiming: Bool[Array, "drones"], pixel_px: Float[Array, "drones cameras"]
 ) -> Claims:
     """What is claimed from each drone in each camera.
 
     Args:
         boxes: of the drones where they are expected.
-        seen, expected_m: what these are the boxes of.
         claiming: (drones,), whether a drone's expected place is good enough to claim foreground.
-        floor_z_m: height of the floor that shadows fall on; None: there are none.
         pixel_px: pixels of the image per pixel of the drone's window. A claim takes every pixel that it touches.
     """
     drones = claiming.shape[0]
-    itself = jnp.eye(drones, dtype=bool)
-    order, near = _nearest(boxes, boxes, claiming & ~itself, min(NUM_NEIGHBOURS, drones - 1))
-    claims = _picked(boxes, order, near, pixel_px)
-    if floor_z_m is None:
-        return claims
-    shadows = _shadows(seen, expected_m, floor_z_m)
-    order, near = _nearest(boxes, shadows, claiming | jnp.zeros_like(itself), min(NUM_SHADOWS, drones))
-    own = order == jnp.arange(drones)[:, None]
-    of_shadows = replace(
-        _picked(shadows, order, near, pixel_px),
-        solid=jnp.zeros_like(near),
-        core=jnp.where(own, CORE, SHADOW_CORE),
+    order, near = _nearest(boxes, claiming & ~jnp.eye(drones, dtype=bool), min(NUM_NEIGHBOURS, drones - 1))
+
+    def of_order(of: Array) -> Array:
+        return jnp.take_along_axis(of[:, None], order, axis=0)
+
+    return Claims(
+        x_middle=of_order(boxes.x_middle),
+        y_middle=of_order(boxes.y_middle),
+        x_half=of_order(CLAIM * boxes.x_half) + pixel_px / 2,
+        y_half=of_order(CLAIM * boxes.y_half) + pixel_px / 2,
+        near=near,
     )
-    return jax.tree.map(lambda *of: jnp.concatenate(of), claims, of_shadows)
 
 
 def clear_share(claims: Claims, boxes: Boxes) -> Float[Array, "drones cameras"]:
-    """Share of each drone's ellipse that no other drone claims, however small it is in the image.
-
-    Shadows do not count: a drone that stands on its own is as good to see as any.
-    """
+    """Share of each drone's ellipse that no other drone claims, however small it is in the image."""
     # Evenly spread over the disc (Vogel's spiral).
     rank = np.arange(_NUM_POINTS)
     radius, angle = np.sqrt((rank + 0.5) / _NUM_POINTS), np.pi * (3 - 5**0.5) * rank
@@ -122,52 +97,20 @@ def clear_share(claims: Claims, boxes: Boxes) -> Float[Array, "drones cameras"]:
             (boxes.y_middle, boxes.y_half, radius * np.sin(angle)),
         )
     )
-    taken = jnp.any(claims.cover(x_px, y_px) & claims.solid[..., None], axis=0)
+    taken = jnp.any(claims.cover(x_px, y_px), axis=0)
     return 1 - jnp.sum(taken, axis=-1, dtype=jnp.float32) / _NUM_POINTS
 
 
-def _picked(
-    claimants: Boxes,
-    order: Int[Array, "ranks drones cameras"],
-    near: Bool[Array, "ranks drones cameras"],
-    pixel_px: Float[Array, "drones cameras"],
-) -> Claims:
-    """The claims of these drones."""
-
-    def of_order(of: Array) -> Array:
-        return jnp.take_along_axis(of[:, None], order, axis=0)
-
-    return Claims(
-        x_middle=of_order(claimants.x_middle),
-        y_middle=of_order(claimants.y_middle),
-        x_half=of_order(CLAIM * claimants.x_half) + pixel_px / 2,
-        y_half=of_order(CLAIM * claimants.y_half) + pixel_px / 2,
-        near=near,
-        solid=jnp.ones_like(near),
-        core=jnp.full(near.shape, CORE),
-    )
-
-
-def _shadows(seen: Extents, expected_m: Positions, floor_z_m: Float[Array, ""]) -> Boxes:
-    """Boxes of the discs that the drones' shadows lie in."""
-    height_m = jnp.maximum(expected_m[:, 2:] - floor_z_m, 0.0)
-    wide_m = seen.size_m[:, :2] + 2 * SHADOW_SPREAD * height_m
-    flat_m = jnp.full_like(height_m, _SHADOW_HEIGHT_M)
-    below_m = jnp.concatenate([expected_m[:, :2], jnp.full_like(height_m, floor_z_m)], axis=-1)
-    return project_boxes(extents(seen.cameras, jnp.concatenate([wide_m, flat_m], axis=-1)), below_m)
-
-
 def _nearest(
-    boxes: Boxes, others: Boxes, claiming: Bool[Array, "drones others"], ranks: int
+    boxes: Boxes, claiming: Bool[Array, "drones others"], ranks: int
 ) -> tuple[Int[Array, "ranks drones cameras"], Bool[Array, "ranks drones cameras"]]:
     """Which of the others that claim come nearest to every drone in every camera, and whether there are as many."""
 
-    def gap2(middle: Array, half: Array, other_middle: Array, other_half: Array) -> Array:
-        return jnp.square((other_middle - middle[:, None]) / jnp.maximum(half[:, None] + other_half, 1e-3))
+    def gap2(middle: Array, half: Array) -> Array:
+        return jnp.square((middle - middle[:, None]) / jnp.maximum(half[:, None] + half, 1e-3))
 
-    gap = gap2(boxes.x_middle, boxes.x_half, others.x_middle, others.x_half)
-    gap += gap2(boxes.y_middle, boxes.y_half, others.y_middle, others.y_half)
-    gap = jnp.where(claiming[..., None] & others.in_front, gap, jnp.inf)
+    gap = gap2(boxes.x_middle, boxes.x_half) + gap2(boxes.y_middle, boxes.y_half)
+    gap = jnp.where(claiming[..., None] & boxes.in_front, gap, jnp.inf)
     order = jnp.argsort(gap, axis=1)[:, :ranks]
     near = jnp.isfinite(jnp.take_along_axis(gap, order, axis=1))
     return jnp.swapaxes(order, 0, 1), jnp.swapaxes(near, 0, 1)

@@ -5,8 +5,8 @@ foreground there is around it:
 
     IoU_s = F_s / (A_s + F_ring - F_s)        score = mean over windows of IoU_s
 
-F is foreground and A is area, both inside the image and without the foreground that is claimed, by another drone or a
-shadow on the floor: whether that is this drone's nobody knows. Foreground in the ring that the window leaves
+F is foreground and A is area, both inside the image and without the foreground that another drone claims: whether that
+is this drone's nobody knows. Foreground in the ring that the window leaves
 unexplained makes the union larger.
 
 One window at s = 1 is the paper's overlap of box and silhouette: a plateau, because every box that holds the whole

@@ -18,6 +18,8 @@ from psotrack.triangulation import viewpoints
 
 #: What has its middle nearer to the floor is a shadow: a drone that stands on its legs is higher.
 FLOOR_CLEARANCE_M = 0.08
+#: Over the floor, no drone is taken to be higher than so much of its width.
+HIGHEST = 0.3
 #: No two drones are nearer to one another than this, on average.
 SEPARATION_M = 0.3
 #: In fewer frames than this, two viewpoints see rays cross by chance for too long.
@@ -73,25 +75,38 @@ def find_drones(
         the usual size of the others, or NaN where there is none.
     """
     seen = all_blobs(
-        [[find_blobs(image, reduction) for image in images] for images in coverage], len(cameras.K)
+        [[find_blobs(image, reduction) for image in images] for images in coverage], len(cameras.K), reduction
     )
     time_s = np.arange(len(coverage)) / fps
     if not seen.whole.any():
         return Start(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
     # Shadows on the floor agree between all views as drones do, and they move with them; but they are flat on it.
+    floor_z_m = float(bounds_m[0, 2])
     bounds_m = bounds_m + np.array([[0.0, 0.0, FLOOR_CLEARANCE_M], [0.0, 0.0, 0.0]])
     paths = propose_paths(cameras, seen, time_s, bounds_m, max_speed_m_s)
     paths = refine_paths(cameras, seen, time_s, paths[choose_paths(paths, viewpoints(cameras), drones)])
     num_cameras = paths.covered.any(axis=-1).sum(axis=-1).mean(axis=-1)
     paths = paths[np.argsort(-num_cameras, kind="stable")]
     own_m = np.where(paths.alone[..., None], paths.size_m, np.nan)
-    sizes_m = [_size(cameras, *of) for of in zip(paths.position_m, own_m, strict=True)]
+    sizes_m = np.array([_size(cameras, *of) for of in zip(paths.position_m, own_m, strict=True)]).reshape(
+        -1, 3
+    )
+    height_m = np.median(paths.position_m[..., 2], axis=1) - floor_z_m
     return Start(
         position_m=paths.coefficient[:, 0],
         velocity_m_s=paths.coefficient[:, 1],
-        size_m=with_usual_size(np.array(sizes_m).reshape(-1, 3)),
+        size_m=with_usual_size(_without_shadows(sizes_m, height_m)),
         num_cameras=np.sort(num_cameras)[::-1],
     )
+
+
+def _without_shadows(
+    size_m: Float[np.ndarray, "drones 3"], height_m: Float[np.ndarray, "drones"]
+) -> Float[np.ndarray, "drones 3"]:
+    """Sizes of which those of low drones are no higher than drones are: their blobs hold their shadows, below them."""
+    low = height_m < size_m[:, 0]
+    highest_m = np.where(low, HIGHEST * size_m[:, 0], np.inf)
+    return np.column_stack([size_m[:, :2], np.minimum(size_m[:, 2], highest_m)])
 
 
 def with_usual_size(size_m: Float[np.ndarray, "drones 3"]) -> Float[np.ndarray, "drones 3"]:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
+from scipy.special import logsumexp
 
 from psotrack.newcomers import Newcomer
 
@@ -23,18 +24,25 @@ NOBODY = -2
 
 #: Drones change their velocity within about this time; after it the last one says little of where they are.
 VELOCITY_TIME_S = 1.0
+#: Images of the room to either side: after so many the drone may be anywhere.
+NUM_WALLS = 3
 #: The standard deviation of a drone's velocity along each axis, as a share of its largest speed.
 SPEED_SHARE = 1 / 3
 #: How well places and velocities are measured, along each axis.
 POSITION_STD_M, VELOCITY_STD_M_S = 0.1, 0.3
 #: How well spans are measured (of their logarithm), and what spans there are.
 SPAN_STD, SPANS_M = 0.2, (0.1, 1.5)
-#: A drone that was slower when it vanished stood still, and as likely as this it has stayed until it is seen again.
-STILL_M_S, STAYED_PROBABILITY = 0.2, 0.5
+#: A drone that was slower when it vanished stood still, and as likely as this it stays until it is seen to fly off: it
+#: vanished in front of the cameras, and flown off it would be foreground.
+STILL_M_S, STAYED_PROBABILITY = 0.2, 0.99
+#: Its speed is that over its last so many seconds: half swallowed, it seems to creep away.
+STILL_S = 1.0
 #: What was so many spans from there, or had been within the last seconds, stayed or flew off from there.
 STAYED_SPANS, FLOWN_OFF_S = 0.6, 0.6
 #: How much likelier a newcomer is a new drone than one that may be anywhere by now; if it does not move, no drone.
 NEW_ODDS, NO_DRONE_ODDS = 0.1, 10.0
+#: Two drones whose middles are nearer than so much of their size, along every axis, are in the same place.
+SAME_PLACE = 0.5
 #: A drone that was tracked for so long while the newcomer was there is another one; less, and its track was failing.
 MAX_OVERLAP_S = 0.4
 #: Beyond reach is farther than a drone can fly, and so many standard deviations of the place.
@@ -50,7 +58,7 @@ class Lost:
 
     Attributes:
         drone: (lost,), which of all drones.
-        position_m, velocity_m_s: (lost, 3), when last seen.
+        position_m, velocity_m_s: (lost, 3), when last seen; of a drone that stood still, where it stood, and 0.
         seconds: (lost,), from then to the first frame of the chunk; below 0 if that was within the chunk.
         size_m: (lost, 3), full lengths along the world's axes.
         doubtful: (lost,), whether it is tracked again, but only where it had vanished, and has not moved since: that
@@ -81,6 +89,36 @@ class Arrivals:
     born_size_m: Float[np.ndarray, "born 3"]
 
 
+def holes(
+    position_m: Float[np.ndarray, "frames drones 3"],
+    tracked: Bool[np.ndarray, "frames drones"],
+    size_m: Float[np.ndarray, "drones 3"],
+) -> Bool[np.ndarray, "drones"]:
+    """Tracks that are of no drone: they never moved, and a drone that did was where they stand.
+
+    A drone that lands and stays for most of a video is background from the first frame on: until it lands, and when it
+    has taken off, its place is foreground that looks like a drone.
+
+    Args:
+        position_m: (frames, drones, 3), from the first frame of the video.
+        tracked: (frames, drones), whether a drone was found, not only predicted.
+        size_m: (drones, 3), full lengths along the world's axes.
+    """
+    found_m = np.where(tracked[..., None], position_m, np.nan)
+    never_moved, taken = np.zeros((2, len(size_m)), bool)
+    for drone in np.flatnonzero(tracked.any(axis=0)).tolist():
+        never_moved[drone] = _within_its_place(found_m[tracked[:, drone], drone], size_m[drone])
+    for drone in np.flatnonzero(never_moved).tolist():
+        reach_m = SAME_PLACE * (size_m + size_m[drone]) / 2
+        apart = np.linalg.norm((found_m - np.nanmedian(found_m[:, drone], axis=0)) / reach_m, axis=-1)
+        taken[drone] = bool((apart[:, ~never_moved] < 1).any())
+    return taken
+
+
+def _within_its_place(position_m: Float[np.ndarray, "frames 3"], size_m: Float[np.ndarray, "3"]) -> bool:
+    return float(np.linalg.norm(np.ptp(position_m, axis=0))) < STAYED_SPANS * float(size_m.max())
+
+
 def lost_drones(
     position_m: Float[np.ndarray, "frames drones 3"],
     velocity_m_s: Float[np.ndarray, "frames drones 3"],
@@ -90,7 +128,7 @@ def lost_drones(
     chunk_frames: int,
     fps: float,
 ) -> Lost:
-    """The drones that may come back at the end of a chunk.
+    """The drones that may come back at the end of a chunk. Holes do not.
 
     Args:
         position_m, velocity_m_s: (frames, drones, 3), from the first frame of the video to the last of the chunk.
@@ -100,23 +138,27 @@ def lost_drones(
         fps: frames per second.
     """
     drones, last, doubtful = [], [], []
-    for drone in np.flatnonzero(tracked.any(axis=0)).tolist():
+    places, velocities = [], []
+    for drone in np.flatnonzero(tracked.any(axis=0) & ~holes(position_m, tracked, size_m)).tolist():
         seen = np.flatnonzero(tracked[:, drone])
         vanished = seen[np.flatnonzero(np.diff(seen, append=len(tracked)) > 1)]
         if not len(vanished):
             continue
-        since = position_m[seen[seen >= vanished[-1]], drone]
-        still = float(np.linalg.norm(np.ptp(since, axis=0))) < STAYED_SPANS * size_m[drone].max()
+        still = _within_its_place(position_m[seen[seen >= vanished[-1]], drone], size_m[drone])
         there_now = bool(tracked[-1, drone])
         if still or not there_now:
             drones.append(drone)
             last.append(vanished[-1])
             doubtful.append(there_now)
+            recent = seen[(seen <= vanished[-1]) & (seen >= vanished[-1] - STILL_S * fps)]
+            stood = _stood(position_m[recent, drone], recent / fps)
+            places.append(position_m[vanished[-1], drone] if stood is None else stood)
+            velocities.append(velocity_m_s[vanished[-1], drone] if stood is None else np.zeros(3))
     rows, columns = np.array(last, int), np.array(drones, int)
     return Lost(
         drone=columns,
-        position_m=position_m[rows, columns],
-        velocity_m_s=velocity_m_s[rows, columns],
+        position_m=np.array(places).reshape(-1, 3),
+        velocity_m_s=np.array(velocities).reshape(-1, 3),
         seconds=(len(tracked) - chunk_frames - rows) / fps,
         size_m=size_m[columns],
         doubtful=np.array(doubtful, bool),
@@ -135,8 +177,8 @@ def recognised(
     """Which newcomer is which lost drone: the assignment of the largest likelihood.
 
     A drone's velocity wanders about 0 (G. E. Uhlenbeck, L. S. Ornstein, On the theory of the Brownian motion, 1930), so
-    that over a short gap it is expected where it was heading, and over a long one anywhere within reach. Or it stayed
-    where it stood. The alternative is a drone that nobody knows, anywhere in the room.
+    that over a short gap it is expected where it was heading, and over a long one anywhere within reach. If it stood,
+    it most probably stayed there. The alternative is a drone that nobody knows, anywhere in the room.
 
     Args:
         newcomers: of a chunk.
@@ -152,16 +194,17 @@ def recognised(
     """
     count = len(lost.drone)
     log_volume = float(np.log(np.prod(bounds_m[1] - bounds_m[0])))
+    holes = [any(_flew_off(other, one) for other in newcomers) for one in newcomers]
     scores = np.full((len(newcomers), count + len(newcomers)), _NEVER)
     for row, newcomer in enumerate(newcomers):
         log_anywhere = _log_normal(newcomer.velocity_m_s, (SPEED_SHARE * max_speed_m_s) ** 2) - log_volume
         odds = NEW_ODDS if newcomer.moves else NO_DRONE_ODDS
         unknown = log_anywhere + np.log(odds / np.log(SPANS_M[1] / SPANS_M[0]))
         scores[row, count + row] = _UNKNOWN_BUT_PINNED if newcomer.moves and max_births == 0 else unknown
-        if not newcomer.moves and any(_flew_off(other, newcomer) for other in newcomers):
-            continue
-        for column in range(count):
-            scores[row, column] = _log_likelihood(newcomer, lost, column, fps, log_anywhere, max_speed_m_s)
+        for column in range(0 if holes[row] else count):
+            scores[row, column] = _log_likelihood(
+                newcomer, lost, column, fps, log_anywhere, max_speed_m_s, bounds_m
+            )
     chosen = np.full(len(newcomers), NOBODY)
     births = 0
     for row, column in zip(
@@ -169,7 +212,7 @@ def recognised(
     ):
         if column < count:
             chosen[row] = column
-        elif newcomers[row].moves and (max_births is None or births < max_births):
+        elif newcomers[row].moves and not holes[row] and (max_births is None or births < max_births):
             chosen[row] = NEW
             births += 1
     return chosen
@@ -197,8 +240,22 @@ def arrivals_of(
     return Arrivals(begin_frame, position, velocity, sizes)
 
 
+def _stood(
+    position_m: Float[np.ndarray, "frames 3"], time_s: Float[np.ndarray, "frames"]
+) -> Float[np.ndarray, "3"] | None:
+    """Where a drone stood in these frames; None if it moved."""
+    moved_m = float(np.linalg.norm(np.ptp(position_m, axis=0)))
+    return np.median(position_m, axis=0) if moved_m < STILL_M_S * np.ptp(time_s) else None
+
+
 def _log_likelihood(
-    newcomer: Newcomer, lost: Lost, row: int, fps: float, log_anywhere: float, max_speed_m_s: float
+    newcomer: Newcomer,
+    lost: Lost,
+    row: int,
+    fps: float,
+    log_anywhere: float,
+    max_speed_m_s: float,
+    bounds_m: Float[np.ndarray, "2 3"],
 ) -> float:
     """Logarithm of how likely a lost drone is seen again as the newcomer: a density over place, velocity and span."""
     place, velocity, span = lost.position_m[row], lost.velocity_m_s[row], float(lost.size_m[row].max())
@@ -206,7 +263,8 @@ def _log_likelihood(
     variance = (SPEED_SHARE * max_speed_m_s) ** 2
     log_stayed = -np.inf
     near_m = STAYED_SPANS * span
-    if float(np.linalg.norm(velocity)) < STILL_M_S and _distance_on_the_way(newcomer, place) < near_m:
+    still = float(np.linalg.norm(velocity)) < STILL_M_S
+    if still and _distance_on_the_way(newcomer, place) < near_m:
         log_stayed = np.log(STAYED_PROBABILITY / (4 / 3 * np.pi * near_m**3))
         log_stayed += _log_normal(newcomer.velocity_m_s, variance)
     if lost.doubtful[row]:
@@ -218,8 +276,9 @@ def _log_likelihood(
     distance = float(np.linalg.norm(newcomer.position_m - place))
     if distance > max_speed_m_s * gap_s + REACH_SIGMAS * POSITION_STD_M:
         return _UNREACHABLE - distance
-    log_flown = _log_motion(newcomer, place, velocity, gap_s, variance)
-    return max(log_stayed, log_flown, log_anywhere) + log_span
+    log_flown = max(_log_motion(newcomer, place, velocity, gap_s, variance, bounds_m), log_anywhere)
+    log_flown += np.log(1 - STAYED_PROBABILITY) if still else 0.0
+    return max(log_stayed, log_flown) + log_span
 
 
 def _log_motion(
@@ -228,8 +287,12 @@ def _log_motion(
     velocity_m_s: Float[np.ndarray, "3"],
     gap_s: float,
     variance: float,
+    bounds_m: Float[np.ndarray, "2 3"],
 ) -> float:
-    """Log density of the newcomer's place and velocity after the gap, of a drone whose velocity wanders about 0."""
+    """Log density of the newcomer's place and velocity after the gap, of a drone whose velocity wanders about 0.
+
+    It turns at the walls: what would be beyond them is mirrored into the room. After a long gap it is anywhere.
+    """
     time = VELOCITY_TIME_S
     left = np.exp(-gap_s / time)
     to = np.array([[1.0, time * (1 - left)], [0.0, left]])
@@ -241,10 +304,25 @@ def _log_motion(
     )
     measured = np.diag([POSITION_STD_M**2, VELOCITY_STD_M_S**2])
     covariance = to @ measured @ to.T + wandered + measured
-    was = np.stack([position_m, velocity_m_s])
-    error = np.stack([newcomer.position_m, newcomer.velocity_m_s]) - to @ was
-    distance2 = (error * np.linalg.solve(covariance, error)).sum()
-    return float(-(distance2 + 3 * np.log(np.linalg.det(2 * np.pi * covariance))) / 2)
+    expected = to @ np.stack([position_m, velocity_m_s])
+    seen = _mirrored(newcomer.position_m, newcomer.velocity_m_s, bounds_m)
+    error = seen - expected[:, None]
+    distance2 = np.einsum("iwa,ij,jwa->wa", error, np.linalg.inv(covariance), error)
+    of_axes = logsumexp(-distance2 / 2, axis=0)
+    return float(of_axes.sum() - 3 * np.log(np.linalg.det(2 * np.pi * covariance)) / 2)
+
+
+def _mirrored(
+    position_m: Float[np.ndarray, "3"],
+    velocity_m_s: Float[np.ndarray, "3"],
+    bounds_m: Float[np.ndarray, "2 3"],
+) -> Float[np.ndarray, "2 images 3"]:
+    """Place and velocity along each axis, and their images in the walls, the walls' images, and so on."""
+    low, length = bounds_m[0], bounds_m[1] - bounds_m[0]
+    away = 2 * length * np.arange(-NUM_WALLS, NUM_WALLS + 1)[:, None]
+    place = np.concatenate([position_m + away, 2 * low - position_m + away])
+    velocity = np.repeat([velocity_m_s, -velocity_m_s], len(away), axis=0)
+    return np.stack([place, velocity])
 
 
 def _log_normal(value: Float[np.ndarray, "dims"], variance: float) -> float:
@@ -252,9 +330,11 @@ def _log_normal(value: Float[np.ndarray, "dims"], variance: float) -> float:
 
 
 def _flew_off(newcomer: Newcomer, hole: Newcomer) -> bool:
-    """Whether a newcomer that moves flew off from the place of one that does not."""
+    """Whether a newcomer flew off from the place of one that does not move; or hardly, while the drone is over it."""
     near_m = STAYED_SPANS * float(hole.size_m.max())
-    return newcomer.moves and _distance_on_the_way(newcomer, hole.position_m) < near_m
+    speed, creep = (float(np.linalg.norm(one.velocity_m_s)) for one in (newcomer, hole))
+    faster = newcomer.moves and (not hole.moves or creep < min(speed, STILL_M_S))
+    return faster and _distance_on_the_way(newcomer, hole.position_m) < near_m
 
 
 def _distance_on_the_way(newcomer: Newcomer, place_m: Float[np.ndarray, "3"]) -> float:

@@ -16,8 +16,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from psotrack import foreground
-from psotrack.blobs import find_blobs
+from psotrack.blobs import LEAST_RADIUS_CELLS, find_blobs
 from psotrack.cameras import Camera, project
 from psotrack.initialisation import FLOOR_CLEARANCE_M, Start, find_drones
 from psotrack.triangulation import match_views, viewpoints
@@ -33,8 +32,6 @@ MAX_GROWTH = 1.5
 SEARCH_STEP = 8
 #: A newcomer is at most so many times smaller or larger than the known drones; or of such a span, if none is known.
 SIZE_RATIO, SPANS_M = 2.0, (0.1, 1.5)
-#: The middle of the smallest blob is off by less than this.
-MIN_RADIUS_PX = 6.0
 #: What moves by less than this share of its span within `OF_FRAMES` stands still.
 MIN_TRAVEL = 0.04
 
@@ -126,13 +123,12 @@ def _proposals(
     farthest_m = np.linalg.norm(corners - cameras.centre_world, axis=-1).max(axis=0)
     focal_px = np.stack([cameras.K[:, 0, 0], cameras.K[:, 1, 1]], axis=-1)
     least_px = spans_m[0] * focal_px.min(axis=-1) / farthest_m
-    # Half the size is enough to meet a drone, and a third of the work; `glance` places it.
-    blobs = [find_blobs(foreground.coverage(image, 2), 2 * room.reduction) for image in left.foreground]
+    blobs = [find_blobs(image, room.reduction) for image in left.foreground]
     large = [one.size_px.max(axis=-1) >= least for one, least in zip(blobs, least_px, strict=True)]
     centre_px = [one.centre_px[keep] for one, keep in zip(blobs, large, strict=True)]
     size_px = [one.size_px[keep] for one, keep in zip(blobs, large, strict=True)]
     # The middle of a drone's blob is nearer to its projection than half of the blob's smaller side.
-    radius_px = [np.maximum(size.min(axis=-1) / 2, MIN_RADIUS_PX) for size in size_px]
+    radius_px = [np.maximum(size.min(axis=-1) / 2, LEAST_RADIUS_CELLS * room.reduction) for size in size_px]
     points, support = match_views(cameras, centre_px, radius_px, room.bounds_m)
     _, depth = project(cameras, points[:, None])
     proposals = []

@@ -6,6 +6,9 @@ that are near. All that the swarm reads is then a few kilobytes per drone and ca
 Drones share images. Foreground that something else is expected to cover (see `claims`) is kept apart in the window: it
 may be this drone's or not, so it counts neither for nor against it. And the camera counts less by as much of the drone
 as other drones claim. So no drone can live on another's silhouette.
+
+Foreground before floor that is in shadow (see `shadows`) would be there without the drone. Its place is taken by the
+drone as it is expected: what is below must balance what is above, or the place would be drawn to one side.
 """
 
 from __future__ import annotations
@@ -19,15 +22,23 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack._typing import Array, Coverage, Positions, Tables
 from psotrack.boxes import Boxes, Extents, project_boxes
-from psotrack.claims import Claims, claims_on, clear_share, ellipse_distance2
+from psotrack.claims import CORE, Claims, claims_on, clear_share, ellipse_distance2
+from psotrack.shadows import low, shadowed
 from psotrack.summed_area import pack, summed_area_table
 
 #: Pixels of a window, along each side.
 SIDE = 64
 #: Silhouettes as they are, halved, halved again ...
 NUM_LEVELS = 4
+#: x and y of all pixels of windows, (drones, cameras, 1, side) and (drones, cameras, side, 1).
+Middles = tuple[Float[Array, "drones cameras 1 side"], Float[Array, "drones cameras side 1"]]
+
 #: What one fully covered pixel of the silhouettes counts.
 FULL = 255
+#: How full of foreground a drone's box is, from its middle to its border and beyond: all, less by the distance (in
+#: halves of the box, along the farther axis), none from here on. Silhouettes of four quadrotors fill 0.8 to 0.9, 0.6 to
+#: 0.7 and 0.4 to 0.5 of boxes of scale 0.4, 0.7 and 1; this, 0.83, 0.63 and 0.43.
+_EMPTY = 1.1
 
 
 @jax.tree_util.register_dataclass
@@ -76,6 +87,11 @@ class _Grid:
     row: Int[Array, "drones cameras side"]
     column: Int[Array, "drones cameras side"]
 
+    def middles_px(self, pixel_px: Float[Array, "drones cameras"]) -> Middles:
+        """In pixels of the image, to be broadcast against one another."""
+        x_px, y_px = ((of.astype(jnp.float32) + 0.5) * pixel_px[..., None] for of in (self.column, self.row))
+        return x_px[..., None, :], y_px[..., :, None]
+
 
 def cut(
     coverage: Coverage,
@@ -98,7 +114,7 @@ def cut(
         claiming: (drones,), whether a drone's expected place is good enough to claim foreground; None: nobody claims.
         reduction: image pixels per silhouette pixel, along each side.
         ring: scale of the largest window that is scored.
-        floor_z_m: height of the floor on which drones that claim also cast shadows; None: they cast none.
+        floor_z_m: height of the floor on which drones that claim cast shadows; None: they cast none.
     """
     boxes = project_boxes(seen, expected_m)
     grid = _grid(boxes, seen, reach_m, reduction, ring)
@@ -106,13 +122,29 @@ def cut(
     value = _read(_pyramid(coverage), coverage.shape, grid)
     clear: Array = jnp.ones(pixel_px.shape)
     # With nobody to claim there is nothing to keep apart: the swarm then reads plain tables.
-    packed = claiming is not None and (len(expected_m) > 1 or floor_z_m is not None)
-    if claiming is not None and packed:
-        claims = claims_on(boxes, seen, expected_m, claiming=claiming, floor_z_m=floor_z_m, pixel_px=pixel_px)
-        clear = clear_share(claims, boxes)
-        claimed = _claimed(claims, boxes, grid, pixel_px)
-        # Half covered is covered: what is claimed is only counted.
-        value = pack(jnp.where(claimed, 0, value), claimed & (2 * value > FULL))
+    packed = claiming is not None and len(expected_m) > 1
+    if claiming is not None:
+        claims = claims_on(boxes, claiming=claiming, pixel_px=pixel_px)
+        at_px = grid.middles_px(pixel_px)
+        shown = value
+        if floor_z_m is not None:
+            shown = _beside_shadows(
+                value,
+                coverage,
+                seen,
+                claims,
+                expected_m,
+                at_px,
+                claiming=claiming,
+                floor_z_m=floor_z_m,
+                reduction=reduction,
+            )
+        if packed:
+            clear = clear_share(claims, boxes)
+            claimed = _claimed(claims, boxes, at_px)
+            # Half covered is covered: what is claimed is only counted.
+            shown = pack(jnp.where(claimed, 0, shown), claimed & (2 * value > FULL))
+        value = shown
     return Patches(
         tables=summed_area_table(value.reshape(-1, SIDE, SIDE)),
         x_px=grid.column[..., 0].astype(jnp.float32) * pixel_px,
@@ -184,12 +216,49 @@ def _read(
     return jnp.where(row_inside[..., None] & column_inside[..., None, :], value, 0)
 
 
-def _claimed(
-    claims: Claims, boxes: Boxes, grid: _Grid, pixel_px: Float[Array, "drones cameras"]
-) -> Bool[Array, "drones cameras side side"]:
+def _claimed(claims: Claims, boxes: Boxes, at_px: Middles) -> Bool[Array, "drones cameras side side"]:
     """The pixels whose middles are claimed and not in the drone's core."""
-    x_px = ((grid.column.astype(jnp.float32) + 0.5) * pixel_px[..., None])[..., None, :]
-    y_px = ((grid.row.astype(jnp.float32) + 0.5) * pixel_px[..., None])[..., :, None]
     own = [of[..., None, None] for of in (boxes.x_middle, boxes.y_middle, boxes.x_half, boxes.y_half)]
-    beyond_core = ellipse_distance2(x_px, y_px, *own) >= jnp.square(claims.core)[..., None, None]
-    return jnp.any(claims.cover(x_px, y_px) & beyond_core, axis=0)
+    beyond_core = ellipse_distance2(*at_px, *own) >= CORE**2
+    return claims.cover(*at_px).any(axis=0) & beyond_core
+
+
+def _beside_shadows(
+    value: Int[Array, "drones cameras side side"],
+    coverage: Coverage,
+    seen: Extents,
+    claims: Claims,
+    expected_m: Positions,
+    at_px: Middles,
+    *,
+    claiming: Bool[Array, "drones"],
+    floor_z_m: Float[Array, ""],
+    reduction: int,
+) -> Int[Array, "drones cameras side side"]:
+    """The windows of low drones with no more foreground before shadows than drones have where they are expected."""
+    is_low = claiming & low(expected_m, seen.size_m, floor_z_m)
+
+    def balanced() -> Array:
+        # No drone is in the floor. One that is expected there would hide from itself what is shadow.
+        least_m = floor_z_m + seen.size_m[:, 2] / 2
+        above_m = jnp.asarray(expected_m).at[:, 2].max(least_m)
+        boxes = project_boxes(seen, above_m)
+        dark = shadowed(
+            coverage, seen, boxes, claims, above_m, at_px, floor_z_m=floor_z_m, reduction=reduction
+        )
+        usual = jnp.round(FULL * _usual_share(boxes, at_px)).astype(value.dtype)
+        return jnp.where(dark & is_low[:, None, None, None], jnp.minimum(value, usual), value)
+
+    # Most of the time all drones are high, and there is nothing to do.
+    return jax.lax.cond(is_low.any(), balanced, lambda: value)
+
+
+def _usual_share(boxes: Boxes, at_px: Middles) -> Float[Array, "drones cameras side side"]:
+    """How full of foreground drones are, pixel by pixel."""
+    x_px, y_px = at_px
+
+    def off(at_px: Array, middle: Array, half: Array) -> Array:
+        return jnp.abs(at_px - middle[..., None, None]) / jnp.maximum(half, 1e-3)[..., None, None]
+
+    farther = jnp.maximum(off(x_px, boxes.x_middle, boxes.x_half), off(y_px, boxes.y_middle, boxes.y_half))
+    return jnp.clip(_EMPTY - farther, 0, 1)

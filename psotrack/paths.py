@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from psotrack.blobs import LEAST_RADIUS_PX, Seen
+from psotrack.blobs import Seen
 from psotrack.cameras import Camera, project
 from psotrack.triangulation import candidates, triangulate_paths, viewpoints
 
@@ -136,7 +136,7 @@ def look(
         blob=np.where(fits, blob, -1),
         fit=np.where(fits, (1 - np.where(fits, least, 0) ** 2) * (1 - unlike**2), 0),
         covered=np.asarray(
-            (np.abs(away) <= seen.half_px + LEAST_RADIUS_PX).all(axis=-1) & in_front[..., None]
+            (np.abs(away) <= seen.half_px + seen.least_radius_px).all(axis=-1) & in_front[..., None]
         ),
         in_view=np.asarray(((pixels >= 0) & (pixels < cameras.image_size_wh)).all(axis=-1) & in_front),
         size_m=np.where(fits[..., None], size_m, np.nan),

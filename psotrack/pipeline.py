@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import collections.abc
 import platform
 import time
 from collections.abc import Mapping
@@ -21,13 +22,14 @@ from jaxtyping import Float
 from psotrack.errors import InputError
 from psotrack.finishing import finished
 from psotrack.identity import Identities
+from psotrack.initialisation import Start
 from psotrack.progress import Report, silent
 from psotrack.sequence import Sequence
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
 from psotrack.sizes import SizeState
 from psotrack.starts import find_start, room_bounds
-from psotrack.tracking import track_silhouettes
+from psotrack.tracking import Tracked, track_silhouettes
 from psotrack.trajectories import Trajectories
 
 
@@ -92,14 +94,81 @@ def track_from_silhouettes(
         InputError: the drones cannot be found.
         SettingsError: a setting does not fit the sequence.
     """
+    (tracked,) = track_runs(sequence, silhouettes, [settings], report=report)
+    if isinstance(tracked, InputError):
+        raise tracked
+    return tracked
+
+
+def track_runs(
+    sequence: Sequence,
+    silhouettes: Silhouettes,
+    settings: collections.abc.Sequence[TrackSettings],
+    *,
+    report: Report = silent,
+) -> list[TrackedSequence | InputError]:
+    """Track a sequence once for each of the settings: each as by itself, many in the time of a few.
+
+    Settings that differ in seeds and in numbers other than of particles and windows are one batch, which all devices
+    share (`jax.devices()`). The seconds of a run are its share of the batch's.
+
+    Args:
+        sequence: fit for use (see `Sequence.usable`).
+        silhouettes: of all of its cameras.
+        settings: of each run.
+        report: told of the frames, in which all runs go on together.
+
+    Returns:
+        For each run what it yields, or why nothing.
+
+    Raises:
+        InputError: there is nothing to start from.
+        SettingsError: a setting does not fit the sequence.
+    """
     began = time.perf_counter()
-    bounds_m = room_bounds(sequence.rig, settings)
-    start = find_start(sequence, silhouettes, settings, bounds_m)
-    tracked = track_silhouettes(
-        sequence.rig, silhouettes, start, settings, fps=sequence.fps, bounds_m=bounds_m, report=report
+    bounds_m = [room_bounds(sequence.rig, each) for each in settings]
+    starts = _starts(sequence, silhouettes, settings, bounds_m)
+    followed = track_silhouettes(
+        sequence.rig, silhouettes, starts, settings, fps=sequence.fps, bounds_m=bounds_m, report=report
     )
+    seconds = {
+        "compile": sum(tracked.compile_s for tracked in followed) / len(settings),
+        "track": (time.perf_counter() - began - sum(tracked.compile_s for tracked in followed))
+        / len(settings),
+    }
+    return [
+        _finished(sequence, silhouettes, *of, seconds)
+        for of in zip(settings, starts, bounds_m, followed, strict=True)
+    ]
+
+
+def _starts(
+    sequence: Sequence,
+    silhouettes: Silhouettes,
+    settings: collections.abc.Sequence[TrackSettings],
+    bounds_m: list[Float[np.ndarray, "2 3"]],
+) -> list[Start]:
+    """The start of each run; runs that differ in nothing but their seeds have the same."""
+    starts: dict[TrackSettings, Start] = {}
+    alike = [msgspec.structs.replace(each, seed=0) for each in settings]
+    for each, bounds in zip(alike, bounds_m, strict=True):
+        if each not in starts:
+            starts[each] = find_start(sequence, silhouettes, each, bounds)
+    return [starts[each] for each in alike]
+
+
+def _finished(
+    sequence: Sequence,
+    silhouettes: Silhouettes,
+    settings: TrackSettings,
+    start: Start,
+    bounds_m: Float[np.ndarray, "2 3"],
+    tracked: Tracked,
+    seconds: Mapping[str, float],
+) -> TrackedSequence | InputError:
+    """One run's trajectories and record."""
     if not tracked.info.status.shape[1]:
-        raise InputError(
+        return InputError(
             sequence.folder,
             expected="drones",
             found="none in any frame",
@@ -107,14 +176,9 @@ def track_from_silhouettes(
         )
     followed = time.perf_counter()
     trajectories, identities = finished(tracked, settings, fps=sequence.fps)
-    ended = time.perf_counter()
-    seconds = {
-        **silhouettes.seconds,
-        "track": followed - began - tracked.compile_s,
-        "compile": tracked.compile_s,
-        "finish": ended - followed,
-        "total": ended - began,
-    }
+    finish_s = time.perf_counter() - followed
+    own_s = {"track": seconds["track"], "compile": seconds["compile"], "finish": finish_s}
+    all_seconds = {**silhouettes.seconds, **own_s, "total": sum(own_s.values())}
     record = {
         "sequence": sequence.name,
         "frames": trajectories.num_frames,
@@ -127,7 +191,7 @@ def track_from_silhouettes(
         "arrivals": [asdict(arrival) for arrival in tracked.arrivals],
         "encounters": [asdict(encounter) for encounter in identities.encounters],
         "input_keys": dict(silhouettes.keys),
-        "seconds": {stage: round(value, 4) for stage, value in seconds.items()},
+        "seconds": {stage: round(value, 4) for stage, value in all_seconds.items()},
         **environment(),
     }
     return TrackedSequence(trajectories, np.asarray(tracked.sizes.size_m), identities, record)

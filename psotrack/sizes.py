@@ -24,6 +24,7 @@ from psotrack.boxes import Boxes, extents, project_boxes
 from psotrack.cameras import Camera
 from psotrack.fitness import ScoreSettings
 from psotrack.patches import FULL, Patches, cut
+from psotrack.shadows import low
 
 #: Half lengths per standard deviation of the foreground: 2 for an ellipse, the root of 6 for a rhombus. Drones, with
 #: arms that end in points and rotors at their widest, are between.
@@ -151,6 +152,7 @@ def look(
     size_m: Positions,
     cameras: Camera,
     settings: ScoreSettings,
+    floor_z_m: Float[Array, ""] | None = None,
 ) -> Looks:
     """The size that every frame shows of every drone.
 
@@ -163,11 +165,14 @@ def look(
         size_m: (drones, 3), full lengths that are believed so far; within a factor of 1.5 or so they do not matter.
         cameras: with one leading axis.
         settings: of the score; of its windows the profile is taken.
+        floor_z_m: height of the floor: what is low over it may have its shadow in its silhouette, and does not count.
     """
 
     def one(frame: tuple[Array, Array, Array]) -> Looks:
         image, position, seen = frame
-        return _look(image, jnp.where(seen[:, None], position, 0.0), seen, size_m, cameras, settings)
+        return _look(
+            image, jnp.where(seen[:, None], position, 0.0), seen, size_m, cameras, settings, floor_z_m
+        )
 
     return jax.lax.map(one, (coverage, position_m, well_seen))
 
@@ -179,6 +184,7 @@ def _look(
     size_m: Positions,
     cameras: Camera,
     settings: ScoreSettings,
+    floor_z_m: Float[Array, ""] | None,
 ) -> Looks:
     """The look of one frame."""
 
@@ -205,6 +211,8 @@ def _look(
     )
     spread, fill, filled = _measured(patches, boxes, settings)
     counts = _counts(boxes, patches, settings.ring, well_seen) & (filled >= MIN_FILLED)
+    if floor_z_m is not None:
+        counts &= ~low(position_m, size_m, floor_z_m)[:, None]
     factors, share = _fitted(design, HALF_PER_STD**2 * spread, counts)
     good = (counts.sum(axis=-1) >= 2)[:, None] & (share >= MIN_SHARE) & (factors > 0)
     factors = jnp.where(good, jnp.sqrt(jnp.where(good, factors, 1.0)), jnp.nan)

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import TypeVar
 
 import jax
@@ -21,6 +22,7 @@ from jaxtyping import Bool, Float
 from psotrack import sizes, tracker
 from psotrack._typing import Array
 from psotrack.cameras import Camera, CameraRig
+from psotrack.crew import Crew, Followed, follow
 from psotrack.fitness import PAPER_SCORE, ScoreSettings
 from psotrack.initialisation import Start
 from psotrack.lifecycle import Arrivals, arrivals_of, lost_drones, recognised
@@ -69,71 +71,135 @@ class Tracked:
     compile_s: float
 
 
-@dataclass(frozen=True)
-class _Crew:
-    """The drones that are followed: all that has their number as a shape."""
+@dataclass
+class _Run:
+    """A run on its way: what it was told, and what it has found out so far."""
 
-    state: tracker.TrackerState
-    params: tracker.TrackerParams
-    sizes: SizeState
-
-    def __len__(self) -> int:
-        return self.params.size_m.shape[0]
+    settings: TrackSettings
+    bounds_m: Float[np.ndarray, "2 3"]
+    program: tracker.Program
+    crew: Crew
+    infos: list[tracker.TrackerInfo] = field(default_factory=list)
+    looks: list[Looks] = field(default_factory=list)
+    arrivals: list[Arrival] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
 class _Place:
-    """Where tracking takes place, and how: what does not change on the way."""
+    """Where tracking takes place: what all runs share."""
 
     rig: CameraRig
     cameras: Camera
-    program: tracker.Program
-    settings: TrackSettings
-    bounds_m: Float[np.ndarray, "2 3"]
+    reduction: int
     fps: float
-    chunk_shape: tuple[int, int, int, int]
 
 
 def track_silhouettes(
     rig: CameraRig,
     silhouettes: Silhouettes,
-    start: Start,
-    settings: TrackSettings,
+    starts: Sequence[Start],
+    settings: Sequence[TrackSettings],
     *,
     fps: float,
-    bounds_m: Float[np.ndarray, "2 3"],
+    bounds_m: Sequence[Float[np.ndarray, "2 3"]],
     report: Report = silent,
-) -> Tracked:
-    """Track all frames from a start, which may be empty."""
-    program, params = tracker_inputs(silhouettes.reduction, start, settings, fps=fps, bounds_m=bounds_m)
-    shape = (CHUNK_FRAMES, len(rig), *silhouettes.shape)
-    place = _Place(rig, on_device(rig.cameras), program, settings, bounds_m, fps, shape)
-    crew = _first_crew(start, params, place)
-    compile_s = _compile(crew, place)
-    infos: list[tracker.TrackerInfo] = []
-    looks: list[Looks] = []
-    arrivals: list[Arrival] = []
+) -> list[Tracked]:
+    """Track all frames, once for each of the settings; runs of equal shape are one batch (see `crew`).
+
+    Args:
+        rig: of the cameras.
+        silhouettes: of all of them.
+        starts: of each run; may be empty.
+        settings: of each run.
+        fps: frames per second.
+        bounds_m: of each run, (2, 3): lowest and highest corner of the room.
+        report: told of the frames, in which all runs go on together.
+    """
+    place = _Place(rig, on_device(rig.cameras), silhouettes.reduction, fps)
+    runs = [_begun(*of, place) for of in zip(starts, settings, bounds_m, strict=True)]
+    batches = _Batches(place, (CHUNK_FRAMES, len(rig), *silhouettes.shape), runs)
     with report("track", silhouettes.num_frames) as advance:
         for first, chunk, frames in _chunks(silhouettes):
-            after, info = _track(crew, chunk, frames, place, None)
-            coming = _coming(chunk[:frames], [*infos, info], crew, place)
-            if coming is not None:
-                crew = _with_room_for(coming, crew, place)
-                compile_s += _compile(crew, place) if len(coming.born_size_m) else 0.0
-                after, info = _track(crew, chunk, frames, place, coming)
-                arrivals += _named(coming, first, len(crew) - len(coming.born_size_m))
-            infos.append(info)
-            learned, look = _learned(crew, chunk, info, place)
-            looks.append(look)
-            crew = _Crew(after, replace(crew.params, size_m=learned.size_m), learned)
+            followed = batches.follow(runs, [None] * len(runs), chunk, frames)
+            coming = [
+                _coming(chunk[:frames], [*run.infos, info], run, place)
+                for run, (_, info, _) in zip(runs, followed, strict=True)
+            ]
+            again = {number: come for number, come in enumerate(coming) if come is not None}
+            for number, come in again.items():
+                _welcome(runs[number], come, first)
+            once_more = batches.follow(
+                [runs[number] for number in again], list(again.values()), chunk, frames
+            )
+            for number, result in zip(again, once_more, strict=True):
+                followed[number] = result
+            for run, (crew, info, looks) in zip(runs, followed, strict=True):
+                run.crew = crew
+                run.infos.append(info)
+                run.looks.append(looks)
             advance(frames)
-    return Tracked(
-        info=_joined(infos, len(crew)),
-        sizes=jax.tree.map(np.asarray, crew.sizes),
-        looks=_joined(looks, len(crew)),
-        arrivals=tuple(arrivals),
-        compile_s=compile_s,
-    )
+    return [
+        Tracked(
+            info=_joined(run.infos, len(run.crew)),
+            sizes=jax.tree.map(np.asarray, run.crew.sizes),
+            looks=_joined(run.looks, len(run.crew)),
+            arrivals=tuple(run.arrivals),
+            compile_s=batches.compile_s / len(runs),
+        )
+        for run in runs
+    ]
+
+
+class _Batches:
+    """Follows runs, those of equal shape together; compiles for a shape when it is first seen."""
+
+    def __init__(self, place: _Place, chunk_shape: tuple[int, int, int, int], runs: Sequence[_Run]) -> None:
+        self.compile_s = 0.0
+        self._place = place
+        self._blank = np.zeros(chunk_shape, np.uint8)
+        self._capacity = Counter(run.program for run in runs)
+        self._compiled: set[tuple[tracker.Program, int]] = set()
+
+    def follow(
+        self, runs: Sequence[_Run], coming: Sequence[Arrivals | None], chunk: np.ndarray, frames: int
+    ) -> list[Followed]:
+        """Each run's crew after a chunk, and what is known of its frames, as NumPy arrays."""
+        shapes: dict[tuple[tracker.Program, int], list[int]] = {}
+        for number, run in enumerate(runs):
+            shapes.setdefault((run.program, len(run.crew)), []).append(number)
+        followed: dict[int, Followed] = {}
+        for shape, numbers in shapes.items():
+            crews = [runs[number].crew for number in numbers]
+            begin = [_begin(coming[number], shape[1]) for number in numbers]
+            if shape not in self._compiled:
+                self._compile(shape, crews[0])
+            results = self._follow(crews, begin, chunk, frames, shape[0])
+            followed |= dict(zip(numbers, results, strict=True))
+        return [followed[number] for number in range(len(runs))]
+
+    def _follow(
+        self,
+        crews: list[Crew],
+        begin: list[tracker.Arrivals],
+        chunk: np.ndarray,
+        frames: int,
+        program: tracker.Program,
+    ) -> list[Followed]:
+        capacity = self._capacity[program]
+        results = follow(crews, begin, chunk, frames, self._place.cameras, program, capacity=capacity)
+        return [
+            (crew, *jax.tree.map(lambda leaf: np.asarray(leaf)[:frames], (info, looks)))
+            for crew, info, looks in results
+        ]
+
+    def _compile(self, shape: tuple[tracker.Program, int], crew: Crew) -> None:
+        # Without iterations a chunk takes no time but the compiler's, which is how compiling is told from tracking.
+        began = time.perf_counter()
+        idle = replace(crew.params, num_iterations=jnp.int32(0), num_refinements=jnp.int32(0))
+        nobody = tracker.no_arrivals(shape[1])
+        self._follow([replace(crew, params=idle)], [nobody], self._blank, len(self._blank), shape[0])
+        self._compiled.add(shape)
+        self.compile_s += time.perf_counter() - began
 
 
 def tracker_inputs(
@@ -195,47 +261,33 @@ def _chunks(silhouettes: Silhouettes) -> Iterator[tuple[int, np.ndarray, int]]:
         yield first, chunk, frames
 
 
-def _first_crew(start: Start, params: tracker.TrackerParams, place: _Place) -> _Crew:
+def _begun(start: Start, settings: TrackSettings, bounds_m: Float[np.ndarray, "2 3"], place: _Place) -> _Run:
+    program, params = tracker_inputs(place.reduction, start, settings, fps=place.fps, bounds_m=bounds_m)
     position, velocity = (jnp.asarray(value, jnp.float32) for value in (start.position_m, start.velocity_m_s))
-    state = tracker.init(jax.random.key(place.settings.seed), position, velocity, params)
-    return _Crew(state, params, _sizes(params.size_m, place))
+    state = tracker.init(jax.random.key(settings.seed), position, velocity, params)
+    crew = Crew(state, params, _sizes(params.size_m, settings, program))
+    return _Run(settings, bounds_m, program, crew)
 
 
-def _sizes(size_m: Array, place: _Place) -> SizeState:
-    pinned = not place.settings.learn_sizes or place.settings.drone_size_m is not None
-    return sizes.init(size_m, jnp.full(size_m.shape, pinned), place.program.score)
+def _sizes(size_m: Array, settings: TrackSettings, program: tracker.Program) -> SizeState:
+    pinned = not settings.learn_sizes or settings.drone_size_m is not None
+    return sizes.init(size_m, jnp.full(size_m.shape, pinned), program.score)
 
 
-def _compile(crew: _Crew, place: _Place) -> float:
-    """Have the tracker compiled for so many drones; returns the seconds that it took."""
-    # Without iterations a chunk takes no time but the compiler's, which is how compiling is told from tracking.
-    began = time.perf_counter()
-    idle = replace(crew.params, num_iterations=jnp.int32(0), num_refinements=jnp.int32(0))
-    blank = np.zeros(place.chunk_shape, np.uint8)
-    _learned(crew, blank, _track(replace(crew, params=idle), blank, len(blank), place, None)[1], place)
-    return time.perf_counter() - began
+def _begin(coming: Arrivals | None, num_drones: int) -> tracker.Arrivals:
+    """The same for the tracker."""
+    if coming is None:
+        return tracker.no_arrivals(num_drones)
+    return tracker.Arrivals(
+        frame=jnp.asarray(coming.begin_frame, jnp.int32),
+        position_m=jnp.asarray(coming.begin_position_m, jnp.float32),
+        velocity_m_s=jnp.asarray(coming.begin_velocity_m_s, jnp.float32),
+    )
 
 
-def _track(
-    crew: _Crew, chunk: np.ndarray, frames: int, place: _Place, coming: Arrivals | None
-) -> tuple[tracker.TrackerState, tracker.TrackerInfo]:
-    """The state after a chunk, and what is known of its frames, as NumPy arrays."""
-    begin = None
-    if coming is not None:
-        begin = tracker.Arrivals(
-            frame=jnp.asarray(coming.begin_frame, jnp.int32),
-            position_m=jnp.asarray(coming.begin_position_m, jnp.float32),
-            velocity_m_s=jnp.asarray(coming.begin_velocity_m_s, jnp.float32),
-        )
-    after, info = tracker.track(crew.state, chunk, place.cameras, crew.params, place.program, begin)
-    return after, jax.tree.map(lambda value: np.asarray(value)[:frames], info)
-
-
-def _coming(
-    chunk: np.ndarray, infos: list[tracker.TrackerInfo], crew: _Crew, place: _Place
-) -> Arrivals | None:
+def _coming(chunk: np.ndarray, infos: list[tracker.TrackerInfo], run: _Run, place: _Place) -> Arrivals | None:
     """Drones that come, or come back, in the last of the chunks that were tracked; None if there are none."""
-    settings, fps, frames = place.settings, place.fps, len(chunk)
+    settings, crew, fps, frames = run.settings, run.crew, place.fps, len(chunk)
     size_m = np.asarray(crew.params.size_m, np.float64)
     found = newcomers(
         place.rig.cameras,
@@ -243,9 +295,9 @@ def _coming(
         np.asarray(infos[-1].position_m, np.float64),
         _explains(infos),
         size_m,
-        reduction=place.program.score.reduction,
+        reduction=place.reduction,
         fps=fps,
-        bounds_m=place.bounds_m,
+        bounds_m=run.bounds_m,
         max_speed_m_s=settings.max_speed_m_s,
     )
     if not found:
@@ -264,7 +316,7 @@ def _coming(
         found,
         lost,
         fps=fps,
-        bounds_m=place.bounds_m,
+        bounds_m=run.bounds_m,
         max_speed_m_s=settings.max_speed_m_s,
         max_births=births,
     )
@@ -281,32 +333,18 @@ def _explains(infos: list[tracker.TrackerInfo]) -> Bool[np.ndarray, "frames dron
     return recent[frames - len(infos[-1].status) :]
 
 
-def _with_room_for(coming: Arrivals, crew: _Crew, place: _Place) -> _Crew:
-    """The crew with those that are born in it, absent yet."""
-    born = coming.born_size_m
-    if not len(born):
-        return crew
-    settings = place.settings
-    if settings.drone_size_m is not None:
-        born = np.broadcast_to(np.array(settings.drone_size_m), born.shape)
-    size_m = jnp.concatenate([crew.params.size_m, jnp.asarray(born, jnp.float32)])
-    params = replace(crew.params, size_m=size_m, motion=motion_params(settings, len(size_m)))
-    added = _sizes(size_m[len(crew) :], place)
-    return _Crew(tracker.enlarged(crew.state, params), params, sizes.enlarged(crew.sizes, added))
-
-
-def _learned(
-    crew: _Crew, chunk: np.ndarray, info: tracker.TrackerInfo, place: _Place
-) -> tuple[SizeState, Looks]:
-    """The sizes with a chunk in them, and what each of its frames shows by itself."""
-    frames = len(info.status)
-    well_seen = np.zeros((len(chunk), len(crew)), bool)
-    well_seen[:frames] = info.status == Status.TRACKED
-    position_m = np.zeros((*well_seen.shape, 3), np.float32)
-    position_m[:frames] = np.nan_to_num(info.position_m)
-    looks = sizes.look(chunk, position_m, well_seen, crew.params.size_m, place.cameras, place.program.score)
-    learned = sizes.learn(crew.sizes, looks)
-    return learned, jax.tree.map(lambda value: np.asarray(value)[:frames], looks)
+def _welcome(run: _Run, coming: Arrivals, first_frame: int) -> None:
+    """Make room in the crew for those that are born, absent yet; and tell people of all that come."""
+    num_known, settings, born = len(run.crew), run.settings, coming.born_size_m
+    if len(born):
+        if settings.drone_size_m is not None:
+            born = np.broadcast_to(np.array(settings.drone_size_m), born.shape)
+        crew = run.crew
+        size_m = jnp.concatenate([crew.params.size_m, jnp.asarray(born, jnp.float32)])
+        params = replace(crew.params, size_m=size_m, motion=motion_params(settings, len(size_m)))
+        added = _sizes(size_m[num_known:], settings, run.program)
+        run.crew = Crew(tracker.enlarged(crew.state, params), params, sizes.enlarged(crew.sizes, added))
+    run.arrivals += _named(coming, first_frame, num_known)
 
 
 def _joined(parts: list[Frames], num_drones: int) -> Frames:

@@ -25,8 +25,9 @@ MIN_VIEWPOINTS = 3
 MIN_SEEING = 0.75
 #: A camera ought to see a drone of which so much is in its image and clear of known drones ...
 MIN_VISIBLE = 0.6
-#: ... and does where so much of that is foreground, and of the ring about it so much less.
-MIN_FILLED, MIN_CONTRAST = 0.25, 0.15
+#: ... and does where so much more of that is foreground than of the ring about it. Thin drones, and small ones, fall
+#: apart: the share itself says little.
+MIN_CONTRAST = 0.1
 #: Foreground belongs to a drone as far as its ellipse, so much larger; first to find it, then to place it.
 WINDOWS = (1.6, 1.6, 1.2)
 #: Ellipsoids of two drones that reach into one another deeper than to this share of their half axes are of one drone.
@@ -174,6 +175,8 @@ def _evidence(
     by a known drone or cut by the border does not shift it.
     """
     middle, half = (value[0, 0] for value in _ellipses(room, position_m[None, None], size_m[None]))
+    # A cell is the mean over its square, of variance 1/12 along each side; that of an ellipse is half² / 4.
+    half = np.sqrt(half**2 + 1 / 3)
     shape = left.visible.shape
     pixels, weight, spread = np.full((len(middle), 2), np.nan), *np.zeros((2, len(middle)))
     seeing, ought = np.zeros((2, len(middle)), bool)
@@ -191,7 +194,7 @@ def _evidence(
         share = inside.sum() / (np.pi * half[camera].prod())
         filled, around = (foreground[where].sum() / max(where.sum(), 1) for where in (inside, ring))
         ought[camera] = share >= MIN_VISIBLE
-        seeing[camera] = ought[camera] and filled >= MIN_FILLED and filled - around >= MIN_CONTRAST
+        seeing[camera] = ought[camera] and filled - around >= MIN_CONTRAST
         if seeing[camera]:
             mass = foreground * (radius <= window)
             shift = np.array([_mean(mass, x) - _mean(inside, x), _mean(mass.T, y) - _mean(inside.T, y)])

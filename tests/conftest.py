@@ -10,6 +10,9 @@ from hypothesis import settings
 # Rank promotion stays allowed: particles x drones x cameras broadcast against cameras everywhere, on purpose.
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
+# Batches of runs are shared by two devices, as they are on machines that have them.
+jax.config.update("jax_num_cpu_devices", 2)
+
 # The same examples in every run: a failure can be repeated, and no test throws a coin. No deadline, because the
 # first example of a compiled function pays for the compiler.
 settings.register_profile("psotrack", derandomize=True, deadline=None, max_examples=40)

@@ -21,7 +21,7 @@ from windows import (
 )
 
 from psotrack.boxes import extents, project_boxes
-from psotrack.claims import CLAIM, CORE, NUM_NEIGHBOURS, SHADOW_SPREAD
+from psotrack.claims import CLAIM, CORE, NUM_NEIGHBOURS
 from psotrack.fitness import camera_scores, drone_fitness
 from psotrack.patches import SIDE
 
@@ -101,9 +101,7 @@ def test_with_one_drone_nothing_changes():
 
 def test_permuting_drones_permutes_windows():
     order = np.array([2, 0, 1])
-    patches, permuted = (
-        cut_at(far_rig(1), NOISE, CLOSE_M[to], SIZES_M[:3], floor_z_m=-0.4) for to in (np.arange(3), order)
-    )
+    patches, permuted = (cut_at(far_rig(1), NOISE, CLOSE_M[to], SIZES_M[:3]) for to in (np.arange(3), order))
     assert patches.clear.min() < 0.9
     np.testing.assert_array_equal(pixels(permuted), pixels(patches)[order])
     np.testing.assert_array_equal(claimed_pixels(permuted), claimed_pixels(patches)[order])
@@ -277,76 +275,3 @@ def test_a_drone_that_is_gone_has_no_place_on_a_neighbour_that_passes(apart_m, s
     assert gone.mean() < share * passing.mean()
     assert np.transpose(free)[0].mean() > free_share * passing.mean()
     assert passing.min() > 0.5
-
-
-# Shadows.
-
-#: A floor on which no shadow is in anybody's window.
-FAR_BELOW_M = -50.0
-
-
-def shadowed(position_m, size_m, floor_z_m=0.0):
-    """Silhouettes of drones that also cast the shadow of a lamp high above: as wide as they are."""
-    shadow_m = np.array([*position_m[:2], floor_z_m])
-    return drawn(np.stack([position_m, shadow_m]), np.stack([size_m, [*size_m[:2], 0.005]]))
-
-
-@pytest.mark.parametrize("height_m", [0.15, 0.2, 0.3, 0.5, 1.0])
-def test_a_shadow_on_the_floor_hardly_moves_the_place(height_m):
-    """At 0.15 m it touches the drone in most views: 81 mm without claims. Measured with them: 3, 7, 9, 0 and 0 mm; and
-    where there is no shadow in what is claimed, 14, 15, 9, 0 and 0 mm. A pixel is 24 mm."""
-    size_m, there = flat(0.4, 0.2), np.array([0.3, -0.2, height_m])
-    without, with_shadow = drawn(there, size_m), shadowed(there, size_m)
-    expected, sizes = there[None], size_m[None]
-    truth = place(without, expected, sizes, floor_z_m=FAR_BELOW_M)[0]
-    pulled = place(with_shadow, expected, sizes, floor_z_m=FAR_BELOW_M)[0] - truth
-    claimed = place(with_shadow, expected, sizes, floor_z_m=0.0)[0] - truth
-    none_there = place(without, expected, sizes, floor_z_m=0.0)[0] - truth
-    assert np.linalg.norm(claimed) < 0.012
-    assert np.linalg.norm(none_there) < 0.018
-    if height_m < 0.2:
-        assert np.linalg.norm(pulled) > 0.05
-
-
-def test_a_drone_on_the_floor_is_not_blinded():
-    """Its silhouette is before the floor that it claims for its shadow: it keeps its weight, score and place."""
-    size_m, there = flat(0.4, 0.2), np.array([0.3, -0.2, 0.1])
-    images = drawn(there, size_m)
-    patches = cut_in_room(images, there[None], size_m[None], floor_z_m=0.0)
-    np.testing.assert_array_equal(patches.clear, 1)
-    fitness = evaluate(drone_fitness, RIG, patches, there[None], size_m[None], REDUCTION)
-    free = cut_in_room(images, there[None], size_m[None], floor_z_m=FAR_BELOW_M)
-    unclaimed = evaluate(drone_fitness, RIG, free, there[None], size_m[None], REDUCTION)
-    assert fitness > 0.8 * unclaimed
-    for off_m in ((0.0, 0, 0), (0.02, 0, 0), (0, -0.02, 0.0), (0, 0, 0.02)):
-        found = place(images, there[None] + off_m, size_m[None], floor_z_m=0.0)[0]
-        # Measured 13 to 19 mm, mostly upwards: less than a pixel.
-        assert np.linalg.norm(found - there) < 0.024
-
-
-def test_shadows_are_claimed_as_discs_below():
-    """Seen from the side the floor is a line, and a disc on it: as wide as the drone and half of its height, at either
-    end a quarter of it."""
-    height_m, floor_z_m = 0.4, -0.3
-    white = np.full_like(NOISE, 255)
-    expected_m = np.array([[0.013, 0, floor_z_m + height_m]])
-    patches = cut_at(far_rig(1), white, expected_m, SIZES_M[:1], floor_z_m=floor_z_m)
-    taken = claimed_pixels(patches)[0, 0]
-    x, y = middle_px(np.array([0.013, 0, floor_z_m]), PIXELS_PER_M[0])
-    rows, columns = np.nonzero(taken)
-    half_px = CLAIM * PIXELS_PER_M[0] * (0.5 + SHADOW_SPREAD * height_m)
-    # Half a pixel more for pixels that are touched, and half for their middles.
-    assert np.abs(patches.x_px[0, 0] + columns + 0.5 - x).max() == pytest.approx(half_px, abs=1)
-    assert np.abs(patches.y_px[0, 0] + rows + 0.5 - y).max() < 1
-    own = ellipse2(0, 0, patches, expected_m[0], CORE) < 1
-    assert not (taken & own).any()
-    np.testing.assert_array_equal(patches.clear, 1)
-
-
-def test_shadows_far_from_every_window_change_nothing():
-    expected_m = np.array([[0.013, 0, 0.021], [0.313, 0, 0.121]])
-    near, far = (
-        cut_at(far_rig(1), NOISE, expected_m, SIZES_M[:2], floor_z_m=floor_z_m) for floor_z_m in (None, -9.0)
-    )
-    np.testing.assert_array_equal(far.tables, near.tables)
-    np.testing.assert_array_equal(far.clear, near.clear)

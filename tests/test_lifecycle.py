@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal, norm
 from psotrack.boxes import extents, project_boxes
 from psotrack.cameras import project
 from psotrack.foreground import ForegroundSettings, foreground, learning_step
-from psotrack.lifecycle import NEW, NOBODY, Lost, arrivals_of, lost_drones, recognised
+from psotrack.lifecycle import NEW, NOBODY, Lost, arrivals_of, holes, lost_drones, recognised
 from psotrack.newcomers import Newcomer, newcomers
 from psotrack.triangulation import viewpoints
 from psotrack.unexplained import Room, known, rest
@@ -378,6 +378,20 @@ def test_after_a_long_time_size_tells():
     assert who([newcomer(span_m=1.0)], lost(gone), max_births=0) == [0]
 
 
+def test_it_comes_back_where_it_went():
+    """Two of a kind left through the ceiling two metres apart; after three seconds one is back beside one of them.
+
+    Nobody flies through walls: they are not as far off as they could be in the open. Size alone decided before.
+    """
+    left = (-1.5, -2.0, 3.0), (0.0, 0.0, 2.0), 3.5
+    also = (-1.5, 0.5, 3.0), (0.0, 0.0, 2.0), 5.5
+    back = newcomer((-0.5, -1.7, 2.8), (1.4, 0.2, -2.5), span_m=0.46)
+    assert who([back], lost((*left, {"span_m": 0.5}), (*also, {"span_m": 0.46}))) == [0]
+    assert who([back], lost((*also, {"span_m": 0.46}), (*left, {"span_m": 0.5}))) == [1]
+    # Where the sizes differ by a third they decide.
+    assert who([back], lost((*left, {"span_m": 0.62}), (*also, {"span_m": 0.46}))) == [1]
+
+
 def test_only_so_many_births():
     found = [newcomer(), newcomer((1.0, 1.0, 1.0)), newcomer((-1.0, 1.0, 1.0))]
     assert who(found, lost()) == [NEW] * 3
@@ -404,6 +418,33 @@ def test_a_hole_is_not_the_drone_that_flew_off_from_it():
     assert who([hole, passing_by], lost(stood)) == [0, NEW]
 
 
+def test_a_drone_that_vanished_where_it_stood_is_there_and_nowhere_else():
+    """Swallowed by the background; then another one comes in at two metres per second, three metres away.
+
+    It was taken for the one that stood there. One that flew out of sight may well be back.
+    """
+    coming = newcomer((0.0, -2.7, 2.7), (0.0, 0.0, -2.0))
+    stood = ((0.0, 0.3, 1.5), (0.0, 0.0, 0.0), 2.6)
+    flew = ((0.0, 0.3, 1.5), (0.0, 0.0, 2.0), 2.6)
+    assert who([coming], lost(stood)) == [NEW]
+    assert who([coming], lost(flew)) == [0]
+    # If nobody can be new it is that one all the same; and of two that were lost, the one that flew.
+    assert who([coming], lost(stood), max_births=0) == [0]
+    assert who([coming], lost(stood, flew)) == [1]
+
+
+def test_a_hole_that_seems_to_move_is_no_drone():
+    """With the drone still over it, what is there creeps upwards: it was taken for the drone, which was born anew."""
+    stood = ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 20.0)
+    hole = newcomer((0.0, 0.0, 1.05), (0.0, -0.02, 0.13))
+    drone = newcomer((0.1, 0.0, 1.3), (0.1, 0.0, 1.5), frame=9)
+    assert who([hole, drone], lost(stood)) == [NOBODY, 0]
+    assert who([hole, drone], lost()) == [NOBODY, NEW]
+    # Two drones that are slow and fast are two.
+    elsewhere = newcomer((1.0, 0.0, 1.3), (0.1, 0.0, 1.5), frame=9)
+    assert who([hole, elsewhere], lost(stood)) == [0, NEW]
+
+
 def test_a_hole_does_not_keep_a_track():
     """Found again where it had vanished and still there: the track may be on the hole, and yields to what flew off."""
     held = ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 20.0, {"doubtful": True})
@@ -420,21 +461,25 @@ def test_a_drone_that_was_tracked_elsewhere_at_the_same_time_is_another_one():
 
 
 def oracle_log_density(one, position_m, velocity_m_s, gap_s, sigma_m_s, time_s=1.0):
-    """dv = -v/time dt + noise: the exact discretisation by a matrix exponential (C. F. Van Loan, 1978)."""
+    """dv = -v/time dt + noise: the exact discretisation by a matrix exponential (C. F. Van Loan, 1978).
+
+    In a room with mirrors for walls: a drone that is seen in one of them counts as the drone itself.
+    """
     drift = np.array([[0.0, 1.0], [0.0, -1.0 / time_s]])
     noise = np.diag([0.0, 2 * sigma_m_s**2 / time_s])
     big = expm(np.block([[-drift, noise], [np.zeros((2, 2)), drift.T]]) * gap_s)
     to = big[2:, 2:].T
     measured = np.diag([0.1**2, 0.3**2])
     covariance = to @ big[:2, 2:] + to @ measured @ to.T + measured
-    return sum(
-        multivariate_normal.logpdf(
-            [one.position_m[axis], one.velocity_m_s[axis]],
-            to @ [position_m[axis], velocity_m_s[axis]],
-            covariance,
-        )
-        for axis in range(3)
-    )
+    total = 0.0
+    for axis, walls in enumerate(ROOM_M.T):
+        density = multivariate_normal(to @ [position_m[axis], velocity_m_s[axis]], covariance).pdf
+        seen = images = {(one.position_m[axis], one.velocity_m_s[axis])}
+        for _ in range(5):
+            images = {(round(2 * wall - place, 9), -velocity) for wall in walls for place, velocity in images}
+            seen = seen | images
+        total += np.log(sum(density(image) for image in seen))
+    return total
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -489,9 +534,50 @@ def test_lost_drones_by_hand():
     assert gone.drone.tolist() == [1, 2, 4]
     # The last frames in which they were tracked: 2, 9 and 1.
     np.testing.assert_array_equal(gone.position_m[:, 0], [2.0, 9.0, 1.0])
-    np.testing.assert_array_equal(gone.velocity_m_s[:, 0], [1.0, 4.5, 0.5])
+    # Where it stands the last one has none, whatever it is said to have.
+    np.testing.assert_array_equal(gone.velocity_m_s[:, 0], [1.0, 4.5, 0.0])
     np.testing.assert_array_equal(gone.seconds, [6 / 2, -1 / 2, 7 / 2])
     assert gone.doubtful.tolist() == [False, False, True]
+
+
+def test_a_track_in_whose_place_a_drone_was_is_a_hole():
+    """One stands; one comes and lands there; one passes by above; one hovers elsewhere. The first was a drone lost."""
+    position = np.full((12, 4, 3), np.nan)
+    position[:6, 0] = (1.0, 0.0, 0.1)
+    position[:8, 1] = (1.0, 0.0, 0.1)
+    position[:7, 1, 2] += np.arange(7)[::-1] * 0.2
+    position[:, 2] = (0.0, 0.0, 0.4)
+    position[:, 2, 0] += 0.2 * np.arange(12)
+    position[:4, 3] = (1.6, 0.0, 0.1)
+    position[:, :, 1] += 0.01 * np.arange(12)[:, None] % 0.02
+    tracked = np.isfinite(position[..., 0])
+    size = np.tile([0.5, 0.5, 0.2], (4, 1))
+    assert holes(position, tracked, size).tolist() == [True, False, False, False]
+    still = np.zeros_like(position)
+    assert lost_drones(position, still, tracked, size, chunk_frames=4, fps=10.0).drone.tolist() == [1, 3]
+    # Who lands is a drone even if it is never found exactly there; and nobody is a hole by itself.
+    assert holes(position[:, 1:], tracked[:, 1:], size[1:]).tolist() == [False, False, False]
+    assert holes(position[:, :1], tracked[:, :1], size[:1]).tolist() == [False]
+    assert holes(position[:, :0], tracked[:, :0], size[:0]).shape == (0,)
+
+
+def test_half_swallowed_a_drone_only_seems_to_move():
+    """Ten frames at 10 frames per second. One stood until what was left of it crept away; one flew slowly; one stopped.
+
+    The first was said to have vanished flying.
+    """
+    position = np.zeros((12, 3, 3))
+    position[..., 1] = (0.0, 1.0, 2.0)
+    position[8:10, 0, 0] = (0.04, 0.08)
+    position[:, 1, 0] = 0.03 * np.arange(12)
+    velocity = np.zeros((12, 3, 3))
+    velocity[8:10, 0, 0], velocity[:, 1, 0], velocity[9, 2, 0] = 0.5, 0.3, 0.05
+    position[:, 2, 0] = np.minimum(0.1 * np.arange(12), 0.8)
+    gone = lost_drones(
+        position, velocity, history(*["x" * 10 + ".."] * 3), np.full((3, 3), 0.5), chunk_frames=4, fps=10.0
+    )
+    np.testing.assert_array_equal(gone.position_m[:, 0], [0.0, 0.27, 0.8])
+    np.testing.assert_array_equal(gone.velocity_m_s[:, 0], [0.0, 0.3, 0.05])
 
 
 def test_arrivals_by_hand():

@@ -67,6 +67,21 @@ def test_where_the_drone_is_thought_to_be_does_not_matter():
     np.testing.assert_allclose(beside, there, rtol=0.025)
 
 
+def test_low_over_the_floor_nothing_is_learned():
+    """What is seen there may be drone and shadow together. The drone is 0.5 m wide."""
+    positions = float32(PLACES_M[:, None])
+    seen = np.ones((len(PLACES_M), 1), bool)
+    shown = [
+        sizes.look(images(PLACES_M), positions, seen, *float32((SIZE_M[None], RIG.cameras)), SETTINGS, *floor)
+        for floor in ((jnp.float32(0.75),), (jnp.float32(0.0),), ())
+    ]
+    low = PLACES_M[:, 2] - 0.75 < SIZE_M[0]
+    assert 0 < low.sum() < len(low)
+    assert np.isnan(shown[0].size_m[low]).all()
+    np.testing.assert_array_equal(shown[0].size_m[~low], shown[2].size_m[~low])
+    assert_same(shown[1], shown[2])
+
+
 def outline_halves2(cam, centre_m, size_m):
     """Squared halves of the box of an ellipsoid's outline, from its dual conic P Q* P^T, float64."""
     P = cam.K @ cam.T_cam_world[:3]

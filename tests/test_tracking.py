@@ -2,9 +2,10 @@
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
-from helpers import ROOM_M, draw_coverage, ring_rig
+from helpers import ROOM_M, assert_same, draw_coverage, ring_rig
 
 from psotrack.finishing import finished
 from psotrack.initialisation import Start
@@ -59,8 +60,35 @@ def silhouettes():
 
 def track(silhouettes, start, **settings):
     chosen = TrackSettings(**(vars_of(SETTINGS) | settings))
-    tracked = track_silhouettes(RIG, silhouettes, start, chosen, fps=FPS, bounds_m=ROOM_M)
+    (tracked,) = track_silhouettes(RIG, silhouettes, [start], [chosen], fps=FPS, bounds_m=[ROOM_M])
     return tracked, finished(tracked, chosen, fps=FPS)[0]
+
+
+@pytest.fixture(scope="module")
+def batch(silhouettes):
+    """Three runs at once: seeds, numbers and starts that differ. Drones are born in one and not in another."""
+    starts = [FIRST, FIRST, NOBODY]
+    changes = [{"seed": 0}, {"seed": 5, "drones": 1}, {"seed": 2, "iterations": 4, "inertia": 0.5}]
+    settings = [TrackSettings(**(vars_of(SETTINGS) | change)) for change in changes]
+    tracked = track_silhouettes(
+        RIG, silhouettes, starts, settings, fps=FPS, bounds_m=[ROOM_M] * len(settings)
+    )
+    return list(zip(starts, settings, tracked, strict=True))
+
+
+@pytest.mark.parametrize("run", range(3))
+def test_a_run_of_a_batch_is_the_run_alone(batch, silhouettes, run):
+    """To the last bit, whichever device it was on and whoever was beside it."""
+    assert len(jax.devices()) == 2
+    start, settings, tracked = batch[run]
+    (alone,) = track_silhouettes(RIG, silhouettes, [start], [settings], fps=FPS, bounds_m=[ROOM_M])
+    assert tracked.arrivals == alone.arrivals
+    for of in ("info", "sizes", "looks"):
+        assert_same(getattr(tracked, of), getattr(alone, of))
+
+
+def test_runs_of_other_seeds_differ(batch):
+    assert (batch[0][2].info.position_m[5] != batch[1][2].info.position_m[5]).any()
 
 
 def vars_of(settings):

@@ -43,13 +43,13 @@ def main(frames: int, cameras: int, drones: int, particles: int, iterations: int
         silhouettes = _store(scene, Path(folder))
         before_gb = _peak_gb()
         began = time.perf_counter()
-        tracked = track_silhouettes(
+        (tracked,) = track_silhouettes(
             scene.rig,
             silhouettes,
-            start,
-            TrackSettings(particles=particles, iterations=iterations),
+            [start],
+            [TrackSettings(particles=particles, iterations=iterations)],
             fps=_scene.FPS,
-            bounds_m=_scene.BOUNDS_M,
+            bounds_m=[_scene.BOUNDS_M],
             report=terminal,
         )
         track_s = time.perf_counter() - began - tracked.compile_s

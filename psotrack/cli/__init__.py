@@ -13,12 +13,15 @@ import click
 from psotrack.cli.commands import cli
 from psotrack.cli.fly import fly
 from psotrack.cli.simulate import simulate
+from psotrack.cli.sweep import sweep, table
 from psotrack.errors import PsotrackError
 
 __all__ = ["cli", "main"]
 
 cli.add_command(simulate)
 cli.add_command(fly)
+cli.add_command(sweep)
+cli.add_command(table)
 
 
 def main() -> None:

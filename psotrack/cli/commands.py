@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, get_args
 
 import click
-import platformdirs
 
 from psotrack import __version__
 from psotrack.cli.answers import answer, report_to, say, write_json
@@ -23,15 +22,14 @@ from psotrack.cli.options import (
     SEQUENCE,
     TRACK,
     Numbers,
+    cache_folder,
+    compiled_folder,
     silhouette_options,
 )
 from psotrack.errors import SettingsError
 from psotrack.files import refuse_to_overwrite
 from psotrack.settings import Score, SwarmKind, TrackSettings
 from psotrack.silhouette_store import SilhouetteSettings
-
-#: Within the folder of the stored silhouettes.
-COMPILED = "compiled"
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -108,7 +106,7 @@ def silhouettes(
     """
     from psotrack.silhouettes import compute
 
-    where = _cache_folder(cache)
+    where = cache_folder(cache)
     stored = compute(
         _usable(sequence, cameras, num_frames),
         SilhouetteSettings(**settings),
@@ -245,8 +243,8 @@ def track(
     silhouette_names = SilhouetteSettings.__struct_fields__
     of_silhouettes = {name: settings.pop(name) for name in silhouette_names if name in settings}
     chosen = TrackSettings(silhouettes=SilhouetteSettings(**of_silhouettes), **settings)
-    where = _cache_folder(cache)
-    keep_compiled(where / COMPILED)
+    where = cache_folder(cache)
+    keep_compiled(compiled_folder(cache))
     tracked = track_sequence(
         _usable(sequence, cameras, num_frames),
         chosen,
@@ -334,7 +332,7 @@ def demo(out: Path, seed: int, jobs: int | None, force: bool, quiet: bool) -> No
     from psotrack.compiled import keep_compiled
     from psotrack.demo import run
 
-    keep_compiled(_cache_folder(None) / COMPILED)
+    keep_compiled(compiled_folder(None))
     result = run(out, seed=seed, jobs=jobs, force=force, report=report_to(quiet))
     if not quiet:
         console = Console()
@@ -347,7 +345,3 @@ def _usable(folder: Path, cameras: str | None, num_frames: int | None) -> Any:
     from psotrack.datasets.dpjait import read_sequence
 
     return read_sequence(folder).usable(cameras.split(",") if cameras else None, num_frames)
-
-
-def _cache_folder(chosen: Path | None) -> Path:
-    return chosen or platformdirs.user_cache_path("psotrack") / "silhouettes"

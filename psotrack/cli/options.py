@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import click
+import platformdirs
 
 from psotrack.foreground import Shadows
 from psotrack.settings import TrackSettings
@@ -108,3 +109,13 @@ def silhouette_options(command: Command) -> Command:
     ):
         command = option(command)
     return command
+
+
+def cache_folder(chosen: Path | None) -> Path:
+    """Of the stored silhouettes."""
+    return chosen or platformdirs.user_cache_path("psotrack") / "silhouettes"
+
+
+def compiled_folder(chosen: Path | None) -> Path:
+    """Of compiled programs, within that of the silhouettes."""
+    return cache_folder(chosen) / "compiled"

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import msgspec
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.simulation.schema import assign, convert, read_toml
+from psotrack.schema import assign, convert, read_toml
 
 _PRESETS = resources.files("psotrack.simulation.presets")
 

@@ -11,7 +11,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -98,6 +98,18 @@ def assign(data: dict[str, Any], path: str, value: Any, error: Raise) -> None:
     place[last] = value
 
 
+def nearest(name: str, names: Iterable[str]) -> str:
+    """The one of `names` that is most like `name`, or "" where none is; of dotted names the last parts may do."""
+
+    def likeness(other: str) -> float:
+        pairs = ((name, other), (name.rpartition(".")[2], other.rpartition(".")[2]))
+        return max(difflib.SequenceMatcher(None, *pair).ratio() for pair in pairs)
+
+    best = max(names, key=likeness, default="")
+    # The limit of `difflib.get_close_matches`.
+    return best if best and likeness(best) >= 0.6 else ""
+
+
 def _fits(place: Any, token: str | int) -> bool:
     """Whether something can be put at the key, or replaced at the index."""
     if isinstance(place, list):
@@ -136,12 +148,15 @@ def _explained(sentence: str, data: Any, kind: type) -> tuple[str, str, str, str
     if fault.startswith("Invalid value"):
         tags = [struct.tag for struct in _structs_at(data, kind, path.rpartition(".")[0])]
         return path, *_one_of([str(tag) for tag in tags], found)
+    if fault.startswith("Invalid enum value"):
+        literals = [one for one in _types_at(data, kind, path) if isinstance(one, inspect.LiteralType)]
+        return path, *_one_of([str(value) for one in literals for value in one.values], str(found))
     return path, _in_words(fault), _quoted(found), ""
 
 
 def _one_of(names: list[str], found: str) -> tuple[str, str, str]:
-    near = difflib.get_close_matches(found, names, 1)
-    return f"one of {', '.join(names)}", _on_one_line(found), f"did you mean {near[0]}?" if near else ""
+    near = nearest(found, names)
+    return f"one of {', '.join(names)}", _on_one_line(found), f"did you mean {near}?" if near else ""
 
 
 def _on_one_line(name: str) -> str:
@@ -171,6 +186,11 @@ def _quoted(value: Any) -> str:
 
 def _structs_at(data: Any, kind: type, path: str) -> list[inspect.StructType]:
     """The records that may stand at a path."""
+    return [one for one in _types_at(data, kind, path) if isinstance(one, inspect.StructType)]
+
+
+def _types_at(data: Any, kind: type, path: str) -> list[inspect.Type]:
+    """The types of what may stand at a path."""
     types: list[inspect.Type] = [inspect.type_info(kind)]
     for token in _tokens(path):
         if isinstance(token, int):
@@ -182,7 +202,7 @@ def _structs_at(data: Any, kind: type, path: str) -> list[inspect.StructType]:
             inner for one in types for inner in (one.types if isinstance(one, inspect.UnionType) else (one,))
         ]
         data = data[token]
-    return [one for one in types if isinstance(one, inspect.StructType)]
+    return types
 
 
 def _struct_at(data: Any, kind: type, path: str) -> inspect.StructType:

@@ -1,0 +1,307 @@
+"""Drones that come, leave, land, hover, and fly out of all but two cameras: what is said of each of them, and when.
+
+    python experiments/accuracy/comings_and_goings.py --data data
+
+Simulates `comings_and_goings.toml` if it is not there, and tracks it without being told how many drones there are, once
+against the background of the whole video and once against one that is learned on, which swallows what stands still for
+three seconds. Writes one row per drone and phase of its flight (CSV), the machine's description (JSON) and a figure
+(PNG); prints the table. A quarter of an hour on two cores, nearly all of it for the videos.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from psotrack.cameras import project
+from psotrack.datasets.dpjait import read_sequence
+from psotrack.evaluation import evaluate
+from psotrack.evaluation.consistency import consistency
+from psotrack.files import written_whole
+from psotrack.pipeline import environment, track_from_silhouettes
+from psotrack.sequence import Sequence
+from psotrack.settings import TrackSettings
+from psotrack.silhouettes import SilhouetteSettings, compute
+from psotrack.simulation import scenarios, simulate
+from psotrack.trajectories import Status, Trajectories
+from psotrack.triangulation import viewpoints
+
+SCENARIO = Path(__file__).with_suffix(".toml")
+BACKGROUNDS = {
+    "background of the whole video": SilhouetteSettings(),
+    "background that is learned on": SilhouetteSettings(learning_rate=0.01),
+}
+#: Slower than this for so long is standing still.
+STILL_M_S, STILL_S = 0.03, 3.0
+#: A track farther than this from every drone is of none.
+GATE_M = 0.5
+UNSEEN, BY_TWO, STILL, SEEN = "unseen", "seen by two", "still", "seen"
+COLOURS = {Status.TRACKED: "tab:green", Status.COASTING: "tab:orange", Status.LOST: "tab:red"}
+
+
+@dataclass(frozen=True)
+class Phase:
+    """Some of the frames of one drone, in which the same can be asked of a tracker."""
+
+    drone: int
+    word: str
+    first: int
+    end: int
+
+
+def opened(data: Path) -> Sequence:
+    """The simulated sequence, which is made if it is not there."""
+    recipe = scenarios.load(SCENARIO)
+    folder = data / "seed0" / "Simulated_Data" / recipe.name
+    if not folder.exists():
+        print(f"simulating {folder}", flush=True)
+        simulate(recipe, folder.parents[1], masks=False, onboard=False)
+    return read_sequence(folder).usable()
+
+
+def views(sequence: Sequence, position_m: np.ndarray) -> np.ndarray:
+    """(frames, drones), viewpoints whose images hold the drones' origins."""
+    cameras = sequence.rig.cameras
+    pixels, depth = project(cameras, position_m[..., None, :])
+    inside = ((pixels >= 0) & (pixels < cameras.image_size_wh)).all(axis=-1) & (depth > 0)
+    of_viewpoint = viewpoints(cameras)
+    return sum(inside[..., of_viewpoint == one].any(axis=-1).astype(int) for one in np.unique(of_viewpoint))
+
+
+def phases(sequence: Sequence) -> list[Phase]:
+    """All drones from the first frame to the last."""
+    position_m = _known(sequence)
+    seen = views(sequence, position_m)
+    words = np.select([seen < 2, seen == 2, _still(position_m, sequence.fps)], [UNSEEN, BY_TWO, STILL], SEEN)
+    found = []
+    for drone, of_drone in enumerate(words.T):
+        ends = [*np.flatnonzero(of_drone[1:] != of_drone[:-1]) + 1, len(of_drone)]
+        found += [
+            Phase(drone, str(of_drone[first]), int(first), int(end))
+            for first, end in zip([0, *ends[:-1]], ends, strict=True)
+        ]
+    return found
+
+
+def _known(sequence: Sequence) -> np.ndarray:
+    """(frames, drones, 3); frame 0, of which the dataset says nothing, like the next."""
+    position_m = sequence.truth.position_m.copy()
+    position_m[0] = position_m[1]
+    return position_m
+
+
+def _still(position_m: np.ndarray, fps: float) -> np.ndarray:
+    """(frames, drones), whether a drone stands still for long."""
+    slow = np.linalg.norm(np.gradient(position_m, axis=0), axis=-1) * fps < STILL_M_S
+    still = np.zeros_like(slow)
+    for drone, of_drone in enumerate(slow.T):
+        edges = np.flatnonzero(np.diff(of_drone, prepend=False, append=False))
+        for first, end in edges.reshape(-1, 2):
+            still[first:end, drone] = end - first >= STILL_S * fps
+    return still
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What a run says, beside the truth.
+
+    Attributes:
+        drone: (frames, tracks), which one a track is at where it is tracked, and else was at last; -1 for none.
+        tracked, coasting: (frames, tracks).
+        residual_m: (frames, tracks, 3), from that drone, without the median of the track; NaN where not tracked.
+    """
+
+    trajectories: Trajectories
+    drone: np.ndarray
+    tracked: np.ndarray
+    coasting: np.ndarray
+    residual_m: np.ndarray
+
+
+def judged(trajectories: Trajectories, position_m: np.ndarray) -> Judged:
+    """Tracks and the drones that they are at."""
+    status = trajectories.status
+    apart_m = trajectories.position_m[:, :, None] - position_m[:, None]
+    distance_m = np.nan_to_num(np.linalg.norm(apart_m, axis=-1), nan=np.inf)
+    nearest = np.where(distance_m.min(axis=-1) < GATE_M, distance_m.argmin(axis=-1), -1)
+    tracked = status == Status.TRACKED
+    last = np.maximum.accumulate(np.where(tracked, np.arange(len(tracked))[:, None], -1), axis=0)
+    drone = np.where(last >= 0, np.take_along_axis(nearest, np.maximum(last, 0), axis=0), -1)
+    residual_m = np.take_along_axis(apart_m, np.maximum(drone, 0)[..., None, None], axis=2)[:, :, 0]
+    residual_m[~tracked | (drone < 0)] = np.nan
+    return Judged(
+        trajectories, drone, tracked, status == Status.COASTING, residual_m - np.nanmedian(residual_m, axis=0)
+    )
+
+
+def row(phase: Phase, run: Judged, fps: float) -> dict[str, Any]:
+    """What a run says of a phase."""
+    frames = slice(phase.first, phase.end)
+    at = run.drone[frames] == phase.drone
+    tracks = at & run.tracked[frames]
+    tracked, coasting = tracks.any(axis=1), (at & run.coasting[frames]).any(axis=1)
+    residual_m = np.where(tracks[..., None], run.residual_m[frames], np.nan)
+    covariance_m2 = run.trajectories.covariance_m2[frames]
+    std_mm = 1e3 * np.sqrt(np.trace(covariance_m2, axis1=-2, axis2=-1))
+    honest = consistency(residual_m, residual_m, covariance_m2)
+    return {
+        "drone": phase.drone + 1,
+        "phase": phase.word,
+        "from_s": phase.first / fps,
+        "to_s": phase.end / fps,
+        "tracks": "+".join(run.trajectories.drones[track] for track in np.flatnonzero(tracks.any(axis=0))),
+        "tracked_after_s": float(tracked.argmax() / fps) if tracked.any() else np.nan,
+        "tracked_share": float(tracked.mean()),
+        "coasting_share": float((coasting & ~tracked).mean()),
+        "double_share": float((tracks.sum(axis=1) > 1).mean()),
+        "error_mm": 1e3 * _mean(np.linalg.norm(residual_m, axis=-1)[tracks]),
+        "std_mm": _mean(std_mm[tracks]),
+        "coasting_to_std_mm": max(std_mm[at & run.coasting[frames]].tolist(), default=np.nan),
+        "inside_90": honest.inside_90_rate,
+        "nees": honest.mean_nees,
+    }
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(values.mean()) if len(values) else np.nan
+
+
+def summary(sequence: Sequence, run: Judged) -> dict[str, Any]:
+    """What a run says on the whole: of drones that two viewpoints see or more."""
+    truth = sequence.truth
+    there = views(sequence, truth.position_m)[..., None] >= 2
+    evaluation = evaluate(
+        run.trajectories, replace(truth, position_m=np.where(there, truth.position_m, np.nan))
+    )
+    nobody = run.tracked & (run.drone < 0)
+    return {
+        "tracks": run.trajectories.num_drones,
+        "tracked_nobody_s": float(nobody.sum() / sequence.fps),
+        "id_switches": evaluation.id_switches,
+        "missed_rate": evaluation.missed_rate,
+        "mota": evaluation.mota,
+        "idf1": evaluation.idf1,
+        "hota": evaluation.hota,
+        "offset_removed_mean_error_m": evaluation.offset_removed_mean_error_m,
+        "offset_removed_inside_90_rate": evaluation.offset_removed_inside_90_rate,
+        "offset_removed_mean_nees": evaluation.offset_removed_mean_nees,
+    }
+
+
+def draw(runs: dict[str, tuple[Judged, tuple[Any, ...]]], plan: list[Phase], fps: float, path: Path) -> None:
+    """A row per drone: what it does as a grey line, below it the tracks that are at it, in the colour of their status.
+
+    Where a track begins, or begins anew, is its number.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+    widths = {UNSEEN: 0.0, BY_TWO: 1.5, STILL: 6.0, SEEN: 3.5}
+    drones = 1 + max(phase.drone for phase in plan)
+    figure = Figure(figsize=(10, 2.9 * len(runs)), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, (name, (run, arrivals)) in zip(
+        figure.subplots(len(runs), 1, sharex=True, squeeze=False)[:, 0], runs.items(), strict=True
+    ):
+        for phase in plan:
+            axes.plot(
+                [phase.first / fps, phase.end / fps],
+                [phase.drone - 0.2] * 2,
+                color="0.7",
+                linewidth=widths[phase.word],
+                solid_capstyle="butt",
+            )
+        rows = np.where(run.drone >= 0, run.drone, drones)
+        for track, of_track in enumerate(rows.T):
+            for status, colour in COLOURS.items():
+                at = np.flatnonzero(run.trajectories.status[:, track] == status)
+                at = at[np.isfinite(run.trajectories.position_m[at, track, 0])]
+                size = 3 if status == Status.LOST else 9
+                axes.scatter(at / fps, of_track[at] + 0.12, c=colour, s=size, marker="s", linewidths=0)
+            begins = run.tracked[:, track] & ~np.roll(run.tracked[:, track], 1)
+            begins[0] = run.tracked[0, track]
+            for first in np.flatnonzero(begins).tolist():
+                axes.annotate(
+                    run.trajectories.drones[track],
+                    (first / fps, of_track[first] + 0.12),
+                    xytext=(-9, -3),
+                    textcoords="offset points",
+                    fontsize=8,
+                )
+        for arrival in arrivals:
+            axes.plot(
+                arrival["frame"] / fps,
+                rows[arrival["frame"], arrival["drone"]] + 0.34,
+                marker="^",
+                color="tab:blue" if arrival["again"] else "black",
+                markersize=6,
+            )
+        axes.set_yticks(range(drones + 1), [*(f"dron{drone + 1}" for drone in range(drones)), "nobody"])
+        axes.set_ylim(drones + 0.6, -0.6)
+        axes.set_title(name, fontsize=10)
+        axes.grid(visible=True, axis="x", alpha=0.3)
+    axes.set_xlabel("s")
+    handles = [
+        Line2D([], [], color=colour, linewidth=3, label=status.label) for status, colour in COLOURS.items()
+    ]
+    handles += [
+        Line2D([], [], color="0.7", linewidth=width, label=f"drone is {word}")
+        for word, width in widths.items()
+        if width
+    ]
+    handles += [
+        Line2D([], [], color=colour, marker="^", linewidth=0, label=label)
+        for colour, label in (("black", "is new"), ("tab:blue", "is back"))
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8)
+    with written_whole(path) as temporary:
+        figure.savefig(temporary, dpi=110)
+
+
+def main() -> None:
+    """Track, write, print, draw."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, default=Path("data"), help="the data's root folder")
+    parser.add_argument("--cache", type=Path, default=Path("data/silhouettes"), help="of the silhouettes")
+    parser.add_argument(
+        "--out", type=Path, default=Path("experiments/accuracy/results"), help="folder of results"
+    )
+    parser.add_argument("--picture", type=Path, default=Path("experiments/pictures/comings_and_goings.png"))
+    parser.add_argument("--seed", type=int, default=0, help="of the swarm")
+    options = parser.parse_args()
+
+    sequence = opened(options.data)
+    position_m, plan = _known(sequence), phases(sequence)
+    table, totals, runs = [], {}, {}
+    for name, how in BACKGROUNDS.items():
+        settings = TrackSettings(seed=options.seed, silhouettes=how)
+        tracked = track_from_silhouettes(sequence, compute(sequence, how, cache=options.cache), settings)
+        run = judged(tracked.trajectories, position_m)
+        runs[name] = run, tracked.record["arrivals"]
+        table += [{"background": name, **row(phase, run, sequence.fps)} for phase in plan]
+        totals[name] = summary(sequence, run)
+    frame = pd.DataFrame(table)
+    options.out.mkdir(parents=True, exist_ok=True)
+    frame.to_csv(options.out / "comings_and_goings.csv", index=False, float_format="%.4g")
+    (options.out / "comings_and_goings.json").write_text(
+        json.dumps({"runs": totals, **environment()}, indent=2) + "\n"
+    )
+    for name, part in frame.groupby("background", sort=False):
+        print(f"\n{name}: {json.dumps(totals[name])}")
+        print(
+            part.drop(columns="background").to_string(index=False, float_format="{:.2f}".format, na_rep="-")
+        )
+    draw(runs, plan, sequence.fps, options.picture)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,142 @@
+"""Drones of a dozen pixels and less: a few cells of a silhouette, which are rough, thin and not all there."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import ROOM_M, draw_coverage, ring_rig
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from psotrack.blobs import all_blobs, find_blobs
+from psotrack.cameras import CameraRig
+from psotrack.initialisation import find_drones
+from psotrack.newcomers import newcomers
+
+FPS = 25.0
+REDUCTION = 2
+#: Half a metre at 4 m is six to nine pixels: three or four cells wide, and one or two high.
+SMALL = ring_rig(6, image_size_wh=(64, 48))
+CELL_M = 0.16
+SIZE_M = (0.5, 0.5, 0.25)
+TIME_S = np.arange(25)[:, None] / FPS
+ONE = np.array((0.6, -0.5, 1.5)) + TIME_S * (0.8, 0.2, 0.1)
+OTHER = np.array((-0.7, 0.6, 0.9)) + TIME_S * (0.3, -1.0, 0.2)
+
+
+def drawn(*paths_m, size_m=SIZE_M, rig=SMALL):
+    images = np.stack([draw_coverage(rig, places, size_m, REDUCTION) for places in np.stack(paths_m, axis=1)])
+    images.flags.writeable = False
+    return images
+
+
+@pytest.fixture(scope="module")
+def both():
+    return drawn(ONE, OTHER)
+
+
+def magnified(rig: CameraRig, times: int) -> CameraRig:
+    """Cameras with so many times as many pixels along each side."""
+    K = rig.cameras.K * np.array([[times], [times], [1]])
+    # The corner of the image stays at half a pixel before the middle of the first one.
+    K[:, :2, 2] += (times - 1) / 2
+    return CameraRig(
+        rig.names, replace(rig.cameras, K=K, image_size_wh=times * np.asarray(rig.cameras.image_size_wh))
+    )
+
+
+def start_of(coverage, rig=SMALL, reduction=REDUCTION):
+    return find_drones(
+        rig.cameras, coverage, reduction=reduction, fps=FPS, bounds_m=ROOM_M, max_speed_m_s=6.0
+    )
+
+
+def newcomers_in(coverage, *known_m, rig=SMALL, reduction=REDUCTION):
+    known = np.stack(known_m, axis=1) if known_m else np.empty((len(coverage), 0, 3))
+    return newcomers(
+        rig.cameras,
+        coverage,
+        known,
+        np.ones(known.shape[:2], bool),
+        np.broadcast_to(SIZE_M, (len(known_m), 3)),
+        reduction=reduction,
+        fps=FPS,
+        bounds_m=ROOM_M,
+        max_speed_m_s=6.0,
+    )
+
+
+def assert_found(position_m, *truth_m, atol):
+    assert len(position_m) == len(truth_m)
+    distance = np.linalg.norm(np.asarray(position_m)[:, None] - np.stack(truth_m), axis=-1)
+    assert distance.min(axis=0).max() < atol
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 8))
+def test_blobs_are_the_same_however_many_pixels_a_cell_has(seed, times):
+    """A bug of the first version: the least area was one of image pixels, and fine silhouettes had no small blobs."""
+    rng = np.random.default_rng(seed)
+    image = 255 * (rng.random((20, 30)) < 0.1).astype(np.uint8)
+    one, other = find_blobs(image, 1), find_blobs(image, times)
+    assert (times * one.size_px == other.size_px).all()
+    assert (times * (one.centre_px + 0.5) == other.centre_px + 0.5).all()
+    assert (times * all_blobs([[one]], 1, 1).radius_px == all_blobs([[other]], 1, times).radius_px)[
+        np.isfinite(all_blobs([[one]], 1, 1).radius_px)
+    ].all()
+
+
+def test_a_single_cell_is_noise():
+    image = np.zeros((12, 12), np.uint8)
+    image[3, 3] = image[8, 7:9] = 255
+    assert find_blobs(image, 4).size_px.tolist() == [[8, 4]]
+
+
+@pytest.mark.parametrize("times", [2, 4])
+def test_starts_are_the_same_however_many_pixels_a_cell_has(both, times):
+    one = start_of(both[:10])
+    other = start_of(both[:10], magnified(SMALL, times), times * REDUCTION)
+    # The lenses' and the lines' equations are the same but for rounding in float64.
+    for name, value in vars(one).items():
+        np.testing.assert_allclose(getattr(other, name), value, atol=1e-6, err_msg=name)
+
+
+def test_drones_of_a_few_cells_are_found_at_the_start(both):
+    """A bug of the first version: blobs of ten cells were too small."""
+    start = start_of(both[:10])
+    assert_found(start.position_m, ONE[0], OTHER[0], atol=CELL_M / 2)
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_drones_of_a_few_cells_are_found_when_they_come(both, times):
+    """A bug of the first version: newcomers were looked for at half the size, of which a small drone is a cell."""
+    found = newcomers_in(both, ONE, rig=magnified(SMALL, times), reduction=times * REDUCTION)
+    assert_found([one.position_m for one in found], OTHER[found[0].frame], atol=CELL_M / 2)
+
+
+def test_known_drones_of_a_few_cells_leave_nobody(both):
+    assert newcomers_in(both, ONE, OTHER) == ()
+
+
+def thinned(coverage, share, seed=0):
+    """The silhouettes with so much of their cells left, drawn anew in every frame."""
+    return coverage * (np.random.default_rng(seed).random(coverage.shape) < share)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_silhouette_full_of_holes_is_a_drone(seed):
+    """A bug of the first version: a camera that showed less than a quarter of the drone was said not to see it."""
+    rig = ring_rig(6, image_size_wh=(240, 180))
+    coverage = thinned(drawn(OTHER, rig=rig), 0.22, seed)
+    found = newcomers_in(coverage, rig=rig)
+    assert_found([one.position_m for one in found], OTHER[found[0].frame], atol=CELL_M / 2)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_noise_everywhere_is_nobody(seed):
+    """A few of the cells of every image, drawn anew in every frame: no place has more than what is about it."""
+    rng = np.random.default_rng(seed)
+    noise = 255 * (rng.random((25, 6, 45, 60)) < 0.03).astype(np.uint8)
+    rig = ring_rig(6, image_size_wh=(120, 90))
+    assert len(start_of(noise[:10], rig).position_m) == 0
+    assert newcomers_in(noise, rig=rig) == ()

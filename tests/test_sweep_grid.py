@@ -1,0 +1,364 @@
+"""Grids: which cells a file stands for, that what is wrong is one line with its place, and what a key is made of."""
+
+import itertools
+import pickle
+import re
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from psotrack.errors import InputError, SettingsError
+from psotrack.settings import TrackSettings
+from psotrack.silhouette_store import SilhouetteSettings
+from psotrack.sweep.grid import Perturbation, grid, key_of, load
+from psotrack.sweep.names import SETTINGS
+
+FILE = """
+sequences = ["S01_D2_A", "S04_D10"]
+runs = 10
+[settings]
+spread_m = 1
+silhouettes.reduction = 8
+[methods.paper]
+swarm = "joint"
+score = "hard"
+[methods.ours]
+silhouettes.reduction = 2
+[grid]
+particles = [20, 50, 100]
+"silhouettes.var_threshold" = [8, 9.5]
+cameras = ["all", 4, ["cam1i", "cam2i"]]
+draws = 3
+"""
+
+SMALL = {"sequences": ["S01"], "grid": {"particles": [20, 50]}}
+
+
+def cells_of(**changes):
+    return grid(SMALL | changes).cells()
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / "grid.toml"
+    path.write_text(FILE)
+    return path
+
+
+def test_every_combination_is_a_cell(path):
+    # Written out anew: 3 draws where cameras are drawn, 1 elsewhere.
+    cameras = [(None, 0), (4, 0), (4, 1), (4, 2), (("cam1i", "cam2i"), 0)]
+    expected = [
+        (sequence, method, particles, threshold, *kept)
+        for sequence, method, particles, threshold, kept in itertools.product(
+            ["S01_D2_A", "S04_D10"], ["paper", "ours"], [20, 50, 100], [8.0, 9.5], cameras
+        )
+    ]
+    found = [
+        (
+            cell.sequence,
+            cell.method,
+            cell.settings.particles,
+            cell.settings.silhouettes.var_threshold,
+            cell.cameras,
+            cell.perturbation.draw,
+        )
+        for cell in load(path).cells()
+    ]
+    assert found == expected
+
+
+def test_a_cell_has_all_that_was_set(path):
+    paper = load(path).cells()[0]
+    assert paper.settings == TrackSettings(
+        particles=20,
+        spread_m=1.0,
+        swarm="joint",
+        score="hard",
+        silhouettes=SilhouetteSettings(reduction=8, var_threshold=8.0),
+    )
+    assert (paper.runs, paper.seeds, paper.frames) == (10, range(10), None)
+    assert paper.perturbation == Perturbation()
+
+
+def test_a_method_overrules_what_all_cells_have(path):
+    ours = next(cell for cell in load(path).cells() if cell.method == "ours")
+    assert (ours.settings.spread_m, ours.settings.silhouettes.reduction) == (1.0, 2)
+
+
+def test_axes_are_what_the_grid_varied_as_numbers_and_words(path):
+    axes = [dict(cell.axes) for cell in load(path).cells()[:5]]
+    kept = [("all", 0), ("4", 0), ("4", 1), ("4", 2), ("cam1i+cam2i", 0)]
+    assert axes == [
+        {"particles": 20, "silhouettes.var_threshold": 8.0, "cameras": cameras, "draw": draw}
+        for cameras, draw in kept
+    ]
+    # A whole number that is meant for a real one is one.
+    assert isinstance(axes[0]["silhouettes.var_threshold"], float)
+
+
+def test_python_is_the_same_as_toml(path):
+    mapping = {
+        "sequences": ("S01_D2_A", "S04_D10"),
+        "runs": 10,
+        "settings": {"spread_m": 1, "silhouettes.reduction": 8},
+        "methods": {
+            "paper": {"swarm": "joint", "score": "hard"},
+            "ours": {"silhouettes": {"reduction": 2}},
+        },
+        "grid": {
+            "particles": (20, 50, 100),
+            "silhouettes": {"var_threshold": [8, 9.5]},
+            "cameras": ["all", 4, ("cam1i", "cam2i")],
+            "draws": 3,
+        },
+    }
+    assert grid(mapping).cells() == load(path).cells()
+
+
+def test_paths_of_sequences_may_be_paths(tmp_path):
+    assert cells_of(sequences=[tmp_path])[0].sequence == str(tmp_path)
+
+
+def test_without_axes_and_methods_there_is_one_cell_per_sequence():
+    (cell,) = grid({"sequences": ["S01"], "first_seed": 5, "runs": 2}).cells()
+    assert (cell.method, cell.settings, dict(cell.axes)) == ("", TrackSettings(), {})
+    assert list(cell.seeds) == [5, 6]
+
+
+def test_perturbations_and_frames_are_axes_too():
+    varied = {"extrinsics_deg": [0, 0.2], "clock_frames": [1], "flipped": [0.03], "frames": [100]}
+    cells = cells_of(grid=varied | {"draws": 2})
+    assert [cell.perturbation for cell in cells] == [
+        Perturbation(extrinsics_deg=angle, clock_frames=1.0, flipped=0.03, draw=draw)
+        for angle in (0.0, 0.2)
+        for draw in (0, 1)
+    ]
+    assert {cell.frames for cell in cells} == {100}
+    assert cells[-1].axes == {
+        "extrinsics_deg": 0.2,
+        "clock_frames": 1.0,
+        "flipped": 0.03,
+        "frames": 100,
+        "draw": 1,
+    }
+
+
+def test_chance_is_drawn_once_unless_more_is_said():
+    assert [cell.perturbation.draw for cell in cells_of(grid={"cameras": [3, 4]})] == [0, 0]
+
+
+def test_every_setting_can_be_set():
+    def names(content, prefix=""):
+        for name, value in content.items():
+            yield from names(value, f"{prefix}{name}.") if isinstance(value, dict) else [f"{prefix}{name}"]
+
+    assert set(SETTINGS) == set(names(msgspec.to_builtins(TrackSettings()))) - {"seed"}
+
+
+@given(
+    particles=st.lists(st.integers(2, 500), min_size=1, max_size=4, unique=True),
+    spread_m=st.lists(st.floats(0.01, 1.0), min_size=1, max_size=4, unique=True),
+    cameras=st.lists(st.one_of(st.just("all"), st.integers(1, 9)), min_size=1, max_size=4, unique=True),
+    draws=st.integers(1, 3),
+)
+def test_cells_are_as_many_as_the_lists_say_and_all_have_keys_of_their_own(
+    particles, spread_m, cameras, draws
+):
+    varied = {"particles": particles, "spread_m": spread_m, "cameras": cameras}
+    num_drawn = len(set(cameras) - {"all"})
+    cells = cells_of(grid=varied | ({"draws": draws} if num_drawn else {}))
+    expected = len(particles) * len(spread_m) * (num_drawn * draws + ("all" in cameras))
+    keys = {key_of(cell, {"cam1": "ab"}) for cell in cells}
+    assert len(keys) == len(cells) == expected
+
+
+WRONG = [
+    # Names.
+    (
+        {"sequnces": ["S01"]},
+        "sequnces: expected a name that there is, found sequnces; did you mean sequences?",
+    ),
+    (
+        {"methods": {"paper": {"swram": "joint"}}},
+        "methods.paper.swram: expected a name that there is, found swram; did you mean swarm?",
+    ),
+    ({"settings": {"reduction": 4}}, "settings.reduction: .*; did you mean silhouettes.reduction?"),
+    (
+        {"settings": {"silhouettes": {"reducton": 4}}},
+        "settings.silhouettes.reducton: .*silhouettes.reduction?",
+    ),
+    ({"grid": {"partcles": [20]}}, "grid.partcles: .*; did you mean particles?"),
+    ({"grid": {"draw": [20]}}, "grid.draw: .*; did you mean draws?"),
+    (
+        {"settings": {"zzz": 4}},
+        "settings.zzz: .*; there are particles, iterations, .*, silhouettes.reduction",
+    ),
+    ({"settings": {"silhouettes": 4}}, "settings.silhouettes: expected a table with names, found none"),
+    # Right names, wrong places.
+    ({"settings": {"cameras": 4}}, "settings.cameras: .*; it belongs in [grid], with a list of values"),
+    ({"particles": 4}, "particles: .*; it belongs in [settings], or in [grid] with a list of values"),
+    ({"grid": {"seed": [1, 2]}}, "grid.seed: .*; runs are seeds: say runs = 10, and first_seed .*"),
+    ({"settings": {"seed": 1}}, "settings.seed: .*; runs are seeds: .*"),
+    ({"seed": 1}, "seed: .*; runs are seeds: .*"),
+    (
+        {"settings": {"particles": 20}},
+        "grid.particles: expected it in one place, found settings.particles as well",
+    ),
+    (
+        {"methods": {"a": {"particles": 20}}},
+        "grid.particles: expected it in one place, found methods.a.particles as well",
+    ),
+    (
+        {"settings": {"silhouettes.reduction": 4, "silhouettes": {"reduction": 8}}},
+        "settings.silhouettes.reduction: expected it once, found it twice",
+    ),
+    # Kinds of values.
+    ({"grid": {"particles": [20, True]}}, "grid.particles[1]: expected a whole number, found true"),
+    ({"grid": {"particles": [20.0]}}, "grid.particles[0]: expected a whole number, found 20.0"),
+    ({"grid": {"windows": [[1.0], [0.5, "a"]]}}, 'grid.windows[1][1]: expected a number, found "a"'),
+    ({"settings": {"spread_m": "wide"}}, 'settings.spread_m: expected a number, found "wide"'),
+    ({"settings": {"spread_m": float("nan")}}, "settings.spread_m: expected a finite number, found nan"),
+    ({"settings": {"bounds_m": [1, 2]}}, "settings.bounds_m: expected a list of length 6, found [1, 2]"),
+    ({"settings": {"particles": {}}, "grid": {}}, "settings.particles: expected a whole number, found {}"),
+    (
+        {"methods": {"paper": {"swarm": "jont"}}},
+        "methods.paper.swarm: expected one of joint, per-drone, found jont; did you mean joint?",
+    ),
+    (
+        {"settings": {"silhouettes": {"shadows": "kep"}}},
+        "settings.silhouettes.shadows: expected one of .*, found kep; did you mean keep?",
+    ),
+    ({"grid": {"particles": 20}}, "grid.particles: expected a list of values, found 20; write [20]"),
+    ({"grid": {"particles": []}}, "grid.particles: expected a list of values, found []"),
+    (
+        {"grid": {"cameras": [0]}},
+        'grid.cameras[0]: expected "all", a number above 0, or a list of .*, found 0',
+    ),
+    ({"grid": {"cameras": [True]}}, "grid.cameras[0]: .*, found True"),
+    ({"grid": {"cameras": ["cam1"]}}, "grid.cameras[0]: .*, found 'cam1'"),
+    ({"grid": {"cameras": [["a", "b", "a"]]}}, "grid.cameras[0]: .*, found ['a', 'b', 'a']"),
+    ({"grid": {"cameras": [[]]}}, "grid.cameras[0]: .*, found []"),
+    ({"grid": {"frames": [0]}}, "grid.frames[0]: expected a whole number of at least 1, found 0"),
+    ({"grid": {"cameras": [4], "draws": 0}}, "grid.draws: expected a whole number of at least 1, found 0"),
+    ({"runs": 0}, "runs: expected a whole number of at least 1, found 0"),
+    ({"runs": True}, "runs: expected a whole number, found true"),
+    ({"first_seed": -1}, "first_seed: expected a whole number of at least 0, found -1"),
+    ({"sequences": []}, "sequences: expected a list of length at least 1, found []"),
+    ({"sequences": "S01"}, 'sequences: expected a list, found "S01"'),
+    ({"sequences": ["S01", 2]}, "sequences[1]: expected text, found 2"),
+    ({"settings": 3}, "settings: expected a table, found 3"),
+    ({"methods": {"paper": 3}}, "methods.paper: expected a table, found 3"),
+    # Values that make no sense.
+    ({"grid": {"particles": [20, 1]}}, "grid.particles[1]: expected at least 2, found 1"),
+    ({"grid": {"flipped": [0.5, 2]}}, "grid.flipped[1]: expected a number from 0 to 1, found 2"),
+    ({"grid": {"clock_frames": [-1]}}, "grid.clock_frames[0]: expected a number of at least 0, found -1"),
+    (
+        {"methods": {"a": {"silhouettes.working_reduction": 4}}, "grid": {"silhouettes.reduction": [4, 6]}},
+        "grid.silhouettes.reduction[1]: expected a multiple of working_reduction, 4, found 6",
+    ),
+    (
+        {"settings": {"silhouettes.working_reduction": 3}},
+        "the default of reduction: expected a multiple of working_reduction, 3, found 4",
+    ),
+    # Cells.
+    (
+        {"grid": {"spread_m": [0.1, 1, 1.0]}},
+        "grid.spread_m[2]: expected cells that differ, found the same as with grid.spread_m[1]",
+    ),
+    (
+        {"sequences": ["a", "a"]},
+        "sequences[1]: expected cells that differ, found the same as with sequences[0]",
+    ),
+    (
+        {"methods": {"a": {}, "b": {"iterations": TrackSettings().iterations}}},
+        "methods.b: expected cells that differ, found the same as with methods.a",
+    ),
+    ({"grid": {"draws": 3}}, "grid.draws: expected something to draw: a number of cameras, .*"),
+    (
+        {"grid": {"flipped": [0.0], "cameras": [["a"]], "draws": 3}},
+        "grid.draws: expected something to draw: .*",
+    ),
+]
+
+
+@pytest.mark.parametrize(("changes", "sentence"), WRONG)
+def test_what_is_wrong_is_one_line_with_its_place(changes, sentence):
+    with pytest.raises(SettingsError) as caught:
+        grid(SMALL | changes, where="table5.toml")
+    pattern = re.escape(f"table5.toml: {sentence}").replace(re.escape(".*"), ".*")
+    assert re.fullmatch(pattern, str(caught.value)), str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_sequences_must_be_given():
+    with pytest.raises(SettingsError, match=r"^grid: sequences: expected a value, found none$"):
+        grid({"runs": 2})
+
+
+def test_messages_of_a_file_begin_with_its_path(path):
+    path.write_text(FILE.replace("swarm", "swram"))
+    with pytest.raises(SettingsError, match=f"^{re.escape(str(path))}: methods.paper.swram: "):
+        load(path)
+
+
+def test_a_file_that_is_no_toml(path):
+    path.write_text("sequences = [\n")
+    with pytest.raises(InputError, match=r"grid.toml.*: expected TOML"):
+        load(path)
+    with pytest.raises(InputError, match=r"none.toml: expected a file to read"):
+        load(path.with_name("none.toml"))
+
+
+def test_a_perturbation_is_checked_wherever_it_comes_from():
+    with pytest.raises(SettingsError, match="extrinsics_deg: expected a number from 0 to 180, found nan"):
+        Perturbation(extrinsics_deg=float("nan"))
+    with pytest.raises(SettingsError, match="clock_frames: expected a number of at least 0, found inf"):
+        Perturbation(clock_frames=float("inf"))
+
+
+# --- keys
+
+INPUT = {"cam1": "ab", "cam2": "cd"}
+
+
+def test_more_runs_are_of_the_same_key():
+    (few,) = grid({"sequences": ["S01"], "runs": 2, "settings": {"particles": 20}}).cells()
+    many = grid({"sequences": ["S01"], "runs": 9, "first_seed": 4, "grid": {"particles": [20, 50]}}).cells()[
+        0
+    ]
+    assert few != many
+    assert key_of(few, INPUT) == key_of(many, INPUT)
+    assert re.fullmatch("[0-9a-f]{40}", key_of(few, INPUT))
+
+
+def test_where_a_sequence_lies_is_not_in_the_key():
+    (one,) = grid({"sequences": ["S01"]}).cells()
+    (other,) = grid({"sequences": ["/data/elsewhere/S01"]}).cells()
+    assert key_of(one, INPUT) == key_of(other, dict(reversed(INPUT.items())))
+
+
+def test_whatever_decides_the_rows_is_in_the_key():
+    base = {"sequences": ["S01"], "settings": {"particles": 20}, "grid": {}}
+    changes = [
+        {},
+        {"sequences": ["S02"]},
+        {"settings": {"particles": 21}},
+        {"settings": {"particles": 20, "silhouettes.reduction": 8}},
+        {"methods": {"paper": {}}},
+        {"grid": {"frames": [100]}},
+        {"grid": {"cameras": [2]}},
+        {"grid": {"cameras": [["cam1", "cam2"]]}},
+        {"grid": {"flipped": [0.1]}},
+    ]
+    keys = [key_of(grid(base | change).cells()[0], INPUT) for change in changes]
+    keys.append(key_of(grid(base).cells()[0], INPUT | {"cam2": "ce"}))
+    keys += [key_of(cell, INPUT) for cell in grid(base | {"grid": {"cameras": [2], "draws": 2}}).cells()[1:]]
+    assert len(set(keys)) == len(keys)
+
+
+def test_cells_travel_to_other_processes(path):
+    cells = load(path).cells()
+    assert pickle.loads(pickle.dumps(cells)) == cells

@@ -1,0 +1,274 @@
+"""Tables: figures against the standard library's, layouts written out by hand."""
+
+import csv
+import io
+import itertools
+import logging
+import math
+import statistics
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from psotrack.errors import SettingsError
+from psotrack.sweep import pivot, render
+
+#: Two methods at two swarm sizes, three runs each; errors in metres.
+ERRORS_M = {
+    ("paper", 20): [0.070, 0.074, 0.072],
+    ("paper", 100): [0.040, 0.042, 0.041],
+    ("ours", 20): [0.010, 0.012, 0.011],
+    ("ours", 100): [0.0050, 0.0070, 0.0060],
+}
+
+
+def results(errors_m=ERRORS_M, **more):
+    return pd.DataFrame(
+        [
+            {
+                "sequence": "S01_D2_A",
+                "method": method,
+                "settings.particles": particles,
+                "settings.seed": seed,
+                "mean_error_m": error_m,
+            }
+            | more
+            for (method, particles), runs in errors_m.items()
+            for seed, error_m in enumerate(runs)
+        ]
+    )
+
+
+def in_mm(rows, rows_by=("method",), columns_by=("particles",)):
+    return pivot(rows, rows_by=list(rows_by), columns_by=list(columns_by), value="mean_error_m", scale=1000.0)
+
+
+def test_figures_are_those_of_the_standard_library():
+    table = in_mm(results())
+    assert table.attrs["value"] == "mean_error_mm"
+    for (method, particles), runs in ERRORS_M.items():
+        found = table.loc[method, particles]
+        assert found["mean"] == pytest.approx(1000 * statistics.mean(runs), rel=1e-12)
+        assert found["std"] == pytest.approx(1000 * statistics.stdev(runs), rel=1e-12)
+        assert found["runs"] == 3
+    assert list(table.index) == ["ours", "paper"]
+    assert list(table.columns.names) == ["particles", "figure"]
+
+
+@given(
+    numbers=st.lists(
+        st.tuples(st.integers(0, 2), st.integers(0, 2), st.one_of(st.none(), st.floats(-1e3, 1e3))),
+        min_size=1,
+        max_size=30,
+    )
+)
+def test_figures_are_those_of_pandas_whatever_is_missing(numbers):
+    rows = pd.DataFrame(numbers, columns=["a", "b", "value"]).astype({"value": float})
+    table = pivot(rows, rows_by=["a"], columns_by=["b"], value="value")
+    oracle = rows.groupby(["a", "b"])["value"].agg(["mean", "std", "count"])
+    for a, b in itertools.product(table.index, table.columns.get_level_values("b").unique()):
+        expected = oracle.loc[(a, b)] if (a, b) in oracle.index else [math.nan, math.nan, 0]
+        # pandas sums in another order: rounding of float64 at 1e3, and of its variance.
+        np.testing.assert_allclose(table.loc[a, b], expected, rtol=1e-9, atol=1e-6)
+
+
+def test_the_order_of_rows_does_not_matter_and_that_of_labels_is_natural():
+    rows = pd.DataFrame({"cameras": ["all", "10", "4", "cam10", "cam2"], "n": [100, 20, 3, 1, 2], "v": 1.0})
+    for shuffled in (rows, rows.iloc[::-1]):
+        assert list(pivot(shuffled, rows_by=["n"], columns_by=[], value="v").index) == [1, 2, 3, 20, 100]
+        table = pivot(shuffled, rows_by=["cameras"], columns_by=[], value="v")
+        assert list(table.index) == ["4", "10", "all", "cam2", "cam10"]
+
+
+def test_failed_runs_do_not_count():
+    rows = results({("paper", 20): [0.070, None, 0.074], ("paper", 100): [None, None]})
+    table = in_mm(rows)
+    assert table.loc["paper", (20, "mean")] == pytest.approx(72.0)
+    assert table.loc["paper", (20, "runs")] == 2
+    assert math.isnan(table.loc["paper", (100, "mean")])
+    assert render(table).splitlines()[-1].split() == ["paper", "72.0", "±", "2.8", "-"]
+
+
+def test_a_single_run_has_no_spread():
+    table = in_mm(results({("paper", 20): [0.0712], ("paper", 100): [0.0412]}))
+    assert render(table) == (
+        "mean_error_mm\n\nparticles    20   100\nmethod\n---------------------\npaper      71.2  41.2\n"
+    )
+
+
+def test_labels_that_are_lists_or_missing():
+    rows = pd.DataFrame({"settings.windows": [(0.5, 1.0), (1.0,), None], "v": [1, 2, 3]})
+    table = pivot(rows, rows_by=["windows"], columns_by=[], value="v")
+    assert list(table.index) == ["0.5 1", "1", "-"]
+    frames = pd.DataFrame({"frames": [100.0, None], "v": [1, 2]})
+    assert list(pivot(frames, rows_by=["frames"], columns_by=[], value="v").index) == [100, "-"]
+
+
+@pytest.mark.parametrize(
+    ("value", "scale", "name"),
+    [
+        ("mean_error_m", 1000.0, "mean_error_mm"),
+        ("track_s", 1000.0, "track_ms"),
+        ("speed_m_s", 1000.0, "speed_m_s x 1000"),
+        ("missed_rate", 100.0, "missed_rate x 100"),
+        ("hota", 1.0, "hota"),
+    ],
+)
+def test_the_name_of_scaled_numbers(value, scale, name):
+    rows = pd.DataFrame({"a": [1], value: [0.5]})
+    table = pivot(rows, rows_by=["a"], columns_by=[], value=value, scale=scale)
+    assert table.attrs["value"] == name
+    assert table.loc[1, "mean"] == 0.5 * scale
+
+
+# --- names
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rows_by": ["methd"]}, "rows: expected the name of one column, found methd; did you mean method?"),
+        ({"columns_by": ["partcles"]}, "columns: .*found partcles; did you mean settings.particles?"),
+        ({"value": "mean_eror_m"}, "value: .*found mean_eror_m; did you mean mean_error_m?"),
+        ({"value": "zzz"}, "value: .*found zzz; there are sequence, method, settings.particles, .*"),
+        ({"value": "sequence"}, "value: expected a column of numbers, found sequence"),
+        ({"rows_by": []}, "rows: expected at least one column, and each only once, found none"),
+        ({"rows_by": ["particles"]}, "rows: .*, found settings.particles twice"),
+        ({"columns_by": ["share"]}, "columns: .*found share; it may be a.share or b.share"),
+    ],
+)
+def test_wrong_columns_are_one_line(changes, message):
+    rows = results(**{"a.share": 1, "b.share": 1})
+    asked = {"rows_by": ["method"], "columns_by": ["settings.particles"], "value": "mean_error_m"} | changes
+    with pytest.raises(SettingsError, match=f"^{message.replace('?', '[?]')}$"):
+        pivot(rows, **asked)
+
+
+def test_a_whole_name_goes_before_the_end_of_another():
+    rows = pd.DataFrame({"frames": [1], "settings.frames": [2], "v": [3]})
+    assert list(pivot(rows, rows_by=["frames"], columns_by=[], value="v").index) == [1]
+
+
+def test_what_is_mixed_is_said(caplog):
+    with caplog.at_level(logging.WARNING):
+        in_mm(results())
+        assert caplog.messages == []
+        in_mm(results(), columns_by=())
+    assert caplog.messages == ["figures are not only over runs: they mix different settings.particles"]
+
+
+def test_draws_are_mixed_without_a_word(caplog):
+    rows = results(**{"perturbation.draw": 0})
+    rows["perturbation.draw"] = rows["settings.seed"]
+    in_mm(rows)
+    assert caplog.messages == []
+
+
+# --- layouts
+
+
+def test_text():
+    assert render(in_mm(results(), ("sequence", "method"))) == (
+        "mean_error_mm: mean ± standard deviation over 3 runs\n"
+        "\n"
+        "          particles          20         100\n"
+        "sequence  method\n"
+        "-------------------------------------------\n"
+        "S01_D2_A  ours       11.0 ± 1.0   6.0 ± 1.0\n"
+        "          paper      72.0 ± 2.0  41.0 ± 1.0\n"
+    )
+
+
+def test_decimals_can_be_said():
+    assert "72 ± 2" in render(in_mm(results()), decimals=0)
+    assert "72.000 ± 2.000" in render(in_mm(results()), decimals=3)
+
+
+def test_whole_numbers_have_no_decimals():
+    rows = pd.DataFrame({"a": [1, 2], "switches": [0, 12]})
+    text = render(pivot(rows, rows_by=["a"], columns_by=[], value="switches"))
+    assert [line.split() for line in text.splitlines()[-2:]] == [["1", "0"], ["2", "12"]]
+
+
+@given(
+    widths=st.tuples(st.integers(1, 3), st.integers(1, 12)),
+    magnitude=st.sampled_from([1e-4, 1.0, 1e3]),
+)
+def test_text_fits_and_loses_nothing(widths, magnitude):
+    """Whatever the number of columns, no line is wider than 80, and every figure is there once per row."""
+    rows = pd.DataFrame(
+        [
+            {
+                "sequence": f"S{row}",
+                "outer": outer,
+                "inner": inner,
+                "v": magnitude * (100 + 10 * outer + inner + run),
+            }
+            for row in range(2)
+            for outer in range(widths[0])
+            for inner in range(widths[1])
+            for run in (-1, 1)
+        ]
+    )
+    table = pivot(rows, rows_by=["sequence"], columns_by=["outer", "inner"], value="v")
+    text = render(table)
+    assert max(map(len, text.splitlines())) <= 80
+    assert text.count("±") == 1 + 2 * math.prod(widths)
+    # Wherever columns are continued, those of the outer level have their label again.
+    blocks = text.split("\n\n")[1:]
+    assert all(block.splitlines()[0].split()[0] == "outer" for block in blocks)
+    assert all(len(block.splitlines()[0].split()) > 1 for block in blocks)
+
+
+def test_markdown():
+    rows = results(sequence="S|1*")
+    assert render(in_mm(rows, ("sequence",), ("method", "particles")), "markdown") == (
+        "mean_error_mm: mean ± standard deviation over 3 runs\n"
+        "\n"
+        "| sequence | method ours, particles 20 | method ours, particles 100 |"
+        " method paper, particles 20 | method paper, particles 100 |\n"
+        "| --- | ---: | ---: | ---: | ---: |\n"
+        "| S\\|1\\* | 11.0 ± 1.0 | 6.0 ± 1.0 | 72.0 ± 2.0 | 41.0 ± 1.0 |\n"
+    )
+
+
+def test_latex():
+    table = in_mm(results(), ("sequence",), ("method", "particles"))
+    assert render(table, "latex") == (
+        "% mean_error_mm: mean ± standard deviation over 3 runs; \\usepackage{booktabs}\n"
+        "\\begin{tabular}{lrrrr}\n"
+        "\\toprule\n"
+        "method & \\multicolumn{2}{c}{ours} & \\multicolumn{2}{c}{paper} \\\\\n"
+        "particles & 20 & 100 & 20 & 100 \\\\\n"
+        "sequence &  &  &  &  \\\\\n"
+        "\\midrule\n"
+        "S01\\_D2\\_A & $11.0 \\pm 1.0$ & $6.0 \\pm 1.0$ & $72.0 \\pm 2.0$ & $41.0 \\pm 1.0$ \\\\\n"
+        "\\bottomrule\n"
+        "\\end{tabular}\n"
+    )
+
+
+def test_latex_escapes_every_sign_that_it_would_read():
+    rows = pd.DataFrame({"name": [r"a\b~c^d&%$#_{}"], "v": [None]}).astype({"v": float})
+    line = render(pivot(rows, rows_by=["name"], columns_by=[], value="v"), "latex").splitlines()[-3]
+    escaped = r"a\textbackslash{}b\textasciitilde{}c\textasciicircum{}d\&\%\$\#\_\{\}"
+    assert line == rf"{escaped} & -- \\"
+
+
+def test_csv_has_all_digits():
+    table = in_mm(results({("a, b", 20): [0.1, 0.2], ("a, b", 100): [1 / 3]}))
+    head, row = csv.reader(io.StringIO(render(table, "csv")))
+    assert head == ["method", *(f"particles {n} {of}" for n in (20, 100) for of in ("mean", "std", "runs"))]
+    assert row[0] == "a, b"
+    assert [float(row[1]), float(row[2]), float(row[4])] == [*table.iloc[0, [0, 1, 3]]]
+    assert (row[3], row[5], row[6]) == ("2", "", "1")
+
+
+def test_formats_that_there_are_not():
+    with pytest.raises(
+        SettingsError, match=r"format: expected one of text, .*, found latx; did you mean latex"
+    ):
+        render(in_mm(results()), "latx")
