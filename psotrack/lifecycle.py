@@ -13,23 +13,17 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
-from scipy.special import logsumexp
 
 from psotrack.newcomers import Newcomer
+from psotrack.wandering import POSITION_STD_M, log_normal, log_wandered
 
 #: In an assignment: a drone that was not there before.
 NEW = -1
 #: In an assignment: no drone, as far as one can tell.
 NOBODY = -2
 
-#: Drones change their velocity within about this time; after it the last one says little of where they are.
-VELOCITY_TIME_S = 1.0
-#: Images of the room to either side: after so many the drone may be anywhere.
-NUM_WALLS = 3
 #: The standard deviation of a drone's velocity along each axis, as a share of its largest speed.
 SPEED_SHARE = 1 / 3
-#: How well places and velocities are measured, along each axis.
-POSITION_STD_M, VELOCITY_STD_M_S = 0.1, 0.3
 #: How well spans are measured (of their logarithm), and what spans there are.
 SPAN_STD, SPANS_M = 0.2, (0.1, 1.5)
 #: A drone that was slower when it vanished stood still, and as likely as this it stays until it is seen to fly off: it
@@ -63,6 +57,7 @@ class Lost:
         size_m: (lost, 3), full lengths along the world's axes.
         doubtful: (lost,), whether it is tracked again, but only where it had vanished, and has not moved since: that
             may be the hole that it left. Such a drone comes back only as what flew off from there.
+        left_m: (places, 3), where any drone ever stood when it vanished: where it is no more there may be a hole.
     """
 
     drone: Int[np.ndarray, "lost"]
@@ -71,6 +66,7 @@ class Lost:
     seconds: Float[np.ndarray, "lost"]
     size_m: Float[np.ndarray, "lost 3"]
     doubtful: Bool[np.ndarray, "lost"]
+    left_m: Float[np.ndarray, "places 3"]
 
 
 @dataclass(frozen=True)
@@ -137,32 +133,41 @@ def lost_drones(
         chunk_frames: so many of the frames are the chunk's.
         fps: frames per second.
     """
-    drones, last, doubtful = [], [], []
-    places, velocities = [], []
+    drones, last, places, velocities, doubtful, left = [], [], [], [], [], []
     for drone in np.flatnonzero(tracked.any(axis=0) & ~holes(position_m, tracked, size_m)).tolist():
         seen = np.flatnonzero(tracked[:, drone])
         vanished = seen[np.flatnonzero(np.diff(seen, append=len(tracked)) > 1)]
         if not len(vanished):
             continue
+        stood = [_stood(position_m[:, drone], seen[seen <= end], fps) for end in vanished.tolist()]
+        left += [place for place in stood if place is not None]
         still = _within_its_place(position_m[seen[seen >= vanished[-1]], drone], size_m[drone])
         there_now = bool(tracked[-1, drone])
         if still or not there_now:
             drones.append(drone)
             last.append(vanished[-1])
+            places.append(position_m[vanished[-1], drone] if stood[-1] is None else stood[-1])
+            velocities.append(velocity_m_s[vanished[-1], drone] if stood[-1] is None else np.zeros(3))
             doubtful.append(there_now)
-            recent = seen[(seen <= vanished[-1]) & (seen >= vanished[-1] - STILL_S * fps)]
-            stood = _stood(position_m[recent, drone], recent / fps)
-            places.append(position_m[vanished[-1], drone] if stood is None else stood)
-            velocities.append(velocity_m_s[vanished[-1], drone] if stood is None else np.zeros(3))
-    rows, columns = np.array(last, int), np.array(drones, int)
+    columns = np.array(drones, int)
     return Lost(
         drone=columns,
         position_m=np.array(places).reshape(-1, 3),
         velocity_m_s=np.array(velocities).reshape(-1, 3),
-        seconds=(len(tracked) - chunk_frames - rows) / fps,
+        seconds=(len(tracked) - chunk_frames - np.array(last, int)) / fps,
         size_m=size_m[columns],
         doubtful=np.array(doubtful, bool),
+        left_m=np.array(left).reshape(-1, 3),
     )
+
+
+def _stood(
+    position_m: Float[np.ndarray, "frames 3"], seen: Int[np.ndarray, "seen"], fps: float
+) -> Float[np.ndarray, "3"] | None:
+    """Where a drone stood when it was last seen; None if it moved."""
+    recent = seen[seen >= seen[-1] - STILL_S * fps]
+    moved_m = float(np.linalg.norm(np.ptp(position_m[recent], axis=0)))
+    return np.median(position_m[recent], axis=0) if moved_m < STILL_M_S * np.ptp(recent) / fps else None
 
 
 def recognised(
@@ -176,9 +181,9 @@ def recognised(
 ) -> Int[np.ndarray, "newcomers"]:
     """Which newcomer is which lost drone: the assignment of the largest likelihood.
 
-    A drone's velocity wanders about 0 (G. E. Uhlenbeck, L. S. Ornstein, On the theory of the Brownian motion, 1930), so
-    that over a short gap it is expected where it was heading, and over a long one anywhere within reach. If it stood,
-    it most probably stayed there. The alternative is a drone that nobody knows, anywhere in the room.
+    A drone's velocity wanders (see `wandering`): over a short gap it is expected where it was heading, over a long one
+    anywhere within reach. If it stood, it most probably stayed there. The alternative is a drone that nobody knows,
+    anywhere in the room.
 
     Args:
         newcomers: of a chunk.
@@ -190,14 +195,18 @@ def recognised(
             even where that is unlikely.
 
     Returns:
-        (newcomers,), a row of `lost`, or `NEW`, or `NOBODY`. What does not move is never new.
+        (newcomers,), a row of `lost`, or `NEW`, or `NOBODY`. What does not move is never new; nor is what hardly does
+        where a drone has stood.
     """
     count = len(lost.drone)
     log_volume = float(np.log(np.prod(bounds_m[1] - bounds_m[0])))
     holes = [any(_flew_off(other, one) for other in newcomers) for one in newcomers]
+    new = [
+        one.moves and not hole and not _left(one, lost) for one, hole in zip(newcomers, holes, strict=True)
+    ]
     scores = np.full((len(newcomers), count + len(newcomers)), _NEVER)
     for row, newcomer in enumerate(newcomers):
-        log_anywhere = _log_normal(newcomer.velocity_m_s, (SPEED_SHARE * max_speed_m_s) ** 2) - log_volume
+        log_anywhere = log_normal(newcomer.velocity_m_s, (SPEED_SHARE * max_speed_m_s) ** 2) - log_volume
         odds = NEW_ODDS if newcomer.moves else NO_DRONE_ODDS
         unknown = log_anywhere + np.log(odds / np.log(SPANS_M[1] / SPANS_M[0]))
         scores[row, count + row] = _UNKNOWN_BUT_PINNED if newcomer.moves and max_births == 0 else unknown
@@ -212,7 +221,7 @@ def recognised(
     ):
         if column < count:
             chosen[row] = column
-        elif newcomers[row].moves and not holes[row] and (max_births is None or births < max_births):
+        elif new[row] and (max_births is None or births < max_births):
             chosen[row] = NEW
             births += 1
     return chosen
@@ -240,14 +249,6 @@ def arrivals_of(
     return Arrivals(begin_frame, position, velocity, sizes)
 
 
-def _stood(
-    position_m: Float[np.ndarray, "frames 3"], time_s: Float[np.ndarray, "frames"]
-) -> Float[np.ndarray, "3"] | None:
-    """Where a drone stood in these frames; None if it moved."""
-    moved_m = float(np.linalg.norm(np.ptp(position_m, axis=0)))
-    return np.median(position_m, axis=0) if moved_m < STILL_M_S * np.ptp(time_s) else None
-
-
 def _log_likelihood(
     newcomer: Newcomer,
     lost: Lost,
@@ -259,14 +260,14 @@ def _log_likelihood(
 ) -> float:
     """Logarithm of how likely a lost drone is seen again as the newcomer: a density over place, velocity and span."""
     place, velocity, span = lost.position_m[row], lost.velocity_m_s[row], float(lost.size_m[row].max())
-    log_span = _log_normal(np.log(newcomer.size_m.max(keepdims=True) / span), SPAN_STD**2)
+    log_span = log_normal(np.log(newcomer.size_m.max(keepdims=True) / span), SPAN_STD**2)
     variance = (SPEED_SHARE * max_speed_m_s) ** 2
     log_stayed = -np.inf
     near_m = STAYED_SPANS * span
     still = float(np.linalg.norm(velocity)) < STILL_M_S
     if still and _distance_on_the_way(newcomer, place) < near_m:
         log_stayed = np.log(STAYED_PROBABILITY / (4 / 3 * np.pi * near_m**3))
-        log_stayed += _log_normal(newcomer.velocity_m_s, variance)
+        log_stayed += log_normal(newcomer.velocity_m_s, variance)
     if lost.doubtful[row]:
         return log_stayed + log_span if newcomer.moves and log_stayed > -np.inf else _NEVER
     gap_s = newcomer.frame / fps + float(lost.seconds[row])
@@ -276,57 +277,10 @@ def _log_likelihood(
     distance = float(np.linalg.norm(newcomer.position_m - place))
     if distance > max_speed_m_s * gap_s + REACH_SIGMAS * POSITION_STD_M:
         return _UNREACHABLE - distance
-    log_flown = max(_log_motion(newcomer, place, velocity, gap_s, variance, bounds_m), log_anywhere)
+    was, seen = np.stack([place, velocity]), np.stack([newcomer.position_m, newcomer.velocity_m_s])
+    log_flown = max(log_wandered(was, seen, gap_s, variance, bounds_m), log_anywhere)
     log_flown += np.log(1 - STAYED_PROBABILITY) if still else 0.0
     return max(log_stayed, log_flown) + log_span
-
-
-def _log_motion(
-    newcomer: Newcomer,
-    position_m: Float[np.ndarray, "3"],
-    velocity_m_s: Float[np.ndarray, "3"],
-    gap_s: float,
-    variance: float,
-    bounds_m: Float[np.ndarray, "2 3"],
-) -> float:
-    """Log density of the newcomer's place and velocity after the gap, of a drone whose velocity wanders about 0.
-
-    It turns at the walls: what would be beyond them is mirrored into the room. After a long gap it is anywhere.
-    """
-    time = VELOCITY_TIME_S
-    left = np.exp(-gap_s / time)
-    to = np.array([[1.0, time * (1 - left)], [0.0, left]])
-    wandered = variance * np.array(
-        [
-            [time**2 * (2 * gap_s / time - 3 + 4 * left - left**2), time * (1 - left) ** 2],
-            [time * (1 - left) ** 2, 1 - left**2],
-        ]
-    )
-    measured = np.diag([POSITION_STD_M**2, VELOCITY_STD_M_S**2])
-    covariance = to @ measured @ to.T + wandered + measured
-    expected = to @ np.stack([position_m, velocity_m_s])
-    seen = _mirrored(newcomer.position_m, newcomer.velocity_m_s, bounds_m)
-    error = seen - expected[:, None]
-    distance2 = np.einsum("iwa,ij,jwa->wa", error, np.linalg.inv(covariance), error)
-    of_axes = logsumexp(-distance2 / 2, axis=0)
-    return float(of_axes.sum() - 3 * np.log(np.linalg.det(2 * np.pi * covariance)) / 2)
-
-
-def _mirrored(
-    position_m: Float[np.ndarray, "3"],
-    velocity_m_s: Float[np.ndarray, "3"],
-    bounds_m: Float[np.ndarray, "2 3"],
-) -> Float[np.ndarray, "2 images 3"]:
-    """Place and velocity along each axis, and their images in the walls, the walls' images, and so on."""
-    low, length = bounds_m[0], bounds_m[1] - bounds_m[0]
-    away = 2 * length * np.arange(-NUM_WALLS, NUM_WALLS + 1)[:, None]
-    place = np.concatenate([position_m + away, 2 * low - position_m + away])
-    velocity = np.repeat([velocity_m_s, -velocity_m_s], len(away), axis=0)
-    return np.stack([place, velocity])
-
-
-def _log_normal(value: Float[np.ndarray, "dims"], variance: float) -> float:
-    return float(-(value @ value / variance + len(value) * np.log(2 * np.pi * variance)) / 2)
 
 
 def _flew_off(newcomer: Newcomer, hole: Newcomer) -> bool:
@@ -335,6 +289,13 @@ def _flew_off(newcomer: Newcomer, hole: Newcomer) -> bool:
     speed, creep = (float(np.linalg.norm(one.velocity_m_s)) for one in (newcomer, hole))
     faster = newcomer.moves and (not hole.moves or creep < min(speed, STILL_M_S))
     return faster and _distance_on_the_way(newcomer, hole.position_m) < near_m
+
+
+def _left(newcomer: Newcomer, lost: Lost) -> bool:
+    """Whether a newcomer is where a drone stood when it vanished, and seems to creep at most, as dying holes do."""
+    near_m = STAYED_SPANS * float(newcomer.size_m.max())
+    creeps = float(np.linalg.norm(newcomer.velocity_m_s)) < STILL_M_S
+    return creeps and bool((np.linalg.norm(lost.left_m - newcomer.position_m, axis=-1) < near_m).any())
 
 
 def _distance_on_the_way(newcomer: Newcomer, place_m: Float[np.ndarray, "3"]) -> float:

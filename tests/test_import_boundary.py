@@ -50,6 +50,7 @@ DEPTH = {
     "unexplained": 3,
     "trajectory_files": 2,
     "video": 2,
+    "wandering": 1,
     "claims": 3,
     "shadows": 4,
     "patches": 5,

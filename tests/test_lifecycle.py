@@ -320,7 +320,7 @@ def newcomer(position_m=(0.0, 0.0, 1.0), velocity_m_s=(1.0, 0.0, 0.0), *, frame=
     return Newcomer(frame, np.array(position_m, float), np.array(velocity_m_s, float), size, 5, moves)
 
 
-def lost(*rows):
+def lost(*rows, left_m=()):
     """Rows of position, velocity, seconds and, where they differ, keywords span_m and doubtful."""
     full = [{"span_m": 0.5, "doubtful": False} | (row[3] if len(row) > 3 else {}) for row in rows]
     return Lost(
@@ -332,6 +332,7 @@ def lost(*rows):
             -1, 3
         ),
         doubtful=np.array([more["doubtful"] for more in full], bool),
+        left_m=np.array(left_m, float).reshape(-1, 3),
     )
 
 
@@ -443,6 +444,17 @@ def test_a_hole_that_seems_to_move_is_no_drone():
     # Two drones that are slow and fast are two.
     elsewhere = newcomer((1.0, 0.0, 1.3), (0.1, 0.0, 1.5), frame=9)
     assert who([hole, elsewhere], lost(stood)) == [0, NEW]
+
+
+def test_a_hole_that_dies_is_not_born():
+    """The background learns the floor again: what is left of the hole seems to move. It was taken for a new drone."""
+    dying = newcomer((2.2, 1.4, 1.5), (-0.1, 0.04, 0.01))
+    assert who([dying], lost(left_m=[(2.2, 1.3, 1.5)])) == [NOBODY]
+    # A drone may creep elsewhere, or fly there; and one that is lost there may be back.
+    assert who([dying], lost(left_m=[(1.2, 1.3, 1.5)])) == [NEW]
+    assert who([newcomer((2.2, 1.4, 1.5))], lost(left_m=[(2.2, 1.3, 1.5)])) == [NEW]
+    stood = ((2.2, 1.3, 1.5), (0.0, 0.0, 0.0), 5.0)
+    assert who([dying], lost(stood, left_m=[(2.2, 1.3, 1.5)])) == [0]
 
 
 def test_a_hole_does_not_keep_a_track():
@@ -578,6 +590,7 @@ def test_half_swallowed_a_drone_only_seems_to_move():
     )
     np.testing.assert_array_equal(gone.position_m[:, 0], [0.0, 0.27, 0.8])
     np.testing.assert_array_equal(gone.velocity_m_s[:, 0], [0.0, 0.3, 0.05])
+    np.testing.assert_array_equal(gone.left_m, [[0.0, 0.0, 0.0]])
 
 
 def test_arrivals_by_hand():

@@ -135,9 +135,9 @@ def judged(trajectories: Trajectories, position_m: np.ndarray) -> Judged:
     drone = np.where(last >= 0, np.take_along_axis(nearest, np.maximum(last, 0), axis=0), -1)
     residual_m = np.take_along_axis(apart_m, np.maximum(drone, 0)[..., None, None], axis=2)[:, :, 0]
     residual_m[~tracked | (drone < 0)] = np.nan
-    return Judged(
-        trajectories, drone, tracked, status == Status.COASTING, residual_m - np.nanmedian(residual_m, axis=0)
-    )
+    for track in np.flatnonzero(np.isfinite(residual_m[..., 0]).any(axis=0)):
+        residual_m[:, track] -= np.nanmedian(residual_m[:, track], axis=0)
+    return Judged(trajectories, drone, tracked, status == Status.COASTING, residual_m)
 
 
 def row(phase: Phase, run: Judged, fps: float) -> dict[str, Any]:
