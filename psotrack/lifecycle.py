@@ -29,8 +29,8 @@ SPAN_STD, SPANS_M = 0.2, (0.1, 1.5)
 #: A drone that was slower when it vanished stood still, and as likely as this it stays until it is seen to fly off: it
 #: vanished in front of the cameras, and flown off it would be foreground.
 STILL_M_S, STAYED_PROBABILITY = 0.2, 0.99
-#: Its speed is that over its last so many seconds: half swallowed, it seems to creep away.
-STILL_S = 1.0
+#: Its speed is that over its last so many seconds, or so many: half swallowed, it seems to creep away.
+STILL_S = (1.0, 0.5)
 #: What was so many spans from there, or had been within the last seconds, stayed or flew off from there.
 STAYED_SPANS, FLOWN_OFF_S = 0.6, 0.6
 #: How much likelier a newcomer is a new drone than one that may be anywhere by now; if it does not move, no drone.
@@ -165,9 +165,12 @@ def _stood(
     position_m: Float[np.ndarray, "frames 3"], seen: Int[np.ndarray, "seen"], fps: float
 ) -> Float[np.ndarray, "3"] | None:
     """Where a drone stood when it was last seen; None if it moved."""
-    recent = seen[seen >= seen[-1] - STILL_S * fps]
-    moved_m = float(np.linalg.norm(np.ptp(position_m[recent], axis=0)))
-    return np.median(position_m[recent], axis=0) if moved_m < STILL_M_S * np.ptp(recent) / fps else None
+    for seconds in STILL_S:
+        recent = seen[seen >= seen[-1] - seconds * fps]
+        moved_m = float(np.linalg.norm(np.ptp(position_m[recent], axis=0)))
+        if moved_m < STILL_M_S * np.ptp(recent) / fps:
+            return np.median(position_m[recent], axis=0)
+    return None
 
 
 def recognised(

@@ -365,7 +365,7 @@ def test_a_second_run_need_not_compile(sequence: Path, tmp_path: Path) -> None:
         kept.append(
             {path: path.stat().st_mtime_ns for path in (tmp_path / "cache" / "compiled").glob("jit*")}
         )
-    assert any(path.name.startswith("jit__track-") for path in kept[0])
+    assert any(path.name.startswith("jit__follow-") for path in kept[0])
     assert kept[0] == kept[1]
     assert (tmp_path / "first.csv").read_bytes() == (tmp_path / "second.csv").read_bytes()
 

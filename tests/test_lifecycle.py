@@ -574,23 +574,27 @@ def test_a_track_in_whose_place_a_drone_was_is_a_hole():
 
 
 def test_half_swallowed_a_drone_only_seems_to_move():
-    """Ten frames at 10 frames per second. One stood until what was left of it crept away; one flew slowly; one stopped.
+    """Ten frames at 10 frames per second. One stood until what was left of it crept away; one flew slowly; one stopped;
+    one has just landed.
 
     The first was said to have vanished flying.
     """
-    position = np.zeros((12, 3, 3))
-    position[..., 1] = (0.0, 1.0, 2.0)
+    position = np.zeros((12, 4, 3))
+    position[..., 1] = (0.0, 1.0, 2.0, 3.0)
     position[8:10, 0, 0] = (0.04, 0.08)
     position[:, 1, 0] = 0.03 * np.arange(12)
-    velocity = np.zeros((12, 3, 3))
+    position[:4, 3, 2] = (0.8, 0.6, 0.4, 0.2)
+    position[9, 3, 0] = 0.06
+    velocity = np.zeros((12, 4, 3))
+    velocity[9, 3, 0] = 0.4
     velocity[8:10, 0, 0], velocity[:, 1, 0], velocity[9, 2, 0] = 0.5, 0.3, 0.05
     position[:, 2, 0] = np.minimum(0.1 * np.arange(12), 0.8)
     gone = lost_drones(
-        position, velocity, history(*["x" * 10 + ".."] * 3), np.full((3, 3), 0.5), chunk_frames=4, fps=10.0
+        position, velocity, history(*["x" * 10 + ".."] * 4), np.full((4, 3), 0.5), chunk_frames=4, fps=10.0
     )
-    np.testing.assert_array_equal(gone.position_m[:, 0], [0.0, 0.27, 0.8])
-    np.testing.assert_array_equal(gone.velocity_m_s[:, 0], [0.0, 0.3, 0.05])
-    np.testing.assert_array_equal(gone.left_m, [[0.0, 0.0, 0.0]])
+    np.testing.assert_array_equal(gone.position_m[:, 0], [0.0, 0.27, 0.8, 0.0])
+    np.testing.assert_array_equal(gone.velocity_m_s[:, 0], [0.0, 0.3, 0.05, 0.0])
+    np.testing.assert_array_equal(gone.left_m, [[0.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
 
 
 def test_arrivals_by_hand():
