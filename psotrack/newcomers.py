@@ -34,6 +34,8 @@ SEARCH_STEP = 8
 SIZE_RATIO, SPANS_M = 2.0, (0.1, 1.5)
 #: What moves by less than this share of its span within `OF_FRAMES` stands still.
 MIN_TRAVEL = 0.04
+#: What goes farther than this share of its span has come from elsewhere.
+MIN_WAY = 0.5
 
 
 @dataclass(frozen=True)
@@ -96,13 +98,15 @@ def newcomers(
     paths: list[list[Glance]] = []
     for frame in range(0, len(coverage) - OF_FRAMES + SEARCH_STEP, SEARCH_STEP):
         for place, size in _proposals(room, rest(coverage[frame], drones, frame), spans_m):
-            path = _followed(room, coverage, drones, frame, place, size)
+            path = _followed(room, coverage, drones, frame, place, size, max_speed_m_s / fps)
             newcomer = _judged(path, size, fps, max_speed_m_s)
             if newcomer is not None and newcomer.moves:
                 # One frame with known drones beside it says little of the size, which says what foreground is its own.
                 best = _best_seen(path)
                 size = _size(find(coverage[best : best + OF_FRAMES]), path[best], size)
-                path = _followed(room, coverage, drones, frame, path[frame].position_m, size)
+                path = _followed(
+                    room, coverage, drones, frame, path[frame].position_m, size, max_speed_m_s / fps
+                )
                 newcomer = _judged(path, size, fps, max_speed_m_s)
             if newcomer is None or not spans_m[0] <= size.max() <= spans_m[1]:
                 continue
@@ -148,8 +152,12 @@ def _followed(
     frame: int,
     position_m: Float[np.ndarray, "3"],
     size_m: Float[np.ndarray, "3"],
+    reach_m: float,
 ) -> list[Glance]:
-    """What is at a place in a frame, and wherever it is before and after it: a glance for each frame."""
+    """What is at a place in a frame, and wherever it is before and after it: a glance for each frame.
+
+    It moves by no more than `reach_m` from frame to frame.
+    """
 
     def look(at: int, place: Float[np.ndarray, "3"]) -> Glance:
         left = rest(coverage[at], drones, at)
@@ -157,8 +165,9 @@ def _followed(
 
     path = [NOTHING] * len(coverage)
     path[frame] = look(frame, position_m)
+    first_shift = _first_shift(room, coverage, drones, frame, path[frame].position_m, size_m, reach_m)
     for step, end in ((1, len(coverage)), (-1, -1)):
-        place, shift, last = path[frame].position_m, np.zeros(3), frame
+        place, shift, last = path[frame].position_m, step * first_shift, frame
         for at in range(frame + step, end, step) if path[frame].there else ():
             gap = abs(at - last)
             seen = look(at, place + gap * shift)
@@ -175,6 +184,24 @@ def _followed(
             elif gap > MAX_GAP:
                 break
     return path
+
+
+def _first_shift(
+    room: Room,
+    coverage: UInt8[np.ndarray, "frames cameras height width"],
+    drones: Known,
+    frame: int,
+    position_m: Float[np.ndarray, "3"],
+    size_m: Float[np.ndarray, "3"],
+    reach_m: float,
+) -> Float[np.ndarray, "3"]:
+    """How far it moves in one frame: a flat drone that sinks fast is out of its ellipse by the next one."""
+    at, sign = (frame + 1, 1) if frame + 1 < len(coverage) else (frame - 1, -1)
+    span_m = float(size_m.max())
+    there = _proposals(room, rest(coverage[at], drones, at), (span_m / SIZE_RATIO, span_m * SIZE_RATIO))
+    shifts = np.array([place - position_m for place, _ in there]).reshape(-1, 3)
+    distance = np.linalg.norm(shifts, axis=-1)
+    return sign * shifts[distance.argmin()] if (distance <= reach_m).any() else np.zeros(3)
 
 
 def _judged(
@@ -203,7 +230,12 @@ def _judged(
 
 
 def _moves(places_m: Float[np.ndarray, "places 3"], span_m: float) -> bool:
-    """Whether it moves at first and at last: a hole only seems to, while the drone is still over it."""
+    """Whether it moves at first and at last, or has come from elsewhere.
+
+    A hole only seems to move, while the drone is still over it, and by a quarter of its span.
+    """
+    if float(np.linalg.norm(places_m[-1] - places_m[0])) > MIN_WAY * span_m:
+        return True
     ends = (places_m[:OF_FRAMES], places_m[-OF_FRAMES:])
     return all(float(np.linalg.norm(np.ptp(end, axis=0))) > MIN_TRAVEL * span_m for end in ends)
 

@@ -221,7 +221,10 @@ def step(
     found = jnp.clip(sharp.position_m, low, high) if program.vertex else found
     fitness, num_cameras = _evidence(view, found, params)
     enough = params.min_fitness * jnp.where(was_lost, REGAIN, 1.0)
+    # Farther off there may be another drone: who it is takes more than a frame to tell (see `lifecycle`).
+    near = jnp.linalg.norm(found - state.motion.apparent_m, axis=-1) < params.size_m.max(axis=-1)
     was_found = state.present & (fitness >= enough) & (num_cameras >= params.min_cameras)
+    was_found &= near | ~was_lost
     dispersion = _averaged(state.dispersion, sharp.dispersion, was_found)
     covariance = COMMON * dispersion[:, None, None] * sharp.inverse_curvature_m2
 

@@ -25,7 +25,7 @@ from psotrack.cameras import Camera, CameraRig
 from psotrack.crew import Crew, Followed, follow
 from psotrack.fitness import PAPER_SCORE, ScoreSettings
 from psotrack.initialisation import Start
-from psotrack.lifecycle import Arrivals, arrivals_of, lost_drones, recognised
+from psotrack.lifecycle import Arrivals, arrivals_of, holes, lost_drones, recognised
 from psotrack.motion import MotionParams
 from psotrack.newcomers import newcomers
 from psotrack.progress import Report, silent
@@ -134,9 +134,9 @@ def track_silhouettes(
             for number, result in zip(again, once_more, strict=True):
                 followed[number] = result
             for run, (crew, info, looks) in zip(runs, followed, strict=True):
-                run.crew = crew
                 run.infos.append(info)
                 run.looks.append(looks)
+                run.crew = _without_holes(crew, run.infos)
             advance(frames)
     return [
         Tracked(
@@ -322,6 +322,17 @@ def _coming(chunk: np.ndarray, infos: list[tracker.TrackerInfo], run: _Run, plac
     )
     coming = arrivals_of(found, who, lost, len(crew))
     return coming if (coming.begin_frame >= 0).any() else None
+
+
+def _without_holes(crew: Crew, infos: list[tracker.TrackerInfo]) -> Crew:
+    """The crew without the tracks that turned out to be of no drone: they are sought no more."""
+    whole = _joined(infos, len(crew))
+    none = holes(
+        np.asarray(whole.position_m, np.float64),
+        np.asarray(whole.status) == Status.TRACKED,
+        np.asarray(crew.params.size_m, np.float64),
+    )
+    return replace(crew, state=replace(crew.state, present=crew.state.present & ~jnp.asarray(none)))
 
 
 def _explains(infos: list[tracker.TrackerInfo]) -> Bool[np.ndarray, "frames drones"]:

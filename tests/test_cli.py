@@ -362,10 +362,10 @@ def test_a_second_run_need_not_compile(sequence: Path, tmp_path: Path) -> None:
     for name in ("first.csv", "second.csv"):
         command = [*track(sequence, tmp_path / name, "--frames", 12), "--cache", tmp_path / "cache"]
         subprocess.run([sys.executable, "-m", "psotrack", *map(str, command)], check=True)
-        kept.append(
-            {path: path.stat().st_mtime_ns for path in (tmp_path / "cache" / "compiled").glob("jit*")}
-        )
-    assert any(path.name.startswith("jit__follow-") for path in kept[0])
+        # Lesser programs compile in about the time from which on they are worth keeping: either way is right.
+        compiled = (tmp_path / "cache" / "compiled").glob("jit__follow-*")
+        kept.append({path.name: path.stat().st_mtime_ns for path in compiled})
+    assert kept[0]
     assert kept[0] == kept[1]
     assert (tmp_path / "first.csv").read_bytes() == (tmp_path / "second.csv").read_bytes()
 

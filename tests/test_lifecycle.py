@@ -236,6 +236,16 @@ def test_half_hidden_by_a_known_drone():
     np.testing.assert_allclose(found.position_m, other[0], atol=CELL_M)
 
 
+def test_a_flat_drone_that_sinks_fast():
+    """From frame to frame it moves by more than it is high: nobody knows yet where to look for it in the next one."""
+    size_m = np.array([0.5, 0.5, 0.12])
+    known, sinking = path((-0.6, 0.6, 0.9)), path((0.6, -0.5, 2.9), (0.0, 0.0, -2.8))[:15]
+    silhouettes = np.maximum(drawn(known, size_m=size_m)[:15], drawn(sinking, size_m=size_m))
+    (found,) = found_in(silhouettes, known, size_m=size_m)
+    np.testing.assert_allclose(found.position_m, sinking[found.frame], atol=2 * CELL_M)
+    assert found.moves
+
+
 def test_what_stands_still_is_marked():
     """A hole in the background looks like a drone that does not move, and is told by that alone."""
     hole, drone = path((0.6, -0.5, 1.5)), OTHER

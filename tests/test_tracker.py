@@ -204,6 +204,19 @@ def test_a_drone_that_vanishes_coasts_is_lost_and_comes_back(interrupted):
     assert error_m[:, 1].max() < CELL_M
 
 
+def test_a_lost_drone_is_not_what_comes_within_its_reach():
+    """More than its span off it may be another one; the tracker, which knows one frame, leaves that to others."""
+    gone, other = HOVER_M.copy(), HOVER_M.copy()
+    other[0] += (0.7, 0.0, 0.0)
+    before, alone, after = (
+        draw_coverage(RIG, *of, REDUCTION) for of in ((gone, SIZE_M), (gone[1:], SIZE_M[1:]), (other, SIZE_M))
+    )
+    silhouettes = np.stack([before] * 4 + [alone] * 12 + [after] * (NUM_FRAMES - 16))
+    _, info = track(silhouettes, HOVER_M, np.zeros((2, 3)), max_coasting_s=5 / FPS, max_speed_m_s=3.0)
+    assert (info.status[:4, 0] == Status.TRACKED).all()
+    assert (info.status[10:, 0] == Status.LOST).all()
+
+
 def test_coasting_goes_straight_on(coverage):
     """Without any foreground a drone flies on at its last velocity, and stands still once it is lost."""
     state, info = track(np.zeros_like(coverage), max_coasting_s=8 / FPS)
