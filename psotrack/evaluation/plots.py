@@ -67,7 +67,7 @@ def save_trajectories(
     def draw(figure: Figure) -> None:
         draw_trajectories(figure.add_subplot(projection="3d"), traj_est, traj_ref)
 
-    _save(path, (7.5, 5.5), draw, force)
+    save(path, (7.5, 5.5), draw, force)
 
 
 def save_errors(path: Path, traj_est: Trajectories, traj_ref: Trajectories, *, force: bool = False) -> None:
@@ -76,7 +76,7 @@ def save_errors(path: Path, traj_est: Trajectories, traj_ref: Trajectories, *, f
     def draw(figure: Figure) -> None:
         draw_errors(figure.add_subplot(), traj_est, traj_ref)
 
-    _save(path, (9.0, 4.0), draw, force)
+    save(path, (9.0, 4.0), draw, force)
 
 
 def save_overview(path: Path, traj_est: Trajectories, traj_ref: Trajectories, *, force: bool = False) -> None:
@@ -87,7 +87,7 @@ def save_overview(path: Path, traj_est: Trajectories, traj_ref: Trajectories, *,
         draw_trajectories(figure.add_subplot(grid[0], projection="3d"), traj_est, traj_ref)
         draw_errors(figure.add_subplot(grid[1]), traj_est, traj_ref)
 
-    _save(path, (8.0, 8.5), draw, force)
+    save(path, (8.0, 8.5), draw, force)
 
 
 def draw_trajectories(axes: Axes3D, traj_est: Trajectories, traj_ref: Trajectories) -> None:
@@ -157,7 +157,8 @@ def colour_of(drone: int) -> str:
     return COLOURS[drone % len(COLOURS)]
 
 
-def _save(path: Path, size_inches: tuple[float, float], draw: Callable[[Figure], None], force: bool) -> None:
+def save(path: Path, size_inches: tuple[float, float], draw: Callable[[Figure], None], force: bool) -> None:
+    """Save a PNG of what `draw` draws, without a window; see `save_trajectories` for what is raised."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -1,0 +1,293 @@
+"""Results as figures: error against work, error over time, errors drone by drone.
+
+The functions that draw make a figure of Matplotlib's that `pyplot`, with its global state, knows nothing of; a notebook
+shows what they return, `save` keeps it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float, Int
+
+from psotrack.errors import SettingsError
+from psotrack.evaluation.plots import COLOURS, colour_of
+from psotrack.files import refuse_to_overwrite, written_whole
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_DARK, _GREY, _LIGHT = "#2b313a", "#9aa3ad", "#e3e6ea"
+_DPI = 150
+_MARKERS = "osD^vP"
+#: Between the boxes of a drone, in parts of the distance between drones.
+_BOXES = 0.8
+
+
+def save(path: Path, figure: Figure, *, force: bool = False) -> None:
+    """Save a figure as PNG.
+
+    Raises:
+        OutputError: the file exists and `force` is not set, or it cannot be written.
+    """
+    refuse_to_overwrite(path, force)
+    with written_whole(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=_DPI)
+
+
+def pareto_front(
+    work: Float[np.ndarray, "cells"], error: Float[np.ndarray, "cells"]
+) -> Int[np.ndarray, "front"]:
+    """The cells than which no other is better in one and at least as good in the other, by ascending work.
+
+    NaN is never on it; of cells that are equal in both the first is.
+    """
+    order = np.lexsort((error, work))
+    order = order[np.isfinite(work[order]) & np.isfinite(error[order])]
+    best = np.minimum.accumulate(np.append(np.inf, error[order]))[:-1]
+    return order[error[order] < best]
+
+
+def error_against_work(
+    rows: pd.DataFrame,
+    *,
+    error: str = "mean_error_m",
+    published: Mapping[str, tuple[float, float]] | None = None,
+) -> Figure:
+    """What a millimetre costs: a panel per sequence, a point per cell, the Pareto front of all methods as a line.
+
+    Points on the front are named by particles x iterations. Bars are the standard deviation over runs.
+
+    Args:
+        rows: of results, one per cell and run (`sweep`).
+        error: the column of errors, metres.
+        published: sequence -> lowest and highest error that others published, metres; drawn as a band.
+    """
+    cells = _cells(rows, error)
+    sequences, methods = list(dict.fromkeys(cells["sequence"])), list(dict.fromkeys(cells["method"]))
+    figure = _figure(4.6 * len(sequences), 4.4)
+    panels = figure.subplots(1, len(sequences), sharey=True, squeeze=False)[0]
+    for axes, sequence in zip(panels, sequences, strict=True):
+        here = cells[cells["sequence"] == sequence]
+        if sequence in (published or {}):
+            low, high = (1e3 * value for value in (published or {})[sequence])
+            axes.axhspan(low, max(high, 1.02 * low), color=_LIGHT, label="published", zorder=0)
+        front = here.iloc[pareto_front(here["work"].to_numpy(), here["error"].to_numpy())]
+        axes.plot(
+            front["work"],
+            front["error"],
+            color=_DARK,
+            linewidth=0.9,
+            zorder=1,
+            label="Pareto front",
+            drawstyle="steps-post",
+        )
+        for number, method in enumerate(methods):
+            of = here[here["method"] == method]
+            axes.errorbar(
+                of["work"],
+                of["error"],
+                of["std"],
+                fmt=_MARKERS[number % len(_MARKERS)],
+                color=COLOURS[number % len(COLOURS)],
+                markersize=5,
+                linewidth=0.8,
+                label=method,
+            )
+        for _, point in front.iterrows():
+            axes.annotate(
+                f"{point['particles']:.0f} x {point['iterations']:.0f}",
+                (point["work"], point["error"]),
+                xytext=(2, -11),
+                textcoords="offset points",
+                fontsize=7,
+                color=_DARK,
+            )
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        _finish(axes, "track stage (ms per frame)", "mean error (mm)" if axes is panels[0] else "", sequence)
+        _plain_numbers(axes)
+    _legend(figure, panels)
+    return figure
+
+
+def error_over_time(errors: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
+    """A panel per method: each drone's error in the run of median error, and the identity switches of all runs.
+
+    Args:
+        errors: method -> rows of `errors_over_time` with a column `seed`.
+        title: above all.
+    """
+    figure = _figure(9.0, 0.8 + 2.1 * len(errors))
+    panels = figure.subplots(len(errors), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, (method, rows) in zip(panels, errors.items(), strict=True):
+        seed = _median_run(rows)
+        run = rows[rows["seed"] == seed]
+        for number, (drone, of) in enumerate(run.groupby("drone", observed=True)):
+            axes.plot(of["time_s"], 1e3 * of["error_m"], color=colour_of(number), linewidth=1.0, label=drone)
+            missed = of[of["error_m"].isna()]
+            if len(missed):
+                axes.plot([], [], color=_GREY, linewidth=1.5, label="missed")
+            axes.plot(
+                missed["time_s"],
+                np.full(len(missed), 0.97 - 0.03 * number),
+                linestyle="",
+                marker="_",
+                markersize=3,
+                color=colour_of(number),
+                transform=axes.get_xaxis_transform(),
+            )
+        for own, of in ((True, run), (False, rows[rows["seed"] != seed])):
+            moments = np.unique(of.loc[of["switch"], "time_s"])
+            if own:
+                label = "identity switch"
+                for index, moment in enumerate(moments):
+                    axes.axvline(
+                        moment, color=_DARK, linestyle=":", linewidth=1.1, label=label if not index else None
+                    )
+            elif len(moments):
+                axes.plot(
+                    moments,
+                    np.full(len(moments), 0.02),
+                    linestyle="",
+                    marker="|",
+                    color=_GREY,
+                    transform=axes.get_xaxis_transform(),
+                    label="switch in another run",
+                )
+        error_mm = 1e3 * run["error_m"].dropna()
+        if error_mm.max() > 10 * error_mm.median():
+            # What is smaller than nearly all would take half of the scale.
+            axes.set_yscale("log")
+            axes.set_ylim(bottom=error_mm.quantile(0.02))
+            _plain_numbers(axes, "y")
+        else:
+            axes.set_ylim(bottom=0.0)
+        runs = rows["seed"].nunique()
+        which = f"run {seed}, the median of {runs}" if runs > 1 else f"run {seed}"
+        _finish(axes, "time (s)" if axes is panels[-1] else "", "error (mm)", f"{method}: {which}")
+    figure.suptitle(title, fontsize=10, color=_DARK)
+    _legend(figure, panels)
+    return figure
+
+
+def error_per_drone(errors: Mapping[str, Mapping[str, pd.DataFrame]]) -> Figure:
+    """A panel per sequence, a box per drone and method: the errors of all frames and runs.
+
+    A box holds the middle half, its line is the median, the whiskers hold 90 %.
+
+    Args:
+        errors: sequence -> method -> rows of `errors_over_time`.
+    """
+    figure = _figure(9.0, 0.8 + 2.3 * len(errors))
+    panels = figure.subplots(len(errors), 1, squeeze=False)[:, 0]
+    for axes, (sequence, methods) in zip(panels, errors.items(), strict=True):
+        width = _BOXES / len(methods)
+        for number, (method, rows) in enumerate(methods.items()):
+            colour = COLOURS[number % len(COLOURS)]
+            groups = [
+                (str(name), of["error_m"].dropna()) for name, of in rows.groupby("drone", observed=True)
+            ]
+            places = np.arange(len(groups)) + (number - (len(methods) - 1) / 2) * width
+            boxes = axes.boxplot(
+                [1e3 * values for _, values in groups],
+                positions=places,
+                widths=0.85 * width,
+                whis=(5, 95),
+                showfliers=False,
+                patch_artist=True,
+                manage_ticks=False,
+                medianprops={"color": "white", "linewidth": 1.4},
+                boxprops={"facecolor": colour, "edgecolor": colour},
+                whiskerprops={"color": colour},
+                capprops={"color": colour},
+            )
+            boxes["boxes"][0].set_label(method)
+            axes.set_xticks(np.arange(len(groups)), [name for name, _ in groups])
+        axes.set_yscale("log")
+        _plain_numbers(axes, "y")
+        _finish(axes, "", "error (mm)", sequence)
+    _legend(figure, panels)
+    return figure
+
+
+def _cells(rows: pd.DataFrame, error: str) -> pd.DataFrame:
+    """One row per cell: sequence, method, particles, iterations, work (ms per frame), error and its spread (mm)."""
+    needed = {
+        "sequence": "sequence",
+        "method": "method",
+        "particles": "settings.particles",
+        "iterations": "settings.iterations",
+    }
+    for name in (*needed.values(), "track_ms_per_frame", error):
+        if name not in rows:
+            raise SettingsError("rows", expected=f"a column {name}", found="none")
+    cells = rows.groupby(list(needed.values()), sort=False)
+    table = pd.DataFrame(
+        {
+            "work": cells["track_ms_per_frame"].mean(),
+            "error": 1e3 * cells[error].mean(),
+            "std": 1e3 * cells[error].std().fillna(0.0),
+        }
+    ).reset_index()
+    return table.rename(columns={long: short for short, long in needed.items()})
+
+
+def _median_run(rows: pd.DataFrame) -> Any:
+    """The seed of the run whose mean error is the median of all, the lower one of two."""
+    means = rows.groupby("seed")["error_m"].mean().sort_values()
+    return means.index[(len(means) - 1) // 2]
+
+
+def _figure(width_in: float, height_in: float) -> Figure:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure((width_in, height_in), dpi=_DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _finish(axes: Axes, x: str, y: str, title: str) -> None:
+    axes.set_title(title, fontsize=9, color=_DARK, loc="left")
+    axes.set_xlabel(x, color=_DARK)
+    axes.set_ylabel(y, color=_DARK)
+    axes.grid(color=_LIGHT, linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.tick_params(colors=_DARK, labelsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(_GREY)
+
+
+def _plain_numbers(axes: Axes, which: str = "both") -> None:
+    """Numbers such as 20 and 50 on a logarithmic scale, not powers of ten."""
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    for name, axis in (("x", axes.xaxis), ("y", axes.yaxis)):
+        if which in (name, "both"):
+            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axis.set_minor_formatter(NullFormatter())
+
+
+def _legend(figure: Figure, panels: Iterable[Axes]) -> None:
+    """One for all panels, below them."""
+    labelled = {
+        label: handle
+        for axes in panels
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(
+        list(labelled.values()),
+        list(labelled),
+        loc="outside lower center",
+        ncols=min(len(labelled), 7),
+        frameon=False,
+        fontsize=8.5,
+        labelcolor=_DARK,
+    )

@@ -1,0 +1,160 @@
+"""Figures of sweeps: what is drawn are the numbers; and the frame of errors over time that two of them show."""
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from psotrack.errors import OutputError, SettingsError
+from psotrack.evaluation import errors_over_time, evaluate
+from psotrack.sweep import figures
+from psotrack.trajectories import Status, Trajectories
+
+NUM_FRAMES = 50
+
+
+def flights():
+    """Two drones 3 m apart; the estimate is 20 mm off, misses the second for ten frames, swaps from frame 40 on."""
+    frame = np.arange(NUM_FRAMES)
+    ref_m = np.zeros((NUM_FRAMES, 2, 3)) + np.array([[0.0, 0, 1], [3.0, 0, 1]])
+    est_m = ref_m + np.array([0.02, 0, 0])
+    est_m[40:] = est_m[40:, ::-1]
+    status = np.full((NUM_FRAMES, 2), Status.TRACKED)
+    status[10:20, 1] = Status.LOST
+    estimate = Trajectories(frame, frame / 25, ("0", "1"), est_m, status=status)
+    return estimate, Trajectories(frame, frame / 25, ("dron1", "dron2"), ref_m)
+
+
+class TestErrorsOverTime:
+    def test_by_hand(self):
+        errors = errors_over_time(*flights())
+        assert list(errors) == ["frame", "time_s", "drone", "error_m", "switch"]
+        assert list(errors["drone"]) == ["dron1"] * NUM_FRAMES + ["dron2"] * NUM_FRAMES
+        assert list(errors["frame"]) == [*range(NUM_FRAMES)] * 2
+        np.testing.assert_allclose(errors["time_s"], errors["frame"] / 25)
+        np.testing.assert_allclose(errors["error_m"][:40], 0.02)
+        # The other one's place, and 20 mm more or less.
+        np.testing.assert_allclose(errors["error_m"][40:50], 3.02)
+        np.testing.assert_allclose(errors["error_m"][90:], 2.98)
+        assert list(np.flatnonzero(errors["error_m"].isna())) == [*range(60, 70)]
+        assert list(np.flatnonzero(errors["switch"])) == [40, 90]
+
+    def test_as_evaluated(self):
+        errors, evaluation = errors_over_time(*flights()), evaluate(*flights())
+        assert errors["error_m"].mean() == pytest.approx(evaluation.mean_error_m)
+        assert errors["error_m"].isna().mean() == pytest.approx(evaluation.missed_rate)
+        assert errors["switch"].sum() == evaluation.id_switches
+
+    def test_where_truth_is_unknown_there_is_no_row(self):
+        estimate, reference = flights()
+        reference.position_m[5:8, 0] = np.nan
+        assert len(errors_over_time(estimate, reference)) == 2 * NUM_FRAMES - 3
+
+
+numbers = st.one_of(st.integers(0, 5).map(float), st.just(float("nan")))
+
+
+@given(st.lists(st.tuples(numbers, numbers), max_size=12))
+def test_the_front_is_what_nothing_dominates(cells):
+    """By comparing all with all; of equal ones the first."""
+    work, error = np.array(cells, float).reshape(-1, 2).T
+
+    def dominated(one):
+        return any(
+            (
+                (work[other], error[other]) != (work[one], error[one])
+                and work[other] <= work[one]
+                and error[other] <= error[one]
+            )
+            or (other < one and (work[other], error[other]) == (work[one], error[one]))
+            for other in range(len(cells))
+        )
+
+    expected = [one for one in range(len(cells)) if np.isfinite(cells[one]).all() and not dominated(one)]
+    front = figures.pareto_front(work, error)
+    assert sorted(front) == expected
+    assert (np.diff(work[front]) > 0).all()
+    assert (np.diff(error[front]) < 0).all()
+
+
+def rows():
+    """Errors of 30 and 50 mm of one method, 20 mm of the other, twice each; work as particles times iterations."""
+    table = [
+        (sequence, method, particles, iterations, seed, particles * iterations / 100, error_m + 0.001 * seed)
+        for sequence in ("S01", "S02")
+        for method, particles, iterations, error_m in (
+            ("paper", 20, 50, 0.05),
+            ("paper", 50, 50, 0.03),
+            ("ours", 30, 50, 0.02),
+        )
+        for seed in (0, 1)
+    ]
+    names = ("sequence", "method", "settings.particles", "settings.iterations", "seed")
+    return pd.DataFrame(table, columns=[*names, "track_ms_per_frame", "mean_error_m"])
+
+
+def lines_of(axes):
+    return {line.get_label(): line.get_xydata() for line in axes.lines}
+
+
+class TestErrorAgainstWork:
+    def test_points_front_and_published(self):
+        figure = figures.error_against_work(rows(), published={"S02": (0.068, 0.068)})
+        first, second = figure.axes
+        assert [axes.get_title(loc="left") for axes in (first, second)] == ["S01", "S02"]
+        # 20 x 50 of the paper's is the least work, 30 x 50 of ours the least error.
+        np.testing.assert_allclose(lines_of(first)["Pareto front"], [(10, 50.5), (15, 20.5)])
+        assert [text.get_text() for text in first.texts] == ["20 x 50", "30 x 50"]
+        bars = {container.get_label(): container for container in first.containers}
+        np.testing.assert_allclose(bars["paper"].lines[0].get_xydata(), [(10, 50.5), (25, 30.5)])
+        np.testing.assert_allclose(bars["ours"].lines[0].get_xydata(), [(15, 20.5)])
+        assert [patch.get_label() for patch in second.patches] == ["published"]
+        assert not first.patches
+        assert first.get_xlabel() == "track stage (ms per frame)"
+        assert first.get_ylabel() == "mean error (mm)"
+
+    def test_a_column_is_missing(self):
+        with pytest.raises(SettingsError, match="track_ms_per_frame"):
+            figures.error_against_work(rows().drop(columns="track_ms_per_frame"))
+
+
+def errors():
+    """Three runs of the flights' errors; in the last they are twice as large, and nothing is switched."""
+    parts = [errors_over_time(*flights()).assign(seed=seed) for seed in (3, 4, 5)]
+    parts[2] = parts[2].assign(error_m=2 * parts[2]["error_m"], switch=False)
+    parts[1] = parts[1].assign(error_m=1.5 * parts[1]["error_m"])
+    return pd.concat(parts, ignore_index=True)
+
+
+def test_error_over_time():
+    (axes,) = figures.error_over_time({"paper": errors()}, "S02").axes
+    assert axes.get_title(loc="left") == "paper: run 4, the median of 3"
+    drawn = lines_of(axes)
+    np.testing.assert_allclose(drawn["dron1"][:40, 1], 30.0)
+    np.testing.assert_allclose(drawn["dron1"][:, 0], np.arange(NUM_FRAMES) / 25)
+    np.testing.assert_allclose(drawn["identity switch"][:, 0], 1.6)
+    np.testing.assert_allclose(drawn["switch in another run"][:, 0], 1.6)
+    assert "missed" in drawn
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("time (s)", "error (mm)")
+
+
+def test_error_per_drone():
+    one = errors()
+    (axes,) = figures.error_per_drone({"S02": {"paper": one, "ours": one.assign(error_m=0.01)}}).axes
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["dron1", "dron2"]
+    medians = sorted(line.get_ydata()[0] for line in axes.lines if line.get_color() == "white")
+    # Of dron1: three times 40 frames of 20, 30, 40 mm and ten of metres.
+    np.testing.assert_allclose(medians[:2], 10.0)
+    assert medians[2] == pytest.approx(30.0)
+
+
+def test_saved_whole_and_not_twice(tmp_path):
+    path = tmp_path / "figures" / "work.png"
+    figures.save(path, figures.error_against_work(rows()))
+    assert cv2.imread(str(path)).std() > 5
+    with pytest.raises(OutputError, match=r"work\.png"):
+        figures.save(path, figures.error_against_work(rows()))
+    figures.save(path, figures.error_against_work(rows()), force=True)
+    assert [child.name for child in path.parent.iterdir()] == ["work.png"]
