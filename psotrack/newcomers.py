@@ -97,16 +97,18 @@ def newcomers(
     found: list[Newcomer] = []
     paths: list[list[Glance]] = []
     for frame in range(0, len(coverage) - OF_FRAMES + SEARCH_STEP, SEARCH_STEP):
-        for place, size in _proposals(room, rest(coverage[frame], drones, frame), spans_m):
-            path = _followed(room, coverage, drones, frame, place, size, max_speed_m_s / fps)
+        proposals = _proposals(room, rest(coverage[frame], drones, frame), spans_m)
+        beside = _beside(frame, len(coverage))
+        there = _proposals(room, rest(coverage[beside], drones, beside), spans_m) if proposals else []
+        for place, size in proposals:
+            shift = (beside - frame) * _shift(place, size, there, max_speed_m_s / fps)
+            path = _followed(room, coverage, drones, frame, place, size, shift)
             newcomer = _judged(path, size, fps, max_speed_m_s)
             if newcomer is not None and newcomer.moves:
                 # One frame with known drones beside it says little of the size, which says what foreground is its own.
                 best = _best_seen(path)
                 size = _size(find(coverage[best : best + OF_FRAMES]), path[best], size)
-                path = _followed(
-                    room, coverage, drones, frame, path[frame].position_m, size, max_speed_m_s / fps
-                )
+                path = _followed(room, coverage, drones, frame, path[frame].position_m, size, shift)
                 newcomer = _judged(path, size, fps, max_speed_m_s)
             if newcomer is None or not spans_m[0] <= size.max() <= spans_m[1]:
                 continue
@@ -152,11 +154,11 @@ def _followed(
     frame: int,
     position_m: Float[np.ndarray, "3"],
     size_m: Float[np.ndarray, "3"],
-    reach_m: float,
+    shift_m: Float[np.ndarray, "3"],
 ) -> list[Glance]:
     """What is at a place in a frame, and wherever it is before and after it: a glance for each frame.
 
-    It moves by no more than `reach_m` from frame to frame.
+    It moves by about `shift_m` from that frame to the next.
     """
 
     def look(at: int, place: Float[np.ndarray, "3"]) -> Glance:
@@ -165,9 +167,8 @@ def _followed(
 
     path = [NOTHING] * len(coverage)
     path[frame] = look(frame, position_m)
-    first_shift = _first_shift(room, coverage, drones, frame, path[frame].position_m, size_m, reach_m)
     for step, end in ((1, len(coverage)), (-1, -1)):
-        place, shift, last = path[frame].position_m, step * first_shift, frame
+        place, shift, last = path[frame].position_m, step * shift_m, frame
         for at in range(frame + step, end, step) if path[frame].there else ():
             gap = abs(at - last)
             seen = look(at, place + gap * shift)
@@ -186,22 +187,26 @@ def _followed(
     return path
 
 
-def _first_shift(
-    room: Room,
-    coverage: UInt8[np.ndarray, "frames cameras height width"],
-    drones: Known,
-    frame: int,
-    position_m: Float[np.ndarray, "3"],
+def _beside(frame: int, num_frames: int) -> int:
+    """The next frame, or the one before the last."""
+    return frame + 1 if frame + 1 < num_frames else frame - 1
+
+
+def _shift(
+    place_m: Float[np.ndarray, "3"],
     size_m: Float[np.ndarray, "3"],
+    beside: list[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]],
     reach_m: float,
 ) -> Float[np.ndarray, "3"]:
-    """How far it moves in one frame: a flat drone that sinks fast is out of its ellipse by the next one."""
-    at, sign = (frame + 1, 1) if frame + 1 < len(coverage) else (frame - 1, -1)
-    span_m = float(size_m.max())
-    there = _proposals(room, rest(coverage[at], drones, at), (span_m / SIZE_RATIO, span_m * SIZE_RATIO))
-    shifts = np.array([place - position_m for place, _ in there]).reshape(-1, 3)
+    """How far it is to the nearest place beside of about its span; 0 if that is farther than anything moves.
+
+    A flat drone that sinks fast is out of its ellipse by the next frame: it must be known where to look for it.
+    """
+    span = size_m.max()
+    alike = [place for place, size in beside if 1 / SIZE_RATIO <= size.max() / span <= SIZE_RATIO]
+    shifts = np.array([place - place_m for place in alike]).reshape(-1, 3)
     distance = np.linalg.norm(shifts, axis=-1)
-    return sign * shifts[distance.argmin()] if (distance <= reach_m).any() else np.zeros(3)
+    return shifts[distance.argmin()] if (distance <= reach_m).any() else np.zeros(3)
 
 
 def _judged(

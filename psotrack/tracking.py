@@ -289,6 +289,19 @@ def _coming(chunk: np.ndarray, infos: list[tracker.TrackerInfo], run: _Run, plac
     """Drones that come, or come back, in the last of the chunks that were tracked; None if there are none."""
     settings, crew, fps, frames = run.settings, run.crew, place.fps, len(chunk)
     size_m = np.asarray(crew.params.size_m, np.float64)
+    whole = _joined(infos, len(crew))
+    lost = lost_drones(
+        np.asarray(whole.position_m, np.float64),
+        np.asarray(whole.velocity_m_s, np.float64),
+        np.asarray(whole.status) == Status.TRACKED,
+        size_m,
+        chunk_frames=frames,
+        fps=fps,
+    )
+    births = None if settings.drones is None else max(settings.drones - len(crew), 0)
+    if births == 0 and not len(lost.drone):
+        # Whatever is there is nobody; with noisy silhouettes to look at it takes long.
+        return None
     found = newcomers(
         place.rig.cameras,
         chunk,
@@ -300,18 +313,6 @@ def _coming(chunk: np.ndarray, infos: list[tracker.TrackerInfo], run: _Run, plac
         bounds_m=run.bounds_m,
         max_speed_m_s=settings.max_speed_m_s,
     )
-    if not found:
-        return None
-    whole = _joined(infos, len(crew))
-    lost = lost_drones(
-        np.asarray(whole.position_m, np.float64),
-        np.asarray(whole.velocity_m_s, np.float64),
-        np.asarray(whole.status) == Status.TRACKED,
-        size_m,
-        chunk_frames=frames,
-        fps=fps,
-    )
-    births = None if settings.drones is None else max(settings.drones - len(crew), 0)
     who = recognised(
         found,
         lost,
