@@ -12,10 +12,10 @@ install = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python
 oracle = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python $(BIN)/python --no-deps 'trackeval>=1.3'; \
 	else $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'trackeval>=1.3'; fi
 
-.PHONY: help demo test test-fast lint format bench clean
+.PHONY: help demo test test-fast lint format bench notebooks table5 table5-quick clean
 
 help:  ## what can be made
-	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
 $(VENV)/.installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null \
@@ -49,5 +49,14 @@ bench: $(VENV)/.installed  ## the swarm against pyswarms and evosax
 	@$(call install,bench)
 	@$(BIN)/python experiments/benchmarks/track_stage.py
 
+notebooks: $(VENV)/.installed  ## run the notebooks and write them with what they show; commit what comes of it
+	@cd notebooks && ../$(BIN)/python _refresh.py
+
+table5: $(VENV)/.installed  ## the paper's Table 5 beside ours, an hour; DATA=FOLDER for the published sequences
+	@$(BIN)/python experiments/table5/table5.py $(if $(DATA),--data $(DATA))
+
+table5-quick: $(VENV)/.installed  ## a small form of it, five minutes
+	@$(BIN)/python experiments/table5/table5.py --quick $(if $(DATA),--data $(DATA))
+
 clean:  ## remove what was built, the environment too
-	rm -rf $(VENV) build dist demo ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist demo notebooks/data ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -203,12 +203,19 @@ def _decoded(
 
 
 def _publish(temporary: Path, path: Path, num_frames: int, shape: tuple[int, int]) -> None:
-    """Rename into place, unless someone else was first."""
+    """Rename into place, unless someone else was first.
+
+    What is whole is never taken away, not for a moment: whoever reads it would see zeros.
+    """
+    try:
+        os.rename(temporary, path)  # not over a folder that has something in it
+        return
+    except OSError:
+        if not path.exists():
+            raise
     if open_stored(path, num_frames, shape) is not None:
         return
-    shutil.rmtree(path, ignore_errors=True)  # damaged, or not there
-    try:
-        os.rename(temporary, path)
-    except OSError:
-        if open_stored(path, num_frames, shape) is None:
-            raise
+    damaged = temporary.with_name(f"{temporary.stem}.damaged{temporary.suffix}")
+    os.rename(path, damaged)
+    os.rename(temporary, path)
+    shutil.rmtree(damaged, ignore_errors=True)

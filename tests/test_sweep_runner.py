@@ -1,108 +1,333 @@
-"""Sweeps through the command line, on a small simulated sequence: cells, rows, resuming, failures, tables."""
+"""Sweeps on a very small sequence: cells, rows, resuming, failures, tables, estimates; real ones, and with a tracker
+that finds nothing where what it finds does not matter."""
 
-import os
+import json
+import shutil
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pandas as pd
 import pytest
+from sweeps import all_rows, grid_file, psotrack, small_sequence, stamps
 
-GRID = """
-sequences = ["S02_D4_A"]
-runs = 2
-[settings]
-particles = 8
-silhouettes.reduction = 2
-[methods.paper]
-swarm = "joint"
-score = "hard"
-[methods.ours]
-[grid]
-iterations = [3, 6]
+from psotrack.cli import main
+from psotrack.errors import InputError
+from psotrack.sweep import grid as grid_of
+from psotrack.sweep import key_of, machine, runner, sweep
+from psotrack.sweep.estimates import FRAME_S, WORK_S, estimate
+from psotrack.sweep.inputs import Inputs
+from psotrack.sweep.locks import claimed
+from psotrack.sweep.store import Store
+
+SETTINGS = {
+    "particles": 8,
+    "swarm": "joint",
+    "score": "hard",
+    "init": "truth",
+    "drone_size_m": [0.5, 0.5, 0.2],
+    "silhouettes.reduction": 2,
+}
+METHODS = """
+[methods.usual]
+[methods.calm]
+inertia = 0.4
 """
 
 
-def psotrack(root: Path, *words: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "psotrack", *map(str, words)],
-        capture_output=True,
-        text=True,
-        env=os.environ | {"PSOTRACK_CACHE": str(root / "cache")},
-        check=False,
-    )
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data folder, and a cache."""
+    return small_sequence(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")
-def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the small sequence, a grid and its results."""
-    root = tmp_path_factory.mktemp("sweep")
-    made = psotrack(
-        root, "simulate", "S02_D4_A", "--out", root, "--scale", 0.35, "--frames", 12, "--no-onboard"
-    )
-    assert made.returncode == 0, made.stderr
-    (root / "grid.toml").write_text(GRID)
-    done = psotrack(root, "sweep", root / "grid.toml", "--data", root, "--out", root / "results")
-    assert done.returncode == 0, done.stderr
-    assert "4 cells finished now, 0 before" in done.stdout
-    return root
+def swept(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with grids and results: of four cells, and of four that fail."""
+    folder = tmp_path_factory.mktemp("sweep")
+    whole = grid_file(folder, [3, 6], runs=2)
+    whole.write_text(whole.read_text() + METHODS)
+    (folder / "good.toml").write_text(whole.read_text())
+    whole.write_text(whole.read_text().replace("[grid]", '[grid]\ncameras = [["nowhere"], "all"]'))
+    done = psotrack(root, "sweep", whole, "--data", root, "--out", folder / "results")
+    assert done.returncode == 2
+    assert "4 cells finished now, 0 before, 4 failed" in done.stdout, done.stderr
+    return folder
+
+
+def called(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, list[str], str]:
+    """`psotrack WORDS` in this process: exit code, lines on stdout, stderr. For what computes nothing."""
+    code = 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["psotrack", *map(str, words)])
+        try:
+            main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+    out, err = capsys.readouterr()
+    return code, out.splitlines(), err
+
+
+class Tracker:
+    """Finds no drones, and fails where it is told to."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.runs: list[tuple[int, list[int]]] = []
+        self.failing: set[int] = set()
+        monkeypatch.setattr(runner, "track_runs", self)
+
+    def __call__(self, sequence: object, silhouettes: object, settings: list) -> list[InputError]:
+        iterations = settings[0].iterations
+        if iterations in self.failing:
+            raise ZeroDivisionError("planted")
+        self.runs.append((iterations, [each.seed for each in settings]))
+        return [InputError("here", expected="drones", found="none") for _ in settings]
+
+
+@pytest.fixture
+def tracker(monkeypatch: pytest.MonkeyPatch) -> Tracker:
+    return Tracker(monkeypatch)
+
+
+def varied(*iterations: int, runs: int = 1) -> dict:
+    grid = {"iterations": list(iterations)}
+    return {"sequences": ["S01_D2_A"], "runs": runs, "settings": SETTINGS, "grid": grid}
 
 
 @pytest.mark.slow
 def test_one_row_per_cell_and_run(swept: Path) -> None:
-    rows = pd.concat(pd.read_parquet(path) for path in (swept / "results" / "cells").glob("*.parquet"))
+    rows = all_rows(swept / "results")
     combinations = set(zip(rows["method"], rows["settings.iterations"], rows["seed"], strict=True))
-    assert combinations == {(m, i, s) for m in ("paper", "ours") for i in (3, 6) for s in (0, 1)}
+    assert combinations == {(m, i, s) for m in ("usual", "calm") for i in (3, 6) for s in (0, 1)}
     assert len(rows) == 8
-    assert set(rows["settings.score"][rows["method"] == "paper"]) == {"hard"}
+    assert set(rows["settings.inertia"][rows["method"] == "calm"]) == {0.4}
     assert (rows["mean_error_m"] < 0.2).all()
-    assert {"seconds.track", "versions.jax", "device.kind", "perturbation.flipped"} <= set(rows.columns)
+    assert (rows["drones"] == 2).all()
+    assert (rows["num_cameras"] == 8).all()
+    assert (rows["frames"] > 0).all()
+    assert {"seconds.track", "versions.jax", "device.kind", "device.processor", "commit"} <= set(rows.columns)
+    assert {"perturbation.flipped", "runs_in_batch", "seconds.compile"} <= set(rows.columns)
 
 
 @pytest.mark.slow
-def test_what_is_finished_is_not_run_again(swept: Path) -> None:
-    cells = swept / "results" / "cells"
-    before = {path: path.stat().st_mtime_ns for path in cells.iterdir()}
-    again = psotrack(swept, "sweep", swept / "grid.toml", "--data", swept, "--out", swept / "results")
+def test_a_cell_that_fails_does_not_stop_the_others(swept: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, status, _ = called(capsys, "sweep", "--status", swept / "results")
+    assert status[-1].endswith("4 finished, 4 failed, 0 claimed")
+    assert len(status) == 5
+    assert all("nowhere" in line for line in status[:-1])
+
+
+@pytest.mark.slow
+def test_what_is_finished_is_not_run_again(root: Path, swept: Path) -> None:
+    before = stamps(swept / "results")
+    words = ("--data", root, "--out", swept / "results", "--device", "cpu")
+    again = psotrack(root, "sweep", swept / "good.toml", *words)
+    assert again.returncode == 0, again.stderr
     assert "0 cells finished now, 4 before" in again.stdout
-    assert {path: path.stat().st_mtime_ns for path in cells.iterdir()} == before
+    assert stamps(swept / "results") == before
+    # The manifest has both grids, and of where rows come from what they say themselves.
+    manifest = json.loads((swept / "results" / "manifest.json").read_text())
+    assert [run["cells"] for run in manifest["runs"]] == [8, 4]
+    assert manifest["runs"][1]["grid"]["methods"] == {"usual": {}, "calm": {"inertia": 0.4}}
+    rows = all_rows(swept / "results")
+    assert list(manifest["inputs"]) == rows["input"].unique().tolist()
+    assert {run["device"]["processor"] for run in manifest["runs"]} == set(rows["device.processor"])
+    assert {run["commit"] for run in manifest["runs"]} == set(rows["commit"])
+    assert len(sweep(swept / "good.toml", swept / "results", data=root, cache=root / "cache")) == 8
+    assert stamps(swept / "results") == before
+    once_more = json.loads((swept / "results" / "manifest.json").read_text())["runs"]
+    assert [run["cells"] for run in once_more] == [8, 4]
+    assert once_more[1]["last"] > manifest["runs"][1]["last"]
 
 
 @pytest.mark.slow
-def test_a_cell_that_fails_does_not_stop_the_others(swept: Path) -> None:
-    (swept / "poor.toml").write_text(
-        'sequences = ["S02_D4_A"]\n[settings]\nparticles = 8\niterations = 3\nsilhouettes.reduction = 2\n'
-        '[grid]\ncameras = [["nowhere"], "all"]\n'
-    )
-    out = swept / "poor"
-    result = psotrack(swept, "sweep", swept / "poor.toml", "--data", swept, "--out", out)
-    assert result.returncode == 2
-    assert "1 cells finished now" in result.stdout
-    status = psotrack(swept, "sweep", "--status", out)
-    assert "nowhere" in status.stdout
-    assert "1 finished, 1 failed, 0 claimed" in status.stdout
-
-
-@pytest.mark.slow
-def test_a_table_of_the_results(swept: Path) -> None:
+def test_a_table_of_the_results(swept: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("table", swept / "results", "--rows", "iterations", "--columns", "method", "--format", "csv")
-    table = psotrack(swept, *words)
-    assert table.returncode == 0, table.stderr
-    assert "paper" in table.stdout
-    assert "ours" in table.stdout
-    wrong = psotrack(swept, "table", swept / "results", "--value", "mean_eror_m")
-    assert wrong.returncode == 2
-    assert wrong.stderr.count("\n") == 1
-    assert "mean_error_m" in wrong.stderr
+    code, lines, _ = called(capsys, *words)
+    assert code == 0
+    assert "usual" in lines[0]
+    assert "calm" in lines[0]
+    code, _, wrong = called(capsys, "table", swept / "results", "--value", "mean_eror_m")
+    assert code == 2
+    assert wrong.count("\n") == 1
+    assert "mean_error_m" in wrong
 
 
-def test_a_dry_run_shows_the_cells(tmp_path: Path) -> None:
-    (tmp_path / "grid.toml").write_text(GRID)
-    result = psotrack(tmp_path, "sweep", tmp_path / "grid.toml", "--dry-run")
-    assert result.returncode == 0, result.stderr
-    assert result.stdout.splitlines()[-1] == "4 cells, 8 runs"
-    (tmp_path / "grid.toml").write_text(GRID.replace("iterations", "iteratons"))
-    result = psotrack(tmp_path, "sweep", tmp_path / "grid.toml", "--dry-run")
+@pytest.mark.slow
+def test_an_estimate_says_what_it_is_made_of(
+    root: Path, swept: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def estimated(grid: Path, out: Path, cache: Path = root / "cache") -> str:
+        code, lines, err = called(
+            capsys, "sweep", grid, "--dry-run", "--data", root, "--out", out, "--cache", cache
+        )
+        assert code == 0, err
+        return lines[-1]
+
+    more = swept / "more.toml"
+    more.write_text((swept / "good.toml").read_text().replace("6", "6, 30").replace("runs = 2", "runs = 3"))
+    known = estimated(more, swept / "results")
+    assert "for 6 cells (tracking " in known
+    assert f"estimated from 8 runs on this device in {swept / 'results'}" in known
+    assert "silhouettes" not in known
+    # Finished cells take no time; without results there is but the rule of thumb, and silhouettes may be missing.
+    assert estimated(swept / "good.toml", swept / "results") == "nothing to run"
+    unknown = estimated(swept / "good.toml", swept / "nothing", swept / "nothing")
+    assert "estimated from a rule of thumb" in unknown
+    assert "silhouettes" in unknown
+
+
+@pytest.mark.slow
+def test_an_estimate_follows_the_rows_and_the_work(root: Path, tracker: Tracker, tmp_path: Path) -> None:
+    """Rows that took ten times as long as the rule says make all ten times as long, what was never run included."""
+    store, inputs = Store(tmp_path), Inputs(root, root / "cache")
+    by_rule = estimate(grid_of(varied(3)).cells(), inputs, store)
+    work = 8 * 3 * 2 * 8
+    assert by_rule.tracking_s == pytest.approx(6 * (FRAME_S + WORK_S * work))
+    rows = sweep(varied(3), tmp_path, data=root, cache=root / "cache")
+    rows["drones"], rows["seconds.track"] = 2, 10 * by_rule.tracking_s
+    store.add(rows["cell"][0], rows, pd.DataFrame({"seed": [0]}))
+    more = estimate(grid_of(varied(3, 30, runs=2)).cells(), inputs, store)
+    assert more.cells == 2
+    assert more.tracking_s == pytest.approx(
+        60 * (FRAME_S + WORK_S * work) + 120 * (FRAME_S + 10 * WORK_S * work)
+    )
+    rows["device.processor"] = "another"
+    store.add(rows["cell"][0], rows, pd.DataFrame({"seed": [0]}))
+    assert "1 runs on another device" in str(estimate(grid_of(varied(30)).cells(), inputs, store))
+
+
+def test_a_dry_run_shows_the_cells(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = grid_file(tmp_path, [3, 6], runs=2)
+    code, lines, _ = called(capsys, "sweep", path, "--dry-run")
+    assert code == 0
+    assert lines[1].split()[1:] == ["sequence=S01_D2_A", "method=", "cameras=all", "runs=2", "iterations=6"]
+    assert lines[2:] == ["2 cells, 4 runs", "nothing to run; without 2 cells whose input cannot be read"]
+
+
+def test_what_is_wrong_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = grid_file(tmp_path, [3])
+    code, _, err = called(capsys, "sweep", path, "--out", tmp_path, "--workers", 2)
+    assert (code, err.count("\n")) == (2, 1)
+    assert "--cluster local" in err
+    path.write_text(path.read_text().replace("iterations", "iteratons"))
+    code, _, err = called(capsys, "sweep", path, "--out", tmp_path)
+    assert (code, err.count("\n")) == (2, 1)
+    assert "iterations" in err
+
+
+@pytest.mark.skipif(shutil.which("nvidia-smi") is not None, reason="there may be a GPU")
+def test_a_gpu_that_is_not_there_is_one_line(tmp_path: Path) -> None:
+    result = psotrack(tmp_path, "sweep", grid_file(tmp_path, [3]), "--out", tmp_path, "--device", "gpu")
     assert result.returncode == 2
     assert result.stderr.count("\n") == 1
-    assert "iterations" in result.stderr
+    assert "pip install '.[cuda]'" in result.stderr
+
+
+@pytest.mark.slow
+def test_in_python_the_rows_are_those_of_the_grid(root: Path, tracker: Tracker, tmp_path: Path) -> None:
+    out, folders = tmp_path / "out", {"data": root, "cache": root / "cache"}
+    rows = sweep(varied(3, 4, runs=2), out, **folders)
+    assert rows[["settings.iterations", "seed"]].to_numpy().tolist() == [[3, 0], [3, 1], [4, 0], [4, 1]]
+    assert (rows["missed_rate"] == 1).all()
+    rows = sweep(grid_of(varied(5, 4)), out, **folders)
+    assert rows[["settings.iterations", "seed"]].to_numpy().tolist() == [[5, 0], [4, 0]]
+    # More runs of a finished cell only add rows.
+    (tmp_path / "grid.toml").write_text(grid_file(tmp_path, [3], runs=3).read_text())
+    assert sweep(tmp_path / "grid.toml", out, **folders)["seed"].tolist() == [0, 1, 2]
+    assert tracker.runs == [(3, [0, 1]), (4, [0, 1]), (5, [0]), (3, [2])]
+
+
+@pytest.mark.slow
+def test_a_failure_goes_when_the_cell_is_finished(root: Path, tracker: Tracker, tmp_path: Path) -> None:
+    out, folders = tmp_path / "out", {"data": root, "cache": root / "cache"}
+    tracker.failing = {3}
+    rows = sweep(varied(3, 4), out, **folders)
+    assert rows["settings.iterations"].tolist() == [4]
+    assert rows.attrs["errors"] == ["S01_D2_A iterations=3: ZeroDivisionError: planted"]
+    (kept,) = (json.loads(path.read_text()) for path in (out / "cells").glob("*.error.json"))
+    assert "in __call__" in kept["where"]
+    tracker.failing = set()
+    assert len(sweep(varied(3, 4), out, **folders)) == 2
+    assert Store(out).status()["failed"] == 0
+    assert tracker.runs == [(4, [0]), (3, [0])]
+
+
+@pytest.mark.slow
+def test_a_failure_to_read_goes_too(root: Path, tracker: Tracker, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    shutil.copytree(root / "Simulated_Data" / "S01_D2_A", data / "S01_D2_A")
+    video = next((data / "S01_D2_A").glob("*.mp4"), None) or next((data / "S01_D2_A").glob("*.avi"))
+    video.rename(tmp_path / video.name)
+    with pytest.raises(InputError, match=r"all failed: S01_D2_A iterations=3: .*expected a video"):
+        sweep(varied(3), tmp_path / "out", data=data, cache=root / "cache")
+    assert Store(tmp_path / "out").status()["failed"] == 1
+    (tmp_path / video.name).rename(video)
+    rows = sweep(varied(3), tmp_path / "out", data=data, cache=root / "cache")
+    assert Store(tmp_path / "out").status()["failed"] == 0
+    assert rows.attrs["errors"] == []
+
+
+@pytest.mark.slow
+def test_a_runner_waits_for_others_and_does_what_they_leave(
+    root: Path, tracker: Tracker, tmp_path: Path
+) -> None:
+    grid, out = grid_of(varied(3, 4)), tmp_path / "out"
+    inputs = Inputs(root, root / "cache")
+    first = grid.cells()[0]
+    store, outcome = Store(out), []
+    with store.claim(key_of(first, inputs.keys_of(first))):
+        waiting = threading.Thread(
+            target=lambda: outcome.append(runner.run(grid, out, data=root, cache=root / "cache"))
+        )
+        waiting.start()
+        until = time.monotonic() + 60
+        while not tracker.runs:
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        time.sleep(0.5)
+        assert waiting.is_alive()
+        assert tracker.runs == [(4, [0])]
+    waiting.join()
+    assert tracker.runs == [(4, [0]), (3, [0])]
+    assert outcome[0].count("finished") == 2
+
+
+@pytest.mark.slow
+def test_one_alone_makes_the_silhouettes(root: Path, tmp_path: Path) -> None:
+    cell = grid_of(varied(3)).cells()[0]
+    inputs = Inputs(root, tmp_path / "cache", jobs=1)
+    inputs.keys_of(cell)
+    with claimed(inputs.claim_of(cell)):
+        assert inputs.read(cell) is None
+        assert not list((tmp_path / "cache").glob("*/zarr.json"))
+    given = inputs.read(cell)
+    assert given is not None
+    assert given.silhouettes.num_frames == 6
+
+
+def test_a_commit_is_that_of_a_checkout_or_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A package that is installed below somebody else's checkout has no commit of that."""
+    assert Path(machine.__file__).is_relative_to(machine._PACKAGE)
+    for folder, expected in ((tmp_path, False), (tmp_path / "tracked", True)):
+        folder.mkdir(exist_ok=True)
+        (folder / "__init__.py").touch()
+        git = ["git", "-c", "user.name=a", "-c", "user.email=a@b", "-C", str(folder)]
+        if expected:
+            for words in (["init", "-q"], ["add", "."], ["commit", "-q", "-m", "a"]):
+                subprocess.run([*git, *words], check=True)
+        monkeypatch.setattr(machine, "_PACKAGE", folder)
+        machine.commit.cache_clear()
+        assert bool(machine.commit()) == expected
+    (tmp_path / "tracked" / "__init__.py").write_text("changed")
+    machine.commit.cache_clear()
+    assert machine.commit().endswith("-dirty")
+    installed = tmp_path / "tracked" / "site-packages"
+    installed.mkdir()
+    (installed / "__init__.py").touch()
+    monkeypatch.setattr(machine, "_PACKAGE", installed)
+    machine.commit.cache_clear()
+    assert machine.commit() == ""
+    machine.commit.cache_clear()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,9 +11,13 @@ import click
 from psotrack.cli.answers import answer, report_to, say
 from psotrack.cli.options import CACHE, FORCE, JOBS, JSON, QUIET, cache_folder, compiled_folder
 from psotrack.errors import SettingsError
+from psotrack.files import refuse_to_overwrite
+from psotrack.progress import Report
 
 if TYPE_CHECKING:
-    from psotrack.sweep import Cell
+    from psotrack.sweep import Grid
+    from psotrack.sweep.machine import Device
+    from psotrack.sweep.runner import Outcome
 
 
 @click.command()
@@ -29,12 +32,25 @@ if TYPE_CHECKING:
     show_default=True,
     help="Root folder of the sequences that the grid names.",
 )
-@click.option("--dry-run", is_flag=True, help="Print the cells, and end.")
+@click.option("--dry-run", is_flag=True, help="Print the cells and an estimate of the time, and end.")
 @click.option(
     "--status",
     type=click.Path(path_type=Path),
     metavar="DIR",
-    help="Say how far the results in DIR are, and end.",
+    help="Say how far the results in DIR are, and who is at work, and end.",
+)
+@click.option(
+    "--cluster",
+    metavar="local|ADDRESS",
+    help="Cells are tasks of a Dask cluster: one that is started here, or that of the scheduler at the address.",
+)
+@click.option(
+    "--workers",
+    type=click.IntRange(min=1),
+    help="Processes of --cluster local.  [default: one per processor; one with --device gpu]",
+)
+@click.option(
+    "--device", type=click.Choice(["cpu", "gpu"]), help="What to compute on.  [default: JAX's choice]"
 )
 @CACHE
 @JOBS
@@ -47,6 +63,9 @@ def sweep(
     data: Path,
     dry_run: bool,
     status: Path | None,
+    cluster: str | None,
+    workers: int | None,
+    device: Device | None,
     cache: Path | None,
     jobs: int | None,
     quiet: bool,
@@ -62,6 +81,7 @@ def sweep(
     Examples:
       psotrack sweep grid.toml --dry-run
       psotrack sweep grid.toml --data data --out results
+      psotrack sweep grid.toml --data data --out results --cluster tcp://10.0.0.5:8786
       psotrack sweep --status results
       psotrack table results --rows particles --columns iterations --value mean_error_m
     """
@@ -70,29 +90,70 @@ def sweep(
         return
     if grid_file is None:
         raise SettingsError("sweep", expected="a GRID.toml, or --status DIR", found="neither")
+    if workers is not None and cluster != "local":
+        raise SettingsError("--workers", expected="--cluster local with it", found=cluster or "no --cluster")
     from psotrack.sweep import load
 
     grid = load(grid_file)
     if dry_run:
-        _show(grid.cells(), quiet, force, json_path)
+        _show(grid, out, data, cache_folder(cache), jobs, quiet, force, json_path)
         return
     if out is None:
         raise SettingsError("--out", expected="the folder to write to", found="none")
-    import jax
+    if json_path not in (None, Path("-")):
+        refuse_to_overwrite(json_path, force)  # now, not after hours
+    if cluster is None:
+        outcome = _run_here(grid, out, data, cache, jobs, device, report_to(quiet))
+    else:
+        outcome = _run_there(grid, out, data, cache, cluster, workers, device, report_to(quiet))
+    counts = {state: outcome.count(state) for state in ("finished", "failed", "left")}
+    answer(json_path, counts, force)
+    failed = f", {counts['failed']} failed (see {out}/cells/*.error.json)" if counts["failed"] else ""
+    say(quiet, json_path, f"{out}: {counts['finished']} cells finished now, {counts['left']} before{failed}")
+    if counts["failed"]:
+        sys.exit(2)
 
-    # Before anything touches a device: runs of a batch are shared by as many as there are processors.
-    if "XLA_FLAGS" not in os.environ:
-        jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+
+def _run_here(
+    grid: Grid,
+    out: Path,
+    data: Path,
+    cache: Path | None,
+    jobs: int | None,
+    device: Device | None,
+    report: Report,
+) -> Outcome:
+    """In this process."""
     from psotrack.compiled import keep_compiled
+    from psotrack.sweep.machine import share_processors, use_device
     from psotrack.sweep.runner import run
 
+    share_processors()
+    if device is not None:
+        use_device(device)
     keep_compiled(compiled_folder(cache))
-    outcome = run(grid, out, data=data, cache=cache_folder(cache), jobs=jobs, report=report_to(quiet))
-    answer(json_path, vars(outcome), force)
-    failed = f", {outcome.failed} failed (see {out}/cells/*.error.json)" if outcome.failed else ""
-    say(quiet, json_path, f"{out}: {outcome.finished} cells finished now, {outcome.left} before{failed}")
-    if outcome.failed:
-        sys.exit(2)
+    return run(grid, out, data=data, cache=cache_folder(cache), jobs=jobs, report=report)
+
+
+def _run_there(
+    grid: Grid,
+    out: Path,
+    data: Path,
+    cache: Path | None,
+    cluster: str,
+    workers: int | None,
+    device: Device | None,
+    report: Report,
+) -> Outcome:
+    """By the workers of a cluster."""
+    from psotrack.sweep.cluster import run_on_cluster
+    from psotrack.sweep.machine import use_device
+
+    use_device("cpu")  # this process computes nothing: a GPU is for the workers
+    folders = {"data": data, "cache": cache_folder(cache)}
+    return run_on_cluster(
+        grid, out, **folders, address=cluster, workers=workers, device=device, report=report
+    )
 
 
 @click.command()
@@ -131,10 +192,23 @@ def table(folder: Path, rows_by: str, columns_by: str, value: str, scale: float,
     click.echo(render(shown, layout).rstrip("\n"))
 
 
-def _show(cells: tuple[Cell, ...], quiet: bool, force: bool, json_path: Path | None) -> None:
-    """The cells of a grid, and how much work they are."""
+def _show(
+    grid: Grid,
+    out: Path | None,
+    data: Path,
+    cache: Path,
+    jobs: int | None,
+    quiet: bool,
+    force: bool,
+    json_path: Path | None,
+) -> None:
+    """The cells of a grid, and how long they will take."""
+    from psotrack.sweep.estimates import estimate
     from psotrack.sweep.grid import cameras_label
+    from psotrack.sweep.inputs import Inputs
+    from psotrack.sweep.store import Store
 
+    cells = grid.cells()
     listed = [
         {
             "sequence": cell.sequence,
@@ -145,10 +219,12 @@ def _show(cells: tuple[Cell, ...], quiet: bool, force: bool, json_path: Path | N
         }
         for cell in cells
     ]
-    answer(json_path, listed, force)
+    expected = estimate(cells, Inputs(data, cache, jobs), Store(out) if out else None)
+    answer(json_path, {"cells": listed, "estimate": vars(expected) | {"total_s": expected.total_s}}, force)
     for number, cell in enumerate(listed):
         say(quiet, json_path, f"{number:4} " + " ".join(f"{name}={value}" for name, value in cell.items()))
     say(quiet, json_path, f"{len(cells)} cells, {sum(cell.runs for cell in cells)} runs")
+    say(quiet, json_path, f"{expected}")
 
 
 def _status(folder: Path, quiet: bool, force: bool, json_path: Path | None) -> None:
@@ -159,5 +235,7 @@ def _status(folder: Path, quiet: bool, force: bool, json_path: Path | None) -> N
     answer(json_path, content, force)
     for failure in content["errors"]:
         say(quiet, json_path, f"failed: {failure}")
+    for worker in content["at_work"]:
+        say(quiet, json_path, f"at work: {worker}")
     numbers = ", ".join(f"{content[name]} {name}" for name in ("finished", "failed", "claimed"))
     say(quiet, json_path, f"{folder}: {numbers}")

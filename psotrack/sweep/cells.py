@@ -110,3 +110,14 @@ def key_of(cell: Cell, input_keys: Mapping[str, str]) -> str:
         "input": dict(input_keys),
     }
     return hashlib.blake2b(msgspec.json.encode(made_of, order="deterministic"), digest_size=20).hexdigest()
+
+
+def name_of(cell: Cell) -> str:
+    """What a cell's failure is kept under, whether or not its input can be read."""
+    return key_of(cell, {"sequence": cell.sequence})
+
+
+def title(cell: Cell) -> str:
+    """A cell in a line."""
+    axes = (f"{name}={value}" for name, value in cell.axes.items())
+    return " ".join(word for word in (Path(cell.sequence).name, cell.method, *axes) if word)

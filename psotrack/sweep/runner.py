@@ -2,66 +2,80 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 import pandas as pd
 
-from psotrack.datasets.dpjait import read_sequence
-from psotrack.errors import InputError, PsotrackError
-from psotrack.evaluation import evaluate
-from psotrack.pipeline import TrackedSequence, environment, track_runs
+from psotrack.errors import InputError, OutputError, PsotrackError
+from psotrack.evaluation import errors_over_time, evaluate
+from psotrack.pipeline import TrackedSequence, track_runs
 from psotrack.progress import Report, silent
-from psotrack.sequence import Sequence
-from psotrack.silhouettes import Silhouettes, compute
-from psotrack.sweep.cells import Cell, key_of
+from psotrack.sweep.cells import Cell, key_of, name_of, title
 from psotrack.sweep.grid import Grid, cameras_label
+from psotrack.sweep.inputs import Input, Inputs, digest_of, folder_of, source_of
+from psotrack.sweep.locks import POLL_S
+from psotrack.sweep.machine import provenance
+from psotrack.sweep.manifest import note_input, note_run
 from psotrack.sweep.names import flat
-from psotrack.sweep.perturbations import perturbed
 from psotrack.sweep.store import Store
 
 logger = logging.getLogger(__name__)
 
-#: Folders of the data's root in which a sequence may lie.
-HALVES = ("Simulated_Data", "Real_Data", ".")
+
+@dataclass(frozen=True)
+class Result:
+    """What became of a cell.
+
+    Attributes:
+        cell: which.
+        state: "left" was finished before, "busy" is somebody else at work on it.
+        key: under which its rows are; None where the input cannot be read.
+        error: why it failed; "" if it did not.
+    """
+
+    cell: Cell
+    state: Literal["finished", "failed", "left", "busy"]
+    key: str | None
+    error: str = ""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a runner did: numbers of cells.
+    """What a runner did, cell by cell, in the grid's order."""
 
-    Attributes:
-        finished: by this runner.
-        failed: kept with their errors.
-        left: finished before, or somebody else is at work on them.
-    """
+    results: tuple[Result, ...]
 
-    finished: int
-    failed: int
-    left: int
+    def count(self, state: str) -> int:
+        """How many cells that became of."""
+        return sum(result.state == state for result in self.results)
 
+    @property
+    def errors(self) -> list[str]:
+        """Cells that failed, and why."""
+        return [f"{title(result.cell)}: {result.error}" for result in self.results if result.error]
 
-@dataclass(frozen=True)
-class _Input:
-    """A sequence as a cell sees it, and digests of all that is read of it."""
-
-    sequence: Sequence
-    silhouettes: Silhouettes
-    keys: dict[str, str]
+    @property
+    def seeds(self) -> dict[str, range]:
+        """Keys of the finished cells and the seeds of their runs."""
+        finished = [result for result in self.results if result.state in ("finished", "left")]
+        return {result.key: result.cell.seeds for result in finished if result.key is not None}
 
 
 def run(
     grid: Grid, out: Path, *, data: Path, cache: Path, jobs: int | None = None, report: Report = silent
 ) -> Outcome:
     """Run what is not finished, cell by cell. Several runners on one folder share the work.
+
+    It ends when every cell is finished or has failed: it waits for those that others are at work on, and does them if
+    the others die.
 
     Args:
         grid: what is to be run.
@@ -75,118 +89,113 @@ def run(
         InputError: a sequence is not there.
         OutputError: the results cannot be written.
     """
-    store, cells = Store(out), grid.cells()
-    for cell in cells:
-        folder_of(cell.sequence, data)
-    done = {"finished": 0, "failed": 0, "left": 0}
-    with report("sweep", len(cells)) as advance:
-        for cell, given in _inputs(cells, data, cache, jobs):
-            done[_run_cell(cell, given, store)] += 1
-            advance(1)
-    return Outcome(**done)
+    store, inputs = opened(grid, out, data, provenance()), Inputs(data, cache, jobs)
+    results: list[Result] = []
+    waiting = in_order(grid.cells())
+    with report("sweep", len(waiting)) as advance:
+        while waiting:
+            busy = []
+            for cell in waiting:
+                result = run_cell(cell, inputs, store)
+                if result.state == "busy":
+                    busy.append(cell)
+                else:
+                    results.append(result)
+                    advance(1)
+            if len(busy) == len(waiting):
+                time.sleep(POLL_S)
+            waiting = busy
+    return outcome_of(grid, results)
 
 
-def folder_of(sequence: str, data: Path) -> Path:
-    """The folder of a sequence that a grid names.
+def outcome_of(grid: Grid, results: Iterable[Result]) -> Outcome:
+    """Results in the order of the grid's cells."""
+    order = {name_of(cell): number for number, cell in enumerate(grid.cells())}
+    return Outcome(tuple(sorted(results, key=lambda result: order[name_of(result.cell)])))
+
+
+def opened(grid: Grid, out: Path, data: Path, origin: Mapping[str, Any]) -> Store:
+    """The folder of a grid's results, which says that the grid is run.
+
+    Args:
+        grid: what is to be run.
+        out: the folder.
+        data: root folder of sequences that the grid names.
+        origin: versions, device and commit.
 
     Raises:
-        InputError: there is none.
+        InputError: a sequence is not there.
+        OutputError: the folder cannot be written.
     """
-    places = [Path(sequence), *(data / half / sequence for half in HALVES)]
-    for place in places:
-        if place.is_dir():
-            return place
-    raise InputError(
-        data, expected=f"the sequence {sequence}", found="none", remedy="name the data's root with --data"
-    )
+    for sequence in grid.sequences:
+        folder_of(sequence, data)
+    store = Store(out)
+    store.tidy()
+    store.change_manifest(lambda manifest: note_run(manifest, grid, origin))
+    return store
 
 
-def _inputs(
-    cells: tuple[Cell, ...], data: Path, cache: Path, jobs: int | None
-) -> Iterator[tuple[Cell, _Input | PsotrackError]]:
-    """The cells and what each of them reads, or why that cannot be had. Cells of the same input follow each other."""
+def in_order(cells: Iterable[Cell]) -> list[Cell]:
+    """Cells that read the same one after the other, and as the grid has them otherwise."""
     groups: dict[Any, list[Cell]] = {}
     for cell in cells:
-        of_input = (cell.sequence, cell.frames, cell.settings.silhouettes, cell.cameras, cell.perturbation)
-        groups.setdefault(of_input, []).append(cell)
-    for alike in groups.values():
-        try:
-            given: _Input | PsotrackError = _read(alike[0], data, cache, jobs)
-        except PsotrackError as error:
-            given = error
-        for cell in alike:
-            yield cell, given
+        groups.setdefault((source_of(cell), cell.cameras, cell.perturbation), []).append(cell)
+    return [cell for alike in groups.values() for cell in alike]
 
 
-def _read(cell: Cell, data: Path, cache: Path, jobs: int | None) -> _Input:
-    sequence = read_sequence(folder_of(cell.sequence, data)).usable(None, cell.frames)
-    if sequence.truth is None:
-        raise InputError(sequence.folder, expected="a reference to compare with", found="none")
-    silhouettes = compute(sequence, cell.settings.silhouettes, cache=cache, jobs=jobs)
-    keys = dict(silhouettes.keys) | {
-        "calibration": _digest(*vars(sequence.rig.cameras).values()),
-        "reference": _digest(sequence.truth.position_m, sequence.truth.orientation_wxyz),
-    }
-    if Path(cell.settings.init).is_file():
-        keys["init"] = _digest(np.frombuffer(Path(cell.settings.init).read_bytes(), np.uint8))
-    return _Input(*perturbed(sequence, silhouettes, cell.perturbation, cell.cameras), keys)
+def finished_before(cell: Cell, inputs: Inputs, store: Store) -> Result | None:
+    """What a finished cell's result is; None for one that is to be run.
+
+    Raises:
+        PsotrackError: its input cannot be read.
+    """
+    key = key_of(cell, inputs.keys_of(cell))
+    if not set(cell.seeds) <= store.seeds_of(key):
+        return None
+    store.forgive(name_of(cell))  # it may have been finished by somebody who was killed just then
+    return Result(cell, "left", key)
 
 
-def _digest(*arrays: Any) -> str:
-    digest = hashlib.blake2b(digest_size=20)
-    for array in arrays:
-        digest.update(np.ascontiguousarray(array).tobytes() if array is not None else b"none")
-    return digest.hexdigest()
+def run_cell(cell: Cell, inputs: Inputs, store: Store) -> Result:
+    """Finish a cell, unless it is finished or somebody else is at work on it. What goes wrong is kept with it.
+
+    Raises:
+        OutputError: the results cannot be written.
+    """
+    key = None
+    try:
+        result = finished_before(cell, inputs, store)
+        if result is not None:
+            return result
+        keys = inputs.keys_of(cell)
+        key = key_of(cell, keys)
+        with store.claim(key, title(cell)) as ours:
+            # Somebody may have finished it just before it was ours.
+            missing = sorted(set(cell.seeds) - store.seeds_of(key)) if ours else []
+            given = inputs.read(cell) if missing else None
+            if given is None:
+                return Result(cell, "busy", key)
+            store.change_manifest(lambda manifest: note_input(manifest, cell, keys))
+            store.add(key, *_outcomes(cell, key, missing, given, digest_of(keys)))
+            store.forgive(name_of(cell))
+        return Result(cell, "finished", key)
+    except OutputError:
+        raise
+    except Exception as error:
+        return failed(cell, key, error, store)
 
 
-def _run_cell(cell: Cell, given: _Input | PsotrackError, store: Store) -> str:
-    """Finish a cell: which of the numbers of `Outcome` it counts for."""
-    if isinstance(given, PsotrackError):
-        store.fail(_nameless(cell), str(given), _about(cell))
-        logger.error("%s: %s", _title(cell), given)
-        return "failed"
-    key = key_of(cell, given.keys)
-    with store.claim(key) as ours:
-        missing = sorted(set(cell.seeds) - store.seeds_of(key))
-        if not ours or not missing:
-            return "left"
-        try:
-            store.add(key, pd.DataFrame(_rows(cell, missing, given)))
-        except Exception as error:
-            store.fail(
-                key, f"{type(error).__name__}: {error}", _about(cell) | {"where": traceback.format_exc()}
-            )
-            logger.error("%s: %s", _title(cell), error)
-            return "failed"
-    return "finished"
+def failed(cell: Cell, key: str | None, error: Exception, store: Store) -> Result:
+    """Keep why a cell failed."""
+    said = isinstance(error, PsotrackError)
+    sentence = f"{error}" if said else f"{type(error).__name__}: {error}"
+    where = {} if said else {"where": "".join(traceback.format_exception(error))}
+    store.fail(name_of(cell), sentence, about(cell) | where)
+    logger.error("%s: %s", title(cell), sentence)
+    return Result(cell, "failed", key, sentence)
 
 
-def _rows(cell: Cell, seeds: list[int], given: _Input) -> list[dict[str, Any]]:
-    """One row per run."""
-    settings = [msgspec.structs.replace(cell.settings, seed=seed) for seed in seeds]
-    began = time.perf_counter()
-    results = track_runs(given.sequence, given.silhouettes, settings)
-    total_s = time.perf_counter() - began
-    about = _about(cell) | {"runs_in_batch": len(seeds), "seconds.batch": total_s}
-    machine = {f"versions.{name}": value for name, value in environment()["versions"].items()}
-    machine |= {f"device.{name}": value for name, value in environment()["device"].items()}
-    return [
-        about | {"seed": seed} | _figures(result, given.sequence) | machine
-        for seed, result in zip(seeds, results, strict=True)
-    ]
-
-
-def _figures(result: TrackedSequence | InputError, sequence: Sequence) -> dict[str, Any]:
-    """What evaluation says of a run. A run that finds no drones has missed all of them."""
-    if isinstance(result, InputError):
-        return {"missed_rate": 1.0, "note": str(result)}
-    assert sequence.truth is not None
-    errors = evaluate(result.trajectories, sequence.truth).to_dict()
-    seconds = {f"seconds.{stage}": value for stage, value in result.record["seconds"].items()}
-    return {key: value for key, value in errors.items() if np.isscalar(value)} | seconds
-
-
-def _about(cell: Cell) -> dict[str, Any]:
+def about(cell: Cell) -> dict[str, Any]:
     """What a cell is, flat: names with dots."""
     settings = msgspec.to_builtins(msgspec.structs.replace(cell.settings, seed=0))
     del settings["seed"]
@@ -200,10 +209,38 @@ def _about(cell: Cell) -> dict[str, Any]:
     }
 
 
-def _title(cell: Cell) -> str:
-    return " ".join(map(str, (cell.sequence, cell.method, *cell.axes.values())))
+def _outcomes(
+    cell: Cell, key: str, seeds: list[int], given: Input, input_digest: str
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """One row per run, and the errors of every run's frames."""
+    settings = [msgspec.structs.replace(cell.settings, seed=seed) for seed in seeds]
+    began = time.perf_counter()
+    results = track_runs(given.sequence, given.silhouettes, settings)
+    total_s = time.perf_counter() - began
+    of_cell = about(cell) | {"frames": given.sequence.num_frames, "num_cameras": len(given.sequence.rig)}
+    of_batch = {"runs_in_batch": len(seeds), "seconds.batch": total_s}
+    origin = {"cell": key, "input": input_digest} | dict(flat(provenance()))
+    runs = list(zip(seeds, results, strict=True))
+    rows = [of_cell | {"seed": seed} | of_batch | _figures(result, given) | origin for seed, result in runs]
+    return pd.DataFrame(rows), pd.concat([_errors(seed, result, given) for seed, result in runs])
 
 
-def _nameless(cell: Cell) -> str:
-    """A key for a cell whose input cannot be read."""
-    return key_of(cell, {})
+def _figures(result: TrackedSequence | InputError, given: Input) -> dict[str, Any]:
+    """What evaluation says of a run. A run that finds no drones has missed all of them."""
+    if isinstance(result, InputError):
+        return {"missed_rate": 1.0, "note": str(result)}
+    assert given.sequence.truth is not None
+    errors = evaluate(result.trajectories, given.sequence.truth).to_dict()
+    seconds = result.record["seconds"]
+    figures = {key: value for key, value in errors.items() if np.isscalar(value)}
+    figures |= {f"seconds.{stage}": value for stage, value in seconds.items()}
+    return figures | {"track_ms_per_frame": 1e3 * seconds["track"] / given.sequence.num_frames}
+
+
+def _errors(seed: int, result: TrackedSequence | InputError, given: Input) -> pd.DataFrame:
+    """Errors of a run's frames; of a run that finds no drones there are none."""
+    if isinstance(result, InputError):
+        return pd.DataFrame({"seed": pd.Series(dtype=int)})
+    assert given.sequence.truth is not None
+    errors = errors_over_time(result.trajectories, given.sequence.truth)
+    return errors.assign(seed=seed, error_m=errors["error_m"].astype(np.float32))

@@ -1,25 +1,22 @@
 """The folder of a sweep's results: what is finished, what failed, and who is at work on what.
 
-    DIR/manifest.json            the grid, versions, the machine
+    DIR/manifest.json            what was run, by which versions, on which machine, from which input
     DIR/cells/KEY.parquet        one row per run of a finished cell
-    DIR/cells/KEY.error.json     why a cell failed
-    DIR/cells/KEY.claim          somebody is at work on it
+    DIR/errors/KEY.parquet       its errors, frame by frame
+    DIR/cells/NAME.error.json    why a cell failed when it was last tried
+    DIR/cells/KEY.claim          somebody is at work on it (see `locks`)
 
-A cell appears whole or not at all. Several runners, on one machine or on many, share a folder: each claims a cell
-before it runs it. A claim is kept alive by its runner; one that nobody has touched for a while is of a runner that was
-killed, and anybody may take it over.
+A cell appears whole or not at all. KEY is made of everything that decides its rows (see `cells.key_of`), NAME of all
+but the input: a cell whose input cannot be read has no key, and must yet be found again.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
-import os
-import secrets
-import socket
-import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,9 +25,10 @@ import pandas as pd
 
 from psotrack.errors import InputError
 from psotrack.files import written_whole
+from psotrack.sweep.locks import claimed, owner_of, waited_for
 
-#: A claim is touched so often; not touched for so long, it is nobody's.
-HEARTBEAT_S, STALE_S = 5.0, 30.0
+#: What was being written so long ago was left by a runner that was killed.
+_LEFT_BEHIND_S = 3600.0
 
 
 @dataclass(frozen=True)
@@ -42,107 +40,150 @@ class Store:
     def seeds_of(self, key: str) -> set[int]:
         """The seeds of a cell's finished runs."""
         path = self._path(key, "parquet")
-        return set(pd.read_parquet(path, columns=["seed"])["seed"]) if path.exists() else set()
+        return set(pd.read_parquet(path, columns=["seed"])["seed"].tolist()) if path.exists() else set()
 
-    def error_of(self, key: str) -> str | None:
+    def claim(self, key: str, what: str = "") -> AbstractContextManager[bool]:
+        """Whether a cell is ours until the block ends; it is not where somebody else is at work on it."""
+        return claimed(self._path(key, "claim"), what)
+
+    def add(self, key: str, rows: pd.DataFrame, errors: pd.DataFrame) -> None:
+        """Keep the rows of a cell, beside those of its other seeds. To be called by whoever has claimed the cell.
+
+        Args:
+            key: of the cell.
+            rows: one per run.
+            errors: one row per frame and drone of every run, with a column `seed`.
+
+        Raises:
+            OutputError: they cannot be written.
+        """
+        # The rows last: they are what makes a cell finished.
+        for path, new in ((self._errors(key), errors), (self._path(key, "parquet"), rows)):
+            if path.exists():
+                before = pd.read_parquet(path)
+                new = pd.concat([before[~before["seed"].isin(rows["seed"])], new], ignore_index=True)
+            with written_whole(path) as temporary:
+                new.sort_values("seed", kind="stable").to_parquet(temporary, index=False)
+
+    def fail(self, name: str, error: str, about: Mapping[str, Any]) -> None:
+        """Keep why a cell failed, and what it was.
+
+        Raises:
+            OutputError: that cannot be written.
+        """
+        with written_whole(self._path(name, "error.json")) as temporary:
+            temporary.write_text(json.dumps({"error": error, **about}, indent=2) + "\n", encoding="utf-8")
+
+    def forgive(self, name: str) -> None:
+        """What is said of a cell's earlier failure goes: it is finished."""
+        self._path(name, "error.json").unlink(missing_ok=True)
+
+    def error_of(self, name: str) -> str | None:
         """Why a cell failed when it was last tried; None if it did not."""
         try:
-            return str(json.loads(self._path(key, "error.json").read_text(encoding="utf-8"))["error"])
+            return str(_read(self._path(name, "error.json"))["error"])
         except FileNotFoundError:
             return None
 
-    def is_claimed(self, key: str) -> bool:
-        """Whether a living runner is at work on a cell, as far as one can see."""
-        try:
-            return time.time() - self._path(key, "claim").stat().st_mtime < STALE_S
-        except FileNotFoundError:
-            return False
-
-    def add(self, key: str, rows: pd.DataFrame) -> None:
-        """Keep the rows of a cell, beside those of its other seeds; what is said of an earlier failure goes.
-
-        To be called by whoever has claimed the cell.
-        """
-        path = self._path(key, "parquet")
-        if path.exists():
-            before = pd.read_parquet(path)
-            rows = pd.concat([before[~before["seed"].isin(rows["seed"])], rows], ignore_index=True)
-        with written_whole(path) as temporary:
-            rows.sort_values("seed").to_parquet(temporary, index=False)
-        self._path(key, "error.json").unlink(missing_ok=True)
-
-    def fail(self, key: str, error: str, about: Mapping[str, Any]) -> None:
-        """Keep why a cell failed, and what it was."""
-        with written_whole(self._path(key, "error.json")) as temporary:
-            temporary.write_text(json.dumps({"error": error, **about}, indent=2) + "\n", encoding="utf-8")
-
-    def write_manifest(self, manifest: Mapping[str, Any]) -> None:
-        """Keep what the results depend on."""
-        with written_whole(self.folder / "manifest.json") as temporary:
-            temporary.write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
-
-    def rows(self) -> pd.DataFrame:
-        """One row per run of every finished cell.
+    def rows(self, seeds: Mapping[str, Collection[int]] | None = None) -> pd.DataFrame:
+        """One row per run of every finished cell; or of those of these keys, and of these seeds.
 
         Raises:
             InputError: there are no results.
         """
-        parts = [pd.read_parquet(path) for path in sorted((self.folder / "cells").glob("*.parquet"))]
+        if seeds is None:
+            parts = [pd.read_parquet(path) for path in self._files("parquet")]
+        else:
+            finished = [(self._path(key, "parquet"), of_key) for key, of_key in seeds.items()]
+            tables = [(pd.read_parquet(path), of_key) for path, of_key in finished if path.exists()]
+            parts = [table[table["seed"].isin(list(of_key))] for table, of_key in tables]
         if not parts:
             raise InputError(self.folder, expected="results of a sweep", found="no finished cell")
         return pd.concat(parts, ignore_index=True)
 
+    def errors(self, key: str, seeds: Collection[int]) -> pd.DataFrame:
+        """Errors of a cell's runs, frame by frame: rows of `evaluation.errors_over_time`, with a column `seed`.
+
+        Args:
+            key: of the cell, as the column `cell` of its rows has it.
+            seeds: of its runs.
+
+        Raises:
+            InputError: they are not there.
+        """
+        path = self._errors(key)
+        if not path.exists():
+            raise InputError(path, expected="errors of a finished cell", found="no file")
+        errors = pd.read_parquet(path)
+        return errors[errors["seed"].isin(list(seeds))].reset_index(drop=True)
+
     def status(self) -> dict[str, Any]:
-        """How many cells are finished, failed and being worked at, and what the failures say."""
-        cells = self.folder / "cells"
-        if not cells.is_dir():
+        """How many cells are finished, failed and being worked at, by whom, and what the failures say.
+
+        Raises:
+            InputError: there are no results.
+        """
+        if not (self.folder / "cells").is_dir():
             raise InputError(self.folder, expected="results of a sweep", found="none")
-        errors = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(cells.glob("*.error.json"))]
-        claims = [path.name.removesuffix(".claim") for path in cells.glob("*.claim")]
+        errors = [error for path in self._files("error.json") if (error := _read_if_there(path))]
+        owners = [owner for path in self._files("claim") if (owner := owner_of(path))]
         return {
-            "finished": len(list(cells.glob("*.parquet"))),
+            "finished": len(self._files("parquet")),
             "failed": len(errors),
-            "claimed": sum(self.is_claimed(key) for key in claims),
+            "claimed": len(owners),
             "errors": [f"{error['sequence']} {error['method']}: {error['error']}" for error in errors],
+            "at_work": [
+                f"process {owner.process} on {owner.host} since {owner.since}: {owner.what}"
+                for owner in owners
+            ],
         }
 
-    @contextlib.contextmanager
-    def claim(self, key: str) -> Iterator[bool]:
-        """Whether a cell is ours until the block ends; it is not where somebody else is at work on it."""
-        if not self._take(key):
-            yield False
-            return
-        ended = threading.Event()
-        beating = threading.Thread(target=self._keep_alive, args=(key, ended), daemon=True)
-        beating.start()
-        try:
-            yield True
-        finally:
-            ended.set()
-            beating.join()
-            self._path(key, "claim").unlink(missing_ok=True)
+    def manifest(self) -> dict[str, Any]:
+        """What was run, and from what; empty lists and tables before the first run."""
+        return _read_if_there(self.folder / "manifest.json") or {"runs": [], "inputs": {}}
+
+    def change_manifest(self, change: Callable[[dict[str, Any]], None]) -> None:
+        """Let `change` change what the manifest says; one runner at a time.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        path = self.folder / "manifest.json"
+        with waited_for(path.with_name(".manifest.claim")):
+            manifest = self.manifest()
+            before = json.dumps(manifest)
+            change(manifest)
+            if json.dumps(manifest) != before:
+                with written_whole(path) as temporary:
+                    temporary.write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
+
+    def tidy(self) -> None:
+        """Remove what runners left half written when they were killed."""
+        for folder in (self.folder, self.folder / "cells", self.folder / "errors"):
+            for path in (*folder.glob(".*.partial.*"), *folder.glob(".*.stale")):
+                with contextlib.suppress(OSError):
+                    if time.time() - path.stat().st_mtime > _LEFT_BEHIND_S:
+                        path.unlink()
+
+    def _errors(self, key: str) -> Path:
+        return self.folder / "errors" / f"{key}.parquet"
 
     def _path(self, key: str, suffix: str) -> Path:
         return self.folder / "cells" / f"{key}.{suffix}"
 
-    def _take(self, key: str) -> bool:
-        """Whether the claim on a cell is ours now."""
-        path = self._path(key, "claim")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.exists() and not self.is_claimed(key):
-            # Of all who see that a claim is stale one alone can move it away.
-            aside = path.with_name(f".{key}.{secrets.token_hex(4)}.stale")
-            with contextlib.suppress(FileNotFoundError):
-                os.rename(path, aside)
-                aside.unlink()
-        try:
-            with path.open("x", encoding="utf-8") as file:
-                json.dump({"host": socket.gethostname(), "process": os.getpid()}, file)
-        except FileExistsError:
-            return False
-        return True
+    def _files(self, suffix: str) -> list[Path]:
+        """Of all cells; not those that are being written, whose names begin with a dot."""
+        files = (self.folder / "cells").glob(f"*.{suffix}")
+        return sorted(path for path in files if not path.name.startswith("."))
 
-    def _keep_alive(self, key: str, ended: threading.Event) -> None:
-        while not ended.wait(HEARTBEAT_S):
-            with contextlib.suppress(FileNotFoundError):
-                os.utime(self._path(key, "claim"))
+
+def _read(path: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return content
+
+
+def _read_if_there(path: Path) -> dict[str, Any] | None:
+    try:
+        return _read(path)
+    except FileNotFoundError:
+        return None

@@ -1,0 +1,82 @@
+"""How much longer many runs of a sequence take than one: the batch axis of `pipeline.track_runs`.
+
+    python experiments/benchmarks/batch.py data/Simulated_Data/S02_D4_A --cache cache
+
+Silhouettes and compiled programs are made before anything is timed. One run and a batch are timed in turn; each ends
+with trajectories and their evaluation's input on the host. Prints device, versions, shapes, medians and their ratio.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+
+from psotrack.compiled import keep_compiled
+from psotrack.datasets.dpjait import read_sequence
+from psotrack.pipeline import environment, track_runs
+from psotrack.settings import TrackSettings
+from psotrack.silhouettes import compute
+
+
+def seconds(call: Callable[[], object]) -> tuple[float, float]:
+    """Of the clock, and of all processors together."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    call()
+    return time.perf_counter() - wall, time.process_time() - cpu
+
+
+def main() -> None:
+    """Time, print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("sequence", type=Path)
+    parser.add_argument("--cache", type=Path, required=True, help="of silhouettes and compiled programs")
+    parser.add_argument("--runs", type=int, default=10)
+    parser.add_argument("--particles", type=int, default=50)
+    parser.add_argument("--iterations", type=int, default=50)
+    parser.add_argument("--swarm", choices=["joint", "per-drone"], default="joint")
+    parser.add_argument("--frames", type=int, help="the first so many")
+    parser.add_argument("--repeats", type=int, default=5)
+    options = parser.parse_args()
+    # Before anything touches a device, as `psotrack sweep` does it.
+    if "XLA_FLAGS" not in os.environ:
+        jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+    keep_compiled(options.cache / "compiled")
+    sequence = read_sequence(options.sequence).usable(num_frames=options.frames)
+    silhouettes = compute(sequence, TrackSettings().silhouettes, cache=options.cache)
+    effort = {name: getattr(options, name) for name in ("particles", "iterations", "swarm")}
+    batch = [TrackSettings(seed=seed, **effort) for seed in range(options.runs)]
+    calls = {
+        "one run": lambda: track_runs(sequence, silhouettes, batch[:1]),
+        f"{options.runs} runs": lambda: track_runs(sequence, silhouettes, batch),
+    }
+    for call in calls.values():
+        call()
+    taken: dict[str, list[tuple[float, float]]] = {name: [] for name in calls}
+    for _ in range(options.repeats):
+        for name, call in calls.items():
+            taken[name].append(seconds(call))
+    print(json.dumps(environment() | {"devices": len(jax.devices())}))
+    print(f"{sequence.name}: {sequence.num_frames} frames, {len(sequence.rig)} cameras, {effort}")
+    print(f"load average {os.getloadavg()[0]:.1f}")
+    medians = {
+        name: [statistics.median(column) for column in zip(*rows, strict=True)]
+        for name, rows in taken.items()
+    }
+    for name, (wall, cpu) in medians.items():
+        print(f"{name:>8}: {wall:7.2f} s, {cpu:7.2f} s of processors")
+    one, many = medians.values()
+    ratio = statistics.median(many[0] / one[0] for one, many in zip(*taken.values(), strict=True))
+    print(f"{options.runs} runs take {ratio:.2f} times as long as one (processors: {many[1] / one[1]:.2f})")
+
+
+if __name__ == "__main__":
+    main()

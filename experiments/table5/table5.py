@@ -1,0 +1,148 @@
+"""The paper's Table 5, beside ours: mean errors at its numbers of particles and iterations, over ten runs.
+
+    python experiments/table5/table5.py            # 540 runs, an hour on two cores; interrupted, it goes on
+    python experiments/table5/table5.py --quick    # a small form of it: five minutes, the second time seconds
+    python experiments/table5/table5.py --data FOLDER_OF_THE_DATASET
+
+Without --data it simulates the sequences that are not there. It writes to --out: results.csv (a row per run),
+manifest.json, table5.md and figures; what is finished there is not run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tomllib
+from pathlib import Path
+
+import pandas as pd
+
+from psotrack.errors import PsotrackError
+from psotrack.progress import terminal
+from psotrack.sweep import Grid, load, pivot, render, sweep
+from psotrack.sweep.store import Store
+
+HERE = Path(__file__).parent
+#: Title -> column, its factor, and decimals: what the tables show.
+TABLES = {
+    "Mean error": ("mean_error_m", 1e3, 1),
+    "Mean error, each drone's constant offset taken out": ("offset_removed_mean_error_m", 1e3, 1),
+    "Identity switches": ("id_switches", 1.0, 1),
+    "Missed, of all frames and drones": ("missed_rate", 1.0, 3),
+    "Time of the track stage per frame": ("track_ms_per_frame", 1.0, 1),
+}
+#: What results.csv keeps, besides settings that differ.
+KEPT = ["sequence", "method", "settings.particles", "settings.iterations", "seed", "frames"]
+KEPT += ["mean_error_m", "median_error_m", "p95_error_m", "max_error_m", "offset_removed_mean_error_m"]
+KEPT += ["missed_rate", "id_switches", "mota", "idf1", "hota", "offset_removed_inside_90_rate"]
+KEPT += ["track_ms_per_frame", "runs_in_batch", "commit"]
+QUICK_FRAMES, QUICK_SCALE = 50, 0.5
+
+
+def main() -> None:
+    """Simulate, track, and show."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--quick", action="store_true", help="a small form of it, in minutes")
+    parser.add_argument("--grid", type=Path, help="[default: grid.toml or quick.toml, beside this file]")
+    parser.add_argument(
+        "--data", type=Path, help="root folder of the sequences [default: simulated into OUT]"
+    )
+    parser.add_argument("--out", type=Path, help="[default: table5, or table5/quick]")
+    options = parser.parse_args()
+    out = options.out or (Path("table5/quick") if options.quick else Path("table5"))
+    try:
+        grid = load(options.grid or HERE / ("quick.toml" if options.quick else "grid.toml"))
+        data = options.data or simulated(grid, out / "data", quick=options.quick)
+        rows = tracked(grid, out, data)
+        show(rows, out)
+    except PsotrackError as error:
+        sys.exit(f"table5: {error}")
+    if rows.attrs["errors"]:
+        sys.exit("\n".join(f"table5: {error}" for error in rows.attrs["errors"]))
+
+
+def simulated(grid: Grid, data: Path, *, quick: bool) -> Path:
+    """The data's root, with the sequences that were not there."""
+    from psotrack.simulation import simulate
+
+    for name in grid.sequences:
+        if not (data / "Simulated_Data" / name).is_dir():
+            print(f"simulating {name}", flush=True)
+            size = {"num_frames": QUICK_FRAMES, "scale": QUICK_SCALE} if quick else {}
+            simulate(name, data, seed=0, masks=False, onboard=False, report=terminal, **size)
+    return data
+
+
+def tracked(grid: Grid, out: Path, data: Path) -> pd.DataFrame:
+    """One row per cell and run; what is in `out` is not run again."""
+    import jax
+
+    from psotrack.compiled import keep_compiled
+
+    if "XLA_FLAGS" not in os.environ:
+        jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+    keep_compiled(out / "cache" / "compiled")
+    return sweep(grid, out, data=data, cache=out / "cache", report=terminal)
+
+
+def show(rows: pd.DataFrame, out: Path) -> None:
+    """Print the tables; write them, the rows and the figures, unless they are there and nothing is new."""
+    published = tomllib.loads((HERE / "published.toml").read_text())
+    tables = {
+        title: pivot(
+            rows,
+            rows_by=["sequence", "particles", "iterations"],
+            columns_by=["method"],
+            value=value,
+            scale=scale,
+        )
+        for title, (value, scale, _) in TABLES.items()
+    }
+    print(render(tables["Mean error"]))
+    said = [
+        f"{name}: {1e3 * low:.0f}{f' to {1e3 * high:.0f}' if high > low else ' at best'} mm"
+        for name, (low, high) in published.items()
+        if name in set(rows["sequence"])
+    ]
+    print("Published mean errors:", ", ".join(said))
+    newest = max(path.stat().st_mtime for path in (out / "cells").glob("*.parquet"))
+    # Written last, so that it is older than the newest cell where something was interrupted.
+    last = out / "table5.md"
+    if last.exists() and last.stat().st_mtime > newest:
+        print(f"{out}: nothing new")
+        return
+    rows[[name for name in KEPT if name in rows]].to_csv(
+        out / "results.csv", index=False, float_format="%.6g"
+    )
+    draw(rows, published, out)
+    parts = [
+        f"## {title}\n\n{render(table, 'markdown', decimals=TABLES[title][2])}"
+        for title, table in tables.items()
+    ]
+    last.write_text("\n".join([*parts, f"Published mean errors: {', '.join(said)}.\n"]))
+    print(f"{out}: {', '.join(sorted(path.name for path in out.glob('*.*')))}")
+
+
+def draw(rows: pd.DataFrame, published: dict[str, tuple[float, float]], out: Path) -> None:
+    """The figures; those of single frames are of the largest swarm."""
+    from psotrack.sweep import figures
+
+    figures.save(
+        out / "error_against_work.png", figures.error_against_work(rows, published=published), force=True
+    )
+    particles, iterations = (rows[f"settings.{name}"].max() for name in ("particles", "iterations"))
+    largest = rows[(rows["settings.particles"] == particles) & (rows["settings.iterations"] == iterations)]
+    store, errors = Store(out), {}
+    for (sequence, method), runs in largest.groupby(["sequence", "method"], sort=False):
+        errors.setdefault(sequence, {})[method] = store.errors(runs["cell"].iloc[0], set(runs["seed"]))
+    for sequence, methods in errors.items():
+        figure = figures.error_over_time(methods, f"{sequence}, {particles} x {iterations}")
+        figures.save(out / f"error_over_time_{sequence}.png", figure, force=True)
+    figures.save(out / "error_per_drone.png", figures.error_per_drone(errors), force=True)
+
+
+if __name__ == "__main__":
+    main()

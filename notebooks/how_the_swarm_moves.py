@@ -1,0 +1,230 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#   kernelspec:
+#     display_name: Python 3 (ipykernel)
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # How the swarm moves
+#
+# A [score](video_to_score.ipynb) says how well a drone at a point explains what the cameras see. In every frame, a
+# particle swarm looks for the point where it is highest. Each particle is a guess of where the drone is. It remembers
+# the best place that it has been to (pbest), and knows the best place that any of them has found (gbest). In each
+# iteration
+#
+# $$v \leftarrow w\,v + c_1 r_1\,(\mathrm{pbest} - x) + c_2 r_2\,(\mathrm{gbest} - x),\qquad x \leftarrow x + v,$$
+#
+# with random numbers $r_1, r_2$ in [0, 1) for every particle and axis (Kennedy and Eberhart 1995, Shi and Eberhart
+# 1998). Here the package's own swarm is taken one step at a time, in one frame, to watch it.
+
+# %%
+import os
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from IPython.display import Image
+from matplotlib.animation import FuncAnimation, PillowWriter
+
+from psotrack import swarm
+from psotrack.compiled import keep_compiled
+from psotrack.datasets.dpjait import read_sequence
+from psotrack.fitness import ScoreSettings, drone_fitness, joint_fitness, scene
+from psotrack.initialisation import find_drones
+from psotrack.settings import TrackSettings
+from psotrack.silhouettes import SilhouetteSettings, compute
+from psotrack.simulation import simulate
+from psotrack.starts import room_bounds
+from psotrack.summed_area import summed_area_table
+from psotrack.tracking import on_device
+
+# %%
+TINY = os.environ.get("PSOTRACK_NOTEBOOKS") == "tiny"  # a quick check that everything runs
+NUM_FRAMES = 20 if TINY else 75
+SCALE = 0.25 if TINY else 0.5
+SILHOUETTES = SilhouetteSettings(reduction=2, working_reduction=1)
+if TINY:  # so few pixels per drone that noise counts
+    SILHOUETTES = SilhouetteSettings(reduction=1, working_reduction=1, min_blob_px=32, var_threshold=16.0)
+FRAME = 10  # the frame that is looked at
+DRONE = 2  # the drone that is looked at, in the truth's order
+PARTICLES = 30
+SHOWN_ITERATIONS = 4 if TINY else 24  # in the animation
+ITERATIONS, SEEDS = (5, 2) if TINY else (50, 20)  # in the comparison
+SPREAD_M = 0.15  # of the particles at the start; the tracker's 0.05 would be hard to see
+HALF_M, STEP_M = 0.45, 0.05 if TINY else 0.01  # half the side of the map, and its step
+DATA = Path("data", "tiny" if TINY else "normal")
+plt.rcParams.update({"figure.dpi": 80, "font.size": 9})
+keep_compiled(Path("data", "compiled"))
+
+# %% [markdown]
+# ## One frame
+#
+# The drones are found in the first frames. Where they would be in frame 10, had they flown straight on, is the
+# prediction about which the particles start.
+
+# %%
+folder = DATA / "Simulated_Data" / "S02_D4_A"
+if not folder.exists():  # the same recording as in the quickstart
+    simulate("S02_D4_A", DATA, num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
+sequence = read_sequence(folder).usable()
+settings = TrackSettings(silhouettes=SILHOUETTES)
+silhouettes = compute(sequence, SILHOUETTES, cache=DATA / "silhouettes")
+start = find_drones(
+    sequence.rig.cameras,
+    silhouettes.read(0, 10),
+    reduction=SILHOUETTES.reduction,
+    fps=sequence.fps,
+    bounds_m=room_bounds(sequence.rig, settings),
+    max_speed_m_s=settings.max_speed_m_s,
+)
+predicted_m = jnp.asarray(start.position_m + start.velocity_m_s * FRAME / sequence.fps, jnp.float32)
+truth_m = sequence.truth.position_m[FRAME, DRONE]
+shown = int(jnp.linalg.norm(predicted_m - truth_m, axis=1).argmin())
+print(f"the prediction is {1e3 * np.linalg.norm(predicted_m[shown] - truth_m):.0f} mm off")
+
+# %%
+seen = scene(
+    on_device(sequence.rig.cameras),
+    jnp.asarray(start.size_m, jnp.float32),
+    summed_area_table(jnp.asarray(silhouettes.read(FRAME, FRAME + 1)[0], jnp.int32)),
+    ScoreSettings(reduction=SILHOUETTES.reduction),
+)
+# Particles have the axes (particles, drones, 3): each drone has a swarm of its own, all of them move at once.
+spread = jax.random.normal(jax.random.key(1), (PARTICLES, *predicted_m.shape))
+first_m = predicted_m + SPREAD_M * spread
+params = swarm.SwarmParams(
+    inertia=jnp.float32(settings.inertia),
+    cognitive=jnp.float32(settings.cognitive),
+    social=jnp.float32(settings.social),
+    max_step=jnp.full(3, settings.max_speed_m_s / sequence.fps, jnp.float32),
+    low=predicted_m - HALF_M,
+    high=predicted_m + HALF_M,
+)
+fitness = jax.jit(lambda position_m: drone_fitness(seen, position_m))
+step = jax.jit(swarm.step, static_argnums=1)
+
+states = [swarm.init(first_m, params)]
+for iteration in range(SHOWN_ITERATIONS):
+    states.append(step(jax.random.key(iteration), fitness, states[-1], params))
+
+# %% [markdown]
+# `states` is all that is to be seen: after each iteration, where the particles are and the best that they know.
+
+# %%
+position_m = np.stack([state.position[:, shown] for state in states])  # iterations, particles, 3
+height = np.stack([fitness(state.position)[:, shown] for state in states])
+best_m = np.stack([state.gbest_position[shown] for state in states[1:]])
+best = np.array([state.gbest_fitness[shown] for state in states[1:]])
+
+line_m = np.arange(-round(HALF_M / STEP_M), round(HALF_M / STEP_M) + 1) * STEP_M
+middle_m = np.asarray(predicted_m[shown])
+x_m, y_m = middle_m[0] + line_m, middle_m[1] + line_m
+place_m = np.stack([*np.meshgrid(x_m, y_m), np.full((len(line_m),) * 2, best_m[-1, 2])], axis=-1)
+# A place for one drone is a place for all of them here; only the column of the one that is shown is looked at.
+everywhere_m = jnp.asarray(np.repeat(place_m[:, :, None], len(predicted_m), axis=2), jnp.float32)
+ground = np.asarray(fitness(everywhere_m))[..., shown]
+
+figure, (left, right) = plt.subplots(1, 2, figsize=(9.6, 4.3), dpi=66, layout="constrained")
+shown_ground = left.contourf(x_m, y_m, ground, levels=np.arange(0, ground.max() + 0.025, 0.025))
+figure.colorbar(shown_ground, ax=left, label="fitness (0 to 1)", shrink=0.85)
+left.plot(*truth_m[:2], "+", color="#2b313a", markersize=14, markeredgewidth=1.5)
+trails = left.plot(*np.zeros((2, 2, PARTICLES)), color="white", linewidth=0.7, alpha=0.7)
+(dots,) = left.plot(
+    [], [], "o", color="white", markersize=4.5, markeredgecolor="#2b313a", markeredgewidth=0.8
+)
+(leader,) = left.plot([], [], "o", color="none", markeredgecolor="#ff4d4d", markersize=12, markeredgewidth=2)
+left.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", xlim=x_m[[0, -1]], ylim=y_m[[0, -1]], title=" ")
+(cloud,) = right.plot([], [], "o", color="#9aa3ad", markersize=3, label="each particle")
+(curve,) = right.plot([], [], color="#d55e00", linewidth=2, label="best so far")
+right.set(
+    xlabel="iteration", ylabel="fitness (0 to 1)", xlim=(-0.5, SHOWN_ITERATIONS), ylim=(0, 1.1 * best[-1])
+)
+right.legend(frameon=False, loc="lower right")
+right.grid(alpha=0.3)
+figure.canvas.draw()
+figure.set_layout_engine("none")  # the axes stay where they are now
+
+
+def draw(iteration):
+    """Show the swarm as it is evaluated in an iteration."""
+    past = np.arange(iteration + 1)
+    steps_m = position_m[[max(iteration - 1, 0), iteration]]
+    for trail, (x, y, _) in zip(trails, steps_m.transpose(1, 2, 0), strict=True):
+        trail.set_data(x, y)
+    dots.set_data(*position_m[iteration, :, :2].T)
+    leader.set_data(*best_m[iteration, :2, None])
+    cloud.set_data(np.repeat(past, PARTICLES), height[past].ravel())
+    curve.set_data(past, best[past])
+    left.set_title(f"iteration {iteration}")
+
+
+animation = FuncAnimation(figure, draw, SHOWN_ITERATIONS)
+animation.save(DATA / "swarm.gif", writer=PillowWriter(fps=3))
+plt.close(figure)
+Image(filename=DATA / "swarm.gif")
+
+# %% [markdown]
+# *What to see. Left, from above: the score's landscape at the drone's height, thirty particles (white, with the last
+# step as a line), the best place that was found so far (ring), and the truth (dark cross). The particles
+# begin as a wide cloud about the prediction, are pulled over the hill, swing through to its other side, and settle on
+# the top. Right: the score of every particle and the best so far. The best is nearly final after a few iterations;
+# the rest of the time goes into the last millimetres.*
+#
+# ## One swarm for each drone, or one for all?
+#
+# The paper has one swarm in which a particle is a guess of *all* drones at once: 12 numbers for four drones. Its
+# score is the mean over the drones, so a particle that is right about three of them and wrong about one looks
+# mediocre, and pulls nobody. Swarms of their own share nothing but the images. Both with the same particles and
+# iterations, that is the same number of looks at the images:
+
+# %%
+joint = jax.jit(lambda position_m: joint_fitness(seen, position_m.reshape(PARTICLES, -1, 3))[:, None])
+all_at_once = swarm.SwarmParams(
+    inertia=params.inertia,
+    cognitive=params.cognitive,
+    social=params.social,
+    max_step=jnp.tile(params.max_step, len(predicted_m)),
+    low=params.low.reshape(1, -1),
+    high=params.high.reshape(1, -1),
+)
+# The top of each hill, from a swarm that has all the time of the world.
+top_m = swarm.run(jax.random.key(0), fitness, jnp.tile(first_m, (10, 1, 1)), params, 300).gbest_position
+
+distance_mm = {"a swarm per drone": [], "one swarm for all": []}
+for seed in range(SEEDS):
+    key_spread, key_swarm = jax.random.split(jax.random.key(100 + seed))
+    begin_m = predicted_m + SPREAD_M * jax.random.normal(key_spread, first_m.shape)
+    own, together = swarm.init(begin_m, params), swarm.init(begin_m.reshape(PARTICLES, 1, -1), all_at_once)
+    for iteration in range(ITERATIONS):
+        key = jax.random.fold_in(key_swarm, iteration)
+        own, together = step(key, fitness, own, params), step(key, joint, together, all_at_once)
+        for name, found in (("a swarm per drone", own), ("one swarm for all", together)):
+            off_m = found.gbest_position.reshape(-1, 3) - top_m
+            distance_mm[name].append(1e3 * float(jnp.linalg.norm(off_m, axis=1).mean()))
+
+figure, axes = plt.subplots(figsize=(9, 3.8), layout="constrained")
+for (name, values), colour in zip(distance_mm.items(), ("#0072b2", "#d55e00"), strict=True):
+    runs = np.array(values).reshape(SEEDS, ITERATIONS)
+    axes.fill_between(
+        np.arange(ITERATIONS), *np.percentile(runs, (10, 90), axis=0), color=colour, alpha=0.2, linewidth=0
+    )
+    axes.plot(np.median(runs, axis=0), color=colour, linewidth=2, label=name)
+axes.set(xlabel="iteration", ylabel="best place to the top of the hill,\nmean over drones (mm)", yscale="log")
+axes.legend(frameon=False, title=f"{PARTICLES} particles, {len(predicted_m)} drones, {SEEDS} seeds")
+axes.grid(alpha=0.3, which="both")
+plt.show()
+
+# %% [markdown]
+# *What to see: how far the best place known is from the place with the highest score, over the iterations; median over
+# the seeds, bands from the 10th to the 90th percentile; the scale is logarithmic. Swarms of their own come closer by a
+# constant factor in every iteration; the joint swarm is slower, and the slower the more drones there are. Either
+# is followed, in the tracker, by a parabola through the score about the best place, which takes out most of the
+# distance that is left: so the tracker needs far fewer iterations than this figure suggests.*
+#
+# Next: [what particles and iterations cost and buy](table_5.ipynb) over whole recordings.

@@ -1,0 +1,182 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#   kernelspec:
+#     display_name: Python 3 (ipykernel)
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Quickstart
+#
+# Four drones fly in a hall, and eight cameras on its walls record them. From the videos alone: where is each drone, in
+# 3D, in every frame?
+#
+# This notebook simulates such a recording, looks at it, tracks the drones, judges the tracks by the truth, and ends
+# with a table to go on with. It takes about two minutes on two cores, and half of one when it runs again.
+
+# %%
+import os
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import pandas as pd
+
+from psotrack.compiled import keep_compiled
+from psotrack.datasets.dpjait import read_sequence
+from psotrack.demo import save_picture
+from psotrack.evaluation import evaluate, plots, tables
+from psotrack.pipeline import track_sequence
+from psotrack.settings import TrackSettings
+from psotrack.silhouettes import SilhouetteSettings
+from psotrack.simulation import simulate
+from psotrack.trajectory_files import write_trajectories
+from psotrack.video import read_frames
+
+# %% [markdown]
+# All sizes are set here. Images have half of their full size, so that nobody waits; `SCALE = 1.0` and
+# `SilhouetteSettings()` are the real thing.
+
+# %%
+TINY = os.environ.get("PSOTRACK_NOTEBOOKS") == "tiny"  # a quick check that everything runs
+NUM_FRAMES = 20 if TINY else 75
+SCALE = 0.25 if TINY else 0.5
+SILHOUETTES = SilhouetteSettings(reduction=2, working_reduction=1)
+if TINY:  # so few pixels per drone that noise counts
+    SILHOUETTES = SilhouetteSettings(reduction=1, working_reduction=1, min_blob_px=32, var_threshold=16.0)
+DATA = Path("data", "tiny" if TINY else "normal")
+plt.rcParams.update({"figure.dpi": 80, "font.size": 9})
+keep_compiled(Path("data", "compiled"))  # the second run does not wait for the compiler
+
+# %% [markdown]
+# ## A recording
+#
+# `simulate` writes a folder as it would come from a recording: a video per camera, the cameras' calibration, and, as
+# this is a simulation, the truth.
+
+# %%
+folder = DATA / "Simulated_Data" / "S02_D4_A"
+if not folder.exists():
+    simulate("S02_D4_A", DATA, num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
+sequence = read_sequence(folder).usable()
+
+print(f"{sequence.num_frames} frames at {sequence.fps:g} per second")
+for name, video, centre_m in zip(
+    sequence.rig.names, sequence.videos.values(), sequence.rig.cameras.centre_world, strict=True
+):
+    width, height = video.image_size_wh
+    x, y, z = centre_m
+    print(f"{name}: {width} x {height} pixels, hangs at x = {x:5.2f}, y = {y:5.2f}, z = {z:4.2f} m")
+
+# %%
+name = sequence.rig.names[0]
+first_frame = next(read_frames(sequence.videos[name]))
+figure, axes = plt.subplots(figsize=(9, 5.2), dpi=64, layout="constrained")
+axes.imshow(first_frame[:, :, ::-1])  # OpenCV has blue first
+axes.set(xlabel="x (pixels)", ylabel="y (pixels)", title=f"camera {name}, frame 0")
+plt.show()
+
+# %% [markdown]
+# *What to see: four drones, the nearest some fifty pixels wide: two left of the middle, two before the far corner.
+# The tracker will know them by nothing but their silhouettes: no markers, no colours, no model of what a drone looks
+# like.*
+
+# %% [markdown]
+# ## Track
+#
+# One call makes silhouettes from the videos (in several processes; they are kept in `cache`), finds the drones in the
+# first frames, and follows them. Nothing is said about how many there are, where they start or how large they are.
+
+# %%
+tracked = track_sequence(sequence, TrackSettings(seed=1, silhouettes=SILHOUETTES), cache=DATA / "silhouettes")
+tracked.trajectories.position_m.shape  # frames, drones, x y z in metres
+
+# %%
+pd.Series(tracked.record["seconds"], name="seconds").to_frame().T.round(1)
+
+# %% [markdown]
+# Where the seconds went: `decode` and `foreground` are summed over processes, and 0 when the silhouettes were in the
+# cache; `compile` is short when the program was on disk; `track` is all frames.
+#
+# ## See it
+
+# %%
+picture = DATA / "quickstart.png"
+save_picture(picture, sequence, tracked)
+figure, axes = plt.subplots(figsize=(13, 4.6), layout="constrained")
+axes.imshow(plt.imread(picture))
+axes.set_axis_off()
+plt.show()
+
+# %% [markdown]
+# *What to see. Left: four of the cameras half-way through the recording; each box is the tracked position with the
+# learned size, projected into the camera, and sits on its drone. A colour is one drone in all pictures. Right: the
+# tracked paths (solid), the true ones (dashed, drawn over them), and their shadows on the floor. Axes are in metres.*
+#
+# ## How good is it?
+
+# %%
+evaluation = evaluate(tracked.trajectories, sequence.truth)
+print(f"mean error {1e3 * evaluation.mean_error_m:.0f} mm")
+print(
+    f"mean error without each drone's constant offset {1e3 * evaluation.offset_removed_mean_error_m:.1f} mm"
+)
+print(f"identity switches {evaluation.id_switches}, missed {evaluation.missed_rate:.1%}")
+
+columns = ["drone", "mean_error_m", "p95_error_m", "offset_removed_mean_error_m", "missed_rate"]
+tables.to_frame(evaluation)[columns].round(4)
+
+# %%
+figure, axes = plt.subplots(figsize=(9, 3.4), layout="constrained")
+plots.draw_errors(axes, tracked.trajectories, sequence.truth)
+plt.show()
+
+# %% [markdown]
+# *What to see: each drone's distance from the truth, frame by frame. The curves keep a height of their own: that is
+# the offset between the body's origin, which the truth is about, and the silhouette's middle, which is all that
+# cameras show. It is constant in each drone's body and comes out with `--body-offset`. What then is left is the third
+# column of the table. Gaps and bars at the top would be frames in which a drone is missed, dotted lines exchanged
+# identities.*
+#
+# ## Take the numbers away
+#
+# What is written here is what `psotrack track SEQ --out tracks.parquet` writes: a row per frame and drone.
+
+# %%
+tracks = DATA / "tracks.parquet"
+write_trajectories(tracks, tracked.trajectories, force=True)
+frame = pd.read_parquet(tracks)
+frame[["frame", "time_s", "drone", "x_m", "y_m", "z_m", "fitness", "num_cameras", "status"]].head(8).round(3)
+
+# %%
+figure, panels = plt.subplots(3, 1, figsize=(9, 4.6), sharex=True, layout="constrained")
+colours = plots.colours_of_estimates(tracked.trajectories, sequence.truth)
+for colour, (drone, rows) in zip(colours, frame.groupby("drone"), strict=True):
+    for panel, axis in zip(panels, "xyz", strict=True):
+        std_m = rows[f"cov_{axis}{axis}"] ** 0.5
+        panel.plot(rows["time_s"], rows[f"{axis}_m"], color=colour, label=f"drone {drone}")
+        panel.fill_between(
+            rows["time_s"],
+            rows[f"{axis}_m"] - 20 * std_m,
+            rows[f"{axis}_m"] + 20 * std_m,
+            color=colour,
+            alpha=0.25,
+            linewidth=0,
+        )
+for panel, axis in zip(panels, "xyz", strict=True):
+    panel.set_ylabel(f"{axis} (m)")
+    panel.grid(alpha=0.3)
+panels[0].legend(ncols=4, frameon=False, loc="lower left", bbox_to_anchor=(0, 1))
+panels[-1].set_xlabel("time (s)")
+plt.show()
+
+# %% [markdown]
+# *What to see: the coordinates of each drone, in colours as above. The bands are the tracker's own standard
+# deviation, drawn twenty times as wide, because at its true width, some millimetres, it would vanish in the line; it
+# is wide in the first frames, when little is known of how the drones move. Numbers are the tracker's: it cannot know
+# what the truth calls a drone.*
+#
+# Next: [how a score comes from a video](video_to_score.ipynb), [how the swarm moves](how_the_swarm_moves.ipynb),
+# [your own cameras](your_own_cameras.ipynb), [what the swarm's size costs and buys](table_5.ipynb).

@@ -1,0 +1,152 @@
+"""How long what is left of a grid will take: a simple model, corrected by the rows that there are."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from psotrack.errors import InputError, PsotrackError
+from psotrack.silhouette_store import open_stored, reduced_shape
+from psotrack.sweep.cells import Cell, key_of
+from psotrack.sweep.inputs import Inputs, source_of
+from psotrack.sweep.machine import provenance
+from psotrack.sweep.store import Store
+
+#: The rule of thumb, measured on two cores of an AMD EPYC: a run's seconds per frame, and per frame and particle x
+#: iteration x drone x camera; of compiling a program; and of making silhouettes of a million pixels, on one core.
+FRAME_S, WORK_S, COMPILE_S, MEGAPIXEL_S = 0.02, 0.8e-6, 10.0, 0.008
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Seconds that a grid will take, roughly.
+
+    Attributes:
+        cells: that are to be run, of those whose input can be read.
+        unread: cells whose input cannot.
+        tracking_s: of their runs; those of a cell are taken to cost as much together as one by one.
+        compiling_s: of the programs that they need, which may be stored already.
+        silhouettes_s: of those that are not stored.
+        basis: in words, where the numbers come from.
+    """
+
+    cells: int
+    unread: int
+    tracking_s: float
+    compiling_s: float
+    silhouettes_s: float
+    basis: str
+
+    @property
+    def total_s(self) -> float:
+        """All of it."""
+        return self.tracking_s + self.compiling_s + self.silhouettes_s
+
+    def __str__(self) -> str:
+        unread = f"; without {self.unread} cells whose input cannot be read" if self.unread else ""
+        if not self.cells:
+            return f"nothing to run{unread}"
+        parts = (
+            ("tracking", self.tracking_s),
+            ("compiling", self.compiling_s),
+            ("silhouettes", self.silhouettes_s),
+        )
+        said = ", ".join(f"{name} {_in_words(seconds)}" for name, seconds in parts if seconds)
+        total = f"about {_in_words(self.total_s)} for {self.cells} cells"
+        return f"{total} ({said}), estimated from {self.basis}{unread}"
+
+
+def estimate(cells: Iterable[Cell], inputs: Inputs, store: Store | None) -> Estimate:
+    """How long the cells will take that are not finished.
+
+    Args:
+        cells: of a grid.
+        inputs: where they are read.
+        store: of the results; what is finished there does not count, and says how good the model is. None without any.
+    """
+    factor, basis = _factor(store)
+    count = unread = 0
+    tracking_s, programs, silhouettes_s = 0.0, set(), {}
+    for cell in cells:
+        try:
+            done = store.seeds_of(key_of(cell, inputs.keys_of(cell))) if store else set()
+            sequence = inputs.sequence_of(cell)
+        except PsotrackError:
+            unread += 1
+            continue
+        runs = len(set(cell.seeds) - done)
+        if not runs:
+            continue
+        every = len(sequence.rig)
+        cameras = cell.cameras if isinstance(cell.cameras, int) else len(cell.cameras or range(every))
+        assert sequence.truth is not None
+        drones = cell.settings.drones or sequence.truth.num_drones
+        settings = cell.settings
+        count += 1
+        work = settings.particles * settings.iterations * drones * cameras
+        tracking_s += factor * runs * sequence.num_frames * (FRAME_S + WORK_S * work)
+        shape = (
+            settings.particles,
+            settings.swarm,
+            settings.score,
+            settings.windows,
+            settings.silhouettes.reduction,
+        )
+        programs.add((cell.sequence, cameras, runs, shape))
+        if source_of(cell) not in silhouettes_s:
+            silhouettes_s[source_of(cell)] = _silhouettes_s(cell, inputs)
+    return Estimate(
+        count, unread, tracking_s, COMPILE_S * len(programs), sum(silhouettes_s.values(), 0.0), basis
+    )
+
+
+def _in_words(seconds: float) -> str:
+    """Two figures of it are more than are known."""
+    for limit, unit_s, unit in ((120, 1, "s"), (7200, 60, "min"), (172800, 3600, "h")):
+        if seconds < limit:
+            return f"{seconds / unit_s:.0f} {unit}"
+    return f"{seconds / 86400:.0f} days"
+
+
+def _factor(store: Store | None) -> tuple[float, str]:
+    """How much slower than by the rule of thumb the runs in a folder were, on this device if there are such."""
+    rule = "a rule of thumb, of two cores of an AMD EPYC"
+    try:
+        rows = store.rows() if store else pd.DataFrame()
+    except InputError:
+        rows = pd.DataFrame()
+    needed = ("frames", "drones", "num_cameras", "seconds.track", "device.kind", "device.processor")
+    if store is None or not set(needed) <= set(rows.columns):
+        return 1.0, rule
+    rows = rows.dropna(subset=list(needed))
+    device = provenance()["device"]
+    here = rows[(rows["device.kind"] == device["kind"]) & (rows["device.processor"] == device["processor"])]
+    used, whose = (here, "this device") if len(here) else (rows, "another device")
+    if used.empty:
+        return 1.0, rule
+    return float(
+        np.median(used["seconds.track"] / _rule_s(used))
+    ), f"{len(used)} runs on {whose} in {store.folder}"
+
+
+def _rule_s(rows: pd.DataFrame) -> pd.Series:
+    """What the rule of thumb says of rows' runs."""
+    work = rows["settings.particles"] * rows["settings.iterations"] * rows["drones"] * rows["num_cameras"]
+    return rows["frames"] * (FRAME_S + WORK_S * work)
+
+
+def _silhouettes_s(cell: Cell, inputs: Inputs) -> float:
+    """Of the silhouettes that are not stored, in as many processes as there will be."""
+    sequence, keys, settings = inputs.sequence_of(cell), inputs.keys_of(cell), cell.settings.silhouettes
+    megapixels = [
+        video.num_frames * video.image_size_wh[0] * video.image_size_wh[1] / 1e6
+        for name, video in sequence.videos.items()
+        if open_stored(inputs.cache / keys[name], video.num_frames, reduced_shape(video, settings.reduction))
+        is None
+    ]
+    jobs = min(inputs.jobs or os.cpu_count() or 1, max(len(megapixels), 1))
+    return MEGAPIXEL_S * sum(megapixels) / jobs

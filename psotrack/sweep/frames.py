@@ -1,0 +1,82 @@
+"""A grid in, a pandas frame out: sweeps for notebooks and scripts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from psotrack.errors import InputError
+from psotrack.progress import Report, silent
+from psotrack.sweep.grid import Grid, load
+from psotrack.sweep.grid import grid as grid_of
+from psotrack.sweep.store import Store
+
+
+def sweep(
+    grid: Grid | Path | str | Mapping[str, Any],
+    out: Path | str,
+    *,
+    data: Path | str = "data",
+    cache: Path | str,
+    jobs: int | None = None,
+    cluster: str | None = None,
+    workers: int | None = None,
+    report: Report = silent,
+) -> pd.DataFrame:
+    """Track with every combination of a grid's settings: one row per cell and run, as `psotrack sweep` keeps them.
+
+    What `out` holds already is not run again: the same call again takes seconds, and one with a larger grid runs what
+    is new. Other programs may work on the same folder at the same time.
+
+    Args:
+        grid: a grid, its TOML file, or a mapping with the same content.
+        out: folder of the results.
+        data: root folder of the sequences that the grid names.
+        cache: folder of the stored silhouettes.
+        jobs: processes for the silhouettes; None is one per processor.
+        cluster: "local", or the address of a Dask scheduler, whose workers do the work; None does it here. Scripts call
+            this below `if __name__ == "__main__":` then.
+        workers: processes of the local cluster; None is one per processor.
+        report: told of the cells.
+
+    Returns:
+        The rows of this grid's cells and seeds, in the grid's order, whatever else lies in the folder. Settings are
+        columns with dots (`settings.particles`), metrics have units in their names; `seconds.*` per run, `device.*`,
+        `versions.*` and `commit` say where a row comes from. `attrs["errors"]` lists cells that failed, by title.
+
+    Raises:
+        InputError: a sequence is not there, or every cell failed.
+        SettingsError: something in the grid is wrong.
+        OutputError: the results cannot be written.
+
+    Example:
+        How the error falls with the number of particles:
+
+            rows = sweep(
+                {"sequences": ["S02_D4_A"], "runs": 5, "grid": {"particles": [20, 50, 100]}},
+                out="results", data="data", cache="cache", report=psotrack.progress.terminal,
+            )
+            rows.groupby("settings.particles")["mean_error_m"].agg(["mean", "std"])
+    """
+    read = load(Path(grid)) if isinstance(grid, Path | str) else grid
+    read = read if isinstance(read, Grid) else grid_of(read)
+    out, data, cache = Path(out), Path(data), Path(cache)
+    if cluster is None:
+        from psotrack.sweep.runner import run
+
+        outcome = run(read, out, data=data, cache=cache, jobs=jobs, report=report)
+    else:
+        from psotrack.sweep.cluster import run_on_cluster
+
+        outcome = run_on_cluster(
+            read, out, data=data, cache=cache, address=cluster, workers=workers, report=report
+        )
+    if not outcome.seeds:
+        found = f"that all failed: {outcome.errors[0]}"
+        raise InputError(out, expected="a cell that can be run", found=found)
+    rows = Store(out).rows(outcome.seeds)
+    rows.attrs["errors"] = outcome.errors
+    return rows

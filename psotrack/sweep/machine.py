@@ -1,0 +1,93 @@
+"""What rows say of where they come from: device, processor, versions, commit; and the choice of the device."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+import subprocess
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+from psotrack.errors import SettingsError
+from psotrack.pipeline import environment
+
+Device = Literal["cpu", "gpu"]
+
+_PACKAGE = Path(__file__).parents[1]
+
+
+def use_device(device: Device) -> None:
+    """Have JAX compute there. To be called before anything touches a device.
+
+    Raises:
+        SettingsError: there is none, or JAX does not find it, or computes elsewhere already.
+    """
+    import jax
+
+    jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[device])
+    remedy = "NVIDIA's need its driver and `pip install '.[cuda]'`" if device == "gpu" else ""
+    try:
+        found = jax.default_backend()
+    except (RuntimeError, AssertionError) as error:  # the latter where JAX has no support for it installed
+        why = str(error).partition("\n")[0] or "none that JAX knows"
+        raise SettingsError("--device", expected=f"a {device}", found=why, remedy=remedy) from error
+    if found != device:
+        raise SettingsError(
+            "--device", expected=f"a {device}", found=f"{found} in use already", remedy=remedy
+        )
+
+
+def share_processors(count: int | None = None) -> None:
+    """Have JAX see the processors as so many devices, which share the runs of a batch. Before anything touches one.
+
+    Nothing changes where a user has told XLA otherwise, or a device is in use.
+
+    Args:
+        count: how many; None for all that this process may use.
+    """
+    import jax
+
+    if "XLA_FLAGS" not in os.environ:
+        with contextlib.suppress(RuntimeError):
+            jax.config.update("jax_num_cpu_devices", count or processors())
+
+
+def processors() -> int:
+    """How many this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def provenance() -> dict[str, Any]:
+    """Versions, device and commit, nested, fit for JSON."""
+    known = environment()
+    device = known["device"] | {"processor": _processor(), "processors": processors()}
+    return {"versions": known["versions"], "device": device, "commit": commit()}
+
+
+@cache
+def commit() -> str:
+    """Of the package, "-dirty" if files were changed since; "" if it does not lie in a git checkout of its own."""
+    try:
+        # An installed package may lie below somebody else's checkout, whose commit says nothing.
+        _git("ls-files", "--error-unmatch", "__init__.py")
+        return _git("describe", "--always", "--dirty", "--exclude=*", "--abbrev=12")
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+
+
+def _git(*words: str) -> str:
+    return subprocess.run(
+        ["git", "--no-optional-locks", *words], cwd=_PACKAGE, capture_output=True, text=True, check=True
+    ).stdout.strip()
+
+
+@cache
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor() or platform.machine()

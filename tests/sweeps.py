@@ -1,0 +1,89 @@
+"""What the tests of sweeps share: a very small sequence, whose program is compiled once, and ways to run psotrack."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from psotrack.sweep.locks import waited_for
+
+#: One program for all cells, whatever the iterations.
+GRID = """
+sequences = ["S01_D2_A"]
+runs = {runs}
+[settings]
+particles = 8
+swarm = "joint"
+score = "hard"
+init = "truth"
+drone_size_m = [0.5, 0.5, 0.2]
+silhouettes.reduction = 2
+[grid]
+iterations = {iterations}
+"""
+
+#: Half the compiler's time, and none of it twice: programs are kept for a number of devices.
+COMPILER = {
+    "XLA_FLAGS": "--xla_force_host_platform_device_count=1",
+    "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+}
+FOLDERS = {"PSOTRACK_CACHE": "cache", "JAX_COMPILATION_CACHE_DIR": "compiled"}
+
+
+def grid_file(folder: Path, iterations: list[int], runs: int = 1) -> Path:
+    """A grid of a cell per number of iterations."""
+    path = folder / f"grid_{len(iterations)}_{runs}.toml"
+    path.write_text(GRID.format(iterations=iterations, runs=runs))
+    return path
+
+
+def started(root: Path, *words: object) -> subprocess.Popen[str]:
+    """`psotrack WORDS`, with the cache of the small sequence's folder."""
+    command = [sys.executable, "-m", "psotrack", *map(str, words)]
+    env = os.environ | COMPILER | {name: str(root / folder) for name, folder in FOLDERS.items()}
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env)
+
+
+def psotrack(root: Path, *words: object) -> subprocess.CompletedProcess[str]:
+    """The same, until it has ended."""
+    process = started(root, *words)
+    out, err = process.communicate()
+    return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+
+def small_sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data folder with a sequence of two drones, and a cache with its silhouettes and program; made once per session.
+
+    Whoever tests sweeps does it after this, so that a run is seconds.
+    """
+    base = tmp_path_factory.getbasetemp()
+    root = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "small_sequence"
+    with waited_for(root / "being made"):
+        if not (root / "warm").exists():
+            made = psotrack(
+                root, "simulate", "S01_D2_A", "--out", root, "--scale", 0.25, "--frames", 6, "--no-onboard"
+            )
+            assert made.returncode == 0, made.stderr
+            swept = psotrack(
+                root, "sweep", grid_file(root, [2]), "--data", root, "--out", root / "warm_results"
+            )
+            assert swept.returncode == 0, swept.stderr
+            (root / "warm").touch()
+    return root
+
+
+def all_rows(results: Path) -> pd.DataFrame:
+    """Of every finished cell, read without psotrack."""
+    files = [path for path in (results / "cells").glob("*.parquet") if not path.name.startswith(".")]
+    return pd.concat([pd.read_parquet(path) for path in files], ignore_index=True)
+
+
+def stamps(results: Path) -> dict[str, int]:
+    """When the file of each finished cell was written."""
+    cells = results / "cells"
+    return {path.name: path.stat().st_mtime_ns for path in cells.glob("*.parquet") if path.name[0] != "."}

@@ -1,0 +1,91 @@
+"""The command that makes the paper's Table 5, on a very small sequence: what it writes, and nothing of it twice."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import pandas as pd
+import pytest
+from sweeps import COMPILER, FOLDERS, small_sequence
+
+EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+GRID = """
+sequences = ["S01_D2_A"]
+runs = 2
+[settings]
+particles = 8
+swarm = "joint"
+score = "hard"
+init = "truth"
+drone_size_m = [0.5, 0.5, 0.2]
+silhouettes.reduction = 2
+[methods.paper]
+[methods.psotrack]
+spread_m = 0.06
+[grid]
+iterations = [2, 3]
+"""
+FIGURES = ("error_against_work", "error_over_time_S01_D2_A", "error_per_drone")
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small_sequence(tmp_path_factory)
+
+
+def table5(data: Path, out: Path, grid: str = GRID) -> subprocess.CompletedProcess[str]:
+    out.parent.mkdir(parents=True, exist_ok=True)
+    (out.parent / "grid.toml").write_text(grid)
+    words = [
+        EXPERIMENTS / "table5" / "table5.py",
+        "--grid",
+        out.parent / "grid.toml",
+        "--data",
+        data,
+        "--out",
+        out,
+    ]
+    env = os.environ | COMPILER | {name: str(data / folder) for name, folder in FOLDERS.items()}
+    return subprocess.run(
+        [sys.executable, *map(str, words)], capture_output=True, text=True, env=env, check=False
+    )
+
+
+def stamps(out: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
+
+
+def test_tables_rows_and_figures_and_nothing_twice(data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "table5"
+    done = table5(data, out)
+    assert done.returncode == 0, done.stderr
+    assert "S01_D2_A: 86 to 140 mm" in done.stdout
+    rows = pd.read_csv(out / "results.csv")
+    assert len(rows) == 8
+    assert set(rows["method"]) == {"paper", "psotrack"}
+    assert (rows["track_ms_per_frame"] > 0).all()
+    table = (out / "table5.md").read_text()
+    mean_mm = 1e3 * rows.groupby(["method", "settings.iterations"])["mean_error_m"].mean()
+    for mean in mean_mm:
+        assert f"{mean:.1f} ±" in table
+    for name in FIGURES:
+        assert cv2.imread(str(out / f"{name}.png")).std() > 5
+
+    before = stamps(out)
+    again = table5(data, out)
+    assert again.returncode == 0, again.stderr
+    assert "nothing new" in again.stdout
+    kept = {name: stamp for name, stamp in stamps(out).items() if name != "manifest.json"}
+    assert kept == {name: stamp for name, stamp in before.items() if name != "manifest.json"}
+
+
+def test_without_the_sequence(data: Path, tmp_path: Path) -> None:
+    done = table5(data, tmp_path / "out", GRID.replace("S01_D2_A", "S02_D4_A"))
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert "expected the sequence S02_D4_A, found none" in line
+    assert not (tmp_path / "out" / "table5.md").exists()
