@@ -1,8 +1,8 @@
 """The drones that are followed, and how they are followed through a chunk of frames: in one run, or in many at once.
 
 Runs whose drones are as many and whose program is the same are a batch axis: one compiled function, one copy of the
-silhouettes on each device. On a processor each run of a batch is computed after the other, as if it
-were alone, and to the same bits; on an accelerator side by side.
+silhouettes. On a processor each run of a batch is computed after the other, as if it were alone, and to the same bits;
+on an accelerator side by side.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def follow(
     *,
     capacity: int,
 ) -> list[Followed]:
-    """Follow the drones of some runs through a chunk, and learn their sizes; all devices share the runs.
+    """Follow the drones of some runs through a chunk, and learn their sizes.
 
     Args:
         crews: of one run or more, each of as many drones.
@@ -67,21 +67,16 @@ def follow(
     Returns:
         One for each crew. The info has all frames of the chunk.
     """
-    devices = jax.devices()[:capacity]
-    most, each = (-(-number // len(devices)) for number in (capacity, len(crews)))
-    shares = [slice(first, first + each) for first in range(0, len(crews), each)]
-    # Every device is given its work before any of them is waited for.
-    followed = [
-        _follow(
-            jax.device_put(_filled(crews[share], most), device),
-            jax.device_put(_filled(arrivals[share], most), device),
-            jax.device_put(jnp.int32(len(crews[share])), device),
-            *jax.device_put((coverage, jnp.int32(num_frames), cameras), device),
-            program,
-        )
-        for share, device in zip(shares, devices, strict=False)
-    ]
-    return [one for share, of in zip(shares, followed, strict=True) for one in of[: len(crews[share])]]
+    followed = _follow(
+        _filled(crews, capacity),
+        _filled(arrivals, capacity),
+        jnp.int32(len(crews)),
+        coverage,
+        jnp.int32(num_frames),
+        cameras,
+        program,
+    )
+    return followed[: len(crews)]
 
 
 def _filled(some: Sequence[Any], size: int) -> tuple[Any, ...]:

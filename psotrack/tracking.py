@@ -7,10 +7,13 @@ the drones' sizes are learned.
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
 from typing import TypeVar
 
@@ -28,7 +31,7 @@ from psotrack.initialisation import Start
 from psotrack.lifecycle import Arrivals, arrivals_of, holes, lost_drones, recognised
 from psotrack.motion import MotionParams
 from psotrack.newcomers import newcomers
-from psotrack.progress import Report, silent
+from psotrack.progress import Advance, Report, silent
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes
 from psotrack.sizes import Looks, SizeState
@@ -104,7 +107,10 @@ def track_silhouettes(
     bounds_m: Sequence[Float[np.ndarray, "2 3"]],
     report: Report = silent,
 ) -> list[Tracked]:
-    """Track all frames, once for each of the settings; runs of equal shape are one batch (see `crew`).
+    """Track all frames, once for each of the settings; all devices share the runs.
+
+    Those of equal shape on a device are one batch (see `crew`). A thread for each device: while one of them computes,
+    the search for newcomers of another one has the processor.
 
     Args:
         rig: of the cameras.
@@ -115,9 +121,60 @@ def track_silhouettes(
         bounds_m: of each run, (2, 3): lowest and highest corner of the room.
         report: told of the frames, in which all runs go on together.
     """
-    place = _Place(rig, on_device(rig.cameras), silhouettes.reduction, fps)
-    runs = [_begun(*of, place) for of in zip(starts, settings, bounds_m, strict=True)]
-    batches = _Batches(place, (CHUNK_FRAMES, len(rig), *silhouettes.shape), runs)
+    asked = list(zip(starts, settings, bounds_m, strict=True))
+    programs = [tracker_program(silhouettes.reduction, each) for each in settings]
+    devices = jax.devices()[: len(asked)]
+    # Alike ones in turn, so that of each program every device has as many, or one more.
+    alike = sorted(range(len(asked)), key=lambda number: programs.index(programs[number]))
+    shares = [alike[first :: len(devices)] for first in range(len(devices))]
+    capacity = {program: -(-count // len(devices)) for program, count in Counter(programs).items()}
+
+    def track_share(share: list[int], device: jax.Device, report: Report) -> list[Tracked]:
+        with jax.default_device(device):
+            place = _Place(rig, on_device(rig.cameras), silhouettes.reduction, fps)
+            runs = [_begun(*asked[number], place) for number in share]
+            return _tracked(runs, capacity, silhouettes, place, report)
+
+    stopped = threading.Event()
+
+    @contextlib.contextmanager
+    def until_stopped(description: str, total: int) -> Iterator[Advance]:
+        def advance(steps: int) -> None:
+            if stopped.is_set():
+                raise RuntimeError("another share of the runs has failed")
+
+        yield advance
+
+    with ThreadPoolExecutor(len(devices)) as threads:
+        # The first is ours: it tells how far they are, and whoever interrupts us is heard.
+        others = [
+            threads.submit(track_share, *of, until_stopped)
+            for of in zip(shares[1:], devices[1:], strict=True)
+        ]
+        try:
+            done = [track_share(shares[0], devices[0], report), *[other.result() for other in others]]
+        except BaseException:
+            stopped.set()
+            raise
+    by_run = dict(
+        pair for share, of in zip(shares, done, strict=True) for pair in zip(share, of, strict=True)
+    )
+    # Devices compile at the same time.
+    return [
+        replace(by_run[number], compile_s=by_run[number].compile_s / len(devices))
+        for number in range(len(asked))
+    ]
+
+
+def _tracked(
+    runs: list[_Run],
+    capacity: Mapping[tracker.Program, int],
+    silhouettes: Silhouettes,
+    place: _Place,
+    report: Report,
+) -> list[Tracked]:
+    """What some runs yield, which go on together, on one device."""
+    batches = _Batches(place, (CHUNK_FRAMES, len(place.rig), *silhouettes.shape), capacity)
     with report("track", silhouettes.num_frames) as advance:
         for first, chunk, frames in _chunks(silhouettes):
             followed = batches.follow(runs, [None] * len(runs), chunk, frames)
@@ -153,11 +210,16 @@ def track_silhouettes(
 class _Batches:
     """Follows runs, those of equal shape together; compiles for a shape when it is first seen."""
 
-    def __init__(self, place: _Place, chunk_shape: tuple[int, int, int, int], runs: Sequence[_Run]) -> None:
+    def __init__(
+        self,
+        place: _Place,
+        chunk_shape: tuple[int, int, int, int],
+        capacity: Mapping[tracker.Program, int],
+    ) -> None:
         self.compile_s = 0.0
         self._place = place
         self._blank = np.zeros(chunk_shape, np.uint8)
-        self._capacity = Counter(run.program for run in runs)
+        self._capacity = capacity
         self._compiled: set[tuple[tracker.Program, int]] = set()
 
     def follow(
@@ -206,16 +268,6 @@ def tracker_inputs(
     reduction: int, start: Start, settings: TrackSettings, *, fps: float, bounds_m: Float[np.ndarray, "2 3"]
 ) -> tuple[tracker.Program, tracker.TrackerParams]:
     """What the tracker compiles, and the numbers that it is called with, from what people set."""
-    soft = settings.score == "soft"
-    score = ScoreSettings(windows=settings.windows) if soft else PAPER_SCORE
-    program = tracker.Program(
-        num_particles=settings.particles,
-        joint=settings.swarm == "joint",
-        claims=settings.claims and soft,
-        refined=settings.refinements > 0,
-        vertex=settings.vertex and soft,
-        score=replace(score, reduction=reduction),
-    )
     params = tracker.TrackerParams(
         num_iterations=jnp.int32(settings.iterations),
         num_refinements=jnp.int32(settings.refinements),
@@ -232,7 +284,21 @@ def tracker_inputs(
         min_cameras=jnp.int32(settings.min_cameras),
         max_coasting_frames=jnp.int32(round(settings.max_coasting_s * fps)),
     )
-    return program, params
+    return tracker_program(reduction, settings), params
+
+
+def tracker_program(reduction: int, settings: TrackSettings) -> tracker.Program:
+    """What the tracker compiles: runs whose programs are equal can be a batch."""
+    soft = settings.score == "soft"
+    score = ScoreSettings(windows=settings.windows) if soft else PAPER_SCORE
+    return tracker.Program(
+        num_particles=settings.particles,
+        joint=settings.swarm == "joint",
+        claims=settings.claims and soft,
+        refined=settings.refinements > 0,
+        vertex=settings.vertex and soft,
+        score=replace(score, reduction=reduction),
+    )
 
 
 def motion_params(settings: TrackSettings, num_drones: int) -> MotionParams:

@@ -1,5 +1,7 @@
 """Drones that come and go, through the chunks of a recording whose silhouettes are drawn by casting rays."""
 
+import contextlib
+import threading
 from dataclasses import replace
 
 import jax
@@ -85,6 +87,28 @@ def test_a_run_of_a_batch_is_the_run_alone(batch, silhouettes, run):
     assert tracked.arrivals == alone.arrivals
     for of in ("info", "sizes", "looks"):
         assert_same(getattr(tracked, of), getattr(alone, of))
+
+
+def test_whoever_interrupts_a_batch_is_heard(silhouettes):
+    """By the share of the first device, after a chunk; the others end with it."""
+
+    class Interrupted(Exception):
+        pass
+
+    @contextlib.contextmanager
+    def report(description, total):
+        def advance(frames):
+            raise Interrupted
+
+        yield advance
+
+    settings = [TrackSettings(**(vars_of(SETTINGS) | {"seed": seed})) for seed in range(2)]
+    threads = threading.active_count()
+    with pytest.raises(Interrupted):
+        track_silhouettes(
+            RIG, silhouettes, [FIRST] * 2, settings, fps=FPS, bounds_m=[ROOM_M] * 2, report=report
+        )
+    assert threading.active_count() == threads
 
 
 def test_runs_of_other_seeds_differ(batch):
