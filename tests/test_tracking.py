@@ -92,19 +92,16 @@ def test_a_run_of_a_batch_is_the_run_alone(batch, silhouettes, run):
 def test_whoever_interrupts_a_batch_is_heard(silhouettes):
     """By the share of the first device, after a chunk; the others end with it."""
 
-    class Interrupted(Exception):
-        pass
-
     @contextlib.contextmanager
     def report(description, total):
         def advance(frames):
-            raise Interrupted
+            raise KeyboardInterrupt
 
         yield advance
 
     settings = [TrackSettings(**(vars_of(SETTINGS) | {"seed": seed})) for seed in range(2)]
     threads = threading.active_count()
-    with pytest.raises(Interrupted):
+    with pytest.raises(KeyboardInterrupt):
         track_silhouettes(
             RIG, silhouettes, [FIRST] * 2, settings, fps=FPS, bounds_m=[ROOM_M] * 2, report=report
         )
