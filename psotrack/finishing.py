@@ -17,7 +17,8 @@ from psotrack.motion import MotionParams
 from psotrack.settings import TrackSettings
 from psotrack.smoothing import jerk_density, smooth
 from psotrack.tracker import TrackerInfo
-from psotrack.tracking import Tracked, motion_params
+from psotrack.tracker_inputs import motion_params
+from psotrack.tracking import Tracked
 from psotrack.trajectories import Status, Trajectories
 
 logger = logging.getLogger(__name__)

@@ -11,7 +11,7 @@ from helpers import ROOM_M, float32, ring_rig
 from psotrack import tracker
 from psotrack.initialisation import Start
 from psotrack.settings import TrackSettings
-from psotrack.tracking import tracker_inputs
+from psotrack.tracker_inputs import tracker_inputs
 
 
 def run(*, num_frames=5, num_drones=2, seed=0, size_m=0.4, focal=1.0, **settings):

@@ -67,6 +67,7 @@ DEPTH = {
     "sizes": 7,
     "tracker": 8,
     "crew": 9,
+    "tracker_inputs": 9,
     "datasets": 4,
     "silhouettes": 4,
     "contents": 4,

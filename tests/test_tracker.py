@@ -10,7 +10,7 @@ from helpers import ROOM_M, assert_same, draw_coverage, float32, ring_rig
 from psotrack import tracker
 from psotrack.initialisation import Start
 from psotrack.settings import TrackSettings
-from psotrack.tracking import tracker_inputs
+from psotrack.tracker_inputs import tracker_inputs
 from psotrack.trajectories import Status
 
 FPS = 25.0

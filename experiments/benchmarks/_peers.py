@@ -23,7 +23,8 @@ from psotrack.cameras import CameraRig
 from psotrack.initialisation import Start
 from psotrack.settings import TrackSettings
 from psotrack.summed_area import summed_area_table
-from psotrack.tracking import on_device, tracker_inputs
+from psotrack.tracker_inputs import tracker_inputs
+from psotrack.tracking import on_device
 
 #: The peers' motion model, an alpha-beta filter: it costs nothing beside the swarm.
 POSITION_GAIN, VELOCITY_GAIN = 0.8, 0.3

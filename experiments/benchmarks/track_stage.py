@@ -32,7 +32,8 @@ from psotrack import fitness, tracker
 from psotrack.initialisation import Start
 from psotrack.settings import TrackSettings
 from psotrack.summed_area import summed_area_table
-from psotrack.tracking import on_device, tracker_inputs
+from psotrack.tracker_inputs import tracker_inputs
+from psotrack.tracking import on_device
 
 PEERS = ("evosax", "pyswarms")
 
