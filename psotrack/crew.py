@@ -52,6 +52,7 @@ def follow(
     program: tracker.Program,
     *,
     capacity: int,
+    device: jax.Device,
 ) -> list[Followed]:
     """Follow the drones of some runs through a chunk, and learn their sizes.
 
@@ -63,19 +64,14 @@ def follow(
         cameras: in float32.
         program: of all of the runs.
         capacity: of the compiled function: so many runs at most. To leave some of it empty costs next to nothing.
+        device: that computes.
 
     Returns:
         One for each crew. The info has all frames of the chunk.
     """
-    followed = _follow(
-        _filled(crews, capacity),
-        _filled(arrivals, capacity),
-        jnp.int32(len(crews)),
-        coverage,
-        jnp.int32(num_frames),
-        cameras,
-        program,
-    )
+    given = _filled(crews, capacity), _filled(arrivals, capacity), jnp.int32(len(crews))
+    # What was put on a device and what just is there are not alike to JAX, which would compile for each.
+    followed = _follow(*jax.device_put((*given, coverage, jnp.int32(num_frames), cameras), device), program)
     return followed[: len(crews)]
 
 

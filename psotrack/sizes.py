@@ -103,8 +103,8 @@ def init(size_m: Positions, pinned: Bool[Array, "drones 3"], settings: ScoreSett
         pinned=jnp.stack([level, level, jnp.asarray(pinned)[:, 2]], axis=1),
         num_frames=none,
         num_chunks=none,
-        scatter=jnp.full(size_m.shape, START_FRAMES * START_STD**2),
-        fill=jnp.full((size_m.shape[0], len(settings.windows)), jnp.nan),
+        scatter=jnp.full(size_m.shape, START_FRAMES * START_STD**2, jnp.float32),
+        fill=jnp.full((size_m.shape[0], len(settings.windows)), jnp.nan, jnp.float32),
     )
 
 

@@ -88,12 +88,13 @@ class _Run:
 
 @dataclass(frozen=True)
 class _Place:
-    """Where tracking takes place: what all runs share."""
+    """Where tracking takes place: what runs that go on together share."""
 
     rig: CameraRig
     cameras: Camera
     reduction: int
     fps: float
+    device: jax.Device
 
 
 def track_silhouettes(
@@ -130,7 +131,7 @@ def track_silhouettes(
 
     def track_share(share: list[int], device: jax.Device, report: Report) -> list[Tracked]:
         with jax.default_device(device):
-            place = _Place(rig, on_device(rig.cameras), silhouettes.reduction, fps)
+            place = _Place(rig, on_device(rig.cameras), silhouettes.reduction, fps, device)
             runs = [_begun(*asked[number], place) for number in share]
             return _tracked(runs, capacity, silhouettes, place, report)
 
@@ -246,8 +247,16 @@ class _Batches:
         frames: int,
         program: tracker.Program,
     ) -> list[Followed]:
-        capacity = self._capacity[program]
-        results = follow(crews, begin, chunk, frames, self._place.cameras, program, capacity=capacity)
+        results = follow(
+            crews,
+            begin,
+            chunk,
+            frames,
+            self._place.cameras,
+            program,
+            capacity=self._capacity[program],
+            device=self._place.device,
+        )
         return [
             (crew, *jax.tree.map(lambda leaf: np.asarray(leaf)[:frames], (info, looks)))
             for crew, info, looks in results

@@ -108,6 +108,17 @@ def test_whoever_interrupts_a_batch_is_heard(silhouettes):
     assert threading.active_count() == threads
 
 
+def test_chunk_after_chunk_is_one_program(silhouettes, caplog):
+    """It was compiled twice: what is learned of sizes began as another type than it went on with."""
+    shorter = replace(silhouettes, num_frames=60, arrays=tuple(array[:60] for array in silhouettes.arrays))
+    with jax.log_compiles(), caplog.at_level("WARNING", logger="jax"):
+        track(shorter, FIRST, drones=1, particles=6)
+    compiled = [
+        record.getMessage().split()[1] for record in caplog.records if "Compiling " in record.getMessage()
+    ]
+    assert sum("_follow" in name for name in compiled) == 1
+
+
 def test_runs_of_other_seeds_differ(batch):
     assert (batch[0][2].info.position_m[5] != batch[1][2].info.position_m[5]).any()
 
