@@ -4,6 +4,7 @@ jaxtyping and beartype check every annotated call of the package (`--jaxtyping-p
 """
 
 import jax
+import pytest
 from hypothesis import settings
 
 # int32 + float32 and the like must be written out: a promotion that nobody meant is how exact sums lose bits.
@@ -17,3 +18,9 @@ jax.config.update("jax_num_cpu_devices", 2)
 # first example of a compiled function pays for the compiler.
 settings.register_profile("psotrack", derandomize=True, deadline=None, max_examples=40)
 settings.load_profile("psotrack")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files with slow tests first: begun last, one of them would leave all other processes without work."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)

@@ -78,6 +78,7 @@ def batch(silhouettes):
     return list(zip(starts, settings, tracked, strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run", range(3))
 def test_a_run_of_a_batch_is_the_run_alone(batch, silhouettes, run):
     """To the last bit, whichever device it was on and whoever was beside it."""
@@ -89,6 +90,7 @@ def test_a_run_of_a_batch_is_the_run_alone(batch, silhouettes, run):
         assert_same(getattr(tracked, of), getattr(alone, of))
 
 
+@pytest.mark.slow
 def test_whoever_interrupts_a_batch_is_heard(silhouettes):
     """By the share of the first device, after a chunk; the others end with it."""
 
