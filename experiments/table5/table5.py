@@ -103,7 +103,8 @@ def show(rows: pd.DataFrame, out: Path) -> None:
     }
     print(render(tables["Mean error"]))
     said = [
-        f"{name}: {1e3 * low:.0f}{f' to {1e3 * high:.0f}' if high > low else ' at best'} mm"
+        f"{name}: "
+        + (f"{1e3 * low:.0f} to {1e3 * high:.0f} mm" if high > low else f"{1e3 * low:.0f} mm at best")
         for name, (low, high) in published.items()
         if name in set(rows["sequence"])
     ]
