@@ -45,8 +45,14 @@ def grid_file(folder: Path, iterations: list[int], runs: int = 1) -> Path:
 def started(root: Path, *words: object) -> subprocess.Popen[str]:
     """`psotrack WORDS`, with the cache of the small sequence's folder."""
     command = [sys.executable, "-m", "psotrack", *map(str, words)]
-    env = os.environ | COMPILER | {name: str(root / folder) for name, folder in FOLDERS.items()}
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env)
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(root)
+    )
+
+
+def environment(root: Path) -> dict[str, str]:
+    """Of commands that use the cache of the small sequence's folder."""
+    return os.environ | COMPILER | {name: str(root / folder) for name, folder in FOLDERS.items()}
 
 
 def psotrack(root: Path, *words: object) -> subprocess.CompletedProcess[str]:

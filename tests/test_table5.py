@@ -1,6 +1,5 @@
 """The command that makes the paper's Table 5, on a very small sequence: what it writes, and nothing of it twice."""
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -8,25 +7,11 @@ from pathlib import Path
 import cv2
 import pandas as pd
 import pytest
-from sweeps import COMPILER, FOLDERS, small_sequence
+import sweeps
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
-GRID = """
-sequences = ["S01_D2_A"]
-runs = 2
-[settings]
-particles = 8
-swarm = "joint"
-score = "hard"
-init = "truth"
-drone_size_m = [0.5, 0.5, 0.2]
-silhouettes.reduction = 2
-[methods.paper]
-[methods.psotrack]
-spread_m = 0.06
-[grid]
-iterations = [2, 3]
-"""
+TWO_METHODS = "[methods.paper]\n[methods.psotrack]\nspread_m = 0.06\n[grid]"
+GRID = sweeps.GRID.format(runs=2, iterations=[2, 3]).replace("[grid]", TWO_METHODS)
 FIGURES = ("error_against_work", "error_over_time_S01_D2_A", "error_per_drone")
 
 pytestmark = pytest.mark.slow
@@ -34,7 +19,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_sequence(tmp_path_factory)
+    return sweeps.small_sequence(tmp_path_factory)
 
 
 def table5(data: Path, out: Path, grid: str = GRID) -> subprocess.CompletedProcess[str]:
@@ -49,9 +34,12 @@ def table5(data: Path, out: Path, grid: str = GRID) -> subprocess.CompletedProce
         "--out",
         out,
     ]
-    env = os.environ | COMPILER | {name: str(data / folder) for name, folder in FOLDERS.items()}
     return subprocess.run(
-        [sys.executable, *map(str, words)], capture_output=True, text=True, env=env, check=False
+        [sys.executable, *map(str, words)],
+        capture_output=True,
+        text=True,
+        env=sweeps.environment(data),
+        check=False,
     )
 
 

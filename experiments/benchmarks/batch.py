@@ -23,6 +23,7 @@ from psotrack.datasets.dpjait import read_sequence
 from psotrack.pipeline import environment, track_runs
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import compute
+from psotrack.sweep.machine import share_processors
 
 
 def seconds(call: Callable[[], object]) -> tuple[float, float]:
@@ -46,9 +47,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, help="the first so many")
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args()
-    # Before anything touches a device, as `psotrack sweep` does it.
-    if "XLA_FLAGS" not in os.environ:
-        jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+    share_processors()
     keep_compiled(options.cache / "compiled")
     sequence = read_sequence(options.sequence).usable(num_frames=options.frames)
     silhouettes = compute(sequence, TrackSettings().silhouettes, cache=options.cache)

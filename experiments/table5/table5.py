@@ -11,7 +11,6 @@ manifest.json, table5.md and figures; what is finished there is not run again.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import tomllib
 from pathlib import Path
@@ -78,12 +77,10 @@ def simulated(grid: Grid, data: Path, *, quick: bool) -> Path:
 
 def tracked(grid: Grid, out: Path, data: Path) -> pd.DataFrame:
     """One row per cell and run; what is in `out` is not run again."""
-    import jax
-
     from psotrack.compiled import keep_compiled
+    from psotrack.sweep.machine import share_processors
 
-    if "XLA_FLAGS" not in os.environ:
-        jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+    share_processors()
     keep_compiled(out / "cache" / "compiled")
     return sweep(grid, out, data=data, cache=out / "cache", report=terminal)
 
