@@ -107,9 +107,12 @@ def error_against_work(
             axes.annotate(
                 f"{point['particles']:.0f} x {point['iterations']:.0f}",
                 (point["work"], point["error"]),
-                xytext=(2, -11),
+                xytext=(3, 3),
                 textcoords="offset points",
                 fontsize=7,
+                rotation=40,
+                rotation_mode="anchor",
+                verticalalignment="bottom",
                 color=_DARK,
             )
         axes.set_xscale("log")
