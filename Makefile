@@ -12,7 +12,7 @@ install = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python
 oracle = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python $(BIN)/python --no-deps 'trackeval>=1.3'; \
 	else $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'trackeval>=1.3'; fi
 
-.PHONY: help demo test test-fast lint format bench notebooks table5 table5-quick clean
+.PHONY: help demo test test-fast lint format bench notebooks table4 table5 table5-quick clean
 
 help:  ## what can be made
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -54,6 +54,9 @@ notebooks: $(VENV)/.installed  ## run the notebooks and write them with what the
 
 table5: $(VENV)/.installed  ## the paper's Table 5 beside ours, an hour; DATA=FOLDER for the published sequences
 	@$(BIN)/python experiments/table5/table5.py $(if $(DATA),--data $(DATA))
+
+table4: $(VENV)/.installed  ## the paper's Table 4: projection lines, beside the swarm; DATA=FOLDER for the published sequences
+	@$(BIN)/python experiments/table4/table4.py $(if $(DATA),--data $(DATA))
 
 table5-quick: $(VENV)/.installed  ## a small form of it, five minutes
 	@$(BIN)/python experiments/table5/table5.py --quick $(if $(DATA),--data $(DATA))

@@ -9,19 +9,23 @@ from __future__ import annotations
 import logging
 import re
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import ezc3d
 import numpy as np
 from jaxtyping import Float
 
+from psotrack.cross_poses import CrossPoses, at_times, between, completed, lerp, poses
+from psotrack.crosses import learn_cross
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.files import written_whole
-from psotrack.trajectories import Trajectories
+from psotrack.trajectories import Status, Trajectories
 
 _logger = logging.getLogger(__name__)
-_METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+_METRES = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "dm": 0.1, "m": 1.0, "in": 0.0254, "ft": 0.3048}
 _BLOCK_BYTES = 512
 _INTEL = 84
 _MOST_FRAMES = 2**16 - 1
@@ -32,7 +36,7 @@ class Markers:
     """Marker positions over the frames of a recording.
 
     Attributes:
-        labels: one per marker; `Dron4:Dron41` is a marker of the body `Dron4`.
+        labels: one per marker; `Dron4:Dron41` is a marker of the body `Dron4`, `*12` one that was not recognised.
         position_m: (frames, markers, 3), world, metres; NaN where a marker was not seen.
         rate_hz: frames per second.
     """
@@ -64,7 +68,7 @@ def read_c3d(path: Path) -> Markers:
         raise InputError(path, expected="a C3D file", found=found) from error
     parameters = content["parameters"]["POINT"]
     points = content["data"]["points"][:3].transpose(2, 1, 0)
-    labels = tuple(parameters["LABELS"]["value"][: points.shape[1]])
+    labels = _labels(parameters)[: points.shape[1]]
     if not labels or not len(points):
         raise InputError(path, expected="markers over time", found=f"{len(labels)} in {len(points)} frames")
     if len(points) < promised:
@@ -75,14 +79,14 @@ def read_c3d(path: Path) -> Markers:
             remedy="the file is cut short: copy it anew",
         )
     unit = "".join(parameters["UNITS"]["value"][:1]).strip()
-    if unit not in _METRES:
+    if unit.lower() not in _METRES:
         raise InputError(path, expected=f"a unit of {', '.join(_METRES)}", found=repr(unit))
     rate_hz = float(parameters["RATE"]["value"][0])
     if not 0 < rate_hz < np.inf:
         raise InputError(path, expected="a rate above 0 Hz", found=f"{rate_hz:g}")
     residuals = content["data"]["meta_points"]["residuals"][0].T
     seen = (residuals >= 0) & np.isfinite(points).all(axis=-1) & (points != 0).any(axis=-1)
-    return Markers(labels, np.where(seen[..., None], points * _METRES[unit], np.nan), rate_hz)
+    return Markers(labels, np.where(seen[..., None], points * _METRES[unit.lower()], np.nan), rate_hz)
 
 
 def write_c3d(path: Path, markers: Markers) -> None:
@@ -113,45 +117,101 @@ def write_c3d(path: Path, markers: Markers) -> None:
             raise OutputError(path, expected="to write it", found="less than all of it written")
 
 
-def body_trajectories(markers: Markers, *, fps: float, num_frames: int, where: Path) -> Trajectories:
-    """The bodies at the frames of a video that started with the recording.
+def positions_at(
+    markers: Markers, time_s: Float[np.ndarray, "times"], offset_s: float = 0.0
+) -> Float[np.ndarray, "times markers 3"]:
+    """(times, markers, 3), world: the markers at the times of a video, NaN where they are not seen just then.
 
-    A body's position is the centroid of its markers, where all of them were seen: that of some would jump by
-    centimetres with each marker that comes or goes, so there it is NaN. A marker that was never seen does not
-    count.
+    Between two frames they are interpolated linearly where both see them; no gap is bridged.
 
     Args:
-        markers: a recording at a whole multiple of `fps`.
+        markers: a recording at any rate.
+        time_s: (times,), of the video.
+        offset_s: time in the recording at 0 s of the video; above 0 where the recording began first.
+    """
+    return lerp(markers.position_m, *between(len(markers.position_m), markers.rate_hz, time_s + offset_s))
+
+
+def body_trajectories(
+    markers: Markers, *, fps: float, num_frames: int, where: Path, offset_s: float = 0.0
+) -> Trajectories:
+    """The bodies at the frames of a video.
+
+    A body's position is the centroid of its whole cross, as its shape is learned from the recording: three markers
+    are enough to place it, and it does not jump when one comes or goes. Where fewer are seen for more than half a
+    second it is NaN, and `lost`; shorter gaps are bridged, and `coasting`. A marker that was never seen does not
+    count; one that lost its label is found again by its distances from the others. Orientations are those of the
+    cross's own frame (`crosses.Cross`); there are none where markers lie on a line.
+
+    Args:
+        markers: a recording at any rate; between its frames, poses are interpolated.
         fps: frames per second of the video.
-        num_frames: frames of the video; the reference is NaN where the recording is shorter.
+        num_frames: frames of the video; the reference is NaN where there is no recording.
         where: the file, for messages.
+        offset_s: time in the recording at the video's frame 0; above 0 where the recording began first.
 
     Raises:
-        InputError: the rate is no multiple of the video's, or no marker was ever seen.
+        InputError: no body is ever placed.
     """
-    ratio = markers.rate_hz / fps
-    stride = round(ratio)
-    # 0.1 % is what rates that are rounded when they are stored differ by; more would drift apart.
-    if stride < 1 or abs(ratio - stride) > 1e-3 * stride:
-        raise InputError(
-            where,
-            expected=f"a rate that is a whole multiple of the video's {fps:g} per second",
-            found=f"{markers.rate_hz:g} Hz",
-        )
-    at_video_frames = markers.position_m[::stride][:num_frames]
-    ever_seen = np.isfinite(markers.position_m).all(axis=-1).any(axis=0)
+    frame = np.arange(num_frames)
     bodies = _bodies(markers.labels)
     position_m = np.full((num_frames, len(bodies), 3), np.nan)
+    orientation_wxyz = np.full((num_frames, len(bodies), 4), np.nan)
+    status = np.full((num_frames, len(bodies)), int(Status.TRACKED))
     for index, (name, columns) in enumerate(bodies.items()):
-        used = [column for column in columns if ever_seen[column]]
-        if len(used) < len(columns):
-            _logger.info("%s: %d markers of %s were never seen", where, len(columns) - len(used), name)
-        if used:
-            position_m[: len(at_video_frames), index] = at_video_frames[:, used].mean(axis=1)
-    if np.isnan(position_m).all():
-        raise InputError(where, expected="frames that see all markers of a drone", found="none")
-    frame = np.arange(num_frames)
-    return Trajectories(frame, frame / fps, tuple(bodies), position_m)
+        found = _body_poses(markers, name, columns, where)
+        if found is not None:
+            rate_hz = _whole_multiple(markers.rate_hz, fps)
+            video = at_times(found, rate_hz, frame / fps + offset_s)
+            position_m[:, index], orientation_wxyz[:, index] = video.position_m, video.orientation_wxyz
+            status[video.bridged, index] = Status.COASTING
+    unknown = np.isnan(position_m).any(axis=-1)
+    if unknown.all():
+        raise InputError(where, expected="three markers of a drone in some frame of the video", found="none")
+    status[unknown] = Status.LOST
+    return Trajectories(
+        frame,
+        frame / fps,
+        tuple(bodies),
+        position_m,
+        orientation_wxyz=None if np.isnan(orientation_wxyz).all() else orientation_wxyz,
+        status=status,
+    )
+
+
+def _body_poses(markers: Markers, name: str, columns: list[int], where: Path) -> CrossPoses | None:
+    """The poses of one body in every frame of the recording; None where its markers make no shape."""
+    ever_seen = np.isfinite(markers.position_m).all(axis=-1).any(axis=0)
+    used = [column for column in columns if ever_seen[column]]
+    if len(used) < len(columns):
+        _logger.info("%s: %d markers of %s were never seen", where, len(columns) - len(used), name)
+    if not used:
+        return None
+    position_m = markers.position_m[:, used]
+    try:
+        cross = learn_cross(position_m, name)
+    except InputError as error:
+        _logger.warning("%s: no reference for %s: %s", where, name, error)
+        return None
+    unlabelled = [column for column, label in enumerate(markers.labels) if _is_unlabelled(label)]
+    return poses(cross, completed(cross, position_m, markers.position_m[:, unlabelled]), markers.rate_hz)
+
+
+def _whole_multiple(rate_hz: float, fps: float) -> float:
+    """The rate, or the whole multiple of the video's that it was before both were rounded."""
+    stride = round(rate_hz / fps)
+    # 0.1 % is what rates that are rounded when they are stored differ by.
+    return stride * fps if stride and abs(rate_hz / fps - stride) <= 1e-3 * stride else rate_hz
+
+
+def _is_unlabelled(label: str) -> bool:
+    return label.rpartition(":")[2].startswith("*")
+
+
+def _labels(parameters: Mapping[str, Any]) -> tuple[str, ...]:
+    """All of them: a parameter holds 255, the next ones are in LABELS2 and so on."""
+    names = ["LABELS", *(f"LABELS{number}" for number in range(2, 257))]
+    return tuple(label for name in names if name in parameters for label in parameters[name]["value"])
 
 
 def _bodies(labels: tuple[str, ...]) -> dict[str, list[int]]:
@@ -163,10 +223,10 @@ def _bodies(labels: tuple[str, ...]) -> dict[str, list[int]]:
     bodies: dict[str, list[int]] = {}
     for index, label in enumerate(labels):
         body, colon, _ = label.rpartition(":")
-        if colon:
+        if colon and not _is_unlabelled(label):
             bodies.setdefault(body.strip().lower(), []).append(index)
     if not bodies:
-        bodies = {"dron1": [index for index, label in enumerate(labels) if not label.startswith("*")]}
+        bodies = {"dron1": [index for index, label in enumerate(labels) if not _is_unlabelled(label)]}
     drones = {name: columns for name, columns in bodies.items() if name.startswith("dron")} or bodies
     return dict(sorted(drones.items(), key=lambda item: _natural(item[0])))
 

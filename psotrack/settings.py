@@ -14,12 +14,18 @@ from psotrack.silhouette_store import SilhouetteSettings
 
 SwarmKind = Literal["joint", "per-drone"]
 Score = Literal["soft", "hard"]
+Method = Literal["swarm", "projection-lines"]
+#: Detections that need no folder: the sequence's own, or blobs of its silhouettes.
+YOLO, BLOBS = "yolo", "blobs"
 
 
 class TrackSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How a sequence is tracked.
 
     Attributes:
+        method: "swarm", of particles over silhouettes; or "projection-lines", which triangulates detections.
+        detections: of the projection lines: "yolo", those that came with the sequence; "blobs" of its silhouettes; or a
+            folder with a CSV file for each camera.
         particles: of every swarm.
         iterations: of the swarm, per frame.
         refinements: gradient steps after the swarm, per frame.
@@ -57,6 +63,8 @@ class TrackSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         SettingsError: a value makes no sense.
     """
 
+    method: Method = "swarm"
+    detections: str = YOLO
     particles: int = 30
     iterations: int = 30
     refinements: int = 0
@@ -113,10 +121,19 @@ class TrackSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
             check_positive(name, getattr(self, name))
         for size in self.drone_size_m or ():
             check_positive("drone_size_m", size)
-        for name, words in (("swarm", get_args(SwarmKind)), ("score", get_args(Score))):
+        for name, words in (
+            ("method", get_args(Method)),
+            ("swarm", get_args(SwarmKind)),
+            ("score", get_args(Score)),
+        ):
             if getattr(self, name) not in words:
                 raise SettingsError(name, expected=f"one of {', '.join(words)}", found=getattr(self, name))
         if self.bounds_m is not None and any(
             low >= high for low, high in zip(self.bounds_m[::2], self.bounds_m[1::2], strict=True)
         ):
             raise SettingsError("bounds_m", expected="x0 < x1, y0 < y1, z0 < z1", found=f"{self.bounds_m}")
+
+    @property
+    def reads_detections(self) -> bool:
+        """Whether files of detections are what is tracked; if not, it is silhouettes."""
+        return self.method == "projection-lines" and self.detections != BLOBS

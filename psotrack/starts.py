@@ -99,6 +99,22 @@ def find_start(
     return start
 
 
+def known_motion(
+    sequence: Sequence, settings: TrackSettings
+) -> tuple[Float[np.ndarray, "known 3"], Float[np.ndarray, "known 3"]] | None:
+    """Positions of the silhouettes' middles and velocities at frame 0, where `settings.init` tells; None if not.
+
+    Raises:
+        InputError: there is no reference or file to start from.
+    """
+    if settings.init == "auto":
+        return None
+    known, _ = _known_start(sequence, settings.init)
+    nobody = Start(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+    start = _with_sizes(known, nobody, sequence.fps, np.array(settings.body_offset_m))
+    return start.position_m[: settings.drones], start.velocity_m_s[: settings.drones]
+
+
 def _known_start(sequence: Sequence, init: str) -> tuple[Trajectories, Path]:
     """The trajectories that a start is taken from, and where they come from."""
     if init != "truth":

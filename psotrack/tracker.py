@@ -39,8 +39,6 @@ REACH_SIGMAS = 3.0
 MAX_CLAIMING_FRAMES = 4
 #: Dispersion before a frame has told any, and the number of frames that it is averaged over.
 DISPERSION, DISPERSION_FRAMES = 1e-3, 25
-#: Over a gap a drone keeps its acceleration for about so long: the best over gaps of 0.5 to 2 s in simulated flights.
-ACCELERATION_TIME_S = 0.5
 #: Cameras do not disagree about what they have in common: a size that does not fit, a clock, a rotor that none sees.
 #: The variance of the measured positions is that many times what the cameras' disagreement says.
 COMMON = 2.0
@@ -235,7 +233,14 @@ def step(
     corrected = motion.chosen(was_found & was_lost, anew, corrected)
     missed = jnp.where(was_found, 0, state.missed + 1)
     lost = missed > params.max_coasting_frames
-    after = _tamed(corrected, missed, params)
+    after = motion.tamed(
+        corrected,
+        missed > 0,
+        lost,
+        dt_s=params.dt_s,
+        bounds_m=params.bounds_m,
+        max_speed_m_s=params.max_speed_m_s,
+    )
     status = jnp.where(was_found, Status.TRACKED, jnp.where(lost, Status.LOST, Status.COASTING))
     info = TrackerInfo(
         position_m=after.position_m,
@@ -438,21 +443,3 @@ def _averaged(
     """The dispersion with this frame's in it: eight cameras of one frame say it roughly."""
     believed = was_found & jnp.isfinite(latest)
     return dispersion + jnp.where(believed, latest - dispersion, 0.0) / DISPERSION_FRAMES
-
-
-def _tamed(state: MotionState, missed: Int[Array, "drones"], params: TrackerParams) -> MotionState:
-    """Within the room, no faster than drones are; unseen, ever straighter; and where lost, at rest."""
-    lost = (missed > params.max_coasting_frames)[:, None]
-    straighter = jnp.where(missed > 0, jnp.exp(-params.dt_s / ACCELERATION_TIME_S), 1.0)[:, None]
-    velocity = _clamp_length(state.velocity_m_s, params.max_speed_m_s)
-    return replace(
-        state,
-        apparent_m=jnp.clip(state.apparent_m, *params.bounds_m),
-        velocity_m_s=jnp.where(lost, 0.0, velocity),
-        acceleration_m_s2=jnp.where(lost, 0.0, straighter * state.acceleration_m_s2),
-    )
-
-
-def _clamp_length(vector: Positions, longest: Float[Array, ""]) -> Positions:
-    length = jnp.linalg.norm(vector, axis=-1, keepdims=True)
-    return vector * jnp.minimum(1.0, longest / jnp.maximum(length, 1e-9))

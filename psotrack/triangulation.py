@@ -35,10 +35,7 @@ def triangulate(
         (..., 3), world, metres; NaN where fewer than two cameras see the point, or all their rays are parallel.
     """
     normal, right, seen = _normal_equations(cameras, points_px, weights)
-    solvable = (seen.sum(axis=-1) >= 2) & (np.linalg.cond(normal) < MAX_CONDITION)
-    normal = np.where(solvable[..., None, None], normal, np.eye(3))
-    point = np.linalg.solve(normal, right[..., None])
-    return np.where(solvable[..., None], point[..., 0], np.nan)
+    return np.where(seen.sum(axis=-1, keepdims=True) >= 2, solve_normal(normal, right), np.nan)
 
 
 def triangulate_paths(
@@ -81,6 +78,32 @@ def triangulate_paths(
     return np.where(solvable[..., None, None], path.reshape(rights.shape), np.nan)
 
 
+def projection_equations(
+    cameras: Camera, points_px: Float[np.ndarray, "*points cameras 2"], num_iterations: int = 20
+) -> tuple[
+    Float[np.ndarray, "*points cameras 2 3"],
+    Float[np.ndarray, "*points cameras 2"],
+    Bool[np.ndarray, "*points cameras"],
+]:
+    """Rows (3) of the paper, L X = B, with lens and K undone: (x r3 - r1) X = t1 - x t3, and the same for y.
+
+    Args:
+        cameras: with one leading axis.
+        points_px: (..., cameras, 2); NaN where a camera does not see the point.
+        num_iterations: that undo the lens, see `undistort`.
+
+    Returns:
+        L (..., cameras, 2, 3), B (..., cameras, 2), and which cameras see the points (..., cameras). Rows of a camera
+        that does not are finite, and of no meaning.
+    """
+    normalised = undistort(cameras, points_px, num_iterations)
+    seen = np.isfinite(normalised).all(axis=-1)
+    normalised = np.where(seen[..., None], normalised, 0.0)
+    T = np.asarray(cameras.T_cam_world)
+    rows = normalised[..., :, None] * T[:, 2, None, :3] - T[:, :2, :3]
+    return rows, T[:, :2, 3] - normalised * T[:, 2, None, 3], seen
+
+
 def _normal_equations(
     cameras: Camera,
     points_px: Float[np.ndarray, "*points cameras 2"],
@@ -89,16 +112,19 @@ def _normal_equations(
     Float[np.ndarray, "*points 3 3"], Float[np.ndarray, "*points 3"], Bool[np.ndarray, "*points cameras"]
 ]:
     """Left and right side of the normal equations, summed over the cameras, and which cameras see the points."""
-    normalised = undistort(cameras, points_px)
-    seen = np.isfinite(normalised).all(axis=-1)
+    rows, right, seen = projection_equations(cameras, points_px)
     weights = seen * (1.0 if weights is None else weights)
-    normalised = np.where(seen[..., None], normalised, 0.0)
-    T = cameras.T_cam_world
-    # Rows (3) with K undone: (x r3 - r1) X = t1 - x t3, and the same for y.
-    rows = normalised[..., :, None] * T[:, 2, None, :3] - T[:, :2, :3]
-    right = T[:, :2, 3] - normalised * T[:, 2, None, 3]
     normal = np.einsum("...c,...cik,...cil->...kl", weights, rows, rows)
     return normal, np.einsum("...c,...cik,...ci->...k", weights, rows, right), seen
+
+
+def solve_normal(
+    normal: Float[np.ndarray, "*points 3 3"], right: Float[np.ndarray, "*points 3"]
+) -> Float[np.ndarray, "*points 3"]:
+    """(..., 3), where the normal equations hold; NaN where they fix no point."""
+    solvable = np.linalg.cond(normal) < MAX_CONDITION
+    point = np.linalg.solve(np.where(solvable[..., None, None], normal, np.eye(3)), right[..., None])
+    return np.where(solvable[..., None], point[..., 0], np.nan)
 
 
 def viewpoints(cameras: Camera, nearest_m: float = 0.3) -> Int[np.ndarray, "cameras"]:

@@ -221,6 +221,43 @@ def test_drones_that_are_not_there_yet_are_awaited(run: Run, sequence: Path, tmp
     assert pd.read_csv(tmp_path / "t.csv")["drone"].nunique() < 7
 
 
+def test_projection_lines_from_the_sequence_a_folder_and_blobs(
+    run: Run, sequence: Path, tmp_path: Path
+) -> None:
+    """The same contract as the swarm's; and the sequence's own detections are those in its folder."""
+    tracks = [tmp_path / f"{name}.csv" for name in ("own", "folder", "blobs")]
+    for path, more in zip(
+        tracks, ((), ("--detections", sequence / "dl_data"), ("--detections", "blobs")), strict=True
+    ):
+        answer = run(*track(sequence, path, "--method", "projection-lines", *more))
+        assert answer.code == 0, answer
+        assert list(pd.read_csv(path).columns) == COLUMNS
+        assert len(pd.read_csv(path)) == 4 * NUM_FRAMES
+    assert tracks[0].read_bytes() == tracks[1].read_bytes() != tracks[2].read_bytes()
+    record = json.loads(tracks[0].with_suffix(".json").read_text())
+    assert record["settings"]["method"] == "projection-lines"
+    assert set(record["seconds"]) == {"decode", "foreground", "compile", "track", "finish", "total"}
+    assert sorted(record["input_keys"]) == [f"cam{i}i" for i in range(1, 9)]
+    assert len(record["start"]["position_m"]) == 4
+    evaluated = run("evaluate", tracks[0], sequence, "--json", "-")
+    errors = json.loads(evaluated.out)
+    assert (errors["id_switches"], errors["missed_rate"]) == (0, 0)
+    # Boxes of a third of the pixels; what is left is mostly how far the drones' origins are from their middles.
+    assert errors["mean_error_m"] < 0.05
+
+
+def test_detections_that_are_not_there(run: Run, sequence: Path, tmp_path: Path) -> None:
+    lines = ("--method", "projection-lines")
+    nowhere = run(*track(sequence, tmp_path / "t.csv", *lines, "--detections", tmp_path / "nowhere"))
+    assert_one_line(nowhere, "nowhere", "cam1i.csv", "no such folder")
+    shutil.rmtree(sequence / "dl_data")
+    assert_one_line(run(*track(sequence, tmp_path / "t.csv", *lines)), "dl_data", "--detections blobs")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "cam1i.csv").touch()
+    nobody = run(*track(sequence, tmp_path / "t.csv", *lines, "--detections", tmp_path / "empty"))
+    assert_one_line(nobody, "drones", "none in any frame")
+
+
 def test_fewer_cameras_and_frames_by_choice(run: Run, sequence: Path, tmp_path: Path) -> None:
     (sequence / "cam8i_s.avi").unlink()
     answer = run(*track(sequence, tmp_path / "t.csv", "--cameras", CAMERAS, "--frames", 11))

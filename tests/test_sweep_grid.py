@@ -194,7 +194,7 @@ WRONG = [
     ({"grid": {"draw": [20]}}, "grid.draw: .*; did you mean draws?"),
     (
         {"settings": {"zzz": 4}},
-        "settings.zzz: .*; there are particles, iterations, .*, silhouettes.reduction",
+        "settings.zzz: .*; there are method, detections, particles, .*, silhouettes.reduction",
     ),
     ({"settings": {"silhouettes": 4}}, "settings.silhouettes: expected a table with names, found none"),
     # Right names, wrong places.
@@ -275,6 +275,11 @@ WRONG = [
     (
         {"methods": {"a": {}, "b": {"iterations": TrackSettings().iterations}}},
         "methods.b: expected cells that differ, found the same as with methods.a",
+    ),
+    # What is done to silhouettes does nothing to detections.
+    (
+        {"settings": {"method": "projection-lines"}, "grid": {"flipped": [0.0, 0.03]}},
+        "grid.flipped[1]: expected 0 where detections are tracked, as it is done to silhouettes, found 0.03",
     ),
     ({"grid": {"draws": 3}}, "grid.draws: expected something to draw: a number of cameras, .*"),
     (

@@ -1,5 +1,7 @@
 """Points from pixels: exact cases, OpenCV for two cameras, least squares written out; and who belongs to whom."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ from helpers import LENSES, ROOM_M, rig_of, ring_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from psotrack.cameras import project
+from psotrack.cameras import CameraRig, project
 from psotrack.triangulation import candidates, match_views, triangulate, triangulate_paths, viewpoints
 
 
@@ -64,6 +66,26 @@ def test_weighted_least_squares():
         expected = np.linalg.lstsq(np.array(rows), np.array(right))[0]
         # Normal equations square the condition number, here about 10.
         np.testing.assert_allclose(found[n], expected, atol=1e-10)
+
+
+def test_the_pseudoinverse_of_the_paper():
+    """Equations (3)-(6) in pixels as they are printed, X = pinv(L) B with p1, p2, p3 the rows of K [R | t].
+
+    A row in pixels is one in normalised coordinates times the focal length: here one for all cameras, as in the paper.
+    """
+    rig, points = ring_rig(5), points_in_room(11)
+    one = np.broadcast_to(rig.cameras.K[0], (5, 3, 3)).copy()
+    one[:, 1, 1] = one[:, 0, 0]
+    rig = CameraRig(rig.names, replace(rig.cameras, K=one))
+    pixels = pixels_of(rig, points) + np.random.default_rng(4).normal(0, 1.0, (11, 5, 2))
+    P = one @ rig.cameras.T_cam_world[:, :3]
+    for n in range(11):
+        L = [pixels[n, c, i] * P[c, 2, :3] - P[c, i, :3] for c in range(5) for i in range(2)]
+        B = [P[c, i, 3] - pixels[n, c, i] * P[c, 2, 3] for c in range(5) for i in range(2)]
+        # As above: two ways of solving one system of condition 10.
+        np.testing.assert_allclose(
+            triangulate(rig.cameras, pixels)[n], np.linalg.pinv(np.array(L)) @ np.array(B), atol=1e-10
+        )
 
 
 def test_a_camera_that_does_not_see_the_point_does_not_count():

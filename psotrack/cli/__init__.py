@@ -10,10 +10,14 @@ import sys
 
 import click
 
+from psotrack.cli.calibrate import calibrate
 from psotrack.cli.commands import cli
+from psotrack.cli.detect import detect
 from psotrack.cli.fly import fly
+from psotrack.cli.labels import labels
 from psotrack.cli.simulate import simulate
 from psotrack.cli.sweep import sweep, table
+from psotrack.cli.synchronise import synchronise
 from psotrack.errors import PsotrackError
 
 __all__ = ["cli", "main"]
@@ -22,6 +26,10 @@ cli.add_command(simulate)
 cli.add_command(fly)
 cli.add_command(sweep)
 cli.add_command(table)
+cli.add_command(calibrate)
+cli.add_command(detect)
+cli.add_command(labels)
+cli.add_command(synchronise)
 
 
 def main() -> None:

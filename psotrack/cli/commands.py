@@ -28,7 +28,7 @@ from psotrack.cli.options import (
 )
 from psotrack.errors import SettingsError
 from psotrack.files import refuse_to_overwrite
-from psotrack.settings import Score, SwarmKind, TrackSettings
+from psotrack.settings import Method, Score, SwarmKind, TrackSettings
 from psotrack.silhouette_store import SilhouetteSettings
 
 
@@ -134,6 +134,20 @@ def silhouettes(
     required=True,
     help="The tracks: a file that ends in .csv or .parquet.",
 )
+@click.option(
+    "--method",
+    type=click.Choice(get_args(Method)),
+    default=TRACK.method,
+    show_default=True,
+    help="A swarm over silhouettes, or triangulated detections.",
+)
+@click.option(
+    "--detections",
+    default=TRACK.detections,
+    show_default=True,
+    metavar="yolo|blobs|FOLDER",
+    help="Of the projection lines: SEQ's own, blobs of its silhouettes, or a folder with a CSV file per camera.",
+)
 @click.option("--particles", type=int, default=TRACK.particles, show_default=True, help="Of every swarm.")
 @click.option("--iterations", type=int, default=TRACK.iterations, show_default=True, help="Per frame.")
 @click.option(
@@ -219,7 +233,7 @@ def track(
     json_path: Path | None,
     **settings: Any,
 ) -> None:
-    """Track the drones of SEQ from its videos.
+    """Track the drones of SEQ from its videos, or from detections in them.
 
     Writes OUT, one row per frame and drone, and beside it the same name with .json (every setting, what was learned of
     each drone, who came and who met, versions, device, input keys, seconds per stage) and with .ambiguity.csv (which
@@ -229,6 +243,7 @@ def track(
     Examples:
       psotrack track data/Simulated_Data/S02_D4_A --out tracks.csv
       psotrack track data/Simulated_Data/S02_D4_A --out smooth.csv --smooth
+      psotrack track data/Simulated_Data/S02_D4_A --out lines.csv --method projection-lines
       psotrack track data/Simulated_Data/S02_D4_A --out paper.parquet --swarm joint --particles 100 --iterations 70
     """
     from psotrack.compiled import keep_compiled

@@ -50,6 +50,7 @@ __all__ = [
     "Detections",
     "MaskWriter",
     "Masks",
+    "detection_files",
     "join_archives",
     "mocap_markers_file",
     "onboard_pose_file",
@@ -109,6 +110,22 @@ def read_sequence(folder: Path | str) -> Sequence:
         detections=detections or None,
         onboard=_onboard(folder),
     )
+
+
+def detection_files(folder: Path, cameras: Ordered[str]) -> dict[str, Path]:
+    """The files in a folder that are named as those in `dl_data` are; a camera without one saw nothing.
+
+    Raises:
+        InputError: there is none of any camera, or two of one.
+    """
+    found = _by_camera(folder.glob("*.csv"), cameras)
+    if not found:
+        raise InputError(
+            folder,
+            expected=f"a folder with files named like the cameras, {cameras[0]}.csv ...",
+            found="none of them" if folder.is_dir() else "no such folder",
+        )
+    return found
 
 
 def _check_folder(folder: Path) -> None:

@@ -33,6 +33,7 @@ from psotrack.evaluation.gospa import gospa
 from psotrack.evaluation.hota import hota
 from psotrack.evaluation.paths import path_errors, rows_apart
 from psotrack.evaluation.records import DroneEvaluation, ErrorSummary, Evaluation
+from psotrack.evaluation.standard_errors import standard_error
 from psotrack.trajectories import Trajectories
 
 
@@ -58,7 +59,9 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
     - `hota`, `deta`, `assa`, `loca`: see `hota.hota`; `gospa_*`: see `gospa.gospa`.
     - `offset_removed_mean_error_m`: the mean error after one constant offset per drone, its mean residual, is
       taken out: in the true body's frame where the orientation is known, else in the world's. Silhouettes
-      and marker crosses have their middle elsewhere than the body's origin; that is no fault of a tracker.
+      and marker crosses have their middle elsewhere than the body's origin; that is no fault of a tracker. In
+      `per_drone`, `offset_m` is this lever arm and `offset_standard_error_m` how well it is known; see
+      `standard_errors.standard_error`.
     - `ate_*`, `rpe_*`: of the same pairs as the errors; see `paths.path_errors`. Over all drones, `ate_aligned_rmse_m`
       moves all of them by one rigid motion; in `per_drone`, each by its own.
     - `inside_90_rate`, `mean_nees`, where the estimate has covariances: see `consistency.consistency`.
@@ -101,8 +104,7 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
                 drone=name,
                 estimate=None if partner[drone] == UNASSIGNED else pair.drones_est[partner[drone]],
                 frames=int(known[:, drone].sum()),
-                offset_m=followed.offsets[drone].offset_m,
-                offset_frame=followed.offsets[drone].offset_frame,
+                **vars(followed.offsets[drone]),
             )
             for drone, name in enumerate(pair.drones)
         ),
@@ -145,9 +147,10 @@ class _Followed:
 
 @dataclass(frozen=True)
 class _Offset:
-    """The constant part of one drone's residuals."""
+    """The constant part of one drone's residuals: its lever arm."""
 
     offset_m: tuple[float, float, float] | None = None
+    offset_standard_error_m: tuple[float, float, float] | None = None
     offset_frame: Literal["body", "world"] | None = None
 
 
@@ -155,7 +158,10 @@ def _follow(pair: AlignedPair, partner: Int[np.ndarray, "drones"]) -> _Followed:
     est_m = of_partners(pair.est_m, partner)
     residual_m = est_m - pair.ref_m
     offsets, centred_m = zip(
-        *(_centre(residual_m[:, drone], pair.orientation_wxyz[:, drone]) for drone in range(len(partner))),
+        *(
+            _centre(residual_m[:, drone], pair.orientation_wxyz[:, drone], pair.frame)
+            for drone in range(len(partner))
+        ),
         strict=True,
     )
     return _Followed(
@@ -170,7 +176,9 @@ def _follow(pair: AlignedPair, partner: Int[np.ndarray, "drones"]) -> _Followed:
 
 
 def _centre(
-    residual_m: Float[np.ndarray, "frames 3"], orientation_wxyz: Float[np.ndarray, "frames 4"]
+    residual_m: Float[np.ndarray, "frames 3"],
+    orientation_wxyz: Float[np.ndarray, "frames 4"],
+    frame: Int[np.ndarray, "frames"],
 ) -> tuple[_Offset, Float[np.ndarray, "frames 3"]]:
     """The mean residual of one drone, in its body where that is known, and what remains, in the world."""
     centred_m = np.full_like(residual_m, np.nan)
@@ -181,10 +189,15 @@ def _centre(
     frame_to_world = Rotation.identity()
     if in_body:
         frame_to_world = Rotation.from_quat(orientation_wxyz[seen], scalar_first=True)
-    offset_m = frame_to_world.inv().apply(residual_m[seen]).mean(axis=0)
+    turned_m = frame_to_world.inv().apply(residual_m[seen])
+    offset_m = turned_m.mean(axis=0)
     centred_m[seen] = residual_m[seen] - frame_to_world.apply(offset_m)
     x, y, z = offset_m.tolist()
-    return _Offset((x, y, z), "body" if in_body else "world"), centred_m
+    known_to_m = None
+    if len(turned_m) > 1:
+        dx, dy, dz = standard_error(turned_m, frame[seen]).tolist()
+        known_to_m = (dx, dy, dz)
+    return _Offset((x, y, z), known_to_m, "body" if in_body else "world"), centred_m
 
 
 def _errors(followed: _Followed, drones: slice) -> dict[str, Any]:

@@ -86,7 +86,9 @@ class DroneEvaluation(ErrorSummary, PathErrors, Consistency):
         frames: in which its true position is known.
         missed_rate: share of those frames without a row, or with a lost one.
         offset_removed_mean_error_m: mean error when the mean residual is taken out; None if never seen.
-        offset_m: that residual, estimate minus truth, (x, y, z); None if never seen.
+        offset_m: that residual, estimate minus truth, (x, y, z): the lever arm from the reference's point to the one
+            that is tracked; None if never seen.
+        offset_standard_error_m: of each of the three; None if seen in fewer than two frames.
         offset_frame: of `offset_m`: the true body's where its orientation is known in every frame of it, else
             the world's.
     """
@@ -97,6 +99,7 @@ class DroneEvaluation(ErrorSummary, PathErrors, Consistency):
     missed_rate: float
     offset_removed_mean_error_m: float | None
     offset_m: tuple[float, float, float] | None
+    offset_standard_error_m: tuple[float, float, float] | None
     offset_frame: Literal["body", "world"] | None
 
 
@@ -146,7 +149,8 @@ _CONTRACT = (
 _CONTRACT_DRONE = (
     *("drone", "estimate", "frames"),
     *_ERRORS,
-    *("missed_rate", "offset_removed_mean_error_m", "offset_m", "offset_frame"),
+    *("missed_rate", "offset_removed_mean_error_m"),
+    *("offset_m", "offset_standard_error_m", "offset_frame"),
     *_PATHS,
     *_CONSISTENCY,
 )

@@ -48,13 +48,18 @@ def render(evaluation: Evaluation, title: str = "") -> Table:
 
 
 def to_frame(evaluation: Evaluation) -> DataFrame:
-    """One row per drone: the keys of `per_drone` in `Evaluation.to_dict`, with `offset_x_m` and so on."""
+    """One row per drone: the keys of `per_drone` in `Evaluation.to_dict`, with `offset_x_m` and so on.
+
+    Likewise `offset_standard_error_x_m` and so on.
+    """
     import pandas as pd
 
     rows = []
     for drone in evaluation.to_dict()["per_drone"]:
-        x_m, y_m, z_m = drone.pop("offset_m") or (None, None, None)
-        rows.append(drone | {"offset_x_m": x_m, "offset_y_m": y_m, "offset_z_m": z_m})
+        for name in ("offset", "offset_standard_error"):
+            parts_m = drone.pop(f"{name}_m") or (None, None, None)
+            drone |= {f"{name}_{axis}_m": part_m for axis, part_m in zip("xyz", parts_m, strict=True)}
+        rows.append(drone)
     words = ("drone", "estimate", "offset_frame")
     return pd.DataFrame(rows).astype({key: float for key in rows[0] if key not in (*words, "frames")})
 
@@ -113,9 +118,17 @@ def _caption(evaluation: Evaluation, unit: _Unit) -> str:
             f"({_percent(evaluation.offset_removed_inside_90_rate)} centred), "
             f"mean NEES {_nees(evaluation.mean_nees)} ({_nees(evaluation.offset_removed_mean_nees)})"
         )
-    frames = sorted({drone.offset_frame for drone in evaluation.per_drone if drone.offset_frame})
-    lines["centred"] = f"without each drone's offset, its mean residual ({' or '.join(frames) or 'no'} frame)"
+    lines["centred"] = _centred(evaluation, unit)
     return "\n".join(f"{label:<10}{line}" for label, line in lines.items())
+
+
+def _centred(evaluation: Evaluation, unit: _Unit) -> str:
+    """What the offsets are, and how well the least known part of them is known."""
+    drones = evaluation.per_drone
+    frames = sorted({drone.offset_frame for drone in drones if drone.offset_frame})
+    parts_m = [part_m for drone in drones for part_m in drone.offset_standard_error_m or ()]
+    known = f", known to {unit.number(max(parts_m))} {unit.name}" if parts_m else ""
+    return f"without each drone's offset ({' or '.join(frames) or 'no'} frame{known})"
 
 
 def _clear(evaluation: Evaluation) -> str:

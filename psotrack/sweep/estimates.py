@@ -87,7 +87,8 @@ def estimate(cells: Iterable[Cell], inputs: Inputs, store: Store | None) -> Esti
         drones = cell.settings.drones or sequence.truth.num_drones
         settings = cell.settings
         count += 1
-        work = settings.particles * settings.iterations * drones * cameras
+        swarm = settings.method == "swarm"
+        work = settings.particles * settings.iterations * drones * cameras if swarm else 0
         tracking_s += factor * runs * sequence.num_frames * (FRAME_S + WORK_S * work)
         shape = (
             settings.particles,
@@ -96,8 +97,9 @@ def estimate(cells: Iterable[Cell], inputs: Inputs, store: Store | None) -> Esti
             settings.windows,
             settings.silhouettes.reduction,
         )
-        programs.add((cell.sequence, cameras, runs, shape))
-        if source_of(cell) not in silhouettes_s:
+        if swarm:
+            programs.add((cell.sequence, cameras, runs, shape))
+        if not settings.reads_detections and source_of(cell) not in silhouettes_s:
             silhouettes_s[source_of(cell)] = _silhouettes_s(cell, inputs)
     return Estimate(
         count, unread, tracking_s, COMPILE_S * len(programs), sum(silhouettes_s.values(), 0.0), basis

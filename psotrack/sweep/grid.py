@@ -98,6 +98,12 @@ class Grid:
         values = {name: value for _, name, value in given}
         settings = self._record(TrackSettings, nested(values, SETTINGS), places)
         perturbation = self._record(Perturbation, nested(values, PERTURBATIONS), places)
+        if settings.reads_detections:
+            # Silently they would do nothing.
+            for name in ("clock_frames", "flipped"):
+                if getattr(perturbation, name):
+                    expected = "0 where detections are tracked, as it is done to silhouettes"
+                    raise self._error(places[name], expected=expected, found=f"{values[name]}")
         cameras, frames = self._cameras(values, places), values.get("frames")
         if frames is not None:
             check_whole(f"{self.where}: {places['frames']}", frames, lowest=1)

@@ -14,6 +14,7 @@ import numpy as np
 
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.errors import InputError, PsotrackError
+from psotrack.pipeline import detection_files_of
 from psotrack.sequence import Sequence
 from psotrack.silhouette_store import SilhouetteSettings
 from psotrack.silhouette_store import key_of as silhouettes_key_of
@@ -25,8 +26,8 @@ from psotrack.sweep.perturbations import perturbed
 #: Folders of the data's root in which a sequence may lie.
 HALVES = ("Simulated_Data", "Real_Data", ".")
 
-#: What decides which silhouettes a cell needs.
-Source = tuple[str, int | None, SilhouetteSettings]
+#: What decides which silhouettes a cell needs; None where it reads detections instead.
+Source = tuple[str, int | None, SilhouetteSettings | None]
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class Input:
     """A sequence as a cell sees it."""
 
     sequence: Sequence
-    silhouettes: Silhouettes
+    silhouettes: Silhouettes | None
 
 
 @dataclass
@@ -54,15 +55,19 @@ class Inputs:
     _last: tuple[Any, Input | PsotrackError] | None = None
 
     def keys_of(self, cell: Cell) -> dict[str, str]:
-        """Digests of all that a cell reads: silhouettes by camera, calibration, reference.
+        """Digests of all that a cell reads: silhouettes by camera, calibration, reference, detections.
 
         Raises:
             InputError: it cannot be read.
             SettingsError: there are not so many frames.
         """
-        _, keys = self._source(cell)
+        sequence, keys = self._source(cell)
+        keys = dict(keys)
         if Path(cell.settings.init).is_file():
-            return keys | {"init": _digest(np.frombuffer(Path(cell.settings.init).read_bytes(), np.uint8))}
+            keys["init"] = _digest_of_file(Path(cell.settings.init))
+        if cell.settings.reads_detections:
+            files = detection_files_of(sequence, cell.settings.detections)
+            keys |= {f"detections of {name}": _digest_of_file(path) for name, path in files.items()}
         return keys
 
     def sequence_of(self, cell: Cell) -> Sequence:
@@ -94,6 +99,8 @@ class Inputs:
         """What a cell reads, or why that cannot be had; None as long as somebody else makes the silhouettes."""
         sequence = self.sequence_of(cell)
         try:
+            if cell.settings.reads_detections:
+                return Input(*perturbed(sequence, None, cell.perturbation, cell.cameras))
             with claimed(self.claim_of(cell), f"silhouettes of {cell.sequence}") as ours:
                 if not ours:
                     return None
@@ -113,9 +120,12 @@ class Inputs:
             sequence = read_sequence(folder_of(cell.sequence, self.data)).usable(None, cell.frames)
             if sequence.truth is None:
                 raise InputError(sequence.folder, expected="a reference to compare with", found="none")
-            with ThreadPoolExecutor() as threads:
-                key_of = partial(silhouettes_key_of, settings=cell.settings.silhouettes)
-                keys = dict(zip(sequence.videos, threads.map(key_of, sequence.videos.values()), strict=True))
+            keys = {}
+            if not cell.settings.reads_detections:
+                with ThreadPoolExecutor() as threads:
+                    key_of = partial(silhouettes_key_of, settings=cell.settings.silhouettes)
+                    of_videos = threads.map(key_of, sequence.videos.values())
+                    keys = dict(zip(sequence.videos, of_videos, strict=True))
             keys |= {
                 "calibration": _digest(*vars(sequence.rig.cameras).values()),
                 "reference": _digest(sequence.truth.position_m, sequence.truth.orientation_wxyz),
@@ -126,7 +136,8 @@ class Inputs:
 
 def source_of(cell: Cell) -> Source:
     """What decides which silhouettes a cell needs."""
-    return cell.sequence, cell.frames, cell.settings.silhouettes
+    settings = cell.settings
+    return cell.sequence, cell.frames, None if settings.reads_detections else settings.silhouettes
 
 
 def folder_of(sequence: str, data: Path) -> Path:
@@ -155,3 +166,7 @@ def _digest(*arrays: Any) -> str:
     for array in arrays:
         digest.update(np.ascontiguousarray(array).tobytes() if array is not None else b"none")
     return digest.hexdigest()
+
+
+def _digest_of_file(path: Path) -> str:
+    return _digest(np.frombuffer(path.read_bytes(), np.uint8))

@@ -32,15 +32,16 @@ _Frames = UInt8[np.ndarray, "frames height width"]
 
 def perturbed(
     sequence: Sequence,
-    silhouettes: Silhouettes,
+    silhouettes: Silhouettes | None,
     perturbation: Perturbation,
     cameras: tuple[str, ...] | int | None,
-) -> tuple[Sequence, Silhouettes]:
+) -> tuple[Sequence, Silhouettes | None]:
     """The input of a cell.
 
     Args:
         sequence: fit for use, with all of its cameras.
-        silhouettes: of all of its cameras; what is changed of them is in memory then, under the same keys.
+        silhouettes: of all of its cameras; what is changed of them is in memory then, under the same keys. None where
+            nothing is read of them.
         perturbation: what is done.
         cameras: the names of those to keep; how many of them, chosen by the draw (see `chosen`); or None for all.
 
@@ -51,20 +52,20 @@ def perturbed(
     kept = chosen(every, cameras, perturbation.draw) if isinstance(cameras, int) else cameras or every
     if kept != every:
         sequence = sequence.usable(list(kept))
-        silhouettes = _of_cameras(silhouettes, kept)
+        silhouettes = None if silhouettes is None else _of_cameras(silhouettes, kept)
     # A camera's number is that of the whole rig.
     index = [every.index(name) for name in kept]
     if perturbation.extrinsics_deg:
         rngs = [_rng(_EXTRINSICS, perturbation.draw, camera) for camera in index]
         sequence = replace(sequence, rig=_turned(sequence.rig, perturbation.extrinsics_deg, rngs))
-    if perturbation.clock_frames:
+    if silhouettes is not None and perturbation.clock_frames:
         rngs = [_rng(_CLOCKS, perturbation.draw, camera) for camera in index]
         late_frames = [rng.uniform(0, perturbation.clock_frames) for rng in rngs]
         arrays = [
             _late(stored, late) for stored, late in zip(_of_each(silhouettes), late_frames, strict=True)
         ]
         silhouettes = replace(silhouettes, arrays=tuple(arrays))
-    if perturbation.flipped:
+    if silhouettes is not None and perturbation.flipped:
         rngs = [_rng(_FLIPS, perturbation.draw, camera) for camera in index]
         arrays = [
             _flipped(stored, perturbation.flipped, silhouettes.reduction**2, rng)

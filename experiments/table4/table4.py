@@ -1,0 +1,120 @@
+"""The paper's Table 4, triangulation based on projection lines, beside the swarm: mean and median error, and FNR.
+
+    python experiments/table4/table4.py            # S01_D2_A, S02_D4_A and S04_D10, simulated where they are not there
+    python experiments/table4/table4.py --data FOLDER_OF_THE_DATASET    # every sequence in it that has a reference
+
+FNR is the share of frames and drones that were missed. It writes to --out: results.csv, table4.md, and what `psotrack
+sweep` writes; what is finished there is not run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tomllib
+from pathlib import Path
+
+import pandas as pd
+
+from psotrack.datasets.dpjait import CALIBRATION
+from psotrack.errors import PsotrackError
+from psotrack.progress import terminal
+from psotrack.sweep import grid, pivot, render, sweep
+
+HERE = Path(__file__).parent
+SIMULATED = ("S01_D2_A", "S02_D4_A", "S04_D10")
+#: Title -> column, its factor, and decimals.
+TABLES = {
+    "Mean error (mm)": ("mean_error_m", 1e3, 1),
+    "Median error (mm)": ("median_error_m", 1e3, 1),
+    "Mean error, each drone's constant offset taken out (mm)": ("offset_removed_mean_error_m", 1e3, 1),
+    "FNR": ("missed_rate", 1.0, 4),
+    "Identity switches": ("id_switches", 1.0, 0),
+    "MOTA": ("mota", 1.0, 3),
+    "Time of the track stage per frame (ms)": ("track_ms_per_frame", 1.0, 1),
+}
+KEPT = [
+    "sequence",
+    "method",
+    "frames",
+    "drones",
+    "mean_error_m",
+    "median_error_m",
+    "p95_error_m",
+    "max_error_m",
+]
+KEPT += ["offset_removed_mean_error_m", "missed_rate", "id_switches", "mota", "idf1", "hota"]
+KEPT += ["offset_removed_inside_90_rate", "track_ms_per_frame", "commit"]
+
+
+def main() -> None:
+    """Simulate what is not there, track, and show."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--data", type=Path, help="root folder of the sequences [default: simulated into OUT]"
+    )
+    parser.add_argument(
+        "--methods",
+        type=Path,
+        default=HERE / "methods.toml",
+        help="[default: methods.toml, beside this file]",
+    )
+    parser.add_argument("--out", type=Path, default=Path("table4"))
+    options = parser.parse_args()
+    try:
+        data = options.data or simulated(options.out / "data")
+        what = tomllib.loads(options.methods.read_text())
+        rows = tracked({**what, "sequences": at_hand(data)}, options.out, data)
+        show(rows, options.out)
+    except PsotrackError as error:
+        sys.exit(f"table4: {error}")
+    if rows.attrs["errors"]:
+        sys.exit("\n".join(f"table4: {error}" for error in rows.attrs["errors"]))
+
+
+def simulated(data: Path) -> Path:
+    """The data's root, with the sequences that were not there."""
+    from psotrack.simulation import simulate
+
+    for name in SIMULATED:
+        if not (data / "Simulated_Data" / name).is_dir():
+            print(f"simulating {name}", flush=True)
+            simulate(name, data, seed=0, masks=False, onboard=False, report=terminal)
+    return data
+
+
+def at_hand(data: Path) -> list[str]:
+    """The names of all sequences below a folder."""
+    found = sorted(path.parent.name for path in data.glob(f"*/*/{CALIBRATION}"))
+    if not found:
+        sys.exit(f"table4: {data}: expected sequences in Simulated_Data or Real_Data, found none")
+    return found
+
+
+def tracked(what: dict, out: Path, data: Path) -> pd.DataFrame:
+    """One row per sequence and method; what is in `out` is not run again."""
+    from psotrack.compiled import keep_compiled
+    from psotrack.sweep.machine import share_processors
+
+    share_processors()
+    keep_compiled(out / "cache" / "compiled")
+    return sweep(grid(what), out, data=data, cache=out / "cache", report=terminal)
+
+
+def show(rows: pd.DataFrame, out: Path) -> None:
+    """Print the tables, and write them and the rows."""
+    parts = []
+    for title, (value, scale, decimals) in TABLES.items():
+        table = pivot(rows, rows_by=["sequence"], columns_by=["method"], value=value, scale=scale)
+        parts.append(f"## {title}\n\n{render(table, 'markdown', decimals=decimals)}")
+        print(f"{title}\n{render(table, decimals=decimals)}")
+    rows[[name for name in KEPT if name in rows]].to_csv(
+        out / "results.csv", index=False, float_format="%.6g"
+    )
+    (out / "table4.md").write_text("\n".join(parts))
+
+
+if __name__ == "__main__":
+    main()

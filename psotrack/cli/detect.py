@@ -1,0 +1,84 @@
+"""`psotrack detect`: detections of a neural network in the videos of a sequence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from psotrack.cli.answers import answer, report_to, say
+from psotrack.cli.options import CAMERAS, FORCE, FRAMES, JSON, QUIET, SEQUENCE
+
+
+@click.command()
+@SEQUENCE
+@click.option(
+    "--detector",
+    "model",
+    type=click.Path(path_type=Path),
+    required=True,
+    metavar="MODEL.onnx",
+    help="A YOLO network (v5 to v11), trained on drones.",
+)
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the detections.")
+@click.option("--confidence", type=float, default=0.25, show_default=True, help="Least score that counts.")
+@click.option(
+    "--nms",
+    type=float,
+    default=0.45,
+    show_default=True,
+    help="Intersection over union above which two boxes are of one drone.",
+)
+@click.option(
+    "--size", type=int, default=640, show_default=True, help="Of the network's square input, in pixels."
+)
+@CAMERAS
+@FRAMES
+@FORCE
+@QUIET
+@JSON
+def detect(
+    sequence: Path,
+    model: Path,
+    out: Path,
+    confidence: float,
+    nms: float,
+    size: int,
+    cameras: str | None,
+    num_frames: int | None,
+    force: bool,
+    quiet: bool,
+    json_path: Path | None,
+) -> None:
+    """Find the drones of SEQ in each of its videos with a network, as 2D boxes.
+
+    Writes OUT/CAMERA.csv for every camera, in the layout of the dataset's own dl_data.
+
+    \b
+    Examples:
+      psotrack detect data/Simulated_Data/S02_D4_A --detector drones.onnx --out boxes
+      psotrack detect data/Real_Data/R12_D4 --detector drones.onnx --out boxes --size 1280 --confidence 0.4
+    """
+    from psotrack.datasets.dpjait import read_sequence
+    from psotrack.detections import write_detections
+    from psotrack.detector import Detector, DetectorSettings
+    from psotrack.detector import detect as detect_in
+    from psotrack.files import refuse_to_overwrite
+
+    detector = Detector(model, DetectorSettings(confidence, nms, size))
+    recording = read_sequence(sequence).usable(cameras.split(",") if cameras else None, num_frames)
+    files = {name: out / f"{video.path.stem}.csv" for name, video in recording.videos.items()}
+    for path in files.values():
+        refuse_to_overwrite(path, force)
+    counts: dict[str, int] = {}
+    for name, video in recording.videos.items():
+        detections = detect_in(detector, name, video, report=report_to(quiet))
+        write_detections(files[name], detections)
+        counts[name] = len(detections)
+    answer(json_path, {"out": str(out), "frames": recording.num_frames, "detections": counts}, force)
+    per_frame = sum(counts.values()) / (len(counts) * recording.num_frames)
+    say(
+        quiet,
+        json_path,
+        f"{out}: {len(counts)} cameras, {recording.num_frames} frames, {per_frame:.2f} boxes per frame and camera",
+    )

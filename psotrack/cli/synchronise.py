@@ -1,0 +1,117 @@
+"""`psotrack synchronise`: the offset between the clocks of a sequence's reference and of its videos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from psotrack.cli.answers import answer, say
+from psotrack.cli.options import FORCE, JSON, QUIET, SEQUENCE
+
+if TYPE_CHECKING:
+    from psotrack.synchronisation import Offset
+    from psotrack.trajectories import Trajectories
+
+
+@click.command()
+@click.argument("tracks", type=click.Path(path_type=Path))
+@SEQUENCE
+@click.option(
+    "--max-offset",
+    "max_offset_s",
+    type=float,
+    default=2.0,
+    show_default=True,
+    help="Offsets from minus this to this are tried, in seconds.",
+)
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path),
+    is_flag=False,
+    flag_value="",
+    metavar="[PNG]",
+    help="Save the mean distance over the offsets.  [default: beside TRACKS, as .offset.png]",
+)
+@FORCE
+@QUIET
+@JSON
+def synchronise(
+    tracks: Path,
+    sequence: Path,
+    max_offset_s: float,
+    plot: Path | None,
+    force: bool,
+    quiet: bool,
+    json_path: Path | None,
+) -> None:
+    """Find by how much the clock of SEQ's reference is ahead of its videos', from the motion in TRACKS.
+
+    The offset with the smallest mean distance, to a fraction of a frame; each drone may have a constant lever arm. A
+    .c3d is read at its own rate, whatever that of the videos.
+
+    \b
+    Examples:
+      psotrack synchronise tracks.csv data/Real_Data/R12_D4
+      psotrack synchronise tracks.csv data/Real_Data/R12_D4 --max-offset 10 --plot offset.png --json -
+    """
+    from psotrack.datasets.dpjait import read_sequence
+    from psotrack.synchronisation import find_offset, own_reference, save_curve
+    from psotrack.trajectory_files import read_trajectories
+
+    recording = read_sequence(sequence)
+    reference = own_reference(recording)
+    estimate = read_trajectories(tracks, fps=recording.fps)
+    offset = find_offset(
+        estimate,
+        reference.time_s,
+        reference.position_m,
+        reference.orientation_wxyz,
+        max_offset_s=max_offset_s,
+    )
+    answer(json_path, _content(offset, estimate, reference), force)
+    if plot is not None:
+        save_curve(plot if plot.name else tracks.with_suffix(".offset.png"), offset, force=force)
+    before = (
+        "nothing to compare" if offset.mean_distance_before_m is None else _mm(offset.mean_distance_before_m)
+    )
+    say(
+        quiet,
+        json_path,
+        f"{recording.name}: the reference's clock is {abs(offset.offset_s):.4f} s "
+        f"{'ahead of' if offset.offset_s >= 0 else 'behind'} the videos', give or take {offset.std_s:.4f} s "
+        f"({offset.offset_s * recording.fps:+.2f} frames); mean distance, lever arms taken out: "
+        f"{before} before, {_mm(offset.mean_distance_m)} after",
+    )
+
+
+def _mm(value_m: float) -> str:
+    return f"{1e3 * value_m:.1f} mm"
+
+
+def _content(offset: Offset, estimate: Trajectories, reference: Trajectories) -> dict[str, Any]:
+    """The offset as JSON has it, with null where there is no number."""
+    from psotrack.evaluation.association import UNASSIGNED
+
+    drones = [
+        {
+            "drone": name,
+            "estimate": None if partner == UNASSIGNED else estimate.drones[partner],
+            "lever_arm_m": None if partner == UNASSIGNED else offset.lever_arm_m[drone].tolist(),
+        }
+        for drone, (name, partner) in enumerate(zip(reference.drones, offset.partner, strict=True))
+    ]
+    return {
+        "offset_s": offset.offset_s,
+        "std_s": offset.std_s,
+        "mean_distance_before_m": offset.mean_distance_before_m,
+        "mean_distance_m": offset.mean_distance_m,
+        "overlap": offset.overlap,
+        "lever_arm_frame": "world" if reference.orientation_wxyz is None else "body",
+        "drones": drones,
+        "curve": {
+            "offset_s": offset.curve_s.tolist(),
+            "mean_distance_m": [None if value != value else value for value in offset.curve_m.tolist()],
+        },
+    }

@@ -1,0 +1,228 @@
+"""A simulated sequence in the form of a real one: the stand-in for the half of DPJAIT that a Vicon system recorded.
+
+What differs there is made here: four cameras by serial number with one lens, 1924 x 1082 pixels with distortion,
+calibration in millimetres, videos named by serial number, and for a reference one C3D file of marker crosses at 100 Hz
+that began at another moment than the videos, with noise, markers that are hidden for a while and labels that get
+swapped. There are no poses and no masks. The middle of a cross is not the drone's: evaluation finds the lever arm.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.interpolate import CubicSpline
+
+from psotrack.cameras import Camera, CameraRig, to_pixels, undistort
+from psotrack.datasets.dpjait import (
+    CALIBRATION,
+    DETECTIONS,
+    Detections,
+    mocap_markers_file,
+    read_detections,
+    read_mocap_markers,
+    read_sequence,
+    write_calibration,
+    write_detections,
+)
+from psotrack.errors import InputError, SettingsError, check_positive
+from psotrack.files import refuse_to_overwrite, written_whole
+from psotrack.mocap import Markers, write_c3d
+from psotrack.progress import Advance, Report, silent
+from psotrack.sequence import Sequence
+from psotrack.video import VideoInfo, VideoWriter, read_frames
+
+#: The bodies of the dataset's cameras; the fifth was a spare.
+SERIALS = ("55260362", "56339527", "60881257", "61016180")
+#: What the real half's calibration says, for pictures of that size; pictures of other sizes get a part of it.
+_FOCAL_LENGTH_PX, _CENTRE_PX, _SIZE_WH = 1158.7, (962.0, 541.0), (1924, 1082)
+_SIMULATED_WIDTH_PX = 1920
+#: k1, k2, p1, p2: a mild barrel, as lenses of this angle have; what the dataset's lenses have is not known.
+_LENS = np.array([-0.08, 0.02, 0.0004, -0.0003])
+#: Of a marker's position, root mean square along each axis.
+_NOISE_M = 0.0002
+#: How often a marker is hidden, and how long on average; how long two labels of each drone are swapped.
+_HIDDEN_PER_S, _HIDDEN_S, _SWAPPED_S = 0.1, 0.08, 0.2
+#: Something else that reflects, lying on the floor: it has no name.
+_REFLECTION_M = (1.3, -1.1, 0.02)
+
+
+def write_as_real(
+    sequence: Path,
+    root: Path,
+    *,
+    rate_hz: float = 100.0,
+    offset_s: float = 0.37,
+    three_videos: bool = False,
+    seed: int = 0,
+    force: bool = False,
+    report: Report = silent,
+) -> Path:
+    """Write a simulated sequence into ROOT/Real_Data/RXX_Dn, as the real half of the archive would hold it.
+
+    Videos are taken through the lens and coded again. The lens shows more than the simulation: the outermost 6 % of a
+    picture repeat its border. Reference positions between the simulation's frames are cubic splines of its markers;
+    before its first frame the drones stand still. A sequence of `psotrack simulate NAME --set
+    cameras=laboratory_corners --no-masks --no-onboard` has all that is used.
+
+    Args:
+        sequence: folder of the simulated sequence; its first four cameras are used.
+        root: folder of the dataset.
+        rate_hz: of the C3D file.
+        offset_s: time in the C3D file at frame 0 of the videos; above 0 where it began first.
+        three_videos: whether the last camera has no video, as in R17_D1_A.
+        seed: of the markers' noise, gaps and swapped labels.
+        force: whether to replace a sequence that is there.
+        report: told of every frame of every video.
+
+    Returns:
+        The folder of the new sequence.
+
+    Raises:
+        InputError: the sequence cannot be read, or has fewer than four cameras or no files of markers.
+        SettingsError: the rate is not above 0, or the C3D file would begin after the videos.
+        OutputError: the new sequence exists and `force` is not set, or it cannot be written.
+    """
+    check_positive("rate_hz", rate_hz)
+    simulated = read_sequence(sequence)
+    if len(simulated.videos) < len(SERIALS):
+        found = f"{len(simulated.videos)}"
+        raise InputError(sequence, expected=f"videos of {len(SERIALS)} cameras", found=found)
+    markers_m = _simulated_markers(simulated)
+    rng = np.random.default_rng(seed)
+    recording = _recording(markers_m, simulated.fps, rate_hz, offset_s, rng)
+    names = [name for name in simulated.rig.names if name in simulated.videos][: len(SERIALS)]
+    rig = _real_rig(simulated.rig.select(names))
+    folder = Path(root) / "Real_Data" / f"R{_number(simulated.name):02d}_D{markers_m.shape[1]}"
+    refuse_to_overwrite(folder, force)
+    filmed = list(zip(rig.names, names, strict=True))[: len(SERIALS) - three_videos]
+    with (
+        written_whole(folder) as growing,
+        report("lens", sum(simulated.videos[name].num_frames for _, name in filmed)) as advance,
+    ):
+        write_calibration(growing / CALIBRATION, rig, unit="mm")
+        write_c3d(growing / f"{folder.name}.c3d", recording)
+        for serial, name in filmed:
+            before, lens = (
+                one.cameras[one.names.index(key)] for one, key in ((simulated.rig, name), (rig, serial))
+            )
+            _write_video(growing / f"{serial}.avi", simulated.videos[name], before, lens, advance)
+            if simulated.detections and name in simulated.detections:
+                boxes = _bent(read_detections(simulated.detections[name]), before, lens)
+                write_detections(growing / DETECTIONS / f"{serial}.csv", boxes)
+    return folder
+
+
+def _number(name: str) -> int:
+    """That of the simulated sequence; 99 where its name has none."""
+    match = re.match(r"[A-Za-z]*(\d+)", name)
+    return int(match[1]) if match else 99
+
+
+# --- cameras and what they see
+
+
+def _real_rig(rig: CameraRig) -> CameraRig:
+    """The cameras where they are, with the real half's intrinsics, lens and names."""
+    cameras = rig.cameras
+    scale = float(cameras.image_size_wh[0, 0]) / _SIMULATED_WIDTH_PX
+    # The corner of the image, which stays where it is, is at -0.5.
+    cx, cy = ((centre + 0.5) * scale - 0.5 for centre in _CENTRE_PX)
+    focal_px = _FOCAL_LENGTH_PX * scale
+    K = np.array([[focal_px, 0.0, cx], [0.0, focal_px, cy], [0.0, 0.0, 1.0]])
+    size_wh = np.array([2.0 * round(side * scale / 2) for side in _SIZE_WH])
+    return CameraRig(
+        SERIALS,
+        replace(
+            cameras,
+            K=np.tile(K, (len(rig), 1, 1)),
+            dist=np.tile(_LENS, (len(rig), 1)),
+            image_size_wh=np.tile(size_wh, (len(rig), 1)),
+        ),
+    )
+
+
+def _write_video(path: Path, video: VideoInfo, before: Camera, lens: Camera, advance: Advance) -> None:
+    width, height = (int(side) for side in lens.image_size_wh)
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
+    xs, ys = np.moveaxis(_through(lens, before, pixels).astype(np.float32), -1, 0)
+    with VideoWriter(path, video.fps, (width, height)) as writer:
+        for frame in read_frames(video):
+            writer.write(cv2.remap(frame, xs, ys, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+            advance(1)
+
+
+def _bent(detections: Detections, before: Camera, lens: Camera) -> Detections:
+    """The boxes around what the lens makes of boxes: of their corners and the middles of their sides."""
+    x0, y0, x1, y1 = detections.xyxy.T
+    xs, ys = (np.stack([low, (low + high) / 2, high], axis=-1) for low, high in ((x0, x1), (y0, y1)))
+    grid = np.stack(np.broadcast_arrays(xs[:, None, :], ys[:, :, None]), axis=-1).reshape(-1, 9, 2)
+    seen = _through(before, lens, grid)
+    return replace(detections, xyxy=np.hstack([seen.min(axis=1), seen.max(axis=1)]))
+
+
+def _through(
+    one: Camera, other: Camera, pixels: Float[np.ndarray, "*points 2"]
+) -> Float[np.ndarray, "*points 2"]:
+    """Where another camera at the same place sees what one sees at some pixels."""
+    rays = undistort(one, pixels)
+    return np.asarray(to_pixels(other, np.concatenate([rays, np.ones_like(rays[..., :1])], axis=-1)))
+
+
+# --- the C3D file
+
+
+def _simulated_markers(simulated: Sequence) -> Float[np.ndarray, "frames drones markers 3"]:
+    """(frames, drones, markers, 3), world, at the frames of the videos."""
+    paths = (simulated.folder / mocap_markers_file(number, simulated.fps) for number in itertools.count(1))
+    drones = [read_mocap_markers(path) for path in itertools.takewhile(Path.exists, paths)]
+    if not drones:
+        expected = f"markers of its drones, {mocap_markers_file(1, simulated.fps)} ..."
+        raise InputError(simulated.folder, expected=expected, found="none", remedy="simulate it anew")
+    return np.stack(drones, axis=1)
+
+
+def _recording(
+    markers_m: Float[np.ndarray, "frames drones markers 3"],
+    fps: float,
+    rate_hz: float,
+    offset_s: float,
+    rng: np.random.Generator,
+) -> Markers:
+    """What a mocap system would have recorded, until the videos end."""
+    num_frames, num_drones, per_drone, _ = markers_m.shape
+    last_s = (num_frames - 1) / fps
+    if not -last_s < offset_s < np.inf:
+        expected = f"more than {-last_s:g} s, as the videos are over by then"
+        raise SettingsError("offset_s", expected=expected, found=f"{offset_s:g}")
+    time_s = np.arange(int((last_s + offset_s) * rate_hz + 1e-6) + 1) / rate_hz - offset_s
+    spline = CubicSpline(np.arange(num_frames) / fps, markers_m.reshape(num_frames, -1))
+    shown_m = spline(np.maximum(time_s, 0.0)).reshape(len(time_s), -1, 3)
+    shown_m += rng.normal(0.0, _NOISE_M, shown_m.shape)
+    shown_m[_hidden(len(time_s), num_drones * per_drone, rate_hz, rng)] = np.nan
+    for drone in range(num_drones):
+        start = int(rng.integers(len(time_s)))
+        swapped = slice(start, start + round(_SWAPPED_S * rate_hz))
+        pair = drone * per_drone + rng.choice(per_drone, 2, replace=False)
+        shown_m[swapped, pair] = shown_m[swapped, pair[::-1]]
+    names = [f"Dron{number}" for number in range(1, num_drones + 1)]
+    labels = [f"{name}:{name}{marker}" for name in names for marker in range(1, per_drone + 1)]
+    strays_m = np.tile(_REFLECTION_M, (len(time_s), 1, 1))
+    return Markers((*labels, "*1"), np.concatenate([shown_m, strays_m], axis=1), rate_hz)
+
+
+def _hidden(
+    num_frames: int, num_markers: int, rate_hz: float, rng: np.random.Generator
+) -> Bool[np.ndarray, "frames markers"]:
+    """Spells in which a marker is not seen: they begin at any time, and last as long as they happen to."""
+    hidden = np.zeros((num_frames, num_markers), bool)
+    for marker in range(num_markers):
+        starts = np.flatnonzero(rng.random(num_frames) < _HIDDEN_PER_S / rate_hz)
+        for start, length_s in zip(starts, rng.exponential(_HIDDEN_S, len(starts)), strict=True):
+            hidden[start : start + 1 + int(length_s * rate_hz), marker] = True
+    return hidden

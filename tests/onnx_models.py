@@ -1,0 +1,123 @@
+"""Tiny networks in ONNX, encoded by hand: a convolution that finds bright squares, with the outputs of YOLO's versions.
+
+The fields and their numbers are those of onnx.proto; protobuf's wire format is varints, and bytes with their lengths.
+"""
+
+import struct
+
+import numpy as np
+
+_FLOAT, _INT64 = 1, 7
+#: The network's boxes: squares of this side, at every so many pixels.
+SIDE, STRIDE = 32, 8
+
+
+def _varint(value: int) -> bytes:
+    value &= 2**64 - 1
+    out = b""
+    while value > 127:
+        out, value = out + bytes([value & 127 | 128]), value >> 7
+    return out + bytes([value])
+
+
+def _field(number: int, value) -> bytes:
+    """One field: an int as a varint, a float in four bytes, all else with its length before it."""
+    if isinstance(value, int):
+        return _varint(number << 3) + _varint(value)
+    if isinstance(value, float):
+        return _varint(number << 3 | 5) + struct.pack("<f", value)
+    content = value.encode() if isinstance(value, str) else value
+    return _varint(number << 3 | 2) + _varint(len(content)) + content
+
+
+def _message(*fields) -> bytes:
+    return b"".join(_field(number, value) for number, value in fields)
+
+
+def _tensor(name: str, values: np.ndarray) -> bytes:
+    kind = _INT64 if values.dtype == np.int64 else _FLOAT
+    dims = [(1, int(side)) for side in values.shape]
+    return _message(*dims, (2, kind), (8, name), (9, values.tobytes()))
+
+
+def _attribute(name: str, value) -> bytes:
+    if isinstance(value, int):
+        return _message((1, name), (3, value), (20, 2))
+    return _message((1, name), *((8, item) for item in value), (20, 7))
+
+
+def _node(kind: str, inputs: list[str], output: str, **attributes) -> bytes:
+    return _message(
+        *((1, name) for name in inputs),
+        (2, output),
+        (3, f"make_{output}"),
+        (4, kind),
+        *((5, _attribute(*item)) for item in attributes.items()),
+    )
+
+
+def _value(name: str, shape) -> bytes:
+    sides = _message(*((1, _message((1, side))) for side in shape))
+    return _message((1, name), (2, _message((1, _message((1, _FLOAT), (2, sides))))))
+
+
+def model(nodes: list[bytes], tensors: dict[str, np.ndarray], input_shape, output_shape) -> bytes:
+    """A model whose graph goes from `images` to `output`."""
+    graph = _message(
+        *((1, node) for node in nodes),
+        (2, "tiny"),
+        *((5, _tensor(*item)) for item in tensors.items()),
+        (11, _value("images", input_shape)),
+        (12, _value("output", output_shape)),
+    )
+    return _message((1, 8), (2, "tests"), (7, graph), (8, _message((1, ""), (2, 13))))
+
+
+def bright_squares(layout: str, size: int) -> bytes:
+    """A network for (1, 3, size, size): a square of `SIDE` at every `STRIDE` pixels scores by its mean brightness.
+
+    The score is sigmoid(40 (mean - 0.75)): 0.9999 for white, 0.5 where a quarter is black, 1e-13 for black.
+
+    Args:
+        layout: "v5", "v8" or "v10" (of the first 300 squares); "logits", which is "v8" without the sigmoid; or "none",
+            which is no layout at all.
+        size: of the input.
+    """
+    cells = (size - SIDE) // STRIDE + 1
+    n = cells * cells
+    row, column = np.divmod(np.arange(n), cells)
+    x0, y0 = STRIDE * column, STRIDE * row
+    side = np.full(n, SIDE)
+    middles = np.stack([x0 + SIDE / 2, y0 + SIDE / 2, side, side])
+    corners = np.stack([x0, y0, x0 + SIDE, y0 + SIDE])
+    tensors = {
+        "kernel": np.full((1, 3, SIDE, SIDE), 40 / (3 * SIDE * SIDE), np.float32),
+        "bias": np.array([-30.0], np.float32),
+        "flat": np.array([1, 1, n], np.int64),
+        "boxes": (corners if layout == "v10" else middles)[None].astype(np.float32),
+        "one": np.ones((1, 1, n), np.float32),
+    }
+    nodes = [
+        _node(
+            "Conv", ["images", "kernel", "bias"], "sums", kernel_shape=[SIDE, SIDE], strides=[STRIDE, STRIDE]
+        ),
+        _node("Identity" if layout == "logits" else "Sigmoid", ["sums"], "map"),
+        _node("Reshape", ["map", "flat"], "scores"),
+    ]
+    if layout in ("v8", "logits"):
+        # Two classes, the first of which is never there.
+        tensors["zero"] = np.zeros((1, 1, n), np.float32)
+        nodes.append(_node("Concat", ["boxes", "zero", "scores"], "output", axis=1))
+        return model(nodes, tensors, (1, 3, size, size), (1, 6, n))
+    if layout == "v5":
+        nodes.append(_node("Concat", ["boxes", "scores", "one"], "columns", axis=1))
+        nodes.append(_node("Transpose", ["columns"], "output", perm=[0, 2, 1]))
+        return model(nodes, tensors, (1, 3, size, size), (1, n, 6))
+    if layout == "v10":
+        tensors["first"] = np.arange(300, dtype=np.int64)
+        nodes.append(_node("Concat", ["boxes", "scores", "one"], "columns", axis=1))
+        nodes.append(_node("Gather", ["columns", "first"], "chosen", axis=2))
+        nodes.append(_node("Transpose", ["chosen"], "output", perm=[0, 2, 1]))
+        return model(nodes, tensors, (1, 3, size, size), (1, 300, 6))
+    nodes.append(_node("Identity", ["map"], "output"))
+    return model(nodes, tensors, (1, 3, size, size), (1, 1, cells, cells))

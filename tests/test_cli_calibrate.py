@@ -1,0 +1,378 @@
+"""`psotrack calibrate` as people type it: marks by hand, markers in videos, boards, drones, conversions, bad input."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from helpers import ring_rig
+from scipy.spatial.transform import Rotation
+
+from psotrack.cameras import CameraRig, camera, look_at, project, stack
+from psotrack.cli.calibrate import calibrate
+from psotrack.datasets.dpjait import write_calibration, write_detections, write_marker_corners
+from psotrack.detections import Detections
+from psotrack.errors import PsotrackError
+from psotrack.lenses import Board
+from psotrack.rig_files import read_lenses, read_rig, write_rig
+from psotrack.trajectories import Trajectories
+from psotrack.trajectory_files import write_trajectories
+from psotrack.video import VideoWriter
+
+WORLD = np.random.default_rng(0).uniform((-1.5, -1.5, 0.2), (1.5, 1.5, 2.4), (14, 3))
+
+
+def run(*arguments):
+    wide = CliRunner(env={"COLUMNS": "200"})
+    result = wide.invoke(calibrate, [str(one) for one in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result
+
+
+def refused(*arguments):
+    """The message of what goes wrong on purpose, which `main` prints as one line."""
+    with pytest.raises(PsotrackError) as error:
+        run(*arguments)
+    message = str(error.value)
+    assert "\n" not in message
+    return message
+
+
+def write_lines(path, *lines):
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def pairs_of(path, rig, *, noise_px=0.5, wrong=None):
+    """Marks of all points in all cameras, with places in the rows of the first camera alone."""
+    rng = np.random.default_rng(1)
+    lines = ["camera,point,x_px,y_px,x_m,y_m,z_m"]
+    for index, name in enumerate(rig.names):
+        pixels = project(rig.cameras[index], WORLD)[0] + rng.normal(0, noise_px, (len(WORLD), 2))
+        for number, (x, y) in enumerate(pixels):
+            x += 80 if (name, number) == wrong else 0
+            place = ",".join(map(repr, WORLD[number].tolist())) if index == 0 else ",,"
+            lines.append(f"{name},p{number},{x},{y},{place}")
+    return write_lines(path, *lines)
+
+
+def centres(rig):
+    return rig.cameras.centre_world
+
+
+def test_extrinsics_from_marks(tmp_path):
+    rig = ring_rig(3, coefficients=5, image_size_wh=(1920, 1080))
+    write_rig(tmp_path / "lenses.yml", rig)
+    pairs = pairs_of(tmp_path / "pairs.csv", rig, wrong=("c1", 4))
+    out, report = tmp_path / "rig.toml", tmp_path / "report.json"
+    shown = run(
+        "extrinsics",
+        "--pairs",
+        pairs,
+        "--intrinsics",
+        tmp_path / "lenses.yml",
+        "--out",
+        out,
+        "--json",
+        report,
+    ).stdout
+    assert "p4" in shown
+    assert "left out" in shown
+    found = read_rig(out)
+    assert found.names == rig.names
+    rows = json.loads(report.read_text())["cameras"]
+    for index, name in enumerate(rig.names):
+        row = rows[name]
+        assert row["points"] - row["used"] == (name == "c1")
+        np.testing.assert_allclose(row["centre_m"], centres(found)[index], atol=1e-12)
+        # Five standard deviations: one in a million.
+        assert (np.abs(centres(found)[index] - centres(rig)[index]) < 5 * np.array(row["centre_std_m"])).all()
+        assert max(row["centre_std_m"]) < 0.01
+        assert 0.3 < row["rms_px"] < 1.2
+    assert rows["c1"]["worst"][0] == {
+        "point": "p4",
+        "residual_px": pytest.approx(80, abs=10),
+        "used": False,
+    }
+    assert "--force" in refused("extrinsics", "--pairs", pairs, "--intrinsics", out, "--out", out)
+
+
+def test_places_in_a_file_of_their_own_and_a_lens_from_a_data_sheet(tmp_path):
+    K = np.array([[800.0, 0, 639.5], [0, 800.0, 359.5], [0, 0, 1]])
+    R, t_m = look_at((4.0, 0.5, 2.0), (0.0, 0.0, 1.2))
+    rig = stack({"60881257": camera(R=R, t_m=t_m, K=K, image_size_wh=(1280, 720))})
+    pixels = project(rig.cameras[0], WORLD)[0]
+    pairs = write_lines(
+        tmp_path / "pairs.csv",
+        "camera,point,x_px,y_px",
+        *(f"60881257,p{i},{x},{y}" for i, (x, y) in enumerate(pixels.tolist())),
+    )
+    points = write_lines(
+        tmp_path / "points.csv",
+        "point,x_m,y_m,z_m",
+        *(f"p{i},{x},{y},{z}" for i, (x, y, z) in enumerate(WORLD.tolist())),
+    )
+    view_deg = [2 * np.rad2deg(np.arctan(side / 2 / 800)) for side in (1280, 720)]
+    lens = ("--fov", f"{view_deg[0]},{view_deg[1]}", "--size", "1280,720")
+    run("extrinsics", "--pairs", pairs, "--points", points, *lens, "--out", tmp_path / "a.toml", "-q")
+    np.testing.assert_allclose(centres(read_rig(tmp_path / "a.toml")), centres(rig), atol=1e-6)
+    lens = ("--focal-length", "8", "--sensor", "12.8,7.2", "--size", "1280x720")
+    run("extrinsics", "--pairs", pairs, "--points", points, *lens, "--out", tmp_path / "b.yml", "-q")
+    np.testing.assert_allclose(centres(read_rig(tmp_path / "b.yml")), centres(rig), atol=1e-6)
+    alone = refused("extrinsics", "--pairs", pairs, *lens, "--out", tmp_path / "c.yml")
+    assert "line 2, column point: expected x_m, y_m, z_m in one of its rows, or in a file of places" in alone
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("c1,p3,", "c1,p2,"), "line 19, column point: expected each point once per camera, found p2 again"),
+        (("c1,p3,", "c1,p99,"), "line 19, column point: expected x_m, y_m, z_m in one of its rows"),
+        (("x_px", "u"), "pairs.csv: expected a column x_px"),
+        (("c0,p0,", "c0,,"), "line 2, column point: expected a value, found nothing"),
+        (("c0,p0,", "c0,p0,x"), "line 2, column x_px: expected a number"),
+        (("c0,p0,", "c0,p0,1,2,3,"), "line 2: expected 7 values as in the header, found 10"),
+        (("c1,p3,", "c9,p3,"), "rig.toml: expected the lens of c9, found only c0, c1"),
+    ],
+)
+def test_broken_marks_are_refused(tmp_path, change, message):
+    rig = ring_rig(2, image_size_wh=(1920, 1080))
+    write_rig(tmp_path / "rig.toml", rig)
+    pairs = pairs_of(tmp_path / "pairs.csv", rig)
+    pairs.write_text(pairs.read_text().replace(*change, 1))
+    options = ("--intrinsics", tmp_path / "rig.toml", "--out", tmp_path / "out.toml")
+    assert message in refused("extrinsics", "--pairs", pairs, *options)
+    assert not (tmp_path / "out.toml").exists()
+
+
+def test_a_point_in_two_places_is_refused(tmp_path):
+    pairs = write_lines(
+        tmp_path / "pairs.csv", "camera,point,x_px,y_px,x_m,y_m,z_m", "c0,p,1,2,0,0,1", "c1,p,3,4,0,0,2"
+    )
+    lens = ("--fov", "60,40", "--size", "640,480", "--out", tmp_path / "out.toml")
+    assert "line 3, column point: expected p at [0.0, 0.0, 1.0], as before" in refused(
+        "extrinsics", "--pairs", pairs, *lens
+    )
+    pairs = write_lines(tmp_path / "pairs.csv", "camera,point,x_px,y_px,x_m,y_m,z_m", "c0,p,1,2,0,0,1")
+    assert "camera c0: expected at least 4 points of known place, found 1" in refused(
+        "extrinsics", "--pairs", pairs, *lens
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "extrinsics: expected --pairs FILE or --markers SEQ, found neither"),
+        (("--pairs", "a", "--markers", "b"), "found both"),
+        (("--pairs", "a.csv"), "a.csv: expected a file to read"),
+        (("--markers", "nowhere"), "aruco_corners.csv: expected a file to read"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(tmp_path, arguments, message):
+    assert message in refused("extrinsics", *arguments, "--out", tmp_path / "out.toml")
+
+
+def test_lenses_that_do_not_go_together_are_refused(tmp_path):
+    pairs = pairs_of(tmp_path / "pairs.csv", ring_rig(1))
+    start = ("extrinsics", "--pairs", pairs, "--out", tmp_path / "out.toml")
+    assert "lens: expected --intrinsics FILE, or --fov H,V" in refused(*start)
+    assert "found another choice" in refused(*start, "--fov", "60,40", "--focal-length", "8")
+    assert "found another choice" in refused(*start, "--focal-length", "8")
+    assert "--size: expected width and height" in refused(*start, "--fov", "60,40")
+
+
+def marker_room(folder):
+    """Markers on two walls, drawn into the picture of a camera by homographies."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
+    K = np.array([[1150.0, 0, 639.5], [0, 1150.0, 359.5], [0, 0, 1]])
+    R, t_m = look_at((4.0, -2.5, 2.2), (-0.6, 0.8, 1.2))
+    one = camera(R=R, t_m=t_m, K=K, image_size_wh=(1280, 720))
+    corners = {}
+    for number, (y, z) in enumerate([(0.0, 1.9), (0.9, 0.6), (0.9, 1.9), (0.1, 0.6)]):
+        square = np.array([(0, 0), (0.5, 0), (0.5, -0.5), (0, -0.5)]) + np.array((y, z))
+        corners[number + 3] = np.column_stack([np.full(4, -1.5), square])
+    for number, (x, z) in enumerate([(-1.3, 1.9), (-0.4, 1.1), (0.5, 1.9)]):
+        square = np.array([(0, 0), (0.5, 0), (0.5, -0.5), (0, -0.5)]) + np.array((x, z))
+        corners[number + 20] = np.column_stack([square[:, 0], np.full(4, 1.5), square[:, 1]])
+    large = np.full((4 * 720, 4 * 1280), 225, np.uint8)
+    for marker, places in corners.items():
+        side = 600
+        sheet = cv2.copyMakeBorder(
+            cv2.aruco.generateImageMarker(dictionary, marker, side),
+            100,
+            100,
+            100,
+            100,
+            cv2.BORDER_CONSTANT,
+            value=255,
+        )
+        drawn = np.array([(0, 0), (side, 0), (side, side), (0, side)], np.float32) + 99.5
+        # Four times as large, pixel p is at 4 p + 1.5.
+        pixels = (4 * project(one, places)[0] + 1.5).astype(np.float32)
+        H = cv2.getPerspectiveTransform(drawn, pixels)
+        inside = cv2.warpPerspective(np.full_like(sheet, 255), H, large.shape[::-1])
+        warped = cv2.warpPerspective(sheet, H, large.shape[::-1], flags=cv2.INTER_AREA)
+        large = np.where(inside > 0, warped, large)
+    image = cv2.cvtColor(cv2.resize(large, (1280, 720), interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)
+    with VideoWriter(folder / "cam1i_s.avi", 25.0, (1280, 720)) as writer:
+        for _ in range(3):
+            writer.write(image)
+    rig = stack({"cam1i": one})
+    write_calibration(folder / "cameras_calibration.csv", rig)
+    write_marker_corners(folder / "aruco_corners.csv", corners)
+    return rig
+
+
+def test_extrinsics_from_markers_on_the_walls(tmp_path):
+    folder = tmp_path / "ROOM"
+    folder.mkdir()
+    rig = marker_room(folder)
+    lens = ("--intrinsics", folder / "cameras_calibration.csv", "--size", "1280,720", "--noise", "0.3")
+    answer = run(
+        "extrinsics", "--markers", folder, *lens, "--out", tmp_path / "rig.toml", "--json", "-"
+    ).stdout
+    row = json.loads(answer)["cameras"]["cam1i"]
+    assert row["points"] == 7 * 4
+    assert row["worst"][0]["point"].partition(".")[0] in {"3", "4", "5", "6", "20", "21", "22"}
+    # A tenth of a pixel at 5 m is 0.5 mm; corners in compressed video are worse. Measured 3 mm.
+    assert np.linalg.norm(centres(read_rig(tmp_path / "rig.toml")) - centres(rig)) < 0.01
+
+
+def test_intrinsics_of_a_board(tmp_path):
+    board, per_m = Board((7, 5), 0.04, 0.03), 3000.0
+    K = np.array([[620.0, 0, 322.0], [0, 620.0, 236.0], [0, 0, 1]])
+    sheet = board.opencv().generateImage((int(0.28 * per_m), int(0.2 * per_m)))
+    rng = np.random.default_rng(0)
+    with VideoWriter(tmp_path / "board.avi", 25.0, (640, 480)) as writer:
+        for _ in range(14):
+            R = Rotation.from_euler("xyz", rng.uniform(-35, 35, 3), degrees=True).as_matrix()
+            shift = (rng.uniform(-0.08, 0.08), rng.uniform(-0.06, 0.06), rng.uniform(0.32, 0.5))
+            # Pixel u of the sheet is at (u + 0.5) / per_m of the board, whose middle is at the shift.
+            to_board = np.array(
+                [[1 / per_m, 0, 0.5 / per_m - 0.14], [0, 1 / per_m, 0.5 / per_m - 0.1], [0, 0, 1]]
+            )
+            H = K @ np.column_stack([R[:, 0], R[:, 1], shift]) @ to_board
+            image = cv2.warpPerspective(sheet, H, (640, 480), flags=cv2.INTER_AREA, borderValue=200)
+            writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    size = ("--squares", "7x5", "--square", "0.04", "--marker", "0.03")
+    out = tmp_path / "lens.toml"
+    answer = run(
+        "intrinsics", tmp_path / "board.avi", *size, "--name", "60881257", "--out", out, "--json", "-"
+    )
+    content = json.loads(answer.stdout)
+    lens = read_lenses(out)
+    assert lens.names == ("60881257",)
+    assert content["values"]["fx_px"] == lens.cameras.K[0, 0, 0]
+    # Warped without smoothing; the exact bounds are in test_calibration.
+    assert abs(lens.cameras.K[0, 0, 0] - 620) < 12
+    shown = run("intrinsics", tmp_path / "board.avi", *size, "--out", tmp_path / "other.yml").stdout
+    assert "fx_px" in shown
+    assert "residual" in shown
+    wrong = ("--squares", "8x6", "--square", "0.04", "--marker", "0.03", "--dictionary", "6x6_50")
+    assert "is it this board?" in refused(
+        "intrinsics", tmp_path / "board.avi", *wrong, "--out", tmp_path / "x.yml"
+    )
+
+
+HALF_PX = np.array([60.0, 35.0])
+
+
+def flight(folder, rig, wrong):
+    """A sequence whose detections are exact boxes of the true rig, and whose calibration is another."""
+    folder.mkdir()
+    rng = np.random.default_rng(3)
+    frame = np.arange(60)
+    position_m = np.stack(
+        [
+            np.stack(
+                [
+                    1.2 * np.sin(0.11 * frame + k),
+                    1.2 * np.cos(0.07 * frame + 2 * k),
+                    1.2 + 0.8 * np.sin(0.05 * frame + k),
+                ],
+                -1,
+            )
+            for k in range(2)
+        ],
+        axis=1,
+    )
+    write_calibration(folder / "cameras_calibration.csv", wrong)
+    (folder / "dl_data").mkdir()
+    for index, name in enumerate(rig.names):
+        middle = project(rig.cameras[index], position_m)[0] + rng.normal(0, 0.5, (60, 2, 2)) + 0.5
+        xyxy = np.concatenate([middle - HALF_PX, middle + HALF_PX], axis=-1).reshape(-1, 4)
+        write_detections(
+            folder / "dl_data" / f"{name}.csv", Detections(np.repeat(frame, 2), xyxy, np.ones(120))
+        )
+        with VideoWriter(folder / f"{name}.avi", 25.0, (1280, 720)) as writer:
+            for _ in frame[:2]:
+                writer.write(np.zeros((720, 1280, 3), np.uint8))
+    tracks = folder / "tracks.csv"
+    write_trajectories(tracks, Trajectories(frame, frame / 25, ("dron1", "dron2"), position_m))
+    return tracks
+
+
+def square_pixels(rig):
+    K = rig.cameras.K.copy()
+    K[:, 1, 1] = K[:, 0, 0]
+    return CameraRig(rig.names, replace(rig.cameras, K=K))
+
+
+def test_a_rig_is_adjusted_to_its_drones(tmp_path):
+    rig = square_pixels(ring_rig(5, image_size_wh=(1280, 720)))
+    T = rig.cameras.T_cam_world.copy()
+    # One camera was pushed: by 1 degree about its own centre, and by 3 cm.
+    R = Rotation.from_rotvec([0.01, -0.012, 0.006]).as_matrix() @ T[2, :3, :3]
+    T[2, :3, :3], T[2, :3, 3] = R, -R @ (centres(rig)[2] + (0.02, -0.02, 0.01))
+    wrong = CameraRig(rig.names, replace(rig.cameras, T_cam_world=T))
+    tracks = flight(tmp_path / "SEQ", rig, wrong)
+    fixed = ("--fixed", "c0,c1,c3,c4", "--noise", "0.5")
+    out = tmp_path / "better.csv"
+    shown = run("adjust", tmp_path / "SEQ", "--tracks", tracks, *fixed, "--out", out).stdout
+    assert "moved (mm)" in shown
+    better = read_rig(out, (1280, 720))
+    # 120 points of 0.5 px, a millimetre and a half each, in depth too.
+    np.testing.assert_allclose(centres(better)[2], centres(rig)[2], atol=0.003)
+    np.testing.assert_allclose(centres(better)[0], centres(rig)[0], atol=1e-12)
+    answer = run(
+        "adjust",
+        tmp_path / "SEQ",
+        "--tracks",
+        tracks,
+        "--refine-focal-length",
+        "--out",
+        tmp_path / "b.toml",
+        "--json",
+        "-",
+    ).stdout
+    rows = json.loads(answer)["cameras"]
+    assert max(rows, key=lambda name: rows[name]["moved_m"]) == "c2"
+    assert rows["c0"]["points"] > 60
+    assert rows["c0"]["worst"][0]["point"].startswith("dron")
+    assert "fixed: expected some of" in refused(
+        "adjust", tmp_path / "SEQ", "--tracks", tracks, "--fixed", "c7", "--out", tmp_path / "c.toml"
+    )
+
+
+def test_files_are_converted(tmp_path):
+    rig = square_pixels(ring_rig(3, coefficients=4))
+    write_rig(tmp_path / "a.toml", rig)
+    shown = run("convert", tmp_path / "a.toml", tmp_path / "b.yml").stdout
+    assert "c2" in shown
+    run("convert", tmp_path / "b.yml", tmp_path / "c.csv", "-q")
+    answer = json.loads(
+        run("convert", tmp_path / "c.csv", tmp_path / "d.toml", "--size", "320,240", "--json", "-").stdout
+    )
+    assert answer["rig"] == str(tmp_path / "d.toml")
+    # Rodrigues vectors, twice.
+    np.testing.assert_allclose(
+        read_rig(tmp_path / "d.toml").cameras.T_cam_world, rig.cameras.T_cam_world, atol=1e-14
+    )
+    run("convert", tmp_path / "a.toml", tmp_path / "mm.toml", "--unit", "mm", "-q")
+    np.testing.assert_allclose(centres(read_rig(tmp_path / "mm.toml")), 1e-3 * centres(rig), atol=1e-15)
+    assert "--force" in refused("convert", tmp_path / "a.toml", tmp_path / "b.yml")
+    result = CliRunner().invoke(calibrate, ["convert", "c.csv", "x.toml", "--size", "320"])
+    assert result.exit_code == 2
+    assert "expected two whole numbers above 0" in result.output

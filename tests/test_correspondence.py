@@ -1,0 +1,501 @@
+"""Who belongs to whom: OpenCV's epipolar lines, a search of all assignments in small scenes, truth in large ones."""
+
+from itertools import product
+
+import cv2
+import numpy as np
+import pytest
+from helpers import LENSES, moved, rig_of, ring_rig
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from psotrack.cameras import project
+from psotrack.correspondence import NEW, SHARED, UNEXPLAINED, epipolar_distance, match
+from psotrack.errors import SettingsError
+
+BOUNDS_M = np.array([[-4.0, -4.0, -1.0], [4.0, 4.0, 4.0]])
+LARGE_WH = (1280, 960)
+
+
+def pixels_of(rig, points):
+    return project(rig.cameras, np.asarray(points)[..., None, :])[0]
+
+
+def apart(count, rng, least_m=0.6):
+    """Points in the room, none nearer than `least_m` to another."""
+    points = np.empty((0, 3))
+    while len(points) < count:
+        point = rng.uniform((-1.5, -1.5, 0.3), (1.5, 1.5, 2.3))
+        if np.linalg.norm(points - point, axis=-1).min(initial=np.inf) > least_m:
+            points = np.vstack([points, point])
+    return points
+
+
+def observed(rig, drones, rng, *, noise_px, missed=0.0, false=0):
+    """For each camera its detections in random order, and which drone each is of (-1: of none)."""
+    pixels = pixels_of(rig, drones)
+    points, owners = [], []
+    for c in range(len(rig)):
+        seen = np.flatnonzero(rng.random(len(drones)) >= missed)
+        real = pixels[seen, c] + noise_px * rng.normal(size=(len(seen), 2))
+        ghosts = rng.uniform((0, 0), rig.cameras.image_size_wh[c], (false, 2))
+        order = rng.permutation(len(seen) + false)
+        points.append(np.vstack([real, ghosts])[order])
+        owners.append(np.concatenate([seen, np.full(false, -1)])[order])
+    return points, owners
+
+
+def matched(rig, points, noise_px, **options):
+    noise = [np.full(len(one), float(noise_px)) for one in points]
+    return match(rig.cameras, points, noise, bounds_m=BOUNDS_M, **options)
+
+
+def groups_of(matches):
+    return {tuple(row) for row in matches.detection.tolist()}
+
+
+# --- epipolar lines
+
+
+def bent_by_opencv(cam, straight):
+    """Where the lens puts the pixels of a camera without one."""
+    rays = np.column_stack([straight, np.ones(len(straight))]) @ np.linalg.inv(cam.K).T
+    return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), cam.K, np.array(cam.dist))[0][:, 0]
+
+
+@pytest.mark.parametrize("coefficients", sorted(LENSES))
+def test_distances_from_opencvs_epipolar_lines(coefficients):
+    rig = ring_rig(5, coefficients=coefficients)
+    rng = np.random.default_rng(0)
+    a, b = rig.cameras[1], rig.cameras[3]
+    straight = [rng.uniform((60, 60), (260, 180), (count, 2)) for count in (7, 3)]
+    bent = [bent_by_opencv(cam, points) for cam, points in zip((a, b), straight, strict=True)]
+    R = b.T_cam_world[:3, :3] @ a.T_cam_world[:3, :3].T
+    t = b.T_cam_world[:3, 3] - R @ a.T_cam_world[:3, 3]
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    F = np.linalg.inv(b.K).T @ cross @ R @ np.linalg.inv(a.K)
+    found = epipolar_distance(a, b, *bent)
+    for side, (of, on) in enumerate(((0, 1), (1, 0))):
+        lines = cv2.computeCorrespondEpilines(straight[of][:, None], of + 1, F)[:, 0]
+        off = np.abs(lines[:, :2] @ straight[on].T + lines[:, 2:])
+        # Lenses are undone to 1e-8 (see test_cameras), which is 3e-6 px.
+        np.testing.assert_allclose(found[..., side], off if side == 0 else off.T, atol=1e-5)
+
+
+def test_what_is_seen_of_one_point_is_on_its_epipolar_lines():
+    rig = ring_rig(3, coefficients=5)
+    pixels = pixels_of(rig, apart(4, np.random.default_rng(0)))
+    distance = epipolar_distance(rig.cameras[0], rig.cameras[2], pixels[:, 0], pixels[:, 2])
+    # Lenses are undone to 1e-8, which is 3e-6 px.
+    np.testing.assert_allclose(distance[np.arange(4), np.arange(4)], 0.0, atol=1e-5)
+    assert (distance[~np.eye(4, dtype=bool)] > 0.1).all()
+    nothing = epipolar_distance(rig.cameras[0], rig.cameras[2], pixels[:0, 0], pixels[:, 2])
+    assert nothing.shape == (0, 4, 2)
+
+
+# --- the least total
+
+
+def reprojection_cost(rig, points, group, noise_px):
+    """Least squared distance in standard deviations of a group's detections, by SciPy."""
+    seen = [c for c, index in enumerate(group) if index >= 0]
+    picked = np.array([points[c][group[c]] for c in seen])
+
+    def residual(point):
+        return ((project(rig.cameras[np.array(seen)], point)[0] - picked) / noise_px).ravel()
+
+    return 2 * least_squares(residual, np.array([0.0, 0.0, 1.3]), method="lm").cost
+
+
+def least_total(rig, points, noise_px):
+    """Groups of three cameras with the least total cost: all assignments are tried."""
+    triples = [
+        (triple, cost)
+        for triple in product(*(range(len(one)) for one in points))
+        if (cost := reprojection_cost(rig, points, triple, noise_px)) < 3 * UNEXPLAINED
+    ]
+    best, chosen = UNEXPLAINED * sum(map(len, points)), frozenset()
+
+    def search(start, used, groups, total):
+        nonlocal best, chosen
+        if total < best:
+            best, chosen = total, frozenset(groups)
+        for number in range(start, len(triples)):
+            triple, cost = triples[number]
+            again = len(used & set(enumerate(triple)))
+            # Two detections of its own, and one that it shares at most.
+            if again < 2:
+                price = NEW + cost + SHARED * again - UNEXPLAINED * (3 - again)
+                search(number + 1, used | set(enumerate(triple)), [*groups, triple], total + price)
+
+    search(0, frozenset(), [], best)
+    return set(chosen), best
+
+
+def total_of(rig, points, groups, noise_px):
+    left = set().union(*({(c, i) for i in range(len(one))} for c, one in enumerate(points)))
+    total = 0.0
+    for group in groups:
+        taken = {(c, i) for c, i in enumerate(group) if i >= 0}
+        total += NEW + reprojection_cost(rig, points, group, noise_px) + SHARED * len(taken - left)
+        left -= taken
+    return total + UNEXPLAINED * len(left)
+
+
+@pytest.mark.parametrize("seed", range(16))
+def test_all_assignments_searched(seed):
+    """Two or three drones and a false detection or none, three cameras: the groups are those with the least total."""
+    rng = np.random.default_rng(seed)
+    rig = ring_rig(3, image_size_wh=LARGE_WH, coefficients=(0, 5)[seed % 2])
+    drones = apart(2 + seed % 2, rng)
+    points, _ = observed(rig, drones, rng, noise_px=3.0, missed=0.1, false=seed // 2 % 2)
+    expected, _ = least_total(rig, points, 3.0)
+    assert groups_of(matched(rig, points, 3.0)) == expected
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_worse_than_the_truth(seed):
+    """What cannot be searched: six drones, seven cameras. The total is at most that of the true groups."""
+    rng = np.random.default_rng(seed)
+    rig = ring_rig(7, image_size_wh=LARGE_WH)
+    drones = apart(6, rng)
+    points, owners = observed(rig, drones, rng, noise_px=2.0, missed=0.1, false=2)
+    truth = [
+        tuple(np.flatnonzero(owner == drone)[0] if (owner == drone).any() else -1 for owner in owners)
+        for drone in range(6)
+    ]
+    found = total_of(rig, points, groups_of(matched(rig, points, 2.0)), 2.0)
+    # Points by weighted linear equations and not by the least reprojection error: measured 0.01, of 13.8 for one view.
+    assert found <= total_of(rig, points, truth, 2.0) + 0.1
+
+
+# --- truth
+
+
+@pytest.mark.parametrize("noise_px", [1.0, 2.0, 3.0])
+def test_truth(noise_px):
+    """Ten scenes of six drones, seven cameras, one in ten missed, two false detections in every image."""
+    found = wrong = drones_seen = 0
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        rig = ring_rig(7, image_size_wh=LARGE_WH, coefficients=5)
+        drones = apart(6, rng)
+        points, owners = observed(rig, drones, rng, noise_px=noise_px, missed=0.1, false=2)
+        matches = matched(rig, points, noise_px)
+        detected = np.array([[(owner == drone).any() for owner in owners] for drone in range(6)])
+        drones_seen += int((detected.sum(axis=1) >= 3).sum())
+        distance = np.linalg.norm(matches.position_m[:, None] - drones, axis=-1)
+        # A pixel is 4 mm at 4 m; of three views or more, some nearly in line, five standard deviations.
+        near = distance < 5 * 0.004 * noise_px
+        assert (near.sum(axis=0) <= 1).all()
+        found += int(near.any(axis=0).sum())
+        wrong += int((~near.any(axis=1)).sum())
+    assert drones_seen == 60
+    # Not found: who is seen three or four times, one of them more than 3.7 standard deviations off (1 in 1000).
+    assert found >= 59
+    # A false group takes three detections that meet by chance, of two false ones per image and what others left.
+    assert wrong <= 1
+
+
+def test_positions_and_costs():
+    """Costs are mean squared distances from where OpenCV projects the position, in standard deviations."""
+    rng = np.random.default_rng(4)
+    rig = ring_rig(5, image_size_wh=LARGE_WH, coefficients=5)
+    drones = apart(3, rng)
+    points, owners = observed(rig, drones, rng, noise_px=1.5)
+    noise = [rng.uniform(1.0, 4.0, len(one)) for one in points]
+    matches = match(rig.cameras, points, noise, bounds_m=BOUNDS_M)
+    assert len(matches.position_m) == 3
+    for position, row, cost in zip(matches.position_m, matches.detection, matches.cost, strict=True):
+        squared = []
+        for c, index in enumerate(row):
+            R, t = rig.cameras.T_cam_world[c, :3, :3], rig.cameras.T_cam_world[c, :3, 3]
+            pixel = cv2.projectPoints(
+                position[None], cv2.Rodrigues(R)[0], t, rig.cameras.K[c], np.array(rig.cameras.dist[c])
+            )[0][0, 0]
+            squared.append(np.sum(((pixel - points[c][index]) / noise[c][index]) ** 2))
+        # Costs are of the straightened image, where a pixel is up to 5 % of one in size away from a pixel here.
+        assert cost == pytest.approx(np.mean(squared), rel=0.15)
+    assert {tuple(owners[c][i] for c, i in enumerate(row)) for row in matches.detection} == {
+        (drone,) * 5 for drone in range(3)
+    }
+
+
+# --- what two views say
+
+
+def test_two_views_alone_are_not_trusted():
+    rig = ring_rig(5, image_size_wh=LARGE_WH)
+    drones = apart(2, np.random.default_rng(0))
+    points = list(pixels_of(rig, drones).swapaxes(0, 1))
+    points[1] = points[3] = points[4] = np.empty((0, 2))
+    assert not len(matched(rig, points, 1.0).position_m)
+    # A prediction of one of them speaks for it, and for no other.
+    told = matched(rig, points, 1.0, expected_m=drones[1:], expected_covariance_m2=0.01 * np.eye(3)[None])
+    assert told.detection.tolist() == [[1, -1, 1, -1, -1]]
+    assert told.expected.tolist() == [0]
+    np.testing.assert_allclose(told.position_m, drones[1:], atol=1e-6)
+    # Where no camera has two detections there is nothing to confuse.
+    alone = matched(rig, [one[:1] for one in points], 1.0)
+    assert alone.detection.tolist() == [[0, -1, 0, -1, -1]]
+    assert alone.expected.tolist() == [-1]
+
+
+@pytest.mark.parametrize("least", [3, 4])
+def test_cameras_side_by_side_are_one_viewpoint(least):
+    rig = ring_rig(5, image_size_wh=LARGE_WH)
+    drones = apart(2, np.random.default_rng(1))
+    for spots, enough in (((0,) * 3 + tuple(range(1, least - 1)), False), (range(least), True)):
+        some = rig_of(*(rig.cameras[i] for i in spots))
+        points = list(pixels_of(some, drones).swapaxes(0, 1))
+        assert len(matched(some, points, 1.0, min_views=least).position_m) == (2 if enough else 0)
+
+
+def test_expected_drones_are_named():
+    """Whatever the order of the predictions; a prediction elsewhere takes nothing, and its drone is new."""
+    rng = np.random.default_rng(2)
+    rig = ring_rig(5, image_size_wh=LARGE_WH)
+    drones = apart(4, rng)
+    points, owners = observed(rig, drones, rng, noise_px=1.0, false=1)
+    order = np.array([2, 0, 3])
+    expected_m = drones[order] + rng.normal(scale=0.03, size=(3, 3))
+    expected_m[2] += (0.0, 0.0, 1.5)
+    matches = matched(
+        rig,
+        points,
+        1.0,
+        expected_m=expected_m,
+        expected_covariance_m2=np.broadcast_to(0.05**2 * np.eye(3), (3, 3, 3)),
+    )
+    named = dict(zip(matches.expected.tolist(), matches.position_m, strict=False))
+    assert sorted(matches.expected.tolist()) == [-1, -1, 0, 1]
+    for number in (0, 1):
+        # A pixel is 4 mm, of five views.
+        assert np.linalg.norm(named[number] - drones[order[number]]) < 0.02
+        row = matches.detection[matches.expected == number][0]
+        assert all(owners[c][i] == order[number] for c, i in enumerate(row) if i >= 0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_expected_drones_that_pass_each_other(seed):
+    """Nearer than a prediction is sure: both predictions are nearest to the same detections, and both get their own."""
+    rng = np.random.default_rng(seed)
+    rig = ring_rig(3, image_size_wh=LARGE_WH)
+    drones = np.array([[0.1, 0.0, 1.2], [0.1, 0.12, 1.25]])
+    points, owners = observed(rig, drones, rng, noise_px=1.0)
+    expected_m = drones + np.array([[0.0, 0.08, 0.0], [0.0, 0.02, 0.0]])
+    spread = np.broadcast_to(0.08**2 * np.eye(3), (2, 3, 3))
+    matches = matched(rig, points, 1.0, expected_m=expected_m, expected_covariance_m2=spread)
+    assert sorted(matches.expected.tolist()) == [0, 1]
+    for number, row in zip(matches.expected, matches.detection, strict=True):
+        assert [owners[c][i] for c, i in enumerate(row)] == [number] * 3
+
+
+# --- merged, false, ambiguous
+
+
+def overlapping():
+    """Two drones in line with the second of three cameras, 2.5 standard deviations from the middle of both there."""
+    rig = rig_of(*(ring_rig(5, image_size_wh=LARGE_WH).cameras[i] for i in (0, 1, 3)))
+    centre = rig.cameras.centre_world[1]
+    near = np.array([0.1, 0.3, 1.2])
+    far = near + 0.8 * (near - centre) / np.linalg.norm(near - centre)
+    pixels = pixels_of(rig, np.stack([near, far + np.array([0.0, 0.0, 0.01])]))
+    return rig, list(pixels.swapaxes(0, 1)), np.linalg.norm(pixels[0, 1] - pixels[1, 1])
+
+
+def test_a_merged_detection_is_shared():
+    rig, points, width_px = overlapping()
+    noise_px = width_px / 3.0
+    points[1] = points[1].mean(axis=0)[None]
+    matches = matched(rig, points, noise_px)
+    assert groups_of(matches) == {(0, 0, 0), (1, 0, 1)}
+    # So far from the middle it is cheaper to leave one drone unexplained.
+    assert len(matched(rig, points, width_px / 8.0).position_m) < 2
+
+
+def test_what_nobody_saw_together_is_nothing():
+    rig = ring_rig(6, image_size_wh=LARGE_WH)
+    rng = np.random.default_rng(0)
+    points = [rng.uniform((0, 0), LARGE_WH, (2, 2)) for _ in range(6)]
+    assert not len(matched(rig, points, 1.0).position_m)
+    assert not len(matched(rig, [np.empty((0, 2))] * 6, 1.0).position_m)
+    one = [points[0], *[np.empty((0, 2))] * 5]
+    assert matched(rig, one, 1.0).detection.shape == (0, 6)
+    waited = matched(
+        rig,
+        [np.empty((0, 2))] * 6,
+        1.0,
+        expected_m=np.zeros((2, 3)),
+        expected_covariance_m2=np.broadcast_to(np.eye(3), (2, 3, 3)),
+    )
+    assert waited.expected.shape == (0,)
+
+
+def test_what_is_not_finite_is_no_detection():
+    """Not even of a drone where all cameras look, in the middle of their images."""
+    rig = ring_rig(4, image_size_wh=LARGE_WH, coefficients=4)
+    drones = np.array([[0.1, -0.1, 1.2], [1.0, 0.5, 1.8]])
+    points = list(pixels_of(rig, drones).swapaxes(0, 1))
+    points[1][0], points[2][1, 0] = np.nan, np.inf
+    assert groups_of(matched(rig, points, 1.0)) == {(0, -1, 0, 0), (1, 1, -1, 1)}
+
+
+def test_one_camera_tells_nothing():
+    rig = ring_rig(1)
+    assert matched(rig, [np.array([[100.0, 80.0], [10.0, 90.0]])], 1.0).position_m.shape == (0, 3)
+
+
+def test_out_of_bounds_is_nothing():
+    rig = ring_rig(5, image_size_wh=LARGE_WH)
+    drones = np.array([[0.0, 0.0, 1.0], [1.0, 0.5, 2.0]])
+    points = list(pixels_of(rig, drones).swapaxes(0, 1))
+    noise = [np.ones(2)] * 5
+    upper = np.array([[-4.0, -4.0, 1.5], [4.0, 4.0, 4.0]])
+    matches = match(rig.cameras, points, noise, bounds_m=upper)
+    assert matches.detection.tolist() == [[1] * 5]
+
+
+def test_one_drone_detected_twice_is_one():
+    """Two boxes on one drone in one image do not make two drones of it, however bad its other views are."""
+    rig = ring_rig(8, image_size_wh=LARGE_WH)
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        drones = apart(3, rng)
+        points, _ = observed(rig, drones, rng, noise_px=5.0)
+        points[2] = np.vstack([points[2], points[2][:1] + rng.normal(scale=8.0, size=2)])
+        assert len(matched(rig, points, 3.0).position_m) == 3
+
+
+@pytest.mark.parametrize("off_px", [1.0, 2.0, 4.0])
+def test_ambiguity_is_a_likelihood_ratio(off_px):
+    """A third place, where a ray of each of two drones meets a false detection: SciPy has its cost.
+
+    The drones would still have three views each, so that this and no more tells the assignments apart: a detection that
+    is explained by a group that nobody expects saves nothing.
+    """
+    rig = rig_of(*(ring_rig(7, image_size_wh=LARGE_WH).cameras[i] for i in (0, 1, 3, 5)))
+    nowhere = np.array([0.3, -0.2, 1.1])
+    drones = np.stack([0.8 * nowhere + 0.2 * centre for centre in rig.cameras.centre_world[:2]])
+    points = list(pixels_of(rig, drones).swapaxes(0, 1))
+    alone = matched(rig, points, 1.0)
+    assert alone.ambiguity.tolist() == [0.0, 0.0]
+    points[2] = np.vstack([points[2], pixels_of(rig, nowhere)[2] + (0.0, off_px)])
+    matches = matched(rig, points, 1.0)
+    assert groups_of(matches) == groups_of(alone) == {(0, 0, 0, 0), (1, 1, 1, 1)}
+    expected = np.exp(-reprojection_cost(rig, points, (0, 1, 2, -1), 1.0) / 2)
+    # Points by weighted linear equations are not quite those of the least reprojection error: limit 5 %.
+    np.testing.assert_allclose(matches.ambiguity, expected, rtol=0.05)
+
+
+@pytest.mark.parametrize("off_px", [1.0, 2.0])
+def test_ambiguity_of_the_other_pairing(off_px):
+    """Two drones in a plane with two cameras: crossed, their rays meet in two other places. So it is the third's word.
+
+    It has detections of all four places, and those of the other two are a little off: SciPy has the two costs.
+    """
+    rig = rig_of(*(ring_rig(5, image_size_wh=LARGE_WH).cameras[i] for i in (0, 1, 3)))
+    first, second = rig.cameras.centre_world[:2]
+    drone, crossed = (
+        np.array([0.3, -0.2, 1.1]) + share * np.array([0.3, -0.2, 1.1] - first) for share in (0, 0.25)
+    )
+    other = crossed + 0.3 * (second - crossed)
+    along = np.linalg.lstsq(np.stack([other - first, second - drone], axis=1), second - first)[0][0]
+    crossed_too = first + along * (other - first)
+    points = [pixels_of(rig, np.stack([drone, other]))[:, c] for c in (0, 1)]
+    third = pixels_of(rig, np.stack([drone, other, crossed, crossed_too]))[:, 2]
+    third[2:, 1] += off_px
+    points.append(third)
+    matches = matched(rig, points, 1.0)
+    assert groups_of(matches) == {(0, 0, 0), (1, 1, 1)}
+    cost = sum(reprojection_cost(rig, points, group, 1.0) for group in ((0, 1, 2), (1, 0, 3)))
+    # Points by weighted linear equations are not quite those of the least reprojection error: limit 5 %.
+    np.testing.assert_allclose(matches.ambiguity, np.exp(-cost / 2), rtol=0.05)
+    assert matched(rig, [*points[:2], third[:2]], 1.0).ambiguity.tolist() == [0.0, 0.0]
+
+
+def test_which_box_of_a_drone_is_not_ambiguous():
+    """Three of five cameras have a second box, of a place 1 cm higher: half a pixel's noise decides which is taken."""
+    rig = ring_rig(5, image_size_wh=LARGE_WH)
+    drones = apart(2, np.random.default_rng(0))
+    points = list(pixels_of(rig, drones).swapaxes(0, 1))
+    higher = pixels_of(rig, drones[0] + np.array([0.0, 0.0, 0.01]))
+    for c in range(3):
+        points[c] = np.vstack([points[c], higher[c]])
+    matches = matched(rig, points, 2.0)
+    assert groups_of(matches) >= {(0,) * 5, (1,) * 5}
+    # Wherever they are taken from, the drone is there.
+    assert not matches.ambiguity.any()
+
+
+def test_settings_that_make_no_sense():
+    rig = ring_rig(3)
+    nothing = [np.empty((0, 2))] * 3
+    with pytest.raises(SettingsError, match="predictions with covariances"):
+        matched(rig, nothing, 1.0, expected_m=np.zeros((1, 3)))
+    with pytest.raises(SettingsError, match="noise_px: expected numbers above 0"):
+        matched(rig, [np.zeros((1, 2)), *nothing[1:]], 0.0)
+    with pytest.raises(SettingsError, match="min_views: expected 2 or more, found 1"):
+        matched(rig, nothing, 1.0, min_views=1)
+
+
+# --- properties
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_order_and_place_do_not_matter(seed):
+    """Cameras and detections in another order, the world turned and shifted: the same groups."""
+    rng = np.random.default_rng(seed)
+    rig = ring_rig(6, image_size_wh=LARGE_WH)
+    drones = apart(int(rng.integers(1, 6)), rng)
+    points, _ = observed(rig, drones, rng, noise_px=2.0, missed=0.1, false=1)
+    matches = matched(rig, points, 2.0)
+    order = rng.permutation(6)
+    within = [rng.permutation(len(one)) for one in points]
+    mixed_rig = rig.select([rig.names[c] for c in order])
+    mixed = matched(mixed_rig, [points[c][within[c]] for c in order], 2.0)
+    back = np.full_like(mixed.detection, -1)
+    for place, c in enumerate(order):
+        seen = mixed.detection[:, place] >= 0
+        back[seen, c] = within[c][mixed.detection[seen, place]]
+    assert {tuple(row) for row in back.tolist()} == groups_of(matches)
+
+    R = Rotation.from_rotvec([0.0, 0.0, rng.uniform(0, 2 * np.pi)]).as_matrix()
+    shift_m = rng.uniform(-5, 5, 3)
+    wide = np.stack([shift_m - 6.0, shift_m + 6.0])
+    noise = [np.full(len(one), 2.0) for one in points]
+    there = match(moved(rig, R, shift_m).cameras, points, noise, bounds_m=wide)
+    here = match(rig.cameras, points, noise, bounds_m=wide - shift_m)
+    assert groups_of(there) == groups_of(here)
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_what_is_always_so(seed):
+    """Each group has its viewpoints and a place in bounds; no detection is of two unless one has two of its own."""
+    rng = np.random.default_rng(seed)
+    rig = ring_rig(int(rng.integers(2, 6)), image_size_wh=LARGE_WH)
+    drones = apart(int(rng.integers(1, 6)), rng, least_m=0.1)
+    points, _ = observed(rig, drones, rng, noise_px=3.0, missed=0.3, false=int(rng.integers(0, 4)))
+    points.append(points[0][:0])
+    rig = rig_of(*(rig.cameras[c] for c in [*range(len(rig)), 0]))
+    known = drones[: rng.integers(0, len(drones) + 1)]
+    matches = matched(
+        rig,
+        points,
+        3.0,
+        expected_m=known,
+        expected_covariance_m2=np.broadcast_to(0.02 * np.eye(3), (len(known), 3, 3)),
+    )
+    assert ((matches.position_m >= BOUNDS_M[0]) & (matches.position_m <= BOUNDS_M[1])).all()
+    assert ((matches.ambiguity >= 0) & (matches.ambiguity <= 1)).all()
+    assert (matches.cost >= 0).all()
+    seen = matches.detection >= 0
+    single = max(map(len, points)) < 2 and len(known) < 2
+    assert (seen.sum(axis=1) >= np.where((matches.expected >= 0) | single, 2, 3)).all()
+    named = matches.expected[matches.expected >= 0]
+    assert len(set(named.tolist())) == len(named)
+    assert (matches.detection < np.array([len(one) for one in points])).all()

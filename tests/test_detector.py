@@ -1,0 +1,217 @@
+"""A detector in ONNX, with tiny real networks: a white square is found where it was painted, to the pixel."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from helpers import rig_of
+from onnx_models import SIDE, STRIDE, bright_squares
+
+from psotrack.cameras import camera, look_at
+from psotrack.cli.detect import detect as command
+from psotrack.datasets import dpjait
+from psotrack.detections import read_detections
+from psotrack.detector import Detector, DetectorSettings, detect
+from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.video import VideoWriter, probe
+
+#: Of the network's input for each layout; v10 has 300 boxes, for which it takes 18 x 18.
+SIZES = {"v5": 128, "v8": 128, "v10": 168}
+#: Pixels of the image for each of the network's.
+SCALE = 2
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("models")
+    for layout in (*SIZES, "logits", "none"):
+        (folder / f"{layout}.onnx").write_bytes(bright_squares(layout, SIZES.get(layout, 128)))
+    return folder
+
+
+def black(size: int):
+    """An image that is twice as wide as the input, and three quarters as high as wide."""
+    return np.zeros((SCALE * size * 3 // 4, SCALE * size, 3), np.uint8)
+
+
+def square(size: int, column: int, row: int):
+    """xyxy in the image of one of the network's squares; above the image there is an eighth of the input in grey."""
+    x0, y0 = SCALE * STRIDE * column, SCALE * (STRIDE * row - size // 8)
+    return [x0, y0, x0 + SCALE * SIDE, y0 + SCALE * SIDE]
+
+
+def paint(bgr, xyxy, value=255):
+    x0, y0, x1, y1 = (max(0, edge) for edge in xyxy)
+    bgr[y0:y1, x0:x1] = value
+
+
+def detector(models, layout, **settings):
+    settings = {"size": SIZES.get(layout, 128)} | settings
+    return Detector(models / f"{layout}.onnx", DetectorSettings(**settings))
+
+
+@pytest.mark.parametrize("layout", SIZES)
+class TestLayouts:
+    def test_a_square(self, models, layout):
+        size = SIZES[layout]
+        bgr, there = black(size), square(size, 5, 6)
+        paint(bgr, there)
+        xyxy, confidence = detector(models, layout).boxes(bgr)
+        # Whole pixels, and shrunk by two: exact but for float32.
+        np.testing.assert_allclose(xyxy, [there], atol=1e-4)
+        assert confidence == pytest.approx(1 / (1 + np.exp(-10)), abs=1e-5)
+
+    def test_two_squares_the_brighter_first(self, models, layout):
+        size = SIZES[layout]
+        bgr, dim, bright = black(size), square(size, 2, 3), square(size, 9, 7)
+        paint(bgr, dim, 200)
+        paint(bgr, bright)
+        xyxy, confidence = detector(models, layout).boxes(bgr)
+        np.testing.assert_allclose(xyxy, [bright, dim], atol=1e-4)
+        # OpenCV's convolutions round as they like: measured 2e-4.
+        assert confidence[1] == pytest.approx(1 / (1 + np.exp(-40 * (200 / 255 - 0.75))), abs=1e-3)
+        xyxy, _ = detector(models, layout, confidence=0.9).boxes(bgr)
+        np.testing.assert_allclose(xyxy, [bright], atol=1e-4)
+
+    def test_nothing(self, models, layout):
+        xyxy, confidence = detector(models, layout).boxes(black(SIZES[layout]))
+        assert (xyxy.shape, confidence.shape) == ((0, 4), (0,))
+
+
+def test_boxes_that_overlap(models):
+    """A step to each side is three fifths of both, and a quarter black: half a score."""
+    bgr = black(128)
+    paint(bgr, square(128, 5, 6))
+    _, alone = detector(models, "v8", nms=0.59).boxes(bgr)
+    _, all_five = detector(models, "v8", nms=0.61, confidence=0.4).boxes(bgr)
+    assert len(alone) == 1
+    np.testing.assert_allclose(all_five, [1, 0.5, 0.5, 0.5, 0.5], atol=1e-3)
+
+
+def test_a_box_ends_where_the_image_ends(models):
+    """Of the square that fits best a quarter is in the grey above the image."""
+    bgr, there = black(128), square(128, 4, 1)
+    assert there[1] == -SCALE * STRIDE
+    paint(bgr, there)
+    xyxy, _ = detector(models, "v5").boxes(bgr)
+    np.testing.assert_allclose(xyxy, [[there[0], 0, *there[2:]]], atol=1e-4)
+
+
+def test_an_upright_image_has_grey_beside_it(models):
+    bgr, there = black(128), square(128, 5, 6)
+    paint(bgr, there)
+    upright = np.ascontiguousarray(bgr.transpose(1, 0, 2))
+    xyxy, _ = detector(models, "v8").boxes(upright)
+    np.testing.assert_allclose(xyxy, [[there[1], there[0], there[3], there[2]]], atol=1e-4)
+
+
+def test_red_is_red(tmp_path, models):
+    """The network gets RGB: one that sees the first channel only sees what is red, the last one of BGR."""
+    kernel = np.full((3, SIDE, SIDE), 40 / (3 * SIDE * SIDE), np.float32)
+    seeing_red = np.stack([3 * kernel[0], 0 * kernel[1], 0 * kernel[2]])
+    content = bright_squares("v8", 128)
+    assert content.count(kernel.tobytes()) == 1
+    path = tmp_path / "red.onnx"
+    path.write_bytes(content.replace(kernel.tobytes(), seeing_red.tobytes()))
+    bgr = black(128)
+    paint(bgr, square(128, 2, 3), (255, 0, 0))
+    paint(bgr, square(128, 9, 6), (0, 0, 255))
+    xyxy, _ = Detector(path, DetectorSettings(size=128)).boxes(bgr)
+    np.testing.assert_allclose(xyxy, [square(128, 9, 6)], atol=1e-4)
+
+
+class TestWhatCannotBeUsed:
+    def test_no_file(self, tmp_path):
+        with pytest.raises(InputError, match=r"gone.onnx: expected an ONNX model, found no such file"):
+            Detector(tmp_path / "gone.onnx", DetectorSettings())
+
+    @pytest.mark.parametrize("content", [b"", b"hello " * 100, "cut"])
+    def test_a_broken_model(self, tmp_path, capfd, content):
+        path = tmp_path / "broken.onnx"
+        path.write_bytes(bright_squares("v5", 128)[:3000] if content == "cut" else content)
+        with pytest.raises(
+            InputError, match=r"broken.onnx: expected an ONNX model that OpenCV can read"
+        ) as error:
+            Detector(path, DetectorSettings())
+        assert "\n" not in str(error.value)
+        assert capfd.readouterr() == ("", "")
+
+    @pytest.mark.parametrize("size", [96, 640])
+    def test_a_model_of_another_input_size(self, models, capfd, size):
+        with pytest.raises(
+            InputError, match=f"a network for images of {size} x {size} pixels.*--size"
+        ) as error:
+            detector(models, "v8", size=size).boxes(black(128))
+        assert "\n" not in str(error.value)
+        assert capfd.readouterr() == ("", "")
+
+    def test_an_output_that_is_none(self, models):
+        with pytest.raises(InputError, match=r"none.onnx: .* as of YOLOv8, found \(1, 1, 13, 13\)"):
+            detector(models, "none").boxes(black(128))
+
+    def test_scores_that_are_none(self, models):
+        with pytest.raises(
+            InputError, match=r"logits.onnx: expected .* from 0 to 1, found scores from 0 to 10;"
+        ):
+            detector(models, "logits").boxes(np.full_like(black(128), 255))
+
+    @pytest.mark.parametrize("settings", [{"confidence": 0.0}, {"nms": 1.5}, {"size": 0}])
+    def test_settings(self, settings):
+        with pytest.raises(SettingsError, match=next(iter(settings))):
+            DetectorSettings(**settings)
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory):
+    """Two cameras and four frames: a square that moves on in the first, nothing in the second."""
+    folder = tmp_path_factory.mktemp("data") / "Simulated_Data" / "S02_D1"
+    folder.mkdir(parents=True)
+    R, t_m = look_at((0.0, -6.0, 2.0), (0.0, 0.0, 1.5))
+    one = camera(R=R, t_m=t_m, K=np.diag([1100.0, 1100.0, 1.0]), image_size_wh=(256, 192))
+    dpjait.write_calibration(folder / dpjait.CALIBRATION, rig_of(one, one))
+    for name in "01":
+        with VideoWriter(folder / f"{name}.avi", 25.0, (256, 192)) as writer:
+            for frame in range(4):
+                bgr = black(128)
+                if name == "0" and frame != 1:
+                    paint(bgr, square(128, 3 + frame, 6))
+                writer.write(bgr)
+    return folder
+
+
+class TestVideos:
+    def test_frames(self, models, sequence):
+        found = detect(detector(models, "v5"), "0", probe(sequence / "0.avi"))
+        assert found.frame.tolist() == [0, 2, 3]
+        # Compressed videos change the colours, not the square that fits best.
+        np.testing.assert_allclose(found.xyxy, [square(128, 3 + frame, 6) for frame in (0, 2, 3)], atol=1e-4)
+
+    def run(self, models, sequence, out, *arguments):
+        options = ["--detector", models / "v8.onnx", "--out", out, "--size", "128", *arguments]
+        return CliRunner().invoke(command, [str(sequence), *map(str, options)], catch_exceptions=False)
+
+    def test_command(self, models, sequence, tmp_path):
+        result = self.run(models, sequence, tmp_path / "boxes")
+        assert result.exit_code == 0
+        assert "2 cameras, 4 frames, 0.38 boxes per frame and camera" in result.stdout
+        assert sorted(path.name for path in (tmp_path / "boxes").iterdir()) == ["0.csv", "1.csv"]
+        found = read_detections(tmp_path / "boxes" / "0.csv")
+        assert found.frame.tolist() == [0, 2, 3]
+        np.testing.assert_allclose(found.in_frame(3).xyxy, [square(128, 6, 6)], atol=1e-4)
+        assert len(read_detections(tmp_path / "boxes" / "1.csv")) == 0
+
+    def test_nothing_is_replaced_unless_asked(self, models, sequence, tmp_path):
+        (tmp_path / "1.csv").write_text("mine")
+        with pytest.raises(OutputError, match=r"1.csv: .*--force"):
+            self.run(models, sequence, tmp_path)
+        assert not (tmp_path / "0.csv").exists()
+        assert self.run(models, sequence, tmp_path, "--force").exit_code == 0
+
+    def test_json_of_some_cameras_and_frames(self, models, sequence, tmp_path):
+        result = self.run(models, sequence, tmp_path / "b", "--cameras", "0", "--frames", "3", "--json", "-")
+        assert json.loads(result.stdout) == {
+            "out": str(tmp_path / "b"),
+            "frames": 3,
+            "detections": {"0": 2},
+        }

@@ -1,0 +1,411 @@
+"""Labels against boxes worked out by hand, OpenCV, and the renderer's masks; data sets as trainers read them."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+import trimesh
+import yaml
+from click.testing import CliRunner
+from helpers import far_camera, rig_of, ring_rig
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from psotrack.cameras import camera, look_at, project
+from psotrack.cli.labels import labels
+from psotrack.datasets.dpjait import read_masks, read_sequence
+from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
+from psotrack.labels import LabelSettings, box_corners, label_boxes
+from psotrack.simulation import scenario, simulate
+from psotrack.simulation.scenarios import Mesh
+from psotrack.training_data import write_data_set
+from psotrack.trajectories import Trajectories
+from psotrack.video import read_frames
+
+#: 100 x 80 pixels, 10 to the metre, from y = -1000 m: x is to the right, z is up.
+FAR = rig_of(far_camera(image_size_wh=(100, 80), pixels_per_m=10.0)).cameras
+CUBE = LabelSettings(drone_size_m=(2.0, 2.0, 2.0))
+SIZE_M = (0.6, 0.4, 0.3)
+
+
+def truth_of(position_m, orientation_wxyz=None):
+    """A reference from (frames, drones, 3) and (frames, drones, 4)."""
+    position_m = np.asarray(position_m, np.float64)
+    frame = np.arange(len(position_m))
+    names = tuple(f"dron{number + 1}" for number in range(position_m.shape[1]))
+    if orientation_wxyz is not None:
+        orientation_wxyz = np.asarray(orientation_wxyz, np.float64)
+    return Trajectories(frame, frame / 25, names, position_m, orientation_wxyz=orientation_wxyz)
+
+
+def labelled(*position_m, cameras=FAR, settings=CUBE, orientation_wxyz=None):
+    """(drones, 4), labels of the first camera."""
+    truth = truth_of([position_m], None if orientation_wxyz is None else [orientation_wxyz])
+    corners_m = box_corners(truth, np.array(settings.drone_size_m), np.array(settings.offset_m))
+    return label_boxes(cameras, corners_m, settings)[0, :, 0]
+
+
+def iou(one, other):
+    width, height = np.maximum(np.minimum(one[2:], other[2:]) - np.maximum(one[:2], other[:2]), 0)
+    areas = [(box[2] - box[0]) * (box[3] - box[1]) for box in (one, other)]
+    return width * height / (sum(areas) - width * height)
+
+
+# --- boxes in one image, worked out by hand
+
+
+def test_a_cube_in_the_middle():
+    # Edges, not pixel centres: the middle of 100 pixels is 50. A metre nearer of 1000 is 0.01 px in 10.
+    np.testing.assert_allclose(labelled((0.0, 0.0, 0.0)), [[40, 30, 60, 50]], atol=0.011)
+    tall = LabelSettings(drone_size_m=(1.0, 2.0, 4.0), offset_m=(0.5, 7.0, -1.0))
+    np.testing.assert_allclose(labelled((0.0, 0.0, 0.0), settings=tall), [[50, 30, 60, 70]], atol=0.25)
+
+
+def test_the_box_turns_with_the_body_and_so_does_its_offset():
+    half = math.radians(45 / 2)
+    turned = [(math.cos(half), 0.0, 0.0, math.sin(half))]
+    wide = 10 * math.sqrt(2)
+    np.testing.assert_allclose(
+        labelled((0.0, 0.0, 0.0), orientation_wxyz=turned), [[50 - wide, 30, 50 + wide, 50]], atol=0.03
+    )
+    # A quarter turn about z makes ahead (x) of what was towards the camera's back (y): not seen from here.
+    quarter = [(math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))]
+    ahead = LabelSettings(drone_size_m=(2.0, 2.0, 2.0), offset_m=(1.0, 0.0, 0.5))
+    np.testing.assert_allclose(
+        labelled((0.0, 0.0, 0.0), settings=ahead, orientation_wxyz=quarter), [[40, 25, 60, 45]], atol=0.03
+    )
+    np.testing.assert_allclose(labelled((0.0, 0.0, 0.0), settings=ahead), [[50, 25, 70, 45]], atol=0.03)
+
+
+def test_orientations_that_are_missing():
+    """A drone that never has one has a level box; one that has gaps is not known in them."""
+    truth = truth_of(np.zeros((2, 2, 3)), np.full((2, 2, 4), np.nan))
+    truth.orientation_wxyz[0, 1] = (1, 0, 0, 0)
+    corners_m = box_corners(truth, np.ones(3), np.zeros(3))
+    assert np.isfinite(corners_m[:, 0]).all()
+    assert np.isfinite(corners_m[0, 1]).all()
+    assert np.isnan(corners_m[1, 1]).all()
+
+
+def test_a_size_and_an_offset_for_each_drone():
+    truth = truth_of([[(0, 0, 0), (0, 0, 0)]])
+    corners_m = box_corners(truth, np.array([[1.0, 1, 1], [2, 4, 6]]), np.array([[0.0, 0, 0], [1, 0, 0]]))
+    assert np.ptp(corners_m[0], axis=1).tolist() == [[1, 1, 1], [2, 4, 6]]
+    assert corners_m[0].mean(axis=1).tolist() == [[0, 0, 0], [1, 0, 0]]
+
+
+@pytest.mark.parametrize(("min_inside", "expected"), [(0.7, [85, 30, 100, 50]), (0.8, [np.nan] * 4)])
+def test_cut_at_the_border(min_inside, expected):
+    """From 85 to 105 in an image of 100: three quarters are in it."""
+    settings = replace(CUBE, min_inside=min_inside)
+    np.testing.assert_allclose(labelled((4.5, 0.0, 0.0), settings=settings), [expected], atol=0.06)
+
+
+def test_outside_is_nothing_even_where_no_share_is_asked_for():
+    settings = replace(CUBE, min_inside=0.0)
+    assert np.isnan(labelled((7.0, 0, 0), (0, 0, -6.0), settings=settings)).all()
+
+
+def test_behind_the_camera_is_nothing():
+    """Behind it, about it, and with one corner beside it."""
+    settings = replace(CUBE, min_inside=0.0)
+    assert np.isnan(labelled((0, -2000.0, 0), (0, -1000.0, 0), (0, -999.5, 0), settings=settings)).all()
+
+
+@pytest.mark.parametrize(
+    ("max_hidden", "hidden"), [(0.74, True), (0.76, False)], ids=["more than allowed", "allowed"]
+)
+def test_a_nearer_drone_hides_a_farther_one(max_hidden, hidden):
+    """Half a metre of two to the side: three quarters are covered."""
+    settings = replace(CUBE, max_hidden=max_hidden)
+    far, near = labelled((0.0, 5.0, 0.0), (0.5, 0.0, 0.0), settings=settings)
+    assert np.isnan(far).all() == hidden
+    np.testing.assert_allclose(near, [45, 30, 65, 50], atol=0.03)
+
+
+def test_who_is_not_there_hides_nobody():
+    for nobody in [(0.0, -1500.0, 0.0), (math.nan, math.nan, math.nan)]:
+        assert np.isfinite(labelled((0.0, 0.0, 0.0), nobody, settings=replace(CUBE, max_hidden=0.0))[0]).all()
+
+
+def test_no_drones():
+    assert label_boxes(FAR, np.empty((3, 0, 8, 3)), CUBE).shape == (3, 0, 1, 4)
+
+
+@pytest.mark.parametrize("coefficients", [0, 4, 5, 8])
+def test_corners_are_where_opencv_projects_them(coefficients):
+    rig = ring_rig(5, coefficients=coefficients)
+    rng = np.random.default_rng(0)
+    position_m = rng.uniform((-1, -1, 0.8), (1, 1, 1.8), (7, 1, 3))
+    wxyz = Rotation.random(7, rng=1).as_quat(scalar_first=True)[:, None]
+    size_m, offset_m = np.array([0.5, 0.3, 0.2]), np.array([0.05, -0.1, 0.02])
+    found = label_boxes(
+        rig.cameras, box_corners(truth_of(position_m, wxyz), size_m, offset_m), LabelSettings(tuple(size_m))
+    )
+    signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    for f in range(7):
+        turn = Rotation.from_quat(wxyz[f, 0], scalar_first=True)
+        corners_m = position_m[f, 0] + turn.apply(offset_m + signs * size_m / 2)
+        for c in range(5):
+            one = rig.cameras[c]
+            rotation, _ = cv2.Rodrigues(one.T_cam_world[:3, :3])
+            dist = one.dist if coefficients else None
+            pixels = cv2.projectPoints(corners_m, rotation, one.T_cam_world[:3, 3], one.K, dist)[0][:, 0]
+            expected = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)]) + 0.5
+            expected = np.clip(expected, 0, [320, 240, 320, 240])
+            np.testing.assert_allclose(found[f, 0, c], expected, atol=1e-9)
+
+
+def test_a_lens_does_not_bring_in_what_is_far_outside():
+    """Its polynomial turns back: 65 degrees off the axis it projects to where 28 degrees are."""
+    R, t_m = look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+    K = np.array([[1158.0, 0, 962], [0, 1158, 541], [0, 0, 1]])
+    bent = camera(R=R, t_m=t_m, K=K, image_size_wh=(1924, 1082), dist=(-0.17, 0.0, 0.0, 0.0))
+    aside = (2.0, -2.0 * math.tan(math.radians(65)), 0.0)
+    pixel, _ = project(bent, np.array(aside))
+    assert (pixel > 0).all()
+    assert (pixel < (1924, 1082)).all()
+    small = LabelSettings(drone_size_m=(0.3, 0.3, 0.2))
+    cameras = rig_of(bent).cameras
+    assert np.isnan(labelled(aside, cameras=cameras, settings=small)).all()
+    # In the image's corner there is a label.
+    corner = np.array([1.0, -0.8, 0.4]) * 4
+    assert np.isfinite(labelled(tuple(corner), cameras=cameras, settings=small)).all()
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_labels_are_in_the_image_and_in_any_order(seed):
+    rng = np.random.default_rng(seed)
+    rig = ring_rig(3, coefficients=4)
+    position_m = rng.uniform((-6, -6, -1), (6, 6, 4), (2, 5, 3))
+    chosen = LabelSettings((0.8, 0.6, 0.4), min_inside=rng.uniform(), max_hidden=rng.uniform())
+    order = rng.permutation(5)
+
+    def labels_of(position_m):
+        corners_m = box_corners(truth_of(position_m), np.array(chosen.drone_size_m), np.zeros(3))
+        return label_boxes(rig.cameras, corners_m, chosen)
+
+    found = labels_of(position_m)
+    np.testing.assert_array_equal(labels_of(position_m[:, order]), found[:, order])
+    there = found[np.isfinite(found).all(axis=-1)]
+    assert np.isfinite(found).all(axis=-1).sum() == np.isfinite(found).any(axis=-1).sum()
+    assert ((there >= 0) & (there <= (320, 240, 320, 240))).all()
+    assert (there[:, 2:] > there[:, :2]).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"drone_size_m": (0.4, 0.0, 0.2)}, "drone_size_m: expected a number above 0, found 0"),
+        ({"min_inside": 1.5}, "min_inside: expected a share, 0 to 1, found 1.5"),
+        ({"max_hidden": math.nan}, "max_hidden: expected a share, 0 to 1, found nan"),
+    ],
+)
+def test_settings_that_make_no_sense(change, message):
+    with pytest.raises(SettingsError, match=message):
+        replace(CUBE, **change)
+
+
+# --- sequences of the simulator, whose drones are boxes
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Two sequences in which every drone is a box: its label is where the renderer's mask ends."""
+    root = tmp_path_factory.mktemp("data")
+    trimesh.creation.box(SIZE_M).export(root / "box.ply", encoding="ascii")
+    for name, num_frames in (("S01_D2_A", 4), ("S12_D3", 3)):
+        recipe = scenario(name)
+        boxes = tuple(
+            msgspec.structs.replace(drone, model=Mesh(file=str(root / "box.ply"))) for drone in recipe.drones
+        )
+        recipe = msgspec.structs.replace(recipe, drones=boxes)
+        simulate(recipe, root, num_frames=num_frames, scale=0.25, onboard=False, jobs=1)
+    return root / "Simulated_Data"
+
+
+@pytest.fixture(scope="module")
+def made(data, tmp_path_factory):
+    """The data set of both, made by the command in two processes."""
+    out = tmp_path_factory.mktemp("yolo") / "set"
+    answer = run(data / "S01_D2_A", data / "S12_D3", "--out", out, "--jobs", 2, "--json", "-")
+    assert answer.exit_code == 0
+    return out, json.loads(answer.stdout)
+
+
+def run(*arguments):
+    words = [*map(str, arguments), "--drone-size", ",".join(map(str, SIZE_M)), "--quiet"]
+    return CliRunner().invoke(labels, words, catch_exceptions=False)
+
+
+def refused(error, *arguments):
+    with pytest.raises(error) as caught:
+        run(*arguments)
+    assert isinstance(caught.value, PsotrackError)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_labels_are_the_boxes_of_the_masks(data):
+    sequence = read_sequence(data / "S01_D2_A")
+    corners_m = box_corners(sequence.truth, np.array(SIZE_M), np.zeros(3))
+    found = label_boxes(sequence.rig.cameras, corners_m, LabelSettings(SIZE_M))
+    overlaps = []
+    with read_masks(sequence.folder) as masks:
+        for frame in range(1, sequence.num_frames):
+            for drone in range(2):
+                for index, name in enumerate(sequence.rig.names):
+                    rows, columns = np.nonzero(masks.mask(name, drone + 1, frame))
+                    box = found[frame, drone, index]
+                    assert np.isfinite(box).all() == bool(len(rows))
+                    if len(rows):
+                        mask = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], float)
+                        # A pixel is in the mask where its middle is in the box: it may end half a pixel beyond.
+                        assert (mask[:2] >= box[:2] - 0.5).all()
+                        assert (mask[2:] <= box[2:] + 0.5).all()
+                        overlaps.append(iou(box, mask))
+    # Half a pixel at each side of 20 to 60. Drones hide each other in none of these frames.
+    assert len(overlaps) == 3 * 2 * 8
+    assert min(overlaps) > 0.85
+    assert np.median(overlaps) > 0.92
+
+
+def loaded(out):
+    """The data set as the trainers read it: (part, image's path) -> rows of its labels.
+
+    They take the paths of images from `data.yaml`, read by PyYAML's `safe_load`, and replace the last /images/ by
+    /labels/ and the suffix by .txt; rows have five numbers, none beyond 1, and are there once.
+    """
+    content = yaml.safe_load((out / "data.yaml").read_text(encoding="utf-8"))
+    assert set(content) == {"path", "train", "val", "nc", "names"}
+    assert content["nc"] == len(content["names"]) == 1
+    found = {}
+    for part in ("train", "val"):
+        folder = Path(content["path"]) / content[part]
+        assert folder.is_dir()
+        for image in sorted(folder.iterdir()):
+            assert image.suffix == ".jpg"
+            before, after = str(image).rsplit("/images/", 1)
+            text = Path(f"{before}/labels/{after}").with_suffix(".txt").read_text()
+            rows = np.array([line.split() for line in text.splitlines()], float).reshape(-1, 5)
+            assert (rows[:, 0] == 0).all()
+            assert ((rows[:, 1:] >= 0) & (rows[:, 1:] <= 1)).all()
+            assert len(np.unique(rows, axis=0)) == len(rows)
+            found[part, image] = rows
+    return found
+
+
+def test_a_trainer_loads_it(data, made):
+    out, counts = made
+    found = loaded(out)
+    assert len(list((out / "labels").glob("*/*.txt"))) == len(found)
+    for part, name, frames, cameras in (("train", "S01_D2_A", 3, 8), ("val", "S12_D3", 2, 4)):
+        rows = [value for (of, _), value in found.items() if of == part]
+        # Frame 0 has no pose in the dataset, so it is left out.
+        assert counts[part] == {"images": frames * cameras, "labels": sum(map(len, rows))}
+        assert len(rows) == frames * cameras
+        sequence = read_sequence(data / name)
+        corners_m = box_corners(sequence.truth, np.array(SIZE_M), np.zeros(3))
+        boxes = label_boxes(sequence.rig.cameras, corners_m, LabelSettings(SIZE_M))
+        for index, camera_name in enumerate(sequence.rig.names):
+            for frame, shown in enumerate(read_frames(sequence.videos[camera_name])):
+                image = out / "images" / part / f"{name}_{camera_name}_{frame:06d}.jpg"
+                assert image.exists() == (frame > 0)
+                if frame:
+                    expected = boxes[frame, :, index]
+                    expected = expected[np.isfinite(expected).all(axis=-1)]
+                    middle, size = found[part, image][:, 1:3], found[part, image][:, 3:]
+                    corners = np.hstack([middle - size / 2, middle + size / 2]) * [480, 270, 480, 270]
+                    # Six decimals of 480 pixels.
+                    np.testing.assert_allclose(corners, expected, atol=5e-4)
+                    stored = cv2.imread(str(image))
+                    # Of quality 95. Another frame of these differs by more, where the drones are.
+                    assert np.abs(stored.astype(int) - shown).mean() < 2.0
+
+
+def test_every_other_frame(data, tmp_path):
+    answer = run(data / "S12_D3", data / "S01_D2_A", "--out", tmp_path / "set", "--every", 2, "--jobs", 1)
+    assert answer.exit_code == 0
+    assert answer.stdout == ""
+    frames = {(part, image.stem[-6:]) for part, image in loaded(tmp_path / "set")}
+    assert frames == {("train", "000002"), ("val", "000002")}
+
+
+def test_an_image_without_drones_has_an_empty_file(data, tmp_path):
+    """With an offset of a kilometre nobody is in any image."""
+    run(
+        data / "S01_D2_A",
+        data / "S12_D3",
+        *("--out", tmp_path / "set", "--offset", "0,0,-1000", "--every", 2, "--jobs", 1),
+    )
+    found = loaded(tmp_path / "set")
+    assert len(found) == 12
+    assert not any(map(len, found.values()))
+
+
+def test_which_sequences_are_validated_on(data, tmp_path):
+    run(
+        data / "S01_D2_A",
+        data / "S12_D3",
+        *("--out", tmp_path / "set", "--validation", "S01_D2_A", "--every", 2, "--jobs", 1),
+    )
+    parts = {(part, image.name[:3]) for part, image in loaded(tmp_path / "set")}
+    assert parts == {("val", "S01"), ("train", "S12")}
+
+
+def test_what_cannot_be_split(data, tmp_path):
+    one, other, out = data / "S01_D2_A", data / "S12_D3", tmp_path / "set"
+    assert "one to train on" in refused(SettingsError, one, "--out", out)
+    assert "one to train on" in refused(
+        SettingsError, one, other, "--out", out, "--validation", "S12_D3,S01_D2_A"
+    )
+    assert "found S99" in refused(SettingsError, one, other, "--out", out, "--validation", "S99")
+    assert "S01_D2_A more than once" in refused(SettingsError, one, one, "--out", out)
+    assert run(one, other, "--out", out, "--every", 0).exit_code == 2
+    with pytest.raises(SettingsError, match="every: expected 1 or more, found 0"):
+        write_data_set(list(map(read_sequence, (one, other))), out, LabelSettings(SIZE_M), every=0)
+    assert not out.exists()
+
+
+def test_nothing_is_replaced_unasked_and_nothing_but_a_data_set_at_all(data, made, tmp_path):
+    both = (data / "S01_D2_A", data / "S12_D3")
+    out, _ = made
+    assert "--force" in refused(OutputError, *both, "--out", out)
+    precious = tmp_path / "home"
+    precious.mkdir()
+    (precious / "thesis.tex").write_text("x")
+    assert "nothing but a data set is replaced" in refused(OutputError, *both, "--out", precious, "--force")
+    assert (precious / "thesis.tex").exists()
+    again = tmp_path / "set"
+    run(*both, "--out", again, "--every", 1, "--jobs", 1)
+    run(*both, "--out", again, "--every", 2, "--jobs", 1, "--force")
+    assert {image.stem[-6:] for _, image in loaded(again)} == {"000002"}
+
+
+def test_a_broken_video_leaves_nothing_behind(data, tmp_path):
+    one, other = (read_sequence(data / name) for name in ("S01_D2_A", "S12_D3"))
+    short = {name: replace(video, num_frames=9) for name, video in one.videos.items()}
+    truth = one.truth
+    longer = Trajectories(
+        np.arange(9), np.arange(9) / 25, truth.drones, np.broadcast_to(truth.position_m[1], (9, 2, 3))
+    )
+    promising = replace(one, videos=short, truth=longer)
+    with pytest.raises(InputError, match="only 4 can be decoded"):
+        write_data_set([promising, other], tmp_path / "set", LabelSettings(SIZE_M), jobs=1)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_reference(data, tmp_path):
+    one, other = (read_sequence(data / name) for name in ("S01_D2_A", "S12_D3"))
+    with pytest.raises(InputError, match=r"S01_D2_A: expected a reference .*, found none"):
+        write_data_set([replace(one, truth=None), other], tmp_path / "set", LabelSettings(SIZE_M), jobs=1)
+    unknown = replace(one.truth, position_m=np.full_like(one.truth.position_m, np.nan))
+    with pytest.raises(InputError, match="found none of the 4"):
+        write_data_set([replace(one, truth=unknown), other], tmp_path / "set", LabelSettings(SIZE_M), jobs=1)

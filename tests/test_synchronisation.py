@@ -1,0 +1,403 @@
+"""Clocks: shifted copies of motion that is known at any time, so that the offset is known exactly."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from helpers import rig_of, ring_rig
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from psotrack.cameras import camera, look_at
+from psotrack.cli.synchronise import synchronise
+from psotrack.datasets import dpjait
+from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.evaluation.association import UNASSIGNED
+from psotrack.mocap import Markers, write_c3d
+from psotrack.simulation.flights.planning import plan
+from psotrack.simulation.scenarios import scenario
+from psotrack.synchronisation import camera_offsets, find_offset
+from psotrack.trajectories import Trajectories
+from psotrack.trajectory_files import write_trajectories
+from psotrack.video import VideoWriter
+
+FPS = 25.0
+
+
+def drifting(number: int = 0, speed_m_s: float = 1.0):
+    """Motion of about this speed that never repeats, at any times (...,): (..., 3)."""
+    rng = np.random.default_rng(number)
+    rate, phase = rng.uniform(0.4, 1.6, (4, 3)), rng.uniform(0, 2 * np.pi, (4, 3))
+    size_m = speed_m_s / np.sqrt(6) / rate
+
+    def position_m(time_s):
+        angle = rate * np.asarray(time_s)[..., None, None] + phase
+        return (size_m * np.sin(angle)).sum(axis=-2) + np.array([3.0 * number, 0, 1.5])
+
+    return position_m
+
+
+def estimate_of(*paths, seconds=12.0, start_s=3.0, offset_s=0.0, noise_m=0.0, fps=FPS, seed=0):
+    """What a tracker finds of drones that are at `path(t)` by the reference's clock, `offset_s` ahead of its own."""
+    time_s = start_s - offset_s + np.arange(int(seconds * fps)) / fps
+    position_m = np.stack([path(time_s + offset_s) for path in paths], axis=1)
+    position_m = position_m + np.random.default_rng(seed).normal(0, noise_m, position_m.shape)
+    return Trajectories(np.arange(len(time_s)), time_s, tuple(map(str, range(len(paths)))), position_m)
+
+
+def reference_of(*paths, rate_hz=100.0, seconds=18.0):
+    time_s = np.arange(int(seconds * rate_hz)) / rate_hz
+    return time_s, np.stack([path(time_s) for path in paths], axis=1)
+
+
+class TestFindOffset:
+    @pytest.mark.parametrize("rate_hz", [25.0, 100.0, 119.88])
+    @pytest.mark.parametrize("fps", [25.0, 29.97])
+    @pytest.mark.parametrize("offset_s", [0.7123, -0.4317])
+    def test_shifted_copies(self, rate_hz, fps, offset_s):
+        estimate = estimate_of(drifting(0), drifting(1), offset_s=offset_s, fps=fps)
+        found = find_offset(
+            estimate, *reference_of(drifting(0), drifting(1), rate_hz=rate_hz), max_offset_s=1.0
+        )
+        # Splines of 25 Hz through motion of at most 1.6 rad/s: (h w)⁴ / 384 of it, 4e-8 m; measured 3e-6 s.
+        assert found.offset_s == pytest.approx(offset_s, abs=2e-5)
+        assert found.mean_distance_m < 1e-5
+        assert found.mean_distance_before_m > 0.2
+        assert (found.overlap, found.partner.tolist()) == (1.0, [0, 1])
+        np.testing.assert_allclose(found.lever_arm_m, 0, atol=1e-5)
+        # The first step: whole samples of the reference.
+        assert np.abs(found.curve_s[np.nanargmin(found.curve_m)] - offset_s) <= 0.5001 / rate_hz
+        assert found.curve_s[[0, -1]] == pytest.approx([-1, 1], abs=1 / rate_hz)
+
+    @pytest.mark.parametrize("name", ["S01_D2_A", "S02_D4_A"])
+    def test_simulated_flights_with_arms_and_noise(self, name):
+        """The figure to reach: 0.1 frame, of arms of 0.12 m on drones that turn, and noise of 20 mm."""
+        flights = plan(scenario(name), 3)
+        rng, offset_s = np.random.default_rng(1), 0.1234
+        time_s = np.arange(900) / 100
+        arm_m = rng.normal(size=(len(flights), 3))
+        arm_m *= 0.12 / np.linalg.norm(arm_m, axis=-1, keepdims=True)
+
+        def tracked_m(flight, arm_m):
+            return lambda t: flight.position_m(t) + flight.rotation(t) @ arm_m
+
+        paths = [tracked_m(*item) for item in zip(flights, arm_m, strict=True)]
+        estimate = estimate_of(*paths, seconds=7.5, start_s=0.7, offset_s=offset_s, noise_m=0.02)
+        found = find_offset(
+            estimate,
+            time_s,
+            np.stack([flight.position_m(time_s) for flight in flights], axis=1),
+            np.stack([flight.orientation_wxyz(time_s) for flight in flights], axis=1),
+            max_offset_s=0.6,
+        )
+        assert abs(found.offset_s - offset_s) * FPS < 0.1
+        assert found.std_s * FPS < 0.05
+        # Noise of three parts of 20 mm: a mean distance of √(8 / π) of it. A median of 187 is known to 2 mm; along what
+        # it shares with the motion less well.
+        assert found.mean_distance_m == pytest.approx(0.02 * np.sqrt(8 / np.pi), rel=0.05)
+        np.testing.assert_allclose(found.lever_arm_m, arm_m, atol=0.012)
+
+    def test_standard_deviations_are_honest(self):
+        """Errors over their standard deviations, of thirty draws: about 1; that is known to √(1/60) = 13 %."""
+        path, (time_s, position_m) = drifting(2, 0.5), reference_of(drifting(2, 0.5))
+        drawn = [
+            find_offset(
+                estimate_of(path, offset_s=0.3, noise_m=0.02, seed=seed), time_s, position_m, max_offset_s=0.5
+            )
+            for seed in range(30)
+        ]
+        normalised = [(found.offset_s - 0.3) / found.std_s for found in drawn]
+        assert 0.6 < np.sqrt(np.mean(np.square(normalised))) < 1.4
+
+    def test_an_arm_along_the_way_is_not_taken_for_time(self):
+        """A drone that flies ahead, faster and slower: its arm of 0.12 m is as far as 0.12 s."""
+
+        def ahead(time_s):
+            time_s = np.asarray(time_s)
+            return np.stack([time_s + 0.5 * np.sin(1.3 * time_s), 0 * time_s, 1 + 0 * time_s], axis=-1)
+
+        estimate = estimate_of(lambda t: ahead(t) + np.array([0.12, 0, 0]), offset_s=0.2)
+        reference = reference_of(ahead)
+        found = find_offset(estimate, *reference, max_offset_s=0.5)
+        assert found.offset_s == pytest.approx(0.2, abs=1e-4)
+        np.testing.assert_allclose(found.lever_arm_m, [[0.12, 0, 0]], atol=1e-4)
+        without = find_offset(estimate, *reference, max_offset_s=0.5, with_lever_arm=False)
+        assert without.offset_s == pytest.approx(0.2 + 0.12, abs=0.05)
+        assert (without.lever_arm_m == 0).all()
+
+    def test_drones_in_any_order_one_of_them_false_and_one_missing(self):
+        paths = [drifting(number) for number in range(3)]
+        false = [lambda t: drifting(7)(t) - [0, 9, 0]]
+        estimate = estimate_of(paths[2], *false, paths[0], offset_s=0.25, noise_m=0.01)
+        found = find_offset(estimate, *reference_of(*paths), max_offset_s=0.5)
+        assert found.offset_s == pytest.approx(0.25, abs=4e-3)
+        assert found.partner.tolist() == [2, UNASSIGNED, 0]
+        assert np.isnan(found.lever_arm_m[1]).all()
+        assert found.overlap == pytest.approx(2 / 3)
+
+    def test_an_exchange_of_two_drones_does_not_matter_much(self):
+        """Distances, not squares: one sixth of the frames with the wrong drone is outvoted."""
+        estimate = estimate_of(drifting(0), drifting(1), offset_s=0.25, noise_m=0.01)
+        estimate.position_m[250:] = estimate.position_m[250:, ::-1]
+        found = find_offset(estimate, *reference_of(drifting(0), drifting(1)), max_offset_s=0.5)
+        assert found.offset_s == pytest.approx(0.25, abs=0.1 / FPS)
+
+    @pytest.mark.parametrize(("gap_s", "bridged"), [(0.08, True), (0.5, False)])
+    def test_long_gaps_are_not_bridged(self, gap_s, bridged):
+        """Where the reference is not known the estimate is 5 m off: it costs where it is compared."""
+        time_s, position_m = reference_of(drifting(0))
+        gap = (time_s > 8) & (time_s < 8 + gap_s)
+        position_m[gap] = np.nan
+        estimate = estimate_of(drifting(0), offset_s=0.25, noise_m=0.01)
+        inside = (estimate.time_s + 0.25 > 8 + 1e-9) & (estimate.time_s + 0.25 < 8 + gap_s - 1e-9)
+        estimate.position_m[inside] += 5.0
+        found = find_offset(estimate, time_s, position_m, max_offset_s=0.5)
+        compared = 1.0 if bridged else 1 - inside.sum() / estimate.num_frames
+        assert found.overlap == pytest.approx(compared, abs=1.5 / estimate.num_frames)
+        assert (found.mean_distance_m > 0.03) == bridged
+
+    @given(st.integers(0, 2**32 - 1), st.floats(-100, 100), st.floats(0, 6.3))
+    @settings(max_examples=6)
+    def test_where_the_clock_and_the_world_begin_does_not_matter(self, seed, later_s, turn):
+        estimate = estimate_of(drifting(0), drifting(1), offset_s=0.2, noise_m=0.02, seed=seed, seconds=6)
+        time_s, position_m = reference_of(drifting(0), drifting(1), rate_hz=50, seconds=10)
+        first = find_offset(estimate, time_s, position_m, max_offset_s=0.4)
+        R = Rotation.from_euler("Z", turn).as_matrix()
+        moved = replace(
+            estimate, time_s=estimate.time_s + later_s, position_m=estimate.position_m[:, ::-1] @ R.T + 4.0
+        )
+        again = find_offset(moved, time_s + later_s, position_m @ R.T + 4.0, max_offset_s=0.4)
+        # Medians of the parts turn only nearly with the world: a fraction of the standard deviation of 2 ms.
+        assert again.offset_s == pytest.approx(first.offset_s, abs=1e-3)
+        assert again.partner.tolist() == first.partner.tolist()[::-1] == [1, 0]
+
+
+class TestWhatCannotBeTold:
+    def refused(self, path, text, *, max_offset_s=1.0, offset_s=0.2, **others):
+        estimate = estimate_of(path, offset_s=offset_s, noise_m=0.02, **others)
+        with pytest.raises(InputError, match=text):
+            find_offset(estimate, *reference_of(path), max_offset_s=max_offset_s)
+
+    def test_drones_that_sway_a_little(self):
+        self.refused(
+            drifting(0, 0.01), "motion that tells the offset to a frame, 0.04 s, found a standard dev"
+        )
+
+    def test_a_drone_that_hovers_or_flies_straight_on(self):
+        for velocity_m_s in (0.0, 1.0):
+            self.refused(
+                lambda t, v=velocity_m_s: np.stack([v * np.asarray(t), 0 * t, 1 + 0 * t], axis=-1),
+                "standard deviation|if the drones hover",
+            )
+
+    def test_circles(self):
+        def circle(time_s):
+            angle = 2 * np.pi * np.asarray(time_s) / 0.8
+            return np.stack([np.cos(angle), np.sin(angle), 1 + 0 * angle], axis=-1)
+
+        self.refused(
+            circle,
+            "one offset that fits best, found both .* repeats: narrow the range",
+            max_offset_s=1.2,
+        )
+        estimate = estimate_of(circle, offset_s=0.2, noise_m=0.02)
+        found = find_offset(estimate, *reference_of(circle), max_offset_s=0.35)
+        assert found.offset_s == pytest.approx(0.2, abs=2e-3)
+
+    def test_an_offset_outside_of_the_range(self):
+        self.refused(
+            drifting(0), r"within 0.3 s, found it at an end, \+0.3 s; widen", max_offset_s=0.3, offset_s=0.9
+        )
+
+    def test_no_time_in_common(self):
+        self.refused(drifting(0), "positions of both at offsets within 1 s, found none", start_s=60.0)
+
+    def test_what_makes_no_sense(self):
+        estimate, (time_s, position_m) = estimate_of(drifting(0)), reference_of(drifting(0))
+        with pytest.raises(SettingsError, match=r"max_offset_s: expected a step of the reference, 0.01 s"):
+            find_offset(estimate, time_s, position_m, max_offset_s=0.001)
+        with pytest.raises(InputError, match="reference at two increasing times"):
+            find_offset(estimate, time_s[::-1].copy(), position_m, max_offset_s=1.0)
+        with pytest.raises(InputError, match="estimate of two frames or more, found 1"):
+            find_offset(estimate.at_frames(np.array([5])), time_s, position_m, max_offset_s=1.0)
+        unseen = replace(estimate, position_m=np.full_like(estimate.position_m, np.nan))
+        with pytest.raises(InputError, match="found none"):
+            find_offset(unseen, time_s, position_m, max_offset_s=1.0)
+
+
+def seen_by(rig, paths, late_frames, *, num_frames=300, noise_px=1.0, missed=0.1, wrong=0.02, seed=0):
+    """(frames, drones, cameras, 2), by OpenCV: each camera sees each drone where it was at k + its own offset."""
+    rng = np.random.default_rng(seed)
+    points_px = np.full((num_frames, len(paths), len(rig), 2), np.nan)
+    for number, late in enumerate(late_frames):
+        time_s = (np.arange(num_frames) + late) / FPS
+        one = rig.cameras[number]
+        R, t = one.T_cam_world[:3, :3], one.T_cam_world[:3, 3]
+        for drone, path in enumerate(paths):
+            projected = cv2.projectPoints(path(time_s), cv2.Rodrigues(R)[0], t, one.K, one.dist)[0]
+            points_px[:, drone, number] = projected[:, 0]
+    points_px += rng.normal(0, noise_px, points_px.shape)
+    stray = rng.random(points_px.shape[:-1]) < wrong
+    points_px[stray] = rng.uniform((0, 0), (1920, 1080), (int(stray.sum()), 2))
+    points_px[rng.random(points_px.shape[:-1]) < missed] = np.nan
+    return points_px
+
+
+def near(number, speed_m_s=1.0):
+    path = drifting(number, speed_m_s)
+    return lambda time_s: path(time_s) - [3.0 * number, 0, 0.3]
+
+
+RIG = ring_rig(8, coefficients=5, image_size_wh=(1920, 1080), radius_m=6.0)
+LATE = np.array([0.4, -1.0, 0.75, -0.2, 1.0, -0.6, 0.15, -0.5])
+DRONES = [near(number) for number in range(3)]
+
+
+class TestCameraOffsets:
+    def test_a_ring_with_noise_and_wrong_detections(self):
+        found = camera_offsets(RIG, seen_by(RIG, DRONES, LATE), FPS)
+        # The figure to reach is 0.1; measured 0.011, as the standard deviations say.
+        np.testing.assert_allclose(found.offset_frames, LATE, atol=0.03)
+        assert found.offset_frames.mean() == pytest.approx(0, abs=1e-12)
+        assert (found.std_frames < 0.02).all()
+        assert found.rms_before_px > 2 * found.rms_after_px
+        # Noise of 1 px in two parts is √2 px, of which points take a share, and interpolation.
+        assert found.rms_after_px < np.sqrt(2)
+
+    def test_without_noise(self):
+        points_px = seen_by(RIG, DRONES, LATE, noise_px=0, missed=0, wrong=0)
+        found = camera_offsets(RIG, points_px, FPS)
+        # Linear interpolation of pixels over a frame is off by an eighth of the acceleration: 0.03 px of 5.
+        np.testing.assert_allclose(found.offset_frames, LATE, atol=3e-3)
+
+    def test_standard_deviations_are_honest(self):
+        late = LATE - LATE.mean()
+        normalised = []
+        for seed in range(6):
+            points_px = seen_by(RIG, DRONES[:2], late, num_frames=150, seed=seed)
+            found = camera_offsets(RIG, points_px, FPS)
+            normalised.append((found.offset_frames - late) / found.std_frames)
+        # Of 6 x 7 numbers, known to 11 %.
+        assert 0.6 < np.sqrt(np.mean(np.square(normalised))) < 1.4
+
+    def test_cameras_that_are_right_stay_so(self):
+        found = camera_offsets(RIG, seen_by(RIG, DRONES, np.zeros(8)), FPS)
+        assert np.abs(found.offset_frames).max() < 0.03
+        assert found.rms_before_px == pytest.approx(found.rms_after_px, rel=0.02)
+
+    @pytest.mark.parametrize("num_cameras", [2, 3])
+    def test_few_cameras_and_large_offsets(self, num_cameras):
+        rig = RIG.select(RIG.names[:num_cameras])
+        late = np.linspace(-3, 3, num_cameras)
+        found = camera_offsets(rig, seen_by(rig, DRONES, late), FPS)
+        np.testing.assert_allclose(found.offset_frames, late, atol=0.1)
+
+    def test_the_order_of_cameras_does_not_matter(self):
+        points_px, order = seen_by(RIG, DRONES, LATE), np.array([3, 0, 7, 1, 6, 2, 5, 4])
+        first = camera_offsets(RIG, points_px, FPS)
+        rig = RIG.select([RIG.names[i] for i in order])
+        second = camera_offsets(rig, points_px[:, :, order], FPS)
+        # It stops where steps are below 1e-4.
+        np.testing.assert_allclose(second.offset_frames, first.offset_frames[order], atol=1e-3)
+
+    def test_nothing_is_known_of_drones_that_hover(self):
+        found = camera_offsets(RIG, seen_by(RIG, [near(0, 0.0)], LATE), FPS, max_offset_frames=4.0)
+        assert (found.std_frames > 2.0).all()
+        assert np.abs(found.offset_frames).max() <= 4.0
+
+    def test_nothing_is_known_of_a_camera_without_detections(self):
+        points_px = seen_by(RIG, DRONES, LATE)
+        points_px[:, :, 5] = np.nan
+        found = camera_offsets(RIG, points_px, FPS, max_offset_frames=4.0)
+        others = np.arange(8) != 5
+        apart = found.offset_frames[others] - LATE[others]
+        np.testing.assert_allclose(apart, apart.mean(), atol=0.03)
+        assert found.std_frames[5] > 2.0
+        assert found.std_frames[5] > 5 * found.std_frames[others].max()
+
+    @pytest.mark.parametrize("shape", [(0, 1), (1, 1), (10, 0), (10, 2)])
+    def test_nothing_at_all(self, shape):
+        found = camera_offsets(RIG, np.full((*shape, 8, 2), np.nan), FPS)
+        assert (found.offset_frames == 0).all()
+        assert np.isnan([found.rms_before_px, found.rms_after_px]).all()
+
+    def test_what_makes_no_sense(self):
+        with pytest.raises(SettingsError, match="points_px: expected 8 cameras, found 5"):
+            camera_offsets(RIG, np.zeros((10, 1, 5, 2)), FPS)
+        with pytest.raises(SettingsError, match="max_offset_frames"):
+            camera_offsets(RIG, np.zeros((10, 1, 8, 2)), FPS, max_offset_frames=0.0)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A real sequence without much in its videos: its .c3d at 100 Hz began 0.4321 s before them."""
+    folder = tmp_path_factory.mktemp("data") / "Real_Data" / "R12_D2"
+    folder.mkdir(parents=True)
+    R, t_m = look_at((0.0, -6.0, 2.0), (0.0, 0.0, 1.5))
+    one = camera(
+        R=R, t_m=t_m, K=np.diag([1100.0, 1100.0, 1.0]), image_size_wh=(64, 48), dist=(0.0, 0.0, 0.0, 0.0)
+    )
+    dpjait.write_calibration(folder / dpjait.CALIBRATION, rig_of(one), "mm")
+    with VideoWriter(folder / "0.avi", FPS, (64, 48)) as writer:
+        for _ in range(150):
+            writer.write(np.zeros((48, 64, 3), np.uint8))
+    time_s, position_m = reference_of(drifting(0), drifting(1), seconds=8)
+    cross_m = np.array([[0.1, 0, 0], [0, 0.13, 0], [-0.16, 0, 0], [0, -0.19, 0]])
+    cross_m -= cross_m.mean(axis=0)
+    labels = tuple(f"Dron{drone}:Dron{drone}{marker}" for drone in (1, 2) for marker in (1, 2, 3, 4))
+    markers_m = (position_m[:, :, None] + cross_m).reshape(len(time_s), 8, 3)
+    write_c3d(folder / "R12_D2.c3d", Markers(labels, markers_m, 100.0))
+    estimate = estimate_of(drifting(0), drifting(1), seconds=6, start_s=0.4321, offset_s=0.4321, noise_m=0.01)
+    tracks = folder.parent.parent / "tracks.csv"
+    write_trajectories(tracks, estimate)
+    return folder, tracks
+
+
+class TestCommand:
+    def run(self, recording, *arguments):
+        folder, tracks = recording
+        return CliRunner().invoke(
+            synchronise, [str(tracks), str(folder), *map(str, arguments)], catch_exceptions=False
+        )
+
+    def test_a_recording_at_its_own_rate(self, recording):
+        result = self.run(recording, "--max-offset", 1)
+        assert result.exit_code == 0
+        words = result.stdout.split()
+        assert result.stdout.startswith("R12_D2: the reference's clock is 0.43")
+        assert float(words[words.index("s") - 1]) == pytest.approx(0.4321, abs=0.1 / FPS)
+        assert "ahead of the videos'" in result.stdout
+        assert "(+10." in result.stdout
+        assert len(result.stdout.splitlines()) == 1
+
+    def test_json(self, recording):
+        content = json.loads(self.run(recording, "--json", "-", "--max-offset", 1).stdout)
+        assert content["offset_s"] == pytest.approx(0.4321, abs=0.1 / FPS)
+        assert content["mean_distance_m"] < 0.03 < content["mean_distance_before_m"]
+        assert content["overlap"] == 1.0
+        assert [(drone["drone"], drone["estimate"]) for drone in content["drones"]] == [
+            ("dron1", "0"),
+            ("dron2", "1"),
+        ]
+        assert len(content["curve"]["offset_s"]) == len(content["curve"]["mean_distance_m"]) == 201
+
+    def test_plot(self, recording, tmp_path):
+        picture = tmp_path / "offset.png"
+        assert self.run(recording, "--plot", picture, "--quiet").stdout == ""
+        assert cv2.imread(str(picture)).shape[0] > 300
+        with pytest.raises(OutputError, match="--force"):
+            self.run(recording, "--plot", picture)
+
+    def test_without_a_reference(self, recording, tmp_path):
+        folder, tracks = recording
+        bare = tmp_path / "R13_D2"
+        bare.mkdir()
+        for path in folder.iterdir():
+            if path.suffix != ".c3d":
+                (bare / path.name).write_bytes(path.read_bytes())
+        with pytest.raises(InputError, match="R13_D2: expected a reference to synchronise with, found none"):
+            self.run((bare, tracks))
