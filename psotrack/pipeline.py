@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import collections.abc
-import hashlib
 import platform
 import time
 from collections.abc import Mapping
@@ -20,20 +19,15 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.datasets.dpjait import detection_files, read_detections
 from psotrack.errors import InputError
 from psotrack.finishing import finished
 from psotrack.identity import Identities
-from psotrack.initialisation import Start
+from psotrack.methods import Way, by_both, by_lines, by_swarm
 from psotrack.progress import Report, silent
-from psotrack.projection_lines import follow, start_of
 from psotrack.sequence import Sequence
-from psotrack.settings import BLOBS, YOLO, TrackSettings
-from psotrack.sightings import from_detections, from_silhouettes
+from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
 from psotrack.sizes import SizeState
-from psotrack.starts import find_start, known_motion, room_bounds
-from psotrack.tracking import Tracked, track_silhouettes
 from psotrack.trajectories import Trajectories
 
 
@@ -78,7 +72,7 @@ def track_sequence(
     """
     began = time.perf_counter()
     silhouettes = None
-    if not settings.reads_detections:
+    if settings.needs_silhouettes:
         silhouettes = compute(sequence, settings.silhouettes, cache=cache, jobs=jobs, report=report)
     tracked = track_from_silhouettes(sequence, silhouettes, settings, report=report)
     seconds = tracked.record["seconds"] | {"total": round(time.perf_counter() - began, 4)}
@@ -131,114 +125,22 @@ def track_runs(
         InputError: there is nothing to start from, or detections cannot be read.
         SettingsError: a setting does not fit the sequence.
     """
-    swarms = [number for number, each in enumerate(settings) if each.method == "swarm"]
-    done: dict[int, TrackedSequence | InputError] = {}
+    swarms = [number for number, each in enumerate(settings) if each.method != "projection-lines"]
+    ways: dict[int, Way] = {}
     if swarms:
         assert silhouettes is not None
-        of_swarms = _by_swarm(sequence, silhouettes, [settings[number] for number in swarms], report)
-        done |= dict(zip(swarms, of_swarms, strict=True))
+        of_swarms = by_swarm(sequence, silhouettes, [settings[number] for number in swarms], report)
+        ways |= dict(zip(swarms, of_swarms, strict=True))
     for number, each in enumerate(settings):
-        if number not in done:
-            done[number] = _by_lines(sequence, silhouettes, each, report)
-    return [done[number] for number in range(len(settings))]
+        if each.method != "swarm":
+            lines = by_lines(sequence, silhouettes, each, report)
+            ways[number] = by_both(ways[number], lines, each, sequence.fps) if number in ways else lines
+    return [_finished(sequence, each, ways[number]) for number, each in enumerate(settings)]
 
 
-def _by_swarm(
-    sequence: Sequence,
-    silhouettes: Silhouettes,
-    settings: collections.abc.Sequence[TrackSettings],
-    report: Report,
-) -> list[TrackedSequence | InputError]:
-    """What runs of the swarm yield."""
-    began = time.perf_counter()
-    bounds_m = [room_bounds(sequence.rig, each) for each in settings]
-    starts = _starts(sequence, silhouettes, settings, bounds_m)
-    followed = track_silhouettes(
-        sequence.rig, silhouettes, starts, settings, fps=sequence.fps, bounds_m=bounds_m, report=report
-    )
-    compile_s = sum(tracked.compile_s for tracked in followed)
-    seconds = {
-        **silhouettes.seconds,
-        "compile": compile_s / len(settings),
-        "track": (time.perf_counter() - began - compile_s) / len(settings),
-    }
-    return [
-        _finished(sequence, dict(silhouettes.keys), *of, seconds)
-        for of in zip(settings, starts, bounds_m, followed, strict=True)
-    ]
-
-
-def _by_lines(
-    sequence: Sequence, silhouettes: Silhouettes | None, settings: TrackSettings, report: Report
-) -> TrackedSequence | InputError:
-    """What the projection lines yield."""
-    began = time.perf_counter()
-    bounds_m = room_bounds(sequence.rig, settings)
-    if settings.detections == BLOBS:
-        assert silhouettes is not None
-        sightings, keys = from_silhouettes(silhouettes, report), dict(silhouettes.keys)
-    else:
-        files = detection_files_of(sequence, settings.detections)
-        detections = {name: read_detections(path) for name, path in files.items()}
-        sightings = from_detections(detections, sequence.rig, sequence.num_frames)
-        keys = {name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for name, path in files.items()}
-    tracked = follow(
-        sequence.rig.cameras,
-        sightings,
-        settings,
-        fps=sequence.fps,
-        bounds_m=bounds_m,
-        known=known_motion(sequence, settings),
-        report=report,
-    )
-    before = {"decode": 0.0, "foreground": 0.0} if silhouettes is None else silhouettes.seconds
-    seconds = {**before, "compile": tracked.compile_s, "track": time.perf_counter() - began}
-    return _finished(sequence, keys, settings, start_of(tracked), bounds_m, tracked, seconds)
-
-
-def detection_files_of(sequence: Sequence, detections: str) -> Mapping[str, Path]:
-    """The file of each camera, as `TrackSettings.detections` says.
-
-    Raises:
-        InputError: there is none.
-    """
-    if detections != YOLO:
-        return detection_files(Path(detections), sequence.rig.names)
-    if sequence.detections is None:
-        raise InputError(
-            sequence.folder,
-            expected="detections in dl_data for --detections yolo",
-            found="none",
-            remedy="use --detections blobs",
-        )
-    return {name: path for name, path in sequence.detections.items() if name in sequence.rig.names}
-
-
-def _starts(
-    sequence: Sequence,
-    silhouettes: Silhouettes,
-    settings: collections.abc.Sequence[TrackSettings],
-    bounds_m: list[Float[np.ndarray, "2 3"]],
-) -> list[Start]:
-    """The start of each run; runs that differ in nothing but their seeds have the same."""
-    starts: dict[TrackSettings, Start] = {}
-    alike = [msgspec.structs.replace(each, seed=0) for each in settings]
-    for each, bounds in zip(alike, bounds_m, strict=True):
-        if each not in starts:
-            starts[each] = find_start(sequence, silhouettes, each, bounds)
-    return [starts[each] for each in alike]
-
-
-def _finished(
-    sequence: Sequence,
-    input_keys: Mapping[str, str],
-    settings: TrackSettings,
-    start: Start,
-    bounds_m: Float[np.ndarray, "2 3"],
-    tracked: Tracked,
-    seconds: Mapping[str, float],
-) -> TrackedSequence | InputError:
+def _finished(sequence: Sequence, settings: TrackSettings, way: Way) -> TrackedSequence | InputError:
     """One run's trajectories and record."""
+    tracked = way.tracked
     if not tracked.info.status.shape[1]:
         return InputError(
             sequence.folder,
@@ -249,20 +151,20 @@ def _finished(
     followed = time.perf_counter()
     trajectories, identities = finished(tracked, settings, fps=sequence.fps)
     finish_s = time.perf_counter() - followed
-    own_s = {"track": seconds["track"], "compile": seconds["compile"], "finish": finish_s}
-    all_seconds = {**seconds, **own_s, "total": sum(own_s.values())}
+    own_s = {"track": way.seconds["track"], "compile": way.seconds["compile"], "finish": finish_s}
+    all_seconds = {**way.seconds, **own_s, "total": sum(own_s.values())}
     record = {
         "sequence": sequence.name,
         "frames": trajectories.num_frames,
         "cameras": list(sequence.rig.names),
         "settings": msgspec.to_builtins(settings),
         "seed": settings.seed,
-        "start": {name: value.tolist() for name, value in vars(start).items()},
-        "bounds_m": bounds_m.tolist(),
+        "start": {name: value.tolist() for name, value in vars(way.start).items()},
+        "bounds_m": way.bounds_m.tolist(),
         "drones": _as_learned(tracked.sizes),
         "arrivals": [asdict(arrival) for arrival in tracked.arrivals],
         "encounters": [asdict(encounter) for encounter in identities.encounters],
-        "input_keys": dict(input_keys),
+        "input_keys": dict(way.input_keys),
         "seconds": {stage: round(value, 4) for stage, value in all_seconds.items()},
         **environment(),
     }

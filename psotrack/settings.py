@@ -14,7 +14,7 @@ from psotrack.silhouette_store import SilhouetteSettings
 
 SwarmKind = Literal["joint", "per-drone"]
 Score = Literal["soft", "hard"]
-Method = Literal["swarm", "projection-lines"]
+Method = Literal["swarm", "projection-lines", "fused"]
 #: Detections that need no folder: the sequence's own, or blobs of its silhouettes.
 YOLO, BLOBS = "yolo", "blobs"
 
@@ -23,7 +23,8 @@ class TrackSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """How a sequence is tracked.
 
     Attributes:
-        method: "swarm", of particles over silhouettes; or "projection-lines", which triangulates detections.
+        method: "swarm", of particles over silhouettes; "projection-lines", which triangulates detections; or "fused",
+            both, weighed by how sure they are.
         detections: of the projection lines: "yolo", those that came with the sequence; "blobs" of its silhouettes; or a
             folder with a CSV file for each camera.
         particles: of every swarm.
@@ -134,6 +135,11 @@ class TrackSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
             raise SettingsError("bounds_m", expected="x0 < x1, y0 < y1, z0 < z1", found=f"{self.bounds_m}")
 
     @property
+    def needs_silhouettes(self) -> bool:
+        """Whether silhouettes are read."""
+        return self.method != "projection-lines" or self.detections == BLOBS
+
+    @property
     def reads_detections(self) -> bool:
-        """Whether files of detections are what is tracked; if not, it is silhouettes."""
-        return self.method == "projection-lines" and self.detections != BLOBS
+        """Whether files of detections are read."""
+        return self.method != "swarm" and self.detections != BLOBS

@@ -73,11 +73,33 @@ def smooth(
     # A scope, not a switch: nothing outside of it computes differently.
     with jax.enable_x64(True):
         parts = _smoothed(*_double((time_s, measured_m, measured_covariance_m2, was_measured, params)))
-        smoothed = Smoothed(*(np.array(part) for part in parts))
+    return _since_birth(parts, was_measured)
+
+
+def forward(
+    time_s: Float[np.ndarray, "frames"],
+    measured_m: Float[np.ndarray, "frames drones 3"],
+    measured_covariance_m2: Float[np.ndarray, "frames drones 3 3"],
+    was_measured: Bool[np.ndarray, "frames drones"],
+    params: MotionParams,
+) -> Smoothed:
+    """What the frames up to each frame say of it: the filter alone.
+
+    Args, errors and what is NaN are those of `smooth`.
+    """
+    check_measurements(time_s, measured_m, measured_covariance_m2, was_measured)
+    with jax.enable_x64(True):
+        parts = _forward(*_double((time_s, measured_m, measured_covariance_m2, was_measured, params)))
+    return _since_birth(parts, was_measured)
+
+
+def _since_birth(parts: tuple[Array, ...], was_measured: Bool[np.ndarray, "frames drones"]) -> Smoothed:
+    """The parts on the host, NaN before a drone's first measurement."""
+    states = Smoothed(*(np.array(part) for part in parts))
     unborn = ~np.logical_or.accumulate(was_measured, axis=0)
-    for value in vars(smoothed).values():
+    for value in vars(states).values():
         value[unborn] = np.nan
-    return smoothed
+    return states
 
 
 def jerk_density(
@@ -138,7 +160,7 @@ def check_measurements(
     if not (np.diff(time_s) > 0).all() or not np.isfinite(time_s).all():
         raise InputError("time_s", expected="increasing times", found="repeats, steps back or no numbers")
     for name, value in (("measured_m", measured_m), ("measured_covariance_m2", measured_covariance_m2)):
-        wrong = was_measured & ~np.isfinite(value.reshape(*was_measured.shape, -1)).all(axis=-1)
+        wrong = was_measured & ~np.isfinite(value).all(axis=tuple(range(2, value.ndim)))
         if wrong.any():
             row, drone = np.argwhere(wrong)[0]
             where = f"{name}, row {row}, drone {drone}"
@@ -191,6 +213,18 @@ def _filtered(
 
 
 @jax.jit
+def _forward(
+    time_s: Array, measured_m: Array, covariance_m2: Array, was_measured: Array, params: MotionParams
+) -> tuple[Array, Array, Array, Array]:
+    """Forward pass: positions, velocities, accelerations and covariances of the positions, of all frames."""
+    return _seen_of(_filtered(time_s, measured_m, covariance_m2, was_measured, params)[1])
+
+
+def _seen_of(states: MotionState) -> tuple[Array, Array, Array, Array]:
+    return states.position_m, states.velocity_m_s, states.acceleration_m_s2, states.position_covariance_m2
+
+
+@jax.jit
 def _smoothed(
     time_s: Array, measured_m: Array, covariance_m2: Array, was_measured: Array, params: MotionParams
 ) -> tuple[Array, Array, Array, Array]:
@@ -213,7 +247,7 @@ def _smoothed(
     ahead = jax.tree.map(itemgetter(slice(1, None)), predicted)
     _, earlier = jax.lax.scan(step, (end.mean, end.covariance), (now, ahead, jnp.diff(time_s)), reverse=True)
     states = jax.tree.map(lambda part, last: jnp.concatenate([part, last[None]]), earlier, end)
-    return states.position_m, states.velocity_m_s, states.acceleration_m_s2, states.position_covariance_m2
+    return _seen_of(states)
 
 
 def _gain(moved: Array, ahead: Array) -> Array:

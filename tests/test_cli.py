@@ -234,6 +234,11 @@ def test_projection_lines_from_the_sequence_a_folder_and_blobs(
         assert list(pd.read_csv(path).columns) == COLUMNS
         assert len(pd.read_csv(path)) == 4 * NUM_FRAMES
     assert tracks[0].read_bytes() == tracks[1].read_bytes() != tracks[2].read_bytes()
+    together = tmp_path / "together.csv"
+    assert run(*track(sequence, together, "--method", "fused")).code == 0
+    assert len(pd.read_csv(together)) == 4 * NUM_FRAMES
+    keys = json.loads(together.with_suffix(".json").read_text())["input_keys"]
+    assert set(keys) == {name for i in range(1, 9) for name in (f"cam{i}i", f"detections of cam{i}i")}
     record = json.loads(tracks[0].with_suffix(".json").read_text())
     assert record["settings"]["method"] == "projection-lines"
     assert set(record["seconds"]) == {"decode", "foreground", "compile", "track", "finish", "total"}

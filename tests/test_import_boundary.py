@@ -96,12 +96,14 @@ DEPTH = {
     "sightings": 5,
     "crossings": 4,
     "projection_lines": 11,
+    "fusion": 11,
     "finishing": 11,
-    "pipeline": 12,
-    "demo": 13,
-    "sweep": 13,
-    "cli": 14,
-    "__main__": 15,
+    "methods": 12,
+    "pipeline": 13,
+    "demo": 14,
+    "sweep": 14,
+    "cli": 15,
+    "__main__": 16,
 }
 
 CORE = {

@@ -139,7 +139,7 @@ def silhouettes(
     type=click.Choice(get_args(Method)),
     default=TRACK.method,
     show_default=True,
-    help="A swarm over silhouettes, or triangulated detections.",
+    help="A swarm over silhouettes, triangulated detections, or both weighed together.",
 )
 @click.option(
     "--detections",

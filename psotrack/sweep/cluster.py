@@ -168,7 +168,7 @@ def _done(
     silhouettes: dict[Any, list[Any]] = {}
     for cell in cells:
         if source_of(cell) not in silhouettes:
-            cameras = () if cell.settings.reads_detections else inputs.sequence_of(cell).rig.names
+            cameras = inputs.sequence_of(cell).rig.names if cell.settings.needs_silhouettes else ()
             silhouettes[source_of(cell)] = client.map(_make, cameras, cell=cell, job=job, pure=False)
     futures = {
         client.submit(_run, cell, job, silhouettes[source_of(cell)], pure=False): cell for cell in cells

@@ -87,7 +87,7 @@ def estimate(cells: Iterable[Cell], inputs: Inputs, store: Store | None) -> Esti
         drones = cell.settings.drones or sequence.truth.num_drones
         settings = cell.settings
         count += 1
-        swarm = settings.method == "swarm"
+        swarm = settings.method != "projection-lines"
         work = settings.particles * settings.iterations * drones * cameras if swarm else 0
         tracking_s += factor * runs * sequence.num_frames * (FRAME_S + WORK_S * work)
         shape = (
@@ -99,7 +99,7 @@ def estimate(cells: Iterable[Cell], inputs: Inputs, store: Store | None) -> Esti
         )
         if swarm:
             programs.add((cell.sequence, cameras, runs, shape))
-        if not settings.reads_detections and source_of(cell) not in silhouettes_s:
+        if settings.needs_silhouettes and source_of(cell) not in silhouettes_s:
             silhouettes_s[source_of(cell)] = _silhouettes_s(cell, inputs)
     return Estimate(
         count, unread, tracking_s, COMPILE_S * len(programs), sum(silhouettes_s.values(), 0.0), basis

@@ -14,7 +14,7 @@ import numpy as np
 
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.errors import InputError, PsotrackError
-from psotrack.pipeline import detection_files_of
+from psotrack.methods import detection_files_of
 from psotrack.sequence import Sequence
 from psotrack.silhouette_store import SilhouetteSettings
 from psotrack.silhouette_store import key_of as silhouettes_key_of
@@ -26,7 +26,7 @@ from psotrack.sweep.perturbations import perturbed
 #: Folders of the data's root in which a sequence may lie.
 HALVES = ("Simulated_Data", "Real_Data", ".")
 
-#: What decides which silhouettes a cell needs; None where it reads detections instead.
+#: What decides which silhouettes a cell needs; None where it needs none.
 Source = tuple[str, int | None, SilhouetteSettings | None]
 
 
@@ -99,7 +99,7 @@ class Inputs:
         """What a cell reads, or why that cannot be had; None as long as somebody else makes the silhouettes."""
         sequence = self.sequence_of(cell)
         try:
-            if cell.settings.reads_detections:
+            if not cell.settings.needs_silhouettes:
                 return Input(*perturbed(sequence, None, cell.perturbation, cell.cameras))
             with claimed(self.claim_of(cell), f"silhouettes of {cell.sequence}") as ours:
                 if not ours:
@@ -121,7 +121,7 @@ class Inputs:
             if sequence.truth is None:
                 raise InputError(sequence.folder, expected="a reference to compare with", found="none")
             keys = {}
-            if not cell.settings.reads_detections:
+            if cell.settings.needs_silhouettes:
                 with ThreadPoolExecutor() as threads:
                     key_of = partial(silhouettes_key_of, settings=cell.settings.silhouettes)
                     of_videos = threads.map(key_of, sequence.videos.values())
@@ -137,7 +137,7 @@ class Inputs:
 def source_of(cell: Cell) -> Source:
     """What decides which silhouettes a cell needs."""
     settings = cell.settings
-    return cell.sequence, cell.frames, None if settings.reads_detections else settings.silhouettes
+    return cell.sequence, cell.frames, settings.silhouettes if settings.needs_silhouettes else None
 
 
 def folder_of(sequence: str, data: Path) -> Path:

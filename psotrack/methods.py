@@ -1,0 +1,154 @@
+"""The methods of tracking, from what they read to tracks: the swarm, the projection lines, and both together."""
+
+from __future__ import annotations
+
+import collections.abc
+import hashlib
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.datasets.dpjait import detection_files, read_detections
+from psotrack.errors import InputError
+from psotrack.fusion import fused
+from psotrack.initialisation import Start
+from psotrack.progress import Report
+from psotrack.projection_lines import follow, start_of
+from psotrack.sequence import Sequence
+from psotrack.settings import BLOBS, YOLO, TrackSettings
+from psotrack.sightings import from_detections, from_silhouettes
+from psotrack.silhouettes import Silhouettes
+from psotrack.starts import find_start, known_motion, room_bounds
+from psotrack.tracking import Tracked, track_silhouettes
+
+
+@dataclass(frozen=True)
+class Way:
+    """How a run went.
+
+    Attributes:
+        tracked: what it yielded.
+        start: from where.
+        bounds_m: (2, 3), lowest and highest corner of the room.
+        input_keys: digests of what was read, by camera.
+        seconds: by stage.
+    """
+
+    tracked: Tracked
+    start: Start
+    bounds_m: Float[np.ndarray, "2 3"]
+    input_keys: Mapping[str, str]
+    seconds: Mapping[str, float]
+
+
+def by_swarm(
+    sequence: Sequence,
+    silhouettes: Silhouettes,
+    settings: collections.abc.Sequence[TrackSettings],
+    report: Report,
+) -> list[Way]:
+    """Runs of the swarm, together.
+
+    Raises:
+        InputError: there is nothing to start from.
+        SettingsError: a setting does not fit the sequence.
+    """
+    began = time.perf_counter()
+    bounds_m = [room_bounds(sequence.rig, each) for each in settings]
+    starts = _starts(sequence, silhouettes, settings, bounds_m)
+    followed = track_silhouettes(
+        sequence.rig, silhouettes, starts, settings, fps=sequence.fps, bounds_m=bounds_m, report=report
+    )
+    compile_s = sum(tracked.compile_s for tracked in followed)
+    seconds = {
+        **silhouettes.seconds,
+        "compile": compile_s / len(settings),
+        "track": (time.perf_counter() - began - compile_s) / len(settings),
+    }
+    return [
+        Way(tracked, start, bounds, silhouettes.keys, seconds)
+        for tracked, start, bounds in zip(followed, starts, bounds_m, strict=True)
+    ]
+
+
+def by_lines(
+    sequence: Sequence, silhouettes: Silhouettes | None, settings: TrackSettings, report: Report
+) -> Way:
+    """A run of the projection lines.
+
+    Raises:
+        InputError: detections cannot be read.
+    """
+    began = time.perf_counter()
+    bounds_m = room_bounds(sequence.rig, settings)
+    if settings.detections == BLOBS:
+        assert silhouettes is not None
+        sightings, keys = from_silhouettes(silhouettes, report), dict(silhouettes.keys)
+    else:
+        files = detection_files_of(sequence, settings.detections)
+        detections = {name: read_detections(path) for name, path in files.items()}
+        sightings = from_detections(detections, sequence.rig, sequence.num_frames)
+        keys = {name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for name, path in files.items()}
+    tracked = follow(
+        sequence.rig.cameras,
+        sightings,
+        settings,
+        fps=sequence.fps,
+        bounds_m=bounds_m,
+        known=known_motion(sequence, settings),
+        report=report,
+    )
+    before = {"decode": 0.0, "foreground": 0.0} if silhouettes is None else silhouettes.seconds
+    seconds = {**before, "compile": tracked.compile_s, "track": time.perf_counter() - began}
+    return Way(tracked, start_of(tracked), bounds_m, keys, seconds)
+
+
+def by_both(swarm: Way, lines: Way, settings: TrackSettings, fps: float) -> Way:
+    """What the two say together."""
+    began = time.perf_counter()
+    tracked = fused(swarm.tracked, lines.tracked, settings, fps=fps)
+    seconds = {
+        **swarm.seconds,
+        "compile": swarm.seconds["compile"] + lines.seconds["compile"],
+        "track": swarm.seconds["track"] + lines.seconds["track"] + time.perf_counter() - began,
+    }
+    keys = {**swarm.input_keys, **{f"detections of {name}": key for name, key in lines.input_keys.items()}}
+    return Way(tracked, swarm.start, swarm.bounds_m, keys, seconds)
+
+
+def detection_files_of(sequence: Sequence, detections: str) -> Mapping[str, Path]:
+    """The file of each camera, as `TrackSettings.detections` says.
+
+    Raises:
+        InputError: there is none.
+    """
+    if detections != YOLO:
+        return detection_files(Path(detections), sequence.rig.names)
+    if sequence.detections is None:
+        raise InputError(
+            sequence.folder,
+            expected="detections in dl_data for --detections yolo",
+            found="none",
+            remedy="use --detections blobs",
+        )
+    return {name: path for name, path in sequence.detections.items() if name in sequence.rig.names}
+
+
+def _starts(
+    sequence: Sequence,
+    silhouettes: Silhouettes,
+    settings: collections.abc.Sequence[TrackSettings],
+    bounds_m: list[Float[np.ndarray, "2 3"]],
+) -> list[Start]:
+    """The start of each run; runs that differ in nothing but their seeds have the same."""
+    starts: dict[TrackSettings, Start] = {}
+    alike = [msgspec.structs.replace(each, seed=0) for each in settings]
+    for each, bounds in zip(alike, bounds_m, strict=True):
+        if each not in starts:
+            starts[each] = find_start(sequence, silhouettes, each, bounds)
+    return [starts[each] for each in alike]

@@ -1,0 +1,143 @@
+"""Two methods' tracks as one: made-up tracks of which every error is known."""
+
+import jax
+import numpy as np
+import pytest
+
+from psotrack import sizes
+from psotrack.fitness import ScoreSettings
+from psotrack.fusion import fused
+from psotrack.settings import TrackSettings
+from psotrack.sizes import Looks
+from psotrack.tracker import COMMON, TrackerInfo
+from psotrack.tracking import Arrival, Tracked
+from psotrack.trajectories import Status
+
+FPS, FRAMES = 25.0, 200
+SETTINGS = TrackSettings()
+#: Errors of the swarm are small along x and large along y; those of the lines the other way round.
+SWARM_STD_M, LINES_STD_M = np.array([0.005, 0.02, 0.01]), np.array([0.02, 0.005, 0.01])
+
+
+def paths(num_drones):
+    """(frames, drones, 3): drones on circles, a metre apart."""
+    angle = np.arange(FRAMES)[:, None] / FPS + 2.0 * np.arange(num_drones)
+    height_m = np.broadcast_to(1.0 + np.arange(num_drones), angle.shape)
+    return np.stack([np.cos(angle), np.sin(angle), height_m], axis=-1)
+
+
+def tracked(truth_m, std_m, *, seed, factor=1.0, hidden=(), offset_m=(0.0, 0.0, 0.0), arrivals=()):
+    """What a method would yield that measures the truth with such errors; hidden is (drone, first, last frame)."""
+    rng = np.random.default_rng(seed)
+    measured_m = truth_m + std_m * rng.standard_normal(truth_m.shape) + offset_m
+    status = np.full(truth_m.shape[:2], int(Status.TRACKED))
+    for drone, first, last in hidden:
+        status[first:last, drone] = Status.LOST
+    measured_m[status != Status.TRACKED] = np.nan
+    covariance_m2 = np.broadcast_to(factor * np.diag(np.square(std_m)), (*truth_m.shape, 3))
+    info = TrackerInfo(
+        position_m=measured_m,
+        velocity_m_s=np.zeros_like(measured_m),
+        covariance_m2=covariance_m2,
+        measured_m=measured_m,
+        measured_covariance_m2=covariance_m2,
+        fitness=np.where(status == Status.TRACKED, 0.5, 0.0),
+        num_cameras=np.where(status == Status.TRACKED, 4, 0),
+        status=status,
+    )
+    num_drones, windows = truth_m.shape[1], len(SETTINGS.windows)
+    size_m = np.full((num_drones, 3), 0.4, np.float32)
+    learned = sizes.init(size_m, np.zeros(size_m.shape, bool), ScoreSettings(windows=SETTINGS.windows))
+    looks = Looks(np.full(truth_m.shape, np.nan), np.full((FRAMES, num_drones, windows), np.nan))
+    return Tracked(info, jax.tree.map(np.asarray, learned), looks, tuple(arrivals), 0.5)
+
+
+def both(truth_m, swarm=None, lines=None, settings=SETTINGS):
+    first = tracked(truth_m, SWARM_STD_M, seed=0, **(swarm or {}))
+    # Whose covariances the fusion takes to be of the cameras' disagreement alone.
+    second = tracked(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON, **(lines or {}))
+    return first, second, fused(first, second, settings, fps=FPS)
+
+
+def test_information_adds_up():
+    truth_m = paths(3)
+    _, _, together = both(truth_m)
+    # About each drone's own median, as the middle that counts is known no better; and by the median of that, as one
+    # frame in 1000 is beyond the gate, where the swarm's alone counts.
+    off_m = together.info.measured_m - truth_m
+    std_m = 1.4826 * np.median(np.abs(off_m - np.median(off_m, axis=0)), axis=(0, 1))
+    expected_m = 1 / np.sqrt(1 / SWARM_STD_M**2 + 1 / LINES_STD_M**2)
+    # The spread of 600 is known to 4 % so.
+    np.testing.assert_allclose(std_m, expected_m, rtol=0.1)
+    diagonal_m2 = np.diagonal(together.info.measured_covariance_m2, axis1=-2, axis2=-1)
+    np.testing.assert_allclose(np.median(diagonal_m2, axis=(0, 1)), expected_m**2, rtol=1e-9)
+    assert (together.info.status == Status.TRACKED).all()
+    assert together.compile_s == 1.0
+
+
+def test_the_middle_of_a_silhouette_is_what_counts():
+    """Boxes whose middles are 8 cm higher: nothing of that is seen in what comes of it."""
+    truth_m = paths(2)
+    _, _, together = both(truth_m, lines={"offset_m": (0.01, 0.0, 0.08)})
+    off_m = (together.info.measured_m - truth_m).mean(axis=(0, 1))
+    np.testing.assert_allclose(off_m, 0.0, atol=0.003)
+
+
+def test_where_one_does_not_see_a_drone_the_other_one_does():
+    truth_m = paths(2)
+    hidden = [(0, 50, 100)]
+    first, second, together = both(truth_m, swarm={"hidden": hidden}, lines={"hidden": [(1, 120, 150)]})
+    assert (together.info.status == Status.TRACKED).all()
+    # Alone, moved by the offset of the middles and no more.
+    moved_m = together.info.measured_m[50:100, 0] - second.info.measured_m[50:100, 0]
+    assert np.ptp(moved_m, axis=0).max() < 1e-12
+    np.testing.assert_array_equal(together.info.measured_m[120:150, 1], first.info.measured_m[120:150, 1])
+    assert np.linalg.norm(together.info.position_m[50:100, 0] - truth_m[50:100, 0], axis=-1).max() < 0.06
+
+
+def test_what_neither_sees_coasts_and_is_lost():
+    truth_m = paths(1)
+    hidden = {"hidden": [(0, 50, 100)]}
+    _, _, together = both(truth_m, swarm=hidden, lines=hidden)
+    status = together.info.status[:, 0]
+    frames = round(SETTINGS.max_coasting_s * FPS)
+    assert (status[50 : 50 + frames] == Status.COASTING).all()
+    assert (status[50 + frames : 100] == Status.LOST).all()
+    variance = np.trace(together.info.covariance_m2[49:100, 0], axis1=1, axis2=2)
+    assert (np.diff(variance) > 0).all()
+
+
+def test_drones_that_only_the_lines_know_come_after_the_others():
+    truth_m = paths(3)
+    swarm = tracked(truth_m[:, [2, 0]], SWARM_STD_M, seed=0, arrivals=[Arrival(3, 1, again=False)])
+    arrivals = [Arrival(9, 0, again=False), Arrival(20, 1, again=True)]
+    lines = tracked(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON, arrivals=arrivals)
+    together = fused(swarm, lines, SETTINGS, fps=FPS)
+    np.testing.assert_allclose(together.info.measured_m, truth_m[:, [2, 0, 1]], atol=0.1)
+    # The first of the lines' arrivals is of a drone that the swarm knows.
+    assert together.arrivals == (Arrival(3, 1, again=False), Arrival(20, 2, again=True))
+    assert together.sizes.size_m.shape == (3, 3)
+    assert together.looks.size_m.shape == (FRAMES, 3, 3)
+
+
+def test_where_they_disagree_it_is_the_swarm_that_counts():
+    truth_m = paths(1)
+    swarm = tracked(truth_m, SWARM_STD_M, seed=0)
+    lines = tracked(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON)
+    lines.info.measured_m[80:90] += 0.5
+    together = fused(swarm, lines, SETTINGS, fps=FPS)
+    np.testing.assert_array_equal(together.info.measured_m[80:90], swarm.info.measured_m[80:90])
+
+
+@pytest.mark.parametrize("who", ["swarm", "lines"])
+def test_one_of_them_may_find_nobody(who):
+    truth_m = paths(2)
+    some, nobody = tracked(truth_m, SWARM_STD_M, seed=0), tracked(truth_m[:, :0], SWARM_STD_M, seed=0)
+    pair = (some, nobody) if who == "swarm" else (nobody, some)
+    together = fused(*pair, SETTINGS, fps=FPS)
+    np.testing.assert_array_equal(together.info.measured_m, some.info.measured_m)
+
+
+def test_nobody_may_find_anybody():
+    nobody = tracked(paths(0), SWARM_STD_M, seed=0)
+    assert fused(nobody, nobody, SETTINGS, fps=FPS).info.status.shape == (FRAMES, 0)
