@@ -13,6 +13,7 @@ import click
 from psotrack.cli.calibrate import calibrate
 from psotrack.cli.commands import cli
 from psotrack.cli.detect import detect
+from psotrack.cli.doctor import doctor
 from psotrack.cli.fly import fly
 from psotrack.cli.labels import labels
 from psotrack.cli.simulate import simulate
@@ -28,6 +29,7 @@ cli.add_command(sweep)
 cli.add_command(table)
 cli.add_command(calibrate)
 cli.add_command(detect)
+cli.add_command(doctor)
 cli.add_command(labels)
 cli.add_command(synchronise)
 

@@ -1,0 +1,150 @@
+"""`psotrack doctor`: a sequence's rig checked against its own detections."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import numpy as np
+
+from psotrack.cli.answers import answer, report_to, say
+from psotrack.cli.options import CACHE, FORCE, JOBS, JSON, QUIET, SEQUENCE, cache_folder
+
+if TYPE_CHECKING:
+    from psotrack.cameras import CameraRig
+    from psotrack.doctor import Diagnosis
+
+#: Of the exit, where something was found.
+FOUND = 2
+
+
+@click.command()
+@SEQUENCE
+@click.option(
+    "--detections",
+    default="yolo",
+    show_default=True,
+    metavar="yolo|blobs|FOLDER",
+    help="Of dl_data, blobs of the foreground, or files in its layout.",
+)
+@CACHE
+@JOBS
+@QUIET
+@FORCE
+@JSON
+def doctor(
+    sequence: Path,
+    detections: str,
+    cache: Path | None,
+    jobs: int | None,
+    quiet: bool,
+    force: bool,
+    json_path: Path | None,
+) -> None:
+    """Check the rig of SEQ against what its cameras see, before anybody tracks.
+
+    Says which camera, pair or file disagrees, by how much, and what to do: a camera that is turned or moved, late, of
+    another focal length, or exchanged with another; translations that are centres, millimetres that were read as
+    metres, mirrored axes; a reference of another clock, unit or place. Faults that move what a camera sees by less
+    than the noise of its detections are not found. It takes four viewpoints to tell which camera it is.
+
+    The exit code is 0 if nothing was found, and 2 if something was.
+
+    \b
+    Examples:
+      psotrack doctor data/Real_Data/R12_D4
+      psotrack doctor data/Real_Data/R12_D4 --detections blobs --json -
+    """
+    from psotrack.datasets.dpjait import read_detections, read_sequence
+    from psotrack.doctor import examine
+    from psotrack.methods import detection_files_of
+    from psotrack.settings import BLOBS
+    from psotrack.sightings import from_detections, from_silhouettes
+    from psotrack.silhouette_store import SilhouetteSettings
+    from psotrack.silhouettes import compute
+
+    recording = read_sequence(sequence)
+    report = report_to(quiet)
+    if detections == BLOBS:
+        recording = recording.usable()
+        made = compute(recording, SilhouetteSettings(), cache=cache_folder(cache), jobs=jobs, report=report)
+        sightings = from_silhouettes(made, report)
+    else:
+        files = detection_files_of(recording, detections)
+        boxes = {name: read_detections(path) for name, path in files.items()}
+        sightings = from_detections(boxes, recording.rig, recording.num_frames)
+    diagnosis = examine(recording.rig, sightings, fps=recording.fps, reference=recording.truth)
+    answer(json_path, _content(recording.rig, diagnosis), force)
+    if not quiet and json_path != Path("-"):
+        _print(recording.rig, diagnosis)
+    for finding in diagnosis.findings:
+        say(False, json_path, str(finding))
+    if diagnosis.findings:
+        sys.exit(FOUND)
+    say(quiet, json_path, f"{recording.name}: nothing disagrees")
+
+
+def _rows(rig: CameraRig, diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    """What was measured of each camera."""
+    found = diagnosis.found
+    rows = []
+    for index, name in enumerate(rig.names):
+        residual_px = found.residual_px[:, index][found.used[:, index]]
+        noise_px = found.noise_px[:, index][found.used[:, index]]
+        rows.append(
+            {
+                "camera": name,
+                "detections_per_frame": float(found.num_sightings[index] / max(found.num_frames, 1)),
+                "explained": float(found.share_of_camera[index]),
+                "residual_px": float(np.median(residual_px)) if len(residual_px) else None,
+                "residual_std": float(np.median(residual_px / noise_px)) if len(residual_px) else None,
+                "late_frames": _number(diagnosis.offset_frames[index]),
+                "late_std_frames": _number(diagnosis.offset_std_frames[index]),
+            }
+        )
+    return rows
+
+
+def _content(rig: CameraRig, diagnosis: Diagnosis) -> dict[str, Any]:
+    """The diagnosis as JSON has it, with null where there is no number."""
+    fit = diagnosis.reference
+    return {
+        "findings": [{**vars(finding), "cameras": list(finding.cameras)} for finding in diagnosis.findings],
+        "frames": diagnosis.found.num_frames,
+        "explained": diagnosis.found.share,
+        "cameras": _rows(rig, diagnosis),
+        "epipolar_px": [[_number(value) for value in row] for row in diagnosis.epipolar_px],
+        "reference_m": None if fit is None else fit.before_m,
+    }
+
+
+def _print(rig: CameraRig, diagnosis: Diagnosis) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=box.HORIZONTALS, show_edge=False)
+    for heading in ("camera", "detections/frame", "explained", "median (px)", "(noise)", "late (frames)"):
+        table.add_column(heading, justify="left" if heading == "camera" else "right")
+    for row in _rows(rig, diagnosis):
+        late, std = row["late_frames"], row["late_std_frames"]
+        table.add_row(
+            row["camera"],
+            f"{row['detections_per_frame']:.2f}",
+            f"{row['explained']:.0%}",
+            *("" if row[key] is None else f"{row[key]:.1f}" for key in ("residual_px", "residual_std")),
+            "" if late is None else f"{late:+.2f} ± {std:.2f}",
+        )
+    pairs = Table(box=box.HORIZONTALS, show_edge=False, title="median distance from epipolar lines (px)")
+    for heading in ("", *rig.names):
+        pairs.add_column(heading, justify="right")
+    for name, values in zip(rig.names, diagnosis.epipolar_px, strict=True):
+        pairs.add_row(name, *("" if np.isnan(value) else f"{value:.1f}" for value in values))
+    Console().print(table)
+    Console().print(pairs)
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

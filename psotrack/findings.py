@@ -1,0 +1,122 @@
+"""What a doctor finds, in words: what disagrees, by how much, and what to do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from psotrack.cameras import CameraRig
+from psotrack.reference_fit import NEAR_M, ReferenceFit
+from psotrack.suspects import Explanation, change
+
+#: A fault must explain so many more of a camera's points. Six freedoms fitted to 30 sound points gain 0.015 by chance.
+CLEARLY = 0.05
+#: Of two explanations the simpler one is taken if it gives this share of what the better one gives.
+ALMOST = 0.9
+#: Scales of rig and reference that differ by less are the same: focal lengths are known to a few per cent.
+SAME_SCALE = 0.03
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that disagrees.
+
+    Attributes:
+        kind: a word or two for programs.
+        cameras: names of those that are concerned; none where it is all, or the reference.
+        message: what disagrees, by how much.
+        remedy: what to do.
+    """
+
+    kind: str
+    cameras: tuple[str, ...]
+    message: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.message}; {self.remedy}"
+
+
+def fault_of(rig: CameraRig, index: int, judged: list[Explanation]) -> Finding:
+    """The simplest explanation that is almost as good as the best one, in words."""
+    name, sound = rig.names[index], judged[0]
+    best = max(each.gain for each in judged)
+    fault = next(each for each in judged if each.gain - sound.gain >= ALMOST * (best - sound.gain))
+    if best - sound.gain <= CLEARLY:
+        message = f"camera {name}: it explains {sound.gain:.0%} of the drones that the others see, whatever is changed"
+        return Finding(
+            "disagrees", (name,), message, f"go without it: --cameras without {name}; calibrate it anew"
+        )
+    numbers = f"(explains {fault.gain:.0%} of the drones that the others see, not {sound.gain:.0%})"
+    if fault.kind == "clock":
+        late = "late" if fault.amount > 0 else "early"
+        message = f"camera {name}: its clock is about {abs(fault.amount):.1f} frames {late} {numbers}"
+        return Finding("clock", (name,), message, "shift its video and detections by that")
+    if fault.kind == "focal length":
+        percent = 100 * (1 / fault.amount - 1)
+        how = f"{abs(percent):.0f} % too {'short' if percent < 0 else 'long'}"
+        message = f"camera {name}: its focal length is {how} {numbers}"
+        f_px = fault.camera.K[0, 0]
+        return Finding("focal length", (name,), message, f"try {f_px:.0f} px, or calibrate its lens anew")
+    if fault.kind == "exchanged":
+        other = rig.names[int(fault.amount)]
+        message = f"camera {name}: what it sees fits the calibration of {other} {numbers}"
+        return Finding("exchanged", (name, other), message, "check which video and detections are whose")
+    turn_deg, shift_m = change(rig.cameras[index], fault.camera)
+    how = f"turned by {turn_deg:.1f} degrees" + (
+        f" and moved by {100 * shift_m:.0f} cm" if fault.kind == "moved" else ""
+    )
+    centre = ", ".join(f"{value:.2f}" for value in fault.camera.centre_world)
+    remedy = f"calibrate it anew (`psotrack calibrate`); the drones put it at ({centre}) m"
+    return Finding(fault.kind, (name,), f"camera {name}: it is {how} {numbers}", remedy)
+
+
+def late_clock(name: str, offset: float, std: float) -> Finding:
+    """A clock that is late by `offset` frames, give or take `std`."""
+    late = "late" if offset > 0 else "early"
+    message = f"camera {name}: its clock is {abs(offset):.2f} frames {late}, give or take {std:.2f}"
+    return Finding("clock", (name,), message, "synchronise its video with the others")
+
+
+def reference_findings(fit: ReferenceFit, fps: float) -> list[Finding]:
+    """How the reference is at odds with the rig, if it is."""
+    if fit.agrees and fit.before_m < NEAR_M:
+        return []
+    numbers = f"(median distance to the detections' points {fit.after_m:.2f} m, not {fit.before_m:.2f} m)"
+    if fit.agrees:
+        message = f"the reference: it is {fit.before_m:.2f} m from what the cameras see, at the median"
+        remedy = "no clock, unit or motion explains it: check that it is of this flight"
+        return [Finding("reference", (), message, remedy)]
+    if fit.offset_frames:
+        frames, seconds = abs(fit.offset_frames), abs(fit.offset_frames) / fps
+        where = "ahead of" if fit.offset_frames > 0 else "behind"
+        message = (
+            f"the reference: its clock is {frames} frames ({seconds:.2f} s) {where} the videos' {numbers}"
+        )
+        remedy = "find it to a fraction of a frame with `psotrack synchronise`"
+        return [Finding("reference clock", (), message, remedy)]
+    kind, how = _motion_of(fit)
+    remedy = "bring both into one world"
+    if kind == "reference unit" and abs(abs(np.log10(fit.scale)) - 3) < 0.05:
+        remedy = "one of them is in millimetres and was read as metres: name the right unit"
+    return [Finding(kind, (), f"the reference: against the rig it is {how} {numbers}", remedy)]
+
+
+def _motion_of(fit: ReferenceFit) -> tuple[str, str]:
+    """What lies between reference and rig: the gravest of it, and all of it in words."""
+    parts, kind = [], "reference moved"
+    diagonal = np.diag(fit.R)
+    turn_deg = np.rad2deg(np.arccos(np.clip((np.trace(fit.R) - 1) / 2, -1, 1)))
+    if abs(fit.scale - 1) > SAME_SCALE:
+        kind = "reference unit"
+        parts.append(f"{fit.scale:.4g} times as large")
+    if np.linalg.det(fit.R) < 0:
+        kind = "reference mirrored"
+        axes = ", ".join(axis for axis, value in zip("xyz", diagonal, strict=True) if value < 0)
+        parts.append("mirrored" + (f" in {axes}" if np.abs(diagonal).min() > 0.95 else ""))
+    elif turn_deg > 2:
+        parts.append(f"turned by {turn_deg:.0f} degrees")
+    if np.linalg.norm(fit.shift_m) / fit.scale > NEAR_M / 3 or not parts:
+        parts.append("shifted by ({:.2f}, {:.2f}, {:.2f}) m".format(*fit.shift_m))
+    return kind, ", ".join(parts)

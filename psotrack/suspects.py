@@ -1,0 +1,275 @@
+"""What is wrong with one camera, judged by points that all others agree on.
+
+The points are projected into the camera, and its sightings looked for beside them. Each kind of fault is a family of
+other cameras (turned, moved, of another focal length, another one's) or of other times; the member is taken that
+explains most sightings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
+
+from psotrack.agreement import MIN_VIEWPOINTS, UNEXPLAINED, Agreement, num_viewpoints
+from psotrack.calibration import locate_camera
+from psotrack.camera_clocks import camera_offsets
+from psotrack.cameras import NEAR_M, Camera, CameraRig, project, undistort
+from psotrack.errors import InputError
+from psotrack.reprojection import reconstruct
+from psotrack.sightings import Sightings
+
+#: Points that others see, below which nothing is said of a camera.
+LEAST_POINTS = 30
+#: Focal lengths and delays that are tried.
+_SCALES = np.exp(np.arange(-0.7, 0.7001, 0.02))
+_FINER = np.exp(np.arange(-0.02, 0.0201, 0.005))
+_DELAYS = np.arange(-5.0, 5.01, 0.25)
+#: Pixels of a cell in which shifts of the image are counted, and rounds in which sightings are paired anew.
+_CELL_PX, _ROUNDS = 16.0, 6
+#: A drone flies no farther than this between frames; less than two are apart.
+_STEP_M = 0.3
+#: Clocks that are apart by less are alike, and so are those that are not beyond it by as many standard deviations.
+LATE_FRAMES, CLEARLY_STD = 0.25, 3.0
+#: Runs of frames are put so far apart that the slopes of one (`camera_clocks`) do not reach another.
+_GAP_FRAMES = 15
+
+
+@dataclass(frozen=True)
+class Views:
+    """What others say that a camera should see, and what it sees in the same frames.
+
+    Attributes:
+        point_m: (points, 3), from the other cameras alone.
+        velocity_m: (points, 3), per frame; NaN where the next frames do not show it.
+        box_px: (points, boxes, 2), the camera's sightings in the frame of each point; NaN for none.
+        noise_px: (points, boxes), their standard deviations.
+    """
+
+    point_m: Float[np.ndarray, "points 3"]
+    velocity_m: Float[np.ndarray, "points 3"]
+    box_px: Float[np.ndarray, "points boxes 2"]
+    noise_px: Float[np.ndarray, "points boxes"]
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A fault that a camera may have.
+
+    Attributes:
+        kind: clock, focal length, exchanged, turned, or moved; sound where nothing is wrong.
+        gain: share of the points that the camera's sightings explain, each by how well.
+        camera: as it would be; the one that was read where the fault is none of it.
+        amount: frames late, factor of the focal length, or index of the other camera.
+    """
+
+    kind: str
+    gain: float
+    camera: Camera
+    amount: float = 0.0
+
+
+def views_of(rig: CameraRig, found: Agreement, sightings: Sightings, index: int) -> Views:
+    """The points that others agree on without the camera at `index`, and its sightings."""
+    others = np.arange(len(rig)) != index
+    kept = num_viewpoints(rig.cameras, found.used & others) >= MIN_VIEWPOINTS
+    centre_px, used, frame = found.centre_px[kept], found.used[kept] & others, found.frame[kept]
+    noise_px = np.nan_to_num(found.noise_px[kept], nan=1.0)
+    lines = reconstruct(rig.cameras, centre_px, used.astype(float), noise_px=noise_px, robust=False)
+    there = np.isfinite(lines.position_m).all(axis=-1)
+    point_m, frame = lines.position_m[there], frame[there]
+    return Views(
+        point_m,
+        velocities(frame, point_m),
+        sightings.centre_px[frame, index],
+        sightings.noise_px[frame, index],
+    )
+
+
+def velocities(frame: Int[np.ndarray, "points"], point_m: Float[np.ndarray, "points 3"]) -> np.ndarray:
+    """(points, 3), metres per frame, from the nearest points of the frames before and after; NaN without both."""
+    steps = []
+    for direction in (-1, 1):
+        step = np.full(point_m.shape, np.nan)
+        for number in np.unique(frame):
+            here, there = np.flatnonzero(frame == number), np.flatnonzero(frame == number + direction)
+            if len(there):
+                off = point_m[there] - point_m[here][:, None]
+                distance = np.linalg.norm(off, axis=-1)
+                nearest = distance.argmin(axis=1)
+                rows = np.arange(len(here))
+                near = distance[rows, nearest] < _STEP_M
+                step[here[near]] = off[rows, nearest][near]
+        steps.append(direction * step)
+    return (steps[0] + steps[1]) / 2
+
+
+def gain_of(camera: Camera, views: Views, delay_frames: float = 0.0) -> float:
+    """Share of the points that are explained: 1 - distance² / `UNEXPLAINED` of each, and 0 for one that is not."""
+    return float(np.sum(_fits(camera, views, delay_frames)[0])) / max(len(views.point_m), 1)
+
+
+def explanations(rig: CameraRig, views: Views, index: int) -> list[Explanation]:
+    """The camera as it was read, and the best of each kind of fault, the simplest ones first."""
+    camera = rig.cameras[index]
+    sound = Explanation("sound", gain_of(camera, views), camera)
+    delay = max(_DELAYS.tolist(), key=lambda delay: gain_of(camera, views, delay))
+    scale = max(_SCALES.tolist(), key=lambda scale: gain_of(scaled(camera, scale), views))
+    scale = max((scale * _FINER).tolist(), key=lambda scale: gain_of(scaled(camera, scale), views))
+    lenses = scaled(camera, scale)
+    turned = _turned(camera, views)
+    moved = _moved(turned, views)
+    faults = [
+        Explanation("clock", gain_of(camera, views, delay), camera, delay),
+        Explanation("focal length", gain_of(lenses, views), lenses, scale),
+    ]
+    for other in range(len(rig)):
+        if other != index:
+            there = rig.cameras[other]
+            faults.append(Explanation("exchanged", gain_of(there, views), there, float(other)))
+    faults.append(Explanation("turned", gain_of(turned, views), turned))
+    faults.append(Explanation("moved", gain_of(moved, views), moved))
+    return [sound, *faults]
+
+
+def scaled(camera: Camera, scale: float) -> Camera:
+    """With another focal length."""
+    K = camera.K.copy()
+    K[..., :2, :2] *= scale
+    return replace(camera, K=K)
+
+
+def change(before: Camera, after: Camera) -> tuple[float, float]:
+    """By how many degrees a camera is turned, and by how many metres moved."""
+    R = after.T_cam_world[:3, :3] @ before.T_cam_world[:3, :3].T
+    turn_deg = float(np.rad2deg(Rotation.from_matrix(R).magnitude()))
+    return turn_deg, float(np.linalg.norm(after.centre_world - before.centre_world))
+
+
+def _fits(
+    camera: Camera, views: Views, delay_frames: float = 0.0, widen: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """For each point how well it is explained, and by which sighting."""
+    moved_m = delay_frames * np.nan_to_num(views.velocity_m)
+    pixels, depth = project(camera, views.point_m + moved_m)
+    off = np.sum((views.box_px - pixels[:, None]) ** 2, axis=-1) / (widen * views.noise_px) ** 2
+    off = np.where(np.isfinite(off) & (depth > NEAR_M)[:, None], off, np.inf)
+    best = off.argmin(axis=1)
+    return np.maximum(0.0, 1 - off[np.arange(len(off)), best] / UNEXPLAINED), best
+
+
+def _turned(camera: Camera, views: Views) -> Camera:
+    """The camera turned about its centre: from the commonest shift of the image to rays that agree."""
+    starts = [camera, _shifted(camera, views)]
+    return max((_aligned(start, views) for start in starts), key=lambda each: gain_of(each, views))
+
+
+def _shifted(camera: Camera, views: Views) -> Camera:
+    """Turned so that most points fall on sightings, to a cell of the image."""
+    pixels, depth = project(camera, views.point_m)
+    off = (views.box_px - pixels[:, None])[depth > NEAR_M].reshape(-1, 2)
+    reach = float(camera.image_size_wh.max()) / 2
+    off = off[(np.abs(off) < reach).all(axis=-1)]
+    if not len(off):
+        return camera
+    edges = np.arange(-reach, reach + _CELL_PX, _CELL_PX)
+    count, _, _ = np.histogram2d(off[:, 0], off[:, 1], bins=[edges, edges])
+    x, y = np.unravel_index(count.argmax(), count.shape)
+    shift = np.array([edges[x], edges[y]]) + _CELL_PX / 2
+    angle_y, angle_x = np.arctan(shift / np.diag(camera.K)[:2])
+    # A camera whose image is to the right of where it should be looks too far left.
+    return _turned_by(camera, Rotation.from_rotvec([-angle_x, angle_y, 0.0]).as_matrix())
+
+
+def _turned_by(camera: Camera, R: Float[np.ndarray, "3 3"]) -> Camera:
+    T = camera.T_cam_world.copy()
+    T[:3] = R @ T[:3]
+    return replace(camera, T_cam_world=T)
+
+
+def _aligned(camera: Camera, views: Views) -> Camera:
+    for round_ in range(_ROUNDS):
+        # A cell is wider than the noise.
+        fit, best = _fits(camera, views, widen=3.0 if round_ < _ROUNDS // 2 else 1.0)
+        pairs = np.flatnonzero(fit > 0)
+        if len(pairs) < LEAST_POINTS:
+            return camera
+        seen = _rays(undistort(camera, views.box_px[pairs, best[pairs]]))
+        T = camera.T_cam_world
+        expected = views.point_m[pairs] @ T[:3, :3].T + T[:3, 3]
+        expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
+        U, _, Vt = np.linalg.svd((seen * fit[pairs, None]).T @ expected)
+        camera = _turned_by(camera, U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+    return camera
+
+
+def _moved(camera: Camera, views: Views) -> Camera:
+    """The camera where its sightings put it."""
+    start = camera
+    # What is moved far has few sightings near where they should be: more come with every round.
+    for widen in (3.0, 1.0, 1.0):
+        fit, best = _fits(camera, views, widen=widen)
+        pairs = np.flatnonzero(fit > 0)
+        if len(pairs) < LEAST_POINTS:
+            return start
+        seen_px = views.box_px[pairs, best[pairs]]
+        noise_px = float(np.median(views.noise_px[pairs, best[pairs]]))
+        try:
+            located = locate_camera(
+                views.point_m[pairs], seen_px, np.asarray(camera.K), np.asarray(camera.dist), noise_px
+            )
+        except InputError:
+            return start
+        camera = replace(camera, T_cam_world=located.T_cam_world)
+    return max((start, camera), key=lambda each: gain_of(each, views))
+
+
+def _rays(x: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+    rays = np.column_stack([x, np.ones(len(x))])
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+def late_cameras(
+    rig: CameraRig, found: Agreement, sound: np.ndarray, fps: float
+) -> tuple[Float[np.ndarray, "cameras"], Float[np.ndarray, "cameras"], list[int]]:
+    """How late each sound camera is against the median of them, in frames, its standard deviation, and which are late.
+
+    Middles of boxes that change with the motion leave a tenth of a frame or two, so that less than
+    `LATE_FRAMES` is none.
+    """
+    offset, std = np.full((2, len(rig)), np.nan)
+    index = np.flatnonzero(sound)
+    tracks_px = _tracks(found)[:, :, index]
+    if len(index) < 2 or not np.isfinite(tracks_px).any():
+        return offset, std, []
+    rest = rig.select([rig.names[each] for each in index])
+    clocks = camera_offsets(rest, tracks_px, fps)
+    offset[index] = clocks.offset_frames - np.median(clocks.offset_frames)
+    std[index] = clocks.std_frames
+    late = [each for each in index.tolist() if abs(offset[each]) > LATE_FRAMES + CLEARLY_STD * std[each]]
+    return offset, std, late
+
+
+def _tracks(found: Agreement) -> Float[np.ndarray, "frames drones cameras 2"]:
+    """The sightings of points that follow each other, so far apart between runs of frames that these do not touch."""
+    frames = np.unique(found.frame)
+    row = np.cumsum(np.diff(frames, prepend=frames[:1]).clip(0, _GAP_FRAMES))
+    most = max(np.bincount(found.frame).tolist(), default=1)
+    tracks_px = np.full((row[-1] + 1 if len(row) else 1, 3 * most, *found.centre_px.shape[1:]), np.nan)
+    before_m, before, last = np.empty((0, 3)), np.empty(0, int), -2
+    for frame, at in zip(frames.tolist(), row.tolist(), strict=True):
+        here = np.flatnonzero(found.frame == frame)
+        slot = np.full(len(here), -1)
+        if len(before) and frame == last + 1:
+            distance = np.linalg.norm(found.position_m[here][:, None] - before_m, axis=-1)
+            for mine, theirs in zip(*linear_sum_assignment(distance), strict=True):
+                slot[mine] = before[theirs] if distance[mine, theirs] < _STEP_M else -1
+        # A track that begins takes a place that none of the frame before had.
+        free = [each for each in range(3 * most) if each not in slot and each not in before]
+        slot[slot < 0] = free[: int((slot < 0).sum())]
+        tracks_px[at, slot] = np.where(found.used[here][..., None], found.centre_px[here], np.nan)
+        before_m, before, last = found.position_m[here], slot, frame
+    return tracks_px

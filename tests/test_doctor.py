@@ -1,0 +1,316 @@
+"""A rig against its own data: faults that are planted one by one are named, and sound rigs are left in peace."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import jaxtyping
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from helpers import ring_rig
+from scipy.spatial.transform import Rotation
+
+from psotrack.agreement import Agreement
+from psotrack.cameras import CameraRig, project
+from psotrack.cli.doctor import doctor
+from psotrack.datasets.dpjait import write_calibration, write_detections, write_poses
+from psotrack.detections import Detections
+from psotrack.doctor import examine, sampled_frames
+from psotrack.sightings import from_detections
+from psotrack.trajectories import Trajectories
+
+#: Two minutes of small calls, each of which is checked.
+pytestmark = pytest.mark.slow
+
+FPS, FRAMES = 25.0, 30
+SPAN_M = np.array([0.5, 0.2])
+
+
+def flights(num_drones, frames=FRAMES, seed=0):
+    """(frames + 1, drones, 3): closed curves through the room, each drone on its own level, at about 1.5 m/s."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(frames)[:, None] / FPS
+    phase = rng.uniform(0, 2 * np.pi, (3, num_drones))
+    x_m = 1.5 * np.sin(0.9 * time_s + phase[0])
+    y_m = 1.2 * np.sin(1.1 * time_s + phase[1])
+    z_m = 0.6 + 0.45 * np.arange(num_drones) + 0.1 * np.sin(1.7 * time_s + phase[2])
+    return np.stack([x_m, y_m, z_m], axis=-1)
+
+
+def seen_by(rig, truth_m, *, late=None, missed=0.05, false_alarms=0.1, jitter=0.02, seed=0):
+    """Boxes about the drones' middles as a detector finds them; a late camera sees them later (frames, by index)."""
+    rng = np.random.default_rng(seed)
+    number = np.arange(len(truth_m))
+    found = {}
+    for index, name in enumerate(rig.names):
+        one = rig.cameras[index]
+        delay = (late or {}).get(index, 0.0)
+        then = np.clip(number + delay, 0, len(truth_m) - 1)
+        before = np.minimum(then.astype(int), len(truth_m) - 2)
+        share = (then - before)[:, None, None]
+        pixels, depth = project(one, (1 - share) * truth_m[before] + share * truth_m[before + 1])
+        size = one.K[0, 0] * SPAN_M / depth[..., None]
+        middle = pixels + 0.5 + jitter * size * rng.standard_normal(pixels.shape)
+        inside = ((middle > 0) & (middle < one.image_size_wh)).all(axis=-1) & (
+            rng.random(depth.shape) >= missed
+        )
+        frame, drone = np.nonzero(inside)
+        low, high = (middle + sign * size / 2 for sign in (-1, 1))
+        xyxy = np.concatenate([low, high], axis=-1)[frame, drone]
+        alarm = np.flatnonzero(rng.random(len(truth_m)) < false_alarms)
+        corner = rng.random((len(alarm), 2)) * (one.image_size_wh - 100)
+        frame, xyxy = np.append(frame, alarm), np.concatenate([xyxy, np.hstack([corner, corner + 60])])
+        order = np.argsort(frame, kind="stable")
+        found[name] = Detections(frame[order], xyxy[order], np.ones(len(order)))
+    return found
+
+
+def reference_of(position_m):
+    frame = np.arange(len(position_m))
+    names = tuple(f"dron{drone + 1}" for drone in range(position_m.shape[1]))
+    return Trajectories(frame, frame / FPS, names, position_m)
+
+
+@pytest.fixture(autouse=True)
+def _checked_once(request):
+    """Types are checked in the test of the command, where all of it runs; in every test that takes minutes."""
+    jaxtyping.config.update("jaxtyping_disable", request.function is not test_the_command)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+RIG = ring_rig(5, coefficients=4, image_size_wh=(1920, 1080))
+TRUTH_M = flights(2)
+SEEN = seen_by(RIG, TRUTH_M)
+
+
+def examined(rig, seen=SEEN, reference_m=TRUTH_M):
+    sightings = from_detections(seen, rig, FRAMES)
+    reference = None if reference_m is None else reference_of(reference_m)
+    return examine(rig, sightings, fps=FPS, reference=reference)
+
+
+def only_finding(*args, **kwargs):
+    (finding,) = examined(*args, **kwargs).findings
+    return finding
+
+
+def posed(R, t_m, rig=RIG):
+    T = rig.cameras.T_cam_world.copy()
+    T[:, :3, :3], T[:, :3, 3] = R, t_m
+    return CameraRig(rig.names, replace(rig.cameras, T_cam_world=T))
+
+
+def with_one(index, turn=(0.0, 0.0, 0.0), shift_m=(0.0, 0.0, 0.0)):
+    """One camera turned about its own axes, in degrees, and moved."""
+    R, centre = RIG.cameras.T_cam_world[:, :3, :3].copy(), RIG.cameras.centre_world.copy()
+    R[index] = Rotation.from_rotvec(turn, degrees=True).as_matrix() @ R[index]
+    centre[index] += shift_m
+    return posed(R, -np.matvec(R, centre))
+
+
+def with_intrinsics(index, factor, rows=2):
+    K = RIG.cameras.K.copy()
+    K[index, :2, :rows] *= factor
+    return CameraRig(RIG.names, replace(RIG.cameras, K=K))
+
+
+R, T_M = RIG.cameras.T_cam_world[:, :3, :3], RIG.cameras.T_cam_world[:, :3, 3]
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_nothing_is_wrong_with_sound_rigs(seed):
+    """Rigs of 4 to 6 cameras, 2 or 3 drones, with and without lenses, detectors good and bad."""
+    rng = np.random.default_rng(seed)
+    num_cameras, num_drones = 4 + seed % 3, 2 + seed % 2
+    rig = ring_rig(num_cameras, coefficients=(0, 4, 5, 8)[seed % 4], image_size_wh=(1920, 1080))
+    truth_m = flights(num_drones, seed=seed)
+    noise = {"missed": 0.15 * rng.random(), "false_alarms": 0.3 * rng.random(), "jitter": 0.05 * rng.random()}
+    diagnosis = examined(rig, seen_by(rig, truth_m, seed=seed, **noise), truth_m)
+    assert diagnosis.findings == ()
+    assert diagnosis.reference.before_m < 0.05
+    # Errors of a quarter of a frame are complained of.
+    assert np.nanmax(np.abs(diagnosis.offset_frames)) < 0.25
+
+
+@pytest.mark.parametrize("degrees", [1.0, 8.0])
+def test_a_camera_that_is_turned(degrees):
+    finding = only_finding(with_one(2, turn=(0.0, degrees, 0.0)))
+    assert (finding.kind, finding.cameras) == ("turned", ("c2",))
+    assert f"turned by {degrees:.1f} degrees" in finding.message
+
+
+def test_a_camera_that_was_moved():
+    seen = seen_by(RIG, TRUTH_M, missed=0.0, false_alarms=0.0, jitter=0.0)
+    finding = only_finding(with_one(4, shift_m=(0.3, 0.3, 0.0)), seen)
+    assert (finding.kind, finding.cameras) == ("moved", ("c4",))
+    # Without noise, the drones put it where it was, but for what is paired with the wrong drone.
+    (moved_cm,) = (float(word) for word in finding.message.split() if word.isdigit() and int(word) > 9)
+    assert abs(moved_cm - 42.4) < 3.5
+
+
+@pytest.mark.parametrize("delay", [0.6, 3.0])
+def test_a_camera_that_is_late(delay):
+    diagnosis = examined(RIG, seen_by(RIG, TRUTH_M, late={1: delay}))
+    (finding,) = diagnosis.findings
+    assert (finding.kind, finding.cameras) == ("clock", ("c1",))
+    assert "late" in finding.message
+    said = float(finding.message.split(" frames")[0].split()[-1])
+    assert abs(said - delay) < 0.3
+
+
+def test_translation_that_is_the_centre():
+    finding = only_finding(posed(R, RIG.cameras.centre_world))
+    assert (finding.kind, finding.cameras) == ("translation or centre", ())
+    assert "rotation" not in finding.message
+
+
+def test_poses_from_camera_to_world():
+    finding = only_finding(posed(R.swapaxes(1, 2), RIG.cameras.centre_world))
+    assert finding.kind == "translation or centre"
+    assert "from camera to world" in finding.message
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"), [(1e3, "millimetres were read as metres"), (1e-3, "metres were read as millimetres")]
+)
+def test_a_unit_that_was_mistaken(factor, words):
+    finding = only_finding(posed(R, factor * T_M))
+    assert finding.kind == "unit"
+    assert words in finding.message
+
+
+def test_camera_axes_as_in_opengl():
+    flip = np.array([1.0, -1.0, -1.0])
+    finding = only_finding(posed(flip[:, None] * R, flip * T_M))
+    assert finding.kind == "mirrored axes"
+    assert "y, z are mirrored as in OpenGL" in finding.message
+
+
+def test_a_left_handed_world():
+    """The third axis of world and cameras mirrored, which leaves rotations rotations."""
+    flip = np.array([1.0, 1.0, -1.0])
+    finding = only_finding(posed(flip[:, None] * R * flip, flip * T_M))
+    assert finding.kind == "mirrored axes"
+    assert "left-handed" in finding.message
+
+
+def test_two_cameras_that_are_exchanged():
+    """Of four: no three agree then."""
+    rig = ring_rig(4, image_size_wh=(1920, 1080))
+    seen = seen_by(rig, TRUTH_M)
+    seen["c1"], seen["c3"] = seen["c3"], seen["c1"]
+    finding = only_finding(rig, seen)
+    assert (finding.kind, finding.cameras) == ("exchanged", ("c1", "c3"))
+
+
+def test_a_focal_length_that_is_wrong():
+    finding = only_finding(with_intrinsics(3, 1.06))
+    assert (finding.kind, finding.cameras) == ("focal length", ("c3",))
+    assert "6 % too long" in finding.message
+
+
+def test_all_focal_lengths_wrong():
+    finding = only_finding(with_intrinsics(slice(None), 1.15))
+    assert (finding.kind, finding.cameras) == ("focal lengths", ())
+    assert "too long" in finding.message
+
+
+def test_intrinsics_of_images_half_as_large():
+    finding = only_finding(with_intrinsics(slice(None), 0.5, rows=3))
+    assert finding.kind == "image size"
+    assert finding.cameras == RIG.names
+    assert "0.50 times as large" in finding.remedy
+
+
+@pytest.mark.parametrize(
+    ("kind", "words", "reference_m"),
+    [
+        ("reference unit", "millimetres", 1e3 * TRUTH_M),
+        ("reference clock", "8 frames (0.32 s) ahead", np.roll(TRUTH_M, 8, axis=0)),
+        ("reference mirrored", "mirrored in y", TRUTH_M * [1.0, -1.0, 1.0]),
+        ("reference moved", "shifted by (1.00, 0.50, ", TRUTH_M + np.array([1.0, 0.5, 0.0])),
+        ("reference", "of this flight", flights(2, seed=9) * [0.2, 3.0, 1.0]),
+    ],
+)
+def test_a_reference_at_odds_with_the_rig(kind, words, reference_m):
+    finding = only_finding(RIG, reference_m=reference_m)
+    assert finding.kind == kind
+    assert words in str(finding)
+
+
+def test_detections_of_another_flight_fit_no_reading():
+    """Each camera sees a flight of its own: nothing is made up to explain it."""
+    seen = {name: seen_by(RIG, flights(2, seed=20 + index))[name] for index, name in enumerate(RIG.names)}
+    assert only_finding(RIG, seen).kind == "no agreement"
+
+
+@pytest.mark.parametrize("num_boxes", [0, 1])
+def test_hardly_anything_seen(num_boxes):
+    seen = {name: Detections(boxes.frame[:num_boxes], boxes.xyxy[:num_boxes], boxes.confidence[:num_boxes])
+            for name, boxes in SEEN.items()}  # fmt: skip
+    assert only_finding(RIG, seen).kind == "too little seen"
+    assert only_finding(RIG, {}).kind == "too little seen"
+
+
+def test_frames_are_those_of_the_video():
+    for num_frames in (0, 1, 10, 15, 40, 5000):
+        frames = sampled_frames(num_frames)
+        assert len(frames) == min(num_frames, 60) or 15 <= len(frames) <= 60
+        assert ((frames >= 0) & (frames < num_frames)).all()
+
+
+def write_sequence(folder, rig, seen, truth_m):
+    (folder / "dl_data").mkdir(parents=True)
+    write_calibration(folder / "cameras_calibration.csv", rig)
+    for name in rig.names:
+        write_detections(folder / "dl_data" / f"{name}.csv", seen[name])
+        video = cv2.VideoWriter(str(folder / f"{name}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), FPS, (320, 240))
+        for _ in range(len(truth_m)):
+            video.write(np.zeros((240, 320, 3), np.uint8))
+        video.release()
+    for drone in range(truth_m.shape[1]):
+        turned = np.tile([1.0, 0.0, 0.0, 0.0], (len(truth_m), 1))
+        write_poses(folder / f"dron{drone + 1}_pos_25.csv", truth_m[:, drone], turned)
+    return folder
+
+
+def test_the_command(tmp_path):
+    small = ring_rig(4)
+    K = small.cameras.K.copy()
+    K[:, 1, 1] = K[:, 0, 0]
+    small = CameraRig(small.names, replace(small.cameras, K=K))
+    seen = seen_by(small, TRUTH_M)
+    folder = write_sequence(tmp_path / "sound", small, seen, TRUTH_M)
+    result = CliRunner(env={"COLUMNS": "200"}).invoke(doctor, [str(folder)], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert "nothing disagrees" in result.output
+
+    centred = posed(small.cameras.T_cam_world[:, :3, :3], small.cameras.centre_world, small)
+    folder = write_sequence(tmp_path / "centred", centred, seen, TRUTH_M)
+    result = CliRunner(env={"COLUMNS": "200"}).invoke(doctor, [str(folder), "-q"], catch_exceptions=False)
+    assert result.exit_code == 2
+    assert result.output.count("\n") == 1
+    assert "write t = -R C" in result.output
+    result = CliRunner().invoke(doctor, [str(folder), "--json", "-"], catch_exceptions=False)
+    assert result.exit_code == 2
+    answer = json.loads(result.output)
+    assert [finding["kind"] for finding in answer["findings"]] == ["translation or centre"]
+    assert [row["camera"] for row in answer["cameras"]] == list(small.names)
+
+
+def test_no_more_than_everything_is_explained():
+    """Boxes of two drones that are one in an image count for both."""
+    merged = Agreement(
+        frame=np.zeros(2, int),
+        position_m=np.zeros((2, 3)),
+        centre_px=np.zeros((2, 3, 2)),
+        noise_px=np.ones((2, 3)),
+        used=np.ones((2, 3), bool),
+        residual_px=np.zeros((2, 3)),
+        num_sightings=np.array([1, 2, 4]),
+        num_frames=1,
+    )
+    assert merged.share_of_camera.tolist() == [1.0, 1.0, 0.5]
+    assert merged.share == 6 / 7
