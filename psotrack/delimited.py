@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from psotrack.errors import InputError
-from psotrack.files import written_whole
+from psotrack.files import read_text, written_whole
 
 #: A column's name and, in brackets, its unit: `pos_x[m]`.
 _HEADER = re.compile(r"(?P<name>[^\[]*?)\s*(?:\[(?P<unit>[^\]]*)\])?")
@@ -114,16 +114,8 @@ def read_rows(path: Path, separator: str) -> list[Row]:
     Raises:
         InputError: the file cannot be read or is no text.
     """
-    try:
-        # utf-8-sig swallows the byte order mark that spreadsheets put first.
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        found = (error.strerror or str(error)).lower()
-        raise InputError(path, expected="a file to read", found=found) from error
-    except UnicodeDecodeError as error:
-        raise InputError(path, expected="text", found=f"a byte that is none at {error.start}") from error
     rows = []
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
         cells = tuple(cell.strip() for cell in line.split(separator))
         if any(cells):
             # One separator at the end of a line ends its last cell and starts none.

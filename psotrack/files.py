@@ -1,4 +1,4 @@
-"""Writing files so that nobody ever loses one: beside the target first, then renamed over it."""
+"""Reading text, and writing files so that nobody ever loses one: beside the target first, then renamed over it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from psotrack.errors import OutputError
+from psotrack.errors import InputError, OutputError
 
 
 def refuse_to_overwrite(path: Path, force: bool) -> None:
@@ -40,6 +40,21 @@ def written_whole(path: Path) -> Iterator[Path]:
         ) from error
     finally:
         _remove(temporary)
+
+
+def read_text(path: Path) -> str:
+    """The text in a file, without the byte order mark that spreadsheets put first.
+
+    Raises:
+        InputError: the file cannot be read or is no text.
+    """
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        found = (error.strerror or str(error)).lower()
+        raise InputError(path, expected="a file to read", found=found) from error
+    except UnicodeDecodeError as error:
+        raise InputError(path, expected="text", found=f"a byte that is none at {error.start}") from error
 
 
 def _replace(temporary: Path, path: Path) -> None:

@@ -31,7 +31,7 @@ from scipy.spatial.transform import Rotation
 from psotrack.cameras import Camera, CameraRig, camera, stack
 from psotrack.datasets.dpjait import read_calibration, write_calibration
 from psotrack.errors import InputError, OutputError
-from psotrack.files import refuse_to_overwrite, written_whole
+from psotrack.files import read_text, refuse_to_overwrite, written_whole
 from psotrack.schema import read_toml
 
 #: What a rotation's rows may be off from unit length and right angles: files with 8 digits pass.
@@ -180,13 +180,7 @@ def _toml_fields(path: Path) -> Iterator[tuple[str, _Fields]]:
 
 def _yaml_fields(path: Path) -> Iterator[tuple[str, _Fields]]:
     """The maps of the cameras, in a sequence `cameras`, or one camera alone as OpenCV's own samples write it."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        found = (error.strerror or str(error)).lower()
-        raise InputError(path, expected="a file to read", found=found) from error
-    except UnicodeDecodeError as error:
-        raise InputError(path, expected="text", found=f"a byte that is none at {error.start}") from error
+    text = read_text(path)
     # OpenCV knows the format by its first line.
     header = "" if text.startswith("%YAML") else "%YAML:1.0\n---\n"
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

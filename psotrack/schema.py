@@ -19,6 +19,7 @@ import msgspec
 from msgspec import inspect
 
 from psotrack.errors import InputError, PsotrackError
+from psotrack.files import read_text
 
 #: A fault: its field, what was expected, what was found, what to do.
 Raise = Callable[[str, str, str, str], PsotrackError]
@@ -62,12 +63,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         InputError: the file cannot be read, or is no TOML; the message names the line.
     """
     try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        found = (error.strerror or str(error)).lower()
-        raise InputError(path, expected="a file to read", found=found) from error
-    except UnicodeDecodeError as error:
-        raise InputError(path, expected="text", found=f"a byte that is none at {error.start}") from error
+        return tomllib.loads(read_text(Path(path)))
     except ValueError as error:
         # A TOMLDecodeError, or an integer of thousands of digits.
         reason, _, place = str(error).removesuffix(")").partition(" (at ")

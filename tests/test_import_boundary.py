@@ -30,7 +30,7 @@ DEPTH = {
     "compiled": 0,
     "errors": 0,
     "progress": 0,
-    "schema": 1,
+    "schema": 2,
     "files": 1,
     "cameras": 1,
     "crosses": 1,

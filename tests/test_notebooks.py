@@ -17,7 +17,7 @@ SCRIPTS = sorted((ROOT / "notebooks").glob("[a-z]*.py"))
 #: So that people can read them where repositories are shown, and clone them.
 MOST_BYTES = 1_000_000
 #: What begins like this lies on somebody's machine; on this one, wherever the checkout is.
-MACHINE = re.compile(rf"(?<![\w.])(/home/|/root/|/tmp/|/Users/|[A-Z]:\\|{re.escape(str(ROOT))})")
+MACHINE = re.compile(rf"(?<![\w.])(/(home|root|tmp|Users)/|[A-Z]:\\|{re.escape(str(ROOT))})")
 
 each = pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
 
