@@ -165,8 +165,12 @@ def _of_lenses(rig: CameraRig) -> tuple[list[Finding], np.ndarray]:
 
 def _nothing_agrees(found: Agreement) -> Finding:
     seen = int(found.num_sightings.sum())
-    if seen < LEAST_POINTS:
-        message = f"the detections: only {seen} in the {found.num_frames} frames that were looked at"
+    # What little there is may well agree.
+    if seen < LEAST_POINTS or found.share >= LEAST_SHARE:
+        message = (
+            f"the detections: only {seen}, of {len(found.frame)} places that three viewpoints see, in the "
+            f"{found.num_frames} frames that were looked at"
+        )
         return Finding(
             "too little seen", (), message, "nothing can be said of the rig; pass other --detections"
         )

@@ -314,3 +314,12 @@ def test_no_more_than_everything_is_explained():
     )
     assert merged.share_of_camera.tolist() == [1.0, 1.0, 0.5]
     assert merged.share == 6 / 7
+
+
+def test_a_sound_rig_that_is_hardly_used_is_not_blamed():
+    """Two drones over a few frames: all agree, but it is too little to judge by."""
+    truth_m = flights(2)[:10]
+    seen = from_detections(seen_by(RIG, truth_m), RIG, len(truth_m))
+    (finding,) = examine(RIG, seen, fps=FPS).findings
+    assert finding.kind == "too little seen"
+    assert "the rig" not in finding.message
