@@ -101,6 +101,7 @@ DEPTH = {
     "findings": 8,
     "doctor": 9,
     "crossings": 4,
+    "inside_out": 6,
     "projection_lines": 11,
     "fusion": 11,
     "finishing": 11,

@@ -33,7 +33,7 @@ def note_run(manifest: dict[str, Any], grid: Grid, origin: Mapping[str, Any]) ->
     asked = {name: value for name, value in asdict(grid).items() if name != "where"}
     # As it will be read again, where tuples are lists.
     entry = json.loads(json.dumps({"grid": asked, "cells": len(grid.cells()), **origin}))
-    now = datetime.now(UTC).isoformat(timespec="seconds")
+    now = datetime.now(UTC).isoformat(timespec="milliseconds")
     for run in manifest["runs"]:
         if {name: value for name, value in run.items() if name not in ("first", "last")} == entry:
             run["last"] = now

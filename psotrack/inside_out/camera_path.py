@@ -1,0 +1,269 @@
+"""`CameraPath`: where a moving camera is in every frame and how it is turned, and its table on disk.
+
+The table has one row per frame, and the columns that `psotrack.trajectory_files` reads among its own: every command
+that reads tracks reads it too.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntFlag
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
+from scipy.spatial.transform import Rotation
+
+from psotrack.delimited import Row, Table, read_table, write_rows
+from psotrack.errors import InputError
+from psotrack.files import refuse_to_overwrite
+from psotrack.trajectories import Status, Trajectories
+
+#: Axes of the covariance: along the world's axes in metres, then small turns about the camera's own in radians.
+_AXES = "xyzabc"
+_UPPER = np.triu_indices(6)
+_POSITION = ("x_m", "y_m", "z_m")
+_VELOCITY = ("vx_m_s", "vy_m_s", "vz_m_s")
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_ROTATION = tuple(f"r{row}{column}" for row, column in itertools.product("123", repeat=2))
+_ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
+_COVARIANCE = tuple(_AXES[row] + _AXES[column] for row, column in zip(*_UPPER, strict=True))
+_STATUS = {status.label: status for status in Status}
+_SEPARATOR = ","
+
+#: Columns: a body's axes (x ahead, y left, z up) in a camera's (x right, y down, z ahead).
+_BODY_IN_CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+
+class Flag(IntFlag):
+    """What is to be known of a frame beside its status."""
+
+    #: Fewer markers than were asked for; none is no such flag.
+    FEW_MARKERS = 1
+    #: Another pose fits about as well, and nothing told which it is.
+    AMBIGUOUS = 2
+    #: The frame's own pose did not fit the motion and was not used.
+    GATED = 4
+
+    @property
+    def label(self) -> str:
+        """The words in tables, with + between them."""
+        return "+".join(flag.name.lower() for flag in Flag if flag in self and flag.name)
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Poses of a camera over frames. What is not known of a frame is NaN.
+
+    Attributes:
+        frame: (frames,), numbers of the video frames, 0-based, increasing.
+        time_s: (frames,), seconds, increasing.
+        position_m: (frames, 3), the camera's centre, world.
+        orientation_wxyz: (frames, 4), unit quaternions, camera to world; camera axes x right, y down, z ahead.
+        covariance: (frames, 6, 6), of the position along the world's axes (m) and of a small turn about the
+            camera's axes (rad): the camera is turned by R exp([turn]) where R is what is given.
+        num_markers: (frames,), markers that the pose is from.
+        reprojection_px: (frames,), root mean square over their corners of the distance in the image.
+        ambiguity: (frames,), probability that another pose is the right one, from 0 to 1/2.
+        status: (frames,), values of `Status`: `TRACKED` where the frame's own markers tell, `COASTING` where the motion
+            does, `LOST` where there is no pose.
+        flags: (frames,), values of `Flag`.
+        velocity_m_s: (frames, 3), world, where a filter tells it.
+    """
+
+    frame: Int[np.ndarray, "frames"]
+    time_s: Float[np.ndarray, "frames"]
+    position_m: Float[np.ndarray, "frames 3"]
+    orientation_wxyz: Float[np.ndarray, "frames 4"]
+    covariance: Float[np.ndarray, "frames 6 6"]
+    num_markers: Int[np.ndarray, "frames"]
+    reprojection_px: Float[np.ndarray, "frames"]
+    ambiguity: Float[np.ndarray, "frames"]
+    status: Int[np.ndarray, "frames"]
+    flags: Int[np.ndarray, "frames"]
+    velocity_m_s: Float[np.ndarray, "frames 3"] | None = None
+
+    def __post_init__(self) -> None:
+        for name, shape in {"position_m": (3,), "orientation_wxyz": (4,), "covariance": (6, 6)}.items():
+            found = getattr(self, name).shape
+            if found != (len(self.frame), *shape):
+                expected = f"shape {(len(self.frame), *shape)}"
+                raise InputError(f"camera_path.{name}", expected=expected, found=f"{found}")
+        if np.any(np.diff(self.frame) <= 0) or np.any(np.diff(self.time_s) <= 0):
+            raise InputError(
+                "camera_path.frame", expected="increasing frames and times", found="repeats or steps back"
+            )
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames."""
+        return len(self.frame)
+
+    @property
+    def seen(self) -> Bool[np.ndarray, "frames"]:
+        """(frames,), where there is a pose that is not lost."""
+        return np.isfinite(self.position_m).all(axis=-1) & (self.status != Status.LOST)
+
+    def trajectories(self, name: str) -> Trajectories:
+        """The path as that of one drone of this name; its orientation is the camera's."""
+        return Trajectories(
+            frame=self.frame,
+            time_s=self.time_s,
+            drones=(name,),
+            position_m=self.position_m[:, None],
+            velocity_m_s=None if self.velocity_m_s is None else self.velocity_m_s[:, None],
+            orientation_wxyz=self.orientation_wxyz[:, None],
+            status=self.status[:, None],
+            covariance_m2=self.covariance[:, None, :3, :3],
+        )
+
+
+def roll_pitch_yaw_deg(orientation_wxyz: Float[np.ndarray, "*frames 4"]) -> Float[np.ndarray, "*frames 3"]:
+    """Angles of a camera's orientation, camera to world, as of a body that looks where it looks; NaN stays NaN.
+
+    The body's axes are x ahead (the camera's z), y left, z up. It is turned about the world's z by yaw, then about its
+    own y by pitch, then about its own x by roll: R = Rz(yaw) Ry(pitch) Rx(roll), as in ROS (REP 103). Yaw is counted
+    from the world's x axis, counterclockwise seen from above; pitch is positive with the nose down; roll with the
+    right side down. Each is in (-180, 180], pitch in [-90, 90].
+    """
+    body = _matrices(orientation_wxyz.reshape(-1, 4)) @ _BODY_IN_CAMERA
+    roll = np.arctan2(body[:, 2, 1], body[:, 2, 2])
+    pitch = -np.arcsin(np.clip(body[:, 2, 0], -1.0, 1.0))
+    yaw = np.arctan2(body[:, 1, 0], body[:, 0, 0])
+    return np.degrees(np.stack([roll, pitch, yaw], axis=-1)).reshape(*orientation_wxyz.shape[:-1], 3)
+
+
+def write_camera_path(path: Path, camera_path: CameraPath, name: str, *, force: bool = False) -> None:
+    """Write a CSV with one row per frame; what is not known is an empty field.
+
+    Columns: `frame`, `time_s`, `drone`, `x_m` to `z_m`, `vx_m_s` to `vz_m_s`, `qw` to `qz` and `r11` to `r33` (both
+    camera to world), `roll_deg`, `pitch_deg`, `yaw_deg` (see `roll_pitch_yaw_deg`), `cov_xx` to `cov_cc` (the upper
+    triangle; a, b and c are small turns about the camera's x, y and z axes), `num_markers`, `reprojection_px`,
+    `ambiguity`, `flags` (words with + between them), `status`.
+
+    Args:
+        path: of the file.
+        camera_path: what to write.
+        name: of the drone that carries the camera.
+        force: replace an existing file.
+
+    Raises:
+        OutputError: the file exists and `force` is not set, or it cannot be written.
+    """
+    refuse_to_overwrite(path, force)
+    count = camera_path.num_frames
+    velocity_m_s = camera_path.velocity_m_s
+    columns: dict[str, Shaped[np.ndarray, "frames"]] = {
+        "frame": camera_path.frame,
+        "time_s": camera_path.time_s,
+        "drone": np.full(count, name),
+        **_split(_POSITION, camera_path.position_m),
+        **_split(_VELOCITY, np.full((count, 3), np.nan) if velocity_m_s is None else velocity_m_s),
+        **_split(_QUATERNION, camera_path.orientation_wxyz),
+        **_split(_ROTATION, _matrices(camera_path.orientation_wxyz).reshape(count, 9)),
+        **_split(_ANGLES, roll_pitch_yaw_deg(camera_path.orientation_wxyz)),
+        **_split([f"cov_{axes}" for axes in _COVARIANCE], camera_path.covariance[:, *_UPPER]),
+        "num_markers": camera_path.num_markers,
+        "reprojection_px": camera_path.reprojection_px,
+        "ambiguity": camera_path.ambiguity,
+        "flags": np.array([Flag(int(flags)).label for flags in camera_path.flags], str),
+        "status": np.array([Status(int(status)).label for status in camera_path.status], str),
+    }
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    write_rows(
+        path, [list(columns), *([_cell(value) for value in row] for row in rows)], separator=_SEPARATOR
+    )
+
+
+def read_camera_path(path: Path) -> tuple[CameraPath, str]:
+    """Read what `write_camera_path` wrote.
+
+    Returns:
+        The path, and the drone's name.
+
+    Raises:
+        InputError: the file cannot be read, a column is missing, or a value makes no sense; the message names the line.
+    """
+    table = read_table(path, _SEPARATOR)
+    if table.find("qw") is None:
+        raise InputError(
+            path,
+            expected="a camera's path with orientations, qw to qz",
+            found="none",
+            remedy="localise writes one",
+        )
+    names = {row.text(table.column("drone")) for row in table.rows}
+    if len(names) > 1:
+        raise InputError(path, expected="the path of one drone", found=f"{', '.join(sorted(names))}")
+    covariance = np.zeros((len(table.rows), 6, 6))
+    covariance[:, *_UPPER] = _numbers(table, *(f"cov_{axes}" for axes in _COVARIANCE))
+    covariance += np.triu(covariance, 1).swapaxes(-1, -2)
+    velocity_m_s = _numbers(table, *_VELOCITY)
+    return (
+        CameraPath(
+            frame=_whole(table, "frame"),
+            time_s=_numbers(table, "time_s")[:, 0],
+            position_m=_numbers(table, *_POSITION),
+            orientation_wxyz=_numbers(table, *_QUATERNION),
+            covariance=covariance,
+            num_markers=_whole(table, "num_markers"),
+            reprojection_px=_numbers(table, "reprojection_px")[:, 0],
+            ambiguity=_numbers(table, "ambiguity")[:, 0],
+            status=np.array([_status(row, table) for row in table.rows]),
+            flags=np.array([_flags(row, table) for row in table.rows]),
+            velocity_m_s=velocity_m_s if np.isfinite(velocity_m_s).any() else None,
+        ),
+        names.pop(),
+    )
+
+
+def _split(names: tuple[str, ...] | list[str], values: Float[np.ndarray, "frames columns"]) -> Mapping:
+    return dict(zip(names, values.T, strict=True))
+
+
+def _matrices(orientation_wxyz: Float[np.ndarray, "frames 4"]) -> Float[np.ndarray, "frames 3 3"]:
+    matrices = np.full((len(orientation_wxyz), 3, 3), np.nan)
+    known = np.isfinite(orientation_wxyz).all(axis=-1)
+    if known.any():
+        matrices[known] = Rotation.from_quat(orientation_wxyz[known], scalar_first=True).as_matrix()
+    return matrices
+
+
+def _cell(value: object) -> object:
+    return "" if value != value else value
+
+
+def _numbers(table: Table, *names: str) -> Float[np.ndarray, "rows columns"]:
+    """(rows, columns), NaN for empty cells."""
+    columns = [table.column(name) for name in names]
+    return np.array(
+        [
+            [row.number(column) if row.cells[column.index] else np.nan for column in columns]
+            for row in table.rows
+        ]
+    )
+
+
+def _whole(table: Table, name: str) -> Int[np.ndarray, "rows"]:
+    column = table.column(name)
+    return np.array([row.count(column) for row in table.rows])
+
+
+def _status(row: Row, table: Table) -> int:
+    column = table.column("status")
+    word = row.text(column)
+    if word not in _STATUS:
+        raise row.wrong(column, f"one of {', '.join(_STATUS)}", repr(word))
+    return int(_STATUS[word])
+
+
+def _flags(row: Row, table: Table) -> int:
+    column = table.column("flags")
+    words = row.cells[column.index].split("+") if row.cells[column.index] else []
+    known = {flag.label: flag for flag in Flag}
+    for word in words:
+        if word not in known:
+            raise row.wrong(column, f"words of {', '.join(known)} with + between them", repr(word))
+    return int(sum(known[word] for word in words))

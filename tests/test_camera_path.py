@@ -1,0 +1,126 @@
+"""The path of a moving camera: its angles against SciPy's, and its table there and back."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from psotrack.errors import InputError, OutputError
+from psotrack.inside_out.camera_path import (
+    CameraPath,
+    Flag,
+    read_camera_path,
+    roll_pitch_yaw_deg,
+    write_camera_path,
+)
+from psotrack.trajectories import Status
+from psotrack.trajectory_files import read_trajectories
+
+#: Camera axes, columns, of a camera that looks along the world's x axis: right is -y, down is -z.
+AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def some_path(with_velocity: bool = True) -> CameraPath:
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(6, 6, 6))
+    covariance = root @ root.swapaxes(-1, -2)
+    path = CameraPath(
+        frame=np.array([0, 1, 2, 4, 5, 6]),
+        time_s=np.array([0.0, 0.04, 0.08, 0.16, 0.2, 0.24]),
+        position_m=rng.normal(size=(6, 3)),
+        orientation_wxyz=Rotation.random(6, rng=rng).as_quat(scalar_first=True),
+        covariance=(covariance + covariance.swapaxes(-1, -2)) / 2,
+        num_markers=np.array([4, 5, 1, 0, 0, 7]),
+        reprojection_px=np.array([0.1, 0.2, 0.3, np.nan, np.nan, 0.4]),
+        ambiguity=np.array([0.0, 0.0, 0.3, np.nan, np.nan, 0.0]),
+        status=np.array([Status.TRACKED] * 3 + [Status.COASTING, Status.LOST, Status.TRACKED]),
+        flags=np.array([0, 0, Flag.FEW_MARKERS | Flag.AMBIGUOUS, Flag.GATED, 0, 0]),
+        velocity_m_s=rng.normal(size=(6, 3)) if with_velocity else None,
+    )
+    for values in (path.position_m, path.orientation_wxyz, path.covariance):
+        values[4] = np.nan
+    return path
+
+
+@pytest.mark.parametrize(
+    ("turn", "expected_deg"),
+    [
+        ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]),
+        # About the world's z, counterclockwise from above.
+        ([0.0, 0.0, 30.0], [0.0, 0.0, 30.0]),
+        # About the world's y, which is the body's left: the nose goes down.
+        ([0.0, 20.0, 0.0], [0.0, 20.0, 0.0]),
+        # About the world's x, which is ahead: the right side goes down.
+        ([10.0, 0.0, 0.0], [10.0, 0.0, 0.0]),
+        ([0.0, 0.0, 180.0], [0.0, 0.0, 180.0]),
+    ],
+)
+def test_angles_of_a_camera_that_is_turned_from_looking_along_x(turn, expected_deg) -> None:
+    turned = Rotation.from_rotvec(turn, degrees=True).as_matrix() @ AHEAD
+    found = roll_pitch_yaw_deg(Rotation.from_matrix(turned).as_quat(scalar_first=True))
+    # Some roundings of an angle below 180 degrees; 180 and -180 are the same.
+    np.testing.assert_allclose((found - expected_deg + 180) % 360 - 180, 0, atol=1e-12)
+
+
+def test_angles_are_scipys() -> None:
+    rng = np.random.default_rng(5)
+    orientation = Rotation.random(200, rng=rng)
+    found = roll_pitch_yaw_deg(orientation.as_quat(scalar_first=True).reshape(50, 4, 4)).reshape(-1, 3)
+    body = Rotation.from_matrix(orientation.as_matrix() @ AHEAD.T)
+    # Near a pitch of 90 degrees angles lose half of their digits.
+    np.testing.assert_allclose(found, body.as_euler("ZYX", degrees=True)[:, ::-1], atol=1e-6)
+
+
+def test_looking_straight_down_and_nowhere() -> None:
+    down = Rotation.from_rotvec([0.0, 90.0, 0.0], degrees=True).as_matrix() @ AHEAD
+    wxyz = np.stack([Rotation.from_matrix(down).as_quat(scalar_first=True), np.full(4, np.nan)])
+    found = roll_pitch_yaw_deg(wxyz)
+    # arcsin near 1 has half of the digits.
+    assert found[0, 1] == pytest.approx(90, abs=1e-5)
+    assert np.isnan(found[1]).all()
+
+
+@pytest.mark.parametrize("with_velocity", [True, False])
+def test_a_table_is_read_as_it_was_written(tmp_path: Path, with_velocity: bool) -> None:
+    written = some_path(with_velocity)
+    write_camera_path(tmp_path / "path.csv", written, "dron2")
+    read, name = read_camera_path(tmp_path / "path.csv")
+    assert name == "dron2"
+    for field in CameraPath.__dataclass_fields__:
+        np.testing.assert_array_equal(getattr(read, field), getattr(written, field), err_msg=field)
+
+
+def test_commands_that_read_tracks_read_it(tmp_path: Path) -> None:
+    written = some_path()
+    write_camera_path(tmp_path / "path.csv", written, "dron2")
+    tracks, own = read_trajectories(tmp_path / "path.csv"), written.trajectories("dron2")
+    assert tracks.drones == ("dron2",)
+    np.testing.assert_array_equal(tracks.position_m, own.position_m)
+    np.testing.assert_array_equal(tracks.seen, own.seen)
+    np.testing.assert_array_equal(tracks.seen[:, 0], written.seen)
+    np.testing.assert_array_equal(tracks.covariance_m2, own.covariance_m2)
+
+
+def test_nothing_is_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "path.csv").write_text("mine")
+    with pytest.raises(OutputError, match=r"path\.csv"):
+        write_camera_path(tmp_path / "path.csv", some_path(), "dron1")
+    assert (tmp_path / "path.csv").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ("few_markers+ambiguous", "few", r"line 4, column flags: .*few_markers"),
+        ("coasting", "gone", r"line 5, column status: .*coasting"),
+        ("qw", "w", r"path.csv: .*orientations"),
+        ("dron2", "dron3", r"path.csv: .*one drone"),
+    ],
+)
+def test_what_makes_no_sense_is_named(tmp_path: Path, before: str, after: str, message: str) -> None:
+    path = tmp_path / "path.csv"
+    write_camera_path(path, some_path(), "dron2")
+    path.write_text(path.read_text().replace(before, after, 1))
+    with pytest.raises(InputError, match=message):
+        read_camera_path(path)
