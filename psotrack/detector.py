@@ -71,8 +71,8 @@ class Detector:
     def __init__(self, model: Path, settings: DetectorSettings) -> None:
         if not model.is_file():
             raise InputError(model, expected="an ONNX model", found="no such file")
-        self._model = model
-        self._settings = settings
+        self.model = model
+        self.settings = settings
         with self._said_in_one_line("an ONNX model that OpenCV can read"):
             self._network = cv2.dnn.readNetFromONNX(str(model))
 
@@ -84,13 +84,13 @@ class Detector:
         Raises:
             InputError: the network cannot take an input of this size, or its output has none of the layouts.
         """
-        size = self._settings.size
+        size = self.settings.size
         image, scale, start = _letterboxed(bgr, size)
         with self._said_in_one_line(f"a network for images of {size} x {size} pixels", "pass its own --size"):
             self._network.setInput(cv2.dnn.blobFromImage(image, 1 / 255, swapRB=True))
             output = self._network.forward()
         xyxy, score = self._decoded(np.asarray(output, np.float64))
-        sure = score >= self._settings.confidence
+        sure = score >= self.settings.confidence
         xyxy, score = (xyxy[sure] - np.tile(start, 2)) / np.tile(scale, 2), np.minimum(score[sure], 1.0)
         height, width = bgr.shape[:2]
         xyxy = np.clip(xyxy, 0, np.tile([width, height], 2))
@@ -98,7 +98,7 @@ class Detector:
         there = (xywh[:, 2:] > 0).all(axis=1)
         xyxy, xywh, score = xyxy[there], xywh[there], score[there]
         # OpenCV's order is that of the scores, and its answer to no boxes an empty tuple.
-        kept = cv2.dnn.NMSBoxes(xywh.tolist(), score.tolist(), self._settings.confidence, self._settings.nms)
+        kept = cv2.dnn.NMSBoxes(xywh.tolist(), score.tolist(), self.settings.confidence, self.settings.nms)
         index = np.asarray(kept, np.int64).ravel()
         return xyxy[index], score[index]
 
@@ -119,13 +119,13 @@ class Detector:
             score = output[0, 4:].max(axis=0)
         else:
             raise InputError(
-                self._model,
+                self.model,
                 expected="an output of (1, boxes, 5 + classes) as of YOLOv5 or (1, 4 + classes, boxes) as of YOLOv8",
                 found=f"{output.shape}",
             )
         if not (np.isfinite(xyxy).all() and (score >= 0).all() and (score <= 1 + _ROUNDING).all()):
             raise InputError(
-                self._model,
+                self.model,
                 expected="finite boxes with scores from 0 to 1",
                 found=f"scores from {score.min():.3g} to {score.max():.3g}",
                 remedy="is it exported with its last layers, and is this YOLO's own layout?",
@@ -141,7 +141,7 @@ class Detector:
             yield
         except cv2.error as error:
             found = f"one that it cannot use ({' '.join((error.err or str(error)).split())})"
-            raise InputError(self._model, expected=expected, found=found, remedy=remedy) from error
+            raise InputError(self.model, expected=expected, found=found, remedy=remedy) from error
         finally:
             cv2.utils.logging.setLogLevel(level)
 

@@ -118,6 +118,13 @@ def _parts(names: Ordered[str], validation: Ordered[str]) -> dict[str, str]:
             found=f"{twice[0]} more than once",
             remedy="rename a folder",
         )
+    if len(names) < 2:
+        raise SettingsError(
+            "sequences",
+            expected="at least two, as whole ones are trained or validated on",
+            found=", ".join(names) or "none",
+            remedy="frames of one flight on both sides would tell nothing",
+        )
     chosen = list(validation) or list(names[-1:])
     unknown = [name for name in chosen if name not in names]
     if unknown:

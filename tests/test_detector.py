@@ -8,18 +8,22 @@ from click.testing import CliRunner
 from helpers import rig_of
 from onnx_models import SIDE, STRIDE, bright_squares
 
-from psotrack.cameras import camera, look_at
+from psotrack.cameras import camera, look_at, project
+from psotrack.cli.commands import track
 from psotrack.cli.detect import detect as command
 from psotrack.datasets import dpjait
 from psotrack.detections import read_detections
 from psotrack.detector import Detector, DetectorSettings, detect
 from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.trajectory_files import read_trajectories
 from psotrack.video import VideoWriter, probe
 
 #: Of the network's input for each layout; v10 has 300 boxes, for which it takes 18 x 18.
 SIZES = {"v5": 128, "v8": 128, "v10": 168}
 #: Pixels of the image for each of the network's.
 SCALE = 2
+#: Where a drone is in the world, metres, by frame.
+PLACES_M = np.linspace([-0.3, -0.2, 1.4], [0.3, 0.2, 1.6], 12)
 
 
 @pytest.fixture(scope="module")
@@ -215,3 +219,62 @@ class TestVideos:
             "frames": 3,
             "detections": {"0": 2},
         }
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tracked") / "Simulated_Data" / "S02_D1"
+    folder.mkdir(parents=True)
+    cameras = []
+    for x_m, y_m in ((0.0, -6.0), (6.0, 0.5), (-0.5, 6.0), (-6.0, -0.5)):
+        R, t_m = look_at((x_m, y_m, 2.0), (0.0, 0.0, 1.5))
+        K = np.array([[1100.0, 0.0, 127.5], [0.0, 1100.0, 95.5], [0.0, 0.0, 1.0]])
+        cameras.append(camera(R=R, t_m=t_m, K=K, image_size_wh=(256, 192)))
+    rig = rig_of(*cameras)
+    dpjait.write_calibration(folder / dpjait.CALIBRATION, rig)
+    middles, _ = project(rig.cameras, PLACES_M[:, None])
+    for index, name in enumerate(rig.names):
+        with VideoWriter(folder / f"{name}.avi", 25.0, (256, 192)) as writer:
+            for x, y in middles[:, index]:
+                bgr = black(128)
+                column, row = (round((at - SIDE) / (SCALE * STRIDE)) for at in (x, y + SCALE * 16))
+                paint(bgr, square(128, column, row))
+                writer.write(bgr)
+    return folder
+
+
+class TestTracking:
+    """A drone that four cameras see as a square, tracked in one command."""
+
+    def run(self, models, seen, out, *arguments):
+        words = [seen, "--out", out, "--cache", out.parent / "cache", "--detector", models / "v8.onnx"]
+        words += ["--detector-size", "128", *arguments]
+        return CliRunner().invoke(track, [*map(str, words)], catch_exceptions=False)
+
+    def test_in_one_command_and_its_detections_are_kept(self, models, seen, tmp_path, monkeypatch):
+        arguments = ("--method", "projection-lines", "--json", "-")
+        found = self.run(models, seen, tmp_path / "a.csv", *arguments)
+        assert found.exit_code == 0
+        tracks = read_trajectories(tmp_path / "a.csv")
+        assert tracks.num_drones == 1
+        # Squares stand at every 16th pixel: up to 8 pixels off, which are 4.4 cm at 6 m.
+        off_m = np.linalg.norm(tracks.position_m[:, 0] - PLACES_M, axis=-1)
+        assert tracks.seen.all()
+        assert off_m.max() < 0.08
+        # The second time nothing is looked for, because all of it is there.
+        monkeypatch.setattr(Detector, "boxes", lambda *_: pytest.fail("looked again"))
+        again = self.run(models, seen, tmp_path / "b.csv", *arguments)
+        assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
+        keys = [json.loads(result.stdout)["input_keys"] for result in (found, again)]
+        assert keys[0] == keys[1]
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            ((), r"--detector: expected --method projection-lines or fused.*found --method swarm"),
+            (("--method", "fused", "--detections", "blobs"), r"--detector: .* found --detections blobs"),
+        ],
+    )
+    def test_a_detector_that_nobody_asks(self, models, seen, tmp_path, arguments, message):
+        with pytest.raises(SettingsError, match=message):
+            self.run(models, seen, tmp_path / "a.csv", *arguments)

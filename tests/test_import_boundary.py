@@ -70,6 +70,7 @@ DEPTH = {
     "sequence": 3,
     "camera_clocks": 4,
     "detector": 4,
+    "detection_store": 5,
     "time_shift": 4,
     "synchronisation": 5,
     "silhouette_store": 3,

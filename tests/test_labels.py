@@ -362,7 +362,7 @@ def test_which_sequences_are_validated_on(data, tmp_path):
 
 def test_what_cannot_be_split(data, tmp_path):
     one, other, out = data / "S01_D2_A", data / "S12_D3", tmp_path / "set"
-    assert "one to train on" in refused(SettingsError, one, "--out", out)
+    assert "sequences: expected at least two" in refused(SettingsError, one, "--out", out)
     assert "one to train on" in refused(
         SettingsError, one, other, "--out", out, "--validation", "S12_D3,S01_D2_A"
     )

@@ -1,14 +1,17 @@
 """A simulated sequence written as a real one: the layout, the lens, the markers and their clock."""
 
+import json
 import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
 from psotrack.cameras import project
+from psotrack.cli.as_real import as_real
 from psotrack.datasets.dpjait import read_detections, read_mocap_markers, read_poses, read_sequence
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.mocap import body_trajectories, read_c3d
@@ -229,3 +232,27 @@ def test_what_cannot_be_written(simulated, real, tmp_path):
     with pytest.raises(InputError, match=r"S78: expected markers of its drones, dron1_markers_25\.csv"):
         write_as_real(unmarked, tmp_path)
     assert not (tmp_path / "Real_Data").exists()
+
+
+def test_command(simulated, tmp_path):
+    words = [
+        simulated,
+        "--out",
+        tmp_path,
+        "--offset",
+        "0.2",
+        "--rate",
+        "120",
+        "--three-videos",
+        "--json",
+        "-",
+    ]
+    result = CliRunner().invoke(as_real, [*map(str, words)], catch_exceptions=False)
+    folder = tmp_path / "Real_Data" / "R02_D4"
+    assert (result.exit_code, json.loads(result.stdout)) == (0, {"sequence": str(folder)})
+    own = write_as_real(simulated, tmp_path / "own", offset_s=0.2, rate_hz=120.0, three_videos=True)
+    for path in own.iterdir():
+        if path.is_file():
+            assert (folder / path.name).read_bytes() == path.read_bytes(), path.name
+    with pytest.raises(OutputError, match="R02_D4"):
+        CliRunner().invoke(as_real, [*map(str, words)], catch_exceptions=False)

@@ -10,6 +10,7 @@ import sys
 
 import click
 
+from psotrack.cli.as_real import as_real
 from psotrack.cli.calibrate import calibrate
 from psotrack.cli.commands import cli
 from psotrack.cli.detect import detect
@@ -24,6 +25,7 @@ from psotrack.errors import PsotrackError
 __all__ = ["cli", "main"]
 
 cli.add_command(simulate)
+cli.add_command(as_real)
 cli.add_command(fly)
 cli.add_command(sweep)
 cli.add_command(table)

@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any, get_args
 
 import click
+import msgspec
 
 from psotrack import __version__
 from psotrack.cli.answers import answer, report_to, say, write_json
 from psotrack.cli.options import (
     CACHE,
     CAMERAS,
+    DETECTOR_SIZE,
     FORCE,
     FRAMES,
     JOBS,
@@ -28,6 +30,7 @@ from psotrack.cli.options import (
 )
 from psotrack.errors import SettingsError
 from psotrack.files import refuse_to_overwrite
+from psotrack.progress import Report
 from psotrack.settings import Method, Score, SwarmKind, TrackSettings
 from psotrack.silhouette_store import SilhouetteSettings
 
@@ -148,6 +151,20 @@ def silhouettes(
     metavar="yolo|blobs|FOLDER",
     help="Of the projection lines: SEQ's own, blobs of its silhouettes, or a folder with a CSV file per camera.",
 )
+@click.option(
+    "--detector",
+    "model",
+    type=click.Path(path_type=Path),
+    metavar="MODEL.onnx",
+    help="Instead of --detections: a YOLO network (v5 to v11) that finds the drones; what it finds is kept.",
+)
+@click.option(
+    "--detector-size",
+    type=int,
+    default=DETECTOR_SIZE,
+    show_default=True,
+    help="Of the network's square input, in pixels.",
+)
 @click.option("--particles", type=int, default=TRACK.particles, show_default=True, help="Of every swarm.")
 @click.option("--iterations", type=int, default=TRACK.iterations, show_default=True, help="Per frame.")
 @click.option(
@@ -231,6 +248,8 @@ def track(
     force: bool,
     quiet: bool,
     json_path: Path | None,
+    model: Path | None,
+    detector_size: int,
     **settings: Any,
 ) -> None:
     """Track the drones of SEQ from its videos, or from detections in them.
@@ -244,6 +263,7 @@ def track(
       psotrack track data/Simulated_Data/S02_D4_A --out tracks.csv
       psotrack track data/Simulated_Data/S02_D4_A --out smooth.csv --smooth
       psotrack track data/Simulated_Data/S02_D4_A --out lines.csv --method projection-lines
+      psotrack track data/Real_Data/R12_D4 --out both.csv --method fused --detector drones.onnx --detector-size 1280
       psotrack track data/Simulated_Data/S02_D4_A --out paper.parquet --swarm joint --particles 100 --iterations 70
     """
     from psotrack.compiled import keep_compiled
@@ -258,10 +278,12 @@ def track(
     silhouette_names = SilhouetteSettings.__struct_fields__
     of_silhouettes = {name: settings.pop(name) for name in silhouette_names if name in settings}
     chosen = TrackSettings(silhouettes=SilhouetteSettings(**of_silhouettes), **settings)
-    where = cache_folder(cache)
+    where, usable = cache_folder(cache), _usable(sequence, cameras, num_frames)
+    if model is not None:
+        chosen = _with_detector(chosen, model, detector_size, usable, where, report_to(quiet))
     keep_compiled(compiled_folder(cache))
     tracked = track_sequence(
-        _usable(sequence, cameras, num_frames),
+        usable,
         chosen,
         cache=where,
         jobs=jobs,
@@ -360,3 +382,21 @@ def _usable(folder: Path, cameras: str | None, num_frames: int | None) -> Any:
     from psotrack.datasets.dpjait import read_sequence
 
     return read_sequence(folder).usable(cameras.split(",") if cameras else None, num_frames)
+
+
+def _with_detector(
+    settings: TrackSettings, model: Path, size: int, sequence: Any, cache: Path, report: Report
+) -> TrackSettings:
+    """The settings, with what a network finds in the videos for detections."""
+    from psotrack.detection_store import stored_detections
+    from psotrack.detector import Detector, DetectorSettings
+
+    if settings.method == "swarm":
+        expected = "--method projection-lines or fused, which read detections"
+        raise SettingsError("--detector", expected=expected, found="--method swarm")
+    if settings.detections != TRACK.detections:
+        found = f"--detections {settings.detections} as well"
+        raise SettingsError("--detector", expected="detections from one source", found=found)
+    detector = Detector(model, DetectorSettings(size=size))
+    folder = stored_detections(detector, sequence, cache=cache, report=report)
+    return msgspec.structs.replace(settings, detections=str(folder))

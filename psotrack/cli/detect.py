@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from psotrack.cli.answers import answer, report_to, say
-from psotrack.cli.options import CAMERAS, FORCE, FRAMES, JSON, QUIET, SEQUENCE
+from psotrack.cli.options import CAMERAS, DETECTOR_SIZE, FORCE, FRAMES, JSON, QUIET, SEQUENCE
 
 
 @click.command()
@@ -30,7 +30,11 @@ from psotrack.cli.options import CAMERAS, FORCE, FRAMES, JSON, QUIET, SEQUENCE
     help="Intersection over union above which two boxes are of one drone.",
 )
 @click.option(
-    "--size", type=int, default=640, show_default=True, help="Of the network's square input, in pixels."
+    "--size",
+    type=int,
+    default=DETECTOR_SIZE,
+    show_default=True,
+    help="Of the network's square input, in pixels.",
 )
 @CAMERAS
 @FRAMES

@@ -16,6 +16,8 @@ from psotrack.silhouette_store import SilhouetteSettings
 #: Defaults are written once, in the settings; the command line shows them.
 TRACK = TrackSettings()
 SILHOUETTES = SilhouetteSettings()
+#: Of a network's square input, pixels: what YOLO is trained with.
+DETECTOR_SIZE = 640
 
 Command = Callable[..., None]
 

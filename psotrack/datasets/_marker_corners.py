@@ -3,40 +3,100 @@
 How the dataset publishes it is not known; this is the layout that is written here: `id`, then `x1[m]`,
 `y1[m]`, `z1[m]` to `x4[m]`, `y4[m]`, `z4[m]`: the corners as OpenCV's ArUco counts them, clockwise from the
 marker's own top left when it is looked at.
+
+Read is whatever can be no other: semicolons, commas or tabs; metres, centimetres or millimetres as the header says,
+`x1[mm]`, `x1 (mm)` or `x1_mm`, and metres where it says none; corners called 1 to 4, 0 to 3 or tl, tr, br, bl, as in
+`x1`, `corner1_x` or `tl_x`; one row for each corner, `id`, `corner`, `x`, `y`, `z`; numbers alone, 13 or 5 in a row.
+Other columns are passed over.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.datasets._calibration import LENGTHS
-from psotrack.delimited import read_table, write_rows
+from psotrack.delimited import Column, Row, Table, read_rows, write_rows
+from psotrack.errors import InputError
+from psotrack.files import read_text
 
 _CORNERS = [f"{axis}{corner}" for corner in range(1, 5) for axis in "xyz"]
+_METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "": 1.0}
+_UNIT = re.compile(r"(?P<name>.*?)\s*(?:[\[(]\s*(?P<bracketed>[^\])]*?)\s*[\])]|_(?P<plain>mm|cm|m))")
+_IDS = {
+    "id",
+    "marker",
+    "markerid",
+    "idmarker",
+    "aruco",
+    "arucoid",
+    "idaruco",
+    "tag",
+    "tagid",
+    "nr",
+    "no",
+    "number",
+}
+_CORNER = {
+    "corner",
+    "cornerid",
+    "cornerno",
+    "cornernr",
+    "cornernumber",
+    "cornerindex",
+    "vertex",
+    "point",
+    "pointid",
+}
+_NAMED = {
+    "tl": 1, "topleft": 1, "lefttop": 1, "upperleft": 1,
+    "tr": 2, "topright": 2, "righttop": 2, "upperright": 2,
+    "br": 3, "bottomright": 3, "rightbottom": 3, "lowerright": 3,
+    "bl": 4, "bottomleft": 4, "leftbottom": 4, "lowerleft": 4,
+}  # fmt: skip
+_WHICH = rf"(?:c|corner|p|pt|point|v|vertex)?(?P<{{group}}>[0-4]|{'|'.join(_NAMED)})"
+_WIDE = re.compile(
+    rf"(?P<before>[xyz]){_WHICH.format(group='after_axis')}|{_WHICH.format(group='before_axis')}(?P<after>[xyz])"
+)
+_LONG = re.compile(r"(?:pos|position|coord|corner|c|p|point)?(?P<axis>[xyz])")
+_ID = re.compile(r"(?:[a-z][a-z _:-]*)?(?P<number>\d+)(?:\.0*)?", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class MarkerRow:
+    """The corners of a marker, and where they stand.
+
+    Attributes:
+        where: file and line, for messages.
+        corners_m: (4, 3), world, metres.
+    """
+
+    where: str
+    corners_m: Float[np.ndarray, "4 3"]
 
 
 def read_marker_corners(path: Path) -> dict[int, Float[np.ndarray, "4 3"]]:
-    """Corners, (4, 3), world, metres, by marker id.
+    """Corners, (4, 3), world, metres, by marker id, as they stand: `inside_out.marker_map` checks them.
 
     Raises:
-        InputError: the file cannot be read, a column is missing, an id is there twice, or a value is no
-            number.
+        InputError: the file cannot be read, a column or a corner is missing, an id is there twice, or a value is no
+            number. The message names the line.
     """
-    table = read_table(path)
-    id_column = table.column("id")
-    columns = [table.column(name) for name in _CORNERS]
-    metres = np.array([table.factor(column, LENGTHS) for column in columns])
-    corners: dict[int, Float[np.ndarray, "4 3"]] = {}
-    for row in table.rows:
-        marker = row.count(id_column)
-        if marker in corners:
-            raise row.wrong(id_column, "each marker once", f"{marker} again")
-        corners[marker] = (np.array([row.number(column) for column in columns]) * metres).reshape(4, 3)
-    return corners
+    return {marker: row.corners_m for marker, row in read_marker_rows(path).items()}
+
+
+def read_marker_rows(path: Path) -> dict[int, MarkerRow]:
+    """The corners by marker id, with where they stand in the file.
+
+    Raises:
+        InputError: as of `read_marker_corners`.
+    """
+    table = _read(path)
+    return _long(table) if table.find("corner") and not table.find("x1") else _wide(table)
 
 
 def write_marker_corners(path: Path, corners_m: Mapping[int, Float[np.ndarray, "4 3"]]) -> None:
@@ -47,3 +107,162 @@ def write_marker_corners(path: Path, corners_m: Mapping[int, Float[np.ndarray, "
     """
     header = ["id", *(f"{name}[m]" for name in _CORNERS)]
     write_rows(path, [header, *([marker, *corners_m[marker].ravel()] for marker in sorted(corners_m))])
+
+
+def _wide(table: Table) -> dict[int, MarkerRow]:
+    """One row for each marker."""
+    id_column = table.column("id")
+    columns = [table.column(name) for name in _CORNERS]
+    metres = np.array([table.factor(column, _METRES) for column in columns])
+    found: dict[int, MarkerRow] = {}
+    for row in table.rows:
+        marker = _marker(row, id_column)
+        if marker in found:
+            raise row.wrong(id_column, "each marker once", f"{marker} again")
+        values = np.array([row.number(column) for column in columns])
+        found[marker] = MarkerRow(row.where, (values * metres).reshape(4, 3))
+    return found
+
+
+def _long(table: Table) -> dict[int, MarkerRow]:
+    """One row for each corner."""
+    id_column, corner_column = table.column("id"), table.column("corner")
+    columns = [table.column(axis) for axis in "xyz"]
+    metres = np.array([table.factor(column, _METRES) for column in columns])
+    first = _first_corner(table, corner_column)
+    rows: dict[int, dict[int, Row]] = {}
+    for row in table.rows:
+        marker, corner = _marker(row, id_column), _corner(row, corner_column)
+        corner += 1 - first if row.text(corner_column).isdecimal() else 0
+        if corner in rows.setdefault(marker, {}):
+            expected = "each corner of a marker once"
+            raise row.wrong(
+                corner_column, expected, f"corner {row.text(corner_column)} of marker {marker} again"
+            )
+        rows[marker][corner] = row
+    found = {}
+    for marker, of_marker in rows.items():
+        lines = [row.line for row in of_marker.values()]
+        where = f"{table.path}, line {min(lines)}" + (f" to {max(lines)}" if len(lines) > 1 else "")
+        missing = [corner for corner in range(1, 5) if corner not in of_marker]
+        if missing:
+            numbers = ", ".join(str(corner - 1 + first) for corner in missing)
+            raise InputError(
+                f"{where}, marker {marker}",
+                expected="4 corners",
+                found=f"none of number {numbers}",
+                remedy="add it, or leave the marker out",
+            )
+        values = np.array(
+            [[of_marker[corner].number(column) for column in columns] for corner in range(1, 5)]
+        )
+        found[marker] = MarkerRow(where, values * metres)
+    return found
+
+
+def _marker(row: Row, column: Column) -> int:
+    match = _ID.fullmatch(row.text(column))
+    if match is None:
+        raise row.wrong(column, "a marker's number", repr(row.text(column)))
+    return int(match["number"])
+
+
+def _corner(row: Row, column: Column) -> int:
+    """The number of a corner as the file counts it; from 1 where it has a name."""
+    text = row.text(column)
+    number = _NAMED.get(_bare(text), int(text) if text.isdecimal() else -1)
+    if not 0 <= number <= 4:
+        raise row.wrong(column, "a corner, 1 to 4, or tl, tr, br or bl", repr(text))
+    return number
+
+
+def _first_corner(table: Table, column: Column) -> int:
+    """The number of the first corner, 0 or 1."""
+    zeros = [row for row in table.rows if row.text(column) == "0"]
+    fours = [row for row in table.rows if row.text(column) == "4"]
+    if zeros and fours:
+        raise fours[0].wrong(column, f"corners 0 to 3, because line {zeros[0].line} has corner 0", "corner 4")
+    return 0 if zeros else 1
+
+
+def _read(path: Path) -> Table:
+    """A table whose columns are called `id` and `x1` to `z4`, or `id`, `corner`, `x`, `y` and `z`."""
+    lines = [line for line in read_text(path).splitlines() if line.strip(" ;,\t")]
+    if not lines:
+        raise InputError(path, expected="a table of marker corners", found="an empty file")
+    separator = next((mark for mark in ";\t" if mark in lines[0]), ",")
+    rows = read_rows(path, separator)
+    if all(map(_is_number, rows[0].cells)):
+        names = {13: ["id", *_CORNERS], 5: ["id", "corner", *"xyz"]}.get(len(rows[0].cells))
+        if names is None:
+            expected = "a header, or numbers in rows of 13 (id, 4 corners) or 5 (id, corner, x, y, z)"
+            raise InputError(rows[0].where, expected=expected, found=f"{len(rows[0].cells)} numbers")
+        columns = tuple(Column(index, name, "", name) for index, name in enumerate(names))
+    else:
+        columns, rows = _columns(rows[0]), rows[1:]
+    if not rows:
+        raise InputError(path, expected="rows below the header", found="none")
+    whole = []
+    for row in rows:
+        # An empty cell at the end of a line is cut off with its separator.
+        cells = row.cells + ("",) * (len(row.cells) == len(columns) - 1)
+        if len(cells) != len(columns):
+            raise InputError(
+                row.where,
+                expected=f"{len(columns)} values{' as in the header' if len(rows) else ''}",
+                found=f"{len(row.cells)}",
+                remedy="a marker has four corners of three coordinates" if len(columns) >= 13 else "",
+            )
+        whole.append(replace(row, cells=cells))
+    return Table(path, columns, tuple(whole))
+
+
+def _columns(header: Row) -> tuple[Column, ...]:
+    """The columns by the names that are used here; others keep their own."""
+    columns = []
+    for index, cell in enumerate(header.cells):
+        text = cell.lower().strip("\"' ")
+        match = _UNIT.fullmatch(text)
+        name, unit = (match["name"], match["bracketed"] or match["plain"] or "") if match else (text, "")
+        columns.append(Column(index, _canonical(_bare(name)), unit.removesuffix("etres"), cell))
+    numbers = {name[1] for name in (column.name for column in columns) if re.fullmatch("[xyz][0-4]", name)}
+    if "0" in numbers and "4" not in numbers:
+        columns = [
+            replace(column, name=f"{column.name[0]}{int(column.name[1]) + 1}")
+            if re.fullmatch("[xyz][0-3]", column.name)
+            else column
+            for column in columns
+        ]
+    names = [column.name for column in columns]
+    twice = [column.header for column in columns if names.count(column.name) > 1 and column.name in _KNOWN]
+    if twice:
+        raise InputError(header.where, expected="each column once", found=f"{' and '.join(twice)}")
+    return tuple(columns)
+
+
+_KNOWN = {"id", "corner", *"xyz", *_CORNERS}
+
+
+def _canonical(name: str) -> str:
+    if name in _IDS:
+        return "id"
+    if name in _CORNER:
+        return "corner"
+    wide = _WIDE.fullmatch(name)
+    if wide is not None:
+        which = wide["after_axis"] or wide["before_axis"]
+        return f"{wide['before'] or wide['after']}{_NAMED.get(which, which)}"
+    single = _LONG.fullmatch(name)
+    return single["axis"] if single is not None else name
+
+
+def _bare(name: str) -> str:
+    return re.sub(r"[\s_.:\"'-]", "", name.lower())
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True

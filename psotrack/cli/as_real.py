@@ -1,0 +1,66 @@
+"""`psotrack as-real`: a simulated sequence in the form of the dataset's real half."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from psotrack.cli.answers import answer, report_to, say
+from psotrack.cli.options import FORCE, JSON, QUIET, SEQUENCE
+
+
+@click.command("as-real")
+@SEQUENCE
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="The data's root folder.")
+@click.option(
+    "--offset",
+    "offset_s",
+    type=float,
+    default=0.37,
+    show_default=True,
+    help="Time in the C3D file at frame 0 of the videos, in seconds.",
+)
+@click.option(
+    "--rate", "rate_hz", type=float, default=100.0, show_default=True, help="Of the C3D file, in hertz."
+)
+@click.option("--three-videos", is_flag=True, help="Leave the last camera's video out, as in R17_D1_A.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Of the markers' noise and gaps.")
+@FORCE
+@QUIET
+@JSON
+def as_real(
+    sequence: Path,
+    out: Path,
+    offset_s: float,
+    rate_hz: float,
+    three_videos: bool,
+    seed: int,
+    force: bool,
+    quiet: bool,
+    json_path: Path | None,
+) -> None:
+    """Write SEQ, a simulated one, in the form of the dataset's real half.
+
+    Writes OUT/Real_Data/RXX_Dn: four cameras with distortion, named by serial number, in millimetres; a C3D file of
+    marker crosses at another rate, that began at another moment, with gaps and swapped labels; detections.
+
+    \b
+    Example:
+      psotrack simulate S02_D4_A --set cameras=laboratory_corners --no-masks --no-onboard --out data
+      psotrack as-real data/Simulated_Data/S02_D4_A --out data
+    """
+    from psotrack.simulation.real_form import write_as_real
+
+    folder = write_as_real(
+        sequence,
+        out,
+        rate_hz=rate_hz,
+        offset_s=offset_s,
+        three_videos=three_videos,
+        seed=seed,
+        force=force,
+        report=report_to(quiet),
+    )
+    answer(json_path, {"sequence": str(folder)}, force)
+    say(quiet, json_path, f"{folder}")

@@ -1,0 +1,57 @@
+"""Detections that a network made, stored: one folder for each model, its settings and the videos' content."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import msgspec
+
+from psotrack.detections import write_detections
+from psotrack.detector import Detector, detect
+from psotrack.errors import InputError
+from psotrack.progress import Report, silent
+from psotrack.sequence import Sequence
+
+
+def stored_detections(
+    detector: Detector, sequence: Sequence, *, cache: Path, report: Report = silent
+) -> Path:
+    """A folder with the detections of each of a sequence's videos; what is not there yet is made.
+
+    Every video's file appears whole or not at all: a call that is interrupted goes on with the next video.
+
+    Args:
+        detector: that finds them.
+        sequence: fit for use (see `Sequence.usable`).
+        cache: below which the folder is.
+        report: told of every frame that is looked at.
+
+    Raises:
+        InputError: a video cannot be read, or the network cannot be used.
+        OutputError: a file cannot be written.
+    """
+    folder = cache / "detections" / _key(detector, sequence)
+    for name, video in sequence.videos.items():
+        path = folder / f"{video.path.stem}.csv"
+        if not path.exists():
+            write_detections(path, detect(detector, name, video, report=report))
+    return folder
+
+
+def _key(detector: Detector, sequence: Sequence) -> str:
+    """40 hexadecimal digits."""
+    made_of = {
+        "model": _digest(detector.model),
+        "settings": msgspec.to_builtins(detector.settings),
+        "videos": {name: [video.num_frames, _digest(video.path)] for name, video in sequence.videos.items()},
+    }
+    return hashlib.blake2b(msgspec.json.encode(made_of, order="deterministic"), digest_size=20).hexdigest()
+
+
+def _digest(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "blake2b").hexdigest()
+    except OSError as error:
+        raise InputError(path, expected="a readable file", found=error.strerror or f"{error}") from error
