@@ -333,7 +333,7 @@ def _adjusted(
     rig: CameraRig,
     problem: _Problem,
     state: _State,
-    used: Bool[np.ndarray, "points cameras"],
+    used: Bool[np.ndarray, "rows cameras"],
     rows: Int[np.ndarray, " rows"],
     num_points: int,
     groups: Int[np.ndarray, " points"] | None,

@@ -50,9 +50,17 @@ def by_swarm(
     sequence: Sequence,
     silhouettes: Silhouettes,
     settings: collections.abc.Sequence[TrackSettings],
+    detected: collections.abc.Sequence[Start | None],
     report: Report,
 ) -> list[Way]:
     """Runs of the swarm, together.
+
+    Args:
+        sequence: fit for use.
+        silhouettes: of all of its cameras.
+        settings: of each run.
+        detected: for each run what detections say of frame 0, where they are read.
+        report: told of the frames.
 
     Raises:
         InputError: there is nothing to start from.
@@ -60,7 +68,7 @@ def by_swarm(
     """
     began = time.perf_counter()
     bounds_m = [room_bounds(sequence.rig, each) for each in settings]
-    starts = _starts(sequence, silhouettes, settings, bounds_m)
+    starts = _starts(sequence, silhouettes, settings, bounds_m, detected)
     followed = track_silhouettes(
         sequence.rig, silhouettes, starts, settings, fps=sequence.fps, bounds_m=bounds_m, report=report
     )
@@ -144,11 +152,12 @@ def _starts(
     silhouettes: Silhouettes,
     settings: collections.abc.Sequence[TrackSettings],
     bounds_m: list[Float[np.ndarray, "2 3"]],
+    detected: collections.abc.Sequence[Start | None],
 ) -> list[Start]:
     """The start of each run; runs that differ in nothing but their seeds have the same."""
     starts: dict[TrackSettings, Start] = {}
     alike = [msgspec.structs.replace(each, seed=0) for each in settings]
-    for each, bounds in zip(alike, bounds_m, strict=True):
+    for each, bounds, also in zip(alike, bounds_m, detected, strict=True):
         if each not in starts:
-            starts[each] = find_start(sequence, silhouettes, each, bounds)
+            starts[each] = find_start(sequence, silhouettes, each, bounds, also)
     return [starts[each] for each in alike]

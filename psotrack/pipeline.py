@@ -125,16 +125,20 @@ def track_runs(
         InputError: there is nothing to start from, or detections cannot be read.
         SettingsError: a setting does not fit the sequence.
     """
+    ways = {
+        number: by_lines(sequence, silhouettes, each, report)
+        for number, each in enumerate(settings)
+        if each.method != "swarm"
+    }
     swarms = [number for number, each in enumerate(settings) if each.method != "projection-lines"]
-    ways: dict[int, Way] = {}
     if swarms:
         assert silhouettes is not None
-        of_swarms = by_swarm(sequence, silhouettes, [settings[number] for number in swarms], report)
-        ways |= dict(zip(swarms, of_swarms, strict=True))
-    for number, each in enumerate(settings):
-        if each.method != "swarm":
-            lines = by_lines(sequence, silhouettes, each, report)
-            ways[number] = by_both(ways[number], lines, each, sequence.fps) if number in ways else lines
+        of_swarms = [settings[number] for number in swarms]
+        detected = [ways[number].start if number in ways else None for number in swarms]
+        followed = by_swarm(sequence, silhouettes, of_swarms, detected, report)
+        for number, each, swarm in zip(swarms, of_swarms, followed, strict=True):
+            both = number in ways
+            ways[number] = by_both(swarm, ways[number], each, sequence.fps) if both else swarm
     return [_finished(sequence, each, ways[number]) for number, each in enumerate(settings)]
 
 

@@ -21,6 +21,8 @@ logger = logging.getLogger(__name__)
 
 #: Frames from which the drones are found. Longer, and their paths are no straight lines any more.
 START_FRAMES = 10
+#: Drones of two starts that are nearer than this are one: the middles of box and silhouette, and some noise.
+SAME_M = 0.3
 
 
 def room_bounds(rig: CameraRig, settings: TrackSettings) -> Float[np.ndarray, "2 3"]:
@@ -47,12 +49,24 @@ def room_bounds(rig: CameraRig, settings: TrackSettings) -> Float[np.ndarray, "2
 
 
 def find_start(
-    sequence: Sequence, silhouettes: Silhouettes, settings: TrackSettings, bounds_m: Float[np.ndarray, "2 3"]
+    sequence: Sequence,
+    silhouettes: Silhouettes,
+    settings: TrackSettings,
+    bounds_m: Float[np.ndarray, "2 3"],
+    detected: Start | None = None,
 ) -> Start:
     """Positions, velocities and sizes of the drones at frame 0, as `settings.init` says.
 
     Positions are of the silhouettes' middles. Drones that are not found may still come (see `tracking`): a start may
     be empty.
+
+    Args:
+        sequence: fit for use.
+        silhouettes: of all of its cameras.
+        settings: how.
+        bounds_m: (2, 3), lowest and highest corner of the room.
+        detected: what detections say of frame 0. With `init` "auto" those of its drones count too that the silhouettes
+            do not tell: one that hangs in the air may be in the background by then.
 
     Raises:
         InputError: there is no reference or file to start from, or it has too few drones.
@@ -67,7 +81,7 @@ def find_start(
         drones=settings.drones,
     )
     if settings.init == "auto":
-        start, source = found, sequence.folder
+        start, source = found if detected is None else _with_others(found, detected), sequence.folder
     else:
         known, source = _known_start(sequence, settings.init)
         start = _with_sizes(known, found, sequence.fps, np.array(settings.body_offset_m))
@@ -97,6 +111,15 @@ def find_start(
             remedy="pass --drone-size X,Y,Z",
         )
     return start
+
+
+def _with_others(found: Start, detected: Start) -> Start:
+    """The found drones, and after them those of the detected ones that are none of them."""
+    apart_m = np.linalg.norm(detected.position_m[:, None] - found.position_m[None], axis=-1)
+    others = apart_m.min(axis=1, initial=np.inf) > SAME_M
+    return Start(
+        *(np.concatenate([value, getattr(detected, name)[others]]) for name, value in vars(found).items())
+    )
 
 
 def known_motion(

@@ -23,13 +23,21 @@ from psotrack.evaluation.plots import COLOURS, save
 from psotrack.evaluation.standard_errors import standard_error
 from psotrack.mocap import body_trajectories, read_c3d
 from psotrack.sequence import Sequence
-from psotrack.time_shift import Comparison, refused
+from psotrack.time_shift import Comparison, refused, shifted
 from psotrack.trajectories import Trajectories
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["CameraOffsets", "Offset", "camera_offsets", "find_offset", "own_reference", "save_curve"]
+__all__ = [
+    "CameraOffsets",
+    "Offset",
+    "camera_offsets",
+    "find_offset",
+    "own_reference",
+    "save_curve",
+    "shifted",
+]
 
 #: Offsets count at which at least this share is compared of what can be compared at any of them.
 LEAST_OVERLAP = 0.5

@@ -184,6 +184,33 @@ class Comparison:
         return Residuals(arm_m, residual_m - arm_m)
 
 
+def shifted(
+    reference: Trajectories,
+    offset_s: float,
+    frame: Int[np.ndarray, "frames"],
+    time_s: Float[np.ndarray, "frames"],
+) -> Trajectories:
+    """A reference whose clock is ahead by the offset, at the frames of a video.
+
+    Positions and orientations are interpolated by cubic splines, not outside of the reference and not in its gaps.
+
+    Args:
+        reference: by its own clock, at its own rate, at two times or more.
+        offset_s: the reference at t + offset_s belongs to the video at t.
+        frame: (frames,), numbers of the video's frames.
+        time_s: (frames,), when they are.
+    """
+    position_m = _interpolated(reference.time_s, reference.position_m)(time_s + offset_s)
+    orientation_wxyz = None
+    if reference.orientation_wxyz is not None:
+        rotation = _interpolated(reference.time_s, _matrices(reference.orientation_wxyz))(time_s + offset_s)
+        orientation_wxyz = np.full((*rotation.shape[:2], 4), np.nan)
+        known = np.isfinite(rotation).all(axis=(-2, -1))
+        if known.any():
+            orientation_wxyz[known] = Rotation.from_matrix(rotation[known]).as_quat(scalar_first=True)
+    return Trajectories(frame, time_s, reference.drones, position_m, orientation_wxyz=orientation_wxyz)
+
+
 def _interpolated(time_s: Float[np.ndarray, "samples"], values: np.ndarray) -> _At:
     """(times, drones, ...) of values (samples, drones, ...), by cubic splines; NaN outside, and in long gaps."""
     flat = values.reshape(*values.shape[:2], -1).astype(np.float64)

@@ -10,10 +10,13 @@ from helpers import ROOM_M, assert_same, draw_coverage, ring_rig
 
 from psotrack.finishing import finished
 from psotrack.initialisation import Start
+from psotrack.sequence import Sequence
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes
+from psotrack.starts import find_start
 from psotrack.tracking import track_silhouettes
 from psotrack.trajectories import Status
+from psotrack.video import VideoInfo
 
 FPS = 25.0
 REDUCTION = 2
@@ -224,3 +227,25 @@ def test_frames_of_a_recording_that_is_no_multiple_of_a_chunk(silhouettes, told)
     _, trajectories = track(shorter, FIRST)
     assert trajectories.num_frames == 40
     np.testing.assert_array_equal(trajectories.position_m[:25], told[1].position_m[:25, :1])
+
+
+def test_detections_tell_of_drones_that_silhouettes_do_not_show(silhouettes, tmp_path):
+    """The second drone is none of the silhouettes' at frame 0; a detector may see it, and the first one too."""
+    video = VideoInfo(tmp_path / "a.avi", NUM_FRAMES, FPS, (480, 360))
+    sequence = Sequence("R", tmp_path, RIG, dict.fromkeys(RIG.names, video))
+    hidden_m = np.array([0.9, 0.9, 0.9])
+    detected = Start(
+        np.stack([FIRST.position_m[0] + [0.05, 0.0, -0.1], hidden_m]),
+        np.zeros((2, 3)),
+        SIZE_M,
+        np.full(2, 4.0),
+    )
+    alone = find_start(sequence, silhouettes, SETTINGS, ROOM_M)
+    both = find_start(sequence, silhouettes, SETTINGS, ROOM_M, detected)
+    assert len(alone.position_m) == 1
+    np.testing.assert_array_equal(both.position_m, [alone.position_m[0], hidden_m])
+    np.testing.assert_array_equal(both.size_m, [alone.size_m[0], SIZE_M[1]])
+    one = find_start(sequence, silhouettes, TrackSettings(drones=1), ROOM_M, detected)
+    np.testing.assert_array_equal(one.position_m, alone.position_m)
+    nobody = find_start(sequence, silhouettes, SETTINGS, ROOM_M, NOBODY)
+    np.testing.assert_array_equal(nobody.position_m, alone.position_m)

@@ -432,7 +432,6 @@ def _answer(
             "centre (m)",
             "std (mm)",
             *["moved (mm)"] * moved,
-            "worst points (px)",
         )
         for name, row in rows.items():
             table.add_row(
@@ -442,9 +441,11 @@ def _answer(
                 _numbers(row["centre_m"], 3),
                 _numbers([1e3 * std for std in row["centre_std_m"]], 1),
                 *([f"{1e3 * row['moved_m']:.1f}"] if moved else []),
-                ", ".join(_worst(one) for one in row["worst"]),
             )
         _print(table)
+        # Names of points may be long, and a column of them narrow.
+        for name, row in rows.items():
+            say(quiet, json_path, f"{name}, worst points (px): {', '.join(map(_worst, row['worst']))}")
     say(quiet, json_path, f"{out}")
 
 
@@ -463,7 +464,7 @@ def _table(*headings: str) -> Any:
 
     table = Table(box=box.HORIZONTALS, show_edge=False)
     for heading in headings:
-        left = heading in {"", "camera", "worst points (px)"}
+        left = heading in {"", "camera"}
         table.add_column(heading, justify="left" if left else "right")
     return table
 

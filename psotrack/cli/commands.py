@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+import math
 import sys
 from pathlib import Path
 from typing import Any, get_args
 
 import click
 import msgspec
+import numpy as np
 
 from psotrack import __version__
 from psotrack.cli.answers import answer, report_to, say, write_json
@@ -315,11 +317,22 @@ def track(
     metavar="[PNG]",
     help="Save 3D paths and error over time.  [default: beside TRACKS, as .png]",
 )
+@click.option(
+    "--offset",
+    metavar="SECONDS|auto",
+    help="The reference's clock is ahead of the videos' by so much; auto finds it, within 2 s.  [default: 0]",
+)
 @FORCE
 @QUIET
 @JSON
 def evaluate(
-    tracks: Path, sequence: Path, plot: Path | None, force: bool, quiet: bool, json_path: Path | None
+    tracks: Path,
+    sequence: Path,
+    plot: Path | None,
+    offset: str | None,
+    force: bool,
+    quiet: bool,
+    json_path: Path | None,
 ) -> None:
     """Compare TRACKS with the reference of SEQ.
 
@@ -327,6 +340,7 @@ def evaluate(
     Examples:
       psotrack evaluate tracks.csv data/Simulated_Data/S02_D4_A
       psotrack evaluate tracks.csv data/Simulated_Data/S02_D4_A --json errors.json --plot errors.png
+      psotrack evaluate tracks.csv data/Real_Data/R12_D4 --offset auto
     """
     from rich.console import Console
 
@@ -340,13 +354,15 @@ def evaluate(
     if recording.truth is None:
         raise InputError(sequence, expected="a reference to compare with", found="none")
     estimate = read_trajectories(tracks, fps=recording.fps)
-    evaluation = compare(estimate, recording.truth)
-    answer(json_path, evaluation.to_dict(), force)
+    truth, offset_s = _reference(recording, estimate, offset)
+    evaluation = compare(estimate, truth)
+    answer(json_path, evaluation.to_dict() | {"reference_offset_s": offset_s}, force)
     if plot is not None:
         picture = plot if plot.name else tracks.with_suffix(".png")
-        plots.save_overview(picture, estimate, recording.truth, force=force)
+        plots.save_overview(picture, estimate, truth, force=force)
     if not quiet and json_path != Path("-"):
-        Console().print(tables.render(evaluation, title=recording.name))
+        title = f"{recording.name}, reference's clock {offset_s:+.4f} s" if offset else recording.name
+        Console().print(tables.render(evaluation, title=title))
 
 
 @cli.command()
@@ -382,6 +398,27 @@ def _usable(folder: Path, cameras: str | None, num_frames: int | None) -> Any:
     from psotrack.datasets.dpjait import read_sequence
 
     return read_sequence(folder).usable(cameras.split(",") if cameras else None, num_frames)
+
+
+def _reference(recording: Any, estimate: Any, offset: str | None) -> tuple[Any, float]:
+    """The reference of a sequence at the frames of its videos, and by how much its clock is ahead of theirs."""
+    from psotrack.synchronisation import find_offset, own_reference, shifted
+
+    if offset is None:
+        return recording.truth, 0.0
+    reference = own_reference(recording)
+    if offset == "auto":
+        clock = (reference.time_s, reference.position_m, reference.orientation_wxyz)
+        offset_s = find_offset(estimate, *clock, max_offset_s=2.0).offset_s
+    else:
+        try:
+            offset_s = float(offset)
+        except ValueError:
+            offset_s = math.nan
+        if not math.isfinite(offset_s):
+            raise SettingsError("--offset", expected="a number of seconds, or auto", found=offset)
+    frame = np.arange(recording.num_frames)
+    return shifted(reference, offset_s, frame, frame / recording.fps), offset_s
 
 
 def _with_detector(
