@@ -11,12 +11,11 @@ from click.testing import CliRunner
 from helpers import ring_rig
 from scipy.spatial.transform import Rotation
 
-from psotrack.agreement import Agreement
 from psotrack.cameras import CameraRig, project
 from psotrack.cli.doctor import doctor
 from psotrack.datasets.dpjait import write_calibration, write_detections, write_poses
 from psotrack.detections import Detections
-from psotrack.doctor import examine, sampled_frames
+from psotrack.doctor import Agreement, examine, sampled_frames
 from psotrack.sightings import from_detections
 from psotrack.trajectories import Trajectories
 

@@ -9,8 +9,8 @@ from itertools import combinations, product
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.agreement import UNEXPLAINED, Agreement, agreement
 from psotrack.cameras import Camera, CameraRig
+from psotrack.doctor.agreement import UNEXPLAINED, Agreement, agreement
 from psotrack.reprojection import reconstruct
 from psotrack.sightings import Sightings
 

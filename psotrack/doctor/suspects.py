@@ -14,10 +14,10 @@ from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
-from psotrack.agreement import MIN_VIEWPOINTS, UNEXPLAINED, Agreement, num_viewpoints
 from psotrack.calibration import locate_camera
 from psotrack.camera_clocks import camera_offsets
 from psotrack.cameras import NEAR_M, Camera, CameraRig, project, undistort
+from psotrack.doctor.agreement import MIN_VIEWPOINTS, UNEXPLAINED, Agreement, num_viewpoints
 from psotrack.errors import InputError
 from psotrack.reprojection import reconstruct
 from psotrack.sightings import Sightings
