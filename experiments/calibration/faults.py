@@ -1,0 +1,180 @@
+"""What the doctor says of a sound rig with one fault in it, fault by fault.
+
+    python experiments/calibration/faults.py data/Simulated_Data/S02_D4_A --out experiments/pictures
+
+Reads a sequence with its detections, plants each fault in the calibration or in the detections, and asks `psotrack
+doctor`'s own function. Writes results/faults.md beside this file, and doctor_faults.png: how far each pair of cameras
+disagrees, for some of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
+
+from psotrack.cameras import CameraRig
+from psotrack.datasets.dpjait import read_detections, read_sequence
+from psotrack.detections import Detections
+from psotrack.doctor import Diagnosis, examine
+from psotrack.evaluation.plots import save
+from psotrack.methods import detection_files_of
+from psotrack.settings import YOLO
+from psotrack.sightings import from_detections
+
+HERE = Path(__file__).parent
+#: The camera that is tampered with, and another one.
+ONE, OTHER = 2, 5
+SHOWN = ("nothing", "a camera turned by 1 degree", "a camera moved by 0.2 m", "a camera late by 3 frames")
+
+#: Where the colours end.
+MOST_PX = 30
+
+Boxes = Mapping[str, Detections]
+Fault = Callable[[CameraRig, Boxes], tuple[CameraRig, Boxes]]
+
+
+def turned(degrees: float) -> Fault:
+    """One camera turned about its upright axis."""
+
+    def fault(rig: CameraRig, boxes: Boxes) -> tuple[CameraRig, Boxes]:
+        R, centre = rig.cameras.T_cam_world[:, :3, :3].copy(), rig.cameras.centre_world
+        R[ONE] = Rotation.from_rotvec([0.0, degrees, 0.0], degrees=True).as_matrix() @ R[ONE]
+        return _posed(rig, R, -np.matvec(R, centre)), boxes
+
+    return fault
+
+
+def moved(shift_m: float) -> Fault:
+    """One camera moved sideways."""
+
+    def fault(rig: CameraRig, boxes: Boxes) -> tuple[CameraRig, Boxes]:
+        t_m = rig.cameras.T_cam_world[:, :3, 3].copy()
+        t_m[ONE, 0] += shift_m
+        return _posed(rig, rig.cameras.T_cam_world[:, :3, :3], t_m), boxes
+
+    return fault
+
+
+def late(frames: int) -> Fault:
+    """One camera's video begins some frames late."""
+
+    def fault(rig: CameraRig, boxes: Boxes) -> tuple[CameraRig, Boxes]:
+        name = rig.names[ONE]
+        seen, there = boxes[name], boxes[name].frame >= frames
+        shifted = Detections(seen.frame[there] - frames, seen.xyxy[there], seen.confidence[there])
+        return rig, {**boxes, name: shifted}
+
+    return fault
+
+
+def centres(rig: CameraRig, boxes: Boxes) -> tuple[CameraRig, Boxes]:
+    """Centres written where translations belong."""
+    return _posed(rig, rig.cameras.T_cam_world[:, :3, :3], rig.cameras.centre_world), boxes
+
+
+def millimetres(rig: CameraRig, boxes: Boxes) -> tuple[CameraRig, Boxes]:
+    """Millimetres read as metres."""
+    T = rig.cameras.T_cam_world
+    return _posed(rig, T[:, :3, :3], 1e3 * T[:, :3, 3]), boxes
+
+
+def opengl(rig: CameraRig, boxes: Boxes) -> tuple[CameraRig, Boxes]:
+    """Camera axes as OpenGL has them."""
+    flip, T = np.array([1.0, -1.0, -1.0]), rig.cameras.T_cam_world
+    return _posed(rig, flip[:, None] * T[:, :3, :3], flip * T[:, :3, 3]), boxes
+
+
+def exchanged(rig: CameraRig, boxes: Boxes) -> tuple[CameraRig, Boxes]:
+    """The videos of two cameras under each other's name."""
+    one, other = rig.names[ONE], rig.names[OTHER]
+    return rig, {**boxes, one: boxes[other], other: boxes[one]}
+
+
+def longer(share: float, of: int | slice) -> Fault:
+    """Focal lengths too long by a share."""
+
+    def fault(rig: CameraRig, boxes: Boxes) -> tuple[CameraRig, Boxes]:
+        K = rig.cameras.K.copy()
+        K[of, :2, :2] *= 1 + share
+        return CameraRig(rig.names, replace(rig.cameras, K=K)), boxes
+
+    return fault
+
+
+FAULTS: dict[str, Fault] = {
+    "nothing": lambda rig, boxes: (rig, boxes),
+    "a camera turned by 1 degree": turned(1.0),
+    "a camera turned by 0.3 degrees": turned(0.3),
+    "a camera moved by 0.2 m": moved(0.2),
+    "a camera late by 3 frames": late(3),
+    "a camera late by 1 frame": late(1),
+    "two cameras exchanged": exchanged,
+    "centres read as translations": centres,
+    "millimetres read as metres": millimetres,
+    "camera axes as in OpenGL": opengl,
+    "a focal length 6 % too long": longer(0.06, ONE),
+    "all focal lengths 10 % too long": longer(0.1, slice(None)),
+    "all focal lengths 4 % too long": longer(0.04, slice(None)),
+}
+
+
+def main() -> None:
+    """Plant, ask, and write what is said."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("sequence", type=Path)
+    parser.add_argument("--out", type=Path, default=HERE.parent / "pictures", help="Folder of the picture.")
+    options = parser.parse_args()
+    recording = read_sequence(options.sequence)
+    boxes = {name: read_detections(path) for name, path in detection_files_of(recording, YOLO).items()}
+    said = {}
+    for name, fault in FAULTS.items():
+        rig, tampered = fault(recording.rig, boxes)
+        sightings = from_detections(tampered, rig, recording.num_frames)
+        said[name] = examine(rig, sightings, fps=recording.fps, reference=recording.truth)
+        print(f"{name}: {words(said[name])}", flush=True)
+    lines = [
+        "| planted | what `psotrack doctor` says |",
+        "|---|---|",
+        *(f"| {name} | {words(diagnosis)} |" for name, diagnosis in said.items()),
+    ]
+    (HERE / "results" / "faults.md").write_text("\n".join(lines) + "\n")
+    names = recording.rig.names
+    save(options.out / "doctor_faults.png", (13.0, 3.9), lambda figure: draw(figure, said, names), force=True)
+
+
+def words(diagnosis: Diagnosis) -> str:
+    """The findings in a line."""
+    return "; ".join(finding.message for finding in diagnosis.findings) or "nothing disagrees"
+
+
+def draw(figure: Figure, said: Mapping[str, Diagnosis], names: tuple[str, ...]) -> None:
+    """A matrix of cameras for each of some faults."""
+    axes = figure.subplots(1, len(SHOWN), sharey=True)
+    for axis, name in zip(axes, SHOWN, strict=True):
+        picture = axis.imshow(
+            np.log10(said[name].epipolar_px), cmap="viridis", vmin=0, vmax=np.log10(MOST_PX)
+        )
+        axis.set_title("a sound rig" if name == "nothing" else name, fontsize=10)
+        axis.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
+        axis.set_yticks(range(len(names)), names, fontsize=8)
+    bar = figure.colorbar(picture, ax=list(axes), shrink=0.85, ticks=np.log10([1, 3, 10, MOST_PX]))
+    bar.ax.set_yticklabels(["1", "3", "10", f"{MOST_PX}"])
+    bar.set_label("median distance from the other's\nepipolar lines (px)", fontsize=9)
+
+
+def _posed(rig: CameraRig, R: np.ndarray, t_m: np.ndarray) -> CameraRig:
+    T = rig.cameras.T_cam_world.copy()
+    T[:, :3, :3], T[:, :3, 3] = R, t_m
+    return CameraRig(rig.names, replace(rig.cameras, T_cam_world=T))
+
+
+if __name__ == "__main__":
+    main()
