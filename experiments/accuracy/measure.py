@@ -25,21 +25,26 @@ def effort(particles: int, iterations: int) -> tuple[str, ...]:
     return "--particles", str(particles), "--iterations", str(iterations)
 
 
+#: The methods beside the swarm; the swarm in "fused" has its defaults.
+OTHERS = {"projection lines": ("--method", "projection-lines"), "fused": ("--method", "fused")}
 METHODS = {
     "S01_D2_A": {
         "joint 50 x 50": (*JOINT, *effort(50, 50)),
         "joint 50 x 50, the paper's hard one-box score": (*JOINT, *effort(50, 50), *HARD),
         "per drone 30 x 30 (the defaults)": (),
+        **OTHERS,
     },
     "S02_D4_A": {
         "joint 100 x 70": (*JOINT, *effort(100, 70)),
         "joint 100 x 70, the paper's hard one-box score": (*JOINT, *effort(100, 70), *HARD),
         "per drone 30 x 20": effort(30, 20),
         "per drone 30 x 30 (the defaults)": (),
+        **OTHERS,
     },
     "S04_D10": {
         "per drone 50 x 30": effort(50, 30),
         "joint 100 x 70, the paper's hard one-box score": (*JOINT, *effort(100, 70), *HARD),
+        **OTHERS,
     },
 }
 KEPT = ["mean_error_m", "median_error_m", "p95_error_m", "max_error_m", "offset_removed_mean_error_m"]
@@ -71,6 +76,9 @@ def main() -> None:
     """Simulate, track, evaluate, and print the table."""
     parser = _runs.parser(__doc__)
     parser.add_argument("--sequence", choices=METHODS, action="append", help="[default: all of them]")
+    parser.add_argument(
+        "--method", choices=sorted({one for of in METHODS.values() for one in of}), action="append"
+    )
     parser.add_argument("--seeds", type=int, default=3, help="seeds of flight and swarm: 0, 1, ...")
     options = parser.parse_args()
     rows = (
@@ -78,6 +86,7 @@ def main() -> None:
         for seed in range(options.seeds)
         for name in options.sequence or METHODS
         for method in METHODS[name]
+        if not options.method or method in options.method
     )
     table = _runs.table(rows, options.out / "measure.csv")
     means = table.drop(columns="seed").groupby(["sequence", "method"], sort=False).mean()
