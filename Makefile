@@ -12,7 +12,7 @@ install = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python
 oracle = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python $(BIN)/python --no-deps 'trackeval>=1.3'; \
 	else $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'trackeval>=1.3'; fi
 
-.PHONY: help demo test test-fast lint format bench notebooks table4 table5 table5-quick clean
+.PHONY: help demo test test-fast lint format bench notebooks table4 table5 table5-quick table7 clean
 
 help:  ## what can be made
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -60,6 +60,9 @@ table4: $(VENV)/.installed  ## the paper's Table 4: projection lines, beside the
 
 table5-quick: $(VENV)/.installed  ## a small form of it, five minutes
 	@$(BIN)/python experiments/table5/table5.py --quick $(if $(DATA),--data $(DATA))
+
+table7: $(VENV)/.installed  ## the paper's Tables 6 to 8 and figure 11: drones' own cameras and markers; DATA=FOLDER for the published sequences
+	@$(BIN)/python experiments/table7/table7.py $(if $(DATA),--data $(DATA))
 
 clean:  ## remove what was built, the environment too
 	rm -rf $(VENV) build dist demo notebooks/data ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

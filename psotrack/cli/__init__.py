@@ -16,7 +16,10 @@ from psotrack.cli.commands import cli
 from psotrack.cli.detect import detect
 from psotrack.cli.doctor import doctor
 from psotrack.cli.fly import fly
+from psotrack.cli.fuse import fuse
 from psotrack.cli.labels import labels
+from psotrack.cli.localise import localise
+from psotrack.cli.map_markers import map_markers
 from psotrack.cli.simulate import simulate
 from psotrack.cli.sweep import sweep, table
 from psotrack.cli.synchronise import synchronise
@@ -32,7 +35,10 @@ cli.add_command(table)
 cli.add_command(calibrate)
 cli.add_command(detect)
 cli.add_command(doctor)
+cli.add_command(fuse)
 cli.add_command(labels)
+cli.add_command(localise)
+cli.add_command(map_markers)
 cli.add_command(synchronise)
 
 

@@ -385,10 +385,11 @@ def _lenses(
 
 
 def _marker_marks(folder: Path, dictionary: str) -> dict[str, Marks]:
-    from psotrack.datasets.dpjait import MARKER_CORNERS, read_marker_corners, read_sequence
+    from psotrack.datasets.dpjait import MARKER_CORNERS, read_sequence
+    from psotrack.inside_out.marker_map import read_marker_map
     from psotrack.marks import find_markers
 
-    corners_m = read_marker_corners(folder / MARKER_CORNERS)
+    corners_m = read_marker_map(folder / MARKER_CORNERS).corners_m
     videos = read_sequence(folder).videos
     return {name: find_markers(video, corners_m, dictionary) for name, video in videos.items()}
 

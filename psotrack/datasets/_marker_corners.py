@@ -6,7 +6,8 @@ marker's own top left when it is looked at.
 
 Read is whatever can be no other: semicolons, commas or tabs; metres, centimetres or millimetres as the header says,
 `x1[mm]`, `x1 (mm)` or `x1_mm`, and metres where it says none; corners called 1 to 4, 0 to 3 or tl, tr, br, bl, as in
-`x1`, `corner1_x` or `tl_x`; one row for each corner, `id`, `corner`, `x`, `y`, `z`; numbers alone, 13 or 5 in a row.
+`x1`, `corner1_x` or `tl_x`; one row for each corner, `id`, `corner`, `x`, `y`, `z`, or `label`, `x`, `y`, `z` with
+labels such as `Marker7:1`, `M7_1` or `7.1`; numbers alone, 13 or 5 in a row.
 Other columns are passed over.
 """
 
@@ -27,31 +28,8 @@ from psotrack.files import read_text
 _CORNERS = [f"{axis}{corner}" for corner in range(1, 5) for axis in "xyz"]
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "": 1.0}
 _UNIT = re.compile(r"(?P<name>.*?)\s*(?:[\[(]\s*(?P<bracketed>[^\])]*?)\s*[\])]|_(?P<plain>mm|cm|m))")
-_IDS = {
-    "id",
-    "marker",
-    "markerid",
-    "idmarker",
-    "aruco",
-    "arucoid",
-    "idaruco",
-    "tag",
-    "tagid",
-    "nr",
-    "no",
-    "number",
-}
-_CORNER = {
-    "corner",
-    "cornerid",
-    "cornerno",
-    "cornernr",
-    "cornernumber",
-    "cornerindex",
-    "vertex",
-    "point",
-    "pointid",
-}
+_IDS = re.compile("(?:id)?(?:marker|aruco|tag)(?:id)?|id|nr|no|number")
+_CORNER = re.compile("(?:corner|vertex|point)(?:id|no|nr|number|index)?|label|name")
 _NAMED = {
     "tl": 1, "topleft": 1, "lefttop": 1, "upperleft": 1,
     "tr": 2, "topright": 2, "righttop": 2, "upperright": 2,
@@ -63,6 +41,7 @@ _WIDE = re.compile(
     rf"(?P<before>[xyz]){_WHICH.format(group='after_axis')}|{_WHICH.format(group='before_axis')}(?P<after>[xyz])"
 )
 _LONG = re.compile(r"(?:pos|position|coord|corner|c|p|point)?(?P<axis>[xyz])")
+_LABEL = re.compile(r"(?:marker|aruco|tag|id|m)?[ _]*(\d+)[ ]?[:_. -][ ]?(?:corner|c)?([0-4])", re.IGNORECASE)
 _ID = re.compile(r"(?:[a-z][a-z _:-]*)?(?P<number>\d+)(?:\.0*)?", re.IGNORECASE)
 
 
@@ -97,6 +76,12 @@ def read_marker_rows(path: Path) -> dict[int, MarkerRow]:
     """
     table = _read(path)
     return _long(table) if table.find("corner") and not table.find("x1") else _wide(table)
+
+
+def split_label(label: str) -> tuple[int, int] | None:
+    """The marker's number and the corner's as it counts them, in labels such as `Marker7:1`, `M7_1` or `7.1`."""
+    match = _LABEL.fullmatch(label.strip())
+    return (int(match[1]), int(match[2])) if match else None
 
 
 def write_marker_corners(path: Path, corners_m: Mapping[int, Float[np.ndarray, "4 3"]]) -> None:
@@ -202,19 +187,38 @@ def _read(path: Path) -> Table:
         columns, rows = _columns(rows[0]), rows[1:]
     if not rows:
         raise InputError(path, expected="rows below the header", found="none")
-    whole = []
-    for row in rows:
-        # An empty cell at the end of a line is cut off with its separator.
-        cells = row.cells + ("",) * (len(row.cells) == len(columns) - 1)
-        if len(cells) != len(columns):
-            raise InputError(
-                row.where,
-                expected=f"{len(columns)} values{' as in the header' if len(rows) else ''}",
-                found=f"{len(row.cells)}",
-                remedy="a marker has four corners of three coordinates" if len(columns) >= 13 else "",
+    whole = [_whole(row, len(columns)) for row in rows]
+    table = Table(path, columns, tuple(whole))
+    return table if table.find("id") or not table.find("corner") else _unlabelled(table)
+
+
+def _whole(row: Row, count: int) -> Row:
+    # An empty cell at the end of a line is cut off with its separator.
+    cells = row.cells + ("",) * (len(row.cells) == count - 1)
+    if len(cells) != count:
+        raise InputError(
+            row.where,
+            expected=f"{count} values",
+            found=f"{len(row.cells)}",
+            remedy="a marker has four corners of three coordinates" if count >= 13 else "",
+        )
+    return replace(row, cells=cells)
+
+
+def _unlabelled(table: Table) -> Table:
+    """A table with the two numbers that its labels have in columns of their own."""
+    column, end = table.column("corner"), len(table.columns)
+    rows = []
+    for row in table.rows:
+        named = split_label(row.text(column))
+        if named is None:
+            raise row.wrong(
+                column, "a label such as Marker7:1, of marker 7's first corner", repr(row.text(column))
             )
-        whole.append(replace(row, cells=cells))
-    return Table(path, columns, tuple(whole))
+        rows.append(replace(row, cells=(*row.cells, *map(str, named))))
+    added = (Column(end, "id", "", column.header), Column(end + 1, "corner", "", column.header))
+    others = tuple(one for one in table.columns if one is not column)
+    return Table(table.path, others + added, tuple(rows))
 
 
 def _columns(header: Row) -> tuple[Column, ...]:
@@ -244,9 +248,9 @@ _KNOWN = {"id", "corner", *"xyz", *_CORNERS}
 
 
 def _canonical(name: str) -> str:
-    if name in _IDS:
+    if _IDS.fullmatch(name):
         return "id"
-    if name in _CORNER:
+    if _CORNER.fullmatch(name):
         return "corner"
     wide = _WIDE.fullmatch(name)
     if wide is not None:

@@ -19,7 +19,13 @@ import numpy as np
 
 from psotrack.datasets._archives import join_archives
 from psotrack.datasets._calibration import camera_key, read_calibration, read_names, write_calibration
-from psotrack.datasets._marker_corners import read_marker_corners, write_marker_corners
+from psotrack.datasets._marker_corners import (
+    MarkerRow,
+    read_marker_corners,
+    read_marker_rows,
+    split_label,
+    write_marker_corners,
+)
 from psotrack.datasets._masks import MASKS, Masks, MaskWriter, read_masks
 from psotrack.datasets._mocap_markers import mocap_markers_file, read_mocap_markers, write_mocap_markers
 from psotrack.datasets._onboard import (
@@ -48,6 +54,7 @@ __all__ = [
     "MASKS",
     "ONBOARD_CALIBRATION",
     "Detections",
+    "MarkerRow",
     "MaskWriter",
     "Masks",
     "detection_files",
@@ -59,12 +66,14 @@ __all__ = [
     "read_calibration",
     "read_detections",
     "read_marker_corners",
+    "read_marker_rows",
     "read_masks",
     "read_mocap_markers",
     "read_onboard",
     "read_onboard_calibration",
     "read_poses",
     "read_sequence",
+    "split_label",
     "write_calibration",
     "write_detections",
     "write_marker_corners",

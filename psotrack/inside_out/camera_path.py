@@ -40,7 +40,7 @@ _BODY_IN_CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]
 class Flag(IntFlag):
     """What is to be known of a frame beside its status."""
 
-    #: Fewer markers than were asked for; none is no such flag.
+    #: Fewer markers than 4, the paper's number, or than were asked for; none is no such flag.
     FEW_MARKERS = 1
     #: Another pose fits about as well, and nothing told which it is.
     AMBIGUOUS = 2
@@ -64,7 +64,7 @@ class CameraPath:
         orientation_wxyz: (frames, 4), unit quaternions, camera to world; camera axes x right, y down, z ahead.
         covariance: (frames, 6, 6), of the position along the world's axes (m) and of a small turn about the
             camera's axes (rad): the camera is turned by R exp([turn]) where R is what is given.
-        num_markers: (frames,), markers that the pose is from.
+        num_markers: (frames,), markers that the pose is from; without a pose, those that were seen.
         reprojection_px: (frames,), root mean square over their corners of the distance in the image.
         ambiguity: (frames,), probability that another pose is the right one, from 0 to 1/2.
         status: (frames,), values of `Status`: `TRACKED` where the frame's own markers tell, `COASTING` where the motion

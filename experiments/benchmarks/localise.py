@@ -1,0 +1,136 @@
+"""Time localising a camera by markers on walls: a video that is drawn, or one of a sequence.
+
+One process. For two cores of a larger machine: `taskset -c 0,1 python localise.py`. Options: `localise.py --help`.
+"""
+
+from __future__ import annotations
+
+import platform
+import tempfile
+from pathlib import Path
+
+import click
+import cv2
+import numpy as np
+
+import psotrack
+from psotrack.cameras import Camera, camera, look_at, project
+from psotrack.datasets.dpjait import MARKER_CORNERS, read_onboard
+from psotrack.inside_out.frames import open_source
+from psotrack.inside_out.localising import STAGES, Localised, localise
+from psotrack.inside_out.marker_map import MarkerMap, read_marker_map
+from psotrack.lenses import lens_of_view, marker_dictionary
+from psotrack.video import VideoWriter
+
+_SIZE_WH, _FPS = (1920, 1080), 25.0
+_SIDE_M = 0.3
+#: The camera goes to and fro before a wall.
+_PERIOD_FRAMES = 200
+#: Of the image, per cell of a marker's own.
+_CELL_PX = 24
+
+
+@click.command(context_settings={"show_default": True})
+@click.option("--sequence", type=click.Path(path_type=Path), help="An _A sequence instead of what is drawn.")
+@click.option("--drone", default="dron1", help="Whose camera, with --sequence.")
+@click.option("--frames", default=250, type=click.IntRange(1), help="Of the video.")
+@click.option("--repeats", default=5, type=click.IntRange(1), help="Runs.")
+def main(sequence: Path | None, drone: str, frames: int, repeats: int) -> None:
+    """Localise a video; print frames per second, milliseconds per stage, and what they were measured on."""
+    with tempfile.TemporaryDirectory() as folder:
+        if sequence is None:
+            video, marker_map, lens = (
+                Path(folder) / "drawn.avi",
+                _wall(),
+                lens_of_view(92.45, 60.83, _SIZE_WH),
+            )
+            _draw(video, marker_map, lens, frames)
+        else:
+            one = read_onboard(sequence)[drone]
+            video, marker_map = one.video.path, read_marker_map(sequence / MARKER_CORNERS)
+            lens = camera(R=np.eye(3), t_m=np.zeros(3), K=one.K, image_size_wh=one.video.image_size_wh)
+        source = open_source(video)
+        source = source.first(min(frames, source.num_frames or frames))
+        # The first run is not counted: it compiles, imports and reads the video from the disk.
+        runs = [localise(source, marker_map, lens) for _ in range(1 + repeats)][1:]
+    click.echo(f"{platform.machine()}, {cv2.getNumberOfCPUs()} processors; psotrack {psotrack.__version__}")
+    click.echo(
+        f"Python {platform.python_version()}, NumPy {np.__version__}, OpenCV {cv2.__version__} "
+        f"with {cv2.getNumThreads()} threads"
+    )
+    _show(runs, source.image_size_wh, len(marker_map))
+
+
+def _show(runs: list[Localised], image_size_wh: tuple[int, int], markers: int) -> None:
+    rates = [run.frames_per_second for run in runs]
+    path = runs[0].path
+    click.echo(
+        f"{path.num_frames} frames of {image_size_wh[0]} x {image_size_wh[1]} pixels, {markers} markers in the map, "
+        f"median of {np.median(path.num_markers):g} in a frame; a pose in {path.seen.sum()} frames"
+    )
+    click.echo(
+        f"frames per second: median {np.median(rates):.1f} of {len(runs)} runs, {min(rates):.1f} to {max(rates):.1f}"
+    )
+    for stage in STAGES:
+        each_ms = [1e3 * run.seconds[stage] / path.num_frames for run in runs]
+        click.echo(f"{stage:<8} {np.median(each_ms):6.2f} ms per frame")
+
+
+def _wall() -> MarkerMap:
+    """Twenty-eight markers on a wall at y = 4, in rows."""
+    corners = {}
+    for index in range(28):
+        x, z = -3.5 + index % 7, 0.4 + 0.7 * (index // 7)
+        corners[index + 1] = np.array(
+            [[x, 4, z + _SIDE_M], [x + _SIDE_M, 4, z + _SIDE_M], [x + _SIDE_M, 4, z], [x, 4, z]]
+        )
+    return MarkerMap(corners)
+
+
+def _draw(path: Path, marker_map: MarkerMap, lens: Camera, frames: int) -> None:
+    """A video before the wall, which has a texture and coloured boards."""
+    rng = np.random.default_rng(0)
+    texture = cv2.GaussianBlur(rng.normal(0, 60, _SIZE_WH[::-1]), (0, 0), 4)
+    background = np.repeat((170 + texture)[..., None], 3, axis=-1)
+    for _ in range(20):
+        x, y = rng.uniform((0, 0), _SIZE_WH).astype(int)
+        width, height = rng.integers(60, 300, 2)
+        background[y : y + height, x : x + width] = rng.uniform(40, 220, 3)
+    background = np.clip(background, 0, 255).astype(np.uint8)
+    with VideoWriter(path, _FPS, _SIZE_WH) as writer:
+        for frame in range(frames):
+            angle = 2 * np.pi * frame / _PERIOD_FRAMES
+            R, t_m = look_at(
+                (1.5 * np.sin(angle), 0.8 * np.cos(angle), 1.5), (0.8 * np.sin(2 * angle), 4.0, 1.5)
+            )
+            posed = camera(R=R, t_m=t_m, K=lens.K, image_size_wh=_SIZE_WH)
+            image = background.copy()
+            for marker, corners_m in marker_map.corners_m.items():
+                _add_marker(image, marker, project(posed, corners_m)[0])
+            writer.write(image)
+
+
+def _add_marker(image: np.ndarray, marker: int, corners_px: np.ndarray) -> None:
+    """Draw one marker with a cell of white around it, in the part of the image that holds it."""
+    low = np.maximum(np.floor(1.3 * corners_px.min(axis=0) - 0.3 * corners_px.max(axis=0)), 0).astype(int)
+    high = np.ceil(1.3 * corners_px.max(axis=0) - 0.3 * corners_px.min(axis=0)).astype(int)
+    high = np.minimum(high, _SIZE_WH)
+    if (high <= low).any():
+        return
+    own = cv2.copyMakeBorder(
+        cv2.aruco.generateImageMarker(marker_dictionary("4x4_1000"), marker, 6 * _CELL_PX),
+        *[_CELL_PX] * 4,
+        cv2.BORDER_CONSTANT,
+        value=255,
+    )
+    near, far = _CELL_PX - 0.5, 7 * _CELL_PX - 0.5
+    at = np.array([[near, near], [far, near], [far, far], [near, far]], np.float32)
+    towards = cv2.getPerspectiveTransform(at, (corners_px - low).astype(np.float32))
+    size = tuple(int(side) for side in high - low)
+    warped = cv2.warpPerspective(own, towards, size, flags=cv2.INTER_AREA)
+    inside = cv2.warpPerspective(np.full_like(own, 255), towards, size, flags=cv2.INTER_NEAREST) > 0
+    image[low[1] : high[1], low[0] : high[0]][inside] = (30 + (190 / 255) * warped[inside])[:, None]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,171 @@
+"""The recordings of Table 7: a drone's own video, the map of the markers, and a reference by clocks of its own."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from psotrack.cameras import Camera, camera
+from psotrack.datasets.dpjait import CALIBRATION, MARKER_CORNERS, read_sequence
+from psotrack.errors import InputError
+from psotrack.inside_out.marker_map import MarkerMap, read_marker_map
+from psotrack.lenses import lens_of_view
+from psotrack.progress import terminal
+from psotrack.sequence import OnboardVideo
+from psotrack.synchronisation import own_reference
+from psotrack.trajectories import Trajectories
+from psotrack.video import VideoInfo
+
+SIMULATED = ("S01_D2_A", "S02_D4_A")
+#: What the paper says of its GoPro, for videos that come without intrinsics.
+FOV_DEG = (92.45, 60.83)
+#: Of a simulated reference: as the paper's Vicon, and its IMU.
+POSITIONS_HZ, ORIENTATIONS_HZ = 100.0, 25.0
+#: How far the clocks of a simulated reference are off, at most, to either side.
+CLOCKS_S = 5.0
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What was recorded beside the video, of the drone's body.
+
+    Attributes:
+        time_s: (samples,), by its own clock.
+        position_m: (samples, 3), world.
+        orientation_wxyz: (turns, 4), body to world, or None.
+        orientation_time_s: (turns,), where they come by another clock.
+        planted_s: how far the two clocks were set ahead of the video's, where that is known.
+    """
+
+    time_s: Float[np.ndarray, "samples"]
+    position_m: Float[np.ndarray, "samples 3"]
+    orientation_wxyz: Float[np.ndarray, "turns 4"] | None
+    orientation_time_s: Float[np.ndarray, "turns"] | None = None
+    planted_s: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One flight of one drone.
+
+    Attributes:
+        sequence, drone: names.
+        video: of the drone's own camera.
+        lens: its intrinsics.
+        marker_map: of the room.
+        reference: what the paper's procedure is given.
+        truth: the camera's poses at the frames, of simulated sequences; None of real ones.
+    """
+
+    sequence: str
+    drone: str
+    video: VideoInfo
+    lens: Camera
+    marker_map: MarkerMap
+    reference: Reference
+    truth: OnboardVideo | None
+
+
+def simulated(data: Path, *, num_frames: int | None = None, scale: float = 1.0) -> Path:
+    """The data's root, with the sequences that were not there.
+
+    Of the cameras in the room one of few pixels is left: only the drones' own videos are wanted.
+    """
+    from psotrack.simulation import replaced, scenario, simulate
+
+    corner = {"position_m": (2.9, 2.1, 2.5), "target_m": (0.0, 0.0, 1.0)}
+    for name in SIMULATED:
+        if not (data / "Simulated_Data" / name).is_dir():
+            print(f"simulating the drones' own videos of {name}", flush=True)
+            recipe = replaced(scenario(name), {"cameras": [corner], "image_size_wh": [160, 160]})
+            simulate(recipe, data, num_frames=num_frames, scale=scale, seed=0, masks=False, report=terminal)
+    return data
+
+
+def at_hand(data: Path) -> list[Path]:
+    """The folders of all sequences with markers below a folder.
+
+    Raises:
+        InputError: there is none.
+    """
+    folders = [path.parent for path in data.glob(f"*/*/{CALIBRATION}") if path.parent.name.endswith("_A")]
+    if not folders:
+        expected = "sequences with markers, *_A, in Simulated_Data or Real_Data"
+        raise InputError(data, expected=expected, found="none")
+    return sorted(folders)
+
+
+def recordings(folder: Path) -> Iterator[Recording]:
+    """Those of all drones of a sequence that have a camera.
+
+    Raises:
+        InputError: there is none, or a file cannot be used.
+    """
+    if not (folder / MARKER_CORNERS).exists():
+        raise InputError(folder / MARKER_CORNERS, expected="the corners of its markers", found="no such file")
+    marker_map, sequence = read_marker_map(folder / MARKER_CORNERS), read_sequence(folder)
+    if not sequence.onboard:
+        raise InputError(folder, expected="a video of a drone's own camera, dronN_cam_s.avi", found="none")
+    flights = own_reference(sequence)
+    for name, onboard in sequence.onboard.items():
+        body = _flight(flights, name, folder)
+        known = np.isfinite(onboard.position_m).all(axis=-1).any()
+        yield Recording(
+            sequence=sequence.name,
+            drone=name,
+            video=onboard.video,
+            lens=_lens(onboard),
+            marker_map=marker_map,
+            reference=_apart(body, f"{sequence.name} {name}") if known else body,
+            truth=onboard if known else None,
+        )
+
+
+def _lens(onboard: OnboardVideo) -> Camera:
+    size_wh = onboard.video.image_size_wh
+    if onboard.K is None:
+        return lens_of_view(*FOV_DEG, size_wh)
+    return camera(R=np.eye(3), t_m=np.zeros(3), K=onboard.K, image_size_wh=size_wh)
+
+
+def _flight(flights: Trajectories, name: str, folder: Path) -> Reference:
+    """That of the drone of this name, or of the only one that there is."""
+    if name not in flights.drones and len(flights.drones) > 1:
+        raise InputError(folder, expected=f"{name} in its reference", found=f"{', '.join(flights.drones)}")
+    drone = flights.drones.index(name) if name in flights.drones else 0
+    seen = flights.seen[:, drone]
+    turns = flights.orientation_wxyz
+    return Reference(
+        flights.time_s,
+        np.where(seen[:, None], flights.position_m[:, drone], np.nan),
+        None if turns is None else np.where(seen[:, None], turns[:, drone], np.nan),
+    )
+
+
+def _apart(body: Reference, name: str) -> Reference:
+    """A simulated flight as two recorders would have it that know nothing of the video: other rates, other clocks."""
+    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    clock_s, turn_clock_s = rng.uniform(-CLOCKS_S, CLOCKS_S, 2)
+    if body.orientation_wxyz is None:
+        raise InputError(name, expected="orientations of the drone", found="none")
+    known = np.isfinite(body.position_m).all(axis=-1) & np.isfinite(body.orientation_wxyz).all(axis=-1)
+    time_s = body.time_s[known]
+    samples_s, turns_s = (
+        np.arange(time_s[0] + rng.uniform(0, 1 / rate_hz), time_s[-1], 1 / rate_hz)
+        for rate_hz in (POSITIONS_HZ, ORIENTATIONS_HZ)
+    )
+    turns = RotationSpline(time_s, Rotation.from_quat(body.orientation_wxyz[known], scalar_first=True))
+    return Reference(
+        samples_s + clock_s,
+        CubicSpline(time_s, body.position_m[known])(samples_s),
+        turns(turns_s).as_quat(scalar_first=True),
+        turns_s + turn_clock_s,
+        (float(clock_s), float(turn_clock_s)),
+    )

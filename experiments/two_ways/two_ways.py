@@ -1,0 +1,162 @@
+"""One rig, two methods: errors of outside-in, inside-out and both fused, beside each other, and in ranges of frames.
+
+    python experiments/two_ways/two_ways.py data/Simulated_Data/S01_D2_A dron1.csv dron2.csv tracks.csv
+    python experiments/two_ways/two_ways.py SEQ INSIDE.csv [INSIDE.csv ...] OUTSIDE.csv --range 25 --out rows.csv
+
+INSIDE are paths of `psotrack localise`, whose drones are named as in SEQ's reference; OUTSIDE is a file of `psotrack
+track`. Each track's constant offset from the reference is taken out in the body: a camera, the middle of a silhouette
+and a body's origin are different points. Only frames that both methods cover count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from scipy.spatial.transform import Rotation
+
+from psotrack.datasets.dpjait import read_sequence
+from psotrack.errors import InputError, PsotrackError
+from psotrack.files import refuse_to_overwrite, written_whole
+from psotrack.inside_out.camera_path import CameraPath, read_camera_path
+from psotrack.inside_out.fusing import Fused, fuse
+from psotrack.trajectories import Trajectories
+from psotrack.trajectory_files import read_trajectories
+
+METHODS = ("outside", "inside", "fused")
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Errors (frames,) of one drone by each method, in metres, in frames that both methods cover."""
+
+    drone: str
+    error_m: dict[str, np.ndarray]
+    frame: np.ndarray
+
+
+def main() -> None:
+    """Fuse, compare, print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("sequence", type=Path)
+    parser.add_argument("inside", type=Path, nargs="+", help="INSIDE.csv, one per drone, then OUTSIDE.csv")
+    parser.add_argument("--range", type=int, default=50, metavar="FRAMES", help="[default: 50]")
+    parser.add_argument("--out", type=Path, help="write a row per drone and range as CSV")
+    parser.add_argument("--force", action="store_true", help="replace what is there")
+    options = parser.parse_args()
+    *inside, outside = options.inside
+    try:
+        if options.out is not None:
+            refuse_to_overwrite(options.out, options.force)
+        paths = {name: path for path, name in map(read_camera_path, inside)}
+        tracks = read_trajectories(outside)
+        fused = fuse(paths, tracks)
+        truth = read_sequence(options.sequence).truth
+        if truth is None or truth.orientation_wxyz is None:
+            raise InputError(options.sequence, expected="a reference with orientations", found="none")
+        compared = [one for name in paths if (one := _compared(name, paths[name], tracks, fused, truth))]
+        rows = pd.concat([_ranges(one, options.range) for one in compared])
+        print(render(compared, rows))
+        if options.out is not None:
+            with written_whole(options.out) as temporary:
+                rows.to_csv(temporary, index=False)
+    except PsotrackError as error:
+        sys.exit(f"two_ways: {error}")
+
+
+def render(compared: list[Compared], rows: pd.DataFrame) -> str:
+    """A line per drone, as Markdown."""
+    lines = [
+        "| drone | outside, mm: median, mean, p99 | inside | fused | ranges | fused is no worse in | worst ratio |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for one in compared:
+        own = rows[rows.drone == one.drone]
+        cells = [_words(one.error_m[method]) for method in METHODS]
+        no_worse = f"{(own.ratio <= 1).sum()} of {len(own)}"
+        worst = own.loc[own.ratio.idxmax()]
+        excess_mm = 1e3 * (worst.fused_m - min(worst.inside_m, worst.outside_m))
+        cells += [
+            f"{len(own)}",
+            no_worse,
+            f"{worst.ratio:.2f} ({excess_mm:+.2f} mm, from frame {worst.first_frame})",
+        ]
+        lines.append(f"| {one.drone} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _words(error_m: np.ndarray) -> str:
+    return ", ".join(
+        f"{1e3 * value:.2f}" for value in (np.median(error_m), error_m.mean(), np.quantile(error_m, 0.99))
+    )
+
+
+def _compared(
+    name: str, path: CameraPath, tracks: Trajectories, fused: Fused, truth: Trajectories
+) -> Compared | None:
+    """None for a drone that only one method has."""
+    index = [drone.name for drone in fused.drones].index(name)
+    if not fused.drones[index].tracks:
+        return None
+    drone = truth.drones.index(name)
+    known = np.isfinite(truth.orientation_wxyz[:, drone]).all(axis=1) & truth.seen[:, drone]
+    frame = truth.frame[known]
+    rotation = Rotation.from_quat(truth.orientation_wxyz[known, drone], scalar_first=True)
+    true_m = truth.position_m[known, drone]
+    own = [tracks.drones.index(track) for track in fused.drones[index].tracks]
+    nearest = np.full((len(frame), 3), np.nan)
+    for track in own:
+        # Of tracks that were exchanged the one that is with the drone, which flatters the outside.
+        there_m = _at(frame, tracks, track)
+        better = np.linalg.norm(there_m - true_m, axis=1) < np.nan_to_num(
+            np.linalg.norm(nearest - true_m, axis=1), nan=np.inf
+        )
+        nearest[better] = there_m[better]
+    position_m = {
+        "outside": nearest,
+        "inside": _at(frame, path.trajectories(name), 0),
+        "fused": _at(frame, fused.trajectories, index),
+    }
+    both = np.isfinite(sum(position_m.values())).all(axis=1)
+    in_body_m = {
+        method: rotation[both].inv().apply(position_m[method][both] - true_m[both]) for method in METHODS
+    }
+    error_m = {
+        method: np.linalg.norm(off_m - np.median(off_m, axis=0), axis=1)
+        for method, off_m in in_body_m.items()
+    }
+    return Compared(name, error_m, frame[both])
+
+
+def _at(frame: np.ndarray, tracks: Trajectories, drone: int) -> np.ndarray:
+    """(frames, 3), NaN where it is not tracked."""
+    position_m = np.full((len(frame), 3), np.nan)
+    _, to, source = np.intersect1d(frame, tracks.frame, return_indices=True)
+    seen = tracks.seen[source, drone]
+    position_m[to[seen]] = tracks.position_m[source[seen], drone]
+    return position_m
+
+
+def _ranges(one: Compared, length: int) -> pd.DataFrame:
+    """A row per range of frames of which at least half are covered by both."""
+    rows = []
+    for first in range(0, int(one.frame.max()) + 1, length):
+        inside = (one.frame >= first) & (one.frame < first + length)
+        if inside.sum() < length / 2:
+            continue
+        mean_m = {f"{method}_m": one.error_m[method][inside].mean() for method in METHODS}
+        ratio = mean_m["fused_m"] / min(mean_m["inside_m"], mean_m["outside_m"])
+        rows.append(
+            {"drone": one.drone, "first_frame": first, "frames": inside.sum(), **mean_m, "ratio": ratio}
+        )
+    return pd.DataFrame(rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,162 @@
+"""`psotrack fuse`: the paths of on-board cameras and the tracks of static cameras, as one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from psotrack.cli.answers import answer, say
+from psotrack.cli.options import FORCE, JSON, QUIET
+
+if TYPE_CHECKING:
+    from psotrack.inside_out.camera_path import CameraPath
+    from psotrack.inside_out.drone_fusion import DroneFusion, Errors
+    from psotrack.inside_out.fusing import Fused, FusedDrone
+
+
+@click.command()
+@click.argument("inside", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("outside", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="The fused tracks, a CSV file.")
+@click.option(
+    "--at",
+    "point",
+    type=click.Choice(["camera", "middle"]),
+    default="camera",
+    show_default=True,
+    help="What fused tracks are of: the camera's centre, or the middle of the drone as static cameras see it.",
+)
+@click.option(
+    "--max-offset",
+    "max_offset_s",
+    type=float,
+    metavar="SECONDS",
+    help="Find by how much each camera's clock is ahead, from minus this to this.  [default: all clocks are one]",
+)
+@FORCE
+@QUIET
+@JSON
+def fuse(
+    inside: tuple[Path, ...],
+    outside: Path,
+    out: Path,
+    point: Any,
+    max_offset_s: float | None,
+    force: bool,
+    quiet: bool,
+    json_path: Path | None,
+) -> None:
+    """Fuse INSIDE, paths of cameras on drones, with OUTSIDE, tracks of the same drones from static cameras.
+
+    INSIDE are files of `psotrack localise`, one per drone; OUTSIDE is one of `psotrack track`, whose names of drones
+    may be any. Each counts as its covariance says; the scales, the arm from the camera to the middle of the drone, and
+    which track is whose are found. Drones that only one of them has are kept as they are.
+
+    \b
+    Examples:
+      psotrack fuse dron1.csv dron2.csv tracks.csv --out fused.csv
+      psotrack fuse dron1.csv tracks.csv --out fused.csv --max-offset 5 --json -
+      psotrack evaluate fused.csv data/Simulated_Data/S01_D2_A
+    """
+    from psotrack.errors import InputError, SettingsError
+    from psotrack.files import refuse_to_overwrite
+    from psotrack.inside_out.camera_path import read_camera_path
+    from psotrack.inside_out.fused_table import write_fused
+    from psotrack.inside_out.fusing import fuse as fuse_paths
+    from psotrack.trajectory_files import read_trajectories
+
+    if out.suffix != ".csv":
+        raise SettingsError("--out", expected="a file that ends in .csv", found=out.name)
+    refuse_to_overwrite(out, force)
+    paths: dict[str, CameraPath] = {}
+    for file in inside:
+        path, name = read_camera_path(file)
+        if name in paths:
+            raise InputError(file, expected="the path of another drone", found=f"a second one of {name}")
+        paths[name] = path
+    fused = fuse_paths(paths, read_trajectories(outside), point=point, max_offset_s=max_offset_s)
+    write_fused(out, fused, force=force)
+    answer(json_path, _content(fused), force)
+    for drone in fused.drones:
+        say(quiet, json_path, _sentence(drone))
+    for exchange in fused.exchanges:
+        say(
+            quiet,
+            json_path,
+            f"from frame {exchange.frame}: {exchange.drone} is track {exchange.after}, no more {exchange.before}",
+        )
+    say(
+        quiet,
+        json_path,
+        f"{out}: {fused.trajectories.num_drones} drones, {fused.trajectories.num_frames} frames",
+    )
+
+
+def _sentence(drone: FusedDrone) -> str:
+    parts = [
+        f"{drone.name}: {' and '.join(f'track {name}' for name in drone.tracks) or 'no track, kept as it is'}"
+    ]
+    if drone.offset is not None:
+        parts.append(f"clock {drone.offset.offset_s:+.4f} s, give or take {drone.offset.std_s:.4f} s")
+    parts.append(
+        f"frames of both {drone.frames_both}, inside only {drone.frames_inside}, outside only {drone.frames_outside}"
+    )
+    if drone.fusion is not None:
+        arm = ", ".join(
+            f"{1e3 * value:.1f} ± {1e3 * std:.1f}"
+            for value, std in zip(drone.fusion.arm_m, drone.fusion.arm_std_m, strict=True)
+        )
+        parts.append(f"arm ({arm}) mm")
+        parts.extend(
+            f"{word}: stated errors x {errors.scale:.2f}, {errors.gated} gross"
+            for word, errors in (("inside", drone.fusion.inside), ("outside", drone.fusion.outside))
+        )
+    return "; ".join(parts)
+
+
+def _content(fused: Fused) -> dict[str, Any]:
+    """The report as JSON has it, with null where there is no number."""
+    return {
+        "point": fused.point,
+        "frames": fused.trajectories.num_frames,
+        "drones": [
+            {
+                "drone": drone.name,
+                "tracks": list(drone.tracks),
+                "offset_s": None if drone.offset is None else drone.offset.offset_s,
+                "offset_std_s": None if drone.offset is None else drone.offset.std_s,
+                "frames_both": drone.frames_both,
+                "frames_inside": drone.frames_inside,
+                "frames_outside": drone.frames_outside,
+                **_found(drone.fusion),
+            }
+            for drone in fused.drones
+        ],
+        "others": list(fused.trajectories.drones[len(fused.drones) :]),
+        "exchanges": [
+            {"drone": of.drone, "frame": of.frame, "before": of.before, "after": of.after}
+            for of in fused.exchanges
+        ],
+    }
+
+
+def _found(fusion: DroneFusion | None) -> dict[str, Any]:
+    if fusion is None:
+        return {"lever_arm_m": None, "lever_arm_std_m": None, "inside": None, "outside": None}
+    return {
+        "lever_arm_m": fusion.arm_m.tolist(),
+        "lever_arm_std_m": fusion.arm_std_m.tolist(),
+        "inside": _errors(fusion.inside),
+        "outside": _errors(fusion.outside),
+    }
+
+
+def _errors(errors: Errors) -> dict[str, float]:
+    return {
+        "scale": errors.scale,
+        "lasting_share": errors.lasting_share,
+        "lasting_s": errors.lasting_s,
+        "gross_frames": errors.gated,
+    }

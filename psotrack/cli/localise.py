@@ -1,0 +1,239 @@
+"""`psotrack localise`: where a drone is, from markers of known places that its own camera sees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from psotrack.cli.answers import answer, report_to, say
+from psotrack.cli.options import FORCE, FRAMES, JSON, QUIET, Numbers
+from psotrack.errors import InputError, SettingsError
+from psotrack.files import refuse_to_overwrite
+
+if TYPE_CHECKING:
+    from psotrack.cameras import Camera
+    from psotrack.inside_out.camera_path import CameraPath
+    from psotrack.inside_out.frames import Source
+    from psotrack.inside_out.localising import Localised
+    from psotrack.sequence import OnboardVideo
+
+
+@dataclass(frozen=True)
+class _Input:
+    """What is localised, and what comes with it."""
+
+    source: Source
+    name: str
+    onboard: OnboardVideo | None = None
+    markers: Path | None = None
+
+
+@click.command()
+@click.argument("video")
+@click.option(
+    "--markers", type=click.Path(path_type=Path), help="Table of corners.  [default: that of a sequence]"
+)
+@click.option(
+    "--camera",
+    "camera_file",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Its intrinsics: .csv, .toml or .yml.  [default: that of a sequence]",
+)
+@click.option("--camera-name", metavar="NAME", help="Of the camera in FILE, where that has several.")
+@click.option("--scale-camera", is_flag=True, help="Scale intrinsics for another size of the same images.")
+@click.option("--fov", "fov_deg", type=Numbers(2), metavar="H,V", help="Instead: fields of view in degrees.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="A CSV, a row per frame.")
+@click.option("--drone", metavar="NAME", help="Whose video, where VIDEO is a sequence's folder.")
+@click.option(
+    "--name", metavar="NAME", help="Of the drone in the table.  [default: --drone, or VIDEO's name]"
+)
+@click.option(
+    "--dictionary", default="4x4_1000", show_default=True, help="Of the markers; any that OpenCV has."
+)
+@click.option(
+    "--min-markers",
+    type=click.IntRange(min=1),
+    default=4,
+    show_default=True,
+    help="That a frame must show; poses of fewer than 4 are flagged.",
+)
+@click.option(
+    "--filter/--no-filter", "filtered", default=True, show_default=True, help="Follow the motion, on the fly."
+)
+@click.option("--smooth", "smoothed", is_flag=True, help="Afterwards: the best path from all frames.")
+@click.option("--fps", type=float, help="Frames per second of a folder of images.")
+@click.option("--live", is_flag=True, help="VIDEO is a camera's number or a stream: newest frames first.")
+@FRAMES
+@FORCE
+@QUIET
+@JSON
+def localise(
+    video: str,
+    markers: Path | None,
+    camera_file: Path | None,
+    camera_name: str | None,
+    scale_camera: bool,
+    fov_deg: tuple[float, float] | None,
+    out: Path,
+    drone: str | None,
+    name: str | None,
+    dictionary: str,
+    min_markers: int,
+    filtered: bool,
+    smoothed: bool,
+    fps: float | None,
+    live: bool,
+    num_frames: int | None,
+    force: bool,
+    quiet: bool,
+    json_path: Path | None,
+) -> None:
+    """Find where the camera of VIDEO is in every frame, from the ArUco markers that it sees.
+
+    VIDEO is a video, a folder of images, the address of a stream, or an _A sequence of the dataset, which brings
+    its markers and intrinsics along. With --live, frames are left out that come too fast; Ctrl-C ends it, and what was
+    localised so far is written.
+
+    \b
+    Examples:
+      psotrack localise flight.mp4 --markers corners.csv --camera lens.toml --out track.csv
+      psotrack localise GOPR0017.MP4 --markers corners.csv --fov 92.45,60.83 --out track.csv --smooth
+      psotrack localise data/Simulated_Data/S01_D2_A --drone dron1 --out dron1.csv
+      psotrack localise images --fps 25 --markers corners.csv --camera lens.yml --out track.csv --frames 100
+      psotrack localise 0 --live --markers corners.csv --camera lens.yml --out track.csv
+    """
+    from dataclasses import replace
+
+    from psotrack.inside_out.camera_path import write_camera_path
+    from psotrack.inside_out.localising import LocaliseSettings
+    from psotrack.inside_out.localising import localise as localise_camera
+    from psotrack.inside_out.marker_map import read_marker_map
+    from psotrack.inside_out.pose import PoseSettings
+    from psotrack.inside_out.pose_filter import PoseFilterParams
+    from psotrack.inside_out.pose_smoothing import smooth
+
+    for path in (out, json_path):
+        if path is not None and path != Path("-"):
+            refuse_to_overwrite(path, force)
+    given = _input(video, drone, fps, live)
+    if markers is None and given.markers is None:
+        raise SettingsError("--markers", expected="a table of corners", found="none")
+    marker_map = read_marker_map(Path(str(markers or given.markers)))
+    lens = _lens(given, camera_file, camera_name, scale_camera, fov_deg)
+    settings = LocaliseSettings(
+        dictionary=dictionary,
+        pose=PoseSettings(min_markers=min_markers),
+        filter=PoseFilterParams() if filtered else None,
+    )
+    found = localise_camera(
+        given.source.first(num_frames), marker_map, lens, settings, report_to(quiet or json_path == Path("-"))
+    )
+    if smoothed:
+        found = replace(found, path=smooth(found.raw, settings.filter))
+    drone_name = name or given.name
+    write_camera_path(out, found.path, drone_name, force=force)
+    content = _content(found, given.source.name, drone_name, settings.pose.min_markers)
+    answer(json_path, content | {"track": str(out), "filtered": filtered, "smoothed": smoothed}, force)
+    say(quiet, json_path, _sentence(out, content))
+
+
+def _input(video: str, drone: str | None, fps: float | None, live: bool) -> _Input:
+    """A video, a folder of images, or a stream; or the video of one drone in a sequence."""
+    from psotrack.datasets.dpjait import MARKER_CORNERS, read_onboard
+    from psotrack.inside_out.frames import holds_images, open_source
+
+    stream, folder = live or "://" in video, Path(video)
+    of_folder = not stream and folder.is_dir()
+    onboard = read_onboard(folder) if of_folder else {}
+    if not onboard:
+        if drone is not None:
+            raise SettingsError(
+                "--drone", expected="a folder with videos of drones' own cameras", found=video
+            )
+        if of_folder and not holds_images(folder):
+            raise InputError(folder, expected="images, or videos of drones' own cameras", found="neither")
+        name = "camera" if stream else folder.name if of_folder else folder.stem
+        return _Input(open_source(video, fps=fps, live=live), name)
+    names = ", ".join(onboard)
+    if drone is None and len(onboard) > 1:
+        raise SettingsError("--drone", expected=f"one of {names}", found="none")
+    chosen = drone or next(iter(onboard))
+    if chosen not in onboard:
+        raise SettingsError("--drone", expected=f"one of {names}", found=chosen)
+    one = onboard[chosen]
+    return _Input(open_source(one.video.path, fps=fps), chosen, one, folder / MARKER_CORNERS)
+
+
+def _lens(
+    given: _Input,
+    camera_file: Path | None,
+    camera_name: str | None,
+    scale: bool,
+    fov_deg: tuple[float, float] | None,
+) -> Camera:
+    import numpy as np
+
+    from psotrack.cameras import camera
+    from psotrack.inside_out.lens_files import read_lens
+    from psotrack.lenses import lens_of_view
+
+    size_wh = given.source.image_size_wh
+    if camera_file is not None and fov_deg is not None:
+        raise SettingsError("lens", expected="--camera FILE or --fov H,V", found="both")
+    if fov_deg is not None:
+        return lens_of_view(*fov_deg, size_wh)
+    if camera_file is not None:
+        return read_lens(camera_file, size_wh, name=camera_name, scale=scale)
+    if given.onboard is None or given.onboard.K is None:
+        raise SettingsError("lens", expected="--camera FILE or --fov H,V", found="neither")
+    return camera(R=np.eye(3), t_m=np.zeros(3), K=given.onboard.K, image_size_wh=size_wh)
+
+
+def _content(found: Localised, video: str, name: str, min_markers: int) -> dict[str, Any]:
+    """The answer as JSON has it, with null where there is no number."""
+    import numpy as np
+
+    from psotrack.inside_out.camera_path import Flag
+    from psotrack.trajectories import Status
+
+    path = found.path
+    frames = path.num_frames
+    shown = found.raw.reprojection_px[np.isfinite(found.raw.reprojection_px)]
+    return {
+        "video": video,
+        "drone": name,
+        "frames": frames,
+        "poses": int(path.seen.sum()),
+        "status": {status.label: int((path.status == status).sum()) for status in Status},
+        "flags": {flag.label: _flagged(path, flag) for flag in Flag},
+        "min_markers": min_markers,
+        "median_markers": float(np.median(path.num_markers)),
+        "median_reprojection_px": float(np.median(shown)) if len(shown) else None,
+        "interrupted": found.interrupted,
+        "frames_per_second": found.frames_per_second,
+        "wall_s": found.wall_s,
+        "stage_s": dict(found.seconds),
+        "stage_ms_per_frame": {stage: 1e3 * value / frames for stage, value in found.seconds.items()},
+    }
+
+
+def _flagged(path: CameraPath, flag: int) -> int:
+    return int(((path.flags & flag) != 0).sum())
+
+
+def _sentence(out: Path, content: dict[str, Any]) -> str:
+    bridged, gated = content["status"]["coasting"], content["flags"]["gated"]
+    stages = ", ".join(f"{stage} {value:.1f}" for stage, value in content["stage_ms_per_frame"].items())
+    error_px = content["median_reprojection_px"]
+    return (
+        f"{out}: {content['drone']} in {content['poses']} of {content['frames']} frames"
+        f"{f', {bridged} of them bridged' if bridged else ''}{f', {gated} poses gated' if gated else ''}; "
+        f"median of {content['median_markers']:g} markers"
+        f"{'' if error_px is None else f' that fit to {error_px:.2f} px'}; "
+        f"{content['frames_per_second']:.1f} frames per second ({stages} ms)"
+        f"{'; ended by Ctrl-C' if content['interrupted'] else ''}"
+    )

@@ -1,0 +1,246 @@
+"""Where a camera's path begins on the clocks of a reference: of its positions, and of its orientations apart.
+
+Both are `synchronisation.find_offset`, first over a wide range and then close by with all samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import median_filter
+from scipy.spatial.transform import Rotation, Slerp
+
+from psotrack import time_shift
+from psotrack.evaluation.association import GATE_M
+from psotrack.inside_out.camera_path import CameraPath
+from psotrack.synchronisation import Offset, find_offset
+from psotrack.trajectories import Status, Trajectories
+
+#: A body's orientations at the samples of its positions when their clock is ahead by the offset, (samples, 4); None
+#: where they do not matter, or are not known before the offset, None, is.
+Bodies = Callable[[float | None], Float[np.ndarray, "samples 4"] | None]
+
+#: Once the offset is known to what a lever arm may have made of it, it is sought within this.
+_NEAR_S = 0.5
+#: Each leaves of the offset's error what the arm turns within it: a tenth or less.
+_ROUNDS = 3
+#: Far below what motion tells.
+_SETTLED_S = 1e-5
+#: Frames whose median a position is held against.
+_NEIGHBOURS = 9
+#: Points that stand for axes: how far out, which is within the gate of a pairing, and how far apart.
+_OUT_M, _APART_M = 0.1, 10.0
+
+
+def offset_of_positions(
+    path: CameraPath,
+    time_s: Float[np.ndarray, "samples"],
+    position_m: Float[np.ndarray, "samples 3"],
+    bodies: Bodies | None,
+    *,
+    max_offset_s: float | None,
+) -> tuple[float, float]:
+    """The offset of a reference's positions, and its standard deviation.
+
+    Args:
+        path: of the camera.
+        time_s, position_m: samples of the reference.
+        bodies: turns a constant lever arm; without it none is allowed for. As long as it knows no orientations, the
+            path's own turn the arm.
+        max_offset_s: as in `comparison.compare`.
+
+    Raises:
+        SettingsError, InputError: see `synchronisation.find_offset`.
+    """
+    path = _without_jumps(path)
+    estimate, points_m = path.trajectories("camera"), position_m[:, None]
+    middle_s, reach_s = _range(estimate, time_s, points_m, max_offset_s)
+    every, body_wxyz = _thinned(estimate, time_s), None if bodies is None else bodies(None)
+    if bodies is not None and body_wxyz is None:
+        # The other way about: the reference is laid on the path, by whose orientations arms are turned.
+        reference = Trajectories(
+            np.arange(len(time_s))[every], time_s[every], estimate.drones, points_m[every]
+        )
+        seen_m = np.where(path.seen[:, None], path.position_m, np.nan)
+        start = _found(reference, path.time_s, seen_m[:, None], path.orientation_wxyz, -middle_s, reach_s)
+        offset_s = -start.offset_s
+    else:
+        thin_wxyz = None if body_wxyz is None else body_wxyz[every]
+        start = _found(
+            estimate, time_s[every], points_m[every], thin_wxyz, middle_s, reach_s, bodies is not None
+        )
+        offset_s = start.offset_s
+    found = _close(estimate, time_s, points_m, bodies, offset_s)
+    body_wxyz = None if bodies is None else bodies(found.offset_s)
+    if body_wxyz is None:
+        return found.offset_s, found.std_s
+    arm_m = _axes(body_wxyz).swapaxes(-1, -2) @ found.lever_arm_m[0]
+    return found.offset_s, _checked(estimate, time_s, position_m + arm_m, found.offset_s)
+
+
+def offset_of_turning(
+    path: CameraPath,
+    time_s: Float[np.ndarray, "samples"],
+    body_wxyz: Float[np.ndarray, "samples 4"],
+    *,
+    with_turn: bool,
+    max_offset_s: float | None,
+) -> float:
+    """The offset of a reference's orientations, whatever the positions are.
+
+    At the right one, points on the camera's axes stand still in the body: their lever arms are the columns of the
+    constant turn from camera to body. The distances that are left are chords of the angles that are.
+
+    Args:
+        path: of the camera.
+        time_s, body_wxyz: samples of the reference, body to world.
+        with_turn: allow that turn; else the camera's axes are the body's.
+        max_offset_s: as in `comparison.compare`.
+
+    Raises:
+        SettingsError, InputError: see `synchronisation.find_offset`.
+    """
+    path, middles_m = _without_jumps(path), _APART_M * np.eye(3)
+    status = np.repeat(path.status[:, None], 3, axis=1)
+    axes_m = middles_m + _OUT_M * _axes(path.orientation_wxyz)
+    estimate = Trajectories(path.frame, path.time_s, ("x", "y", "z"), axes_m, status=status)
+    known = np.isfinite(body_wxyz).all(axis=-1)[:, None, None]
+    points_m = np.where(known, middles_m, np.nan) if with_turn else middles_m + _OUT_M * _axes(body_wxyz)
+    turned = body_wxyz if with_turn else None
+    middle_s, reach_s = _range(estimate, time_s, points_m, max_offset_s)
+    every = _thinned(estimate, time_s)
+    thin_wxyz = None if turned is None else turned[every]
+    start = _found(estimate, time_s[every], points_m[every], thin_wxyz, middle_s, reach_s, with_turn)
+    bodies = (lambda offset_s: turned) if with_turn else None
+    return _close(estimate, time_s, points_m, bodies, start.offset_s).offset_s
+
+
+def at_times(
+    time_s: Float[np.ndarray, "samples"],
+    orientation_wxyz: Float[np.ndarray, "samples 4"],
+    wanted_s: Float[np.ndarray, "times"],
+) -> Float[np.ndarray, "times 4"]:
+    """Orientations between samples, on great arcs; NaN outside, and in gaps longer than those of positions may be."""
+    found = np.full((len(wanted_s), 4), np.nan)
+    known = np.isfinite(orientation_wxyz).all(axis=-1)
+    if known.sum() < 2:
+        return found
+    sample_s = time_s[known]
+    arcs = Slerp(sample_s, Rotation.from_quat(orientation_wxyz[known], scalar_first=True))
+    longest_s = max(time_shift.MAX_GAP_S, 1.5 * float(np.median(np.diff(time_s))))
+    after = np.clip(np.searchsorted(sample_s, wanted_s), 1, len(sample_s) - 1)
+    before_s, after_s = wanted_s - sample_s[after - 1], sample_s[after] - wanted_s
+    # Samples themselves are known on both sides of a gap, but for rounding.
+    inside = (np.minimum(before_s, after_s) >= 0) & (before_s + after_s <= longest_s)
+    inside |= np.minimum(np.abs(before_s), np.abs(after_s)) < 1e-9
+    at_s = np.clip(wanted_s[inside], sample_s[0], sample_s[-1])
+    found[inside] = arcs(at_s).as_quat(scalar_first=True)
+    return found
+
+
+def _thinned(estimate: Trajectories, time_s: Float[np.ndarray, "samples"]) -> slice:
+    """About as many samples as frames: a wide search with all of four times as many would tell no more."""
+    step_s, frame_s = (float(np.median(np.diff(times))) for times in (time_s, estimate.time_s))
+    return slice(None, None, max(1, round(frame_s / step_s)))
+
+
+def _close(
+    estimate: Trajectories,
+    time_s: Float[np.ndarray, "samples"],
+    position_m: Float[np.ndarray, "samples drones 3"],
+    bodies: Bodies | None,
+    offset_s: float,
+) -> Offset:
+    """The offset near one that is about right, by all samples."""
+    reach_s = max(_NEAR_S, 2 * float(np.median(np.diff(time_s))))
+    for _ in range(_ROUNDS):
+        before_s, body_wxyz = offset_s, None if bodies is None else bodies(offset_s)
+        found = _found(estimate, time_s, position_m, body_wxyz, offset_s, reach_s, bodies is not None)
+        offset_s = found.offset_s
+        if abs(offset_s - before_s) < _SETTLED_S:
+            break
+    return found
+
+
+def _checked(
+    estimate: Trajectories,
+    time_s: Float[np.ndarray, "samples"],
+    camera_m: Float[np.ndarray, "samples 3"],
+    offset_s: float,
+) -> float:
+    """The standard deviation of an offset from how the camera moves by the reference, arm and all.
+
+    Seen from a body that turns, what hovers moves as well: `find_offset` alone would take that for motion.
+    """
+    placed = time_shift.Comparison.of(estimate, time_s, camera_m[:, None], None, with_lever_arm=True)
+    std_s = placed.standard_deviation_s(offset_s, np.zeros(1, int))
+    frame_s = float(np.median(np.diff(estimate.time_s)))
+    if not std_s < frame_s:
+        raise time_shift.refused(
+            f"motion that tells the offset to a frame, {frame_s:g} s",
+            f"a standard deviation of {std_s:.2g} s",
+            "drones that hover, or fly straight on at one speed, do not tell: use more of the recording",
+        )
+    return std_s
+
+
+def _found(
+    estimate: Trajectories,
+    time_s: Float[np.ndarray, "samples"],
+    position_m: Float[np.ndarray, "samples drones 3"],
+    body_wxyz: Float[np.ndarray, "samples 4"] | None,
+    middle_s: float,
+    reach_s: float,
+    with_lever_arm: bool = True,
+) -> Offset:
+    """`find_offset` about another offset than 0, of drones that are turned alike."""
+    found = find_offset(
+        estimate,
+        time_s - middle_s,
+        position_m,
+        None if body_wxyz is None else np.repeat(body_wxyz[:, None], position_m.shape[1], axis=1),
+        max_offset_s=reach_s,
+        with_lever_arm=with_lever_arm,
+    )
+    return replace(found, offset_s=middle_s + found.offset_s)
+
+
+def _range(
+    estimate: Trajectories,
+    time_s: Float[np.ndarray, "samples"],
+    position_m: Float[np.ndarray, "samples drones 3"],
+    max_offset_s: float | None,
+) -> tuple[float, float]:
+    """The middle of the offsets that are tried, and how far they reach; by default half of the shorter is covered."""
+    if max_offset_s is not None:
+        return 0.0, max_offset_s
+    spans_s = estimate.time_s[estimate.seen.any(axis=1)], time_s[np.isfinite(position_m).any(axis=(1, 2))]
+    if not all(map(len, spans_s)):
+        raise time_shift.refused("poses of both", f"{len(spans_s[0])} and {len(spans_s[1])}")
+    middles_s = [(span_s[0] + span_s[-1]) / 2 for span_s in spans_s]
+    return float(middles_s[1] - middles_s[0]), float(max(map(np.ptp, spans_s)) / 2)
+
+
+def _without_jumps(path: CameraPath) -> CameraPath:
+    """The path without poses that are far from where the poses before and after are: they tell nothing of time.
+
+    They would not move the least distance much, but hide how clearly it is the least.
+    """
+    seen = np.flatnonzero(path.seen)
+    position_m = path.position_m[seen]
+    jump_m = np.linalg.norm(position_m - median_filter(position_m, (_NEIGHBOURS, 1), mode="nearest"), axis=-1)
+    status = path.status.copy()
+    status[seen[jump_m > GATE_M]] = Status.LOST
+    return replace(path, status=status)
+
+
+def _axes(orientation_wxyz: Float[np.ndarray, "times 4"]) -> Float[np.ndarray, "times 3 3"]:
+    """The axes of a frame in the world, one per row."""
+    axes = np.full((len(orientation_wxyz), 3, 3), np.nan)
+    known = np.isfinite(orientation_wxyz).all(axis=-1)
+    if known.any():
+        axes[known] = Rotation.from_quat(orientation_wxyz[known], scalar_first=True).inv().as_matrix()
+    return axes

@@ -1,0 +1,112 @@
+"""Pictures of a camera's path beside its reference: the paper's figure 11, and what is between them over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.evaluation.plots import COLOURS, save
+from psotrack.inside_out.camera_path import CameraPath
+from psotrack.inside_out.comparison import Comparison
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: As in the paper: what is reconstructed is red, the reference blue.
+RECONSTRUCTED, REFERENCE = "#d62728", "#1f5fbf"
+_GRID = "#dde1e6"
+_AXES = "xyz"
+#: Around the reference, as a share of its largest extent: what is further away is counted, not drawn.
+_MARGIN = 0.15
+
+
+def save_paths(
+    png: Path, path: CameraPath, comparison: Comparison, *, caption: str = "", force: bool = False
+) -> None:
+    """Save a PNG of the path and of where its reference says it was, from above and from the side: figure 11.
+
+    Both views have one scale, in metres. The side view is along the horizontal axis of the world of the smaller extent.
+
+    Raises:
+        OutputError: the file exists and `force` is not set, or it cannot be written.
+    """
+    position_m = np.where(path.seen[:, None], path.position_m, np.nan)
+    low_m, high_m = (find(comparison.reference_m, axis=0) for find in (np.nanmin, np.nanmax))
+    margin_m = _MARGIN * float((high_m - low_m).max())
+    low_m, high_m = low_m - margin_m, high_m + margin_m
+    along = int(np.argmax((high_m - low_m)[:2]))
+    drawn = ((position_m >= low_m) & (position_m <= high_m)).all(axis=-1)
+    beyond = int((path.seen & ~drawn).sum())
+    position_m = np.where(drawn[:, None], position_m, np.nan)
+
+    def draw(figure: Figure) -> None:
+        extent_m = high_m - low_m
+        views = ((along, 1 - along, "from above"), (along, 2, "from the side"))
+        panels = figure.subplots(2, 1, height_ratios=[extent_m[up] for _, up, _ in views])
+        for axes, (across, up, name) in zip(panels, views, strict=True):
+            for points_m, colour, width, label in (
+                (comparison.reference_m, REFERENCE, 2.4, "reference"),
+                (position_m, RECONSTRUCTED, 1.0, "reconstructed"),
+            ):
+                axes.plot(points_m[:, across], points_m[:, up], color=colour, linewidth=width, label=label)
+            axes.set(xlim=(low_m[across], high_m[across]), ylim=(low_m[up], high_m[up]), aspect="equal")
+            axes.set_title(name, fontsize=9, loc="left")
+            _finish(axes, f"{_AXES[across]} (m)", f"{_AXES[up]} (m)")
+        panels[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False, fontsize=8.5)
+        parts = [caption] * bool(caption) + [f"{beyond} positions lie beyond these views"] * (beyond > 0)
+        if parts:
+            figure.supxlabel("; ".join(parts), fontsize=9)
+
+    save(png, (7.0, 8.0), draw, force)
+
+
+def save_errors(png: Path, comparisons: Mapping[str, Comparison], *, force: bool = False) -> None:
+    """Save a PNG of the distance, and of the angle where there are orientations, over time: a line per comparison.
+
+    Raises:
+        OutputError: the file exists and `force` is not set, or it cannot be written.
+    """
+    quantities = [("distance (mm)", {name: 1e3 * one.distance_m for name, one in comparisons.items()})]
+    turned = {name: one.turning.angle_deg for name, one in comparisons.items() if one.turning}
+    if turned:
+        quantities.append(("angle (degrees)", turned))
+
+    def draw(figure: Figure) -> None:
+        panels = figure.subplots(len(quantities), 1, sharex=True, squeeze=False)[:, 0]
+        for axes, (label, values) in zip(panels, quantities, strict=True):
+            for number, (name, value) in enumerate(values.items()):
+                colour = COLOURS[number % len(COLOURS)]
+                axes.plot(comparisons[name].time_s, value, color=colour, linewidth=1.0, label=name)
+            _scale(axes, np.concatenate(list(values.values())))
+            _finish(axes, "", label)
+        panels[-1].set_xlabel("time (s)")
+        panels[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, frameon=False, fontsize=8.5)
+
+    save(png, (9.0, 2.6 * len(quantities) + 0.6), draw, force)
+
+
+def _scale(axes: Axes, values: Float[np.ndarray, "values"]) -> None:
+    """From zero, or logarithmic where the largest value would leave the others on the floor."""
+    from matplotlib.ticker import StrMethodFormatter
+
+    known = values[np.isfinite(values) & (values > 0)]
+    if len(known) and known.max() > 30 * np.median(known):
+        axes.set_yscale("log")
+        axes.set_ylim(bottom=float(np.percentile(known, 1)))
+        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    else:
+        axes.set_ylim(bottom=0)
+
+
+def _finish(axes: Axes, across: str, up: str) -> None:
+    axes.set_xlabel(across)
+    axes.set_ylabel(up)
+    axes.grid(color=_GRID, linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.tick_params(labelsize=8)
+    axes.spines[["top", "right"]].set_visible(False)

@@ -1,0 +1,105 @@
+"""Which positions of two sources are gross errors, judged by the motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.special import gammaincinv
+
+from psotrack.inside_out.joint_filter import (
+    Arm,
+    ErrorModel,
+    Readings,
+    State,
+    observation,
+    predicted,
+    roots_of,
+    rows_of,
+    start,
+    transitions,
+    updated,
+)
+
+#: The chi-square distribution with 3 degrees of freedom exceeds this once in a million: five standard deviations.
+GATE = 2.0 * float(gammaincinv(3 / 2, 1 - 1e-6))
+
+_Observation = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def gated(
+    readings: Readings, model: ErrorModel, arm: Arm
+) -> tuple[Bool[np.ndarray, "frames 2"], Float[np.ndarray, "frames 2 3 3"]]:
+    """Which readings to leave out as gross errors, and what covariance to add to others, under one model.
+
+    Where both sources speak and do not fit each other, the one that fits the motion less is left out. Two that fit each
+    other are right whatever the motion says. One that is alone and does not fit the motion gets a larger covariance,
+    with which it would be just at the gate: a drone that did jump is followed, a wild reading hardly.
+
+    It begins where the two first fit each other, and goes from there to the end, and to the beginning.
+
+    Returns:
+        (frames, 2), left out; (frames, 2, 3, 3), to be added.
+    """
+    first = _first_agreement(readings, model, arm)
+    out = np.zeros(readings.known.shape, bool)
+    added_m2 = np.zeros(readings.covariance_m2.shape)
+    out[first:], added_m2[first:] = _gated_onwards(rows_of(readings, slice(first, None)), model, arm)
+    if first:
+        back = rows_of(readings, slice(first, None, -1))
+        back = replace(back, time_s=-back.time_s, ahead_s=-back.ahead_s)
+        out_back, added_back_m2 = _gated_onwards(back, model, arm)
+        out[:first], added_m2[:first] = out_back[:0:-1], added_back_m2[:0:-1]
+    return out, added_m2
+
+
+def _gated_onwards(
+    readings: Readings, model: ErrorModel, arm: Arm
+) -> tuple[Bool[np.ndarray, "frames 2"], Float[np.ndarray, "frames 2 3 3"]]:
+    roots = roots_of(readings)
+    out = np.zeros(readings.known.shape, bool)
+    added_m2 = np.zeros(readings.covariance_m2.shape)
+    rows = np.flatnonzero(readings.known.any(axis=1))
+    state = start(readings, model, arm, rows[0])
+    for k, (F, Q) in zip(rows, transitions(readings.time_s[rows], model), strict=True):
+        state = predicted(state, F, Q)
+        sources = np.flatnonzero(readings.known[k])
+        parts = [
+            observation(readings, model, roots, k, sources[row : row + 1]) for row in range(len(sources))
+        ]
+        misfits = [_misfit(state, part) for part in parts]
+        best = int(np.argmin(misfits))
+        after, _ = updated(state, *parts[best])
+        other = parts[1 - best] if len(parts) > 1 else None
+        if other is not None and _misfit(after, other) <= GATE:
+            state, _ = updated(after, *other)
+            continue
+        if other is not None:
+            out[k, sources[1 - best]] = True
+        excess = misfits[best] / GATE
+        if excess > 1:
+            H, y, R = parts[best]
+            added_m2[k, sources[best]] = (excess - 1) * (H @ state[1] @ H.swapaxes(1, 2) + R)[0]
+            after, _ = updated(state, H, y, R + added_m2[k, sources[best]])
+        state = after
+    return out, added_m2
+
+
+def _first_agreement(readings: Readings, model: ErrorModel, arm: Arm) -> int:
+    """The first frame in which both sources speak and fit each other, else the first in which any does."""
+    roots = roots_of(readings)
+    for k in np.flatnonzero(readings.known.all(axis=1)):
+        inside, outside = (observation(readings, model, roots, k, np.array([source])) for source in (0, 1))
+        after, _ = updated(start(readings, model, arm, k), *inside)
+        if _misfit(after, outside) <= GATE:
+            return int(k)
+    return int(np.argmax(readings.known.any(axis=1)))
+
+
+def _misfit(state: State, one: _Observation) -> float:
+    """Squared innovation of one source, normalised by its covariance: 3 on average."""
+    H, y, R = one
+    mean, spread = state
+    innovation = y - H[0] @ mean[0]
+    return float(innovation @ np.linalg.solve(H[0] @ spread[0] @ H[0].T + R[0], innovation))

@@ -1,0 +1,115 @@
+"""A room with markers, the views of it, and what the markers' corners in the images say of both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from psotrack.calibration import reproject
+from psotrack.cameras import NEAR_M
+from psotrack.inside_out.map_sightings import SQUARE, Sightings
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Where views and markers are.
+
+    Attributes:
+        R_cam_world: (views, 3, 3).
+        t_m: (views, 3), of world to camera.
+        ids: (markers,), increasing.
+        R_world_marker: (markers, 3, 3), from a marker's own axes, see `map_sightings.SQUARE`.
+        centre_m: (markers, 3), world.
+        side_m: (markers,).
+        inset_px: (videos,), by how much the sides of squares are found too far inside.
+    """
+
+    R_cam_world: Float[np.ndarray, "views 3 3"]
+    t_m: Float[np.ndarray, "views 3"]
+    ids: Int[np.ndarray, " markers"]
+    R_world_marker: Float[np.ndarray, "markers 3 3"]
+    centre_m: Float[np.ndarray, "markers 3"]
+    side_m: Float[np.ndarray, " markers"]
+    inset_px: Float[np.ndarray, " videos"]
+
+    def rows(self, sightings: Sightings) -> Int[np.ndarray, " sightings"]:
+        """(sightings,), index of each sighting's marker."""
+        return np.searchsorted(self.ids, sightings.marker)
+
+    @property
+    def corners_m(self) -> Float[np.ndarray, "markers 4 3"]:
+        """(markers, 4, 3), world."""
+        return self.centre_m[:, None] + self.arms_m
+
+    @property
+    def arms_m(self) -> Float[np.ndarray, "markers 4 3"]:
+        """(markers, 4, 3), from the centres to the corners, along the world's axes."""
+        return (self.side_m[:, None, None] * SQUARE) @ self.R_world_marker.swapaxes(-1, -2)
+
+
+def residuals_px(sightings: Sightings, scene: Scene) -> Float[np.ndarray, "sightings 4"]:
+    """Distances in the image, the inset taken out; infinite behind the camera."""
+    return np.linalg.norm(linearised(sightings, scene).off, axis=-1)
+
+
+def outward(sightings: Sightings) -> Float[np.ndarray, "sightings 4 2"]:
+    """How the corners move in the image when each side of the square moves outwards by 1 px: along the bisectors."""
+    ahead = _unit(np.roll(sightings.corners_px, -1, axis=1) - sightings.corners_px)
+    behind = np.roll(-ahead, 1, axis=1)
+    # Of two sides with an angle a between them: by 1 / sin(a / 2). A marker seen that obliquely is not recognised.
+    sine = np.maximum(np.linalg.norm(ahead - behind, axis=-1, keepdims=True) / 2, 0.1)
+    return -_unit(ahead + behind) / sine
+
+
+def _unit(vectors: Float[np.ndarray, "*vectors 2"]) -> Float[np.ndarray, "*vectors 2"]:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """What is seen less what should be, in pixels, and the derivatives of the latter.
+
+    Attributes:
+        off: (sightings, 4, 2), infinite behind the camera.
+        by_view: (sightings, 4, 2, 6), by a small turn about the camera's axes (rad) and by its translation (m).
+        by_rest: (sightings, 4, 2, 8), by the marker's centre (m), a small turn about the world's axes (rad), the
+            logarithm of its side, and by the video's inset.
+    """
+
+    off: Float[np.ndarray, "sightings 4 2"]
+    by_view: Float[np.ndarray, "sightings 4 2 6"]
+    by_rest: Float[np.ndarray, "sightings 4 2 8"]
+
+
+def linearised(sightings: Sightings, scene: Scene) -> Linearised:
+    """The sightings of a scene that has all their markers and views."""
+    row, view = scene.rows(sightings), sightings.view
+    video = sightings.lens[view]
+    R = scene.R_cam_world[view]
+    arm = scene.arms_m[row]
+    turned = (scene.centre_m[row][:, None] + arm) @ R.swapaxes(-1, -2)
+    points_cam = turned + scene.t_m[view][:, None]
+    off, by_shift = np.empty((len(row), 4, 2)), np.empty((len(row), 4, 2, 3))
+    for index, lens in enumerate(sightings.lenses):
+        of_lens = np.flatnonzero(video == index)
+        if not len(of_lens):
+            continue
+        # Points in the camera's axes move as its translation does.
+        pixels, _, slopes = reproject(points_cam[of_lens].reshape(-1, 3), np.eye(3), np.zeros(3), lens)
+        off[of_lens] = sightings.corners_px[of_lens] - pixels.reshape(-1, 4, 2)
+        by_shift[of_lens] = slopes.reshape(-1, 4, 2, 3)
+    off[points_cam[..., 2] <= NEAR_M] = np.inf
+    # A turn by w moves a point at q by w x q, so the derivative is q x slope; growth moves it along the arm.
+    by_turn = np.cross(turned[:, :, None], by_shift)
+    by_point, arm = by_shift @ R[:, None], arm[:, :, None]
+    inward = -outward(sightings)
+    off = off - scene.inset_px[video][:, None, None] * inward
+    rest = [
+        by_point,
+        np.cross(arm, by_point),
+        (by_point * arm).sum(axis=-1, keepdims=True),
+        inward[..., None],
+    ]
+    return Linearised(off, np.concatenate([by_turn, by_shift], axis=-1), np.concatenate(rest, axis=-1))

@@ -1,0 +1,186 @@
+"""What cameras that are carried through a room see of its markers: what a map is made from, or checked with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from collections.abc import Sequence as Ordered
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from psotrack.cameras import Camera, undistort
+from psotrack.errors import InputError
+from psotrack.inside_out.detection import MarkerDetector
+from psotrack.progress import Report, silent
+from psotrack.video import VideoInfo, read_frames
+
+#: A marker's corners in its own axes, for a side of 1: x to its right, y up, z out of the print. OpenCV's order.
+SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Markers in one frame.
+
+    Attributes:
+        source: number of the video.
+        time_s: of the frame in its video.
+        ids: (markers,).
+        corners_px: (markers, 4, 2), as OpenCV's ArUco counts them.
+    """
+
+    source: int
+    time_s: float
+    ids: Int[np.ndarray, " markers"]
+    corners_px: Float[np.ndarray, "markers 4 2"]
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Markers in the frames of one or several videos; a view is a frame that shows one at least.
+
+    Attributes:
+        lenses: of the videos' cameras.
+        lens: (views,), number of the view's video.
+        time_s: (views,), in that video.
+        view: (sightings,), number of the view, not decreasing.
+        marker: (sightings,), ids. No view has a marker twice.
+        corners_px: (sightings, 4, 2).
+    """
+
+    lenses: tuple[Camera, ...]
+    lens: Int[np.ndarray, " views"]
+    time_s: Float[np.ndarray, " views"]
+    view: Int[np.ndarray, " sightings"]
+    marker: Int[np.ndarray, " sightings"]
+    corners_px: Float[np.ndarray, "sightings 4 2"]
+
+    @property
+    def num_views(self) -> int:
+        """Number of views."""
+        return len(self.lens)
+
+    @property
+    def ids(self) -> list[int]:
+        """The markers that are seen, increasing."""
+        return np.unique(self.marker).tolist()
+
+    def select(self, kept: Bool[np.ndarray, " sightings"]) -> Sightings:
+        """Some of the sightings, with the views that still have some."""
+        views, view = np.unique(self.view[kept], return_inverse=True)
+        return Sightings(
+            self.lenses,
+            self.lens[views],
+            self.time_s[views],
+            view.reshape(-1),
+            self.marker[kept],
+            self.corners_px[kept],
+        )
+
+
+def find_sightings(
+    videos: Ordered[tuple[VideoInfo, Camera]],
+    dictionary: str = "4x4_1000",
+    *,
+    most_frames: int = 300,
+    report: Report = silent,
+) -> Sightings:
+    """The markers in videos of one room, each with its camera's lens.
+
+    Args:
+        videos: with lenses for images of their size.
+        dictionary: of the markers, such as 4x4_50.
+        most_frames: of a video that are looked at, evenly spread: those beside each other say the same.
+        report: told of progress.
+
+    Raises:
+        InputError: a video cannot be read, or is of another size than its lens; or no frame shows a marker.
+        SettingsError: there is no such dictionary.
+    """
+    for video, lens in videos:
+        width, height = (int(side) for side in lens.image_size_wh)
+        if (width, height) != video.image_size_wh:
+            raise InputError(
+                video.path,
+                expected=f"{width} x {height} pixels as the lens is for",
+                found="{} x {}".format(*video.image_size_wh),
+            )
+    detectors = [MarkerDetector(dictionary, lens=lens) for _, lens in videos]
+    seen = []
+    steps = [max(1, -(-video.num_frames // most_frames)) for video, _ in videos]
+    total = sum(-(-video.num_frames // step) for (video, _), step in zip(videos, steps, strict=True))
+    with report("markers", total) as advance:
+        for source, ((video, _), step) in enumerate(zip(videos, steps, strict=True)):
+            for index, frame in enumerate(read_frames(video, step)):
+                gray = np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), np.uint8)
+                found = detectors[source].detect(gray)
+                seen.append(Seen(source, index * step / video.fps, found.ids, found.corners_px))
+                advance(1)
+    return sightings_of(seen, [lens for _, lens in videos])
+
+
+def sightings_of(seen: Iterable[Seen], lenses: Ordered[Camera]) -> Sightings:
+    """The sightings in frames. A marker that is in a frame twice is left out of it: one of the two is another one.
+
+    Raises:
+        InputError: no frame shows a marker.
+    """
+    views: list[tuple[int, float]] = []
+    rows: list[tuple[int, int, Float[np.ndarray, "4 2"]]] = []
+    for frame in seen:
+        ids, counts = np.unique(frame.ids, return_counts=True)
+        single = set(ids[counts == 1].tolist())
+        found = [
+            (len(views), marker, corners.astype(np.float64))
+            for marker, corners in zip(frame.ids.tolist(), frame.corners_px, strict=True)
+            if marker in single
+        ]
+        if found:
+            views.append((frame.source, frame.time_s))
+            rows += found
+    if not rows:
+        raise InputError(
+            "video",
+            expected="frames that show markers",
+            found="none in any frame",
+            remedy="is --dictionary the one that was printed?",
+        )
+    return Sightings(
+        tuple(lenses),
+        np.array([source for source, _ in views]),
+        np.array([time_s for _, time_s in views]),
+        np.array([view for view, _, _ in rows]),
+        np.array([marker for _, marker, _ in rows]),
+        np.array([corners for _, _, corners in rows]),
+    )
+
+
+def two_poses(
+    sightings: Sightings, side_m: float
+) -> tuple[Float[np.ndarray, "sightings 2 3 3"], Float[np.ndarray, "sightings 2 3"]]:
+    """The two poses of a square that look almost alike, marker to camera, better one first (IPPE; Collins & Bartoli
+    2014); NaN where there is none.
+
+    Args:
+        sightings: of markers.
+        side_m: of all of them, in metres.
+    """
+    R = np.full((len(sightings.view), 2, 3, 3), np.nan)
+    t_m = np.full((len(sightings.view), 2, 3), np.nan)
+    lens_of = sightings.lens[sightings.view]
+    for index, lens in enumerate(sightings.lenses):
+        of_lens = np.flatnonzero(lens_of == index)
+        normalised = undistort(lens, sightings.corners_px[of_lens])
+        for row, corners in zip(of_lens.tolist(), normalised, strict=True):
+            try:
+                _, turns, shifts, _ = cv2.solvePnPGeneric(
+                    side_m * SQUARE, corners, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
+                )
+            except cv2.error:
+                # Corners on a line.
+                continue
+            for which, (turn, shift) in enumerate(zip(turns, shifts, strict=True)):
+                R[row, which], t_m[row, which] = cv2.Rodrigues(turn)[0], shift.ravel()
+    return R, t_m

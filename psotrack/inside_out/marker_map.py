@@ -1,0 +1,198 @@
+"""`MarkerMap`: where the corners of markers are in a room, and its table, read with every doubt spoken out.
+
+A table that is wrong is found by its geometry where that is beyond doubt: a marker is a flat square that faces the
+room. What is off by less than that is found from a video: see `map_check`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from psotrack.datasets.dpjait import MarkerRow, read_marker_rows
+from psotrack.errors import InputError
+
+#: What a corner may be off its square, as a share of the side. Corners that are measured by motion capture are off by
+#: some 3 mm each: three standard deviations of one against the three others, 2 x 3 x 3 mm, are 9 % of 0.2 m.
+SQUARE_TOLERANCE = 0.1
+#: Sides of markers, in metres. A table in millimetres that is read as metres is far above.
+_SIDES_M = (0.005, 5.0)
+#: Of the side: centres that are nearer to each other are of one marker. A board with two sides is thicker than nothing,
+#: but its two markers face opposite ways.
+_SAME_PLACE = 0.5
+#: Of the side: what is nearer to a marker's plane is neither before nor behind it.
+_BESIDE = 1.0
+#: Sides that a thing with markers on its outside may have across; a room has more.
+_THING = 10.0
+
+
+@dataclass(frozen=True)
+class MarkerMap:
+    """Markers of known place.
+
+    Attributes:
+        corners_m: (4, 3) by marker id, world, metres: as OpenCV's ArUco counts them, clockwise from the marker's own
+            top left when it is looked at.
+    """
+
+    corners_m: Mapping[int, Float[np.ndarray, "4 3"]]
+
+    def __post_init__(self) -> None:
+        if not self.corners_m:
+            raise InputError("marker map", expected="at least one marker", found="none")
+        for marker, corners in self.corners_m.items():
+            if corners.shape != (4, 3) or not np.isfinite(corners).all():
+                found = f"{corners.shape}" if corners.shape != (4, 3) else "NaN or infinity"
+                raise InputError(f"marker {marker}", expected="finite corners of shape (4, 3)", found=found)
+
+    def __len__(self) -> int:
+        return len(self.corners_m)
+
+    def __contains__(self, marker: object) -> bool:
+        return marker in self.corners_m
+
+    @cached_property
+    def ids(self) -> Int[np.ndarray, " markers"]:
+        """(markers,), increasing."""
+        return np.array(sorted(self.corners_m))
+
+    def corners_of(self, ids: Iterable[int]) -> Float[np.ndarray, "chosen 4 3"]:
+        """(chosen, 4, 3), the corners of some markers; all must be in the map."""
+        return np.array([self.corners_m[int(marker)] for marker in ids], np.float64).reshape(-1, 4, 3)
+
+    @cached_property
+    def all_corners_m(self) -> Float[np.ndarray, "markers 4 3"]:
+        """(markers, 4, 3), in the order of `ids`."""
+        return self.corners_of(self.ids.tolist())
+
+    @cached_property
+    def sides_m(self) -> Float[np.ndarray, " markers"]:
+        """(markers,), mean lengths of the four sides, in the order of `ids`."""
+        return sides_m(self.all_corners_m)
+
+    @cached_property
+    def centres_m(self) -> Float[np.ndarray, "markers 3"]:
+        """(markers, 3), in the order of `ids`."""
+        return self.all_corners_m.mean(axis=1)
+
+    @cached_property
+    def normals(self) -> Float[np.ndarray, "markers 3"]:
+        """(markers, 3), unit normals, out of the side that is printed, in the order of `ids`."""
+        return normals(self.all_corners_m)
+
+
+def read_marker_map(path: Path) -> MarkerMap:
+    """The map in a table of corners; `datasets._marker_corners` says in which layouts.
+
+    Raises:
+        InputError: the file cannot be read, a corner or column is missing, a marker is there twice, or one is no flat
+            square of the size of a marker, is where another one is, or faces away from the room. The message names
+            the line.
+    """
+    rows = read_marker_rows(path)
+    for marker, row in rows.items():
+        _check_square(marker, row)
+    marker_map = MarkerMap({marker: row.corners_m for marker, row in rows.items()})
+    _check_apart(rows, marker_map)
+    _check_facing(path, rows, marker_map)
+    return marker_map
+
+
+def sides_m(corners_m: Float[np.ndarray, "markers 4 3"]) -> Float[np.ndarray, " markers"]:
+    """Mean lengths of the four sides."""
+    return np.linalg.norm(np.roll(corners_m, -1, axis=-2) - corners_m, axis=-1).mean(axis=-1)
+
+
+def normals(corners_m: Float[np.ndarray, "*markers 4 3"]) -> Float[np.ndarray, "*markers 3"]:
+    """Unit normals, out of the side from which the corners are clockwise."""
+    across = np.cross(
+        corners_m[..., 3, :] - corners_m[..., 1, :], corners_m[..., 2, :] - corners_m[..., 0, :]
+    )
+    return across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-300)
+
+
+def _check_square(marker: int, row: MarkerRow) -> None:
+    corners, side = row.corners_m, float(sides_m(row.corners_m[None])[0])
+    where = f"{row.where}, marker {marker}"
+    if not _SIDES_M[0] <= side <= _SIDES_M[1]:
+        found = f"{side:g} m"
+        remedy = "is it in millimetres? then call the columns x1[mm] and so on" if side > _SIDES_M[1] else ""
+        remedy = remedy or "is the unit in the header right?"
+        expected = f"a marker with a side of {_SIDES_M[0]:g} to {_SIDES_M[1]:g} m"
+        raise InputError(where, expected=expected, found=found, remedy=remedy)
+    tolerance_m = SQUARE_TOLERANCE * side
+    edges = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
+    diagonals = np.linalg.norm(corners[2:] - corners[:2], axis=1)
+    # 1, 2, 4, 3 or the like: a square's six distances, but two diagonals are as short as its sides.
+    six = np.sort([*edges, *diagonals]) / edges.min()
+    square = np.allclose(six, [1, 1, 1, 1, np.sqrt(2), np.sqrt(2)], atol=SQUARE_TOLERANCE)
+    if square and diagonals.min() < 0.9 * edges.max():
+        expected = "corners one after the other around the marker"
+        raise InputError(where, expected=expected, found="two that are exchanged", remedy="put them in order")
+    # One corner's height over the plane of the three others, whichever it is.
+    normal, twist = normals(corners), corners[0] - corners[1] + corners[2] - corners[3]
+    height = abs(float(twist @ normal))
+    if height > tolerance_m:
+        raise InputError(
+            where,
+            expected=f"corners in a plane to {SQUARE_TOLERANCE:.0%} of the side",
+            found=f"one that is {1e3 * height:.0f} mm off that of the others, of a side of {1e3 * side:.0f} mm",
+            remedy="measure its corners again",
+        )
+    off = np.abs([*(edges - side), *(diagonals - np.sqrt(2) * side)])
+    if off.max() > tolerance_m:
+        lengths = ", ".join(f"{1e3 * length:.0f}" for length in (*edges, *diagonals))
+        raise InputError(
+            where,
+            expected=f"a square, its sides and diagonals right to {SQUARE_TOLERANCE:.0%} of the side",
+            found=f"sides and diagonals of {lengths} mm",
+            remedy="measure its corners again",
+        )
+
+
+def _check_apart(rows: Mapping[int, MarkerRow], marker_map: MarkerMap) -> None:
+    ids, centres, faces = marker_map.ids, marker_map.centres_m, marker_map.normals
+    distance = np.linalg.norm(centres[:, None] - centres, axis=-1)
+    limit = _SAME_PLACE * np.minimum(marker_map.sides_m[:, None], marker_map.sides_m)
+    pairs = np.argwhere(np.triu((distance < limit) & (faces @ faces.T > 0), 1))
+    for first, second in ids[pairs].tolist():
+        raise InputError(
+            f"{rows[second].where}, marker {second}",
+            expected="markers in different places",
+            found=f"it where marker {first} is",
+            remedy="correct one of the two",
+        )
+
+
+def _check_facing(path: Path, rows: Mapping[int, MarkerRow], marker_map: MarkerMap) -> None:
+    """Refuse a marker that has all others behind it: it faces the wall, so its corners are counted backwards.
+
+    Markers that all do are those of a mirrored table, or on the outside of a thing: that is small.
+    """
+    ids, centres = marker_map.ids, marker_map.centres_m
+    height = np.einsum("mnk,mk->mn", centres - centres[:, None], marker_map.normals)
+    beside = _BESIDE * marker_map.sides_m[:, None]
+    outward = (height < -beside).any(axis=1) & ~(height > beside).any(axis=1)
+    inward = (height > beside).any(axis=1)
+    remedy = "count them clockwise as seen from the room, from the marker's own top left"
+    if outward.any() and inward.any():
+        marker = int(ids[outward][0])
+        raise InputError(
+            f"{rows[marker].where}, marker {marker}",
+            expected="corners in the order in which a camera in the room sees them",
+            found="that all other markers are behind it",
+            remedy=f"its corners are counted backwards: {remedy}",
+        )
+    across = np.linalg.norm(np.ptp(centres, axis=0))
+    if outward.any() and across > _THING * np.median(marker_map.sides_m):
+        raise InputError(
+            path,
+            expected="corners in the order in which a camera in the room sees them",
+            found=f"that {int(outward.sum())} of {len(ids)} markers face out of the room, and none into it",
+            remedy=f"corners are counted backwards, or an axis is mirrored: {remedy}",
+        )

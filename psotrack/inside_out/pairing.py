@@ -1,0 +1,146 @@
+"""Which outside-in track is of the drone that carries a camera: by distance, piece by piece.
+
+Names of tracks are arbitrary, and two that met may have been exchanged. A camera knows on which drone it is. So each
+path has a sequence of tracks: the one of least cost, where a frame costs the squared distance up to a limit, and a
+change of tracks as much as some frames that are all wrong (A. Viterbi, Error bounds for convolutional codes, IEEE
+Transactions on Information Theory 13 (2), 1967).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from psotrack.evaluation.association import GATE_M, UNASSIGNED
+
+#: A frame without the track costs this share of a frame with the track elsewhere.
+_MISSING = 0.25
+#: A change of tracks costs as many frames with the track elsewhere.
+_CHANGE_FRAMES = 5.0
+
+
+@dataclass(frozen=True)
+class Change:
+    """From this frame on another track is of the drone.
+
+    Attributes:
+        drone: index of the camera's path.
+        frame: number of the first frame.
+        before, after: indices of the tracks.
+    """
+
+    drone: int
+    frame: int
+    before: int
+    after: int
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """Who is who.
+
+    Attributes:
+        track: (frames, paths), index of the track that is of each path's drone, or `UNASSIGNED`.
+        rest: (frames, tracks), for each track's own name the track of a drone without a camera, or `UNASSIGNED`.
+        changes: in the order of frames.
+    """
+
+    track: Int[np.ndarray, "frames paths"]
+    rest: Int[np.ndarray, "frames tracks"]
+    changes: tuple[Change, ...]
+
+
+def paired(
+    frame: Int[np.ndarray, "frames"],
+    expected_m: Float[np.ndarray, "frames paths 3"],
+    reach_m: Float[np.ndarray, "paths"],
+    middle_m: Float[np.ndarray, "frames tracks 3"],
+) -> Pairing:
+    """Assign tracks to paths.
+
+    Args:
+        frame: (frames,), numbers.
+        expected_m: (frames, paths, 3), where each path expects its drone's middle; NaN where it does not know.
+        reach_m: (paths,), distance from there at which a track is as good as elsewhere.
+        middle_m: (frames, tracks, 3), NaN where a track is not there.
+
+    A path has no track at all if the best is further away than half a metre in most frames that have both.
+    """
+    num_frames, num_paths, num_tracks = len(frame), expected_m.shape[1], middle_m.shape[1]
+    distance_m = np.linalg.norm(expected_m[:, :, None] - middle_m[:, None], axis=-1)
+    track = np.full((num_frames, num_paths), UNASSIGNED)
+    for path in range(num_paths if num_tracks else 0):
+        there = np.isfinite(distance_m[:, path])
+        cost = np.minimum((distance_m[:, path] / reach_m[path]) ** 2, 1.0)
+        cost = np.where(there, cost, _MISSING)
+        cost[~there.any(axis=1)] = 0.0
+        best = _cheapest(cost, _CHANGE_FRAMES)
+        to_best_m = distance_m[np.arange(num_frames), path, best]
+        both = np.isfinite(to_best_m)
+        if both.any() and np.mean(to_best_m[both] <= GATE_M) > 0.5:
+            track[:, path] = best
+    _release_shared(track, distance_m)
+    return Pairing(track, _rest(track, num_tracks), _changes(frame, track))
+
+
+def _cheapest(cost: Float[np.ndarray, "frames states"], change: float) -> Int[np.ndarray, "frames"]:
+    """(frames,), the sequence of states with the least sum of costs and changes."""
+    total = np.zeros(cost.shape[1])
+    came_from = np.empty(cost.shape, int)
+    for here, origin in zip(cost, came_from, strict=True):
+        best = int(np.argmin(total))
+        stayed = total <= total[best] + change
+        origin[:] = np.where(stayed, np.arange(len(total)), best)
+        total = np.where(stayed, total, total[best] + change) + here
+    states = np.empty(len(cost), int)
+    state = int(np.argmin(total))
+    for k in range(len(cost) - 1, -1, -1):
+        states[k] = state
+        state = came_from[k, state]
+    return states
+
+
+def _release_shared(
+    track: Int[np.ndarray, "frames paths"], distance_m: Float[np.ndarray, "frames paths tracks"]
+) -> None:
+    """In place: where two paths have the same track, it is the nearer one's; a path that does not know has none."""
+    if not distance_m.size:
+        return
+    own_m = np.take_along_axis(distance_m, np.maximum(track, 0)[..., None], axis=2)[..., 0]
+    own_m = np.where(np.isfinite(own_m), own_m, np.inf)
+    original = track.copy()
+    for path in range(track.shape[1]):
+        for other in range(path):
+            shared = (original[:, path] == original[:, other]) & (original[:, path] != UNASSIGNED)
+            first = own_m[:, path] < own_m[:, other]
+            track[shared & first, other] = UNASSIGNED
+            track[shared & ~first, path] = UNASSIGNED
+
+
+def _changes(frame: Int[np.ndarray, "frames"], track: Int[np.ndarray, "frames paths"]) -> tuple[Change, ...]:
+    found = []
+    for path in range(track.shape[1]):
+        rows = np.flatnonzero(track[:, path] != UNASSIGNED)
+        before, after = track[rows[:-1], path], track[rows[1:], path]
+        found += [
+            Change(path, int(frame[rows[row + 1]]), int(before[row]), int(after[row]))
+            for row in np.flatnonzero(before != after)
+        ]
+    return tuple(sorted(found, key=lambda change: (change.frame, change.drone)))
+
+
+def _rest(track: Int[np.ndarray, "frames paths"], num_tracks: int) -> Int[np.ndarray, "frames tracks"]:
+    """What is left to drones without a camera: a path that takes such a drone's track leaves its own in its place."""
+    held = np.arange(num_tracks)
+    current = np.full(track.shape[1], UNASSIGNED)
+    rest = np.empty((len(track), num_tracks), int)
+    for row, now in enumerate(track):
+        for path in np.flatnonzero((now != current) & (now != UNASSIGNED)):
+            held = np.where(
+                held == now[path], current[path] if current[path] not in now else UNASSIGNED, held
+            )
+            current[path] = now[path]
+        rest[row] = held
+    return rest

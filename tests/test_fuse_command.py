@@ -1,0 +1,116 @@
+"""`psotrack fuse` on files: tracks that other commands read, a report, and one line for what is wrong."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from test_inside_out_fusing import recording, rms, unseen, without
+
+from psotrack.cli.fuse import fuse
+from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
+from psotrack.inside_out.camera_path import write_camera_path
+from psotrack.trajectory_files import read_trajectories, write_trajectories
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Two paths, the tracks with their labels exchanged from frame 60 on, and the truth."""
+    folder = tmp_path_factory.mktemp("fuse")
+    paths, outside, truths = recording(31, 100, num_drones=2, apart_m=1.5)
+    outside.position_m[60:, [0, 1]] = outside.position_m[60:, [1, 0]]
+    paths["dron1"] = without(paths["dron1"], slice(20, 30))
+    write_trajectories(folder / "tracks.csv", unseen(outside, slice(80, 90)))
+    for name, path in paths.items():
+        write_camera_path(folder / f"{name}.csv", path, name)
+    return folder, truths
+
+
+def run(*words):
+    return CliRunner().invoke(fuse, [str(word) for word in words])
+
+
+def test_files_are_fused_into_tracks_that_other_commands_read(files, tmp_path) -> None:
+    folder, truths = files
+    out, report = tmp_path / "fused.csv", tmp_path / "report.json"
+    done = run(
+        folder / "dron1.csv", folder / "dron2.csv", folder / "tracks.csv", "--out", out, "--json", report
+    )
+    assert done.exit_code == 0, done.output
+    assert "dron1: track 0 and track 1" in done.output
+    assert "from frame 60: dron1 is track 1, no more 0" in done.output
+    fused = read_trajectories(out)
+    assert fused.drones == ("dron1", "dron2")
+    for drone, (truth_m, _) in enumerate(truths):
+        # Frames without a pose are as good as the outside, 7 mm, and as the arm is turned over the gap.
+        assert rms(fused.position_m[:, drone] - truth_m) < 0.005
+    assert np.isfinite(fused.covariance_m2).all()
+    assert fused.seen.all()
+    header, first = out.read_text().splitlines()[:2]
+    assert {"qw", "qx", "qy", "qz", "source", "status"} <= set(header.split(","))
+    assert first.endswith("both,tracked")
+    content = json.loads(report.read_text())
+    assert content["point"] == "camera"
+    assert [one["frame"] for one in content["exchanges"]] == [60, 60]
+    drone = content["drones"][0]
+    # Track 0, which was lost from frame 80 to 89, was the second drone's by then.
+    assert (drone["frames_both"], drone["frames_inside"], drone["frames_outside"]) == (90, 0, 10)
+    assert content["drones"][1]["frames_inside"] == 10
+    assert np.allclose(drone["lever_arm_m"], [0.01, 0.03, -0.12], atol=0.005)
+    assert len(drone["lever_arm_std_m"]) == 3
+    assert drone["offset_s"] is None
+    assert drone["inside"]["scale"] > 0
+
+
+def test_options(files, tmp_path) -> None:
+    folder, _ = files
+    out = tmp_path / "fused.csv"
+    words = (
+        folder / "dron2.csv",
+        folder / "tracks.csv",
+        "--out",
+        out,
+        "--at",
+        "middle",
+        "--max-offset",
+        "0.5",
+    )
+    done = run(*words, "--json", "-")
+    content = json.loads(done.output)
+    assert content["point"] == "middle"
+    assert content["others"] == ["0"]
+    # The clocks are one: within four standard deviations.
+    assert abs(content["drones"][0]["offset_s"]) < 4 * content["drones"][0]["offset_std_s"]
+    before = out.read_bytes()
+    assert run(*words, "-q", "--force").output == ""
+    assert out.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("words", "error", "sentence"),
+    [
+        (
+            ["dron1.csv", "tracks.csv", "--out", "fused.txt"],
+            SettingsError,
+            "--out: expected a file that ends in .csv",
+        ),
+        (["dron1.csv", "dron1.csv", "tracks.csv", "--out", "new.csv"], InputError, "a second one of dron1"),
+        (["tracks.csv", "tracks.csv", "--out", "new.csv"], InputError, "a camera's path with orientations"),
+        (["dron1.csv", "none.csv", "--out", "new.csv"], InputError, "none.csv"),
+        (["dron1.csv", "tracks.csv", "--out", "dron2.csv"], OutputError, "pass --force to replace it"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(files, words, error, sentence) -> None:
+    folder, _ = files
+    done = run(*(folder / word if word.endswith((".csv", ".txt")) else word for word in words))
+    assert isinstance(done.exception, PsotrackError)
+    assert isinstance(done.exception, error)
+    assert sentence in str(done.exception).replace(f"{folder}/", "")
+    assert "\n" not in str(done.exception)
+    assert not (folder / "new.csv").exists()
+
+
+def test_help_shows_examples() -> None:
+    shown = run("--help").output
+    assert "psotrack fuse dron1.csv dron2.csv tracks.csv --out fused.csv" in shown
+    assert "--max-offset SECONDS" in shown

@@ -1,0 +1,568 @@
+"""The causal filter over camera poses: its manifold against SciPy, its arithmetic against a textbook filter, its
+covariance against truth, and what it does with outliers, wrong starts, gaps and ambiguous poses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from psotrack.errors import InputError, SettingsError
+from psotrack.inside_out import manifold, pose_motion
+from psotrack.inside_out.camera_path import CameraPath, Flag
+from psotrack.inside_out.path_rows import path_of, rows_of
+from psotrack.inside_out.pose_filter import (
+    Following,
+    MeasuredPose,
+    PoseFilterParams,
+    advance,
+    estimate,
+    expected,
+    follow,
+    init,
+    predict,
+    step,
+    update,
+)
+from psotrack.trajectories import Status
+
+FPS = 25.0
+STD_M, STD_RAD = 0.004, 0.0008
+#: Within this is 90 % of a chi-square distribution with 3 degrees of freedom.
+NINETY = chi2.ppf(0.9, 3)
+
+
+def spread() -> np.ndarray:
+    """Covariance of poses: to the side and about the vertical axis a camera cannot tell well what it did."""
+    covariance = np.diag([STD_M**2] * 3 + [STD_RAD**2] * 3)
+    covariance[0, 4] = covariance[4, 0] = 0.8 * STD_M * STD_RAD
+    covariance[1, 3] = covariance[3, 1] = -0.8 * STD_M * STD_RAD
+    return covariance
+
+
+def flight(frames, *, acceleration=2.0, wobble=2.0, seed=0):
+    """A camera with white forces through a damping, and raw poses whose errors partly last.
+
+    Another motion than the filter's, with errors that last otherwise too (half a second).
+
+    Returns:
+        Raw poses, and the true positions (frames, 3) and orientations.
+    """
+    rng = np.random.default_rng(seed)
+    finer, dt = 10, 1 / FPS / 10
+    pull, twist = np.zeros(3), np.zeros(3)
+    position, velocity, rate, turned = np.zeros(3), np.zeros(3), np.zeros(3), Rotation.identity()
+    positions, quaternions = [], []
+    for k in range(frames * finer):
+        pull = np.exp(-dt / 0.4) * pull + acceleration * np.sqrt(2 * dt / 0.4) * rng.normal(size=3)
+        twist = np.exp(-dt / 0.1) * twist + wobble * np.sqrt(2 * dt / 0.1) * rng.normal(size=3)
+        velocity = velocity + (pull - 0.3 * velocity) * dt
+        rate = rate + (twist - rate) * dt
+        position = position + velocity * dt
+        turned = turned * Rotation.from_rotvec(rate * dt)
+        if k % finer == 0:
+            positions.append(position)
+            quaternions.append(turned.as_quat(scalar_first=True))
+    position_m, truth = np.array(positions), Rotation.from_quat(quaternions, scalar_first=True)
+    root = np.linalg.cholesky(spread())
+    lasting, off = rng.normal(size=6), []
+    for _ in range(frames):
+        off.append(root @ (np.sqrt(0.6) * lasting + np.sqrt(0.4) * rng.normal(size=6)))
+        kept = np.exp(-1 / FPS / 0.5)
+        lasting = kept * lasting + np.sqrt(1 - kept**2) * rng.normal(size=6)
+    error = np.array(off)
+    return raw_path(position_m - error[:, :3], truth * Rotation.from_rotvec(-error[:, 3:])), position_m, truth
+
+
+def raw_path(position_m, orientation, time_s=None) -> CameraPath:
+    count = len(position_m)
+    return CameraPath(
+        frame=np.arange(count),
+        time_s=np.arange(count) / FPS if time_s is None else time_s,
+        position_m=position_m,
+        orientation_wxyz=orientation.as_quat(scalar_first=True).reshape(count, 4),
+        covariance=np.tile(spread(), (count, 1, 1)),
+        num_markers=np.full(count, 8),
+        reprojection_px=np.full(count, 0.3),
+        ambiguity=np.zeros(count),
+        status=np.full(count, int(Status.TRACKED)),
+        flags=np.zeros(count, int),
+    )
+
+
+def without(path: CameraPath, gone) -> CameraPath:
+    """The path without the poses of some frames."""
+    values = {
+        name: getattr(path, name).copy()
+        for name in ("position_m", "orientation_wxyz", "covariance", "ambiguity", "reprojection_px")
+    }
+    for value in values.values():
+        value[gone] = np.nan
+    status, num_markers = path.status.copy(), path.num_markers.copy()
+    status[gone], num_markers[gone] = Status.LOST, 0
+    return replace(path, **values, status=status, num_markers=num_markers)
+
+
+def misplaced(path: CameraPath, rows, shift_m, turn=(0.0, 0.0, 0.0)) -> CameraPath:
+    """The path with some poses elsewhere."""
+    position_m, orientation_wxyz = path.position_m.copy(), path.orientation_wxyz.copy()
+    position_m[rows] += shift_m
+    there = Rotation.from_quat(orientation_wxyz[rows], scalar_first=True) * Rotation.from_rotvec(turn)
+    orientation_wxyz[rows] = there.as_quat(scalar_first=True)
+    return replace(path, position_m=position_m, orientation_wxyz=orientation_wxyz)
+
+
+def errors(path: CameraPath, position_m, truth):
+    """Truth less what is told, (told, 3) each, along the world's axes and about the camera's, where a pose is told."""
+    told = path.seen
+    turn = Rotation.from_quat(path.orientation_wxyz[told], scalar_first=True).inv() * truth[told]
+    return position_m[told] - path.position_m[told], turn.as_rotvec()
+
+
+def share_within(error, covariance) -> float:
+    """Of truths within the 90 % ellipsoids."""
+    return float((np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error) < NINETY).mean())
+
+
+def a_pose(time_s=0.0, position_m=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0), ambiguity=0.0) -> MeasuredPose:
+    quaternion = Rotation.from_rotvec(turn).as_quat(scalar_first=True)
+    return MeasuredPose(time_s, np.array(position_m, float), quaternion, spread(), ambiguity)
+
+
+# The manifold.
+
+turns = st.lists(st.floats(-1.7, 1.7), min_size=3, max_size=3).map(np.array)
+
+
+@given(turns, turns)
+def test_turns_are_scipys(first, second) -> None:
+    """Turned, and the turn between, to rounding; where angles are tiny, too."""
+    for scale in (1.0, 1e-3, 1e-9):
+        start = Rotation.from_rotvec(first)
+        wxyz = start.as_quat(scalar_first=True)[None]
+        end = start * Rotation.from_rotvec(scale * second)
+        turned = manifold.turned(wxyz, scale * second[None])
+        np.testing.assert_allclose(manifold.rotation_matrices(turned)[0], end.as_matrix(), atol=1e-14)
+        for sign in (1.0, -1.0):
+            between = manifold.turn_between(wxyz, sign * end.as_quat(scalar_first=True)[None])
+            np.testing.assert_allclose(between[0], scale * second, rtol=1e-9, atol=1e-15)
+
+
+@given(turns)
+@pytest.mark.parametrize("scale", [1.0, 0.02, 0.0])
+def test_jacobians_are_numerical_derivatives(scale, turn) -> None:
+    turn, small = scale * turn, 1e-6
+    right, inverse = np.zeros((3, 3)), np.zeros((3, 3))
+    for axis, step_rad in enumerate(small * np.eye(3)):
+        ahead, behind = (Rotation.from_rotvec(turn + sign * step_rad) for sign in (1, -1))
+        right[:, axis] = (behind.inv() * ahead).as_rotvec() / (2 * small)
+        ahead, behind = (
+            Rotation.from_rotvec(turn) * Rotation.from_rotvec(sign * step_rad) for sign in (1, -1)
+        )
+        inverse[:, axis] = (ahead.as_rotvec() - behind.as_rotvec()) / (2 * small)
+    # Central differences: their error is of the order of the step's square, and of rounding by the step, 1e-10.
+    np.testing.assert_allclose(manifold.right_jacobian(turn[None])[0], right, atol=2e-9)
+    np.testing.assert_allclose(manifold.right_jacobian_inverse(turn[None])[0], inverse, atol=2e-9)
+
+
+def test_half_a_turn_has_a_turn() -> None:
+    start, end = np.array([[1.0, 0.0, 0.0, 0.0]]), np.array([[0.0, 0.6, 0.8, 0.0]])
+    np.testing.assert_allclose(manifold.turn_between(start, end), [[0.6 * np.pi, 0.8 * np.pi, 0.0]])
+
+
+# The arithmetic of one level.
+
+LEVEL = pose_motion.Levels(np.array([30.0]), np.array([0.5]))
+
+
+def test_translation_of_a_camera_that_does_not_turn_is_a_textbook_filter() -> None:
+    """Kalman's equations as they are written, on position, velocity, acceleration and the error that lasts.
+
+    F and Q from the matrix exponential (C. F. Van Loan, Computing integrals involving the matrix exponential, 1978).
+    """
+    rng = np.random.default_rng(1)
+    noise = rng.normal(size=(3, 3))
+    noise_m2 = 1e-5 * (noise @ noise.T + np.eye(3))
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3], covariance[3:, 3:] = noise_m2, 1e-6 * np.eye(3)
+    share, lasting_s = pose_motion.LASTING_SHARE, pose_motion.LASTING_TIME_S
+    variances, axes = np.linalg.eigh(noise_m2)
+    root = axes @ np.diag(np.sqrt(share * variances)) @ axes.T
+    H = np.hstack([np.eye(3), np.zeros((3, 6)), root])
+
+    A = np.zeros((12, 12))
+    A[:3, 3:6] = A[3:6, 6:9] = np.eye(3)
+    A[6:9, 6:9] = -np.eye(3) / pose_motion.ACCELERATION_TIME_S
+    A[9:, 9:] = -np.eye(3) / lasting_s
+    driven = np.diag([0.0] * 6 + [30.0] * 3 + [2 / lasting_s] * 3)
+
+    straight = np.array([1.0, 0.0, 0.0, 0.0])
+    motion = pose_motion.begun(np.zeros(3), straight, covariance, LEVEL)
+    part = np.r_[0:9, 15:18]
+    x, P = np.zeros(12), motion.covariance[0][np.ix_(part, part)]
+    for dt_s in (0.04, 0.04, 0.01, 0.3, 0.04):
+        loan = expm(np.block([[-A, driven], [np.zeros((12, 12)), A.T]]) * dt_s)
+        F = loan[12:, 12:].T
+        x, P = F @ x, F @ P @ F.T + F @ loan[:12, 12:]
+        z = rng.normal(scale=0.01, size=3)
+        S = H @ P @ H.T + (1 - share) * noise_m2
+        K = P @ H.T @ np.linalg.inv(S)
+        x, P = x + K @ (z - H @ x), P - K @ S @ K.T
+
+        motion, _ = pose_motion.foretold(motion, dt_s, LEVEL)
+        motion = pose_motion.corrected(motion, pose_motion.innovation(motion, z, straight, covariance))
+        found = np.concatenate(
+            [motion.position_m, motion.velocity_m_s, motion.acceleration_m_s2, motion.lasting[:, :3]], axis=1
+        )
+        # Measured: 1e-11 of the largest of their kind, velocities' variances of 25 being cancelled to 1e-3.
+        np.testing.assert_allclose(found[0], x, rtol=1e-8, atol=1e-9)
+        np.testing.assert_allclose(motion.covariance[0][np.ix_(part, part)], P, rtol=1e-7, atol=1e-10)
+
+
+def test_errors_go_where_f_takes_them() -> None:
+    """F is the numerical derivative of the motion, turns included."""
+    rng = np.random.default_rng(2)
+    orientation_wxyz = Rotation.random(rng=rng).as_quat(scalar_first=True)
+    motion = pose_motion.begun(rng.normal(size=3), orientation_wxyz, spread(), LEVEL)
+    motion = pose_motion.moved(motion, rng.normal(size=(1, pose_motion.SIZE)))
+    later, F = pose_motion.foretold(motion, 0.3, LEVEL)
+    for k, change in enumerate(1e-6 * np.eye(pose_motion.SIZE)):
+        ahead, behind = (
+            pose_motion.foretold(pose_motion.shifted(motion, sign * change[None]), 0.3, LEVEL)[0]
+            for sign in (1, -1)
+        )
+        slope = (pose_motion.difference(later, ahead) - pose_motion.difference(later, behind)) / 2e-6
+        np.testing.assert_allclose(F[0, :, k], slope[0], atol=1e-8)
+
+
+def test_one_level_knows_how_well_it_knows() -> None:
+    """Cameras that move as the level says: the squared error in units of the covariance (NEES) is 21 on the mean."""
+    rng = np.random.default_rng(3)
+    frames, runs, dt_s = 6, 60, 0.04
+    squares = []
+    Q = pose_motion.process_noise(dt_s, LEVEL)[0]
+    variances, axes = np.linalg.eigh(spread())
+    lasting_root = (axes * np.sqrt(pose_motion.LASTING_SHARE * variances)) @ axes.T
+    white_root = np.sqrt(1 - pose_motion.LASTING_SHARE) * np.linalg.cholesky(spread())
+    for _ in range(runs):
+        start = Rotation.random(rng=rng).as_quat(scalar_first=True)
+        motion = pose_motion.begun(rng.normal(size=3), start, spread(), LEVEL)
+        truth = pose_motion.shifted(motion, rng.multivariate_normal(np.zeros(21), motion.covariance[0])[None])
+        for _ in range(frames):
+            truth, _ = pose_motion.foretold(truth, dt_s, LEVEL)
+            truth = pose_motion.shifted(truth, rng.multivariate_normal(np.zeros(21), Q)[None])
+            off = lasting_root @ truth.lasting[0] + white_root @ rng.normal(size=6)
+            seen_wxyz = manifold.turned(truth.orientation_wxyz, off[None, 3:])[0]
+            motion, _ = pose_motion.foretold(motion, dt_s, LEVEL)
+            told = pose_motion.innovation(motion, truth.position_m[0] + off[:3], seen_wxyz, spread())
+            motion = pose_motion.corrected(motion, told)
+        error = pose_motion.difference(motion, truth)[0]
+        squares.append(error @ np.linalg.solve(motion.covariance[0], error))
+    # The sum of independent chi-squares is one; 1 in 1000 such tests would fail on either side.
+    low, high = chi2.ppf([0.001, 0.999], 21 * runs) / runs
+    assert low < np.mean(squares) < high
+
+
+# The filter on flights.
+
+
+@pytest.mark.parametrize(("acceleration", "wobble"), [(0.2, 0.5), (2.0, 2.0), (25.0, 25.0)])
+def test_hovering_or_racing_the_filter_is_no_worse_than_poses_and_knows_it(acceleration, wobble) -> None:
+    """Nobody tells it how the camera flies, nor for how long errors last."""
+    raw, position_m, truth = flight(150, acceleration=acceleration, wobble=wobble, seed=6)
+    path = follow(raw)
+    assert (path.status[2:] != Status.LOST).all()
+    off_m, off_rad = errors(path, position_m, truth)
+    raw_off_m, raw_off_rad = errors(raw, position_m, truth)
+    # Most of the error lasts, and cannot be told from motion: not much is to be won.
+    assert np.median(np.linalg.norm(off_m, axis=1)) < 1.03 * np.median(np.linalg.norm(raw_off_m, axis=1))
+    assert np.median(np.linalg.norm(off_rad, axis=1)) < 1.03 * np.median(np.linalg.norm(raw_off_rad, axis=1))
+    covariance = path.covariance[path.seen]
+    assert 0.78 < share_within(off_m, covariance[:, :3, :3]) < 0.98
+    assert 0.75 < share_within(off_rad, covariance[:, 3:, 3:]) < 0.98
+    speed_error = np.linalg.norm(
+        path.velocity_m_s[10:] - np.gradient(position_m, raw.time_s, axis=0)[10:], axis=1
+    )
+    # A frame's white error by the time of some frames, and what a racer's acceleration changes in one.
+    assert np.median(speed_error) < 0.1 + acceleration / FPS
+
+
+def test_good_poses_are_gated_as_seldom_as_is_said() -> None:
+    raw, _, _ = flight(300, acceleration=0.5, wobble=0.3, seed=6)
+    path = follow(raw, PoseFilterParams(false_alarm=0.03))
+    # 9 are expected of 300 where level and errors are as assumed; 20 would be 4 sigma off that.
+    assert 1 <= ((path.flags & Flag.GATED) > 0).sum() <= 20
+
+
+def test_covariances_that_are_too_large_are_found_out() -> None:
+    raw, position_m, truth = flight(200, acceleration=0.5, wobble=0.5, seed=7)
+    raw = replace(raw, covariance=4 * raw.covariance)
+    path = follow(raw)
+    late = slice(100, None)
+    off_m, _ = errors(path, position_m, truth)
+    assert share_within(off_m[late], path.covariance[path.seen][late, :3, :3]) > 0.8
+    # A quarter is right, a little less what a filter makes of it.
+    assert 0.15 < np.trace(path.covariance[-1]) / np.trace(raw.covariance[-1]) < 0.4
+
+
+@pytest.mark.parametrize("near", [False, True])
+def test_outliers_do_not_count(near) -> None:
+    """2 in 100 poses are elsewhere, and so is the very first, and two runs of some frames."""
+    raw, position_m, truth = flight(150, seed=8)
+    bad = np.zeros(150, bool)
+    bad[[0, 15, 40, 90]] = True
+    bad[50:56], bad[110:118] = True, True
+    shift_m, turn = ([0.0, 0.15, 0.0], [0.0, 0.0, 0.03]) if near else ([1.5, -2.0, 0.3], [0.0, 0.9, 0.0])
+    path = follow(misplaced(raw, bad, shift_m, turn))
+    off_m, off_rad = errors(path, position_m, truth)
+    # 8 frames are 0.32 s: 0.1 m and 6 degrees at accelerations of 2 m/s2 and 2 rad/s2, which by chance are larger.
+    assert np.linalg.norm(off_m, axis=1).max() < 0.25
+    assert np.degrees(np.linalg.norm(off_rad, axis=1)).max() < 12.0
+    assert (path.flags[bad][1:] & Flag.GATED).all()
+    assert (path.status[bad] != Status.TRACKED).all()
+    assert ((path.flags[~bad] & Flag.GATED) > 0).sum() <= 3
+    assert (path.status == Status.LOST).sum() <= 5
+
+
+def test_gated_frames_coast_with_growing_uncertainty_and_keep_what_was_seen() -> None:
+    raw, _, _ = flight(60, seed=10)
+    path = follow(misplaced(raw, slice(40, 46), [0.0, 3.0, 0.0]))
+    assert (path.status[40:46] == Status.COASTING).all()
+    assert (path.flags[40:46] == Flag.GATED).all()
+    assert (path.num_markers[40:46] == 8).all()
+    assert (np.diff(np.trace(path.covariance[39:46, :3, :3], axis1=1, axis2=2)) > 0).all()
+    assert path.status[46] == Status.TRACKED
+
+
+def test_a_wrong_start_that_was_believed_is_given_up_as_soon_as_more_poses_contradict() -> None:
+    raw, position_m, _ = flight(40, seed=11)
+    path = follow(misplaced(raw, slice(0, 4), [3.0, 0.0, 0.0]))
+    assert path.status[3] == Status.TRACKED
+    # Four poses supported it; the fifth against it is one more.
+    assert (path.status[4:8] == Status.COASTING).all()
+    assert (path.status[8:] == Status.TRACKED).all()
+    assert np.linalg.norm(path.position_m[8:] - position_m[8:], axis=1).max() < 0.03
+
+
+@pytest.mark.parametrize("restart_after", [4, 10])
+def test_a_camera_that_is_elsewhere_for_good_is_found_after_so_many_poses(restart_after) -> None:
+    raw, position_m, _ = flight(100, seed=12)
+    path = follow(
+        misplaced(raw, slice(50, None), [0.0, 0.0, 5.0]), PoseFilterParams(restart_after=restart_after)
+    )
+    believed = 50 + restart_after - 1
+    assert (path.status[50:believed] == Status.COASTING).all()
+    assert (path.status[believed : believed + 10] == Status.TRACKED).all()
+    moved_m = position_m[believed:] + np.array([0.0, 0.0, 5.0])
+    assert np.linalg.norm(path.position_m[believed:] - moved_m, axis=1).max() < 0.03
+
+
+def test_a_turn_that_nothing_foretold_is_followed_after_one_frame() -> None:
+    """A camera that hung in the air races off: 40 m/s2 from one frame to the next."""
+    position_m = np.zeros((60, 3))
+    position_m[50:, 0] = 40.0 / 2 * (np.arange(1, 11) / FPS) ** 2
+    rng = np.random.default_rng(13)
+    raw = raw_path(position_m + rng.normal(scale=0.002, size=(60, 3)), Rotation.identity(60))
+    path = follow(raw)
+    assert (path.status[50:] == Status.COASTING).sum() == 1
+    assert np.linalg.norm(path.position_m[52:] - position_m[52:], axis=1).max() < 0.03
+
+
+def test_gaps_are_bridged_for_as_long_as_is_said() -> None:
+    raw, position_m, truth = flight(150, acceleration=0.5, wobble=0.3, seed=14)
+    raw = without(raw, np.r_[50:58, 90:120])
+    path = follow(raw, PoseFilterParams(longest_gap_s=0.5))
+    assert (path.status[50:58] == Status.COASTING).all()
+    assert (path.flags[50:58] == 0).all()
+    assert (np.diff(np.trace(path.covariance[49:58, :3, :3], axis1=1, axis2=2)) > 0).all()
+    assert (path.status[90:101] == Status.COASTING).all()
+    assert (path.status[102:122] == Status.LOST).all()
+    for value in (path.position_m, path.orientation_wxyz, path.covariance, path.ambiguity, path.velocity_m_s):
+        assert np.isnan(value[102:122]).all()
+    assert (path.status[122:132] == Status.TRACKED).all()
+    off_m, off_rad = errors(path, position_m, truth)
+    covariance = path.covariance[path.seen]
+    gap = slice(48, 56)
+    assert (np.einsum("ni,nij,nj->n", off_m, np.linalg.inv(covariance[:, :3, :3]), off_m)[gap] < 16.3).all()
+    assert (
+        np.einsum("ni,nij,nj->n", off_rad, np.linalg.inv(covariance[:, 3:, 3:]), off_rad)[gap] < 16.3
+    ).all()
+
+
+# Starts, and paths with little in them.
+
+
+@pytest.mark.parametrize("frames", [0, 1, 2])
+def test_paths_with_hardly_a_pose(frames) -> None:
+    raw, _, _ = flight(5, seed=15)
+    rows = rows_of(raw)[:frames]
+    path = follow(path_of(rows))
+    assert path.num_frames == frames
+    assert (path.status == Status.LOST).all()
+    believing = follow(path_of(rows), PoseFilterParams(confirm=1))
+    assert (believing.status == Status.TRACKED).all()
+    if frames == 1:
+        # One pose: the same, and as sure.
+        np.testing.assert_allclose(believing.position_m, raw.position_m[:1], atol=1e-12)
+        np.testing.assert_allclose(believing.covariance[0], raw.covariance[0], atol=1e-15)
+
+
+def test_no_pose_at_all_and_none_at_the_beginning() -> None:
+    raw, _, _ = flight(30, seed=16)
+    assert (follow(without(raw, slice(None))).status == Status.LOST).all()
+    path = follow(without(raw, slice(0, 10)))
+    assert (path.status[:12] == Status.LOST).all()
+    assert (path.status[12:] == Status.TRACKED).all()
+
+
+def test_the_raw_path_stays_as_it_is() -> None:
+    raw, _, _ = flight(30, seed=17)
+    raw = without(misplaced(raw, slice(20, 21), [1.0, 0.0, 0.0]), slice(5, 8))
+    before = {name: np.copy(value) for name, value in vars(raw).items() if value is not None}
+    follow(raw)
+    for name, value in before.items():
+        np.testing.assert_array_equal(getattr(raw, name), value)
+
+
+def test_a_path_is_its_rows() -> None:
+    raw, _, _ = flight(5, seed=18)
+    again = path_of(rows_of(raw))
+    for name, value in vars(raw).items():
+        np.testing.assert_array_equal(getattr(again, name), value)
+
+
+def test_frame_by_frame_one_learns_where_the_next_pose_should_be() -> None:
+    raw, position_m, _ = flight(40, seed=19)
+    params = PoseFilterParams()
+    following, rows = Following(), []
+    for k, row in enumerate(rows_of(raw)):
+        following = advance(following, row.time_s, params)
+        told = expected(following, params)
+        assert (told is None) == (k < 3)
+        if told is not None and k > 10:
+            # 2 m/s2 change a place by 2 mm within a frame; the rest are poses' errors of 4 mm along each axis.
+            assert np.linalg.norm(told.position_m - position_m[k]) < 0.03
+        following, told_row = step(following, row, params)
+        rows.append(told_row)
+    whole = follow(raw)
+    for name, value in vars(path_of(rows)).items():
+        np.testing.assert_array_equal(getattr(whole, name), value)
+
+
+def test_times_may_be_irregular() -> None:
+    """A live stream that drops frames at random is followed as closely as the frames that it has allow."""
+    raw, position_m, truth = flight(200, acceleration=0.5, wobble=0.3, seed=20)
+    kept = np.flatnonzero(np.random.default_rng(21).random(200) < 0.4)
+    some = path_of([rows_of(raw)[k] for k in kept])
+    path = follow(some)
+    off_m, _ = errors(path, position_m[kept], truth[kept])
+    raw_off_m, _ = errors(some, position_m[kept], truth[kept])
+    assert np.median(np.linalg.norm(off_m, axis=1)) < 1.03 * np.median(np.linalg.norm(raw_off_m, axis=1))
+
+
+# Ambiguous poses.
+
+
+def test_an_ambiguous_pose_counts_by_how_well_it_fits() -> None:
+    """After a gap, where two poses are possible, it is half believed; where the motion is known, wholly."""
+    params = PoseFilterParams()
+    state = init(a_pose())
+    for k in range(1, 20):
+        state, _ = update(state, a_pose(k / FPS), params)
+    told = estimate(update(state, a_pose(20 / FPS, ambiguity=0.4), params)[0])
+    sure = estimate(update(state, a_pose(20 / FPS), params)[0])
+    np.testing.assert_allclose(told.covariance, sure.covariance, rtol=0.05)
+
+    late = predict(init(a_pose()), 0.4)
+    there = a_pose(0.4, position_m=(0.5, 0.0, 0.0), ambiguity=0.5)
+    half, gated = update(late, there, params)
+    whole, _ = update(late, replace(there, ambiguity=0.0), params)
+    assert not gated
+    assert estimate(half).position_m[0] < 0.95 * estimate(whole).position_m[0]
+    assert np.trace(estimate(half).covariance) > 3 * np.trace(estimate(whole).covariance)
+
+
+def test_motion_takes_ambiguity_away_and_nothing_else_does() -> None:
+    raw, _, _ = flight(30, seed=22)
+    ambiguity, flags = np.full(30, 0.3), np.full(30, int(Flag.AMBIGUOUS))
+    path = follow(replace(raw, ambiguity=ambiguity, flags=flags))
+    assert (path.ambiguity[2:] == 0.3).all()
+    assert (path.flags == Flag.AMBIGUOUS).all()
+    ambiguity[10], flags[10] = 0.0, 0
+    path = follow(replace(raw, ambiguity=ambiguity, flags=flags))
+    assert (path.ambiguity[2:10] == 0.3).all()
+    assert (path.ambiguity[10:] == 0.0).all()
+    assert (path.flags[10:] == 0).all()
+
+
+# What holds for all worlds.
+
+
+@settings(max_examples=6)
+@given(turns, st.lists(st.floats(-100, 100), min_size=3, max_size=3).map(np.array), st.booleans())
+def test_turning_and_shifting_the_world_turns_and_shifts_the_path(turn, shift_m, negate) -> None:
+    raw, _, _ = flight(15, seed=23)
+    raw = misplaced(without(raw, slice(5, 7)), slice(10, 11), [1.0, 0.0, 0.0])
+    raw = replace(raw, covariance=raw.covariance * (1 + 0.5 * np.sin(np.arange(15.0)))[:, None, None])
+    world = Rotation.from_rotvec(turn)
+    by_world = np.eye(6)
+    by_world[:3, :3] = world.as_matrix()
+    there = raw.seen
+    orientation_wxyz = raw.orientation_wxyz.copy()
+    moved = world * Rotation.from_quat(orientation_wxyz[there], scalar_first=True)
+    # A quaternion and its negative are the same orientation.
+    orientation_wxyz[there] = moved.as_quat(scalar_first=True) * (-1 if negate else 1)
+    other = replace(
+        raw,
+        position_m=raw.position_m @ world.as_matrix().T + shift_m,
+        orientation_wxyz=orientation_wxyz,
+        covariance=by_world @ raw.covariance @ by_world.T,
+    )
+    here, moved_path = follow(raw), follow(other)
+    np.testing.assert_array_equal(moved_path.status, here.status)
+    np.testing.assert_array_equal(moved_path.flags, here.flags)
+    told = here.seen
+    # Rounding: places of 100 m to 1e-14, and a hundred steps.
+    np.testing.assert_allclose(
+        moved_path.position_m[told], here.position_m[told] @ world.as_matrix().T + shift_m, atol=1e-8
+    )
+    np.testing.assert_allclose(
+        moved_path.velocity_m_s[told], here.velocity_m_s[told] @ world.as_matrix().T, atol=1e-6
+    )
+    expected_turns = world * Rotation.from_quat(here.orientation_wxyz[told], scalar_first=True)
+    apart = expected_turns.inv() * Rotation.from_quat(moved_path.orientation_wxyz[told], scalar_first=True)
+    assert apart.magnitude().max() < 1e-8
+    np.testing.assert_allclose(
+        moved_path.covariance[told], by_world @ here.covariance[told] @ by_world.T, rtol=1e-4, atol=1e-10
+    )
+
+
+# What is refused.
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"false_alarm": 0.0}, r"false_alarm: expected a probability above 0 and below 1, found 0"),
+        ({"longest_gap_s": -1.0}, r"longest_gap_s: expected a number above 0, found -1"),
+        ({"confirm": 0}, r"confirm: expected at least 1, found 0"),
+        ({"restart_after": 0}, r"restart_after: expected at least 1, found 0"),
+    ],
+)
+def test_settings_that_make_no_sense(setting, message) -> None:
+    with pytest.raises(SettingsError, match=message):
+        PoseFilterParams(**setting)
+
+
+def test_times_that_go_back_and_covariances_that_are_none() -> None:
+    state = init(a_pose(1.0))
+    with pytest.raises(InputError, match=r"time_s: expected a time after 1 s, found 0.5 s"):
+        predict(state, 0.5)
+    raw, _, _ = flight(5, seed=24)
+    raw.covariance[3] = np.nan
+    with pytest.raises(InputError, match=r"covariance at 0.12 s: expected a positive definite matrix"):
+        follow(raw)

@@ -1,0 +1,561 @@
+"""`psotrack localise`: from videos, folders and streams of a drawn room to the path of the camera in it."""
+
+import json
+import signal
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy.spatial.transform import Rotation
+
+from psotrack.cameras import camera, look_at, project, stack
+from psotrack.cli.localise import localise as command
+from psotrack.datasets.dpjait import write_calibration, write_marker_corners
+from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.inside_out.camera_path import Flag, read_camera_path
+from psotrack.inside_out.frames import natural_key, open_source, read_ahead
+from psotrack.inside_out.lens_files import read_lens, scaled
+from psotrack.inside_out.localising import LocaliseSettings, localise
+from psotrack.inside_out.marker_map import MarkerMap, read_marker_map
+from psotrack.lenses import lens_of_sensor, lens_of_view, marker_dictionary
+from psotrack.rig_files import write_rig
+from psotrack.trajectories import Status
+from psotrack.video import VideoWriter
+
+SIZE_WH = (640, 480)
+FPS = 25.0
+SIDE_M = 0.3
+FRAMES = 12
+LENS = lens_of_view(70.0, 55.4, SIZE_WH)
+#: Frames in which nothing but three markers, or nothing at all, is drawn.
+FEW, NONE = 6, 8
+
+
+@dataclass(frozen=True)
+class Room:
+    """A drawn room, as the files that a user would have."""
+
+    folder: Path
+    marker_map: MarkerMap
+    position_m: np.ndarray
+    R_world_cam: np.ndarray
+    images: list
+
+    @property
+    def markers(self):
+        return self.folder / "corners.csv"
+
+    @property
+    def video(self):
+        return self.folder / "flight.avi"
+
+    @property
+    def lens(self):
+        return self.folder / "lens.toml"
+
+
+def wall_markers():
+    """Nine markers on one wall, at y = 4, and four on another, at x = 3; ids are not in a row."""
+    corners = {}
+    for index in range(9):
+        x, z = -1.6 + 1.3 * (index % 3), 0.7 + 0.75 * (index // 3)
+        corners[5 + 3 * index] = np.array(
+            [[x, 4, z + SIDE_M], [x + SIDE_M, 4, z + SIDE_M], [x + SIDE_M, 4, z], [x, 4, z]], float
+        )
+    for index in range(4):
+        y, z = 2.2 + 0.8 * (index % 2), 0.9 + 0.9 * (index // 2)
+        corners[40 + index] = np.array(
+            [[3, y + SIDE_M, z + SIDE_M], [3, y, z + SIDE_M], [3, y, z], [3, y + SIDE_M, z]], float
+        )
+    return corners
+
+
+def drawn(corners_m, posed):
+    """An image of markers whose printed side is seen, at three times the size and then reduced, in light."""
+    width, height = SIZE_WH
+    image = np.full((3 * height, 3 * width), 150.0**2, np.float32)
+    for marker, corners in corners_m.items():
+        pixels, depth = project(posed, corners)
+        if depth.min() < 0.3:
+            continue
+        # Four cells, two of border, and one of white around.
+        cell = 24
+        own = cv2.copyMakeBorder(
+            cv2.aruco.generateImageMarker(marker_dictionary("4x4_1000"), marker, 6 * cell),
+            *[cell] * 4,
+            cv2.BORDER_CONSTANT,
+            value=255,
+        )
+        low, high = cell - 0.5, 7 * cell - 0.5
+        at = np.array([[low, low], [high, low], [high, high], [low, high]], np.float32)
+        # Pixel centres are at whole numbers at both sizes.
+        towards = cv2.getPerspectiveTransform(at, (3 * pixels + 1).astype(np.float32))
+        size = image.shape[1], image.shape[0]
+        warped = cv2.warpPerspective(own, towards, size, flags=cv2.INTER_AREA)
+        inside = cv2.warpPerspective(np.full_like(own, 255), towards, size, flags=cv2.INTER_NEAREST) > 0
+        image[inside] = (30 + (180 / 255) * warped[inside]) ** 2
+    # A pixel is the mean of its light, and its level the square root of that.
+    small = np.sqrt(cv2.resize(image, SIZE_WH, interpolation=cv2.INTER_AREA)).round().astype(np.uint8)
+    return cv2.cvtColor(small, cv2.COLOR_GRAY2BGR)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """Twelve frames, in which the camera goes right and forward: as images, as a video, and its calibration."""
+    folder = tmp_path_factory.mktemp("room")
+    corners_m = wall_markers()
+    write_marker_corners(folder / "corners.csv", corners_m)
+    write_rig(folder / "lens.toml", stack({"front": LENS}))
+    (folder / "images").mkdir()
+    positions, rotations, images = [], [], []
+    with VideoWriter(folder / "flight.avi", FPS, SIZE_WH) as writer:
+        for index in range(FRAMES):
+            centre = np.array([-0.3 + 0.04 * index, -0.2 + 0.02 * index, 1.4])
+            R, t_m = look_at(tuple(centre), (0.5 + 0.03 * index, 4.0, 1.5))
+            posed = camera(R=R, t_m=t_m, K=LENS.K, image_size_wh=SIZE_WH)
+            shown = corners_m
+            if index in (FEW, NONE):
+                shown = {} if index == NONE else {marker: corners_m[marker] for marker in (5, 8, 17)}
+            # One that the map does not know, and that is everywhere.
+            stranger = {900: np.array([[0, 3.9, 0.6], [0.3, 3.9, 0.6], [0.3, 3.9, 0.3], [0, 3.9, 0.3]])}
+            image = drawn(shown | ({} if index == NONE else stranger), posed)
+            # Without leading zeros: 10 comes after 9.
+            cv2.imwrite(str(folder / "images" / f"frame{index}.png"), image)
+            writer.write(image)
+            positions.append(centre)
+            rotations.append(R.T)
+            images.append(image)
+    return Room(
+        folder, read_marker_map(folder / "corners.csv"), np.array(positions), np.array(rotations), images
+    )
+
+
+def run(*arguments):
+    """The command; what psotrack raises is raised here."""
+    result = CliRunner().invoke(command, [str(argument) for argument in arguments])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+def ordinary(path):
+    """Frames in which the walls are drawn."""
+    return ~np.isin(path.frame, (FEW, NONE))
+
+
+def error_m(path, room):
+    return np.linalg.norm(path.position_m - room.position_m[path.frame], axis=-1)
+
+
+def error_deg(path, room, rows):
+    found = Rotation.from_quat(path.orientation_wxyz[rows], scalar_first=True)
+    true = Rotation.from_matrix(room.R_world_cam[path.frame[rows]])
+    return np.rad2deg((found.inv() * true).magnitude())
+
+
+def test_the_path_of_a_folder_of_images_is_where_the_camera_was(room, tmp_path):
+    out = tmp_path / "track.csv"
+    result = run(
+        room.folder / "images", "--fps", 25, "--markers", room.markers, "--camera", room.lens,
+        "--out", out, "--no-filter",
+    )  # fmt: skip
+    path, name = read_camera_path(out)
+    there = ordinary(path)
+    assert name == "images"
+    np.testing.assert_array_equal(path.frame, np.arange(FRAMES))
+    np.testing.assert_allclose(path.time_s, np.arange(FRAMES) / 25, rtol=1e-12)
+    # Measured 4.4 mm and 0.06 degrees: a tenth of a pixel in each of 36 corners, 4 m away.
+    assert error_m(path, room)[there].max() < 0.01
+    assert error_deg(path, room, there).max() < 0.15
+    assert (path.status[there] == Status.TRACKED).all()
+    assert (path.num_markers[there] >= 8).all()
+    assert (path.flags[there] == 0).all()
+    assert "10 of 12 frames" in result.output
+    assert "frames per second (decode" in result.output
+
+
+def test_a_video_tells_the_same_as_its_images(room, tmp_path):
+    tracks = {}
+    for source, options in ((room.video, []), (room.folder / "images", ["--fps", FPS])):
+        out = tmp_path / f"{source.stem}.csv"
+        run(source, *options, "--markers", room.markers, "--camera", room.lens, "--out", out, "--no-filter")
+        tracks[source.stem] = read_camera_path(out)[0]
+    video, images = tracks["flight"], tracks["images"]
+    # The codec is lossy: a marker may be lost, and the path was measured to move by 1 mm.
+    np.testing.assert_allclose(video.num_markers, images.num_markers, atol=1)
+    np.testing.assert_allclose(video.position_m, images.position_m, atol=0.005)
+
+
+def test_frames_with_few_markers_or_none_are_ordinary_and_said(room, tmp_path):
+    source = open_source(room.folder / "images", fps=FPS)
+    raw = localise(source, room.marker_map, LENS, LocaliseSettings(filter=None)).path
+    assert (raw.status[[FEW, NONE]] == Status.LOST).all()
+    assert raw.num_markers[[FEW, NONE]].tolist() == [3, 0]
+    assert raw.flags[[FEW, NONE]].tolist() == [Flag.FEW_MARKERS, 0]
+    assert np.isnan(raw.position_m[[FEW, NONE]]).all()
+
+
+def test_fewer_markers_are_allowed_and_flagged(room, tmp_path):
+    out = tmp_path / "track.csv"
+    run(
+        room.video,
+        "--markers",
+        room.markers,
+        "--camera",
+        room.lens,
+        "--out",
+        out,
+        "--no-filter",
+        "--min-markers",
+        1,
+    )
+    path, _ = read_camera_path(out)
+    assert path.status[[FEW, NONE]].tolist() == [Status.TRACKED, Status.LOST]
+    assert path.flags[FEW] & Flag.FEW_MARKERS
+    # Three markers in a plane, 4 m away: measured 31 mm, and 12 mm from the image that the codec has not touched.
+    assert error_m(path, room)[FEW] < 0.1
+
+
+def test_the_filter_bridges_frames_without_markers(room, tmp_path):
+    out, report = tmp_path / "track.csv", tmp_path / "report.json"
+    run(
+        room.video,
+        "--markers",
+        room.markers,
+        "--camera",
+        room.lens,
+        "--out",
+        out,
+        "--json",
+        report,
+        "--name",
+        "dron1",
+    )
+    path, name = read_camera_path(out)
+    content = json.loads(report.read_text())
+    assert name == "dron1"
+    assert (path.status[[FEW, NONE]] == Status.COASTING).all()
+    # Measured 3 mm: the motion is even.
+    assert np.nanmax(error_m(path, room)) < 0.02
+    assert path.velocity_m_s is not None
+    assert content["status"]["coasting"] == 2
+    assert content["frames"] == FRAMES
+    assert set(content["stage_s"]) == {"decode", "grey", "detect", "locate", "filter"}
+    assert content["frames_per_second"] == pytest.approx(FRAMES / content["wall_s"])
+
+
+def test_the_smoother_tells_the_first_frames_too(room, tmp_path):
+    out = tmp_path / "track.csv"
+    run(room.video, "--markers", room.markers, "--camera", room.lens, "--out", out, "--smooth")
+    path, _ = read_camera_path(out)
+    assert path.seen.all()
+    # Measured 1.5 mm.
+    assert error_m(path, room).max() < 0.01
+
+
+def test_a_field_of_view_is_as_good_as_a_file(room, tmp_path):
+    for name, options in (("fov", ["--fov", "70,55.4"]), ("file", ["--camera", room.lens])):
+        run(room.video, *options, "--markers", room.markers, "--out", tmp_path / f"{name}.csv", "--frames", 3)
+    assert (tmp_path / "fov.csv").read_text().split("\n")[0] == (tmp_path / "file.csv").read_text().split(
+        "\n"
+    )[0]
+    fov, file = (read_camera_path(tmp_path / f"{name}.csv")[0] for name in ("fov", "file"))
+    assert fov.num_frames == 3
+    np.testing.assert_array_equal(fov.position_m, file.position_m)
+
+
+def test_a_stream_tells_the_same_as_its_file(room, tmp_path):
+    """FFmpeg serves a file by its address; the stamps in it are its times."""
+    for name, source in (("file", room.video), ("stream", f"file://{room.video}")):
+        run(source, "--markers", room.markers, "--camera", room.lens, "--out", tmp_path / f"{name}.csv")
+    (file, _), (stream, name) = (read_camera_path(tmp_path / f"{name}.csv") for name in ("file", "stream"))
+    assert name == "camera"
+    np.testing.assert_allclose(stream.time_s, file.time_s, atol=1e-6)
+    np.testing.assert_array_equal(stream.position_m, file.position_m)
+
+
+class Capture:
+    """A camera that shows images, without stamps; then its user presses Ctrl-C, or it ends."""
+
+    def __init__(self, images, *, interrupt=False):
+        self.images, self.interrupt, self.released = list(images), interrupt, False
+
+    def isOpened(self):
+        return True
+
+    def get(self, _):
+        return 0.0
+
+    def read(self):
+        if self.images:
+            return True, self.images.pop(0)
+        if self.interrupt:
+            # Once the frames before are localised, or the last would be lost: most of a second is enough for one.
+            time.sleep(0.7)
+            signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+            time.sleep(0.5)
+        return False, None
+
+    def release(self):
+        self.released = True
+
+
+def test_ctrl_c_ends_a_live_stream_and_keeps_what_was_localised(room, tmp_path, monkeypatch):
+    capture = Capture(room.images[:FEW], interrupt=True)
+    opened = []
+    monkeypatch.setattr(cv2, "VideoCapture", lambda device: opened.append(device) or capture)
+    out = tmp_path / "track.csv"
+    result = run(
+        "0",
+        "--live",
+        "--fps",
+        25,
+        "--markers",
+        room.markers,
+        "--camera",
+        room.lens,
+        "--out",
+        out,
+        "--no-filter",
+    )
+    path, _ = read_camera_path(out)
+    assert opened == [0]
+    assert capture.released
+    assert "ended by Ctrl-C" in result.output
+    # The first and the last are always had; those that come while another is worked on are left out.
+    assert set(path.frame.tolist()) <= set(range(FEW))
+    np.testing.assert_allclose(path.time_s, path.frame / 25, rtol=1e-12)
+    assert error_m(path, room).max() < 0.01
+
+
+def test_a_stream_that_ends_has_ended(room, monkeypatch):
+    monkeypatch.setattr(cv2, "VideoCapture", lambda device: Capture(room.images[:5]))
+    found = localise(open_source("rtsp://camera/1"), room.marker_map, LENS, LocaliseSettings(filter=None))
+    assert found.path.num_frames == 5
+    assert not found.interrupted
+    # Without stamps, times are when frames came.
+    assert (np.diff(found.path.time_s) > 0).all()
+
+
+def test_ctrl_c_in_a_recording_leaves_nothing(room, tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("psotrack.inside_out.localising.locate", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        localise(open_source(room.video), room.marker_map, LENS)
+
+
+def test_no_such_stream_is_one_line(tmp_path):
+    with pytest.raises(
+        InputError, match=r"file:///nowhere.avi: expected a camera or a stream, found none that can be op"
+    ):
+        open_source("file:///nowhere.avi")
+
+
+@pytest.fixture
+def sequence(room, tmp_path):
+    """The folder of a sequence with two drones' videos."""
+    folder = tmp_path / "S01_D2_A"
+    folder.mkdir()
+    for drone in ("dron1", "dron2"):
+        (folder / f"{drone}_cam_s.avi").write_bytes(room.video.read_bytes())
+    (folder / "aruco_corners.csv").write_bytes(room.markers.read_bytes())
+    rows = [f"dron{number};{LENS.K[0, 0]};{LENS.K[1, 1]};319.5;239.5;640;480" for number in (1, 2)]
+    header = "cam_name;focal_length_x;focal_length_y;cx;cy;width;height"
+    (folder / "drone_cameras_calibration.csv").write_text("\n".join([header, *rows]) + "\n")
+    return folder
+
+
+def test_a_sequence_brings_markers_and_intrinsics(room, sequence, tmp_path):
+    out = tmp_path / "track.csv"
+    # A picture that somebody left there makes it no folder of images.
+    cv2.imwrite(str(sequence / "plot.png"), np.zeros((20, 30), np.uint8))
+    run(sequence, "--drone", "dron2", "--out", out)
+    path, name = read_camera_path(out)
+    assert name == "dron2"
+    assert np.nanmax(error_m(path, room)) < 0.02
+    calibration = sequence / "drone_cameras_calibration.csv"
+    options = ["--markers", room.markers, "--camera", calibration, "--camera-name", "dron2", "--out"]
+    run(sequence / "dron2_cam_s.avi", *options, tmp_path / "same.csv")
+    same, _ = read_camera_path(tmp_path / "same.csv")
+    np.testing.assert_array_equal(same.position_m, path.position_m)
+
+
+@pytest.mark.parametrize("options", [[], ["--drone", "dron7"]], ids=["none", "unknown"])
+def test_a_sequence_of_several_drones_says_which_there_are(sequence, tmp_path, options):
+    with pytest.raises(SettingsError, match=r"--drone: expected one of dron1, dron2, found"):
+        run(sequence, *options, "--out", tmp_path / "track.csv")
+
+
+def test_a_folder_without_images_or_videos_is_one_line(room, tmp_path):
+    with pytest.raises(InputError, match="expected images, or videos of drones' own cameras, found neither"):
+        run(tmp_path, "--markers", room.markers, "--fov", "70,55", "--out", tmp_path / "track.csv")
+
+
+def test_intrinsics_for_other_images_are_one_line_that_names_the_file(room, tmp_path):
+    lens = tmp_path / "lens.toml"
+    write_rig(lens, stack({"front": scaled(LENS, (1280, 960))}))
+    arguments = [room.video, "--markers", room.markers, "--camera", lens, "--out", tmp_path / "track.csv"]
+    with pytest.raises(
+        InputError,
+        match=r"lens.toml: expected intrinsics for 640 x 480 pixels.*found 1280 x 960; pass --scale-camera",
+    ):
+        run(*arguments)
+    assert not (tmp_path / "track.csv").exists()
+    run(*arguments, "--scale-camera", "--frames", 3)
+    path, _ = read_camera_path(tmp_path / "track.csv")
+    assert np.nanmax(error_m(path, room)) < 0.01
+
+
+def test_a_scaled_lens_sees_the_same_place_in_the_scaled_image():
+    """Edges of the image, half a pixel beyond the outer centres, are where they were."""
+    small, large = LENS, scaled(LENS, (1920, 1440))
+    points = np.random.default_rng(0).uniform((-1, -1, 2), (1, 1, 4), (20, 3))
+    np.testing.assert_allclose(
+        project(large, points)[0] + 0.5, 3 * (project(small, points)[0] + 0.5), rtol=1e-12
+    )
+
+
+def test_other_shapes_of_images_are_not_scaled(tmp_path):
+    lens = tmp_path / "lens.yml"
+    write_rig(lens, stack({"front": LENS}))
+    with pytest.raises(InputError, match="found 640 x 480; calibrate at this size: the shape differs"):
+        read_lens(lens, (1920, 1080), scale=True)
+
+
+def test_a_csv_without_sizes_is_doubted_where_its_axis_is_far_off_the_middle(tmp_path):
+    lens = tmp_path / "cameras_calibration.csv"
+    write_calibration(lens, stack({"cam1i": lens_of_sensor(4.0, (6.4, 4.8), SIZE_WH)}))
+    assert read_lens(lens, SIZE_WH).K[0, 2] == 319.5
+    with pytest.raises(
+        InputError, match=r"expected intrinsics for 1920 x 1080.*found an optical axis at \(320, 240\)"
+    ):
+        read_lens(lens, (1920, 1080))
+
+
+def test_several_cameras_in_a_file_are_named(tmp_path):
+    lens = tmp_path / "lens.toml"
+    write_rig(lens, stack({"left": LENS, "right": LENS}))
+    with pytest.raises(InputError, match="expected one camera, found left, right; name it by --camera-name"):
+        read_lens(lens, SIZE_WH)
+    with pytest.raises(InputError, match="expected a camera up, found left, right"):
+        read_lens(lens, SIZE_WH, name="up")
+    assert read_lens(lens, SIZE_WH, name="right").K[0, 0] == LENS.K[0, 0]
+
+
+def test_a_video_that_ends_early_leaves_nothing_but_what_frames_ask_for(room, tmp_path):
+    content = room.video.read_bytes()
+    short, out = tmp_path / "short.avi", tmp_path / "track.csv"
+    short.write_bytes(content[: len(content) * 6 // 10])
+    options = ["--markers", room.markers, "--camera", room.lens, "--out", out]
+    with pytest.raises(
+        InputError, match=rf"short.avi: expected {FRAMES} frames, found that only \d+ can be decoded \(frame"
+    ):
+        run(short, *options)
+    assert not out.exists()
+    run(short, *options, "--frames", 3)
+    assert read_camera_path(out)[0].num_frames == 3
+
+
+def test_nothing_is_overwritten(room, tmp_path):
+    out = tmp_path / "track.csv"
+    out.write_text("mine")
+    options = ["--markers", room.markers, "--camera", room.lens, "--out", out, "--frames", 2]
+    with pytest.raises(OutputError, match="pass --force to replace it"):
+        run(room.video, *options)
+    assert out.read_text() == "mine"
+    run(room.video, *options, "--force")
+    assert read_camera_path(out)[0].num_frames == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere.avi", "--fov", "70,55"], r"nowhere.avi: expected a video, found no such file"),
+        (["VIDEO"], r"lens: expected --camera FILE or --fov H,V, found neither"),
+        (["VIDEO", "--camera", "x.toml", "--fov", "70,55"], r"lens: .*found both"),
+        (["VIDEO", "--camera", "nowhere.toml"], r"nowhere.toml: expected a file to read"),
+        (["VIDEO", "--fov", "70,55", "--frames", "99"], r"frames: expected 1 to 12, the frames of .*avi, found 99"),
+        (["VIDEO", "--fov", "70,55", "--dictionary", "3x3"], r"dictionary: expected one of"),
+        (["VIDEO", "--fov", "70,55", "--drone", "dron1"], r"--drone: expected a folder with videos of drones' own"),
+        (["IMAGES", "--fov", "70,55"], r"--fps: expected frames per second of the images in .*images, found none"),
+        (["IMAGES", "--fov", "70,55", "--fps", "0"], r"--fps: expected a number above 0, found 0"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_one_line(room, tmp_path, arguments, message):
+    words = {"VIDEO": room.video, "IMAGES": room.folder / "images"}
+    with pytest.raises((InputError, SettingsError), match=message) as error:
+        run(
+            *[words.get(word, word) for word in arguments],
+            "--markers",
+            room.markers,
+            "--out",
+            tmp_path / "track.csv",
+        )
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "track.csv").exists()
+
+
+def test_markers_are_needed(room, tmp_path):
+    with pytest.raises(SettingsError, match="--markers: expected a table of corners, found none"):
+        run(room.video, "--fov", "70,55", "--out", tmp_path / "track.csv")
+
+
+def test_images_of_two_sizes_name_the_one_that_differs(tmp_path):
+    for name, shape in (("a1.png", (20, 30)), ("a2.png", (20, 32))):
+        cv2.imwrite(str(tmp_path / name), np.zeros(shape, np.uint8))
+    with pytest.raises(InputError, match=r"a2.png: expected 30 x 20 pixels as a1.png has, found 32 x 20"):
+        list(open_source(tmp_path, fps=25.0).frames())
+
+
+def test_a_broken_image_is_named(tmp_path):
+    (tmp_path / "a1.png").write_bytes(b"no image")
+    with pytest.raises(
+        InputError, match=r"a1.png: expected an image, found a file that OpenCV cannot decode"
+    ):
+        open_source(tmp_path, fps=25.0)
+
+
+def test_names_sort_as_people_do():
+    names = ["b1.png", "a10.png", "a9.png", "a09b.png"]
+    assert sorted(names, key=lambda name: natural_key(Path(name))) == [
+        "a9.png",
+        "a09b.png",
+        "a10.png",
+        "b1.png",
+    ]
+
+
+def test_reading_ahead_keeps_order_and_raises_what_goes_wrong():
+    assert list(read_ahead(iter(range(100)))) == list(range(100))
+
+    def broken():
+        yield 1
+        raise InputError("frame 1", expected="an image", found="none")
+
+    found = []
+    with pytest.raises(InputError, match="frame 1"):
+        found.extend(read_ahead(broken()))
+    assert list(read_ahead(iter([]))) == []
+
+
+def test_the_newest_is_worked_on_and_the_last_is_never_left_out():
+    made = threading.Event()
+
+    def many():
+        yield from range(50)
+        made.set()
+
+    found = []
+    for item in read_ahead(many(), newest=True):
+        found.append(item)
+        assert made.wait(5)
+    # While the first was worked on, all others came; the last took the place of those before.
+    assert found[-1] == 49
+    assert len(found) <= 2

@@ -1,0 +1,659 @@
+"""Maps of markers: tables, squares through measured corners, maps from videos, and what is wrong with a map."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from psotrack.cameras import camera, look_at, project
+from psotrack.datasets.dpjait import read_marker_corners, write_marker_corners
+from psotrack.errors import InputError, SettingsError
+from psotrack.inside_out.map_check import check_map
+from psotrack.inside_out.map_scene import outward
+from psotrack.inside_out.map_sightings import SQUARE, Seen, sightings_of
+from psotrack.inside_out.map_squares import best_square, read_measured, squares
+from psotrack.inside_out.mapping import build_map, own_frame
+from psotrack.inside_out.marker_map import MarkerMap, read_marker_map
+from psotrack.mocap import Markers, write_c3d
+
+SIDE_M = 0.4
+
+
+def on_wall(centre_m, inward, side_m=SIDE_M):
+    """Corners of an upright marker on a wall."""
+    front = np.array(inward, float)
+    up = np.array([0.0, 0.0, 1.0])
+    return np.array(centre_m, float) + side_m * SQUARE @ np.stack([np.cross(up, front), up, front])
+
+
+def room():
+    """Four markers on each wall of a room of 8 x 6 m, at changing heights; ids from 1."""
+    walls = [((0, 3), (0, -1, 0)), ((4, 0), (-1, 0, 0)), ((0, -3), (0, 1, 0)), ((-4, 0), (1, 0, 0))]
+    corners, marker = {}, 1
+    for (x, y), inward in walls:
+        for index, along in enumerate((-2.1, -0.7, 0.8, 2.2)):
+            centre = (x + along * abs(inward[1]), y + along * abs(inward[0]), 1.2 + 0.5 * (index % 3))
+            corners[marker] = on_wall(centre, inward)
+            marker += 1
+    return corners
+
+
+ROOM = room()
+LENSES = (
+    camera(
+        R=np.eye(3),
+        t_m=np.zeros(3),
+        K=np.array([[560.0, 0.0, 640.0], [0.0, 563.0, 478.0], [0.0, 0.0, 1.0]]),
+        image_size_wh=(1280, 960),
+    ),
+    camera(
+        R=np.eye(3),
+        t_m=np.zeros(3),
+        K=np.array([[520.0, 0.0, 650.0], [0.0, 520.0, 470.0], [0.0, 0.0, 1.0]]),
+        dist=(-0.08, 0.015, 0.001, -0.0005),
+        image_size_wh=(1280, 960),
+    ),
+)
+
+
+def seen_in(corners_m, lens, source, num_views, *, noise_px=0.0, seed=0):
+    """What a camera sees that is carried around in a room while it turns around more than once."""
+    rng = np.random.default_rng(seed)
+    frames = []
+    for view in range(num_views):
+        turn = 2.3 * np.pi * view / num_views + source
+        away = np.array([-1.8 * np.cos(turn), -1.2 * np.sin(turn), 1.5])
+        centre = away + 0.4 * np.array([np.cos(5 * turn), np.sin(4 * turn), np.sin(3 * turn)])
+        ahead = np.array([np.cos(turn), np.sin(turn), 0.15 * np.sin(3 * turn)])
+        R, t_m = look_at(centre.tolist(), (centre + ahead).tolist())
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R, t_m
+        ids, quads = [], []
+        for marker, corners in corners_m.items():
+            pixels, depth = project(replace(lens, T_cam_world=T), corners)
+            normal = np.cross(corners[3] - corners[1], corners[2] - corners[0])
+            faces = normal @ (centre - corners.mean(axis=0)) > 0
+            inside = ((pixels > 0) & (pixels < lens.image_size_wh - 1)).all()
+            # The distortion's polynomial folds back far outside of the image.
+            if (
+                faces
+                and inside
+                and (depth > 0.3).all()
+                and (np.abs((corners @ R.T + t_m)[:, :2]) < 1.2 * depth[:, None]).all()
+            ):
+                ids.append(marker)
+                quads.append(pixels + noise_px * rng.standard_normal((4, 2)))
+        frames.append(Seen(source, view / 5, np.array(ids, int), np.array(quads).reshape(-1, 4, 2)))
+    return frames
+
+
+def sightings(corners_m=ROOM, num_views=28, videos=1, **how):
+    frames = [
+        frame
+        for source in range(videos)
+        for frame in seen_in(corners_m, LENSES[source], source, num_views, **how)
+    ]
+    return sightings_of(frames, LENSES[:videos])
+
+
+def errors_m(built, truth=ROOM):
+    """(markers, 4), distances of corners from the truth."""
+    ids = built.ids.tolist()
+    return np.linalg.norm(
+        built.marker_map.all_corners_m - np.array([truth[marker] for marker in ids]), axis=-1
+    )
+
+
+# Tables
+
+NAMES = ("tl", "tr", "br", "bl")
+
+
+def wide(header, *, scale=1.0, separator=";"):
+    lines = [separator.join(header)] if header else []
+    for marker, corners in ROOM.items():
+        lines.append(
+            separator.join([str(marker), *(repr(float(scale * value)) for value in corners.ravel())])
+        )
+    return "\n".join(lines) + "\n"
+
+
+def columns(pattern, corners="1234"):
+    return ["id", *(pattern.format(axis=axis, corner=corner) for corner in corners for axis in "xyz")]
+
+
+def long(header, corner_names, *, scale=1.0, separator=","):
+    lines = [separator.join(header)] if header else []
+    for marker, corners in ROOM.items():
+        for name, corner in zip(corner_names, corners, strict=True):
+            lines.append(
+                separator.join([str(marker), name, *(repr(float(scale * value)) for value in corner)])
+            )
+    return "\n".join(lines) + "\n"
+
+
+def labelled(pattern):
+    lines = ["label;x[mm];y[mm];z[mm]"]
+    for marker, corners in ROOM.items():
+        for number, corner in enumerate(1000 * corners, start=1):
+            lines.append(
+                ";".join([pattern.format(marker, number), *(repr(float(value)) for value in corner)])
+            )
+    return "\n".join(lines) + "\n"
+
+
+LAYOUTS = {
+    "ours": wide(columns("{axis}{corner}[m]")),
+    "millimetres": wide(columns("{axis}{corner}[mm]"), scale=1e3),
+    "centimetres": wide(columns("{axis}{corner} (cm)"), scale=1e2),
+    "commas": wide(columns("{axis}_{corner}"), separator=","),
+    "tabs": wide(columns("corner{corner}_{axis}_mm"), scale=1e3, separator="\t"),
+    "from 0": wide(columns("p{corner}.{axis} [m]", "0123")),
+    "corner names": wide(["Marker ID", *columns("{corner}_{axis}", NAMES)[1:]], separator=","),
+    "numbers alone": wide(None, separator=","),
+    "long": long(["id", "corner", "x_m", "y_m", "z_m"], "1234"),
+    "long from 0": long(
+        ["marker", "corner_id", "X [mm]", "Y [mm]", "Z [mm]"], "0123", scale=1e3, separator=";"
+    ),
+    "long with names": long(["aruco_id", "corner", "x", "y", "z"], ["Top-left", "TR", "bottom right", "bl"]),
+    "long numbers": long(None, "1234", separator=";"),
+    "labels": labelled("Marker{}:{}"),
+    "short labels": labelled("M{}_{}"),
+    "numbers as labels": labelled("{}.{}"),
+    "a spreadsheet's": "\ufeff" + wide(columns("{axis}{corner}[m]")).replace("\n", ";\r\n"),
+    "words in ids": wide(columns("{axis}{corner}[m]")).replace("\n", "\nMarker_")[: -len("Marker_")],
+}
+
+
+@pytest.mark.parametrize("text", LAYOUTS.values(), ids=LAYOUTS)
+def test_layouts_of_tables(tmp_path, text):
+    path = tmp_path / "corners.csv"
+    path.write_bytes(text.encode())
+    found = read_marker_map(path)
+    assert set(found.corners_m) == set(ROOM)
+    for marker, corners in ROOM.items():
+        # Millimetres are divided by 1000: some units in the last place.
+        np.testing.assert_allclose(found.corners_m[marker], corners, atol=1e-12)
+        np.testing.assert_array_equal(read_marker_corners(path)[marker], found.corners_m[marker])
+
+
+def test_other_columns_are_passed_over(tmp_path):
+    path = tmp_path / "corners.csv"
+    lines = wide(columns("{axis}{corner}[m]")).splitlines()
+    path.write_text("\n".join([f"{lines[0]};wall;size", *(f"{line};north;0.3" for line in lines[1:])]))
+    assert len(read_marker_map(path)) == len(ROOM)
+
+
+def test_map_knows_its_squares():
+    found = MarkerMap(ROOM)
+    np.testing.assert_array_equal(found.ids, np.arange(1, 17))
+    np.testing.assert_allclose(found.sides_m, SIDE_M, rtol=1e-12)
+    np.testing.assert_allclose(found.normals[4], [-1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(found.centres_m[0], [-2.1, 3, 1.2], atol=1e-12)
+    np.testing.assert_array_equal(found.corners_of([7, 3])[1], ROOM[3])
+    assert 7 in found
+    assert 17 not in found
+    with pytest.raises(InputError, match=r"marker 5: expected finite corners"):
+        MarkerMap({5: np.full((4, 3), np.nan)})
+    with pytest.raises(InputError, match="at least one marker"):
+        MarkerMap({})
+
+
+def with_corners(marker, corners):
+    return {**ROOM, marker: corners}
+
+
+def bent(distance_m, axis):
+    corners = ROOM[3].copy()
+    corners[2, axis] += distance_m
+    return with_corners(3, corners)
+
+
+#: Line 4 of our layout is marker 3's.
+BAD_PLACES = {
+    "not planar": (
+        bent(0.05, 1),
+        r"line 4, marker 3: expected corners in a plane to 10% .* 50 mm off .* of 40\d mm",
+    ),
+    "not square": (bent(0.06, 0), r"line 4, marker 3: expected a square.* found sides and diagonals of"),
+    "crossed": (
+        with_corners(3, ROOM[3][[0, 1, 3, 2]]),
+        r"line 4, marker 3: expected corners one after the other .* found two that are exchanged",
+    ),
+    "backwards": (
+        with_corners(3, ROOM[3][[0, 3, 2, 1]]),
+        r"line 4, marker 3: .* all other markers are behind it; its corners are counted backwards",
+    ),
+    "in one place": (with_corners(3, ROOM[2] + 0.01), r"line 4, marker 3: .* found it where marker 2 is"),
+    "one in millimetres": (
+        with_corners(3, 1e3 * ROOM[3]),
+        r"line 4, marker 3: expected a marker with a side of .* found 400 m; is it in millimetres\? .* x1\[mm\]",
+    ),
+    "mirrored": (
+        {marker: corners * [1.0, -1.0, 1.0] for marker, corners in ROOM.items()},
+        r"corners.csv: .* 16 of 16 markers face out of the room, and none into it; .* an axis is mirrored",
+    ),
+    "all in millimetres": (
+        {marker: 1e3 * corners for marker, corners in ROOM.items()},
+        r"line 2, marker 1: .* found 400 m; is it in millimetres",
+    ),
+}
+
+
+@pytest.mark.parametrize(("corners", "message"), BAD_PLACES.values(), ids=BAD_PLACES)
+def test_bad_places(tmp_path, corners, message):
+    path = tmp_path / "corners.csv"
+    write_marker_corners(path, corners)
+    with pytest.raises(InputError, match=message):
+        read_marker_map(path)
+
+
+OURS, LONG = LAYOUTS["ours"], LAYOUTS["long"]
+THIRD = OURS.splitlines()[3]
+BAD_TEXTS = {
+    "an empty cell": (
+        OURS.replace(THIRD, ";".join("" if i == 5 else cell for i, cell in enumerate(THIRD.split(";")))),
+        r"line 4, column y2\[m\]: expected a value, found nothing",
+    ),
+    "an empty cell at the end": (
+        OURS.replace(THIRD, THIRD.rpartition(";")[0] + ";"),
+        r"line 4, column z4\[m\]: expected a value, found nothing",
+    ),
+    "three corners": (
+        OURS.replace(THIRD, ";".join(THIRD.split(";")[:10])),
+        r"line 4: expected 13 values, found 10; a marker has four corners",
+    ),
+    "three corners in a header": (
+        "\n".join(";".join(line.split(";")[:10]) for line in OURS.splitlines()),
+        r"corners.csv: expected a column x4, found only",
+    ),
+    "three corners below each other": (
+        LONG.replace(LONG.splitlines()[11] + "\n", ""),
+        r"line 10 to 12, marker 3: expected 4 corners, found none of number 3; add it, or leave the marker out",
+    ),
+    "a marker twice": (
+        OURS.replace("\n4;", "\n3;"),
+        r"line 5, column id: expected each marker once, found 3 again",
+    ),
+    "a corner twice": (
+        LONG.replace("\n3,2,", "\n3,1,"),
+        r"line 11, column corner: .* found corner 1 of marker 3 again",
+    ),
+    "corners from 0 to 4": (
+        LONG.replace("\n3,1,", "\n3,0,"),
+        r"line 5, column corner: .* because line 10 has corner 0",
+    ),
+    "no number": (
+        OURS.replace("\n3;", "\nthree;"),
+        r"line 4, column id: expected a marker's number, found 'three'",
+    ),
+    "decimal commas": (
+        OURS.replace("3.0;", "3,0;"),
+        r"column y1\[m\]: expected a number.*; write decimals with a point",
+    ),
+    "another unit": (OURS.replace("x1[m]", "x1[in]"), r"expected a column x1\[m\].* found x1\[in\]"),
+    "a column twice": (
+        OURS.replace("y2[m]", "x_2[m]"),
+        r"line 1: expected each column once, found x2\[m\] and x_2\[m\]",
+    ),
+    "no rows": (OURS.splitlines()[0], "expected rows below the header, found none"),
+    "nothing": ("\n", "expected a table of marker corners, found an empty file"),
+    "other numbers": ("1;2;3;4\n5;6;7;8\n", "line 1: expected a header, or numbers in rows of 13"),
+    "another label": (
+        LAYOUTS["labels"].replace("Marker3:2", "Dron3:Dron32"),
+        r"line 11, column label: .* found 'Dron3:Dron32'",
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "message"), BAD_TEXTS.values(), ids=BAD_TEXTS)
+def test_bad_tables(tmp_path, text, message):
+    path = tmp_path / "corners.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_marker_map(path)
+
+
+def test_a_measured_map_is_no_bad_one(tmp_path):
+    """Corners that are 2 mm off each, as motion capture has them, of markers of 0.2 m."""
+    rng = np.random.default_rng(0)
+    path = tmp_path / "corners.csv"
+    corners = {
+        marker: on_wall(corners.mean(axis=0), MarkerMap(ROOM).normals[marker - 1], 0.2)
+        + 0.002 * rng.standard_normal((4, 3))
+        for marker, corners in ROOM.items()
+    }
+    write_marker_corners(path, corners)
+    assert len(read_marker_map(path)) == len(ROOM)
+
+
+def test_markers_on_the_outside_of_a_box_face_outwards(tmp_path):
+    box = {
+        index: on_wall(0.3 * np.array(front, float), front)
+        for index, front in enumerate([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)])
+    }
+    write_marker_corners(tmp_path / "box.csv", box)
+    assert len(read_marker_map(tmp_path / "box.csv")) == 4
+
+
+# Measured corners
+
+
+@given(st.tuples(*[st.floats(-3, 3)] * 3), st.tuples(*[st.floats(-9, 9)] * 3), st.floats(0.05, 1.0))
+def test_best_square_of_a_square_is_itself(turn, centre, side_m):
+    axes = Rotation.from_rotvec(turn).as_matrix()
+    found_axes, found_centre, found_side = best_square(np.array(centre) + side_m * SQUARE @ axes.T)
+    # Double precision, of numbers up to 10.
+    np.testing.assert_allclose(found_axes, axes, atol=1e-11 / side_m)
+    np.testing.assert_allclose(found_centre, centre, atol=1e-11)
+    assert found_side == pytest.approx(side_m, rel=1e-9)
+
+
+def test_best_square_is_nearer_than_any_other():
+    rng = np.random.default_rng(1)
+    points = ROOM[5] + 0.005 * rng.standard_normal((4, 3))
+    axes, centre, side = best_square(points)
+
+    def squares_of(turn, shift, grown):
+        turned = axes @ Rotation.from_rotvec(turn).as_matrix()
+        return np.sum((centre + shift + side * grown * SQUARE @ turned.T - points) ** 2)
+
+    best = squares_of(np.zeros(3), np.zeros(3), 1.0)
+    for _ in range(200):
+        step = 1e-3 * rng.standard_normal(7)
+        assert squares_of(step[:3], step[3:6], 1 + step[6]) > best
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2, 3], [0, 3, 2, 1], [2, 0, 3, 1], [1, 0, 3, 2]])
+def test_corners_in_any_order_are_put_right(tmp_path, order):
+    """All but the first are no order that a camera sees; upright markers are resolved by what is up."""
+    path = tmp_path / "points.csv"
+    write_marker_corners(path, with_corners(3, ROOM[3][order]))
+    found = squares(read_measured(path))
+    np.testing.assert_allclose(found.marker_map.corners_m[3], ROOM[3], atol=1e-12)
+    assert found.reordered == (() if order == [0, 1, 2, 3] else (3,))
+
+
+def test_the_side_that_a_lone_wall_is_seen_from(tmp_path):
+    path = tmp_path / "points.csv"
+    wall = {marker: ROOM[marker] for marker in (1, 2, 3)}
+    write_marker_corners(path, {**wall, 2: ROOM[2][[1, 0, 2, 3]]})
+    with pytest.raises(InputError, match=r"line 3, marker 2: .* all markers in one plane; pass --seen-from"):
+        squares(read_measured(path))
+    found = squares(read_measured(path), seen_from_m=np.zeros(3))
+    np.testing.assert_allclose(found.marker_map.corners_m[2], ROOM[2], atol=1e-12)
+
+
+def test_a_marker_on_the_floor_has_no_top(tmp_path):
+    path = tmp_path / "points.csv"
+    floor = SIDE_M * SQUARE
+    write_marker_corners(path, {**ROOM, 20: floor[[1, 0, 2, 3]]})
+    with pytest.raises(InputError, match=r"marker 20: .* lies flat"):
+        squares(read_measured(path))
+    write_marker_corners(path, {**ROOM, 20: floor})
+    np.testing.assert_allclose(squares(read_measured(path)).marker_map.corners_m[20], floor, atol=1e-12)
+
+
+def recorded(corners_m, labels="Marker{}:{}", frames=30, noise_m=0.0):
+    rng = np.random.default_rng(2)
+    names = [labels.format(marker, corner) for marker in corners_m for corner in range(1, 5)]
+    position = np.concatenate(list(corners_m.values())) + noise_m * rng.standard_normal(
+        (frames, len(names), 3)
+    )
+    return Markers(
+        (*names, "Dron1:Dron12", "*113"),
+        np.pad(position, ((0, 0), (0, 2), (0, 0)), constant_values=1.0),
+        100.0,
+    )
+
+
+@pytest.mark.parametrize("labels", ["Marker{}:{}", "M{}_{}", "{}.{}", "aruco {}-{}"])
+def test_corners_of_a_c3d(tmp_path, labels):
+    path = tmp_path / "room.c3d"
+    markers = recorded(ROOM, labels, noise_m=0.0005)
+    markers.position_m[:11, 3] = np.nan
+    # A label that jumped to another point for a while.
+    markers.position_m[5:12, 8] += 0.5
+    write_c3d(path, markers)
+    found = squares(read_measured(path))
+    for marker, corners in ROOM.items():
+        # Medians of 20 to 30 frames: 0.0005 m x 1.25 / sqrt(20) = 0.14 mm; five of them.
+        np.testing.assert_allclose(found.marker_map.corners_m[marker], corners, atol=7e-4)
+        assert found.residual_m[marker].max() < 1e-3
+
+
+def test_c3d_without_a_corner(tmp_path):
+    markers = recorded(ROOM)
+    markers.position_m[:, 9] = np.nan
+    write_c3d(tmp_path / "room.c3d", markers)
+    with pytest.raises(
+        InputError, match=r"room.c3d, marker 3: expected 4 corners, found that number 2 is never seen"
+    ):
+        read_measured(tmp_path / "room.c3d")
+    write_c3d(tmp_path / "drones.c3d", Markers(("Dron1:Dron11",), np.ones((5, 1, 3)), 100.0))
+    with pytest.raises(InputError, match=r"labels such as Marker7:1.* found Dron1:Dron11"):
+        read_measured(tmp_path / "drones.c3d")
+
+
+def test_measured_corners_that_are_no_square(tmp_path):
+    write_marker_corners(tmp_path / "points.csv", bent(0.15, 0))
+    with pytest.raises(InputError, match=r"line 4, marker 3: expected four points that are a square"):
+        squares(read_measured(tmp_path / "points.csv"))
+
+
+# Maps from videos
+
+
+@pytest.mark.parametrize("videos", [1, 2])
+def test_exact_images_give_the_exact_map(videos):
+    """Two videos have lenses of their own, one of them bent."""
+    built = build_map(sightings(videos=videos), {7: ROOM[7]})
+    assert set(built.ids) == set(ROOM)
+    assert built.unplaced == ()
+    assert errors_m(built).max() < 1e-6
+    assert built.outliers.sum() == 0
+
+
+def test_the_known_marker_stays_and_has_no_deviation():
+    built = build_map(sightings(noise_px=0.3), {7: ROOM[7], 12: ROOM[12]})
+    for marker in (7, 12):
+        np.testing.assert_allclose(built.marker_map.corners_m[marker], ROOM[marker], atol=1e-12)
+        assert not built.covariance[built.ids.tolist().index(marker)].any()
+    assert built.known.sum() == 2
+    assert (built.std_m[~built.known] > 0).all()
+
+
+def test_the_world_of_a_lone_marker_is_its_own():
+    """The whole map moves with the known marker: the same images, another world."""
+    given_world = build_map(sightings(noise_px=0.2), {7: ROOM[7]})
+    own_world = build_map(sightings(noise_px=0.2), {7: own_frame(SIDE_M)})
+    axes, centre, _ = best_square(ROOM[7])
+    moved = own_world.marker_map.all_corners_m @ axes.T + centre
+    # Both searches end where the cost falls by less than 1e-9 of itself.
+    np.testing.assert_allclose(moved, given_world.marker_map.all_corners_m, atol=1e-5)
+
+
+def test_a_larger_marker_makes_a_larger_room():
+    built = build_map(sightings(), {7: own_frame(2 * SIDE_M)})
+    np.testing.assert_allclose(built.marker_map.sides_m, 2 * SIDE_M, rtol=1e-12)
+    distance = np.linalg.norm(built.marker_map.centres_m[0] - built.marker_map.centres_m[8])
+    # As exact as the map is.
+    assert distance == pytest.approx(
+        2 * np.linalg.norm(ROOM[1].mean(axis=0) - ROOM[9].mean(axis=0)), abs=1e-5
+    )
+
+
+def test_sides_that_differ_are_found():
+    normals = MarkerMap(ROOM).normals
+    sizes = {marker: 0.2 + 0.02 * marker for marker in ROOM}
+    truth = {
+        marker: on_wall(ROOM[marker].mean(axis=0), normals[marker - 1], sizes[marker]) for marker in ROOM
+    }
+    built = build_map(sightings(truth), {7: truth[7]}, estimate_sides=True)
+    assert errors_m(built, truth).max() < 1e-6
+
+
+def test_an_inset_of_corners_is_found():
+    """Corners that a detector finds too far inside; a room from squares that are too small would be too large."""
+    exact = sightings(videos=2)
+    inset_px = np.array([0.3, 0.15])[exact.lens[exact.view]][:, None, None]
+    found = replace(exact, corners_px=exact.corners_px - inset_px * outward(exact))
+    built = build_map(found, {7: ROOM[7]})
+    # Most of it: the prior says that there is little. What is left is in the covariance.
+    assert (np.abs(built.inset_px - [0.2, 0.1]) < 0.05).all()
+    off_m = np.linalg.norm(built.marker_map.centres_m - MarkerMap(ROOM).centres_m, axis=1)[~built.known]
+    assert (off_m < 3 * np.linalg.norm(built.std_m[~built.known], axis=1)).all()
+
+
+def test_wrong_identities_are_left_out():
+    honest = sightings(noise_px=0.2, num_views=40)
+    rng = np.random.default_rng(3)
+    wrong = rng.random(len(honest.view)) < 0.04
+    marker = np.where(wrong, rng.integers(1, 17, len(wrong)), honest.marker)
+    # What comes twice in a view is left out where detections become sightings.
+    frames = [
+        Seen(
+            0, float(honest.time_s[view]), marker[honest.view == view], honest.corners_px[honest.view == view]
+        )
+        for view in range(honest.num_views)
+    ]
+    built = build_map(sightings_of(frames, LENSES[:1]), {7: ROOM[7]})
+    clean = build_map(honest, {7: ROOM[7]})
+    assert set(built.ids) == set(ROOM)
+    assert 0 < built.outliers.sum() <= wrong.sum() + 2
+    # As good as without them, but for the sightings that are gone.
+    assert errors_m(built).max() < 1.5 * errors_m(clean).max()
+
+
+def test_what_cannot_be_reached_is_not_placed():
+    lonely = Seen(0, 99.0, np.array([40]), np.array([[[10.0, 10], [50, 10], [50, 50], [10, 50]]]))
+    found = sightings_of([*seen_in(ROOM, LENSES[0], 0, 20), lonely], LENSES[:1])
+    built = build_map(found, {7: ROOM[7]})
+    assert built.unplaced == (40,)
+    assert 40 not in built.marker_map
+
+
+def test_unusable_known_markers():
+    with pytest.raises(
+        InputError, match=r"expected marker 77, that is known, beside others, found only 1, 2, 3"
+    ):
+        build_map(sightings(), {77: ROOM[7]})
+    alone = sightings({7: ROOM[7]})
+    with pytest.raises(InputError, match="found others beside it in no frame; name another one by --known"):
+        build_map(alone, {7: ROOM[7]})
+    with pytest.raises(SettingsError, match="side_m: expected a number above 0"):
+        own_frame(0.0)
+    with pytest.raises(InputError, match="expected frames that show markers, found none in any frame"):
+        sightings_of([Seen(0, 0.0, np.array([], int), np.zeros((0, 4, 2)))], LENSES[:1])
+
+
+@pytest.mark.slow
+def test_the_covariance_is_that_of_the_errors():
+    """Noise that is new in every frame, drawn anew: normalised squared errors of centres average to 3."""
+    normalised = []
+    for seed in range(12):
+        built = build_map(sightings(noise_px=0.3, num_views=50, seed=seed), {7: ROOM[7]})
+        off = built.marker_map.centres_m - np.array(
+            [ROOM[marker].mean(axis=0) for marker in built.ids.tolist()]
+        )
+        for error, covariance in zip(off[~built.known], built.covariance[~built.known, :3, :3], strict=True):
+            normalised.append(error @ np.linalg.solve(covariance, error))
+    # Less than 3, because errors of the corners that are alike in all frames are reckoned with and there are none; and
+    # the 15 markers of a room share their errors, so that 12 rooms have some 60 degrees of freedom: 3 +- 0.5.
+    assert 1.2 < np.mean(normalised) < 4.0
+
+
+# Wrong maps
+
+
+def test_healthy_maps_have_no_findings():
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        measured = {marker: corners + 0.001 * rng.standard_normal((4, 3)) for marker, corners in ROOM.items()}
+        checkup = check_map(sightings(noise_px=0.3, seed=seed), MarkerMap(measured))
+        assert checkup.findings == ()
+        assert all(one.sightings > 5 for one in checkup.markers.values())
+
+
+TURN = Rotation.from_rotvec(np.deg2rad(12) * np.array([0.0, 0.0, 1.0])).as_matrix()
+MIDDLE = ROOM[9].mean(axis=0)
+FAULTS = {
+    "moved": (
+        {9: ROOM[9] + np.array([0.04, 0.0, -0.03])},
+        "moved",
+        {9},
+        r"marker 9: it is 5\d mm from where the map has it, at \(-2.10., -3.0.., 1.2..\) m|4\d mm",
+    ),
+    "far away": (
+        {9: ROOM[9] + np.array([1.0, 0.0, 0.5])},
+        "moved",
+        {9},
+        r"marker 9: it is 1.12 m from where",
+    ),
+    "turned": (
+        {9: MIDDLE + (ROOM[9] - MIDDLE) @ TURN.T},
+        "turned",
+        {9},
+        r"marker 9: it is turned by 1[123]\.\d degrees",
+    ),
+    "exchanged": (
+        {9: ROOM[14], 14: ROOM[9]},
+        "exchanged",
+        {9, 14},
+        "markers 9 and 14: each is where the map has the other",
+    ),
+    "corners from another": (
+        {9: np.roll(ROOM[9], 1, axis=0)},
+        "corner order",
+        {9},
+        "90 degrees around; what the map calls corner 2",
+    ),
+    "corners from the opposite": (
+        {9: np.roll(ROOM[9], 2, axis=0)},
+        "corner order",
+        {9},
+        "180 degrees around; .* corner 3",
+    ),
+    "corners backwards": (
+        {9: ROOM[9][[0, 3, 2, 1]]},
+        "backwards",
+        {9},
+        "marker 9: the map counts its corners backwards",
+    ),
+    "too large": (
+        {9: MIDDLE + 1.2 * (ROOM[9] - MIDDLE)},
+        "side",
+        {9},
+        "marker 9: it is (399|400|401) mm wide, not 480 mm",
+    ),
+}
+
+
+@pytest.mark.parametrize(("wrong", "kind", "markers", "message"), FAULTS.values(), ids=FAULTS)
+def test_a_wrong_marker_is_named(wrong, kind, markers, message):
+    checkup = check_map(sightings(noise_px=0.3), MarkerMap({**ROOM, **wrong}))
+    assert [(one.kind, set(one.markers)) for one in checkup.findings] == [(kind, markers)]
+    assert re.search(message, str(checkup.findings[0]))
+
+
+def test_several_wrong_markers_are_named():
+    wrong = {2: ROOM[2] + 0.1, 6: np.roll(ROOM[6], -1, axis=0), 11: ROOM[15], 15: ROOM[11]}
+    checkup = check_map(sightings(noise_px=0.3), MarkerMap({**ROOM, **wrong}))
+    assert {(one.kind, one.markers) for one in checkup.findings} == {
+        ("moved", (2,)),
+        ("corner order", (6,)),
+        ("exchanged", (11, 15)),
+    }
+
+
+def test_another_room_is_told_as_a_whole():
+    rng = np.random.default_rng(4)
+    shuffled = dict(zip(ROOM, [ROOM[marker] for marker in rng.permutation(list(ROOM)).tolist()], strict=True))
+    checkup = check_map(sightings(noise_px=0.3), MarkerMap(shuffled))
+    assert [one.kind for one in checkup.findings] == ["map"]
+    with pytest.raises(InputError, match="expected frames that show two markers of the map, found none"):
+        check_map(sightings(), MarkerMap({99: ROOM[1]}))

@@ -1,0 +1,413 @@
+"""Poses from one frame's markers: exact cases, SciPy and Monte Carlo, wrong markers, second poses, what is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import LENSES
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import approx_fprime, least_squares
+from scipy.spatial.transform import Rotation
+from scipy.stats import binom, chi2
+
+from psotrack.cameras import camera, look_at, project
+from psotrack.errors import InputError, SettingsError
+from psotrack.inside_out.pose import Expected, PoseSettings, locate
+from psotrack.inside_out.pose_equations import INSET_STD_PX, Noise, equations, seen_markers, summed
+from psotrack.inside_out.pose_fit import FALSE_ALARM
+
+K = np.array([[920.0, 0, 959.5], [0, 921.0, 539.5], [0, 0, 1]])
+SETTINGS = PoseSettings()
+ANY_NUMBER = PoseSettings(min_markers=1)
+SIDE_M = 0.3
+
+
+def marker(centre_m, right, down, side_m=SIDE_M):
+    """(4, 3), corners clockwise from the top left for who looks at it."""
+    right, down = np.asarray(right, float), np.asarray(down, float)
+    offsets = [-right - down, right - down, right + down, -right + down]
+    return np.asarray(centre_m) + side_m / 2 * np.array(offsets)
+
+
+def two_walls(count=10):
+    """(count, 4, 3), markers on the walls y = 4 and x = 5, at three heights."""
+    on_y = [marker((x, 4.0, 1.2 + 0.7 * (i % 3)), (1, 0, 0), (0, 0, -1)) for i, x in enumerate(range(5))]
+    on_x = [
+        marker((5.0, 3.0 - y, 1.5 + 0.7 * (i % 3)), (0, -1, 0), (0, 0, -1)) for i, y in enumerate(range(5))
+    ]
+    return np.array([one for pair in zip(on_y, on_x, strict=True) for one in pair])[:count]
+
+
+def one_wall(count=9):
+    """(count, 4, 3), markers on the wall y = 4."""
+    return np.array([marker((x - 1, 4.0, z + 1), (1, 0, 0), (0, 0, -1)) for x in range(3) for z in range(3)])[
+        :count
+    ]
+
+
+def looking(centre_m=(-0.8, -2.5, 1.3), target_m=(3.0, 3.0, 1.8), coefficients=0, K=K):
+    R, t_m = look_at(tuple(centre_m), tuple(target_m))
+    return camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080), dist=LENSES[coefficients])
+
+
+def lens_of(view):
+    """The camera without its pose."""
+    return replace(view, T_cam_world=np.eye(4))
+
+
+def corners_of(view, corners_m, rng=None, noise_px=0.0):
+    pixels = project(view, corners_m)[0]
+    return pixels if rng is None else pixels + noise_px * rng.normal(size=pixels.shape)
+
+
+def error(found, view):
+    """(6,), of position along the world's axes and of turn about the camera's own, as the covariance has it."""
+    R_world_cam = view.T_cam_world[:3, :3].T
+    turn = Rotation.from_matrix(found.R_world_cam.T @ R_world_cam).as_rotvec()
+    return np.concatenate([view.centre_world - found.position_m, turn])
+
+
+def squared_deviations(found, view):
+    off = error(found, view)
+    return off @ np.linalg.solve(found.covariance, off)
+
+
+@pytest.mark.parametrize("coefficients", sorted(LENSES))
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 7, 10])
+def test_exact_corners_give_the_pose_exactly(coefficients, count):
+    view, corners_m = looking(coefficients=coefficients), two_walls(count)
+    found = locate(corners_of(view, corners_m), corners_m, lens_of(view), ANY_NUMBER)
+    # The last step is quadratic: a hundredth of a deviation squared, which is below 1 cm for a single marker.
+    np.testing.assert_allclose(error(found, view), 0, atol=1e-9)
+    assert found.used.all()
+    assert found.reprojection_px < 1e-6
+    assert found.ambiguity < 1e-3
+
+
+def test_derivatives_are_those_of_differences():
+    view, corners_m = looking(coefficients=8), two_walls(3)
+    seen = seen_markers(corners_of(view, corners_m), corners_m, lens_of(view), 0.3, 1e-4)
+    R_world_cam = view.T_cam_world[:3, :3].T
+
+    def off_px(x):
+        turned = R_world_cam @ Rotation.from_rotvec(x[3:6]).as_matrix()
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = turned.T, -turned.T @ (view.centre_world + x[:3])
+        return (project(replace(view, T_cam_world=T), corners_m)[0] + x[6] * seen.inward).ravel()
+
+    rows, depth_m = equations(seen, view.centre_world, R_world_cam, 0.0)
+    slopes = approx_fprime(np.zeros(7), off_px, 1e-7).reshape(3, 4, 2, 7)
+    # A step of 1e-7 bends by 1e-5 px and rounds at 1e-6 px.
+    np.testing.assert_allclose(rows[..., :7], slopes, rtol=1e-4, atol=0.01)
+    np.testing.assert_allclose(depth_m, project(view, corners_m)[1], rtol=1e-12)
+
+
+def test_elimination_is_scipys_least_squares_over_pose_inset_and_every_markers_place():
+    rng = np.random.default_rng(0)
+    view, corners_m = looking(coefficients=4), two_walls(6)
+    noise, count = Noise(0.4**2, 0.003**2, 10.0, 10.0), 6
+    placed_m = corners_m + 0.003 * rng.normal(size=(count, 1, 3))
+    seen = seen_markers(corners_of(view, placed_m, rng, 0.4), corners_m, lens_of(view), 0.4, 0.003)
+    position_m, R, inset_px = view.centre_world, view.T_cam_world[:3, :3].T, 0.0
+    for _ in range(6):
+        sums = summed(equations(seen, position_m, R, inset_px)[0], np.ones((count, 4), bool))
+        solution = sums.solved(noise, inset_px)
+        position_m, inset_px = position_m + solution.step[:3], inset_px + solution.step[6]
+        R = R @ Rotation.from_rotvec(solution.step[3:6]).as_matrix()
+
+    def residuals(x):
+        turned = R @ Rotation.from_rotvec(x[3:6]).as_matrix()
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = turned.T, -turned.T @ (position_m + x[:3])
+        places_m = x[7:].reshape(count, 1, 3)
+        pixels = project(replace(view, T_cam_world=T), corners_m + places_m)[0] + x[6] * seen.inward
+        return np.concatenate(
+            [((seen.corners_px - pixels) / 0.4).ravel(), x[7:] / 0.003, [x[6] / INSET_STD_PX]]
+        )
+
+    start = np.zeros(7 + 3 * count)
+    start[6] = inset_px
+    result = least_squares(residuals, start, "3-point", x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-12)
+    deviation = np.sqrt(np.diag(solution.covariance))
+    # Derivatives are taken where the markers should be, 3 mm in 5 m from where they are fitted.
+    np.testing.assert_allclose((result.x[:7] - start[:7]) / deviation, 0, atol=0.01)
+    expected = np.linalg.inv(result.jac.T @ result.jac)[:7, :7]
+    np.testing.assert_allclose(
+        solution.covariance / np.outer(deviation, deviation),
+        expected / np.outer(deviation, deviation),
+        atol=0.01,
+    )
+
+
+def test_pose_is_scipys_where_the_map_is_exact():
+    rng = np.random.default_rng(1)
+    view, corners_m = looking(coefficients=5), two_walls(8)
+    corners_px = corners_of(view, corners_m, rng, 0.3)
+    lens = lens_of(view)
+    found = locate(corners_px, corners_m, lens, PoseSettings(noise_px=0.3, place_m=1e-7))
+    inward = seen_markers(corners_px, corners_m, lens, 0.3, 1e-7).inward
+
+    def residuals(x):
+        R = Rotation.from_rotvec(x[3:6]).as_matrix()
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R, -R @ x[:3]
+        off_px = corners_px - project(replace(view, T_cam_world=T), corners_m)[0] - x[6] * inward
+        return np.append(off_px.ravel() / 0.3, x[6] / INSET_STD_PX)
+
+    start = np.concatenate(
+        [view.centre_world, Rotation.from_matrix(view.T_cam_world[:3, :3]).as_rotvec(), [0.0]]
+    )
+    result = least_squares(residuals, start, x_scale="jac", xtol=1e-14, ftol=1e-14)
+    deviation_m = np.sqrt(np.diag(found.covariance)[:3])
+    # The noise is estimated, and the inset's prior weighs a little more or less against it.
+    np.testing.assert_allclose((found.position_m - result.x[:3]) / deviation_m, 0, atol=0.02)
+
+
+def placements(rng, count, noise_px, place_m, stated, number):
+    """Squared deviations of poses from random places of the camera, corners' noise and markers off their places."""
+    for _ in range(number):
+        view = looking(
+            rng.uniform((-1.5, -3, 0.8), (0.0, -1, 2)), rng.uniform((2.5, 3, 1.2), (3.5, 3.5, 2.2))
+        )
+        corners_m = two_walls(count)
+        placed_m = corners_m + place_m * rng.normal(size=(count, 1, 3))
+        yield locate(corners_of(view, placed_m, rng, noise_px), corners_m, lens_of(view), stated), view
+
+
+@pytest.mark.parametrize(
+    ("noise_px", "place_m", "stated", "least"),
+    [
+        pytest.param(0.2, 0.0, SETTINGS, 0.85, id="as stated"),
+        pytest.param(1.0, 0.0, SETTINGS, 0.85, id="more noise than stated"),
+        pytest.param(0.1, 0.0, SETTINGS, 0.85, id="less noise than stated"),
+        pytest.param(0.3, 0.003, PoseSettings(place_m=0.003), 0.85, id="markers off by what is stated"),
+        # Of so few markers, six of whose places the pose takes, the variance is loosely known.
+        pytest.param(0.3, 0.003, SETTINGS, 0.7, id="markers off by thirty times what is stated"),
+    ],
+)
+def test_covariance_is_honest(noise_px, place_m, stated, least):
+    poses = placements(np.random.default_rng(2), 8, noise_px, place_m, stated, 120)
+    squares = np.array([squared_deviations(found, view) for found, view in poses])
+    share = np.mean(squares < chi2.ppf(0.9, 6))
+    # Three deviations of a share of 120.
+    assert share > least - 3 * np.sqrt(least * (1 - least) / 120)
+    # Nor is it so wide that it says nothing: deviations are at most a half too large.
+    assert np.median(squares) > chi2.median(6) / 1.5**2
+
+
+def test_inset_of_all_corners_does_not_move_the_camera():
+    view, corners_m = looking(), two_walls(8)
+    corners_px = corners_of(view, corners_m)
+    inward = seen_markers(corners_px, corners_m, lens_of(view), 0.3, 1e-4).inward
+    found = locate(corners_px + 0.5 * inward, corners_m, lens_of(view), SETTINGS)
+    assert squared_deviations(found, view) < 0.01
+    assert found.reprojection_px == pytest.approx(0.5, rel=0.01)
+
+
+@given(
+    axis=st.tuples(*[st.floats(-3, 3)] * 3),
+    shift_m=st.tuples(*[st.floats(-50, 50)] * 3),
+    seed=st.integers(0, 2**31),
+)
+@settings(max_examples=20)
+def test_the_world_may_be_turned_and_shifted_and_markers_reordered(axis, shift_m, seed):
+    rng = np.random.default_rng(seed)
+    view, corners_m = looking(), two_walls(9)
+    corners_px = corners_of(view, corners_m, rng, 0.2)
+    corners_px[4] += 40.0
+    order = rng.permutation(9)
+    R = Rotation.from_rotvec(axis).as_matrix()
+    one = locate(corners_px, corners_m, lens_of(view), SETTINGS)
+    other = locate(corners_px[order], corners_m[order] @ R.T + shift_m, lens_of(view), SETTINGS)
+    np.testing.assert_array_equal(other.used, one.used[order])
+    # Both stop within a tenth of a deviation of the same minimum; deviations are about 1 mm and 0.2 mrad.
+    np.testing.assert_allclose(R.T @ (other.position_m - shift_m), one.position_m, atol=1e-4)
+    np.testing.assert_allclose(R.T @ other.R_world_cam, one.R_world_cam, atol=2e-5)
+    turned = np.kron(np.eye(2), R)
+    turned[3:, 3:] = np.eye(3)
+    np.testing.assert_allclose(
+        turned.T @ other.covariance @ turned,
+        one.covariance,
+        rtol=0.02,
+        atol=0.02 * np.abs(one.covariance).max(),
+    )
+
+
+@pytest.mark.parametrize("wrong", [1, 2, 3, 4])
+def test_markers_with_the_identity_of_another_are_found(wrong):
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        view, corners_m = looking(), two_walls(10)
+        corners_px = corners_of(view, corners_m, rng, 0.2)
+        swapped = rng.permutation(10)[:wrong]
+        taken = corners_m.copy()
+        for index in swapped:
+            taken[index] = corners_m[rng.choice([i for i in range(10) if i != index])]
+        found = locate(corners_px, taken, lens_of(view), SETTINGS)
+        np.testing.assert_array_equal(np.flatnonzero(~found.used), np.sort(swapped))
+        assert squared_deviations(found, view) < chi2.ppf(0.9999, 6)
+
+
+def test_one_bad_corner_costs_a_corner_and_two_cost_the_marker():
+    rng = np.random.default_rng(3)
+    view, corners_m = looking(), two_walls(8)
+    clean_px = corners_of(view, corners_m, rng, 0.2)
+    one_px, two_px = clean_px.copy(), clean_px.copy()
+    one_px[2, 1] += (4.0, -3.0)
+    two_px[2, 1:3] += (4.0, -3.0)
+    clean, one, two, without = (
+        locate(corners_px, places_m, lens_of(view), SETTINGS)
+        for corners_px, places_m in (
+            (clean_px, corners_m),
+            (one_px, corners_m),
+            (two_px, corners_m),
+            (np.delete(clean_px, 2, axis=0), np.delete(corners_m, 2, axis=0)),
+        )
+    )
+    assert clean.used.all()
+    assert one.used.all()
+    np.testing.assert_array_equal(two.used, np.arange(8) != 2)
+    # What was thrown out has no influence: the pose is that of the rest, to a tenth of a deviation of a millimetre.
+    np.testing.assert_allclose(two.position_m, without.position_m, atol=1e-4)
+    assert one.reprojection_px < 1.0
+    # The information of 31 corners instead of 32.
+    assert np.trace(one.covariance[:3, :3]) == pytest.approx(np.trace(clean.covariance[:3, :3]), rel=0.5)
+
+
+def test_good_markers_are_thrown_out_as_seldom_as_stated():
+    found = [one.used for one, _ in placements(np.random.default_rng(4), 10, 0.3, 0.0, SETTINGS, 60)]
+    thrown = np.sum(~np.array(found))
+    # A marker is out with its mean, or with two corners, which is much rarer.
+    assert thrown <= binom.ppf(0.9999, 600, 2 * FALSE_ALARM)
+
+
+def far_marker(rng, angle_deg=20.0, distance_m=7.0):
+    """A single small marker, a little turned from the camera, and a camera before it."""
+    angle = np.deg2rad(angle_deg)
+    view = looking((0.0, 0.0, 1.0), (0.0, distance_m, 1.0))
+    one = marker((0.0, distance_m, 1.0), (np.cos(angle), np.sin(angle), 0), (0, 0, -1))[None]
+    return view, one, corners_of(view, one, rng, 0.3)
+
+
+def test_ambiguity_of_a_single_marker_is_how_often_the_other_pose_is_right():
+    rng = np.random.default_rng(5)
+    said, wrong = [], []
+    for _ in range(120):
+        view, corners_m, corners_px = far_marker(rng)
+        found = locate(corners_px, corners_m, lens_of(view), ANY_NUMBER)
+        said.append(found.ambiguity)
+        # The other pose sees the marker turned to the other side.
+        wrong.append(np.rad2deg(np.linalg.norm(error(found, view)[3:])) > 20)
+    assert 0.1 < np.mean(said) < 0.5
+    # Three deviations of the count, and a fifth for the approximations.
+    limit = 3 * np.sqrt(np.mean(said) / 120) + 0.2 * np.mean(said)
+    assert abs(np.mean(wrong) - np.mean(said)) < limit
+
+
+def test_expectation_decides_between_the_poses_of_a_single_marker():
+    rng = np.random.default_rng(6)
+    for _ in range(20):
+        view, corners_m, corners_px = far_marker(rng)
+        expected = Expected(
+            view.centre_world + np.array([0.2, -0.1, 0.1]),
+            view.T_cam_world[:3, :3].T,
+            np.diag([0.1] * 3 + [0.01] * 3),
+        )
+        found = locate(corners_px, corners_m, lens_of(view), ANY_NUMBER, expected)
+        assert np.rad2deg(np.linalg.norm(error(found, view)[3:])) < 20
+        assert found.ambiguity < 0.05
+
+
+def test_expectation_is_only_an_expectation():
+    view, corners_m = looking(), two_walls(6)
+    corners_px = corners_of(view, corners_m)
+    elsewhere = Expected(view.centre_world + 30.0, np.eye(3), 1e-6 * np.eye(6))
+    found = locate(corners_px, corners_m, lens_of(view), SETTINGS, elsewhere)
+    np.testing.assert_allclose(error(found, view), 0, atol=1e-9)
+
+
+def test_markers_of_one_wall_are_ambiguous_from_far_away_only():
+    rng = np.random.default_rng(7)
+    corners_m = one_wall()
+    near = looking((1.5, -0.5, 1.5), (0.0, 4.0, 2.0))
+    found = locate(corners_of(near, corners_m, rng, 0.3), corners_m, lens_of(near), SETTINGS)
+    assert found.ambiguity < 1e-9
+    tele = np.array([[920.0, 0, 959.5], [0, 920.0, 539.5], [0, 0, 1]])
+    ambiguities = []
+    for _ in range(20):
+        far = looking((12.0, -60.0, 1.5), (0.0, 4.0, 2.0), K=tele)
+        ambiguities.append(
+            locate(corners_of(far, corners_m, rng, 0.5), corners_m, lens_of(far), SETTINGS).ambiguity
+        )
+    assert max(ambiguities) > 0.05
+
+
+def test_of_two_markers_that_contradict_each_other_nobody_knows_which_is_right():
+    rng = np.random.default_rng(8)
+    view, all_m = looking(), two_walls(10)
+    corners_m = all_m[[0, 1]]
+    corners_px = corners_of(view, corners_m, rng, 0.2)
+    taken = np.stack([corners_m[0], all_m[8]])
+    found = locate(corners_px, taken, lens_of(view), ANY_NUMBER)
+    assert found is None or (found.used.sum() == 1 and found.ambiguity > 0.01)
+    expected = Expected(
+        view.centre_world + 0.05, view.T_cam_world[:3, :3].T, np.diag([0.01] * 3 + [0.003] * 3)
+    )
+    found = locate(corners_px, taken, lens_of(view), ANY_NUMBER, expected)
+    np.testing.assert_array_equal(found.used, [True, False])
+    assert found.ambiguity < 0.01
+    assert squared_deviations(found, view) < chi2.ppf(0.9999, 6)
+
+
+def test_a_marker_that_the_map_has_behind_the_camera_is_wrong():
+    view, corners_m = looking(), two_walls(6)
+    corners_px = corners_of(view, corners_m)
+    taken = corners_m.copy()
+    taken[3] = marker((0.0, -4.0, 1.5), (-1, 0, 0), (0, 0, -1))
+    found = locate(corners_px, taken, lens_of(view), SETTINGS)
+    np.testing.assert_array_equal(found.used, np.arange(6) != 3)
+    np.testing.assert_allclose(error(found, view), 0, atol=1e-9)
+
+
+def test_too_few_markers_give_no_pose():
+    view, corners_m = looking(), two_walls(4)
+    corners_px = corners_of(view, corners_m)
+    nothing = np.zeros((0, 4, 2)), np.zeros((0, 4, 3))
+    assert locate(*nothing, lens_of(view), ANY_NUMBER) is None
+    assert locate(corners_px[:3], corners_m[:3], lens_of(view), SETTINGS) is None
+    assert locate(corners_px, corners_m, lens_of(view), SETTINGS) is not None
+
+
+def test_markers_that_do_not_fix_a_pose_give_none():
+    view = looking()
+    # All corners on one line, as they are seen and as the map has them.
+    line_m = np.array([[[x + 0.1 * i, 4.0, 1.5] for i in range(4)] for x in range(5)])
+    assert locate(corners_of(view, line_m), line_m, lens_of(view), SETTINGS) is None
+    # All corners in one point.
+    point_m = np.tile([1.0, 4.0, 1.5], (5, 4, 1))
+    assert locate(corners_of(view, point_m), point_m, lens_of(view), SETTINGS) is None
+
+
+def test_markers_that_all_contradict_one_another_give_none():
+    rng = np.random.default_rng(9)
+    view, corners_m = looking(), two_walls(10)
+    for seed in range(5):
+        shuffled = np.roll(np.random.default_rng(seed).permutation(10), 1)
+        corners_px = rng.uniform((200, 200), (1700, 900), (10, 1, 2)) + 30 * np.array(
+            [[-1, -1], [1, -1], [1, 1], [-1, 1]]
+        )
+        assert locate(corners_px, corners_m[shuffled], lens_of(view), SETTINGS) is None
+
+
+def test_what_makes_no_sense_is_refused():
+    view, corners_m = looking(), two_walls(4)
+    corners_px = corners_of(view, corners_m)
+    with pytest.raises(InputError, match="finite coordinates"):
+        locate(np.where(corners_px > 1e9, 0, np.nan), corners_m, lens_of(view), SETTINGS)
+    with pytest.raises(SettingsError, match="min_markers: expected at least 1, found 0"):
+        PoseSettings(min_markers=0)
+    with pytest.raises(SettingsError, match="noise_px"):
+        PoseSettings(noise_px=0.0)
+    with pytest.raises(SettingsError, match="place_m"):
+        PoseSettings(place_m=np.inf)

@@ -1,0 +1,187 @@
+"""The smoother over camera poses: against least squares over all frames at once, against the filter, and over gaps."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from test_inside_out_filter import (
+    FPS,
+    errors,
+    flight,
+    misplaced,
+    raw_path,
+    share_within,
+    spread,
+    without,
+)
+
+from psotrack.errors import InputError
+from psotrack.inside_out import pose_bank, pose_motion, pose_smoothing
+from psotrack.inside_out.camera_path import Flag
+from psotrack.inside_out.path_rows import path_of, rows_of
+from psotrack.inside_out.pose_filter import PoseFilterParams, follow
+from psotrack.inside_out.pose_smoothing import smooth
+from psotrack.trajectories import Status
+
+
+def median_mm(error) -> float:
+    return 1e3 * float(np.median(np.linalg.norm(error, axis=1)))
+
+
+def test_a_camera_that_does_not_turn_is_smoothed_as_by_least_squares_over_all_frames(monkeypatch) -> None:
+    """All positions, velocities, accelerations and lasting errors as unknowns of one linear problem."""
+    frames, dt_s = 12, 1 / FPS
+    level = pose_motion.Levels(np.array([4.0]), np.array([0.01]))
+    # One level alone, so that both know the same of the motion; and covariances as they are.
+    monkeypatch.setattr(pose_bank, "LEVELS", level)
+    monkeypatch.setattr(pose_smoothing, "LEVELS", level)
+    monkeypatch.setattr(pose_bank, "_FIRST_LOG_WEIGHT", np.zeros(1))
+    monkeypatch.setattr(pose_bank, "_MOST_SCALED", 1.0)
+    noise_m2 = np.diag([1e-5, 2e-5, 4e-5])
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3], covariance[3:, 3:] = noise_m2, 1e-6 * np.eye(3)
+    rng = np.random.default_rng(1)
+    measured_m = np.cumsum(rng.normal(scale=0.01, size=(frames, 3)), axis=0) * 0.3
+    raw = raw_path(measured_m, Rotation.identity(frames))
+    raw = replace(raw, covariance=np.tile(covariance, (frames, 1, 1)))
+    gone = slice(5, 8)
+    path = smooth(without(raw, gone), PoseFilterParams(false_alarm=1e-12))
+
+    part = np.r_[0:9, 15:18]
+    start = pose_motion.begun(measured_m[0], raw.orientation_wxyz[0], covariance, level)
+    _, F = pose_motion.foretold(start, dt_s, level)
+    F, Q = F[0][np.ix_(part, part)], pose_motion.process_noise(dt_s, level)[0][np.ix_(part, part)]
+    first = start.covariance[0][np.ix_(part, part)]
+    H = np.hstack([np.eye(3), np.zeros((3, 6)), np.sqrt(pose_motion.LASTING_SHARE * noise_m2)])
+    rows, wanted = [], []
+
+    def equation(coefficients, right, cov) -> None:
+        whiten = np.linalg.inv(np.linalg.cholesky(cov))
+        rows.append(whiten @ coefficients)
+        wanted.append(whiten @ right)
+
+    def at(frame, matrix):
+        whole = np.zeros((len(matrix), 12 * frames))
+        whole[:, 12 * frame : 12 * frame + 12] = matrix
+        return whole
+
+    equation(at(0, np.eye(12)), np.concatenate([measured_m[0], np.zeros(9)]), first)
+    for k in range(1, frames):
+        equation(at(k, np.eye(12)) - at(k - 1, F), np.zeros(12), Q)
+        if not gone.start <= k < gone.stop:
+            equation(at(k, H), measured_m[k], (1 - pose_motion.LASTING_SHARE) * noise_m2)
+    A, b = np.vstack(rows), np.concatenate(wanted)
+    best = np.linalg.lstsq(A, b, rcond=None)[0].reshape(frames, 12)
+    inverse = np.linalg.inv(A.T @ A)
+    # Conditioned as 1e5 squared, the normal equations leave six digits of the covariance; measured: 1e-8 m, 2e-5.
+    np.testing.assert_allclose(path.position_m, best[:, :3], atol=1e-7)
+    np.testing.assert_allclose(path.velocity_m_s, best[:, 3:6], atol=1e-5)
+    for k in range(frames):
+        found = path.covariance[k, :3, :3]
+        np.testing.assert_allclose(
+            found, inverse[12 * k : 12 * k + 3, 12 * k : 12 * k + 3], rtol=1e-3, atol=1e-10
+        )
+
+
+@pytest.mark.parametrize(("acceleration", "wobble"), [(0.5, 0.5), (8.0, 8.0)])
+def test_the_smoother_is_better_than_the_filter_and_knows_it(acceleration, wobble) -> None:
+    raw, position_m, truth = flight(100, acceleration=acceleration, wobble=wobble, seed=33)
+    filtered, smoothed = follow(raw), smooth(raw)
+    # Where it moves roughly, a pose in ten may be gated from one side.
+    assert (smoothed.status == Status.TRACKED).mean() > 0.88
+    assert (smoothed.status != Status.LOST).all()
+    off_m, off_rad = errors(smoothed, position_m, truth)
+    of_filter_m, of_filter_rad = errors(filtered, position_m, truth)
+    assert median_mm(off_m) < median_mm(of_filter_m)
+    assert median_mm(off_rad) < 1.02 * median_mm(of_filter_rad)
+    assert 0.75 < share_within(off_m, smoothed.covariance[:, :3, :3]) < 1.0
+    assert 0.7 < share_within(off_rad, smoothed.covariance[:, 3:, 3:]) < 1.0
+    speed_m_s = np.gradient(position_m, raw.time_s, axis=0)
+    of_speed = np.linalg.norm(smoothed.velocity_m_s - speed_m_s, axis=1)[2:-2]
+    assert np.median(of_speed) < np.median(np.linalg.norm(filtered.velocity_m_s - speed_m_s, axis=1)[2:-2])
+
+
+def test_gaps_are_bridged_from_both_sides() -> None:
+    raw, position_m, truth = flight(110, acceleration=1.0, wobble=1.0, seed=32)
+    gone = np.r_[0:4, 30:50, 70:100]
+    raw = without(raw, gone)
+    path, filtered = smooth(raw, PoseFilterParams(longest_gap_s=0.45)), follow(raw)
+    # 0.84 s have a pose within 0.45 s everywhere; 1.24 s do not, and none is told before the first pose.
+    assert (path.status[:4] == Status.LOST).all()
+    assert (path.status[30:50] == Status.COASTING).all()
+    assert (path.status[70:81] == Status.COASTING).all()
+    assert (path.status[81:100] == Status.LOST).all()
+    assert np.isnan(path.position_m[81:100]).all()
+    assert (path.status[100:] == Status.TRACKED).all()
+    variance_m2 = np.trace(path.covariance[:, :3, :3], axis1=1, axis2=2)
+    # Least is known in the middle, and far more than a filter knows there.
+    assert 36 <= 30 + variance_m2[30:50].argmax() <= 43
+    assert variance_m2[40] < 0.3 * np.trace(filtered.covariance[40, :3, :3])
+    told = np.flatnonzero(path.seen)
+    off_m, _ = errors(path, position_m, truth)
+    inside = np.isin(told, np.r_[30:50])
+    off_m, covariance = off_m[inside], path.covariance[told][inside, :3, :3]
+    # Within what 1 of 10,000 would leave.
+    assert (np.einsum("ni,nij,nj->n", off_m, np.linalg.inv(covariance), off_m) < 21.1).all()
+
+
+def test_outliers_wrong_starts_and_wrong_ends_do_not_count() -> None:
+    raw, position_m, truth = flight(100, seed=33)
+    bad = np.r_[0:4, 40, 60:66, 98:100]
+    path = smooth(misplaced(raw, bad, [0.4, -2.0, 0.3], [0.0, 0.5, 0.0]))
+    assert (path.flags[bad] & Flag.GATED).all()
+    assert (path.status[bad] != Status.TRACKED).all()
+    off_m, _ = errors(path, position_m, truth)
+    # Six frames from both sides: a centimetre or two at 2 m/s2.
+    assert np.linalg.norm(off_m, axis=1).max() < 0.05
+    good = np.setdiff1d(np.arange(100), bad)
+    assert (path.status[good] == Status.TRACKED).mean() > 0.95
+
+
+def test_a_turn_that_was_gated_when_it_came_counts_in_the_end() -> None:
+    position_m = np.zeros((60, 3))
+    position_m[30:, 0] = 40.0 / 2 * (np.arange(1, 31) / FPS) ** 2
+    rng = np.random.default_rng(34)
+    raw = raw_path(position_m + rng.normal(scale=0.002, size=(60, 3)), Rotation.identity(60))
+    assert (follow(raw).status[28:34] == Status.COASTING).any()
+    path = smooth(raw)
+    assert (path.status[28:34] == Status.TRACKED).all()
+
+
+def test_a_camera_that_is_elsewhere_for_good_is_not_drawn_there() -> None:
+    """Where the camera is put elsewhere, the path jumps, and is not bent on either side."""
+    raw, position_m, _ = flight(60, seed=35)
+    path = smooth(misplaced(raw, slice(30, None), [0.0, 0.0, 5.0]))
+    position_m = position_m + np.array([0.0, 0.0, 5.0]) * (np.arange(60) >= 30)[:, None]
+    # Some poses beside the jump may be gated, and coasted over; drawn across it, the path would be off by metres.
+    assert np.linalg.norm(path.position_m - position_m, axis=1).max() < 0.1
+
+
+@pytest.mark.parametrize("frames", [0, 1, 2])
+def test_paths_with_hardly_a_pose(frames) -> None:
+    raw, _, _ = flight(5, seed=36)
+    some = path_of(rows_of(raw)[:frames])
+    assert (smooth(some).status == Status.LOST).all()
+    believing = smooth(some, PoseFilterParams(confirm=1))
+    assert (believing.status == Status.TRACKED).all()
+    if frames == 1:
+        np.testing.assert_allclose(believing.position_m, raw.position_m[:1], atol=1e-12)
+        np.testing.assert_allclose(believing.covariance[0], spread(), atol=1e-15)
+
+
+def test_the_raw_path_stays_as_it_is() -> None:
+    raw, _, _ = flight(20, seed=37)
+    raw = without(misplaced(raw, slice(15, 16), [1.0, 0.0, 0.0]), slice(5, 8))
+    before = {name: np.copy(value) for name, value in vars(raw).items() if value is not None}
+    smooth(raw)
+    for name, value in before.items():
+        np.testing.assert_array_equal(getattr(raw, name), value)
+    assert (smooth(without(raw, slice(None))).status == Status.LOST).all()
+
+
+def test_a_pose_without_a_covariance_is_refused() -> None:
+    raw, _, _ = flight(6, seed=38)
+    raw.covariance[4] = 0.0
+    with pytest.raises(InputError, match=r"covariance at 0.16 s: expected a positive definite matrix"):
+        smooth(raw)

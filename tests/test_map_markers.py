@@ -1,0 +1,265 @@
+"""`psotrack map-markers` on real files: measured corners, a video, a sequence of the dataset, and a wrong map."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from test_inside_out_map import ROOM, bent, on_wall, recorded
+
+from psotrack.cameras import camera, look_at, project, stack
+from psotrack.cli.map_markers import FOUND, map_markers
+from psotrack.datasets.dpjait import read_marker_corners, write_marker_corners
+from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
+from psotrack.inside_out.marker_map import MarkerMap
+from psotrack.lenses import marker_dictionary
+from psotrack.mocap import write_c3d
+from psotrack.rig_files import write_rig
+from psotrack.video import VideoWriter
+
+SIZE_WH = (960, 720)
+LENS = camera(
+    R=np.eye(3),
+    t_m=np.zeros(3),
+    K=np.array([[620.0, 0.0, 479.5], [0.0, 620.0, 359.5], [0.0, 0.0, 1.0]]),
+    image_size_wh=SIZE_WH,
+)
+SIDE_M = 0.4
+#: Two walls that meet.
+CORNERS = {
+    **{
+        marker: on_wall((x, 3.0, z), (0, -1, 0), SIDE_M)
+        for marker, x, z in ((3, -1.2, 1.2), (7, 0.0, 1.8), (8, 1.2, 1.1))
+    },
+    **{marker: on_wall((2.2, y, z), (-1, 0, 0), SIDE_M) for marker, y, z in ((21, 2.1, 2.0), (22, 0.9, 1.3))},
+}
+#: Cells of the printed sheet across, 6 of them the marker's.
+_CELLS = 8
+
+
+def invoke(*words, expect=None):
+    """What the command prints; or the error that it must end with."""
+    result = CliRunner().invoke(map_markers, [str(word) for word in words], catch_exceptions=True)
+    if expect is None:
+        assert result.exception is None, result.output + repr(result.exception)
+        return result.output
+    assert isinstance(result.exception, expect), repr(result.exception)
+    return str(result.exception) if isinstance(result.exception, PsotrackError) else result.output
+
+
+def image(cam):
+    """Sheets of paper on grey walls, drawn twice as large, blurred in light, and coded as video is."""
+    canvas = np.full((2 * SIZE_WH[1], 2 * SIZE_WH[0]), 0.2, np.float32)
+    for marker, corners in CORNERS.items():
+        sheet = np.ones((_CELLS * 40, _CELLS * 40), np.float32)
+        sheet[40:-40, 40:-40] = (
+            cv2.aruco.generateImageMarker(marker_dictionary("4x4_1000"), marker, 240) / 255
+        )
+        pixels, depth = project(cam, corners)
+        if (depth < 0.3).any():
+            continue
+        # Edges of pixels, and of the sheet's: centres are at whole numbers.
+        at = np.array([[40, 40], [280, 40], [280, 280], [40, 280]], np.float32) - 0.5
+        onto = cv2.getPerspectiveTransform(at, (2 * pixels + 0.5).astype(np.float32))
+        mask = cv2.warpPerspective(np.ones_like(sheet), onto, canvas.shape[::-1])
+        drawn = cv2.warpPerspective(sheet, onto, canvas.shape[::-1], flags=cv2.INTER_AREA)
+        canvas = np.where(mask > 0.5, drawn, canvas)
+    light = cv2.resize(cv2.GaussianBlur(canvas, (0, 0), 1.5), SIZE_WH, interpolation=cv2.INTER_AREA)
+    gray = (255 * np.sqrt(np.clip(0.05 + 0.9 * light, 0, 1))).round().astype(np.uint8)
+    return cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR)
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory):
+    """A folder with a video of the two walls, `walk.avi`, and the lens, `lens.toml`."""
+    folder = tmp_path_factory.mktemp("walk")
+    write_rig(folder / "lens.toml", stack({"gopro": LENS}))
+    with VideoWriter(folder / "walk.avi", 25.0, SIZE_WH) as writer:
+        for turn in np.linspace(0, 2 * np.pi, 24):
+            centre = np.array(
+                [-0.8 + 0.9 * np.cos(turn), -1.2 + 0.8 * np.sin(turn), 1.5 + 0.3 * np.sin(2 * turn)]
+            )
+            R, t_m = look_at(centre.tolist(), [0.7 + 0.3 * np.sin(3 * turn), 2.6, 1.5])
+            writer.write(image(camera(R=R, t_m=t_m, K=LENS.K, image_size_wh=SIZE_WH)))
+    write_marker_corners(folder / "truth.csv", CORNERS)
+    return folder
+
+
+def centres_off_m(path):
+    found = read_marker_corners(path)
+    return {marker: np.linalg.norm((found[marker] - CORNERS[marker]).mean(axis=0)) for marker in found}
+
+
+def test_a_map_from_a_video(walk, tmp_path):
+    out = tmp_path / "corners.csv"
+    words = [walk / "walk.avi", "--known", 7, "--markers", walk / "truth.csv", "--camera", walk / "lens.toml"]
+    printed = invoke(*words, "--out", out, "--json", tmp_path / "map.json")
+    assert "5 markers from 24 frames" in printed
+    off = centres_off_m(out)
+    # Corners are right to 0.1 px of 620 px per metre at 1 m: 0.6 mm at 4 m, and some times that around a corner.
+    assert set(off) == set(CORNERS)
+    assert max(off.values()) < 0.01
+    content = json.loads((tmp_path / "map.json").read_text())
+    assert content["frames"] == 24
+    for marker, row in content["markers"].items():
+        assert row["known"] == (marker == "7")
+        # A centre that is off by less than 4 of its deviations, in its length.
+        assert off[int(marker)] <= 4 * np.linalg.norm(row["std_m"]) + 1e-9
+        assert row["residual_px"] < 0.5
+    assert "expected no such file yet" in invoke(*words, "--out", out, expect=OutputError)
+    invoke(*words, "--out", out, "--force", "--quiet")
+
+
+def test_the_world_of_a_marker_of_which_the_side_is_known(walk, tmp_path):
+    out = tmp_path / "corners.csv"
+    invoke(
+        walk / "walk.avi",
+        "--known",
+        7,
+        "--side",
+        SIDE_M,
+        "--camera",
+        walk / "lens.toml",
+        "--out",
+        out,
+        "--quiet",
+    )
+    found = MarkerMap(read_marker_corners(out))
+    row = found.ids.tolist().index(7)
+    np.testing.assert_allclose(found.centres_m[row], 0.0, atol=1e-12)
+    np.testing.assert_allclose(found.normals[row], [0, 0, 1], atol=1e-12)
+    # Marker 8 hangs 1.2 m to the right of 7 and 0.7 m lower, on the same wall.
+    np.testing.assert_allclose(found.centres_m[found.ids.tolist().index(8)], [1.2, -0.7, 0.0], atol=0.01)
+
+
+def test_a_sequence_brings_its_own(walk, tmp_path):
+    """The layout of the dataset: video, intrinsics and table of corners are found by their names."""
+    folder = tmp_path / "S01_D2_A"
+    folder.mkdir()
+    shutil.copy(walk / "walk.avi", folder / "dron1_cam_s.avi")
+    shutil.copy(walk / "walk.avi", folder / "cam1i_s.avi")
+    shutil.copy(walk / "truth.csv", folder / "aruco_corners.csv")
+    (folder / "drone_cameras_calibration.csv").write_text(
+        "cam_name;focal_length_x;focal_length_y;cx;cy;width;height\ndron1;620;620;479.5;359.5;960;720\n"
+    )
+    (folder / "cameras_calibration.csv").write_text(
+        "cam_name;cam_x[m];cam_y[m];cam_z[m];cam_or_x[rad];cam_or_y[rad];cam_or_z[rad];focal_length;cx;cy\n"
+        "cam1i;0;0;5;0;0;0;600;480;360\n"
+    )
+    out = tmp_path / "corners.csv"
+    printed = invoke(folder, "--drone", "dron1", "--known", "7", "--out", out)
+    assert "5 markers" in printed
+    assert max(centres_off_m(out).values()) < 0.01
+    assert "nothing disagrees" in invoke(folder, "--check", folder / "aruco_corners.csv")
+    message = invoke(
+        folder, "--drone", "dron5", "--known", "7", "--out", tmp_path / "x.csv", expect=SettingsError
+    )
+    assert "expected some of dron1, found dron5" in message
+
+
+def test_a_wrong_map_is_told_and_the_exit_says_so(walk, tmp_path):
+    wrong = tmp_path / "wrong.csv"
+    write_marker_corners(wrong, {**CORNERS, 22: CORNERS[22] + np.array([0.0, 0.1, 0.05])})
+    words = ["--check", wrong, "--camera", walk / "lens.toml"]
+    result = CliRunner().invoke(
+        map_markers, [str(word) for word in (walk / "walk.avi", *words, "--json", "-")]
+    )
+    assert result.exit_code == FOUND
+    content = json.loads(result.stdout)
+    assert [(one["kind"], one["markers"]) for one in content["findings"]] == [("moved", [22])]
+    assert content["markers"]["22"]["moved_m"] == pytest.approx([0.0, -0.1, -0.05], abs=0.01)
+    said = CliRunner().invoke(map_markers, [str(word) for word in (walk / "walk.avi", *words, "--quiet")])
+    assert "marker 22: it is 0.11 m from where the map has it" in said.output
+
+
+def test_a_map_from_motion_capture(tmp_path):
+    write_c3d(tmp_path / "room.c3d", recorded(ROOM))
+    out = tmp_path / "corners.csv"
+    printed = invoke(tmp_path / "room.c3d", "--out", out)
+    assert "16 markers, corners within 0.0 mm of squares" in printed
+    for marker, corners in read_marker_corners(out).items():
+        # A C3D holds float32 millimetres: 4e-4 mm at 4 m.
+        np.testing.assert_allclose(corners, ROOM[marker], atol=2e-6)
+    content = json.loads(invoke(tmp_path / "room.c3d", "--out", out, "--force", "--json", "-"))
+    assert len(content["markers"]["3"]["residual_m"]) == 4
+    assert content["reordered"] == []
+
+
+def test_measured_corners_in_another_order_are_told(tmp_path):
+    path = tmp_path / "points.csv"
+    write_marker_corners(path, {**ROOM, 3: ROOM[3][[3, 2, 1, 0]]})
+    printed = invoke(path, "--out", tmp_path / "corners.csv")
+    assert "marker 3: its corners were labelled in another order, and put right" in printed
+    np.testing.assert_allclose(read_marker_corners(tmp_path / "corners.csv")[3], ROOM[3], atol=1e-12)
+    write_marker_corners(path, bent(0.2, 0))
+    message = invoke(path, "--out", tmp_path / "other.csv", expect=InputError)
+    assert "line 4, marker 3: expected four points that are a square" in message
+    assert not (tmp_path / "other.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "error", "message"),
+    [
+        (["{walk}"], SettingsError, "expected --out FILE or --check MAP, found neither"),
+        (["{walk}", "--out", "{new}", "--check", "{new}"], SettingsError, "found --out and --check"),
+        (["{walk}", "--out", "{new}"], SettingsError, "expected numbers of markers that are known"),
+        (
+            ["{walk}", "--out", "{new}", "--known", "7"],
+            SettingsError,
+            "--markers with the corners of the known",
+        ),
+        (
+            ["{walk}", "--out", "{new}", "--known", "7,8", "--side", "0.4"],
+            SettingsError,
+            "found no --markers",
+        ),
+        (
+            ["{walk}", "--out", "{new}", "--known", "9", "--markers", "{truth}"],
+            InputError,
+            "expected the known marker 9",
+        ),
+        (
+            ["{walk}", "--out", "{new}", "--known", "7", "--side", "0.4"],
+            SettingsError,
+            "--camera FILE or --fov H,V, found nei",
+        ),
+        (
+            ["{walk}", "--out", "{new}", "--known", "7", "--side", "-1"],
+            SettingsError,
+            "side_m: expected a number above 0",
+        ),
+        (["{walk}", "--check", "{walk}"], InputError, "walk.avi: expected text"),
+        (["{gone}", "--check", "{truth}", "--fov", "90,60"], InputError, "gone.avi: expected a video"),
+        (
+            ["{walk}", "--drone", "dron1", "--check", "{truth}"],
+            SettingsError,
+            "expected a sequence's folder as SOURCE",
+        ),
+        (
+            ["{walk}", "--check", "{truth}", "--fov", "75.5,60.3", "--dictionary", "5x5_50"],
+            InputError,
+            "that show markers, found none",
+        ),
+    ],
+)
+def test_unusable_choices(walk, tmp_path, words, error, message):
+    names = {"walk": "walk.avi", "truth": "truth.csv", "gone": "gone.avi"}
+    paths = {key: walk / name for key, name in names.items()} | {"new": tmp_path / "new.csv"}
+    assert message in invoke(*(word.format(**paths) for word in words), expect=error)
+    assert not (tmp_path / "new.csv").exists()
+
+
+def test_intrinsics_for_another_resolution(walk, tmp_path):
+    lens = camera(R=np.eye(3), t_m=np.zeros(3), K=LENS.K, image_size_wh=(1920, 1440))
+    write_rig(tmp_path / "lens.toml", stack({"gopro": lens}))
+    message = invoke(
+        walk / "walk.avi",
+        "--check",
+        walk / "truth.csv",
+        "--camera",
+        tmp_path / "lens.toml",
+        expect=InputError,
+    )
+    assert "lens.toml: expected intrinsics for 960 x 720 pixels" in message
