@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.comparison import Statistics, compare, mean_rotation, wrapped_deg
-from psotrack.inside_out.comparison_clocks import at_times
-from psotrack.inside_out.comparison_plots import RECONSTRUCTED, REFERENCE, save_errors, save_paths
+from psotrack.inside_out.comparison.clocks import at_times
+from psotrack.inside_out.comparison.plots import RECONSTRUCTED, REFERENCE, save_errors, save_paths
 from psotrack.trajectories import Status
 
 FPS = 25.0

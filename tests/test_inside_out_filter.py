@@ -12,10 +12,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.inside_out import manifold, pose_motion
 from psotrack.inside_out.camera_path import CameraPath, Flag
-from psotrack.inside_out.path_rows import path_of, rows_of
-from psotrack.inside_out.pose_filter import (
+from psotrack.inside_out.filtering import manifold as manifold
+from psotrack.inside_out.filtering import motion as pose_motion
+from psotrack.inside_out.filtering.path_rows import path_of, rows_of
+from psotrack.inside_out.filtering.pose_filter import (
     Following,
     MeasuredPose,
     PoseFilterParams,

@@ -13,9 +13,16 @@ from scipy.stats import multivariate_normal
 from psotrack.errors import InputError
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.fusing import fuse
-from psotrack.inside_out.gating import gated
-from psotrack.inside_out.joint_filter import Arm, ErrorModel, Readings, log_likelihood, smooth, transition
-from psotrack.inside_out.mounting import mounted
+from psotrack.inside_out.fusing.gating import gated
+from psotrack.inside_out.fusing.joint_filter import (
+    Arm,
+    ErrorModel,
+    Readings,
+    log_likelihood,
+    smooth,
+    transition,
+)
+from psotrack.inside_out.fusing.mounting import mounted
 from psotrack.trajectories import Status, Trajectories
 
 FPS = 25.0

@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 from psotrack.cameras import camera, look_at, project
 from psotrack.datasets.dpjait import read_marker_corners, write_marker_corners
 from psotrack.errors import InputError, SettingsError
-from psotrack.inside_out.map_check import check_map
-from psotrack.inside_out.map_scene import outward
-from psotrack.inside_out.map_sightings import SQUARE, Seen, sightings_of
-from psotrack.inside_out.map_squares import best_square, read_measured, squares
 from psotrack.inside_out.mapping import build_map, own_frame
+from psotrack.inside_out.mapping.check import check_map
+from psotrack.inside_out.mapping.scene import outward
+from psotrack.inside_out.mapping.sightings import SQUARE, Seen, sightings_of
+from psotrack.inside_out.mapping.squares import best_square, read_measured, squares
 from psotrack.inside_out.marker_map import MarkerMap, read_marker_map
 from psotrack.mocap import Markers, write_c3d
 

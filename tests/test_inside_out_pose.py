@@ -14,8 +14,8 @@ from scipy.stats import binom, chi2
 from psotrack.cameras import camera, look_at, project
 from psotrack.errors import InputError, SettingsError
 from psotrack.inside_out.pose import Expected, PoseSettings, locate
-from psotrack.inside_out.pose_equations import INSET_STD_PX, Noise, equations, seen_markers, summed
-from psotrack.inside_out.pose_fit import FALSE_ALARM
+from psotrack.inside_out.pose.equations import INSET_STD_PX, Noise, equations, seen_markers, summed
+from psotrack.inside_out.pose.fit import FALSE_ALARM
 
 K = np.array([[920.0, 0, 959.5], [0, 921.0, 539.5], [0, 0, 1]])
 SETTINGS = PoseSettings()

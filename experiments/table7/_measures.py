@@ -14,7 +14,7 @@ from scipy.stats import chi2
 
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.comparison import Comparison, Statistics
-from psotrack.inside_out.visibility import visible_markers
+from psotrack.inside_out.comparison.visibility import visible_markers
 
 ANGLES = ("roll", "pitch", "yaw")
 

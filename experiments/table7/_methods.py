@@ -11,10 +11,10 @@ from _sightings import Sightings
 
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.detection import SeenMarkers
+from psotrack.inside_out.filtering.path_rows import path_of
+from psotrack.inside_out.filtering.smoothing import smooth
 from psotrack.inside_out.localising import LocaliseSettings, follow_markers, row_of
-from psotrack.inside_out.path_rows import path_of
 from psotrack.inside_out.pose import MarkerPose, PoseSettings
-from psotrack.inside_out.pose_smoothing import smooth
 
 #: What the paper asks for.
 MIN_MARKERS = 4

@@ -26,7 +26,7 @@ from psotrack.errors import PsotrackError
 from psotrack.files import written_whole
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.comparison import Comparison, compare
-from psotrack.inside_out.comparison_plots import save_errors, save_paths
+from psotrack.inside_out.comparison.plots import save_errors, save_paths
 
 #: Shares of the markers that are taken for others.
 WRONG = (0.0, 0.02)

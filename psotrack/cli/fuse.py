@@ -12,8 +12,8 @@ from psotrack.cli.options import FORCE, JSON, QUIET
 
 if TYPE_CHECKING:
     from psotrack.inside_out.camera_path import CameraPath
-    from psotrack.inside_out.drone_fusion import DroneFusion, Errors
     from psotrack.inside_out.fusing import Fused, FusedDrone
+    from psotrack.inside_out.fusing.drone_fusion import DroneFusion, Errors
 
 
 @click.command()
@@ -63,8 +63,8 @@ def fuse(
     from psotrack.errors import InputError, SettingsError
     from psotrack.files import refuse_to_overwrite
     from psotrack.inside_out.camera_path import read_camera_path
-    from psotrack.inside_out.fused_table import write_fused
     from psotrack.inside_out.fusing import fuse as fuse_paths
+    from psotrack.inside_out.fusing.fused_table import write_fused
     from psotrack.trajectory_files import read_trajectories
 
     if out.suffix != ".csv":

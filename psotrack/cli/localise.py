@@ -109,12 +109,12 @@ def localise(
     from dataclasses import replace
 
     from psotrack.inside_out.camera_path import write_camera_path
+    from psotrack.inside_out.filtering.pose_filter import PoseFilterParams
+    from psotrack.inside_out.filtering.smoothing import smooth
     from psotrack.inside_out.localising import LocaliseSettings
     from psotrack.inside_out.localising import localise as localise_camera
     from psotrack.inside_out.marker_map import read_marker_map
     from psotrack.inside_out.pose import PoseSettings
-    from psotrack.inside_out.pose_filter import PoseFilterParams
-    from psotrack.inside_out.pose_smoothing import smooth
 
     for path in (out, json_path):
         if path is not None and path != Path("-"):

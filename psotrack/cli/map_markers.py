@@ -17,10 +17,10 @@ from psotrack.files import refuse_to_overwrite
 
 if TYPE_CHECKING:
     from psotrack.cameras import Camera
-    from psotrack.inside_out.map_check import Checkup
-    from psotrack.inside_out.map_sightings import Sightings
-    from psotrack.inside_out.map_squares import Squares
     from psotrack.inside_out.mapping import BuiltMap
+    from psotrack.inside_out.mapping.check import Checkup
+    from psotrack.inside_out.mapping.sightings import Sightings
+    from psotrack.inside_out.mapping.squares import Squares
     from psotrack.inside_out.marker_map import MarkerMap
     from psotrack.video import VideoInfo
 
@@ -119,9 +119,9 @@ def map_markers(
       psotrack map-markers data/Simulated_Data/S01_D2_A --check corners.csv
     """
     from psotrack.datasets.dpjait import write_marker_corners
-    from psotrack.inside_out.map_check import check_map
-    from psotrack.inside_out.map_squares import read_measured, squares
     from psotrack.inside_out.mapping import build_map
+    from psotrack.inside_out.mapping.check import check_map
+    from psotrack.inside_out.mapping.squares import read_measured, squares
     from psotrack.inside_out.marker_map import read_marker_map
 
     given = [name for name, value in {"--out": out, "--check": checked}.items() if value is not None]
@@ -252,7 +252,7 @@ def _of_sequence(folder: Path, drones: str | None, lenses: _Lenses) -> dict[str,
 
 
 def _sightings(videos: dict[str, tuple[VideoInfo, Camera]], dictionary: str, quiet: bool) -> Sightings:
-    from psotrack.inside_out.map_sightings import find_sightings
+    from psotrack.inside_out.mapping.sightings import find_sightings
 
     return find_sightings(list(videos.values()), dictionary, report=report_to(quiet))
 

@@ -15,11 +15,11 @@ from psotrack.cameras import Camera
 from psotrack.errors import InputError
 from psotrack.inside_out.camera_path import CameraPath, Flag
 from psotrack.inside_out.detection import MarkerDetector, SeenMarkers
+from psotrack.inside_out.filtering.path_rows import PoseRow, path_of
+from psotrack.inside_out.filtering.pose_filter import Following, PoseFilterParams, advance, expected, step
 from psotrack.inside_out.frames import Frame, Source, read_ahead
 from psotrack.inside_out.marker_map import MarkerMap
-from psotrack.inside_out.path_rows import PoseRow, path_of
 from psotrack.inside_out.pose import Expected, MarkerPose, PoseSettings, locate
-from psotrack.inside_out.pose_filter import Following, PoseFilterParams, advance, expected, step
 from psotrack.progress import Report, silent
 from psotrack.trajectories import Status
 

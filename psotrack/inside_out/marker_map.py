@@ -1,7 +1,7 @@
 """`MarkerMap`: where the corners of markers are in a room, and its table, read with every doubt spoken out.
 
 A table that is wrong is found by its geometry where that is beyond doubt: a marker is a flat square that faces the
-room. What is off by less than that is found from a video: see `map_check`.
+room. What is off by less than that is found from a video: see `mapping.check`.
 """
 
 from __future__ import annotations

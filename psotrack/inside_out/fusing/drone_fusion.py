@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.inside_out.camera_path import CameraPath
-from psotrack.inside_out.error_models import CHI2_3_MEDIAN, expected_model, fitted
-from psotrack.inside_out.gating import gated
-from psotrack.inside_out.joint_filter import INSIDE, OUTSIDE, Arm, ErrorModel, Joint, Readings, smooth
-from psotrack.inside_out.mounting import Mounted, mounted, robust_arm, swept_m2
+from psotrack.inside_out.fusing.error_models import CHI2_3_MEDIAN, expected_model, fitted
+from psotrack.inside_out.fusing.gating import gated
+from psotrack.inside_out.fusing.joint_filter import INSIDE, OUTSIDE, Arm, ErrorModel, Joint, Readings, smooth
+from psotrack.inside_out.fusing.mounting import Mounted, mounted, robust_arm, swept_m2
 from psotrack.trajectories import Status
 
 #: The point of a drone whose track it is: the centre of its camera, or the middle of its silhouette.

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.inside_out.manifold import (
+from psotrack.inside_out.filtering.manifold import (
     right_jacobian,
     right_jacobian_inverse,
     rotation_matrices,

@@ -3,7 +3,7 @@
 The pose of all markers together is the first start (SQPnP of Terzakis & Lourakis, ECCV 2020). Where it does not
 explain most of them, some are wrong, and the poses of pairs are starts (AP3P of Ke & Roumeliotis, CVPR 2017), as in
 random sample consensus (Fischler & Bolles, CACM 24(6), 1981). Markers in a plane have a second pose, turned over (IPPE
-of Collins & Bartoli, IJCV 2014). `pose_fit` makes the most likely starts precise; which pose it is, likelihoods tell,
+of Collins & Bartoli, IJCV 2014). `fit` makes the most likely starts precise; which pose it is, likelihoods tell,
 and where the camera is expected.
 """
 
@@ -21,8 +21,8 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.cameras import NEAR_M, Camera, undistort
 from psotrack.errors import InputError, SettingsError, check_positive
-from psotrack.inside_out.pose_equations import Seen, seen_markers
-from psotrack.inside_out.pose_fit import MIN_CORNERS, Fit, fit
+from psotrack.inside_out.pose.equations import Seen, seen_markers
+from psotrack.inside_out.pose.fit import MIN_CORNERS, Fit, fit
 
 _Start = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]
 

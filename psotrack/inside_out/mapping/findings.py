@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.inside_out.map_start import Placed
+from psotrack.inside_out.mapping.start import Placed
 
 #: Standard deviations that make a difference one.
 _SURE = 5.0

@@ -1,6 +1,6 @@
 """Where a camera is, on the fly: a causal filter over the poses that single frames tell.
 
-`init`, `predict` and `update` (of `pose_bank`) are the filter of one motion, frame by frame; a pose that does not fit
+`init`, `predict` and `update` (of `bank`) are the filter of one motion, frame by frame; a pose that does not fit
 is gated: it does not count. `step` follows a camera with them. It confirms a start, tells nothing after too long a
 gap, and starts anew where poses agree with one another but not with the state: none of them may be wrong for ever.
 `follow` is a loop over `step`.
@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psotrack.inside_out.camera_path import CameraPath, Flag
-from psotrack.inside_out.path_rows import PoseRow, path_of, rows_of
-from psotrack.inside_out.pose_bank import (
+from psotrack.inside_out.filtering.bank import (
     MeasuredPose,
     PoseEstimate,
     PoseFilterParams,
@@ -25,6 +24,7 @@ from psotrack.inside_out.pose_bank import (
     predict,
     update,
 )
+from psotrack.inside_out.filtering.path_rows import PoseRow, path_of, rows_of
 from psotrack.trajectories import Status
 
 __all__ = [

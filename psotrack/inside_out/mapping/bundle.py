@@ -21,8 +21,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import GATE, spread_px
-from psotrack.inside_out.map_scene import Scene, linearised, outward, residuals_px
-from psotrack.inside_out.map_sightings import Sightings
+from psotrack.inside_out.mapping.scene import Scene, linearised, outward, residuals_px
+from psotrack.inside_out.mapping.sightings import Sightings
 
 #: Relative change of the cost that ends the search; of the robust one, which only finds the outliers.
 _SETTLED, _SETTLED_ROBUST = 1e-9, 1e-3

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from psotrack.calibration import reproject
 from psotrack.cameras import NEAR_M
-from psotrack.inside_out.map_sightings import SQUARE, Sightings
+from psotrack.inside_out.mapping.sightings import SQUARE, Sightings
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Scene:
         R_cam_world: (views, 3, 3).
         t_m: (views, 3), of world to camera.
         ids: (markers,), increasing.
-        R_world_marker: (markers, 3, 3), from a marker's own axes, see `map_sightings.SQUARE`.
+        R_world_marker: (markers, 3, 3), from a marker's own axes, see `sightings.SQUARE`.
         centre_m: (markers, 3), world.
         side_m: (markers,).
         inset_px: (videos,), by how much the sides of squares are found too far inside.

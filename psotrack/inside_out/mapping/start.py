@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.cameras import NEAR_M, undistort
-from psotrack.inside_out.map_bundle import improved
-from psotrack.inside_out.map_scene import Scene
-from psotrack.inside_out.map_sightings import SQUARE, Sightings, two_poses
+from psotrack.inside_out.mapping.bundle import improved
+from psotrack.inside_out.mapping.scene import Scene
+from psotrack.inside_out.mapping.sightings import SQUARE, Sightings, two_poses
 
 #: Views that a marker's poses are taken from, and tried in.
 _TRIED = 24

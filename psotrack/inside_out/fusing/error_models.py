@@ -15,7 +15,7 @@ from jaxtyping import Float
 from scipy.optimize import minimize
 from scipy.special import gammaincinv
 
-from psotrack.inside_out.joint_filter import (
+from psotrack.inside_out.fusing.joint_filter import (
     OUTSIDE,
     Arm,
     ErrorModel,

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from psotrack.evaluation.plots import COLOURS, save
 from psotrack.inside_out.camera_path import CameraPath
-from psotrack.inside_out.comparison import Comparison
+from psotrack.inside_out.comparison.comparing import Comparison
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -18,8 +18,8 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from psotrack import time_shift
-from psotrack.inside_out import comparison_clocks as clocks
 from psotrack.inside_out.camera_path import CameraPath, roll_pitch_yaw_deg
+from psotrack.inside_out.comparison import clocks as clocks
 
 _MEAN_STEPS = 10
 

@@ -1,4 +1,4 @@
-"""The filter of one camera's motion: `pose_motion` at several levels of agility, and what they tell together.
+"""The filter of one camera's motion: `motion` at several levels of agility, and what they tell together.
 
 Nobody knows how wildly a drone flies. So the same filter runs as if it hovered, flew and raced, and levels count by
 how well they foretold the poses of late (multiple models: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with
@@ -16,9 +16,9 @@ from jaxtyping import Float
 from scipy.special import chdtri
 
 from psotrack.errors import InputError, SettingsError, check_positive
-from psotrack.inside_out import pose_motion
-from psotrack.inside_out.manifold import rotation_matrices
-from psotrack.inside_out.pose_motion import POSE, Innovation, Levels, Motion
+from psotrack.inside_out.filtering import motion as pose_motion
+from psotrack.inside_out.filtering.manifold import rotation_matrices
+from psotrack.inside_out.filtering.motion import POSE, Innovation, Levels, Motion
 
 #: Accelerations (m/s2, along each axis) and changes of the turn rate within a second (rad/s, about each axis) that are
 #: tried, each with each: hovering, flying, racing.

@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.inside_out import pose_motion
 from psotrack.inside_out.camera_path import CameraPath
-from psotrack.inside_out.manifold import right_jacobian_inverse
-from psotrack.inside_out.path_rows import PoseRow, path_of, rows_of
-from psotrack.inside_out.pose_bank import LEVELS, PoseEstimate, PoseFilterParams, right_pose
-from psotrack.inside_out.pose_filter import Following, lost, measured, step, told_row
-from psotrack.inside_out.pose_motion import POSE, Levels, Motion
+from psotrack.inside_out.filtering import motion as pose_motion
+from psotrack.inside_out.filtering.bank import LEVELS, PoseEstimate, PoseFilterParams, right_pose
+from psotrack.inside_out.filtering.manifold import right_jacobian_inverse
+from psotrack.inside_out.filtering.motion import POSE, Levels, Motion
+from psotrack.inside_out.filtering.path_rows import PoseRow, path_of, rows_of
+from psotrack.inside_out.filtering.pose_filter import Following, lost, measured, step, told_row
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from jaxtyping import Float, Shaped
 
 from psotrack.delimited import write_rows
 from psotrack.files import refuse_to_overwrite
-from psotrack.inside_out.fusing import Fused
+from psotrack.inside_out.fusing.fused import Fused
 from psotrack.trajectories import Status
 
 #: What `Fused.source` means.

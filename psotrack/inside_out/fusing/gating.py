@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import gammaincinv
 
-from psotrack.inside_out.joint_filter import (
+from psotrack.inside_out.fusing.joint_filter import (
     Arm,
     ErrorModel,
     Readings,

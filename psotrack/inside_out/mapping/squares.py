@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from psotrack.datasets.dpjait import MarkerRow, read_marker_rows, split_label
 from psotrack.errors import InputError
-from psotrack.inside_out.map_sightings import SQUARE
+from psotrack.inside_out.mapping.sightings import SQUARE
 from psotrack.inside_out.marker_map import SQUARE_TOLERANCE, MarkerMap, normals, sides_m
 from psotrack.mocap import read_c3d
 

@@ -16,10 +16,10 @@ from jaxtyping import Float, Int
 from psotrack.errors import InputError
 from psotrack.evaluation.association import GATE_M, UNASSIGNED
 from psotrack.inside_out.camera_path import CameraPath
-from psotrack.inside_out.drone_fusion import DroneFusion, DroneTrack, Point, fuse_drone, path_alone
-from psotrack.inside_out.mounting import Mounted, mounted, robust_arm
-from psotrack.inside_out.outside_tracks import OutsideTracks, picked, spread
-from psotrack.inside_out.pairing import Pairing, paired
+from psotrack.inside_out.fusing.drone_fusion import DroneFusion, DroneTrack, Point, fuse_drone, path_alone
+from psotrack.inside_out.fusing.mounting import Mounted, mounted, robust_arm
+from psotrack.inside_out.fusing.outside_tracks import OutsideTracks, picked, spread
+from psotrack.inside_out.fusing.pairing import Pairing, paired
 from psotrack.synchronisation import Offset, find_offset
 from psotrack.trajectories import Status, Trajectories
 

@@ -2,7 +2,7 @@
 
 Which corners and markers fit, studentised residuals tell: residuals in units of their own standard deviations (Cook &
 Weisberg, Residuals and influence in regression, 1982, section 2.2). The covariance is the inverse of the information,
-with the inset and the markers' places integrated out (see `pose_equations`).
+with the inset and the markers' places integrated out (see `equations`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Shaped
 
 from psotrack.calibration import spread_px
 from psotrack.cameras import NEAR_M
-from psotrack.inside_out.pose_equations import (
+from psotrack.inside_out.pose.equations import (
     INSET_STD_PX,
     PRIOR_RESIDUALS,
     Noise,

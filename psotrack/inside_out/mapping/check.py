@@ -15,12 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import spread_px
 from psotrack.errors import InputError
-from psotrack.inside_out.map_bundle import adjust, improved
-from psotrack.inside_out.map_findings import CheckedMarker, MapFinding, findings_of
-from psotrack.inside_out.map_scene import Scene, residuals_px
-from psotrack.inside_out.map_sightings import Sightings
-from psotrack.inside_out.map_squares import best_square
-from psotrack.inside_out.map_start import GROWTHS, Beginning, Placed, placed_of, scene_of
+from psotrack.inside_out.mapping.bundle import adjust, improved
+from psotrack.inside_out.mapping.findings import CheckedMarker, MapFinding, findings_of
+from psotrack.inside_out.mapping.scene import Scene, residuals_px
+from psotrack.inside_out.mapping.sightings import Sightings
+from psotrack.inside_out.mapping.squares import best_square
+from psotrack.inside_out.mapping.start import GROWTHS, Beginning, Placed, placed_of, scene_of
 from psotrack.inside_out.marker_map import MarkerMap
 
 #: Times the usual residual that half of a marker's corners are off by, where it is not where the map has it.

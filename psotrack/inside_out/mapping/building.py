@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.errors import InputError, check_positive
-from psotrack.inside_out.map_bundle import Adjusted, adjust
-from psotrack.inside_out.map_scene import Scene
-from psotrack.inside_out.map_sightings import SQUARE, Sightings
-from psotrack.inside_out.map_squares import best_square
-from psotrack.inside_out.map_start import Beginning, Placed, begin, placed_of, scene_of
+from psotrack.inside_out.mapping.bundle import Adjusted, adjust
+from psotrack.inside_out.mapping.scene import Scene
+from psotrack.inside_out.mapping.sightings import SQUARE, Sightings
+from psotrack.inside_out.mapping.squares import best_square
+from psotrack.inside_out.mapping.start import Beginning, Placed, begin, placed_of, scene_of
 from psotrack.inside_out.marker_map import MarkerMap
 
 #: Views that the first idea is from; the rest is needed for markers that none of them shows.
