@@ -26,12 +26,16 @@ def written_whole(path: Path) -> Iterator[Path]:
     the suffix of `path`, because writers of videos and images choose their format by it.
 
     Raises:
-        OutputError: the folder cannot be written, or the disk is full.
+        OutputError: the folder cannot be written, the disk is full, or a file is to take a folder's place.
     """
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.partial{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
+        if path.is_dir() and not temporary.is_dir():
+            # Whoever names a folder for a file does not mean to lose what is in it.
+            remedy = "name a file; what is in the folder is unchanged"
+            raise OutputError(path, expected="a file to write", found="a folder", remedy=remedy)
         _replace(temporary, path)
     except OSError as error:
         reason = f"{error.strerror or error} ({temporary.name})"

@@ -169,3 +169,16 @@ def test_progress_is_quiet_where_there_is_no_terminal(report, capfd):
     out, err = capfd.readouterr()
     assert out == ""
     assert err.strip() == ""
+
+
+def test_a_file_never_takes_the_place_of_a_folder(tmp_path):
+    """It did, where --force allowed it, and what was in the folder was gone."""
+    folder = tmp_path / "frames.csv"
+    folder.mkdir()
+    (folder / "mine.png").write_bytes(b"mine")
+    with (
+        pytest.raises(OutputError, match=r"expected a file to write, found a folder"),
+        written_whole(folder) as temporary,
+    ):
+        temporary.write_text("a,b")
+    assert [path.name for path in tmp_path.rglob("*")] == ["frames.csv", "mine.png"]

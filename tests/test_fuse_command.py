@@ -1,6 +1,7 @@
 """`psotrack fuse` on files: tracks that other commands read, a report, and one line for what is wrong."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,6 +22,10 @@ def files(tmp_path_factory):
     outside.position_m[60:, [0, 1]] = outside.position_m[60:, [1, 0]]
     paths["dron1"] = without(paths["dron1"], slice(20, 30))
     write_trajectories(folder / "tracks.csv", unseen(outside, slice(80, 90)))
+    write_trajectories(
+        folder / "elsewhere.csv", replace(outside, position_m=outside.position_m + np.array([0.0, 50.0, 0.0]))
+    )
+    write_camera_path(folder / "blind.csv", without(paths["dron1"], slice(0, 100)), "dron3")
     for name, path in paths.items():
         write_camera_path(folder / f"{name}.csv", path, name)
     return folder, truths
@@ -98,6 +103,27 @@ def test_options(files, tmp_path) -> None:
         (["tracks.csv", "tracks.csv", "--out", "new.csv"], InputError, "a camera's path with orientations"),
         (["dron1.csv", "none.csv", "--out", "new.csv"], InputError, "none.csv"),
         (["dron1.csv", "tracks.csv", "--out", "dron2.csv"], OutputError, "pass --force to replace it"),
+        (
+            ["dron1.csv", "tracks.csv", "--out", "new.csv", "--json", "tracks.csv"],
+            OutputError,
+            "tracks.csv: expected no such file yet",
+        ),
+        (
+            ["dron1.csv", "tracks.csv", "--out", "new.csv", "--json", "new.csv"],
+            SettingsError,
+            "--json: expected another file than --out",
+        ),
+        (
+            ["dron1.csv", "tracks.csv", "--out", "new.csv", "--max-offset", "-1"],
+            SettingsError,
+            "--max-offset: expected a number above 0, found -1",
+        ),
+        (
+            ["blind.csv", "tracks.csv", "--out", "new.csv"],
+            InputError,
+            "blind.csv: expected a pose in at least",
+        ),
+        (["dron1.csv", "blind.csv", "--out", "new.csv"], InputError, "blind.csv: expected a position in at"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line(files, words, error, sentence) -> None:
@@ -108,6 +134,18 @@ def test_what_is_wrong_is_said_in_one_line(files, words, error, sentence) -> Non
     assert sentence in str(done.exception).replace(f"{folder}/", "")
     assert "\n" not in str(done.exception)
     assert not (folder / "new.csv").exists()
+
+
+def test_tracks_of_another_recording_are_said_not_to_be_fused(files, tmp_path) -> None:
+    folder, _ = files
+    done = run(folder / "dron1.csv", folder / "elsewhere.csv", "--out", tmp_path / "fused.csv")
+    assert "dron1: no track, kept as it is" in done.output
+    assert "nothing was fused, as no path is near a track" in done.output.splitlines()[-1]
+    done = run(
+        folder / "dron1.csv", folder / "blind.csv", folder / "tracks.csv", "--out", tmp_path / "two.csv"
+    )
+    assert "dron3: no track" in done.output
+    assert "nothing was fused" not in done.output
 
 
 def test_help_shows_examples() -> None:

@@ -200,6 +200,27 @@ def test_frames_with_few_markers_or_none_are_ordinary_and_said(room, tmp_path):
     assert np.isnan(raw.position_m[[FEW, NONE]]).all()
 
 
+@pytest.mark.parametrize(
+    ("options", "doubt"),
+    [
+        (["--fov", "70,55.4", "--dictionary", "5x5_1000"], "no frame shows a marker of the map: are --dictionary"),
+        (["--fov", "70,55.4", "--min-markers", "14"], "of the map: --min-markers asks for 14"),
+        (["--fov", "20,70"], "no pose fits the markers: are --markers, and --camera or --fov, the right ones?"),
+        (["--fov", "70,55.4", "--frames", "1"], "the filter took none of 1 poses: --no-filter keeps them"),
+        (["--fov", "70,55.4", "--frames", "1", "--no-filter"], None),
+    ],
+)  # fmt: skip
+def test_without_any_pose_the_answer_says_what_to_look_at(room, tmp_path, options, doubt):
+    said = run(room.video, "--markers", room.markers, *options, "--out", tmp_path / "track.csv").output
+    if doubt is None:
+        assert "flight in 1 of 1 frames" in said
+        assert "?" not in said
+    else:
+        assert "flight in 0 of" in said
+        assert doubt in said
+    assert said.count("\n") == 1
+
+
 def test_fewer_markers_are_allowed_and_flagged(room, tmp_path):
     out = tmp_path / "track.csv"
     run(
@@ -484,12 +505,14 @@ def test_nothing_is_overwritten(room, tmp_path):
         (["VIDEO", "--fov", "70,55", "--frames", "99"], r"frames: expected 1 to 12, the frames of .*avi, found 99"),
         (["VIDEO", "--fov", "70,55", "--dictionary", "3x3"], r"dictionary: expected one of"),
         (["VIDEO", "--fov", "70,55", "--drone", "dron1"], r"--drone: expected a folder with videos of drones' own"),
+        (["0", "--fov", "70,55"], r"0: expected a video, found no such file; pass --live if it is a camera's number"),
+        (["VIDEO", "--fov", "70,55", "--json", "OUT"], r"--json: expected another file than --out"),
         (["IMAGES", "--fov", "70,55"], r"--fps: expected frames per second of the images in .*images, found none"),
         (["IMAGES", "--fov", "70,55", "--fps", "0"], r"--fps: expected a number above 0, found 0"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_one_line(room, tmp_path, arguments, message):
-    words = {"VIDEO": room.video, "IMAGES": room.folder / "images"}
+    words = {"VIDEO": room.video, "IMAGES": room.folder / "images", "OUT": tmp_path / "track.csv"}
     with pytest.raises((InputError, SettingsError), match=message) as error:
         run(
             *[words.get(word, word) for word in arguments],
@@ -512,6 +535,18 @@ def test_images_of_two_sizes_name_the_one_that_differs(tmp_path):
         cv2.imwrite(str(tmp_path / name), np.zeros(shape, np.uint8))
     with pytest.raises(InputError, match=r"a2.png: expected 30 x 20 pixels as a1.png has, found 32 x 20"):
         list(open_source(tmp_path, fps=25.0).frames())
+
+
+def test_a_folder_that_may_not_be_read_is_named(tmp_path, monkeypatch):
+    def refused(_):
+        raise PermissionError(13, "Permission denied")
+
+    # Whoever runs tests as root may read everything.
+    monkeypatch.setattr(Path, "iterdir", refused)
+    with pytest.raises(InputError, match="expected a folder to read, found permission denied"):
+        open_source(tmp_path)
+    with pytest.raises(InputError, match="expected a folder to read, found permission denied"):
+        run(tmp_path, "--markers", "corners.csv", "--fov", "70,55", "--out", tmp_path / "track.csv")
 
 
 def test_a_broken_image_is_named(tmp_path):

@@ -1,6 +1,7 @@
 """`psotrack map-markers` on real files: measured corners, a video, a sequence of the dataset, and a wrong map."""
 
 import json
+import re
 import shutil
 
 import cv2
@@ -13,6 +14,7 @@ from psotrack.cameras import camera, look_at, project, stack
 from psotrack.cli.map_markers import FOUND, map_markers
 from psotrack.datasets.dpjait import read_marker_corners, write_marker_corners
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
+from psotrack.inside_out.lens_files import scaled
 from psotrack.inside_out.marker_map import MarkerMap
 from psotrack.lenses import marker_dictionary
 from psotrack.mocap import write_c3d
@@ -228,7 +230,7 @@ def test_measured_corners_in_another_order_are_told(tmp_path):
         (
             ["{walk}", "--out", "{new}", "--known", "7", "--side", "-1"],
             SettingsError,
-            "side_m: expected a number above 0",
+            "--side: expected a number above 0",
         ),
         (["{walk}", "--check", "{walk}"], InputError, "walk.avi: expected text"),
         (["{gone}", "--check", "{truth}", "--fov", "90,60"], InputError, "gone.avi: expected a video"),
@@ -240,7 +242,23 @@ def test_measured_corners_in_another_order_are_told(tmp_path):
         (
             ["{walk}", "--check", "{truth}", "--fov", "75.5,60.3", "--dictionary", "5x5_50"],
             InputError,
-            "that show markers, found none",
+            "walk.avi: expected frames that show markers, found none",
+        ),
+        (
+            ["{walk}", "--out", "{new}", "--known", "99", "--side", "1", "--fov", "75.5,60.3"],
+            InputError,
+            "walk.avi: expected marker 99, that is known, beside others, found only 3, 7, 8, 21, 22",
+        ),
+        (
+            ["{walk}", "--check", "{truth}", "--fov", "75.5,60.3", "--frames", "25"],
+            SettingsError,
+            "--frames: expected 1 to 24, the frames of",
+        ),
+        (["{truth}", "--out", "{new}", "--json", "{new}"], SettingsError, "--json: expected another file"),
+        (
+            ["{truth}", "--out", "{new}", "--json", "{truth}"],
+            OutputError,
+            "truth.csv: expected no such file yet",
         ),
     ],
 )
@@ -263,3 +281,31 @@ def test_intrinsics_for_another_resolution(walk, tmp_path):
         expect=InputError,
     )
     assert "lens.toml: expected intrinsics for 960 x 720 pixels" in message
+    assert "pass --scale-camera" in message
+
+
+def test_intrinsics_of_the_same_images_twice_as_large(walk, tmp_path):
+    write_rig(tmp_path / "lens.toml", stack({"gopro": scaled(LENS, (2 * SIZE_WH[0], 2 * SIZE_WH[1]))}))
+    words = [walk / "walk.avi", "--check", walk / "truth.csv", "--camera", tmp_path / "lens.toml"]
+    assert "nothing disagrees" in invoke(*words, "--scale-camera")
+
+
+def test_the_rest_of_a_video_that_ends_early_is_used_as_its_message_says(walk, tmp_path):
+    whole = (walk / "walk.avi").read_bytes()
+    (tmp_path / "walk.avi").write_bytes(whole[: len(whole) * 2 // 3])
+    out = tmp_path / "corners.csv"
+    words = [
+        tmp_path / "walk.avi",
+        "--known",
+        7,
+        "--side",
+        SIDE_M,
+        "--camera",
+        walk / "lens.toml",
+        "--out",
+        out,
+    ]
+    message = invoke(*words, expect=InputError)
+    there = int(re.search(r"--frames (\d+) uses the rest", message)[1])
+    assert not out.exists()
+    assert f"from {there} frames" in invoke(*words, "--frames", there)

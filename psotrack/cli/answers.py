@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from psotrack.errors import SettingsError
 from psotrack.files import refuse_to_overwrite, written_whole
 from psotrack.progress import Report, silent, terminal
 
@@ -21,6 +22,17 @@ def say(quiet: bool, json_path: Path | None, sentence: str) -> None:
     """One sentence on stdout, unless that is silent or taken by JSON."""
     if not quiet and json_path != Path("-"):
         click.echo(sentence)
+
+
+def check_outputs(out: Path | None, json_path: Path | None, force: bool) -> None:
+    """Refuse, before any work, a table that is no CSV, files that are there, and one file for both."""
+    if out is not None and out.suffix != ".csv":
+        raise SettingsError("--out", expected="a file that ends in .csv", found=out.name)
+    for path in (out, json_path):
+        if path is not None and path != Path("-"):
+            refuse_to_overwrite(path, force)
+    if out is not None and json_path == out:
+        raise SettingsError("--json", expected="another file than --out", found=f"{out} twice")
 
 
 def answer(json_path: Path | None, content: Any, force: bool) -> None:

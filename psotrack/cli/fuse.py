@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from psotrack.cli.answers import answer, say
+from psotrack.cli.answers import answer, check_outputs, say
 from psotrack.cli.options import FORCE, JSON, QUIET
 
 if TYPE_CHECKING:
@@ -60,23 +60,28 @@ def fuse(
       psotrack fuse dron1.csv tracks.csv --out fused.csv --max-offset 5 --json -
       psotrack evaluate fused.csv data/Simulated_Data/S01_D2_A
     """
-    from psotrack.errors import InputError, SettingsError
-    from psotrack.files import refuse_to_overwrite
+    from psotrack.errors import InputError, check_positive
     from psotrack.inside_out.camera_path import read_camera_path
     from psotrack.inside_out.fusing import fuse as fuse_paths
     from psotrack.inside_out.fusing.fused_table import write_fused
     from psotrack.trajectory_files import read_trajectories
 
-    if out.suffix != ".csv":
-        raise SettingsError("--out", expected="a file that ends in .csv", found=out.name)
-    refuse_to_overwrite(out, force)
+    check_outputs(out, json_path, force)
+    if max_offset_s is not None:
+        check_positive("--max-offset", max_offset_s)
     paths: dict[str, CameraPath] = {}
     for file in inside:
         path, name = read_camera_path(file)
         if name in paths:
             raise InputError(file, expected="the path of another drone", found=f"a second one of {name}")
         paths[name] = path
-    fused = fuse_paths(paths, read_trajectories(outside), point=point, max_offset_s=max_offset_s)
+    tracks = read_trajectories(outside)
+    if not any(path.seen.any() for path in paths.values()):
+        where = ", ".join(map(str, inside))
+        raise InputError(where, expected="a pose in at least one frame", found="none")
+    if not tracks.seen.any():
+        raise InputError(outside, expected="a position in at least one frame", found="none")
+    fused = fuse_paths(paths, tracks, point=point, max_offset_s=max_offset_s)
     write_fused(out, fused, force=force)
     answer(json_path, _content(fused), force)
     for drone in fused.drones:
@@ -90,8 +95,15 @@ def fuse(
     say(
         quiet,
         json_path,
-        f"{out}: {fused.trajectories.num_drones} drones, {fused.trajectories.num_frames} frames",
+        f"{out}: {fused.trajectories.num_drones} drones, {fused.trajectories.num_frames} frames{_doubt(fused)}",
     )
+
+
+def _doubt(fused: Fused) -> str:
+    """What to look at where nothing was fused."""
+    if any(drone.tracks for drone in fused.drones):
+        return ""
+    return "; nothing was fused, as no path is near a track: are all of one recording, and of one clock?"
 
 
 def _sentence(drone: FusedDrone) -> str:

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from psotrack.cli.answers import answer, report_to, say
+from psotrack.cli.answers import answer, check_outputs, report_to, say
 from psotrack.cli.options import FORCE, FRAMES, JSON, QUIET, Numbers
 from psotrack.errors import InputError, SettingsError
-from psotrack.files import refuse_to_overwrite
 
 if TYPE_CHECKING:
     from psotrack.cameras import Camera
@@ -116,9 +115,7 @@ def localise(
     from psotrack.inside_out.marker_map import read_marker_map
     from psotrack.inside_out.pose import PoseSettings
 
-    for path in (out, json_path):
-        if path is not None and path != Path("-"):
-            refuse_to_overwrite(path, force)
+    check_outputs(out, json_path, force)
     given = _input(video, drone, fps, live)
     if markers is None and given.markers is None:
         raise SettingsError("--markers", expected="a table of corners", found="none")
@@ -148,13 +145,18 @@ def _input(video: str, drone: str | None, fps: float | None, live: bool) -> _Inp
 
     stream, folder = live or "://" in video, Path(video)
     of_folder = not stream and folder.is_dir()
+    if video.isdecimal() and not stream and not folder.exists():
+        raise InputError(
+            video, expected="a video", found="no such file", remedy="pass --live if it is a camera's number"
+        )
+    has_images = of_folder and holds_images(folder)
     onboard = read_onboard(folder) if of_folder else {}
     if not onboard:
         if drone is not None:
             raise SettingsError(
                 "--drone", expected="a folder with videos of drones' own cameras", found=video
             )
-        if of_folder and not holds_images(folder):
+        if of_folder and not has_images:
             raise InputError(folder, expected="images, or videos of drones' own cameras", found="neither")
         name = "camera" if stream else folder.name if of_folder else folder.stem
         return _Input(open_source(video, fps=fps, live=live), name)
@@ -175,22 +177,12 @@ def _lens(
     scale: bool,
     fov_deg: tuple[float, float] | None,
 ) -> Camera:
-    import numpy as np
+    from psotrack.inside_out.lens_files import chosen_lens, lens_of_matrix
 
-    from psotrack.cameras import camera
-    from psotrack.inside_out.lens_files import read_lens
-    from psotrack.lenses import lens_of_view
-
-    size_wh = given.source.image_size_wh
-    if camera_file is not None and fov_deg is not None:
-        raise SettingsError("lens", expected="--camera FILE or --fov H,V", found="both")
-    if fov_deg is not None:
-        return lens_of_view(*fov_deg, size_wh)
-    if camera_file is not None:
-        return read_lens(camera_file, size_wh, name=camera_name, scale=scale)
-    if given.onboard is None or given.onboard.K is None:
-        raise SettingsError("lens", expected="--camera FILE or --fov H,V", found="neither")
-    return camera(R=np.eye(3), t_m=np.zeros(3), K=given.onboard.K, image_size_wh=size_wh)
+    size_wh, K = given.source.image_size_wh, None if given.onboard is None else given.onboard.K
+    if camera_file is None and fov_deg is None and K is not None:
+        return lens_of_matrix(K, size_wh)
+    return chosen_lens(size_wh, path=camera_file, fov_deg=fov_deg, name=camera_name, scale=scale)
 
 
 def _content(found: Localised, video: str, name: str, min_markers: int) -> dict[str, Any]:
@@ -208,10 +200,12 @@ def _content(found: Localised, video: str, name: str, min_markers: int) -> dict[
         "drone": name,
         "frames": frames,
         "poses": int(path.seen.sum()),
+        "own_poses": int(found.raw.seen.sum()),
         "status": {status.label: int((path.status == status).sum()) for status in Status},
         "flags": {flag.label: _flagged(path, flag) for flag in Flag},
         "min_markers": min_markers,
         "median_markers": float(np.median(path.num_markers)),
+        "most_markers": int(path.num_markers.max()),
         "median_reprojection_px": float(np.median(shown)) if len(shown) else None,
         "interrupted": found.interrupted,
         "frames_per_second": found.frames_per_second,
@@ -231,9 +225,23 @@ def _sentence(out: Path, content: dict[str, Any]) -> str:
     error_px = content["median_reprojection_px"]
     return (
         f"{out}: {content['drone']} in {content['poses']} of {content['frames']} frames"
-        f"{f', {bridged} of them bridged' if bridged else ''}{f', {gated} poses gated' if gated else ''}; "
+        f"{f', {bridged} of them bridged' if bridged else ''}{f', {gated} gated' if gated else ''}; "
         f"median of {content['median_markers']:g} markers"
         f"{'' if error_px is None else f' that fit to {error_px:.2f} px'}; "
         f"{content['frames_per_second']:.1f} frames per second ({stages} ms)"
-        f"{'; ended by Ctrl-C' if content['interrupted'] else ''}"
+        f"{'; ended by Ctrl-C' if content['interrupted'] else ''}{_doubt(content)}"
     )
+
+
+def _doubt(content: dict[str, Any]) -> str:
+    """What to look at where no frame has a pose."""
+    most = content["most_markers"]
+    if content["poses"]:
+        return ""
+    if not most:
+        return "; no frame shows a marker of the map: are --dictionary and --markers those of this room?"
+    if content["own_poses"]:
+        return f"; the filter took none of {content['own_poses']} poses: --no-filter keeps them"
+    if most < content["min_markers"]:
+        return f"; no frame shows more than {most} markers of the map: --min-markers asks for {content['min_markers']}"
+    return "; no pose fits the markers: are --markers, and --camera or --fov, the right ones?"

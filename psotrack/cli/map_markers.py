@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
 
-from psotrack.cli.answers import answer, report_to, say
-from psotrack.cli.options import FORCE, JSON, QUIET, Numbers
-from psotrack.errors import InputError, SettingsError
-from psotrack.files import refuse_to_overwrite
+from psotrack.cli.answers import answer, check_outputs, report_to, say
+from psotrack.cli.options import FORCE, FRAMES, JSON, QUIET, Numbers
+from psotrack.errors import InputError, SettingsError, check_positive
 
 if TYPE_CHECKING:
     from psotrack.cameras import Camera
@@ -70,6 +69,7 @@ _MEASURED = {".c3d", ".csv", ".txt", ".tsv"}
     metavar="NAME,NAME...",
     help="Of the camera in FILE, where that has several: one for all videos, or one for each.",
 )
+@click.option("--scale-camera", is_flag=True, help="Scale intrinsics for another size of the same images.")
 @click.option("--fov", "fov_deg", type=Numbers(2), metavar="H,V", help="Instead: fields of view in degrees.")
 @click.option("--dictionary", default="4x4_1000", show_default=True, help="Of the markers.")
 @click.option(
@@ -79,6 +79,7 @@ _MEASURED = {".c3d", ".csv", ".txt", ".tsv"}
     metavar="X,Y,Z",
     help="A place that all measured markers face.  [default: their middle]",
 )
+@FRAMES
 @FORCE
 @QUIET
 @JSON
@@ -93,9 +94,11 @@ def map_markers(
     drones: str | None,
     camera_file: Path | None,
     camera_names: str | None,
+    scale_camera: bool,
     fov_deg: tuple[float, float] | None,
     dictionary: str,
     seen_from_m: tuple[float, float, float] | None,
+    num_frames: int | None,
     force: bool,
     quiet: bool,
     json_path: Path | None,
@@ -129,8 +132,9 @@ def map_markers(
         raise SettingsError(
             "map-markers", expected="--out FILE or --check MAP", found=" and ".join(given) or "neither"
         )
-    if out is not None:
-        refuse_to_overwrite(out, force)
+    check_outputs(out, json_path, force)
+    if side_m is not None:
+        check_positive("--side", side_m)
     if out is not None and sources[0].suffix.lower() in _MEASURED:
         if len(sources) > 1:
             raise SettingsError(
@@ -144,7 +148,8 @@ def map_markers(
     # What can be wrong is looked at before the videos are.
     marker_map = None if checked is None else read_marker_map(checked)
     world = {} if out is None else _world(known, table, side_m, sources)
-    videos = _videos(sources, drones, _Lenses(camera_file, camera_names, fov_deg))
+    videos = _videos(sources, drones, _Lenses(camera_file, camera_names, scale_camera, fov_deg))
+    videos = {name: (_leading(video, num_frames), lens) for name, (video, lens) in videos.items()}
     sightings = _sightings(videos, dictionary, quiet)
     if marker_map is not None:
         _answer_check(check_map(sightings, marker_map), Path(str(checked)), quiet, json_path, force)
@@ -190,23 +195,21 @@ class _Lenses:
 
     file: Path | None
     names: str | None
+    scale: bool
     fov_deg: tuple[float, float] | None
 
     def of(self, video: VideoInfo, index: int, count: int) -> Camera:
         """The lens of a video, number `index` of `count`."""
-        from psotrack.inside_out.lens_files import read_lens
-        from psotrack.lenses import lens_of_view
+        from psotrack.inside_out.lens_files import chosen_lens
 
-        if (self.file is None) == (self.fov_deg is None):
-            found = "neither" if self.file is None else "both"
-            raise SettingsError("lens", expected="--camera FILE or --fov H,V", found=found)
-        if self.file is None:
-            return lens_of_view(*(self.fov_deg or (0.0, 0.0)), video.image_size_wh)
         names = [None] if self.names is None else self.names.split(",")
         if len(names) not in (1, count):
             expected = f"one name, or one for each of {count} videos"
             raise SettingsError("--camera-name", expected=expected, found=f"{len(names)}")
-        return read_lens(self.file, video.image_size_wh, name=names[index % len(names)])
+        name = names[index % len(names)]
+        return chosen_lens(
+            video.image_size_wh, path=self.file, fov_deg=self.fov_deg, name=name, scale=self.scale
+        )
 
 
 def _videos(
@@ -228,8 +231,8 @@ def _videos(
 
 
 def _of_sequence(folder: Path, drones: str | None, lenses: _Lenses) -> dict[str, tuple[VideoInfo, Camera]]:
-    from psotrack.cameras import camera
     from psotrack.datasets.dpjait import read_sequence
+    from psotrack.inside_out.lens_files import lens_of_matrix
 
     onboard = read_sequence(folder).onboard or {}
     if not onboard:
@@ -246,9 +249,18 @@ def _of_sequence(folder: Path, drones: str | None, lenses: _Lenses) -> dict[str,
         if K is None or lenses.file is not None or lenses.fov_deg is not None:
             lens = lenses.of(video, index, len(chosen))
         else:
-            lens = camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=video.image_size_wh)
+            lens = lens_of_matrix(K, video.image_size_wh)
         videos[name] = (video, lens)
     return videos
+
+
+def _leading(video: VideoInfo, num_frames: int | None) -> VideoInfo:
+    if num_frames is None:
+        return video
+    if not 0 < num_frames <= video.num_frames:
+        expected = f"1 to {video.num_frames}, the frames of {video.path}"
+        raise SettingsError("--frames", expected=expected, found=f"{num_frames}")
+    return replace(video, num_frames=num_frames)
 
 
 def _sightings(videos: dict[str, tuple[VideoInfo, Camera]], dictionary: str, quiet: bool) -> Sightings:

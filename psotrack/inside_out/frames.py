@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from psotrack.errors import InputError, SettingsError, check_positive
-from psotrack.video import probe, read_frames
+from psotrack.video import probe, quiet, read_frames
 
 _Item = TypeVar("_Item")
 
@@ -158,7 +158,7 @@ def read_ahead(items: Iterator[_Item], *, newest: bool = False) -> Iterator[_Ite
 
 def holds_images(folder: Path) -> bool:
     """Whether a folder has images in it."""
-    return any(path.suffix.lower() in IMAGES for path in folder.iterdir())
+    return bool(_image_paths(folder))
 
 
 def natural_key(path: Path) -> list[tuple[int, str]]:
@@ -167,8 +167,16 @@ def natural_key(path: Path) -> list[tuple[int, str]]:
     return [(int(word), "") if word.isdecimal() else (-1, word) for word in words]
 
 
+def _image_paths(folder: Path) -> list[Path]:
+    try:
+        return sorted((path for path in folder.iterdir() if path.suffix.lower() in IMAGES), key=natural_key)
+    except OSError as error:
+        found = (error.strerror or str(error)).lower()
+        raise InputError(folder, expected="a folder to read", found=found) from error
+
+
 def _images(folder: Path, fps: float | None) -> Source:
-    paths = sorted((path for path in folder.iterdir() if path.suffix.lower() in IMAGES), key=natural_key)
+    paths = _image_paths(folder)
     if not paths:
         raise InputError(folder, expected=f"images, which end in {', '.join(IMAGES)}", found="none")
     if fps is None:
@@ -201,7 +209,8 @@ def _image(path: Path) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def _stream(address: str, fps: float | None, live: bool) -> Source:
-    capture = cv2.VideoCapture(int(address) if address.isdecimal() else address)
+    with quiet():
+        capture = cv2.VideoCapture(int(address) if address.isdecimal() else address)
     there, first = capture.read() if capture.isOpened() else (False, None)
     if not there or first is None:
         capture.release()

@@ -1,4 +1,4 @@
-"""The lens of the camera that is localised, from any file of cameras, checked against the size of its images."""
+"""The lens of a camera that is carried, from any file of cameras or its fields of view, for images of one size."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from psotrack.cameras import Camera, CameraRig, camera, stack
 from psotrack.datasets.dpjait import read_onboard_calibration
 from psotrack.delimited import read_table
-from psotrack.errors import InputError
+from psotrack.errors import InputError, SettingsError
+from psotrack.lenses import lens_of_view
 from psotrack.rig_files import read_lenses
 
 #: Of the image, that the optical axis may be off its middle, where a file does not say the size of its images.
@@ -19,6 +21,40 @@ _OFF_MIDDLE = 0.2
 _ASPECT = 2e-3
 
 Size = tuple[int, int]
+
+
+def chosen_lens(
+    image_size_wh: Size,
+    *,
+    path: Path | None,
+    fov_deg: tuple[float, float] | None,
+    name: str | None = None,
+    scale: bool = False,
+) -> Camera:
+    """The lens of a file as `read_lens` has it, or that of fields of view, whichever is given.
+
+    Args:
+        image_size_wh: width and height of the images in pixels.
+        path: of a calibration.
+        fov_deg: fields of view, horizontal and vertical, in degrees.
+        name: of the camera in the file.
+        scale: as of `read_lens`.
+
+    Raises:
+        InputError: as of `read_lens`.
+        SettingsError: both are given, or neither, or angles that no lens has.
+    """
+    if (path is None) == (fov_deg is None):
+        found = "neither" if path is None else "both"
+        raise SettingsError("lens", expected="--camera FILE or --fov H,V", found=found)
+    if fov_deg is not None:
+        return lens_of_view(*fov_deg, image_size_wh)
+    return read_lens(Path(str(path)), image_size_wh, name=name, scale=scale)
+
+
+def lens_of_matrix(K: Float[np.ndarray, "3 3"], image_size_wh: Size) -> Camera:
+    """A lens without distortion, at the world's origin."""
+    return camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=image_size_wh)
 
 
 def read_lens(path: Path, image_size_wh: Size, *, name: str | None = None, scale: bool = False) -> Camera:
@@ -73,7 +109,7 @@ def _cameras(path: Path, image_size_wh: Size) -> CameraRig:
     if path.suffix.lower() == ".csv" and read_table(path).find("focal_length_x") is not None:
         return stack(
             {
-                name: camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=size_wh)
+                name: lens_of_matrix(K, size_wh)
                 for name, (K, size_wh) in read_onboard_calibration(path).items()
             }
         )

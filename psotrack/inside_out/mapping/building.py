@@ -124,7 +124,7 @@ def _check_known(sightings: Sightings, known: list[int]) -> None:
     if not seen or not beside.any():
         found = "others beside it in no frame" if seen else f"only {', '.join(map(str, sightings.ids))}"
         raise InputError(
-            "video",
+            sightings.name,
             expected=f"marker {', '.join(map(str, known))}, that is known, beside others",
             found=found,
             remedy="name another one by --known",

@@ -63,7 +63,7 @@ def check_map(sightings: Sightings, marker_map: MarkerMap) -> Checkup:
     kept &= counts[sightings.view] >= 2
     if not kept.any():
         raise InputError(
-            "video",
+            sightings.name,
             expected="frames that show two markers of the map",
             found="none",
             remedy="is it this room?",

@@ -48,6 +48,7 @@ class Sightings:
         view: (sightings,), number of the view, not decreasing.
         marker: (sightings,), ids. No view has a marker twice.
         corners_px: (sightings, 4, 2).
+        name: of the videos, for messages.
     """
 
     lenses: tuple[Camera, ...]
@@ -56,6 +57,7 @@ class Sightings:
     view: Int[np.ndarray, " sightings"]
     marker: Int[np.ndarray, " sightings"]
     corners_px: Float[np.ndarray, "sightings 4 2"]
+    name: str = "video"
 
     @property
     def num_views(self) -> int:
@@ -77,6 +79,7 @@ class Sightings:
             view.reshape(-1),
             self.marker[kept],
             self.corners_px[kept],
+            self.name,
         )
 
 
@@ -118,10 +121,11 @@ def find_sightings(
                 found = detectors[source].detect(gray)
                 seen.append(Seen(source, index * step / video.fps, found.ids, found.corners_px))
                 advance(1)
-    return sightings_of(seen, [lens for _, lens in videos])
+    name = ", ".join(str(video.path) for video, _ in videos)
+    return sightings_of(seen, [lens for _, lens in videos], name)
 
 
-def sightings_of(seen: Iterable[Seen], lenses: Ordered[Camera]) -> Sightings:
+def sightings_of(seen: Iterable[Seen], lenses: Ordered[Camera], name: str = "video") -> Sightings:
     """The sightings in frames. A marker that is in a frame twice is left out of it: one of the two is another one.
 
     Raises:
@@ -142,7 +146,7 @@ def sightings_of(seen: Iterable[Seen], lenses: Ordered[Camera]) -> Sightings:
             rows += found
     if not rows:
         raise InputError(
-            "video",
+            name,
             expected="frames that show markers",
             found="none in any frame",
             remedy="is --dictionary the one that was printed?",
@@ -154,6 +158,7 @@ def sightings_of(seen: Iterable[Seen], lenses: Ordered[Camera]) -> Sightings:
         np.array([view for view, _, _ in rows]),
         np.array([marker for _, marker, _ in rows]),
         np.array([corners for _, _, corners in rows]),
+        name,
     )
 
 
