@@ -356,7 +356,8 @@ def evaluate(
     estimate = read_trajectories(tracks, fps=recording.fps)
     truth, offset_s = _reference(recording, estimate, offset)
     evaluation = compare(estimate, truth)
-    answer(json_path, evaluation.to_dict() | {"reference_offset_s": offset_s}, force)
+    content = evaluation.to_dict() | ({"reference_offset_s": offset_s} if offset else {})
+    answer(json_path, content, force)
     if plot is not None:
         picture = plot if plot.name else tracks.with_suffix(".png")
         plots.save_overview(picture, estimate, truth, force=force)
