@@ -412,7 +412,8 @@ def _print(
         return
     table = Table(box=box.HORIZONTALS, show_edge=False)
     for heading in headings:
-        table.add_column(heading, justify="left" if heading == "marker" else "right")
+        left = heading == "marker"
+        table.add_column(heading, justify="left" if left else "right", no_wrap="centre" in heading)
     for row in rows:
         table.add_row(*row)
     Console().print(table)

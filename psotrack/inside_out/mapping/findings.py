@@ -175,4 +175,6 @@ def _std(one: CheckedMarker) -> float:
 
 
 def _metres(length_m: float) -> str:
-    return f"{length_m:.2f} m" if length_m >= 0.1 else f"{1e3 * length_m:.0f} mm"
+    if length_m >= 0.1:
+        return f"{length_m:.2f} m"
+    return f"{1e3 * length_m:.{0 if length_m >= 0.01 else 1}f} mm"
