@@ -9,7 +9,7 @@ import msgspec
 
 from psotrack.detections import write_detections
 from psotrack.detector import Detector, detect
-from psotrack.errors import InputError
+from psotrack.files import digest_of
 from psotrack.progress import Report, silent
 from psotrack.sequence import Sequence
 
@@ -42,16 +42,10 @@ def stored_detections(
 def _key(detector: Detector, sequence: Sequence) -> str:
     """40 hexadecimal digits."""
     made_of = {
-        "model": _digest(detector.model),
+        "model": digest_of(detector.model),
         "settings": msgspec.to_builtins(detector.settings),
-        "videos": {name: [video.num_frames, _digest(video.path)] for name, video in sequence.videos.items()},
+        "videos": {
+            name: [video.num_frames, digest_of(video.path)] for name, video in sequence.videos.items()
+        },
     }
     return hashlib.blake2b(msgspec.json.encode(made_of, order="deterministic"), digest_size=20).hexdigest()
-
-
-def _digest(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "blake2b").hexdigest()
-    except OSError as error:
-        raise InputError(path, expected="a readable file", found=error.strerror or f"{error}") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import secrets
 import shutil
@@ -59,6 +60,19 @@ def read_text(path: Path) -> str:
         raise InputError(path, expected="a file to read", found=found) from error
     except UnicodeDecodeError as error:
         raise InputError(path, expected="text", found=f"a byte that is none at {error.start}") from error
+
+
+def digest_of(path: Path, expected: str = "a readable file") -> str:
+    """A file's content as hexadecimal digits (BLAKE2b), read piece by piece; `expected` says what it should be.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "blake2b").hexdigest()
+    except OSError as error:
+        raise InputError(path, expected=expected, found=error.strerror or f"{error}") from error
 
 
 def _replace(temporary: Path, path: Path) -> None:

@@ -21,7 +21,8 @@ import zarr
 from jaxtyping import UInt8
 from zarr.codecs import ZstdCodec
 
-from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.errors import OutputError, SettingsError
+from psotrack.files import digest_of
 from psotrack.foreground import ForegroundSettings, check_whole, coverage, foreground, learning_step
 from psotrack.progress import Advance
 from psotrack.video import VideoInfo, read_frames
@@ -77,16 +78,9 @@ def key_of(video: VideoInfo, settings: SilhouetteSettings) -> str:
     Raises:
         InputError: the video cannot be read.
     """
-    try:
-        with video.path.open("rb") as file:
-            content = hashlib.file_digest(file, "blake2b").hexdigest()
-    except OSError as error:
-        raise InputError(
-            video.path, expected="a readable video", found=error.strerror or f"{error}"
-        ) from error
     made_of = {
         "schema": SCHEMA,
-        "content": content,
+        "content": digest_of(video.path, "a readable video"),
         "num_frames": video.num_frames,
         "settings": msgspec.to_builtins(settings),
     }
