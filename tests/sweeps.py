@@ -42,24 +42,24 @@ def grid_file(folder: Path, iterations: list[int], runs: int = 1) -> Path:
     return path
 
 
-def started(root: Path, *words: object) -> subprocess.Popen[str]:
-    """`psotrack WORDS`, with the cache of the small sequence's folder."""
-    command = [sys.executable, "-m", "psotrack", *map(str, words)]
-    return subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(root)
-    )
-
-
 def environment(root: Path) -> dict[str, str]:
     """Of commands that use the cache of the small sequence's folder."""
     return os.environ | COMPILER | {name: str(root / folder) for name, folder in FOLDERS.items()}
 
 
-def psotrack(root: Path, *words: object) -> subprocess.CompletedProcess[str]:
-    """The same, until it has ended."""
-    process = started(root, *words)
-    out, err = process.communicate()
-    return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+def python(root: Path, *words: object, **more: str) -> subprocess.CompletedProcess[str]:
+    """`python WORDS`, with the cache of the small sequence's folder, until it has ended.
+
+    Whatever becomes of the test, no process is left to another one: there is nothing to wait for, and nothing to kill.
+    What is to die dies by itself, at a place in the program; no clock says when.
+    """
+    command = [sys.executable, *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, env=environment(root) | more, check=False)
+
+
+def psotrack(root: Path, *words: object, **more: str) -> subprocess.CompletedProcess[str]:
+    """The same of `psotrack WORDS`."""
+    return python(root, "-m", "psotrack", *words, **more)
 
 
 def small_sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -89,7 +89,7 @@ def all_rows(results: Path) -> pd.DataFrame:
     return pd.concat([pd.read_parquet(path) for path in files], ignore_index=True)
 
 
-def stamps(results: Path) -> dict[str, int]:
-    """When the file of each finished cell was written."""
-    cells = results / "cells"
-    return {path.name: path.stat().st_mtime_ns for path in cells.glob("*.parquet") if path.name[0] != "."}
+def stamps(results: Path) -> dict[str, tuple[int, int]]:
+    """Which file each finished cell is, and when it was written: some clocks of file systems tick slowly."""
+    found = [path for path in (results / "cells").glob("*.parquet") if path.name[0] != "."]
+    return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in found}

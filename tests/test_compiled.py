@@ -23,7 +23,7 @@ ANSWER = "0.958851"
 
 
 def run(folder: Path, **environment: str) -> list[str]:
-    """What the program prints; nothing must come on stderr."""
+    """What the program prints, a number and a folder; nothing must come on stderr."""
     result = subprocess.run(
         [sys.executable, "-c", PROGRAM, str(folder)],
         capture_output=True,
@@ -32,7 +32,7 @@ def run(folder: Path, **environment: str) -> list[str]:
         check=True,
     )
     assert result.stderr == ""
-    return result.stdout.split()
+    return result.stdout.rstrip("\n").split(" ", 1)
 
 
 def entry(folder: Path) -> Path:

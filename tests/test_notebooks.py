@@ -121,10 +121,12 @@ def test_notebook_runs_at_tiny_size(script, copies):
         "-p",
         "no:cacheprovider",
         "--nbmake",
+        # Five minutes for a cell, its default, are not enough for the compiler of any machine.
+        "--nbmake-timeout=7200",
         f"{script.stem}.ipynb",
     ]
     # Most of the time is the compiler's, at this size.
     environment = os.environ | {"PSOTRACK_NOTEBOOKS": "tiny", "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
-    ran = subprocess.run(command, cwd=copies, env=environment, capture_output=True, text=True, timeout=600)
+    ran = subprocess.run(command, cwd=copies, env=environment, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stdout + ran.stderr
     assert (copies / "data" / "tiny").exists() or script.stem == "table_5"

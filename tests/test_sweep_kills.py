@@ -1,4 +1,4 @@
-"""kill -9 at moments of chance: no finished cell is lost or run twice, and runners share what is left.
+"""kill -9 at lines of chance: no finished cell is lost or run twice, and runners share what is left.
 
 `PSOTRACK_KILLS=20 pytest -n 0 --log-cli-level=INFO tests/test_sweep_kills.py` does it more often, and says what it saw.
 """
@@ -7,11 +7,13 @@ import json
 import logging
 import os
 import random
-import time
-from pathlib import Path
+import signal
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from sweeps import all_rows, grid_file, small_sequence, stamps, started
+from sweeps import all_rows, grid_file, psotrack, python, small_sequence, stamps
+
+from psotrack.sweep.store import Store
 
 logger = logging.getLogger(__name__)
 
@@ -20,29 +22,30 @@ KILLS = int(os.environ.get("PSOTRACK_KILLS", "3"))
 #: Cells per kill: there is always something left.
 CELLS = 3
 
+#: `psotrack`, which kills itself before it runs the LINE-th line of what keeps results: python -c KILLED LINE WORDS.
+#: Between lines of anything else, nothing changes on the disk.
+KILLED = """
+import os, signal, sys
 
-def claims(results: Path) -> list[dict]:
-    return [json.loads(path.read_text() or "{}") for path in (results / "cells").glob("*.claim")]
+left = int(sys.argv.pop(1))
+keepers = tuple(f"psotrack/{name}.py" for name in ("files", "sweep/locks", "sweep/store"))
 
+def on_line(frame, event, argument):
+    global left
+    left -= event == "line"
+    if left == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return on_line
 
-def killed(root: Path, grid: Path, results: Path, rng: random.Random) -> None:
-    """Start a runner and kill it: while it starts and works at its first cell, or some cells later."""
-    before, more = len(stamps(results)), rng.choice([0, 0, 1, 2])
-    runner = started(root, "sweep", grid, "--data", root, "--out", results)
-    try:
-        until = time.monotonic() + 120
-        while (
-            not any(claim.get("process") == runner.pid for claim in claims(results))
-            or len(stamps(results)) < before + more
-        ):
-            assert runner.poll() is None, runner.communicate()
-            assert time.monotonic() < until, "it does nothing"
-            time.sleep(0.002)
-        # A first cell takes seconds, because the program is fetched; the others fractions of one.
-        time.sleep(rng.uniform(0, 0.4 if more else 4))
-    finally:
-        runner.kill()
-        runner.communicate()
+def on_call(frame, event, argument):
+    return on_line if frame.f_code.co_filename.endswith(keepers) else None
+
+sys.settrace(on_call)
+from psotrack.cli import main
+main()
+"""
+#: Measured: modules are imported until line 106; rows of cells are written from lines 363, 516, 669 and so on.
+LINES = range(106, 700)
 
 
 @pytest.mark.slow
@@ -50,22 +53,24 @@ def test_kills_lose_nothing_and_repeat_nothing(tmp_path_factory, tmp_path):
     root, results = small_sequence(tmp_path_factory), tmp_path / "results"
     rng = random.Random(KILLS)
     iterations = list(range(2, 2 + CELLS * KILLS))
-    grid = grid_file(tmp_path, iterations)
-    finished: dict[str, int] = {}
+    words = ("sweep", grid_file(tmp_path, iterations), "--data", root, "--out", results)
+    finished: dict[str, tuple[int, int]] = {}
     for number in range(KILLS):
-        killed(root, grid, results, rng)
+        line = rng.choice(LINES)
+        killed = python(root, "-c", KILLED, line, *words)
+        assert killed.returncode == -signal.SIGKILL, killed
         now = stamps(results)
         assert finished.items() <= now.items(), "a finished cell was lost or written again"
-        ended, at_work = len(now) - len(finished), len(claims(results))
-        logger.info("kill %d: %d cells finished, %d being run", number + 1, ended, at_work)
+        claims = len(list((results / "cells").glob("*.claim")))
+        logger.info("kill %d, line %d: %d cells finished, %d claimed", number + 1, line, len(now), claims)
         finished = now
     logger.info("%d of %d cells were finished by runners that were killed", len(finished), len(iterations))
-    two = [started(root, "sweep", grid, "--data", root, "--out", results, "--json", "-") for _ in range(2)]
-    ends = [(*runner.communicate(), runner.returncode) for runner in two]
-    assert [code for _, _, code in ends] == [0, 0], ends
-    counts = [json.loads(out) for out, _, _ in ends]
+    with ThreadPoolExecutor(2) as threads:
+        two = list(threads.map(lambda _: psotrack(root, *words, "--json", "-"), range(2)))
+    assert [runner.returncode for runner in two] == [0, 0], two
+    counts = [json.loads(runner.stdout) for runner in two]
     logger.info("then two runners finished %s", [count["finished"] for count in counts])
     assert sum(count["finished"] for count in counts) == len(iterations) - len(finished)
     assert finished.items() <= stamps(results).items()
     assert sorted(all_rows(results)["settings.iterations"]) == iterations
-    assert not claims(results)
+    assert Store(results).status()["at_work"] == []

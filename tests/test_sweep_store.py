@@ -35,7 +35,7 @@ def claim_of(store: Store) -> Path:
 
 
 def grown_old(path: Path) -> None:
-    past = time.time() - STALE_S - 1
+    past = time.time() - 2 * STALE_S
     os.utime(path, (past, past))
 
 
@@ -125,11 +125,12 @@ def test_a_claim_is_given_up_when_the_work_fails(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not Path("/proc/self/ns/pid").exists(), reason="processes of this machine cannot be seen")
 def test_the_claim_of_a_killed_process_of_this_machine_lapses_at_once(tmp_path: Path) -> None:
-    code = "import sys, time; from pathlib import Path; from psotrack.sweep.locks import claimed\n"
-    code += "with claimed(Path(sys.argv[1])):\n    print('claimed', flush=True)\n    time.sleep(600)"
+    code = "import sys; from pathlib import Path; from psotrack.sweep.locks import claimed\n"
+    code += "with claimed(Path(sys.argv[1])):\n    print('claimed', flush=True)\n    sys.stdin.read()"
     store = Store(tmp_path)
     command = [sys.executable, "-c", code, str(claim_of(store))]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as runner:
+    # What it waits for comes with the end of the block at the latest, however that is reached.
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as runner:
         assert runner.stdout is not None
         assert runner.stdout.readline() == "claimed\n"
         with store.claim(KEY) as while_it_lives:
@@ -185,7 +186,9 @@ def test_of_many_who_see_that_a_claim_is_nobodys_one_has_it(tmp_path: Path) -> N
     store, threads = Store(tmp_path), 8
     for _ in range(20):
         grown_old(planted(store, machine="another"))
-        begin, tried, got = threading.Barrier(threads), threading.Barrier(threads), []
+        # One that fails leaves the others waiting: not for ever.
+        begin, tried = (threading.Barrier(threads, timeout=300) for _ in range(2))
+        got: list[bool] = []
 
         def compete(begin=begin, tried=tried, got=got) -> None:
             begin.wait()
@@ -202,8 +205,11 @@ def test_of_many_who_see_that_a_claim_is_nobodys_one_has_it(tmp_path: Path) -> N
         assert not claim_of(store).exists()
 
 
-def test_who_lost_a_claim_does_not_remove_its_successors(tmp_path: Path) -> None:
-    """As after a machine was asleep."""
+def test_who_lost_a_claim_does_not_remove_its_successors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after a machine was asleep: its owner, too, so it does not touch the claim meanwhile."""
+    monkeypatch.setattr(locks, "HEARTBEAT_S", 3600.0)
     store = Store(tmp_path)
     with store.claim(KEY):
         grown_old(claim_of(store))
@@ -220,7 +226,7 @@ def test_claims_are_kept_alive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(locks, "HEARTBEAT_S", 0.01)
     with Store(tmp_path).claim(KEY):
         grown_old(claim_of(Store(tmp_path)))
-        until = time.monotonic() + 10
+        until = time.monotonic() + 300
         while owner_of(claim_of(Store(tmp_path))) is None:
             assert time.monotonic() < until
             time.sleep(0.01)

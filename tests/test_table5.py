@@ -44,7 +44,7 @@ def table5(data: Path, out: Path, grid: str = GRID) -> subprocess.CompletedProce
 
 
 def stamps(out: Path) -> dict[str, int]:
-    return {path.name: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
+    return {str(path.relative_to(out)): path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
 
 
 def test_tables_rows_and_figures_and_nothing_twice(data: Path, tmp_path: Path) -> None:

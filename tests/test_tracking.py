@@ -1,6 +1,8 @@
 """Drones that come and go, through the chunks of a recording whose silhouettes are drawn by casting rays."""
 
 import contextlib
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import jax
@@ -8,6 +10,7 @@ import numpy as np
 import pytest
 from helpers import ROOM_M, assert_same, draw_coverage, ring_rig
 
+from psotrack import tracking
 from psotrack.finishing import finished
 from psotrack.initialisation import Start
 from psotrack.sequence import Sequence
@@ -95,8 +98,21 @@ def test_a_run_of_a_batch_is_the_run_alone(batch, silhouettes, run):
 @pytest.mark.slow
 def test_whoever_interrupts_a_batch_is_heard(silhouettes, monkeypatch):
     """By the share of the first device; the others end with their chunk, of the six of the recording."""
-    read, chunks = Silhouettes.read, []
-    monkeypatch.setattr(Silhouettes, "read", lambda *of: chunks.append(of) or read(*of))
+    read, chunks, left = Silhouettes.read, [], threading.Event()
+
+    class Threads(ThreadPoolExecutor):
+        def shutdown(self, *options, **more):
+            left.set()
+            super().shutdown(*options, **more)
+
+    def read_late(*of):
+        # However slow the first share's thread is, it has left when the other begins with a chunk.
+        assert left.wait(300)
+        chunks.append(of)
+        return read(*of)
+
+    monkeypatch.setattr(tracking, "ThreadPoolExecutor", Threads)
+    monkeypatch.setattr(Silhouettes, "read", read_late)
 
     @contextlib.contextmanager
     def report(description, total):
