@@ -120,10 +120,10 @@ def at_times(found: CrossPoses, rate_hz: float, time_s: Float[np.ndarray, "times
         rate_hz: of the recording, whose frame 0 is at 0 s.
         time_s: (times,), in any order; outside of the recording there are none.
     """
-    before, after, share = between(len(found.bridged), rate_hz, time_s)
+    before, after, share = _between(len(found.bridged), rate_hz, time_s)
     inside = before >= 0
     # Where a time is a frame's, `after` is that frame too.
-    position_m = lerp(found.position_m, before, after, share)
+    position_m = _lerp(found.position_m, before, after, share)
     orientation_wxyz = np.full((len(time_s), 4), np.nan)
     turned = inside & np.isfinite(found.orientation_wxyz[[before, after], 0]).all(axis=0)
     if turned.any():
@@ -142,7 +142,7 @@ def at_times(found: CrossPoses, rate_hz: float, time_s: Float[np.ndarray, "times
     )
 
 
-def between(
+def _between(
     num_frames: int, rate_hz: float, time_s: Float[np.ndarray, "times"]
 ) -> tuple[Int[np.ndarray, "times"], Int[np.ndarray, "times"], Float[np.ndarray, "times"]]:
     """The frames before and after each time, both -1 outside of the recording, and the share of the way between."""
@@ -158,7 +158,7 @@ def between(
     )
 
 
-def lerp(
+def _lerp(
     values: Float[np.ndarray, "frames *rest"],
     before: Int[np.ndarray, "times"],
     after: Int[np.ndarray, "times"],

@@ -12,10 +12,10 @@ from itertools import product
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
 
 from psotrack.cameras import NEAR_M, Camera, distort, project, to_camera
 from psotrack.errors import SettingsError, check_positive
+from psotrack.rotations import rotation_matrices
 from psotrack.trajectories import Trajectories
 
 #: Where lenses are looked at: up to 80 degrees off the axis.
@@ -98,10 +98,8 @@ def _rotations(
     orientation_wxyz: Float[np.ndarray, "frames drones 4"],
 ) -> Float[np.ndarray, "frames drones 3 3"]:
     """From body to world; none for drones that never have an orientation, NaN where one is missing."""
-    known = np.isfinite(orientation_wxyz).all(axis=-1)
-    rotation = np.full((*known.shape, 3, 3), np.nan)
-    rotation[known] = Rotation.from_quat(orientation_wxyz[known], scalar_first=True).as_matrix()
-    rotation[:, ~known.any(axis=0)] = np.eye(3)
+    rotation = rotation_matrices(orientation_wxyz)
+    rotation[:, np.isnan(rotation[..., 0, 0]).all(axis=0)] = np.eye(3)
     return rotation
 
 

@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -28,11 +29,29 @@ from psotrack.tracking import Tracked, track_silhouettes
 
 
 @dataclass(frozen=True)
+class Point:
+    """Which point of a drone a track is of. Where the body's origin is from there no image shows.
+
+    Attributes:
+        drone: its number.
+        middle_of: "silhouette" or "box".
+        box_off_m, box_off_std_m: (3,), from the middle of its silhouette to that of its boxes along the world's axes,
+            and the standard error of that; None where nothing tells.
+    """
+
+    drone: int
+    middle_of: Literal["silhouette", "box"]
+    box_off_m: list[float] | None = None
+    box_off_std_m: list[float] | None = None
+
+
+@dataclass(frozen=True)
 class Way:
     """How a run went.
 
     Attributes:
         tracked: what it yielded.
+        points: of each drone, what its track is of.
         start: from where.
         bounds_m: (2, 3), lowest and highest corner of the room.
         input_keys: digests of what was read, by camera.
@@ -40,6 +59,7 @@ class Way:
     """
 
     tracked: Tracked
+    points: tuple[Point, ...]
     start: Start
     bounds_m: Float[np.ndarray, "2 3"]
     input_keys: Mapping[str, str]
@@ -79,7 +99,7 @@ def by_swarm(
         "track": (time.perf_counter() - began - compile_s) / len(settings),
     }
     return [
-        Way(tracked, start, bounds, silhouettes.keys, seconds)
+        Way(tracked, _middles_of("silhouette", tracked), start, bounds, silhouettes.keys, seconds)
         for tracked, start, bounds in zip(followed, starts, bounds_m, strict=True)
     ]
 
@@ -113,20 +133,27 @@ def by_lines(
     )
     before = {"decode": 0.0, "foreground": 0.0} if silhouettes is None else silhouettes.seconds
     seconds = {**before, "compile": tracked.compile_s, "track": time.perf_counter() - began}
-    return Way(tracked, start_of(tracked), bounds_m, keys, seconds)
+    return Way(tracked, _middles_of("box", tracked), start_of(tracked), bounds_m, keys, seconds)
 
 
 def by_both(swarm: Way, lines: Way, settings: TrackSettings, fps: float) -> Way:
     """What the two say together."""
     began = time.perf_counter()
-    tracked = fused(swarm.tracked, lines.tracked, settings, fps=fps)
+    tracked, middles = fused(
+        swarm.tracked, lines.tracked, settings, fps=fps, same_foreground=settings.detections == BLOBS
+    )
     seconds = {
         **swarm.seconds,
         "compile": swarm.seconds["compile"] + lines.seconds["compile"],
         "track": swarm.seconds["track"] + lines.seconds["track"] + time.perf_counter() - began,
     }
     keys = {**swarm.input_keys, **{f"detections of {name}": key for name, key in lines.input_keys.items()}}
-    return Way(tracked, swarm.start, swarm.bounds_m, keys, seconds)
+    known = len(swarm.points)
+    points = tuple(
+        Point(drone, "silhouette" if drone < known else "box", *told)
+        for drone, told in enumerate(zip(_told(middles.off_m), _told(middles.std_m), strict=True))
+    )
+    return Way(tracked, points, swarm.start, swarm.bounds_m, keys, seconds)
 
 
 def detection_files_of(sequence: Sequence, detections: str) -> Mapping[str, Path]:
@@ -145,6 +172,15 @@ def detection_files_of(sequence: Sequence, detections: str) -> Mapping[str, Path
             remedy="use --detections blobs",
         )
     return {name: path for name, path in sequence.detections.items() if name in sequence.rig.names}
+
+
+def _middles_of(what: Literal["silhouette", "box"], tracked: Tracked) -> tuple[Point, ...]:
+    return tuple(Point(drone, what) for drone in range(tracked.info.status.shape[1]))
+
+
+def _told(values: Float[np.ndarray, "drones 3"]) -> list[list[float] | None]:
+    """What is known of each drone, fit for JSON."""
+    return [None if np.isnan(value).any() else value.tolist() for value in values]
 
 
 def _starts(

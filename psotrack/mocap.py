@@ -18,7 +18,7 @@ import ezc3d
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.cross_poses import CrossPoses, at_times, between, completed, lerp, poses
+from psotrack.cross_poses import CrossPoses, at_times, completed, poses
 from psotrack.crosses import learn_cross
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.files import written_whole
@@ -115,21 +115,6 @@ def write_c3d(path: Path, markers: Markers) -> None:
         expected_bytes = num_frames * num_markers * 4 * 4
         if not temporary.is_file() or temporary.stat().st_size < expected_bytes:
             raise OutputError(path, expected="to write it", found="less than all of it written")
-
-
-def positions_at(
-    markers: Markers, time_s: Float[np.ndarray, "times"], offset_s: float = 0.0
-) -> Float[np.ndarray, "times markers 3"]:
-    """(times, markers, 3), world: the markers at the times of a video, NaN where they are not seen just then.
-
-    Between two frames they are interpolated linearly where both see them; no gap is bridged.
-
-    Args:
-        markers: a recording at any rate.
-        time_s: (times,), of the video.
-        offset_s: time in the recording at 0 s of the video; above 0 where the recording began first.
-    """
-    return lerp(markers.position_m, *between(len(markers.position_m), markers.rate_hz, time_s + offset_s))
 
 
 def body_trajectories(

@@ -167,6 +167,7 @@ def _finished(sequence: Sequence, settings: TrackSettings, way: Way) -> TrackedS
         "bounds_m": way.bounds_m.tolist(),
         "drones": _as_learned(tracked.sizes),
         "arrivals": [asdict(arrival) for arrival in tracked.arrivals],
+        "points": [asdict(point) for point in way.points],
         "encounters": [asdict(encounter) for encounter in identities.encounters],
         "input_keys": dict(way.input_keys),
         "seconds": {stage: round(value, 4) for stage, value in all_seconds.items()},

@@ -38,8 +38,8 @@ class TrackSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         drones: how many there are; None takes as many as `init` yields.
         drone_size_m: full lengths of every drone along x, y and z; None takes them from the first frames.
         learn_sizes: whether sizes are learned on the way; not where `drone_size_m` says them.
-        body_offset_m: from the body's origin to the middle of the silhouette, along the world's axes. Silhouettes do
-            not show where the origin is; who knows it may say.
+        body_offset_m: from the body's origin to the middle of the silhouette (with "projection-lines" of the box),
+            along the world's axes. Neither shows where the origin is; who knows it may say.
         bounds_m: lowest and highest x, y and z of the room: (x0, x1, y0, y1, z0, z1); None derives them from the
             cameras.
         max_speed_m_s: of a drone.

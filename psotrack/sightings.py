@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from psotrack.blobs import find_blobs
 from psotrack.cameras import CameraRig
@@ -31,6 +31,38 @@ _Image = tuple[int, int, np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
+class View:
+    """The sightings of one frame, in all cameras; NaN for none.
+
+    Attributes:
+        centre_px, size_px: (cameras, boxes, 2), middles and sides.
+        noise_px: (cameras, boxes), standard deviations of the middles.
+    """
+
+    centre_px: Float[np.ndarray, "cameras boxes 2"]
+    size_px: Float[np.ndarray, "cameras boxes 2"]
+    noise_px: Float[np.ndarray, "cameras boxes"]
+
+    def found(self, values: Float[np.ndarray, "cameras boxes *rest"]) -> list[np.ndarray]:
+        """What is known of the sightings of each camera, without the gaps: (found, ...) each."""
+        return [of[which] for of, which in zip(values, np.isfinite(self.noise_px), strict=True)]
+
+    def grouped(
+        self, values: Float[np.ndarray, "cameras boxes *rest"], detection: Int[np.ndarray, "groups cameras"]
+    ) -> Float[np.ndarray, "groups cameras *rest"]:
+        """What is known of the sightings of each group; NaN where a camera has none, which is -1.
+
+        Args:
+            values: of all boxes.
+            detection: (groups, cameras), numbers of sightings, without the gaps.
+        """
+        padded = np.full((values.shape[0], values.shape[1] + 1, *values.shape[2:]), np.nan)
+        for camera, found in enumerate(self.found(values)):
+            padded[camera, : len(found)] = found
+        return padded[np.arange(len(values)), detection]
+
+
+@dataclass(frozen=True)
 class Sightings:
     """Boxes in all frames of all cameras; the axis of boxes is as long as the fullest image needs.
 
@@ -48,6 +80,10 @@ class Sightings:
     def num_frames(self) -> int:
         """Number of frames."""
         return len(self.centre_px)
+
+    def at(self, frame: int) -> View:
+        """Those of a frame."""
+        return View(self.centre_px[frame], self.size_px[frame], self.noise_px[frame])
 
 
 def from_detections(detections: Mapping[str, Detections], rig: CameraRig, num_frames: int) -> Sightings:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.interpolate import CubicSpline
 from scipy.optimize import linear_sum_assignment, minimize_scalar
 from scipy.spatial.transform import Rotation
@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from psotrack.errors import InputError
 from psotrack.evaluation.association import GATE_M, UNASSIGNED, of_partners
 from psotrack.evaluation.standard_errors import standard_error
+from psotrack.rotations import rotation_matrices
 from psotrack.trajectories import Trajectories
 
 #: Gaps of a reference are bridged up to this, or to one and a half of its steps where that is more.
@@ -104,7 +105,7 @@ class Comparison:
             estimate.time_s.astype(np.float64),
             np.where(estimate.seen[..., None], estimate.position_m, np.nan).astype(np.float64),
             _interpolated(time_s, position_m),
-            None if orientation_wxyz is None else _interpolated(time_s, _matrices(orientation_wxyz)),
+            None if orientation_wxyz is None else _interpolated(time_s, rotation_matrices(orientation_wxyz)),
             with_lever_arm,
         )
 
@@ -203,7 +204,9 @@ def shifted(
     position_m = _interpolated(reference.time_s, reference.position_m)(time_s + offset_s)
     orientation_wxyz = None
     if reference.orientation_wxyz is not None:
-        rotation = _interpolated(reference.time_s, _matrices(reference.orientation_wxyz))(time_s + offset_s)
+        rotation = _interpolated(reference.time_s, rotation_matrices(reference.orientation_wxyz))(
+            time_s + offset_s
+        )
         orientation_wxyz = np.full((*rotation.shape[:2], 4), np.nan)
         known = np.isfinite(rotation).all(axis=(-2, -1))
         if known.any():
@@ -211,10 +214,26 @@ def shifted(
     return Trajectories(frame, time_s, reference.drones, position_m, orientation_wxyz=orientation_wxyz)
 
 
+def longest_gap_s(time_s: Float[np.ndarray, "samples"]) -> float:
+    """Gaps between samples are bridged up to this, which holds for all of their times, known or not."""
+    return max(MAX_GAP_S, 1.5 * float(np.median(np.diff(time_s))))
+
+
+def between_samples(
+    sample_s: Float[np.ndarray, "samples"], wanted_s: Float[np.ndarray, "times"], longest_s: float
+) -> Bool[np.ndarray, "times"]:
+    """Times that are at a sample, or between two that are no farther apart than that; of two samples or more."""
+    after = np.clip(np.searchsorted(sample_s, wanted_s), 1, len(sample_s) - 1)
+    before_s, after_s = wanted_s - sample_s[after - 1], sample_s[after] - wanted_s
+    inside = (np.minimum(before_s, after_s) >= 0) & (before_s + after_s <= longest_s)
+    # Samples themselves are known on both sides of a gap, but for rounding.
+    return inside | (np.minimum(np.abs(before_s), np.abs(after_s)) < 1e-9)
+
+
 def _interpolated(time_s: Float[np.ndarray, "samples"], values: np.ndarray) -> _At:
     """(times, drones, ...) of values (samples, drones, ...), by cubic splines; NaN outside, and in long gaps."""
     flat = values.reshape(*values.shape[:2], -1).astype(np.float64)
-    longest_s = max(MAX_GAP_S, 1.5 * float(np.median(np.diff(time_s))))
+    longest_s = longest_gap_s(time_s)
     known = [np.isfinite(flat[:, drone]).all(axis=-1) for drone in range(flat.shape[1])]
     # A spline takes two samples.
     splines = {
@@ -226,25 +245,12 @@ def _interpolated(time_s: Float[np.ndarray, "samples"], values: np.ndarray) -> _
     def at(wanted_s: Float[np.ndarray, "times"]) -> np.ndarray:
         found = np.full((len(wanted_s), *flat.shape[1:]), np.nan)
         for drone, (sample_s, spline) in splines.items():
-            after = np.clip(np.searchsorted(sample_s, wanted_s), 1, len(sample_s) - 1)
-            before_s, after_s = wanted_s - sample_s[after - 1], sample_s[after] - wanted_s
-            # Samples themselves are known on both sides of a gap, but for rounding.
-            inside = (np.minimum(before_s, after_s) >= 0) & (before_s + after_s <= longest_s)
-            inside |= np.minimum(np.abs(before_s), np.abs(after_s)) < 1e-9
+            inside = between_samples(sample_s, wanted_s, longest_s)
             if inside.any():
                 found[inside, drone] = spline(wanted_s[inside])
         return found.reshape(len(wanted_s), *values.shape[1:])
 
     return at
-
-
-def _matrices(
-    orientation_wxyz: Float[np.ndarray, "samples drones 4"],
-) -> Float[np.ndarray, "samples drones 3 3"]:
-    known = np.isfinite(orientation_wxyz).all(axis=-1)
-    matrices = np.full((*known.shape, 3, 3), np.nan)
-    matrices[known] = Rotation.from_quat(orientation_wxyz[known], scalar_first=True).as_matrix()
-    return matrices
 
 
 def _medians(values: Float[np.ndarray, "frames drones 3"]) -> Float[np.ndarray, "drones 3"]:

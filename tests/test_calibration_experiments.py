@@ -1,10 +1,17 @@
 """The commands behind the figures on calibration."""
 
+import runpy
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
+from helpers import moved, ring_rig
+from scipy.spatial.transform import Rotation
+
+from psotrack.cameras import CameraRig
 
 FOLDER = Path(__file__).parents[1] / "experiments" / "calibration"
 
@@ -19,3 +26,22 @@ def test_cameras_placed_by_twelve_points(tmp_path: Path) -> None:
     assert table["median (mm)"].between(2, 20).all()
     kept = pd.read_csv(FOLDER / "results" / "extrinsics.csv")
     assert list(kept.columns) == list(table.columns)
+
+
+def test_errors_of_a_rig_that_is_held_as_a_whole():
+    """The truth moved as a whole is no error of cameras, where that cannot be told; a camera that was pushed is."""
+    errors = runpy.run_path(str(FOLDER / "adjusting.py"))["errors"]
+    rig = ring_rig(5)
+    as_a_whole = moved(rig, Rotation.from_rotvec([1e-4, 2e-4, -1e-4]).as_matrix(), (1e-3, -2e-3, 1e-3))
+    off_m, off_deg = errors(as_a_whole, rig, rig, whole=True)
+    # Of 2 mm and 0.014 degrees; the motions are linear in them.
+    assert np.abs(off_m).max() < 1e-6
+    assert np.abs(off_deg).max() < 1e-5
+    off_m, off_deg = errors(as_a_whole, rig, rig, whole=False)
+    assert np.linalg.norm(off_m, axis=1).min() > 1e-3
+    T = rig.cameras.T_cam_world.copy()
+    T[2, 0, 3] += 0.05
+    pushed = CameraRig(rig.names, replace(rig.cameras, T_cam_world=T))
+    off_m, _ = errors(rig, pushed, pushed, whole=False)
+    np.testing.assert_allclose(np.linalg.norm(off_m, axis=1), [0, 0, 0.05, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(errors(rig, pushed, rig, whole=False)[0], 0, atol=1e-12)

@@ -6,10 +6,8 @@ import json
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -239,7 +237,12 @@ def test_projection_lines_from_the_sequence_a_folder_and_blobs(
     assert len(pd.read_csv(together)) == 4 * NUM_FRAMES
     keys = json.loads(together.with_suffix(".json").read_text())["input_keys"]
     assert set(keys) == {name for i in range(1, 9) for name in (f"cam{i}i", f"detections of cam{i}i")}
+    points = json.loads(together.with_suffix(".json").read_text())["points"]
+    assert {point["middle_of"] for point in points} == {"silhouette"}
+    # Both are within the drone, some centimetres thick.
+    assert all(0 < abs(point["box_off_m"][2]) < 0.1 and point["box_off_std_m"][2] > 0 for point in points)
     record = json.loads(tracks[0].with_suffix(".json").read_text())
+    assert [point["middle_of"] for point in record["points"]] == ["box"] * 4
     assert record["settings"]["method"] == "projection-lines"
     assert set(record["seconds"]) == {"decode", "foreground", "compile", "track", "finish", "total"}
     assert sorted(record["input_keys"]) == [f"cam{i}i" for i in range(1, 9)]
@@ -444,26 +447,31 @@ def test_a_full_disk_leaves_earlier_results(run: Run, data: Path, sequence: Path
     assert list(tmp_path.glob(".*")) == []
 
 
+#: `psotrack`, at which Ctrl-C is pressed when it makes the folder that is its first argument.
+INTERRUPTED = """
+import signal, sys
+
+folder = sys.argv.pop(1)
+
+def press(event, arguments):
+    if event == "os.mkdir" and str(arguments[0]) == folder:
+        signal.raise_signal(signal.SIGINT)
+
+sys.addaudithook(press)
+from psotrack.cli import main
+main()
+"""
+
+
 def test_ctrl_c_leaves_earlier_results(sequence: Path, tmp_path: Path) -> None:
     tracks, cache = tmp_path / "tracks.csv", tmp_path / "cache"
     tracks.write_text("earlier")
-    process = subprocess.Popen(
-        [
-            sys.executable,
-            "-m",
-            "psotrack",
-            *map(str, track(sequence, tracks, "--force", "--iterations", 100000)),
-        ],
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED, *map(str, (cache, *track(sequence, tracks, "--force")))],
         env={**os.environ, "PSOTRACK_CACHE": str(cache)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+        capture_output=True,
         text=True,
+        check=False,
     )
-    while not cache.exists():
-        assert process.poll() is None
-        time.sleep(0.05)
-    time.sleep(0.3)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
-    assert_one_line(Answer(process.returncode, out, err), "interrupted")
+    assert_one_line(Answer(done.returncode, done.stdout, done.stderr), "interrupted")
     assert tracks.read_text() == "earlier"

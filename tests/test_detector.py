@@ -9,8 +9,8 @@ from helpers import rig_of
 from onnx_models import SIDE, STRIDE, bright_squares
 
 from psotrack.cameras import camera, look_at, project
-from psotrack.cli.commands import track
 from psotrack.cli.detect import detect as command
+from psotrack.cli.track import track
 from psotrack.datasets import dpjait
 from psotrack.detections import read_detections
 from psotrack.detector import Detector, DetectorSettings, detect

@@ -1,6 +1,7 @@
 """A rig against its own data: faults that are planted one by one are named, and sound rigs are left in peace."""
 
 import json
+import re
 from dataclasses import replace
 
 import cv2
@@ -214,6 +215,17 @@ def test_all_focal_lengths_wrong():
     finding = only_finding(with_intrinsics(slice(None), 1.15))
     assert (finding.kind, finding.cameras) == ("focal lengths", ())
     assert "too long" in finding.message
+
+
+@pytest.mark.parametrize("factor", [0.96, 1.04])
+def test_all_focal_lengths_a_little_wrong(factor):
+    """Too little for any single sighting, and for any single camera."""
+    finding = only_finding(with_intrinsics(slice(None), factor))
+    assert (finding.kind, finding.cameras) == ("focal lengths", ())
+    found = re.search(r"too (long|short): 4 % off, give or take (\S+) %", finding.message)
+    assert found is not None, finding.message
+    assert found[1] == ("long" if factor > 1 else "short")
+    assert 0 < float(found[2]) < 1.1
 
 
 def test_intrinsics_of_images_half_as_large():

@@ -6,7 +6,7 @@ import pytest
 
 from psotrack import sizes
 from psotrack.fitness import ScoreSettings
-from psotrack.fusion import fused
+from psotrack.fusion import ALIKE, fused
 from psotrack.settings import TrackSettings
 from psotrack.sizes import Looks
 from psotrack.tracker import COMMON, TrackerInfo
@@ -52,16 +52,16 @@ def tracked(truth_m, std_m, *, seed, factor=1.0, hidden=(), offset_m=(0.0, 0.0, 
     return Tracked(info, jax.tree.map(np.asarray, learned), looks, tuple(arrivals), 0.5)
 
 
-def both(truth_m, swarm=None, lines=None, settings=SETTINGS):
+def both(truth_m, swarm=None, lines=None, settings=SETTINGS, **how):
     first = tracked(truth_m, SWARM_STD_M, seed=0, **(swarm or {}))
     # Whose covariances the fusion takes to be of the cameras' disagreement alone.
     second = tracked(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON, **(lines or {}))
-    return first, second, fused(first, second, settings, fps=FPS)
+    return first, second, fused(first, second, settings, fps=FPS, **how)[0]
 
 
 def test_information_adds_up():
     truth_m = paths(3)
-    _, _, together = both(truth_m)
+    first, second, together = both(truth_m)
     # About each drone's own median, as the middle that counts is known no better; and by the median of that, as one
     # frame in 1000 is beyond the gate, where the swarm's alone counts.
     off_m = together.info.measured_m - truth_m
@@ -69,8 +69,11 @@ def test_information_adds_up():
     expected_m = 1 / np.sqrt(1 / SWARM_STD_M**2 + 1 / LINES_STD_M**2)
     # The spread of 600 is known to 4 % so.
     np.testing.assert_allclose(std_m, expected_m, rtol=0.1)
+    # The lines have another error, that of the offset of the middles.
+    _, middles = fused(first, second, SETTINGS, fps=FPS)
+    expected_m2 = 1 / (1 / SWARM_STD_M**2 + 1 / (LINES_STD_M**2 + middles.std_m**2))
     diagonal_m2 = np.diagonal(together.info.measured_covariance_m2, axis1=-2, axis2=-1)
-    np.testing.assert_allclose(np.median(diagonal_m2, axis=(0, 1)), expected_m**2, rtol=1e-9)
+    np.testing.assert_allclose(np.median(diagonal_m2, axis=0), expected_m2, rtol=1e-9)
     assert (together.info.status == Status.TRACKED).all()
     assert together.compile_s == 1.0
 
@@ -81,6 +84,72 @@ def test_the_middle_of_a_silhouette_is_what_counts():
     _, _, together = both(truth_m, lines={"offset_m": (0.01, 0.0, 0.08)})
     off_m = (together.info.measured_m - truth_m).mean(axis=(0, 1))
     np.testing.assert_allclose(off_m, 0.0, atol=0.003)
+
+
+def test_the_offset_of_the_middles_is_told_with_its_error():
+    truth_m, off_m = paths(4), np.array([0.01, 0.0, 0.08])
+    first = tracked(truth_m, SWARM_STD_M, seed=0)
+    second = tracked(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON, offset_m=off_m)
+    # A tenth of the frames has another drone in its place.
+    second.info.measured_m[20:40, 0] += 0.2
+    _, middles = fused(first, second, SETTINGS, fps=FPS)
+    # A median of 200 differences, of errors that do not last.
+    expected_m = np.sqrt(np.pi / 2 * (SWARM_STD_M**2 + LINES_STD_M**2) / FRAMES)
+    # Never less, but for what is clipped of the tails; what looks as if it lasted, by chance, makes it more.
+    assert (middles.std_m[1:] > 0.85 * expected_m).all()
+    assert (middles.std_m[1:] < 2.0 * expected_m).all()
+    assert (np.abs(middles.off_m - off_m) < 4 * middles.std_m).all()
+
+
+def test_an_offset_from_errors_that_last_is_known_less_well():
+    truth_m = paths(1)
+    first = tracked(truth_m, np.full(3, 1e-6), seed=0)
+    second = tracked(truth_m, np.full(3, 1e-6), seed=1, factor=1 / COMMON)
+    lasting_m = np.repeat(np.random.default_rng(2).normal(0.0, 0.01, (FRAMES // 10, 1, 3)), 10, axis=0)
+    second.info.measured_m[:] += lasting_m
+    _, middles = fused(first, second, SETTINGS, fps=FPS)
+    # 20 independent errors, not 200: from so few the spread is known to a quarter.
+    expected_m = np.sqrt(np.pi / 2 / 20) * 0.01
+    np.testing.assert_allclose(middles.std_m / expected_m, 1.0, atol=0.6)
+
+
+def test_who_is_seen_by_one_alone_has_no_offset():
+    truth_m = paths(3)
+    swarm, lines = tracked(truth_m[:, :2], SWARM_STD_M, seed=0), tracked(truth_m[:, 1:], LINES_STD_M, seed=1)
+    _, middles = fused(swarm, lines, SETTINGS, fps=FPS)
+    assert np.isfinite(middles.off_m).all(axis=-1).tolist() == [False, True, False]
+    np.testing.assert_array_equal(np.isnan(middles.off_m), np.isnan(middles.std_m))
+
+
+def test_a_place_by_the_lines_alone_is_as_uncertain_as_the_offset_makes_it():
+    hidden = [(0, 50, 100)]
+    first = tracked(paths(1), SWARM_STD_M, seed=0, hidden=hidden)
+    second = tracked(paths(1), LINES_STD_M, seed=1, factor=1 / COMMON)
+    together, middles = fused(first, second, SETTINGS, fps=FPS)
+    diagonal_m2 = np.diagonal(together.info.measured_covariance_m2[60, 0])
+    np.testing.assert_allclose(diagonal_m2, LINES_STD_M**2 + middles.std_m[0] ** 2, rtol=1e-9)
+
+
+def test_errors_of_the_same_foreground_say_less():
+    """The best linear estimate of two that err alike: less sure than that of two that do not."""
+    first, second, apart = both(paths(2))
+    alike, middles = fused(first, second, SETTINGS, fps=FPS, same_foreground=True)
+    # Axis by axis the least variance of a weighted mean (Lagrange): 1 / (1' S^-1 1).
+    one_m, other_m = SWARM_STD_M + 0 * middles.std_m, np.hypot(LINES_STD_M, middles.std_m)
+    cross_m2 = ALIKE * one_m * other_m
+    joint_m2 = np.moveaxis(np.array([[one_m**2, cross_m2], [cross_m2, other_m**2]]), (0, 1), (-2, -1))
+    expected_m2 = 1 / np.linalg.inv(joint_m2).sum(axis=(-2, -1))
+    diagonal_m2 = np.diagonal(alike.info.measured_covariance_m2, axis1=-2, axis2=-1)
+    np.testing.assert_allclose(np.median(diagonal_m2, axis=0), expected_m2, rtol=1e-9)
+    less = np.median(np.linalg.det(apart.info.measured_covariance_m2))
+    assert np.median(np.linalg.det(alike.info.measured_covariance_m2)) > less
+
+
+def test_what_only_the_blobs_of_the_same_foreground_show_is_no_drone():
+    truth_m = paths(3)
+    swarm, lines = tracked(truth_m[:, :2], SWARM_STD_M, seed=0), tracked(truth_m, LINES_STD_M, seed=1)
+    assert fused(swarm, lines, SETTINGS, fps=FPS)[0].info.status.shape[1] == 3
+    assert fused(swarm, lines, SETTINGS, fps=FPS, same_foreground=True)[0].info.status.shape[1] == 2
 
 
 def test_where_one_does_not_see_a_drone_the_other_one_does():
@@ -112,7 +181,7 @@ def test_drones_that_only_the_lines_know_come_after_the_others():
     swarm = tracked(truth_m[:, [2, 0]], SWARM_STD_M, seed=0, arrivals=[Arrival(3, 1, again=False)])
     arrivals = [Arrival(9, 0, again=False), Arrival(20, 1, again=True)]
     lines = tracked(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON, arrivals=arrivals)
-    together = fused(swarm, lines, SETTINGS, fps=FPS)
+    together, _ = fused(swarm, lines, SETTINGS, fps=FPS)
     np.testing.assert_allclose(together.info.measured_m, truth_m[:, [2, 0, 1]], atol=0.1)
     # The first of the lines' arrivals is of a drone that the swarm knows.
     assert together.arrivals == (Arrival(3, 1, again=False), Arrival(20, 2, again=True))
@@ -125,7 +194,7 @@ def test_where_they_disagree_it_is_the_swarm_that_counts():
     swarm = tracked(truth_m, SWARM_STD_M, seed=0)
     lines = tracked(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON)
     lines.info.measured_m[80:90] += 0.5
-    together = fused(swarm, lines, SETTINGS, fps=FPS)
+    together, _ = fused(swarm, lines, SETTINGS, fps=FPS)
     np.testing.assert_array_equal(together.info.measured_m[80:90], swarm.info.measured_m[80:90])
 
 
@@ -134,10 +203,10 @@ def test_one_of_them_may_find_nobody(who):
     truth_m = paths(2)
     some, nobody = tracked(truth_m, SWARM_STD_M, seed=0), tracked(truth_m[:, :0], SWARM_STD_M, seed=0)
     pair = (some, nobody) if who == "swarm" else (nobody, some)
-    together = fused(*pair, SETTINGS, fps=FPS)
+    together, _ = fused(*pair, SETTINGS, fps=FPS)
     np.testing.assert_array_equal(together.info.measured_m, some.info.measured_m)
 
 
 def test_nobody_may_find_anybody():
     nobody = tracked(paths(0), SWARM_STD_M, seed=0)
-    assert fused(nobody, nobody, SETTINGS, fps=FPS).info.status.shape == (FRAMES, 0)
+    assert fused(nobody, nobody, SETTINGS, fps=FPS)[0].info.status.shape == (FRAMES, 0)

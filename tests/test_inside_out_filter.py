@@ -29,6 +29,7 @@ from psotrack.inside_out.filtering.pose_filter import (
     step,
     update,
 )
+from psotrack.inside_out.filtering.smoothing import smooth
 from psotrack.trajectories import Status
 
 FPS = 25.0
@@ -178,6 +179,8 @@ def test_half_a_turn_has_a_turn() -> None:
 # The arithmetic of one level.
 
 LEVEL = pose_motion.Levels(np.array([30.0]), np.array([0.5]))
+#: No errors that never change.
+NONE = np.zeros((6, 0))
 
 
 def test_translation_of_a_camera_that_does_not_turn_is_a_textbook_filter() -> None:
@@ -202,7 +205,7 @@ def test_translation_of_a_camera_that_does_not_turn_is_a_textbook_filter() -> No
     driven = np.diag([0.0] * 6 + [30.0] * 3 + [2 / lasting_s] * 3)
 
     straight = np.array([1.0, 0.0, 0.0, 0.0])
-    motion = pose_motion.begun(np.zeros(3), straight, covariance, LEVEL)
+    motion = pose_motion.begun(np.zeros(3), straight, covariance, NONE, LEVEL)
     part = np.r_[0:9, 15:18]
     x, P = np.zeros(12), motion.covariance[0][np.ix_(part, part)]
     for dt_s in (0.04, 0.04, 0.01, 0.3, 0.04):
@@ -215,7 +218,7 @@ def test_translation_of_a_camera_that_does_not_turn_is_a_textbook_filter() -> No
         x, P = x + K @ (z - H @ x), P - K @ S @ K.T
 
         motion, _ = pose_motion.foretold(motion, dt_s, LEVEL)
-        motion = pose_motion.corrected(motion, pose_motion.innovation(motion, z, straight, covariance))
+        motion = pose_motion.corrected(motion, pose_motion.innovation(motion, z, straight, covariance, NONE))
         found = np.concatenate(
             [motion.position_m, motion.velocity_m_s, motion.acceleration_m_s2, motion.lasting[:, :3]], axis=1
         )
@@ -228,7 +231,7 @@ def test_errors_go_where_f_takes_them() -> None:
     """F is the numerical derivative of the motion, turns included."""
     rng = np.random.default_rng(2)
     orientation_wxyz = Rotation.random(rng=rng).as_quat(scalar_first=True)
-    motion = pose_motion.begun(rng.normal(size=3), orientation_wxyz, spread(), LEVEL)
+    motion = pose_motion.begun(rng.normal(size=3), orientation_wxyz, spread(), NONE, LEVEL)
     motion = pose_motion.moved(motion, rng.normal(size=(1, pose_motion.SIZE)))
     later, F = pose_motion.foretold(motion, 0.3, LEVEL)
     for k, change in enumerate(1e-6 * np.eye(pose_motion.SIZE)):
@@ -241,7 +244,10 @@ def test_errors_go_where_f_takes_them() -> None:
 
 
 def test_one_level_knows_how_well_it_knows() -> None:
-    """Cameras that move as the level says: the squared error in units of the covariance (NEES) is 21 on the mean."""
+    """Cameras that move as the level says: the squared error in units of the covariance (NEES) is 21 on the mean.
+
+    Two errors never change, and do something else to each frame's pose.
+    """
     rng = np.random.default_rng(3)
     frames, runs, dt_s = 6, 60, 0.04
     squares = []
@@ -251,18 +257,23 @@ def test_one_level_knows_how_well_it_knows() -> None:
     white_root = np.sqrt(1 - pose_motion.LASTING_SHARE) * np.linalg.cholesky(spread())
     for _ in range(runs):
         start = Rotation.random(rng=rng).as_quat(scalar_first=True)
-        motion = pose_motion.begun(rng.normal(size=3), start, spread(), LEVEL)
-        truth = pose_motion.shifted(motion, rng.multivariate_normal(np.zeros(21), motion.covariance[0])[None])
+        common = np.array([[0.01] * 3 + [0.002] * 3]).T * rng.normal(size=(6, 2))
+        never_changing = rng.normal(size=2)
+        motion = pose_motion.begun(rng.normal(size=3), start, spread(), common, LEVEL)
+        off = rng.multivariate_normal(np.zeros(21), motion.covariance[0])
+        truth = pose_motion.shifted(motion, (off - motion.common[0] @ never_changing)[None])
         for _ in range(frames):
             truth, _ = pose_motion.foretold(truth, dt_s, LEVEL)
             truth = pose_motion.shifted(truth, rng.multivariate_normal(np.zeros(21), Q)[None])
-            off = lasting_root @ truth.lasting[0] + white_root @ rng.normal(size=6)
+            common = common + np.array([[0.002] * 3 + [0.0004] * 3]).T * rng.normal(size=(6, 2))
+            off = lasting_root @ truth.lasting[0] + white_root @ rng.normal(size=6) + common @ never_changing
             seen_wxyz = manifold.turned(truth.orientation_wxyz, off[None, 3:])[0]
             motion, _ = pose_motion.foretold(motion, dt_s, LEVEL)
-            told = pose_motion.innovation(motion, truth.position_m[0] + off[:3], seen_wxyz, spread())
+            told = pose_motion.innovation(motion, truth.position_m[0] + off[:3], seen_wxyz, spread(), common)
             motion = pose_motion.corrected(motion, told)
         error = pose_motion.difference(motion, truth)[0]
-        squares.append(error @ np.linalg.solve(motion.covariance[0], error))
+        whole = motion.covariance[0] + motion.common[0] @ motion.common[0].T
+        squares.append(error @ np.linalg.solve(whole, error))
     # The sum of independent chi-squares is one; 1 in 1000 such tests would fail on either side.
     low, high = chi2.ppf([0.001, 0.999], 21 * runs) / runs
     assert low < np.mean(squares) < high
@@ -381,10 +392,11 @@ def test_gaps_are_bridged_for_as_long_as_is_said() -> None:
     assert (path.flags[50:58] == 0).all()
     assert (np.diff(np.trace(path.covariance[49:58, :3, :3], axis1=1, axis2=2)) > 0).all()
     assert (path.status[90:101] == Status.COASTING).all()
-    assert (path.status[102:122] == Status.LOST).all()
+    assert (path.status[102:120] == Status.LOST).all()
     for value in (path.position_m, path.orientation_wxyz, path.covariance, path.ambiguity, path.velocity_m_s):
-        assert np.isnan(value[102:122]).all()
-    assert (path.status[122:132] == Status.TRACKED).all()
+        assert np.isnan(value[102:120]).all()
+    # It hovered, and is where a hovering camera would be: nothing else needs to confirm that.
+    assert (path.status[120:130] == Status.TRACKED).all()
     off_m, off_rad = errors(path, position_m, truth)
     covariance = path.covariance[path.seen]
     gap = slice(48, 56)
@@ -394,7 +406,68 @@ def test_gaps_are_bridged_for_as_long_as_is_said() -> None:
     ).all()
 
 
+def planted(acceleration, *, chance=None):
+    """A flight with a gap of a second, after which five poses agree with one another, 2.3 m off."""
+    raw, position_m, _ = flight(150, acceleration=acceleration, wobble=0.5, seed=40)
+    raw = replace(raw, chance=None if chance is None else np.full(150, chance))
+    return misplaced(without(raw, slice(60, 85)), slice(85, 90), [2.3, 0.0, 0.0]), position_m
+
+
+@pytest.mark.parametrize("acceleration", [0.5, 2.0])
+def test_poses_that_agree_behind_a_gap_and_are_wrong_are_held_off(acceleration) -> None:
+    raw, position_m = planted(acceleration)
+    path = follow(raw)
+    assert (path.status[85:90] == Status.LOST).all()
+    # The right ones are believed when they are one more than the wrong ones, and enough to contradict a state.
+    assert (path.status[100:] == Status.TRACKED).all()
+    assert np.nanmax(np.linalg.norm(path.position_m[85:] - position_m[85:], axis=1)) < 0.05
+    smoothed = smooth(raw)
+    assert np.nanmax(np.linalg.norm(smoothed.position_m[85:] - position_m[85:], axis=1)) < 0.05
+
+
+def test_behind_a_gap_markers_that_agree_say_nothing_against_what_a_hovering_camera_cannot_do() -> None:
+    raw, position_m = planted(0.05, chance=1e-12)
+    path = follow(raw)
+    assert (path.status[85:90] == Status.LOST).all()
+    assert np.nanmax(np.linalg.norm(path.position_m[85:] - position_m[85:], axis=1)) < 0.05
+
+
+def test_behind_a_gap_markers_that_agree_beyond_chance_are_believed_at_once() -> None:
+    raw, position_m, _ = flight(120, acceleration=2.0, wobble=2.0, seed=41)
+    raw = without(raw, slice(60, 90))
+    path = follow(replace(raw, chance=np.full(120, 1e-12)))
+    assert (path.status[90:94] == Status.TRACKED).all()
+    assert (path.status[90:] != Status.LOST).all()
+    assert np.linalg.norm(path.position_m[90:] - position_m[90:], axis=1).max() < 0.05
+    # Else they need others, for so long a gap foretells nothing.
+    assert (follow(raw).status[90:99] == Status.LOST).all()
+
+
 # Starts, and paths with little in them.
+
+
+@pytest.mark.parametrize(
+    ("chance", "ambiguity", "first"),
+    [(1e-12, 0.0, 0), (1e-12, 0.01, 2), (0.01, 0.0, 2), (np.nan, 0.0, 2)],
+    ids=["sure", "ambiguous", "by chance", "unknown"],
+)
+def test_a_first_pose_is_told_at_once_where_nothing_else_is_likely(chance, ambiguity, first) -> None:
+    raw, _, _ = flight(6, seed=42)
+    raw = replace(raw, chance=np.full(6, chance), ambiguity=np.full(6, ambiguity))
+    for path in (follow(raw), smooth(raw)):
+        told = path.status != Status.LOST
+        assert told[first:].all()
+        assert path.chance is None
+    assert not follow(raw).seen[:first].any()
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_where_no_more_frames_could_confirm_a_start_it_counts(frames) -> None:
+    raw, _, _ = flight(5, seed=43)
+    path = follow(path_of(rows_of(raw)[:frames]), PoseFilterParams().within(frames))
+    # The first cannot be confirmed when it comes: what is told is told on the fly.
+    assert (path.status[: frames - 1] == Status.LOST).all()
+    assert path.status[-1] == Status.TRACKED
 
 
 @pytest.mark.parametrize("frames", [0, 1, 2])
@@ -463,6 +536,45 @@ def test_times_may_be_irregular() -> None:
     off_m, _ = errors(path, position_m[kept], truth[kept])
     raw_off_m, _ = errors(some, position_m[kept], truth[kept])
     assert np.median(np.linalg.norm(off_m, axis=1)) < 1.03 * np.median(np.linalg.norm(raw_off_m, axis=1))
+
+
+# Errors that never change.
+
+
+def test_errors_that_never_change_are_not_averaged_away() -> None:
+    """Each does to poses what slowly changes, and jumps as other markers come into view: 40 cameras."""
+    rng, frames, inside, inside_untold, gated = np.random.default_rng(44), 12, [], [], 0
+    scale = np.array([[0.012] * 3 + [0.002] * 3]).T
+    for seed in range(40):
+        raw, position_m, _ = flight(frames, acceleration=0.5, wobble=0.5, seed=seed)
+        common = scale * (
+            rng.normal(size=(6, 2)) + rng.normal(scale=0.02, size=(frames, 6, 2)).cumsum(axis=0)
+        )
+        common[8:] += scale * rng.normal(scale=0.5, size=(6, 2))
+        off = common @ rng.normal(size=2)
+        orientation = Rotation.from_quat(raw.orientation_wxyz, scalar_first=True)
+        raw = replace(
+            raw,
+            position_m=raw.position_m + off[:, :3],
+            orientation_wxyz=(orientation * Rotation.from_rotvec(off[:, 3:])).as_quat(scalar_first=True),
+        )
+        told = replace(raw, covariance=raw.covariance + common @ common.swapaxes(1, 2), common=common)
+        filtered = follow(told)
+        gated += int(((filtered.flags & Flag.GATED) > 0).sum())
+        inside.append([within_90(filtered, position_m, k) for k in (7, 10)])
+        inside[-1].append(within_90(smooth(told), position_m, 5))
+        inside_untold.append(within_90(follow(raw), position_m, 7))
+    # Three deviations of a share of 40 below 0.9; poses' own covariances, if anything, are wide.
+    assert (np.mean(inside, axis=0) > 0.9 - 3 * np.sqrt(0.09 / 40)).all()
+    assert np.mean(inside_untold) < 0.5
+    # Nor is a jump that other markers explain an outlier.
+    assert gated <= 0.01 * 40 * frames
+
+
+def within_90(path: CameraPath, position_m, k) -> bool:
+    """Whether the truth of a frame is within its 90 % ellipsoid."""
+    off_m = position_m[k] - path.position_m[k]
+    return bool(off_m @ np.linalg.solve(path.covariance[k, :3, :3], off_m) < NINETY)
 
 
 # Ambiguous poses.

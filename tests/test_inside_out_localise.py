@@ -3,7 +3,6 @@
 import json
 import signal
 import threading
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +12,8 @@ import pytest
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
+from psotrack.aruco import marker_dictionary
+from psotrack.calibration import lens_of_sensor, lens_of_view, write_rig
 from psotrack.cameras import camera, look_at, project, stack
 from psotrack.cli.localise import localise as command
 from psotrack.datasets.dpjait import write_calibration, write_marker_corners
@@ -20,10 +21,8 @@ from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.inside_out.camera_path import Flag, read_camera_path
 from psotrack.inside_out.frames import natural_key, open_source, read_ahead
 from psotrack.inside_out.lens_files import read_lens, scaled
-from psotrack.inside_out.localising import LocaliseSettings, localise
+from psotrack.inside_out.localising import LocaliseSettings, follow_markers, localise
 from psotrack.inside_out.marker_map import MarkerMap, read_marker_map
-from psotrack.lenses import lens_of_sensor, lens_of_view, marker_dictionary
-from psotrack.rig_files import write_rig
 from psotrack.trajectories import Status
 from psotrack.video import VideoWriter
 
@@ -206,7 +205,7 @@ def test_frames_with_few_markers_or_none_are_ordinary_and_said(room, tmp_path):
         (["--fov", "70,55.4", "--dictionary", "5x5_1000"], "no frame shows a marker of the map: are --dictionary"),
         (["--fov", "70,55.4", "--min-markers", "14"], "of the map: --min-markers asks for 14"),
         (["--fov", "20,70"], "no pose fits the markers: are --markers, and --camera or --fov, the right ones?"),
-        (["--fov", "70,55.4", "--frames", "1"], "the filter took none of 1 poses: --no-filter keeps them"),
+        (["--fov", "70,55.4", "--frames", "1"], None),
         (["--fov", "70,55.4", "--frames", "1", "--no-filter"], None),
     ],
 )  # fmt: skip
@@ -240,6 +239,85 @@ def test_fewer_markers_are_allowed_and_flagged(room, tmp_path):
     assert path.flags[FEW] & Flag.FEW_MARKERS
     # Three markers in a plane, 4 m away: measured 31 mm, and 12 mm from the image that the codec has not touched.
     assert error_m(path, room)[FEW] < 0.1
+
+
+def test_the_first_frame_has_a_pose_where_its_markers_agree_beyond_chance(room, tmp_path):
+    run(room.video, "--markers", room.markers, "--camera", room.lens, "--out", tmp_path / "track.csv")
+    path, _ = read_camera_path(tmp_path / "track.csv")
+    assert path.seen.all()
+    # Measured 3 mm.
+    assert error_m(path, room).max() < 0.02
+
+
+@pytest.mark.parametrize(("frame", "options"), [(0, []), (FEW, ["--min-markers", 1])])
+@pytest.mark.parametrize("smooth", [[], ["--smooth"]])
+def test_a_folder_with_one_image_has_its_pose(room, tmp_path, frame, options, smooth):
+    (tmp_path / "one").mkdir()
+    cv2.imwrite(str(tmp_path / "one" / "frame.png"), room.images[frame])
+    out = tmp_path / "track.csv"
+    room_files = ["--markers", room.markers, "--camera", room.lens, "--fps", 25]
+    result = run(tmp_path / "one", *room_files, *options, *smooth, "--out", out)
+    path, _ = read_camera_path(out)
+    assert "one in 1 of 1 frames" in result.output
+    assert path.status.tolist() == [Status.TRACKED]
+    # Three markers in a plane: measured 12 mm.
+    assert np.linalg.norm(path.position_m[0] - room.position_m[frame]) < 0.05
+
+
+def test_a_focal_length_that_is_off_is_known_to_the_covariance(room, tmp_path):
+    """A lens 1 % too long, in a table a marker 5 mm too high: what is stated makes poses better, and honest."""
+    lens = tmp_path / "lens.toml"
+    K = LENS.K * np.array([[1.01, 1.01, 1], [1.01, 1.01, 1], [1, 1, 1]])
+    write_rig(lens, stack({"front": camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=SIZE_WH)}))
+    markers, out, report = tmp_path / "corners.csv", tmp_path / "track.csv", tmp_path / "report.json"
+    write_marker_corners(
+        markers, {i: c + 0.005 * (i == 17) * np.eye(3)[2] for i, c in wall_markers().items()}
+    )
+    files = ["--markers", markers, "--camera", lens, "--out", out, "--json", report, "--force"]
+    median_m, inside = {}, {}
+    for name, stated in (("untold", []), ("told", ["--map-error", 3, "--focal-error", 1])):
+        run(room.folder / "images", "--fps", 25, *files, *stated)
+        path, _ = read_camera_path(out)
+        off_m = (path.position_m - room.position_m)[path.seen]
+        covariance = path.covariance[path.seen][:, :3, :3]
+        squared = np.einsum("ni,nij,nj->n", off_m, np.linalg.inv(covariance), off_m)
+        # Within what 90 % are.
+        inside[name] = np.mean(squared < 6.25)
+        median_m[name] = np.median(np.linalg.norm(off_m, axis=1))
+    assert inside["untold"] < 0.2
+    assert inside["told"] == 1.0
+    # Markers on two walls tell most of the focal length.
+    assert median_m["told"] < 0.7 * median_m["untold"]
+    content = json.loads(report.read_text())
+    assert (content["map_error_m"], content["focal_error"]) == (0.003, 0.01)
+
+
+def test_a_plot_tells_bridged_frames_from_gaps(room, tmp_path):
+    """Colours of the picture: tracked, bridged, and the ground of frames without a pose."""
+    colours = {"tracked": (0x00, 0x72, 0xB2), "bridged": (0xD5, 0x5E, 0x00), "none": (0xDD, 0xE1, 0xE6)}
+
+    def share(png):
+        image = cv2.imread(str(png))[..., ::-1].astype(int)
+        # The ground in a solid block, which no line of the grid is.
+        return {
+            name: np.mean(
+                cv2.erode((np.abs(image - rgb).max(axis=-1) < 3).astype(np.uint8), np.ones((size, size)))
+            )
+            for (name, rgb), size in zip(colours.items(), (1, 1, 9), strict=True)
+        }
+
+    files = ["--markers", room.markers, "--camera", room.lens, "--out", tmp_path / "track.csv", "--force"]
+    run(room.video, *files, "--plot")
+    bridged = share(tmp_path / "track.png")
+    run(room.video, *files, "--no-filter", "--plot", tmp_path / "raw.png")
+    raw = share(tmp_path / "raw.png")
+    assert bridged["tracked"] > 0
+    assert bridged["bridged"] > 0
+    assert raw["bridged"] == 0
+    assert raw["none"] > bridged["none"]
+    with pytest.raises(OutputError, match=r"raw.png.*pass --force to replace it"):
+        run(room.video, *files[:-1], "--plot", tmp_path / "raw.png", "--out", tmp_path / "other.csv")
+    assert not (tmp_path / "other.csv").exists()
 
 
 def test_the_filter_bridges_frames_without_markers(room, tmp_path):
@@ -303,8 +381,8 @@ def test_a_stream_tells_the_same_as_its_file(room, tmp_path):
 class Capture:
     """A camera that shows images, without stamps; then its user presses Ctrl-C, or it ends."""
 
-    def __init__(self, images, *, interrupt=False):
-        self.images, self.interrupt, self.released = list(images), interrupt, False
+    def __init__(self, images, press=None):
+        self.images, self.press, self.released = list(images), press, threading.Event()
 
     def isOpened(self):
         return True
@@ -315,38 +393,45 @@ class Capture:
     def read(self):
         if self.images:
             return True, self.images.pop(0)
-        if self.interrupt:
-            # Once the frames before are localised, or the last would be lost: most of a second is enough for one.
-            time.sleep(0.7)
-            signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
-            time.sleep(0.5)
+        if self.press:
+            self.press()
         return False, None
 
     def release(self):
-        self.released = True
+        self.released.set()
 
 
 def test_ctrl_c_ends_a_live_stream_and_keeps_what_was_localised(room, tmp_path, monkeypatch):
-    capture = Capture(room.images[:FEW], interrupt=True)
-    opened = []
+    kept, heard, opened = threading.Event(), threading.Event(), []
+
+    def followed(*told):
+        for one in follow_markers(*told):
+            yield one
+            # Whoever asks for the next has kept this one.
+            kept.set()
+
+    def hear(*_):
+        heard.set()
+        raise KeyboardInterrupt
+
+    def press():
+        # What was localised is to be kept, so there must be some; and the stream does not end before Ctrl-C is heard.
+        assert kept.wait(300)
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+        assert heard.wait(300)
+
+    capture = Capture(room.images[:FEW], press)
     monkeypatch.setattr(cv2, "VideoCapture", lambda device: opened.append(device) or capture)
-    out = tmp_path / "track.csv"
-    result = run(
-        "0",
-        "--live",
-        "--fps",
-        25,
-        "--markers",
-        room.markers,
-        "--camera",
-        room.lens,
-        "--out",
-        out,
-        "--no-filter",
-    )
+    monkeypatch.setattr("psotrack.inside_out.localising.follow_markers", followed)
+    out, before = tmp_path / "track.csv", signal.signal(signal.SIGINT, hear)
+    try:
+        options = ("--live", "--fps", 25, "--markers", room.markers, "--camera", room.lens, "--no-filter")
+        result = run("0", *options, "--out", out)
+    finally:
+        signal.signal(signal.SIGINT, before)
     path, _ = read_camera_path(out)
     assert opened == [0]
-    assert capture.released
+    assert capture.released.wait(300)
     assert "ended by Ctrl-C" in result.output
     # The first and the last are always had; those that come while another is worked on are left out.
     assert set(path.frame.tolist()) <= set(range(FEW))
@@ -370,6 +455,13 @@ def test_ctrl_c_in_a_recording_leaves_nothing(room, tmp_path, monkeypatch):
     monkeypatch.setattr("psotrack.inside_out.localising.locate", interrupted)
     with pytest.raises(KeyboardInterrupt):
         localise(open_source(room.video), room.marker_map, LENS)
+    out = tmp_path / "track.csv"
+    result = run(room.video, "--markers", room.markers, "--camera", room.lens, "--out", out)
+    assert result.exit_code != 0
+    assert (
+        "interrupted; nothing is written, and the same command starts from the first frame" in result.output
+    )
+    assert not out.exists()
 
 
 def test_no_such_stream_is_one_line(tmp_path):
@@ -590,7 +682,7 @@ def test_the_newest_is_worked_on_and_the_last_is_never_left_out():
     found = []
     for item in read_ahead(many(), newest=True):
         found.append(item)
-        assert made.wait(5)
+        assert made.wait(300)
     # While the first was worked on, all others came; the last took the place of those before.
     assert found[-1] == 49
     assert len(found) <= 2

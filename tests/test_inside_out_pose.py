@@ -51,6 +51,11 @@ def looking(centre_m=(-0.8, -2.5, 1.3), target_m=(3.0, 3.0, 1.8), coefficients=0
     return camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080), dist=LENSES[coefficients])
 
 
+def longer_lens(view, by):
+    """The camera with another focal length, by a share of it."""
+    return replace(view, K=view.K * np.array([[1 + by, 1 + by, 1], [1 + by, 1 + by, 1], [1, 1, 1]]))
+
+
 def lens_of(view):
     """The camera without its pose."""
     return replace(view, T_cam_world=np.eye(4))
@@ -87,57 +92,75 @@ def test_exact_corners_give_the_pose_exactly(coefficients, count):
 
 def test_derivatives_are_those_of_differences():
     view, corners_m = looking(coefficients=8), two_walls(3)
-    seen = seen_markers(corners_of(view, corners_m), corners_m, lens_of(view), 0.3, 1e-4)
+    seen = seen_markers(corners_of(view, corners_m), corners_m, lens_of(view), 0.3, 1e-4, focal_error=0.005)
     R_world_cam = view.T_cam_world[:3, :3].T
 
     def off_px(x):
         turned = R_world_cam @ Rotation.from_rotvec(x[3:6]).as_matrix()
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = turned.T, -turned.T @ (view.centre_world + x[:3])
-        return (project(replace(view, T_cam_world=T), corners_m)[0] + x[6] * seen.inward).ravel()
+        longer = longer_lens(replace(view, T_cam_world=T), 0.005 * x[7])
+        return (project(longer, corners_m)[0] + x[6] * seen.inward).ravel()
 
-    rows, depth_m = equations(seen, view.centre_world, R_world_cam, 0.0)
-    slopes = approx_fprime(np.zeros(7), off_px, 1e-7).reshape(3, 4, 2, 7)
+    rows, depth_m = equations(seen, view.centre_world, R_world_cam, np.zeros(2))
+    slopes = approx_fprime(np.zeros(8), off_px, 1e-7).reshape(3, 4, 2, 8)
     # A step of 1e-7 bends by 1e-5 px and rounds at 1e-6 px.
-    np.testing.assert_allclose(rows[..., :7], slopes, rtol=1e-4, atol=0.01)
+    np.testing.assert_allclose(rows[..., :8], slopes, rtol=1e-4, atol=0.01)
     np.testing.assert_allclose(depth_m, project(view, corners_m)[1], rtol=1e-12)
 
 
-def test_elimination_is_scipys_least_squares_over_pose_inset_and_every_markers_place():
+def test_elimination_is_scipys_least_squares_over_pose_inset_focal_length_and_every_markers_place():
+    """And what all frames have in common moves the pose as it moves SciPy's."""
     rng = np.random.default_rng(0)
     view, corners_m = looking(coefficients=4), two_walls(6)
-    noise, count = Noise(0.4**2, 0.003**2, 10.0, 10.0), 6
+    noise, count, focal_error = Noise(0.4**2, 0.003**2, 10.0, 10.0), 6, 0.005
     placed_m = corners_m + 0.003 * rng.normal(size=(count, 1, 3))
-    seen = seen_markers(corners_of(view, placed_m, rng, 0.4), corners_m, lens_of(view), 0.4, 0.003)
-    position_m, R, inset_px = view.centre_world, view.T_cam_world[:3, :3].T, 0.0
+    corners_px = corners_of(longer_lens(view, 0.003), placed_m, rng, 0.4)
+    # Of a marker's place, 0.6 of the deviation are the map's.
+    seen = seen_markers(corners_px, corners_m, lens_of(view), 0.4, 0.0024, 0.0018, focal_error)
+    position_m, R, extra = view.centre_world, view.T_cam_world[:3, :3].T, np.zeros(2)
     for _ in range(6):
-        sums = summed(equations(seen, position_m, R, inset_px)[0], np.ones((count, 4), bool))
-        solution = sums.solved(noise, inset_px)
-        position_m, inset_px = position_m + solution.step[:3], inset_px + solution.step[6]
+        sums = summed(equations(seen, position_m, R, extra)[0], np.ones((count, 4), bool))
+        solution = sums.solved(noise, extra)
+        position_m, extra = position_m + solution.step[:3], extra + solution.step[6:]
         R = R @ Rotation.from_rotvec(solution.step[3:6]).as_matrix()
 
-    def residuals(x):
-        turned = R @ Rotation.from_rotvec(x[3:6]).as_matrix()
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = turned.T, -turned.T @ (position_m + x[:3])
-        places_m = x[7:].reshape(count, 1, 3)
-        pixels = project(replace(view, T_cam_world=T), corners_m + places_m)[0] + x[6] * seen.inward
-        return np.concatenate(
-            [((seen.corners_px - pixels) / 0.4).ravel(), x[7:] / 0.003, [x[6] / INSET_STD_PX]]
-        )
+    def best_for(corners_px, start):
+        def residuals(x):
+            turned = R @ Rotation.from_rotvec(x[3:6]).as_matrix()
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = turned.T, -turned.T @ (position_m + x[:3])
+            there = longer_lens(replace(view, T_cam_world=T), focal_error * x[7])
+            pixels = project(there, corners_m + x[8:].reshape(count, 1, 3))[0] + x[6] * seen.inward
+            known = [x[8:] / 0.003, [x[6] / INSET_STD_PX, x[7]]]
+            return np.concatenate([((corners_px - pixels) / 0.4).ravel(), *known])
 
-    start = np.zeros(7 + 3 * count)
-    start[6] = inset_px
-    result = least_squares(residuals, start, "3-point", x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-12)
+        return least_squares(residuals, start, "3-point", x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-12)
+
+    start = np.zeros(8 + 3 * count)
+    start[6:8] = extra
+    result = best_for(corners_px, start)
     deviation = np.sqrt(np.diag(solution.covariance))
     # Derivatives are taken where the markers should be, 3 mm in 5 m from where they are fitted.
-    np.testing.assert_allclose((result.x[:7] - start[:7]) / deviation, 0, atol=0.01)
-    expected = np.linalg.inv(result.jac.T @ result.jac)[:7, :7]
+    np.testing.assert_allclose((result.x[:8] - start[:8]) / deviation, 0, atol=0.01)
+    expected = np.linalg.inv(result.jac.T @ result.jac)[:8, :8]
     np.testing.assert_allclose(
         solution.covariance / np.outer(deviation, deviation),
         expected / np.outer(deviation, deviation),
         atol=0.01,
     )
+
+    common = sums.common(solution, noise, seen.map_share)
+    there, off_m = longer_lens(view, 0.003), np.zeros((count, 1, 3))
+    off_m[4, 0, 2] = 0.003 * 0.6
+    for column, view_of_it, moved_m in (
+        (3 * 4 + 2, there, placed_m + off_m),
+        (-1, longer_lens(view, 0.003 + focal_error), placed_m),
+    ):
+        by_px = project(view_of_it, moved_m)[0] - project(there, placed_m)[0]
+        moved = best_for(corners_px + by_px, result.x).x[:6] - result.x[:6]
+        # Nearly linear, and a covariance to a hundredth.
+        np.testing.assert_allclose(common[:, column] / deviation[:6], moved / deviation[:6], atol=0.02)
 
 
 def test_pose_is_scipys_where_the_map_is_exact():
@@ -194,6 +217,54 @@ def test_covariance_is_honest(noise_px, place_m, stated, least):
     assert share > least - 3 * np.sqrt(least * (1 - least) / 120)
     # Nor is it so wide that it says nothing: deviations are at most a half too large.
     assert np.median(squares) > chi2.median(6) / 1.5**2
+
+
+@pytest.mark.parametrize(
+    ("map_error_m", "focal_error"), [(0.002, 0.0), (0.0, 0.005), (0.002, 0.005)], ids=["map", "focal", "both"]
+)
+def test_covariance_knows_errors_of_the_map_and_of_the_focal_length(map_error_m, focal_error):
+    """Six markers, 0.1 px; each pose with another map and another lens."""
+    rng = np.random.default_rng(12)
+    told = PoseSettings(map_error_m=map_error_m, focal_error=focal_error)
+    views = [view for _, view in placements(np.random.default_rng(13), 6, 0.1, 0.0, SETTINGS, 100)]
+    limit, corners_m = chi2.ppf(0.9, 3), two_walls(6)
+    inside, inside_untold, off_m, off_untold_m = [], [], [], []
+    for view in views:
+        placed_m = corners_m + map_error_m * rng.normal(size=(6, 1, 3))
+        corners_px = corners_of(longer_lens(view, focal_error * rng.normal()), placed_m, rng, 0.1)
+        for stated, within, off in ((told, inside, off_m), (SETTINGS, inside_untold, off_untold_m)):
+            found = locate(corners_px, corners_m, lens_of(view), stated)
+            miss_m = view.centre_world - found.position_m
+            within.append(miss_m @ np.linalg.solve(found.covariance[:3, :3], miss_m) < limit)
+            off.append(np.linalg.norm(miss_m))
+            of_common = found.common @ found.common.T
+            assert np.linalg.eigvalsh(found.covariance - of_common)[0] > 0
+    # Three deviations of a share of 100.
+    assert np.mean(inside) > 0.9 - 3 * np.sqrt(0.09 / 100)
+    assert np.mean(inside_untold) < np.mean(inside) - 0.05
+    # Markers on two walls tell the focal length; what the map does, one pose cannot tell.
+    assert np.median(off_m) < (0.8 if focal_error else 1.05) * np.median(off_untold_m)
+
+
+def test_chance_is_how_many_sets_of_markers_would_agree():
+    rng = np.random.default_rng(14)
+    view, corners_m = looking(), two_walls(4)
+    corners_px = corners_of(view, corners_m, rng, 0.05)
+    found = {
+        count: locate(corners_px[:count], corners_m[:count], lens_of(view), ANY_NUMBER).chance
+        for count in (1, 2, 4)
+    }
+    # Within 15 times the stated 0.2 px of one place in an image of 1920 x 1080.
+    near = np.pi * 3.0**2 / (1920 * 1080)
+    assert found[1] == 1.0
+    assert found[2] == pytest.approx(2 * near)
+    assert found[4] == pytest.approx(4 * near**3)
+    # Any two of the four others would do as well.
+    wrong_px = np.concatenate([corners_px[:3], corners_px[2:] + rng.uniform(200, 400, (2, 1, 2))])
+    taken_m = np.concatenate([corners_m[:3], two_walls(6)[4:]])
+    some = locate(wrong_px, taken_m, lens_of(view), ANY_NUMBER)
+    np.testing.assert_array_equal(some.used, [True] * 3 + [False] * 2)
+    assert some.chance == pytest.approx(5 * 6 * near**2)
 
 
 def test_inset_of_all_corners_does_not_move_the_camera():
@@ -411,3 +482,7 @@ def test_what_makes_no_sense_is_refused():
         PoseSettings(noise_px=0.0)
     with pytest.raises(SettingsError, match="place_m"):
         PoseSettings(place_m=np.inf)
+    with pytest.raises(SettingsError, match=r"focal_error: expected a number from 0 to below 1, found -0.1"):
+        PoseSettings(focal_error=-0.1)
+    with pytest.raises(SettingsError, match="map_error_m: expected a number from 0 to below 1, found nan"):
+        PoseSettings(map_error_m=np.nan)

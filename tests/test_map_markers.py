@@ -10,15 +10,15 @@ import pytest
 from click.testing import CliRunner
 from test_inside_out_map import ROOM, bent, on_wall, recorded
 
+from psotrack.aruco import marker_dictionary
+from psotrack.calibration import write_rig
 from psotrack.cameras import camera, look_at, project, stack
 from psotrack.cli.map_markers import FOUND, map_markers
 from psotrack.datasets.dpjait import read_marker_corners, write_marker_corners
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
 from psotrack.inside_out.lens_files import scaled
 from psotrack.inside_out.marker_map import MarkerMap
-from psotrack.lenses import marker_dictionary
 from psotrack.mocap import write_c3d
-from psotrack.rig_files import write_rig
 from psotrack.video import VideoWriter
 
 SIZE_WH = (960, 720)

@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.mocap import Markers, body_trajectories, positions_at, read_c3d, write_c3d
+from psotrack.mocap import Markers, body_trajectories, read_c3d, write_c3d
 from psotrack.trajectories import Status
 
 #: An asymmetric cross, metres, in the body.
@@ -253,20 +253,6 @@ def test_a_recording_that_began_at_another_time(offset_s, first):
     np.testing.assert_allclose(truth.position_m[first:, 0], path, rtol=0, atol=1e-9)
 
 
-def test_markers_at_the_times_of_a_video():
-    markers, _ = recording()
-    markers.position_m[12, 3] = np.nan
-    time_s = np.array([0.0, 0.04, 0.045, 0.055, 0.06, 5.0])
-    found = positions_at(markers, time_s, offset_s=0.07)
-    assert found.shape == (6, 10, 3)
-    np.testing.assert_array_equal(found[:2], markers.position_m[[7, 11]])
-    expected = markers.position_m[[11, 12]].mean(axis=0)
-    np.testing.assert_allclose(found[2, :3], expected[:3], rtol=0, atol=1e-12)
-    assert np.isnan(found[2:4, 3]).all()  # between a frame that sees it and one that does not
-    np.testing.assert_array_equal(found[4, 3], markers.position_m[13, 3])
-    assert np.isnan(found[5]).all()
-
-
 def test_nothing_seen_is_an_error():
     markers, _ = recording()
     markers.position_m[:] = np.nan
@@ -305,6 +291,6 @@ def test_a_full_disk_is_an_error(tmp_path):
         """
     )
     path = tmp_path / "a.c3d"
-    done = subprocess.run([sys.executable, "-c", script, path], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", script, path], capture_output=True, text=True)
     assert "a.c3d: expected to write it" in done.stdout, done.stderr
     assert list(tmp_path.iterdir()) == []

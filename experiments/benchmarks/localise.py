@@ -14,15 +14,17 @@ import cv2
 import numpy as np
 
 import psotrack
+from psotrack.aruco import marker_dictionary
+from psotrack.calibration import lens_of_view
 from psotrack.cameras import Camera, camera, look_at, project
 from psotrack.datasets.dpjait import MARKER_CORNERS, read_onboard
 from psotrack.inside_out.frames import open_source
 from psotrack.inside_out.localising import STAGES, Localised, localise
 from psotrack.inside_out.marker_map import MarkerMap, read_marker_map
-from psotrack.lenses import lens_of_view, marker_dictionary
 from psotrack.video import VideoWriter
 
-_SIZE_WH, _FPS = (1920, 1080), 25.0
+_SIZES_WH = {"1920x1080": (1920, 1080), "3840x2160": (3840, 2160)}
+_FPS = 25.0
 _SIDE_M = 0.3
 #: The camera goes to and fro before a wall.
 _PERIOD_FRAMES = 200
@@ -33,16 +35,19 @@ _CELL_PX = 24
 @click.command(context_settings={"show_default": True})
 @click.option("--sequence", type=click.Path(path_type=Path), help="An _A sequence instead of what is drawn.")
 @click.option("--drone", default="dron1", help="Whose camera, with --sequence.")
+@click.option(
+    "--size", default="1920x1080", type=click.Choice(list(_SIZES_WH)), help="Of what is drawn, pixels."
+)
 @click.option("--frames", default=250, type=click.IntRange(1), help="Of the video.")
 @click.option("--repeats", default=5, type=click.IntRange(1), help="Runs.")
-def main(sequence: Path | None, drone: str, frames: int, repeats: int) -> None:
+def main(sequence: Path | None, drone: str, size: str, frames: int, repeats: int) -> None:
     """Localise a video; print frames per second, milliseconds per stage, and what they were measured on."""
     with tempfile.TemporaryDirectory() as folder:
         if sequence is None:
             video, marker_map, lens = (
                 Path(folder) / "drawn.avi",
                 _wall(),
-                lens_of_view(92.45, 60.83, _SIZE_WH),
+                lens_of_view(92.45, 60.83, _SIZES_WH[size]),
             )
             _draw(video, marker_map, lens, frames)
         else:
@@ -88,33 +93,39 @@ def _wall() -> MarkerMap:
 
 
 def _draw(path: Path, marker_map: MarkerMap, lens: Camera, frames: int) -> None:
-    """A video before the wall, which has a texture and coloured boards."""
-    rng = np.random.default_rng(0)
-    texture = cv2.GaussianBlur(rng.normal(0, 60, _SIZE_WH[::-1]), (0, 0), 4)
-    background = np.repeat((170 + texture)[..., None], 3, axis=-1)
-    for _ in range(20):
-        x, y = rng.uniform((0, 0), _SIZE_WH).astype(int)
-        width, height = rng.integers(60, 300, 2)
-        background[y : y + height, x : x + width] = rng.uniform(40, 220, 3)
-    background = np.clip(background, 0, 255).astype(np.uint8)
-    with VideoWriter(path, _FPS, _SIZE_WH) as writer:
+    """A video before the wall, which has a texture and coloured boards; larger ones have larger pixels of it."""
+    size_wh = (int(lens.image_size_wh[0]), int(lens.image_size_wh[1]))
+    background = cv2.resize(_background(), size_wh, interpolation=cv2.INTER_LINEAR)
+    with VideoWriter(path, _FPS, size_wh) as writer:
         for frame in range(frames):
             angle = 2 * np.pi * frame / _PERIOD_FRAMES
             R, t_m = look_at(
                 (1.5 * np.sin(angle), 0.8 * np.cos(angle), 1.5), (0.8 * np.sin(2 * angle), 4.0, 1.5)
             )
-            posed = camera(R=R, t_m=t_m, K=lens.K, image_size_wh=_SIZE_WH)
+            posed = camera(R=R, t_m=t_m, K=lens.K, image_size_wh=size_wh)
             image = background.copy()
             for marker, corners_m in marker_map.corners_m.items():
                 _add_marker(image, marker, project(posed, corners_m)[0])
             writer.write(image)
 
 
+def _background() -> np.ndarray:
+    """The wall without markers, 1920 x 1080."""
+    size_wh, rng = (1920, 1080), np.random.default_rng(0)
+    texture = cv2.GaussianBlur(rng.normal(0, 60, size_wh[::-1]), (0, 0), 4)
+    background = np.repeat((170 + texture)[..., None], 3, axis=-1)
+    for _ in range(20):
+        x, y = rng.uniform((0, 0), size_wh).astype(int)
+        width, height = rng.integers(60, 300, 2)
+        background[y : y + height, x : x + width] = rng.uniform(40, 220, 3)
+    return np.clip(background, 0, 255).astype(np.uint8)
+
+
 def _add_marker(image: np.ndarray, marker: int, corners_px: np.ndarray) -> None:
     """Draw one marker with a cell of white around it, in the part of the image that holds it."""
     low = np.maximum(np.floor(1.3 * corners_px.min(axis=0) - 0.3 * corners_px.max(axis=0)), 0).astype(int)
     high = np.ceil(1.3 * corners_px.max(axis=0) - 0.3 * corners_px.min(axis=0)).astype(int)
-    high = np.minimum(high, _SIZE_WH)
+    high = np.minimum(high, image.shape[1::-1])
     if (high <= low).any():
         return
     own = cv2.copyMakeBorder(

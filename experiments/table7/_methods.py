@@ -73,4 +73,6 @@ def _of_all(markers: SeenMarkers, recording: Recording) -> MarkerPose | None:
         used=np.ones(len(markers), bool),
         reprojection_px=float(np.sqrt(squared_px.mean())),
         ambiguity=0.0,
+        common=np.zeros((6, 0)),
+        chance=1.0,
     )

@@ -12,11 +12,11 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from psotrack.calibration import lens_of_view
 from psotrack.cameras import Camera, camera
 from psotrack.datasets.dpjait import CALIBRATION, MARKER_CORNERS, read_sequence
 from psotrack.errors import InputError
 from psotrack.inside_out.marker_map import MarkerMap, read_marker_map
-from psotrack.lenses import lens_of_view
 from psotrack.progress import terminal
 from psotrack.sequence import OnboardVideo
 from psotrack.synchronisation import own_reference

@@ -1,45 +1,80 @@
 """The command line. Every command says what it needs, what it writes, and shows an example.
 
+Commands are thin over functions, which are imported when they are called, so that `--help` is quick.
 Exit codes: 0 only when all was done; 2 for everything that went wrong, with one line on stderr that says what.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 
 import click
 
+from psotrack import __version__
 from psotrack.cli.as_real import as_real
 from psotrack.cli.calibrate import calibrate
-from psotrack.cli.commands import cli
+from psotrack.cli.demo import demo
 from psotrack.cli.detect import detect
 from psotrack.cli.doctor import doctor
+from psotrack.cli.evaluate import evaluate
 from psotrack.cli.fly import fly
 from psotrack.cli.fuse import fuse
+from psotrack.cli.info import info
 from psotrack.cli.labels import labels
 from psotrack.cli.localise import localise
 from psotrack.cli.map_markers import map_markers
+from psotrack.cli.silhouettes import silhouettes
 from psotrack.cli.simulate import simulate
 from psotrack.cli.sweep import sweep, table
 from psotrack.cli.synchronise import synchronise
+from psotrack.cli.track import track
 from psotrack.errors import PsotrackError
 
 __all__ = ["cli", "main"]
 
-cli.add_command(simulate)
-cli.add_command(as_real)
-cli.add_command(fly)
-cli.add_command(sweep)
-cli.add_command(table)
-cli.add_command(calibrate)
-cli.add_command(detect)
-cli.add_command(doctor)
-cli.add_command(fuse)
-cli.add_command(labels)
-cli.add_command(localise)
-cli.add_command(map_markers)
-cli.add_command(synchronise)
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(__version__, prog_name="psotrack")
+@click.option("--verbose", "-v", is_flag=True, help="Log what is done.")
+def cli(verbose: bool) -> None:
+    """3D positions of several drones, in every frame, from calibrated camera videos alone.
+
+    \b
+    Try it:          psotrack demo
+    Step by step:    psotrack simulate S02_D4_A --out data
+                     psotrack track data/Simulated_Data/S02_D4_A --out tracks.csv
+                     psotrack evaluate tracks.csv data/Simulated_Data/S02_D4_A --plot
+    """
+    logging.basicConfig(
+        level=logging.INFO if verbose else logging.WARNING,
+        format="%(levelname)s %(name)s: %(message)s",
+        stream=sys.stderr,
+    )
+
+
+for _command in (
+    as_real,
+    calibrate,
+    demo,
+    detect,
+    doctor,
+    evaluate,
+    fly,
+    fuse,
+    info,
+    labels,
+    localise,
+    map_markers,
+    silhouettes,
+    simulate,
+    sweep,
+    synchronise,
+    table,
+    track,
+):
+    cli.add_command(_command)
 
 
 def main() -> None:

@@ -1,8 +1,10 @@
-"""How commands answer: progress and sentences for people, JSON for programs."""
+"""How commands answer: progress, sentences and tables for people, JSON for programs."""
 
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,9 @@ import click
 from psotrack.errors import SettingsError
 from psotrack.files import refuse_to_overwrite, written_whole
 from psotrack.progress import Report, silent, terminal
+
+#: Heading of places in a table.
+PLACE = "centre (m)"
 
 
 def report_to(quiet: bool) -> Report:
@@ -22,6 +27,34 @@ def say(quiet: bool, json_path: Path | None, sentence: str) -> None:
     """One sentence on stdout, unless that is silent or taken by JSON."""
     if not quiet and json_path != Path("-"):
         click.echo(sentence)
+
+
+def show(
+    quiet: bool, json_path: Path | None, headings: tuple[str, ...], rows: Iterable[tuple[str, ...]]
+) -> None:
+    """A table of names and numbers on stdout, where `say` would say something; places stay on one line."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    if quiet or json_path == Path("-"):
+        return
+    table = Table(box=box.HORIZONTALS, show_edge=False)
+    for index, heading in enumerate(headings):
+        table.add_column(heading, justify="right" if index else "left", no_wrap=heading == PLACE)
+    for row in rows:
+        table.add_row(*row)
+    Console().print(table)
+
+
+def known(value: float) -> float | None:
+    """A number as JSON has it: null for none."""
+    return float(value) if math.isfinite(value) else None
+
+
+def in_words(values: Iterable[float], digits: int) -> str:
+    """Numbers with spaces between them."""
+    return " ".join(f"{value:.{digits}f}" for value in values)
 
 
 def check_outputs(out: Path | None, json_path: Path | None, force: bool) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from psotrack.cli.answers import answer, report_to, say
-from psotrack.cli.options import CAMERAS, DETECTOR_SIZE, FORCE, FRAMES, JSON, QUIET, SEQUENCE
+from psotrack.cli.options import CAMERAS, DETECTOR_SIZE, FORCE, FRAMES, JSON, QUIET, SEQUENCE, usable_sequence
 
 
 @click.command()
@@ -63,14 +63,13 @@ def detect(
       psotrack detect data/Simulated_Data/S02_D4_A --detector drones.onnx --out boxes
       psotrack detect data/Real_Data/R12_D4 --detector drones.onnx --out boxes --size 1280 --confidence 0.4
     """
-    from psotrack.datasets.dpjait import read_sequence
     from psotrack.detections import write_detections
     from psotrack.detector import Detector, DetectorSettings
     from psotrack.detector import detect as detect_in
     from psotrack.files import refuse_to_overwrite
 
     detector = Detector(model, DetectorSettings(confidence, nms, size))
-    recording = read_sequence(sequence).usable(cameras.split(",") if cameras else None, num_frames)
+    recording = usable_sequence(sequence, cameras, num_frames)
     files = {name: out / f"{video.path.stem}.csv" for name, video in recording.videos.items()}
     for path in files.values():
         refuse_to_overwrite(path, force)

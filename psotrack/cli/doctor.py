@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from psotrack.cli.answers import answer, report_to, say
+from psotrack.cli.answers import answer, known, report_to, say
 from psotrack.cli.options import CACHE, FORCE, JOBS, JSON, QUIET, SEQUENCE, cache_folder
 
 if TYPE_CHECKING:
@@ -100,8 +100,8 @@ def _rows(rig: CameraRig, diagnosis: Diagnosis) -> list[dict[str, Any]]:
                 "explained": float(found.share_of_camera[index]),
                 "residual_px": float(np.median(residual_px)) if len(residual_px) else None,
                 "residual_std": float(np.median(residual_px / noise_px)) if len(residual_px) else None,
-                "late_frames": _number(diagnosis.offset_frames[index]),
-                "late_std_frames": _number(diagnosis.offset_std_frames[index]),
+                "late_frames": known(diagnosis.offset_frames[index]),
+                "late_std_frames": known(diagnosis.offset_std_frames[index]),
             }
         )
     return rows
@@ -115,7 +115,7 @@ def _content(rig: CameraRig, diagnosis: Diagnosis) -> dict[str, Any]:
         "frames": diagnosis.found.num_frames,
         "explained": diagnosis.found.share,
         "cameras": _rows(rig, diagnosis),
-        "epipolar_px": [[_number(value) for value in row] for row in diagnosis.epipolar_px],
+        "epipolar_px": [[known(value) for value in row] for row in diagnosis.epipolar_px],
         "reference_m": None if fit is None else fit.before_m,
     }
 
@@ -144,7 +144,3 @@ def _print(rig: CameraRig, diagnosis: Diagnosis) -> None:
         pairs.add_row(name, *("" if np.isnan(value) else f"{value:.1f}" for value in values))
     Console().print(table)
     Console().print(pairs)
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

@@ -64,8 +64,34 @@ class _Input:
     "--filter/--no-filter", "filtered", default=True, show_default=True, help="Follow the motion, on the fly."
 )
 @click.option("--smooth", "smoothed", is_flag=True, help="Afterwards: the best path from all frames.")
+@click.option(
+    "--map-error",
+    "map_error_mm",
+    type=click.FloatRange(min=0, max=1000, max_open=True),
+    default=0.0,
+    show_default=True,
+    metavar="MM",
+    help="Standard deviation of each marker's place in the table.",
+)
+@click.option(
+    "--focal-error",
+    "focal_error_percent",
+    type=click.FloatRange(min=0, max=100, max_open=True),
+    default=0.0,
+    show_default=True,
+    metavar="PERCENT",
+    help="Standard deviation of the focal length.",
+)
 @click.option("--fps", type=float, help="Frames per second of a folder of images.")
 @click.option("--live", is_flag=True, help="VIDEO is a camera's number or a stream: newest frames first.")
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path),
+    is_flag=False,
+    flag_value="",
+    metavar="[PNG]",
+    help="Save the path from above, and the height over time.  [default: beside --out, as .png]",
+)
 @FRAMES
 @FORCE
 @QUIET
@@ -84,8 +110,11 @@ def localise(
     min_markers: int,
     filtered: bool,
     smoothed: bool,
+    map_error_mm: float,
+    focal_error_percent: float,
     fps: float | None,
     live: bool,
+    plot: Path | None,
     num_frames: int | None,
     force: bool,
     quiet: bool,
@@ -97,17 +126,23 @@ def localise(
     its markers and intrinsics along. With --live, frames are left out that come too fast; Ctrl-C ends it, and what was
     localised so far is written.
 
+    What is off in all frames alike, the map or the focal length, is not averaged away by any number of frames:
+    --map-error and --focal-error make poses better, where several markers tell, and covariances honest.
+
     \b
     Examples:
       psotrack localise flight.mp4 --markers corners.csv --camera lens.toml --out track.csv
       psotrack localise GOPR0017.MP4 --markers corners.csv --fov 92.45,60.83 --out track.csv --smooth
       psotrack localise data/Simulated_Data/S01_D2_A --drone dron1 --out dron1.csv
       psotrack localise images --fps 25 --markers corners.csv --camera lens.yml --out track.csv --frames 100
+      psotrack localise flight.mp4 --markers corners.csv --fov 92,61 --focal-error 0.5 --out track.csv --plot
       psotrack localise 0 --live --markers corners.csv --camera lens.yml --out track.csv
     """
     from dataclasses import replace
 
+    from psotrack.files import refuse_to_overwrite
     from psotrack.inside_out.camera_path import write_camera_path
+    from psotrack.inside_out.comparison.plots import save_flight
     from psotrack.inside_out.filtering.pose_filter import PoseFilterParams
     from psotrack.inside_out.filtering.smoothing import smooth
     from psotrack.inside_out.localising import LocaliseSettings
@@ -116,25 +151,43 @@ def localise(
     from psotrack.inside_out.pose import PoseSettings
 
     check_outputs(out, json_path, force)
+    picture = None if plot is None else plot if plot.name else out.with_suffix(".png")
+    if picture is not None:
+        refuse_to_overwrite(picture, force)
     given = _input(video, drone, fps, live)
     if markers is None and given.markers is None:
         raise SettingsError("--markers", expected="a table of corners", found="none")
     marker_map = read_marker_map(Path(str(markers or given.markers)))
     lens = _lens(given, camera_file, camera_name, scale_camera, fov_deg)
+    source = given.source.first(num_frames)
     settings = LocaliseSettings(
         dictionary=dictionary,
-        pose=PoseSettings(min_markers=min_markers),
+        pose=PoseSettings(
+            min_markers=min_markers, map_error_m=map_error_mm / 1e3, focal_error=focal_error_percent / 100
+        ),
         filter=PoseFilterParams() if filtered else None,
-    )
-    found = localise_camera(
-        given.source.first(num_frames), marker_map, lens, settings, report_to(quiet or json_path == Path("-"))
-    )
-    if smoothed:
-        found = replace(found, path=smooth(found.raw, settings.filter))
+    ).within(source.num_frames)
+    try:
+        found = localise_camera(
+            source, marker_map, lens, settings, report_to(quiet or json_path == Path("-"))
+        )
+        if smoothed:
+            found = replace(found, path=smooth(found.raw, settings.filter))
+    except KeyboardInterrupt as stop:
+        again = (
+            "a stream is not heard twice" if source.stream else "the same command starts from the first frame"
+        )
+        raise click.ClickException(f"interrupted; nothing is written, and {again}") from stop
     drone_name = name or given.name
     write_camera_path(out, found.path, drone_name, force=force)
+    if picture is not None:
+        save_flight(
+            picture, found.path, marker_map, caption=f"{drone_name}: {given.source.name}", force=force
+        )
     content = _content(found, given.source.name, drone_name, settings.pose.min_markers)
-    answer(json_path, content | {"track": str(out), "filtered": filtered, "smoothed": smoothed}, force)
+    content |= {"track": str(out), "filtered": filtered, "smoothed": smoothed}
+    content |= {"map_error_m": settings.pose.map_error_m, "focal_error": settings.pose.focal_error}
+    answer(json_path, content, force)
     say(quiet, json_path, _sentence(out, content))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 import platformdirs
@@ -12,6 +12,9 @@ import platformdirs
 from psotrack.foreground import Shadows
 from psotrack.settings import TrackSettings
 from psotrack.silhouette_store import SilhouetteSettings
+
+if TYPE_CHECKING:
+    from psotrack.sequence import Sequence
 
 #: Defaults are written once, in the settings; the command line shows them.
 TRACK = TrackSettings()
@@ -40,6 +43,21 @@ class Numbers(click.ParamType):
         if len(numbers) != self.count:
             self.fail(f"expected {self.count} numbers with commas between them, found {value!r}", param, ctx)
         return numbers
+
+
+class Size(click.ParamType):
+    """Two whole numbers above 0, such as 1920,1080 or 7x5."""
+
+    name = "W,H"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """A pair of integers; what is no string was converted before."""
+        if not isinstance(value, str):
+            return value
+        words = value.replace("x", ",").split(",")
+        if len(words) != 2 or not all(word.isdecimal() and int(word) > 0 for word in words):
+            self.fail(f"expected two whole numbers above 0, such as 1920,1080, found {value!r}", param, ctx)
+        return int(words[0]), int(words[1])
 
 
 SEQUENCE = click.argument("sequence", metavar="SEQ", type=click.Path(path_type=Path))
@@ -111,6 +129,13 @@ def silhouette_options(command: Command) -> Command:
     ):
         command = option(command)
     return command
+
+
+def usable_sequence(folder: Path, cameras: str | None, num_frames: int | None) -> Sequence:
+    """What is to be used of a sequence, of what `CAMERAS` and `FRAMES` ask for."""
+    from psotrack.datasets.dpjait import read_sequence
+
+    return read_sequence(folder).usable(cameras.split(",") if cameras else None, num_frames)
 
 
 def cache_folder(chosen: Path | None) -> Path:

@@ -11,7 +11,7 @@ from psotrack.cameras import Camera, CameraRig
 from psotrack.correspondence import match
 from psotrack.reprojection import reconstruct
 from psotrack.settings import TrackSettings
-from psotrack.sightings import Sightings
+from psotrack.sightings import Sightings, View
 from psotrack.starts import room_bounds
 from psotrack.triangulation import viewpoints
 
@@ -69,18 +69,11 @@ def agreement(rig: CameraRig, sightings: Sightings, frames: Int[np.ndarray, "cho
     centres: list[np.ndarray] = []
     noises: list[np.ndarray] = []
     for frame in frames.tolist():
-        there = np.isfinite(sightings.noise_px[frame])
-        points_px = [of[which] for of, which in zip(sightings.centre_px[frame], there, strict=True)]
-        noise_px = [of[which] for of, which in zip(sightings.noise_px[frame], there, strict=True)]
-        found = _matched(rig, points_px, noise_px, bounds_m)
-        centre, noise = np.full((*found.shape, 2), np.nan), np.full(found.shape, np.nan)
-        for camera, which in enumerate(found.T):
-            seen = which >= 0
-            centre[seen, camera] = points_px[camera][which[seen]]
-            noise[seen, camera] = noise_px[camera][which[seen]]
+        view = sightings.at(frame)
+        found = _matched(rig, view, bounds_m)
         numbers.append(np.full(len(found), frame))
-        centres.append(centre)
-        noises.append(noise)
+        centres.append(view.grouped(view.centre_px, found))
+        noises.append(view.grouped(view.noise_px, found))
     frame_of, centre_px, all_noise_px = (np.concatenate(values) for values in (numbers, centres, noises))
     lines = reconstruct(rig.cameras, centre_px, noise_px=np.nan_to_num(all_noise_px, nan=1.0))
     kept = num_viewpoints(rig.cameras, lines.used) >= MIN_VIEWPOINTS
@@ -97,17 +90,17 @@ def agreement(rig: CameraRig, sightings: Sightings, frames: Int[np.ndarray, "cho
 
 
 def _matched(
-    rig: CameraRig,
-    points_px: list[Float[np.ndarray, "_ 2"]],
-    noise_px: list[Float[np.ndarray, "_"]],
-    bounds_m: Float[np.ndarray, "2 3"],
+    rig: CameraRig, view: View, bounds_m: Float[np.ndarray, "2 3"]
 ) -> Int[np.ndarray, "points cameras"]:
-    """Which detections are of which point; none where a rig is so wrong that its equations are singular."""
+    """Which sightings are of which point; none where a rig is so wrong that its equations are singular."""
     try:
         with np.errstate(all="ignore"):
-            return match(rig.cameras, points_px, noise_px, bounds_m=bounds_m).detection
+            found = match(
+                rig.cameras, view.found(view.centre_px), view.found(view.noise_px), bounds_m=bounds_m
+            )
     except np.linalg.LinAlgError:
         return np.empty((0, len(rig)), int)
+    return found.detection
 
 
 def num_viewpoints(cameras: Camera, seen: Bool[np.ndarray, "points cameras"]) -> Int[np.ndarray, "points"]:

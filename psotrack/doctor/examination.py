@@ -17,7 +17,7 @@ from psotrack.cameras import CameraRig
 from psotrack.correspondence import epipolar_distance
 from psotrack.doctor.agreement import Agreement, agreement
 from psotrack.doctor.findings import CLEARLY, Finding, fault_of, late_clock, reference_findings
-from psotrack.doctor.readings import better_lenses, better_reading, halfway
+from psotrack.doctor.readings import better_lenses, better_reading, certain_lenses, halfway
 from psotrack.doctor.reference_fit import ReferenceFit, fit_reference
 from psotrack.doctor.suspects import LEAST_POINTS, explanations, late_cameras, views_of
 from psotrack.sightings import Sightings
@@ -91,9 +91,17 @@ def examine(
         return Diagnosis(tuple(findings), found, nothing, nothing, _epipolar(rig, found), None)
     lenses = better_lenses(rig, found, CLEARLY)
     if lenses is not None:
-        findings.append(Finding(lenses.kind, (), f"the calibration: {lenses.words}", lenses.remedy))
         rig, found = lenses.rig, agreement(lenses.rig, sightings, frames)
     of_cameras, sound = _of_cameras(rig, found, sightings, frames)
+    certain = certain_lenses(rig, found) if lenses is None else None
+    if certain is not None:
+        agreed = agreement(certain.rig, sightings, frames)
+        # What is wrong with all may look as if it were with the one that shows it most; the reverse does not go away.
+        still, all_sound = _of_cameras(certain.rig, agreed, sightings, frames)
+        if not still:
+            lenses, rig, found, of_cameras, sound = certain, certain.rig, agreed, still, all_sound
+    if lenses is not None:
+        findings.append(Finding(lenses.kind, (), f"the calibration: {lenses.words}", lenses.remedy))
     findings += of_cameras
     offset, std, late = late_cameras(rig, found, sound, fps)
     findings += [late_clock(rig.names[index], offset[index], std[index]) for index in late]

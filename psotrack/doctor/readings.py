@@ -9,6 +9,7 @@ from itertools import combinations, product
 import numpy as np
 from jaxtyping import Float, Int
 
+from psotrack.calibration import Alike, adjust
 from psotrack.cameras import Camera, CameraRig
 from psotrack.doctor.agreement import UNEXPLAINED, Agreement, agreement
 from psotrack.reprojection import reconstruct
@@ -17,6 +18,11 @@ from psotrack.sightings import Sightings
 #: Common factors of the focal lengths that are tried at first, and then about the best.
 _SCALES = np.exp(np.arange(-0.7, 0.7001, 0.1))
 _FINER = np.exp(np.arange(-0.1, 0.1001, 0.01))
+#: A factor that is nearer to 1 than this is none, because bodies in perspective pass for one; others are off for
+#: certain from so many standard deviations on.
+_LEAST_OFF, _CERTAIN = 0.02, 3.5
+#: Share of a sighting's noise that others of the same camera have in common: for a while, and over the image.
+_COMMON = 0.3
 
 
 @dataclass(frozen=True)
@@ -145,6 +151,32 @@ def better_lenses(rig: CameraRig, found: Agreement, clearly: float) -> Reading |
     scale = best.rig.cameras.K[0, 0, 0] / rig.cameras.K[0, 0, 0]
     best = max(_lenses(rig, scale * _FINER), key=gain)
     return best if gain(best) > as_read + clearly else None
+
+
+def certain_lenses(rig: CameraRig, found: Agreement) -> Reading | None:
+    """All focal lengths times a factor, if a bundle adjustment in which cameras stand still finds it off for certain.
+
+    With other lenses lines of sight pass each other, the farther from the middle of the image the more, because cameras
+    stand where they do. A few per cent are less than the noise of one sighting, and more than that of a thousand.
+
+    Args:
+        rig: as it was read.
+        found: its points.
+    """
+    seen_px = np.where(found.used[..., None], found.centre_px, np.nan)
+    noise_px = np.nan_to_num(found.noise_px, nan=1.0)
+    middle_px, size_px = np.asarray(rig.cameras.K)[:, :2, 2], np.asarray(rig.cameras.image_size_wh)
+    from_middle = np.nan_to_num((seen_px - middle_px) / (size_px / 2))
+    run = np.cumsum(np.diff(found.frame, prepend=found.frame[:1]) > 1)
+    common_px, all_of_it = _COMMON * noise_px, np.zeros_like(run)
+    alike = [Alike(run, common_px)]
+    alike += [Alike(all_of_it, common_px * of) for of in (1.0, *np.moveaxis(from_middle, -1, 0))]
+    adjusted = adjust(rig, seen_px, noise_px, fixed=rig.names, rescaled=rig.names, alike=alike)
+    scale, std = adjusted.focal_scale, adjusted.focal_scale_std
+    if abs(np.log(scale)) < max(_LEAST_OFF, _CERTAIN * std / scale):
+        return None
+    (reading,) = _lenses(rig, np.array([scale]))
+    return replace(reading, words=f"{reading.words}, give or take {100 * std / scale:.1f} %")
 
 
 def _lenses(rig: CameraRig, scales: Float[np.ndarray, "scales"]) -> Iterator[Reading]:

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
-from scipy.spatial.transform import Rotation
 
 from psotrack.delimited import Row, Table, read_table, write_rows
 from psotrack.errors import InputError
 from psotrack.files import refuse_to_overwrite
+from psotrack.rotations import rotation_matrices
 from psotrack.trajectories import Status, Trajectories
 
 #: Axes of the covariance: along the world's axes in metres, then small turns about the camera's own in radians.
@@ -71,6 +71,10 @@ class CameraPath:
             does, `LOST` where there is no pose.
         flags: (frames,), values of `Flag`.
         velocity_m_s: (frames, 3), world, where a filter tells it.
+        chance: (frames,), of frames' own poses: probability at most that so many markers would agree if none were what
+            it is taken for. It is for the filter, and in no table.
+        common: (frames, 6, errors), of frames' own poses, as a root: the part of the covariance due to each error of
+            the map and of the lens, which are the same in all frames. It is for the filter, and in no table.
     """
 
     frame: Int[np.ndarray, "frames"]
@@ -84,6 +88,8 @@ class CameraPath:
     status: Int[np.ndarray, "frames"]
     flags: Int[np.ndarray, "frames"]
     velocity_m_s: Float[np.ndarray, "frames 3"] | None = None
+    chance: Float[np.ndarray, "frames"] | None = None
+    common: Float[np.ndarray, "frames 6 errors"] | None = None
 
     def __post_init__(self) -> None:
         for name, shape in {"position_m": (3,), "orientation_wxyz": (4,), "covariance": (6, 6)}.items():
@@ -128,7 +134,7 @@ def roll_pitch_yaw_deg(orientation_wxyz: Float[np.ndarray, "*frames 4"]) -> Floa
     from the world's x axis, counterclockwise seen from above; pitch is positive with the nose down; roll with the
     right side down. Each is in (-180, 180], pitch in [-90, 90].
     """
-    body = _matrices(orientation_wxyz.reshape(-1, 4)) @ _BODY_IN_CAMERA
+    body = rotation_matrices(orientation_wxyz.reshape(-1, 4)) @ _BODY_IN_CAMERA
     roll = np.arctan2(body[:, 2, 1], body[:, 2, 2])
     pitch = -np.arcsin(np.clip(body[:, 2, 0], -1.0, 1.0))
     yaw = np.arctan2(body[:, 1, 0], body[:, 0, 0])
@@ -162,7 +168,7 @@ def write_camera_path(path: Path, camera_path: CameraPath, name: str, *, force: 
         **_split(_POSITION, camera_path.position_m),
         **_split(_VELOCITY, np.full((count, 3), np.nan) if velocity_m_s is None else velocity_m_s),
         **_split(_QUATERNION, camera_path.orientation_wxyz),
-        **_split(_ROTATION, _matrices(camera_path.orientation_wxyz).reshape(count, 9)),
+        **_split(_ROTATION, rotation_matrices(camera_path.orientation_wxyz).reshape(count, 9)),
         **_split(_ANGLES, roll_pitch_yaw_deg(camera_path.orientation_wxyz)),
         **_split([f"cov_{axes}" for axes in _COVARIANCE], camera_path.covariance[:, *_UPPER]),
         "num_markers": camera_path.num_markers,
@@ -221,14 +227,6 @@ def read_camera_path(path: Path) -> tuple[CameraPath, str]:
 
 def _split(names: tuple[str, ...] | list[str], values: Float[np.ndarray, "frames columns"]) -> Mapping:
     return dict(zip(names, values.T, strict=True))
-
-
-def _matrices(orientation_wxyz: Float[np.ndarray, "frames 4"]) -> Float[np.ndarray, "frames 3 3"]:
-    matrices = np.full((len(orientation_wxyz), 3, 3), np.nan)
-    known = np.isfinite(orientation_wxyz).all(axis=-1)
-    if known.any():
-        matrices[known] = Rotation.from_quat(orientation_wxyz[known], scalar_first=True).as_matrix()
-    return matrices
 
 
 def _cell(value: object) -> object:

@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from psotrack.calibration import lens_of_view, read_lenses
 from psotrack.cameras import Camera, CameraRig, camera, stack
 from psotrack.datasets.dpjait import read_onboard_calibration
 from psotrack.delimited import read_table
 from psotrack.errors import InputError, SettingsError
-from psotrack.lenses import lens_of_view
-from psotrack.rig_files import read_lenses
 
 #: Of the image, that the optical axis may be off its middle, where a file does not say the size of its images.
 _OFF_MIDDLE = 0.2

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from psotrack.cameras import Camera
@@ -46,6 +46,10 @@ class LocaliseSettings:
     dictionary: str = "4x4_1000"
     pose: PoseSettings = field(default_factory=PoseSettings)
     filter: PoseFilterParams | None = field(default_factory=PoseFilterParams)
+
+    def within(self, num_frames: int | None) -> LocaliseSettings:
+        """The same for a recording of so many frames; None of a stream."""
+        return self if self.filter is None else replace(self, filter=self.filter.within(num_frames))
 
 
 @dataclass(frozen=True)
@@ -99,7 +103,7 @@ def localise(
         InputError: frames cannot be read, or end early; or the lens is for another size of images.
         SettingsError: there is no such dictionary, or it has none of the map's markers.
     """
-    settings = settings or LocaliseSettings()
+    settings = (settings or LocaliseSettings()).within(source.num_frames)
     _check_size(source, lens)
     detector = MarkerDetector(settings.dictionary, lens, ids=marker_map.ids.tolist())
     seconds = dict.fromkeys(STAGES, 0.0)
@@ -147,7 +151,9 @@ def follow_markers(
         if settings.filter is not None:
             following = advance(following, time_s, settings.filter)
         foretold_s = time.perf_counter()
-        raw = row_of(number, time_s, seen, _located(seen, marker_map, lens, settings, following), settings)
+        pose = _located(seen, marker_map, lens, settings, following)
+        raw = row_of(number, time_s, seen, pose, settings)
+        raw = replace(raw, common=_common(seen, pose, marker_map, settings.pose))
         located_s = time.perf_counter()
         row = raw
         if settings.filter is not None:
@@ -228,4 +234,19 @@ def row_of(
         status=int(Status.LOST if pose is None else Status.TRACKED),
         flags=int(flags),
         velocity_m_s=nothing,
+        chance=np.nan if pose is None else pose.chance,
     )
+
+
+def _common(
+    seen: SeenMarkers, pose: MarkerPose | None, marker_map: MarkerMap, settings: PoseSettings
+) -> Float[np.ndarray, "6 errors"]:
+    """What errors of the whole map, and of the focal length, do to a pose; none where none are stated."""
+    if not settings.map_error_m and not settings.focal_error:
+        return np.zeros((6, 0))
+    common = np.zeros((6, 3 * len(marker_map) + 1))
+    if pose is not None:
+        first = 3 * np.searchsorted(marker_map.ids, seen.ids)
+        common[:, (first[:, None] + np.arange(3)).ravel()] = pose.common[:, :-1]
+        common[:, -1] = pose.common[:, -1]
+    return common

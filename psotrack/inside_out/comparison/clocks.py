@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from psotrack import time_shift
 from psotrack.evaluation.association import GATE_M
 from psotrack.inside_out.camera_path import CameraPath
+from psotrack.rotations import rotation_matrices
 from psotrack.synchronisation import Offset, find_offset
 from psotrack.trajectories import Status, Trajectories
 
@@ -130,12 +131,7 @@ def at_times(
         return found
     sample_s = time_s[known]
     arcs = Slerp(sample_s, Rotation.from_quat(orientation_wxyz[known], scalar_first=True))
-    longest_s = max(time_shift.MAX_GAP_S, 1.5 * float(np.median(np.diff(time_s))))
-    after = np.clip(np.searchsorted(sample_s, wanted_s), 1, len(sample_s) - 1)
-    before_s, after_s = wanted_s - sample_s[after - 1], sample_s[after] - wanted_s
-    # Samples themselves are known on both sides of a gap, but for rounding.
-    inside = (np.minimum(before_s, after_s) >= 0) & (before_s + after_s <= longest_s)
-    inside |= np.minimum(np.abs(before_s), np.abs(after_s)) < 1e-9
+    inside = time_shift.between_samples(sample_s, wanted_s, time_shift.longest_gap_s(time_s))
     at_s = np.clip(wanted_s[inside], sample_s[0], sample_s[-1])
     found[inside] = arcs(at_s).as_quat(scalar_first=True)
     return found
@@ -239,8 +235,4 @@ def _without_jumps(path: CameraPath) -> CameraPath:
 
 def _axes(orientation_wxyz: Float[np.ndarray, "times 4"]) -> Float[np.ndarray, "times 3 3"]:
     """The axes of a frame in the world, one per row."""
-    axes = np.full((len(orientation_wxyz), 3, 3), np.nan)
-    known = np.isfinite(orientation_wxyz).all(axis=-1)
-    if known.any():
-        axes[known] = Rotation.from_quat(orientation_wxyz[known], scalar_first=True).inv().as_matrix()
-    return axes
+    return rotation_matrices(orientation_wxyz).swapaxes(-1, -2)

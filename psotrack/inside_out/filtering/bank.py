@@ -15,10 +15,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtri
 
-from psotrack.errors import InputError, SettingsError, check_positive
+from psotrack.errors import InputError
 from psotrack.inside_out.filtering import motion as pose_motion
-from psotrack.inside_out.filtering.manifold import rotation_matrices
 from psotrack.inside_out.filtering.motion import POSE, Innovation, Levels, Motion
+from psotrack.inside_out.filtering.records import MeasuredPose, PoseEstimate, PoseFilterParams
 
 #: Accelerations (m/s2, along each axis) and changes of the turn rate within a second (rad/s, about each axis) that are
 #: tried, each with each: hovering, flying, racing.
@@ -52,50 +52,6 @@ _OTHER_POSE_STD = 1.0
 
 
 @dataclass(frozen=True)
-class PoseFilterParams:
-    """What may be chosen of the filter.
-
-    Attributes:
-        false_alarm: probability with which a good pose is gated.
-        longest_gap_s: after so long without a pose that fits, none is told until there are poses again.
-        confirm: poses that must agree before the first is told; 1 believes every start.
-        restart_after: poses in a row that agree with one another and not with the state, after which the state is
-            given up; fewer, where it rests on fewer itself.
-    """
-
-    false_alarm: float = 1e-3
-    longest_gap_s: float = 0.5
-    confirm: int = 3
-    restart_after: int = 10
-
-    def __post_init__(self) -> None:
-        check_positive("longest_gap_s", self.longest_gap_s)
-        if not 0 < self.false_alarm < 1:
-            raise SettingsError(
-                "false_alarm", expected="a probability above 0 and below 1", found=f"{self.false_alarm:g}"
-            )
-        for name in ("confirm", "restart_after"):
-            if getattr(self, name) < 1:
-                raise SettingsError(name, expected="at least 1", found=f"{getattr(self, name)}")
-
-
-@dataclass(frozen=True)
-class MeasuredPose:
-    """What one frame says of a camera by itself.
-
-    Attributes:
-        time_s: of the frame.
-        position_m, orientation_wxyz, covariance, ambiguity: as in `CameraPath`.
-    """
-
-    time_s: float
-    position_m: Float[np.ndarray, "3"]
-    orientation_wxyz: Float[np.ndarray, "4"]
-    covariance: Float[np.ndarray, "6 6"]
-    ambiguity: float = 0.0
-
-
-@dataclass(frozen=True)
 class PoseState:
     """What is known of a camera at a time.
 
@@ -107,6 +63,7 @@ class PoseState:
         support: poses that fitted.
         log_density: with which the last of them was foretold, but for a constant; its covariance is that of all levels.
         ambiguity: probability that all of them are of another camera pose that looks the same.
+        doubt: probability at most that the surest of them is wrong, by itself.
         noise_power, noise_faith: squares that the noise of poses had of late, and should have had.
     """
 
@@ -117,6 +74,7 @@ class PoseState:
     support: int
     log_density: float
     ambiguity: float
+    doubt: float
     noise_power: float = _NOISE_FAITH
     noise_faith: float = _NOISE_FAITH
 
@@ -124,28 +82,6 @@ class PoseState:
     def noise_scale(self) -> float:
         """What covariances of measured poses are multiplied with."""
         return min(max(self.noise_power / self.noise_faith, 1 / _MOST_SCALED), _MOST_SCALED)
-
-
-@dataclass(frozen=True)
-class PoseEstimate:
-    """A pose and how sure it is.
-
-    Attributes:
-        position_m: (3,), the camera's centre, world.
-        orientation_wxyz: (4,), unit quaternion, camera to world.
-        covariance: (6, 6), as in `CameraPath`.
-        velocity_m_s: (3,), world.
-    """
-
-    position_m: Float[np.ndarray, "3"]
-    orientation_wxyz: Float[np.ndarray, "4"]
-    covariance: Float[np.ndarray, "6 6"]
-    velocity_m_s: Float[np.ndarray, "3"]
-
-    @property
-    def R_world_cam(self) -> Float[np.ndarray, "3 3"]:
-        """(3, 3), camera to world."""
-        return rotation_matrices(self.orientation_wxyz[None])[0]
 
 
 def init(measurement: MeasuredPose) -> PoseState:
@@ -156,7 +92,11 @@ def init(measurement: MeasuredPose) -> PoseState:
     """
     _check(measurement)
     motion = pose_motion.begun(
-        measurement.position_m, measurement.orientation_wxyz, measurement.covariance, LEVELS
+        measurement.position_m,
+        measurement.orientation_wxyz,
+        measurement.covariance,
+        measurement.common,
+        LEVELS,
     )
     return PoseState(
         time_s=measurement.time_s,
@@ -166,6 +106,7 @@ def init(measurement: MeasuredPose) -> PoseState:
         support=1,
         log_density=-np.inf,
         ambiguity=measurement.ambiguity,
+        doubt=measurement.doubt,
     )
 
 
@@ -197,9 +138,9 @@ def update(state: PoseState, measurement: MeasuredPose, params: PoseFilterParams
     state = predict(state, measurement.time_s)
     covariance = state.noise_scale * measurement.covariance
     told = pose_motion.innovation(
-        state.motion, measurement.position_m, measurement.orientation_wxyz, covariance
+        state.motion, measurement.position_m, measurement.orientation_wxyz, covariance, measurement.common
     )
-    off, spread = _merged(_weights(state), told.pose, told.covariance)
+    off, spread = _merged(_weights(state), told.pose, told.whole_covariance)
     precision = np.linalg.inv(spread)
     whitened = precision @ off
     nis = float(off @ whitened)
@@ -220,6 +161,7 @@ def update(state: PoseState, measurement: MeasuredPose, params: PoseFilterParams
         support=state.support + 1,
         log_density=-(nis + float(np.linalg.slogdet(spread)[1])) / 2,
         ambiguity=min(state.ambiguity, measurement.ambiguity),
+        doubt=min(state.doubt, measurement.doubt),
         noise_power=_NOISE_FAITH + kept * (state.noise_power - _NOISE_FAITH) + power,
         noise_faith=_NOISE_FAITH
         + kept * (state.noise_faith - _NOISE_FAITH)
@@ -234,10 +176,11 @@ def estimate(state: PoseState) -> PoseEstimate:
     apart = pose_motion.difference(best, state.motion)
     change, covariance = _merged(weight, apart, state.motion.covariance)
     middle = pose_motion.shifted(best, change[None])
+    common = np.tensordot(weight, state.motion.common[:, POSE], axes=1)
     return PoseEstimate(
         position_m=middle.position_m[0],
         orientation_wxyz=middle.orientation_wxyz[0],
-        covariance=covariance[np.ix_(POSE, POSE)],
+        covariance=covariance[np.ix_(POSE, POSE)] + common @ common.T,
         velocity_m_s=middle.velocity_m_s[0],
     )
 
@@ -291,8 +234,9 @@ def _normalised(log_weight: Float[np.ndarray, "levels"]) -> Float[np.ndarray, "l
 
 def _log_densities(told: Innovation) -> Float[np.ndarray, "levels"]:
     """Logarithms of the densities with which the levels foretold a measurement, but for a constant."""
-    nis = np.einsum("li,lij,lj->l", told.pose, np.linalg.inv(told.covariance), told.pose)
-    return -((_FREEDOM + 6) * np.log1p(nis / _FREEDOM) + np.linalg.slogdet(told.covariance)[1]) / 2
+    covariance = told.whole_covariance
+    nis = np.einsum("li,lij,lj->l", told.pose, np.linalg.inv(covariance), told.pose)
+    return -((_FREEDOM + 6) * np.log1p(nis / _FREEDOM) + np.linalg.slogdet(covariance)[1]) / 2
 
 
 def _check(measurement: MeasuredPose) -> None:

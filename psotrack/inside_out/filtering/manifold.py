@@ -11,6 +11,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from psotrack.rotations import cross_matrices
+
 #: Batches of one are of any size.
 Turns = Float[np.ndarray, "#batch 3"]
 Quaternions = Float[np.ndarray, "#batch 4"]
@@ -49,13 +51,6 @@ def rotation_matrices(orientation_wxyz: Quaternions) -> Matrices:
     w, vector = orientation_wxyz[:, 0, None, None], orientation_wxyz[:, 1:]
     crossed = cross_matrices(vector)
     return _EYE + 2 * (w * crossed + crossed @ crossed)
-
-
-def cross_matrices(vectors: Turns) -> Matrices:
-    """[v] with [v] w = v x w."""
-    matrices = np.zeros((len(vectors), 3, 3))
-    matrices[:, 2, 1], matrices[:, 0, 2], matrices[:, 1, 0] = vectors.T
-    return matrices - matrices.swapaxes(1, 2)
 
 
 def right_jacobian(turn: Turns) -> Matrices:

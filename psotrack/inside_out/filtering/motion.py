@@ -10,6 +10,11 @@ places in the image. So a share of a measurement's covariance is that of an erro
 symmetric root of that share, which turns with the world, and six numbers u of variance 1 that are part of the state
 and change slowly. A filter that took such errors for white would soon believe itself far better than any frame
 (`psotrack.motion` does alike for positions).
+
+Errors of the map and of the focal length never change. No motion tells them, and no number of frames averages them
+away: they are considered, not estimated (S. F. Schmidt, Application of state-space methods to navigation problems,
+Advances in Control Systems 3, 1966). What each does to a pose is known, and what that does to the state is carried
+along; gains are as if there were none of them.
 """
 
 from __future__ import annotations
@@ -70,7 +75,8 @@ class Motion:
         orientation_wxyz: (levels, 4), unit quaternions, camera to world.
         rate_rad_s: (levels, 3), turn rate about the camera's axes.
         lasting: (levels, 6), the error u that lasts, in standard deviations.
-        covariance: (levels, 21, 21), of all these in this order.
+        covariance: (levels, 21, 21), of all these in this order, as if there were no errors that never change.
+        common: (levels, 21, errors), by how much one standard deviation of each error that never changes puts it off.
     """
 
     position_m: Float[np.ndarray, "levels 3"]
@@ -80,6 +86,7 @@ class Motion:
     rate_rad_s: Float[np.ndarray, "levels 3"]
     lasting: Float[np.ndarray, "levels 6"]
     covariance: Float[np.ndarray, "levels n n"]
+    common: Float[np.ndarray, "levels n errors"]
 
 
 @dataclass(frozen=True)
@@ -90,17 +97,25 @@ class Innovation:
         pose: (levels, 6), along the world's axes and about the foretold camera's.
         covariance: (levels, 6, 6), of `pose`: of state and measurement together.
         shared: (levels, 21, 6), covariance of the state with it.
+        common: (levels, 6, errors), what one standard deviation of each error that never changes adds to `pose`.
     """
 
     pose: Float[np.ndarray, "levels 6"]
     covariance: Float[np.ndarray, "levels 6 6"]
     shared: Float[np.ndarray, "levels n 6"]
+    common: Float[np.ndarray, "levels 6 errors"]
+
+    @property
+    def whole_covariance(self) -> Float[np.ndarray, "levels 6 6"]:
+        """(levels, 6, 6), of `pose`, with errors that never change."""
+        return self.covariance + self.common @ self.common.swapaxes(1, 2)
 
 
 def begun(
     position_m: Float[np.ndarray, "3"],
     orientation_wxyz: Float[np.ndarray, "4"],
     covariance: Float[np.ndarray, "6 6"],
+    common: Float[np.ndarray, "6 errors"],
     levels: Levels,
 ) -> Motion:
     """What is known after the first pose: that pose, and that drones have some speed."""
@@ -116,6 +131,8 @@ def begun(
     variance[:, 6:9] = levels.jerk_density_m2_s5[:, None] * ACCELERATION_TIME_S / 2
     variance[:, _RATE] = _RATE_STD_RAD_S**2
     variance[:, _LASTING] = 1.0
+    off = np.zeros((count, SIZE, common.shape[1]))
+    off[:, POSE] = common
     none = np.zeros((count, 3))
     return Motion(
         position_m=np.tile(position_m, (count, 1)),
@@ -125,6 +142,7 @@ def begun(
         rate_rad_s=none,
         lasting=np.zeros((count, 6)),
         covariance=spread,
+        common=off,
     )
 
 
@@ -149,6 +167,7 @@ def foretold(motion: Motion, dt_s: float, levels: Levels) -> tuple[Motion, Float
         rate_rad_s=motion.rate_rad_s,
         lasting=kept * motion.lasting,
         covariance=F @ motion.covariance @ F.swapaxes(1, 2) + process_noise(dt_s, levels),
+        common=F @ motion.common,
     )
     return later, F
 
@@ -174,8 +193,9 @@ def innovation(
     position_m: Float[np.ndarray, "3"],
     orientation_wxyz: Float[np.ndarray, "4"],
     covariance: Float[np.ndarray, "6 6"],
+    common: Float[np.ndarray, "6 errors"],
 ) -> Innovation:
-    """What a measured pose, with its covariance as in `CameraPath`, tells that was not foretold."""
+    """What a measured pose tells that was not foretold; its covariance, as in `CameraPath`, is without `common`."""
     turn = turn_between(motion.orientation_wxyz, orientation_wxyz[None])
     # The measurement's small turns are about its own axes; these are of the logarithm.
     by_noise = np.zeros((len(turn), 6, 6))
@@ -189,7 +209,8 @@ def innovation(
     white = (1 - LASTING_SHARE) * by_noise @ covariance @ by_noise.swapaxes(1, 2)
     expected = np.einsum("lij,lj->li", H[:, :, _LASTING], motion.lasting)
     off = np.concatenate([position_m - motion.position_m, turn], axis=1) - expected
-    return Innovation(off, _symmetric(H @ shared + white), shared)
+    differs = by_noise @ common - H @ motion.common
+    return Innovation(off, _symmetric(H @ shared + white), shared, differs)
 
 
 def corrected(motion: Motion, told: Innovation, right: float = 1.0) -> Motion:
@@ -206,20 +227,22 @@ def corrected(motion: Motion, told: Innovation, right: float = 1.0) -> Motion:
     spread = motion.covariance - right * gain @ told.shared.swapaxes(1, 2)
     if right < 1:
         spread = spread + right * (1 - right) * change[:, :, None] * change[:, None, :]
-    return moved(replace(motion, covariance=_symmetric(spread)), right * change)
+    off = motion.common + right * gain @ told.common
+    return moved(replace(motion, covariance=_symmetric(spread), common=off), right * change)
 
 
 def moved(motion: Motion, change: Float[np.ndarray, "levels n"]) -> Motion:
-    """The motion changed by an error state; its covariance is then about the axes of the turned camera."""
+    """The motion changed by an error state; its errors are then about the axes of the turned camera."""
     J = right_jacobian(change[:, _TURN])
-    spread = motion.covariance.copy()
+    spread, off = motion.covariance.copy(), motion.common.copy()
+    off[:, _TURN] = J @ off[:, _TURN]
     spread[:, _TURN] = J @ spread[:, _TURN]
     spread[:, :, _TURN] = spread[:, :, _TURN] @ J.swapaxes(1, 2)
-    return replace(shifted(motion, change), covariance=spread)
+    return replace(shifted(motion, change), covariance=spread, common=off)
 
 
 def shifted(motion: Motion, change: Float[np.ndarray, "levels n"]) -> Motion:
-    """The motion changed by an error state, (levels, 21), its covariance left as it is."""
+    """The motion changed by an error state, (levels, 21), its errors left as they are."""
     return replace(
         motion,
         position_m=motion.position_m + change[:, :3],

@@ -1,14 +1,16 @@
-"""One frame of a `CameraPath`, for those who make or read a path frame by frame."""
+"""One frame of a `CameraPath`, for those who make or read a path frame by frame, and what a filter tells of it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.inside_out.camera_path import CameraPath
+from psotrack.inside_out.camera_path import CameraPath, Flag
+from psotrack.inside_out.filtering.records import MeasuredPose, PoseEstimate
+from psotrack.trajectories import Status
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,8 @@ class PoseRow:
     status: int
     flags: int
     velocity_m_s: Float[np.ndarray, "3"]
+    chance: float = np.nan
+    common: Float[np.ndarray, "6 errors"] = field(default_factory=lambda: np.zeros((6, 0)))
 
     @property
     def has_pose(self) -> bool:
@@ -34,8 +38,11 @@ class PoseRow:
 
 
 def rows_of(path: CameraPath) -> list[PoseRow]:
-    """The frames of a path, one by one; velocities are NaN where the path has none."""
-    velocity_m_s = np.full((path.num_frames, 3), np.nan) if path.velocity_m_s is None else path.velocity_m_s
+    """The frames of a path, one by one; what the path has none of is NaN, and there are no common errors."""
+    count = path.num_frames
+    velocity_m_s = np.full((count, 3), np.nan) if path.velocity_m_s is None else path.velocity_m_s
+    chance = np.full(count, np.nan) if path.chance is None else path.chance
+    common = np.zeros((count, 6, 0)) if path.common is None else path.common
     return [
         PoseRow(
             frame=int(path.frame[k]),
@@ -49,14 +56,18 @@ def rows_of(path: CameraPath) -> list[PoseRow]:
             status=int(path.status[k]),
             flags=int(path.flags[k]),
             velocity_m_s=velocity_m_s[k],
+            chance=float(chance[k]),
+            common=common[k],
         )
         for k in range(path.num_frames)
     ]
 
 
 def path_of(rows: Sequence[PoseRow]) -> CameraPath:
-    """The path of these frames, which increase; velocities are left out where no frame has one."""
+    """The path of these frames, which increase; what no frame has any of is left out."""
     velocity_m_s = _stacked([row.velocity_m_s for row in rows], (3,))
+    chance = np.array([row.chance for row in rows], float)
+    common = np.array([row.common for row in rows], float)
     return CameraPath(
         frame=np.array([row.frame for row in rows], int),
         time_s=np.array([row.time_s for row in rows], float),
@@ -69,6 +80,58 @@ def path_of(rows: Sequence[PoseRow]) -> CameraPath:
         status=np.array([row.status for row in rows], int),
         flags=np.array([row.flags for row in rows], int),
         velocity_m_s=velocity_m_s if np.isfinite(velocity_m_s).any() else None,
+        chance=chance if np.isfinite(chance).any() else None,
+        common=common if common.size else None,
+    )
+
+
+def measured(row: PoseRow) -> MeasuredPose:
+    """The pose of a frame that has one; where nothing is said of its ambiguity, it has none; of chance, all may be."""
+    return MeasuredPose(
+        row.time_s,
+        row.position_m,
+        row.orientation_wxyz,
+        row.covariance - row.common @ row.common.T,
+        float(np.nan_to_num(row.ambiguity)),
+        row.common,
+        float(np.nan_to_num(row.chance, nan=1.0)),
+    )
+
+
+def told_row(raw: PoseRow, told: PoseEstimate, ambiguity: float, *, used: bool) -> PoseRow:
+    """A frame with the pose that is told of it, by its own pose or without."""
+    flags = Flag(raw.flags)
+    if raw.has_pose and not used:
+        flags |= Flag.GATED
+    if ambiguity < raw.ambiguity:
+        flags &= ~Flag.AMBIGUOUS
+    return replace(
+        raw,
+        position_m=told.position_m,
+        orientation_wxyz=told.orientation_wxyz,
+        covariance=told.covariance,
+        ambiguity=ambiguity,
+        status=int(Status.TRACKED if used else Status.COASTING),
+        flags=int(flags),
+        velocity_m_s=told.velocity_m_s,
+        chance=np.nan,
+        common=np.zeros((6, 0)),
+    )
+
+
+def lost(raw: PoseRow, *, gated: bool = False) -> PoseRow:
+    """A frame of which no pose is told."""
+    return replace(
+        raw,
+        position_m=np.full(3, np.nan),
+        orientation_wxyz=np.full(4, np.nan),
+        covariance=np.full((6, 6), np.nan),
+        ambiguity=np.nan,
+        status=int(Status.LOST),
+        flags=int(Flag(raw.flags) | Flag.GATED if gated else raw.flags),
+        velocity_m_s=np.full(3, np.nan),
+        chance=np.nan,
+        common=np.zeros((6, 0)),
     )
 
 

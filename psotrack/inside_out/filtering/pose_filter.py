@@ -3,7 +3,8 @@
 `init`, `predict` and `update` (of `bank`) are the filter of one motion, frame by frame; a pose that does not fit
 is gated: it does not count. `step` follows a camera with them. It confirms a start, tells nothing after too long a
 gap, and starts anew where poses agree with one another but not with the state: none of them may be wrong for ever.
-`follow` is a loop over `step`.
+What was known before a gap is kept, and grows vague: poses after it that this does not foretell need others, as they do
+against a state, or markers that agree beyond chance where it does not contradict them. `follow` is a loop over `step`.
 """
 
 from __future__ import annotations
@@ -12,20 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from psotrack.inside_out.camera_path import CameraPath, Flag
-from psotrack.inside_out.filtering.bank import (
-    MeasuredPose,
-    PoseEstimate,
-    PoseFilterParams,
-    PoseState,
-    estimate,
-    init,
-    open_minded,
-    predict,
-    update,
-)
-from psotrack.inside_out.filtering.path_rows import PoseRow, path_of, rows_of
-from psotrack.trajectories import Status
+from psotrack.inside_out.camera_path import CameraPath
+from psotrack.inside_out.filtering.bank import PoseState, estimate, init, open_minded, predict, update
+from psotrack.inside_out.filtering.path_rows import PoseRow, lost, measured, path_of, rows_of, told_row
+from psotrack.inside_out.filtering.records import MeasuredPose, PoseEstimate, PoseFilterParams
 
 __all__ = [
     "Following",
@@ -45,6 +36,8 @@ __all__ = [
 
 #: Poses in a row that tell a turn, which no level that counts foretold, from an outlier.
 _TURN_POSES = 2
+#: A camera that is somewhere within so much, along an axis, may be anywhere in a room.
+_ANYWHERE_M = 10.0
 
 
 @dataclass(frozen=True)
@@ -55,13 +48,13 @@ class Rival:
         state: by them alone, or by them as a turn that nothing foretold.
         since_s: time of the first of them.
         needed: support with which the rival is believed.
-        is_turn: whether it goes on from the state.
+        goes_on: whether the camera may have come there from where the state has it.
     """
 
     state: PoseState
     since_s: float
     needed: int
-    is_turn: bool
+    goes_on: bool
 
 
 @dataclass(frozen=True)
@@ -74,6 +67,8 @@ class Following:
         former: what was believed until a rival was; while it is no longer ago than gaps may be, it may still be right.
         overthrown: the rival that became the state in this very frame.
         recalled: the former state that became the state again in this very frame, as it was foretold.
+        before: what was known before too long a gap, until the camera is found again.
+        strange: whether the state contradicts that.
     """
 
     state: PoseState | None = None
@@ -81,6 +76,8 @@ class Following:
     former: PoseState | None = None
     overthrown: Rival | None = None
     recalled: PoseState | None = None
+    before: PoseState | None = None
+    strange: bool = False
 
 
 def advance(following: Following, time_s: float, params: PoseFilterParams) -> Following:
@@ -100,15 +97,32 @@ def advance(following: Following, time_s: float, params: PoseFilterParams) -> Fo
     state, former, rival = later(following.state), later(following.former), following.rival
     rival_state = later(rival.state) if rival else None
     rival = replace(rival, state=rival_state) if rival and rival_state else None
+    before = following.state if state is None and confirmed(following, params) else following.before
+    if before is not None:
+        before = predict(before, time_s)
+        before = None if _anywhere(before) else before
     if state is None and rival is not None:
-        return Following(rival.state, former=former, overthrown=rival)
-    return Following(state, rival, former)
+        return Following(rival.state, former=former, overthrown=rival, before=before)
+    strange = before is not None and following.strange
+    return Following(state, rival, former, before=before, strange=strange)
 
 
 def expected(following: Following, params: PoseFilterParams) -> PoseEstimate | None:
     """Where the camera should be at the time that `following` was advanced to; None where nothing is confirmed."""
+    return estimate(following.state) if following.state and confirmed(following, params) else None
+
+
+def confirmed(following: Following, params: PoseFilterParams) -> bool:
+    """Whether the state is to be told: enough poses agree, or the markers of one of them do, beyond chance.
+
+    Behind a gap, poses that what was known before does not foretell need as many as they would against a state, and
+    where they contradict it, markers that agree do not change that.
+    """
     state = following.state
-    return None if state is None or state.support < params.confirm else estimate(state)
+    if state is None:
+        return False
+    needed = params.confirm if following.before is None else max(params.confirm, params.restart_after)
+    return state.support >= needed or (state.doubt < params.false_alarm and not following.strange)
 
 
 def step(following: Following, raw: PoseRow, params: PoseFilterParams) -> tuple[Following, PoseRow]:
@@ -157,52 +171,32 @@ def follow(path: CameraPath, params: PoseFilterParams | None = None) -> CameraPa
     return path_of(rows)
 
 
-def measured(row: PoseRow) -> MeasuredPose:
-    """The pose of a frame that has one; where nothing is said of its ambiguity, it has none."""
-    ambiguity = float(np.nan_to_num(row.ambiguity))
-    return MeasuredPose(row.time_s, row.position_m, row.orientation_wxyz, row.covariance, ambiguity)
-
-
-def told_row(raw: PoseRow, told: PoseEstimate, ambiguity: float, *, used: bool) -> PoseRow:
-    """A frame with the pose that is told of it, by its own pose or without."""
-    flags = Flag(raw.flags)
-    if raw.has_pose and not used:
-        flags |= Flag.GATED
-    if ambiguity < raw.ambiguity:
-        flags &= ~Flag.AMBIGUOUS
-    return replace(
-        raw,
-        position_m=told.position_m,
-        orientation_wxyz=told.orientation_wxyz,
-        covariance=told.covariance,
-        ambiguity=ambiguity,
-        status=int(Status.TRACKED if used else Status.COASTING),
-        flags=int(flags),
-        velocity_m_s=told.velocity_m_s,
-    )
-
-
-def lost(raw: PoseRow, *, gated: bool = False) -> PoseRow:
-    """A frame of which no pose is told."""
-    return replace(
-        raw,
-        position_m=np.full(3, np.nan),
-        orientation_wxyz=np.full(4, np.nan),
-        covariance=np.full((6, 6), np.nan),
-        ambiguity=np.nan,
-        status=int(Status.LOST),
-        flags=int(Flag(raw.flags) | Flag.GATED if gated else raw.flags),
-        velocity_m_s=np.full(3, np.nan),
-    )
-
-
 def _looked(
     following: Following, measurement: MeasuredPose, params: PoseFilterParams
 ) -> tuple[Following, bool]:
     """After a measured pose, and whether it was gated."""
+    before, strange = following.before, False
+    if before is not None:
+        again, strange = update(before, measurement, params)
+        if not strange and _foretold(again, params):
+            return Following(again, recalled=before), False
     if following.state is None:
-        return Following(init(measurement)), False
-    state, gated = update(following.state, measurement, params)
+        anew = init(measurement)
+        began = None if before is None else Rival(anew, measurement.time_s, 1, goes_on=not strange)
+        found, gated = Following(anew, overthrown=began), False
+    else:
+        found, gated = _compared(following, following.state, measurement, params)
+        strange = strange if found.overthrown else following.strange
+    found = replace(found, before=before, strange=strange)
+    return replace(found, before=None, strange=False) if confirmed(found, params) else found, gated
+
+
+def _compared(
+    following: Following, state: PoseState, measurement: MeasuredPose, params: PoseFilterParams
+) -> tuple[Following, bool]:
+    """After a measured pose, where there is a state, and whether it was gated."""
+    foretold = state
+    state, gated = update(foretold, measurement, params)
     former, rival = following.former, following.rival
     if former is not None:
         again, strange = update(former, measurement, params)
@@ -219,15 +213,26 @@ def _looked(
         return Following(state, former=former), False
     # The pose is the rival's, even where the state, vague by now, would have it too.
     if rival.state.support >= rival.needed:
-        return Following(rival.state, former=former or following.state, overthrown=rival), False
-    return Following(following.state, rival, former), True
+        return Following(rival.state, former=former or foretold, overthrown=rival), False
+    return Following(foretold, rival, former), True
 
 
 def _begun(state: PoseState, measurement: MeasuredPose, params: PoseFilterParams) -> Rival:
     """A rival of a state, by a pose that does not fit it: the camera turned as nothing foretold, or is elsewhere."""
-    if state.support >= params.confirm:
+    sure = state.doubt < params.false_alarm
+    if sure or state.support >= params.confirm:
         turned, strange = update(open_minded(state), measurement, params)
-        if not strange:
-            return Rival(turned, measurement.time_s, state.support + _TURN_POSES, is_turn=True)
-    needed = min(params.restart_after, state.support + 1)
-    return Rival(init(measurement), measurement.time_s, needed, is_turn=False)
+        if not strange and _foretold(turned, params):
+            return Rival(turned, measurement.time_s, state.support + _TURN_POSES, goes_on=True)
+    needed = params.restart_after if sure else min(params.restart_after, state.support + 1)
+    return Rival(init(measurement), measurement.time_s, needed, goes_on=False)
+
+
+def _anywhere(state: PoseState) -> bool:
+    return bool(np.linalg.eigvalsh(estimate(state).covariance[:3, :3])[-1] > _ANYWHERE_M**2)
+
+
+def _foretold(state: PoseState, params: PoseFilterParams) -> bool:
+    """Whether the last pose that fitted is likelier by the motion than somewhere within a metre and a radian, and by so
+    much that it is an outlier less often than good poses are gated."""
+    return bool(state.log_density > -np.log(params.false_alarm))

@@ -16,11 +16,12 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.filtering import motion as pose_motion
-from psotrack.inside_out.filtering.bank import LEVELS, PoseEstimate, PoseFilterParams, right_pose
+from psotrack.inside_out.filtering.bank import LEVELS, right_pose
 from psotrack.inside_out.filtering.manifold import right_jacobian_inverse
 from psotrack.inside_out.filtering.motion import POSE, Levels, Motion
-from psotrack.inside_out.filtering.path_rows import PoseRow, path_of, rows_of
-from psotrack.inside_out.filtering.pose_filter import Following, lost, measured, step, told_row
+from psotrack.inside_out.filtering.path_rows import PoseRow, lost, measured, path_of, rows_of, told_row
+from psotrack.inside_out.filtering.pose_filter import Following, confirmed, step
+from psotrack.inside_out.filtering.records import PoseEstimate, PoseFilterParams
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ def _learned(rows: Sequence[PoseRow], params: PoseFilterParams) -> _Learned:
     has_pose = np.array([row.has_pose for row in rows], bool)
     counts, jumped = np.zeros(len(rows), bool), np.zeros(len(rows), bool)
     start = np.zeros(len(rows), int)
-    support, found = [0], []
+    told, found = [False], []
     following, known = Following(), (_log_levels(_evenly()), 0.0, np.nan)
     for k, raw in enumerate(rows):
         following, _ = step(following, raw, params)
@@ -99,15 +100,15 @@ def _learned(rows: Sequence[PoseRow], params: PoseFilterParams) -> _Learned:
         if state is not None:
             # The poses of a rival were gated when they came.
             since = k if rival is None else int(np.searchsorted(time_s, rival.since_s))
-            jumped[since] |= rival is not None and not rival.is_turn
+            jumped[since] |= rival is not None and not rival.goes_on
             if state.support == 1 or jumped[since]:
-                support.append(0)
-            start[since : k + 1], support[-1] = len(support) - 1, state.support
+                told.append(False)
+            start[since : k + 1], told[-1] = len(told) - 1, confirmed(following, params)
             counts[since : k + 1] = has_pose[since : k + 1] & (state.seen_s == raw.time_s)
             known = _log_levels(state.log_weight), float(np.log(state.noise_scale)), state.ambiguity
         found.append(known)
     log_levels, log_noise_scale, ambiguity = (np.array(values) for values in zip(*found, strict=True))
-    counts &= np.array(support)[start] >= params.confirm
+    counts &= np.array(told)[start]
     return _Learned(counts, np.cumsum(jumped), log_levels, log_noise_scale, ambiguity)
 
 
@@ -154,9 +155,11 @@ def _forward(
     passes: list[_Pass] = []
     for k, raw in enumerate(rows):
         levels = Levels(np.exp(log_levels[k, :1]), np.exp(log_levels[k, 1:]))
+        pose = measured(raw)
+        covariance = noise_scale[k] * pose.covariance
         if not passes:
             motion = pose_motion.begun(
-                raw.position_m, raw.orientation_wxyz, noise_scale[k] * raw.covariance, levels
+                pose.position_m, pose.orientation_wxyz, covariance, pose.common, levels
             )
             nothing = np.zeros_like(motion.covariance)
             passes.append(_Pass(motion, nothing, nothing, motion))
@@ -166,9 +169,9 @@ def _forward(
         corrected = foretold
         if counts[k]:
             told = pose_motion.innovation(
-                foretold, raw.position_m, raw.orientation_wxyz, noise_scale[k] * raw.covariance
+                foretold, pose.position_m, pose.orientation_wxyz, covariance, pose.common
             )
-            right = right_pose(told.pose[0], told.covariance[0], measured(raw).ambiguity)
+            right = right_pose(told.pose[0], told.whole_covariance[0], pose.ambiguity)
             corrected = pose_motion.corrected(foretold, told, right)
         passes.append(_Pass(foretold, F, pose_motion.process_noise(dt_s, levels), corrected))
     return passes
@@ -185,8 +188,10 @@ def _earlier(now: Motion, ahead: _Pass, later: Motion) -> Motion:
     kept = np.eye(pose_motion.SIZE) - gain @ ahead.F
     added = ahead.Q + J @ later.covariance @ J.swapaxes(1, 2)
     spread = kept @ now.covariance @ kept.swapaxes(1, 2) + gain @ added @ gain.swapaxes(1, 2)
+    off = now.common + gain @ (J @ later.common - ahead.foretold.common)
     return pose_motion.moved(
-        replace(now, covariance=(spread + spread.swapaxes(1, 2)) / 2), (gain @ change[:, :, None])[:, :, 0]
+        replace(now, covariance=(spread + spread.swapaxes(1, 2)) / 2, common=off),
+        (gain @ change[:, :, None])[:, :, 0],
     )
 
 
@@ -200,7 +205,8 @@ def _gain(
 
 
 def _estimate(motion: Motion) -> PoseEstimate:
-    covariance = motion.covariance[0][np.ix_(POSE, POSE)]
+    common = motion.common[0, POSE]
+    covariance = motion.covariance[0][np.ix_(POSE, POSE)] + common @ common.T
     return PoseEstimate(motion.position_m[0], motion.orientation_wxyz[0], covariance, motion.velocity_m_s[0])
 
 

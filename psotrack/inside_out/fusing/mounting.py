@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from psotrack.evaluation.standard_errors import standard_error
 from psotrack.inside_out.camera_path import CameraPath
+from psotrack.rotations import cross_matrices
 from psotrack.trajectories import Status
 
 #: In units of the median distance from the median; beyond, a frame does not count for the arm.
@@ -123,8 +124,7 @@ def robust_arm(
 
 def swept_m2(camera: Mounted, arm_m: Float[np.ndarray, "3"]) -> Float[np.ndarray, "frames 3 3"]:
     """(frames, 3, 3), covariance of the arm's end, world, because the camera's turn is not known exactly."""
-    x, y, z = arm_m
-    by_turn = camera.rotation @ np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    by_turn = camera.rotation @ cross_matrices(arm_m)
     return by_turn @ camera.turn_covariance_rad2 @ by_turn.swapaxes(1, 2)
 
 

@@ -2,7 +2,7 @@
 
 Which corners and markers fit, studentised residuals tell: residuals in units of their own standard deviations (Cook &
 Weisberg, Residuals and influence in regression, 1982, section 2.2). The covariance is the inverse of the information,
-with the inset and the markers' places integrated out (see `equations`).
+with the inset, the focal length and the markers' places integrated out (see `equations`).
 """
 
 from __future__ import annotations
@@ -17,12 +17,14 @@ from jaxtyping import Bool, Float, Shaped
 from psotrack.calibration import spread_px
 from psotrack.cameras import NEAR_M
 from psotrack.inside_out.pose.equations import (
-    INSET_STD_PX,
     PRIOR_RESIDUALS,
     Noise,
     Seen,
     Solution,
+    Sums,
+    add_known,
     equations,
+    log_known,
     summed,
 )
 
@@ -57,6 +59,8 @@ class Fit:
         position_m: (3,), the camera's centre, world.
         R_world_cam: (3, 3), camera to world.
         covariance: (6, 6), as in `CameraPath`.
+        common: (6, 3 markers + 1), what one standard deviation of each marker's place in the map along each axis, and
+            of the focal length, does to it.
         fits: (markers, 4), corners that the pose explains.
         reprojection_px: root mean square of their distances in the image.
         log_evidence: logarithm of the probability density of all corners, whatever the pose is near this one.
@@ -65,6 +69,7 @@ class Fit:
     position_m: Float[np.ndarray, "3"]
     R_world_cam: Float[np.ndarray, "3 3"]
     covariance: Float[np.ndarray, "6 6"]
+    common: Float[np.ndarray, "6 errors"]
     fits: Bool[np.ndarray, "markers 4"]
     reprojection_px: float
     log_evidence: float
@@ -92,15 +97,15 @@ def fit(
     Returns:
         None where the markers leave the pose free, or it explains none of them.
     """
-    pose = _Pose(position_m, R_world_cam, 0.0)
+    pose = _Pose(position_m, R_world_cam, np.zeros(2))
     if fits is None:
         pose, fits = _robust(seen, pose)
     noise = Noise(seen.noise_px**2, (_START * seen.place_m) ** 2, PRIOR_RESIDUALS, PRIOR_RESIDUALS)
     for number in range(_MOST_STEPS):
-        rows, depth_m = equations(seen, pose.position_m, pose.R_world_cam, pose.inset_px)
+        rows, depth_m = equations(seen, pose.position_m, pose.R_world_cam, pose.extra)
         ahead = depth_m > NEAR_M
         sums = summed(rows, fits & ahead)
-        solution = sums.solved(noise, pose.inset_px)
+        solution = sums.solved(noise, pose.extra)
         if solution is None:
             return None
         pose = pose.stepped(solution.step, depth_m)
@@ -108,7 +113,7 @@ def fit(
         explained = fits & ahead
         if number > 0:
             # By the noise that is stated nothing is judged, only by what the residuals have made of it.
-            explained = _explained(off_px, rows[..., :7], ahead, fits, solution.covariance, noise)
+            explained = _explained(off_px, rows[..., :8], ahead, fits, solution.covariance, noise)
         if number >= _SETTLED:
             # The gates move with the fit and the fit with the gates; what swings to and fro ends outside.
             explained &= fits
@@ -121,21 +126,21 @@ def fit(
         fits = before
     if length > _NEAR:
         return None
-    return _fitted(seen, pose, fits, off_px, sums.solved(noise.widened(), pose.inset_px), noise)
+    return _fitted(seen, pose, fits, off_px, sums, noise)
 
 
 @dataclass(frozen=True)
 class _Pose:
     position_m: Float[np.ndarray, "3"]
     R_world_cam: Float[np.ndarray, "3 3"]
-    inset_px: float
+    extra: Float[np.ndarray, "2"]
 
-    def stepped(self, step: Float[np.ndarray, "7"], depth_m: Float[np.ndarray, "markers 4"]) -> _Pose:
+    def stepped(self, step: Float[np.ndarray, "8"], depth_m: Float[np.ndarray, "markers 4"]) -> _Pose:
         distance_m = np.maximum(depth_m, NEAR_M).mean()
         longest = max(np.linalg.norm(step[:3]) / distance_m, np.linalg.norm(step[3:6]), _LONGEST)
         step = step * (_LONGEST / longest)
         turn = np.asarray(cv2.Rodrigues(step[3:6])[0])
-        return _Pose(self.position_m + step[:3], self.R_world_cam @ turn, self.inset_px + float(step[6]))
+        return _Pose(self.position_m + step[:3], self.R_world_cam @ turn, self.extra + step[6:])
 
 
 def _fitted(
@@ -143,54 +148,57 @@ def _fitted(
     pose: _Pose,
     fits: Bool[np.ndarray, "markers 4"],
     off_px: Float[np.ndarray, "markers 4 2"],
-    solution: Solution | None,
+    sums: Sums,
     noise: Noise,
 ) -> Fit | None:
     """What is to be said of a pose and of the corners that it explains; None where nothing is to be believed."""
+    widened = noise.widened()
+    solution: Solution | None = sums.solved(widened, pose.extra)
     hopeless = noise.own_px2 > (_HOPELESS * seen.noise_px) ** 2 or noise.place_m2 > _HOPELESS_M**2
     if solution is None or hopeless:
         return None
     covariance = solution.covariance[:6, :6]
     # The inset is part of what was measured: the distance in the image is without it.
-    distance_px = np.linalg.norm(off_px + pose.inset_px * seen.inward, axis=-1)[fits]
+    distance_px = np.linalg.norm(off_px + pose.extra[0] * seen.inward, axis=-1)[fits]
     return Fit(
         pose.position_m,
         pose.R_world_cam,
         covariance,
+        sums.common(solution, widened, seen.map_share),
         fits,
         float(np.sqrt(np.mean(distance_px**2))),
-        _log_evidence(off_px[fits], fits.size, pose.inset_px, covariance, seen.noise_px),
+        _log_evidence(off_px[fits], fits.size, covariance, seen.noise_px) + log_known(pose.extra),
     )
 
 
 def _robust(seen: Seen, pose: _Pose) -> tuple[_Pose, Bool[np.ndarray, "markers 4"]]:
     """Steps with the weights of a Cauchy loss, whose scale is the residuals' median, and what is within them then."""
     for _ in range(_MOST_STEPS):
-        rows, depth_m = equations(seen, pose.position_m, pose.R_world_cam, pose.inset_px)
-        distance_px = np.where(depth_m > NEAR_M, np.linalg.norm(rows[..., 7], axis=-1), np.inf)
+        rows, depth_m = equations(seen, pose.position_m, pose.R_world_cam, pose.extra)
+        distance_px = np.where(depth_m > NEAR_M, np.linalg.norm(rows[..., 8], axis=-1), np.inf)
         scale_px = max(seen.noise_px, spread_px(distance_px.ravel(), 6))
         fits = distance_px < _WITHIN * scale_px
         if not np.isfinite(scale_px):
             break
-        weighted = (rows / np.hypot(scale_px, distance_px)[..., None, None]).reshape(-1, 8)
+        weighted = (rows / np.hypot(scale_px, distance_px)[..., None, None]).reshape(-1, 9)
         total = weighted.T @ weighted
-        total[6, 6:] += np.array([1.0, -pose.inset_px]) / INSET_STD_PX**2
+        add_known(total, pose.extra)
         try:
-            step = np.linalg.solve(total[:7, :7], total[:7, 7])
+            step = np.linalg.solve(total[:8, :8], total[:8, 8])
         except np.linalg.LinAlgError:
             break
         pose = pose.stepped(step, depth_m)
-        if step @ total[:7, 7] < _NEAR:
+        if step @ total[:8, 8] < _NEAR:
             break
     return pose, fits
 
 
 def _explained(
     off_px: Float[np.ndarray, "markers 4 2"],
-    slopes: Float[np.ndarray, "markers 4 2 7"],
+    slopes: Float[np.ndarray, "markers 4 2 8"],
     ahead: Bool[np.ndarray, "markers 4"],
     fits: Bool[np.ndarray, "markers 4"],
-    covariance: Float[np.ndarray, "7 7"],
+    covariance: Float[np.ndarray, "8 8"],
     noise: Noise,
 ) -> Bool[np.ndarray, "markers 4"]:
     """Corners, and markers' means, whose studentised residuals are within the gates."""
@@ -209,9 +217,9 @@ def _explained(
 
 def _within(
     off_px: Float[np.ndarray, "*items 2"],
-    slopes: Float[np.ndarray, "*items 2 7"],
+    slopes: Float[np.ndarray, "*items 2 8"],
     count: Shaped[np.ndarray, "*items"],
-    covariance: Float[np.ndarray, "7 7"],
+    covariance: Float[np.ndarray, "8 8"],
     noise: Noise,
     fitted: Bool[np.ndarray, "*items"],
 ) -> Bool[np.ndarray, "*items"]:
@@ -221,7 +229,7 @@ def _within(
     """
     own_px2 = noise.own_px2 / count
     by_place = slopes[..., :3]
-    half = (slopes.reshape(-1, 7) @ covariance).reshape(slopes.shape)
+    half = (slopes.reshape(-1, 8) @ covariance).reshape(slopes.shape)
     sign = np.where(fitted, -1.0, 1.0)
     of_place = noise.place_m2 * (by_place * by_place).sum(axis=-1)
     variance = of_place + sign[..., None] * (half * slopes).sum(axis=-1)
@@ -243,7 +251,6 @@ def _within(
 def _log_evidence(
     off_px: Float[np.ndarray, "corners 2"],
     num_corners: int,
-    inset_px: float,
     covariance: Float[np.ndarray, "6 6"],
     stated_px: float,
 ) -> float:
@@ -255,4 +262,4 @@ def _log_evidence(
     of_fitted -= half * log(1 + np.sum(off_px**2) / prior_px2)
     of_others = (num_corners - len(off_px)) * _LOG_ANYWHERE
     of_poses = 0.5 * (6 * log(2 * pi) + np.linalg.slogdet(covariance)[1])
-    return float(of_fitted + of_others + of_poses - 0.5 * (inset_px / INSET_STD_PX) ** 2)
+    return float(of_fitted + of_others + of_poses)

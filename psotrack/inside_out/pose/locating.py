@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import combinations
-from math import log, pi
+from math import comb, log, pi
 
 import cv2
 import numpy as np
@@ -54,18 +54,28 @@ class PoseSettings:
     Attributes:
         min_markers: a frame must show, 1 or more.
         noise_px: standard deviation of a corner along x and along y; residuals correct it where there are enough.
-        place_m: standard deviation of a marker's place along each axis; residuals correct it as well.
+        place_m: standard deviation of what a marker's corners are off together in a frame, along each axis of the
+            world; residuals correct it as well.
+        map_error_m: standard deviation of a marker's place in the map along each axis, the same in every frame.
+        focal_error: standard deviation of the focal length, as a share of it; the same in every frame.
     """
 
     min_markers: int = 4
     noise_px: float = 0.2
     place_m: float = 0.0001
+    map_error_m: float = 0.0
+    focal_error: float = 0.0
 
     def __post_init__(self) -> None:
         check_positive("noise_px", self.noise_px)
         check_positive("place_m", self.place_m)
         if self.min_markers < 1:
             raise SettingsError("min_markers", expected="at least 1", found=f"{self.min_markers}")
+        for name in ("map_error_m", "focal_error"):
+            if not 0 <= getattr(self, name) < 1:
+                raise SettingsError(
+                    name, expected="a number from 0 to below 1", found=f"{getattr(self, name):g}"
+                )
 
 
 @dataclass(frozen=True)
@@ -95,6 +105,9 @@ class MarkerPose:
         used: (markers,), those that the pose explains.
         reprojection_px: root mean square over their good corners of the distance in the image.
         ambiguity: probability that another pose is the right one, from 0 to 1/2.
+        common: (6, 3 markers + 1), of the covariance, the part that all frames have in common, as its root: what one
+            standard deviation of each marker's place in the map along each axis, and of the focal length, does.
+        chance: probability at most that, if no marker were what it is taken for, so many would agree.
     """
 
     position_m: Float[np.ndarray, "3"]
@@ -103,6 +116,8 @@ class MarkerPose:
     used: Bool[np.ndarray, "markers"]
     reprojection_px: float
     ambiguity: float
+    common: Float[np.ndarray, "6 errors"]
+    chance: float
 
 
 def locate(
@@ -137,6 +152,8 @@ def locate(
         lens,
         settings.noise_px,
         settings.place_m,
+        settings.map_error_m,
+        settings.focal_error,
     )
     found = _poses(seen, undistort(lens, seen.corners_px))
     # That one or two of many agree is chance: any single marker has a pose that explains it.
@@ -153,7 +170,20 @@ def locate(
         best.used,
         best.reprojection_px,
         float(odds / (1 + odds)),
+        best.common,
+        _chance(seen, best),
     )
+
+
+def _chance(seen: Seen, best: Fit) -> float:
+    """How many sets of so many markers would agree by chance, at most: each but one falls near where it should be.
+
+    Their sizes and how they are turned would have to agree as well; that is left out.
+    """
+    count, others = len(best.used), int(best.used.sum()) - 1
+    near_px = _LOOSE * max(seen.noise_px, best.reprojection_px)
+    area_px2 = np.prod(np.asarray(seen.lens.image_size_wh, float))
+    return min(float(count * comb(count - 1, others) * min(pi * near_px**2 / area_px2, 1.0) ** others), 1.0)
 
 
 def _poses(seen: Seen, rays: Float[np.ndarray, "markers 4 2"]) -> list[Fit]:

@@ -12,13 +12,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
+from psotrack.aruco import marker_dictionary
+from psotrack.calibration.alike import Alike
 from psotrack.cameras import CameraRig, project
 from psotrack.delimited import Column, Row, Table, read_rows
 from psotrack.detections import Detections
 from psotrack.errors import InputError
-from psotrack.lenses import marker_dictionary
+from psotrack.sightings import BORDER_PX, NOISE_PX, NOISE_SHARE
 from psotrack.trajectories import Trajectories
 from psotrack.video import VideoInfo, read_frames
 
@@ -28,8 +30,10 @@ _WORLD = ("x_m", "y_m", "z_m")
 _FRAMES = 15
 #: Share of those frames that must show a marker, or it is something else.
 _SEEN = 0.5
-#: How long the middle of a drone's box is off in the same way: its errors' correlation is 0.2 after a second.
-_ALIKE_S = 2.0
+#: The middle of a drone's box is off by so much of its sides in the same way for as long as the drone flies alike; and
+#: by as much again in all frames of a camera, for its shape; and again, all drones, over a camera's image, for bodies
+#: are near and far, and seen from above or the side.
+_ALIKE_SHARE, _ALIKE_S = 0.015, 1.0
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,23 @@ class Marks:
     points: tuple[str, ...]
     points_m: Float[np.ndarray, "points 3"]
     points_px: Float[np.ndarray, "points 2"]
+
+
+@dataclass(frozen=True)
+class DroneViews:
+    """What cameras see of tracked drones, a point for each drone in each frame.
+
+    Attributes:
+        points: their names, `dron1@40` for frame 40.
+        points_px: (points, cameras, 2), middles of boxes; NaN where a camera does not see the drone, or not clearly.
+        noise_px: (points, cameras), standard deviation of what differs from frame to frame; NaN where the point is.
+        alike: what lasts.
+    """
+
+    points: tuple[str, ...]
+    points_px: Float[np.ndarray, "points cameras 2"]
+    noise_px: Float[np.ndarray, "points cameras"]
+    alike: tuple[Alike, ...]
 
 
 def read_marks(path: Path, places: Path | None = None) -> dict[str, Marks]:
@@ -124,42 +145,75 @@ def find_markers(
 
 
 def in_boxes(
-    rig: CameraRig, detections: Mapping[str, Detections], tracks: Trajectories, most_frames: int = 200
-) -> tuple[Float[np.ndarray, "points cameras 2"], list[str], Int[np.ndarray, " points"]]:
+    rig: CameraRig, detections: Mapping[str, Detections], tracks: Trajectories, most_frames: int = 500
+) -> DroneViews:
     """Where cameras see tracked drones: the middle of the box that holds a drone's projection.
 
-    A box that holds two drones, and a drone in two boxes, tell nothing. Where there are many frames some are left out,
-    evenly: those beside each other say the same.
+    A box that holds two drones, and a drone in two boxes, tell nothing; the middles of boxes that the border of the
+    image cuts, or that touch others, are not those of drones. Where there are many frames some are left out, evenly:
+    those beside each other say the same.
 
     Args:
         rig: of the tracks.
         detections: by camera name; cameras without any see nothing.
         tracks: of the drones.
         most_frames: that are used.
-
-    Returns:
-        (points, cameras, 2), a point for each drone in each frame, NaN where a camera does not see it; the points'
-        names, `dron1@40` for frame 40; and their groups: of a drone within `_ALIKE_S` the errors are alike.
     """
     rows = np.arange(0, tracks.num_frames, max(1, -(-tracks.num_frames // most_frames)))
     places_m = np.where(tracks.seen[rows, :, None], tracks.position_m[rows], np.nan)
     projected, depth = project(rig.cameras, places_m[:, :, None, :])
-    points_px = np.full(projected.shape, np.nan)
+    points_px, side_px = np.full(projected.shape, np.nan), np.full(depth.shape, np.nan)
     for camera, name in enumerate(rig.names):
         for row, frame in enumerate(tracks.frame[rows].tolist() if name in detections else []):
             xyxy = detections[name].in_frame(frame).xyxy
+            clear = _clear(xyxy, np.asarray(rig.cameras.image_size_wh[camera]))
             at = projected[row, :, camera, None]
             # Pixel centres are at whole numbers, and the edges of boxes half a pixel from them.
             xyxy = xyxy - 0.5
             holds = ((at >= xyxy[:, :2]) & (at <= xyxy[:, 2:])).all(axis=-1)
             holds &= (depth[row, :, camera] > 0)[:, None]
             alone = holds & (holds.sum(axis=0) == 1) & (holds.sum(axis=1) == 1)[:, None]
-            drone, box = np.nonzero(alone)
+            drone, box = np.nonzero(alone & clear)
             points_px[row, drone, camera] = (xyxy[box, :2] + xyxy[box, 2:]) / 2
+            side_px[row, drone, camera] = np.sqrt((xyxy[box, 2:] - xyxy[box, :2]).prod(axis=-1))
     names = [f"{drone}@{frame}" for frame in tracks.frame[rows].tolist() for drone in tracks.drones]
-    block = np.floor(tracks.time_s[rows] / _ALIKE_S).astype(np.int64)
-    groups = block[:, None] * tracks.num_drones + np.arange(tracks.num_drones)
-    return points_px.reshape(-1, len(rig), 2), names, groups.ravel()
+    drone = np.tile(np.arange(tracks.num_drones), len(rows))
+    second = np.floor(tracks.time_s[rows] / _ALIKE_S).astype(np.int64).repeat(tracks.num_drones)
+    points_px, side_px = points_px.reshape(-1, len(rig), 2), side_px.reshape(-1, len(rig))
+    return DroneViews(
+        tuple(names),
+        points_px,
+        NOISE_PX + NOISE_SHARE * side_px,
+        _alike(rig, points_px, side_px, drone, (second - second.min(initial=0)) * tracks.num_drones + drone),
+    )
+
+
+def _clear(
+    xyxy: Float[np.ndarray, "boxes 4"], image_size_wh: Float[np.ndarray, "2"]
+) -> Bool[np.ndarray, " boxes"]:
+    """Boxes that neither the border of the image cuts nor another one touches."""
+    sides = np.minimum(xyxy[:, None, 2:], xyxy[:, 2:]) - np.maximum(xyxy[:, None, :2], xyxy[:, :2])
+    touched = (sides > 0).all(axis=-1).sum(axis=1) > 1
+    cut = (xyxy[:, :2] < BORDER_PX) | (xyxy[:, 2:] > image_size_wh - BORDER_PX)
+    return ~touched & ~cut.any(axis=-1)
+
+
+def _alike(
+    rig: CameraRig,
+    points_px: Float[np.ndarray, "points cameras 2"],
+    side_px: Float[np.ndarray, "points cameras"],
+    drone: Int[np.ndarray, " points"],
+    second: Int[np.ndarray, " points"],
+) -> tuple[Alike, ...]:
+    """What lasts of the boxes' errors: of a drone in a camera, for a while and for good, and of a camera's drones."""
+    middle_px = np.asarray(rig.cameras.K)[:, :2, 2]
+    from_middle = (points_px - middle_px) / (np.asarray(rig.cameras.image_size_wh) / 2)
+    everything = np.zeros_like(drone)
+    return (
+        Alike(second, _ALIKE_SHARE * side_px),
+        Alike(drone, _ALIKE_SHARE * side_px),
+        *(Alike(everything, _ALIKE_SHARE * side_px * of) for of in (1.0, *np.moveaxis(from_middle, -1, 0))),
+    )
 
 
 def _read_table(path: Path) -> Table:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
+from psotrack.aruco import marker_dictionary
 from psotrack.cameras import Camera, camera
 from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.video import VideoInfo, read_frames
@@ -27,6 +28,8 @@ _MOST_FRAMES = 300
 _LOOSE = 0.02
 #: What two of the boards must differ by.
 _TILTED_DEG = 10.0
+#: Widths of an image that a focal length may be: 20 are a field of view of 3 degrees.
+_MOST_WIDTHS = 20.0
 
 
 @dataclass(frozen=True)
@@ -142,7 +145,10 @@ def lens_of_board(video: VideoInfo, board: Board) -> Lens:
     # Boards that all face the camera fit every focal length, and the deviation of one is rubbish.
     normals = np.array([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
     tilted = np.rad2deg(np.arccos(np.clip((normals @ normals.T).min(), -1, 1)))
-    if not np.isfinite(rms) or tilted < _TILTED_DEG or not (std[:2] < _LOOSE * np.diag(K)[:2]).all():
+    # So is their tilt, where the fit ran away to a focal length of hundreds of images.
+    endless = K[0, 0] > _MOST_WIDTHS * video.image_size_wh[0]
+    loose = not (std[:2] < _LOOSE * np.diag(K)[:2]).all()
+    if not np.isfinite(rms) or endless or tilted < _TILTED_DEG or loose:
         raise InputError(
             video.path,
             expected=f"views that fix the focal length to {_LOOSE:.0%}",
@@ -161,20 +167,6 @@ def lens_of_board(video: VideoInfo, board: Board) -> Lens:
         np.array([view.frame for view in used]),
         np.asarray(per_view, np.float64).ravel(),
     )
-
-
-def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
-    """OpenCV's dictionary of a name such as 4x4_50 or DICT_4X4_50.
-
-    Raises:
-        SettingsError: there is none.
-    """
-    known = {key.lower(): key for key in dir(cv2.aruco) if key.startswith("DICT_")}
-    key = known.get(f"dict_{name.lower().removeprefix('dict_')}")
-    if key is None:
-        names = ", ".join(name.removeprefix("dict_") for name in known)
-        raise SettingsError("dictionary", expected=f"one of {names}", found=name)
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, key))
 
 
 @dataclass(frozen=True)

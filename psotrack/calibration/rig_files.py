@@ -19,27 +19,23 @@ import json
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from psotrack.cameras import Camera, CameraRig, camera, stack
+from psotrack.calibration.camera_fields import CameraFields, camera_of
+from psotrack.cameras import Camera, CameraRig, stack
 from psotrack.datasets.dpjait import read_calibration, write_calibration
 from psotrack.errors import InputError, OutputError
 from psotrack.files import read_text, refuse_to_overwrite, written_whole
 from psotrack.schema import read_toml
 
-#: What a rotation's rows may be off from unit length and right angles: files with 8 digits pass.
-_ROTATION = 1e-6
 #: caliscope's name for its file; any other TOML is anipose's.
 _CALISCOPE = "camera_array"
-#: OpenCV's counts of coefficients that `psotrack.cameras` knows.
-_COEFFICIENTS = (0, 4, 5, 8)
 
 
 def read_rig(
@@ -89,46 +85,6 @@ def write_rig(path: Path, rig: CameraRig, *, force: bool = False) -> None:
     write(path, rig)
 
 
-@dataclass(frozen=True)
-class _Fields:
-    """The fields of one camera in a file, and how to complain of them."""
-
-    path: Path
-    place: str
-    values: Mapping[str, Any]
-
-    def wrong(self, name: str, expected: str, found: str, remedy: str = "") -> InputError:
-        return InputError(f"{self.path}, {self.place}.{name}", expected=expected, found=found, remedy=remedy)
-
-    def first(self, *names: str) -> str | None:
-        """The first of the names that has a value; of text only a name, because caliscope wrote "null" for none."""
-        there = (name for name in names if self.values.get(name) is not None)
-        return next(
-            (name for name in there if not isinstance(self.values[name], str) or name == "name"), None
-        )
-
-    def array(self, names: tuple[str, ...], *shapes: tuple[int, ...]) -> Float[np.ndarray, "..."]:
-        """Finite numbers of one of the shapes; -1 is any length."""
-        name = self.first(*names)
-        expected = " or ".join(_words(shape) for shape in shapes)
-        if name is None:
-            raise self.wrong(" or ".join(names), expected, "none")
-        try:
-            array = np.array(self.values[name], np.float64)
-        except (TypeError, ValueError):
-            raise self.wrong(name, expected, _quoted(self.values[name])) from None
-        # OpenCV writes vectors as columns or rows.
-        squeezed = array.ravel() if array.ndim == 2 and 1 in array.shape else array
-        for shape in shapes:
-            if squeezed.ndim == len(shape) and all(
-                want in (-1, have) for want, have in zip(shape, squeezed.shape, strict=True)
-            ):
-                if not np.isfinite(squeezed).all():
-                    raise self.wrong(name, "finite numbers", _quoted(self.values[name]))
-                return squeezed
-        raise self.wrong(name, expected, " x ".join(map(str, array.shape)) or _quoted(self.values[name]))
-
-
 def _read(
     path: Path, image_size_wh: tuple[int, int] | None, metres_per_unit: float, *, placed: bool
 ) -> CameraRig:
@@ -141,7 +97,7 @@ def _read(
     for name, fields in read(path):
         if name in cameras:
             raise fields.wrong("name", "each camera once", f"{name} again")
-        cameras[name] = _camera(fields, image_size_wh, metres_per_unit, placed)
+        cameras[name] = camera_of(fields, image_size_wh, metres_per_unit, placed)
     if not cameras:
         raise InputError(path, expected="at least one camera", found="none")
     return stack(cameras)
@@ -158,7 +114,7 @@ def _read_csv(path: Path, image_size_wh: tuple[int, int] | None) -> CameraRig:
     return read_calibration(path, defaultdict(lambda: image_size_wh))
 
 
-def _toml_fields(path: Path) -> Iterator[tuple[str, _Fields]]:
+def _toml_fields(path: Path) -> Iterator[tuple[str, CameraFields]]:
     """The tables of the cameras, anipose's or caliscope's, with their names."""
     data = read_toml(path)
     nested = data.get("cameras")
@@ -171,14 +127,14 @@ def _toml_fields(path: Path) -> Iterator[tuple[str, _Fields]]:
         if not isinstance(table, dict) or key == "metadata" or "matrix" not in table:
             if prefix or re.fullmatch(r"cam_\w+", key):
                 values = table if isinstance(table, dict) else {}
-                raise _Fields(path, f"{prefix}{key}", values).wrong("matrix", "3 x 3 numbers", "none")
+                raise CameraFields(path, f"{prefix}{key}", values).wrong("matrix", "3 x 3 numbers", "none")
             continue
-        fields = _Fields(path, f"{prefix}{key}", table)
+        fields = CameraFields(path, f"{prefix}{key}", table)
         name = fields.first("name", "cam_id", "port")
         yield str(table[name]) if name else key.removeprefix("cam_"), fields
 
 
-def _yaml_fields(path: Path) -> Iterator[tuple[str, _Fields]]:
+def _yaml_fields(path: Path) -> Iterator[tuple[str, CameraFields]]:
     """The maps of the cameras, in a sequence `cameras`, or one camera alone as OpenCV's own samples write it."""
     text = read_text(path)
     # OpenCV knows the format by its first line.
@@ -199,10 +155,10 @@ def _yaml_fields(path: Path) -> Iterator[tuple[str, _Fields]]:
     values = content if isinstance(content, dict) else {}
     cameras = values.get("cameras")
     if not isinstance(cameras, list):
-        yield path.stem, _Fields(path, "camera", values)
+        yield path.stem, CameraFields(path, "camera", values)
         return
     for index, one in enumerate(cameras):
-        fields = _Fields(path, f"cameras[{index}]", one if isinstance(one, dict) else {})
+        fields = CameraFields(path, f"cameras[{index}]", one if isinstance(one, dict) else {})
         name = fields.first("name")
         if name is None:
             raise fields.wrong("name", "a name", "none")
@@ -221,56 +177,6 @@ def _values(node: Any) -> Any:
     if node.isString():
         return node.string()
     return node.real() if node.isReal() or node.isInt() else None
-
-
-def _camera(
-    fields: _Fields, image_size_wh: tuple[int, int] | None, metres_per_unit: float, placed: bool
-) -> Camera:
-    if fields.values.get("fisheye"):
-        raise fields.wrong("fisheye", "a lens of OpenCV's pinhole model", "a fisheye")
-    dist = np.zeros(0)
-    coefficients = ("distortions", "D", "dist", "distortion_coefficients")
-    if fields.first(*coefficients):
-        dist = fields.array(coefficients, (-1,))
-    if dist.size not in _COEFFICIENTS:
-        allowed = ", ".join(map(str, _COEFFICIENTS))
-        raise fields.wrong(str(fields.first(*coefficients)), f"{allowed} coefficients", f"{dist.size}")
-    K = fields.array(("matrix", "K", "camera_matrix"), (3, 3))
-    if not (K[0, 0] > 0 and K[1, 1] > 0 and K[1, 0] == 0 and np.array_equal(K[2], [0, 0, 1])):
-        name = str(fields.first("matrix", "K", "camera_matrix"))
-        raise fields.wrong(
-            name, "intrinsics [[fx, s, cx], [0, fy, cy], [0, 0, 1]], fx and fy above 0", _quoted(K.tolist())
-        )
-    R, t_m = np.eye(3), np.zeros(3)
-    if placed:
-        R = _rotation(fields)
-        t_m = fields.array(("translation", "t", "T", "tvec"), (3,)) * metres_per_unit
-    return camera(R=R, t_m=t_m, K=K, dist=dist.tolist(), image_size_wh=_image_size(fields, image_size_wh))
-
-
-def _rotation(fields: _Fields) -> Float[np.ndarray, "3 3"]:
-    names = ("rotation", "R", "rvec")
-    turn = fields.array(names, (3,), (3, 3))
-    if turn.ndim == 1:
-        return Rotation.from_rotvec(turn).as_matrix()
-    if np.abs(turn @ turn.T - np.eye(3)).max() > _ROTATION or np.linalg.det(turn) < 0:
-        remedy = "its axes are mirrored" if np.linalg.det(turn) < 0 else ""
-        raise fields.wrong(str(fields.first(*names)), "a rotation matrix", _quoted(turn.tolist()), remedy)
-    return turn
-
-
-def _image_size(fields: _Fields, image_size_wh: tuple[int, int] | None) -> tuple[int, int]:
-    if fields.first("size", "image_size"):
-        sides = fields.array(("size", "image_size"), (2,))
-    elif fields.first("image_width") and fields.first("image_height"):
-        sides = np.array([fields.array((f"image_{side}",), ()) for side in ("width", "height")])
-    elif image_size_wh is not None:
-        return image_size_wh
-    else:
-        raise fields.wrong("size or image_size", "width and height of the images", "none", "pass --size")
-    if (sides < 1).any() or (sides != np.round(sides)).any():
-        raise fields.wrong("size", "whole numbers of pixels above 0", _quoted(sides.tolist()))
-    return int(sides[0]), int(sides[1])
 
 
 def _write_toml(path: Path, rig: CameraRig) -> None:
@@ -333,14 +239,3 @@ def _by_suffix(path: Path, functions: Mapping[str, Callable[..., Any]]) -> Calla
     if function is None:
         raise InputError(path, expected=f"a file that ends in {', '.join(functions)}", found=path.name)
     return function
-
-
-def _words(shape: tuple[int, ...]) -> str:
-    if not shape:
-        return "a number"
-    return "numbers" if -1 in shape else f"{' x '.join(map(str, shape))} numbers"
-
-
-def _quoted(value: Any) -> str:
-    text = str(value).replace("\n", " ")
-    return text if len(text) <= 60 else f"{text[:60]}..."

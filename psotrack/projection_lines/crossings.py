@@ -10,23 +10,13 @@ from jaxtyping import Bool, Float, Int
 from psotrack.cameras import NEAR_M, Camera, project
 from psotrack.correspondence import match
 from psotrack.reprojection import reconstruct
+from psotrack.sightings import CUT_SHARE, View
 
 #: No sighting is known better, however well the cameras agree.
 LEAST_NOISE_PX = 0.1
-
-
-@dataclass(frozen=True)
-class View:
-    """The sightings of one frame, in all cameras; NaN for none.
-
-    Attributes:
-        centre_px, size_px: (cameras, boxes, 2), middles and sides.
-        noise_px: (cameras, boxes), standard deviations of the middles.
-    """
-
-    centre_px: Float[np.ndarray, "cameras boxes 2"]
-    size_px: Float[np.ndarray, "cameras boxes 2"]
-    noise_px: Float[np.ndarray, "cameras boxes"]
+#: Of drones that share a sighting all but one are hidden: its middle is off theirs by so much of its sides, as that of
+#: one that the image's border cuts.
+SHARED_SHARE = CUT_SHARE
 
 
 @dataclass(frozen=True)
@@ -71,21 +61,25 @@ def crossings(
     """
     # What nobody expected is like what is known.
     dispersion = np.append(dispersion, np.median(dispersion) if len(dispersion) else 1.0)
-    there = np.isfinite(view.noise_px)
     # In doubt a detector is taken to be as good as it says: what is matched is judged afterwards.
     scale = np.sqrt(max(1.0, dispersion[-1]))
     groups = match(
         cameras,
-        [centre[which] for centre, which in zip(view.centre_px, there, strict=True)],
-        [scale * noise[which] for noise, which in zip(view.noise_px, there, strict=True)],
+        view.found(view.centre_px),
+        [scale * noise_px for noise_px in view.found(view.noise_px)],
         bounds_m=bounds_m,
         expected_m=expected_m,
         expected_covariance_m2=expected_covariance_m2,
     )
     centre_px, size_px, noise_px = (
-        _of(values, there, groups.detection) for values in (view.centre_px, view.size_px, view.noise_px)
+        view.grouped(values, groups.detection) for values in (view.centre_px, view.size_px, view.noise_px)
     )
-    known_px = np.maximum(noise_px * np.sqrt(dispersion[groups.expected])[:, None], LEAST_NOISE_PX)
+    several = _shared(groups.detection)
+    hidden_px = np.where(several, SHARED_SHARE * np.sqrt(size_px.prod(axis=-1)), 0.0)
+    noise_px = np.hypot(noise_px, hidden_px)
+    # How well a drone is seen by itself says nothing of the others before it.
+    usual = np.where(several, 1.0, np.sqrt(dispersion[groups.expected])[:, None])
+    known_px = np.maximum(noise_px * usual, LEAST_NOISE_PX)
     lines = reconstruct(cameras, centre_px, noise_px=np.nan_to_num(known_px, nan=1.0))
     kept = lines.used.any(axis=-1)
     position_m, seen = lines.position_m[kept], lines.used[kept]
@@ -110,13 +104,6 @@ def in_view(cameras: Camera, position_m: Float[np.ndarray, "drones 3"]) -> Bool[
     return np.asarray(inside.all(axis=-1) & (depth > NEAR_M))
 
 
-def _of(
-    values: Float[np.ndarray, "cameras boxes *rest"],
-    there: Bool[np.ndarray, "cameras boxes"],
-    detection: Int[np.ndarray, "groups cameras"],
-) -> Float[np.ndarray, "groups cameras *rest"]:
-    """What is known of the sightings of each group, NaN where a camera has none; they are numbered without the gaps."""
-    padded = np.full((values.shape[0], values.shape[1] + 1, *values.shape[2:]), np.nan)
-    for camera, which in enumerate(there):
-        padded[camera, : which.sum()] = values[camera, which]
-    return padded[np.arange(len(values)), detection]
+def _shared(detection: Int[np.ndarray, "groups cameras"]) -> Bool[np.ndarray, "groups cameras"]:
+    """(groups, cameras), whether the sighting is that of several groups."""
+    return ((detection[:, None] == detection) & (detection >= 0)).sum(axis=1) > 1

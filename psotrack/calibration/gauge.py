@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.calibration import centre_by_pose, cross_matrix
+from psotrack.calibration.derivatives import centre_by_pose
+from psotrack.rotations import cross_matrices
 
 #: What counts as much as `TURN_RAD` when a rig is moved as little as can be.
 SHIFT_M = 0.05
@@ -32,12 +33,12 @@ def common_motions(T_cam_world: Float[np.ndarray, "cameras 4 4"]) -> Float[np.nd
         by_turn, by_centre = np.zeros((3, 7)), np.zeros((3, 7))
         by_turn[:, :3] = -R
         by_centre[:, :3], by_centre[:, 3:6], by_centre[:, 6] = (
-            -cross_matrix(from_middle),
+            -cross_matrices(from_middle),
             np.eye(3),
             from_middle,
         )
         # t = -R c, so its change is -R dc, and -[dθ] R c = [R c] dθ.
-        blocks.append(np.vstack([by_turn, -R @ by_centre + cross_matrix(R @ c) @ by_turn]))
+        blocks.append(np.vstack([by_turn, -R @ by_centre + cross_matrices(R @ c) @ by_turn]))
     return np.vstack([*blocks, np.zeros((1, 7))])
 
 
@@ -49,7 +50,7 @@ def departure(
     for T, c, T_now, c_now in zip(given, _centres(given), now, _centres(now), strict=True):
         R = T[:3, :3]
         turn = cv2.Rodrigues(T_now[:3, :3] @ R.T)[0].ravel()
-        parts += [turn, -R @ (c_now - c) + cross_matrix(R @ c) @ turn]
+        parts += [turn, -R @ (c_now - c) + cross_matrices(R @ c) @ turn]
     return np.concatenate([*parts, [0.0]])
 
 

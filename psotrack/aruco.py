@@ -1,0 +1,21 @@
+"""ArUco markers: OpenCV's dictionaries by their names."""
+
+from __future__ import annotations
+
+import cv2
+
+from psotrack.errors import SettingsError
+
+
+def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
+    """OpenCV's dictionary of a name such as 4x4_50 or DICT_4X4_50.
+
+    Raises:
+        SettingsError: there is none.
+    """
+    known = {key.lower(): key for key in dir(cv2.aruco) if key.startswith("DICT_")}
+    key = known.get(f"dict_{name.lower().removeprefix('dict_')}")
+    if key is None:
+        names = ", ".join(name.removeprefix("dict_") for name in known)
+        raise SettingsError("dictionary", expected=f"one of {names}", found=name)
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, key))

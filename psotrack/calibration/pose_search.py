@@ -1,0 +1,173 @@
+"""Poses from known points: starts from sets of four, refined; the most likely first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import combinations
+from math import comb
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import least_squares
+
+from psotrack.calibration.derivatives import pixel_slopes, reproject
+from psotrack.cameras import NEAR_M, Camera, project, undistort
+from psotrack.errors import InputError
+
+#: A pose has six unknowns and a point gives two equations; the fourth point picks one of P3P's four answers.
+MIN_POINTS = 4
+#: Of the largest extent, below which a second pose, turned over, is looked for.
+_NEARLY_FLAT = 0.1
+#: Sets of four that the start is sought among; with 40 % outliers 13 in 100 of them are clean.
+_MOST_SETS = 100
+#: Starts that are refined.
+_MOST_STARTS = 4
+#: Poses that differ by less are the same.
+_SAME_RAD = np.deg2rad(2.0)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """World to camera: x_cam = R X + t."""
+
+    R: Float[np.ndarray, "3 3"]
+    t_m: Float[np.ndarray, "3"]
+    #: The robust cost: minus the logarithm of the likelihood.
+    cost: float = np.inf
+
+    def turned_like(self, other: Pose) -> bool:
+        """Whether the camera looks almost the same way."""
+        # The trace of a rotation by an angle is 1 + 2 cos(angle).
+        return bool(np.sum(self.R * other.R) > 1 + 2 * np.cos(_SAME_RAD))
+
+
+def likely(
+    points_m: Float[np.ndarray, "points 3"],
+    points_px: Float[np.ndarray, "points 2"],
+    lens: Camera,
+    noise_px: float,
+    extent_m: Float[np.ndarray, "3"],
+    name: str,
+) -> list[Pose]:
+    """Poses that no small change makes better, the most likely first."""
+    started = _distinct(starts_of(points_m, points_px, lens, noise_px, extent_m))
+    found = _distinct(refined(points_m, points_px, start, lens, noise_px, loss="cauchy") for start in started)
+    if not found:
+        raise InputError(
+            name, expected="points that some pose fits", found="none that has them in front of it"
+        )
+    return found
+
+
+def _distinct(poses: Iterable[Pose]) -> list[Pose]:
+    """The cheapest, without those that are much like a cheaper one."""
+    found: list[Pose] = []
+    for pose in sorted(poses, key=lambda pose: pose.cost):
+        if len(found) < _MOST_STARTS and np.isfinite(pose.cost) and not any(map(pose.turned_like, found)):
+            found.append(pose)
+    return found
+
+
+def starts_of(
+    points_m: Float[np.ndarray, "points 3"],
+    points_px: Float[np.ndarray, "points 2"],
+    lens: Camera,
+    noise_px: float,
+    extent_m: Float[np.ndarray, "3"],
+) -> list[Pose]:
+    """Poses from all points, and from sets of four of which some have no outlier."""
+    normalised = undistort(lens, points_px)
+    count = len(points_m)
+    if comb(count, MIN_POINTS) <= _MOST_SETS:
+        sets = [list(four) for four in combinations(range(count), MIN_POINTS)]
+    else:
+        rng = np.random.default_rng(0)
+        sets = [rng.permutation(count)[:MIN_POINTS].tolist() for _ in range(_MOST_SETS)]
+    middle_m = points_m.mean(axis=0)
+    axes = np.linalg.svd(points_m - middle_m)[2]
+    flat = points_m - ((points_m - middle_m) @ axes[2])[:, None] * axes[2]
+    methods = [(points_m, cv2.SOLVEPNP_SQPNP)]
+    if extent_m[2] < _NEARLY_FLAT * extent_m[0]:
+        methods.append((flat, cv2.SOLVEPNP_IPPE))
+    if count == MIN_POINTS:
+        # With more, some other set of four has a better start.
+        methods.append((points_m, cv2.SOLVEPNP_AP3P))
+    solved = [
+        pose
+        for rows in [list(range(count)), *sets]
+        for places_m, method in methods
+        for pose in _solved(places_m[rows], normalised[rows], method)
+    ]
+    if not solved:
+        return []
+    T = np.tile(np.eye(4), (len(solved), 1, 1))
+    T[:, :3] = [np.column_stack(pose) for pose in solved]
+    costs = _costs(points_m, points_px, T, lens, noise_px)
+    return [Pose(R, t_m, cost) for (R, t_m), cost in zip(solved, costs.tolist(), strict=True)]
+
+
+def _solved(
+    points_m: Float[np.ndarray, "points 3"], normalised: Float[np.ndarray, "points 2"], method: int
+) -> list[tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]]:
+    try:
+        _, turns, shifts, _ = cv2.solvePnPGeneric(points_m, normalised, np.eye(3), None, flags=method)
+    except cv2.error:
+        # Four points on a line, or the like.
+        return []
+    poses = [(cv2.Rodrigues(turn)[0], shift.ravel()) for turn, shift in zip(turns, shifts, strict=True)]
+    return [(R, t_m) for R, t_m in poses if np.isfinite(R).all() and np.isfinite(t_m).all()]
+
+
+def _costs(
+    points_m: Float[np.ndarray, "points 3"],
+    points_px: Float[np.ndarray, "points 2"],
+    T_cam_world: Float[np.ndarray, "poses 4 4"],
+    lens: Camera,
+    noise_px: float,
+) -> Float[np.ndarray, " poses"]:
+    """The Cauchy loss of each pose; infinite where most points are behind the camera."""
+    shape = (len(T_cam_world), 1)
+    K, dist = (np.broadcast_to(value, shape + value.shape) for value in (lens.K, lens.dist))
+    cameras = Camera(T_cam_world[:, None], K, dist, np.zeros((*shape, 2)))
+    pixels, depth = project(cameras, points_m)
+    loss = 0.5 * np.log1p(((pixels - points_px) / noise_px) ** 2).sum(axis=(-2, -1))
+    return np.where(np.median(depth, axis=-1) > NEAR_M, loss, np.inf)
+
+
+def refined(
+    points_m: Float[np.ndarray, "points 3"],
+    points_px: Float[np.ndarray, "points 2"],
+    start: Pose,
+    lens: Camera,
+    noise_px: float,
+    *,
+    loss: Literal["linear", "cauchy"],
+) -> Pose:
+    """The pose that minimises the loss of the reprojection error, from a start."""
+    turned = np.ascontiguousarray(points_m @ start.R.T)
+
+    def off(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, " equations"]:
+        return ((pixel_slopes(turned, x[:3], x[3:], lens)[0] - points_px) / noise_px).ravel()
+
+    def slopes(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "equations 6"]:
+        return pixel_slopes(turned, x[:3], x[3:], lens)[1][..., :6].reshape(-1, 6) / noise_px
+
+    result = least_squares(off, np.concatenate([np.zeros(3), start.t_m]), slopes, loss=loss, x_scale="jac")
+    R = np.asarray(cv2.Rodrigues(result.x[:3])[0]) @ start.R
+    T = np.eye(4)[None]
+    T[0, :3] = np.column_stack([R, result.x[3:]])
+    return Pose(R, result.x[3:], float(_costs(points_m, points_px, T, lens, noise_px)[0]))
+
+
+def distances_px(
+    points_m: Float[np.ndarray, "points 3"],
+    points_px: Float[np.ndarray, "points 2"],
+    pose: Pose,
+    lens: Camera,
+) -> Float[np.ndarray, " points"]:
+    """Distances in the image; infinite behind the camera."""
+    distance = np.linalg.norm(reproject(points_m, pose.R, pose.t_m, lens)[0] - points_px, axis=-1)
+    return np.where(points_m @ pose.R[2] + pose.t_m[2] > NEAR_M, distance, np.inf)

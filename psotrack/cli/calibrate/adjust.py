@@ -1,0 +1,144 @@
+"""`psotrack calibrate adjust`: a rig that agrees with the drones that its cameras see."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from psotrack.cli.answers import say
+from psotrack.cli.calibrate.options import OUT
+from psotrack.cli.calibrate.shown import row_of, show_cameras
+from psotrack.cli.options import FORCE, JSON, QUIET, SEQUENCE
+from psotrack.errors import InputError
+from psotrack.files import refuse_to_overwrite
+
+if TYPE_CHECKING:
+    from psotrack.calibration import DroneViews, Improved
+    from psotrack.cameras import CameraRig
+
+
+@click.command()
+@SEQUENCE
+@click.option(
+    "--tracks", type=click.Path(path_type=Path), required=True, help="Of SEQ's drones, as `track` writes."
+)
+@click.option("--fixed", default="", metavar="NAME,NAME...", help="Cameras that stay where they are.")
+@click.option("--refine-focal-length", is_flag=True, help="Scale all focal lengths by a common factor, too.")
+@click.option(
+    "--noise",
+    "noise_px",
+    type=float,
+    help="Standard deviation of the middle of a box from frame to frame, along x and along y, in pixels.  "
+    "[default: 1, and 5 % of its sides]",
+)
+@OUT
+@FORCE
+@QUIET
+@JSON
+def adjust(
+    sequence: Path,
+    tracks: Path,
+    fixed: str,
+    refine_focal_length: bool,
+    noise_px: float | None,
+    out: Path,
+    force: bool,
+    quiet: bool,
+    json_path: Path | None,
+) -> None:
+    """Move the cameras of SEQ that do not agree with the others on where its drones are: a bundle adjustment.
+
+    The points are the middles of SEQ's detections that hold a tracked drone. These are off by about a pixel, in the
+    same way for many frames, which places cameras to a centimetre or two. So only cameras are moved that are off by
+    more than that for certain; if none is, OUT is the rig as it was.
+
+    Where the world's origin is, how its axes are turned and how large it is cannot be seen from drones: where most
+    cameras are off, all are moved, and the rig as a whole stays where it is.
+
+    \b
+    Example:
+      psotrack calibrate adjust data/Simulated_Data/S02_D4_A --tracks tracks.csv --out better.toml
+    """
+    from psotrack.calibration import improve, in_boxes, write_rig
+    from psotrack.datasets.dpjait import read_sequence
+    from psotrack.detections import read_detections
+    from psotrack.trajectory_files import read_trajectories
+
+    refuse_to_overwrite(out, force)
+    recording = read_sequence(sequence)
+    if not recording.detections:
+        raise InputError(sequence, expected="detections in dl_data", found="none")
+    detections = {name: read_detections(path) for name, path in recording.detections.items()}
+    flown = read_trajectories(tracks, fps=recording.fps if recording.videos else None)
+    views = in_boxes(recording.rig, detections, flown)
+    held = tuple(name for name in fixed.split(",") if name)
+    improved = improve(
+        recording.rig,
+        views.points_px,
+        views.noise_px if noise_px is None else noise_px,
+        fixed=held,
+        refine_focal_length=refine_focal_length,
+        alike=views.alike,
+    )
+    write_rig(out, improved.rig, force=force)
+    rows = _rows(recording.rig, improved, views, held)
+    show_cameras(rows, out, quiet, json_path, force)
+    say(quiet, json_path, _in_words(improved, rows))
+    if refine_focal_length:
+        scale, std = improved.everything.focal_scale, improved.everything.focal_scale_std
+        done = "" if improved.rescaled else ", which may be chance: they are written as they were"
+        say(quiet, json_path, f"focal lengths x {scale:.5f}, give or take {std:.5f}{done}")
+
+
+def _rows(
+    rig: CameraRig, improved: Improved, views: DroneViews, held: tuple[str, ...]
+) -> dict[str, dict[str, Any]]:
+    """What is said of each camera."""
+    shown = improved.everything if improved.final is None else improved.final
+    T, T_before = (np.asarray(one.cameras.T_cam_world) for one in (improved.rig, rig))
+    turns = Rotation.from_matrix(T[:, :3, :3] @ T_before[:, :3, :3].swapaxes(-1, -2))
+    turned_deg = np.linalg.norm(turns.as_rotvec(degrees=True), axis=-1)
+    centre_m, before_m = (np.asarray(one.cameras.centre_world) for one in (improved.rig, rig))
+    moved_m = np.linalg.norm(centre_m - before_m, axis=-1)
+    rows = {}
+    for index, name in enumerate(rig.names):
+        seen = np.isfinite(shown.residual_px[:, index])
+        rows[name] = row_of(
+            centre_m[index],
+            improved.centre_covariance_m2[index],
+            shown.residual_px[seen, index],
+            shown.used[seen, index],
+            [point for point, there in zip(views.points, seen, strict=True) if there],
+        )
+        rows[name]["moved_m"] = float(moved_m[index])
+        rows[name]["turned_deg"] = float(turned_deg[index])
+        rows[name]["verdict"] = "moved" if name in improved.moved else "fixed" if name in held else "agrees"
+    return rows
+
+
+def _in_words(improved: Improved, rows: dict[str, dict[str, Any]]) -> str:
+    """Whether adjusting paid."""
+    if not improved.moved:
+        what = "only the focal lengths are changed" if improved.rescaled else "the rig is written as it was"
+        known_mm = [1e3 * float(np.linalg.norm(row["centre_std_m"])) for row in rows.values()]
+        told_mm = [value for value in known_mm if value > 0] or [0.0]
+        return (
+            "no camera is off by more than these detections can tell, which is "
+            f"{min(told_mm):.0f} to {max(told_mm):.0f} mm: {what}"
+        )
+    parts = [
+        f"{name} is off: moved by {1e3 * rows[name]['moved_m']:.0f} mm, "
+        f"turned by {rows[name]['turned_deg']:.2f} degrees"
+        for name in improved.moved
+    ]
+    parts += [
+        f"or the focal length of {name} is (x {scale:.3f}, give or take {std:.3f}): check its lens"
+        for name, (scale, std) in improved.zoomed.items()
+    ]
+    agree = any(row["verdict"] == "agrees" for row in rows.values())
+    parts.append("the others agree and stay" if agree else "too few agree: the rig as a whole was held")
+    return "; ".join(parts)

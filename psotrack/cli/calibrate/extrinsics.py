@@ -1,0 +1,153 @@
+"""`psotrack calibrate extrinsics`: where cameras stand, from points of known places."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import numpy as np
+
+from psotrack.cli.calibrate.options import OUT, SIZE, noise_option
+from psotrack.cli.calibrate.shown import row_of, show_cameras
+from psotrack.cli.options import FORCE, JSON, QUIET, Numbers
+from psotrack.errors import InputError, SettingsError
+from psotrack.files import refuse_to_overwrite
+
+if TYPE_CHECKING:
+    from psotrack.calibration import Marks
+
+
+@click.command()
+@click.option(
+    "--pairs",
+    type=click.Path(path_type=Path),
+    help="Points marked by hand: camera,point,x_px,y_px,x_m,y_m,z_m.",
+)
+@click.option(
+    "--points",
+    type=click.Path(path_type=Path),
+    help="Where the points are, if --pairs does not say: point,x_m,y_m,z_m.",
+)
+@click.option(
+    "--markers",
+    type=click.Path(path_type=Path),
+    metavar="SEQ",
+    help="Instead of --pairs: find the ArUco markers of SEQ's aruco_corners.csv in its videos.",
+)
+@click.option("--dictionary", default="4x4_1000", show_default=True, help="Of the markers.")
+@click.option(
+    "--intrinsics",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="The cameras' lenses; a file of one camera is for all.",
+)
+@click.option("--fov", "fov_deg", type=Numbers(2), metavar="H,V", help="Instead: fields of view in degrees.")
+@click.option("--focal-length", "focal_length_mm", type=float, help="Instead: in millimetres, with --sensor.")
+@click.option("--sensor", "sensor_mm", type=Numbers(2), metavar="W,H", help="Its size in millimetres.")
+@SIZE
+@noise_option(1.0)
+@OUT
+@FORCE
+@QUIET
+@JSON
+def extrinsics(
+    pairs: Path | None,
+    points: Path | None,
+    markers: Path | None,
+    dictionary: str,
+    noise_px: float,
+    out: Path,
+    force: bool,
+    quiet: bool,
+    json_path: Path | None,
+    **lens: Any,
+) -> None:
+    """Find where cameras stand, from points whose places in the world and in the images are known.
+
+    Four points that are not on one line are the least; twelve, spread over the image and in depth, are good. Points
+    that do not agree with the others are left out, and shown.
+
+    \b
+    Examples:
+      psotrack calibrate extrinsics --pairs pairs.csv --intrinsics lens.toml --out rig.toml
+      psotrack calibrate extrinsics --pairs pairs.csv --points points.csv --fov 92.4,60.8 --size 1920,1080 --out rig.yml
+      psotrack calibrate extrinsics --markers data/Simulated_Data/S01_D2_A --intrinsics rig.toml --out found.toml
+    """
+    from psotrack.calibration import locate_camera, read_marks, write_rig
+    from psotrack.cameras import Camera, stack
+
+    if (pairs is None) == (markers is None):
+        found = "neither" if pairs is None else "both"
+        raise SettingsError("extrinsics", expected="--pairs FILE or --markers SEQ", found=found)
+    refuse_to_overwrite(out, force)
+    marks = read_marks(pairs, points) if pairs else _marker_marks(Path(str(markers)), dictionary)
+    lenses = _lenses(list(marks), **lens)
+    cameras: dict[str, Camera] = {}
+    rows: dict[str, dict[str, Any]] = {}
+    for name, of_camera in marks.items():
+        one = lenses[name]
+        located = locate_camera(
+            of_camera.points_m, of_camera.points_px, one.K, one.dist, noise_px, name=f"camera {name}"
+        )
+        cameras[name] = replace(one, T_cam_world=located.T_cam_world)
+        rows[name] = row_of(
+            np.asarray(cameras[name].centre_world),
+            located.centre_covariance_m2,
+            located.residual_px,
+            located.used,
+            of_camera.points,
+        )
+    rig = stack(cameras)
+    write_rig(out, rig, force=force)
+    show_cameras(rows, out, quiet, json_path, force)
+
+
+def _lenses(
+    names: list[str],
+    *,
+    intrinsics: Path | None,
+    fov_deg: tuple[float, float] | None,
+    focal_length_mm: float | None,
+    sensor_mm: tuple[float, float] | None,
+    image_size_wh: tuple[int, int] | None,
+) -> Mapping[str, Any]:
+    """The lens of each camera, from the one of three ways that was chosen."""
+    from psotrack.calibration import lens_of_sensor, lens_of_view, read_lenses
+
+    ways = [value is not None for value in (intrinsics, fov_deg, focal_length_mm)]
+    if sum(ways) != 1 or (focal_length_mm is None) != (sensor_mm is None):
+        raise SettingsError(
+            "lens",
+            expected="--intrinsics FILE, or --fov H,V, or --focal-length with --sensor",
+            found="another choice" if any(ways) else "none",
+        )
+    if intrinsics is not None:
+        rig = read_lenses(intrinsics, image_size_wh)
+        if len(rig) == 1:
+            return dict.fromkeys(names, rig.cameras[0])
+        missing = [name for name in names if name not in rig.names]
+        if missing:
+            raise InputError(
+                intrinsics, expected=f"the lens of {missing[0]}", found=f"only {', '.join(rig.names)}"
+            )
+        return {name: rig.cameras[rig.names.index(name)] for name in names}
+    if image_size_wh is None:
+        raise SettingsError("--size", expected="width and height of the images", found="none")
+    if fov_deg is not None:
+        return dict.fromkeys(names, lens_of_view(*fov_deg, image_size_wh))
+    return dict.fromkeys(
+        names, lens_of_sensor(focal_length_mm or 0.0, sensor_mm or (0.0, 0.0), image_size_wh)
+    )
+
+
+def _marker_marks(folder: Path, dictionary: str) -> dict[str, Marks]:
+    from psotrack.calibration import find_markers
+    from psotrack.datasets.dpjait import MARKER_CORNERS, read_sequence
+    from psotrack.inside_out.marker_map import read_marker_map
+
+    corners_m = read_marker_map(folder / MARKER_CORNERS).corners_m
+    videos = read_sequence(folder).videos
+    return {name: find_markers(video, corners_m, dictionary) for name, video in videos.items()}

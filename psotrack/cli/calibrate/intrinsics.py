@@ -1,0 +1,78 @@
+"""`psotrack calibrate intrinsics`: a camera's lens, from a video of a ChArUco board."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import numpy as np
+
+from psotrack.cli.answers import answer, say, show
+from psotrack.cli.calibrate.options import OUT
+from psotrack.cli.options import FORCE, JSON, QUIET, Size
+from psotrack.files import refuse_to_overwrite
+
+
+@click.command()
+@click.argument("video", type=click.Path(path_type=Path))
+@click.option("--squares", "squares_wh", type=Size(), required=True, help="Of the board, such as 7x5.")
+@click.option("--square", "square_m", type=float, required=True, help="Side of a square in metres.")
+@click.option("--marker", "marker_m", type=float, required=True, help="Side of a marker in metres.")
+@click.option("--dictionary", default="4x4_50", show_default=True, help="Of the markers.")
+@click.option("--name", help="Of the camera.  [default: the video's]")
+@OUT
+@FORCE
+@QUIET
+@JSON
+def intrinsics(
+    video: Path,
+    squares_wh: tuple[int, int],
+    square_m: float,
+    marker_m: float,
+    dictionary: str,
+    name: str | None,
+    out: Path,
+    force: bool,
+    quiet: bool,
+    json_path: Path | None,
+) -> None:
+    """Find a camera's lens from VIDEO, in which a ChArUco board is moved about.
+
+    Carry the board into all corners of the image, near and far, and tilt it.
+
+    \b
+    Example:
+      psotrack calibrate intrinsics board.avi --squares 7x5 --square 0.04 --marker 0.03 --out lens.toml
+    """
+    from psotrack.calibration import Board, lens_of_board, write_rig
+    from psotrack.cameras import stack
+    from psotrack.video import probe
+
+    refuse_to_overwrite(out, force)
+    lens = lens_of_board(probe(video), Board(squares_wh, square_m, marker_m, dictionary))
+    write_rig(out, stack({name or video.stem: lens.camera}), force=force)
+    K, dist = lens.camera.K, lens.camera.dist
+    values = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *dist]
+    names = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2")
+    content = {
+        "lens": str(out),
+        "values": {key: float(value) for key, value in zip(names, values, strict=True)},
+        "std": {key: float(value) for key, value in zip(names, lens.std, strict=True)},
+        "frames": lens.frame.tolist(),
+        "residual_px": lens.residual_px.tolist(),
+    }
+    answer(json_path, content, force)
+    rows = zip(names, values, lens.std, strict=True)
+    show(
+        quiet,
+        json_path,
+        ("", "value", "give or take"),
+        ((key, f"{value:.5g}", f"{std:.2g}") for key, value, std in rows),
+    )
+    rms = float(np.sqrt(np.mean(lens.residual_px**2)))
+    worst = lens.frame[lens.residual_px.argmax()]
+    say(
+        quiet,
+        json_path,
+        f"{out}: {len(lens.frame)} views, residual {rms:.2f} px, {lens.residual_px.max():.2f} px in frame {worst}",
+    )

@@ -1,0 +1,39 @@
+"""`psotrack demo`: all of it, once, without any data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from psotrack.cli.answers import report_to
+from psotrack.cli.options import FORCE, JOBS, QUIET, compiled_folder
+
+
+@click.command()
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=Path("psotrack-demo"), show_default=True, help="Folder."
+)
+@click.option("--seed", type=int, default=0, show_default=True, help="Of flights, noise and swarm.")
+@JOBS
+@FORCE
+@QUIET
+def demo(out: Path, seed: int, jobs: int | None, force: bool, quiet: bool) -> None:
+    """Simulate four drones, track them from eight videos, print the errors, save a picture.
+
+    \b
+    Example:
+      psotrack demo --out demo
+    """
+    from rich.console import Console
+
+    from psotrack.compiled import keep_compiled
+    from psotrack.demo import run
+
+    keep_compiled(compiled_folder(None))
+    result = run(out, seed=seed, jobs=jobs, force=force, report=report_to(quiet))
+    if not quiet:
+        console = Console()
+        console.print(result.errors)
+        console.print(result.stages)
+        console.print(f"picture: {result.picture}", soft_wrap=True)

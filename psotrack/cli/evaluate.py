@@ -1,0 +1,100 @@
+"""`psotrack evaluate`: tracks against the reference of their sequence."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+import numpy as np
+
+from psotrack.cli.answers import answer
+from psotrack.cli.options import FORCE, JSON, QUIET, SEQUENCE
+from psotrack.errors import InputError, SettingsError
+
+if TYPE_CHECKING:
+    from psotrack.sequence import Sequence
+    from psotrack.trajectories import Trajectories
+
+
+@click.command()
+@click.argument("tracks", type=click.Path(path_type=Path))
+@SEQUENCE
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path),
+    is_flag=False,
+    flag_value="",
+    metavar="[PNG]",
+    help="Save 3D paths and error over time.  [default: beside TRACKS, as .png]",
+)
+@click.option(
+    "--offset",
+    metavar="SECONDS|auto",
+    help="The reference's clock is ahead of the videos' by so much; auto finds it, within 2 s.  [default: 0]",
+)
+@FORCE
+@QUIET
+@JSON
+def evaluate(
+    tracks: Path,
+    sequence: Path,
+    plot: Path | None,
+    offset: str | None,
+    force: bool,
+    quiet: bool,
+    json_path: Path | None,
+) -> None:
+    """Compare TRACKS with the reference of SEQ.
+
+    \b
+    Examples:
+      psotrack evaluate tracks.csv data/Simulated_Data/S02_D4_A
+      psotrack evaluate tracks.csv data/Simulated_Data/S02_D4_A --json errors.json --plot errors.png
+      psotrack evaluate tracks.csv data/Real_Data/R12_D4 --offset auto
+    """
+    from rich.console import Console
+
+    from psotrack.datasets.dpjait import read_sequence
+    from psotrack.evaluation import evaluate as compare
+    from psotrack.evaluation import plots, tables
+    from psotrack.trajectory_files import read_trajectories
+
+    recording = read_sequence(sequence)
+    if recording.truth is None:
+        raise InputError(sequence, expected="a reference to compare with", found="none")
+    estimate = read_trajectories(tracks, fps=recording.fps)
+    truth, offset_s = recording.truth, 0.0
+    if offset is not None:
+        truth, offset_s = _shifted_reference(recording, estimate, offset)
+    evaluation = compare(estimate, truth)
+    content = evaluation.to_dict() | ({"reference_offset_s": offset_s} if offset else {})
+    answer(json_path, content, force)
+    if plot is not None:
+        picture = plot if plot.name else tracks.with_suffix(".png")
+        plots.save_overview(picture, estimate, truth, force=force)
+    if not quiet and json_path != Path("-"):
+        title = f"{recording.name}, reference's clock {offset_s:+.4f} s" if offset else recording.name
+        Console().print(tables.render(evaluation, title=title))
+
+
+def _shifted_reference(
+    recording: Sequence, estimate: Trajectories, offset: str
+) -> tuple[Trajectories, float]:
+    """The reference of a sequence at the frames of its videos, and by how much its clock is ahead of theirs."""
+    from psotrack.synchronisation import find_offset, own_reference, shifted
+
+    reference = own_reference(recording)
+    if offset == "auto":
+        clock = (reference.time_s, reference.position_m, reference.orientation_wxyz)
+        offset_s = find_offset(estimate, *clock, max_offset_s=2.0).offset_s
+    else:
+        try:
+            offset_s = float(offset)
+        except ValueError:
+            offset_s = math.nan
+        if not math.isfinite(offset_s):
+            raise SettingsError("--offset", expected="a number of seconds, or auto", found=offset)
+    frame = np.arange(recording.num_frames)
+    return shifted(reference, offset_s, frame, frame / recording.fps), offset_s

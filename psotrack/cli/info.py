@@ -1,0 +1,32 @@
+"""`psotrack info`: what a sequence holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from psotrack.cli.answers import answer
+from psotrack.cli.options import FORCE, JSON, SEQUENCE
+
+
+@click.command()
+@SEQUENCE
+@FORCE
+@JSON
+def info(sequence: Path, force: bool, json_path: Path | None) -> None:
+    """Show what SEQ holds, and read all of it but the videos' frames, so that what is broken shows.
+
+    \b
+    Example:
+      psotrack info data/Simulated_Data/S02_D4_A
+    """
+    from rich.console import Console
+
+    from psotrack.contents import contents, render
+    from psotrack.datasets.dpjait import read_sequence
+
+    content = contents(read_sequence(sequence))
+    answer(json_path, content, force)
+    if json_path != Path("-"):
+        Console().print(render(content))

@@ -1,0 +1,154 @@
+"""`psotrack map-markers`: its options, and what it does."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+import numpy as np
+
+from psotrack.cli.answers import check_outputs, report_to
+from psotrack.cli.map_markers.shown import show_built, show_check, show_measured
+from psotrack.cli.map_markers.sources import Lenses, known_corners, leading, videos_of
+from psotrack.cli.options import FORCE, FRAMES, JSON, QUIET, Numbers
+from psotrack.errors import SettingsError, check_positive
+
+#: Of the exit, where something is wrong with a map.
+FOUND = 2
+#: Files of measured corners; all others are videos.
+_MEASURED = {".c3d", ".csv", ".txt", ".tsv"}
+
+
+@click.command("map-markers")
+@click.argument("sources", metavar="SOURCE...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--out", type=click.Path(path_type=Path), help="The table of corners to write; not needed for --check."
+)
+@click.option(
+    "--known",
+    metavar="ID,ID...",
+    help="Markers that say where the world is: in --markers, or one with a --side.",
+)
+@click.option(
+    "--markers",
+    "table",
+    type=click.Path(path_type=Path),
+    help="A table with the corners of the known markers.  [default: SEQ's, if there is no --side]",
+)
+@click.option("--side", "side_m", type=float, help="Of the markers' black squares, in metres.")
+@click.option("--estimate-sides", is_flag=True, help="Find the sides of markers that are not known, too.")
+@click.option(
+    "--check",
+    "checked",
+    type=click.Path(path_type=Path),
+    metavar="MAP",
+    help="Check this map instead of making one.",
+)
+@click.option("--drone", "drones", metavar="NAME,NAME...", help="Whose videos of a sequence.  [default: all]")
+@click.option(
+    "--camera",
+    "--intrinsics",
+    "camera_file",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Intrinsics of the videos: .csv, .toml or .yml.  [default: those of a sequence]",
+)
+@click.option(
+    "--camera-name",
+    "camera_names",
+    metavar="NAME,NAME...",
+    help="Of the camera in FILE, where that has several: one for all videos, or one for each.",
+)
+@click.option("--scale-camera", is_flag=True, help="Scale intrinsics for another size of the same images.")
+@click.option("--fov", "fov_deg", type=Numbers(2), metavar="H,V", help="Instead: fields of view in degrees.")
+@click.option("--dictionary", default="4x4_1000", show_default=True, help="Of the markers.")
+@click.option(
+    "--seen-from",
+    "seen_from_m",
+    type=Numbers(3),
+    metavar="X,Y,Z",
+    help="A place that all measured markers face.  [default: their middle]",
+)
+@FRAMES
+@FORCE
+@QUIET
+@JSON
+def map_markers(
+    sources: tuple[Path, ...],
+    out: Path | None,
+    known: str | None,
+    table: Path | None,
+    side_m: float | None,
+    estimate_sides: bool,
+    checked: Path | None,
+    drones: str | None,
+    camera_file: Path | None,
+    camera_names: str | None,
+    scale_camera: bool,
+    fov_deg: tuple[float, float] | None,
+    dictionary: str,
+    seen_from_m: tuple[float, float, float] | None,
+    num_frames: int | None,
+    force: bool,
+    quiet: bool,
+    json_path: Path | None,
+) -> None:
+    """Make the table of a room's marker corners, from SOURCE, or check one.
+
+    SOURCE is a .c3d or table of measured corners, labelled such as Marker7:1; or videos of the room, or a sequence
+    whose drones carry cameras. From videos all markers are placed relative to those that are --known: where these
+    are in --markers they stay. Of one with a --side alone the world's axes are its own: origin in its centre, x to its
+    right, y up, z out of the print.
+
+    With --check MAP, says which markers of a map are not where a video sees them, and how. The exit code is then 2 if
+    something was found.
+
+    \b
+    Examples:
+      psotrack map-markers room.c3d --out corners.csv
+      psotrack map-markers walk.mp4 --known 7 --side 0.2 --camera lens.toml --out corners.csv
+      psotrack map-markers a.mp4 b.mp4 --known 7,12 --markers measured.csv --fov 92.45,60.83 --out corners.csv
+      psotrack map-markers data/Simulated_Data/S01_D2_A --drone dron1 --known 7 --out corners.csv --json -
+      psotrack map-markers data/Simulated_Data/S01_D2_A --check corners.csv
+    """
+    from psotrack.datasets.dpjait import write_marker_corners
+    from psotrack.inside_out.mapping import build_map
+    from psotrack.inside_out.mapping.check import check_map
+    from psotrack.inside_out.mapping.sightings import find_sightings
+    from psotrack.inside_out.mapping.squares import read_measured, squares
+    from psotrack.inside_out.marker_map import read_marker_map
+
+    given = [name for name, value in {"--out": out, "--check": checked}.items() if value is not None]
+    if len(given) != 1:
+        raise SettingsError(
+            "map-markers", expected="--out FILE or --check MAP", found=" and ".join(given) or "neither"
+        )
+    check_outputs(out, json_path, force)
+    if side_m is not None:
+        check_positive("--side", side_m)
+    if out is not None and sources[0].suffix.lower() in _MEASURED:
+        if len(sources) > 1:
+            raise SettingsError(
+                "SOURCE", expected="one file of measured corners", found=f"{len(sources)} files"
+            )
+        viewer = None if seen_from_m is None else np.array(seen_from_m)
+        measured = squares(read_measured(sources[0]), side_m=side_m, seen_from_m=viewer)
+        write_marker_corners(out, measured.marker_map.corners_m)
+        show_measured(measured, out, quiet, json_path, force)
+        return
+    # What can be wrong is looked at before the videos are.
+    marker_map = None if checked is None else read_marker_map(checked)
+    world = {} if out is None else known_corners(known, table, side_m, sources)
+    videos = videos_of(sources, drones, Lenses(camera_file, camera_names, scale_camera, fov_deg))
+    videos = {name: (leading(video, num_frames), lens) for name, (video, lens) in videos.items()}
+    sightings = find_sightings(list(videos.values()), dictionary, report=report_to(quiet))
+    if marker_map is not None:
+        checkup = check_map(sightings, marker_map)
+        show_check(checkup, Path(str(checked)), quiet, json_path, force)
+        if checkup.findings:
+            sys.exit(FOUND)
+    elif out is not None:
+        built = build_map(sightings, world, side_m=side_m, estimate_sides=estimate_sides)
+        write_marker_corners(out, built.marker_map.corners_m)
+        show_built(built, list(videos), out, quiet, json_path, force)

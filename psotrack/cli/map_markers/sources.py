@@ -1,0 +1,120 @@
+"""What `map-markers` starts from: the corners of known markers, and videos with their lenses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from psotrack.errors import InputError, SettingsError
+
+if TYPE_CHECKING:
+    from psotrack.cameras import Camera
+    from psotrack.video import VideoInfo
+
+
+def known_corners(
+    known: str | None, table: Path | None, side_m: float | None, sources: tuple[Path, ...]
+) -> dict[int, np.ndarray]:
+    """The corners of the known markers, by id."""
+    from psotrack.datasets.dpjait import MARKER_CORNERS
+    from psotrack.inside_out.mapping import own_frame
+    from psotrack.inside_out.marker_map import read_marker_map
+
+    words = [word.strip() for word in (known or "").split(",") if word.strip()]
+    if not words or not all(word.isdecimal() for word in words):
+        expected = "numbers of markers that are known, such as 7 or 7,12"
+        raise SettingsError("--known", expected=expected, found=known or "none")
+    ids = list(dict.fromkeys(map(int, words)))
+    if table is None and side_m is None and sources[0].is_dir():
+        table = sources[0] / MARKER_CORNERS
+    if table is not None:
+        marker_map = read_marker_map(table)
+        missing = [marker for marker in ids if marker not in marker_map]
+        if missing:
+            found = f"only {', '.join(map(str, marker_map.ids.tolist()))}"
+            raise InputError(table, expected=f"the known marker {missing[0]}", found=found)
+        return {marker: marker_map.corners_m[marker] for marker in ids}
+    if side_m is None or len(ids) > 1:
+        expected = "--markers with the corners of the known markers, or --side and one known marker"
+        raise SettingsError(
+            "--known", expected=expected, found="no --markers" if side_m is not None else "neither"
+        )
+    return {ids[0]: own_frame(side_m)}
+
+
+@dataclass(frozen=True)
+class Lenses:
+    """What was said of the videos' lenses."""
+
+    file: Path | None
+    names: str | None
+    scale: bool
+    fov_deg: tuple[float, float] | None
+
+    def of(self, video: VideoInfo, index: int, count: int) -> Camera:
+        """The lens of a video, number `index` of `count`."""
+        from psotrack.inside_out.lens_files import chosen_lens
+
+        names = [None] if self.names is None else self.names.split(",")
+        if len(names) not in (1, count):
+            expected = f"one name, or one for each of {count} videos"
+            raise SettingsError("--camera-name", expected=expected, found=f"{len(names)}")
+        name = names[index % len(names)]
+        return chosen_lens(
+            video.image_size_wh, path=self.file, fov_deg=self.fov_deg, name=name, scale=self.scale
+        )
+
+
+def videos_of(
+    sources: tuple[Path, ...], drones: str | None, lenses: Lenses
+) -> dict[str, tuple[VideoInfo, Camera]]:
+    """The videos with their lenses, by name."""
+    from psotrack.video import probe
+
+    if sources[0].is_dir():
+        if len(sources) > 1:
+            raise SettingsError("SOURCE", expected="one sequence, or videos", found=f"{len(sources)} of them")
+        return _of_sequence(sources[0], drones, lenses)
+    if drones is not None:
+        raise SettingsError("--drone", expected="a sequence's folder as SOURCE", found=f"{sources[0]}")
+    infos = [probe(path) for path in sources]
+    return {
+        str(video.path): (video, lenses.of(video, index, len(infos))) for index, video in enumerate(infos)
+    }
+
+
+def _of_sequence(folder: Path, drones: str | None, lenses: Lenses) -> dict[str, tuple[VideoInfo, Camera]]:
+    from psotrack.datasets.dpjait import read_sequence
+    from psotrack.inside_out.lens_files import lens_of_matrix
+
+    onboard = read_sequence(folder).onboard or {}
+    if not onboard:
+        raise InputError(
+            folder, expected="videos of drones' own cameras, such as dron1_cam_s.avi", found="none"
+        )
+    chosen = list(onboard) if drones is None else drones.split(",")
+    unknown = [name for name in chosen if name not in onboard]
+    if unknown:
+        raise SettingsError("--drone", expected=f"some of {', '.join(onboard)}", found=", ".join(unknown))
+    videos = {}
+    for index, name in enumerate(chosen):
+        video, K = onboard[name].video, onboard[name].K
+        if K is None or lenses.file is not None or lenses.fov_deg is not None:
+            lens = lenses.of(video, index, len(chosen))
+        else:
+            lens = lens_of_matrix(K, video.image_size_wh)
+        videos[name] = (video, lens)
+    return videos
+
+
+def leading(video: VideoInfo, num_frames: int | None) -> VideoInfo:
+    """The first frames of a video."""
+    if num_frames is None:
+        return video
+    if not 0 < num_frames <= video.num_frames:
+        expected = f"1 to {video.num_frames}, the frames of {video.path}"
+        raise SettingsError("--frames", expected=expected, found=f"{num_frames}")
+    return replace(video, num_frames=num_frames)

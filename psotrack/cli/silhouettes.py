@@ -1,0 +1,77 @@
+"""`psotrack silhouettes`: the silhouettes of a sequence, made and stored."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from psotrack.cli.answers import answer, report_to, say
+from psotrack.cli.options import (
+    CACHE,
+    CAMERAS,
+    FORCE,
+    FRAMES,
+    JOBS,
+    JSON,
+    QUIET,
+    SEQUENCE,
+    cache_folder,
+    silhouette_options,
+    usable_sequence,
+)
+from psotrack.silhouette_store import SilhouetteSettings
+
+
+@click.command()
+@SEQUENCE
+@silhouette_options
+@CAMERAS
+@FRAMES
+@CACHE
+@JOBS
+@QUIET
+@FORCE
+@JSON
+def silhouettes(
+    sequence: Path,
+    cameras: str | None,
+    num_frames: int | None,
+    cache: Path | None,
+    jobs: int | None,
+    quiet: bool,
+    force: bool,
+    json_path: Path | None,
+    **settings: Any,
+) -> None:
+    """Make and store the silhouettes of SEQ, which `track` reads.
+
+    They are kept under a key of the video's content and every setting: a second call finds them, a changed setting
+    makes new ones.
+
+    \b
+    Examples:
+      psotrack silhouettes data/Simulated_Data/S02_D4_A
+      psotrack silhouettes data/Simulated_Data/S02_D4_A --shadows drop --json -
+    """
+    from psotrack.silhouettes import compute
+
+    where = cache_folder(cache)
+    stored = compute(
+        usable_sequence(sequence, cameras, num_frames),
+        SilhouetteSettings(**settings),
+        cache=where,
+        jobs=jobs,
+        report=report_to(quiet),
+    )
+    content = {
+        "cache": str(where),
+        "keys": dict(stored.keys),
+        "frames": stored.num_frames,
+        "shape": list(stored.shape),
+        "seconds": dict(stored.seconds),
+    }
+    answer(json_path, content, force)
+    made = "made" if any(stored.seconds.values()) else "already there"
+    say(quiet, json_path, f"{len(stored.cameras)} cameras, {stored.num_frames} frames: {made}, in {where}")

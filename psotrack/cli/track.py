@@ -1,0 +1,230 @@
+"""`psotrack track`: drones from the videos of a sequence, or from detections in them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+import click
+import msgspec
+
+from psotrack.cli.answers import answer, report_to, say, write_json
+from psotrack.cli.options import (
+    CACHE,
+    CAMERAS,
+    DETECTOR_SIZE,
+    FORCE,
+    FRAMES,
+    JOBS,
+    JSON,
+    QUIET,
+    SEQUENCE,
+    TRACK,
+    Numbers,
+    cache_folder,
+    compiled_folder,
+    silhouette_options,
+    usable_sequence,
+)
+from psotrack.errors import SettingsError
+from psotrack.files import refuse_to_overwrite
+from psotrack.progress import Report
+from psotrack.settings import Method, Score, SwarmKind, TrackSettings
+from psotrack.silhouette_store import SilhouetteSettings
+
+if TYPE_CHECKING:
+    from psotrack.sequence import Sequence
+
+
+@click.command()
+@SEQUENCE
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="The tracks: a file that ends in .csv or .parquet.",
+)
+@click.option(
+    "--method",
+    type=click.Choice(get_args(Method)),
+    default=TRACK.method,
+    show_default=True,
+    help="A swarm over silhouettes, triangulated detections, or both weighed together.",
+)
+@click.option(
+    "--detections",
+    default=TRACK.detections,
+    show_default=True,
+    metavar="yolo|blobs|FOLDER",
+    help="Of the projection lines: SEQ's own, blobs of its silhouettes, or a folder with a CSV file per camera.",
+)
+@click.option(
+    "--detector",
+    "model",
+    type=click.Path(path_type=Path),
+    metavar="MODEL.onnx",
+    help="Instead of --detections: a YOLO network (v5 to v11) that finds the drones; what it finds is kept.",
+)
+@click.option(
+    "--detector-size",
+    type=int,
+    default=DETECTOR_SIZE,
+    show_default=True,
+    help="Of the network's square input, in pixels.",
+)
+@click.option("--particles", type=int, default=TRACK.particles, show_default=True, help="Of every swarm.")
+@click.option("--iterations", type=int, default=TRACK.iterations, show_default=True, help="Per frame.")
+@click.option(
+    "--refinements",
+    type=int,
+    default=TRACK.refinements,
+    show_default=True,
+    help="Gradient steps after the swarm.",
+)
+@click.option(
+    "--swarm",
+    type=click.Choice(get_args(SwarmKind)),
+    default=TRACK.swarm,
+    show_default=True,
+    help="One swarm over all drones, as in the paper, or one for each.",
+)
+@click.option(
+    "--score",
+    type=click.Choice(get_args(Score)),
+    default=TRACK.score,
+    show_default=True,
+    help="Concentric windows, or the paper's one box in whole pixels.",
+)
+@click.option("--seed", type=int, default=TRACK.seed, show_default=True, help="Of the swarm.")
+@click.option(
+    "--init",
+    default=TRACK.init,
+    show_default=True,
+    metavar="auto|truth|FILE",
+    help="Where the drones are at first: found by themselves, from the reference, or from a file of tracks.",
+)
+@click.option(
+    "--drones", type=int, metavar="N", help="How many there are.  [default: as many as --init finds]"
+)
+@click.option(
+    "--drone-size",
+    "drone_size_m",
+    type=Numbers(3),
+    metavar="X,Y,Z",
+    help="Full lengths in metres.  [default: learned on the way]",
+)
+@click.option(
+    "--body-offset",
+    "body_offset_m",
+    type=Numbers(3),
+    default=TRACK.body_offset_m,
+    metavar="X,Y,Z",
+    help="From a body's origin to the middle of its silhouette (with projection lines: of its box), in metres, along "
+    "the world's axes.  [default: 0,0,0]",
+)
+@click.option(
+    "--bounds",
+    "bounds_m",
+    type=Numbers(6),
+    metavar="X0,X1,Y0,Y1,Z0,Z1",
+    help="The room in metres.  [default: what the cameras stand around]",
+)
+@click.option(
+    "--max-speed",
+    "max_speed_m_s",
+    type=float,
+    default=TRACK.max_speed_m_s,
+    show_default=True,
+    help="Of a drone, in m/s.",
+)
+@click.option("--smooth", is_flag=True, default=TRACK.smooth, help="Let later frames correct earlier ones.")
+@silhouette_options
+@CAMERAS
+@FRAMES
+@CACHE
+@JOBS
+@FORCE
+@QUIET
+@JSON
+def track(
+    sequence: Path,
+    out: Path,
+    cameras: str | None,
+    num_frames: int | None,
+    cache: Path | None,
+    jobs: int | None,
+    force: bool,
+    quiet: bool,
+    json_path: Path | None,
+    model: Path | None,
+    detector_size: int,
+    **settings: Any,
+) -> None:
+    """Track the drones of SEQ from its videos, or from detections in them.
+
+    Writes OUT, one row per frame and drone, and beside it the same name with .json (every setting, what was learned of
+    each drone, who came and who met, versions, device, input keys, seconds per stage) and with .ambiguity.csv (which
+    drones may be taken for each other, frame by frame).
+
+    \b
+    Examples:
+      psotrack track data/Simulated_Data/S02_D4_A --out tracks.csv
+      psotrack track data/Simulated_Data/S02_D4_A --out smooth.csv --smooth
+      psotrack track data/Simulated_Data/S02_D4_A --out lines.csv --method projection-lines
+      psotrack track data/Real_Data/R12_D4 --out both.csv --method fused --detector drones.onnx --detector-size 1280
+      psotrack track data/Simulated_Data/S02_D4_A --out paper.parquet --swarm joint --particles 100 --iterations 70
+    """
+    from psotrack.compiled import keep_compiled
+    from psotrack.pipeline import track_sequence
+    from psotrack.trajectory_files import write_ambiguity, write_trajectories
+
+    if out.suffix not in {".csv", ".parquet"}:
+        raise SettingsError("--out", expected="a file that ends in .csv or .parquet", found=out.name)
+    record_path, ambiguity_path = out.with_suffix(".json"), out.with_suffix(".ambiguity.csv")
+    for path in (out, record_path, ambiguity_path):
+        refuse_to_overwrite(path, force)
+    silhouette_names = SilhouetteSettings.__struct_fields__
+    of_silhouettes = {name: settings.pop(name) for name in silhouette_names if name in settings}
+    chosen = TrackSettings(silhouettes=SilhouetteSettings(**of_silhouettes), **settings)
+    where, usable = cache_folder(cache), usable_sequence(sequence, cameras, num_frames)
+    if model is not None:
+        chosen = _with_detector(chosen, model, detector_size, usable, where, report_to(quiet))
+    keep_compiled(compiled_folder(cache))
+    tracked = track_sequence(
+        usable,
+        chosen,
+        cache=where,
+        jobs=jobs,
+        report=report_to(quiet),
+    )
+    write_trajectories(out, tracked.trajectories, force=force)
+    identities, time_s = tracked.identities, tracked.trajectories.time_s
+    write_ambiguity(ambiguity_path, time_s, identities.pairs, identities.ambiguity, force=force)
+    write_json(record_path, tracked.record)
+    answer(json_path, tracked.record, force)
+    seen = tracked.trajectories.seen.mean()
+    seconds = tracked.record["seconds"]
+    say(
+        quiet,
+        json_path,
+        f"{out}: {tracked.trajectories.num_drones} drones, {tracked.trajectories.num_frames} frames, "
+        f"{seen:.1%} seen, {seconds['total']:.1f} s",
+    )
+
+
+def _with_detector(
+    settings: TrackSettings, model: Path, size: int, sequence: Sequence, cache: Path, report: Report
+) -> TrackSettings:
+    """The settings, with what a network finds in the videos for detections."""
+    from psotrack.detection_store import stored_detections
+    from psotrack.detector import Detector, DetectorSettings
+
+    if settings.method == "swarm":
+        expected = "--method projection-lines or fused, which read detections"
+        raise SettingsError("--detector", expected=expected, found="--method swarm")
+    if settings.detections != TRACK.detections:
+        found = f"--detections {settings.detections} as well"
+        raise SettingsError("--detector", expected="detections from one source", found=found)
+    detector = Detector(model, DetectorSettings(size=size))
+    folder = stored_detections(detector, sequence, cache=cache, report=report)
+    return msgspec.structs.replace(settings, detections=str(folder))

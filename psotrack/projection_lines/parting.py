@@ -1,0 +1,132 @@
+"""Boxes of several drones taken apart: blobs that have grown together, drones of which a detector made one.
+
+The middle of such a box is that of no drone. But its edges are still those of drones: of those that are farthest out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from psotrack.cameras import NEAR_M, Camera, project
+from psotrack.sightings import View
+
+#: A drone that is placed by one edge and its size is off by so much of its sides more: they differ as it turns.
+PART_SHARE = 0.1
+
+
+@dataclass(frozen=True)
+class _Outlines:
+    """Boxes from corner to corner, pixel centres at whole numbers.
+
+    Attributes:
+        lower_px, upper_px: (..., 2).
+    """
+
+    lower_px: Float[np.ndarray, "*boxes 2"]
+    upper_px: Float[np.ndarray, "*boxes 2"]
+
+    @property
+    def size_px(self) -> Float[np.ndarray, "*boxes 2"]:
+        """(..., 2), widths and heights."""
+        return self.upper_px - self.lower_px
+
+    def iou(self, other: _Outlines) -> Float[np.ndarray, "*boxes"]:
+        """Intersection over union, of boxes that broadcast."""
+        lower = np.maximum(self.lower_px, other.lower_px)
+        shared = np.maximum(np.minimum(self.upper_px, other.upper_px) - lower, 0.0).prod(axis=-1)
+        return shared / (self.size_px.prod(axis=-1) + other.size_px.prod(axis=-1) - shared)
+
+
+def parted(
+    cameras: Camera,
+    view: View,
+    expected_m: Float[np.ndarray, "drones 3"],
+    span_m: Float[np.ndarray, "drones 2"],
+) -> View:
+    """The view with a box for each of several drones in the place of one for all of them.
+
+    A box is of several drones if the middles of several are expected in it, and the box around all of these fits it
+    better than that of any one of them. Each of its edges is that of the drone which is expected farthest out there. A
+    drone that has an edge along either axis is placed by these and by its size; of the others nothing is known here:
+    they are hidden.
+
+    Args:
+        cameras: with one leading axis.
+        view: the frame.
+        expected_m: (drones, 3), where drones are expected.
+        span_m: (drones, 2), their widths and heights; NaN where not known, which takes no box apart.
+    """
+    outlines, inside = _expected(cameras, view, expected_m, span_m)
+    camera, box = np.nonzero(inside.sum(axis=0) > 1)
+    if not len(camera):
+        return view
+    half_px = view.size_px[camera, box] / 2
+    seen = _Outlines(view.centre_px[camera, box] - half_px, view.centre_px[camera, box] + half_px)
+    # (boxes, drones, 2): the drones that are expected in each of the boxes; no others are ever farther out.
+    members = inside[:, camera, box].T
+    lower_px = np.where(members[..., None], outlines.lower_px[:, camera].swapaxes(0, 1), np.inf)
+    upper_px = np.where(members[..., None], outlines.upper_px[:, camera].swapaxes(0, 1), -np.inf)
+    alone = np.full(members.shape, -1.0)
+    row, drone = np.nonzero(members)
+    each = _Outlines(lower_px[row, drone], upper_px[row, drone])
+    alone[row, drone] = each.iou(_Outlines(seen.lower_px[row], seen.upper_px[row]))
+    together = _Outlines(lower_px.min(axis=1), upper_px.max(axis=1)).iou(seen)
+    several = together > alone.max(axis=-1)
+    # Whether each edge of the box is this drone's.
+    first = several[row, None] & (lower_px.argmin(axis=1)[row] == drone[:, None])
+    last = several[row, None] & (upper_px.argmax(axis=1)[row] == drone[:, None])
+    placed = (first | last).all(axis=-1)
+    row, first, last, size_px = row[placed], first[placed], last[placed], each.size_px[placed]
+    from_first, from_last = seen.lower_px[row] + size_px / 2, seen.upper_px[row] - size_px / 2
+    middle_px = np.where(first & last, (from_first + from_last) / 2, np.where(first, from_first, from_last))
+    off_px = PART_SHARE * np.sqrt(size_px.prod(axis=-1))
+    noise_px = np.hypot(view.noise_px[camera, box][row], off_px)
+    without = _without(view, camera[several], box[several])
+    return _with(without, camera[row], middle_px, size_px, noise_px)
+
+
+def _expected(
+    cameras: Camera,
+    view: View,
+    expected_m: Float[np.ndarray, "drones 3"],
+    span_m: Float[np.ndarray, "drones 2"],
+) -> tuple[_Outlines, Bool[np.ndarray, "drones cameras boxes"]]:
+    """(drones, cameras, 2), the boxes that are expected, and whether their middles are in those that are seen."""
+    pixels, depth = project(cameras, expected_m[:, None])
+    focal_px = np.stack([cameras.K[:, 0, 0], cameras.K[:, 1, 1]], axis=-1)
+    half_px = span_m[:, None] * focal_px / np.maximum(depth, NEAR_M)[..., None] / 2
+    known = np.isfinite(half_px).all(axis=-1) & (depth > NEAR_M)
+    inside = (np.abs(pixels[:, :, None] - view.centre_px) < view.size_px / 2).all(axis=-1)
+    return _Outlines(pixels - half_px, pixels + half_px), inside & known[..., None]
+
+
+def _without(view: View, camera: Int[np.ndarray, "gone"], box: Int[np.ndarray, "gone"]) -> View:
+    """The view without some boxes."""
+    centre_px, size_px, noise_px = view.centre_px.copy(), view.size_px.copy(), view.noise_px.copy()
+    for values in (centre_px, size_px, noise_px):
+        values[camera, box] = np.nan
+    return View(centre_px, size_px, noise_px)
+
+
+def _with(
+    view: View,
+    camera: Int[np.ndarray, "more"],
+    centre_px: Float[np.ndarray, "more 2"],
+    size_px: Float[np.ndarray, "more 2"],
+    noise_px: Float[np.ndarray, "more"],
+) -> View:
+    """The view with more boxes; `camera` is in ascending order."""
+    place = np.arange(len(camera)) - np.searchsorted(camera, camera)
+    room = int(place.max(initial=-1)) + 1
+
+    def longer(values: np.ndarray, more: np.ndarray) -> np.ndarray:
+        added = np.full((len(values), room, *values.shape[2:]), np.nan)
+        added[camera, place] = more
+        return np.concatenate([values, added], axis=1)
+
+    return View(
+        longer(view.centre_px, centre_px), longer(view.size_px, size_px), longer(view.noise_px, noise_px)
+    )

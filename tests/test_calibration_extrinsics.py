@@ -1,0 +1,202 @@
+"""Where cameras stand: OpenCV and exact cases, honest covariances, and what is refused."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from helpers import LENSES
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import approx_fprime
+from scipy.spatial.transform import Rotation
+from scipy.stats import binom, chi2
+
+from psotrack.calibration import inflation, locate_camera, reproject, spread_px
+from psotrack.cameras import camera, look_at, project
+from psotrack.errors import InputError, SettingsError
+
+K = np.array([[1157.0, 0, 959.5], [0, 1157.0, 539.5], [0, 0, 1]])
+NO_LENS = np.zeros(0)
+
+
+def view(rng, *, count=12, nearest_m=3.5, farthest_m=6.5, dist=(), K=K):
+    """A camera 5 m from what it looks at, and points in a grid of cells of its image, at various depths."""
+    angle = rng.uniform(0, 2 * np.pi)
+    R, t_m = look_at((5 * np.cos(angle), 5 * np.sin(angle), 2.0), (0.0, 0.0, 1.0))
+    one = camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080), dist=dist)
+    cells = np.array([(i, j) for i in range(4) for j in range(3)] * (count // 12 + 1))[:count]
+    pixels = (cells + rng.uniform(0.1, 0.9, (count, 2))) * (480, 360)
+    rays = np.concatenate([pixels, np.ones((count, 1))], axis=1) @ np.linalg.inv(K).T
+    # The lens moves the pixels a little: they are points near those rays.
+    return one, (rays * rng.uniform(nearest_m, farthest_m, (count, 1)) - t_m) @ R
+
+
+def centre(T):
+    return -T[:3, :3].T @ T[:3, 3]
+
+
+@pytest.mark.parametrize("coefficients", sorted(LENSES))
+def test_derivatives_are_those_of_differences(coefficients):
+    rng = np.random.default_rng(0)
+    skewed = K + np.array([[0, 3.0, 0], [0, 0, 0], [0, 0, 0]])
+    one, points = view(rng, count=7, dist=LENSES[coefficients], K=skewed)
+    R, t_m = one.T_cam_world[:3, :3], one.T_cam_world[:3, 3]
+
+    def pixels(step):
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = Rotation.from_rotvec(step[:3]).as_matrix() @ R, t_m + step[3:]
+        return project(replace(one, T_cam_world=T), points)[0].ravel()
+
+    found, by_turn, by_shift = reproject(points, R, t_m, one)
+    # Both are the same formula, of numbers of about 1000.
+    np.testing.assert_allclose(found, project(one, points)[0], atol=1e-9)
+    slopes = approx_fprime(np.zeros(6), pixels, 1e-7).reshape(-1, 2, 6)
+    # A step of 1e-7 bends by 1e-4 px and rounds at 1e-6 px.
+    np.testing.assert_allclose(np.concatenate([by_turn, by_shift], axis=-1), slopes, rtol=1e-4, atol=0.01)
+
+
+@pytest.mark.parametrize("coefficients", sorted(LENSES))
+@pytest.mark.parametrize("count", [6, 12, 29])
+def test_exact_points_give_the_camera(count, coefficients):
+    one, points = view(np.random.default_rng(count), count=count, dist=LENSES[coefficients])
+    located = locate_camera(points, project(one, points)[0], one.K, one.dist)
+    # Least squares ends at 1e-8 of the cost's scale.
+    np.testing.assert_allclose(located.T_cam_world, one.T_cam_world, atol=1e-6)
+    assert located.used.all()
+
+
+def test_it_is_the_least_squares_pose_of_opencv():
+    rng = np.random.default_rng(3)
+    one, points = view(rng, dist=LENSES[5])
+    pixels = project(one, points)[0] + rng.normal(0, 1, (12, 2))
+    located = locate_camera(points, pixels, one.K, one.dist)
+    turn, t_m = cv2.Rodrigues(one.T_cam_world[:3, :3])[0], one.T_cam_world[:3, 3:].copy()
+    turn, t_m = cv2.solvePnPRefineLM(points, pixels, one.K, one.dist, turn, t_m)
+    np.testing.assert_allclose(located.T_cam_world[:3, :3], cv2.Rodrigues(turn)[0], atol=1e-6)
+    # Two searches that end at the same bottom to a millionth of its width, which is 8 mm.
+    np.testing.assert_allclose(located.T_cam_world[:3, 3], t_m.ravel(), atol=1e-6)
+
+
+@pytest.mark.parametrize(("nearest_m", "farthest_m"), [(2.5, 7.5), (4.5, 5.5)])
+def test_twelve_points_and_a_pixel_of_noise(nearest_m, farthest_m):
+    """The centre is within 1 cm at 5 m where points are spread in depth, and its 90 % ellipsoid holds 90 %."""
+    rng, runs = np.random.default_rng(1), 100
+    errors_m, distances = [], []
+    for _ in range(runs):
+        one, points = view(rng, nearest_m=nearest_m, farthest_m=farthest_m)
+        located = locate_camera(points, project(one, points)[0] + rng.normal(0, 1, (12, 2)), K, NO_LENS, 1.0)
+        off = centre(located.T_cam_world) - one.centre_world
+        errors_m.append(np.linalg.norm(off))
+        distances.append(off @ np.linalg.solve(located.centre_covariance_m2, off))
+    # What chance allows once in a thousand tests, on either side.
+    for share in (0.5, 0.9):
+        inside = int((np.array(distances) < chi2.ppf(share, 3)).sum())
+        assert binom.ppf(0.0005, runs, share) <= inside <= binom.ppf(0.9995, runs, share)
+    if nearest_m < 3:
+        # Measured over 1000: median 4.6 mm, 95 % below 10.1 mm.
+        assert np.median(errors_m) < 0.006
+        assert np.percentile(errors_m, 90) < 0.01
+
+
+def test_outliers_are_found_and_do_not_count():
+    rng = np.random.default_rng(5)
+    one, points = view(rng, count=13)
+    pixels = project(one, points)[0] + rng.normal(0, 1, (13, 2))
+    wrong = np.array([1, 4, 8, 11])
+    spoilt = pixels.copy()
+    spoilt[wrong] += rng.uniform(60, 400, (4, 2)) * rng.choice([-1, 1], (4, 2))
+    located = locate_camera(points, spoilt, K, NO_LENS)
+    assert np.flatnonzero(~located.used).tolist() == wrong.tolist()
+    without = locate_camera(np.delete(points, wrong, 0), np.delete(pixels, wrong, 0), K, NO_LENS)
+    # The same points, started from elsewhere.
+    np.testing.assert_allclose(located.T_cam_world, without.T_cam_world, atol=1e-6)
+    assert (located.residual_px[wrong] > 30).all()
+
+
+def test_noise_larger_than_stated_widens_the_covariance():
+    rng = np.random.default_rng(6)
+    one, points = view(rng, count=36)
+    off = rng.normal(0, 1, (36, 2))
+    small = locate_camera(points, project(one, points)[0] + off, K, NO_LENS, noise_px=1.0)
+    large = locate_camera(points, project(one, points)[0] + 4 * off, K, NO_LENS, noise_px=1.0)
+    assert large.used.all()
+    ratio = np.sqrt(large.centre_covariance_m2.trace() / small.centre_covariance_m2.trace())
+    # 36 points tell σ to a tenth.
+    assert 3 < ratio < 5
+
+
+def test_points_in_a_plane_do():
+    rng = np.random.default_rng(7)
+    R, t_m = look_at((4.0, 1.0, 2.5), (0.0, 0.0, 0.0))
+    one = camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080))
+    points = np.concatenate([rng.uniform(-1.5, 1.5, (12, 2)), np.zeros((12, 1))], axis=1)
+    located = locate_camera(points, project(one, points)[0] + rng.normal(0, 1, (12, 2)), K, NO_LENS)
+    off = centre(located.T_cam_world) - one.centre_world
+    # 99.9 %.
+    assert off @ np.linalg.solve(located.centre_covariance_m2, off) < chi2.ppf(0.999, 3)
+
+
+@settings(max_examples=8)
+@given(st.tuples(*[st.floats(-3, 3)] * 3), st.tuples(*[st.floats(-20, 20)] * 3))
+def test_moving_the_world_moves_the_camera_with_it(turn, shift_m):
+    rng = np.random.default_rng(8)
+    one, points = view(rng)
+    pixels = project(one, points)[0] + rng.normal(0, 1, (12, 2))
+    R = Rotation.from_rotvec(turn).as_matrix()
+    here = locate_camera(points, pixels, K, NO_LENS)
+    there = locate_camera(points @ R.T + shift_m, pixels, K, NO_LENS)
+    np.testing.assert_allclose(
+        centre(there.T_cam_world), R @ centre(here.T_cam_world) + shift_m, rtol=0, atol=1e-5
+    )
+    # Relative to variances of 1e-5 m².
+    np.testing.assert_allclose(
+        there.centre_covariance_m2, R @ here.centre_covariance_m2 @ R.T, rtol=0, atol=1e-8
+    )
+
+
+def refused(points, pixels, *, noise_px=1.0):
+    with pytest.raises(InputError) as error:
+        locate_camera(points, pixels, K, NO_LENS, noise_px, name="camera c7")
+    assert str(error.value).startswith("camera c7: ")
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_what_no_pose_can_be_found_from_is_refused():
+    rng = np.random.default_rng(9)
+    one, points = view(rng)
+    pixels = project(one, points)[0]
+    assert "at least 4 points of known place, found 3" in refused(points[:3], pixels[:3])
+    line = np.array([0, 0, 1.0]) + np.arange(5)[:, None] * np.array([0.2, 0.1, 0.05])
+    assert "not all on one line" in refused(line, project(one, line)[0])
+    broken = points.copy()
+    broken[2, 1] = np.nan
+    assert "NaN" in refused(broken, pixels)
+    mirrored = refused(points * np.array([1, -1, 1]), pixels)
+    assert "right-handed axes" in mirrored
+    assert "mirrored" in mirrored
+    assert "mixed up" in refused(points, pixels[rng.permutation(12)])
+    with pytest.raises(SettingsError, match="noise_px"):
+        locate_camera(points, pixels, K, NO_LENS, 0.0)
+
+
+def test_a_small_plane_far_away_has_two_poses():
+    """A sheet of 20 cm at 8 m, hardly tilted: turned to the other side it looks the same."""
+    R, t_m = look_at((0.9, 0.0, 8.0), (0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
+    one = camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080))
+    sheet = np.array([(x, y, 0) for x in (-0.1, 0.0, 0.1) for y in (-0.1, 0.1)])
+    rng = np.random.default_rng(0)
+    assert "two poses" in refused(sheet, project(one, sheet)[0] + rng.normal(0, 0.5, (6, 2)))
+
+
+def test_spread_and_inflation():
+    rng = np.random.default_rng(10)
+    distance = np.linalg.norm(rng.normal(0, 2.0, (20001, 2)), axis=1)
+    # A median of 20,000 is known to 1 %.
+    assert spread_px(distance, 0) == pytest.approx(2.0, rel=0.03)
+    assert spread_px(distance, 20001) == pytest.approx(2.0 * np.sqrt(2), rel=0.03)
+    assert spread_px(np.ones(3), 6) == 0.0
+    assert inflation(24.0, 18) == 1.0
+    assert inflation(180.0, 18) == 10.0
+    assert inflation(5.0, 0) == 1.0

@@ -1,0 +1,164 @@
+"""Boxes of several drones taken apart: boxes whose every edge is known, and flights in which boxes grow together."""
+
+import numpy as np
+from helpers import ROOM_M, ring_rig
+
+from psotrack.cameras import project
+from psotrack.detections import Detections
+from psotrack.evaluation import evaluate
+from psotrack.projection_lines import follow
+from psotrack.projection_lines.parting import PART_SHARE, parted
+from psotrack.settings import TrackSettings
+from psotrack.sightings import View, from_detections
+from psotrack.trajectories import Trajectories
+
+RIG = ring_rig(5, coefficients=4, image_size_wh=(1920, 1080))
+FPS = 25.0
+#: Width and height of one drone and of another.
+SPAN_M = np.array([[0.5, 0.2], [0.3, 0.3]])
+
+
+def boxes_of(drones_m, span_m=SPAN_M, rig=RIG):
+    """(drones, cameras, 4), the boxes that the cameras see, pixel centres at whole numbers."""
+    pixels, depth = project(rig.cameras, drones_m[:, None])
+    focal_px = np.diagonal(rig.cameras.K, axis1=-2, axis2=-1)[:, :2]
+    half_px = span_m[:, None] * focal_px / depth[..., None] / 2
+    return np.concatenate([pixels - half_px, pixels + half_px], axis=-1)
+
+
+def around(boxes):
+    """The box around boxes, along the first axis."""
+    return np.concatenate([boxes[..., :2].min(axis=0), boxes[..., 2:].max(axis=0)], axis=-1)
+
+
+def view_of(*boxes, noise_px=3.0):
+    """Views of (cameras, 4) boxes each."""
+    boxes = np.stack(boxes, axis=1)
+    noise = np.full(boxes.shape[:2], noise_px)
+    return View((boxes[..., :2] + boxes[..., 2:]) / 2, boxes[..., 2:] - boxes[..., :2], noise)
+
+
+def kept(view, camera):
+    """The boxes of a camera, (boxes, 4)."""
+    there = np.isfinite(view.noise_px[camera])
+    centre_px, half_px = view.centre_px[camera, there], view.size_px[camera, there] / 2
+    return np.concatenate([centre_px - half_px, centre_px + half_px], axis=-1)
+
+
+def two_drones():
+    """One beside and a little above the other; in some cameras the narrow one is wholly before or behind the other."""
+    return np.array([[0.0, 0.0, 1.0], [0.2, 0.15, 1.24]])
+
+
+def test_drones_in_one_box_get_their_own_where_each_has_an_edge_of_it():
+    drones_m = two_drones()
+    own = boxes_of(drones_m)
+    whole = around(own)
+    seen = parted(RIG.cameras, view_of(whole), drones_m, SPAN_M)
+    num_placed = []
+    for camera in range(len(RIG)):
+        edges = own[:, camera] == whole[camera]
+        placed = (edges[:, :2] | edges[:, 2:]).all(axis=-1)
+        np.testing.assert_allclose(kept(seen, camera), own[placed, camera], atol=1e-9)
+        num_placed.append(placed.sum())
+    # Both ways it may be are there.
+    assert {1, 2} <= set(num_placed)
+    off_px = PART_SHARE * np.sqrt(seen.size_px[:, 1:].prod(axis=-1))
+    np.testing.assert_allclose(seen.noise_px[:, 1:], np.hypot(3.0, off_px), rtol=1e-12)
+
+
+def test_where_exactly_drones_were_expected_makes_no_difference():
+    """Edges are seen; only sizes depend on how far away the drones were thought to be."""
+    right, down, _ = RIG.cameras.T_cam_world[0, :3, :3]
+    drones_m = np.array([0.0, 0.0, 1.2]) + np.array([np.zeros(3), 0.35 * right + 0.25 * down])
+    own = boxes_of(drones_m)
+    expected_m = drones_m + 0.03 * np.array([[1.0, -1.0, 0.5], [-1.0, 0.5, 1.0]])
+    seen = parted(RIG.cameras, view_of(around(own)), expected_m, SPAN_M)
+    # 5 cm of some 4 m are 1.3 % of 150 px, and half of the size goes into the middle.
+    middle_px = (own[:, 0, :2] + own[:, 0, 2:]) / 2
+    np.testing.assert_allclose(seen.centre_px[0, 1:], middle_px, atol=1.0)
+
+
+def test_boxes_that_overlap_but_are_each_of_a_drone_stay_as_they_are():
+    own = boxes_of(two_drones())
+    view = view_of(*own)
+    seen = parted(RIG.cameras, view, two_drones(), SPAN_M)
+    np.testing.assert_array_equal(seen.centre_px, view.centre_px)
+    np.testing.assert_array_equal(seen.noise_px, view.noise_px)
+
+
+def test_a_drone_between_others_is_hidden():
+    """Three in a row, one over the other: no edge says how high the middle one is."""
+    drones_m = np.array([[0.0, 0.0, 0.9], [0.0, 0.0, 1.1], [0.0, 0.0, 1.3]])
+    span_m = np.tile(SPAN_M[0], (3, 1))
+    own = boxes_of(drones_m, span_m)
+    seen = parted(RIG.cameras, view_of(around(own)), drones_m, span_m)
+    for camera in range(len(RIG)):
+        high = kept(seen, camera)[:, 1]
+        assert own[1, camera, 1] not in high
+        assert len(high) <= 2
+
+
+def test_drones_of_unknown_size_take_no_box_apart():
+    own = boxes_of(two_drones())
+    view = view_of(around(own))
+    seen = parted(RIG.cameras, view, two_drones(), np.full((2, 2), np.nan))
+    np.testing.assert_array_equal(seen.centre_px, view.centre_px)
+
+
+def grown_together(boxes):
+    """Boxes that touch made one, as long as there are any, as foreground does."""
+    boxes = list(boxes)
+    for i, one in enumerate(boxes):
+        for j in range(i + 1, len(boxes)):
+            if (np.maximum(one, boxes[j])[:2] < np.minimum(one, boxes[j])[2:]).all():
+                both = around(np.stack([one, boxes[j]]))
+                return grown_together([both, *boxes[:i], *boxes[i + 1 : j], *boxes[j + 1 :]])
+    return boxes
+
+
+def test_drones_whose_boxes_grow_together_keep_their_tracks():
+    """Three in a row, 0.3 m from each other, as two come towards the third that stands between them, and pass it."""
+    rig = ring_rig(8, coefficients=4, image_size_wh=(1920, 1080))
+    along_m = np.arange(60) / FPS - 1.2
+    middle = np.zeros_like(along_m)
+    truth_m = np.stack(
+        [
+            np.stack([along_m, middle - 0.3, middle + 1.25], axis=-1),
+            np.stack([middle, middle, middle + 1.2], axis=-1),
+            np.stack([-along_m, middle + 0.3, middle + 1.15], axis=-1),
+        ],
+        axis=1,
+    )
+    span_m = np.array([[0.45, 0.18], [0.35, 0.25], [0.45, 0.18]])
+    rng = np.random.default_rng(0)
+    images = {name: ([], []) for name in rig.names}
+    for number, drones_m in enumerate(truth_m):
+        for index, name in enumerate(rig.names):
+            own = boxes_of(drones_m, span_m, rig)[:, index] + 0.5 + rng.normal(0.0, 1.0, (3, 4))
+            for box in grown_together(own):
+                images[name][0].append(number)
+                images[name][1].append(box)
+    detections = {
+        name: Detections(np.array(frame), np.array(boxes), np.ones(len(frame)))
+        for name, (frame, boxes) in images.items()
+    }
+    tracked = follow(
+        rig.cameras,
+        from_detections(detections, rig, len(truth_m)),
+        TrackSettings(),
+        fps=FPS,
+        bounds_m=ROOM_M,
+        known=(truth_m[0], (truth_m[1] - truth_m[0]) * FPS),
+    )
+    frame = np.arange(len(truth_m))
+    names = ("0", "1", "2")
+    estimate = Trajectories(
+        frame, frame / FPS, names, tracked.info.position_m[:, :3], status=tracked.info.status[:, :3]
+    )
+    errors = evaluate(estimate, Trajectories(frame, frame / FPS, names, truth_m)).to_dict()
+    assert errors["id_switches"] == 0
+    # The one between has no edge of its own for two frames. Measured 1.1 % and 1.8 mm; 3.3 % and 3.6 mm where the
+    # middles of boxes that have grown together are taken for those of drones.
+    assert errors["missed_rate"] < 0.02
+    assert errors["mean_error_m"] < 0.0025
