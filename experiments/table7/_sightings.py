@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from _recordings import Recording
 from jaxtyping import Float, Int
 
 from psotrack.files import written_whole
+from psotrack.inside_out import detection
 from psotrack.inside_out.detection import MarkerDetector, SeenMarkers
 from psotrack.inside_out.marker_map import MarkerMap
 from psotrack.progress import terminal
@@ -40,13 +42,12 @@ class Sightings:
 
 
 def detected(recording: Recording, kept: Path) -> Sightings:
-    """The markers of the map in a video; from the file `kept`, if it was made of that very video and map."""
+    """The markers of the map in a video; from the file `kept`, if nothing that decides on them has changed since."""
     video, ids = recording.video, recording.marker_map.ids
-    status = video.path.stat()
-    made_of = np.array([status.st_size, status.st_mtime_ns, video.num_frames, *ids])
+    made_of = _made_of(recording)
     if kept.exists():
         with np.load(kept) as stored:
-            if np.array_equal(stored["made_of"], made_of):
+            if str(stored["made_of"]) == made_of:
                 return Sightings(stored["frame"], stored["ids"], stored["corners_px"])
     detector = MarkerDetector(DICTIONARY, recording.lens, ids=ids.tolist())
     seen = []
@@ -62,6 +63,15 @@ def detected(recording: Recording, kept: Path) -> Sightings:
     with written_whole(kept) as temporary:
         np.savez(temporary, made_of=made_of, frame=found.frame, ids=found.ids, corners_px=found.corners_px)
     return found
+
+
+def _made_of(recording: Recording) -> str:
+    """All that decides which markers are found, and where."""
+    video, lens, status = recording.video, recording.lens, recording.video.path.stat()
+    sources = sorted(Path(str(detection.__file__)).parent.glob("*.py"))
+    detector = zlib.crc32(b"".join(source.read_bytes() for source in sources))
+    seen = (status.st_size, status.st_mtime_ns, video.num_frames, recording.marker_map.ids.tolist())
+    return repr((*seen, np.asarray(lens.K).tolist(), np.asarray(lens.dist).tolist(), detector))
 
 
 def mislabelled(seen: Sightings, share: float, marker_map: MarkerMap, rng: np.random.Generator) -> Sightings:

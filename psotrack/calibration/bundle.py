@@ -100,7 +100,7 @@ def adjust(
     placed &= (placed.sum(axis=1) >= 2)[:, None]
     start_m = triangulate(rig.cameras, np.where(placed[..., None], points_px, np.nan))
     placed &= (np.isfinite(start_m).all(axis=-1) & _before(rig.cameras, start_m))[:, None]
-    _check_seen(rig, placed, fixed)
+    _check_seen(rig, placed, fixed, rescaled)
     rows = np.flatnonzero(placed.any(axis=1))
     free, common = _unknowns(rig, fixed, bool(rescaled))
     given = np.asarray(rig.cameras.T_cam_world)
@@ -124,12 +124,14 @@ def adjust(
         residual_px = distance_px(problem, state)
         if (used == before).all():
             break
-    _check_seen(rig, used, fixed)
+    _check_seen(rig, used, fixed, rescaled)
     alike = [Alike(kind.label[rows], kind.std_px[rows]) for kind in alike]
     return _adjusted(rig, problem, state, used, rows, len(points_px), alike)
 
 
-def _check_seen(rig: CameraRig, placed: Bool[np.ndarray, "points cameras"], fixed: Ordered[str]) -> None:
+def _check_seen(
+    rig: CameraRig, placed: Bool[np.ndarray, "points cameras"], fixed: Ordered[str], rescaled: Ordered[str]
+) -> None:
     for name, count in zip(rig.names, placed.sum(axis=0).tolist(), strict=True):
         # Six unknowns of the pose; with fewer points it swings freely.
         if count < 6 and name not in fixed:
@@ -139,6 +141,14 @@ def _check_seen(rig: CameraRig, placed: Bool[np.ndarray, "points cameras"], fixe
                 found=f"{count}",
                 remedy="leave it out, or keep it fixed",
             )
+    telling = int(placed[:, [rig.names.index(name) for name in rescaled]].sum())
+    if rescaled and telling < 6:
+        raise InputError(
+            "focal lengths",
+            expected="at least 6 points that another camera sees too",
+            found=f"{telling}",
+            remedy="keep them",
+        )
 
 
 def _unknowns(

@@ -20,6 +20,7 @@ from psotrack.calibration.alike import Alike
 from psotrack.calibration.bundle import Adjusted, adjust
 from psotrack.calibration.gauge import common_motions, departure, metric
 from psotrack.cameras import CameraRig
+from psotrack.errors import InputError
 
 #: Probability, at most, that a camera of a right rig is called off.
 FALSE_ALARM = 0.01
@@ -116,7 +117,10 @@ def _zoomed(
         index = rig.names.index(name)
         hidden = np.array([one in moved and one != name for one in rig.names])
         seen_px = np.where(hidden[:, None], np.nan, points_px)
-        lens = adjust(rig, seen_px, noise_px, fixed=rig.names, rescaled=(name,), alike=alike)
+        try:
+            lens = adjust(rig, seen_px, noise_px, fixed=rig.names, rescaled=(name,), alike=alike)
+        except InputError:
+            continue  # with no focal length do its views agree with those of the others
         by_lens, by_pose = (np.nanmedian(one.residual_px[:, index]) for one in (lens, final))
         if by_lens < AS_WELL * by_pose:
             found[name] = lens.focal_scale, lens.focal_scale_std
