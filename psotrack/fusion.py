@@ -41,8 +41,6 @@ LEAST_FRAMES = 10
 MAD_STD, MEDIAN_ERROR = 1.4826, np.sqrt(np.pi / 2)
 #: What is farther from the median, in standard deviations, says that a track was elsewhere, not how well that is known.
 FAR = 3.0
-
-
 #: Correlation of errors of two methods that see the same foreground: shadows, noise, and what one drone hides of
 #: another are the same, what each makes of them is not.
 ALIKE = 0.5
