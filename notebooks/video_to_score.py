@@ -186,7 +186,7 @@ plt.show()
 
 # %% [markdown]
 # *What to see: nearly every camera prefers the true position, some more than others: those that look along x hardly
-# notice a step along x. And `cam1i`, where two drones are one silhouette, is wrong. No single camera knows where the
+# notice a step along x. And `cam1`, where two drones are one silhouette, is wrong. No single camera knows where the
 # drone is; the mean over all of them does. (The tracker goes further: what another drone is expected to cover says
 # nothing about this one; see `psotrack.claims`.)*
 #

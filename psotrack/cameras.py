@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack._typing import Array
+from psotrack.camera_names import chosen_camera
 from psotrack.errors import SettingsError
 
 #: Points nearer than this to the camera's plane, or behind it, have no projection.
@@ -77,18 +78,22 @@ class CameraRig:
     def select(self, names: Ordered[str]) -> CameraRig:
         """The rig of some of the cameras, in the order of `names`.
 
+        Args:
+            names: of the cameras, spelt as in the rig or as their files are (`cam1i_s` for `cam1`).
+
         Raises:
-            SettingsError: a name is not in the rig, or none is given.
+            SettingsError: a name is not in the rig, a camera is named twice, or no name is given.
         """
-        unknown = [name for name in names if name not in self.names]
+        found = {name: chosen_camera(name, self.names) for name in names}
+        unknown = [name for name in names if found[name] is None]
+        expected = f"some of {', '.join(self.names)}"
         if unknown or not names:
-            raise SettingsError(
-                "cameras",
-                expected=f"some of {', '.join(self.names)}",
-                found=", ".join(unknown) or "none",
-            )
-        index = np.array([self.names.index(name) for name in names])
-        return CameraRig(tuple(names), self.cameras[index])
+            raise SettingsError("cameras", expected=expected, found=", ".join(unknown) or "none")
+        kept = [camera for camera in (found[name] for name in names) if camera is not None]
+        if len(set(kept)) < len(kept):
+            twice = ", ".join(name for name in names if kept.count(found[name] or "") > 1)
+            raise SettingsError("cameras", expected=f"{expected}, each once", found=twice)
+        return CameraRig(tuple(kept), self.cameras[np.array([self.names.index(name) for name in kept])])
 
 
 def camera(

@@ -1,7 +1,8 @@
 """2D detections: boxes that a detector found, in the files of the DPJAIT dataset (`dl_data/<camera>.csv`).
 
 One line per frame, comma-separated, no header: the 0-based frame number, then 7 values per detection: x, y,
-w, h, cx, cy, confidence, in pixels (YOLOv5). Frames may be missing, and the number of detections differs.
+w, h, cx, cy, confidence, in pixels (YOLOv5). Frames may be missing, the number of detections differs, and lines may be
+padded with empty fields, which mean nothing.
 """
 
 from __future__ import annotations
@@ -87,13 +88,16 @@ def write_detections(path: Path, detections: Detections) -> None:
 def _boxes(row: Row) -> list[tuple[float, ...]]:
     """x0, y0, x1, y1, confidence of each detection in a line."""
     size = len(_VALUES)
-    if (len(row.cells) - 1) % size:
+    # Lines of the dataset are padded with empty fields to the width of the longest line.
+    num_values = max((index for index, cell in enumerate(row.cells) if cell), default=0)
+    if num_values % size:
         raise InputError(
             row.where,
             expected=f"a frame number and {size} values per detection ({', '.join(_VALUES)})",
-            found=f"{len(row.cells) - 1} values",
+            found=f"{num_values} values",
         )
-    return [_box(row, start) for start in range(1, len(row.cells), size)]
+    starts = range(1, num_values + 1, size)
+    return [_box(row, start) for start in starts if any(row.cells[start : start + size])]
 
 
 def _box(row: Row, start: int) -> tuple[float, ...]:

@@ -36,7 +36,7 @@ ERRORS = [
 ]
 NUM_FRAMES = 12
 #: All but the last: drones of a dozen pixels are found by themselves only where many cameras see them.
-CAMERAS = ",".join(f"cam{i}i" for i in range(1, 8))
+CAMERAS = ",".join(f"cam{i}" for i in range(1, 8))
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def test_the_contract_from_videos_to_errors(run: Run, sequence: Path, tmp_path: 
     assert record["seed"] == 3
     assert record["settings"]["particles"] == 20
     assert set(record["seconds"]) == {"decode", "foreground", "track", "compile", "finish", "total"}
-    assert set(record["input_keys"]) == {f"cam{i}i" for i in range(1, 9)}
+    assert set(record["input_keys"]) == {f"cam{i}" for i in range(1, 9)}
     assert {"python", "jax", "numpy", "psotrack"} <= set(record["versions"])
     assert record["device"]["platform"]
 
@@ -236,7 +236,7 @@ def test_projection_lines_from_the_sequence_a_folder_and_blobs(
     assert run(*track(sequence, together, "--method", "fused")).code == 0
     assert len(pd.read_csv(together)) == 4 * NUM_FRAMES
     keys = json.loads(together.with_suffix(".json").read_text())["input_keys"]
-    assert set(keys) == {name for i in range(1, 9) for name in (f"cam{i}i", f"detections of cam{i}i")}
+    assert set(keys) == {name for i in range(1, 9) for name in (f"cam{i}", f"detections of cam{i}")}
     points = json.loads(together.with_suffix(".json").read_text())["points"]
     assert {point["middle_of"] for point in points} == {"silhouette"}
     # Both are within the drone, some centimetres thick.
@@ -245,7 +245,7 @@ def test_projection_lines_from_the_sequence_a_folder_and_blobs(
     assert [point["middle_of"] for point in record["points"]] == ["box"] * 4
     assert record["settings"]["method"] == "projection-lines"
     assert set(record["seconds"]) == {"decode", "foreground", "compile", "track", "finish", "total"}
-    assert sorted(record["input_keys"]) == [f"cam{i}i" for i in range(1, 9)]
+    assert sorted(record["input_keys"]) == [f"cam{i}" for i in range(1, 9)]
     assert len(record["start"]["position_m"]) == 4
     evaluated = run("evaluate", tracks[0], sequence, "--json", "-")
     errors = json.loads(evaluated.out)
@@ -257,7 +257,7 @@ def test_projection_lines_from_the_sequence_a_folder_and_blobs(
 def test_detections_that_are_not_there(run: Run, sequence: Path, tmp_path: Path) -> None:
     lines = ("--method", "projection-lines")
     nowhere = run(*track(sequence, tmp_path / "t.csv", *lines, "--detections", tmp_path / "nowhere"))
-    assert_one_line(nowhere, "nowhere", "cam1i.csv", "no such folder")
+    assert_one_line(nowhere, "nowhere", "cam1.csv", "no such folder")
     shutil.rmtree(sequence / "dl_data")
     assert_one_line(run(*track(sequence, tmp_path / "t.csv", *lines)), "dl_data", "--detections blobs")
     (tmp_path / "empty").mkdir()
@@ -279,7 +279,7 @@ def test_info_shows_what_a_sequence_holds(run: Run, sequence: Path) -> None:
     assert answer.code == 0
     content = json.loads(answer.out)
     assert content["drones"] == ["dron1", "dron2", "dron3", "dron4"]
-    assert content["cameras"]["cam1i"]["frames"] == NUM_FRAMES
+    assert content["cameras"]["cam1"]["frames"] == NUM_FRAMES
     assert run("info", sequence).out.count("672 x 378") == 8
 
 
@@ -331,7 +331,7 @@ class TestBadInput:
 
     def test_missing_video(self, fails: Callable[..., None], sequence: Path) -> None:
         (sequence / "cam3i_s.avi").unlink()
-        fails(sequence, "cam3i", "--cameras cam1i,cam2i,cam4i")
+        fails(sequence, "cam3", "--cameras cam1,cam2,cam4")
 
     def test_truncated_video(self, fails: Callable[..., None], sequence: Path) -> None:
         path = sequence / "cam2i_s.avi"
@@ -374,7 +374,7 @@ class TestBadInput:
         fails(sequence, "start.csv", more=("--init", "start.csv"))
 
     def test_unknown_camera(self, fails: Callable[..., None], sequence: Path) -> None:
-        fails(sequence, "cam9", more=("--cameras", "cam1i,cam9"))
+        fails(sequence, "cam9", more=("--cameras", "cam1,cam9"))
 
     def test_broken_detections(self, run: Run, sequence: Path) -> None:
         (sequence / "dl_data" / "cam1i_s.csv").write_text("0,1,2,3,4,2.5,4,0.9\n1,5,6\n")

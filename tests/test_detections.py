@@ -40,8 +40,18 @@ def test_x_and_y_may_be_the_middle(tmp_path):
         f"\n\n{LINE},\n\n",
         LINE.replace(",", " , "),
         f"{LINE}\n2,{LINE[2:]}".replace("\n2", "\n2.0"),
+        f"{LINE},,,,\n2,{LINE[2:]}{7 * ','}\n3,,,,\n,,,,",
+        f"{LINE},,,,,,,,{LINE[2:]}",
     ],
-    ids=["byte order mark", "Windows", "blank lines and last comma", "spaces", "out of order, frame as 2.0"],
+    ids=[
+        "byte order mark",
+        "Windows",
+        "blank lines and last comma",
+        "spaces",
+        "out of order, frame as 2.0",
+        "padded with empty fields",
+        "an empty detection between two",
+    ],
 )
 def test_harmless_differences(tmp_path, text):
     detections = read_detections(written(tmp_path, text))

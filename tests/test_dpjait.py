@@ -9,7 +9,7 @@ import pytest
 
 from psotrack.cameras import project
 from psotrack.datasets import dpjait
-from psotrack.errors import InputError
+from psotrack.errors import InputError, SettingsError
 from psotrack.mocap import Markers, write_c3d
 from psotrack.video import VideoWriter
 
@@ -101,6 +101,68 @@ def test_the_simulated_half(simulated):
     assert truth.time_s.tolist() == [0, 0.04, 0.08, 0.12, 0.16]
     assert sequence.detections is None
     assert sequence.usable().num_frames == 5
+
+
+@pytest.fixture
+def published(simulated, video):
+    """The simulated half as published: ten cameras called `cam1` in the calibration, files called `cam1i_s`."""
+    names = [f"cam{i}" for i in range(1, 11)]
+    cameras = [f"{name};{i};0.5;8;1.9;0;0;{1156.3 + i};32;24" for i, name in enumerate(names, start=1)]
+    (simulated / "cameras_calibration.csv").write_text("\n".join([SIMULATED, *cameras]) + "\n")
+    (simulated / "dl_data").mkdir()
+    for i, name in enumerate(names, start=1):
+        shutil.copy(video(5), simulated / f"{name}i_s.avi")
+        (simulated / "dl_data" / f"{name}i_s.csv").write_text(f"{i},10,20,30,40,25,40,0.66,,,,,,,\n")
+    return simulated
+
+
+def test_the_simulated_half_as_published(published):
+    """Calibration `cam1`, files `cam1i_s`: `cam1i_s` belongs to `cam1`, `cam10i_s` does not."""
+    sequence = dpjait.read_sequence(published)
+    names = tuple(f"cam{i}" for i in range(1, 11))
+    assert sequence.rig.names == names
+    assert {name: video.path.name for name, video in sequence.videos.items()} == {
+        name: f"{name}i_s.avi" for name in names
+    }
+    for i, name in enumerate(names, start=1):
+        assert dpjait.read_detections(sequence.detections[name]).frame.tolist() == [i]
+
+
+@pytest.mark.parametrize("typed", ["cam1", "cam1i", "cam1i_s", "CAM1"])
+@pytest.mark.parametrize("half", ["simulated", "published"])
+def test_a_camera_by_any_of_its_names(half, typed, request):
+    sequence = dpjait.read_sequence(request.getfixturevalue(half))
+    kept = sequence.usable([typed, "cam3"])
+    assert kept.rig.names == (sequence.rig.names[0], sequence.rig.names[2])
+    assert list(kept.videos) == list(kept.rig.names)
+    assert kept.rig.cameras.K[:, 0, 0].tolist() == [1157.3, 1159.3]
+
+
+@pytest.mark.parametrize(
+    ("typed", "found"),
+    [
+        (["cam"], "found cam"),
+        (["cam11"], "found cam11"),
+        (["cam1", "cam1i_s"], "each once, found cam1, cam1i_s"),
+    ],
+)
+def test_names_that_are_no_camera_or_one_twice(published, typed, found):
+    with pytest.raises(SettingsError, match=f"cameras: expected some of cam1, cam2, .*{found}"):
+        dpjait.read_sequence(published).usable(typed)
+
+
+def test_the_longest_name_and_the_exact_file(simulated, video):
+    """`left_back_s` belongs to `left_back`, not to `left`; `left.avi` comes before `left_debug.avi`."""
+    names = ("left", "left_back")
+    cameras = [f"{name};1;0.5;8;1.9;0;0;1156.3;32;24" for name in names]
+    (simulated / "cameras_calibration.csv").write_text("\n".join([SIMULATED, *cameras]) + "\n")
+    for name in ("left_back_s", "left", "left_debug"):
+        shutil.copy(video(5), simulated / f"{name}.avi")
+    videos = dpjait.read_sequence(simulated).videos
+    assert {name: one.path.name for name, one in videos.items()} == {
+        "left": "left.avi",
+        "left_back": "left_back_s.avi",
+    }
 
 
 def test_the_real_half(real):

@@ -28,7 +28,8 @@ DEPTH = {
     "__init__": 0,
     "_typing": 0,
     "compiled": 0,
-    "errors": 0,
+    "errors": -1,
+    "camera_names": 0,
     "progress": 0,
     "schema": 2,
     "files": 1,
@@ -106,6 +107,7 @@ DEPTH = {
 }
 
 CORE = {
+    "camera_names",
     "_typing",
     "cameras",
     "identity",

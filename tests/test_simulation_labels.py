@@ -383,7 +383,7 @@ def test_broken_archives_and_images_are_named(tmp_path):
             with pytest.raises(
                 InputError, match=rf"masks\.zip: cam1i/dron1/{frame}\.png: expected an image, found none"
             ):
-                masks.mask("cam1i", 1, frame)
+                masks.mask("cam1", 1, frame)
 
 
 # --- detections

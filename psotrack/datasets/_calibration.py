@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from psotrack.camera_names import camera_key
 from psotrack.cameras import Camera, CameraRig, camera, stack
 from psotrack.delimited import Column, Row, Table, read_table, write_rows
 from psotrack.errors import InputError, SettingsError
@@ -22,13 +23,6 @@ from psotrack.errors import InputError, SettingsError
 LENGTHS = {"m": 1.0, "mm": 1e-3}
 ANGLES = {"rad": 1.0, "": 1.0, "deg": np.pi / 180}
 _MOST_COEFFICIENTS = 4
-
-
-def camera_key(name: str) -> str:
-    """What a camera and its files share: `cam1i` and `cam1i_s`, `60881257` and `cam_60881257`."""
-    key = name.lower().removesuffix("_s")
-    serial_number = "".join(character for character in key if character.isdigit())
-    return serial_number if len(serial_number) >= 6 else key
 
 
 def read_names(path: Path) -> tuple[str, ...]:

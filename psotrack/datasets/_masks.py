@@ -20,8 +20,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
+from psotrack.camera_names import camera_key, chosen_camera
 from psotrack.datasets._archives import entry
-from psotrack.datasets._calibration import camera_key
+
 from psotrack.errors import InputError
 
 MASKS = "drone_masks.zip"
@@ -90,7 +91,8 @@ class Masks:
         Raises:
             InputError: there is no such mask, or it is no image.
         """
-        name = self._names.get((camera_key(camera), drone, frame))
+        key = chosen_camera(camera, self.cameras)
+        name = None if key is None else self._names.get((key, drone, frame))
         if name is None:
             raise InputError(
                 self._path, expected=f"a mask of dron{drone} in frame {frame} of {camera}", found="none"

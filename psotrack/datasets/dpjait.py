@@ -11,14 +11,15 @@ import logging
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from collections.abc import Sequence as Ordered
 from pathlib import Path
 
 import numpy as np
 
+from psotrack.camera_names import files_by_camera
 from psotrack.datasets._archives import join_archives
-from psotrack.datasets._calibration import camera_key, read_calibration, read_names, write_calibration
+from psotrack.datasets._calibration import read_calibration, read_names, write_calibration
 from psotrack.datasets._marker_corners import (
     MarkerRow,
     read_marker_corners,
@@ -109,7 +110,7 @@ def read_sequence(folder: Path | str) -> Sequence:
     files = sorted(folder.iterdir())
     videos = _videos(folder, files, names)
     rig = read_calibration(calibration, _image_sizes(names, videos))
-    detections = _by_camera((folder / DETECTIONS).glob("*.csv"), names)
+    detections = files_by_camera((folder / DETECTIONS).glob("*.csv"), names)
     return Sequence(
         name=folder.resolve().name,
         folder=folder,
@@ -127,7 +128,7 @@ def detection_files(folder: Path, cameras: Ordered[str]) -> dict[str, Path]:
     Raises:
         InputError: there is none of any camera, or two of one.
     """
-    found = _by_camera(folder.glob("*.csv"), cameras)
+    found = files_by_camera(folder.glob("*.csv"), cameras)
     if not found:
         raise InputError(
             folder,
@@ -161,7 +162,7 @@ def _onboard(folder: Path) -> Mapping[str, OnboardVideo] | None:
 def _videos(folder: Path, files: Ordered[Path], names: Ordered[str]) -> dict[str, VideoInfo]:
     videos = [path for path in files if path.suffix.lower() in _VIDEO_SUFFIXES]
     candidates = [path for path in videos if not is_onboard_video(path)]
-    found = _by_camera(candidates, names)
+    found = files_by_camera(candidates, names)
     if not found:
         raise InputError(
             folder,
@@ -172,17 +173,6 @@ def _videos(folder: Path, files: Ordered[Path], names: Ordered[str]) -> dict[str
         if path not in found.values():
             _logger.info("%s: not used, no camera of %s has this name", path, CALIBRATION)
     return {name: probe(path) for name, path in found.items()}
-
-
-def _by_camera(paths: Iterable[Path], names: Ordered[str]) -> dict[str, Path]:
-    """The file of each camera, in the order of `names`; cameras without one are absent."""
-    found: dict[str, Path] = {}
-    for path in sorted(paths):
-        key = camera_key(path.stem)
-        if key in found:
-            raise InputError(path, expected="one such file per camera", found=f"{found[key].name} as well")
-        found[key] = path
-    return {name: found[camera_key(name)] for name in names if camera_key(name) in found}
 
 
 def _image_sizes(names: Ordered[str], videos: Mapping[str, VideoInfo]) -> dict[str, tuple[int, int]]:

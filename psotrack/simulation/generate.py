@@ -132,7 +132,8 @@ def _digests(recipe: Scenario) -> dict[str, str]:
 
 
 def _streams(scene: Scene, onboard: bool) -> list[Stream]:
-    static = [Stream(name, index) for index, name in enumerate(scene.rig.names)]
+    # As published: the calibration says `cam1`, the files of that camera are `cam1i_s.avi` and `dl_data/cam1i_s.csv`.
+    static = [Stream(f"{name}i", index) for index, name in enumerate(scene.rig.names)]
     drones = range(len(scene.flights)) if onboard else ()
     return static + [Stream(f"dron{drone + 1}_cam", drone, onboard=True) for drone in drones]
 

@@ -91,7 +91,7 @@ def _rig(scenario: Scenario, scale: float, seed: int) -> CameraRig:
     draws = np.clip(normal, -2.5, 2.5) * [spread.focal_length, *2 * [spread.principal_point_px]]
     return stack(
         {
-            f"cam{index}i": _camera(_moved(place, draw), scenario, scale)
+            f"cam{index}": _camera(_moved(place, draw), scenario, scale)
             for index, (place, draw) in enumerate(zip(places, draws, strict=True), start=1)
         }
     )

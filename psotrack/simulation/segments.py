@@ -35,7 +35,7 @@ class Stream:
     """What one camera sees over time: a static one, or that of a drone.
 
     Attributes:
-        name: the camera's.
+        name: with which the camera's files begin.
         index: of the static camera, or of the drone.
         onboard: which of the two.
     """

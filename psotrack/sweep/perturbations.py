@@ -49,7 +49,10 @@ def perturbed(
         SettingsError: there are no such cameras, or not so many.
     """
     every = sequence.rig.names
-    kept = chosen(every, cameras, perturbation.draw) if isinstance(cameras, int) else cameras or every
+    if isinstance(cameras, int):
+        kept = chosen(every, cameras, perturbation.draw)
+    else:
+        kept = sequence.rig.select(cameras).names if cameras else every
     if kept != every:
         sequence = sequence.usable(list(kept))
         silhouettes = None if silhouettes is None else _of_cameras(silhouettes, kept)
