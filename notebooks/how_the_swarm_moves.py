@@ -32,17 +32,16 @@ import numpy as np
 from IPython.display import Image
 from matplotlib.animation import FuncAnimation, PillowWriter
 
-from psotrack import swarm
-from psotrack.compiled import keep_compiled
 from psotrack.datasets.dpjait import read_sequence
-from psotrack.fitness import ScoreSettings, drone_fitness, joint_fitness, scene
-from psotrack.initialisation import find_drones
+from psotrack.initiation import room_bounds
+from psotrack.initiation.initialisation import find_drones
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import SilhouetteSettings, compute
+from psotrack.silhouettes import compute, summed_area_table
+from psotrack.silhouettes.computation import SilhouetteSettings
 from psotrack.simulation import simulate
-from psotrack.starts import room_bounds
-from psotrack.summed_area import summed_area_table
-from psotrack.tracking import on_device
+from psotrack.support import keep_compiled
+from psotrack.tracking import ScoreSettings, on_device, swarm
+from psotrack.tracking.fitness import drone_fitness, joint_fitness, score_inputs
 
 # %%
 TINY = os.environ.get("PSOTRACK_NOTEBOOKS") == "tiny"  # a quick check that everything runs
@@ -89,7 +88,7 @@ shown = int(jnp.linalg.norm(predicted_m - truth_m, axis=1).argmin())
 print(f"the prediction is {1e3 * np.linalg.norm(predicted_m[shown] - truth_m):.0f} mm off")
 
 # %%
-seen = scene(
+seen = score_inputs(
     on_device(sequence.rig.cameras),
     jnp.asarray(start.size_m, jnp.float32),
     summed_area_table(jnp.asarray(silhouettes.read(FRAME, FRAME + 1)[0], jnp.int32)),

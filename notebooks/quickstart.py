@@ -24,16 +24,16 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import pandas as pd
 
-from psotrack.compiled import keep_compiled
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.demo import save_picture
 from psotrack.evaluation import evaluate, plots, tables
 from psotrack.pipeline import track_sequence
+from psotrack.recordings import read_frames
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import SilhouetteSettings
+from psotrack.silhouettes.computation import SilhouetteSettings
 from psotrack.simulation import simulate
-from psotrack.trajectory_files import write_trajectories
-from psotrack.video import read_frames
+from psotrack.support import keep_compiled
+from psotrack.trajectories import write_trajectories
 
 # %% [markdown]
 # All sizes are set here. Images have half of their full size, so that nobody waits; `SCALE = 1.0` and

@@ -25,7 +25,7 @@ import matplotlib.pyplot as plt
 import pandas as pd
 from IPython.display import Markdown
 
-from psotrack.evaluation.plots import COLOURS
+from psotrack.support import COLOURS
 from psotrack.sweep import pivot, render
 from psotrack.sweep.figures import error_against_work
 

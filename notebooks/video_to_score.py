@@ -31,19 +31,19 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Rectangle
 
-from psotrack.boxes import extents, project_boxes
-from psotrack.compiled import keep_compiled
 from psotrack.datasets.dpjait import read_sequence
-from psotrack.fitness import PAPER_SCORE, ScoreSettings, camera_scores, drone_fitness, scene
-from psotrack.foreground import classify, coverage, learn, learning_step
-from psotrack.initialisation import find_drones
+from psotrack.geometry import extents, project_boxes
+from psotrack.initiation import room_bounds
+from psotrack.initiation.initialisation import find_drones
+from psotrack.recordings import read_frames
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import SilhouetteSettings, compute
+from psotrack.silhouettes import compute, summed_area_table
+from psotrack.silhouettes.computation import SilhouetteSettings
+from psotrack.silhouettes.foreground import classify, coverage, learn, learning_step
 from psotrack.simulation import simulate
-from psotrack.starts import room_bounds
-from psotrack.summed_area import summed_area_table
-from psotrack.tracking import on_device
-from psotrack.video import read_frames
+from psotrack.support import keep_compiled
+from psotrack.tracking import ScoreSettings, on_device
+from psotrack.tracking.fitness import PAPER_SCORE, camera_scores, drone_fitness, score_inputs
 
 # %%
 TINY = os.environ.get("PSOTRACK_NOTEBOOKS") == "tiny"  # a quick check that everything runs
@@ -172,8 +172,10 @@ plt.show()
 
 # %%
 tables = summed_area_table(jnp.asarray(seen, jnp.int32))
-score, weight = camera_scores(scene(cameras, size_m, tables, soft), place_m[None])
-moved, _ = camera_scores(scene(cameras, size_m, tables, soft), place_m[None] + jnp.array([0.15, 0.0, 0.0]))
+score, weight = camera_scores(score_inputs(cameras, size_m, tables, soft), place_m[None])
+moved, _ = camera_scores(
+    score_inputs(cameras, size_m, tables, soft), place_m[None] + jnp.array([0.15, 0.0, 0.0])
+)
 
 figure, axes = plt.subplots(figsize=(9, 2.8), layout="constrained")
 number = np.arange(len(sequence.rig))
@@ -188,7 +190,7 @@ plt.show()
 # *What to see: nearly every camera prefers the true position, some more than others: those that look along x hardly
 # notice a step along x. And `cam1`, where two drones are one silhouette, is wrong. No single camera knows where the
 # drone is; the mean over all of them does. (The tracker goes further: what another drone is expected to cover says
-# nothing about this one; see `psotrack.claims`.)*
+# nothing about this one; see `psotrack.tracking.occlusion`.)*
 #
 # ## The landscape around a drone
 #
@@ -204,7 +206,7 @@ scores = {"soft score": soft, "the paper's hard score": hard}
 
 figure, panels = plt.subplots(2, 3, figsize=(13, 7.4), layout="constrained")
 for row, (label, settings) in zip(panels, scores.items(), strict=True):
-    fitness_at = jax.jit(partial(drone_fitness, scene(cameras, size_m, tables, settings)))
+    fitness_at = jax.jit(partial(drone_fitness, score_inputs(cameras, size_m, tables, settings)))
     for panel, (right, up) in zip(row, slices.items(), strict=False):
         offset_m = np.zeros((*across_m.shape, 3))
         offset_m[..., "xyz".index(right)], offset_m[..., "xyz".index(up)] = across_m, up_m
@@ -260,7 +262,7 @@ plt.show()
 low_m, high_m = room_bounds(sequence.rig, TrackSettings())
 x_m, y_m = np.arange(low_m[0], high_m[0], ROOM_STEP_M), np.arange(low_m[1], high_m[1], ROOM_STEP_M)
 room_m = np.stack([*np.meshgrid(x_m, y_m), np.full((len(y_m), len(x_m)), truth_m[DRONE, 2])], axis=-1)
-view = scene(cameras, size_m, tables, soft)
+view = score_inputs(cameras, size_m, tables, soft)
 height = np.asarray(drone_fitness(view, jnp.asarray(room_m[..., None, :], jnp.float32)))[..., 0]
 
 figure, axes = plt.subplots(figsize=(9, 6.4), layout="constrained")
@@ -283,6 +285,6 @@ plt.show()
 # patches are places where foreground in two or three cameras agrees by chance: rays from cameras to the other drones,
 # which are higher or lower, cross there. In most of the room there is no slope that leads anywhere. A swarm finds the
 # hill because it starts where the drone is expected after the last frame; where it is in the very first frame is
-# found in another way, from blobs that agree between cameras (`psotrack.initialisation`).*
+# found in another way, from blobs that agree between cameras (`psotrack.initiation.initialisation`).*
 #
 # Next: [how the swarm moves](how_the_swarm_moves.ipynb) in this landscape.

@@ -37,21 +37,27 @@ import pandas as pd
 from matplotlib.patches import Rectangle
 from scipy.spatial.transform import Rotation
 
-from psotrack.boxes import extents, project_boxes
-from psotrack.cameras import CameraRig, camera, project, stack, undistort
-from psotrack.compiled import keep_compiled
-from psotrack.contents import contents
 from psotrack.datasets.dpjait import CALIBRATION, read_sequence, write_calibration
 from psotrack.evaluation import evaluate, plots
-from psotrack.fitness import ScoreSettings, camera_scores, scene
+from psotrack.geometry import (
+    CameraRig,
+    camera,
+    extents,
+    project,
+    project_boxes,
+    stack,
+    triangulate,
+    undistort,
+)
 from psotrack.pipeline import track_from_silhouettes
+from psotrack.recordings import VideoWriter, contents, probe, read_frames
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import SilhouetteSettings, compute
+from psotrack.silhouettes import compute, summed_area_table
+from psotrack.silhouettes.computation import SilhouetteSettings
 from psotrack.simulation import simulate
-from psotrack.summed_area import summed_area_table
-from psotrack.tracking import on_device
-from psotrack.triangulation import triangulate
-from psotrack.video import VideoWriter, probe, read_frames
+from psotrack.support import keep_compiled
+from psotrack.tracking import ScoreSettings, on_device
+from psotrack.tracking.fitness import camera_scores, score_inputs
 
 # %%
 TINY = os.environ.get("PSOTRACK_NOTEBOOKS") == "tiny"  # a quick check that everything runs
@@ -239,7 +245,7 @@ plt.show()
 # DPJAIT dataset's: one focal length per camera, no skew, k1, k2, p1, p2. With OpenCV, calibrate with
 # `CALIB_FIX_ASPECT_RATIO` and `CALIB_FIX_K3`. If yours has two focal lengths or more coefficients,
 # `write_calibration` says so; then stay in Python, where nothing is lost: `Sequence(name, folder, rig, videos)` from
-# `psotrack.sequence`, with `videos` from `psotrack.video.probe`, is all that the rest of this notebook needs.
+# `psotrack.recordings.sequence`, with `videos` from `psotrack.recordings.video.probe`, is all that the rest of this notebook needs.
 
 # %%
 FOLDER.mkdir(exist_ok=True)
@@ -335,7 +341,9 @@ frames = range(0, sequence.num_frames, 5)
 rigs = {"as calibrated": (rig, tracked), f"gopro3 turned by {TURN_DEG} deg": (turned_rig, turned)}
 mean_score = {}
 soft = ScoreSettings(reduction=SILHOUETTES.reduction)
-scores = jax.jit(lambda rig, size_m, tables, at_m: camera_scores(scene(rig, size_m, tables, soft), at_m))
+scores = jax.jit(
+    lambda rig, size_m, tables, at_m: camera_scores(score_inputs(rig, size_m, tables, soft), at_m)
+)
 for label, (of_rig, of_tracks) in rigs.items():
     cameras, size_m = on_device(of_rig.cameras), jnp.asarray(of_tracks.size_m, jnp.float32)
     each = []

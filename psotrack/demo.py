@@ -10,19 +10,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from psotrack.boxes import extents, project_boxes
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.evaluation import evaluate, plots, tables
-from psotrack.files import refuse_to_overwrite, written_whole
+from psotrack.geometry import extents, project_boxes
 from psotrack.pipeline import TrackedSequence, track_sequence
-from psotrack.progress import Report, silent
-from psotrack.sequence import Sequence
+from psotrack.recordings import Sequence, read_frames
 from psotrack.settings import TrackSettings
-from psotrack.silhouette_store import SilhouetteSettings
+from psotrack.silhouettes import SilhouetteSettings
 from psotrack.simulation import simulate
+from psotrack.support import Report, refuse_to_overwrite, silent, written_whole
 from psotrack.tracking import on_device
-from psotrack.trajectory_files import write_trajectories
-from psotrack.video import read_frames
+from psotrack.trajectories import write_trajectories
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -14,17 +14,16 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
+from psotrack.correspondence import from_detections, from_silhouettes
 from psotrack.datasets.dpjait import detection_files, read_detections
 from psotrack.errors import InputError
-from psotrack.fusion import fused
-from psotrack.initialisation import Start
-from psotrack.progress import Report
+from psotrack.fusion import fuse_tracks
+from psotrack.initiation import InitialState, find_initial_state, known_motion, room_bounds
 from psotrack.projection_lines import follow, start_of
-from psotrack.sequence import Sequence
+from psotrack.recordings import Sequence
 from psotrack.settings import BLOBS, YOLO, TrackSettings
-from psotrack.sightings import from_detections, from_silhouettes
 from psotrack.silhouettes import Silhouettes
-from psotrack.starts import find_start, known_motion, room_bounds
+from psotrack.support import Report
 from psotrack.tracking import Tracked, track_silhouettes
 
 
@@ -46,7 +45,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Way:
+class MethodResult:
     """How a run went.
 
     Attributes:
@@ -60,19 +59,19 @@ class Way:
 
     tracked: Tracked
     points: tuple[Point, ...]
-    start: Start
+    start: InitialState
     bounds_m: Float[np.ndarray, "2 3"]
     input_keys: Mapping[str, str]
     seconds: Mapping[str, float]
 
 
-def by_swarm(
+def track_by_swarm(
     sequence: Sequence,
     silhouettes: Silhouettes,
     settings: collections.abc.Sequence[TrackSettings],
-    detected: collections.abc.Sequence[Start | None],
+    detected: collections.abc.Sequence[InitialState | None],
     report: Report,
-) -> list[Way]:
+) -> list[MethodResult]:
     """Runs of the swarm, together.
 
     Args:
@@ -99,14 +98,14 @@ def by_swarm(
         "track": (time.perf_counter() - began - compile_s) / len(settings),
     }
     return [
-        Way(tracked, _middles_of("silhouette", tracked), start, bounds, silhouettes.keys, seconds)
+        MethodResult(tracked, _middles_of("silhouette", tracked), start, bounds, silhouettes.keys, seconds)
         for tracked, start, bounds in zip(followed, starts, bounds_m, strict=True)
     ]
 
 
-def by_lines(
+def track_by_projection_lines(
     sequence: Sequence, silhouettes: Silhouettes | None, settings: TrackSettings, report: Report
-) -> Way:
+) -> MethodResult:
     """A run of the projection lines.
 
     Raises:
@@ -133,13 +132,15 @@ def by_lines(
     )
     before = {"decode": 0.0, "foreground": 0.0} if silhouettes is None else silhouettes.seconds
     seconds = {**before, "compile": tracked.compile_s, "track": time.perf_counter() - began}
-    return Way(tracked, _middles_of("box", tracked), start_of(tracked), bounds_m, keys, seconds)
+    return MethodResult(tracked, _middles_of("box", tracked), start_of(tracked), bounds_m, keys, seconds)
 
 
-def by_both(swarm: Way, lines: Way, settings: TrackSettings, fps: float) -> Way:
+def fuse_methods(
+    swarm: MethodResult, lines: MethodResult, settings: TrackSettings, fps: float
+) -> MethodResult:
     """What the two say together."""
     began = time.perf_counter()
-    tracked, middles = fused(
+    tracked, middles = fuse_tracks(
         swarm.tracked, lines.tracked, settings, fps=fps, same_foreground=settings.detections == BLOBS
     )
     seconds = {
@@ -153,7 +154,7 @@ def by_both(swarm: Way, lines: Way, settings: TrackSettings, fps: float) -> Way:
         Point(drone, "silhouette" if drone < known else "box", *told)
         for drone, told in enumerate(zip(_told(middles.off_m), _told(middles.std_m), strict=True))
     )
-    return Way(tracked, points, swarm.start, swarm.bounds_m, keys, seconds)
+    return MethodResult(tracked, points, swarm.start, swarm.bounds_m, keys, seconds)
 
 
 def detection_files_of(sequence: Sequence, detections: str) -> Mapping[str, Path]:
@@ -188,12 +189,12 @@ def _starts(
     silhouettes: Silhouettes,
     settings: collections.abc.Sequence[TrackSettings],
     bounds_m: list[Float[np.ndarray, "2 3"]],
-    detected: collections.abc.Sequence[Start | None],
-) -> list[Start]:
+    detected: collections.abc.Sequence[InitialState | None],
+) -> list[InitialState]:
     """The start of each run; runs that differ in nothing but their seeds have the same."""
-    starts: dict[TrackSettings, Start] = {}
+    starts: dict[TrackSettings, InitialState] = {}
     alike = [msgspec.structs.replace(each, seed=0) for each in settings]
     for each, bounds, also in zip(alike, bounds_m, detected, strict=True):
         if each not in starts:
-            starts[each] = find_start(sequence, silhouettes, each, bounds, also)
+            starts[each] = find_initial_state(sequence, silhouettes, each, bounds, also)
     return [starts[each] for each in alike]

@@ -20,14 +20,13 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import InputError
-from psotrack.finishing import finished
-from psotrack.identity import Identities
-from psotrack.methods import Way, by_both, by_lines, by_swarm
-from psotrack.progress import Report, silent
-from psotrack.sequence import Sequence
+from psotrack.identity import Identities, postprocess
+from psotrack.methods import MethodResult, fuse_methods, track_by_projection_lines, track_by_swarm
+from psotrack.recordings import Sequence
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
-from psotrack.sizes import SizeState
+from psotrack.support import Report, silent
+from psotrack.tracking import SizeState
 from psotrack.trajectories import Trajectories
 
 
@@ -126,7 +125,7 @@ def track_runs(
         SettingsError: a setting does not fit the sequence.
     """
     ways = {
-        number: by_lines(sequence, silhouettes, each, report)
+        number: track_by_projection_lines(sequence, silhouettes, each, report)
         for number, each in enumerate(settings)
         if each.method != "swarm"
     }
@@ -135,14 +134,14 @@ def track_runs(
         assert silhouettes is not None
         of_swarms = [settings[number] for number in swarms]
         detected = [ways[number].start if number in ways else None for number in swarms]
-        followed = by_swarm(sequence, silhouettes, of_swarms, detected, report)
+        followed = track_by_swarm(sequence, silhouettes, of_swarms, detected, report)
         for number, each, swarm in zip(swarms, of_swarms, followed, strict=True):
             both = number in ways
-            ways[number] = by_both(swarm, ways[number], each, sequence.fps) if both else swarm
+            ways[number] = fuse_methods(swarm, ways[number], each, sequence.fps) if both else swarm
     return [_finished(sequence, each, ways[number]) for number, each in enumerate(settings)]
 
 
-def _finished(sequence: Sequence, settings: TrackSettings, way: Way) -> TrackedSequence | InputError:
+def _finished(sequence: Sequence, settings: TrackSettings, way: MethodResult) -> TrackedSequence | InputError:
     """One run's trajectories and record."""
     tracked = way.tracked
     if not tracked.info.status.shape[1]:
@@ -153,7 +152,7 @@ def _finished(sequence: Sequence, settings: TrackSettings, way: Way) -> TrackedS
             remedy="look at what the cameras see with `psotrack silhouettes`, or say where they are with --init FILE",
         )
     followed = time.perf_counter()
-    trajectories, identities = finished(tracked, settings, fps=sequence.fps)
+    trajectories, identities = postprocess(tracked, settings, fps=sequence.fps)
     finish_s = time.perf_counter() - followed
     own_s = {"track": way.seconds["track"], "compile": way.seconds["compile"], "finish": finish_s}
     all_seconds = {**way.seconds, **own_s, "total": sum(own_s.values())}

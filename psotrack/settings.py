@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import msgspec
 
 from psotrack.errors import SettingsError, check_positive
-from psotrack.silhouette_store import SilhouetteSettings
+from psotrack.silhouettes import SilhouetteSettings
 
 SwarmKind = Literal["joint", "per-drone"]
 Score = Literal["soft", "hard"]

@@ -7,8 +7,7 @@ import numpy as np
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from psotrack.evaluation.association import UNASSIGNED
-from psotrack.trajectories import Trajectories
+from psotrack.trajectories import UNASSIGNED, Trajectories
 
 # Two frames per second: frames 0 and 1 are the first second, in which identity is fixed.
 FPS = 2.0

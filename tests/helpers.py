@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from psotrack.cameras import Camera, CameraRig, camera, look_at, project, stack, undistort
+from psotrack.geometry import Camera, CameraRig, camera, look_at, project, stack, undistort
 
 #: Lenses as strong as those of action cameras, in OpenCV's order.
 LENSES = {

@@ -5,7 +5,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from psotrack.cameras import project
+from psotrack.geometry import project
 from psotrack.simulation.flights.formulas import HarmonicFlight
 from psotrack.simulation.flights.motion import Heading
 from psotrack.simulation.labels.masks import silhouettes

@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from psotrack.boxes import extents, project_boxes
-from psotrack.cameras import project
+from psotrack.geometry import extents, project, project_boxes
 
 
 @jax.jit

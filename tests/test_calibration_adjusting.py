@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
 from psotrack.calibration import Alike, adjust, improve, in_boxes, off_cameras
-from psotrack.cameras import CameraRig, project
-from psotrack.detections import Detections
 from psotrack.errors import SettingsError
+from psotrack.geometry import CameraRig, project
+from psotrack.recordings import Detections
 from psotrack.trajectories import Trajectories
 
 RIG = ring_rig(5, image_size_wh=(1920, 1080))

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
 from psotrack.calibration import Alike, adjust
-from psotrack.cameras import CameraRig, project
 from psotrack.errors import InputError, SettingsError
+from psotrack.geometry import CameraRig, project
 
 
 def jittered(rig: CameraRig, rng, *, turn_deg=0.6, shift_m=0.03, skip=()) -> CameraRig:

@@ -11,7 +11,7 @@ import pandas as pd
 from helpers import moved, ring_rig
 from scipy.spatial.transform import Rotation
 
-from psotrack.cameras import CameraRig
+from psotrack.geometry import CameraRig
 
 FOLDER = Path(__file__).parents[1] / "experiments" / "calibration"
 

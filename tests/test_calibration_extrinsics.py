@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
 from psotrack.calibration import inflation, locate_camera, reproject, spread_px
-from psotrack.cameras import camera, look_at, project
 from psotrack.errors import InputError, SettingsError
+from psotrack.geometry import camera, look_at, project
 
 K = np.array([[1157.0, 0, 959.5], [0, 1157.0, 539.5], [0, 0, 1]])
 NO_LENS = np.zeros(0)

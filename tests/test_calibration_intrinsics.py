@@ -6,9 +6,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import Board, lens_of_board, lens_of_sensor, lens_of_view
-from psotrack.cameras import project
 from psotrack.errors import InputError, SettingsError
-from psotrack.video import VideoWriter, probe
+from psotrack.geometry import project
+from psotrack.recordings import VideoWriter, probe
 
 
 def test_lenses_of_a_data_sheet():

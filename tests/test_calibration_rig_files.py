@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 from helpers import LENSES, assert_same, ring_rig
 
-from psotrack.calibration import read_lenses, read_rig, write_rig
-from psotrack.cameras import CameraRig, project, stack
 from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.geometry import CameraRig, project, read_lenses, read_rig, stack, write_rig
 
 #: As anipose 1.1 writes: tables cam_0 ..., lengths in the board's unit.
 ANIPOSE = """[cam_0]

@@ -7,15 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, OutputError
-from psotrack.inside_out.camera_path import (
-    CameraPath,
-    Flag,
-    read_camera_path,
-    roll_pitch_yaw_deg,
-    write_camera_path,
-)
-from psotrack.trajectories import Status
-from psotrack.trajectory_files import read_trajectories
+from psotrack.inside_out import CameraPath, Flag, read_camera_path, write_camera_path
+from psotrack.inside_out.camera_path import roll_pitch_yaw_deg
+from psotrack.trajectories import Status, read_trajectories
 
 #: Camera axes, columns, of a camera that looks along the world's x axis: right is -y, down is -z.
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from psotrack.cameras import NEAR_M, camera, look_at, project, stack, to_camera, undistort
 from psotrack.errors import SettingsError
+from psotrack.geometry import NEAR_M, camera, look_at, project, stack, to_camera, undistort
 
 
 def points_in_room(count, seed=0):

@@ -20,10 +20,10 @@ from windows import (
     pixels,
 )
 
-from psotrack.boxes import extents, project_boxes
-from psotrack.claims import CLAIM, CORE, NUM_NEIGHBOURS
-from psotrack.fitness import camera_scores, drone_fitness
-from psotrack.patches import SIDE
+from psotrack.geometry import extents, project_boxes
+from psotrack.tracking.fitness import camera_scores, drone_fitness
+from psotrack.tracking.occlusion import CLAIM, CORE, NUM_NEIGHBOURS
+from psotrack.tracking.patches import SIDE
 
 SIZES_M = np.array([[1.0, 1.0, 0.5]]).repeat(5, axis=0)
 #: Halves of a drone of 1 m x 0.5 m, per camera.

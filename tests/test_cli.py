@@ -17,7 +17,7 @@ import pandas as pd
 import pytest
 
 from psotrack import cli
-from psotrack.video import VideoWriter, probe, read_frames
+from psotrack.recordings import VideoWriter, probe, read_frames
 
 COLUMNS = [
     *("frame", "time_s", "drone", "x_m", "y_m", "z_m", "vx_m_s", "vy_m_s", "vz_m_s"),
@@ -190,7 +190,7 @@ def test_smoothed_tracks_are_surer(run: Run, sequence: Path, tmp_path: Path) -> 
 
 
 def test_who_met_is_written_beside_the_tracks(run: Run, sequence: Path, tmp_path: Path) -> None:
-    from psotrack.trajectory_files import write_ambiguity
+    from psotrack.trajectories import write_ambiguity
 
     tracks = tmp_path / "t.csv"
     assert run(*track(sequence, tracks)).code == 0

@@ -10,15 +10,13 @@ from click.testing import CliRunner
 from helpers import ring_rig
 from scipy.spatial.transform import Rotation
 
-from psotrack.calibration import Board, read_lenses, read_rig, write_rig
-from psotrack.cameras import CameraRig, camera, look_at, project, stack
+from psotrack.calibration import Board
 from psotrack.cli.calibrate import calibrate
 from psotrack.datasets.dpjait import read_sequence, write_calibration, write_detections, write_marker_corners
-from psotrack.detections import Detections
 from psotrack.errors import PsotrackError
-from psotrack.trajectories import Trajectories
-from psotrack.trajectory_files import write_trajectories
-from psotrack.video import VideoWriter
+from psotrack.geometry import CameraRig, camera, look_at, project, read_lenses, read_rig, stack, write_rig
+from psotrack.recordings import Detections, VideoWriter
+from psotrack.trajectories import Trajectories, write_trajectories
 
 WORLD = np.random.default_rng(0).uniform((-1.5, -1.5, 0.2), (1.5, 1.5, 2.4), (14, 3))
 

@@ -13,15 +13,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from psotrack.cameras import project
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.evaluation import evaluate
+from psotrack.geometry import project
 from psotrack.pipeline import track_sequence
 from psotrack.settings import TrackSettings
-from psotrack.silhouette_store import SilhouetteSettings
-from psotrack.simulation import simulate
-from psotrack.simulation.flights.recordings import write_recording
-from psotrack.simulation.scenarios import Scenario
+from psotrack.silhouettes import SilhouetteSettings
+from psotrack.simulation import Scenario, simulate, write_recording
 from psotrack.trajectories import Status, Trajectories
 
 pytestmark = pytest.mark.slow

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from helpers import ROOM_M, float32, ring_rig
 
-from psotrack import tracker
-from psotrack.initialisation import Start
+from psotrack.initiation import InitialState
 from psotrack.settings import TrackSettings
-from psotrack.tracker_inputs import tracker_inputs
+from psotrack.tracking import tracker
+from psotrack.tracking.inputs import tracker_inputs
 
 
 def run(*, num_frames=5, num_drones=2, seed=0, size_m=0.4, focal=1.0, **settings):
     """Track noise, and wait for the result."""
     rng = np.random.default_rng(seed)
-    start = Start(
+    start = InitialState(
         position_m=rng.uniform(-1, 1, (num_drones, 3)),
         velocity_m_s=np.zeros((num_drones, 3)),
         size_m=np.full((num_drones, 3), size_m),

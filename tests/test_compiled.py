@@ -12,7 +12,7 @@ PROGRAM = """
 import sys
 from pathlib import Path
 import jax
-from psotrack import compiled
+from psotrack.support import compiled
 compiled.WORTH_KEEPING_S = 0.0
 compiled.keep_compiled(Path(sys.argv[1]))
 def twice_the_sine(x):

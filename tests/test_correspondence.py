@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from psotrack.cameras import project
 from psotrack.correspondence import NEW, SHARED, UNEXPLAINED, epipolar_distance, match
 from psotrack.errors import SettingsError
+from psotrack.geometry import project
 
 BOUNDS_M = np.array([[-4.0, -4.0, -1.0], [4.0, 4.0, 4.0]])
 LARGE_WH = (1280, 960)

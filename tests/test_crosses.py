@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from psotrack.cross_poses import at_times, completed, poses, relabelled
-from psotrack.crosses import Cross, fit, identify, learn_cross, which_marker
 from psotrack.errors import InputError, SettingsError
+from psotrack.recordings.cross_poses import at_times, completed, poses, relabelled
+from psotrack.recordings.crosses import Cross, fit, identify, learn_cross, which_marker
 
 #: Markers A, B, C, D ahead, left, back, right; and the same with a fifth on a mast.
 FOUR_M = np.array([[0.055, 0, 0.1], [0, 0.085, 0.1], [-0.115, 0, 0.1], [0, -0.105, 0.1]])

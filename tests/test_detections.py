@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psotrack.detections import Detections, read_detections, write_detections
 from psotrack.errors import InputError
+from psotrack.recordings import Detections, read_detections, write_detections
 
 LINE = "4,10,20,30,40,25,40,0.9"
 

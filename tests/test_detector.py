@@ -8,15 +8,14 @@ from click.testing import CliRunner
 from helpers import rig_of
 from onnx_models import SIDE, STRIDE, bright_squares
 
-from psotrack.cameras import camera, look_at, project
 from psotrack.cli.detect import detect as command
 from psotrack.cli.track import track
 from psotrack.datasets import dpjait
-from psotrack.detections import read_detections
-from psotrack.detector import Detector, DetectorSettings, detect
+from psotrack.detection import DetectorSettings, OnnxDetector, detect
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.trajectory_files import read_trajectories
-from psotrack.video import VideoWriter, probe
+from psotrack.geometry import camera, look_at, project
+from psotrack.recordings import VideoWriter, probe, read_detections
+from psotrack.trajectories import read_trajectories
 
 #: Of the network's input for each layout; v10 has 300 boxes, for which it takes 18 x 18.
 SIZES = {"v5": 128, "v8": 128, "v10": 168}
@@ -52,7 +51,7 @@ def paint(bgr, xyxy, value=255):
 
 def detector(models, layout, **settings):
     settings = {"size": SIZES.get(layout, 128)} | settings
-    return Detector(models / f"{layout}.onnx", DetectorSettings(**settings))
+    return OnnxDetector(models / f"{layout}.onnx", DetectorSettings(**settings))
 
 
 @pytest.mark.parametrize("layout", SIZES)
@@ -121,14 +120,14 @@ def test_red_is_red(tmp_path, models):
     bgr = black(128)
     paint(bgr, square(128, 2, 3), (255, 0, 0))
     paint(bgr, square(128, 9, 6), (0, 0, 255))
-    xyxy, _ = Detector(path, DetectorSettings(size=128)).boxes(bgr)
+    xyxy, _ = OnnxDetector(path, DetectorSettings(size=128)).boxes(bgr)
     np.testing.assert_allclose(xyxy, [square(128, 9, 6)], atol=1e-4)
 
 
 class TestWhatCannotBeUsed:
     def test_no_file(self, tmp_path):
         with pytest.raises(InputError, match=r"gone.onnx: expected an ONNX model, found no such file"):
-            Detector(tmp_path / "gone.onnx", DetectorSettings())
+            OnnxDetector(tmp_path / "gone.onnx", DetectorSettings())
 
     @pytest.mark.parametrize("content", [b"", b"hello " * 100, "cut"])
     def test_a_broken_model(self, tmp_path, capfd, content):
@@ -137,7 +136,7 @@ class TestWhatCannotBeUsed:
         with pytest.raises(
             InputError, match=r"broken.onnx: expected an ONNX model that OpenCV can read"
         ) as error:
-            Detector(path, DetectorSettings())
+            OnnxDetector(path, DetectorSettings())
         assert "\n" not in str(error.value)
         assert capfd.readouterr() == ("", "")
 
@@ -262,7 +261,7 @@ class TestTracking:
         assert tracks.seen.all()
         assert off_m.max() < 0.08
         # The second time nothing is looked for, because all of it is there.
-        monkeypatch.setattr(Detector, "boxes", lambda *_: pytest.fail("looked again"))
+        monkeypatch.setattr(OnnxDetector, "boxes", lambda *_: pytest.fail("looked again"))
         again = self.run(models, seen, tmp_path / "b.csv", *arguments)
         assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
         keys = [json.loads(result.stdout)["input_keys"] for result in (found, again)]

@@ -12,12 +12,12 @@ from click.testing import CliRunner
 from helpers import ring_rig
 from scipy.spatial.transform import Rotation
 
-from psotrack.cameras import CameraRig, project
 from psotrack.cli.doctor import doctor
+from psotrack.correspondence import from_detections
 from psotrack.datasets.dpjait import write_calibration, write_detections, write_poses
-from psotrack.detections import Detections
 from psotrack.doctor import Agreement, examine, sampled_frames
-from psotrack.sightings import from_detections
+from psotrack.geometry import CameraRig, project
+from psotrack.recordings import Detections
 from psotrack.trajectories import Trajectories
 
 #: Two minutes of small calls, each of which is checked.

@@ -7,11 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from psotrack.cameras import project
 from psotrack.datasets import dpjait
 from psotrack.errors import InputError, SettingsError
-from psotrack.mocap import Markers, write_c3d
-from psotrack.video import VideoWriter
+from psotrack.geometry import project
+from psotrack.recordings import Markers, VideoWriter, write_c3d
 
 WIDTH, HEIGHT, FPS = 64, 48, 25.0
 SIMULATED = "cam_name;cam_x[m];cam_y[m];cam_z[m];cam_or_x[rad];cam_or_y[rad];cam_or_z[rad];focal_length;cx;cy"

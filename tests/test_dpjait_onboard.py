@@ -9,11 +9,10 @@ from hypothesis import strategies as st
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from psotrack.cameras import camera, look_at, stack
-from psotrack.contents import contents, render
 from psotrack.datasets import dpjait
 from psotrack.errors import InputError, SettingsError
-from psotrack.video import VideoWriter
+from psotrack.geometry import camera, look_at, stack
+from psotrack.recordings import VideoWriter, contents, render
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 5
 K = np.array([[30.5, 0.0, 31.5], [0.0, 30.25, 23.5], [0.0, 0.0, 1.0]])

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from psotrack.cameras import CameraRig, camera, project, stack
 from psotrack.datasets import dpjait
 from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.geometry import CameraRig, camera, project, stack
 
 finite = st.floats(-50, 50)
 triples = st.tuples(finite, finite, finite)

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError, check_positive
-from psotrack.files import refuse_to_overwrite, written_whole
-from psotrack.progress import silent, terminal
+from psotrack.support import refuse_to_overwrite, silent, terminal, written_whole
 
 
 def test_a_message_is_one_sentence():

@@ -13,15 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError
 from psotrack.evaluation import evaluate
-from psotrack.evaluation.association import (
-    GATE_M,
-    UNASSIGNED,
-    align,
-    fixed_identity,
-    identity_switches,
-    matched_per_frame,
-)
-from psotrack.trajectories import Status
+from psotrack.trajectories import GATE_M, UNASSIGNED, Status
+from psotrack.trajectories.association import align, fixed_identity, identity_switches, matched_per_frame
 
 
 def numbers(evaluation, *names):

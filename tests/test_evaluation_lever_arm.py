@@ -11,7 +11,7 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from psotrack.evaluation import evaluate, tables
-from psotrack.evaluation.standard_errors import standard_error
+from psotrack.support import standard_error
 from psotrack.trajectories import Trajectories
 
 ARM_M = np.array([0.03, -0.02, -0.117])

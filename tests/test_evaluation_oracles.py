@@ -14,8 +14,7 @@ from evaluation_flights import FPS, ROUNDING, random_flights, seeds
 from hypothesis import given, settings
 
 from psotrack.evaluation import evaluate
-from psotrack.evaluation.association import GATE_M
-from psotrack.trajectories import Trajectories
+from psotrack.trajectories import GATE_M, Trajectories
 
 
 def crowded(seed: int) -> tuple[Trajectories, Trajectories]:

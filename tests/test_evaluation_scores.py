@@ -6,7 +6,7 @@ from evaluation_flights import ROUNDING, TRUTH, on_x_axis, pairings, random_flig
 from hypothesis import given, settings
 
 from psotrack.evaluation import evaluate
-from psotrack.evaluation.association import GATE_M, UNASSIGNED
+from psotrack.trajectories import GATE_M, UNASSIGNED
 
 
 def hota_of(est, ref=TRUTH):

@@ -208,7 +208,7 @@ class TestPictures:
 def test_importing_draws_nothing_in():
     """Neither Matplotlib nor pandas comes with the import; drawing does not bring pyplot's global state."""
     code = (
-        "import sys; from psotrack.evaluation import plots, tables; import psotrack.trajectory_files;"
+        "import sys; from psotrack.evaluation import plots, tables; import psotrack.trajectories.files;"
         "assert not {'matplotlib', 'pandas', 'pyarrow'} & set(sys.modules), set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -11,16 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from windows import best_place, cut_at
 
-from psotrack.fitness import (
+from psotrack.silhouettes import summed_area_table
+from psotrack.tracking import ScoreSettings
+from psotrack.tracking.fitness import (
     PAPER_SCORE,
-    ScoreSettings,
     camera_scores,
     drone_fitness,
     filled,
     joint_fitness,
-    scene,
+    score_inputs,
 )
-from psotrack.summed_area import summed_area_table
 
 #: 64 x 48 pixels, 20 pixels a metre: a drone of 1 m x 0.5 m at the origin has columns 22 to 42, rows 19 to 29.
 FAR = {"image_size_wh": (64, 48), "pixels_per_m": 20.0}
@@ -49,7 +49,7 @@ def evaluate(function, rig, images, position_m, size_m=SIZE_M, settings=ONE_BOX)
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _compiled(function, settings, images, cameras, position_m, size_m):
-    return function(scene(cameras, size_m, summed_area_table(images), settings), position_m)
+    return function(score_inputs(cameras, size_m, summed_area_table(images), settings), position_m)
 
 
 def score_at(image, x_px=0.0, settings=ONE_BOX):
@@ -301,7 +301,7 @@ def _gradients(cameras, images, position_m, size_m, offset_m):
     """Fitness of both drones, and the gradients of its sum in position, size and offset."""
 
     def each(position_m, size_m, offset_m):
-        view = scene(cameras, size_m, summed_area_table(images), SOFT, offset_m)
+        view = score_inputs(cameras, size_m, summed_area_table(images), SOFT, offset_m)
         fitness = drone_fitness(view, position_m)
         return fitness.sum(), fitness
 
@@ -346,7 +346,7 @@ def test_gradients_are_those_of_the_oracle(images, shift_m):
 def _gradients_at(images, cameras, places_m, size_m, offset_m):
     def one(position_m):
         def total(position_m, size_m, offset_m):
-            view = scene(cameras, size_m, summed_area_table(images), SOFT, offset_m)
+            view = score_inputs(cameras, size_m, summed_area_table(images), SOFT, offset_m)
             return joint_fitness(view, position_m)
 
         return jax.value_and_grad(total, (0, 1, 2))(position_m, size_m, offset_m)

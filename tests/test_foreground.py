@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from psotrack.errors import SettingsError
-from psotrack.foreground import (
+from psotrack.silhouettes.foreground import (
     ForegroundSettings,
     classify,
     coverage,

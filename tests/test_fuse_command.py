@@ -10,8 +10,8 @@ from test_inside_out_fusing import recording, rms, unseen, without
 
 from psotrack.cli.fuse import fuse
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
-from psotrack.inside_out.camera_path import write_camera_path
-from psotrack.trajectory_files import read_trajectories, write_trajectories
+from psotrack.inside_out import write_camera_path
+from psotrack.trajectories import read_trajectories, write_trajectories
 
 
 @pytest.fixture(scope="module")

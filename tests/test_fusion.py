@@ -4,13 +4,10 @@ import jax
 import numpy as np
 import pytest
 
-from psotrack import sizes
-from psotrack.fitness import ScoreSettings
-from psotrack.fusion import ALIKE, fused
+from psotrack.fusion import fuse_tracks
+from psotrack.fusion.fusion import ALIKE
 from psotrack.settings import TrackSettings
-from psotrack.sizes import Looks
-from psotrack.tracker import COMMON, TrackerInfo
-from psotrack.tracking import Arrival, Tracked
+from psotrack.tracking import COMMON, Arrival, ScoreSettings, SizeMeasurements, Tracked, TrackerInfo, sizes
 from psotrack.trajectories import Status
 
 FPS, FRAMES = 25.0, 200
@@ -48,7 +45,7 @@ def tracked(truth_m, std_m, *, seed, factor=1.0, hidden=(), offset_m=(0.0, 0.0, 
     num_drones, windows = truth_m.shape[1], len(SETTINGS.windows)
     size_m = np.full((num_drones, 3), 0.4, np.float32)
     learned = sizes.init(size_m, np.zeros(size_m.shape, bool), ScoreSettings(windows=SETTINGS.windows))
-    looks = Looks(np.full(truth_m.shape, np.nan), np.full((FRAMES, num_drones, windows), np.nan))
+    looks = SizeMeasurements(np.full(truth_m.shape, np.nan), np.full((FRAMES, num_drones, windows), np.nan))
     return Tracked(info, jax.tree.map(np.asarray, learned), looks, tuple(arrivals), 0.5)
 
 
@@ -56,7 +53,7 @@ def both(truth_m, swarm=None, lines=None, settings=SETTINGS, **how):
     first = tracked(truth_m, SWARM_STD_M, seed=0, **(swarm or {}))
     # Whose covariances the fusion takes to be of the cameras' disagreement alone.
     second = tracked(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON, **(lines or {}))
-    return first, second, fused(first, second, settings, fps=FPS, **how)[0]
+    return first, second, fuse_tracks(first, second, settings, fps=FPS, **how)[0]
 
 
 def test_information_adds_up():
@@ -70,7 +67,7 @@ def test_information_adds_up():
     # The spread of 600 is known to 4 % so.
     np.testing.assert_allclose(std_m, expected_m, rtol=0.1)
     # The lines have another error, that of the offset of the middles.
-    _, middles = fused(first, second, SETTINGS, fps=FPS)
+    _, middles = fuse_tracks(first, second, SETTINGS, fps=FPS)
     expected_m2 = 1 / (1 / SWARM_STD_M**2 + 1 / (LINES_STD_M**2 + middles.std_m**2))
     diagonal_m2 = np.diagonal(together.info.measured_covariance_m2, axis1=-2, axis2=-1)
     np.testing.assert_allclose(np.median(diagonal_m2, axis=0), expected_m2, rtol=1e-9)
@@ -92,7 +89,7 @@ def test_the_offset_of_the_middles_is_told_with_its_error():
     second = tracked(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON, offset_m=off_m)
     # A tenth of the frames has another drone in its place.
     second.info.measured_m[20:40, 0] += 0.2
-    _, middles = fused(first, second, SETTINGS, fps=FPS)
+    _, middles = fuse_tracks(first, second, SETTINGS, fps=FPS)
     # A median of 200 differences, of errors that do not last.
     expected_m = np.sqrt(np.pi / 2 * (SWARM_STD_M**2 + LINES_STD_M**2) / FRAMES)
     # Never less, but for what is clipped of the tails; what looks as if it lasted, by chance, makes it more.
@@ -107,7 +104,7 @@ def test_an_offset_from_errors_that_last_is_known_less_well():
     second = tracked(truth_m, np.full(3, 1e-6), seed=1, factor=1 / COMMON)
     lasting_m = np.repeat(np.random.default_rng(2).normal(0.0, 0.01, (FRAMES // 10, 1, 3)), 10, axis=0)
     second.info.measured_m[:] += lasting_m
-    _, middles = fused(first, second, SETTINGS, fps=FPS)
+    _, middles = fuse_tracks(first, second, SETTINGS, fps=FPS)
     # 20 independent errors, not 200: from so few the spread is known to a quarter.
     expected_m = np.sqrt(np.pi / 2 / 20) * 0.01
     np.testing.assert_allclose(middles.std_m / expected_m, 1.0, atol=0.6)
@@ -116,7 +113,7 @@ def test_an_offset_from_errors_that_last_is_known_less_well():
 def test_who_is_seen_by_one_alone_has_no_offset():
     truth_m = paths(3)
     swarm, lines = tracked(truth_m[:, :2], SWARM_STD_M, seed=0), tracked(truth_m[:, 1:], LINES_STD_M, seed=1)
-    _, middles = fused(swarm, lines, SETTINGS, fps=FPS)
+    _, middles = fuse_tracks(swarm, lines, SETTINGS, fps=FPS)
     assert np.isfinite(middles.off_m).all(axis=-1).tolist() == [False, True, False]
     np.testing.assert_array_equal(np.isnan(middles.off_m), np.isnan(middles.std_m))
 
@@ -125,7 +122,7 @@ def test_a_place_by_the_lines_alone_is_as_uncertain_as_the_offset_makes_it():
     hidden = [(0, 50, 100)]
     first = tracked(paths(1), SWARM_STD_M, seed=0, hidden=hidden)
     second = tracked(paths(1), LINES_STD_M, seed=1, factor=1 / COMMON)
-    together, middles = fused(first, second, SETTINGS, fps=FPS)
+    together, middles = fuse_tracks(first, second, SETTINGS, fps=FPS)
     diagonal_m2 = np.diagonal(together.info.measured_covariance_m2[60, 0])
     np.testing.assert_allclose(diagonal_m2, LINES_STD_M**2 + middles.std_m[0] ** 2, rtol=1e-9)
 
@@ -133,7 +130,7 @@ def test_a_place_by_the_lines_alone_is_as_uncertain_as_the_offset_makes_it():
 def test_errors_of_the_same_foreground_say_less():
     """The best linear estimate of two that err alike: less sure than that of two that do not."""
     first, second, apart = both(paths(2))
-    alike, middles = fused(first, second, SETTINGS, fps=FPS, same_foreground=True)
+    alike, middles = fuse_tracks(first, second, SETTINGS, fps=FPS, same_foreground=True)
     # Axis by axis the least variance of a weighted mean (Lagrange): 1 / (1' S^-1 1).
     one_m, other_m = SWARM_STD_M + 0 * middles.std_m, np.hypot(LINES_STD_M, middles.std_m)
     cross_m2 = ALIKE * one_m * other_m
@@ -148,8 +145,8 @@ def test_errors_of_the_same_foreground_say_less():
 def test_what_only_the_blobs_of_the_same_foreground_show_is_no_drone():
     truth_m = paths(3)
     swarm, lines = tracked(truth_m[:, :2], SWARM_STD_M, seed=0), tracked(truth_m, LINES_STD_M, seed=1)
-    assert fused(swarm, lines, SETTINGS, fps=FPS)[0].info.status.shape[1] == 3
-    assert fused(swarm, lines, SETTINGS, fps=FPS, same_foreground=True)[0].info.status.shape[1] == 2
+    assert fuse_tracks(swarm, lines, SETTINGS, fps=FPS)[0].info.status.shape[1] == 3
+    assert fuse_tracks(swarm, lines, SETTINGS, fps=FPS, same_foreground=True)[0].info.status.shape[1] == 2
 
 
 def test_where_one_does_not_see_a_drone_the_other_one_does():
@@ -181,7 +178,7 @@ def test_drones_that_only_the_lines_know_come_after_the_others():
     swarm = tracked(truth_m[:, [2, 0]], SWARM_STD_M, seed=0, arrivals=[Arrival(3, 1, again=False)])
     arrivals = [Arrival(9, 0, again=False), Arrival(20, 1, again=True)]
     lines = tracked(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON, arrivals=arrivals)
-    together, _ = fused(swarm, lines, SETTINGS, fps=FPS)
+    together, _ = fuse_tracks(swarm, lines, SETTINGS, fps=FPS)
     np.testing.assert_allclose(together.info.measured_m, truth_m[:, [2, 0, 1]], atol=0.1)
     # The first of the lines' arrivals is of a drone that the swarm knows.
     assert together.arrivals == (Arrival(3, 1, again=False), Arrival(20, 2, again=True))
@@ -194,7 +191,7 @@ def test_where_they_disagree_it_is_the_swarm_that_counts():
     swarm = tracked(truth_m, SWARM_STD_M, seed=0)
     lines = tracked(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON)
     lines.info.measured_m[80:90] += 0.5
-    together, _ = fused(swarm, lines, SETTINGS, fps=FPS)
+    together, _ = fuse_tracks(swarm, lines, SETTINGS, fps=FPS)
     np.testing.assert_array_equal(together.info.measured_m[80:90], swarm.info.measured_m[80:90])
 
 
@@ -203,10 +200,10 @@ def test_one_of_them_may_find_nobody(who):
     truth_m = paths(2)
     some, nobody = tracked(truth_m, SWARM_STD_M, seed=0), tracked(truth_m[:, :0], SWARM_STD_M, seed=0)
     pair = (some, nobody) if who == "swarm" else (nobody, some)
-    together, _ = fused(*pair, SETTINGS, fps=FPS)
+    together, _ = fuse_tracks(*pair, SETTINGS, fps=FPS)
     np.testing.assert_array_equal(together.info.measured_m, some.info.measured_m)
 
 
 def test_nobody_may_find_anybody():
     nobody = tracked(paths(0), SWARM_STD_M, seed=0)
-    assert fused(nobody, nobody, SETTINGS, fps=FPS)[0].info.status.shape == (FRAMES, 0)
+    assert fuse_tracks(nobody, nobody, SETTINGS, fps=FPS)[0].info.status.shape == (FRAMES, 0)

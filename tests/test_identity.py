@@ -14,9 +14,9 @@ from scipy.special import logsumexp, softmax
 from scipy.stats import binom
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.identity import IdentityParams, Outcome, labellings, likeness, relabelled, resolve
+from psotrack.identity import IdentityParams, LabelOutcome, labellings, likeness, relabelled, resolve
+from psotrack.simulation import scenario
 from psotrack.simulation.flights import planning
-from psotrack.simulation.scenarios import scenario
 
 ENCOUNTER_M = 0.6
 PARAMS = IdentityParams(encounter_m=ENCOUNTER_M)
@@ -145,7 +145,7 @@ class TestTwoDrones:
         found = resolved(tracks)
         np.testing.assert_array_equal(found.order, tracks.truth)
         (encounter,) = found.encounters
-        assert encounter.outcome is Outcome.KEPT
+        assert encounter.outcome is LabelOutcome.KEPT
         assert encounter.drones == (0, 1)
         assert encounter.log_odds < np.log(0.01)
         # Errors of some hundredths shift the frame where tenths of a metre are the least.
@@ -159,7 +159,7 @@ class TestTwoDrones:
     def test_swapped_labels_are_mended(self, flight, frame, std_m):
         tracks = seen(flight(), std_m, exchanges=[(frame, (1, 0))])
         found = resolved(tracks)
-        assert outcomes(found) == [Outcome.SWAPPED]
+        assert outcomes(found) == [LabelOutcome.SWAPPED]
         assert found.encounters[0].log_odds > np.log(99)
         # 0.3 m apart and more, one frame tells; of 0.03 m, two.
         assert (found.order != tracks.truth).any(axis=1).sum() <= 2
@@ -168,7 +168,7 @@ class TestTwoDrones:
     def test_who_hovers_together_is_ambiguous(self, exchanged):
         """Both are on one silhouette for more than a second: nobody can say who comes out on which side."""
         found = resolved(seen(merging(hovering()), exchanges=[(50, (1, 0))] * exchanged))
-        assert outcomes(found) == [Outcome.UNDECIDED]
+        assert outcomes(found) == [LabelOutcome.UNDECIDED]
         assert (found.order == [0, 1]).all()
         last = found.encounters[0].last_frame
         # Even odds, but for what is left of the course that they had more than a second ago: measured 0.41 to 0.62.
@@ -185,7 +185,7 @@ class TestTwoDrones:
         size_m[apart_m(flown_m) < 0.3] = 0.5
         tracks = seen(flown_m, exchanges=[(250, (1, 0))] * exchanged, size_m=size_m)
         found = resolved(tracks)
-        assert outcomes(found) == [Outcome.SWAPPED if exchanged else Outcome.KEPT]
+        assert outcomes(found) == [LabelOutcome.SWAPPED if exchanged else LabelOutcome.KEPT]
         # While they are one silhouette nobody can say which frame it was.
         apart = apart_m(flown_m) > 0.3
         np.testing.assert_array_equal(found.order[apart], tracks.truth[apart])
@@ -195,7 +195,7 @@ class TestTwoDrones:
         flown_m = np.concatenate([np.repeat(hovering()[:1], 200, axis=0), merging(hovering())])
         size_m = np.array([0.36, 0.36, 0.12]) + 0.01 * lasting(np.random.default_rng(2), (360, 2, 3))
         found = resolved(seen(flown_m, exchanges=[(250, (1, 0))] * exchanged, size_m=size_m))
-        assert outcomes(found) == [Outcome.UNDECIDED]
+        assert outcomes(found) == [LabelOutcome.UNDECIDED]
         assert abs(found.ambiguity[found.encounters[0].last_frame, 0] - 0.5) < 0.2
 
     def test_ambiguity_begins_with_the_encounter_and_ends_with_it(self):
@@ -216,7 +216,7 @@ class TestTwoDrones:
             was_measured[46:54, hidden] = False
             measured_m = np.where(was_measured[..., None], tracks.measured_m, np.nan)
             found = resolved(replace(tracks, was_measured=was_measured, measured_m=measured_m))
-            assert outcomes(found) == [Outcome.SWAPPED if exchanged else Outcome.KEPT]
+            assert outcomes(found) == [LabelOutcome.SWAPPED if exchanged else LabelOutcome.KEPT]
             # What is not measured is nobody's: only frames outside of the stretch count.
             assert (found.order == tracks.truth)[was_measured.all(axis=1)].all()
 
@@ -237,7 +237,7 @@ class TestTwoDrones:
         """For some tenths of a second both are seen in the same place; their course before tells, or nothing does."""
         tracks = seen(merging(passing(0.15)), exchanges=[(50, (1, 0))] * exchanged)
         found = resolved(tracks)
-        assert outcomes(found) == [Outcome.SWAPPED if exchanged else Outcome.KEPT]
+        assert outcomes(found) == [LabelOutcome.SWAPPED if exchanged else LabelOutcome.KEPT]
         np.testing.assert_array_equal(found.order[[0, -1]], tracks.truth[[0, -1]])
 
     def test_a_drone_that_appears_beside_another(self):
@@ -245,13 +245,13 @@ class TestTwoDrones:
         was_measured = tracks.was_measured.copy()
         was_measured[:48, 1] = False
         found = resolved(replace(tracks, was_measured=was_measured))
-        assert outcomes(found) == [Outcome.KEPT]
+        assert outcomes(found) == [LabelOutcome.KEPT]
         assert (found.order == [0, 1]).all()
 
     def test_a_meeting_that_does_not_end(self):
         tracks = seen(passing()[:51], exchanges=[(48, (1, 0))])
         found = resolved(tracks)
-        assert outcomes(found) == [Outcome.OPEN]
+        assert outcomes(found) == [LabelOutcome.OPEN]
         assert found.encounters[0].last_frame == 50
         np.testing.assert_array_equal(found.order, tracks.truth)
 
@@ -264,7 +264,7 @@ class TestTwoDrones:
         found = resolved(replace(tracks, was_measured=was_measured), params=params)
         (encounter,) = found.encounters
         assert encounter.last_frame == 49 + round(0.8 / DT_S)
-        assert encounter.outcome is not Outcome.SWAPPED
+        assert encounter.outcome is not LabelOutcome.SWAPPED
 
 
 def meeting_in_the_middle(drones, nearest_m=0.25, speed_m_s=1.0):
@@ -292,7 +292,7 @@ class TestMoreDrones:
         for encounter in found.encounters:
             one, other = encounter.drones
             mixed = permutation[one] == other or permutation[other] == one
-            assert encounter.outcome is (Outcome.SWAPPED if mixed else Outcome.KEPT)
+            assert encounter.outcome is (LabelOutcome.SWAPPED if mixed else LabelOutcome.KEPT)
 
     def test_two_exchanges_at_different_times(self):
         """Three tracks change places in two steps: each is mended where it was."""
@@ -332,9 +332,9 @@ class TestMoreDrones:
         found = resolved(tracks)
         np.testing.assert_array_equal(found.order, tracks.truth)
         (passed,) = (encounter for encounter in found.encounters if encounter.drones == (0, 2))
-        assert passed.outcome is Outcome.SWAPPED
+        assert passed.outcome is LabelOutcome.SWAPPED
         assert passed.last_frame < 70
-        assert found.encounters[-1].outcome is Outcome.OPEN
+        assert found.encounters[-1].outcome is LabelOutcome.OPEN
 
     @given(st.integers(0, 2**32 - 1))
     @settings(max_examples=4)
@@ -371,7 +371,9 @@ class TestMoreDrones:
         for frames in range(20, 300, 56):
             names = ("time_s", "measured_m", "covariance_m2", "was_measured")
             found = resolved(replace(tracks, **{name: getattr(tracks, name)[:frames] for name in names}))
-            still_open = [encounter for encounter in found.encounters if encounter.outcome is Outcome.OPEN]
+            still_open = [
+                encounter for encounter in found.encounters if encounter.outcome is LabelOutcome.OPEN
+            ]
             safe = min((encounter.first_frame for encounter in still_open), default=frames)
             np.testing.assert_array_equal(found.order[:safe], whole.order[:safe])
             np.testing.assert_array_equal(found.ambiguity[:safe], whole.ambiguity[:safe])

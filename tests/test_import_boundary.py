@@ -18,125 +18,99 @@ import pytest
 from helpers import ring_rig
 
 import psotrack
-from psotrack.summed_area import box_sum
-from psotrack.triangulation import triangulate
+from psotrack.geometry import triangulate
+from psotrack.silhouettes import box_sum
 
 PACKAGE = Path(psotrack.__file__).parent
 
-#: A module imports only from smaller depths. A folder is one room: its modules import one another freely.
-DEPTH = {
-    "__init__": 0,
-    "_typing": 0,
-    "compiled": 0,
-    "errors": -1,
-    "camera_names": 0,
-    "progress": 0,
-    "schema": 2,
-    "files": 1,
-    "aruco": 1,
-    "cameras": 1,
-    "crosses": 1,
-    "cross_poses": 2,
-    "motion": 1,
-    "refinement": 1,
-    "rotations": 1,
-    "summed_area": 1,
-    "swarm": 1,
-    "trajectories": 1,
-    "blobs": 2,
-    "boxes": 2,
-    "triangulation": 2,
-    "delimited": 2,
-    "foreground": 2,
-    "mocap": 3,
-    "processes": 2,
-    "smoothing": 2,
-    "tum": 2,
-    "unexplained": 3,
-    "trajectory_files": 2,
-    "video": 2,
-    "wandering": 1,
-    "claims": 3,
-    "shadows": 4,
-    "patches": 5,
-    "fitness": 6,
-    "correspondence": 3,
-    "detections": 3,
-    "evaluation": 3,
-    "identity": 3,
-    "initialisation": 4,
-    "paths": 3,
-    "image_fit": 2,
-    "reprojection": 3,
-    "newcomers": 5,
-    "lifecycle": 6,
-    "sequence": 3,
-    "camera_clocks": 4,
-    "detector": 4,
-    "detection_store": 5,
-    "time_shift": 4,
-    "synchronisation": 5,
-    "silhouette_store": 3,
-    "sizes": 7,
-    "tracker": 8,
-    "crew": 9,
-    "tracker_inputs": 9,
-    "datasets": 4,
-    "silhouettes": 4,
-    "contents": 4,
-    "labels": 2,
-    "training_data": 4,
-    "settings": 4,
-    "simulation": 5,
-    "starts": 5,
-    "calibration": 6,
-    "localisation": 7,
-    "tracking": 10,
-    "sightings": 5,
-    "doctor": 9,
-    "inside_out": 7,
-    "projection_lines": 11,
-    "fusion": 11,
-    "finishing": 11,
-    "methods": 12,
-    "pipeline": 13,
-    "demo": 14,
-    "sweep": 14,
-    "cli": 15,
-    "__main__": 16,
-}
-
-CORE = {
-    "camera_names",
+#: The rooms of the package, lowest first: a module imports only from its own room and from lower rooms.
+ROOMS = [
     "_typing",
-    "cameras",
-    "identity",
-    "image_fit",
-    "localisation",
-    "refinement",
+    "errors",
+    "support",
+    "geometry",
     "motion",
-    "sizes",
-    "smoothing",
-    "summed_area",
-    "swarm",
     "trajectories",
-    "boxes",
-    "claims",
-    "shadows",
-    "patches",
-    "fitness",
-    "reprojection",
-    "tracker",
-    "triangulation",
-}
-CORE_MAY_USE = {"jax", "jaxtyping", "numpy", "optax"}
+    "recordings",
+    "datasets",
+    "silhouettes",
+    "settings",
+    "detection",
+    "correspondence",
+    "clocks",
+    "initiation",
+    "tracking",
+    "projection_lines",
+    "fusion",
+    "identity",
+    "calibration",
+    "doctor",
+    "inside_out",
+    "methods",
+    "pipeline",
+    "evaluation",
+    "simulation",
+    "demo",
+    "sweep",
+    "cli",
+    "__main__",
+]
 
-#: Room -> rooms that it must not import, however their depths are.
+#: The rooms inside of `inside_out`, lowest first, in the same way.
+INSIDE_OUT = [
+    "camera_path",
+    "lens_files",
+    "marker_map",
+    "frames",
+    "detection",
+    "pose",
+    "filtering",
+    "localising",
+    "mapping",
+    "comparison",
+    "fusing",
+]
+
+#: At most so many files at the package's root.
+MOST_ROOT_FILES = 10
+
+#: Modules and rooms that may use JAX and NumPy only.
+CORE = {
+    "_typing",
+    "geometry.boxes",
+    "geometry.camera_names",
+    "geometry.cameras",
+    "geometry.image_fit",
+    "geometry.reprojection",
+    "geometry.triangulation",
+    "identity.groups",
+    "identity.labellings",
+    "identity.likeness",
+    "identity.records",
+    "identity.resolving",
+    "identity.settling",
+    "identity.tracks",
+    "motion",
+    "silhouettes.summed_area",
+    "tracking.fitness",
+    "tracking.occlusion",
+    "tracking.patches",
+    "tracking.refinement",
+    "tracking.shadows",
+    "tracking.sizes",
+    "tracking.swarm",
+    "tracking.tracker",
+    "tracking.vertex",
+    "trajectories.trajectories",
+}
+CORE_MAY_USE = {"jax", "jaxtyping", "lazy_loader", "numpy", "optax"}
+
+#: Module or room -> modules and rooms that it must not import, although the order of rooms allows it.
 STRANGERS = {
-    "swarm": {"fitness", "boxes", "cameras"},
-    "fitness": {"swarm"},
-    "simulation": {"boxes", "fitness", "tracker", "summed_area", "silhouettes", "foreground"},
-    "evaluation": {"tracker", "fitness", "boxes", "pipeline"},
+    "tracking.swarm": {"tracking.fitness", "geometry"},
+    "tracking.fitness": {"tracking.swarm"},
+    "simulation": {"geometry.boxes", "tracking", "silhouettes", "pipeline", "methods"},
+    "evaluation": {"tracking", "geometry", "pipeline", "methods"},
 }
 
 
@@ -165,63 +139,143 @@ def imports(source, package="psotrack"):
     return found
 
 
-def room_of(path):
-    """The room of a file relative to the package: its folder, or its own name."""
-    return path.parts[0].removesuffix(".py")
+def name_of(path):
+    """The dotted name of a file relative to the package: `tracking.swarm`, `tracking` for its `__init__`."""
+    return ".".join(part for part in path.with_suffix("").parts if part != "__init__")
+
+
+def is_within(name, places):
+    """Whether a dotted name is one of the places, or below one."""
+    return any(name == place or name.startswith(f"{place}.") for place in places)
+
+
+def source_of(name):
+    """`geometry.Camera` is in `geometry.cameras`: where a name that a room exports comes from."""
+    room, *rest = name.split(".")
+    return f"{room}.{EXPORTS[room][rest[0]]}" if rest and rest[0] in EXPORTS.get(room, {}) else name
+
+
+def exports():
+    """Room -> name -> the module of the room that it is from, read from the rooms' `__init__.pyi`."""
+    found = {}
+    for stub in PACKAGE.glob("*/__init__.pyi"):
+        tree = ast.parse(stub.read_text(encoding="utf-8"))
+        found[stub.parent.name] = {
+            alias.name: node.module
+            for node in tree.body
+            if isinstance(node, ast.ImportFrom)
+            for alias in node.names
+        }
+    return found
+
+
+EXPORTS = exports()
 
 
 def complaints(path, source):
-    """What a module at a path relative to the package does that it must not."""
-    room = room_of(path)
-    if room not in DEPTH:
-        return [f"{path}: not in the table of depths"]
-    found = imports(source, ".".join(["psotrack", *path.parts[:-1]]))
+    """The imports of a module, at a path relative to the package, that break the rules above."""
+    me = name_of(path) or "__init__"
+    room = me.split(".")[0]
+    if room == "__init__":
+        return []
+    if room not in ROOMS:
+        return [f"{path}: not in the list of rooms"]
     wrong = []
-    for name in sorted(found):
-        top, *rest = name.split(".")
+    for name in sorted(imports(source, ".".join(["psotrack", *path.parts[:-1]]))):
+        top, _, rest = name.partition(".")
         if top != "psotrack":
-            if room in CORE and top not in CORE_MAY_USE and top not in sys.stdlib_module_names:
+            if is_within(me, CORE) and top not in CORE_MAY_USE and top not in sys.stdlib_module_names:
                 wrong.append(f"{path}: the core imports {name}")
             continue
-        other = rest[0] if rest and rest[0] in DEPTH else "__init__"
-        if other in (room, "__init__") or (other == "__init__" and not rest):
+        other = rest.split(".")[0]
+        if other not in ROOMS:
             continue
-        if DEPTH[other] >= DEPTH[room]:
-            wrong.append(f"{path}: depth {DEPTH[room]} imports {other} of depth {DEPTH[other]}")
-        if other in STRANGERS.get(room, ()):
-            wrong.append(f"{path}: {room} does not know {other}")
+        if ROOMS.index(other) > ROOMS.index(room):
+            wrong.append(f"{path}: {room} imports {other}, a higher room")
+        if room == other == "inside_out":
+            mine, its = (part.split(".")[1] if "." in part else "" for part in (me, rest))
+            if {mine, its} <= set(INSIDE_OUT) and INSIDE_OUT.index(its) > INSIDE_OUT.index(mine):
+                wrong.append(f"{path}: inside_out.{mine} imports inside_out.{its}, a higher room")
+        origin = source_of(rest)
+        for knower, unknown in STRANGERS.items():
+            if is_within(me, {knower}) and is_within(origin, unknown):
+                wrong.append(f"{path}: {knower} does not know {origin}")
+        private = [part for part in rest.split(".")[1:] if part.startswith("_") and part != "__init__"]
+        if private and other != room:
+            wrong.append(f"{path}: {rest} is private to {other}")
     return wrong
 
 
-def test_every_module_keeps_to_the_graph():
+def test_every_module_keeps_to_the_order_of_rooms():
     wrong = []
     for path in sorted(PACKAGE.rglob("*.py")):
         wrong += complaints(path.relative_to(PACKAGE), path.read_text(encoding="utf-8"))
     assert wrong == []
 
 
-def test_the_table_has_no_rooms_that_are_gone():
-    rooms = {room_of(path.relative_to(PACKAGE)) for path in PACKAGE.rglob("*.py")}
-    assert set(DEPTH) <= rooms
+def test_the_lists_name_nothing_that_is_gone():
+    names = {name_of(path.relative_to(PACKAGE)) for path in PACKAGE.rglob("*.py")}
+    listed = {*ROOMS, *CORE, *STRANGERS, *(f"inside_out.{room}" for room in INSIDE_OUT)}
+    assert listed <= names
+    assert {name.split(".")[0] for name in names if name} <= set(ROOMS)
+
+
+def test_few_files_stand_at_the_root():
+    assert len(list(PACKAGE.glob("*.py"))) <= MOST_ROOT_FILES
+
+
+@pytest.mark.parametrize("room", sorted(EXPORTS))
+def test_a_room_exports_what_its_stub_says(room):
+    """Names are loaded when they are asked for: each of them must be there, and the room must say what it is for."""
+    module = importlib.import_module(f"psotrack.{room}")
+    assert set(dir(module)) >= set(EXPORTS[room])
+    for name in EXPORTS[room]:
+        assert getattr(module, name) is not None
+    assert len(module.__doc__) > 100
 
 
 @pytest.mark.parametrize(
     ("path", "source", "complaint"),
     [
-        ("boxes.py", "import cv2", "the core imports cv2"),
-        ("tracker.py", "def f():\n    from scipy.optimize import minimize", "the core imports scipy"),
-        ("cameras.py", "import matplotlib.pyplot as plt", "the core imports matplotlib.pyplot"),
-        ("swarm.py", "from psotrack.fitness import scene", "imports fitness of depth 6"),
-        ("swarm.py", "from psotrack import cameras", "does not know cameras"),
-        ("fitness.py", "import psotrack.swarm", "fitness does not know swarm"),
-        ("evaluation/metrics.py", "from .. import tracker", "imports tracker of depth 8"),
-        ("simulation/renderer.py", "from ..boxes import project_boxes", "simulation does not know boxes"),
+        ("geometry/boxes.py", "import cv2", "the core imports cv2"),
+        (
+            "tracking/tracker.py",
+            "def f():\n    from scipy.optimize import minimize",
+            "the core imports scipy",
+        ),
+        ("geometry/cameras.py", "import matplotlib.pyplot as plt", "the core imports matplotlib.pyplot"),
+        (
+            "geometry/cameras.py",
+            "from psotrack.recordings import Sequence",
+            "imports recordings, a higher room",
+        ),
+        ("geometry/cameras.py", "from psotrack import recordings", "imports recordings, a higher room"),
+        (
+            "tracking/swarm.py",
+            "from psotrack.tracking.fitness import camera_scores",
+            "does not know tracking.fitness",
+        ),
+        ("tracking/swarm.py", "from psotrack.geometry import Camera", "does not know geometry.cameras"),
+        ("tracking/fitness.py", "import psotrack.tracking.swarm", "does not know tracking.swarm"),
+        (
+            "tracking/chunks.py",
+            "from psotrack.evaluation import evaluate",
+            "imports evaluation, a higher room",
+        ),
+        (
+            "evaluation/metrics.py",
+            "from ..tracking import tracker",
+            "evaluation does not know tracking.tracker",
+        ),
+        ("simulation/renderer.py", "from ..geometry import project_boxes", "does not know geometry.boxes"),
         (
             "simulation/renderer.py",
-            "if True:\n    from psotrack import fitness as f",
-            "does not know fitness",
+            "if True:\n    from psotrack.tracking import fitness as f",
+            "does not know tracking",
         ),
-        ("novelty.py", "", "not in the table of depths"),
+        ("cli/track.py", "from psotrack.datasets._poses import read_poses", "private to datasets"),
+        ("inside_out/pose/fit.py", "from psotrack.inside_out.filtering.bank import init", "a higher room"),
+        ("novelty.py", "", "not in the list of rooms"),
     ],
 )
 def test_a_planted_import_is_found(path, source, complaint):
@@ -232,13 +286,14 @@ def test_what_is_allowed_is_not_complained_of():
     source = """
 from typing import TYPE_CHECKING
 import numpy as np
-from psotrack import __version__, swarm
-from psotrack.fitness import scene
+from psotrack import __version__
+from psotrack.tracking import swarm
+from psotrack.tracking.fitness import camera_scores
 if TYPE_CHECKING:
     import cv2
     from psotrack.pipeline import TrackSettings
 """
-    assert complaints(Path("tracker.py"), source) == []
+    assert complaints(Path("tracking/tracker.py"), source) == []
     assert (
         complaints(Path("evaluation/tables.py"), "from psotrack.evaluation.metrics import Evaluation") == []
     )

@@ -9,10 +9,11 @@ from helpers import ROOM_M, draw_coverage, ring_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from psotrack.blobs import MOST_BLOBS, Blobs, all_blobs, find_blobs
-from psotrack.cameras import CameraRig, project
-from psotrack.initialisation import choose_paths, find_drones, with_usual_size
-from psotrack.paths import propose_paths
+from psotrack.geometry import CameraRig, project
+from psotrack.initiation.initialisation import choose_paths, find_drones, with_usual_size
+from psotrack.initiation.paths import propose_paths
+from psotrack.silhouettes import all_blobs, find_blobs
+from psotrack.silhouettes.blobs import MOST_BLOBS, Blobs
 
 FPS = 25.0
 REDUCTION = 2

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.inside_out.camera_path import CameraPath
+from psotrack.inside_out import CameraPath
 from psotrack.inside_out.comparison import Statistics, compare, mean_rotation, wrapped_deg
 from psotrack.inside_out.comparison.clocks import at_times
 from psotrack.inside_out.comparison.plots import RECONSTRUCTED, REFERENCE, save_errors, save_paths

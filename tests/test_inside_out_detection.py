@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from psotrack.aruco import marker_dictionary
-from psotrack.cameras import camera, distort, undistort
+from psotrack.detection import marker_dictionary
 from psotrack.errors import SettingsError
+from psotrack.geometry import camera, distort, undistort
 from psotrack.inside_out.detection import MarkerDetector, refined_corners
 from psotrack.inside_out.detection.blending import blending_exponent
 

@@ -12,14 +12,13 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.inside_out.camera_path import CameraPath, Flag
+from psotrack.inside_out import CameraPath, Flag, PoseFilterParams, smooth
 from psotrack.inside_out.filtering import manifold as manifold
 from psotrack.inside_out.filtering import motion as pose_motion
 from psotrack.inside_out.filtering.path_rows import path_of, rows_of
 from psotrack.inside_out.filtering.pose_filter import (
-    Following,
+    FilterRun,
     MeasuredPose,
-    PoseFilterParams,
     advance,
     estimate,
     expected,
@@ -29,7 +28,6 @@ from psotrack.inside_out.filtering.pose_filter import (
     step,
     update,
 )
-from psotrack.inside_out.filtering.smoothing import smooth
 from psotrack.trajectories import Status
 
 FPS = 25.0
@@ -512,7 +510,7 @@ def test_a_path_is_its_rows() -> None:
 def test_frame_by_frame_one_learns_where_the_next_pose_should_be() -> None:
     raw, position_m, _ = flight(40, seed=19)
     params = PoseFilterParams()
-    following, rows = Following(), []
+    following, rows = FilterRun(), []
     for k, row in enumerate(rows_of(raw)):
         following = advance(following, row.time_s, params)
         told = expected(following, params)

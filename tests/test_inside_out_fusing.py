@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import multivariate_normal
 
 from psotrack.errors import InputError
-from psotrack.inside_out.camera_path import CameraPath
-from psotrack.inside_out.fusing import fuse
+from psotrack.inside_out import CameraPath, fuse
 from psotrack.inside_out.fusing.gating import gated
 from psotrack.inside_out.fusing.joint_filter import (
     Arm,

@@ -12,19 +12,26 @@ import pytest
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
-from psotrack.aruco import marker_dictionary
-from psotrack.calibration import lens_of_sensor, lens_of_view, write_rig
-from psotrack.cameras import camera, look_at, project, stack
+from psotrack.calibration import lens_of_sensor, lens_of_view
 from psotrack.cli.localise import localise as command
 from psotrack.datasets.dpjait import write_calibration, write_marker_corners
+from psotrack.detection import marker_dictionary
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.inside_out.camera_path import Flag, read_camera_path
-from psotrack.inside_out.frames import natural_key, open_source, read_ahead
+from psotrack.geometry import camera, look_at, project, stack, write_rig
+from psotrack.inside_out import (
+    Flag,
+    LocaliseSettings,
+    MarkerMap,
+    localise_video,
+    open_source,
+    read_camera_path,
+    read_marker_map,
+)
+from psotrack.inside_out.frames import natural_key, read_ahead
 from psotrack.inside_out.lens_files import read_lens, scaled
-from psotrack.inside_out.localising import LocaliseSettings, follow_markers, localise
-from psotrack.inside_out.marker_map import MarkerMap, read_marker_map
+from psotrack.inside_out.localising import follow_markers
+from psotrack.recordings import VideoWriter
 from psotrack.trajectories import Status
-from psotrack.video import VideoWriter
 
 SIZE_WH = (640, 480)
 FPS = 25.0
@@ -192,7 +199,7 @@ def test_a_video_tells_the_same_as_its_images(room, tmp_path):
 
 def test_frames_with_few_markers_or_none_are_ordinary_and_said(room, tmp_path):
     source = open_source(room.folder / "images", fps=FPS)
-    raw = localise(source, room.marker_map, LENS, LocaliseSettings(filter=None)).path
+    raw = localise_video(source, room.marker_map, LENS, LocaliseSettings(filter=None)).path
     assert (raw.status[[FEW, NONE]] == Status.LOST).all()
     assert raw.num_markers[[FEW, NONE]].tolist() == [3, 0]
     assert raw.flags[[FEW, NONE]].tolist() == [Flag.FEW_MARKERS, 0]
@@ -441,7 +448,9 @@ def test_ctrl_c_ends_a_live_stream_and_keeps_what_was_localised(room, tmp_path, 
 
 def test_a_stream_that_ends_has_ended(room, monkeypatch):
     monkeypatch.setattr(cv2, "VideoCapture", lambda device: Capture(room.images[:5]))
-    found = localise(open_source("rtsp://camera/1"), room.marker_map, LENS, LocaliseSettings(filter=None))
+    found = localise_video(
+        open_source("rtsp://camera/1"), room.marker_map, LENS, LocaliseSettings(filter=None)
+    )
     assert found.path.num_frames == 5
     assert not found.interrupted
     # Without stamps, times are when frames came.
@@ -454,7 +463,7 @@ def test_ctrl_c_in_a_recording_leaves_nothing(room, tmp_path, monkeypatch):
 
     monkeypatch.setattr("psotrack.inside_out.localising.locate", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        localise(open_source(room.video), room.marker_map, LENS)
+        localise_video(open_source(room.video), room.marker_map, LENS)
     out = tmp_path / "track.csv"
     result = run(room.video, "--markers", room.markers, "--camera", room.lens, "--out", out)
     assert result.exit_code != 0

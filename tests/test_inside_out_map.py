@@ -9,16 +9,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from psotrack.cameras import camera, look_at, project
 from psotrack.datasets.dpjait import read_marker_corners, write_marker_corners
 from psotrack.errors import InputError, SettingsError
-from psotrack.inside_out.mapping import build_map, own_frame
-from psotrack.inside_out.mapping.check import check_map
+from psotrack.geometry import camera, look_at, project
+from psotrack.inside_out import (
+    MarkerMap,
+    build_map,
+    check_map,
+    own_frame,
+    read_marker_map,
+    read_measured,
+    squares,
+)
 from psotrack.inside_out.mapping.scene import outward
-from psotrack.inside_out.mapping.sightings import SQUARE, Seen, sightings_of
-from psotrack.inside_out.mapping.squares import best_square, read_measured, squares
-from psotrack.inside_out.marker_map import MarkerMap, read_marker_map
-from psotrack.mocap import Markers, write_c3d
+from psotrack.inside_out.mapping.sightings import SQUARE, MarkersInView, sightings_of
+from psotrack.inside_out.mapping.squares import best_square
+from psotrack.recordings import Markers, write_c3d
 
 SIDE_M = 0.4
 
@@ -87,7 +93,7 @@ def seen_in(corners_m, lens, source, num_views, *, noise_px=0.0, seed=0):
             ):
                 ids.append(marker)
                 quads.append(pixels + noise_px * rng.standard_normal((4, 2)))
-        frames.append(Seen(source, view / 5, np.array(ids, int), np.array(quads).reshape(-1, 4, 2)))
+        frames.append(MarkersInView(source, view / 5, np.array(ids, int), np.array(quads).reshape(-1, 4, 2)))
     return frames
 
 
@@ -516,7 +522,7 @@ def test_wrong_identities_are_left_out():
     marker = np.where(wrong, rng.integers(1, 17, len(wrong)), honest.marker)
     # What comes twice in a view is left out where detections become sightings.
     frames = [
-        Seen(
+        MarkersInView(
             0, float(honest.time_s[view]), marker[honest.view == view], honest.corners_px[honest.view == view]
         )
         for view in range(honest.num_views)
@@ -530,7 +536,7 @@ def test_wrong_identities_are_left_out():
 
 
 def test_what_cannot_be_reached_is_not_placed():
-    lonely = Seen(0, 99.0, np.array([40]), np.array([[[10.0, 10], [50, 10], [50, 50], [10, 50]]]))
+    lonely = MarkersInView(0, 99.0, np.array([40]), np.array([[[10.0, 10], [50, 10], [50, 50], [10, 50]]]))
     found = sightings_of([*seen_in(ROOM, LENSES[0], 0, 20), lonely], LENSES[:1])
     built = build_map(found, {7: ROOM[7]})
     assert built.unplaced == (40,)
@@ -548,7 +554,7 @@ def test_unusable_known_markers():
     with pytest.raises(SettingsError, match="side_m: expected a number above 0"):
         own_frame(0.0)
     with pytest.raises(InputError, match="expected frames that show markers, found none in any frame"):
-        sightings_of([Seen(0, 0.0, np.array([], int), np.zeros((0, 4, 2)))], LENSES[:1])
+        sightings_of([MarkersInView(0, 0.0, np.array([], int), np.zeros((0, 4, 2)))], LENSES[:1])
 
 
 @pytest.mark.slow

@@ -11,9 +11,10 @@ from scipy.optimize import approx_fprime, least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
-from psotrack.cameras import camera, look_at, project
 from psotrack.errors import InputError, SettingsError
-from psotrack.inside_out.pose import Expected, PoseSettings, locate
+from psotrack.geometry import camera, look_at, project
+from psotrack.inside_out import PoseSettings
+from psotrack.inside_out.pose import Expected, locate
 from psotrack.inside_out.pose.equations import INSET_STD_PX, Noise, equations, seen_markers, summed
 from psotrack.inside_out.pose.fit import FALSE_ALARM
 

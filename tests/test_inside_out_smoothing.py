@@ -17,13 +17,12 @@ from test_inside_out_filter import (
 )
 
 from psotrack.errors import InputError
-from psotrack.inside_out.camera_path import Flag
+from psotrack.inside_out import Flag, PoseFilterParams, smooth
 from psotrack.inside_out.filtering import bank as pose_bank
 from psotrack.inside_out.filtering import motion as pose_motion
 from psotrack.inside_out.filtering import smoothing as pose_smoothing
 from psotrack.inside_out.filtering.path_rows import path_of, rows_of
-from psotrack.inside_out.filtering.pose_filter import PoseFilterParams, follow
-from psotrack.inside_out.filtering.smoothing import smooth
+from psotrack.inside_out.filtering.pose_filter import follow
 from psotrack.trajectories import Status
 
 

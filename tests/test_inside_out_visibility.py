@@ -8,9 +8,9 @@ import pytest
 from helpers import LENSES
 from scipy.spatial.transform import Rotation
 
-from psotrack.cameras import camera
+from psotrack.geometry import camera
+from psotrack.inside_out import MarkerMap
 from psotrack.inside_out.comparison.visibility import visible_markers
-from psotrack.inside_out.marker_map import MarkerMap
 
 #: At the origin, x to the right, y down, z ahead: a metre at one metre is 100 px, in an image of 201 x 101.
 LENS = camera(

@@ -17,16 +17,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from psotrack.cameras import camera, look_at, project
 from psotrack.cli.labels import labels
 from psotrack.datasets.dpjait import read_masks, read_sequence
+from psotrack.detection import LabelSettings, write_data_set
+from psotrack.detection.labels import box_corners, label_boxes
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
-from psotrack.labels import LabelSettings, box_corners, label_boxes
+from psotrack.geometry import camera, look_at, project
+from psotrack.recordings import read_frames
 from psotrack.simulation import scenario, simulate
 from psotrack.simulation.scenarios import Mesh
-from psotrack.training_data import write_data_set
 from psotrack.trajectories import Trajectories
-from psotrack.video import read_frames
 
 #: 100 x 80 pixels, 10 to the metre, from y = -1000 m: x is to the right, z is up.
 FAR = rig_of(far_camera(image_size_wh=(100, 80), pixels_per_m=10.0)).cameras

@@ -9,13 +9,20 @@ from helpers import ROOM_M, draw_coverage, float32, rig_of, ring_rig
 from scipy.linalg import expm
 from scipy.stats import multivariate_normal, norm
 
-from psotrack.boxes import extents, project_boxes
-from psotrack.cameras import project
-from psotrack.foreground import ForegroundSettings, foreground, learning_step
-from psotrack.lifecycle import NEW, NOBODY, Lost, arrivals_of, holes, lost_drones, recognised
-from psotrack.newcomers import Newcomer, newcomers
-from psotrack.triangulation import viewpoints
-from psotrack.unexplained import Room, known, rest
+from psotrack.geometry import extents, project, project_boxes, viewpoints
+from psotrack.initiation import (
+    NEW,
+    LostTracks,
+    TrackCandidate,
+    find_candidates,
+    find_false_tracks,
+    find_lost_tracks,
+    plan_starts,
+    reidentify,
+)
+from psotrack.initiation.reidentification import NOBODY
+from psotrack.initiation.residual_foreground import SearchVolume, known, rest
+from psotrack.silhouettes.foreground import ForegroundSettings, foreground, learning_step
 
 FPS = 25.0
 REDUCTION = 2
@@ -57,7 +64,7 @@ _DRAWN = {}
 
 def found_in(coverage, *known_m, size_m=SIZE_M, rig=RIG):
     known = np.stack(known_m, axis=1) if known_m else np.empty((len(coverage), 0, 3))
-    return newcomers(
+    return find_candidates(
         rig.cameras,
         coverage,
         known[: len(coverage)],
@@ -120,7 +127,7 @@ def test_where_no_drone_is_known_all_are_found(both):
 def test_a_drone_that_explains_nothing_hides_nobody(both):
     """The same track, but marked as not to be believed: both are found."""
     known = np.stack([ONE, OTHER], axis=1)
-    found = newcomers(
+    found = find_candidates(
         RIG.cameras,
         both,
         known,
@@ -256,7 +263,7 @@ def test_what_stands_still_is_marked():
 def test_what_known_drones_explain_is_their_ellipse_a_little_enlarged():
     """Against the ellipse's inequality at the middle of every cell; cells that its edge crosses may be either."""
     full = np.full((6, 90, 120), 255, np.uint8)
-    room = Room(RIG.cameras, viewpoints(RIG.cameras), ROOM_M, REDUCTION)
+    room = SearchVolume(RIG.cameras, viewpoints(RIG.cameras), ROOM_M, REDUCTION)
     drones = known(room, ONE[:1, None], SIZE_M[None])
     left = rest(full, drones, 0)
     seen = project_boxes(extents(float32(RIG.cameras), np.float32(SIZE_M)), np.float32(ONE[0]))
@@ -327,13 +334,13 @@ ROOM_M3 = float(np.prod(ROOM_M[1] - ROOM_M[0]))
 
 def newcomer(position_m=(0.0, 0.0, 1.0), velocity_m_s=(1.0, 0.0, 0.0), *, frame=0, span_m=0.5, moves=True):
     size = np.array([span_m, span_m, span_m / 2])
-    return Newcomer(frame, np.array(position_m, float), np.array(velocity_m_s, float), size, 5, moves)
+    return TrackCandidate(frame, np.array(position_m, float), np.array(velocity_m_s, float), size, 5, moves)
 
 
 def lost(*rows, left_m=()):
     """Rows of position, velocity, seconds and, where they differ, keywords span_m and doubtful."""
     full = [{"span_m": 0.5, "doubtful": False} | (row[3] if len(row) > 3 else {}) for row in rows]
-    return Lost(
+    return LostTracks(
         drone=10 + np.arange(len(rows)),
         position_m=np.array([row[0] for row in rows], float).reshape(-1, 3),
         velocity_m_s=np.array([row[1] for row in rows], float).reshape(-1, 3),
@@ -348,7 +355,7 @@ def lost(*rows, left_m=()):
 
 def who(found, gone, **keywords):
     keywords = {"fps": FPS, "bounds_m": ROOM_M, "max_speed_m_s": 6.0} | keywords
-    return recognised(tuple(found), gone, **keywords).tolist()
+    return reidentify(tuple(found), gone, **keywords).tolist()
 
 
 AHEAD = ((-0.5, 0.0, 1.0), (1.0, 0.0, 0.0), 0.5)
@@ -476,7 +483,7 @@ def test_a_hole_does_not_keep_a_track():
 
 
 def test_a_drone_that_was_tracked_elsewhere_at_the_same_time_is_another_one():
-    """Lost in frame 20 of the chunk, while the newcomer is there from frame 2 on: 0.7 s of both."""
+    """LostTracks in frame 20 of the chunk, while the newcomer is there from frame 2 on: 0.7 s of both."""
     here = ((0.3, 0.0, 1.0), (1.0, 0.0, 0.0), -20 / FPS)
     assert who([newcomer(frame=2)], lost(here)) == [NEW]
     assert who([newcomer(frame=18)], lost(here)) == [0]
@@ -552,7 +559,7 @@ def test_lost_drones_by_hand():
     position = np.zeros((12, 6, 3))
     position[..., 0] = frames[:, None]
     position[:, 4] = (1.0, 2.0, 0.1)
-    gone = lost_drones(position, position / 2, tracked, np.full((6, 3), 0.5), chunk_frames=4, fps=2.0)
+    gone = find_lost_tracks(position, position / 2, tracked, np.full((6, 3), 0.5), chunk_frames=4, fps=2.0)
     assert gone.drone.tolist() == [1, 2, 4]
     # The last frames in which they were tracked: 2, 9 and 1.
     np.testing.assert_array_equal(gone.position_m[:, 0], [2.0, 9.0, 1.0])
@@ -574,13 +581,13 @@ def test_a_track_in_whose_place_a_drone_was_is_a_hole():
     position[:, :, 1] += 0.01 * np.arange(12)[:, None] % 0.02
     tracked = np.isfinite(position[..., 0])
     size = np.tile([0.5, 0.5, 0.2], (4, 1))
-    assert holes(position, tracked, size).tolist() == [True, False, False, False]
+    assert find_false_tracks(position, tracked, size).tolist() == [True, False, False, False]
     still = np.zeros_like(position)
-    assert lost_drones(position, still, tracked, size, chunk_frames=4, fps=10.0).drone.tolist() == [1, 3]
+    assert find_lost_tracks(position, still, tracked, size, chunk_frames=4, fps=10.0).drone.tolist() == [1, 3]
     # Who lands is a drone even if it is never found exactly there; and nobody is a hole by itself.
-    assert holes(position[:, 1:], tracked[:, 1:], size[1:]).tolist() == [False, False, False]
-    assert holes(position[:, :1], tracked[:, :1], size[:1]).tolist() == [False]
-    assert holes(position[:, :0], tracked[:, :0], size[:0]).shape == (0,)
+    assert find_false_tracks(position[:, 1:], tracked[:, 1:], size[1:]).tolist() == [False, False, False]
+    assert find_false_tracks(position[:, :1], tracked[:, :1], size[:1]).tolist() == [False]
+    assert find_false_tracks(position[:, :0], tracked[:, :0], size[:0]).shape == (0,)
 
 
 def test_half_swallowed_a_drone_only_seems_to_move():
@@ -599,7 +606,7 @@ def test_half_swallowed_a_drone_only_seems_to_move():
     velocity[9, 3, 0] = 0.4
     velocity[8:10, 0, 0], velocity[:, 1, 0], velocity[9, 2, 0] = 0.5, 0.3, 0.05
     position[:, 2, 0] = np.minimum(0.1 * np.arange(12), 0.8)
-    gone = lost_drones(
+    gone = find_lost_tracks(
         position, velocity, history(*["x" * 10 + ".."] * 4), np.full((4, 3), 0.5), chunk_frames=4, fps=10.0
     )
     np.testing.assert_array_equal(gone.position_m[:, 0], [0.0, 0.27, 0.8, 0.0])
@@ -612,7 +619,7 @@ def test_arrivals_by_hand():
     found = (newcomer((1, 1, 1), frame=3), newcomer((2, 2, 2), frame=5, span_m=0.7), newcomer((3, 3, 3)))
     gone = lost(AHEAD, AHEAD)
     gone.drone[:] = (0, 2)
-    arrivals = arrivals_of(found, np.array([1, NEW, NOBODY]), gone, 4)
+    arrivals = plan_starts(found, np.array([1, NEW, NOBODY]), gone, 4)
     assert arrivals.begin_frame.tolist() == [-1, -1, 3, -1, 5]
     assert arrivals.begin_position_m.tolist() == [[0, 0, 0], [0, 0, 0], [1, 1, 1], [0, 0, 0], [2, 2, 2]]
     assert arrivals.begin_velocity_m_s[:, 0].tolist() == [0, 0, 1, 0, 1]
@@ -620,6 +627,6 @@ def test_arrivals_by_hand():
 
 
 def test_no_arrivals():
-    arrivals = arrivals_of((), np.empty(0, int), lost(), 2)
+    arrivals = plan_starts((), np.empty(0, int), lost(), 2)
     assert arrivals.begin_frame.tolist() == [-1, -1]
     assert arrivals.born_size_m.shape == (0, 3)

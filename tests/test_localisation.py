@@ -8,9 +8,10 @@ from helpers import draw_coverage, float32, ring_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from psotrack.fitness import ScoreSettings, camera_scores, scene
-from psotrack.localisation import SPAN, localise
-from psotrack.summed_area import summed_area_table
+from psotrack.silhouettes import summed_area_table
+from psotrack.tracking import ScoreSettings
+from psotrack.tracking.fitness import camera_scores, score_inputs
+from psotrack.tracking.vertex import SPAN, find_vertex
 
 REDUCTION = 4
 SIZE_M = np.array([[0.5, 0.5, 0.2]])
@@ -20,11 +21,11 @@ RIG = ring_rig(6, image_size_wh=(960, 720), coefficients=5)
 def view_of(truth_m, *, rig=RIG, size_m=SIZE_M):
     coverage = draw_coverage(rig, truth_m, size_m, REDUCTION)
     tables = summed_area_table(jnp.asarray(coverage))
-    return scene(float32(rig.cameras), float32(size_m), tables, ScoreSettings(reduction=REDUCTION))
+    return score_inputs(float32(rig.cameras), float32(size_m), tables, ScoreSettings(reduction=REDUCTION))
 
 
 def found(view, position_m, size_m=SIZE_M):
-    return jax.jit(localise)(view, *float32((np.asarray(position_m, float), size_m)))
+    return jax.jit(find_vertex)(view, *float32((np.asarray(position_m, float), size_m)))
 
 
 def test_it_is_the_least_squares_paraboloid():

@@ -10,16 +10,14 @@ import pytest
 from click.testing import CliRunner
 from test_inside_out_map import ROOM, bent, on_wall, recorded
 
-from psotrack.aruco import marker_dictionary
-from psotrack.calibration import write_rig
-from psotrack.cameras import camera, look_at, project, stack
 from psotrack.cli.map_markers import FOUND, map_markers
 from psotrack.datasets.dpjait import read_marker_corners, write_marker_corners
+from psotrack.detection import marker_dictionary
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
+from psotrack.geometry import camera, look_at, project, stack, write_rig
+from psotrack.inside_out import MarkerMap
 from psotrack.inside_out.lens_files import scaled
-from psotrack.inside_out.marker_map import MarkerMap
-from psotrack.mocap import write_c3d
-from psotrack.video import VideoWriter
+from psotrack.recordings import VideoWriter, write_c3d
 
 SIZE_WH = (960, 720)
 LENS = camera(

@@ -3,13 +3,13 @@
 import numpy as np
 from helpers import ROOM_M, ring_rig
 
-from psotrack.cameras import project
-from psotrack.detections import Detections
+from psotrack.correspondence import CameraSightings, from_detections
 from psotrack.evaluation import evaluate
+from psotrack.geometry import project
 from psotrack.projection_lines import follow
 from psotrack.projection_lines.parting import PART_SHARE, parted
+from psotrack.recordings import Detections
 from psotrack.settings import TrackSettings
-from psotrack.sightings import View, from_detections
 from psotrack.trajectories import Trajectories
 
 RIG = ring_rig(5, coefficients=4, image_size_wh=(1920, 1080))
@@ -35,7 +35,7 @@ def view_of(*boxes, noise_px=3.0):
     """Views of (cameras, 4) boxes each."""
     boxes = np.stack(boxes, axis=1)
     noise = np.full(boxes.shape[:2], noise_px)
-    return View((boxes[..., :2] + boxes[..., 2:]) / 2, boxes[..., 2:] - boxes[..., :2], noise)
+    return CameraSightings((boxes[..., :2] + boxes[..., 2:]) / 2, boxes[..., 2:] - boxes[..., :2], noise)
 
 
 def kept(view, camera):

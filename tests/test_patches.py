@@ -24,10 +24,11 @@ from windows import (
     pixels,
 )
 
-from psotrack.boxes import extents
-from psotrack.fitness import Scene, ScoreSettings, camera_scores, drone_fitness, filled
-from psotrack.patches import NUM_LEVELS, SIDE
-from psotrack.summed_area import box_sum
+from psotrack.geometry import extents
+from psotrack.silhouettes import box_sum
+from psotrack.tracking import ScoreSettings
+from psotrack.tracking.fitness import ScoreInputs, camera_scores, drone_fitness, filled
+from psotrack.tracking.patches import NUM_LEVELS, SIDE
 
 #: At the middle, beside, over the left upper and right lower borders in most cameras, and out of all images.
 PLACES_M = np.array([[0.01, 0, 0.02], [0.53, 0, 0.21], [-1.213, 0, 0.83], [1.24, 0, -0.87], [40.0, 0, 3.0]])
@@ -237,7 +238,7 @@ def test_gradients_are_those_of_finite_differences():
     assert patches.clear.min() < 0.9
     with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
         windows = jax.tree.map(jnp.asarray, patches)
-        view = Scene(extents(RIG.cameras, SMALL_M), windows, ScoreSettings(reduction=REDUCTION))
+        view = ScoreInputs(extents(RIG.cameras, SMALL_M), windows, ScoreSettings(reduction=REDUCTION))
 
         @jax.jit
         def total(position_m):

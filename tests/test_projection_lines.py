@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from helpers import ROOM_M, ring_rig
 
-from psotrack.cameras import project
-from psotrack.detections import Detections
+from psotrack.correspondence import from_detections
 from psotrack.evaluation import evaluate
+from psotrack.geometry import project
 from psotrack.projection_lines import follow, start_of
+from psotrack.recordings import Detections
 from psotrack.settings import TrackSettings
-from psotrack.sightings import from_detections
 from psotrack.trajectories import Status, Trajectories
 
 FPS = 25.0

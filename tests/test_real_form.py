@@ -10,15 +10,14 @@ import pytest
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
-from psotrack.cameras import project
 from psotrack.cli.as_real import as_real
 from psotrack.datasets.dpjait import read_detections, read_mocap_markers, read_poses, read_sequence
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.mocap import body_trajectories, read_c3d
-from psotrack.simulation import replaced, scenario, simulate
-from psotrack.simulation.real_form import SERIALS, write_as_real
+from psotrack.geometry import project
+from psotrack.recordings import body_trajectories, read_c3d, read_frames
+from psotrack.simulation import replaced, scenario, simulate, write_as_real
+from psotrack.simulation.real_form import SERIALS
 from psotrack.trajectories import Status
-from psotrack.video import read_frames
 
 NUM_FRAMES, OFFSET_S = 25, 0.377
 

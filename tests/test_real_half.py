@@ -7,8 +7,8 @@ import pytest
 from click.testing import CliRunner
 
 from psotrack.cli import cli
-from psotrack.simulation import replaced, scenario, simulate
-from psotrack.simulation.real_form import SERIALS, write_as_real
+from psotrack.simulation import replaced, scenario, simulate, write_as_real
+from psotrack.simulation.real_form import SERIALS
 
 pytestmark = pytest.mark.slow
 

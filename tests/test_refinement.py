@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from psotrack.refinement import STEP_M, climb
+from psotrack.tracking.refinement import STEP_M, climb
 
 PEAK_M = np.array([[0.10, -0.20, 1.00], [0.50, 0.40, 1.50]])
 LOW_M, HIGH_M = (np.full((2, 3), value, np.float32) for value in (-3.0, 3.0))

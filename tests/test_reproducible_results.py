@@ -15,12 +15,11 @@ import pytest
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.evaluation import Evaluation, evaluate
 from psotrack.pipeline import track_sequence
-from psotrack.sequence import Sequence
+from psotrack.recordings import Sequence
 from psotrack.settings import TrackSettings
-from psotrack.silhouette_store import SilhouetteSettings
+from psotrack.silhouettes import SilhouetteSettings
 from psotrack.simulation import simulate
-from psotrack.trajectories import Trajectories
-from psotrack.trajectory_files import write_trajectories
+from psotrack.trajectories import Trajectories, write_trajectories
 
 
 @dataclass(frozen=True)

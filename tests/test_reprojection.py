@@ -12,11 +12,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
-from psotrack.cameras import camera, look_at, project, undistort
 from psotrack.errors import SettingsError
-from psotrack.image_fit import project_with_jacobian
-from psotrack.reprojection import reconstruct
-from psotrack.triangulation import triangulate
+from psotrack.geometry import camera, look_at, project, reconstruct, triangulate, undistort
+from psotrack.geometry.image_fit import project_with_jacobian
 
 
 def points_in_room(*shape, seed=0):

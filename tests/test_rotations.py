@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from psotrack.rotations import cross_matrices, rotation_matrices
+from psotrack.geometry import cross_matrices, rotation_matrices
 
 
 def product(left, right):

@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psotrack.cameras import camera, stack
 from psotrack.errors import InputError, SettingsError
-from psotrack.sequence import Sequence
-from psotrack.video import VideoInfo
+from psotrack.geometry import camera, stack
+from psotrack.recordings import Sequence, VideoInfo
 
 NAMES = ("a", "b", "c", "d", "e")
 

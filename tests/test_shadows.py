@@ -12,12 +12,11 @@ import pytest
 from helpers import draw_coverage, float32, ring_rig
 from windows import best_place, claimed_pixels, cut_at, evaluate, pixels
 
-from psotrack import sizes
-from psotrack.boxes import extents, project_boxes
-from psotrack.cameras import project, undistort
-from psotrack.claims import CLAIM, claims_on
-from psotrack.fitness import ScoreSettings, drone_fitness
-from psotrack.shadows import CAST, LOW, low, shadowed
+from psotrack.geometry import extents, project, project_boxes, undistort
+from psotrack.tracking import ScoreSettings, sizes
+from psotrack.tracking.fitness import drone_fitness
+from psotrack.tracking.occlusion import CLAIM, claims_on
+from psotrack.tracking.shadows import CAST, LOW, low, shadowed
 
 REDUCTION = 2
 #: A silhouette's pixel is 2.4 cm in the middle of the room.
@@ -54,7 +53,7 @@ def drawn(position_m, lamps=()):
 def size_m():
     """What the tracker takes the drone's size for: learned where it is high."""
     high = at(1.5)[None, None]
-    looks = sizes.look(
+    looks = sizes.measure_sizes(
         jnp.asarray(drawn(high[0, 0])[None]),
         *float32((high,)),
         jnp.ones((1, 1), bool),

@@ -3,9 +3,9 @@
 import numpy as np
 from helpers import draw_coverage, ring_rig
 
-from psotrack.cameras import project
-from psotrack.detections import Detections
-from psotrack.sightings import from_detections, from_silhouettes
+from psotrack.correspondence import from_detections, from_silhouettes
+from psotrack.geometry import project
+from psotrack.recordings import Detections
 from psotrack.silhouettes import Silhouettes
 
 RIG = ring_rig(8, coefficients=4, image_size_wh=(1920, 1080))

@@ -20,15 +20,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from psotrack import silhouette_store
-from psotrack.cameras import camera, look_at, stack
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
-from psotrack.foreground import coverage, foreground
-from psotrack.processes import map_in_processes
-from psotrack.progress import Advance
-from psotrack.sequence import Sequence
-from psotrack.silhouettes import Silhouettes, SilhouetteSettings, compute
-from psotrack.video import VideoWriter, probe, read_frames
+from psotrack.geometry import camera, look_at, stack
+from psotrack.recordings import Sequence, VideoWriter, probe, read_frames
+from psotrack.silhouettes import Silhouettes, compute
+from psotrack.silhouettes import store as silhouette_store
+from psotrack.silhouettes.computation import SilhouetteSettings
+from psotrack.silhouettes.foreground import coverage, foreground
+from psotrack.support import Advance, map_in_processes
 
 NUM_FRAMES = 30
 SIZE_WH = (162, 118)  # no multiple of 4
@@ -421,7 +420,7 @@ def test_ctrl_c_leaves_nothing(folder: Path, tmp_path: Path) -> None:
         folder,
         tmp_path / "cache",
         # Workers that are slow to clear up are not made to end: how long that takes is nothing to this test.
-        before="from psotrack import processes; processes._GRACE_S = 3600",
+        before="from psotrack.support import processes; processes._GRACE_S = 3600",
         fate="os.kill(0, signal.SIGINT)",  # as a terminal does: to the workers too
         after_frames=1,
     )
@@ -463,7 +462,9 @@ def test_full_disk(folder: Path, tmp_path: Path) -> None:
 
 
 def test_workers_do_not_import_jax() -> None:
-    program = "import sys, psotrack.silhouette_store, psotrack.processes; sys.exit('jax' in sys.modules)"
+    program = (
+        "import sys, psotrack.silhouettes.store, psotrack.support.processes; sys.exit('jax' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", program]).returncode == 0
 
 

@@ -18,7 +18,6 @@ import pytest
 from placed_drones import drone_masks
 
 from psotrack import __version__
-from psotrack.cameras import project
 from psotrack.datasets.dpjait import (
     DETECTIONS,
     MARKER_CORNERS,
@@ -27,12 +26,12 @@ from psotrack.datasets.dpjait import (
     read_mocap_markers,
     read_sequence,
 )
-from psotrack.detections import read_detections
 from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.geometry import project
+from psotrack.recordings import VideoWriter, probe, read_detections, read_frames
 from psotrack.simulation import CameraRenderer, build, replaced, scenario, segments, simulate
 from psotrack.simulation.imaging.onboard import OnboardRenderer
 from psotrack.simulation.unfinished import unfinished
-from psotrack.video import VideoWriter, probe, read_frames
 
 NAME = "S02_D4_A"
 SMALL = {"num_frames": 3, "scale": 0.1}

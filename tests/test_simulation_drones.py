@@ -12,8 +12,8 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from psotrack.cameras import project
 from psotrack.errors import InputError, SettingsError
+from psotrack.geometry import project
 from psotrack.simulation import CameraRenderer, build, scenario
 from psotrack.simulation.scenarios import Mesh, Rotor
 from psotrack.simulation.world import drones, shapes

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from placed_drones import cube, drone_masks, pixel_of, straight_flight, with_drones
 
-from psotrack.cameras import project
+from psotrack.geometry import project
 from psotrack.simulation import CameraRenderer, build, scenario
 from psotrack.simulation.flights.motion import Heading
 from psotrack.simulation.imaging import reflections, sensor, shadows

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import SettingsError
+from psotrack.simulation import Scenario, preset_names, replaced, scenario, write_recording
 from psotrack.simulation.flights.motion import GRAVITY_M_S2, quaternions_wxyz
 from psotrack.simulation.flights.planning import frame_times_s, plan
-from psotrack.simulation.flights.recordings import write_recording
 from psotrack.simulation.scenarios import (
     Crossing,
     Drone,
-    Following,
+    FollowingFlight,
     Formation,
     Harmonic,
     Harmonics,
@@ -24,12 +24,8 @@ from psotrack.simulation.scenarios import (
     NearPass,
     Orbit,
     Recording,
-    Scenario,
     Variation,
     Waypoints,
-    preset_names,
-    replaced,
-    scenario,
 )
 
 S02 = scenario("S02_D4_A")
@@ -44,7 +40,7 @@ EVERY_KIND = (
         other=7, distance_m=0.7, side=(0.0, 0.0, -2.0), swing_m=(1.1, 0.4, 0.0), period_s=5.1, phase_deg=33.0
     ),
     Formation(leader=1, offset_m=(0.0, 0.9, 0.2)),
-    Following(leader=2, delay_s=1.3),
+    FollowingFlight(leader=2, delay_s=1.3),
     Harmonics(
         centre_m=(0.0, 0.1, 1.2),
         terms=(
@@ -192,7 +188,7 @@ def test_a_crossing_goes_straight_from_end_to_end_and_rests_at_both():
 
 
 def test_a_formation_keeps_its_offset_and_a_follower_its_delay_along_a_chain(every_kind):
-    first, second, third = (every_kind[kind] for kind in ("NearPass", "Formation", "Following"))
+    first, second, third = (every_kind[kind] for kind in ("NearPass", "Formation", "FollowingFlight"))
     np.testing.assert_allclose(
         second.position_m(TIME_S) - first.position_m(TIME_S), np.tile([0.0, 0.9, 0.2], (301, 1)), atol=1e-12
     )
@@ -262,7 +258,7 @@ def test_a_recording_replays_whatever_the_seed_and_others_fly_relative_to_it(tmp
         )
     with pytest.raises(SettingsError, match=r"r.csv: expected a recording of at least "):
         plan(scene_of(replay, num_frames=300), 0)
-    behind = Following(leader=1, delay_s=1.5)
+    behind = FollowingFlight(leader=1, delay_s=1.5)
     plan(scene_of(msgspec.structs.replace(replay, start_s=1.5), behind), 0)
     with pytest.raises(
         SettingsError, match=r"r.csv: expected a start_s of at least 1.5 s, found 1 s; who foll"
@@ -455,11 +451,11 @@ POINTS = Waypoints(points_m=((0.0, 0.0, 1.0), (1.0, 0.0, 1.0), (0.0, 1.0, 1.0)),
     ("records", "sentence"),
     [
         ((ORBIT, Formation(leader=3, offset_m=(0, 0, 1))), r"drones\[1\].flight.leader: .* 1 to 2, found 3$"),
-        ((ORBIT, Following(leader=9, delay_s=1.0)), r"drones\[1\].flight.leader: .* 1 to 2, found 9$"),
+        ((ORBIT, FollowingFlight(leader=9, delay_s=1.0)), r"drones\[1\].flight.leader: .* 1 to 2, found 9$"),
         ((ORBIT, msgspec.structs.replace(NEAR, other=5)), r"drones\[1\].flight.other: .* 1 to 2, found 5$"),
         ((NEAR,), r"drones\[0\].flight.other: .* in a ring, found drones 1 -> 1$"),
         (
-            (Formation(leader=2, offset_m=(0, 0, 1)), Following(leader=3, delay_s=1.0), NEAR, ORBIT),
+            (Formation(leader=2, offset_m=(0, 0, 1)), FollowingFlight(leader=3, delay_s=1.0), NEAR, ORBIT),
             r"drones\[2\].flight.other: .* in a ring, found drones 1 -> 2 -> 3 -> 1$",
         ),
         (

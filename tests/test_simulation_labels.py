@@ -28,7 +28,7 @@ from psotrack.errors import InputError
 from psotrack.simulation import CameraRenderer, build, replaced, scenario
 from psotrack.simulation.flights.formulas import HarmonicFlight
 from psotrack.simulation.flights.motion import Heading
-from psotrack.simulation.imaging.raster import View, pinhole
+from psotrack.simulation.imaging.raster import RasterView, pinhole
 from psotrack.simulation.labels.detector import detect, iou
 from psotrack.simulation.labels.masks import Silhouette, silhouettes
 from psotrack.simulation.labels.mocap import mocap_markers_m
@@ -392,7 +392,7 @@ def test_broken_archives_and_images_are_named(tmp_path):
 def seen_as(scene, xyxy, number=1, share=1.0):
     """A drone that is seen as a full rectangle, that share of its whole."""
     x0, y0, x1, y1 = xyxy
-    window = View(pinhole(scene.rig.cameras[0]), x0, y0, x1 - x0, y1 - y0)
+    window = RasterView(pinhole(scene.rig.cameras[0]), x0, y0, x1 - x0, y1 - y0)
     return Silhouette(number, window, np.ones(window.shape, bool), round((x1 - x0) * (y1 - y0) / share))
 
 

@@ -15,9 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from psotrack import cli
 from psotrack.errors import InputError, SettingsError
+from psotrack.simulation import space_in
 from psotrack.simulation.flights import devices
 from psotrack.simulation.flights.devices import GamepadDevice, KeyboardDevice, ScriptedDevice, open_device
-from psotrack.simulation.flights.dynamics import DYNAMICS, Space, Sticks, space_in
+from psotrack.simulation.flights.dynamics import DYNAMICS, Space, Sticks
 from psotrack.simulation.flights.motion import Heading
 from psotrack.simulation.flights.piloting import Sample, fly, read_sticks, until, write_sticks
 from psotrack.simulation.flights.recordings import read_recording, recorded_flight
@@ -249,7 +250,7 @@ def test_what_was_flown_replays_as_it_was(tmp_path):
 
 
 def record(path, rows):
-    from psotrack.simulation.flights.recordings import write_recording
+    from psotrack.simulation import write_recording
 
     recorded = flown(*rows)
     write_recording(path, recorded.time_s, recorded.position_m, recorded.orientation_wxyz)

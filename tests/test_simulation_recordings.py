@@ -13,19 +13,13 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.datasets.dpjait import pose_file, write_poses
 from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.simulation import Scenario, write_recording
 from psotrack.simulation.flights.formulas import HarmonicFlight
 from psotrack.simulation.flights.motion import Heading
 from psotrack.simulation.flights.planning import plan
-from psotrack.simulation.flights.recordings import (
-    Recorded,
-    RecordedFlight,
-    read_recording,
-    recorded_flight,
-    write_recording,
-)
-from psotrack.simulation.scenarios import Drone, Limits, Recording, Scenario
-from psotrack.trajectories import Trajectories
-from psotrack.trajectory_files import write_trajectories
+from psotrack.simulation.flights.recordings import Recorded, RecordedFlight, read_recording, recorded_flight
+from psotrack.simulation.scenarios import Drone, Limits, Recording
+from psotrack.trajectories import Trajectories, write_trajectories
 
 HEADING = Heading(0.4, 0.6, 0.8, 0.1)
 #: Up to 2.4 m/s, 4 m/s^2 and 23 degrees of tilt: as lively as the scenarios of the dataset.

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from placed_drones import cube, drone_masks, pixel_of, ray_point, straight_flight, with_drones
 
-from psotrack.cameras import camera, look_at, project
+from psotrack.geometry import camera, look_at, project
 from psotrack.simulation import CameraRenderer, build, scenario
 from psotrack.simulation.imaging import posing, raster, sensor
 from psotrack.simulation.world import drones, rooms
@@ -40,7 +40,7 @@ def test_a_drawn_square_is_where_the_camera_model_projects_it(window, magnificat
     R, t = look_at((1.0, -4.0, 2.0), (0.2, 0.1, 1.0))
     K = np.array([[150.0, 0.0, 91.3], [0.0, 150.0, 66.8], [0.0, 0.0, 1.0]])  # well off the image's middle
     cam = camera(R=R, t_m=t, K=K, image_size_wh=(200, 120))
-    view = raster.View(raster.pinhole(cam), *window, magnification)
+    view = raster.RasterView(raster.pinhole(cam), *window, magnification)
     errors = []
     while len(errors) < 40:
         centre = R.T @ (rng.uniform(3, 6) * np.linalg.inv(K) @ [*rng.uniform((70, 35), (100, 75)), 1.0] - t)

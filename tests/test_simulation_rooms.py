@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from psotrack.cameras import camera, look_at, project
 from psotrack.errors import SettingsError
+from psotrack.geometry import camera, look_at, project
 from psotrack.simulation.imaging import backdrop, raster
 from psotrack.simulation.scenarios import Imaging
 from psotrack.simulation.world import lighting, rooms

@@ -8,10 +8,9 @@ from helpers import assert_same, draw_coverage, float32, ring_rig
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psotrack import sizes
-from psotrack.cameras import camera, look_at, stack
-from psotrack.fitness import ScoreSettings
-from psotrack.sizes import HALF_PER_STD, MIN_FRAMES, RANGE, Looks
+from psotrack.geometry import camera, look_at, stack
+from psotrack.tracking import ScoreSettings, SizeMeasurements, sizes
+from psotrack.tracking.sizes import HALF_PER_STD, MIN_FRAMES, RANGE
 
 SETTINGS = ScoreSettings(reduction=2)
 #: What a learned length is of a filled ellipsoid's.
@@ -30,12 +29,14 @@ def images(position_m, size_m=SIZE_M, rig=RIG):
 
 
 def looks_at(coverage, position_m, believed_m, well_seen=None, rig=RIG):
-    """Looks at drones where they are, or where they are said to be; NumPy."""
+    """SizeMeasurements at drones where they are, or where they are said to be; NumPy."""
     position_m = position_m if position_m.ndim == 3 else position_m[:, None]
     seen = np.ones(position_m.shape[:2], bool) if well_seen is None else well_seen
     believed_m = np.broadcast_to(believed_m, position_m.shape[1:])
     arrays = float32((position_m, believed_m, rig.cameras))
-    return jax.tree.map(np.asarray, sizes.look(coverage, arrays[0], seen, arrays[1], arrays[2], SETTINGS))
+    return jax.tree.map(
+        np.asarray, sizes.measure_sizes(coverage, arrays[0], seen, arrays[1], arrays[2], SETTINGS)
+    )
 
 
 def started(size_m, pinned=(False, False, False)):
@@ -44,9 +45,9 @@ def started(size_m, pinned=(False, False, False)):
 
 
 def chunk(size_m):
-    """Looks of one drone that showed these sizes (frames, 3), whatever its windows held."""
+    """SizeMeasurements of one drone that showed these sizes (frames, 3), whatever its windows held."""
     size_m = jnp.asarray(size_m, jnp.float32)[:, None]
-    return Looks(size_m, jnp.full((*size_m.shape[:2], len(SETTINGS.windows)), 0.5))
+    return SizeMeasurements(size_m, jnp.full((*size_m.shape[:2], len(SETTINGS.windows)), 0.5))
 
 
 @pytest.mark.parametrize(
@@ -72,7 +73,9 @@ def test_low_over_the_floor_nothing_is_learned():
     positions = float32(PLACES_M[:, None])
     seen = np.ones((len(PLACES_M), 1), bool)
     shown = [
-        sizes.look(images(PLACES_M), positions, seen, *float32((SIZE_M[None], RIG.cameras)), SETTINGS, *floor)
+        sizes.measure_sizes(
+            images(PLACES_M), positions, seen, *float32((SIZE_M[None], RIG.cameras)), SETTINGS, *floor
+        )
         for floor in ((jnp.float32(0.75),), (jnp.float32(0.0),), ())
     ]
     low = PLACES_M[:, 2] - 0.75 < SIZE_M[0]
@@ -152,7 +155,7 @@ def test_a_wrong_start_is_mended_within_three_chunks(wrong):
     for _ in range(3):
         # Five places, five times each: a chunk of 25 frames.
         looks = looks_at(coverage, PLACES_M, np.asarray(state.size_m))
-        state = sizes.learn(state, jax.tree.map(lambda value: jnp.tile(value, (5, 1, 1)), looks))
+        state = sizes.learn_sizes(state, jax.tree.map(lambda value: jnp.tile(value, (5, 1, 1)), looks))
     # What is left of the start after 75 frames is 5 / 80 of 20 %; its surroundings were measured in wrong windows once.
     np.testing.assert_allclose(state.size_m[0], LONGER * SIZE_M, rtol=0.0125 + DRAWN)
     assert (np.abs(np.asarray(state.size_m)[0] / (LONGER * SIZE_M) - 1) < np.abs(wrong - 1) / 8).all()
@@ -168,7 +171,9 @@ def test_a_fifth_of_bad_frames_changes_little():
     five = looks_at(good, PLACES_M, SIZE_M), looks_at(bad, PLACES_M, SIZE_M)
     assert np.abs(five[1].size_m[2] / five[0].size_m[2] - 1).max() > 0.2
     learned = [
-        sizes.learn(started(SIZE_M), jax.tree.map(lambda value: jnp.tile(value, (5, 1, 1)), looks)).size_m
+        sizes.learn_sizes(
+            started(SIZE_M), jax.tree.map(lambda value: jnp.tile(value, (5, 1, 1)), looks)
+        ).size_m
         for looks in five
     ]
     # The median is now another of the good frames, which differ by what drawing costs.
@@ -182,7 +187,7 @@ def test_a_fifth_of_bad_frames_changes_little():
 def test_bad_frames_move_nothing_while_they_are_the_fewer(good, bad):
     """Whatever twelve of 25 frames show, the estimate stays among what start and the others say."""
     shown = np.array([*good, *bad])[:, None] * SIZE_M
-    learned = np.asarray(sizes.learn(started(SIZE_M), chunk(shown)).size_m)[0] / SIZE_M
+    learned = np.asarray(sizes.learn_sizes(started(SIZE_M), chunk(shown)).size_m)[0] / SIZE_M
     # Some roundings of float32 logarithms.
     assert (learned >= min(*good, 1.0) - 1e-5).all()
     assert (learned <= max(*good, 1.0) + 1e-5).all()
@@ -190,18 +195,20 @@ def test_bad_frames_move_nothing_while_they_are_the_fewer(good, bad):
 
 def test_frames_that_show_nothing_change_nothing():
     state = started(SIZE_M)
-    nothing = sizes.learn(state, jax.tree.map(lambda value: value * jnp.nan, chunk(np.tile(SIZE_M, (25, 1)))))
+    nothing = sizes.learn_sizes(
+        state, jax.tree.map(lambda value: value * jnp.nan, chunk(np.tile(SIZE_M, (25, 1))))
+    )
     assert_same(nothing, state)
     few = np.full((25, 3), np.nan)
     few[: MIN_FRAMES - 1] = 3 * SIZE_M
-    np.testing.assert_array_equal(sizes.learn(state, chunk(few)).size_m, state.size_m)
+    np.testing.assert_array_equal(sizes.learn_sizes(state, chunk(few)).size_m, state.size_m)
 
 
 @pytest.mark.parametrize(("shown", "bound"), [(100.0, RANGE), (0.01, 1 / RANGE)])
 def test_lengths_stay_within_range_of_the_start(shown, bound):
     state = started(SIZE_M)
     for _ in range(3):
-        state = sizes.learn(state, chunk(np.tile(shown * SIZE_M, (25, 1))))
+        state = sizes.learn_sizes(state, chunk(np.tile(shown * SIZE_M, (25, 1))))
     np.testing.assert_allclose(state.size_m[0], bound * SIZE_M, rtol=1e-6)
 
 
@@ -211,7 +218,7 @@ def test_lengths_stay_within_range_of_the_start(shown, bound):
 )
 def test_what_is_pinned_stays(pinned, kept):
     """One level length pins both: they are learned together."""
-    state = sizes.learn(started(SIZE_M, pinned), chunk(np.tile(1.5 * SIZE_M, (25, 1))))
+    state = sizes.learn_sizes(started(SIZE_M, pinned), chunk(np.tile(1.5 * SIZE_M, (25, 1))))
     changed = ~np.isclose(state.size_m[0], SIZE_M, rtol=1e-6)
     np.testing.assert_array_equal(np.flatnonzero(~changed), kept)
     np.testing.assert_array_equal(np.asarray(state.std_m)[0] == 0, ~changed)
@@ -219,7 +226,7 @@ def test_what_is_pinned_stays(pinned, kept):
 
 
 def test_level_lengths_change_by_the_same_share():
-    state = sizes.learn(started([0.6, 0.3, 0.2]), chunk(np.tile([0.66, 0.33, 0.2], (25, 1))))
+    state = sizes.learn_sizes(started([0.6, 0.3, 0.2]), chunk(np.tile([0.66, 0.33, 0.2], (25, 1))))
     np.testing.assert_allclose(state.size_m[0, 0] / state.size_m[0, 1], 2.0, rtol=1e-6)
 
 
@@ -236,7 +243,7 @@ def test_the_height_of_a_flat_drone_seen_from_above_stays_at_the_start():
     shown = looks_at(images(places, flat, rig), places, flat * [1, 1, 2], rig=rig).size_m[0, 0]
     np.testing.assert_allclose(shown[:2], LONGER * flat[:2], rtol=2 * DRAWN)
     assert np.isnan(shown[2])
-    state = sizes.learn(started(flat * [0.9, 0.9, 2]), chunk(np.tile(shown, (25, 1))))
+    state = sizes.learn_sizes(started(flat * [0.9, 0.9, 2]), chunk(np.tile(shown, (25, 1))))
     np.testing.assert_allclose(state.size_m[0, 2], 2 * flat[2], rtol=1e-6)
     assert state.num_frames[0].tolist() == [25, 25, 0]
 
@@ -276,7 +283,9 @@ def test_standard_errors_are_as_large_as_the_errors():
     state = started(np.tile(SIZE_M, (drones, 1)))
     for chunk_off in off:
         shown = np.broadcast_to(SIZE_M * np.exp(chunk_off), (25, drones, 3))
-        state = sizes.learn(state, Looks(jnp.asarray(shown, jnp.float32), jnp.full((25, drones, 3), 0.5)))
+        state = sizes.learn_sizes(
+            state, SizeMeasurements(jnp.asarray(shown, jnp.float32), jnp.full((25, drones, 3), 0.5))
+        )
     error = np.log(np.asarray(state.size_m) / SIZE_M).std(axis=0)
     stated = np.sqrt(np.square(state.std_m / state.size_m).mean(axis=0))
     # 400 drones tell their errors to 4 %; the start, here exact, counts as a thirteenth chunk that was off by 15 %.
@@ -287,12 +296,12 @@ def test_the_profile_is_a_mean_over_all_frames():
     state = started(SIZE_M)
     shown = jnp.asarray(np.tile(SIZE_M, (25, 1)), jnp.float32)[:, None]
     for value, frames in ((0.2, 25), (0.6, 15)):
-        state = sizes.learn(state, Looks(shown[:frames], jnp.full((frames, 1, 3), value)))
+        state = sizes.learn_sizes(state, SizeMeasurements(shown[:frames], jnp.full((frames, 1, 3), value)))
     np.testing.assert_allclose(state.fill, (25 * 0.2 + 15 * 0.6) / 40, rtol=1e-6)
 
 
 def test_drones_that_come_later_begin_at_their_own_start():
-    before = sizes.learn(started(SIZE_M), chunk(np.tile(1.1 * SIZE_M, (25, 1))))
-    both = sizes.enlarged(before, started(2 * SIZE_M))
+    before = sizes.learn_sizes(started(SIZE_M), chunk(np.tile(1.1 * SIZE_M, (25, 1))))
+    both = sizes.with_added_drones(before, started(2 * SIZE_M))
     assert_same(jax.tree.map(lambda value: value[:1], both), before)
     assert_same(jax.tree.map(lambda value: value[1:], both), started(2 * SIZE_M))

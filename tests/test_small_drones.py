@@ -8,10 +8,10 @@ from helpers import ROOM_M, draw_coverage, ring_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from psotrack.blobs import all_blobs, find_blobs
-from psotrack.cameras import CameraRig
-from psotrack.initialisation import find_drones
-from psotrack.newcomers import newcomers
+from psotrack.geometry import CameraRig
+from psotrack.initiation import find_candidates
+from psotrack.initiation.initialisation import find_drones
+from psotrack.silhouettes import all_blobs, find_blobs
 
 FPS = 25.0
 REDUCTION = 2
@@ -53,7 +53,7 @@ def start_of(coverage, rig=SMALL, reduction=REDUCTION):
 
 def newcomers_in(coverage, *known_m, rig=SMALL, reduction=REDUCTION):
     known = np.stack(known_m, axis=1) if known_m else np.empty((len(coverage), 0, 3))
-    return newcomers(
+    return find_candidates(
         rig.cameras,
         coverage,
         known,

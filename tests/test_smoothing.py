@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
 from psotrack.errors import InputError
-from psotrack.smoothing import jerk_density, smooth
+from psotrack.motion import jerk_density, smooth
 
 
 def smoothed(flown: Flown):

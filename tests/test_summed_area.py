@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psotrack.summed_area import LOW_BITS, box_sum, of_packed_box_sums, pack, summed_area_table
+from psotrack.silhouettes import box_sum, of_packed_box_sums, pack, summed_area_table
+from psotrack.silhouettes.summed_area import LOW_BITS
 
 table_of = jax.jit(summed_area_table)
 sum_of = jax.jit(box_sum)

@@ -11,7 +11,7 @@ from helpers import assert_same
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psotrack import swarm
+from psotrack.tracking import swarm
 
 
 def params(

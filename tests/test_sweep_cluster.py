@@ -7,8 +7,7 @@ import pytest
 from sweeps import all_rows, grid_file, psotrack, small_sequence
 
 from psotrack.errors import SettingsError
-from psotrack.sweep import load
-from psotrack.sweep.cluster import run_on_cluster
+from psotrack.sweep import load, run_on_cluster
 
 pytest.importorskip("distributed")
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.settings import TrackSettings
-from psotrack.silhouette_store import SilhouetteSettings
-from psotrack.sweep.grid import Perturbation, grid, key_of, load
+from psotrack.silhouettes import SilhouetteSettings
+from psotrack.sweep import Perturbation, grid, key_of, load
 from psotrack.sweep.names import SETTINGS
 
 FILE = """

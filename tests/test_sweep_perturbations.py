@@ -13,11 +13,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import SettingsError
-from psotrack.sequence import Sequence
+from psotrack.recordings import Sequence, VideoInfo
 from psotrack.silhouettes import Silhouettes
-from psotrack.sweep.grid import Perturbation
-from psotrack.sweep.perturbations import chosen, perturbed
-from psotrack.video import VideoInfo
+from psotrack.sweep import Perturbation, perturbed
+from psotrack.sweep.perturbations import chosen
 
 FRAMES, REDUCTION = 70, 4
 EVERYTHING = Perturbation(extrinsics_deg=0.3, clock_frames=1.5, flipped=0.05)

@@ -16,12 +16,10 @@ from sweeps import all_rows, grid_file, psotrack, small_sequence, stamps
 
 from psotrack.cli import main
 from psotrack.errors import InputError
+from psotrack.sweep import Inputs, Store, estimate, key_of, machine, runner, sweep
 from psotrack.sweep import grid as grid_of
-from psotrack.sweep import key_of, machine, runner, sweep
-from psotrack.sweep.estimates import FRAME_S, WORK_S, estimate
-from psotrack.sweep.inputs import Inputs
+from psotrack.sweep.estimates import FRAME_S, WORK_S
 from psotrack.sweep.locks import claimed
-from psotrack.sweep.store import Store
 
 SETTINGS = {
     "particles": 8,

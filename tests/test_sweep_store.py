@@ -13,9 +13,8 @@ import pandas as pd
 import pytest
 
 from psotrack.errors import InputError
-from psotrack.sweep import locks
+from psotrack.sweep import Store, locks
 from psotrack.sweep.locks import STALE_S, Owner, owner_of
-from psotrack.sweep.store import Store
 
 KEY = "0" * 40
 

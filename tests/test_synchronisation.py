@@ -12,18 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from psotrack.cameras import camera, look_at
 from psotrack.cli.synchronise import synchronise
+from psotrack.clocks import find_offset
+from psotrack.clocks.synchronisation import camera_offsets
 from psotrack.datasets import dpjait
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.evaluation.association import UNASSIGNED
-from psotrack.mocap import Markers, write_c3d
+from psotrack.geometry import camera, look_at
+from psotrack.recordings import Markers, VideoWriter, write_c3d
+from psotrack.simulation import scenario
 from psotrack.simulation.flights.planning import plan
-from psotrack.simulation.scenarios import scenario
-from psotrack.synchronisation import camera_offsets, find_offset
-from psotrack.trajectories import Trajectories
-from psotrack.trajectory_files import write_trajectories
-from psotrack.video import VideoWriter
+from psotrack.trajectories import UNASSIGNED, Trajectories, write_trajectories
 
 FPS = 25.0
 

@@ -13,8 +13,6 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from psotrack.aruco import marker_dictionary
-from psotrack.cameras import camera, look_at, project, stack
 from psotrack.datasets.dpjait import (
     CALIBRATION,
     MARKER_CORNERS,
@@ -27,8 +25,9 @@ from psotrack.datasets.dpjait import (
     write_onboard_calibration,
     write_poses,
 )
-from psotrack.mocap import Markers, write_c3d
-from psotrack.video import VideoWriter
+from psotrack.detection import marker_dictionary
+from psotrack.geometry import camera, look_at, project, stack
+from psotrack.recordings import Markers, VideoWriter, write_c3d
 
 EXPERIMENT = Path(__file__).parents[1] / "experiments" / "table7"
 METHODS = ("paper", "single frames", "filter", "smoother")
@@ -253,7 +252,7 @@ def test_markers_that_are_taken_for_others(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.syspath_prepend(EXPERIMENT)
     from _sightings import Sightings, mislabelled
 
-    from psotrack.inside_out.marker_map import MarkerMap
+    from psotrack.inside_out import MarkerMap
 
     ids = np.tile([*walls_m(), 500], 200)
     seen = Sightings(np.arange(len(ids)) // 31, ids, np.zeros((len(ids), 4, 2)))

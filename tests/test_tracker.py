@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from helpers import ROOM_M, assert_same, draw_coverage, float32, ring_rig
 
-from psotrack import tracker
-from psotrack.initialisation import Start
+from psotrack.initiation import InitialState
 from psotrack.settings import TrackSettings
-from psotrack.tracker_inputs import tracker_inputs
+from psotrack.tracking import tracker
+from psotrack.tracking.inputs import tracker_inputs
 from psotrack.trajectories import Status
 
 FPS = 25.0
@@ -56,7 +56,7 @@ def track(
 
 def prepared(position_m=TRUTH_M[0], velocity_m_s=VELOCITY_M_S[0], *, size_m=SIZE_M, **settings):
     settings = TrackSettings(**({"particles": 20, "iterations": 20} | settings))
-    start = Start(np.asarray(position_m), np.asarray(velocity_m_s), size_m, np.full(2, 5.0))
+    start = InitialState(np.asarray(position_m), np.asarray(velocity_m_s), size_m, np.full(2, 5.0))
     program, params = tracker_inputs(REDUCTION, start, settings, fps=FPS, bounds_m=ROOM_M)
     where, speed = float32((start.position_m, start.velocity_m_s))
     return tracker.init(jax.random.key(settings.seed), where, speed, params), params, program

@@ -10,16 +10,14 @@ import numpy as np
 import pytest
 from helpers import ROOM_M, assert_same, draw_coverage, ring_rig
 
-from psotrack import tracking
-from psotrack.finishing import finished
-from psotrack.initialisation import Start
-from psotrack.sequence import Sequence
+from psotrack.identity import postprocess
+from psotrack.initiation import InitialState, find_initial_state
+from psotrack.recordings import Sequence, VideoInfo
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes
-from psotrack.starts import find_start
+from psotrack.tracking import chunks as tracking
 from psotrack.tracking import track_silhouettes
 from psotrack.trajectories import Status
-from psotrack.video import VideoInfo
 
 FPS = 25.0
 REDUCTION = 2
@@ -48,8 +46,8 @@ def paths():
 
 
 TRUTH_M = paths()
-NOBODY = Start(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
-FIRST = Start(TRUTH_M[:1, 0], np.array([[0.25, 0.1, 0.05]]), SIZE_M[:1], np.array([5.0]))
+NOBODY = InitialState(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+FIRST = InitialState(TRUTH_M[:1, 0], np.array([[0.25, 0.1, 0.05]]), SIZE_M[:1], np.array([5.0]))
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +66,7 @@ def silhouettes():
 def track(silhouettes, start, **settings):
     chosen = TrackSettings(**(vars_of(SETTINGS) | settings))
     (tracked,) = track_silhouettes(RIG, silhouettes, [start], [chosen], fps=FPS, bounds_m=[ROOM_M])
-    return tracked, finished(tracked, chosen, fps=FPS)[0]
+    return tracked, postprocess(tracked, chosen, fps=FPS)[0]
 
 
 @pytest.fixture(scope="module")
@@ -226,7 +224,7 @@ def test_smoothing_and_offset(told, silhouettes):
     """Smoothed tracks are surer of themselves and no worse; a body's offset moves them as a whole."""
     tracked, filtered = told
     settings = TrackSettings(**(vars_of(SETTINGS) | {"smooth": True, "body_offset_m": (0.0, 0.0, 0.1)}))
-    smoothed, _ = finished(tracked, settings, fps=FPS)
+    smoothed, _ = postprocess(tracked, settings, fps=FPS)
     seen = filtered.seen & np.isfinite(TRUTH_M).all(axis=-1)
     error_m = np.linalg.norm(smoothed.position_m + np.array([0.0, 0.0, 0.1]) - TRUTH_M, axis=-1)
     # Silhouettes without noise leave little to smooth: 2 mm before as after.
@@ -250,18 +248,18 @@ def test_detections_tell_of_drones_that_silhouettes_do_not_show(silhouettes, tmp
     video = VideoInfo(tmp_path / "a.avi", NUM_FRAMES, FPS, (480, 360))
     sequence = Sequence("R", tmp_path, RIG, dict.fromkeys(RIG.names, video))
     hidden_m = np.array([0.9, 0.9, 0.9])
-    detected = Start(
+    detected = InitialState(
         np.stack([FIRST.position_m[0] + [0.05, 0.0, -0.1], hidden_m]),
         np.zeros((2, 3)),
         SIZE_M,
         np.full(2, 4.0),
     )
-    alone = find_start(sequence, silhouettes, SETTINGS, ROOM_M)
-    both = find_start(sequence, silhouettes, SETTINGS, ROOM_M, detected)
+    alone = find_initial_state(sequence, silhouettes, SETTINGS, ROOM_M)
+    both = find_initial_state(sequence, silhouettes, SETTINGS, ROOM_M, detected)
     assert len(alone.position_m) == 1
     np.testing.assert_array_equal(both.position_m, [alone.position_m[0], hidden_m])
     np.testing.assert_array_equal(both.size_m, [alone.size_m[0], SIZE_M[1]])
-    one = find_start(sequence, silhouettes, TrackSettings(drones=1), ROOM_M, detected)
+    one = find_initial_state(sequence, silhouettes, TrackSettings(drones=1), ROOM_M, detected)
     np.testing.assert_array_equal(one.position_m, alone.position_m)
-    nobody = find_start(sequence, silhouettes, SETTINGS, ROOM_M, NOBODY)
+    nobody = find_initial_state(sequence, silhouettes, SETTINGS, ROOM_M, NOBODY)
     np.testing.assert_array_equal(nobody.position_m, alone.position_m)

@@ -15,9 +15,9 @@ from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.trajectories import Status, Trajectories
-from psotrack.trajectory_files import COLUMNS, read_trajectories, write_trajectories
-from psotrack.tum import read_tum, write_tum
+from psotrack.trajectories import Status, Trajectories, read_trajectories, write_trajectories
+from psotrack.trajectories.files import COLUMNS
+from psotrack.trajectories.tum import read_tum, write_tum
 
 SUFFIXES = (".csv", ".parquet")
 HEADER = "frame,time_s,drone,x_m,y_m,z_m,vx_m_s,vy_m_s,vz_m_s,fitness,num_cameras,status"

@@ -9,8 +9,15 @@ from helpers import LENSES, ROOM_M, rig_of, ring_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from psotrack.cameras import CameraRig, project
-from psotrack.triangulation import candidates, match_views, triangulate, triangulate_paths, viewpoints
+from psotrack.geometry import (
+    CameraRig,
+    candidates,
+    match_views,
+    project,
+    triangulate,
+    triangulate_paths,
+    viewpoints,
+)
 
 
 def points_in_room(*shape, seed=0):

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
-from psotrack.video import VideoInfo, VideoWriter, join_videos, probe, read_frames
+from psotrack.recordings import VideoInfo, VideoWriter, join_videos, probe, read_frames
 
 WIDTH, HEIGHT = 96, 64
 
@@ -232,7 +232,7 @@ def test_a_full_disk_is_an_error_and_costs_nothing(tmp_path):
         from pathlib import Path
         import numpy as np
         from psotrack.errors import OutputError
-        from psotrack.video import VideoWriter
+        from psotrack.recordings.video import VideoWriter
         sys.dont_write_bytecode = True  # a cached module would be cut off too, for everybody
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
         rng = np.random.default_rng(0)
@@ -261,7 +261,7 @@ def test_an_index_that_is_cut_off_is_noticed(tmp_path, missing):
         from pathlib import Path
         import numpy as np
         from psotrack.errors import OutputError
-        from psotrack.video import VideoWriter
+        from psotrack.recordings.video import VideoWriter
         sys.dont_write_bytecode = True  # a cached module would be cut off too, for everybody
         resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
         try:
@@ -351,7 +351,7 @@ def test_a_disk_that_is_full_while_joining_costs_nothing(tmp_path):
         import resource, sys
         from pathlib import Path
         from psotrack.errors import OutputError
-        from psotrack.video import join_videos
+        from psotrack.recordings.video import join_videos
         target, limit, *parts = sys.argv[1:]
         sys.dont_write_bytecode = True  # a cached module would be cut off too, for everybody
         resource.setrlimit(resource.RLIMIT_FSIZE, (int(limit), int(limit)))

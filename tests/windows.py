@@ -7,10 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from helpers import far_camera, float32, rig_of
 
-from psotrack.boxes import extents
-from psotrack.fitness import Scene, ScoreSettings, drone_fitness, scene
-from psotrack.patches import SIDE, cut
-from psotrack.summed_area import LOW_BITS, summed_area_table
+from psotrack.geometry import extents
+from psotrack.silhouettes import summed_area_table
+from psotrack.silhouettes.summed_area import LOW_BITS
+from psotrack.tracking import ScoreSettings
+from psotrack.tracking.fitness import ScoreInputs, drone_fitness, score_inputs
+from psotrack.tracking.patches import SIDE, cut
 
 RING = ScoreSettings().ring
 
@@ -87,12 +89,12 @@ def evaluate(function, rig, patches, position_m, size_m, reduction):
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _evaluate(function, settings, patches, cameras, position_m, size_m):
-    return function(Scene(extents(cameras, size_m), patches, settings), position_m)
+    return function(ScoreInputs(extents(cameras, size_m), patches, settings), position_m)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def evaluate_whole(function, settings, images, cameras, position_m, size_m):
-    return function(scene(cameras, size_m, summed_area_table(images), settings), position_m)
+    return function(score_inputs(cameras, size_m, summed_area_table(images), settings), position_m)
 
 
 def best_place(rig, patches, about_m, size_m, reduction):
@@ -103,7 +105,7 @@ def best_place(rig, patches, about_m, size_m, reduction):
 
 @partial(jax.jit, static_argnums=0)
 def _best_place(settings, patches, cameras, best_m, size_m):
-    view = Scene(extents(cameras, size_m), patches, settings)
+    view = ScoreInputs(extents(cameras, size_m), patches, settings)
     unit = np.stack(np.meshgrid(*[np.arange(-4, 5)] * 3, indexing="ij"), axis=-1).reshape(-1, 1, 3)
 
     def closer(best_m, step_m):

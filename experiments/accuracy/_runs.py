@@ -10,15 +10,15 @@ from typing import Any
 
 import pandas as pd
 
-from psotrack.compiled import keep_compiled
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.errors import PsotrackError
 from psotrack.evaluation import evaluate
 from psotrack.pipeline import environment, track_from_silhouettes
-from psotrack.sequence import Sequence
+from psotrack.recordings import Sequence
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
 from psotrack.simulation import simulate
+from psotrack.support import keep_compiled
 
 KEPT = ["offset_removed_mean_error_m", "mean_error_m", "max_error_m", "missed_rate", "id_switches", "hota"]
 KEPT += ["offset_removed_inside_90_rate", "offset_removed_mean_nees"]

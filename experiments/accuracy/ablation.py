@@ -15,8 +15,8 @@ from typing import Any
 import _runs
 import pandas as pd
 
-from psotrack.files import written_whole
 from psotrack.settings import TrackSettings
+from psotrack.support import written_whole
 
 #: Settings that leave a part out, or add one that is off by default.
 VARIANTS: dict[str, dict[str, Any]] = {

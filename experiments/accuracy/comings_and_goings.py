@@ -19,18 +19,18 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from psotrack.cameras import project
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.evaluation import evaluate
 from psotrack.evaluation.consistency import consistency
-from psotrack.files import written_whole
+from psotrack.geometry import project, viewpoints
 from psotrack.pipeline import environment, track_from_silhouettes
-from psotrack.sequence import Sequence
+from psotrack.recordings import Sequence
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import SilhouetteSettings, compute
+from psotrack.silhouettes import compute
+from psotrack.silhouettes.computation import SilhouetteSettings
 from psotrack.simulation import scenarios, simulate
+from psotrack.support import written_whole
 from psotrack.trajectories import Status, Trajectories
-from psotrack.triangulation import viewpoints
 
 SCENARIO = Path(__file__).with_suffix(".toml")
 BACKGROUNDS = {

@@ -23,20 +23,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.optimize import linear_sum_assignment
 
-from psotrack.boxes import extents
-from psotrack.cameras import Camera
 from psotrack.datasets.dpjait import read_sequence
-from psotrack.fitness import PAPER_SCORE, Scene, ScoreSettings, drone_fitness
-from psotrack.initialisation import find_drones
-from psotrack.patches import cut
+from psotrack.geometry import Camera, extents
+from psotrack.initiation import room_bounds
+from psotrack.initiation.initialisation import find_drones
 from psotrack.settings import TrackSettings
-from psotrack.silhouette_store import SilhouetteSettings
-from psotrack.silhouettes import compute
-from psotrack.simulation import scenario, simulate
-from psotrack.simulation.scenarios import Drone, Harmonic, Harmonics, Scenario, Variation
+from psotrack.silhouettes import SilhouetteSettings, compute
+from psotrack.simulation import Scenario, scenario, simulate
+from psotrack.simulation.scenarios import Drone, Harmonic, Harmonics, Variation
 from psotrack.simulation.world.drones import MODELS
-from psotrack.starts import room_bounds
-from psotrack.tracking import on_device
+from psotrack.tracking import ScoreSettings, on_device
+from psotrack.tracking.fitness import PAPER_SCORE, ScoreInputs, drone_fitness
+from psotrack.tracking.patches import cut
 
 NUM_FRAMES, SCALE = 50, 0.5
 #: At half size: as coarse as silhouettes of the full size are.
@@ -125,7 +123,7 @@ def scores(
         reduction=settings.reduction,
         ring=settings.ring,
     )
-    view = Scene(seen, patches, settings)
+    view = ScoreInputs(seen, patches, settings)
     # Piece by piece: a slice has as many places as a hundred swarms.
     places = about_m + offset_m[:, None]
     return jnp.nan_to_num(jax.lax.map(lambda one: drone_fitness(view, one), places, batch_size=500))

@@ -16,10 +16,8 @@ import _runs
 import numpy as np
 import pandas as pd
 
-from psotrack.compiled import keep_compiled
-from psotrack.files import written_whole
 from psotrack.pipeline import environment
-from psotrack.progress import terminal
+from psotrack.support import keep_compiled, terminal, written_whole
 from psotrack.sweep import load, sweep
 
 GRIDS = Path(__file__).parent / "studies"

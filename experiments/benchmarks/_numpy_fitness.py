@@ -10,13 +10,13 @@ from typing import Protocol
 
 import numpy as np
 
-from psotrack.cameras import NEAR_M, Camera
-from psotrack.fitness import ScoreSettings
-from psotrack.patches import FULL
+from psotrack.geometry import NEAR_M, Camera
+from psotrack.tracking import ScoreSettings
+from psotrack.tracking.patches import FULL
 
 
 class NumpyFitness(Protocol):
-    """The mean fitness over drones of whole constellations, as `psotrack.fitness.joint_fitness`."""
+    """The mean fitness over drones of whole constellations, as `psotrack.tracking.fitness.joint_fitness`."""
 
     def tables(self, coverage: np.ndarray) -> np.ndarray:
         """Summed-area tables (cameras, height + 1, width + 1) of silhouettes, in whole pixels."""

@@ -18,13 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from _numpy_fitness import NumpyFitness
 
-from psotrack import fitness
-from psotrack.cameras import CameraRig
-from psotrack.initialisation import Start
+from psotrack.geometry import CameraRig
+from psotrack.initiation import InitialState
 from psotrack.settings import TrackSettings
-from psotrack.summed_area import summed_area_table
-from psotrack.tracker_inputs import tracker_inputs
-from psotrack.tracking import on_device
+from psotrack.silhouettes import summed_area_table
+from psotrack.tracking import fitness, on_device
+from psotrack.tracking.inputs import tracker_inputs
 
 #: The peers' motion model, an alpha-beta filter: it costs nothing beside the swarm.
 POSITION_GAIN, VELOCITY_GAIN = 0.8, 0.3
@@ -36,7 +35,7 @@ class Problem:
 
     rig: CameraRig
     reduction: int
-    start: Start
+    start: InitialState
     settings: TrackSettings
     fps: float
     bounds_m: np.ndarray
@@ -122,7 +121,9 @@ class Evosax:
     ) -> jax.Array:
         settings, algorithm, params = self._problem.settings, self._algorithm, self._params
         size_m = jnp.asarray(self._problem.start.size_m, jnp.float32)
-        view = fitness.scene(self._cameras, size_m, summed_area_table(silhouettes), self._problem.score)
+        view = fitness.score_inputs(
+            self._cameras, size_m, summed_area_table(silhouettes), self._problem.score
+        )
         shape = (settings.particles, *predicted.shape)
 
         def cost(population: jax.Array) -> jax.Array:

@@ -1,7 +1,7 @@
 """A scene without files: drones that are ellipsoids fly on closed paths, and their outlines are drawn into cameras.
 
 The outline of an ellipsoid is a circle in coordinates that make it a unit sphere, so every outline is exact and owes
-nothing to the quadrics of `psotrack.boxes`.
+nothing to the quadrics of `psotrack.geometry.boxes`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from psotrack.cameras import Camera, CameraRig, camera, look_at, project, stack
+from psotrack.geometry import Camera, CameraRig, camera, look_at, project, stack
 
 IMAGE_SIZE_WH = (1920, 1080)
 REDUCTION = 4

@@ -18,12 +18,12 @@ from pathlib import Path
 
 import jax
 
-from psotrack.compiled import keep_compiled
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.pipeline import environment, track_runs
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import compute
-from psotrack.sweep.machine import share_processors
+from psotrack.support import keep_compiled
+from psotrack.sweep import share_processors
 
 
 def seconds(call: Callable[[], object]) -> tuple[float, float]:

@@ -14,14 +14,13 @@ import cv2
 import numpy as np
 
 import psotrack
-from psotrack.aruco import marker_dictionary
 from psotrack.calibration import lens_of_view
-from psotrack.cameras import Camera, camera, look_at, project
 from psotrack.datasets.dpjait import MARKER_CORNERS, read_onboard
-from psotrack.inside_out.frames import open_source
-from psotrack.inside_out.localising import STAGES, Localised, localise
-from psotrack.inside_out.marker_map import MarkerMap, read_marker_map
-from psotrack.video import VideoWriter
+from psotrack.detection import marker_dictionary
+from psotrack.geometry import Camera, camera, look_at, project
+from psotrack.inside_out import LocalisedVideo, MarkerMap, localise_video, open_source, read_marker_map
+from psotrack.inside_out.localising import STAGES
+from psotrack.recordings import VideoWriter
 
 _SIZES_WH = {"1920x1080": (1920, 1080), "3840x2160": (3840, 2160)}
 _FPS = 25.0
@@ -57,7 +56,7 @@ def main(sequence: Path | None, drone: str, size: str, frames: int, repeats: int
         source = open_source(video)
         source = source.first(min(frames, source.num_frames or frames))
         # The first run is not counted: it compiles, imports and reads the video from the disk.
-        runs = [localise(source, marker_map, lens) for _ in range(1 + repeats)][1:]
+        runs = [localise_video(source, marker_map, lens) for _ in range(1 + repeats)][1:]
     click.echo(f"{platform.machine()}, {cv2.getNumberOfCPUs()} processors; psotrack {psotrack.__version__}")
     click.echo(
         f"Python {platform.python_version()}, NumPy {np.__version__}, OpenCV {cv2.__version__} "
@@ -66,7 +65,7 @@ def main(sequence: Path | None, drone: str, size: str, frames: int, repeats: int
     _show(runs, source.image_size_wh, len(marker_map))
 
 
-def _show(runs: list[Localised], image_size_wh: tuple[int, int], markers: int) -> None:
+def _show(runs: list[LocalisedVideo], image_size_wh: tuple[int, int], markers: int) -> None:
     rates = [run.frames_per_second for run in runs]
     path = runs[0].path
     click.echo(

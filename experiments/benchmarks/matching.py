@@ -11,8 +11,8 @@ import click
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.cameras import CameraRig, camera, look_at, project, stack
 from psotrack.correspondence import Matches, match
+from psotrack.geometry import CameraRig, camera, look_at, project, stack
 
 #: Of the room, and how near to its walls no drone comes.
 _BOUNDS_M, _MARGIN_M = np.array([[-5.0, -4.0, 0.0], [5.0, 4.0, 4.0]]), 0.5

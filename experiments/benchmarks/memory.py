@@ -18,11 +18,11 @@ import numpy as np
 import zarr
 from zarr.codecs import ZstdCodec
 
-from psotrack.initialisation import Start
-from psotrack.progress import terminal
+from psotrack.initiation import InitialState
 from psotrack.settings import TrackSettings
-from psotrack.silhouette_store import CHUNK_FRAMES, open_stored
-from psotrack.silhouettes import Silhouettes
+from psotrack.silhouettes import Silhouettes, open_stored
+from psotrack.silhouettes.store import CHUNK_FRAMES
+from psotrack.support import terminal
 from psotrack.tracking import track_silhouettes
 
 
@@ -38,7 +38,9 @@ from psotrack.tracking import track_silhouettes
 def main(frames: int, cameras: int, drones: int, particles: int, iterations: int, limit_gb: float) -> None:
     """Track a long sequence from stored silhouettes; print the peak of the resident memory."""
     scene = _scene.scene(frames, drones, cameras)
-    start = Start(scene.position_m[0], scene.velocity_m_s[0], scene.size_m, np.full(drones, float(cameras)))
+    start = InitialState(
+        scene.position_m[0], scene.velocity_m_s[0], scene.size_m, np.full(drones, float(cameras))
+    )
     with tempfile.TemporaryDirectory() as folder:
         silhouettes = _store(scene, Path(folder))
         before_gb = _peak_gb()

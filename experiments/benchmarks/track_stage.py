@@ -28,12 +28,11 @@ import numpy as np
 from _numpy_fitness import NumpyFitness, PlainFitness, TunedFitness
 from _peers import Evosax, Problem, PySwarms
 
-from psotrack import fitness, tracker
-from psotrack.initialisation import Start
+from psotrack.initiation import InitialState
 from psotrack.settings import TrackSettings
-from psotrack.summed_area import summed_area_table
-from psotrack.tracker_inputs import tracker_inputs
-from psotrack.tracking import on_device
+from psotrack.silhouettes import summed_area_table
+from psotrack.tracking import fitness, on_device, tracker
+from psotrack.tracking.inputs import tracker_inputs
 
 PEERS = ("evosax", "pyswarms")
 
@@ -157,7 +156,7 @@ def _require_peers() -> None:
 
 
 def _problem(scene: _scene.Scene, settings: TrackSettings) -> Problem:
-    start = Start(
+    start = InitialState(
         position_m=scene.position_m[0],
         velocity_m_s=scene.velocity_m_s[0],
         size_m=scene.size_m,
@@ -177,7 +176,7 @@ def _check_same_fitness(
     position = np.concatenate([near, anywhere]).astype(np.float32)
 
     size_m = jnp.asarray(problem.start.size_m, jnp.float32)
-    view = fitness.scene(
+    view = fitness.score_inputs(
         on_device(problem.rig.cameras), size_m, summed_area_table(jnp.asarray(silhouettes)), problem.score
     )
     ours = np.asarray(fitness.joint_fitness(view, jnp.asarray(position)))

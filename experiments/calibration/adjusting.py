@@ -24,8 +24,8 @@ from scipy.stats import chi2
 
 from psotrack.calibration import centre_by_pose, improve, in_boxes
 from psotrack.calibration.gauge import common_motions, departure, metric
-from psotrack.cameras import CameraRig
 from psotrack.datasets.dpjait import read_detections, read_sequence
+from psotrack.geometry import CameraRig
 from psotrack.methods import detection_files_of
 from psotrack.settings import YOLO
 

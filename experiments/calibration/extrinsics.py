@@ -18,7 +18,7 @@ from jaxtyping import Float
 from scipy.stats import chi2
 
 from psotrack.calibration import locate_camera
-from psotrack.cameras import Camera, camera, look_at, project
+from psotrack.geometry import Camera, camera, look_at, project
 
 HERE = Path(__file__).parent
 K = np.array([[1157.0, 0.0, 959.5], [0.0, 1157.0, 539.5], [0.0, 0.0, 1.0]])

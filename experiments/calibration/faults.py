@@ -18,14 +18,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from psotrack.cameras import CameraRig
+from psotrack.correspondence import from_detections
 from psotrack.datasets.dpjait import read_detections, read_sequence
-from psotrack.detections import Detections
 from psotrack.doctor import Diagnosis, examine
-from psotrack.evaluation.plots import save
+from psotrack.geometry import CameraRig
 from psotrack.methods import detection_files_of
+from psotrack.recordings import Detections
 from psotrack.settings import YOLO
-from psotrack.sightings import from_detections
+from psotrack.support import save_figure
 
 HERE = Path(__file__).parent
 #: The camera that is tampered with, and another one.
@@ -147,7 +147,9 @@ def main() -> None:
     ]
     (HERE / "results" / "faults.md").write_text("\n".join(lines) + "\n")
     names = recording.rig.names
-    save(options.out / "doctor_faults.png", (13.0, 3.9), lambda figure: draw(figure, said, names), force=True)
+    save_figure(
+        options.out / "doctor_faults.png", (13.0, 3.9), lambda figure: draw(figure, said, names), force=True
+    )
 
 
 def words(diagnosis: Diagnosis) -> str:

@@ -15,11 +15,10 @@ import msgspec
 import numpy as np
 from matplotlib.figure import Figure
 
-from psotrack.cameras import camera, look_at
-from psotrack.simulation import build, scenario
+from psotrack.geometry import camera, look_at
+from psotrack.simulation import Scene, build, scenario
 from psotrack.simulation.imaging import posing, raster, sensor
 from psotrack.simulation.scenarios import Drone, Harmonic, Harmonics, Variation
-from psotrack.simulation.scene import Scene
 from psotrack.simulation.world.drones import MODELS, DroneModel, disc_fans
 
 PAINT_BGR = {
@@ -55,7 +54,7 @@ def hovering() -> Scene:
 
 def view_of(
     at_m: np.ndarray, height_m: float, angles: tuple[float, float], distance_m: float, focal_px: float
-) -> raster.View:
+) -> raster.RasterView:
     """A window of `WIDTH_M` by `height_m` around a point, seen from one side."""
     azimuth, elevation = np.radians(angles)
     away = np.array(

@@ -21,11 +21,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
-from psotrack.cameras import project
-from psotrack.evaluation.plots import COLOURS
+from psotrack.geometry import project
 from psotrack.simulation import CameraRenderer, Scenario, build, scenario
 from psotrack.simulation.imaging.sensor import Sensor, flicker_gain
 from psotrack.simulation.scenarios import CameraPlace, Drone, Harmonic, Harmonics, Imaging, Limits, Variation
+from psotrack.support import COLOURS
 
 Vector = tuple[float, float, float]
 

@@ -21,11 +21,11 @@ import cv2
 import numpy as np
 
 from psotrack.datasets.dpjait import MaskWriter
+from psotrack.recordings import VideoWriter
 from psotrack.simulation import CameraRenderer, Scene, build, preset_names, scenario
 from psotrack.simulation.imaging.onboard import OnboardRenderer
 from psotrack.simulation.labels.detector import detect
 from psotrack.simulation.labels.masks import silhouettes
-from psotrack.video import VideoWriter
 
 _spent_s: dict[str, float] = defaultdict(float)
 

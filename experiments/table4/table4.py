@@ -18,7 +18,7 @@ import pandas as pd
 
 from psotrack.datasets.dpjait import CALIBRATION
 from psotrack.errors import PsotrackError
-from psotrack.progress import terminal
+from psotrack.support import terminal
 from psotrack.sweep import grid, pivot, render, sweep
 
 HERE = Path(__file__).parent
@@ -95,8 +95,8 @@ def at_hand(data: Path) -> list[str]:
 
 def tracked(what: dict, out: Path, data: Path) -> pd.DataFrame:
     """One row per sequence and method; what is in `out` is not run again."""
-    from psotrack.compiled import keep_compiled
-    from psotrack.sweep.machine import share_processors
+    from psotrack.support import keep_compiled
+    from psotrack.sweep import share_processors
 
     share_processors()
     keep_compiled(out / "cache" / "compiled")

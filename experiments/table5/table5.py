@@ -18,9 +18,8 @@ from pathlib import Path
 import pandas as pd
 
 from psotrack.errors import PsotrackError
-from psotrack.progress import terminal
-from psotrack.sweep import Grid, load, pivot, render, sweep
-from psotrack.sweep.store import Store
+from psotrack.support import terminal
+from psotrack.sweep import Grid, Store, load, pivot, render, sweep
 
 HERE = Path(__file__).parent
 #: Title -> column, its factor, and decimals: what the tables show.
@@ -77,8 +76,8 @@ def simulated(grid: Grid, data: Path, *, quick: bool) -> Path:
 
 def tracked(grid: Grid, out: Path, data: Path) -> pd.DataFrame:
     """One row per cell and run; what is in `out` is not run again."""
-    from psotrack.compiled import keep_compiled
-    from psotrack.sweep.machine import share_processors
+    from psotrack.support import keep_compiled
+    from psotrack.sweep import share_processors
 
     share_processors()
     keep_compiled(out / "cache" / "compiled")

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from psotrack.inside_out.camera_path import CameraPath
+from psotrack.inside_out import CameraPath
 from psotrack.inside_out.comparison import Comparison, Statistics
 from psotrack.inside_out.comparison.visibility import visible_markers
 

@@ -9,12 +9,11 @@ import numpy as np
 from _recordings import Recording
 from _sightings import Sightings
 
-from psotrack.inside_out.camera_path import CameraPath
+from psotrack.inside_out import CameraPath, LocaliseSettings, PoseSettings, smooth
 from psotrack.inside_out.detection import SeenMarkers
 from psotrack.inside_out.filtering.path_rows import path_of
-from psotrack.inside_out.filtering.smoothing import smooth
-from psotrack.inside_out.localising import LocaliseSettings, follow_markers, row_of
-from psotrack.inside_out.pose import MarkerPose, PoseSettings
+from psotrack.inside_out.localising import follow_markers, row_of
+from psotrack.inside_out.pose import MarkerPose
 
 #: What the paper asks for.
 MIN_MARKERS = 4

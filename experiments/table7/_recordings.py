@@ -13,15 +13,14 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from psotrack.calibration import lens_of_view
-from psotrack.cameras import Camera, camera
+from psotrack.clocks import own_reference
 from psotrack.datasets.dpjait import CALIBRATION, MARKER_CORNERS, read_sequence
 from psotrack.errors import InputError
-from psotrack.inside_out.marker_map import MarkerMap, read_marker_map
-from psotrack.progress import terminal
-from psotrack.sequence import OnboardVideo
-from psotrack.synchronisation import own_reference
+from psotrack.geometry import Camera, camera
+from psotrack.inside_out import MarkerMap, read_marker_map
+from psotrack.recordings import OnboardVideo, VideoInfo
+from psotrack.support import terminal
 from psotrack.trajectories import Trajectories
-from psotrack.video import VideoInfo
 
 SIMULATED = ("S01_D2_A", "S02_D4_A")
 #: What the paper says of its GoPro, for videos that come without intrinsics.

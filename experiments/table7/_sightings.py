@@ -11,12 +11,10 @@ import numpy as np
 from _recordings import Recording
 from jaxtyping import Float, Int
 
-from psotrack.files import written_whole
-from psotrack.inside_out import detection
+from psotrack.inside_out import MarkerMap, detection
 from psotrack.inside_out.detection import MarkerDetector, SeenMarkers
-from psotrack.inside_out.marker_map import MarkerMap
-from psotrack.progress import terminal
-from psotrack.video import read_frames
+from psotrack.recordings import read_frames
+from psotrack.support import terminal, written_whole
 
 DICTIONARY = "4x4_1000"
 

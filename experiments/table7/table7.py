@@ -23,10 +23,10 @@ from _recordings import Recording, at_hand, recordings, simulated
 from _sightings import Sightings, detected, mislabelled
 
 from psotrack.errors import PsotrackError
-from psotrack.files import written_whole
-from psotrack.inside_out.camera_path import CameraPath
+from psotrack.inside_out import CameraPath
 from psotrack.inside_out.comparison import Comparison, compare
 from psotrack.inside_out.comparison.plots import save_errors, save_paths
+from psotrack.support import written_whole
 
 #: Shares of the markers that are taken for others.
 WRONG = (0.0, 0.02)

@@ -21,11 +21,9 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.errors import InputError, PsotrackError
-from psotrack.files import refuse_to_overwrite, written_whole
-from psotrack.inside_out.camera_path import CameraPath, read_camera_path
-from psotrack.inside_out.fusing import Fused, fuse
-from psotrack.trajectories import Trajectories
-from psotrack.trajectory_files import read_trajectories
+from psotrack.inside_out import CameraPath, Fused, fuse, read_camera_path
+from psotrack.support import refuse_to_overwrite, written_whole
+from psotrack.trajectories import Trajectories, read_trajectories
 
 METHODS = ("outside", "inside", "fused")
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.calibration.bundle_equations import Equations, Problem, State, slopes_of
+from psotrack.calibration.bundle_equations import BundleState, Equations, Problem, slopes_of
 
 #: A common error that its points tell less well than this, in its own standard deviations, says nothing of its size.
 _TOLD = 1.0
@@ -36,7 +36,7 @@ class Alike:
 
 def covariance_of_alike(
     problem: Problem,
-    state: State,
+    state: BundleState,
     weights: Float[np.ndarray, "points cameras"],
     equations: Equations,
     alike: Ordered[Alike],
@@ -75,7 +75,7 @@ def covariance_of_alike(
 
 
 def _reduced_slopes(
-    problem: Problem, state: State, equations: Equations, index: int, seen: Int[np.ndarray, " seen"]
+    problem: Problem, state: BundleState, equations: Equations, index: int, seen: Int[np.ndarray, " seen"]
 ) -> tuple[Float[np.ndarray, "seen 2 free"], Float[np.ndarray, "seen 2"]]:
     """Derivatives of a camera's pixels by the unknowns, the points following them; and what pixels are off by."""
     by_camera, off = slopes_of(problem, state, index, seen)

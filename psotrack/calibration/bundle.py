@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack.calibration.alike import Alike, covariance_of_alike
 from psotrack.calibration.bundle_equations import (
+    BundleState,
     Problem,
-    State,
     distance_px,
     equations_of,
     scaled,
@@ -27,13 +27,12 @@ from psotrack.calibration.bundle_equations import (
 from psotrack.calibration.derivatives import centre_by_pose
 from psotrack.calibration.gauge import common_motions, metric
 from psotrack.calibration.residuals import GATE, inflation, spread_px
-from psotrack.cameras import NEAR_M, Camera, CameraRig, to_camera
 from psotrack.errors import InputError, SettingsError, check_positive
-from psotrack.triangulation import triangulate
+from psotrack.geometry import NEAR_M, Camera, CameraRig, to_camera, triangulate
 
 
 @dataclass(frozen=True)
-class Adjusted:
+class AdjustedRig:
     """A rig that its data agree with.
 
     Attributes:
@@ -69,7 +68,7 @@ def adjust(
     fixed: Ordered[str] = (),
     rescaled: Ordered[str] = (),
     alike: Ordered[Alike] = (),
-) -> Adjusted:
+) -> AdjustedRig:
     """The rig, and the points, that explain what the cameras see.
 
     The covariance is that of errors of the stated noise, wider where residuals are larger than it explains, and of
@@ -109,7 +108,7 @@ def adjust(
     noise = np.where(placed, noise_px, 1.0)[rows]
     zoomed = np.array([name in rescaled for name in rig.names])
     problem = Problem(rig.cameras, given, points_px[rows], noise, zoomed, free, common, held)
-    state, used = State(given, start_m[rows]), placed[rows]
+    state, used = BundleState(given, start_m[rows]), placed[rows]
     state = solved(problem, state, used, robust=True)
     residual_px = distance_px(problem, state)
     unknowns = free.shape[1] - common.shape[1] + 3 * len(rows)
@@ -171,12 +170,12 @@ def _unknowns(
 def _adjusted(
     rig: CameraRig,
     problem: Problem,
-    state: State,
+    state: BundleState,
     used: Bool[np.ndarray, "rows cameras"],
     rows: Int[np.ndarray, " rows"],
     num_points: int,
     alike: Ordered[Alike],
-) -> Adjusted:
+) -> AdjustedRig:
     """The answer for all points, with the covariance of the cameras."""
     weights = weights_of(problem, state, used, robust=False)
     equations = equations_of(problem, state, weights, damping=0.0)
@@ -208,7 +207,7 @@ def _adjusted(
     all_residual_px[rows] = residual_px
     all_used = np.zeros((num_points, len(rig)), bool)
     all_used[rows] = used
-    return Adjusted(
+    return AdjustedRig(
         CameraRig(rig.names, replace(scaled(rig.cameras, factor), T_cam_world=state.T_cam_world)),
         points_m,
         all_residual_px,

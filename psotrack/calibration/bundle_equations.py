@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack.calibration.derivatives import reproject
 from psotrack.calibration.gauge import departure
-from psotrack.cameras import Camera
+from psotrack.geometry import Camera
 
 #: Weight of a common motion of the whole rig: so large that it is none, so small that sums keep their digits.
 _HELD = 1e6
@@ -20,7 +20,7 @@ _MOST_STEPS = 100
 
 
 @dataclass(frozen=True)
-class State:
+class BundleState:
     """What is sought."""
 
     T_cam_world: Float[np.ndarray, "cameras 4 4"]
@@ -64,8 +64,8 @@ class Equations:
 
 
 def solved(
-    problem: Problem, state: State, used: Bool[np.ndarray, "points cameras"], *, robust: bool
-) -> State:
+    problem: Problem, state: BundleState, used: Bool[np.ndarray, "points cameras"], *, robust: bool
+) -> BundleState:
     """Levenberg-Marquardt from a state; damping grows where a step does not help."""
     damping, cost = 1e-4, _cost(problem, state, used, robust)
     for _ in range(_MOST_STEPS):
@@ -85,7 +85,9 @@ def solved(
     return state
 
 
-def _cost(problem: Problem, state: State, used: Bool[np.ndarray, "points cameras"], robust: bool) -> float:
+def _cost(
+    problem: Problem, state: BundleState, used: Bool[np.ndarray, "points cameras"], robust: bool
+) -> float:
     squares = (distance_px(problem, state) / problem.noise_px)[used] ** 2
     common = problem.held @ departure(problem.given, state.T_cam_world)
     loss = np.log1p(squares) if robust else squares
@@ -93,14 +95,14 @@ def _cost(problem: Problem, state: State, used: Bool[np.ndarray, "points cameras
 
 
 def weights_of(
-    problem: Problem, state: State, used: Bool[np.ndarray, "points cameras"], robust: bool
+    problem: Problem, state: BundleState, used: Bool[np.ndarray, "points cameras"], robust: bool
 ) -> Float[np.ndarray, "points cameras"]:
     """1 / variance of what counts, less where it is far off and the loss robust; else 0."""
     squares = np.where(used, distance_px(problem, state) / problem.noise_px, 0.0) ** 2
     return used / (1 + squares if robust else 1.0) / problem.noise_px**2
 
 
-def distance_px(problem: Problem, state: State) -> Float[np.ndarray, "points cameras"]:
+def distance_px(problem: Problem, state: BundleState) -> Float[np.ndarray, "points cameras"]:
     """Distances in the image between projections and what is seen."""
     columns = []
     for index, T in enumerate(state.T_cam_world):
@@ -109,7 +111,7 @@ def distance_px(problem: Problem, state: State) -> Float[np.ndarray, "points cam
     return np.stack(columns, axis=-1)
 
 
-def _lens(problem: Problem, state: State, index: int) -> Camera:
+def _lens(problem: Problem, state: BundleState, index: int) -> Camera:
     return (
         scaled(problem.lenses[index], state.focal_scale) if problem.rescaled[index] else problem.lenses[index]
     )
@@ -123,7 +125,7 @@ def scaled(lenses: Camera, focal_scale: float | Float[np.ndarray, " cameras"]) -
 
 
 def equations_of(
-    problem: Problem, state: State, weights: Float[np.ndarray, "points cameras"], damping: float
+    problem: Problem, state: BundleState, weights: Float[np.ndarray, "points cameras"], damping: float
 ) -> Equations:
     """The normal equations at a state; a share `damping` of the diagonal is added to it."""
     count, free = len(problem.given), problem.free
@@ -160,7 +162,7 @@ def equations_of(
 
 
 def slopes_of(
-    problem: Problem, state: State, index: int, seen: Int[np.ndarray, " seen"]
+    problem: Problem, state: BundleState, index: int, seen: Int[np.ndarray, " seen"]
 ) -> tuple[Float[np.ndarray, "seen 2 7"], Float[np.ndarray, "seen 2"]]:
     """Derivatives of a camera's pixels by its own six unknowns and the focal length's, and what they are off by."""
     T, lens = state.T_cam_world[index], _lens(problem, state, index)
@@ -170,7 +172,7 @@ def slopes_of(
     return np.concatenate([by_turn, by_shift, by_focal], axis=-1), problem.points_px[seen, index] - pixels
 
 
-def _moved(problem: Problem, state: State, equations: Equations) -> State:
+def _moved(problem: Problem, state: BundleState, equations: Equations) -> BundleState:
     step = np.linalg.lstsq(equations.reduced, equations.right, rcond=None)[0]
     whole = problem.free @ step
     T = state.T_cam_world.copy()
@@ -178,7 +180,7 @@ def _moved(problem: Problem, state: State, equations: Equations) -> State:
         turn, shift = whole[6 * index : 6 * index + 3], whole[6 * index + 3 : 6 * index + 6]
         T[index, :3, :3] = cv2.Rodrigues(turn)[0] @ T[index, :3, :3]
         T[index, :3, 3] += shift
-    return State(
+    return BundleState(
         T,
         state.points_m + equations.point_step + equations.back @ step,
         state.focal_scale * float(np.exp(whole[-1])),

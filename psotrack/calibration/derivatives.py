@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.cameras import Camera
-from psotrack.rotations import cross_matrices
+from psotrack.geometry import Camera, cross_matrices
 
 
 def reproject(

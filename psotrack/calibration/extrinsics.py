@@ -20,8 +20,8 @@ from jaxtyping import Bool, Float
 from psotrack.calibration.derivatives import centre_by_pose, reproject
 from psotrack.calibration.pose_search import MIN_POINTS, Pose, distances_px, likely, refined, starts_of
 from psotrack.calibration.residuals import GATE, inflation, spread_px
-from psotrack.cameras import Camera
 from psotrack.errors import InputError, check_positive
+from psotrack.geometry import Camera
 
 #: Times the stated σ that half of the points may be off, before nothing is believed.
 _HOPELESS = 10.0

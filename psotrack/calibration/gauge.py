@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.calibration.derivatives import centre_by_pose
-from psotrack.rotations import cross_matrices
+from psotrack.geometry import cross_matrices
 
 #: What counts as much as `TURN_RAD` when a rig is moved as little as can be.
 SHIFT_M = 0.05

@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.aruco import marker_dictionary
-from psotrack.cameras import Camera, camera
+from psotrack.detection import marker_dictionary
 from psotrack.errors import InputError, SettingsError, check_positive
-from psotrack.video import VideoInfo, read_frames
+from psotrack.geometry import Camera, camera
+from psotrack.recordings import VideoInfo, read_frames
 
 #: Views that a calibration needs: fewer fix k1, k2, p1, p2 badly.
 _MIN_VIEWS = 8

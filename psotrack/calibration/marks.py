@@ -14,15 +14,14 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.aruco import marker_dictionary
 from psotrack.calibration.alike import Alike
-from psotrack.cameras import CameraRig, project
-from psotrack.delimited import Column, Row, Table, read_rows
-from psotrack.detections import Detections
+from psotrack.correspondence import BORDER_PX, NOISE_PX, NOISE_SHARE
+from psotrack.detection import marker_dictionary
 from psotrack.errors import InputError
-from psotrack.sightings import BORDER_PX, NOISE_PX, NOISE_SHARE
+from psotrack.geometry import CameraRig, project
+from psotrack.recordings import Detections, VideoInfo, read_frames
+from psotrack.support import Column, Table, TextRow, read_rows
 from psotrack.trajectories import Trajectories
-from psotrack.video import VideoInfo, read_frames
 
 _SEPARATOR = ","
 _WORLD = ("x_m", "y_m", "z_m")
@@ -218,7 +217,7 @@ def _alike(
 
 def _read_table(path: Path) -> Table:
     """A table whose last cells may be empty, which `delimited.read_table` would take for a short row."""
-    header, *rows = read_rows(path, _SEPARATOR) or [Row(path, 1, ("",))]
+    header, *rows = read_rows(path, _SEPARATOR) or [TextRow(path, 1, ("",))]
     columns = tuple(Column(index, cell.lower(), "", cell) for index, cell in enumerate(header.cells))
     if not rows:
         raise InputError(path, expected="rows below the header", found="none")
@@ -229,7 +228,7 @@ def _read_table(path: Path) -> Table:
             raise InputError(
                 row.where, expected=f"{len(columns)} values as in the header", found=f"{len(row.cells)}"
             )
-        whole.append(Row(path, row.line, cells))
+        whole.append(TextRow(path, row.line, cells))
     return Table(path, columns, tuple(whole))
 
 

@@ -14,8 +14,8 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 
 from psotrack.calibration.derivatives import pixel_slopes, reproject
-from psotrack.cameras import NEAR_M, Camera, project, undistort
 from psotrack.errors import InputError
+from psotrack.geometry import NEAR_M, Camera, project, undistort
 
 #: A pose has six unknowns and a point gives two equations; the fourth point picks one of P3P's four answers.
 MIN_POINTS = 4

@@ -17,10 +17,10 @@ from jaxtyping import Float
 from scipy.stats import chi2
 
 from psotrack.calibration.alike import Alike
-from psotrack.calibration.bundle import Adjusted, adjust
+from psotrack.calibration.bundle import AdjustedRig, adjust
 from psotrack.calibration.gauge import common_motions, departure, metric
-from psotrack.cameras import CameraRig
 from psotrack.errors import InputError
+from psotrack.geometry import CameraRig
 
 #: Probability, at most, that a camera of a right rig is called off.
 FALSE_ALARM = 0.01
@@ -51,8 +51,8 @@ class Improved:
     moved: tuple[str, ...]
     zoomed: dict[str, tuple[float, float]]
     rescaled: bool
-    everything: Adjusted
-    final: Adjusted | None
+    everything: AdjustedRig
+    final: AdjustedRig | None
     centre_covariance_m2: Float[np.ndarray, "cameras 3 3"]
 
 
@@ -95,7 +95,7 @@ def improve(
     return Improved(final.rig, moved, zoomed, rescaled, everything, final, covariance_m2)
 
 
-def _surprise(adjusted: Adjusted) -> float:
+def _surprise(adjusted: AdjustedRig) -> float:
     """χ² of one degree of freedom, of the focal lengths' factor; 0 where they are fixed."""
     std = adjusted.focal_scale_std / adjusted.focal_scale
     return float((np.log(adjusted.focal_scale) / std) ** 2) if std > 0 else 0.0
@@ -106,7 +106,7 @@ def _zoomed(
     points_px: Float[np.ndarray, "points cameras 2"],
     noise_px: float | Float[np.ndarray, "points cameras"],
     alike: Ordered[Alike],
-    final: Adjusted,
+    final: AdjustedRig,
     moved: tuple[str, ...],
 ) -> dict[str, tuple[float, float]]:
     """Cameras whose views another focal length, where they stood, fits as well as another pose."""
@@ -127,7 +127,7 @@ def _zoomed(
     return found
 
 
-def off_cameras(rig: CameraRig, adjusted: Adjusted, fixed: Ordered[str] = ()) -> tuple[str, ...]:
+def off_cameras(rig: CameraRig, adjusted: AdjustedRig, fixed: Ordered[str] = ()) -> tuple[str, ...]:
     """Names of the cameras that are off by more than the covariance explains; all that may move if most of them are.
 
     Args:
@@ -156,7 +156,7 @@ def off_cameras(rig: CameraRig, adjusted: Adjusted, fixed: Ordered[str] = ()) ->
 
 
 def _information(
-    rig: CameraRig, adjusted: Adjusted, fixed: Ordered[str]
+    rig: CameraRig, adjusted: AdjustedRig, fixed: Ordered[str]
 ) -> tuple[Float[np.ndarray, "unknowns unknowns"], Float[np.ndarray, " unknowns"]]:
     """Λ of the cameras that may move, whatever common motion is added to them, and b = Λ x."""
     given = np.asarray(rig.cameras.T_cam_world)

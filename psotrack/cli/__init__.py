@@ -1,7 +1,8 @@
-"""The command line. Every command says what it needs, what it writes, and shows an example.
+"""The command line: every command says what it needs and what it writes, and shows an example.
 
-Commands are thin over functions, which are imported when they are called, so that `--help` is quick.
-Exit codes: 0 only when all was done; 2 for everything that went wrong, with one line on stderr that says what.
+In: arguments and files. Out: files, text on stdout, and one line on stderr where something is wrong. Commands contain
+no numerics; they import the functions they call when they run, so that `--help` is quick. The exit code is 0 only
+when everything was done, and 2 for every error.
 """
 
 from __future__ import annotations

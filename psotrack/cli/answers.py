@@ -11,8 +11,7 @@ from typing import Any
 import click
 
 from psotrack.errors import SettingsError
-from psotrack.files import refuse_to_overwrite, written_whole
-from psotrack.progress import Report, silent, terminal
+from psotrack.support import Report, refuse_to_overwrite, silent, terminal, written_whole
 
 #: Heading of places in a table.
 PLACE = "centre (m)"

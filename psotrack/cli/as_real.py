@@ -50,7 +50,7 @@ def as_real(
       psotrack simulate S02_D4_A --set cameras=laboratory_corners --no-masks --no-onboard --out data
       psotrack as-real data/Simulated_Data/S02_D4_A --out data
     """
-    from psotrack.simulation.real_form import write_as_real
+    from psotrack.simulation import write_as_real
 
     folder = write_as_real(
         sequence,

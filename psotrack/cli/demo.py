@@ -27,8 +27,8 @@ def demo(out: Path, seed: int, jobs: int | None, force: bool, quiet: bool) -> No
     """
     from rich.console import Console
 
-    from psotrack.compiled import keep_compiled
     from psotrack.demo import run
+    from psotrack.support import keep_compiled
 
     keep_compiled(compiled_folder(None))
     result = run(out, seed=seed, jobs=jobs, force=force, report=report_to(quiet))

@@ -63,12 +63,12 @@ def detect(
       psotrack detect data/Simulated_Data/S02_D4_A --detector drones.onnx --out boxes
       psotrack detect data/Real_Data/R12_D4 --detector drones.onnx --out boxes --size 1280 --confidence 0.4
     """
-    from psotrack.detections import write_detections
-    from psotrack.detector import Detector, DetectorSettings
-    from psotrack.detector import detect as detect_in
-    from psotrack.files import refuse_to_overwrite
+    from psotrack.detection import DetectorSettings, OnnxDetector
+    from psotrack.detection import detect as detect_in
+    from psotrack.recordings import write_detections
+    from psotrack.support import refuse_to_overwrite
 
-    detector = Detector(model, DetectorSettings(confidence, nms, size))
+    detector = OnnxDetector(model, DetectorSettings(confidence, nms, size))
     recording = usable_sequence(sequence, cameras, num_frames)
     files = {name: out / f"{video.path.stem}.csv" for name, video in recording.videos.items()}
     for path in files.values():

@@ -13,8 +13,8 @@ from psotrack.cli.answers import answer, known, report_to, say
 from psotrack.cli.options import CACHE, FORCE, JOBS, JSON, QUIET, SEQUENCE, cache_folder
 
 if TYPE_CHECKING:
-    from psotrack.cameras import CameraRig
     from psotrack.doctor import Diagnosis
+    from psotrack.geometry import CameraRig
 
 #: Of the exit, where something was found.
 FOUND = 2
@@ -57,13 +57,12 @@ def doctor(
       psotrack doctor data/Real_Data/R12_D4
       psotrack doctor data/Real_Data/R12_D4 --detections blobs --json -
     """
+    from psotrack.correspondence import from_detections, from_silhouettes
     from psotrack.datasets.dpjait import read_detections, read_sequence
     from psotrack.doctor import examine
     from psotrack.methods import detection_files_of
     from psotrack.settings import BLOBS
-    from psotrack.sightings import from_detections, from_silhouettes
-    from psotrack.silhouette_store import SilhouetteSettings
-    from psotrack.silhouettes import compute
+    from psotrack.silhouettes import SilhouetteSettings, compute
 
     recording = read_sequence(sequence)
     report = report_to(quiet)

@@ -14,7 +14,7 @@ from psotrack.cli.options import FORCE, JSON, QUIET, SEQUENCE
 from psotrack.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
-    from psotrack.sequence import Sequence
+    from psotrack.recordings import Sequence
     from psotrack.trajectories import Trajectories
 
 
@@ -59,7 +59,7 @@ def evaluate(
     from psotrack.datasets.dpjait import read_sequence
     from psotrack.evaluation import evaluate as compare
     from psotrack.evaluation import plots, tables
-    from psotrack.trajectory_files import read_trajectories
+    from psotrack.trajectories import read_trajectories
 
     recording = read_sequence(sequence)
     if recording.truth is None:
@@ -83,7 +83,7 @@ def _shifted_reference(
     recording: Sequence, estimate: Trajectories, offset: str
 ) -> tuple[Trajectories, float]:
     """The reference of a sequence at the frames of its videos, and by how much its clock is ahead of theirs."""
-    from psotrack.synchronisation import find_offset, own_reference, shifted
+    from psotrack.clocks import find_offset, own_reference, shifted
 
     reference = own_reference(recording)
     if offset == "auto":

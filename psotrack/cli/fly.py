@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from psotrack.cli.options import FORCE, QUIET, Numbers
-from psotrack.files import refuse_to_overwrite
+from psotrack.support import refuse_to_overwrite
 
 
 @click.command()
@@ -70,9 +70,8 @@ def fly(
     """
     import numpy as np
 
+    from psotrack.simulation import space_in, write_recording
     from psotrack.simulation.flights import devices, piloting
-    from psotrack.simulation.flights.dynamics import space_in
-    from psotrack.simulation.flights.recordings import write_recording
 
     sticks_path = out.with_suffix(".sticks.csv")
     refuse_to_overwrite(out, force)

@@ -11,9 +11,7 @@ from psotrack.cli.answers import answer, check_outputs, say
 from psotrack.cli.options import FORCE, JSON, QUIET
 
 if TYPE_CHECKING:
-    from psotrack.inside_out.camera_path import CameraPath
-    from psotrack.inside_out.fusing import Fused, FusedDrone
-    from psotrack.inside_out.fusing.drone_fusion import DroneFusion, Errors
+    from psotrack.inside_out import CameraPath, DroneFusion, Errors, Fused, FusedDrone
 
 
 @click.command()
@@ -61,10 +59,9 @@ def fuse(
       psotrack evaluate fused.csv data/Simulated_Data/S01_D2_A
     """
     from psotrack.errors import InputError, check_positive
-    from psotrack.inside_out.camera_path import read_camera_path
-    from psotrack.inside_out.fusing import fuse as fuse_paths
-    from psotrack.inside_out.fusing.fused_table import write_fused
-    from psotrack.trajectory_files import read_trajectories
+    from psotrack.inside_out import fuse as fuse_paths
+    from psotrack.inside_out import read_camera_path, write_fused
+    from psotrack.trajectories import read_trajectories
 
     check_outputs(out, json_path, force)
     if max_offset_s is not None:

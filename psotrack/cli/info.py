@@ -23,8 +23,8 @@ def info(sequence: Path, force: bool, json_path: Path | None) -> None:
     """
     from rich.console import Console
 
-    from psotrack.contents import contents, render
     from psotrack.datasets.dpjait import read_sequence
+    from psotrack.recordings import contents, render
 
     content = contents(read_sequence(sequence))
     answer(json_path, content, force)

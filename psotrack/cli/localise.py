@@ -13,11 +13,9 @@ from psotrack.cli.options import FORCE, FRAMES, JSON, QUIET, Numbers
 from psotrack.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
-    from psotrack.cameras import Camera
-    from psotrack.inside_out.camera_path import CameraPath
-    from psotrack.inside_out.frames import Source
-    from psotrack.inside_out.localising import Localised
-    from psotrack.sequence import OnboardVideo
+    from psotrack.geometry import Camera
+    from psotrack.inside_out import CameraPath, LocalisedVideo, Source
+    from psotrack.recordings import OnboardVideo
 
 
 @dataclass(frozen=True)
@@ -140,15 +138,17 @@ def localise(
     """
     from dataclasses import replace
 
-    from psotrack.files import refuse_to_overwrite
-    from psotrack.inside_out.camera_path import write_camera_path
-    from psotrack.inside_out.comparison.plots import save_flight
-    from psotrack.inside_out.filtering.pose_filter import PoseFilterParams
-    from psotrack.inside_out.filtering.smoothing import smooth
-    from psotrack.inside_out.localising import LocaliseSettings
-    from psotrack.inside_out.localising import localise as localise_camera
-    from psotrack.inside_out.marker_map import read_marker_map
-    from psotrack.inside_out.pose import PoseSettings
+    from psotrack.inside_out import (
+        LocaliseSettings,
+        PoseFilterParams,
+        PoseSettings,
+        read_marker_map,
+        save_flight,
+        smooth,
+        write_camera_path,
+    )
+    from psotrack.inside_out import localise_video as localise_camera
+    from psotrack.support import refuse_to_overwrite
 
     check_outputs(out, json_path, force)
     picture = None if plot is None else plot if plot.name else out.with_suffix(".png")
@@ -194,7 +194,7 @@ def localise(
 def _input(video: str, drone: str | None, fps: float | None, live: bool) -> _Input:
     """A video, a folder of images, or a stream; or the video of one drone in a sequence."""
     from psotrack.datasets.dpjait import MARKER_CORNERS, read_onboard
-    from psotrack.inside_out.frames import holds_images, open_source
+    from psotrack.inside_out import holds_images, open_source
 
     stream, folder = live or "://" in video, Path(video)
     of_folder = not stream and folder.is_dir()
@@ -230,7 +230,7 @@ def _lens(
     scale: bool,
     fov_deg: tuple[float, float] | None,
 ) -> Camera:
-    from psotrack.inside_out.lens_files import chosen_lens, lens_of_matrix
+    from psotrack.inside_out import chosen_lens, lens_of_matrix
 
     size_wh, K = given.source.image_size_wh, None if given.onboard is None else given.onboard.K
     if camera_file is None and fov_deg is None and K is not None:
@@ -238,11 +238,11 @@ def _lens(
     return chosen_lens(size_wh, path=camera_file, fov_deg=fov_deg, name=camera_name, scale=scale)
 
 
-def _content(found: Localised, video: str, name: str, min_markers: int) -> dict[str, Any]:
+def _content(found: LocalisedVideo, video: str, name: str, min_markers: int) -> dict[str, Any]:
     """The answer as JSON has it, with null where there is no number."""
     import numpy as np
 
-    from psotrack.inside_out.camera_path import Flag
+    from psotrack.inside_out import Flag
     from psotrack.trajectories import Status
 
     path = found.path

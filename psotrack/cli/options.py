@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 import platformdirs
 
-from psotrack.foreground import Shadows
 from psotrack.settings import TrackSettings
-from psotrack.silhouette_store import SilhouetteSettings
+from psotrack.silhouettes import Shadows, SilhouetteSettings
 
 if TYPE_CHECKING:
-    from psotrack.sequence import Sequence
+    from psotrack.recordings import Sequence
 
 #: Defaults are written once, in the settings; the command line shows them.
 TRACK = TrackSettings()

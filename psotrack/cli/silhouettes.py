@@ -21,7 +21,7 @@ from psotrack.cli.options import (
     silhouette_options,
     usable_sequence,
 )
-from psotrack.silhouette_store import SilhouetteSettings
+from psotrack.silhouettes import SilhouetteSettings
 
 
 @click.command()

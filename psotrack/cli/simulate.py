@@ -109,7 +109,7 @@ def simulate(
     recipe = load(scenario_file) if scenario_file else scenario(str(name))
     recipe = replaced(recipe, dict(_change(change) for change in changes))
     if preview:
-        from psotrack.simulation.preview import save_preview
+        from psotrack.simulation import save_preview
 
         page = save_preview(
             out / f"{recipe.name}.png",
@@ -142,7 +142,7 @@ def simulate(
 def _list(json_path: Path | None, quiet: bool, force: bool) -> None:
     from rich.console import Console
 
-    from psotrack.simulation.catalogue import catalogue, render
+    from psotrack.simulation import catalogue, render
 
     rows = catalogue()
     answer(json_path, rows, force)

@@ -11,13 +11,10 @@ import click
 from psotrack.cli.answers import answer, report_to, say
 from psotrack.cli.options import CACHE, FORCE, JOBS, JSON, QUIET, cache_folder, compiled_folder
 from psotrack.errors import SettingsError
-from psotrack.files import refuse_to_overwrite
-from psotrack.progress import Report
+from psotrack.support import Report, refuse_to_overwrite
 
 if TYPE_CHECKING:
-    from psotrack.sweep import Grid
-    from psotrack.sweep.machine import Device
-    from psotrack.sweep.runner import Outcome
+    from psotrack.sweep import Device, Grid, SweepOutcome
 
 
 @click.command()
@@ -122,11 +119,10 @@ def _run_here(
     jobs: int | None,
     device: Device | None,
     report: Report,
-) -> Outcome:
+) -> SweepOutcome:
     """In this process."""
-    from psotrack.compiled import keep_compiled
-    from psotrack.sweep.machine import share_processors, use_device
-    from psotrack.sweep.runner import run
+    from psotrack.support import keep_compiled
+    from psotrack.sweep import run, share_processors, use_device
 
     share_processors()
     if device is not None:
@@ -144,10 +140,9 @@ def _run_there(
     workers: int | None,
     device: Device | None,
     report: Report,
-) -> Outcome:
+) -> SweepOutcome:
     """By the workers of a cluster."""
-    from psotrack.sweep.cluster import run_on_cluster
-    from psotrack.sweep.machine import use_device
+    from psotrack.sweep import run_on_cluster, use_device
 
     use_device("cpu")  # this process computes nothing: a GPU is for the workers
     folders = {"data": data, "cache": cache_folder(cache)}
@@ -179,8 +174,7 @@ def table(folder: Path, rows_by: str, columns_by: str, value: str, scale: float,
       psotrack table results --rows sequence,particles --columns iterations --value mean_error_m --scale 1000
       psotrack table results --columns method --value missed_rate --format latex
     """
-    from psotrack.sweep import pivot, render
-    from psotrack.sweep.store import Store
+    from psotrack.sweep import Store, pivot, render
 
     shown = pivot(
         Store(folder).rows(),
@@ -203,10 +197,7 @@ def _show(
     json_path: Path | None,
 ) -> None:
     """The cells of a grid, and how long they will take."""
-    from psotrack.sweep.estimates import estimate
-    from psotrack.sweep.grid import cameras_label
-    from psotrack.sweep.inputs import Inputs
-    from psotrack.sweep.store import Store
+    from psotrack.sweep import Inputs, Store, cameras_label, estimate
 
     cells = grid.cells()
     listed = [
@@ -229,7 +220,7 @@ def _show(
 
 def _status(folder: Path, quiet: bool, force: bool, json_path: Path | None) -> None:
     """How far the results in a folder are."""
-    from psotrack.sweep.store import Store
+    from psotrack.sweep import Store
 
     content = Store(folder).status()
     answer(json_path, content, force)

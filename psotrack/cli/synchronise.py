@@ -11,7 +11,7 @@ from psotrack.cli.answers import answer, say
 from psotrack.cli.options import FORCE, JSON, QUIET, SEQUENCE
 
 if TYPE_CHECKING:
-    from psotrack.synchronisation import Offset
+    from psotrack.clocks import Offset
     from psotrack.trajectories import Trajectories
 
 
@@ -56,9 +56,9 @@ def synchronise(
       psotrack synchronise tracks.csv data/Real_Data/R12_D4
       psotrack synchronise tracks.csv data/Real_Data/R12_D4 --max-offset 10 --plot offset.png --json -
     """
+    from psotrack.clocks import find_offset, own_reference, save_curve
     from psotrack.datasets.dpjait import read_sequence
-    from psotrack.synchronisation import find_offset, own_reference, save_curve
-    from psotrack.trajectory_files import read_trajectories
+    from psotrack.trajectories import read_trajectories
 
     recording = read_sequence(sequence)
     reference = own_reference(recording)
@@ -92,7 +92,7 @@ def _mm(value_m: float) -> str:
 
 def _content(offset: Offset, estimate: Trajectories, reference: Trajectories) -> dict[str, Any]:
     """The offset as JSON has it, with null where there is no number."""
-    from psotrack.evaluation.association import UNASSIGNED
+    from psotrack.trajectories import UNASSIGNED
 
     drones = [
         {

@@ -27,13 +27,12 @@ from psotrack.cli.options import (
     usable_sequence,
 )
 from psotrack.errors import SettingsError
-from psotrack.files import refuse_to_overwrite
-from psotrack.progress import Report
 from psotrack.settings import Method, Score, SwarmKind, TrackSettings
-from psotrack.silhouette_store import SilhouetteSettings
+from psotrack.silhouettes import SilhouetteSettings
+from psotrack.support import Report, refuse_to_overwrite
 
 if TYPE_CHECKING:
-    from psotrack.sequence import Sequence
+    from psotrack.recordings import Sequence
 
 
 @click.command()
@@ -174,9 +173,9 @@ def track(
       psotrack track data/Real_Data/R12_D4 --out both.csv --method fused --detector drones.onnx --detector-size 1280
       psotrack track data/Simulated_Data/S02_D4_A --out paper.parquet --swarm joint --particles 100 --iterations 70
     """
-    from psotrack.compiled import keep_compiled
     from psotrack.pipeline import track_sequence
-    from psotrack.trajectory_files import write_ambiguity, write_trajectories
+    from psotrack.support import keep_compiled
+    from psotrack.trajectories import write_ambiguity, write_trajectories
 
     if out.suffix not in {".csv", ".parquet"}:
         raise SettingsError("--out", expected="a file that ends in .csv or .parquet", found=out.name)
@@ -216,8 +215,7 @@ def _with_detector(
     settings: TrackSettings, model: Path, size: int, sequence: Sequence, cache: Path, report: Report
 ) -> TrackSettings:
     """The settings, with what a network finds in the videos for detections."""
-    from psotrack.detection_store import stored_detections
-    from psotrack.detector import Detector, DetectorSettings
+    from psotrack.detection import DetectorSettings, OnnxDetector, stored_detections
 
     if settings.method == "swarm":
         expected = "--method projection-lines or fused, which read detections"
@@ -225,6 +223,6 @@ def _with_detector(
     if settings.detections != TRACK.detections:
         found = f"--detections {settings.detections} as well"
         raise SettingsError("--detector", expected="detections from one source", found=found)
-    detector = Detector(model, DetectorSettings(size=size))
+    detector = OnnxDetector(model, DetectorSettings(size=size))
     folder = stored_detections(detector, sequence, cache=cache, report=report)
     return msgspec.structs.replace(settings, detections=str(folder))

@@ -1,19 +1,19 @@
-"""Which detections of several cameras are of the same drone, by epipolar geometry (paper, figure 8), in float64.
+"""Correspondence: which detections of several cameras are of the same drone (paper, figure 8), in float64.
 
-The assignment with the least total cost is sought: a detection in a group costs its squared distance from where the
-group's point is seen, in standard deviations; one in no group costs `UNEXPLAINED`; a group costs `NEW`, or the squared
-distance from where a drone is expected. More than two viewpoints must agree, because any two rays nearly meet
-somewhere, often enough where there is nothing.
+In: detections of one frame in all cameras, and where drones are expected. Out: `Matches`, groups of detections with
+their 3D points.
 
-To search all assignments is the multidimensional assignment problem, which takes exponential time. Here groups are
-proposed by pairs of detections on each other's epipolar lines, packed by exchanges that each lower the cost, and
-completed by optimal assignments of each camera's detections. That is polynomial, and in small scenes, where all can be
-searched, hardly ever more than the least.
+The assignment of least total cost is sought. A detection in a group costs its squared distance, in standard
+deviations, from the projection of the group's point; a detection in no group costs `UNEXPLAINED`; a group costs
+`NEW`, or the squared distance from the position where a drone is expected. More than two viewpoints must agree,
+because two rays nearly meet somewhere even where there is no drone.
+
+Searching all assignments is the multidimensional assignment problem, which takes exponential time. Here pairs of
+detections on each other's epipolar lines propose groups, exchanges that each lower the cost pack the groups, and
+optimal assignments of each camera's detections complete them. This takes polynomial time, and in small scenes, where
+all assignments can be searched, the cost is hardly ever higher than the least cost.
 """
 
-from psotrack.correspondence.epipolar import epipolar_distance
-from psotrack.correspondence.groups import NEW, SHARED, UNEXPLAINED
-from psotrack.correspondence.matching import Matches, match
-from psotrack.correspondence.packing import SEPARATION_M
+import lazy_loader
 
-__all__ = ["NEW", "SEPARATION_M", "SHARED", "UNEXPLAINED", "Matches", "epipolar_distance", "match"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

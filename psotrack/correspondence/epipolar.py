@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.cameras import Camera, undistort
 from psotrack.correspondence.sight import Sight
+from psotrack.geometry import Camera, undistort
 
 
 def epipolar_distance(

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.cameras import NEAR_M
 from psotrack.correspondence.sight import Priors, Sight
+from psotrack.geometry import NEAR_M
 
 #: Cost of a detection in no group. One in 1000 of a drone's is farther off (χ², two degrees of freedom).
 UNEXPLAINED = 13.8

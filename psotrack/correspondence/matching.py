@@ -7,13 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.cameras import Camera
 from psotrack.correspondence.groups import SHARED, UNEXPLAINED, Groups
 from psotrack.correspondence.packing import exchanged, offers_of, packed
 from psotrack.correspondence.proposals import proposals
 from psotrack.correspondence.sight import Sight, priors_of, sight_of
 from psotrack.errors import SettingsError
-from psotrack.triangulation import triangulate
+from psotrack.geometry import Camera, triangulate
 
 
 @dataclass(frozen=True)

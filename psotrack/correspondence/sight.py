@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.cameras import NEAR_M, Camera, undistort
 from psotrack.errors import SettingsError
-from psotrack.triangulation import projection_equations, viewpoints
+from psotrack.geometry import NEAR_M, Camera, projection_equations, undistort, viewpoints
 
 
 @dataclass(frozen=True)

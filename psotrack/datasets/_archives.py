@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import IO
 
 from psotrack.errors import InputError
-from psotrack.files import written_whole
+from psotrack.support import written_whole
 
 #: The first day that the format knows: archives of the same contents have the same bytes.
 EPOCH = (1980, 1, 1, 0, 0, 0)

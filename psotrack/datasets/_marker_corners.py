@@ -21,9 +21,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.delimited import Column, Row, Table, read_rows, write_rows
 from psotrack.errors import InputError
-from psotrack.files import read_text
+from psotrack.support import Column, Table, TextRow, read_rows, read_text, write_rows
 
 _CORNERS = [f"{axis}{corner}" for corner in range(1, 5) for axis in "xyz"]
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "": 1.0}
@@ -115,7 +114,7 @@ def _long(table: Table) -> dict[int, MarkerRow]:
     columns = [table.column(axis) for axis in "xyz"]
     metres = np.array([table.factor(column, _METRES) for column in columns])
     first = _first_corner(table, corner_column)
-    rows: dict[int, dict[int, Row]] = {}
+    rows: dict[int, dict[int, TextRow]] = {}
     for row in table.rows:
         marker, corner = _marker(row, id_column), _corner(row, corner_column)
         corner += 1 - first if row.text(corner_column).isdecimal() else 0
@@ -145,14 +144,14 @@ def _long(table: Table) -> dict[int, MarkerRow]:
     return found
 
 
-def _marker(row: Row, column: Column) -> int:
+def _marker(row: TextRow, column: Column) -> int:
     match = _ID.fullmatch(row.text(column))
     if match is None:
         raise row.wrong(column, "a marker's number", repr(row.text(column)))
     return int(match["number"])
 
 
-def _corner(row: Row, column: Column) -> int:
+def _corner(row: TextRow, column: Column) -> int:
     """The number of a corner as the file counts it; from 1 where it has a name."""
     text = row.text(column)
     number = _NAMED.get(_bare(text), int(text) if text.isdecimal() else -1)
@@ -192,7 +191,7 @@ def _read(path: Path) -> Table:
     return table if table.find("id") or not table.find("corner") else _unlabelled(table)
 
 
-def _whole(row: Row, count: int) -> Row:
+def _whole(row: TextRow, count: int) -> TextRow:
     # An empty cell at the end of a line is cut off with its separator.
     cells = row.cells + ("",) * (len(row.cells) == count - 1)
     if len(cells) != count:
@@ -221,7 +220,7 @@ def _unlabelled(table: Table) -> Table:
     return Table(table.path, others + added, tuple(rows))
 
 
-def _columns(header: Row) -> tuple[Column, ...]:
+def _columns(header: TextRow) -> tuple[Column, ...]:
     """The columns by the names that are used here; others keep their own."""
     columns = []
     for index, cell in enumerate(header.cells):

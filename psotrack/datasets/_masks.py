@@ -20,10 +20,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
-from psotrack.camera_names import camera_key, chosen_camera
 from psotrack.datasets._archives import entry
-
 from psotrack.errors import InputError
+from psotrack.geometry import camera_key, chosen_camera
 
 MASKS = "drone_masks.zip"
 

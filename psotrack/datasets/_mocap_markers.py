@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.datasets._calibration import LENGTHS
-from psotrack.delimited import read_table, write_rows
+from psotrack.geometry import LENGTHS
+from psotrack.support import read_table, write_rows
 
 #: The names of a drone's markers, in the order of the columns.
 MOCAP_MARKERS = "ABCD"

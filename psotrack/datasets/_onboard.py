@@ -19,10 +19,9 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.datasets._poses import read_poses
-from psotrack.delimited import read_table, write_rows
 from psotrack.errors import InputError, SettingsError
-from psotrack.sequence import OnboardVideo
-from psotrack.video import VideoInfo, probe
+from psotrack.recordings import OnboardVideo, VideoInfo, probe
+from psotrack.support import read_table, write_rows
 
 ONBOARD_CALIBRATION = "drone_cameras_calibration.csv"
 

@@ -1,6 +1,6 @@
 """`dronN_pos_25.csv` of the DPJAIT dataset: the poses of one simulated drone, one line per video frame.
 
-Row i belongs to video frame i, but row 0 is a placeholder, (0, 0, -0), so frame 0 has no pose. How the
+TextRow i belongs to video frame i, but row 0 is a placeholder, (0, 0, -0), so frame 0 has no pose. How the
 published files name the columns of the orientation is not known: any that end in `w`, `x`, `y`, `z` after a
 word with a `q` (`q_w`, `qw`, `quat_w`, ...) are the quaternion, which turns body into world coordinates.
 Euler angles are not read: beside a quaternion they say nothing new, and without one their order would be a
@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from psotrack.datasets._calibration import LENGTHS
-from psotrack.delimited import Column, Row, Table, read_table, write_rows
 from psotrack.errors import SettingsError
+from psotrack.geometry import LENGTHS
+from psotrack.support import Column, Table, TextRow, read_table, write_rows
 
 Positions = Float[np.ndarray, "frames 3"]
 Orientations = Float[np.ndarray, "frames 4"]
@@ -98,8 +98,8 @@ def _euler_rad(orientation_wxyz: Orientations) -> Positions:
     return Rotation.from_quat(orientation_wxyz, scalar_first=True).as_euler("xyz")
 
 
-def _by_frame(table: Table, column: Column) -> dict[int, Row]:
-    rows: dict[int, Row] = {}
+def _by_frame(table: Table, column: Column) -> dict[int, TextRow]:
+    rows: dict[int, TextRow] = {}
     for row in table.rows:
         frame = row.count(column)
         if frame in rows:
@@ -119,7 +119,7 @@ def _quaternion_columns(table: Table) -> list[Column]:
     return [complete[0][axis] for axis in "wxyz"] if complete else []
 
 
-def _unit_quaternion(row: Row, columns: list[Column]) -> Float[np.ndarray, " 4"]:
+def _unit_quaternion(row: TextRow, columns: list[Column]) -> Float[np.ndarray, " 4"]:
     quaternion = np.array([row.number(column) for column in columns])
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > _NORM_TOLERANCE:

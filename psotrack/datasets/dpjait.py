@@ -17,9 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from psotrack.camera_names import files_by_camera
 from psotrack.datasets._archives import join_archives
-from psotrack.datasets._calibration import read_calibration, read_names, write_calibration
 from psotrack.datasets._marker_corners import (
     MarkerRow,
     read_marker_corners,
@@ -41,12 +39,20 @@ from psotrack.datasets._onboard import (
     write_onboard_calibration,
 )
 from psotrack.datasets._poses import pose_file, read_poses, write_poses
-from psotrack.detections import Detections, read_detections, write_detections
 from psotrack.errors import InputError
-from psotrack.mocap import body_trajectories, read_c3d
-from psotrack.sequence import OnboardVideo, Sequence
+from psotrack.geometry import files_by_camera, read_calibration, read_names, write_calibration
+from psotrack.recordings import (
+    Detections,
+    OnboardVideo,
+    Sequence,
+    VideoInfo,
+    body_trajectories,
+    probe,
+    read_c3d,
+    read_detections,
+    write_detections,
+)
 from psotrack.trajectories import Trajectories
-from psotrack.video import VideoInfo, probe
 
 __all__ = [
     "CALIBRATION",

@@ -1,6 +1,9 @@
-"""The doctor: a rig against its own data, before anybody tracks; what disagrees, by how much, and what to do."""
+"""The doctor: does a rig agree with its own recording, before anybody tracks?
 
-from psotrack.doctor.agreement import Agreement
-from psotrack.doctor.examination import Diagnosis, examine, sampled_frames
+In: the rig, and detections or blobs of several cameras; optionally a reference. Out: a `Diagnosis` with findings,
+each of which names a camera, pair or clock, says by how much it disagrees, and what to do.
+"""
 
-__all__ = ["Agreement", "Diagnosis", "examine", "sampled_frames"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -7,13 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.cameras import Camera, CameraRig
-from psotrack.correspondence import match
-from psotrack.reprojection import reconstruct
+from psotrack.correspondence import CameraSightings, Sightings, match
+from psotrack.geometry import Camera, CameraRig, reconstruct, viewpoints
+from psotrack.initiation import room_bounds
 from psotrack.settings import TrackSettings
-from psotrack.sightings import Sightings, View
-from psotrack.starts import room_bounds
-from psotrack.triangulation import viewpoints
 
 #: Two viewpoints agree by chance.
 MIN_VIEWPOINTS = 3
@@ -90,7 +87,7 @@ def agreement(rig: CameraRig, sightings: Sightings, frames: Int[np.ndarray, "cho
 
 
 def _matched(
-    rig: CameraRig, view: View, bounds_m: Float[np.ndarray, "2 3"]
+    rig: CameraRig, view: CameraSightings, bounds_m: Float[np.ndarray, "2 3"]
 ) -> Int[np.ndarray, "points cameras"]:
     """Which sightings are of which point; none where a rig is so wrong that its equations are singular."""
     try:

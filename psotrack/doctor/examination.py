@@ -13,14 +13,13 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.cameras import CameraRig
-from psotrack.correspondence import epipolar_distance
+from psotrack.correspondence import Sightings, epipolar_distance
 from psotrack.doctor.agreement import Agreement, agreement
 from psotrack.doctor.findings import CLEARLY, Finding, fault_of, late_clock, reference_findings
 from psotrack.doctor.readings import better_lenses, better_reading, certain_lenses, halfway
 from psotrack.doctor.reference_fit import ReferenceFit, fit_reference
 from psotrack.doctor.suspects import LEAST_POINTS, explanations, late_cameras, views_of
-from psotrack.sightings import Sightings
+from psotrack.geometry import CameraRig
 from psotrack.trajectories import Trajectories
 
 #: Runs of consecutive frames that are looked at, so that motion shows.

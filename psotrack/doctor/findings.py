@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psotrack.cameras import CameraRig
 from psotrack.doctor.reference_fit import NEAR_M, ReferenceFit
 from psotrack.doctor.suspects import Explanation, change
+from psotrack.geometry import CameraRig
 
 #: A fault must explain so many more of a camera's points. Six freedoms fitted to 30 sound points gain 0.015 by chance.
 CLEARLY = 0.05

@@ -10,10 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.calibration import Alike, adjust
-from psotrack.cameras import Camera, CameraRig
+from psotrack.correspondence import Sightings
 from psotrack.doctor.agreement import UNEXPLAINED, Agreement, agreement
-from psotrack.reprojection import reconstruct
-from psotrack.sightings import Sightings
+from psotrack.geometry import Camera, CameraRig, reconstruct
 
 #: Common factors of the focal lengths that are tried at first, and then about the best.
 _SCALES = np.exp(np.arange(-0.7, 0.7001, 0.1))

@@ -15,12 +15,11 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import locate_camera
-from psotrack.camera_clocks import camera_offsets
-from psotrack.cameras import NEAR_M, Camera, CameraRig, project, undistort
+from psotrack.clocks import camera_offsets
+from psotrack.correspondence import Sightings
 from psotrack.doctor.agreement import MIN_VIEWPOINTS, UNEXPLAINED, Agreement, num_viewpoints
 from psotrack.errors import InputError
-from psotrack.reprojection import reconstruct
-from psotrack.sightings import Sightings
+from psotrack.geometry import NEAR_M, Camera, CameraRig, project, reconstruct, undistort
 
 #: Points that others see, below which nothing is said of a camera.
 LEAST_POINTS = 30
@@ -39,7 +38,7 @@ _GAP_FRAMES = 15
 
 
 @dataclass(frozen=True)
-class Views:
+class DetectionViews:
     """What others say that a camera should see, and what it sees in the same frames.
 
     Attributes:
@@ -72,7 +71,7 @@ class Explanation:
     amount: float = 0.0
 
 
-def views_of(rig: CameraRig, found: Agreement, sightings: Sightings, index: int) -> Views:
+def views_of(rig: CameraRig, found: Agreement, sightings: Sightings, index: int) -> DetectionViews:
     """The points that others agree on without the camera at `index`, and its sightings."""
     others = np.arange(len(rig)) != index
     kept = num_viewpoints(rig.cameras, found.used & others) >= MIN_VIEWPOINTS
@@ -81,7 +80,7 @@ def views_of(rig: CameraRig, found: Agreement, sightings: Sightings, index: int)
     lines = reconstruct(rig.cameras, centre_px, used.astype(float), noise_px=noise_px, robust=False)
     there = np.isfinite(lines.position_m).all(axis=-1)
     point_m, frame = lines.position_m[there], frame[there]
-    return Views(
+    return DetectionViews(
         point_m,
         velocities(frame, point_m),
         sightings.centre_px[frame, index],
@@ -107,12 +106,12 @@ def velocities(frame: Int[np.ndarray, "points"], point_m: Float[np.ndarray, "poi
     return (steps[0] + steps[1]) / 2
 
 
-def gain_of(camera: Camera, views: Views, delay_frames: float = 0.0) -> float:
+def gain_of(camera: Camera, views: DetectionViews, delay_frames: float = 0.0) -> float:
     """Share of the points that are explained: 1 - distance² / `UNEXPLAINED` of each, and 0 for one that is not."""
     return float(np.sum(_fits(camera, views, delay_frames)[0])) / max(len(views.point_m), 1)
 
 
-def explanations(rig: CameraRig, views: Views, index: int) -> list[Explanation]:
+def explanations(rig: CameraRig, views: DetectionViews, index: int) -> list[Explanation]:
     """The camera as it was read, and the best of each kind of fault, the simplest ones first."""
     camera = rig.cameras[index]
     sound = Explanation("sound", gain_of(camera, views), camera)
@@ -150,7 +149,7 @@ def change(before: Camera, after: Camera) -> tuple[float, float]:
 
 
 def _fits(
-    camera: Camera, views: Views, delay_frames: float = 0.0, widen: float = 1.0
+    camera: Camera, views: DetectionViews, delay_frames: float = 0.0, widen: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """For each point how well it is explained, and by which sighting."""
     moved_m = delay_frames * np.nan_to_num(views.velocity_m)
@@ -161,13 +160,13 @@ def _fits(
     return np.maximum(0.0, 1 - off[np.arange(len(off)), best] / UNEXPLAINED), best
 
 
-def _turned(camera: Camera, views: Views) -> Camera:
+def _turned(camera: Camera, views: DetectionViews) -> Camera:
     """The camera turned about its centre: from the commonest shift of the image to rays that agree."""
     starts = [camera, _shifted(camera, views)]
     return max((_aligned(start, views) for start in starts), key=lambda each: gain_of(each, views))
 
 
-def _shifted(camera: Camera, views: Views) -> Camera:
+def _shifted(camera: Camera, views: DetectionViews) -> Camera:
     """Turned so that most points fall on sightings, to a cell of the image."""
     pixels, depth = project(camera, views.point_m)
     off = (views.box_px - pixels[:, None])[depth > NEAR_M].reshape(-1, 2)
@@ -190,7 +189,7 @@ def _turned_by(camera: Camera, R: Float[np.ndarray, "3 3"]) -> Camera:
     return replace(camera, T_cam_world=T)
 
 
-def _aligned(camera: Camera, views: Views) -> Camera:
+def _aligned(camera: Camera, views: DetectionViews) -> Camera:
     for round_ in range(_ROUNDS):
         # A cell is wider than the noise.
         fit, best = _fits(camera, views, widen=3.0 if round_ < _ROUNDS // 2 else 1.0)
@@ -206,7 +205,7 @@ def _aligned(camera: Camera, views: Views) -> Camera:
     return camera
 
 
-def _moved(camera: Camera, views: Views) -> Camera:
+def _moved(camera: Camera, views: DetectionViews) -> Camera:
     """The camera where its sightings put it."""
     start = camera
     # What is moved far has few sightings near where they should be: more come with every round.

@@ -1,10 +1,9 @@
-"""Judging tracks by a reference. Sees trajectories only, so every method is judged by the same lines.
+"""Evaluation: tracks judged by a reference.
 
-`evaluate` gives the numbers, `errors_over_time` those of every frame; `tables` and `plots` show them.
+In: two `Trajectories`. Out: an `Evaluation` with the figures of the contract, errors per frame, tables and plots.
+Only trajectories come in, so every method is judged by the same code. No lower room imports this one.
 """
 
-from psotrack.evaluation.metrics import evaluate
-from psotrack.evaluation.over_time import errors_over_time
-from psotrack.evaluation.records import DroneEvaluation, ErrorSummary, Evaluation
+import lazy_loader
 
-__all__ = ["DroneEvaluation", "ErrorSummary", "Evaluation", "errors_over_time", "evaluate"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

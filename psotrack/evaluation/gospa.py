@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from psotrack.evaluation.association import GATE_M, cheapest_partners, paired_values
 from psotrack.evaluation.records import Gospa
+from psotrack.trajectories.association import GATE_M, cheapest_partners, paired_values
 
 
 def gospa(

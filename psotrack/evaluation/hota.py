@@ -12,8 +12,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.evaluation.association import GATE_M, UNASSIGNED, cheapest_partners, paired_values
 from psotrack.evaluation.records import Hota
+from psotrack.trajectories.association import GATE_M, UNASSIGNED, cheapest_partners, paired_values
 
 _THRESHOLDS = np.linspace(0.05, 0.95, 19)
 #: A similarity counts as reaching a threshold that it misses by no more than rounding.

@@ -17,7 +17,14 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
-from psotrack.evaluation.association import (
+from psotrack.evaluation.consistency import consistency
+from psotrack.evaluation.gospa import gospa
+from psotrack.evaluation.hota import hota
+from psotrack.evaluation.paths import path_errors, rows_apart
+from psotrack.evaluation.records import DroneEvaluation, ErrorSummary, Evaluation
+from psotrack.support.standard_errors import standard_error
+from psotrack.trajectories import Trajectories
+from psotrack.trajectories.association import (
     GATE_M,
     UNASSIGNED,
     AlignedPair,
@@ -28,13 +35,6 @@ from psotrack.evaluation.association import (
     of_partners,
     paired_values,
 )
-from psotrack.evaluation.consistency import consistency
-from psotrack.evaluation.gospa import gospa
-from psotrack.evaluation.hota import hota
-from psotrack.evaluation.paths import path_errors, rows_apart
-from psotrack.evaluation.records import DroneEvaluation, ErrorSummary, Evaluation
-from psotrack.evaluation.standard_errors import standard_error
-from psotrack.trajectories import Trajectories
 
 
 def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:

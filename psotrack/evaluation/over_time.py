@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psotrack.evaluation.association import (
+from psotrack.trajectories import Trajectories
+from psotrack.trajectories.association import (
     align,
     fixed_identity,
     identity_switches,
     matched_per_frame,
     of_partners,
 )
-from psotrack.trajectories import Trajectories
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -6,14 +6,15 @@ is imported when something is drawn, and `pyplot`, with its global state, not at
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.evaluation.association import (
+from psotrack.support import colour_of, save_figure
+from psotrack.trajectories import Trajectories
+from psotrack.trajectories.association import (
     GATE_M,
     UNASSIGNED,
     AlignedPair,
@@ -23,32 +24,16 @@ from psotrack.evaluation.association import (
     matched_per_frame,
     of_partners,
 )
-from psotrack.files import refuse_to_overwrite, written_whole
-from psotrack.trajectories import Trajectories
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d import Axes3D
 
-#: One colour per drone, in turn; first those of Okabe and Ito (2008), which colour-blind people tell apart.
-COLOURS = (
-    "#0072b2",
-    "#d55e00",
-    "#009e73",
-    "#cc79a7",
-    "#e69f00",
-    "#56b4e9",
-    "#7a5195",
-    "#8c8c00",
-    "#7f4f24",
-    "#4d4d4d",
-)
 _DARK = "#2b313a"
 _GREY = "#9aa3ad"
 _SHADOW = "#dde1e6"
 _DASHES = (0, (4, 2.5))
-_DPI = 150
 #: Where the bars of missed frames stand, in parts of the height of the axes.
 _BARS_TOP = 0.975
 _BARS_STEP = 0.025
@@ -67,7 +52,7 @@ def save_trajectories(
     def draw(figure: Figure) -> None:
         draw_trajectories(figure.add_subplot(projection="3d"), traj_est, traj_ref)
 
-    save(path, (7.5, 5.5), draw, force)
+    save_figure(path, (7.5, 5.5), draw, force)
 
 
 def save_errors(path: Path, traj_est: Trajectories, traj_ref: Trajectories, *, force: bool = False) -> None:
@@ -76,7 +61,7 @@ def save_errors(path: Path, traj_est: Trajectories, traj_ref: Trajectories, *, f
     def draw(figure: Figure) -> None:
         draw_errors(figure.add_subplot(), traj_est, traj_ref)
 
-    save(path, (9.0, 4.0), draw, force)
+    save_figure(path, (9.0, 4.0), draw, force)
 
 
 def save_overview(path: Path, traj_est: Trajectories, traj_ref: Trajectories, *, force: bool = False) -> None:
@@ -87,7 +72,7 @@ def save_overview(path: Path, traj_est: Trajectories, traj_ref: Trajectories, *,
         draw_trajectories(figure.add_subplot(grid[0], projection="3d"), traj_est, traj_ref)
         draw_errors(figure.add_subplot(grid[1]), traj_est, traj_ref)
 
-    save(path, (8.0, 8.5), draw, force)
+    save_figure(path, (8.0, 8.5), draw, force)
 
 
 def draw_trajectories(axes: Axes3D, traj_est: Trajectories, traj_ref: Trajectories) -> None:
@@ -150,24 +135,6 @@ def colours_of_estimates(traj_est: Trajectories, traj_ref: Trajectories) -> list
         if estimate != UNASSIGNED:
             colours[estimate] = colour_of(drone)
     return colours
-
-
-def colour_of(drone: int) -> str:
-    """The colour of the drone at this place of the reference's order, as #rrggbb."""
-    return COLOURS[drone % len(COLOURS)]
-
-
-def save(path: Path, size_inches: tuple[float, float], draw: Callable[[Figure], None], force: bool) -> None:
-    """Save a PNG of what `draw` draws, without a window; see `save_trajectories` for what is raised."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    refuse_to_overwrite(path, force)
-    figure = Figure(size_inches, dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    draw(figure)
-    with written_whole(path) as temporary:
-        figure.savefig(temporary, format="png")
 
 
 def _with_gaps(

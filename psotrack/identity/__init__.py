@@ -1,18 +1,20 @@
-"""Who is who after drones have met: tracks that may have exchanged their drones, and what to do about it.
+"""Identity: tracks that may have exchanged their drones when they met, and the final labels.
 
-Two drones that come near each other share silhouettes, and a tracker may leave them with the wrong labels. So from
-when they come near until the views have separated them, every labelling is kept with motion states of its own
-(`labellings`): those before the meeting predict, what is measured during and after it decides. A sudden exchange is a
-jump of both tracks, a slow one a change of course that the motion model does not expect, and apparent sizes tell
-drones apart that are not alike. When the labelling is as good as certain, it is settled: tracks are exchanged from the
-frame on in which that makes the most frames right.
+In: tracks of a whole recording. Out: trajectories with resolved labels (`postprocessing`), and the encounters with
+their probabilities.
 
-A frame is judged by itself and the frames before it alone, and what is settled stays. So `resolve` of the first
-frames of a recording yields what `resolve` of all of it yields there, up to the first frame of an encounter that is
-still open; and of what is before that frame it needs no more than the tracks, to go on.
+Two drones that come near each other share silhouettes, and a tracker may give them each other's labels. While the
+views do not separate them, every assignment of labels is kept with motion states of its own (`labellings`): the
+motion before the encounter predicts, the measurements during and after it decide. A sudden exchange is a jump of both
+tracks, a slow one a change of course that the motion model does not expect, and apparent sizes distinguish drones of
+different size. When one assignment is nearly certain, it is applied from the frame on in which it makes the most
+frames right.
+
+Each decision uses only its frame and the frames before, and is final. So `resolve` of the first frames of a recording
+gives the same result as `resolve` of the whole recording, up to the first frame of an encounter that is still open;
+to go on from there it needs only the tracks.
 """
 
-from psotrack.identity.records import Encounter, Identities, IdentityParams, Outcome, relabelled
-from psotrack.identity.resolving import resolve
+import lazy_loader
 
-__all__ = ["Encounter", "Identities", "IdentityParams", "Outcome", "relabelled", "resolve"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

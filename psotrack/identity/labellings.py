@@ -20,9 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack import motion
 from psotrack._typing import Array, Positions
-from psotrack.motion import Covariances, MotionParams, MotionState
+from psotrack.motion import Covariances, MotionParams, MotionState, kalman
 
 #: No labelling is less probable than exp of this: what is nearly excluded can still come back, and nothing is infinite.
 LEAST_LOG = -300.0
@@ -126,10 +125,10 @@ def step(
     )
     density = jnp.asarray(params.jerk_density_m2_s5)
     flat = jax.tree.map(lambda value: value.reshape(-1, *value.shape[2:]), bank.state)
-    predicted = motion.predict(flat, dt_s, replace(params, jerk_density_m2_s5=jnp.tile(density, num)))
+    predicted = kalman.predict(flat, dt_s, replace(params, jerk_density_m2_s5=jnp.tile(density, num)))
     predicted = jax.tree.map(lambda value: jnp.repeat(value, drones, axis=0), predicted)
-    plausible = jnp.where(there, motion.log_likelihood(predicted, measured, spread, params), 0.0)
-    updated, _ = motion.update(predicted, measured, spread, there, params)
+    plausible = jnp.where(there, kalman.log_likelihood(predicted, measured, spread, params), 0.0)
+    updated, _ = kalman.update(predicted, measured, spread, there, params)
 
     # Which of these a labelling after makes of one before.
     each = (slice(None), jnp.arange(drones), jnp.asarray(labellings(drones)))
@@ -156,7 +155,7 @@ def _merged(weight: Float[Array, "before after"], state: MotionState) -> MotionS
     mean = mean_of(state.mean)
     apart = state.mean - mean
     spread = mean_of(state.covariance + apart[..., :, None] * apart[..., None, :])
-    return motion.state_of(mean, spread, mean_of(state.noise_m2))
+    return kalman.state_of(mean, spread, mean_of(state.noise_m2))
 
 
 @jax.jit
@@ -174,12 +173,12 @@ def begin(
         counts: (frames,), which measurements there are; the first is the start, and must be a number in any case.
         params: of this one drone.
     """
-    start = motion.init(measured_m[:1], jnp.zeros_like(measured_m[:1]), measured_covariance_m2[:1], params)
+    start = kalman.init(measured_m[:1], jnp.zeros_like(measured_m[:1]), measured_covariance_m2[:1], params)
 
     def one(state: MotionState, frame: tuple) -> tuple[MotionState, None]:
         measured, spread, dt_s, there = frame
-        state, _ = motion.update(state, measured[None], spread[None], there[None], params)
-        return motion.predict(state, dt_s, params), None
+        state, _ = kalman.update(state, measured[None], spread[None], there[None], params)
+        return kalman.predict(state, dt_s, params), None
 
     counts = jnp.asarray(counts).at[0].set(False)
     state, _ = jax.lax.scan(one, start, (measured_m, measured_covariance_m2, dt_s, counts))

@@ -42,7 +42,7 @@ class IdentityParams:
             )
 
 
-class Outcome(StrEnum):
+class LabelOutcome(StrEnum):
     """What became of the labels of two drones that met."""
 
     KEPT = "kept"
@@ -72,7 +72,7 @@ class Encounter:
     distance_m: float
     last_frame: int
     log_odds: float
-    outcome: Outcome
+    outcome: LabelOutcome
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,7 @@ from psotrack.identity.groups import Group, advanced, grouped
 from psotrack.identity.records import Identities, IdentityParams
 from psotrack.identity.settling import is_settled, settled
 from psotrack.identity.tracks import tracks_of
-from psotrack.motion import MotionParams
-from psotrack.smoothing import check_measurements
+from psotrack.motion import MotionParams, check_measurements
 
 
 def resolve(

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from psotrack.identity import labellings
 from psotrack.identity.groups import Group
-from psotrack.identity.records import Encounter, Identities, IdentityParams, Outcome
+from psotrack.identity.records import Encounter, Identities, IdentityParams, LabelOutcome
 from psotrack.identity.tracks import Tracks
 
 _log = logging.getLogger(__name__)
@@ -62,12 +62,12 @@ def settled(
         swapped = np.logaddexp.reduce(log_probability[-1][wrong[0]])
         right = np.logaddexp.reduce(log_probability[-1][~wrong[0]])
         if still_open:
-            outcome = Outcome.OPEN
+            outcome = LabelOutcome.OPEN
         elif wrong[0, chosen]:
-            outcome = Outcome.SWAPPED
+            outcome = LabelOutcome.SWAPPED
         else:
             sure = right >= np.log(params.decision_probability)
-            outcome = Outcome.KEPT if sure else Outcome.UNDECIDED
+            outcome = LabelOutcome.KEPT if sure else LabelOutcome.UNDECIDED
         encounter = Encounter(
             drones=drones,
             first_frame=group.first,

@@ -1,6 +1,6 @@
 """`CameraPath`: where a moving camera is in every frame and how it is turned, and its table on disk.
 
-The table has one row per frame, and the columns that `psotrack.trajectory_files` reads among its own: every command
+The table has one row per frame, and the columns that `psotrack.trajectories.files` reads among its own: every command
 that reads tracks reads it too.
 """
 
@@ -15,10 +15,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from psotrack.delimited import Row, Table, read_table, write_rows
 from psotrack.errors import InputError
-from psotrack.files import refuse_to_overwrite
-from psotrack.rotations import rotation_matrices
+from psotrack.geometry import rotation_matrices
+from psotrack.support import Table, TextRow, read_table, refuse_to_overwrite, write_rows
 from psotrack.trajectories import Status, Trajectories
 
 #: Axes of the covariance: along the world's axes in metres, then small turns about the camera's own in radians.
@@ -249,7 +248,7 @@ def _whole(table: Table, name: str) -> Int[np.ndarray, "rows"]:
     return np.array([row.count(column) for row in table.rows])
 
 
-def _status(row: Row, table: Table) -> int:
+def _status(row: TextRow, table: Table) -> int:
     column = table.column("status")
     word = row.text(column)
     if word not in _STATUS:
@@ -257,7 +256,7 @@ def _status(row: Row, table: Table) -> int:
     return int(_STATUS[word])
 
 
-def _flags(row: Row, table: Table) -> int:
+def _flags(row: TextRow, table: Table) -> int:
     column = table.column("flags")
     words = row.cells[column.index].split("+") if row.cells[column.index] else []
     known = {flag.label: flag for flag in Flag}

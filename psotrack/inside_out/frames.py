@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from psotrack.errors import InputError, SettingsError, check_positive
-from psotrack.video import probe, quiet, read_frames
+from psotrack.recordings import probe, quiet, read_frames
 
 _Item = TypeVar("_Item")
 

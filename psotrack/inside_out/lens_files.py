@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.calibration import lens_of_view, read_lenses
-from psotrack.cameras import Camera, CameraRig, camera, stack
+from psotrack.calibration import lens_of_view
 from psotrack.datasets.dpjait import read_onboard_calibration
-from psotrack.delimited import read_table
 from psotrack.errors import InputError, SettingsError
+from psotrack.geometry import Camera, CameraRig, camera, read_lenses, stack
+from psotrack.support import read_table
 
 #: Of the image, that the optical axis may be off its middle, where a file does not say the size of its images.
 _OFF_MIDDLE = 0.2

@@ -11,16 +11,16 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
-from psotrack.cameras import Camera
 from psotrack.errors import InputError
+from psotrack.geometry import Camera
 from psotrack.inside_out.camera_path import CameraPath, Flag
 from psotrack.inside_out.detection import MarkerDetector, SeenMarkers
 from psotrack.inside_out.filtering.path_rows import PoseRow, path_of
-from psotrack.inside_out.filtering.pose_filter import Following, PoseFilterParams, advance, expected, step
+from psotrack.inside_out.filtering.pose_filter import FilterRun, PoseFilterParams, advance, expected, step
 from psotrack.inside_out.frames import Frame, Source, read_ahead
 from psotrack.inside_out.marker_map import MarkerMap
 from psotrack.inside_out.pose import Expected, MarkerPose, PoseSettings, locate
-from psotrack.progress import Report, silent
+from psotrack.support import Report, silent
 from psotrack.trajectories import Status
 
 #: What a frame goes through; the first two in a thread of their own.
@@ -53,7 +53,7 @@ class LocaliseSettings:
 
 
 @dataclass(frozen=True)
-class Localised:
+class LocalisedVideo:
     """A camera's path, and what it took.
 
     Attributes:
@@ -76,13 +76,13 @@ class Localised:
         return self.raw.num_frames / max(self.wall_s, 1e-9)
 
 
-def localise(
+def localise_video(
     source: Source,
     marker_map: MarkerMap,
     lens: Camera,
     settings: LocaliseSettings | None = None,
     report: Report = silent,
-) -> Localised:
+) -> LocalisedVideo:
     """Where a camera is in every frame, from markers of known places.
 
     Every frame is decoded and made grey in a thread, ahead of the search for markers. Markers that the map does not
@@ -125,7 +125,7 @@ def localise(
     # Ctrl-C may come between the two.
     raw_rows = raw_rows[: len(rows)]
     wall_s = time.perf_counter() - began_s
-    return Localised(path_of(rows), path_of(raw_rows), seconds, wall_s, interrupted)
+    return LocalisedVideo(path_of(rows), path_of(raw_rows), seconds, wall_s, interrupted)
 
 
 def follow_markers(
@@ -145,7 +145,7 @@ def follow_markers(
         seconds: what "locate" and "filter" take is added to.
     """
     spent_s = dict.fromkeys(STAGES, 0.0) if seconds is None else seconds
-    following = Following()
+    following = FilterRun()
     for number, time_s, seen in sightings:
         began_s = time.perf_counter()
         if settings.filter is not None:
@@ -202,7 +202,7 @@ def _located(
     marker_map: MarkerMap,
     lens: Camera,
     settings: LocaliseSettings,
-    following: Following,
+    following: FilterRun,
 ) -> MarkerPose | None:
     told = None if settings.filter is None else expected(following, settings.filter)
     where = None if told is None else Expected(told.position_m, told.R_world_cam, told.covariance)

@@ -1,13 +1,13 @@
-"""The paper's other outside-in method: drones from the lines of sight of their detections, followed over time.
+"""Projection lines: drones from detections of several cameras, triangulated and tracked (the paper's second method).
 
-Frame after frame the motion model says where drones are expected; the sightings of all cameras are matched with them
-and with each other, and triangulated (`crossings`); what comes of it corrects the motion model. What nobody expected
-and is there in several frames is a drone, a new one or one that was lost.
+In: detections of all cameras and the rig. Out: tracks with the same motion model, status and covariances as those of
+the swarm.
 
-Motion model, status and covariances are those of the swarm's tracker, and so are the results.
+In every frame the motion model says where drones are expected; `crossings` matches the detections of all cameras with
+these positions and with each other, and triangulates them. A position that no track explains and that lasts for
+several frames starts a track, or continues a lost one.
 """
 
-from psotrack.projection_lines.following import follow
-from psotrack.projection_lines.results import start_of
+import lazy_loader
 
-__all__ = ["follow", "start_of"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -7,10 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.cameras import NEAR_M, Camera, project
-from psotrack.correspondence import match
-from psotrack.reprojection import reconstruct
-from psotrack.sightings import CUT_SHARE, View
+from psotrack.correspondence import CUT_SHARE, CameraSightings, match
+from psotrack.geometry import NEAR_M, Camera, project, reconstruct
 
 #: No sighting is known better, however well the cameras agree.
 LEAST_NOISE_PX = 0.1
@@ -43,7 +41,7 @@ class Crossings:
 
 def crossings(
     cameras: Camera,
-    view: View,
+    view: CameraSightings,
     bounds_m: Float[np.ndarray, "2 3"],
     expected_m: Float[np.ndarray, "drones 3"],
     expected_covariance_m2: Float[np.ndarray, "drones 3 3"],

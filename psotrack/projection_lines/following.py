@@ -6,21 +6,18 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.cameras import Camera
-from psotrack.initialisation import FLOOR_CLEARANCE_M
-from psotrack.lifecycle import NEW, SPEED_SHARE, recognised
+from psotrack.correspondence import CameraSightings, Sightings
+from psotrack.geometry import Camera, viewpoints
+from psotrack.initiation import FLOOR_CLEARANCE_M, NEW, SPEED_SHARE, reidentify
 from psotrack.motion import GATE_999
-from psotrack.progress import Report, silent
 from psotrack.projection_lines.crossings import crossings, in_view
 from psotrack.projection_lines.motions import Motions
 from psotrack.projection_lines.parting import parted
 from psotrack.projection_lines.results import tracked_of
-from psotrack.projection_lines.tracks import Found, Row, Track, lost_of, newcomer_of
+from psotrack.projection_lines.tracks import Found, Track, TrackRow, lost_of, newcomer_of
 from psotrack.settings import TrackSettings
-from psotrack.sightings import Sightings, View
-from psotrack.tracker import DISPERSION_FRAMES
-from psotrack.tracking import Tracked
-from psotrack.triangulation import viewpoints
+from psotrack.support import Report, silent
+from psotrack.tracking import DISPERSION_FRAMES, Tracked
 
 #: What was found in so many of its first frames is a drone.
 CONFIRMED_HITS, FIRST_FRAMES = 5, 8
@@ -98,7 +95,7 @@ class _Follower:
             self._begin(Track(self._num_drones, 1.0), before_m, velocity, self._settings.velocity_std_m_s)
             self._num_drones += 1
 
-    def step(self, frame: int, view: View) -> None:
+    def step(self, frame: int, view: CameraSightings) -> None:
         """One frame: predict, match, correct, and see who comes and goes."""
         self._motions.predict()
         found = self._found(view)
@@ -138,7 +135,7 @@ class _Follower:
         self._ended.append(track)
         self._slots[slot] = None
 
-    def _found(self, view: View) -> dict[int, Found]:
+    def _found(self, view: CameraSightings) -> dict[int, Found]:
         """What the frame shows of the tracks, by slot; where it shows what is none of them a track begins."""
         slots, tracks = [slot for slot, _ in self._tracks()], [track for _, track in self._tracks()]
         expected_m = np.asarray(self._motions.state.apparent_m[slots])
@@ -217,7 +214,7 @@ class _Follower:
         for slot, track in self._tracks():
             one = found.get(slot)
             state = (position_m[slot], velocity_m_s[slot], covariance_m2[slot])
-            track.rows.append(Row(frame, *state, int(num_in_view[slot]), one))
+            track.rows.append(TrackRow(frame, *state, int(num_in_view[slot]), one))
             if one is not None:
                 track.hits += 1
                 track.dispersion += (one.disagreement - track.dispersion) / DISPERSION_FRAMES
@@ -238,7 +235,7 @@ class _Follower:
             return
         absent = self._absent()
         wanted = self._settings.drones
-        chosen = recognised(
+        chosen = reidentify(
             tuple(newcomer_of(track) for _, track in coming),
             lost_of([track for _, track in absent], coming[0][1].rows[-1].frame, self._fps),
             fps=self._fps,

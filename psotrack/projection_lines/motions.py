@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from psotrack import motion
 from psotrack._typing import Array
-from psotrack.motion import MotionParams, MotionState
+from psotrack.motion import MotionParams, MotionState, kalman
 from psotrack.settings import TrackSettings
-from psotrack.tracker_inputs import motion_params
+from psotrack.tracking import motion_params
 
 #: The arrays have room for a multiple of so many tracks: each length is compiled.
 ROOM = 16
@@ -52,7 +51,7 @@ class Motions:
     ) -> None:
         """Let the motion of a track begin here."""
         params = replace(_params(self._settings, 1), velocity_std_m_s=jnp.float64(velocity_std_m_s))
-        begun = motion.init(position_m[None], velocity_m_s[None], covariance_m2[None], params)
+        begun = kalman.init(position_m[None], velocity_m_s[None], covariance_m2[None], params)
         for each in fields(MotionState):
             getattr(self.state, each.name)[slot] = np.asarray(getattr(begun, each.name))[0]
 
@@ -79,7 +78,7 @@ def _params(settings: TrackSettings, room: int) -> MotionParams:
 
 def _nobody(room: int, params: MotionParams) -> MotionState:
     none = np.zeros((room, 3))
-    return _on_host(motion.init(none, none, np.tile(np.eye(3), (room, 1, 1)), params))
+    return _on_host(kalman.init(none, none, np.tile(np.eye(3), (room, 1, 1)), params))
 
 
 def _on_host(state: MotionState) -> MotionState:
@@ -89,7 +88,7 @@ def _on_host(state: MotionState) -> MotionState:
 
 @jax.jit
 def _predict(state: MotionState, dt_s: Float[Array, ""], params: MotionParams) -> MotionState:
-    return motion.predict(state, dt_s, params)
+    return kalman.predict(state, dt_s, params)
 
 
 @jax.jit
@@ -104,6 +103,6 @@ def _correct(
     max_speed_m_s: Float[Array, ""],
     params: MotionParams,
 ) -> MotionState:
-    state, _ = motion.update(state, measured_m, covariance_m2, was_measured, params)
+    state, _ = kalman.update(state, measured_m, covariance_m2, was_measured, params)
     limits = {"dt_s": dt_s, "bounds_m": bounds_m, "max_speed_m_s": max_speed_m_s}
-    return motion.tamed(state, ~was_measured, lost, **limits)
+    return kalman.tamed(state, ~was_measured, lost, **limits)

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.cameras import NEAR_M, Camera, project
-from psotrack.sightings import View
+from psotrack.correspondence import CameraSightings
+from psotrack.geometry import NEAR_M, Camera, project
 
 #: A drone that is placed by one edge and its size is off by so much of its sides more: they differ as it turns.
 PART_SHARE = 0.1
@@ -42,10 +42,10 @@ class _Outlines:
 
 def parted(
     cameras: Camera,
-    view: View,
+    view: CameraSightings,
     expected_m: Float[np.ndarray, "drones 3"],
     span_m: Float[np.ndarray, "drones 2"],
-) -> View:
+) -> CameraSightings:
     """The view with a box for each of several drones in the place of one for all of them.
 
     A box is of several drones if the middles of several are expected in it, and the box around all of these fits it
@@ -90,7 +90,7 @@ def parted(
 
 def _expected(
     cameras: Camera,
-    view: View,
+    view: CameraSightings,
     expected_m: Float[np.ndarray, "drones 3"],
     span_m: Float[np.ndarray, "drones 2"],
 ) -> tuple[_Outlines, Bool[np.ndarray, "drones cameras boxes"]]:
@@ -103,21 +103,23 @@ def _expected(
     return _Outlines(pixels - half_px, pixels + half_px), inside & known[..., None]
 
 
-def _without(view: View, camera: Int[np.ndarray, "gone"], box: Int[np.ndarray, "gone"]) -> View:
+def _without(
+    view: CameraSightings, camera: Int[np.ndarray, "gone"], box: Int[np.ndarray, "gone"]
+) -> CameraSightings:
     """The view without some boxes."""
     centre_px, size_px, noise_px = view.centre_px.copy(), view.size_px.copy(), view.noise_px.copy()
     for values in (centre_px, size_px, noise_px):
         values[camera, box] = np.nan
-    return View(centre_px, size_px, noise_px)
+    return CameraSightings(centre_px, size_px, noise_px)
 
 
 def _with(
-    view: View,
+    view: CameraSightings,
     camera: Int[np.ndarray, "more"],
     centre_px: Float[np.ndarray, "more 2"],
     size_px: Float[np.ndarray, "more 2"],
     noise_px: Float[np.ndarray, "more"],
-) -> View:
+) -> CameraSightings:
     """The view with more boxes; `camera` is in ascending order."""
     place = np.arange(len(camera)) - np.searchsorted(camera, camera)
     room = int(place.max(initial=-1)) + 1
@@ -127,6 +129,6 @@ def _with(
         added[camera, place] = more
         return np.concatenate([values, added], axis=1)
 
-    return View(
+    return CameraSightings(
         longer(view.centre_px, centre_px), longer(view.size_px, size_px), longer(view.noise_px, noise_px)
     )

@@ -6,14 +6,11 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.fitness import ScoreSettings
-from psotrack.initialisation import Start
-from psotrack.projection_lines.tracks import Row, Track
+from psotrack.initiation import InitialState
+from psotrack.projection_lines.tracks import Track, TrackRow
 from psotrack.settings import TrackSettings
-from psotrack.sizes import Looks
-from psotrack.sizes import init as init_sizes
-from psotrack.tracker import TrackerInfo
-from psotrack.tracking import Arrival, Tracked
+from psotrack.tracking import Arrival, ScoreSettings, SizeMeasurements, Tracked, TrackerInfo
+from psotrack.tracking import init as init_sizes
 from psotrack.trajectories import Status
 
 
@@ -45,13 +42,13 @@ def tracked_of(tracks: list[Track], num_frames: int, settings: TrackSettings) ->
     return Tracked(
         info=info,
         sizes=jax.tree.map(np.asarray, init_sizes(sizes, np.zeros(sizes.shape, bool), score)),
-        looks=Looks(np.full((*shape, 3), np.nan), np.full((*shape, len(score.windows)), np.nan)),
+        looks=SizeMeasurements(np.full((*shape, 3), np.nan), np.full((*shape, len(score.windows)), np.nan)),
         arrivals=tuple(arrivals),
         compile_s=0.0,
     )
 
 
-def start_of(tracked: Tracked) -> Start:
+def start_of(tracked: Tracked) -> InitialState:
     """The drones that were there at frame 0, as a start of tracking."""
     there = np.flatnonzero(np.isfinite(tracked.info.position_m[0]).all(axis=-1))
     position_m, velocity_m_s = (
@@ -59,10 +56,12 @@ def start_of(tracked: Tracked) -> Start:
         for value in (tracked.info.position_m, tracked.info.velocity_m_s)
     )
     size_m = np.asarray(tracked.sizes.size_m, np.float64)[there]
-    return Start(position_m, velocity_m_s, size_m, np.asarray(tracked.info.num_cameras[0], float)[there])
+    return InitialState(
+        position_m, velocity_m_s, size_m, np.asarray(tracked.info.num_cameras[0], float)[there]
+    )
 
 
-def _write(info: TrackerInfo, row: Row, of: tuple[int, int]) -> None:
+def _write(info: TrackerInfo, row: TrackRow, of: tuple[int, int]) -> None:
     """Write a row into the arrays."""
     info.position_m[of], info.velocity_m_s[of] = row.position_m, row.velocity_m_s
     info.covariance_m2[of] = row.covariance_m2

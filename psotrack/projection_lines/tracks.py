@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.lifecycle import Lost
-from psotrack.newcomers import Newcomer
+from psotrack.initiation import LostTracks, TrackCandidate
 
 #: How wide a drone looks changes as it turns: what counts is what it was in so many frames.
 SPAN_FRAMES = 25
@@ -27,7 +26,7 @@ class Found:
 
 
 @dataclass(frozen=True)
-class Row:
+class TrackRow:
     """What is known of a track after a frame; found is None where the frame did not show it."""
 
     frame: int
@@ -50,7 +49,7 @@ class Track:
 
     drone: int | None
     dispersion: float
-    rows: list[Row] = field(default_factory=list)
+    rows: list[TrackRow] = field(default_factory=list)
     hits: int = 0
     missed: int = 0
 
@@ -61,7 +60,7 @@ class Track:
         return float(np.mean(shares)) if shares else 0.0
 
     @property
-    def last_found(self) -> Row:
+    def last_found(self) -> TrackRow:
         """The last row in which it was found; the first one if it never was."""
         return next((row for row in reversed(self.rows) if row.found is not None), self.rows[0])
 
@@ -79,10 +78,10 @@ class Track:
         return np.array([width, width, height])
 
 
-def newcomer_of(track: Track) -> Newcomer:
+def newcomer_of(track: Track) -> TrackCandidate:
     """A track as a newcomer, at the frame in which it began; its velocity is known by now."""
     first, now = track.rows[0], track.rows[-1]
-    return Newcomer(
+    return TrackCandidate(
         frame=first.frame - now.frame,
         position_m=first.position_m,
         velocity_m_s=now.velocity_m_s,
@@ -92,10 +91,10 @@ def newcomer_of(track: Track) -> Newcomer:
     )
 
 
-def lost_of(tracks: list[Track], frame: int, fps: float) -> Lost:
+def lost_of(tracks: list[Track], frame: int, fps: float) -> LostTracks:
     """Drones that are missed, as they were when last found."""
     last = [track.last_found for track in tracks]
-    return Lost(
+    return LostTracks(
         drone=np.array([track.drone for track in tracks], int),
         position_m=np.array([row.position_m for row in last]).reshape(-1, 3),
         velocity_m_s=np.array([row.velocity_m_s for row in last]).reshape(-1, 3),

@@ -1,19 +1,10 @@
-"""Simulated sequences: a scenario's name and a seed -> videos, calibration and truth on disk, as if recorded."""
+"""Simulated recordings: a scenario and a seed become videos, a calibration and the truth.
 
-from psotrack.simulation.generate import simulate
-from psotrack.simulation.imaging.renderer import CameraRenderer
-from psotrack.simulation.scenarios import Scenario, load, preset_names, preset_text, replaced, scenario
-from psotrack.simulation.scene import Scene, build
+In: a `Scenario` (a preset or a TOML file) and a seed. Out: a folder in the layout of the DPJAIT dataset, which is
+read like a recorded one. The renderer draws 3D shapes; it knows neither the boxes nor the score of the tracker, so it
+cannot confirm their mistakes.
+"""
 
-__all__ = [
-    "CameraRenderer",
-    "Scenario",
-    "Scene",
-    "build",
-    "load",
-    "preset_names",
-    "preset_text",
-    "replaced",
-    "scenario",
-    "simulate",
-]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

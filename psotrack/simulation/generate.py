@@ -27,8 +27,6 @@ from psotrack.datasets.dpjait import (
     write_poses,
 )
 from psotrack.errors import InputError, SettingsError
-from psotrack.processes import map_in_processes
-from psotrack.progress import Report, silent
 from psotrack.simulation import scenarios
 from psotrack.simulation.imaging.onboard import intrinsics, onboard_poses
 from psotrack.simulation.labels.mocap import mocap_markers_m
@@ -36,6 +34,7 @@ from psotrack.simulation.scenarios import Mesh, Recording, Scenario
 from psotrack.simulation.scene import Scene, build
 from psotrack.simulation.segments import Stream, Work, draw, join, join_masks, segment_folder, segments
 from psotrack.simulation.unfinished import Unfinished, unfinished
+from psotrack.support import Report, map_in_processes, silent
 
 #: Pieces of work per process: few, because each starts with a camera's backdrop, and enough to end together.
 _PIECES_PER_JOB = 4

@@ -9,16 +9,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from psotrack.cameras import Camera, project
-from psotrack.evaluation.plots import COLOURS
-from psotrack.files import refuse_to_overwrite, written_whole
-from psotrack.processes import map_in_processes
-from psotrack.progress import Advance, Report, silent
+from psotrack.geometry import Camera, project
 from psotrack.simulation.imaging.onboard import OnboardRenderer
 from psotrack.simulation.imaging.renderer import CameraRenderer
 from psotrack.simulation.scenarios import Scenario, frames_of
 from psotrack.simulation.scene import Scene, build
 from psotrack.simulation.world.halls import HALLS
+from psotrack.support import (
+    COLOURS,
+    Advance,
+    Report,
+    map_in_processes,
+    refuse_to_overwrite,
+    silent,
+    written_whole,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

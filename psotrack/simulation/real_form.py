@@ -18,7 +18,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
 
-from psotrack.cameras import Camera, CameraRig, to_pixels, undistort
 from psotrack.datasets.dpjait import (
     CALIBRATION,
     DETECTIONS,
@@ -31,11 +30,9 @@ from psotrack.datasets.dpjait import (
     write_detections,
 )
 from psotrack.errors import InputError, SettingsError, check_positive
-from psotrack.files import refuse_to_overwrite, written_whole
-from psotrack.mocap import Markers, write_c3d
-from psotrack.progress import Advance, Report, silent
-from psotrack.sequence import Sequence
-from psotrack.video import VideoInfo, VideoWriter, read_frames
+from psotrack.geometry import Camera, CameraRig, to_pixels, undistort
+from psotrack.recordings import Markers, Sequence, VideoInfo, VideoWriter, read_frames, write_c3d
+from psotrack.support import Advance, Report, refuse_to_overwrite, silent, written_whole
 
 #: The bodies of the dataset's cameras; the fifth was a spare.
 SERIALS = ("55260362", "56339527", "60881257", "61016180")

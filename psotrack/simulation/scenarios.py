@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import msgspec
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.schema import assign, convert, read_toml
+from psotrack.support import assign, convert, read_toml
 
 _PRESETS = resources.files("psotrack.simulation.presets")
 
@@ -89,7 +89,7 @@ class Formation(_Record, frozen=True, kw_only=True, tag_field="kind", tag="forma
     offset_m: Vector
 
 
-class Following(_Record, frozen=True, kw_only=True, tag_field="kind", tag="following"):
+class FollowingFlight(_Record, frozen=True, kw_only=True, tag_field="kind", tag="following"):
     """On the path of another drone, some time behind it.
 
     Attributes:
@@ -146,7 +146,7 @@ class Recording(_Record, frozen=True, kw_only=True, tag_field="kind", tag="recor
     offset_m: Vector = (0.0, 0.0, 0.0)
 
 
-FlightRecord = Harmonics | Orbit | Crossing | Formation | Following | NearPass | Waypoints | Recording
+FlightRecord = Harmonics | Orbit | Crossing | Formation | FollowingFlight | NearPass | Waypoints | Recording
 
 
 # --- drones
@@ -270,7 +270,7 @@ class Imaging(_Record, frozen=True, kw_only=True):
     jpeg_quality: Annotated[int, msgspec.Meta(ge=0, le=100)] = 0
 
 
-class Detector(_Record, frozen=True, kw_only=True):
+class SimulatedDetector(_Record, frozen=True, kw_only=True):
     """The noise of a detector of boxes, with what a good network does on such videos as default.
 
     Attributes:
@@ -354,7 +354,7 @@ class Scenario(_Record, frozen=True, kw_only=True):
     onboard: OnboardCamera | None = None
     camera_spread: CameraSpread = CameraSpread()
     imaging: Imaging = Imaging()
-    detector: Detector = Detector()
+    detector: SimulatedDetector = SimulatedDetector()
     variation: Variation = Variation()
 
 

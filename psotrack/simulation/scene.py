@@ -8,8 +8,8 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.cameras import Camera, CameraRig, camera, look_at, stack
 from psotrack.errors import SettingsError, check_positive
+from psotrack.geometry import Camera, CameraRig, camera, look_at, stack
 from psotrack.simulation.flights.motion import Flight
 from psotrack.simulation.flights.planning import frame_times_s, plan
 from psotrack.simulation.scenarios import CameraPlace, Scenario

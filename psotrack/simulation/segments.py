@@ -14,16 +14,14 @@ from pathlib import Path
 import numpy as np
 
 from psotrack.datasets.dpjait import DETECTIONS, MASKS, MaskWriter, join_archives, write_detections
-from psotrack.detections import Detections
-from psotrack.files import written_whole
-from psotrack.progress import Advance
+from psotrack.recordings import Detections, VideoWriter, join_videos
 from psotrack.simulation.imaging.onboard import OnboardRenderer
 from psotrack.simulation.imaging.raster import Pinhole
 from psotrack.simulation.imaging.renderer import CameraRenderer
 from psotrack.simulation.labels.detector import detect
 from psotrack.simulation.labels.masks import Silhouette, silhouettes
 from psotrack.simulation.scene import Scene
-from psotrack.video import VideoWriter, join_videos
+from psotrack.support import Advance, written_whole
 
 #: Frames per segment: ten groups of pictures of the codec, and some ten seconds of work that an interruption costs.
 SEGMENT_FRAMES = 120

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from psotrack.errors import OutputError
-from psotrack.files import refuse_to_overwrite
+from psotrack.support import refuse_to_overwrite
 
 #: How the sequence was made. Its name is hidden until everything else is there.
 RECORD = "simulation.json"

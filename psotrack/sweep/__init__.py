@@ -1,9 +1,9 @@
-"""Sweeps: grids of settings, run and remembered cell by cell, and tables of what came out."""
+"""Sweeps: a grid of settings, tracked and evaluated cell by cell, and tables of the results.
 
-from psotrack.sweep.frames import sweep
-from psotrack.sweep.grid import Cell, Grid, Perturbation, grid, key_of, load
-from psotrack.sweep.perturbations import perturbed
-from psotrack.sweep.printing import render
-from psotrack.sweep.tables import pivot
+In: a grid (a TOML file or a mapping) and the sequences. Out: one stored result per cell, so that an interrupted sweep
+goes on where it stopped and several machines can share one, and pandas tables of the results.
+"""
 
-__all__ = ["Cell", "Grid", "Perturbation", "grid", "key_of", "load", "perturbed", "pivot", "render", "sweep"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -18,18 +18,17 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from psotrack.compiled import keep_compiled
 from psotrack.errors import InputError, PsotrackError, SettingsError
-from psotrack.progress import Report, silent
 from psotrack.silhouettes import compute
+from psotrack.support import Report, keep_compiled, silent
 from psotrack.sweep.cells import Cell
-from psotrack.sweep.grid import Grid
+from psotrack.sweep.grid_files import Grid
 from psotrack.sweep.inputs import Inputs, source_of
 from psotrack.sweep.locks import POLL_S
 from psotrack.sweep.machine import Device, processors, provenance, share_processors, use_device
 from psotrack.sweep.runner import (
-    Outcome,
     Result,
+    SweepOutcome,
     failed,
     finished_before,
     in_order,
@@ -71,7 +70,7 @@ def run_on_cluster(
     workers: int | None = None,
     device: Device | None = None,
     report: Report = silent,
-) -> Outcome:
+) -> SweepOutcome:
     """Run what is not finished, as tasks of a cluster; as `runner.run` otherwise.
 
     Args:

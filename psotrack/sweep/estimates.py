@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from psotrack.errors import InputError, PsotrackError
-from psotrack.silhouette_store import open_stored, reduced_shape
+from psotrack.silhouettes import open_stored, reduced_shape
 from psotrack.sweep.cells import Cell, key_of
 from psotrack.sweep.inputs import Inputs, source_of
 from psotrack.sweep.machine import provenance

@@ -15,8 +15,7 @@ import pandas as pd
 from jaxtyping import Float, Int
 
 from psotrack.errors import SettingsError
-from psotrack.evaluation.plots import COLOURS, colour_of
-from psotrack.files import refuse_to_overwrite, written_whole
+from psotrack.support import COLOURS, colour_of, refuse_to_overwrite, written_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

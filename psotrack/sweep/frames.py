@@ -9,9 +9,9 @@ from typing import Any
 import pandas as pd
 
 from psotrack.errors import InputError
-from psotrack.progress import Report, silent
-from psotrack.sweep.grid import Grid, load
-from psotrack.sweep.grid import grid as grid_of
+from psotrack.support import Report, silent
+from psotrack.sweep.grid_files import Grid, load
+from psotrack.sweep.grid_files import grid as grid_of
 from psotrack.sweep.store import Store
 
 
@@ -57,7 +57,7 @@ def sweep(
 
             rows = sweep(
                 {"sequences": ["S02_D4_A"], "runs": 5, "grid": {"particles": [20, 50, 100]}},
-                out="results", data="data", cache="cache", report=psotrack.progress.terminal,
+                out="results", data="data", cache="cache", report=psotrack.support.progress.terminal,
             )
             rows.groupby("settings.particles")["mean_error_m"].agg(["mean", "std"])
     """

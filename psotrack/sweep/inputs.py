@@ -15,10 +15,9 @@ import numpy as np
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.errors import InputError, PsotrackError
 from psotrack.methods import detection_files_of
-from psotrack.sequence import Sequence
-from psotrack.silhouette_store import SilhouetteSettings
-from psotrack.silhouette_store import key_of as silhouettes_key_of
-from psotrack.silhouettes import Silhouettes, compute
+from psotrack.recordings import Sequence
+from psotrack.silhouettes import Silhouettes, SilhouetteSettings, compute
+from psotrack.silhouettes import key_of as silhouettes_key_of
 from psotrack.sweep.cells import Cell
 from psotrack.sweep.locks import claimed
 from psotrack.sweep.perturbations import perturbed

@@ -20,7 +20,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from psotrack.files import written_whole
+from psotrack.support import written_whole
 
 logger = logging.getLogger(__name__)
 

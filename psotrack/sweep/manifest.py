@@ -18,7 +18,7 @@ from typing import Any
 import msgspec
 
 from psotrack.sweep.cells import Cell
-from psotrack.sweep.grid import Grid
+from psotrack.sweep.grid_files import Grid
 from psotrack.sweep.inputs import digest_of
 
 

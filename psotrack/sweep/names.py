@@ -6,9 +6,9 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from psotrack.errors import SettingsError
-from psotrack.schema import nearest
 from psotrack.settings import TrackSettings
-from psotrack.silhouette_store import SilhouetteSettings
+from psotrack.silhouettes import SilhouetteSettings
+from psotrack.support import nearest
 from psotrack.sweep.cells import Perturbation
 
 #: Dotted names of everything that [settings] and [methods] may set.

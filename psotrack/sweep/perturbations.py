@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import UInt8
 from scipy.spatial.transform import Rotation
 
-from psotrack.cameras import CameraRig
 from psotrack.errors import SettingsError
-from psotrack.sequence import Sequence
+from psotrack.geometry import CameraRig
+from psotrack.recordings import Sequence
 from psotrack.silhouettes import Silhouettes
 from psotrack.sweep.cells import Perturbation
 

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from psotrack.errors import SettingsError
-from psotrack.schema import nearest
+from psotrack.support import nearest
 from psotrack.sweep.tables import FIGURES
 
 FORMATS = ("text", "markdown", "latex", "csv")

@@ -17,9 +17,9 @@ import pandas as pd
 from psotrack.errors import InputError, OutputError, PsotrackError
 from psotrack.evaluation import errors_over_time, evaluate
 from psotrack.pipeline import TrackedSequence, track_runs
-from psotrack.progress import Report, silent
+from psotrack.support import Report, silent
 from psotrack.sweep.cells import Cell, key_of, name_of, title
-from psotrack.sweep.grid import Grid, cameras_label
+from psotrack.sweep.grid_files import Grid, cameras_label
 from psotrack.sweep.inputs import Input, Inputs, digest_of, folder_of, source_of
 from psotrack.sweep.locks import POLL_S
 from psotrack.sweep.machine import provenance
@@ -48,7 +48,7 @@ class Result:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class SweepOutcome:
     """What a runner did, cell by cell, in the grid's order."""
 
     results: tuple[Result, ...]
@@ -71,7 +71,7 @@ class Outcome:
 
 def run(
     grid: Grid, out: Path, *, data: Path, cache: Path, jobs: int | None = None, report: Report = silent
-) -> Outcome:
+) -> SweepOutcome:
     """Run what is not finished, cell by cell. Several runners on one folder share the work.
 
     It ends when every cell is finished or has failed: it waits for those that others are at work on, and does them if
@@ -108,10 +108,10 @@ def run(
     return outcome_of(grid, results)
 
 
-def outcome_of(grid: Grid, results: Iterable[Result]) -> Outcome:
+def outcome_of(grid: Grid, results: Iterable[Result]) -> SweepOutcome:
     """Results in the order of the grid's cells."""
     order = {name_of(cell): number for number, cell in enumerate(grid.cells())}
-    return Outcome(tuple(sorted(results, key=lambda result: order[name_of(result.cell)])))
+    return SweepOutcome(tuple(sorted(results, key=lambda result: order[name_of(result.cell)])))
 
 
 def opened(grid: Grid, out: Path, data: Path, origin: Mapping[str, Any]) -> Store:

@@ -24,7 +24,7 @@ from typing import Any
 import pandas as pd
 
 from psotrack.errors import InputError
-from psotrack.files import written_whole
+from psotrack.support import written_whole
 from psotrack.sweep.locks import claimed, owner_of, waited_for
 
 #: What was being written so long ago was left by a runner that was killed.

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from psotrack.errors import SettingsError
-from psotrack.schema import nearest
+from psotrack.support import nearest
 
 logger = logging.getLogger(__name__)
 

@@ -14,11 +14,11 @@ from psotrack.cli.calibrate.options import OUT
 from psotrack.cli.calibrate.shown import row_of, show_cameras
 from psotrack.cli.options import FORCE, JSON, QUIET, SEQUENCE
 from psotrack.errors import InputError
-from psotrack.files import refuse_to_overwrite
+from psotrack.support import refuse_to_overwrite
 
 if TYPE_CHECKING:
     from psotrack.calibration import DroneViews, Improved
-    from psotrack.cameras import CameraRig
+    from psotrack.geometry import CameraRig
 
 
 @click.command()
@@ -63,10 +63,11 @@ def adjust(
     Example:
       psotrack calibrate adjust data/Simulated_Data/S02_D4_A --tracks tracks.csv --out better.toml
     """
-    from psotrack.calibration import improve, in_boxes, write_rig
+    from psotrack.calibration import improve, in_boxes
     from psotrack.datasets.dpjait import read_sequence
-    from psotrack.detections import read_detections
-    from psotrack.trajectory_files import read_trajectories
+    from psotrack.geometry import write_rig
+    from psotrack.recordings import read_detections
+    from psotrack.trajectories import read_trajectories
 
     refuse_to_overwrite(out, force)
     recording = read_sequence(sequence)

@@ -44,7 +44,7 @@ def convert(
       psotrack calibrate convert calibration.toml cameras_calibration.csv --unit mm
       psotrack calibrate convert cameras_calibration.csv rig.yml --size 1920,1080
     """
-    from psotrack.calibration import read_rig, write_rig
+    from psotrack.geometry import read_rig, write_rig
 
     rig = read_rig(source, image_size_wh, metres_per_unit=_METRES[unit])
     write_rig(out, rig, force=force)

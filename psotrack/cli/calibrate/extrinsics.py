@@ -14,7 +14,7 @@ from psotrack.cli.calibrate.options import OUT, SIZE, noise_option
 from psotrack.cli.calibrate.shown import row_of, show_cameras
 from psotrack.cli.options import FORCE, JSON, QUIET, Numbers
 from psotrack.errors import InputError, SettingsError
-from psotrack.files import refuse_to_overwrite
+from psotrack.support import refuse_to_overwrite
 
 if TYPE_CHECKING:
     from psotrack.calibration import Marks
@@ -76,8 +76,8 @@ def extrinsics(
       psotrack calibrate extrinsics --pairs pairs.csv --points points.csv --fov 92.4,60.8 --size 1920,1080 --out rig.yml
       psotrack calibrate extrinsics --markers data/Simulated_Data/S01_D2_A --intrinsics rig.toml --out found.toml
     """
-    from psotrack.calibration import locate_camera, read_marks, write_rig
-    from psotrack.cameras import Camera, stack
+    from psotrack.calibration import locate_camera, read_marks
+    from psotrack.geometry import Camera, stack, write_rig
 
     if (pairs is None) == (markers is None):
         found = "neither" if pairs is None else "both"
@@ -115,7 +115,8 @@ def _lenses(
     image_size_wh: tuple[int, int] | None,
 ) -> Mapping[str, Any]:
     """The lens of each camera, from the one of three ways that was chosen."""
-    from psotrack.calibration import lens_of_sensor, lens_of_view, read_lenses
+    from psotrack.calibration import lens_of_sensor, lens_of_view
+    from psotrack.geometry import read_lenses
 
     ways = [value is not None for value in (intrinsics, fov_deg, focal_length_mm)]
     if sum(ways) != 1 or (focal_length_mm is None) != (sensor_mm is None):
@@ -146,7 +147,7 @@ def _lenses(
 def _marker_marks(folder: Path, dictionary: str) -> dict[str, Marks]:
     from psotrack.calibration import find_markers
     from psotrack.datasets.dpjait import MARKER_CORNERS, read_sequence
-    from psotrack.inside_out.marker_map import read_marker_map
+    from psotrack.inside_out import read_marker_map
 
     corners_m = read_marker_map(folder / MARKER_CORNERS).corners_m
     videos = read_sequence(folder).videos

@@ -10,7 +10,7 @@ import numpy as np
 from psotrack.cli.answers import answer, say, show
 from psotrack.cli.calibrate.options import OUT
 from psotrack.cli.options import FORCE, JSON, QUIET, Size
-from psotrack.files import refuse_to_overwrite
+from psotrack.support import refuse_to_overwrite
 
 
 @click.command()
@@ -44,9 +44,9 @@ def intrinsics(
     Example:
       psotrack calibrate intrinsics board.avi --squares 7x5 --square 0.04 --marker 0.03 --out lens.toml
     """
-    from psotrack.calibration import Board, lens_of_board, write_rig
-    from psotrack.cameras import stack
-    from psotrack.video import probe
+    from psotrack.calibration import Board, lens_of_board
+    from psotrack.geometry import stack, write_rig
+    from psotrack.recordings import probe
 
     refuse_to_overwrite(out, force)
     lens = lens_of_board(probe(video), Board(squares_wh, square_m, marker_m, dictionary))

@@ -113,11 +113,14 @@ def map_markers(
       psotrack map-markers data/Simulated_Data/S01_D2_A --check corners.csv
     """
     from psotrack.datasets.dpjait import write_marker_corners
-    from psotrack.inside_out.mapping import build_map
-    from psotrack.inside_out.mapping.check import check_map
-    from psotrack.inside_out.mapping.sightings import find_sightings
-    from psotrack.inside_out.mapping.squares import read_measured, squares
-    from psotrack.inside_out.marker_map import read_marker_map
+    from psotrack.inside_out import (
+        build_map,
+        check_map,
+        find_sightings,
+        read_marker_map,
+        read_measured,
+        squares,
+    )
 
     given = [name for name, value in {"--out": out, "--check": checked}.items() if value is not None]
     if len(given) != 1:

@@ -10,10 +10,7 @@ import numpy as np
 from psotrack.cli.answers import PLACE, answer, in_words, known, say, show
 
 if TYPE_CHECKING:
-    from psotrack.inside_out.mapping import BuiltMap
-    from psotrack.inside_out.mapping.check import Checkup
-    from psotrack.inside_out.mapping.squares import Squares
-    from psotrack.inside_out.marker_map import MarkerMap
+    from psotrack.inside_out import BuiltMap, Checkup, MarkerMap, Squares
 
 
 def show_measured(squares: Squares, out: Path, quiet: bool, json_path: Path | None, force: bool) -> None:

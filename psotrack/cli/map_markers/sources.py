@@ -11,8 +11,8 @@ import numpy as np
 from psotrack.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
-    from psotrack.cameras import Camera
-    from psotrack.video import VideoInfo
+    from psotrack.geometry import Camera
+    from psotrack.recordings import VideoInfo
 
 
 def known_corners(
@@ -20,8 +20,7 @@ def known_corners(
 ) -> dict[int, np.ndarray]:
     """The corners of the known markers, by id."""
     from psotrack.datasets.dpjait import MARKER_CORNERS
-    from psotrack.inside_out.mapping import own_frame
-    from psotrack.inside_out.marker_map import read_marker_map
+    from psotrack.inside_out import own_frame, read_marker_map
 
     words = [word.strip() for word in (known or "").split(",") if word.strip()]
     if not words or not all(word.isdecimal() for word in words):
@@ -56,7 +55,7 @@ class Lenses:
 
     def of(self, video: VideoInfo, index: int, count: int) -> Camera:
         """The lens of a video, number `index` of `count`."""
-        from psotrack.inside_out.lens_files import chosen_lens
+        from psotrack.inside_out import chosen_lens
 
         names = [None] if self.names is None else self.names.split(",")
         if len(names) not in (1, count):
@@ -72,7 +71,7 @@ def videos_of(
     sources: tuple[Path, ...], drones: str | None, lenses: Lenses
 ) -> dict[str, tuple[VideoInfo, Camera]]:
     """The videos with their lenses, by name."""
-    from psotrack.video import probe
+    from psotrack.recordings import probe
 
     if sources[0].is_dir():
         if len(sources) > 1:
@@ -88,7 +87,7 @@ def videos_of(
 
 def _of_sequence(folder: Path, drones: str | None, lenses: Lenses) -> dict[str, tuple[VideoInfo, Camera]]:
     from psotrack.datasets.dpjait import read_sequence
-    from psotrack.inside_out.lens_files import lens_of_matrix
+    from psotrack.inside_out import lens_of_matrix
 
     onboard = read_sequence(folder).onboard or {}
     if not onboard:

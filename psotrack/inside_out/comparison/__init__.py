@@ -1,11 +1,11 @@
 """A camera's path against a reference, by the paper's procedure."""
 
 from psotrack.inside_out.comparison.comparing import (
-    Comparison,
+    PathComparison,
     Statistics,
     compare,
     mean_rotation,
     wrapped_deg,
 )
 
-__all__ = ["Comparison", "Statistics", "compare", "mean_rotation", "wrapped_deg"]
+__all__ = ["PathComparison", "Statistics", "compare", "mean_rotation", "wrapped_deg"]

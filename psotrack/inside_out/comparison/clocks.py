@@ -13,12 +13,10 @@ from jaxtyping import Float
 from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation, Slerp
 
-from psotrack import time_shift
-from psotrack.evaluation.association import GATE_M
+from psotrack.clocks import Offset, find_offset, time_shift
+from psotrack.geometry import rotation_matrices
 from psotrack.inside_out.camera_path import CameraPath
-from psotrack.rotations import rotation_matrices
-from psotrack.synchronisation import Offset, find_offset
-from psotrack.trajectories import Status, Trajectories
+from psotrack.trajectories import GATE_M, Status, Trajectories
 
 #: A body's orientations at the samples of its positions when their clock is ahead by the offset, (samples, 4); None
 #: where they do not matter, or are not known before the offset, None, is.
@@ -171,7 +169,7 @@ def _checked(
 
     Seen from a body that turns, what hovers moves as well: `find_offset` alone would take that for motion.
     """
-    placed = time_shift.Comparison.of(estimate, time_s, camera_m[:, None], None, with_lever_arm=True)
+    placed = time_shift.ShiftedPair.of(estimate, time_s, camera_m[:, None], None, with_lever_arm=True)
     std_s = placed.standard_deviation_s(offset_s, np.zeros(1, int))
     frame_s = float(np.median(np.diff(estimate.time_s)))
     if not std_s < frame_s:

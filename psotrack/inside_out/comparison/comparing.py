@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from psotrack import time_shift
+from psotrack.clocks import time_shift
 from psotrack.inside_out.camera_path import CameraPath, roll_pitch_yaw_deg
 from psotrack.inside_out.comparison import clocks as clocks
 
@@ -72,7 +72,7 @@ class Turning:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class PathComparison:
     """A path and its reference at corresponding frames. What is not known of a frame is NaN.
 
     Attributes:
@@ -115,7 +115,7 @@ def compare(
     with_lever_arm: bool = True,
     with_turn: bool = True,
     max_offset_s: float | None = None,
-) -> Comparison:
+) -> PathComparison:
     """A path against a reference of any rate, whose clocks are not that of the video.
 
     Between samples of the reference positions are cubic splines and orientations great arcs, neither over gaps
@@ -147,7 +147,7 @@ def compare(
         path, reference_time_s, reference_m, bodies if with_lever_arm else None, max_offset_s=max_offset_s
     )
     turned = bodies(offset_s) if with_lever_arm else None
-    placed = time_shift.Comparison.of(
+    placed = time_shift.ShiftedPair.of(
         path.trajectories("camera"),
         reference_time_s,
         reference_m[:, None],
@@ -165,7 +165,7 @@ def compare(
         turning = _turning(
             path, clocks.at_times(turns_s, reference_wxyz, path.time_s + by_s), by_s, with_turn
         )
-    return Comparison(
+    return PathComparison(
         frame=path.frame,
         time_s=path.time_s,
         offset_s=offset_s,

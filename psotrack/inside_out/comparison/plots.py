@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float
 
-from psotrack.evaluation.plots import COLOURS, save
 from psotrack.inside_out.camera_path import CameraPath
-from psotrack.inside_out.comparison.comparing import Comparison
+from psotrack.inside_out.comparison.comparing import PathComparison
 from psotrack.inside_out.marker_map import MarkerMap
+from psotrack.support import COLOURS, save_figure
 from psotrack.trajectories import Status
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ _MARGIN = 0.15
 
 
 def save_paths(
-    png: Path, path: CameraPath, comparison: Comparison, *, caption: str = "", force: bool = False
+    png: Path, path: CameraPath, comparison: PathComparison, *, caption: str = "", force: bool = False
 ) -> None:
     """Save a PNG of the path and of where its reference says it was, from above and from the side: figure 11.
 
@@ -67,7 +67,7 @@ def save_paths(
         if parts:
             figure.supxlabel("; ".join(parts), fontsize=9)
 
-    save(png, (7.0, 8.0), draw, force)
+    save_figure(png, (7.0, 8.0), draw, force)
 
 
 def save_flight(
@@ -111,7 +111,7 @@ def save_flight(
         if caption:
             figure.supxlabel(caption, fontsize=9)
 
-    save(png, (7.0, 8.0), draw, force)
+    save_figure(png, (7.0, 8.0), draw, force)
 
 
 def _runs(marked: Bool[np.ndarray, "frames"]) -> list[tuple[int, int]]:
@@ -120,7 +120,7 @@ def _runs(marked: Bool[np.ndarray, "frames"]) -> list[tuple[int, int]]:
     return list(zip(np.flatnonzero(steps > 0).tolist(), np.flatnonzero(steps < 0).tolist(), strict=True))
 
 
-def save_errors(png: Path, comparisons: Mapping[str, Comparison], *, force: bool = False) -> None:
+def save_errors(png: Path, comparisons: Mapping[str, PathComparison], *, force: bool = False) -> None:
     """Save a PNG of the distance, and of the angle where there are orientations, over time: a line per comparison.
 
     Raises:
@@ -142,7 +142,7 @@ def save_errors(png: Path, comparisons: Mapping[str, Comparison], *, force: bool
         panels[-1].set_xlabel("time (s)")
         panels[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, frameon=False, fontsize=8.5)
 
-    save(png, (9.0, 2.6 * len(quantities) + 0.6), draw, force)
+    save_figure(png, (9.0, 2.6 * len(quantities) + 0.6), draw, force)
 
 
 def _scale(axes: Axes, values: Float[np.ndarray, "values"]) -> None:

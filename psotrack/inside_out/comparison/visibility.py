@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from psotrack.cameras import NEAR_M, Camera, to_pixels
+from psotrack.geometry import NEAR_M, Camera, to_pixels
 from psotrack.inside_out.marker_map import MarkerMap
 
 #: Two pixels for each of the six cells across a 4 x 4 marker, its border among them: less tells no bit from the next.

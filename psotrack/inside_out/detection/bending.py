@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.cameras import Camera, distort, undistort
+from psotrack.geometry import Camera, distort, undistort
 
 
 def straight(

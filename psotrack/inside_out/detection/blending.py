@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8, UInt16
 
-from psotrack.cameras import Camera
+from psotrack.geometry import Camera
 from psotrack.inside_out.detection.bending import bent, straight
 from psotrack.inside_out.detection.rises import Levels, rises
 

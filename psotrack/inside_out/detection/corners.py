@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from psotrack.cameras import Camera
+from psotrack.geometry import Camera
 from psotrack.inside_out.detection.bending import bent, straight
 from psotrack.inside_out.detection.blending import blending_exponent, light_of
 from psotrack.inside_out.detection.rises import Levels, rises

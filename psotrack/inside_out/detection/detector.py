@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from psotrack.aruco import marker_dictionary
-from psotrack.cameras import Camera
+from psotrack.detection import marker_dictionary
 from psotrack.errors import SettingsError
+from psotrack.geometry import Camera
 from psotrack.inside_out.detection.corners import refined_corners
 
 #: Longer side of the images that are searched: larger ones are made smaller by a whole number that comes nearest. What

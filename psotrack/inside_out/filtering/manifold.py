@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.rotations import cross_matrices
+from psotrack.geometry import cross_matrices
 
 #: Batches of one are of any size.
 Turns = Float[np.ndarray, "#batch 3"]

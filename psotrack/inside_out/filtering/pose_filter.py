@@ -19,7 +19,7 @@ from psotrack.inside_out.filtering.path_rows import PoseRow, lost, measured, pat
 from psotrack.inside_out.filtering.records import MeasuredPose, PoseEstimate, PoseFilterParams
 
 __all__ = [
-    "Following",
+    "FilterRun",
     "MeasuredPose",
     "PoseEstimate",
     "PoseFilterParams",
@@ -58,8 +58,8 @@ class Rival:
 
 
 @dataclass(frozen=True)
-class Following:
-    """What `step` hands from frame to frame; `Following()` knows nothing yet.
+class FilterRun:
+    """What `step` hands from frame to frame; `FilterRun()` knows nothing yet.
 
     Attributes:
         state: what is believed.
@@ -80,7 +80,7 @@ class Following:
     strange: bool = False
 
 
-def advance(following: Following, time_s: float, params: PoseFilterParams) -> Following:
+def advance(following: FilterRun, time_s: float, params: PoseFilterParams) -> FilterRun:
     """The same at a later time, before its frame is looked at; what is too long ago is forgotten.
 
     Raises:
@@ -102,17 +102,17 @@ def advance(following: Following, time_s: float, params: PoseFilterParams) -> Fo
         before = predict(before, time_s)
         before = None if _anywhere(before) else before
     if state is None and rival is not None:
-        return Following(rival.state, former=former, overthrown=rival, before=before)
+        return FilterRun(rival.state, former=former, overthrown=rival, before=before)
     strange = before is not None and following.strange
-    return Following(state, rival, former, before=before, strange=strange)
+    return FilterRun(state, rival, former, before=before, strange=strange)
 
 
-def expected(following: Following, params: PoseFilterParams) -> PoseEstimate | None:
+def expected(following: FilterRun, params: PoseFilterParams) -> PoseEstimate | None:
     """Where the camera should be at the time that `following` was advanced to; None where nothing is confirmed."""
     return estimate(following.state) if following.state and confirmed(following, params) else None
 
 
-def confirmed(following: Following, params: PoseFilterParams) -> bool:
+def confirmed(following: FilterRun, params: PoseFilterParams) -> bool:
     """Whether the state is to be told: enough poses agree, or the markers of one of them do, beyond chance.
 
     Behind a gap, poses that what was known before does not foretell need as many as they would against a state, and
@@ -125,7 +125,7 @@ def confirmed(following: Following, params: PoseFilterParams) -> bool:
     return state.support >= needed or (state.doubt < params.false_alarm and not following.strange)
 
 
-def step(following: Following, raw: PoseRow, params: PoseFilterParams) -> tuple[Following, PoseRow]:
+def step(following: FilterRun, raw: PoseRow, params: PoseFilterParams) -> tuple[FilterRun, PoseRow]:
     """Follow the camera into the next frame.
 
     Args:
@@ -164,7 +164,7 @@ def follow(path: CameraPath, params: PoseFilterParams | None = None) -> CameraPa
         InputError: a pose's covariance is not positive definite.
     """
     params = params or PoseFilterParams()
-    following, rows = Following(), []
+    following, rows = FilterRun(), []
     for raw in rows_of(path):
         following, row = step(following, raw, params)
         rows.append(row)
@@ -172,18 +172,18 @@ def follow(path: CameraPath, params: PoseFilterParams | None = None) -> CameraPa
 
 
 def _looked(
-    following: Following, measurement: MeasuredPose, params: PoseFilterParams
-) -> tuple[Following, bool]:
+    following: FilterRun, measurement: MeasuredPose, params: PoseFilterParams
+) -> tuple[FilterRun, bool]:
     """After a measured pose, and whether it was gated."""
     before, strange = following.before, False
     if before is not None:
         again, strange = update(before, measurement, params)
         if not strange and _foretold(again, params):
-            return Following(again, recalled=before), False
+            return FilterRun(again, recalled=before), False
     if following.state is None:
         anew = init(measurement)
         began = None if before is None else Rival(anew, measurement.time_s, 1, goes_on=not strange)
-        found, gated = Following(anew, overthrown=began), False
+        found, gated = FilterRun(anew, overthrown=began), False
     else:
         found, gated = _compared(following, following.state, measurement, params)
         strange = strange if found.overthrown else following.strange
@@ -192,8 +192,8 @@ def _looked(
 
 
 def _compared(
-    following: Following, state: PoseState, measurement: MeasuredPose, params: PoseFilterParams
-) -> tuple[Following, bool]:
+    following: FilterRun, state: PoseState, measurement: MeasuredPose, params: PoseFilterParams
+) -> tuple[FilterRun, bool]:
     """After a measured pose, where there is a state, and whether it was gated."""
     foretold = state
     state, gated = update(foretold, measurement, params)
@@ -201,20 +201,20 @@ def _compared(
     if former is not None:
         again, strange = update(former, measurement, params)
         if not strange and (gated or again.log_density > state.log_density):
-            return Following(again, recalled=former), False
+            return FilterRun(again, recalled=former), False
     strange = True
     if rival is not None:
         rival_state, strange = update(rival.state, measurement, params)
         rival = replace(rival, state=rival_state)
     if rival is None or strange:
         rival = _begun(state, measurement, params) if gated else None
-        return Following(state, rival, former), gated
+        return FilterRun(state, rival, former), gated
     if not gated and rival.state.log_density <= state.log_density:
-        return Following(state, former=former), False
+        return FilterRun(state, former=former), False
     # The pose is the rival's, even where the state, vague by now, would have it too.
     if rival.state.support >= rival.needed:
-        return Following(rival.state, former=former or foretold, overthrown=rival), False
-    return Following(foretold, rival, former), True
+        return FilterRun(rival.state, former=former or foretold, overthrown=rival), False
+    return FilterRun(foretold, rival, former), True
 
 
 def _begun(state: PoseState, measurement: MeasuredPose, params: PoseFilterParams) -> Rival:

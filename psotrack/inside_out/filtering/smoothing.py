@@ -20,7 +20,7 @@ from psotrack.inside_out.filtering.bank import LEVELS, right_pose
 from psotrack.inside_out.filtering.manifold import right_jacobian_inverse
 from psotrack.inside_out.filtering.motion import POSE, Levels, Motion
 from psotrack.inside_out.filtering.path_rows import PoseRow, lost, measured, path_of, rows_of, told_row
-from psotrack.inside_out.filtering.pose_filter import Following, confirmed, step
+from psotrack.inside_out.filtering.pose_filter import FilterRun, confirmed, step
 from psotrack.inside_out.filtering.records import PoseEstimate, PoseFilterParams
 
 
@@ -90,7 +90,7 @@ def _learned(rows: Sequence[PoseRow], params: PoseFilterParams) -> _Learned:
     counts, jumped = np.zeros(len(rows), bool), np.zeros(len(rows), bool)
     start = np.zeros(len(rows), int)
     told, found = [False], []
-    following, known = Following(), (_log_levels(_evenly()), 0.0, np.nan)
+    following, known = FilterRun(), (_log_levels(_evenly()), 0.0, np.nan)
     for k, raw in enumerate(rows):
         following, _ = step(following, raw, params)
         state, rival, recalled = following.state, following.overthrown, following.recalled

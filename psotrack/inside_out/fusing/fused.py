@@ -13,15 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from psotrack.clocks import Offset, find_offset
 from psotrack.errors import InputError
-from psotrack.evaluation.association import GATE_M, UNASSIGNED
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.fusing.drone_fusion import DroneFusion, DroneTrack, Point, fuse_drone, path_alone
 from psotrack.inside_out.fusing.mounting import Mounted, mounted, robust_arm
 from psotrack.inside_out.fusing.outside_tracks import OutsideTracks, picked, spread
 from psotrack.inside_out.fusing.pairing import Pairing, paired
-from psotrack.synchronisation import Offset, find_offset
-from psotrack.trajectories import Status, Trajectories
+from psotrack.trajectories import GATE_M, UNASSIGNED, Status, Trajectories
 
 #: Within so much of where its middle is expected, or four times as far as is usual, a track may be of a drone.
 _LEAST_REACH_M, _FAR = 0.1, 4.0

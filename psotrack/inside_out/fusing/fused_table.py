@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from psotrack.delimited import write_rows
-from psotrack.files import refuse_to_overwrite
 from psotrack.inside_out.fusing.fused import Fused
+from psotrack.support import refuse_to_overwrite, write_rows
 from psotrack.trajectories import Status
 
 #: What `Fused.source` means.

@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float, Int
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
-from psotrack.evaluation.standard_errors import standard_error
+from psotrack.geometry import cross_matrices
 from psotrack.inside_out.camera_path import CameraPath
-from psotrack.rotations import cross_matrices
+from psotrack.support import standard_error
 from psotrack.trajectories import Status
 
 #: In units of the median distance from the median; beyond, a frame does not count for the arm.

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.evaluation.association import UNASSIGNED
-from psotrack.trajectories import Status, Trajectories
+from psotrack.trajectories import UNASSIGNED, Status, Trajectories
 
 #: Tracks without covariances are taken to be as good as this along each axis; the scale is found.
 _UNSTATED_M = 0.03

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.evaluation.association import GATE_M, UNASSIGNED
+from psotrack.trajectories import GATE_M, UNASSIGNED
 
 #: A frame without the track costs this share of a frame with the track elsewhere.
 _MISSING = 0.25

@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.errors import InputError, check_positive
-from psotrack.inside_out.mapping.bundle import Adjusted, adjust
-from psotrack.inside_out.mapping.scene import Scene
-from psotrack.inside_out.mapping.sightings import SQUARE, Sightings
+from psotrack.inside_out.mapping.bundle import AdjustedMap, adjust
+from psotrack.inside_out.mapping.scene import MappedScene
+from psotrack.inside_out.mapping.sightings import SQUARE, MarkerSightings
 from psotrack.inside_out.mapping.squares import best_square
 from psotrack.inside_out.mapping.start import Beginning, Placed, begin, placed_of, scene_of
 from psotrack.inside_out.marker_map import MarkerMap
@@ -82,7 +82,7 @@ def own_frame(side_m: float) -> Float[np.ndarray, "4 3"]:
 
 
 def build_map(
-    sightings: Sightings,
+    sightings: MarkerSightings,
     known: Mapping[int, Float[np.ndarray, "4 3"]],
     *,
     side_m: float | None = None,
@@ -117,7 +117,7 @@ def build_map(
     return _built(sightings, tied, adjusted, list(known))
 
 
-def _check_known(sightings: Sightings, known: list[int]) -> None:
+def _check_known(sightings: MarkerSightings, known: list[int]) -> None:
     seen = [marker for marker in known if marker in sightings.ids]
     views = set(sightings.view[np.isin(sightings.marker, seen)].tolist())
     beside = np.isin(sightings.view, list(views)) & ~np.isin(sightings.marker, seen)
@@ -131,13 +131,15 @@ def _check_known(sightings: Sightings, known: list[int]) -> None:
         )
 
 
-def _spread(sightings: Sightings) -> Bool[np.ndarray, " sightings"]:
+def _spread(sightings: MarkerSightings) -> Bool[np.ndarray, " sightings"]:
     count = min(_FIRST_VIEWS, sightings.num_views)
     views = np.linspace(0, sightings.num_views - 1, count).round().astype(int)
     return np.isin(sightings.view, views)
 
 
-def _tied(sightings: Sightings, placed: Mapping[int, Placed], side_m: float) -> tuple[Sightings, Scene]:
+def _tied(
+    sightings: MarkerSightings, placed: Mapping[int, Placed], side_m: float
+) -> tuple[MarkerSightings, MappedScene]:
     """The sightings of placed markers in views that show two at least: fewer tie nothing; and the scene of them."""
     kept = np.isin(sightings.marker, list(placed))
     counts = np.bincount(sightings.view[kept], minlength=sightings.num_views)
@@ -150,13 +152,13 @@ def _tied(sightings: Sightings, placed: Mapping[int, Placed], side_m: float) -> 
 
 
 def _settled(
-    sightings: Sightings, scene: Scene, fixed: list[int], side_m: float, estimate_sides: bool
-) -> tuple[Adjusted, Sightings]:
+    sightings: MarkerSightings, scene: MappedScene, fixed: list[int], side_m: float, estimate_sides: bool
+) -> tuple[AdjustedMap, MarkerSightings]:
     """The adjusted scene; a marker that most of its sightings disagree with is placed anew, or left out."""
     tried: set[int] = set()
     while True:
         present = np.isin(scene.ids, sightings.ids)
-        scene = Scene(
+        scene = MappedScene(
             scene.R_cam_world,
             scene.t_m,
             scene.ids[present],
@@ -186,7 +188,9 @@ def _settled(
         sightings, scene = _tied(sightings, sound, side_m)
 
 
-def _built(all_of_them: Sightings, used: Sightings, adjusted: Adjusted, known: list[int]) -> BuiltMap:
+def _built(
+    all_of_them: MarkerSightings, used: MarkerSightings, adjusted: AdjustedMap, known: list[int]
+) -> BuiltMap:
     scene = adjusted.scene
     ids = scene.ids.tolist()
     of_marker = [used.marker == marker for marker in ids]

@@ -21,8 +21,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import GATE, spread_px
-from psotrack.inside_out.mapping.scene import Scene, linearised, outward, residuals_px
-from psotrack.inside_out.mapping.sightings import Sightings
+from psotrack.inside_out.mapping.scene import MappedScene, linearised, outward, residuals_px
+from psotrack.inside_out.mapping.sightings import MarkerSightings
 
 #: Relative change of the cost that ends the search; of the robust one, which only finds the outliers.
 _SETTLED, _SETTLED_ROBUST = 1e-9, 1e-3
@@ -36,7 +36,7 @@ _FINEST_PX = 0.01
 
 
 @dataclass(frozen=True)
-class Adjusted:
+class AdjustedMap:
     """A scene that the images agree with.
 
     Attributes:
@@ -48,7 +48,7 @@ class Adjusted:
         noise_px: standard deviation of a corner along x and along y, as the residuals say.
     """
 
-    scene: Scene
+    scene: MappedScene
     residual_px: Float[np.ndarray, "sightings 4"]
     used: Bool[np.ndarray, " sightings"]
     covariance: Float[np.ndarray, "markers 7 7"]
@@ -57,7 +57,7 @@ class Adjusted:
 
 @dataclass(frozen=True)
 class _Problem:
-    sightings: Sightings
+    sightings: MarkerSightings
     #: (unknowns,), which of 7 unknowns per marker, and of one per video, are sought.
     free: Bool[np.ndarray, " unknowns"]
     noise_px: float
@@ -68,13 +68,13 @@ class _Problem:
 
 
 def adjust(
-    sightings: Sightings,
-    start: Scene,
+    sightings: MarkerSightings,
+    start: MappedScene,
     fixed: Ordered[int],
     *,
     noise_px: float = 0.3,
     estimate_sides: bool = False,
-) -> Adjusted:
+) -> AdjustedMap:
     """The scene that explains what is seen.
 
     The covariance is that of the noise that the residuals tell of: of noise that is new in every frame, and of errors
@@ -103,19 +103,24 @@ def adjust(
         residual_px = residuals_px(sightings, scene)
         if (used == before).all():
             break
-    return Adjusted(scene, residual_px, used, _covariance(problem, scene, used), sigma_px)
+    return AdjustedMap(scene, residual_px, used, _covariance(problem, scene, used), sigma_px)
 
 
 def improved(
-    sightings: Sightings, start: Scene, fixed: Ordered[int], *, noise_px: float, estimate_sides: bool = False
-) -> Scene:
+    sightings: MarkerSightings,
+    start: MappedScene,
+    fixed: Ordered[int],
+    *,
+    noise_px: float,
+    estimate_sides: bool = False,
+) -> MappedScene:
     """As `adjust`, with the robust loss alone: good enough to go on from."""
     problem = _problem(sightings, start, fixed, noise_px, estimate_sides)
     return _solved(problem, start, np.ones(len(sightings.view), bool), robust=True)
 
 
 def _problem(
-    sightings: Sightings, start: Scene, fixed: Ordered[int], noise_px: float, estimate_sides: bool
+    sightings: MarkerSightings, start: MappedScene, fixed: Ordered[int], noise_px: float, estimate_sides: bool
 ) -> _Problem:
     sought = np.tile(np.array([True] * 6 + [estimate_sides]), (len(start.ids), 1))
     sought[np.isin(start.ids, fixed)] = False
@@ -137,7 +142,7 @@ class _Normal:
     mixed: Float[np.ndarray, "views 6 free"]
 
 
-def _normal(problem: _Problem, scene: Scene, weights: Float[np.ndarray, " sightings"]) -> _Normal:
+def _normal(problem: _Problem, scene: MappedScene, weights: Float[np.ndarray, " sightings"]) -> _Normal:
     views, unknowns, free = problem.sightings.num_views, len(problem.free), problem.free
     kept = np.flatnonzero(weights)
     slopes = linearised(problem.sightings, scene)
@@ -171,7 +176,7 @@ def _reduced(
     return inverse, (reduced + reduced.T) / 2, normal.right - back.T @ normal.view_right.reshape(-1)
 
 
-def _moved(problem: _Problem, scene: Scene, normal: _Normal, damping: float) -> Scene:
+def _moved(problem: _Problem, scene: MappedScene, normal: _Normal, damping: float) -> MappedScene:
     inverse, reduced, right = _reduced(normal, damping)
     scale = np.sqrt(np.maximum(np.diag(reduced), 1e-300))
     # A ridge that changes nothing, but where there is nothing.
@@ -182,7 +187,7 @@ def _moved(problem: _Problem, scene: Scene, normal: _Normal, damping: float) -> 
     whole = np.zeros(len(problem.free))
     whole[problem.free] = step
     of_markers = whole[: 7 * len(scene.ids)].reshape(-1, 7)
-    return Scene(
+    return MappedScene(
         Rotation.from_rotvec(of_views[:, :3]).as_matrix() @ scene.R_cam_world,
         scene.t_m + of_views[:, 3:],
         scene.ids,
@@ -193,7 +198,9 @@ def _moved(problem: _Problem, scene: Scene, normal: _Normal, damping: float) -> 
     )
 
 
-def _solved(problem: _Problem, scene: Scene, used: Bool[np.ndarray, " sightings"], *, robust: bool) -> Scene:
+def _solved(
+    problem: _Problem, scene: MappedScene, used: Bool[np.ndarray, " sightings"], *, robust: bool
+) -> MappedScene:
     """Levenberg-Marquardt from a scene; damping grows where a step does not help."""
     damping, squares = 1e-4, _squares(problem, scene)
     # What is behind a camera at the start has no slope, and no say.
@@ -217,19 +224,21 @@ def _solved(problem: _Problem, scene: Scene, used: Bool[np.ndarray, " sightings"
     return scene
 
 
-def _squares(problem: _Problem, scene: Scene) -> Float[np.ndarray, " sightings"]:
+def _squares(problem: _Problem, scene: MappedScene) -> Float[np.ndarray, " sightings"]:
     """Squared distances over a marker's four corners, in units of the noise; 8 on average."""
     return ((residuals_px(problem.sightings, scene) / problem.noise_px) ** 2).sum(axis=-1)
 
 
-def _cost(problem: _Problem, squares: Float[np.ndarray, " sightings"], scene: Scene, robust: bool) -> float:
+def _cost(
+    problem: _Problem, squares: Float[np.ndarray, " sightings"], scene: MappedScene, robust: bool
+) -> float:
     # All four corners of a marker are wrong together, where it is another marker: they share their loss.
     loss = 8 * np.log1p(squares / 8) if robust else squares
     return float(loss.sum() + np.sum(problem.held * scene.inset_px**2))
 
 
 def _covariance(
-    problem: _Problem, scene: Scene, used: Bool[np.ndarray, " sightings"]
+    problem: _Problem, scene: MappedScene, used: Bool[np.ndarray, " sightings"]
 ) -> Float[np.ndarray, "markers 7 7"]:
     """Of noise that is new in every frame, of errors that a marker's corner has in all of them, and of the inset."""
     weights = used / problem.noise_px**2
@@ -254,14 +263,14 @@ def _covariance(
     return np.einsum("aiaj->aij", whole.reshape(count, 7, count, 7)).copy()
 
 
-def _axes(sightings: Sightings) -> Float[np.ndarray, "sightings 4 2 2"]:
+def _axes(sightings: MarkerSightings) -> Float[np.ndarray, "sightings 4 2 2"]:
     """Columns: outward from the middle of the marker, and across."""
     out = outward(sightings)
     out = out / np.linalg.norm(out, axis=-1, keepdims=True)
     return np.stack([out, np.stack([-out[..., 1], out[..., 0]], axis=-1)], axis=-1)
 
 
-def _alike_px(problem: _Problem, scene: Scene, used: Bool[np.ndarray, " sightings"]) -> float:
+def _alike_px(problem: _Problem, scene: MappedScene, used: Bool[np.ndarray, " sightings"]) -> float:
     """Standard deviation of what a corner is off in all frames, along each axis, from the means of residuals.
 
     Of the eight of a marker its own six unknowns hide six.
@@ -281,7 +290,7 @@ def _alike_px(problem: _Problem, scene: Scene, used: Bool[np.ndarray, " sighting
 
 def _alike_pulls(
     problem: _Problem,
-    scene: Scene,
+    scene: MappedScene,
     weights: Float[np.ndarray, " sightings"],
     inverse_of_views: Float[np.ndarray, "views 6 6"],
     mixed: Float[np.ndarray, "views 6 free"],

@@ -17,8 +17,8 @@ from psotrack.calibration import spread_px
 from psotrack.errors import InputError
 from psotrack.inside_out.mapping.bundle import adjust, improved
 from psotrack.inside_out.mapping.findings import CheckedMarker, MapFinding, findings_of
-from psotrack.inside_out.mapping.scene import Scene, residuals_px
-from psotrack.inside_out.mapping.sightings import Sightings
+from psotrack.inside_out.mapping.scene import MappedScene, residuals_px
+from psotrack.inside_out.mapping.sightings import MarkerSightings
 from psotrack.inside_out.mapping.squares import best_square
 from psotrack.inside_out.mapping.start import GROWTHS, Beginning, Placed, placed_of, scene_of
 from psotrack.inside_out.marker_map import MarkerMap
@@ -50,7 +50,7 @@ class Checkup:
     strangers: tuple[int, ...]
 
 
-def check_map(sightings: Sightings, marker_map: MarkerMap) -> Checkup:
+def check_map(sightings: MarkerSightings, marker_map: MarkerMap) -> Checkup:
     """What is wrong with a map.
 
     Raises:
@@ -99,7 +99,7 @@ def check_map(sightings: Sightings, marker_map: MarkerMap) -> Checkup:
     return Checkup(tuple(findings), checked, noise_px, sightings.num_views, strangers)
 
 
-def _located(sightings: Sightings, given: Mapping[int, Placed], side_m: float) -> Scene:
+def _located(sightings: MarkerSightings, given: Mapping[int, Placed], side_m: float) -> MappedScene:
     """Views that agree with as many markers as can be, all markers being where the map has them."""
     beginning = Beginning(sightings, side_m)
     scene = scene_of(
@@ -115,13 +115,17 @@ def _located(sightings: Sightings, given: Mapping[int, Placed], side_m: float) -
 
 
 def _by_marker(
-    sightings: Sightings, residual_px: Float[np.ndarray, "sightings 4"]
+    sightings: MarkerSightings, residual_px: Float[np.ndarray, "sightings 4"]
 ) -> dict[int, Float[np.ndarray, " corners"]]:
     return {marker: residual_px[sightings.marker == marker].ravel() for marker in sightings.ids}
 
 
 def _measured(
-    sightings: Sightings, sound: Mapping[int, Placed], suspects: list[int], located: Scene, side_m: float
+    sightings: MarkerSightings,
+    sound: Mapping[int, Placed],
+    suspects: list[int],
+    located: MappedScene,
+    side_m: float,
 ) -> tuple[dict[int, tuple[Placed, Float[np.ndarray, "7 7"]]], float]:
     """Where suspects are in the video, with covariances, the sound markers being where the map has them; and the noise.
 

@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.calibration import reproject
-from psotrack.cameras import NEAR_M
-from psotrack.inside_out.mapping.sightings import SQUARE, Sightings
+from psotrack.geometry import NEAR_M
+from psotrack.inside_out.mapping.sightings import SQUARE, MarkerSightings
 
 
 @dataclass(frozen=True)
-class Scene:
+class MappedScene:
     """Where views and markers are.
 
     Attributes:
@@ -34,7 +34,7 @@ class Scene:
     side_m: Float[np.ndarray, " markers"]
     inset_px: Float[np.ndarray, " videos"]
 
-    def rows(self, sightings: Sightings) -> Int[np.ndarray, " sightings"]:
+    def rows(self, sightings: MarkerSightings) -> Int[np.ndarray, " sightings"]:
         """(sightings,), index of each sighting's marker."""
         return np.searchsorted(self.ids, sightings.marker)
 
@@ -49,12 +49,12 @@ class Scene:
         return (self.side_m[:, None, None] * SQUARE) @ self.R_world_marker.swapaxes(-1, -2)
 
 
-def residuals_px(sightings: Sightings, scene: Scene) -> Float[np.ndarray, "sightings 4"]:
+def residuals_px(sightings: MarkerSightings, scene: MappedScene) -> Float[np.ndarray, "sightings 4"]:
     """Distances in the image, the inset taken out; infinite behind the camera."""
     return np.linalg.norm(linearised(sightings, scene).off, axis=-1)
 
 
-def outward(sightings: Sightings) -> Float[np.ndarray, "sightings 4 2"]:
+def outward(sightings: MarkerSightings) -> Float[np.ndarray, "sightings 4 2"]:
     """How the corners move in the image when each side of the square moves outwards by 1 px: along the bisectors."""
     ahead = _unit(np.roll(sightings.corners_px, -1, axis=1) - sightings.corners_px)
     behind = np.roll(-ahead, 1, axis=1)
@@ -83,7 +83,7 @@ class Linearised:
     by_rest: Float[np.ndarray, "sightings 4 2 8"]
 
 
-def linearised(sightings: Sightings, scene: Scene) -> Linearised:
+def linearised(sightings: MarkerSightings, scene: MappedScene) -> Linearised:
     """The sightings of a scene that has all their markers and views."""
     row, view = scene.rows(sightings), sightings.view
     video = sightings.lens[view]

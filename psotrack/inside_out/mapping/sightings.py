@@ -10,18 +10,18 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.cameras import Camera, undistort
 from psotrack.errors import InputError
+from psotrack.geometry import Camera, undistort
 from psotrack.inside_out.detection import MarkerDetector
-from psotrack.progress import Report, silent
-from psotrack.video import VideoInfo, read_frames
+from psotrack.recordings import VideoInfo, read_frames
+from psotrack.support import Report, silent
 
 #: A marker's corners in its own axes, for a side of 1: x to its right, y up, z out of the print. OpenCV's order.
 SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 
 
 @dataclass(frozen=True)
-class Seen:
+class MarkersInView:
     """Markers in one frame.
 
     Attributes:
@@ -38,7 +38,7 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Sightings:
+class MarkerSightings:
     """Markers in the frames of one or several videos; a view is a frame that shows one at least.
 
     Attributes:
@@ -69,10 +69,10 @@ class Sightings:
         """The markers that are seen, increasing."""
         return np.unique(self.marker).tolist()
 
-    def select(self, kept: Bool[np.ndarray, " sightings"]) -> Sightings:
+    def select(self, kept: Bool[np.ndarray, " sightings"]) -> MarkerSightings:
         """Some of the sightings, with the views that still have some."""
         views, view = np.unique(self.view[kept], return_inverse=True)
-        return Sightings(
+        return MarkerSightings(
             self.lenses,
             self.lens[views],
             self.time_s[views],
@@ -89,7 +89,7 @@ def find_sightings(
     *,
     most_frames: int = 300,
     report: Report = silent,
-) -> Sightings:
+) -> MarkerSightings:
     """The markers in videos of one room, each with its camera's lens.
 
     Args:
@@ -119,13 +119,15 @@ def find_sightings(
             for index, frame in enumerate(read_frames(video, step)):
                 gray = np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), np.uint8)
                 found = detectors[source].detect(gray)
-                seen.append(Seen(source, index * step / video.fps, found.ids, found.corners_px))
+                seen.append(MarkersInView(source, index * step / video.fps, found.ids, found.corners_px))
                 advance(1)
     name = ", ".join(str(video.path) for video, _ in videos)
     return sightings_of(seen, [lens for _, lens in videos], name)
 
 
-def sightings_of(seen: Iterable[Seen], lenses: Ordered[Camera], name: str = "video") -> Sightings:
+def sightings_of(
+    seen: Iterable[MarkersInView], lenses: Ordered[Camera], name: str = "video"
+) -> MarkerSightings:
     """The sightings in frames. A marker that is in a frame twice is left out of it: one of the two is another one.
 
     Raises:
@@ -151,7 +153,7 @@ def sightings_of(seen: Iterable[Seen], lenses: Ordered[Camera], name: str = "vid
             found="none in any frame",
             remedy="is --dictionary the one that was printed?",
         )
-    return Sightings(
+    return MarkerSightings(
         tuple(lenses),
         np.array([source for source, _ in views]),
         np.array([time_s for _, time_s in views]),
@@ -163,7 +165,7 @@ def sightings_of(seen: Iterable[Seen], lenses: Ordered[Camera], name: str = "vid
 
 
 def two_poses(
-    sightings: Sightings, side_m: float
+    sightings: MarkerSightings, side_m: float
 ) -> tuple[Float[np.ndarray, "sightings 2 3 3"], Float[np.ndarray, "sightings 2 3"]]:
     """The two poses of a square that look almost alike, marker to camera, better one first (IPPE; Collins & Bartoli
     2014); NaN where there is none.

@@ -17,7 +17,7 @@ from psotrack.datasets.dpjait import MarkerRow, read_marker_rows, split_label
 from psotrack.errors import InputError
 from psotrack.inside_out.mapping.sightings import SQUARE
 from psotrack.inside_out.marker_map import SQUARE_TOLERANCE, MarkerMap, normals, sides_m
-from psotrack.mocap import read_c3d
+from psotrack.recordings import read_c3d
 
 #: Of the side: a viewer that is nearer to a marker's plane is on neither side of it.
 _ON_A_SIDE = 0.5

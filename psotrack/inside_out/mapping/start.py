@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.cameras import NEAR_M, undistort
+from psotrack.geometry import NEAR_M, undistort
 from psotrack.inside_out.mapping.bundle import improved
-from psotrack.inside_out.mapping.scene import Scene
-from psotrack.inside_out.mapping.sightings import SQUARE, Sightings, two_poses
+from psotrack.inside_out.mapping.scene import MappedScene
+from psotrack.inside_out.mapping.sightings import SQUARE, MarkerSightings, two_poses
 
-#: Views that a marker's poses are taken from, and tried in.
+#: MarkerViews that a marker's poses are taken from, and tried in.
 _TRIED = 24
 #: Standard deviation of a corner of markers that are placed but not adjusted.
 _ROUGH_PX = 3.0
@@ -37,7 +37,7 @@ class Placed:
 
 
 @dataclass(frozen=True)
-class Views:
+class MarkerViews:
     """Where the cameras of views may be, world to camera: two poses each, twice the same where one is sure.
 
     Attributes:
@@ -54,7 +54,7 @@ class Views:
 class Beginning:
     """What is worked out once of sightings, to place markers from them."""
 
-    def __init__(self, sightings: Sightings, side_m: float) -> None:
+    def __init__(self, sightings: MarkerSightings, side_m: float) -> None:
         self.sightings = sightings
         self.side_m = side_m
         self.R, self.t_m = two_poses(sightings, side_m)
@@ -65,7 +65,7 @@ class Beginning:
             self.rays[lens == index] = undistort(one, sightings.corners_px[lens == index])
         self._start = np.searchsorted(sightings.view, np.arange(sightings.num_views + 1))
 
-    def located(self, placed: Mapping[int, Placed], before: Scene | None = None) -> Views:
+    def located(self, placed: Mapping[int, Placed], before: MappedScene | None = None) -> MarkerViews:
         """The views' poses from the markers that are placed; those of a scene before are tried too."""
         num_views = self.sightings.num_views
         R, t_m = np.full((num_views, 2, 3, 3), np.nan), np.full((num_views, 2, 3), np.nan)
@@ -95,10 +95,10 @@ class Beginning:
             else:
                 chosen = [int(off.argmin())] * 2
             R[view], t_m[view] = tried_R[chosen], tried_t[chosen]
-        return Views(R, t_m, count)
+        return MarkerViews(R, t_m, count)
 
     def place(
-        self, marker: int, views: Views, growths: Float[np.ndarray, " growths"] = _KNOWN_SIDE
+        self, marker: int, views: MarkerViews, growths: Float[np.ndarray, " growths"] = _KNOWN_SIDE
     ) -> tuple[Placed, float] | None:
         """Where a marker is in the world, of all that frames say the one that fits most of them; and its mean loss.
 
@@ -158,7 +158,7 @@ class Beginning:
 
 
 def begin(
-    sightings: Sightings,
+    sightings: MarkerSightings,
     known: Mapping[int, Placed],
     side_m: float,
     *,
@@ -198,18 +198,18 @@ def begin(
 
 
 def improved_part(
-    sightings: Sightings,
-    scene: Scene,
+    sightings: MarkerSightings,
+    scene: MappedScene,
     kept: Bool[np.ndarray, " sightings"],
     fixed: Collection[int],
     noise_px: float,
     estimate_sides: bool,
-) -> Scene:
+) -> MappedScene:
     """A scene adjusted to some of the sightings; the views without any are NaN."""
     part, views = sightings.select(kept), np.unique(sightings.view[kept])
     seen = set(part.ids)
     chosen = np.array([marker in seen for marker in scene.ids.tolist()])
-    start = Scene(
+    start = MappedScene(
         scene.R_cam_world[views],
         scene.t_m[views],
         scene.ids[chosen],
@@ -223,13 +223,15 @@ def improved_part(
     R[views], t_m[views] = better.R_cam_world, better.t_m
     axes, centres, sides = scene.R_world_marker.copy(), scene.centre_m.copy(), scene.side_m.copy()
     axes[chosen], centres[chosen], sides[chosen] = better.R_world_marker, better.centre_m, better.side_m
-    return Scene(R, t_m, scene.ids, axes, centres, sides, better.inset_px)
+    return MappedScene(R, t_m, scene.ids, axes, centres, sides, better.inset_px)
 
 
-def scene_of(placed: Mapping[int, Placed], views: Views, inset_px: Float[np.ndarray, " videos"]) -> Scene:
+def scene_of(
+    placed: Mapping[int, Placed], views: MarkerViews, inset_px: Float[np.ndarray, " videos"]
+) -> MappedScene:
     """Markers that are placed, and the likelier pose of each view."""
     ids = sorted(placed)
-    return Scene(
+    return MappedScene(
         views.R[:, 0],
         views.t_m[:, 0],
         np.array(ids),
@@ -240,13 +242,13 @@ def scene_of(placed: Mapping[int, Placed], views: Views, inset_px: Float[np.ndar
     )
 
 
-def placed_of(scene: Scene) -> dict[int, Placed]:
+def placed_of(scene: MappedScene) -> dict[int, Placed]:
     """The markers of a scene."""
     rows = zip(scene.ids.tolist(), scene.R_world_marker, scene.centre_m, scene.side_m.tolist(), strict=True)
     return {marker: Placed(axes, centre, side) for marker, axes, centre, side in rows}
 
 
-def _next(sightings: Sightings, views: Views, done: set[int]) -> int | None:
+def _next(sightings: MarkerSightings, views: MarkerViews, done: set[int]) -> int | None:
     """The marker that most frames show beside placed ones."""
     sure = np.minimum(views.count, 3)[sightings.view]
     weight = {

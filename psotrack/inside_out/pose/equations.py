@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from psotrack.calibration import reproject
-from psotrack.cameras import NEAR_M, Camera
+from psotrack.geometry import NEAR_M, Camera
 
 #: Standard deviation of the inset, px.
 INSET_STD_PX = 0.5
@@ -34,7 +34,7 @@ _FREE = 1e12
 
 
 @dataclass(frozen=True)
-class Seen:
+class SeenCorners:
     """One frame's markers, and the lens that saw them.
 
     Attributes:
@@ -127,7 +127,7 @@ class Sums:
         step = covariance @ toward
         return Solution(step, (covariance + covariance.T) / 2, float(step @ toward), places_m2)
 
-    def noise(self, solution: Solution, noise: Noise, seen: Seen) -> Noise:
+    def noise(self, solution: Solution, noise: Noise, seen: SeenCorners) -> Noise:
         """The variances from what a step leaves."""
         left = np.append(-solution.step, 1.0)
         gain = solution.places_m2 @ self.by_place / noise.own_px2
@@ -180,16 +180,18 @@ def seen_markers(
     place_m: float,
     map_error_m: float = 0.0,
     focal_error: float = 0.0,
-) -> Seen:
+) -> SeenCorners:
     """One frame's markers, ready to be fitted; a marker is off its place by the map, and in this frame."""
     to_next = _unit(corners_px[:, [1, 2, 3, 0]] - corners_px)
     inward = _unit(to_next - to_next[:, [3, 0, 1, 2]])
     off_m = float(np.hypot(place_m, map_error_m))
-    return Seen(corners_px, corners_m, inward, lens, noise_px, off_m, (map_error_m / off_m) ** 2, focal_error)
+    return SeenCorners(
+        corners_px, corners_m, inward, lens, noise_px, off_m, (map_error_m / off_m) ** 2, focal_error
+    )
 
 
 def equations(
-    seen: Seen,
+    seen: SeenCorners,
     position_m: Float[np.ndarray, "3"],
     R_world_cam: Float[np.ndarray, "3 3"],
     extra: Float[np.ndarray, "2"],

@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from psotrack.calibration import spread_px
-from psotrack.cameras import NEAR_M
+from psotrack.geometry import NEAR_M
 from psotrack.inside_out.pose.equations import (
     PRIOR_RESIDUALS,
     Noise,
-    Seen,
+    SeenCorners,
     Solution,
     Sums,
     add_known,
@@ -81,7 +81,7 @@ class Fit:
 
 
 def fit(
-    seen: Seen,
+    seen: SeenCorners,
     position_m: Float[np.ndarray, "3"],
     R_world_cam: Float[np.ndarray, "3 3"],
     fits: Bool[np.ndarray, "markers 4"] | None = None,
@@ -144,7 +144,7 @@ class _Pose:
 
 
 def _fitted(
-    seen: Seen,
+    seen: SeenCorners,
     pose: _Pose,
     fits: Bool[np.ndarray, "markers 4"],
     off_px: Float[np.ndarray, "markers 4 2"],
@@ -171,7 +171,7 @@ def _fitted(
     )
 
 
-def _robust(seen: Seen, pose: _Pose) -> tuple[_Pose, Bool[np.ndarray, "markers 4"]]:
+def _robust(seen: SeenCorners, pose: _Pose) -> tuple[_Pose, Bool[np.ndarray, "markers 4"]]:
     """Steps with the weights of a Cauchy loss, whose scale is the residuals' median, and what is within them then."""
     for _ in range(_MOST_STEPS):
         rows, depth_m = equations(seen, pose.position_m, pose.R_world_cam, pose.extra)

@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from psotrack.cameras import NEAR_M, Camera, undistort
 from psotrack.errors import InputError, SettingsError, check_positive
-from psotrack.inside_out.pose.equations import Seen, seen_markers
+from psotrack.geometry import NEAR_M, Camera, undistort
+from psotrack.inside_out.pose.equations import SeenCorners, seen_markers
 from psotrack.inside_out.pose.fit import MIN_CORNERS, Fit, fit
 
 _Start = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]
@@ -175,7 +175,7 @@ def locate(
     )
 
 
-def _chance(seen: Seen, best: Fit) -> float:
+def _chance(seen: SeenCorners, best: Fit) -> float:
     """How many sets of so many markers would agree by chance, at most: each but one falls near where it should be.
 
     Their sizes and how they are turned would have to agree as well; that is left out.
@@ -186,7 +186,7 @@ def _chance(seen: Seen, best: Fit) -> float:
     return min(float(count * comb(count - 1, others) * min(pi * near_px**2 / area_px2, 1.0) ** others), 1.0)
 
 
-def _poses(seen: Seen, rays: Float[np.ndarray, "markers 4 2"]) -> list[Fit]:
+def _poses(seen: SeenCorners, rays: Float[np.ndarray, "markers 4 2"]) -> list[Fit]:
     """Poses that explain the markers, or some of them, the most likely first, no two alike."""
     found = _distinct(fit(seen, *start) for start in _solved(seen.corners_m, rays, cv2.SOLVEPNP_SQPNP))
     # All that there are, or three that agree and are more than the others: no other pose explains as many as well.
@@ -197,7 +197,7 @@ def _poses(seen: Seen, rays: Float[np.ndarray, "markers 4 2"]) -> list[Fit]:
     return _distinct([*found, *(twin for one in found for twin in _twins(seen, rays, one))])
 
 
-def _few(seen: Seen, rays: Float[np.ndarray, "markers 4 2"]) -> Iterator[_Start]:
+def _few(seen: SeenCorners, rays: Float[np.ndarray, "markers 4 2"]) -> Iterator[_Start]:
     """Poses of pairs of markers, from opposite corners of both, and of single ones where there are few."""
     count = len(rays)
     pairs = list(combinations(range(count), 2))
@@ -230,7 +230,7 @@ def _solved(
 
 
 def _ranked(
-    seen: Seen, rays: Float[np.ndarray, "markers 4 2"], starts: Iterable[_Start]
+    seen: SeenCorners, rays: Float[np.ndarray, "markers 4 2"], starts: Iterable[_Start]
 ) -> list[tuple[_Start, Bool[np.ndarray, "markers 4"]]]:
     """The starts that explain most, with the corners that they do, no two with the same markers."""
     starts = list(starts)
@@ -250,7 +250,7 @@ def _ranked(
 
 
 def _distance_px(
-    seen: Seen, rays: Float[np.ndarray, "markers 4 2"], starts: list[_Start]
+    seen: SeenCorners, rays: Float[np.ndarray, "markers 4 2"], starts: list[_Start]
 ) -> Float[np.ndarray, "starts markers 4"]:
     """How far each start is off at each corner, as if the lens did not bend; infinite behind the camera."""
     position_m, R = (np.array(part) for part in zip(*starts, strict=True))
@@ -261,7 +261,7 @@ def _distance_px(
     return np.where(ahead, np.linalg.norm(off_px, axis=-1), np.inf).reshape(len(starts), *rays.shape[:2])
 
 
-def _twins(seen: Seen, rays: Float[np.ndarray, "markers 4 2"], best: Fit) -> list[Fit | None]:
+def _twins(seen: SeenCorners, rays: Float[np.ndarray, "markers 4 2"], best: Fit) -> list[Fit | None]:
     """Poses that are turned over, where the markers of the best one are nearly in a plane."""
     corners_m = seen.corners_m[best.used]
     middle_m = corners_m.mean(axis=(0, 1))

@@ -6,7 +6,7 @@ import numpy as np
 
 from psotrack.simulation.scenarios import (
     FlightRecord,
-    Following,
+    FollowingFlight,
     Formation,
     NearPass,
     Scenario,
@@ -21,7 +21,7 @@ _PERPENDICULAR = 1e-6
 
 def followed(record: FlightRecord) -> tuple[str, int] | None:
     """The field and the number of the drone that a flight is relative to."""
-    if isinstance(record, Formation | Following):
+    if isinstance(record, Formation | FollowingFlight):
         return "leader", record.leader
     if isinstance(record, NearPass):
         return "other", record.other

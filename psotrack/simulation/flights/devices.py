@@ -17,7 +17,7 @@ from types import TracebackType
 from typing import Any, Protocol, runtime_checkable
 
 from psotrack.errors import SettingsError
-from psotrack.simulation.flights.dynamics import Space, State, Sticks
+from psotrack.simulation.flights.dynamics import FlightState, Space, Sticks
 from psotrack.simulation.flights.panel import PygletPanel, pyglet_module
 from psotrack.simulation.flights.piloting import Sample, read_sticks
 
@@ -57,7 +57,7 @@ class Device(ABC):
         """Samples of the sticks, times increasing from 0, until the flight is over."""
 
     @abstractmethod
-    def watch(self, time_s: float, state: State) -> None:
+    def watch(self, time_s: float, state: FlightState) -> None:
         """Show the pilot where the drone is."""
 
     @abstractmethod
@@ -103,7 +103,7 @@ class ScriptedDevice(Device):
         """All of them at once: nobody waits."""
         return iter(self.script)
 
-    def watch(self, time_s: float, state: State) -> None:
+    def watch(self, time_s: float, state: FlightState) -> None:
         """Nobody looks."""
 
     def close(self) -> None:
@@ -124,7 +124,7 @@ class Panel(Protocol):
     def pump(self) -> None:
         """Let events arrive: keys, sticks, the window's closing."""
 
-    def draw(self, time_s: float, state: State) -> None:
+    def draw(self, time_s: float, state: FlightState) -> None:
         """Show where the drone is."""
 
     def close(self) -> None:
@@ -177,7 +177,7 @@ class LiveDevice(Device):
             polls = max(polls + 1, int((self._clock() - begin_s) / _POLL_S))
             self._sleep(max(0.001, polls * _POLL_S - (self._clock() - begin_s)))
 
-    def watch(self, time_s: float, state: State) -> None:
+    def watch(self, time_s: float, state: FlightState) -> None:
         """Show the pilot where the drone is."""
         self._panel.draw(time_s, state)
 

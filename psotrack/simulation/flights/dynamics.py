@@ -101,7 +101,7 @@ def space_in(hall: str) -> Space:
 
 
 @dataclass(frozen=True)
-class State:
+class FlightState:
     """A drone in flight.
 
     Attributes:
@@ -117,12 +117,12 @@ class State:
     turn_rad_s: float = 0.0
 
     @classmethod
-    def hovering(cls, position_m: Vector) -> State:
+    def hovering(cls, position_m: Vector) -> FlightState:
         """At rest, looking along x."""
         return cls(position_m, np.zeros(3), np.zeros(3))
 
 
-def step(state: State, sticks: Sticks, dynamics: Dynamics, space: Space, step_s: float) -> State:
+def step(state: FlightState, sticks: Sticks, dynamics: Dynamics, space: Space, step_s: float) -> FlightState:
     """The state one step later, the sticks as they are."""
     x_m, v_m_s = state.position_m, state.velocity_m_s
     wished_m_s = _wished_velocity(sticks, state.yaw_rad, dynamics)
@@ -142,7 +142,7 @@ def step(state: State, sticks: Sticks, dynamics: Dynamics, space: Space, step_s:
     x_m = x_m + step_s * v_m_s
     stopped_m = np.clip(x_m, space.lower_m, space.upper_m)
     v_m_s = np.where(stopped_m == x_m, v_m_s, 0.0)
-    return State(stopped_m, v_m_s, push, state.yaw_rad + step_s * turn, turn)
+    return FlightState(stopped_m, v_m_s, push, state.yaw_rad + step_s * turn, turn)
 
 
 def _wished_velocity(sticks: Sticks, yaw_rad: float, dynamics: Dynamics) -> Vector:

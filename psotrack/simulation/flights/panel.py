@@ -11,7 +11,7 @@ from types import ModuleType
 import numpy as np
 
 from psotrack.errors import SettingsError
-from psotrack.simulation.flights.dynamics import Space, State
+from psotrack.simulation.flights.dynamics import FlightState, Space
 
 _PLAN_PX = 520
 _MARGIN_PX = 30
@@ -104,7 +104,7 @@ class PygletPanel:
         self._window.switch_to()
         self._window.dispatch_events()
 
-    def draw(self, time_s: float, state: State) -> None:
+    def draw(self, time_s: float, state: FlightState) -> None:
         """Show where the drone is."""
         x, y, z = state.position_m
         speed = float(np.linalg.norm(state.velocity_m_s))
@@ -120,7 +120,7 @@ class PygletPanel:
         self._draw_plan(state)
         self._window.flip()
 
-    def _draw_plan(self, state: State) -> None:
+    def _draw_plan(self, state: FlightState) -> None:
         shapes = self._pyglet["shapes"]
         corner = np.array([_MARGIN_PX, 2 * _MARGIN_PX + self._text_px], float)
         shapes.Box(*corner, *self._plan_px, thickness=2, color=_GREY).draw()

@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from psotrack.delimited import Column, Row, read_table, write_rows
 from psotrack.errors import SettingsError, check_positive
-from psotrack.simulation.flights.dynamics import DYNAMICS, Dynamics, Space, State, Sticks, Vector, step
+from psotrack.simulation.flights.dynamics import DYNAMICS, Dynamics, FlightState, Space, Sticks, Vector, step
 from psotrack.simulation.flights.motion import GRAVITY_M_S2, attitude
 from psotrack.simulation.flights.recordings import Recorded
+from psotrack.support import Column, TextRow, read_table, write_rows
 
 #: Steps per second, at least: several in each time constant of the dynamics.
 _MIN_STEPS_HZ = 250.0
@@ -49,7 +49,7 @@ def fly(
     *,
     dynamics: Dynamics = DYNAMICS,
     rate_hz: float = 25.0,
-    watch: Callable[[float, State], None] = lambda time_s, state: None,
+    watch: Callable[[float, FlightState], None] = lambda time_s, state: None,
 ) -> Flown:
     """Fly as the sticks say, from hovering, until the last sample's time.
 
@@ -68,8 +68,8 @@ def fly(
     check(start_m, space, rate_hz)
     per_record = int(np.ceil(_MIN_STEPS_HZ / rate_hz))
     step_s = 1 / (rate_hz * per_record)
-    state, sticks, done = State.hovering(start_m), Sticks(), 0
-    records: list[State] = [state]
+    state, sticks, done = FlightState.hovering(start_m), Sticks(), 0
+    records: list[FlightState] = [state]
     used: list[Sample] = []
     for sample in samples:
         if used and sample.time_s <= used[-1].time_s:
@@ -109,7 +109,7 @@ def until(samples: Iterable[Sample], end_s: float) -> Iterator[Sample]:
         yield sample
 
 
-def _recorded(states: list[State], rate_hz: float) -> Recorded:
+def _recorded(states: list[FlightState], rate_hz: float) -> Recorded:
     thrust = np.array([state.push_m_s2 for state in states]) + np.array([0.0, 0.0, GRAVITY_M_S2])
     rotation = attitude(thrust, np.array([state.yaw_rad for state in states]))
     return Recorded(
@@ -150,7 +150,7 @@ def write_sticks(path: Path, samples: Iterable[Sample]) -> None:
     write_rows(path, [_HEADER, *((sample.time_s, *sample.sticks) for sample in samples)], ",")
 
 
-def _stick(row: Row, column: Column) -> float:
+def _stick(row: TextRow, column: Column) -> float:
     value = row.number(column)
     if abs(value) > 1:
         raise row.wrong(column, "a number from -1 to 1", row.text(column))

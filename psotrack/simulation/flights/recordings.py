@@ -13,11 +13,11 @@ from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from psotrack.datasets.dpjait import read_poses
-from psotrack.delimited import Column, Row, Table, read_rows, read_table, write_rows
 from psotrack.errors import InputError, SettingsError
 from psotrack.simulation.flights.motion import Flight, Heading
 from psotrack.simulation.flights.resampling import MIN_SAMPLES, spline
 from psotrack.simulation.scenarios import Recording
+from psotrack.support import Column, Table, TextRow, read_rows, read_table, write_rows
 
 #: More than half an exposure, which reaches beyond the first and the last frame.
 _BEYOND_S = 0.1
@@ -161,7 +161,7 @@ def _check_one_drone(table: Table) -> None:
             raise row.wrong(column, f"one drone, {name} as above", row.text(column), "keep the rows of one")
 
 
-def _unit(row: Row, columns: list[Column]) -> Float[np.ndarray, "4"]:
+def _unit(row: TextRow, columns: list[Column]) -> Float[np.ndarray, "4"]:
     quaternion = np.array([row.number(column) for column in columns])
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > _NORM_TOLERANCE:

@@ -25,7 +25,7 @@ from psotrack.simulation.scenarios import (
     Crossing,
     Drone,
     FlightRecord,
-    Following,
+    FollowingFlight,
     Formation,
     Harmonic,
     Harmonics,
@@ -94,7 +94,7 @@ def _draw(drones: Ordered[Drone], uniform: Callable[..., Float[np.ndarray, "*sha
 
 
 def _num_harmonics(record: FlightRecord) -> int:
-    if isinstance(record, Recording | Following):
+    if isinstance(record, Recording | FollowingFlight):
         return 0
     # The period of waypoints is varied like that of a harmonic.
     return 1 if isinstance(record, Waypoints) else len(_as_harmonics(record).terms)
@@ -117,7 +117,7 @@ def make(scenario: Scenario, drawn: Draws, recorded: Mapping[int, Flight]) -> tu
         match drone.flight:
             case Recording():
                 made[index] = recorded[index]
-            case Following(leader=leader, delay_s=delay_s):
+            case FollowingFlight(leader=leader, delay_s=delay_s):
                 made[index] = DelayedFlight(made[leader - 1], delay_s, heading)
             case Formation(leader=other) | NearPass(other=other) as record:
                 # A stated offset or distance is not varied.

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.simulation.imaging.raster import Pinhole, View, draw, empty_buffers, full_view
+from psotrack.simulation.imaging.raster import Pinhole, RasterView, draw, empty_buffers, full_view
 from psotrack.simulation.scenarios import Imaging
 from psotrack.simulation.world.rooms import Room, Surface
 
@@ -60,7 +60,7 @@ def light_of(
 
 
 def numbers_and_depth(
-    surfaces: Ordered[Surface], view: View
+    surfaces: Ordered[Surface], view: RasterView
 ) -> tuple[Int[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"]]:
     """Which surface is seen, -1 where none is, and its depth in metres along the optical axis."""
     corners = np.stack([surface.corners_m for surface in surfaces])

@@ -22,7 +22,7 @@ from psotrack.simulation.imaging import sensor
 from psotrack.simulation.imaging.backdrop import lens_blur
 from psotrack.simulation.imaging.painter import LIGHT_UNIT, RoomPainter, may_be_seen
 from psotrack.simulation.imaging.posing import PosedDrone, margin_px, pose, sample, windows
-from psotrack.simulation.imaging.raster import Pinhole, View, full_view
+from psotrack.simulation.imaging.raster import Pinhole, RasterView, full_view
 from psotrack.simulation.imaging.shadows import FloorLight
 from psotrack.simulation.scenarios import OnboardCamera
 from psotrack.simulation.scene import Scene, image_size_wh
@@ -114,7 +114,7 @@ class OnboardRenderer:
         return float(self.K[0, 0] * (turned_rad + moved_m / _NEAR_SCENERY_M))
 
     def _draw_drones(
-        self, light: UInt16[np.ndarray, "height width 4"], view: View, posed: list[PosedDrone]
+        self, light: UInt16[np.ndarray, "height width 4"], view: RasterView, posed: list[PosedDrone]
     ) -> None:
         # One beside the camera reaches behind it and has no window, but is not seen.
         visible = [drone for drone in posed if _may_be_seen(drone, view)]
@@ -198,7 +198,7 @@ def _poses(
     return flight.position_m(time_s) + rotation @ np.array(record.position_m), rotation @ to_body
 
 
-def _may_be_seen(posed: PosedDrone, view: View) -> bool:
+def _may_be_seen(posed: PosedDrone, view: RasterView) -> bool:
     points = np.concatenate([posed.faces_m, posed.discs_m], axis=1).reshape(-1, 3)
     return bool(may_be_seen((points @ view.cam.R.T + view.cam.t_m)[None], view.K, view.shape)[0])
 

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int, UInt16
 
 from psotrack.simulation.imaging.backdrop import numbers_and_depth, texel_to_camera
 from psotrack.simulation.imaging.order import Order
-from psotrack.simulation.imaging.raster import View, empty_buffers
+from psotrack.simulation.imaging.raster import RasterView, empty_buffers
 from psotrack.simulation.world.rooms import Surface
 
 #: Light 1 as a number; lamps are three times as bright.
@@ -67,7 +67,7 @@ class RoomPainter:
         self._texel_m = [_texel_m(surface) for surface in surfaces]
         self._buffer = np.empty(0, np.uint16)
 
-    def paint(self, view: View, image: Light) -> None:
+    def paint(self, view: RasterView, image: Light) -> None:
         """Paint what a view sees, one sample per pixel.
 
         Args:
@@ -86,7 +86,7 @@ class RoomPainter:
                 self._paint_piece(image, view, index, corners[index], normal / height_m[index])
 
     def hiding_depth_m(
-        self, view: View, faces_m: Float[np.ndarray, "faces 3 3"]
+        self, view: RasterView, faces_m: Float[np.ndarray, "faces 3 3"]
     ) -> Float[np.ndarray, "rows columns"]:
         """(rows, columns), depth of what may hide some faces, along the optical axis; very far where nothing does."""
         points = faces_m.reshape(-1, 3)
@@ -102,7 +102,7 @@ class RoomPainter:
     def _paint_piece(
         self,
         image: Light,
-        view: View,
+        view: RasterView,
         index: int,
         corners: Float[np.ndarray, "corners 3"],
         normal_per_height: Float[np.ndarray, "3"],

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.simulation.imaging.raster import View, draw, empty_buffers, enclosing
+from psotrack.simulation.imaging.raster import RasterView, draw, empty_buffers, enclosing
 from psotrack.simulation.scenarios import Imaging
 from psotrack.simulation.scene import Scene
 from psotrack.simulation.world.drones import disc_fans
@@ -107,9 +107,11 @@ def margin_px(blur_px: float) -> int:
     return 2 + int(np.ceil(4 * blur_px))
 
 
-def windows(whole: View, posed: list[PosedDrone], margin_px: int) -> list[tuple[View, list[PosedDrone]]]:
+def windows(
+    whole: RasterView, posed: list[PosedDrone], margin_px: int
+) -> list[tuple[RasterView, list[PosedDrone]]]:
     """Parts of a window that hold drones, those that overlap made one, with the drones in each."""
-    found: list[tuple[View, list[PosedDrone]]] = []
+    found: list[tuple[RasterView, list[PosedDrone]]] = []
     for drone in posed:
         # What moves evenly is widest at the exposure's ends.
         ends = [points[[0, -1]].reshape(-1, 3) for points in (drone.faces_m, drone.discs_m)]
@@ -126,7 +128,7 @@ def windows(whole: View, posed: list[PosedDrone], margin_px: int) -> list[tuple[
 
 
 def average(
-    window: View,
+    window: RasterView,
     posed: list[PosedDrone],
     samples: Float[np.ndarray, "passes 3"],
     behind_m: Float[np.ndarray, "rows columns"],
@@ -146,7 +148,7 @@ def average(
 
 
 def sample(
-    view: View, posed: list[PosedDrone], index: int, behind_m: Float[np.ndarray, "rows columns"]
+    view: RasterView, posed: list[PosedDrone], index: int, behind_m: Float[np.ndarray, "rows columns"]
 ) -> Float[np.ndarray, "rows columns 4"]:
     """(rows, columns, 4): light of drones at one time of their exposure, and how much of the rest is seen."""
     light, depth = np.full((*view.shape, 3), -1.0, np.float32), behind_m.copy()

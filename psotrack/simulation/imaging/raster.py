@@ -1,8 +1,8 @@
 """Triangles to pixels: OpenCV's z-buffered rasteriser behind the package's own camera convention.
 
 `cv2.triangleRasterize` has OpenGL's camera (y up, looking along -z), a symmetric field of view, and samples a pixel at
-its corner plus a half in both directions. Here a `View` is any window of a camera's image at any magnification: the
-window's offset and the principal point become a shear of camera coordinates, in float64, before OpenCV sees them.
+its corner plus a half in both directions. Here a `RasterView` is any window of a camera's image at any magnification:
+the window's offset and the principal point become a shear of camera coordinates, in float64, before OpenCV sees them.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.cameras import Camera
+from psotrack.geometry import Camera
 
 NEAR_M = 0.1
 FAR_M = 100.0
@@ -44,7 +44,7 @@ def pinhole(cam: Camera) -> Pinhole:
 
 
 @dataclass(frozen=True)
-class View:
+class RasterView:
     """A window of a camera's image.
 
     Attributes:
@@ -72,12 +72,12 @@ class View:
         """The window in the camera's image: rows, columns."""
         return slice(self.y, self.y + self.height), slice(self.x, self.x + self.width)
 
-    def slices_in(self, outer: View) -> tuple[slice, slice]:
+    def slices_in(self, outer: RasterView) -> tuple[slice, slice]:
         """The window in the buffers of one that holds it, both of magnification 1."""
         x, y = self.x - outer.x, self.y - outer.y
         return slice(y, y + self.height), slice(x, x + self.width)
 
-    def overlaps(self, other: View) -> bool:
+    def overlaps(self, other: RasterView) -> bool:
         """Whether they share pixels."""
         return (
             self.x < other.x + other.width
@@ -86,7 +86,7 @@ class View:
             and other.y < self.y + self.height
         )
 
-    def joined(self, other: View) -> View:
+    def joined(self, other: RasterView) -> RasterView:
         """The smallest window that holds both."""
         x, y = min(self.x, other.x), min(self.y, other.y)
         right = max(self.x + self.width, other.x + other.width)
@@ -101,12 +101,14 @@ class View:
         return np.array([[m, 0, offset[0]], [0, m, offset[1]], [0, 0, 1.0]]) @ self.cam.K
 
 
-def full_view(cam: Pinhole, magnification: int = 1) -> View:
+def full_view(cam: Pinhole, magnification: int = 1) -> RasterView:
     """The whole image of a camera."""
-    return View(cam, 0, 0, cam.width, cam.height, magnification)
+    return RasterView(cam, 0, 0, cam.width, cam.height, magnification)
 
 
-def enclosing(view: View, points_world: Float[np.ndarray, "points 3"], margin_px: int) -> View | None:
+def enclosing(
+    view: RasterView, points_world: Float[np.ndarray, "points 3"], margin_px: int
+) -> RasterView | None:
     """The part of a window in which some points lie, with a margin; None where none of it is theirs.
 
     Points that reach behind the camera may be anywhere: they enclose all of the window.
@@ -131,14 +133,14 @@ _FLAT, _SMOOTH = (
 
 
 def empty_buffers(
-    view: View,
+    view: RasterView,
 ) -> tuple[Float[np.ndarray, "rows columns 3"], Float[np.ndarray, "rows columns"]]:
     """Black, and infinitely far."""
     return np.zeros((*view.shape, 3), np.float32), np.full(view.shape, FAR_M, np.float32)
 
 
 def draw(
-    view: View,
+    view: RasterView,
     triangles_world: Float[np.ndarray, "faces 3 3"],
     colours: Float[np.ndarray, "faces corners 3"],
     colour_buffer: Float[np.ndarray, "rows columns 3"],

@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from psotrack.simulation.imaging import backdrop, reflections, sensor
 from psotrack.simulation.imaging.backdrop import Backdrop, lens_blur
 from psotrack.simulation.imaging.posing import PosedDrone, average, margin_px, pass_samples, pose, windows
-from psotrack.simulation.imaging.raster import Pinhole, View, full_view, pinhole
+from psotrack.simulation.imaging.raster import Pinhole, RasterView, full_view, pinhole
 from psotrack.simulation.imaging.reflections import Mirror
 from psotrack.simulation.imaging.shadows import FloorShadows
 from psotrack.simulation.scene import Scene
@@ -54,7 +54,7 @@ class CameraRenderer:
         """The frame as the sensor yields it, before the codec: BGR, (height, width, 3)."""
         return self.sensor.expose(self.clean_frame(frame), frame, self.scene.time_s(frame))
 
-    def _draw_drones(self, image: Image, window: View, drones: list[PosedDrone]) -> None:
+    def _draw_drones(self, image: Image, window: RasterView, drones: list[PosedDrone]) -> None:
         seen = average(window, drones, self._samples, self.backdrop.depth_m[window.slices])
         seen = lens_blur(seen, self.scene.scenario.imaging.lens_blur_px)
         part = image[window.slices]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.detections import Detections
+from psotrack.recordings import Detections
 from psotrack.simulation.labels.masks import Silhouette
 from psotrack.simulation.scene import Scene
 

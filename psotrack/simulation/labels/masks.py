@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from psotrack.simulation.imaging.raster import (
     NEAR_M,
     Pinhole,
-    View,
+    RasterView,
     draw,
     empty_buffers,
     enclosing,
@@ -35,7 +35,7 @@ class Silhouette:
     """
 
     number: int
-    window: View
+    window: RasterView
     seen: Bool[np.ndarray, "rows columns"]
     whole_px: int
 
@@ -46,7 +46,7 @@ class Silhouette:
 
     @property
     def xyxy(self) -> Float[np.ndarray, "4"] | None:
-        """(4,), the box of what is seen, in the convention of `psotrack.boxes`; None where nothing is."""
+        """(4,), the box of what is seen, in the convention of `psotrack.geometry.boxes`; None where nothing is."""
         rows, columns = (np.flatnonzero(self.seen.any(axis=axis)) for axis in (1, 0))
         if not len(rows):
             return None
@@ -88,7 +88,7 @@ class _Drawn:
     """A drone drawn alone: where it covers its window, and at what depth."""
 
     number: int
-    window: View
+    window: RasterView
     covered: Bool[np.ndarray, "rows columns"]
     depth_m: Float[np.ndarray, "rows columns"]
     whole_px: int
@@ -105,7 +105,7 @@ def _drawn(scene: Scene, cam: Pinhole, drone: int, time_s: float) -> _Drawn | No
     beyond = window
     if (points @ cam.R[2] + cam.t_m[2]).min() > NEAR_M:
         # What the image's edges cut off counts as hidden.
-        around = View(cam, -cam.width // 2, -cam.height // 2, 2 * cam.width, 2 * cam.height)
+        around = RasterView(cam, -cam.width // 2, -cam.height // 2, 2 * cam.width, 2 * cam.height)
         beyond = enclosing(around, points, _MARGIN_PX) or window
     colour, depth_m = empty_buffers(beyond)
     draw(beyond, triangles, np.ones((len(triangles), 1, 3)), colour, depth_m)
@@ -123,7 +123,7 @@ def _hide(
         return
     x, y = max(a.x, b.x), max(a.y, b.y)
     right, bottom = min(a.x + a.width, b.x + b.width), min(a.y + a.height, b.y + b.height)
-    shared = View(a.cam, x, y, right - x, bottom - y)
+    shared = RasterView(a.cam, x, y, right - x, bottom - y)
     here, there = shared.slices_in(a), shared.slices_in(b)
     both = one.covered[here] & other.covered[there]
     nearer = one.depth_m[here] <= other.depth_m[there]

@@ -1,0 +1,221 @@
+"""The clocks of a reference and of a video: the offset between them, found from the motion of the drones.
+
+The paper (technical validation, "ArUco markers") lays the reconstructed path on successive points of the reference and
+takes the offset with the smallest mean distance. Here that is the first step; the second finds the minimum between the
+samples, with the reference interpolated. Every drone has a constant lever arm, from the point that the reference gives
+to the one that is tracked. It is taken out at every offset: for a drone that flies one way it would pass for time.
+
+Offsets between cameras are found in `camera_clocks`, and are here too, so that all of synchronising is in one place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from psotrack.clocks.camera_clocks import CameraOffsets, camera_offsets
+from psotrack.clocks.time_shift import ShiftedPair, refused, shifted
+from psotrack.errors import InputError, SettingsError
+from psotrack.recordings import Sequence, body_trajectories, read_c3d
+from psotrack.support import COLOURS, save_figure, standard_error
+from psotrack.trajectories import Trajectories
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "CameraOffsets",
+    "Offset",
+    "camera_offsets",
+    "find_offset",
+    "own_reference",
+    "save_curve",
+    "shifted",
+]
+
+#: Offsets count at which at least this share is compared of what can be compared at any of them.
+LEAST_OVERLAP = 0.5
+#: The least distance and another one are told apart by as many standard errors of their difference.
+_CLEARLY = 3.0
+
+
+@dataclass(frozen=True)
+class Offset:
+    """What the reference's clock shows beyond the estimate's, and how well that is known.
+
+    Attributes:
+        offset_s: the reference at t + offset_s belongs to the estimate at t.
+        std_s: its standard deviation, from the motion and from the distances that are left.
+        mean_distance_m: over frames and drones at that offset, without the lever arms.
+        mean_distance_before_m: the same at offset 0; None where too little can be compared.
+        lever_arm_m: (drones, 3), from the reference's point to the one that is tracked, in the body where orientations
+            were given, else in the world; NaN of drones that were not compared.
+        partner: (drones,), index of the estimated drone that stands for each, or `UNASSIGNED`.
+        overlap: share of the estimate's positions that were compared.
+        curve_s: (offsets,), the offsets that were tried: whole samples of the reference.
+        curve_m: (offsets,), the mean distance at each, without the lever arms; NaN where too little can be compared.
+    """
+
+    offset_s: float
+    std_s: float
+    mean_distance_m: float
+    mean_distance_before_m: float | None
+    lever_arm_m: Float[np.ndarray, "drones 3"]
+    partner: Int[np.ndarray, "drones"]
+    overlap: float
+    curve_s: Float[np.ndarray, "offsets"]
+    curve_m: Float[np.ndarray, "offsets"]
+
+
+def find_offset(
+    estimate: Trajectories,
+    reference_time_s: Float[np.ndarray, "samples"],
+    reference_position_m: Float[np.ndarray, "samples drones 3"],
+    reference_orientation_wxyz: Float[np.ndarray, "samples drones 4"] | None = None,
+    *,
+    max_offset_s: float,
+    with_lever_arm: bool = True,
+) -> Offset:
+    """The offset between the clocks of an estimate and of its reference, to a fraction of a frame.
+
+    At every offset the estimates are assigned to the drones, with the least total of mean distances; then each drone's
+    arm, its median residual, is taken out, and what remains is averaged. Drones are left out that are further than
+    half a metre from their estimate at the best offset, as long as others are not.
+
+    Args:
+        estimate: at the times of the video; what is lost does not count.
+        reference_time_s: (samples,), of the reference's own clock, at its own rate.
+        reference_position_m: (samples, drones, 3), world; NaN where it is not known.
+        reference_orientation_wxyz: (samples, drones, 4), body to world. With them arms turn with their drones; where
+            they are not known, positions do not count. Without them an arm that points ahead is taken for time.
+        max_offset_s: from minus this to this.
+        with_lever_arm: allow each drone a constant arm.
+
+    Raises:
+        SettingsError: the range is smaller than a step of the reference.
+        InputError: times do not increase, nothing can be compared, the least distance is at an end of the range, the
+            motion repeats so that another offset does as well, or it does not tell the offset to a frame: drones that
+            hover, or fly straight on at one speed.
+    """
+    comparison = ShiftedPair.of(
+        estimate, reference_time_s, reference_position_m, reference_orientation_wxyz, with_lever_arm
+    )
+    step_s = float(np.median(np.diff(reference_time_s)))
+    frame_s = float(np.median(np.diff(estimate.time_s)))
+    if not step_s <= max_offset_s < np.inf:
+        expected = f"a step of the reference, {step_s:g} s, or more"
+        raise SettingsError("max_offset_s", expected=expected, found=f"{max_offset_s:g}")
+    # A hair more, for steps that are rounded.
+    steps = int(max_offset_s / step_s + 1e-6)
+    curve_s = step_s * np.arange(-steps, steps + 1)
+    curve_m = _curve(comparison, curve_s)
+    best = int(np.nanargmin(curve_m))
+    if not (0 < best < 2 * steps) or not np.isfinite(curve_m[best - 1 : best + 2]).all():
+        raise refused(
+            f"the least distance within {max_offset_s:g} s",
+            f"it at an end, {curve_s[best]:+.3g} s",
+            "widen the range; if the drones hover, their motion tells no offset",
+        )
+    partner = comparison.without_far(curve_s[best])
+    offset_s = comparison.least(partner, curve_s[best], max(step_s, frame_s))
+    found = comparison.at(offset_s, partner)
+    std_s = comparison.standard_deviation_s(offset_s, partner)
+    if not std_s < frame_s:
+        raise refused(
+            f"motion that tells the offset to a frame, {frame_s:g} s",
+            f"a standard deviation of {std_s:.2g} s",
+            "drones that hover, or fly straight on at one speed, do not tell: use more of the recording",
+        )
+    error_m = standard_error(found.per_frame_m[:, None], estimate.frame)[0]
+    _check_alone(curve_s, curve_m, float(error_m), frame_s)
+    before_m = float(curve_m[steps])
+    return Offset(
+        offset_s=offset_s,
+        std_s=std_s,
+        mean_distance_m=found.mean_m,
+        mean_distance_before_m=before_m if np.isfinite(before_m) else None,
+        lever_arm_m=found.arm_m,
+        partner=partner,
+        overlap=found.count / int(estimate.seen.sum()),
+        curve_s=curve_s,
+        curve_m=curve_m,
+    )
+
+
+def own_reference(sequence: Sequence) -> Trajectories:
+    """The reference of a sequence at its own rate and by its own clock: its .c3d, or else its poses.
+
+    Orientations are there only where each position has one.
+
+    Raises:
+        InputError: it has none, or the .c3d cannot be used.
+    """
+    reference = sequence.truth
+    for path in sequence.folder.iterdir():
+        if path.suffix.lower() == ".c3d":
+            markers = read_c3d(path)
+            num_frames = len(markers.position_m)
+            reference = body_trajectories(markers, fps=markers.rate_hz, num_frames=num_frames, where=path)
+    if reference is None:
+        raise InputError(sequence.folder, expected="a reference to synchronise with", found="none")
+    if reference.orientation_wxyz is not None:
+        turned = np.isfinite(reference.orientation_wxyz).all(axis=-1)
+        if not turned[reference.seen].all():
+            return replace(reference, orientation_wxyz=None)
+    return reference
+
+
+def save_curve(path: Path, offset: Offset, *, force: bool = False) -> None:
+    """Save a PNG of the mean distance over the offsets, with the one that was found.
+
+    Raises:
+        OutputError: the file exists and `force` is not set, or it cannot be written.
+    """
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        axes.plot(offset.curve_s, 1e3 * offset.curve_m, color=COLOURS[0], linewidth=1.2)
+        axes.plot(offset.offset_s, 1e3 * offset.mean_distance_m, "o", color=COLOURS[1], markersize=5)
+        axes.annotate(
+            f"{offset.offset_s:+.4f} s, {1e3 * offset.mean_distance_m:.1f} mm",
+            (offset.offset_s, 1e3 * offset.mean_distance_m),
+            (14, 12),
+            textcoords="offset points",
+        )
+        axes.set_xlabel("offset of the reference (s)")
+        axes.set_ylabel("mean distance (mm)")
+        axes.set_ylim(bottom=0)
+
+    save_figure(path, (8.0, 4.0), draw, force)
+
+
+def _curve(comparison: ShiftedPair, curve_s: Float[np.ndarray, "offsets"]) -> Float[np.ndarray, "offsets"]:
+    """The mean distance at each offset; NaN where less than `LEAST_OVERLAP` of the most is compared."""
+    tried = [comparison.at(offset_s, comparison.partner(offset_s)) for offset_s in curve_s]
+    count = np.array([one.count for one in tried])
+    if not count.any():
+        raise refused(f"positions of both at offsets within {curve_s[-1]:g} s", "none")
+    enough = count >= np.maximum(LEAST_OVERLAP * count.max(), 1)
+    return np.where(enough, [one.mean_m for one in tried], np.nan)
+
+
+def _check_alone(
+    curve_s: Float[np.ndarray, "offsets"],
+    curve_m: Float[np.ndarray, "offsets"],
+    error_m: float,
+    frame_s: float,
+) -> None:
+    """Raise if there is another offset, apart from the best, at which the distance is not clearly larger."""
+    low_s = curve_s[curve_m <= np.nanmin(curve_m) + _CLEARLY * np.sqrt(2) * error_m]
+    apart = np.diff(low_s) > max(frame_s, 1.5 * (curve_s[1] - curve_s[0]))
+    if apart.any():
+        place = int(np.argmax(apart))
+        raise refused(
+            "one offset that fits best",
+            f"both {low_s[place]:+.2f} s and {low_s[place + 1]:+.2f} s",
+            "the motion repeats: narrow the range",
+        )

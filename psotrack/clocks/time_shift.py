@@ -1,0 +1,271 @@
+"""An estimate against its reference at another time: what is left between them once lever arms are taken out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.interpolate import CubicSpline
+from scipy.optimize import linear_sum_assignment, minimize_scalar
+from scipy.spatial.transform import Rotation
+
+from psotrack.errors import InputError
+from psotrack.geometry import rotation_matrices
+from psotrack.support import standard_error
+from psotrack.trajectories import GATE_M, UNASSIGNED, Trajectories, of_partners
+
+#: Gaps of a reference are bridged up to this, or to one and a half of its steps where that is more.
+MAX_GAP_S = 0.1
+#: Motion is what happens within this before and after: the noise of a drone that stands still is none.
+_MOTION_S = 0.1
+#: Far below what noise allows.
+_PRECISION_S = 1e-6
+_MEDIAN_STEPS = 5
+
+_At = Callable[[Float[np.ndarray, "times"]], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """What is left between estimates and drones at one offset.
+
+    Attributes:
+        arm_m: (drones, 3), what was taken out; NaN of drones that are not compared.
+        residual_m: (frames, drones, 3), in the frame of the arms; NaN where it is not known.
+    """
+
+    arm_m: Float[np.ndarray, "drones 3"]
+    residual_m: Float[np.ndarray, "frames drones 3"]
+
+    @property
+    def per_frame_m(self) -> Float[np.ndarray, "frames"]:
+        """(frames,), the mean distance in each; NaN where nothing is compared."""
+        distance_m = np.linalg.norm(self.residual_m, axis=-1)
+        count = np.isfinite(distance_m).sum(axis=1)
+        return np.where(count > 0, np.nansum(distance_m, axis=1) / np.maximum(count, 1), np.nan)
+
+    @property
+    def distance_m(self) -> Float[np.ndarray, "compared"]:
+        """(compared,), of all frames and drones that are compared."""
+        distance_m = np.linalg.norm(self.residual_m, axis=-1)
+        return distance_m[np.isfinite(distance_m)]
+
+    @property
+    def count(self) -> int:
+        """Of what is compared."""
+        return len(self.distance_m)
+
+    @property
+    def mean_m(self) -> float:
+        """The mean distance; NaN where nothing is compared."""
+        return float(self.distance_m.mean()) if self.count else np.nan
+
+
+@dataclass(frozen=True)
+class ShiftedPair:
+    """An estimate, and its reference at any time.
+
+    Attributes:
+        frame, time_s: (frames,), of the estimate.
+        est_m: (frames, estimates, 3), NaN where nothing is known.
+        position_m: (times, drones, 3) at times of the reference's clock, NaN likewise.
+        rotation: (times, drones, 3, 3), frame of the arms to world; None where that is the world.
+        with_lever_arm: allow each drone a constant arm.
+    """
+
+    frame: Int[np.ndarray, "frames"]
+    time_s: Float[np.ndarray, "frames"]
+    est_m: Float[np.ndarray, "frames estimates 3"]
+    position_m: _At
+    rotation: _At | None
+    with_lever_arm: bool
+
+    @staticmethod
+    def of(
+        estimate: Trajectories,
+        time_s: Float[np.ndarray, "samples"],
+        position_m: Float[np.ndarray, "samples drones 3"],
+        orientation_wxyz: Float[np.ndarray, "samples drones 4"] | None,
+        with_lever_arm: bool,
+    ) -> ShiftedPair:
+        """Of an estimate and the samples of its reference; see `synchronisation.find_offset`.
+
+        Raises:
+            InputError: times do not increase, or there are fewer than two of either.
+        """
+        if len(time_s) < 2 or not (np.diff(time_s) > 0).all():
+            raise refused("a reference at two increasing times or more", f"{len(time_s)} times")
+        if estimate.num_frames < 2:
+            raise refused("an estimate of two frames or more", f"{estimate.num_frames}")
+        return ShiftedPair(
+            estimate.frame,
+            estimate.time_s.astype(np.float64),
+            np.where(estimate.seen[..., None], estimate.position_m, np.nan).astype(np.float64),
+            _interpolated(time_s, position_m),
+            None if orientation_wxyz is None else _interpolated(time_s, rotation_matrices(orientation_wxyz)),
+            with_lever_arm,
+        )
+
+    def partner(self, offset_s: float) -> Int[np.ndarray, "drones"]:
+        """Index of the estimate that stands for each drone: the least total of mean distances, arms and all."""
+        ref_m = self.position_m(self.time_s + offset_s)
+        distance_m = np.linalg.norm(ref_m[:, :, None] - self.est_m[:, None], axis=-1)
+        count = np.isfinite(distance_m).sum(axis=0)
+        # What cannot be compared is dearer than what can: no room is a kilometre wide.
+        mean_m = np.where(count > 0, np.nansum(distance_m, axis=0) / np.maximum(count, 1), 1e3)
+        drones, estimates = linear_sum_assignment(mean_m)
+        partner = np.full(ref_m.shape[1], UNASSIGNED)
+        partner[drones] = np.where(count[drones, estimates] > 0, estimates, UNASSIGNED)
+        return partner
+
+    def without_far(self, offset_s: float) -> Int[np.ndarray, "drones"]:
+        """The partners, without those that are out of the gate, as long as some are not."""
+        partner = self.partner(offset_s)
+        near = np.linalg.norm(_medians(self._residual_m(offset_s, partner)), axis=-1) <= GATE_M
+        return np.where(near, partner, UNASSIGNED) if near.any() else partner
+
+    def at(self, offset_s: float, partner: Int[np.ndarray, "drones"]) -> Residuals:
+        """What is left when the reference's clock is ahead by the offset."""
+        return self._without_arms(self._residual_m(offset_s, partner))
+
+    def least(self, partner: Int[np.ndarray, "drones"], near_s: float, reach_s: float) -> float:
+        """The offset of the least mean distance within reach, by Brent's method.
+
+        Over what can be compared at both ends: a position that comes or goes would make a step in the mean.
+        """
+        low_s, high_s = near_s - reach_s, near_s + reach_s
+        outside = np.isnan(self._residual_m(low_s, partner) + self._residual_m(high_s, partner))
+
+        def mean_m(offset_s: float) -> float:
+            residual_m = np.where(outside, np.nan, self._residual_m(offset_s, partner))
+            return self._without_arms(residual_m).mean_m
+
+        found = minimize_scalar(
+            mean_m, bounds=(low_s, high_s), method="bounded", options={"xatol": _PRECISION_S}
+        )
+        return float(found.x)
+
+    def standard_deviation_s(self, offset_s: float, partner: Int[np.ndarray, "drones"]) -> float:
+        """Of the offset of the least mean distance: its gradient's standard error over its curvature."""
+        residual_m = self.at(offset_s, partner).residual_m
+        ends_m = [self._residual_m(offset_s + sign * _MOTION_S, partner) for sign in (-1, 1)]
+        motion_m_s = (ends_m[1] - ends_m[0]) / (2 * _MOTION_S)
+        if self.with_lever_arm:
+            # A motion that is the same throughout is an arm's, not time's.
+            known = np.isfinite(motion_m_s)
+            mean_m_s = np.where(known, motion_m_s, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+            motion_m_s = motion_m_s - mean_m_s
+        # Of |r + v dt|: v r/|r| at first order, (v² - (v r/|r|)²) / |r| at second, where r may point anywhere.
+        distance_m = np.maximum(np.linalg.norm(residual_m, axis=-1), 1e-9)
+        slope = (motion_m_s * residual_m).sum(axis=-1) / distance_m
+        bend = 2 / 3 * (motion_m_s**2).sum(axis=-1) / distance_m
+        curvature = np.nansum(bend)
+        if not curvature > 0:
+            return np.inf
+        gradient = np.where(np.isfinite(slope).any(axis=1), np.nansum(slope, axis=1), np.nan)
+        error = standard_error(gradient[:, None], self.frame)[0] * np.isfinite(gradient).sum()
+        return float(error / curvature)
+
+    def _residual_m(
+        self, offset_s: float, partner: Int[np.ndarray, "drones"]
+    ) -> Float[np.ndarray, "frames drones 3"]:
+        time_s = self.time_s + offset_s
+        residual_m = of_partners(self.est_m, partner) - self.position_m(time_s)
+        if self.rotation is None:
+            return residual_m
+        return np.einsum("fdji,fdj->fdi", self.rotation(time_s), residual_m)
+
+    def _without_arms(self, residual_m: Float[np.ndarray, "frames drones 3"]) -> Residuals:
+        arm_m = _medians(residual_m)
+        if not self.with_lever_arm:
+            arm_m = 0.0 * arm_m
+        return Residuals(arm_m, residual_m - arm_m)
+
+
+def shifted(
+    reference: Trajectories,
+    offset_s: float,
+    frame: Int[np.ndarray, "frames"],
+    time_s: Float[np.ndarray, "frames"],
+) -> Trajectories:
+    """A reference whose clock is ahead by the offset, at the frames of a video.
+
+    Positions and orientations are interpolated by cubic splines, not outside of the reference and not in its gaps.
+
+    Args:
+        reference: by its own clock, at its own rate, at two times or more.
+        offset_s: the reference at t + offset_s belongs to the video at t.
+        frame: (frames,), numbers of the video's frames.
+        time_s: (frames,), when they are.
+    """
+    position_m = _interpolated(reference.time_s, reference.position_m)(time_s + offset_s)
+    orientation_wxyz = None
+    if reference.orientation_wxyz is not None:
+        rotation = _interpolated(reference.time_s, rotation_matrices(reference.orientation_wxyz))(
+            time_s + offset_s
+        )
+        orientation_wxyz = np.full((*rotation.shape[:2], 4), np.nan)
+        known = np.isfinite(rotation).all(axis=(-2, -1))
+        if known.any():
+            orientation_wxyz[known] = Rotation.from_matrix(rotation[known]).as_quat(scalar_first=True)
+    return Trajectories(frame, time_s, reference.drones, position_m, orientation_wxyz=orientation_wxyz)
+
+
+def longest_gap_s(time_s: Float[np.ndarray, "samples"]) -> float:
+    """Gaps between samples are bridged up to this, which holds for all of their times, known or not."""
+    return max(MAX_GAP_S, 1.5 * float(np.median(np.diff(time_s))))
+
+
+def between_samples(
+    sample_s: Float[np.ndarray, "samples"], wanted_s: Float[np.ndarray, "times"], longest_s: float
+) -> Bool[np.ndarray, "times"]:
+    """Times that are at a sample, or between two that are no farther apart than that; of two samples or more."""
+    after = np.clip(np.searchsorted(sample_s, wanted_s), 1, len(sample_s) - 1)
+    before_s, after_s = wanted_s - sample_s[after - 1], sample_s[after] - wanted_s
+    inside = (np.minimum(before_s, after_s) >= 0) & (before_s + after_s <= longest_s)
+    # Samples themselves are known on both sides of a gap, but for rounding.
+    return inside | (np.minimum(np.abs(before_s), np.abs(after_s)) < 1e-9)
+
+
+def _interpolated(time_s: Float[np.ndarray, "samples"], values: np.ndarray) -> _At:
+    """(times, drones, ...) of values (samples, drones, ...), by cubic splines; NaN outside, and in long gaps."""
+    flat = values.reshape(*values.shape[:2], -1).astype(np.float64)
+    longest_s = longest_gap_s(time_s)
+    known = [np.isfinite(flat[:, drone]).all(axis=-1) for drone in range(flat.shape[1])]
+    # A spline takes two samples.
+    splines = {
+        drone: (time_s[there], CubicSpline(time_s[there], flat[there, drone]))
+        for drone, there in enumerate(known)
+        if there.sum() > 1
+    }
+
+    def at(wanted_s: Float[np.ndarray, "times"]) -> np.ndarray:
+        found = np.full((len(wanted_s), *flat.shape[1:]), np.nan)
+        for drone, (sample_s, spline) in splines.items():
+            inside = between_samples(sample_s, wanted_s, longest_s)
+            if inside.any():
+                found[inside, drone] = spline(wanted_s[inside])
+        return found.reshape(len(wanted_s), *values.shape[1:])
+
+    return at
+
+
+def _medians(values: Float[np.ndarray, "frames drones 3"]) -> Float[np.ndarray, "drones 3"]:
+    """Points of the least mean distance, to a few steps of Weiszfeld 1937; NaN where nothing is known."""
+    found = np.full(values.shape[1:], np.nan)
+    known = np.isfinite(values).all(axis=-1)
+    for drone in np.flatnonzero(known.any(axis=0)):
+        there = values[known[:, drone], drone]
+        median = np.median(there, axis=0)
+        for _ in range(_MEDIAN_STEPS):
+            weight = 1 / np.maximum(np.linalg.norm(there - median, axis=-1), 1e-9)
+            median = weight @ there / weight.sum()
+        found[drone] = median
+    return found
+
+
+def refused(expected: str, found: str, remedy: str = "") -> InputError:
+    """The error of an estimate and a reference that cannot be compared."""
+    return InputError("estimate and reference", expected=expected, found=found, remedy=remedy)

@@ -1,0 +1,179 @@
+"""Detections by a neural network: a YOLO model in ONNX, run by OpenCV over every frame of a video.
+
+Frames are fitted into the network's square input with grey around them (letterbox), RGB in [0, 1]. Outputs are told
+apart by their shape:
+
+- v5 to v7: (1, boxes, 5 + classes), box as middle and size, how sure that it is anything, and of each class;
+- v8, v9, v11: (1, 4 + classes, boxes), box as middle and size, how sure of each class;
+- v10: (1, 300, 6), box as corners, how sure, class.
+
+All boxes are in pixels of the input. What is found counts whatever its class: train the network on drones.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from psotrack.errors import InputError, SettingsError
+from psotrack.recordings import Detections, VideoInfo, read_frames
+from psotrack.support import Report, silent
+
+#: What YOLO's own letterbox has around the image.
+_GREY = (114, 114, 114)
+#: Most boxes of v10, after its own choice; no input has as many in the other layouts.
+_FINISHED = (300, 6)
+#: How far above 1 a score is that was rounded.
+_ROUNDING = 1e-3
+
+
+@dataclass(frozen=True)
+class DetectorSettings:
+    """What counts as a detection.
+
+    Attributes:
+        confidence: least score, in (0, 1].
+        nms: of boxes whose intersection over union is above this, the surest stays; in (0, 1].
+        size: of the network's square input, pixels.
+    """
+
+    confidence: float = 0.25
+    nms: float = 0.45
+    size: int = 640
+
+    def __post_init__(self) -> None:
+        for name in ("confidence", "nms"):
+            value = getattr(self, name)
+            if not 0 < value <= 1:
+                raise SettingsError(name, expected="a number above 0, at most 1", found=f"{value:g}")
+        if self.size < 1:
+            raise SettingsError("size", expected="1 pixel or more", found=f"{self.size}")
+
+
+class OnnxDetector:
+    """A network that finds drones in images.
+
+    Args:
+        model: an ONNX file.
+        settings: what counts.
+
+    Raises:
+        InputError: there is no such file, or it is no network that OpenCV can read.
+    """
+
+    def __init__(self, model: Path, settings: DetectorSettings) -> None:
+        if not model.is_file():
+            raise InputError(model, expected="an ONNX model", found="no such file")
+        self.model = model
+        self.settings = settings
+        with self._said_in_one_line("an ONNX model that OpenCV can read"):
+            self._network = cv2.dnn.readNetFromONNX(str(model))
+
+    def boxes(
+        self, bgr: UInt8[np.ndarray, "height width 3"]
+    ) -> tuple[Float[np.ndarray, "found 4"], Float[np.ndarray, "found"]]:
+        """Boxes (xyxy, in the convention of `psotrack.geometry.boxes`) and confidences in an image, the surest first.
+
+        Raises:
+            InputError: the network cannot take an input of this size, or its output has none of the layouts.
+        """
+        size = self.settings.size
+        image, scale, start = _letterboxed(bgr, size)
+        with self._said_in_one_line(f"a network for images of {size} x {size} pixels", "pass its own --size"):
+            self._network.setInput(cv2.dnn.blobFromImage(image, 1 / 255, swapRB=True))
+            output = self._network.forward()
+        xyxy, score = self._decoded(np.asarray(output, np.float64))
+        sure = score >= self.settings.confidence
+        xyxy, score = (xyxy[sure] - np.tile(start, 2)) / np.tile(scale, 2), np.minimum(score[sure], 1.0)
+        height, width = bgr.shape[:2]
+        xyxy = np.clip(xyxy, 0, np.tile([width, height], 2))
+        xywh = np.hstack([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]])
+        there = (xywh[:, 2:] > 0).all(axis=1)
+        xyxy, xywh, score = xyxy[there], xywh[there], score[there]
+        # OpenCV's order is that of the scores, and its answer to no boxes an empty tuple.
+        kept = cv2.dnn.NMSBoxes(xywh.tolist(), score.tolist(), self.settings.confidence, self.settings.nms)
+        index = np.asarray(kept, np.int64).ravel()
+        return xyxy[index], score[index]
+
+    def _decoded(
+        self, output: Float[np.ndarray, "..."]
+    ) -> tuple[Float[np.ndarray, "boxes 4"], Float[np.ndarray, "boxes"]]:
+        """Boxes, xyxy in pixels of the input, and their scores."""
+        rows, columns = output.shape[1:] if output.ndim == 3 and len(output) == 1 else (0, 0)
+        if (rows, columns) == _FINISHED:
+            xyxy, score = output[0, :, :4], output[0, :, 4]
+        elif rows > columns > 5:
+            middle, half = output[0, :, :2], output[0, :, 2:4] / 2
+            xyxy = np.hstack([middle - half, middle + half])
+            score = output[0, :, 4] * output[0, :, 5:].max(axis=1)
+        elif columns > rows > 4:
+            middle, half = output[0, :2].T, output[0, 2:4].T / 2
+            xyxy = np.hstack([middle - half, middle + half])
+            score = output[0, 4:].max(axis=0)
+        else:
+            raise InputError(
+                self.model,
+                expected="an output of (1, boxes, 5 + classes) as of YOLOv5 or (1, 4 + classes, boxes) as of YOLOv8",
+                found=f"{output.shape}",
+            )
+        if not (np.isfinite(xyxy).all() and (score >= 0).all() and (score <= 1 + _ROUNDING).all()):
+            raise InputError(
+                self.model,
+                expected="finite boxes with scores from 0 to 1",
+                found=f"scores from {score.min():.3g} to {score.max():.3g}",
+                remedy="is it exported with its last layers, and is this YOLO's own layout?",
+            )
+        return xyxy, score
+
+    @contextlib.contextmanager
+    def _said_in_one_line(self, expected: str, remedy: str = "") -> Iterator[None]:
+        """What OpenCV says against the network as one line, and nothing of it before."""
+        level = cv2.utils.logging.getLogLevel()
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        try:
+            yield
+        except cv2.error as error:
+            found = f"one that it cannot use ({' '.join((error.err or str(error)).split())})"
+            raise InputError(self.model, expected=expected, found=found, remedy=remedy) from error
+        finally:
+            cv2.utils.logging.setLogLevel(level)
+
+
+def detect(detector: OnnxDetector, name: str, video: VideoInfo, *, report: Report = silent) -> Detections:
+    """The detections in all frames of a video; `name` is what progress is called.
+
+    Raises:
+        InputError: the video ends early, or the network cannot be used.
+    """
+    frame: list[Int[np.ndarray, "_"]] = [np.empty(0, np.int64)]
+    boxes: list[Float[np.ndarray, "_ 4"]] = [np.empty((0, 4))]
+    scores: list[Float[np.ndarray, "_"]] = [np.empty(0)]
+    with report(name, video.num_frames) as advance:
+        for number, bgr in enumerate(read_frames(video)):
+            xyxy, score = detector.boxes(bgr)
+            frame.append(np.full(len(score), number))
+            boxes.append(xyxy)
+            scores.append(score)
+            advance(1)
+    return Detections(np.concatenate(frame), np.concatenate(boxes), np.concatenate(scores))
+
+
+def _letterboxed(
+    bgr: UInt8[np.ndarray, "height width 3"], size: int
+) -> tuple[UInt8[np.ndarray, "size size 3"], Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """The image in the middle of a grey square; and what takes x, y of its edges there: scale, and then start."""
+    image_wh = np.array([bgr.shape[1], bgr.shape[0]])
+    inside_wh = np.maximum(np.round(image_wh * size / image_wh.max()), 1).astype(int)
+    start = (size - inside_wh) // 2
+    left, top = start.tolist()
+    right, bottom = (size - inside_wh - start).tolist()
+    # As YOLO does it, and its networks are trained.
+    resized = cv2.resize(bgr, inside_wh.tolist(), interpolation=cv2.INTER_LINEAR)
+    image = cv2.copyMakeBorder(resized, top, bottom, left, right, cv2.BORDER_CONSTANT, value=_GREY)
+    return np.asarray(image, np.uint8), inside_wh / image_wh, start.astype(np.float64)

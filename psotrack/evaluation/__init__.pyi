@@ -1,0 +1,11 @@
+from .metrics import evaluate
+from .over_time import errors_over_time
+from .records import DroneEvaluation, ErrorSummary, Evaluation
+
+__all__ = [
+    "DroneEvaluation",
+    "ErrorSummary",
+    "Evaluation",
+    "errors_over_time",
+    "evaluate",
+]

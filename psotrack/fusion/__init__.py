@@ -1,0 +1,9 @@
+"""Fusion of the tracks of two methods into one set of tracks, weighted by covariances.
+
+In: tracks of the swarm and of the projection lines for the same frames. Out: the fused tracks, and for each drone the
+constant offset between the two tracked points.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

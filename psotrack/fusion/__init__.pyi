@@ -1,0 +1,5 @@
+from .fusion import fuse_tracks
+
+__all__ = [
+    "fuse_tracks",
+]

@@ -1,0 +1,10 @@
+"""Cameras, rotations, boxes and triangulation, and the files that hold a rig.
+
+In: camera parameters and points, or detections in pixels. Out: pixels, boxes, 3D points with covariances. Everything
+but the rig's files (`rig_files`, `dpjait_calibration`) is NumPy and JAX only; what must be exact is computed in
+float64.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

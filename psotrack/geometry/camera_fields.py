@@ -1,0 +1,127 @@
+"""The fields of one camera as files have them, by any of the names that programs use, and how to complain of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from psotrack.errors import InputError
+from psotrack.geometry.cameras import Camera, camera
+
+#: What a rotation's rows may be off from unit length and right angles: files with 8 digits pass.
+_ROTATION = 1e-6
+#: OpenCV's counts of coefficients that `psotrack.geometry.cameras` knows.
+_COEFFICIENTS = (0, 4, 5, 8)
+
+
+@dataclass(frozen=True)
+class CameraFields:
+    """The fields of one camera in a file, and how to complain of them."""
+
+    path: Path
+    place: str
+    values: Mapping[str, Any]
+
+    def wrong(self, name: str, expected: str, found: str, remedy: str = "") -> InputError:
+        """The error of a field."""
+        return InputError(f"{self.path}, {self.place}.{name}", expected=expected, found=found, remedy=remedy)
+
+    def first(self, *names: str) -> str | None:
+        """The first of the names that has a value; of text only a name, because caliscope wrote "null" for none."""
+        there = (name for name in names if self.values.get(name) is not None)
+        return next(
+            (name for name in there if not isinstance(self.values[name], str) or name == "name"), None
+        )
+
+    def array(self, names: tuple[str, ...], *shapes: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+        """Finite numbers of one of the shapes; -1 is any length."""
+        name = self.first(*names)
+        expected = " or ".join(_words(shape) for shape in shapes)
+        if name is None:
+            raise self.wrong(" or ".join(names), expected, "none")
+        try:
+            array = np.array(self.values[name], np.float64)
+        except (TypeError, ValueError):
+            raise self.wrong(name, expected, _quoted(self.values[name])) from None
+        # OpenCV writes vectors as columns or rows.
+        squeezed = array.ravel() if array.ndim == 2 and 1 in array.shape else array
+        for shape in shapes:
+            if squeezed.ndim == len(shape) and all(
+                want in (-1, have) for want, have in zip(shape, squeezed.shape, strict=True)
+            ):
+                if not np.isfinite(squeezed).all():
+                    raise self.wrong(name, "finite numbers", _quoted(self.values[name]))
+                return squeezed
+        raise self.wrong(name, expected, " x ".join(map(str, array.shape)) or _quoted(self.values[name]))
+
+
+def camera_from_fields(
+    fields: CameraFields, image_size_wh: tuple[int, int] | None, metres_per_unit: float, placed: bool
+) -> Camera:
+    """The camera of the fields; at the world's origin if not `placed`.
+
+    Raises:
+        InputError: a field is missing or wrong.
+    """
+    if fields.values.get("fisheye"):
+        raise fields.wrong("fisheye", "a lens of OpenCV's pinhole model", "a fisheye")
+    dist = np.zeros(0)
+    coefficients = ("distortions", "D", "dist", "distortion_coefficients")
+    if fields.first(*coefficients):
+        dist = fields.array(coefficients, (-1,))
+    if dist.size not in _COEFFICIENTS:
+        allowed = ", ".join(map(str, _COEFFICIENTS))
+        raise fields.wrong(str(fields.first(*coefficients)), f"{allowed} coefficients", f"{dist.size}")
+    K = fields.array(("matrix", "K", "camera_matrix"), (3, 3))
+    if not (K[0, 0] > 0 and K[1, 1] > 0 and K[1, 0] == 0 and np.array_equal(K[2], [0, 0, 1])):
+        name = str(fields.first("matrix", "K", "camera_matrix"))
+        raise fields.wrong(
+            name, "intrinsics [[fx, s, cx], [0, fy, cy], [0, 0, 1]], fx and fy above 0", _quoted(K.tolist())
+        )
+    R, t_m = np.eye(3), np.zeros(3)
+    if placed:
+        R = _rotation(fields)
+        t_m = fields.array(("translation", "t", "T", "tvec"), (3,)) * metres_per_unit
+    return camera(R=R, t_m=t_m, K=K, dist=dist.tolist(), image_size_wh=_image_size(fields, image_size_wh))
+
+
+def _rotation(fields: CameraFields) -> Float[np.ndarray, "3 3"]:
+    names = ("rotation", "R", "rvec")
+    turn = fields.array(names, (3,), (3, 3))
+    if turn.ndim == 1:
+        return Rotation.from_rotvec(turn).as_matrix()
+    if np.abs(turn @ turn.T - np.eye(3)).max() > _ROTATION or np.linalg.det(turn) < 0:
+        remedy = "its axes are mirrored" if np.linalg.det(turn) < 0 else ""
+        raise fields.wrong(str(fields.first(*names)), "a rotation matrix", _quoted(turn.tolist()), remedy)
+    return turn
+
+
+def _image_size(fields: CameraFields, image_size_wh: tuple[int, int] | None) -> tuple[int, int]:
+    if fields.first("size", "image_size"):
+        sides = fields.array(("size", "image_size"), (2,))
+    elif fields.first("image_width") and fields.first("image_height"):
+        sides = np.array([fields.array((f"image_{side}",), ()) for side in ("width", "height")])
+    elif image_size_wh is not None:
+        return image_size_wh
+    else:
+        raise fields.wrong("size or image_size", "width and height of the images", "none", "pass --size")
+    if (sides < 1).any() or (sides != np.round(sides)).any():
+        raise fields.wrong("size", "whole numbers of pixels above 0", _quoted(sides.tolist()))
+    return int(sides[0]), int(sides[1])
+
+
+def _words(shape: tuple[int, ...]) -> str:
+    if not shape:
+        return "a number"
+    return "numbers" if -1 in shape else f"{' x '.join(map(str, shape))} numbers"
+
+
+def _quoted(value: Any) -> str:
+    text = str(value).replace("\n", " ")
+    return text if len(text) <= 60 else f"{text[:60]}..."

@@ -1,0 +1,147 @@
+"""`cameras_calibration.csv` of the DPJAIT dataset: one camera per line.
+
+`cam_x/y/z` is the translation t of x_cam = R X + t, not the camera's centre -Rᵀ t; `cam_or_x/y/z` is the
+Rodrigues vector of R (world to camera); `focal_length`, `cx`, `cy` are in pixels; `coeff_1..4`, where they
+are given, are OpenCV's k1, k2, p1, p2. Lengths are in the unit that the header names, millimetres or metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from psotrack.errors import InputError, SettingsError
+from psotrack.geometry.camera_names import camera_key
+from psotrack.geometry.cameras import Camera, CameraRig, camera, stack
+from psotrack.support import Column, Table, TextRow, read_table, write_rows
+
+LENGTHS = {"m": 1.0, "mm": 1e-3}
+ANGLES = {"rad": 1.0, "": 1.0, "deg": np.pi / 180}
+_MOST_COEFFICIENTS = 4
+
+
+def read_names(path: Path) -> tuple[str, ...]:
+    """The names of the cameras in a calibration.
+
+    Raises:
+        InputError: as of `read_calibration`.
+    """
+    table = read_table(path)
+    column = table.column("cam_name")
+    names: dict[str, str] = {}
+    for row in table.rows:
+        name = row.text(column)
+        if camera_key(name) in names:
+            raise row.wrong(column, "each camera once", f"{name} again")
+        names[camera_key(name)] = name
+    return tuple(names.values())
+
+
+def read_calibration(path: Path, image_sizes_wh: Mapping[str, tuple[int, int]]) -> CameraRig:
+    """The cameras of a calibration, in metres.
+
+    Args:
+        path: of the file.
+        image_sizes_wh: width and height in pixels by camera name, because the file has none.
+
+    Raises:
+        InputError: the file cannot be read, a column is missing, a value is no finite number, a camera is
+            there twice, or a focal length is not above 0. The message names line and column.
+    """
+    names = read_names(path)
+    table = read_table(path)
+    translation = [table.column(f"cam_{axis}") for axis in "xyz"]
+    rotation = [table.column(f"cam_or_{axis}") for axis in "xyz"]
+    metres = np.array([table.factor(column, LENGTHS) for column in translation])
+    radians = np.array([table.factor(column, ANGLES) for column in rotation])
+    coefficients = _coefficient_columns(table)
+    cameras = {}
+    for name, row in zip(names, table.rows, strict=True):
+        cameras[name] = camera(
+            R=Rotation.from_rotvec(_numbers(row, rotation) * radians).as_matrix(),
+            t_m=_numbers(row, translation) * metres,
+            K=_intrinsics(table, row),
+            dist=_numbers(row, coefficients).tolist(),
+            image_size_wh=image_sizes_wh[name],
+        )
+    return stack(cameras)
+
+
+def write_calibration(path: Path, rig: CameraRig, unit: Literal["m", "mm"] = "m") -> None:
+    """Write a rig so that `read_calibration` gives it back to 1e-12.
+
+    Distortion columns are written where a camera has distortion, as in the real half of the dataset; the
+    simulated half has none.
+
+    Raises:
+        SettingsError: the layout cannot hold the rig: two focal lengths, skew, or more coefficients.
+        OutputError: the file cannot be written.
+    """
+    if unit not in LENGTHS:
+        raise SettingsError("unit", expected=" or ".join(LENGTHS), found=unit)
+    _check_writable(rig)
+    num_coefficients = min(rig.cameras.dist.shape[-1], _MOST_COEFFICIENTS) if rig.cameras.dist.any() else 0
+    header = [
+        "cam_name",
+        *(f"cam_{axis}[{unit}]" for axis in "xyz"),
+        *(f"cam_or_{axis}[rad]" for axis in "xyz"),
+        "focal_length",
+        "cx",
+        "cy",
+        *(f"coeff_{number + 1}" for number in range(num_coefficients)),
+    ]
+    rows = [_calibration_row(rig, index, unit, num_coefficients) for index in range(len(rig))]
+    write_rows(path, [header, *rows])
+
+
+def _calibration_row(rig: CameraRig, index: int, unit: str, num_coefficients: int) -> list[object]:
+    one: Camera = rig.cameras[index]
+    return [
+        rig.names[index],
+        *(one.T_cam_world[:3, 3] / LENGTHS[unit]),
+        *Rotation.from_matrix(one.T_cam_world[:3, :3]).as_rotvec(),
+        *(one.K[0, 0], one.K[0, 2], one.K[1, 2]),
+        *one.dist[:num_coefficients],
+    ]
+
+
+def _check_writable(rig: CameraRig) -> None:
+    K = rig.cameras.K
+    if np.any(K[:, 0, 0] != K[:, 1, 1]) or np.any(K[:, 0, 1]):
+        raise SettingsError(
+            "rig", expected="one focal length per camera and no skew", found="cameras with other intrinsics"
+        )
+    if rig.cameras.dist[:, _MOST_COEFFICIENTS:].any():
+        raise SettingsError("rig", expected="distortion by k1, k2, p1, p2 alone", found="more coefficients")
+
+
+def _intrinsics(table: Table, row: TextRow) -> Float[np.ndarray, "3 3"]:
+    column = table.column("focal_length")
+    focal_length_px = row.number(column)
+    if focal_length_px <= 0:
+        raise row.wrong(column, "a focal length above 0 pixels", f"{focal_length_px:g}")
+    cx, cy = (row.number(table.column(name)) for name in ("cx", "cy"))
+    return np.array([[focal_length_px, 0, cx], [0, focal_length_px, cy], [0, 0, 1]])
+
+
+def _coefficient_columns(table: Table) -> list[Column]:
+    """k1, k2, p1, p2, all or none."""
+    there = [column for column in table.columns if column.name.startswith("coeff")]
+    if not there:
+        return []
+    if len(there) > _MOST_COEFFICIENTS:
+        raise InputError(
+            table.path,
+            expected=f"{_MOST_COEFFICIENTS} distortion coefficients",
+            found=f"{len(there)}: {', '.join(column.header for column in there)}",
+        )
+    return [table.column(f"coeff_{number + 1}") for number in range(_MOST_COEFFICIENTS)]
+
+
+def _numbers(row: TextRow, columns: list[Column]) -> Float[np.ndarray, " columns"]:
+    return np.array([row.number(column) for column in columns], np.float64)

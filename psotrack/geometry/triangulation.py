@@ -1,0 +1,260 @@
+"""Projection lines: points in space from the pixels of several cameras, in float64 (paper, equations 1-6).
+
+Each camera that sees a point adds two linear equations in its three unknown coordinates; the overdetermined system is
+solved in the least-squares sense. The lens is undone first, so that the equations are linear.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from psotrack.geometry.cameras import Camera, project, undistort
+
+#: Rays that fix a point less well than this are parallel.
+MAX_CONDITION = 1e12
+#: Points in one cube with such sides are the same.
+SAME_M = 0.01
+
+
+def triangulate(
+    cameras: Camera,
+    points_px: Float[np.ndarray, "*points cameras 2"],
+    weights: Float[np.ndarray, "*points cameras"] | None = None,
+) -> Float[np.ndarray, "*points 3"]:
+    """World points from pixels, by the normal equations of (3)-(6) in normalised image coordinates.
+
+    Args:
+        cameras: with one leading axis.
+        points_px: (..., cameras, 2); NaN where a camera does not see the point.
+        weights: (..., cameras), how much each camera's two equations count; 1 where not given.
+
+    Returns:
+        (..., 3), world, metres; NaN where fewer than two cameras see the point, or all their rays are parallel.
+    """
+    normal, right, seen = _normal_equations(cameras, points_px, weights)
+    return np.where(seen.sum(axis=-1, keepdims=True) >= 2, solve_normal(normal, right), np.nan)
+
+
+def triangulate_paths(
+    cameras: Camera,
+    points_px: Float[np.ndarray, "*paths frames cameras 2"],
+    time_s: Float[np.ndarray, "frames"],
+    weights: Float[np.ndarray, "*paths frames cameras"] | None = None,
+    *,
+    noise_m: float = 0.02,
+    expected: tuple[float, ...] = (3.0, 2.0),
+) -> Float[np.ndarray, "*paths terms 3"]:
+    """Paths of points that move, X(t) = Σ c_k t^k, from all of their pixels at once.
+
+    The equations of `triangulate` with X(t) in place of X, and one for each motion: c_k is about 0, give or take
+    `expected`. So frames in which fewer than two cameras see the point count too, and short paths are straight.
+
+    Args:
+        cameras: with one leading axis.
+        points_px: (..., frames, cameras, 2); NaN where a camera does not see the point.
+        time_s: (frames,).
+        weights: (..., frames, cameras), how much each camera's two equations count; 1 where not given.
+        noise_m: standard deviation of a camera's equations, in metres at the point.
+        expected: standard deviations of c_1, c_2 ... in m/s, m/s² ...; as many as the path has.
+
+    Returns:
+        (..., 1 + len(expected), 3), c_0, c_1 ..., metres and seconds; NaN where fewer than two cameras see the point
+        at any time, or all their rays are parallel.
+    """
+    normal, right, seen = _normal_equations(cameras, points_px, weights)
+    solvable = seen.any(axis=-2).sum(axis=-1) >= 2
+    solvable &= np.linalg.cond(normal.sum(axis=-3)) < MAX_CONDITION
+    terms = 1 + len(expected)
+    power = time_s[:, None] ** np.arange(terms)
+    whole = np.einsum("fk,fl,...fij->...kilj", power, power, normal)
+    whole = whole.reshape(*whole.shape[:-4], 3 * terms, 3 * terms)
+    stiffness = np.repeat([0.0, *((noise_m / std) ** 2 for std in expected)], 3)
+    whole = np.where(solvable[..., None, None], whole + np.diag(stiffness), np.eye(3 * terms))
+    rights = np.einsum("fk,...fi->...ki", power, right)
+    path = np.linalg.solve(whole, rights.reshape(*rights.shape[:-2], 3 * terms, 1))
+    return np.where(solvable[..., None, None], path.reshape(rights.shape), np.nan)
+
+
+def projection_equations(
+    cameras: Camera, points_px: Float[np.ndarray, "*points cameras 2"], num_iterations: int = 20
+) -> tuple[
+    Float[np.ndarray, "*points cameras 2 3"],
+    Float[np.ndarray, "*points cameras 2"],
+    Bool[np.ndarray, "*points cameras"],
+]:
+    """Rows (3) of the paper, L X = B, with lens and K undone: (x r3 - r1) X = t1 - x t3, and the same for y.
+
+    Args:
+        cameras: with one leading axis.
+        points_px: (..., cameras, 2); NaN where a camera does not see the point.
+        num_iterations: that undo the lens, see `undistort`.
+
+    Returns:
+        L (..., cameras, 2, 3), B (..., cameras, 2), and which cameras see the points (..., cameras). Rows of a camera
+        that does not are finite, and of no meaning.
+    """
+    normalised = undistort(cameras, points_px, num_iterations)
+    seen = np.isfinite(normalised).all(axis=-1)
+    normalised = np.where(seen[..., None], normalised, 0.0)
+    T = np.asarray(cameras.T_cam_world)
+    rows = normalised[..., :, None] * T[:, 2, None, :3] - T[:, :2, :3]
+    return rows, T[:, :2, 3] - normalised * T[:, 2, None, 3], seen
+
+
+def _normal_equations(
+    cameras: Camera,
+    points_px: Float[np.ndarray, "*points cameras 2"],
+    weights: Float[np.ndarray, "*points cameras"] | None,
+) -> tuple[
+    Float[np.ndarray, "*points 3 3"], Float[np.ndarray, "*points 3"], Bool[np.ndarray, "*points cameras"]
+]:
+    """Left and right side of the normal equations, summed over the cameras, and which cameras see the points."""
+    rows, right, seen = projection_equations(cameras, points_px)
+    weights = seen * (1.0 if weights is None else weights)
+    normal = np.einsum("...c,...cik,...cil->...kl", weights, rows, rows)
+    return normal, np.einsum("...c,...cik,...ci->...k", weights, rows, right), seen
+
+
+def solve_normal(
+    normal: Float[np.ndarray, "*points 3 3"], right: Float[np.ndarray, "*points 3"]
+) -> Float[np.ndarray, "*points 3"]:
+    """(..., 3), where the normal equations hold; NaN where they fix no point."""
+    solvable = np.linalg.cond(normal) < MAX_CONDITION
+    point = np.linalg.solve(np.where(solvable[..., None, None], normal, np.eye(3)), right[..., None])
+    return np.where(solvable[..., None], point[..., 0], np.nan)
+
+
+def viewpoints(cameras: Camera, nearest_m: float = 0.3) -> Int[np.ndarray, "cameras"]:
+    """Number of the viewpoint of each camera: cameras nearer than `nearest_m` to one another share one.
+
+    Two cameras that stand beside each other see a drone twice but locate it hardly better than one.
+    """
+    centre = cameras.centre_world
+    label = np.arange(len(centre))
+    for a, b in combinations(range(len(centre)), 2):
+        if np.linalg.norm(centre[a] - centre[b]) < nearest_m:
+            label[label == label[b]] = label[a]
+    return label
+
+
+def match_views(
+    cameras: Camera,
+    points_px: list[Float[np.ndarray, "_ 2"]],
+    radius_px: list[Float[np.ndarray, "_"]],
+    bounds_m: Float[np.ndarray, "2 3"],
+    *,
+    min_viewpoints: int = 3,
+    separation_m: float = 0.3,
+) -> tuple[Float[np.ndarray, "found 3"], Int[np.ndarray, "found cameras"]]:
+    """Points in space that explain 2D points of several cameras, when nobody says which belong together.
+
+    Every pair of 2D points from two viewpoints proposes a point in space; a proposal is supported by the cameras that
+    have a 2D point within its radius of where it projects to. Proposals are accepted greedily, best supported first.
+    Each must have `min_viewpoints` 2D points of its own that no accepted one has used: two views alone cannot tell
+    real drones from the crossings of different drones' rays.
+
+    Args:
+        cameras: with one leading axis.
+        points_px: for each camera (n, 2), n may be 0.
+        radius_px: for each camera (n,), how far from the 2D point a projection still fits.
+        bounds_m: (2, 3), corners of the region where points are sought.
+        min_viewpoints: least number of viewpoints (see `viewpoints`).
+        separation_m: no two points are nearer than this.
+
+    Returns:
+        (found, 3) points, and (found, cameras) the index of the 2D point that each camera sees it at, or -1.
+    """
+    viewpoint = viewpoints(cameras)
+    proposals, support = candidates(cameras, points_px, radius_px, bounds_m)
+    found: list[int] = []
+    free = support >= 0
+    while len(proposals):
+        own = np.array([len(set(viewpoint[row])) for row in free])
+        total = (support >= 0).sum(axis=-1)
+        best = int(np.lexsort((total, own))[-1])
+        if own[best] < min_viewpoints:
+            break
+        found.append(best)
+        used = (support == support[best]) & (support[best] >= 0)
+        free &= ~used
+        near = np.linalg.norm(proposals - proposals[best], axis=-1) < separation_m
+        free[near] = False
+    return proposals[found], support[found]
+
+
+def candidates(
+    cameras: Camera,
+    points_px: list[Float[np.ndarray, "_ 2"]],
+    radius_px: list[Float[np.ndarray, "_"]],
+    bounds_m: Float[np.ndarray, "2 3"],
+) -> tuple[Float[np.ndarray, "candidates 3"], Int[np.ndarray, "candidates cameras"]]:
+    """Every point in space that 2D points of two viewpoints or more agree on; most of them are nothing's place.
+
+    Arguments and results are those of `match_views`; of candidates in one cube with sides of `SAME_M` one is kept.
+    """
+    points = _proposals(cameras, points_px, viewpoints(cameras))
+    # From two rays to all that agree. What fits badly counts little: the middle of a blob that two drones share.
+    for _ in range(3):
+        points = points[_within(points, bounds_m)]
+        support, fit = _support(cameras, points, points_px, radius_px)
+        points = triangulate(cameras, _pick(points_px, support), fit**2)
+    # Not a number is not within either.
+    kept = np.flatnonzero(_within(points, bounds_m))
+    _, first = np.unique(np.round(points[kept] / SAME_M), axis=0, return_index=True)
+    return points[kept[first]], support[kept[first]]
+
+
+def _within(
+    points: Float[np.ndarray, "points 3"], bounds_m: Float[np.ndarray, "2 3"]
+) -> Bool[np.ndarray, "points"]:
+    return ((points >= bounds_m[0]) & (points <= bounds_m[1])).all(axis=-1)
+
+
+def _proposals(
+    cameras: Camera, points_px: list[Float[np.ndarray, "_ 2"]], viewpoint: Int[np.ndarray, "cameras"]
+) -> Float[np.ndarray, "proposals 3"]:
+    """A point for every pair of 2D points from two viewpoints."""
+    proposals = [np.empty((0, 3))]
+    for a, b in combinations(range(len(points_px)), 2):
+        if viewpoint[a] != viewpoint[b] and len(points_px[a]) and len(points_px[b]):
+            first, second = np.meshgrid(np.arange(len(points_px[a])), np.arange(len(points_px[b])))
+            pairs = np.stack([points_px[a][first.ravel()], points_px[b][second.ravel()]], axis=1)
+            proposals.append(triangulate(cameras[np.array([a, b])], pairs))
+    points = np.concatenate(proposals)
+    return points[np.isfinite(points).all(axis=-1)]
+
+
+def _support(
+    cameras: Camera,
+    proposals: Float[np.ndarray, "proposals 3"],
+    points_px: list[Float[np.ndarray, "_ 2"]],
+    radius_px: list[Float[np.ndarray, "_"]],
+) -> tuple[Int[np.ndarray, "proposals cameras"], Float[np.ndarray, "proposals cameras"]]:
+    """Index of the nearest 2D point of each camera that fits the proposal, or -1; and how well it fits, 1 to 0."""
+    pixels, depth = project(cameras, proposals[:, None, :])
+    support, fit = np.full(depth.shape, -1), np.zeros(depth.shape)
+    for camera, (points, radius) in enumerate(zip(points_px, radius_px, strict=True)):
+        if len(points):
+            distance = np.linalg.norm(pixels[:, camera, None, :] - points, axis=-1)
+            distance = np.where((distance <= radius) & (depth[:, camera, None] > 0), distance, np.inf)
+            nearest = distance.argmin(axis=-1)
+            distance = distance.min(axis=-1)
+            fits = np.isfinite(distance)
+            support[fits, camera] = nearest[fits]
+            fit[fits, camera] = 1 - (distance[fits] / radius[nearest[fits]]) ** 2
+    return support, fit
+
+
+def _pick(
+    points_px: list[Float[np.ndarray, "_ 2"]], support: Int[np.ndarray, "proposals cameras"]
+) -> Float[np.ndarray, "proposals cameras 2"]:
+    """The 2D points that support each proposal, NaN where a camera has none."""
+    picked = np.full((*support.shape, 2), np.nan)
+    for camera, points in enumerate(points_px):
+        rows = np.flatnonzero(support[:, camera] >= 0)
+        if len(rows):
+            picked[rows, camera] = points[support[rows, camera]]
+    return picked

@@ -1,0 +1,31 @@
+from .initial_state import find_initial_state, known_motion, room_bounds
+from .initialisation import FLOOR_CLEARANCE_M, InitialState
+from .new_tracks import TrackCandidate, find_candidates
+from .reidentification import (
+    NEW,
+    SPEED_SHARE,
+    LostTracks,
+    PlannedStarts,
+    find_false_tracks,
+    find_lost_tracks,
+    plan_starts,
+    reidentify,
+)
+
+__all__ = [
+    "FLOOR_CLEARANCE_M",
+    "NEW",
+    "SPEED_SHARE",
+    "InitialState",
+    "LostTracks",
+    "PlannedStarts",
+    "TrackCandidate",
+    "find_candidates",
+    "find_false_tracks",
+    "find_initial_state",
+    "find_lost_tracks",
+    "known_motion",
+    "plan_starts",
+    "reidentify",
+    "room_bounds",
+]

@@ -1,0 +1,9 @@
+"""How a drone moves: a Kalman filter with white jerk and lasting measurement errors, and its smoother.
+
+In: measured positions with covariances. Out: filtered (`kalman`) and smoothed (`smoothing`) states with covariances.
+The functions of `kalman` are pure and run inside the tracker's compiled scan.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

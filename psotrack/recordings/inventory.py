@@ -1,0 +1,95 @@
+"""What a sequence holds, as a record for programs and a table for people: the command `psotrack info`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from psotrack.recordings.detections import read_detections
+from psotrack.recordings.sequence import Sequence
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+def contents(sequence: Sequence) -> dict[str, Any]:
+    """Cameras, videos, detections and reference of a sequence; detections are read whole.
+
+    Raises:
+        InputError: a file of detections is broken.
+    """
+    cameras: dict[str, dict[str, Any]] = {}
+    for index, name in enumerate(sequence.rig.names):
+        cam, video = sequence.rig.cameras[index], sequence.videos.get(name)
+        detections = (sequence.detections or {}).get(name)
+        cameras[name] = {
+            "video": str(video.path) if video else None,
+            "frames": video.num_frames if video else None,
+            "fps": video.fps if video else None,
+            "image_size_wh": [int(side) for side in cam.image_size_wh],
+            "focal_length_px": float(cam.K[0, 0]),
+            "centre_m": [round(float(value), 4) for value in cam.centre_world],
+            "detections": len(read_detections(detections)) if detections else None,
+        }
+    onboard: dict[str, dict[str, Any]] = {}
+    for name, one in (sequence.onboard or {}).items():
+        onboard[name] = {
+            "video": str(one.video.path),
+            "frames": one.video.num_frames,
+            "fps": one.video.fps,
+            "image_size_wh": list(one.video.image_size_wh),
+            "focal_length_px": None if one.K is None else float(one.K[0, 0]),
+            "frames_with_pose": int(np.isfinite(one.orientation_wxyz).all(axis=1).sum()),
+        }
+    truth = sequence.truth
+    return {
+        "name": sequence.name,
+        "folder": str(sequence.folder),
+        "cameras": cameras,
+        "onboard": onboard or None,
+        "drones": list(truth.drones) if truth else None,
+        "frames_with_truth": int(np.count_nonzero(truth.seen.any(axis=1))) if truth else None,
+    }
+
+
+def render(content: dict[str, Any]) -> Table:
+    """The record as a table, one row per camera; those on drones come last."""
+    from rich import box
+    from rich.table import Table
+
+    drones = content["drones"]
+    reference = (
+        f"reference of {', '.join(drones)} in {content['frames_with_truth']} frames"
+        if drones is not None
+        else "no reference"
+    )
+    table = Table(
+        title=f"{content['name']}: {reference}", title_justify="left", box=box.HORIZONTALS, show_edge=False
+    )
+    for name in ("camera", "frames", "fps", "size", "f (px)", "centre (m)", "detections"):
+        table.add_column(name, justify="left" if name == "camera" else "right")
+    for name, camera in content["cameras"].items():
+        width, height = camera["image_size_wh"]
+        table.add_row(
+            name,
+            "no video" if camera["frames"] is None else f"{camera['frames']}",
+            "" if camera["fps"] is None else f"{camera['fps']:g}",
+            f"{width} x {height}",
+            f"{camera['focal_length_px']:.1f}",
+            " ".join(f"{value:.2f}" for value in camera["centre_m"]),
+            "" if camera["detections"] is None else f"{camera['detections']}",
+        )
+    for name, camera in (content["onboard"] or {}).items():
+        width, height = camera["image_size_wh"]
+        focal_length_px = camera["focal_length_px"]
+        table.add_row(
+            f"on {name}",
+            f"{camera['frames']}",
+            f"{camera['fps']:g}",
+            f"{width} x {height}",
+            "" if focal_length_px is None else f"{focal_length_px:.1f}",
+            f"{camera['frames_with_pose']} poses",
+            "",
+        )
+    return table

@@ -1,0 +1,322 @@
+"""Videos: what is in them, their frames in order, writing them, and joining them.
+
+FFmpeg, inside OpenCV, decodes and encodes. It believes containers, drops frames that it cannot decode and
+fails to write without a word; here each of these is an error that names the file. Frame rates stay as exact
+as the container holds them: 29.97 truncated to 29 is a second lost in every half minute.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import threading
+from collections.abc import Iterator
+from collections.abc import Sequence as Ordered
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from psotrack.errors import InputError, OutputError, SettingsError, check_positive
+from psotrack.support import written_whole
+
+#: MPEG-4 part 2: OpenCV's own wheel encodes and decodes it, and decodes it faster than MJPEG.
+_CODEC = "XVID"
+_FFMPEG_LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
+_FFMPEG_QUIET = "-8"
+#: What makes a writer take coded frames, key frames being those that are said to be.
+_CODED = (cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1, cv2.VIDEOWRITER_PROP_KEY_INTERVAL, 2**31 - 1)
+_opening = threading.Lock()
+
+
+@dataclass(frozen=True)
+class VideoInfo:
+    """A video file that was opened once.
+
+    Attributes:
+        path: of the file.
+        num_frames: as the container's header says, above 0; lower it with `dataclasses.replace` to use only
+            the leading frames.
+        fps: frames per second, as exact as the container holds it.
+        image_size_wh: width and height in pixels.
+    """
+
+    path: Path
+    num_frames: int
+    fps: float
+    image_size_wh: tuple[int, int]
+
+
+def probe(path: Path) -> VideoInfo:
+    """What the header of a video says. Nothing is decoded: it takes `read_frames` to find a file cut short.
+
+    Raises:
+        InputError: there is no such file, it is empty or no video, or it has no frames.
+    """
+    capture = _open(path)
+    try:
+        num_frames = round(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        fps = capture.get(cv2.CAP_PROP_FPS)
+        width, height = (
+            round(capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+        )
+    finally:
+        capture.release()
+    if num_frames < 1:
+        raise InputError(path, expected="a video with frames", found="none in it")
+    if not (math.isfinite(fps) and fps > 0):
+        raise InputError(path, expected="a video with a frame rate", found=f"{fps:g} frames per second")
+    return VideoInfo(path, num_frames, fps, (width, height))
+
+
+def read_frames(video: VideoInfo, step: int = 1) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    """Frames 0, step, 2 step, ... below `video.num_frames`, in order: BGR, (height, width, 3), uint8.
+
+    Frames in between are decoded, because that is how video codecs work, but not converted.
+
+    Raises:
+        InputError: the file ends, or breaks, before its last frame; or a frame has another size.
+    """
+    if step < 1:
+        raise SettingsError("step", expected="1 or more", found=f"{step}")
+    width, height = video.image_size_wh
+    capture = _open(video.path)
+    try:
+        for index in range(video.num_frames):
+            if not capture.grab():
+                raise _ended_early(video, index)
+            if index % step:
+                continue
+            decoded, frame = capture.retrieve()
+            if not decoded:
+                raise _ended_early(video, index)
+            if frame.shape != (height, width, 3):
+                raise InputError(
+                    video.path,
+                    expected=f"{width} x {height} pixels",
+                    found=f"{frame.shape[1]} x {frame.shape[0]} in frame {index}",
+                )
+            yield frame
+    finally:
+        capture.release()
+
+
+class VideoWriter:
+    """Writes BGR frames to an .avi file, lossily (MPEG-4); it appears at `path` when the block ends well.
+
+    The container holds the frame rate to 0.001 per second.
+
+    Args:
+        path: of the file, ending in .avi; its folder is made.
+        fps: frames per second.
+        image_size_wh: even width and height in pixels.
+
+    Raises:
+        SettingsError: the suffix, the rate or the size cannot be written; a frame has another size.
+        OutputError: the file cannot be written, or not wholly: the disk is full.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with VideoWriter(Path(folder) / "cam1i_s.avi", 25.0, (64, 48)) as writer:
+        ...         writer.write(np.zeros((48, 64, 3), np.uint8))
+        ...     probe(Path(folder) / "cam1i_s.avi").num_frames
+        1
+    """
+
+    def __init__(self, path: Path, fps: float, image_size_wh: tuple[int, int]) -> None:
+        if path.suffix.lower() != ".avi":
+            raise SettingsError("video", expected="a file name ending in .avi", found=path.name)
+        check_positive("fps", fps)
+        if any(side < 2 or side % 2 for side in image_size_wh):
+            raise SettingsError(
+                "image size",
+                expected="even numbers of pixels, as the codec halves the colours",
+                found=f"{image_size_wh[0]} x {image_size_wh[1]}",
+            )
+        self._path = path
+        self._fps = fps
+        self._size_wh = image_size_wh
+        self._num_frames = 0
+        self._open_until_exit = contextlib.ExitStack()
+
+    def __enter__(self) -> VideoWriter:
+        with contextlib.ExitStack() as stack:
+            self._temporary = stack.enter_context(written_whole(self._path))
+            self._writer = _writer(self._path, self._temporary, self._fps, self._size_wh)
+            # From here on __exit__ answers for the temporary file.
+            self._open_until_exit = stack.pop_all()
+        return self
+
+    def write(self, bgr: UInt8[np.ndarray, "height width 3"]) -> None:
+        """Append one frame, (height, width, 3)."""
+        width, height = self._size_wh
+        if bgr.shape != (height, width, 3):
+            raise SettingsError("frame", expected=f"shape {(height, width, 3)}", found=f"{bgr.shape}")
+        self._writer.write(bgr)
+        self._num_frames += 1
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        with self._open_until_exit:
+            self._writer.release()
+            if error is not None:
+                raise error
+            _check_written(self._path, self._temporary, self._num_frames)
+
+
+def join_videos(path: Path, parts: Ordered[Path]) -> None:
+    """Write the frames of several videos into one, as they are coded; it appears at `path` when it is whole.
+
+    Decoding it yields what decoding the parts one after the other does, and frames can be sought as in them.
+
+    Args:
+        path: of the new file, ending in .avi.
+        parts: videos of one size and one rate that `VideoWriter` wrote, at least one.
+
+    Raises:
+        InputError: a part cannot be read, ends early, or has another size or rate than the first.
+        OutputError: the file cannot be written, or not wholly: the disk is full.
+    """
+    videos = [probe(part) for part in parts]
+    first = videos[0]
+    for video in videos:
+        if (video.fps, video.image_size_wh) != (first.fps, first.image_size_wh):
+            raise InputError(
+                video.path, expected=f"{_kind(first)} as in {first.path.name}", found=_kind(video)
+            )
+    with written_whole(path) as temporary:
+        writer = _writer(path, temporary, first.fps, first.image_size_wh, _CODED)
+        try:
+            for video in videos:
+                _copy_packets(video, writer)
+        finally:
+            writer.release()
+        _check_written(path, temporary, sum(video.num_frames for video in videos))
+
+
+def _writer(
+    path: Path, temporary: Path, fps: float, image_size_wh: tuple[int, int], settings: Ordered[int] = ()
+) -> cv2.VideoWriter:
+    codec = cv2.VideoWriter.fourcc(*_CODEC)
+    with quiet():
+        writer = cv2.VideoWriter(
+            os.path.abspath(temporary), cv2.CAP_FFMPEG, codec, fps, image_size_wh, settings
+        )
+    if not writer.isOpened():
+        raise OutputError(path, expected="to write a video", found="that it cannot be opened")
+    return writer
+
+
+def _check_written(path: Path, temporary: Path, num_frames: int) -> None:
+    # FFmpeg's failed writes are silent, and the header may promise every frame still: count them.
+    found = _count_packets(temporary) if num_frames else 0
+    if found != num_frames or found == 0 or not _has_its_end(temporary):
+        raise OutputError(
+            path,
+            expected=f"to write {num_frames} frames" if num_frames else "at least one frame",
+            found=f"{found} written" if found != num_frames or found == 0 else "their index cut off",
+            remedy="is the disk full? earlier results are unchanged" if num_frames else "",
+        )
+
+
+def _has_its_end(path: Path) -> bool:
+    """Whether an AVI file is as long as its chunks `RIFF` say; the last thing in them is the index of frames."""
+    size, position = path.stat().st_size, 0
+    with path.open("rb") as file:
+        while position < size:
+            file.seek(position)
+            name, length = file.read(4), file.read(4)
+            if name != b"RIFF":
+                return False
+            position += 8 + int.from_bytes(length, "little")
+    return position == size
+
+
+def _copy_packets(video: VideoInfo, writer: cv2.VideoWriter) -> None:
+    capture = _open(video.path)
+    try:
+        capture.set(cv2.CAP_PROP_FORMAT, -1)
+        for index in range(video.num_frames):
+            there, packet = capture.read()
+            if not there:
+                raise _ended_early(video, index)
+            writer.set(cv2.VIDEOWRITER_PROP_KEY_FLAG, capture.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME))
+            writer.write(packet)
+    finally:
+        capture.release()
+
+
+def _kind(video: VideoInfo) -> str:
+    return "{} x {} pixels at {:g} Hz".format(*video.image_size_wh, video.fps)
+
+
+def _open(path: Path) -> cv2.VideoCapture:
+    try:
+        with path.open("rb") as file:
+            empty = not file.read(1)
+    except OSError as error:
+        raise InputError(path, expected="a video", found=(error.strerror or str(error)).lower()) from error
+    if empty:
+        raise InputError(path, expected="a video", found="an empty file")
+    with quiet():
+        # An absolute path, because FFmpeg takes what stands before a colon for a protocol.
+        capture = cv2.VideoCapture(os.path.abspath(path), cv2.CAP_FFMPEG)
+    if not capture.isOpened():
+        raise InputError(path, expected="a video", found="a file that FFmpeg cannot open")
+    return capture
+
+
+def _count_packets(path: Path) -> int:
+    """Number of coded frames in the file, without decoding them: some microseconds each."""
+    try:
+        capture = _open(path)
+    except InputError:
+        return 0
+    try:
+        capture.set(cv2.CAP_PROP_FORMAT, -1)
+        count = 0
+        while capture.grab():
+            count += 1
+        return count
+    finally:
+        capture.release()
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """No words from OpenCV and FFmpeg about a file that is opened here; this module's errors say it better.
+
+    FFmpeg reads its level from the environment at each opening and holds it until the next; a user's own is
+    kept.
+    """
+    with _opening:
+        level = cv2.utils.logging.getLogLevel()
+        chosen = _FFMPEG_LOG_LEVEL in os.environ
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        os.environ.setdefault(_FFMPEG_LOG_LEVEL, _FFMPEG_QUIET)
+        try:
+            yield
+        finally:
+            cv2.utils.logging.setLogLevel(level)
+            if not chosen:
+                del os.environ[_FFMPEG_LOG_LEVEL]
+
+
+def _ended_early(video: VideoInfo, index: int) -> InputError:
+    return InputError(
+        video.path,
+        expected=f"{video.num_frames} frames",
+        found=f"that only {index} can be decoded (frame {index} is missing or broken)",
+        remedy=f"copy it anew; if just its end is missing, --frames {index} uses the rest"
+        if index
+        else "copy it anew",
+    )

@@ -1,0 +1,24 @@
+from .blobs import LEAST_RADIUS_CELLS, ViewBlobs, all_blobs, find_blobs
+from .computation import Silhouettes, compute
+from .foreground import Shadows, check_whole
+from .store import SilhouetteSettings, key_of, open_stored, reduced_shape
+from .summed_area import box_sum, of_packed_box_sums, pack, summed_area_table
+
+__all__ = [
+    "LEAST_RADIUS_CELLS",
+    "Shadows",
+    "SilhouetteSettings",
+    "Silhouettes",
+    "ViewBlobs",
+    "all_blobs",
+    "box_sum",
+    "check_whole",
+    "compute",
+    "find_blobs",
+    "key_of",
+    "of_packed_box_sums",
+    "open_stored",
+    "pack",
+    "reduced_shape",
+    "summed_area_table",
+]

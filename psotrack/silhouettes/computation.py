@@ -1,0 +1,161 @@
+"""Silhouettes of all cameras: computed once, in parallel, then read from the store piece by piece."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import zarr
+from jaxtyping import UInt8
+
+from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.recordings import Sequence
+from psotrack.silhouettes.foreground import check_whole
+from psotrack.silhouettes.store import (
+    SilhouetteSettings,
+    Task,
+    frames_to_decode,
+    key_of,
+    open_stored,
+    reduced_shape,
+    remove_stale,
+    store,
+)
+from psotrack.support import Report, map_in_processes, silent
+
+__all__ = ["SilhouetteSettings", "Silhouettes", "compute"]
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Silhouettes:
+    """Stored silhouettes of all cameras of a sequence.
+
+    Attributes:
+        cameras: names, in the order of the rig.
+        keys: by camera name: what the silhouettes are stored under.
+        reduction: r; cell (i, j) covers the pixels [r * i, r * i + r) x [r * j, r * j + r), beyond the border
+            of the image background.
+        num_frames: of each camera.
+        shape: height and width of one silhouette.
+        seconds: spent on "decode" and "foreground", summed over workers; 0 for what was read from the store.
+        arrays: one (frames, height, width) per camera, stored or in memory.
+    """
+
+    cameras: tuple[str, ...]
+    keys: Mapping[str, str]
+    reduction: int
+    num_frames: int
+    shape: tuple[int, int]
+    seconds: Mapping[str, float]
+    arrays: tuple[zarr.Array | UInt8[np.ndarray, "frames height width"], ...]
+
+    def read(self, start: int, stop: int) -> UInt8[np.ndarray, "frames cameras height width"]:
+        """Coverage of the frames [start, stop), 0 to 255: (frames, cameras, height, width).
+
+        Raises:
+            SettingsError: there are no such frames.
+            InputError: the store was damaged after it was opened.
+        """
+        if not 0 <= start <= stop <= self.num_frames:
+            raise SettingsError(
+                "frames", expected=f"a part of 0 to {self.num_frames}", found=f"{start} to {stop}"
+            )
+        frames = np.empty((stop - start, len(self.cameras), *self.shape), np.uint8)
+        for index, array in enumerate(self.arrays):
+            try:
+                frames[:, index] = array[start:stop]
+            except (OSError, ValueError, RuntimeError) as error:
+                raise InputError(
+                    f"silhouettes {self.keys[self.cameras[index]]}",
+                    expected="what was stored",
+                    found=f"{error}",
+                    remedy="remove that folder from the cache to have it made anew",
+                ) from error
+        return frames
+
+
+def compute(
+    sequence: Sequence,
+    settings: SilhouetteSettings = SilhouetteSettings(),  # noqa: B008  frozen
+    *,
+    cache: Path,
+    jobs: int | None = None,
+    report: Report = silent,
+) -> Silhouettes:
+    """The silhouettes of a sequence: those that `cache` holds are read, the others are computed and stored.
+
+    Each camera is stored under a key of its video's content, the frames used and every setting, as soon as it
+    is finished: a call that was interrupted, by whatever, goes on with the cameras that are missing.
+
+    Args:
+        sequence: with a video for each camera, all of one length and size.
+        settings: how silhouettes are made.
+        cache: folder of the store; made if it is not there.
+        jobs: at most so many processes; None is one per processor.
+        report: told of the frames of all cameras, those that teach the background included.
+
+    Raises:
+        InputError: a video is missing, unreadable, ends early, or differs from the others in length or size.
+        SettingsError: `jobs` is below 1.
+        OutputError: the store cannot be written; the cameras that were finished stay.
+    """
+    jobs = jobs if jobs is not None else os.cpu_count() or 1
+    check_whole("jobs", jobs, lowest=1)
+    sequence = sequence.usable()
+    cameras = sequence.rig.names
+    videos = [sequence.videos[name] for name in cameras]
+    shape = reduced_shape(videos[0], settings.reduction)
+    with ThreadPoolExecutor(jobs) as threads:
+        keys = list(threads.map(partial(key_of, settings=settings), videos))
+    tasks = [Task(video, settings, cache, key) for video, key in zip(videos, keys, strict=True)]
+    seconds = _make_missing(tasks, shape, jobs, report)
+    return Silhouettes(
+        cameras=cameras,
+        keys=dict(zip(cameras, keys, strict=True)),
+        reduction=settings.reduction,
+        num_frames=sequence.num_frames,
+        shape=shape,
+        seconds=seconds,
+        arrays=tuple(_opened(task, shape) for task in tasks),
+    )
+
+
+def _make_missing(tasks: list[Task], shape: tuple[int, int], jobs: int, report: Report) -> dict[str, float]:
+    """Store what is not stored yet; the seconds that it took, summed over the workers."""
+    # By key: two cameras of the same content are one.
+    missing = list({task.key: task for task in tasks if _stored(task, shape) is None}.values())
+    seconds = {"decode": 0.0, "foreground": 0.0}
+    if not missing:
+        return seconds
+    logger.info("silhouettes: %d of %d videos are to be done", len(missing), len(tasks))
+    cache = missing[0].cache
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            cache, expected="a folder to write to", found=error.strerror or f"{error}"
+        ) from error
+    remove_stale(cache)
+    with report("silhouettes", sum(frames_to_decode(task) for task in missing)) as advance:
+        for taken in map_in_processes(store, missing, jobs=jobs, advance=advance):
+            seconds = {stage: seconds[stage] + taken[stage] for stage in seconds}
+    return seconds
+
+
+def _stored(task: Task, shape: tuple[int, int]) -> zarr.Array | None:
+    return open_stored(task.cache / task.key, task.video.num_frames, shape)
+
+
+def _opened(task: Task, shape: tuple[int, int]) -> zarr.Array:
+    array = _stored(task, shape)
+    if array is None:
+        raise InputError(task.cache / task.key, expected="the silhouettes just stored", found="no such thing")
+    return array

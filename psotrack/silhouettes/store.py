@@ -1,0 +1,220 @@
+"""The silhouettes of one video on disk: a zarr array under a key that is made of everything that made it.
+
+Imports no JAX, because every worker process imports this module.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import secrets
+import shutil
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import zarr
+from jaxtyping import UInt8
+from zarr.codecs import ZstdCodec
+
+from psotrack.errors import OutputError, SettingsError
+from psotrack.recordings import VideoInfo, read_frames
+from psotrack.silhouettes.foreground import (
+    ForegroundSettings,
+    check_whole,
+    coverage,
+    foreground,
+    learning_step,
+)
+from psotrack.support import Advance, digest_of
+
+logger = logging.getLogger(__name__)
+
+#: Part of every key: to be raised whenever the same settings would give other silhouettes.
+SCHEMA = 1
+
+#: Frames that are compressed and read together.
+CHUNK_FRAMES = 25
+
+#: Unfinished work that nobody wrote to for so long is of a process that was killed.
+_STALE_S = 24 * 3600
+
+
+class SilhouetteSettings(ForegroundSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How silhouettes are made: `ForegroundSettings`, and how far they are reduced.
+
+    Attributes:
+        reduction: a stored value covers `reduction` x `reduction` pixels; a multiple of `working_reduction`.
+
+    Raises:
+        SettingsError: a value makes no sense.
+    """
+
+    reduction: int = 4
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_whole("reduction", self.reduction, lowest=1)
+        if self.reduction % self.working_reduction:
+            raise SettingsError(
+                "reduction",
+                expected=f"a multiple of working_reduction, {self.working_reduction}",
+                found=f"{self.reduction}",
+            )
+
+
+@dataclass(frozen=True)
+class Task:
+    """Silhouettes to be made: of one video, into the folder `cache` / `key`."""
+
+    video: VideoInfo
+    settings: SilhouetteSettings
+    cache: Path
+    key: str
+
+
+def key_of(video: VideoInfo, settings: SilhouetteSettings) -> str:
+    """A name for the silhouettes of a video's content, frames used and settings: 40 hexadecimal digits.
+
+    Raises:
+        InputError: the video cannot be read.
+    """
+    made_of = {
+        "schema": SCHEMA,
+        "content": digest_of(video.path, "a readable video"),
+        "num_frames": video.num_frames,
+        "settings": msgspec.to_builtins(settings),
+    }
+    return hashlib.blake2b(msgspec.json.encode(made_of, order="deterministic"), digest_size=20).hexdigest()
+
+
+def open_stored(path: Path, num_frames: int, shape: tuple[int, int]) -> zarr.Array | None:
+    """The stored silhouettes (frames, height, width) if they are there and whole, else None."""
+    try:
+        array = zarr.open_array(path, mode="r", zarr_format=3)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    # zarr reads a chunk that is missing as zeros: "nothing seen" must not come from a lost file.
+    whole = array.shape == (num_frames, *shape) and array.nchunks_initialized == array.nchunks
+    return array if whole else None
+
+
+def reduced_shape(video: VideoInfo, reduction: int) -> tuple[int, int]:
+    """Height and width of a video's silhouettes."""
+    width, height = video.image_size_wh
+    return -(-height // reduction), -(-width // reduction)
+
+
+def frames_to_decode(task: Task) -> int:
+    """How far `store` advances: the frames of both passes."""
+    num_frames = task.video.num_frames
+    return num_frames + len(range(0, num_frames, learning_step(num_frames, task.settings)))
+
+
+def store(task: Task, advance: Advance) -> dict[str, float]:
+    """Make the silhouettes of one video and store them; the seconds of "decode" and "foreground".
+
+    They appear under their key at once and whole, or not at all. Of two who make the same, the first wins.
+
+    Raises:
+        InputError: the video ends early.
+        OutputError: the store cannot be written.
+    """
+    path = task.cache / task.key
+    temporary = task.cache / f".{task.key}.{secrets.token_hex(4)}.partial"
+    shape = reduced_shape(task.video, task.settings.reduction)
+    try:
+        temporary.mkdir(parents=True)
+        seconds = _write(temporary, shape, task, advance)
+        if open_stored(temporary, task.video.num_frames, shape) is None:
+            raise OSError("it was changed by someone else")
+        _publish(temporary, path, task.video.num_frames, shape)
+    except OSError as error:
+        raise OutputError(
+            path,
+            expected="to write silhouettes",
+            found=error.strerror or f"{error}",
+            remedy="what was stored before is unchanged",
+        ) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    return seconds
+
+
+def remove_stale(cache: Path) -> None:
+    """Remove what processes left unfinished that were killed a day ago or earlier."""
+    for folder in cache.glob(".*.partial"):
+        try:
+            newest = max(file.stat().st_mtime for file in (folder, *folder.rglob("*")))
+        except OSError:
+            continue  # someone is working there, or has just finished
+        if time.time() - newest > _STALE_S:
+            logger.info("removing %s, left by a process that was killed", folder)
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _write(folder: Path, shape: tuple[int, int], task: Task, advance: Advance) -> dict[str, float]:
+    video, settings = task.video, task.settings
+    array = zarr.create_array(
+        folder,
+        shape=(video.num_frames, *shape),
+        chunks=(CHUNK_FRAMES, *shape),
+        dtype=np.uint8,
+        compressors=ZstdCodec(level=3, checksum=True),
+        attributes={"video": video.path.name, "schema": SCHEMA, "settings": msgspec.to_builtins(settings)},
+        # Empty chunks are written too, so that one that is missing is known to be lost.
+        config={"write_empty_chunks": True},
+        overwrite=True,
+    )
+    started, seconds = time.perf_counter(), {"decode": 0.0, "foreground": 0.0}
+    masks = foreground(
+        _decoded(video, learning_step(video.num_frames, settings), seconds, advance),
+        _decoded(video, 1, seconds, advance),
+        settings,
+    )
+    chunk = np.empty((CHUNK_FRAMES, *shape), np.uint8)
+    for index, mask in enumerate(masks):
+        chunk[index % CHUNK_FRAMES] = coverage(mask, settings.reduction // settings.working_reduction)
+        count = index % CHUNK_FRAMES + 1
+        if count == CHUNK_FRAMES or index + 1 == video.num_frames:
+            array[index + 1 - count : index + 1] = chunk[:count]
+    seconds["foreground"] = time.perf_counter() - started - seconds["decode"]
+    return seconds
+
+
+def _decoded(
+    video: VideoInfo, step: int, seconds: dict[str, float], advance: Advance
+) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    """Every `step`-th frame; adds the time that decoding took, reports each frame when it was worked on."""
+    frames = read_frames(video, step)
+    while True:
+        started = time.perf_counter()
+        frame = next(frames, None)
+        seconds["decode"] += time.perf_counter() - started
+        if frame is None:
+            return
+        yield frame
+        advance(1)
+
+
+def _publish(temporary: Path, path: Path, num_frames: int, shape: tuple[int, int]) -> None:
+    """Rename into place, unless someone else was first.
+
+    What is whole is never taken away, not for a moment: whoever reads it would see zeros.
+    """
+    try:
+        os.rename(temporary, path)  # not over a folder that has something in it
+        return
+    except OSError:
+        if not path.exists():
+            raise
+    if open_stored(path, num_frames, shape) is not None:
+        return
+    damaged = temporary.with_name(f"{temporary.stem}.damaged{temporary.suffix}")
+    os.rename(path, damaged)
+    os.rename(temporary, path)
+    shutil.rmtree(damaged, ignore_errors=True)

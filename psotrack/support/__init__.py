@@ -1,0 +1,9 @@
+"""Tools that know nothing of cameras or drones: files, text tables, settings files, processes, progress.
+
+In: paths, text, callables. Out: checked values, files that are written whole or not at all, results of processes.
+Others may use every name in `__init__.pyi`.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,237 @@
+"""What is to be run: a grid in TOML, or the same as a mapping, and the cells that it stands for.
+
+Everything is checked when the grid is read, the settings of every cell included: what is wrong is named by its place in
+the file, such as `grid.particles[1]`, before anything runs.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+
+from psotrack.errors import SettingsError
+from psotrack.settings import TrackSettings
+from psotrack.silhouettes import check_whole
+from psotrack.support import convert, read_toml
+from psotrack.sweep.cells import Cell, Perturbation, key_of
+from psotrack.sweep.names import INPUTS, PERTURBATIONS, SETTINGS, check_name, flat, nested, place_of, table
+
+__all__ = ["Cell", "Grid", "Perturbation", "grid", "key_of", "load"]
+
+#: A value of a cell: its place in the file, its name, and itself as it was written.
+_Choice = tuple[str, str, Any]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A grid whose names are right; `dataclasses.replace` makes another one of it.
+
+    Attributes:
+        sequences: folders, or names under the data's root.
+        runs: of every cell, with the seeds `first_seed`, `first_seed` + 1, ...
+        settings: dotted names -> values, of every cell.
+        methods: names -> such settings, which overrule those of every cell.
+        axes: dotted names -> lists of values; every combination is a cell.
+        draws: how often what is drawn by chance is drawn; None is once.
+        where: what messages begin with.
+    """
+
+    sequences: tuple[str, ...]
+    runs: int
+    first_seed: int
+    settings: Mapping[str, Any]
+    methods: Mapping[str, Mapping[str, Any]]
+    axes: Mapping[str, tuple[Any, ...]]
+    draws: int | None
+    where: str
+
+    def cells(self) -> tuple[Cell, ...]:
+        """Every combination, in the order of the file: sequences, methods, axes, draws.
+
+        Raises:
+            SettingsError: a value does not fit, or two cells are the same; the message names the place.
+        """
+        options = [
+            [(f"grid.{name}[{index}]", name, value) for index, value in enumerate(values)]
+            for name, values in self.axes.items()
+        ]
+        variants = [
+            (places, cell)
+            for method in self.methods or ("",)
+            for choices in itertools.product(*options)
+            for places, cell in self._draws(method, choices)
+        ]
+        placed = [
+            ((f"sequences[{index}]", *places), replace(cell, sequence=sequence))
+            for index, sequence in enumerate(self.sequences)
+            for places, cell in variants
+        ]
+        self._check_different(placed)
+        if self.draws is not None and not any(cell.by_chance for _, cell in placed):
+            expected = f"something to draw: a number of cameras, {', '.join(PERTURBATIONS)}"
+            raise self._error("grid.draws", expected=expected, found="nothing of it")
+        return tuple(cell for _, cell in placed)
+
+    def _draws(self, method: str, choices: tuple[_Choice, ...]) -> Iterator[tuple[tuple[str, ...], Cell]]:
+        """The cells of one combination, of no sequence yet, each with its places: one per draw, if any is drawn."""
+        cell = self._cell(method, choices)
+        places = (f"methods.{method}", *(place for place, _, _ in choices))
+        for draw in range(self.draws or 1) if cell.by_chance else (0,):
+            perturbation = msgspec.structs.replace(cell.perturbation, draw=draw)
+            axes = cell.axes if self.draws is None else {**cell.axes, "draw": draw}
+            yield places, replace(cell, perturbation=perturbation, axes=axes)
+
+    def _cell(self, method: str, choices: tuple[_Choice, ...]) -> Cell:
+        own = self.methods.get(method, {})
+        given: tuple[_Choice, ...] = (
+            *((f"settings.{name}", name, value) for name, value in self.settings.items()),
+            *((f"methods.{method}.{name}", name, value) for name, value in own.items()),
+            *choices,
+        )
+        places = {name: place for place, name, _ in given}
+        values = {name: value for _, name, value in given}
+        settings = self._record(TrackSettings, nested(values, SETTINGS), places)
+        perturbation = self._record(Perturbation, nested(values, PERTURBATIONS), places)
+        if settings.reads_detections:
+            # Silently they would do nothing.
+            for name in ("clock_frames", "flipped"):
+                if getattr(perturbation, name):
+                    expected = "0 where detections are tracked, as it is done to silhouettes"
+                    raise self._error(places[name], expected=expected, found=f"{values[name]}")
+        cameras, frames = self._cameras(values, places), values.get("frames")
+        if frames is not None:
+            check_whole(f"{self.where}: {places['frames']}", frames, lowest=1)
+        every = dict(flat(msgspec.to_builtins(settings))) | msgspec.to_builtins(perturbation)
+        every |= {"cameras": cameras_label(cameras), "frames": frames}
+        axes = {name: every[name] for name in self.axes}
+        return Cell("", method, cameras, frames, perturbation, settings, self.runs, axes, self.first_seed)
+
+    def _record(self, kind: type[msgspec.Struct], data: dict[str, Any], places: Mapping[str, str]) -> Any:
+        """The record of these data."""
+        try:
+            return convert(data, kind, _unplaced)
+        except SettingsError as fault:
+            # Which knows the field, or its last name if it is of a record's own checks, but nothing of the file.
+            field, _, sentence = str(fault).partition(": expected ")
+            expected, _, found = sentence.partition(", found ")
+            raise self._error(place_of(field, places), expected=expected, found=found) from None
+
+    def _cameras(self, values: Mapping[str, Any], places: Mapping[str, str]) -> tuple[str, ...] | int | None:
+        value = values.get("cameras", "all")
+        if value == "all":
+            return None
+        if isinstance(value, int) and not isinstance(value, bool) and value > 0:
+            return value
+        names = tuple(value) if isinstance(value, list | tuple) else ()
+        words = all(isinstance(name, str) and name for name in names)
+        if not (names and words and len(set(names)) == len(names)):
+            expected = '"all", a number above 0, or a list of different names'
+            raise self._error(places["cameras"], expected=expected, found=f"{value!r}")
+        return names
+
+    def _check_different(self, placed: list[tuple[tuple[str, ...], Cell]]) -> None:
+        seen: dict[Any, tuple[str, ...]] = {}
+        for places, cell in placed:
+            made_of = (cell.sequence, cell.cameras, cell.frames, cell.perturbation, cell.settings)
+            first = seen.setdefault(made_of, places)
+            if first is not places:
+                pairs = [(one, other) for one, other in zip(places, first, strict=True) if one != other]
+                here, there = (" and ".join(names) for names in zip(*pairs, strict=True))
+                raise self._error(here, expected="cells that differ", found=f"the same as with {there}")
+
+    def _error(self, place: str, *, expected: str, found: str, remedy: str = "") -> SettingsError:
+        return SettingsError(f"{self.where}: {place}", expected=expected, found=found, remedy=remedy)
+
+
+class _File(msgspec.Struct, frozen=True, kw_only=True):
+    """What a grid's file holds; tables are looked into one by one."""
+
+    sequences: Annotated[tuple[Annotated[str, msgspec.Meta(min_length=1)], ...], msgspec.Meta(min_length=1)]
+    runs: Annotated[int, msgspec.Meta(ge=1)] = 1
+    first_seed: Annotated[int, msgspec.Meta(ge=0)] = 0
+    settings: dict[str, Any] = {}
+    methods: dict[str, Any] = {}
+    grid: dict[str, Any] = {}
+
+
+def load(path: Path) -> Grid:
+    """The grid in a TOML file.
+
+    Raises:
+        InputError: the file cannot be read, or is no TOML.
+        SettingsError: something in it is wrong; the message names its place, and the nearest right name.
+    """
+    return grid(read_toml(path), where=str(path))
+
+
+def grid(mapping: Mapping[str, Any], where: str = "grid") -> Grid:
+    """The grid that a mapping describes, as TOML would.
+
+    Args:
+        mapping: `sequences`, `runs`, `first_seed`, `settings`, `methods` and `grid`; names of settings are dotted, or
+            lead into nested mappings.
+        where: what messages begin with.
+
+    Raises:
+        SettingsError: something in it is wrong; the message names its place, and the nearest right name.
+
+    Example:
+        >>> varied = grid({"sequences": ["S01"], "grid": {"particles": [20, 50], "silhouettes.reduction": [4]}})
+        >>> [dict(cell.axes) for cell in varied.cells()]
+        [{'particles': 20, 'silhouettes.reduction': 4}, {'particles': 50, 'silhouettes.reduction': 4}]
+    """
+    for name in mapping:
+        check_name(f"{where}: ", name, _File.__struct_fields__)
+    data = dict(mapping)
+    if isinstance(data.get("sequences"), list | tuple):
+        data["sequences"] = [os.fspath(one) if isinstance(one, Path) else one for one in data["sequences"]]
+    file: _File = convert(data, _File, lambda field, *said: _unplaced(f"{where}: {field}", *said))
+    settings = table(where, "settings", file.settings, SETTINGS)
+    methods = {
+        name: table(where, f"methods.{name}", content, SETTINGS) for name, content in file.methods.items()
+    }
+    axes = table(where, "grid", file.grid, (*SETTINGS, *INPUTS, "draws"))
+    draws = axes.pop("draws", None)
+    if draws is not None:
+        check_whole(f"{where}: grid.draws", draws, lowest=1)
+    for name, values in axes.items():
+        if not isinstance(values, list | tuple) or not values:
+            remedy = "" if isinstance(values, list | tuple | dict) else f"write [{values}]"
+            expected, found = "a list of values", f"{values!r}"
+            raise SettingsError(f"{where}: grid.{name}", expected=expected, found=found, remedy=remedy)
+        for place, set_there in {
+            "settings": settings,
+            **{f"methods.{of}": methods[of] for of in methods},
+        }.items():
+            if name in set_there:
+                found = f"{place}.{name} as well"
+                raise SettingsError(f"{where}: grid.{name}", expected="it in one place", found=found)
+    checked = Grid(
+        file.sequences,
+        file.runs,
+        file.first_seed,
+        settings,
+        methods,
+        {name: tuple(values) for name, values in axes.items()},
+        draws,
+        where,
+    )
+    checked.cells()
+    return checked
+
+
+def _unplaced(field: str, expected: str, found: str, remedy: str) -> SettingsError:
+    return SettingsError(field, expected=expected, found=found, remedy=remedy)
+
+
+def cameras_label(cameras: tuple[str, ...] | int | None) -> str:
+    """A cell's cameras in a word: `all`, `4`, `cam1+cam2`."""
+    if cameras is None:
+        return "all"
+    return str(cameras) if isinstance(cameras, int) else "+".join(cameras)

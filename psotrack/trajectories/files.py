@@ -1,0 +1,383 @@
+"""Trajectories on disk: CSV and Parquet tables with one row per frame and drone.
+
+Writing is strict, so that other programs can rely on the columns of `COLUMNS`, in this order, and those of
+`COVARIANCE_COLUMNS` after them where covariances are known. Reading needs `frame`, `drone` and the position, takes
+rows and columns in any order, and leaves others alone.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
+
+from psotrack.errors import InputError, check_positive
+from psotrack.support import refuse_to_overwrite, written_whole
+from psotrack.trajectories.trajectories import Status, Trajectories
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+#: Version of the columns, their units and words; a changed meaning is a new version.
+SCHEMA_VERSION = 1
+
+#: Columns and their units, in the order in which they are written.
+COLUMNS = {
+    "frame": "1",
+    "time_s": "s",
+    "drone": "name",
+    "x_m": "m",
+    "y_m": "m",
+    "z_m": "m",
+    "vx_m_s": "m/s",
+    "vy_m_s": "m/s",
+    "vz_m_s": "m/s",
+    "fitness": "1",
+    "num_cameras": "1",
+    "status": "tracked, coasting or lost",
+}
+
+#: Columns after those, where covariances of the positions are known: the upper triangle, row by row.
+COVARIANCE_COLUMNS = dict.fromkeys(("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"), "m2")
+_READ = COLUMNS | COVARIANCE_COLUMNS
+_REQUIRED = ("frame", "drone", "x_m", "y_m", "z_m")
+_WORDS = ("drone", "status")
+#: Which of the six columns stands in which place of the matrix.
+_UPPER = np.triu_indices(3)
+_PLACES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+_STATUS = {status.label: status for status in Status}
+
+
+def write_trajectories(path: Path, trajectories: Trajectories, *, force: bool = False) -> None:
+    """Write a table with one row per frame and drone, frames first.
+
+    CSV has the fewest digits that give the same number in the array's own precision, and equal trajectories
+    give equal bytes. Parquet has float64, and units and version of the schema as key-value metadata. What is
+    unknown is an empty field. Where the status is unknown, a drone with a position is `tracked` and one
+    without `lost`.
+
+    Args:
+        path: ends in .csv or .parquet.
+        trajectories: what to write; orientations have no column.
+        force: replace an existing file.
+
+    Raises:
+        InputError: the suffix is another one.
+        OutputError: the file exists and `force` is not set, or it cannot be written; what was there is
+            unchanged.
+    """
+    write = _by_suffix(path, {".csv": _write_csv, ".parquet": _write_parquet})
+    refuse_to_overwrite(path, force)
+    columns = _to_columns(trajectories)
+    with written_whole(path) as temporary:
+        write(temporary, columns)
+
+
+def write_ambiguity(
+    path: Path,
+    time_s: Float[np.ndarray, "frames"],
+    pairs: Int[np.ndarray, "pairs 2"],
+    ambiguity: Float[np.ndarray, "frames pairs"],
+    *,
+    force: bool = False,
+) -> None:
+    """Write which drones may be taken for each other: a row for each frame and pair where that is not impossible.
+
+    Args:
+        path: of the CSV file: `frame`, `time_s`, `drone`, `other`, `ambiguity`.
+        time_s: of the frames.
+        pairs: two drones each.
+        ambiguity: probability that each pair's labels are exchanged.
+        force: replace an existing file.
+
+    Raises:
+        OutputError: the file exists and `force` is not set, or it cannot be written.
+    """
+    refuse_to_overwrite(path, force)
+    frame, pair = np.nonzero(ambiguity)
+    columns = {
+        "frame": frame,
+        "time_s": time_s[frame],
+        "drone": pairs[pair, 0],
+        "other": pairs[pair, 1],
+        "ambiguity": ambiguity[frame, pair].astype(np.float32),
+    }
+    with written_whole(path) as temporary:
+        _write_csv(temporary, columns)
+
+
+def read_trajectories(path: Path, *, fps: float | None = None) -> Trajectories:
+    """Read a table: `frame`, `drone`, `x_m`, `y_m`, `z_m`, and of the other columns those that are there.
+
+    A frame and drone without a row, or with an empty position, is NaN and `lost`. Names of drones may be
+    numbers; their order is that of first appearance.
+
+    Args:
+        path: ends in .csv or .parquet.
+        fps: frames per second, for rows without `time_s`.
+
+    Raises:
+        InputError: no such file, a broken line, a column that is missing, a frame number that is none, two
+            rows for one frame and drone, two times for one frame, or no time and no `fps`. The message names
+            file and line.
+    """
+    if fps is not None:
+        check_positive("fps", fps)
+    read = _by_suffix(path, {".csv": _read_csv, ".parquet": _read_parquet})
+    if not path.is_file():
+        raise InputError(path, expected="a file of trajectories", found="no such file")
+    return _from_table(read(path), fps)
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Columns as they were read, and how to name the place of a row in a message."""
+
+    path: Path
+    columns: Mapping[str, Shaped[np.ndarray, "rows"]]
+    place: Callable[[int], str]
+
+    def error(self, row: int, *, expected: str, found: object) -> InputError:
+        return InputError(f"{self.path}, {self.place(row)}", expected=expected, found=f"{found}")
+
+
+def _by_suffix(path: Path, functions: Mapping[str, Callable]) -> Callable:
+    if path.suffix not in functions:
+        expected = f"a name that ends in {' or '.join(functions)}"
+        raise InputError(path, expected=expected, found=repr(path.name))
+    return functions[path.suffix]
+
+
+# Writing
+
+
+def _to_columns(trajectories: Trajectories) -> dict[str, Shaped[np.ndarray, "rows"]]:
+    """One array per column; NaN, or -1 cameras, where nothing is known."""
+    shape = (trajectories.num_frames, trajectories.num_drones)
+    unknown = np.full(shape, np.nan, np.float32)
+    velocity_m_s = trajectories.velocity_m_s
+    status = trajectories.status
+    if status is None:
+        status = np.where(trajectories.seen, Status.TRACKED, Status.LOST)
+    labels = np.array([status.label for status in Status])
+    columns = {
+        "frame": np.broadcast_to(trajectories.frame[:, None], shape),
+        "time_s": np.broadcast_to(trajectories.time_s[:, None], shape),
+        "drone": np.broadcast_to(np.array(trajectories.drones, str), shape),
+        "x_m": trajectories.position_m[..., 0],
+        "y_m": trajectories.position_m[..., 1],
+        "z_m": trajectories.position_m[..., 2],
+        "vx_m_s": unknown if velocity_m_s is None else velocity_m_s[..., 0],
+        "vy_m_s": unknown if velocity_m_s is None else velocity_m_s[..., 1],
+        "vz_m_s": unknown if velocity_m_s is None else velocity_m_s[..., 2],
+        "fitness": unknown if trajectories.fitness is None else trajectories.fitness,
+        "num_cameras": np.full(shape, -1) if trajectories.num_cameras is None else trajectories.num_cameras,
+        "status": labels[status],
+    }
+    columns = {name: columns[name] for name in COLUMNS}
+    if trajectories.covariance_m2 is not None:
+        upper = np.moveaxis(trajectories.covariance_m2[..., *_UPPER], -1, 0)
+        columns |= dict(zip(COVARIANCE_COLUMNS, upper, strict=True))
+    return {name: column.ravel() for name, column in columns.items()}
+
+
+def _write_csv(path: Path, columns: Mapping[str, Shaped[np.ndarray, "rows"]]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        # NumPy writes the shortest digits that read back as the same number in the array's own precision.
+        words = [np.where(_known(column), column.astype(str), "") for column in columns.values()]
+        writer.writerows(zip(*words, strict=True))
+
+
+def _write_parquet(path: Path, columns: Mapping[str, Shaped[np.ndarray, "rows"]]) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    types = {"frame": pa.int64(), "drone": pa.string(), "num_cameras": pa.int32(), "status": pa.string()}
+    arrays = {
+        name: pa.array(column, types.get(name, pa.float64()), mask=~_known(column))
+        for name, column in columns.items()
+    }
+    units = {name: _READ[name] for name in columns}
+    metadata = {"psotrack.schema_version": str(SCHEMA_VERSION), "psotrack.units": json.dumps(units)}
+    pq.write_table(pa.table(arrays).replace_schema_metadata(metadata), path)
+
+
+def _known(column: Shaped[np.ndarray, "rows"]) -> Shaped[np.ndarray, "rows"]:
+    if column.dtype.kind == "f":
+        return ~np.isnan(column)
+    return column >= 0 if column.dtype.kind in "iu" else np.ones(len(column), bool)
+
+
+# Reading
+
+
+def _read_csv(path: Path) -> _Table:
+    lines: list[int] = []
+    rows: list[list[str]] = []
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.reader(file, strict=True)
+            header = [name.strip() for name in next(reader, [])]
+            _check_columns(path, header)
+            for row in reader:
+                if len(row) not in (0, len(header)):
+                    expected = f"{len(header)} fields as in the first line"
+                    raise InputError(
+                        f"{path}, line {reader.line_num}", expected=expected, found=f"{len(row)}"
+                    )
+                if row:
+                    lines.append(reader.line_num)
+                    rows.append(row)
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(path, expected="a CSV table in UTF-8", found=f"{error}") from error
+    except OSError as error:
+        raise InputError(path, expected="a readable file", found=f"{error.strerror}") from error
+
+    def number(line: int, word: str, name: str) -> float:
+        try:
+            return float(word or "nan")
+        except ValueError:
+            found = repr(word)
+            raise InputError(f"{path}, line {line}", expected=f"a number in {name}", found=found) from None
+
+    columns: dict[str, np.ndarray] = {}
+    for name in [name for name in _READ if name in header]:
+        words = [row[header.index(name)].strip() for row in rows]
+        if name in _WORDS:
+            columns[name] = np.array(words, object)
+        else:
+            columns[name] = np.array([number(*item, name) for item in zip(lines, words, strict=True)], float)
+    return _Table(path, columns, lambda row: f"line {lines[row]}")
+
+
+def _read_parquet(path: Path) -> _Table:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.read_table(path)
+    except (pa.ArrowException, OSError) as error:
+        raise InputError(path, expected="a Parquet file", found=f"{error}".partition("\n")[0]) from error
+    _check_columns(path, table.column_names)
+    columns = {name: _parquet_column(path, table, name) for name in _READ if name in table.column_names}
+    return _Table(path, columns, lambda row: f"row {row + 1}")
+
+
+def _parquet_column(path: Path, table: pa.Table, name: str) -> Shaped[np.ndarray, "rows"]:
+    import pyarrow as pa
+
+    column = table.column(name)
+    try:
+        if name not in _WORDS:
+            return column.cast(pa.float64()).to_numpy().astype(float)
+        words = column.cast(pa.string()).to_pylist()
+    except pa.ArrowException:
+        expected = f"{'words' if name in _WORDS else 'numbers'} in {name}"
+        raise InputError(path, expected=expected, found=f"{column.type}") from None
+    return np.array([word or "" for word in words], object)
+
+
+def _check_columns(path: Path, names: list[str]) -> None:
+    missing = [name for name in _REQUIRED if name not in names]
+    twice = [name for name in _READ if names.count(name) > 1]
+    if missing or twice:
+        raise InputError(
+            path,
+            expected=f"each of the columns {', '.join(_REQUIRED)} once",
+            found=f"{', '.join(missing)} missing" if missing else f"{', '.join(twice)} twice",
+        )
+
+
+def _from_table(table: _Table, fps: float | None) -> Trajectories:
+    columns = table.columns
+    if not len(columns["frame"]):
+        raise InputError(table.path, expected="at least one row", found="none")
+    _check_values(table)
+    frame, frame_index = np.unique(columns["frame"].astype(np.int64), return_inverse=True)
+    names: dict[str, int] = {}
+    drone_index = np.array([names.setdefault(name, len(names)) for name in columns["drone"]])
+    cell = frame_index * len(names) + drone_index
+    first = np.unique(cell, return_index=True)[1]
+    if len(first) < len(cell):
+        again = int(np.setdiff1d(np.arange(len(cell)), first)[0])
+        raise table.error(
+            again,
+            expected="one row per frame and drone",
+            found=f"a second one for frame {frame[frame_index[again]]} and drone {columns['drone'][again]}",
+        )
+
+    def grid(*parts: str, missing: float) -> np.ndarray:
+        values = np.full((len(frame) * len(names), len(parts)), missing)
+        values[cell] = np.stack([columns[part] for part in parts], axis=-1)
+        return values.reshape(len(frame), len(names), len(parts))
+
+    def optional(*parts: str) -> np.ndarray | None:
+        known = all(part in columns and np.isfinite(columns[part]).any() for part in parts)
+        return grid(*parts, missing=np.nan) if known else None
+
+    fitness, num_cameras = optional("fitness"), optional("num_cameras")
+    covariance_m2 = optional(*COVARIANCE_COLUMNS)
+    status = np.full(len(frame) * len(names), int(Status.LOST))
+    if "status" in columns:
+        status[cell] = [_STATUS[word] for word in columns["status"]]
+    return Trajectories(
+        frame=frame,
+        time_s=_times(table, frame, frame_index, fps),
+        drones=tuple(names),
+        position_m=grid("x_m", "y_m", "z_m", missing=np.nan),
+        velocity_m_s=optional("vx_m_s", "vy_m_s", "vz_m_s"),
+        fitness=None if fitness is None else fitness[..., 0],
+        num_cameras=None if num_cameras is None else np.nan_to_num(num_cameras[..., 0]).astype(np.int64),
+        status=status.reshape(len(frame), len(names)) if "status" in columns else None,
+        covariance_m2=None if covariance_m2 is None else covariance_m2[..., _PLACES],
+    )
+
+
+def _check_values(table: _Table) -> None:
+    for name, values in table.columns.items():
+        if name == "drone":
+            wrong, expected = values == "", "a name"
+        elif name == "status":
+            wrong, expected = ~np.isin(values, list(_STATUS)), f"one of {', '.join(_STATUS)}"
+        elif name == "frame":
+            wrong, expected = ~_whole(values), "a whole number from 0"
+        elif name == "num_cameras":
+            wrong, expected = ~(_whole(values) | np.isnan(values)), "a whole number from 0, or nothing"
+        else:
+            wrong, expected = np.isinf(values), "a finite number, or nothing"
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            raise table.error(row, expected=f"{expected} in {name}", found=repr(values.tolist()[row]))
+
+
+def _whole(values: Float[np.ndarray, "rows"]) -> Bool[np.ndarray, "rows"]:
+    return np.isfinite(values) & (values >= 0) & (values == np.floor(values))
+
+
+def _times(
+    table: _Table, frame: Int[np.ndarray, "frames"], frame_index: Int[np.ndarray, "rows"], fps: float | None
+) -> Float[np.ndarray, "frames"]:
+    """(frames,), the time that the rows of each frame agree on."""
+    time_s = np.full(len(frame), np.nan) if fps is None else frame / fps
+    given_s = table.columns.get("time_s", np.full(len(frame_index), np.nan))
+    known = np.flatnonzero(~np.isnan(given_s))
+    # Backwards, so that the first row of a frame has the last word.
+    time_s[frame_index[known[::-1]]] = given_s[known[::-1]]
+    # Far above any rounding, far below the time between two frames.
+    differs = np.abs(time_s[frame_index[known]] - given_s[known]) > 1e-3
+    if differs.any():
+        row = int(known[np.argmax(differs)])
+        expected = f"{time_s[frame_index[row]]:g} s, as another row of this frame has"
+        raise table.error(row, expected=expected, found=f"{given_s[row]:g} s")
+    if np.isnan(time_s).any():
+        row = int(np.argmax(np.isnan(time_s)[frame_index]))
+        raise table.error(row, expected="a time_s, or the frame rate to know it by", found="neither")
+    return time_s

@@ -1,0 +1,128 @@
+"""TUM files: one pose per line, `timestamp tx ty tz qx qy qz qw`, one file per drone; evo reads them.
+
+The format is that of the TUM RGB-D benchmark (Sturm et al., IROS 2012). It knows neither frames nor status.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.errors import InputError, check_positive
+from psotrack.support import refuse_to_overwrite, written_whole
+from psotrack.trajectories.trajectories import Trajectories
+
+_HEADER = "# timestamp tx ty tz qx qy qz qw"
+_UNKNOWN = "# orientation unknown: 0 0 0 1 in every line"
+
+
+def write_tum(folder: Path, trajectories: Trajectories, *, force: bool = False) -> list[Path]:
+    """Write `folder`/NAME.tum for each drone, with the frames in which it is seen.
+
+    Numbers have the fewest digits that give the same number in the array's own precision. A drone whose
+    orientation is not known in all of them gets the identity throughout, and a comment that says so.
+
+    Returns:
+        The files, one per drone.
+
+    Raises:
+        InputError: a drone's name cannot be the name of a file.
+        OutputError: a file exists and `force` is not set, or it cannot be written; what was there is
+            unchanged.
+    """
+    for name in trajectories.drones:
+        if not name or Path(name).name != name:
+            raise InputError("drones", expected="names that can be names of files", found=repr(name))
+    paths = [folder / f"{name}.tum" for name in trajectories.drones]
+    for path in paths:
+        refuse_to_overwrite(path, force)
+    for drone, path in enumerate(paths):
+        lines = _lines(trajectories, drone)
+        with written_whole(path) as temporary:
+            temporary.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+    return paths
+
+
+def read_tum(path: Path, *, fps: float) -> Trajectories:
+    """Read one TUM file, or all `*.tum` of a folder, in order of the names, which name the drones.
+
+    Args:
+        path: file or folder.
+        fps: frames per second; frame k is at k / fps seconds, and every line must be within 0.1 frames.
+
+    Raises:
+        InputError: nothing to read, a line that is no pose, a time that is no frame's, or two lines for one
+            frame. The message names file and line.
+    """
+    check_positive("fps", fps)
+    files = sorted(path.glob("*.tum")) if path.is_dir() else [path]
+    if not files or not files[0].is_file():
+        raise InputError(path, expected="a TUM file, or a folder with some", found="none")
+    poses = [_read_file(file, fps) for file in files]
+    frame = np.unique(np.concatenate([numbers for numbers, _ in poses]))
+    if not len(frame):
+        raise InputError(path, expected="at least one pose", found="none")
+    values = np.full((len(frame), len(files), 7), np.nan)
+    for drone, (numbers, pose) in enumerate(poses):
+        values[np.searchsorted(frame, numbers), drone] = pose
+    orientation_wxyz = np.roll(values[..., 3:], 1, axis=-1)
+    return Trajectories(
+        frame=frame,
+        time_s=frame / fps,
+        drones=tuple(file.stem for file in files),
+        position_m=values[..., :3],
+        orientation_wxyz=orientation_wxyz if np.isfinite(orientation_wxyz).any() else None,
+    )
+
+
+def _lines(trajectories: Trajectories, drone: int) -> list[str]:
+    seen = trajectories.seen[:, drone]
+    orientation = trajectories.orientation_wxyz
+    known = orientation is not None and bool(np.isfinite(orientation[seen, drone]).all())
+    columns = [trajectories.time_s[seen], *trajectories.position_m[seen, drone].T]
+    if orientation is not None and known:
+        columns += list(np.roll(orientation[seen, drone], -1, axis=-1).T)
+    else:
+        columns += list(np.tile([0, 0, 0, 1], (int(seen.sum()), 1)).T)
+    words = [column.astype(str) for column in columns]
+    return [_HEADER] + [_UNKNOWN] * (not known) + [" ".join(row) for row in zip(*words, strict=True)]
+
+
+def _read_file(path: Path, fps: float) -> tuple[np.ndarray, Float[np.ndarray, "rows 7"]]:
+    """Frame numbers, and positions with orientations (x, y, z, w); these are NaN if the file has none."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (UnicodeDecodeError, OSError) as error:
+        raise InputError(path, expected="a readable text file", found=f"{error}") from error
+    poses: dict[int, list[float]] = {}
+    for number, line in enumerate(lines, start=1):
+        if line.strip() and not line.startswith("#"):
+            place = f"{path}, line {number}"
+            time_s, *pose = _numbers(place, line)
+            frame = round(time_s * fps)
+            if abs(time_s * fps - frame) > 0.1 or frame < 0:
+                raise InputError(place, expected=f"the time of a frame at {fps:g} fps", found=f"{time_s:g} s")
+            if poses.setdefault(frame, pose) is not pose:
+                raise InputError(
+                    place, expected="one line per frame", found=f"a second one for frame {frame}"
+                )
+    values = np.array([poses[frame] for frame in sorted(poses)]).reshape(-1, 7)
+    values[:, 3:] /= np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
+    if _UNKNOWN in lines:
+        values[:, 3:] = np.nan
+    return np.array(sorted(poses), int), values
+
+
+def _numbers(place: str, line: str) -> list[float]:
+    expected = "8 finite numbers: timestamp tx ty tz qx qy qz qw"
+    try:
+        values = [float(word) for word in line.split()]
+    except ValueError as error:
+        raise InputError(place, expected=expected, found=f"{error}") from None
+    if len(values) != 8 or not np.isfinite(values).all():
+        raise InputError(place, expected=expected, found=repr(line.strip()))
+    if not any(values[4:]):
+        raise InputError(place, expected="a quaternion", found="0 0 0 0")
+    return values
