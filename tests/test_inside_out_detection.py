@@ -1,4 +1,4 @@
-"""Markers in images: which they are, and where their corners are, against images that are drawn to be known."""
+"""Detection of markers and their corners, against drawn images whose corners are known."""
 
 import cv2
 import numpy as np
@@ -9,20 +9,20 @@ from hypothesis import strategies as st
 from psotrack.detection import marker_dictionary
 from psotrack.errors import SettingsError
 from psotrack.geometry import camera, distort, undistort
-from psotrack.inside_out.detection import MarkerDetector, refined_corners
-from psotrack.inside_out.detection.blending import blending_exponent
+from psotrack.inside_out.detection import MarkerDetector, refine_corners
+from psotrack.inside_out.detection.gamma import estimate_gamma
 
 SIZE_WH = (640, 480)
-#: Samples per pixel, along each side, of what is drawn: an edge is then right to 1/16 of a pixel everywhere.
+#: Samples per pixel along each side of drawn images: every edge is right to 1/16 of a pixel.
 FINE = 8
-#: Cells of white around a marker.
+#: Width of the white zone around a marker, cells.
 QUIET = 1.0
 SQUARE = np.array([[260.0, 180.0], [360.0, 170.0], [370.0, 275.0], [255.0, 280.0]])
 OBLIQUE = np.array([[100.0, 100.0], [140.0, 108.0], [139.0, 190.0], [101.0, 200.0]])
 
 
 def pattern(marker, dictionary="4x4_1000", cell_px=20):
-    """A marker with its quiet zone, in its own pixels, and its corners there: the edges of its border."""
+    """Image of a marker with its white zone, and the corners of the marker's border in that image, pixels."""
     model = marker_dictionary(dictionary)
     cells = model.markerSize + 2
     quiet_px = round(QUIET * cell_px)
@@ -47,12 +47,12 @@ def draw(
     white=200,
     wall=140,
 ):
-    """An image of a wall with markers whose corners are given, (4, 2) each, by casting rays through fine pixels."""
+    """An image of a wall with markers at given corners, (4, 2) each, drawn by casting rays through fine pixels."""
     drawn = np.full(size_wh[::-1], wall, np.uint8)
     for marker, corners in markers:
         image, own = pattern(marker, dictionary)
         towards = cv2.getPerspectiveTransform(corners.astype(np.float32), own.astype(np.float32))
-        # Whole pixels that hold the marker and the white around it.
+        # The block of whole pixels that holds the marker and its white zone.
         margin = np.ptp(corners, axis=0).max() / 4
         low = np.clip(np.floor(corners.min(axis=0) - margin), 0, size_wh).astype(int)
         high = np.clip(np.ceil(corners.max(axis=0) + margin), 0, size_wh).astype(int)
@@ -63,13 +63,13 @@ def draw(
         grid = np.stack(np.meshgrid(*axes), axis=-1)
         if lens is not None:
             grid = undistort(lens, grid) @ lens.K[:2, :2].T + lens.K[:2, 2]
-        # Where a fine pixel is in the marker's own image.
+        # Position of each fine pixel in the marker's image.
         there = grid @ towards[:, :2].T + towards[:, 2]
         there = np.round(there[..., :2] / there[..., 2:]).astype(int)
         inside = ((there >= 0) & (there < image.shape[0])).all(axis=-1)
         fine = np.where(inside, 0.0, float(wall))
         fine[inside] = black + (white - black) * (image[there[inside][:, 1], there[inside][:, 0]] / 255)
-        # A pixel is the mean of its light, and its level a root of that.
+        # The light of a pixel is the mean of its fine pixels; its grey level is a root of the light.
         light = (fine**exponent).reshape(high[1] - low[1], FINE, high[0] - low[0], FINE).mean(axis=(1, 3))
         coarse = light ** (1 / exponent)
         part = drawn[low[1] : high[1], low[0] : high[0]]
@@ -79,9 +79,9 @@ def draw(
 
 
 def degraded(image, *, blur_px=0.0, moved_px=0, noise=0.0, exponent=2.0, gain=1.0):
-    """The image through a soft lens, moved to the right while the shutter was open, brighter, and with noise.
+    """The image through a soft lens, moved to the right during the exposure, brighter, with noise, and clipped.
 
-    All of it in light, of which grey levels are a root; and clipped.
+    Blur is applied to light, of which grey levels are a root.
     """
     light = image.astype(float) ** exponent
     soft = cv2.GaussianBlur(light, (0, 0), blur_px) if blur_px else light
@@ -91,7 +91,7 @@ def degraded(image, *, blur_px=0.0, moved_px=0, noise=0.0, exponent=2.0, gain=1.
 
 
 def scene(*, exponent=2.0, **changes):
-    """Three markers of 96 to 140 pixels, two of them turned, and where they are."""
+    """Three markers with sides of 96 to 140 pixels, two of them turned, and their corners."""
     around = np.deg2rad(np.array([225, 315, 405, 495]))
     corners = {
         marker: np.array(middle)
@@ -107,11 +107,11 @@ def scene(*, exponent=2.0, **changes):
 
 
 def errors_px(image, corners):
-    """How far each corner is off, of markers that must all be there."""
-    seen = MarkerDetector().detect(image)
-    assert sorted(seen.ids.tolist()) == sorted(corners)
-    true = np.stack([corners[marker] for marker in seen.ids.tolist()])
-    return np.linalg.norm(seen.corners_px - true, axis=-1)
+    """Distance of each corner from its true position, pixels; all markers must be found."""
+    found = MarkerDetector().detect(image)
+    assert sorted(found.ids.tolist()) == sorted(corners)
+    true = np.stack([corners[marker] for marker in found.ids.tolist()])
+    return np.linalg.norm(found.corners_px - true, axis=-1)
 
 
 def error_px(found, corners):
@@ -123,7 +123,7 @@ def white_cells(marker):
 
 
 def opencv_corners(image):
-    """OpenCV's own corners with its refinement, by id."""
+    """Corners by OpenCV's own refinement, by id."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     quads, ids, _ = cv2.aruco.ArucoDetector(marker_dictionary("4x4_1000"), parameters).detectMarkers(image)
@@ -133,9 +133,9 @@ def opencv_corners(image):
 @pytest.mark.parametrize(
     ("changes", "limits_px"),
     [
-        # Pairs of limits, for the square and the oblique one. Measured 0.04 and 0.10: samples are half a pixel apart.
+        # Limits for the square and for the oblique marker. Measured 0.04 and 0.10: samples are half a pixel apart.
         ({}, (0.1, 0.2)),
-        # Measured 0.02 and 0.12: a blur moves no edge, but cells of the oblique one are as narrow as it is wide.
+        # Measured 0.02 and 0.12: blur moves no edge, but the cells of the oblique marker are as narrow as the blur.
         ({"blur_px": 1.5}, (0.1, 0.25)),
         # Measured 0.03 and 0.12.
         ({"moved_px": 5}, (0.1, 0.25)),
@@ -145,15 +145,15 @@ def opencv_corners(image):
     ids=["sharp", "soft", "moved", "noisy"],
 )
 @pytest.mark.parametrize(("corners", "which"), [(SQUARE, 0), (OBLIQUE, 1)], ids=["square", "oblique"])
-def test_a_marker_is_where_it_was_drawn(corners, which, changes, limits_px):
-    seen = MarkerDetector().detect(degraded(draw([(17, corners)]), **changes))
-    assert seen.ids.tolist() == [17]
-    assert error_px(seen.corners_px[0], corners) < limits_px[which]
+def test_corners_are_where_the_marker_was_drawn(corners, which, changes, limits_px):
+    found = MarkerDetector().detect(degraded(draw([(17, corners)]), **changes))
+    assert found.ids.tolist() == [17]
+    assert error_px(found.corners_px[0], corners) < limits_px[which]
 
 
 @pytest.mark.parametrize("changes", [{"blur_px": 1.5}, {"moved_px": 5}], ids=["soft", "moved"])
 def test_corners_are_better_than_those_of_opencv_where_images_are_blurred(changes):
-    """OpenCV looks at the corners themselves, which blurs round off: measured 40 times as far off."""
+    """OpenCV looks at the corners themselves, which blur rounds off: measured 40 times the error."""
     image = degraded(draw([(17, SQUARE)]), **changes)
     ours = error_px(MarkerDetector().detect(image).corners_px[0], SQUARE)
     assert 3 * ours < error_px(opencv_corners(image)[17], SQUARE)
@@ -161,36 +161,36 @@ def test_corners_are_better_than_those_of_opencv_where_images_are_blurred(change
 
 @pytest.mark.parametrize("exponent", [1.0, 1.8, 2.4])
 @pytest.mark.parametrize("changes", [{}, {"blur_px": 2.5}, {"moved_px": 9}], ids=["sharp", "soft", "moved"])
-def test_corners_are_right_in_whatever_power_of_grey_an_image_blends(changes, exponent):
-    """Renderers blend grey levels, cameras light. Taken for squares, grey ones that are blurred are 1.5 pixels off."""
+def test_corners_are_right_for_every_gamma(changes, exponent):
+    """Renderers blend grey levels, cameras light. With a gamma of 2, blurred grey images are 1.5 pixels off."""
     # Measured 0.09 at most.
     assert errors_px(*scene(exponent=exponent, **changes)).max() < 0.15
 
 
 @pytest.mark.parametrize("exponent", [1.0, 1.5, 2.0, 2.5])
-def test_markers_tell_in_which_power_an_image_blends(exponent):
+def test_gamma_is_estimated_from_markers(exponent):
     image, corners = scene(exponent=exponent, blur_px=1.5)
     white = np.concatenate([white_cells(marker) for marker in corners])
-    told = blending_exponent(image, np.stack(list(corners.values())), np.full((3, 4), 4.0), white, None)
-    # Between the two that are measured, 1 and 2.2, a line is a curve: measured 0.06.
-    assert told == pytest.approx(exponent, abs=0.12)
+    gamma = estimate_gamma(image, np.stack(list(corners.values())), np.full((3, 4), 4.0), white, None)
+    # The estimate is linear between the two measured powers, 1 and 2.2, where the truth is curved: measured 0.06.
+    assert gamma == pytest.approx(exponent, abs=0.12)
 
 
 def test_a_blur_of_most_of_a_cell_moves_no_corner():
-    """Edges are looked for as far as they are blurred: in four pixels, most of this rise is missed."""
+    """The search for an edge must reach as far as its blur: within four pixels most of this transition is missed."""
     # Measured 0.07.
     assert errors_px(*scene(moved_px=15)).max() < 0.15
 
 
 @pytest.mark.parametrize("exponent", [1.0, 2.2])
-def test_white_that_is_clipped_moves_corners_little(exponent):
-    """What was blurred and then clipped has wide white, as what blends in a high power: else off by 0.3 to 1.0."""
+def test_clipped_white_moves_corners_little(exponent):
+    """An image that was blurred and then clipped has wide white, like a high power: otherwise off by 0.3 to 1.0."""
     # Measured 0.04.
     assert errors_px(*scene(exponent=exponent, blur_px=2.0, gain=1.3)).max() < 0.1
 
 
-def test_what_is_blurred_again_once_it_is_encoded_blends_in_between():
-    """As by scaling or compressing a video. Edges that are blurred otherwise than others are then off a little."""
+def test_blur_before_and_after_encoding_moves_corners_little():
+    """Scaling or compressing a video blurs it again. Edges with unequal blurs are then a little off."""
     image, corners = scene(moved_px=5)
     # Measured 0.24; in light 0.48.
     assert np.median(errors_px(cv2.GaussianBlur(image, (0, 0), 1.5), corners)) < 0.35
@@ -205,7 +205,7 @@ def test_compression_and_noise_move_corners_little():
 
 @pytest.mark.parametrize(("gain", "noise"), [(0.2, 3.0), (0.1, 1.5)])
 def test_dim_light_hides_no_markers(gain, noise):
-    """In levels of their own, black is not dark enough for a threshold that is made for bright images."""
+    """Without equalised brightness, black in dim images misses a threshold that is made for bright images."""
     # Measured 0.61: contrast is 11 and 21 times the noise.
     assert errors_px(*scene(exponent=2.2, gain=gain, noise=noise)).max() < 1.0
 
@@ -216,15 +216,15 @@ def test_shade_hides_no_markers():
     assert errors_px(image, corners).max() < 0.2
 
 
-def test_a_large_marker_has_no_white_of_its_own():
-    """Black cells side by side are as wide as what white is looked for in, in images that are lit alike."""
+def test_black_cells_of_a_large_marker_do_not_count_as_white():
+    """Neighbouring black cells of this marker are nearly as wide as the square in which white is searched."""
     around = 0.1 + np.deg2rad(np.array([225, 315, 405, 495]))
     corners = np.array([320.3, 240.6]) + 210 * np.stack([np.cos(around), np.sin(around)], axis=-1)
     # The lower half of 17 is black, with its border. Measured 0.02.
     assert errors_px(draw([(17, corners)]), {17: corners}).max() < 0.1
 
 
-def test_large_images_are_searched_smaller_and_looked_at_as_they_are():
+def test_large_images_are_searched_shrunk_and_refined_in_full_size():
     image = np.full((2160, 3840), 140, np.uint8)
     shown, corners = scene()
     image[1500:1980, 3001:3641] = shown
@@ -238,10 +238,10 @@ def test_large_images_are_searched_smaller_and_looked_at_as_they_are():
     "dictionary", ["4x4_50", "5x5_100", "DICT_6X6_250", "7x7_1000", "aruco_original", "apriltag_36h11"]
 )
 def test_any_dictionary_of_opencv(dictionary):
-    seen = MarkerDetector(dictionary).detect(draw([(7, SQUARE)], dictionary=dictionary))
-    assert seen.ids.tolist() == [7]
+    found = MarkerDetector(dictionary).detect(draw([(7, SQUARE)], dictionary=dictionary))
+    assert found.ids.tolist() == [7]
     # Measured 0.04.
-    assert error_px(seen.corners_px[0], SQUARE) < 0.1
+    assert error_px(found.corners_px[0], SQUARE) < 0.1
 
 
 def test_an_unknown_dictionary_is_one_line():
@@ -251,20 +251,20 @@ def test_an_unknown_dictionary_is_one_line():
 
 @pytest.mark.parametrize("side_px", [18, 24, 40])
 def test_small_markers_in_large_images_are_found(side_px):
-    """OpenCV's defaults find none below 14.4 pixels in images of this width."""
+    """OpenCV's defaults find no marker with sides below 14.4 pixels in images of this width."""
     corners = np.array(
         [[700.0, 400.0], [700 + side_px, 401], [699 + side_px, 401 + side_px], [700, 399 + side_px]]
     )
     image = np.full((1080, 1920), 140, np.uint8)
     patch = draw([(3, corners - [600, 300])], size_wh=(240, 200))
     image[300:500, 600:840] = patch
-    seen = MarkerDetector().detect(image)
-    assert seen.ids.tolist() == [3]
+    found = MarkerDetector().detect(image)
+    assert found.ids.tolist() == [3]
     # Measured 0.13.
-    assert error_px(seen.corners_px[0], corners) < 0.25
+    assert error_px(found.corners_px[0], corners) < 0.25
 
 
-def test_a_lens_bends_edges_and_corners_stay_where_they_are():
+def test_corners_are_right_in_images_of_a_lens_with_distortion():
     lens = camera(
         R=np.eye(3),
         t_m=np.zeros(3),
@@ -276,21 +276,21 @@ def test_a_lens_bends_edges_and_corners_stay_where_they_are():
     rays = (straight - lens.K[:2, 2]) / 400
     corners = np.stack(distort(lens, *rays.T), axis=-1) * 400 + lens.K[:2, 2]
     image = draw([(5, straight)], lens=lens)
-    # Measured 0.04; lines that are taken to be straight miss the corners by 0.85.
+    # Measured 0.04; straight lines through bent edges miss the corners by 0.85.
     assert error_px(MarkerDetector(lens=lens).detect(image).corners_px[0], corners) < 0.1
     assert error_px(MarkerDetector().detect(image).corners_px[0], corners) > 0.4
 
 
-def test_only_the_markers_that_are_sought_are_found():
+def test_only_the_wanted_markers_are_found():
     image = draw([(17, SQUARE), (400, OBLIQUE)])
     whole = MarkerDetector().detect(image)
     assert sorted(whole.ids.tolist()) == [17, 400]
-    for sought in (17, 400):
-        # Those that the dictionary does not have are no markers.
-        seen = MarkerDetector(ids=[5000, sought, 3]).detect(image)
-        assert seen.ids.tolist() == [sought]
-        # What they tell of how the image blends, 0.01 pixels of it, is then told by one of them.
-        np.testing.assert_allclose(seen.corners_px, whole.select(whole.ids == sought).corners_px, atol=0.03)
+    for wanted in (17, 400):
+        # Ids that the dictionary does not have are ignored.
+        found = MarkerDetector(ids=[5000, wanted, 3]).detect(image)
+        assert found.ids.tolist() == [wanted]
+        # The gamma is then estimated from one marker instead of two, which moves corners by 0.01 pixels.
+        np.testing.assert_allclose(found.corners_px, whole.select(whole.ids == wanted).corners_px, atol=0.03)
 
 
 def test_a_dictionary_without_any_of_the_markers_is_one_line():
@@ -300,32 +300,32 @@ def test_a_dictionary_without_any_of_the_markers_is_one_line():
         MarkerDetector("4x4_50", ids=[50, 51])
 
 
-def test_of_two_with_one_id_neither_counts():
+def test_two_markers_with_one_id_are_both_left_out():
     shifted = SQUARE + np.array([150, 0])
-    seen = MarkerDetector().detect(draw([(17, SQUARE), (17, shifted), (4, OBLIQUE)]))
-    assert seen.ids.tolist() == [4]
+    found = MarkerDetector().detect(draw([(17, SQUARE), (17, shifted), (4, OBLIQUE)]))
+    assert found.ids.tolist() == [4]
 
 
 @pytest.mark.parametrize("noise", [0.0, 40.0])
-def test_no_markers_are_an_ordinary_case(noise):
-    seen = MarkerDetector().detect(degraded(np.full((240, 320), 128, np.uint8), noise=noise))
-    assert len(seen) == 0
-    assert seen.corners_px.shape == (0, 4, 2)
+def test_an_image_without_markers_gives_an_empty_result(noise):
+    found = MarkerDetector().detect(degraded(np.full((240, 320), 128, np.uint8), noise=noise))
+    assert len(found) == 0
+    assert found.corners_px.shape == (0, 4, 2)
 
 
-def test_what_hides_a_part_of_an_edge_moves_no_corner():
+def test_a_hidden_part_of_an_edge_moves_no_corner():
     image = draw([(17, SQUARE)])
-    # A dark thing over a fifth of the right edge, with an edge of its own beside it.
+    # A dark object over a fifth of the right edge, with an edge of its own beside the marker's.
     image[225:245, 360:380] = 30
-    found = refined_corners(image, SQUARE[None] + 0.5, white_cells(17))
+    found = refine_corners(image, SQUARE[None] + 0.5, white_cells(17))
     # Measured 0.04.
     assert error_px(found[0], SQUARE) < 0.2
 
 
-def test_without_edges_corners_stay():
+def test_corners_without_edges_stay():
     flat = np.full((480, 640), 128, np.uint8)
-    assert np.array_equal(refined_corners(flat, SQUARE[None], white_cells(17)), SQUARE[None])
-    assert refined_corners(flat, np.zeros((0, 4, 2)), np.zeros((0, 6, 6), bool)).shape == (0, 4, 2)
+    assert np.array_equal(refine_corners(flat, SQUARE[None], white_cells(17)), SQUARE[None])
+    assert refine_corners(flat, np.zeros((0, 4, 2)), np.zeros((0, 6, 6), bool)).shape == (0, 4, 2)
 
 
 @settings(max_examples=10)
@@ -337,10 +337,10 @@ def test_without_edges_corners_stay():
     marker=st.integers(0, 999),
 )
 def test_any_place_and_turn(angle, x, y, side, marker):
-    """Corners come in the marker's own order, clockwise from its own top left, however it is turned."""
+    """Corners come in the marker's own order, clockwise from its own top left, at every turn."""
     around = angle + np.pi / 4 * np.array([5, 7, 9, 11])
     corners = np.array([x, y]) + side / np.sqrt(2) * np.stack([np.cos(around), np.sin(around)], axis=-1)
-    seen = MarkerDetector().detect(draw([(marker, corners)]))
-    assert seen.ids.tolist() == [marker]
-    # Measured 0.2 at most, where sides of 40 pixels are nearly upright and sharp.
-    assert error_px(seen.corners_px[0], corners) < 0.3
+    found = MarkerDetector().detect(draw([(marker, corners)]))
+    assert found.ids.tolist() == [marker]
+    # Measured 0.2 at most, with sides of 40 pixels that are nearly upright and sharp.
+    assert error_px(found.corners_px[0], corners) < 0.3

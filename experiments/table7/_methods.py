@@ -10,7 +10,7 @@ from _recordings import Recording
 from _sightings import Sightings
 
 from psotrack.inside_out import CameraPath, LocaliseSettings, PoseSettings, smooth
-from psotrack.inside_out.detection import SeenMarkers
+from psotrack.inside_out.detection import DetectedMarkers
 from psotrack.inside_out.filtering.path_rows import path_of
 from psotrack.inside_out.localising import follow_markers, row_of
 from psotrack.inside_out.pose import MarkerPose
@@ -33,7 +33,7 @@ def paths(recording: Recording, seen: Sightings) -> dict[str, CameraPath]:
     }
 
 
-_Markers = tuple[int, float, SeenMarkers]
+_Markers = tuple[int, float, DetectedMarkers]
 
 
 def _known(recording: Recording, seen: Sightings, frame: int) -> _Markers:
@@ -51,7 +51,7 @@ def _followed(
     return path_of([raw for raw, _ in rows]), path_of([row for _, row in rows])
 
 
-def _of_all(markers: SeenMarkers, recording: Recording) -> MarkerPose | None:
+def _of_all(markers: DetectedMarkers, recording: Recording) -> MarkerPose | None:
     """The least squares of all corners of all markers, right and wrong ones alike: the paper's way."""
     if len(markers) < MIN_MARKERS:
         return None

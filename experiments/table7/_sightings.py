@@ -12,7 +12,7 @@ from _recordings import Recording
 from jaxtyping import Float, Int
 
 from psotrack.inside_out import MarkerMap, detection
-from psotrack.inside_out.detection import MarkerDetector, SeenMarkers
+from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
 from psotrack.recordings import read_frames
 from psotrack.support import terminal, written_whole
 
@@ -33,10 +33,10 @@ class Sightings:
     ids: Int[np.ndarray, "seen"]
     corners_px: Float[np.ndarray, "seen 4 2"]
 
-    def in_frame(self, frame: int) -> SeenMarkers:
+    def in_frame(self, frame: int) -> DetectedMarkers:
         """Those of one frame."""
         first, last = np.searchsorted(self.frame, [frame, frame + 1])
-        return SeenMarkers(self.ids[first:last], self.corners_px[first:last])
+        return DetectedMarkers(self.ids[first:last], self.corners_px[first:last])
 
 
 def detected(recording: Recording, kept: Path) -> Sightings:

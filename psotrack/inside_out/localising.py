@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from psotrack.errors import InputError
 from psotrack.geometry import Camera
 from psotrack.inside_out.camera_path import CameraPath, Flag
-from psotrack.inside_out.detection import MarkerDetector, SeenMarkers
+from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
 from psotrack.inside_out.filtering.path_rows import PoseRow, path_of
 from psotrack.inside_out.filtering.pose_filter import FilterRun, PoseFilterParams, advance, expected, step
 from psotrack.inside_out.frames import Frame, Source, read_ahead
@@ -129,7 +129,7 @@ def localise_video(
 
 
 def follow_markers(
-    sightings: Iterable[tuple[int, float, SeenMarkers]],
+    sightings: Iterable[tuple[int, float, DetectedMarkers]],
     marker_map: MarkerMap,
     lens: Camera,
     settings: LocaliseSettings,
@@ -165,7 +165,7 @@ def follow_markers(
 
 def _detected(
     source: Source, detector: MarkerDetector, seconds: dict[str, float]
-) -> Iterator[tuple[int, float, SeenMarkers]]:
+) -> Iterator[tuple[int, float, DetectedMarkers]]:
     for number, time_s, gray in read_ahead(_greyed(source, seconds), newest=source.newest):
         start_s = time.perf_counter()
         seen = detector.detect(gray)
@@ -198,7 +198,7 @@ def _greyed(source: Source, seconds: dict[str, float]) -> Iterator[_Gray]:
 
 
 def _located(
-    seen: SeenMarkers,
+    seen: DetectedMarkers,
     marker_map: MarkerMap,
     lens: Camera,
     settings: LocaliseSettings,
@@ -210,7 +210,7 @@ def _located(
 
 
 def row_of(
-    number: int, time_s: float, seen: SeenMarkers, pose: MarkerPose | None, settings: LocaliseSettings
+    number: int, time_s: float, seen: DetectedMarkers, pose: MarkerPose | None, settings: LocaliseSettings
 ) -> PoseRow:
     """What one frame says by itself; without a pose, the markers are those that were seen."""
     markers = len(seen) if pose is None else int(pose.used.sum())
@@ -239,7 +239,7 @@ def row_of(
 
 
 def _common(
-    seen: SeenMarkers, pose: MarkerPose | None, marker_map: MarkerMap, settings: PoseSettings
+    seen: DetectedMarkers, pose: MarkerPose | None, marker_map: MarkerMap, settings: PoseSettings
 ) -> Float[np.ndarray, "6 errors"]:
     """What errors of the whole map, and of the focal length, do to a pose; none where none are stated."""
     if not settings.map_error_m and not settings.focal_error:
