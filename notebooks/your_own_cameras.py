@@ -286,7 +286,7 @@ for number, (panel, name) in enumerate(zip(panels.flat, rig.names, strict=True))
     image = next(islice(read_frames(sequence.videos[name]), FRAME, None))
     panel.imshow(image[:, :, ::-1])
     for drone, (left, top, right, bottom) in enumerate(xyxy_px[:, number] - 0.5):
-        edge = plots.colour_of(drone)
+        edge = plots.drone_colour(drone)
         panel.add_patch(
             Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=edge, linewidth=1.5)
         )
@@ -300,7 +300,7 @@ plt.show()
 # %%
 figure, (top, bottom) = plt.subplots(2, 1, figsize=(9, 4.2), sharex=True, layout="constrained")
 for drone in range(tracks.num_drones):
-    colour = plots.colour_of(drone)
+    colour = plots.drone_colour(drone)
     top.plot(tracks.time_s, tracks.fitness[:, drone], color=colour, label=f"drone {drone}")
     bottom.plot(tracks.time_s, tracks.num_cameras[:, drone], color=colour, drawstyle="steps-mid")
 top.axhline(settings.min_fitness, color="#2b313a", linestyle=":", label="not found below this")

@@ -1,7 +1,7 @@
-"""The words for array axes, and the aliases that are used in more than one module.
+"""Names of array axes, and type aliases that more than one module uses.
 
-Axis words, the same in every annotation and docstring: `frames`, `cameras`, `drones`, `particles`, `groups` and
-`dims` (of a swarm), `height`, `width` (of an image, rows and columns), `coefficients` (of a lens).
+Annotations and docstrings call the axes `frames`, `cameras`, `drones`; `particles`, `groups` and `dims` in a swarm;
+`height` and `width` (rows and columns) in an image; `coefficients` in a lens.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray, UInt8
 
-#: NumPy outside of jit, where geometry is float64; JAX inside, where it is float32.
+#: NumPy arrays (float64) outside of jit, JAX arrays (float32) inside.
 if TYPE_CHECKING:
     Array = np.ndarray | jax.Array
 else:
-    # NumPy turns arrays without axes into scalars, which to a type checker could not be indexed.
+    # NumPy turns arrays without axes into scalars. Static type checkers do not get them: scalars cannot be indexed.
     Array = np.ndarray | np.generic | jax.Array
 
 Key = PRNGKeyArray

@@ -18,7 +18,7 @@ from psotrack.recordings import Sequence, read_frames
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import SilhouetteSettings
 from psotrack.simulation import simulate
-from psotrack.support import Report, refuse_to_overwrite, silent, written_whole
+from psotrack.support import Report, atomic_write, no_progress, refuse_to_overwrite
 from psotrack.tracking import on_device
 from psotrack.trajectories import write_trajectories
 
@@ -42,7 +42,7 @@ class Demo:
 
 
 def run(
-    out: Path, *, seed: int = 0, jobs: int | None = None, force: bool = False, report: Report = silent
+    out: Path, *, seed: int = 0, jobs: int | None = None, force: bool = False, report: Report = no_progress
 ) -> Demo:
     """Simulate, track, evaluate; all files go to `out`.
 
@@ -117,7 +117,7 @@ def save_picture(path: Path, sequence: Sequence, tracked: TrackedSequence, frame
         axes.set_axis_off()
     paths = figure.add_axes((0.56, 0.0, 0.42, 0.88), projection="3d")
     plots.draw_trajectories(paths, tracked.trajectories, sequence.truth)
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=120)
 
 

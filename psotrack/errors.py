@@ -1,7 +1,7 @@
-"""The errors that users see, and the one sentence that each of them is made of.
+"""Exceptions with messages for users.
 
-Every message says where the trouble is, what was expected, what was found, and what to do. The command line
-prints it as one line and exits with code 2; a program can catch `PsotrackError`.
+Every message is one line: the place, what was expected there, what was found, and what to do about it. The command
+line prints the message and exits with code 2; a program can catch `PsotrackError`.
 """
 
 from __future__ import annotations
@@ -10,38 +10,48 @@ import os
 
 
 class PsotrackError(Exception):
-    """Root of all errors that psotrack raises on purpose."""
+    """Base class of all exceptions that psotrack raises on purpose.
+
+    Args:
+        where: the file, setting or other place of the fault; the message begins with it.
+        expected: noun phrase for what should be at the place.
+        found: noun phrase for what is there instead.
+        remedy: what the user can do; the end of the message.
+    """
 
     def __init__(self, where: object, *, expected: str, found: str, remedy: str = "") -> None:
-        sentence = f"{_place(where)}: expected {expected}, found {found}"
-        super().__init__(f"{sentence}; {remedy}" if remedy else sentence)
+        place = os.fspath(where) if isinstance(where, os.PathLike) else str(where)
+        message = f"{place}: expected {expected}, found {found}"
+        super().__init__(f"{message}; {remedy}" if remedy else message)
 
     def __reduce__(self) -> tuple[object, ...]:
-        # Pickling brings errors out of worker processes, and would call __init__ with the sentence alone.
-        return _restored, (type(self), str(self))
+        # Worker processes send errors by pickle, which by default calls __init__ with the message as only argument.
+        return _unpickled, (type(self), str(self))
 
 
 class InputError(PsotrackError):
-    """A file or folder that was given cannot be used."""
+    """An input file or folder cannot be used."""
 
 
 class SettingsError(PsotrackError):
-    """A setting has a value that makes no sense."""
+    """A setting has a value that is not allowed."""
 
 
 class OutputError(PsotrackError):
-    """A result could not be written; what was there before is untouched."""
+    """A result cannot be written. An older result at the same path is unchanged."""
 
 
-def _restored(kind: type[PsotrackError], sentence: str) -> PsotrackError:
-    return kind.__new__(kind, sentence)
-
-
-def _place(where: object) -> str:
-    return os.fspath(where) if isinstance(where, os.PathLike) else str(where)
+def _unpickled(kind: type[PsotrackError], message: str) -> PsotrackError:
+    return kind.__new__(kind, message)
 
 
 def check_positive(name: str, value: float, remedy: str = "") -> None:
-    """Raise `SettingsError` unless `value` is a finite number above 0."""
+    """Raise `SettingsError` unless `value` is a finite number above 0.
+
+    Args:
+        name: name of the setting, for the message.
+        value: value of the setting.
+        remedy: what the user can do, for the message.
+    """
     if not 0 < value < float("inf"):
         raise SettingsError(name, expected="a number above 0", found=f"{value:g}", remedy=remedy)

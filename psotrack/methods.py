@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import collections.abc
-import hashlib
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from psotrack.projection_lines import follow, start_of
 from psotrack.recordings import Sequence
 from psotrack.settings import BLOBS, YOLO, TrackSettings
 from psotrack.silhouettes import Silhouettes
-from psotrack.support import Report
+from psotrack.support import Report, digest_file
 from psotrack.tracking import Tracked, track_silhouettes
 
 
@@ -120,7 +119,7 @@ def track_by_projection_lines(
         files = detection_files_of(sequence, settings.detections)
         detections = {name: read_detections(path) for name, path in files.items()}
         sightings = from_detections(detections, sequence.rig, sequence.num_frames)
-        keys = {name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for name, path in files.items()}
+        keys = {name: digest_file(path, algorithm="sha256")[:16] for name, path in files.items()}
     tracked = follow(
         sequence.rig.cameras,
         sightings,

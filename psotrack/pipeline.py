@@ -25,7 +25,7 @@ from psotrack.methods import MethodResult, fuse_methods, track_by_projection_lin
 from psotrack.recordings import Sequence
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
-from psotrack.support import Report, silent
+from psotrack.support import Report, no_progress
 from psotrack.tracking import SizeState
 from psotrack.trajectories import Trajectories
 
@@ -53,7 +53,7 @@ def track_sequence(
     *,
     cache: Path,
     jobs: int | None = None,
-    report: Report = silent,
+    report: Report = no_progress,
 ) -> TrackedSequence:
     """Track the drones of a sequence from its videos.
 
@@ -79,7 +79,11 @@ def track_sequence(
 
 
 def track_from_silhouettes(
-    sequence: Sequence, silhouettes: Silhouettes | None, settings: TrackSettings, *, report: Report = silent
+    sequence: Sequence,
+    silhouettes: Silhouettes | None,
+    settings: TrackSettings,
+    *,
+    report: Report = no_progress,
 ) -> TrackedSequence:
     """Track the drones of a sequence of which there are silhouettes.
 
@@ -104,7 +108,7 @@ def track_runs(
     silhouettes: Silhouettes | None,
     settings: collections.abc.Sequence[TrackSettings],
     *,
-    report: Report = silent,
+    report: Report = no_progress,
 ) -> list[TrackedSequence | InputError]:
     """Track a sequence once for each of the settings: each as by itself, many swarms in the time of a few.
 

@@ -87,7 +87,7 @@ def test_a_broken_line_is_named(tmp_path, broken, expected):
 def test_no_text(tmp_path):
     path = tmp_path / "cam1i_s.csv"
     path.write_bytes(b"\xff\xfe\x00\x01")
-    with pytest.raises(InputError, match=r"cam1i_s\.csv: expected text, found a byte"):
+    with pytest.raises(InputError, match=r"cam1i_s\.csv: expected UTF-8 text, found an invalid byte"):
         read_detections(path)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError, check_positive
-from psotrack.support import refuse_to_overwrite, silent, terminal, written_whole
+from psotrack.support import atomic_write, no_progress, progress_bar, refuse_to_overwrite
 
 
 def test_a_message_is_one_sentence():
@@ -44,10 +44,10 @@ def names(folder):
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".avi", ""])
-def test_written_whole(tmp_path, suffix):
+def test_atomic_write(tmp_path, suffix):
     """Under its name only when it is whole; the temporary has the same suffix, which writers choose a format by."""
     path = tmp_path / "new" / f"out{suffix}"
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         assert temporary.suffix == suffix or not suffix
         assert temporary.parent == path.parent
         temporary.write_text("whole")
@@ -57,7 +57,7 @@ def test_written_whole(tmp_path, suffix):
 
 
 def fail_half_way(path, fault):
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text("half")
         raise fault
 
@@ -75,7 +75,7 @@ def test_what_was_there_survives_a_failure(tmp_path, fault):
 def test_a_full_disk(tmp_path):
     path = tmp_path / "out.csv"
     path.write_text("before")
-    message = r"out\.csv: expected to write it, found No space left .* unchanged"
+    message = r"out\.csv: expected a path that can be written, found No space left .* unchanged"
     with pytest.raises(OutputError, match=message) as caught:
         fail_half_way(path, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
     assert caught.value.__cause__.errno == errno.ENOSPC
@@ -88,7 +88,7 @@ def test_a_folder_that_cannot_be(tmp_path):
     (tmp_path / "file").write_text("")
     with (
         pytest.raises(OutputError, match="earlier results are unchanged"),
-        written_whole(tmp_path / "file" / "out"),
+        atomic_write(tmp_path / "file" / "out"),
     ):
         raise AssertionError("never entered")
 
@@ -96,7 +96,7 @@ def test_a_folder_that_cannot_be(tmp_path):
 def test_nothing_written_is_an_error(tmp_path):
     path = tmp_path / "out.csv"
     path.write_text("before")
-    with pytest.raises(OutputError, match="No such file"), written_whole(path):
+    with pytest.raises(OutputError, match="No such file"), atomic_write(path):
         pass
     assert path.read_text() == "before"
 
@@ -105,7 +105,7 @@ def test_a_folder_takes_the_place_of_a_folder(tmp_path):
     path = tmp_path / "sequence"
     path.mkdir()
     (path / "old").write_text("old")
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.mkdir()
         (temporary / "new").write_text("new")
         assert names(path) == ["old"]
@@ -114,7 +114,7 @@ def test_a_folder_takes_the_place_of_a_folder(tmp_path):
 
 
 def fail_half_way_in_a_folder(path):
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.mkdir()
         (temporary / "new").write_text("half")
         raise KeyboardInterrupt
@@ -134,7 +134,7 @@ def test_a_folder_that_was_never_made_leaves_the_old_one(tmp_path):
     path = tmp_path / "sequence"
     path.mkdir()
     (path / "old").write_text("old")
-    with pytest.raises(OutputError), written_whole(path):
+    with pytest.raises(OutputError), atomic_write(path):
         pass
     assert names(path) == ["old"]
     assert names(tmp_path) == ["sequence"]
@@ -143,7 +143,7 @@ def test_a_folder_that_was_never_made_leaves_the_old_one(tmp_path):
 def test_two_writers_at_once(tmp_path):
     """Each has a temporary of its own; the last to finish is there, whole."""
     path = tmp_path / "out.csv"
-    with written_whole(path) as first, written_whole(path) as second:
+    with atomic_write(path) as first, atomic_write(path) as second:
         assert first != second
         first.write_text("first")
         second.write_text("second")
@@ -156,11 +156,14 @@ def test_refuse_to_overwrite(tmp_path):
     refuse_to_overwrite(path, force=False)
     path.write_text("")
     refuse_to_overwrite(path, force=True)
-    with pytest.raises(OutputError, match=r"out\.csv: expected no such file yet, found one; pass --force"):
+    with pytest.raises(
+        OutputError,
+        match=r"out\.csv: expected a path that does not exist yet, found an existing file; pass --force",
+    ):
         refuse_to_overwrite(path, force=False)
 
 
-@pytest.mark.parametrize("report", [silent, terminal])
+@pytest.mark.parametrize("report", [no_progress, progress_bar])
 def test_progress_is_quiet_where_there_is_no_terminal(report, capfd):
     with report("track", 10) as advance:
         advance(4)
@@ -176,8 +179,8 @@ def test_a_file_never_takes_the_place_of_a_folder(tmp_path):
     folder.mkdir()
     (folder / "mine.png").write_bytes(b"mine")
     with (
-        pytest.raises(OutputError, match=r"expected a file to write, found a folder"),
-        written_whole(folder) as temporary,
+        pytest.raises(OutputError, match=r"expected the path of a file, found a folder"),
+        atomic_write(folder) as temporary,
     ):
         temporary.write_text("a,b")
     assert [path.name for path in tmp_path.rglob("*")] == ["frames.csv", "mine.png"]

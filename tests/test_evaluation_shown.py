@@ -184,7 +184,7 @@ class TestPictures:
         save(path, est, ref)
         rgb = cv2.imread(str(path))[..., ::-1].reshape(-1, 3).astype(int)
         for drone in range(3):
-            colour = np.round(np.array(to_rgb(plots.colour_of(drone))) * 255)
+            colour = np.round(np.array(to_rgb(plots.drone_colour(drone))) * 255)
             # Lines are a few hundred pixels long; one that is hidden behind its truth still has a rim.
             assert (np.abs(rgb - colour).max(axis=1) <= 2).sum() > 100
 

@@ -106,7 +106,7 @@ def test_options(files, tmp_path) -> None:
         (
             ["dron1.csv", "tracks.csv", "--out", "new.csv", "--json", "tracks.csv"],
             OutputError,
-            "tracks.csv: expected no such file yet",
+            "tracks.csv: expected a path that does not exist yet",
         ),
         (
             ["dron1.csv", "tracks.csv", "--out", "new.csv", "--json", "new.csv"],

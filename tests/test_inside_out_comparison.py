@@ -446,7 +446,7 @@ class TestPictures:
         save_paths(png, path, comparison, caption="a flight")
         for colour in (RECONSTRUCTED, REFERENCE):
             assert self.of_colour(png, colour).sum() > 500
-        with pytest.raises(OutputError, match="expected no such file yet"):
+        with pytest.raises(OutputError, match="expected a path that does not exist yet"):
             save_paths(png, path, comparison)
         # One pose far away does not make the picture small; the caption counts it.
         wild = replace(path, position_m=path.position_m.copy())

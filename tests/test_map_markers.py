@@ -108,7 +108,7 @@ def test_a_map_from_a_video(walk, tmp_path):
         # A centre that is off by less than 4 of its deviations, in its length.
         assert off[int(marker)] <= 4 * np.linalg.norm(row["std_m"]) + 1e-9
         assert row["residual_px"] < 0.5
-    assert "expected no such file yet" in invoke(*words, "--out", out, expect=OutputError)
+    assert "expected a path that does not exist yet" in invoke(*words, "--out", out, expect=OutputError)
     invoke(*words, "--out", out, "--force", "--quiet")
 
 
@@ -256,7 +256,7 @@ def test_measured_corners_in_another_order_are_told(tmp_path):
         (
             ["{truth}", "--out", "{new}", "--json", "{truth}"],
             OutputError,
-            "truth.csv: expected no such file yet",
+            "truth.csv: expected a path that does not exist yet",
         ),
     ],
 )

@@ -292,5 +292,5 @@ def test_a_full_disk_is_an_error(tmp_path):
     )
     path = tmp_path / "a.c3d"
     done = subprocess.run([sys.executable, "-c", script, path], capture_output=True, text=True)
-    assert "a.c3d: expected to write it" in done.stdout, done.stderr
+    assert "a.c3d: expected a path that can be written" in done.stdout, done.stderr
     assert list(tmp_path.iterdir()) == []

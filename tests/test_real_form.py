@@ -214,7 +214,10 @@ def test_the_seed_decides(simulated, real, tmp_path):
 
 
 def test_what_cannot_be_written(simulated, real, tmp_path):
-    with pytest.raises(OutputError, match=r"R02_D4: expected no such file yet, found one; pass --force"):
+    with pytest.raises(
+        OutputError,
+        match=r"R02_D4: expected a path that does not exist yet, found an existing folder; pass --force",
+    ):
         write_as_real(simulated, real.parents[1])
     with pytest.raises(SettingsError, match=r"offset_s: expected more than -0\.96 s, .* found -1"):
         write_as_real(simulated, tmp_path, offset_s=-1.0)

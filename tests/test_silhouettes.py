@@ -489,5 +489,7 @@ def test_errors_of_workers_come_as_themselves() -> None:
 
 
 def test_worker_that_dies() -> None:
-    with pytest.raises(PsotrackError, match="a worker process: expected to finish, found that it died"):
+    with pytest.raises(
+        PsotrackError, match="a worker process: expected a result, found that the process died"
+    ):
         map_in_processes(_double, [1, -1, 3], jobs=2, advance=lambda steps: None)

@@ -370,7 +370,7 @@ def test_a_death_between_the_two_moves_of_a_replacement_loses_nothing(pair_folde
     folder = tmp_path / "Simulated_Data" / NAME
     aside = folder.with_name(f".{NAME}.old")
     shutil.copytree(pair_folder, aside)
-    with pytest.raises(OutputError, match="expected no such file yet, found one"):
+    with pytest.raises(OutputError, match="expected a path that does not exist yet, found an existing"):
         simulate(PAIR, tmp_path, jobs=1, seed=1, **TINY)
     assert contents(folder) == contents(pair_folder)
     assert beside(folder) == [NAME]
@@ -386,7 +386,9 @@ def test_a_replacement_that_cannot_be_moved_leaves_the_old_sequence(pair_folder,
         move(source, target)
 
     monkeypatch.setattr("psotrack.simulation.unfinished.os.replace", refuse)
-    with pytest.raises(OutputError, match=r"S02_D4_A: expected to write it, found Input/output error"):
+    with pytest.raises(
+        OutputError, match=r"S02_D4_A: expected a path that can be written, found Input/output error"
+    ):
         simulate(PAIR, tmp_path, num_frames=1, scale=0.04, jobs=1, force=True)
     assert contents(folder) == contents(pair_folder)
     assert beside(folder) == [f".{NAME}.unfinished", NAME]
@@ -427,7 +429,9 @@ def test_a_file_system_without_locks_keeps_nobody_out_and_a_broken_one_is_named(
         raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr("psotrack.simulation.unfinished.fcntl.flock", fail)
-    refused = pytest.raises(OutputError, match=r"S02_D4_A: expected to write it, found Input/output error")
+    refused = pytest.raises(
+        OutputError, match=r"S02_D4_A: expected a path that can be written, found Input/output error"
+    )
     allowed = contextlib.nullcontext() if code == errno.ENOLCK else refused
     with allowed, unfinished(tmp_path / NAME, b"record", force=False) as growing:
         assert growing.folder.is_dir()
@@ -469,7 +473,10 @@ def test_a_full_disk_leaves_no_sequence_and_keeps_what_was_whole(pair_folder, tm
 def test_a_sequence_that_exists_is_left_alone_unless_forced(pair_folder, tmp_path):
     folder = shutil.copytree(pair_folder, tmp_path / "Simulated_Data" / NAME)
     before = contents(folder)
-    with pytest.raises(OutputError, match=r"S02_D4_A: expected no such file yet, found one; pass --force"):
+    with pytest.raises(
+        OutputError,
+        match=r"S02_D4_A: expected a path that does not exist yet, found an existing folder; pass --force",
+    ):
         simulate(PAIR, tmp_path, jobs=1, **TINY)
     with pytest.raises(KeyboardInterrupt):
         simulate(PAIR, tmp_path, jobs=1, seed=1, force=True, report=interrupting(2), **TINY)

@@ -637,7 +637,8 @@ def test_what_is_there_is_kept_unless_forced(run, tmp_path, there):
     answer = run("--out", "loop.csv", "--device", "script.csv")
     assert answer.code == 2
     assert re.fullmatch(
-        rf"psotrack: {there}: expected no such file yet, found one; pass --force .*\n", answer.err
+        rf"psotrack: {there}: expected a path that does not exist yet, found an existing file; pass --force .*\n",
+        answer.err,
     )
     assert (tmp_path / there).read_text() == "mine"
     assert run("--out", "loop.csv", "--device", "script.csv", "--force").code == 0

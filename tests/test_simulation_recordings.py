@@ -368,5 +368,5 @@ def test_what_makes_no_recording_is_not_written(tmp_path, time_s, index, value, 
 
 def test_a_folder_that_cannot_be_written_is_one_clear_error(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="expected to write it"):
+    with pytest.raises(OutputError, match="expected a path that can be written"):
         write_recording(tmp_path / "file" / "loop.csv", EVEN_S, FORMULA.position_m(EVEN_S), None)

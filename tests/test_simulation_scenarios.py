@@ -177,7 +177,7 @@ def test_paths_in_a_file_start_at_its_folder(tmp_path, monkeypatch):
          "num_frames: expected a whole number of at most 1000000, found 2500000000"),
         ("num_frames = 250", "num_frames = 2026-01-01", 'num_frames: expected a whole number, found "2026-01-01"'),
         ("num_frames = 250", f"num_frames = 250\nfps = 1{'0' * 400}",
-         f"fps: expected a value that fits, found 1{'0' * 59}..."),
+         f"fps: expected a value in the allowed range, found 1{'0' * 59}..."),
         ("markers = true", 'markers = "yes"', 'markers: expected true or false, found "yes"'),
         ("[onboard]", "onboard = 3", "onboard: expected a table, found 3"),
         ("max_tilt_deg = 20.0", "max_tilt_deg = 90", "limits.max_tilt_deg: expected a number below 90, found 90"),
@@ -207,13 +207,13 @@ def test_an_unknown_field_at_the_top_is_answered_with_all_and_the_nearest(tmp_pa
 @pytest.mark.parametrize(
     ("text", "where"),
     [
-        ('name = "x"\nfps = \n', ", line 2: expected TOML, found what is none (invalid value)"),
+        ('name = "x"\nfps = \n', ", line 2: expected valid TOML, found an error (invalid value)"),
         (
             'name = "x"\nname = "y"\n',
-            ", line 2: expected TOML, found what is none (cannot overwrite a value)",
+            ", line 2: expected valid TOML, found an error (cannot overwrite a value)",
         ),
-        ("drones = [", ", end of document: expected TOML, found what is none (invalid value)"),
-        (f"fps = {'1' * 5000}", ": expected TOML, found what is none (exceeds the limit"),
+        ("drones = [", ", end of document: expected valid TOML, found an error (invalid value)"),
+        (f"fps = {'1' * 5000}", ": expected valid TOML, found an error (exceeds the limit"),
         ("", ": name: expected a value, found none"),
     ],
 )
@@ -229,7 +229,9 @@ def test_files_that_cannot_be_read_are_named(tmp_path):
     for name, found in (("none.toml", "no such file or directory"), ("", "is a directory")):
         with pytest.raises(InputError, match=f": expected a file to read, found {found}$"):
             load(tmp_path / name)
-    with pytest.raises(InputError, match=r"bytes.toml: expected text, found a byte that is none at 8$"):
+    with pytest.raises(
+        InputError, match=r"bytes.toml: expected UTF-8 text, found an invalid byte at offset 8$"
+    ):
         load(tmp_path / "bytes.toml")
 
 

@@ -218,7 +218,7 @@ def test_a_frame_of_another_size_is_refused(tmp_path):
 
 def test_writing_where_a_file_stands_for_a_folder(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(PsotrackError, match=r"a\.avi: expected to write it"):
+    with pytest.raises(PsotrackError, match=r"a\.avi: expected a path that can be written"):
         write(tmp_path / "file" / "a.avi", noise(1))
 
 

@@ -16,7 +16,7 @@ import _runs
 import pandas as pd
 
 from psotrack.settings import TrackSettings
-from psotrack.support import written_whole
+from psotrack.support import atomic_write
 
 #: Settings that leave a part out, or add one that is off by default.
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -73,7 +73,7 @@ def draw(table: pd.DataFrame, path: Path) -> None:
         axes.set_xlabel("mean error, offset removed (mm)")
         axes.grid(visible=True, axis="x", which="both", alpha=0.3)
         axes.set_yticks(range(len(variants)), list(reversed(variants)))
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=110)
 
 

@@ -29,7 +29,7 @@ from psotrack.settings import TrackSettings
 from psotrack.silhouettes import compute
 from psotrack.silhouettes.computation import SilhouetteSettings
 from psotrack.simulation import scenarios, simulate
-from psotrack.support import written_whole
+from psotrack.support import atomic_write
 from psotrack.trajectories import Status, Trajectories
 
 SCENARIO = Path(__file__).with_suffix(".toml")
@@ -261,7 +261,7 @@ def draw(runs: dict[str, tuple[Judged, tuple[Any, ...]]], plan: list[Phase], fps
         for colour, label in (("black", "is new"), ("tab:blue", "is back"))
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8)
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=110)
 
 

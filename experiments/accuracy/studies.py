@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from psotrack.pipeline import environment
-from psotrack.support import keep_compiled, terminal, written_whole
+from psotrack.support import atomic_write, keep_compiled, progress_bar
 from psotrack.sweep import load, sweep
 
 GRIDS = Path(__file__).parent / "studies"
@@ -40,7 +40,7 @@ def rows_of(study: str, data: Path) -> pd.DataFrame:
         seed = int(Path(sequence).parts[0].removeprefix("seed"))
         _runs.folder_of(Path(sequence).name, data, seed)
     keep_compiled(_runs.cache_of(data) / "compiled")
-    rows = sweep(grid, data / "studies" / study, data=data, cache=_runs.cache_of(data), report=terminal)
+    rows = sweep(grid, data / "studies" / study, data=data, cache=_runs.cache_of(data), report=progress_bar)
     flight = {key: number for number, key in enumerate(dict.fromkeys(rows["input"]))}
     return rows.assign(
         study=study,
@@ -81,7 +81,7 @@ def draw(table: pd.DataFrame, path: Path) -> None:
         axes.set_xlabel(STUDIES[study][1])
         axes.grid(visible=True, axis="y", alpha=0.3)
     figure.axes[0].set_ylabel("mean error, offset removed (mm)")
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, format="png", dpi=110)
 
 

@@ -22,7 +22,7 @@ from psotrack.initiation import InitialState
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes, open_stored
 from psotrack.silhouettes.store import CHUNK_FRAMES
-from psotrack.support import terminal
+from psotrack.support import progress_bar
 from psotrack.tracking import track_silhouettes
 
 
@@ -52,7 +52,7 @@ def main(frames: int, cameras: int, drones: int, particles: int, iterations: int
             [TrackSettings(particles=particles, iterations=iterations)],
             fps=_scene.FPS,
             bounds_m=[_scene.BOUNDS_M],
-            report=terminal,
+            report=progress_bar,
         )
         track_s = time.perf_counter() - began - tracked.compile_s
     peak_gb = _peak_gb()

@@ -18,7 +18,7 @@ import pandas as pd
 
 from psotrack.datasets.dpjait import CALIBRATION
 from psotrack.errors import PsotrackError
-from psotrack.support import terminal
+from psotrack.support import progress_bar
 from psotrack.sweep import grid, pivot, render, sweep
 
 HERE = Path(__file__).parent
@@ -81,7 +81,7 @@ def simulated(data: Path) -> Path:
     for name in SIMULATED:
         if not (data / "Simulated_Data" / name).is_dir():
             print(f"simulating {name}", flush=True)
-            simulate(name, data, seed=0, masks=False, onboard=False, report=terminal)
+            simulate(name, data, seed=0, masks=False, onboard=False, report=progress_bar)
     return data
 
 
@@ -100,7 +100,7 @@ def tracked(what: dict, out: Path, data: Path) -> pd.DataFrame:
 
     share_processors()
     keep_compiled(out / "cache" / "compiled")
-    return sweep(grid(what), out, data=data, cache=out / "cache", report=terminal)
+    return sweep(grid(what), out, data=data, cache=out / "cache", report=progress_bar)
 
 
 def show(rows: pd.DataFrame, out: Path) -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 import pandas as pd
 
 from psotrack.errors import PsotrackError
-from psotrack.support import terminal
+from psotrack.support import progress_bar
 from psotrack.sweep import Grid, Store, load, pivot, render, sweep
 
 HERE = Path(__file__).parent
@@ -70,7 +70,7 @@ def simulated(grid: Grid, data: Path, *, quick: bool) -> Path:
         if not (data / "Simulated_Data" / name).is_dir():
             print(f"simulating {name}", flush=True)
             size = {"num_frames": QUICK_FRAMES, "scale": QUICK_SCALE} if quick else {}
-            simulate(name, data, seed=0, masks=False, onboard=False, report=terminal, **size)
+            simulate(name, data, seed=0, masks=False, onboard=False, report=progress_bar, **size)
     return data
 
 
@@ -81,7 +81,7 @@ def tracked(grid: Grid, out: Path, data: Path) -> pd.DataFrame:
 
     share_processors()
     keep_compiled(out / "cache" / "compiled")
-    return sweep(grid, out, data=data, cache=out / "cache", report=terminal)
+    return sweep(grid, out, data=data, cache=out / "cache", report=progress_bar)
 
 
 def show(rows: pd.DataFrame, out: Path) -> None:

@@ -19,7 +19,7 @@ from psotrack.errors import InputError
 from psotrack.geometry import Camera, camera
 from psotrack.inside_out import MarkerMap, read_marker_map
 from psotrack.recordings import OnboardVideo, VideoInfo
-from psotrack.support import terminal
+from psotrack.support import progress_bar
 from psotrack.trajectories import Trajectories
 
 SIMULATED = ("S01_D2_A", "S02_D4_A")
@@ -84,7 +84,9 @@ def simulated(data: Path, *, num_frames: int | None = None, scale: float = 1.0) 
         if not (data / "Simulated_Data" / name).is_dir():
             print(f"simulating the drones' own videos of {name}", flush=True)
             recipe = replaced(scenario(name), {"cameras": [corner], "image_size_wh": [160, 160]})
-            simulate(recipe, data, num_frames=num_frames, scale=scale, seed=0, masks=False, report=terminal)
+            simulate(
+                recipe, data, num_frames=num_frames, scale=scale, seed=0, masks=False, report=progress_bar
+            )
     return data
 
 

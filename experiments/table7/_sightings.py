@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from psotrack.inside_out import MarkerMap, detection
 from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
 from psotrack.recordings import read_frames
-from psotrack.support import terminal, written_whole
+from psotrack.support import atomic_write, progress_bar
 
 DICTIONARY = "4x4_1000"
 
@@ -49,7 +49,7 @@ def detected(recording: Recording, kept: Path) -> Sightings:
                 return Sightings(stored["frame"], stored["ids"], stored["corners_px"])
     detector = MarkerDetector(DICTIONARY, recording.lens, ids=ids.tolist())
     seen = []
-    with terminal(f"detect {video.path.stem}", video.num_frames) as advance:
+    with progress_bar(f"detect {video.path.stem}", video.num_frames) as advance:
         for image in read_frames(video):
             seen.append(detector.detect(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)))
             advance(1)
@@ -58,7 +58,7 @@ def detected(recording: Recording, kept: Path) -> Sightings:
         np.concatenate([one.ids for one in seen]),
         np.concatenate([one.corners_px for one in seen]),
     )
-    with written_whole(kept) as temporary:
+    with atomic_write(kept) as temporary:
         np.savez(temporary, made_of=made_of, frame=found.frame, ids=found.ids, corners_px=found.corners_px)
     return found
 

@@ -26,7 +26,7 @@ from psotrack.errors import PsotrackError
 from psotrack.inside_out import CameraPath
 from psotrack.inside_out.comparison import Comparison, compare
 from psotrack.inside_out.comparison.plots import save_errors, save_paths
-from psotrack.support import written_whole
+from psotrack.support import atomic_write
 
 #: Shares of the markers that are taken for others.
 WRONG = (0.0, 0.02)
@@ -187,7 +187,7 @@ def show(flown: list[Flight], out: Path) -> None:
         parts.append(("Clocks: found minus planted, at most (frames)", clock_errors(rows)))
     text = "\n\n".join(f"## {title}\n\n{markdown(table)}" for title, table in parts)
     print(text)
-    with written_whole(out / "table7.md") as temporary:
+    with atomic_write(out / "table7.md") as temporary:
         temporary.write_text(f"{text}\n")
 
 

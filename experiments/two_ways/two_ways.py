@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.errors import InputError, PsotrackError
 from psotrack.inside_out import CameraPath, Fused, fuse, read_camera_path
-from psotrack.support import refuse_to_overwrite, written_whole
+from psotrack.support import atomic_write, refuse_to_overwrite
 from psotrack.trajectories import Trajectories, read_trajectories
 
 METHODS = ("outside", "inside", "fused")
@@ -62,7 +62,7 @@ def main() -> None:
         rows = pd.concat([_ranges(one, options.range) for one in compared])
         print(render(compared, rows))
         if options.out is not None:
-            with written_whole(options.out) as temporary:
+            with atomic_write(options.out) as temporary:
                 rows.to_csv(temporary, index=False)
     except PsotrackError as error:
         sys.exit(f"two_ways: {error}")

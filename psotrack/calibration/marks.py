@@ -88,9 +88,9 @@ def read_marks(path: Path, places: Path | None = None) -> dict[str, Marks]:
         of_camera = seen.setdefault(row.text(camera), {})
         name = row.text(point)
         if name in of_camera:
-            raise row.wrong(point, "each point once per camera", f"{name} again")
+            raise row.error(point, "each point once per camera", f"{name} again")
         if name not in place_of:
-            raise row.wrong(
+            raise row.error(
                 point,
                 f"{', '.join(_WORLD)} in one of its rows, or in a file of places",
                 f"none for {name}",
@@ -245,5 +245,5 @@ def _places(
             continue
         name, place = row.text(point), [row.number(column) for column in columns]
         if places.setdefault(name, place) != place:
-            raise row.wrong(point, f"{name} at {places[name]}, as before", f"{place}")
+            raise row.error(point, f"{name} at {places[name]}, as before", f"{place}")
     return places

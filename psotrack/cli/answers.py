@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from psotrack.errors import SettingsError
-from psotrack.support import Report, refuse_to_overwrite, silent, terminal, written_whole
+from psotrack.support import Report, atomic_write, no_progress, progress_bar, refuse_to_overwrite
 
 #: Heading of places in a table.
 PLACE = "centre (m)"
@@ -19,7 +19,7 @@ PLACE = "centre (m)"
 
 def report_to(quiet: bool) -> Report:
     """Whom long work reports to."""
-    return silent if quiet else terminal
+    return no_progress if quiet else progress_bar
 
 
 def say(quiet: bool, json_path: Path | None, sentence: str) -> None:
@@ -78,5 +78,5 @@ def answer(json_path: Path | None, content: Any, force: bool) -> None:
 
 def write_json(path: Path, content: Any) -> None:
     """Write a JSON file whole."""
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")

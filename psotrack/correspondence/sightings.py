@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from psotrack.geometry import CameraRig
 from psotrack.recordings import Detections
 from psotrack.silhouettes import Silhouettes, find_blobs
-from psotrack.support import Report, silent
+from psotrack.support import Report, no_progress
 
 #: The middle of a box is off by about a pixel, and by so much of its sides; what it really is, the views tell.
 NOISE_PX, NOISE_SHARE = 1.0, 0.05
@@ -108,7 +108,7 @@ def from_detections(detections: Mapping[str, Detections], rig: CameraRig, num_fr
     return _arrays(images, num_frames, len(rig))
 
 
-def from_silhouettes(silhouettes: Silhouettes, report: Report = silent) -> Sightings:
+def from_silhouettes(silhouettes: Silhouettes, report: Report = no_progress) -> Sightings:
     """The blobs of foreground.
 
     Args:

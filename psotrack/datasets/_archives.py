@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import IO
 
 from psotrack.errors import InputError
-from psotrack.support import written_whole
+from psotrack.support import atomic_write
 
 #: The first day that the format knows: archives of the same contents have the same bytes.
 EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -48,7 +48,7 @@ def join_archives(path: Path, parts: Ordered[Path]) -> None:
         OutputError: the file cannot be written.
     """
     with (
-        written_whole(path) as temporary,
+        atomic_write(path) as temporary,
         temporary.open("wb") as archive,
         tempfile.TemporaryFile() as central,
     ):

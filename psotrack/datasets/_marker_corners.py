@@ -102,7 +102,7 @@ def _wide(table: Table) -> dict[int, MarkerRow]:
     for row in table.rows:
         marker = _marker(row, id_column)
         if marker in found:
-            raise row.wrong(id_column, "each marker once", f"{marker} again")
+            raise row.error(id_column, "each marker once", f"{marker} again")
         values = np.array([row.number(column) for column in columns])
         found[marker] = MarkerRow(row.where, (values * metres).reshape(4, 3))
     return found
@@ -120,7 +120,7 @@ def _long(table: Table) -> dict[int, MarkerRow]:
         corner += 1 - first if row.text(corner_column).isdecimal() else 0
         if corner in rows.setdefault(marker, {}):
             expected = "each corner of a marker once"
-            raise row.wrong(
+            raise row.error(
                 corner_column, expected, f"corner {row.text(corner_column)} of marker {marker} again"
             )
         rows[marker][corner] = row
@@ -147,7 +147,7 @@ def _long(table: Table) -> dict[int, MarkerRow]:
 def _marker(row: TextRow, column: Column) -> int:
     match = _ID.fullmatch(row.text(column))
     if match is None:
-        raise row.wrong(column, "a marker's number", repr(row.text(column)))
+        raise row.error(column, "a marker's number", repr(row.text(column)))
     return int(match["number"])
 
 
@@ -156,7 +156,7 @@ def _corner(row: TextRow, column: Column) -> int:
     text = row.text(column)
     number = _NAMED.get(_bare(text), int(text) if text.isdecimal() else -1)
     if not 0 <= number <= 4:
-        raise row.wrong(column, "a corner, 1 to 4, or tl, tr, br or bl", repr(text))
+        raise row.error(column, "a corner, 1 to 4, or tl, tr, br or bl", repr(text))
     return number
 
 
@@ -165,7 +165,7 @@ def _first_corner(table: Table, column: Column) -> int:
     zeros = [row for row in table.rows if row.text(column) == "0"]
     fours = [row for row in table.rows if row.text(column) == "4"]
     if zeros and fours:
-        raise fours[0].wrong(column, f"corners 0 to 3, because line {zeros[0].line} has corner 0", "corner 4")
+        raise fours[0].error(column, f"corners 0 to 3, because line {zeros[0].line} has corner 0", "corner 4")
     return 0 if zeros else 1
 
 
@@ -211,7 +211,7 @@ def _unlabelled(table: Table) -> Table:
     for row in table.rows:
         named = split_label(row.text(column))
         if named is None:
-            raise row.wrong(
+            raise row.error(
                 column, "a label such as Marker7:1, of marker 7's first corner", repr(row.text(column))
             )
         rows.append(replace(row, cells=(*row.cells, *map(str, named))))

@@ -50,7 +50,7 @@ def read_mocap_markers(path: Path) -> Float[np.ndarray, "frames 4 3"]:
     for row in table.rows:
         frame = row.count(id_column)
         if frame in rows:
-            raise row.wrong(id_column, "each frame once", f"{frame} again")
+            raise row.error(id_column, "each frame once", f"{frame} again")
         rows[frame] = np.array([row.number(column) for column in columns]) * metres
     markers_m = np.full((max(rows) + 1, len(_COLUMNS)), np.nan)
     for frame, values in rows.items():

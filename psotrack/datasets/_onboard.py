@@ -89,10 +89,10 @@ def read_onboard_calibration(path: Path) -> Intrinsics:
     for row in table.rows:
         name = row.text(name_column).lower()
         if name in found:
-            raise row.wrong(name_column, "each camera once", f"{name} again")
+            raise row.error(name_column, "each camera once", f"{name} again")
         for column in (*focal, *sizes):
             if row.number(column) <= 0:
-                raise row.wrong(column, "a number of pixels above 0", row.text(column))
+                raise row.error(column, "a number of pixels above 0", row.text(column))
         (fx, fy), (cx, cy) = ([row.number(column) for column in pair] for pair in (focal, centre))
         width, height = (row.count(column) for column in sizes)
         found[name] = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), (width, height)

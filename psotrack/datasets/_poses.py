@@ -103,7 +103,7 @@ def _by_frame(table: Table, column: Column) -> dict[int, TextRow]:
     for row in table.rows:
         frame = row.count(column)
         if frame in rows:
-            raise row.wrong(column, "each frame once", f"{frame} again, after line {rows[frame].line}")
+            raise row.error(column, "each frame once", f"{frame} again, after line {rows[frame].line}")
         rows[frame] = row
     return rows
 
@@ -123,5 +123,5 @@ def _unit_quaternion(row: TextRow, columns: list[Column]) -> Float[np.ndarray, "
     quaternion = np.array([row.number(column) for column in columns])
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > _NORM_TOLERANCE:
-        raise row.wrong(columns[0], "a quaternion of length 1", f"length {norm:g}")
+        raise row.error(columns[0], "a quaternion of length 1", f"length {norm:g}")
     return quaternion / norm

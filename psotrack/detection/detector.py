@@ -23,7 +23,7 @@ from jaxtyping import Float, Int, UInt8
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.recordings import Detections, VideoInfo, read_frames
-from psotrack.support import Report, silent
+from psotrack.support import Report, no_progress
 
 #: What YOLO's own letterbox has around the image.
 _GREY = (114, 114, 114)
@@ -145,7 +145,9 @@ class OnnxDetector:
             cv2.utils.logging.setLogLevel(level)
 
 
-def detect(detector: OnnxDetector, name: str, video: VideoInfo, *, report: Report = silent) -> Detections:
+def detect(
+    detector: OnnxDetector, name: str, video: VideoInfo, *, report: Report = no_progress
+) -> Detections:
     """The detections in all frames of a video; `name` is what progress is called.
 
     Raises:

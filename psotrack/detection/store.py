@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
 import msgspec
 
 from psotrack.detection.detector import OnnxDetector, detect
 from psotrack.recordings import Sequence, write_detections
-from psotrack.support import Report, digest_of, silent
+from psotrack.support import Report, digest_file, digest_record, no_progress
 
 
 def stored_detections(
-    detector: OnnxDetector, sequence: Sequence, *, cache: Path, report: Report = silent
+    detector: OnnxDetector, sequence: Sequence, *, cache: Path, report: Report = no_progress
 ) -> Path:
     """A folder with the detections of each of a sequence's videos; what is not there yet is made.
 
@@ -40,10 +39,10 @@ def stored_detections(
 def _key(detector: OnnxDetector, sequence: Sequence) -> str:
     """40 hexadecimal digits."""
     made_of = {
-        "model": digest_of(detector.model),
+        "model": digest_file(detector.model),
         "settings": msgspec.to_builtins(detector.settings),
         "videos": {
-            name: [video.num_frames, digest_of(video.path)] for name, video in sequence.videos.items()
+            name: [video.num_frames, digest_file(video.path)] for name, video in sequence.videos.items()
         },
     }
-    return hashlib.blake2b(msgspec.json.encode(made_of, order="deterministic"), digest_size=20).hexdigest()
+    return digest_record(made_of)

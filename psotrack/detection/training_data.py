@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 from psotrack.detection.labels import LabelSettings, box_corners, label_boxes
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.recordings import Sequence, VideoInfo, read_frames
-from psotrack.support import Advance, Report, map_in_processes, refuse_to_overwrite, silent, written_whole
+from psotrack.support import Advance, Report, atomic_write, map_in_processes, no_progress, refuse_to_overwrite
 
 #: The file that makes a folder a data set.
 DATA_SET = "data.yaml"
@@ -38,7 +38,7 @@ def write_data_set(
     every: int = 1,
     force: bool = False,
     jobs: int | None = None,
-    report: Report = silent,
+    report: Report = no_progress,
 ) -> dict[str, dict[str, int]]:
     """Images and labels of sequences as a YOLO data set, in a new folder.
 
@@ -67,7 +67,7 @@ def write_data_set(
     _check_replaceable(out, force)
     if every < 1:
         raise SettingsError("every", expected="1 or more", found=f"{every}")
-    with written_whole(out) as temporary:
+    with atomic_write(out) as temporary:
         tasks = [
             task for one in sequences for task in _tasks(one, parts[one.name], settings, every, temporary)
         ]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.support import colour_of, save_figure
+from psotrack.support import drone_colour, save_figure
 from psotrack.trajectories import Trajectories
 from psotrack.trajectories.association import (
     GATE_M,
@@ -88,7 +88,7 @@ def draw_trajectories(axes: Axes3D, traj_est: Trajectories, traj_ref: Trajectori
     for estimate in surplus:
         axes.plot(*_with_gaps(pair, pair.est_m[:, estimate]), color=_GREY, linewidth=1.0)
     for drone, name in enumerate(pair.drones):
-        colour, truth_m = colour_of(drone), _with_gaps(pair, pair.ref_m[:, drone])
+        colour, truth_m = drone_colour(drone), _with_gaps(pair, pair.ref_m[:, drone])
         axes.plot(truth_m[0], truth_m[1], floor_m, color=colour, alpha=0.18, linewidth=1.2, zorder=1)
         if partner[drone] != UNASSIGNED:
             axes.plot(*_with_gaps(pair, pair.est_m[:, partner[drone]]), color=colour, linewidth=1.8)
@@ -113,7 +113,7 @@ def draw_errors(axes: Axes, traj_est: Trajectories, traj_ref: Trajectories) -> N
     switches = identity_switches(matched_per_frame(pair.distance_m, keep=True))
     time_s = _with_gaps(pair, pair.time_s)
     for drone, name in enumerate(pair.drones):
-        colour = colour_of(drone)
+        colour = drone_colour(drone)
         axes.plot(time_s, 1e3 * _with_gaps(pair, error_m[:, drone]), color=colour, linewidth=1.1, label=name)
         bar = np.where(missed[:, drone], _BARS_TOP - _BARS_STEP * drone, np.nan)
         axes.plot(
@@ -133,7 +133,7 @@ def colours_of_estimates(traj_est: Trajectories, traj_ref: Trajectories) -> list
     colours = [_GREY] * len(pair.drones_est)
     for drone, estimate in enumerate(fixed_identity(pair)):
         if estimate != UNASSIGNED:
-            colours[estimate] = colour_of(drone)
+            colours[estimate] = drone_colour(drone)
     return colours
 
 

@@ -28,7 +28,7 @@ class CameraFields:
     place: str
     values: Mapping[str, Any]
 
-    def wrong(self, name: str, expected: str, found: str, remedy: str = "") -> InputError:
+    def error(self, name: str, expected: str, found: str, remedy: str = "") -> InputError:
         """The error of a field."""
         return InputError(f"{self.path}, {self.place}.{name}", expected=expected, found=found, remedy=remedy)
 
@@ -44,11 +44,11 @@ class CameraFields:
         name = self.first(*names)
         expected = " or ".join(_words(shape) for shape in shapes)
         if name is None:
-            raise self.wrong(" or ".join(names), expected, "none")
+            raise self.error(" or ".join(names), expected, "none")
         try:
             array = np.array(self.values[name], np.float64)
         except (TypeError, ValueError):
-            raise self.wrong(name, expected, _quoted(self.values[name])) from None
+            raise self.error(name, expected, _quoted(self.values[name])) from None
         # OpenCV writes vectors as columns or rows.
         squeezed = array.ravel() if array.ndim == 2 and 1 in array.shape else array
         for shape in shapes:
@@ -56,9 +56,9 @@ class CameraFields:
                 want in (-1, have) for want, have in zip(shape, squeezed.shape, strict=True)
             ):
                 if not np.isfinite(squeezed).all():
-                    raise self.wrong(name, "finite numbers", _quoted(self.values[name]))
+                    raise self.error(name, "finite numbers", _quoted(self.values[name]))
                 return squeezed
-        raise self.wrong(name, expected, " x ".join(map(str, array.shape)) or _quoted(self.values[name]))
+        raise self.error(name, expected, " x ".join(map(str, array.shape)) or _quoted(self.values[name]))
 
 
 def camera_from_fields(
@@ -70,18 +70,18 @@ def camera_from_fields(
         InputError: a field is missing or wrong.
     """
     if fields.values.get("fisheye"):
-        raise fields.wrong("fisheye", "a lens of OpenCV's pinhole model", "a fisheye")
+        raise fields.error("fisheye", "a lens of OpenCV's pinhole model", "a fisheye")
     dist = np.zeros(0)
     coefficients = ("distortions", "D", "dist", "distortion_coefficients")
     if fields.first(*coefficients):
         dist = fields.array(coefficients, (-1,))
     if dist.size not in _COEFFICIENTS:
         allowed = ", ".join(map(str, _COEFFICIENTS))
-        raise fields.wrong(str(fields.first(*coefficients)), f"{allowed} coefficients", f"{dist.size}")
+        raise fields.error(str(fields.first(*coefficients)), f"{allowed} coefficients", f"{dist.size}")
     K = fields.array(("matrix", "K", "camera_matrix"), (3, 3))
     if not (K[0, 0] > 0 and K[1, 1] > 0 and K[1, 0] == 0 and np.array_equal(K[2], [0, 0, 1])):
         name = str(fields.first("matrix", "K", "camera_matrix"))
-        raise fields.wrong(
+        raise fields.error(
             name, "intrinsics [[fx, s, cx], [0, fy, cy], [0, 0, 1]], fx and fy above 0", _quoted(K.tolist())
         )
     R, t_m = np.eye(3), np.zeros(3)
@@ -98,7 +98,7 @@ def _rotation(fields: CameraFields) -> Float[np.ndarray, "3 3"]:
         return Rotation.from_rotvec(turn).as_matrix()
     if np.abs(turn @ turn.T - np.eye(3)).max() > _ROTATION or np.linalg.det(turn) < 0:
         remedy = "its axes are mirrored" if np.linalg.det(turn) < 0 else ""
-        raise fields.wrong(str(fields.first(*names)), "a rotation matrix", _quoted(turn.tolist()), remedy)
+        raise fields.error(str(fields.first(*names)), "a rotation matrix", _quoted(turn.tolist()), remedy)
     return turn
 
 
@@ -110,9 +110,9 @@ def _image_size(fields: CameraFields, image_size_wh: tuple[int, int] | None) -> 
     elif image_size_wh is not None:
         return image_size_wh
     else:
-        raise fields.wrong("size or image_size", "width and height of the images", "none", "pass --size")
+        raise fields.error("size or image_size", "width and height of the images", "none", "pass --size")
     if (sides < 1).any() or (sides != np.round(sides)).any():
-        raise fields.wrong("size", "whole numbers of pixels above 0", _quoted(sides.tolist()))
+        raise fields.error("size", "whole numbers of pixels above 0", _quoted(sides.tolist()))
     return int(sides[0]), int(sides[1])
 
 

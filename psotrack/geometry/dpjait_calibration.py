@@ -37,7 +37,7 @@ def read_names(path: Path) -> tuple[str, ...]:
     for row in table.rows:
         name = row.text(column)
         if camera_key(name) in names:
-            raise row.wrong(column, "each camera once", f"{name} again")
+            raise row.error(column, "each camera once", f"{name} again")
         names[camera_key(name)] = name
     return tuple(names.values())
 
@@ -124,7 +124,7 @@ def _intrinsics(table: Table, row: TextRow) -> Float[np.ndarray, "3 3"]:
     column = table.column("focal_length")
     focal_length_px = row.number(column)
     if focal_length_px <= 0:
-        raise row.wrong(column, "a focal length above 0 pixels", f"{focal_length_px:g}")
+        raise row.error(column, "a focal length above 0 pixels", f"{focal_length_px:g}")
     cx, cy = (row.number(table.column(name)) for name in ("cx", "cy"))
     return np.array([[focal_length_px, 0, cx], [0, focal_length_px, cy], [0, 0, 1]])
 

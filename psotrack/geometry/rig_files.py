@@ -31,7 +31,7 @@ from psotrack.errors import InputError, OutputError
 from psotrack.geometry.camera_fields import CameraFields, camera_from_fields
 from psotrack.geometry.cameras import Camera, CameraRig, stack
 from psotrack.geometry.dpjait_calibration import read_calibration, write_calibration
-from psotrack.support import read_text, read_toml, refuse_to_overwrite, written_whole
+from psotrack.support import atomic_write, read_text, read_toml, refuse_to_overwrite
 
 #: caliscope's name for its file; any other TOML is anipose's.
 _CALISCOPE = "camera_array"
@@ -95,7 +95,7 @@ def _read(
     cameras: dict[str, Camera] = {}
     for name, fields in read(path):
         if name in cameras:
-            raise fields.wrong("name", "each camera once", f"{name} again")
+            raise fields.error("name", "each camera once", f"{name} again")
         cameras[name] = camera_from_fields(fields, image_size_wh, metres_per_unit, placed)
     if not cameras:
         raise InputError(path, expected="at least one camera", found="none")
@@ -126,7 +126,7 @@ def _toml_fields(path: Path) -> Iterator[tuple[str, CameraFields]]:
         if not isinstance(table, dict) or key == "metadata" or "matrix" not in table:
             if prefix or re.fullmatch(r"cam_\w+", key):
                 values = table if isinstance(table, dict) else {}
-                raise CameraFields(path, f"{prefix}{key}", values).wrong("matrix", "3 x 3 numbers", "none")
+                raise CameraFields(path, f"{prefix}{key}", values).error("matrix", "3 x 3 numbers", "none")
             continue
         fields = CameraFields(path, f"{prefix}{key}", table)
         name = fields.first("name", "cam_id", "port")
@@ -160,7 +160,7 @@ def _yaml_fields(path: Path) -> Iterator[tuple[str, CameraFields]]:
         fields = CameraFields(path, f"cameras[{index}]", one if isinstance(one, dict) else {})
         name = fields.first("name")
         if name is None:
-            raise fields.wrong("name", "a name", "none")
+            raise fields.error("name", "a name", "none")
         yield str(fields.values[name]), fields
 
 
@@ -202,12 +202,12 @@ def _write_toml(path: Path, rig: CameraRig) -> None:
         blocks.append("\n".join(lines))
     if not caliscope:
         blocks.append('[metadata]\nunit = "m"')
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text("\n\n".join(blocks) + "\n", encoding="utf-8")
 
 
 def _write_yaml(path: Path, rig: CameraRig) -> None:
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         storage = cv2.FileStorage(str(temporary), cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_FORMAT_YAML)
         if not storage.isOpened():
             raise OutputError(path, expected="to write it", found="a folder that cannot be written")

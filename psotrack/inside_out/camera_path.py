@@ -252,7 +252,7 @@ def _status(row: TextRow, table: Table) -> int:
     column = table.column("status")
     word = row.text(column)
     if word not in _STATUS:
-        raise row.wrong(column, f"one of {', '.join(_STATUS)}", repr(word))
+        raise row.error(column, f"one of {', '.join(_STATUS)}", repr(word))
     return int(_STATUS[word])
 
 
@@ -262,5 +262,5 @@ def _flags(row: TextRow, table: Table) -> int:
     known = {flag.label: flag for flag in Flag}
     for word in words:
         if word not in known:
-            raise row.wrong(column, f"words of {', '.join(known)} with + between them", repr(word))
+            raise row.error(column, f"words of {', '.join(known)} with + between them", repr(word))
     return int(sum(known[word] for word in words))

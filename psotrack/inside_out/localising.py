@@ -20,7 +20,7 @@ from psotrack.inside_out.filtering.pose_filter import FilterRun, PoseFilterParam
 from psotrack.inside_out.frames import Frame, Source, read_ahead
 from psotrack.inside_out.marker_map import MarkerMap
 from psotrack.inside_out.pose import Expected, MarkerPose, PoseSettings, locate
-from psotrack.support import Report, silent
+from psotrack.support import Report, no_progress
 from psotrack.trajectories import Status
 
 #: What a frame goes through; the first two in a thread of their own.
@@ -81,7 +81,7 @@ def localise_video(
     marker_map: MarkerMap,
     lens: Camera,
     settings: LocaliseSettings | None = None,
-    report: Report = silent,
+    report: Report = no_progress,
 ) -> LocalisedVideo:
     """Where a camera is in every frame, from markers of known places.
 

@@ -16,7 +16,7 @@ from psotrack.projection_lines.parting import parted
 from psotrack.projection_lines.results import tracked_of
 from psotrack.projection_lines.tracks import Found, Track, TrackRow, lost_of, newcomer_of
 from psotrack.settings import TrackSettings
-from psotrack.support import Report, silent
+from psotrack.support import Report, no_progress
 from psotrack.tracking import DISPERSION_FRAMES, Tracked
 
 #: What was found in so many of its first frames is a drone.
@@ -41,7 +41,7 @@ def follow(
     fps: float,
     bounds_m: Float[np.ndarray, "2 3"],
     known: tuple[Float[np.ndarray, "known 3"], Float[np.ndarray, "known 3"]] | None = None,
-    report: Report = silent,
+    report: Report = no_progress,
 ) -> Tracked:
     """Follow the drones through all frames.
 

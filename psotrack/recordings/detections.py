@@ -62,7 +62,7 @@ def read_detections(path: Path) -> Detections:
     for row in read_rows(path, _SEPARATOR):
         frame = row.count(_column(0))
         if frame in boxes:
-            raise row.wrong(_column(0), "each frame once", f"frame {frame} again")
+            raise row.error(_column(0), "each frame once", f"frame {frame} again")
         boxes[frame] = _boxes(row)
     found = [(frame, box) for frame in sorted(boxes) for box in boxes[frame]]
     values = np.array([box for _, box in found], np.float64).reshape(-1, 5)
@@ -105,9 +105,9 @@ def _box(row: TextRow, start: int) -> tuple[float, ...]:
     value = {name: row.number(column) for name, column in columns.items()}
     for name in ("w", "h"):
         if value[name] < 0:
-            raise row.wrong(columns[name], f"a size {name} of 0 or more pixels", f"{value[name]:g}")
+            raise row.error(columns[name], f"a size {name} of 0 or more pixels", f"{value[name]:g}")
     if not 0 <= value["confidence"] <= 1:
-        raise row.wrong(columns["confidence"], "a confidence from 0 to 1", f"{value['confidence']:g}")
+        raise row.error(columns["confidence"], "a confidence from 0 to 1", f"{value['confidence']:g}")
     half_w, half_h = value["w"] / 2, value["h"] / 2
     return (
         value["cx"] - half_w,

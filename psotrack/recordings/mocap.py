@@ -21,7 +21,7 @@ from jaxtyping import Float
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.recordings.cross_poses import CrossPoses, at_times, completed, poses
 from psotrack.recordings.crosses import learn_cross
-from psotrack.support import written_whole
+from psotrack.support import atomic_write
 from psotrack.trajectories import Status, Trajectories
 
 _logger = logging.getLogger(__name__)
@@ -109,7 +109,7 @@ def write_c3d(path: Path, markers: Markers) -> None:
     points = np.ones((4, num_markers, num_frames))
     points[:3] = np.nan_to_num(markers.position_m / _METRES["mm"]).transpose(2, 1, 0)
     content["data"]["points"] = points
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         content.write(str(temporary))
         # ezc3d says nothing when the disk is full.
         expected_bytes = num_frames * num_markers * 4 * 4

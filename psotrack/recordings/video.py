@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from psotrack.errors import InputError, OutputError, SettingsError, check_positive
-from psotrack.support import written_whole
+from psotrack.support import atomic_write
 
 #: MPEG-4 part 2: OpenCV's own wheel encodes and decodes it, and decodes it faster than MJPEG.
 _CODEC = "XVID"
@@ -146,7 +146,7 @@ class VideoWriter:
 
     def __enter__(self) -> VideoWriter:
         with contextlib.ExitStack() as stack:
-            self._temporary = stack.enter_context(written_whole(self._path))
+            self._temporary = stack.enter_context(atomic_write(self._path))
             self._writer = _writer(self._path, self._temporary, self._fps, self._size_wh)
             # From here on __exit__ answers for the temporary file.
             self._open_until_exit = stack.pop_all()
@@ -193,7 +193,7 @@ def join_videos(path: Path, parts: Ordered[Path]) -> None:
             raise InputError(
                 video.path, expected=f"{_kind(first)} as in {first.path.name}", found=_kind(video)
             )
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         writer = _writer(path, temporary, first.fps, first.image_size_wh, _CODED)
         try:
             for video in videos:

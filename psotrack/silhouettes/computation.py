@@ -27,7 +27,7 @@ from psotrack.silhouettes.store import (
     remove_stale,
     store,
 )
-from psotrack.support import Report, map_in_processes, silent
+from psotrack.support import Report, map_in_processes, no_progress
 
 __all__ = ["SilhouetteSettings", "Silhouettes", "compute"]
 
@@ -88,7 +88,7 @@ def compute(
     *,
     cache: Path,
     jobs: int | None = None,
-    report: Report = silent,
+    report: Report = no_progress,
 ) -> Silhouettes:
     """The silhouettes of a sequence: those that `cache` holds are read, the others are computed and stored.
 

@@ -5,7 +5,6 @@ Imports no JAX, because every worker process imports this module.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
 import secrets
@@ -30,7 +29,7 @@ from psotrack.silhouettes.foreground import (
     foreground,
     learning_step,
 )
-from psotrack.support import Advance, digest_of
+from psotrack.support import Advance, digest_file, digest_record
 
 logger = logging.getLogger(__name__)
 
@@ -85,11 +84,11 @@ def key_of(video: VideoInfo, settings: SilhouetteSettings) -> str:
     """
     made_of = {
         "schema": SCHEMA,
-        "content": digest_of(video.path, "a readable video"),
+        "content": digest_file(video.path, expected="a readable video"),
         "num_frames": video.num_frames,
         "settings": msgspec.to_builtins(settings),
     }
-    return hashlib.blake2b(msgspec.json.encode(made_of, order="deterministic"), digest_size=20).hexdigest()
+    return digest_record(made_of)
 
 
 def open_stored(path: Path, num_frames: int, shape: tuple[int, int]) -> zarr.Array | None:

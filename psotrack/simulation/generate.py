@@ -34,7 +34,7 @@ from psotrack.simulation.scenarios import Mesh, Recording, Scenario
 from psotrack.simulation.scene import Scene, build
 from psotrack.simulation.segments import Stream, Work, draw, join, join_masks, segment_folder, segments
 from psotrack.simulation.unfinished import Unfinished, unfinished
-from psotrack.support import Report, map_in_processes, silent
+from psotrack.support import Report, map_in_processes, no_progress
 
 #: Pieces of work per process: few, because each starts with a camera's backdrop, and enough to end together.
 _PIECES_PER_JOB = 4
@@ -53,7 +53,7 @@ def simulate(
     onboard: bool = True,
     force: bool = False,
     jobs: int | None = None,
-    report: Report = silent,
+    report: Report = no_progress,
 ) -> Path:
     """Simulate a sequence into ROOT/Simulated_Data/NAME, as the published archive would hold it.
 

@@ -19,10 +19,10 @@ from psotrack.support import (
     COLOURS,
     Advance,
     Report,
+    atomic_write,
     map_in_processes,
+    no_progress,
     refuse_to_overwrite,
-    silent,
-    written_whole,
 )
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def save_preview(
     seed: int = 0,
     force: bool = False,
     jobs: int,
-    report: Report = silent,
+    report: Report = no_progress,
 ) -> Path:
     """Save a PNG of pictures of every camera, some of the drones' own, and plans of the paths.
 
@@ -89,7 +89,7 @@ def save_preview(
     with report("preview", len(strips)) as advance:
         pictures = map_in_processes(_draw, strips, jobs=jobs, advance=advance)
     figure = _page(scene, strips, pictures, num_frames)
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=_DPI)
     return path
 

@@ -32,7 +32,7 @@ from psotrack.datasets.dpjait import (
 from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.geometry import Camera, CameraRig, to_pixels, undistort
 from psotrack.recordings import Markers, Sequence, VideoInfo, VideoWriter, read_frames, write_c3d
-from psotrack.support import Advance, Report, refuse_to_overwrite, silent, written_whole
+from psotrack.support import Advance, Report, atomic_write, no_progress, refuse_to_overwrite
 
 #: The bodies of the dataset's cameras; the fifth was a spare.
 SERIALS = ("55260362", "56339527", "60881257", "61016180")
@@ -58,7 +58,7 @@ def write_as_real(
     three_videos: bool = False,
     seed: int = 0,
     force: bool = False,
-    report: Report = silent,
+    report: Report = no_progress,
 ) -> Path:
     """Write a simulated sequence into ROOT/Real_Data/RXX_Dn, as the real half of the archive would hold it.
 
@@ -99,7 +99,7 @@ def write_as_real(
     refuse_to_overwrite(folder, force)
     filmed = list(zip(rig.names, names, strict=True))[: len(SERIALS) - three_videos]
     with (
-        written_whole(folder) as growing,
+        atomic_write(folder) as growing,
         report("lens", sum(simulated.videos[name].num_frames for _, name in filmed)) as advance,
     ):
         write_calibration(growing / CALIBRATION, rig, unit="mm")

@@ -21,7 +21,7 @@ from psotrack.simulation.imaging.renderer import CameraRenderer
 from psotrack.simulation.labels.detector import detect
 from psotrack.simulation.labels.masks import Silhouette, silhouettes
 from psotrack.simulation.scene import Scene
-from psotrack.support import Advance, written_whole
+from psotrack.support import Advance, atomic_write
 
 #: Frames per segment: ten groups of pictures of the codec, and some ten seconds of work that an interruption costs.
 SEGMENT_FRAMES = 120
@@ -83,7 +83,7 @@ def draw(work: Work, advance: Advance) -> None:
     scene, stream = work.scene, work.stream
     artist = OnboardRenderer(scene, stream.index) if stream.onboard else CameraRenderer(scene, stream.index)
     for frames in work.segments:
-        with written_whole(segment_folder(work.folder, frames)) as temporary:
+        with atomic_write(segment_folder(work.folder, frames)) as temporary:
             temporary.mkdir()
             if isinstance(artist, CameraRenderer):
                 _draw_static(work, artist, temporary, frames, advance)
@@ -103,7 +103,7 @@ def join(stream: Stream, parts: Ordered[Path], folder: Path) -> None:
         OutputError: a file cannot be written; nothing is freed then.
     """
     if not stream.onboard:
-        with written_whole(folder / DETECTIONS / f"{stream.name}_s.csv") as temporary:
+        with atomic_write(folder / DETECTIONS / f"{stream.name}_s.csv") as temporary:
             temporary.write_bytes(b"".join((part / _BOXES).read_bytes() for part in parts))
     video = folder / stream.video_file
     if not video.exists():

@@ -152,7 +152,7 @@ def _holds(path: Path, record: bytes) -> bool:
 
 
 def _partial(folder: Path) -> Iterator[Path]:
-    """What processes that were killed were just writing (`files.written_whole`)."""
+    """What processes that were killed were just writing (`files.atomic_write`)."""
     # Unlike `rglob`, it bears with folders that vanish meanwhile.
     for place, folders, files in os.walk(folder):
         yield from (Path(place, name) for name in (*folders, *files) if ".partial" in name)

@@ -1,7 +1,7 @@
-"""Tools that know nothing of cameras or drones: files, text tables, settings files, processes, progress.
+"""General tools without knowledge of cameras or drones: files, text tables, settings files, processes, progress.
 
-In: paths, text, callables. Out: checked values, files that are written whole or not at all, results of processes.
-Others may use every name in `__init__.pyi`.
+In: paths, text, callables. Out: checked values, files that are written completely or not at all, results of worker
+processes. Other rooms may use every name in `__init__.pyi`.
 """
 
 import lazy_loader

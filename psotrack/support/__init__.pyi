@@ -1,9 +1,9 @@
 from .compiled import keep_compiled
 from .delimited import Column, Table, TextRow, read_rows, read_table, write_rows
-from .figures import COLOURS, colour_of, save_figure
-from .files import digest_of, read_text, refuse_to_overwrite, written_whole
+from .figures import COLOURS, drone_colour, save_figure
+from .files import atomic_write, digest_file, digest_record, read_text, refuse_to_overwrite
 from .processes import map_in_processes
-from .progress import Advance, Report, silent, terminal
+from .progress import Advance, Report, no_progress, progress_bar
 from .schema import assign, convert, nearest, read_toml
 from .standard_errors import standard_error
 
@@ -15,21 +15,22 @@ __all__ = [
     "Table",
     "TextRow",
     "assign",
-    "colour_of",
+    "atomic_write",
     "convert",
-    "digest_of",
+    "digest_file",
+    "digest_record",
+    "drone_colour",
     "keep_compiled",
     "map_in_processes",
     "nearest",
+    "no_progress",
+    "progress_bar",
     "read_rows",
     "read_table",
     "read_text",
     "read_toml",
     "refuse_to_overwrite",
     "save_figure",
-    "silent",
     "standard_error",
-    "terminal",
     "write_rows",
-    "written_whole",
 ]

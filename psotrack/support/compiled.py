@@ -1,4 +1,4 @@
-"""Compiled programs, kept on disk: the compiler's seconds are paid once per machine and program, not by every run."""
+"""Compile cache on disk: JAX compiles each program once per machine instead of once per process."""
 
 from __future__ import annotations
 
@@ -12,34 +12,36 @@ import jax
 
 logger = logging.getLogger(__name__)
 
-#: What compiles in less is compiled again: reading it back would take as long.
+#: Shortest compile time of a program that is stored, seconds. Reading a smaller program back takes as long.
 WORTH_KEEPING_S = 0.3
-_TROUBLE = re.compile(r"persistent compilation cache entry for '([\w.]+)'")
+_UNREADABLE_ENTRY = re.compile(r"persistent compilation cache entry for '([\w.]+)'")
 
 
-def keep_compiled(folder: Path) -> None:
-    """Have JAX keep what this process compiles from now on, and find what others compiled.
+def keep_compiled(folder: Path | str) -> None:
+    """Let JAX store compiled programs in a folder, and load programs that other processes stored there.
 
-    For programs, not for libraries: it changes JAX and how warnings are shown for the whole process. Nothing changes
-    where a user has already told JAX to keep it elsewhere (`JAX_COMPILATION_CACHE_DIR`).
+    For programs, not for libraries: the function changes JAX, and the display of warnings, for the whole process. It
+    changes nothing if the user has already chosen a folder (`JAX_COMPILATION_CACHE_DIR`).
 
     Args:
-        folder: made when something is kept. Trouble with it costs the compiler's seconds, and a line in the log.
+        folder: created when the first program is stored. If the folder cannot be used, JAX compiles as without a
+            cache, and the log says so.
     """
+    folder = Path(folder)
     if jax.config.values["jax_compilation_cache_dir"] is not None:
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_KEEPING_S)
     show = warnings.showwarning
 
-    def tidied(message: Warning | str, *where: Any, **more: Any) -> None:
-        trouble = _TROUBLE.search(str(message))
-        if trouble is None:
+    def show_or_repair(message: Warning | str, *where: Any, **more: Any) -> None:
+        unreadable = _UNREADABLE_ENTRY.search(str(message))
+        if unreadable is None:
             show(message, *where, **more)
             return
         logger.info("%s: %s", folder, message)
-        # JAX never replaces an entry, and one that a full disk or a kill cut off would be in the way for ever.
-        for entry in folder.glob(f"{trouble[1]}-*-cache"):
+        # JAX never replaces an entry, so an entry that a full disk cut short would fail in every later run.
+        for entry in folder.glob(f"{unreadable[1]}-*-cache"):
             entry.unlink(missing_ok=True)
 
-    warnings.showwarning = tidied
+    warnings.showwarning = show_or_repair

@@ -1,8 +1,7 @@
-"""Numbers in delimited text, read so that every complaint names its file, line and column.
+"""Tables in delimited text (CSV), with error messages that name file, line and column.
 
-Lenient where nothing can be misread: a byte order mark, Windows line ends, spaces, a separator at the end of
-a line, blank lines, upper case in the header. Strict where something could: a decimal comma is refused,
-because 1,156 may be a thousand.
+The readers accept a byte order mark, Windows line ends, spaces, a separator at the end of a line, blank lines, and
+upper case in the header. They refuse a decimal comma, because 1,156 may mean a thousand.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from psotrack.errors import InputError
-from psotrack.support.files import read_text, written_whole
+from psotrack.support.files import atomic_write, read_text
 
 #: A column's name and, in brackets, its unit: `pos_x[m]`.
 _HEADER = re.compile(r"(?P<name>[^\[]*?)\s*(?:\[(?P<unit>[^\]]*)\])?")
@@ -23,7 +22,14 @@ _HEADER = re.compile(r"(?P<name>[^\[]*?)\s*(?:\[(?P<unit>[^\]]*)\])?")
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table: where it stands, its name and unit in lower case, and what the file calls it."""
+    """A column of a table.
+
+    Attributes:
+        index: number of the column in a row, from 0.
+        name: name in lower case, without the unit.
+        unit: unit in lower case; "" if the header has none.
+        header: text of the header's cell, for messages.
+    """
 
     index: int
     name: str
@@ -33,7 +39,13 @@ class Column:
 
 @dataclass(frozen=True)
 class TextRow:
-    """The cells of a line, and what it takes to say where it stands."""
+    """The cells of one line.
+
+    Attributes:
+        path: file of the line.
+        line: number of the line in the file, from 1.
+        cells: texts of the cells, without spaces around them.
+    """
 
     path: Path
     line: int
@@ -45,33 +57,33 @@ class TextRow:
         return f"{self.path}, line {self.line}"
 
     def text(self, column: Column) -> str:
-        """The cell as it stands, not empty."""
+        """Text of a cell. An empty cell is an error."""
         cell = self.cells[column.index]
         if not cell:
-            raise self.wrong(column, "a value", "nothing")
+            raise self.error(column, "a value", "nothing")
         return cell
 
     def number(self, column: Column) -> float:
-        """The cell as a finite number."""
+        """Value of a cell as a finite number."""
         cell = self.text(column)
         try:
             value = float(cell)
         except ValueError:
             remedy = "write decimals with a point" if "," in cell else ""
-            raise self.wrong(column, "a number", repr(cell), remedy) from None
+            raise self.error(column, "a number", repr(cell), remedy) from None
         if not math.isfinite(value):
-            raise self.wrong(column, "a finite number", repr(cell))
+            raise self.error(column, "a finite number", repr(cell))
         return value
 
     def count(self, column: Column) -> int:
-        """The cell as a whole number, 0 or more."""
+        """Value of a cell as a whole number, 0 or more."""
         value = self.number(column)
         if value < 0 or value != int(value):
-            raise self.wrong(column, "a whole number, 0 or more", repr(self.cells[column.index]))
+            raise self.error(column, "a whole number, 0 or more", repr(self.cells[column.index]))
         return int(value)
 
-    def wrong(self, column: Column, expected: str, found: str, remedy: str = "") -> InputError:
-        """The error that names this line and the column."""
+    def error(self, column: Column, expected: str, found: str, remedy: str = "") -> InputError:
+        """Error whose message names this line and the column."""
         return InputError(
             f"{self.where}, column {column.header}", expected=expected, found=found, remedy=remedy
         )
@@ -79,18 +91,18 @@ class TextRow:
 
 @dataclass(frozen=True)
 class Table:
-    """A header and the rows below it."""
+    """A table: the columns of the header, and the rows below the header."""
 
     path: Path
     columns: tuple[Column, ...]
     rows: tuple[TextRow, ...]
 
     def find(self, name: str) -> Column | None:
-        """The column of this name, whatever its unit, or None."""
+        """Column with this name and any unit, or None."""
         return next((column for column in self.columns if column.name == name), None)
 
     def column(self, name: str) -> Column:
-        """The column of this name, whatever its unit."""
+        """Column with this name and any unit. A missing column is an error."""
         found = self.find(name)
         if found is None:
             raise InputError(
@@ -101,35 +113,42 @@ class Table:
         return found
 
     def factor(self, column: Column, units: Mapping[str, float]) -> float:
-        """What values of the column are multiplied with; `units` has a factor for each known unit."""
+        """Factor that converts the column's values to the unit that has the factor 1 in `units`.
+
+        Args:
+            column: the column.
+            units: factor of each unit that is allowed.
+        """
         if column.unit not in units:
-            known = " or ".join(f"{column.name}[{unit}]" if unit else column.name for unit in units)
-            raise InputError(self.path, expected=f"a column {known}", found=column.header)
+            allowed = " or ".join(f"{column.name}[{unit}]" if unit else column.name for unit in units)
+            raise InputError(self.path, expected=f"a column {allowed}", found=column.header)
         return units[column.unit]
 
 
-def read_rows(path: Path, separator: str) -> list[TextRow]:
-    """The lines of a text file that are not blank, cut at the separator.
+def read_rows(path: Path | str, separator: str) -> list[TextRow]:
+    """Read the lines of a text file that are not blank, split at the separator.
 
     Raises:
-        InputError: the file cannot be read or is no text.
+        InputError: the file cannot be read or is not text.
     """
+    path = Path(path)
     rows = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         cells = tuple(cell.strip() for cell in line.split(separator))
         if any(cells):
-            # One separator at the end of a line ends its last cell and starts none.
+            # A separator at the end of a line ends the last cell; no empty cell follows.
             rows.append(TextRow(path, number, cells[:-1] if len(cells) > 1 and not cells[-1] else cells))
     return rows
 
 
-def read_table(path: Path, separator: str = ";") -> Table:
-    """The table in a text file, whose first line names its columns.
+def read_table(path: Path | str, separator: str = ";") -> Table:
+    """Read a table from a text file whose first line names the columns.
 
     Raises:
-        InputError: the file cannot be read, has fewer than two columns or one twice, no rows, or a row
-            of another length than its header.
+        InputError: the file cannot be read, has fewer than two columns, one column twice, no rows, or a row
+            whose length differs from the header's.
     """
+    path = Path(path)
     header, *rows = read_rows(path, separator) or [TextRow(path, 1, ("",))]
     if len(header.cells) < 2:
         found = repr(header.cells[0][:60]) if header.cells[0] else "an empty file"
@@ -149,19 +168,19 @@ def read_table(path: Path, separator: str = ";") -> Table:
     return Table(path, columns, tuple(rows))
 
 
-def write_rows(path: Path, rows: Iterable[Ordered[object]], separator: str = ";") -> None:
-    """Write lines of cells; floats with all their digits, so that reading gives the same numbers.
+def write_rows(path: Path | str, rows: Iterable[Ordered[object]], separator: str = ";") -> None:
+    """Write rows of cells as lines. Floats have all their digits, so that reading gives the same numbers.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         lines = (separator.join(_cell(value) for value in row) for row in rows)
         temporary.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
 
 
 def _cell(value: object) -> str:
-    # float() because the repr of NumPy's scalars names their type.
+    # float() because the repr of a NumPy scalar contains the type's name.
     return repr(float(value)) if isinstance(value, float) else str(value)
 
 

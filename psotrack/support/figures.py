@@ -1,6 +1,6 @@
-"""Figures on disk: one colour per drone, and PNG files that are written whole.
+"""PNG figures, and one colour per drone.
 
-Matplotlib is imported when something is drawn, and `pyplot`, with its global state, not at all.
+Matplotlib is imported at the first figure. `pyplot` is not used, because it has global state.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from psotrack.support.files import refuse_to_overwrite, written_whole
+from psotrack.support.files import atomic_write, refuse_to_overwrite
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: One colour per drone, in turn; first those of Okabe and Ito (2008), which colour-blind people tell apart.
+#: Colours of the drones in their order. The first six are from Okabe and Ito (2008), for colour-blind readers.
 COLOURS = (
     "#0072b2",
     "#d55e00",
@@ -30,15 +30,29 @@ COLOURS = (
 _DPI = 150
 
 
-def colour_of(drone: int) -> str:
-    """The colour of the drone at this place of the reference's order, as #rrggbb."""
+def drone_colour(drone: int) -> str:
+    """Colour of a drone, as #rrggbb.
+
+    Args:
+        drone: index of the drone in the reference, from 0.
+    """
     return COLOURS[drone % len(COLOURS)]
 
 
 def save_figure(
-    path: Path, size_inches: tuple[float, float], draw: Callable[[Figure], None], force: bool
+    path: Path | str, size_inches: tuple[float, float], draw: Callable[[Figure], None], force: bool
 ) -> None:
-    """Save a PNG of what `draw` draws, without a window; see `save_trajectories` for what is raised."""
+    """Draw a figure without a window and save it as PNG.
+
+    Args:
+        path: path of the PNG file.
+        size_inches: width and height, inches.
+        draw: draws into the empty figure that it is given.
+        force: replace an existing file.
+
+    Raises:
+        OutputError: the file exists and `force` is not set, or it cannot be written.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -46,5 +60,5 @@ def save_figure(
     figure = Figure(size_inches, dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
     draw(figure)
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, format="png")

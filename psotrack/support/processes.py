@@ -1,4 +1,4 @@
-"""Work on several files at once, in processes that end with the one that started them."""
+"""Parallel work in worker processes that end when their parent process ends."""
 
 from __future__ import annotations
 
@@ -21,29 +21,31 @@ from psotrack.support.progress import Advance
 _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
 
-#: How long a worker may take to notice that it is to end, and to clear up, before it is made to.
+#: Time that a worker has to end by itself before it is terminated, seconds: enough to remove its temporary files.
 _GRACE_S = 5.0
 
 
 def map_in_processes(
     function: Callable[[_Task, Advance], _Result], tasks: Ordered[_Task], *, jobs: int, advance: Advance
 ) -> list[_Result]:
-    """`[function(task, advance) for task in tasks]`, `jobs` of them at once.
+    """Compute `[function(task, advance) for task in tasks]` in up to `jobs` processes.
 
-    The workers are fresh interpreters, with one thread of OpenCV each. They live as long as this call:
-    whatever ends it, Ctrl-C and SIGKILL included, breaks the pipe on which `function` reports, so its next
-    `advance` raises `BrokenPipeError` and its own clean-up runs. With one job or one task all is done in this
-    process.
+    The workers are new Python interpreters with one OpenCV thread each. They end with this call, also if Ctrl-C or
+    SIGKILL ends it: the pipe to the worker breaks, the next `advance` in the worker raises `BrokenPipeError`, and the
+    clean-up of `function` runs. With one job or one task the work is done in the calling process.
 
     Args:
         function: importable by name; calls `advance` at least a few times per second.
         tasks: picklable, as are the results.
-        jobs: at most so many processes.
-        advance: called with what the workers report.
+        jobs: largest number of processes.
+        advance: called with the number of steps that a worker reports.
+
+    Returns:
+        The results in the order of the tasks.
 
     Raises:
-        PsotrackError: a worker died.
-        Exception: whatever `function` raised first; the other tasks are abandoned.
+        PsotrackError: a worker process died.
+        Exception: the first exception that `function` raised; the remaining tasks are abandoned.
     """
     if jobs == 1 or len(tasks) < 2:
         return [function(task, advance) for task in tasks]
@@ -69,8 +71,8 @@ def map_in_processes(
 
 @contextlib.contextmanager
 def _workers(function: Callable[..., Any], count: int) -> Iterator[list[Connection]]:
-    """Connections to `count` new processes that run `_serve`; at the end of the block they end."""
-    # Spawned, not forked: a fork of a process in which JAX or OpenCV has threads may hang.
+    """Connections to `count` new processes that run `_serve` until the end of the block."""
+    # Spawned, not forked: a forked copy of a process with JAX or OpenCV threads may hang.
     context = multiprocessing.get_context("spawn")
     connections: list[Connection] = []
     processes = []
@@ -95,7 +97,7 @@ def _workers(function: Callable[..., Any], count: int) -> Iterator[list[Connecti
 
 @contextlib.contextmanager
 def _sigint_ignored() -> Iterator[None]:
-    """Processes that start here leave Ctrl-C to their parent, which a terminal would send to all of them."""
+    """Start processes in this block that ignore SIGINT: on Ctrl-C a terminal signals them too, but the parent acts."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -112,15 +114,15 @@ def _receive(connection: Connection) -> Any:
     except (EOFError, ConnectionResetError) as error:
         raise PsotrackError(
             "a worker process",
-            expected="to finish",
-            found="that it died",
-            remedy="is memory short? does a script call this outside of `if __name__ == '__main__':`? "
-            "jobs=1 needs no other processes",
+            expected="a result",
+            found="that the process died",
+            remedy="is memory short? is the call in a script outside of `if __name__ == '__main__':`? "
+            "jobs=1 works without worker processes",
         ) from error
 
 
 def _serve(function: Callable[..., Any], connection: Connection) -> None:
-    """A worker: tasks come in; progress (int), results (index, result) and errors go out."""
+    """Run a worker: receive tasks; send progress (int), results (index, result) and exceptions."""
     cv2.setNumThreads(1)
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:
@@ -128,7 +130,7 @@ def _serve(function: Callable[..., Any], connection: Connection) -> None:
             try:
                 result = function(task, connection.send)
             except Exception as error:
-                if not isinstance(error, PsotrackError):  # a mistake of ours: the pipe carries no traceback
+                if not isinstance(error, PsotrackError):  # a bug: its traceback would get lost in the pipe
                     error.add_note(f"in a worker process:\n{traceback.format_exc()}")
                 connection.send(error)
             else:

@@ -1,26 +1,26 @@
-"""Progress of long work, as a callable that counts, so that no numeric code knows about terminals."""
+"""Progress of long work: numeric code calls a counting function and knows nothing about terminals."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
 
-#: Called with the number of steps that were done since the last call.
+#: Function that is called with the number of steps done since the last call.
 Advance = Callable[[int], None]
 
-#: `with report("track", total) as advance: ... advance(1)`: how a function is told whom to report to.
+#: Function that opens a progress bar: `with report("track", total) as advance: ... advance(1)`.
 Report = Callable[[str, int], contextlib.AbstractContextManager[Advance]]
 
 
 @contextlib.contextmanager
-def silent(description: str, total: int) -> Iterator[Advance]:
-    """Report to nobody: the default of every function that takes a `Report`."""
+def no_progress(description: str, total: int) -> Iterator[Advance]:
+    """Show no progress: the default of every function that takes a `Report`."""
     yield lambda steps: None
 
 
 @contextlib.contextmanager
-def terminal(description: str, total: int) -> Iterator[Advance]:
-    """A bar on stderr that disappears when the work is done; nothing where stderr is no terminal."""
+def progress_bar(description: str, total: int) -> Iterator[Advance]:
+    """Show a bar on stderr that disappears at the end of the work; show nothing if stderr is not a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 

@@ -1,4 +1,4 @@
-"""How well a mean over time is known when neighbouring frames err alike, as those of a tracker do.
+"""Standard error of a mean over time when the errors of neighbouring frames are correlated.
 
 C. J. Geyer, Practical Markov Chain Monte Carlo, Statistical Science 7 (4), 1992, section 3.3 (the initial positive
 sequence estimator).
@@ -13,26 +13,27 @@ from jaxtyping import Float, Int
 def standard_error(
     values: Float[np.ndarray, "frames parts"], frame: Int[np.ndarray, "frames"]
 ) -> Float[np.ndarray, "parts"]:
-    """Standard error of the mean over frames of each column, which counts correlated frames as fewer.
+    """Standard error of the mean of each column over correlated frames.
 
-    For independent frames it is s / √n, and it is never taken to be less. For others the variance of the sum is that of
-    n values and twice their autocovariances at all lags, summed in pairs until a pair is no longer positive.
+    For independent frames the standard error is s / √n; smaller results are replaced by this value. For correlated
+    frames the variance of the sum has twice the autocovariances at all lags added. They are added in pairs of lags,
+    until a pair is not positive.
 
     Args:
-        values: (frames, parts); rows with a NaN are not there.
+        values: (frames, parts); rows with a NaN are left out.
         frame: (frames,), numbers of the frames, increasing.
 
     Returns:
-        (parts,), in the unit of the values; NaN where fewer than two rows are there.
+        (parts,), in the unit of the values; NaN for fewer than two rows without NaN.
     """
-    there = np.isfinite(values).all(axis=-1)
-    n = int(there.sum())
+    finite = np.isfinite(values).all(axis=-1)
+    n = int(finite.sum())
     if n < 2:
         return np.full(values.shape[1], np.nan)
-    centred, row = values[there] - values[there].mean(axis=0), frame[there] - frame[there][0]
-    # Frames may be every fourth: lags are counted in the steps that there are.
+    centred, row = values[finite] - values[finite].mean(axis=0), frame[finite] - frame[finite][0]
+    # The recording may use every fourth frame only: lags are counted in steps between used frames.
     row = row // np.diff(row).min()
-    # Zeros, the mean, in frames that are missing, and behind the end so that no lag wraps around.
+    # Missing frames have the mean, 0. The series is padded with zeros to twice its length, so that no lag wraps around.
     series = np.zeros((2 * (row[-1] + 1), values.shape[1]))
     series[row] = centred
     power = np.abs(np.fft.rfft(series, axis=0)) ** 2
@@ -40,6 +41,6 @@ def standard_error(
     if len(covariance) % 2:
         covariance = np.vstack([covariance, np.zeros_like(covariance[:1])])
     pairs = covariance[0::2] + covariance[1::2]
-    kept = np.logical_and.accumulate(pairs > 0, axis=0)
-    of_sum = 2 * np.where(kept, pairs, 0.0).sum(axis=0) - covariance[0]
-    return np.sqrt(np.maximum(of_sum, covariance[0]) / (n * (n - 1)))
+    used = np.logical_and.accumulate(pairs > 0, axis=0)
+    variance_of_sum = 2 * np.where(used, pairs, 0.0).sum(axis=0) - covariance[0]
+    return np.sqrt(np.maximum(variance_of_sum, covariance[0]) / (n * (n - 1)))

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from psotrack.errors import InputError, PsotrackError, SettingsError
 from psotrack.silhouettes import compute
-from psotrack.support import Report, keep_compiled, silent
+from psotrack.support import Report, keep_compiled, no_progress
 from psotrack.sweep.cells import Cell
 from psotrack.sweep.grid_files import Grid
 from psotrack.sweep.inputs import Inputs, source_of
@@ -69,7 +69,7 @@ def run_on_cluster(
     address: str = "local",
     workers: int | None = None,
     device: Device | None = None,
-    report: Report = silent,
+    report: Report = no_progress,
 ) -> SweepOutcome:
     """Run what is not finished, as tasks of a cluster; as `runner.run` otherwise.
 

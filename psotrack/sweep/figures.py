@@ -15,7 +15,7 @@ import pandas as pd
 from jaxtyping import Float, Int
 
 from psotrack.errors import SettingsError
-from psotrack.support import COLOURS, colour_of, refuse_to_overwrite, written_whole
+from psotrack.support import COLOURS, atomic_write, drone_colour, refuse_to_overwrite
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,7 +35,7 @@ def save(path: Path, figure: Figure, *, force: bool = False) -> None:
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
     refuse_to_overwrite(path, force)
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, format="png", dpi=_DPI)
 
 
@@ -135,7 +135,9 @@ def error_over_time(errors: Mapping[str, pd.DataFrame], title: str = "") -> Figu
         seed = _median_run(rows)
         run = rows[rows["seed"] == seed]
         for number, (drone, of) in enumerate(run.groupby("drone", observed=True)):
-            axes.plot(of["time_s"], 1e3 * of["error_m"], color=colour_of(number), linewidth=1.0, label=drone)
+            axes.plot(
+                of["time_s"], 1e3 * of["error_m"], color=drone_colour(number), linewidth=1.0, label=drone
+            )
             missed = of[of["error_m"].isna()]
             if len(missed):
                 axes.plot([], [], color=_GREY, linewidth=1.5, label="missed")
@@ -145,7 +147,7 @@ def error_over_time(errors: Mapping[str, pd.DataFrame], title: str = "") -> Figu
                 linestyle="",
                 marker="_",
                 markersize=3,
-                color=colour_of(number),
+                color=drone_colour(number),
                 transform=axes.get_xaxis_transform(),
             )
         for own, of in ((True, run), (False, rows[rows["seed"] != seed])):

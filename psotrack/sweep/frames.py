@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from psotrack.errors import InputError
-from psotrack.support import Report, silent
+from psotrack.support import Report, no_progress
 from psotrack.sweep.grid_files import Grid, load
 from psotrack.sweep.grid_files import grid as grid_of
 from psotrack.sweep.store import Store
@@ -24,7 +24,7 @@ def sweep(
     jobs: int | None = None,
     cluster: str | None = None,
     workers: int | None = None,
-    report: Report = silent,
+    report: Report = no_progress,
 ) -> pd.DataFrame:
     """Track with every combination of a grid's settings: one row per cell and run, as `psotrack sweep` keeps them.
 

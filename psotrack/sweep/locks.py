@@ -20,7 +20,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from psotrack.support import written_whole
+from psotrack.support import atomic_write
 
 logger = logging.getLogger(__name__)
 
@@ -144,7 +144,7 @@ def _taken_over(path: Path, ours: Owner) -> bool:
         return False
     try:
         if _is_of(path, seen):
-            with written_whole(path) as temporary:
+            with atomic_write(path) as temporary:
                 temporary.write_text(json.dumps(asdict(ours)), encoding="utf-8")
             return True
         return False

@@ -17,7 +17,7 @@ import pandas as pd
 from psotrack.errors import InputError, OutputError, PsotrackError
 from psotrack.evaluation import errors_over_time, evaluate
 from psotrack.pipeline import TrackedSequence, track_runs
-from psotrack.support import Report, silent
+from psotrack.support import Report, no_progress
 from psotrack.sweep.cells import Cell, key_of, name_of, title
 from psotrack.sweep.grid_files import Grid, cameras_label
 from psotrack.sweep.inputs import Input, Inputs, digest_of, folder_of, source_of
@@ -70,7 +70,7 @@ class SweepOutcome:
 
 
 def run(
-    grid: Grid, out: Path, *, data: Path, cache: Path, jobs: int | None = None, report: Report = silent
+    grid: Grid, out: Path, *, data: Path, cache: Path, jobs: int | None = None, report: Report = no_progress
 ) -> SweepOutcome:
     """Run what is not finished, cell by cell. Several runners on one folder share the work.
 

@@ -24,7 +24,7 @@ from typing import Any
 import pandas as pd
 
 from psotrack.errors import InputError
-from psotrack.support import written_whole
+from psotrack.support import atomic_write
 from psotrack.sweep.locks import claimed, owner_of, waited_for
 
 #: What was being written so long ago was left by a runner that was killed.
@@ -62,7 +62,7 @@ class Store:
             if path.exists():
                 before = pd.read_parquet(path)
                 new = pd.concat([before[~before["seed"].isin(rows["seed"])], new], ignore_index=True)
-            with written_whole(path) as temporary:
+            with atomic_write(path) as temporary:
                 new.sort_values("seed", kind="stable").to_parquet(temporary, index=False)
 
     def fail(self, name: str, error: str, about: Mapping[str, Any]) -> None:
@@ -71,7 +71,7 @@ class Store:
         Raises:
             OutputError: that cannot be written.
         """
-        with written_whole(self._path(name, "error.json")) as temporary:
+        with atomic_write(self._path(name, "error.json")) as temporary:
             temporary.write_text(json.dumps({"error": error, **about}, indent=2) + "\n", encoding="utf-8")
 
     def forgive(self, name: str) -> None:
@@ -154,7 +154,7 @@ class Store:
             before = json.dumps(manifest)
             change(manifest)
             if json.dumps(manifest) != before:
-                with written_whole(path) as temporary:
+                with atomic_write(path) as temporary:
                     temporary.write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
 
     def tidy(self) -> None:

@@ -35,7 +35,7 @@ from psotrack.initiation import (
 )
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes
-from psotrack.support import Advance, Report, silent
+from psotrack.support import Advance, Report, no_progress
 from psotrack.tracking import sizes, tracker
 from psotrack.tracking.batch import BatchResult, TrackedDrones, track_batch
 from psotrack.tracking.inputs import motion_params, tracker_inputs, tracker_program
@@ -111,7 +111,7 @@ def track_silhouettes(
     *,
     fps: float,
     bounds_m: Sequence[Float[np.ndarray, "2 3"]],
-    report: Report = silent,
+    report: Report = no_progress,
 ) -> list[Tracked]:
     """Track all frames, once for each of the settings; all devices share the runs.
 

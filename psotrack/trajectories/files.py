@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from psotrack.errors import InputError, check_positive
-from psotrack.support import refuse_to_overwrite, written_whole
+from psotrack.support import atomic_write, refuse_to_overwrite
 from psotrack.trajectories.trajectories import Status, Trajectories
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def write_trajectories(path: Path, trajectories: Trajectories, *, force: bool = 
     write = _by_suffix(path, {".csv": _write_csv, ".parquet": _write_parquet})
     refuse_to_overwrite(path, force)
     columns = _to_columns(trajectories)
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         write(temporary, columns)
 
 
@@ -108,7 +108,7 @@ def write_ambiguity(
         "other": pairs[pair, 1],
         "ambiguity": ambiguity[frame, pair].astype(np.float32),
     }
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         _write_csv(temporary, columns)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import InputError, check_positive
-from psotrack.support import refuse_to_overwrite, written_whole
+from psotrack.support import atomic_write, refuse_to_overwrite
 from psotrack.trajectories.trajectories import Trajectories
 
 _HEADER = "# timestamp tx ty tz qx qy qz qw"
@@ -40,7 +40,7 @@ def write_tum(folder: Path, trajectories: Trajectories, *, force: bool = False) 
         refuse_to_overwrite(path, force)
     for drone, path in enumerate(paths):
         lines = _lines(trajectories, drone)
-        with written_whole(path) as temporary:
+        with atomic_write(path) as temporary:
             temporary.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
     return paths
 

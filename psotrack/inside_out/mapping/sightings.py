@@ -14,7 +14,7 @@ from psotrack.errors import InputError
 from psotrack.geometry import Camera, undistort
 from psotrack.inside_out.detection import MarkerDetector
 from psotrack.recordings import VideoInfo, read_frames
-from psotrack.support import Report, silent
+from psotrack.support import Report, no_progress
 
 #: A marker's corners in its own axes, for a side of 1: x to its right, y up, z out of the print. OpenCV's order.
 SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
@@ -88,7 +88,7 @@ def find_sightings(
     dictionary: str = "4x4_1000",
     *,
     most_frames: int = 300,
-    report: Report = silent,
+    report: Report = no_progress,
 ) -> MarkerSightings:
     """The markers in videos of one room, each with its camera's lens.
 

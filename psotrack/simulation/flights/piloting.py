@@ -136,7 +136,7 @@ def read_sticks(path: Path) -> tuple[Sample, ...]:
         time_s = row.number(time_column)
         if time_s < 0 or (samples and time_s <= samples[-1].time_s):
             expected = f"a time above {samples[-1].time_s:g}" if samples else "a time of 0 or more"
-            raise row.wrong(time_column, expected, row.text(time_column))
+            raise row.error(time_column, expected, row.text(time_column))
         samples.append(Sample(time_s, Sticks(*(_stick(row, column) for column in stick_columns))))
     return tuple(samples)
 
@@ -153,5 +153,5 @@ def write_sticks(path: Path, samples: Iterable[Sample]) -> None:
 def _stick(row: TextRow, column: Column) -> float:
     value = row.number(column)
     if abs(value) > 1:
-        raise row.wrong(column, "a number from -1 to 1", row.text(column))
+        raise row.error(column, "a number from -1 to 1", row.text(column))
     return value

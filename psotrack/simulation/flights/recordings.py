@@ -145,7 +145,7 @@ def _from_table(table: Table) -> _Samples:
     stuck = np.flatnonzero(np.diff(time_s) <= 0)
     if len(stuck):
         before, row = (table.rows[stuck[0] + step] for step in (0, 1))
-        raise row.wrong(time, f"a time after that of line {before.line}, {before.text(time)}", row.text(time))
+        raise row.error(time, f"a time after that of line {before.line}, {before.text(time)}", row.text(time))
     position_m = np.array([[row.number(column) for column in position] for row in table.rows])
     orientation_wxyz = np.array([_unit(row, quaternion) for row in table.rows]) if quaternion else None
     return time_s, position_m, orientation_wxyz
@@ -158,14 +158,14 @@ def _check_one_drone(table: Table) -> None:
     name = table.rows[0].text(column)
     for row in table.rows:
         if row.text(column) != name:
-            raise row.wrong(column, f"one drone, {name} as above", row.text(column), "keep the rows of one")
+            raise row.error(column, f"one drone, {name} as above", row.text(column), "keep the rows of one")
 
 
 def _unit(row: TextRow, columns: list[Column]) -> Float[np.ndarray, "4"]:
     quaternion = np.array([row.number(column) for column in columns])
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > _NORM_TOLERANCE:
-        raise row.wrong(columns[0], "a quaternion of length 1", f"length {norm:g}")
+        raise row.error(columns[0], "a quaternion of length 1", f"length {norm:g}")
     return quaternion / norm
 
 
