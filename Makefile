@@ -12,7 +12,7 @@ install = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python
 oracle = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python $(BIN)/python --no-deps 'trackeval>=1.3'; \
 	else $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'trackeval>=1.3'; fi
 
-.PHONY: help demo test test-fast lint format bench notebooks table4 table5 table5-quick table7 clean
+.PHONY: help demo test test-fast lint format bench notebooks table4 table5 table5-quick table7 docs results results-check clean
 
 help:  ## what can be made
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -63,6 +63,20 @@ table5-quick: $(VENV)/.installed  ## a small form of it, five minutes
 
 table7: $(VENV)/.installed  ## the paper's Tables 6 to 8 and figure 11: drones' own cameras and markers; DATA=FOLDER for the published sequences
 	@$(BIN)/python experiments/table7/table7.py $(if $(DATA),--data $(DATA))
+
+docs: $(VENV)/.installed  ## build the documentation into build/docs; fails on a warning or a missing figure
+	@$(call install,docs)
+	@$(BIN)/python docs/readme.py --check
+	@DISABLE_MKDOCS_2_WARNING=true $(BIN)/python -m mkdocs build --quiet --strict --config-file docs/mkdocs.yml
+	@echo "build/docs/index.html"
+
+results: $(VENV)/.installed  ## make the results again that are older than their code, hours; ONLY=table4 for one, FORCE=1 for all
+	@$(call install,bench)
+	@$(BIN)/python experiments/_results.py make $(ONLY) $(if $(FORCE),--force)
+	@$(BIN)/python docs/readme.py
+
+results-check:  ## name each result that is older than the code that it depends on
+	@$(if $(wildcard $(BIN)/python),$(BIN)/python,$(PYTHON)) experiments/_results.py check $(ONLY)
 
 clean:  ## remove what was built, the environment too
 	rm -rf $(VENV) build dist demo notebooks/data ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,9 +1,10 @@
-"""One run of the tracker, from stored silhouettes to figures: what the studies of this folder have in common."""
+"""What the studies of this folder share: sequences, one run of the tracker, and rows that survive an interrupt."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -13,17 +14,20 @@ import pandas as pd
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.errors import PsotrackError
 from psotrack.evaluation import evaluate
-from psotrack.pipeline import environment, track_from_silhouettes
+from psotrack.pipeline import track_from_silhouettes
 from psotrack.recordings import Sequence
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
-from psotrack.simulation import simulate
 from psotrack.support import keep_compiled
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+import _results
+from _sequences import simulated
 
 KEPT = ["offset_removed_mean_error_m", "mean_error_m", "max_error_m", "missed_rate", "id_switches", "hota"]
 KEPT += ["offset_removed_inside_90_rate", "offset_removed_mean_nees"]
 
-#: Swarms of the figures to reach.
+#: Size of the swarm on each sequence.
 EFFORT: dict[str, dict[str, Any]] = {
     "S01_D2_A": {"swarm": "joint", "particles": 50, "iterations": 50},
     "S02_D4_A": {"swarm": "per-drone", "particles": 30, "iterations": 20},
@@ -32,38 +36,31 @@ EFFORT: dict[str, dict[str, Any]] = {
 
 
 def parser(description: str | None) -> argparse.ArgumentParser:
-    """The options that all studies have."""
+    """Options of every study."""
     options = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     options.add_argument("--data", type=Path, default=Path("data"), help="the data's root folder")
-    options.add_argument("--out", type=Path, default=Path("experiments/accuracy/results"), help="of results")
+    options.add_argument(
+        "--out", type=Path, default=Path("experiments/accuracy/results"), help="folder of the result"
+    )
     return options
 
 
-def cache_of(data: Path) -> Path:
-    """Silhouettes and compiled programs, beside the data."""
+def cache_folder(data: Path) -> Path:
+    """Folder of silhouettes and compiled programs, beside the data."""
     return data / "silhouettes"
-
-
-def folder_of(name: str, data: Path, seed: int) -> Path:
-    """The folder of a simulated sequence, which is made if it is not there."""
-    folder = data / f"seed{seed}" / "Simulated_Data" / name
-    if not folder.exists():
-        print(f"simulating {folder}", flush=True)
-        simulate(name, folder.parents[1], seed=seed, masks=False, onboard=False)
-    return folder
 
 
 def opened(name: str, data: Path, seed: int = 0) -> tuple[Sequence, Silhouettes]:
     """A simulated sequence and its silhouettes; both are made if they are not there."""
-    keep_compiled(cache_of(data) / "compiled")
-    sequence = read_sequence(folder_of(name, data, seed)).usable()
-    return sequence, compute(sequence, TrackSettings().silhouettes, cache=cache_of(data))
+    keep_compiled(cache_folder(data) / "compiled")
+    sequence = read_sequence(simulated(name, data, seed)).usable()
+    return sequence, compute(sequence, TrackSettings().silhouettes, cache=cache_folder(data))
 
 
 def figures(sequence: Sequence, silhouettes: Silhouettes, settings: TrackSettings) -> dict[str, Any]:
-    """What evaluation says of one run. A run that finds no drones has missed all of them."""
+    """Figures of one run. A run that finds no drones has missed all drones."""
     assert sequence.truth is not None
     try:
         tracked = track_from_silhouettes(sequence, silhouettes, settings)
@@ -75,21 +72,62 @@ def figures(sequence: Sequence, silhouettes: Silhouettes, settings: TrackSetting
     return {key: errors[key] for key in KEPT} | {"drones_found": found, "track_ms_per_frame": ms}
 
 
-def table(rows: Iterable[Callable[[], dict[str, Any]]], path: Path) -> pd.DataFrame:
-    """One row per run, written after each, so that a study that was interrupted leaves what it has.
+def start(name: str) -> _results.Run:
+    """Begin the run of a study; its record states the commit at this moment."""
+    return _results.Run(name)
 
-    Beside it, with the suffix .json, is what the results depend on: versions and the machine.
+
+def save_rows(
+    run: _results.Run,
+    rows: Iterable[tuple[str, Callable[[], dict[str, Any]]]],
+    data: Path,
+    out: Path,
+    *,
+    draw: Callable[[pd.DataFrame], None] | None = None,
+    files: Iterable[Path] = (),
+) -> pd.DataFrame:
+    """Compute rows one after the other, and save them with their record.
+
+    Rows that are done are kept in `data`/partial until all are done, so that an interrupted study goes on where it was,
+    as long as neither the code nor the command has changed.
+
+    Args:
+        run: the run of the experiment.
+        rows: a unique name and a function that computes the row, for each row.
+        data: root folder of the data.
+        out: folder of the result.
+        draw: draws the pictures of the result.
+        files: the pictures that `draw` writes.
     """
-    done: list[dict[str, Any]] = []
+    partial = data / "partial" / f"{run.name}.json"
+    done = _read_partial(partial, run.code_state)
+    for name, compute_row in rows:
+        if name in done:
+            continue
+        done[name] = compute_row()
+        words = (f"{value:.4f}" if isinstance(value, float) else f"{value}" for value in done[name].values())
+        print(" ".join(words), flush=True)
+        _write_partial(partial, run.code_state, done)
+    table = pd.DataFrame(list(done.values()))
+    if draw is not None:
+        draw(table)
+    run.save(out, rows=table, files=files)
+    partial.unlink(missing_ok=True)
+    return table
+
+
+def _read_partial(path: Path, code_state: str) -> dict[str, dict[str, Any]]:
+    """Rows that an interrupted run of the same code has left."""
+    if not path.exists():
+        return {}
+    kept = json.loads(path.read_text(encoding="utf-8"))
+    return kept["rows"] if kept["code_state"] == code_state else {}
+
+
+def _write_partial(path: Path, code_state: str, rows: dict[str, dict[str, Any]]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.with_suffix(".json").write_text(json.dumps(environment(), indent=2) + "\n")
-    for row in rows:
-        done.append(row())
-        print(
-            " ".join(
-                f"{value:.4f}" if isinstance(value, float) else f"{value}" for value in done[-1].values()
-            ),
-            flush=True,
-        )
-        pd.DataFrame(done).to_csv(path, index=False, float_format="%.6g")
-    return pd.DataFrame(done)
+    temporary = path.with_suffix(".part")
+    temporary.write_text(
+        json.dumps({"code_state": code_state, "rows": rows}, default=float), encoding="utf-8"
+    )
+    temporary.replace(path)

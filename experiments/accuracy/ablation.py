@@ -2,8 +2,8 @@
 
     python experiments/accuracy/ablation.py --data data
 
-Simulates what is not there, tracks, writes one row per run (CSV), the machine's description (JSON), and a figure
-(PNG); prints the means.
+Simulates the sequences that are missing, tracks them, and writes one row per run and a picture; prints the means. An
+interrupted study goes on where it was.
 """
 
 from __future__ import annotations
@@ -86,22 +86,29 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3, help="seeds of flight and swarm: 0, 1, ...")
     options = parser.parse_args()
 
-    # One flight after the other, so that a study that is interrupted has something of everything.
+    started = _runs.start("ablation")
+    # One flight after the other, so that an interrupted study has rows of every sequence and variant.
     rows = (
-        partial(run, name, variant, seed, opened)
+        (f"{name} {variant} {seed}", partial(run, name, variant, seed, opened))
         for seed in range(options.seeds)
         for name in options.sequence or _runs.EFFORT
         for opened in [_runs.opened(name, options.data, seed)]
         for variant in options.variant or VARIANTS
     )
-    table = _runs.table(rows, options.out / "ablation.csv")
+    table = _runs.save_rows(
+        started,
+        rows,
+        options.data,
+        options.out,
+        draw=lambda table: draw(table, options.picture),
+        files=[options.picture],
+    )
     means = (
         table.drop(columns=["seed", "note"], errors="ignore")
         .groupby(["sequence", "variant"], sort=False)
         .mean()
     )
     print(means.to_string(float_format="{:.4f}".format))
-    draw(table, options.picture)
 
 
 if __name__ == "__main__":

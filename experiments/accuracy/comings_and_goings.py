@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from psotrack.datasets.dpjait import read_sequence
 from psotrack.evaluation import evaluate
 from psotrack.evaluation.consistency import consistency
 from psotrack.geometry import project, viewpoints
-from psotrack.pipeline import environment, track_from_silhouettes
+from psotrack.pipeline import track_from_silhouettes
 from psotrack.recordings import Sequence
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import compute
@@ -31,6 +32,9 @@ from psotrack.silhouettes.computation import SilhouetteSettings
 from psotrack.simulation import scenarios, simulate
 from psotrack.support import atomic_write
 from psotrack.trajectories import Status, Trajectories
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+import _results
 
 SCENARIO = Path(__file__).with_suffix(".toml")
 BACKGROUNDS = {
@@ -278,6 +282,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, default=Path("experiments/pictures/comings_and_goings.png"))
     parser.add_argument("--seed", type=int, default=0, help="of the swarm")
     options = parser.parse_args()
+    started = _results.Run("comings_and_goings")
 
     sequence = opened(options.data)
     position_m, plan = _known(sequence), phases(sequence)
@@ -290,17 +295,13 @@ def main() -> None:
         table += [{"background": name, **row(phase, run, sequence.fps)} for phase in plan]
         totals[name] = summary(sequence, run)
     frame = pd.DataFrame(table)
-    options.out.mkdir(parents=True, exist_ok=True)
-    frame.to_csv(options.out / "comings_and_goings.csv", index=False, float_format="%.4g")
-    (options.out / "comings_and_goings.json").write_text(
-        json.dumps({"runs": totals, **environment()}, indent=2) + "\n"
-    )
+    draw(runs, plan, sequence.fps, options.picture)
+    started.save(options.out, rows=frame, figures={"runs": totals}, files=[options.picture], decimals="%.4g")
     for name, part in frame.groupby("background", sort=False):
         print(f"\n{name}: {json.dumps(totals[name])}")
         print(
             part.drop(columns="background").to_string(index=False, float_format="{:.2f}".format, na_rep="-")
         )
-    draw(runs, plan, sequence.fps, options.picture)
 
 
 if __name__ == "__main__":

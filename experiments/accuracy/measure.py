@@ -2,8 +2,8 @@
 
     python experiments/accuracy/measure.py --data data
 
-Simulates three flights of each sequence into --data if they are not there, tracks them with each method by the very
-commands that it prints, and writes one row per run (CSV), with the machine's description beside it (JSON).
+Simulates three flights of each sequence into --data unless they are there, tracks them with each method, and writes one
+row per run. It prints the commands that it runs. An interrupted study goes on where it was.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def effort(particles: int, iterations: int) -> tuple[str, ...]:
     return "--particles", str(particles), "--iterations", str(iterations)
 
 
-#: The methods beside the swarm; the swarm in "fused" has its defaults.
+#: Methods that use detections; the swarm inside "fused" has the default settings.
 OTHERS = {"projection lines": ("--method", "projection-lines"), "fused": ("--method", "fused")}
 METHODS = {
     "S01_D2_A": {
@@ -61,10 +61,10 @@ def psotrack(*words: str) -> str:
 
 def measured(name: str, method: str, seed: int, data: Path) -> dict[str, Any]:
     """One row."""
-    sequence = str(_runs.folder_of(name, data, seed))
+    sequence = str(_runs.simulated(name, data, seed))
     number = list(METHODS[name]).index(method)
     tracks = data / "tracks" / f"{name}-{seed}-{number}.csv"
-    effort = (*METHODS[name][method], "--seed", str(seed), "--cache", str(_runs.cache_of(data)))
+    effort = (*METHODS[name][method], "--seed", str(seed), "--cache", str(_runs.cache_folder(data)))
     psotrack("track", sequence, "--out", str(tracks), *effort, "--force", "--quiet")
     errors = json.loads(psotrack("evaluate", str(tracks), sequence, "--json", "-"))
     record = json.loads(tracks.with_suffix(".json").read_text())
@@ -81,14 +81,15 @@ def main() -> None:
     )
     parser.add_argument("--seeds", type=int, default=3, help="seeds of flight and swarm: 0, 1, ...")
     options = parser.parse_args()
+    run = _runs.start("measure")
     rows = (
-        partial(measured, name, method, seed, options.data)
+        (f"{name} {method} {seed}", partial(measured, name, method, seed, options.data))
         for seed in range(options.seeds)
         for name in options.sequence or METHODS
         for method in METHODS[name]
         if not options.method or method in options.method
     )
-    table = _runs.table(rows, options.out / "measure.csv")
+    table = _runs.save_rows(run, rows, options.data, options.out)
     means = table.drop(columns="seed").groupby(["sequence", "method"], sort=False).mean()
     print(f"mean of {options.seeds} flights", means.T.to_string(float_format="{:.4f}".format), sep="\n")
 

@@ -2,8 +2,8 @@
 
     python experiments/accuracy/refinement.py --data data
 
-Tracks S02_D4_A with one swarm per drone; writes one row per run (CSV) and the machine's description (JSON), and prints
-them. The rows with two particles and no iterations are gradients alone, from the prediction and the last position.
+Tracks S02_D4_A with one swarm per drone, writes one row per run, and prints the rows. Rows with two particles and no
+iterations show gradient steps alone, which begin at the prediction and at the last position.
 """
 
 from __future__ import annotations
@@ -32,13 +32,17 @@ def main() -> None:
     parser = _runs.parser(__doc__)
     options = parser.parse_args()
     opened = _runs.opened(NAME, options.data)
+    started = _runs.start("refinement")
     rows = (
-        partial(run, particles, iterations, steps, vertex, opened)
+        (
+            f"{particles} {iterations} {steps} {vertex}",
+            partial(run, particles, iterations, steps, vertex, opened),
+        )
         for particles, iterations in SWARMS
         for steps in STEPS
         for vertex in (False, True)
     )
-    table = _runs.table(rows, options.out / "refinement.csv")
+    table = _runs.save_rows(started, rows, options.data, options.out)
     print(table.to_string(float_format="{:.4f}".format, index=False))
 
 

@@ -10,6 +10,7 @@ the maximum is and how wide it is, mean over frames.
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -35,6 +36,9 @@ from psotrack.simulation.world.drones import MODELS
 from psotrack.tracking import ScoreSettings, on_device
 from psotrack.tracking.fitness import PAPER_SCORE, ScoreInputs, drone_fitness
 from psotrack.tracking.patches import cut
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+import _results
 
 NUM_FRAMES, SCALE = 50, 0.5
 #: At half size: as coarse as silhouettes of the full size are.
@@ -247,12 +251,17 @@ def main() -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("experiments/pictures"), help="folder of the picture"
     )
+    parser.add_argument(
+        "--results", type=Path, default=Path(__file__).parent / "results", help="folder of the record"
+    )
     options = parser.parse_args()
+    run = _results.Run("score_landscape")
     data = load(options.data)
     path = options.out / "score_landscape.png"
     draw(data, NUM_FRAMES // 2).savefig(path, dpi=80)
     print(path)
     table = summary(data, range(5, NUM_FRAMES, 5))
+    run.save(options.results, rows=table, files=[path])
     print(table.to_string(index=False, float_format="{:.0f}".format))
 
 

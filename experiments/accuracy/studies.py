@@ -3,20 +3,18 @@
     python experiments/accuracy/studies.py --data data
 
 Five grids (`studies/*.toml`) over three flights of S02_D4_A, joint swarm of 100 x 70, drones found by themselves; each
-can be run by `psotrack sweep` alone, and a study that was interrupted goes on. Simulates what is not there; writes one
-row per run (CSV), the machine's description (JSON), and a figure; prints means and the worst.
+can be run by `psotrack sweep` alone, and an interrupted study goes on where it was. Simulates the sequences that are
+missing; writes one row per run and a picture; prints means and worst values.
 """
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import _runs
 import numpy as np
 import pandas as pd
 
-from psotrack.pipeline import environment
 from psotrack.support import atomic_write, keep_compiled, progress_bar
 from psotrack.sweep import load, sweep
 
@@ -38,9 +36,11 @@ def rows_of(study: str, data: Path) -> pd.DataFrame:
     grid = load(GRIDS / f"{study}.toml")
     for sequence in grid.sequences:
         seed = int(Path(sequence).parts[0].removeprefix("seed"))
-        _runs.folder_of(Path(sequence).name, data, seed)
-    keep_compiled(_runs.cache_of(data) / "compiled")
-    rows = sweep(grid, data / "studies" / study, data=data, cache=_runs.cache_of(data), report=progress_bar)
+        _runs.simulated(Path(sequence).name, data, seed)
+    keep_compiled(_runs.cache_folder(data) / "compiled")
+    rows = sweep(
+        grid, data / "studies" / study, data=data, cache=_runs.cache_folder(data), report=progress_bar
+    )
     flight = {key: number for number, key in enumerate(dict.fromkeys(rows["input"]))}
     return rows.assign(
         study=study,
@@ -91,15 +91,14 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, default=Path("experiments/pictures/studies.png"))
     parser.add_argument("--study", choices=STUDIES, action="append", help="[default: all of them]")
     options = parser.parse_args()
+    run = _runs.start("studies")
     table = pd.concat([rows_of(study, options.data) for study in options.study or STUDIES], ignore_index=True)
-    options.out.mkdir(parents=True, exist_ok=True)
-    table.to_csv(options.out / "studies.csv", index=False, float_format="%.6g")
-    (options.out / "studies.json").write_text(json.dumps(environment(), indent=2) + "\n")
+    draw(table, options.picture)
+    run.save(options.out, rows=table, files=[options.picture])
     grouped = table.drop(columns=["flight", "draw"]).groupby(["study", "level"], sort=False)
     print("runs", grouped.size().to_string(), sep="\n")
     print("mean", grouped.mean().to_string(float_format="{:.4f}".format), sep="\n")
     print("worst", grouped.max().to_string(float_format="{:.4f}".format), sep="\n")
-    draw(table, options.picture)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import argparse
 import json
 import os
 import statistics
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -25,9 +26,12 @@ from psotrack.silhouettes import compute
 from psotrack.support import keep_compiled
 from psotrack.sweep import share_processors
 
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+import _results
+
 
 def seconds(call: Callable[[], object]) -> tuple[float, float]:
-    """Of the clock, and of all processors together."""
+    """Wall time and processor time of a call, seconds."""
     wall, cpu = time.perf_counter(), time.process_time()
     call()
     return time.perf_counter() - wall, time.process_time() - cpu
@@ -44,9 +48,11 @@ def main() -> None:
     parser.add_argument("--particles", type=int, default=50)
     parser.add_argument("--iterations", type=int, default=50)
     parser.add_argument("--swarm", choices=["joint", "per-drone"], default="joint")
-    parser.add_argument("--frames", type=int, help="the first so many")
+    parser.add_argument("--frames", type=int, help="use the first FRAMES frames only")
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--results", type=Path, help="write the record into this folder")
     options = parser.parse_args()
+    run = _results.Run("batch")
     share_processors()
     keep_compiled(options.cache / "compiled")
     sequence = read_sequence(options.sequence).usable(num_frames=options.frames)
@@ -75,6 +81,10 @@ def main() -> None:
     one, many = medians.values()
     ratio = statistics.median(many[0] / one[0] for one, many in zip(*taken.values(), strict=True))
     print(f"{options.runs} runs take {ratio:.2f} times as long as one (processors: {many[1] / one[1]:.2f})")
+    if options.results:
+        figures = {"sequence": sequence.name, "frames": sequence.num_frames, "runs": options.runs, **effort}
+        figures |= {"one_s": one[0], "many_s": many[0], "ratio": ratio, "processor_ratio": many[1] / one[1]}
+        run.save(options.results, figures=figures)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ One process. For two cores of a larger machine: `taskset -c 0,1 python localise.
 from __future__ import annotations
 
 import platform
+import sys
 import tempfile
 from pathlib import Path
 
@@ -21,6 +22,9 @@ from psotrack.geometry import Camera, camera, look_at, project
 from psotrack.inside_out import LocalisedVideo, MarkerMap, localise_video, open_source, read_marker_map
 from psotrack.inside_out.localising import STAGES
 from psotrack.recordings import VideoWriter
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+import _results
 
 _SIZES_WH = {"1920x1080": (1920, 1080), "3840x2160": (3840, 2160)}
 _FPS = 25.0
@@ -39,8 +43,14 @@ _CELL_PX = 24
 )
 @click.option("--frames", default=250, type=click.IntRange(1), help="Of the video.")
 @click.option("--repeats", default=5, type=click.IntRange(1), help="Runs.")
-def main(sequence: Path | None, drone: str, size: str, frames: int, repeats: int) -> None:
+@click.option(
+    "--results", type=click.Path(path_type=Path), help="Write the result and its record into this folder."
+)
+def main(
+    sequence: Path | None, drone: str, size: str, frames: int, repeats: int, results: Path | None
+) -> None:
     """Localise a video; print frames per second, milliseconds per stage, and what they were measured on."""
+    started = _results.Run("localise")
     with tempfile.TemporaryDirectory() as folder:
         if sequence is None:
             video, marker_map, lens = (
@@ -63,6 +73,18 @@ def main(sequence: Path | None, drone: str, size: str, frames: int, repeats: int
         f"with {cv2.getNumThreads()} threads"
     )
     _show(runs, source.image_size_wh, len(marker_map))
+    if results is not None:
+        started.save(results, figures=_figures(runs))
+
+
+def _figures(runs: list[LocalisedVideo]) -> dict[str, object]:
+    """Medians over the runs: frames per second, and milliseconds of each stage per frame."""
+    frames = runs[0].path.num_frames
+    stages_ms = {
+        stage: float(np.median([1e3 * run.seconds[stage] / frames for run in runs])) for stage in STAGES
+    }
+    per_second = float(np.median([run.frames_per_second for run in runs]))
+    return {"frames": frames, "frames_per_second": per_second, "stages_ms": stages_ms}
 
 
 def _show(runs: list[LocalisedVideo], image_size_wh: tuple[int, int], markers: int) -> None:

@@ -5,7 +5,9 @@ One process. For one core set OMP_NUM_THREADS=1 and OPENBLAS_NUM_THREADS=1. Opti
 
 from __future__ import annotations
 
+import sys
 import time
+from pathlib import Path
 
 import click
 import numpy as np
@@ -13,6 +15,9 @@ from jaxtyping import Float
 
 from psotrack.correspondence import Matches, match
 from psotrack.geometry import CameraRig, camera, look_at, project, stack
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+import _results
 
 #: Of the room, and how near to its walls no drone comes.
 _BOUNDS_M, _MARGIN_M = np.array([[-5.0, -4.0, 0.0], [5.0, 4.0, 4.0]]), 0.5
@@ -32,7 +37,10 @@ _LEAST_APART_M, _FOUND_M = 0.5, 0.1
 @click.option(
     "--repeats", default=5, type=click.IntRange(1), help="Timings of every scene; the least counts."
 )
-@click.option("--seed", default=0, help="Of the scenes.")
+@click.option("--seed", default=0, help="Seed of the scenes.")
+@click.option(
+    "--results", type=click.Path(path_type=Path), help="Write the result and its record into this folder."
+)
 def main(
     drones: int,
     cameras: int,
@@ -42,8 +50,10 @@ def main(
     frames: int,
     repeats: int,
     seed: int,
+    results: Path | None,
 ) -> None:
     """Time matching, without predictions; print milliseconds per frame, and what was found."""
+    run = _results.Run("matching")
     rig = _rig(cameras)
     rng = np.random.default_rng(seed)
     least_ms, found, false, error_m = [], 0, 0, []
@@ -67,6 +77,11 @@ def main(
         f"found {found / (frames * drones):.4f} within {_FOUND_M:g} m, false {false / frames:.3f} per frame, "
         f"mean error {1e3 * np.mean(error_m):.1f} mm"
     )
+    if results is not None:
+        figures = {"drones": drones, "cameras": cameras, "detections": detections, "noise_px": noise_px}
+        figures |= {"median_ms": float(np.median(least_ms)), "max_ms": float(np.max(least_ms))}
+        figures |= {"found_rate": found / (frames * drones), "mean_error_m": float(np.mean(error_m))}
+        run.save(results, figures=figures)
 
 
 def _timed(

@@ -1,7 +1,7 @@
 """Peak resident memory of tracking a long sequence: 3,000 frames of 8 cameras, against a limit of 2 GB.
 
-Silhouettes are drawn, stored as psotrack stores them, and read back and tracked by psotrack's own pipeline. Exit code
-1 when the limit is passed. `python experiments/benchmarks/memory.py --help`.
+Draws silhouettes, stores them as psotrack does, and tracks them from the store by psotrack's own pipeline. The exit
+code is 1 if the memory exceeds the limit. `python experiments/benchmarks/memory.py --help`.
 """
 
 from __future__ import annotations
@@ -25,18 +25,35 @@ from psotrack.silhouettes.store import CHUNK_FRAMES
 from psotrack.support import progress_bar
 from psotrack.tracking import track_silhouettes
 
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+import _results
+
 
 @click.command(context_settings={"show_default": True})
 @click.option("--frames", default=3000, type=click.IntRange(2), help="Frames that are tracked.")
-@click.option("--cameras", default=8, type=click.IntRange(2), help="Of 1920 x 1080 pixels each.")
-@click.option("--drones", default=4, type=click.IntRange(1), help="In the room.")
+@click.option("--cameras", default=8, type=click.IntRange(2), help="Cameras of 1920 x 1080 pixels.")
+@click.option("--drones", default=4, type=click.IntRange(1), help="Drones in the room.")
 @click.option(
-    "--particles", default=TrackSettings().particles, type=click.IntRange(2), help="Of every swarm."
+    "--particles", default=TrackSettings().particles, type=click.IntRange(2), help="Particles of every swarm."
 )
-@click.option("--iterations", default=TrackSettings().iterations, type=click.IntRange(0), help="Per frame.")
+@click.option(
+    "--iterations", default=TrackSettings().iterations, type=click.IntRange(0), help="Iterations per frame."
+)
 @click.option("--limit-gb", default=2.0, help="Largest resident memory, 10^9 bytes.")
-def main(frames: int, cameras: int, drones: int, particles: int, iterations: int, limit_gb: float) -> None:
+@click.option(
+    "--results", type=click.Path(path_type=Path), help="Write the result and its record into this folder."
+)
+def main(
+    frames: int,
+    cameras: int,
+    drones: int,
+    particles: int,
+    iterations: int,
+    limit_gb: float,
+    results: Path | None,
+) -> None:
     """Track a long sequence from stored silhouettes; print the peak of the resident memory."""
+    run = _results.Run("memory")
     scene = _scene.scene(frames, drones, cameras)
     start = InitialState(
         scene.position_m[0], scene.velocity_m_s[0], scene.size_m, np.full(drones, float(cameras))
@@ -68,11 +85,26 @@ def main(frames: int, cameras: int, drones: int, particles: int, iterations: int
     print(
         f"peak resident memory {peak_gb:.2f} GB (before tracking {before_gb:.2f} GB), limit {limit_gb:g} GB"
     )
+    if results is not None:
+        shape = {"frames": frames, "cameras": cameras, "drones": drones}
+        figures = {
+            **shape,
+            "particles": particles,
+            "iterations": iterations,
+            "track_s": track_s,
+            "track_ms_per_frame": 1e3 * track_s / frames,
+            "compile_s": tracked.compile_s,
+            "mean_error_m": float(errors_m.mean()),
+            "peak_gb": peak_gb,
+            "before_gb": before_gb,
+            "limit_gb": limit_gb,
+        }
+        run.save(results, figures=figures)
     sys.exit(peak_gb > limit_gb)
 
 
 def _store(scene: _scene.Scene, folder: Path) -> Silhouettes:
-    """The scene's silhouettes in a store; paths are closed, so what is drawn once serves every period."""
+    """The scene's silhouettes in a store; paths are closed, so one period is drawn and written again and again."""
     num_frames, names = len(scene.position_m), scene.rig.names
     arrays = [
         zarr.create_array(

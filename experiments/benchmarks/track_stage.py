@@ -6,11 +6,7 @@ does hits all alike; what is timed ends when the result is there. `python experi
 
 from __future__ import annotations
 
-import json
-import os
-import platform
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -25,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import msgspec
 import numpy as np
+import pandas as pd
 from _numpy_fitness import NumpyFitness, PlainFitness, TunedFitness
 from _peers import Evosax, Problem, PySwarms
 
@@ -33,6 +30,9 @@ from psotrack.settings import TrackSettings
 from psotrack.silhouettes import summed_area_table
 from psotrack.tracking import fitness, on_device, tracker
 from psotrack.tracking.inputs import tracker_inputs
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+import _results
 
 PEERS = ("evosax", "pyswarms")
 
@@ -93,7 +93,9 @@ class Timing:
 @click.option("--iterations", default=70, type=click.IntRange(1), help="Of the swarm, per frame.")
 @click.option("--drones", default=4, type=click.IntRange(1), help="In the room.")
 @click.option("--cameras", default=8, type=click.IntRange(2), help="Around it, 1920 x 1080 pixels each.")
-@click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write header and rows there too.")
+@click.option(
+    "--results", type=click.Path(path_type=Path), help="Write the result and its record into this folder."
+)
 def main(
     frames: int,
     repeats: int,
@@ -101,10 +103,11 @@ def main(
     iterations: int,
     drones: int,
     cameras: int,
-    json_path: Path | None,
+    results: Path | None,
 ) -> None:
     """Time the track stage of psotrack, evosax and pyswarms on the same silhouettes; print a table."""
     _require_peers()
+    run = _results.Run("track_stage")
     scene = _scene.scene(frames, drones, cameras)
     coverage = scene.coverage()
     joint = _problem(scene, TrackSettings(particles=particles, iterations=iterations, swarm="joint"))
@@ -138,9 +141,8 @@ def main(
     )
     timings = _time(methods, coverage, scene.position_m, repeats)
     _print(header, timings)
-    if json_path is not None:
-        rows = [vars(timing) for timing in timings]
-        json_path.write_text(json.dumps({**header, "methods": rows}, indent=2) + "\n", encoding="utf-8")
+    if results is not None:
+        run.save(results, rows=pd.DataFrame([vars(timing) for timing in timings]), figures=header["shapes"])
 
 
 def _require_peers() -> None:
@@ -227,53 +229,24 @@ def _time(
 
 
 def _header(shapes: dict[str, Any]) -> dict[str, Any]:
-    device = jax.devices()[0]
-    packages = ("psotrack", "jax", "jaxlib", "numpy", *PEERS)
-    return {
-        "device": f"{device.platform} ({device.device_kind})",
-        "cpu": _cpu_model(),
-        "processors": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "load_average": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
-        "versions": {"python": platform.python_version()} | {name: version(name) for name in packages},
-        "commit": _commit(),
-        **shapes,
-    }
-
-
-def _cpu_model() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return models[0] if models else platform.machine()
-
-
-def _commit() -> str:
-    command = ["git", "describe", "--always", "--dirty", "--exclude=*"]
-    try:
-        return subprocess.run(
-            command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
-        ).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
+    return {**_results.machine(), "versions": _results.versions(), "shapes": shapes}
 
 
 def _print(header: dict[str, Any], timings: list[Timing]) -> None:
+    shapes = header["shapes"]
     versions = ", ".join(f"{name} {number}" for name, number in header["versions"].items())
-    frames, cameras, height, width = header["silhouettes"]
-    reduction = header["reduction"]
+    frames, cameras, height, width = shapes["silhouettes"]
+    reduction = shapes["reduction"]
     print(
-        f"{header['device']}, {header['cpu']}, {header['processors']} processors, load {header['load_average']}"
+        f"{header['device']}, {header['processor']}, {header['processors']} processors, load {header['load_average']}"
     )
     print(versions)
-    print(f"commit {header['commit']}")
     print(
-        f"{header['particles']} particles x {header['iterations']} iterations, {header['drones']} drones, "
+        f"{shapes['particles']} particles x {shapes['iterations']} iterations, {shapes['drones']} drones, "
         f"{cameras} cameras of {width * reduction} x {height * reduction} pixels at reduction {reduction}, "
-        f"{frames} frames, {header['repeats']} repeats"
+        f"{frames} frames, {shapes['repeats']} repeats"
     )
-    difference = header["fitness_difference"]
+    difference = shapes["fitness_difference"]
     print(
         f"largest difference from psotrack's fitness: NumPy {difference['plain']:.1e}, "
         f"NumPy tuned by hand {difference['tuned']:.1e}\n"

@@ -12,6 +12,7 @@ Writes OUT/adjusting.csv.
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +29,9 @@ from psotrack.datasets.dpjait import read_detections, read_sequence
 from psotrack.geometry import CameraRig
 from psotrack.methods import detection_files_of
 from psotrack.settings import YOLO
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+import _results
 
 HERE = Path(__file__).parent
 #: The camera that is tampered with.
@@ -80,11 +84,11 @@ def main() -> None:
     parser.add_argument("sequences", type=Path, nargs="+")
     parser.add_argument("--out", type=Path, default=HERE / "results", help="Folder of the table.")
     options = parser.parse_args()
+    run = _results.Run("adjusting")
     cases = pd.concat([of_sequence(folder) for folder in options.sequences])
     table = cases.groupby("planted", sort=False).apply(summary, include_groups=False).reset_index()
     print(table.to_string(index=False))
-    options.out.mkdir(parents=True, exist_ok=True)
-    table.to_csv(options.out / "adjusting.csv", index=False)
+    run.save(options.out, rows=table)
 
 
 def of_sequence(folder: Path) -> pd.DataFrame:

@@ -9,6 +9,7 @@ the 90 % ellipsoid of the covariance that `locate_camera` states. Writes OUT/ext
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,6 +20,9 @@ from scipy.stats import chi2
 
 from psotrack.calibration import locate_camera
 from psotrack.geometry import Camera, camera, look_at, project
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+import _results
 
 HERE = Path(__file__).parent
 K = np.array([[1157.0, 0.0, 959.5], [0.0, 1157.0, 539.5], [0.0, 0.0, 1.0]])
@@ -38,11 +42,11 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=500, help="Of each row.")
     parser.add_argument("--out", type=Path, default=HERE / "results", help="Folder of the table.")
     options = parser.parse_args()
+    run = _results.Run("extrinsics")
     rows = [summary(words, range_m, options.draws) for words, range_m in DEPTHS_M.items()]
     table = pd.DataFrame(rows)
     print(table.to_string(index=False))
-    options.out.mkdir(parents=True, exist_ok=True)
-    table.to_csv(options.out / "extrinsics.csv", index=False)
+    run.save(options.out, rows=table)
 
 
 def summary(words: str, range_m: tuple[float, float], draws: int) -> dict[str, object]:

@@ -3,13 +3,14 @@
     python experiments/calibration/faults.py data/Simulated_Data/S02_D4_A --out experiments/pictures
 
 Reads a sequence with its detections, plants each fault in the calibration or in the detections, and asks `psotrack
-doctor`'s own function. Writes results/faults.md beside this file, and doctor_faults.png: how far each pair of cameras
-disagrees, for some of them.
+doctor`'s own function. Writes results/faults.json beside this file, and doctor_faults.png, which shows for some faults
+how far each pair of cameras disagrees.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +27,9 @@ from psotrack.methods import detection_files_of
 from psotrack.recordings import Detections
 from psotrack.settings import YOLO
 from psotrack.support import save_figure
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+import _results
 
 HERE = Path(__file__).parent
 #: The camera that is tampered with, and another one.
@@ -131,7 +135,9 @@ def main() -> None:
     )
     parser.add_argument("sequence", type=Path)
     parser.add_argument("--out", type=Path, default=HERE.parent / "pictures", help="Folder of the picture.")
+    parser.add_argument("--results", type=Path, default=HERE / "results", help="Folder of the record.")
     options = parser.parse_args()
+    run = _results.Run("faults")
     recording = read_sequence(options.sequence)
     boxes = {name: read_detections(path) for name, path in detection_files_of(recording, YOLO).items()}
     said = {}
@@ -140,16 +146,12 @@ def main() -> None:
         sightings = from_detections(tampered, rig, recording.num_frames)
         said[name] = examine(rig, sightings, fps=recording.fps, reference=recording.truth)
         print(f"{name}: {words(said[name])}", flush=True)
-    lines = [
-        "| planted | what `psotrack doctor` says |",
-        "|---|---|",
-        *(f"| {name} | {words(diagnosis)} |" for name, diagnosis in said.items()),
-    ]
-    (HERE / "results" / "faults.md").write_text("\n".join(lines) + "\n")
     names = recording.rig.names
     save_figure(
         options.out / "doctor_faults.png", (13.0, 3.9), lambda figure: draw(figure, said, names), force=True
     )
+    found = {name: words(diagnosis) for name, diagnosis in said.items()}
+    run.save(options.results, figures={"found": found}, files=[options.out / "doctor_faults.png"])
 
 
 def words(diagnosis: Diagnosis) -> str:

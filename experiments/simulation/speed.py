@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import platform
+import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -19,6 +20,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pandas as pd
 
 from psotrack.datasets.dpjait import MaskWriter
 from psotrack.recordings import VideoWriter
@@ -26,6 +28,9 @@ from psotrack.simulation import CameraRenderer, Scene, build, preset_names, scen
 from psotrack.simulation.imaging.onboard import OnboardRenderer
 from psotrack.simulation.labels.detector import detect
 from psotrack.simulation.labels.masks import silhouettes
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+import _results
 
 _spent_s: dict[str, float] = defaultdict(float)
 
@@ -75,30 +80,50 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--scenario", choices=preset_names(), default="S02_D4_A")
+    parser.add_argument("--scenario", choices=preset_names(), action="append", help="[default: S02_D4_A]")
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--scale", type=float, default=1.0)
+    parser.add_argument("--results", type=Path, help="write the result and its record into this folder")
     options = parser.parse_args()
+    run = _results.Run("simulator_speed")
     cv2.setNumThreads(1)
-    recipe = scenario(options.scenario)
-    scene = build(recipe, scale=options.scale)
+    rows = [
+        row for name in options.scenario or ["S02_D4_A"] for row in timed(name, options.frames, options.scale)
+    ]
+    if options.results:
+        run.save(options.results, rows=pd.DataFrame(rows))
+
+
+def timed(name: str, num_frames: int, scale: float) -> list[dict[str, object]]:
+    """Print the table of one scenario; return a row per stage, with processor milliseconds per frame."""
+    _spent_s.clear()
+    recipe = scenario(name)
+    scene = build(recipe, scale=scale)
     width, height = (int(side) for side in scene.rig.cameras.image_size_wh[0])
-    print(f"{recipe.name}: {len(recipe.drones)} drones, {width} x {height}, {options.frames} frames")
+    print(f"{recipe.name}: {len(recipe.drones)} drones, {width} x {height}, {num_frames} frames")
     print(f"{platform.processor() or platform.machine()}, OpenCV {cv2.__version__}, NumPy {np.__version__}")
-    frames = range(options.frames)
+    frames = range(num_frames)
     with tempfile.TemporaryDirectory() as folder:
         static_camera(scene, frames, Path(folder))
         if recipe.onboard is not None:
             onboard_camera(scene, frames, Path(folder))
     set_up_s, onboard_s = _spent_s.pop("set-up"), _spent_s.pop("on-board video", None)
-    for name, spent_s in _spent_s.items():
-        print(f"{name:30} {1e3 * spent_s / options.frames:7.1f} ms per frame")
-    total_s = sum(_spent_s.values()) / options.frames
+    for stage_name, spent_s in _spent_s.items():
+        print(f"{stage_name:30} {1e3 * spent_s / num_frames:7.1f} ms per frame")
+    total_s = sum(_spent_s.values()) / num_frames
     print(f"{'total of a static camera':30} {1e3 * total_s:7.1f} ms per frame")
     print(f"{'one second of eight, two cores':30} {200 * total_s / 2:7.1f} s")
     if onboard_s is not None:
-        print(f"{'video of an on-board camera':30} {1e3 * onboard_s / options.frames:7.1f} ms per frame")
+        print(f"{'video of an on-board camera':30} {1e3 * onboard_s / num_frames:7.1f} ms per frame")
     print(f"{'set-up, once per camera':30} {set_up_s:7.1f} s")
+    spent_ms = {stage_name: 1e3 * spent_s / num_frames for stage_name, spent_s in _spent_s.items()}
+    spent_ms |= {"total": 1e3 * total_s, "set-up": 1e3 * set_up_s}
+    if onboard_s is not None:
+        spent_ms["on-board video"] = 1e3 * onboard_s / num_frames
+    return [
+        {"scenario": name, "drones": len(recipe.drones), "stage": stage_name, "ms_per_frame": value}
+        for stage_name, value in spent_ms.items()
+    ]
 
 
 if __name__ == "__main__":

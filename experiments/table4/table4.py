@@ -3,8 +3,8 @@
     python experiments/table4/table4.py            # S01_D2_A, S02_D4_A and S04_D10, simulated where they are not there
     python experiments/table4/table4.py --data FOLDER_OF_THE_DATASET    # every sequence in it that has a reference
 
-FNR is the share of frames and drones that were missed. It writes to --out: results.csv, table4.md, and what `psotrack
-sweep` writes; what is finished there is not run again.
+FNR is the share of frames and drones that were missed. Writes results.csv, table4.md and the files of `psotrack sweep`
+to --out. Cells that are finished there are not run again.
 """
 
 from __future__ import annotations
@@ -21,6 +21,9 @@ from psotrack.errors import PsotrackError
 from psotrack.support import progress_bar
 from psotrack.sweep import grid, pivot, render, sweep
 
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+import _results
+
 HERE = Path(__file__).parent
 SIMULATED = ("S01_D2_A", "S02_D4_A", "S04_D10")
 #: Title -> column, its factor, and decimals.
@@ -33,6 +36,8 @@ TABLES = {
     "MOTA": ("mota", 1.0, 3),
     "Time of the track stage per frame (ms)": ("track_ms_per_frame", 1.0, 1),
 }
+#: Files of the result that are committed.
+FILES = ("results.csv", "table4.md", "manifest.json")
 KEPT = [
     "sequence",
     "method",
@@ -48,7 +53,7 @@ KEPT += ["offset_removed_inside_90_rate", "track_ms_per_frame", "commit"]
 
 
 def main() -> None:
-    """Simulate what is not there, track, and show."""
+    """Simulate the sequences that are missing, track, and show the tables."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -62,12 +67,16 @@ def main() -> None:
         help="[default: methods.toml, beside this file]",
     )
     parser.add_argument("--out", type=Path, default=Path("table4"))
+    parser.add_argument("--results", type=Path, help="copy the result and its record into this folder, too")
     options = parser.parse_args()
+    run = _results.Run("table4")
     try:
         data = options.data or simulated(options.out / "data")
         what = tomllib.loads(options.methods.read_text())
         rows = tracked({**what, "sequences": at_hand(data)}, options.out, data)
         show(rows, options.out)
+        if options.results:
+            run.copy([options.out / name for name in FILES], options.results)
     except PsotrackError as error:
         sys.exit(f"table4: {error}")
     if rows.attrs["errors"]:
@@ -75,7 +84,7 @@ def main() -> None:
 
 
 def simulated(data: Path) -> Path:
-    """The data's root, with the sequences that were not there."""
+    """Root folder of the data, after the missing sequences were simulated."""
     from psotrack.simulation import simulate
 
     for name in SIMULATED:
@@ -94,7 +103,7 @@ def at_hand(data: Path) -> list[str]:
 
 
 def tracked(what: dict, out: Path, data: Path) -> pd.DataFrame:
-    """One row per sequence and method; what is in `out` is not run again."""
+    """One row per sequence and method; cells that are finished in `out` are not run again."""
     from psotrack.support import keep_compiled
     from psotrack.sweep import share_processors
 
@@ -104,7 +113,7 @@ def tracked(what: dict, out: Path, data: Path) -> pd.DataFrame:
 
 
 def show(rows: pd.DataFrame, out: Path) -> None:
-    """Print the tables, and write them and the rows."""
+    """Print the tables, and write the tables and the rows."""
     parts = []
     for title, (value, scale, decimals) in TABLES.items():
         table = pivot(rows, rows_by=["sequence"], columns_by=["method"], value=value, scale=scale)

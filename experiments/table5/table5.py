@@ -4,8 +4,8 @@
     python experiments/table5/table5.py --quick    # a small form of it: five minutes, the second time seconds
     python experiments/table5/table5.py --data FOLDER_OF_THE_DATASET
 
-Without --data it simulates the sequences that are not there. It writes to --out: results.csv (a row per run),
-manifest.json, table5.md and figures; what is finished there is not run again.
+Without --data it simulates the sequences that are missing. Writes results.csv (one row per run), manifest.json,
+table5.md and pictures to --out. Cells that are finished there are not run again.
 """
 
 from __future__ import annotations
@@ -21,8 +21,13 @@ from psotrack.errors import PsotrackError
 from psotrack.support import progress_bar
 from psotrack.sweep import Grid, Store, load, pivot, render, sweep
 
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+import _results
+
 HERE = Path(__file__).parent
-#: Title -> column, its factor, and decimals: what the tables show.
+#: Files of the result that are committed, besides pictures.
+FILES = ("results.csv", "table5.md", "manifest.json")
+#: Title of a table -> column, its factor, and decimals.
 TABLES = {
     "Mean error": ("mean_error_m", 1e3, 1),
     "Mean error, each drone's constant offset taken out": ("offset_removed_mean_error_m", 1e3, 1),
@@ -30,7 +35,7 @@ TABLES = {
     "Missed, of all frames and drones": ("missed_rate", 1.0, 3),
     "Time of the track stage per frame": ("track_ms_per_frame", 1.0, 1),
 }
-#: What results.csv keeps, besides settings that differ.
+#: Columns of results.csv.
 KEPT = ["sequence", "method", "settings.particles", "settings.iterations", "seed", "frames"]
 KEPT += ["mean_error_m", "median_error_m", "p95_error_m", "max_error_m", "offset_removed_mean_error_m"]
 KEPT += ["missed_rate", "id_switches", "mota", "idf1", "hota", "offset_removed_inside_90_rate"]
@@ -49,13 +54,18 @@ def main() -> None:
         "--data", type=Path, help="root folder of the sequences [default: simulated into OUT]"
     )
     parser.add_argument("--out", type=Path, help="[default: table5, or table5/quick]")
+    parser.add_argument("--results", type=Path, help="copy the result and its record into this folder, too")
     options = parser.parse_args()
+    run = _results.Run("table5")
     out = options.out or (Path("table5/quick") if options.quick else Path("table5"))
     try:
         grid = load(options.grid or HERE / ("quick.toml" if options.quick else "grid.toml"))
         data = options.data or simulated(grid, out / "data", quick=options.quick)
         rows = tracked(grid, out, data)
         show(rows, out)
+        if options.results:
+            pictures = sorted(out.glob("*.png"))
+            run.copy([*(out / name for name in FILES), *pictures], options.results)
     except PsotrackError as error:
         sys.exit(f"table5: {error}")
     if rows.attrs["errors"]:
@@ -63,7 +73,7 @@ def main() -> None:
 
 
 def simulated(grid: Grid, data: Path, *, quick: bool) -> Path:
-    """The data's root, with the sequences that were not there."""
+    """Root folder of the data, after the missing sequences were simulated."""
     from psotrack.simulation import simulate
 
     for name in grid.sequences:
@@ -75,7 +85,7 @@ def simulated(grid: Grid, data: Path, *, quick: bool) -> Path:
 
 
 def tracked(grid: Grid, out: Path, data: Path) -> pd.DataFrame:
-    """One row per cell and run; what is in `out` is not run again."""
+    """One row per cell and run; cells that are finished in `out` are not run again."""
     from psotrack.support import keep_compiled
     from psotrack.sweep import share_processors
 
@@ -85,7 +95,7 @@ def tracked(grid: Grid, out: Path, data: Path) -> pd.DataFrame:
 
 
 def show(rows: pd.DataFrame, out: Path) -> None:
-    """Print the tables; write them, the rows and the figures, unless they are there and nothing is new."""
+    """Print the tables; write tables, rows and pictures, unless the files are newer than every cell."""
     published = tomllib.loads((HERE / "published.toml").read_text())
     tables = {
         title: pivot(
@@ -106,7 +116,7 @@ def show(rows: pd.DataFrame, out: Path) -> None:
     ]
     print("Published mean errors:", ", ".join(said))
     newest = max(path.stat().st_mtime for path in (out / "cells").glob("*.parquet"))
-    # Written last, so that it is older than the newest cell where something was interrupted.
+    # This file is written last, so after an interrupt it is older than the newest cell.
     last = out / "table5.md"
     if last.exists() and last.stat().st_mtime > newest:
         print(f"{out}: nothing new")
@@ -124,7 +134,7 @@ def show(rows: pd.DataFrame, out: Path) -> None:
 
 
 def draw(rows: pd.DataFrame, published: dict[str, tuple[float, float]], out: Path) -> None:
-    """The figures; those of single frames are of the largest swarm."""
+    """Draw the pictures; pictures of single frames show the largest swarm."""
     from psotrack.sweep import figures
 
     figures.save(

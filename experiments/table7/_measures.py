@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from psotrack.inside_out import CameraPath
-from psotrack.inside_out.comparison import Comparison, Statistics
+from psotrack.inside_out.comparison import PathComparison, Statistics
 from psotrack.inside_out.comparison.visibility import visible_markers
 
 ANGLES = ("roll", "pitch", "yaw")
@@ -24,7 +24,7 @@ class Measures:
     """Frame by frame, NaN where it is not known.
 
     Attributes:
-        distance_m, distance_to_point_m, difference_deg, angle_deg: by the paper's procedure: see `Comparison`.
+        distance_m, distance_to_point_m, difference_deg, angle_deg: by the paper's procedure: see `PathComparison`.
         error_m, error_deg: from the true pose of the camera, at the video's own times; of real recordings, which have
             none, the distances and angles.
         inside_90: whether the true position lies in the 90 % ellipsoid of the estimate.
@@ -43,7 +43,7 @@ class Measures:
     enough: Bool[np.ndarray, "frames"]
 
 
-def measured(recording: Recording, path: CameraPath, comparison: Comparison) -> Measures:
+def measured(recording: Recording, path: CameraPath, comparison: PathComparison) -> Measures:
     """Of one flight by one method."""
     turning, unknown = comparison.turning, np.full(path.num_frames, np.nan)
     if recording.truth is not None:

@@ -3,13 +3,15 @@
     python experiments/table7/table7.py            # S01_D2_A and S02_D4_A, simulated where they are not there
     python experiments/table7/table7.py --data FOLDER_OF_THE_DATASET    # every sequence *_A in it
 
-Every video is searched for markers once; what is found is kept in --out, and every method works from it: as it is, and
-with some markers taken for others. It writes to --out: results.csv, table6.csv, table7.md and figures.
+Every video is searched for markers once. The markers are kept in --out, and every method works from them: once as they
+are, and once with a share of them mistaken for other markers. Writes results.csv, table6.csv, table7.md and pictures to
+--out.
 """
 
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
 import zlib
 from collections.abc import Iterator
@@ -24,11 +26,21 @@ from _sightings import Sightings, detected, mislabelled
 
 from psotrack.errors import PsotrackError
 from psotrack.inside_out import CameraPath
-from psotrack.inside_out.comparison import Comparison, compare
+from psotrack.inside_out.comparison import PathComparison, compare
 from psotrack.inside_out.comparison.plots import save_errors, save_paths
 from psotrack.support import atomic_write
 
-#: Shares of the markers that are taken for others.
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+import _results
+
+#: Files of the result that are committed.
+FILES = ("results.csv", "table6.csv", "table7.md")
+#: Pictures of the result -> their committed names in experiments/pictures.
+PICTURES = {
+    "paths_S02_D4_A_dron2.png": "table7_paths.png",
+    "errors_S02_D4_A_dron2_2_percent_wrong.png": "table7_errors.png",
+}
+#: Shares of the markers that are mistaken for other markers.
 WRONG = (0.0, 0.02)
 KEYS = ["sequence", "drone", "wrong", "method"]
 STATISTICS = ("mean", "median", "std", "minimum", "maximum")
@@ -43,14 +55,14 @@ FIGURES = {
 }
 
 
-#: A drone, a method, and what was measured.
+#: A drone with a method, and the measures of the method.
 Case = tuple[dict[str, object], Measures]
-#: A row of Table 6, and what the other tables are made of.
+#: A row of Table 6, and the cases behind the other tables.
 Flight = tuple[dict[str, object], list[Case]]
 
 
 def main() -> None:
-    """Simulate what is not there, find markers and poses, compare and show."""
+    """Simulate the sequences that are missing, find markers and poses, compare, and show the tables."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -58,13 +70,19 @@ def main() -> None:
         "--data", type=Path, help="root folder of the sequences [default: simulated into OUT]"
     )
     parser.add_argument("--out", type=Path, default=Path("table7"))
+    parser.add_argument("--results", type=Path, help="copy the result and its record into this folder, too")
     options = parser.parse_args()
+    run = _results.Run("table7")
     errors: list[PsotrackError] = []
     try:
         data = options.data or simulated(options.out / "data")
         flown = [each for folder in at_hand(data) for each in flights(folder, options.out, errors)]
         if flown:
             show(flown, options.out)
+            if options.results:
+                for name, picture in PICTURES.items():
+                    shutil.copy(options.out / name, options.results.parents[1] / "pictures" / picture)
+                run.copy([options.out / name for name in FILES], options.results)
     except PsotrackError as error:
         errors.append(error)
     if errors:
@@ -72,7 +90,7 @@ def main() -> None:
 
 
 def flights(folder: Path, out: Path, errors: list[PsotrackError]) -> Iterator[Flight]:
-    """All of a sequence. What goes wrong with one is kept: the others are worth showing."""
+    """All flights of a sequence. An error of one flight is appended to `errors`, and the next flight follows."""
     try:
         found = list(recordings(folder))
     except PsotrackError as error:
@@ -86,7 +104,7 @@ def flights(folder: Path, out: Path, errors: list[PsotrackError]) -> Iterator[Fl
 
 
 def flight(recording: Recording, out: Path) -> Flight:
-    """One video by every method."""
+    """Localise one video by every method."""
     name = f"{recording.sequence}_{recording.drone}"
     seen = detected(recording, out / "detections" / f"{name}.npz")
     cases, described = [], {}
@@ -112,8 +130,8 @@ def flight(recording: Recording, out: Path) -> Flight:
     return described, cases
 
 
-def compared(recording: Recording, path: CameraPath) -> Comparison:
-    """By the paper's procedure, which knows nothing of the clocks."""
+def compared(recording: Recording, path: CameraPath) -> PathComparison:
+    """Compare by the paper's procedure, which does not know the offsets of the clocks."""
     reference = recording.reference
     return compare(
         path,
@@ -124,8 +142,8 @@ def compared(recording: Recording, path: CameraPath) -> Comparison:
     )
 
 
-def clocks(recording: Recording, comparison: Comparison) -> dict[str, float]:
-    """The offsets that were found, and by how many frames they are off where they are known."""
+def clocks(recording: Recording, comparison: PathComparison) -> dict[str, float]:
+    """Clock offsets that were found, and their errors in frames where the true offsets are known."""
     turning, planted_s = comparison.turning, recording.reference.planted_s
     found = {
         "offset_s": comparison.offset_s,
@@ -142,7 +160,7 @@ def clocks(recording: Recording, comparison: Comparison) -> dict[str, float]:
 
 
 def description(
-    recording: Recording, seen: Sightings, path: CameraPath, comparison: Comparison
+    recording: Recording, seen: Sightings, path: CameraPath, comparison: PathComparison
 ) -> dict[str, object]:
     """The row of Table 6."""
     known = np.isin(seen.ids, recording.marker_map.ids)
@@ -192,7 +210,7 @@ def show(flown: list[Flight], out: Path) -> None:
 
 
 def of_sequences(cases: list[Case]) -> list[Case]:
-    """All drones of a sequence together."""
+    """Pool all drones of a sequence."""
     together_by: dict[tuple, list[Measures]] = {}
     for key, measures in cases:
         together_by.setdefault((key["sequence"], "all", key["wrong"], key["method"]), []).append(measures)
@@ -200,7 +218,7 @@ def of_sequences(cases: list[Case]) -> list[Case]:
 
 
 def figures(rows: pd.DataFrame) -> pd.DataFrame:
-    """The figures of the project."""
+    """Table of errors against the true pose."""
     table = labels(rows)
     for column, (heading, factor, decimals) in FIGURES.items():
         table[heading] = [cell(value, factor, decimals) for value in rows[column]]
@@ -217,7 +235,7 @@ def statistics(rows: pd.DataFrame, column: str, factor: float) -> pd.DataFrame:
 
 
 def clock_errors(rows: pd.DataFrame) -> pd.DataFrame:
-    """The largest over drones, without its sign."""
+    """Largest absolute clock error over the drones."""
     columns = {"offset_s_off_frames": "positions", "orientation_offset_s_off_frames": "orientations"}
     worst = (
         rows.assign(**rows[list(columns)].abs()).groupby(KEYS[:1] + KEYS[2:], sort=False)[list(columns)].max()

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,14 +53,8 @@ def main() -> None:
     try:
         if options.out is not None:
             refuse_to_overwrite(options.out, options.force)
-        paths = {name: path for path, name in map(read_camera_path, inside)}
-        tracks = read_trajectories(outside)
-        fused = fuse(paths, tracks)
-        truth = read_sequence(options.sequence).truth
-        if truth is None or truth.orientation_wxyz is None:
-            raise InputError(options.sequence, expected="a reference with orientations", found="none")
-        compared = [one for name in paths if (one := _compared(name, paths[name], tracks, fused, truth))]
-        rows = pd.concat([_ranges(one, options.range) for one in compared])
+        compared = compare_drones(options.sequence, inside, outside)
+        rows = pd.concat([ranges(one, options.range) for one in compared])
         print(render(compared, rows))
         if options.out is not None:
             with atomic_write(options.out) as temporary:
@@ -68,8 +63,25 @@ def main() -> None:
         sys.exit(f"two_ways: {error}")
 
 
+def compare_drones(sequence: Path, inside: Sequence[Path], outside: Path) -> list[Compared]:
+    """Fuse, and compare every drone that both methods have with the sequence's reference.
+
+    Args:
+        sequence: folder of the sequence.
+        inside: files of `psotrack localise`, whose drones are named as in the reference.
+        outside: a file of `psotrack track`.
+    """
+    paths = {name: path for path, name in map(read_camera_path, inside)}
+    tracks = read_trajectories(outside)
+    fused = fuse(paths, tracks)
+    truth = read_sequence(sequence).truth
+    if truth is None or truth.orientation_wxyz is None:
+        raise InputError(sequence, expected="a reference with orientations", found="none")
+    return [one for name in paths if (one := _compared(name, paths[name], tracks, fused, truth))]
+
+
 def render(compared: list[Compared], rows: pd.DataFrame) -> str:
-    """A line per drone, as Markdown."""
+    """A table in Markdown, one line per drone."""
     lines = [
         "| drone | outside, mm: median, mean, p99 | inside | fused | ranges | fused is no worse in | worst ratio |",
         "|---|---|---|---|---|---|---|",
@@ -98,7 +110,7 @@ def _words(error_m: np.ndarray) -> str:
 def _compared(
     name: str, path: CameraPath, tracks: Trajectories, fused: Fused, truth: Trajectories
 ) -> Compared | None:
-    """None for a drone that only one method has."""
+    """Errors of one drone; None if only one method has the drone."""
     index = [drone.name for drone in fused.drones].index(name)
     if not fused.drones[index].tracks:
         return None
@@ -110,7 +122,7 @@ def _compared(
     own = [tracks.drones.index(track) for track in fused.drones[index].tracks]
     nearest = np.full((len(frame), 3), np.nan)
     for track in own:
-        # Of tracks that were exchanged the one that is with the drone, which flatters the outside.
+        # Where tracks were exchanged, the track at the drone counts, which favours the outside-in method.
         there_m = _at(frame, tracks, track)
         better = np.linalg.norm(there_m - true_m, axis=1) < np.nan_to_num(
             np.linalg.norm(nearest - true_m, axis=1), nan=np.inf
@@ -133,7 +145,7 @@ def _compared(
 
 
 def _at(frame: np.ndarray, tracks: Trajectories, drone: int) -> np.ndarray:
-    """(frames, 3), NaN where it is not tracked."""
+    """Positions (frames, 3) of one drone, metres; NaN where the drone is not tracked."""
     position_m = np.full((len(frame), 3), np.nan)
     _, to, source = np.intersect1d(frame, tracks.frame, return_indices=True)
     seen = tracks.seen[source, drone]
@@ -141,8 +153,8 @@ def _at(frame: np.ndarray, tracks: Trajectories, drone: int) -> np.ndarray:
     return position_m
 
 
-def _ranges(one: Compared, length: int) -> pd.DataFrame:
-    """A row per range of frames of which at least half are covered by both."""
+def ranges(one: Compared, length: int) -> pd.DataFrame:
+    """One row per range of frames; both methods must cover at least half of a range."""
     rows = []
     for first in range(0, int(one.frame.max()) + 1, length):
         inside = (one.frame >= first) & (one.frame < first + length)

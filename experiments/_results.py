@@ -1,0 +1,383 @@
+"""Result files of the experiments: how they are written, checked against the code, and made again.
+
+    python experiments/_results.py list               # the results, and the command that makes each of them
+    python experiments/_results.py check [NAME ...]   # each result that is older than its code (`make results-check`)
+    python experiments/_results.py make [NAME ...]    # makes the older results again (`make results`)
+
+`results.toml` declares every result: its folder, its command, and the code that it depends on. An experiment writes its
+result with `Run.save`: rows as NAME.csv, and NAME.json, the record, with commit, machine, date, versions, command,
+digests of the files, and figures that are no rows. The pages in docs/ read these files when they are built.
+
+`make` skips results that are as new as their code, so an interrupted call goes on with the next result. `--force` makes
+the named results again in any case.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import hashlib
+import json
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from fnmatch import fnmatch
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+ROOT = Path(__file__).resolve().parents[1]
+REGISTRY = Path(__file__).with_name("results.toml")
+#: Packages whose versions a record states, where they are installed.
+PACKAGES = (
+    "psotrack",
+    "jax",
+    "jaxlib",
+    "numpy",
+    "scipy",
+    "pandas",
+    "opencv-python-headless",
+    "zarr",
+    "ezc3d",
+)
+PACKAGES += ("evosax", "pyswarms")
+#: Keys that every record has.
+KEYS = ("result", "command", "commit", "dirty", "date", "machine", "versions", "files", "figures")
+#: Longest list of changed files that `check` prints for one result.
+MOST_FILES_SHOWN = 3
+
+
+@dataclass(frozen=True)
+class Result:
+    """One entry of the registry.
+
+    Attributes:
+        name: name of the entry; the record is `folder`/`name`.json.
+        says: what the result shows, one line.
+        folder: folder of the committed files, relative to the repository's root.
+        commands: commands that make the result, in order, relative to the repository's root.
+        code: Git path patterns of the code that the result depends on.
+        minutes: time that the commands take on two cores, roughly, minutes.
+    """
+
+    name: str
+    says: str
+    folder: Path
+    commands: tuple[str, ...]
+    code: tuple[str, ...]
+    minutes: float
+
+    @property
+    def record(self) -> Path:
+        """The committed record."""
+        return ROOT / self.folder / f"{self.name}.json"
+
+
+@cache
+def registry() -> dict[str, Result]:
+    """All declared results by name, in the order of the file."""
+    declared = tomllib.loads(REGISTRY.read_text(encoding="utf-8"))
+    groups = declared["code"]
+    return {
+        name: Result(
+            name,
+            entry["says"],
+            Path(entry["folder"]),
+            tuple(entry["commands"]),
+            tuple(path for one in entry["code"] for path in groups.get(one, [one])),
+            entry["minutes"],
+        )
+        for name, entry in declared["results"].items()
+    }
+
+
+class Run:
+    """One run of an experiment; create it before the work begins, because the commit is read then.
+
+    Args:
+        name: name of the result in the registry.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._result = registry()[name]
+        self._facts = {
+            "result": name,
+            "command": shlex.join(["python", *_relative(sys.argv)]),
+            "commit": _git("rev-parse", "HEAD") or None,
+            "dirty": dirty(self._result.code),
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        }
+
+    @property
+    def name(self) -> str:
+        """Name of the result."""
+        return self._result.name
+
+    @property
+    def code_state(self) -> str:
+        """Digest of commit and command: rows that were made in the same state need not be made again."""
+        facts = json.dumps([self._facts[key] for key in ("commit", "dirty", "command")])
+        return hashlib.sha256(facts.encode()).hexdigest()
+
+    def copy(self, paths: Iterable[Path], folder: Path, *, figures: Mapping[str, Any] | None = None) -> None:
+        """Copy the files of a result into `folder`, and write the record beside them."""
+        folder.mkdir(parents=True, exist_ok=True)
+        copies = [Path(shutil.copy(path, folder)) for path in paths]
+        self.save(folder, figures=figures, files=copies)
+
+    def save(
+        self,
+        folder: Path,
+        *,
+        rows: pd.DataFrame | None = None,
+        figures: Mapping[str, Any] | None = None,
+        files: Iterable[Path] = (),
+        decimals: str = "%.6g",
+    ) -> None:
+        """Write rows to `folder`/NAME.csv, and the record to `folder`/NAME.json.
+
+        Args:
+            folder: folder of the result; made if it is missing.
+            rows: rows of the result.
+            figures: figures that are no rows, fit for JSON.
+            files: further files of the result, pictures for instance, which exist already.
+            decimals: format of floating-point numbers in the rows.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        written = [*files]
+        if rows is not None:
+            written.insert(0, folder / f"{self._result.name}.csv")
+            rows.to_csv(written[0], index=False, float_format=decimals)
+        record = self._facts | {
+            "machine": machine(),
+            "versions": versions(),
+            "files": {_from(path, folder): digest(path) for path in written},
+            "figures": dict(figures or {}),
+        }
+        path = folder / f"{self._result.name}.json"
+        temporary = path.with_suffix(".json.part")
+        temporary.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+        temporary.replace(path)
+
+
+def machine() -> dict[str, Any]:
+    """Processor, number of usable processors, system, and the device that JAX computes on, if JAX is loaded."""
+    jax = sys.modules.get("jax")
+    device = jax.devices()[0] if jax is not None else None
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {
+        "processor": _processor(),
+        "processors": usable,
+        "system": f"{platform.system()} {platform.machine()}",
+        "device": None if device is None else f"{device.platform} ({device.device_kind})",
+        "load_average": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that are installed."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file's content."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def dirty(code: Sequence[str]) -> list[str]:
+    """Files of the code that differ from the commit, or that Git does not know."""
+    status = _git("status", "--porcelain", "--untracked-files=all", "--", *code)
+    return sorted(line[3:] for line in status.splitlines())
+
+
+def reasons(result: Result) -> list[str]:
+    """Why a result is older than its code, one sentence each; empty if the result is as new as its code."""
+    if not result.record.exists():
+        return ["there is no record; the result was never made"]
+    record = json.loads(result.record.read_text(encoding="utf-8"))
+    missing = [key for key in KEYS if key not in record]
+    if missing:
+        return [f"the record lacks {', '.join(missing)}"]
+    found = []
+    if record.get("note"):
+        found.append(record["note"])
+    if record["dirty"]:
+        found.append(f"made from a working tree with changes in {_listed(record['dirty'])}")
+    for name, expected in record["files"].items():
+        path = result.record.parent / name
+        if not path.exists():
+            found.append(f"{name} is missing")
+        elif digest(path) != expected:
+            found.append(f"{name} is not the file that the record describes")
+    changed = dirty(result.code)
+    if changed:
+        found.append(f"the working tree has changes in {_listed(changed)}")
+    commit = record["commit"]
+    if not commit or _git("cat-file", "-t", commit) != "commit":
+        found.append(f"its commit {commit} is not in this clone")
+        return found
+    newer = newer_files(commit, result.code)
+    if newer:
+        found.append(f"code changed since {commit[:7]}: {_listed(newer)}")
+    return found
+
+
+def newer_files(commit: str, code: Sequence[str]) -> list[str]:
+    """Files of the code whose content changed between a commit and HEAD; docstrings and comments do not count."""
+    names = _git("diff", "--name-only", "--no-renames", commit, "HEAD", "--", *code).splitlines()
+    return [name for name in names if not _same_code(commit, name)]
+
+
+def _same_code(commit: str, name: str) -> bool:
+    """Whether a Python file differs from that of the commit in docstrings, comments and layout only."""
+    if not name.endswith(".py"):
+        return False
+    old, new = (_git("show", f"{at}:{name}", default=None) for at in (commit, "HEAD"))
+    if old is None or new is None:
+        return False
+    try:
+        return _stripped(old) == _stripped(new)
+    except SyntaxError:
+        return False
+
+
+def _stripped(source: str) -> str:
+    """The syntax tree of a source without docstrings."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
+            body = node.body
+            if body and isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant):
+                node.body = body[1:]
+    return ast.dump(tree)
+
+
+def check(names: Sequence[str]) -> int:
+    """Print each result that is older than its code, with the reasons; the exit code is 1 if there is one."""
+    tracked = _git("ls-files").splitlines()
+    older = 0
+    for result in _chosen(names):
+        why = reasons(result)
+        unmatched = [
+            path
+            for path in result.code
+            if not any(fnmatch(name, path) or name.startswith(f"{path}/") for name in tracked)
+        ]
+        why += [f"results.toml names {path}, which matches no file" for path in unmatched]
+        if why:
+            older += 1
+            print(f"{result.name}: {'; '.join(why)}")
+    total = len(_chosen(names))
+    print(f"{total - older} of {total} results are as new as their code")
+    return int(older > 0)
+
+
+def make(names: Sequence[str], *, force: bool) -> int:
+    """Make the older of these results again, one after the other; the exit code is 1 if a command failed."""
+    failed = []
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    for result in _chosen(names):
+        if not force and not reasons(result):
+            print(f"{result.name}: as new as its code", flush=True)
+            continue
+        print(f"{result.name}: about {result.minutes:g} minutes on two cores", flush=True)
+        began = time.monotonic()
+        for command in result.commands:
+            print(f"$ {command}", flush=True)
+            words = [sys.executable if word == "python" else word for word in shlex.split(command)]
+            if subprocess.run(words, cwd=ROOT, env=environment, check=False).returncode:
+                failed.append(result.name)
+                break
+        else:
+            print(f"{result.name}: made in {(time.monotonic() - began) / 60:.1f} minutes", flush=True)
+    if failed:
+        print(f"failed: {', '.join(failed)}", file=sys.stderr)
+    return int(bool(failed))
+
+
+def _chosen(names: Sequence[str]) -> list[Result]:
+    unknown = set(names) - set(registry())
+    if unknown:
+        sys.exit(
+            f"results: expected names of results.toml ({', '.join(registry())}), found {', '.join(sorted(unknown))}"
+        )
+    return [result for name, result in registry().items() if not names or name in names]
+
+
+def _listed(names: Sequence[str]) -> str:
+    """The first names of a list, and how many more there are."""
+    shown = ", ".join(names[:MOST_FILES_SHOWN])
+    return (
+        shown if len(names) <= MOST_FILES_SHOWN else f"{shown} and {len(names) - MOST_FILES_SHOWN} more files"
+    )
+
+
+def _relative(words: Sequence[str]) -> list[str]:
+    """Words of a command with paths below the repository's root written relative to the root."""
+    return [word.removeprefix(f"{ROOT}/") for word in words]
+
+
+def _from(path: Path, folder: Path) -> str:
+    """A path relative to a folder, with forward slashes."""
+    return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.machine()
+
+
+def _git(*words: str, default: Any = "") -> Any:
+    """Output of a Git command, or `default` where the command fails or Git is missing."""
+    try:
+        done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return default
+    return done.stdout.rstrip("\n")
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("action", choices=["list", "check", "make"])
+    parser.add_argument("names", nargs="*", metavar="NAME", help="results [default: all of results.toml]")
+    parser.add_argument(
+        "--force", action="store_true", help="make results again that are as new as their code"
+    )
+    options = parser.parse_args()
+    if options.action == "list":
+        for result in _chosen(options.names):
+            print(f"{result.name:20} {result.minutes:4g} min  {result.says}")
+            print("".join(f"{'':30}{command}\n" for command in result.commands), end="")
+    elif options.action == "check":
+        sys.exit(check(options.names))
+    else:
+        sys.exit(make(options.names, force=options.force))
+
+
+if __name__ == "__main__":
+    main()
