@@ -451,6 +451,8 @@ def test_a_full_disk_leaves_earlier_results(run: Run, data: Path, sequence: Path
 INTERRUPTED = """
 import signal, sys
 
+# `nohup` and `&` in scripts start the tests with Ctrl-C ignored.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 folder = sys.argv.pop(1)
 
 def press(event, arguments):

@@ -52,6 +52,6 @@ def test_a_worker_is_killed_and_its_cell_runs_again(tmp_path_factory, tmp_path):
 def test_without_dask_one_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(
-        SettingsError, match=r"expected Dask, found .*; install it with `pip install '\.\[dask\]'`"
+        SettingsError, match=r"expected Dask, found .*; install it with `pip install 'psotrack\[dask\]'`"
     ):
         run_on_cluster(load(grid_file(tmp_path, [2])), tmp_path, data=tmp_path, cache=tmp_path)

@@ -222,7 +222,7 @@ def test_a_gpu_that_is_not_there_is_one_line(tmp_path: Path) -> None:
     result = psotrack(tmp_path, "sweep", grid_file(tmp_path, [3]), "--out", tmp_path, "--device", "gpu")
     assert result.returncode == 2
     assert result.stderr.count("\n") == 1
-    assert "pip install '.[cuda]'" in result.stderr
+    assert "pip install 'psotrack[cuda]'" in result.stderr
 
 
 @pytest.mark.slow

@@ -1,8 +1,9 @@
-"""The command line: every command says what it needs and what it writes, and shows an example.
+"""The command line: every command's help says what the command needs and writes, and shows an example.
 
 In: arguments and files. Out: files, text on stdout, and one line on stderr where something is wrong. Commands contain
-no numerics; they import the functions they call when they run, so that `--help` is quick. The exit code is 0 only
-when everything was done, and 2 for every error.
+no numerics. A command's module is imported when the command runs, and the module imports the functions that it calls
+when they are called, so that `--help` and shell completion are quick. The exit code is 0 if everything was done, and 2
+for every error.
 """
 
 from __future__ import annotations
@@ -14,31 +15,85 @@ import sys
 import click
 
 from psotrack import __version__
-from psotrack.cli.as_real import as_real
-from psotrack.cli.calibrate import calibrate
-from psotrack.cli.demo import demo
-from psotrack.cli.detect import detect
-from psotrack.cli.doctor import doctor
-from psotrack.cli.evaluate import evaluate
-from psotrack.cli.fly import fly
-from psotrack.cli.fuse import fuse
-from psotrack.cli.info import info
-from psotrack.cli.labels import labels
-from psotrack.cli.localise import localise
-from psotrack.cli.map_markers import map_markers
-from psotrack.cli.silhouettes import silhouettes
-from psotrack.cli.simulate import simulate
-from psotrack.cli.sweep import sweep, table
-from psotrack.cli.synchronise import synchronise
-from psotrack.cli.track import track
-from psotrack.errors import PsotrackError
+from psotrack.cli.lazy import LazyCommand, LazyGroup
+from psotrack.errors import PsotrackError, SettingsError
 
 __all__ = ["cli", "main"]
 
+#: Commands by name: the module that defines the command, and the first sentence of its help. A test holds the sentences
+#: equal to the commands' own.
+COMMANDS = {
+    "as-real": LazyCommand(
+        "psotrack.cli.as_real", "Write the simulated sequence SEQ in the form of the dataset's real half."
+    ),
+    "calibrate": LazyCommand("psotrack.cli.calibrate", "Calibrate cameras, and convert calibration files."),
+    "demo": LazyCommand(
+        "psotrack.cli.demo",
+        "Simulate four drones, track them in eight videos, print the errors and save a picture.",
+    ),
+    "detect": LazyCommand(
+        "psotrack.cli.detect",
+        "Detect the drones of SEQ in each of its videos with a neural network, as 2D boxes.",
+    ),
+    "doctor": LazyCommand(
+        "psotrack.cli.doctor",
+        "Check the calibration of SEQ against the detections of its cameras, before tracking.",
+    ),
+    "evaluate": LazyCommand("psotrack.cli.evaluate", "Compare TRACKS with the reference of SEQ."),
+    "fly": LazyCommand(
+        "psotrack.cli.fly", "Fly a simulated drone by hand and record the flight for a scenario."
+    ),
+    "fuse": LazyCommand(
+        "psotrack.cli.fuse",
+        "Fuse INSIDE, paths of on-board cameras, with OUTSIDE, tracks of the same drones from static cameras.",
+    ),
+    "info": LazyCommand(
+        "psotrack.cli.info",
+        "Show what SEQ contains, and check all of its files but the frames of the videos.",
+    ),
+    "labels": LazyCommand(
+        "psotrack.cli.labels", "Write a YOLO training set from sequences with a reference."
+    ),
+    "localise": LazyCommand(
+        "psotrack.cli.localise",
+        "Find the position of the camera of VIDEO in every frame, from the ArUco markers that it sees.",
+    ),
+    "map-markers": LazyCommand(
+        "psotrack.cli.map_markers",
+        "Write the table of a room's marker corners from SOURCE, or check such a table.",
+    ),
+    "silhouettes": LazyCommand(
+        "psotrack.cli.silhouettes", "Compute and store the silhouettes of SEQ, which `track` reads."
+    ),
+    "simulate": LazyCommand(
+        "psotrack.cli.simulate",
+        "Simulate a sequence: videos, calibration, ground truth, masks and detections.",
+    ),
+    "sweep": LazyCommand(
+        "psotrack.cli.sweep", "Track with every combination of a grid's settings, and keep one row per run."
+    ),
+    "synchronise": LazyCommand(
+        "psotrack.cli.synchronise",
+        "Find the offset between the clocks of SEQ's reference and of its videos, from the motion in TRACKS.",
+    ),
+    "table": LazyCommand(
+        "psotrack.cli.sweep", "Show a figure of the results in DIR: mean +- standard deviation over runs."
+    ),
+    "track": LazyCommand(
+        "psotrack.cli.track", "Track the drones of SEQ from its videos, or from detections in them."
+    ),
+}
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+_COMPLETION_VARIABLE = "_PSOTRACK_COMPLETE"
+
+
+@click.group(
+    cls=LazyGroup,
+    lazy_commands=COMMANDS,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+)
 @click.version_option(__version__, prog_name="psotrack")
-@click.option("--verbose", "-v", is_flag=True, help="Log what is done.")
+@click.option("--verbose", "-v", is_flag=True, help="Log the steps of the work on stderr.")
 def cli(verbose: bool) -> None:
     """3D positions of several drones, in every frame, from calibrated camera videos alone.
 
@@ -47,6 +102,12 @@ def cli(verbose: bool) -> None:
     Step by step:    psotrack simulate S02_D4_A --out data
                      psotrack track data/Simulated_Data/S02_D4_A --out tracks.csv
                      psotrack evaluate tracks.csv data/Simulated_Data/S02_D4_A --plot
+
+    \b
+    Completion with the Tab key needs one line in the start-up file of your shell:
+      ~/.bashrc                   eval "$(_PSOTRACK_COMPLETE=bash_source psotrack)"
+      ~/.zshrc                    eval "$(_PSOTRACK_COMPLETE=zsh_source psotrack)"
+      ~/.config/fish/config.fish  _PSOTRACK_COMPLETE=fish_source psotrack | source
     """
     logging.basicConfig(
         level=logging.INFO if verbose else logging.WARNING,
@@ -55,55 +116,46 @@ def cli(verbose: bool) -> None:
     )
 
 
-for _command in (
-    as_real,
-    calibrate,
-    demo,
-    detect,
-    doctor,
-    evaluate,
-    fly,
-    fuse,
-    info,
-    labels,
-    localise,
-    map_markers,
-    silhouettes,
-    simulate,
-    sweep,
-    synchronise,
-    table,
-    track,
-):
-    cli.add_command(_command)
-
-
 def main() -> None:
-    """Run the command line; what psotrack raises on purpose becomes one line and exit code 2."""
+    """Run the command line; an error that psotrack raises on purpose becomes one line and exit code 2."""
     try:
-        # Not `cli.main`, which would make two lines of Ctrl-C.
-        with cli.make_context("psotrack", sys.argv[1:]) as started:
-            cli.invoke(started)
+        _complete()
+        # `cli.main` would print two lines for Ctrl-C.
+        with cli.make_context("psotrack", sys.argv[1:]) as context:
+            cli.invoke(context)
     except click.exceptions.Exit as done:
         sys.exit(done.exit_code)
     except click.exceptions.NoArgsIsHelpError as error:
         error.show()
         sys.exit(2)
     except click.ClickException as error:
-        # Not `error.show`, which says it in four lines.
-        context = error.ctx if isinstance(error, click.UsageError) else None
-        remedy = f"; see `{context.command_path} --help`" if context else ""
+        # `error.show` would print four lines.
+        failed = error.ctx if isinstance(error, click.UsageError) else None
+        remedy = f"; see `{failed.command_path} --help`" if failed else ""
         sys.stderr.write(f"psotrack: {error.format_message().rstrip('.')}{remedy}\n")
         sys.exit(2)
     except KeyboardInterrupt:
         sys.stderr.write(
-            "psotrack: interrupted; earlier results are unchanged, and the same command goes on\n"
+            "psotrack: interrupted; earlier results are unchanged, and the same command continues the work\n"
         )
         sys.exit(2)
     except PsotrackError as error:
         sys.stderr.write(f"psotrack: {error}\n")
         sys.exit(2)
     except BrokenPipeError:
-        # Whoever read our output has left, as `head` does.
+        # The program that reads the output has ended, as `head` does.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(2)
+
+
+def _complete() -> None:
+    """Answer a shell that asks for completions, and exit; do nothing if no shell asks."""
+    instruction = os.environ.get(_COMPLETION_VARIABLE)
+    if not instruction:
+        return
+    from click.shell_completion import shell_complete
+
+    if shell_complete(cli, {}, "psotrack", _COMPLETION_VARIABLE, instruction) != 0:
+        expected = "bash_source, zsh_source or fish_source"
+        raise SettingsError(_COMPLETION_VARIABLE, expected=expected, found=instruction)
+    sys.exit(0)

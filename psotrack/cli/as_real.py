@@ -40,7 +40,7 @@ def as_real(
     quiet: bool,
     json_path: Path | None,
 ) -> None:
-    """Write SEQ, a simulated one, in the form of the dataset's real half.
+    """Write the simulated sequence SEQ in the form of the dataset's real half.
 
     Writes OUT/Real_Data/RXX_Dn: four cameras with distortion, named by serial number, in millimetres; a C3D file of
     marker crosses at another rate, that began at another moment, with gaps and swapped labels; detections.

@@ -19,7 +19,7 @@ from psotrack.cli.options import FORCE, JOBS, QUIET, compiled_folder
 @FORCE
 @QUIET
 def demo(out: Path, seed: int, jobs: int | None, force: bool, quiet: bool) -> None:
-    """Simulate four drones, track them from eight videos, print the errors, save a picture.
+    """Simulate four drones, track them in eight videos, print the errors and save a picture.
 
     \b
     Example:

@@ -54,7 +54,7 @@ def detect(
     quiet: bool,
     json_path: Path | None,
 ) -> None:
-    """Find the drones of SEQ in each of its videos with a network, as 2D boxes.
+    """Detect the drones of SEQ in each of its videos with a neural network, as 2D boxes.
 
     Writes OUT/CAMERA.csv for every camera, in the layout of the dataset's own dl_data.
 

@@ -43,7 +43,7 @@ def doctor(
     force: bool,
     json_path: Path | None,
 ) -> None:
-    """Check the rig of SEQ against what its cameras see, before anybody tracks.
+    """Check the calibration of SEQ against the detections of its cameras, before tracking.
 
     Says which camera, pair or file disagrees, by how much, and what to do: a camera that is turned or moved, late, of
     another focal length, or exchanged with another; translations that are centres, millimetres that were read as

@@ -56,7 +56,7 @@ def fly(
     force: bool,
     quiet: bool,
 ) -> None:
-    """Fly a drone by hand and record it for a scenario.
+    """Fly a simulated drone by hand and record the flight for a scenario.
 
     Writes OUT, position and orientation over time, and beside it the same name with .sticks.csv: what the sticks did,
     which --device flies again. Start, back or Esc ends the flight; so does Ctrl-C, and what was flown is kept.

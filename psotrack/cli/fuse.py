@@ -46,7 +46,7 @@ def fuse(
     quiet: bool,
     json_path: Path | None,
 ) -> None:
-    """Fuse INSIDE, paths of cameras on drones, with OUTSIDE, tracks of the same drones from static cameras.
+    """Fuse INSIDE, paths of on-board cameras, with OUTSIDE, tracks of the same drones from static cameras.
 
     INSIDE are files of `psotrack localise`, one per drone; OUTSIDE is one of `psotrack track`, whose names of drones
     may be any. Each counts as its covariance says; the scales, the arm from the camera to the middle of the drone, and

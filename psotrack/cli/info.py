@@ -15,7 +15,7 @@ from psotrack.cli.options import FORCE, JSON, SEQUENCE
 @FORCE
 @JSON
 def info(sequence: Path, force: bool, json_path: Path | None) -> None:
-    """Show what SEQ holds, and read all of it but the videos' frames, so that what is broken shows.
+    """Show what SEQ contains, and check all of its files but the frames of the videos.
 
     \b
     Example:

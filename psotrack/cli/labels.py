@@ -69,7 +69,7 @@ def labels(
     quiet: bool,
     json_path: Path | None,
 ) -> None:
-    """Make a YOLO data set of sequences whose reference says where the drones are.
+    """Write a YOLO training set from sequences with a reference.
 
     Writes OUT/images, OUT/labels (a text file per image, `class cx cy w h`) and OUT/data.yaml. Whole sequences are
     trained or validated on, at least one of each: frames of one flight resemble each other too much.

@@ -118,7 +118,7 @@ def localise(
     quiet: bool,
     json_path: Path | None,
 ) -> None:
-    """Find where the camera of VIDEO is in every frame, from the ArUco markers that it sees.
+    """Find the position of the camera of VIDEO in every frame, from the ArUco markers that it sees.
 
     VIDEO is a video, a folder of images, the address of a stream, or an _A sequence of the dataset, which brings
     its markers and intrinsics along. With --live, frames are left out that come too fast; Ctrl-C ends it, and what was

@@ -45,7 +45,7 @@ def silhouettes(
     json_path: Path | None,
     **settings: Any,
 ) -> None:
-    """Make and store the silhouettes of SEQ, which `track` reads.
+    """Compute and store the silhouettes of SEQ, which `track` reads.
 
     They are kept under a key of the video's content and every setting: a second call finds them, a changed setting
     makes new ones.

@@ -65,7 +65,7 @@ def simulate(
     quiet: bool,
     json_path: Path | None,
 ) -> None:
-    """Make a sequence of the dataset's simulated half: videos, calibration, truth, masks, detections.
+    """Simulate a sequence: videos, calibration, ground truth, masks and detections.
 
     Writes OUT/Simulated_Data/NAME. The same seed makes the same flights and the same pixels; an interrupted call goes
     on where it was.

@@ -46,7 +46,7 @@ def synchronise(
     quiet: bool,
     json_path: Path | None,
 ) -> None:
-    """Find by how much the clock of SEQ's reference is ahead of its videos', from the motion in TRACKS.
+    """Find the offset between the clocks of SEQ's reference and of its videos, from the motion in TRACKS.
 
     The offset with the smallest mean distance, to a fraction of a frame; each drone may have a constant lever arm. A
     .c3d is read at its own rate, whatever that of the videos.

@@ -119,7 +119,7 @@ def _distributed() -> Any:
     try:
         import distributed
     except ImportError as error:
-        remedy = "install it with `pip install '.[dask]'`"
+        remedy = "install it with `pip install 'psotrack[dask]'`"
         raise SettingsError(
             "--cluster", expected="Dask", found="no package distributed", remedy=remedy
         ) from error

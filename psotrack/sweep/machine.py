@@ -27,7 +27,7 @@ def use_device(device: Device) -> None:
     import jax
 
     jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[device])
-    remedy = "NVIDIA's need its driver and `pip install '.[cuda]'`" if device == "gpu" else ""
+    remedy = "NVIDIA's need its driver and `pip install 'psotrack[cuda]'`" if device == "gpu" else ""
     try:
         found = jax.default_backend()
     except (RuntimeError, AssertionError) as error:  # the latter where JAX has no support for it installed

@@ -1,26 +1,41 @@
-"""`psotrack calibrate`: lenses, where cameras stand, a rig that agrees with its drones, and other programs' files."""
+"""`psotrack calibrate`: lenses, poses of cameras, a rig that agrees with tracked drones, and other programs' files."""
 
 import click
 
-from psotrack.cli.calibrate.adjust import adjust
-from psotrack.cli.calibrate.convert import convert
-from psotrack.cli.calibrate.extrinsics import extrinsics
-from psotrack.cli.calibrate.intrinsics import intrinsics
+from psotrack.cli.lazy import LazyCommand, LazyGroup
+
+#: Commands by name, as in `psotrack.cli`.
+COMMANDS = {
+    "adjust": LazyCommand(
+        "psotrack.cli.calibrate.adjust",
+        "Move the cameras of SEQ that disagree with the other cameras about its drones, by a bundle adjustment.",
+    ),
+    "convert": LazyCommand(
+        "psotrack.cli.calibrate.convert",
+        "Convert a calibration: IN and OUT end in .csv (DPJAIT), .toml (anipose, caliscope) or .yml (OpenCV).",
+    ),
+    "extrinsics": LazyCommand(
+        "psotrack.cli.calibrate.extrinsics",
+        "Find the poses of cameras, from points whose positions in the world and in the images are known.",
+    ),
+    "intrinsics": LazyCommand(
+        "psotrack.cli.calibrate.intrinsics",
+        "Find a camera's lens from VIDEO, in which a ChArUco board is moved about.",
+    ),
+}
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.group(
+    cls=LazyGroup,
+    lazy_commands=COMMANDS,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+)
 def calibrate() -> None:
-    """Calibrate cameras, and convert calibrations.
+    """Calibrate cameras, and convert calibration files.
 
     \b
-    Lenses:             psotrack calibrate intrinsics a.avi --squares 7x5 --square 0.04 --marker 0.03 --out lens.toml
-    Where cameras are:  psotrack calibrate extrinsics --pairs pairs.csv --intrinsics lens.toml --out rig.toml
-    From the drones:    psotrack calibrate adjust SEQ --tracks tracks.csv --out better.toml
-    Other programs:     psotrack calibrate convert rig.toml cameras_calibration.csv
+    Lenses:            psotrack calibrate intrinsics a.avi --squares 7x5 --square 0.04 --marker 0.03 --out lens.toml
+    Poses of cameras:  psotrack calibrate extrinsics --pairs pairs.csv --intrinsics lens.toml --out rig.toml
+    From the drones:   psotrack calibrate adjust SEQ --tracks tracks.csv --out better.toml
+    Other programs:    psotrack calibrate convert rig.toml cameras_calibration.csv
     """
-
-
-calibrate.add_command(adjust)
-calibrate.add_command(convert)
-calibrate.add_command(extrinsics)
-calibrate.add_command(intrinsics)

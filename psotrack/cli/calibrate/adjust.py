@@ -50,7 +50,7 @@ def adjust(
     quiet: bool,
     json_path: Path | None,
 ) -> None:
-    """Move the cameras of SEQ that do not agree with the others on where its drones are: a bundle adjustment.
+    """Move the cameras of SEQ that disagree with the other cameras about its drones, by a bundle adjustment.
 
     The points are the middles of SEQ's detections that hold a tracked drone. These are off by about a pixel, in the
     same way for many frames, which places cameras to a centimetre or two. So only cameras are moved that are off by

@@ -65,7 +65,7 @@ def extrinsics(
     json_path: Path | None,
     **lens: Any,
 ) -> None:
-    """Find where cameras stand, from points whose places in the world and in the images are known.
+    """Find the poses of cameras, from points whose positions in the world and in the images are known.
 
     Four points that are not on one line are the least; twelve, spread over the image and in depth, are good. Points
     that do not agree with the others are left out, and shown.

@@ -94,15 +94,17 @@ def map_markers(
     quiet: bool,
     json_path: Path | None,
 ) -> None:
-    """Make the table of a room's marker corners, from SOURCE, or check one.
+    """Write the table of a room's marker corners from SOURCE, or check such a table.
 
-    SOURCE is a .c3d or table of measured corners, labelled such as Marker7:1; or videos of the room, or a sequence
-    whose drones carry cameras. From videos all markers are placed relative to those that are --known: where these
-    are in --markers they stay. Of one with a --side alone the world's axes are its own: origin in its centre, x to its
-    right, y up, z out of the print.
+    SOURCE is a .c3d file or a table of measured corners with labels such as Marker7:1, or videos of the room, or a
+    sequence whose drones carry cameras. In videos, markers are placed relative to the --known markers. Known markers
+    that --markers lists keep their corners. A single known marker with a --side defines the world: origin in the
+    marker's centre, x to its right, y up, z out of the print.
 
-    With --check MAP, says which markers of a map are not where a video sees them, and how. The exit code is then 2 if
-    something was found.
+    --check MAP reports the markers of MAP that videos see elsewhere. The exit code is then 2 if a marker was reported.
+
+    In images whose longer side is 2880 pixels or more, such as 3840 x 2160, markers are searched for in an image of
+    half the size, and markers whose sides are shorter than 48 pixels are overlooked.
 
     \b
     Examples:

@@ -1,0 +1,190 @@
+"""`psotrack --help` is quick and agrees with the commands, and shells complete commands and options."""
+
+from __future__ import annotations
+
+import os
+import re
+import resource
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from psotrack import cli
+from psotrack.cli.calibrate import calibrate
+from psotrack.cli.lazy import LazyGroup
+
+#: Largest user time of `psotrack --help`, seconds.
+MAX_HELP_S = 0.3
+#: Packages that only commands need.
+HEAVY = ("cv2", "jax", "matplotlib", "msgspec", "numpy", "pandas", "rich", "scipy", "trimesh", "zarr")
+
+#: Runs `psotrack` with the arguments of the process, then prints the heavy packages that were imported.
+REPORT_IMPORTS = f"""
+import sys
+from psotrack.cli import main
+try:
+    main()
+finally:
+    print("imported:", *sorted(set({HEAVY!r}) & set(sys.modules)))
+"""
+
+
+def psotrack(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """`psotrack` in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "psotrack", *arguments],
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("group", [cli.cli, calibrate], ids=["psotrack", "calibrate"])
+def test_summaries_are_the_first_sentences_of_the_commands(group: LazyGroup) -> None:
+    assert len(group.lazy_commands) >= 4
+    for name, lazy in group.lazy_commands.items():
+        command = group.commands[name]
+        assert command.name == name
+        assert lazy.summary == command.get_short_help_str(limit=1000), name
+
+
+def test_help_lists_every_command_with_its_whole_summary() -> None:
+    answer = psotrack("--help")
+    assert answer.returncode == 0
+    words = " ".join(answer.stdout.split())
+    for name, lazy in cli.cli.lazy_commands.items():
+        assert f" {name} {lazy.summary}" in words
+
+
+def test_help_and_names_of_commands_import_no_heavy_package() -> None:
+    for arguments, environment in (
+        (["--help"], {}),
+        (["--version"], {}),
+        (["calibrate", "--help"], {}),
+        ([], {"_PSOTRACK_COMPLETE": "bash_complete", "COMP_WORDS": "psotrack s", "COMP_CWORD": "1"}),
+    ):
+        answer = subprocess.run(
+            [sys.executable, "-c", REPORT_IMPORTS, *arguments],
+            env=os.environ | environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert answer.stdout.splitlines()[-1] == "imported:", arguments
+
+
+def test_help_is_quick() -> None:
+    seconds = []
+    for _ in range(3):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+        assert psotrack("--help").returncode == 0
+        seconds.append(resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before)
+    # The quickest of three: work beside this test makes the others slower.
+    assert min(seconds) <= MAX_HELP_S
+
+
+def test_mistyped_commands_are_answered_with_names_near_them() -> None:
+    answer = psotrack("silhouetes")
+    assert answer.returncode == 2
+    assert answer.stderr.count("\n") == 1
+    assert "'silhouettes'" in answer.stderr
+
+
+def test_help_says_how_to_switch_completion_on() -> None:
+    text = psotrack("--help").stdout
+    for shell in ("bash", "zsh", "fish"):
+        assert f"_PSOTRACK_COMPLETE={shell}_source psotrack" in text
+
+
+@pytest.mark.parametrize(
+    ("shell", "switch"), [("bash", "complete "), ("zsh", "compdef "), ("fish", "complete ")]
+)
+def test_the_script_that_switches_completion_on(shell: str, switch: str) -> None:
+    if shell == "bash" and shutil.which("bash") is None:
+        pytest.skip("click asks bash for its version")
+    answer = psotrack(_PSOTRACK_COMPLETE=f"{shell}_source")
+    assert answer.returncode == 0, answer.stderr
+    assert f"_PSOTRACK_COMPLETE={shell}_complete" in answer.stdout
+    assert any(line.strip().startswith(switch) and "psotrack" in line for line in answer.stdout.splitlines())
+
+
+def completions(shell: str, words: list[str], incomplete: str) -> set[str]:
+    """What `psotrack` offers a shell after `words`, where `incomplete` is typed."""
+    if shell == "fish":
+        typed = {"COMP_WORDS": " ".join(words), "COMP_CWORD": incomplete}
+    else:
+        typed = {"COMP_WORDS": " ".join([*words, incomplete]), "COMP_CWORD": str(len(words))}
+    answer = psotrack(_PSOTRACK_COMPLETE=f"{shell}_complete", **typed)
+    assert answer.returncode == 0, answer.stderr
+    lines = answer.stdout.splitlines()
+    if shell == "zsh":
+        # Three lines for each: type, value, help.
+        return set(lines[1::3])
+    # bash: `type,value`; fish: `type,value<tab>help`.
+    return {line.split(",", 1)[1].split("\t")[0] for line in lines}
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_shells_complete_commands_and_options(shell: str) -> None:
+    assert completions(shell, ["psotrack"], "s") == {"silhouettes", "simulate", "sweep", "synchronise"}
+    assert completions(shell, ["psotrack", "calibrate"], "in") == {"intrinsics"}
+    assert completions(shell, ["psotrack", "simulate"], "--s") == {
+        "--scenario",
+        "--set",
+        "--show",
+        "--scale",
+        "--seed",
+    }
+    assert completions(shell, ["psotrack", "fuse", "--at"], "") == {"camera", "middle"}
+
+
+#: Switches completion on in a shell, presses Tab after `psotrack sim`, and prints the completions.
+TAB = {
+    "bash": 'eval "$(_PSOTRACK_COMPLETE=bash_source psotrack)"; COMP_WORDS=(psotrack sim); COMP_CWORD=1; '
+    '_psotrack_completion psotrack sim psotrack; echo "${COMPREPLY[@]}"',
+    # zsh has no such command; its functions for completion are replaced by one that prints.
+    "zsh": "compdef() { :; }; _describe() { print -r -- $completions_with_descriptions; }; "
+    'eval "$(_PSOTRACK_COMPLETE=zsh_source psotrack)"; words=(psotrack sim); CURRENT=2; '
+    "_psotrack_completion",
+    "fish": "_PSOTRACK_COMPLETE=fish_source psotrack | source; complete -C 'psotrack sim'",
+}
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_tab_key_in_a_shell(tmp_path: Path, shell: str) -> None:
+    if shutil.which(shell) is None:
+        pytest.skip(f"{shell} is not installed")
+    program = tmp_path / "psotrack"
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m psotrack "$@"\n', encoding="utf-8")
+    program.chmod(0o755)
+    answer = subprocess.run(
+        [shell, "-c", TAB[shell]],
+        env=os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert re.match(r"simulate\b", answer.stdout), answer
+
+
+def test_an_unknown_shell_is_one_line() -> None:
+    answer = psotrack(_PSOTRACK_COMPLETE="tcsh_source")
+    assert (answer.returncode, answer.stdout) == (2, "")
+    assert answer.stderr.count("\n") == 1
+    assert "bash_source, zsh_source or fish_source" in answer.stderr
+
+
+def test_hints_about_pip_need_no_checkout() -> None:
+    """`pip install .` works only in a checkout, so messages and help name the package."""
+    hints = [
+        line
+        for path in Path(cli.__file__).parents[1].rglob("*.py")
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if "pip install" in line
+    ]
+    assert len(hints) >= 4
+    assert not [line for line in hints if not re.search(r"pip install 'psotrack\[\w+\]'", line)]
