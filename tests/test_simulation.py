@@ -357,7 +357,8 @@ def test_killed_at_random_moments_it_comes_to_the_same_bytes(pair_folder, tmp_pa
         # It has ended when nobody has its stderr any more, which its workers share.
         killed = subprocess.run(command, input=msgspec.json.encode(PAIR), capture_output=True, check=False)
         assert killed.returncode == -signal.SIGKILL, killed
-        assert [path.name for path in place.iterdir()] == [f".{NAME}.unfinished"]
+        # The lock's file stays, but its lock has ended with the process.
+        assert sorted(path.name for path in place.iterdir()) == [f".{NAME}.lock", f".{NAME}.unfinished"]
         made.append(len(list(place.rglob("[0-9]*/video.avi"))))
     assert made[-1] > 1, "what was whole has been kept"
     assert contents(simulate(PAIR, tmp_path, jobs=1, **TINY)) == contents(pair_folder)
@@ -423,12 +424,18 @@ def test_two_calls_at_once_do_not_meet(tmp_path):
     assert beside(folder) == [NAME]
 
 
+def test_the_simulator_is_imported_where_there_is_no_fcntl():
+    """As on Windows."""
+    code = "import sys; sys.modules['fcntl'] = None; from psotrack.simulation import simulate"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 @pytest.mark.parametrize("code", [errno.ENOLCK, errno.EIO])
 def test_a_file_system_without_locks_keeps_nobody_out_and_a_broken_one_is_named(tmp_path, monkeypatch, code):
     def fail(descriptor, operation):
         raise OSError(code, os.strerror(code))
 
-    monkeypatch.setattr("psotrack.simulation.unfinished.fcntl.flock", fail)
+    monkeypatch.setattr("fcntl.flock", fail)
     refused = pytest.raises(
         OutputError, match=r"S02_D4_A: expected a path that can be written, found Input/output error"
     )

@@ -94,7 +94,7 @@ def simulate(
         intrinsics(scene)
     record = _record(scene, frames, masks, onboard)
     with unfinished(folder, record, force) as growing:
-        if not growing.whole:
+        if not growing.complete:
             _write_streams(scene, growing, frames, masks, onboard, jobs or os.cpu_count() or 1, report)
             _write_tables(scene, growing.folder, frames)
             if onboard:

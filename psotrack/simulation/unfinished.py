@@ -1,10 +1,9 @@
-"""The hidden folder in which a sequence grows: whose it is, what is kept of it, and how it becomes the sequence."""
+"""The hidden folder in which a sequence is made: its lock, the parts that are kept, and the move to its final place."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import hashlib
 import os
 import shutil
@@ -12,16 +11,21 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
 from psotrack.errors import OutputError
 from psotrack.support import refuse_to_overwrite
 
-#: How the sequence was made. Its name is hidden until everything else is there.
+#: File that says how the sequence was made. Its name is hidden until everything else is there.
 RECORD = "simulation.json"
-_GROWING = f".{RECORD}"
-#: Named by the record: a worker that outlives its killed parent by a moment cannot leave a segment to another record.
+_HIDDEN_RECORD = f".{RECORD}"
+#: Folder of the segments. It is named by the record, because a worker that outlives its killed parent for a moment must
+#: not leave a segment to a sequence with another record.
 _SEGMENTS = ".segments-{}"
-#: What file systems without locks answer; there, nobody is kept out.
-_NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}
+#: Time that a call waits for the lock, seconds: enough to try again where another call has just removed the lock file.
+_LOCK_TIMEOUT_S = 0.2
+#: Errors of file systems without locks. Two calls at once are not prevented there.
+_NO_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP}
 
 
 @dataclass(frozen=True)
@@ -29,91 +33,91 @@ class Unfinished:
     """A sequence that is being made, locked for this call.
 
     Attributes:
-        folder: hidden, beside the sequence's.
-        segments: the folder of what is made bit by bit, in there; not part of the sequence.
-        target: where the sequence will be.
-        whole: whether an earlier call made all of it, and just did not come to move it.
+        folder: hidden folder beside the sequence's.
+        segments: folder of the segments, inside `folder`; not part of the sequence.
+        target: final folder of the sequence.
+        complete: whether an earlier call made the whole sequence and only did not move it to `target`.
     """
 
     folder: Path
     segments: Path
     target: Path
-    whole: bool
+    complete: bool
 
     def finish(self) -> None:
-        """Everything is there: clear up, and put the sequence in its place.
+        """Remove what is not part of the sequence, and move the sequence to its place.
 
         Raises:
-            OutputError: it cannot be moved; a sequence that was there before still is.
+            OutputError: the sequence cannot be moved; a sequence that was there before is still there.
         """
         with _output_errors(self.target):
-            if not self.whole:
-                os.replace(self.folder / _GROWING, self.folder / RECORD)
+            if not self.complete:
+                os.replace(self.folder / _HIDDEN_RECORD, self.folder / RECORD)
             _remove_all(self.folder.glob(".*"))
-            aside = _aside(self.target)
+            old = _old_folder(self.target)
             if self.target.exists():
-                os.replace(self.target, aside)
+                os.replace(self.target, old)
             try:
                 os.replace(self.folder, self.target)
             except OSError:
-                if aside.exists():
-                    os.replace(aside, self.target)
+                if old.exists():
+                    os.replace(old, self.target)
                 raise
-            shutil.rmtree(aside, ignore_errors=True)
+            shutil.rmtree(old, ignore_errors=True)
 
 
 @contextlib.contextmanager
 def unfinished(target: Path, record: bytes, force: bool) -> Iterator[Unfinished]:
-    """The folder for a sequence, with what an earlier call of the same record left there, or empty.
+    """Folder for a sequence that is being made: empty, or with the parts that an earlier call made for the same record.
 
     Args:
-        target: the sequence's folder.
-        record: everything that decides what the sequence will be.
-        force: whether one that is there may be replaced.
+        target: final folder of the sequence.
+        record: everything that decides the content of the sequence.
+        force: whether an existing sequence may be replaced.
 
     Raises:
-        OutputError: the sequence exists and `force` is not set, another call is at work on it, or nothing can be
-            written there.
+        OutputError: the sequence exists and `force` is not set, another call is making it, or the folder cannot be
+            written.
     """
     folder = target.with_name(f".{target.name}.unfinished")
     segments = folder / _SEGMENTS.format(hashlib.sha256(record).hexdigest()[:16])
     with _locked(folder, target):
         with _output_errors(target):
-            _put_back(target)
+            _restore(target)
             refuse_to_overwrite(target, force)
-            whole = _holds(folder / RECORD, record)
-            if not whole and not _holds(folder / _GROWING, record):
+            complete = _holds(folder / RECORD, record)
+            if not complete and not _holds(folder / _HIDDEN_RECORD, record):
                 _remove_all(folder.iterdir())
-                (folder / _GROWING).write_bytes(record)
-            _remove_all(_partial(folder))
-        yield Unfinished(folder, segments, target, whole)
+                (folder / _HIDDEN_RECORD).write_bytes(record)
+            _remove_all(_partial_files(folder))
+        yield Unfinished(folder, segments, target, complete)
 
 
 @contextlib.contextmanager
 def _locked(folder: Path, target: Path) -> Iterator[None]:
-    """Make the folder, and keep others out. The lock ends with the process, however it ends."""
+    """Make the folder and lock it. The lock ends with the process, even if the process is killed."""
+    lock_file = target.with_name(f".{target.name}.lock")
+    lock = FileLock(lock_file)
     with _output_errors(target):
-        while True:
-            folder.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(folder, os.O_RDONLY)
-            _lock(descriptor, target)
-            if _is(folder, descriptor):
-                break
-            # Who had it has just finished, and moved it away.
-            os.close(descriptor)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        _acquire(lock, target)
+        folder.mkdir(exist_ok=True)
     try:
         yield
     finally:
-        with contextlib.suppress(OSError):  # it is not empty, or has become the sequence
+        with contextlib.suppress(OSError):  # the folder is not empty, or has become the sequence
             folder.rmdir()
-        os.close(descriptor)
+        # `FileLock` refuses a lock on a removed file, so it is safe to remove the file before the release. Windows
+        # cannot remove an open file; `release` removes it there.
+        with contextlib.suppress(OSError):
+            lock_file.unlink()
+        lock.release()
 
 
-def _lock(descriptor: int, target: Path) -> None:
+def _acquire(lock: FileLock, target: Path) -> None:
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(descriptor)
+        lock.acquire(timeout=_LOCK_TIMEOUT_S, poll_interval=_LOCK_TIMEOUT_S / 10)
+    except Timeout:
         raise OutputError(
             target,
             expected="to be the only one who writes it",
@@ -125,35 +129,28 @@ def _lock(descriptor: int, target: Path) -> None:
             raise
 
 
-def _is(folder: Path, descriptor: int) -> bool:
-    try:
-        return os.path.samestat(folder.stat(), os.fstat(descriptor))
-    except FileNotFoundError:
-        return False
-
-
-def _aside(target: Path) -> Path:
-    """Where the old sequence is while the new one takes its place."""
+def _old_folder(target: Path) -> Path:
+    """Place of the old sequence while the new one is moved to the old one's place."""
     return target.with_name(f".{target.name}.old")
 
 
-def _put_back(target: Path) -> None:
-    """What a process leaves that dies between the two moves of `finish`."""
-    aside = _aside(target)
-    if aside.exists():
+def _restore(target: Path) -> None:
+    """Undo the first move of a process that died between the two moves of `finish`."""
+    old = _old_folder(target)
+    if old.exists():
         if target.exists():
-            shutil.rmtree(aside)
+            shutil.rmtree(old)
         else:
-            os.replace(aside, target)
+            os.replace(old, target)
 
 
 def _holds(path: Path, record: bytes) -> bool:
     return path.exists() and path.read_bytes() == record
 
 
-def _partial(folder: Path) -> Iterator[Path]:
-    """What processes that were killed were just writing (`files.atomic_write`)."""
-    # Unlike `rglob`, it bears with folders that vanish meanwhile.
+def _partial_files(folder: Path) -> Iterator[Path]:
+    """Files that killed processes left half-written (`support.atomic_write`)."""
+    # Unlike `rglob`, `os.walk` tolerates folders that vanish meanwhile.
     for place, folders, files in os.walk(folder):
         yield from (Path(place, name) for name in (*folders, *files) if ".partial" in name)
 
@@ -161,7 +158,7 @@ def _partial(folder: Path) -> Iterator[Path]:
 def _remove_all(paths: Iterable[Path]) -> None:
     for path in list(paths):
         if path.is_dir():
-            # In hidden ones an orphaned worker may be at work; nobody reads them.
+            # An orphaned worker may still write into a hidden folder. What it writes there is never read.
             shutil.rmtree(path, ignore_errors=path.name.startswith("."))
         else:
             path.unlink(missing_ok=True)
@@ -172,4 +169,4 @@ def _output_errors(target: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise OutputError(target, expected="to write it", found=error.strerror or str(error)) from error
+        raise OutputError(target, expected="a path that can be written", found=error.strerror or str(error)) from error
