@@ -169,4 +169,6 @@ def _output_errors(target: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise OutputError(target, expected="a path that can be written", found=error.strerror or str(error)) from error
+        raise OutputError(
+            target, expected="a path that can be written", found=error.strerror or str(error)
+        ) from error
