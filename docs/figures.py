@@ -1,0 +1,313 @@
+"""Figures that the pages and the README show, taken from the result files of the experiments.
+
+Pages call these functions in Jinja expressions, for instance `{{ mean("measure", "mean_error_m") | mm }}`.
+A result, a column or a row that is missing raises `MissingFigureError`, which stops the build.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pandas as pd
+from griffe import Docstring, DocstringSectionKind
+from jinja2 import Environment, StrictUndefined
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.append(str(ROOT / "experiments"))
+
+import _results  # noqa: E402
+from cli_reference import reference as cli_reference  # noqa: E402
+
+
+class MissingFigureError(Exception):
+    """A result file does not hold the figure that a page shows."""
+
+
+@cache
+def record(name: str) -> dict[str, Any]:
+    """The record of a result."""
+    if name not in _results.registry():
+        raise MissingFigureError(f"expected a result of experiments/results.toml, found {name!r}")
+    path = _results.registry()[name].record
+    if not path.exists():
+        raise MissingFigureError(f"{path}: expected a record, found none; run `make results ONLY={name}`")
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+@cache
+def all_rows(name: str) -> pd.DataFrame:
+    """All rows of a result, from its first CSV file."""
+    folder = _results.registry()[name].record.parent
+    tables = [file for file in record(name)["files"] if file.endswith(".csv")]
+    if not tables:
+        raise MissingFigureError(f"{name}: expected a CSV file in the record, found none")
+    return pd.read_csv(folder / tables[0])
+
+
+def rows(name: str, **where: Any) -> pd.DataFrame:
+    """Rows of a result whose columns have the given values.
+
+    Args:
+        name: name of the result in experiments/results.toml.
+        where: values that columns must have; a list allows several values.
+    """
+    table = all_rows(name)
+    for column, value in where.items():
+        if column not in table:
+            raise MissingFigureError(f"{name}: expected a column {column}, found {', '.join(table.columns)}")
+        table = table[table[column].isin(value if isinstance(value, list) else [value])]
+    if table.empty:
+        raise MissingFigureError(f"{name}: expected rows with {where}, found none")
+    return table
+
+
+def column(name: str, value: str, **where: Any) -> pd.Series:
+    """One column of the rows of a result."""
+    table = rows(name, **where)
+    if value not in table:
+        raise MissingFigureError(f"{name}: expected a column {value}, found {', '.join(table.columns)}")
+    return table[value]
+
+
+def mean(name: str, value: str, **where: Any) -> float:
+    """Mean of a column over the rows of a result."""
+    return float(column(name, value, **where).mean())
+
+
+def least(name: str, value: str, **where: Any) -> float:
+    """Smallest value of a column over the rows of a result."""
+    return float(column(name, value, **where).min())
+
+
+def most(name: str, value: str, **where: Any) -> float:
+    """Largest value of a column over the rows of a result."""
+    return float(column(name, value, **where).max())
+
+
+def total(name: str, value: str, **where: Any) -> float:
+    """Sum of a column over the rows of a result."""
+    return float(column(name, value, **where).sum())
+
+
+def figure(name: str, path: str) -> Any:
+    """A figure of a record, by the keys that lead to it, with dots between."""
+    found: Any = record(name)["figures"]
+    for key in path.split("."):
+        if not isinstance(found, dict) or key not in found:
+            raise MissingFigureError(f"{name}: expected the figure {path}, found none")
+        found = found[key]
+    return found
+
+
+def pivot(
+    name: str, index: str, columns: str, value: str, scale: float = 1.0, decimals: int = 1, **where: Any
+) -> str:
+    """A Markdown table of means: one line per value of `index`, one column per value of `columns`."""
+    table = rows(name, **where)
+    found = table.pivot_table(index=index, columns=columns, values=value, aggfunc="mean", sort=False)
+    cells = (found * scale).map(lambda number: "" if pd.isna(number) else f"{number:.{decimals}f}")
+    return markdown(cells.reset_index())
+
+
+def markdown(table: pd.DataFrame) -> str:
+    """A table in Markdown."""
+    lines = [list(table.columns), ["---"] * len(table.columns), *table.to_numpy().tolist()]
+    return "\n".join(
+        f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in line)} |" for line in lines
+    )
+
+
+def result_table(name: str) -> str:
+    """All rows of a result as a Markdown table."""
+    return markdown(
+        all_rows(name).map(lambda cell: f"{cell:g}" if isinstance(cell, float) else cell).fillna("")
+    )
+
+
+def part(name: str, file: str, title: str) -> str:
+    """The section below a title of a Markdown file of a result."""
+    path = _results.registry()[name].record.parent / file
+    sections = path.read_text(encoding="utf-8").split("## ")
+    found = [section.partition("\n")[2].strip() for section in sections if section.startswith(title)]
+    if len(found) != 1:
+        raise MissingFigureError(f"{path}: expected one section {title!r}, found {len(found)}")
+    return found[0]
+
+
+def accuracy_table() -> str:
+    """The accuracy table of the README: mean error, and the error without constant offsets in brackets, metres."""
+    sequences = {
+        "S01_D2_A": "two drones that pass at 0.3 m",
+        "S02_D4_A": "four drones",
+        "S04_D10": "ten drones, passes at 0.4 m",
+    }
+    methods = {
+        "joint swarm": ["joint 50 x 50", "joint 100 x 70"],
+        "one swarm per drone": ["per drone 30 x 20", "per drone 50 x 30", "per drone 30 x 30 (the defaults)"],
+        "joint swarm with the paper's hard score": [
+            "joint 50 x 50, the paper's hard one-box score",
+            "joint 100 x 70, the paper's hard one-box score",
+        ],
+        "projection lines, from detections": ["projection lines"],
+        "swarm and projection lines, fused": ["fused"],
+    }
+    table = all_rows("measure")
+    lines = [["", *(f"{name}: {words}" for name, words in sequences.items())]]
+    for title, names in methods.items():
+        line = [title]
+        for sequence in sequences:
+            chosen = table[(table["sequence"] == sequence) & table["method"].isin(names)]
+            raw, centred = chosen["mean_error_m"].mean(), chosen["offset_removed_mean_error_m"].mean()
+            line.append("" if chosen.empty else f"{raw:.3f} m ({centred:.4f} m)")
+        lines.append(line)
+    lines.append(["the paper, on its own videos", *(published(name) for name in sequences)])
+    return markdown(pd.DataFrame(lines[1:], columns=lines[0]))
+
+
+def published(name: str) -> str:
+    """Range of the mean errors that the paper states for a sequence."""
+    import tomllib
+
+    path = ROOT / "experiments" / "table5" / "published.toml"
+    low, high = tomllib.loads(path.read_text(encoding="utf-8"))[name]
+    return f"{low:.3f} to {high:.3f} m" if high > low else f"{low:.3f} m"
+
+
+def provenance(name: str) -> str:
+    """One line that says how a result was made."""
+    facts = record(name)
+    machine = facts["machine"]
+    where = f"{machine['processors']} processors of {machine['processor']}"
+    text = f"`{facts['command']}`, commit {facts['commit'][:7]}, {facts['date'][:10]}, {where}"
+    if facts["dirty"]:
+        text += f", with local changes in {len(facts['dirty'])} files"
+    return text + (f" ({facts['note']})" if facts.get("note") else "")
+
+
+def records() -> str:
+    """A table of all results with their records."""
+    lines = []
+    for name, result in _results.registry().items():
+        made = provenance(name) if result.record.exists() else "not made yet"
+        lines.append({"result": f"`{name}`", "shows": result.says, "made by": made})
+    return markdown(pd.DataFrame(lines))
+
+
+def struct_tables(path: str) -> str:
+    """Markdown tables of the fields of a msgspec Struct and of the Structs inside of it.
+
+    Args:
+        path: dotted path of the class, for instance "psotrack.settings.TrackSettings".
+    """
+    module, _, name = path.rpartition(".")
+    cls = getattr(__import__(module, fromlist=[name]), name)
+    return "\n\n".join(_struct_tables(cls, "", set()))
+
+
+def _struct_tables(cls: type, prefix: str, done: set[type]) -> list[str]:
+    done.add(cls)
+    summary, descriptions = _docstring(cls)
+    lines, nested = [], []
+    for field in msgspec.structs.fields(cls):
+        inner = [one for one in _structs(field.type) if one not in done]
+        title = f"`{prefix}{field.encode_name}`"
+        default = _default(field)
+        lines.append([title, f"`{_type_name(field.type)}`", default, descriptions.get(field.name, "")])
+        for one in inner:
+            nested += _struct_tables(one, f"{prefix}{field.encode_name}.", done)
+    table = pd.DataFrame(lines, columns=["field", "type", "default", "meaning"])
+    heading = f"### {prefix.rstrip('.') or cls.__name__} {{ #{cls.__name__.lower()} }}"
+    return [heading, summary, markdown(table), *nested]
+
+
+def _structs(kind: Any) -> list[type]:
+    """Struct classes inside of a type."""
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        return [kind]
+    return [one for inner in getattr(kind, "__args__", ()) for one in _structs(inner)]
+
+
+def _default(field: Any) -> str:
+    if field.default is not msgspec.NODEFAULT:
+        inner = isinstance(field.default, msgspec.Struct)
+        return "see below" if inner else f"`{json.dumps(msgspec.to_builtins(field.default))}`"
+    if field.default_factory is not msgspec.NODEFAULT:
+        return (
+            "see below"
+            if isinstance(field.default_factory, type) and _structs(field.default_factory)
+            else "empty"
+        )
+    return "required"
+
+
+def _type_name(kind: Any) -> str:
+    """A type as people write it in code."""
+    if kind is type(None):
+        return "None"
+    if isinstance(kind, type) and not getattr(kind, "__args__", ()):
+        return kind.__name__
+    text = str(kind)
+    for module in ("typing.", "collections.abc.", "psotrack."):
+        text = text.replace(module, "")
+    if getattr(kind, "__metadata__", None):
+        return _type_name(kind.__origin__)
+    return text.replace("NoneType", "None")
+
+
+def _docstring(cls: type) -> tuple[str, dict[str, str]]:
+    """The summary of a class, and the descriptions of its attributes by name."""
+    sections = Docstring(cls.__doc__ or "", lineno=1).parse("google", warnings=False)
+    texts = [one.value for one in sections if one.kind is DocstringSectionKind.text]
+    found: dict[str, str] = {}
+    for section in sections:
+        if section.kind is DocstringSectionKind.attributes:
+            for attribute in section.value:
+                for name in attribute.name.split(","):
+                    found[name.strip()] = " ".join(attribute.description.split())
+    return (texts[0] if texts else ""), found
+
+
+def millimetres(value_m: float, decimals: int = 1) -> str:
+    """Metres in millimetres."""
+    return f"{1e3 * value_m:.{decimals}f}"
+
+
+def percent(value: float, decimals: int = 0) -> str:
+    """A share in percent."""
+    return f"{100 * value:.{decimals}f}"
+
+
+def number(value: float, decimals: int = 1) -> str:
+    """A number with a fixed count of decimals."""
+    return f"{value:,.{decimals}f}"
+
+
+ENVIRONMENT = Environment(undefined=StrictUndefined, autoescape=False, keep_trailing_newline=True)
+ENVIRONMENT.filters.update(mm=millimetres, percent=percent, number=number)
+ENVIRONMENT.globals.update(
+    mean=mean,
+    least=least,
+    most=most,
+    total=total,
+    figure=figure,
+    pivot=pivot,
+    result_table=result_table,
+    part=part,
+    accuracy_table=accuracy_table,
+    cli_reference=cli_reference,
+    published=published,
+    provenance=provenance,
+    records=records,
+    struct_tables=struct_tables,
+    rows=rows,
+)
+
+
+def render(text: str) -> str:
+    """A page with its figures filled in."""
+    return ENVIRONMENT.from_string(text).render()
