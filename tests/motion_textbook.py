@@ -149,7 +149,7 @@ class Flown:
 
     @property
     def measurements(self):
-        """What `smooth` and `jerk_density` take, but the params."""
+        """What `smooth` and `estimate_jerk_density` take, but the params."""
         return self.time_s, self.measured_m, self.covariance_m2, self.was_measured
 
     @property

@@ -28,6 +28,7 @@ ROOMS = [
     "_typing",
     "errors",
     "support",
+    "estimation",
     "geometry",
     "motion",
     "trajectories",
@@ -77,6 +78,7 @@ MOST_ROOT_FILES = 10
 #: Modules and rooms that may use JAX and NumPy only.
 CORE = {
     "_typing",
+    "estimation",
     "geometry.boxes",
     "geometry.camera_names",
     "geometry.cameras",

@@ -203,7 +203,7 @@ def test_translation_of_a_camera_that_does_not_turn_is_a_textbook_filter() -> No
     driven = np.diag([0.0] * 6 + [30.0] * 3 + [2 / lasting_s] * 3)
 
     straight = np.array([1.0, 0.0, 0.0, 0.0])
-    motion = pose_motion.begun(np.zeros(3), straight, covariance, NONE, LEVEL)
+    motion = pose_motion.initial_motion(np.zeros(3), straight, covariance, NONE, LEVEL)
     part = np.r_[0:9, 15:18]
     x, P = np.zeros(12), motion.covariance[0][np.ix_(part, part)]
     for dt_s in (0.04, 0.04, 0.01, 0.3, 0.04):
@@ -215,8 +215,8 @@ def test_translation_of_a_camera_that_does_not_turn_is_a_textbook_filter() -> No
         K = P @ H.T @ np.linalg.inv(S)
         x, P = x + K @ (z - H @ x), P - K @ S @ K.T
 
-        motion, _ = pose_motion.foretold(motion, dt_s, LEVEL)
-        motion = pose_motion.corrected(motion, pose_motion.innovation(motion, z, straight, covariance, NONE))
+        motion, _ = pose_motion.predict(motion, dt_s, LEVEL)
+        motion = pose_motion.correct(motion, pose_motion.innovation(motion, z, straight, covariance, NONE))
         found = np.concatenate(
             [motion.position_m, motion.velocity_m_s, motion.acceleration_m_s2, motion.lasting[:, :3]], axis=1
         )
@@ -229,12 +229,12 @@ def test_errors_go_where_f_takes_them() -> None:
     """F is the numerical derivative of the motion, turns included."""
     rng = np.random.default_rng(2)
     orientation_wxyz = Rotation.random(rng=rng).as_quat(scalar_first=True)
-    motion = pose_motion.begun(rng.normal(size=3), orientation_wxyz, spread(), NONE, LEVEL)
-    motion = pose_motion.moved(motion, rng.normal(size=(1, pose_motion.SIZE)))
-    later, F = pose_motion.foretold(motion, 0.3, LEVEL)
+    motion = pose_motion.initial_motion(rng.normal(size=3), orientation_wxyz, spread(), NONE, LEVEL)
+    motion = pose_motion.retract(motion, rng.normal(size=(1, pose_motion.SIZE)))
+    later, F = pose_motion.predict(motion, 0.3, LEVEL)
     for k, change in enumerate(1e-6 * np.eye(pose_motion.SIZE)):
         ahead, behind = (
-            pose_motion.foretold(pose_motion.shifted(motion, sign * change[None]), 0.3, LEVEL)[0]
+            pose_motion.predict(pose_motion.shift(motion, sign * change[None]), 0.3, LEVEL)[0]
             for sign in (1, -1)
         )
         slope = (pose_motion.difference(later, ahead) - pose_motion.difference(later, behind)) / 2e-6
@@ -257,18 +257,18 @@ def test_one_level_knows_how_well_it_knows() -> None:
         start = Rotation.random(rng=rng).as_quat(scalar_first=True)
         common = np.array([[0.01] * 3 + [0.002] * 3]).T * rng.normal(size=(6, 2))
         never_changing = rng.normal(size=2)
-        motion = pose_motion.begun(rng.normal(size=3), start, spread(), common, LEVEL)
+        motion = pose_motion.initial_motion(rng.normal(size=3), start, spread(), common, LEVEL)
         off = rng.multivariate_normal(np.zeros(21), motion.covariance[0])
-        truth = pose_motion.shifted(motion, (off - motion.common[0] @ never_changing)[None])
+        truth = pose_motion.shift(motion, (off - motion.common[0] @ never_changing)[None])
         for _ in range(frames):
-            truth, _ = pose_motion.foretold(truth, dt_s, LEVEL)
-            truth = pose_motion.shifted(truth, rng.multivariate_normal(np.zeros(21), Q)[None])
+            truth, _ = pose_motion.predict(truth, dt_s, LEVEL)
+            truth = pose_motion.shift(truth, rng.multivariate_normal(np.zeros(21), Q)[None])
             common = common + np.array([[0.002] * 3 + [0.0004] * 3]).T * rng.normal(size=(6, 2))
             off = lasting_root @ truth.lasting[0] + white_root @ rng.normal(size=6) + common @ never_changing
             seen_wxyz = manifold.turned(truth.orientation_wxyz, off[None, 3:])[0]
-            motion, _ = pose_motion.foretold(motion, dt_s, LEVEL)
+            motion, _ = pose_motion.predict(motion, dt_s, LEVEL)
             told = pose_motion.innovation(motion, truth.position_m[0] + off[:3], seen_wxyz, spread(), common)
-            motion = pose_motion.corrected(motion, told)
+            motion = pose_motion.correct(motion, told)
         error = pose_motion.difference(motion, truth)[0]
         whole = motion.covariance[0] + motion.common[0] @ motion.common[0].T
         squares.append(error @ np.linalg.solve(whole, error))

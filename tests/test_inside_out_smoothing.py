@@ -1,4 +1,4 @@
-"""The smoother over camera poses: against least squares over all frames at once, against the filter, and over gaps."""
+"""The smoother of camera poses, compared with least squares over all frames and with the filter, and its gaps."""
 
 from dataclasses import replace
 
@@ -18,11 +18,10 @@ from test_inside_out_filter import (
 
 from psotrack.errors import InputError
 from psotrack.inside_out import Flag, PoseFilterParams, smooth
-from psotrack.inside_out.filtering import bank as pose_bank
 from psotrack.inside_out.filtering import motion as pose_motion
-from psotrack.inside_out.filtering import smoothing as pose_smoothing
 from psotrack.inside_out.filtering.path_rows import path_of, rows_of
 from psotrack.inside_out.filtering.pose_filter import follow
+from psotrack.inside_out.filtering.smoothing import MotionModel, estimate_motion_model
 from psotrack.trajectories import Status
 
 
@@ -30,19 +29,14 @@ def median_mm(error) -> float:
     return 1e3 * float(np.median(np.linalg.norm(error, axis=1)))
 
 
-def test_a_camera_that_does_not_turn_is_smoothed_as_by_least_squares_over_all_frames(monkeypatch) -> None:
-    """All positions, velocities, accelerations and lasting errors as unknowns of one linear problem.
+def test_a_camera_that_does_not_turn_is_smoothed_as_by_least_squares_over_all_frames() -> None:
+    """The reference solves one linear problem for the positions, velocities, accelerations and errors of all frames.
 
-    An error that never changes shifts what is measured, in each frame otherwise: what it does to the solution is what
-    its shifts would do.
+    A constant error shifts the measurement of each frame by another amount. Its effect on the solution is the solution
+    for these shifts.
     """
     frames, dt_s = 12, 1 / FPS
     level = pose_motion.Levels(np.array([4.0]), np.array([0.01]))
-    # One level alone, so that both know the same of the motion; and covariances as they are.
-    monkeypatch.setattr(pose_bank, "LEVELS", level)
-    monkeypatch.setattr(pose_smoothing, "LEVELS", level)
-    monkeypatch.setattr(pose_bank, "_FIRST_LOG_WEIGHT", np.zeros(1))
-    monkeypatch.setattr(pose_bank, "_MOST_SCALED", 1.0)
     noise_m2 = np.diag([1e-5, 2e-5, 4e-5])
     covariance = np.zeros((6, 6))
     covariance[:3, :3], covariance[3:, 3:] = noise_m2, 1e-6 * np.eye(3)
@@ -53,11 +47,22 @@ def test_a_camera_that_does_not_turn_is_smoothed_as_by_least_squares_over_all_fr
     common[:, :3, 0] = 0.01 + np.cumsum(rng.normal(scale=0.001, size=(frames, 3)), axis=0)
     raw = replace(raw, covariance=covariance + common @ common.swapaxes(1, 2), common=common)
     gone = slice(5, 8)
-    path = smooth(without(raw, gone), PoseFilterParams(false_alarm=1e-12))
+    # Smoother and reference use the same densities and the covariances as stated.
+    model = MotionModel(
+        fits=~np.isin(np.arange(frames), np.r_[gone]),
+        jumps=np.zeros(frames, int),
+        jerk_density_m2_s5=np.full(frames, 4.0),
+        wobble_density_rad2_s3=np.full(frames, 0.01),
+        noise_scale=np.ones(frames),
+        ambiguity=np.zeros(frames),
+    )
+    path = smooth(without(raw, gone), model=model)
 
     part = np.r_[0:9, 15:18]
-    start = pose_motion.begun(measured_m[0], raw.orientation_wxyz[0], covariance, np.zeros((6, 0)), level)
-    _, F = pose_motion.foretold(start, dt_s, level)
+    start = pose_motion.initial_motion(
+        measured_m[0], raw.orientation_wxyz[0], covariance, np.zeros((6, 0)), level
+    )
+    _, F = pose_motion.predict(start, dt_s, level)
     F, Q = F[0][np.ix_(part, part)], pose_motion.process_noise(dt_s, level)[0][np.ix_(part, part)]
     first = start.covariance[0][np.ix_(part, part)]
     H = np.hstack([np.eye(3), np.zeros((3, 6)), np.sqrt(pose_motion.LASTING_SHARE * noise_m2)])
@@ -86,7 +91,8 @@ def test_a_camera_that_does_not_turn_is_smoothed_as_by_least_squares_over_all_fr
     inverse = np.linalg.inv(A.T @ A)
     off = np.linalg.lstsq(A, np.concatenate(shifts), rcond=None)[0]
     whole = inverse + np.outer(off, off)
-    # Conditioned as 1e5 squared, the normal equations leave six digits of the covariance; measured: 1e-8 m, 2e-5.
+    # The condition number of 1e5 is squared in the normal equations, which leaves six digits of the covariance.
+    # Measured: 1e-8 m for positions, 2e-5 relative for covariances.
     np.testing.assert_allclose(path.position_m, best[:, :3], atol=1e-7)
     np.testing.assert_allclose(path.velocity_m_s, best[:, 3:6], atol=1e-5)
     for k in range(frames):
@@ -96,11 +102,34 @@ def test_a_camera_that_does_not_turn_is_smoothed_as_by_least_squares_over_all_fr
         )
 
 
+def test_without_a_model_the_smoother_uses_the_estimated_model() -> None:
+    raw, _, _ = flight(40, acceleration=1.0, wobble=1.0, seed=31)
+    raw = misplaced(without(raw, slice(10, 13)), slice(20, 21), [1.0, 0.0, 0.0])
+    params = PoseFilterParams(false_alarm=1e-4)
+    model = estimate_motion_model(raw, params)
+    assert not model.fits[[10, 11, 12, 20]].any()
+    assert model.fits.sum() >= 33
+    for name, value in vars(smooth(raw, params)).items():
+        np.testing.assert_array_equal(getattr(smooth(raw, params, model), name), value)
+
+
+def test_the_model_tells_calm_from_violent_flights_and_wide_covariances_from_right_ones() -> None:
+    calm, _, _ = flight(100, acceleration=0.5, wobble=0.5, seed=33)
+    violent, _, _ = flight(100, acceleration=8.0, wobble=8.0, seed=33)
+    of_calm, of_violent = (estimate_motion_model(raw, PoseFilterParams()) for raw in (calm, violent))
+    # A factor of 16 in acceleration is a factor of 256 in density. The levels of the filter are a factor of 100 apart.
+    assert np.median(of_violent.jerk_density_m2_s5) > 30 * np.median(of_calm.jerk_density_m2_s5)
+    assert np.median(of_violent.wobble_density_rad2_s3) > 10 * np.median(of_calm.wobble_density_rad2_s3)
+    wide = estimate_motion_model(replace(calm, covariance=9 * calm.covariance), PoseFilterParams())
+    assert np.median(wide.noise_scale) < 0.5 * np.median(of_calm.noise_scale)
+    assert 0.5 < np.median(of_calm.noise_scale) < 2.0
+
+
 @pytest.mark.parametrize(("acceleration", "wobble"), [(0.5, 0.5), (8.0, 8.0)])
-def test_the_smoother_is_better_than_the_filter_and_knows_it(acceleration, wobble) -> None:
+def test_the_smoother_is_better_than_the_filter_and_its_covariances_are_right(acceleration, wobble) -> None:
     raw, position_m, truth = flight(100, acceleration=acceleration, wobble=wobble, seed=33)
     filtered, smoothed = follow(raw), smooth(raw)
-    # Where it moves roughly, a pose in ten may be gated from one side.
+    # In a violent flight, one of the two filter runs may gate a pose in ten.
     assert (smoothed.status == Status.TRACKED).mean() > 0.88
     assert (smoothed.status != Status.LOST).all()
     off_m, off_rad = errors(smoothed, position_m, truth)
@@ -119,7 +148,8 @@ def test_gaps_are_bridged_from_both_sides() -> None:
     gone = np.r_[0:4, 30:50, 70:100]
     raw = without(raw, gone)
     path, filtered = smooth(raw, PoseFilterParams(longest_gap_s=0.45)), follow(raw)
-    # 0.84 s have a pose within 0.45 s everywhere; 1.24 s do not, and none is told before the first pose.
+    # Every frame of the gap of 0.84 s is within 0.45 s of a pose; the gap of 1.24 s has frames that are not. Frames
+    # before the first pose are lost.
     assert (path.status[:4] == Status.LOST).all()
     assert (path.status[30:50] == Status.COASTING).all()
     assert (path.status[70:81] == Status.COASTING).all()
@@ -127,31 +157,31 @@ def test_gaps_are_bridged_from_both_sides() -> None:
     assert np.isnan(path.position_m[81:100]).all()
     assert (path.status[100:] == Status.TRACKED).all()
     variance_m2 = np.trace(path.covariance[:, :3, :3], axis1=1, axis2=2)
-    # Least is known in the middle, and far more than a filter knows there.
+    # The uncertainty is largest in the middle of the gap, and far below that of the filter.
     assert 36 <= 30 + variance_m2[30:50].argmax() <= 43
     assert variance_m2[40] < 0.3 * np.trace(filtered.covariance[40, :3, :3])
     told = np.flatnonzero(path.seen)
     off_m, _ = errors(path, position_m, truth)
     inside = np.isin(told, np.r_[30:50])
     off_m, covariance = off_m[inside], path.covariance[told][inside, :3, :3]
-    # Within what 1 of 10,000 would leave.
+    # 21.1 is exceeded by chi-square with 3 degrees of freedom once in 10,000.
     assert (np.einsum("ni,nij,nj->n", off_m, np.linalg.inv(covariance), off_m) < 21.1).all()
 
 
-def test_outliers_wrong_starts_and_wrong_ends_do_not_count() -> None:
+def test_outliers_and_wrong_poses_at_both_ends_are_not_used() -> None:
     raw, position_m, truth = flight(100, seed=33)
     bad = np.r_[0:4, 40, 60:66, 98:100]
     path = smooth(misplaced(raw, bad, [0.4, -2.0, 0.3], [0.0, 0.5, 0.0]))
     assert (path.flags[bad] & Flag.GATED).all()
     assert (path.status[bad] != Status.TRACKED).all()
     off_m, _ = errors(path, position_m, truth)
-    # Six frames from both sides: a centimetre or two at 2 m/s2.
+    # Bridging six frames from both sides at 2 m/s² costs one or two centimetres.
     assert np.linalg.norm(off_m, axis=1).max() < 0.05
     good = np.setdiff1d(np.arange(100), bad)
     assert (path.status[good] == Status.TRACKED).mean() > 0.95
 
 
-def test_a_turn_that_was_gated_when_it_came_counts_in_the_end() -> None:
+def test_a_sharp_turn_that_the_filter_gated_is_used_by_the_smoother() -> None:
     position_m = np.zeros((60, 3))
     position_m[30:, 0] = 40.0 / 2 * (np.arange(1, 31) / FPS) ** 2
     rng = np.random.default_rng(34)
@@ -161,28 +191,28 @@ def test_a_turn_that_was_gated_when_it_came_counts_in_the_end() -> None:
     assert (path.status[28:34] == Status.TRACKED).all()
 
 
-def test_a_camera_that_is_elsewhere_for_good_is_not_drawn_there() -> None:
-    """Where the camera is put elsewhere, the path jumps, and is not bent on either side."""
+def test_the_path_is_not_drawn_across_a_permanent_jump() -> None:
+    """The path jumps with the camera, and is not bent on either side of the jump."""
     raw, position_m, _ = flight(60, seed=35)
     path = smooth(misplaced(raw, slice(30, None), [0.0, 0.0, 5.0]))
     position_m = position_m + np.array([0.0, 0.0, 5.0]) * (np.arange(60) >= 30)[:, None]
-    # Some poses beside the jump may be gated, and coasted over; drawn across it, the path would be off by metres.
+    # Some poses beside the jump may be gated and bridged. A path drawn across the jump would be off by metres.
     assert np.linalg.norm(path.position_m - position_m, axis=1).max() < 0.1
 
 
 @pytest.mark.parametrize("frames", [0, 1, 2])
-def test_paths_with_hardly_a_pose(frames) -> None:
+def test_paths_of_few_poses(frames) -> None:
     raw, _, _ = flight(5, seed=36)
     some = path_of(rows_of(raw)[:frames])
     assert (smooth(some).status == Status.LOST).all()
-    believing = smooth(some, PoseFilterParams(confirm=1))
-    assert (believing.status == Status.TRACKED).all()
+    confirmed_at_once = smooth(some, PoseFilterParams(confirm=1))
+    assert (confirmed_at_once.status == Status.TRACKED).all()
     if frames == 1:
-        np.testing.assert_allclose(believing.position_m, raw.position_m[:1], atol=1e-12)
-        np.testing.assert_allclose(believing.covariance[0], spread(), atol=1e-15)
+        np.testing.assert_allclose(confirmed_at_once.position_m, raw.position_m[:1], atol=1e-12)
+        np.testing.assert_allclose(confirmed_at_once.covariance[0], spread(), atol=1e-15)
 
 
-def test_the_raw_path_stays_as_it_is() -> None:
+def test_the_raw_path_is_not_changed() -> None:
     raw, _, _ = flight(20, seed=37)
     raw = without(misplaced(raw, slice(15, 16), [1.0, 0.0, 0.0]), slice(5, 8))
     before = {name: np.copy(value) for name, value in vars(raw).items() if value is not None}
@@ -192,7 +222,7 @@ def test_the_raw_path_stays_as_it_is() -> None:
     assert (smooth(without(raw, slice(None))).status == Status.LOST).all()
 
 
-def test_a_pose_without_a_covariance_is_refused() -> None:
+def test_a_singular_covariance_is_refused() -> None:
     raw, _, _ = flight(6, seed=38)
     raw.covariance[4] = 0.0
     with pytest.raises(InputError, match=r"covariance at 0.16 s: expected a positive definite matrix"):

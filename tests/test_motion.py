@@ -27,7 +27,7 @@ from scipy.integrate import quad_vec
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2, multivariate_normal
 
-from psotrack.motion import GATE_999, kalman
+from psotrack.motion import GATE_999, kalman, white_jerk_noise
 
 
 def numbers(tree, dtype):
@@ -82,7 +82,7 @@ class TestAgainstTheTextbook:
         expected, _ = quad_vec(response, 0, dt_s, epsabs=0, epsrel=1e-13)
         with jax.enable_x64(True):
             # Both to float64; the quadrature says 1e-13.
-            np.testing.assert_allclose(kalman.jerk_noise(jnp.float64(dt_s)), expected, rtol=1e-12)
+            np.testing.assert_allclose(white_jerk_noise(jnp.float64(dt_s)), expected, rtol=1e-12)
 
     @pytest.mark.parametrize("error_share", [0.0, 0.5, 0.95])
     @pytest.mark.parametrize(
@@ -359,7 +359,7 @@ class TestFloat32:
         covariance = np.tile(np.eye(12), (50, 1, 1))
         covariance[:, :3, :3] = error + 1e-10 * np.eye(3)
         covariance[:, :3, 9:] = covariance[:, 9:, :3] = covariance[:, 9:, 9:] = error
-        state = kalman.state_of(*float32((np.zeros((50, 12)), covariance, error)))
+        state = kalman.state_from_mean(*float32((np.zeros((50, 12)), covariance, error)))
         assert least_correlation(np.asarray(state.position_covariance_m2)).min() > 0
         # Nor may it be said to be much worse known than it is: to some roundings of the error's variance.
         spread, limit = (np.trace(each, axis1=1, axis2=2) for each in (state.position_covariance_m2, error))
@@ -529,7 +529,7 @@ class TestSymmetries:
 
 def test_means_come_apart_and_together():
     mean = jnp.arange(24.0).reshape(2, 12)
-    state = kalman.state_of(mean, jnp.zeros((2, 12, 12)), jnp.zeros((2, 3, 3)))
+    state = kalman.state_from_mean(mean, jnp.zeros((2, 12, 12)), jnp.zeros((2, 3, 3)))
     assert state.velocity_m_s.tolist() == [[3, 4, 5], [15, 16, 17]]
     assert state.error_m.tolist() == [[9, 10, 11], [21, 22, 23]]
     assert state.position_m.tolist() == [[-9] * 3] * 2

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
 from psotrack.errors import InputError
-from psotrack.motion import jerk_density, smooth
+from psotrack.motion import estimate_jerk_density, smooth
 
 
 def smoothed(flown: Flown):
@@ -63,7 +63,7 @@ class TestSmoothing:
         other = replace(flown, model=Model(error_time_s=7.0))
         for one, same in zip(*(vars(smoothed(each)).values() for each in (flown, other)), strict=True):
             np.testing.assert_array_equal(one, same)
-        density = [jerk_density(*flown.measurements, each.params) for each in (flown, other)]
+        density = [estimate_jerk_density(*flown.measurements, each.params) for each in (flown, other)]
         np.testing.assert_array_equal(*density)
 
     def test_it_beats_the_filter_which_beats_what_is_measured(self):
@@ -224,7 +224,7 @@ class TestJerkDensity:
     def test_it_is_found_from_the_measurements(self, density, error_share):
         flown = fly(12, frames=self.FRAMES, drones=8, density=density, error_share=error_share, steady=True)
         flown = some_unknown(flown, 13, 0.1)
-        found = jerk_density(*flown.measurements, motion_params(30.0, 8, error_share=error_share))
+        found = estimate_jerk_density(*flown.measurements, motion_params(30.0, 8, error_share=error_share))
         off = np.log10(found / density)
         # 24 s are some 100 independent looks at the jerk along three axes: each drone to a tenth of a decade or so,
         # eight of them to a third of that. Measured 0.06 and 0.01 at the most.
@@ -237,7 +237,9 @@ class TestJerkDensity:
         wild = rng.random(flown.was_measured.shape) < 0.03
         wild[0] = False
         measured_m = flown.measured_m + wild[..., None] * rng.normal(scale=0.5, size=flown.measured_m.shape)
-        found = jerk_density(*replace(flown, measured_m=measured_m).measurements, motion_params(30.0, 8))
+        found = estimate_jerk_density(
+            *replace(flown, measured_m=measured_m).measurements, motion_params(30.0, 8)
+        )
         # As if there were none.
         assert np.abs(np.log10(found / 30.0)).max() < 0.3
 
@@ -245,7 +247,7 @@ class TestJerkDensity:
         unknown = np.zeros((30, 2), bool)
         unknown[1:, 0], unknown[:, 1] = True, True
         flown = without(fly(16, frames=30, drones=2), unknown)
-        found = jerk_density(*flown.measurements, motion_params(70.0, 2))
+        found = estimate_jerk_density(*flown.measurements, motion_params(70.0, 2))
         # A prior alone is a parabola, whose vertex is found to rounding, and the params are float32.
         np.testing.assert_allclose(found, 70.0, rtol=1e-6)
 
@@ -258,7 +260,7 @@ class TestJerkDensity:
             covariance_m2=np.broadcast_to(1e-4 * np.eye(3), flown.covariance_m2.shape),
         )
         # Three hundred times less, in spite of the prior: in 24 s it accelerates to less than 1 m/s2.
-        assert (jerk_density(*still.measurements, flown.params) < 0.1).all()
+        assert (estimate_jerk_density(*still.measurements, flown.params) < 0.1).all()
 
 
 class TestWhatIsRefused:
@@ -268,7 +270,7 @@ class TestWhatIsRefused:
             getattr(flown, name)[index] = value
         return flown
 
-    @pytest.mark.parametrize("function", [smooth, jerk_density])
+    @pytest.mark.parametrize("function", [smooth, estimate_jerk_density])
     @pytest.mark.parametrize(
         ("changes", "message"),
         [
@@ -306,7 +308,7 @@ def test_other_numbers_compile_nothing(caplog):
     def both(seed, density):
         flown = some_unknown(fly(seed, frames=8, drones=2), seed)
         smooth(*flown.measurements, motion_params(density, 2))
-        jerk_density(*flown.measurements, motion_params(density, 2))
+        estimate_jerk_density(*flown.measurements, motion_params(density, 2))
         lines = [record.getMessage() for record in caplog.records if "Compiling" in record.getMessage()]
         caplog.clear()
         return lines

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
-from psotrack.motion import GATE_999, forward
+from psotrack.motion import GATE_999, filter_measurements
 from psotrack.settings import TrackSettings
 from psotrack.support import standard_error
 from psotrack.tracking import COMMON, Arrival, SizeMeasurements, Tracked, TrackerInfo, motion_params, sizes
@@ -83,7 +83,7 @@ def fuse_tracks(
     params = jax.tree.map(
         lambda value: np.asarray(value, np.float64), motion_params(settings, measured_m.shape[1])
     )
-    moving = forward(time_s, measured_m, covariance_m2, was_measured, params)
+    moving = filter_measurements(time_s, measured_m, covariance_m2, was_measured, params)
     unseen = _frames_unseen(was_measured)
     coasting = unseen <= round(settings.max_coasting_s * fps)
     status = np.where(was_measured, Status.TRACKED, np.where(coasting, Status.COASTING, Status.LOST))

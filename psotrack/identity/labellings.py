@@ -155,7 +155,7 @@ def _merged(weight: Float[Array, "before after"], state: MotionState) -> MotionS
     mean = mean_of(state.mean)
     apart = state.mean - mean
     spread = mean_of(state.covariance + apart[..., :, None] * apart[..., None, :])
-    return kalman.state_of(mean, spread, mean_of(state.noise_m2))
+    return kalman.state_from_mean(mean, spread, mean_of(state.noise_m2))
 
 
 @jax.jit

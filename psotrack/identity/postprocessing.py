@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from psotrack.identity import Identities, IdentityParams, LabelOutcome, relabelled, resolve
-from psotrack.motion import MotionParams, jerk_density, smooth
+from psotrack.motion import MotionParams, estimate_jerk_density, smooth
 from psotrack.settings import TrackSettings
 from psotrack.tracking import Tracked, TrackerInfo, motion_params
 from psotrack.trajectories import Status, Trajectories
@@ -88,7 +88,7 @@ def _smoothed(trajectories: Trajectories, info: TrackerInfo, motion: MotionParam
     """The trajectories with what later frames say of earlier ones."""
     measured = (trajectories.time_s, *_measured(info))
     # How much drones really change their acceleration: all of the recording tells.
-    known = replace(motion, jerk_density_m2_s5=jerk_density(*measured, motion))
+    known = replace(motion, jerk_density_m2_s5=estimate_jerk_density(*measured, motion))
     smoothed = smooth(*measured, known)
     return replace(
         trajectories,

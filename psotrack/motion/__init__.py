@@ -1,7 +1,8 @@
-"""How a drone moves: a Kalman filter with white jerk and lasting measurement errors, and its smoother.
+"""The motion of drones: a Kalman filter with white jerk and lasting measurement errors, and its smoother.
 
 In: measured positions with covariances. Out: filtered (`kalman`) and smoothed (`smoothing`) states with covariances.
-The functions of `kalman` are pure and run inside the tracker's compiled scan.
+The functions of `kalman` are pure and run inside the tracker's compiled scan. `white_jerk` is the process noise that
+other filters of the package use too.
 """
 
 import lazy_loader

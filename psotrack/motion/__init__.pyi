@@ -1,5 +1,6 @@
 from .kalman import GATE_999, Covariances, MotionParams, MotionState
-from .smoothing import check_measurements, forward, jerk_density, smooth
+from .smoothing import check_measurements, estimate_jerk_density, filter_measurements, smooth
+from .white_jerk import white_jerk_noise
 
 __all__ = [
     "GATE_999",
@@ -7,7 +8,8 @@ __all__ = [
     "MotionParams",
     "MotionState",
     "check_measurements",
-    "forward",
-    "jerk_density",
+    "estimate_jerk_density",
+    "filter_measurements",
     "smooth",
+    "white_jerk_noise",
 ]

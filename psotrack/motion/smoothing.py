@@ -1,9 +1,8 @@
-"""Tracks after the fact: what the frames after say of the frames before.
+"""Smoothed tracks: every frame estimated from all measurements, before and after the frame.
 
-A forward-backward smoother over the motion model of `motion`, errors that last included (H. E. Rauch, F. Tung, C. T.
-Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA Journal 3(8), 1965), and the strength of the jerk
-from the measurements themselves. In float64, unlike the tracker: the backward pass inverts covariances, and nobody
-waits for it in a frame.
+A Rauch-Tung-Striebel smoother (`psotrack.estimation`) over the motion model of `kalman` with its lasting errors, and
+an estimate of the jerk density from the measurements. All computations are in float64, unlike in the tracker, because
+the backward pass inverts covariances and its time is not critical.
 """
 
 from __future__ import annotations
@@ -18,26 +17,27 @@ from jaxtyping import Bool, Float
 
 from psotrack._typing import Array
 from psotrack.errors import InputError
+from psotrack.estimation import backward_step
 from psotrack.motion import kalman
 from psotrack.motion.kalman import MotionParams, MotionState
 
-#: Decades of density (m2/s5) that are tried: from a drone that all but hangs in the air to one that is thrown about.
+#: Grid of log10 jerk densities, m²/s⁵: from a drone that hovers to one in violent manoeuvres.
 _JERK_DECADES = np.arange(-4.0, 7.0)
 
-#: Then as many about the best, so far apart; over a fifth of a decade the likelihood is as good as a parabola.
-_FINER = 0.2
+#: Step of the second, finer grid, decades. Over this step the log likelihood is close to a parabola.
+_FINER_STEP = 0.2
 
-#: How far the density may be off what one expected, in decades, as a standard deviation; some frames outweigh it.
+#: Standard deviation of the prior on log10 of the density, decades. The data of a few dozen frames outweigh the prior.
 _JERK_PRIOR_DECADES = 1.0
 
 
 @dataclass(frozen=True)
 class Smoothed:
-    """Tracks after smoothing, float64. NaN before a drone's first measurement.
+    """Filtered or smoothed tracks, float64; NaN before a drone's first measurement.
 
     Attributes:
-        position_m, velocity_m_s, acceleration_m_s2: (frames, drones, 3).
-        covariance_m2: (frames, drones, 3, 3), of the positions.
+        position_m, velocity_m_s, acceleration_m_s2: (frames, drones, 3), world.
+        covariance_m2: (frames, drones, 3, 3), covariances of the positions, m².
     """
 
     position_m: Float[np.ndarray, "frames drones 3"]
@@ -53,91 +53,92 @@ def smooth(
     was_measured: Bool[np.ndarray, "frames drones"],
     params: MotionParams,
 ) -> Smoothed:
-    """The best estimate of every frame from all measurements, of the frames before and after it.
+    """Estimate every frame from all measurements, before and after the frame.
 
-    What is measured must be what a frame says by itself: the output of a filter has its past in it already, and would
-    count twice. A drone begins at its first measurement, at the velocity 0 to within `params`; gaps are bridged from
-    both sides, and after the last measurement the drone is predicted. Outliers count less, as in `motion.update`, but
-    for the first measurement, which there is nothing to compare with.
+    Each measurement must come from its own frame alone. The output of a filter already contains the earlier frames,
+    which would then count twice. A track begins at its first measurement with velocity 0 and the standard deviation of
+    `params`. Gaps are bridged from both sides, and after the last measurement the drone is predicted. Outliers get less
+    weight, as in `kalman.update`, except for the first measurement, which has no prediction to compare with.
 
     Args:
-        time_s: (frames,), increasing.
-        measured_m: (frames, drones, 3), world; any value, NaN too, where not measured.
-        measured_covariance_m2: (frames, drones, 3, 3), symmetric and positive definite where measured.
-        was_measured: (frames, drones).
+        time_s: (frames,), increasing, seconds.
+        measured_m: (frames, drones, 3), measured positions, world, metres; any value, also NaN, where not measured.
+        measured_covariance_m2: (frames, drones, 3, 3), symmetric and positive definite where measured, m².
+        was_measured: (frames, drones), True where a drone has a measurement.
+        params: parameters of the motion model.
 
     Raises:
-        InputError: times do not increase, or a measurement is no number or has no positive definite covariance.
+        InputError: times do not increase, or a measurement is not finite, or its covariance not positive definite.
     """
     check_measurements(time_s, measured_m, measured_covariance_m2, was_measured)
-    # A scope, not a switch: nothing outside of it computes differently.
+    # The context manager limits float64 to this call.
     with jax.enable_x64(True):
-        parts = _smoothed(*_double((time_s, measured_m, measured_covariance_m2, was_measured, params)))
-    return _since_birth(parts, was_measured)
+        parts = _smoothed(*_to_float64((time_s, measured_m, measured_covariance_m2, was_measured, params)))
+    return _mask_before_first(parts, was_measured)
 
 
-def forward(
+def filter_measurements(
     time_s: Float[np.ndarray, "frames"],
     measured_m: Float[np.ndarray, "frames drones 3"],
     measured_covariance_m2: Float[np.ndarray, "frames drones 3 3"],
     was_measured: Bool[np.ndarray, "frames drones"],
     params: MotionParams,
 ) -> Smoothed:
-    """What the frames up to each frame say of it: the filter alone.
+    """Estimate every frame from the measurements up to that frame: the Kalman filter without the backward pass.
 
-    Args, errors and what is NaN are those of `smooth`.
+    Arguments, errors and NaN are as in `smooth`.
     """
     check_measurements(time_s, measured_m, measured_covariance_m2, was_measured)
     with jax.enable_x64(True):
-        parts = _forward(*_double((time_s, measured_m, measured_covariance_m2, was_measured, params)))
-    return _since_birth(parts, was_measured)
+        parts = _filter(*_to_float64((time_s, measured_m, measured_covariance_m2, was_measured, params)))
+    return _mask_before_first(parts, was_measured)
 
 
-def _since_birth(parts: tuple[Array, ...], was_measured: Bool[np.ndarray, "frames drones"]) -> Smoothed:
-    """The parts on the host, NaN before a drone's first measurement."""
+def _mask_before_first(parts: tuple[Array, ...], was_measured: Bool[np.ndarray, "frames drones"]) -> Smoothed:
+    """Move the results to the host, and set NaN before each drone's first measurement."""
     states = Smoothed(*(np.array(part) for part in parts))
-    unborn = ~np.logical_or.accumulate(was_measured, axis=0)
+    not_begun = ~np.logical_or.accumulate(was_measured, axis=0)
     for value in vars(states).values():
-        value[unborn] = np.nan
+        value[not_begun] = np.nan
     return states
 
 
-def jerk_density(
+def estimate_jerk_density(
     time_s: Float[np.ndarray, "frames"],
     measured_m: Float[np.ndarray, "frames drones 3"],
     measured_covariance_m2: Float[np.ndarray, "frames drones 3 3"],
     was_measured: Bool[np.ndarray, "frames drones"],
     params: MotionParams,
 ) -> Float[np.ndarray, "drones"]:
-    """(drones,), the jerk density under which the measurements are the most plausible, m2/s5.
+    """(drones,), jerk density of the highest posterior probability given the measurements, m²/s⁵.
 
-    The largest likelihood of all innovations (Bar-Shalom et al. 2001, section 11.4), first over decades, then finer
-    about the best of them, then by a parabola; times a prior about `params.jerk_density_m2_s5`, which is what a drone
-    with hardly any measurement gets. Outliers have long tails (`motion.log_likelihood`) and so do not pass for jerk.
-    The covariances must be right: too small ones do pass for jerk.
+    The likelihood is that of all innovations (Bar-Shalom et al. 2001, section 11.4). The search tries decades, then a
+    finer grid around the best decade, then the vertex of a parabola. The prior is centred on
+    `params.jerk_density_m2_s5`, so a drone with few measurements keeps that value. Outliers do not raise the density,
+    because `kalman.log_likelihood` has long tails. Measurement covariances that are too small do raise the density.
 
-    Args and errors are those of `smooth`.
+    Arguments and errors are as in `smooth`.
     """
     check_measurements(time_s, measured_m, measured_covariance_m2, was_measured)
     expected = np.log10(np.asarray(params.jerk_density_m2_s5, np.float64))
     drones = np.arange(was_measured.shape[1])
     with jax.enable_x64(True):
-        inputs = _double((time_s, measured_m, measured_covariance_m2, was_measured, params))
+        inputs = _to_float64((time_s, measured_m, measured_covariance_m2, was_measured, params))
 
         def scores(decades: Float[np.ndarray, "tried drones"]) -> Float[np.ndarray, "tried drones"]:
-            plausible = np.asarray(_log_likelihoods(*inputs, jnp.asarray(10.0**decades)))
-            return plausible - ((decades - expected) / _JERK_PRIOR_DECADES) ** 2 / 2
+            log_likelihood = np.asarray(_log_likelihoods(*inputs, jnp.asarray(10.0**decades)))
+            return log_likelihood - ((decades - expected) / _JERK_PRIOR_DECADES) ** 2 / 2
 
         decades = np.broadcast_to(_JERK_DECADES[:, None], (len(_JERK_DECADES), len(drones)))
         best = decades[scores(decades).argmax(axis=0), drones]
         around = _JERK_DECADES - _JERK_DECADES.mean()
-        decades = best + _FINER * around[:, None]
+        decades = best + _FINER_STEP * around[:, None]
         score = scores(decades)
     best = np.clip(score.argmax(axis=0), 1, len(decades) - 2)
     below, at, above = (score[best + shift, drones] for shift in (-1, 0, 1))
-    # The prior at least bends the score downwards, so that there is a vertex; it is not sought beyond the grid.
+    # The prior makes the score concave, so a vertex exists. The search stays within one grid step.
     vertex = np.clip((above - below) / 2 / (2 * at - above - below), -1, 1)
-    return 10.0 ** (decades[best, drones] + vertex * _FINER)
+    return 10.0 ** (decades[best, drones] + vertex * _FINER_STEP)
 
 
 def check_measurements(
@@ -146,16 +147,16 @@ def check_measurements(
     measured_covariance_m2: Float[np.ndarray, "frames drones 3 3"],
     was_measured: Bool[np.ndarray, "frames drones"],
 ) -> None:
-    """Refuse what no filter can use.
+    """Check that a filter can use the measurements.
 
     Args:
-        time_s: (frames,), increasing.
-        measured_m: (frames, drones, 3), numbers where measured.
+        time_s: (frames,), increasing, seconds.
+        measured_m: (frames, drones, 3), finite where measured.
         measured_covariance_m2: (frames, drones, 3, 3), symmetric and positive definite where measured.
-        was_measured: (frames, drones).
+        was_measured: (frames, drones), True where a drone has a measurement.
 
     Raises:
-        InputError: it is not so; the first place where, and what was found there.
+        InputError: a requirement is not met; the message names the first place and the value found there.
     """
     if not (np.diff(time_s) > 0).all() or not np.isfinite(time_s).all():
         raise InputError("time_s", expected="increasing times", found="repeats, steps back or no numbers")
@@ -177,50 +178,52 @@ def check_measurements(
         )
 
 
-def _double(tree: tuple) -> tuple:
+def _to_float64(tree: tuple) -> tuple:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, bool if leaf.dtype == bool else jnp.float64), tree)
 
 
 def _filtered(
     time_s: Array, measured_m: Array, covariance_m2: Array, was_measured: Array, params: MotionParams
 ) -> tuple[MotionState, MotionState, Array]:
-    """Forward pass: predicted and corrected states, and log likelihoods (frames, drones), 0 where none is defined.
+    """Run the filter: predicted states, corrected states, and log likelihoods (frames, drones).
 
-    A state is that of the drone's first measurement until there is one.
+    Before a drone's first measurement its state has no meaning; the log likelihood is 0 up to that measurement.
     """
 
-    def begun(measured: Array, spread: Array) -> MotionState:
-        return kalman.init(measured, jnp.zeros_like(measured), spread, params)
+    def initial(measured: Array, covariance: Array) -> MotionState:
+        return kalman.init(measured, jnp.zeros_like(measured), covariance, params)
 
     def step(carry: tuple, frame: tuple) -> tuple[tuple, tuple]:
-        state, born = carry
-        dt_s, measured, spread, there = frame
+        state, has_begun = carry
+        dt_s, measured, covariance, is_measured = frame
         predicted = kalman.predict(state, dt_s, params)
-        corrected, _ = kalman.update(predicted, measured, spread, there, params)
-        plausible = kalman.log_likelihood(predicted, measured, spread, params)
-        state = kalman.chosen(born, corrected, begun(measured, spread))
-        return (state, born | there), (predicted, state, jnp.where(born & there, plausible, 0.0))
+        corrected, _ = kalman.update(predicted, measured, covariance, is_measured, params)
+        log_density = kalman.log_likelihood(predicted, measured, covariance, params)
+        state = kalman.select_drones(has_begun, corrected, initial(measured, covariance))
+        log_density = jnp.where(has_begun & is_measured, log_density, 0.0)
+        return (state, has_begun | is_measured), (predicted, state, log_density)
 
-    # What is not measured is never used, but is carried along until a drone is born: it must be a number.
+    # The scan carries these values along before a drone's first measurement, so they must be finite.
     measured_m = jnp.where(was_measured[..., None], measured_m, 0.0)
     covariance_m2 = jnp.where(was_measured[..., None, None], covariance_m2, jnp.eye(3))
     dt_s = jnp.diff(time_s, prepend=time_s[:1])
-    carry = (begun(measured_m[0], covariance_m2[0]), jnp.zeros(was_measured.shape[1], bool))
-    _, (predicted, states, plausible) = jax.lax.scan(
+    carry = (initial(measured_m[0], covariance_m2[0]), jnp.zeros(was_measured.shape[1], bool))
+    _, (predicted, states, log_densities) = jax.lax.scan(
         step, carry, (dt_s, measured_m, covariance_m2, was_measured)
     )
-    return predicted, states, plausible
+    return predicted, states, log_densities
 
 
 @jax.jit
-def _forward(
+def _filter(
     time_s: Array, measured_m: Array, covariance_m2: Array, was_measured: Array, params: MotionParams
 ) -> tuple[Array, Array, Array, Array]:
-    """Forward pass: positions, velocities, accelerations and covariances of the positions, of all frames."""
-    return _seen_of(_filtered(time_s, measured_m, covariance_m2, was_measured, params)[1])
+    """Filtered positions, velocities, accelerations, and covariances of the positions, of all frames."""
+    return _without_error(_filtered(time_s, measured_m, covariance_m2, was_measured, params)[1])
 
 
-def _seen_of(states: MotionState) -> tuple[Array, Array, Array, Array]:
+def _without_error(states: MotionState) -> tuple[Array, Array, Array, Array]:
+    """Positions, velocities, accelerations, and covariances of the positions, without the lasting error."""
     return states.position_m, states.velocity_m_s, states.acceleration_m_s2, states.position_covariance_m2
 
 
@@ -228,44 +231,29 @@ def _seen_of(states: MotionState) -> tuple[Array, Array, Array, Array]:
 def _smoothed(
     time_s: Array, measured_m: Array, covariance_m2: Array, was_measured: Array, params: MotionParams
 ) -> tuple[Array, Array, Array, Array]:
-    """Backward pass: positions, velocities, accelerations and covariances of the positions, of all frames."""
+    """Smoothed positions, velocities, accelerations, and covariances of the positions, of all frames."""
     predicted, filtered, _ = _filtered(time_s, measured_m, covariance_m2, was_measured, params)
 
     def step(later: tuple[Array, Array], frame: tuple) -> tuple[tuple[Array, Array], MotionState]:
-        now, ahead, dt_s = frame
-        F = kalman.transported(jnp.broadcast_to(jnp.eye(12), now.covariance.shape), dt_s, params)
-        gain = _gain(F @ now.covariance, ahead.covariance)
-        mean = now.mean + (gain @ (later[0] - ahead.mean)[..., None])[..., 0]
-        # P + G (P_later - P_ahead) G^T would be a difference, and negative after many frames. This is a sum.
-        kept = jnp.eye(12) - gain @ F
-        added = kalman.process_noise(now.noise_m2, dt_s, params) + later[1]
-        spread = kept @ now.covariance @ _transpose(kept) + gain @ added @ _transpose(gain)
-        spread = (spread + _transpose(spread)) / 2
-        return (mean, spread), kalman.state_of(mean, spread, now.noise_m2)
+        state, next_predicted, dt_s = frame
+        change, covariance = backward_step(
+            state.covariance,
+            kalman.apply_transition(jnp.broadcast_to(jnp.eye(12), state.covariance.shape), dt_s, params),
+            kalman.process_noise(state.noise_m2, dt_s, params),
+            next_predicted.covariance,
+            later[1],
+            (later[0] - next_predicted.mean)[..., None],
+        )
+        mean = state.mean + change[..., 0]
+        return (mean, covariance), kalman.state_from_mean(mean, covariance, state.noise_m2)
 
-    now, end = (jax.tree.map(itemgetter(rows), filtered) for rows in (slice(-1), -1))
-    ahead = jax.tree.map(itemgetter(slice(1, None)), predicted)
-    _, earlier = jax.lax.scan(step, (end.mean, end.covariance), (now, ahead, jnp.diff(time_s)), reverse=True)
-    states = jax.tree.map(lambda part, last: jnp.concatenate([part, last[None]]), earlier, end)
-    return _seen_of(states)
-
-
-def _gain(moved: Array, ahead: Array) -> Array:
-    """(drones, 12, 12), P F^T P_ahead^-1 of `moved`, F P, and `ahead`, P_ahead.
-
-    In units of the standard deviations, so that metres and m/s2 count alike. What has no variance, as the error that
-    lasts where errors are white, is known, takes part in nothing, and is not corrected: a 1 in its place on the
-    diagonal says so.
-    """
-    variance = jnp.diagonal(ahead, axis1=-2, axis2=-1)
-    known = variance == 0
-    unit = jnp.sqrt(jnp.where(known, 1.0, variance))[..., None]
-    correlation = ahead / (unit * _transpose(unit)) + jnp.where(known[..., None], jnp.eye(12), 0.0)
-    return _transpose(jnp.linalg.solve(correlation, moved / unit) / unit)
-
-
-def _transpose(matrix: Array) -> Array:
-    return jnp.swapaxes(matrix, -1, -2)
+    earlier, last = (jax.tree.map(itemgetter(rows), filtered) for rows in (slice(-1), -1))
+    next_predicted = jax.tree.map(itemgetter(slice(1, None)), predicted)
+    _, smoothed = jax.lax.scan(
+        step, (last.mean, last.covariance), (earlier, next_predicted, jnp.diff(time_s)), reverse=True
+    )
+    states = jax.tree.map(lambda part, end: jnp.concatenate([part, end[None]]), smoothed, last)
+    return _without_error(states)
 
 
 @jax.jit
@@ -275,12 +263,12 @@ def _log_likelihoods(
     covariance_m2: Array,
     was_measured: Array,
     params: MotionParams,
-    tried: Array,
+    densities: Array,
 ) -> Array:
-    """(tried, drones), of all measurements under each jerk density of `tried`, (tried, drones)."""
+    """(tried, drones), log likelihood of all measurements under each jerk density of `densities`, (tried, drones)."""
 
     def total(density: Array) -> Array:
         varied = replace(params, jerk_density_m2_s5=density)
         return _filtered(time_s, measured_m, covariance_m2, was_measured, varied)[2].sum(axis=0)
 
-    return jax.vmap(total)(tried)
+    return jax.vmap(total)(densities)

@@ -105,4 +105,4 @@ def _correct(
 ) -> MotionState:
     state, _ = kalman.update(state, measured_m, covariance_m2, was_measured, params)
     limits = {"dt_s": dt_s, "bounds_m": bounds_m, "max_speed_m_s": max_speed_m_s}
-    return kalman.tamed(state, ~was_measured, lost, **limits)
+    return kalman.limit_motion(state, ~was_measured, lost, **limits)

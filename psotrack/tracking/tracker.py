@@ -206,7 +206,7 @@ def step(
     was_lost = state.missed > params.max_coasting_frames
     predicted = kalman.predict(state.motion, params.dt_s, params.motion)
     # Nobody knows where to a lost drone goes, nor how uncertain that is.
-    predicted = kalman.chosen(was_lost | ~state.present, state.motion, predicted)
+    predicted = kalman.select_drones(was_lost | ~state.present, state.motion, predicted)
     expected = jnp.clip(predicted.apparent_m, low, high)
     view = _view(state, coverage, cameras, expected, params, program)
     found = _search(key_spread, key_swarm, view, expected, state, params, program, (low, high))
@@ -229,10 +229,10 @@ def step(
     was_found &= ~_yields(found, was_found, -plausible, params.size_m)
     corrected, _ = kalman.update(predicted, found, covariance, was_found, params.motion)
     anew = kalman.init(found, jnp.zeros_like(found), covariance, params.motion)
-    corrected = kalman.chosen(was_found & was_lost, anew, corrected)
+    corrected = kalman.select_drones(was_found & was_lost, anew, corrected)
     missed = jnp.where(was_found, 0, state.missed + 1)
     lost = missed > params.max_coasting_frames
-    after = kalman.tamed(
+    after = kalman.limit_motion(
         corrected,
         missed > 0,
         lost,
@@ -303,7 +303,7 @@ def with_started_tracks(
     begun = _begun(arrivals.position_m, arrivals.velocity_m_s, params)
     return replace(
         state,
-        motion=kalman.chosen(begins, begun, state.motion),
+        motion=kalman.select_drones(begins, begun, state.motion),
         present=state.present | begins,
         missed=jnp.where(begins, 0, state.missed),
         dispersion=jnp.where(begins, DISPERSION, state.dispersion),

@@ -91,7 +91,7 @@ def init(measurement: MeasuredPose) -> PoseState:
         InputError: its covariance is not positive definite.
     """
     _check(measurement)
-    motion = pose_motion.begun(
+    motion = pose_motion.initial_motion(
         measurement.position_m,
         measurement.orientation_wxyz,
         measurement.covariance,
@@ -120,7 +120,7 @@ def predict(state: PoseState, time_s: float) -> PoseState:
         return state
     if not time_s > state.time_s:
         raise InputError("time_s", expected=f"a time after {state.time_s:g} s", found=f"{time_s:g} s")
-    motion, _ = pose_motion.foretold(state.motion, time_s - state.time_s, LEVELS)
+    motion, _ = pose_motion.predict(state.motion, time_s - state.time_s, LEVELS)
     return replace(state, time_s=time_s, motion=motion)
 
 
@@ -155,7 +155,7 @@ def update(state: PoseState, measurement: MeasuredPose, params: PoseFilterParams
     power = state.noise_scale * min(float(whitened @ covariance @ whitened), _MOST_POWER)
     return PoseState(
         time_s=measurement.time_s,
-        motion=pose_motion.corrected(state.motion, told, right),
+        motion=pose_motion.correct(state.motion, told, right),
         log_weight=_normalised(log_weight),
         seen_s=measurement.time_s,
         support=state.support + 1,
@@ -175,7 +175,7 @@ def estimate(state: PoseState) -> PoseEstimate:
     best = pose_motion.level_of(state.motion, int(weight.argmax()))
     apart = pose_motion.difference(best, state.motion)
     change, covariance = _merged(weight, apart, state.motion.covariance)
-    middle = pose_motion.shifted(best, change[None])
+    middle = pose_motion.shift(best, change[None])
     common = np.tensordot(weight, state.motion.common[:, POSE], axes=1)
     return PoseEstimate(
         position_m=middle.position_m[0],

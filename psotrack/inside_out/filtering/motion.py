@@ -1,20 +1,19 @@
-"""How a camera on a drone moves between frames, and how a measured pose corrects what is known of it.
+"""Motion of a camera on a drone: prediction between frames, and correction by measured poses.
 
-An error-state Kalman filter (J. Solà, Quaternion kinematics for the error-state Kalman filter, arXiv:1711.02508):
-position, velocity and an acceleration that dies away (R. A. Singer, IEEE Transactions on Aerospace and Electronic
-Systems 6(4), 1970) along the world's axes, orientation and turn rate about the camera's own. It runs at several levels
-of jerk and of angular acceleration at once.
+An error-state Kalman filter (J. Solà, Quaternion kinematics for the error-state Kalman filter, arXiv:1711.02508) with
+position, velocity and an acceleration that decays (R. A. Singer, IEEE Transactions on Aerospace and Electronic
+Systems 6(4), 1970) along the world's axes, and orientation and turn rate about the camera's own axes. The filter runs
+for several levels of jerk and angular acceleration at once.
 
-Poses of neighbouring frames are off by much the same, because they are from the same corners at nearly the same
-places in the image. So a share of a measurement's covariance is that of an error that lasts. It is L u, with L the
-symmetric root of that share, which turns with the world, and six numbers u of variance 1 that are part of the state
-and change slowly. A filter that took such errors for white would soon believe itself far better than any frame
-(`psotrack.motion` does alike for positions).
+Poses of neighbouring frames have similar errors, because they come from the same corners at nearly the same places in
+the image. Therefore a share of a measurement's covariance belongs to a lasting error, as in `psotrack.motion`. The
+lasting error is L u: L is the symmetric root of that share, and u are six slowly changing numbers of variance 1 that
+are part of the state. A filter that treated these errors as white noise would become overconfident.
 
-Errors of the map and of the focal length never change. No motion tells them, and no number of frames averages them
-away: they are considered, not estimated (S. F. Schmidt, Application of state-space methods to navigation problems,
-Advances in Control Systems 3, 1966). What each does to a pose is known, and what that does to the state is carried
-along; gains are as if there were none of them.
+Errors of the map and of the focal length are constant. No motion reveals them, and no number of frames averages them
+out, so the filter considers them without estimating them (S. F. Schmidt, Application of state-space methods to
+navigation problems, Advances in Control Systems 3, 1966). The effect of each constant error on a pose is known, and the
+filter carries its effect on the state along (`common`). The gains are computed without constant errors.
 """
 
 from __future__ import annotations
@@ -31,35 +30,36 @@ from psotrack.inside_out.filtering.manifold import (
     turn_between,
     turned,
 )
+from psotrack.motion import white_jerk_noise
 
-#: The error state: position, velocity, acceleration, turn, turn rate (3 each), and the error that lasts, u (6).
+#: Size of the error state: position, velocity, acceleration, turn, turn rate (3 each), and the lasting error u (6).
 SIZE = 21
 _TURN, _RATE, _LASTING = slice(9, 12), slice(12, 15), slice(15, 21)
-#: Where position and turn are in it.
+#: Indices of position and turn in the error state.
 POSE = np.r_[0:3, 9:12]
 
-#: A drone keeps its acceleration for about so long.
+#: Time constant of the acceleration's exponential decay, seconds.
 ACCELERATION_TIME_S = 1.0
-#: Of a measurement's covariance, what is due to errors that last, and after which time 1 / e is left of them.
+#: Share of a measurement's covariance that belongs to the lasting error, and the error's time constant, seconds.
 LASTING_SHARE = 0.6
 LASTING_TIME_S = 0.4
-#: Standard deviations along each axis of what is not known of a camera whose pose was just seen first.
+#: Standard deviations of velocity and turn rate along each axis after the first pose.
 _VELOCITY_STD_M_S = 5.0
 _RATE_STD_RAD_S = 3.0
 
 _NO_TURN = np.array([[1.0, 0.0, 0.0, 0.0]])
-# Nodes and weights on [0, 1]: exact to rounding for all times between frames, where the closed form cancels.
+# Gauss-Legendre nodes and weights on [0, 1]. The quadrature is exact to rounding, and the closed form has cancellation.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 
 
 @dataclass(frozen=True)
 class Levels:
-    """How wildly a camera may move, one value per level.
+    """Levels of agility of a camera, one value per level.
 
     Attributes:
         jerk_density_m2_s5: (levels,), power spectral density of the jerk along each axis.
-        wobble_density_rad2_s3: (levels,), that of the angular acceleration about each axis.
+        wobble_density_rad2_s3: (levels,), power spectral density of the angular acceleration about each axis.
     """
 
     jerk_density_m2_s5: Float[np.ndarray, "levels"]
@@ -68,15 +68,15 @@ class Levels:
 
 @dataclass(frozen=True)
 class Motion:
-    """What each level knows of a camera at one time.
+    """State of the filter at one time, for each level.
 
     Attributes:
         position_m, velocity_m_s, acceleration_m_s2: (levels, 3), world.
         orientation_wxyz: (levels, 4), unit quaternions, camera to world.
         rate_rad_s: (levels, 3), turn rate about the camera's axes.
-        lasting: (levels, 6), the error u that lasts, in standard deviations.
-        covariance: (levels, 21, 21), of all these in this order, as if there were no errors that never change.
-        common: (levels, 21, errors), by how much one standard deviation of each error that never changes puts it off.
+        lasting: (levels, 6), lasting error u, in standard deviations.
+        covariance: (levels, 21, 21), covariance of the error state, without constant errors.
+        common: (levels, 21, errors), effect of one standard deviation of each constant error on the error state.
     """
 
     position_m: Float[np.ndarray, "levels 3"]
@@ -91,13 +91,13 @@ class Motion:
 
 @dataclass(frozen=True)
 class Innovation:
-    """What was measured less what was foretold, and how they vary.
+    """Difference of a measured pose and the predicted one, with covariances.
 
     Attributes:
-        pose: (levels, 6), along the world's axes and about the foretold camera's.
-        covariance: (levels, 6, 6), of `pose`: of state and measurement together.
-        shared: (levels, 21, 6), covariance of the state with it.
-        common: (levels, 6, errors), what one standard deviation of each error that never changes adds to `pose`.
+        pose: (levels, 6), measured minus predicted, along the world's axes and about the predicted camera's axes.
+        covariance: (levels, 6, 6), covariance of `pose`, from state and measurement together.
+        shared: (levels, 21, 6), covariance of the error state with `pose`.
+        common: (levels, 6, errors), effect of one standard deviation of each constant error on `pose`.
     """
 
     pose: Float[np.ndarray, "levels 6"]
@@ -107,22 +107,22 @@ class Innovation:
 
     @property
     def whole_covariance(self) -> Float[np.ndarray, "levels 6 6"]:
-        """(levels, 6, 6), of `pose`, with errors that never change."""
+        """(levels, 6, 6), covariance of `pose` with constant errors."""
         return self.covariance + self.common @ self.common.swapaxes(1, 2)
 
 
-def begun(
+def initial_motion(
     position_m: Float[np.ndarray, "3"],
     orientation_wxyz: Float[np.ndarray, "4"],
     covariance: Float[np.ndarray, "6 6"],
     common: Float[np.ndarray, "6 errors"],
     levels: Levels,
 ) -> Motion:
-    """What is known after the first pose: that pose, and that drones have some speed."""
+    """Make the state after the first pose; velocity, acceleration and turn rate have mean 0."""
     count = len(levels.jerk_density_m2_s5)
     spread = np.zeros((count, SIZE, SIZE))
     root = _lasting_root(covariance)
-    # The pose is off by the error that lasts, with the opposite sign, and by the rest.
+    # The state's pose error contains the lasting error with the opposite sign.
     spread[:, POSE[:, None], POSE] = covariance
     spread[:, POSE, _LASTING] = -root
     spread[:, _LASTING, POSE] = -root
@@ -146,9 +146,9 @@ def begun(
     )
 
 
-def foretold(motion: Motion, dt_s: float, levels: Levels) -> tuple[Motion, Float[np.ndarray, "levels n n"]]:
-    """The motion `dt_s` seconds later, from 0 up, and F, (levels, 21, 21), which takes the errors there."""
-    along, turn = _grown_from(dt_s), motion.rate_rad_s * dt_s
+def predict(motion: Motion, dt_s: float, levels: Levels) -> tuple[Motion, Float[np.ndarray, "levels n n"]]:
+    """Predict the motion `dt_s` seconds later, at least 0; also return F, (levels, 21, 21), for the error state."""
+    along, turn = _transition_per_axis(dt_s), motion.rate_rad_s * dt_s
     kept = np.exp(-dt_s / LASTING_TIME_S)
     F = np.zeros_like(motion.covariance)
     F[:, :9, :9] = _each_axis(along)
@@ -173,14 +173,15 @@ def foretold(motion: Motion, dt_s: float, levels: Levels) -> tuple[Motion, Float
 
 
 def process_noise(dt_s: float, levels: Levels) -> Float[np.ndarray, "levels n n"]:
-    """Q, (levels, 21, 21), what is unknown after `dt_s` for jerk and wobble, and has come to the error that lasts.
+    """Q, (levels, 21, 21), process noise of `dt_s` seconds: jerk, angular acceleration, and new lasting error.
 
-    The jerk's is the integral over s from 0 to dt of g gᵀ, where g(s) is what a jerk has led to s later; the wobble's
-    is that of white angular acceleration, of which the turn of the axes meanwhile is left out.
+    The jerk's part is the integral over s from 0 to dt of g gᵀ, where g(s) is the response to a unit jerk s seconds
+    earlier. It differs from `white_jerk_noise`, because the acceleration decays. The part of the white angular
+    acceleration neglects the turn of the axes during `dt_s`.
     """
-    grown = _grown(_NODES * dt_s)
-    jerk = _each_axis((grown.T * (_WEIGHTS * dt_s)) @ grown)
-    wobble = _each_axis(np.array([[dt_s**3 / 3, dt_s**2 / 2], [dt_s**2 / 2, dt_s]]))
+    response = _acceleration_response(_NODES * dt_s)
+    jerk = _each_axis((response.T * (_WEIGHTS * dt_s)) @ response)
+    wobble = _each_axis(np.asarray(white_jerk_noise(dt_s))[1:, 1:])
     Q = np.zeros((len(levels.jerk_density_m2_s5), SIZE, SIZE))
     Q[:, :9, :9] = levels.jerk_density_m2_s5[:, None, None] * jerk
     Q[:, 9:15, 9:15] = levels.wobble_density_rad2_s3[:, None, None] * wobble
@@ -195,9 +196,9 @@ def innovation(
     covariance: Float[np.ndarray, "6 6"],
     common: Float[np.ndarray, "6 errors"],
 ) -> Innovation:
-    """What a measured pose tells that was not foretold; its covariance, as in `CameraPath`, is without `common`."""
+    """Compare a measured pose with the predicted one; `covariance`, as in `CameraPath`, is without constant errors."""
     turn = turn_between(motion.orientation_wxyz, orientation_wxyz[None])
-    # The measurement's small turns are about its own axes; these are of the logarithm.
+    # The measurement's small turns are about its own axes; the innovation's turn is a logarithm.
     by_noise = np.zeros((len(turn), 6, 6))
     by_noise[:, :3, :3] = np.eye(3)
     by_noise[:, 3:, 3:] = right_jacobian_inverse(turn)
@@ -213,36 +214,36 @@ def innovation(
     return Innovation(off, _symmetric(H @ shared + white), shared, differs)
 
 
-def corrected(motion: Motion, told: Innovation, right: float = 1.0) -> Motion:
-    """The motion after a measurement.
+def correct(motion: Motion, measured: Innovation, right: float = 1.0) -> Motion:
+    """Correct a motion by a measured pose.
 
     Args:
-        motion: as foretold.
-        told: by the measurement.
-        right: probability that the measurement is of this motion at all; the less, the less it counts
-            (Bar-Shalom, Daum & Huang, The probabilistic data association filter, IEEE Control Systems 29(6), 2009).
+        motion: predicted motion.
+        measured: innovation of the measured pose.
+        right: probability that the pose belongs to this motion at all, which is its weight (Bar-Shalom, Daum & Huang,
+            The probabilistic data association filter, IEEE Control Systems 29(6), 2009).
     """
-    gain = np.linalg.solve(told.covariance, told.shared.swapaxes(1, 2)).swapaxes(1, 2)
-    change = np.einsum("lij,lj->li", gain, told.pose)
-    spread = motion.covariance - right * gain @ told.shared.swapaxes(1, 2)
+    gain = np.linalg.solve(measured.covariance, measured.shared.swapaxes(1, 2)).swapaxes(1, 2)
+    change = np.einsum("lij,lj->li", gain, measured.pose)
+    spread = motion.covariance - right * gain @ measured.shared.swapaxes(1, 2)
     if right < 1:
         spread = spread + right * (1 - right) * change[:, :, None] * change[:, None, :]
-    off = motion.common + right * gain @ told.common
-    return moved(replace(motion, covariance=_symmetric(spread), common=off), right * change)
+    off = motion.common + right * gain @ measured.common
+    return retract(replace(motion, covariance=_symmetric(spread), common=off), right * change)
 
 
-def moved(motion: Motion, change: Float[np.ndarray, "levels n"]) -> Motion:
-    """The motion changed by an error state; its errors are then about the axes of the turned camera."""
+def retract(motion: Motion, change: Float[np.ndarray, "levels n"]) -> Motion:
+    """Add an error state to a motion, and express its covariance about the axes of the turned camera."""
     J = right_jacobian(change[:, _TURN])
     spread, off = motion.covariance.copy(), motion.common.copy()
     off[:, _TURN] = J @ off[:, _TURN]
     spread[:, _TURN] = J @ spread[:, _TURN]
     spread[:, :, _TURN] = spread[:, :, _TURN] @ J.swapaxes(1, 2)
-    return replace(shifted(motion, change), covariance=spread, common=off)
+    return replace(shift(motion, change), covariance=spread, common=off)
 
 
-def shifted(motion: Motion, change: Float[np.ndarray, "levels n"]) -> Motion:
-    """The motion changed by an error state, (levels, 21), its errors left as they are."""
+def shift(motion: Motion, change: Float[np.ndarray, "levels n"]) -> Motion:
+    """Add an error state, (levels, 21), to a motion without a change of its covariance."""
     return replace(
         motion,
         position_m=motion.position_m + change[:, :3],
@@ -255,7 +256,7 @@ def shifted(motion: Motion, change: Float[np.ndarray, "levels n"]) -> Motion:
 
 
 def difference(motion: Motion, other: Motion) -> Float[np.ndarray, "levels n"]:
-    """The error state that takes `motion` to `other`; of one of them there may be a single level."""
+    """(levels, 21), error state that takes `motion` to `other`; either of them may have a single level."""
     turn = turn_between(motion.orientation_wxyz, other.orientation_wxyz)
     parts = [
         other.position_m - motion.position_m,
@@ -269,33 +270,33 @@ def difference(motion: Motion, other: Motion) -> Float[np.ndarray, "levels n"]:
 
 
 def level_of(motion: Motion, level: int) -> Motion:
-    """The motion of one level, as one of a single level."""
+    """Take one level of a motion, as a motion of a single level."""
     only = slice(level, level + 1)
     return Motion(*(getattr(motion, name)[only] for name in Motion.__dataclass_fields__))
 
 
 def _lasting_root(covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
-    """L, symmetric, with L L the covariance of the error that lasts."""
+    """Symmetric root L of the lasting error's covariance: L L is that covariance."""
     variances, axes = np.linalg.eigh(covariance)
     return (axes * np.sqrt(LASTING_SHARE * np.maximum(variances, 0.0))) @ axes.T
 
 
-def _grown_from(dt_s: float) -> Float[np.ndarray, "3 3"]:
-    """F of position, velocity and acceleration along one axis after `dt_s`."""
+def _transition_per_axis(dt_s: float) -> Float[np.ndarray, "3 3"]:
+    """(3, 3), F of position, velocity and acceleration along one axis after `dt_s`."""
     F = np.eye(3)
-    F[0, 1], F[:, 2] = dt_s, _grown(np.array([dt_s]))[0]
+    F[0, 1], F[:, 2] = dt_s, _acceleration_response(np.array([dt_s]))[0]
     return F
 
 
-def _grown(s: Float[np.ndarray, " times"]) -> Float[np.ndarray, "times 3"]:
-    """Position, velocity and acceleration a time s after there was an acceleration of 1 and nothing else."""
-    gone = -np.expm1(-s / ACCELERATION_TIME_S)
-    velocity = ACCELERATION_TIME_S * gone
-    return np.stack([ACCELERATION_TIME_S * (s - velocity), velocity, 1 - gone], axis=-1)
+def _acceleration_response(s: Float[np.ndarray, " times"]) -> Float[np.ndarray, "times 3"]:
+    """(times, 3), response to a unit acceleration at time 0: position, velocity and acceleration at the times s."""
+    decayed = -np.expm1(-s / ACCELERATION_TIME_S)
+    velocity = ACCELERATION_TIME_S * decayed
+    return np.stack([ACCELERATION_TIME_S * (s - velocity), velocity, 1 - decayed], axis=-1)
 
 
 def _each_axis(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "m m"]:
-    """The Kronecker product with the identity: what holds along one axis, along three."""
+    """Kronecker product with the (3, 3) identity: extend a matrix for one axis to three axes."""
     return (matrix[:, None, :, None] * np.eye(3)[:, None, :]).reshape(3 * len(matrix), -1)
 
 

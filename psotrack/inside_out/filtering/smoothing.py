@@ -1,9 +1,8 @@
-"""Where a camera was, after the fact: what the frames after say of the frames before.
+"""Smoothed camera poses: every frame estimated from the poses of all frames.
 
-The causal filter runs once forwards and once backwards: poses count that fit in both directions, and both tell how
-wildly the camera moved, and how good poses are, at any time. With these known, a forward-backward smoother on the
-manifold gives the best pose of every frame from all poses (H. E. Rauch, F. Tung, C. T. Striebel, Maximum likelihood
-estimates of linear dynamic systems, AIAA Journal 3(8), 1965).
+The causal filter runs once forwards and once backwards in time. A pose is used if it fits in both directions. Both runs
+estimate how violently the camera moves, and how good the poses are, at any time. With these estimates a
+Rauch-Tung-Striebel smoother on the manifold of poses (`psotrack.estimation`) gives the path.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from psotrack.estimation import backward_step
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.filtering import motion as pose_motion
 from psotrack.inside_out.filtering.bank import LEVELS, right_pose
@@ -25,18 +25,18 @@ from psotrack.inside_out.filtering.records import PoseEstimate, PoseFilterParams
 
 
 @dataclass(frozen=True)
-class _Learned:
-    """What a run of the filter tells beside poses.
+class _FilterFindings:
+    """Findings of one run of the filter, apart from poses.
 
     Attributes:
-        counts: (frames,), whether the frame's pose fits, as is known in the end.
-        jumps: (frames,), how often the camera was found to be elsewhere up to the frame.
-        log_levels: (frames, 2), logarithms of the densities of jerk and wobble.
-        log_noise_scale: (frames,), logarithm of what covariances of poses are multiplied with.
-        ambiguity: (frames,), of the state.
+        fits: (frames,), True if the frame's pose fits the motion, judged at the end of the run.
+        jumps: (frames,), number of times up to the frame that the filter restarted at another place.
+        log_levels: (frames, 2), logarithms of the densities of the jerk and of the angular acceleration.
+        log_noise_scale: (frames,), logarithm of the factor on the covariances of measured poses.
+        ambiguity: (frames,), ambiguity of the filter's state.
     """
 
-    counts: Bool[np.ndarray, "frames"]
+    fits: Bool[np.ndarray, "frames"]
     jumps: Int[np.ndarray, "frames"]
     log_levels: Float[np.ndarray, "frames 2"]
     log_noise_scale: Float[np.ndarray, "frames"]
@@ -44,23 +44,54 @@ class _Learned:
 
 
 @dataclass(frozen=True)
-class _Pass:
-    """One frame of the forward pass: as foretold from the frame before, with F and Q of that, and as corrected."""
+class MotionModel:
+    """All that the smoother needs to know about a path, apart from the poses.
 
-    foretold: Motion
+    Attributes:
+        fits: (frames,), True if the smoother uses the frame's pose.
+        jumps: (frames,), number of times up to the frame that the camera jumped; the path is not drawn across a jump.
+        jerk_density_m2_s5: (frames,), power spectral density of the jerk along each axis.
+        wobble_density_rad2_s3: (frames,), power spectral density of the angular acceleration about each axis.
+        noise_scale: (frames,), factor on the covariances of the measured poses.
+        ambiguity: (frames,), probability that the path shows another camera pose that looks the same.
+    """
+
+    fits: Bool[np.ndarray, "frames"]
+    jumps: Int[np.ndarray, "frames"]
+    jerk_density_m2_s5: Float[np.ndarray, "frames"]
+    wobble_density_rad2_s3: Float[np.ndarray, "frames"]
+    noise_scale: Float[np.ndarray, "frames"]
+    ambiguity: Float[np.ndarray, "frames"]
+
+
+@dataclass(frozen=True)
+class _FilteredFrame:
+    """One frame of the forward pass.
+
+    Attributes:
+        predicted: motion before the frame's pose.
+        F, Q: (1, n, n), transition matrix and process noise from the previous frame.
+        motion: motion after the frame's pose.
+    """
+
+    predicted: Motion
     F: Float[np.ndarray, "1 n n"]
     Q: Float[np.ndarray, "1 n n"]
-    corrected: Motion
+    motion: Motion
 
 
-def smooth(path: CameraPath, params: PoseFilterParams | None = None) -> CameraPath:
-    """The best estimate of every frame from all frames.
+def smooth(
+    path: CameraPath, params: PoseFilterParams | None = None, model: MotionModel | None = None
+) -> CameraPath:
+    """Estimate every frame's pose from the poses of all frames.
 
-    Gaps are bridged from both sides; frames that are farther from all poses that count than `longest_gap_s` are lost.
+    Gaps are bridged from both sides. A frame is lost if no used pose lies within `longest_gap_s` of it.
 
     Args:
-        path: raw poses, each from its frame alone; not those of `follow`, which would count twice.
-        params: of the filter.
+        path: raw poses, each estimated from its frame alone. Poses from `follow` already contain other frames, which
+            would then count twice.
+        params: parameters of the filter; None for the defaults.
+        model: what is known about the motion; None for `estimate_motion_model(path, params)`.
 
     Raises:
         InputError: a pose's covariance is not positive definite.
@@ -69,153 +100,163 @@ def smooth(path: CameraPath, params: PoseFilterParams | None = None) -> CameraPa
     rows = rows_of(path)
     if not rows:
         return path
-    forth = _learned(rows, params)
-    back = _learned([replace(row, time_s=-row.time_s) for row in reversed(rows)], params)
-    counts = forth.counts & back.counts[::-1]
-    log_levels = (forth.log_levels + back.log_levels[::-1]) / 2
-    noise_scale = np.exp((forth.log_noise_scale + back.log_noise_scale[::-1]) / 2)
-    ambiguity = np.fmin(forth.ambiguity, back.ambiguity[::-1])
+    model = model or estimate_motion_model(path, params)
     smoothed = [lost(row, gated=row.has_pose) for row in rows]
-    for span in _spans(path.time_s, counts, forth.jumps, params.longest_gap_s):
-        poses = _smoothed(rows[span], counts[span], log_levels[span], noise_scale[span])
-        for k, told in zip(range(span.start, span.stop), poses, strict=True):
-            smoothed[k] = told_row(rows[k], told, float(ambiguity[k]), used=bool(counts[k]))
+    for span in _spans(path.time_s, model, params.longest_gap_s):
+        poses = _smooth_span(rows, model, span)
+        for k, pose in zip(range(span.start, span.stop), poses, strict=True):
+            smoothed[k] = told_row(rows[k], pose, float(model.ambiguity[k]), used=bool(model.fits[k]))
     return path_of(smoothed)
 
 
-def _learned(rows: Sequence[PoseRow], params: PoseFilterParams) -> _Learned:
-    """What the causal filter finds out on its way; where it knows nothing, what it knew last."""
+def estimate_motion_model(path: CameraPath, params: PoseFilterParams) -> MotionModel:
+    """Estimate from raw poses how the camera moves and which poses fit: the causal filter in both directions of time.
+
+    Args:
+        path: raw poses, each estimated from its frame alone.
+        params: parameters of the filter.
+
+    Raises:
+        InputError: a pose's covariance is not positive definite.
+    """
+    rows = rows_of(path)
+    forward = _run_filter(rows, params)
+    backward = _run_filter([replace(row, time_s=-row.time_s) for row in reversed(rows)], params)
+    log_levels = (forward.log_levels + backward.log_levels[::-1]) / 2
+    return MotionModel(
+        fits=forward.fits & backward.fits[::-1],
+        jumps=forward.jumps,
+        jerk_density_m2_s5=np.exp(log_levels[:, 0]),
+        wobble_density_rad2_s3=np.exp(log_levels[:, 1]),
+        noise_scale=np.exp((forward.log_noise_scale + backward.log_noise_scale[::-1]) / 2),
+        ambiguity=np.fmin(forward.ambiguity, backward.ambiguity[::-1]),
+    )
+
+
+def _run_filter(rows: Sequence[PoseRow], params: PoseFilterParams) -> _FilterFindings:
+    """Run the causal filter; a frame without a state gets the findings of the last frame that had one."""
     time_s = np.array([row.time_s for row in rows])
     has_pose = np.array([row.has_pose for row in rows], bool)
-    counts, jumped = np.zeros(len(rows), bool), np.zeros(len(rows), bool)
-    start = np.zeros(len(rows), int)
-    told, found = [False], []
-    following, known = FilterRun(), (_log_levels(_evenly()), 0.0, np.nan)
-    for k, raw in enumerate(rows):
-        following, _ = step(following, raw, params)
-        state, rival, recalled = following.state, following.overthrown, following.recalled
+    fits, jumped = np.zeros(len(rows), bool), np.zeros(len(rows), bool)
+    # A new track begins where the filter starts or jumps; poses of a track that is never confirmed do not count.
+    track, is_confirmed = np.zeros(len(rows), int), [False]
+    run, found = FilterRun(), []
+    latest = _mean_log_levels(_uniform_log_weights()), 0.0, np.nan
+    for k, row in enumerate(rows):
+        run, _ = step(run, row, params)
+        state, rival, recalled = run.state, run.overthrown, run.recalled
         if recalled is not None:
-            # What was believed meanwhile was wrong.
-            counts[np.searchsorted(time_s, recalled.seen_s, side="right") : k] = False
+            # The filter went back to an earlier state, so the poses since then were wrong.
+            fits[np.searchsorted(time_s, recalled.seen_s, side="right") : k] = False
         if state is not None:
-            # The poses of a rival were gated when they came.
+            # The poses of a rival track were gated when they came.
             since = k if rival is None else int(np.searchsorted(time_s, rival.since_s))
             jumped[since] |= rival is not None and not rival.goes_on
             if state.support == 1 or jumped[since]:
-                told.append(False)
-            start[since : k + 1], told[-1] = len(told) - 1, confirmed(following, params)
-            counts[since : k + 1] = has_pose[since : k + 1] & (state.seen_s == raw.time_s)
-            known = _log_levels(state.log_weight), float(np.log(state.noise_scale)), state.ambiguity
-        found.append(known)
+                is_confirmed.append(False)
+            track[since : k + 1], is_confirmed[-1] = len(is_confirmed) - 1, confirmed(run, params)
+            fits[since : k + 1] = has_pose[since : k + 1] & (state.seen_s == row.time_s)
+            latest = _mean_log_levels(state.log_weight), float(np.log(state.noise_scale)), state.ambiguity
+        found.append(latest)
     log_levels, log_noise_scale, ambiguity = (np.array(values) for values in zip(*found, strict=True))
-    counts &= np.array(told)[start]
-    return _Learned(counts, np.cumsum(jumped), log_levels, log_noise_scale, ambiguity)
+    fits &= np.array(is_confirmed)[track]
+    return _FilterFindings(fits, np.cumsum(jumped), log_levels, log_noise_scale, ambiguity)
 
 
-def _spans(
-    time_s: Float[np.ndarray, "frames"],
-    counts: Bool[np.ndarray, "frames"],
-    jumps: Int[np.ndarray, "frames"],
-    longest_gap_s: float,
-) -> Iterator[slice]:
-    """Frames without a jump or too long a gap, from a pose that counts to where it is too long ago."""
-    seen = np.flatnonzero(counts)
-    apart = (np.diff(time_s[seen]) > 2 * longest_gap_s) | (np.diff(jumps[seen]) != 0)
-    ends = np.append(np.flatnonzero(apart), len(seen) - 1) if len(seen) else np.array([], int)
+def _spans(time_s: Float[np.ndarray, "frames"], model: MotionModel, longest_gap_s: float) -> Iterator[slice]:
+    """Yield the spans of frames without a jump or a long gap; a span ends `longest_gap_s` after its last used pose."""
+    seen = np.flatnonzero(model.fits)
+    is_break = (np.diff(time_s[seen]) > 2 * longest_gap_s) | (np.diff(model.jumps[seen]) != 0)
+    ends = np.append(np.flatnonzero(is_break), len(seen) - 1) if len(seen) else np.array([], int)
     first = 0
     for end in ends:
-        after = seen[end + 1] if end + 1 < len(seen) else len(time_s)
-        told = int(np.searchsorted(time_s, time_s[seen[end]] + longest_gap_s, side="right"))
-        yield slice(int(seen[first]), int(min(after, told)))
+        next_seen = seen[end + 1] if end + 1 < len(seen) else len(time_s)
+        within_gap = int(np.searchsorted(time_s, time_s[seen[end]] + longest_gap_s, side="right"))
+        yield slice(int(seen[first]), int(min(next_seen, within_gap)))
         first = end + 1
 
 
-def _smoothed(
-    rows: Sequence[PoseRow],
-    counts: Bool[np.ndarray, "frames"],
-    log_levels: Float[np.ndarray, "frames 2"],
-    noise_scale: Float[np.ndarray, "frames"],
-) -> list[PoseEstimate]:
-    """The poses of frames, of which the first counts, from all of them that count."""
-    passes = _forward(rows, counts, log_levels, noise_scale)
-    later = passes[-1].corrected
+def _smooth_span(rows: Sequence[PoseRow], model: MotionModel, span: slice) -> list[PoseEstimate]:
+    """Smoothed poses of a span of frames whose first pose fits."""
+    frames = _filter(rows, model, span)
+    later = frames[-1].motion
     poses = [_estimate(later)]
-    for now, ahead in zip(passes[-2::-1], passes[:0:-1], strict=True):
-        later = _earlier(now.corrected, ahead, later)
+    for now, ahead in zip(frames[-2::-1], frames[:0:-1], strict=True):
+        later = _smoothed(now.motion, ahead, later)
         poses.append(_estimate(later))
     return poses[::-1]
 
 
-def _forward(
-    rows: Sequence[PoseRow],
-    counts: Bool[np.ndarray, "frames"],
-    log_levels: Float[np.ndarray, "frames 2"],
-    noise_scale: Float[np.ndarray, "frames"],
-) -> list[_Pass]:
-    passes: list[_Pass] = []
-    for k, raw in enumerate(rows):
-        levels = Levels(np.exp(log_levels[k, :1]), np.exp(log_levels[k, 1:]))
-        pose = measured(raw)
-        covariance = noise_scale[k] * pose.covariance
-        if not passes:
-            motion = pose_motion.begun(
+def _filter(rows: Sequence[PoseRow], model: MotionModel, span: slice) -> list[_FilteredFrame]:
+    """Forward pass of the smoother over a span of frames."""
+    frames: list[_FilteredFrame] = []
+    for k in range(span.start, span.stop):
+        row = rows[k]
+        levels = Levels(model.jerk_density_m2_s5[k : k + 1], model.wobble_density_rad2_s3[k : k + 1])
+        pose = measured(row)
+        covariance = model.noise_scale[k] * pose.covariance
+        if not frames:
+            motion = pose_motion.initial_motion(
                 pose.position_m, pose.orientation_wxyz, covariance, pose.common, levels
             )
-            nothing = np.zeros_like(motion.covariance)
-            passes.append(_Pass(motion, nothing, nothing, motion))
+            zeros = np.zeros_like(motion.covariance)
+            frames.append(_FilteredFrame(motion, zeros, zeros, motion))
             continue
-        dt_s = raw.time_s - rows[k - 1].time_s
-        foretold, F = pose_motion.foretold(passes[-1].corrected, dt_s, levels)
-        corrected = foretold
-        if counts[k]:
-            told = pose_motion.innovation(
-                foretold, pose.position_m, pose.orientation_wxyz, covariance, pose.common
+        dt_s = row.time_s - rows[k - 1].time_s
+        predicted, F = pose_motion.predict(frames[-1].motion, dt_s, levels)
+        motion = predicted
+        if model.fits[k]:
+            innovation = pose_motion.innovation(
+                predicted, pose.position_m, pose.orientation_wxyz, covariance, pose.common
             )
-            right = right_pose(told.pose[0], told.whole_covariance[0], pose.ambiguity)
-            corrected = pose_motion.corrected(foretold, told, right)
-        passes.append(_Pass(foretold, F, pose_motion.process_noise(dt_s, levels), corrected))
-    return passes
+            right = right_pose(innovation.pose[0], innovation.whole_covariance[0], pose.ambiguity)
+            motion = pose_motion.correct(predicted, innovation, right)
+        frames.append(_FilteredFrame(predicted, F, pose_motion.process_noise(dt_s, levels), motion))
+    return frames
 
 
-def _earlier(now: Motion, ahead: _Pass, later: Motion) -> Motion:
-    """A frame by all frames, from it by those up to it, and the next one by all."""
-    gain = _gain(ahead.F @ now.covariance, ahead.foretold.covariance)
-    change = pose_motion.difference(ahead.foretold, later)
-    # Its covariance is about the axes of the camera as it is turned there; here, as it was foretold.
+def _smoothed(now: Motion, ahead: _FilteredFrame, later: Motion) -> Motion:
+    """Smooth one frame.
+
+    Args:
+        now: filtered motion of the frame.
+        ahead: the next frame of the forward pass.
+        later: smoothed motion of the next frame.
+    """
+    change = pose_motion.difference(ahead.predicted, later)
+    # The covariance of `later` is about its own camera axes; the step needs it about those of the predicted camera.
     J = np.eye(pose_motion.SIZE)[None]
     J[:, 9:12, 9:12] = right_jacobian_inverse(change[:, 9:12])
-    # P + G (P_later - P_ahead) Gᵀ would be a difference, and negative after many frames. This is a sum.
-    kept = np.eye(pose_motion.SIZE) - gain @ ahead.F
-    added = ahead.Q + J @ later.covariance @ J.swapaxes(1, 2)
-    spread = kept @ now.covariance @ kept.swapaxes(1, 2) + gain @ added @ gain.swapaxes(1, 2)
-    off = now.common + gain @ (J @ later.common - ahead.foretold.common)
-    return pose_motion.moved(
-        replace(now, covariance=(spread + spread.swapaxes(1, 2)) / 2, common=off),
-        (gain @ change[:, :, None])[:, :, 0],
+    # The gain corrects the effects of the constant errors (`common`) like the state.
+    deviation = np.concatenate([change[..., None], J @ later.common - ahead.predicted.common], axis=-1)
+    correction, covariance = map(
+        np.asarray,
+        backward_step(
+            now.covariance,
+            ahead.F,
+            ahead.Q,
+            ahead.predicted.covariance,
+            J @ later.covariance @ J.swapaxes(1, 2),
+            deviation,
+        ),
     )
-
-
-def _gain(
-    transported: Float[np.ndarray, "1 n n"], ahead: Float[np.ndarray, "1 n n"]
-) -> Float[np.ndarray, "1 n n"]:
-    """P Fᵀ P_ahead⁻¹ of F P and P_ahead, in standard deviations, so that metres and radians count alike."""
-    unit = np.sqrt(np.einsum("lii->li", ahead))[:, :, None]
-    correlation = ahead / (unit * unit.swapaxes(1, 2))
-    return (np.linalg.solve(correlation, transported / unit) / unit).swapaxes(1, 2)
+    smoothed = replace(now, covariance=covariance, common=now.common + correction[..., 1:])
+    return pose_motion.retract(smoothed, correction[..., 0])
 
 
 def _estimate(motion: Motion) -> PoseEstimate:
+    """Pose of a motion of one level; the covariance includes the constant errors."""
     common = motion.common[0, POSE]
     covariance = motion.covariance[0][np.ix_(POSE, POSE)] + common @ common.T
     return PoseEstimate(motion.position_m[0], motion.orientation_wxyz[0], covariance, motion.velocity_m_s[0])
 
 
-def _log_levels(log_weight: Float[np.ndarray, "levels"]) -> Float[np.ndarray, "2"]:
-    """Logarithms of the densities of jerk and wobble that these weights amount to."""
+def _mean_log_levels(log_weight: Float[np.ndarray, "levels"]) -> Float[np.ndarray, "2"]:
+    """Weighted means of the log densities of the jerk and of the angular acceleration, over the filter's levels."""
     densities = np.stack([LEVELS.jerk_density_m2_s5, LEVELS.wobble_density_rad2_s3])
     return np.log(densities) @ np.exp(log_weight)
 
 
-def _evenly() -> Float[np.ndarray, "levels"]:
-    """Logarithms of weights that are all the same."""
+def _uniform_log_weights() -> Float[np.ndarray, "levels"]:
+    """Logarithms of equal weights of all levels."""
     return np.full(len(LEVELS.jerk_density_m2_s5), -np.log(len(LEVELS.jerk_density_m2_s5)))

@@ -21,7 +21,7 @@ from psotrack.inside_out.fusing.joint_filter import (
     ErrorModel,
     Readings,
     log_likelihood,
-    rows_of,
+    select_frames,
 )
 
 #: Half of all draws from the chi-square distribution with 3 degrees of freedom are below this.
@@ -220,4 +220,4 @@ def _telling(readings: Readings) -> Readings:
     spoken = np.cumsum(np.pad(readings.known.sum(axis=1), (1, 0)))
     length = min(_MOST_FRAMES, len(readings.time_s))
     begin = int(np.argmax(spoken[length:] - spoken[: len(spoken) - length]))
-    return rows_of(readings, slice(begin, begin + length))
+    return select_frames(readings, slice(begin, begin + length))

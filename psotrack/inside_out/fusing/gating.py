@@ -13,13 +13,13 @@ from psotrack.inside_out.fusing.joint_filter import (
     ErrorModel,
     Readings,
     State,
-    observation,
-    predicted,
-    roots_of,
-    rows_of,
-    start,
-    transitions,
-    updated,
+    covariance_roots,
+    initial_state,
+    iterate_transitions,
+    observe,
+    predict,
+    select_frames,
+    update,
 )
 
 #: The chi-square distribution with 3 degrees of freedom exceeds this once in a million: five standard deviations.
@@ -45,9 +45,9 @@ def gated(
     first = _first_agreement(readings, model, arm)
     out = np.zeros(readings.known.shape, bool)
     added_m2 = np.zeros(readings.covariance_m2.shape)
-    out[first:], added_m2[first:] = _gated_onwards(rows_of(readings, slice(first, None)), model, arm)
+    out[first:], added_m2[first:] = _gated_onwards(select_frames(readings, slice(first, None)), model, arm)
     if first:
-        back = rows_of(readings, slice(first, None, -1))
+        back = select_frames(readings, slice(first, None, -1))
         back = replace(back, time_s=-back.time_s, ahead_s=-back.ahead_s)
         out_back, added_back_m2 = _gated_onwards(back, model, arm)
         out[:first], added_m2[:first] = out_back[:0:-1], added_back_m2[:0:-1]
@@ -57,23 +57,21 @@ def gated(
 def _gated_onwards(
     readings: Readings, model: ErrorModel, arm: Arm
 ) -> tuple[Bool[np.ndarray, "frames 2"], Float[np.ndarray, "frames 2 3 3"]]:
-    roots = roots_of(readings)
+    roots = covariance_roots(readings)
     out = np.zeros(readings.known.shape, bool)
     added_m2 = np.zeros(readings.covariance_m2.shape)
     rows = np.flatnonzero(readings.known.any(axis=1))
-    state = start(readings, model, arm, rows[0])
-    for k, (F, Q) in zip(rows, transitions(readings.time_s[rows], model), strict=True):
-        state = predicted(state, F, Q)
+    state = initial_state(readings, model, arm, rows[0])
+    for k, (F, Q) in zip(rows, iterate_transitions(readings.time_s[rows], model), strict=True):
+        state = predict(state, F, Q)
         sources = np.flatnonzero(readings.known[k])
-        parts = [
-            observation(readings, model, roots, k, sources[row : row + 1]) for row in range(len(sources))
-        ]
+        parts = [observe(readings, model, roots, k, sources[row : row + 1]) for row in range(len(sources))]
         misfits = [_misfit(state, part) for part in parts]
         best = int(np.argmin(misfits))
-        after, _ = updated(state, *parts[best])
+        after, _ = update(state, *parts[best])
         other = parts[1 - best] if len(parts) > 1 else None
         if other is not None and _misfit(after, other) <= GATE:
-            state, _ = updated(after, *other)
+            state, _ = update(after, *other)
             continue
         if other is not None:
             out[k, sources[1 - best]] = True
@@ -81,17 +79,17 @@ def _gated_onwards(
         if excess > 1:
             H, y, R = parts[best]
             added_m2[k, sources[best]] = (excess - 1) * (H @ state[1] @ H.swapaxes(1, 2) + R)[0]
-            after, _ = updated(state, H, y, R + added_m2[k, sources[best]])
+            after, _ = update(state, H, y, R + added_m2[k, sources[best]])
         state = after
     return out, added_m2
 
 
 def _first_agreement(readings: Readings, model: ErrorModel, arm: Arm) -> int:
     """The first frame in which both sources speak and fit each other, else the first in which any does."""
-    roots = roots_of(readings)
+    roots = covariance_roots(readings)
     for k in np.flatnonzero(readings.known.all(axis=1)):
-        inside, outside = (observation(readings, model, roots, k, np.array([source])) for source in (0, 1))
-        after, _ = updated(start(readings, model, arm, k), *inside)
+        inside, outside = (observe(readings, model, roots, k, np.array([source])) for source in (0, 1))
+        after, _ = update(initial_state(readings, model, arm, k), *inside)
         if _misfit(after, outside) <= GATE:
             return int(k)
     return int(np.argmax(readings.known.any(axis=1)))

@@ -1,13 +1,13 @@
-"""One drone from two sources of positions: a motion, an error that lasts in each source, and an arm between them.
+"""Kalman filter and smoother of one drone from two sources: its motion, the errors of both sources, and an arm.
 
-A forward-backward filter (H. E. Rauch, F. Tung, C. T. Striebel, Maximum likelihood estimates of linear dynamic systems,
-AIAA Journal 3(8), 1965) over the motion of `psotrack.motion`: white jerk (Y. Bar-Shalom, X. R. Li, T. Kirubarajan,
-Estimation with Applications to Tracking and Navigation, 2001, section 6.2.3). The two sources share no error. What each
-is off by is partly new in every frame and partly lasts, a first-order Gauss-Markov process (chapter 8 there), because
-the output of a filter or a body seen from one side errs alike in neighbouring frames. Such an error is in the state:
-where one source ends, what is known of the other's error is not forgotten, and the path does not jump.
+The motion has white jerk (`psotrack.motion`); the backward pass is Rauch-Tung-Striebel's (`psotrack.estimation`). The
+two sources have independent errors. Part of each source's error is white noise, and part lasts: a first-order
+Gauss-Markov process (Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to Tracking and Navigation,
+2001, chapter 8), because the output of a filter, or a body seen from one side, has similar errors in neighbouring
+frames. The lasting errors are part of the state. Where one source ends, the estimate of the other source's error stays,
+and the path does not jump. The arm is the vector between the points that the two sources measure.
 
-In float64, all of it, over any number of error models at once.
+All computations are in float64, and for several error models at once.
 """
 
 from __future__ import annotations
@@ -18,12 +18,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from psotrack.estimation import backward_step
+from psotrack.motion import white_jerk_noise
+
 INSIDE, OUTSIDE = 0, 1
 
-#: Standard deviations that a drone starts with along each axis: about its first reading, of velocity and acceleration.
+#: Standard deviations of the initial position (about its first reading), velocity and acceleration along each axis.
 _START_M, _START_M_S, _START_M_S2 = 1.0, 10.0, 10.0
 
-#: Blocks of the state, three numbers each.
+#: Slices of the state vector; a tuple has one slice for each source.
 _POSITION, _VELOCITY, _ACCELERATION, _ERRORS, _ARM = (
     slice(0, 3),
     slice(3, 6),
@@ -32,27 +35,28 @@ _POSITION, _VELOCITY, _ACCELERATION, _ERRORS, _ARM = (
     slice(15, 18),
 )
 SIZE = 18
-_EYE = np.eye(SIZE)
+_IDENTITY = np.eye(SIZE)
 
 _Vector = Float[np.ndarray, "models 18"]
 _Matrix = Float[np.ndarray, "models 18 18"]
-#: Mean and covariance.
+#: Mean and covariance of the state under each model.
 State = tuple[_Vector, _Matrix]
 
 
 @dataclass(frozen=True)
 class Readings:
-    """What two sources say of one drone: the inside (index 0) and the outside (1).
+    """Positions of one drone from two sources: the inside source (index 0) and the outside source (index 1).
 
     Attributes:
-        time_s: (frames,), increasing.
-        position_m: (frames, 2, 3), world.
-        covariance_m2: (frames, 2, 3, 3), as the sources state them; numbers everywhere.
-        known: (frames, 2), where a source says something.
-        ahead_s: (frames, 2), by how much the reading is of a later time than the frame.
-        lever: (frames, 2, 3, 3), what a reading is off the fused point, per arm: a rotation, its negative, or 0.
-        added_m2: (frames, 2, 3, 3), covariance that comes on top, whatever the scales: of an arm that is turned by
-            nobody knows what, or of a reading that is not to count in full.
+        time_s: (frames,), increasing, seconds.
+        position_m: (frames, 2, 3), world, metres.
+        covariance_m2: (frames, 2, 3, 3), covariances as the sources state them, m²; finite in all frames.
+        known: (frames, 2), True where a source has a reading.
+        ahead_s: (frames, 2), time of the reading minus time of the frame, seconds.
+        lever: (frames, 2, 3, 3), matrix whose product with the arm is the reading minus the fused point: a rotation,
+            its negative, or 0.
+        added_m2: (frames, 2, 3, 3), covariance to be added without any scale: for the unknown rotation of the arm, or
+            to reduce the weight of a reading.
     """
 
     time_s: Float[np.ndarray, "frames"]
@@ -66,13 +70,13 @@ class Readings:
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """How the sources err, and how quickly the drone changes its acceleration. Several models at once, or one.
+    """Error models of the sources, and the jerk density of the drone: one or several alternatives.
 
     Attributes:
-        white: (models, 2), variance that is new in every frame, per stated variance.
-        lasting: (models, 2), variance of the error that lasts, likewise.
-        time_s: (models, 2), after which 1 / e of that error is left.
-        jerk_density_m2_s5: (models,), of the white jerk along each axis.
+        white: (models, 2), variance of each source's white noise, as a multiple of the stated variance.
+        lasting: (models, 2), variance of each source's lasting error, as a multiple of the stated variance.
+        time_s: (models, 2), time constant of the lasting error's exponential decay, seconds.
+        jerk_density_m2_s5: (models,), power spectral density of the white jerk along each axis, m²/s⁵.
     """
 
     white: Float[np.ndarray, "models 2"]
@@ -83,7 +87,7 @@ class ErrorModel:
 
 @dataclass(frozen=True)
 class Arm:
-    """What is known of the arm beforehand: its mean (3,), metres, and its standard deviation along each axis."""
+    """Prior of the arm: its mean (3,), metres, and its standard deviation along each axis, metres."""
 
     mean_m: Float[np.ndarray, "3"]
     std_m: float
@@ -91,12 +95,12 @@ class Arm:
 
 @dataclass(frozen=True)
 class Joint:
-    """The drone from all readings, of the frames before and after each.
+    """Smoothed states of the drone, each from the readings of all frames.
 
     Attributes:
         position_m, velocity_m_s: (frames, 3), world.
-        covariance_m2: (frames, 3, 3), of the position.
-        arm_m, arm_covariance_m2: (3,), (3, 3), of the arm.
+        covariance_m2: (frames, 3, 3), covariances of the positions, m².
+        arm_m, arm_covariance_m2: (3,), (3, 3), mean and covariance of the arm, m and m².
     """
 
     position_m: Float[np.ndarray, "frames 3"]
@@ -107,68 +111,67 @@ class Joint:
 
 
 def log_likelihood(readings: Readings, model: ErrorModel, arm: Arm) -> Float[np.ndarray, "models"]:
-    """(models,), logarithm of the density of all readings under each model."""
+    """(models,), logarithm of the probability density of all readings under each model."""
     total = np.zeros(len(model.white))
-    for step in _forward(readings, model, arm):
-        total += step.log_density
+    for frame in _filter(readings, model, arm):
+        total += frame.log_density
     return total
 
 
 def smooth(readings: Readings, model: ErrorModel, arm: Arm) -> Joint:
-    """The best estimate of every frame from all readings, under one model."""
-    steps = list(_forward(readings, model, arm))
-    F, Q, mean, spread, mean_before, spread_before = (
-        np.stack([getattr(step, name)[0] for step in steps])
-        for name in ("F", "Q", "mean", "spread", "mean_before", "spread_before")
-    )
-    # P F^T P_ahead^-1, in units of standard deviations, so that metres and m/s2 count alike.
-    unit = np.sqrt(np.diagonal(spread_before[1:], axis1=1, axis2=2))
-    ahead = spread_before[1:] / (unit[:, :, None] * unit[:, None, :])
-    gain = np.linalg.solve(ahead, (F[1:] @ spread[:-1]) / unit[:, :, None]).swapaxes(1, 2) / unit[:, None, :]
-    kept = np.eye(SIZE) - gain @ F[1:]
-    for k in range(len(steps) - 2, -1, -1):
-        mean[k] += gain[k] @ (mean[k + 1] - mean_before[k + 1])
-        # A sum, where P + G (P_later - P_ahead) G^T would be a difference and negative after many frames.
-        later = gain[k] @ (Q[k + 1] + spread[k + 1]) @ gain[k].T
-        spread[k] = _symmetric(kept[k] @ spread[k] @ kept[k].T + later)
+    """Estimate every frame from all readings under one model."""
+    frames = list(_filter(readings, model, arm))
+    mean, covariance = frames[-1].state
+    smoothed = [(mean, covariance)]
+    for now, later in zip(frames[-2::-1], frames[:0:-1], strict=True):
+        deviation = (mean - later.predicted[0])[..., None]
+        step = backward_step(now.state[1], later.F, later.Q, later.predicted[1], covariance, deviation)
+        change, covariance = map(np.asarray, step)
+        mean = now.state[0] + change[..., 0]
+        smoothed.append((mean, covariance))
+    means, covariances = (np.concatenate(parts) for parts in zip(*smoothed[::-1], strict=True))
     return Joint(
-        position_m=mean[:, _POSITION],
-        velocity_m_s=mean[:, _VELOCITY],
-        covariance_m2=spread[:, _POSITION, _POSITION],
-        arm_m=mean[0, _ARM],
-        arm_covariance_m2=spread[0, _ARM, _ARM],
+        position_m=means[:, _POSITION],
+        velocity_m_s=means[:, _VELOCITY],
+        covariance_m2=covariances[:, _POSITION, _POSITION],
+        arm_m=means[0, _ARM],
+        arm_covariance_m2=covariances[0, _ARM, _ARM],
     )
 
 
 @dataclass(frozen=True)
-class _Step:
-    """One frame of the forward pass: how it was reached, the state before and after its readings, their density."""
+class _FilteredFrame:
+    """One frame of the forward pass.
+
+    Attributes:
+        F, Q: transition matrix and process noise from the previous frame.
+        predicted: state before the readings of the frame.
+        state: state after the readings of the frame.
+        log_density: (models,), logarithm of the density of the readings under the predicted state.
+    """
 
     F: _Matrix
     Q: _Matrix
-    mean_before: _Vector
-    spread_before: _Matrix
-    mean: _Vector
-    spread: _Matrix
+    predicted: State
+    state: State
     log_density: Float[np.ndarray, "models"]
 
 
-def _forward(readings: Readings, model: ErrorModel, arm: Arm) -> Iterator[_Step]:
-    roots = roots_of(readings)
+def _filter(readings: Readings, model: ErrorModel, arm: Arm) -> Iterator[_FilteredFrame]:
+    roots = covariance_roots(readings)
     first = int(np.argmax(readings.known.any(axis=1)))
-    state = start(readings, model, arm, first)
-    for k, (F, Q) in enumerate(transitions(readings.time_s, model)):
-        before = predicted(state, F, Q)
+    state = initial_state(readings, model, arm, first)
+    for k, (F, Q) in enumerate(iterate_transitions(readings.time_s, model)):
+        predicted = state = predict(state, F, Q)
         log_density = np.zeros(len(model.white))
-        state = before
         if readings.known[k].any():
-            parts = observation(readings, model, roots, k, np.flatnonzero(readings.known[k]))
-            state, log_density = updated(before, *parts)
-        yield _Step(F, Q, *before, *state, log_density)
+            parts = observe(readings, model, roots, k, np.flatnonzero(readings.known[k]))
+            state, log_density = update(predicted, *parts)
+        yield _FilteredFrame(F, Q, predicted, state, log_density)
 
 
-def start(readings: Readings, model: ErrorModel, arm: Arm, first: int | np.integer) -> State:
-    """At rest about the first reading, and hardly known."""
+def initial_state(readings: Readings, model: ErrorModel, arm: Arm, first: int | np.integer) -> State:
+    """Make the initial state: at rest at the reading of frame `first`, with large standard deviations."""
     models = len(model.white)
     source = int(np.argmax(readings.known[first]))
     mean = np.zeros((models, SIZE))
@@ -179,53 +182,58 @@ def start(readings: Readings, model: ErrorModel, arm: Arm, first: int | np.integ
 
 
 def transition(dt_s: float, model: ErrorModel) -> tuple[_Matrix, _Matrix]:
-    """F and Q over `dt_s`; errors that last have unit variance, and readings scale them."""
+    """Transition matrix F and process noise Q over `dt_s` seconds; lasting errors have unit variance in the state."""
     models = len(model.white)
-    left = np.exp(-dt_s / model.time_s)
+    kept = np.exp(-dt_s / model.time_s)
     F = np.tile(np.eye(SIZE), (models, 1, 1))
     F[:, _POSITION, _VELOCITY] = F[:, _VELOCITY, _ACCELERATION] = dt_s * np.eye(3)
     F[:, _POSITION, _ACCELERATION] = dt_s**2 / 2 * np.eye(3)
     Q = np.zeros_like(F)
-    reached = np.array([dt_s**5 / 20, dt_s**4 / 8, dt_s**3 / 6, dt_s**3 / 3, dt_s**2 / 2, dt_s])
-    jerk = np.kron(reached[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]], np.eye(3))
-    Q[:, :9, :9] = model.jerk_density_m2_s5[:, None, None] * jerk
+    Q[:, :9, :9] = model.jerk_density_m2_s5[:, None, None] * np.kron(white_jerk_noise(dt_s), np.eye(3))
     for source, block in enumerate(_ERRORS):
-        F[:, block, block] = left[:, source, None, None] * np.eye(3)
-        Q[:, block, block] = (1 - left[:, source, None, None] ** 2) * np.eye(3)
+        F[:, block, block] = kept[:, source, None, None] * np.eye(3)
+        Q[:, block, block] = (1 - kept[:, source, None, None] ** 2) * np.eye(3)
     return F, Q
 
 
-def transitions(time_s: Float[np.ndarray, "frames"], model: ErrorModel) -> Iterator[tuple[_Matrix, _Matrix]]:
-    """`transition` to each frame from the one before; nearly all are alike, and made once."""
-    made: dict[float, tuple[_Matrix, _Matrix]] = {}
+def iterate_transitions(
+    time_s: Float[np.ndarray, "frames"], model: ErrorModel
+) -> Iterator[tuple[_Matrix, _Matrix]]:
+    """Yield the `transition` from the previous frame to each frame; equal time steps share one computation."""
+    by_step: dict[float, tuple[_Matrix, _Matrix]] = {}
     for dt_s in np.round(np.diff(time_s, prepend=time_s[:1]), 9).tolist():
-        if dt_s not in made:
-            made[dt_s] = transition(dt_s, model)
-        yield made[dt_s]
+        if dt_s not in by_step:
+            by_step[dt_s] = transition(dt_s, model)
+        yield by_step[dt_s]
 
 
-def predicted(state: State, F: _Matrix, Q: _Matrix) -> State:
-    """The state after a transition."""
-    mean, spread = state
-    return (F @ mean[..., None])[..., 0], F @ spread @ F.swapaxes(1, 2) + Q
+def predict(state: State, F: _Matrix, Q: _Matrix) -> State:
+    """Take a state through a transition."""
+    mean, covariance = state
+    return (F @ mean[..., None])[..., 0], F @ covariance @ F.swapaxes(1, 2) + Q
 
 
-def observation(
+def observe(
     readings: Readings,
     model: ErrorModel,
     roots: Float[np.ndarray, "frames 2 3 3"],
     k: int | np.integer,
     sources: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """H (models, 3 n, 18), y (3 n,) and R (models, 3 n, 3 n) of n sources in frame k."""
+    """Make the observation equations of n sources in frame k.
+
+    Returns:
+        H (models, 3 n, 18), observation matrix; y (3 n,), measured positions, metres; and R (models, 3 n, 3 n), noise
+        covariance, m².
+    """
     models = len(model.white)
     H = np.zeros((models, 3 * len(sources), SIZE))
     R = np.zeros((models, 3 * len(sources), 3 * len(sources)))
     for row, source in enumerate(sources):
         rows, ahead_s = slice(3 * row, 3 * row + 3), readings.ahead_s[k, source]
-        H[:, rows, _POSITION] = _EYE[:3, :3]
-        H[:, rows, _VELOCITY] = ahead_s * _EYE[:3, :3]
-        H[:, rows, _ACCELERATION] = ahead_s**2 / 2 * _EYE[:3, :3]
+        H[:, rows, _POSITION] = _IDENTITY[:3, :3]
+        H[:, rows, _VELOCITY] = ahead_s * _IDENTITY[:3, :3]
+        H[:, rows, _ACCELERATION] = ahead_s**2 / 2 * _IDENTITY[:3, :3]
         H[:, rows, _ERRORS[source]] = np.sqrt(model.lasting[:, source, None, None]) * roots[k, source]
         H[:, rows, _ARM] = readings.lever[k, source]
         white = model.white[:, source, None, None]
@@ -233,34 +241,30 @@ def observation(
     return H, readings.position_m[k, sources].ravel(), R
 
 
-def updated(
+def update(
     state: State, H: np.ndarray, y: np.ndarray, R: np.ndarray
 ) -> tuple[State, Float[np.ndarray, "models"]]:
-    """The corrected state, and the logarithm of the density with which it was expected."""
-    mean, spread = state
-    PHt = spread @ H.swapaxes(1, 2)
+    """Correct a state by an observation; return the state and the logarithm of the observation's density."""
+    mean, covariance = state
+    PHt = covariance @ H.swapaxes(1, 2)
     S = H @ PHt + R
     innovation = y - (H @ mean[..., None])[..., 0]
     precision = np.linalg.inv(S)
     K = PHt @ precision
     correction = (K @ innovation[..., None])[..., 0]
-    kept = _EYE - K @ H
-    after = kept @ spread @ kept.swapaxes(1, 2) + K @ R @ K.swapaxes(1, 2)
+    kept = _IDENTITY - K @ H
+    after = kept @ covariance @ kept.swapaxes(1, 2) + K @ R @ K.swapaxes(1, 2)
     misfit = (innovation * (precision @ innovation[..., None])[..., 0]).sum(axis=1)
     log_density = -(misfit + np.linalg.slogdet(2 * np.pi * S)[1]) / 2
-    return (mean + correction, _symmetric(after)), log_density
+    return (mean + correction, (after + after.swapaxes(1, 2)) / 2), log_density
 
 
-def rows_of(readings: Readings, rows: slice) -> Readings:
-    """The readings of some frames."""
+def select_frames(readings: Readings, rows: slice) -> Readings:
+    """Take the readings of a slice of frames."""
     return Readings(**{name: value[rows] for name, value in vars(readings).items()})
 
 
-def roots_of(readings: Readings) -> Float[np.ndarray, "frames 2 3 3"]:
-    """Symmetric square roots of the stated covariances."""
+def covariance_roots(readings: Readings) -> Float[np.ndarray, "frames 2 3 3"]:
+    """(frames, 2, 3, 3), symmetric square roots of the stated covariances."""
     variance, axes = np.linalg.eigh(readings.covariance_m2)
     return np.einsum("...ij,...j,...kj->...ik", axes, np.sqrt(np.maximum(variance, 0.0)), axes)
-
-
-def _symmetric(matrix: np.ndarray) -> np.ndarray:
-    return (matrix + matrix.swapaxes(-1, -2)) / 2
