@@ -12,7 +12,11 @@ install = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python
 oracle = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python $(BIN)/python --no-deps 'trackeval>=1.3'; \
 	else $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'trackeval>=1.3'; fi
 
-.PHONY: help demo test test-fast lint format bench notebooks table4 table5 table5-quick table7 docs results results-check clean
+# One worker per processor; a worker that has finished takes tests of another. Bytecode is kept between runs, because
+# every worker and every command that a test starts would compile the package again.
+pytest = env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n auto --dist worksteal
+
+.PHONY: help demo test test-slow lint format bench notebooks table4 table5 table5-quick table7 docs results results-check clean
 
 help:  ## what can be made
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -30,11 +34,11 @@ $(VENV)/.installed: pyproject.toml
 demo: $(VENV)/.installed  ## simulate four drones, track them from the videos, print the errors, save a picture in demo/
 	@$(BIN)/psotrack demo --out demo --force
 
-test: $(VENV)/.installed  ## all tests
-	@$(BIN)/python -m pytest
+test: $(VENV)/.installed  ## the fast tests, some minutes; NAMES="tests/test_video.py ..." for some files
+	@$(pytest) -m 'not slow' $(NAMES)
 
-test-fast: $(VENV)/.installed  ## all tests but the slow ones
-	@$(BIN)/python -m pytest -m 'not slow'
+test-slow: $(VENV)/.installed  ## the slow tests: whole programs, notebooks and experiments at small sizes
+	@$(pytest) -m slow $(NAMES)
 
 lint: $(VENV)/.installed  ## ruff, its format check, mypy
 	@$(BIN)/ruff check .
@@ -79,4 +83,4 @@ results-check:  ## name each result that is older than the code that it depends 
 	@$(if $(wildcard $(BIN)/python),$(BIN)/python,$(PYTHON)) experiments/_results.py check $(ONLY)
 
 clean:  ## remove what was built, the environment too
-	rm -rf $(VENV) build dist demo notebooks/data ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist demo notebooks/data ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .compiled

@@ -1,4 +1,4 @@
-"""Session-wide switches that turn silent trouble into failures.
+"""Settings of the whole test session: strict JAX, one folder of compiled programs, repeatable examples.
 
 jaxtyping and beartype check every annotated call of the package (`--jaxtyping-packages` in pyproject.toml).
 """
@@ -6,24 +6,28 @@ jaxtyping and beartype check every annotated call of the package (`--jaxtyping-p
 import importlib
 import os
 import pkgutil
+from pathlib import Path
 
-# Whose window is how wide, and where somebody has JAX keep programs, decides no test. Before JAX looks.
+# The user's terminal and JAX settings must not decide any test. All processes of the suite (workers and commands that
+# tests start) share one folder of compiled programs, which is kept between runs. JAX reads the variables on import.
 os.environ["COLUMNS"] = "80"
-os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
+os.environ["JAX_COMPILATION_CACHE_DIR"] = str(Path(__file__).parents[1] / ".compiled")
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 
 import jax
 import pytest
 from hypothesis import HealthCheck, settings
 
-# int32 + float32 and the like must be written out: a promotion that nobody meant is how exact sums lose bits.
-# Rank promotion stays allowed: particles x drones x cameras broadcast against cameras everywhere, on purpose.
+# int32 + float32 and the like must be written out: an implicit promotion loses bits of exact sums.
+# Rank promotion stays allowed: the package broadcasts particles x drones x cameras against cameras on purpose.
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-# Batches of runs are shared by two devices, as they are on machines that have them.
+# Two devices, because batches of runs are divided between devices.
 jax.config.update("jax_num_cpu_devices", 2)
 
-# The same examples in every run: a failure can be repeated, and no test throws a coin. No deadline, because the
-# first example of a compiled function pays for the compiler; and nobody minds how long a slow machine draws them.
+# The same examples in every run, so that a failure can be repeated. No deadline, because the first example of a
+# compiled function includes the compilation.
 settings.register_profile(
     "psotrack",
     derandomize=True,
@@ -35,15 +39,13 @@ settings.load_profile("psotrack")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with slow tests first: begun last, one of them would leave all other processes without work.
+    """Import the whole package.
 
-    And all of the package is imported: Hypothesis also draws the numbers that it finds in imported modules, which would
-    be other ones after other tests.
+    Hypothesis also draws the constants that it finds in imported modules. If the tests that ran before decided which
+    modules are imported, a failure could not be repeated.
     """
     import psotrack
 
     for module in pkgutil.walk_packages(psotrack.__path__, "psotrack."):
         if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
-    slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)

@@ -1,8 +1,14 @@
 """Rigs and silhouettes for tests, made without the code that they test (`boxes`, `fitness`)."""
 
+import os
+from collections.abc import Callable
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
+from filelock import FileLock
 
 from psotrack.geometry import Camera, CameraRig, camera, look_at, project, stack, undistort
 
@@ -47,6 +53,28 @@ def far_camera(*, image_size_wh, pixels_per_m, distance_m=1000.0):
 def rig_of(*cameras):
     """A rig of unnamed cameras."""
     return stack({str(i): one for i, one in enumerate(cameras)})
+
+
+def environment_without_jax_settings() -> dict[str, str]:
+    """Environment variables for a command that must not use the suite's folder of compiled programs."""
+    return {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+
+
+def make_once(tmp_path_factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """The folder `name` with what `make` writes into it; made by the first worker of a run that asks for it.
+
+    Tests must not change the folder: the tests of all workers read it.
+    """
+    base = tmp_path_factory.getbasetemp()
+    # Each worker has a folder of its own within the folder of the run.
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    folder, finished = shared / name, shared / f"{name}.finished"
+    with FileLock(shared / f"{name}.lock"):
+        if not finished.exists():
+            folder.mkdir(exist_ok=True)
+            make(folder)
+            finished.touch()
+    return folder
 
 
 def float32(tree):

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-
-from psotrack.sweep.locks import waited_for
+from helpers import make_once
 
 #: One program for all cells, whatever the iterations.
 GRID = """
@@ -29,10 +28,7 @@ iterations = {iterations}
 COMPILER = {
     "XLA_FLAGS": "--xla_force_host_platform_device_count=1",
     "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
-    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-    "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
 }
-FOLDERS = {"PSOTRACK_CACHE": "cache", "JAX_COMPILATION_CACHE_DIR": "compiled"}
 
 
 def grid_file(folder: Path, iterations: list[int], runs: int = 1) -> Path:
@@ -44,7 +40,7 @@ def grid_file(folder: Path, iterations: list[int], runs: int = 1) -> Path:
 
 def environment(root: Path) -> dict[str, str]:
     """Of commands that use the cache of the small sequence's folder."""
-    return os.environ | COMPILER | {name: str(root / folder) for name, folder in FOLDERS.items()}
+    return os.environ | COMPILER | {"PSOTRACK_CACHE": str(root / "cache")}
 
 
 def python(root: Path, *words: object, **more: str) -> subprocess.CompletedProcess[str]:
@@ -67,20 +63,16 @@ def small_sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     Whoever tests sweeps does it after this, so that a run is seconds.
     """
-    base = tmp_path_factory.getbasetemp()
-    root = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "small_sequence"
-    with waited_for(root / "being made"):
-        if not (root / "warm").exists():
-            made = psotrack(
-                root, "simulate", "S01_D2_A", "--out", root, "--scale", 0.25, "--frames", 6, "--no-onboard"
-            )
-            assert made.returncode == 0, made.stderr
-            swept = psotrack(
-                root, "sweep", grid_file(root, [2]), "--data", root, "--out", root / "warm_results"
-            )
-            assert swept.returncode == 0, swept.stderr
-            (root / "warm").touch()
-    return root
+
+    def make(root: Path) -> None:
+        made = psotrack(
+            root, "simulate", "S01_D2_A", "--out", root, "--scale", 0.25, "--frames", 6, "--no-onboard"
+        )
+        assert made.returncode == 0, made.stderr
+        swept = psotrack(root, "sweep", grid_file(root, [2]), "--data", root, "--out", root / "warm_results")
+        assert swept.returncode == 0, swept.stderr
+
+    return make_once(tmp_path_factory, "small_sequence", make)
 
 
 def all_rows(results: Path) -> pd.DataFrame:

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers import environment_without_jax_settings
 
 #: One program, kept however quickly it compiles; prints what it computes and where JAX keeps programs.
 PROGRAM = """
@@ -28,7 +29,7 @@ def run(folder: Path, **environment: str) -> list[str]:
         [sys.executable, "-c", PROGRAM, str(folder)],
         capture_output=True,
         text=True,
-        env=os.environ | environment,
+        env=environment_without_jax_settings() | environment,
         check=True,
     )
     assert result.stderr == ""

@@ -358,6 +358,8 @@ def _run(
     """
     program = f"""
         import contextlib, os, signal, sys
+        # A suite that was started in the background hands down that SIGINT is ignored.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.path.insert(0, {str(Path(__file__).parent)!r})
         from pathlib import Path
         from test_silhouettes import SETTINGS, SilhouetteSettings, _sequence, compute
