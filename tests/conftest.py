@@ -1,7 +1,4 @@
-"""Settings of the whole test session: strict JAX, one folder of compiled programs, repeatable examples.
-
-jaxtyping and beartype check every annotated call of the package (`--jaxtyping-packages` in pyproject.toml).
-"""
+"""Settings of the whole test session: checked shapes, strict JAX, one folder of compiled programs, same examples."""
 
 import importlib
 import os
@@ -18,6 +15,10 @@ os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 import jax
 import pytest
 from hypothesis import HealthCheck, settings
+from jaxtyping import install_import_hook
+
+# jaxtyping and beartype check the types and shapes of every annotated call of the package. Before it is imported.
+install_import_hook("psotrack", "beartype.beartype")
 
 # int32 + float32 and the like must be written out: an implicit promotion loses bits of exact sums.
 # Rank promotion stays allowed: the package broadcasts particles x drones x cameras against cameras on purpose.
