@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import json
 import sys
+import tomllib
 from functools import cache
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import pandas as pd
@@ -171,8 +173,6 @@ def accuracy_table() -> str:
 
 def published(name: str) -> str:
     """Range of the mean errors that the paper states for a sequence."""
-    import tomllib
-
     path = ROOT / "experiments" / "table5" / "published.toml"
     low, high = tomllib.loads(path.read_text(encoding="utf-8"))[name]
     return f"{low:.3f} to {high:.3f} m" if high > low else f"{low:.3f} m"
@@ -205,7 +205,7 @@ def struct_tables(path: str) -> str:
         path: dotted path of the class, for instance "psotrack.settings.TrackSettings".
     """
     module, _, name = path.rpartition(".")
-    cls = getattr(__import__(module, fromlist=[name]), name)
+    cls = getattr(import_module(module), name)
     return "\n\n".join(_struct_tables(cls, "", set()))
 
 
@@ -251,6 +251,8 @@ def _type_name(kind: Any) -> str:
         return "None"
     if isinstance(kind, type) and not getattr(kind, "__args__", ()):
         return kind.__name__
+    if getattr(kind, "__origin__", None) is Literal:
+        return " | ".join(json.dumps(value) for value in kind.__args__)
     text = str(kind)
     for module in ("typing.", "collections.abc.", "psotrack."):
         text = text.replace(module, "")

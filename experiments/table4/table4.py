@@ -37,7 +37,7 @@ TABLES = {
     "Time of the track stage per frame (ms)": ("track_ms_per_frame", 1.0, 1),
 }
 #: Files of the result that are committed.
-FILES = ("results.csv", "table4.md", "manifest.json")
+FILES = ("results.csv", "table4.md")
 KEPT = [
     "sequence",
     "method",
@@ -76,7 +76,8 @@ def main() -> None:
         rows = tracked({**what, "sequences": at_hand(data)}, options.out, data)
         show(rows, options.out)
         if options.results:
-            run.copy([options.out / name for name in FILES], options.results)
+            manifest = options.out.glob("*manifest.json")
+            run.copy([*(options.out / name for name in FILES), *manifest], options.results)
     except PsotrackError as error:
         sys.exit(f"table4: {error}")
     if rows.attrs["errors"]:

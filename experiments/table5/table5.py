@@ -26,7 +26,7 @@ import _results
 
 HERE = Path(__file__).parent
 #: Files of the result that are committed, besides pictures.
-FILES = ("results.csv", "table5.md", "manifest.json")
+FILES = ("results.csv", "table5.md")
 #: Title of a table -> column, its factor, and decimals.
 TABLES = {
     "Mean error": ("mean_error_m", 1e3, 1),
@@ -64,7 +64,7 @@ def main() -> None:
         rows = tracked(grid, out, data)
         show(rows, out)
         if options.results:
-            pictures = sorted(out.glob("*.png"))
+            pictures = [*sorted(out.glob("*.png")), *out.glob("*manifest.json")]
             run.copy([*(out / name for name in FILES), *pictures], options.results)
     except PsotrackError as error:
         sys.exit(f"table5: {error}")
