@@ -164,6 +164,7 @@ def test_quiet_says_nothing_and_no_terminal_means_no_bars(run: Run, sequence: Pa
     assert loud.err == ""
 
 
+@pytest.mark.slow
 def test_init_from_truth_and_from_tracks(run: Run, sequence: Path, tmp_path: Path) -> None:
     assert run(*track(sequence, tmp_path / "a.csv", "--init", "truth")).code == 0
     assert run(*track(sequence, tmp_path / "b.csv", "--init", tmp_path / "a.csv", "--drones", 2)).code == 0
@@ -172,6 +173,7 @@ def test_init_from_truth_and_from_tracks(run: Run, sequence: Path, tmp_path: Pat
     assert set(second["drone"]) == {0, 1}
 
 
+@pytest.mark.slow
 def test_the_paper_baseline_runs(run: Run, sequence: Path, tmp_path: Path) -> None:
     answer = run(*track(sequence, tmp_path / "t.csv", "--swarm", "joint", "--score", "hard"))
     assert answer.code == 0
@@ -267,6 +269,7 @@ def test_detections_that_are_not_there(run: Run, sequence: Path, tmp_path: Path)
     assert_one_line(nobody, "drones", "none in any frame")
 
 
+@pytest.mark.slow
 def test_fewer_cameras_and_frames_by_choice(run: Run, sequence: Path, tmp_path: Path) -> None:
     (sequence / "cam8i_s.avi").unlink()
     answer = run(*track(sequence, tmp_path / "t.csv", "--cameras", CAMERAS, "--frames", 11))

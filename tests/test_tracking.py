@@ -136,6 +136,7 @@ def test_chunk_after_chunk_is_one_program(silhouettes, caplog):
     assert sum("_follow" in name for name in compiled) == 1
 
 
+@pytest.mark.slow
 def test_runs_of_other_seeds_differ(batch):
     assert (batch[0][2].info.position_m[5] != batch[1][2].info.position_m[5]).any()
 
