@@ -1,4 +1,4 @@
-"""The path of a moving camera: its angles against SciPy's, and its table there and back."""
+"""The path of a moving camera: its angles against SciPy's, and its table written and read."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from psotrack.inside_out import CameraPath, Flag, read_camera_path, write_camera
 from psotrack.inside_out.camera_path import roll_pitch_yaw_deg
 from psotrack.trajectories import Status, read_trajectories
 
-#: Camera axes, columns, of a camera that looks along the world's x axis: right is -y, down is -z.
+#: Columns: axes of a camera that looks along the world's x axis: right is -y, down is -z.
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
@@ -50,14 +50,14 @@ def some_path(with_velocity: bool = True) -> CameraPath:
         ([0.0, 0.0, 180.0], [0.0, 0.0, 180.0]),
     ],
 )
-def test_angles_of_a_camera_that_is_turned_from_looking_along_x(turn, expected_deg) -> None:
+def test_angles_of_a_camera_turned_from_the_x_axis(turn, expected_deg) -> None:
     turned = Rotation.from_rotvec(turn, degrees=True).as_matrix() @ AHEAD
     found = roll_pitch_yaw_deg(Rotation.from_matrix(turned).as_quat(scalar_first=True))
-    # Some roundings of an angle below 180 degrees; 180 and -180 are the same.
+    # Rounding of an angle below 180 degrees; 180 and -180 are the same.
     np.testing.assert_allclose((found - expected_deg + 180) % 360 - 180, 0, atol=1e-12)
 
 
-def test_angles_are_scipys() -> None:
+def test_angles_equal_scipys() -> None:
     rng = np.random.default_rng(5)
     orientation = Rotation.random(200, rng=rng)
     found = roll_pitch_yaw_deg(orientation.as_quat(scalar_first=True).reshape(50, 4, 4)).reshape(-1, 3)
@@ -66,11 +66,11 @@ def test_angles_are_scipys() -> None:
     np.testing.assert_allclose(found, body.as_euler("ZYX", degrees=True)[:, ::-1], atol=1e-6)
 
 
-def test_looking_straight_down_and_nowhere() -> None:
+def test_angles_straight_down_and_without_a_pose() -> None:
     down = Rotation.from_rotvec([0.0, 90.0, 0.0], degrees=True).as_matrix() @ AHEAD
     wxyz = np.stack([Rotation.from_matrix(down).as_quat(scalar_first=True), np.full(4, np.nan)])
     found = roll_pitch_yaw_deg(wxyz)
-    # arcsin near 1 has half of the digits.
+    # arcsin near 1 loses half of the digits.
     assert found[0, 1] == pytest.approx(90, abs=1e-5)
     assert np.isnan(found[1]).all()
 
@@ -85,7 +85,7 @@ def test_a_table_is_read_as_it_was_written(tmp_path: Path, with_velocity: bool) 
         np.testing.assert_array_equal(getattr(read, field), getattr(written, field), err_msg=field)
 
 
-def test_commands_that_read_tracks_read_it(tmp_path: Path) -> None:
+def test_the_reader_of_tracks_reads_the_table(tmp_path: Path) -> None:
     written = some_path()
     write_camera_path(tmp_path / "path.csv", written, "dron2")
     tracks, own = read_trajectories(tmp_path / "path.csv"), written.trajectories("dron2")
@@ -96,7 +96,7 @@ def test_commands_that_read_tracks_read_it(tmp_path: Path) -> None:
     np.testing.assert_array_equal(tracks.covariance_m2, own.covariance_m2)
 
 
-def test_nothing_is_overwritten(tmp_path: Path) -> None:
+def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "path.csv").write_text("mine")
     with pytest.raises(OutputError, match=r"path\.csv"):
         write_camera_path(tmp_path / "path.csv", some_path(), "dron1")
@@ -112,7 +112,9 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
         ("dron2", "dron3", r"path.csv: .*one drone"),
     ],
 )
-def test_what_makes_no_sense_is_named(tmp_path: Path, before: str, after: str, message: str) -> None:
+def test_invalid_values_are_refused_with_their_line(
+    tmp_path: Path, before: str, after: str, message: str
+) -> None:
     path = tmp_path / "path.csv"
     write_camera_path(path, some_path(), "dron2")
     path.write_text(path.read_text().replace(before, after, 1))

@@ -1,4 +1,4 @@
-"""`psotrack fuse` on files: tracks that other commands read, a report, and one line for what is wrong."""
+"""`psotrack fuse` on files: tracks that other commands read, a report, and errors in one line."""
 
 import json
 from dataclasses import replace
@@ -16,7 +16,7 @@ from psotrack.trajectories import read_trajectories, write_trajectories
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """Two paths, the tracks with their labels exchanged from frame 60 on, and the truth."""
+    """Two paths, the tracks with an identity swap at frame 60, and the ground truth."""
     folder = tmp_path_factory.mktemp("fuse")
     paths, outside, truths = recording(31, 100, num_drones=2, apart_m=1.5)
     outside.position_m[60:, [0, 1]] = outside.position_m[60:, [1, 0]]
@@ -47,7 +47,7 @@ def test_files_are_fused_into_tracks_that_other_commands_read(files, tmp_path) -
     fused = read_trajectories(out)
     assert fused.drones == ("dron1", "dron2")
     for drone, (truth_m, _) in enumerate(truths):
-        # Frames without a pose are as good as the outside, 7 mm, and as the arm is turned over the gap.
+        # Frames without a pose are as good as the outside, 7 mm, with an interpolated direction of the arm.
         assert rms(fused.position_m[:, drone] - truth_m) < 0.005
     assert np.isfinite(fused.covariance_m2).all()
     assert fused.seen.all()
@@ -58,7 +58,7 @@ def test_files_are_fused_into_tracks_that_other_commands_read(files, tmp_path) -
     assert content["point"] == "camera"
     assert [one["frame"] for one in content["exchanges"]] == [60, 60]
     drone = content["drones"][0]
-    # Track 0, which was lost from frame 80 to 89, was the second drone's by then.
+    # Track 0, which is lost from frame 80 to 89, belongs to the second drone there.
     assert (drone["frames_both"], drone["frames_inside"], drone["frames_outside"]) == (90, 0, 10)
     assert content["drones"][1]["frames_inside"] == 10
     assert np.allclose(drone["lever_arm_m"], [0.01, 0.03, -0.12], atol=0.005)
@@ -84,7 +84,7 @@ def test_options(files, tmp_path) -> None:
     content = json.loads(done.output)
     assert content["point"] == "middle"
     assert content["others"] == ["0"]
-    # The clocks are one: within four standard deviations.
+    # Both clocks are the same: within four standard deviations.
     assert abs(content["drones"][0]["offset_s"]) < 4 * content["drones"][0]["offset_std_s"]
     before = out.read_bytes()
     assert run(*words, "-q", "--force").output == ""
@@ -126,7 +126,7 @@ def test_options(files, tmp_path) -> None:
         (["dron1.csv", "blind.csv", "--out", "new.csv"], InputError, "blind.csv: expected a position in at"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(files, words, error, sentence) -> None:
+def test_errors_are_one_line(files, words, error, sentence) -> None:
     folder, _ = files
     done = run(*(folder / word if word.endswith((".csv", ".txt")) else word for word in words))
     assert isinstance(done.exception, PsotrackError)
@@ -136,7 +136,7 @@ def test_what_is_wrong_is_said_in_one_line(files, words, error, sentence) -> Non
     assert not (folder / "new.csv").exists()
 
 
-def test_tracks_of_another_recording_are_said_not_to_be_fused(files, tmp_path) -> None:
+def test_tracks_of_another_recording_are_reported_as_not_fused(files, tmp_path) -> None:
     folder, _ = files
     done = run(folder / "dron1.csv", folder / "elsewhere.csv", "--out", tmp_path / "fused.csv")
     assert "dron1: no track, kept as it is" in done.output

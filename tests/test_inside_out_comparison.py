@@ -1,4 +1,4 @@
-"""A camera's path against a reference apart from it: hand-worked tables, planted clocks, arms and turns."""
+"""Comparison of a camera's path with a reference: tables worked by hand, planted clock offsets, arms and turns."""
 
 from dataclasses import replace
 
@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.inside_out import CameraPath
-from psotrack.inside_out.comparison import Statistics, compare, mean_rotation, wrapped_deg
-from psotrack.inside_out.comparison.clocks import at_times
-from psotrack.inside_out.comparison.plots import RECONSTRUCTED, REFERENCE, save_errors, save_paths
+from psotrack.inside_out.comparison import Statistics, compare_paths, mean_rotation, wrap_deg
+from psotrack.inside_out.comparison.clocks import interpolate_orientations
+from psotrack.inside_out.comparison.plots import RECONSTRUCTED, REFERENCE, save_path_errors, save_paths
 from psotrack.trajectories import Status
 
 FPS = 25.0
-#: Columns: the axes of a camera that looks ahead, in a body with x ahead and z up.
+#: Columns: the axes of a camera that looks ahead, in the axes of a body (x ahead, z up).
 LOOKS_AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
@@ -38,7 +38,7 @@ def path_of(time_s, position_m, wxyz) -> CameraPath:
 
 
 def flown_m(time_s, speed_m_s=1.0, seed=0):
-    """Motion of about this speed that never repeats: (times, 3)."""
+    """Motion that never repeats, at about this speed: (times, 3), metres."""
     rng = np.random.default_rng(seed)
     rate, phase = rng.uniform(0.4, 1.6, (4, 3)), rng.uniform(0, 2 * np.pi, (4, 3))
     angle = rate * np.asarray(time_s)[:, None, None] + phase
@@ -46,7 +46,7 @@ def flown_m(time_s, speed_m_s=1.0, seed=0):
 
 
 def turned(time_s, seed=1) -> Rotation:
-    """A body that goes about and sways a little, so that yaw passes 180 degrees, likewise."""
+    """Orientations of a body that turns around and sways a little, so that yaw passes 180 degrees, at each time."""
     sway_deg = 12.0 * flown_m(time_s, 1.0, seed)
     return Rotation.from_euler("ZYX", sway_deg * [15, 1, 1] + [170, -18, 0], degrees=True)
 
@@ -56,13 +56,13 @@ def wxyz_of(rotation: Rotation):
 
 
 def recording(rate_hz=100.0, seconds=13.0, clock_s=0.0):
-    """Times by a clock that is ahead, and where the body is at each."""
+    """Times by a clock that is ahead, and positions and orientations of the body at these times."""
     time_s = 0.0031 + np.arange(int(seconds * rate_hz)) / rate_hz
     return time_s + clock_s, flown_m(time_s), wxyz_of(turned(time_s))
 
 
 def filmed(arm_m=(0.0, 0.0, 0.0), turn=None, seconds=10.0, start_s=1.5, noise_m=0.0, noise_deg=0.0, seed=0):
-    """A path of the camera that the body of `recording` carries."""
+    """Path of the camera on the body of `recording`."""
     rng = np.random.default_rng(seed)
     time_s = start_s + np.arange(int(seconds * FPS)) / FPS
     body = turned(time_s)
@@ -73,7 +73,7 @@ def filmed(arm_m=(0.0, 0.0, 0.0), turn=None, seconds=10.0, start_s=1.5, noise_m=
 
 
 class TestTablesByHand:
-    """Five frames of a flight in the horizontal plane, whose reference is four times as fast and longer."""
+    """Five frames of a flight in the horizontal plane, with a longer reference at four times the rate."""
 
     TIME_S = 0.2 + np.arange(5) / FPS
     SAMPLES_S = np.arange(60) / 100
@@ -84,23 +84,23 @@ class TestTablesByHand:
 
     @staticmethod
     def going_about(yaw_deg):
-        """Cameras that look along the horizon, to a yaw."""
+        """Orientations of cameras that look along the horizon, at these yaw angles."""
         ahead = Rotation.from_matrix(LOOKS_AHEAD)
         return Rotation.from_euler("Z", np.reshape(yaw_deg, (-1, 1)), degrees=True) * ahead
 
     def test_table_7(self):
-        """Errors are straight up: no offset makes them less."""
+        """Errors are vertical, so that no offset makes them smaller."""
         error_m = np.array([0.01, 0.02, 0.03, 0.04, 0.10])
         position_m = self.level_m(self.TIME_S) + error_m[:, None] * [0, 0, 1]
         path = path_of(self.TIME_S, position_m, np.tile([1.0, 0, 0, 0], (5, 1)))
-        found = compare(
+        found = compare_paths(
             path, self.SAMPLES_S, self.level_m(self.SAMPLES_S), with_lever_arm=False, max_offset_s=0.1
         )
-        # The least mean is found to 1e-6 s, in which the drone flies 1e-5 m: 5e-9 m across to 0.01 m up.
+        # The offset is found to 1e-6 s, in which the drone flies 1e-5 m: 5e-9 m beside an error of 0.01 m.
         assert found.offset_s == pytest.approx(0, abs=2e-6)
         np.testing.assert_allclose(found.distance_m, error_m, atol=1e-8)
         table = Statistics.of(found.distance_m)
-        # Squares of -3, -2, -1, 0 and 6 hundredths: 50 / 5.
+        # Squared deviations of -3, -2, -1, 0 and 6 hundredths: 50 / 5.
         expected = [0.20 / 5, 0.03, np.sqrt(50 / 5) / 100, 0.01, 0.10]
         assert [table.mean, table.median, table.std, table.minimum, table.maximum] == pytest.approx(expected)
         assert table.count == 5
@@ -109,11 +109,11 @@ class TestTablesByHand:
         np.testing.assert_allclose(found.distance_to_point_m, found.distance_m)
 
     def test_table_8(self):
-        """Yaw goes from 176 to 184 degrees, which is -176: differences are wrapped."""
+        """Yaw goes from 176 to 184 degrees, which is -176 degrees: differences are wrapped."""
         yaw_deg, error_deg = 176.0 + 2 * np.arange(5), np.array([1.0, 3.0, -2.0, 0.5, -5.0])
         path = path_of(self.TIME_S, self.level_m(self.TIME_S), wxyz_of(self.going_about(yaw_deg + error_deg)))
         yaws_deg = 176.0 + 2 * FPS * (self.SAMPLES_S - 0.2)
-        found = compare(
+        found = compare_paths(
             path,
             self.SAMPLES_S,
             self.level_m(self.SAMPLES_S),
@@ -122,20 +122,20 @@ class TestTablesByHand:
             with_turn=False,
             max_offset_s=0.1,
         )
-        # 50 degrees per second, by offsets of 2e-6 s.
+        # 50 degrees per second, for an offset error of 2e-6 s.
         np.testing.assert_allclose(found.turning.difference_deg[:, 2], error_deg, atol=1e-4)
         np.testing.assert_allclose(found.turning.difference_deg[:, :2], 0, atol=1e-6)
         np.testing.assert_allclose(found.turning.angle_deg, np.abs(error_deg), atol=1e-4)
         np.testing.assert_array_equal(found.turning.turn_wxyz, [1, 0, 0, 0])
         assert found.turning.offset_s == found.offset_s
         table = Statistics.of(found.turning.difference_deg[:, 2])
-        # About the mean, -1/2: 1.5, 3.5, -1.5, 1 and -4.5, whose squares are 38 / 5 on average.
+        # Deviations from the mean of -1/2 are 1.5, 3.5, -1.5, 1 and -4.5; their squares average 38 / 5.
         expected = [-2.5 / 5, 0.5, np.sqrt(38 / 5), -5.0, 3.0]
         assert [table.mean, table.median, table.std, table.minimum, table.maximum] == pytest.approx(
             expected, abs=1e-4
         )
 
-    def test_nothing_has_no_statistics(self):
+    def test_statistics_without_values_are_nan(self):
         table = Statistics.of(np.full(3, np.nan))
         assert table.count == 0
         assert np.isnan([table.mean, table.median, table.std, table.minimum, table.maximum]).all()
@@ -147,25 +147,25 @@ class TestAngles:
         [(180, 180), (-180, 180), (181, -179), (-181, 179), (359, -1), (-359, 1), (540, 180), (0, 0)],
     )
     def test_wrapping(self, angle_deg, expected_deg):
-        assert wrapped_deg(np.array([float(angle_deg)])) == pytest.approx([expected_deg])
+        assert wrap_deg(np.array([float(angle_deg)])) == pytest.approx([expected_deg])
 
     @given(st.floats(-1e4, 1e4))
     def test_wrapped_angles_are_the_same_angles(self, angle_deg):
-        found = wrapped_deg(np.array([angle_deg]))[0]
+        found = wrap_deg(np.array([angle_deg]))[0]
         assert -180 < found <= 180
-        # Sums of up to 1e4 are rounded to 2e-12.
+        # Sums of up to 1e4 have rounding errors of 2e-12.
         assert np.exp(1j * np.radians(found)) == pytest.approx(np.exp(1j * np.radians(angle_deg)), abs=1e-12)
 
     @given(st.integers(0, 2**32 - 1))
     @settings(max_examples=5)
-    def test_differences_and_angles_of_any_orientations(self, seed):
-        """Against SciPy: its Euler angles of the body, and the magnitude of the rotation between."""
+    def test_differences_and_angles_of_random_orientations(self, seed):
+        """Against SciPy's Euler angles of the body, and the magnitude of the rotation between the two."""
         path = filmed(seconds=4)
         rng = np.random.default_rng(seed)
         errors = Rotation.from_rotvec(rng.normal(0, 0.3, (path.num_frames, 3)))
         poses = Rotation.from_quat(path.orientation_wxyz, scalar_first=True) * errors
         time_s, position_m, wxyz = recording(seconds=8)
-        found = compare(
+        found = compare_paths(
             replace(path, orientation_wxyz=wxyz_of(poses)),
             time_s,
             position_m,
@@ -174,7 +174,7 @@ class TestAngles:
             with_turn=False,
             max_offset_s=0.1,
         ).turning
-        # Great arcs of 10 ms cut what turns by up to 20 rad/s² short by h² / 8 of it: 2.5e-4 rad.
+        # Great arcs over h = 10 ms miss h² / 8 of an angular acceleration of up to 20 rad/s²: 2.5e-4 rad.
         np.testing.assert_allclose(found.angle_deg, np.degrees(errors.magnitude()), atol=0.02)
         ahead = Rotation.from_matrix(LOOKS_AHEAD).inv()
         euler_deg = [
@@ -182,23 +182,23 @@ class TestAngles:
             for one in (poses, Rotation.from_quat(found.reference_wxyz, scalar_first=True))
         ]
         difference_deg = (euler_deg[0] - euler_deg[1] + 180) % 360 - 180
-        np.testing.assert_allclose(wrapped_deg(found.difference_deg - difference_deg), 0, atol=1e-6)
+        np.testing.assert_allclose(wrap_deg(found.difference_deg - difference_deg), 0, atol=1e-6)
 
     @pytest.mark.parametrize("share", [0.0, 0.3])
-    def test_the_mean_rotation_is_not_moved_by_others(self, share):
+    def test_the_mean_rotation_is_robust_to_outliers(self, share):
         rng = np.random.default_rng(5)
         true = Rotation.random(rng=rng)
         near = true * Rotation.from_rotvec(rng.normal(0, 0.01, (200, 3)))
         wild = Rotation.random(int(200 * share / (1 - share)), rng=rng)
         found = mean_rotation(Rotation.concatenate([near, wild]))
-        # The mean of 200 at 0.01 rad: 0.0007 along each axis; others pull no more than a few times that.
+        # The mean of 200 rotations with 0.01 rad: 0.0007 along each axis; outliers move it by a few times as much.
         assert (true.inv() * found).magnitude() < (0.0025 if share == 0 else 0.006)
 
-    def test_between_samples_as_scipy_has_it_and_not_over_gaps(self):
+    def test_orientations_between_samples_equal_scipys_except_in_gaps(self):
         time_s, _, wxyz = recording(rate_hz=50, seconds=2)
         wxyz[30:40] = np.nan
         wanted_s = np.linspace(-0.1, 2.1, 301)
-        found = at_times(time_s, wxyz, wanted_s)
+        found = interpolate_orientations(time_s, wxyz, wanted_s)
         known = (wanted_s >= time_s[0]) & (wanted_s <= time_s[-1])
         known &= (wanted_s <= time_s[29]) | (wanted_s >= time_s[40])
         np.testing.assert_array_equal(np.isfinite(found).all(axis=-1), known)
@@ -206,15 +206,17 @@ class TestAngles:
         oracle = Slerp(time_s[there], Rotation.from_quat(wxyz[there], scalar_first=True))(wanted_s[known])
         turns = Rotation.from_quat(found[known], scalar_first=True).inv() * oracle
         assert turns.magnitude().max() < 1e-7
-        # A sample that misses is no gap, and a single one is nothing to go between.
+        # A single missing sample is no gap, and a single sample has no interval.
         wxyz = recording(rate_hz=50, seconds=2)[2]
         wxyz[30] = np.nan
-        assert np.isfinite(at_times(time_s, wxyz, time_s)).all()
-        assert np.isnan(at_times(time_s[:1], wxyz[:1], time_s)).all()
-        # A quaternion and its negative are one orientation.
+        assert np.isfinite(interpolate_orientations(time_s, wxyz, time_s)).all()
+        assert np.isnan(interpolate_orientations(time_s[:1], wxyz[:1], time_s)).all()
+        # A quaternion and its negative are the same orientation.
         signs = np.where(np.arange(len(wxyz)) % 3, 1.0, -1.0)[:, None]
-        same = at_times(time_s, signs * wxyz, wanted_s[known])
-        np.testing.assert_allclose(np.abs((same * at_times(time_s, wxyz, wanted_s[known])).sum(axis=-1)), 1)
+        same = interpolate_orientations(time_s, signs * wxyz, wanted_s[known])
+        np.testing.assert_allclose(
+            np.abs((same * interpolate_orientations(time_s, wxyz, wanted_s[known])).sum(axis=-1)), 1
+        )
 
 
 TURN = Rotation.from_euler("ZYX", [-90.0, 4.0, -97.0], degrees=True)
@@ -226,29 +228,29 @@ class TestClocks:
         ("clock_s", "turn_clock_s"),
         [(0.3137, None), (-0.2719, None), (-0.2719, 0.1573), (512.2345, -77.03)],
     )
-    def test_planted_offsets_arm_and_turn(self, clock_s, turn_clock_s):
-        """Positions at 100 Hz by one clock, orientations by theirs, or at 40 Hz by another."""
+    def test_planted_offsets_arm_and_turn_are_found(self, clock_s, turn_clock_s):
+        """Positions at 100 Hz by one clock; orientations by the same clock, or at 40 Hz by another clock."""
         path = filmed(ARM_M, TURN, noise_m=0.005, noise_deg=0.2)
         time_s, position_m, wxyz = recording(clock_s=clock_s)
         turns = {}
         if turn_clock_s is not None:
             orientation_time_s, _, wxyz = recording(rate_hz=40, clock_s=turn_clock_s)
             turns = {"orientation_time_s": orientation_time_s}
-        found = compare(path, time_s, position_m, wxyz, **turns)
-        # The figure to reach: 0.1 frame. Here the noise allows a fiftieth.
+        found = compare_paths(path, time_s, position_m, wxyz, **turns)
+        # The aim is 0.1 frame. Here the noise allows a fiftieth of a frame.
         assert abs(found.offset_s - clock_s) * FPS < 0.05
         assert found.offset_std_s * FPS < 0.05
         expected_s = clock_s if turn_clock_s is None else turn_clock_s
         assert abs(found.turning.offset_s - expected_s) * FPS < 0.05
-        # Medians of 250: of 5 mm, 0.4 mm; of 0.2 degrees, 0.015. Six times that.
+        # Medians of 250 values: of 5 mm, 0.4 mm; of 0.2 degrees, 0.015. Six times as much.
         np.testing.assert_allclose(found.lever_arm_m, ARM_M, atol=0.0024)
         turn = Rotation.from_quat(found.turning.turn_wxyz, scalar_first=True)
         assert np.degrees((TURN.inv() * turn).magnitude()) < 0.1
-        # Means of distances in three dimensions are √(8 / π) of the noise along each; to 42 % / √250, thrice.
+        # The mean distance in three dimensions is √(8 / π) of the noise along each axis, to 42 % / √250; three times.
         of_noise = np.sqrt(8 / np.pi)
         assert np.mean(found.distance_m) == pytest.approx(0.005 * of_noise, rel=0.08)
         assert np.mean(found.turning.angle_deg) == pytest.approx(0.2 * of_noise, rel=0.08)
-        # The arm of 0.13 m, give or take the noise.
+        # The arm of 0.13 m, within the noise.
         assert np.mean(found.distance_to_point_m) == pytest.approx(np.linalg.norm(ARM_M), abs=0.002)
         body_m = flown_m(path.time_s) + turned(path.time_s).apply(ARM_M)
         np.testing.assert_allclose(found.reference_m, body_m, atol=0.006)
@@ -256,44 +258,44 @@ class TestClocks:
             np.linalg.norm(np.diff(body_m, axis=0), axis=1).sum(), rel=0.01
         )
 
-    def test_an_arm_without_orientations_of_the_reference(self):
-        """The path's own carry it, and it is told in the camera's axes."""
+    def test_a_lever_arm_without_orientations_of_the_reference(self):
+        """The path's orientations turn the arm, which is returned in the camera's axes."""
         path = filmed(ARM_M, TURN, noise_m=0.005, noise_deg=0.2)
         time_s, position_m, _ = recording(clock_s=0.3137)
-        found = compare(path, time_s, position_m)
+        found = compare_paths(path, time_s, position_m)
         assert abs(found.offset_s - 0.3137) * FPS < 0.05
         np.testing.assert_allclose(found.lever_arm_m, TURN.inv().apply(ARM_M), atol=0.0024)
         assert found.turning is None
 
     @pytest.mark.parametrize("turn_clock_s", [None, 0.1573])
-    def test_a_slow_drone_with_a_long_arm_that_turns_about(self, turn_clock_s):
-        """Taken for one in the world, the arm would be most of what is seen of the motion."""
+    def test_a_slow_drone_with_a_long_lever_arm_that_turns(self, turn_clock_s):
+        """With a constant arm in the world instead of the body, most of the visible motion would be the arm's."""
         path, (time_s, _, _) = filmed(noise_deg=0.2), recording()
         slow_m = [flown_m(each_s, speed_m_s=0.3) for each_s in (path.time_s, time_s)]
         moved_m = slow_m[0] + turned(path.time_s).apply([0.2, -0.1, 0.12])
         path = replace(path, position_m=moved_m + np.random.default_rng(1).normal(0, 0.002, moved_m.shape))
         turns_s, _, wxyz = recording(rate_hz=40, clock_s=turn_clock_s or 0)
         by_own_clock = {} if turn_clock_s is None else {"orientation_time_s": turns_s}
-        found = compare(path, time_s + 0.7, slow_m[1], wxyz if by_own_clock else None, **by_own_clock)
+        found = compare_paths(path, time_s + 0.7, slow_m[1], wxyz if by_own_clock else None, **by_own_clock)
         assert abs(found.offset_s - 0.7) * FPS < 0.05
         np.testing.assert_allclose(
             np.linalg.norm(found.lever_arm_m), np.linalg.norm([0.2, -0.1, 0.12]), atol=2e-3
         )
 
     @pytest.mark.parametrize("turn_clock_s", [0.1573, -0.4081])
-    def test_axes_that_are_the_bodys_own(self, turn_clock_s):
+    def test_a_camera_with_the_axes_of_the_body(self, turn_clock_s):
         path = filmed(noise_deg=0.2)
         turns_s, _, wxyz = recording(rate_hz=40, clock_s=turn_clock_s)
         time_s, position_m, _ = recording()
-        found = compare(
+        found = compare_paths(
             path, time_s, position_m, wxyz, orientation_time_s=turns_s, with_turn=False, with_lever_arm=False
         )
         assert abs(found.turning.offset_s - turn_clock_s) * FPS < 0.05
         np.testing.assert_array_equal(found.turning.turn_wxyz, [1, 0, 0, 0])
         assert np.median(found.turning.angle_deg) < 0.5
 
-    def test_outliers_are_left_in_and_do_not_move_the_clocks(self):
-        """Every eighth pose is anywhere in the room, and one of them is ten kilometres away."""
+    def test_outliers_are_counted_and_do_not_move_the_clocks(self):
+        """Every eighth pose is anywhere in the room, and one pose is ten kilometres away."""
         path = filmed(ARM_M, TURN, noise_m=0.005, noise_deg=0.2)
         wild = np.arange(3, path.num_frames, 8)
         rng = np.random.default_rng(2)
@@ -305,10 +307,10 @@ class TestClocks:
         turns_s, _, turns_wxyz = recording(rate_hz=40, clock_s=0.4)
         wrong = replace(path, position_m=position_m, orientation_wxyz=orientation_wxyz)
         for turns, wxyz_used in (({}, wxyz), ({"orientation_time_s": turns_s}, turns_wxyz)):
-            found = compare(wrong, time_s, reference_m, wxyz_used, **turns)
+            found = compare_paths(wrong, time_s, reference_m, wxyz_used, **turns)
             assert abs(found.offset_s + 0.2719) * FPS < 0.1
             assert abs(found.turning.offset_s - (0.4 if turns else -0.2719)) * FPS < 0.1
-            # None is hidden: 10 km stay in the mean and the maximum.
+            # No outlier is left out: 10 km stay in the mean and the maximum.
             assert Statistics.of(found.distance_m).count == path.num_frames
             assert np.max(found.distance_m) > 9e3
             assert np.max(found.turning.angle_deg) > 90
@@ -322,25 +324,25 @@ class TestClocks:
         time_s, position_m, wxyz = recording()
         position_m[(time_s > 8) & (time_s < 8.5)] = np.nan
         wxyz[(time_s > 9) & (time_s < 10)] = np.nan
-        found = compare(path, time_s, position_m, wxyz)
+        found = compare_paths(path, time_s, position_m, wxyz)
         assert abs(found.offset_s) * FPS < 0.05
         lost = np.isin(path.frame, [*range(40, 60), *range(80, 90)])
-        # Both ends of a gap are within a step of 10 ms.
+        # Both ends of a gap are right to a step of 10 ms.
         no_position = (path.time_s > 7.99) & (path.time_s < 8.51)
         no_turn = (path.time_s > 8.99) & (path.time_s < 10.01)
         np.testing.assert_array_equal(np.isnan(found.distance_m), lost | no_position | no_turn)
         np.testing.assert_array_equal(np.isnan(found.distance_to_point_m), lost | no_position)
         np.testing.assert_array_equal(np.isnan(found.turning.angle_deg), lost | no_turn)
         np.testing.assert_array_equal(np.isnan(found.turning.difference_deg).any(axis=1), lost | no_turn)
-        # Where the reference is known it is told, though there is no pose.
+        # A known reference is returned in frames without a pose, too.
         assert np.isfinite(found.reference_m[lost]).all()
 
     @given(st.integers(0, 2**32 - 1), st.floats(-100, 100))
     @settings(max_examples=2)
-    def test_where_the_world_begins_and_how_it_is_turned_does_not_matter(self, seed, later_s):
+    def test_the_comparison_does_not_depend_on_the_worlds_axes(self, seed, later_s):
         path = filmed(ARM_M, TURN, noise_m=0.01, noise_deg=0.5, seed=seed, seconds=8)
         time_s, position_m, wxyz = recording(rate_hz=50, seconds=12)
-        first = compare(path, time_s, position_m, wxyz)
+        first = compare_paths(path, time_s, position_m, wxyz)
         world = Rotation.random(rng=np.random.default_rng(seed))
         moved = replace(
             path,
@@ -349,22 +351,22 @@ class TestClocks:
             orientation_wxyz=wxyz_of(world * Rotation.from_quat(path.orientation_wxyz, scalar_first=True)),
         )
         turned_wxyz = wxyz_of(world * Rotation.from_quat(wxyz, scalar_first=True))
-        again = compare(moved, time_s + later_s, world.apply(position_m) + 7.0, turned_wxyz)
-        # Offsets are found to 1e-6 s, in which it flies 1e-6 m and turns 1e-4 degrees.
+        again = compare_paths(moved, time_s + later_s, world.apply(position_m) + 7.0, turned_wxyz)
+        # Offsets are found to 1e-6 s, in which the camera moves by 1e-6 m and turns by 1e-4 degrees.
         assert again.offset_s == pytest.approx(first.offset_s, abs=5e-6)
         np.testing.assert_allclose(again.distance_m, first.distance_m, atol=2e-5)
         np.testing.assert_allclose(again.lever_arm_m, first.lever_arm_m, atol=2e-5)
         np.testing.assert_allclose(again.turning.angle_deg, first.turning.angle_deg, atol=2e-3)
 
 
-class TestWhatCannotBeCompared:
+class TestRefusedComparisons:
     def refused(self, text, path, *reference, error=InputError, **options):
         with pytest.raises(error, match=text) as caught:
-            compare(path, *reference, **options)
+            compare_paths(path, *reference, **options)
         assert "\n" not in str(caught.value)
 
-    def test_clocks_apart(self):
-        """Nothing in common at any offset that is allowed."""
+    def test_clocks_too_far_apart(self):
+        """The two have nothing in common at any allowed offset."""
         time_s, position_m, _ = recording(clock_s=100)
         self.refused(
             "expected positions of both at offsets within 2 s, found none",
@@ -409,7 +411,7 @@ class TestWhatCannotBeCompared:
         path.position_m[:] = still_m + rng.normal(0, 0.01, path.position_m.shape)
         time_s, _, wxyz = recording()
         reference_m = np.tile(still_m, (len(time_s), 1))
-        # However much it turns meanwhile.
+        # Turning does not help.
         self.refused("hover", path, time_s, reference_m)
         self.refused("hover", path, time_s, reference_m, wxyz)
         self.refused("hover", path, time_s, reference_m, wxyz, orientation_time_s=time_s)
@@ -430,13 +432,13 @@ class TestWhatCannotBeCompared:
 @pytest.fixture(scope="module")
 def flown():
     path = filmed(ARM_M, TURN, noise_m=0.05, noise_deg=0.5)
-    return path, compare(path, *recording())
+    return path, compare_paths(path, *recording())
 
 
-class TestPictures:
+class TestPlots:
     @staticmethod
     def of_colour(png, colour):
-        """Whether each pixel has a colour, #rrggbb, nearly."""
+        """Which pixels have about this colour, #rrggbb."""
         bgr = [int(colour[place : place + 2], 16) for place in (5, 3, 1)]
         return np.abs(cv2.imread(str(png)).astype(int) - bgr).max(axis=-1) < 40
 
@@ -448,10 +450,10 @@ class TestPictures:
             assert self.of_colour(png, colour).sum() > 500
         with pytest.raises(OutputError, match="expected a path that does not exist yet"):
             save_paths(png, path, comparison)
-        # One pose far away does not make the picture small; the caption counts it.
+        # A pose far away does not change the scale of the plot; the caption counts it.
         wild = replace(path, position_m=path.position_m.copy())
         wild.position_m[100] = 1e4
-        save_paths(tmp_path / "wild.png", wild, compare(wild, *recording()), caption="a flight")
+        save_paths(tmp_path / "wild.png", wild, compare_paths(wild, *recording()), caption="a flight")
         # Measured 0.99 of the pixels: a piece of the line is missing.
         assert (
             self.of_colour(tmp_path / "wild.png", REFERENCE).sum()
@@ -462,10 +464,12 @@ class TestPictures:
         path, comparison = flown
         wild = replace(path, position_m=path.position_m.copy())
         wild.position_m[100] += 500.0
-        save_errors(tmp_path / "errors.png", {"one": comparison, "other": compare(wild, *recording())})
+        save_path_errors(
+            tmp_path / "errors.png", {"one": comparison, "other": compare_paths(wild, *recording())}
+        )
         picture = cv2.imread(str(tmp_path / "errors.png"))
         assert picture.std() > 5
-        # Without orientations there is one panel.
+        # Without orientations there is only one panel.
         time_s, position_m, _ = recording()
-        save_errors(tmp_path / "distances.png", {"one": compare(path, time_s, position_m)})
+        save_path_errors(tmp_path / "distances.png", {"one": compare_paths(path, time_s, position_m)})
         assert cv2.imread(str(tmp_path / "distances.png")).shape[0] < 0.6 * picture.shape[0]

@@ -1,5 +1,5 @@
 """The causal filter over camera poses: its manifold against SciPy, its arithmetic against a textbook filter, its
-covariance against truth, and what it does with outliers, wrong starts, gaps and ambiguous poses."""
+covariance against ground truth, and outliers, wrong first poses, gaps and ambiguous poses."""
 
 from dataclasses import replace
 
@@ -15,14 +15,14 @@ from psotrack.errors import InputError, SettingsError
 from psotrack.inside_out import CameraPath, Flag, PoseFilterParams, smooth
 from psotrack.inside_out.filtering import manifold as manifold
 from psotrack.inside_out.filtering import motion as pose_motion
-from psotrack.inside_out.filtering.path_rows import path_of, rows_of
+from psotrack.inside_out.filtering.path_rows import join_rows, split_path
 from psotrack.inside_out.filtering.pose_filter import (
     FilterRun,
     MeasuredPose,
     advance,
     estimate,
     expected,
-    follow,
+    filter_path,
     init,
     predict,
     step,
@@ -32,12 +32,12 @@ from psotrack.trajectories import Status
 
 FPS = 25.0
 STD_M, STD_RAD = 0.004, 0.0008
-#: Within this is 90 % of a chi-square distribution with 3 degrees of freedom.
+#: The 90 % quantile of the chi-square distribution with 3 degrees of freedom.
 NINETY = chi2.ppf(0.9, 3)
 
 
 def spread() -> np.ndarray:
-    """Covariance of poses: to the side and about the vertical axis a camera cannot tell well what it did."""
+    """Covariance of poses: shifts to the side and turns about the vertical axis are correlated, as in real poses."""
     covariance = np.diag([STD_M**2] * 3 + [STD_RAD**2] * 3)
     covariance[0, 4] = covariance[4, 0] = 0.8 * STD_M * STD_RAD
     covariance[1, 3] = covariance[3, 1] = -0.8 * STD_M * STD_RAD
@@ -45,9 +45,9 @@ def spread() -> np.ndarray:
 
 
 def flight(frames, *, acceleration=2.0, wobble=2.0, seed=0):
-    """A camera with white forces through a damping, and raw poses whose errors partly last.
+    """A camera with white forces through a damping, and raw poses with partly lasting errors.
 
-    Another motion than the filter's, with errors that last otherwise too (half a second).
+    The motion differs from the filter's, and so does the duration of lasting errors (half a second).
 
     Returns:
         Raw poses, and the true positions (frames, 3) and orientations.
@@ -95,7 +95,7 @@ def raw_path(position_m, orientation, time_s=None) -> CameraPath:
 
 
 def without(path: CameraPath, gone) -> CameraPath:
-    """The path without the poses of some frames."""
+    """The path with the poses of some frames lost."""
     values = {
         name: getattr(path, name).copy()
         for name in ("position_m", "orientation_wxyz", "covariance", "ambiguity", "reprojection_px")
@@ -108,7 +108,7 @@ def without(path: CameraPath, gone) -> CameraPath:
 
 
 def misplaced(path: CameraPath, rows, shift_m, turn=(0.0, 0.0, 0.0)) -> CameraPath:
-    """The path with some poses elsewhere."""
+    """The path with some poses shifted and turned."""
     position_m, orientation_wxyz = path.position_m.copy(), path.orientation_wxyz.copy()
     position_m[rows] += shift_m
     there = Rotation.from_quat(orientation_wxyz[rows], scalar_first=True) * Rotation.from_rotvec(turn)
@@ -117,14 +117,14 @@ def misplaced(path: CameraPath, rows, shift_m, turn=(0.0, 0.0, 0.0)) -> CameraPa
 
 
 def errors(path: CameraPath, position_m, truth):
-    """Truth less what is told, (told, 3) each, along the world's axes and about the camera's, where a pose is told."""
-    told = path.seen
-    turn = Rotation.from_quat(path.orientation_wxyz[told], scalar_first=True).inv() * truth[told]
-    return position_m[told] - path.position_m[told], turn.as_rotvec()
+    """Truth less estimate, (seen, 3) each, along the world's axes and about the camera's, in frames with a pose."""
+    seen = path.seen
+    turn = Rotation.from_quat(path.orientation_wxyz[seen], scalar_first=True).inv() * truth[seen]
+    return position_m[seen] - path.position_m[seen], turn.as_rotvec()
 
 
 def share_within(error, covariance) -> float:
-    """Of truths within the 90 % ellipsoids."""
+    """Share of errors within the 90 % ellipsoids."""
     return float((np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error) < NINETY).mean())
 
 
@@ -133,14 +133,14 @@ def a_pose(time_s=0.0, position_m=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0), ambigui
     return MeasuredPose(time_s, np.array(position_m, float), quaternion, spread(), ambiguity)
 
 
-# The manifold.
+# Manifold.
 
 turns = st.lists(st.floats(-1.7, 1.7), min_size=3, max_size=3).map(np.array)
 
 
 @given(turns, turns)
-def test_turns_are_scipys(first, second) -> None:
-    """Turned, and the turn between, to rounding; where angles are tiny, too."""
+def test_turns_equal_scipys(first, second) -> None:
+    """`turned` and `turn_between`, to rounding, for tiny angles as well."""
     for scale in (1.0, 1e-3, 1e-9):
         start = Rotation.from_rotvec(first)
         wxyz = start.as_quat(scalar_first=True)[None]
@@ -164,25 +164,25 @@ def test_jacobians_are_numerical_derivatives(scale, turn) -> None:
             Rotation.from_rotvec(turn) * Rotation.from_rotvec(sign * step_rad) for sign in (1, -1)
         )
         inverse[:, axis] = (ahead.as_rotvec() - behind.as_rotvec()) / (2 * small)
-    # Central differences: their error is of the order of the step's square, and of rounding by the step, 1e-10.
+    # Central differences: errors of the order of the squared step, and of rounding divided by the step, 1e-10.
     np.testing.assert_allclose(manifold.right_jacobian(turn[None])[0], right, atol=2e-9)
     np.testing.assert_allclose(manifold.right_jacobian_inverse(turn[None])[0], inverse, atol=2e-9)
 
 
-def test_half_a_turn_has_a_turn() -> None:
+def test_a_half_turn_is_found() -> None:
     start, end = np.array([[1.0, 0.0, 0.0, 0.0]]), np.array([[0.0, 0.6, 0.8, 0.0]])
     np.testing.assert_allclose(manifold.turn_between(start, end), [[0.6 * np.pi, 0.8 * np.pi, 0.0]])
 
 
-# The arithmetic of one level.
+# Arithmetic of one level.
 
 LEVEL = pose_motion.Levels(np.array([30.0]), np.array([0.5]))
-#: No errors that never change.
+#: No errors that are common to all frames.
 NONE = np.zeros((6, 0))
 
 
-def test_translation_of_a_camera_that_does_not_turn_is_a_textbook_filter() -> None:
-    """Kalman's equations as they are written, on position, velocity, acceleration and the error that lasts.
+def test_translation_of_a_camera_without_turns_equals_a_textbook_filter() -> None:
+    """Kalman's equations in textbook form, for position, velocity, acceleration and the lasting error.
 
     F and Q from the matrix exponential (C. F. Van Loan, Computing integrals involving the matrix exponential, 1978).
     """
@@ -220,13 +220,13 @@ def test_translation_of_a_camera_that_does_not_turn_is_a_textbook_filter() -> No
         found = np.concatenate(
             [motion.position_m, motion.velocity_m_s, motion.acceleration_m_s2, motion.lasting[:, :3]], axis=1
         )
-        # Measured: 1e-11 of the largest of their kind, velocities' variances of 25 being cancelled to 1e-3.
+        # Measured: 1e-11 of the largest value of each kind; velocities' variances of 25 are cancelled to 1e-3.
         np.testing.assert_allclose(found[0], x, rtol=1e-8, atol=1e-9)
         np.testing.assert_allclose(motion.covariance[0][np.ix_(part, part)], P, rtol=1e-7, atol=1e-10)
 
 
-def test_errors_go_where_f_takes_them() -> None:
-    """F is the numerical derivative of the motion, turns included."""
+def test_transition_matrix_is_the_derivative_of_the_motion() -> None:
+    """F equals the numerical derivative of the motion, turns included."""
     rng = np.random.default_rng(2)
     orientation_wxyz = Rotation.random(rng=rng).as_quat(scalar_first=True)
     motion = pose_motion.initial_motion(rng.normal(size=3), orientation_wxyz, spread(), NONE, LEVEL)
@@ -241,10 +241,10 @@ def test_errors_go_where_f_takes_them() -> None:
         np.testing.assert_allclose(F[0, :, k], slope[0], atol=1e-8)
 
 
-def test_one_level_knows_how_well_it_knows() -> None:
-    """Cameras that move as the level says: the squared error in units of the covariance (NEES) is 21 on the mean.
+def test_covariance_of_one_level_is_consistent() -> None:
+    """Cameras that move as the level assumes: the normalised estimation error squared (NEES) is 21 on average.
 
-    Two errors never change, and do something else to each frame's pose.
+    Two errors are common to all frames, with another effect on each frame's pose.
     """
     rng = np.random.default_rng(3)
     frames, runs, dt_s = 6, 60, 0.04
@@ -267,28 +267,30 @@ def test_one_level_knows_how_well_it_knows() -> None:
             off = lasting_root @ truth.lasting[0] + white_root @ rng.normal(size=6) + common @ never_changing
             seen_wxyz = manifold.turned(truth.orientation_wxyz, off[None, 3:])[0]
             motion, _ = pose_motion.predict(motion, dt_s, LEVEL)
-            told = pose_motion.innovation(motion, truth.position_m[0] + off[:3], seen_wxyz, spread(), common)
-            motion = pose_motion.correct(motion, told)
+            innovation = pose_motion.innovation(
+                motion, truth.position_m[0] + off[:3], seen_wxyz, spread(), common
+            )
+            motion = pose_motion.correct(motion, innovation)
         error = pose_motion.difference(motion, truth)[0]
         whole = motion.covariance[0] + motion.common[0] @ motion.common[0].T
         squares.append(error @ np.linalg.solve(whole, error))
-    # The sum of independent chi-squares is one; 1 in 1000 such tests would fail on either side.
+    # The sum is chi-square distributed; 1 in 1000 such tests would fail on either side.
     low, high = chi2.ppf([0.001, 0.999], 21 * runs) / runs
     assert low < np.mean(squares) < high
 
 
-# The filter on flights.
+# The filter on whole flights.
 
 
 @pytest.mark.parametrize(("acceleration", "wobble"), [(0.2, 0.5), (2.0, 2.0), (25.0, 25.0)])
-def test_hovering_or_racing_the_filter_is_no_worse_than_poses_and_knows_it(acceleration, wobble) -> None:
-    """Nobody tells it how the camera flies, nor for how long errors last."""
+def test_filter_improves_poses_for_hovering_and_racing_cameras(acceleration, wobble) -> None:
+    """The filter knows neither how the camera flies nor how long errors last."""
     raw, position_m, truth = flight(150, acceleration=acceleration, wobble=wobble, seed=6)
-    path = follow(raw)
+    path = filter_path(raw)
     assert (path.status[2:] != Status.LOST).all()
     off_m, off_rad = errors(path, position_m, truth)
     raw_off_m, raw_off_rad = errors(raw, position_m, truth)
-    # Most of the error lasts, and cannot be told from motion: not much is to be won.
+    # Most of the error lasts and cannot be separated from motion: the gain is small.
     assert np.median(np.linalg.norm(off_m, axis=1)) < 1.03 * np.median(np.linalg.norm(raw_off_m, axis=1))
     assert np.median(np.linalg.norm(off_rad, axis=1)) < 1.03 * np.median(np.linalg.norm(raw_off_rad, axis=1))
     covariance = path.covariance[path.seen]
@@ -297,39 +299,39 @@ def test_hovering_or_racing_the_filter_is_no_worse_than_poses_and_knows_it(accel
     speed_error = np.linalg.norm(
         path.velocity_m_s[10:] - np.gradient(position_m, raw.time_s, axis=0)[10:], axis=1
     )
-    # A frame's white error by the time of some frames, and what a racer's acceleration changes in one.
+    # The white error divided by the time of some frames, and the change of a racing camera's acceleration in a frame.
     assert np.median(speed_error) < 0.1 + acceleration / FPS
 
 
-def test_good_poses_are_gated_as_seldom_as_is_said() -> None:
+def test_good_poses_are_gated_as_seldom_as_stated() -> None:
     raw, _, _ = flight(300, acceleration=0.5, wobble=0.3, seed=6)
-    path = follow(raw, PoseFilterParams(false_alarm=0.03))
-    # 9 are expected of 300 where level and errors are as assumed; 20 would be 4 sigma off that.
+    path = filter_path(raw, PoseFilterParams(false_alarm=0.03))
+    # 9 of 300 are expected where level and errors are as assumed; 20 would be 4 sigma more.
     assert 1 <= ((path.flags & Flag.GATED) > 0).sum() <= 20
 
 
-def test_covariances_that_are_too_large_are_found_out() -> None:
+def test_too_large_covariances_are_scaled_down() -> None:
     raw, position_m, truth = flight(200, acceleration=0.5, wobble=0.5, seed=7)
     raw = replace(raw, covariance=4 * raw.covariance)
-    path = follow(raw)
+    path = filter_path(raw)
     late = slice(100, None)
     off_m, _ = errors(path, position_m, truth)
     assert share_within(off_m[late], path.covariance[path.seen][late, :3, :3]) > 0.8
-    # A quarter is right, a little less what a filter makes of it.
+    # A quarter is right; the filter reaches a little less.
     assert 0.15 < np.trace(path.covariance[-1]) / np.trace(raw.covariance[-1]) < 0.4
 
 
 @pytest.mark.parametrize("near", [False, True])
-def test_outliers_do_not_count(near) -> None:
-    """2 in 100 poses are elsewhere, and so is the very first, and two runs of some frames."""
+def test_outliers_are_not_used(near) -> None:
+    """2 in 100 poses are elsewhere, the very first pose too, and two runs of several frames."""
     raw, position_m, truth = flight(150, seed=8)
     bad = np.zeros(150, bool)
     bad[[0, 15, 40, 90]] = True
     bad[50:56], bad[110:118] = True, True
     shift_m, turn = ([0.0, 0.15, 0.0], [0.0, 0.0, 0.03]) if near else ([1.5, -2.0, 0.3], [0.0, 0.9, 0.0])
-    path = follow(misplaced(raw, bad, shift_m, turn))
+    path = filter_path(misplaced(raw, bad, shift_m, turn))
     off_m, off_rad = errors(path, position_m, truth)
-    # 8 frames are 0.32 s: 0.1 m and 6 degrees at accelerations of 2 m/s2 and 2 rad/s2, which by chance are larger.
+    # 8 frames are 0.32 s: 0.1 m and 6 degrees at 2 m/s2 and 2 rad/s2, and more where accelerations happen to be larger.
     assert np.linalg.norm(off_m, axis=1).max() < 0.25
     assert np.degrees(np.linalg.norm(off_rad, axis=1)).max() < 12.0
     assert (path.flags[bad][1:] & Flag.GATED).all()
@@ -338,9 +340,9 @@ def test_outliers_do_not_count(near) -> None:
     assert (path.status == Status.LOST).sum() <= 5
 
 
-def test_gated_frames_coast_with_growing_uncertainty_and_keep_what_was_seen() -> None:
+def test_gated_frames_coast_with_growing_uncertainty() -> None:
     raw, _, _ = flight(60, seed=10)
-    path = follow(misplaced(raw, slice(40, 46), [0.0, 3.0, 0.0]))
+    path = filter_path(misplaced(raw, slice(40, 46), [0.0, 3.0, 0.0]))
     assert (path.status[40:46] == Status.COASTING).all()
     assert (path.flags[40:46] == Flag.GATED).all()
     assert (path.num_markers[40:46] == 8).all()
@@ -348,20 +350,20 @@ def test_gated_frames_coast_with_growing_uncertainty_and_keep_what_was_seen() ->
     assert path.status[46] == Status.TRACKED
 
 
-def test_a_wrong_start_that_was_believed_is_given_up_as_soon_as_more_poses_contradict() -> None:
+def test_a_wrong_first_state_is_replaced_when_more_poses_contradict_it() -> None:
     raw, position_m, _ = flight(40, seed=11)
-    path = follow(misplaced(raw, slice(0, 4), [3.0, 0.0, 0.0]))
+    path = filter_path(misplaced(raw, slice(0, 4), [3.0, 0.0, 0.0]))
     assert path.status[3] == Status.TRACKED
-    # Four poses supported it; the fifth against it is one more.
+    # Four poses supported the state; the fifth pose against it is one more.
     assert (path.status[4:8] == Status.COASTING).all()
     assert (path.status[8:] == Status.TRACKED).all()
     assert np.linalg.norm(path.position_m[8:] - position_m[8:], axis=1).max() < 0.03
 
 
 @pytest.mark.parametrize("restart_after", [4, 10])
-def test_a_camera_that_is_elsewhere_for_good_is_found_after_so_many_poses(restart_after) -> None:
+def test_a_camera_that_stays_elsewhere_is_found_after_restart_after_poses(restart_after) -> None:
     raw, position_m, _ = flight(100, seed=12)
-    path = follow(
+    path = filter_path(
         misplaced(raw, slice(50, None), [0.0, 0.0, 5.0]), PoseFilterParams(restart_after=restart_after)
     )
     believed = 50 + restart_after - 1
@@ -371,21 +373,21 @@ def test_a_camera_that_is_elsewhere_for_good_is_found_after_so_many_poses(restar
     assert np.linalg.norm(path.position_m[believed:] - moved_m, axis=1).max() < 0.03
 
 
-def test_a_turn_that_nothing_foretold_is_followed_after_one_frame() -> None:
-    """A camera that hung in the air races off: 40 m/s2 from one frame to the next."""
+def test_an_unpredicted_turn_is_followed_after_one_frame() -> None:
+    """A hovering camera accelerates by 40 m/s2 from one frame to the next."""
     position_m = np.zeros((60, 3))
     position_m[50:, 0] = 40.0 / 2 * (np.arange(1, 11) / FPS) ** 2
     rng = np.random.default_rng(13)
     raw = raw_path(position_m + rng.normal(scale=0.002, size=(60, 3)), Rotation.identity(60))
-    path = follow(raw)
+    path = filter_path(raw)
     assert (path.status[50:] == Status.COASTING).sum() == 1
     assert np.linalg.norm(path.position_m[52:] - position_m[52:], axis=1).max() < 0.03
 
 
-def test_gaps_are_bridged_for_as_long_as_is_said() -> None:
+def test_gaps_are_bridged_for_the_longest_gap() -> None:
     raw, position_m, truth = flight(150, acceleration=0.5, wobble=0.3, seed=14)
     raw = without(raw, np.r_[50:58, 90:120])
-    path = follow(raw, PoseFilterParams(longest_gap_s=0.5))
+    path = filter_path(raw, PoseFilterParams(longest_gap_s=0.5))
     assert (path.status[50:58] == Status.COASTING).all()
     assert (path.flags[50:58] == 0).all()
     assert (np.diff(np.trace(path.covariance[49:58, :3, :3], axis1=1, axis2=2)) > 0).all()
@@ -393,7 +395,7 @@ def test_gaps_are_bridged_for_as_long_as_is_said() -> None:
     assert (path.status[102:120] == Status.LOST).all()
     for value in (path.position_m, path.orientation_wxyz, path.covariance, path.ambiguity, path.velocity_m_s):
         assert np.isnan(value[102:120]).all()
-    # It hovered, and is where a hovering camera would be: nothing else needs to confirm that.
+    # It hovered, and is where a hovering camera would be: no further pose is needed to confirm it.
     assert (path.status[120:130] == Status.TRACKED).all()
     off_m, off_rad = errors(path, position_m, truth)
     covariance = path.covariance[path.seen]
@@ -412,36 +414,36 @@ def planted(acceleration, *, chance=None):
 
 
 @pytest.mark.parametrize("acceleration", [0.5, 2.0])
-def test_poses_that_agree_behind_a_gap_and_are_wrong_are_held_off(acceleration) -> None:
+def test_wrong_poses_that_agree_after_a_gap_are_not_accepted(acceleration) -> None:
     raw, position_m = planted(acceleration)
-    path = follow(raw)
+    path = filter_path(raw)
     assert (path.status[85:90] == Status.LOST).all()
-    # The right ones are believed when they are one more than the wrong ones, and enough to contradict a state.
+    # The right poses are accepted when they are one more than the wrong ones, and enough to contradict a state.
     assert (path.status[100:] == Status.TRACKED).all()
     assert np.nanmax(np.linalg.norm(path.position_m[85:] - position_m[85:], axis=1)) < 0.05
     smoothed = smooth(raw)
     assert np.nanmax(np.linalg.norm(smoothed.position_m[85:] - position_m[85:], axis=1)) < 0.05
 
 
-def test_behind_a_gap_markers_that_agree_say_nothing_against_what_a_hovering_camera_cannot_do() -> None:
+def test_after_a_gap_agreeing_markers_do_not_outweigh_the_motion_of_a_hovering_camera() -> None:
     raw, position_m = planted(0.05, chance=1e-12)
-    path = follow(raw)
+    path = filter_path(raw)
     assert (path.status[85:90] == Status.LOST).all()
     assert np.nanmax(np.linalg.norm(path.position_m[85:] - position_m[85:], axis=1)) < 0.05
 
 
-def test_behind_a_gap_markers_that_agree_beyond_chance_are_believed_at_once() -> None:
+def test_after_a_gap_markers_that_agree_beyond_chance_are_accepted_at_once() -> None:
     raw, position_m, _ = flight(120, acceleration=2.0, wobble=2.0, seed=41)
     raw = without(raw, slice(60, 90))
-    path = follow(replace(raw, chance=np.full(120, 1e-12)))
+    path = filter_path(replace(raw, chance=np.full(120, 1e-12)))
     assert (path.status[90:94] == Status.TRACKED).all()
     assert (path.status[90:] != Status.LOST).all()
     assert np.linalg.norm(path.position_m[90:] - position_m[90:], axis=1).max() < 0.05
-    # Else they need others, for so long a gap foretells nothing.
-    assert (follow(raw).status[90:99] == Status.LOST).all()
+    # Without such markers more poses are needed, because nothing is predicted after so long a gap.
+    assert (filter_path(raw).status[90:99] == Status.LOST).all()
 
 
-# Starts, and paths with little in them.
+# First poses, and paths with few poses.
 
 
 @pytest.mark.parametrize(
@@ -449,21 +451,21 @@ def test_behind_a_gap_markers_that_agree_beyond_chance_are_believed_at_once() ->
     [(1e-12, 0.0, 0), (1e-12, 0.01, 2), (0.01, 0.0, 2), (np.nan, 0.0, 2)],
     ids=["sure", "ambiguous", "by chance", "unknown"],
 )
-def test_a_first_pose_is_told_at_once_where_nothing_else_is_likely(chance, ambiguity, first) -> None:
+def test_an_unambiguous_first_pose_is_returned_at_once(chance, ambiguity, first) -> None:
     raw, _, _ = flight(6, seed=42)
     raw = replace(raw, chance=np.full(6, chance), ambiguity=np.full(6, ambiguity))
-    for path in (follow(raw), smooth(raw)):
-        told = path.status != Status.LOST
-        assert told[first:].all()
+    for path in (filter_path(raw), smooth(raw)):
+        found = path.status != Status.LOST
+        assert found[first:].all()
         assert path.chance is None
-    assert not follow(raw).seen[:first].any()
+    assert not filter_path(raw).seen[:first].any()
 
 
 @pytest.mark.parametrize("frames", [1, 2])
-def test_where_no_more_frames_could_confirm_a_start_it_counts(frames) -> None:
+def test_a_first_pose_counts_where_the_recording_is_too_short_to_confirm_it(frames) -> None:
     raw, _, _ = flight(5, seed=43)
-    path = follow(path_of(rows_of(raw)[:frames]), PoseFilterParams().within(frames))
-    # The first cannot be confirmed when it comes: what is told is told on the fly.
+    path = filter_path(join_rows(split_path(raw)[:frames]), PoseFilterParams().within(frames))
+    # The first pose cannot be confirmed when it comes, and the filter is causal.
     assert (path.status[: frames - 1] == Status.LOST).all()
     assert path.status[-1] == Status.TRACKED
 
@@ -471,77 +473,77 @@ def test_where_no_more_frames_could_confirm_a_start_it_counts(frames) -> None:
 @pytest.mark.parametrize("frames", [0, 1, 2])
 def test_paths_with_hardly_a_pose(frames) -> None:
     raw, _, _ = flight(5, seed=15)
-    rows = rows_of(raw)[:frames]
-    path = follow(path_of(rows))
+    rows = split_path(raw)[:frames]
+    path = filter_path(join_rows(rows))
     assert path.num_frames == frames
     assert (path.status == Status.LOST).all()
-    believing = follow(path_of(rows), PoseFilterParams(confirm=1))
+    believing = filter_path(join_rows(rows), PoseFilterParams(confirm=1))
     assert (believing.status == Status.TRACKED).all()
     if frames == 1:
-        # One pose: the same, and as sure.
+        # With one pose the estimate equals the pose and its covariance.
         np.testing.assert_allclose(believing.position_m, raw.position_m[:1], atol=1e-12)
         np.testing.assert_allclose(believing.covariance[0], raw.covariance[0], atol=1e-15)
 
 
-def test_no_pose_at_all_and_none_at_the_beginning() -> None:
+def test_paths_without_poses_and_without_poses_at_the_beginning() -> None:
     raw, _, _ = flight(30, seed=16)
-    assert (follow(without(raw, slice(None))).status == Status.LOST).all()
-    path = follow(without(raw, slice(0, 10)))
+    assert (filter_path(without(raw, slice(None))).status == Status.LOST).all()
+    path = filter_path(without(raw, slice(0, 10)))
     assert (path.status[:12] == Status.LOST).all()
     assert (path.status[12:] == Status.TRACKED).all()
 
 
-def test_the_raw_path_stays_as_it_is() -> None:
+def test_filtering_leaves_the_raw_path_unchanged() -> None:
     raw, _, _ = flight(30, seed=17)
     raw = without(misplaced(raw, slice(20, 21), [1.0, 0.0, 0.0]), slice(5, 8))
     before = {name: np.copy(value) for name, value in vars(raw).items() if value is not None}
-    follow(raw)
+    filter_path(raw)
     for name, value in before.items():
         np.testing.assert_array_equal(getattr(raw, name), value)
 
 
-def test_a_path_is_its_rows() -> None:
+def test_a_path_equals_its_joined_rows() -> None:
     raw, _, _ = flight(5, seed=18)
-    again = path_of(rows_of(raw))
+    again = join_rows(split_path(raw))
     for name, value in vars(raw).items():
         np.testing.assert_array_equal(getattr(again, name), value)
 
 
-def test_frame_by_frame_one_learns_where_the_next_pose_should_be() -> None:
+def test_the_next_pose_is_predicted_frame_by_frame() -> None:
     raw, position_m, _ = flight(40, seed=19)
     params = PoseFilterParams()
-    following, rows = FilterRun(), []
-    for k, row in enumerate(rows_of(raw)):
-        following = advance(following, row.time_s, params)
-        told = expected(following, params)
-        assert (told is None) == (k < 3)
-        if told is not None and k > 10:
-            # 2 m/s2 change a place by 2 mm within a frame; the rest are poses' errors of 4 mm along each axis.
-            assert np.linalg.norm(told.position_m - position_m[k]) < 0.03
-        following, told_row = step(following, row, params)
-        rows.append(told_row)
-    whole = follow(raw)
-    for name, value in vars(path_of(rows)).items():
+    run, rows = FilterRun(), []
+    for k, row in enumerate(split_path(raw)):
+        run = advance(run, row.time_s, params)
+        predicted = expected(run, params)
+        assert (predicted is None) == (k < 3)
+        if predicted is not None and k > 10:
+            # 2 m/s2 move the camera by 2 mm within a frame; the rest are poses' errors of 4 mm along each axis.
+            assert np.linalg.norm(predicted.position_m - position_m[k]) < 0.03
+        run, row = step(run, row, params)
+        rows.append(row)
+    whole = filter_path(raw)
+    for name, value in vars(join_rows(rows)).items():
         np.testing.assert_array_equal(getattr(whole, name), value)
 
 
 def test_times_may_be_irregular() -> None:
-    """A live stream that drops frames at random is followed as closely as the frames that it has allow."""
+    """A live stream with randomly dropped frames is followed as closely as its frames allow."""
     raw, position_m, truth = flight(200, acceleration=0.5, wobble=0.3, seed=20)
     kept = np.flatnonzero(np.random.default_rng(21).random(200) < 0.4)
-    some = path_of([rows_of(raw)[k] for k in kept])
-    path = follow(some)
+    some = join_rows([split_path(raw)[k] for k in kept])
+    path = filter_path(some)
     off_m, _ = errors(path, position_m[kept], truth[kept])
     raw_off_m, _ = errors(some, position_m[kept], truth[kept])
     assert np.median(np.linalg.norm(off_m, axis=1)) < 1.03 * np.median(np.linalg.norm(raw_off_m, axis=1))
 
 
-# Errors that never change.
+# Errors that are common to all frames.
 
 
-def test_errors_that_never_change_are_not_averaged_away() -> None:
-    """Each does to poses what slowly changes, and jumps as other markers come into view: 40 cameras."""
-    rng, frames, inside, inside_untold, gated = np.random.default_rng(44), 12, [], [], 0
+def test_errors_common_to_all_frames_are_not_averaged_away() -> None:
+    """The effect of each error on the poses changes slowly, and jumps as other markers come into view: 40 cameras."""
+    rng, frames, inside, inside_without, gated = np.random.default_rng(44), 12, [], [], 0
     scale = np.array([[0.012] * 3 + [0.002] * 3]).T
     for seed in range(40):
         raw, position_m, _ = flight(frames, acceleration=0.5, wobble=0.5, seed=seed)
@@ -556,21 +558,21 @@ def test_errors_that_never_change_are_not_averaged_away() -> None:
             position_m=raw.position_m + off[:, :3],
             orientation_wxyz=(orientation * Rotation.from_rotvec(off[:, 3:])).as_quat(scalar_first=True),
         )
-        told = replace(raw, covariance=raw.covariance + common @ common.swapaxes(1, 2), common=common)
-        filtered = follow(told)
+        with_common = replace(raw, covariance=raw.covariance + common @ common.swapaxes(1, 2), common=common)
+        filtered = filter_path(with_common)
         gated += int(((filtered.flags & Flag.GATED) > 0).sum())
         inside.append([within_90(filtered, position_m, k) for k in (7, 10)])
-        inside[-1].append(within_90(smooth(told), position_m, 5))
-        inside_untold.append(within_90(follow(raw), position_m, 7))
-    # Three deviations of a share of 40 below 0.9; poses' own covariances, if anything, are wide.
+        inside[-1].append(within_90(smooth(with_common), position_m, 5))
+        inside_without.append(within_90(filter_path(raw), position_m, 7))
+    # Three standard deviations of a share of 40 below 0.9; the poses' own covariances are, if anything, too wide.
     assert (np.mean(inside, axis=0) > 0.9 - 3 * np.sqrt(0.09 / 40)).all()
-    assert np.mean(inside_untold) < 0.5
-    # Nor is a jump that other markers explain an outlier.
+    assert np.mean(inside_without) < 0.5
+    # A jump that other markers explain is no outlier.
     assert gated <= 0.01 * 40 * frames
 
 
 def within_90(path: CameraPath, position_m, k) -> bool:
-    """Whether the truth of a frame is within its 90 % ellipsoid."""
+    """Whether the true position in a frame is within its 90 % ellipsoid."""
     off_m = position_m[k] - path.position_m[k]
     return bool(off_m @ np.linalg.solve(path.covariance[k, :3, :3], off_m) < NINETY)
 
@@ -578,15 +580,15 @@ def within_90(path: CameraPath, position_m, k) -> bool:
 # Ambiguous poses.
 
 
-def test_an_ambiguous_pose_counts_by_how_well_it_fits() -> None:
-    """After a gap, where two poses are possible, it is half believed; where the motion is known, wholly."""
+def test_an_ambiguous_pose_is_weighted_by_how_well_it_fits() -> None:
+    """After a gap, where two poses are possible, it has half of the weight; where the motion is known, all of it."""
     params = PoseFilterParams()
     state = init(a_pose())
     for k in range(1, 20):
         state, _ = update(state, a_pose(k / FPS), params)
-    told = estimate(update(state, a_pose(20 / FPS, ambiguity=0.4), params)[0])
+    estimated = estimate(update(state, a_pose(20 / FPS, ambiguity=0.4), params)[0])
     sure = estimate(update(state, a_pose(20 / FPS), params)[0])
-    np.testing.assert_allclose(told.covariance, sure.covariance, rtol=0.05)
+    np.testing.assert_allclose(estimated.covariance, sure.covariance, rtol=0.05)
 
     late = predict(init(a_pose()), 0.4)
     there = a_pose(0.4, position_m=(0.5, 0.0, 0.0), ambiguity=0.5)
@@ -597,20 +599,20 @@ def test_an_ambiguous_pose_counts_by_how_well_it_fits() -> None:
     assert np.trace(estimate(half).covariance) > 3 * np.trace(estimate(whole).covariance)
 
 
-def test_motion_takes_ambiguity_away_and_nothing_else_does() -> None:
+def test_only_motion_reduces_ambiguity() -> None:
     raw, _, _ = flight(30, seed=22)
     ambiguity, flags = np.full(30, 0.3), np.full(30, int(Flag.AMBIGUOUS))
-    path = follow(replace(raw, ambiguity=ambiguity, flags=flags))
+    path = filter_path(replace(raw, ambiguity=ambiguity, flags=flags))
     assert (path.ambiguity[2:] == 0.3).all()
     assert (path.flags == Flag.AMBIGUOUS).all()
     ambiguity[10], flags[10] = 0.0, 0
-    path = follow(replace(raw, ambiguity=ambiguity, flags=flags))
+    path = filter_path(replace(raw, ambiguity=ambiguity, flags=flags))
     assert (path.ambiguity[2:10] == 0.3).all()
     assert (path.ambiguity[10:] == 0.0).all()
     assert (path.flags[10:] == 0).all()
 
 
-# What holds for all worlds.
+# Invariance to the world's axes.
 
 
 @settings(max_examples=6)
@@ -633,26 +635,26 @@ def test_turning_and_shifting_the_world_turns_and_shifts_the_path(turn, shift_m,
         orientation_wxyz=orientation_wxyz,
         covariance=by_world @ raw.covariance @ by_world.T,
     )
-    here, moved_path = follow(raw), follow(other)
+    here, moved_path = filter_path(raw), filter_path(other)
     np.testing.assert_array_equal(moved_path.status, here.status)
     np.testing.assert_array_equal(moved_path.flags, here.flags)
-    told = here.seen
-    # Rounding: places of 100 m to 1e-14, and a hundred steps.
+    seen = here.seen
+    # Rounding: positions of 100 m to 1e-14, over a hundred steps.
     np.testing.assert_allclose(
-        moved_path.position_m[told], here.position_m[told] @ world.as_matrix().T + shift_m, atol=1e-8
+        moved_path.position_m[seen], here.position_m[seen] @ world.as_matrix().T + shift_m, atol=1e-8
     )
     np.testing.assert_allclose(
-        moved_path.velocity_m_s[told], here.velocity_m_s[told] @ world.as_matrix().T, atol=1e-6
+        moved_path.velocity_m_s[seen], here.velocity_m_s[seen] @ world.as_matrix().T, atol=1e-6
     )
-    expected_turns = world * Rotation.from_quat(here.orientation_wxyz[told], scalar_first=True)
-    apart = expected_turns.inv() * Rotation.from_quat(moved_path.orientation_wxyz[told], scalar_first=True)
+    expected_turns = world * Rotation.from_quat(here.orientation_wxyz[seen], scalar_first=True)
+    apart = expected_turns.inv() * Rotation.from_quat(moved_path.orientation_wxyz[seen], scalar_first=True)
     assert apart.magnitude().max() < 1e-8
     np.testing.assert_allclose(
-        moved_path.covariance[told], by_world @ here.covariance[told] @ by_world.T, rtol=1e-4, atol=1e-10
+        moved_path.covariance[seen], by_world @ here.covariance[seen] @ by_world.T, rtol=1e-4, atol=1e-10
     )
 
 
-# What is refused.
+# Refused input.
 
 
 @pytest.mark.parametrize(
@@ -664,16 +666,16 @@ def test_turning_and_shifting_the_world_turns_and_shifts_the_path(turn, shift_m,
         ({"restart_after": 0}, r"restart_after: expected at least 1, found 0"),
     ],
 )
-def test_settings_that_make_no_sense(setting, message) -> None:
+def test_invalid_settings_are_refused(setting, message) -> None:
     with pytest.raises(SettingsError, match=message):
         PoseFilterParams(**setting)
 
 
-def test_times_that_go_back_and_covariances_that_are_none() -> None:
+def test_decreasing_times_and_invalid_covariances_are_refused() -> None:
     state = init(a_pose(1.0))
     with pytest.raises(InputError, match=r"time_s: expected a time after 1 s, found 0.5 s"):
         predict(state, 0.5)
     raw, _, _ = flight(5, seed=24)
     raw.covariance[3] = np.nan
     with pytest.raises(InputError, match=r"covariance at 0.12 s: expected a positive definite matrix"):
-        follow(raw)
+        filter_path(raw)

@@ -1,4 +1,4 @@
-"""Inside-out and outside-in fused: against dense Gaussians, on flights of known truth, and with all that goes wrong."""
+"""Fusion of inside-out and outside-in: against dense Gaussians, on flights with ground truth, and with faulty input."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 
 from psotrack.errors import InputError
 from psotrack.inside_out import CameraPath, fuse
-from psotrack.inside_out.fusing.gating import gated
+from psotrack.inside_out.fusing.gating import gate_readings
 from psotrack.inside_out.fusing.joint_filter import (
     Arm,
     ErrorModel,
@@ -21,7 +21,7 @@ from psotrack.inside_out.fusing.joint_filter import (
     smooth,
     transition,
 )
-from psotrack.inside_out.fusing.mounting import mounted
+from psotrack.inside_out.fusing.resampling import resample_path
 from psotrack.trajectories import Status, Trajectories
 
 FPS = 25.0
@@ -30,7 +30,7 @@ INSIDE_M, OUTSIDE_M = np.array([0.001, 0.001, 0.003]), np.array([0.004, 0.004, 0
 
 
 def flight(rng, num_frames, offset_s=0.0):
-    """Position (frames, 3) and rotation of a camera that flies about and turns, smoothly."""
+    """Position (frames, 3) and rotation of a camera that flies and turns smoothly."""
     time_s = np.arange(num_frames) / FPS + offset_s
     frequency, phase = rng.uniform(0.1, 0.5, (3, 3, 1)), rng.uniform(0, 6, (3, 3, 1))
     waves = np.sin(2 * np.pi * frequency * time_s + phase).sum(axis=0).T
@@ -40,7 +40,7 @@ def flight(rng, num_frames, offset_s=0.0):
 
 
 def lasting(rng, num_frames, time_s=0.3):
-    """(frames, 3), Gauss-Markov errors of unit variance."""
+    """(frames, 3), Gauss-Markov errors with a variance of 1."""
     left = np.exp(-1 / FPS / time_s)
     values = rng.normal(size=(num_frames, 3))
     for k in range(1, num_frames):
@@ -99,7 +99,7 @@ def tracks_of(middle_m, covariance_m2, first=0):
 
 
 def without(path, rows):
-    """The path, lost in some frames."""
+    """The path with some frames lost."""
     status, position_m, orientation_wxyz = (
         path.status.copy(),
         path.position_m.copy(),
@@ -110,7 +110,7 @@ def without(path, rows):
 
 
 def unseen(tracks, rows, drone=0):
-    """The tracks, one lost in some frames."""
+    """The tracks with some frames of one track lost."""
     status = tracks.status.copy()
     status[rows, drone] = Status.LOST
     return replace(tracks, status=status)
@@ -144,7 +144,7 @@ MODEL = ErrorModel(np.array([[0.6, 0.3]]), np.array([[0.4, 1.2]]), np.array([[0.
 
 
 def dense(readings, model, arm):
-    """Prior mean and covariance of all states, and H, y, R of all readings: without any recursion."""
+    """Prior mean and covariance of all states, and H, y, R of all readings, without recursion."""
     n = len(readings.time_s)
     std = np.repeat([1.0, 10.0, 10.0, 1.0, 1.0, arm.std_m], 3)
     mean, prior = np.zeros((n, 18)), np.zeros((n, n, 18, 18))
@@ -179,7 +179,7 @@ def dense(readings, model, arm):
     return mean.ravel(), prior.transpose(0, 2, 1, 3).reshape(18 * n, 18 * n), np.vstack(rows), np.hstack(y), R
 
 
-def test_smoother_and_likelihood_are_those_of_the_joint_gaussian() -> None:
+def test_smoother_and_likelihood_equal_the_joint_gaussian() -> None:
     readings, arm = readings_of(np.random.default_rng(1)), Arm(np.array([0.1, 0.0, -0.1]), 0.3)
     mean, prior, H, y, R = dense(readings, MODEL, arm)
     S = H @ prior @ H.T + R
@@ -187,7 +187,7 @@ def test_smoother_and_likelihood_are_those_of_the_joint_gaussian() -> None:
     expected, spread = mean + gain @ (y - H @ mean), prior - gain @ H @ prior
     found = smooth(readings, MODEL, arm)
     n = len(readings.time_s)
-    # Starts with variances of 100 beside some of 1e-3: half of the digits of float64 are more than enough.
+    # Variances begin at 100 beside some of 1e-3: half of the digits of float64 are more than enough.
     np.testing.assert_allclose(found.position_m, expected.reshape(n, 18)[:, :3], atol=1e-8)
     np.testing.assert_allclose(found.velocity_m_s, expected.reshape(n, 18)[:, 3:6], atol=1e-7)
     np.testing.assert_allclose(found.arm_m, expected[15:18], atol=1e-8)
@@ -209,13 +209,13 @@ def test_transition_is_the_integral_of_its_differential_equation() -> None:
     whole = expm(dt_s * np.block([[-A, W], [np.zeros_like(A), A.T]]))
     F, Q = whole[18:, 18:].T, whole[18:, 18:].T @ whole[:18, 18:]
     found_F, found_Q = transition(dt_s, MODEL)
-    # Some hundred roundings.
+    # Rounding of some hundred operations.
     np.testing.assert_allclose(found_F[0], F, atol=1e-12)
     np.testing.assert_allclose(found_Q[0], Q, atol=1e-12)
 
 
-def test_errors_are_those_of_theory_by_monte_carlo() -> None:
-    """Flights of white jerk and errors that last, drawn from the model: NEES of the fused position is 3 on average."""
+def test_errors_agree_with_theory_by_monte_carlo() -> None:
+    """Flights with white jerk and lasting errors, drawn from the model: the NEES of the fused position averages 3."""
     rng, n, dt_s = np.random.default_rng(2), 40, 0.04
     model = ErrorModel(
         np.array([[0.5, 0.1]]), np.array([[0.5, 0.9]]), np.array([[0.3, 0.3]]), np.array([20.0])
@@ -250,17 +250,17 @@ def test_errors_are_those_of_theory_by_monte_carlo() -> None:
         for k in (0, n // 2):
             error_m = found.position_m[k] - truth[k, :3]
             nees.append(error_m @ np.linalg.solve(found.covariance_m2[k], error_m))
-    # The mean of 120 draws of chi-square with 3 degrees of freedom has a standard deviation of 0.22: four of those.
+    # The mean of 120 draws of chi-square with 3 degrees of freedom has a standard deviation of 0.22: four of them.
     assert np.mean(nees) == pytest.approx(3.0, abs=0.9)
 
 
-def test_a_source_of_no_certainty_changes_nothing() -> None:
+def test_a_source_with_huge_covariances_changes_nothing() -> None:
     readings, arm = readings_of(np.random.default_rng(3)), Arm(np.zeros(3), 0.3)
     alone = replace(readings, known=readings.known & [True, False])
     vague_m2 = readings.covariance_m2.copy()
     vague_m2[:, 1] *= 1e14
     found, expected = smooth(replace(readings, covariance_m2=vague_m2), MODEL, arm), smooth(alone, MODEL, arm)
-    # The other's weight is 1e-14, of positions of a metre or so; rounding is as large.
+    # The other source has a weight of 1e-14, for positions of about a metre; rounding is as large.
     np.testing.assert_allclose(found.position_m, expected.position_m, atol=1e-9)
     np.testing.assert_allclose(found.covariance_m2, expected.covariance_m2, atol=1e-9)
 
@@ -269,8 +269,8 @@ def test_a_source_of_no_certainty_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("stated", [0.4, 1.0, 2.5])
-def test_fused_is_better_than_both_and_knows_it(stated) -> None:
-    """Also where both sources state errors that are too small, or too large."""
+def test_fused_tracks_are_better_than_both_sources_with_consistent_covariances(stated) -> None:
+    """This holds also where both sources state errors that are too small or too large."""
     better, nees, off = [], [], []
     for seed in range(3):
         paths, outside, ((truth_m, rotation),) = recording(seed, stated=stated)
@@ -288,42 +288,42 @@ def test_fused_is_better_than_both_and_knows_it(stated) -> None:
         assert fused.trajectories.drones == ("dron1",)
         assert (drone.frames_both, drone.frames_inside, drone.frames_outside) == (150, 0, 0)
         assert (fused.source == 3).all()
-        # From about 40 independent frames, and a prior that keeps the ratio: within a factor of 1.6.
+        # From about 40 independent frames and a prior of the ratio: within a factor of 1.6.
         assert 1 / 1.6 < drone.fusion.inside.scale * stated < 1.6
         assert 1 / 1.6 < drone.fusion.outside.scale * stated < 1.6
-    # With weights 1 / variance alone it would be about 0.85; motion takes part of what is white.
+    # With weights 1 / variance alone the ratio would be about 0.85; the motion removes part of the white errors.
     assert max(better) < 1.0
     assert np.mean(better) < 0.85
-    # 3 where all is known; scales, times and jerk are estimated, from errors that last. Measured 2.6 to 3.6.
+    # 3 with a known model; scales, durations and jerk are estimated from lasting errors. Measured 2.6 to 3.6.
     assert 1.5 < np.mean(nees) < 6
-    # Standard errors: the worst of 9 is below 3.3 but for one in a hundred; half as much again for the same reason.
+    # Standard errors: the worst of 9 is below 3.3 in 99 of 100 cases; half as much again for the same reason.
     assert np.abs(off).max() < 5
 
 
 @pytest.mark.parametrize(("inside", "outside"), [(3.0, 1.0), (1.0, 5.0)])
-def test_one_source_that_states_too_large_errors_is_judged_by_its_scatter(inside, outside) -> None:
+def test_one_source_with_too_large_stated_errors_is_weighted_by_its_scatter(inside, outside) -> None:
     paths, tracks, ((truth_m, _),) = recording(22)
     path = replace(paths["dron1"], covariance=inside**2 * paths["dron1"].covariance)
     fused = fuse({"dron1": path}, replace(tracks, covariance_m2=outside**2 * tracks.covariance_m2))
-    # Measured 0.65 to 0.9 over seeds, where both state what is right 0.7.
+    # Measured 0.65 to 0.9 over seeds; 0.7 where both state the right errors.
     assert rms(fused.trajectories.position_m[:, 0] - truth_m) < rms(path.position_m - truth_m)
 
 
-def test_hardly_any_common_frames_and_a_drone_that_stands_still() -> None:
+def test_few_common_frames_and_a_drone_at_rest() -> None:
     paths, outside, ((truth_m, _),) = recording(23, 60)
     few = fuse(paths, unseen(outside, np.r_[0:20, 23:60]))
     assert few.drones[0].frames_both == 3
-    # One source alone: motion takes part of what is white in it.
+    # One source alone: the motion removes part of its white errors.
     assert rms(few.trajectories.position_m[:, 0] - truth_m) < rms(paths["dron1"].position_m - truth_m)
     at_m, turns = np.tile(truth_m[0], (60, 1)), Rotation.from_rotvec(np.zeros((60, 3)))
     still = path_of(at_m, turns, paths["dron1"].covariance)
     fused = fuse(still, tracks_of((at_m + ARM_M)[:, None], outside.covariance_m2))
-    # Without any error, some roundings.
+    # Without any error only rounding remains.
     np.testing.assert_allclose(fused.trajectories.position_m[:, 0], at_m, atol=1e-9)
     np.testing.assert_allclose(fused.drones[0].fusion.arm_m, ARM_M, atol=1e-9)
 
 
-def test_at_the_middle() -> None:
+def test_fusion_of_the_middle() -> None:
     paths, outside, ((truth_m, rotation),) = recording(5)
     fused = fuse(paths, outside, point="middle")
     error_m = fused.trajectories.position_m[:, 0] - truth_m - rotation.apply(ARM_M)
@@ -335,14 +335,14 @@ def test_at_the_middle() -> None:
     )
 
 
-def test_one_path_without_a_name_and_tracks_without_covariances() -> None:
+def test_a_single_path_without_a_name_and_tracks_without_covariances() -> None:
     paths, outside, ((truth_m, _),) = recording(6)
     fused = fuse(paths["dron1"], replace(outside, covariance_m2=None, status=None))
     assert fused.trajectories.drones == ("drone",)
     assert rms(fused.trajectories.position_m[:, 0] - truth_m) < rms(paths["dron1"].position_m - truth_m)
 
 
-def test_the_clock_of_a_camera_is_found() -> None:
+def test_the_clock_offset_of_a_camera_is_estimated() -> None:
     paths, outside, ((truth_m, _),) = recording(7, 200)
     late = replace(paths["dron1"], time_s=paths["dron1"].time_s + 0.815)
     fused = fuse({"dron1": late}, outside, max_offset_s=2.0)
@@ -356,7 +356,7 @@ def test_the_clock_of_a_camera_is_found() -> None:
     )
 
 
-def test_samples_between_frames_count_at_their_own_time() -> None:
+def test_samples_between_frames_are_used_at_their_own_times() -> None:
     """A camera at the same rate, half a step later, of a drone at up to 4 m/s: no interpolation, and no lag."""
     rng = np.random.default_rng(8)
     _, outside, ((truth_m, _),) = recording(8)
@@ -370,10 +370,10 @@ def test_samples_between_frames_count_at_their_own_time() -> None:
     assert rms(fused.trajectories.position_m[:, 0] - truth_m) < 0.0025
 
 
-# What goes wrong
+# Faulty input
 
 
-def test_gaps_of_either_are_bridged_by_the_other_without_a_jump() -> None:
+def test_gaps_of_either_source_are_bridged_without_a_jump() -> None:
     paths, outside, ((truth_m, _),) = recording(9)
     inside_gap, outside_gap = slice(40, 70), slice(90, 120)
     fused = fuse({"dron1": without(paths["dron1"], inside_gap)}, unseen(outside, outside_gap))
@@ -381,16 +381,16 @@ def test_gaps_of_either_are_bridged_by_the_other_without_a_jump() -> None:
     assert (fused.source[outside_gap] == 1).all()
     assert (fused.trajectories.status == Status.TRACKED).all()
     error_m = fused.trajectories.position_m[:, 0] - truth_m
-    # Jumps between frames are those of errors that last: a twentieth of the outside's own.
+    # Jumps between frames are those of lasting errors: a twentieth of the outside's errors.
     assert np.abs(np.diff(error_m, axis=0)).max() < 0.003
     spread_m = np.sqrt(np.trace(fused.trajectories.covariance_m2[:, 0], axis1=1, axis2=2))
-    # The orientation is not known in the gap, and 0.12 m of arm turn with it.
+    # The orientation is unknown in the gap, and with it the direction of the arm of 0.12 m.
     assert spread_m[55] > 2 * spread_m[20]
     assert np.linalg.norm(error_m[55]) < 4 * spread_m[55]
     assert np.isnan(fused.trajectories.orientation_wxyz[45:65, 0]).all()
 
 
-def test_where_neither_sees_it_coasts_and_then_is_lost() -> None:
+def test_without_both_sources_a_drone_coasts_and_is_then_lost() -> None:
     paths, outside, _ = recording(10)
     fused = fuse({"dron1": without(paths["dron1"], slice(50, 100))}, unseen(outside, slice(50, 100)))
     status = fused.trajectories.status[:, 0]
@@ -401,7 +401,7 @@ def test_where_neither_sees_it_coasts_and_then_is_lost() -> None:
     assert (status[[0, 49, 100, 149]] == Status.TRACKED).all()
 
 
-def test_coasting_and_lost_frames_do_not_pull() -> None:
+def test_coasting_and_lost_frames_are_not_used() -> None:
     paths, outside, _ = recording(11)
     path, rows = paths["dron1"], slice(60, 80)
     astray_m, status = path.position_m.copy(), path.status.copy()
@@ -414,10 +414,10 @@ def test_coasting_and_lost_frames_do_not_pull() -> None:
 
 
 @pytest.mark.parametrize("which", ["inside", "outside"])
-def test_the_one_that_is_off_by_far_is_left_out(which) -> None:
+def test_the_source_with_gross_errors_is_left_out(which) -> None:
     paths, outside, ((truth_m, _),) = recording(12)
     rng = np.random.default_rng(12)
-    # From the very first frame, now and then, and for more than a second.
+    # Gross errors in the very first frame, in single frames, and for more than a second.
     wrong = np.unique([0, 1, *rng.choice(np.arange(5, 60), 6, replace=False), *range(80, 110)])
     path, middle_m = paths["dron1"], outside.position_m.copy()
     position_m, orientation_wxyz = path.position_m.copy(), path.orientation_wxyz.copy()
@@ -438,38 +438,38 @@ def test_the_one_that_is_off_by_far_is_left_out(which) -> None:
     assert (counts.outside if which == "inside" else counts.inside).gated <= 2
     right = np.setdiff1d(np.arange(150), wrong)
     error_m = np.linalg.norm(fused.trajectories.position_m[:, 0] - truth_m, axis=1)
-    # As good as if nothing were wrong, but for what is missing.
+    # As good as without gross errors, except for the missing frames.
     assert rms(error_m[right][:, None]) < 1.5 * rms(plain.trajectories.position_m[:, 0] - truth_m)
-    # Alone the outside is off by 7 mm, and by as much again where the arm is turned between poses.
+    # The outside alone is off by 7 mm, and by as much again where the arm's direction is interpolated between poses.
     assert error_m[wrong].max() < (0.04 if which == "inside" else 0.015)
 
 
-def test_exchanged_tracks_are_put_right() -> None:
+def test_identity_swaps_are_resolved() -> None:
     paths, outside, _ = recording(13, num_drones=2, apart_m=1.5)
     exchanged_m = outside.position_m.copy()
     exchanged_m[70:, [0, 1]] = exchanged_m[70:, [1, 0]]
     swapped = replace(outside, position_m=exchanged_m[:, [1, 0]], drones=("b", "a"))
     fused, plain = fuse(paths, swapped), fuse(paths, outside)
-    assert [(one.drone, one.frame, one.before, one.after) for one in fused.exchanges] == [
+    assert [(one.drone, one.frame, one.before, one.after) for one in fused.identity_swaps] == [
         ("dron1", 70, "a", "b"),
         ("dron2", 70, "b", "a"),
     ]
-    assert not plain.exchanges
+    assert not plain.identity_swaps
     assert fused.trajectories.drones == ("dron1", "dron2")
     np.testing.assert_allclose(fused.trajectories.position_m, plain.trajectories.position_m, atol=1e-12)
 
 
-def test_a_drone_without_a_camera_keeps_its_track_when_it_is_exchanged() -> None:
+def test_a_drone_without_a_camera_keeps_its_track_through_an_identity_swap() -> None:
     paths, outside, _ = recording(14, num_drones=2, apart_m=1.5)
     exchanged_m = outside.position_m.copy()
     exchanged_m[70:, [0, 1]] = exchanged_m[70:, [1, 0]]
     fused = fuse({"dron1": paths["dron1"]}, replace(outside, position_m=exchanged_m))
     assert fused.trajectories.drones == ("dron1", "1")
     np.testing.assert_array_equal(fused.trajectories.position_m[:, 1], outside.position_m[:, 1])
-    assert [one.frame for one in fused.exchanges] == [70]
+    assert [one.frame for one in fused.identity_swaps] == [70]
 
 
-def test_what_only_one_has_is_kept_as_it_is() -> None:
+def test_tracks_of_only_one_source_are_kept_unchanged() -> None:
     paths, outside, _ = recording(15, num_drones=2)
     far = {"dron2": paths["dron2"], "0": replace(paths["dron1"], position_m=paths["dron1"].position_m - 20)}
     fused = fuse(far, outside)
@@ -481,7 +481,7 @@ def test_what_only_one_has_is_kept_as_it_is() -> None:
     np.testing.assert_array_equal(fused.trajectories.covariance_m2[:, 2], outside.covariance_m2[:, 0])
 
 
-def test_no_common_frames() -> None:
+def test_sources_without_common_frames() -> None:
     paths, outside, _ = recording(16, 60)
     later = tracks_of(outside.position_m, outside.covariance_m2, first=100)
     fused = fuse(paths, later)
@@ -492,7 +492,7 @@ def test_no_common_frames() -> None:
 
 
 @pytest.mark.parametrize("value", [np.inf, np.nan])
-def test_frames_of_infinite_uncertainty_change_nothing(value) -> None:
+def test_frames_with_infinite_uncertainty_change_nothing(value) -> None:
     paths, outside, _ = recording(17)
     rows = slice(50, 90)
     covariance = paths["dron1"].covariance.copy()
@@ -504,7 +504,7 @@ def test_frames_of_infinite_uncertainty_change_nothing(value) -> None:
     np.testing.assert_array_equal(vague.trajectories.position_m, expected.trajectories.position_m)
 
 
-def test_tracks_of_no_known_uncertainty_leave_a_path_as_it_is() -> None:
+def test_tracks_with_unknown_uncertainty_leave_a_path_unchanged() -> None:
     paths, outside, _ = recording(17, 60)
     covariance_m2 = outside.covariance_m2.copy()
     covariance_m2[:50] = np.nan
@@ -516,7 +516,7 @@ def test_tracks_of_no_known_uncertainty_leave_a_path_as_it_is() -> None:
     )
 
 
-def test_nothing_to_fuse() -> None:
+def test_empty_sources_are_refused() -> None:
     paths, outside, _ = recording(18, 30)
     with pytest.raises(InputError, match="inside paths: expected a pose in at least one frame, found none"):
         fuse({"dron1": without(paths["dron1"], slice(None))}, outside)
@@ -524,7 +524,7 @@ def test_nothing_to_fuse() -> None:
         fuse(paths, unseen(outside, slice(None)))
 
 
-def test_a_motion_that_tells_no_offset() -> None:
+def test_a_motion_that_determines_no_offset_is_refused() -> None:
     paths, outside, _ = recording(19, 60)
     still = replace(paths["dron1"], position_m=np.tile(paths["dron1"].position_m[0], (60, 1)))
     with pytest.raises(InputError, match="the clock of dron1: expected an offset, found none"):
@@ -557,7 +557,7 @@ def test_turning_and_shifting_the_world_turns_and_shifts_the_result(turn, shift_
         covariance_m2=(spread_m2 + spread_m2.swapaxes(-1, -2)) / 2,
     )
     expected, found = fuse(paths, outside), fuse({"dron1": turned}, moved)
-    # The search for the scales ends some 1e-5 from its minimum, where everything is flat: measured 2e-6 m.
+    # The search for the scales ends about 1e-5 from its minimum, where the cost is flat: measured 2e-6 m.
     np.testing.assert_allclose(
         found.trajectories.position_m[:, 0],
         R.apply(expected.trajectories.position_m[:, 0]) + shift_m,
@@ -566,8 +566,8 @@ def test_turning_and_shifting_the_world_turns_and_shifts_the_result(turn, shift_
     np.testing.assert_allclose(found.drones[0].fusion.arm_m, expected.drones[0].fusion.arm_m, atol=5e-5)
 
 
-def test_a_wild_reading_that_is_alone_counts_little() -> None:
-    """No other source speaks; the gate is no wall for a drone that did jump, but a single frame hardly moves it."""
+def test_a_single_gross_reading_has_little_effect() -> None:
+    """No other source has a reading. A drone that jumped must be followed, but a single frame has little weight."""
     rng = np.random.default_rng(4)
     readings = readings_of(rng, 30)
     smooth_m = np.broadcast_to(np.sin(readings.time_s)[:, None, None], (30, 2, 3)).copy()
@@ -577,21 +577,21 @@ def test_a_wild_reading_that_is_alone_counts_little() -> None:
     readings = replace(
         readings, position_m=smooth_m, covariance_m2=spread_m2, known=known, ahead_s=np.zeros((30, 2))
     )
-    out, added_m2 = gated(readings, MODEL, Arm(np.zeros(3), 0.01))
+    out, added_m2 = gate_readings(readings, MODEL, Arm(np.zeros(3), 0.01))
     assert not out.any()
     assert (np.trace(added_m2[:, 0], axis1=1, axis2=2) > 0.1**2).nonzero()[0].tolist() == [15]
 
 
-def test_orientations_over_a_gap_are_known_the_less_the_farther_off() -> None:
+def test_the_uncertainty_of_orientations_in_a_gap_grows_with_time() -> None:
     paths, _, ((_, rotation),) = recording(21, 60)
-    camera = mounted(without(paths["dron1"], slice(20, 40)), np.arange(60) / FPS, 0.0)
-    assert camera.turned[:20].all()
-    assert not camera.turned[20:40].any()
+    camera = resample_path(without(paths["dron1"], slice(20, 40)), np.arange(60) / FPS, 0.0)
+    assert camera.has_orientation[:20].all()
+    assert not camera.has_orientation[20:40].any()
     spread = np.trace(camera.turn_covariance_rad2, axis1=1, axis2=2)
     assert (np.diff(spread[19:30]) > 0).all()
     assert (np.diff(spread[30:41]) < 0).all()
     off_rad = (Rotation.from_matrix(camera.rotation).inv() * rotation).magnitude()
     # Three axes; four standard deviations.
     assert (off_rad[20:40] < 4 * np.sqrt(spread[20:40])).all()
-    # Some roundings.
+    # Rounding of some operations.
     assert off_rad[[0, 19, 40, 59]].max() < 1e-7

@@ -1,4 +1,4 @@
-"""`psotrack localise`: from videos, folders and streams of a drawn room to the path of the camera in it."""
+"""`psotrack localise`: from videos, folders and streams of a drawn room to the path of the camera in the room."""
 
 import json
 import signal
@@ -27,9 +27,10 @@ from psotrack.inside_out import (
     read_camera_path,
     read_marker_map,
 )
-from psotrack.inside_out.frames import natural_key, read_ahead
-from psotrack.inside_out.lens_files import read_lens, scaled
-from psotrack.inside_out.localising import follow_markers
+from psotrack.inside_out.frames import read_ahead
+from psotrack.inside_out.frames.image_folder import natural_key
+from psotrack.inside_out.lens_files import read_lens, scale_lens
+from psotrack.inside_out.localising import localise_frames
 from psotrack.recordings import VideoWriter
 from psotrack.trajectories import Status
 
@@ -38,13 +39,13 @@ FPS = 25.0
 SIDE_M = 0.3
 FRAMES = 12
 LENS = lens_of_view(70.0, 55.4, SIZE_WH)
-#: Frames in which nothing but three markers, or nothing at all, is drawn.
+#: Frames in which only three markers, or nothing, is drawn.
 FEW, NONE = 6, 8
 
 
 @dataclass(frozen=True)
 class Room:
-    """A drawn room, as the files that a user would have."""
+    """A drawn room, as files that a user would have."""
 
     folder: Path
     marker_map: MarkerMap
@@ -66,7 +67,7 @@ class Room:
 
 
 def wall_markers():
-    """Nine markers on one wall, at y = 4, and four on another, at x = 3; ids are not in a row."""
+    """Nine markers on a wall at y = 4, and four on a wall at x = 3; ids with gaps."""
     corners = {}
     for index in range(9):
         x, z = -1.6 + 1.3 * (index % 3), 0.7 + 0.75 * (index // 3)
@@ -82,14 +83,14 @@ def wall_markers():
 
 
 def drawn(corners_m, posed):
-    """An image of markers whose printed side is seen, at three times the size and then reduced, in light."""
+    """An image of markers whose printed side is visible, drawn in light at three times the size and then reduced."""
     width, height = SIZE_WH
     image = np.full((3 * height, 3 * width), 150.0**2, np.float32)
     for marker, corners in corners_m.items():
         pixels, depth = project(posed, corners)
         if depth.min() < 0.3:
             continue
-        # Four cells, two of border, and one of white around.
+        # Four cells, two of border, and one of white at each side.
         cell = 24
         own = cv2.copyMakeBorder(
             cv2.aruco.generateImageMarker(marker_dictionary("4x4_1000"), marker, 6 * cell),
@@ -105,7 +106,7 @@ def drawn(corners_m, posed):
         warped = cv2.warpPerspective(own, towards, size, flags=cv2.INTER_AREA)
         inside = cv2.warpPerspective(np.full_like(own, 255), towards, size, flags=cv2.INTER_NEAREST) > 0
         image[inside] = (30 + (180 / 255) * warped[inside]) ** 2
-    # A pixel is the mean of its light, and its level the square root of that.
+    # The light of a pixel is the mean of its parts; its grey level is the square root of the light.
     small = np.sqrt(cv2.resize(image, SIZE_WH, interpolation=cv2.INTER_AREA)).round().astype(np.uint8)
     return cv2.cvtColor(small, cv2.COLOR_GRAY2BGR)
 
@@ -127,10 +128,10 @@ def room(tmp_path_factory):
             shown = corners_m
             if index in (FEW, NONE):
                 shown = {} if index == NONE else {marker: corners_m[marker] for marker in (5, 8, 17)}
-            # One that the map does not know, and that is everywhere.
+            # A marker that is not in the map, in every frame.
             stranger = {900: np.array([[0, 3.9, 0.6], [0.3, 3.9, 0.6], [0.3, 3.9, 0.3], [0, 3.9, 0.3]])}
             image = drawn(shown | ({} if index == NONE else stranger), posed)
-            # Without leading zeros: 10 comes after 9.
+            # File names without leading zeros: 10 must come after 9.
             cv2.imwrite(str(folder / "images" / f"frame{index}.png"), image)
             writer.write(image)
             positions.append(centre)
@@ -142,7 +143,7 @@ def room(tmp_path_factory):
 
 
 def run(*arguments):
-    """The command; what psotrack raises is raised here."""
+    """Run the command; errors of psotrack are raised here."""
     result = CliRunner().invoke(command, [str(argument) for argument in arguments])
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
@@ -150,7 +151,7 @@ def run(*arguments):
 
 
 def ordinary(path):
-    """Frames in which the walls are drawn."""
+    """Frames in which all walls are drawn."""
     return ~np.isin(path.frame, (FEW, NONE))
 
 
@@ -164,7 +165,7 @@ def error_deg(path, room, rows):
     return np.rad2deg((found.inv() * true).magnitude())
 
 
-def test_the_path_of_a_folder_of_images_is_where_the_camera_was(room, tmp_path):
+def test_the_path_from_a_folder_of_images_is_the_cameras(room, tmp_path):
     out = tmp_path / "track.csv"
     result = run(
         room.folder / "images", "--fps", 25, "--markers", room.markers, "--camera", room.lens,
@@ -175,7 +176,7 @@ def test_the_path_of_a_folder_of_images_is_where_the_camera_was(room, tmp_path):
     assert name == "images"
     np.testing.assert_array_equal(path.frame, np.arange(FRAMES))
     np.testing.assert_allclose(path.time_s, np.arange(FRAMES) / 25, rtol=1e-12)
-    # Measured 4.4 mm and 0.06 degrees: a tenth of a pixel in each of 36 corners, 4 m away.
+    # Measured 4.4 mm and 0.06 degrees: an error of a tenth of a pixel in each of 36 corners, 4 m away.
     assert error_m(path, room)[there].max() < 0.01
     assert error_deg(path, room, there).max() < 0.15
     assert (path.status[there] == Status.TRACKED).all()
@@ -185,19 +186,19 @@ def test_the_path_of_a_folder_of_images_is_where_the_camera_was(room, tmp_path):
     assert "frames per second (decode" in result.output
 
 
-def test_a_video_tells_the_same_as_its_images(room, tmp_path):
+def test_a_video_gives_the_same_path_as_its_images(room, tmp_path):
     tracks = {}
     for source, options in ((room.video, []), (room.folder / "images", ["--fps", FPS])):
         out = tmp_path / f"{source.stem}.csv"
         run(source, *options, "--markers", room.markers, "--camera", room.lens, "--out", out, "--no-filter")
         tracks[source.stem] = read_camera_path(out)[0]
     video, images = tracks["flight"], tracks["images"]
-    # The codec is lossy: a marker may be lost, and the path was measured to move by 1 mm.
+    # The codec is lossy: a marker may be missing, and the path was measured to move by 1 mm.
     np.testing.assert_allclose(video.num_markers, images.num_markers, atol=1)
     np.testing.assert_allclose(video.position_m, images.position_m, atol=0.005)
 
 
-def test_frames_with_few_markers_or_none_are_ordinary_and_said(room, tmp_path):
+def test_frames_with_few_or_no_markers_are_reported(room, tmp_path):
     source = open_source(room.folder / "images", fps=FPS)
     raw = localise_video(source, room.marker_map, LENS, LocaliseSettings(filter=None)).path
     assert (raw.status[[FEW, NONE]] == Status.LOST).all()
@@ -216,7 +217,7 @@ def test_frames_with_few_markers_or_none_are_ordinary_and_said(room, tmp_path):
         (["--fov", "70,55.4", "--frames", "1", "--no-filter"], None),
     ],
 )  # fmt: skip
-def test_without_any_pose_the_answer_says_what_to_look_at(room, tmp_path, options, doubt):
+def test_without_any_pose_the_output_says_what_to_check(room, tmp_path, options, doubt):
     said = run(room.video, "--markers", room.markers, *options, "--out", tmp_path / "track.csv").output
     if doubt is None:
         assert "flight in 1 of 1 frames" in said
@@ -244,7 +245,7 @@ def test_fewer_markers_are_allowed_and_flagged(room, tmp_path):
     path, _ = read_camera_path(out)
     assert path.status[[FEW, NONE]].tolist() == [Status.TRACKED, Status.LOST]
     assert path.flags[FEW] & Flag.FEW_MARKERS
-    # Three markers in a plane, 4 m away: measured 31 mm, and 12 mm from the image that the codec has not touched.
+    # Three markers in a plane, 4 m away: measured 31 mm, and 12 mm without the codec.
     assert error_m(path, room)[FEW] < 0.1
 
 
@@ -271,8 +272,8 @@ def test_a_folder_with_one_image_has_its_pose(room, tmp_path, frame, options, sm
     assert np.linalg.norm(path.position_m[0] - room.position_m[frame]) < 0.05
 
 
-def test_a_focal_length_that_is_off_is_known_to_the_covariance(room, tmp_path):
-    """A lens 1 % too long, in a table a marker 5 mm too high: what is stated makes poses better, and honest."""
+def test_the_covariance_includes_the_error_of_the_focal_length(room, tmp_path):
+    """A lens 1 % too long and a marker 5 mm too high in the map: stated errors improve poses and covariances."""
     lens = tmp_path / "lens.toml"
     K = LENS.K * np.array([[1.01, 1.01, 1], [1.01, 1.01, 1], [1, 1, 1]])
     write_rig(lens, stack({"front": camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=SIZE_WH)}))
@@ -282,30 +283,30 @@ def test_a_focal_length_that_is_off_is_known_to_the_covariance(room, tmp_path):
     )
     files = ["--markers", markers, "--camera", lens, "--out", out, "--json", report, "--force"]
     median_m, inside = {}, {}
-    for name, stated in (("untold", []), ("told", ["--map-error", 3, "--focal-error", 1])):
+    for name, stated in (("without", []), ("with", ["--map-error", 3, "--focal-error", 1])):
         run(room.folder / "images", "--fps", 25, *files, *stated)
         path, _ = read_camera_path(out)
         off_m = (path.position_m - room.position_m)[path.seen]
         covariance = path.covariance[path.seen][:, :3, :3]
         squared = np.einsum("ni,nij,nj->n", off_m, np.linalg.inv(covariance), off_m)
-        # Within what 90 % are.
+        # The 90 % ellipsoid.
         inside[name] = np.mean(squared < 6.25)
         median_m[name] = np.median(np.linalg.norm(off_m, axis=1))
-    assert inside["untold"] < 0.2
-    assert inside["told"] == 1.0
-    # Markers on two walls tell most of the focal length.
-    assert median_m["told"] < 0.7 * median_m["untold"]
+    assert inside["without"] < 0.2
+    assert inside["with"] == 1.0
+    # Markers on two walls determine most of the focal length.
+    assert median_m["with"] < 0.7 * median_m["without"]
     content = json.loads(report.read_text())
     assert (content["map_error_m"], content["focal_error"]) == (0.003, 0.01)
 
 
-def test_a_plot_tells_bridged_frames_from_gaps(room, tmp_path):
-    """Colours of the picture: tracked, bridged, and the ground of frames without a pose."""
+def test_a_plot_distinguishes_bridged_frames_from_gaps(room, tmp_path):
+    """Colours of the plot: tracked frames, bridged frames, and the background of frames without a pose."""
     colours = {"tracked": (0x00, 0x72, 0xB2), "bridged": (0xD5, 0x5E, 0x00), "none": (0xDD, 0xE1, 0xE6)}
 
     def share(png):
         image = cv2.imread(str(png))[..., ::-1].astype(int)
-        # The ground in a solid block, which no line of the grid is.
+        # The background is a solid block, in contrast to lines of the grid.
         return {
             name: np.mean(
                 cv2.erode((np.abs(image - rgb).max(axis=-1) < 3).astype(np.uint8), np.ones((size, size)))
@@ -346,7 +347,7 @@ def test_the_filter_bridges_frames_without_markers(room, tmp_path):
     content = json.loads(report.read_text())
     assert name == "dron1"
     assert (path.status[[FEW, NONE]] == Status.COASTING).all()
-    # Measured 3 mm: the motion is even.
+    # Measured 3 mm, because the motion is even.
     assert np.nanmax(error_m(path, room)) < 0.02
     assert path.velocity_m_s is not None
     assert content["status"]["coasting"] == 2
@@ -355,7 +356,7 @@ def test_the_filter_bridges_frames_without_markers(room, tmp_path):
     assert content["frames_per_second"] == pytest.approx(FRAMES / content["wall_s"])
 
 
-def test_the_smoother_tells_the_first_frames_too(room, tmp_path):
+def test_the_smoother_estimates_the_first_frames_too(room, tmp_path):
     out = tmp_path / "track.csv"
     run(room.video, "--markers", room.markers, "--camera", room.lens, "--out", out, "--smooth")
     path, _ = read_camera_path(out)
@@ -364,7 +365,7 @@ def test_the_smoother_tells_the_first_frames_too(room, tmp_path):
     assert error_m(path, room).max() < 0.01
 
 
-def test_a_field_of_view_is_as_good_as_a_file(room, tmp_path):
+def test_a_field_of_view_replaces_a_calibration_file(room, tmp_path):
     for name, options in (("fov", ["--fov", "70,55.4"]), ("file", ["--camera", room.lens])):
         run(room.video, *options, "--markers", room.markers, "--out", tmp_path / f"{name}.csv", "--frames", 3)
     assert (tmp_path / "fov.csv").read_text().split("\n")[0] == (tmp_path / "file.csv").read_text().split(
@@ -375,8 +376,8 @@ def test_a_field_of_view_is_as_good_as_a_file(room, tmp_path):
     np.testing.assert_array_equal(fov.position_m, file.position_m)
 
 
-def test_a_stream_tells_the_same_as_its_file(room, tmp_path):
-    """FFmpeg serves a file by its address; the stamps in it are its times."""
+def test_a_stream_gives_the_same_path_as_its_file(room, tmp_path):
+    """FFmpeg opens a file by its address; the timestamps in the file are its times."""
     for name, source in (("file", room.video), ("stream", f"file://{room.video}")):
         run(source, "--markers", room.markers, "--camera", room.lens, "--out", tmp_path / f"{name}.csv")
     (file, _), (stream, name) = (read_camera_path(tmp_path / f"{name}.csv") for name in ("file", "stream"))
@@ -386,7 +387,7 @@ def test_a_stream_tells_the_same_as_its_file(room, tmp_path):
 
 
 class Capture:
-    """A camera that shows images, without stamps; then its user presses Ctrl-C, or it ends."""
+    """A camera that shows images without timestamps; then its user presses Ctrl-C, or the stream ends."""
 
     def __init__(self, images, press=None):
         self.images, self.press, self.released = list(images), press, threading.Event()
@@ -408,22 +409,22 @@ class Capture:
         self.released.set()
 
 
-def test_ctrl_c_ends_a_live_stream_and_keeps_what_was_localised(room, tmp_path, monkeypatch):
+def test_ctrl_c_ends_a_live_stream_and_keeps_its_frames(room, tmp_path, monkeypatch):
     kept, heard, opened = threading.Event(), threading.Event(), []
 
-    def followed(*told):
-        for one in follow_markers(*told):
+    def followed(*arguments):
+        for one in localise_frames(*arguments):
             yield one
-            # Whoever asks for the next has kept this one.
+            # When the next frame is requested, this one has been kept.
             kept.set()
 
-    def hear(*_):
+    def interrupt(*_):
         if not heard.is_set():
             heard.set()
             raise KeyboardInterrupt
 
     def press():
-        # What was localised is to be kept, so there must be some; and the stream does not end before Ctrl-C is heard.
+        # Some frame must have been localised before Ctrl-C, and the stream must not end before Ctrl-C arrives.
         assert kept.wait(300)
         # A signal that comes just before the main thread begins to wait for the next frame does not wake that thread.
         for _ in range(300):
@@ -434,8 +435,8 @@ def test_ctrl_c_ends_a_live_stream_and_keeps_what_was_localised(room, tmp_path, 
 
     capture = Capture(room.images[:FEW], press)
     monkeypatch.setattr(cv2, "VideoCapture", lambda device: opened.append(device) or capture)
-    monkeypatch.setattr("psotrack.inside_out.localising.follow_markers", followed)
-    out, before = tmp_path / "track.csv", signal.signal(signal.SIGINT, hear)
+    monkeypatch.setattr("psotrack.inside_out.localising.video.localise_frames", followed)
+    out, before = tmp_path / "track.csv", signal.signal(signal.SIGINT, interrupt)
     try:
         options = ("--live", "--fps", 25, "--markers", room.markers, "--camera", room.lens, "--no-filter")
         result = run("0", *options, "--out", out)
@@ -445,28 +446,28 @@ def test_ctrl_c_ends_a_live_stream_and_keeps_what_was_localised(room, tmp_path, 
     assert opened == [0]
     assert capture.released.wait(300)
     assert "ended by Ctrl-C" in result.output
-    # The first and the last are always had; those that come while another is worked on are left out.
+    # The first and the last frame are always used; frames that come while another one is in use are left out.
     assert set(path.frame.tolist()) <= set(range(FEW))
     np.testing.assert_allclose(path.time_s, path.frame / 25, rtol=1e-12)
     assert error_m(path, room).max() < 0.01
 
 
-def test_a_stream_that_ends_has_ended(room, monkeypatch):
+def test_a_stream_that_ends_is_not_interrupted(room, monkeypatch):
     monkeypatch.setattr(cv2, "VideoCapture", lambda device: Capture(room.images[:5]))
     found = localise_video(
         open_source("rtsp://camera/1"), room.marker_map, LENS, LocaliseSettings(filter=None)
     )
     assert found.path.num_frames == 5
     assert not found.interrupted
-    # Without stamps, times are when frames came.
+    # Without timestamps, times are those of arrival.
     assert (np.diff(found.path.time_s) > 0).all()
 
 
-def test_ctrl_c_in_a_recording_leaves_nothing(room, tmp_path, monkeypatch):
+def test_ctrl_c_in_a_recording_writes_nothing(room, tmp_path, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("psotrack.inside_out.localising.locate", interrupted)
+    monkeypatch.setattr("psotrack.inside_out.localising.frame_poses.estimate_pose", interrupted)
     with pytest.raises(KeyboardInterrupt):
         localise_video(open_source(room.video), room.marker_map, LENS)
     out = tmp_path / "track.csv"
@@ -478,7 +479,7 @@ def test_ctrl_c_in_a_recording_leaves_nothing(room, tmp_path, monkeypatch):
     assert not out.exists()
 
 
-def test_no_such_stream_is_one_line(tmp_path):
+def test_an_unknown_stream_is_refused_in_one_line(tmp_path):
     with pytest.raises(
         InputError, match=r"file:///nowhere.avi: expected a camera or a stream, found none that can be op"
     ):
@@ -487,7 +488,7 @@ def test_no_such_stream_is_one_line(tmp_path):
 
 @pytest.fixture
 def sequence(room, tmp_path):
-    """The folder of a sequence with two drones' videos."""
+    """The folder of a sequence with the videos of two drones."""
     folder = tmp_path / "S01_D2_A"
     folder.mkdir()
     for drone in ("dron1", "dron2"):
@@ -499,9 +500,9 @@ def sequence(room, tmp_path):
     return folder
 
 
-def test_a_sequence_brings_markers_and_intrinsics(room, sequence, tmp_path):
+def test_a_sequence_provides_markers_and_intrinsics(room, sequence, tmp_path):
     out = tmp_path / "track.csv"
-    # A picture that somebody left there makes it no folder of images.
+    # A stray picture does not make it a folder of images.
     cv2.imwrite(str(sequence / "plot.png"), np.zeros((20, 30), np.uint8))
     run(sequence, "--drone", "dron2", "--out", out)
     path, name = read_camera_path(out)
@@ -515,19 +516,19 @@ def test_a_sequence_brings_markers_and_intrinsics(room, sequence, tmp_path):
 
 
 @pytest.mark.parametrize("options", [[], ["--drone", "dron7"]], ids=["none", "unknown"])
-def test_a_sequence_of_several_drones_says_which_there_are(sequence, tmp_path, options):
+def test_a_sequence_of_several_drones_lists_its_drones(sequence, tmp_path, options):
     with pytest.raises(SettingsError, match=r"--drone: expected one of dron1, dron2, found"):
         run(sequence, *options, "--out", tmp_path / "track.csv")
 
 
-def test_a_folder_without_images_or_videos_is_one_line(room, tmp_path):
+def test_a_folder_without_images_or_videos_is_refused_in_one_line(room, tmp_path):
     with pytest.raises(InputError, match="expected images, or videos of drones' own cameras, found neither"):
         run(tmp_path, "--markers", room.markers, "--fov", "70,55", "--out", tmp_path / "track.csv")
 
 
-def test_intrinsics_for_other_images_are_one_line_that_names_the_file(room, tmp_path):
+def test_intrinsics_for_another_size_are_refused_in_one_line_with_the_file(room, tmp_path):
     lens = tmp_path / "lens.toml"
-    write_rig(lens, stack({"front": scaled(LENS, (1280, 960))}))
+    write_rig(lens, stack({"front": scale_lens(LENS, (1280, 960))}))
     arguments = [room.video, "--markers", room.markers, "--camera", lens, "--out", tmp_path / "track.csv"]
     with pytest.raises(
         InputError,
@@ -540,23 +541,23 @@ def test_intrinsics_for_other_images_are_one_line_that_names_the_file(room, tmp_
     assert np.nanmax(error_m(path, room)) < 0.01
 
 
-def test_a_scaled_lens_sees_the_same_place_in_the_scaled_image():
-    """Edges of the image, half a pixel beyond the outer centres, are where they were."""
-    small, large = LENS, scaled(LENS, (1920, 1440))
+def test_a_scaled_lens_maps_to_the_same_position_in_the_scaled_image():
+    """The edges of the image, half a pixel beyond the outer centres, stay where they are."""
+    small, large = LENS, scale_lens(LENS, (1920, 1440))
     points = np.random.default_rng(0).uniform((-1, -1, 2), (1, 1, 4), (20, 3))
     np.testing.assert_allclose(
         project(large, points)[0] + 0.5, 3 * (project(small, points)[0] + 0.5), rtol=1e-12
     )
 
 
-def test_other_shapes_of_images_are_not_scaled(tmp_path):
+def test_lenses_are_not_scaled_to_other_aspect_ratios(tmp_path):
     lens = tmp_path / "lens.yml"
     write_rig(lens, stack({"front": LENS}))
     with pytest.raises(InputError, match="found 640 x 480; calibrate at this size: the shape differs"):
         read_lens(lens, (1920, 1080), scale=True)
 
 
-def test_a_csv_without_sizes_is_doubted_where_its_axis_is_far_off_the_middle(tmp_path):
+def test_a_csv_without_sizes_is_refused_where_its_axis_is_far_off_the_middle(tmp_path):
     lens = tmp_path / "cameras_calibration.csv"
     write_calibration(lens, stack({"cam1i": lens_of_sensor(4.0, (6.4, 4.8), SIZE_WH)}))
     assert read_lens(lens, SIZE_WH).K[0, 2] == 319.5
@@ -566,7 +567,7 @@ def test_a_csv_without_sizes_is_doubted_where_its_axis_is_far_off_the_middle(tmp
         read_lens(lens, (1920, 1080))
 
 
-def test_several_cameras_in_a_file_are_named(tmp_path):
+def test_one_of_several_cameras_in_a_file_must_be_chosen(tmp_path):
     lens = tmp_path / "lens.toml"
     write_rig(lens, stack({"left": LENS, "right": LENS}))
     with pytest.raises(InputError, match="expected one camera, found left, right; name it by --camera-name"):
@@ -576,7 +577,7 @@ def test_several_cameras_in_a_file_are_named(tmp_path):
     assert read_lens(lens, SIZE_WH, name="right").K[0, 0] == LENS.K[0, 0]
 
 
-def test_a_video_that_ends_early_leaves_nothing_but_what_frames_ask_for(room, tmp_path):
+def test_a_video_that_ends_early_is_refused_unless_fewer_frames_are_requested(room, tmp_path):
     content = room.video.read_bytes()
     short, out = tmp_path / "short.avi", tmp_path / "track.csv"
     short.write_bytes(content[: len(content) * 6 // 10])
@@ -590,7 +591,7 @@ def test_a_video_that_ends_early_leaves_nothing_but_what_frames_ask_for(room, tm
     assert read_camera_path(out)[0].num_frames == 3
 
 
-def test_nothing_is_overwritten(room, tmp_path):
+def test_existing_files_are_not_overwritten(room, tmp_path):
     out = tmp_path / "track.csv"
     out.write_text("mine")
     options = ["--markers", room.markers, "--camera", room.lens, "--out", out, "--frames", 2]
@@ -617,7 +618,7 @@ def test_nothing_is_overwritten(room, tmp_path):
         (["IMAGES", "--fov", "70,55", "--fps", "0"], r"--fps: expected a number above 0, found 0"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_one_line(room, tmp_path, arguments, message):
+def test_invalid_input_is_refused_in_one_line(room, tmp_path, arguments, message):
     words = {"VIDEO": room.video, "IMAGES": room.folder / "images", "OUT": tmp_path / "track.csv"}
     with pytest.raises((InputError, SettingsError), match=message) as error:
         run(
@@ -636,18 +637,18 @@ def test_markers_are_needed(room, tmp_path):
         run(room.video, "--fov", "70,55", "--out", tmp_path / "track.csv")
 
 
-def test_images_of_two_sizes_name_the_one_that_differs(tmp_path):
+def test_the_image_of_another_size_is_named(tmp_path):
     for name, shape in (("a1.png", (20, 30)), ("a2.png", (20, 32))):
         cv2.imwrite(str(tmp_path / name), np.zeros(shape, np.uint8))
     with pytest.raises(InputError, match=r"a2.png: expected 30 x 20 pixels as a1.png has, found 32 x 20"):
         list(open_source(tmp_path, fps=25.0).frames())
 
 
-def test_a_folder_that_may_not_be_read_is_named(tmp_path, monkeypatch):
+def test_an_unreadable_folder_is_named(tmp_path, monkeypatch):
     def refused(_):
         raise PermissionError(13, "Permission denied")
 
-    # Whoever runs tests as root may read everything.
+    # Tests may run as root, who may read every folder.
     monkeypatch.setattr(Path, "iterdir", refused)
     with pytest.raises(InputError, match="expected a folder to read, found permission denied"):
         open_source(tmp_path)
@@ -663,7 +664,7 @@ def test_a_broken_image_is_named(tmp_path):
         open_source(tmp_path, fps=25.0)
 
 
-def test_names_sort_as_people_do():
+def test_file_names_sort_in_natural_order():
     names = ["b1.png", "a10.png", "a9.png", "a09b.png"]
     assert sorted(names, key=lambda name: natural_key(Path(name))) == [
         "a9.png",
@@ -673,7 +674,7 @@ def test_names_sort_as_people_do():
     ]
 
 
-def test_reading_ahead_keeps_order_and_raises_what_goes_wrong():
+def test_reading_ahead_keeps_order_and_raises_errors():
     assert list(read_ahead(iter(range(100)))) == list(range(100))
 
     def broken():
@@ -686,7 +687,7 @@ def test_reading_ahead_keeps_order_and_raises_what_goes_wrong():
     assert list(read_ahead(iter([]))) == []
 
 
-def test_the_newest_is_worked_on_and_the_last_is_never_left_out():
+def test_newest_items_are_used_and_the_last_is_never_left_out():
     made = threading.Event()
 
     def many():
@@ -697,6 +698,6 @@ def test_the_newest_is_worked_on_and_the_last_is_never_left_out():
     for item in read_ahead(many(), newest=True):
         found.append(item)
         assert made.wait(300)
-    # While the first was worked on, all others came; the last took the place of those before.
+    # While the first item was in use, all others came; the last one replaced those before it.
     assert found[-1] == 49
     assert len(found) <= 2

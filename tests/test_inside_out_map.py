@@ -1,4 +1,4 @@
-"""Maps of markers: tables, squares through measured corners, maps from videos, and what is wrong with a map."""
+"""Maps of markers: tables, squares fitted to measured corners, maps from videos, and faults of maps."""
 
 import re
 from dataclasses import replace
@@ -16,14 +16,14 @@ from psotrack.inside_out import (
     MarkerMap,
     build_map,
     check_map,
-    own_frame,
+    corners_in_own_frame,
+    fit_squares,
     read_marker_map,
-    read_measured,
-    squares,
+    read_measured_corners,
 )
 from psotrack.inside_out.mapping.scene import outward
-from psotrack.inside_out.mapping.sightings import SQUARE, MarkersInView, sightings_of
-from psotrack.inside_out.mapping.squares import best_square
+from psotrack.inside_out.mapping.sightings import SQUARE, FrameMarkers, collect_sightings
+from psotrack.inside_out.mapping.square_fitting import fit_square
 from psotrack.recordings import Markers, write_c3d
 
 SIDE_M = 0.4
@@ -67,7 +67,7 @@ LENSES = (
 
 
 def seen_in(corners_m, lens, source, num_views, *, noise_px=0.0, seed=0):
-    """What a camera sees that is carried around in a room while it turns around more than once."""
+    """Markers in the view of a camera that is carried through a room and turns around more than once."""
     rng = np.random.default_rng(seed)
     frames = []
     for view in range(num_views):
@@ -84,7 +84,7 @@ def seen_in(corners_m, lens, source, num_views, *, noise_px=0.0, seed=0):
             normal = np.cross(corners[3] - corners[1], corners[2] - corners[0])
             faces = normal @ (centre - corners.mean(axis=0)) > 0
             inside = ((pixels > 0) & (pixels < lens.image_size_wh - 1)).all()
-            # The distortion's polynomial folds back far outside of the image.
+            # The polynomial of the distortion folds back far outside of the image.
             if (
                 faces
                 and inside
@@ -93,7 +93,7 @@ def seen_in(corners_m, lens, source, num_views, *, noise_px=0.0, seed=0):
             ):
                 ids.append(marker)
                 quads.append(pixels + noise_px * rng.standard_normal((4, 2)))
-        frames.append(MarkersInView(source, view / 5, np.array(ids, int), np.array(quads).reshape(-1, 4, 2)))
+        frames.append(FrameMarkers(source, view / 5, np.array(ids, int), np.array(quads).reshape(-1, 4, 2)))
     return frames
 
 
@@ -103,7 +103,7 @@ def sightings(corners_m=ROOM, num_views=28, videos=1, **how):
         for source in range(videos)
         for frame in seen_in(corners_m, LENSES[source], source, num_views, **how)
     ]
-    return sightings_of(frames, LENSES[:videos])
+    return collect_sightings(frames, LENSES[:videos])
 
 
 def errors_m(built, truth=ROOM):
@@ -182,19 +182,19 @@ def test_layouts_of_tables(tmp_path, text):
     found = read_marker_map(path)
     assert set(found.corners_m) == set(ROOM)
     for marker, corners in ROOM.items():
-        # Millimetres are divided by 1000: some units in the last place.
+        # Millimetres are divided by 1000: rounding in the last digits.
         np.testing.assert_allclose(found.corners_m[marker], corners, atol=1e-12)
         np.testing.assert_array_equal(read_marker_corners(path)[marker], found.corners_m[marker])
 
 
-def test_other_columns_are_passed_over(tmp_path):
+def test_other_columns_are_ignored(tmp_path):
     path = tmp_path / "corners.csv"
     lines = wide(columns("{axis}{corner}[m]")).splitlines()
     path.write_text("\n".join([f"{lines[0]};wall;size", *(f"{line};north;0.3" for line in lines[1:])]))
     assert len(read_marker_map(path)) == len(ROOM)
 
 
-def test_map_knows_its_squares():
+def test_a_map_has_sides_centres_and_normals():
     found = MarkerMap(ROOM)
     np.testing.assert_array_equal(found.ids, np.arange(1, 17))
     np.testing.assert_allclose(found.sides_m, SIDE_M, rtol=1e-12)
@@ -219,7 +219,7 @@ def bent(distance_m, axis):
     return with_corners(3, corners)
 
 
-#: Line 4 of our layout is marker 3's.
+#: Line 4 of our layout belongs to marker 3.
 BAD_PLACES = {
     "not planar": (
         bent(0.05, 1),
@@ -251,7 +251,7 @@ BAD_PLACES = {
 
 
 @pytest.mark.parametrize(("corners", "message"), BAD_PLACES.values(), ids=BAD_PLACES)
-def test_bad_places(tmp_path, corners, message):
+def test_impossible_markers_are_refused(tmp_path, corners, message):
     path = tmp_path / "corners.csv"
     write_marker_corners(path, corners)
     with pytest.raises(InputError, match=message):
@@ -317,15 +317,15 @@ BAD_TEXTS = {
 
 
 @pytest.mark.parametrize(("text", "message"), BAD_TEXTS.values(), ids=BAD_TEXTS)
-def test_bad_tables(tmp_path, text, message):
+def test_malformed_tables_are_refused(tmp_path, text, message):
     path = tmp_path / "corners.csv"
     path.write_text(text)
     with pytest.raises(InputError, match=message):
         read_marker_map(path)
 
 
-def test_a_measured_map_is_no_bad_one(tmp_path):
-    """Corners that are 2 mm off each, as motion capture has them, of markers of 0.2 m."""
+def test_a_measured_map_is_accepted(tmp_path):
+    """Corners with errors of 2 mm each, as from motion capture, of markers of 0.2 m."""
     rng = np.random.default_rng(0)
     path = tmp_path / "corners.csv"
     corners = {
@@ -350,23 +350,23 @@ def test_markers_on_the_outside_of_a_box_face_outwards(tmp_path):
 
 
 @given(st.tuples(*[st.floats(-3, 3)] * 3), st.tuples(*[st.floats(-9, 9)] * 3), st.floats(0.05, 1.0))
-def test_best_square_of_a_square_is_itself(turn, centre, side_m):
+def test_the_square_fitted_to_a_square_is_itself(turn, centre, side_m):
     axes = Rotation.from_rotvec(turn).as_matrix()
-    found_axes, found_centre, found_side = best_square(np.array(centre) + side_m * SQUARE @ axes.T)
-    # Double precision, of numbers up to 10.
+    found_axes, found_centre, found_side = fit_square(np.array(centre) + side_m * SQUARE @ axes.T)
+    # Double precision, for numbers up to 10.
     np.testing.assert_allclose(found_axes, axes, atol=1e-11 / side_m)
     np.testing.assert_allclose(found_centre, centre, atol=1e-11)
     assert found_side == pytest.approx(side_m, rel=1e-9)
 
 
-def test_best_square_is_nearer_than_any_other():
+def test_the_fitted_square_is_nearer_than_any_other():
     rng = np.random.default_rng(1)
     points = ROOM[5] + 0.005 * rng.standard_normal((4, 3))
-    axes, centre, side = best_square(points)
+    axes, centre, side = fit_square(points)
 
-    def squares_of(turn, shift, grown):
+    def squares_of(turn, shift, factor):
         turned = axes @ Rotation.from_rotvec(turn).as_matrix()
-        return np.sum((centre + shift + side * grown * SQUARE @ turned.T - points) ** 2)
+        return np.sum((centre + shift + side * factor * SQUARE @ turned.T - points) ** 2)
 
     best = squares_of(np.zeros(3), np.zeros(3), 1.0)
     for _ in range(200):
@@ -375,33 +375,35 @@ def test_best_square_is_nearer_than_any_other():
 
 
 @pytest.mark.parametrize("order", [[0, 1, 2, 3], [0, 3, 2, 1], [2, 0, 3, 1], [1, 0, 3, 2]])
-def test_corners_in_any_order_are_put_right(tmp_path, order):
-    """All but the first are no order that a camera sees; upright markers are resolved by what is up."""
+def test_corners_in_any_order_are_sorted(tmp_path, order):
+    """Only the first order is one that a camera sees; the corners of upright markers are sorted by the up direction."""
     path = tmp_path / "points.csv"
     write_marker_corners(path, with_corners(3, ROOM[3][order]))
-    found = squares(read_measured(path))
+    found = fit_squares(read_measured_corners(path))
     np.testing.assert_allclose(found.marker_map.corners_m[3], ROOM[3], atol=1e-12)
     assert found.reordered == (() if order == [0, 1, 2, 3] else (3,))
 
 
-def test_the_side_that_a_lone_wall_is_seen_from(tmp_path):
+def test_the_viewer_decides_the_front_of_a_single_wall(tmp_path):
     path = tmp_path / "points.csv"
     wall = {marker: ROOM[marker] for marker in (1, 2, 3)}
     write_marker_corners(path, {**wall, 2: ROOM[2][[1, 0, 2, 3]]})
     with pytest.raises(InputError, match=r"line 3, marker 2: .* all markers in one plane; pass --seen-from"):
-        squares(read_measured(path))
-    found = squares(read_measured(path), seen_from_m=np.zeros(3))
+        fit_squares(read_measured_corners(path))
+    found = fit_squares(read_measured_corners(path), seen_from_m=np.zeros(3))
     np.testing.assert_allclose(found.marker_map.corners_m[2], ROOM[2], atol=1e-12)
 
 
-def test_a_marker_on_the_floor_has_no_top(tmp_path):
+def test_a_marker_on_the_floor_cannot_be_sorted(tmp_path):
     path = tmp_path / "points.csv"
     floor = SIDE_M * SQUARE
     write_marker_corners(path, {**ROOM, 20: floor[[1, 0, 2, 3]]})
     with pytest.raises(InputError, match=r"marker 20: .* lies flat"):
-        squares(read_measured(path))
+        fit_squares(read_measured_corners(path))
     write_marker_corners(path, {**ROOM, 20: floor})
-    np.testing.assert_allclose(squares(read_measured(path)).marker_map.corners_m[20], floor, atol=1e-12)
+    np.testing.assert_allclose(
+        fit_squares(read_measured_corners(path)).marker_map.corners_m[20], floor, atol=1e-12
+    )
 
 
 def recorded(corners_m, labels="Marker{}:{}", frames=30, noise_m=0.0):
@@ -422,10 +424,10 @@ def test_corners_of_a_c3d(tmp_path, labels):
     path = tmp_path / "room.c3d"
     markers = recorded(ROOM, labels, noise_m=0.0005)
     markers.position_m[:11, 3] = np.nan
-    # A label that jumped to another point for a while.
+    # A label that was on another point for a while.
     markers.position_m[5:12, 8] += 0.5
     write_c3d(path, markers)
-    found = squares(read_measured(path))
+    found = fit_squares(read_measured_corners(path))
     for marker, corners in ROOM.items():
         # Medians of 20 to 30 frames: 0.0005 m x 1.25 / sqrt(20) = 0.14 mm; five of them.
         np.testing.assert_allclose(found.marker_map.corners_m[marker], corners, atol=7e-4)
@@ -439,16 +441,16 @@ def test_c3d_without_a_corner(tmp_path):
     with pytest.raises(
         InputError, match=r"room.c3d, marker 3: expected 4 corners, found that number 2 is never seen"
     ):
-        read_measured(tmp_path / "room.c3d")
+        read_measured_corners(tmp_path / "room.c3d")
     write_c3d(tmp_path / "drones.c3d", Markers(("Dron1:Dron11",), np.ones((5, 1, 3)), 100.0))
     with pytest.raises(InputError, match=r"labels such as Marker7:1.* found Dron1:Dron11"):
-        read_measured(tmp_path / "drones.c3d")
+        read_measured_corners(tmp_path / "drones.c3d")
 
 
-def test_measured_corners_that_are_no_square(tmp_path):
+def test_measured_corners_without_a_square_are_refused(tmp_path):
     write_marker_corners(tmp_path / "points.csv", bent(0.15, 0))
     with pytest.raises(InputError, match=r"line 4, marker 3: expected four points that are a square"):
-        squares(read_measured(tmp_path / "points.csv"))
+        fit_squares(read_measured_corners(tmp_path / "points.csv"))
 
 
 # Maps from videos
@@ -456,7 +458,7 @@ def test_measured_corners_that_are_no_square(tmp_path):
 
 @pytest.mark.parametrize("videos", [1, 2])
 def test_exact_images_give_the_exact_map(videos):
-    """Two videos have lenses of their own, one of them bent."""
+    """Two videos have different lenses, one of them with distortion."""
     built = build_map(sightings(videos=videos), {7: ROOM[7]})
     assert set(built.ids) == set(ROOM)
     assert built.unplaced == ()
@@ -464,7 +466,7 @@ def test_exact_images_give_the_exact_map(videos):
     assert built.outliers.sum() == 0
 
 
-def test_the_known_marker_stays_and_has_no_deviation():
+def test_the_known_marker_stays_and_has_no_uncertainty():
     built = build_map(sightings(noise_px=0.3), {7: ROOM[7], 12: ROOM[12]})
     for marker in (7, 12):
         np.testing.assert_allclose(built.marker_map.corners_m[marker], ROOM[marker], atol=1e-12)
@@ -473,18 +475,18 @@ def test_the_known_marker_stays_and_has_no_deviation():
     assert (built.std_m[~built.known] > 0).all()
 
 
-def test_the_world_of_a_lone_marker_is_its_own():
-    """The whole map moves with the known marker: the same images, another world."""
+def test_a_single_known_side_makes_the_markers_axes_the_worlds():
+    """The whole map moves with the known marker: the same images in another world."""
     given_world = build_map(sightings(noise_px=0.2), {7: ROOM[7]})
-    own_world = build_map(sightings(noise_px=0.2), {7: own_frame(SIDE_M)})
-    axes, centre, _ = best_square(ROOM[7])
+    own_world = build_map(sightings(noise_px=0.2), {7: corners_in_own_frame(SIDE_M)})
+    axes, centre, _ = fit_square(ROOM[7])
     moved = own_world.marker_map.all_corners_m @ axes.T + centre
-    # Both searches end where the cost falls by less than 1e-9 of itself.
+    # Both searches end where the cost decreases by less than a share of 1e-9.
     np.testing.assert_allclose(moved, given_world.marker_map.all_corners_m, atol=1e-5)
 
 
 def test_a_larger_marker_makes_a_larger_room():
-    built = build_map(sightings(), {7: own_frame(2 * SIDE_M)})
+    built = build_map(sightings(), {7: corners_in_own_frame(2 * SIDE_M)})
     np.testing.assert_allclose(built.marker_map.sides_m, 2 * SIDE_M, rtol=1e-12)
     distance = np.linalg.norm(built.marker_map.centres_m[0] - built.marker_map.centres_m[8])
     # As exact as the map is.
@@ -493,7 +495,7 @@ def test_a_larger_marker_makes_a_larger_room():
     )
 
 
-def test_sides_that_differ_are_found():
+def test_different_sides_are_estimated():
     normals = MarkerMap(ROOM).normals
     sizes = {marker: 0.2 + 0.02 * marker for marker in ROOM}
     truth = {
@@ -503,63 +505,61 @@ def test_sides_that_differ_are_found():
     assert errors_m(built, truth).max() < 1e-6
 
 
-def test_an_inset_of_corners_is_found():
-    """Corners that a detector finds too far inside; a room from squares that are too small would be too large."""
+def test_an_inset_of_corners_is_estimated():
+    """Corners that a detector finds too far inside. Without the inset, squares that look too small enlarge the room."""
     exact = sightings(videos=2)
     inset_px = np.array([0.3, 0.15])[exact.lens[exact.view]][:, None, None]
     found = replace(exact, corners_px=exact.corners_px - inset_px * outward(exact))
     built = build_map(found, {7: ROOM[7]})
-    # Most of it: the prior says that there is little. What is left is in the covariance.
+    # Most of the inset is found, because the prior expects less. The covariance contains the rest.
     assert (np.abs(built.inset_px - [0.2, 0.1]) < 0.05).all()
     off_m = np.linalg.norm(built.marker_map.centres_m - MarkerMap(ROOM).centres_m, axis=1)[~built.known]
     assert (off_m < 3 * np.linalg.norm(built.std_m[~built.known], axis=1)).all()
 
 
-def test_wrong_identities_are_left_out():
+def test_sightings_with_wrong_ids_are_left_out():
     honest = sightings(noise_px=0.2, num_views=40)
     rng = np.random.default_rng(3)
     wrong = rng.random(len(honest.view)) < 0.04
     marker = np.where(wrong, rng.integers(1, 17, len(wrong)), honest.marker)
-    # What comes twice in a view is left out where detections become sightings.
+    # Ids that are twice in a view are left out when sightings are collected.
     frames = [
-        MarkersInView(
+        FrameMarkers(
             0, float(honest.time_s[view]), marker[honest.view == view], honest.corners_px[honest.view == view]
         )
         for view in range(honest.num_views)
     ]
-    built = build_map(sightings_of(frames, LENSES[:1]), {7: ROOM[7]})
+    built = build_map(collect_sightings(frames, LENSES[:1]), {7: ROOM[7]})
     clean = build_map(honest, {7: ROOM[7]})
     assert set(built.ids) == set(ROOM)
     assert 0 < built.outliers.sum() <= wrong.sum() + 2
-    # As good as without them, but for the sightings that are gone.
+    # As good as without wrong ids, except for the missing sightings.
     assert errors_m(built).max() < 1.5 * errors_m(clean).max()
 
 
-def test_what_cannot_be_reached_is_not_placed():
-    lonely = MarkersInView(0, 99.0, np.array([40]), np.array([[[10.0, 10], [50, 10], [50, 50], [10, 50]]]))
-    found = sightings_of([*seen_in(ROOM, LENSES[0], 0, 20), lonely], LENSES[:1])
+def test_markers_without_a_connection_are_not_placed():
+    lonely = FrameMarkers(0, 99.0, np.array([40]), np.array([[[10.0, 10], [50, 10], [50, 50], [10, 50]]]))
+    found = collect_sightings([*seen_in(ROOM, LENSES[0], 0, 20), lonely], LENSES[:1])
     built = build_map(found, {7: ROOM[7]})
     assert built.unplaced == (40,)
     assert 40 not in built.marker_map
 
 
 def test_unusable_known_markers():
-    with pytest.raises(
-        InputError, match=r"expected marker 77, that is known, beside others, found only 1, 2, 3"
-    ):
+    with pytest.raises(InputError, match=r"expected the known marker 77 beside others, found only 1, 2, 3"):
         build_map(sightings(), {77: ROOM[7]})
     alone = sightings({7: ROOM[7]})
     with pytest.raises(InputError, match="found others beside it in no frame; name another one by --known"):
         build_map(alone, {7: ROOM[7]})
     with pytest.raises(SettingsError, match="side_m: expected a number above 0"):
-        own_frame(0.0)
+        corners_in_own_frame(0.0)
     with pytest.raises(InputError, match="expected frames that show markers, found none in any frame"):
-        sightings_of([MarkersInView(0, 0.0, np.array([], int), np.zeros((0, 4, 2)))], LENSES[:1])
+        collect_sightings([FrameMarkers(0, 0.0, np.array([], int), np.zeros((0, 4, 2)))], LENSES[:1])
 
 
 @pytest.mark.slow
-def test_the_covariance_is_that_of_the_errors():
-    """Noise that is new in every frame, drawn anew: normalised squared errors of centres average to 3."""
+def test_the_covariance_agrees_with_the_errors():
+    """Noise that is new in every frame: the normalised squared errors of the centres average 3 over repeated draws."""
     normalised = []
     for seed in range(12):
         built = build_map(sightings(noise_px=0.3, num_views=50, seed=seed), {7: ROOM[7]})
@@ -568,15 +568,15 @@ def test_the_covariance_is_that_of_the_errors():
         )
         for error, covariance in zip(off[~built.known], built.covariance[~built.known, :3, :3], strict=True):
             normalised.append(error @ np.linalg.solve(covariance, error))
-    # Less than 3, because errors of the corners that are alike in all frames are reckoned with and there are none; and
-    # the 15 markers of a room share their errors, so that 12 rooms have some 60 degrees of freedom: 3 +- 0.5.
+    # Less than 3, because the covariance allows for errors common to all frames, which these corners do not have. The
+    # 15 markers of a room share errors, so that 12 rooms have about 60 degrees of freedom: 3 +- 0.5.
     assert 1.2 < np.mean(normalised) < 4.0
 
 
 # Wrong maps
 
 
-def test_healthy_maps_have_no_findings():
+def test_correct_maps_have_no_findings():
     for seed in range(3):
         rng = np.random.default_rng(seed)
         measured = {marker: corners + 0.001 * rng.standard_normal((4, 3)) for marker, corners in ROOM.items()}
@@ -646,7 +646,7 @@ def test_a_wrong_marker_is_named(wrong, kind, markers, message):
     assert re.search(message, str(checkup.findings[0]))
 
 
-def test_several_wrong_markers_are_named():
+def test_several_wrong_markers_are_all_named():
     wrong = {2: ROOM[2] + 0.1, 6: np.roll(ROOM[6], -1, axis=0), 11: ROOM[15], 15: ROOM[11]}
     checkup = check_map(sightings(noise_px=0.3), MarkerMap({**ROOM, **wrong}))
     assert {(one.kind, one.markers) for one in checkup.findings} == {
@@ -656,7 +656,7 @@ def test_several_wrong_markers_are_named():
     }
 
 
-def test_another_room_is_told_as_a_whole():
+def test_a_map_of_another_room_is_one_finding():
     rng = np.random.default_rng(4)
     shuffled = dict(zip(ROOM, [ROOM[marker] for marker in rng.permutation(list(ROOM)).tolist()], strict=True))
     checkup = check_map(sightings(noise_px=0.3), MarkerMap(shuffled))

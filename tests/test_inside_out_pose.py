@@ -1,4 +1,4 @@
-"""Poses from one frame's markers: exact cases, SciPy and Monte Carlo, wrong markers, second poses, what is refused."""
+"""Poses from one frame's markers: exact cases, SciPy and Monte Carlo, wrong markers, second poses, refused input."""
 
 from dataclasses import replace
 
@@ -14,8 +14,14 @@ from scipy.stats import binom, chi2
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import camera, look_at, project
 from psotrack.inside_out import PoseSettings
-from psotrack.inside_out.pose import Expected, locate
-from psotrack.inside_out.pose.equations import INSET_STD_PX, Noise, equations, seen_markers, summed
+from psotrack.inside_out.pose import ExpectedPose, estimate_pose
+from psotrack.inside_out.pose.equations import (
+    INSET_STD_PX,
+    Noise,
+    equations,
+    seen_markers,
+    summed,
+)
 from psotrack.inside_out.pose.fit import FALSE_ALARM
 
 K = np.array([[920.0, 0, 959.5], [0, 921.0, 539.5], [0, 0, 1]])
@@ -25,7 +31,7 @@ SIDE_M = 0.3
 
 
 def marker(centre_m, right, down, side_m=SIDE_M):
-    """(4, 3), corners clockwise from the top left for who looks at it."""
+    """(4, 3), corners clockwise from the top left as corners from the front."""
     right, down = np.asarray(right, float), np.asarray(down, float)
     offsets = [-right - down, right - down, right + down, -right + down]
     return np.asarray(centre_m) + side_m / 2 * np.array(offsets)
@@ -53,7 +59,7 @@ def looking(centre_m=(-0.8, -2.5, 1.3), target_m=(3.0, 3.0, 1.8), coefficients=0
 
 
 def longer_lens(view, by):
-    """The camera with another focal length, by a share of it."""
+    """The camera with a focal length that is longer by this share."""
     return replace(view, K=view.K * np.array([[1 + by, 1 + by, 1], [1 + by, 1 + by, 1], [1, 1, 1]]))
 
 
@@ -68,7 +74,7 @@ def corners_of(view, corners_m, rng=None, noise_px=0.0):
 
 
 def error(found, view):
-    """(6,), of position along the world's axes and of turn about the camera's own, as the covariance has it."""
+    """(6,), error of position along the world's axes and of turn about the camera's, in the covariance's order."""
     R_world_cam = view.T_cam_world[:3, :3].T
     turn = Rotation.from_matrix(found.R_world_cam.T @ R_world_cam).as_rotvec()
     return np.concatenate([view.centre_world - found.position_m, turn])
@@ -83,17 +89,19 @@ def squared_deviations(found, view):
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 7, 10])
 def test_exact_corners_give_the_pose_exactly(coefficients, count):
     view, corners_m = looking(coefficients=coefficients), two_walls(count)
-    found = locate(corners_of(view, corners_m), corners_m, lens_of(view), ANY_NUMBER)
-    # The last step is quadratic: a hundredth of a deviation squared, which is below 1 cm for a single marker.
+    found = estimate_pose(corners_of(view, corners_m), corners_m, lens_of(view), ANY_NUMBER)
+    # The last step converges quadratically: the remaining error is far below a standard deviation.
     np.testing.assert_allclose(error(found, view), 0, atol=1e-9)
     assert found.used.all()
     assert found.reprojection_px < 1e-6
     assert found.ambiguity < 1e-3
 
 
-def test_derivatives_are_those_of_differences():
+def test_derivatives_equal_finite_differences():
     view, corners_m = looking(coefficients=8), two_walls(3)
-    seen = seen_markers(corners_of(view, corners_m), corners_m, lens_of(view), 0.3, 1e-4, focal_error=0.005)
+    corners = seen_markers(
+        corners_of(view, corners_m), corners_m, lens_of(view), 0.3, 1e-4, focal_error=0.005
+    )
     R_world_cam = view.T_cam_world[:3, :3].T
 
     def off_px(x):
@@ -101,29 +109,29 @@ def test_derivatives_are_those_of_differences():
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = turned.T, -turned.T @ (view.centre_world + x[:3])
         longer = longer_lens(replace(view, T_cam_world=T), 0.005 * x[7])
-        return (project(longer, corners_m)[0] + x[6] * seen.inward).ravel()
+        return (project(longer, corners_m)[0] + x[6] * corners.inward).ravel()
 
-    rows, depth_m = equations(seen, view.centre_world, R_world_cam, np.zeros(2))
+    rows, depth_m = equations(corners, view.centre_world, R_world_cam, np.zeros(2))
     slopes = approx_fprime(np.zeros(8), off_px, 1e-7).reshape(3, 4, 2, 8)
-    # A step of 1e-7 bends by 1e-5 px and rounds at 1e-6 px.
+    # A finite step of 1e-7 has a curvature error of 1e-5 px and a rounding error of 1e-6 px.
     np.testing.assert_allclose(rows[..., :8], slopes, rtol=1e-4, atol=0.01)
     np.testing.assert_allclose(depth_m, project(view, corners_m)[1], rtol=1e-12)
 
 
-def test_elimination_is_scipys_least_squares_over_pose_inset_focal_length_and_every_markers_place():
-    """And what all frames have in common moves the pose as it moves SciPy's."""
+def test_elimination_equals_scipys_least_squares_over_all_unknowns():
+    """Unknowns: pose, inset, focal length, markers' offsets. Errors common to all frames move the pose as in SciPy."""
     rng = np.random.default_rng(0)
     view, corners_m = looking(coefficients=4), two_walls(6)
     noise, count, focal_error = Noise(0.4**2, 0.003**2, 10.0, 10.0), 6, 0.005
     placed_m = corners_m + 0.003 * rng.normal(size=(count, 1, 3))
     corners_px = corners_of(longer_lens(view, 0.003), placed_m, rng, 0.4)
-    # Of a marker's place, 0.6 of the deviation are the map's.
-    seen = seen_markers(corners_px, corners_m, lens_of(view), 0.4, 0.0024, 0.0018, focal_error)
-    position_m, R, extra = view.centre_world, view.T_cam_world[:3, :3].T, np.zeros(2)
+    # Of a marker's stated deviation, a share of 0.6 is the map's.
+    corners = seen_markers(corners_px, corners_m, lens_of(view), 0.4, 0.0024, 0.0018, focal_error)
+    position_m, R, nuisance = view.centre_world, view.T_cam_world[:3, :3].T, np.zeros(2)
     for _ in range(6):
-        sums = summed(equations(seen, position_m, R, extra)[0], np.ones((count, 4), bool))
-        solution = sums.solved(noise, extra)
-        position_m, extra = position_m + solution.step[:3], extra + solution.step[6:]
+        sums = summed(equations(corners, position_m, R, nuisance)[0], np.ones((count, 4), bool))
+        solution = sums.solved(noise, nuisance)
+        position_m, nuisance = position_m + solution.step[:3], nuisance + solution.step[6:]
         R = R @ Rotation.from_rotvec(solution.step[3:6]).as_matrix()
 
     def best_for(corners_px, start):
@@ -132,17 +140,17 @@ def test_elimination_is_scipys_least_squares_over_pose_inset_focal_length_and_ev
             T = np.eye(4)
             T[:3, :3], T[:3, 3] = turned.T, -turned.T @ (position_m + x[:3])
             there = longer_lens(replace(view, T_cam_world=T), focal_error * x[7])
-            pixels = project(there, corners_m + x[8:].reshape(count, 1, 3))[0] + x[6] * seen.inward
-            known = [x[8:] / 0.003, [x[6] / INSET_STD_PX, x[7]]]
-            return np.concatenate([((corners_px - pixels) / 0.4).ravel(), *known])
+            pixels = project(there, corners_m + x[8:].reshape(count, 1, 3))[0] + x[6] * corners.inward
+            prior = [x[8:] / 0.003, [x[6] / INSET_STD_PX, x[7]]]
+            return np.concatenate([((corners_px - pixels) / 0.4).ravel(), *prior])
 
         return least_squares(residuals, start, "3-point", x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-12)
 
     start = np.zeros(8 + 3 * count)
-    start[6:8] = extra
+    start[6:8] = nuisance
     result = best_for(corners_px, start)
     deviation = np.sqrt(np.diag(solution.covariance))
-    # Derivatives are taken where the markers should be, 3 mm in 5 m from where they are fitted.
+    # Derivatives are taken at the markers' positions in the map, 3 mm in 5 m from their fitted positions.
     np.testing.assert_allclose((result.x[:8] - start[:8]) / deviation, 0, atol=0.01)
     expected = np.linalg.inv(result.jac.T @ result.jac)[:8, :8]
     np.testing.assert_allclose(
@@ -151,7 +159,7 @@ def test_elimination_is_scipys_least_squares_over_pose_inset_focal_length_and_ev
         atol=0.01,
     )
 
-    common = sums.common(solution, noise, seen.map_share)
+    common = sums.common(solution, noise, corners.map_share)
     there, off_m = longer_lens(view, 0.003), np.zeros((count, 1, 3))
     off_m[4, 0, 2] = 0.003 * 0.6
     for column, view_of_it, moved_m in (
@@ -160,16 +168,16 @@ def test_elimination_is_scipys_least_squares_over_pose_inset_focal_length_and_ev
     ):
         by_px = project(view_of_it, moved_m)[0] - project(there, placed_m)[0]
         moved = best_for(corners_px + by_px, result.x).x[:6] - result.x[:6]
-        # Nearly linear, and a covariance to a hundredth.
+        # The problem is nearly linear, and the covariance is right to a hundredth.
         np.testing.assert_allclose(common[:, column] / deviation[:6], moved / deviation[:6], atol=0.02)
 
 
-def test_pose_is_scipys_where_the_map_is_exact():
+def test_pose_equals_scipys_where_the_map_is_exact():
     rng = np.random.default_rng(1)
     view, corners_m = looking(coefficients=5), two_walls(8)
     corners_px = corners_of(view, corners_m, rng, 0.3)
     lens = lens_of(view)
-    found = locate(corners_px, corners_m, lens, PoseSettings(noise_px=0.3, place_m=1e-7))
+    found = estimate_pose(corners_px, corners_m, lens, PoseSettings(noise_px=0.3, place_m=1e-7))
     inward = seen_markers(corners_px, corners_m, lens, 0.3, 1e-7).inward
 
     def residuals(x):
@@ -184,19 +192,19 @@ def test_pose_is_scipys_where_the_map_is_exact():
     )
     result = least_squares(residuals, start, x_scale="jac", xtol=1e-14, ftol=1e-14)
     deviation_m = np.sqrt(np.diag(found.covariance)[:3])
-    # The noise is estimated, and the inset's prior weighs a little more or less against it.
+    # Our noise is estimated, so that the prior of the inset has a slightly different weight.
     np.testing.assert_allclose((found.position_m - result.x[:3]) / deviation_m, 0, atol=0.02)
 
 
 def placements(rng, count, noise_px, place_m, stated, number):
-    """Squared deviations of poses from random places of the camera, corners' noise and markers off their places."""
+    """Poses and cameras: random positions of the camera, noise of the corners, offsets of the markers."""
     for _ in range(number):
         view = looking(
             rng.uniform((-1.5, -3, 0.8), (0.0, -1, 2)), rng.uniform((2.5, 3, 1.2), (3.5, 3.5, 2.2))
         )
         corners_m = two_walls(count)
         placed_m = corners_m + place_m * rng.normal(size=(count, 1, 3))
-        yield locate(corners_of(view, placed_m, rng, noise_px), corners_m, lens_of(view), stated), view
+        yield estimate_pose(corners_of(view, placed_m, rng, noise_px), corners_m, lens_of(view), stated), view
 
 
 @pytest.mark.parametrize(
@@ -205,65 +213,68 @@ def placements(rng, count, noise_px, place_m, stated, number):
         pytest.param(0.2, 0.0, SETTINGS, 0.85, id="as stated"),
         pytest.param(1.0, 0.0, SETTINGS, 0.85, id="more noise than stated"),
         pytest.param(0.1, 0.0, SETTINGS, 0.85, id="less noise than stated"),
-        pytest.param(0.3, 0.003, PoseSettings(place_m=0.003), 0.85, id="markers off by what is stated"),
-        # Of so few markers, six of whose places the pose takes, the variance is loosely known.
-        pytest.param(0.3, 0.003, SETTINGS, 0.7, id="markers off by thirty times what is stated"),
+        pytest.param(0.3, 0.003, PoseSettings(place_m=0.003), 0.85, id="marker offsets as stated"),
+        # The variance of 8 markers' offsets is known loosely, because the pose takes 6 unknowns.
+        pytest.param(0.3, 0.003, SETTINGS, 0.7, id="marker offsets thirty times as stated"),
     ],
 )
 def test_covariance_is_honest(noise_px, place_m, stated, least):
     poses = placements(np.random.default_rng(2), 8, noise_px, place_m, stated, 120)
     squares = np.array([squared_deviations(found, view) for found, view in poses])
     share = np.mean(squares < chi2.ppf(0.9, 6))
-    # Three deviations of a share of 120.
+    # Three standard deviations of a share of 120.
     assert share > least - 3 * np.sqrt(least * (1 - least) / 120)
-    # Nor is it so wide that it says nothing: deviations are at most a half too large.
+    # The covariance is not too wide either: deviations are at most one and a half times too large.
     assert np.median(squares) > chi2.median(6) / 1.5**2
 
 
 @pytest.mark.parametrize(
     ("map_error_m", "focal_error"), [(0.002, 0.0), (0.0, 0.005), (0.002, 0.005)], ids=["map", "focal", "both"]
 )
-def test_covariance_knows_errors_of_the_map_and_of_the_focal_length(map_error_m, focal_error):
-    """Six markers, 0.1 px; each pose with another map and another lens."""
+def test_covariance_includes_errors_of_the_map_and_of_the_focal_length(map_error_m, focal_error):
+    """Six markers, noise of 0.1 px; each pose has another map and another lens."""
     rng = np.random.default_rng(12)
-    told = PoseSettings(map_error_m=map_error_m, focal_error=focal_error)
+    with_errors = PoseSettings(map_error_m=map_error_m, focal_error=focal_error)
     views = [view for _, view in placements(np.random.default_rng(13), 6, 0.1, 0.0, SETTINGS, 100)]
     limit, corners_m = chi2.ppf(0.9, 3), two_walls(6)
-    inside, inside_untold, off_m, off_untold_m = [], [], [], []
+    inside, inside_without, off_m, off_without_m = [], [], [], []
     for view in views:
         placed_m = corners_m + map_error_m * rng.normal(size=(6, 1, 3))
         corners_px = corners_of(longer_lens(view, focal_error * rng.normal()), placed_m, rng, 0.1)
-        for stated, within, off in ((told, inside, off_m), (SETTINGS, inside_untold, off_untold_m)):
-            found = locate(corners_px, corners_m, lens_of(view), stated)
+        for stated, within, off in (
+            (with_errors, inside, off_m),
+            (SETTINGS, inside_without, off_without_m),
+        ):
+            found = estimate_pose(corners_px, corners_m, lens_of(view), stated)
             miss_m = view.centre_world - found.position_m
             within.append(miss_m @ np.linalg.solve(found.covariance[:3, :3], miss_m) < limit)
             off.append(np.linalg.norm(miss_m))
             of_common = found.common @ found.common.T
             assert np.linalg.eigvalsh(found.covariance - of_common)[0] > 0
-    # Three deviations of a share of 100.
+    # Three standard deviations of a share of 100.
     assert np.mean(inside) > 0.9 - 3 * np.sqrt(0.09 / 100)
-    assert np.mean(inside_untold) < np.mean(inside) - 0.05
-    # Markers on two walls tell the focal length; what the map does, one pose cannot tell.
-    assert np.median(off_m) < (0.8 if focal_error else 1.05) * np.median(off_untold_m)
+    assert np.mean(inside_without) < np.mean(inside) - 0.05
+    # Markers on two walls determine the focal length; one pose cannot separate the errors of the map.
+    assert np.median(off_m) < (0.8 if focal_error else 1.05) * np.median(off_without_m)
 
 
-def test_chance_is_how_many_sets_of_markers_would_agree():
+def test_chance_is_the_expected_number_of_sets_of_markers_that_agree():
     rng = np.random.default_rng(14)
     view, corners_m = looking(), two_walls(4)
     corners_px = corners_of(view, corners_m, rng, 0.05)
     found = {
-        count: locate(corners_px[:count], corners_m[:count], lens_of(view), ANY_NUMBER).chance
+        count: estimate_pose(corners_px[:count], corners_m[:count], lens_of(view), ANY_NUMBER).chance
         for count in (1, 2, 4)
     }
-    # Within 15 times the stated 0.2 px of one place in an image of 1920 x 1080.
+    # The area within 15 times the stated 0.2 px of a place, as a share of an image of 1920 x 1080.
     near = np.pi * 3.0**2 / (1920 * 1080)
     assert found[1] == 1.0
     assert found[2] == pytest.approx(2 * near)
     assert found[4] == pytest.approx(4 * near**3)
-    # Any two of the four others would do as well.
+    # Any two of the four other markers could agree with the first.
     wrong_px = np.concatenate([corners_px[:3], corners_px[2:] + rng.uniform(200, 400, (2, 1, 2))])
     taken_m = np.concatenate([corners_m[:3], two_walls(6)[4:]])
-    some = locate(wrong_px, taken_m, lens_of(view), ANY_NUMBER)
+    some = estimate_pose(wrong_px, taken_m, lens_of(view), ANY_NUMBER)
     np.testing.assert_array_equal(some.used, [True] * 3 + [False] * 2)
     assert some.chance == pytest.approx(5 * 6 * near**2)
 
@@ -272,7 +283,7 @@ def test_inset_of_all_corners_does_not_move_the_camera():
     view, corners_m = looking(), two_walls(8)
     corners_px = corners_of(view, corners_m)
     inward = seen_markers(corners_px, corners_m, lens_of(view), 0.3, 1e-4).inward
-    found = locate(corners_px + 0.5 * inward, corners_m, lens_of(view), SETTINGS)
+    found = estimate_pose(corners_px + 0.5 * inward, corners_m, lens_of(view), SETTINGS)
     assert squared_deviations(found, view) < 0.01
     assert found.reprojection_px == pytest.approx(0.5, rel=0.01)
 
@@ -283,17 +294,17 @@ def test_inset_of_all_corners_does_not_move_the_camera():
     seed=st.integers(0, 2**31),
 )
 @settings(max_examples=20)
-def test_the_world_may_be_turned_and_shifted_and_markers_reordered(axis, shift_m, seed):
+def test_pose_follows_a_transformed_world_and_reordered_markers(axis, shift_m, seed):
     rng = np.random.default_rng(seed)
     view, corners_m = looking(), two_walls(9)
     corners_px = corners_of(view, corners_m, rng, 0.2)
     corners_px[4] += 40.0
     order = rng.permutation(9)
     R = Rotation.from_rotvec(axis).as_matrix()
-    one = locate(corners_px, corners_m, lens_of(view), SETTINGS)
-    other = locate(corners_px[order], corners_m[order] @ R.T + shift_m, lens_of(view), SETTINGS)
+    one = estimate_pose(corners_px, corners_m, lens_of(view), SETTINGS)
+    other = estimate_pose(corners_px[order], corners_m[order] @ R.T + shift_m, lens_of(view), SETTINGS)
     np.testing.assert_array_equal(other.used, one.used[order])
-    # Both stop within a tenth of a deviation of the same minimum; deviations are about 1 mm and 0.2 mrad.
+    # Both fits stop within a tenth of a deviation of the same minimum; deviations are about 1 mm and 0.2 mrad.
     np.testing.assert_allclose(R.T @ (other.position_m - shift_m), one.position_m, atol=1e-4)
     np.testing.assert_allclose(R.T @ other.R_world_cam, one.R_world_cam, atol=2e-5)
     turned = np.kron(np.eye(2), R)
@@ -307,7 +318,7 @@ def test_the_world_may_be_turned_and_shifted_and_markers_reordered(axis, shift_m
 
 
 @pytest.mark.parametrize("wrong", [1, 2, 3, 4])
-def test_markers_with_the_identity_of_another_are_found(wrong):
+def test_markers_with_the_id_of_another_are_left_out(wrong):
     for seed in range(5):
         rng = np.random.default_rng(seed)
         view, corners_m = looking(), two_walls(10)
@@ -316,12 +327,12 @@ def test_markers_with_the_identity_of_another_are_found(wrong):
         taken = corners_m.copy()
         for index in swapped:
             taken[index] = corners_m[rng.choice([i for i in range(10) if i != index])]
-        found = locate(corners_px, taken, lens_of(view), SETTINGS)
+        found = estimate_pose(corners_px, taken, lens_of(view), SETTINGS)
         np.testing.assert_array_equal(np.flatnonzero(~found.used), np.sort(swapped))
         assert squared_deviations(found, view) < chi2.ppf(0.9999, 6)
 
 
-def test_one_bad_corner_costs_a_corner_and_two_cost_the_marker():
+def test_one_bad_corner_excludes_the_corner_and_two_exclude_the_marker():
     rng = np.random.default_rng(3)
     view, corners_m = looking(), two_walls(8)
     clean_px = corners_of(view, corners_m, rng, 0.2)
@@ -329,7 +340,7 @@ def test_one_bad_corner_costs_a_corner_and_two_cost_the_marker():
     one_px[2, 1] += (4.0, -3.0)
     two_px[2, 1:3] += (4.0, -3.0)
     clean, one, two, without = (
-        locate(corners_px, places_m, lens_of(view), SETTINGS)
+        estimate_pose(corners_px, places_m, lens_of(view), SETTINGS)
         for corners_px, places_m in (
             (clean_px, corners_m),
             (one_px, corners_m),
@@ -340,22 +351,22 @@ def test_one_bad_corner_costs_a_corner_and_two_cost_the_marker():
     assert clean.used.all()
     assert one.used.all()
     np.testing.assert_array_equal(two.used, np.arange(8) != 2)
-    # What was thrown out has no influence: the pose is that of the rest, to a tenth of a deviation of a millimetre.
+    # Excluded corners have no influence: the pose equals that of the other markers to a tenth of a deviation.
     np.testing.assert_allclose(two.position_m, without.position_m, atol=1e-4)
     assert one.reprojection_px < 1.0
-    # The information of 31 corners instead of 32.
+    # 31 corners have nearly the information of 32.
     assert np.trace(one.covariance[:3, :3]) == pytest.approx(np.trace(clean.covariance[:3, :3]), rel=0.5)
 
 
-def test_good_markers_are_thrown_out_as_seldom_as_stated():
+def test_good_markers_are_excluded_as_seldom_as_stated():
     found = [one.used for one, _ in placements(np.random.default_rng(4), 10, 0.3, 0.0, SETTINGS, 60)]
     thrown = np.sum(~np.array(found))
-    # A marker is out with its mean, or with two corners, which is much rarer.
+    # A marker is excluded by its mean, or by two of its corners, which is much rarer.
     assert thrown <= binom.ppf(0.9999, 600, 2 * FALSE_ALARM)
 
 
 def far_marker(rng, angle_deg=20.0, distance_m=7.0):
-    """A single small marker, a little turned from the camera, and a camera before it."""
+    """A camera, a single small marker that is slightly turned from it, and the marker's corners in the image."""
     angle = np.deg2rad(angle_deg)
     view = looking((0.0, 0.0, 1.0), (0.0, distance_m, 1.0))
     one = marker((0.0, distance_m, 1.0), (np.cos(angle), np.sin(angle), 0), (0, 0, -1))[None]
@@ -364,38 +375,38 @@ def far_marker(rng, angle_deg=20.0, distance_m=7.0):
 
 def test_ambiguity_of_a_single_marker_is_how_often_the_other_pose_is_right():
     rng = np.random.default_rng(5)
-    said, wrong = [], []
+    stated, wrong = [], []
     for _ in range(120):
         view, corners_m, corners_px = far_marker(rng)
-        found = locate(corners_px, corners_m, lens_of(view), ANY_NUMBER)
-        said.append(found.ambiguity)
-        # The other pose sees the marker turned to the other side.
+        found = estimate_pose(corners_px, corners_m, lens_of(view), ANY_NUMBER)
+        stated.append(found.ambiguity)
+        # The mirrored pose sees the marker turned to the other side.
         wrong.append(np.rad2deg(np.linalg.norm(error(found, view)[3:])) > 20)
-    assert 0.1 < np.mean(said) < 0.5
-    # Three deviations of the count, and a fifth for the approximations.
-    limit = 3 * np.sqrt(np.mean(said) / 120) + 0.2 * np.mean(said)
-    assert abs(np.mean(wrong) - np.mean(said)) < limit
+    assert 0.1 < np.mean(stated) < 0.5
+    # Three standard deviations of the count, and a fifth for the approximations.
+    limit = 3 * np.sqrt(np.mean(stated) / 120) + 0.2 * np.mean(stated)
+    assert abs(np.mean(wrong) - np.mean(stated)) < limit
 
 
-def test_expectation_decides_between_the_poses_of_a_single_marker():
+def test_expected_pose_decides_between_the_poses_of_a_single_marker():
     rng = np.random.default_rng(6)
     for _ in range(20):
         view, corners_m, corners_px = far_marker(rng)
-        expected = Expected(
+        expected = ExpectedPose(
             view.centre_world + np.array([0.2, -0.1, 0.1]),
             view.T_cam_world[:3, :3].T,
             np.diag([0.1] * 3 + [0.01] * 3),
         )
-        found = locate(corners_px, corners_m, lens_of(view), ANY_NUMBER, expected)
+        found = estimate_pose(corners_px, corners_m, lens_of(view), ANY_NUMBER, expected)
         assert np.rad2deg(np.linalg.norm(error(found, view)[3:])) < 20
         assert found.ambiguity < 0.05
 
 
-def test_expectation_is_only_an_expectation():
+def test_markers_outweigh_a_wrong_expected_pose():
     view, corners_m = looking(), two_walls(6)
     corners_px = corners_of(view, corners_m)
-    elsewhere = Expected(view.centre_world + 30.0, np.eye(3), 1e-6 * np.eye(6))
-    found = locate(corners_px, corners_m, lens_of(view), SETTINGS, elsewhere)
+    elsewhere = ExpectedPose(view.centre_world + 30.0, np.eye(3), 1e-6 * np.eye(6))
+    found = estimate_pose(corners_px, corners_m, lens_of(view), SETTINGS, elsewhere)
     np.testing.assert_allclose(error(found, view), 0, atol=1e-9)
 
 
@@ -403,41 +414,41 @@ def test_markers_of_one_wall_are_ambiguous_from_far_away_only():
     rng = np.random.default_rng(7)
     corners_m = one_wall()
     near = looking((1.5, -0.5, 1.5), (0.0, 4.0, 2.0))
-    found = locate(corners_of(near, corners_m, rng, 0.3), corners_m, lens_of(near), SETTINGS)
+    found = estimate_pose(corners_of(near, corners_m, rng, 0.3), corners_m, lens_of(near), SETTINGS)
     assert found.ambiguity < 1e-9
     tele = np.array([[920.0, 0, 959.5], [0, 920.0, 539.5], [0, 0, 1]])
     ambiguities = []
     for _ in range(20):
         far = looking((12.0, -60.0, 1.5), (0.0, 4.0, 2.0), K=tele)
         ambiguities.append(
-            locate(corners_of(far, corners_m, rng, 0.5), corners_m, lens_of(far), SETTINGS).ambiguity
+            estimate_pose(corners_of(far, corners_m, rng, 0.5), corners_m, lens_of(far), SETTINGS).ambiguity
         )
     assert max(ambiguities) > 0.05
 
 
-def test_of_two_markers_that_contradict_each_other_nobody_knows_which_is_right():
+def test_two_markers_that_contradict_each_other_are_ambiguous_without_an_expected_pose():
     rng = np.random.default_rng(8)
     view, all_m = looking(), two_walls(10)
     corners_m = all_m[[0, 1]]
     corners_px = corners_of(view, corners_m, rng, 0.2)
     taken = np.stack([corners_m[0], all_m[8]])
-    found = locate(corners_px, taken, lens_of(view), ANY_NUMBER)
+    found = estimate_pose(corners_px, taken, lens_of(view), ANY_NUMBER)
     assert found is None or (found.used.sum() == 1 and found.ambiguity > 0.01)
-    expected = Expected(
+    expected = ExpectedPose(
         view.centre_world + 0.05, view.T_cam_world[:3, :3].T, np.diag([0.01] * 3 + [0.003] * 3)
     )
-    found = locate(corners_px, taken, lens_of(view), ANY_NUMBER, expected)
+    found = estimate_pose(corners_px, taken, lens_of(view), ANY_NUMBER, expected)
     np.testing.assert_array_equal(found.used, [True, False])
     assert found.ambiguity < 0.01
     assert squared_deviations(found, view) < chi2.ppf(0.9999, 6)
 
 
-def test_a_marker_that_the_map_has_behind_the_camera_is_wrong():
+def test_a_marker_that_the_map_places_behind_the_camera_is_left_out():
     view, corners_m = looking(), two_walls(6)
     corners_px = corners_of(view, corners_m)
     taken = corners_m.copy()
     taken[3] = marker((0.0, -4.0, 1.5), (-1, 0, 0), (0, 0, -1))
-    found = locate(corners_px, taken, lens_of(view), SETTINGS)
+    found = estimate_pose(corners_px, taken, lens_of(view), SETTINGS)
     np.testing.assert_array_equal(found.used, np.arange(6) != 3)
     np.testing.assert_allclose(error(found, view), 0, atol=1e-9)
 
@@ -446,22 +457,22 @@ def test_too_few_markers_give_no_pose():
     view, corners_m = looking(), two_walls(4)
     corners_px = corners_of(view, corners_m)
     nothing = np.zeros((0, 4, 2)), np.zeros((0, 4, 3))
-    assert locate(*nothing, lens_of(view), ANY_NUMBER) is None
-    assert locate(corners_px[:3], corners_m[:3], lens_of(view), SETTINGS) is None
-    assert locate(corners_px, corners_m, lens_of(view), SETTINGS) is not None
+    assert estimate_pose(*nothing, lens_of(view), ANY_NUMBER) is None
+    assert estimate_pose(corners_px[:3], corners_m[:3], lens_of(view), SETTINGS) is None
+    assert estimate_pose(corners_px, corners_m, lens_of(view), SETTINGS) is not None
 
 
-def test_markers_that_do_not_fix_a_pose_give_none():
+def test_markers_that_do_not_determine_a_pose_give_none():
     view = looking()
-    # All corners on one line, as they are seen and as the map has them.
+    # All corners lie on one line, in the image and in the map.
     line_m = np.array([[[x + 0.1 * i, 4.0, 1.5] for i in range(4)] for x in range(5)])
-    assert locate(corners_of(view, line_m), line_m, lens_of(view), SETTINGS) is None
-    # All corners in one point.
+    assert estimate_pose(corners_of(view, line_m), line_m, lens_of(view), SETTINGS) is None
+    # All corners lie in one point.
     point_m = np.tile([1.0, 4.0, 1.5], (5, 4, 1))
-    assert locate(corners_of(view, point_m), point_m, lens_of(view), SETTINGS) is None
+    assert estimate_pose(corners_of(view, point_m), point_m, lens_of(view), SETTINGS) is None
 
 
-def test_markers_that_all_contradict_one_another_give_none():
+def test_markers_that_all_contradict_one_another_give_no_pose():
     rng = np.random.default_rng(9)
     view, corners_m = looking(), two_walls(10)
     for seed in range(5):
@@ -469,14 +480,14 @@ def test_markers_that_all_contradict_one_another_give_none():
         corners_px = rng.uniform((200, 200), (1700, 900), (10, 1, 2)) + 30 * np.array(
             [[-1, -1], [1, -1], [1, 1], [-1, 1]]
         )
-        assert locate(corners_px, corners_m[shuffled], lens_of(view), SETTINGS) is None
+        assert estimate_pose(corners_px, corners_m[shuffled], lens_of(view), SETTINGS) is None
 
 
-def test_what_makes_no_sense_is_refused():
+def test_invalid_corners_and_settings_are_refused():
     view, corners_m = looking(), two_walls(4)
     corners_px = corners_of(view, corners_m)
     with pytest.raises(InputError, match="finite coordinates"):
-        locate(np.where(corners_px > 1e9, 0, np.nan), corners_m, lens_of(view), SETTINGS)
+        estimate_pose(np.where(corners_px > 1e9, 0, np.nan), corners_m, lens_of(view), SETTINGS)
     with pytest.raises(SettingsError, match="min_markers: expected at least 1, found 0"):
         PoseSettings(min_markers=0)
     with pytest.raises(SettingsError, match="noise_px"):

@@ -19,8 +19,8 @@ from test_inside_out_filter import (
 from psotrack.errors import InputError
 from psotrack.inside_out import Flag, PoseFilterParams, smooth
 from psotrack.inside_out.filtering import motion as pose_motion
-from psotrack.inside_out.filtering.path_rows import path_of, rows_of
-from psotrack.inside_out.filtering.pose_filter import follow
+from psotrack.inside_out.filtering.path_rows import join_rows, split_path
+from psotrack.inside_out.filtering.pose_filter import filter_path
 from psotrack.inside_out.filtering.smoothing import MotionModel, estimate_motion_model
 from psotrack.trajectories import Status
 
@@ -128,7 +128,7 @@ def test_the_model_tells_calm_from_violent_flights_and_wide_covariances_from_rig
 @pytest.mark.parametrize(("acceleration", "wobble"), [(0.5, 0.5), (8.0, 8.0)])
 def test_the_smoother_is_better_than_the_filter_and_its_covariances_are_right(acceleration, wobble) -> None:
     raw, position_m, truth = flight(100, acceleration=acceleration, wobble=wobble, seed=33)
-    filtered, smoothed = follow(raw), smooth(raw)
+    filtered, smoothed = filter_path(raw), smooth(raw)
     # In a violent flight, one of the two filter runs may gate a pose in ten.
     assert (smoothed.status == Status.TRACKED).mean() > 0.88
     assert (smoothed.status != Status.LOST).all()
@@ -147,7 +147,7 @@ def test_gaps_are_bridged_from_both_sides() -> None:
     raw, position_m, truth = flight(110, acceleration=1.0, wobble=1.0, seed=32)
     gone = np.r_[0:4, 30:50, 70:100]
     raw = without(raw, gone)
-    path, filtered = smooth(raw, PoseFilterParams(longest_gap_s=0.45)), follow(raw)
+    path, filtered = smooth(raw, PoseFilterParams(longest_gap_s=0.45)), filter_path(raw)
     # Every frame of the gap of 0.84 s is within 0.45 s of a pose; the gap of 1.24 s has frames that are not. Frames
     # before the first pose are lost.
     assert (path.status[:4] == Status.LOST).all()
@@ -186,7 +186,7 @@ def test_a_sharp_turn_that_the_filter_gated_is_used_by_the_smoother() -> None:
     position_m[30:, 0] = 40.0 / 2 * (np.arange(1, 31) / FPS) ** 2
     rng = np.random.default_rng(34)
     raw = raw_path(position_m + rng.normal(scale=0.002, size=(60, 3)), Rotation.identity(60))
-    assert (follow(raw).status[28:34] == Status.COASTING).any()
+    assert (filter_path(raw).status[28:34] == Status.COASTING).any()
     path = smooth(raw)
     assert (path.status[28:34] == Status.TRACKED).all()
 
@@ -203,7 +203,7 @@ def test_the_path_is_not_drawn_across_a_permanent_jump() -> None:
 @pytest.mark.parametrize("frames", [0, 1, 2])
 def test_paths_of_few_poses(frames) -> None:
     raw, _, _ = flight(5, seed=36)
-    some = path_of(rows_of(raw)[:frames])
+    some = join_rows(split_path(raw)[:frames])
     assert (smooth(some).status == Status.LOST).all()
     confirmed_at_once = smooth(some, PoseFilterParams(confirm=1))
     assert (confirmed_at_once.status == Status.TRACKED).all()

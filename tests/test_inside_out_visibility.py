@@ -1,4 +1,4 @@
-"""Which markers a camera could see: hand-placed markers, and OpenCV's projection of them."""
+"""Markers that a camera could see: markers placed by hand, and OpenCV's projection."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from psotrack.geometry import camera
 from psotrack.inside_out import MarkerMap
 from psotrack.inside_out.comparison.visibility import visible_markers
 
-#: At the origin, x to the right, y down, z ahead: a metre at one metre is 100 px, in an image of 201 x 101.
+#: At the origin, x to the right, y down, z ahead; a metre at a distance of 1 m is 100 px, in an image of 201 x 101.
 LENS = camera(
     R=np.eye(3),
     t_m=np.zeros(3),
@@ -23,7 +23,7 @@ ORIGIN, AHEAD = np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]])
 
 
 def square_m(middle, side_m=0.2, turn_deg=0.0):
-    """A marker that faces the camera, turned about the vertical through its middle."""
+    """A marker that faces the camera, turned about the vertical axis through its middle."""
     corners = side_m / 2 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)
     return Rotation.from_euler("y", turn_deg, degrees=True).apply(corners) + middle
 
@@ -38,7 +38,7 @@ def seen(*markers, position_m=ORIGIN, wxyz=AHEAD, **options):
     [
         (square_m([0, 0, 1]), True),
         (square_m([0, 0, -1], turn_deg=180), False),  # Behind, though it faces the camera.
-        (square_m([0, 0, 1], turn_deg=180), False),  # From its back.
+        (square_m([0, 0, 1], turn_deg=180), False),  # Seen from its back.
         (square_m([0, 0, 1], turn_deg=-45), True),
         (square_m([1.2, 0, 1]), False),  # To the right of the image.
         # Its right edge at 100 + 100 (0.904 + 0.1) = 200.4 px; the image ends at 200.5.
@@ -55,12 +55,12 @@ def test_hand_placed_markers(corners, expected):
     assert seen(corners).tolist() == [[expected]]
 
 
-def test_fewer_pixels_may_do():
+def test_the_smallest_side_can_be_chosen():
     assert seen(square_m([0, 0, 1.7]), min_side_px=11.0).tolist() == [[True]]
 
 
-def test_any_pose_and_poses_that_are_not_known():
-    """The world turned about, markers and camera alike; in the second frame there is no pose."""
+def test_visibility_does_not_depend_on_the_worlds_axes():
+    """The world is turned, markers and camera together; in the second frame there is no pose."""
     markers = [square_m([0, 0, 1]), square_m([0.906, 0, 1]), square_m([-0.3, 0.1, 1.2])]
     turn, shift_m = Rotation.from_rotvec([0.3, -2.0, 1.1]), np.array([4.0, -7.0, 2.0])
     moved = [turn.apply(corners) + shift_m for corners in markers]
@@ -73,8 +73,8 @@ def test_any_pose_and_poses_that_are_not_known():
     assert not seen(*moved, position_m=np.full((2, 3), np.nan), wxyz=np.full((2, 4), np.nan)).any()
 
 
-def test_a_lens_that_bends():
-    """Markers at all distances from the axis: inside where OpenCV's projection of all corners is."""
+def test_a_lens_with_distortion():
+    """Markers at all distances from the axis are visible where OpenCV projects all corners into the image."""
     lens = replace(LENS, dist=np.array(LENSES[4]))
     middles = [[x, y, 1.0] for x in np.linspace(-1.2, 1.2, 25) for y in (-0.3, 0.0, 0.42)]
     marker_map = MarkerMap({number: square_m(middle) for number, middle in enumerate(middles)})

@@ -16,7 +16,7 @@ from psotrack.detection import marker_dictionary
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
 from psotrack.geometry import camera, look_at, project, stack, write_rig
 from psotrack.inside_out import MarkerMap
-from psotrack.inside_out.lens_files import scaled
+from psotrack.inside_out.lens_files import scale_lens
 from psotrack.recordings import VideoWriter, write_c3d
 
 SIZE_WH = (960, 720)
@@ -35,12 +35,12 @@ CORNERS = {
     },
     **{marker: on_wall((2.2, y, z), (-1, 0, 0), SIDE_M) for marker, y, z in ((21, 2.1, 2.0), (22, 0.9, 1.3))},
 }
-#: Cells of the printed sheet across, 6 of them the marker's.
+#: Width of a printed sheet, cells, of which 6 are the marker's.
 _CELLS = 8
 
 
 def invoke(*words, expect=None):
-    """What the command prints; or the error that it must end with."""
+    """Output of the command; or check the error with which it must end."""
     result = CliRunner().invoke(map_markers, [str(word) for word in words], catch_exceptions=True)
     if expect is None:
         assert result.exception is None, result.output + repr(result.exception)
@@ -50,7 +50,7 @@ def invoke(*words, expect=None):
 
 
 def image(cam):
-    """Sheets of paper on grey walls, drawn twice as large, blurred in light, and coded as video is."""
+    """Sheets of paper on grey walls, drawn at twice the size, blurred in light, and compressed as in a video."""
     canvas = np.full((2 * SIZE_WH[1], 2 * SIZE_WH[0]), 0.2, np.float32)
     for marker, corners in CORNERS.items():
         sheet = np.ones((_CELLS * 40, _CELLS * 40), np.float32)
@@ -60,7 +60,7 @@ def image(cam):
         pixels, depth = project(cam, corners)
         if (depth < 0.3).any():
             continue
-        # Edges of pixels, and of the sheet's: centres are at whole numbers.
+        # Edges of pixels and of the sheet: pixel centres are at whole numbers.
         at = np.array([[40, 40], [280, 40], [280, 280], [40, 280]], np.float32) - 0.5
         onto = cv2.getPerspectiveTransform(at, (2 * pixels + 0.5).astype(np.float32))
         mask = cv2.warpPerspective(np.ones_like(sheet), onto, canvas.shape[::-1])
@@ -98,21 +98,21 @@ def test_a_map_from_a_video(walk, tmp_path):
     printed = invoke(*words, "--out", out, "--json", tmp_path / "map.json")
     assert "5 markers from 24 frames" in printed
     off = centres_off_m(out)
-    # Corners are right to 0.1 px of 620 px per metre at 1 m: 0.6 mm at 4 m, and some times that around a corner.
+    # Corners are right to 0.1 px at 620 px per metre at 1 m: 0.6 mm at 4 m, and several times as much around a corner.
     assert set(off) == set(CORNERS)
     assert max(off.values()) < 0.01
     content = json.loads((tmp_path / "map.json").read_text())
     assert content["frames"] == 24
     for marker, row in content["markers"].items():
         assert row["known"] == (marker == "7")
-        # A centre that is off by less than 4 of its deviations, in its length.
+        # The error of the centre is below 4 of its standard deviations, in its length.
         assert off[int(marker)] <= 4 * np.linalg.norm(row["std_m"]) + 1e-9
         assert row["residual_px"] < 0.5
     assert "expected a path that does not exist yet" in invoke(*words, "--out", out, expect=OutputError)
     invoke(*words, "--out", out, "--force", "--quiet")
 
 
-def test_the_world_of_a_marker_of_which_the_side_is_known(walk, tmp_path):
+def test_a_marker_with_known_side_defines_the_world(walk, tmp_path):
     out = tmp_path / "corners.csv"
     invoke(
         walk / "walk.avi",
@@ -134,7 +134,7 @@ def test_the_world_of_a_marker_of_which_the_side_is_known(walk, tmp_path):
     np.testing.assert_allclose(found.centres_m[found.ids.tolist().index(8)], [1.2, -0.7, 0.0], atol=0.01)
 
 
-def test_a_sequence_brings_its_own(walk, tmp_path):
+def test_a_sequence_provides_video_intrinsics_and_map(walk, tmp_path):
     """The layout of the dataset: video, intrinsics and table of corners are found by their names."""
     folder = tmp_path / "S01_D2_A"
     folder.mkdir()
@@ -159,7 +159,7 @@ def test_a_sequence_brings_its_own(walk, tmp_path):
     assert "expected some of dron1, found dron5" in message
 
 
-def test_a_wrong_map_is_told_and_the_exit_says_so(walk, tmp_path):
+def test_a_wrong_map_is_reported_and_changes_the_exit_status(walk, tmp_path):
     wrong = tmp_path / "wrong.csv"
     write_marker_corners(wrong, {**CORNERS, 22: CORNERS[22] + np.array([0.0, 0.1, 0.05])})
     words = ["--check", wrong, "--camera", walk / "lens.toml"]
@@ -187,7 +187,7 @@ def test_a_map_from_motion_capture(tmp_path):
     assert content["reordered"] == []
 
 
-def test_measured_corners_in_another_order_are_told(tmp_path):
+def test_measured_corners_in_another_order_are_reported(tmp_path):
     path = tmp_path / "points.csv"
     write_marker_corners(path, {**ROOM, 3: ROOM[3][[3, 2, 1, 0]]})
     printed = invoke(path, "--out", tmp_path / "corners.csv")
@@ -230,7 +230,7 @@ def test_measured_corners_in_another_order_are_told(tmp_path):
             SettingsError,
             "--side: expected a number above 0",
         ),
-        (["{walk}", "--check", "{walk}"], InputError, "walk.avi: expected text"),
+        (["{walk}", "--check", "{walk}"], InputError, "walk.avi: expected UTF-8 text"),
         (["{gone}", "--check", "{truth}", "--fov", "90,60"], InputError, "gone.avi: expected a video"),
         (
             ["{walk}", "--drone", "dron1", "--check", "{truth}"],
@@ -245,7 +245,7 @@ def test_measured_corners_in_another_order_are_told(tmp_path):
         (
             ["{walk}", "--out", "{new}", "--known", "99", "--side", "1", "--fov", "75.5,60.3"],
             InputError,
-            "walk.avi: expected marker 99, that is known, beside others, found only 3, 7, 8, 21, 22",
+            "walk.avi: expected the known marker 99 beside others, found only 3, 7, 8, 21, 22",
         ),
         (
             ["{walk}", "--check", "{truth}", "--fov", "75.5,60.3", "--frames", "25"],
@@ -260,14 +260,14 @@ def test_measured_corners_in_another_order_are_told(tmp_path):
         ),
     ],
 )
-def test_unusable_choices(walk, tmp_path, words, error, message):
+def test_unusable_choices_are_refused(walk, tmp_path, words, error, message):
     names = {"walk": "walk.avi", "truth": "truth.csv", "gone": "gone.avi"}
     paths = {key: walk / name for key, name in names.items()} | {"new": tmp_path / "new.csv"}
     assert message in invoke(*(word.format(**paths) for word in words), expect=error)
     assert not (tmp_path / "new.csv").exists()
 
 
-def test_intrinsics_for_another_resolution(walk, tmp_path):
+def test_intrinsics_for_another_aspect_ratio_are_refused(walk, tmp_path):
     lens = camera(R=np.eye(3), t_m=np.zeros(3), K=LENS.K, image_size_wh=(1920, 1440))
     write_rig(tmp_path / "lens.toml", stack({"gopro": lens}))
     message = invoke(
@@ -283,7 +283,7 @@ def test_intrinsics_for_another_resolution(walk, tmp_path):
 
 
 def test_intrinsics_of_the_same_images_twice_as_large(walk, tmp_path):
-    write_rig(tmp_path / "lens.toml", stack({"gopro": scaled(LENS, (2 * SIZE_WH[0], 2 * SIZE_WH[1]))}))
+    write_rig(tmp_path / "lens.toml", stack({"gopro": scale_lens(LENS, (2 * SIZE_WH[0], 2 * SIZE_WH[1]))}))
     words = [walk / "walk.avi", "--check", walk / "truth.csv", "--camera", tmp_path / "lens.toml"]
     assert "nothing disagrees" in invoke(*words, "--scale-camera")
 

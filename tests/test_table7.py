@@ -1,4 +1,4 @@
-"""The command that makes Tables 6 to 8, on a small sequence that is drawn here: not by the simulator's renderer."""
+"""The command that makes Tables 6 to 8, on a small sequence that is drawn here, not by the simulator's renderer."""
 
 import functools
 import shutil
@@ -34,14 +34,14 @@ METHODS = ("paper", "single frames", "filter", "smoother")
 FPS, NUM_FRAMES = 25.0, 90
 SIZE_WH, FOCAL_PX = (640, 480), 420.0
 SIDE_M, ARM_M = 0.36, np.array([0.1, 0.02, -0.04])
-#: Columns: the axes of a camera that looks ahead, in a body with x ahead and z up.
+#: Columns: the axes of a camera that looks ahead, in the axes of a body (x ahead, z up).
 LOOKS_AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-#: Pixels per cell of a marker's picture, which has six cells and a white one around.
+#: Pixels per cell of a marker's picture, which has six cells and a white cell at each side.
 CELL_PX = 16
 
 
 def walls_m() -> dict[int, np.ndarray]:
-    """Corners, (4, 3), of markers on a wall ahead and on one to the left."""
+    """Corners, (4, 3), of markers on a wall ahead and on a wall to the left."""
     corners = {}
     for number, (across, up) in enumerate(
         (a, u) for a in (-1.6, -0.8, 0.0, 0.8, 1.6) for u in (0.6, 1.4, 2.2)
@@ -54,7 +54,7 @@ def walls_m() -> dict[int, np.ndarray]:
 
 
 def flight() -> tuple[np.ndarray, Rotation]:
-    """Where the body is in every frame, and how it is turned."""
+    """Position and orientation of the body in every frame."""
     t = np.arange(NUM_FRAMES) / FPS
     position_m = np.stack(
         [0.7 * np.sin(1.9 * t), 0.6 * np.sin(1.3 * t + 1), 1.4 + 0.3 * np.sin(2.3 * t)], axis=-1
@@ -64,7 +64,7 @@ def flight() -> tuple[np.ndarray, Rotation]:
 
 
 def drawn(one, corners_m) -> np.ndarray:
-    """What a camera sees of the markers, at twice the size and then averaged."""
+    """The image of the markers in a camera, drawn at twice the size and then averaged."""
     picture = np.full((2 * SIZE_WH[1], 2 * SIZE_WH[0], 3), 150, np.uint8)
     dictionary = marker_dictionary("4x4_1000")
     side_px = 8 * CELL_PX
@@ -136,7 +136,7 @@ def results(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_tables_rows_and_figures(results: Path) -> None:
     every = pd.read_csv(results / "results.csv")
     assert len(every) == 2 * 2 * len(METHODS)
-    # One drone is all drones.
+    # With one drone, the row of all drones equals its row.
     one, all_drones = (every[every["drone"] == drone].drop(columns="drone") for drone in ("dron1", "all"))
     shared = [name for name in one if not one[name].isna().any() and not all_drones[name].isna().any()]
     pd.testing.assert_frame_equal(
@@ -145,22 +145,22 @@ def test_tables_rows_and_figures(results: Path) -> None:
     rows = one.set_index(["wrong", "method"])
     assert list(rows.index) == [(wrong, method) for wrong in (0.0, 0.02) for method in METHODS]
     clean, wrong = rows.loc[0.0], rows.loc[0.02]
-    # A pixel is 7 mm on the wall ahead; corners are found to a tenth or two, and there are twenty and more.
+    # A pixel is 7 mm on the wall ahead; more than twenty corners are found to one or two tenths of a pixel.
     assert (clean["position_median_m"] < 0.005).all()
     assert (clean["orientation_median_deg"] < 0.1).all()
     assert (rows["posed_rate"] >= 0.98).all()
-    # Every eighth frame or so has a marker that is taken for another one, and the paper leaves that in.
+    # About every eighth frame has a marker with a wrong id, which the paper's method does not leave out.
     assert wrong["position_p99_m"]["paper"] > 0.3
     assert (wrong["position_max_m"][["filter", "smoother"]] < 0.02).all()
-    # The paper's way has no covariances.
+    # The paper's method has no covariances.
     assert rows["inside_90_rate"].isna().tolist() == [method == "paper" for _, method in rows.index]
-    # The figure to reach, of clocks that are seconds off.
+    # The aim for clocks that are seconds off.
     assert (rows["offset_s"].abs() > 0.1).all()
     for name in ("offset_s_off_frames", "orientation_offset_s_off_frames"):
         assert (rows[name].abs() < 0.1).all()
     for axis, arm_m in zip("xyz", ARM_M, strict=True):
         assert rows[f"lever_arm_{axis}_m"].to_numpy() == pytest.approx(arm_m, abs=0.005)
-    # The procedure and the truth agree on good paths, but for what the arm and the turn take out of them.
+    # On good paths the procedure and the truth agree, except for the parts of the errors that arm and turn remove.
     assert clean["distance_m.median"].to_numpy() == pytest.approx(clean["position_median_m"], rel=0.4)
     assert (clean["distance_to_point_m.median"] > 0.1).all()
     table = (results / "table7.md").read_text()
@@ -181,7 +181,7 @@ def test_table_6(results: Path) -> None:
     assert row["length (s)"] == NUM_FRAMES / FPS
     position_m, body = flight()
     camera_m = position_m + body.apply(ARM_M)
-    # Two or three frames at the ends are not covered by the reference.
+    # Two or three frames at the ends are outside the reference.
     length_m = np.linalg.norm(np.diff(camera_m, axis=0), axis=-1).sum()
     assert 0.94 * length_m < row["path length (m)"] < length_m
 
@@ -194,7 +194,7 @@ def test_figures(results: Path, name: str) -> None:
 
 @pytest.mark.slow
 def test_again_beside_a_sequence_that_cannot_be_used(data: Path, results: Path) -> None:
-    """Markers are not sought again, and what can be shown is."""
+    """Markers are not detected again, and the results of all other sequences are shown."""
     kept = results / "detections" / "S99_D1_A_dron1.npz"
     before, table = kept.stat().st_mtime_ns, (results / "table7.md").read_text()
     broken = data / "Simulated_Data" / "S98_D1_A"
@@ -231,13 +231,13 @@ def test_a_recording_in_the_form_of_a_real_one(data: Path, tmp_path: Path) -> No
     rows = rows[rows["drone"] == "dron1"]
     assert (rows["offset_s"] - 2.0).abs().max() * FPS < 0.1
     assert (rows["orientation_offset_s"] == rows["offset_s"]).all()
-    # From the middle of the cross, in its own frame, which is turned as it likes.
+    # From the middle of the cross, in a frame of its own with arbitrary axes.
     arm_m = np.linalg.norm(rows[[f"lever_arm_{axis}_m" for axis in "xyz"]], axis=1)
     assert arm_m == pytest.approx(np.linalg.norm(ARM_M - cross_m.mean(axis=0)), abs=0.003)
     ours = rows[rows["method"] != "paper"]
     assert (ours["position_p99_m"] < 0.01).all()
     assert (ours["posed_rate"] > 0.95).all()
-    # Nobody knows by how much the clocks of a real recording are off.
+    # The true clock offsets of a real recording are not known.
     assert "found minus planted" not in done.stdout
 
 
@@ -248,7 +248,7 @@ def test_a_folder_without_sequences(tmp_path: Path) -> None:
     assert done.stderr.splitlines()[-1] == f"table7: {tmp_path}: {expected}"
 
 
-def test_markers_that_are_taken_for_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_markers_with_wrong_ids(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(EXPERIMENT)
     from _sightings import Sightings, mislabelled
 
@@ -258,7 +258,7 @@ def test_markers_that_are_taken_for_others(monkeypatch: pytest.MonkeyPatch) -> N
     seen = Sightings(np.arange(len(ids)) // 31, ids, np.zeros((len(ids), 4, 2)))
     found = mislabelled(seen, 0.02, MarkerMap(walls_m()), np.random.default_rng(3))
     changed = found.ids != ids
-    # Of 6,000 with a probability of 2 %: 120, give or take 11.
+    # Of 6,000 with a probability of 2 %: 120, with a standard deviation of 11.
     assert 85 < changed.sum() < 155
     assert set(found.ids) == set(ids)
     assert (found.ids[ids == 500] == 500).all()
@@ -283,7 +283,7 @@ def test_the_drones_own_videos_are_simulated_where_they_are_not_there(
     assert "simulating the drones' own videos of S01_D2_A" in capsys.readouterr().out
     rows = pd.read_csv(tmp_path / "results.csv")
     assert set(rows["drone"]) == {"dron1", "dron2", "all"}
-    # The figure to reach at full size; half of the pixels are twice as large.
+    # The aim at full size; at half the size, pixels are twice as large.
     assert (rows[rows["method"] == "filter"]["position_median_m"] < 0.02).all()
     assert small(tmp_path / "data") == tmp_path / "data"
     assert capsys.readouterr().out == ""

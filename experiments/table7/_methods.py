@@ -11,8 +11,8 @@ from _sightings import Sightings
 
 from psotrack.inside_out import CameraPath, LocaliseSettings, PoseSettings, smooth
 from psotrack.inside_out.detection import DetectedMarkers
-from psotrack.inside_out.filtering.path_rows import path_of
-from psotrack.inside_out.localising import follow_markers, row_of
+from psotrack.inside_out.filtering.path_rows import join_rows
+from psotrack.inside_out.localising import localise_frames, pose_row
 from psotrack.inside_out.pose import MarkerPose
 
 #: What the paper asks for.
@@ -26,7 +26,7 @@ def paths(recording: Recording, seen: Sightings) -> dict[str, CameraPath]:
     single = replace(settings, filter=None)
     raw, filtered = _followed(recording, markers, settings)
     return {
-        "paper": path_of([row_of(*one, _of_all(one[2], recording), single) for one in markers]),
+        "paper": join_rows([pose_row(*one, _of_all(one[2], recording), single) for one in markers]),
         "single frames": _followed(recording, markers, single)[0],
         "filter": filtered,
         "smoother": smooth(raw),
@@ -47,8 +47,8 @@ def _followed(
     recording: Recording, markers: list[_Markers], settings: LocaliseSettings
 ) -> tuple[CameraPath, CameraPath]:
     """Each frame's own poses, and what the filter makes of them."""
-    rows = list(follow_markers(markers, recording.marker_map, recording.lens, settings))
-    return path_of([raw for raw, _ in rows]), path_of([row for _, row in rows])
+    rows = list(localise_frames(markers, recording.marker_map, recording.lens, settings))
+    return join_rows([raw for raw, _ in rows]), join_rows([row for _, row in rows])
 
 
 def _of_all(markers: DetectedMarkers, recording: Recording) -> MarkerPose | None:

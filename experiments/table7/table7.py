@@ -26,8 +26,8 @@ from _sightings import Sightings, detected, mislabelled
 
 from psotrack.errors import PsotrackError
 from psotrack.inside_out import CameraPath
-from psotrack.inside_out.comparison import PathComparison, compare
-from psotrack.inside_out.comparison.plots import save_errors, save_paths
+from psotrack.inside_out.comparison import PathComparison, compare_paths
+from psotrack.inside_out.comparison.plots import save_path_errors, save_paths
 from psotrack.support import atomic_write
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -120,7 +120,7 @@ def flight(recording: Recording, out: Path) -> Flight:
                 f"{name}, {wrong:.0%} wrong, {method}: {1e3 * np.nanmean(one.distance_m):.1f} mm", flush=True
             )
         with_wrong = f"{wrong:.0%}".replace("%", "_percent_wrong")
-        save_errors(out / f"errors_{name}_{with_wrong}.png", comparisons, force=True)
+        save_path_errors(out / f"errors_{name}_{with_wrong}.png", comparisons, force=True)
         if wrong == 0:
             described = description(recording, seen, found["paper"], comparisons["smoother"])
             caption = f"{recording.sequence}, {recording.drone}: by the filter, and by the reference"
@@ -133,7 +133,7 @@ def flight(recording: Recording, out: Path) -> Flight:
 def compared(recording: Recording, path: CameraPath) -> PathComparison:
     """Compare by the paper's procedure, which does not know the offsets of the clocks."""
     reference = recording.reference
-    return compare(
+    return compare_paths(
         path,
         reference.time_s,
         reference.position_m,

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.errors import InputError, PsotrackError
-from psotrack.inside_out import CameraPath, Fused, fuse, read_camera_path
+from psotrack.inside_out import CameraPath, FusedTracks, fuse, read_camera_path
 from psotrack.support import atomic_write, refuse_to_overwrite
 from psotrack.trajectories import Trajectories, read_trajectories
 
@@ -108,7 +108,7 @@ def _words(error_m: np.ndarray) -> str:
 
 
 def _compared(
-    name: str, path: CameraPath, tracks: Trajectories, fused: Fused, truth: Trajectories
+    name: str, path: CameraPath, tracks: Trajectories, fused: FusedTracks, truth: Trajectories
 ) -> Compared | None:
     """Errors of one drone; None if only one method has the drone."""
     index = [drone.name for drone in fused.drones].index(name)

@@ -11,7 +11,7 @@ from psotrack.cli.answers import answer, check_outputs, say
 from psotrack.cli.options import FORCE, JSON, QUIET
 
 if TYPE_CHECKING:
-    from psotrack.inside_out import CameraPath, DroneFusion, Errors, Fused, FusedDrone
+    from psotrack.inside_out import CameraPath, DroneFusion, FusedDrone, FusedTracks, SourceErrors
 
 
 @click.command()
@@ -83,7 +83,7 @@ def fuse(
     answer(json_path, _content(fused), force)
     for drone in fused.drones:
         say(quiet, json_path, _sentence(drone))
-    for exchange in fused.exchanges:
+    for exchange in fused.identity_swaps:
         say(
             quiet,
             json_path,
@@ -96,7 +96,7 @@ def fuse(
     )
 
 
-def _doubt(fused: Fused) -> str:
+def _doubt(fused: FusedTracks) -> str:
     """What to look at where nothing was fused."""
     if any(drone.tracks for drone in fused.drones):
         return ""
@@ -125,7 +125,7 @@ def _sentence(drone: FusedDrone) -> str:
     return "; ".join(parts)
 
 
-def _content(fused: Fused) -> dict[str, Any]:
+def _content(fused: FusedTracks) -> dict[str, Any]:
     """The report as JSON has it, with null where there is no number."""
     return {
         "point": fused.point,
@@ -146,7 +146,7 @@ def _content(fused: Fused) -> dict[str, Any]:
         "others": list(fused.trajectories.drones[len(fused.drones) :]),
         "exchanges": [
             {"drone": of.drone, "frame": of.frame, "before": of.before, "after": of.after}
-            for of in fused.exchanges
+            for of in fused.identity_swaps
         ],
     }
 
@@ -162,7 +162,7 @@ def _found(fusion: DroneFusion | None) -> dict[str, Any]:
     }
 
 
-def _errors(errors: Errors) -> dict[str, float]:
+def _errors(errors: SourceErrors) -> dict[str, float]:
     return {
         "scale": errors.scale,
         "lasting_share": errors.lasting_share,

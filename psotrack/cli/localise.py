@@ -14,7 +14,7 @@ from psotrack.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
     from psotrack.geometry import Camera
-    from psotrack.inside_out import CameraPath, LocalisedVideo, Source
+    from psotrack.inside_out import CameraPath, FrameSource, LocalisedVideo
     from psotrack.recordings import OnboardVideo
 
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 class _Input:
     """What is localised, and what comes with it."""
 
-    source: Source
+    source: FrameSource
     name: str
     onboard: OnboardVideo | None = None
     markers: Path | None = None
@@ -194,7 +194,7 @@ def localise(
 def _input(video: str, drone: str | None, fps: float | None, live: bool) -> _Input:
     """A video, a folder of images, or a stream; or the video of one drone in a sequence."""
     from psotrack.datasets.dpjait import MARKER_CORNERS, read_onboard
-    from psotrack.inside_out import holds_images, open_source
+    from psotrack.inside_out import folder_has_images, open_source
 
     stream, folder = live or "://" in video, Path(video)
     of_folder = not stream and folder.is_dir()
@@ -202,7 +202,7 @@ def _input(video: str, drone: str | None, fps: float | None, live: bool) -> _Inp
         raise InputError(
             video, expected="a video", found="no such file", remedy="pass --live if it is a camera's number"
         )
-    has_images = of_folder and holds_images(folder)
+    has_images = of_folder and folder_has_images(folder)
     onboard = read_onboard(folder) if of_folder else {}
     if not onboard:
         if drone is not None:
@@ -230,12 +230,12 @@ def _lens(
     scale: bool,
     fov_deg: tuple[float, float] | None,
 ) -> Camera:
-    from psotrack.inside_out import chosen_lens, lens_of_matrix
+    from psotrack.inside_out import choose_lens, lens_from_matrix
 
     size_wh, K = given.source.image_size_wh, None if given.onboard is None else given.onboard.K
     if camera_file is None and fov_deg is None and K is not None:
-        return lens_of_matrix(K, size_wh)
-    return chosen_lens(size_wh, path=camera_file, fov_deg=fov_deg, name=camera_name, scale=scale)
+        return lens_from_matrix(K, size_wh)
+    return choose_lens(size_wh, path=camera_file, fov_deg=fov_deg, name=camera_name, scale=scale)
 
 
 def _content(found: LocalisedVideo, video: str, name: str, min_markers: int) -> dict[str, Any]:

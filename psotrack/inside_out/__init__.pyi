@@ -2,51 +2,51 @@ from .camera_path import CameraPath, Flag, read_camera_path, write_camera_path
 from .comparison.plots import save_flight
 from .filtering.pose_filter import PoseFilterParams
 from .filtering.smoothing import smooth
-from .frames import Source, holds_images, open_source
-from .fusing import Fused, FusedDrone, fuse
-from .fusing.drone_fusion import DroneFusion, Errors
+from .frames import FrameSource, folder_has_images, open_source
+from .fusing import FusedDrone, FusedTracks, fuse
+from .fusing.drone_fusion import DroneFusion, SourceErrors
 from .fusing.fused_table import write_fused
-from .lens_files import chosen_lens, lens_of_matrix
+from .lens_files import choose_lens, lens_from_matrix
 from .localising import LocalisedVideo, LocaliseSettings, localise_video
-from .mapping import BuiltMap, build_map, own_frame
-from .mapping.check import Checkup, check_map
+from .mapping import BuiltMap, build_map, corners_in_own_frame
+from .mapping.check import MapCheck, check_map
 from .mapping.sightings import find_sightings
-from .mapping.squares import Squares, read_measured, squares
+from .mapping.square_fitting import FittedSquares, fit_squares, read_measured_corners
 from .marker_map import MarkerMap, read_marker_map
 from .pose import PoseSettings
 
 __all__ = [
     "BuiltMap",
     "CameraPath",
-    "Checkup",
     "DroneFusion",
-    "Errors",
+    "FittedSquares",
     "Flag",
-    "Fused",
+    "FrameSource",
     "FusedDrone",
+    "FusedTracks",
     "LocaliseSettings",
     "LocalisedVideo",
+    "MapCheck",
     "MarkerMap",
     "PoseFilterParams",
     "PoseSettings",
-    "Source",
-    "Squares",
+    "SourceErrors",
     "build_map",
     "check_map",
-    "chosen_lens",
+    "choose_lens",
+    "corners_in_own_frame",
     "find_sightings",
+    "fit_squares",
+    "folder_has_images",
     "fuse",
-    "holds_images",
-    "lens_of_matrix",
+    "lens_from_matrix",
     "localise_video",
     "open_source",
-    "own_frame",
     "read_camera_path",
     "read_marker_map",
-    "read_measured",
+    "read_measured_corners",
     "save_flight",
     "smooth",
-    "squares",
     "write_camera_path",
     "write_fused",
 ]

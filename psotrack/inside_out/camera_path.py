@@ -1,7 +1,7 @@
-"""`CameraPath`: where a moving camera is in every frame and how it is turned, and its table on disk.
+"""`CameraPath`: position and orientation of a moving camera in every frame, and its table on disk.
 
-The table has one row per frame, and the columns that `psotrack.trajectories.files` reads among its own: every command
-that reads tracks reads it too.
+The table has one row per frame. Its columns include all columns that `psotrack.trajectories.files` reads, so that every
+command that reads tracks reads the table too.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from psotrack.geometry import rotation_matrices
 from psotrack.support import Table, TextRow, read_table, refuse_to_overwrite, write_rows
 from psotrack.trajectories import Status, Trajectories
 
-#: Axes of the covariance: along the world's axes in metres, then small turns about the camera's own in radians.
+#: Axes of the covariance: the world's axes, in metres, then small turns about the camera's axes, in radians.
 _AXES = "xyzabc"
 _UPPER = np.triu_indices(6)
 _POSITION = ("x_m", "y_m", "z_m")
@@ -32,48 +32,50 @@ _COVARIANCE = tuple(_AXES[row] + _AXES[column] for row, column in zip(*_UPPER, s
 _STATUS = {status.label: status for status in Status}
 _SEPARATOR = ","
 
-#: Columns: a body's axes (x ahead, y left, z up) in a camera's (x right, y down, z ahead).
+#: Columns: the axes of a body (x ahead, y left, z up) in the axes of a camera (x right, y down, z ahead).
 _BODY_IN_CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
 class Flag(IntFlag):
-    """What is to be known of a frame beside its status."""
+    """Remarks on a frame, in addition to its status."""
 
-    #: Fewer markers than 4, the paper's number, or than were asked for; none is no such flag.
+    #: The pose is from fewer markers than 4, the paper's number, or than were required, but from at least 1.
     FEW_MARKERS = 1
-    #: Another pose fits about as well, and nothing told which it is.
+    #: Another pose fits about equally well, and neither markers nor motion decide between the two.
     AMBIGUOUS = 2
     #: The frame's own pose did not fit the motion and was not used.
     GATED = 4
 
     @property
     def label(self) -> str:
-        """The words in tables, with + between them."""
+        """The names of the flags as in tables, with + between them."""
         return "+".join(flag.name.lower() for flag in Flag if flag in self and flag.name)
 
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Poses of a camera over frames. What is not known of a frame is NaN.
+    """Poses of a camera over frames. Values that are not known are NaN.
 
     Attributes:
         frame: (frames,), numbers of the video frames, 0-based, increasing.
         time_s: (frames,), seconds, increasing.
-        position_m: (frames, 3), the camera's centre, world.
+        position_m: (frames, 3), the camera's centre, world, metres.
         orientation_wxyz: (frames, 4), unit quaternions, camera to world; camera axes x right, y down, z ahead.
         covariance: (frames, 6, 6), of the position along the world's axes (m) and of a small turn about the
-            camera's axes (rad): the camera is turned by R exp([turn]) where R is what is given.
-        num_markers: (frames,), markers that the pose is from; without a pose, those that were seen.
-        reprojection_px: (frames,), root mean square over their corners of the distance in the image.
-        ambiguity: (frames,), probability that another pose is the right one, from 0 to 1/2.
-        status: (frames,), values of `Status`: `TRACKED` where the frame's own markers tell, `COASTING` where the motion
-            does, `LOST` where there is no pose.
+            camera's axes (rad): the true orientation is R exp([turn]), with R the estimated one.
+        num_markers: (frames,), number of markers behind the pose; without a pose, number of detected markers.
+        reprojection_px: (frames,), root mean square distance between the markers' corners and their projections,
+            pixels.
+        ambiguity: (frames,), probability that another pose is the right one, 0 to 1/2.
+        status: (frames,), values of `Status`: `TRACKED` where the frame's own markers were used, `COASTING` where the
+            pose is from the motion, `LOST` where there is no pose.
         flags: (frames,), values of `Flag`.
-        velocity_m_s: (frames, 3), world, where a filter tells it.
-        chance: (frames,), of frames' own poses: probability at most that so many markers would agree if none were what
-            it is taken for. It is for the filter, and in no table.
-        common: (frames, 6, errors), of frames' own poses, as a root: the part of the covariance due to each error of
-            the map and of the lens, which are the same in all frames. It is for the filter, and in no table.
+        velocity_m_s: (frames, 3), world; None without a filter.
+        chance: (frames,), for frames' own poses: upper bound on the probability that as many markers agree by chance
+            although all were misread. The filter uses it; the table does not have it.
+        common: (frames, 6, errors), for frames' own poses: a matrix square root of the part of the covariance due to
+            errors of the map and of the lens, which are the same in all frames. The filter uses it; the table does not
+            have it.
     """
 
     frame: Int[np.ndarray, "frames"]
@@ -108,11 +110,11 @@ class CameraPath:
 
     @property
     def seen(self) -> Bool[np.ndarray, "frames"]:
-        """(frames,), where there is a pose that is not lost."""
+        """(frames,), whether a frame has a pose and is not lost."""
         return np.isfinite(self.position_m).all(axis=-1) & (self.status != Status.LOST)
 
     def trajectories(self, name: str) -> Trajectories:
-        """The path as that of one drone of this name; its orientation is the camera's."""
+        """The path as the trajectory of one drone with this name; its orientation is the camera's."""
         return Trajectories(
             frame=self.frame,
             time_s=self.time_s,
@@ -126,12 +128,18 @@ class CameraPath:
 
 
 def roll_pitch_yaw_deg(orientation_wxyz: Float[np.ndarray, "*frames 4"]) -> Float[np.ndarray, "*frames 3"]:
-    """Angles of a camera's orientation, camera to world, as of a body that looks where it looks; NaN stays NaN.
+    """Angles of a camera's orientation, as of a body that faces the camera's viewing direction; NaN stays NaN.
 
     The body's axes are x ahead (the camera's z), y left, z up. It is turned about the world's z by yaw, then about its
     own y by pitch, then about its own x by roll: R = Rz(yaw) Ry(pitch) Rx(roll), as in ROS (REP 103). Yaw is counted
-    from the world's x axis, counterclockwise seen from above; pitch is positive with the nose down; roll with the
-    right side down. Each is in (-180, 180], pitch in [-90, 90].
+    from the world's x axis, counterclockwise seen from above. Pitch is positive with the nose down, roll with the right
+    side down. Each angle is in (-180, 180], pitch in [-90, 90].
+
+    Args:
+        orientation_wxyz: (*frames, 4), unit quaternions, camera to world.
+
+    Returns:
+        (*frames, 3): roll, pitch, yaw, degrees.
     """
     body = rotation_matrices(orientation_wxyz.reshape(-1, 4)) @ _BODY_IN_CAMERA
     roll = np.arctan2(body[:, 2, 1], body[:, 2, 2])
@@ -140,8 +148,8 @@ def roll_pitch_yaw_deg(orientation_wxyz: Float[np.ndarray, "*frames 4"]) -> Floa
     return np.degrees(np.stack([roll, pitch, yaw], axis=-1)).reshape(*orientation_wxyz.shape[:-1], 3)
 
 
-def write_camera_path(path: Path, camera_path: CameraPath, name: str, *, force: bool = False) -> None:
-    """Write a CSV with one row per frame; what is not known is an empty field.
+def write_camera_path(path: Path | str, camera_path: CameraPath, name: str, *, force: bool = False) -> None:
+    """Write a CSV with one row per frame; values that are not known are empty fields.
 
     Columns: `frame`, `time_s`, `drone`, `x_m` to `z_m`, `vx_m_s` to `vz_m_s`, `qw` to `qz` and `r11` to `r33` (both
     camera to world), `roll_deg`, `pitch_deg`, `yaw_deg` (see `roll_pitch_yaw_deg`), `cov_xx` to `cov_cc` (the upper
@@ -149,14 +157,15 @@ def write_camera_path(path: Path, camera_path: CameraPath, name: str, *, force: 
     `ambiguity`, `flags` (words with + between them), `status`.
 
     Args:
-        path: of the file.
-        camera_path: what to write.
-        name: of the drone that carries the camera.
+        path: file to write.
+        camera_path: path to write.
+        name: name of the drone that carries the camera.
         force: replace an existing file.
 
     Raises:
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
+    path = Path(path)
     refuse_to_overwrite(path, force)
     count = camera_path.num_frames
     velocity_m_s = camera_path.velocity_m_s
@@ -182,15 +191,16 @@ def write_camera_path(path: Path, camera_path: CameraPath, name: str, *, force: 
     )
 
 
-def read_camera_path(path: Path) -> tuple[CameraPath, str]:
-    """Read what `write_camera_path` wrote.
+def read_camera_path(path: Path | str) -> tuple[CameraPath, str]:
+    """Read a table that `write_camera_path` wrote.
 
     Returns:
         The path, and the drone's name.
 
     Raises:
-        InputError: the file cannot be read, a column is missing, or a value makes no sense; the message names the line.
+        InputError: the file cannot be read, a column is missing, or a value is invalid; the message names the line.
     """
+    path = Path(path)
     table = read_table(path, _SEPARATOR)
     if table.find("qw") is None:
         raise InputError(

@@ -1,7 +1,7 @@
-"""`MarkerMap`: where the corners of markers are in a room, and its table, read with every doubt spoken out.
+"""`MarkerMap`: corners of markers in a room; and its table, which is checked when it is read.
 
-A table that is wrong is found by its geometry where that is beyond doubt: a marker is a flat square that faces the
-room. What is off by less than that is found from a video: see `mapping.check`.
+A marker is a flat square that faces the room. A table is refused where it clearly contradicts this. Smaller errors of a
+map are found from a video: see `mapping.check`.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ from jaxtyping import Float, Int
 from psotrack.datasets.dpjait import MarkerRow, read_marker_rows
 from psotrack.errors import InputError
 
-#: What a corner may be off its square, as a share of the side. Corners that are measured by motion capture are off by
-#: some 3 mm each: three standard deviations of one against the three others, 2 x 3 x 3 mm, are 9 % of 0.2 m.
+#: Largest deviation of a corner from its square, as a share of the side. Corners measured by motion capture are off by
+#: some 3 mm each: three standard deviations of one corner against the three others, 2 x 3 x 3 mm, are 9 % of 0.2 m.
 SQUARE_TOLERANCE = 0.1
-#: Sides of markers, in metres. A table in millimetres that is read as metres is far above.
+#: Smallest and largest side of a marker, metres. A table in millimetres that is read as metres is far above.
 _SIDES_M = (0.005, 5.0)
-#: Of the side: centres that are nearer to each other are of one marker. A board with two sides is thicker than nothing,
-#: but its two markers face opposite ways.
+#: Distance of two centres, in sides, below which two markers that face the same way are at the same place. The two
+#: markers on the front and the back of a board face opposite ways.
 _SAME_PLACE = 0.5
-#: Of the side: what is nearer to a marker's plane is neither before nor behind it.
-_BESIDE = 1.0
-#: Sides that a thing with markers on its outside may have across; a room has more.
-_THING = 10.0
+#: Distance from a marker's plane, in sides, below which another marker is neither before nor behind it.
+_IN_PLANE = 1.0
+#: Largest extent, in sides, of an object with markers on its outside. A room is larger.
+_OBJECT_EXTENT = 10.0
 
 
 @dataclass(frozen=True)
 class MarkerMap:
-    """Markers of known place.
+    """Markers with known corners.
 
     Attributes:
-        corners_m: (4, 3) by marker id, world, metres: as OpenCV's ArUco counts them, clockwise from the marker's own
-            top left when it is looked at.
+        corners_m: (4, 3) by marker id, world, metres: in the order of OpenCV's ArUco, clockwise from the marker's own
+            top left as seen from its front.
     """
 
     corners_m: Mapping[int, Float[np.ndarray, "4 3"]]
@@ -58,42 +58,43 @@ class MarkerMap:
 
     @cached_property
     def ids(self) -> Int[np.ndarray, " markers"]:
-        """(markers,), increasing."""
+        """(markers,), ids in increasing order."""
         return np.array(sorted(self.corners_m))
 
     def corners_of(self, ids: Iterable[int]) -> Float[np.ndarray, "chosen 4 3"]:
-        """(chosen, 4, 3), the corners of some markers; all must be in the map."""
+        """(chosen, 4, 3), corners of these markers; all of them must be in the map."""
         return np.array([self.corners_m[int(marker)] for marker in ids], np.float64).reshape(-1, 4, 3)
 
     @cached_property
     def all_corners_m(self) -> Float[np.ndarray, "markers 4 3"]:
-        """(markers, 4, 3), in the order of `ids`."""
+        """(markers, 4, 3), corners in the order of `ids`."""
         return self.corners_of(self.ids.tolist())
 
     @cached_property
     def sides_m(self) -> Float[np.ndarray, " markers"]:
-        """(markers,), mean lengths of the four sides, in the order of `ids`."""
+        """(markers,), mean lengths of the four sides, metres, in the order of `ids`."""
         return sides_m(self.all_corners_m)
 
     @cached_property
     def centres_m(self) -> Float[np.ndarray, "markers 3"]:
-        """(markers, 3), in the order of `ids`."""
+        """(markers, 3), centres in the order of `ids`."""
         return self.all_corners_m.mean(axis=1)
 
     @cached_property
     def normals(self) -> Float[np.ndarray, "markers 3"]:
-        """(markers, 3), unit normals, out of the side that is printed, in the order of `ids`."""
+        """(markers, 3), unit normals, out of the printed side, in the order of `ids`."""
         return normals(self.all_corners_m)
 
 
-def read_marker_map(path: Path) -> MarkerMap:
-    """The map in a table of corners; `datasets._marker_corners` says in which layouts.
+def read_marker_map(path: Path | str) -> MarkerMap:
+    """Read a map from a table of corners; `psotrack.datasets.dpjait` describes the layouts.
 
     Raises:
-        InputError: the file cannot be read, a corner or column is missing, a marker is there twice, or one is no flat
-            square of the size of a marker, is where another one is, or faces away from the room. The message names
-            the line.
+        InputError: the file cannot be read, a corner or column is missing, or a marker is listed twice, is no flat
+            square of the size of a marker, is at the place of another marker, or faces away from the room. The message
+            names the line.
     """
+    path = Path(path)
     rows = read_marker_rows(path)
     for marker, row in rows.items():
         _check_square(marker, row)
@@ -104,12 +105,12 @@ def read_marker_map(path: Path) -> MarkerMap:
 
 
 def sides_m(corners_m: Float[np.ndarray, "markers 4 3"]) -> Float[np.ndarray, " markers"]:
-    """Mean lengths of the four sides."""
+    """Mean length of each marker's four sides, metres."""
     return np.linalg.norm(np.roll(corners_m, -1, axis=-2) - corners_m, axis=-1).mean(axis=-1)
 
 
 def normals(corners_m: Float[np.ndarray, "*markers 4 3"]) -> Float[np.ndarray, "*markers 3"]:
-    """Unit normals, out of the side from which the corners are clockwise."""
+    """Unit normals of markers, towards the side from which the corners are clockwise."""
     across = np.cross(
         corners_m[..., 3, :] - corners_m[..., 1, :], corners_m[..., 2, :] - corners_m[..., 0, :]
     )
@@ -128,13 +129,13 @@ def _check_square(marker: int, row: MarkerRow) -> None:
     tolerance_m = SQUARE_TOLERANCE * side
     edges = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     diagonals = np.linalg.norm(corners[2:] - corners[:2], axis=1)
-    # 1, 2, 4, 3 or the like: a square's six distances, but two diagonals are as short as its sides.
+    # Corners in an order such as 1, 2, 4, 3 have a square's six distances, but two diagonals as short as its sides.
     six = np.sort([*edges, *diagonals]) / edges.min()
     square = np.allclose(six, [1, 1, 1, 1, np.sqrt(2), np.sqrt(2)], atol=SQUARE_TOLERANCE)
     if square and diagonals.min() < 0.9 * edges.max():
         expected = "corners one after the other around the marker"
         raise InputError(where, expected=expected, found="two that are exchanged", remedy="put them in order")
-    # One corner's height over the plane of the three others, whichever it is.
+    # Height of one corner over the plane of the three others; it is the same for each corner.
     normal, twist = normals(corners), corners[0] - corners[1] + corners[2] - corners[3]
     height = abs(float(twist @ normal))
     if height > tolerance_m:
@@ -170,13 +171,13 @@ def _check_apart(rows: Mapping[int, MarkerRow], marker_map: MarkerMap) -> None:
 
 
 def _check_facing(path: Path, rows: Mapping[int, MarkerRow], marker_map: MarkerMap) -> None:
-    """Refuse a marker that has all others behind it: it faces the wall, so its corners are counted backwards.
+    """Refuse a marker whose front faces away from all others: its corners are in the wrong order.
 
-    Markers that all do are those of a mirrored table, or on the outside of a thing: that is small.
+    Where all markers face away, the table is mirrored, unless the markers are on the outside of a small object.
     """
     ids, centres = marker_map.ids, marker_map.centres_m
     height = np.einsum("mnk,mk->mn", centres - centres[:, None], marker_map.normals)
-    beside = _BESIDE * marker_map.sides_m[:, None]
+    beside = _IN_PLANE * marker_map.sides_m[:, None]
     outward = (height < -beside).any(axis=1) & ~(height > beside).any(axis=1)
     inward = (height > beside).any(axis=1)
     remedy = "count them clockwise as seen from the room, from the marker's own top left"
@@ -189,7 +190,7 @@ def _check_facing(path: Path, rows: Mapping[int, MarkerRow], marker_map: MarkerM
             remedy=f"its corners are counted backwards: {remedy}",
         )
     across = np.linalg.norm(np.ptp(centres, axis=0))
-    if outward.any() and across > _THING * np.median(marker_map.sides_m):
+    if outward.any() and across > _OBJECT_EXTENT * np.median(marker_map.sides_m):
         raise InputError(
             path,
             expected="corners in the order in which a camera in the room sees them",

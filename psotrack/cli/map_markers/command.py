@@ -119,9 +119,9 @@ def map_markers(
         build_map,
         check_map,
         find_sightings,
+        fit_squares,
         read_marker_map,
-        read_measured,
-        squares,
+        read_measured_corners,
     )
 
     given = [name for name, value in {"--out": out, "--check": checked}.items() if value is not None]
@@ -138,7 +138,7 @@ def map_markers(
                 "SOURCE", expected="one file of measured corners", found=f"{len(sources)} files"
             )
         viewer = None if seen_from_m is None else np.array(seen_from_m)
-        measured = squares(read_measured(sources[0]), side_m=side_m, seen_from_m=viewer)
+        measured = fit_squares(read_measured_corners(sources[0]), side_m=side_m, seen_from_m=viewer)
         write_marker_corners(out, measured.marker_map.corners_m)
         show_measured(measured, out, quiet, json_path, force)
         return

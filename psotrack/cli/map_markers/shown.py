@@ -10,10 +10,12 @@ import numpy as np
 from psotrack.cli.answers import PLACE, answer, in_words, known, say, show
 
 if TYPE_CHECKING:
-    from psotrack.inside_out import BuiltMap, Checkup, MarkerMap, Squares
+    from psotrack.inside_out import BuiltMap, FittedSquares, MapCheck, MarkerMap
 
 
-def show_measured(squares: Squares, out: Path, quiet: bool, json_path: Path | None, force: bool) -> None:
+def show_measured(
+    squares: FittedSquares, out: Path, quiet: bool, json_path: Path | None, force: bool
+) -> None:
     """A map from measured corners, and how far these are from squares."""
     rows = {
         marker: {**_place(squares.marker_map, marker), "residual_m": squares.residual_m[marker].tolist()}
@@ -88,7 +90,7 @@ def show_built(
     say(quiet, json_path, f"{out}: {len(rows)} markers from {built.num_views} frames")
 
 
-def show_check(checkup: Checkup, path: Path, quiet: bool, json_path: Path | None, force: bool) -> None:
+def show_check(checkup: MapCheck, path: Path, quiet: bool, json_path: Path | None, force: bool) -> None:
     """Which markers of a map are not where videos see them."""
     rows = {
         marker: {
@@ -98,7 +100,7 @@ def show_check(checkup: Checkup, path: Path, quiet: bool, json_path: Path | None
             "std_m": [known(value) for value in one.std_m],
             "turned_deg": known(one.turned_deg),
             "turn_std_deg": known(one.turn_std_deg),
-            "grown": known(one.grown),
+            "grown": known(one.side_ratio),
         }
         for marker, one in sorted(checkup.markers.items())
     }
@@ -107,7 +109,7 @@ def show_check(checkup: Checkup, path: Path, quiet: bool, json_path: Path | None
         "findings": [{**vars(one), "markers": list(one.markers)} for one in checkup.findings],
         "frames": checkup.num_views,
         "noise_px": checkup.noise_px,
-        "not_in_map": list(checkup.strangers),
+        "not_in_map": list(checkup.not_in_map),
         "markers": rows,
     }
     answer(json_path, content, force)

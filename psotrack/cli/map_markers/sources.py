@@ -20,7 +20,7 @@ def known_corners(
 ) -> dict[int, np.ndarray]:
     """The corners of the known markers, by id."""
     from psotrack.datasets.dpjait import MARKER_CORNERS
-    from psotrack.inside_out import own_frame, read_marker_map
+    from psotrack.inside_out import corners_in_own_frame, read_marker_map
 
     words = [word.strip() for word in (known or "").split(",") if word.strip()]
     if not words or not all(word.isdecimal() for word in words):
@@ -41,7 +41,7 @@ def known_corners(
         raise SettingsError(
             "--known", expected=expected, found="no --markers" if side_m is not None else "neither"
         )
-    return {ids[0]: own_frame(side_m)}
+    return {ids[0]: corners_in_own_frame(side_m)}
 
 
 @dataclass(frozen=True)
@@ -55,14 +55,14 @@ class Lenses:
 
     def of(self, video: VideoInfo, index: int, count: int) -> Camera:
         """The lens of a video, number `index` of `count`."""
-        from psotrack.inside_out import chosen_lens
+        from psotrack.inside_out import choose_lens
 
         names = [None] if self.names is None else self.names.split(",")
         if len(names) not in (1, count):
             expected = f"one name, or one for each of {count} videos"
             raise SettingsError("--camera-name", expected=expected, found=f"{len(names)}")
         name = names[index % len(names)]
-        return chosen_lens(
+        return choose_lens(
             video.image_size_wh, path=self.file, fov_deg=self.fov_deg, name=name, scale=self.scale
         )
 
@@ -87,7 +87,7 @@ def videos_of(
 
 def _of_sequence(folder: Path, drones: str | None, lenses: Lenses) -> dict[str, tuple[VideoInfo, Camera]]:
     from psotrack.datasets.dpjait import read_sequence
-    from psotrack.inside_out import lens_of_matrix
+    from psotrack.inside_out import lens_from_matrix
 
     onboard = read_sequence(folder).onboard or {}
     if not onboard:
@@ -104,7 +104,7 @@ def _of_sequence(folder: Path, drones: str | None, lenses: Lenses) -> dict[str, 
         if K is None or lenses.file is not None or lenses.fov_deg is not None:
             lens = lenses.of(video, index, len(chosen))
         else:
-            lens = lens_of_matrix(K, video.image_size_wh)
+            lens = lens_from_matrix(K, video.image_size_wh)
         videos[name] = (video, lens)
     return videos
 

@@ -1,6 +1,6 @@
-"""Where a camera's path begins on the clocks of a reference: of its positions, and of its orientations apart.
+"""Clock offsets between a camera's path and a reference: of its positions, and separately of its orientations.
 
-Both are `synchronisation.find_offset`, first over a wide range and then close by with all samples.
+Both use `psotrack.clocks.find_offset`, first over a wide range and then near the result with all samples.
 """
 
 from __future__ import annotations
@@ -18,48 +18,49 @@ from psotrack.geometry import rotation_matrices
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.trajectories import GATE_M, Status, Trajectories
 
-#: A body's orientations at the samples of its positions when their clock is ahead by the offset, (samples, 4); None
-#: where they do not matter, or are not known before the offset, None, is.
-Bodies = Callable[[float | None], Float[np.ndarray, "samples 4"] | None]
+#: Function from the offset of the positions' clock to the body's orientations at the samples of its positions,
+#: (samples, 4). The offset is None before it is known. The result is None where orientations are not used or unknown.
+BodyOrientations = Callable[[float | None], Float[np.ndarray, "samples 4"] | None]
 
-#: Once the offset is known to what a lever arm may have made of it, it is sought within this.
+#: Largest distance of the refined offset from the first offset, which a lever arm may have shifted, seconds.
 _NEAR_S = 0.5
-#: Each leaves of the offset's error what the arm turns within it: a tenth or less.
+#: Number of refinements. Each reduces the offset's error to a tenth or less: to the lever arm's motion within it.
 _ROUNDS = 3
-#: Far below what motion tells.
+#: Change of the offset that ends the refinements, seconds; far below the precision of any motion.
 _SETTLED_S = 1e-5
-#: Frames whose median a position is held against.
+#: Number of neighbouring frames whose median position shows jumps.
 _NEIGHBOURS = 9
-#: Points that stand for axes: how far out, which is within the gate of a pairing, and how far apart.
+#: Three points stand for the axes of a body: their distance from its origin, which is within the gate of a pairing, and
+#: the distance between the three origins, metres.
 _OUT_M, _APART_M = 0.1, 10.0
 
 
-def offset_of_positions(
+def find_position_offset(
     path: CameraPath,
     time_s: Float[np.ndarray, "samples"],
     position_m: Float[np.ndarray, "samples 3"],
-    bodies: Bodies | None,
+    bodies: BodyOrientations | None,
     *,
     max_offset_s: float | None,
 ) -> tuple[float, float]:
-    """The offset of a reference's positions, and its standard deviation.
+    """Find the clock offset of a reference's positions, and its standard deviation, seconds.
 
     Args:
-        path: of the camera.
+        path: path of the camera.
         time_s, position_m: samples of the reference.
-        bodies: turns a constant lever arm; without it none is allowed for. As long as it knows no orientations, the
-            path's own turn the arm.
-        max_offset_s: as in `comparison.compare`.
+        bodies: orientations of the body, which turn a constant lever arm; None estimates no lever arm. Where the
+            function returns None, the orientations of the path turn the arm.
+        max_offset_s: see `comparing.compare_paths`.
 
     Raises:
-        SettingsError, InputError: see `synchronisation.find_offset`.
+        SettingsError, InputError: see `psotrack.clocks.find_offset`.
     """
     path = _without_jumps(path)
     estimate, points_m = path.trajectories("camera"), position_m[:, None]
     middle_s, reach_s = _range(estimate, time_s, points_m, max_offset_s)
     every, body_wxyz = _thinned(estimate, time_s), None if bodies is None else bodies(None)
     if bodies is not None and body_wxyz is None:
-        # The other way about: the reference is laid on the path, by whose orientations arms are turned.
+        # Exchange the roles: shift the reference along the path, whose orientations turn the arm.
         reference = Trajectories(
             np.arange(len(time_s))[every], time_s[every], estimate.drones, points_m[every]
         )
@@ -72,15 +73,15 @@ def offset_of_positions(
             estimate, time_s[every], points_m[every], thin_wxyz, middle_s, reach_s, bodies is not None
         )
         offset_s = start.offset_s
-    found = _close(estimate, time_s, points_m, bodies, offset_s)
+    found = _refine(estimate, time_s, points_m, bodies, offset_s)
     body_wxyz = None if bodies is None else bodies(found.offset_s)
     if body_wxyz is None:
         return found.offset_s, found.std_s
     arm_m = _axes(body_wxyz).swapaxes(-1, -2) @ found.lever_arm_m[0]
-    return found.offset_s, _checked(estimate, time_s, position_m + arm_m, found.offset_s)
+    return found.offset_s, _checked_std_s(estimate, time_s, position_m + arm_m, found.offset_s)
 
 
-def offset_of_turning(
+def find_orientation_offset(
     path: CameraPath,
     time_s: Float[np.ndarray, "samples"],
     body_wxyz: Float[np.ndarray, "samples 4"],
@@ -88,19 +89,19 @@ def offset_of_turning(
     with_turn: bool,
     max_offset_s: float | None,
 ) -> float:
-    """The offset of a reference's orientations, whatever the positions are.
+    """Find the clock offset of a reference's orientations, seconds, from orientations alone.
 
-    At the right one, points on the camera's axes stand still in the body: their lever arms are the columns of the
-    constant turn from camera to body. The distances that are left are chords of the angles that are.
+    At the right offset, points on the camera's axes are at rest in the body: their lever arms are the columns of the
+    constant turn from camera to body. The remaining distances are chords of the remaining angles.
 
     Args:
-        path: of the camera.
+        path: path of the camera.
         time_s, body_wxyz: samples of the reference, body to world.
-        with_turn: allow that turn; else the camera's axes are the body's.
-        max_offset_s: as in `comparison.compare`.
+        with_turn: estimate the constant turn; otherwise the camera's axes are the body's.
+        max_offset_s: see `comparing.compare_paths`.
 
     Raises:
-        SettingsError, InputError: see `synchronisation.find_offset`.
+        SettingsError, InputError: see `psotrack.clocks.find_offset`.
     """
     path, middles_m = _without_jumps(path), _APART_M * np.eye(3)
     status = np.repeat(path.status[:, None], 3, axis=1)
@@ -114,15 +115,15 @@ def offset_of_turning(
     thin_wxyz = None if turned is None else turned[every]
     start = _found(estimate, time_s[every], points_m[every], thin_wxyz, middle_s, reach_s, with_turn)
     bodies = (lambda offset_s: turned) if with_turn else None
-    return _close(estimate, time_s, points_m, bodies, start.offset_s).offset_s
+    return _refine(estimate, time_s, points_m, bodies, start.offset_s).offset_s
 
 
-def at_times(
+def interpolate_orientations(
     time_s: Float[np.ndarray, "samples"],
     orientation_wxyz: Float[np.ndarray, "samples 4"],
     wanted_s: Float[np.ndarray, "times"],
 ) -> Float[np.ndarray, "times 4"]:
-    """Orientations between samples, on great arcs; NaN outside, and in gaps longer than those of positions may be."""
+    """Orientations between samples, on great arcs, (times, 4); NaN outside, and in gaps too long for positions."""
     found = np.full((len(wanted_s), 4), np.nan)
     known = np.isfinite(orientation_wxyz).all(axis=-1)
     if known.sum() < 2:
@@ -136,19 +137,19 @@ def at_times(
 
 
 def _thinned(estimate: Trajectories, time_s: Float[np.ndarray, "samples"]) -> slice:
-    """About as many samples as frames: a wide search with all of four times as many would tell no more."""
+    """Every n-th sample, about as many as frames: a wide search with more samples would not be more precise."""
     step_s, frame_s = (float(np.median(np.diff(times))) for times in (time_s, estimate.time_s))
     return slice(None, None, max(1, round(frame_s / step_s)))
 
 
-def _close(
+def _refine(
     estimate: Trajectories,
     time_s: Float[np.ndarray, "samples"],
     position_m: Float[np.ndarray, "samples drones 3"],
-    bodies: Bodies | None,
+    bodies: BodyOrientations | None,
     offset_s: float,
 ) -> Offset:
-    """The offset near one that is about right, by all samples."""
+    """The offset near a first offset, by all samples."""
     reach_s = max(_NEAR_S, 2 * float(np.median(np.diff(time_s))))
     for _ in range(_ROUNDS):
         before_s, body_wxyz = offset_s, None if bodies is None else bodies(offset_s)
@@ -159,24 +160,24 @@ def _close(
     return found
 
 
-def _checked(
+def _checked_std_s(
     estimate: Trajectories,
     time_s: Float[np.ndarray, "samples"],
     camera_m: Float[np.ndarray, "samples 3"],
     offset_s: float,
 ) -> float:
-    """The standard deviation of an offset from how the camera moves by the reference, arm and all.
+    """Standard deviation of an offset, by the camera's motion in the reference, with the lever arm.
 
-    Seen from a body that turns, what hovers moves as well: `find_offset` alone would take that for motion.
+    Seen from a body that turns, a hovering camera seems to move: `find_offset` alone would count this as motion.
     """
     placed = time_shift.ShiftedPair.of(estimate, time_s, camera_m[:, None], None, with_lever_arm=True)
     std_s = placed.standard_deviation_s(offset_s, np.zeros(1, int))
     frame_s = float(np.median(np.diff(estimate.time_s)))
     if not std_s < frame_s:
         raise time_shift.refused(
-            f"motion that tells the offset to a frame, {frame_s:g} s",
+            f"motion that determines the offset to a frame, {frame_s:g} s",
             f"a standard deviation of {std_s:.2g} s",
-            "drones that hover, or fly straight on at one speed, do not tell: use more of the recording",
+            "drones that hover, or fly straight on at one speed, do not determine it: use more of the recording",
         )
     return std_s
 
@@ -190,7 +191,7 @@ def _found(
     reach_s: float,
     with_lever_arm: bool = True,
 ) -> Offset:
-    """`find_offset` about another offset than 0, of drones that are turned alike."""
+    """`find_offset` with a range about another offset than 0, for drones that all have the same orientation."""
     found = find_offset(
         estimate,
         time_s - middle_s,
@@ -208,7 +209,7 @@ def _range(
     position_m: Float[np.ndarray, "samples drones 3"],
     max_offset_s: float | None,
 ) -> tuple[float, float]:
-    """The middle of the offsets that are tried, and how far they reach; by default half of the shorter is covered."""
+    """Middle and half width of the range of offsets; by default half of the shorter recording always overlaps."""
     if max_offset_s is not None:
         return 0.0, max_offset_s
     spans_s = estimate.time_s[estimate.seen.any(axis=1)], time_s[np.isfinite(position_m).any(axis=(1, 2))]
@@ -219,9 +220,9 @@ def _range(
 
 
 def _without_jumps(path: CameraPath) -> CameraPath:
-    """The path without poses that are far from where the poses before and after are: they tell nothing of time.
+    """The path without poses far from the poses before and after, which say nothing about time.
 
-    They would not move the least distance much, but hide how clearly it is the least.
+    They would move the smallest mean distance little, but would hide how distinct it is.
     """
     seen = np.flatnonzero(path.seen)
     position_m = path.position_m[seen]
@@ -232,5 +233,5 @@ def _without_jumps(path: CameraPath) -> CameraPath:
 
 
 def _axes(orientation_wxyz: Float[np.ndarray, "times 4"]) -> Float[np.ndarray, "times 3 3"]:
-    """The axes of a frame in the world, one per row."""
+    """The axes of each frame in the world, one per row."""
     return rotation_matrices(orientation_wxyz).swapaxes(-1, -2)

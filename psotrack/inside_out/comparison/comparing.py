@@ -1,12 +1,12 @@
-"""A camera's path against a reference that was recorded apart from it: the paper's Tables 7 and 8.
+"""Comparison of a camera's path with a reference that was recorded separately: the paper's Tables 7 and 8.
 
-The paper (technical validation, "ArUco markers") lays the path on successive points of the reference, takes the offset
-with the smallest mean distance, and gives distances and differences of angles at corresponding frames. It does so in
-steps of the reference's samples; here the offset is found to a fraction of them (`synchronisation`). Orientations may
-come by a clock of their own, as those of an IMU do: their offset is found from how the camera turns.
+The paper (technical validation, "ArUco markers") shifts the path along the reference, takes the offset with the
+smallest mean distance, and states distances and differences of angles at corresponding frames. The paper does so in
+steps of the reference's samples; here the offset is found to a fraction of a step (`psotrack.clocks`). Orientations may
+come with a clock of their own, as those of an IMU do: their offset is found from how the camera turns.
 
-Two things are constant and no error: the lever arm, from the reference's point on the drone to the camera, and the turn
-from the camera's axes to those of the reference's body. Each may be taken out, and is told.
+Two constant differences are no errors: the lever arm, from the reference's point on the drone to the camera, and the
+turn from the camera's axes to those of the reference's body. Each can be estimated and removed, and is returned.
 """
 
 from __future__ import annotations
@@ -21,16 +21,18 @@ from psotrack.clocks import time_shift
 from psotrack.inside_out.camera_path import CameraPath, roll_pitch_yaw_deg
 from psotrack.inside_out.comparison import clocks as clocks
 
+#: Number of iterations of the mean rotation.
 _MEAN_STEPS = 10
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """Of the values that are known, in their unit: a row of Tables 7 and 8. NaN where there are none.
+    """Statistics of the values that are not NaN, in their unit: a row of Tables 7 and 8. NaN if there are no values.
 
     Attributes:
-        count: of them.
-        std: about the mean, divided by their number.
+        count: number of values.
+        mean, median, minimum, maximum: of the values.
+        std: standard deviation about the mean (the sum of squares divided by `count`).
     """
 
     count: int
@@ -42,7 +44,7 @@ class Statistics:
 
     @staticmethod
     def of(values: Float[np.ndarray, "values"]) -> Statistics:
-        """Of the values that are not NaN."""
+        """Statistics of the values that are not NaN."""
         known = values[np.isfinite(values)]
         if not len(known):
             return Statistics(0, *[np.nan] * 5)
@@ -51,17 +53,17 @@ class Statistics:
 
 
 @dataclass(frozen=True)
-class Turning:
-    """The orientations of a path and its reference at corresponding frames. What is not known of a frame is NaN.
+class OrientationComparison:
+    """Orientations of a path and its reference at corresponding frames. Values that are not known are NaN.
 
     Attributes:
-        offset_s: the reference's orientations at t + offset_s belong to the path at t.
-        turn_wxyz: (4,), camera to the reference's body; the identity where none was allowed for.
-        reference_wxyz: (frames, 4), camera to world by the reference, turn and all.
+        offset_s: the reference's orientation at t + offset_s corresponds to the path at t, seconds.
+        turn_wxyz: (4,), rotation from the camera's axes to the reference's body; the identity if it is not estimated.
+        reference_wxyz: (frames, 4), orientation of the camera by the reference, with the turn, camera to world.
         difference_deg: (frames, 3), in roll, pitch and yaw (`roll_pitch_yaw_deg`): path minus reference, each wrapped
             to (-180, 180]. Table 8.
-        angle_deg: (frames,), of the one turn that leads from the reference's orientation to the path's: no convention
-            enters it.
+        angle_deg: (frames,), angle of the rotation from the reference's orientation to the path's; independent of
+            conventions of angles.
     """
 
     offset_s: float
@@ -73,19 +75,19 @@ class Turning:
 
 @dataclass(frozen=True)
 class PathComparison:
-    """A path and its reference at corresponding frames. What is not known of a frame is NaN.
+    """A path and its reference at corresponding frames. Values that are not known are NaN.
 
     Attributes:
-        frame: (frames,), those of the path.
-        time_s: (frames,), likewise.
-        offset_s: the reference's positions at t + offset_s belong to the path at t.
-        offset_std_s: its standard deviation, from the motion and the distances that are left.
-        lever_arm_m: (3,), from the reference's point to the camera, in the axes of the reference's body, or in the
-            camera's where it has no orientations; zeros where none was allowed for.
-        reference_m: (frames, 3), where the camera is by the reference, lever arm and all, world.
-        distance_m: (frames,), of the path's position from there. Table 7.
-        distance_to_point_m: (frames,), from the reference's own point: the lever arm counts.
-        turning: of the orientations; None where the reference has none.
+        frame: (frames,), frame numbers of the path.
+        time_s: (frames,), times of the path, seconds.
+        offset_s: the reference's position at t + offset_s corresponds to the path at t, seconds.
+        offset_std_s: standard deviation of `offset_s`, from the motion and the remaining distances.
+        lever_arm_m: (3,), from the reference's point to the camera, in the axes of the reference's body, or of the
+            camera where the reference has no orientations; zeros if it is not estimated.
+        reference_m: (frames, 3), position of the camera by the reference, with the lever arm, world.
+        distance_m: (frames,), from `reference_m` to the path. Table 7.
+        distance_to_point_m: (frames,), from the reference's point to the path, without the lever arm.
+        turning: comparison of orientations; None where the reference has none.
     """
 
     frame: Int[np.ndarray, "frames"]
@@ -96,16 +98,16 @@ class PathComparison:
     reference_m: Float[np.ndarray, "frames 3"]
     distance_m: Float[np.ndarray, "frames"]
     distance_to_point_m: Float[np.ndarray, "frames"]
-    turning: Turning | None
+    turning: OrientationComparison | None
 
     @property
     def path_length_m(self) -> float:
-        """Of the way by the reference, over the frames in which it is known."""
+        """Length of the reference's path over the frames in which it is known, metres."""
         known_m = self.reference_m[np.isfinite(self.reference_m).all(axis=-1)]
         return float(np.linalg.norm(np.diff(known_m, axis=0), axis=-1).sum())
 
 
-def compare(
+def compare_paths(
     path: CameraPath,
     reference_time_s: Float[np.ndarray, "samples"],
     reference_m: Float[np.ndarray, "samples 3"],
@@ -116,34 +118,35 @@ def compare(
     with_turn: bool = True,
     max_offset_s: float | None = None,
 ) -> PathComparison:
-    """A path against a reference of any rate, whose clocks are not that of the video.
+    """Compare a path with a reference of any rate, whose clocks differ from the video's.
 
-    Between samples of the reference positions are cubic splines and orientations great arcs, neither over gaps
-    (`time_shift.MAX_GAP_S`). Poses that are lost do not count; all others do, however wrong they are.
+    Between samples of the reference, positions are cubic splines and orientations great arcs, but not over gaps longer
+    than `time_shift.MAX_GAP_S`. Lost poses are left out; all others count, even if they are wrong.
 
     Args:
-        path: at the times of the video.
-        reference_time_s: (samples,), by the reference's own clock, at its own rate.
-        reference_m: (samples, 3), world; NaN where it is not known.
-        reference_wxyz: (turns, 4), body to world, at the times of the positions, or else at `orientation_time_s`; NaN
-            where it is not known.
-        orientation_time_s: (turns,), where orientations come by a clock of their own.
-        with_lever_arm: allow a constant arm in the body.
-        with_turn: allow a constant turn between the camera's axes and the body's; without it they are the same.
-        max_offset_s: offsets from minus this to this; None for all at which half of the shorter one is covered.
+        path: path at the times of the video.
+        reference_time_s: (samples,), times of the reference's positions by its own clock, seconds.
+        reference_m: (samples, 3), positions, world, metres; NaN where unknown.
+        reference_wxyz: (turns, 4), orientations, body to world, at `reference_time_s` or else `orientation_time_s`; NaN
+            where unknown.
+        orientation_time_s: (turns,), times of the orientations if they have a clock of their own, seconds.
+        with_lever_arm: estimate a constant lever arm in the body.
+        with_turn: estimate a constant turn between the camera's axes and the body's; without it the axes are the same.
+        max_offset_s: offsets from minus this to this are tried, seconds; None tries all offsets at which half of the
+            shorter recording overlaps the other.
 
     Raises:
         SettingsError: the range is smaller than a step of the reference.
-        InputError: nothing is in common, or the motion does not tell the offset: see `synchronisation.find_offset`.
+        InputError: the two have nothing in common, or the motion does not determine the offset; see `find_offset`.
     """
     turns_s, turn_offset_s = reference_time_s, None
     if reference_wxyz is not None and orientation_time_s is not None:
         turns_s = orientation_time_s
-        turn_offset_s = clocks.offset_of_turning(
+        turn_offset_s = clocks.find_orientation_offset(
             path, turns_s, reference_wxyz, with_turn=with_turn, max_offset_s=max_offset_s
         )
     bodies = _bodies(path, reference_time_s, reference_wxyz, turns_s, turn_offset_s)
-    offset_s, std_s = clocks.offset_of_positions(
+    offset_s, std_s = clocks.find_position_offset(
         path, reference_time_s, reference_m, bodies if with_lever_arm else None, max_offset_s=max_offset_s
     )
     turned = bodies(offset_s) if with_lever_arm else None
@@ -163,7 +166,10 @@ def compare(
     if reference_wxyz is not None:
         by_s = offset_s if turn_offset_s is None else turn_offset_s
         turning = _turning(
-            path, clocks.at_times(turns_s, reference_wxyz, path.time_s + by_s), by_s, with_turn
+            path,
+            clocks.interpolate_orientations(turns_s, reference_wxyz, path.time_s + by_s),
+            by_s,
+            with_turn,
         )
     return PathComparison(
         frame=path.frame,
@@ -178,8 +184,8 @@ def compare(
     )
 
 
-def wrapped_deg(angle_deg: Float[np.ndarray, "*angles"]) -> Float[np.ndarray, "*angles"]:
-    """The same angles in (-180, 180]."""
+def wrap_deg(angle_deg: Float[np.ndarray, "*angles"]) -> Float[np.ndarray, "*angles"]:
+    """The same angles in (-180, 180], degrees."""
     return 180.0 - (180.0 - angle_deg) % 360.0
 
 
@@ -201,19 +207,21 @@ def _bodies(
     reference_wxyz: Float[np.ndarray, "turns 4"] | None,
     turns_s: Float[np.ndarray, "turns"],
     turn_offset_s: float | None,
-) -> clocks.Bodies:
-    """The reference's own orientations; without any, the path's, which are the camera's."""
+) -> clocks.BodyOrientations:
+    """The reference's own orientations; without any, the orientations of the path, which are the camera's."""
     if reference_wxyz is not None and turn_offset_s is None:
         return lambda offset_s: reference_wxyz
     by_video_s, wxyz = path.time_s, _poses(path)
     if reference_wxyz is not None and turn_offset_s is not None:
         by_video_s, wxyz = turns_s - turn_offset_s, reference_wxyz
-    return lambda offset_s: None if offset_s is None else clocks.at_times(by_video_s, wxyz, time_s - offset_s)
+    return lambda offset_s: (
+        None if offset_s is None else clocks.interpolate_orientations(by_video_s, wxyz, time_s - offset_s)
+    )
 
 
 def _turning(
     path: CameraPath, body_wxyz: Float[np.ndarray, "frames 4"], offset_s: float, with_turn: bool
-) -> Turning:
+) -> OrientationComparison:
     pose_wxyz = _poses(path)
     known = np.isfinite(body_wxyz).all(axis=-1)
     both = known & np.isfinite(pose_wxyz).all(axis=-1)
@@ -226,8 +234,8 @@ def _turning(
     reference_wxyz[known] = (every * turn).as_quat(scalar_first=True)
     angle_deg[both] = np.degrees(((bodies * turn).inv() * poses).magnitude())
     difference_deg = roll_pitch_yaw_deg(pose_wxyz) - roll_pitch_yaw_deg(reference_wxyz)
-    return Turning(
-        offset_s, turn.as_quat(scalar_first=True), reference_wxyz, wrapped_deg(difference_deg), angle_deg
+    return OrientationComparison(
+        offset_s, turn.as_quat(scalar_first=True), reference_wxyz, wrap_deg(difference_deg), angle_deg
     )
 
 

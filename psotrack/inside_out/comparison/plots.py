@@ -1,4 +1,4 @@
-"""Pictures of a camera's path: in its room, and beside its reference (the paper's figure 11) or off it over time."""
+"""Plots of a camera's path: in its room, with its reference (the paper's figure 11), and errors over time."""
 
 from __future__ import annotations
 
@@ -19,27 +19,28 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: As in the paper: what is reconstructed is red, the reference blue.
+#: Colours of the paper's figure: the reconstructed path is red, the reference blue.
 RECONSTRUCTED, REFERENCE = "#d62728", "#1f5fbf"
 _GRID = "#dde1e6"
 _MARKERS = "#4d4d4d"
-#: From a frame's own markers, and from the motion.
+#: Colours of poses from the frame's own markers, and of poses from the motion.
 _TRACKED, _BRIDGED = COLOURS[0], COLOURS[1]
 _AXES = "xyz"
-#: Around the reference, as a share of its largest extent: what is further away is counted, not drawn.
+#: Margin around the reference, as a share of its largest extent. Positions beyond the margin are counted, not drawn.
 _MARGIN = 0.15
 
 
 def save_paths(
-    png: Path, path: CameraPath, comparison: PathComparison, *, caption: str = "", force: bool = False
+    png: Path | str, path: CameraPath, comparison: PathComparison, *, caption: str = "", force: bool = False
 ) -> None:
-    """Save a PNG of the path and of where its reference says it was, from above and from the side: figure 11.
+    """Save a PNG of the path and its reference from above and from the side: the paper's figure 11.
 
-    Both views have one scale, in metres. The side view is along the horizontal axis of the world of the smaller extent.
+    Both views have the same scale, in metres. The side view shows the horizontal axis of the larger extent, and height.
 
     Raises:
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
+    png = Path(png)
     position_m = np.where(path.seen[:, None], path.position_m, np.nan)
     low_m, high_m = (find(comparison.reference_m, axis=0) for find in (np.nanmin, np.nanmax))
     margin_m = _MARGIN * float((high_m - low_m).max())
@@ -71,18 +72,19 @@ def save_paths(
 
 
 def save_flight(
-    png: Path, path: CameraPath, marker_map: MarkerMap, *, caption: str = "", force: bool = False
+    png: Path | str, path: CameraPath, marker_map: MarkerMap, *, caption: str = "", force: bool = False
 ) -> None:
     """Save a PNG of a path from above, with the markers of the room, and of its height over time.
 
-    Frames that the motion bridges have a colour of their own; where there is no pose, the line is broken and, over
-    time, the ground is grey.
+    Frames with poses from the motion have a colour of their own. Where there is no pose, the line is interrupted, and
+    the background of the height is grey.
 
     Raises:
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
+    png = Path(png)
     bridged = path.seen & (path.status == Status.COASTING)
-    # A line reaches from the frame before to the frame after.
+    # Lines are drawn between frames, so that a bridged frame needs its neighbours.
     beside = path.seen & np.convolve(bridged, np.ones(3), mode="same").astype(bool)
 
     def draw(figure: Figure) -> None:
@@ -115,17 +117,20 @@ def save_flight(
 
 
 def _runs(marked: Bool[np.ndarray, "frames"]) -> list[tuple[int, int]]:
-    """First and end of each run of marked frames."""
+    """First frame and end (exclusive) of each run of marked frames."""
     steps = np.diff(np.concatenate([[False], marked, [False]]).astype(int))
     return list(zip(np.flatnonzero(steps > 0).tolist(), np.flatnonzero(steps < 0).tolist(), strict=True))
 
 
-def save_errors(png: Path, comparisons: Mapping[str, PathComparison], *, force: bool = False) -> None:
-    """Save a PNG of the distance, and of the angle where there are orientations, over time: a line per comparison.
+def save_path_errors(
+    png: Path | str, comparisons: Mapping[str, PathComparison], *, force: bool = False
+) -> None:
+    """Save a PNG of the distance, and of the angle if there are orientations, over time, with a line per comparison.
 
     Raises:
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
+    png = Path(png)
     quantities = [("distance (mm)", {name: 1e3 * one.distance_m for name, one in comparisons.items()})]
     turned = {name: one.turning.angle_deg for name, one in comparisons.items() if one.turning}
     if turned:
@@ -146,7 +151,7 @@ def save_errors(png: Path, comparisons: Mapping[str, PathComparison], *, force: 
 
 
 def _scale(axes: Axes, values: Float[np.ndarray, "values"]) -> None:
-    """From zero, or logarithmic where the largest value would leave the others on the floor."""
+    """Start the vertical axis at zero; make it logarithmic where the largest value is far above the median."""
     from matplotlib.ticker import StrMethodFormatter
 
     known = values[np.isfinite(values) & (values > 0)]

@@ -1,4 +1,4 @@
-"""One frame of a `CameraPath`, for those who make or read a path frame by frame, and what a filter tells of it."""
+"""One frame of a `CameraPath`, for code that makes or reads a path frame by frame."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from psotrack.trajectories import Status
 
 @dataclass(frozen=True)
 class PoseRow:
-    """One frame. Attributes are those of `CameraPath`, without the axis of the frames; NaN for what is not known."""
+    """One frame of a path. Attributes are those of `CameraPath` without the frames' axis; unknown values are NaN."""
 
     frame: int
     time_s: float
@@ -37,8 +37,8 @@ class PoseRow:
         return bool(np.isfinite(self.position_m).all())
 
 
-def rows_of(path: CameraPath) -> list[PoseRow]:
-    """The frames of a path, one by one; what the path has none of is NaN, and there are no common errors."""
+def split_path(path: CameraPath) -> list[PoseRow]:
+    """The frames of a path, one by one. Values that the path lacks are NaN; without `common`, there are 0 errors."""
     count = path.num_frames
     velocity_m_s = np.full((count, 3), np.nan) if path.velocity_m_s is None else path.velocity_m_s
     chance = np.full(count, np.nan) if path.chance is None else path.chance
@@ -63,8 +63,8 @@ def rows_of(path: CameraPath) -> list[PoseRow]:
     ]
 
 
-def path_of(rows: Sequence[PoseRow]) -> CameraPath:
-    """The path of these frames, which increase; what no frame has any of is left out."""
+def join_rows(rows: Sequence[PoseRow]) -> CameraPath:
+    """The path of these frames, in increasing order; optional values that no frame has are None."""
     velocity_m_s = _stacked([row.velocity_m_s for row in rows], (3,))
     chance = np.array([row.chance for row in rows], float)
     common = np.array([row.common for row in rows], float)
@@ -85,8 +85,8 @@ def path_of(rows: Sequence[PoseRow]) -> CameraPath:
     )
 
 
-def measured(row: PoseRow) -> MeasuredPose:
-    """The pose of a frame that has one; where nothing is said of its ambiguity, it has none; of chance, all may be."""
+def measured_pose(row: PoseRow) -> MeasuredPose:
+    """The pose of a frame that has one. An unknown ambiguity counts as 0, an unknown chance as 1."""
     return MeasuredPose(
         row.time_s,
         row.position_m,
@@ -98,8 +98,8 @@ def measured(row: PoseRow) -> MeasuredPose:
     )
 
 
-def told_row(raw: PoseRow, told: PoseEstimate, ambiguity: float, *, used: bool) -> PoseRow:
-    """A frame with the pose that is told of it, by its own pose or without."""
+def estimated_row(raw: PoseRow, estimate: PoseEstimate, ambiguity: float, *, used: bool) -> PoseRow:
+    """A frame with its estimated pose; `used` says whether the frame's own pose was used for it."""
     flags = Flag(raw.flags)
     if raw.has_pose and not used:
         flags |= Flag.GATED
@@ -107,20 +107,20 @@ def told_row(raw: PoseRow, told: PoseEstimate, ambiguity: float, *, used: bool) 
         flags &= ~Flag.AMBIGUOUS
     return replace(
         raw,
-        position_m=told.position_m,
-        orientation_wxyz=told.orientation_wxyz,
-        covariance=told.covariance,
+        position_m=estimate.position_m,
+        orientation_wxyz=estimate.orientation_wxyz,
+        covariance=estimate.covariance,
         ambiguity=ambiguity,
         status=int(Status.TRACKED if used else Status.COASTING),
         flags=int(flags),
-        velocity_m_s=told.velocity_m_s,
+        velocity_m_s=estimate.velocity_m_s,
         chance=np.nan,
         common=np.zeros((6, 0)),
     )
 
 
-def lost(raw: PoseRow, *, gated: bool = False) -> PoseRow:
-    """A frame of which no pose is told."""
+def lost_row(raw: PoseRow, *, gated: bool = False) -> PoseRow:
+    """A frame without an estimated pose."""
     return replace(
         raw,
         position_m=np.full(3, np.nan),

@@ -1,10 +1,11 @@
-"""Where a camera is, on the fly: a causal filter over the poses that single frames tell.
+"""Causal filter over the poses of single frames: each frame's estimate uses this frame and earlier ones only.
 
-`init`, `predict` and `update` (of `bank`) are the filter of one motion, frame by frame; a pose that does not fit
-is gated: it does not count. `step` follows a camera with them. It confirms a start, tells nothing after too long a
-gap, and starts anew where poses agree with one another but not with the state: none of them may be wrong for ever.
-What was known before a gap is kept, and grows vague: poses after it that this does not foretell need others, as they do
-against a state, or markers that agree beyond chance where it does not contradict them. `follow` is a loop over `step`.
+`init`, `predict` and `update` (of `multiple_models`) filter one continuous motion; a pose that does not fit it is gated
+and not used. `step` follows a camera with these functions. It returns poses once the first ones are confirmed, and none
+after too long a gap. It replaces its state where successive poses agree with one another but not with the state, so
+that no wrong state lasts. The state before a gap is kept and predicted, with growing uncertainty. After the gap, poses
+that this state does not predict need as many confirmations as poses against a state, or markers that agree beyond
+chance in a pose that does not contradict the kept state. `filter_path` is a loop over `step`.
 """
 
 from __future__ import annotations
@@ -14,8 +15,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psotrack.inside_out.camera_path import CameraPath
-from psotrack.inside_out.filtering.bank import PoseState, estimate, init, open_minded, predict, update
-from psotrack.inside_out.filtering.path_rows import PoseRow, lost, measured, path_of, rows_of, told_row
+from psotrack.inside_out.filtering.multiple_models import (
+    PoseState,
+    estimate,
+    init,
+    predict,
+    update,
+    with_equal_weights,
+)
+from psotrack.inside_out.filtering.path_rows import (
+    PoseRow,
+    estimated_row,
+    join_rows,
+    lost_row,
+    measured_pose,
+    split_path,
+)
 from psotrack.inside_out.filtering.records import MeasuredPose, PoseEstimate, PoseFilterParams
 
 __all__ = [
@@ -27,212 +42,218 @@ __all__ = [
     "advance",
     "estimate",
     "expected",
-    "follow",
+    "filter_path",
     "init",
     "predict",
     "step",
     "update",
 ]
 
-#: Poses in a row that tell a turn, which no level that counts foretold, from an outlier.
+#: Number of successive poses that distinguish a turn, which no level of agility predicted, from an outlier.
 _TURN_POSES = 2
-#: A camera that is somewhere within so much, along an axis, may be anywhere in a room.
+#: Standard deviation along an axis, metres, from which on the camera may be anywhere in a room.
 _ANYWHERE_M = 10.0
 
 
 @dataclass(frozen=True)
-class Rival:
-    """What poses that did not fit the state agree on.
+class Alternative:
+    """Alternative state, from poses that did not fit the state.
 
     Attributes:
-        state: by them alone, or by them as a turn that nothing foretold.
-        since_s: time of the first of them.
-        needed: support with which the rival is believed.
-        goes_on: whether the camera may have come there from where the state has it.
+        state: state by these poses alone, or by these poses as a turn that no level of agility predicted.
+        since_s: time of the first of these poses, seconds.
+        needed: number of poses after which the alternative replaces the state.
+        continuous: whether the camera can have moved there from the state, so that the motion has no jump.
     """
 
     state: PoseState
     since_s: float
     needed: int
-    goes_on: bool
+    continuous: bool
 
 
 @dataclass(frozen=True)
 class FilterRun:
-    """What `step` hands from frame to frame; `FilterRun()` knows nothing yet.
+    """What `step` passes on from frame to frame; `FilterRun()` is the beginning, without any pose.
 
     Attributes:
-        state: what is believed.
-        rival: what might be believed instead.
-        former: what was believed until a rival was; while it is no longer ago than gaps may be, it may still be right.
-        overthrown: the rival that became the state in this very frame.
-        recalled: the former state that became the state again in this very frame, as it was foretold.
-        before: what was known before too long a gap, until the camera is found again.
-        strange: whether the state contradicts that.
+        state: current state.
+        alternative: state that poses against the current state suggest.
+        previous: state that an alternative replaced; it may still prove right while its last pose is no longer ago
+            than the longest gap.
+        adopted: alternative that became the state in this frame.
+        restored: previous state, as predicted, that became the state again in this frame.
+        before_gap: state before too long a gap, kept until the camera is found again.
+        contradicts: whether the state contradicts the state before the gap.
     """
 
     state: PoseState | None = None
-    rival: Rival | None = None
-    former: PoseState | None = None
-    overthrown: Rival | None = None
-    recalled: PoseState | None = None
-    before: PoseState | None = None
-    strange: bool = False
+    alternative: Alternative | None = None
+    previous: PoseState | None = None
+    adopted: Alternative | None = None
+    restored: PoseState | None = None
+    before_gap: PoseState | None = None
+    contradicts: bool = False
 
 
-def advance(following: FilterRun, time_s: float, params: PoseFilterParams) -> FilterRun:
-    """The same at a later time, before its frame is looked at; what is too long ago is forgotten.
+def advance(run: FilterRun, time_s: float, params: PoseFilterParams) -> FilterRun:
+    """Predict a run to the time of the next frame; states without a pose for too long are dropped.
 
     Raises:
-        InputError: the time is before that of `following`.
+        InputError: the time is before that of the run.
     """
-    if following.state is not None and following.state.time_s == time_s:
-        return following
+    if run.state is not None and run.state.time_s == time_s:
+        return run
 
     def later(state: PoseState | None) -> PoseState | None:
         if state is None or time_s - state.seen_s > params.longest_gap_s:
             return None
         return predict(state, time_s)
 
-    state, former, rival = later(following.state), later(following.former), following.rival
-    rival_state = later(rival.state) if rival else None
-    rival = replace(rival, state=rival_state) if rival and rival_state else None
-    before = following.state if state is None and confirmed(following, params) else following.before
-    if before is not None:
-        before = predict(before, time_s)
-        before = None if _anywhere(before) else before
-    if state is None and rival is not None:
-        return FilterRun(rival.state, former=former, overthrown=rival, before=before)
-    strange = before is not None and following.strange
-    return FilterRun(state, rival, former, before=before, strange=strange)
+    state, previous, alternative = later(run.state), later(run.previous), run.alternative
+    alternative_state = later(alternative.state) if alternative else None
+    alternative = replace(alternative, state=alternative_state) if alternative and alternative_state else None
+    before_gap = run.state if state is None and confirmed(run, params) else run.before_gap
+    if before_gap is not None:
+        before_gap = predict(before_gap, time_s)
+        before_gap = None if _is_anywhere(before_gap) else before_gap
+    if state is None and alternative is not None:
+        return FilterRun(alternative.state, previous=previous, adopted=alternative, before_gap=before_gap)
+    contradicts = before_gap is not None and run.contradicts
+    return FilterRun(state, alternative, previous, before_gap=before_gap, contradicts=contradicts)
 
 
-def expected(following: FilterRun, params: PoseFilterParams) -> PoseEstimate | None:
-    """Where the camera should be at the time that `following` was advanced to; None where nothing is confirmed."""
-    return estimate(following.state) if following.state and confirmed(following, params) else None
+def expected(run: FilterRun, params: PoseFilterParams) -> PoseEstimate | None:
+    """Estimate at the time to which the run was advanced; None where no state is confirmed."""
+    return estimate(run.state) if run.state and confirmed(run, params) else None
 
 
-def confirmed(following: FilterRun, params: PoseFilterParams) -> bool:
-    """Whether the state is to be told: enough poses agree, or the markers of one of them do, beyond chance.
+def confirmed(run: FilterRun, params: PoseFilterParams) -> bool:
+    """Whether the state may be returned: enough poses agree, or the markers of one pose agree beyond chance.
 
-    Behind a gap, poses that what was known before does not foretell need as many as they would against a state, and
-    where they contradict it, markers that agree do not change that.
+    After a gap, poses that the state before the gap does not predict need as many confirmations as poses against a
+    state. Where they contradict that state, markers that agree do not replace confirmations.
     """
-    state = following.state
+    state = run.state
     if state is None:
         return False
-    needed = params.confirm if following.before is None else max(params.confirm, params.restart_after)
-    return state.support >= needed or (state.doubt < params.false_alarm and not following.strange)
+    needed = params.confirm if run.before_gap is None else max(params.confirm, params.restart_after)
+    return state.support >= needed or (state.p_wrong < params.false_alarm and not run.contradicts)
 
 
-def step(following: FilterRun, raw: PoseRow, params: PoseFilterParams) -> tuple[FilterRun, PoseRow]:
+def step(run: FilterRun, raw: PoseRow, params: PoseFilterParams) -> tuple[FilterRun, PoseRow]:
     """Follow the camera into the next frame.
 
     Args:
-        following: from the frame before, advanced to this one or not.
-        raw: what the frame says by itself; without a pose, its position is NaN.
-        params: of the filter.
+        run: result of the frame before, advanced to this frame or not.
+        raw: this frame's own pose; its position is NaN where there is none.
+        params: parameters of the filter.
 
     Returns:
-        What to hand on, and the frame as the filter tells it: `TRACKED` where the frame's pose counted, `COASTING`
-        where there was none, or one that was gated, and `LOST`, with NaN, where nothing is confirmed, or too long ago.
+        The run for the next frame, and this frame with its estimate: `TRACKED` where the frame's own pose was used,
+        `COASTING` where there was none or it was gated, and `LOST`, with NaN, where no state is confirmed.
 
     Raises:
         InputError: times do not increase, or a pose's covariance is not positive definite.
     """
-    following = advance(following, raw.time_s, params)
+    run = advance(run, raw.time_s, params)
     gated = False
     if raw.has_pose:
-        overthrown = following.overthrown
-        following, gated = _looked(following, measured(raw), params)
-        following = replace(following, overthrown=following.overthrown or overthrown)
-    told = expected(following, params)
-    if told is None or following.state is None:
-        return following, lost(raw, gated=gated)
-    ambiguity = following.state.ambiguity
-    return following, told_row(raw, told, ambiguity, used=raw.has_pose and not gated)
+        adopted = run.adopted
+        run, gated = _use_pose(run, measured_pose(raw), params)
+        run = replace(run, adopted=run.adopted or adopted)
+    estimated = expected(run, params)
+    if estimated is None or run.state is None:
+        return run, lost_row(raw, gated=gated)
+    return run, estimated_row(raw, estimated, run.state.ambiguity, used=raw.has_pose and not gated)
 
 
-def follow(path: CameraPath, params: PoseFilterParams | None = None) -> CameraPath:
-    """What the frames up to each frame say of it.
+def filter_path(path: CameraPath, params: PoseFilterParams | None = None) -> CameraPath:
+    """Filter a path: the estimate in each frame uses this frame and earlier ones.
 
     Args:
         path: raw poses, each from its frame alone.
-        params: of the filter.
+        params: parameters of the filter.
 
     Raises:
         InputError: a pose's covariance is not positive definite.
     """
     params = params or PoseFilterParams()
-    following, rows = FilterRun(), []
-    for raw in rows_of(path):
-        following, row = step(following, raw, params)
+    run, rows = FilterRun(), []
+    for raw in split_path(path):
+        run, row = step(run, raw, params)
         rows.append(row)
-    return path_of(rows)
+    return join_rows(rows)
 
 
-def _looked(
-    following: FilterRun, measurement: MeasuredPose, params: PoseFilterParams
-) -> tuple[FilterRun, bool]:
-    """After a measured pose, and whether it was gated."""
-    before, strange = following.before, False
-    if before is not None:
-        again, strange = update(before, measurement, params)
-        if not strange and _foretold(again, params):
-            return FilterRun(again, recalled=before), False
-    if following.state is None:
-        anew = init(measurement)
-        began = None if before is None else Rival(anew, measurement.time_s, 1, goes_on=not strange)
-        found, gated = FilterRun(anew, overthrown=began), False
+def _use_pose(run: FilterRun, measurement: MeasuredPose, params: PoseFilterParams) -> tuple[FilterRun, bool]:
+    """The run after a measured pose, and whether the pose was gated."""
+    before_gap, contradicts = run.before_gap, False
+    if before_gap is not None:
+        updated, contradicts = update(before_gap, measurement, params)
+        if not contradicts and _is_predicted(updated, params):
+            return FilterRun(updated, restored=before_gap), False
+    if run.state is None:
+        first = init(measurement)
+        adopted = (
+            None
+            if before_gap is None
+            else Alternative(first, measurement.time_s, 1, continuous=not contradicts)
+        )
+        found, gated = FilterRun(first, adopted=adopted), False
     else:
-        found, gated = _compared(following, following.state, measurement, params)
-        strange = strange if found.overthrown else following.strange
-    found = replace(found, before=before, strange=strange)
-    return replace(found, before=None, strange=False) if confirmed(found, params) else found, gated
+        found, gated = _use_pose_with_state(run, run.state, measurement, params)
+        contradicts = contradicts if found.adopted else run.contradicts
+    found = replace(found, before_gap=before_gap, contradicts=contradicts)
+    return replace(found, before_gap=None, contradicts=False) if confirmed(found, params) else found, gated
 
 
-def _compared(
-    following: FilterRun, state: PoseState, measurement: MeasuredPose, params: PoseFilterParams
+def _use_pose_with_state(
+    run: FilterRun, state: PoseState, measurement: MeasuredPose, params: PoseFilterParams
 ) -> tuple[FilterRun, bool]:
-    """After a measured pose, where there is a state, and whether it was gated."""
-    foretold = state
-    state, gated = update(foretold, measurement, params)
-    former, rival = following.former, following.rival
-    if former is not None:
-        again, strange = update(former, measurement, params)
-        if not strange and (gated or again.log_density > state.log_density):
-            return FilterRun(again, recalled=former), False
-    strange = True
-    if rival is not None:
-        rival_state, strange = update(rival.state, measurement, params)
-        rival = replace(rival, state=rival_state)
-    if rival is None or strange:
-        rival = _begun(state, measurement, params) if gated else None
-        return FilterRun(state, rival, former), gated
-    if not gated and rival.state.log_density <= state.log_density:
-        return FilterRun(state, former=former), False
-    # The pose is the rival's, even where the state, vague by now, would have it too.
-    if rival.state.support >= rival.needed:
-        return FilterRun(rival.state, former=former or foretold, overthrown=rival), False
-    return FilterRun(foretold, rival, former), True
+    """The run after a measured pose, where there is a state, and whether the pose was gated."""
+    predicted = state
+    state, gated = update(predicted, measurement, params)
+    previous, alternative = run.previous, run.alternative
+    if previous is not None:
+        updated, outside = update(previous, measurement, params)
+        if not outside and (gated or updated.log_density > state.log_density):
+            return FilterRun(updated, restored=previous), False
+    outside = True
+    if alternative is not None:
+        alternative_state, outside = update(alternative.state, measurement, params)
+        alternative = replace(alternative, state=alternative_state)
+    if alternative is None or outside:
+        alternative = _first_alternative(state, measurement, params) if gated else None
+        return FilterRun(state, alternative, previous), gated
+    if not gated and alternative.state.log_density <= state.log_density:
+        return FilterRun(state, previous=previous), False
+    # The pose belongs to the alternative, even where the state has grown uncertain enough to accept it.
+    if alternative.state.support >= alternative.needed:
+        return FilterRun(alternative.state, previous=previous or predicted, adopted=alternative), False
+    return FilterRun(predicted, alternative, previous), True
 
 
-def _begun(state: PoseState, measurement: MeasuredPose, params: PoseFilterParams) -> Rival:
-    """A rival of a state, by a pose that does not fit it: the camera turned as nothing foretold, or is elsewhere."""
-    sure = state.doubt < params.false_alarm
+def _first_alternative(state: PoseState, measurement: MeasuredPose, params: PoseFilterParams) -> Alternative:
+    """An alternative by one pose that does not fit the state: an unpredicted turn, or a camera that is elsewhere."""
+    sure = state.p_wrong < params.false_alarm
     if sure or state.support >= params.confirm:
-        turned, strange = update(open_minded(state), measurement, params)
-        if not strange and _foretold(turned, params):
-            return Rival(turned, measurement.time_s, state.support + _TURN_POSES, goes_on=True)
+        turned, outside = update(with_equal_weights(state), measurement, params)
+        if not outside and _is_predicted(turned, params):
+            return Alternative(turned, measurement.time_s, state.support + _TURN_POSES, continuous=True)
     needed = params.restart_after if sure else min(params.restart_after, state.support + 1)
-    return Rival(init(measurement), measurement.time_s, needed, goes_on=False)
+    return Alternative(init(measurement), measurement.time_s, needed, continuous=False)
 
 
-def _anywhere(state: PoseState) -> bool:
+def _is_anywhere(state: PoseState) -> bool:
+    """Whether the position is so uncertain that the camera may be anywhere in a room."""
     return bool(np.linalg.eigvalsh(estimate(state).covariance[:3, :3])[-1] > _ANYWHERE_M**2)
 
 
-def _foretold(state: PoseState, params: PoseFilterParams) -> bool:
-    """Whether the last pose that fitted is likelier by the motion than somewhere within a metre and a radian, and by so
-    much that it is an outlier less often than good poses are gated."""
+def _is_predicted(state: PoseState, params: PoseFilterParams) -> bool:
+    """Whether the last pose is predicted by the motion rather than an outlier.
+
+    Its density must exceed that of an outlier within a metre and a radian by so much that it is an outlier less often
+    than good poses are gated.
+    """
     return bool(state.log_density > -np.log(params.false_alarm))

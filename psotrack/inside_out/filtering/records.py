@@ -1,4 +1,4 @@
-"""What goes into the filter and what comes out of it: its parameters, measured poses, and estimates."""
+"""Input and output of the filter: its parameters, measured poses, and estimates."""
 
 from __future__ import annotations
 
@@ -13,15 +13,17 @@ from psotrack.inside_out.filtering.manifold import rotation_matrices
 
 @dataclass(frozen=True)
 class PoseFilterParams:
-    """What may be chosen of the filter.
+    """Parameters of the pose filter.
 
     Attributes:
-        false_alarm: probability with which a good pose is gated.
-        longest_gap_s: after so long without a pose that fits, none is told until there are poses again.
-        confirm: poses that must agree before the first is told, unless the markers of one of them agree beyond chance:
-            it is wrong less often than good poses are gated. 1 believes every start.
-        restart_after: poses in a row that agree with one another and not with the state, after which the state is
-            given up; fewer, where it rests on fewer itself, and on none whose markers agree beyond chance.
+        false_alarm: probability that a good pose is gated.
+        longest_gap_s: time without a fitting pose after which no pose is returned until poses are confirmed again,
+            seconds.
+        confirm: number of poses that must agree before the first pose is returned, unless the markers of one pose agree
+            so well that it is wrong less often than `false_alarm`. 1 accepts every first pose.
+        restart_after: number of successive poses that agree with one another and not with the state, after which they
+            replace the state. A state that rests on fewer poses needs fewer, unless the markers of one of its poses
+            agree beyond chance.
     """
 
     false_alarm: float = 1e-3
@@ -40,20 +42,20 @@ class PoseFilterParams:
                 raise SettingsError(name, expected="at least 1", found=f"{getattr(self, name)}")
 
     def within(self, num_frames: int | None) -> PoseFilterParams:
-        """The same for a recording of so many frames: where there are no more that could confirm a start, it counts."""
+        """Parameters for a recording of `num_frames` frames: `confirm` is at most this number. None is a stream."""
         return self if num_frames is None else replace(self, confirm=max(1, min(self.confirm, num_frames)))
 
 
 @dataclass(frozen=True)
 class MeasuredPose:
-    """What one frame says of a camera by itself.
+    """The pose of a camera from one frame alone.
 
     Attributes:
-        time_s: of the frame.
+        time_s: time of the frame, seconds.
         position_m, orientation_wxyz, ambiguity: as in `CameraPath`.
-        covariance: (6, 6), as there, without `common`.
-        common: (6, errors), what one standard deviation of each error that never changes does to the pose.
-        chance: probability at most that so many markers agree by chance.
+        covariance: (6, 6), as in `CameraPath`, without the part that `common` describes.
+        common: (6, errors), change of the pose by one standard deviation of each error that is the same in all frames.
+        chance: upper bound on the probability that as many markers agree by chance.
     """
 
     time_s: float
@@ -65,17 +67,17 @@ class MeasuredPose:
     chance: float = 1.0
 
     @property
-    def doubt(self) -> float:
-        """Probability at most that it is wrong, by itself."""
+    def p_wrong(self) -> float:
+        """Upper bound on the probability that the pose is wrong, from its frame alone."""
         return self.chance + self.ambiguity
 
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """A pose and how sure it is.
+    """An estimated pose with its velocity and covariance.
 
     Attributes:
-        position_m: (3,), the camera's centre, world.
+        position_m: (3,), the camera's centre, world, metres.
         orientation_wxyz: (4,), unit quaternion, camera to world.
         covariance: (6, 6), as in `CameraPath`.
         velocity_m_s: (3,), world.
@@ -88,5 +90,5 @@ class PoseEstimate:
 
     @property
     def R_world_cam(self) -> Float[np.ndarray, "3 3"]:
-        """(3, 3), camera to world."""
+        """(3, 3), rotation from camera to world."""
         return rotation_matrices(self.orientation_wxyz[None])[0]

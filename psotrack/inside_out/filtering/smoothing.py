@@ -16,10 +16,17 @@ from jaxtyping import Bool, Float, Int
 from psotrack.estimation import backward_step
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.filtering import motion as pose_motion
-from psotrack.inside_out.filtering.bank import LEVELS, right_pose
 from psotrack.inside_out.filtering.manifold import right_jacobian_inverse
 from psotrack.inside_out.filtering.motion import POSE, Levels, Motion
-from psotrack.inside_out.filtering.path_rows import PoseRow, lost, measured, path_of, rows_of, told_row
+from psotrack.inside_out.filtering.multiple_models import LEVELS, probability_right
+from psotrack.inside_out.filtering.path_rows import (
+    PoseRow,
+    estimated_row,
+    join_rows,
+    lost_row,
+    measured_pose,
+    split_path,
+)
 from psotrack.inside_out.filtering.pose_filter import FilterRun, confirmed, step
 from psotrack.inside_out.filtering.records import PoseEstimate, PoseFilterParams
 
@@ -88,8 +95,8 @@ def smooth(
     Gaps are bridged from both sides. A frame is lost if no used pose lies within `longest_gap_s` of it.
 
     Args:
-        path: raw poses, each estimated from its frame alone. Poses from `follow` already contain other frames, which
-            would then count twice.
+        path: raw poses, each estimated from its frame alone. Poses from `filter_path` already contain other frames,
+            which would then count twice.
         params: parameters of the filter; None for the defaults.
         model: what is known about the motion; None for `estimate_motion_model(path, params)`.
 
@@ -97,16 +104,16 @@ def smooth(
         InputError: a pose's covariance is not positive definite.
     """
     params = params or PoseFilterParams()
-    rows = rows_of(path)
+    rows = split_path(path)
     if not rows:
         return path
     model = model or estimate_motion_model(path, params)
-    smoothed = [lost(row, gated=row.has_pose) for row in rows]
+    smoothed = [lost_row(row, gated=row.has_pose) for row in rows]
     for span in _spans(path.time_s, model, params.longest_gap_s):
         poses = _smooth_span(rows, model, span)
         for k, pose in zip(range(span.start, span.stop), poses, strict=True):
-            smoothed[k] = told_row(rows[k], pose, float(model.ambiguity[k]), used=bool(model.fits[k]))
-    return path_of(smoothed)
+            smoothed[k] = estimated_row(rows[k], pose, float(model.ambiguity[k]), used=bool(model.fits[k]))
+    return join_rows(smoothed)
 
 
 def estimate_motion_model(path: CameraPath, params: PoseFilterParams) -> MotionModel:
@@ -119,7 +126,7 @@ def estimate_motion_model(path: CameraPath, params: PoseFilterParams) -> MotionM
     Raises:
         InputError: a pose's covariance is not positive definite.
     """
-    rows = rows_of(path)
+    rows = split_path(path)
     forward = _run_filter(rows, params)
     backward = _run_filter([replace(row, time_s=-row.time_s) for row in reversed(rows)], params)
     log_levels = (forward.log_levels + backward.log_levels[::-1]) / 2
@@ -144,14 +151,14 @@ def _run_filter(rows: Sequence[PoseRow], params: PoseFilterParams) -> _FilterFin
     latest = _mean_log_levels(_uniform_log_weights()), 0.0, np.nan
     for k, row in enumerate(rows):
         run, _ = step(run, row, params)
-        state, rival, recalled = run.state, run.overthrown, run.recalled
+        state, rival, recalled = run.state, run.adopted, run.restored
         if recalled is not None:
             # The filter went back to an earlier state, so the poses since then were wrong.
             fits[np.searchsorted(time_s, recalled.seen_s, side="right") : k] = False
         if state is not None:
             # The poses of a rival track were gated when they came.
             since = k if rival is None else int(np.searchsorted(time_s, rival.since_s))
-            jumped[since] |= rival is not None and not rival.goes_on
+            jumped[since] |= rival is not None and not rival.continuous
             if state.support == 1 or jumped[since]:
                 is_confirmed.append(False)
             track[since : k + 1], is_confirmed[-1] = len(is_confirmed) - 1, confirmed(run, params)
@@ -193,7 +200,7 @@ def _filter(rows: Sequence[PoseRow], model: MotionModel, span: slice) -> list[_F
     for k in range(span.start, span.stop):
         row = rows[k]
         levels = Levels(model.jerk_density_m2_s5[k : k + 1], model.wobble_density_rad2_s3[k : k + 1])
-        pose = measured(row)
+        pose = measured_pose(row)
         covariance = model.noise_scale[k] * pose.covariance
         if not frames:
             motion = pose_motion.initial_motion(
@@ -209,7 +216,7 @@ def _filter(rows: Sequence[PoseRow], model: MotionModel, span: slice) -> list[_F
             innovation = pose_motion.innovation(
                 predicted, pose.position_m, pose.orientation_wxyz, covariance, pose.common
             )
-            right = right_pose(innovation.pose[0], innovation.whole_covariance[0], pose.ambiguity)
+            right = probability_right(innovation.pose[0], innovation.whole_covariance[0], pose.ambiguity)
             motion = pose_motion.correct(predicted, innovation, right)
         frames.append(_FilteredFrame(predicted, F, pose_motion.process_noise(dt_s, levels), motion))
     return frames

@@ -1,4 +1,4 @@
-"""One drone: the path of its camera and the outside track of its middle, fused."""
+"""Fusion of one drone: the path of its camera and the outside track of its middle."""
 
 from __future__ import annotations
 
@@ -9,38 +9,43 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.inside_out.camera_path import CameraPath
-from psotrack.inside_out.fusing.error_models import CHI2_3_MEDIAN, expected_model, fitted
-from psotrack.inside_out.fusing.gating import gated
+from psotrack.inside_out.fusing.error_models import CHI2_3_MEDIAN, expected_model, fit_error_model
+from psotrack.inside_out.fusing.gating import gate_readings
 from psotrack.inside_out.fusing.joint_filter import INSIDE, OUTSIDE, Arm, ErrorModel, Joint, Readings, smooth
-from psotrack.inside_out.fusing.mounting import Mounted, mounted, robust_arm, swept_m2
+from psotrack.inside_out.fusing.resampling import (
+    ResampledPath,
+    arm_covariance_m2,
+    estimate_arm,
+    resample_path,
+)
 from psotrack.trajectories import Status
 
-#: The point of a drone whose track it is: the centre of its camera, or the middle of its silhouette.
+#: Tracked point of a drone: the centre of its camera, or the middle of its silhouette.
 Point = Literal["camera", "middle"]
 
-#: Over gaps of both sources a drone coasts so long, from either side; then it is lost.
+#: Longest time to the nearest frame with a source during which a drone coasts, seconds; beyond, it is lost.
 MAX_COASTING_S = 0.5
-#: Beforehand an arm is no longer than a drone, along each axis.
+#: Prior standard deviation of an arm along each axis, metres: the size of a drone.
 _ARM_STD_M = 0.3
-#: No arm is known better beforehand than this: the silhouette's middle wanders about in the body.
+#: Smallest prior standard deviation of an arm, metres: the silhouette's middle moves in the body.
 _LEAST_ARM_STD_M = 0.01
-#: Standard errors of the arm that is found first; nobody knows how the rest is distributed.
+#: Standard deviation of the first estimate of the arm, in its standard errors; the distribution is not known.
 _ARM_ERRORS = 3.0
-#: Kept on every stated variance, m2: no pose is known to a hundredth of a millimetre.
+#: Smallest part of every stated variance, m2: no pose is known to a hundredth of a millimetre.
 _LEAST_M2 = 1e-10
-#: Sources that never differ at all are no better than this part of what they state, as a variance.
+#: Smallest scale of stated variances, for sources that never differ at all.
 _LEAST_SCALE = 1e-6
 
 
 @dataclass(frozen=True)
-class Errors:
-    """How one source errs, as the differences between the two tell.
+class SourceErrors:
+    """Error model of one source, estimated from the differences between the two sources.
 
     Attributes:
-        scale: its standard deviations are so many times what it states.
-        lasting_share: of the variance, what lasts over frames.
-        lasting_s: after which 1 / e of such an error is left.
-        gated: frames in which it was grossly off and did not count.
+        scale: standard deviation of its errors divided by the stated one.
+        lasting_share: share of the variance that lasts over several frames.
+        lasting_s: time in which such an error decays to 1 / e, seconds.
+        gated: number of frames in which it was grossly wrong and was not used.
     """
 
     scale: float
@@ -51,7 +56,7 @@ class Errors:
 
 @dataclass(frozen=True)
 class DroneTrack:
-    """One drone over frames; NaN where nothing is known.
+    """Track of one drone; NaN where unknown.
 
     Attributes:
         position_m, velocity_m_s: (frames, 3), world.
@@ -71,19 +76,19 @@ class DroneTrack:
 
 @dataclass(frozen=True)
 class DroneFusion:
-    """A fused drone, and what was found on the way.
+    """A fused drone, with its arm and error models.
 
     Attributes:
-        track: of the drone.
+        track: track of the drone.
         arm_m, arm_std_m: (3,), from the camera's centre to the middle, in the camera's axes, and standard errors.
-        inside, outside: how each source errs.
+        inside, outside: error models of the sources.
     """
 
     track: DroneTrack
     arm_m: Float[np.ndarray, "3"]
     arm_std_m: Float[np.ndarray, "3"]
-    inside: Errors
-    outside: Errors
+    inside: SourceErrors
+    outside: SourceErrors
 
 
 def fuse_drone(
@@ -95,18 +100,18 @@ def fuse_drone(
     middle_covariance_m2: Float[np.ndarray, "frames 3 3"],
     point: Point,
 ) -> DroneFusion:
-    """Fuse a path and an outside track, which have frames in common.
+    """Fuse a path and an outside track that have frames in common.
 
     Args:
-        path: of the camera, by its own clock.
-        frame, time_s: (frames,), numbers and times by the clock of the outside tracks.
-        clock_s: the path at t + clock_s belongs to the frame at t.
-        middle_m: (frames, 3), NaN where the track is not tracked.
-        middle_covariance_m2: (frames, 3, 3), of that.
-        point: whose track it is to be.
+        path: path of the camera, by its own clock.
+        frame, time_s: (frames,), numbers and times by the clock of the outside tracks, seconds.
+        clock_s: the path at t + clock_s belongs to the frame at t, seconds.
+        middle_m: (frames, 3), positions of the track; NaN where it is not tracked.
+        middle_covariance_m2: (frames, 3, 3), covariances of `middle_m`.
+        point: tracked point of the result.
     """
-    camera = mounted(path, time_s, clock_s)
-    arm_m, arm_error_m = robust_arm(camera, middle_m, frame)
+    camera = resample_path(path, time_s, clock_s)
+    arm_m, arm_error_m = estimate_arm(camera, middle_m, frame)
     near = Arm(
         arm_m, max(_ARM_ERRORS * arm_error_m, _LEAST_ARM_STD_M) if np.isfinite(arm_error_m) else _ARM_STD_M
     )
@@ -114,17 +119,17 @@ def fuse_drone(
     middle = middle_m, middle_covariance_m2
     readings = _readings(path, camera, time_s, *middle, arm_m, point)
     expected = expected_model(_excess(_difference_m(camera, middle_m, arm_m), readings))
-    out, added_m2 = gated(readings, expected, near)
+    out, added_m2 = gate_readings(readings, expected, near)
     gross = out[:, INSIDE].copy()
     if gross.any():
-        # A gross pose turns the arm wrongly as well: its turn is between its neighbours'.
-        camera = mounted(_without(path, camera.index[gross]), time_s, clock_s)
+        # The orientation of a gross pose is wrong too: take it from the neighbouring poses.
+        camera = resample_path(_without(path, camera.index[gross]), time_s, clock_s)
         readings = _readings(path, camera, time_s, *middle, arm_m, point)
-        out, added_m2 = gated(readings, expected, near)
+        out, added_m2 = gate_readings(readings, expected, near)
     difference_m = _difference_m(camera, middle_m, arm_m)
-    covariance_m2, model = fitted(_used(readings, out, added_m2), difference_m, open_arm)
+    covariance_m2, model = fit_error_model(_used(readings, out, added_m2), difference_m, open_arm)
     readings = replace(readings, covariance_m2=covariance_m2)
-    out, added_m2 = gated(readings, model, near)
+    out, added_m2 = gate_readings(readings, model, near)
     joint = smooth(_used(readings, out, added_m2), model, open_arm)
     used = readings.known & ~out
     out[:, INSIDE] |= gross
@@ -132,20 +137,20 @@ def fuse_drone(
         track=_track(joint, path, camera, time_s, used),
         arm_m=joint.arm_m,
         arm_std_m=np.sqrt(np.diag(joint.arm_covariance_m2)),
-        inside=_errors(model, INSIDE, out),
-        outside=_errors(model, OUTSIDE, out),
+        inside=_source_errors(model, INSIDE, out),
+        outside=_source_errors(model, OUTSIDE, out),
     )
 
 
 def path_alone(path: CameraPath, time_s: Float[np.ndarray, "frames"], clock_s: float) -> DroneTrack:
-    """A path as it is, at its samples that are nearest to the frames."""
-    camera = mounted(path, time_s, clock_s, coasting=True)
+    """A path as it is, at its samples nearest to the frames."""
+    camera = resample_path(path, time_s, clock_s, coasting=True)
     known = camera.index >= 0
 
     def rows(values: Float[np.ndarray, "samples *rest"]) -> Float[np.ndarray, "frames *rest"]:
-        picked = values[camera.index].astype(np.float64)
-        picked[~known] = np.nan
-        return picked
+        chosen = values[camera.index].astype(np.float64)
+        chosen[~known] = np.nan
+        return chosen
 
     velocity_m_s = np.full_like(path.position_m, np.nan) if path.velocity_m_s is None else path.velocity_m_s
     status = np.where(known, path.status[camera.index], int(Status.LOST))
@@ -161,7 +166,7 @@ def path_alone(path: CameraPath, time_s: Float[np.ndarray, "frames"], clock_s: f
 
 def _readings(
     path: CameraPath,
-    camera: Mounted,
+    camera: ResampledPath,
     time_s: Float[np.ndarray, "frames"],
     middle_m: Float[np.ndarray, "frames 3"],
     middle_covariance_m2: Float[np.ndarray, "frames 3 3"],
@@ -173,10 +178,10 @@ def _readings(
     covariance_m2 = np.stack([path.covariance[camera.index, :3, :3], middle_covariance_m2], axis=1)
     covariance_m2 = np.where(known[..., None, None], covariance_m2, np.eye(3)) + _LEAST_M2 * np.eye(3)
     lever, added_m2 = np.zeros(covariance_m2.shape), np.zeros(covariance_m2.shape)
-    # The one that is not of the point has the arm between it and the point, and what the turn does not tell of it.
+    # The source of the other point includes the arm, and the part of its uncertainty that is due to the orientation.
     of_arm, sign = (OUTSIDE, 1.0) if point == "camera" else (INSIDE, -1.0)
     lever[:, of_arm] = sign * camera.rotation
-    added_m2[:, of_arm] = swept_m2(camera, arm_m)
+    added_m2[:, of_arm] = arm_covariance_m2(camera, arm_m)
     return Readings(
         time_s=time_s,
         position_m=np.where(known[..., None], position_m, 0.0),
@@ -189,14 +194,14 @@ def _readings(
 
 
 def _difference_m(
-    camera: Mounted, middle_m: Float[np.ndarray, "frames 3"], arm_m: Float[np.ndarray, "3"]
+    camera: ResampledPath, middle_m: Float[np.ndarray, "frames 3"], arm_m: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "frames 3"]:
-    """(frames, 3), the outside less the inside and the arm; NaN where either is not known."""
+    """(frames, 3), position by the outside less that by inside and arm; NaN where either is unknown."""
     return middle_m - camera.position_m - camera.rotation @ arm_m
 
 
 def _excess(difference_m: Float[np.ndarray, "frames 3"], readings: Readings) -> float:
-    """By how much the squared differences exceed the stated variances, in the median."""
+    """Median of the squared differences, divided by its expectation from the stated variances."""
     both = np.isfinite(difference_m).all(axis=1) & readings.known.all(axis=1)
     if not both.any():
         return 1.0
@@ -218,9 +223,9 @@ def _without(path: CameraPath, rows: Int[np.ndarray, "rows"]) -> CameraPath:
     return replace(path, status=status)
 
 
-def _errors(model: ErrorModel, source: int, out: Bool[np.ndarray, "frames 2"]) -> Errors:
+def _source_errors(model: ErrorModel, source: int, out: Bool[np.ndarray, "frames 2"]) -> SourceErrors:
     white, lasting = float(model.white[0, source]), float(model.lasting[0, source])
-    return Errors(
+    return SourceErrors(
         scale=float(np.sqrt(white + lasting)),
         lasting_share=lasting / (white + lasting),
         lasting_s=float(model.time_s[0, source]),
@@ -231,11 +236,11 @@ def _errors(model: ErrorModel, source: int, out: Bool[np.ndarray, "frames 2"]) -
 def _track(
     joint: Joint,
     path: CameraPath,
-    camera: Mounted,
+    camera: ResampledPath,
     time_s: Float[np.ndarray, "frames"],
     used: Bool[np.ndarray, "frames 2"],
 ) -> DroneTrack:
-    """The fused drone; lost, and unknown, where neither source says anything for long."""
+    """The fused drone; lost, with NaN, where neither source has a reading for too long."""
     tracked = used.any(axis=1)
     seen_s = time_s[tracked]
     after = np.clip(np.searchsorted(seen_s, time_s), 1, max(len(seen_s) - 1, 1))
@@ -245,7 +250,7 @@ def _track(
     lost = nearest_s > MAX_COASTING_S
     status = np.where(tracked, int(Status.TRACKED), np.where(lost, int(Status.LOST), int(Status.COASTING)))
     orientation_wxyz = np.full((len(time_s), 4), np.nan)
-    orientation_wxyz[camera.turned] = camera.orientation_wxyz[camera.turned]
+    orientation_wxyz[camera.has_orientation] = camera.orientation_wxyz[camera.has_orientation]
     return DroneTrack(
         position_m=np.where(lost[:, None], np.nan, joint.position_m),
         velocity_m_s=np.where(lost[:, None], np.nan, joint.velocity_m_s),

@@ -1,9 +1,9 @@
-"""How two sources of positions err, from what they say: the scales of their covariances, and for how long.
+"""Error models of two sources of positions: scales of their stated covariances, and how long their errors last.
 
-What a source states of its own errors may be too little or too much, and says nothing of how long they last. The two
-share no error, so that what they differ by has the sum of their variances and no motion in it, and how it changes over
-time tells how long errors last. What is new in every frame is each source's own scatter. How smooth a track is tells
-nothing else: a smoother's output is smooth, right or wrong.
+The covariances that a source states may be too small or too large, and do not say how long errors last. The two sources
+share no errors. Their difference therefore contains no motion, has the sum of their variances, and its change over
+time shows how long errors last. Noise that is new in every frame is estimated from each source's own scatter. The
+smoothness of a track shows nothing else: the output of a smoother is smooth, whether right or wrong.
 """
 
 from __future__ import annotations
@@ -24,34 +24,35 @@ from psotrack.inside_out.fusing.joint_filter import (
     select_frames,
 )
 
-#: Half of all draws from the chi-square distribution with 3 degrees of freedom are below this.
+#: Median of the chi-square distribution with 3 degrees of freedom.
 CHI2_3_MEDIAN = 2.0 * float(gammaincinv(3 / 2, 0.5))
 
-#: So many frames tell how quickly the drone changes its acceleration; more only take longer.
+#: Number of frames from which the jerk density is estimated; more frames only take longer.
 _MOST_FRAMES = 500
-#: Decades of its density that are tried; then as many about the best, so far apart.
+#: Decimal logarithms of the jerk densities that are tried first, and the steps of the same number of values about the
+#: best one.
 _JERK_DECADES, _FINER = np.arange(-3.0, 6.0), 0.25
-#: What is expected before anything is read: half of each variance lasts so long, and a drone of this jerk.
+#: Values before any estimation: share of the variance that lasts, its duration (s), and the drone's jerk density.
 _LASTING, _LASTING_S, _JERK_M2_S5 = 0.5, 0.4, 10.0
-#: Errors last between these, and less than so much of both sources does not tell how long.
-_LEAST_S, _MOST_S, _TELLING_S = 0.1, 5.0, 2.0
-#: Factors on both stated variances may be e to any of the first. Their ratio is e to the second, or, where a source
-#: shows its own scatter, to the third. As standard deviations: the differences tell the sum of the variances.
+#: Shortest and longest duration of errors, and the time with both sources that is needed to estimate it, seconds.
+_LEAST_S, _MOST_S, _LEAST_BOTH_S = 0.1, 5.0, 2.0
+#: Prior standard deviations of logarithms: of the scale of both stated variances, of the ratio of the two scales, and
+#: of this ratio where a source shows its own scatter. The differences determine only the sum of the variances.
 _BOTH_PRIOR, _RATIO_PRIOR, _RATIO_SHOWN_PRIOR = 3.0, 0.5, 2.0
-#: At least this share of a variance lasts, and this much of a stated one is new: there is no source without either.
+#: Smallest ratio of the lasting to the new variance, and smallest new share of a stated variance.
 _LEAST_LASTING, _LEAST_WHITE = 0.1, 1e-6
-#: Weights of fifth differences, in which there is hardly any motion.
+#: Weights of fifth differences, which contain hardly any motion.
 _FIFTH = np.array([-1.0, 5.0, -10.0, 10.0, -5.0, 1.0])
-#: A source whose frames are independent has errors that last about as large as those that do not, give or take a factor
-#: of e; but for one in e to this.
+#: A source with independent frames has lasting errors about as large as its new ones, within a factor of e; exceptions
+#: have the probability of e to the power of minus this.
 _SURPRISE = 4.0
-#: The differences count for the scales with this share of the frames that are independent: they tell the sum of the
-#: variances, and seem to tell more of its parts than they do, because stated covariances have wrong shapes as well.
+#: Share of the independent frames with which the differences count for the scales. The differences determine the sum of
+#: the variances and seem to determine its parts better than they do, because stated covariances have wrong shapes too.
 _TRUST = 0.25
 
 
 def expected_model(scale: float) -> ErrorModel:
-    """The model that is expected where variances are so many times what is stated."""
+    """The model before any estimation, with variances that are `scale` times the stated ones."""
     shares = np.full((1, 2), scale)
     return ErrorModel(
         white=(1 - _LASTING) * shares,
@@ -61,22 +62,25 @@ def expected_model(scale: float) -> ErrorModel:
     )
 
 
-def fitted(
+def fit_error_model(
     readings: Readings, difference_m: Float[np.ndarray, "frames 3"], arm: Arm
 ) -> tuple[Float[np.ndarray, "frames 2 3 3"], ErrorModel]:
-    """The stated covariances, as round as the errors really are, and the model of what they are multiplied with.
+    """Fit an error model, and correct the shape of the stated covariances.
 
     Args:
-        readings: of both sources, some of them in the same frames, without gross errors.
-        difference_m: (frames, 3), the outside less the inside at the same time, the arm taken out; NaN where either is
-            not known.
-        arm: what is known of it beforehand.
+        readings: readings of both sources, some of them in the same frames, without gross errors.
+        difference_m: (frames, 3), outside less inside at the same time, without the arm, metres; NaN where either is
+            unknown.
+        arm: prior of the arm.
+
+    Returns:
+        (frames, 2, 3, 3), stated covariances with corrected shapes, m²; and the model, whose scales refer to them.
     """
     both = np.asarray(readings.known.all(axis=1))
     apart_m = np.where(both[:, None], difference_m, np.nan)
     step_s = float(np.median(np.diff(readings.time_s)))
     time_s, rounder, white = _LASTING_S, readings, np.zeros(2)
-    # Twice, because how long errors last says how many frames the scales are from.
+    # Twice, because the duration of errors determines how many frames are independent for the scales.
     for _ in range(2):
         independent = min(1.0, step_s / (2 * time_s))
         least, own = np.array([_white(rounder, source) for source in (0, 1)]).T
@@ -85,14 +89,16 @@ def fitted(
         white = np.minimum(least, (1 - _LEAST_LASTING) * scales)
         time_s = _lasting_s(apart_m, rounder, scales, white, step_s)
     model = ErrorModel(white[None], (scales - white)[None], np.full((1, 2), time_s), np.array([_JERK_M2_S5]))
-    return rounder.covariance_m2, replace(model, jerk_density_m2_s5=_jerk(_telling(rounder), model, arm))
+    return rounder.covariance_m2, replace(
+        model, jerk_density_m2_s5=_jerk(_densest_stretch(rounder), model, arm)
+    )
 
 
 def _white(readings: Readings, source: int) -> tuple[float, float]:
-    """What is new in every frame, per stated variance, and how white a source's scatter is, from 0 to 1.
+    """Variance that is new in every frame, per stated variance, and the whiteness of a source's scatter, 0 to 1.
 
-    Fifth differences of white noise are as large between every second frame as between neighbours. Those of what a
-    filter put out are much larger.
+    Fifth differences of white noise are equally large between neighbouring and between every second frames. In the
+    output of a filter the latter are much larger.
     """
     near, far = (_scatter(readings, source, step) for step in (1, 2))
     if near is None or far is None:
@@ -101,17 +107,17 @@ def _white(readings: Readings, source: int) -> tuple[float, float]:
 
 
 def _scatter(readings: Readings, source: int, step: int) -> float | None:
-    """Squared fifth differences of frames so many apart, per what is expected of them; None without any."""
+    """Squared fifth differences of frames `step` apart, divided by their expected value; None without such frames."""
     known, time_s = readings.known[:, source], readings.time_s
     rows = np.arange(max(len(known) - 5 * step, 0))[:, None] + step * np.arange(6)
     steps_s = np.diff(time_s[rows], axis=1)
-    alike = (np.abs(steps_s - step * np.median(np.diff(time_s))) < 0.1 * steps_s).all(axis=1)
-    rows = rows[known[rows].all(axis=1) & alike]
+    evenly_spaced = (np.abs(steps_s - step * np.median(np.diff(time_s))) < 0.1 * steps_s).all(axis=1)
+    rows = rows[known[rows].all(axis=1) & evenly_spaced]
     if not len(rows):
         return None
     fifth_m = np.einsum("r,fri->fi", _FIFTH, readings.position_m[rows, source])
     variance_m2 = np.einsum("r,frij->fij", _FIFTH**2, readings.covariance_m2[rows, source])
-    # No track is exact.
+    # A lower limit, because no track is exact.
     return max(float(np.median(_normalised(fifth_m, variance_m2))) / CHI2_3_MEDIAN, _LEAST_WHITE)
 
 
@@ -122,9 +128,9 @@ def _scales(
     whiteness: Float[np.ndarray, "2"],
     independent: float,
 ) -> tuple[Float[np.ndarray, "2"], float]:
-    """(2,), factors on the stated variances, none less than what is white, and the outside's roundness.
+    """(2,), factors on the stated variances, none less than the new variance; and the roundness of the outside's.
 
-    The most plausible for the differences, with what is expected beforehand.
+    They maximise the posterior density, given the differences.
     """
     both = np.isfinite(apart_m).all(axis=1)
     stated_m2 = readings.covariance_m2[both]
@@ -141,7 +147,7 @@ def _scales(
         return float(_TRUST * independent * misfit.sum() + prior) / 2
 
     bounds = [*((low, max(low, 0.0) + 10.0) for low in least), (0.0, 1.0)]
-    # There may be two minima: one where a source is as good as its scatter says, one where it is as it states.
+    # There may be two minima: one where a source is as good as its scatter, one where it is as good as it states.
     begins = (np.maximum(least, 0.0), np.array([least[0] + np.log(2), max(least[1], 0.0)]))
     found = [minimize(cost, [*begin, 0.1], method="L-BFGS-B", bounds=bounds) for begin in begins]
     best = min(found, key=lambda one: one.fun).x
@@ -151,10 +157,10 @@ def _scales(
 def _rounded(
     covariance_m2: Float[np.ndarray, "frames 2 3 3"], roundness: float
 ) -> Float[np.ndarray, "frames 2 3 3"]:
-    """The covariances, of the outside's of which such a share is the same along all axes.
+    """The covariances, of which a share (`roundness`) of the outside's is made equal along all axes.
 
-    Rays that cross well say that a point is known well, but not what the middle of a silhouette is of the body. A pose
-    from points of known place has no such error.
+    Rays that cross well determine a point well, but the point is the middle of a silhouette, which moves in the body. A
+    pose from markers of known position has no such error.
     """
     rounded_m2 = covariance_m2.copy()
     mean_m2 = np.trace(covariance_m2[:, OUTSIDE], axis1=1, axis2=2)[:, None, None] / 3
@@ -169,7 +175,7 @@ def _lasting_s(
     white: Float[np.ndarray, "2"],
     step_s: float,
 ) -> float:
-    """After which 1 / e of what lasts of the differences is left, by their autocorrelation."""
+    """Time in which the lasting part of the differences decays to 1 / e, seconds, by their autocorrelation."""
     S = np.einsum("s,fsij->fij", scales, readings.covariance_m2)
     whitened = np.linalg.solve(np.linalg.cholesky(S), apart_m[..., None])[..., 0]
     of_white = np.linalg.solve(S, np.einsum("s,fsij->fij", white, readings.covariance_m2))
@@ -177,7 +183,7 @@ def _lasting_s(
     both = np.asarray(np.isfinite(whitened).all(axis=1))
     whitened[~both] = 0.0
     power = float((whitened**2).sum()) / max(int(both.sum()), 1)
-    if both.sum() * step_s < _TELLING_S or power == 0:
+    if both.sum() * step_s < _LEAST_BOTH_S or power == 0:
         return _LASTING_S
     most = min(round(_MOST_S / step_s), len(both) // 2)
     before = 1.0
@@ -185,8 +191,8 @@ def _lasting_s(
         pairs = int((both[lag:] & both[:-lag]).sum())
         if not pairs:
             continue
-        alike = (whitened[lag:] * whitened[:-lag]).sum() / pairs
-        now = float(alike) / power / lasting
+        correlation = (whitened[lag:] * whitened[:-lag]).sum() / pairs
+        now = float(correlation) / power / lasting
         if now < np.exp(-1):
             part = (before - np.exp(-1)) / (before - now)
             return float(np.clip((lag - 1 + part) * step_s, _LEAST_S, _MOST_S))
@@ -195,7 +201,7 @@ def _lasting_s(
 
 
 def _jerk(readings: Readings, model: ErrorModel, arm: Arm) -> Float[np.ndarray, "1"]:
-    """The jerk density under which the readings are the most plausible, everything else being known."""
+    """The jerk density that maximises the likelihood of the readings, with everything else known."""
 
     def scores(decades: Float[np.ndarray, "tried"]) -> Float[np.ndarray, "tried"]:
         parts = {
@@ -215,9 +221,9 @@ def _normalised(
     return np.einsum("ri,ri->r", vectors, np.linalg.solve(covariance, vectors[..., None])[..., 0])
 
 
-def _telling(readings: Readings) -> Readings:
+def _densest_stretch(readings: Readings) -> Readings:
     """The stretch of frames with the most readings."""
-    spoken = np.cumsum(np.pad(readings.known.sum(axis=1), (1, 0)))
+    readings_before = np.cumsum(np.pad(readings.known.sum(axis=1), (1, 0)))
     length = min(_MOST_FRAMES, len(readings.time_s))
-    begin = int(np.argmax(spoken[length:] - spoken[: len(spoken) - length]))
+    begin = int(np.argmax(readings_before[length:] - readings_before[: len(readings_before) - length]))
     return select_frames(readings, slice(begin, begin + length))

@@ -1,8 +1,8 @@
-"""Inside-out and outside-in fused: one track of each drone from its own camera's path and the static cameras' tracks.
+"""Fusion of inside-out and outside-in: one track per drone from its own camera's path and the static cameras' tracks.
 
-Each source counts as its covariance says, with a scale that the differences between the two tell; errors that last over
-frames count once, not once per frame. Where one source is missing the other goes on alone, from where both were. Where
-they are grossly apart, the one that fits the motion is believed.
+Each source is weighted by its covariance, with a scale that is estimated from the differences between the two. Errors
+that last over several frames are modelled as such. Where one source is missing, the other continues alone. Where the
+two differ grossly, the source that fits the motion is used.
 """
 
 from __future__ import annotations
@@ -17,25 +17,26 @@ from psotrack.clocks import Offset, find_offset
 from psotrack.errors import InputError
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.fusing.drone_fusion import DroneFusion, DroneTrack, Point, fuse_drone, path_alone
-from psotrack.inside_out.fusing.mounting import Mounted, mounted, robust_arm
-from psotrack.inside_out.fusing.outside_tracks import OutsideTracks, picked, spread
-from psotrack.inside_out.fusing.pairing import Pairing, paired
+from psotrack.inside_out.fusing.outside_tracks import OutsideTracks, align_tracks, select_track
+from psotrack.inside_out.fusing.pairing import Pairing, pair_tracks
+from psotrack.inside_out.fusing.resampling import ResampledPath, estimate_arm, resample_path
 from psotrack.trajectories import GATE_M, UNASSIGNED, Status, Trajectories
 
-#: Within so much of where its middle is expected, or four times as far as is usual, a track may be of a drone.
+#: Smallest distance, metres, and multiple of the usual distance, from the expected middle of a drone, within which a
+#: track may belong to the drone.
 _LEAST_REACH_M, _FAR = 0.1, 4.0
 
 
 @dataclass(frozen=True)
 class FusedDrone:
-    """What the fusion found of one drone that carries a camera.
+    """Result of the fusion for one drone that carries a camera.
 
     Attributes:
-        name: of the drone.
-        tracks: names of the outside tracks that are of it, in the order of time; empty where none is.
-        offset: of the camera's clock, where it was sought.
-        frames_both, frames_inside, frames_outside: frames in which both, or one alone, were used.
-        fusion: the arm, and how each source errs; None without a track.
+        name: name of the drone.
+        tracks: names of the outside tracks that belong to it, in the order of time; empty where there are none.
+        offset: offset of the camera's clock; None if it was not estimated.
+        frames_both, frames_inside, frames_outside: number of frames in which both sources, or only one, were used.
+        fusion: arm and error models; None without a track.
     """
 
     name: str
@@ -48,8 +49,8 @@ class FusedDrone:
 
 
 @dataclass(frozen=True)
-class Exchange:
-    """From this frame on, a drone's outside track is another one: `before` and `after` are their names."""
+class IdentitySwap:
+    """A frame from which on a drone has another outside track; `before` and `after` are the tracks' names."""
 
     drone: str
     frame: int
@@ -58,21 +59,22 @@ class Exchange:
 
 
 @dataclass(frozen=True)
-class Fused:
-    """Drones that carry cameras, fused, and after them the outside tracks of others, as they are.
+class FusedTracks:
+    """FusedTracks tracks of drones that carry cameras, followed by the outside tracks of all other drones.
 
     Attributes:
-        trajectories: of the frames of both, by the clock of the outside tracks. Orientations are the cameras'.
-        point: of the fused drones. Paths without a track are of the camera, tracks without a path of the middle.
-        drones: one for each path.
-        exchanges: of outside tracks between drones, mended.
+        trajectories: at the frames of both sources, by the clock of the outside tracks. Orientations are the cameras'.
+        point: tracked point of the fused drones. Paths without a track are of the camera, tracks without a path of the
+            middle.
+        drones: results for the drones that carry cameras, one per path.
+        identity_swaps: swaps of outside tracks between drones; the fused tracks are without them.
         source: (frames, drones), 1 where the inside was used, 2 where the outside was, 3 where both were, else 0.
     """
 
     trajectories: Trajectories
     point: Point
     drones: tuple[FusedDrone, ...]
-    exchanges: tuple[Exchange, ...]
+    identity_swaps: tuple[IdentitySwap, ...]
     source: Int[np.ndarray, "frames drones"]
 
 
@@ -82,23 +84,24 @@ def fuse(
     *,
     point: Point = "camera",
     max_offset_s: float | None = None,
-) -> Fused:
+) -> FusedTracks:
     """Fuse the paths of on-board cameras with the tracks that static cameras have of the same drones.
 
-    Tracks may have any names: each path is assigned the track that is with it, piece by piece, so that tracks that
-    were exchanged are put right. The arm between the camera's centre and the middle that the tracks are of is found
-    from both, constant in the camera's axes, and so are the scales of both covariances. A path without a track and a
-    track without a path are kept as they are. Only what either tracks counts: what is coasting or lost does not.
+    Names of tracks do not matter: each path is assigned the track near it, piece by piece, so that identity swaps are
+    resolved. The arm between the camera's centre and the middle of the silhouette, constant in the camera's axes, is
+    estimated, and so are the scales of both covariances. A path without a track and a track without a path are kept as
+    they are. Only tracked poses and positions are used, neither coasting nor lost ones.
 
     Args:
-        inside: the paths, by the names of their drones; one alone is called `drone`.
-        outside: the tracks, of the middles of silhouettes; covariances may be missing.
-        point: what the fused tracks are of. The camera's centre is where the markers say; the middle is the point
-            that static cameras see, a property of the silhouettes.
-        max_offset_s: find by how much each camera's clock is ahead of the tracks', from minus this to this.
+        inside: paths by the names of their drones; a single path is called `drone`.
+        outside: tracks of the middles of silhouettes; covariances are optional.
+        point: tracked point of the result: the camera's centre, which the markers define, or the middle of the
+            silhouette, which static cameras see.
+        max_offset_s: estimate how much each camera's clock is ahead of the tracks' clock, from minus this to this,
+            seconds; None for equal clocks.
 
     Raises:
-        InputError: there is nothing to fuse, or an offset is sought and the motion does not tell it.
+        InputError: there is nothing to fuse, or the motion does not determine a clock offset.
     """
     paths = {"drone": inside} if isinstance(inside, CameraPath) else dict(inside)
     if not any(path.seen.any() for path in paths.values()):
@@ -107,17 +110,19 @@ def fuse(
         raise InputError("outside tracks", expected="a position in at least one frame", found="none")
     offsets = {name: _offset(name, path, outside, max_offset_s) for name, path in paths.items()}
     clocks_s = {name: 0.0 if offset is None else offset.offset_s for name, offset in offsets.items()}
-    tracks_in = spread(outside, (path.time_s[path.seen] - clocks_s[name] for name, path in paths.items()))
+    tracks_in = align_tracks(
+        outside, (path.time_s[path.seen] - clocks_s[name] for name, path in paths.items())
+    )
     frame, time_s = tracks_in.frame, tracks_in.time_s
-    cameras = [mounted(path, time_s, clocks_s[name]) for name, path in paths.items()]
-    pairing = _paired(frame, cameras, tracks_in.tracked_m)
+    cameras = [resample_path(path, time_s, clocks_s[name]) for name, path in paths.items()]
+    pairing = _pair(frame, cameras, tracks_in.tracked_m)
     tracks: dict[str, DroneTrack] = {}
     drones = []
     for (name, path), theirs in zip(paths.items(), pairing.track.T, strict=True):
         names = tuple(dict.fromkeys(outside.drones[k] for k in theirs if k != UNASSIGNED))
         found = None
         if names:
-            own = picked(tracks_in.tracked_m, theirs), picked(tracks_in.covariance_m2, theirs)
+            own = select_track(tracks_in.tracked_m, theirs), select_track(tracks_in.covariance_m2, theirs)
             found = fuse_drone(path, frame, time_s, clocks_s[name], *own, point)
         tracks[name] = path_alone(path, time_s, clocks_s[name]) if found is None else found.track
         both, one, other = (int((_source(tracks[name]) == source).sum()) for source in (3, 1, 2))
@@ -126,13 +131,18 @@ def fuse(
         track = _track_alone(tracks_in, theirs)
         if track.used.any():
             tracks[_new_name(name, tracks)] = track
-    return Fused(
+    return FusedTracks(
         trajectories=_together(tracks_in, tracks),
         point=point,
         drones=tuple(drones),
-        exchanges=tuple(
-            Exchange(drones[of.drone].name, of.frame, outside.drones[of.before], outside.drones[of.after])
-            for of in pairing.changes
+        identity_swaps=tuple(
+            IdentitySwap(
+                drones[change.drone].name,
+                change.frame,
+                outside.drones[change.before],
+                outside.drones[change.after],
+            )
+            for change in pairing.changes
         ),
         source=np.stack([_source(track) for track in tracks.values()], axis=1),
     )
@@ -150,21 +160,23 @@ def _offset(name: str, path: CameraPath, outside: Trajectories, max_offset_s: fl
         raise InputError(f"the clock of {name}", expected="an offset", found=f"none ({error})") from error
 
 
-def _paired(
-    frame: Int[np.ndarray, "frames"], cameras: list[Mounted], middle_m: Float[np.ndarray, "frames tracks 3"]
+def _pair(
+    frame: Int[np.ndarray, "frames"],
+    cameras: list[ResampledPath],
+    middle_m: Float[np.ndarray, "frames tracks 3"],
 ) -> Pairing:
-    """Who is who: first by the cameras themselves, then by where each, with its arm, expects its drone's middle."""
+    """Pair tracks with paths, first by the cameras' positions, then by the middles expected from each camera's arm."""
     expected_m = np.stack([camera.position_m for camera in cameras], axis=1)
     reach_m = np.full(len(cameras), GATE_M)
-    pairing = paired(frame, expected_m, reach_m, middle_m)
+    pairing = pair_tracks(frame, expected_m, reach_m, middle_m)
     for index, camera in enumerate(cameras):
-        own_m = picked(middle_m, pairing.track[:, index])
-        arm_m, _ = robust_arm(camera, own_m, frame)
+        own_m = select_track(middle_m, pairing.track[:, index])
+        arm_m, _ = estimate_arm(camera, own_m, frame)
         expected_m[:, index] += camera.rotation @ arm_m
         off_m = np.linalg.norm(own_m - expected_m[:, index], axis=1)
         if np.isfinite(off_m).any():
             reach_m[index] = np.clip(_FAR * np.nanmedian(off_m), _LEAST_REACH_M, GATE_M)
-    return paired(frame, expected_m, reach_m, middle_m)
+    return pair_tracks(frame, expected_m, reach_m, middle_m)
 
 
 def _track_alone(outside: OutsideTracks, track: Int[np.ndarray, "frames"]) -> DroneTrack:
@@ -172,9 +184,9 @@ def _track_alone(outside: OutsideTracks, track: Int[np.ndarray, "frames"]) -> Dr
     own = outside.status[np.arange(len(track)), track]
     status = np.where(track == UNASSIGNED, int(Status.LOST), own)
     return DroneTrack(
-        position_m=picked(outside.position_m, track),
-        velocity_m_s=picked(outside.velocity_m_s, track),
-        covariance_m2=picked(outside.covariance_m2, track),
+        position_m=select_track(outside.position_m, track),
+        velocity_m_s=select_track(outside.velocity_m_s, track),
+        covariance_m2=select_track(outside.covariance_m2, track),
         orientation_wxyz=np.full((len(track), 4), np.nan),
         status=status,
         used=np.stack([np.zeros(len(track), bool), status == Status.TRACKED], axis=1),

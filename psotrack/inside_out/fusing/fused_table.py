@@ -7,24 +7,25 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from psotrack.inside_out.fusing.fused import Fused
+from psotrack.inside_out.fusing.fused import FusedTracks
 from psotrack.support import refuse_to_overwrite, write_rows
 from psotrack.trajectories import Status
 
-#: What `Fused.source` means.
+#: Words for the values of `FusedTracks.source`.
 SOURCES = ("none", "inside", "outside", "both")
 
 
-def write_fused(path: Path, fused: Fused, *, force: bool = False) -> None:
-    """Write a CSV with one row per frame and drone; what is not known is an empty field.
+def write_fused(path: Path | str, fused: FusedTracks, *, force: bool = False) -> None:
+    """Write a CSV with one row per frame and drone; values that are not known are empty fields.
 
     Columns: `frame`, `time_s`, `drone`, `x_m` to `z_m`, `vx_m_s` to `vz_m_s`, `qw` to `qz` (camera to world), `cov_xx`
     to `cov_zz` (the upper triangle), `source` (both, inside, outside or none), `status`. Every command that reads
-    tracks reads it.
+    tracks reads the table.
 
     Raises:
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
+    path = Path(path)
     refuse_to_overwrite(path, force)
     tracks = fused.trajectories
     shape = (tracks.num_frames, tracks.num_drones)

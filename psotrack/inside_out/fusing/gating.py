@@ -1,4 +1,4 @@
-"""Which positions of two sources are gross errors, judged by the motion."""
+"""Gross errors of two sources of positions, detected by their differences and by the motion."""
 
 from __future__ import annotations
 
@@ -22,39 +22,40 @@ from psotrack.inside_out.fusing.joint_filter import (
     update,
 )
 
-#: The chi-square distribution with 3 degrees of freedom exceeds this once in a million: five standard deviations.
+#: Gate of squared normalised errors: chi-square with 3 degrees of freedom exceeds it with probability 1e-6.
 GATE = 2.0 * float(gammaincinv(3 / 2, 1 - 1e-6))
 
 _Observation = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
-def gated(
+def gate_readings(
     readings: Readings, model: ErrorModel, arm: Arm
 ) -> tuple[Bool[np.ndarray, "frames 2"], Float[np.ndarray, "frames 2 3 3"]]:
-    """Which readings to leave out as gross errors, and what covariance to add to others, under one model.
+    """Gross errors among readings, and covariances to add to single readings, under one error model.
 
-    Where both sources speak and do not fit each other, the one that fits the motion less is left out. Two that fit each
-    other are right whatever the motion says. One that is alone and does not fit the motion gets a larger covariance,
-    with which it would be just at the gate: a drone that did jump is followed, a wild reading hardly.
+    Where both sources have a reading and the two contradict each other, the reading that fits the motion less is left
+    out. Two readings that agree are used, whatever the motion predicts. A single reading that does not fit the motion
+    gets a larger covariance, with which it lies exactly at the gate: a drone that really jumped is followed, and a
+    gross error has little effect.
 
-    It begins where the two first fit each other, and goes from there to the end, and to the beginning.
+    Gating begins where the two sources first agree, and goes from there to the end and to the beginning.
 
     Returns:
-        (frames, 2), left out; (frames, 2, 3, 3), to be added.
+        (frames, 2), whether a reading is left out; (frames, 2, 3, 3), covariances to add, m².
     """
     first = _first_agreement(readings, model, arm)
     out = np.zeros(readings.known.shape, bool)
     added_m2 = np.zeros(readings.covariance_m2.shape)
-    out[first:], added_m2[first:] = _gated_onwards(select_frames(readings, slice(first, None)), model, arm)
+    out[first:], added_m2[first:] = _gate_onwards(select_frames(readings, slice(first, None)), model, arm)
     if first:
         back = select_frames(readings, slice(first, None, -1))
         back = replace(back, time_s=-back.time_s, ahead_s=-back.ahead_s)
-        out_back, added_back_m2 = _gated_onwards(back, model, arm)
+        out_back, added_back_m2 = _gate_onwards(back, model, arm)
         out[:first], added_m2[:first] = out_back[:0:-1], added_back_m2[:0:-1]
     return out, added_m2
 
 
-def _gated_onwards(
+def _gate_onwards(
     readings: Readings, model: ErrorModel, arm: Arm
 ) -> tuple[Bool[np.ndarray, "frames 2"], Float[np.ndarray, "frames 2 3 3"]]:
     roots = covariance_roots(readings)
@@ -85,7 +86,7 @@ def _gated_onwards(
 
 
 def _first_agreement(readings: Readings, model: ErrorModel, arm: Arm) -> int:
-    """The first frame in which both sources speak and fit each other, else the first in which any does."""
+    """The first frame in which both sources have readings that agree, else the first frame with any reading."""
     roots = covariance_roots(readings)
     for k in np.flatnonzero(readings.known.all(axis=1)):
         inside, outside = (observe(readings, model, roots, k, np.array([source])) for source in (0, 1))
@@ -96,8 +97,8 @@ def _first_agreement(readings: Readings, model: ErrorModel, arm: Arm) -> int:
 
 
 def _misfit(state: State, one: _Observation) -> float:
-    """Squared innovation of one source, normalised by its covariance: 3 on average."""
+    """Squared innovation of one source, normalised by its covariance; 3 is expected."""
     H, y, R = one
-    mean, spread = state
+    mean, covariance = state
     innovation = y - H[0] @ mean[0]
-    return float(innovation @ np.linalg.solve(H[0] @ spread[0] @ H[0].T + R[0], innovation))
+    return float(innovation @ np.linalg.solve(H[0] @ covariance[0] @ H[0].T + R[0], innovation))

@@ -1,4 +1,4 @@
-"""Tracks of static cameras, spread over all frames that they or the cameras on drones have."""
+"""Tracks of static cameras, at all frames of these tracks and of the cameras on drones."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from jaxtyping import Float, Int
 
 from psotrack.trajectories import UNASSIGNED, Status, Trajectories
 
-#: Tracks without covariances are taken to be as good as this along each axis; the scale is found.
+#: Standard deviation along each axis of tracks without covariances, metres; the fusion estimates its scale.
 _UNSTATED_M = 0.03
 
 
 @dataclass(frozen=True)
 class OutsideTracks:
-    """Tracks with all that they may lack, NaN and lost where there is none.
+    """Tracks with all optional values filled in: NaN where unknown, and `LOST` where there is no position.
 
     Attributes:
-        frame, time_s: (frames,), numbers and times.
+        frame, time_s: (frames,), numbers and times, seconds.
         position_m, velocity_m_s: (frames, tracks, 3), world.
         covariance_m2: (frames, tracks, 3, 3), of the positions.
         status: (frames, tracks), values of `Status`.
@@ -34,16 +34,16 @@ class OutsideTracks:
 
     @property
     def tracked_m(self) -> Float[np.ndarray, "frames tracks 3"]:
-        """(frames, tracks, 3), positions where a track is neither coasting nor lost."""
+        """(frames, tracks, 3), positions of tracks that are neither coasting nor lost; NaN elsewhere."""
         return np.where((self.status == Status.TRACKED)[..., None], self.position_m, np.nan)
 
 
-def spread(outside: Trajectories, also_s: Iterable[Float[np.ndarray, "_"]]) -> OutsideTracks:
-    """The tracks at their own frames, and at those, counted on at the same rate, of other times.
+def align_tracks(outside: Trajectories, also_s: Iterable[Float[np.ndarray, "_"]]) -> OutsideTracks:
+    """The tracks at their own frames, and at frames of the same rate for other times.
 
     Args:
-        outside: the tracks.
-        also_s: times of cameras on drones, by the clock of the tracks; what is before frame 0 is left out.
+        outside: tracks of static cameras.
+        also_s: times of cameras on drones, by the clock of the tracks, seconds; times before frame 0 are left out.
     """
     frame, time_s = _frames(outside, list(also_s))
     rows = np.isin(frame, outside.frame)
@@ -61,7 +61,7 @@ def spread(outside: Trajectories, also_s: Iterable[Float[np.ndarray, "_"]]) -> O
     position_m, covariance_m2 = at_frames(outside.position_m, 3), at_frames(outside.covariance_m2, 3, 3)
     if outside.covariance_m2 is None:
         covariance_m2[:] = _UNSTATED_M**2 * np.eye(3)
-    # What is infinitely uncertain says nothing.
+    # Positions with infinite uncertainty carry no information.
     status[~np.isfinite(covariance_m2).all(axis=(2, 3)) | ~np.isfinite(position_m).all(axis=2)] = Status.LOST
     return OutsideTracks(
         frame=frame,
@@ -73,10 +73,10 @@ def spread(outside: Trajectories, also_s: Iterable[Float[np.ndarray, "_"]]) -> O
     )
 
 
-def picked(
+def select_track(
     values: Float[np.ndarray, "frames tracks *rest"], track: Int[np.ndarray, "frames"]
 ) -> Float[np.ndarray, "frames *rest"]:
-    """Of the track that is chosen in each frame; NaN where none is."""
+    """Values of the chosen track in each frame; NaN where none is chosen."""
     chosen = values[np.arange(len(track)), track].copy()
     chosen[track == UNASSIGNED] = np.nan
     return chosen

@@ -1,9 +1,9 @@
-"""Which outside-in track is of the drone that carries a camera: by distance, piece by piece.
+"""Assignment of outside tracks to the drones that carry cameras, by distance, piece by piece.
 
-Names of tracks are arbitrary, and two that met may have been exchanged. A camera knows on which drone it is. So each
-path has a sequence of tracks: the one of least cost, where a frame costs the squared distance up to a limit, and a
-change of tracks as much as some frames that are all wrong (A. Viterbi, Error bounds for convolutional codes, IEEE
-Transactions on Information Theory 13 (2), 1967).
+Names of tracks are arbitrary, and two tracks that met may have swapped identities, while a camera stays on its drone.
+Each path is therefore assigned the sequence of tracks with the least cost: a frame costs the squared distance up to a
+limit, and a change of tracks costs as much as several frames that are all wrong (A. Viterbi, Error bounds for
+convolutional codes, IEEE Transactions on Information Theory 13 (2), 1967).
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from jaxtyping import Float, Int
 
 from psotrack.trajectories import GATE_M, UNASSIGNED
 
-#: A frame without the track costs this share of a frame with the track elsewhere.
+#: Cost of a frame without the track, as a share of the cost of a frame in which the track is elsewhere.
 _MISSING = 0.25
-#: A change of tracks costs as many frames with the track elsewhere.
+#: Cost of a change of tracks, in frames in which the track is elsewhere.
 _CHANGE_FRAMES = 5.0
 
 
 @dataclass(frozen=True)
-class Change:
-    """From this frame on another track is of the drone.
+class TrackChange:
+    """A frame from which on another track belongs to a drone.
 
     Attributes:
         drone: index of the camera's path.
@@ -39,20 +39,21 @@ class Change:
 
 @dataclass(frozen=True)
 class Pairing:
-    """Who is who.
+    """Assignment of tracks to paths.
 
     Attributes:
-        track: (frames, paths), index of the track that is of each path's drone, or `UNASSIGNED`.
-        rest: (frames, tracks), for each track's own name the track of a drone without a camera, or `UNASSIGNED`.
-        changes: in the order of frames.
+        track: (frames, paths), index of the track of each path's drone, or `UNASSIGNED`.
+        rest: (frames, tracks), for each track's name the index of the track of the drone without a camera that the
+            name belongs to, or `UNASSIGNED`.
+        changes: changes of tracks, in the order of frames.
     """
 
     track: Int[np.ndarray, "frames paths"]
     rest: Int[np.ndarray, "frames tracks"]
-    changes: tuple[Change, ...]
+    changes: tuple[TrackChange, ...]
 
 
-def paired(
+def pair_tracks(
     frame: Int[np.ndarray, "frames"],
     expected_m: Float[np.ndarray, "frames paths 3"],
     reach_m: Float[np.ndarray, "paths"],
@@ -60,13 +61,13 @@ def paired(
 ) -> Pairing:
     """Assign tracks to paths.
 
+    A path gets no track if its best track is more than half a metre away in most frames that have both.
+
     Args:
         frame: (frames,), numbers.
-        expected_m: (frames, paths, 3), where each path expects its drone's middle; NaN where it does not know.
-        reach_m: (paths,), distance from there at which a track is as good as elsewhere.
-        middle_m: (frames, tracks, 3), NaN where a track is not there.
-
-    A path has no track at all if the best is further away than half a metre in most frames that have both.
+        expected_m: (frames, paths, 3), expected position of the middle of each path's drone; NaN where unknown.
+        reach_m: (paths,), distance from there from which on a track counts as elsewhere, metres.
+        middle_m: (frames, tracks, 3), positions of the tracks; NaN where a track has none.
     """
     num_frames, num_paths, num_tracks = len(frame), expected_m.shape[1], middle_m.shape[1]
     distance_m = np.linalg.norm(expected_m[:, :, None] - middle_m[:, None], axis=-1)
@@ -86,7 +87,7 @@ def paired(
 
 
 def _cheapest(cost: Float[np.ndarray, "frames states"], change: float) -> Int[np.ndarray, "frames"]:
-    """(frames,), the sequence of states with the least sum of costs and changes."""
+    """(frames,), the sequence of states with the least sum of costs and changes (Viterbi)."""
     total = np.zeros(cost.shape[1])
     came_from = np.empty(cost.shape, int)
     for here, origin in zip(cost, came_from, strict=True):
@@ -105,7 +106,7 @@ def _cheapest(cost: Float[np.ndarray, "frames states"], change: float) -> Int[np
 def _release_shared(
     track: Int[np.ndarray, "frames paths"], distance_m: Float[np.ndarray, "frames paths tracks"]
 ) -> None:
-    """In place: where two paths have the same track, it is the nearer one's; a path that does not know has none."""
+    """In place: of two paths with the same track, only the nearer one keeps it; an unknown position is not near."""
     if not distance_m.size:
         return
     own_m = np.take_along_axis(distance_m, np.maximum(track, 0)[..., None], axis=2)[..., 0]
@@ -119,20 +120,22 @@ def _release_shared(
             track[shared & ~first, path] = UNASSIGNED
 
 
-def _changes(frame: Int[np.ndarray, "frames"], track: Int[np.ndarray, "frames paths"]) -> tuple[Change, ...]:
+def _changes(
+    frame: Int[np.ndarray, "frames"], track: Int[np.ndarray, "frames paths"]
+) -> tuple[TrackChange, ...]:
     found = []
     for path in range(track.shape[1]):
         rows = np.flatnonzero(track[:, path] != UNASSIGNED)
         before, after = track[rows[:-1], path], track[rows[1:], path]
         found += [
-            Change(path, int(frame[rows[row + 1]]), int(before[row]), int(after[row]))
+            TrackChange(path, int(frame[rows[row + 1]]), int(before[row]), int(after[row]))
             for row in np.flatnonzero(before != after)
         ]
     return tuple(sorted(found, key=lambda change: (change.frame, change.drone)))
 
 
 def _rest(track: Int[np.ndarray, "frames paths"], num_tracks: int) -> Int[np.ndarray, "frames tracks"]:
-    """What is left to drones without a camera: a path that takes such a drone's track leaves its own in its place."""
+    """Tracks of drones without a camera: a path that takes such a drone's track gives it its own track in exchange."""
     held = np.arange(num_tracks)
     current = np.full(track.shape[1], UNASSIGNED)
     rest = np.empty((len(track), num_tracks), int)

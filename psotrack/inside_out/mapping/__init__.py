@@ -1,5 +1,14 @@
-"""Where the markers of a room are: their map from videos or from measured corners, and what is wrong with a map."""
+"""Maps of the markers in a room: built from videos or from measured corners, and checked against a video.
 
-from psotrack.inside_out.mapping.building import BuiltMap, build_map, own_frame
+In: videos of a room with lenses, or measured corners, and what is known of a marker. Out: a `MarkerMap` with its
+uncertainty (`BuiltMap`), squares fitted to measured corners (`FittedSquares`), or the faults of a map (`MapCheck`).
+Other rooms use these records with `build_map`, `fit_squares`, `check_map`, `read_measured_corners`, `find_sightings`
+and `corners_in_own_frame`.
 
-__all__ = ["BuiltMap", "build_map", "own_frame"]
+Imports go in this order: `sightings` (markers in frames), `square_fitting`, `scene` (views and markers with their
+derivatives), `bundle` (bundle adjustment), `initial_map`, `building`, `findings` (faults in words), `check`.
+"""
+
+from psotrack.inside_out.mapping.building import BuiltMap, build_map, corners_in_own_frame
+
+__all__ = ["BuiltMap", "build_map", "corners_in_own_frame"]

@@ -1,8 +1,7 @@
-"""A map of markers from videos of a room alone, up to one marker that is known.
+"""A map of markers from videos of a room, given at least one known marker.
 
-Where the known marker is says where the world's origin is, how its axes are turned and how large it is. Of a marker of
-which nothing is known but its side, the world's axes are its own: the origin in its centre, x to its right, y up, z out
-of the print.
+The known marker defines the origin, the axes and the scale of the world. If only the side of a marker is known, its own
+axes are the world's: the origin at its centre, x to its right, y up, z out of the print.
 """
 
 from __future__ import annotations
@@ -15,37 +14,43 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack.errors import InputError, check_positive
 from psotrack.inside_out.mapping.bundle import AdjustedMap, adjust
+from psotrack.inside_out.mapping.initial_map import (
+    MarkerPlacer,
+    PlacedMarker,
+    make_scene,
+    place_markers,
+    placed_markers,
+)
 from psotrack.inside_out.mapping.scene import MappedScene
 from psotrack.inside_out.mapping.sightings import SQUARE, MarkerSightings
-from psotrack.inside_out.mapping.squares import best_square
-from psotrack.inside_out.mapping.start import Beginning, Placed, begin, placed_of, scene_of
+from psotrack.inside_out.mapping.square_fitting import fit_square
 from psotrack.inside_out.marker_map import MarkerMap
 
-#: Views that the first idea is from; the rest is needed for markers that none of them shows.
+#: Number of views for the initial map; the other views are used for markers that none of these shows.
 _FIRST_VIEWS = 100
-#: Standard deviation of a corner, along x and along y, before residuals tell it.
+#: Standard deviation of a corner along x and along y, pixels, before it is estimated from residuals.
 _NOISE_PX = 0.3
-#: Share of its sightings that a marker must explain, or it is not where it is thought to be.
+#: Smallest share of a marker's sightings that its position must explain.
 _EXPLAINED = 0.5
 
 
 @dataclass(frozen=True)
 class BuiltMap:
-    """A map, and how sure it is.
+    """A map with its uncertainty.
 
     Attributes:
         marker_map: the markers that could be placed.
         ids: (markers,), increasing.
         covariance: (markers, 7, 7), of the centre along the world's axes (m), of a small turn about them (rad), and of
-            the logarithm of the side; 0 for what is known.
-        residual_px: (markers,), root mean square distance of corners in the image, without outliers.
-        sightings: (markers,), frames that show each.
-        outliers: (markers,), of those, frames that do not fit.
-        known: (markers,), which of them were given.
-        unplaced: ids that are seen, but never beside markers that lead to a known one, or nowhere for sure.
-        noise_px: standard deviation of a corner along x and along y.
-        inset_px: (videos,), by how much the sides of squares are found too far inside.
-        num_views: frames that were used.
+            the logarithm of the side; 0 for known quantities.
+        residual_px: (markers,), root mean square distance of corners in the image, without outliers, pixels.
+        sightings: (markers,), number of frames that show the marker.
+        outliers: (markers,), number of these frames that do not fit.
+        known: (markers,), whether the marker was given.
+        unplaced: ids that are seen, but that no chain of neighbours leads to, or that have no certain position.
+        noise_px: standard deviation of a corner along x and along y, pixels.
+        inset_px: (videos,), distance by which the sides of squares are found too far inside, pixels.
+        num_views: number of frames that were used.
     """
 
     marker_map: MarkerMap
@@ -71,8 +76,8 @@ class BuiltMap:
         return np.sqrt(np.einsum("mii->mi", self.covariance)[:, 3:6])
 
 
-def own_frame(side_m: float) -> Float[np.ndarray, "4 3"]:
-    """The corners, (4, 3), of a marker in its own axes.
+def corners_in_own_frame(side_m: float) -> Float[np.ndarray, "4 3"]:
+    """Corners, (4, 3), of a marker in its own axes, metres.
 
     Raises:
         SettingsError: the side is not above 0.
@@ -88,33 +93,34 @@ def build_map(
     side_m: float | None = None,
     estimate_sides: bool = False,
 ) -> BuiltMap:
-    """The map that explains what cameras see, given where some markers are.
+    """Build the map that explains sightings, given the positions of some markers.
 
     Args:
-        sightings: of markers, in videos of one room.
-        known: corners, (4, 3), world, metres, of markers that stay where they are, by id; squares are fitted to them.
-        side_m: of all others; None takes that of the known ones.
-        estimate_sides: let the sides of the others differ, and find them.
+        sightings: markers in videos of one room.
+        known: corners, (4, 3), world, metres, of known markers, which stay where they are, by id; squares are fitted to
+            them.
+        side_m: side of all other markers, metres; None takes the known markers' side.
+        estimate_sides: estimate the side of each other marker.
 
     Raises:
         InputError: no known marker is seen beside another one.
         SettingsError: the side is not above 0.
     """
-    placed = {marker: Placed(*best_square(corners)) for marker, corners in known.items()}
+    placed = {marker: PlacedMarker(*fit_square(corners)) for marker, corners in known.items()}
     side_m = float(np.median([one.side_m for one in placed.values()])) if side_m is None else side_m
     check_positive("side_m", side_m)
     _check_known(sightings, list(known))
-    first = sightings.select(_spread(sightings))
-    placed = begin(first, placed, side_m, noise_px=_NOISE_PX, estimate_sides=estimate_sides)
+    first = sightings.select(_spread_views(sightings))
+    placed = place_markers(first, placed, side_m, noise_px=_NOISE_PX, estimate_sides=estimate_sides)
     if set(sightings.ids) - set(placed):
-        placed = begin(sightings, placed, side_m, noise_px=_NOISE_PX, estimate_sides=estimate_sides)
-    # What was known but is never seen has no say.
+        placed = place_markers(sightings, placed, side_m, noise_px=_NOISE_PX, estimate_sides=estimate_sides)
+    # Known markers that no frame shows are left out.
     placed = {marker: one for marker, one in placed.items() if marker in set(sightings.ids)}
-    tied, scene = _tied(sightings, placed, side_m)
-    adjusted, tied = _settled(
-        tied, scene, [marker for marker in known if marker in placed], side_m, estimate_sides
+    connected, scene = _connect(sightings, placed, side_m)
+    adjusted, connected = _adjust(
+        connected, scene, [marker for marker in known if marker in placed], side_m, estimate_sides
     )
-    return _built(sightings, tied, adjusted, list(known))
+    return _make_result(sightings, connected, adjusted, list(known))
 
 
 def _check_known(sightings: MarkerSightings, known: list[int]) -> None:
@@ -125,36 +131,37 @@ def _check_known(sightings: MarkerSightings, known: list[int]) -> None:
         found = "others beside it in no frame" if seen else f"only {', '.join(map(str, sightings.ids))}"
         raise InputError(
             sightings.name,
-            expected=f"marker {', '.join(map(str, known))}, that is known, beside others",
+            expected=f"the known marker {', '.join(map(str, known))} beside others",
             found=found,
             remedy="name another one by --known",
         )
 
 
-def _spread(sightings: MarkerSightings) -> Bool[np.ndarray, " sightings"]:
+def _spread_views(sightings: MarkerSightings) -> Bool[np.ndarray, " sightings"]:
+    """Which sightings belong to views that are spread evenly over all views."""
     count = min(_FIRST_VIEWS, sightings.num_views)
     views = np.linspace(0, sightings.num_views - 1, count).round().astype(int)
     return np.isin(sightings.view, views)
 
 
-def _tied(
-    sightings: MarkerSightings, placed: Mapping[int, Placed], side_m: float
+def _connect(
+    sightings: MarkerSightings, placed: Mapping[int, PlacedMarker], side_m: float
 ) -> tuple[MarkerSightings, MappedScene]:
-    """The sightings of placed markers in views that show two at least: fewer tie nothing; and the scene of them."""
+    """Sightings of placed markers in views that show at least two, which connect markers; and the scene of them."""
     kept = np.isin(sightings.marker, list(placed))
     counts = np.bincount(sightings.view[kept], minlength=sightings.num_views)
-    tied = sightings.select(kept & (counts[sightings.view] >= 2))
-    views = Beginning(tied, side_m).located(placed)
+    connected = sightings.select(kept & (counts[sightings.view] >= 2))
+    views = MarkerPlacer(connected, side_m).locate_views(placed)
     if np.isfinite(views.t_m[:, 0, 0]).all():
-        return tied, scene_of(placed, views, np.zeros(len(tied.lenses)))
+        return connected, make_scene(placed, views, np.zeros(len(connected.lenses)))
     found = np.isfinite(views.t_m[:, 0, 0])
-    return _tied(tied.select(found[tied.view]), placed, side_m)
+    return _connect(connected.select(found[connected.view]), placed, side_m)
 
 
-def _settled(
+def _adjust(
     sightings: MarkerSightings, scene: MappedScene, fixed: list[int], side_m: float, estimate_sides: bool
 ) -> tuple[AdjustedMap, MarkerSightings]:
-    """The adjusted scene; a marker that most of its sightings disagree with is placed anew, or left out."""
+    """The adjusted scene. A marker that most of its sightings contradict is placed again, or left out."""
     tried: set[int] = set()
     while True:
         present = np.isin(scene.ids, sightings.ids)
@@ -176,20 +183,20 @@ def _settled(
         ]
         if not bad:
             return adjusted, sightings
-        placed = placed_of(scene)
+        placed = placed_markers(scene)
         sound = {marker: one for marker, one in placed.items() if marker not in bad}
-        beginning = Beginning(sightings, side_m)
-        views = beginning.located(sound, scene)
+        placer = MarkerPlacer(sightings, side_m)
+        views = placer.locate_views(sound, scene)
         for marker in bad:
-            found = None if marker in tried else beginning.place(marker, views)
+            found = None if marker in tried else placer.place(marker, views)
             if found is not None:
                 sound[marker] = found[0]
         tried |= set(bad)
-        sightings, scene = _tied(sightings, sound, side_m)
+        sightings, scene = _connect(sightings, sound, side_m)
 
 
-def _built(
-    all_of_them: MarkerSightings, used: MarkerSightings, adjusted: AdjustedMap, known: list[int]
+def _make_result(
+    sightings: MarkerSightings, used: MarkerSightings, adjusted: AdjustedMap, known: list[int]
 ) -> BuiltMap:
     scene = adjusted.scene
     ids = scene.ids.tolist()
@@ -205,7 +212,7 @@ def _built(
         np.array([rows.sum() for rows in of_marker]),
         np.array([(rows & ~adjusted.used).sum() for rows in of_marker]),
         np.isin(scene.ids, known),
-        tuple(marker for marker in all_of_them.ids if marker not in ids),
+        tuple(marker for marker in sightings.ids if marker not in ids),
         adjusted.noise_px,
         scene.inset_px,
         used.num_views,

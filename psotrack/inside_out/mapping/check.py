@@ -1,7 +1,7 @@
-"""Which markers of a map are wrong, by how much, and what to do: the map against a video of its room.
+"""A check of a map against a video of its room: which markers are wrong, by how much, and what to do.
 
-Cameras are located by the markers that agree with one another; what most frames then see somewhere else is placed anew
-from them, and its new place is put into words. Nothing is found where fewer than half of the markers agree.
+Cameras are located by the markers that agree with one another. Markers that most frames show elsewhere are then placed
+again, and the difference is put into words. The check fails where fewer than half of the markers agree.
 """
 
 from __future__ import annotations
@@ -16,48 +16,56 @@ from scipy.spatial.transform import Rotation
 from psotrack.calibration import spread_px
 from psotrack.errors import InputError
 from psotrack.inside_out.mapping.bundle import adjust, improved
-from psotrack.inside_out.mapping.findings import CheckedMarker, MapFinding, findings_of
+from psotrack.inside_out.mapping.findings import CheckedMarker, MapFinding, find_faults
+from psotrack.inside_out.mapping.initial_map import (
+    SIDE_FACTORS,
+    MarkerPlacer,
+    PlacedMarker,
+    make_scene,
+    placed_markers,
+)
 from psotrack.inside_out.mapping.scene import MappedScene, residuals_px
 from psotrack.inside_out.mapping.sightings import MarkerSightings
-from psotrack.inside_out.mapping.squares import best_square
-from psotrack.inside_out.mapping.start import GROWTHS, Beginning, Placed, placed_of, scene_of
+from psotrack.inside_out.mapping.square_fitting import fit_square
 from psotrack.inside_out.marker_map import MarkerMap
 
-#: Times the usual residual that half of a marker's corners are off by, where it is not where the map has it.
+#: Median residual of a suspect marker, as a multiple of the usual median residual.
 _SUSPECT = 4.0
-#: Frames that tell where a marker is.
-_FRAMES = 3
-#: Standard deviations of a corner, from a rough start to a good end.
+#: Smallest number of frames from which a suspect marker is placed.
+_LEAST_FRAMES = 3
+#: Standard deviations of a corner in successive adjustments, from a rough start to the end, pixels.
 _NOISES_PX = (8.0, 2.0, 0.5)
 
 
 @dataclass(frozen=True)
-class Checkup:
-    """A map against a video.
+class MapCheck:
+    """Result of a check of a map.
 
     Attributes:
-        findings: none where nothing is wrong.
-        markers: what was measured, by id.
-        noise_px: standard deviation of a corner along x and along y.
-        num_views: frames that show two markers of the map at least.
-        strangers: ids that are seen and not in the map.
+        findings: faults of the map; empty where nothing is wrong.
+        markers: measurements by marker id.
+        noise_px: standard deviation of a corner along x and along y, pixels.
+        num_views: number of frames that show at least two markers of the map.
+        not_in_map: ids that are seen but not in the map.
     """
 
     findings: tuple[MapFinding, ...]
     markers: Mapping[int, CheckedMarker]
     noise_px: float
     num_views: int
-    strangers: tuple[int, ...]
+    not_in_map: tuple[int, ...]
 
 
-def check_map(sightings: MarkerSightings, marker_map: MarkerMap) -> Checkup:
-    """What is wrong with a map.
+def check_map(sightings: MarkerSightings, marker_map: MarkerMap) -> MapCheck:
+    """Check a map against sightings.
 
     Raises:
         InputError: no frame shows two markers of the map.
     """
-    given = {int(marker): Placed(*best_square(corners)) for marker, corners in marker_map.corners_m.items()}
-    strangers = tuple(marker for marker in sightings.ids if marker not in given)
+    given = {
+        int(marker): PlacedMarker(*fit_square(corners)) for marker, corners in marker_map.corners_m.items()
+    }
+    not_in_map = tuple(marker for marker in sightings.ids if marker not in given)
     kept = np.isin(sightings.marker, list(given))
     counts = np.bincount(sightings.view[kept], minlength=sightings.num_views)
     kept &= counts[sightings.view] >= 2
@@ -85,32 +93,32 @@ def check_map(sightings: MarkerSightings, marker_map: MarkerMap) -> Checkup:
             f"the map as a whole does not fit the video: {len(sound)} of {len(typical)} markers agree with one another",
             "check that lens, dictionary and map are those of this room, and that no axis is mirrored",
         )
-        return Checkup((finding,), checked, usual_px, sightings.num_views, strangers)
+        return MapCheck((finding,), checked, usual_px, sightings.num_views, not_in_map)
     suspects = [marker for marker in typical if marker not in sound]
     if not suspects:
-        return Checkup((), checked, usual_px, sightings.num_views, strangers)
+        return MapCheck((), checked, usual_px, sightings.num_views, not_in_map)
     measured, noise_px = _measured(sightings, sound, suspects, located, side_m)
     checked |= {
         marker: _compared(given[marker], *one, residual_px[marker]) for marker, one in measured.items()
     }
-    findings = findings_of(
+    findings = find_faults(
         given, {marker: found for marker, (found, _) in measured.items()}, checked, suspects
     )
-    return Checkup(tuple(findings), checked, noise_px, sightings.num_views, strangers)
+    return MapCheck(tuple(findings), checked, noise_px, sightings.num_views, not_in_map)
 
 
-def _located(sightings: MarkerSightings, given: Mapping[int, Placed], side_m: float) -> MappedScene:
-    """Views that agree with as many markers as can be, all markers being where the map has them."""
-    beginning = Beginning(sightings, side_m)
-    scene = scene_of(
+def _located(sightings: MarkerSightings, given: Mapping[int, PlacedMarker], side_m: float) -> MappedScene:
+    """The scene in which views agree with as many markers as possible, with all markers where the map has them."""
+    placer = MarkerPlacer(sightings, side_m)
+    scene = make_scene(
         {marker: given[marker] for marker in sightings.ids},
-        beginning.located(given),
+        placer.locate_views(given),
         np.zeros(len(sightings.lenses)),
     )
     for noise_px in _NOISES_PX:
         scene = improved(sightings, scene, sightings.ids, noise_px=noise_px)
-        # A view that fell into a wrong pose may find a better one now that the inset is known.
-        scene = scene_of(placed_of(scene), beginning.located(given, scene), scene.inset_px)
+        # With the inset known, a view in a wrong pose may find a better one.
+        scene = make_scene(placed_markers(scene), placer.locate_views(given, scene), scene.inset_px)
     return improved(sightings, scene, sightings.ids, noise_px=_NOISES_PX[-1])
 
 
@@ -122,33 +130,33 @@ def _by_marker(
 
 def _measured(
     sightings: MarkerSightings,
-    sound: Mapping[int, Placed],
+    sound: Mapping[int, PlacedMarker],
     suspects: list[int],
     located: MappedScene,
     side_m: float,
-) -> tuple[dict[int, tuple[Placed, Float[np.ndarray, "7 7"]]], float]:
-    """Where suspects are in the video, with covariances, the sound markers being where the map has them; and the noise.
+) -> tuple[dict[int, tuple[PlacedMarker, Float[np.ndarray, "7 7"]]], float]:
+    """Suspect markers as in the video, with covariances, by id; and the standard deviation of a corner, pixels.
 
-    Those are absent that are never seen beside two sound ones.
+    Sound markers stay where the map has them. Suspects that no frame shows beside two sound markers are left out.
     """
     of_sound = np.bincount(
         sightings.view[np.isin(sightings.marker, list(sound))], minlength=sightings.num_views
     )
     kept = of_sound[sightings.view] >= 2
-    tied, rows = sightings.select(kept), np.unique(sightings.view[kept])
-    beginning = Beginning(tied, side_m)
+    connected, rows = sightings.select(kept), np.unique(sightings.view[kept])
+    placer = MarkerPlacer(connected, side_m)
     before = replace(located, R_cam_world=located.R_cam_world[rows], t_m=located.t_m[rows])
-    views = beginning.located(sound, before)
+    views = placer.locate_views(sound, before)
     placed = dict(sound)
     for marker in suspects:
-        found = beginning.place(marker, views, GROWTHS)
-        if found is not None and (tied.marker == marker).sum() >= _FRAMES:
+        found = placer.place(marker, views, SIDE_FACTORS)
+        if found is not None and (connected.marker == marker).sum() >= _LEAST_FRAMES:
             placed[marker] = found[0]
-    tied = tied.select(np.isin(tied.marker, list(placed)))
-    start = scene_of({marker: placed[marker] for marker in tied.ids}, views, located.inset_px)
-    fixed = [marker for marker in tied.ids if marker in sound]
-    adjusted = adjust(tied, start, fixed, noise_px=_NOISES_PX[-1], estimate_sides=True)
-    now = placed_of(adjusted.scene)
+    connected = connected.select(np.isin(connected.marker, list(placed)))
+    start = make_scene({marker: placed[marker] for marker in connected.ids}, views, located.inset_px)
+    fixed = [marker for marker in connected.ids if marker in sound]
+    adjusted = adjust(connected, start, fixed, noise_px=_NOISES_PX[-1], estimate_sides=True)
+    now = placed_markers(adjusted.scene)
     return {
         marker: (now[marker], adjusted.covariance[row])
         for row, marker in enumerate(adjusted.scene.ids.tolist())
@@ -165,8 +173,8 @@ def _unmoved(residual_px: Float[np.ndarray, " corners"] | None) -> CheckedMarker
 
 
 def _compared(
-    given: Placed,
-    found: Placed,
+    given: PlacedMarker,
+    found: PlacedMarker,
     covariance: Float[np.ndarray, "7 7"],
     residual_px: Float[np.ndarray, " corners"],
 ) -> CheckedMarker:

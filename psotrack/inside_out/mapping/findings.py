@@ -1,4 +1,4 @@
-"""What a check of a map finds, in words: which marker is wrong, by how much, and what to do."""
+"""Faults that a check of a map finds, in words: which marker is wrong, by how much, and what to do."""
 
 from __future__ import annotations
 
@@ -8,28 +8,29 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.inside_out.mapping.start import Placed
+from psotrack.inside_out.mapping.initial_map import PlacedMarker
 
-#: Standard deviations that make a difference one.
-_SURE = 5.0
-#: Differences that a map measured by hand or by motion capture has: corners are off by some millimetres.
+#: Number of standard deviations from which on a difference is significant.
+_SIGNIFICANT = 5.0
+#: Differences below these are expected of a map that was measured by hand or by motion capture, whose corners are off
+#: by some millimetres: of positions (metres), orientations (degrees) and sides (share of the side).
 _SHIFT_M = 0.01
 _TURN_DEG = 3.0
-_GROWTH = 0.03
-#: A marker that is turned in its plane by a quarter, give or take this, has its corners counted from another one.
+_SIDE_CHANGE = 0.03
+#: Largest deviation, degrees, from a turn by 90, 180 or 270 degrees at which the order of the corners is the fault.
 _QUARTER_DEG = 15.0
-#: Shares of the side that places may differ by and be the same.
+#: Largest distance of two centres that are the same place, in sides.
 _SAME_PLACE = 0.35
 
 
 @dataclass(frozen=True)
 class MapFinding:
-    """A marker of a map that is wrong.
+    """A fault of a map.
 
     Attributes:
-        kind: a word or two for programs.
-        markers: their ids; none where it is the whole map.
-        message: what is wrong, by how much.
+        kind: kind of the fault in a word or two, for programs.
+        markers: ids of the wrong markers; empty where the whole map is wrong.
+        message: what is wrong, and by how much.
         remedy: what to do.
     """
 
@@ -44,16 +45,16 @@ class MapFinding:
 
 @dataclass(frozen=True)
 class CheckedMarker:
-    """A marker of a map in a video.
+    """A marker of a map, compared with a video.
 
     Attributes:
-        sightings: frames that show it beside others of the map.
-        residual_px: median distance in the image between its corners as seen and as the map has them; NaN if unseen.
-        moved_m: (3,), from the map's centre to that in the video, world; NaN where it is where the map has it.
-        std_m: (3,), of `moved_m`.
-        turned_deg: between the map's axes and the video's.
-        turn_std_deg: of that.
-        grown: the side in the video over the map's.
+        sightings: number of frames that show the marker beside others of the map.
+        residual_px: median distance in the image between its corners and those of the map, pixels; NaN if unseen.
+        moved_m: (3,), from the centre in the map to the centre in the video, world; NaN where the two agree.
+        std_m: (3,), standard deviation of `moved_m`.
+        turned_deg: angle between the axes in the map and in the video, degrees.
+        turn_std_deg: standard deviation of `turned_deg`.
+        side_ratio: side in the video divided by the side in the map.
     """
 
     sightings: int
@@ -62,31 +63,31 @@ class CheckedMarker:
     std_m: Float[np.ndarray, "3"]
     turned_deg: float
     turn_std_deg: float
-    grown: float
+    side_ratio: float
 
 
-def findings_of(
-    given: Mapping[int, Placed],
-    found: Mapping[int, Placed],
+def find_faults(
+    given: Mapping[int, PlacedMarker],
+    found: Mapping[int, PlacedMarker],
     checked: Mapping[int, CheckedMarker],
     suspects: list[int],
 ) -> list[MapFinding]:
-    """What is wrong with suspects, those that are exchanged together.
+    """Describe the faults of suspect markers; two exchanged markers are one fault.
 
     Args:
-        given: all markers of the map.
-        found: suspects where the video has them; some may be absent.
-        checked: what was measured of all markers.
-        suspects: those that the video has not where the map has them.
+        given: all markers as in the map, by id.
+        found: suspect markers as in the video, by id; a suspect that could not be placed is missing.
+        checked: measurements of all markers, by id.
+        suspects: ids of markers that the video shows elsewhere than the map.
     """
     findings, done = [], set()
     for marker in suspects:
         if marker in done:
             continue
         if marker not in found:
-            findings.append(_unexplained(marker, checked[marker]))
+            findings.append(_unplaced(marker, checked[marker]))
             continue
-        other = _place_of(marker, found[marker], given)
+        other = _marker_at(found[marker], given, excluded=marker)
         if other is not None and other in found and _same_place(found[other], given[marker]):
             done.add(other)
             findings.append(_exchanged(marker, other))
@@ -97,15 +98,17 @@ def findings_of(
     return findings
 
 
-def _place_of(marker: int, found: Placed, given: Mapping[int, Placed]) -> int | None:
-    """Another marker of the map in whose place one is."""
-    return next((other for other, one in given.items() if other != marker and _same_place(found, one)), None)
+def _marker_at(found: PlacedMarker, given: Mapping[int, PlacedMarker], *, excluded: int) -> int | None:
+    """Id of the marker of the map, other than the excluded one, at the place of a found marker."""
+    return next(
+        (other for other, one in given.items() if other != excluded and _same_place(found, one)), None
+    )
 
 
-def _same_place(one: Placed, other: Placed) -> bool:
+def _same_place(one: PlacedMarker, other: PlacedMarker) -> bool:
     apart = float(np.linalg.norm(one.centre_m - other.centre_m))
-    faces_alike = float(one.R_world_marker[:, 2] @ other.R_world_marker[:, 2]) > 0
-    return apart < _SAME_PLACE * other.side_m and faces_alike
+    same_facing = float(one.R_world_marker[:, 2] @ other.R_world_marker[:, 2]) > 0
+    return apart < _SAME_PLACE * other.side_m and same_facing
 
 
 def _exchanged(marker: int, other: int) -> MapFinding:
@@ -113,22 +116,24 @@ def _exchanged(marker: int, other: int) -> MapFinding:
     return MapFinding("exchanged", (marker, other), message, "exchange their ids in the map, or on the wall")
 
 
-def _unexplained(marker: int, one: CheckedMarker) -> MapFinding:
+def _unplaced(marker: int, one: CheckedMarker) -> MapFinding:
     message = (
         f"marker {marker}: it is {one.residual_px:.1f} px off where the map has it, in {one.sightings} frames"
     )
-    remedy = "it is too seldom seen beside others to tell where it is: film it with them, or measure it again"
+    remedy = (
+        "too few frames show it beside others to tell where it is: film it with them, or measure it again"
+    )
     return MapFinding("disagrees", (marker,), message, remedy)
 
 
 def _fault(
-    marker: int, given: Placed, found: Placed, one: CheckedMarker, other: int | None
+    marker: int, given: PlacedMarker, found: PlacedMarker, one: CheckedMarker, other: int | None
 ) -> MapFinding | None:
-    """The one thing that is wrong with a marker, or all; None if it is no more than what maps are off by."""
+    """The fault of one marker; None if the differences are those of any measured map."""
     shift = float(np.linalg.norm(one.moved_m))
-    moved = shift > max(_SHIFT_M, _SURE * float(np.linalg.norm(one.std_m)))
-    turned = one.turned_deg > max(_TURN_DEG, _SURE * one.turn_std_deg)
-    grown = abs(one.grown - 1) > _GROWTH
+    moved = shift > max(_SHIFT_M, _SIGNIFICANT * float(np.linalg.norm(one.std_m)))
+    turned = one.turned_deg > max(_TURN_DEG, _SIGNIFICANT * one.turn_std_deg)
+    resized = abs(one.side_ratio - 1) > _SIDE_CHANGE
     stays = shift < _SAME_PLACE * given.side_m
     place = ", ".join(f"{value:.3f}" for value in found.centre_m)
     if stays and given.R_world_marker[:, 2] @ found.R_world_marker[:, 2] < -np.sqrt(0.5):
@@ -152,7 +157,7 @@ def _fault(
         )
     if turned:
         words.append(f"turned by {one.turned_deg:.1f} degrees, give or take {one.turn_std_deg:.1f}")
-    if grown:
+    if resized:
         words.append(f"{1e3 * found.side_m:.0f} mm wide, not {1e3 * given.side_m:.0f} mm")
     if not words:
         return None
@@ -161,8 +166,8 @@ def _fault(
     return MapFinding(kind, (marker,), f"marker {marker}: it is {' and '.join(words)}", remedy)
 
 
-def _quarter_turns(given: Placed, found: Placed) -> int:
-    """Quarters by which a marker is turned in its own plane, clockwise as seen; 0 if it is not just that."""
+def _quarter_turns(given: PlacedMarker, found: PlacedMarker) -> int:
+    """Quarter turns of a marker in its own plane, clockwise as seen from its front; 0 if it differs in another way."""
     turn = given.R_world_marker.T @ found.R_world_marker
     angle_deg = float(np.rad2deg(np.arctan2(turn[1, 0], turn[0, 0])))
     quarter = round(-angle_deg / 90) % 4

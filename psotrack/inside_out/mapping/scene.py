@@ -1,4 +1,4 @@
-"""A room with markers, the views of it, and what the markers' corners in the images say of both."""
+"""Markers of a room and views of them, with residuals of the corners and their derivatives."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from psotrack.inside_out.mapping.sightings import SQUARE, MarkerSightings
 
 @dataclass(frozen=True)
 class MappedScene:
-    """Where views and markers are.
+    """Poses of views and markers.
 
     Attributes:
-        R_cam_world: (views, 3, 3).
-        t_m: (views, 3), of world to camera.
+        R_cam_world: (views, 3, 3), world to camera.
+        t_m: (views, 3), translation from world to camera, metres.
         ids: (markers,), increasing.
-        R_world_marker: (markers, 3, 3), from a marker's own axes, see `sightings.SQUARE`.
-        centre_m: (markers, 3), world.
-        side_m: (markers,).
-        inset_px: (videos,), by how much the sides of squares are found too far inside.
+        R_world_marker: (markers, 3, 3), from a marker's own axes (see `sightings.SQUARE`) to the world's.
+        centre_m: (markers, 3), world, metres.
+        side_m: (markers,), sides, metres.
+        inset_px: (videos,), distance by which the sides of squares are found too far inside, pixels.
     """
 
     R_cam_world: Float[np.ndarray, "views 3 3"]
@@ -40,25 +40,25 @@ class MappedScene:
 
     @property
     def corners_m(self) -> Float[np.ndarray, "markers 4 3"]:
-        """(markers, 4, 3), world."""
+        """(markers, 4, 3), corners, world, metres."""
         return self.centre_m[:, None] + self.arms_m
 
     @property
     def arms_m(self) -> Float[np.ndarray, "markers 4 3"]:
-        """(markers, 4, 3), from the centres to the corners, along the world's axes."""
+        """(markers, 4, 3), vectors from the centres to the corners, along the world's axes, metres."""
         return (self.side_m[:, None, None] * SQUARE) @ self.R_world_marker.swapaxes(-1, -2)
 
 
 def residuals_px(sightings: MarkerSightings, scene: MappedScene) -> Float[np.ndarray, "sightings 4"]:
-    """Distances in the image, the inset taken out; infinite behind the camera."""
+    """Distances in the image between corners and their projections, after the inset; infinite behind the camera."""
     return np.linalg.norm(linearised(sightings, scene).off, axis=-1)
 
 
 def outward(sightings: MarkerSightings) -> Float[np.ndarray, "sightings 4 2"]:
-    """How the corners move in the image when each side of the square moves outwards by 1 px: along the bisectors."""
+    """Shift of each corner in the image, along the bisector, when each side of the square moves outwards by 1 px."""
     ahead = _unit(np.roll(sightings.corners_px, -1, axis=1) - sightings.corners_px)
     behind = np.roll(-ahead, 1, axis=1)
-    # Of two sides with an angle a between them: by 1 / sin(a / 2). A marker seen that obliquely is not recognised.
+    # Two sides with an angle a between them give 1 / sin(a / 2). Markers seen too obliquely are not recognised.
     sine = np.maximum(np.linalg.norm(ahead - behind, axis=-1, keepdims=True) / 2, 0.1)
     return -_unit(ahead + behind) / sine
 
@@ -69,10 +69,10 @@ def _unit(vectors: Float[np.ndarray, "*vectors 2"]) -> Float[np.ndarray, "*vecto
 
 @dataclass(frozen=True)
 class Linearised:
-    """What is seen less what should be, in pixels, and the derivatives of the latter.
+    """Residuals of corners, and derivatives of the projected corners, pixels.
 
     Attributes:
-        off: (sightings, 4, 2), infinite behind the camera.
+        off: (sightings, 4, 2), corner less its projection; infinite behind the camera.
         by_view: (sightings, 4, 2, 6), by a small turn about the camera's axes (rad) and by its translation (m).
         by_rest: (sightings, 4, 2, 8), by the marker's centre (m), a small turn about the world's axes (rad), the
             logarithm of its side, and by the video's inset.
@@ -84,7 +84,7 @@ class Linearised:
 
 
 def linearised(sightings: MarkerSightings, scene: MappedScene) -> Linearised:
-    """The sightings of a scene that has all their markers and views."""
+    """Residuals and derivatives of all sightings; the scene has all their markers and views."""
     row, view = scene.rows(sightings), sightings.view
     video = sightings.lens[view]
     R = scene.R_cam_world[view]
@@ -96,12 +96,12 @@ def linearised(sightings: MarkerSightings, scene: MappedScene) -> Linearised:
         of_lens = np.flatnonzero(video == index)
         if not len(of_lens):
             continue
-        # Points in the camera's axes move as its translation does.
+        # A translation of the camera moves points in its axes by the same vector.
         pixels, _, slopes = reproject(points_cam[of_lens].reshape(-1, 3), np.eye(3), np.zeros(3), lens)
         off[of_lens] = sightings.corners_px[of_lens] - pixels.reshape(-1, 4, 2)
         by_shift[of_lens] = slopes.reshape(-1, 4, 2, 3)
     off[points_cam[..., 2] <= NEAR_M] = np.inf
-    # A turn by w moves a point at q by w x q, so the derivative is q x slope; growth moves it along the arm.
+    # A turn by w moves a point q by w x q, so the derivative is q x slope; a larger side moves q along the arm.
     by_turn = np.cross(turned[:, :, None], by_shift)
     by_point, arm = by_shift @ R[:, None], arm[:, :, None]
     inward = -outward(sightings)

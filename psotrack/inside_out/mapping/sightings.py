@@ -1,4 +1,4 @@
-"""What cameras that are carried through a room see of its markers: what a map is made from, or checked with."""
+"""Markers in the frames of cameras that are carried through a room: input for building and checking a map."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from psotrack.inside_out.detection import MarkerDetector
 from psotrack.recordings import VideoInfo, read_frames
 from psotrack.support import Report, no_progress
 
-#: A marker's corners in its own axes, for a side of 1: x to its right, y up, z out of the print. OpenCV's order.
+#: Corners of a marker with sides of 1 in its own axes, x to its right, y up, z out of the print, in OpenCV's order.
 SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 
 
 @dataclass(frozen=True)
-class MarkersInView:
+class FrameMarkers:
     """Markers in one frame.
 
     Attributes:
         source: number of the video.
-        time_s: of the frame in its video.
+        time_s: time of the frame in its video, seconds.
         ids: (markers,).
-        corners_px: (markers, 4, 2), as OpenCV's ArUco counts them.
+        corners_px: (markers, 4, 2), in the order of OpenCV's ArUco, pixels.
     """
 
     source: int
@@ -39,16 +39,16 @@ class MarkersInView:
 
 @dataclass(frozen=True)
 class MarkerSightings:
-    """Markers in the frames of one or several videos; a view is a frame that shows one at least.
+    """Markers in the frames of one or several videos. A view is a frame that shows at least one marker.
 
     Attributes:
-        lenses: of the videos' cameras.
+        lenses: lenses of the videos' cameras.
         lens: (views,), number of the view's video.
-        time_s: (views,), in that video.
+        time_s: (views,), time in this video, seconds.
         view: (sightings,), number of the view, not decreasing.
         marker: (sightings,), ids. No view has a marker twice.
-        corners_px: (sightings, 4, 2).
-        name: of the videos, for messages.
+        corners_px: (sightings, 4, 2), pixels.
+        name: name of the videos, for messages.
     """
 
     lenses: tuple[Camera, ...]
@@ -90,17 +90,18 @@ def find_sightings(
     most_frames: int = 300,
     report: Report = no_progress,
 ) -> MarkerSightings:
-    """The markers in videos of one room, each with its camera's lens.
+    """Find the markers in videos of one room.
 
     Args:
-        videos: with lenses for images of their size.
-        dictionary: of the markers, such as 4x4_50.
-        most_frames: of a video that are looked at, evenly spread: those beside each other say the same.
-        report: told of progress.
+        videos: videos with the lens of each, for images of its size.
+        dictionary: name of the markers' dictionary, such as 4x4_50.
+        most_frames: largest number of frames of a video that are searched, evenly spread: neighbouring frames show the
+            same.
+        report: progress is reported to it.
 
     Raises:
         InputError: a video cannot be read, or is of another size than its lens; or no frame shows a marker.
-        SettingsError: there is no such dictionary.
+        SettingsError: there is no dictionary of this name.
     """
     for video, lens in videos:
         width, height = (int(side) for side in lens.image_size_wh)
@@ -119,16 +120,16 @@ def find_sightings(
             for index, frame in enumerate(read_frames(video, step)):
                 gray = np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), np.uint8)
                 found = detectors[source].detect(gray)
-                seen.append(MarkersInView(source, index * step / video.fps, found.ids, found.corners_px))
+                seen.append(FrameMarkers(source, index * step / video.fps, found.ids, found.corners_px))
                 advance(1)
     name = ", ".join(str(video.path) for video, _ in videos)
-    return sightings_of(seen, [lens for _, lens in videos], name)
+    return collect_sightings(seen, [lens for _, lens in videos], name)
 
 
-def sightings_of(
-    seen: Iterable[MarkersInView], lenses: Ordered[Camera], name: str = "video"
+def collect_sightings(
+    seen: Iterable[FrameMarkers], lenses: Ordered[Camera], name: str = "video"
 ) -> MarkerSightings:
-    """The sightings in frames. A marker that is in a frame twice is left out of it: one of the two is another one.
+    """The sightings of frames. Two markers with one id in a frame are left out: at least one is misread.
 
     Raises:
         InputError: no frame shows a marker.
@@ -164,15 +165,16 @@ def sightings_of(
     )
 
 
-def two_poses(
+def square_poses(
     sightings: MarkerSightings, side_m: float
 ) -> tuple[Float[np.ndarray, "sightings 2 3 3"], Float[np.ndarray, "sightings 2 3"]]:
-    """The two poses of a square that look almost alike, marker to camera, better one first (IPPE; Collins & Bartoli
-    2014); NaN where there is none.
+    """The two poses of a square that look almost the same, marker to camera, the better one first; NaN without a pose.
+
+    Infinitesimal plane-based pose estimation (IPPE; Collins & Bartoli 2014).
 
     Args:
-        sightings: of markers.
-        side_m: of all of them, in metres.
+        sightings: markers in views.
+        side_m: side of all markers, metres.
     """
     R = np.full((len(sightings.view), 2, 3, 3), np.nan)
     t_m = np.full((len(sightings.view), 2, 3), np.nan)
@@ -186,7 +188,7 @@ def two_poses(
                     side_m * SQUARE, corners, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
                 )
             except cv2.error:
-                # Corners on a line.
+                # Degenerate corners, such as corners on one line.
                 continue
             for which, (turn, shift) in enumerate(zip(turns, shifts, strict=True)):
                 R[row, which], t_m[row, which] = cv2.Rodrigues(turn)[0], shift.ravel()

@@ -1,5 +1,14 @@
-"""The pose of a camera from one frame's markers."""
+"""The pose of a camera from the markers in one frame.
 
-from psotrack.inside_out.pose.locating import Expected, MarkerPose, PoseSettings, locate
+In: corners of markers in the image (pixels) and in the world (metres), the lens and `PoseSettings`. Out: a
+`MarkerPose` with its covariance and the probability that another pose is the right one. Other rooms use
+`estimate_pose` and these records, and nothing else of this room.
 
-__all__ = ["Expected", "MarkerPose", "PoseSettings", "locate"]
+Imports go in this order: `records`; `equations` (linear equations of the corners); `fit` (the most likely pose near
+an initial pose); `initial_poses` (poses by closed-form solvers); `estimating` (all of it).
+"""
+
+from psotrack.inside_out.pose.estimating import estimate_pose
+from psotrack.inside_out.pose.records import ExpectedPose, MarkerPose, PoseSettings
+
+__all__ = ["ExpectedPose", "MarkerPose", "PoseSettings", "estimate_pose"]

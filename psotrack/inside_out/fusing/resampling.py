@@ -1,7 +1,7 @@
-"""How a camera sits on its drone, seen from outside: its path at the frames of other cameras, its turn, its arm.
+"""A camera's path at the frames of other cameras, and the arm from the camera to the middle of its drone.
 
-The camera's centre is not the point that cameras on the walls track, which is the middle of the drone's silhouette. The
-arm from one to the other is constant in the camera's axes, because the camera is fixed to the body.
+The camera's centre is not the point that static cameras track, which is the middle of the drone's silhouette. The arm
+from one to the other is constant in the camera's axes, because the camera is fixed to the body.
 """
 
 from __future__ import annotations
@@ -18,26 +18,26 @@ from psotrack.inside_out.camera_path import CameraPath
 from psotrack.support import standard_error
 from psotrack.trajectories import Status
 
-#: In units of the median distance from the median; beyond, a frame does not count for the arm.
+#: Distance from the median, in median distances, beyond which a frame is left out of the arm.
 _FAR = 4.0
-#: Turns of a camera that nobody knows differ by no more than this, as a standard deviation about each axis.
-_MOST_TURN_RAD = np.pi / 2
-#: Times that differ by less are the same.
+#: Standard deviation of an unknown orientation about each axis, radians.
+_LARGEST_TURN_RAD = np.pi / 2
+#: Difference below which two times are equal, seconds, and two lengths are, metres.
 _SAME_S = 1e-6
 
 
 @dataclass(frozen=True)
-class Mounted:
-    """A camera's path brought to other frames.
+class ResampledPath:
+    """A camera's path at the frames of other cameras.
 
     Attributes:
-        index: (frames,), row of the path that stands for each frame, the nearest in time; -1 for none.
-        ahead_s: (frames,), by how much that row is later than the frame.
-        position_m: (frames, 3), the camera's centre in the frame, world; NaN where it is not tracked.
-        rotation: (frames, 3, 3), camera to world, in every frame: between known ones the shortest turn.
-        turn_covariance_rad2: (frames, 3, 3), of small turns about the camera's axes; what is bridged is known the less
-            the farther off the next known one is.
-        turned: (frames,), where the orientation is the path's own.
+        index: (frames,), row of the path that is nearest in time to each frame; -1 for none.
+        ahead_s: (frames,), time of this row less the time of the frame, seconds.
+        position_m: (frames, 3), the camera's centre at the frame's time, world; NaN where it is not tracked.
+        rotation: (frames, 3, 3), camera to world, in every frame; between known orientations the shortest turn.
+        turn_covariance_rad2: (frames, 3, 3), of small turns about the camera's axes; in gaps it grows with the time to
+            the next known orientation.
+        has_orientation: (frames,), whether the orientation is the path's own.
     """
 
     index: Int[np.ndarray, "frames"]
@@ -45,7 +45,7 @@ class Mounted:
     position_m: Float[np.ndarray, "frames 3"]
     rotation: Float[np.ndarray, "frames 3 3"]
     turn_covariance_rad2: Float[np.ndarray, "frames 3 3"]
-    turned: Bool[np.ndarray, "frames"]
+    has_orientation: Bool[np.ndarray, "frames"]
 
     @property
     def orientation_wxyz(self) -> Float[np.ndarray, "frames 4"]:
@@ -54,65 +54,65 @@ class Mounted:
 
     @property
     def known(self) -> Bool[np.ndarray, "frames"]:
-        """(frames,), where the path's own markers tell."""
+        """(frames,), whether a tracked pose of the path belongs to the frame."""
         return self.index >= 0
 
 
-def mounted(
+def resample_path(
     path: CameraPath, time_s: Float[np.ndarray, "frames"], offset_s: float, *, coasting: bool = False
-) -> Mounted:
-    """The path at the times of frames.
+) -> ResampledPath:
+    """Resample a path at the times of frames.
 
     Args:
-        path: of the camera.
-        time_s: (frames,), increasing.
-        offset_s: the path at t + offset_s belongs to the frame at t.
-        coasting: take what is predicted over gaps as well.
+        path: path of the camera.
+        time_s: (frames,), increasing, seconds.
+        offset_s: the path at t + offset_s belongs to the frame at t, seconds.
+        coasting: use predicted poses as well.
     """
     tracked = (
         path.seen
         & (coasting | (path.status == Status.TRACKED))
         & np.isfinite(path.orientation_wxyz).all(axis=-1)
     )
-    # What is infinitely uncertain says nothing.
+    # Poses with infinite uncertainty carry no information.
     tracked &= np.isfinite(path.covariance).all(axis=(1, 2))
     posed = path.seen & np.isfinite(path.orientation_wxyz).all(axis=-1)
     wanted_s = time_s + offset_s
     step_s = max(_step(path.time_s), _step(time_s))
     index, ahead_s = _nearest(path.time_s, np.flatnonzero(tracked), wanted_s)
     near = np.abs(ahead_s) <= step_s / 2 + _SAME_S
-    rotation, turn_covariance_rad2, turned = _turns(path, np.flatnonzero(posed), wanted_s)
+    rotation, turn_covariance_rad2, has_orientation = _orientations(path, np.flatnonzero(posed), wanted_s)
     position_m = np.full((len(time_s), 3), np.nan)
     known_s = path.time_s[tracked]
     if len(known_s) > 1:
-        # Only to tell who is who, and the arm at first: the fusion itself reads the samples as they are.
+        # These positions only serve the pairing and the first arm; the fusion uses the samples themselves.
         inside = near & (wanted_s >= known_s[0] - _SAME_S) & (wanted_s <= known_s[-1] + _SAME_S)
         position_m[inside] = CubicSpline(known_s, path.position_m[tracked])(wanted_s[inside])
-    return Mounted(
+    return ResampledPath(
         index=np.where(near, index, -1),
         ahead_s=np.where(near, ahead_s, 0.0),
         position_m=position_m,
         rotation=rotation,
         turn_covariance_rad2=turn_covariance_rad2,
-        turned=turned,
+        has_orientation=has_orientation,
     )
 
 
-def robust_arm(
-    camera: Mounted, middle_m: Float[np.ndarray, "frames 3"], frame: Int[np.ndarray, "frames"]
+def estimate_arm(
+    camera: ResampledPath, middle_m: Float[np.ndarray, "frames 3"], frame: Int[np.ndarray, "frames"]
 ) -> tuple[Float[np.ndarray, "3"], float]:
-    """The arm (3,) from the camera's centre to the middle, in the camera's axes, metres, and its standard error.
+    """The arm (3,) from the camera's centre to the middle, in the camera's axes, and its standard error, metres.
 
-    The median over frames, which no minority of gross errors moves far, then the mean of what is near it. The error
-    counts neighbouring frames as the fewer that they are worth.
+    The result is the mean of the arms near their median, which a minority of gross errors moves little. The standard
+    error accounts for the correlation of neighbouring frames.
 
     Args:
-        camera: of which some frames are known.
-        middle_m: (frames, 3), NaN where it is not known.
+        camera: resampled path.
+        middle_m: (frames, 3), middle of the silhouette; NaN where unknown.
         frame: (frames,), numbers of the frames.
     """
     arms_m = np.einsum("fji,fj->fi", camera.rotation, middle_m - camera.position_m)
-    arms_m[~camera.turned] = np.nan
+    arms_m[~camera.has_orientation] = np.nan
     there = np.isfinite(arms_m).all(axis=1)
     if not there.any():
         return np.zeros(3), np.inf
@@ -122,8 +122,10 @@ def robust_arm(
     return arms_m[near].mean(axis=0), float(np.max(np.nan_to_num(error_m, nan=np.inf)))
 
 
-def swept_m2(camera: Mounted, arm_m: Float[np.ndarray, "3"]) -> Float[np.ndarray, "frames 3 3"]:
-    """(frames, 3, 3), covariance of the arm's end, world, because the camera's turn is not known exactly."""
+def arm_covariance_m2(
+    camera: ResampledPath, arm_m: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "frames 3 3"]:
+    """(frames, 3, 3), covariance of the arm's end, world, m², due to the uncertainty of the camera's orientation."""
     by_turn = camera.rotation @ cross_matrices(arm_m)
     return by_turn @ camera.turn_covariance_rad2 @ by_turn.swapaxes(1, 2)
 
@@ -137,13 +139,13 @@ def _nearest(
     rows: Int[np.ndarray, "rows"],
     wanted_s: Float[np.ndarray, "frames"],
 ) -> tuple[Int[np.ndarray, "frames"], Float[np.ndarray, "frames"]]:
-    """The nearest of some samples to each time, and by how much it is later; each serves one frame at most."""
+    """The nearest sample to each time, and its time less the wanted time, seconds; a sample is used at most once."""
     if not len(rows):
         return np.full(len(wanted_s), -1), np.full(len(wanted_s), np.inf)
     after = np.clip(np.searchsorted(time_s[rows], wanted_s), 1, max(len(rows) - 1, 1))
     candidates = np.stack([rows[after - 1], rows[np.minimum(after, len(rows) - 1)]])
     ahead_s = time_s[candidates] - wanted_s
-    # Of two that are as near the earlier, whatever rounding says.
+    # Of two equally near samples take the earlier one, in spite of rounding.
     choice = np.where(np.abs(ahead_s[0]) <= np.abs(ahead_s[1]) + _SAME_S, 0, 1)
     frames = np.arange(len(wanted_s))
     index, ahead_s = candidates[choice, frames], ahead_s[choice, frames]
@@ -154,12 +156,12 @@ def _nearest(
     return np.where(alone, index, -1), np.where(alone, ahead_s, np.inf)
 
 
-def _turns(
+def _orientations(
     path: CameraPath, rows: Int[np.ndarray, "rows"], wanted_s: Float[np.ndarray, "frames"]
 ) -> tuple[Float[np.ndarray, "frames 3 3"], Float[np.ndarray, "frames 3 3"], Bool[np.ndarray, "frames"]]:
-    """Rotations, covariances of small turns, and where they are the path's own."""
+    """Rotations, covariances of small turns, and whether orientations are the path's own."""
     count = len(wanted_s)
-    unknown_rad2 = np.tile(_MOST_TURN_RAD**2 * np.eye(3), (count, 1, 1))
+    unknown_rad2 = np.tile(_LARGEST_TURN_RAD**2 * np.eye(3), (count, 1, 1))
     if not len(rows):
         return np.tile(np.eye(3), (count, 1, 1)), unknown_rad2, np.zeros(count, bool)
     known_s = path.time_s[rows]
@@ -172,7 +174,7 @@ def _turns(
         matrices = np.tile(rotations.as_matrix(), (count, 1, 1))
     else:
         matrices = Slerp(known_s, rotations)(np.clip(wanted_s, known_s[0], known_s[-1])).as_matrix()
-    # Between neighbouring samples a turn is known as they are; over a gap it may be any that cameras make in that time.
+    # Between neighbouring samples a turn is as certain as they are; in a gap it may be any usual turn of that duration.
     step_s = _step(path.time_s)
     bridged_s = np.where(away_s <= step_s / 2 + _SAME_S, 0.0, away_s)
     rate_rad_s = _turn_rate_rad_s(rotations, known_s, step_s)
@@ -180,17 +182,17 @@ def _turns(
     own_rad2 = np.where(np.isfinite(own_rad2), own_rad2, 0.0)
     extra_rad2 = (rate_rad_s * bridged_s) ** 2
     covariance_rad2 = own_rad2 + extra_rad2[:, None, None] * np.eye(3)
-    far = extra_rad2 > _MOST_TURN_RAD**2
+    far = extra_rad2 > _LARGEST_TURN_RAD**2
     return matrices, np.where(far[:, None, None], unknown_rad2, covariance_rad2), bridged_s == 0
 
 
 def _turn_rate_rad_s(rotations: Rotation, time_s: Float[np.ndarray, "samples"], step_s: float) -> float:
-    """About an axis, as a standard deviation; as fast as can be where no samples are neighbours."""
+    """Usual turn rate about an axis, as a standard deviation; the largest possible if no samples are neighbours."""
     steps_s = np.diff(time_s)
     near = steps_s <= 1.5 * step_s
     if not near.any():
-        return _MOST_TURN_RAD / max(step_s, _SAME_S)
+        return _LARGEST_TURN_RAD / max(step_s, _SAME_S)
     turned_rad = np.atleast_1d((rotations[:-1].inv() * rotations[1:]).magnitude())[near]
-    # The median, as poses from a wrong marker turn wildly. Of the length of three normal numbers it is 1.54 times one's
-    # standard deviation; twice that, as there are quicker turns than the usual.
+    # The median, because poses from a wrong marker turn wildly. The median length of three normal numbers is 1.54 times
+    # the standard deviation of one; the factor 2 allows for quicker turns than the usual.
     return 2 / 1.54 * float(np.median(turned_rad / steps_s[near]))

@@ -1,8 +1,8 @@
-"""A first idea of where markers are, from one that is known: one after the other, each from the frames that show it
-together with some that are placed before.
+"""An initial map: markers are placed one after the other, from frames that show them beside placed markers.
 
-A single square looks almost the same from two poses. Which of them is right is told by other frames: the right one
-stays where it is when the camera moves, the other one does not. So the poses of both kinds are tried in many frames.
+A single square looks almost the same in two poses. Other frames tell which pose is right: in the right one the marker
+stays where it is when the camera moves, in the other one it does not. The poses of both kinds are therefore compared in
+many frames.
 """
 
 from __future__ import annotations
@@ -16,20 +16,26 @@ from jaxtyping import Bool, Float, Int
 from psotrack.geometry import NEAR_M, undistort
 from psotrack.inside_out.mapping.bundle import improved
 from psotrack.inside_out.mapping.scene import MappedScene
-from psotrack.inside_out.mapping.sightings import SQUARE, MarkerSightings, two_poses
+from psotrack.inside_out.mapping.sightings import SQUARE, MarkerSightings, square_poses
 
-#: MarkerViews that a marker's poses are taken from, and tried in.
-_TRIED = 24
-#: Standard deviation of a corner of markers that are placed but not adjusted.
+#: Number of sightings from which candidates of a marker's pose are taken, and in which they are compared.
+_COMPARED_SIGHTINGS = 24
+#: Standard deviation of a corner of markers that are placed but not adjusted, pixels.
 _ROUGH_PX = 3.0
-#: Sides that are tried where they are not known, as shares of the one that is.
+#: Sides that are tried, as multiples of the usual side: where sides are known, and where they are not.
 _KNOWN_SIDE = np.ones(1)
-GROWTHS = np.geomspace(0.2, 5.0, 41)
+SIDE_FACTORS = np.geomspace(0.2, 5.0, 41)
 
 
 @dataclass(frozen=True)
-class Placed:
-    """A marker that is placed: its axes and centre in the world, and its side."""
+class PlacedMarker:
+    """Position of a marker.
+
+    Attributes:
+        R_world_marker: (3, 3), from the marker's axes to the world's.
+        centre_m: (3,), centre, world, metres.
+        side_m: side, metres.
+    """
 
     R_world_marker: Float[np.ndarray, "3 3"]
     centre_m: Float[np.ndarray, "3"]
@@ -37,13 +43,13 @@ class Placed:
 
 
 @dataclass(frozen=True)
-class MarkerViews:
-    """Where the cameras of views may be, world to camera: two poses each, twice the same where one is sure.
+class ViewPoses:
+    """Possible poses of the cameras of views, world to camera: two per view, which are equal where one is certain.
 
     Attributes:
-        R: (views, 2, 3, 3), NaN where no marker that is placed is seen.
-        t_m: (views, 2, 3).
-        count: (views,), markers that are placed.
+        R: (views, 2, 3, 3), NaN where the view shows no placed marker.
+        t_m: (views, 2, 3), metres.
+        count: (views,), number of placed markers in the view.
     """
 
     R: Float[np.ndarray, "views 2 3 3"]
@@ -51,13 +57,18 @@ class MarkerViews:
     count: Int[np.ndarray, " views"]
 
 
-class Beginning:
-    """What is worked out once of sightings, to place markers from them."""
+class MarkerPlacer:
+    """Places markers and locates views from sightings; poses of single squares are computed once, when it is made.
+
+    Args:
+        sightings: markers in views.
+        side_m: usual side of the markers, metres.
+    """
 
     def __init__(self, sightings: MarkerSightings, side_m: float) -> None:
         self.sightings = sightings
         self.side_m = side_m
-        self.R, self.t_m = two_poses(sightings, side_m)
+        self.R, self.t_m = square_poses(sightings, side_m)
         lens = sightings.lens[sightings.view]
         self.rays = np.empty_like(sightings.corners_px)
         self.focal_px = np.array([float(np.mean(np.diag(one.K)[:2])) for one in sightings.lenses])[lens]
@@ -65,8 +76,10 @@ class Beginning:
             self.rays[lens == index] = undistort(one, sightings.corners_px[lens == index])
         self._start = np.searchsorted(sightings.view, np.arange(sightings.num_views + 1))
 
-    def located(self, placed: Mapping[int, Placed], before: MappedScene | None = None) -> MarkerViews:
-        """The views' poses from the markers that are placed; those of a scene before are tried too."""
+    def locate_views(
+        self, placed: Mapping[int, PlacedMarker], before: MappedScene | None = None
+    ) -> ViewPoses:
+        """The views' poses by placed markers; the poses of an earlier scene are candidates as well."""
         num_views = self.sightings.num_views
         R, t_m = np.full((num_views, 2, 3, 3), np.nan), np.full((num_views, 2, 3), np.nan)
         count = np.zeros(num_views, int)
@@ -95,17 +108,17 @@ class Beginning:
             else:
                 chosen = [int(off.argmin())] * 2
             R[view], t_m[view] = tried_R[chosen], tried_t[chosen]
-        return MarkerViews(R, t_m, count)
+        return ViewPoses(R, t_m, count)
 
     def place(
-        self, marker: int, views: MarkerViews, growths: Float[np.ndarray, " growths"] = _KNOWN_SIDE
-    ) -> tuple[Placed, float] | None:
-        """Where a marker is in the world, of all that frames say the one that fits most of them; and its mean loss.
+        self, marker: int, views: ViewPoses, side_factors: Float[np.ndarray, " factors"] = _KNOWN_SIDE
+    ) -> tuple[PlacedMarker, float] | None:
+        """The position of a marker that fits most sightings, and its mean loss; None if no view shows the marker.
 
         Args:
-            marker: its id.
-            views: where the cameras may be.
-            growths: (growths,), sides that are tried, as shares of the usual one.
+            marker: id of the marker.
+            views: possible poses of the views.
+            side_factors: (factors,), sides that are tried, as multiples of the usual side.
         """
         rows = np.flatnonzero(
             (self.sightings.marker == marker)
@@ -114,19 +127,19 @@ class Beginning:
         )
         if not len(rows):
             return None
-        # Those with more markers first, which are surer, and then spread over time.
+        # Views with more markers come first, because they are surer; then views are spread over time.
         surest = rows[np.argsort(-np.minimum(views.count[self.sightings.view[rows]], 3), kind="stable")]
-        surest = np.sort(surest[: max(_TRIED, len(rows) // 2)])
-        rows = surest[np.linspace(0, len(surest) - 1, min(_TRIED, len(surest))).astype(int)]
+        surest = np.sort(surest[: max(_COMPARED_SIGHTINGS, len(rows) // 2)])
+        rows = surest[np.linspace(0, len(surest) - 1, min(_COMPARED_SIGHTINGS, len(surest))).astype(int)]
         at = self.sightings.view[rows]
         R_cam, t_cam = views.R[at][:, :, None, None], views.t_m[at][:, :, None, None]
         R_marker, t_marker = self.R[rows][:, None, :, None], self.t_m[rows][:, None, :, None]
-        t_marker = t_marker * growths[:, None]
+        t_marker = t_marker * side_factors[:, None]
         axes = np.broadcast_to(
-            R_cam.swapaxes(-1, -2) @ R_marker, (len(rows), 2, 2, len(growths), 3, 3)
+            R_cam.swapaxes(-1, -2) @ R_marker, (len(rows), 2, 2, len(side_factors), 3, 3)
         ).reshape(-1, 3, 3)
         centres = (R_cam.swapaxes(-1, -2) @ (t_marker - t_cam)[..., None])[..., 0].reshape(-1, 3)
-        sides = self.side_m * np.broadcast_to(growths, (len(rows), 2, 2, len(growths))).reshape(-1)
+        sides = self.side_m * np.broadcast_to(side_factors, (len(rows), 2, 2, len(side_factors))).reshape(-1)
         corners = centres[:, None] + (sides[:, None, None] * SQUARE) @ axes.swapaxes(-1, -2)
         # (candidates, views, two poses): a view agrees with a candidate if one of its poses does.
         loss = np.stack(
@@ -139,7 +152,7 @@ class Beginning:
         best = int(total.argmin())
         if not np.isfinite(total[best]):
             return None
-        return Placed(axes[best], centres[best], float(sides[best])), float(total[best])
+        return PlacedMarker(axes[best], centres[best], float(sides[best])), float(total[best])
 
     def _losses(
         self,
@@ -148,56 +161,56 @@ class Beginning:
         R: Float[np.ndarray, "*#candidates 3 3"],
         t_m: Float[np.ndarray, "*#candidates 3"],
     ) -> Float[np.ndarray, "*candidates"]:
-        """The Cauchy loss of sightings, with world points and poses that broadcast against them along the last axis."""
+        """Cauchy loss of sightings; world points and poses broadcast against the rows along the last axis."""
         points = corners_m @ R.swapaxes(-1, -2) + t_m[..., None, :]
         depth = points[..., 2]
         off = points[..., :2] / np.where(depth > NEAR_M, depth, np.nan)[..., None] - self.rays[rows]
         squares = (off**2).sum(axis=-1).sum(axis=-1) * (self.focal_px[rows] / _ROUGH_PX) ** 2
-        # Behind a camera is as bad as anything.
+        # A marker behind the camera has the largest loss.
         return np.log1p(np.where(np.isfinite(squares), squares, 1e12))
 
 
-def begin(
+def place_markers(
     sightings: MarkerSightings,
-    known: Mapping[int, Placed],
+    known: Mapping[int, PlacedMarker],
     side_m: float,
     *,
     noise_px: float,
     estimate_sides: bool = False,
-) -> dict[int, Placed]:
-    """Where all markers are that can be reached from known ones, roughly.
+) -> dict[int, PlacedMarker]:
+    """Roughly place all markers that known markers lead to.
 
     Args:
-        sightings: of not too many views: each marker that is placed is followed by an adjustment.
-        known: markers by id.
-        side_m: of those that are not known; a first guess if they are estimated.
-        noise_px: standard deviation of a corner.
-        estimate_sides: of those that are not known.
+        sightings: markers in a moderate number of views: an adjustment follows each placed marker.
+        known: known markers by id.
+        side_m: side of the other markers, metres; an initial value if sides are estimated.
+        noise_px: standard deviation of a corner, pixels.
+        estimate_sides: estimate the sides of the markers that are not known.
     """
-    beginning = Beginning(sightings, side_m)
+    placer = MarkerPlacer(sightings, side_m)
     placed, scene, inset_px = dict(known), None, np.zeros(len(sightings.lenses))
-    growths = GROWTHS if estimate_sides else _KNOWN_SIDE
+    side_factors = SIDE_FACTORS if estimate_sides else _KNOWN_SIDE
     unreachable: set[int] = set()
     while True:
-        views = beginning.located(placed, scene)
+        views = placer.locate_views(placed, scene)
         marker = _next(sightings, views, set(placed) | unreachable)
         if marker is None:
             return placed
-        found = beginning.place(marker, views, growths)
+        found = placer.place(marker, views, side_factors)
         if found is None:
             unreachable.add(marker)
             continue
         placed[marker] = found[0]
-        views = beginning.located(placed, scene)
-        scene = scene_of(placed, views, inset_px)
+        views = placer.locate_views(placed, scene)
+        scene = make_scene(placed, views, inset_px)
         several = np.isin(sightings.marker, list(placed)) & (views.count[sightings.view] >= 2)
         if several.any():
-            scene = improved_part(sightings, scene, several, list(known), noise_px, estimate_sides)
+            scene = _adjust_part(sightings, scene, several, list(known), noise_px, estimate_sides)
             inset_px = scene.inset_px
-            placed |= {name: one for name, one in placed_of(scene).items() if name not in known}
+            placed |= {name: one for name, one in placed_markers(scene).items() if name not in known}
 
 
-def improved_part(
+def _adjust_part(
     sightings: MarkerSightings,
     scene: MappedScene,
     kept: Bool[np.ndarray, " sightings"],
@@ -205,7 +218,7 @@ def improved_part(
     noise_px: float,
     estimate_sides: bool,
 ) -> MappedScene:
-    """A scene adjusted to some of the sightings; the views without any are NaN."""
+    """A scene adjusted to a part of the sightings; views without any of these sightings are NaN."""
     part, views = sightings.select(kept), np.unique(sightings.view[kept])
     seen = set(part.ids)
     chosen = np.array([marker in seen for marker in scene.ids.tolist()])
@@ -226,10 +239,10 @@ def improved_part(
     return MappedScene(R, t_m, scene.ids, axes, centres, sides, better.inset_px)
 
 
-def scene_of(
-    placed: Mapping[int, Placed], views: MarkerViews, inset_px: Float[np.ndarray, " videos"]
+def make_scene(
+    placed: Mapping[int, PlacedMarker], views: ViewPoses, inset_px: Float[np.ndarray, " videos"]
 ) -> MappedScene:
-    """Markers that are placed, and the likelier pose of each view."""
+    """The scene of placed markers, with the likelier pose of each view."""
     ids = sorted(placed)
     return MappedScene(
         views.R[:, 0],
@@ -242,14 +255,14 @@ def scene_of(
     )
 
 
-def placed_of(scene: MappedScene) -> dict[int, Placed]:
-    """The markers of a scene."""
+def placed_markers(scene: MappedScene) -> dict[int, PlacedMarker]:
+    """The markers of a scene, by id."""
     rows = zip(scene.ids.tolist(), scene.R_world_marker, scene.centre_m, scene.side_m.tolist(), strict=True)
-    return {marker: Placed(axes, centre, side) for marker, axes, centre, side in rows}
+    return {marker: PlacedMarker(axes, centre, side) for marker, axes, centre, side in rows}
 
 
-def _next(sightings: MarkerSightings, views: MarkerViews, done: set[int]) -> int | None:
-    """The marker that most frames show beside placed ones."""
+def _next(sightings: MarkerSightings, views: ViewPoses, done: set[int]) -> int | None:
+    """The marker that most views show beside placed markers; None if there is none."""
     sure = np.minimum(views.count, 3)[sightings.view]
     weight = {
         marker: int(sure[sightings.marker == marker].sum()) for marker in sightings.ids if marker not in done

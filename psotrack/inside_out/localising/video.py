@@ -1,0 +1,109 @@
+"""Localising a camera in a video: decoding, detection of markers, poses and filter, as one loop over frames."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from psotrack.errors import InputError
+from psotrack.geometry import Camera
+from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
+from psotrack.inside_out.filtering.path_rows import join_rows
+from psotrack.inside_out.frames import Frame, FrameSource, read_ahead
+from psotrack.inside_out.localising.frame_poses import localise_frames
+from psotrack.inside_out.localising.records import STAGES, LocalisedVideo, LocaliseSettings
+from psotrack.inside_out.marker_map import MarkerMap
+from psotrack.support import Report, no_progress
+
+#: Number, time (seconds) and grey image of a frame.
+_GreyFrame = tuple[int, float, UInt8[np.ndarray, "height width"]]
+
+
+def localise_video(
+    source: FrameSource,
+    marker_map: MarkerMap,
+    lens: Camera,
+    settings: LocaliseSettings | None = None,
+    report: Report = no_progress,
+) -> LocalisedVideo:
+    """Localise a camera in every frame, from markers of known positions.
+
+    A thread decodes frames and converts them to grey, ahead of the detection of markers. Markers that are not in the
+    map are not detected. Where two poses fit a frame's markers about equally well, the filter's prediction decides;
+    then the filter uses the pose or gates it.
+
+    Args:
+        source: frames of the camera.
+        marker_map: map of the room.
+        lens: intrinsics of the camera, for the size of the frames; the pose in it is ignored.
+        settings: settings of detection, pose estimation and filter.
+        report: progress is reported to it.
+
+    Returns:
+        The path, with all frames of the source. A stream ends by itself or by Ctrl-C.
+
+    Raises:
+        InputError: frames cannot be read, or end early; or the lens is for another size of images.
+        SettingsError: there is no dictionary of this name, or it has none of the map's markers.
+    """
+    settings = (settings or LocaliseSettings()).within(source.num_frames)
+    _check_size(source, lens)
+    detector = MarkerDetector(settings.dictionary, lens, ids=marker_map.ids.tolist())
+    seconds = dict.fromkeys(STAGES, 0.0)
+    raw_rows, rows, interrupted = [], [], False
+    began_s = time.perf_counter()
+    try:
+        with report("localise", source.num_frames or 0) as done:
+            for raw, row in localise_frames(
+                _detect_markers(source, detector, seconds), marker_map, lens, settings, seconds
+            ):
+                raw_rows.append(raw)
+                rows.append(row)
+                done(1)
+    except KeyboardInterrupt:
+        # A recording can be localised again, a stream cannot: the frames of a stream are kept.
+        if not source.stream or not rows:
+            raise
+        interrupted = True
+    # Ctrl-C may come between the two appends.
+    raw_rows = raw_rows[: len(rows)]
+    wall_s = time.perf_counter() - began_s
+    return LocalisedVideo(join_rows(rows), join_rows(raw_rows), seconds, wall_s, interrupted)
+
+
+def _detect_markers(
+    source: FrameSource, detector: MarkerDetector, seconds: dict[str, float]
+) -> Iterator[tuple[int, float, DetectedMarkers]]:
+    for number, time_s, gray in read_ahead(_grey_frames(source, seconds), newest=source.newest):
+        start_s = time.perf_counter()
+        markers = detector.detect(gray)
+        seconds["detect"] += time.perf_counter() - start_s
+        yield number, time_s, markers
+
+
+def _check_size(source: FrameSource, lens: Camera) -> None:
+    size_wh = (int(lens.image_size_wh[0]), int(lens.image_size_wh[1]))
+    if size_wh != source.image_size_wh:
+        raise InputError(
+            source.name,
+            expected=f"{size_wh[0]} x {size_wh[1]} pixels as the lens is for",
+            found=f"{source.image_size_wh[0]} x {source.image_size_wh[1]}",
+        )
+
+
+def _grey_frames(source: FrameSource, seconds: dict[str, float]) -> Iterator[_GreyFrame]:
+    frames: Iterator[Frame] = source.frames()
+    while True:
+        start_s = time.perf_counter()
+        frame = next(frames, None)
+        decoded_s = time.perf_counter()
+        seconds["decode"] += decoded_s - start_s
+        if frame is None:
+            return
+        gray = np.asarray(cv2.cvtColor(frame.bgr, cv2.COLOR_BGR2GRAY), np.uint8)
+        seconds["grey"] += time.perf_counter() - decoded_s
+        yield frame.number, frame.time_s, gray

@@ -1,0 +1,147 @@
+"""Estimation of a camera's pose from the corners of markers in one frame.
+
+The fit starts at the pose of all markers together. Where this pose does not explain most of the markers, some markers
+are wrong, and poses of pairs of markers are fitted too (see `initial_poses`); markers in a plane have a second pose.
+Likelihoods, and the pose that motion predicts, decide which of the fitted poses is returned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from math import comb, log, pi
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from psotrack.errors import InputError
+from psotrack.geometry import Camera, undistort
+from psotrack.inside_out.pose.equations import SeenCorners, seen_markers
+from psotrack.inside_out.pose.fit import Fit, fit
+from psotrack.inside_out.pose.initial_poses import LOOSE, mirrored_poses, pose_of_all, poses_of_pairs
+from psotrack.inside_out.pose.records import ExpectedPose, MarkerPose, PoseSettings
+
+#: Number of markers that suffices for a pose; in frames of fewer than twice as many, half of the markers suffice.
+_ENOUGH_MARKERS = 4
+#: Logarithm of the density of a pose that is not where motion predicts it: in 1 of 1000 frames the camera is anywhere
+#: in 1000 m³, in any orientation.
+_LOG_UNEXPECTED = -log(1e3 * 1e3 * 8 * pi**2)
+#: Squared Mahalanobis distance of two poses below which they are one pose: χ² with 6 degrees of freedom exceeds it
+#: with probability 1/1000.
+_SAME = 22.5
+
+
+def estimate_pose(
+    corners_px: Float[np.ndarray, "markers 4 2"],
+    corners_m: Float[np.ndarray, "markers 4 3"],
+    lens: Camera,
+    settings: PoseSettings,
+    expected: ExpectedPose | None = None,
+) -> MarkerPose | None:
+    """Estimate the pose of a camera from one frame's markers; whole markers and single corners may be wrong.
+
+    Args:
+        corners_px: (markers, 4, 2), corners in the image, pixels.
+        corners_m: (markers, 4, 3), the same corners in the world, metres.
+        lens: intrinsics of the camera; the pose in it is ignored.
+        settings: settings of pose estimation.
+        expected: pose that motion predicts; decides between poses that fit about equally well.
+
+    Returns:
+        The pose; None where there are too few markers, or no pose explains the markers.
+
+    Raises:
+        InputError: a coordinate is not finite.
+    """
+    if not (np.isfinite(corners_px).all() and np.isfinite(corners_m).all()):
+        raise InputError("corners", expected="finite coordinates", found="NaN or infinity")
+    if len(corners_px) < settings.min_markers:
+        return None
+    corners = seen_markers(
+        np.asarray(corners_px, np.float64),
+        np.asarray(corners_m, np.float64),
+        lens,
+        settings.noise_px,
+        settings.place_m,
+        settings.map_error_m,
+        settings.focal_error,
+    )
+    poses = _likely_poses(corners, undistort(lens, corners.corners_px))
+    # One or two markers of many may agree by chance: any single marker has a pose that explains it.
+    poses = [pose for pose in poses if pose.used.sum() >= min(_ENOUGH_MARKERS, len(corners_px) / 2)]
+    if not poses:
+        return None
+    log_likelihood = np.array([pose.log_evidence + _log_prior(pose, expected) for pose in poses])
+    best = poses[log_likelihood.argmax()]
+    odds = np.exp(np.sort(log_likelihood - log_likelihood.max()))[-2:-1].sum()
+    return MarkerPose(
+        best.position_m,
+        best.R_world_cam,
+        best.covariance,
+        best.used,
+        best.reprojection_px,
+        float(odds / (1 + odds)),
+        best.common,
+        _chance(corners, best),
+    )
+
+
+def _chance(corners: SeenCorners, best: Fit) -> float:
+    """Expected number of sets of as many markers that agree by chance: all but one fall near their projections.
+
+    This is an upper bound on the probability: sizes and orientations of the markers, which would have to agree as well,
+    are left out.
+    """
+    count, others = len(best.used), int(best.used.sum()) - 1
+    near_px = LOOSE * max(corners.noise_px, best.reprojection_px)
+    area_px2 = np.prod(np.asarray(corners.lens.image_size_wh, float))
+    return min(float(count * comb(count - 1, others) * min(pi * near_px**2 / area_px2, 1.0) ** others), 1.0)
+
+
+def _likely_poses(corners: SeenCorners, rays: Float[np.ndarray, "markers 4 2"]) -> list[Fit]:
+    """Different poses that explain all markers or some of them, the most likely first."""
+    found = _distinct(fit(corners, *pose) for pose in pose_of_all(corners, rays))
+    # If all markers agree, or at least three and more than half of them, no other pose explains as many as well.
+    enough, near_px = min(max(3, len(rays) // 2 + 1), len(rays)), LOOSE * corners.noise_px
+    if not found or found[0].used.sum() < enough or found[0].reprojection_px > near_px:
+        by_pairs = poses_of_pairs(corners, rays)
+        found = _distinct([*found, *(fit(corners, *pose, fits) for pose, fits in by_pairs)])
+    mirrored = [
+        fit(corners, *pose, best.fits) for best in found for pose in mirrored_poses(corners, rays, best)
+    ]
+    return _distinct([*found, *mirrored])
+
+
+def _distinct(fits: Iterable[Fit | None]) -> list[Fit]:
+    """Fits, the most likely first, without those that are the same pose as a more likely one."""
+    found: list[Fit] = []
+    for pose in sorted((pose for pose in fits if pose is not None), key=lambda pose: -pose.log_evidence):
+        if not any(
+            _mahalanobis2(pose, other.position_m, other.R_world_cam, other.covariance)[0] < _SAME
+            for other in found
+        ):
+            found.append(pose)
+    return found
+
+
+def _mahalanobis2(
+    pose: Fit,
+    position_m: Float[np.ndarray, "3"],
+    R_world_cam: Float[np.ndarray, "3 3"],
+    covariance: Float[np.ndarray, "6 6"],
+) -> tuple[float, float]:
+    """Squared Mahalanobis distance of two poses, and the log determinant of the sum of their covariances."""
+    turn = Rotation.from_matrix(R_world_cam.T @ pose.R_world_cam).as_rotvec()
+    apart = np.concatenate([pose.position_m - position_m, turn])
+    both = pose.covariance + covariance
+    return float(apart @ np.linalg.solve(both, apart)), float(np.linalg.slogdet(both)[1])
+
+
+def _log_prior(pose: Fit, expected: ExpectedPose | None) -> float:
+    """Log density of a pose given the pose that motion predicts."""
+    if expected is None:
+        return 0.0
+    square, log_determinant = _mahalanobis2(
+        pose, expected.position_m, expected.R_world_cam, expected.covariance
+    )
+    return float(np.logaddexp(-0.5 * (square + log_determinant + 6 * log(2 * pi)), _LOG_UNEXPECTED))

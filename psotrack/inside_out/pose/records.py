@@ -1,0 +1,87 @@
+"""Records of pose estimation: its settings, the pose that motion predicts, and the pose that a frame's markers give."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from psotrack.errors import SettingsError, check_positive
+
+
+@dataclass(frozen=True)
+class PoseSettings:
+    """Settings of pose estimation.
+
+    Attributes:
+        min_markers: smallest number of markers that a pose is estimated from, 1 or more.
+        noise_px: standard deviation of a corner along x and along y, pixels; corrected by residuals where there are
+            enough of them.
+        place_m: standard deviation of the error that all corners of a marker share in one frame, along each axis of
+            the world, metres; corrected by residuals as well.
+        map_error_m: standard deviation of a marker's position in the map along each axis, metres; the same error in
+            every frame.
+        focal_error: standard deviation of the focal length, as a share of the focal length; the same error in every
+            frame.
+    """
+
+    min_markers: int = 4
+    noise_px: float = 0.2
+    place_m: float = 0.0001
+    map_error_m: float = 0.0
+    focal_error: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_positive("noise_px", self.noise_px)
+        check_positive("place_m", self.place_m)
+        if self.min_markers < 1:
+            raise SettingsError("min_markers", expected="at least 1", found=f"{self.min_markers}")
+        for name in ("map_error_m", "focal_error"):
+            if not 0 <= getattr(self, name) < 1:
+                raise SettingsError(
+                    name, expected="a number from 0 to below 1", found=f"{getattr(self, name):g}"
+                )
+
+
+@dataclass(frozen=True)
+class ExpectedPose:
+    """Pose of a camera as its motion predicts it.
+
+    Attributes:
+        position_m: (3,), the camera's centre, world, metres.
+        R_world_cam: (3, 3), camera to world.
+        covariance: (6, 6), as in `CameraPath`.
+    """
+
+    position_m: Float[np.ndarray, "3"]
+    R_world_cam: Float[np.ndarray, "3 3"]
+    covariance: Float[np.ndarray, "6 6"]
+
+
+@dataclass(frozen=True)
+class MarkerPose:
+    """Pose of a camera from the markers in one frame, with its uncertainty.
+
+    Attributes:
+        position_m: (3,), the camera's centre, world, metres.
+        R_world_cam: (3, 3), camera to world; camera axes x right, y down, z ahead.
+        covariance: (6, 6), as in `CameraPath`: of the position along the world's axes (m) and of a small turn about the
+            camera's axes (rad).
+        used: (markers,), the markers that the pose explains.
+        reprojection_px: root mean square distance, over the used corners, between image and projection, pixels.
+        ambiguity: probability that another pose is the right one, 0 to 1/2.
+        common: (6, 3 markers + 1), a matrix square root of the part of the covariance that comes from errors common
+            to all frames: a column per axis of each marker's position in the map, and one for the focal length, each
+            for an error of one standard deviation.
+        chance: upper bound on the probability that this many markers agree by chance although all were misread.
+    """
+
+    position_m: Float[np.ndarray, "3"]
+    R_world_cam: Float[np.ndarray, "3 3"]
+    covariance: Float[np.ndarray, "6 6"]
+    used: Bool[np.ndarray, "markers"]
+    reprojection_px: float
+    ambiguity: float
+    common: Float[np.ndarray, "6 errors"]
+    chance: float
