@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from psotrack.correspondence import NEW, SHARED, UNEXPLAINED, epipolar_distance, match
+from psotrack.correspondence import NEW_GROUP_COST, SHARED_COST, UNEXPLAINED_COST, epipolar_distance, match
 from psotrack.errors import SettingsError
 from psotrack.geometry import project
 
@@ -114,9 +114,9 @@ def least_total(rig, points, noise_px):
     triples = [
         (triple, cost)
         for triple in product(*(range(len(one)) for one in points))
-        if (cost := reprojection_cost(rig, points, triple, noise_px)) < 3 * UNEXPLAINED
+        if (cost := reprojection_cost(rig, points, triple, noise_px)) < 3 * UNEXPLAINED_COST
     ]
-    best, chosen = UNEXPLAINED * sum(map(len, points)), frozenset()
+    best, chosen = UNEXPLAINED_COST * sum(map(len, points)), frozenset()
 
     def search(start, used, groups, total):
         nonlocal best, chosen
@@ -127,7 +127,7 @@ def least_total(rig, points, noise_px):
             again = len(used & set(enumerate(triple)))
             # Two detections of its own, and one that it shares at most.
             if again < 2:
-                price = NEW + cost + SHARED * again - UNEXPLAINED * (3 - again)
+                price = NEW_GROUP_COST + cost + SHARED_COST * again - UNEXPLAINED_COST * (3 - again)
                 search(number + 1, used | set(enumerate(triple)), [*groups, triple], total + price)
 
     search(0, frozenset(), [], best)
@@ -139,9 +139,11 @@ def total_of(rig, points, groups, noise_px):
     total = 0.0
     for group in groups:
         taken = {(c, i) for c, i in enumerate(group) if i >= 0}
-        total += NEW + reprojection_cost(rig, points, group, noise_px) + SHARED * len(taken - left)
+        total += (
+            NEW_GROUP_COST + reprojection_cost(rig, points, group, noise_px) + SHARED_COST * len(taken - left)
+        )
         left -= taken
-    return total + UNEXPLAINED * len(left)
+    return total + UNEXPLAINED_COST * len(left)
 
 
 @pytest.mark.parametrize("seed", range(16))
@@ -233,10 +235,12 @@ def test_two_views_alone_are_not_trusted():
     points[1] = points[3] = points[4] = np.empty((0, 2))
     assert not len(matched(rig, points, 1.0).position_m)
     # A prediction of one of them speaks for it, and for no other.
-    told = matched(rig, points, 1.0, expected_m=drones[1:], expected_covariance_m2=0.01 * np.eye(3)[None])
-    assert told.detection.tolist() == [[1, -1, 1, -1, -1]]
-    assert told.expected.tolist() == [0]
-    np.testing.assert_allclose(told.position_m, drones[1:], atol=1e-6)
+    with_prediction = matched(
+        rig, points, 1.0, expected_m=drones[1:], expected_covariance_m2=0.01 * np.eye(3)[None]
+    )
+    assert with_prediction.detection.tolist() == [[1, -1, 1, -1, -1]]
+    assert with_prediction.expected.tolist() == [0]
+    np.testing.assert_allclose(with_prediction.position_m, drones[1:], atol=1e-6)
     # Where no camera has two detections there is nothing to confuse.
     alone = matched(rig, [one[:1] for one in points], 1.0)
     assert alone.detection.tolist() == [[0, -1, 0, -1, -1]]

@@ -1,7 +1,7 @@
+from .assignment import SEPARATION_M
 from .epipolar import epipolar_distance
-from .groups import NEW, SHARED, UNEXPLAINED
+from .groups import NEW_GROUP_COST, SHARED_COST, UNEXPLAINED_COST
 from .matching import Matches, match
-from .packing import SEPARATION_M
 from .sightings import (
     BORDER_PX,
     CUT_SHARE,
@@ -16,12 +16,12 @@ from .sightings import (
 __all__ = [
     "BORDER_PX",
     "CUT_SHARE",
-    "NEW",
+    "NEW_GROUP_COST",
     "NOISE_PX",
     "NOISE_SHARE",
     "SEPARATION_M",
-    "SHARED",
-    "UNEXPLAINED",
+    "SHARED_COST",
+    "UNEXPLAINED_COST",
     "CameraSightings",
     "Matches",
     "Sightings",

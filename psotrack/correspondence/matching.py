@@ -1,4 +1,4 @@
-"""Matching detections over cameras: `match`, from cameras and pixels to drones."""
+"""Matching of detections over cameras: `match` computes drones from cameras and pixels."""
 
 from __future__ import annotations
 
@@ -7,27 +7,27 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.correspondence.groups import SHARED, UNEXPLAINED, Groups
-from psotrack.correspondence.packing import exchanged, offers_of, packed
-from psotrack.correspondence.proposals import proposals
-from psotrack.correspondence.sight import Sight, priors_of, sight_of
+from psotrack.correspondence.assignment import apply_exchanges, assign_groups, propose_exchanges
+from psotrack.correspondence.groups import SHARED_COST, UNEXPLAINED_COST, Groups
+from psotrack.correspondence.padded_sightings import PaddedSightings, make_priors, pad_sightings
+from psotrack.correspondence.proposals import propose_groups
 from psotrack.errors import SettingsError
 from psotrack.geometry import Camera, triangulate
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Drones in one frame, each with the detections that are of it.
+    """Drones in one frame, and the detections of each drone.
 
     Attributes:
-        position_m: (drones, 3), by `triangulate`, world, metres.
-        detection: (drones, cameras), index of the detection that each camera sees the drone at, -1 for none. Two drones
-            that overlap in an image may share one.
-        cost: (drones,), mean over these detections of the squared distance from where the drone is seen, in standard
-            deviations: about 2 - 3 / n for n of them.
-        ambiguity: (drones,), 0 to 1, likelihood relative to this assignment of the best other one found in which some
-            of these detections are of a drone elsewhere.
-        expected: (drones,), index of the expected drone that it is, -1 for one that nobody expected.
+        position_m: (drones, 3), positions in the world, computed by `triangulate`, metres.
+        detection: (drones, cameras), index of the drone's detection in each camera; -1 for no detection. Two drones
+            that overlap in an image may share a detection.
+        cost: (drones,), mean squared distance of the drone's detections from its projections, in squared standard
+            deviations: about 2 - 3 / n for n detections.
+        ambiguity: (drones,), from 0 to 1: likelihood, relative to this assignment, of the best other assignment that
+            was found and in which some of the drone's detections belong to a drone at another place.
+        expected: (drones,), index of the expected drone; -1 for a drone that was not expected.
     """
 
     position_m: Float[np.ndarray, "drones 3"]
@@ -47,24 +47,25 @@ def match(
     expected_m: Float[np.ndarray, "known 3"] | None = None,
     expected_covariance_m2: Float[np.ndarray, "known 3 3"] | None = None,
 ) -> Matches:
-    """The groups of detections with the least total cost (see `psotrack.correspondence`).
+    """Find the groups of detections that have the smallest total cost (see `psotrack.correspondence`).
 
-    Two viewpoints are enough for a drone that is expected; and where no camera has more than one detection, for then
-    there is nothing to confuse. The position is from the detections alone: what was expected only helps to tell whose
-    they are.
+    Two viewpoints are enough for an expected drone. They are also enough if no camera has more than one detection and
+    at most one drone is expected, because then no detections can be confused. The positions are computed from the
+    detections alone: the expected positions only help to find which detections belong to which drone.
 
     Args:
-        cameras: with one leading axis.
-        points_px: for each camera (n, 2), middles of detections; n may be 0, and what is not finite is no detection.
-        noise_px: for each camera (n,), their standard deviations along either axis.
-        bounds_m: (2, 3), corners of the region where drones are.
-        min_views: least number of viewpoints (see `triangulation.viewpoints`), 2 or more.
-        expected_m: (known, 3), predicted positions of drones, world.
-        expected_covariance_m2: (known, 3, 3), covariances of the predictions.
+        cameras: cameras with one leading axis.
+        points_px: for each camera (n, 2), middles of the detections, pixels; n may be 0. A row that is not finite is
+            no detection.
+        noise_px: for each camera (n,), standard deviations of the middles along each axis, pixels.
+        bounds_m: (2, 3), corners of the region where drones can be, metres.
+        min_views: smallest number of viewpoints (see `psotrack.geometry.viewpoints`), 2 or more.
+        expected_m: (known, 3), predicted positions of drones in the world, metres.
+        expected_covariance_m2: (known, 3, 3), covariances of the predictions, square metres.
 
     Raises:
-        SettingsError: a noise is not above 0, predictions come without covariances or the reverse, or fewer than two
-            views are to be enough.
+        SettingsError: a noise is not above 0, predictions have no covariances or the reverse, or `min_views` is below
+            2.
     """
     if (expected_m is None) != (expected_covariance_m2 is None):
         raise SettingsError(
@@ -74,54 +75,55 @@ def match(
         raise SettingsError("min_views", expected="2 or more", found=f"{min_views}")
     if expected_m is None or expected_covariance_m2 is None:
         expected_m, expected_covariance_m2 = np.empty((0, 3)), np.empty((0, 3, 3))
-    alone = len(expected_m) < 2 and max(map(len, points_px), default=0) < 2
-    priors = priors_of(bounds_m, expected_m, expected_covariance_m2, 2 if alone else min_views)
-    sight = sight_of(cameras, points_px, noise_px)
-    proposed = proposals(sight, priors, bounds_m)
-    return _matches(sight, packed(sight, proposed, priors, bounds_m), proposed)
+    unambiguous = len(expected_m) < 2 and max(map(len, points_px), default=0) < 2
+    priors = make_priors(bounds_m, expected_m, expected_covariance_m2, 2 if unambiguous else min_views)
+    padded = pad_sightings(cameras, points_px, noise_px)
+    proposed = propose_groups(padded, priors, bounds_m)
+    return _matches(padded, assign_groups(padded, proposed, priors, bounds_m), proposed)
 
 
-def _matches(sight: Sight, groups: Groups, proposed: Groups) -> Matches:
-    views = np.arange(len(sight.x)), groups.support
-    x = np.where(groups.seen[..., None], sight.x[views], np.nan)
-    weights = 1 / (sight.variance[views] * sight.depth(groups.point) ** 2)
-    position = triangulate(sight.straight, x, weights)
-    squared = np.where(groups.seen, UNEXPLAINED - SHARED * groups.shared - groups.gain, 0.0)
-    # Rays of two views may be parallel.
+def _matches(padded: PaddedSightings, groups: Groups, proposed: Groups) -> Matches:
+    views = np.arange(len(padded.x)), groups.detection
+    x = np.where(groups.seen[..., None], padded.x[views], np.nan)
+    weights = 1 / (padded.variance[views] * padded.depth(groups.point) ** 2)
+    position = triangulate(padded.straight, x, weights)
+    squared = np.where(groups.seen, UNEXPLAINED_COST - SHARED_COST * groups.shared - groups.gain, 0.0)
+    # Two rays may be parallel: then the group has no position.
     there = np.isfinite(position).all(axis=-1)
     return Matches(
         position_m=position[there],
-        detection=groups.support[there],
+        detection=groups.detection[there],
         cost=(squared.sum(axis=-1) / groups.seen.sum(axis=-1))[there],
-        ambiguity=_ambiguity(sight, groups, proposed)[there],
+        ambiguity=_ambiguity(padded, groups, proposed)[there],
         expected=groups.prior[there],
     )
 
 
-def _ambiguity(sight: Sight, groups: Groups, proposed: Groups) -> Float[np.ndarray, "groups"]:
-    """Likelihood relative to this assignment of the best other one found, for each group (see `Matches`).
+def _ambiguity(padded: PaddedSightings, groups: Groups, proposed: Groups) -> Float[np.ndarray, "groups"]:
+    """For each group, the likelihood of the best other assignment relative to this assignment (see `Matches`).
 
-    A rival of a group is a candidate that has some of its detections, another one in place of some, and a place that
-    the group's detections do not speak for. It is put in, whatever that costs, and what is left completed.
+    A rival of a group is a candidate that has some of the group's detections, has other detections in other cameras
+    of the group, and is at a place that the group's detections exclude. Each rival is put into the assignment at any
+    cost, and the remaining detections are assigned anew.
     """
     both = proposed.seen[:, None] & groups.seen
-    same = proposed.support[:, None] == groups.support
+    same = proposed.detection[:, None] == groups.detection
     off = proposed.point[:, None] - groups.point
-    elsewhere = np.einsum("pgi,gij,pgj->pg", off, np.linalg.inv(groups.covariance), off) > UNEXPLAINED
+    elsewhere = np.einsum("pgi,gij,pgj->pg", off, np.linalg.inv(groups.covariance), off) > UNEXPLAINED_COST
     rival = (both & same).any(axis=-1) & (both & ~same).any(axis=-1) & elsewhere
     ambiguity = np.zeros(len(groups))
     if not rival.any():
         return ambiguity
-    offers = offers_of(sight, groups, proposed, forced=True)
-    value = np.where(rival, offers.value[:, None], -np.inf)
+    exchanges = propose_exchanges(padded, groups, proposed, forced=True)
+    value = np.where(rival, exchanges.value[:, None], -np.inf)
     for which in np.unique(value.argmax(axis=0)[rival.any(axis=0)]):
-        gained = offers.value[which]
-        if offers.broken[which].any():
-            # What is left may be of other drones. The rival stays: nothing is taken from it.
-            taken = (proposed.support == proposed.support[which]) & proposed.seen[which]
+        gained = exchanges.value[which]
+        if exchanges.broken[which].any():
+            # The remaining detections may form other groups, but must not take detections of the rival.
+            taken = (proposed.detection == proposed.detection[which]) & proposed.seen[which]
             others = proposed.only(~taken.any(axis=-1))
-            other = exchanged(sight, offers.accepted(groups, proposed, int(which)), others)
-            gained = other.worth.sum() - groups.worth.sum()
+            other = apply_exchanges(padded, exchanges.apply(groups, proposed, int(which)), others)
+            gained = other.saving.sum() - groups.saving.sum()
         likelihood = np.exp(min(gained, 0.0) / 2)
         ambiguity[rival[which]] = np.maximum(ambiguity[rival[which]], likelihood)
     return ambiguity

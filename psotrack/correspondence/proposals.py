@@ -1,84 +1,103 @@
-"""Candidates for groups: what pairs of detections and predictions propose, completed by the other views."""
+"""Candidates for groups: pairs of detections, and predictions, completed with detections of the other cameras."""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.correspondence.epipolar import line_distances
+from psotrack.correspondence.epipolar import squared_epipolar_distances
 from psotrack.correspondence.groups import (
-    UNEXPLAINED,
+    UNEXPLAINED_COST,
     Groups,
-    distances,
-    equations,
-    measured,
-    solved,
-    valid,
-    within,
+    are_in_bounds,
+    are_valid,
+    make_groups,
+    normal_equations,
+    solve_points,
+    squared_distances,
 )
-from psotrack.correspondence.sight import Priors, Sight
+from psotrack.correspondence.padded_sightings import PaddedSightings, Priors
 
 
-def proposals(sight: Sight, priors: Priors, bounds_m: Float[np.ndarray, "2 3"]) -> Groups:
-    """Groups of the detections nearest to where something is proposed, without heed to other groups."""
-    point, covariance = _pairs(sight, priors)
-    kept = within(point, bounds_m)
-    point, covariance, prior = _with_expected(point[kept], covariance[kept], priors)
-    # From two rays to all that agree; then those that agree with all.
+def propose_groups(padded: PaddedSightings, priors: Priors, bounds_m: Float[np.ndarray, "2 3"]) -> Groups:
+    """Candidates for groups: in every camera the detection nearest to the projection of a proposed point.
+
+    Candidates may share detections: `assign_groups` chooses among them.
+
+    Args:
+        padded: sightings of the frame.
+        priors: expected drones, and the room.
+        bounds_m: (2, 3), corners of the region where drones can be, metres.
+    """
+    point, covariance = _pair_points(padded, priors)
+    kept = are_in_bounds(point, bounds_m)
+    point, covariance, prior = _add_expected(point[kept], covariance[kept], priors)
+    # First add all detections that agree with the two rays, then keep those that agree with the resulting point.
     for _ in range(2):
-        distance = distances(sight, point[:, None], covariance[:, None])
-        support = np.where(distance.min(axis=-1) < UNEXPLAINED, distance.argmin(axis=-1), -1)
-        _, first = np.unique(np.column_stack([support, prior]), axis=0, return_index=True)
-        support = support[first]
-        groups = measured(sight, priors, support, np.zeros(support.shape, bool), prior[first], point[first])
-        groups = groups.only(within(groups.point, bounds_m))
+        distance = squared_distances(padded, point[:, None], covariance[:, None])
+        detection = np.where(distance.min(axis=-1) < UNEXPLAINED_COST, distance.argmin(axis=-1), -1)
+        _, first = np.unique(np.column_stack([detection, prior]), axis=0, return_index=True)
+        detection = detection[first]
+        groups = make_groups(
+            padded, priors, detection, np.zeros(detection.shape, bool), prior[first], point[first]
+        )
+        groups = groups.only(are_in_bounds(groups.point, bounds_m))
         point, covariance, prior = groups.point, groups.covariance, groups.prior
-    return groups.only(valid(sight, groups, bounds_m))
+    return groups.only(are_valid(padded, groups, bounds_m))
 
 
-def _pairs(
-    sight: Sight, priors: Priors
+def _pair_points(
+    padded: PaddedSightings, priors: Priors
 ) -> tuple[Float[np.ndarray, "pairs 3"], Float[np.ndarray, "pairs 3 3"]]:
-    """Points, and their covariances, of pairs of detections near each other's epipolar lines, if other views agree."""
-    least = int(priors.least[-1])
-    close = line_distances(sight) < UNEXPLAINED
-    first, second, i, j = np.nonzero(close & _proposing(sight, least)[..., None, None])
-    # Where both lines meet in another view there must be something too.
+    """Points of pairs of detections that are near each other's epipolar lines, and covariances of the points.
+
+    Only pairs are kept with which enough other cameras agree.
+    """
+    min_viewpoints = int(priors.min_viewpoints[-1])
+    close = squared_epipolar_distances(padded) < UNEXPLAINED_COST
+    first, second, i, j = np.nonzero(close & _proposing_camera_pairs(padded, min_viewpoints)[..., None, None])
+    # Another camera agrees if it has a detection near the epipolar lines of both detections.
     others = np.any(close[first, :, i] & close[second, :, j], axis=-1)
-    kept = sight.num_viewpoints(others) >= least - 2
-    camera, support = np.stack([first, second], axis=-1)[kept], np.stack([i, j], axis=-1)[kept]
+    kept = padded.num_viewpoints(others) >= min_viewpoints - 2
+    camera, detection = np.stack([first, second], axis=-1)[kept], np.stack([i, j], axis=-1)[kept]
     room, middle = priors.equations(np.array([-1]))
-    depth = sight.depth(priors.mean[-1])[camera]
+    depth = padded.depth(priors.mean[-1])[camera]
     for _ in range(2):
-        normal, right = equations(sight, camera, support, depth)
-        point, covariance = solved(normal.sum(axis=1) + room, right.sum(axis=1) + middle)
-        depth = np.take_along_axis(sight.depth(point), camera, axis=-1)
+        normal, right = normal_equations(padded, camera, detection, depth)
+        point, covariance = solve_points(normal.sum(axis=1) + room, right.sum(axis=1) + middle)
+        depth = np.take_along_axis(padded.depth(point), camera, axis=-1)
     return point, covariance
 
 
-def _proposing(sight: Sight, least: int) -> Bool[np.ndarray, "cameras cameras"]:
-    """Pairs of cameras that propose: so few that there is still one among any `least` viewpoints.
+def _proposing_camera_pairs(
+    padded: PaddedSightings, min_viewpoints: int
+) -> Bool[np.ndarray, "cameras cameras"]:
+    """Pairs of cameras whose detections propose points: as few as possible, but one among any `min_viewpoints`.
 
-    Of three viewpoints two are in the same half of the rig, and neighbours see a point from better angles than
-    cameras that face each other.
+    Of three viewpoints, two are in the same half of the rig. Pairs in one half of the rig are therefore enough, and
+    neighbours see a point from better angles than cameras that face each other.
     """
-    apart = np.triu(sight.at @ sight.at.T < 0.5)
-    if least < 3:
+    apart = np.triu(padded.at @ padded.at.T < 0.5)
+    if min_viewpoints < 3:
         return apart
-    centre = sight.at.T @ sight.straight.centre_world / sight.at.sum(axis=0)[:, None]
-    half = sight.at @ (np.lexsort(centre.T[::-1]).argsort() < len(centre) // 2) > 0.5
+    centre = padded.at.T @ padded.straight.centre_world / padded.at.sum(axis=0)[:, None]
+    half = padded.at @ (np.lexsort(centre.T[::-1]).argsort() < len(centre) // 2) > 0.5
     return apart & (half[:, None] == half)
 
 
-def _with_expected(
+def _add_expected(
     point: Float[np.ndarray, "pairs 3"], covariance: Float[np.ndarray, "pairs 3 3"], priors: Priors
 ) -> tuple[Float[np.ndarray, "proposed 3"], Float[np.ndarray, "proposed 3 3"], Int[np.ndarray, "proposed"]]:
-    """The pairs, each once more for every expected drone near it, and the predictions; each with its prior."""
+    """Add proposals for expected drones to the pairs' points; each proposal has the index of its prior.
+
+    Returned are the pairs' points, each point again for every expected drone near it (fused with the prediction), and
+    the predictions themselves.
+    """
     expected, spread = priors.mean[:-1], np.linalg.inv(priors.normal[:-1])
     off = point[:, None] - expected
     apart = np.linalg.inv(covariance[:, None] + spread)
     squared = (off[..., None, :] @ apart @ off[..., None])[..., 0, 0]
-    pair, known = np.nonzero(squared < UNEXPLAINED)
+    pair, known = np.nonzero(squared < UNEXPLAINED_COST)
     gain = spread[known] @ apart[pair, known]
     return (
         np.concatenate([point, expected[known] + (gain @ off[pair, known][..., None])[..., 0], expected]),

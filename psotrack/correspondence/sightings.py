@@ -1,6 +1,6 @@
-"""Where cameras see something, frame by frame: boxes of a detector, or blobs of foreground.
+"""Sightings: the places where cameras see something in each frame, as boxes of a detector or blobs of foreground.
 
-What the projection lines start from, in arrays, whatever it came from.
+Both kinds become the same arrays, from which the correspondence and the projection lines start.
 """
 
 from __future__ import annotations
@@ -16,26 +16,28 @@ from psotrack.recordings import Detections
 from psotrack.silhouettes import Silhouettes, find_blobs
 from psotrack.support import Report, no_progress
 
-#: The middle of a box is off by about a pixel, and by so much of its sides; what it really is, the views tell.
+#: Standard deviation of a box's middle along each axis: a constant, pixels, plus a share of the box's mean side. It is
+#: a first assumption; the agreement of several views shows the real value.
 NOISE_PX, NOISE_SHARE = 1.0, 0.05
-#: Of a box that the image's border cuts the middle is off by so much of its sides.
+#: The same share for a box that the image's border cuts.
 CUT_SHARE = 0.25
-#: Boxes nearer to the border than this are cut by it.
+#: A box with an edge nearer to the image's border than this is taken as cut, pixels.
 BORDER_PX = 1.5
-#: Silhouettes that are looked at together.
+#: Number of frames of silhouettes that are read together.
 _CHUNK_FRAMES = 25
 
-#: Frame, camera, middles, sides, and whether the border cuts the box.
+#: Frame, camera, middles, widths and heights, and whether the border cuts each box.
 _Image = tuple[int, int, np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
 class CameraSightings:
-    """The sightings of one frame, in all cameras; NaN for none.
+    """Sightings of one frame in all cameras; NaN for no sighting.
 
     Attributes:
-        centre_px, size_px: (cameras, boxes, 2), middles and sides.
-        noise_px: (cameras, boxes), standard deviations of the middles.
+        centre_px: (cameras, boxes, 2), middles of the boxes, pixels.
+        size_px: (cameras, boxes, 2), widths and heights, pixels.
+        noise_px: (cameras, boxes), standard deviations of the middles along each axis, pixels.
     """
 
     centre_px: Float[np.ndarray, "cameras boxes 2"]
@@ -43,17 +45,18 @@ class CameraSightings:
     noise_px: Float[np.ndarray, "cameras boxes"]
 
     def found(self, values: Float[np.ndarray, "cameras boxes *rest"]) -> list[np.ndarray]:
-        """What is known of the sightings of each camera, without the gaps: (found, ...) each."""
-        return [of[which] for of, which in zip(values, np.isfinite(self.noise_px), strict=True)]
+        """Select the values of each camera's sightings, without padding: an array (sightings, ...) per camera."""
+        return [row[present] for row, present in zip(values, np.isfinite(self.noise_px), strict=True)]
 
     def grouped(
         self, values: Float[np.ndarray, "cameras boxes *rest"], detection: Int[np.ndarray, "groups cameras"]
     ) -> Float[np.ndarray, "groups cameras *rest"]:
-        """What is known of the sightings of each group; NaN where a camera has none, which is -1.
+        """Select the values of each group's sightings; NaN where the group has no sighting.
 
         Args:
-            values: of all boxes.
-            detection: (groups, cameras), numbers of sightings, without the gaps.
+            values: (cameras, boxes, ...), a value per sighting.
+            detection: (groups, cameras), index of the sighting among the camera's sightings without padding; -1 for
+                no sighting.
         """
         padded = np.full((values.shape[0], values.shape[1] + 1, *values.shape[2:]), np.nan)
         for camera, found in enumerate(self.found(values)):
@@ -63,12 +66,14 @@ class CameraSightings:
 
 @dataclass(frozen=True)
 class Sightings:
-    """Boxes in all frames of all cameras; the axis of boxes is as long as the fullest image needs.
+    """Sightings in all frames of all cameras; NaN for no sighting.
+
+    The axis of boxes is as long as the largest number of sightings in one image.
 
     Attributes:
-        centre_px: (frames, cameras, boxes, 2), middles, pixel centres at whole numbers; NaN for none.
-        size_px: (frames, cameras, boxes, 2), widths and heights; NaN for none.
-        noise_px: (frames, cameras, boxes), standard deviation of the middle along either axis; NaN for none.
+        centre_px: (frames, cameras, boxes, 2), middles of the boxes, pixels; pixel centres are at whole numbers.
+        size_px: (frames, cameras, boxes, 2), widths and heights, pixels.
+        noise_px: (frames, cameras, boxes), standard deviations of the middles along each axis, pixels.
     """
 
     centre_px: Float[np.ndarray, "frames cameras boxes 2"]
@@ -77,21 +82,21 @@ class Sightings:
 
     @property
     def num_frames(self) -> int:
-        """Number of frames."""
+        """Number of frames of the recording."""
         return len(self.centre_px)
 
     def at(self, frame: int) -> CameraSightings:
-        """Those of a frame."""
+        """The sightings of one frame."""
         return CameraSightings(self.centre_px[frame], self.size_px[frame], self.noise_px[frame])
 
 
 def from_detections(detections: Mapping[str, Detections], rig: CameraRig, num_frames: int) -> Sightings:
-    """The boxes of a detector.
+    """Make sightings from the boxes of a detector.
 
     Args:
-        detections: by camera name; a camera that is absent sees nothing.
-        rig: of the cameras.
-        num_frames: of the videos; what was detected in later frames does not count.
+        detections: detections by camera name; a camera without an entry has no sightings.
+        rig: the cameras.
+        num_frames: number of frames of the videos; detections in later frames are ignored.
     """
     images: list[_Image] = []
     for index, name in enumerate(rig.names):
@@ -102,18 +107,18 @@ def from_detections(detections: Mapping[str, Detections], rig: CameraRig, num_fr
         for frame, start, stop in _runs(boxes.frame):
             if 0 <= frame < num_frames:
                 xyxy = boxes.xyxy[start:stop]
-                # Pixels are squares about whole numbers: an edge at 0 is half a pixel before the first centre.
+                # Pixel centres are at whole numbers, so an edge at 0 is half a pixel before the first centre.
                 cut = np.any((xyxy[:, :2] < BORDER_PX) | (xyxy[:, 2:] > width_height - BORDER_PX), axis=-1)
                 images.append((frame, index, (xyxy[:, :2] + xyxy[:, 2:]) / 2 - 0.5, _sides(xyxy), cut))
     return _arrays(images, num_frames, len(rig))
 
 
 def from_silhouettes(silhouettes: Silhouettes, report: Report = no_progress) -> Sightings:
-    """The blobs of foreground.
+    """Make sightings from the blobs of foreground.
 
     Args:
-        silhouettes: of all cameras.
-        report: told of the frames.
+        silhouettes: stored silhouettes of all cameras.
+        report: receives the progress, in frames.
     """
     images: list[_Image] = []
     with report("blobs", silhouettes.num_frames) as advance:
@@ -128,7 +133,7 @@ def from_silhouettes(silhouettes: Silhouettes, report: Report = no_progress) -> 
 
 
 def _runs(frame: np.ndarray) -> Iterable[tuple[int, int, int]]:
-    """Each frame number, the first row that has it, and the first one after them."""
+    """Frame numbers, each with the first row of the frame and the first row after the frame."""
     values, starts, counts = np.unique(frame, return_index=True, return_counts=True)
     return zip(values.tolist(), starts.tolist(), (starts + counts).tolist(), strict=True)
 
@@ -138,14 +143,14 @@ def _sides(xyxy: Float[np.ndarray, "boxes 4"]) -> Float[np.ndarray, "boxes 2"]:
 
 
 def _arrays(images: list[_Image], num_frames: int, num_cameras: int) -> Sightings:
-    """The images' boxes in arrays, with room for one box at least."""
-    most = max([1, *(len(centre) for _, _, centre, _, _ in images)])
-    shape = (num_frames, num_cameras, most)
+    """Put the boxes of all images into arrays; the axis of boxes has at least one entry."""
+    max_boxes = max([1, *(len(centre) for _, _, centre, _, _ in images)])
+    shape = (num_frames, num_cameras, max_boxes)
     centre_px, size_px = np.full((2, *shape, 2), np.nan)
     noise_px = np.full(shape, np.nan)
     for frame, camera, centre, size, cut in images:
-        of = (frame, camera, slice(len(centre)))
-        centre_px[of], size_px[of] = centre, size
+        rows = (frame, camera, slice(len(centre)))
+        centre_px[rows], size_px[rows] = centre, size
         side_px = np.sqrt(size.prod(axis=-1))
-        noise_px[of] = NOISE_PX + np.where(cut, CUT_SHARE, NOISE_SHARE) * side_px
+        noise_px[rows] = NOISE_PX + np.where(cut, CUT_SHARE, NOISE_SHARE) * side_px
     return Sightings(centre_px, size_px, noise_px)

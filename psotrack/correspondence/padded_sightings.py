@@ -1,4 +1,4 @@
-"""What the cameras see in one frame, as arrays, and what is known of drones before."""
+"""Sightings of one frame as padded arrays, and prior knowledge of the drones' positions."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from psotrack.geometry import NEAR_M, Camera, projection_equations, undistort, v
 
 
 @dataclass(frozen=True)
-class Sight:
-    """The detections of all cameras, padded. The last column is no detection, so that index -1 is none.
+class PaddedSightings:
+    """Detections of all cameras, padded to one length. The last column is padding, so that index -1 is no detection.
 
     Attributes:
-        straight: cameras without K and lens, whose pixels are `x`.
-        x: (cameras, padded, 2), normalised image coordinates with the lens undone.
-        variance: (cameras, padded), of these, infinite for no detection. Pixels are taken to be square.
-        normal, right: (cameras, padded, 3, 3) and (..., 3), the normal equations of each at a depth of 1 m.
-        at: (cameras, viewpoints), 1 where a camera stands at a viewpoint.
+        straight: the cameras with K = 1 and without lens distortion; `x` are their pixels.
+        x: (cameras, padded, 2), normalised undistorted image coordinates.
+        variance: (cameras, padded), variances of `x` along each axis; infinite for padding. Pixels are assumed square.
+        normal, right: (cameras, padded, 3, 3) and (cameras, padded, 3), left and right sides of each detection's
+            normal equations for a depth of 1 m.
+        at: (cameras, viewpoints), 1 where a camera stands at a viewpoint, else 0.
     """
 
     straight: Camera
@@ -32,23 +33,23 @@ class Sight:
 
     @property
     def T(self) -> Float[np.ndarray, "cameras 3 4"]:
-        """World to camera."""
+        """(cameras, 3, 4), transforms from world to camera."""
         return np.asarray(self.straight.T_cam_world)[:, :3]
 
     def depth(self, point: Float[np.ndarray, "*points 3"]) -> Float[np.ndarray, "*points cameras"]:
-        """Depth of points in the cameras, `NEAR_M` at least."""
+        """Depths of points in the cameras, at least `NEAR_M`, metres."""
         T = self.T
         return np.maximum(point @ T[:, 2, :3].T + T[:, 2, 3], NEAR_M)
 
     def num_viewpoints(self, seen: Bool[np.ndarray, "*groups cameras"]) -> Int[np.ndarray, "*groups"]:
-        """From how many viewpoints something is seen."""
+        """Number of viewpoints from which each group is seen."""
         return (seen @ self.at > 0).sum(axis=-1)
 
 
-def sight_of(
+def pad_sightings(
     cameras: Camera, points_px: list[Float[np.ndarray, "_ 2"]], noise_px: list[Float[np.ndarray, "_"]]
-) -> Sight:
-    """Arguments and errors are those of `match`; a point that is not finite is no detection."""
+) -> PaddedSightings:
+    """Put the detections of all cameras into padded arrays. Arguments and errors are those of `match`."""
     counts = list(map(len, points_px))
     pixels = np.full((max(counts, default=0) + 1, len(counts), 2), np.nan)
     variance = np.full((len(counts), len(pixels)), np.inf)
@@ -70,7 +71,7 @@ def sight_of(
     rows, right = rows.swapaxes(0, 1), right.swapaxes(0, 1)
     weighted = rows.swapaxes(-1, -2) / variance[..., None, None]
     label = viewpoints(cameras)
-    return Sight(
+    return PaddedSightings(
         straight=straight,
         x=np.nan_to_num(x.swapaxes(0, 1)),
         variance=variance,
@@ -82,41 +83,39 @@ def sight_of(
 
 @dataclass(frozen=True)
 class Priors:
-    """What is known of drones before they are seen: those that are expected, and the room for all others.
+    """Prior knowledge of the drones' positions: one prior per expected drone, and the room for a new drone.
 
-    The room is the last, so that its index is -1.
+    The room is the last prior, so that its index is -1.
 
     Attributes:
-        normal: (priors, 3, 3), information, the inverse of the covariance.
-        mean: (priors, 3).
-        least: (priors,), viewpoints that a drone must be seen from.
+        normal: (priors, 3, 3), information matrices, the inverses of the covariances.
+        mean: (priors, 3), expected positions in the world, metres.
+        min_viewpoints: (priors,), smallest number of viewpoints that must see the drone.
     """
 
     normal: Float[np.ndarray, "priors 3 3"]
     mean: Float[np.ndarray, "priors 3"]
-    least: Int[np.ndarray, "priors"]
-
-    @property
-    def known(self) -> int:
-        """How many drones are expected."""
-        return len(self.mean) - 1
+    min_viewpoints: Int[np.ndarray, "priors"]
 
     def equations(
         self, prior: Int[np.ndarray, "groups"]
     ) -> tuple[Float[np.ndarray, "groups 3 3"], Float[np.ndarray, "groups 3"]]:
-        """Left and right side of their normal equations."""
+        """Left and right sides of the normal equations of these priors."""
         normal = self.normal[prior]
         return normal, (normal @ self.mean[prior][..., None])[..., 0]
 
 
-def priors_of(
+def make_priors(
     bounds_m: Float[np.ndarray, "2 3"],
     expected_m: Float[np.ndarray, "known 3"],
     covariance_m2: Float[np.ndarray, "known 3 3"],
     min_views: int,
 ) -> Priors:
-    """Arguments are those of `match`; two viewpoints are enough for what is expected."""
-    # The room is so vague that it moves nothing, but no equations are singular.
+    """Priors of the expected drones and of the room. Arguments are those of `match`.
+
+    Two viewpoints are enough for an expected drone.
+    """
+    # The room's prior is too weak to move a point, and keeps the normal equations from being singular.
     room = np.diag((bounds_m[1] - bounds_m[0]) ** -2.0)
     return Priors(
         np.concatenate([np.linalg.inv(covariance_m2), room[None]]),
