@@ -11,9 +11,9 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import linear_sum_assignment, minimize_scalar
 from scipy.spatial.transform import Rotation
 
+from psotrack.clocks.correlated_errors import autocorrelation, widening
 from psotrack.errors import InputError
 from psotrack.geometry import rotation_matrices
-from psotrack.support import standard_error
 from psotrack.trajectories import GATE_M, UNASSIGNED, Trajectories, of_partners
 
 #: Gaps of a reference are bridged up to this, or to one and a half of its steps where that is more.
@@ -148,25 +148,56 @@ class ShiftedPair:
         return float(found.x)
 
     def standard_deviation_s(self, offset_s: float, partner: Int[np.ndarray, "drones"]) -> float:
-        """Of the offset of the least mean distance: its gradient's standard error over its curvature."""
+        """Standard deviation of the offset at which the mean distance is smallest, seconds.
+
+        It is the standard deviation of the gradient of the summed distance, over the curvature of this sum. The
+        gradient is the sum of v · r / |r|, where v are the velocities and r the residuals. Neighbouring frames have
+        similar errors, so the variance of the gradient uses the autocovariance of r / |r| at all lags, which is pooled
+        over drones and axes, where axes with fast motion have more weight.
+
+        An error that always points along the motion is not included, because such an error looks like an offset.
+        """
         residual_m = self.at(offset_s, partner).residual_m
         ends_m = [self._residual_m(offset_s + sign * _MOTION_S, partner) for sign in (-1, 1)]
-        motion_m_s = (ends_m[1] - ends_m[0]) / (2 * _MOTION_S)
+        velocity_m_s = (ends_m[1] - ends_m[0]) / (2 * _MOTION_S)
+        there = np.isfinite(velocity_m_s).all(axis=-1) & np.isfinite(residual_m).all(axis=-1)
+        count, there_3d = there.sum(axis=0), there[..., None]
+        v = np.where(there_3d, velocity_m_s, 0.0)
         if self.with_lever_arm:
-            # A motion that is the same throughout is an arm's, not time's.
-            known = np.isfinite(motion_m_s)
-            mean_m_s = np.where(known, motion_m_s, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-            motion_m_s = motion_m_s - mean_m_s
-        # Of |r + v dt|: v r/|r| at first order, (v² - (v r/|r|)²) / |r| at second, where r may point anywhere.
+            # A constant velocity only changes the lever arm, so it does not show the offset.
+            v = np.where(there_3d, v - v.sum(axis=0) / np.maximum(count, 1)[:, None], 0.0)
         distance_m = np.maximum(np.linalg.norm(residual_m, axis=-1), 1e-9)
-        slope = (motion_m_s * residual_m).sum(axis=-1) / distance_m
-        bend = 2 / 3 * (motion_m_s**2).sum(axis=-1) / distance_m
-        curvature = np.nansum(bend)
+        direction = np.where(there_3d, residual_m / distance_m[..., None], 0.0)
+        curvature = self._curvature(v, direction, distance_m)
         if not curvature > 0:
             return np.inf
-        gradient = np.where(np.isfinite(slope).any(axis=1), np.nansum(slope, axis=1), np.nan)
-        error = standard_error(gradient[:, None], self.frame)[0] * np.isfinite(gradient).sum()
-        return float(error / curvature)
+        squared_speed = (v**2).sum(axis=0)
+        weight = squared_speed / squared_speed.sum()
+        pairs = np.maximum(np.round(autocorrelation(there.astype(float))), 0.0)
+        covariance = (weight * autocorrelation(direction)).sum(axis=(1, 2))
+        covariance /= np.maximum((weight.sum(axis=-1) * pairs).sum(axis=-1), 1e-9)
+        products = autocorrelation(v).sum(axis=(1, 2))
+        # Never less than the variance of independent errors.
+        independent = float(products[0] * covariance[0])
+        variance = max(float(2 * covariance @ products) - independent, independent)
+        share = variance / (products[0] * max(float((direction**2).sum()), 1e-300))
+        return float(np.sqrt(variance) * widening(np.array(share)) / curvature)
+
+    @staticmethod
+    def _curvature(
+        v: Float[np.ndarray, "frames drones 3"],
+        direction: Float[np.ndarray, "frames drones 3"],
+        distance_m: Float[np.ndarray, "frames drones"],
+    ) -> float:
+        """Second derivative of the summed distance by the offset, metres per squared second.
+
+        The second derivative of |r + v t| is (v² - (v · r / |r|)²) / |r|. For residuals of any direction its mean is
+        2/3 v² / |r|. The smaller sum of the two is returned: residuals along the motion make the minimum flatter.
+        """
+        squared = (v**2).sum(axis=-1)
+        mean = np.where(squared > 0, 2 / 3 * squared / distance_m, 0.0)
+        actual = np.where(squared > 0, (squared - (v * direction).sum(axis=-1) ** 2) / distance_m, 0.0)
+        return float(min(mean.sum(), actual.sum()))
 
     def _residual_m(
         self, offset_s: float, partner: Int[np.ndarray, "drones"]
