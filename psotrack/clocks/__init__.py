@@ -1,7 +1,7 @@
-"""Clocks: how late is one camera, one recording or one reference, compared with another.
+"""Clocks: offsets between the clocks of cameras, and between the clocks of a recording and its reference.
 
-In: detections of several cameras, or two sets of positions over time. Out: offsets in seconds or frames, with standard
-errors.
+In: detections of several cameras, or two sets of positions over time. Out: offsets in frames or seconds, with standard
+deviations that hold for errors that are correlated in time.
 """
 
 import lazy_loader

@@ -24,7 +24,7 @@ def widening(share: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
     """
     share = np.minimum(share, _MAX_SHARE)
     freedom = 1 / np.maximum(share, 1e-9) - 1
-    return t_distribution.isf(_OUTSIDE_TWO_STD / 2, freedom) / 2 / (1 - share)
+    return np.asarray(t_distribution.isf(_OUTSIDE_TWO_STD / 2, freedom) / 2 / (1 - share))
 
 
 def autocorrelation(values: Float[np.ndarray, "frames *rest"]) -> Float[np.ndarray, "frames *rest"]:

@@ -1,11 +1,12 @@
-"""The clocks of a reference and of a video: the offset between them, found from the motion of the drones.
+"""The offset between the clocks of a reference and of a video, found from the motion of the drones.
 
 The paper (technical validation, "ArUco markers") lays the reconstructed path on successive points of the reference and
-takes the offset with the smallest mean distance. Here that is the first step; the second finds the minimum between the
-samples, with the reference interpolated. Every drone has a constant lever arm, from the point that the reference gives
-to the one that is tracked. It is taken out at every offset: for a drone that flies one way it would pass for time.
+takes the offset with the smallest mean distance. This is the first step here. The second step interpolates the
+reference and finds the minimum between its samples. Every drone has a constant lever arm from the reference's point to
+the tracked point. The lever arm is subtracted at every offset: for a drone that flies in one direction, a lever arm
+would look like an offset in time.
 
-Offsets between cameras are found in `camera_clocks`, and are here too, so that all of synchronising is in one place.
+Offsets between cameras are found in `camera_clocks`.
 """
 
 from __future__ import annotations
@@ -37,27 +38,29 @@ __all__ = [
     "shifted",
 ]
 
-#: Offsets count at which at least this share is compared of what can be compared at any of them.
-LEAST_OVERLAP = 0.5
-#: The least distance and another one are told apart by as many standard errors of their difference.
+#: An offset counts only if at least this share of the largest number of comparable positions can be compared at it.
+MIN_OVERLAP = 0.5
+#: Another minimum is worse for certain if its distance is larger by this multiple of the difference's standard error.
 _CLEARLY = 3.0
 
 
 @dataclass(frozen=True)
 class Offset:
-    """What the reference's clock shows beyond the estimate's, and how well that is known.
+    """Offset of the reference's clock from the estimate's clock, and its standard deviation.
 
     Attributes:
-        offset_s: the reference at t + offset_s belongs to the estimate at t.
-        std_s: its standard deviation, from the motion and from the distances that are left.
-        mean_distance_m: over frames and drones at that offset, without the lever arms.
-        mean_distance_before_m: the same at offset 0; None where too little can be compared.
-        lever_arm_m: (drones, 3), from the reference's point to the one that is tracked, in the body where orientations
-            were given, else in the world; NaN of drones that were not compared.
-        partner: (drones,), index of the estimated drone that stands for each, or `UNASSIGNED`.
+        offset_s: the reference at time t + offset_s belongs to the estimate at time t, seconds.
+        std_s: standard deviation of the offset, from the motion and the remaining distances, seconds.
+        mean_distance_m: mean distance over frames and drones at this offset, without the lever arms, metres.
+        mean_distance_before_m: mean distance at offset 0, metres; None if too few positions can be compared.
+        lever_arm_m: (drones, 3), vectors from the reference's point to the tracked point, metres; in the body frame if
+            orientations were given, else in the world; NaN for drones that were not compared.
+        partner: (drones,), index of the estimated drone that is assigned to each drone of the reference, or
+            `UNASSIGNED`.
         overlap: share of the estimate's positions that were compared.
-        curve_s: (offsets,), the offsets that were tried: whole samples of the reference.
-        curve_m: (offsets,), the mean distance at each, without the lever arms; NaN where too little can be compared.
+        curve_s: (offsets,), offsets that were tried, seconds: whole samples of the reference.
+        curve_m: (offsets,), mean distances at these offsets, without the lever arms, metres; NaN if too few positions
+            can be compared.
     """
 
     offset_s: float
@@ -80,26 +83,28 @@ def find_offset(
     max_offset_s: float,
     with_lever_arm: bool = True,
 ) -> Offset:
-    """The offset between the clocks of an estimate and of its reference, to a fraction of a frame.
+    """Find the offset between the clocks of an estimate and of its reference, to a fraction of a frame.
 
-    At every offset the estimates are assigned to the drones, with the least total of mean distances; then each drone's
-    arm, its median residual, is taken out, and what remains is averaged. Drones are left out that are further than
-    half a metre from their estimate at the best offset, as long as others are not.
+    At every offset, the estimated drones are assigned to the reference's drones so that the sum of mean distances is
+    smallest. Then each drone's lever arm, the median of its residuals, is subtracted, and the remaining distances are
+    averaged. Drones that are farther than half a metre from their estimate at the best offset are left out, unless all
+    are that far.
 
     Args:
-        estimate: at the times of the video; what is lost does not count.
-        reference_time_s: (samples,), of the reference's own clock, at its own rate.
-        reference_position_m: (samples, drones, 3), world; NaN where it is not known.
-        reference_orientation_wxyz: (samples, drones, 4), body to world. With them arms turn with their drones; where
-            they are not known, positions do not count. Without them an arm that points ahead is taken for time.
-        max_offset_s: from minus this to this.
-        with_lever_arm: allow each drone a constant arm.
+        estimate: trajectories at the times of the video; lost drones do not count.
+        reference_time_s: (samples,), times of the reference's own clock, at its own rate, seconds.
+        reference_position_m: (samples, drones, 3), positions in the world, metres; NaN where missing.
+        reference_orientation_wxyz: (samples, drones, 4), unit quaternions, body to world. With orientations, the lever
+            arms turn with the drones, and positions without an orientation do not count. Without orientations, a lever
+            arm along the motion is taken for an offset in time.
+        max_offset_s: largest offset that is tried, forwards and backwards, seconds.
+        with_lever_arm: allow each drone a constant lever arm.
 
     Raises:
-        SettingsError: the range is smaller than a step of the reference.
-        InputError: times do not increase, nothing can be compared, the least distance is at an end of the range, the
-            motion repeats so that another offset does as well, or it does not tell the offset to a frame: drones that
-            hover, or fly straight on at one speed.
+        SettingsError: `max_offset_s` is smaller than a sample interval of the reference.
+        InputError: times do not increase, no positions can be compared, the smallest distance is at an end of the
+            range, the motion repeats so that another offset fits as well, or the offset's standard deviation is above
+            one frame: the drones hover, or fly straight on at constant speed.
     """
     comparison = ShiftedPair.of(
         estimate, reference_time_s, reference_position_m, reference_orientation_wxyz, with_lever_arm
@@ -109,7 +114,7 @@ def find_offset(
     if not step_s <= max_offset_s < np.inf:
         expected = f"a step of the reference, {step_s:g} s, or more"
         raise SettingsError("max_offset_s", expected=expected, found=f"{max_offset_s:g}")
-    # A hair more, for steps that are rounded.
+    # The small addition is for rounding errors.
     steps = int(max_offset_s / step_s + 1e-6)
     curve_s = step_s * np.arange(-steps, steps + 1)
     curve_m = _curve(comparison, curve_s)
@@ -131,7 +136,7 @@ def find_offset(
             "drones that hover, or fly straight on at one speed, do not tell: use more of the recording",
         )
     error_m = standard_error(found.per_frame_m[:, None], estimate.frame)[0]
-    _check_alone(curve_s, curve_m, float(error_m), frame_s)
+    _check_unique(curve_s, curve_m, float(error_m), frame_s)
     before_m = float(curve_m[steps])
     return Offset(
         offset_s=offset_s,
@@ -147,12 +152,12 @@ def find_offset(
 
 
 def own_reference(sequence: Sequence) -> Trajectories:
-    """The reference of a sequence at its own rate and by its own clock: its .c3d, or else its poses.
+    """The reference of a sequence at its own rate and with its own clock: the .c3d file, or else the pose files.
 
-    Orientations are there only where each position has one.
+    Orientations are returned only if every position has an orientation.
 
     Raises:
-        InputError: it has none, or the .c3d cannot be used.
+        InputError: the sequence has no reference, or the .c3d file cannot be used.
     """
     reference = sequence.truth
     for path in sequence.folder.iterdir():
@@ -169,11 +174,11 @@ def own_reference(sequence: Sequence) -> Trajectories:
     return reference
 
 
-def save_curve(path: Path, offset: Offset, *, force: bool = False) -> None:
-    """Save a PNG of the mean distance over the offsets, with the one that was found.
+def save_curve(path: str | Path, offset: Offset, *, force: bool = False) -> None:
+    """Save a PNG with the mean distance at each offset, and a mark at the offset that was found.
 
     Raises:
-        OutputError: the file exists and `force` is not set, or it cannot be written.
+        OutputError: the file exists and `force` is not set, or the file cannot be written.
     """
 
     def draw(figure: Figure) -> None:
@@ -190,26 +195,26 @@ def save_curve(path: Path, offset: Offset, *, force: bool = False) -> None:
         axes.set_ylabel("mean distance (mm)")
         axes.set_ylim(bottom=0)
 
-    save_figure(path, (8.0, 4.0), draw, force)
+    save_figure(Path(path), (8.0, 4.0), draw, force)
 
 
 def _curve(comparison: ShiftedPair, curve_s: Float[np.ndarray, "offsets"]) -> Float[np.ndarray, "offsets"]:
-    """The mean distance at each offset; NaN where less than `LEAST_OVERLAP` of the most is compared."""
+    """Mean distance at each offset, metres; NaN where too few positions can be compared (`MIN_OVERLAP`)."""
     tried = [comparison.at(offset_s, comparison.partner(offset_s)) for offset_s in curve_s]
     count = np.array([one.count for one in tried])
     if not count.any():
         raise refused(f"positions of both at offsets within {curve_s[-1]:g} s", "none")
-    enough = count >= np.maximum(LEAST_OVERLAP * count.max(), 1)
+    enough = count >= np.maximum(MIN_OVERLAP * count.max(), 1)
     return np.where(enough, [one.mean_m for one in tried], np.nan)
 
 
-def _check_alone(
+def _check_unique(
     curve_s: Float[np.ndarray, "offsets"],
     curve_m: Float[np.ndarray, "offsets"],
     error_m: float,
     frame_s: float,
 ) -> None:
-    """Raise if there is another offset, apart from the best, at which the distance is not clearly larger."""
+    """Raise an error if the distance is not clearly larger at another offset, apart from the best offset."""
     low_s = curve_s[curve_m <= np.nanmin(curve_m) + _CLEARLY * np.sqrt(2) * error_m]
     apart = np.diff(low_s) > max(frame_s, 1.5 * (curve_s[1] - curve_s[0]))
     if apart.any():

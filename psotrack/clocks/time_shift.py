@@ -1,4 +1,4 @@
-"""An estimate against its reference at another time: what is left between them once lever arms are taken out."""
+"""Distances between an estimate and its reference at a shifted time, after the lever arms are subtracted."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from psotrack.errors import InputError
 from psotrack.geometry import rotation_matrices
 from psotrack.trajectories import GATE_M, UNASSIGNED, Trajectories, of_partners
 
-#: Gaps of a reference are bridged up to this, or to one and a half of its steps where that is more.
+#: Longest gap of a reference over which positions are interpolated, seconds; for slow references 1.5 sample intervals.
 MAX_GAP_S = 0.1
-#: Motion is what happens within this before and after: the noise of a drone that stands still is none.
+#: Velocities are differences over this time before and after a frame, seconds: shorter times would show noise.
 _MOTION_S = 0.1
-#: Far below what noise allows.
+#: Precision of the offset at the minimum, seconds: far below the standard deviations that noise allows.
 _PRECISION_S = 1e-6
+#: Number of iterations of Weiszfeld's algorithm.
 _MEDIAN_STEPS = 5
 
 _At = Callable[[Float[np.ndarray, "times"]], np.ndarray]
@@ -29,11 +30,12 @@ _At = Callable[[Float[np.ndarray, "times"]], np.ndarray]
 
 @dataclass(frozen=True)
 class Residuals:
-    """What is left between estimates and drones at one offset.
+    """Differences between estimates and reference at one offset, without the lever arms.
 
     Attributes:
-        arm_m: (drones, 3), what was taken out; NaN of drones that are not compared.
-        residual_m: (frames, drones, 3), in the frame of the arms; NaN where it is not known.
+        arm_m: (drones, 3), lever arms that were subtracted, metres; NaN for drones that are not compared.
+        residual_m: (frames, drones, 3), remaining differences in the frame of the arms, metres; NaN where the estimate
+            or the reference is missing.
     """
 
     arm_m: Float[np.ndarray, "drones 3"]
@@ -41,38 +43,41 @@ class Residuals:
 
     @property
     def per_frame_m(self) -> Float[np.ndarray, "frames"]:
-        """(frames,), the mean distance in each; NaN where nothing is compared."""
+        """(frames,), mean distance of the drones in each frame, metres; NaN for a frame without compared drones."""
         distance_m = np.linalg.norm(self.residual_m, axis=-1)
         count = np.isfinite(distance_m).sum(axis=1)
         return np.where(count > 0, np.nansum(distance_m, axis=1) / np.maximum(count, 1), np.nan)
 
     @property
     def distance_m(self) -> Float[np.ndarray, "compared"]:
-        """(compared,), of all frames and drones that are compared."""
+        """(compared,), distances of all compared positions, metres."""
         distance_m = np.linalg.norm(self.residual_m, axis=-1)
         return distance_m[np.isfinite(distance_m)]
 
     @property
     def count(self) -> int:
-        """Of what is compared."""
+        """Number of compared positions."""
         return len(self.distance_m)
 
     @property
     def mean_m(self) -> float:
-        """The mean distance; NaN where nothing is compared."""
+        """Mean distance of all compared positions, metres; NaN if no positions are compared."""
         return float(self.distance_m.mean()) if self.count else np.nan
 
 
 @dataclass(frozen=True)
 class ShiftedPair:
-    """An estimate, and its reference at any time.
+    """An estimate, and a reference that is interpolated at any time.
 
     Attributes:
-        frame, time_s: (frames,), of the estimate.
-        est_m: (frames, estimates, 3), NaN where nothing is known.
-        position_m: (times, drones, 3) at times of the reference's clock, NaN likewise.
-        rotation: (times, drones, 3, 3), frame of the arms to world; None where that is the world.
-        with_lever_arm: allow each drone a constant arm.
+        frame: (frames,), numbers of the estimate's frames.
+        time_s: (frames,), times of the estimate's frames, seconds.
+        est_m: (frames, estimates, 3), estimated positions, metres; NaN for lost drones.
+        position_m: function from times (times,) of the reference's clock to positions (times, drones, 3), metres; NaN
+            where the reference is missing.
+        rotation: function from times to rotations (times, drones, 3, 3) from the lever arms' frame to the world; None
+            if the lever arms are in the world.
+        with_lever_arm: allow each drone a constant lever arm.
     """
 
     frame: Int[np.ndarray, "frames"]
@@ -109,11 +114,14 @@ class ShiftedPair:
         )
 
     def partner(self, offset_s: float) -> Int[np.ndarray, "drones"]:
-        """Index of the estimate that stands for each drone: the least total of mean distances, arms and all."""
+        """(drones,), index of the estimated drone that is assigned to each drone of the reference.
+
+        The assignment has the smallest sum of mean distances, which include the lever arms.
+        """
         ref_m = self.position_m(self.time_s + offset_s)
         distance_m = np.linalg.norm(ref_m[:, :, None] - self.est_m[:, None], axis=-1)
         count = np.isfinite(distance_m).sum(axis=0)
-        # What cannot be compared is dearer than what can: no room is a kilometre wide.
+        # A pair without common positions costs more than any real distance: no room is a kilometre wide.
         mean_m = np.where(count > 0, np.nansum(distance_m, axis=0) / np.maximum(count, 1), 1e3)
         drones, estimates = linear_sum_assignment(mean_m)
         partner = np.full(ref_m.shape[1], UNASSIGNED)
@@ -121,19 +129,20 @@ class ShiftedPair:
         return partner
 
     def without_far(self, offset_s: float) -> Int[np.ndarray, "drones"]:
-        """The partners, without those that are out of the gate, as long as some are not."""
+        """The assignment without drones whose lever arm is longer than the gate, unless all are longer."""
         partner = self.partner(offset_s)
         near = np.linalg.norm(_medians(self._residual_m(offset_s, partner)), axis=-1) <= GATE_M
         return np.where(near, partner, UNASSIGNED) if near.any() else partner
 
     def at(self, offset_s: float, partner: Int[np.ndarray, "drones"]) -> Residuals:
-        """What is left when the reference's clock is ahead by the offset."""
+        """The residuals if the reference's clock is ahead by the offset."""
         return self._without_arms(self._residual_m(offset_s, partner))
 
     def least(self, partner: Int[np.ndarray, "drones"], near_s: float, reach_s: float) -> float:
-        """The offset of the least mean distance within reach, by Brent's method.
+        """The offset with the smallest mean distance between near_s - reach_s and near_s + reach_s, by Brent's method.
 
-        Over what can be compared at both ends: a position that comes or goes would make a step in the mean.
+        Only positions count that can be compared at both ends: a position that can be compared at some offsets only
+        would make a step in the mean.
         """
         low_s, high_s = near_s - reach_s, near_s + reach_s
         outside = np.isnan(self._residual_m(low_s, partner) + self._residual_m(high_s, partner))
@@ -221,15 +230,15 @@ def shifted(
     frame: Int[np.ndarray, "frames"],
     time_s: Float[np.ndarray, "frames"],
 ) -> Trajectories:
-    """A reference whose clock is ahead by the offset, at the frames of a video.
+    """Interpolate a reference at the frames of a video, if the reference's clock is ahead by the offset.
 
-    Positions and orientations are interpolated by cubic splines, not outside of the reference and not in its gaps.
+    Positions and orientations are interpolated by cubic splines; they are NaN outside of the reference and in its gaps.
 
     Args:
-        reference: by its own clock, at its own rate, at two times or more.
-        offset_s: the reference at t + offset_s belongs to the video at t.
+        reference: reference with the times of its own clock, at its own rate, with at least two samples.
+        offset_s: the reference at time t + offset_s belongs to the video at time t, seconds.
         frame: (frames,), numbers of the video's frames.
-        time_s: (frames,), when they are.
+        time_s: (frames,), times of the video's frames, seconds.
     """
     position_m = _interpolated(reference.time_s, reference.position_m)(time_s + offset_s)
     orientation_wxyz = None
@@ -245,27 +254,36 @@ def shifted(
 
 
 def longest_gap_s(time_s: Float[np.ndarray, "samples"]) -> float:
-    """Gaps between samples are bridged up to this, which holds for all of their times, known or not."""
+    """Longest gap between samples over which positions are interpolated, seconds."""
     return max(MAX_GAP_S, 1.5 * float(np.median(np.diff(time_s))))
 
 
 def between_samples(
     sample_s: Float[np.ndarray, "samples"], wanted_s: Float[np.ndarray, "times"], longest_s: float
 ) -> Bool[np.ndarray, "times"]:
-    """Times that are at a sample, or between two that are no farther apart than that; of two samples or more."""
+    """Say which times are at a sample, or between two samples that are at most `longest_s` apart.
+
+    Args:
+        sample_s: (samples,), increasing times of at least two samples, seconds.
+        wanted_s: (times,), times of interest, seconds.
+        longest_s: longest gap between two samples, seconds.
+    """
     after = np.clip(np.searchsorted(sample_s, wanted_s), 1, len(sample_s) - 1)
     before_s, after_s = wanted_s - sample_s[after - 1], sample_s[after] - wanted_s
     inside = (np.minimum(before_s, after_s) >= 0) & (before_s + after_s <= longest_s)
-    # Samples themselves are known on both sides of a gap, but for rounding.
+    # The samples at both ends of a gap are valid; the tolerance is for rounding errors.
     return inside | (np.minimum(np.abs(before_s), np.abs(after_s)) < 1e-9)
 
 
 def _interpolated(time_s: Float[np.ndarray, "samples"], values: np.ndarray) -> _At:
-    """(times, drones, ...) of values (samples, drones, ...), by cubic splines; NaN outside, and in long gaps."""
+    """A function that interpolates values (samples, drones, ...) by cubic splines.
+
+    It takes times (times,) and returns values (times, drones, ...), NaN outside of the samples and in long gaps.
+    """
     flat = values.reshape(*values.shape[:2], -1).astype(np.float64)
     longest_s = longest_gap_s(time_s)
     known = [np.isfinite(flat[:, drone]).all(axis=-1) for drone in range(flat.shape[1])]
-    # A spline takes two samples.
+    # A spline needs two samples.
     splines = {
         drone: (time_s[there], CubicSpline(time_s[there], flat[there, drone]))
         for drone, there in enumerate(known)
@@ -284,7 +302,7 @@ def _interpolated(time_s: Float[np.ndarray, "samples"], values: np.ndarray) -> _
 
 
 def _medians(values: Float[np.ndarray, "frames drones 3"]) -> Float[np.ndarray, "drones 3"]:
-    """Points of the least mean distance, to a few steps of Weiszfeld 1937; NaN where nothing is known."""
+    """Geometric median of each drone's values, by a few iterations of E. Weiszfeld (1937); NaN without values."""
     found = np.full(values.shape[1:], np.nan)
     known = np.isfinite(values).all(axis=-1)
     for drone in np.flatnonzero(known.any(axis=0)):
@@ -298,5 +316,5 @@ def _medians(values: Float[np.ndarray, "frames drones 3"]) -> Float[np.ndarray, 
 
 
 def refused(expected: str, found: str, remedy: str = "") -> InputError:
-    """The error of an estimate and a reference that cannot be compared."""
+    """The error that an estimate and a reference cannot be compared."""
     return InputError("estimate and reference", expected=expected, found=found, remedy=remedy)
