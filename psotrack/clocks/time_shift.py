@@ -95,10 +95,10 @@ class ShiftedPair:
         orientation_wxyz: Float[np.ndarray, "samples drones 4"] | None,
         with_lever_arm: bool,
     ) -> ShiftedPair:
-        """Of an estimate and the samples of its reference; see `synchronisation.find_offset`.
+        """Interpolate the samples of a reference; the arguments are those of `synchronisation.find_offset`.
 
         Raises:
-            InputError: times do not increase, or there are fewer than two of either.
+            InputError: the reference's times do not increase, or the reference or the estimate has fewer than two times.
         """
         if len(time_s) < 2 or not (np.diff(time_s) > 0).all():
             raise refused("a reference at two increasing times or more", f"{len(time_s)} times")
@@ -201,12 +201,14 @@ class ShiftedPair:
         """Second derivative of the summed distance by the offset, metres per squared second.
 
         The second derivative of |r + v t| is (v² - (v · r / |r|)²) / |r|. For residuals of any direction its mean is
-        2/3 v² / |r|. The smaller sum of the two is returned: residuals along the motion make the minimum flatter.
+        2/3 v² / |r|. The smaller sum of the two is returned, because residuals along the motion make the minimum
+        flatter; but at least half of the mean, because residuals exactly along the motion make a kink, not a flat
+        minimum.
         """
         squared = (v**2).sum(axis=-1)
         mean = np.where(squared > 0, 2 / 3 * squared / distance_m, 0.0)
         actual = np.where(squared > 0, (squared - (v * direction).sum(axis=-1) ** 2) / distance_m, 0.0)
-        return float(min(mean.sum(), actual.sum()))
+        return float(np.clip(actual.sum(), mean.sum() / 2, mean.sum()))
 
     def _residual_m(
         self, offset_s: float, partner: Int[np.ndarray, "drones"]
