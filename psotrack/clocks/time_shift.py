@@ -98,7 +98,7 @@ class ShiftedPair:
         """Interpolate the samples of a reference; the arguments are those of `synchronisation.find_offset`.
 
         Raises:
-            InputError: the reference's times do not increase, or the reference or the estimate has fewer than two times.
+            InputError: the reference's times do not increase, or one of both has fewer than two times.
         """
         if len(time_s) < 2 or not (np.diff(time_s) > 0).all():
             raise refused("a reference at two increasing times or more", f"{len(time_s)} times")
