@@ -162,6 +162,6 @@ plt.show()
 # ## Where it came from
 
 # %%
-manifest = json.loads((RESULTS / "manifest.json").read_text())
+manifest = json.loads((RESULTS / "_manifest.json").read_text())
 origin = pd.json_normalize(manifest["runs"])
 origin.drop(columns=[name for name in origin if name.startswith("grid")]).T

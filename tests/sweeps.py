@@ -1,4 +1,4 @@
-"""What the tests of sweeps share: a very small sequence, whose program is compiled once, and ways to run psotrack."""
+"""Shared by the tests of sweeps: a very small sequence, whose program is compiled once, and ways to run psotrack."""
 
 import os
 import subprocess
@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from helpers import make_once
 
-#: One program for all cells, whatever the iterations.
+#: All cells use one compiled program: the number of iterations is no shape.
 GRID = """
 sequences = ["S01_D2_A"]
 runs = {runs}
@@ -24,7 +24,7 @@ silhouettes.reduction = 2
 iterations = {iterations}
 """
 
-#: Half the compiler's time, and none of it twice: programs are kept for a number of devices.
+#: Settings that halve the time of compiling. Compiled programs are stored per number of devices, so one device is set.
 COMPILER = {
     "XLA_FLAGS": "--xla_force_host_platform_device_count=1",
     "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
@@ -32,36 +32,35 @@ COMPILER = {
 
 
 def grid_file(folder: Path, iterations: list[int], runs: int = 1) -> Path:
-    """A grid of a cell per number of iterations."""
+    """Write a grid with one cell per number of iterations."""
     path = folder / f"grid_{len(iterations)}_{runs}.toml"
     path.write_text(GRID.format(iterations=iterations, runs=runs))
     return path
 
 
 def environment(root: Path) -> dict[str, str]:
-    """Of commands that use the cache of the small sequence's folder."""
+    """Environment of commands that use the cache in the small sequence's folder."""
     return os.environ | COMPILER | {"PSOTRACK_CACHE": str(root / "cache")}
 
 
 def python(root: Path, *words: object, **more: str) -> subprocess.CompletedProcess[str]:
-    """`python WORDS`, with the cache of the small sequence's folder, until it has ended.
+    """Run `python WORDS` with the caches in the small sequence's folder, and wait until it has ended.
 
-    Whatever becomes of the test, no process is left to another one: there is nothing to wait for, and nothing to kill.
-    What is to die dies by itself, at a place in the program; no clock says when.
+    No test kills a process from outside: a process that is to be killed kills itself at a place in the program.
     """
     command = [sys.executable, *map(str, words)]
     return subprocess.run(command, capture_output=True, text=True, env=environment(root) | more, check=False)
 
 
 def psotrack(root: Path, *words: object, **more: str) -> subprocess.CompletedProcess[str]:
-    """The same of `psotrack WORDS`."""
+    """Run `psotrack WORDS` with the caches in the small sequence's folder, and wait until it has ended."""
     return python(root, "-m", "psotrack", *words, **more)
 
 
 def small_sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data folder with a sequence of two drones, and a cache with its silhouettes and program; made once per session.
+    """A data folder with a sequence of two drones, and caches with its silhouettes and its compiled program.
 
-    Whoever tests sweeps does it after this, so that a run is seconds.
+    The folder is made once per session, so that a run in a test takes seconds.
     """
 
     def make(root: Path) -> None:
@@ -76,12 +75,12 @@ def small_sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def all_rows(results: Path) -> pd.DataFrame:
-    """Of every finished cell, read without psotrack."""
+    """Rows of every finished cell, read without psotrack."""
     files = [path for path in (results / "cells").glob("*.parquet") if not path.name.startswith(".")]
     return pd.concat([pd.read_parquet(path) for path in files], ignore_index=True)
 
 
 def stamps(results: Path) -> dict[str, tuple[int, int]]:
-    """Which file each finished cell is, and when it was written: some clocks of file systems tick slowly."""
+    """Inode and modification time of each finished cell's file; clocks of file systems may be coarse."""
     found = [path for path in (results / "cells").glob("*.parquet") if path.name[0] != "."]
     return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in found}

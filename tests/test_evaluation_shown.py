@@ -1,4 +1,4 @@
-"""Tables and pictures of an evaluation: that they fit, and that what they show are the numbers."""
+"""Tables and plots of an evaluation: they fit in a terminal, and show the evaluation's numbers."""
 
 import io
 import subprocess
@@ -19,10 +19,12 @@ from psotrack.evaluation import evaluate, plots, tables
 from psotrack.trajectories import Status, Trajectories
 
 NUM_FRAMES = 50
+#: Drones of the reference, with the tracks that follow them.
+LABELS = ["dron0 (track 0)", "dron1 (track 1)", "dron2 (track 2)"]
 
 
 def flights(num_drones: int = 3, *, swap: bool = False, names: tuple[str, ...] = ()):
-    """Circles in a row; the estimate is 20 mm off, lost for a while, and swapped from frame 40 on."""
+    """Drones on circles; the estimate is 20 mm off, lacks the third drone in frames 10 to 19, and may swap from frame 40."""
     frame = np.arange(NUM_FRAMES)
     angle = frame[:, None] / 10 + np.arange(num_drones)
     ref_m = np.stack([np.cos(angle) + 2 * np.arange(num_drones), np.sin(angle), 1 + 0 * angle], axis=-1)
@@ -48,10 +50,21 @@ class TestTable:
     def test_rows(self):
         lines = printed(tables.render(evaluate(*flights()), "S02_D4_A"))
         assert lines[0].strip() == "S02_D4_A: 50 frames, 3 drones, errors in mm"
-        rows = {words[0]: words[1:] for words in map(str.split, lines) if words}
-        assert rows["dron0"] == ["20.0", "20.0", "0.0", "20.0", "20.0", "0.0%", "0.0", "+20", "+0", "+0"]
+        rows = {line[:15].strip(): line[15:].split() for line in lines}
+        assert rows["dron0 (track 0)"] == [
+            "20.0",
+            "20.0",
+            "0.0",
+            "20.0",
+            "20.0",
+            "0.0%",
+            "0.0",
+            "+20",
+            "+0",
+            "+0",
+        ]
         # Ten frames of 50 are lost; of 150, that is one in fifteen.
-        assert rows["dron2"][5] == "20.0%"
+        assert rows["dron2 (track 2)"][5] == "20.0%"
         assert rows["all"] == ["20.0", "20.0", "0.0", "20.0", "20.0", "6.7%", "0.0"]
         text = "\n".join(lines)
         assert "MOTA 0.933, MOTP 20.0 mm, IDF1 0.966, identity switches 0" in text
@@ -85,7 +98,7 @@ class TestTable:
         est = replace(est, covariance_m2=covariance_m2)
         lines = printed(tables.render(evaluate(est, ref), "S04_D10"))
         assert max(map(len, lines)) <= 80
-        # Nothing is cut off, and nothing in a name is taken for a style.
+        # No name is cut off, and no part of a name is taken for a style.
         assert [line.split()[0] for line in lines if "d_" in line] == [f"[red]d_{n}" for n in range(10)]
         assert sum("…" in line for line in lines) == 0
         # No line of the scores is folded.
@@ -99,7 +112,7 @@ class TestTable:
         lines = printed(tables.render(evaluate(est, ref)))
         assert lines[0].strip() == "50 frames, 3 drones, errors in m"
         row = next(line for line in lines if line.startswith("dron0")).split()
-        assert (row[1], row[-3:]) == ("4.00", ["+0.0", "+0.0", "+4.0"])
+        assert (row[3], row[-3:]) == ("4.00", ["+0.0", "+0.0", "+4.0"])
 
     def test_a_drone_that_was_never_seen(self):
         est, ref = flights()
@@ -131,11 +144,11 @@ class TestPictures:
     def test_errors_in_millimetres_with_gaps_where_missed(self):
         axes = axes_of()
         plots.draw_errors(axes, *flights())
-        line = next(line for line in axes.lines if line.get_label() == "dron2")
+        line = next(line for line in axes.lines if line.get_label() == LABELS[2])
         expected_mm = np.full(NUM_FRAMES, 20.0)
         expected_mm[10:20] = np.nan
         np.testing.assert_allclose(line.get_ydata(), expected_mm, rtol=1e-12)
-        assert labels(axes) == ["dron0", "dron1", "dron2", "missed"]
+        assert labels(axes) == [*LABELS, "missed"]
         assert axes.get_yscale() == "linear"
 
     def test_a_swap_is_marked_and_makes_the_scale_logarithmic(self):
@@ -145,12 +158,12 @@ class TestPictures:
         assert [list(mark.get_xdata()) for mark in marks] == [[40 / 25] * 2]
         assert axes.get_yscale() == "log"
 
-    def test_no_line_runs_over_frames_without_truth(self):
+    def test_lines_have_gaps_at_frames_without_reference(self):
         est, ref = flights()
         ref.position_m[25:30] = np.nan
         axes = axes_of()
         plots.draw_errors(axes, est, ref)
-        line = next(line for line in axes.lines if line.get_label() == "dron0")
+        line = next(line for line in axes.lines if line.get_label() == LABELS[0])
         # 45 frames with truth, and one gap between them.
         assert len(line.get_ydata()) == 46
         assert np.flatnonzero(np.isnan(line.get_ydata())).tolist() == [25]
@@ -166,7 +179,7 @@ class TestPictures:
         ratio = extent_m / axes.get_box_aspect()
         np.testing.assert_allclose(ratio, ratio[0], rtol=1e-12)
         assert axes.get_zlim()[0] == 0.0
-        assert labels(axes) == ["dron0", "dron1", "dron2", "truth"]
+        assert labels(axes) == [*LABELS, "truth"]
 
     def test_a_false_track_is_grey(self):
         est, ref = flights()
@@ -176,19 +189,19 @@ class TestPictures:
         assert labels(axes)[-1] == "false track"
 
     @pytest.mark.parametrize("save", [plots.save_trajectories, plots.save_errors, plots.save_overview])
-    def test_png_with_the_colour_of_each_drone(self, tmp_path, save):
+    def test_png_with_the_drone_colour_each_drone(self, tmp_path, save):
         path = tmp_path / "picture.png"
         est, ref = flights()
-        # Errors of their own, so that no line hides another.
+        # Each drone has a different error, so that no line hides another.
         est.position_m[..., 1] += [0.0, 0.03, 0.06]
         save(path, est, ref)
         rgb = cv2.imread(str(path))[..., ::-1].reshape(-1, 3).astype(int)
         for drone in range(3):
             colour = np.round(np.array(to_rgb(plots.drone_colour(drone))) * 255)
-            # Lines are a few hundred pixels long; one that is hidden behind its truth still has a rim.
+            # Lines are a few hundred pixels long; a line behind its reference still has visible edges.
             assert (np.abs(rgb - colour).max(axis=1) <= 2).sum() > 100
 
-    def test_an_existing_picture_is_replaced_only_by_force(self, tmp_path):
+    def test_an_existing_plot_is_replaced_only_by_force(self, tmp_path):
         path = tmp_path / "picture.png"
         path.write_text("precious")
         with pytest.raises(OutputError, match="pass --force"):
@@ -197,7 +210,7 @@ class TestPictures:
         plots.save_errors(path, *flights(), force=True)
         assert cv2.imread(str(path)) is not None
 
-    def test_what_does_not_fit_together_leaves_no_file(self, tmp_path):
+    def test_recordings_without_common_frames_leave_no_file(self, tmp_path):
         est, ref = flights()
         later = Trajectories(ref.frame + 1000, ref.time_s, ref.drones, ref.position_m)
         with pytest.raises(InputError, match="frames of the reference"):
@@ -205,14 +218,14 @@ class TestPictures:
         assert not list(tmp_path.iterdir())
 
 
-def test_importing_draws_nothing_in():
-    """Neither Matplotlib nor pandas comes with the import; drawing does not bring pyplot's global state."""
+def test_importing_loads_neither_pandas_nor_matplotlib():
+    """Importing loads neither Matplotlib nor pandas, and drawing does not load pyplot, which has global state."""
     code = (
         "import sys; from psotrack.evaluation import plots, tables; import psotrack.trajectories.files;"
         "assert not {'matplotlib', 'pandas', 'pyarrow'} & set(sys.modules), set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
-    # By itself: other tests of this process may have drawn what needs it.
+    # In a process of its own, because other tests may have imported pyplot.
     code = (
         "import sys, test_evaluation_shown as shown; shown.plots.draw_errors(shown.axes_of(), *shown.flights());"
         "assert 'matplotlib.pyplot' not in sys.modules"

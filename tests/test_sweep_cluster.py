@@ -1,4 +1,4 @@
-"""Sweeps as tasks of a Dask cluster: workers die, cells run again, the results are those of any other sweep."""
+"""Sweeps as tasks of a Dask cluster: when a worker is killed, its cell runs again, and the results are complete."""
 
 import json
 import sys
@@ -11,7 +11,7 @@ from psotrack.sweep import load, run_on_cluster
 
 pytest.importorskip("distributed")
 
-#: Dask has every worker run it first: of all workers one kills itself when its cell has but to be put in its place.
+#: Code that every worker runs first: one worker kills itself just before it moves its cell's file to its place.
 DYING = """
 import contextlib, os, signal, sys
 from pathlib import Path
@@ -31,7 +31,7 @@ def test_a_worker_is_killed_and_its_cell_runs_again(tmp_path_factory, tmp_path):
     root, results, died = small_sequence(tmp_path_factory), tmp_path / "results", tmp_path / "died"
     (tmp_path / "dying.py").write_text(DYING)
     dask = {"WORKER__PRELOAD": str(tmp_path / "dying.py")}
-    # Nothing here may fail because a machine is slow: half a minute for an answer is Dask's default.
+    # The test must not fail on a slow machine: Dask's default timeout is half a minute.
     dask |= {"COMM__TIMEOUTS__CONNECT": "600s", "COMM__TIMEOUTS__TCP": "600s"}
     more = {f"DASK_DISTRIBUTED__{name}": value for name, value in dask.items()} | {"DIED": str(died)}
     grid = grid_file(tmp_path, [2, 3, 4, 5])
@@ -41,10 +41,10 @@ def test_a_worker_is_killed_and_its_cell_runs_again(tmp_path_factory, tmp_path):
     assert died.exists()
     assert json.loads(done.stdout) == {"finished": 4, "failed": 0, "left": 0}
     assert sorted(all_rows(results)["settings.iterations"]) == [2, 3, 4, 5]
-    manifest = json.loads((results / "manifest.json").read_text())
+    manifest = json.loads((results / "_manifest.json").read_text())
     assert [run["cells"] for run in manifest["runs"]] == [4]
     assert list(manifest["inputs"]) == all_rows(results)["input"].unique().tolist()
-    # Nothing is left, so no cluster is needed, and none at this address is missed.
+    # All cells are finished, so no cluster is needed, and the address without a cluster is no error.
     again = psotrack(root, *words, "tcp://127.0.0.1:1")
     assert json.loads(again.stdout) == {"finished": 0, "failed": 0, "left": 4}
 

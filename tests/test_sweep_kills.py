@@ -1,6 +1,6 @@
-"""kill -9 at lines of chance: no finished cell is lost or run twice, and runners share what is left.
+"""Kill runners at random file operations: no finished cell is lost or run twice, and later runners finish the rest.
 
-`PSOTRACK_KILLS=20 pytest -n 0 --log-cli-level=INFO tests/test_sweep_kills.py` does it more often, and says what it saw.
+`PSOTRACK_KILLS=20 pytest -n 0 --log-cli-level=INFO tests/test_sweep_kills.py` kills more runners and logs the counts.
 """
 
 import json
@@ -19,33 +19,28 @@ logger = logging.getLogger(__name__)
 
 KILLS = int(os.environ.get("PSOTRACK_KILLS", "3"))
 
-#: Cells per kill: there is always something left.
+#: Cells per kill: enough that some are always left.
 CELLS = 3
 
-#: `psotrack`, which kills itself before it runs the LINE-th line of what keeps results: python -c KILLED LINE WORDS.
-#: Between lines of anything else, nothing changes on the disk.
+#: `psotrack`, which kills itself before the N-th operation on a file in a folder: python -c KILLED N FOLDER WORDS.
 KILLED = """
 import os, signal, sys
 
-left = int(sys.argv.pop(1))
-keepers = tuple(f"psotrack/{name}.py" for name in ("files", "sweep/locks", "sweep/store"))
+left, folder = int(sys.argv.pop(1)), sys.argv.pop(1)
 
-def on_line(frame, event, argument):
+def on_event(event, arguments):
     global left
-    left -= event == "line"
-    if left == 0:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return on_line
+    if event in ("open", "os.mkdir", "os.remove", "os.rename") and str(arguments[0]).startswith(folder):
+        left -= 1
+        if left == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
 
-def on_call(frame, event, argument):
-    return on_line if frame.f_code.co_filename.endswith(keepers) else None
-
-sys.settrace(on_call)
+sys.addaudithook(on_event)
 from psotrack.cli import main
 main()
 """
-#: Measured: modules are imported until line 106; rows of cells are written from lines 363, 516, 669 and so on.
-LINES = range(106, 700)
+#: A runner makes OPERATIONS of them in a folder with three unfinished cells; each cell takes about a third.
+OPERATIONS = 60
 
 
 @pytest.mark.slow
@@ -56,15 +51,17 @@ def test_kills_lose_nothing_and_repeat_nothing(tmp_path_factory, tmp_path):
     words = ("sweep", grid_file(tmp_path, iterations), "--data", root, "--out", results)
     finished: dict[str, tuple[int, int]] = {}
     for number in range(KILLS):
-        line = rng.choice(LINES)
-        killed = python(root, "-c", KILLED, line, *words)
+        operation = rng.randrange(1, OPERATIONS)
+        killed = python(root, "-c", KILLED, operation, results, *words)
         assert killed.returncode == -signal.SIGKILL, killed
         now = stamps(results)
         assert finished.items() <= now.items(), "a finished cell was lost or written again"
-        claims = len(list((results / "cells").glob("*.claim")))
-        logger.info("kill %d, line %d: %d cells finished, %d claimed", number + 1, line, len(now), claims)
+        locks = len(list((results / "cells").glob(".*.lock")))
+        logger.info(
+            "kill %d, operation %d: %d cells finished, %d locked", number + 1, operation, len(now), locks
+        )
         finished = now
-    logger.info("%d of %d cells were finished by runners that were killed", len(finished), len(iterations))
+    logger.info("runners that were killed finished %d of %d cells", len(finished), len(iterations))
     with ThreadPoolExecutor(2) as threads:
         two = list(threads.map(lambda _: psotrack(root, *words, "--json", "-"), range(2)))
     assert [runner.returncode for runner in two] == [0, 0], two

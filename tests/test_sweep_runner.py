@@ -19,7 +19,7 @@ from psotrack.errors import InputError
 from psotrack.sweep import Inputs, Store, estimate, key_of, machine, runner, sweep
 from psotrack.sweep import grid as grid_of
 from psotrack.sweep.estimates import FRAME_S, WORK_S
-from psotrack.sweep.locks import claimed
+from psotrack.sweep.locks import Locks
 
 SETTINGS = {
     "particles": 8,
@@ -127,7 +127,7 @@ def test_what_is_finished_is_not_run_again(root: Path, swept: Path) -> None:
     assert "0 cells finished now, 4 before" in again.stdout
     assert stamps(swept / "results") == before
     # The manifest has both grids, and of where rows come from what they say themselves.
-    manifest = json.loads((swept / "results" / "manifest.json").read_text())
+    manifest = json.loads((swept / "results" / "_manifest.json").read_text())
     assert [run["cells"] for run in manifest["runs"]] == [8, 4]
     assert manifest["runs"][1]["grid"]["methods"] == {"usual": {}, "calm": {"inertia": 0.4}}
     rows = all_rows(swept / "results")
@@ -136,7 +136,7 @@ def test_what_is_finished_is_not_run_again(root: Path, swept: Path) -> None:
     assert {run["commit"] for run in manifest["runs"]} == set(rows["commit"])
     assert len(sweep(swept / "good.toml", swept / "results", data=root, cache=root / "cache")) == 8
     assert stamps(swept / "results") == before
-    once_more = json.loads((swept / "results" / "manifest.json").read_text())["runs"]
+    once_more = json.loads((swept / "results" / "_manifest.json").read_text())["runs"]
     assert [run["cells"] for run in once_more] == [8, 4]
     assert once_more[1]["last"] != manifest["runs"][1]["last"]
 
@@ -148,6 +148,10 @@ def test_a_table_of_the_results(swept: Path, capsys: pytest.CaptureFixture[str])
     assert code == 0
     assert "usual" in lines[0]
     assert "calm" in lines[0]
+    # The columns are the sequences where the rows are the methods.
+    code, lines, _ = called(capsys, "table", swept / "results", "--rows", "method")
+    assert code == 0
+    assert "S01_D2_A" in lines[2]
     code, _, wrong = called(capsys, "table", swept / "results", "--value", "mean_eror_m")
     assert code == 2
     assert wrong.count("\n") == 1
@@ -246,7 +250,7 @@ def test_a_failure_goes_when_the_cell_is_finished(root: Path, tracker: Tracker, 
     rows = sweep(varied(3, 4), out, **folders)
     assert rows["settings.iterations"].tolist() == [4]
     assert rows.attrs["errors"] == ["S01_D2_A iterations=3: ZeroDivisionError: planted"]
-    (kept,) = (json.loads(path.read_text()) for path in (out / "cells").glob("*.error.json"))
+    (kept,) = (json.loads(path.read_text()) for path in (out / "cells").glob("_*.error.json"))
     assert "in __call__" in kept["where"]
     tracker.failing = set()
     assert len(sweep(varied(3, 4), out, **folders)) == 2
@@ -276,9 +280,9 @@ def test_a_runner_waits_for_others_and_does_what_they_leave(
     grid, out = grid_of(varied(3, 4)), tmp_path / "out"
     inputs = Inputs(root, root / "cache")
     first = grid.cells()[0]
-    # Whatever goes wrong, the claim is given up before the thread is waited for.
+    # If an assertion fails, the lock is released before the pool waits for its thread.
     with ThreadPoolExecutor(1) as threads:
-        with Store(out).claim(key_of(first, inputs.keys_of(first))):
+        with Store(out).lock(key_of(first, inputs.keys_of(first))):
             waiting = threads.submit(runner.run, grid, out, data=root, cache=root / "cache")
             while not tracker.runs:
                 assert not waiting.done(), waiting.result()
@@ -295,7 +299,7 @@ def test_one_alone_makes_the_silhouettes(root: Path, tmp_path: Path) -> None:
     cell = grid_of(varied(3)).cells()[0]
     inputs = Inputs(root, tmp_path / "cache", jobs=1)
     inputs.keys_of(cell)
-    with claimed(inputs.claim_of(cell)):
+    with Locks().attempt(inputs.silhouettes_lock(cell)):
         assert inputs.read(cell) is None
         assert not list((tmp_path / "cache").glob("*/zarr.json"))
     given = inputs.read(cell)

@@ -1,4 +1,4 @@
-"""The folder of a sweep's results: whole cells or none, one runner per cell, nothing run twice."""
+"""The folder of a sweep's results: whole cells or none, one runner per cell, no run twice."""
 
 import json
 import os
@@ -6,7 +6,6 @@ import subprocess
 import sys
 import threading
 import time
-from dataclasses import asdict, replace
 from pathlib import Path
 
 import pandas as pd
@@ -14,9 +13,15 @@ import pytest
 
 from psotrack.errors import InputError
 from psotrack.sweep import Store, locks
-from psotrack.sweep.locks import STALE_S, Owner, owner_of
 
 KEY = "0" * 40
+
+
+@pytest.fixture
+def short_leases(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Locks that lapse after half a second, and whose holders never touch them."""
+    monkeypatch.setattr(locks, "LEASE_S", 0.5)
+    monkeypatch.setattr(locks, "HEARTBEAT_S", 0.49)
 
 
 def rows(*seeds: int, error_m: float = 0.01) -> pd.DataFrame:
@@ -24,26 +29,21 @@ def rows(*seeds: int, error_m: float = 0.01) -> pd.DataFrame:
 
 
 def add(store: Store, key: str, new: pd.DataFrame) -> None:
-    """Rows, and two frames of errors for each."""
+    """Add rows, and the errors of two frames for each row."""
     frames = pd.concat([new.assign(frame=frame, error_m=new["mean_error_m"]) for frame in (0, 1)])
     store.add(key, new, frames[["seed", "frame", "error_m"]])
 
 
-def claim_of(store: Store) -> Path:
-    return store.folder / "cells" / f"{KEY}.claim"
-
-
-def grown_old(path: Path) -> None:
-    past = time.time() - 2 * STALE_S
-    os.utime(path, (past, past))
+def lock_path(store: Store) -> Path:
+    return store.folder / "cells" / f".{KEY}.lock"
 
 
 def test_rows_of_more_seeds_are_added(tmp_path: Path) -> None:
     store = Store(tmp_path)
-    assert store.seeds_of(KEY) == set()
+    assert store.finished_seeds(KEY) == set()
     add(store, KEY, rows(2, 0))
     add(store, KEY, rows(1))
-    assert store.seeds_of(KEY) == {0, 1, 2}
+    assert store.finished_seeds(KEY) == {0, 1, 2}
     pd.testing.assert_frame_equal(store.rows(), rows(0, 1, 2))
     assert store.errors(KEY, [0, 2])[["seed", "frame"]].to_numpy().tolist() == [
         [0, 0],
@@ -69,8 +69,8 @@ def test_rows_of_some_cells_and_seeds(tmp_path: Path) -> None:
     assert store.rows({other: [0], KEY: [0], "2" * 40: [0]})["mean_error_m"].tolist() == [5.0, 0.01]
 
 
-def test_what_is_half_written_is_no_result(tmp_path: Path) -> None:
-    """A runner that is killed while it writes leaves a file beside the others."""
+def test_a_half_written_file_is_no_result(tmp_path: Path) -> None:
+    """A runner that is killed while it writes leaves a temporary file."""
     store = Store(tmp_path)
     add(store, KEY, rows(0))
     left = tmp_path / "cells" / f".{KEY}.0a1b2c3d.partial.parquet"
@@ -78,16 +78,16 @@ def test_what_is_half_written_is_no_result(tmp_path: Path) -> None:
     assert len(store.rows()) == 1
     assert store.status()["finished"] == 1
     store.tidy()
-    assert left.exists(), "somebody may be writing it"
+    assert left.exists(), "another process may be writing the file"
     os.utime(left, (0, 0))
     store.tidy()
     assert not left.exists()
 
 
-def test_a_failure_is_kept_until_it_is_forgiven(tmp_path: Path) -> None:
+def test_a_failure_is_stored_until_it_is_removed(tmp_path: Path) -> None:
     store = Store(tmp_path)
-    store.fail(KEY, "no such camera", {"sequence": "S01", "method": "ours"})
-    assert store.error_of(KEY) == "no such camera"
+    store.add_failure(KEY, "no such camera", {"sequence": "S01", "method": "ours"})
+    assert store.failure(KEY) == "no such camera"
     assert store.status() == {
         "finished": 0,
         "failed": 1,
@@ -95,105 +95,149 @@ def test_a_failure_is_kept_until_it_is_forgiven(tmp_path: Path) -> None:
         "errors": ["S01 ours: no such camera"],
         "at_work": [],
     }
-    store.forgive(KEY)
-    store.forgive(KEY)
-    assert store.error_of(KEY) is None
+    store.remove_failure(KEY)
+    store.remove_failure(KEY)
+    assert store.failure(KEY) is None
     assert store.status()["failed"] == 0
 
 
-def test_one_runner_alone_has_a_cell(tmp_path: Path) -> None:
+def test_the_folder_is_a_parquet_data_set_of_the_rows(tmp_path: Path) -> None:
+    """Also with errors, failures, a manifest and a locked cell in the folder."""
+    store = Store(str(tmp_path))
+    add(store, KEY, rows(0, 1))
+    add(store, "1" * 40, rows(2))
+    store.add_failure("2" * 40, "no such camera", {"sequence": "S01", "method": "ours"})
+    store.change_manifest(lambda manifest: manifest["runs"].append(1))
+    with store.lock("3" * 40, "S01 ours"):
+        pd.testing.assert_frame_equal(pd.read_parquet(tmp_path), store.rows())
+
+
+def test_a_folder_of_an_older_version_stays_usable(tmp_path: Path) -> None:
     store = Store(tmp_path)
-    with store.claim(KEY, "S01 ours") as first:
+    add(store, KEY, rows(0, 1))
+    store.add_failure(KEY, "no such camera", {"sequence": "S01", "method": "ours"})
+    store.change_manifest(lambda manifest: manifest["runs"].append(1))
+    failure = tmp_path / "cells" / f"_{KEY}.error.json"
+    for path in (tmp_path / "_errors", failure, tmp_path / "_manifest.json"):
+        path.rename(path.with_name(path.name[1:]))
+    for _ in ("as it was", "renamed"):
+        assert len(store.errors(KEY, [0])) == 2
+        assert store.failure(KEY) == "no such camera"
+        assert store.status()["failed"] == 1
+        assert store.manifest()["runs"] == [1]
+        store.tidy()
+    pd.testing.assert_frame_equal(pd.read_parquet(tmp_path), store.rows())
+    assert failure.exists()
+
+
+def test_one_runner_at_a_time_locks_a_cell(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    with store.lock(KEY, "S01 ours") as first:
         assert first
-        with store.claim(KEY) as second:
-            assert not second
-        status = store.status()
-        assert status["claimed"] == 1
-        assert f"process {os.getpid()} on " in status["at_work"][0]
-        assert status["at_work"][0].endswith(": S01 ours")
+        for other in (store, Store(tmp_path)):
+            with other.lock(KEY) as second:
+                assert not second
+        for reader in (store, Store(tmp_path)):
+            status = reader.status()
+            assert status["claimed"] == 1
+            assert f"process {os.getpid()} on " in status["at_work"][0]
+            assert status["at_work"][0].endswith(": S01 ours")
     assert store.status()["claimed"] == 0
-    with store.claim(KEY) as third:
+    with store.lock(KEY) as third:
         assert third
 
 
-def test_a_claim_is_given_up_when_the_work_fails(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="work"), Store(tmp_path).claim(KEY):
+def test_a_lock_is_released_when_the_work_fails(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="work"), Store(tmp_path).lock(KEY):
         raise ValueError("work")
-    assert not claim_of(Store(tmp_path)).exists()
+    assert list((tmp_path / "cells").iterdir()) == []
 
 
-@pytest.mark.skipif(not Path("/proc/self/ns/pid").exists(), reason="processes of this machine cannot be seen")
-def test_the_claim_of_a_killed_process_of_this_machine_lapses_at_once(tmp_path: Path) -> None:
-    code = "import sys; from pathlib import Path; from psotrack.sweep.locks import claimed\n"
-    code += "with claimed(Path(sys.argv[1])):\n    print('claimed', flush=True)\n    sys.stdin.read()"
+@pytest.mark.skipif(not Path("/proc/self/ns/pid").exists(), reason="process start times are read from /proc")
+def test_the_lock_of_a_killed_process_of_this_machine_lapses_at_once(tmp_path: Path) -> None:
+    code = "import sys; from pathlib import Path; from psotrack.sweep import Store\n"
+    code += "with Store(Path(sys.argv[1])).lock(sys.argv[2], 'S01 ours'):\n"
+    code += "    print('locked', flush=True)\n    sys.stdin.read()"
     store = Store(tmp_path)
-    command = [sys.executable, "-c", code, str(claim_of(store))]
-    # What it waits for comes with the end of the block at the latest, however that is reached.
+    command = [sys.executable, "-c", code, str(tmp_path), KEY]
+    # The process ends at the end of this block at the latest, because its standard input is closed.
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as runner:
         assert runner.stdout is not None
-        assert runner.stdout.readline() == "claimed\n"
-        with store.claim(KEY) as while_it_lives:
+        assert runner.stdout.readline() == "locked\n"
+        with store.lock(KEY) as while_it_lives:
             assert not while_it_lives
         runner.kill()
-        # Before its parent takes note of it, too: it is a zombie then.
-        os.waitid(os.P_PID, runner.pid, os.WEXITED | os.WNOWAIT)
-        assert owner_of(claim_of(store)) is None
-    with store.claim(KEY) as after:
+        runner.wait()
+        assert Store(tmp_path).status()["at_work"] == []
+    with store.lock(KEY) as after:
         assert after
-        assert json.loads(claim_of(store).read_text())["process"] == os.getpid()
 
 
-def planted(store: Store, **changed: object) -> Path:
-    """A claim as this process would make it, but for what is changed."""
-    path = claim_of(store)
-    with locks.claimed(path):
-        owner = Owner(**json.loads(path.read_text()))
-    path.write_text(json.dumps(asdict(replace(owner, **changed))))
+def plant(store: Store, **fields: object) -> Path:
+    """Leave a lock as this process would make it, with some fields of its record changed."""
+    path = lock_path(store)
+    with locks.Locks().attempt(path):
+        lines = path.read_text().splitlines()
+    changed = {name: f"{name}={value}" for name, value in fields.items()}
+    path.write_text("".join(f"{changed.get(line.partition('=')[0], line)}\n" for line in lines))
     return path
 
 
-def test_a_number_that_another_process_has_now_is_not_its_owner(tmp_path: Path) -> None:
-    assert owner_of(planted(Store(tmp_path))) is not None
-    assert owner_of(planted(Store(tmp_path), started=1)) is None
-
-
-def test_claims_of_other_machines_lapse_when_they_are_not_touched(tmp_path: Path) -> None:
+@pytest.mark.skipif(not Path("/proc/self/ns/pid").exists(), reason="process start times are read from /proc")
+def test_another_process_with_the_same_number_is_not_the_holder(tmp_path: Path) -> None:
     store = Store(tmp_path)
-    # No process of this machine has this number; of another one may.
-    path = planted(store, machine="another", host="node7", process=2**30)
-    with store.claim(KEY) as early:
+    plant(store)
+    assert store.status()["claimed"] == 1
+    plant(store, start=1)
+    assert store.status()["claimed"] == 0
+
+
+def test_a_lock_of_another_machine_lapses_when_it_is_not_touched(tmp_path: Path, short_leases: None) -> None:
+    store = Store(tmp_path)
+    # No process of this machine has this number.
+    path = plant(store, host="node7", pid=2**30)
+    assert "process 1073741824 on node7" in store.status()["at_work"][0]
+    with store.lock(KEY) as early:
         assert not early
-    assert "on node7" in store.status()["at_work"][0]
-    grown_old(path)
-    with store.claim(KEY) as late:
+    os.utime(path)
+    with store.lock(KEY) as touched:
+        assert not touched
+    time.sleep(0.6)
+    assert store.status()["at_work"] == []
+    with store.lock(KEY) as late:
         assert late
 
 
-def test_a_claim_that_was_cut_off_lapses(tmp_path: Path) -> None:
-    path = claim_of(Store(tmp_path))
+def test_an_empty_lock_lapses(tmp_path: Path) -> None:
+    """A machine that fails while it makes a lock leaves an empty file."""
+    store = Store(tmp_path)
+    path = lock_path(store)
     path.parent.mkdir()
-    path.write_text("")
-    assert owner_of(path) is not None
-    grown_old(path)
-    assert owner_of(path) is None
-    with Store(tmp_path).claim(KEY) as ours:
-        assert ours
+    path.touch()
+    assert store.status()["claimed"] == 1
+    os.utime(path, (time.time() - 2 * locks.LEASE_S,) * 2)
+    assert store.status()["claimed"] == 0
+    with store.lock(KEY) as locked:
+        assert locked
 
 
-def test_of_many_who_see_that_a_claim_is_nobodys_one_has_it(tmp_path: Path) -> None:
-    """Each holds what it got until all have tried; in the end one of them has it, not one that was replaced."""
+def test_one_of_many_takes_over_a_lapsed_lock(tmp_path: Path, short_leases: None) -> None:
+    """Each thread holds what it got until all have tried."""
     store, threads = Store(tmp_path), 8
-    for _ in range(20):
-        grown_old(planted(store, machine="another"))
-        # One that fails leaves the others waiting: not for ever.
+    for _ in range(3):
+        plant(store, host="node7")
+        with store.lock(KEY) as early:
+            assert not early
+        time.sleep(0.6)
+        # The timeout ends the test if a thread fails.
         begin, tried = (threading.Barrier(threads, timeout=300) for _ in range(2))
         got: list[bool] = []
 
         def compete(begin=begin, tried=tried, got=got) -> None:
             begin.wait()
-            with store.claim(KEY) as ours:
+            with store.lock(KEY) as locked:
                 tried.wait()
-                got.append(ours)
+                got.append(locked)
 
         competitors = [threading.Thread(target=compete) for _ in range(threads)]
         for competitor in competitors:
@@ -201,37 +245,38 @@ def test_of_many_who_see_that_a_claim_is_nobodys_one_has_it(tmp_path: Path) -> N
         for competitor in competitors:
             competitor.join()
         assert sum(got) == 1
-        assert not claim_of(store).exists()
+        assert not lock_path(store).exists()
 
 
-def test_who_lost_a_claim_does_not_remove_its_successors(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_runner_that_lost_its_lock_leaves_its_successors_lock(
+    tmp_path: Path, short_leases: None, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """As after a machine was asleep: its owner, too, so it does not touch the claim meanwhile."""
-    monkeypatch.setattr(locks, "HEARTBEAT_S", 3600.0)
+    """As after a machine was asleep; the first runner logs that it has lost the lock."""
     store = Store(tmp_path)
-    with store.claim(KEY):
-        grown_old(claim_of(store))
-        with store.claim(KEY) as taken_over:
-            assert taken_over
-            successor = claim_of(store).read_text()
-            claim_of(store).unlink()
-            claim_of(store).write_text(successor.replace('"token": "', '"token": "another'))
-        assert claim_of(store).exists()
-    assert claim_of(store).exists()
-
-
-def test_claims_are_kept_alive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(locks, "HEARTBEAT_S", 0.01)
-    with Store(tmp_path).claim(KEY):
-        grown_old(claim_of(Store(tmp_path)))
+    with store.lock(KEY):
+        successor = lock_path(store).read_text().replace("host=", "host=node7.")
+        lock_path(store).unlink()
+        lock_path(store).write_text(successor)
         until = time.monotonic() + 300
-        while owner_of(claim_of(Store(tmp_path))) is None:
+        while not caplog.records:
+            assert time.monotonic() < until
+            time.sleep(0.01)
+    assert "has lost the lock" in caplog.text
+    assert lock_path(store).read_text() == successor
+
+
+def test_a_holder_keeps_its_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(locks, "HEARTBEAT_S", 0.01)
+    store = Store(tmp_path)
+    with store.lock(KEY):
+        os.utime(lock_path(store), (0, 0))
+        until = time.monotonic() + 300
+        while lock_path(store).stat().st_mtime == 0:
             assert time.monotonic() < until
             time.sleep(0.01)
 
 
-def test_the_manifest_is_changed_by_one_at_a_time(tmp_path: Path) -> None:
+def test_one_process_at_a_time_changes_the_manifest(tmp_path: Path) -> None:
     store = Store(tmp_path)
     assert store.manifest() == {"runs": [], "inputs": {}}
 
@@ -247,10 +292,12 @@ def test_the_manifest_is_changed_by_one_at_a_time(tmp_path: Path) -> None:
     assert store.manifest()["runs"] == [1] * 20
 
 
-def test_no_results_are_one_clear_line(tmp_path: Path) -> None:
+def test_missing_results_are_one_clear_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected results of a sweep, found none"):
         Store(tmp_path).status()
     with pytest.raises(InputError, match="no finished cell"):
         Store(tmp_path).rows()
     with pytest.raises(InputError, match="expected errors of a finished cell"):
         Store(tmp_path).errors(KEY, [0])
+    # The manifest of no run is empty.
+    assert json.dumps(Store(tmp_path).manifest()) == '{"runs": [], "inputs": {}}'

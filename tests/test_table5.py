@@ -67,8 +67,8 @@ def test_tables_rows_and_figures_and_nothing_twice(data: Path, tmp_path: Path) -
     again = table5(data, out)
     assert again.returncode == 0, again.stderr
     assert "nothing new" in again.stdout
-    kept = {name: stamp for name, stamp in stamps(out).items() if name != "manifest.json"}
-    assert kept == {name: stamp for name, stamp in before.items() if name != "manifest.json"}
+    kept = {name: stamp for name, stamp in stamps(out).items() if name != "_manifest.json"}
+    assert kept == {name: stamp for name, stamp in before.items() if name != "_manifest.json"}
 
 
 def test_without_the_sequence(data: Path, tmp_path: Path) -> None:

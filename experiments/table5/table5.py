@@ -4,7 +4,7 @@
     python experiments/table5/table5.py --quick    # a small form of it: five minutes, the second time seconds
     python experiments/table5/table5.py --data FOLDER_OF_THE_DATASET
 
-Without --data it simulates the sequences that are missing. Writes results.csv (one row per run), manifest.json,
+Without --data it simulates the sequences that are missing. Writes results.csv (one row per run), _manifest.json,
 table5.md and pictures to --out. Cells that are finished there are not run again.
 """
 

@@ -155,7 +155,9 @@ def _run_there(
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @click.option("--rows", "rows_by", default="sequence", show_default=True, help="Names with commas between.")
 @click.option(
-    "--columns", "columns_by", default="method", show_default=True, help="Names with commas between."
+    "--columns",
+    "columns_by",
+    help="Names with commas between.  [default: method; sequence where --rows names method]",
 )
 @click.option("--value", default="mean_error_m", show_default=True, help="Which figure.")
 @click.option("--scale", type=float, default=1.0, show_default=True, help="1000 makes mm of m.")
@@ -166,7 +168,7 @@ def _run_there(
     default="text",
     show_default=True,
 )
-def table(folder: Path, rows_by: str, columns_by: str, value: str, scale: float, layout: str) -> None:
+def table(folder: Path, rows_by: str, columns_by: str | None, value: str, scale: float, layout: str) -> None:
     """Show a figure of the results in DIR: mean +- standard deviation over runs.
 
     \b
@@ -176,9 +178,12 @@ def table(folder: Path, rows_by: str, columns_by: str, value: str, scale: float,
     """
     from psotrack.sweep import Store, pivot, render
 
+    rows = [name for name in rows_by.split(",") if name]
+    if columns_by is None:
+        columns_by = next((name for name in ("method", "sequence") if name not in rows), "")
     shown = pivot(
         Store(folder).rows(),
-        rows_by=[name for name in rows_by.split(",") if name],
+        rows_by=rows,
         columns_by=[name for name in columns_by.split(",") if name],
         value=value,
         scale=scale,

@@ -1,7 +1,8 @@
-"""Evaluation: tracks judged by a reference.
+"""Evaluation: compare tracks with a reference.
 
-In: two `Trajectories`. Out: an `Evaluation` with the figures of the contract, errors per frame, tables and plots.
-Only trajectories come in, so every method is judged by the same code. No lower room imports this one.
+In: two `Trajectories`, the estimate and the reference. Out: an `Evaluation` with the figures of the contract, errors
+per frame, tables and plots. The input is only trajectories, so all methods are evaluated by the same code. Only
+`sweep`, `cli` and other rooms above this one import it.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""Whether an estimate knows how far off it is: its covariances against its errors.
+"""Consistency of an estimate: its covariances compared with its errors.
 
 Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4.2
 (NEES, the normalised estimation error squared).
@@ -22,31 +22,31 @@ def consistency(
     centred_m: Float[np.ndarray, "frames drones 3"],
     covariance_m2: Float[np.ndarray, "frames drones 3 3"],
 ) -> Consistency:
-    """Share of truths inside of the 90 % ellipsoid, and mean NEES, over all frames and drones with both.
+    """Share of reference positions inside the estimate's 90 % ellipsoid, and mean NEES, over frames and drones.
 
-    NEES is r^T C^-1 r with the residual r and its covariance C. For Gaussian errors with that covariance it is
-    distributed as chi-square with 3 degrees of freedom: its mean is 3, and 90 % of it is below `INSIDE_90`.
+    NEES is r^T C^-1 r with the residual r and its covariance C. For Gaussian errors with covariance C, NEES has a
+    chi-square distribution with 3 degrees of freedom: the mean is 3, and 90 % of the values are below `INSIDE_90`.
 
     Args:
-        residual_m: (frames, drones, 3), estimate minus truth, NaN where either is not known.
-        centred_m: the same without each drone's constant offset.
-        covariance_m2: (frames, drones, 3, 3), of the estimates, in the world; NaN where not known.
+        residual_m: (frames, drones, 3), estimate minus reference, NaN where either is not known.
+        centred_m: (frames, drones, 3), residuals minus each drone's mean residual.
+        covariance_m2: (frames, drones, 3, 3), covariances of the estimates in the world; NaN where not known.
 
     Raises:
         InputError: a covariance is not positive definite.
     """
-    there = np.isfinite(residual_m).all(axis=-1) & np.isfinite(covariance_m2).all(axis=(-2, -1))
-    if not there.any():
+    known = np.isfinite(residual_m).all(axis=-1) & np.isfinite(covariance_m2).all(axis=(-2, -1))
+    if not known.any():
         return Consistency(None, None, None, None)
-    smallest_m2 = np.linalg.eigvalsh(covariance_m2[there])[:, 0].min()
+    smallest_m2 = np.linalg.eigvalsh(covariance_m2[known])[:, 0].min()
     if not smallest_m2 > 0:
         raise InputError(
             "estimate",
             expected="covariances that are positive definite",
-            found=f"one whose least eigenvalue is {smallest_m2:.3g} m2",
+            found=f"one whose smallest eigenvalue is {smallest_m2:.3g} m2",
             remedy="leave a covariance empty (NaN) where it is not known",
         )
-    raw, centred = (_nees(vector_m[there], covariance_m2[there]) for vector_m in (residual_m, centred_m))
+    raw, centred = (_nees(vector_m[known], covariance_m2[known]) for vector_m in (residual_m, centred_m))
     return Consistency(
         inside_90_rate=float(np.mean(raw <= INSIDE_90)),
         mean_nees=float(raw.mean()),

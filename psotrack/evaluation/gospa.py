@@ -1,7 +1,7 @@
-"""GOSPA: errors of position, of missed drones and of false ones, in metres and in one number.
+"""GOSPA: one figure, in metres, for errors of position, missed drones and false tracks.
 
 A. S. Rahmathullah, A. F. Garcia-Fernandez, L. Svensson, Generalized Optimal Sub-Pattern Assignment Metric,
-International Conference on Information Fusion, 2017. It knows nothing of identity: each frame stands for itself.
+International Conference on Information Fusion, 2017. Each frame is scored alone, so identities do not matter.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ def gospa(
 
     GOSPA^2 = min [ sum over pairs of distance^2 + c^2 / 2 (missed + false) ]
 
-    so that a drone that is missed costs c / sqrt(2), and a pair further apart than c is a missed drone and a
-    false one. The mean of GOSPA^2 over frames, and its root at the end, keep it a metric (section IV of the
-    paper) and its parts additive: localisation^2 + missed^2 + false^2 = GOSPA^2.
+    A missed drone costs c / sqrt(2), and a pair further apart than c counts as a missed drone and a false track. The
+    result is the root of the mean of GOSPA^2 over frames; it is a metric (section IV of the paper), and its parts add
+    up: localisation^2 + missed^2 + false^2 = GOSPA^2.
 
-    It grows with the number of drones: a drone missed throughout costs 0.354 m, ten cost 1.118 m.
+    GOSPA grows with the number of drones: one drone missed in all frames costs 0.354 m, ten cost 1.118 m.
 
     Args:
-        distance_m: (frames, drones, estimates), NaN where either is not seen.
-        known: (frames, drones), what is there to be found.
-        counted: (frames, estimates), what was found.
+        distance_m: (frames, drones, estimates), NaN where either is not known.
+        known: (frames, drones), whether the drone's position is known.
+        counted: (frames, estimates), whether the estimate counts as a true or false positive.
     """
     cut_m2 = GATE_M**2
-    # A pair at the cut-off costs as much as both of them alone.
+    # A pair at the cut-off costs the same as a missed drone and a false track.
     cost_m2 = np.where(distance_m < GATE_M, distance_m**2, cut_m2)
     paired_m2 = paired_values(cost_m2, cheapest_partners(cost_m2))
     matched = paired_m2 < cut_m2

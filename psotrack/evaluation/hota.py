@@ -3,8 +3,8 @@
 J. Luiten, A. Osep, P. Dendorfer, P. Torr, A. Geiger, L. Leal-Taixe, B. Leibe, HOTA: A Higher Order Metric for
 Evaluating Multi-Object Tracking, International Journal of Computer Vision 129, 2021.
 
-The paper leaves the similarity to the user. Ours falls linearly from 1 at the truth to 0 at `GATE_M`, so that its
-thresholds 0.05, 0.10 ... 0.95 stand for distances of 0.475 m, 0.450 m ... 0.025 m.
+The paper leaves the choice of similarity to the user. Here, similarity falls linearly from 1 at distance 0 to 0 at
+`GATE_M`, so that the thresholds 0.05, 0.10 ... 0.95 are distances of 0.475 m, 0.450 m ... 0.025 m.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from psotrack.evaluation.records import Hota
 from psotrack.trajectories.association import GATE_M, UNASSIGNED, cheapest_partners, paired_values
 
 _THRESHOLDS = np.linspace(0.05, 0.95, 19)
-#: A similarity counts as reaching a threshold that it misses by no more than rounding.
+#: Tolerance for rounding when a similarity is compared with a threshold.
 _EPSILON = np.finfo(float).eps
 
 
@@ -25,27 +25,28 @@ def hota(
     known: Bool[np.ndarray, "frames drones"],
     counted: Bool[np.ndarray, "frames estimates"],
 ) -> Hota:
-    """HOTA, DetA, AssA and LocA: means over the thresholds.
+    """HOTA, DetA, AssA and LocA, each the mean over the thresholds.
 
-    In each frame one assignment serves all thresholds. It maximises the sum of similarities, each weighted by how
-    well the two whole tracks fit together (section 5.2 of the paper); a pair is a match at threshold alpha
-    where its similarity is at least alpha. With TP, FN, FP over the whole run, and TPA, FNA, FPA of a match the
-    frames in which its two tracks are matched, and those in which the true one or the estimated one is not:
+    Each frame has one assignment for all thresholds. The assignment maximises the sum of similarities, each weighted by
+    the overlap of the two whole tracks (section 5.2 of the paper). A pair is a match at threshold alpha if its
+    similarity is at least alpha. TP, FN and FP are counted over all frames. For a match, TPA is the number of frames in
+    which its drone and its track are matched; FNA and FPA are the numbers of the other frames of the drone and of the
+    track:
 
     - DetA_alpha = TP / (TP + FN + FP);
     - AssA_alpha = mean over matches of TPA / (TPA + FNA + FPA);
     - HOTA_alpha = sqrt(DetA_alpha AssA_alpha);
-    - LocA_alpha = mean over matches of the similarity; 1 at a threshold that no pair reaches, as in the
-      authors' code, but None where no pair reaches the lowest.
+    - LocA_alpha = mean over matches of the similarity; 1 at a threshold without matches, as in the authors' code;
+      LocA is None if the lowest threshold has no matches.
 
     Args:
-        distance_m: (frames, drones, estimates), NaN where either is not seen.
-        known: (frames, drones), what is there to be found. Each drone is known in some frame.
-        counted: (frames, estimates), what was found; an estimate that is not counted is within `GATE_M` of
-            no drone.
+        distance_m: (frames, drones, estimates), NaN where either is not known.
+        known: (frames, drones), whether the drone's position is known; each drone's is known in at least one frame.
+        counted: (frames, estimates), whether the estimate counts as a true or false positive; the other estimates are
+            further than `GATE_M` from all drones.
     """
     similarity = np.where(distance_m < GATE_M, 1.0 - distance_m / GATE_M, 0.0)
-    # Numbers of frames of a true track and of an estimated one, together: (drones, estimates).
+    # Number of frames of a drone plus number of frames of a track: (drones, estimates).
     frames_of_both = known.sum(axis=0)[:, None] + counted.sum(axis=0)[None, :]
     weighted = _track_fit(similarity, frames_of_both) * similarity
     partners = cheapest_partners(-weighted)
@@ -75,9 +76,9 @@ def _track_fit(
     similarity: Float[np.ndarray, "frames drones estimates"],
     frames_of_both: Int[np.ndarray, "drones estimates"],
 ) -> Float[np.ndarray, "drones estimates"]:
-    """The soft overlap of two whole tracks, before anything is matched; in [0, 1].
+    """Overlap of each drone with each track over all frames, in [0, 1], used as weight of the matching.
 
-    In a frame, a pair gets its similarity as a share of all that either of the two has.
+    In each frame, a pair's similarity is divided by the sum of similarities of the drone and of the track.
     """
     total = similarity.sum(axis=1, keepdims=True) + similarity.sum(axis=2, keepdims=True) - similarity
     share = np.divide(similarity, total, out=np.zeros_like(similarity), where=total > _EPSILON)
@@ -88,9 +89,9 @@ def _track_fit(
 def _frames_together(
     matched: Bool[np.ndarray, "frames drones"], partners: Int[np.ndarray, "frames drones"], num_estimates: int
 ) -> Int[np.ndarray, "drones estimates"]:
-    """In how many frames each pair is matched."""
-    there = matched & (partners != UNASSIGNED)
-    _, drones = np.nonzero(there)
+    """Number of frames in which each pair is matched."""
+    assigned = matched & (partners != UNASSIGNED)
+    _, drones = np.nonzero(assigned)
     together = np.zeros((matched.shape[1], num_estimates), int)
-    np.add.at(together, (drones, partners[there]), 1)
+    np.add.at(together, (drones, partners[assigned]), 1)
     return together

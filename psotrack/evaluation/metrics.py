@@ -1,4 +1,4 @@
-"""How good a track is: position errors, what was missed, and whether drones kept their identity.
+"""Accuracy of tracks: position errors, missed drones, and whether drones kept their identity.
 
 References:
     K. Bernardin, R. Stiefelhagen, Evaluating Multiple Object Tracking Performance: The CLEAR MOT Metrics,
@@ -38,32 +38,29 @@ from psotrack.trajectories.association import (
 
 
 def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
-    """Judge an estimate by its reference. The names of the estimated drones do not matter.
+    """Compare an estimate with a reference. The names of the estimated tracks do not matter.
 
-    What counts: the frames of the reference in which some drone's position is known, and in each the drones
-    whose position is known (`frames`, `drones` and all rates are over these). Missed: no row in the estimate,
-    or a lost one.
+    All figures are over the known positions: frames and drones whose position is in the reference. A drone is missed in
+    a frame where its position is known and the estimate has no row, or a row with the status lost.
 
-    - Errors are distances between a true drone and the estimate that stands for it, wherever it is not
-      missed. Identity is fixed once (`association.fixed_identity`), so that a later swap costs.
-    - `missed_rate`: missed / known, over frames and drones; a true drone without partner is missed
-      throughout.
-    - `matched_mean_error_m`: the mean over pairs that are assigned anew in each frame, within 0.5 m.
-    - `mota` = 1 - (misses + false positives + `id_switches`) / known, and `motp_m`, the mean distance of the
-      matched pairs in metres (Bernardin and Stiefelhagen 2008): pairs within 0.5 m, a pair of the previous
-      frame is kept while it is valid, and a switch is a true drone matched to another estimate than when it
-      was last matched.
-    - `idf1` = 2 IDTP / (known + estimated), with the one assignment of whole tracks that has the most frames
-      within 0.5 m, IDTP (Ristani et al. 2016).
-    - An estimate whose own drone is unknown in a frame, and that is near no other, is no false positive.
+    - Errors are distances between a drone and the track that follows it, where the drone is not missed. The assignment
+      of tracks to drones is one for all frames (`association.fixed_identity`), so that a later swap costs.
+    - `missed_rate`: missed / known positions; a drone without a track is missed in all its frames.
+    - `matched_mean_error_m`: mean distance of the pairs within 0.5 m, when drones and tracks are assigned frame by
+      frame.
+    - `mota` = 1 - (misses + false positives + `id_switches`) / known, and `motp_m`, the mean distance of the matched
+      pairs (Bernardin and Stiefelhagen 2008): pairs are within 0.5 m, a pair of the previous frame is kept while it is
+      valid, and an identity switch is a drone matched to another track than at its previous match.
+    - `idf1` = 2 IDTP / (known + estimated), where IDTP is the number of frames within 0.5 m under the assignment of
+      whole tracks that has the most such frames (Ristani et al. 2016).
+    - A track whose drone has no known position in a frame is no false positive, unless it is near another drone.
     - `hota`, `deta`, `assa`, `loca`: see `hota.hota`; `gospa_*`: see `gospa.gospa`.
-    - `offset_removed_mean_error_m`: the mean error after one constant offset per drone, its mean residual, is
-      taken out: in the true body's frame where the orientation is known, else in the world's. Silhouettes
-      and marker crosses have their middle elsewhere than the body's origin; that is no fault of a tracker. In
-      `per_drone`, `offset_m` is this lever arm and `offset_standard_error_m` how well it is known; see
-      `standard_errors.standard_error`.
-    - `ate_*`, `rpe_*`: of the same pairs as the errors; see `paths.path_errors`. Over all drones, `ate_aligned_rmse_m`
-      moves all of them by one rigid motion; in `per_drone`, each by its own.
+    - `offset_removed_mean_error_m`: the mean error after each drone's mean residual is subtracted: in the body's frame
+      where the reference's orientation is known, else in the world's frame. The middles of silhouettes and of marker
+      crosses differ from the body's origin, which is no fault of a tracker. In `per_drone`, `offset_m` is this lever
+      arm and `offset_standard_error_m` its standard error (see `standard_errors.standard_error`).
+    - `ate_*`, `rpe_*`: see `paths.path_errors`. For all drones together, `ate_aligned_rmse_m` aligns all tracks by one
+      rigid motion; in `per_drone`, each track by its own.
     - `inside_90_rate`, `mean_nees`, where the estimate has covariances: see `consistency.consistency`.
 
     Args:
@@ -71,8 +68,8 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
         traj_ref: the reference.
 
     Raises:
-        InputError: nothing is known in the reference, the two have no frame in common, or the estimate has a
-            covariance that is none.
+        InputError: the reference has no known position, both have no frame in common, or a covariance of the estimate
+            is not positive definite.
     """
     pair = align(traj_est, traj_ref)
     known = pair.truth_known
@@ -114,27 +111,26 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
 def _counted_estimates(
     pair: AlignedPair, partner: Int[np.ndarray, "drones"]
 ) -> Bool[np.ndarray, "frames estimates"]:
-    """(frames, estimates), those that a matching may find right or wrong.
+    """(frames, estimates), the estimates that count as true or false positives.
 
-    An estimate that follows its own drone while nobody knows where that is cannot be judged, unless it is
-    near another.
+    An estimate does not count where the position of its own drone is unknown, unless it is near another drone.
     """
-    unjudged = np.zeros(pair.est_m.shape[:2], bool)
+    unknown = np.zeros(pair.est_m.shape[:2], bool)
     assigned = partner != UNASSIGNED
-    unjudged[:, partner[assigned]] = ~pair.truth_known[:, assigned]
-    near_some = (pair.distance_m <= GATE_M).any(axis=1)
-    return np.isfinite(pair.est_m).all(axis=-1) & (near_some | ~unjudged)
+    unknown[:, partner[assigned]] = ~pair.truth_known[:, assigned]
+    near_a_drone = (pair.distance_m <= GATE_M).any(axis=1)
+    return np.isfinite(pair.est_m).all(axis=-1) & (near_a_drone | ~unknown)
 
 
 def _identity_true_positives(distance_m: Float[np.ndarray, "frames drones estimates"]) -> int:
-    """Frames within the gate under the assignment of whole tracks that has the most of them."""
+    """Number of frames within the gate under the assignment of whole tracks that has the most such frames."""
     together = (distance_m <= GATE_M).sum(axis=0)
     return int(together[linear_sum_assignment(together, maximize=True)].sum())
 
 
 @dataclass(frozen=True)
 class _Followed:
-    """Every true drone with the one estimate that stands for it; NaN where either is not known."""
+    """Each drone with the track that follows it in all frames; NaN where either is not known."""
 
     pair: AlignedPair
     est_m: Float[np.ndarray, "frames drones 3"]
@@ -147,7 +143,7 @@ class _Followed:
 
 @dataclass(frozen=True)
 class _Offset:
-    """The constant part of one drone's residuals: its lever arm."""
+    """Mean residual of one drone: its lever arm."""
 
     offset_m: tuple[float, float, float] | None = None
     offset_standard_error_m: tuple[float, float, float] | None = None
@@ -180,7 +176,7 @@ def _centre(
     orientation_wxyz: Float[np.ndarray, "frames 4"],
     frame: Int[np.ndarray, "frames"],
 ) -> tuple[_Offset, Float[np.ndarray, "frames 3"]]:
-    """The mean residual of one drone, in its body where that is known, and what remains, in the world."""
+    """Mean residual of one drone, in its body's frame where known, and the residuals without it, in the world."""
     centred_m = np.full_like(residual_m, np.nan)
     seen = np.isfinite(residual_m).all(axis=-1)
     if not seen.any():
@@ -193,15 +189,15 @@ def _centre(
     offset_m = turned_m.mean(axis=0)
     centred_m[seen] = residual_m[seen] - frame_to_world.apply(offset_m)
     x, y, z = offset_m.tolist()
-    known_to_m = None
+    standard_error_m = None
     if len(turned_m) > 1:
         dx, dy, dz = standard_error(turned_m, frame[seen]).tolist()
-        known_to_m = (dx, dy, dz)
-    return _Offset((x, y, z), known_to_m, "body" if in_body else "world"), centred_m
+        standard_error_m = (dx, dy, dz)
+    return _Offset((x, y, z), standard_error_m, "body" if in_body else "world"), centred_m
 
 
 def _errors(followed: _Followed, drones: slice) -> dict[str, Any]:
-    """What is said of one drone and of all of them in the same words."""
+    """Figures that are given for each drone and for all drones together."""
     pair = followed.pair
     residual_m, centred_m = followed.residual_m[:, drones], followed.centred_m[:, drones]
     error_m = np.linalg.norm(residual_m, axis=-1)
@@ -223,13 +219,13 @@ def _errors(followed: _Followed, drones: slice) -> dict[str, Any]:
 
 
 def _summary(error_m: Float[np.ndarray, "*shape"]) -> ErrorSummary:
-    there = error_m[np.isfinite(error_m)]
-    if not len(there):
+    known_m = error_m[np.isfinite(error_m)]
+    if not len(known_m):
         return ErrorSummary(None, None, None, None, None)
-    values = (there.mean(), np.median(there), there.std(), np.percentile(there, 95), there.max())
+    values = (known_m.mean(), np.median(known_m), known_m.std(), np.percentile(known_m, 95), known_m.max())
     return ErrorSummary(*map(float, values))
 
 
 def _mean(error_m: Float[np.ndarray, "*shape"]) -> float | None:
-    there = error_m[np.isfinite(error_m)]
-    return float(there.mean()) if len(there) else None
+    known_m = error_m[np.isfinite(error_m)]
+    return float(known_m.mean()) if len(known_m) else None

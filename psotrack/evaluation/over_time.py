@@ -1,4 +1,4 @@
-"""Errors frame by frame, for those who want to look at them rather than at their mean."""
+"""Errors frame by frame."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 
 def errors_over_time(traj_est: Trajectories, traj_ref: Trajectories) -> DataFrame:
-    """One row per frame and drone of which the truth is known, drone by drone.
+    """One row per frame and drone whose position is known, sorted by drone and frame.
 
     Returns:
-        `frame`, `time_s`, `drone` (its name in the reference), `error_m` (distance to the track that stands for it as
-        in `evaluate`; NaN where it is missed), and `switch`, whether another track is at it than when it was last
-        matched.
+        Columns `frame`; `time_s`; `drone`, the drone's name in the reference; `error_m`, distance to the track that
+        follows the drone as in `evaluate`, NaN where the drone is missed; and `switch`, whether the drone is matched to
+        another track than at its previous match.
 
     Raises:
         InputError: the estimate and the reference do not fit together.

@@ -1,4 +1,4 @@
-"""Errors of whole paths: absolute (ATE) and relative (RPE), as benchmarks of SLAM give them.
+"""Errors of whole paths, as in benchmarks of SLAM: absolute trajectory error (ATE) and relative pose error (RPE).
 
 References:
     J. Sturm, N. Engelhard, F. Endres, W. Burgard, D. Cremers, A Benchmark for the Evaluation of RGB-D SLAM
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.evaluation.records import PathErrors
 
-#: The relative error is of motions over this time.
+#: Time between the two poses of a relative pose error, seconds.
 RPE_SPAN_S = 1.0
 
 
@@ -26,31 +26,30 @@ def path_errors(
     orientation_wxyz: Float[np.ndarray, "frames drones 4"],
     later: Int[np.ndarray, "2 pairs"],
 ) -> PathErrors:
-    """ATE and RPE of drones whose estimates are known; NaN where either side is not.
+    """Compute ATE and RPE over the frames and drones where estimate and reference are known.
 
-    - ATE: distances in the same frame. Aligned: after one rigid motion of all that is estimated here (rotation
-      and translation, no scale, no reflection) that makes their mean square least. It forgives a world that is
-      turned or shifted, and an offset that is constant in the world.
-    - RPE: of the displacement vectors over a second, the length of their difference, both in the world. Sturm
-      et al. turn displacements into the bodies first; ours stay in the world whether or not there are
-      orientations, since points have none, so that methods with and without them are judged alike. A constant
-      offset in the world costs nothing.
-    - RPE of rotations: the angle between the true and the estimated turn over a second.
+    - ATE: distances between estimate and reference in the same frame. The aligned ATE is computed after the rigid
+      motion of all estimates (rotation and translation, no scale, no reflection) that gives the smallest mean square.
+      It ignores a rotation or a shift between the two worlds, and a constant offset in the world.
+    - RPE: length of the difference between the estimated and the true displacement over a second. Sturm et al. rotate
+      displacements into the bodies first. Here they stay in the world, so that methods with and without orientations
+      are compared equally. A constant offset in the world does not change it.
+    - RPE of rotations: angle between the estimated and the true rotation over a second.
 
     Args:
-        est_m: (frames, drones, 3), estimates of the drones.
-        ref_m: (frames, drones, 3), truth.
-        orientation_est_wxyz: (frames, drones, 4), body to world, of the estimates.
-        orientation_wxyz: (frames, drones, 4), of the truth.
+        est_m: (frames, drones, 3), estimated positions; NaN where not known.
+        ref_m: (frames, drones, 3), reference positions; NaN where not known.
+        orientation_est_wxyz: (frames, drones, 4), estimated orientations, body to world.
+        orientation_wxyz: (frames, drones, 4), reference orientations, body to world.
         later: rows of frames that are `RPE_SPAN_S` apart, from `rows_apart`.
     """
     residual_m = est_m - ref_m
-    there = np.isfinite(residual_m).all(axis=-1)
+    known = np.isfinite(residual_m).all(axis=-1)
     first, second = later
-    aligned_m = aligned(est_m[there], ref_m[there])
+    aligned_m = align_rigidly(est_m[known], ref_m[known])
     return PathErrors(
         ate_rmse_m=_rmse(np.linalg.norm(residual_m, axis=-1)),
-        ate_aligned_rmse_m=_rmse(np.linalg.norm(aligned_m - ref_m[there], axis=-1)),
+        ate_aligned_rmse_m=_rmse(np.linalg.norm(aligned_m - ref_m[known], axis=-1)),
         # The difference of two displacements is the displacement of the residual.
         rpe_1s_rmse_m=_rmse(np.linalg.norm(residual_m[second] - residual_m[first], axis=-1)),
         rpe_1s_rotation_rmse_deg=_rmse(_turn_errors_deg(orientation_est_wxyz, orientation_wxyz, later)),
@@ -60,9 +59,9 @@ def path_errors(
 def rows_apart(
     frame: Int[np.ndarray, "frames"], time_s: Float[np.ndarray, "frames"]
 ) -> Int[np.ndarray, "2 pairs"]:
-    """Rows of earlier and later frames, `RPE_SPAN_S` apart: as near to it as whole frames come, and one at least.
+    """Rows of pairs of frames that are `RPE_SPAN_S` apart, rounded to whole frames, at least one frame.
 
-    Counted in frame numbers, so that rows may be missing between them.
+    The distance is counted in frame numbers, so rows may be missing between the two.
     """
     if len(frame) < 2 or not time_s[-1] > time_s[0]:
         return np.empty((2, 0), int)
@@ -73,10 +72,10 @@ def rows_apart(
     return np.stack([first, row[first]])
 
 
-def aligned(
+def align_rigidly(
     from_m: Float[np.ndarray, "points 3"], to_m: Float[np.ndarray, "points 3"]
 ) -> Float[np.ndarray, "points 3"]:
-    """`from_m` after the rigid motion that brings it nearest to `to_m`: Umeyama 1991, without scale."""
+    """Apply to `from_m` the rigid motion that aligns it best with `to_m` (Umeyama 1991, without scale)."""
     if not len(from_m):
         return from_m
     from_middle_m, to_middle_m = from_m.mean(axis=0), to_m.mean(axis=0)
@@ -95,13 +94,13 @@ def _turn_errors_deg(
     """Angles of (Q_i^-1 Q_j)^-1 (P_i^-1 P_j), where all four orientations are known (Sturm et al., equation 2)."""
     first, second = later
     four_wxyz = np.stack([ref_wxyz[first], ref_wxyz[second], est_wxyz[first], est_wxyz[second]])
-    there = np.isfinite(four_wxyz).all(axis=(0, -1))
-    if not there.any():
+    known = np.isfinite(four_wxyz).all(axis=(0, -1))
+    if not known.any():
         return np.empty(0)
-    Q_i, Q_j, P_i, P_j = (Rotation.from_quat(wxyz[there], scalar_first=True) for wxyz in four_wxyz)
+    Q_i, Q_j, P_i, P_j = (Rotation.from_quat(wxyz[known], scalar_first=True) for wxyz in four_wxyz)
     return np.rad2deg(((Q_i.inv() * Q_j).inv() * (P_i.inv() * P_j)).magnitude())
 
 
 def _rmse(error: Float[np.ndarray, "*shape"]) -> float | None:
-    there = error[np.isfinite(error)]
-    return float(np.sqrt(np.mean(there**2))) if len(there) else None
+    known = error[np.isfinite(error)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else None

@@ -1,7 +1,7 @@
-"""Pictures of an estimate beside its reference: paths in 3D, and the error over time.
+"""Plots of an estimate and its reference: paths in 3D, and the error over time.
 
-The functions that draw take axes, so that other figures can use them; those that save make a PNG. Matplotlib
-is imported when something is drawn, and `pyplot`, with its global state, not at all.
+Functions `draw_*` draw into given axes, so that other figures can use them; functions `save_*` write a PNG. Matplotlib
+is imported only for drawing; `pyplot` is never imported, because it has global state.
 """
 
 from __future__ import annotations
@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from psotrack.evaluation.records import drone_label
 from psotrack.support import drone_colour, save_figure
 from psotrack.trajectories import Trajectories
 from psotrack.trajectories.association import (
@@ -34,13 +35,13 @@ _DARK = "#2b313a"
 _GREY = "#9aa3ad"
 _SHADOW = "#dde1e6"
 _DASHES = (0, (4, 2.5))
-#: Where the bars of missed frames stand, in parts of the height of the axes.
+#: Height of the first bar of missed frames, and distance between bars, as shares of the axes' height.
 _BARS_TOP = 0.975
 _BARS_STEP = 0.025
 
 
 def save_trajectories(
-    path: Path, traj_est: Trajectories, traj_ref: Trajectories, *, force: bool = False
+    path: Path | str, traj_est: Trajectories, traj_ref: Trajectories, *, force: bool = False
 ) -> None:
     """Save a PNG of the paths in 3D; see `draw_trajectories`.
 
@@ -52,51 +53,55 @@ def save_trajectories(
     def draw(figure: Figure) -> None:
         draw_trajectories(figure.add_subplot(projection="3d"), traj_est, traj_ref)
 
-    save_figure(path, (7.5, 5.5), draw, force)
+    save_figure(Path(path), (7.5, 5.5), draw, force)
 
 
-def save_errors(path: Path, traj_est: Trajectories, traj_ref: Trajectories, *, force: bool = False) -> None:
-    """Save a PNG of the error over time; see `draw_errors`, and `save_trajectories` for what is raised."""
+def save_errors(
+    path: Path | str, traj_est: Trajectories, traj_ref: Trajectories, *, force: bool = False
+) -> None:
+    """Save a PNG of the error over time; see `draw_errors`. It raises the same errors as `save_trajectories`."""
 
     def draw(figure: Figure) -> None:
         draw_errors(figure.add_subplot(), traj_est, traj_ref)
 
-    save_figure(path, (9.0, 4.0), draw, force)
+    save_figure(Path(path), (9.0, 4.0), draw, force)
 
 
-def save_overview(path: Path, traj_est: Trajectories, traj_ref: Trajectories, *, force: bool = False) -> None:
-    """Save a PNG of the paths with the error over time below; see `save_trajectories` for what is raised."""
+def save_overview(
+    path: Path | str, traj_est: Trajectories, traj_ref: Trajectories, *, force: bool = False
+) -> None:
+    """Save a PNG of the paths and the error over time. It raises the same errors as `save_trajectories`."""
 
     def draw(figure: Figure) -> None:
         grid = figure.add_gridspec(2, 1, height_ratios=(1.6, 1.0))
         draw_trajectories(figure.add_subplot(grid[0], projection="3d"), traj_est, traj_ref)
         draw_errors(figure.add_subplot(grid[1]), traj_est, traj_ref)
 
-    save_figure(path, (8.0, 8.5), draw, force)
+    save_figure(Path(path), (8.0, 8.5), draw, force)
 
 
 def draw_trajectories(axes: Axes3D, traj_est: Trajectories, traj_ref: Trajectories) -> None:
-    """Draw the true paths thin and dashed, the estimated ones solid, and the true ones' shadows on the floor.
+    """Draw the reference paths thin and dashed, the tracks solid, and the reference's shadows on the floor.
 
-    An estimate has the colour of the drone that it stands for (`association.fixed_identity`); false tracks
-    are grey. A dot marks where a true path begins. All axes have one scale, in metres.
+    A track has the colour of the drone that it follows (`association.fixed_identity`); false tracks are grey. A dot
+    marks the first position of a reference path. All axes have the same scale, in metres.
     """
     pair = align(traj_est, traj_ref)
     partner = fixed_identity(pair)
     floor_m = min(0.0, float(np.nanmin(pair.ref_m[..., 2])))
-    surplus = np.setdiff1d(np.arange(len(pair.drones_est)), partner)
-    for estimate in surplus:
+    false_tracks = np.setdiff1d(np.arange(len(pair.drones_est)), partner)
+    for estimate in false_tracks:
         axes.plot(*_with_gaps(pair, pair.est_m[:, estimate]), color=_GREY, linewidth=1.0)
-    for drone, name in enumerate(pair.drones):
+    for drone, label in enumerate(_labels(pair, partner)):
         colour, truth_m = drone_colour(drone), _with_gaps(pair, pair.ref_m[:, drone])
         axes.plot(truth_m[0], truth_m[1], floor_m, color=colour, alpha=0.18, linewidth=1.2, zorder=1)
         if partner[drone] != UNASSIGNED:
             axes.plot(*_with_gaps(pair, pair.est_m[:, partner[drone]]), color=colour, linewidth=1.8)
         axes.plot(*truth_m, color=_DARK, linewidth=0.8, linestyle=_DASHES, zorder=4)
         start_m = truth_m[:, np.isfinite(truth_m).all(axis=0)][:, :1]
-        axes.plot(*start_m, color=colour, marker="o", markersize=5, linewidth=1.8, label=name, zorder=5)
+        axes.plot(*start_m, color=colour, marker="o", markersize=5, linewidth=1.8, label=label, zorder=5)
     axes.plot([], [], [], color=_DARK, linewidth=0.8, linestyle=_DASHES, label="truth")
-    if len(surplus):
+    if len(false_tracks):
         axes.plot([], [], [], color=_GREY, linewidth=1.0, label="false track")
     _finish_3d(axes, floor_m)
 
@@ -104,17 +109,18 @@ def draw_trajectories(axes: Axes3D, traj_est: Trajectories, traj_ref: Trajectori
 def draw_errors(axes: Axes, traj_est: Trajectories, traj_ref: Trajectories) -> None:
     """Draw each drone's error over time, with gaps where it is missed.
 
-    Bars at the top mark the frames in which a drone is missed, dotted lines the identity switches. The scale
-    is logarithmic where an error exceeds the gate of 0.5 m, so that what came before stays readable.
+    Bars at the top mark the frames in which a drone is missed, dotted lines the identity switches. The scale is
+    logarithmic if an error exceeds the gate of 0.5 m, so that small errors stay readable.
     """
     pair = align(traj_est, traj_ref)
-    error_m = np.linalg.norm(of_partners(pair.est_m, fixed_identity(pair)) - pair.ref_m, axis=-1)
+    partner = fixed_identity(pair)
+    error_m = np.linalg.norm(of_partners(pair.est_m, partner) - pair.ref_m, axis=-1)
     missed = pair.truth_known & np.isnan(error_m)
     switches = identity_switches(matched_per_frame(pair.distance_m, keep=True))
     time_s = _with_gaps(pair, pair.time_s)
-    for drone, name in enumerate(pair.drones):
+    for drone, label in enumerate(_labels(pair, partner)):
         colour = drone_colour(drone)
-        axes.plot(time_s, 1e3 * _with_gaps(pair, error_m[:, drone]), color=colour, linewidth=1.1, label=name)
+        axes.plot(time_s, 1e3 * _with_gaps(pair, error_m[:, drone]), color=colour, linewidth=1.1, label=label)
         bar = np.where(missed[:, drone], _BARS_TOP - _BARS_STEP * drone, np.nan)
         axes.plot(
             time_s, _with_gaps(pair, bar), color=colour, linewidth=3, transform=axes.get_xaxis_transform()
@@ -122,13 +128,13 @@ def draw_errors(axes: Axes, traj_est: Trajectories, traj_ref: Trajectories) -> N
     if missed.any():
         axes.plot([], [], color=_GREY, linewidth=3, label="missed")
     for number, switch_s in enumerate(pair.time_s[switches.any(axis=1)]):
-        label = "identity switch" if number == 0 else None
-        axes.axvline(switch_s, color=_DARK, linewidth=1.1, linestyle=":", label=label)
+        first = "identity switch" if number == 0 else None
+        axes.axvline(switch_s, color=_DARK, linewidth=1.1, linestyle=":", label=first)
     _finish_errors(axes, error_m[np.isfinite(error_m)], num_bars=len(pair.drones) if missed.any() else 0)
 
 
 def colours_of_estimates(traj_est: Trajectories, traj_ref: Trajectories) -> list[str]:
-    """One colour per estimated drone: that of the true drone which it stands for, grey if it stands for none."""
+    """One colour per track: the colour of the drone that the track follows; grey for a false track."""
     pair = align(traj_est, traj_ref)
     colours = [_GREY] * len(pair.drones_est)
     for drone, estimate in enumerate(fixed_identity(pair)):
@@ -137,10 +143,15 @@ def colours_of_estimates(traj_est: Trajectories, traj_ref: Trajectories) -> list
     return colours
 
 
+def _labels(pair: AlignedPair, partner: Int[np.ndarray, "drones"]) -> list[str]:
+    tracks = [None if track == UNASSIGNED else pair.drones_est[track] for track in partner]
+    return [drone_label(drone, track) for drone, track in zip(pair.drones, tracks, strict=True)]
+
+
 def _with_gaps(
     pair: AlignedPair, values: Float[np.ndarray, "frames *rest"]
 ) -> Float[np.ndarray, "*rest_then_frames"]:
-    """`values` with frames last, and NaN wherever frames are skipped, so that no line runs over a gap."""
+    """`values` with the frames on the last axis, and NaN where frames are skipped, so that lines have gaps there."""
     step = np.diff(pair.frame)
     after = np.flatnonzero(step > min(step, default=1)) + 1
     return np.insert(values.astype(float), after, np.nan, axis=0).T
@@ -153,9 +164,9 @@ def _finish_3d(axes: Axes3D, floor_m: float) -> None:
     extent_m = [high - low for low, high in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())]
     axes.set_box_aspect(extent_m, zoom=1.1)
     for line in axes.lines:
-        # The box stands over the edges of the axes at this zoom.
+        # At this zoom, the box reaches beyond the edges of the axes.
         line.set(clip_on=False, in_layout=False)
-    # One distance between ticks, so that the one scale is seen.
+    # The same distance between ticks on all axes shows that the scales are equal.
     step_m = np.diff(MaxNLocator(6).tick_values(0.0, max(extent_m)))[0]
     axes.view_init(elev=24, azim=-58)
     for axis, name in ((axes.xaxis, "x"), (axes.yaxis, "y"), (axes.zaxis, "z")):
@@ -192,11 +203,11 @@ def _finish_errors(axes: Axes, error_m: Float[np.ndarray, "seen"], num_bars: int
 
 
 def _legend(axes: Axes) -> None:
-    """Above the axes, in rows of six: beside them it would take its width from the picture."""
+    """Add a legend above the axes, because beside the axes it would make the plot narrower."""
     axes.legend(
         loc="lower left",
         bbox_to_anchor=(0.0, 1.0),
-        ncols=6,
+        ncols=4,
         frameon=False,
         fontsize=8.5,
         labelcolor=_DARK,

@@ -1,4 +1,4 @@
-"""What an evaluation says: frozen records, None where there is no number, and the keys of the contract."""
+"""Records of an evaluation, with None where there is no number, and the keys of the contract."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any, Literal
 
 @dataclass(frozen=True)
 class ErrorSummary:
-    """Of the distances between true and estimated positions; all None where there are none.
+    """Statistics of the distances between reference and estimated positions, metres; None without any distance.
 
-    The standard deviation is that of the distances about their mean (divided by their number); p95 is the
-    95th percentile, interpolated.
+    The standard deviation is the population's (divided by the number of distances); p95 is the 95th percentile,
+    interpolated.
     """
 
     mean_error_m: float | None
@@ -23,14 +23,14 @@ class ErrorSummary:
 
 @dataclass(frozen=True)
 class PathErrors:
-    """Of whole paths, root mean squares; None where there is nothing to compare. See `paths`.
+    """Root mean square errors of whole paths; None where there is nothing to compare. See `paths`.
 
     Attributes:
-        ate_rmse_m: absolute trajectory error, as it stands.
-        ate_aligned_rmse_m: the same after the rigid motion that brings the estimate nearest to the truth: one
-            for the drone, or one for all drones together.
-        rpe_1s_rmse_m: relative pose error over 1 s, of displacements.
-        rpe_1s_rotation_rmse_deg: likewise of rotations; None unless both have orientations.
+        ate_rmse_m: absolute trajectory error, without alignment.
+        ate_aligned_rmse_m: absolute trajectory error after the rigid motion that best aligns the estimate with the
+            reference: one motion for the drone, or one for all drones together.
+        rpe_1s_rmse_m: relative pose error of displacements over 1 s.
+        rpe_1s_rotation_rmse_deg: relative pose error of rotations over 1 s; None unless both have orientations.
     """
 
     ate_rmse_m: float | None
@@ -41,13 +41,13 @@ class PathErrors:
 
 @dataclass(frozen=True)
 class Consistency:
-    """Whether the estimate's covariances are honest; all None where it has none. See `consistency`.
+    """Consistency of the estimate's covariances with its errors; None without covariances. See `consistency`.
 
     Attributes:
-        inside_90_rate: share of true positions inside of the estimate's 90 % ellipsoid.
-        mean_nees: mean normalised estimation error squared; 3 for honest covariances.
-        offset_removed_inside_90_rate: the first after each drone's constant offset is taken out.
-        offset_removed_mean_nees: the second, likewise.
+        inside_90_rate: share of reference positions inside the estimate's 90 % ellipsoid.
+        mean_nees: mean normalised estimation error squared; 3 for correct covariances.
+        offset_removed_inside_90_rate: `inside_90_rate` after each drone's mean residual is subtracted.
+        offset_removed_mean_nees: `mean_nees` after each drone's mean residual is subtracted.
     """
 
     inside_90_rate: float | None
@@ -68,7 +68,7 @@ class Hota:
 
 @dataclass(frozen=True)
 class Gospa:
-    """Root mean squares over frames; the squares of the last three add up to that of the first."""
+    """GOSPA and its three parts, root mean squares over frames; the parts' squares add up to GOSPA's square."""
 
     gospa_m: float
     gospa_localisation_m: float
@@ -78,19 +78,18 @@ class Gospa:
 
 @dataclass(frozen=True)
 class DroneEvaluation(ErrorSummary, PathErrors, Consistency):
-    """The errors of one true drone.
+    """Errors of one drone of the reference.
 
     Attributes:
-        drone: its name in the reference.
-        estimate: name of the estimated drone that stands for it, or None.
-        frames: in which its true position is known.
-        missed_rate: share of those frames without a row, or with a lost one.
-        offset_removed_mean_error_m: mean error when the mean residual is taken out; None if never seen.
-        offset_m: that residual, estimate minus truth, (x, y, z): the lever arm from the reference's point to the one
-            that is tracked; None if never seen.
-        offset_standard_error_m: of each of the three; None if seen in fewer than two frames.
-        offset_frame: of `offset_m`: the true body's where its orientation is known in every frame of it, else
-            the world's.
+        drone: the drone's name in the reference.
+        estimate: name of the track that follows the drone; None without such a track.
+        frames: number of frames in which the drone's position is known.
+        missed_rate: share of these frames in which the track has no row, or a row with the status lost.
+        offset_removed_mean_error_m: mean error after the mean residual is subtracted; None if missed in all frames.
+        offset_m: (x, y, z), mean residual, estimate minus reference: the lever arm from the reference's point to the
+            tracked point; None if missed in all frames.
+        offset_standard_error_m: (x, y, z), standard error of `offset_m`; None if seen in fewer than two frames.
+        offset_frame: frame of `offset_m`: the body's where its orientation is known in every frame, else the world's.
     """
 
     drone: str
@@ -103,9 +102,14 @@ class DroneEvaluation(ErrorSummary, PathErrors, Consistency):
     offset_frame: Literal["body", "world"] | None
 
 
+def drone_label(drone: str, track: str | None) -> str:
+    """Name of a drone in the reference, and of the track that follows it, such as "dron2 (track 0)"."""
+    return drone if track in (None, drone) else f"{drone} (track {track})"
+
+
 @dataclass(frozen=True)
 class Evaluation(ErrorSummary, Hota, Gospa, PathErrors, Consistency):
-    """An estimate judged by its reference; see `evaluate` for the definitions."""
+    """Figures of an estimate compared with its reference; see `evaluate` for the definitions."""
 
     frames: int
     drones: int
@@ -119,7 +123,7 @@ class Evaluation(ErrorSummary, Hota, Gospa, PathErrors, Consistency):
     per_drone: tuple[DroneEvaluation, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """The contract for other programs: fit for strict JSON, with null where there is no number."""
+        """The figures with the contract's keys, for strict JSON; None becomes null."""
         values = asdict(self)
         return {key: values[key] for key in _CONTRACT} | {
             "per_drone": [{key: drone[key] for key in _CONTRACT_DRONE} for drone in values["per_drone"]]

@@ -1,4 +1,4 @@
-"""An evaluation as a table: for the terminal, and as a data frame with one row per drone."""
+"""Tables of an evaluation: for the terminal, and as a data frame with one row per drone."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from psotrack.evaluation.records import DroneEvaluation, Evaluation
+from psotrack.evaluation.records import DroneEvaluation, Evaluation, drone_label
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -18,9 +18,10 @@ _COLUMNS = ("mean", "median", "std", "p95", "max", "missed", "centred", "offset 
 
 
 def render(evaluation: Evaluation, title: str = "") -> Table:
-    """A table of at most 80 columns: a row per drone, one for all, and below the scores of the whole.
+    """Table at most 80 characters wide: one row per drone, one row for all drones, and the scores below.
 
-    Errors are in millimetres, or all in metres where the mean error is a metre or more.
+    Errors are in millimetres, or in metres if the mean error is a metre or more. A drone is named as in the reference,
+    with the track that follows it.
     """
     unit = _METRES if (evaluation.mean_error_m or 0) >= 1 else _MILLIMETRES
     heading = f"{evaluation.frames} frames, {evaluation.drones} drones, errors in {unit.name}"
@@ -30,27 +31,29 @@ def render(evaluation: Evaluation, title: str = "") -> Table:
         box=box.HORIZONTALS,
         show_edge=False,
         pad_edge=False,
-        # As wide as the caption, which would wrap otherwise.
+        # The width of the caption, which would wrap otherwise.
         min_width=76,
         padding=(0, 0, 0, 1),
         title_justify="left",
         caption_justify="left",
     )
-    # The only column that gives way when the width does not do: numbers are never cut.
-    table.add_column("drone", overflow="ellipsis", max_width=12)
+    # Only this column is cut where the table would be too wide; numbers are never cut.
+    table.add_column("drone", overflow="ellipsis", max_width=20)
     for name in _COLUMNS:
         table.add_column(name, justify="right", no_wrap=True)
     for drone in evaluation.per_drone:
-        table.add_row(Text(drone.drone), *_cells(drone, unit), unit.vector(drone.offset_m))
+        table.add_row(
+            Text(drone_label(drone.drone, drone.estimate)), *_cells(drone, unit), unit.vector(drone.offset_m)
+        )
     table.add_section()
     table.add_row("all", *_cells(evaluation, unit), "", style="bold")
     return table
 
 
 def to_frame(evaluation: Evaluation) -> DataFrame:
-    """One row per drone: the keys of `per_drone` in `Evaluation.to_dict`, with `offset_x_m` and so on.
+    """One row per drone, with the keys of `per_drone` in `Evaluation.to_dict` as columns.
 
-    Likewise `offset_standard_error_x_m` and so on.
+    Vectors have one column per axis: `offset_x_m`, `offset_standard_error_x_m` and so on.
     """
     import pandas as pd
 
@@ -77,7 +80,7 @@ class _Unit:
         return f"{value:.{self.decimals if value < 100 else 0}f}"
 
     def vector(self, value_m: tuple[float, float, float] | None) -> str:
-        """Signed, a digit less than a number: as fine as an offset is known."""
+        """Signed numbers with one decimal fewer than `number`, because offsets are not known better."""
         if value_m is None:
             return "-"
         return " ".join(f"{part * self.per_metre:+.{self.decimals - 1}f}" for part in value_m)
@@ -123,7 +126,7 @@ def _caption(evaluation: Evaluation, unit: _Unit) -> str:
 
 
 def _centred(evaluation: Evaluation, unit: _Unit) -> str:
-    """What the offsets are, and how well the least known part of them is known."""
+    """Explain the column "centred": the frames of the offsets, and the largest standard error of an offset."""
     drones = evaluation.per_drone
     frames = sorted({drone.offset_frame for drone in drones if drone.offset_frame})
     parts_m = [part_m for drone in drones for part_m in drone.offset_standard_error_m or ()]
@@ -132,7 +135,7 @@ def _centred(evaluation: Evaluation, unit: _Unit) -> str:
 
 
 def _clear(evaluation: Evaluation) -> str:
-    # Within the gate of matching, so always millimetres.
+    # These errors are always below the gate of matching, so millimetres fit.
     motp, matched = map(_MILLIMETRES.number, (evaluation.motp_m, evaluation.matched_mean_error_m))
     return (
         f"MOTA {evaluation.mota:.3f}, MOTP {motp} mm, IDF1 {evaluation.idf1:.3f}, "
@@ -142,7 +145,7 @@ def _clear(evaluation: Evaluation) -> str:
 
 
 def _gospa(evaluation: Evaluation) -> str:
-    # Of the size of the cut-off.
+    # GOSPA has the size of its cut-off, so millimetres fit.
     total, localisation, missed, false = map(
         _MILLIMETRES.number,
         (

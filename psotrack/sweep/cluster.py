@@ -1,7 +1,7 @@
-"""The cells of a grid as tasks of a Dask cluster: on this machine, or on many that share a file system.
+"""Run the cells of a grid as tasks of a Dask cluster: on this machine, or on several that share a file system.
 
-The folder of results stays the truth, as without a cluster: workers claim cells and write their rows. So workers may
-die, cells run again, and other runners, with or without a cluster, work on the same folder.
+As without a cluster, only the folder of results says what is finished: workers lock cells and write their rows. So
+workers may be killed, cells may run again, and other runners may work on the same folder.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from psotrack.sweep.machine import Device, processors, provenance, share_process
 from psotrack.sweep.runner import (
     Result,
     SweepOutcome,
-    failed,
-    finished_before,
-    in_order,
-    opened,
-    outcome_of,
+    find_finished,
+    open_store,
+    outcome,
     run_cell,
+    sort_by_input,
+    store_failure,
 )
 from psotrack.sweep.store import Store
 
@@ -44,12 +44,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _Job:
-    """What the workers know of the sweep.
+    """Settings of a sweep that its workers need.
 
     Attributes:
         out, data, cache, device: as in `run_on_cluster`.
-        devices: as which a worker's processors share its batches; None is as many as it may use.
-        token: another for each sweep, so that none sees files as they were.
+        devices: number of JAX devices that share a worker's batches; None is one per processor.
+        token: text that differs from sweep to sweep, so that a worker reads files again for each sweep.
     """
 
     out: Path
@@ -62,29 +62,29 @@ class _Job:
 
 def run_on_cluster(
     grid: Grid,
-    out: Path,
+    out: Path | str,
     *,
-    data: Path,
-    cache: Path,
+    data: Path | str,
+    cache: Path | str,
     address: str = "local",
     workers: int | None = None,
     device: Device | None = None,
     report: Report = no_progress,
 ) -> SweepOutcome:
-    """Run what is not finished, as tasks of a cluster; as `runner.run` otherwise.
+    """Run the unfinished cells of a grid as tasks of a cluster; otherwise the same as `runner.run`.
 
     Args:
-        grid: what is to be run.
-        out: folder of the results, which all workers see under this name, as the next two.
-        data: root folder of sequences that the grid names.
+        grid: the cells to run.
+        out: folder of the results. All workers must see `out`, `data` and `cache` under the same paths.
+        data: root folder of the sequences that the grid names.
         cache: folder of the stored silhouettes and of compiled programs.
-        address: of the cluster's scheduler; "local" starts one here, for as long as this takes.
-        workers: processes of the local cluster; None is one per processor, or one if `device` is "gpu".
-        device: what the workers compute on; None leaves that to JAX.
-        report: told of the cells.
+        address: address of the cluster's scheduler; "local" starts a cluster on this machine for this call.
+        workers: number of processes of the local cluster; None is one per processor, or one if `device` is "gpu".
+        device: device on which the workers compute; None leaves the choice to JAX.
+        report: progress bar for the cells.
 
     Raises:
-        InputError: a sequence is not there, or no cluster at the address.
+        InputError: a sequence does not exist, or there is no cluster at the address.
         OutputError: the results cannot be written.
         SettingsError: Dask is not installed, or `workers` is given for a cluster that is not local.
     """
@@ -92,12 +92,12 @@ def run_on_cluster(
         raise SettingsError("--workers", expected="--cluster local with it", found=f"--cluster {address}")
     dask = _distributed()
     out, data, cache = (Path(os.path.abspath(folder)) for folder in (out, data, cache))
-    # Where rows were made they say themselves.
+    # Each row names the device on which it was made, which may differ from this one.
     origin = {name: value for name, value in provenance().items() if name != "device"} | {"cluster": True}
-    store, inputs = opened(grid, out, data, origin), Inputs(data, cache)
+    store, inputs = open_store(grid, out, data, origin), Inputs(data, cache)
     results, cells = [], []
-    for cell in in_order(grid.cells()):
-        result = _known(cell, inputs, store)
+    for cell in sort_by_input(grid.cells()):
+        result = _result_without_worker(cell, inputs, store)
         if result is None:
             cells.append(cell)
         else:
@@ -109,10 +109,10 @@ def run_on_cluster(
         advance(len(results))
         if cells:
             with _client(dask, address, local) as client:
-                for result in _done(dask, client, cells, job, inputs, store):
+                for result in _results(dask, client, cells, job, inputs, store):
                     results.append(result)
                     advance(1)
-    return outcome_of(grid, results)
+    return outcome(grid, results)
 
 
 def _distributed() -> Any:
@@ -123,7 +123,7 @@ def _distributed() -> Any:
         raise SettingsError(
             "--cluster", expected="Dask", found="no package distributed", remedy=remedy
         ) from error
-    # Its comings and goings of every worker are not news.
+    # At the level INFO, Dask reports every worker that starts and ends.
     logging.getLogger("distributed").setLevel(logging.WARNING)
     return distributed
 
@@ -152,23 +152,25 @@ def _client(dask: Any, address: str, workers: int) -> Iterator[Client]:
         yield client
 
 
-def _known(cell: Cell, inputs: Inputs, store: Store) -> Result | None:
-    """The result of a cell that needs no worker."""
+def _result_without_worker(cell: Cell, inputs: Inputs, store: Store) -> Result | None:
+    """Result of a cell that is finished or whose input cannot be read; None for all other cells."""
     try:
-        return finished_before(cell, inputs, store)
+        return find_finished(cell, inputs, store)
     except PsotrackError as error:
-        return failed(cell, None, error, store)
+        return store_failure(cell, None, error, store)
 
 
-def _done(
+def _results(
     dask: Any, client: Client, cells: list[Cell], job: _Job, inputs: Inputs, store: Store
 ) -> Iterator[Result]:
-    """What became of the cells, as they are done. Each waits for its silhouettes, which are tasks by camera."""
+    """Yield the result of each cell when it ends. Each cell waits for its silhouettes, one task per camera."""
     silhouettes: dict[Any, list[Any]] = {}
     for cell in cells:
         if source_of(cell) not in silhouettes:
             cameras = inputs.sequence_of(cell).rig.names if cell.settings.needs_silhouettes else ()
-            silhouettes[source_of(cell)] = client.map(_make, cameras, cell=cell, job=job, pure=False)
+            silhouettes[source_of(cell)] = client.map(
+                _make_silhouettes, cameras, cell=cell, job=job, pure=False
+            )
     futures = {
         client.submit(_run, cell, job, silhouettes[source_of(cell)], pure=False): cell for cell in cells
     }
@@ -176,16 +178,17 @@ def _done(
         try:
             yield future.result()
         except dask.KilledWorker as error:
-            yield failed(futures[future], None, error, store)
+            yield store_failure(futures[future], None, error, store)
         except CancelledError as error:
             remedy = "what is finished is kept, and the same command goes on"
             raise InputError(
-                "--cluster", expected="its scheduler to stay", found="it gone", remedy=remedy
+                "--cluster", expected="a running scheduler", found="that it has ended", remedy=remedy
             ) from error
 
 
-def _make(camera: str, cell: Cell, job: _Job) -> None:
-    """A task: store the silhouettes of one camera. What goes wrong is said by the cells that need them."""
+def _make_silhouettes(camera: str, cell: Cell, job: _Job) -> None:
+    """A task: store the silhouettes of one camera."""
+    # The cells that need the silhouettes report the error.
     with contextlib.suppress(PsotrackError):
         sequence = _inputs(job).sequence_of(cell).usable([camera])
         compute(sequence, cell.settings.silhouettes, cache=job.cache, jobs=1)
@@ -197,12 +200,13 @@ def _run(cell: Cell, job: _Job, after: list[None]) -> Result:
     if job.device is not None:
         use_device(job.device)
     keep_compiled(job.cache / "compiled")
-    while (result := run_cell(cell, _inputs(job), Store(job.out))).state == "busy":
+    store = Store(job.out)
+    while (result := run_cell(cell, _inputs(job), store)).state == "busy":
         time.sleep(POLL_S)
     return result
 
 
 @lru_cache(maxsize=1)
 def _inputs(job: _Job) -> Inputs:
-    """A worker's; its processes may have no children, so it makes silhouettes by itself."""
+    """Inputs of a worker. Dask's workers may not start processes, so a worker makes silhouettes in its own process."""
     return Inputs(job.data, job.cache, jobs=1)

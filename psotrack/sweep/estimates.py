@@ -73,7 +73,7 @@ def estimate(cells: Iterable[Cell], inputs: Inputs, store: Store | None) -> Esti
     tracking_s, programs, silhouettes_s = 0.0, set(), {}
     for cell in cells:
         try:
-            done = store.seeds_of(key_of(cell, inputs.keys_of(cell))) if store else set()
+            done = store.finished_seeds(key_of(cell, inputs.keys_of(cell))) if store else set()
             sequence = inputs.sequence_of(cell)
         except PsotrackError:
             unread += 1

@@ -1,9 +1,9 @@
-"""What manifest.json says of a folder of results.
+"""The manifest of a folder of results: which grids were run, on which machines, from which inputs.
 
-    runs      of each grid, version and machine: what was asked for, when first, when last
-    inputs    what the column `input` of the rows stands for: a sequence, its frames, digests of its files
+    runs      one entry per grid, version and machine: the grid, and when it was first and last run
+    inputs    for each value of the rows' column `input`: the sequence, its frames, digests of its files
 
-Many grids may be run into one folder, on many machines: nothing of what the manifest says of one is lost to another.
+Several grids may be run into one folder, on several machines; each has its own entry.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ import msgspec
 
 from psotrack.sweep.cells import Cell
 from psotrack.sweep.grid_files import Grid
-from psotrack.sweep.inputs import digest_of
+from psotrack.sweep.inputs import input_digest
 
 
 def note_run(manifest: dict[str, Any], grid: Grid, origin: Mapping[str, Any]) -> None:
-    """Say in a manifest that a grid is run now.
+    """Record in a manifest that a grid is run.
 
     Args:
-        manifest: is changed.
-        grid: as it was read.
+        manifest: content of the manifest, changed in place.
+        grid: the grid.
         origin: versions, device and commit.
     """
     asked = {name: value for name, value in asdict(grid).items() if name != "where"}
-    # As it will be read again, where tuples are lists.
+    # The entry must compare equal to one that was read from JSON, where tuples are lists.
     entry = json.loads(json.dumps({"grid": asked, "cells": len(grid.cells()), **origin}))
     now = datetime.now(UTC).isoformat(timespec="milliseconds")
     for run in manifest["runs"]:
@@ -42,14 +42,14 @@ def note_run(manifest: dict[str, Any], grid: Grid, origin: Mapping[str, Any]) ->
 
 
 def note_input(manifest: dict[str, Any], cell: Cell, keys: Mapping[str, str]) -> None:
-    """Say in a manifest what a cell reads.
+    """Record in a manifest what a cell reads.
 
     Args:
-        manifest: is changed.
-        cell: that reads.
-        keys: digests of all that it reads.
+        manifest: content of the manifest, changed in place.
+        cell: the cell.
+        keys: digests of everything that the cell reads.
     """
-    manifest["inputs"][digest_of(keys)] = {
+    manifest["inputs"][input_digest(keys)] = {
         "sequence": Path(cell.sequence).name,
         "frames": cell.frames,
         "silhouettes": msgspec.to_builtins(cell.settings.silhouettes),

@@ -1,13 +1,10 @@
-"""Tables of `pivot` as people paste them: text, markdown, LaTeX, CSV."""
+"""Print tables of `pivot` as text, Markdown, LaTeX or CSV."""
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import math
 import re
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,48 +16,22 @@ from psotrack.sweep.tables import FIGURES
 
 FORMATS = ("text", "markdown", "latex", "csv")
 
-#: What text fits in, where it can.
+#: Largest width of a table in the format "text", characters.
 WIDTH = 80
 
-#: Mean numbers have so many digits that count.
+#: Number of significant digits of a usual mean.
 _DIGITS = 3
-
-_LATEX = {
-    **{sign: f"\\{sign}" for sign in "&%$#_{}"},
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-}
-
-
-@dataclass(frozen=True)
-class _Words:
-    """A table in words.
-
-    Attributes:
-        title: what the numbers are.
-        row_names, column_names: of the labels' levels.
-        row_labels, column_labels: one tuple per row and per column.
-        cells: (mean, standard deviation) as text, "" for none, by row and column.
-    """
-
-    title: str
-    row_names: list[str]
-    column_names: list[str]
-    row_labels: list[tuple[str, ...]]
-    column_labels: list[tuple[str, ...]]
-    cells: list[list[tuple[str, str]]]
 
 
 def render(table: pd.DataFrame, format: str = "text", *, decimals: int | None = None) -> str:
-    """A table of `pivot` in words, with a line's end after each line.
+    """Print a table of `pivot` into a text that ends with a line break.
 
     Args:
-        table: what `pivot` yields.
-        format: "text", for a terminal: where 80 columns do not hold the table, its columns are continued below;
-            "markdown"; "latex", a tabular for the package booktabs; or "csv", all digits, mean, standard deviation and
-            number of runs beside one another.
-        decimals: of the numbers; None is three digits of a usual mean. CSV has all.
+        table: a table of `pivot`.
+        format: "text", for a terminal: columns beyond 80 characters are continued below; "markdown"; "latex", a tabular
+            for the package booktabs; or "csv", with all digits, and with mean, standard deviation and number of runs in
+            columns of their own.
+        decimals: number of decimals; None gives three significant digits to a usual mean. CSV always has all digits.
 
     Raises:
         SettingsError: there is no such format.
@@ -72,37 +43,102 @@ def render(table: pd.DataFrame, format: str = "text", *, decimals: int | None = 
     if format == "csv":
         return _csv(table)
     writer = {"text": _text, "markdown": _markdown, "latex": _latex}[format]
-    return writer(_in_words(table, decimals))
+    return writer(table, _decimals(table) if decimals is None else decimals)
 
 
-def _in_words(table: pd.DataFrame, decimals: int | None) -> _Words:
-    means, stds = (table.iloc[:, index :: len(FIGURES)].to_numpy(float) for index in (0, 1))
-    counts = table.iloc[:, 2 :: len(FIGURES)].to_numpy(int)
-    places = _decimals(means, stds) if decimals is None else decimals
-    return _Words(
-        title=_title(str(table.attrs.get("value", "")), counts),
-        row_names=[str(name) for name in table.index.names],
-        column_names=[str(name) for name in table.columns.names[:-1]],
-        row_labels=[_words(key) for key in table.index],
-        column_labels=[_words(key)[:-1] for key in table.columns[:: len(FIGURES)]],
-        cells=[
-            [(_number(mean, places), _number(std, places)) for mean, std in zip(*row, strict=True)]
-            for row in zip(means, stds, strict=True)
-        ],
-    )
+def _text(table: pd.DataFrame, decimals: int) -> str:
+    for sign in (" ± ", "±"):
+        cells = _cells(table, f"{{}}{sign}{{}}", decimals)
+        text = cells.to_string(sparsify=True)
+        if max(map(len, text.splitlines())) <= WIDTH:
+            break
+    else:
+        text = cells.to_string(sparsify=True, line_width=WIDTH)
+    lines = [line.rstrip() for line in text.splitlines()]
+    return "\n".join([_title(table), "", *lines, ""])
 
 
-def _words(key: Any) -> tuple[str, ...]:
+def _markdown(table: pd.DataFrame, decimals: int) -> str:
+    # pandas' own writer needs another package for this, and does not escape the signs of Markdown.
+    cells = _cells(table, "{} ± {}", decimals)
+    head = [*cells.index.names, *_column_titles(cells)]
+    rule = [*("---" for _ in cells.index.names), *("---:" for _ in cells.columns)]
+    body = [[*_labels(key), *row] for key, row in zip(cells.index, cells.to_numpy(), strict=True)]
+    lines = [[_escape_markdown(text) for text in line] for line in (head, *body)]
+    lines.insert(1, rule)
+    title = _escape_markdown(_title(table))
+    return "\n".join([title, "", *(f"| {' | '.join(line)} |" for line in lines), ""])
+
+
+def _latex(table: pd.DataFrame, decimals: int) -> str:
+    cells = _cells(table, r"${} \pm {}$", decimals).replace("-", "--")
+    # `format_index` escapes the labels, but not the names of their levels.
+    for axis in (cells.index, cells.columns):
+        axis.names = [name and f"{name}".replace("_", r"\_") for name in axis.names]
+    style = cells.style.format_index(escape="latex").format_index(escape="latex", axis="columns")
+    form = "l" * cells.index.nlevels + "r" * len(cells.columns)
+    text = style.to_latex(hrules=True, column_format=form, multirow_align="naive", multicol_align="c")
+    return f"% {_title(table)}; \\usepackage{{booktabs}}\n{text}"
+
+
+def _csv(table: pd.DataFrame) -> str:
+    cells = _cells(table, "", 0)
+    titles = _column_titles(cells) if table.columns.nlevels > 1 else [""]
+    head = [f"{title} {figure}".strip() for title, figure in itertools.product(titles, FIGURES)]
+    return table.set_axis(cells.index).set_axis(head, axis="columns").to_csv(lineterminator="\n")
+
+
+def _cells(table: pd.DataFrame, form: str, decimals: int) -> pd.DataFrame:
+    """The table with one column of words per label: mean and standard deviation in a form; "-" where runs are missing.
+
+    All labels are words too. A table without labels of columns gets the name of its numbers as the only label.
+    """
+    rows = [
+        [_cell(row[start], row[start + 1], form, decimals) for start in range(0, len(row), len(FIGURES))]
+        for row in table.to_numpy(float)
+    ]
+    columns = [_labels(key)[:-1] for key in table.columns[:: len(FIGURES)]]
+    names = list(table.columns.names[:-1])
+    if not names:
+        columns, names = [(str(table.attrs.get("value", "")),)], [None]
+    index = _index([_labels(key) for key in table.index], list(table.index.names))
+    return pd.DataFrame(rows, index=index, columns=_index(columns, names))
+
+
+def _cell(mean: float, std: float, form: str, decimals: int) -> str:
+    if math.isnan(mean):
+        return "-"
+    # The form of a single run is that of both numbers, without what stands between them.
+    alone = re.sub(r"\{\}.*\{\}", "{}", form)
+    numbers = [f"{value:.{decimals}f}" for value in (mean, std) if not math.isnan(value)]
+    return (form if len(numbers) == 2 else alone).format(*numbers)
+
+
+def _labels(key: Any) -> tuple[str, ...]:
     parts = key if isinstance(key, tuple) else (key,)
     return tuple(f"{part:g}" if isinstance(part, float) else f"{part}" for part in parts)
 
 
-def _number(value: float, decimals: int) -> str:
-    return "" if math.isnan(value) else f"{value:.{decimals}f}"
+def _index(labels: list[tuple[str, ...]], names: list[Any]) -> pd.Index:
+    if len(names) == 1:
+        return pd.Index([label[0] for label in labels], name=names[0])
+    return pd.MultiIndex.from_tuples(labels, names=names)
 
 
-def _decimals(means: np.ndarray, stds: np.ndarray) -> int:
-    """As many as give the middle one of the means its digits; none for whole numbers without spread."""
+def _column_titles(cells: pd.DataFrame) -> list[str]:
+    """Names and labels of each column in one line, such as "method ours, particles 20"."""
+    names = cells.columns.names
+    return [
+        ", ".join(
+            f"{name} {label}" if name else label for name, label in zip(names, _labels(key), strict=True)
+        )
+        for key in cells.columns
+    ]
+
+
+def _decimals(table: pd.DataFrame) -> int:
+    """Number of decimals that gives the median of the means its digits; 0 for whole numbers without spread."""
+    means, stds = (table.iloc[:, index :: len(FIGURES)].to_numpy(float) for index in (0, 1))
     known = means[np.isfinite(means)]
     sizes = np.abs(known[known != 0])
     if not len(sizes) or (np.all(known == np.round(known)) and not np.any(stds > 0)):
@@ -110,150 +146,14 @@ def _decimals(means: np.ndarray, stds: np.ndarray) -> int:
     return int(np.clip(_DIGITS - 1 - math.floor(math.log10(float(np.median(sizes)))), 0, 9))
 
 
-def _title(value: str, counts: np.ndarray) -> str:
+def _title(table: pd.DataFrame) -> str:
+    """Name of the numbers, and the number of runs in a cell if it is more than one."""
+    value, counts = str(table.attrs.get("value", "")), table.iloc[:, 2 :: len(FIGURES)].to_numpy(int)
     fewest, most = int(counts[counts > 0].min(initial=counts.max(initial=0))), int(counts.max(initial=0))
     if most < 2:
         return value
     return f"{value}: mean ± standard deviation over {most if fewest == most else f'{fewest} to {most}'} runs"
 
 
-def _cell(cell: tuple[str, str], sign: str) -> str:
-    mean, std = cell
-    return f"{mean}{sign}{std}" if mean and std else mean or "-"
-
-
-def _head(words: _Words) -> list[list[str]]:
-    """A line per level of the columns, its name before its labels, and one of the rows' names."""
-    blank = [""] * (len(words.row_names) - 1)
-    lines = [
-        [*blank, name, *labels]
-        for name, *labels in zip(words.column_names, *_sparse(words.column_labels), strict=True)
-    ]
-    return [*lines, [*words.row_names, *([""] * len(words.column_labels))]]
-
-
-def _body(words: _Words, sign: str) -> list[list[str]]:
-    return [
-        [*label, *(_cell(cell, sign) for cell in row)]
-        for label, row in zip(_sparse(words.row_labels), words.cells, strict=True)
-    ]
-
-
-def _sparse(labels: list[tuple[str, ...]]) -> list[list[str]]:
-    """Labels without the leading parts that are as in the label before; the last part always stays."""
-    sparse = []
-    for before, label in zip([(), *labels], labels, strict=False):
-        pairs = itertools.zip_longest(label[:-1], before)
-        same = len(list(itertools.takewhile(lambda pair: pair[0] == pair[1], pairs)))
-        sparse.append([""] * same + list(label[same:]))
-    return sparse
-
-
-def _text(words: _Words) -> str:
-    """The widest spacing that fits; columns that do not fit by any are continued below."""
-    num_labels = len(words.row_names)
-    for sign, gap in ((" ± ", "  "), ("±", "  "), ("±", " ")):
-        widths = [
-            _width(column) + len(gap) for column in zip(*_head(words), *_body(words, sign), strict=True)
-        ]
-        if sum(widths) - len(gap) <= WIDTH:
-            break
-    room = WIDTH + len(gap) - sum(widths[:num_labels])
-    blocks = [slice(0, 0)]
-    for index in range(len(words.column_labels)):
-        start = blocks[-1].start
-        if index > start and sum(widths[num_labels:][start : index + 1]) > room:
-            blocks.append(slice(index, index + 1))
-        blocks[-1] = slice(blocks[-1].start, index + 1)
-    return "\n\n".join([words.title, *(_block(_part(words, block), sign, gap) for block in blocks)]) + "\n"
-
-
-def _part(words: _Words, columns: slice) -> _Words:
-    return replace(
-        words,
-        column_labels=words.column_labels[columns],
-        cells=[row[columns] for row in words.cells],
-    )
-
-
-def _block(words: _Words, sign: str, gap: str) -> str:
-    head, num_labels = _head(words), len(words.row_names)
-    columns = [
-        _padded(column, left=index < num_labels)
-        for index, column in enumerate(zip(*head, *_body(words, sign), strict=True))
-    ]
-    lines = [gap.join(line) for line in zip(*columns, strict=True)]
-    lines.insert(len(head), "-" * len(lines[0]))
-    return "\n".join(line.rstrip() for line in lines)
-
-
-def _padded(column: tuple[str, ...], *, left: bool) -> list[str]:
-    width = _width(column)
-    return [text.ljust(width) if left else text.rjust(width) for text in column]
-
-
-def _width(column: tuple[str, ...]) -> int:
-    return max(map(len, column))
-
-
-def _markdown(words: _Words) -> str:
-    head = [*words.row_names, *_joined(words, words.title.partition(":")[0])]
-    rule = [*("---" for _ in words.row_names), *("---:" for _ in words.column_labels)]
-    body = [
-        [*label, *(_cell(cell, " ± ") for cell in row)]
-        for label, row in zip(words.row_labels, words.cells, strict=True)
-    ]
-    lines = [[_in_markdown(text) for text in line] for line in (head, *body)]
-    lines.insert(1, rule)
-    return "\n".join([_in_markdown(words.title), "", *(f"| {' | '.join(line)} |" for line in lines), ""])
-
-
-def _joined(words: _Words, otherwise: str) -> list[str]:
-    """The columns' labels in one line each."""
-    names = [
-        ", ".join(map(" ".join, zip(words.column_names, label, strict=True))) for label in words.column_labels
-    ]
-    return [name or otherwise for name in names]
-
-
-def _latex(words: _Words) -> str:
-    num_labels = len(words.row_names)
-    *levels, names = _head(words)
-    for level, line in enumerate(levels[:-1]):
-        spans = itertools.groupby(label[: level + 1] for label in words.column_labels)
-        line[num_labels:] = [
-            f"\\multicolumn{{{len(list(group))}}}{{c}}{{{_in_latex(label[-1])}}}" for label, group in spans
-        ]
-        line[:num_labels] = map(_in_latex, line[:num_labels])
-    body = _body(words, r" \pm ")
-    for line in body:
-        line[:num_labels] = map(_in_latex, line[:num_labels])
-        line[num_labels:] = ["--" if text == "-" else f"${text}$" for text in line[num_labels:]]
-    plain = [[_in_latex(text) for text in line] for line in (*levels[-1:], names)]
-    head, rows = ([" & ".join(line) + r" \\" for line in part] for part in ([*levels[:-1], *plain], body))
-    form = "l" * num_labels + "r" * len(words.column_labels)
-    lines = [f"% {words.title}; \\usepackage{{booktabs}}", f"\\begin{{tabular}}{{{form}}}", r"\toprule"]
-    return "\n".join([*lines, *head, r"\midrule", *rows, r"\bottomrule", r"\end{tabular}", ""])
-
-
-def _in_latex(text: str) -> str:
-    return "".join(_LATEX.get(sign, sign) for sign in text)
-
-
-def _in_markdown(text: str) -> str:
+def _escape_markdown(text: str) -> str:
     return re.sub(r"([\\|*`<])", r"\\\1", text)
-
-
-def _csv(table: pd.DataFrame) -> str:
-    """A line per row, all digits; mean, standard deviation and runs of every column beside one another."""
-    words = _in_words(table, 0)
-    head = [
-        " ".join(part for part in pair if part) for pair in itertools.product(_joined(words, ""), FIGURES)
-    ]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*words.row_names, *head])
-    for label, row in zip(words.row_labels, table.to_numpy(float), strict=True):
-        numbers = ["" if math.isnan(value) else repr(float(value)).removesuffix(".0") for value in row]
-        writer.writerow([*label, *numbers])
-    return text.getvalue()

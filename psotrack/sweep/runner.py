@@ -1,4 +1,4 @@
-"""Runs the cells of a grid that nobody has finished, one batch of runs per cell, and keeps their rows."""
+"""Run the unfinished cells of a grid, one batch of runs per cell, and store their rows."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from psotrack.pipeline import TrackedSequence, track_runs
 from psotrack.support import Report, no_progress
 from psotrack.sweep.cells import Cell, key_of, name_of, title
 from psotrack.sweep.grid_files import Grid, cameras_label
-from psotrack.sweep.inputs import Input, Inputs, digest_of, folder_of, source_of
+from psotrack.sweep.inputs import Input, Inputs, folder_of, input_digest, source_of
 from psotrack.sweep.locks import POLL_S
 from psotrack.sweep.machine import provenance
 from psotrack.sweep.manifest import note_input, note_run
@@ -32,13 +32,14 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Result:
-    """What became of a cell.
+    """Result of an attempt to run a cell.
 
     Attributes:
-        cell: which.
-        state: "left" was finished before, "busy" is somebody else at work on it.
-        key: under which its rows are; None where the input cannot be read.
-        error: why it failed; "" if it did not.
+        cell: the cell.
+        state: "finished" or "failed" in this attempt, "left" as an earlier run had finished the cell, or "busy" because
+            another process works on the cell.
+        key: key of the cell's rows; None where the input cannot be read.
+        error: why the cell failed; "" if it did not fail.
     """
 
     cell: Cell
@@ -49,49 +50,55 @@ class Result:
 
 @dataclass(frozen=True)
 class SweepOutcome:
-    """What a runner did, cell by cell, in the grid's order."""
+    """Results of all cells, in the grid's order."""
 
     results: tuple[Result, ...]
 
     def count(self, state: str) -> int:
-        """How many cells that became of."""
+        """Number of cells whose result has a state."""
         return sum(result.state == state for result in self.results)
 
     @property
     def errors(self) -> list[str]:
-        """Cells that failed, and why."""
+        """One line per failed cell: the cell's title and why it failed."""
         return [f"{title(result.cell)}: {result.error}" for result in self.results if result.error]
 
     @property
     def seeds(self) -> dict[str, range]:
-        """Keys of the finished cells and the seeds of their runs."""
+        """Seeds of the runs of each finished cell, by the cell's key."""
         finished = [result for result in self.results if result.state in ("finished", "left")]
         return {result.key: result.cell.seeds for result in finished if result.key is not None}
 
 
 def run(
-    grid: Grid, out: Path, *, data: Path, cache: Path, jobs: int | None = None, report: Report = no_progress
+    grid: Grid,
+    out: Path | str,
+    *,
+    data: Path | str,
+    cache: Path | str,
+    jobs: int | None = None,
+    report: Report = no_progress,
 ) -> SweepOutcome:
-    """Run what is not finished, cell by cell. Several runners on one folder share the work.
+    """Run the unfinished cells of a grid, one after the other. Several runners on one folder share the work.
 
-    It ends when every cell is finished or has failed: it waits for those that others are at work on, and does them if
-    the others die.
+    The function returns when every cell is finished or has failed. It waits for cells that other runners work on, and
+    runs these cells when the other runners were killed.
 
     Args:
-        grid: what is to be run.
+        grid: the cells to run.
         out: folder of the results (see `Store`).
-        data: root folder of sequences that the grid names.
+        data: root folder of the sequences that the grid names.
         cache: folder of the stored silhouettes.
-        jobs: processes for the silhouettes; None is one per processor.
-        report: told of the cells.
+        jobs: number of processes that make silhouettes; None is one per processor.
+        report: progress bar for the cells.
 
     Raises:
-        InputError: a sequence is not there.
+        InputError: a sequence does not exist.
         OutputError: the results cannot be written.
     """
-    store, inputs = opened(grid, out, data, provenance()), Inputs(data, cache, jobs)
+    store, inputs = open_store(grid, out, data, provenance()), Inputs(Path(data), Path(cache), jobs)
     results: list[Result] = []
-    waiting = in_order(grid.cells())
+    waiting = sort_by_input(grid.cells())
     with report("sweep", len(waiting)) as advance:
         while waiting:
             busy = []
@@ -105,98 +112,99 @@ def run(
             if len(busy) == len(waiting):
                 time.sleep(POLL_S)
             waiting = busy
-    return outcome_of(grid, results)
+    return outcome(grid, results)
 
 
-def outcome_of(grid: Grid, results: Iterable[Result]) -> SweepOutcome:
-    """Results in the order of the grid's cells."""
+def outcome(grid: Grid, results: Iterable[Result]) -> SweepOutcome:
+    """Sort results into the order of the grid's cells."""
     order = {name_of(cell): number for number, cell in enumerate(grid.cells())}
     return SweepOutcome(tuple(sorted(results, key=lambda result: order[name_of(result.cell)])))
 
 
-def opened(grid: Grid, out: Path, data: Path, origin: Mapping[str, Any]) -> Store:
-    """The folder of a grid's results, which says that the grid is run.
+def open_store(grid: Grid, out: Path | str, data: Path | str, origin: Mapping[str, Any]) -> Store:
+    """Open the folder of a grid's results, and record in the manifest that the grid is run.
 
     Args:
-        grid: what is to be run.
-        out: the folder.
-        data: root folder of sequences that the grid names.
+        grid: the grid.
+        out: folder of the results.
+        data: root folder of the sequences that the grid names.
         origin: versions, device and commit.
 
     Raises:
-        InputError: a sequence is not there.
+        InputError: a sequence does not exist.
         OutputError: the folder cannot be written.
     """
     for sequence in grid.sequences:
-        folder_of(sequence, data)
-    store = Store(out)
+        folder_of(sequence, Path(data))
+    store = Store(Path(out))
     store.tidy()
     store.change_manifest(lambda manifest: note_run(manifest, grid, origin))
     return store
 
 
-def in_order(cells: Iterable[Cell]) -> list[Cell]:
-    """Cells that read the same one after the other, and as the grid has them otherwise."""
+def sort_by_input(cells: Iterable[Cell]) -> list[Cell]:
+    """Put cells with the same input next to each other; the order stays the grid's otherwise."""
     groups: dict[Any, list[Cell]] = {}
     for cell in cells:
         groups.setdefault((source_of(cell), cell.cameras, cell.perturbation), []).append(cell)
-    return [cell for alike in groups.values() for cell in alike]
+    return [cell for group in groups.values() for cell in group]
 
 
-def finished_before(cell: Cell, inputs: Inputs, store: Store) -> Result | None:
-    """What a finished cell's result is; None for one that is to be run.
+def find_finished(cell: Cell, inputs: Inputs, store: Store) -> Result | None:
+    """Result of a cell that is finished already; None if runs are missing.
 
     Raises:
-        PsotrackError: its input cannot be read.
+        PsotrackError: the cell's input cannot be read.
     """
     key = key_of(cell, inputs.keys_of(cell))
-    if not set(cell.seeds) <= store.seeds_of(key):
+    if not set(cell.seeds) <= store.finished_seeds(key):
         return None
-    store.forgive(name_of(cell))  # it may have been finished by somebody who was killed just then
+    # The runner that finished the cell may have been killed before it removed the record of an earlier failure.
+    store.remove_failure(name_of(cell))
     return Result(cell, "left", key)
 
 
 def run_cell(cell: Cell, inputs: Inputs, store: Store) -> Result:
-    """Finish a cell, unless it is finished or somebody else is at work on it. What goes wrong is kept with it.
+    """Run a cell's missing runs, unless another process works on the cell; an error is stored as the cell's failure.
 
     Raises:
         OutputError: the results cannot be written.
     """
     key = None
     try:
-        result = finished_before(cell, inputs, store)
+        result = find_finished(cell, inputs, store)
         if result is not None:
             return result
         keys = inputs.keys_of(cell)
         key = key_of(cell, keys)
-        with store.claim(key, title(cell)) as ours:
-            # Somebody may have finished it just before it was ours.
-            missing = sorted(set(cell.seeds) - store.seeds_of(key)) if ours else []
+        with store.lock(key, title(cell)) as locked:
+            # Another process may have finished the cell just before this process locked it.
+            missing = sorted(set(cell.seeds) - store.finished_seeds(key)) if locked else []
             given = inputs.read(cell) if missing else None
             if given is None:
                 return Result(cell, "busy", key)
             store.change_manifest(lambda manifest: note_input(manifest, cell, keys))
-            store.add(key, *_outcomes(cell, key, missing, given, digest_of(keys)))
-            store.forgive(name_of(cell))
+            store.add(key, *_run_seeds(cell, key, missing, given, input_digest(keys)))
+            store.remove_failure(name_of(cell))
         return Result(cell, "finished", key)
     except OutputError:
         raise
     except Exception as error:
-        return failed(cell, key, error, store)
+        return store_failure(cell, key, error, store)
 
 
-def failed(cell: Cell, key: str | None, error: Exception, store: Store) -> Result:
-    """Keep why a cell failed."""
-    said = isinstance(error, PsotrackError)
-    sentence = f"{error}" if said else f"{type(error).__name__}: {error}"
-    where = {} if said else {"where": "".join(traceback.format_exception(error))}
-    store.fail(name_of(cell), sentence, about(cell) | where)
+def store_failure(cell: Cell, key: str | None, error: Exception, store: Store) -> Result:
+    """Store why a cell failed; an error that psotrack does not expect is stored with its traceback."""
+    expected = isinstance(error, PsotrackError)
+    sentence = f"{error}" if expected else f"{type(error).__name__}: {error}"
+    where = {} if expected else {"where": "".join(traceback.format_exception(error))}
+    store.add_failure(name_of(cell), sentence, describe(cell) | where)
     logger.error("%s: %s", title(cell), sentence)
     return Result(cell, "failed", key, sentence)
 
 
-def about(cell: Cell) -> dict[str, Any]:
-    """What a cell is, flat: names with dots."""
+def describe(cell: Cell) -> dict[str, Any]:
+    """Description of a cell as a flat table, whose names have dots."""
     settings = msgspec.to_builtins(msgspec.structs.replace(cell.settings, seed=0))
     del settings["seed"]
     return {
@@ -209,24 +217,24 @@ def about(cell: Cell) -> dict[str, Any]:
     }
 
 
-def _outcomes(
-    cell: Cell, key: str, seeds: list[int], given: Input, input_digest: str
+def _run_seeds(
+    cell: Cell, key: str, seeds: list[int], given: Input, input_name: str
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """One row per run, and the errors of every run's frames."""
+    """Track and evaluate with each seed: one row per run, and the errors of every run's frames."""
     settings = [msgspec.structs.replace(cell.settings, seed=seed) for seed in seeds]
     began = time.perf_counter()
     results = track_runs(given.sequence, given.silhouettes, settings)
     total_s = time.perf_counter() - began
-    of_cell = about(cell) | {"frames": given.sequence.num_frames, "num_cameras": len(given.sequence.rig)}
+    of_cell = describe(cell) | {"frames": given.sequence.num_frames, "num_cameras": len(given.sequence.rig)}
     of_batch = {"runs_in_batch": len(seeds), "seconds.batch": total_s}
-    origin = {"cell": key, "input": input_digest} | dict(flat(provenance()))
+    origin = {"cell": key, "input": input_name} | dict(flat(provenance()))
     runs = list(zip(seeds, results, strict=True))
     rows = [of_cell | {"seed": seed} | of_batch | _figures(result, given) | origin for seed, result in runs]
     return pd.DataFrame(rows), pd.concat([_errors(seed, result, given) for seed, result in runs])
 
 
 def _figures(result: TrackedSequence | InputError, given: Input) -> dict[str, Any]:
-    """What evaluation says of a run. A run that finds no drones has missed all of them."""
+    """Evaluation and duration of a run. A run that finds no drones has missed all drones."""
     if isinstance(result, InputError):
         return {"missed_rate": 1.0, "note": str(result)}
     assert given.sequence.truth is not None
@@ -238,7 +246,7 @@ def _figures(result: TrackedSequence | InputError, given: Input) -> dict[str, An
 
 
 def _errors(seed: int, result: TrackedSequence | InputError, given: Input) -> pd.DataFrame:
-    """Errors of a run's frames; of a run that finds no drones there are none."""
+    """Errors of a run's frames; no rows for a run that finds no drones."""
     if isinstance(result, InputError):
         return pd.DataFrame({"seed": pd.Series(dtype=int)})
     assert given.sequence.truth is not None

@@ -1,13 +1,17 @@
-"""The folder of a sweep's results: what is finished, what failed, and who is at work on what.
+"""The folder of a sweep's results: finished cells, failed cells, and the locks of the cells that processes work on.
 
-    DIR/manifest.json            what was run, by which versions, on which machine, from which input
-    DIR/cells/KEY.parquet        one row per run of a finished cell
-    DIR/errors/KEY.parquet       its errors, frame by frame
-    DIR/cells/NAME.error.json    why a cell failed when it was last tried
-    DIR/cells/KEY.claim          somebody is at work on it (see `locks`)
+    DIR/cells/KEY.parquet            one row per run of a finished cell
+    DIR/cells/_NAME.error.json       why a cell failed at the last attempt
+    DIR/cells/.KEY.lock              a process works on the cell (see `locks`)
+    DIR/_errors/KEY.parquet          errors of the cell's runs, frame by frame
+    DIR/_manifest.json               what was run, with which versions, on which machine, from which input
 
-A cell appears whole or not at all. KEY is made of everything that decides its rows (see `cells.key_of`), NAME of all
-but the input: a cell whose input cannot be read has no key, and must yet be found again.
+Programs that read DIR as one Parquet data set, such as `pandas.read_parquet`, skip names that begin with a dot or an
+underscore, and so read exactly the rows of the finished cells. Folders of older versions lack the underscores; they can
+be read, and a runner that continues one renames its files.
+
+A cell's file appears whole or not at all. KEY is made of everything that decides the cell's rows (see `cells.key_of`).
+NAME is made of the same without the content of the input: a cell whose input cannot be read has no KEY.
 """
 
 from __future__ import annotations
@@ -17,7 +21,6 @@ import json
 import time
 from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,78 +28,90 @@ import pandas as pd
 
 from psotrack.errors import InputError
 from psotrack.support import atomic_write
-from psotrack.sweep.locks import claimed, owner_of, waited_for
+from psotrack.sweep.locks import Locks
 
-#: What was being written so long ago was left by a runner that was killed.
+#: A temporary file that is older was left by a runner that was killed, seconds.
 _LEFT_BEHIND_S = 3600.0
 
 
-@dataclass(frozen=True)
 class Store:
-    """Results in a folder, which is made when the first is written."""
+    """Results in a folder, which the first writer makes.
 
-    folder: Path
+    Attributes:
+        folder: the folder.
+    """
 
-    def seeds_of(self, key: str) -> set[int]:
-        """The seeds of a cell's finished runs."""
-        path = self._path(key, "parquet")
+    def __init__(self, folder: Path | str) -> None:
+        self.folder = Path(folder)
+        self._locks = Locks()
+
+    def finished_seeds(self, key: str) -> set[int]:
+        """Seeds of a cell's finished runs."""
+        path = self._rows_path(key)
         return set(pd.read_parquet(path, columns=["seed"])["seed"].tolist()) if path.exists() else set()
 
-    def claim(self, key: str, what: str = "") -> AbstractContextManager[bool]:
-        """Whether a cell is ours until the block ends; it is not where somebody else is at work on it."""
-        return claimed(self._path(key, "claim"), what)
-
-    def add(self, key: str, rows: pd.DataFrame, errors: pd.DataFrame) -> None:
-        """Keep the rows of a cell, beside those of its other seeds. To be called by whoever has claimed the cell.
+    def lock(self, key: str, work: str = "") -> AbstractContextManager[bool]:
+        """Try to lock a cell until the block ends; yields whether the cell is locked for this process.
 
         Args:
-            key: of the cell.
-            rows: one per run.
+            key: the cell's key.
+            work: description of the work, for `status`.
+        """
+        return self._locks.attempt(self.folder / "cells" / f".{key}.lock", work)
+
+    def add(self, key: str, rows: pd.DataFrame, errors: pd.DataFrame) -> None:
+        """Store rows of a cell beside the rows of its other seeds. The caller holds the cell's lock.
+
+        Args:
+            key: the cell's key.
+            rows: one row per run.
             errors: one row per frame and drone of every run, with a column `seed`.
 
         Raises:
-            OutputError: they cannot be written.
+            OutputError: the files cannot be written.
         """
-        # The rows last: they are what makes a cell finished.
-        for path, new in ((self._errors(key), errors), (self._path(key, "parquet"), rows)):
-            if path.exists():
-                before = pd.read_parquet(path)
+        # The rows come last, because a cell with rows counts as finished.
+        for path, new in ((self._errors_path(key), errors), (self._rows_path(key), rows)):
+            before_path = _present(path)
+            if before_path.exists():
+                before = pd.read_parquet(before_path)
                 new = pd.concat([before[~before["seed"].isin(rows["seed"])], new], ignore_index=True)
             with atomic_write(path) as temporary:
                 new.sort_values("seed", kind="stable").to_parquet(temporary, index=False)
 
-    def fail(self, name: str, error: str, about: Mapping[str, Any]) -> None:
-        """Keep why a cell failed, and what it was.
+    def add_failure(self, name: str, error: str, cell: Mapping[str, Any]) -> None:
+        """Store why a cell failed, and a description of the cell.
 
         Raises:
-            OutputError: that cannot be written.
+            OutputError: the file cannot be written.
         """
-        with atomic_write(self._path(name, "error.json")) as temporary:
-            temporary.write_text(json.dumps({"error": error, **about}, indent=2) + "\n", encoding="utf-8")
+        with atomic_write(self._failure_path(name)) as temporary:
+            temporary.write_text(json.dumps({"error": error, **cell}, indent=2) + "\n", encoding="utf-8")
 
-    def forgive(self, name: str) -> None:
-        """What is said of a cell's earlier failure goes: it is finished."""
-        self._path(name, "error.json").unlink(missing_ok=True)
+    def remove_failure(self, name: str) -> None:
+        """Remove the record of a cell's earlier failure, because the cell is finished."""
+        _present(self._failure_path(name)).unlink(missing_ok=True)
 
-    def error_of(self, name: str) -> str | None:
-        """Why a cell failed when it was last tried; None if it did not."""
-        try:
-            return str(_read(self._path(name, "error.json"))["error"])
-        except FileNotFoundError:
-            return None
+    def failure(self, name: str) -> str | None:
+        """Why a cell failed at the last attempt; None if it did not fail."""
+        content = _read_if_present(self._failure_path(name))
+        return None if content is None else str(content["error"])
 
     def rows(self, seeds: Mapping[str, Collection[int]] | None = None) -> pd.DataFrame:
-        """One row per run of every finished cell; or of those of these keys, and of these seeds.
+        """One row per run of the finished cells.
+
+        Args:
+            seeds: keys of the wanted cells, and the wanted seeds of each; None for all cells and seeds.
 
         Raises:
             InputError: there are no results.
         """
         if seeds is None:
-            parts = [pd.read_parquet(path) for path in self._files("parquet")]
+            parts = [pd.read_parquet(path) for path in self._cell_files("parquet")]
         else:
-            finished = [(self._path(key, "parquet"), of_key) for key, of_key in seeds.items()]
-            tables = [(pd.read_parquet(path), of_key) for path, of_key in finished if path.exists()]
-            parts = [table[table["seed"].isin(list(of_key))] for table, of_key in tables]
+            paths = {self._rows_path(key): wanted for key, wanted in seeds.items()}
+            tables = [(pd.read_parquet(path), wanted) for path, wanted in paths.items() if path.exists()]
+            parts = [table[table["seed"].isin(list(wanted))] for table, wanted in tables]
         if not parts:
             raise InputError(self.folder, expected="results of a sweep", found="no finished cell")
         return pd.concat(parts, ignore_index=True)
@@ -105,51 +120,54 @@ class Store:
         """Errors of a cell's runs, frame by frame: rows of `evaluation.errors_over_time`, with a column `seed`.
 
         Args:
-            key: of the cell, as the column `cell` of its rows has it.
-            seeds: of its runs.
+            key: the cell's key, as in the column `cell` of its rows.
+            seeds: seeds of the wanted runs.
 
         Raises:
-            InputError: they are not there.
+            InputError: there is no file of the cell's errors.
         """
-        path = self._errors(key)
+        path = _present(self._errors_path(key))
         if not path.exists():
             raise InputError(path, expected="errors of a finished cell", found="no file")
         errors = pd.read_parquet(path)
         return errors[errors["seed"].isin(list(seeds))].reset_index(drop=True)
 
     def status(self) -> dict[str, Any]:
-        """How many cells are finished, failed and being worked at, by whom, and what the failures say.
+        """Numbers of finished, failed and locked cells, the errors, and the processes at work.
 
         Raises:
             InputError: there are no results.
         """
         if not (self.folder / "cells").is_dir():
             raise InputError(self.folder, expected="results of a sweep", found="none")
-        errors = [error for path in self._files("error.json") if (error := _read_if_there(path))]
-        owners = [owner for path in self._files("claim") if (owner := owner_of(path))]
+        failures = [failure for path in self._cell_files("error.json") if (failure := _read_if_present(path))]
+        locks = sorted((self.folder / "cells").glob(".*.lock"))
+        at_work = [holder for path in locks if (holder := self._locks.holder(path))]
         return {
-            "finished": len(self._files("parquet")),
-            "failed": len(errors),
-            "claimed": len(owners),
-            "errors": [f"{error['sequence']} {error['method']}: {error['error']}" for error in errors],
-            "at_work": [
-                f"process {owner.process} on {owner.host} since {owner.since}: {owner.what}"
-                for owner in owners
+            "finished": len(self._cell_files("parquet")),
+            "failed": len(failures),
+            "claimed": len(at_work),
+            "errors": [
+                f"{failure['sequence']} {failure['method']}: {failure['error']}" for failure in failures
             ],
+            "at_work": at_work,
         }
 
     def manifest(self) -> dict[str, Any]:
-        """What was run, and from what; empty lists and tables before the first run."""
-        return _read_if_there(self.folder / "manifest.json") or {"runs": [], "inputs": {}}
+        """Content of the manifest: runs and inputs; both are empty before the first run."""
+        return _read_if_present(self.folder / "_manifest.json") or {"runs": [], "inputs": {}}
 
     def change_manifest(self, change: Callable[[dict[str, Any]], None]) -> None:
-        """Let `change` change what the manifest says; one runner at a time.
+        """Change the manifest while no other runner does.
+
+        Args:
+            change: changes the manifest's content in place.
 
         Raises:
-            OutputError: it cannot be written.
+            OutputError: the file cannot be written.
         """
-        path = self.folder / "manifest.json"
-        with waited_for(path.with_name(".manifest.claim")):
+        path = self.folder / "_manifest.json"
+        with self._locks.wait(self.folder / ".manifest.lock"):
             manifest = self.manifest()
             before = json.dumps(manifest)
             change(manifest)
@@ -158,32 +176,45 @@ class Store:
                     temporary.write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
 
     def tidy(self) -> None:
-        """Remove what runners left half written when they were killed."""
-        for folder in (self.folder, self.folder / "cells", self.folder / "errors"):
-            for path in (*folder.glob(".*.partial.*"), *folder.glob(".*.stale")):
+        """Remove half-written files of runners that were killed, and rename files that an older version wrote."""
+        for folder in (self.folder, self.folder / "cells", self.folder / "_errors"):
+            for path in (*folder.glob(".*.partial.*"), *folder.glob(".*.lock.[br]*")):
                 with contextlib.suppress(OSError):
                     if time.time() - path.stat().st_mtime > _LEFT_BEHIND_S:
                         path.unlink()
+        with self._locks.wait(self.folder / ".manifest.lock"):
+            failures = (self.folder / "cells").glob("*.error.json")
+            names = ("_manifest.json", "_errors", *(f"cells/_{path.name.lstrip('_')}" for path in failures))
+            for path in (self.folder / name for name in names):
+                if _present(path) != path:
+                    _present(path).rename(path)
 
-    def _errors(self, key: str) -> Path:
-        return self.folder / "errors" / f"{key}.parquet"
+    def _rows_path(self, key: str) -> Path:
+        return self.folder / "cells" / f"{key}.parquet"
 
-    def _path(self, key: str, suffix: str) -> Path:
-        return self.folder / "cells" / f"{key}.{suffix}"
+    def _errors_path(self, key: str) -> Path:
+        return self.folder / "_errors" / f"{key}.parquet"
 
-    def _files(self, suffix: str) -> list[Path]:
-        """Of all cells; not those that are being written, whose names begin with a dot."""
+    def _failure_path(self, name: str) -> Path:
+        return self.folder / "cells" / f"_{name}.error.json"
+
+    def _cell_files(self, suffix: str) -> list[Path]:
+        """Files of all cells, without temporary files, whose names begin with a dot."""
         files = (self.folder / "cells").glob(f"*.{suffix}")
         return sorted(path for path in files if not path.name.startswith("."))
 
 
-def _read(path: Path) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return content
+def _present(path: Path) -> Path:
+    """The path, or the path without underscores that an older version used, if only that path exists."""
+    older = path.with_name(path.name.removeprefix("_"))
+    if path.parent.name == "_errors":
+        older = path.parent.with_name("errors") / path.name
+    return older if older.exists() and not path.exists() else path
 
 
-def _read_if_there(path: Path) -> dict[str, Any] | None:
+def _read_if_present(path: Path) -> dict[str, Any] | None:
     try:
-        return _read(path)
+        content: dict[str, Any] = json.loads(_present(path).read_text(encoding="utf-8"))
+        return content
     except FileNotFoundError:
         return None
