@@ -39,7 +39,7 @@ from psotrack.recordings import read_frames
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import compute, summed_area_table
 from psotrack.silhouettes.computation import SilhouetteSettings
-from psotrack.silhouettes.foreground import classify, coverage, learn, learning_step
+from psotrack.silhouettes.foreground import classify, coverage, learn_background, learning_step
 from psotrack.simulation import simulate
 from psotrack.support import keep_compiled
 from psotrack.tracking import ScoreSettings, on_device
@@ -79,7 +79,7 @@ names = sequence.rig.names
 images, masks = [], []
 for camera in CAMERAS:
     video = sequence.videos[names[camera]]
-    model = learn(read_frames(video, learning_step(video.num_frames, SILHOUETTES)), SILHOUETTES)
+    model = learn_background(read_frames(video, learning_step(video.num_frames, SILHOUETTES)), SILHOUETTES)
     for image in islice(read_frames(video), FRAME + 1):  # in order: what was seen leaves traces in the model
         mask = classify(model, image, SILHOUETTES)
     images.append(image)

@@ -24,7 +24,7 @@ LABELS = ["dron0 (track 0)", "dron1 (track 1)", "dron2 (track 2)"]
 
 
 def flights(num_drones: int = 3, *, swap: bool = False, names: tuple[str, ...] = ()):
-    """Drones on circles; the estimate is 20 mm off, lacks the third drone in frames 10 to 19, and may swap from frame 40."""
+    """Drones on circles; the estimate is 20 mm off, lacks drone 2 in frames 10 to 19, and may swap from frame 40."""
     frame = np.arange(NUM_FRAMES)
     angle = frame[:, None] / 10 + np.arange(num_drones)
     ref_m = np.stack([np.cos(angle) + 2 * np.arange(num_drones), np.sin(angle), 1 + 0 * angle], axis=-1)

@@ -15,9 +15,9 @@ from psotrack.silhouettes.foreground import (
     classify,
     coverage,
     foreground,
-    learn,
+    learn_background,
     learning_step,
-    without_speckle,
+    remove_speckle,
 )
 
 HEIGHT, WIDTH = 120, 160
@@ -106,7 +106,7 @@ def test_without_learning_rate_the_background_stays() -> None:
     rng = np.random.default_rng(9)
     scene = _scene(rng)
     frames = [_frame(scene, rng, (20.0 + 3 * i, 60.0)) for i in range(40)]
-    model = learn(frames, ForegroundSettings())
+    model = learn_background(frames, ForegroundSettings())
     first = classify(model, frames[3], ForegroundSettings())
     for _ in range(60):
         again = classify(model, frames[3], ForegroundSettings())
@@ -146,7 +146,7 @@ def test_speckle_goes_and_all_else_stays(pixels: list[int], min_blob_px: int) ->
     for label in range(1, count + 1):
         if np.count_nonzero(labels == label) < min_blob_px:
             expected[labels == label] = 0
-    np.testing.assert_array_equal(without_speckle(mask, min_blob_px), expected)
+    np.testing.assert_array_equal(remove_speckle(mask, min_blob_px), expected)
 
 
 def test_smallest_blob_is_in_pixels_of_the_full_image() -> None:

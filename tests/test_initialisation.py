@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from psotrack.geometry import CameraRig, project
 from psotrack.initiation.initialisation import choose_paths, find_drones, with_usual_size
 from psotrack.initiation.paths import propose_paths
-from psotrack.silhouettes import all_blobs, find_blobs
+from psotrack.silhouettes import find_blobs, stack_blobs
 from psotrack.silhouettes.blobs import MOST_BLOBS, Blobs
 
 FPS = 25.0
@@ -291,7 +291,7 @@ def test_the_order_of_the_blobs_does_not_matter(random):
     time_s, viewpoint = np.arange(3) / FPS, np.arange(5)
 
     def chosen(images):
-        paths = propose_paths(RIG.cameras, all_blobs(images, 5, REDUCTION), time_s, ROOM_M, 6.0)
+        paths = propose_paths(RIG.cameras, stack_blobs(images, 5, REDUCTION), time_s, ROOM_M, 6.0)
         return paths[choose_paths(paths, viewpoint)].position_m[:, 0]
 
     def mixed(blobs):
@@ -312,7 +312,7 @@ def test_silhouettes_full_of_noise_take_no_more_than_their_largest_blobs():
     many = find_blobs(image, 3)
     assert (many.size_px[:, 0] / 3).tolist() == list(range(71, 71 - MOST_BLOBS, -1))
     few = Blobs(np.zeros((1, 2)), np.ones((1, 2)), np.zeros(1, bool))
-    seen = all_blobs([[many, few]], 2, 3)
+    seen = stack_blobs([[many, few]], 2, 3)
     assert seen.whole.shape == (1, 2, MOST_BLOBS)
     assert np.isfinite(seen.half_px[0, 1]).all(axis=-1).tolist() == [True] + [False] * (MOST_BLOBS - 1)
     assert not seen.whole[0, 1].any()

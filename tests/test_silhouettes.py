@@ -266,7 +266,7 @@ def test_damage_after_opening_is_an_error_not_background(folder: Path, tmp_path:
     content = bytearray(chunk.read_bytes())
     content[len(content) // 2] ^= 0xFF
     chunk.write_bytes(content)
-    with pytest.raises(InputError, match=f"{silhouettes.keys['cam2']}: expected what was stored"):
+    with pytest.raises(InputError, match=f"{silhouettes.keys['cam2']}: expected readable silhouettes"):
         silhouettes.read(0, 5)
 
 

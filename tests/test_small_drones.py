@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from psotrack.geometry import CameraRig
 from psotrack.initiation import find_candidates
 from psotrack.initiation.initialisation import find_drones
-from psotrack.silhouettes import all_blobs, find_blobs
+from psotrack.silhouettes import find_blobs, stack_blobs
 
 FPS = 25.0
 REDUCTION = 2
@@ -81,8 +81,8 @@ def test_blobs_are_the_same_however_many_pixels_a_cell_has(seed, times):
     one, other = find_blobs(image, 1), find_blobs(image, times)
     assert (times * one.size_px == other.size_px).all()
     assert (times * (one.centre_px + 0.5) == other.centre_px + 0.5).all()
-    assert (times * all_blobs([[one]], 1, 1).radius_px == all_blobs([[other]], 1, times).radius_px)[
-        np.isfinite(all_blobs([[one]], 1, 1).radius_px)
+    assert (times * stack_blobs([[one]], 1, 1).radius_px == stack_blobs([[other]], 1, times).radius_px)[
+        np.isfinite(stack_blobs([[one]], 1, 1).radius_px)
     ].all()
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from psotrack.geometry import Camera, viewpoints
 from psotrack.initiation.paths import Paths, by_viewpoint, propose_paths, refine_paths
-from psotrack.silhouettes import all_blobs, find_blobs
+from psotrack.silhouettes import find_blobs, stack_blobs
 
 #: What has its middle nearer to the floor is a shadow: a drone that stands on its legs is higher.
 FLOOR_CLEARANCE_M = 0.08
@@ -73,7 +73,7 @@ def find_drones(
         Those for which the frames speak, on the whole; possibly none. Drones that no camera sees by themselves have
         the usual size of the others, or NaN where there is none.
     """
-    seen = all_blobs(
+    seen = stack_blobs(
         [[find_blobs(image, reduction) for image in images] for images in coverage], len(cameras.K), reduction
     )
     time_s = np.arange(len(coverage)) / fps

@@ -1,7 +1,7 @@
-"""Silhouettes: which share of each reduced pixel is foreground.
+"""Silhouettes: the share of each reduced pixel that is foreground.
 
-In: videos. Out: `Silhouettes`, arrays of coverage (0 to 255) that are computed once and stored, the blobs in them, and
-summed-area tables of them.
+In: videos. Out: `Silhouettes`, arrays of coverage (0 to 255), which are computed once and stored; blobs in the
+silhouettes; and summed-area tables of the silhouettes.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-from .blobs import LEAST_RADIUS_CELLS, ViewBlobs, all_blobs, find_blobs
+from .blobs import LEAST_RADIUS_CELLS, ViewBlobs, find_blobs, stack_blobs
 from .computation import Silhouettes, compute
 from .foreground import Shadows, check_whole
 from .store import SilhouetteSettings, key_of, open_stored, reduced_shape
@@ -10,7 +10,6 @@ __all__ = [
     "SilhouetteSettings",
     "Silhouettes",
     "ViewBlobs",
-    "all_blobs",
     "box_sum",
     "check_whole",
     "compute",
@@ -20,5 +19,6 @@ __all__ = [
     "open_stored",
     "pack",
     "reduced_shape",
+    "stack_blobs",
     "summed_area_table",
 ]

@@ -1,4 +1,4 @@
-"""Blobs: connected foreground of silhouettes, in one image, and in all images of a few frames."""
+"""Blobs: connected regions of foreground, in one silhouette, and in the silhouettes of several frames."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-#: A cell of the reduced silhouettes belongs to a blob when so much of it (of 255) is foreground.
+#: Smallest coverage of a cell that belongs to a blob, out of 255.
 MIN_COVERAGE = 64
-#: A single cell is noise as often as not. How small a drone's image may be is for the silhouettes to say, which
-#: are without smaller speckle.
+#: Smallest number of cells of a blob, because a single cell is often noise. The silhouettes have a limit of their own,
+#: `min_blob_px`.
 MIN_BLOB_CELLS = 2
-#: The middle of a blob is nowhere better known than to so many cells.
+#: Smallest uncertainty of a blob's middle, cells.
 LEAST_RADIUS_CELLS = 1.5
-#: Of an image with more blobs than this, the largest ones count.
+#: Largest number of blobs per image; in images with more blobs, only the largest count.
 MOST_BLOBS = 50
 
 
 @dataclass(frozen=True)
 class Blobs:
-    """Connected foreground in one image.
+    """Blobs of one image.
 
     Attributes:
         centre_px: (blobs, 2), middles of the boxes, pixel centres at whole numbers.
         size_px: (blobs, 2), widths and heights of the boxes.
-        whole: (blobs,), whether the blob is clear of the image's border.
+        whole: (blobs,), whether the blob does not touch the image's border.
     """
 
     centre_px: Float[np.ndarray, "blobs 2"]
@@ -36,12 +36,13 @@ class Blobs:
 
 @dataclass(frozen=True)
 class ViewBlobs:
-    """The blobs of all frames and cameras; the axis of blobs is as long as the fullest image needs.
+    """Blobs of all frames and cameras. The length of the blobs axis is the largest number of blobs in an image.
 
     Attributes:
-        centre_px, half_px: (frames, cameras, blobs, 2), middles of the boxes and half of their sides; NaN for none.
-        whole: (frames, cameras, blobs), whether there is a blob, and clear of the image's border.
-        least_radius_px: no middle is known better than to so much.
+        centre_px, half_px: (frames, cameras, blobs, 2), middles and half sizes of the boxes; NaN where there is no
+            blob.
+        whole: (frames, cameras, blobs), whether there is a blob, and it does not touch the image's border.
+        least_radius_px: smallest uncertainty of a blob's middle, pixels.
     """
 
     centre_px: Float[np.ndarray, "frames cameras blobs 2"]
@@ -50,21 +51,21 @@ class ViewBlobs:
     least_radius_px: float
 
     def __getitem__(self, frames: Bool[np.ndarray, "frames"]) -> ViewBlobs:
-        """The blobs of some of the frames."""
+        """Select the blobs of some frames."""
         return replace(
             self, centre_px=self.centre_px[frames], half_px=self.half_px[frames], whole=self.whole[frames]
         )
 
     @property
     def radius_px(self) -> Float[np.ndarray, "frames cameras blobs"]:
-        """Half of the smaller side: the middle of a drone's blob is nearer to its projection than that."""
+        """Half of the smaller side: an upper limit of the distance from the blob's middle to the drone's projection."""
         return np.maximum(self.half_px.min(axis=-1), self.least_radius_px)
 
 
 def find_blobs(coverage: UInt8[np.ndarray, "height width"], reduction: int) -> Blobs:
-    """Connected foreground of one silhouette, the largest first."""
+    """Find the blobs of one silhouette, sorted from large to small boxes."""
     foreground = (coverage >= MIN_COVERAGE).astype(np.uint8)
-    # Rotors and arms fall apart in thin silhouettes; a gap of one cell is none.
+    # In thin silhouettes, gaps of one cell separate rotors and arms from the body.
     closed = cv2.morphologyEx(foreground, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     _, _, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
     stats = stats[1:][stats[1:, cv2.CC_STAT_AREA] >= MIN_BLOB_CELLS]
@@ -75,8 +76,8 @@ def find_blobs(coverage: UInt8[np.ndarray, "height width"], reduction: int) -> B
     return Blobs((corner + size / 2) * reduction - 0.5, size * reduction, whole)
 
 
-def all_blobs(images: list[list[Blobs]], num_cameras: int, reduction: int) -> ViewBlobs:
-    """Blobs of frames and cameras in arrays, with room for one blob at least."""
+def stack_blobs(images: list[list[Blobs]], num_cameras: int, reduction: int) -> ViewBlobs:
+    """Put the blobs of frames and cameras into arrays, with space for at least one blob."""
     most = max([1, *(len(blobs.whole) for frame in images for blobs in frame)])
     shape = (len(images), num_cameras, most)
     centre_px, half_px, whole = (

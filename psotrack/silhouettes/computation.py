@@ -1,4 +1,4 @@
-"""Silhouettes of all cameras: computed once, in parallel, then read from the store piece by piece."""
+"""Silhouettes of all cameras: computed once, in parallel, and then read from the store in pieces."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ class Silhouettes:
     """Stored silhouettes of all cameras of a sequence.
 
     Attributes:
-        cameras: names, in the order of the rig.
-        keys: by camera name: what the silhouettes are stored under.
-        reduction: r; cell (i, j) covers the pixels [r * i, r * i + r) x [r * j, r * j + r), beyond the border
-            of the image background.
-        num_frames: of each camera.
-        shape: height and width of one silhouette.
-        seconds: spent on "decode" and "foreground", summed over workers; 0 for what was read from the store.
-        arrays: one (frames, height, width) per camera, stored or in memory.
+        cameras: names of the cameras, in the order of the rig.
+        keys: key of each camera's silhouettes in the store, by camera name.
+        reduction: r; cell (i, j) covers the pixels [r * i, r * i + r) x [r * j, r * j + r). Pixels beyond the image's
+            border count as background.
+        num_frames: number of frames of each camera.
+        shape: height and width of one silhouette, cells.
+        seconds: time spent on "decode" and "foreground", summed over workers; 0 for silhouettes from the store.
+        arrays: one array (frames, height, width) per camera, stored or in memory.
     """
 
     cameras: tuple[str, ...]
@@ -58,10 +58,10 @@ class Silhouettes:
     arrays: tuple[zarr.Array | UInt8[np.ndarray, "frames height width"], ...]
 
     def read(self, start: int, stop: int) -> UInt8[np.ndarray, "frames cameras height width"]:
-        """Coverage of the frames [start, stop), 0 to 255: (frames, cameras, height, width).
+        """Read the coverage of the frames [start, stop), 0 to 255: (frames, cameras, height, width).
 
         Raises:
-            SettingsError: there are no such frames.
+            SettingsError: the frames do not exist.
             InputError: the store was damaged after it was opened.
         """
         if not 0 <= start <= stop <= self.num_frames:
@@ -75,9 +75,9 @@ class Silhouettes:
             except (OSError, ValueError, RuntimeError) as error:
                 raise InputError(
                     f"silhouettes {self.keys[self.cameras[index]]}",
-                    expected="what was stored",
+                    expected="readable silhouettes",
                     found=f"{error}",
-                    remedy="remove that folder from the cache to have it made anew",
+                    remedy="remove this folder from the cache; the next run makes it again",
                 ) from error
         return frames
 
@@ -86,27 +86,28 @@ def compute(
     sequence: Sequence,
     settings: SilhouetteSettings = SilhouetteSettings(),  # noqa: B008  frozen
     *,
-    cache: Path,
+    cache: Path | str,
     jobs: int | None = None,
     report: Report = no_progress,
 ) -> Silhouettes:
-    """The silhouettes of a sequence: those that `cache` holds are read, the others are computed and stored.
+    """Silhouettes of a sequence, read from the store; missing silhouettes are computed and stored.
 
-    Each camera is stored under a key of its video's content, the frames used and every setting, as soon as it
-    is finished: a call that was interrupted, by whatever, goes on with the cameras that are missing.
+    Each camera's silhouettes are stored when they are finished, under a key made of the video's content, the number of
+    frames and all settings. After an interruption, the next call computes only the missing cameras.
 
     Args:
-        sequence: with a video for each camera, all of one length and size.
-        settings: how silhouettes are made.
-        cache: folder of the store; made if it is not there.
-        jobs: at most so many processes; None is one per processor.
-        report: told of the frames of all cameras, those that teach the background included.
+        sequence: a sequence with a video for each camera, all of the same length and size.
+        settings: settings of the silhouettes.
+        cache: folder of the store; made if it does not exist.
+        jobs: largest number of processes; None is one per processor.
+        report: progress bar for the frames of all cameras, including the frames from which the background is learned.
 
     Raises:
         InputError: a video is missing, unreadable, ends early, or differs from the others in length or size.
         SettingsError: `jobs` is below 1.
-        OutputError: the store cannot be written; the cameras that were finished stay.
+        OutputError: the store cannot be written; the cameras that were finished stay in the store.
     """
+    cache = Path(cache)
     jobs = jobs if jobs is not None else os.cpu_count() or 1
     check_whole("jobs", jobs, lowest=1)
     sequence = sequence.usable()
@@ -124,18 +125,18 @@ def compute(
         num_frames=sequence.num_frames,
         shape=shape,
         seconds=seconds,
-        arrays=tuple(_opened(task, shape) for task in tasks),
+        arrays=tuple(_open(task, shape) for task in tasks),
     )
 
 
 def _make_missing(tasks: list[Task], shape: tuple[int, int], jobs: int, report: Report) -> dict[str, float]:
-    """Store what is not stored yet; the seconds that it took, summed over the workers."""
-    # By key: two cameras of the same content are one.
+    """Make and store missing silhouettes; returns the seconds of each stage, summed over the workers."""
+    # Two cameras with the same content have the same key, so their silhouettes are made once.
     missing = list({task.key: task for task in tasks if _stored(task, shape) is None}.values())
     seconds = {"decode": 0.0, "foreground": 0.0}
     if not missing:
         return seconds
-    logger.info("silhouettes: %d of %d videos are to be done", len(missing), len(tasks))
+    logger.info("silhouettes: computing %d of %d videos", len(missing), len(tasks))
     cache = missing[0].cache
     try:
         cache.mkdir(parents=True, exist_ok=True)
@@ -154,8 +155,8 @@ def _stored(task: Task, shape: tuple[int, int]) -> zarr.Array | None:
     return open_stored(task.cache / task.key, task.video.num_frames, shape)
 
 
-def _opened(task: Task, shape: tuple[int, int]) -> zarr.Array:
+def _open(task: Task, shape: tuple[int, int]) -> zarr.Array:
     array = _stored(task, shape)
     if array is None:
-        raise InputError(task.cache / task.key, expected="the silhouettes just stored", found="no such thing")
+        raise InputError(task.cache / task.key, expected="the silhouettes just stored", found="none")
     return array

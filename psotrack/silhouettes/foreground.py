@@ -1,12 +1,12 @@
-"""Foreground of one camera that stands still: MOG2, learned before it is used.
+"""Foreground of a camera that does not move: MOG2 with a background that is learned in advance.
 
 Method: Zivkovic, "Improved adaptive Gaussian mixture model for background subtraction", ICPR 2004; Zivkovic
 and van der Heijden, "Efficient adaptive density estimation per image pixel", 2006; OpenCV's implementation.
-A first pass over frames from the whole video learns the background, each frame with equal weight, so the
-foreground of the second pass is usable from frame 0: a drone that stands anywhere for less than half of the
-video leaves no ghost.
+A first pass over frames from the whole video learns the background, each frame with equal weight. So the foreground of
+the second pass is usable from frame 0, and a drone that stands at one place for less than half of the video does not
+become background.
 
-Nothing here shifts the mask: images are reduced by whole factors, by area; speckle is dropped blob by blob.
+No step shifts the mask: images are reduced by whole factors, by area, and speckle is removed blob by blob.
 """
 
 from __future__ import annotations
@@ -22,33 +22,33 @@ from jaxtyping import UInt8
 
 from psotrack.errors import SettingsError, check_positive
 
-#: What becomes of MOG2's shadow label: full foreground, background, or foreground of less weight.
+#: Meaning of MOG2's shadow label: foreground, background, or foreground with a smaller weight.
 Shadows = Literal["keep", "drop", "weight"]
 
-#: A value that MOG2 writes for shadow; foreground is 255.
+#: MOG2's label of shadow pixels; foreground is 255.
 _SHADOW = 127
 
-#: Background is what a pixel shows for more than half of the time: not all that it shows often (MOG2's 0.9).
+#: MOG2's background ratio: background is what a pixel shows in more than half of the frames (MOG2's default is 0.9).
 _BACKGROUND_RATIO = 0.5
 
-#: Of one channel or of three.
+#: An image with one or three channels.
 _Image = UInt8[np.ndarray, "..."]
 
 
 class ForegroundSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How foreground is told from background.
+    """Settings that separate foreground from background.
 
     Attributes:
-        working_reduction: MOG2 works on the image reduced by this whole factor, by area; 1 is the full image.
-        num_learning_frames: at most so many frames, spread over the video, teach the background.
-        learning_rate: of the second pass, per frame in [0, 1]; 0 keeps the learned background.
+        working_reduction: whole factor by which the image is reduced, by area, before MOG2; 1 is the full image.
+        num_learning_frames: largest number of frames, spread over the video, from which the background is learned.
+        learning_rate: learning rate per frame in the second pass, in [0, 1]; 0 keeps the learned background.
         var_threshold: squared Mahalanobis distance from the background beyond which a pixel is foreground.
-        shadows: what becomes of MOG2's shadow label.
-        shadow_weight: in [0, 1], of a shadow pixel, for `shadows="weight"`.
-        min_blob_px: 8-connected blobs of fewer pixels of the full image are dropped.
+        shadows: meaning of MOG2's shadow label.
+        shadow_weight: weight of a shadow pixel in [0, 1], for `shadows="weight"`.
+        min_blob_px: 8-connected blobs with fewer pixels of the full image are removed.
 
     Raises:
-        SettingsError: a value makes no sense.
+        SettingsError: a value is out of range.
     """
 
     working_reduction: int = 2
@@ -80,7 +80,7 @@ def check_whole(name: str, value: object, *, lowest: int) -> None:
 
 
 def learning_step(num_frames: int, settings: ForegroundSettings) -> int:
-    """Every so many frames of a video of `num_frames`, the background is learned from one."""
+    """Distance between two frames from which the background is learned, frames."""
     return math.ceil(num_frames / settings.num_learning_frames)
 
 
@@ -89,33 +89,33 @@ def foreground(
     frames: Iterable[UInt8[np.ndarray, "height width 3"]],
     settings: ForegroundSettings,
 ) -> Iterator[UInt8[np.ndarray, "working_height working_width"]]:
-    """The foreground of `frames`, one image for each, against the background of `learning`.
+    """Yield the foreground of each frame; the background is learned from other frames first.
 
     Args:
-        learning: BGR frames, at least one, from the whole video: what most of them show is the background.
+        learning: BGR frames from the whole video, at least one; the background is what most of these frames show.
         frames: BGR frames in order.
-        settings: how foreground is told from background.
+        settings: settings of the foreground.
 
     Yields:
-        0 is background, 255 foreground, between them weighted shadow. Pixel (i, j) covers the pixels
-        [r * i, r * i + r) x [r * j, r * j + r) of the frame, where r is `working_reduction`.
+        Images in which 0 is background, 255 foreground, and values between weighted shadow. Pixel (i, j) covers the
+        pixels [r * i, r * i + r) x [r * j, r * j + r) of the frame, where r is `working_reduction`.
     """
-    model = learn(learning, settings)
+    model = learn_background(learning, settings)
     for frame in frames:
         yield classify(model, frame, settings)
 
 
-def learn(
+def learn_background(
     frames: Iterable[UInt8[np.ndarray, "height width 3"]], settings: ForegroundSettings
 ) -> cv2.BackgroundSubtractorMOG2:
-    """The background of some frames, each of which counts the same, in whichever order."""
+    """Learn the background from frames, each with the same weight; their order does not matter."""
     model = cv2.createBackgroundSubtractorMOG2(
         history=settings.num_learning_frames, varThreshold=settings.var_threshold, detectShadows=True
     )
     model.setBackgroundRatio(_BACKGROUND_RATIO)
     for index, frame in enumerate(frames):
-        # A rate of 1/n is the mean of n frames; MOG2's own schedule would favour the last ones.
-        model.apply(_working(frame, settings), learningRate=1 / (index + 1))
+        # The rate 1/n gives the mean of n frames; MOG2's own schedule gives the last frames more weight.
+        model.apply(_reduce_for_mog2(frame, settings), learningRate=1 / (index + 1))
     return model
 
 
@@ -124,21 +124,21 @@ def classify(
     frame: UInt8[np.ndarray, "height width 3"],
     settings: ForegroundSettings,
 ) -> UInt8[np.ndarray, "working_height working_width"]:
-    """The foreground of one frame, as `foreground` yields it; updates `model` at `learning_rate`."""
-    mask = model.apply(_working(frame, settings), learningRate=settings.learning_rate)
-    return without_speckle(
+    """Foreground of one frame, as `foreground` yields it; updates `model` at `learning_rate`."""
+    mask = model.apply(_reduce_for_mog2(frame, settings), learningRate=settings.learning_rate)
+    return remove_speckle(
         cv2.LUT(mask, _levels(settings)), math.ceil(settings.min_blob_px / settings.working_reduction**2)
     )
 
 
-def without_speckle(
+def remove_speckle(
     mask: UInt8[np.ndarray, "height width"], min_blob_px: int
 ) -> UInt8[np.ndarray, "height width"]:
-    """`mask` without its 8-connected blobs of fewer than `min_blob_px` pixels; others stay as they are."""
+    """Remove 8-connected blobs with fewer than `min_blob_px` pixels from a mask; larger blobs do not change."""
     points = cv2.findNonZero(mask)
     if min_blob_px <= 1 or points is None:
         return mask
-    # Areas are counted over foreground alone, which is a third of the time of OpenCV's own statistics.
+    # Counting over foreground pixels only takes a third of the time of OpenCV's connectedComponentsWithStats.
     count, labels = cv2.connectedComponents(mask, connectivity=8)
     x, y = points.reshape(-1, 2).T
     labels_of_points = labels[y, x]
@@ -151,27 +151,25 @@ def without_speckle(
 def coverage(
     mask: UInt8[np.ndarray, "height width"], reduction: int
 ) -> UInt8[np.ndarray, "reduced_height reduced_width"]:
-    """The mean of every `reduction` x `reduction` pixels, rounded.
+    """Mean of every `reduction` x `reduction` pixels, rounded.
 
     Cell (i, j) covers the pixels [r * i, r * i + r) x [r * j, r * j + r). Where the size is no multiple of r,
-    the last row and column reach over the border, where all is background.
+    the last row and column reach beyond the image's border, where all pixels count as background.
     """
     if reduction == 1:
         return mask
-    padded = _padded(mask, reduction, cv2.BORDER_CONSTANT)
-    return _reduced(padded, reduction)
+    padded = _pad(mask, reduction, cv2.BORDER_CONSTANT)
+    return _reduce(padded, reduction)
 
 
-def _working(frame: UInt8[np.ndarray, "height width 3"], settings: ForegroundSettings) -> _Image:
-    """The image that MOG2 sees; a last row or column that reaches over the border repeats what is there."""
+def _reduce_for_mog2(frame: UInt8[np.ndarray, "height width 3"], settings: ForegroundSettings) -> _Image:
+    """Reduce a frame by `working_reduction`; pixels beyond the image's border repeat the pixels at the border."""
     if settings.working_reduction == 1:
         return frame
-    return _reduced(
-        _padded(frame, settings.working_reduction, cv2.BORDER_REPLICATE), settings.working_reduction
-    )
+    return _reduce(_pad(frame, settings.working_reduction, cv2.BORDER_REPLICATE), settings.working_reduction)
 
 
-def _padded(image: _Image, factor: int, border: int) -> _Image:
+def _pad(image: _Image, factor: int, border: int) -> _Image:
     height, width = image.shape[:2]
     below, right = -height % factor, -width % factor
     if not (below or right):
@@ -179,13 +177,13 @@ def _padded(image: _Image, factor: int, border: int) -> _Image:
     return cv2.copyMakeBorder(image, 0, below, 0, right, border, value=(0, 0, 0))
 
 
-def _reduced(image: _Image, factor: int) -> _Image:
+def _reduce(image: _Image, factor: int) -> _Image:
     height, width = image.shape[:2]
     return cv2.resize(image, (width // factor, height // factor), interpolation=cv2.INTER_AREA)
 
 
 def _levels(settings: ForegroundSettings) -> UInt8[np.ndarray, "1 levels"]:
-    """The value of each of MOG2's labels: a table for `cv2.LUT`."""
+    """Mask value of each of MOG2's labels: a table for `cv2.LUT`."""
     weight = {"keep": 1.0, "drop": 0.0, "weight": settings.shadow_weight}[settings.shadows]
     levels = np.zeros((1, 256), np.uint8)
     levels[0, _SHADOW], levels[0, 255] = round(255 * weight), 255

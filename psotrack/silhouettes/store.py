@@ -1,6 +1,6 @@
-"""The silhouettes of one video on disk: a zarr array under a key that is made of everything that made it.
+"""Silhouettes of one video on disk: a zarr array, whose key is a digest of the video, the frames and the settings.
 
-Imports no JAX, because every worker process imports this module.
+This module does not import JAX, because every worker process imports this module.
 """
 
 from __future__ import annotations
@@ -33,24 +33,24 @@ from psotrack.support import Advance, digest_file, digest_record
 
 logger = logging.getLogger(__name__)
 
-#: Part of every key: to be raised whenever the same settings would give other silhouettes.
+#: Part of every key; raise it when the same settings give other silhouettes than before.
 SCHEMA = 1
 
-#: Frames that are compressed and read together.
+#: Number of frames that are compressed and read together.
 CHUNK_FRAMES = 25
 
-#: Unfinished work that nobody wrote to for so long is of a process that was killed.
+#: An unfinished folder that was not changed for this long was left by a process that was killed, seconds.
 _STALE_S = 24 * 3600
 
 
 class SilhouetteSettings(ForegroundSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How silhouettes are made: `ForegroundSettings`, and how far they are reduced.
+    """Settings of silhouettes: `ForegroundSettings` and the reduction.
 
     Attributes:
-        reduction: a stored value covers `reduction` x `reduction` pixels; a multiple of `working_reduction`.
+        reduction: each stored value covers `reduction` x `reduction` pixels; a multiple of `working_reduction`.
 
     Raises:
-        SettingsError: a value makes no sense.
+        SettingsError: a value is out of range.
     """
 
     reduction: int = 4
@@ -68,7 +68,7 @@ class SilhouetteSettings(ForegroundSettings, frozen=True, kw_only=True, forbid_u
 
 @dataclass(frozen=True)
 class Task:
-    """Silhouettes to be made: of one video, into the folder `cache` / `key`."""
+    """Task of making one video's silhouettes and storing them in the folder `cache` / `key`."""
 
     video: VideoInfo
     settings: SilhouetteSettings
@@ -77,7 +77,7 @@ class Task:
 
 
 def key_of(video: VideoInfo, settings: SilhouetteSettings) -> str:
-    """A name for the silhouettes of a video's content, frames used and settings: 40 hexadecimal digits.
+    """Digest of a video's content, number of frames and settings: 40 hexadecimal digits.
 
     Raises:
         InputError: the video cannot be read.
@@ -92,32 +92,32 @@ def key_of(video: VideoInfo, settings: SilhouetteSettings) -> str:
 
 
 def open_stored(path: Path, num_frames: int, shape: tuple[int, int]) -> zarr.Array | None:
-    """The stored silhouettes (frames, height, width) if they are there and whole, else None."""
+    """Open stored silhouettes (frames, height, width); None if they do not exist or are damaged."""
     try:
         array = zarr.open_array(path, mode="r", zarr_format=3)
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    # zarr reads a chunk that is missing as zeros: "nothing seen" must not come from a lost file.
+    # zarr reads a missing chunk as zeros, which would look like frames without foreground.
     whole = array.shape == (num_frames, *shape) and array.nchunks_initialized == array.nchunks
     return array if whole else None
 
 
 def reduced_shape(video: VideoInfo, reduction: int) -> tuple[int, int]:
-    """Height and width of a video's silhouettes."""
+    """Height and width of a video's silhouettes, cells."""
     width, height = video.image_size_wh
     return -(-height // reduction), -(-width // reduction)
 
 
 def frames_to_decode(task: Task) -> int:
-    """How far `store` advances: the frames of both passes."""
+    """Number of frames that `store` decodes in both passes."""
     num_frames = task.video.num_frames
     return num_frames + len(range(0, num_frames, learning_step(num_frames, task.settings)))
 
 
 def store(task: Task, advance: Advance) -> dict[str, float]:
-    """Make the silhouettes of one video and store them; the seconds of "decode" and "foreground".
+    """Make the silhouettes of one video and store them; returns the seconds of "decode" and "foreground".
 
-    They appear under their key at once and whole, or not at all. Of two who make the same, the first wins.
+    The folder appears whole or not at all. If two processes make the same silhouettes, the first folder stays.
 
     Raises:
         InputError: the video ends early.
@@ -130,7 +130,7 @@ def store(task: Task, advance: Advance) -> dict[str, float]:
         temporary.mkdir(parents=True)
         seconds = _write(temporary, shape, task, advance)
         if open_stored(temporary, task.video.num_frames, shape) is None:
-            raise OSError("it was changed by someone else")
+            raise OSError("another program changed the folder")
         _publish(temporary, path, task.video.num_frames, shape)
     except OSError as error:
         raise OutputError(
@@ -145,12 +145,12 @@ def store(task: Task, advance: Advance) -> dict[str, float]:
 
 
 def remove_stale(cache: Path) -> None:
-    """Remove what processes left unfinished that were killed a day ago or earlier."""
+    """Remove unfinished folders of processes that were killed more than a day ago."""
     for folder in cache.glob(".*.partial"):
         try:
             newest = max(file.stat().st_mtime for file in (folder, *folder.rglob("*")))
         except OSError:
-            continue  # someone is working there, or has just finished
+            continue  # another process works in the folder, or has just finished
         if time.time() - newest > _STALE_S:
             logger.info("removing %s, left by a process that was killed", folder)
             shutil.rmtree(folder, ignore_errors=True)
@@ -165,7 +165,7 @@ def _write(folder: Path, shape: tuple[int, int], task: Task, advance: Advance) -
         dtype=np.uint8,
         compressors=ZstdCodec(level=3, checksum=True),
         attributes={"video": video.path.name, "schema": SCHEMA, "settings": msgspec.to_builtins(settings)},
-        # Empty chunks are written too, so that one that is missing is known to be lost.
+        # Chunks of zeros are written too, so that a missing chunk is always a damage.
         config={"write_empty_chunks": True},
         overwrite=True,
     )
@@ -188,7 +188,7 @@ def _write(folder: Path, shape: tuple[int, int], task: Task, advance: Advance) -
 def _decoded(
     video: VideoInfo, step: int, seconds: dict[str, float], advance: Advance
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-    """Every `step`-th frame; adds the time that decoding took, reports each frame when it was worked on."""
+    """Yield every `step`-th frame; adds the decoding time to `seconds`, and advances the progress bar by each frame."""
     frames = read_frames(video, step)
     while True:
         started = time.perf_counter()
@@ -201,12 +201,12 @@ def _decoded(
 
 
 def _publish(temporary: Path, path: Path, num_frames: int, shape: tuple[int, int]) -> None:
-    """Rename into place, unless someone else was first.
+    """Move a folder to its place, unless another process has put an undamaged folder there.
 
-    What is whole is never taken away, not for a moment: whoever reads it would see zeros.
+    An undamaged folder is never moved away, because a process that reads it would see zeros meanwhile.
     """
     try:
-        os.rename(temporary, path)  # not over a folder that has something in it
+        os.rename(temporary, path)  # fails if `path` is a folder that is not empty
         return
     except OSError:
         if not path.exists():

@@ -1,4 +1,4 @@
-"""Summed-area tables (Crow 1984): the sum of an image over any box from four corners.
+"""Summed-area tables (Crow 1984): the sum of an image over any box, read from four corners of the box.
 
 A table has one row and one column of zeros in front, and boxes are half-open: `table[y, x]` is the sum of the image
 over rows below y and columns below x. Pixel (column i, row j) covers [i, i + 1) x [j, j + 1), so corners may be
@@ -17,21 +17,21 @@ from jaxtyping import Bool, Float, Int, Integer
 
 from psotrack._typing import Array
 
-#: Of a packed sum, what the first image gets; the second gets the rest of the 32.
+#: Number of bits of a packed sum that hold the first image's sum; the second image's sum has the rest of the 32 bits.
 LOW_BITS = 20
 
 
 def summed_area_table(
     images: Integer[Array, "cameras height width"],
 ) -> Int[Array, "height1 cameras width1"]:
-    """Tables of the images of several cameras, of whole numbers, exact.
+    """Exact summed-area tables of the images of several cameras.
 
     Args:
         images: (cameras, height, width), non-negative whole numbers whose sum is below 2^31 (a 4K image of 0..255 is).
 
     Returns:
-        (height + 1, cameras, width + 1), int32: row by row, and in a row camera by camera, which is the order in which
-        the sums are made, so that nothing is copied afterwards.
+        (height + 1, cameras, width + 1), int32. This order of axes is the order in which the sums are computed, so the
+        result is not copied.
 
     Example:
         >>> summed_area_table(jnp.array([[[1, 2], [3, 4]]]))[:, 0].tolist()
@@ -42,7 +42,7 @@ def summed_area_table(
 
 
 def _running_sum(lines: Integer[Array, "lines *line"]) -> Int[Array, "lines *line"]:
-    """`jnp.cumsum` over the leading axis: compiled to additions of whole lines, several times faster on a CPU."""
+    """Cumulative sum over the leading axis. On a CPU it is several times faster than `jnp.cumsum`."""
 
     def add(total: jax.Array, line: Any) -> tuple[jax.Array, jax.Array]:
         total = total + line.astype(jnp.int32)
@@ -52,11 +52,11 @@ def _running_sum(lines: Integer[Array, "lines *line"]) -> Int[Array, "lines *lin
 
 
 def pack(low: Integer[Array, "*image"], high: Bool[Array, "*image"]) -> Int[Array, "*image"]:
-    """Two images in one, so that one table holds the sums of both: reading the second costs no memory traffic.
+    """Pack two images into one, so that one table holds the sums of both, and one read gives both sums.
 
     Args:
-        low: whole numbers of which no box sums to 2^`LOW_BITS` or more (64 x 64 pixels of 0..255 do not).
-        high: of which no box counts 2^(32 - `LOW_BITS`) or more.
+        low: whole numbers whose sum over any box is below 2^`LOW_BITS` (as for 64 x 64 pixels of 0..255).
+        high: mask with fewer than 2^(32 - `LOW_BITS`) true pixels in any box.
     """
     return low.astype(jnp.int32) + (high.astype(jnp.int32) << LOW_BITS)
 
@@ -71,18 +71,18 @@ def box_sum(
 ) -> Float[Array, "sets *boxes"]:
     """Sums over sets of fractional boxes, each box in the table of its camera.
 
-    Boxes are cut at the image's border; one that lies outside, or whose ends are in the wrong order, has sum 0.
-    Differentiable in the corners (almost everywhere).
+    Boxes are clipped at the image's border. A box outside the image, or with edges in the wrong order, has sum 0. The
+    sums are differentiable in the corners almost everywhere.
 
     Args:
         tables: (height + 1, cameras, width + 1), from `summed_area_table`.
-        camera: which table each box of a set reads.
+        camera: index of the table that each box of a set reads.
         x0, y0, x1, y1: (sets, ...), edges in pixels of the image, half-open.
 
     Returns:
         (sets, ...), float32, in units of the image times pixels.
     """
-    return _set_by_set(tables, camera, (x0, y0, x1, y1), _whole, lambda total: total)
+    return _map_sets(tables, camera, (x0, y0, x1, y1), _unpacked_part, lambda total: total)
 
 
 def of_packed_box_sums(
@@ -95,26 +95,28 @@ def of_packed_box_sums(
     y1: Float[Array, "sets *#boxes"],
     *given: Float[Array, "sets *#boxes"],
 ) -> Float[Array, "sets *boxes"]:
-    """What follows from the sums of two images that are packed into one table, boxes as in `box_sum`.
+    """Apply a function to the box sums of two images that are packed into one table; boxes as in `box_sum`.
 
     Args:
-        then: of the low and the high sums of one set, and what is given for it. It is called where they are made: two
-            results would have XLA on CPU read the tables twice.
+        then: function of one set's sums of the first image, sums of the second image, and values of `given`. It is
+            called inside the loop, because XLA on a CPU would read the tables twice for two results.
+        tables, camera, x0, y0, x1, y1: as in `box_sum`; the tables are of images from `pack`.
+        given: (sets, ...), further arguments of `then`.
     """
-    return _set_by_set(tables, camera, (x0, y0, x1, y1), _unpacked, then, *given)
+    return _map_sets(tables, camera, (x0, y0, x1, y1), _packed_parts, then, *given)
 
 
-def _whole(total: Array, dtype: Any) -> tuple[Array, ...]:
+def _unpacked_part(total: Array, dtype: Any) -> tuple[Array, ...]:
     return (total.astype(dtype),)
 
 
-def _unpacked(total: Array, dtype: Any) -> tuple[Array, ...]:
-    # Logically: the highest bit is one of the number's.
+def _packed_parts(total: Array, dtype: Any) -> tuple[Array, ...]:
+    # A logical shift, because the highest bit belongs to the number and is no sign.
     low, high = total & ((1 << LOW_BITS) - 1), jax.lax.shift_right_logical(total, jnp.int32(LOW_BITS))
     return low.astype(dtype), high.astype(dtype)
 
 
-def _set_by_set(
+def _map_sets(
     tables: Int[Array, "height1 cameras width1"],
     camera: Int[Array, "*#boxes"],
     edges: tuple[Float[Array, "sets *#boxes"], ...],
@@ -122,13 +124,13 @@ def _set_by_set(
     then: Callable[..., Array],
     *given: Float[Array, "sets *#boxes"],
 ) -> Float[Array, "sets *boxes"]:
-    """`then` of the sums of one set of boxes after the other; `parts` of a table's number are what is summed."""
+    """Apply `then` to the sums of each set of boxes; `parts` splits a sum into the sums of the packed images."""
     x0, y0, x1, y1 = edges
     height1, num_cameras, width1 = tables.shape
     flat, row = jnp.reshape(tables, -1), num_cameras * width1
 
     def split(edge: Array, last: int) -> tuple[Array, Array]:
-        # The cell below the edge and how far the edge reaches into it; at the far border the last cell, full.
+        # The cell of the edge, and the share of the cell before the edge; at the last border this is 1.
         edge = jnp.clip(edge, 0, last)
         cell = jnp.minimum(edge.astype(jnp.int32), last - 1)
         return cell, edge - cell.astype(edge.dtype)
@@ -138,13 +140,13 @@ def _set_by_set(
     row0, row1 = camera * width1 + j0 * row, camera * width1 + j1 * row
 
     def read(index: Array) -> Array:
-        # Indices are in bounds by construction; saying so spares a check in the innermost loop of the tracker.
+        # Indices are in bounds by construction, and a check in the tracker's innermost loop would cost time.
         return flat.at[index].get(mode="promise_in_bounds")
 
     def corner(index: Array, fx: Array, fy: Array) -> tuple[Array, tuple[Array, ...]]:
-        # The table at the cell's corner, and what bilinear reading adds to it. Whole numbers are differenced before
-        # anything becomes float32, because the sums of a 1080p image exceed 2^24; and each difference is the sum over
-        # some box, which has parts.
+        # The table at the cell's corner, and the part that bilinear interpolation adds. Integers are subtracted before
+        # the conversion to float32, because the sums of a 1080p image exceed 2^24. Each difference is the sum over a
+        # box, so `parts` can split it.
         here, right, below, across = (read(index + step) for step in (0, 1, row, row + 1))
         steps = (
             parts(step, fx.dtype) for step in (right - here, below - here, across - below - right + here)
@@ -165,6 +167,6 @@ def _set_by_set(
         )
         return then(*sums, *rest)
 
-    # Set by set: within one expression XLA on CPU computes all indices anew for each of the sixteen reads.
+    # One set at a time, because XLA on a CPU would else compute all indices again for each of the sixteen reads.
     cells = (row0 + i0, row0 + i1, row1 + i0, row1 + i1)
     return jax.lax.map(one_set, (*cells, fx0, fx1, fy0, fy1, *given))

@@ -53,7 +53,8 @@ def _text(table: pd.DataFrame, decimals: int) -> str:
         if max(map(len, text.splitlines())) <= WIDTH:
             break
     else:
-        text = cells.to_string(sparsify=True, line_width=WIDTH)
+        # With `sparsify`, pandas would not repeat the outer labels where columns are continued.
+        text = cells.to_string(sparsify=False, line_width=WIDTH)
     lines = [line.rstrip() for line in text.splitlines()]
     return "\n".join([_title(table), "", *lines, ""])
 
