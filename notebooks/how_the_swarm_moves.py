@@ -12,14 +12,14 @@
 # # How the swarm moves
 #
 # A [score](video_to_score.ipynb) says how well a drone at a point explains what the cameras see. In every frame, a
-# particle swarm looks for the point where it is highest. Each particle is a guess of where the drone is. It remembers
-# the best place that it has been to (pbest), and knows the best place that any of them has found (gbest). In each
-# iteration
+# particle swarm searches the point with the highest score. Each particle is a possible position of the drone. A
+# particle stores the best position that it has visited (pbest), and the swarm stores the best position of all
+# particles (gbest). In each iteration
 #
 # $$v \leftarrow w\,v + c_1 r_1\,(\mathrm{pbest} - x) + c_2 r_2\,(\mathrm{gbest} - x),\qquad x \leftarrow x + v,$$
 #
 # with random numbers $r_1, r_2$ in [0, 1) for every particle and axis (Kennedy and Eberhart 1995, Shi and Eberhart
-# 1998). Here the package's own swarm is taken one step at a time, in one frame, to watch it.
+# 1998). This notebook runs the package's own swarm in one frame, one step at a time.
 
 # %%
 import os
@@ -64,8 +64,8 @@ keep_compiled(Path("data", "compiled"))
 # %% [markdown]
 # ## One frame
 #
-# The drones are found in the first frames. Where they would be in frame 10, had they flown straight on, is the
-# prediction about which the particles start.
+# The drones are found in the first frames. Their positions in frame 10, extrapolated at constant velocity, are the
+# prediction around which the particles start.
 
 # %%
 folder = DATA / "Simulated_Data" / "S02_D4_A"
@@ -113,7 +113,7 @@ for iteration in range(SHOWN_ITERATIONS):
     states.append(step(jax.random.key(iteration), fitness, states[-1], params))
 
 # %% [markdown]
-# `states` is all that is to be seen: after each iteration, where the particles are and the best that they know.
+# `states` holds, after each iteration, the positions of the particles and their best positions.
 
 # %%
 position_m = np.stack([state.position[:, shown] for state in states])  # iterations, particles, 3
@@ -177,10 +177,10 @@ Image(filename=DATA / "swarm.gif")
 #
 # ## One swarm for each drone, or one for all?
 #
-# The paper has one swarm in which a particle is a guess of *all* drones at once: 12 numbers for four drones. Its
-# score is the mean over the drones, so a particle that is right about three of them and wrong about one looks
-# mediocre, and pulls nobody. Swarms of their own share nothing but the images. Both with the same particles and
-# iterations, that is the same number of looks at the images:
+# The paper has one swarm in which a particle is a guess of *all* drones at once: 12 numbers for four drones. Its score
+# is the mean over the drones, so a particle that is right about three drones and wrong about one has a mediocre score,
+# and attracts no other particle. Separate swarms share only the images. Both kinds get the same number of particles
+# and iterations, that is, of evaluations of the score:
 
 # %%
 joint = jax.jit(lambda position_m: joint_fitness(seen, position_m.reshape(PARTICLES, -1, 3))[:, None])
@@ -220,10 +220,10 @@ axes.grid(alpha=0.3, which="both")
 plt.show()
 
 # %% [markdown]
-# *What to see: how far the best place known is from the place with the highest score, over the iterations; median over
-# the seeds, bands from the 10th to the 90th percentile; the scale is logarithmic. Swarms of their own come closer by a
-# constant factor in every iteration; the joint swarm is slower, and the slower the more drones there are. Either
-# is followed, in the tracker, by a parabola through the score about the best place, which takes out most of the
-# distance that is left: so the tracker needs far fewer iterations than this figure suggests.*
+# *What to see: the distance of the best known position from the position with the highest score, over the iterations;
+# median over the seeds, bands from the 10th to the 90th percentile; the scale is logarithmic. Separate swarms reduce
+# the distance by a constant factor in every iteration; the joint swarm is slower, and slows down with the number of
+# drones. In the tracker a paraboloid through the score about the best position removes most of the remaining distance,
+# so the tracker needs far fewer iterations than this figure suggests.*
 #
 # Next: [what particles and iterations cost and buy](table_5.ipynb) over whole recordings.

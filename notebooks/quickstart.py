@@ -14,8 +14,8 @@
 # Four drones fly in a hall, and eight cameras on its walls record them. From the videos alone: where is each drone, in
 # 3D, in every frame?
 #
-# This notebook simulates such a recording, looks at it, tracks the drones, judges the tracks by the truth, and ends
-# with a table to go on with. It takes about two minutes on two cores, and half of one when it runs again.
+# This notebook simulates such a recording, shows it, tracks the drones, compares the tracks with the ground truth, and
+# writes a table. It takes about two minutes on two cores, and half a minute when it runs again.
 
 # %%
 import os
@@ -36,8 +36,8 @@ from psotrack.support import keep_compiled
 from psotrack.trajectories import write_trajectories
 
 # %% [markdown]
-# All sizes are set here. Images have half of their full size, so that nobody waits; `SCALE = 1.0` and
-# `SilhouetteSettings()` are the real thing.
+# All sizes are set here. Images have half of their full size to save time; use `SCALE = 1.0` and
+# `SilhouetteSettings()` for the full size.
 
 # %%
 TINY = os.environ.get("PSOTRACK_NOTEBOOKS") == "tiny"  # a quick check that everything runs
@@ -53,8 +53,8 @@ keep_compiled(Path("data", "compiled"))  # the second run does not wait for the 
 # %% [markdown]
 # ## A recording
 #
-# `simulate` writes a folder as it would come from a recording: a video per camera, the cameras' calibration, and, as
-# this is a simulation, the truth.
+# `simulate` writes the same folder that a real recording has: one video per camera and the cameras' calibration. A
+# simulation also has the ground truth.
 
 # %%
 folder = DATA / "Simulated_Data" / "S02_D4_A"
@@ -79,15 +79,15 @@ axes.set(xlabel="x (pixels)", ylabel="y (pixels)", title=f"camera {name}, frame 
 plt.show()
 
 # %% [markdown]
-# *What to see: four drones, the nearest some fifty pixels wide: two left of the middle, two before the far corner.
-# The tracker will know them by nothing but their silhouettes: no markers, no colours, no model of what a drone looks
-# like.*
+# *What to see: four drones, the nearest some fifty pixels wide: two left of the middle, two before the far corner. The
+# tracker uses only their silhouettes: no markers, no colours, no model of a drone's appearance.*
 
 # %% [markdown]
 # ## Track
 #
 # One call makes silhouettes from the videos (in several processes; they are kept in `cache`), finds the drones in the
-# first frames, and follows them. Nothing is said about how many there are, where they start or how large they are.
+# first frames, and follows them. The call does not say how many drones there are, where they start or how large they
+# are.
 
 # %%
 tracked = track_sequence(sequence, TrackSettings(seed=1, silhouettes=SILHOUETTES), cache=DATA / "silhouettes")
@@ -97,8 +97,8 @@ tracked.trajectories.position_m.shape  # frames, drones, x y z in metres
 pd.Series(tracked.record["seconds"], name="seconds").to_frame().T.round(1)
 
 # %% [markdown]
-# Where the seconds went: `decode` and `foreground` are summed over processes, and 0 when the silhouettes were in the
-# cache; `compile` is short when the program was on disk; `track` is all frames.
+# Seconds per stage: `decode` and `foreground` are summed over processes, and 0 when the silhouettes were in the cache;
+# `compile` is short when the compiled program was on disk; `track` is the time of all frames.
 #
 # ## See it
 
@@ -134,15 +134,15 @@ plots.draw_errors(axes, tracked.trajectories, sequence.truth)
 plt.show()
 
 # %% [markdown]
-# *What to see: each drone's distance from the truth, frame by frame. The curves keep a height of their own: that is
-# the offset between the body's origin, which the truth is about, and the silhouette's middle, which is all that
-# cameras show. It is constant in each drone's body and comes out with `--body-offset`. What then is left is the third
-# column of the table. Gaps and bars at the top would be frames in which a drone is missed, dotted lines exchanged
-# identities.*
+# *What to see: each drone's distance from the truth, frame by frame. Each curve keeps a constant height: the offset
+# between the body's origin, which the ground truth describes, and the silhouette's middle, which cameras show. The
+# offset is constant in each drone's body, and `--body-offset` removes it. The third column of the table is the error
+# without the offset. Gaps and bars at the top would be frames in which a drone is missed; dotted lines would be
+# identity swaps.*
 #
 # ## Take the numbers away
 #
-# What is written here is what `psotrack track SEQ --out tracks.parquet` writes: a row per frame and drone.
+# This file is the same as that of `psotrack track SEQ --out tracks.parquet`: one row per frame and drone.
 
 # %%
 tracks = DATA / "tracks.parquet"
@@ -173,10 +173,10 @@ panels[-1].set_xlabel("time (s)")
 plt.show()
 
 # %% [markdown]
-# *What to see: the coordinates of each drone, in colours as above. The bands are the tracker's own standard
-# deviation, drawn twenty times as wide, because at its true width, some millimetres, it would vanish in the line; it
-# is wide in the first frames, when little is known of how the drones move. Numbers are the tracker's: it cannot know
-# what the truth calls a drone.*
+# *What to see: the coordinates of each drone, in colours as above. The bands are the tracker's own standard deviation,
+# drawn twenty times as wide, because at its true width, some millimetres, it would vanish in the line; it is wide in
+# the first frames, when little is known of how the drones move. Numbers of drones are the tracker's; the tracker does
+# not know the names in the ground truth.*
 #
 # Next: [how a score comes from a video](video_to_score.ipynb), [how the swarm moves](how_the_swarm_moves.ipynb),
 # [your own cameras](your_own_cameras.ipynb), [what the swarm's size costs and buys](table_5.ipynb).

@@ -12,9 +12,9 @@
 # # Table 5, and what a millimetre costs
 #
 # The paper's Table 5 tracks three sequences with 20, 50 and 100 particles and 20, 50 and 70 iterations, several times
-# each, because a swarm is chance. `make table5` does the same with the paper's method (one swarm for all drones, one
-# hard box as score) and with psotrack's defaults, ten runs each. This notebook reads what came out, which is kept in
-# `experiments/table5/results`; nothing is computed anew.
+# each, because a swarm is random. `make table5` does the same with the paper's method (one swarm for all drones, one
+# hard box as score) and with psotrack's defaults, ten runs each. This notebook reads the results in
+# `experiments/table5/results`; it tracks nothing itself.
 
 # %%
 import json
@@ -64,8 +64,8 @@ table = pivot(
 Markdown(render(table, "markdown", decimals=1))
 
 # %% [markdown]
-# Millimetres, mean ± standard deviation over the runs; from the drones' origins, so each drone's constant offset from
-# its silhouette's middle is in it, 10 to 25 mm that no method can see. The same without it:
+# Millimetres, mean ± standard deviation over the runs; measured from the drones' origins, so each drone's constant
+# offset from its silhouette's middle is included, 10 to 25 mm that no image shows. The same without the offset:
 
 # %%
 table = pivot(
@@ -78,8 +78,8 @@ table = pivot(
 Markdown(render(table, "markdown", decimals=1))
 
 # %% [markdown]
-# The paper's own figures, on its own videos. They are not the same videos as these, and not the same silhouettes,
-# sizes, start and motion model: compare the two methods above with each other rather than with these.
+# The paper's own figures, on its own videos. Videos, silhouettes, sizes, initial states and motion model differ from
+# ours: compare the two methods above with each other, not with these figures.
 
 # %%
 pd.DataFrame(published_m, index=["lowest mean error (mm)", "highest mean error (mm)"]).T * 1000
@@ -94,9 +94,9 @@ figure
 
 # %% [markdown]
 # *What to see: a point is one number of particles and iterations with one method; to the right is more time per frame,
-# up is a larger mean error, both on logarithmic scales; bars are the standard deviation over the runs. The dark line is
-# the Pareto front: points on it have none that is both faster and better. Where it is flat, more work buys nothing.
-# The band is what the paper published.*
+# up is a larger mean error, both on logarithmic scales; bars are the standard deviation over the runs. The dark line
+# is the Pareto front: no other point is both faster and more accurate than a point on it. Where the front is flat,
+# more work does not lower the error. The band is what the paper published.*
 
 # %%
 figure = error_against_work(rows, error="offset_removed_mean_error_m")
@@ -155,9 +155,9 @@ panels[0, 0].legend(frameon=False)
 plt.show()
 
 # %% [markdown]
-# *What to see: every run by itself. A tight column is a method that gives the same whenever it is asked; a long one is
-# luck. Rings are runs in which drones exchanged their identities: they stand far above the others, and a mean over
-# runs mixes the two.*
+# *What to see: every run by itself. A short column is a method whose runs agree; a long column is a method whose
+# result depends on the seed. Rings are runs with identity swaps: their errors are far above those of other runs, and a
+# mean over runs mixes both kinds.*
 #
 # ## Where it came from
 

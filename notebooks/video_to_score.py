@@ -11,12 +11,12 @@
 # %% [markdown]
 # # From a video to a score
 #
-# The tracker asks one question, a million times per second: *if a drone were at this point, how well would that
-# explain what the cameras see?* The answer is a number in [0, 1], the soft IoU. This notebook makes it step by step:
+# The tracker computes, a million times per second, how well a drone at a given point would explain what the cameras
+# see. The result is a number in [0, 1], the soft IoU. This notebook computes it step by step:
 #
 # frame → foreground → silhouette → box of a drone at a point → overlap of the two
 #
-# and then draws the number over space: the landscape in which the swarm looks for the highest place.
+# and then draws the soft IoU over space: the swarm searches this landscape for its highest point.
 
 # %%
 import os
@@ -72,8 +72,9 @@ names = sequence.rig.names
 # ## Frame → foreground → silhouette
 #
 # The cameras stand still, so a pixel shows the background most of the time. A background model (MOG2) learns what each
-# pixel usually shows from frames of the whole video; what does not fit is foreground. What the tracker reads is coarser: each value of a *silhouette* is how much of a little square of pixels is
-# foreground, 0 to 255. `psotrack.silhouettes.compute` does the same for all cameras and frames, and keeps the result.
+# pixel usually shows from frames of the whole video; pixels that differ from the model are foreground. The tracker
+# reads a coarser picture: each value of a *silhouette* is the share of a small square of pixels that is foreground, 0
+# to 255. `psotrack.silhouettes.compute` does the same for all cameras and frames, and keeps the result.
 
 # %%
 images, masks = [], []
@@ -94,9 +95,9 @@ for camera, mask in zip(CAMERAS, masks, strict=True):  # just so they are made
 # %% [markdown]
 # ## A point → a box in every camera
 #
-# How large the drones are is learned from the first frames. An ellipsoid of that size at a point has a box in each
-# camera. The score compares three concentric boxes, its *windows*, with the silhouette, and looks at a larger *ring*
-# to see what else is there.
+# The sizes of the drones are learned from the first frames. An ellipsoid of that size at a point has a box in each
+# camera. The score compares three concentric boxes, its *windows*, with the silhouette; a larger *ring* shows
+# foreground beside the windows.
 
 # %%
 start = find_drones(
@@ -155,10 +156,10 @@ for row, camera, image, mask in zip(panels, CAMERAS, images, masks, strict=True)
 plt.show()
 
 # %% [markdown]
-# *What to see, from left to right: one drone, cut out of the frame; what differs from the background, drone and
-# rotors; the same at the tracker's resolution; and the three windows (solid, 0.4, 0.7 and 1 times the drone's box)
-# and the ring (dashed, 1.5 times) of a drone that is at the true position. Above, a camera that sees it alone: the
-# windows sit on the silhouette. Below, one in whose view a second drone is right behind: two drones, one silhouette.*
+# *What to see, from left to right: one drone, cut out of the frame; the foreground, drone and rotors; the foreground
+# at the tracker's resolution; and the three windows (solid, 0.4, 0.7 and 1 times the drone's box) and the ring
+# (dashed, 1.5 times) of a drone that is at the true position. Above, a camera that sees it alone: the windows sit on
+# the silhouette. Below, one in whose view a second drone is right behind: two drones, one silhouette.*
 #
 # ## Box and silhouette → soft IoU
 #
@@ -166,9 +167,9 @@ plt.show()
 #
 # $$\mathrm{IoU}_s = \frac{F_s}{A_s + F_{ring} - F_s},\qquad \mathrm{score} = \text{mean over the windows.}$$
 #
-# It never reaches 1: drones do not fill boxes. Edges of boxes lie between pixels, and the foreground in them is summed
-# exactly, by area, so the score changes smoothly as the point moves. A drone's fitness is the mean over the cameras
-# that see it.
+# The score never reaches 1, because drones do not fill their boxes. Edges of boxes lie between pixels, and the
+# foreground in them is summed exactly, by area, so the score changes smoothly as the point moves. A drone's fitness is
+# the mean over the cameras that see it.
 
 # %%
 tables = summed_area_table(jnp.asarray(seen, jnp.int32))
@@ -249,10 +250,11 @@ plt.show()
 
 # %% [markdown]
 # *What to see. Heat maps: brighter is a better explanation; a contour every 0.05. Both scores have one hill, and the
-# truth (cross) is near its top. Right, the top itself, 0.1 m to either side: the soft score is a smooth summit, so
-# that a parabola through it says where the top is, to millimetres. The hard score goes up and down in steps, because
-# a box only changes when an edge reaches the next pixel: among places that look alike, chance decides. The summit is
-# some ten millimetres beside the truth: that is the body's origin, and the score knows the silhouette's middle.*
+# true position (cross) is near its top. Right, the top of the hill, 0.1 m to either side: the soft score is smooth, so
+# a parabola through it gives the position of the top to millimetres. The hard score changes in steps, because a box
+# changes only when an edge reaches the next pixel: neighbouring positions have the same score, and the choice between
+# them is random. The top is some ten millimetres beside the true position, because the ground truth describes the
+# body's origin and the score the silhouette's middle.*
 #
 # ## The landscape of the room
 #
@@ -281,10 +283,10 @@ axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, facecolor="#2b313a
 plt.show()
 
 # %% [markdown]
-# *What to see: one bright hill, a few decimetres wide, in a dark plain. That is where this drone is. The faint
-# patches are places where foreground in two or three cameras agrees by chance: rays from cameras to the other drones,
-# which are higher or lower, cross there. In most of the room there is no slope that leads anywhere. A swarm finds the
-# hill because it starts where the drone is expected after the last frame; where it is in the very first frame is
-# found in another way, from blobs that agree between cameras (`psotrack.initiation.initialisation`).*
+# *What to see: one bright hill, a few decimetres wide, in a dark plain. The drone is at this hill. The faint patches
+# are places where foreground in two or three cameras agrees by chance: rays from cameras to the other drones, which
+# are higher or lower, cross there. In most of the room the score has no slope towards the hill. A swarm finds the hill
+# because it starts at the position that the motion model predicts. In the first frame positions are found in another
+# way, from blobs that agree between cameras (`psotrack.initiation.initialisation`).*
 #
 # Next: [how the swarm moves](how_the_swarm_moves.ipynb) in this landscape.

@@ -77,10 +77,10 @@ keep_compiled(Path("data", "compiled"))
 # %% [markdown]
 # ## What stands for your files
 #
-# Skip these two cells when you have files of your own. They take a simulated recording and make it foreign: other
-# names, lenses that bend (the videos are resampled), millimetres, and a world that is the first camera's, as stereo
-# calibration leaves it. Beside videos and calibration there are *marks*: six points of which you know where they are
-# in the room (tape on the floor, a pole), and where you clicked on them in each picture.
+# Skip these two cells when you have files of your own. They turn a simulated recording into one from another program:
+# other names, lens distortion (the videos are resampled), millimetres, and the first camera's frame as world, as after
+# stereo calibration. Besides videos and calibration there are *marks*: six points whose positions in the room you know
+# (tape on the floor, a pole), and where you clicked on them in each picture.
 
 # %%
 folder = DATA / "Simulated_Data" / "S02_D4_A"
@@ -170,9 +170,9 @@ first_rig = stack(
 )
 
 # %% [markdown]
-# The world of this rig is its first camera. psotrack wants z up and the floor at z = 0: it looks for drones in a
-# room, and for shadows on its floor. The marks tell how the two worlds lie to each other: triangulate them in the
-# world of the calibration, and turn that onto what the tape measure says.
+# The world of this rig is its first camera. psotrack wants z up and the floor at z = 0: it looks for drones in a room,
+# and for shadows on its floor. The marks give the transformation between the two worlds: triangulate the marks in the
+# world of the calibration, and fit the result to the positions that you measured.
 
 # %%
 marks = np.load(FOREIGN / "marks.npz")
@@ -199,13 +199,14 @@ print(
 )
 
 # %% [markdown]
-# The first number should be 1.000. A thousand: millimetres were taken for metres. A few per cent: the calibration
-# board's squares are not as large as was said. The second should be millimetres.
+# The first number, the scale, should be 1.000. A scale of 1000 means that millimetres were read as metres. A scale
+# that is a few per cent off means that the calibration board's squares have another size than was stated. The second
+# number, the residual, should be a few millimetres.
 #
 # ## 2. Check the rig
 #
-# Project what is known and compare it with the pictures. This finds nearly every mistake there is: `R` for its
-# transpose, `t` for the centre, a camera's name for another's, a video of another size than the calibration's.
+# Project the known points and compare them with the pictures. This finds nearly every mistake: `R` for its transpose,
+# `t` for the centre, a camera's name for another's, a video of another size than the calibration's.
 
 # %%
 projected_px, depth_m = project(rig.cameras, marks_m[:, None])
@@ -262,8 +263,8 @@ pd.DataFrame(contents(sequence)["cameras"]).T.drop(columns=["video", "detections
 #
 # ## 4. Track
 #
-# From here on, `psotrack track my_recording --drones 4 --out tracks.csv` does the same. How many drones there are need
-# not be said, but who knows it may: what else moves is then left alone.
+# From here on, `psotrack track my_recording --drones 4 --out tracks.csv` does the same. The number of drones is
+# optional. With `--drones`, other moving things start no tracks.
 
 # %%
 settings = TrackSettings(drones=4, silhouettes=SILHOUETTES)
@@ -274,8 +275,8 @@ print(f"{tracks.num_drones} drones, {np.mean(tracks.seen):.0%} of all frames tra
 pd.DataFrame(tracked.size_m, columns=["size x (m)", "size y (m)", "size z (m)"]).round(2)
 
 # %% [markdown]
-# Nobody has a truth for recordings of their own. What to look at instead: do the boxes sit on the drones, in every
-# camera; is the fitness steady; do all cameras agree?
+# Your own recordings usually have no ground truth. Check three things instead: the boxes are on the drones, in every
+# camera; the fitness is steady; all cameras agree.
 
 # %%
 cameras = on_device(rig.cameras)
@@ -315,7 +316,7 @@ plt.show()
 # *What to see: a steady fitness of about 0.4, far above the dotted line, and nearly all cameras at nearly all times:
 # as it should be. A drop of one curve is a drone that is hidden or leaves; a drop of all of them, light that changes.*
 #
-# Here, and only here, there is a truth after all, because these recordings were made from a simulation:
+# This recording has a ground truth, because it was made from a simulation:
 
 # %%
 evaluation = evaluate(tracks, simulated.truth)
@@ -324,9 +325,9 @@ print(f"mean error {1e3 * evaluation.mean_error_m:.0f} mm, identity switches {ev
 # %% [markdown]
 # ## 5. When it fails: which camera is it?
 #
-# Somebody has knocked against a tripod after the calibration: `gopro3` now looks a little to the side. The tracker
-# still works, a little worse, because seven cameras outvote one. How would you know? By each camera's own score at
-# the positions that all of them agreed on.
+# A tripod was moved after the calibration: `gopro3` now looks a little to the side. The tracker still works, a little
+# less accurately, because seven cameras outvote one. Each camera's own score at the tracked positions shows which
+# camera is wrong.
 
 # %%
 knocked = rig.names.index("gopro3")
