@@ -422,7 +422,7 @@ def test_ctrl_c_leaves_nothing(folder: Path, tmp_path: Path) -> None:
         folder,
         tmp_path / "cache",
         # Workers that are slow to clear up are not made to end: how long that takes is nothing to this test.
-        before="from psotrack.support import processes; processes._GRACE_S = 3600",
+        before="from psotrack.support import processes; processes.GRACE_S = 3600",
         fate="os.kill(0, signal.SIGINT)",  # as a terminal does: to the workers too
         after_frames=1,
     )

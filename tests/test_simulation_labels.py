@@ -1,6 +1,7 @@
 """Masks against OpenCV's projection and polygons, archives against `zipfile`, detections against their settings."""
 
 import math
+import struct
 import zipfile
 from dataclasses import replace
 from itertools import combinations
@@ -278,16 +279,24 @@ def test_joined_archives_read_as_one(tmp_path, parts):
     assert (tmp_path / "all.zip").read_bytes() == before
 
 
-def test_many_entries_take_64_bit_records(tmp_path, parts, monkeypatch):
-    """As above 65,535 entries: the limit is lowered, the records are the same."""
-    monkeypatch.setattr(_archives, "_FULL_16", 19)
-    join_archives(tmp_path / "all.zip", parts)
+def test_more_entries_than_16_bits_count_are_all_found(tmp_path):
+    """65,536 entries and more need the 64-bit records of ZIP."""
+    counts = (40_000, 26_000)
+    halves = [tmp_path / f"half_{number}.zip" for number in range(2)]
+    for number, (path, count) in enumerate(zip(halves, counts, strict=True)):
+        with zipfile.ZipFile(path, "w") as half:
+            for index in range(count):
+                half.writestr(_archives.entry(f"{number}/{index}"), str(index))
+    join_archives(tmp_path / "all.zip", halves)
+    with zipfile.ZipFile(tmp_path / "all.zip") as archive:
+        names = archive.namelist()
+        assert names == [f"{number}/{index}" for number in range(2) for index in range(counts[number])]
+        for name in (names[0], names[65_535], names[65_536], names[-1]):
+            assert archive.read(name) == name[2:].encode()
     content = (tmp_path / "all.zip").read_bytes()
-    assert b"PK\x06\x06" in content
-    # Readers look at the 64-bit record where the short one has its largest number.
-    end = content.rfind(b"PK\x05\x06")
-    (tmp_path / "all.zip").write_bytes(content[: end + 8] + b"\xff" * 4 + content[end + 12 :])
-    check(tmp_path / "all.zip")
+    # Other readers take the number of entries, on this disk and in total, from the 64-bit record.
+    record = content.rfind(b"PK\x06\x06")
+    assert struct.unpack_from("<QQ", content, record + 24) == (sum(counts),) * 2
 
 
 def test_entries_beyond_4_gb_are_found(tmp_path, parts):

@@ -22,7 +22,7 @@ _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
 
 #: Time that a worker has to end by itself before it is terminated, seconds: enough to remove its temporary files.
-_GRACE_S = 5.0
+GRACE_S = 5.0
 
 
 def map_in_processes(
@@ -90,7 +90,7 @@ def _workers(function: Callable[..., Any], count: int) -> Iterator[list[Connecti
         for connection in connections:
             connection.close()
         for process in processes:
-            process.join(_GRACE_S)
+            process.join(GRACE_S)
             process.terminate()
             process.join()
 

@@ -67,19 +67,19 @@ def provenance() -> dict[str, Any]:
 
 
 @cache
-def commit() -> str:
+def commit(package: Path = _PACKAGE) -> str:
     """Of the package, "-dirty" if files were changed since; "" if it does not lie in a git checkout of its own."""
     try:
         # An installed package may lie below somebody else's checkout, whose commit says nothing.
-        _git("ls-files", "--error-unmatch", "__init__.py")
-        return _git("describe", "--always", "--dirty", "--exclude=*", "--abbrev=12")
+        _git(package, "ls-files", "--error-unmatch", "__init__.py")
+        return _git(package, "describe", "--always", "--dirty", "--exclude=*", "--abbrev=12")
     except (OSError, subprocess.CalledProcessError):
         return ""
 
 
-def _git(*words: str) -> str:
+def _git(folder: Path, *words: str) -> str:
     return subprocess.run(
-        ["git", "--no-optional-locks", *words], cwd=_PACKAGE, capture_output=True, text=True, check=True
+        ["git", "--no-optional-locks", *words], cwd=folder, capture_output=True, text=True, check=True
     ).stdout.strip()
 
 
