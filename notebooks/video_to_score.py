@@ -32,7 +32,7 @@ import numpy as np
 from matplotlib.patches import Rectangle
 
 from psotrack.datasets.dpjait import read_sequence
-from psotrack.geometry import extents, project_boxes
+from psotrack.geometry import make_extents, project_boxes
 from psotrack.initiation import room_bounds
 from psotrack.initiation.initialisation import find_drones
 from psotrack.recordings import read_frames
@@ -116,7 +116,7 @@ print("size of the drone, x y z:", np.round(start.size_m[found], 2), "m")
 
 cameras = on_device(sequence.rig.cameras)
 place_m = jnp.asarray(truth_m[DRONE], jnp.float32)
-boxes = project_boxes(extents(cameras, size_m), place_m[None])
+boxes = project_boxes(make_extents(cameras, size_m), place_m[None])
 xyxy_px = np.asarray(boxes.xyxy)[0]  # cameras, 4
 
 # %%

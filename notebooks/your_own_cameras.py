@@ -41,11 +41,11 @@ from psotrack.datasets.dpjait import CALIBRATION, read_sequence, write_calibrati
 from psotrack.evaluation import evaluate, plots
 from psotrack.geometry import (
     CameraRig,
-    camera,
-    extents,
+    make_camera,
+    make_extents,
+    make_rig,
     project,
     project_boxes,
-    stack,
     triangulate,
     undistort,
 )
@@ -103,9 +103,9 @@ for number, video in enumerate(simulated.videos.values()):
     }
 (FOREIGN / "calibration.json").write_text(json.dumps(calibration, indent=1))
 
-bent = stack(
+bent = make_rig(
     {
-        name: camera(
+        name: make_camera(
             R=np.array(simulated.rig.cameras.T_cam_world[number, :3, :3]),
             t_m=np.array(simulated.rig.cameras.T_cam_world[number, :3, 3]),
             K=np.array(one["matrix"]),
@@ -149,16 +149,16 @@ print(*sorted(path.name for path in FOREIGN.iterdir()), sep=", ")
 # %% [markdown]
 # ## 1. The calibration becomes a rig
 #
-# `camera` takes what OpenCV's `calibrateCamera` and `stereoCalibrate` give: `R` and `t` from the world to the camera
+# `make_camera` takes what OpenCV's `calibrateCamera` and `stereoCalibrate` give: `R` and `t` from the world to the camera
 # ($x_{cam} = R\,x_{world} + t$; if you have the camera's position $C$ instead, $t = -R\,C$), `K` in pixels, and 0, 4,
 # 5 or 8 distortion coefficients in OpenCV's order. Rotation vectors become matrices with SciPy. Lengths become metres
 # here, once.
 
 # %%
 calibration = json.loads((FOREIGN / "calibration.json").read_text())
-first_rig = stack(
+first_rig = make_rig(
     {
-        name: camera(
+        name: make_camera(
             R=Rotation.from_rotvec(one["rotation"]).as_matrix(),
             t_m=np.array(one["translation"]) / 1000,
             K=np.array(one["matrix"]),
@@ -280,7 +280,7 @@ pd.DataFrame(tracked.size_m, columns=["size x (m)", "size y (m)", "size z (m)"])
 
 # %%
 cameras = on_device(rig.cameras)
-seen = extents(cameras, jnp.asarray(tracked.size_m, jnp.float32))
+seen = make_extents(cameras, jnp.asarray(tracked.size_m, jnp.float32))
 xyxy_px = np.asarray(project_boxes(seen, jnp.asarray(tracks.position_m[FRAME], jnp.float32)).xyxy)
 figure, panels = plt.subplots(2, 4, figsize=(13, 4.2), dpi=64, layout="constrained")
 for number, (panel, name) in enumerate(zip(panels.flat, rig.names, strict=True)):

@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.evaluation import evaluate, plots, tables
-from psotrack.geometry import extents, project_boxes
+from psotrack.geometry import make_extents, project_boxes
 from psotrack.pipeline import TrackedSequence, track_sequence
 from psotrack.recordings import Sequence, read_frames
 from psotrack.settings import TrackSettings
@@ -123,7 +123,7 @@ def save_picture(path: Path, sequence: Sequence, tracked: TrackedSequence, frame
 
 def _boxes(sequence: Sequence, tracked: TrackedSequence, frame: int) -> Float[np.ndarray, "drones cameras 4"]:
     cameras = on_device(sequence.rig.cameras)
-    seen = extents(cameras, np.asarray(tracked.size_m, np.float32))
+    seen = make_extents(cameras, np.asarray(tracked.size_m, np.float32))
     position: Float[np.ndarray, "drones 3"] = tracked.trajectories.position_m[frame].astype(np.float32)
     return np.asarray(project_boxes(seen, position).xyxy)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
-from psotrack.geometry import Camera, CameraRig, camera, look_at, project, stack, undistort
+from psotrack.geometry import Camera, CameraRig, look_at, make_camera, make_rig, project, undistort
 
 #: Lenses as strong as those of action cameras, in OpenCV's order.
 LENSES = {
@@ -34,8 +34,10 @@ def ring_rig(num_cameras, *, coefficients=0, image_size_wh=(320, 240), radius_m=
         K = np.array(
             [[focal, 0, image_size_wh[0] / 2 + 1.5], [0, 1.01 * focal, image_size_wh[1] / 2 - 2], [0, 0, 1]]
         )
-        cameras[f"c{i}"] = camera(R=R, t_m=t_m, K=K, image_size_wh=image_size_wh, dist=LENSES[coefficients])
-    return stack(cameras)
+        cameras[f"c{i}"] = make_camera(
+            R=R, t_m=t_m, K=K, image_size_wh=image_size_wh, dist=LENSES[coefficients]
+        )
+    return make_rig(cameras)
 
 
 def far_camera(*, image_size_wh, pixels_per_m, distance_m=1000.0):
@@ -47,12 +49,12 @@ def far_camera(*, image_size_wh, pixels_per_m, distance_m=1000.0):
     width, height = image_size_wh
     focal = pixels_per_m * distance_m
     K = np.array([[focal, 0, width / 2 - 0.5], [0, focal, height / 2 - 0.5], [0, 0, 1]])
-    return camera(R=R, t_m=t_m, K=K, image_size_wh=image_size_wh)
+    return make_camera(R=R, t_m=t_m, K=K, image_size_wh=image_size_wh)
 
 
 def rig_of(*cameras):
     """A rig of unnamed cameras."""
-    return stack({str(i): one for i, one in enumerate(cameras)})
+    return make_rig({str(i): one for i, one in enumerate(cameras)})
 
 
 def environment_without_jax_settings() -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Boxes: the oracle is a dense sampling of the ellipsoid's surface, projected by `cameras.project` in float64."""
+"""Boxes: the oracle samples the ellipsoid's surface densely and projects it by `cameras.project` in float64."""
 
 import jax
 import numpy as np
@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from psotrack.geometry import extents, project, project_boxes
+from psotrack.geometry import make_extents, project, project_boxes
 
 
 @jax.jit
 def boxes_of(cameras, position_m, size_m):
-    boxes = project_boxes(extents(cameras, size_m), position_m)
+    boxes = project_boxes(make_extents(cameras, size_m), position_m)
     return boxes.xyxy, boxes.in_front
 
 
@@ -32,7 +32,7 @@ def sampled_boxes(rig, position_m, size_m, num_points=20_000):
 
 @pytest.mark.parametrize("coefficients", [0, 5])
 def test_an_offset_moves_the_extent_from_the_position(coefficients):
-    """Each drone by its own, whatever the particles: the boxes are those of the extents' middles, without one."""
+    """Boxes with an offset per drone equal boxes without offsets at the middles of the ellipsoids."""
     rig = ring_rig(5, coefficients=coefficients)
     position_m, size_m = drones(2)
     particles_m = position_m + 0.1 * np.random.default_rng(2).standard_normal((7, 2, 3))
@@ -40,11 +40,11 @@ def test_an_offset_moves_the_extent_from_the_position(coefficients):
 
     @jax.jit
     def offset_boxes(cameras, position_m, size_m, offset_m):
-        return project_boxes(extents(cameras, size_m, offset_m), position_m).xyxy
+        return project_boxes(make_extents(cameras, size_m, offset_m), position_m).xyxy
 
     found = offset_boxes(*float32((rig.cameras, particles_m, size_m, offset_m)))
     expected, _ = boxes(rig, particles_m + offset_m, size_m)
-    # Coordinates of 5 m in float32 are good to 5e-7 m: 1e-4 px, a few times over.
+    # Coordinates of 5 m in float32 are exact to 5e-7 m, which is 1e-4 px; the limit is a few such errors.
     np.testing.assert_allclose(found, expected, atol=1e-3)
     assert np.abs(expected - boxes(rig, particles_m, size_m)[0]).min(axis=(0, 1, 2)).max() > 0.1
 
@@ -69,8 +69,8 @@ def test_boxes_touch_the_outline(num_drones, num_cameras, coefficients):
     np.testing.assert_allclose(xyxy, sampled, atol=0.06 if coefficients else 0.01)
 
 
-def test_an_ellipsoid_of_a_metre_at_a_metre_is_no_approximation():
-    """Near and large, where the outline of the middle cross-section would be tens of pixels too small."""
+def test_the_box_of_a_large_near_ellipsoid_is_exact():
+    """One metre large at one metre: the box of the middle cross-section would be tens of pixels too small."""
     rig = ring_rig(3)
     position_m = rig.cameras.centre_world[:1] + 1.3 * rig.cameras.T_cam_world[:1, 2, :3] + [[0.1, 0.2, 0.1]]
     size_m = np.array([[1.0, 0.8, 0.9]])
@@ -88,7 +88,7 @@ def test_moving_world_and_rig_together_leaves_boxes(shift_m, coefficients):
     position_m, size_m = drones(2)
     xyxy, _ = boxes(rig, position_m, size_m)
     shifted, _ = boxes(moved(rig, np.eye(3), shift_m), position_m + shift_m, size_m)
-    # Coordinates of up to 10 m in float32: 1e-6 m, at 1.5 m and 300 px of focal length 2e-4 px, a few times over.
+    # Coordinates up to 10 m in float32 are exact to 1e-6 m: at 1.5 m depth and 300 px focal length 2e-4 px.
     np.testing.assert_allclose(shifted, xyxy, atol=3e-3)
 
 
@@ -111,13 +111,13 @@ def test_particles_drones_and_cameras_broadcast():
     assert together.shape == (7, 2, 5, 4)
     for particle in range(7):
         alone, _ = boxes(rig, position_m[particle], size_m)
-        # The same arithmetic, perhaps fused otherwise.
+        # The same arithmetic; the compiler may fuse operations differently.
         np.testing.assert_allclose(together[particle], alone, atol=1e-3)
 
 
 @pytest.mark.parametrize("distance_m", [-3.0, -0.05, 0.0, 0.1, 0.199])
 def test_behind_or_around_the_camera_is_flagged_and_finite(distance_m):
-    """A drone behind the camera, or that the camera stands in, has no box, but nothing that could spread either."""
+    """A drone behind or around the camera has no valid box, but its numbers and gradients are finite."""
     rig = ring_rig(3, coefficients=5)
     position_m = rig.cameras.centre_world[:1] + distance_m * rig.cameras.T_cam_world[:1, 2, :3]
     size_m = np.full((1, 3), 0.4)
@@ -136,7 +136,7 @@ def test_behind_or_around_the_camera_is_flagged_and_finite(distance_m):
     st.lists(st.floats(-8, 8, width=32), min_size=3, max_size=3),
     st.lists(st.floats(0.015625, 1.5, width=32), min_size=3, max_size=3),
 )
-def test_edges_are_in_order_wherever_the_drone_is_in_front(position_m, size_m):
+def test_edges_are_in_order_for_drones_in_front(position_m, size_m):
     xyxy, in_front = boxes(ring_rig(5), np.array([position_m]), np.array([size_m]))
     assert np.isfinite(xyxy).all()
     x0, y0, x1, y1 = xyxy[in_front].T

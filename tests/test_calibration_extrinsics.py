@@ -14,7 +14,7 @@ from scipy.stats import binom, chi2
 
 from psotrack.calibration import inflation, locate_camera, reproject, spread_px
 from psotrack.errors import InputError, SettingsError
-from psotrack.geometry import camera, look_at, project
+from psotrack.geometry import look_at, make_camera, project
 
 K = np.array([[1157.0, 0, 959.5], [0, 1157.0, 539.5], [0, 0, 1]])
 NO_LENS = np.zeros(0)
@@ -24,7 +24,7 @@ def view(rng, *, count=12, nearest_m=3.5, farthest_m=6.5, dist=(), K=K):
     """A camera 5 m from what it looks at, and points in a grid of cells of its image, at various depths."""
     angle = rng.uniform(0, 2 * np.pi)
     R, t_m = look_at((5 * np.cos(angle), 5 * np.sin(angle), 2.0), (0.0, 0.0, 1.0))
-    one = camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080), dist=dist)
+    one = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080), dist=dist)
     cells = np.array([(i, j) for i in range(4) for j in range(3)] * (count // 12 + 1))[:count]
     pixels = (cells + rng.uniform(0.1, 0.9, (count, 2))) * (480, 360)
     rays = np.concatenate([pixels, np.ones((count, 1))], axis=1) @ np.linalg.inv(K).T
@@ -129,7 +129,7 @@ def test_noise_larger_than_stated_widens_the_covariance():
 def test_points_in_a_plane_do():
     rng = np.random.default_rng(7)
     R, t_m = look_at((4.0, 1.0, 2.5), (0.0, 0.0, 0.0))
-    one = camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080))
+    one = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080))
     points = np.concatenate([rng.uniform(-1.5, 1.5, (12, 2)), np.zeros((12, 1))], axis=1)
     located = locate_camera(points, project(one, points)[0] + rng.normal(0, 1, (12, 2)), K, NO_LENS)
     off = centre(located.T_cam_world) - one.centre_world
@@ -184,7 +184,7 @@ def test_what_no_pose_can_be_found_from_is_refused():
 def test_a_small_plane_far_away_has_two_poses():
     """A sheet of 20 cm at 8 m, hardly tilted: turned to the other side it looks the same."""
     R, t_m = look_at((0.9, 0.0, 8.0), (0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
-    one = camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080))
+    one = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080))
     sheet = np.array([(x, y, 0) for x in (-0.1, 0.0, 0.1) for y in (-0.1, 0.1)])
     rng = np.random.default_rng(0)
     assert "two poses" in refused(sheet, project(one, sheet)[0] + rng.normal(0, 0.5, (6, 2)))

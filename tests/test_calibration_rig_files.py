@@ -6,7 +6,7 @@ import pytest
 from helpers import LENSES, assert_same, ring_rig
 
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.geometry import CameraRig, project, read_lenses, read_rig, stack, write_rig
+from psotrack.geometry import CameraRig, make_rig, project, read_lenses, read_rig, write_rig
 
 #: As anipose 1.1 writes: tables cam_0 ..., lengths in the board's unit.
 ANIPOSE = """[cam_0]
@@ -104,7 +104,7 @@ def test_the_datasets_layout_comes_back(tmp_path):
     K = np.array([[1157.0, 0, 960.5], [0, 1157.0, 540.25], [0, 0, 1]])
     rig = ring_rig(5, coefficients=4, image_size_wh=(1920, 1080))
     one = rig.cameras[2]
-    rig = stack({"cam1i": type(one)(one.T_cam_world, K, one.dist, one.image_size_wh)})
+    rig = make_rig({"cam1i": type(one)(one.T_cam_world, K, one.dist, one.image_size_wh)})
     write_rig(tmp_path / "rig.csv", rig)
     back = read_rig(tmp_path / "rig.csv", (1920, 1080))
     assert back.names == rig.names
@@ -238,7 +238,7 @@ def test_nothing_is_overwritten(tmp_path):
             "cameras.2.matrix: expected 3 x 3 numbers, found none",
         ),
         ("x.yml", "", "camera.matrix or K or camera_matrix: expected 3 x 3 numbers, found none"),
-        ("x.yml", "cameras:\n   - a\n     b\n   K: {\n", "expected OpenCV's YAML, found what is none"),
+        ("x.yml", "cameras:\n   - a\n     b\n   K: {\n", "expected OpenCV's YAML, found an error"),
         ("x.yml", "cameras:\n   - { K: [1, 2] }\n", "cameras[0].name: expected a name, found none"),
         ("x.yml", "cameras:\n   - { name: c, K: [1, 2] }\n", "cameras[0].K: expected 3 x 3 numbers, found 2"),
         ("x.csv", "cam_name\n", "x.csv, line 1"),

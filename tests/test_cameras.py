@@ -1,4 +1,4 @@
-"""Projection: OpenCV is the oracle of the lens, rigid motions of the world that of the geometry."""
+"""Projection: OpenCV is the oracle for lenses, rigid motions of the world are the oracle for the geometry."""
 
 import cv2
 import jax
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import SettingsError
-from psotrack.geometry import NEAR_M, camera, look_at, project, stack, to_camera, undistort
+from psotrack.geometry import NEAR_M, look_at, make_camera, make_rig, project, to_camera, undistort
 
 
 def points_in_room(count, seed=0):
@@ -32,7 +32,7 @@ def test_pixels_are_those_of_opencv(num_cameras, coefficients):
     assert pixels.shape == (7, num_cameras, 2)
     assert pixels.dtype == np.float64
     for i in range(num_cameras):
-        # Both are float64; 1e-9 px is a thousand roundings of a number of 300 px, and OpenCV goes through Rodrigues.
+        # Both are float64; 1e-9 px is a thousand roundings of 300 px. OpenCV converts through Rodrigues vectors.
         np.testing.assert_allclose(pixels[:, i], opencv_pixels(rig.cameras[i], points), atol=1e-9)
         R, t = rig.cameras.T_cam_world[i, :3, :3], rig.cameras.T_cam_world[i, :3, 3]
         np.testing.assert_allclose(depth[:, i], (points @ R.T + t)[:, 2], atol=1e-12)
@@ -40,7 +40,7 @@ def test_pixels_are_those_of_opencv(num_cameras, coefficients):
 
 @pytest.mark.parametrize("coefficients", sorted(LENSES))
 def test_leading_axes_broadcast(coefficients):
-    """(particles, drones, cameras) at once are the same as one camera and one point at a time."""
+    """Projecting (particles, drones, cameras) at once equals projecting one point into one camera at a time."""
     rig = ring_rig(5, coefficients=coefficients)
     points = points_in_room(2 * 7).reshape(7, 2, 3)
     pixels, depth = project(rig.cameras, points[..., None, :])
@@ -65,7 +65,7 @@ def test_undistort_is_the_inverse(coefficients):
 def test_skew_is_part_of_the_inverse():
     R, t_m = look_at((0.0, -4.0, 1.0), (0.0, 0.0, 1.0))
     K = np.array([[300.0, 12.0, 160.0], [0.0, 310.0, 120.0], [0.0, 0.0, 1.0]])
-    one = camera(R=R, t_m=t_m, K=K, image_size_wh=(320, 240))
+    one = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(320, 240))
     in_camera = to_camera(one, np.array([0.7, 0.3, 1.9]))
     pixel = K @ in_camera / in_camera[2]
     np.testing.assert_allclose(project(one, np.array([0.7, 0.3, 1.9]))[0], pixel[:2], rtol=1e-13)
@@ -88,7 +88,7 @@ def test_moving_world_and_rig_together_changes_no_pixel(turn, shift_m, coefficie
 
 
 @pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
-def test_points_behind_have_finite_pixels_and_a_depth_that_says_so(xp):
+def test_points_behind_have_finite_pixels_and_negative_depth(xp):
     rig = ring_rig(3, coefficients=5)
     cameras = rig.cameras if xp is np else float32(rig.cameras)
     behind = rig.cameras.centre_world - 0.5 * rig.cameras.T_cam_world[:, 2, :3]
@@ -128,7 +128,7 @@ def test_look_at(centre_m):
     np.testing.assert_allclose(R @ np.array(centre_m) + t_m, 0, atol=1e-12)
     distance = np.linalg.norm(np.subtract(target_m, centre_m))
     np.testing.assert_allclose(R @ np.array(target_m) + t_m, (0, 0, distance), atol=1e-12)
-    # The image is upright: the world's up points to smaller rows and neither left nor right.
+    # The image is upright: a point above the target has a smaller row and the same column.
     assert R[1, 2] < 0
     assert abs(R[0, 2]) < 1e-12
 
@@ -139,11 +139,11 @@ def test_centre_of_projection():
         np.testing.assert_allclose(to_camera(rig.cameras[i], rig.cameras.centre_world[i]), 0, atol=1e-12)
 
 
-def test_stack_pads_short_lenses():
+def test_make_rig_pads_short_lenses():
     named = {
         name: ring_rig(1, coefficients=n).cameras[0] for name, n in (("a", 0), ("b", 5), ("c", 4), ("d", 8))
     }
-    rig = stack(named)
+    rig = make_rig(named)
     assert rig.names == ("a", "b", "c", "d")
     assert rig.cameras.dist.shape == (4, 8)
     points = points_in_room(7)
@@ -170,7 +170,7 @@ def test_select_names_what_is_missing(names, message):
 
 def test_a_rig_needs_a_camera():
     with pytest.raises(SettingsError, match="expected at least one camera, found none"):
-        stack({})
+        make_rig({})
 
 
 GOOD = {
@@ -195,13 +195,13 @@ GOOD = {
         ({"dist": (0.1, 0.2, 0.3)}, r"camera\.dist: expected 0, 4, 5 or 8 coefficients, found 3"),
     ],
 )
-def test_a_camera_that_cannot_be(change, message):
+def test_impossible_cameras_are_refused(change, message):
     with pytest.raises(SettingsError, match=message):
-        camera(**(GOOD | change))
+        make_camera(**(GOOD | change))
 
 
 def test_a_far_camera_makes_metres_pixels():
-    """The rig that the tests of the fitness stand on: 20 pixels a metre, the origin in the middle of the image."""
+    """The rig that the tests of the fitness use has 20 pixels per metre and the origin in the middle of the image."""
     rig = rig_of(far_camera(image_size_wh=(64, 48), pixels_per_m=20))
     pixels, _ = project(rig.cameras, np.array([[[0.0, 0, 0]], [[1.0, 0, 0.5]]]))
     np.testing.assert_allclose(pixels[:, 0], [[31.5, 23.5], [51.5, 13.5]], atol=1e-9)

@@ -20,7 +20,7 @@ from windows import (
     pixels,
 )
 
-from psotrack.geometry import extents, project_boxes
+from psotrack.geometry import make_extents, project_boxes
 from psotrack.tracking.fitness import camera_scores, drone_fitness
 from psotrack.tracking.occlusion import CLAIM, CORE, NUM_NEIGHBOURS
 from psotrack.tracking.patches import SIDE
@@ -225,7 +225,7 @@ def test_where_nobody_is_near_claims_change_nothing():
     pair = np.array([THERE_M, THERE_M + np.array([-0.9, 0.9, -0.5])])
     images = drawn(pair, size_m)
     # In no camera are their claims in each other's windows.
-    boxes = jax.jit(project_boxes)(extents(*float32((RIG.cameras, size_m))), float32(pair)).xyxy
+    boxes = jax.jit(project_boxes)(make_extents(*float32((RIG.cameras, size_m))), float32(pair)).xyxy
     gap_px = np.maximum(boxes[0, :, :2] - boxes[1, :, 2:], boxes[1, :, :2] - boxes[0, :, 2:]).max(axis=-1)
     apart = np.asarray(gap_px > 40)
     assert apart.sum() >= 4

@@ -14,7 +14,16 @@ from psotrack.calibration import Board
 from psotrack.cli.calibrate import calibrate
 from psotrack.datasets.dpjait import read_sequence, write_calibration, write_detections, write_marker_corners
 from psotrack.errors import PsotrackError
-from psotrack.geometry import CameraRig, camera, look_at, project, read_lenses, read_rig, stack, write_rig
+from psotrack.geometry import (
+    CameraRig,
+    look_at,
+    make_camera,
+    make_rig,
+    project,
+    read_lenses,
+    read_rig,
+    write_rig,
+)
 from psotrack.recordings import Detections, VideoWriter
 from psotrack.trajectories import Trajectories, write_trajectories
 
@@ -99,7 +108,7 @@ def test_extrinsics_from_marks(tmp_path):
 def test_places_in_a_file_of_their_own_and_a_lens_from_a_data_sheet(tmp_path):
     K = np.array([[800.0, 0, 639.5], [0, 800.0, 359.5], [0, 0, 1]])
     R, t_m = look_at((4.0, 0.5, 2.0), (0.0, 0.0, 1.2))
-    rig = stack({"60881257": camera(R=R, t_m=t_m, K=K, image_size_wh=(1280, 720))})
+    rig = make_rig({"60881257": make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1280, 720))})
     pixels = project(rig.cameras[0], WORLD)[0]
     pairs = write_lines(
         tmp_path / "pairs.csv",
@@ -185,7 +194,7 @@ def marker_room(folder):
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
     K = np.array([[1150.0, 0, 639.5], [0, 1150.0, 359.5], [0, 0, 1]])
     R, t_m = look_at((4.0, -2.5, 2.2), (-0.6, 0.8, 1.2))
-    one = camera(R=R, t_m=t_m, K=K, image_size_wh=(1280, 720))
+    one = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1280, 720))
     corners = {}
     for number, (y, z) in enumerate([(0.0, 1.9), (0.9, 0.6), (0.9, 1.9), (0.1, 0.6)]):
         square = np.array([(0, 0), (0.5, 0), (0.5, -0.5), (0, -0.5)]) + np.array((y, z))
@@ -216,7 +225,7 @@ def marker_room(folder):
     with VideoWriter(folder / "cam1i_s.avi", 25.0, (1280, 720)) as writer:
         for _ in range(3):
             writer.write(image)
-    rig = stack({"cam1i": one})
+    rig = make_rig({"cam1i": one})
     write_calibration(folder / "cameras_calibration.csv", rig)
     write_marker_corners(folder / "aruco_corners.csv", corners)
     return rig

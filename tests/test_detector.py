@@ -13,7 +13,7 @@ from psotrack.cli.track import track
 from psotrack.datasets import dpjait
 from psotrack.detection import DetectorSettings, OnnxDetector, detect
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.geometry import camera, look_at, project
+from psotrack.geometry import look_at, make_camera, project
 from psotrack.recordings import VideoWriter, probe, read_detections
 from psotrack.trajectories import read_trajectories
 
@@ -171,7 +171,7 @@ def sequence(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data") / "Simulated_Data" / "S02_D1"
     folder.mkdir(parents=True)
     R, t_m = look_at((0.0, -6.0, 2.0), (0.0, 0.0, 1.5))
-    one = camera(R=R, t_m=t_m, K=np.diag([1100.0, 1100.0, 1.0]), image_size_wh=(256, 192))
+    one = make_camera(R=R, t_m=t_m, K=np.diag([1100.0, 1100.0, 1.0]), image_size_wh=(256, 192))
     dpjait.write_calibration(folder / dpjait.CALIBRATION, rig_of(one, one))
     for name in "01":
         with VideoWriter(folder / f"{name}.avi", 25.0, (256, 192)) as writer:
@@ -228,7 +228,7 @@ def seen(tmp_path_factory):
     for x_m, y_m in ((0.0, -6.0), (6.0, 0.5), (-0.5, 6.0), (-6.0, -0.5)):
         R, t_m = look_at((x_m, y_m, 2.0), (0.0, 0.0, 1.5))
         K = np.array([[1100.0, 0.0, 127.5], [0.0, 1100.0, 95.5], [0.0, 0.0, 1.0]])
-        cameras.append(camera(R=R, t_m=t_m, K=K, image_size_wh=(256, 192)))
+        cameras.append(make_camera(R=R, t_m=t_m, K=K, image_size_wh=(256, 192)))
     rig = rig_of(*cameras)
     dpjait.write_calibration(folder / dpjait.CALIBRATION, rig)
     middles, _ = project(rig.cameras, PLACES_M[:, None])

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.datasets import dpjait
 from psotrack.errors import InputError, SettingsError
-from psotrack.geometry import camera, look_at, stack
+from psotrack.geometry import look_at, make_camera, make_rig
 from psotrack.recordings import VideoWriter, contents, render
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 5
@@ -32,8 +32,8 @@ def write_video(path, size_wh=(WIDTH, HEIGHT), num_frames=FRAMES):
 def folder(tmp_path):
     """Two cameras on walls, two drones, of which both have a camera."""
     R, t_m = look_at((4.0, 3.0, 2.5), (0.0, 0.0, 1.0))
-    one = camera(R=R, t_m=t_m, K=np.diag([80.0, 80.0, 1.0]), image_size_wh=(WIDTH, HEIGHT))
-    dpjait.write_calibration(tmp_path / dpjait.CALIBRATION, stack({"cam1i": one, "cam2i": one}))
+    one = make_camera(R=R, t_m=t_m, K=np.diag([80.0, 80.0, 1.0]), image_size_wh=(WIDTH, HEIGHT))
+    dpjait.write_calibration(tmp_path / dpjait.CALIBRATION, make_rig({"cam1i": one, "cam2i": one}))
     for name in ("cam1i_s.avi", "cam2i_s.avi", "dron1_cam_s.avi", "dron2_cam_s.avi"):
         write_video(tmp_path / name)
     for number in (1, 2):

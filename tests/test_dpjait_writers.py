@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.datasets import dpjait
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.geometry import CameraRig, camera, project, stack
+from psotrack.geometry import CameraRig, make_camera, make_rig, project
 
 finite = st.floats(-50, 50)
 triples = st.tuples(finite, finite, finite)
@@ -29,14 +29,14 @@ def rig_of(poses, dist=(), focal_length_px=1156.3) -> CameraRig:
     cameras = {}
     for index, (rotation, t_m) in enumerate(poses):
         f = focal_length_px + 10 * index
-        cameras[f"cam{index + 1}i"] = camera(
+        cameras[f"cam{index + 1}i"] = make_camera(
             R=rotation.as_matrix(),
             t_m=np.array(t_m),
             K=np.array([[f, 0, 960.25], [0, f, 540 + index], [0, 0, 1]]),
             image_size_wh=SIZE_WH,
             dist=dist,
         )
-    return stack(cameras)
+    return make_rig(cameras)
 
 
 def read_back(path: Path, rig: CameraRig) -> CameraRig:
@@ -98,7 +98,7 @@ def test_rigs_that_the_layout_cannot_hold(tmp_path):
         dpjait.write_calibration(path, rig_of(pose, (0.1, 0.0, 0.0, 0.0, 0.01)))
     dpjait.write_calibration(path, rig_of(pose, (0.1, 0.0, 0.0, 0.0, 0.0)))  # a fifth of zero can be left out
     K = np.array([[1000, 0, 960], [0, 1001, 540], [0, 0, 1.0]])
-    two = stack({"a": camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=SIZE_WH)})
+    two = make_rig({"a": make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=SIZE_WH)})
     with pytest.raises(SettingsError, match="one focal length per camera and no skew"):
         dpjait.write_calibration(path, two)
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from psotrack.detection import marker_dictionary
 from psotrack.errors import SettingsError
-from psotrack.geometry import camera, distort, undistort
+from psotrack.geometry import distort, make_camera, undistort
 from psotrack.inside_out.detection import MarkerDetector, refine_corners
 from psotrack.inside_out.detection.gamma import estimate_gamma
 
@@ -265,7 +265,7 @@ def test_small_markers_in_large_images_are_found(side_px):
 
 
 def test_corners_are_right_in_images_of_a_lens_with_distortion():
-    lens = camera(
+    lens = make_camera(
         R=np.eye(3),
         t_m=np.zeros(3),
         K=np.array([[400.0, 0, 319.5], [0, 400.0, 239.5], [0, 0, 1]]),

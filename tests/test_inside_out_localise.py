@@ -17,7 +17,7 @@ from psotrack.cli.localise import localise as command
 from psotrack.datasets.dpjait import write_calibration, write_marker_corners
 from psotrack.detection import marker_dictionary
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.geometry import camera, look_at, project, stack, write_rig
+from psotrack.geometry import look_at, make_camera, make_rig, project, write_rig
 from psotrack.inside_out import (
     Flag,
     LocaliseSettings,
@@ -117,14 +117,14 @@ def room(tmp_path_factory):
     folder = tmp_path_factory.mktemp("room")
     corners_m = wall_markers()
     write_marker_corners(folder / "corners.csv", corners_m)
-    write_rig(folder / "lens.toml", stack({"front": LENS}))
+    write_rig(folder / "lens.toml", make_rig({"front": LENS}))
     (folder / "images").mkdir()
     positions, rotations, images = [], [], []
     with VideoWriter(folder / "flight.avi", FPS, SIZE_WH) as writer:
         for index in range(FRAMES):
             centre = np.array([-0.3 + 0.04 * index, -0.2 + 0.02 * index, 1.4])
             R, t_m = look_at(tuple(centre), (0.5 + 0.03 * index, 4.0, 1.5))
-            posed = camera(R=R, t_m=t_m, K=LENS.K, image_size_wh=SIZE_WH)
+            posed = make_camera(R=R, t_m=t_m, K=LENS.K, image_size_wh=SIZE_WH)
             shown = corners_m
             if index in (FEW, NONE):
                 shown = {} if index == NONE else {marker: corners_m[marker] for marker in (5, 8, 17)}
@@ -276,7 +276,9 @@ def test_the_covariance_includes_the_error_of_the_focal_length(room, tmp_path):
     """A lens 1 % too long and a marker 5 mm too high in the map: stated errors improve poses and covariances."""
     lens = tmp_path / "lens.toml"
     K = LENS.K * np.array([[1.01, 1.01, 1], [1.01, 1.01, 1], [1, 1, 1]])
-    write_rig(lens, stack({"front": camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=SIZE_WH)}))
+    write_rig(
+        lens, make_rig({"front": make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=SIZE_WH)})
+    )
     markers, out, report = tmp_path / "corners.csv", tmp_path / "track.csv", tmp_path / "report.json"
     write_marker_corners(
         markers, {i: c + 0.005 * (i == 17) * np.eye(3)[2] for i, c in wall_markers().items()}
@@ -528,7 +530,7 @@ def test_a_folder_without_images_or_videos_is_refused_in_one_line(room, tmp_path
 
 def test_intrinsics_for_another_size_are_refused_in_one_line_with_the_file(room, tmp_path):
     lens = tmp_path / "lens.toml"
-    write_rig(lens, stack({"front": scale_lens(LENS, (1280, 960))}))
+    write_rig(lens, make_rig({"front": scale_lens(LENS, (1280, 960))}))
     arguments = [room.video, "--markers", room.markers, "--camera", lens, "--out", tmp_path / "track.csv"]
     with pytest.raises(
         InputError,
@@ -552,14 +554,14 @@ def test_a_scaled_lens_maps_to_the_same_position_in_the_scaled_image():
 
 def test_lenses_are_not_scaled_to_other_aspect_ratios(tmp_path):
     lens = tmp_path / "lens.yml"
-    write_rig(lens, stack({"front": LENS}))
+    write_rig(lens, make_rig({"front": LENS}))
     with pytest.raises(InputError, match="found 640 x 480; calibrate at this size: the shape differs"):
         read_lens(lens, (1920, 1080), scale=True)
 
 
 def test_a_csv_without_sizes_is_refused_where_its_axis_is_far_off_the_middle(tmp_path):
     lens = tmp_path / "cameras_calibration.csv"
-    write_calibration(lens, stack({"cam1i": lens_of_sensor(4.0, (6.4, 4.8), SIZE_WH)}))
+    write_calibration(lens, make_rig({"cam1i": lens_of_sensor(4.0, (6.4, 4.8), SIZE_WH)}))
     assert read_lens(lens, SIZE_WH).K[0, 2] == 319.5
     with pytest.raises(
         InputError, match=r"expected intrinsics for 1920 x 1080.*found an optical axis at \(320, 240\)"
@@ -569,7 +571,7 @@ def test_a_csv_without_sizes_is_refused_where_its_axis_is_far_off_the_middle(tmp
 
 def test_one_of_several_cameras_in_a_file_must_be_chosen(tmp_path):
     lens = tmp_path / "lens.toml"
-    write_rig(lens, stack({"left": LENS, "right": LENS}))
+    write_rig(lens, make_rig({"left": LENS, "right": LENS}))
     with pytest.raises(InputError, match="expected one camera, found left, right; name it by --camera-name"):
         read_lens(lens, SIZE_WH)
     with pytest.raises(InputError, match="expected a camera up, found left, right"):

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.datasets.dpjait import read_marker_corners, write_marker_corners
 from psotrack.errors import InputError, SettingsError
-from psotrack.geometry import camera, look_at, project
+from psotrack.geometry import look_at, make_camera, project
 from psotrack.inside_out import (
     MarkerMap,
     build_map,
@@ -50,13 +50,13 @@ def room():
 
 ROOM = room()
 LENSES = (
-    camera(
+    make_camera(
         R=np.eye(3),
         t_m=np.zeros(3),
         K=np.array([[560.0, 0.0, 640.0], [0.0, 563.0, 478.0], [0.0, 0.0, 1.0]]),
         image_size_wh=(1280, 960),
     ),
-    camera(
+    make_camera(
         R=np.eye(3),
         t_m=np.zeros(3),
         K=np.array([[520.0, 0.0, 650.0], [0.0, 520.0, 470.0], [0.0, 0.0, 1.0]]),

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.geometry import camera, look_at, project
+from psotrack.geometry import look_at, make_camera, project
 from psotrack.inside_out import PoseSettings
 from psotrack.inside_out.pose import ExpectedPose, estimate_pose
 from psotrack.inside_out.pose.equations import (
@@ -55,7 +55,7 @@ def one_wall(count=9):
 
 def looking(centre_m=(-0.8, -2.5, 1.3), target_m=(3.0, 3.0, 1.8), coefficients=0, K=K):
     R, t_m = look_at(tuple(centre_m), tuple(target_m))
-    return camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080), dist=LENSES[coefficients])
+    return make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080), dist=LENSES[coefficients])
 
 
 def longer_lens(view, by):

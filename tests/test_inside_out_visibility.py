@@ -8,12 +8,12 @@ import pytest
 from helpers import LENSES
 from scipy.spatial.transform import Rotation
 
-from psotrack.geometry import camera
+from psotrack.geometry import make_camera
 from psotrack.inside_out import MarkerMap
 from psotrack.inside_out.comparison.visibility import visible_markers
 
 #: At the origin, x to the right, y down, z ahead; a metre at a distance of 1 m is 100 px, in an image of 201 x 101.
-LENS = camera(
+LENS = make_camera(
     R=np.eye(3),
     t_m=np.zeros(3),
     K=np.array([[100.0, 0, 100], [0, 100, 50], [0, 0, 1]]),

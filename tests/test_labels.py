@@ -22,7 +22,7 @@ from psotrack.datasets.dpjait import read_masks, read_sequence
 from psotrack.detection import LabelSettings, write_data_set
 from psotrack.detection.labels import box_corners, label_boxes
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
-from psotrack.geometry import camera, look_at, project
+from psotrack.geometry import look_at, make_camera, project
 from psotrack.recordings import read_frames
 from psotrack.simulation import scenario, simulate
 from psotrack.simulation.scenarios import Mesh
@@ -166,7 +166,7 @@ def test_a_lens_does_not_bring_in_what_is_far_outside():
     """Its polynomial turns back: 65 degrees off the axis it projects to where 28 degrees are."""
     R, t_m = look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
     K = np.array([[1158.0, 0, 962], [0, 1158, 541], [0, 0, 1]])
-    bent = camera(R=R, t_m=t_m, K=K, image_size_wh=(1924, 1082), dist=(-0.17, 0.0, 0.0, 0.0))
+    bent = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1924, 1082), dist=(-0.17, 0.0, 0.0, 0.0))
     aside = (2.0, -2.0 * math.tan(math.radians(65)), 0.0)
     pixel, _ = project(bent, np.array(aside))
     assert (pixel > 0).all()

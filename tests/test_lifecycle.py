@@ -9,7 +9,7 @@ from helpers import ROOM_M, draw_coverage, float32, rig_of, ring_rig
 from scipy.linalg import expm
 from scipy.stats import multivariate_normal, norm
 
-from psotrack.geometry import extents, project, project_boxes, viewpoints
+from psotrack.geometry import make_extents, project, project_boxes, viewpoints
 from psotrack.initiation import (
     NEW,
     LostTracks,
@@ -266,7 +266,7 @@ def test_what_known_drones_explain_is_their_ellipse_a_little_enlarged():
     room = SearchVolume(RIG.cameras, viewpoints(RIG.cameras), ROOM_M, REDUCTION)
     drones = known(room, ONE[:1, None], SIZE_M[None])
     left = rest(full, drones, 0)
-    seen = project_boxes(extents(float32(RIG.cameras), np.float32(SIZE_M)), np.float32(ONE[0]))
+    seen = project_boxes(make_extents(float32(RIG.cameras), np.float32(SIZE_M)), np.float32(ONE[0]))
     y, x = np.mgrid[:90, :120] + 0.5
     for camera in range(6):
         u = (x - seen.x_middle[camera] / REDUCTION) / (1.3 * seen.x_half[camera] / REDUCTION + 1.5)

@@ -14,13 +14,13 @@ from psotrack.cli.map_markers import FOUND, map_markers
 from psotrack.datasets.dpjait import read_marker_corners, write_marker_corners
 from psotrack.detection import marker_dictionary
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
-from psotrack.geometry import camera, look_at, project, stack, write_rig
+from psotrack.geometry import look_at, make_camera, make_rig, project, write_rig
 from psotrack.inside_out import MarkerMap
 from psotrack.inside_out.lens_files import scale_lens
 from psotrack.recordings import VideoWriter, write_c3d
 
 SIZE_WH = (960, 720)
-LENS = camera(
+LENS = make_camera(
     R=np.eye(3),
     t_m=np.zeros(3),
     K=np.array([[620.0, 0.0, 479.5], [0.0, 620.0, 359.5], [0.0, 0.0, 1.0]]),
@@ -75,14 +75,14 @@ def image(cam):
 def walk(tmp_path_factory):
     """A folder with a video of the two walls, `walk.avi`, and the lens, `lens.toml`."""
     folder = tmp_path_factory.mktemp("walk")
-    write_rig(folder / "lens.toml", stack({"gopro": LENS}))
+    write_rig(folder / "lens.toml", make_rig({"gopro": LENS}))
     with VideoWriter(folder / "walk.avi", 25.0, SIZE_WH) as writer:
         for turn in np.linspace(0, 2 * np.pi, 24):
             centre = np.array(
                 [-0.8 + 0.9 * np.cos(turn), -1.2 + 0.8 * np.sin(turn), 1.5 + 0.3 * np.sin(2 * turn)]
             )
             R, t_m = look_at(centre.tolist(), [0.7 + 0.3 * np.sin(3 * turn), 2.6, 1.5])
-            writer.write(image(camera(R=R, t_m=t_m, K=LENS.K, image_size_wh=SIZE_WH)))
+            writer.write(image(make_camera(R=R, t_m=t_m, K=LENS.K, image_size_wh=SIZE_WH)))
     write_marker_corners(folder / "truth.csv", CORNERS)
     return folder
 
@@ -268,8 +268,8 @@ def test_unusable_choices_are_refused(walk, tmp_path, words, error, message):
 
 
 def test_intrinsics_for_another_aspect_ratio_are_refused(walk, tmp_path):
-    lens = camera(R=np.eye(3), t_m=np.zeros(3), K=LENS.K, image_size_wh=(1920, 1440))
-    write_rig(tmp_path / "lens.toml", stack({"gopro": lens}))
+    lens = make_camera(R=np.eye(3), t_m=np.zeros(3), K=LENS.K, image_size_wh=(1920, 1440))
+    write_rig(tmp_path / "lens.toml", make_rig({"gopro": lens}))
     message = invoke(
         walk / "walk.avi",
         "--check",
@@ -283,7 +283,7 @@ def test_intrinsics_for_another_aspect_ratio_are_refused(walk, tmp_path):
 
 
 def test_intrinsics_of_the_same_images_twice_as_large(walk, tmp_path):
-    write_rig(tmp_path / "lens.toml", stack({"gopro": scale_lens(LENS, (2 * SIZE_WH[0], 2 * SIZE_WH[1]))}))
+    write_rig(tmp_path / "lens.toml", make_rig({"gopro": scale_lens(LENS, (2 * SIZE_WH[0], 2 * SIZE_WH[1]))}))
     words = [walk / "walk.avi", "--check", walk / "truth.csv", "--camera", tmp_path / "lens.toml"]
     assert "nothing disagrees" in invoke(*words, "--scale-camera")
 

@@ -24,7 +24,7 @@ from windows import (
     pixels,
 )
 
-from psotrack.geometry import extents
+from psotrack.geometry import make_extents
 from psotrack.silhouettes import box_sum
 from psotrack.tracking import ScoreSettings
 from psotrack.tracking.fitness import ScoreInputs, camera_scores, drone_fitness, filled
@@ -238,7 +238,7 @@ def test_gradients_are_those_of_finite_differences():
     assert patches.clear.min() < 0.9
     with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
         windows = jax.tree.map(jnp.asarray, patches)
-        view = ScoreInputs(extents(RIG.cameras, SMALL_M), windows, ScoreSettings(reduction=REDUCTION))
+        view = ScoreInputs(make_extents(RIG.cameras, SMALL_M), windows, ScoreSettings(reduction=REDUCTION))
 
         @jax.jit
         def total(position_m):

@@ -1,4 +1,4 @@
-"""Points refined in the image: OpenCV's projection, SciPy's least squares, and chance itself as oracles."""
+"""Points refined in the image: the oracles are OpenCV's projection, SciPy's least squares, and simulated noise."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
 from psotrack.errors import SettingsError
-from psotrack.geometry import camera, look_at, project, reconstruct, triangulate, undistort
+from psotrack.geometry import look_at, make_camera, project, reconstruct, triangulate, undistort
 from psotrack.geometry.image_fit import project_with_jacobian
 
 
@@ -38,19 +38,19 @@ def opencv_pixels(rig, index, points):
     pixels, by = cv2.projectPoints(
         points.reshape(-1, 3), turn, one.T_cam_world[:3, 3], one.K, one.dist if one.dist.size else None
     )
-    # By the translation, which is by the point in camera coordinates.
+    # The derivative by the translation is the derivative by the point in camera coordinates.
     return pixels[:, 0], by[:, 3:6].reshape(-1, 2, 3) @ R
 
 
 def unlike_rig(num_cameras):
-    """No two cameras share any number: focal lengths by half, middles by tens of pixels, every lens its own."""
+    """Cameras without a common number: different focal lengths, principal points and lenses."""
     cameras = []
     for i in range(num_cameras):
         one = ring_rig(num_cameras).cameras[i]
         K = np.array([[250.0 + 40 * i, 0, 150 + 9 * i], [0, 270 + 35 * i, 130 - 7 * i], [0, 0, 1]])
         dist = (-0.2 + 0.05 * i, 0.04 - 0.01 * i, 0.002 * i, 0.003 - 0.001 * i)
         cameras.append(
-            camera(
+            make_camera(
                 R=one.T_cam_world[:3, :3],
                 t_m=one.T_cam_world[:3, 3],
                 K=K,
@@ -80,7 +80,7 @@ def test_the_derivative_is_opencvs(coefficients):
         np.testing.assert_allclose(pixels[:, c], expected_px, rtol=0, atol=1e-9)
         # Some hundred pixels per metre, to 12 digits.
         np.testing.assert_allclose(jacobian[:, c], expected, rtol=0, atol=1e-9)
-        # OpenCV knows no skew: it adds to u what it has of v.
+        # OpenCV has no skew: the skew times v is added to u.
         expected[:, 0] += 12.0 / rig.cameras.K[c, 1, 1] * expected[:, 1]
         of_skewed = project_with_jacobian(skewed, points[:, None])[2][:, c]
         np.testing.assert_allclose(of_skewed, expected, rtol=0, atol=1e-9)
@@ -99,8 +99,8 @@ def test_exact_pixels_give_the_point(num_cameras, shape, coefficients, refine):
     assert found.covariance_m2.shape == (*shape, 3, 3)
     assert found.reprojection_px.shape == found.used.shape == (*shape, num_cameras)
     assert found.used.all()
-    # Unrefined as in test_triangulation. Refined in the image, without undoing the lens: the last step is smaller than
-    # 1e-4 standard deviations, of 5 to 20 mm here, and it converges quadratically: measured 1e-9.
+    # Unrefined points as in test_triangulation. The refinement does not undistort: its last step is smaller than
+    # 1e-4 standard deviations of 5 to 20 mm, and it converges quadratically: measured 1e-9.
     np.testing.assert_allclose(found.position_m, points, atol=1e-8 if refine else 1e-6)
     np.testing.assert_allclose(found.reprojection_px, 0.0, atol=1e-5 if refine else 1e-3)
 
@@ -114,7 +114,7 @@ def test_two_cameras_agree_with_opencv():
     np.testing.assert_allclose(found.position_m, (homogeneous[:3] / homogeneous[3]).T, atol=1e-6)
 
 
-def test_unrefined_it_is_triangulate():
+def test_without_refinement_it_equals_triangulate():
     rig = ring_rig(5, coefficients=5)
     pixels = noisy(rig, points_in_room(3, 4))
     pixels[0, 1, 2] = np.nan
@@ -126,10 +126,10 @@ def test_unrefined_it_is_triangulate():
 
 
 def test_every_camera_with_its_own_numbers():
-    """Three bugs that others had: the lens undone by a radius that is itself bent, intrinsics of the first two cameras
-    for every pair, poses of other cameras.
+    """Three known bugs of such programs: undistortion with the distorted radius, the intrinsics of the first two
+    cameras used for every pair, poses of the wrong cameras.
 
-    OpenCV makes the pixels. Each bug, put into rig or pixels, is off by far more than what is right.
+    OpenCV makes the pixels. With each bug put into rig or pixels, the error is far larger than without.
     """
     rig, points = unlike_rig(5), points_in_room(17)
     cams = rig.cameras
@@ -182,12 +182,12 @@ def test_refined_as_by_scipy(coefficients):
         )
         assert found.used[n].tolist() == (scale > 0).tolist()
         distance = [np.linalg.norm(opencv_pixels(rig, c, expected.x)[0][0] - pixels[n, c]) for c in range(5)]
-        # Of a view that does not count too; NaN of one that sees nothing.
+        # Views that are not used have a distance too; views that see nothing have NaN.
         np.testing.assert_allclose(found.reprojection_px[n], distance, rtol=0, atol=1e-3)
 
 
 def test_refined_is_never_worse_than_linear():
-    """Nor within a metre of a camera, with noise of half a drone's width, where steps of Gauss and Newton overshoot."""
+    """Also within a metre of a camera with noise of half a drone's width, where Gauss-Newton steps overshoot."""
     rig, rng = ring_rig(2), np.random.default_rng(0)
     nearness = rng.uniform(0.8, 0.98, (3000, 1))
     points = nearness * rig.cameras.centre_world[0] + (1 - nearness) * np.array([0.1, -0.1, 1.2])
@@ -201,12 +201,12 @@ def test_refined_is_never_worse_than_linear():
     assert (cost[0] <= cost[1] * (1 + 1e-9)).all()
 
 
-# --- chance
+# --- simulated noise
 
 
 @pytest.mark.parametrize("num_cameras", [2, 3, 7])
-def test_the_covariance_is_what_noise_makes(num_cameras):
-    """Nine of ten points are inside the ellipsoid of 90 %, the mean square along it is 3, as that of χ² with 3."""
+def test_the_covariance_agrees_with_simulated_noise(num_cameras):
+    """90 % of the points are inside the 90 % ellipsoid; the mean squared Mahalanobis distance is 3, as for χ²(3)."""
     rig = ring_rig(num_cameras, coefficients=5, image_size_wh=(960, 720))
     point, draws = np.array([0.4, -0.3, 1.1]), 4000
     noise_px = np.linspace(0.5, 3.0, num_cameras)
@@ -216,20 +216,20 @@ def test_the_covariance_is_what_noise_makes(num_cameras):
     squared = np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.covariance_m2), off)
     low, high = binom.interval(1 - 1e-4, draws, 0.9)
     assert low <= (squared < chi2.ppf(0.9, 3)).sum() <= high
-    # Standard error sqrt(6 / draws) = 0.04; four of them, and 0.02 for the bend of the image over 3 px.
+    # Four standard errors of sqrt(6 / draws) = 0.04, and 0.02 for the nonlinearity of the projection over 3 px.
     assert abs(squared.mean() - 3) < 0.18
 
 
 @pytest.mark.parametrize("num_cameras", [3, 4, 8])
 @pytest.mark.parametrize("false_alarm", [0.05, 0.01])
-def test_right_views_are_left_out_as_seldom_as_is_said(num_cameras, false_alarm):
+def test_correct_views_are_left_out_with_the_promised_probability(num_cameras, false_alarm):
     rig, draws = ring_rig(num_cameras, image_size_wh=(960, 720)), 10_000
     noise_px = np.linspace(0.5, 2.0, num_cameras)
     pixels = noisy(rig, points_in_room(draws), noise_px=noise_px)
     found = reconstruct(rig.cameras, pixels, noise_px=noise_px, false_alarm=false_alarm)
     lost = (~found.used.all(axis=-1)).sum()
     assert lost <= binom.ppf(1 - 1e-4, draws, false_alarm)
-    # Not much more seldom either, or the gate would be wider than is said; of three views one is left out reluctantly.
+    # A much lower rate would mean that the gate is too wide. Of three views, one is left out only on strong evidence.
     assert lost >= (binom.ppf(1e-4, draws, 0.6 * false_alarm) if num_cameras > 3 else 1)
 
 
@@ -248,7 +248,7 @@ def test_one_view_is_off(num_cameras, off_px):
     found = reconstruct(rig.cameras, pixels)
     assert not found.used[each, wrong].any()
     assert found.used.sum() == 40 * (num_cameras - 1)
-    # Without it the point is what it would be had it not been seen.
+    # The point equals the point from the other views alone.
     seen = pixels.copy()
     pixels[each, wrong] = np.nan
     unseen = reconstruct(rig.cameras, pixels, robust=False)
@@ -271,40 +271,41 @@ def test_three_of_eight_views_are_off():
         row[rng.choice(8, 3, replace=False)] = True
     pixels[wrong] += rng.choice([-1, 1], (90, 2)) * rng.uniform(20, 200, (90, 2))
     found = reconstruct(rig.cameras, pixels)
-    # Wrong views may agree with each other by chance; in 30 points they do not.
+    # Wrong views may agree with each other by chance; in these 30 points they do not.
     np.testing.assert_array_equal(found.used, ~wrong)
     # Noise of 1 px is 4 to 10 mm from five views: four standard deviations.
     assert (np.linalg.norm(found.position_m - points, axis=-1) < 0.06).all()
 
 
 def epipolar_direction(rig, of, to, point):
-    """Unit vector in the image of camera `of`, along the line of sight of camera `to` through the point."""
+    """Unit vector in the image of camera `of` along the projected line of sight of camera `to` through the point."""
     nearer = point + 0.02 * (rig.cameras.centre_world[to] - point)
     pixels = pixels_of(rig, np.stack([point, nearer]))[:, of]
     return (pixels[1] - pixels[0]) / np.linalg.norm(pixels[1] - pixels[0])
 
 
-def test_of_three_views_the_odd_one_is_told_only_if_the_others_alone_agree():
+def test_of_three_views_the_wrong_one_is_found_only_if_the_others_alone_agree():
     rig, point = rig_of(*(ring_rig(5).cameras[i] for i in (0, 1, 3))), np.array([0.2, 0.1, 1.2])
     exact = pixels_of(rig, point)
     along = [epipolar_direction(rig, 0, to, point) for to in (1, 2)]
-    # Across both lines: neither of the others agrees with it.
+    # The error is across both epipolar lines: neither of the other views agrees with the wrong view.
     across = exact.copy()
     across[0] += (
         30 * (along[0] - along[1] * np.sign(along[0] @ along[1])) / np.linalg.norm(along[0] - along[1])
     )
-    # Along the line of the second: it agrees with the second, and the second with the third.
+    # The error is along the second camera's epipolar line: the wrong view agrees with the second view, and the second
+    # view agrees with the third.
     on_line = exact.copy()
     on_line[0] += 30 * along[0]
     found = reconstruct(rig.cameras, np.stack([exact, across, on_line]))
     assert found.used.tolist() == [[True] * 3, [False, True, True], [True] * 3]
     np.testing.assert_allclose(found.position_m[:2], [point, point], atol=1e-6)
-    # That it is not known which is wrong shows.
+    # The reprojection errors show the disagreement.
     assert found.reprojection_px[2].max() > 3
 
 
-def test_two_cameras_at_one_spot_do_not_outvote_a_third():
-    """They agree with each other whatever they see, and know no depth without the third."""
+def test_two_cameras_at_one_position_do_not_outvote_a_third():
+    """Two such cameras always agree with each other, and without the third camera there is no depth."""
     one, other = (ring_rig(5).cameras[i] for i in (0, 2))
     T = one.T_cam_world.copy()
     T[:3, 3] += (0.02, 0.0, 0.0)
@@ -317,13 +318,13 @@ def test_two_cameras_at_one_spot_do_not_outvote_a_third():
     assert found.reprojection_px.max() > 10
 
 
-def test_where_nothing_agrees_nothing_is_left_out():
+def test_without_agreement_no_view_is_left_out():
     rig = ring_rig(6)
     pixels = np.random.default_rng(7).uniform((0, 0), (320, 240), (50, 6, 2))
     found = reconstruct(rig.cameras, pixels)
     worst = np.nanmax(found.reprojection_px, axis=-1)
     whole = found.used.all(axis=-1)
-    # Three of six may meet by chance; mostly they do not.
+    # Three of six rays may meet by chance, but rarely.
     assert whole.sum() > 25
     assert (worst[whole] > 5).all()
     np.testing.assert_allclose(
@@ -350,7 +351,7 @@ def test_too_few_views_is_nan(num_seeing):
     np.testing.assert_allclose(found.position_m[0], points[0], atol=1e-8)
 
 
-def test_rays_from_one_spot_are_nan():
+def test_rays_from_one_position_are_nan():
     one = ring_rig(3).cameras[0]
     rig = rig_of(one, one, one)
     found = reconstruct(rig.cameras, pixels_of(rig, points_in_room(3)))
@@ -364,13 +365,13 @@ def test_rays_that_meet_behind_the_cameras_are_nan_and_a_camera_that_looks_away_
     spread = []
     for centre, target in looks.values():
         R, t_m = look_at(centre, target)
-        spread.append(camera(R=R, t_m=t_m, K=K, image_size_wh=(320, 240)))
+        spread.append(make_camera(R=R, t_m=t_m, K=K, image_size_wh=(320, 240)))
     found = reconstruct(rig_of(*spread).cameras, np.full((2, 2, 2), 130.0))
     assert np.isnan(found.position_m).all()
-    # The point is behind the last camera, whose pixel is of something else.
+    # The point is behind the last camera, whose pixel belongs to another object.
     ring = ring_rig(5)
     R, t_m = look_at((0.0, 3.0, 1.2), (0.0, 6.0, 1.2))
-    away = camera(R=R, t_m=t_m, K=K, image_size_wh=(320, 240))
+    away = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(320, 240))
     rig, point = rig_of(*(ring.cameras[i] for i in range(4)), away), np.array([0.2, 0.1, 1.2])
     pixels = np.concatenate([pixels_of(ring, point)[:4], [[160.0, 120.0]]])
     found = reconstruct(rig.cameras, pixels)
@@ -381,18 +382,18 @@ def test_rays_that_meet_behind_the_cameras_are_nan_and_a_camera_that_looks_away_
 
 
 @pytest.mark.parametrize("noise_px", [0.0, -1.0, np.nan])
-def test_noise_that_is_none(noise_px):
+def test_invalid_noise_is_refused(noise_px):
     rig = ring_rig(3)
     pixels = pixels_of(rig, points_in_room(2))
     with pytest.raises(SettingsError, match="noise_px: expected numbers above 0"):
         reconstruct(rig.cameras, pixels, noise_px=noise_px)
-    # Of what does not count it does not matter.
+    # The noise of a view that is not used may have any value.
     pixels[:, 1] = np.nan
     reconstruct(rig.cameras, pixels, noise_px=np.array([1.0, noise_px, 2.0]))
 
 
 @pytest.mark.parametrize("false_alarm", [0.0, 1.0, np.nan])
-def test_a_gate_that_is_none(false_alarm):
+def test_an_invalid_false_alarm_is_refused(false_alarm):
     rig = ring_rig(3)
     with pytest.raises(SettingsError, match="false_alarm: expected a probability"):
         reconstruct(rig.cameras, pixels_of(rig, points_in_room(2)), false_alarm=false_alarm)
@@ -402,7 +403,7 @@ def test_a_gate_that_is_none(false_alarm):
 
 
 def some_views(seed):
-    """Views with noise, gaps, and some that are off."""
+    """Views with noise, gaps and wrong pixels."""
     rng = np.random.default_rng(seed)
     rig = ring_rig(6, coefficients=4)
     pixels = noisy(rig, points_in_room(9, seed=seed), seed=seed)
@@ -418,7 +419,7 @@ def test_the_order_of_cameras_does_not_matter(seed):
     order = np.random.default_rng(seed).permutation(6)
     one, other = reconstruct(rig.cameras, pixels), reconstruct(rig.cameras[order], pixels[:, order])
     np.testing.assert_array_equal(one.used[:, order], other.used)
-    # Sums in another order; a last step below 1e-4 standard deviations may be taken in one and not in the other.
+    # Sums have another order, and a last step below 1e-4 standard deviations may be taken in one case only.
     np.testing.assert_allclose(one.position_m, other.position_m, rtol=0, atol=2e-6)
     np.testing.assert_allclose(one.reprojection_px[:, order], other.reprojection_px, rtol=1e-3, atol=1e-3)
 
@@ -434,11 +435,11 @@ def test_points_move_with_the_world(seed):
     np.testing.assert_allclose(R @ one.covariance_m2 @ R.T, other.covariance_m2, rtol=1e-3, atol=1e-9)
 
 
-def test_points_do_not_matter_to_each_other():
+def test_points_are_independent_of_each_other():
     rig, pixels = some_views(8)
     together = reconstruct(rig.cameras, pixels)
     for n in range(9):
         alone = reconstruct(rig.cameras, pixels[n])
         np.testing.assert_array_equal(alone.used, together.used[n])
-        # Alone it may end a step earlier.
+        # The refinement of a single point may end one step earlier.
         np.testing.assert_allclose(alone.position_m, together.position_m[n], rtol=0, atol=2e-6)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.geometry import camera, stack
+from psotrack.geometry import make_camera, make_rig
 from psotrack.recordings import Sequence, VideoInfo
 
 NAMES = ("a", "b", "c", "d", "e")
@@ -15,7 +15,7 @@ NAMES = ("a", "b", "c", "d", "e")
 
 def a_camera(size_wh=(1920, 1080)):
     K = np.array([[1000, 0, 960], [0, 1000, 540], [0, 0, 1.0]])
-    return camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=size_wh)
+    return make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=size_wh)
 
 
 def a_sequence(**changes) -> Sequence:
@@ -26,7 +26,7 @@ def a_sequence(**changes) -> Sequence:
             del videos[name]
         else:
             videos[name] = replace(videos[name], **change)
-    rig = stack({name: a_camera() for name in NAMES})
+    rig = make_rig({name: a_camera() for name in NAMES})
     return Sequence(name="S01", folder=Path("S01"), rig=rig, videos=videos)
 
 

@@ -12,7 +12,7 @@ import pytest
 from helpers import draw_coverage, float32, ring_rig
 from windows import best_place, claimed_pixels, cut_at, evaluate, pixels
 
-from psotrack.geometry import extents, project, project_boxes, undistort
+from psotrack.geometry import make_extents, project, project_boxes, undistort
 from psotrack.tracking import ScoreSettings, sizes
 from psotrack.tracking.fitness import drone_fitness
 from psotrack.tracking.occlusion import CLAIM, claims_on
@@ -129,7 +129,7 @@ def test_dark_pixels_are_those_of_a_ray_caster(coefficients):
     """Silhouettes of noise, so that every cell has another answer."""
     rig = ring_rig(5, coefficients=coefficients, height_m=1.2)
     images = np.random.default_rng(1).choice([0, 63, 64, 255], (5, 120, 160)).astype(np.uint8)
-    seen = extents(*float32((rig.cameras, SIZES_M)))
+    seen = make_extents(*float32((rig.cameras, SIZES_M)))
     boxes = project_boxes(seen, *float32((DRONES_M,)))
     x_px, y_px = windows_about(boxes, 150.0)
     # The first camera is level: windows reach above its horizon.

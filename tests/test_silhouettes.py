@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
-from psotrack.geometry import camera, look_at, stack
+from psotrack.geometry import look_at, make_camera, make_rig
 from psotrack.recordings import Sequence, VideoWriter, probe, read_frames
 from psotrack.silhouettes import Silhouettes, compute
 from psotrack.silhouettes import store as silhouette_store
@@ -51,7 +51,7 @@ def _sequence(folder: Path) -> Sequence:
     R, t_m = look_at((0.0, 0.0, 1.0), (5.0, 0.0, 1.0))
     K = np.array([[100.0, 0, 81], [0, 100, 59], [0, 0, 1]])
     videos = {path.stem: probe(path) for path in sorted(folder.glob("*.avi"))}
-    rig = stack({name: camera(R=R, t_m=t_m, K=K, image_size_wh=SIZE_WH) for name in videos})
+    rig = make_rig({name: make_camera(R=R, t_m=t_m, K=K, image_size_wh=SIZE_WH) for name in videos})
     return Sequence(folder.name, folder, rig, videos)
 
 

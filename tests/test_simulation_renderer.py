@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from placed_drones import cube, drone_masks, pixel_of, ray_point, straight_flight, with_drones
 
-from psotrack.geometry import camera, look_at, project
+from psotrack.geometry import look_at, make_camera, project
 from psotrack.simulation import CameraRenderer, build, scenario
 from psotrack.simulation.imaging import posing, raster, sensor
 from psotrack.simulation.world import drones, rooms
@@ -39,7 +39,7 @@ def test_a_drawn_square_is_where_the_camera_model_projects_it(window, magnificat
     rng = np.random.default_rng(5)
     R, t = look_at((1.0, -4.0, 2.0), (0.2, 0.1, 1.0))
     K = np.array([[150.0, 0.0, 91.3], [0.0, 150.0, 66.8], [0.0, 0.0, 1.0]])  # well off the image's middle
-    cam = camera(R=R, t_m=t, K=K, image_size_wh=(200, 120))
+    cam = make_camera(R=R, t_m=t, K=K, image_size_wh=(200, 120))
     view = raster.RasterView(raster.pinhole(cam), *window, magnification)
     errors = []
     while len(errors) < 40:
@@ -64,7 +64,9 @@ def test_a_drawn_square_is_where_the_camera_model_projects_it(window, magnificat
 
 def test_a_floor_that_reaches_behind_the_camera_is_cut_there_not_lost():
     R, t = look_at((0.0, 0.0, 1.5), (3.0, 0.0, 1.2))
-    cam = camera(R=R, t_m=t, K=np.array([[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]]), image_size_wh=(80, 60))
+    cam = make_camera(
+        R=R, t_m=t, K=np.array([[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]]), image_size_wh=(80, 60)
+    )
     view = raster.full_view(raster.pinhole(cam))
     floor = np.array([(-9.0, -9.0, 0.0), (9.0, -9.0, 0.0), (9.0, 9.0, 0.0), (-9.0, 9.0, 0.0)])
     colour, depth = raster.empty_buffers(view)
@@ -82,7 +84,9 @@ def test_a_floor_that_reaches_behind_the_camera_is_cut_there_not_lost():
 
 def test_what_lies_wholly_behind_the_camera_is_not_drawn():
     R, t = look_at((0.0, 0.0, 1.5), (3.0, 0.0, 1.5))
-    cam = camera(R=R, t_m=t, K=np.array([[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]]), image_size_wh=(80, 60))
+    cam = make_camera(
+        R=R, t_m=t, K=np.array([[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]]), image_size_wh=(80, 60)
+    )
     view = raster.full_view(raster.pinhole(cam))
     colour, depth = raster.empty_buffers(view)
     raster.draw(view, drones.box((-3.0, 0.0, 1.5), (1.0, 1.0, 1.0)), np.ones((12, 1, 3)), colour, depth)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from psotrack.errors import SettingsError
-from psotrack.geometry import camera, look_at, project
+from psotrack.geometry import look_at, make_camera, project
 from psotrack.simulation.imaging import backdrop, raster
 from psotrack.simulation.scenarios import Imaging
 from psotrack.simulation.world import lighting, rooms
@@ -47,7 +47,7 @@ def cam_of(place, scale=1.0):
     R, t = look_at(place.position_m, place.target_m)
     focal, centre = place.focal_length_px * scale, (np.array(place.principal_point_px) + 0.5) * scale - 0.5
     K = np.array([[focal, 0.0, centre[0]], [0.0, focal, centre[1]], [0.0, 0.0, 1.0]])
-    return camera(R=R, t_m=t, K=K, image_size_wh=(round(1920 * scale), round(1080 * scale)))
+    return make_camera(R=R, t_m=t, K=K, image_size_wh=(round(1920 * scale), round(1080 * scale)))
 
 
 def seen(cam, points_m):
@@ -192,7 +192,7 @@ def test_markers_of_the_large_hall_are_read_from_where_drones_fly(full_size):
     for azimuth in np.radians(np.arange(0, 360, 60)):
         R, t = look_at(eye_m, tuple(np.add(eye_m, [np.cos(azimuth), np.sin(azimuth), 0.22])))
         K = np.array([[460.0, 0.0, 479.5], [0.0, 460.0, 269.5], [0.0, 0.0, 1.0]])
-        cam = camera(R=R, t_m=t, K=K, image_size_wh=(960, 540))
+        cam = make_camera(R=R, t_m=t, K=K, image_size_wh=(960, 540))
         light = backdrop.render(room, raster.pinhole(cam), PLAIN).light
         corners, ids, _ = detector.detectMarkers(np.clip(250 * light, 0, 255).astype(np.uint8))
         for marker, pixels in zip(ids.ravel(), corners, strict=True):

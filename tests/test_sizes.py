@@ -8,7 +8,7 @@ from helpers import assert_same, draw_coverage, float32, ring_rig
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psotrack.geometry import camera, look_at, stack
+from psotrack.geometry import look_at, make_camera, make_rig
 from psotrack.tracking import ScoreSettings, SizeMeasurements, sizes
 from psotrack.tracking.sizes import HALF_PER_STD, MIN_FRAMES, RANGE
 
@@ -236,8 +236,8 @@ def test_the_height_of_a_flat_drone_seen_from_above_stays_at_the_start():
     for i in range(3):
         R, t_m = look_at((0.3 * i, -0.2 * i, 5.0), (0.3 * i, -0.2 * i + 0.01, 0.0), up=(0.0, 1.0, 0.0))
         K = np.array([[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]])
-        overhead[f"c{i}"] = camera(R=R, t_m=t_m, K=K, image_size_wh=(640, 480))
-    rig = stack(overhead)
+        overhead[f"c{i}"] = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(640, 480))
+    rig = make_rig(overhead)
     places = np.array([[0.3, -0.2, 1.0]])
     flat = np.array([0.5, 0.5, 0.08])
     shown = looks_at(images(places, flat, rig), places, flat * [1, 1, 2], rig=rig).size_m[0, 0]

@@ -17,7 +17,7 @@ from psotrack.clocks import find_offset
 from psotrack.clocks.synchronisation import camera_offsets
 from psotrack.datasets import dpjait
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.geometry import camera, look_at
+from psotrack.geometry import look_at, make_camera
 from psotrack.recordings import Markers, VideoWriter, write_c3d
 from psotrack.simulation import scenario
 from psotrack.simulation.flights.planning import plan
@@ -388,7 +388,7 @@ def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data") / "Real_Data" / "R12_D2"
     folder.mkdir(parents=True)
     R, t_m = look_at((0.0, -6.0, 2.0), (0.0, 0.0, 1.5))
-    one = camera(
+    one = make_camera(
         R=R, t_m=t_m, K=np.diag([1100.0, 1100.0, 1.0]), image_size_wh=(64, 48), dist=(0.0, 0.0, 0.0, 0.0)
     )
     dpjait.write_calibration(folder / dpjait.CALIBRATION, rig_of(one), "mm")

@@ -26,7 +26,7 @@ from psotrack.datasets.dpjait import (
     write_poses,
 )
 from psotrack.detection import marker_dictionary
-from psotrack.geometry import camera, look_at, project, stack
+from psotrack.geometry import look_at, make_camera, make_rig, project
 from psotrack.recordings import Markers, VideoWriter, write_c3d
 
 EXPERIMENT = Path(__file__).parents[1] / "experiments" / "table7"
@@ -105,14 +105,16 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_poses(folder / onboard_pose_file(1, FPS), camera_m, turns.as_quat(scalar_first=True))
     R, t_m = look_at((-2.0, -2.0, 2.0), (0.0, 0.0, 1.0))
     write_calibration(
-        folder / CALIBRATION, stack({"cam1i": camera(R=R, t_m=t_m, K=K, image_size_wh=(64, 48))}), unit="m"
+        folder / CALIBRATION,
+        make_rig({"cam1i": make_camera(R=R, t_m=t_m, K=K, image_size_wh=(64, 48))}),
+        unit="m",
     )
     with (
         VideoWriter(folder / onboard_video_file(1), FPS, SIZE_WH) as video,
         VideoWriter(folder / "cam1i_s.avi", FPS, (64, 48)) as still,
     ):
         for centre_m, R_cam_world in zip(camera_m, turns.inv().as_matrix(), strict=True):
-            one = camera(R=R_cam_world, t_m=-R_cam_world @ centre_m, K=K, image_size_wh=SIZE_WH)
+            one = make_camera(R=R_cam_world, t_m=-R_cam_world @ centre_m, K=K, image_size_wh=SIZE_WH)
             video.write(drawn(one, corners_m))
             still.write(np.zeros((48, 64, 3), np.uint8))
     return root

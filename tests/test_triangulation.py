@@ -1,4 +1,4 @@
-"""Points from pixels: exact cases, OpenCV for two cameras, least squares written out; and who belongs to whom."""
+"""Triangulation against exact cases, OpenCV (two cameras) and explicit least squares; matching of views."""
 
 from dataclasses import replace
 
@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from psotrack.geometry import (
     CameraRig,
-    candidates,
     match_views,
     project,
     triangulate,
+    triangulate_candidates,
     triangulate_paths,
     viewpoints,
 )
@@ -34,7 +34,7 @@ def test_exact_pixels_give_the_point(num_cameras, shape, coefficients):
     rig, points = ring_rig(num_cameras, coefficients=coefficients), points_in_room(*shape)
     found = triangulate(rig.cameras, pixels_of(rig, points))
     assert found.shape == points.shape
-    # The lens is undone to 1e-8 (see test_cameras), which is 4e-8 m at 4 m; two cameras stretch it a little.
+    # Pixels are undistorted to 1e-8 (see test_cameras), which is 4e-8 m at 4 m; two cameras enlarge the error a little.
     np.testing.assert_allclose(found, points, atol=1e-6)
 
 
@@ -56,7 +56,7 @@ def test_two_cameras_agree_with_opencv():
 
 
 def test_weighted_least_squares():
-    """Equations (3) of the paper, written out and given to `lstsq`, with noise so that no point solves them."""
+    """Equations (3) of the paper, solved by `lstsq`, with noise so that no point solves them exactly."""
     rig, points = ring_rig(5), points_in_room(11)
     rng = np.random.default_rng(2)
     pixels = pixels_of(rig, points) + rng.normal(0, 1.0, (11, 5, 2))
@@ -78,7 +78,8 @@ def test_weighted_least_squares():
 def test_the_pseudoinverse_of_the_paper():
     """Equations (3)-(6) in pixels as they are printed, X = pinv(L) B with p1, p2, p3 the rows of K [R | t].
 
-    A row in pixels is one in normalised coordinates times the focal length: here one for all cameras, as in the paper.
+    A row in pixels is the row in normalised coordinates times the focal length, which all cameras share, as in the
+    paper.
     """
     rig, points = ring_rig(5), points_in_room(11)
     one = np.broadcast_to(rig.cameras.K[0], (5, 3, 3)).copy()
@@ -118,8 +119,8 @@ def test_too_few_cameras_is_nan(num_seeing):
     np.testing.assert_allclose(found[[0, 2]], points[[0, 2]], atol=1e-6)
 
 
-def test_rays_from_one_spot_are_nan():
-    """Two cameras at one spot see a point along one ray: no depth. Likewise when only one of the weights counts."""
+def test_rays_from_one_position_are_nan():
+    """Two cameras at one position see a point along one ray, without depth. So does a single camera with weight."""
     one = ring_rig(3).cameras[0]
     rig = rig_of(one, one)
     pixels = pixels_of(rig, points_in_room(3))
@@ -148,12 +149,12 @@ def test_exact_pixels_give_the_path(coefficients):
     rig, paths = ring_rig(3, coefficients=coefficients), some_paths(5)
     found = triangulate_paths(rig.cameras, pixels_of(rig, flown(paths)), TIME_S, noise_m=1e-6)
     assert found.shape == paths.shape
-    # As for points: the lens is undone to 4e-8 m, of which two derivatives over a quarter of a second make 1e-5.
+    # As for points, undistortion is exact to 4e-8 m; two derivatives over a quarter of a second make 1e-5 of it.
     np.testing.assert_allclose(found, paths, atol=1e-4)
 
 
 def test_paths_by_least_squares():
-    """The equations, those of what is expected too, written out and given to `lstsq`."""
+    """The equations of the views and of the priors, written out and solved by `lstsq`."""
     rig, paths = ring_rig(5), some_paths(3)
     rng = np.random.default_rng(2)
     pixels = pixels_of(rig, flown(paths)) + rng.normal(0, 1.0, (3, 7, 5, 2))
@@ -179,7 +180,7 @@ def test_paths_by_least_squares():
 
 
 def test_frames_with_one_camera_each_make_a_path():
-    """Two cameras that take turns: no frame has a point, all together have the path."""
+    """Two cameras take turns: no single frame determines a point, but all frames together determine the path."""
     rig, paths = ring_rig(3), some_paths(3)[:, :2]
     pixels = pixels_of(rig, flown(paths))
     pixels[:, ::2, 0] = pixels[:, 1::2, 1] = pixels[:, :, 2] = np.nan
@@ -188,7 +189,7 @@ def test_frames_with_one_camera_each_make_a_path():
     np.testing.assert_allclose(found, paths, atol=1e-4)
 
 
-def test_one_frame_is_a_path_that_stands():
+def test_one_frame_gives_a_path_at_rest():
     rig, points = ring_rig(3), points_in_room(4)
     found = triangulate_paths(rig.cameras, pixels_of(rig, points)[:, None], np.zeros(1))
     np.testing.assert_allclose(found[:, 0], points, atol=1e-6)
@@ -215,7 +216,7 @@ def test_cameras_side_by_side_share_a_viewpoint():
 
 
 def apart(count, seed, least_m=0.6):
-    """Points in the room, none nearer than `least_m` to another."""
+    """Points in the room with distances of at least `least_m`."""
     rng = np.random.default_rng(seed)
     points = np.empty((0, 3))
     while len(points) < count:
@@ -226,7 +227,7 @@ def apart(count, seed, least_m=0.6):
 
 
 def observed(rig, drones, seed, *, missing=0.0, false=0, noise_px=0.5):
-    """For each camera its 2D points in random order, and which drone each is of (-1: of none)."""
+    """For each camera its 2D points in random order, and the drone of each 2D point (-1: false point)."""
     rng = np.random.default_rng(seed)
     pixels = pixels_of(rig, drones)
     points, owners = [], []
@@ -256,7 +257,7 @@ def check_match(rig, drones, points, owners, enough):
 @pytest.mark.parametrize("num_drones", range(1, 7))
 @pytest.mark.parametrize("seed", range(3))
 def test_drones_on_a_ring_of_cameras(num_drones, seed):
-    """Every drone is found once, at its place, and nothing else."""
+    """Every drone is found once, at its position, and nothing else is found."""
     rig, drones = ring_rig(7), apart(num_drones, seed)
     points, owners = observed(rig, drones, seed)
     check_match(rig, drones, points, owners, np.ones(num_drones, bool))
@@ -264,7 +265,7 @@ def test_drones_on_a_ring_of_cameras(num_drones, seed):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_missing_and_false_points(seed):
-    """One in seven is missing, and every camera has a false point: found is who is seen by four cameras or more."""
+    """One 2D point in seven is missing, and every camera has a false point: drones seen by four cameras are found."""
     rig, drones = ring_rig(7), apart(3, seed)
     points, owners = observed(rig, drones, seed, missing=1 / 7, false=1)
     seen_by = np.array([sum((owner == drone).any() for owner in owners) for drone in range(3)])
@@ -272,8 +273,8 @@ def test_missing_and_false_points(seed):
     check_match(rig, drones, points, owners, seen_by >= 4)
 
 
-def test_two_cameras_at_one_spot_do_not_count_twice():
-    """Three cameras at two spots see a point: that is two viewpoints, too few."""
+def test_two_cameras_at_one_position_do_not_count_twice():
+    """Three cameras at two positions see a point: two viewpoints are too few."""
     rig, drones = ring_rig(5), points_in_room(1)
     doubled = rig_of(*(rig.cameras[i] for i in (0, 0, 2)))
     points, _ = observed(doubled, drones, 0)
@@ -295,24 +296,24 @@ def test_the_order_of_cameras_and_points_does_not_matter(seed):
     cameras = rng.permutation(4)
     mixed = [points[c][rng.permutation(len(points[c]))] for c in cameras]
     radius, mixed_radius = ([np.full(len(p), 4.0) for p in of] for of in (points, mixed))
-    first, _ = candidates(rig.cameras, points, radius, ROOM_M)
-    second, _ = candidates(rig.cameras[cameras], mixed, mixed_radius, ROOM_M)
+    first, _ = triangulate_candidates(rig.cameras, points, radius, ROOM_M)
+    second, _ = triangulate_candidates(rig.cameras[cameras], mixed, mixed_radius, ROOM_M)
     for one, other in ((first, second), (second, first)):
         distance = np.linalg.norm(one[:, None] - other, axis=-1).min(axis=1, initial=np.inf)
-        # Candidates in one cube of a centimetre are one, and which of them it is may differ.
+        # One candidate is kept per cube of a centimetre, and the order may decide which one.
         assert (distance < 0.01 * 3**0.5).all()
 
 
 def test_a_point_that_two_drones_share_does_not_hide_them():
-    """One camera sees the middle of both. What the other two agree on is a candidate, not pulled to that middle."""
+    """One camera sees the middle of two drones. The point on which the other two cameras agree remains a candidate."""
     rig = rig_of(*(ring_rig(5).cameras[i] for i in (0, 1, 3)))
     drones = np.array([[0.3, 0.2, 1.4], [0.1, -0.1, 1.3]])
     pixels = pixels_of(rig, drones)
     points = [pixels[:, 0].mean(axis=0)[None], pixels[:, 1], pixels[:, 2]]
     wide = np.linalg.norm(pixels[0, 0] - pixels[1, 0]) / 2 / 0.9
-    found, _ = candidates(rig.cameras, points, [np.full(len(p), wide) for p in points], ROOM_M)
+    found, _ = triangulate_candidates(rig.cameras, points, [np.full(len(p), wide) for p in points], ROOM_M)
     for drone in drones:
-        # At 0.9 of its radius a point has 4 % of the weight: measured 3 cm. With equal weights it is 9 cm.
+        # At 0.9 of its radius a 2D point has 4 % of the weight: the error is 3 cm. With equal weights it would be 9 cm.
         assert np.linalg.norm(found - drone, axis=-1).min() < 0.05
     equal = triangulate(
         rig.cameras, np.stack([np.stack([points[0][0], p[k], q[k]]) for p, q in [points[1:]] for k in (0, 1)])
@@ -328,7 +329,7 @@ def test_nothing_to_match():
     assert support.shape == (0, 3)
 
 
-def test_outside_the_bounds_is_nothing():
+def test_nothing_is_found_outside_the_bounds():
     rig = ring_rig(5)
     points, _ = observed(rig, np.array([[0.0, 0, 1]]), 0)
     radius = [np.full(len(p), 4.0) for p in points]
@@ -339,7 +340,7 @@ def test_outside_the_bounds_is_nothing():
 
 @pytest.mark.parametrize("seed", range(5))
 def test_no_point_is_found_out_of_bounds(seed):
-    """A bug of the first version: pairs of noisy points proposed a place in bounds, and all views refined it out."""
+    """Noisy pairs may propose a point inside the bounds that the refinement by all views moves outside."""
     rig = ring_rig(6)
     rng = np.random.default_rng(seed)
     on_the_floor = np.array([[0.3, -0.2, 0.0]])

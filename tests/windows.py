@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from helpers import far_camera, float32, rig_of
 
-from psotrack.geometry import extents
+from psotrack.geometry import make_extents
 from psotrack.silhouettes import summed_area_table
 from psotrack.silhouettes.summed_area import LOW_BITS
 from psotrack.tracking import ScoreSettings
@@ -52,7 +52,7 @@ def cut_at(
 def _cut(images, cameras, expected_m, size_m, reach_m, claiming, reduction, floor_z_m, offset_m):
     return cut(
         images,
-        extents(cameras, size_m, offset_m),
+        make_extents(cameras, size_m, offset_m),
         expected_m,
         reach_m=reach_m,
         claiming=claiming,
@@ -89,7 +89,7 @@ def evaluate(function, rig, patches, position_m, size_m, reduction):
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _evaluate(function, settings, patches, cameras, position_m, size_m):
-    return function(ScoreInputs(extents(cameras, size_m), patches, settings), position_m)
+    return function(ScoreInputs(make_extents(cameras, size_m), patches, settings), position_m)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -105,7 +105,7 @@ def best_place(rig, patches, about_m, size_m, reduction):
 
 @partial(jax.jit, static_argnums=0)
 def _best_place(settings, patches, cameras, best_m, size_m):
-    view = ScoreInputs(extents(cameras, size_m), patches, settings)
+    view = ScoreInputs(make_extents(cameras, size_m), patches, settings)
     unit = np.stack(np.meshgrid(*[np.arange(-4, 5)] * 3, indexing="ij"), axis=-1).reshape(-1, 1, 3)
 
     def closer(best_m, step_m):

@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 from scipy.optimize import linear_sum_assignment
 
 from psotrack.datasets.dpjait import read_sequence
-from psotrack.geometry import Camera, extents
+from psotrack.geometry import Camera, make_extents
 from psotrack.initiation import room_bounds
 from psotrack.initiation.initialisation import find_drones
 from psotrack.settings import TrackSettings
@@ -116,7 +116,7 @@ def scores(
     settings: ScoreSettings,
 ) -> jax.Array:
     """(places, drones), the score of every drone at its position moved by each of the offsets (places, 3)."""
-    seen = extents(cameras, size_m)
+    seen = make_extents(cameras, size_m)
     drones = len(size_m)
     patches = cut(
         coverage,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from psotrack.geometry import Camera, CameraRig, camera, look_at, project, stack
+from psotrack.geometry import Camera, CameraRig, look_at, make_camera, make_rig, project
 
 IMAGE_SIZE_WH = (1920, 1080)
 REDUCTION = 4
@@ -76,7 +76,7 @@ def scene(num_frames: int, num_drones: int, num_cameras: int) -> Scene:
         angle = 2 * np.pi * (index + 0.5) / num_cameras
         R, t_m = look_at((5 * np.cos(angle), 4 * np.sin(angle), 3.0), (0.0, 0.0, 1.2))
         K = np.array([[1156.3, 0.0, 960.0], [0.0, 1156.3, 540.0], [0.0, 0.0, 1.0]])
-        named[f"camera{index}"] = camera(R=R, t_m=t_m, K=K, image_size_wh=IMAGE_SIZE_WH)
+        named[f"camera{index}"] = make_camera(R=R, t_m=t_m, K=K, image_size_wh=IMAGE_SIZE_WH)
 
     rate = 2 * np.pi / PERIOD_FRAMES * FPS
     time_s = np.arange(num_frames)[:, None] / FPS
@@ -89,7 +89,7 @@ def scene(num_frames: int, num_drones: int, num_cameras: int) -> Scene:
     position_m = amplitudes_m * np.sin(angles)
     position_m[..., 2] += level_m
     return Scene(
-        rig=stack(named),
+        rig=make_rig(named),
         position_m=position_m,
         velocity_m_s=amplitudes_m * turns * np.cos(angles),
         size_m=np.tile(DRONE_SIZE_M, (num_drones, 1)),

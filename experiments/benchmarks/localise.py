@@ -18,7 +18,7 @@ import psotrack
 from psotrack.calibration import lens_of_view
 from psotrack.datasets.dpjait import MARKER_CORNERS, read_onboard
 from psotrack.detection import marker_dictionary
-from psotrack.geometry import Camera, camera, look_at, project
+from psotrack.geometry import Camera, look_at, make_camera, project
 from psotrack.inside_out import LocalisedVideo, MarkerMap, localise_video, open_source, read_marker_map
 from psotrack.inside_out.localising import STAGES
 from psotrack.recordings import VideoWriter
@@ -62,7 +62,7 @@ def main(
         else:
             one = read_onboard(sequence)[drone]
             video, marker_map = one.video.path, read_marker_map(sequence / MARKER_CORNERS)
-            lens = camera(R=np.eye(3), t_m=np.zeros(3), K=one.K, image_size_wh=one.video.image_size_wh)
+            lens = make_camera(R=np.eye(3), t_m=np.zeros(3), K=one.K, image_size_wh=one.video.image_size_wh)
         source = open_source(video)
         source = source.first(min(frames, source.num_frames or frames))
         # The first run is not counted: it compiles, imports and reads the video from the disk.
@@ -123,7 +123,7 @@ def _draw(path: Path, marker_map: MarkerMap, lens: Camera, frames: int) -> None:
             R, t_m = look_at(
                 (1.5 * np.sin(angle), 0.8 * np.cos(angle), 1.5), (0.8 * np.sin(2 * angle), 4.0, 1.5)
             )
-            posed = camera(R=R, t_m=t_m, K=lens.K, image_size_wh=size_wh)
+            posed = make_camera(R=R, t_m=t_m, K=lens.K, image_size_wh=size_wh)
             image = background.copy()
             for marker, corners_m in marker_map.corners_m.items():
                 _add_marker(image, marker, project(posed, corners_m)[0])

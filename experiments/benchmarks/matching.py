@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.correspondence import Matches, match
-from psotrack.geometry import CameraRig, camera, look_at, project, stack
+from psotrack.geometry import CameraRig, look_at, make_camera, make_rig, project
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results
@@ -99,10 +99,10 @@ def _rig(count: int) -> CameraRig:
         angle = 2 * np.pi * (i + 0.5) / count
         R, t_m = look_at((7 * np.cos(angle), 6 * np.sin(angle), 2.5 + 0.2 * i), (0.0, 0.0, 1.8))
         K = np.array([[_FOCAL_PX, 0, 959.5], [0, _FOCAL_PX, 539.5], [0, 0, 1]])
-        cameras[f"c{i}"] = camera(
+        cameras[f"c{i}"] = make_camera(
             R=R, t_m=t_m, K=K, image_size_wh=_SIZE_WH, dist=(-0.1, 0.02, 5e-4, -3e-4, 0.0)
         )
-    return stack(cameras)
+    return make_rig(cameras)
 
 
 def _apart(count: int, rng: np.random.Generator) -> Float[np.ndarray, "drones 3"]:

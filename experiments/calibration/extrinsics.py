@@ -19,7 +19,7 @@ from jaxtyping import Float
 from scipy.stats import chi2
 
 from psotrack.calibration import locate_camera
-from psotrack.geometry import Camera, camera, look_at, project
+from psotrack.geometry import Camera, look_at, make_camera, project
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results
@@ -79,7 +79,7 @@ def scenes(
         around = rng.uniform(0, 2 * np.pi)
         centre_m = (AWAY_M * np.cos(around), AWAY_M * np.sin(around), 2.0)
         R, t_m = look_at(centre_m, (0.0, 0.0, 1.0))
-        one = camera(R=R, t_m=t_m, K=K, image_size_wh=SIZE_WH)
+        one = make_camera(R=R, t_m=t_m, K=K, image_size_wh=SIZE_WH)
         pixels = (cells + rng.uniform(0.1, 0.9, cells.shape)) * cell_px
         rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(K).T
         points_m = (rays * rng.uniform(*range_m, (len(rays), 1)) - t_m) @ R

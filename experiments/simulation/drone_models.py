@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from matplotlib.figure import Figure
 
-from psotrack.geometry import camera, look_at
+from psotrack.geometry import look_at, make_camera
 from psotrack.simulation import Scene, build, scenario
 from psotrack.simulation.imaging import posing, raster, sensor
 from psotrack.simulation.scenarios import Drone, Harmonic, Harmonics, Variation
@@ -63,7 +63,7 @@ def view_of(
     R, t = look_at(at_m + distance_m * away, at_m)
     width, height = (round(side * focal_px / distance_m) for side in (WIDTH_M, height_m))
     K = np.array([[focal_px, 0.0, (width - 1) / 2], [0.0, focal_px, (height - 1) / 2], [0.0, 0.0, 1.0]])
-    return raster.full_view(raster.pinhole(camera(R=R, t_m=t, K=K, image_size_wh=(width, height))))
+    return raster.full_view(raster.pinhole(make_camera(R=R, t_m=t, K=K, image_size_wh=(width, height))))
 
 
 def portrait(scene: Scene, drone: int, height_m: float, angles: tuple[float, float]) -> np.ndarray:

@@ -16,7 +16,7 @@ from psotrack.calibration import lens_of_view
 from psotrack.clocks import own_reference
 from psotrack.datasets.dpjait import CALIBRATION, MARKER_CORNERS, read_sequence
 from psotrack.errors import InputError
-from psotrack.geometry import Camera, camera
+from psotrack.geometry import Camera, make_camera
 from psotrack.inside_out import MarkerMap, read_marker_map
 from psotrack.recordings import OnboardVideo, VideoInfo
 from psotrack.support import progress_bar
@@ -133,7 +133,7 @@ def _lens(onboard: OnboardVideo) -> Camera:
     size_wh = onboard.video.image_size_wh
     if onboard.K is None:
         return lens_of_view(*FOV_DEG, size_wh)
-    return camera(R=np.eye(3), t_m=np.zeros(3), K=onboard.K, image_size_wh=size_wh)
+    return make_camera(R=np.eye(3), t_m=np.zeros(3), K=onboard.K, image_size_wh=size_wh)
 
 
 def _flight(flights: Trajectories, name: str, folder: Path) -> Reference:

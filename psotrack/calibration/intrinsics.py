@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from psotrack.detection import marker_dictionary
 from psotrack.errors import InputError, SettingsError, check_positive
-from psotrack.geometry import Camera, camera
+from psotrack.geometry import Camera, make_camera
 from psotrack.recordings import VideoInfo, read_frames
 
 #: Views that a calibration needs: fewer fix k1, k2, p1, p2 badly.
@@ -156,7 +156,7 @@ def lens_of_board(video: VideoInfo, board: Board) -> Lens:
             remedy="tilt the board, and carry it into all corners of the image",
         )
     return Lens(
-        camera(
+        make_camera(
             R=np.eye(3),
             t_m=np.zeros(3),
             K=K,
@@ -216,4 +216,4 @@ def _plain(focal_length_px: Float[np.ndarray, "2"], image_size_wh: tuple[int, in
     # Pixel centres are at whole numbers: the middle of the image is half a pixel from half its size.
     cx, cy = (np.array(image_size_wh) - 1) / 2
     K = np.array([[focal_length_px[0], 0.0, cx], [0.0, focal_length_px[1], cy], [0.0, 0.0, 1.0]])
-    return camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=image_size_wh)
+    return make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=image_size_wh)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.geometry import LENGTHS
+from psotrack.geometry import METRES_PER_UNIT
 from psotrack.support import read_table, write_rows
 
 #: The names of a drone's markers, in the order of the columns.
@@ -45,7 +45,7 @@ def read_mocap_markers(path: Path) -> Float[np.ndarray, "frames 4 3"]:
     table = read_table(path)
     id_column = table.column("id")
     columns = [table.column(name.lower()) for name in _COLUMNS]
-    metres = np.array([table.factor(column, LENGTHS) for column in columns])
+    metres = np.array([table.factor(column, METRES_PER_UNIT) for column in columns])
     rows: dict[int, np.ndarray] = {}
     for row in table.rows:
         frame = row.count(id_column)

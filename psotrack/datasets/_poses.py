@@ -18,7 +18,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import SettingsError
-from psotrack.geometry import LENGTHS
+from psotrack.geometry import METRES_PER_UNIT
 from psotrack.support import Column, Table, TextRow, read_table, write_rows
 
 Positions = Float[np.ndarray, "frames 3"]
@@ -41,7 +41,7 @@ def read_poses(path: Path) -> tuple[Positions, Orientations | None]:
     table = read_table(path)
     id_column = table.column("id")
     position = [table.column(f"pos_{axis}") for axis in "xyz"]
-    metres = np.array([table.factor(column, LENGTHS) for column in position])
+    metres = np.array([table.factor(column, METRES_PER_UNIT) for column in position])
     quaternion = _quaternion_columns(table)
     rows = _by_frame(table, id_column)
     position_m = np.full((max(rows) + 1, 3), np.nan)

@@ -40,7 +40,7 @@ from psotrack.datasets._onboard import (
 )
 from psotrack.datasets._poses import pose_file, read_poses, write_poses
 from psotrack.errors import InputError
-from psotrack.geometry import files_by_camera, read_calibration, read_names, write_calibration
+from psotrack.geometry import files_by_camera, read_calibration, read_camera_names, write_calibration
 from psotrack.recordings import (
     Detections,
     OnboardVideo,
@@ -112,7 +112,7 @@ def read_sequence(folder: Path | str) -> Sequence:
     folder = Path(folder)
     _check_folder(folder)
     calibration = folder / CALIBRATION
-    names = read_names(calibration)
+    names = read_camera_names(calibration)
     files = sorted(folder.iterdir())
     videos = _videos(folder, files, names)
     rig = read_calibration(calibration, _image_sizes(names, videos))

@@ -1,8 +1,8 @@
 """Cameras, rotations, boxes and triangulation, and the files that hold a rig.
 
-In: camera parameters and points, or detections in pixels. Out: pixels, boxes, 3D points with covariances. Everything
-but the rig's files (`rig_files`, `dpjait_calibration`) is NumPy and JAX only; what must be exact is computed in
-float64.
+In: camera parameters and points, or detections in pixels. Out: pixels, boxes, 3D points with covariances. All modules
+except those for the rig's files (`rig_files`, `dpjait_calibration`) use NumPy and JAX only. Calibration and
+triangulation compute in float64.
 """
 
 import lazy_loader

@@ -1,12 +1,13 @@
-"""A drone's extent at a position, as one box per camera. The pixel convention of all boxes is written here.
+"""Boxes of drones in cameras, and the pixel convention of all boxes.
 
 Boxes are `xyxy`, half-open, in pixels, with fractional edges: pixel (column i, row j) covers [i, i + 1) x [j, j + 1).
-Projected points have pixel centres at whole numbers (OpenCV), so half a pixel is added on the way from one to the
-other. On an image reduced by r, edges are divided by r.
+Projected points have pixel centres at whole numbers (OpenCV), so that half a pixel is added to convert a projected
+point to the convention of boxes. On an image reduced by the factor r, edges are divided by r.
 
-A drone's extent is an ellipsoid with the three axes of the world. Its box is exact and cheap: a plane u = const
-through the camera with normal n = (1, 0, -u) touches the ellipsoid of shape S centred at X (camera coordinates)
-where (n·X)² = nᵀ S n, a quadratic in u; likewise for v (Hartley & Zisserman 2004, section 8.3, on dual quadrics).
+A drone's extent is an ellipsoid whose axes are parallel to the world's axes. The box of an ellipsoid has a closed
+form: a plane u = const through the camera with normal n = (1, 0, -u) touches the ellipsoid of shape S centred at X
+(camera coordinates) where (n·X)² = nᵀ S n, a quadratic in u; likewise for v (Hartley & Zisserman 2004, section 8.3, on
+dual quadrics).
 """
 
 from __future__ import annotations
@@ -24,11 +25,12 @@ from psotrack.geometry.cameras import NEAR_M, Camera, distort
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Boxes:
-    """Boxes in pixels, and whether the camera has the drone in front of it.
+    """Boxes of drones in cameras, as middles and half sizes, because the score scales boxes about their middles.
 
-    Kept as middles and halves, because windows scale boxes about their middles.
-
-    Attributes are of equal shape: (..., cameras).
+    Attributes:
+        x_middle, y_middle: (..., cameras), middle of the box, pixels.
+        x_half, y_half: (..., cameras), half width and half height, pixels.
+        in_front: (..., cameras), True if the drone is in front of the camera; other boxes have no meaning.
     """
 
     x_middle: Float[Array, "*batch"]
@@ -52,17 +54,18 @@ class Boxes:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Extents:
-    """Drones of known size as cameras see them: all of their boxes that does not depend on where they are.
+    """The parts of drones' boxes that do not depend on the drones' positions.
 
-    Every number is an array of its own, because positions are tried by the thousand: picked out of matrices within the
-    swarm's loop, they would be picked anew in every iteration.
+    Every number is an array of its own, because the swarm tries thousands of positions in a loop: elements of a matrix
+    would be extracted again in every iteration.
 
     Attributes:
-        cameras: with one leading axis.
-        size_m: (..., 3), full lengths along the world's axes.
-        rotation: nine of (cameras,), the rows of R one after the other.
-        translation_m: three of (cameras,), or of (..., cameras) where ellipsoids sit beside the positions.
-        s_xx, s_yy, s_xz, s_yz, s_zz: (..., cameras), of the shape S = R diag(size / 2)² Rᵀ in camera coordinates, m².
+        cameras: cameras with one leading axis.
+        size_m: (..., 3), full lengths of the drones along the world's axes, metres.
+        rotation: nine arrays of shape (cameras,), the rows of R one after the other.
+        translation_m: three arrays of shape (cameras,), or (..., cameras) for ellipsoids with an offset, metres.
+        s_xx, s_yy, s_xz, s_yz, s_zz: (..., cameras), elements of the shape S = R diag(size / 2)² Rᵀ in camera
+            coordinates, m².
         f_x, f_y, skew, c_x, c_y: (cameras,), intrinsics in pixels; c_x and c_y in the convention of boxes.
     """
 
@@ -82,20 +85,20 @@ class Extents:
     c_y: Float[Array, "cameras"]
 
 
-def extents(
+def make_extents(
     cameras: Camera, size_m: Float[Array, "*drones 3"], offset_m: Float[Array, "*drones 3"] | None = None
 ) -> Extents:
-    """Ellipsoids in cameras.
+    """Prepare the projection of drones' ellipsoids to boxes.
 
     Args:
-        cameras: with one leading axis.
-        size_m: (..., 3), full lengths of the extent along the world's axes.
-        offset_m: (..., 3), from the positions that are asked about (a body's origin) to the middle of the extent, along
-            the world's axes; None is at the positions.
+        cameras: cameras with one leading axis.
+        size_m: (..., 3), full lengths of the drones along the world's axes, metres.
+        offset_m: (..., 3), vector from a drone's position (such as its body's origin) to the middle of its ellipsoid,
+            along the world's axes, metres; None: the middle is the position.
     """
     R, t, K = cameras.T_cam_world[:, :3, :3], cameras.T_cam_world[:, :3, 3], cameras.K
     if offset_m is not None:
-        # R (position + offset) + t: part of the translation, so that it costs nothing where positions are tried.
+        # R (position + offset) + t: the offset becomes part of the translation and costs nothing per tried position.
         t = jnp.einsum("cij,...j->...ci", R, offset_m) + t
     S = jnp.einsum("cij,...j,ckj->...cik", R, jnp.square(size_m / 2), R)
     return Extents(
@@ -119,11 +122,12 @@ def extents(
 def project_boxes(seen: Extents, position_m: Float[Array, "*#drones 3"]) -> Boxes:
     """Boxes of drones at positions, in every camera.
 
-    The lens bends the middles of the box's four sides; at a drone's few degrees that is the box of the bent outline.
+    Lens distortion is applied to the middles of the box's four sides. A drone covers a few degrees, where this box
+    equals the box of the distorted outline.
 
     Args:
-        seen: from `extents`; its leading axes broadcast against those of `position_m`.
-        position_m: (..., 3), world.
+        seen: extents from `make_extents`; the leading axes broadcast against those of `position_m`.
+        position_m: (..., 3), positions in the world, metres.
 
     Returns:
         Boxes with axes (..., cameras).
@@ -137,7 +141,7 @@ def project_boxes(seen: Extents, position_m: Float[Array, "*#drones 3"]) -> Boxe
         for i in range(3)
     )
     in_front = z * z * jnp.sign(z) > seen.s_zz + NEAR_M
-    # Behind the camera the quadratic has no meaning; any positive denominator keeps values and gradients finite.
+    # Behind the camera the quadratic has no meaning. Any positive denominator keeps values and gradients finite.
     a = jnp.where(in_front, z * z - seen.s_zz, 1.0)
 
     def tangents(along: Array, s_along_z: Array, s_along: Array) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""The fields of one camera as files have them, by any of the names that programs use, and how to complain of them."""
+"""Fields of one camera in a rig file, under any of the names that calibration programs use, and their checks."""
 
 from __future__ import annotations
 
@@ -12,35 +12,49 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError
-from psotrack.geometry.cameras import Camera, camera
+from psotrack.geometry.cameras import Camera, make_camera
 
-#: What a rotation's rows may be off from unit length and right angles: files with 8 digits pass.
-_ROTATION = 1e-6
-#: OpenCV's counts of coefficients that `psotrack.geometry.cameras` knows.
+#: Largest element of |R Rᵀ - I| in a rotation matrix; matrices written with 8 digits pass.
+_ROTATION_TOLERANCE = 1e-6
+#: Numbers of OpenCV's distortion coefficients that `psotrack.geometry.cameras` supports.
 _COEFFICIENTS = (0, 4, 5, 8)
 
 
 @dataclass(frozen=True)
 class CameraFields:
-    """The fields of one camera in a file, and how to complain of them."""
+    """The fields of one camera in a file.
+
+    Attributes:
+        path: path of the file.
+        place: name of the camera's table in the file, for messages.
+        values: values by field name.
+    """
 
     path: Path
     place: str
     values: Mapping[str, Any]
 
     def error(self, name: str, expected: str, found: str, remedy: str = "") -> InputError:
-        """The error of a field."""
+        """Error whose message names the file and the field."""
         return InputError(f"{self.path}, {self.place}.{name}", expected=expected, found=found, remedy=remedy)
 
     def first(self, *names: str) -> str | None:
-        """The first of the names that has a value; of text only a name, because caliscope wrote "null" for none."""
-        there = (name for name in names if self.values.get(name) is not None)
+        """First of these fields that has a value, or None.
+
+        Text counts as no value except in the field `name`, because caliscope wrote "null" for missing values.
+        """
+        present = (name for name in names if self.values.get(name) is not None)
         return next(
-            (name for name in there if not isinstance(self.values[name], str) or name == "name"), None
+            (name for name in present if not isinstance(self.values[name], str) or name == "name"), None
         )
 
     def array(self, names: tuple[str, ...], *shapes: tuple[int, ...]) -> Float[np.ndarray, "..."]:
-        """Finite numbers of one of the shapes; -1 is any length."""
+        """Value of the first of these fields, as an array of finite numbers.
+
+        Args:
+            names: names that programs use for the field.
+            shapes: allowed shapes; -1 stands for any length.
+        """
         name = self.first(*names)
         expected = " or ".join(_words(shape) for shape in shapes)
         if name is None:
@@ -49,7 +63,7 @@ class CameraFields:
             array = np.array(self.values[name], np.float64)
         except (TypeError, ValueError):
             raise self.error(name, expected, _quoted(self.values[name])) from None
-        # OpenCV writes vectors as columns or rows.
+        # OpenCV writes vectors as matrices with one column or one row.
         squeezed = array.ravel() if array.ndim == 2 and 1 in array.shape else array
         for shape in shapes:
             if squeezed.ndim == len(shape) and all(
@@ -64,7 +78,13 @@ class CameraFields:
 def camera_from_fields(
     fields: CameraFields, image_size_wh: tuple[int, int] | None, metres_per_unit: float, placed: bool
 ) -> Camera:
-    """The camera of the fields; at the world's origin if not `placed`.
+    """Make a camera from its fields.
+
+    Args:
+        fields: fields of the camera.
+        image_size_wh: width and height in pixels, if the fields have none.
+        metres_per_unit: length unit of the translation, metres.
+        placed: read the camera's pose; if not, the camera stands at the world's origin.
 
     Raises:
         InputError: a field is missing or wrong.
@@ -88,7 +108,9 @@ def camera_from_fields(
     if placed:
         R = _rotation(fields)
         t_m = fields.array(("translation", "t", "T", "tvec"), (3,)) * metres_per_unit
-    return camera(R=R, t_m=t_m, K=K, dist=dist.tolist(), image_size_wh=_image_size(fields, image_size_wh))
+    return make_camera(
+        R=R, t_m=t_m, K=K, dist=dist.tolist(), image_size_wh=_image_size(fields, image_size_wh)
+    )
 
 
 def _rotation(fields: CameraFields) -> Float[np.ndarray, "3 3"]:
@@ -96,7 +118,7 @@ def _rotation(fields: CameraFields) -> Float[np.ndarray, "3 3"]:
     turn = fields.array(names, (3,), (3, 3))
     if turn.ndim == 1:
         return Rotation.from_rotvec(turn).as_matrix()
-    if np.abs(turn @ turn.T - np.eye(3)).max() > _ROTATION or np.linalg.det(turn) < 0:
+    if np.abs(turn @ turn.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(turn) < 0:
         remedy = "its axes are mirrored" if np.linalg.det(turn) < 0 else ""
         raise fields.error(str(fields.first(*names)), "a rotation matrix", _quoted(turn.tolist()), remedy)
     return turn

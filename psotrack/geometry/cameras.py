@@ -1,14 +1,14 @@
-"""Cameras and rigs: pytrees of calibration, and the projection of world points into them.
+"""Cameras and rigs as pytrees, and the projection of world points to pixels.
 
-Conventions, used by the whole package:
+Conventions of the whole package:
 
 - World: right-handed, z up, metres. Camera: x right, y down, z forward (OpenCV).
 - `T_cam_world` maps world to camera: `x_cam = R x_world + t`. Its last column is t, not the camera's centre.
 - Pixels: (x, y) = (column, row); the centre of the first pixel is (0, 0), as in OpenCV's calibration.
-- Lens distortion is OpenCV's: (k1, k2, p1, p2[, k3[, k4, k5, k6]]); a rig without it has 0 coefficients.
+- Lens distortion is OpenCV's: (k1, k2, p1, p2[, k3[, k4, k5, k6]]); a rig without distortion has 0 coefficients.
 
-The functions follow their input: NumPy arrays give NumPy float64 (calibration, triangulation), JAX arrays and
-tracers give JAX (the tracker). There is one projection, so there is one convention.
+The functions return the kind of array that they are given: NumPy float64 in calibration and triangulation, JAX arrays
+and tracers in the tracker. Both use the same projection.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from psotrack._typing import Array
 from psotrack.errors import SettingsError
 from psotrack.geometry.camera_names import chosen_camera
 
-#: Points nearer than this to the camera's plane, or behind it, have no projection.
+#: Smallest depth of a point that has a projection, metres.
 NEAR_M = 1e-3
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Camera:
-    """One camera, or several of them along a leading axis.
+    """One camera, or several cameras along a leading axis.
 
     Attributes:
         T_cam_world: (..., 4, 4), world to camera, metres.
@@ -54,18 +54,18 @@ class Camera:
         return -(R.swapaxes(-1, -2) @ t[..., None])[..., 0]
 
     def __getitem__(self, index: Any) -> Camera:
-        """The cameras at `index` of the leading axis."""
+        """Cameras at `index` of the leading axis."""
         return jax.tree.map(lambda leaf: leaf[index], self)
 
 
 @dataclass(frozen=True)
 class CameraRig:
-    """Named cameras that stand still, with everything in float64 on the host.
+    """Named cameras that stand still; arrays are float64 on the host.
 
-    Compiled code gets `cameras`, a pytree; the names are for people, so that two rigs of equal shape share a program.
+    Compiled code gets `cameras` without the names, so that rigs of equal shape share a compiled program.
 
     Attributes:
-        names: one per camera.
+        names: one name per camera.
         cameras: a `Camera` with one leading axis.
     """
 
@@ -76,10 +76,10 @@ class CameraRig:
         return len(self.names)
 
     def select(self, names: Ordered[str]) -> CameraRig:
-        """The rig of some of the cameras, in the order of `names`.
+        """A rig of chosen cameras, in the order of `names`.
 
         Args:
-            names: of the cameras, spelt as in the rig or as their files are (`cam1i_s` for `cam1`).
+            names: names of the cameras, as in the rig or as in the names of files (`cam1i_s` for `cam1`).
 
         Raises:
             SettingsError: a name is not in the rig, a camera is named twice, or no name is given.
@@ -96,7 +96,7 @@ class CameraRig:
         return CameraRig(tuple(kept), self.cameras[np.array([self.names.index(name) for name in kept])])
 
 
-def camera(
+def make_camera(
     *,
     R: Float[np.ndarray, "3 3"],
     t_m: Float[np.ndarray, "3"],
@@ -104,23 +104,23 @@ def camera(
     image_size_wh: tuple[int, int],
     dist: Ordered[float] = (),
 ) -> Camera:
-    """One camera from its calibration, checked, in float64.
+    """Make one camera from its calibration and check the numbers; arrays are float64.
 
     Args:
         R: (3, 3), rotation from world to camera.
-        t_m: (3,), translation from world to camera in metres (not the centre).
+        t_m: (3,), translation from world to camera in metres (not the camera's centre).
         K: (3, 3), intrinsics in pixels.
         image_size_wh: width and height in pixels.
         dist: 0, 4, 5 or 8 coefficients in OpenCV's order.
 
     Raises:
-        SettingsError: R is no rotation, a number is not finite, K has no positive focal length, the image has no
-            pixels, or the number of coefficients is none that OpenCV knows.
+        SettingsError: R is not a rotation, a number is not finite, a focal length is not above 0, the image has no
+            pixels, or the number of coefficients is not 0, 4, 5 or 8.
     """
     R, t_m, K = (np.asarray(value, np.float64) for value in (R, t_m, K))
     coefficients = np.asarray(dist, np.float64)
     if not all(np.isfinite(value).all() for value in (R, t_m, K, coefficients)):
-        raise SettingsError("camera", expected="finite numbers", found="NaN or infinity")
+        raise SettingsError("make_camera", expected="finite numbers", found="NaN or infinity")
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0:
         raise SettingsError("camera.R", expected="a rotation matrix", found=f"{R.tolist()}")
     if not (K[0, 0] > 0 and K[1, 1] > 0):
@@ -136,13 +136,17 @@ def camera(
     return Camera(T, K, coefficients, np.asarray(image_size_wh, np.float64))
 
 
-def stack(named: dict[str, Camera]) -> CameraRig:
-    """A rig of single cameras; shorter distortions are padded with zeros, which change nothing."""
+def make_rig(named: dict[str, Camera]) -> CameraRig:
+    """Make a rig from single cameras by name.
+
+    Shorter lists of distortion coefficients are padded with zeros, which do not change the projection.
+    """
     if not named:
         raise SettingsError("cameras", expected="at least one camera", found="none")
-    coefficients = max(one.dist.shape[-1] for one in named.values())
+    coefficients = max(camera.dist.shape[-1] for camera in named.values())
     padded = [
-        replace(one, dist=np.pad(one.dist, (0, coefficients - one.dist.shape[-1]))) for one in named.values()
+        replace(camera, dist=np.pad(camera.dist, (0, coefficients - camera.dist.shape[-1])))
+        for camera in named.values()
     ]
     return CameraRig(tuple(named), jax.tree.map(lambda *leaves: np.stack(leaves), *padded))
 
@@ -150,10 +154,18 @@ def stack(named: dict[str, Camera]) -> CameraRig:
 def look_at(
     centre_m: Ordered[float], target_m: Ordered[float], up: Ordered[float] = (0.0, 0.0, 1.0)
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """R and t of a camera at `centre_m` whose optical axis passes through `target_m`, its image upright.
+    """R and t of a camera at `centre_m` whose optical axis passes through `target_m` and whose image is upright.
+
+    Args:
+        centre_m: position of the camera in the world, metres.
+        target_m: a point in the world, metres.
+        up: upward direction in the world.
+
+    Returns:
+        Rotation (3, 3) and translation (3,) from world to camera, metres.
 
     Raises:
-        SettingsError: the target is at the centre, or straight above or below it along `up`.
+        SettingsError: the target is at the centre, or exactly above or below the centre along `up`.
     """
     centre = np.asarray(centre_m, np.float64)
     forward = np.asarray(target_m, np.float64) - centre
@@ -172,17 +184,17 @@ def to_camera(cam: Camera, points_world: Float[Array, "*#points 3"]) -> Float[Ar
 
     Args:
         cam: cameras with leading axes (*batch).
-        points_world: (..., 3) metres; for every camera of a rig at every point, pass `points[..., None, :]`.
+        points_world: (..., 3), metres. To get every point in every camera of a rig, pass `points[..., None, :]`.
     """
     R, t = cam.T_cam_world[..., :3, :3], cam.T_cam_world[..., :3, 3]
-    # A sum over three terms, written out: a batched matmul of 3 x 3 matrices is slow everywhere.
+    # The sum over three terms is written out, because batched products of 3 x 3 matrices are slow in NumPy and JAX.
     return sum((R[..., :, j] * points_world[..., None, j] for j in range(3)), start=t)
 
 
 def to_pixels(cam: Camera, points_cam: Float[Array, "*#points 3"]) -> Float[Array, "*#points 2"]:
     """Pixels of points in camera coordinates, lens distortion included (OpenCV's `projectPoints`).
 
-    Points behind the camera get the pixels of a point at `NEAR_M`: finite, and of no meaning.
+    A point behind the camera is projected as if its depth were `NEAR_M`: its pixel is finite but has no meaning.
     """
     xp = np if isinstance(points_cam, np.ndarray) else jnp
     z = xp.maximum(points_cam[..., 2], NEAR_M)
@@ -201,15 +213,15 @@ def project(
 
     Args:
         cam: cameras with leading axes (*batch).
-        points_world: (..., 3) metres, broadcast as in `to_camera`.
+        points_world: (..., 3), metres, broadcast as in `to_camera`.
 
     Returns:
-        Pixels (..., 2), and depth (...) in metres along the optical axis. Where depth is below `NEAR_M` the point
-        has no projection and the pixels have no meaning.
+        Pixels (..., 2), and depth (...) in metres along the optical axis. A point with a depth below `NEAR_M` has no
+        projection; its pixel has no meaning.
 
     Example:
         >>> R, t = look_at((0.0, 0.0, 1.0), (5.0, 0.0, 1.0))
-        >>> one = camera(R=R, t_m=t, K=np.diag([1000.0, 1000.0, 1.0]), image_size_wh=(1920, 1080))
+        >>> one = make_camera(R=R, t_m=t, K=np.diag([1000.0, 1000.0, 1.0]), image_size_wh=(1920, 1080))
         >>> project(one, np.array([5.0, -0.5, 1.0]))[0].round(6).tolist()
         [100.0, 0.0]
     """
@@ -220,7 +232,12 @@ def project(
 def distort(
     cam: Camera, x: Float[Array, "*#points"], y: Float[Array, "*#points"]
 ) -> tuple[Float[Array, "*#points"], Float[Array, "*#points"]]:
-    """Normalised image coordinates as the lens bends them: OpenCV's rational and tangential model."""
+    """Distorted normalised image coordinates by OpenCV's rational and tangential lens model.
+
+    Args:
+        cam: cameras with leading axes (*batch).
+        x, y: (...), undistorted normalised image coordinates.
+    """
     coefficients = cam.dist.shape[-1]
     if coefficients == 0:
         return x, y
@@ -238,7 +255,13 @@ def distort(
 def undistort(
     cam: Camera, pixels: Float[np.ndarray, "*#points 2"], num_iterations: int = 20
 ) -> Float[np.ndarray, "*#points 2"]:
-    """Normalised image coordinates of pixels with the lens undone, by OpenCV's fixed-point iteration, in float64."""
+    """Undistorted normalised image coordinates of pixels, by OpenCV's fixed-point iteration, in float64.
+
+    Args:
+        cam: cameras with leading axes (*batch).
+        pixels: (..., 2), distorted pixels.
+        num_iterations: iterations of the undistortion.
+    """
     K = cam.K
     v = (pixels[..., 1] - K[..., 1, 2]) / K[..., 1, 1]
     u = (pixels[..., 0] - K[..., 0, 2] - K[..., 0, 1] * v) / K[..., 0, 0]

@@ -1,8 +1,8 @@
 """`cameras_calibration.csv` of the DPJAIT dataset: one camera per line.
 
-`cam_x/y/z` is the translation t of x_cam = R X + t, not the camera's centre -Rᵀ t; `cam_or_x/y/z` is the
-Rodrigues vector of R (world to camera); `focal_length`, `cx`, `cy` are in pixels; `coeff_1..4`, where they
-are given, are OpenCV's k1, k2, p1, p2. Lengths are in the unit that the header names, millimetres or metres.
+`cam_x/y/z` is the translation t of x_cam = R X + t, not the camera's centre -Rᵀ t. `cam_or_x/y/z` is the Rodrigues
+vector of R (world to camera). `focal_length`, `cx`, `cy` are in pixels. `coeff_1..4` are OpenCV's k1, k2, p1, p2; a
+file may lack them. The header names the unit of lengths, millimetres or metres.
 """
 
 from __future__ import annotations
@@ -17,19 +17,20 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry.camera_names import camera_key
-from psotrack.geometry.cameras import Camera, CameraRig, camera, stack
+from psotrack.geometry.cameras import Camera, CameraRig, make_camera, make_rig
 from psotrack.support import Column, Table, TextRow, read_table, write_rows
 
-LENGTHS = {"m": 1.0, "mm": 1e-3}
-ANGLES = {"rad": 1.0, "": 1.0, "deg": np.pi / 180}
+#: Units of lengths in the headers of the dataset's tables.
+METRES_PER_UNIT = {"m": 1.0, "mm": 1e-3}
+_RADIANS_PER_UNIT = {"rad": 1.0, "": 1.0, "deg": np.pi / 180}
 _MOST_COEFFICIENTS = 4
 
 
-def read_names(path: Path) -> tuple[str, ...]:
-    """The names of the cameras in a calibration.
+def read_camera_names(path: Path | str) -> tuple[str, ...]:
+    """Read the names of the cameras from a calibration file.
 
     Raises:
-        InputError: as of `read_calibration`.
+        InputError: the file cannot be read, has no column `cam_name`, or names a camera twice.
     """
     table = read_table(path)
     column = table.column("cam_name")
@@ -42,48 +43,53 @@ def read_names(path: Path) -> tuple[str, ...]:
     return tuple(names.values())
 
 
-def read_calibration(path: Path, image_sizes_wh: Mapping[str, tuple[int, int]]) -> CameraRig:
-    """The cameras of a calibration, in metres.
+def read_calibration(path: Path | str, image_sizes_wh: Mapping[str, tuple[int, int]]) -> CameraRig:
+    """Read the cameras of a calibration file, in metres.
 
     Args:
-        path: of the file.
-        image_sizes_wh: width and height in pixels by camera name, because the file has none.
+        path: path of the file.
+        image_sizes_wh: width and height of the images in pixels, by camera name; the file does not have them.
 
     Raises:
-        InputError: the file cannot be read, a column is missing, a value is no finite number, a camera is
-            there twice, or a focal length is not above 0. The message names line and column.
+        InputError: the file cannot be read, a column is missing, a value is not a finite number, a camera occurs
+            twice, or a focal length is not above 0. The message names line and column.
     """
-    names = read_names(path)
+    names = read_camera_names(path)
     table = read_table(path)
     translation = [table.column(f"cam_{axis}") for axis in "xyz"]
     rotation = [table.column(f"cam_or_{axis}") for axis in "xyz"]
-    metres = np.array([table.factor(column, LENGTHS) for column in translation])
-    radians = np.array([table.factor(column, ANGLES) for column in rotation])
+    metres = np.array([table.factor(column, METRES_PER_UNIT) for column in translation])
+    radians = np.array([table.factor(column, _RADIANS_PER_UNIT) for column in rotation])
     coefficients = _coefficient_columns(table)
     cameras = {}
     for name, row in zip(names, table.rows, strict=True):
-        cameras[name] = camera(
+        cameras[name] = make_camera(
             R=Rotation.from_rotvec(_numbers(row, rotation) * radians).as_matrix(),
             t_m=_numbers(row, translation) * metres,
             K=_intrinsics(table, row),
             dist=_numbers(row, coefficients).tolist(),
             image_size_wh=image_sizes_wh[name],
         )
-    return stack(cameras)
+    return make_rig(cameras)
 
 
-def write_calibration(path: Path, rig: CameraRig, unit: Literal["m", "mm"] = "m") -> None:
-    """Write a rig so that `read_calibration` gives it back to 1e-12.
+def write_calibration(path: Path | str, rig: CameraRig, unit: Literal["m", "mm"] = "m") -> None:
+    """Write a rig to a calibration file; `read_calibration` reads the same numbers to 1e-12.
 
-    Distortion columns are written where a camera has distortion, as in the real half of the dataset; the
-    simulated half has none.
+    Distortion columns are written if a camera has distortion, as in the real half of the dataset. The simulated half
+    has no such columns.
+
+    Args:
+        path: path of the file.
+        rig: the cameras.
+        unit: unit of lengths in the file.
 
     Raises:
-        SettingsError: the layout cannot hold the rig: two focal lengths, skew, or more coefficients.
+        SettingsError: the layout cannot hold the rig: a camera has two focal lengths, skew, or coefficients beyond p2.
         OutputError: the file cannot be written.
     """
-    if unit not in LENGTHS:
-        raise SettingsError("unit", expected=" or ".join(LENGTHS), found=unit)
+    if unit not in METRES_PER_UNIT:
+        raise SettingsError("unit", expected=" or ".join(METRES_PER_UNIT), found=unit)
     _check_writable(rig)
     num_coefficients = min(rig.cameras.dist.shape[-1], _MOST_COEFFICIENTS) if rig.cameras.dist.any() else 0
     header = [
@@ -100,13 +106,13 @@ def write_calibration(path: Path, rig: CameraRig, unit: Literal["m", "mm"] = "m"
 
 
 def _calibration_row(rig: CameraRig, index: int, unit: str, num_coefficients: int) -> list[object]:
-    one: Camera = rig.cameras[index]
+    camera: Camera = rig.cameras[index]
     return [
         rig.names[index],
-        *(one.T_cam_world[:3, 3] / LENGTHS[unit]),
-        *Rotation.from_matrix(one.T_cam_world[:3, :3]).as_rotvec(),
-        *(one.K[0, 0], one.K[0, 2], one.K[1, 2]),
-        *one.dist[:num_coefficients],
+        *(camera.T_cam_world[:3, 3] / METRES_PER_UNIT[unit]),
+        *Rotation.from_matrix(camera.T_cam_world[:3, :3]).as_rotvec(),
+        *(camera.K[0, 0], camera.K[0, 2], camera.K[1, 2]),
+        *camera.dist[:num_coefficients],
     ]
 
 
@@ -130,15 +136,15 @@ def _intrinsics(table: Table, row: TextRow) -> Float[np.ndarray, "3 3"]:
 
 
 def _coefficient_columns(table: Table) -> list[Column]:
-    """k1, k2, p1, p2, all or none."""
-    there = [column for column in table.columns if column.name.startswith("coeff")]
-    if not there:
+    """The columns of k1, k2, p1, p2, or an empty list."""
+    present = [column for column in table.columns if column.name.startswith("coeff")]
+    if not present:
         return []
-    if len(there) > _MOST_COEFFICIENTS:
+    if len(present) > _MOST_COEFFICIENTS:
         raise InputError(
             table.path,
             expected=f"{_MOST_COEFFICIENTS} distortion coefficients",
-            found=f"{len(there)}: {', '.join(column.header for column in there)}",
+            found=f"{len(present)}: {', '.join(column.header for column in present)}",
         )
     return [table.column(f"coeff_{number + 1}") for number in range(_MOST_COEFFICIENTS)]
 

@@ -1,16 +1,16 @@
-"""Rigs on disk: the DPJAIT dataset's CSV, the TOML of anipose and caliscope, and OpenCV's YAML.
+"""Rig files: the DPJAIT dataset's CSV, the TOML of anipose and caliscope, and OpenCV's YAML.
 
-All of them map world to camera, x_cam = R X + t, as `psotrack.geometry` does; t is not the camera's centre. Written
-lengths are metres.
+All formats map world to camera, x_cam = R X + t, as `psotrack.geometry` does; t is not the camera's centre. Lengths are
+written in metres.
 
-- CSV: see `datasets._calibration`. One focal length per camera, no skew, k1, k2, p1, p2 and no more; no image sizes.
-- TOML: a table per camera with `name`, `size`, `matrix`, `distortions`, `rotation` (a Rodrigues vector; 3 x 3 is read
-  too) and `translation`: `[cam_0]`, ... and `[metadata]` of anipose, `[cameras.0]`, ... of caliscope's
-  `camera_array.toml`, which is written where the file is called so.
+- CSV: see `geometry.dpjait_calibration`. One focal length per camera, no skew, only k1, k2, p1, p2; no image sizes.
+- TOML: a table per camera with `name`, `size`, `matrix`, `distortions`, `rotation` (a Rodrigues vector; a 3 x 3 matrix
+  can be read too) and `translation`. The tables are `[cam_0]`, ... and `[metadata]` in files of anipose,
+  `[cameras.0]`, ... in files of caliscope. A file whose name starts with `camera_array` is written as caliscope's.
 - YAML: a sequence `cameras` of maps with `name`, `image_size`, `K`, `D`, `R` (3 x 3) and `t`.
 
-Numbers are written with all their digits. What is given back is the same to the last bit, but for rotations that pass
-through Rodrigues vectors, 1e-15.
+Numbers are written with all their digits. Reading gives the same bits; only rotations that are written as Rodrigues
+vectors may differ by 1e-15.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, OutputError
 from psotrack.geometry.camera_fields import CameraFields, camera_from_fields
-from psotrack.geometry.cameras import Camera, CameraRig, stack
+from psotrack.geometry.cameras import Camera, CameraRig, make_rig
 from psotrack.geometry.dpjait_calibration import read_calibration, write_calibration
 from psotrack.support import atomic_write, read_text, read_toml, refuse_to_overwrite
 
-#: caliscope's name for its file; any other TOML is anipose's.
+#: Beginning of the name of caliscope's files. TOML files with other names are written as anipose's.
 _CALISCOPE = "camera_array"
 
 
 def read_rig(
-    path: Path, image_size_wh: tuple[int, int] | None = None, *, metres_per_unit: float = 1.0
+    path: Path | str, image_size_wh: tuple[int, int] | None = None, *, metres_per_unit: float = 1.0
 ) -> CameraRig:
-    """The cameras of a file, in metres.
+    """Read the cameras of a rig file, in metres.
 
     Args:
-        path: ends in .csv, .toml, .yml or .yaml.
-        image_size_wh: width and height in pixels, for files that have none.
-        metres_per_unit: of a TOML or YAML, which do not name their unit; a CSV does.
+        path: path that ends in .csv, .toml, .yml or .yaml.
+        image_size_wh: width and height of the images in pixels, for files without image sizes.
+        metres_per_unit: length unit of a TOML or YAML file, metres; a CSV file names its unit.
 
     Raises:
         InputError: the file cannot be read, or a field is missing or wrong; the message names file and field.
@@ -53,27 +53,27 @@ def read_rig(
     return _read(Path(path), image_size_wh, metres_per_unit, placed=True)
 
 
-def read_lenses(path: Path, image_size_wh: tuple[int, int] | None = None) -> CameraRig:
-    """The cameras of a file as if all stood at the world's origin: their lenses alone.
+def read_lenses(path: Path | str, image_size_wh: tuple[int, int] | None = None) -> CameraRig:
+    """Read only the lenses of a rig file: all cameras stand at the world's origin.
 
-    Arguments and errors are those of `read_rig`, but the poses may be missing.
+    Arguments and errors are those of `read_rig`, but the file need not have poses.
     """
     rig = _read(Path(path), image_size_wh, 1.0, placed=False)
     origin = np.tile(np.eye(4), (len(rig), 1, 1))
     return CameraRig(rig.names, replace(rig.cameras, T_cam_world=origin))
 
 
-def write_rig(path: Path, rig: CameraRig, *, force: bool = False) -> None:
-    """Write a rig; the suffix says how.
+def write_rig(path: Path | str, rig: CameraRig, *, force: bool = False) -> None:
+    """Write a rig to a file; the suffix of the path selects the format.
 
     Args:
-        path: ends in .csv, .toml, .yml or .yaml.
-        rig: to write.
+        path: path that ends in .csv, .toml, .yml or .yaml.
+        rig: the cameras.
         force: replace an existing file.
 
     Raises:
-        InputError: the suffix is another one.
-        SettingsError: a CSV cannot hold the rig.
+        InputError: the path has another suffix.
+        SettingsError: the rig does not fit into a CSV file.
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
     path = Path(path)
@@ -99,22 +99,22 @@ def _read(
         cameras[name] = camera_from_fields(fields, image_size_wh, metres_per_unit, placed)
     if not cameras:
         raise InputError(path, expected="at least one camera", found="none")
-    return stack(cameras)
+    return make_rig(cameras)
 
 
 def _read_csv(path: Path, image_size_wh: tuple[int, int] | None) -> CameraRig:
     if image_size_wh is None:
         raise InputError(
             path,
-            expected="the size of the images, which this layout has not",
-            found="none",
+            expected="the size of the images",
+            found="a layout without image sizes",
             remedy="pass --size",
         )
     return read_calibration(path, defaultdict(lambda: image_size_wh))
 
 
 def _toml_fields(path: Path) -> Iterator[tuple[str, CameraFields]]:
-    """The tables of the cameras, anipose's or caliscope's, with their names."""
+    """Names and tables of the cameras in a file of anipose or caliscope."""
     data = read_toml(path)
     nested = data.get("cameras")
     tables = nested if isinstance(nested, dict) else data
@@ -122,7 +122,7 @@ def _toml_fields(path: Path) -> Iterator[tuple[str, CameraFields]]:
     for key, table in tables.items():
         if isinstance(table, dict) and table.get("ignore") is True:
             continue
-        # Other tables are a program's own: metadata, charuco, and what else there may come.
+        # Other tables, such as metadata or charuco, belong to the program that wrote the file.
         if not isinstance(table, dict) or key == "metadata" or "matrix" not in table:
             if prefix or re.fullmatch(r"cam_\w+", key):
                 values = table if isinstance(table, dict) else {}
@@ -134,20 +134,20 @@ def _toml_fields(path: Path) -> Iterator[tuple[str, CameraFields]]:
 
 
 def _yaml_fields(path: Path) -> Iterator[tuple[str, CameraFields]]:
-    """The maps of the cameras, in a sequence `cameras`, or one camera alone as OpenCV's own samples write it."""
+    """Names and maps of the cameras: a sequence `cameras`, or a single camera as OpenCV's samples write it."""
     text = read_text(path)
-    # OpenCV knows the format by its first line.
+    # OpenCV recognises the format by the first line.
     header = "" if text.startswith("%YAML") else "%YAML:1.0\n---\n"
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         storage = cv2.FileStorage(header + text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         content = _values(storage.root())
     except (cv2.error, SystemError) as error:
-        # Its constructor wraps OpenCV's error, whose first lines are code.
+        # The last line of OpenCV's error is the reason; the lines before are source code.
         reason = str(error.__cause__ or error).strip().splitlines()[-1].rstrip("'")
         line = re.search(r"\((\d+)\): (.*)", reason)
         where = f"{path}, line {int(line[1]) - header.count(chr(10))}" if line else path
-        found = f"what is none ({line[2] if line else reason})"
+        found = f"an error ({line[2] if line else reason})"
         raise InputError(where, expected="OpenCV's YAML", found=found) from None
     finally:
         cv2.utils.logging.setLogLevel(level)
@@ -156,8 +156,8 @@ def _yaml_fields(path: Path) -> Iterator[tuple[str, CameraFields]]:
     if not isinstance(cameras, list):
         yield path.stem, CameraFields(path, "camera", values)
         return
-    for index, one in enumerate(cameras):
-        fields = CameraFields(path, f"cameras[{index}]", one if isinstance(one, dict) else {})
+    for index, item in enumerate(cameras):
+        fields = CameraFields(path, f"cameras[{index}]", item if isinstance(item, dict) else {})
         name = fields.first("name")
         if name is None:
             raise fields.error("name", "a name", "none")
@@ -165,9 +165,9 @@ def _yaml_fields(path: Path) -> Iterator[tuple[str, CameraFields]]:
 
 
 def _values(node: Any) -> Any:
-    """A node of OpenCV's file storage as dictionaries, lists, arrays, numbers and text."""
+    """Convert a node of OpenCV's file storage to dictionaries, lists, arrays, numbers and text."""
     if node.isMap():
-        inner = {key: node.getNode(key) for key in node.keys()}  # noqa: SIM118 - it is no dictionary
+        inner = {key: node.getNode(key) for key in node.keys()}  # noqa: SIM118 - a FileNode is not iterable
         if {"rows", "cols", "dt", "data"} <= set(inner):
             return node.mat()
         return {key: _values(value) for key, value in inner.items()}
@@ -180,24 +180,24 @@ def _values(node: Any) -> Any:
 
 def _write_toml(path: Path, rig: CameraRig) -> None:
     caliscope = path.name.startswith(_CALISCOPE)
-    # anipose sorts the tables by their names as text: cam_10 would come before cam_2.
+    # Numbers have leading zeros, because anipose sorts the tables by name: cam_10 would come before cam_2.
     digits = len(str(len(rig) - 1))
     blocks = []
     for index, name in enumerate(rig.names):
-        one = rig.cameras[index]
+        camera = rig.cameras[index]
         fields: dict[str, Any] = {"cam_id": index} if caliscope else {}
         fields |= {
             "name": name,
-            "size": [int(side) for side in one.image_size_wh],
-            "matrix": one.K.tolist(),
-            # anipose wants some; zeros change nothing.
-            "distortions": one.dist.tolist() or [0.0] * 5,
-            "rotation": Rotation.from_matrix(one.T_cam_world[:3, :3]).as_rotvec().tolist(),
-            "translation": one.T_cam_world[:3, 3].tolist(),
+            "size": [int(side) for side in camera.image_size_wh],
+            "matrix": camera.K.tolist(),
+            # anipose needs coefficients; zeros mean no distortion.
+            "distortions": camera.dist.tolist() or [0.0] * 5,
+            "rotation": Rotation.from_matrix(camera.T_cam_world[:3, :3]).as_rotvec().tolist(),
+            "translation": camera.T_cam_world[:3, 3].tolist(),
         }
         fields |= {"rotation_count": 0, "fisheye": False} if caliscope else {}
         header = f"[cameras.{index}]" if caliscope else f"[cam_{index:0{digits}d}]"
-        # A list or text of JSON is one of TOML.
+        # Lists and texts in JSON are valid TOML.
         lines = [header, *(f"{key} = {json.dumps(value)}" for key, value in fields.items())]
         blocks.append("\n".join(lines))
     if not caliscope:
@@ -210,20 +210,22 @@ def _write_yaml(path: Path, rig: CameraRig) -> None:
     with atomic_write(path) as temporary:
         storage = cv2.FileStorage(str(temporary), cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_FORMAT_YAML)
         if not storage.isOpened():
-            raise OutputError(path, expected="to write it", found="a folder that cannot be written")
+            raise OutputError(
+                path, expected="a path that can be written", found="a folder that cannot be written"
+            )
         storage.startWriteStruct("cameras", cv2.FILE_NODE_SEQ)
         for index, name in enumerate(rig.names):
-            one = rig.cameras[index]
+            camera = rig.cameras[index]
             storage.startWriteStruct("", cv2.FILE_NODE_MAP)
-            # In quotes it is taken as it is; without them, true and null would be no names.
+            # In quotes, because OpenCV would read the names true and null as values.
             storage.write("name", json.dumps(name, ensure_ascii=False))
-            # Columns, because OpenCV 4 has no arrays of one axis.
+            # Vectors become columns, because OpenCV 4 has no arrays with camera axis.
             arrays = {
-                "image_size": one.image_size_wh.astype(np.int32)[:, None],
-                "K": one.K,
-                "D": one.dist[:, None],
-                "R": one.T_cam_world[:3, :3],
-                "t": one.T_cam_world[:3, 3:],
+                "image_size": camera.image_size_wh.astype(np.int32)[:, None],
+                "K": camera.K,
+                "D": camera.dist[:, None],
+                "R": camera.T_cam_world[:3, :3],
+                "t": camera.T_cam_world[:3, 3:],
             }
             for key, array in arrays.items():
                 if array.size:

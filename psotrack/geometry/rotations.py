@@ -1,4 +1,4 @@
-"""Rotation matrices of quaternions, and the matrices of small turns."""
+"""Rotation matrices from quaternions, and skew-symmetric matrices of cross products."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 
 def rotation_matrices(orientation_wxyz: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:
-    """The matrices of quaternions; NaN where one is not known."""
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4), w first; NaN for a quaternion with NaN."""
     known = np.isfinite(orientation_wxyz).all(axis=-1)
     matrices = np.full((*known.shape, 3, 3), np.nan)
     matrices[known] = Rotation.from_quat(orientation_wxyz[known], scalar_first=True).as_matrix()
@@ -16,7 +16,7 @@ def rotation_matrices(orientation_wxyz: Float[np.ndarray, "*batch 4"]) -> Float[
 
 
 def cross_matrices(vectors: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
-    """[v] with [v] w = v x w."""
+    """Skew-symmetric matrices [v] of vectors v, with [v] w = v x w."""
     matrices = np.zeros((*vectors.shape, 3))
     matrices[..., [2, 0, 1], [1, 2, 0]] = vectors
     return matrices - matrices.swapaxes(-1, -2)

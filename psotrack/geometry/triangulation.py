@@ -1,7 +1,7 @@
-"""Projection lines: points in space from the pixels of several cameras, in float64 (paper, equations 1-6).
+"""Triangulation: points in space from the pixels of several cameras, in float64 (paper, equations 1-6).
 
-Each camera that sees a point adds two linear equations in its three unknown coordinates; the overdetermined system is
-solved in the least-squares sense. The lens is undone first, so that the equations are linear.
+Each camera that sees a point adds two linear equations in the point's three coordinates. The overdetermined system is
+solved by least squares. Pixels are undistorted first, so that the equations are linear.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack.geometry.cameras import Camera, project, undistort
 
-#: Rays that fix a point less well than this are parallel.
+#: Largest condition number of the normal equations; beyond this number the rays count as parallel.
 MAX_CONDITION = 1e12
-#: Points in one cube with such sides are the same.
+#: Side of the cubes in which only one candidate point is kept, metres: below the accuracy of the candidates.
 SAME_M = 0.01
 
 
@@ -27,15 +27,16 @@ def triangulate(
     """World points from pixels, by the normal equations of (3)-(6) in normalised image coordinates.
 
     Args:
-        cameras: with one leading axis.
-        points_px: (..., cameras, 2); NaN where a camera does not see the point.
-        weights: (..., cameras), how much each camera's two equations count; 1 where not given.
+        cameras: cameras with one leading axis.
+        points_px: (..., cameras, 2), pixels; NaN if a camera does not see the point.
+        weights: (..., cameras), weight of each camera's two equations; None: 1.
 
     Returns:
-        (..., 3), world, metres; NaN where fewer than two cameras see the point, or all their rays are parallel.
+        (..., 3), positions in the world, metres; NaN if fewer than two cameras see the point, or if all rays are
+        parallel.
     """
     normal, right, seen = _normal_equations(cameras, points_px, weights)
-    return np.where(seen.sum(axis=-1, keepdims=True) >= 2, solve_normal(normal, right), np.nan)
+    return np.where(seen.sum(axis=-1, keepdims=True) >= 2, solve_normal_equations(normal, right), np.nan)
 
 
 def triangulate_paths(
@@ -47,22 +48,23 @@ def triangulate_paths(
     noise_m: float = 0.02,
     expected: tuple[float, ...] = (3.0, 2.0),
 ) -> Float[np.ndarray, "*paths terms 3"]:
-    """Paths of points that move, X(t) = Σ c_k t^k, from all of their pixels at once.
+    """Polynomial paths of moving points, X(t) = Σ c_k t^k, from the pixels of all frames together.
 
-    The equations of `triangulate` with X(t) in place of X, and one for each motion: c_k is about 0, give or take
-    `expected`. So frames in which fewer than two cameras see the point count too, and short paths are straight.
+    The equations are those of `triangulate` with X(t) in place of X, and one prior per coefficient: c_k is normal with
+    mean 0 and standard deviation `expected`. Frames in which only one camera sees the point therefore count too, and
+    short paths are straight.
 
     Args:
-        cameras: with one leading axis.
-        points_px: (..., frames, cameras, 2); NaN where a camera does not see the point.
-        time_s: (frames,).
-        weights: (..., frames, cameras), how much each camera's two equations count; 1 where not given.
+        cameras: cameras with one leading axis.
+        points_px: (..., frames, cameras, 2), pixels; NaN if a camera does not see the point.
+        time_s: (frames,), times of the frames, seconds.
+        weights: (..., frames, cameras), weight of each camera's two equations; None: 1.
         noise_m: standard deviation of a camera's equations, in metres at the point.
-        expected: standard deviations of c_1, c_2 ... in m/s, m/s² ...; as many as the path has.
+        expected: standard deviations of c_1, c_2 ..., m/s, m/s² ...; their number is the degree of the path.
 
     Returns:
-        (..., 1 + len(expected), 3), c_0, c_1 ..., metres and seconds; NaN where fewer than two cameras see the point
-        at any time, or all their rays are parallel.
+        (..., 1 + len(expected), 3), coefficients c_0, c_1 ..., metres and seconds; NaN if fewer than two cameras ever
+        see the point, or if all rays are parallel.
     """
     normal, right, seen = _normal_equations(cameras, points_px, weights)
     solvable = seen.any(axis=-2).sum(axis=-1) >= 2
@@ -85,16 +87,16 @@ def projection_equations(
     Float[np.ndarray, "*points cameras 2"],
     Bool[np.ndarray, "*points cameras"],
 ]:
-    """Rows (3) of the paper, L X = B, with lens and K undone: (x r3 - r1) X = t1 - x t3, and the same for y.
+    """Linear equations L X = B of the paper (3) in normalised coordinates: (x r3 - r1) X = t1 - x t3, likewise for y.
 
     Args:
-        cameras: with one leading axis.
-        points_px: (..., cameras, 2); NaN where a camera does not see the point.
-        num_iterations: that undo the lens, see `undistort`.
+        cameras: cameras with one leading axis.
+        points_px: (..., cameras, 2), pixels; NaN if a camera does not see the point.
+        num_iterations: iterations of `undistort`.
 
     Returns:
-        L (..., cameras, 2, 3), B (..., cameras, 2), and which cameras see the points (..., cameras). Rows of a camera
-        that does not are finite, and of no meaning.
+        L (..., cameras, 2, 3), B (..., cameras, 2), and a mask (..., cameras) of the cameras that see the points. The
+        rows of the other cameras are finite but have no meaning.
     """
     normalised = undistort(cameras, points_px, num_iterations)
     seen = np.isfinite(normalised).all(axis=-1)
@@ -111,26 +113,26 @@ def _normal_equations(
 ) -> tuple[
     Float[np.ndarray, "*points 3 3"], Float[np.ndarray, "*points 3"], Bool[np.ndarray, "*points cameras"]
 ]:
-    """Left and right side of the normal equations, summed over the cameras, and which cameras see the points."""
+    """Left and right side of the normal equations, summed over cameras, and which cameras see the points."""
     rows, right, seen = projection_equations(cameras, points_px)
     weights = seen * (1.0 if weights is None else weights)
     normal = np.einsum("...c,...cik,...cil->...kl", weights, rows, rows)
     return normal, np.einsum("...c,...cik,...ci->...k", weights, rows, right), seen
 
 
-def solve_normal(
+def solve_normal_equations(
     normal: Float[np.ndarray, "*points 3 3"], right: Float[np.ndarray, "*points 3"]
 ) -> Float[np.ndarray, "*points 3"]:
-    """(..., 3), where the normal equations hold; NaN where they fix no point."""
+    """(..., 3), solutions of normal equations; NaN if the equations are singular."""
     solvable = np.linalg.cond(normal) < MAX_CONDITION
     point = np.linalg.solve(np.where(solvable[..., None, None], normal, np.eye(3)), right[..., None])
     return np.where(solvable[..., None], point[..., 0], np.nan)
 
 
 def viewpoints(cameras: Camera, nearest_m: float = 0.3) -> Int[np.ndarray, "cameras"]:
-    """Number of the viewpoint of each camera: cameras nearer than `nearest_m` to one another share one.
+    """Viewpoint number of each camera, (cameras,): cameras nearer to each other than `nearest_m` share a number.
 
-    Two cameras that stand beside each other see a drone twice but locate it hardly better than one.
+    Two cameras beside each other locate a drone hardly better than one camera.
     """
     centre = cameras.centre_world
     label = np.arange(len(centre))
@@ -149,26 +151,26 @@ def match_views(
     min_viewpoints: int = 3,
     separation_m: float = 0.3,
 ) -> tuple[Float[np.ndarray, "found 3"], Int[np.ndarray, "found cameras"]]:
-    """Points in space that explain 2D points of several cameras, when nobody says which belong together.
+    """Points in space from 2D points of several cameras whose correspondence is unknown.
 
-    Every pair of 2D points from two viewpoints proposes a point in space; a proposal is supported by the cameras that
-    have a 2D point within its radius of where it projects to. Proposals are accepted greedily, best supported first.
-    Each must have `min_viewpoints` 2D points of its own that no accepted one has used: two views alone cannot tell
-    real drones from the crossings of different drones' rays.
+    Every pair of 2D points from two viewpoints proposes a point in space. A camera supports a proposal if one of its 2D
+    points lies within the radius of the proposal's projection. Proposals are accepted greedily, the one with most
+    support first. An accepted proposal needs unused 2D points from `min_viewpoints` viewpoints, because two views
+    cannot distinguish a real drone from a crossing of two drones' rays.
 
     Args:
-        cameras: with one leading axis.
-        points_px: for each camera (n, 2), n may be 0.
-        radius_px: for each camera (n,), how far from the 2D point a projection still fits.
-        bounds_m: (2, 3), corners of the region where points are sought.
-        min_viewpoints: least number of viewpoints (see `viewpoints`).
-        separation_m: no two points are nearer than this.
+        cameras: cameras with one leading axis.
+        points_px: for each camera (n, 2), pixels; n may be 0.
+        radius_px: for each camera (n,), largest distance between the 2D point and a projection, pixels.
+        bounds_m: (2, 3), lowest and highest corner of the searched region, metres.
+        min_viewpoints: smallest number of viewpoints (see `viewpoints`).
+        separation_m: smallest distance between two accepted points, metres.
 
     Returns:
-        (found, 3) points, and (found, cameras) the index of the 2D point that each camera sees it at, or -1.
+        (found, 3) positions, metres, and (found, cameras) the index of each camera's 2D point, or -1.
     """
     viewpoint = viewpoints(cameras)
-    proposals, support = candidates(cameras, points_px, radius_px, bounds_m)
+    proposals, support = triangulate_candidates(cameras, points_px, radius_px, bounds_m)
     found: list[int] = []
     free = support >= 0
     while len(proposals):
@@ -185,23 +187,24 @@ def match_views(
     return proposals[found], support[found]
 
 
-def candidates(
+def triangulate_candidates(
     cameras: Camera,
     points_px: list[Float[np.ndarray, "_ 2"]],
     radius_px: list[Float[np.ndarray, "_"]],
     bounds_m: Float[np.ndarray, "2 3"],
 ) -> tuple[Float[np.ndarray, "candidates 3"], Int[np.ndarray, "candidates cameras"]]:
-    """Every point in space that 2D points of two viewpoints or more agree on; most of them are nothing's place.
+    """Every point in space that 2D points of at least two viewpoints support, false crossings of rays included.
 
-    Arguments and results are those of `match_views`; of candidates in one cube with sides of `SAME_M` one is kept.
+    Arguments and results are those of `match_views`. One candidate is kept in each cube with sides of `SAME_M`.
     """
     points = _proposals(cameras, points_px, viewpoints(cameras))
-    # From two rays to all that agree. What fits badly counts little: the middle of a blob that two drones share.
+    # Each pass triangulates from all supporting cameras. A 2D point that fits badly, such as the middle of a blob that
+    # two drones share, gets a small weight.
     for _ in range(3):
         points = points[_within(points, bounds_m)]
         support, fit = _support(cameras, points, points_px, radius_px)
         points = triangulate(cameras, _pick(points_px, support), fit**2)
-    # Not a number is not within either.
+    # NaN is not within the bounds either.
     kept = np.flatnonzero(_within(points, bounds_m))
     _, first = np.unique(np.round(points[kept] / SAME_M), axis=0, return_index=True)
     return points[kept[first]], support[kept[first]]
@@ -216,7 +219,7 @@ def _within(
 def _proposals(
     cameras: Camera, points_px: list[Float[np.ndarray, "_ 2"]], viewpoint: Int[np.ndarray, "cameras"]
 ) -> Float[np.ndarray, "proposals 3"]:
-    """A point for every pair of 2D points from two viewpoints."""
+    """One point for every pair of 2D points from two viewpoints."""
     proposals = [np.empty((0, 3))]
     for a, b in combinations(range(len(points_px)), 2):
         if viewpoint[a] != viewpoint[b] and len(points_px[a]) and len(points_px[b]):
@@ -233,7 +236,10 @@ def _support(
     points_px: list[Float[np.ndarray, "_ 2"]],
     radius_px: list[Float[np.ndarray, "_"]],
 ) -> tuple[Int[np.ndarray, "proposals cameras"], Float[np.ndarray, "proposals cameras"]]:
-    """Index of the nearest 2D point of each camera that fits the proposal, or -1; and how well it fits, 1 to 0."""
+    """Each camera's supporting 2D point of each proposal: its index or -1, and a fit from 1 (exact) to 0.
+
+    The supporting 2D point is the nearest one, if the proposal's projection lies within its radius.
+    """
     pixels, depth = project(cameras, proposals[:, None, :])
     support, fit = np.full(depth.shape, -1), np.zeros(depth.shape)
     for camera, (points, radius) in enumerate(zip(points_px, radius_px, strict=True)):
@@ -251,7 +257,7 @@ def _support(
 def _pick(
     points_px: list[Float[np.ndarray, "_ 2"]], support: Int[np.ndarray, "proposals cameras"]
 ) -> Float[np.ndarray, "proposals cameras 2"]:
-    """The 2D points that support each proposal, NaN where a camera has none."""
+    """2D points that support each proposal; NaN for a camera without support."""
     picked = np.full((*support.shape, 2), np.nan)
     for camera, points in enumerate(points_px):
         rows = np.flatnonzero(support[:, camera] >= 0)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from psotrack.geometry import Camera, candidates, project, triangulate_paths, viewpoints
+from psotrack.geometry import Camera, project, triangulate_candidates, triangulate_paths, viewpoints
 from psotrack.silhouettes import ViewBlobs
 
 #: A blob that is so many times wider than what the other cameras see holds more than the drone; narrower, less.
@@ -197,7 +197,7 @@ def _points(
     whole, radius = seen.whole[frame], seen.radius_px[frame]
     points_px = [seen.centre_px[frame, camera, there] for camera, there in enumerate(whole)]
     radius_px = [of[there] for of, there in zip(radius, whole, strict=True)]
-    points, support = candidates(cameras, points_px, radius_px, bounds_m)
+    points, support = triangulate_candidates(cameras, points_px, radius_px, bounds_m)
     views = by_viewpoint(support >= 0, viewpoints(cameras)).sum(axis=-1)
     return points[np.argsort(-views, kind="stable")[:MOST_POINTS]]
 

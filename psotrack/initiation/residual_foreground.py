@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from psotrack.geometry import Boxes, Camera, extents, project, project_boxes, triangulate
+from psotrack.geometry import Boxes, Camera, make_extents, project, project_boxes, triangulate
 
 #: Known drones explain their ellipse, so much larger and so many cells wider: outlines are no ellipses, rotors blur.
 EXPLAINED, EXPLAINED_CELLS = 1.3, 1.5
@@ -234,7 +234,7 @@ def _ellipses(
 def _boxes(
     cameras: Camera, size_m: Float[jax.Array, "drones 3"], position_m: Float[jax.Array, "frames drones 3"]
 ) -> Boxes:
-    return project_boxes(extents(cameras, size_m), position_m)
+    return project_boxes(make_extents(cameras, size_m), position_m)
 
 
 def _meets(

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from psotrack.calibration import lens_of_view
 from psotrack.datasets.dpjait import read_onboard_calibration
 from psotrack.errors import InputError, SettingsError
-from psotrack.geometry import Camera, CameraRig, camera, read_lenses, stack
+from psotrack.geometry import Camera, CameraRig, make_camera, make_rig, read_lenses
 from psotrack.support import read_table
 
 #: Largest distance of the optical axis from the middle of the image, as a share of its size, for files that do not
@@ -55,7 +55,7 @@ def choose_lens(
 
 def lens_from_matrix(K: Float[np.ndarray, "3 3"], image_size_wh: Size) -> Camera:
     """A lens without distortion, with intrinsics K, at the world's origin."""
-    return camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=image_size_wh)
+    return make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=image_size_wh)
 
 
 def read_lens(
@@ -113,7 +113,7 @@ def scale_lens(lens: Camera, image_size_wh: Size) -> Camera:
 
 def _read_cameras(path: Path, image_size_wh: Size) -> CameraRig:
     if path.suffix.lower() == ".csv" and read_table(path).find("focal_length_x") is not None:
-        return stack(
+        return make_rig(
             {
                 name: lens_from_matrix(K, size_wh)
                 for name, (K, size_wh) in read_onboard_calibration(path).items()

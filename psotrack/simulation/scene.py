@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import SettingsError, check_positive
-from psotrack.geometry import Camera, CameraRig, camera, look_at, stack
+from psotrack.geometry import Camera, CameraRig, look_at, make_camera, make_rig
 from psotrack.simulation.flights.motion import Flight
 from psotrack.simulation.flights.planning import frame_times_s, plan
 from psotrack.simulation.scenarios import CameraPlace, Scenario
@@ -89,7 +89,7 @@ def _rig(scenario: Scenario, scale: float, seed: int) -> CameraRig:
     normal = np.random.default_rng([seed, _FOR_CAMERAS]).standard_normal((len(places), 3))
     # Without its tails, so that no lens turns into another or looks out of its side.
     draws = np.clip(normal, -2.5, 2.5) * [spread.focal_length, *2 * [spread.principal_point_px]]
-    return stack(
+    return make_rig(
         {
             f"cam{index}": _camera(_moved(place, draw), scenario, scale)
             for index, (place, draw) in enumerate(zip(places, draws, strict=True), start=1)
@@ -134,4 +134,4 @@ def _camera(place: CameraPlace, scenario: Scenario, scale: float) -> Camera:
     # Pixel centres are at integers, so the corner of the image, which stays where it is, is at -0.5.
     cx, cy = ((centre + 0.5) * scale - 0.5 for centre in place.principal_point_px)
     K = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
-    return camera(R=R, t_m=t_m, K=K, image_size_wh=image_size_wh(scenario, scale))
+    return make_camera(R=R, t_m=t_m, K=K, image_size_wh=image_size_wh(scenario, scale))

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from psotrack._typing import Array, Tables
-from psotrack.geometry import Boxes, Camera, Extents, extents, project_boxes
+from psotrack.geometry import Boxes, Camera, Extents, make_extents, project_boxes
 from psotrack.silhouettes import box_sum, of_packed_box_sums
 from psotrack.tracking.patches import FULL, Patches, whole_images
 
@@ -81,7 +81,9 @@ def score_inputs(
     offset_m: Float[Array, "drones 3"] | None = None,
 ) -> ScoreInputs:
     """The scene of one frame, all of its images, for drones of these sizes and offsets (see `boxes.extents`)."""
-    return ScoreInputs(extents(cameras, size_m, offset_m), whole_images(tables, settings.reduction), settings)
+    return ScoreInputs(
+        make_extents(cameras, size_m, offset_m), whole_images(tables, settings.reduction), settings
+    )
 
 
 def camera_scores(

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int, UInt8
 
 from psotrack._typing import Array, Coverage, Positions
-from psotrack.geometry import Boxes, Camera, extents, project_boxes
+from psotrack.geometry import Boxes, Camera, make_extents, project_boxes
 from psotrack.tracking.fitness import ScoreSettings
 from psotrack.tracking.patches import FULL, Patches, cut
 from psotrack.tracking.shadows import low
@@ -189,7 +189,7 @@ def _look(
 
     def boxes_of(factors: Float[Array, "2"]) -> Boxes:
         factor = jnp.sqrt(jnp.stack([factors[0], factors[0], factors[1]]))
-        return project_boxes(extents(cameras, size_m * factor), position_m)
+        return project_boxes(make_extents(cameras, size_m * factor), position_m)
 
     def squares(factors: Float[Array, "2"]) -> Float[Array, "drones cameras 2"]:
         boxes = boxes_of(factors)
@@ -200,7 +200,7 @@ def _look(
     design = slope / slope.sum(axis=-1, keepdims=True)
     patches = cut(
         coverage,
-        extents(cameras, size_m),
+        make_extents(cameras, size_m),
         position_m,
         reach_m=jnp.zeros_like(size_m[:, 0]),
         # Views in which a neighbour could claim anything do not count.

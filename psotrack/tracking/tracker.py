@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int, UInt8
 
 from psotrack._typing import Array, Coverage, Key, Positions
-from psotrack.geometry import Camera, extents
+from psotrack.geometry import Camera, make_extents
 from psotrack.motion import MotionParams, MotionState, kalman
 from psotrack.tracking import swarm
 from psotrack.tracking.fitness import ScoreInputs, ScoreSettings, drone_fitness, filled, joint_fitness
@@ -339,7 +339,7 @@ def _view(
     program: Program,
 ) -> ScoreInputs:
     """What the score reads: windows about where drones are expected."""
-    seen = extents(cameras, params.size_m)
+    seen = make_extents(cameras, params.size_m)
     patches = cut(
         coverage,
         seen,

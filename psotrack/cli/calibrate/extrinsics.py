@@ -77,7 +77,7 @@ def extrinsics(
       psotrack calibrate extrinsics --markers data/Simulated_Data/S01_D2_A --intrinsics rig.toml --out found.toml
     """
     from psotrack.calibration import locate_camera, read_marks
-    from psotrack.geometry import Camera, stack, write_rig
+    from psotrack.geometry import Camera, make_rig, write_rig
 
     if (pairs is None) == (markers is None):
         found = "neither" if pairs is None else "both"
@@ -100,7 +100,7 @@ def extrinsics(
             located.used,
             of_camera.points,
         )
-    rig = stack(cameras)
+    rig = make_rig(cameras)
     write_rig(out, rig, force=force)
     show_cameras(rows, out, quiet, json_path, force)
 

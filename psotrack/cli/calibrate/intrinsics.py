@@ -45,12 +45,12 @@ def intrinsics(
       psotrack calibrate intrinsics board.avi --squares 7x5 --square 0.04 --marker 0.03 --out lens.toml
     """
     from psotrack.calibration import Board, lens_of_board
-    from psotrack.geometry import stack, write_rig
+    from psotrack.geometry import make_rig, write_rig
     from psotrack.recordings import probe
 
     refuse_to_overwrite(out, force)
     lens = lens_of_board(probe(video), Board(squares_wh, square_m, marker_m, dictionary))
-    write_rig(out, stack({name or video.stem: lens.camera}), force=force)
+    write_rig(out, make_rig({name or video.stem: lens.camera}), force=force)
     K, dist = lens.camera.K, lens.camera.dist
     values = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *dist]
     names = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2")
