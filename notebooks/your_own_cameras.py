@@ -50,7 +50,7 @@ from psotrack.geometry import (
     undistort,
 )
 from psotrack.pipeline import track_from_silhouettes
-from psotrack.recordings import VideoWriter, contents, probe, read_frames
+from psotrack.recordings import VideoWriter, describe_sequence, probe, read_frames
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import compute, summed_area_table
 from psotrack.silhouettes.computation import SilhouetteSettings
@@ -255,7 +255,7 @@ for name in rig.names:
     shutil.copy(FOREIGN / f"{name}.avi", FOLDER)
 
 sequence = read_sequence(FOLDER).usable()  # says what does not fit: sizes, rates, lengths, names
-pd.DataFrame(contents(sequence)["cameras"]).T.drop(columns=["video", "detections"])
+pd.DataFrame(describe_sequence(sequence)["cameras"]).T.drop(columns=["video", "detections"])
 
 # %% [markdown]
 # The same as a table in the terminal: `psotrack info my_recording`. Videos must begin at the same moment; a camera

@@ -9,8 +9,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.recordings.cross_poses import at_times, completed, poses, relabelled
-from psotrack.recordings.crosses import Cross, fit, identify, learn_cross, which_marker
+from psotrack.recordings.marker_cross_poses import (
+    complete_markers,
+    correct_labels,
+    estimate_poses,
+    interpolate_poses,
+)
+from psotrack.recordings.marker_crosses import Cross, fit_rigid, identify_cross, identify_markers, learn_cross
 
 #: Markers A, B, C, D ahead, left, back, right; and the same with a fifth on a mast.
 FOUR_M = np.array([[0.055, 0, 0.1], [0, 0.085, 0.1], [-0.115, 0, 0.1], [0, -0.105, 0.1]])
@@ -60,7 +65,7 @@ def test_the_fit_is_that_of_scipy(seed, num_markers, noise_mm):
     turn, shift_m = Rotation.random(rng=rng), rng.uniform(-3, 3, 3)
     world_m = turn.apply(body_m) + shift_m + noise_mm / 1e3 * rng.standard_normal(body_m.shape)
     width_m = np.linalg.svd(body_m)[1][1] / np.sqrt(num_markers)
-    found = fit(body_m, world_m[None])
+    found = fit_rigid(body_m, world_m[None])
     if width_m < 0.0051:  # on a line: another test's
         return
     expected, rssd = Rotation.align_vectors(world_m - world_m.mean(axis=0), body_m)
@@ -76,7 +81,7 @@ def test_three_markers_give_the_pose_of_four(unseen):
     cross = learn_cross(recorded(FOUR_M))
     markers_m = recorded(FOUR_M)
     markers_m[50:, unseen] = np.nan
-    found = poses(cross, markers_m, RATE_HZ)
+    found = estimate_poses(cross, markers_m, RATE_HZ)
     assert found.num_markers.tolist() == [4] * 50 + [3] * 70
     assert not found.bridged.any()
     # Double precision. The mean of the three would be 18 mm off at least.
@@ -90,7 +95,7 @@ def test_a_quarter_turn_by_hand():
         2.0,
         3.0,
     ]  # each marker where the next one was: 90 degrees about z
-    found = fit(square, quarter_m[None])
+    found = fit_rigid(square, quarter_m[None])
     np.testing.assert_allclose(found.rotation[0], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-15)
     np.testing.assert_allclose(found.position_m[0], [1, 2, 3], atol=1e-15)
 
@@ -99,8 +104,8 @@ def test_a_quarter_turn_by_hand():
 def test_moving_the_world_moves_the_pose(angles, seed):
     cross, markers_m = learn_cross(recorded(FIVE_M)), recorded(FIVE_M, 3, seed, noise_m=NOISE_M)
     turn, shift_m = Rotation.from_euler("ZYX", angles), np.array([1.0, -2.0, 0.5])
-    here = fit(cross.markers_m, markers_m)
-    there = fit(cross.markers_m, np.einsum("ij,fmj->fmi", turn.as_matrix(), markers_m) + shift_m)
+    here = fit_rigid(cross.markers_m, markers_m)
+    there = fit_rigid(cross.markers_m, np.einsum("ij,fmj->fmi", turn.as_matrix(), markers_m) + shift_m)
     np.testing.assert_allclose(there.rotation, turn.as_matrix() @ here.rotation, rtol=0, atol=1e-10)
     np.testing.assert_allclose(there.position_m, turn.apply(here.position_m) + shift_m, rtol=0, atol=1e-12)
     np.testing.assert_allclose(there.residual_m, here.residual_m, rtol=0, atol=1e-12)
@@ -111,7 +116,7 @@ def test_markers_on_a_line_have_a_middle_but_no_turn(num_markers):
     line_m = np.array([[0.1, 0.1, 0.1]]) * np.arange(num_markers)[:, None]
     markers_m = recorded(line_m, 20)
     markers_m[10:15, 0] = np.nan
-    found = poses(learn_cross(markers_m), markers_m, RATE_HZ, max_gap_s=0.01)
+    found = estimate_poses(learn_cross(markers_m), markers_m, RATE_HZ, max_gap_s=0.01)
     assert np.isnan(found.orientation_wxyz).all()
     assert np.isnan(found.position_m[:, 0]).tolist() == [False] * 10 + [True] * 5 + [False] * 5
     np.testing.assert_allclose(found.position_m[:10], markers_m[:10].mean(axis=1), rtol=0, atol=1e-12)
@@ -119,8 +124,8 @@ def test_markers_on_a_line_have_a_middle_but_no_turn(num_markers):
 
 def test_no_frames_and_no_markers_seen():
     cross = learn_cross(recorded(FOUR_M))
-    assert poses(cross, np.zeros((0, 4, 3)), RATE_HZ).position_m.shape == (0, 3)
-    unseen = poses(cross, np.full((5, 4, 3), np.nan), RATE_HZ)
+    assert estimate_poses(cross, np.zeros((0, 4, 3)), RATE_HZ).position_m.shape == (0, 3)
+    unseen = estimate_poses(cross, np.full((5, 4, 3), np.nan), RATE_HZ)
     assert np.isnan(unseen.position_m).all()
     assert np.isnan(unseen.orientation_wxyz).all()
     assert unseen.num_markers.tolist() == [0] * 5
@@ -196,8 +201,8 @@ def test_a_cross_has_its_origin_at_its_centroid():
 def test_every_exchange_is_found(order):
     cross = learn_cross(recorded(FOUR_M))
     points_m = recorded(FOUR_M, 1, seed=3, noise_m=NOISE_M)[0]
-    assert which_marker(cross, points_m[list(order)]).tolist() == list(order)
-    assert which_marker(cross, points_m[list(order[:3])]).tolist() == list(order[:3])
+    assert identify_markers(cross, points_m[list(order)]).tolist() == list(order)
+    assert identify_markers(cross, points_m[list(order[:3])]).tolist() == list(order[:3])
 
 
 def test_points_among_strays():
@@ -205,15 +210,15 @@ def test_points_among_strays():
     points_m = recorded(FIVE_M, 1, seed=3, noise_m=NOISE_M)[0]
     strays_m = points_m[0] + np.random.default_rng(0).uniform(-1, 1, (20, 3))
     soup_m = np.vstack([strays_m[:7], points_m[[3, 0]], strays_m[7:], points_m[[4, 1, 2]]])
-    assert which_marker(cross, soup_m).tolist() == [-1] * 7 + [3, 0] + [-1] * 13 + [4, 1, 2]
+    assert identify_markers(cross, soup_m).tolist() == [-1] * 7 + [3, 0] + [-1] * 13 + [4, 1, 2]
 
 
 def test_a_mirror_image_is_no_match():
     """All distances fit; no turn does."""
     body_m = np.array([[0.1, 0, 0], [0, 0.13, 0], [-0.07, 0, 0], [0.01, 0.02, 0.12]])
     cross = learn_cross(recorded(body_m))
-    assert which_marker(cross, body_m).tolist() == [0, 1, 2, 3]
-    assert which_marker(cross, body_m * [1, 1, -1]).max() == -1 or -1 in which_marker(
+    assert identify_markers(cross, body_m).tolist() == [0, 1, 2, 3]
+    assert identify_markers(cross, body_m * [1, 1, -1]).max() == -1 or -1 in identify_markers(
         cross, body_m * [1, 1, -1]
     )
 
@@ -230,15 +235,15 @@ def test_a_mirror_image_is_no_match():
 )
 def test_what_is_no_cross(points_m):
     cross = learn_cross(recorded(FOUR_M))
-    assert which_marker(cross, points_m).tolist() == [-1] * len(points_m)
-    assert identify([cross], points_m) is None
+    assert identify_markers(cross, points_m).tolist() == [-1] * len(points_m)
+    assert identify_cross([cross], points_m) is None
 
 
 def test_a_symmetric_cross_is_ambiguous_but_is_itself():
     square = np.array([[0.1, 0, 0], [0, 0.1, 0], [-0.1, 0, 0], [0, -0.1, 0]])
     cross = Cross("square", square)
-    assert which_marker(cross, square + 1.0).tolist() == [-1] * 4
-    assert identify([learn_cross(recorded(FOUR_M)), cross], square + 1.0) == 1
+    assert identify_markers(cross, square + 1.0).tolist() == [-1] * 4
+    assert identify_cross([learn_cross(recorded(FOUR_M)), cross], square + 1.0) == 1
 
 
 def test_which_drone_it_is():
@@ -246,10 +251,10 @@ def test_which_drone_it_is():
     crosses = [learn_cross(recorded(shape, seed=index)) for index, shape in enumerate(shapes)]
     for index, shape in enumerate(shapes):
         later_m = recorded(shape[[2, 0, 3, 1]], seed=9, noise_m=NOISE_M)
-        assert identify(crosses, learn_cross(later_m).markers_m) == index
-        assert identify(crosses, later_m[4, :3]) == index
-    assert identify([crosses[0], crosses[0]], recorded(FOUR_M)[0]) is None
-    assert identify([], FOUR_M) is None
+        assert identify_cross(crosses, learn_cross(later_m).markers_m) == index
+        assert identify_cross(crosses, later_m[4, :3]) == index
+    assert identify_cross([crosses[0], crosses[0]], recorded(FOUR_M)[0]) is None
+    assert identify_cross([], FOUR_M) is None
 
 
 # --- poses over time
@@ -258,12 +263,12 @@ def test_which_drone_it_is():
 def test_swapped_labels_change_no_pose():
     cross = learn_cross(recorded(FOUR_M))
     markers_m = recorded(FOUR_M, noise_m=NOISE_M)
-    expected = poses(cross, markers_m, RATE_HZ)
+    expected = estimate_poses(cross, markers_m, RATE_HZ)
     swapped_m = markers_m.copy()
     swapped_m[30:40, [0, 1]] = markers_m[30:40, [1, 0]]
     swapped_m[60, [0, 1, 2, 3]] = markers_m[60, [3, 0, 1, 2]]
     swapped_m[70, [0, 1]], swapped_m[70, 3] = markers_m[70, [1, 0]], np.nan
-    found = poses(cross, swapped_m, RATE_HZ)
+    found = estimate_poses(cross, swapped_m, RATE_HZ)
     others = np.arange(120) != 70  # there, the fourth marker is missing as well
     assert not found.bridged.any()
     np.testing.assert_array_equal(found.position_m[others], expected.position_m[others])
@@ -276,7 +281,7 @@ def test_a_marker_on_another_body_is_left_out():
     cross = learn_cross(recorded(FIVE_M))
     markers_m = recorded(FIVE_M)
     markers_m[20:30, 2] = [3.0, 3.0, 1.0]
-    found = poses(cross, markers_m, RATE_HZ)
+    found = estimate_poses(cross, markers_m, RATE_HZ)
     assert found.num_markers[20:30].tolist() == [4] * 10
     np.testing.assert_allclose(found.position_m, centroids(FIVE_M, 120), rtol=0, atol=1e-9)
 
@@ -285,15 +290,15 @@ def test_frames_in_which_nothing_fits_are_gaps():
     cross = learn_cross(recorded(FOUR_M))
     markers_m = recorded(FOUR_M)
     markers_m[20:25] = np.random.default_rng(0).uniform(-1, 1, (5, 4, 3))
-    assert np.isnan(relabelled(cross, markers_m)[20:25]).all()
-    assert np.flatnonzero(poses(cross, markers_m, RATE_HZ).bridged).tolist() == [20, 21, 22, 23, 24]
+    assert np.isnan(correct_labels(cross, markers_m)[20:25]).all()
+    assert np.flatnonzero(estimate_poses(cross, markers_m, RATE_HZ).bridged).tolist() == [20, 21, 22, 23, 24]
 
 
 @pytest.mark.parametrize(("gap", "bridged"), [(1, True), (20, True), (50, True), (51, False)])
 def test_gaps_are_bridged_to_half_a_second(gap, bridged):
     cross, markers_m = learn_cross(recorded(FOUR_M)), recorded(FOUR_M, 300)
     markers_m[100 : 100 + gap, :2] = np.nan  # two markers are left, which is no pose
-    found = poses(cross, markers_m, RATE_HZ)
+    found = estimate_poses(cross, markers_m, RATE_HZ)
     inside = np.zeros(300, bool)
     inside[100 : 100 + gap] = True
     assert found.bridged.tolist() == (inside & bridged).tolist()
@@ -313,7 +318,7 @@ def test_gaps_are_bridged_to_half_a_second(gap, bridged):
 def test_gaps_at_the_ends_stay():
     cross, markers_m = learn_cross(recorded(FOUR_M)), recorded(FOUR_M, 100)
     markers_m[:5] = markers_m[95:] = np.nan
-    found = poses(cross, markers_m, RATE_HZ)
+    found = estimate_poses(cross, markers_m, RATE_HZ)
     assert not found.bridged.any()
     assert np.flatnonzero(np.isnan(found.position_m[:, 0])).tolist() == [*range(5), *range(95, 100)]
 
@@ -321,7 +326,7 @@ def test_gaps_at_the_ends_stay():
 def test_a_single_pose_between_gaps():
     cross, markers_m = learn_cross(recorded(FOUR_M)), recorded(FOUR_M, 3, rate_hz=20.0)
     markers_m[1] = np.nan
-    found = poses(cross, markers_m, 20.0, max_gap_s=0.06)
+    found = estimate_poses(cross, markers_m, 20.0, max_gap_s=0.06)
     np.testing.assert_allclose(found.position_m[1], found.position_m[[0, 2]].mean(axis=0), rtol=0, atol=1e-12)
 
 
@@ -330,7 +335,9 @@ def test_any_time_between_frames(rate_hz, fps, offset_s):
     cross = learn_cross(recorded(FOUR_M))
     num_frames = int(2 * rate_hz)
     time_s = np.arange(int(1.4 * fps)) / fps + offset_s
-    found = at_times(poses(cross, recorded(FOUR_M, num_frames, rate_hz=rate_hz), rate_hz), rate_hz, time_s)
+    found = interpolate_poses(
+        estimate_poses(cross, recorded(FOUR_M, num_frames, rate_hz=rate_hz), rate_hz), rate_hz, time_s
+    )
     turn, position_m = flight(len(time_s), seed=offset_s, rate_hz=fps)
     # dt^2 / 8 of 4 m/s^2 at 80 Hz is 0.08 mm.
     np.testing.assert_allclose(
@@ -346,12 +353,12 @@ def test_any_time_between_frames(rate_hz, fps, offset_s):
 def test_times_at_frames_are_those_frames():
     cross, markers_m = learn_cross(recorded(FOUR_M)), recorded(FOUR_M)
     markers_m[60:] = np.nan
-    every = poses(cross, markers_m, RATE_HZ)
-    found = at_times(every, RATE_HZ, np.arange(40) / 25)
+    every = estimate_poses(cross, markers_m, RATE_HZ)
+    found = interpolate_poses(every, RATE_HZ, np.arange(40) / 25)
     # Frame 14 of the video is frame 56, the last that is seen: there is nothing between it and the next.
     np.testing.assert_array_equal(found.position_m[:15], every.position_m[:60:4])
     assert np.isnan(found.position_m[15:]).all()
-    outside = at_times(every, RATE_HZ, np.array([-0.01, 1.2, 0.595]))
+    outside = interpolate_poses(every, RATE_HZ, np.array([-0.01, 1.2, 0.595]))
     assert np.isnan(outside.position_m).all()
     assert not outside.bridged.any()
 
@@ -359,7 +366,9 @@ def test_times_at_frames_are_those_frames():
 def test_bridges_are_flagged_at_other_times():
     cross, markers_m = learn_cross(recorded(FOUR_M)), recorded(FOUR_M)
     markers_m[41:44] = np.nan
-    found = at_times(poses(cross, markers_m, RATE_HZ), RATE_HZ, np.array([0.395, 0.405, 0.42, 0.435, 0.445]))
+    found = interpolate_poses(
+        estimate_poses(cross, markers_m, RATE_HZ), RATE_HZ, np.array([0.395, 0.405, 0.42, 0.435, 0.445])
+    )
     assert found.bridged.tolist() == [False, True, True, True, False]
     assert np.isfinite(found.position_m).all()
 
@@ -371,7 +380,7 @@ def test_lost_labels_are_found_again():
     labelled_m[10, [1, 2]], unlabelled_m[10, [4, 1]] = np.nan, markers_m[10, [1, 2]]
     labelled_m[11], unlabelled_m[11, 1:5] = np.nan, markers_m[11, [3, 1, 0, 2]]
     labelled_m[12], unlabelled_m[12, 1:4] = np.nan, markers_m[12, [3, 1, 0]]
-    whole_m = completed(cross, labelled_m, unlabelled_m)
+    whole_m = complete_markers(cross, labelled_m, unlabelled_m)
     rest = np.arange(120) != 12  # three points that nobody named are too few
     np.testing.assert_array_equal(whole_m[rest], markers_m[rest])
     assert np.isnan(whole_m[12]).all()

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from psotrack.datasets import dpjait
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import look_at, make_camera, make_rig
-from psotrack.recordings import VideoWriter, contents, render
+from psotrack.recordings import VideoWriter, describe_sequence, inventory_table
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 5
 K = np.array([[30.5, 0.0, 31.5], [0.0, 30.25, 23.5], [0.0, 0.0, 1.0]])
@@ -105,7 +105,7 @@ def test_a_sequence_without_them_is_as_it_was(folder):
     assert dpjait.read_onboard(folder) == {}
     sequence = dpjait.read_sequence(folder)
     assert sequence.onboard is None
-    assert contents(sequence)["onboard"] is None
+    assert describe_sequence(sequence)["onboard"] is None
 
 
 @pytest.mark.parametrize("missing", ["dron1_cam_25.csv", dpjait.ONBOARD_CALIBRATION])
@@ -203,7 +203,7 @@ def test_intrinsics_that_the_table_cannot_hold(tmp_path, intrinsics):
 
 
 def test_the_table_of_contents_has_a_row_for_each(folder):
-    content = contents(dpjait.read_sequence(folder))
+    content = describe_sequence(dpjait.read_sequence(folder))
     assert content["onboard"]["dron2"] == {
         "video": str(folder / "dron2_cam_s.avi"),
         "frames": FRAMES,
@@ -214,6 +214,6 @@ def test_the_table_of_contents_has_a_row_for_each(folder):
     }
     console = Console(width=120)
     with console.capture() as capture:
-        console.print(render(content))
+        console.print(inventory_table(content))
     row = next(line for line in capture.get().splitlines() if "on dron2" in line)
     assert row.split() == ["on", "dron2", "5", "25", "64", "x", "48", "31.5", "4", "poses"]

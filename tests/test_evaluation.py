@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from psotrack.errors import InputError
 from psotrack.evaluation import evaluate
 from psotrack.trajectories import GATE_M, UNASSIGNED, Status
-from psotrack.trajectories.association import align, fixed_identity, identity_switches, matched_per_frame
+from psotrack.trajectories.association import align, fixed_identity, identity_switches, partners_per_frame
 
 
 def numbers(evaluation, *names):
@@ -330,7 +330,7 @@ class TestAgainstBruteForce:
     def test_matching_of_a_frame(self, seed):
         est, ref = random_flights(seed)
         distance_m = align(est, ref).distance_m
-        for here_m, partner in zip(distance_m, matched_per_frame(distance_m, keep=False), strict=True):
+        for here_m, partner in zip(distance_m, partners_per_frame(distance_m, keep=False), strict=True):
 
             def worth(pairing, here_m=here_m):
                 """Most pairs first, then the least sum of distances; impossible pairs are worth nothing at all."""

@@ -1,4 +1,4 @@
-"""`Trajectories`: what it accepts, what counts as seen, and picking frames."""
+"""`Trajectories`: checks of the arrays, `seen`, and the choice of frames."""
 
 from dataclasses import fields
 
@@ -40,7 +40,7 @@ def test_counts():
     assert (trajectories().num_frames, trajectories().num_drones) == (FRAMES, DRONES)
 
 
-def test_seen_is_a_whole_position_that_is_not_lost():
+def test_seen_needs_a_complete_position_that_is_not_lost():
     position_m = np.zeros((FRAMES, DRONES, 3))
     position_m[1, 0, 2] = np.nan
     status = np.full((FRAMES, DRONES), Status.TRACKED)
@@ -54,7 +54,7 @@ def test_status_words():
     assert [status.label for status in Status] == ["tracked", "coasting", "lost"]
 
 
-def test_at_frames_picks_rows_of_everything():
+def test_at_frames_picks_rows_of_all_arrays():
     full = everything()
     picked = full.at_frames(np.array([12, 18]))
     assert picked.frame.tolist() == [12, 18]
@@ -65,12 +65,12 @@ def test_at_frames_picks_rows_of_everything():
         np.testing.assert_array_equal(getattr(picked, name), getattr(full, name)[[1, 4]])
 
 
-def test_at_frames_leaves_out_what_is_unknown():
+def test_at_frames_keeps_unknown_quantities_none():
     assert trajectories().at_frames(np.array([10])).velocity_m_s is None
 
 
 @pytest.mark.parametrize("wanted", [[11], [10, 20], [8]], ids=["between", "after", "before"])
-def test_at_frames_that_are_not_there(wanted):
+def test_at_frames_refuses_missing_frames(wanted):
     with pytest.raises(InputError, match=f"expected frames {wanted[0]} to {wanted[-1]}"):
         trajectories().at_frames(np.array(wanted))
 
@@ -87,15 +87,15 @@ def test_at_frames_that_are_not_there(wanted):
         ),
     ],
 )
-def test_what_makes_no_sense_is_refused(changes, message):
+def test_invalid_arrays_are_refused(changes, message):
     with pytest.raises(InputError, match=message):
         trajectories(**changes)
 
 
-def test_a_covariance_is_symmetric_within_rounding_where_it_is_known():
-    """Of a matrix that is unknown as a whole or in part there is nothing to compare."""
+def test_a_known_covariance_must_be_symmetric_within_rounding():
+    """Matrices with NaN are not checked."""
     rng = np.random.default_rng(1)
-    # A last bit of float32 in one half only.
+    # One half differs by the last bit of float32.
     rounded = covariances(rng).astype(np.float32)
     rounded[..., 0, 2] = np.nextafter(rounded[..., 2, 0], np.float32(np.inf))
     rounded[1, 2] = np.nan
@@ -104,7 +104,7 @@ def test_a_covariance_is_symmetric_within_rounding_where_it_is_known():
     np.testing.assert_array_equal(kept, rounded)
 
 
-def test_a_covariance_of_another_shape():
-    # The annotations are checked before the shapes under the tests' import hook; both name the field.
+def test_a_covariance_of_wrong_shape_is_refused():
+    # With the tests' import hook the annotations are checked before the shapes; both messages name the field.
     with pytest.raises((InputError, jaxtyping.TypeCheckError), match="covariance_m2"):
         trajectories(covariance_m2=np.zeros((FRAMES, DRONES + 1, 3, 3)))

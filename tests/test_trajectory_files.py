@@ -1,4 +1,4 @@
-"""Tables and TUM files of trajectories: exact columns, exact round trips, and what is wrong with a file, by line."""
+"""Tables and TUM files of trajectories: exact columns, exact round trips, and errors that name the line."""
 
 import json
 import resource
@@ -24,7 +24,7 @@ HEADER = "frame,time_s,drone,x_m,y_m,z_m,vx_m_s,vy_m_s,vz_m_s,fitness,num_camera
 
 
 def two_drones(dtype=np.float32) -> Trajectories:
-    """Three frames of two drones; the second is lost in the last one, at an unknown place."""
+    """Three frames of two drones; the second drone is lost in the last frame, with an unknown position."""
     position_m = np.array([[[0.1, -2, 1.5], [3, 4, 1]]] * 3, dtype)
     position_m[2, 1] = np.nan
     return Trajectories(
@@ -40,7 +40,7 @@ def two_drones(dtype=np.float32) -> Trajectories:
 
 
 def assert_same(read: Trajectories, written: Trajectories, dtype=np.float64) -> None:
-    """Equal to the last bit in the precision of what was written."""
+    """Assert equality to the last bit in the precision of the written arrays."""
     assert read.drones == written.drones
     for name in ("frame", "time_s", "num_cameras", "status"):
         np.testing.assert_array_equal(getattr(read, name), getattr(written, name))
@@ -55,7 +55,7 @@ class TestRoundTrip:
     @staticmethod
     @st.composite
     def arguments(draw, dtype):
-        # Not yet a `Trajectories`: the type checker samples at random, which a strategy must not.
+        # Not yet a `Trajectories`: the type checker samples elements at random, which a strategy must not do.
         frames, drones = draw(st.integers(1, 4)), draw(st.integers(1, 3))
         names = st.text("ab 1,;\"'#é", min_size=1, max_size=5).map(str.strip).filter(bool)
         numbers = st.floats(allow_infinity=False, width=32 if dtype == np.float32 else 64)
@@ -63,7 +63,7 @@ class TestRoundTrip:
 
         def floats(*parts):
             values = draw(hnp.arrays(dtype, (frames, drones, *parts), elements=numbers))
-            # One known number: what is not known at all comes back as None.
+            # At least one known number: a quantity that is unknown altogether is read back as None.
             values[0, 0] = draw(known)
             return values
 
@@ -97,7 +97,7 @@ class TestRoundTrip:
         assert_same(read_trajectories(path), written, dtype)
 
     @pytest.mark.parametrize("suffix", SUFFIXES)
-    def test_what_is_not_known_at_all(self, tmp_path, suffix):
+    def test_unknown_quantities_are_none(self, tmp_path, suffix):
         path = tmp_path / f"tracks{suffix}"
         bare = replace(two_drones(), velocity_m_s=None, fitness=None, num_cameras=None, status=None)
         write_trajectories(path, bare)
@@ -121,7 +121,7 @@ class TestWriting:
             "",
         ]
 
-    def test_parquet_has_the_same_rows_and_says_what_they_mean(self, tmp_path):
+    def test_parquet_has_the_same_rows_and_names_the_units(self, tmp_path):
         for suffix in SUFFIXES:
             write_trajectories(tmp_path / f"tracks{suffix}", two_drones(np.float64))
         frame = pd.read_parquet(tmp_path / "tracks.parquet")
@@ -131,7 +131,7 @@ class TestWriting:
         assert json.loads(metadata[b"psotrack.units"]) == COLUMNS
         assert list(COLUMNS) == HEADER.split(",")
 
-    def test_covariances_are_six_columns_more(self, tmp_path):
+    def test_covariances_are_six_more_columns(self, tmp_path):
         covariance_m2 = np.full((3, 2, 3, 3), np.nan)
         covariance_m2[0, 1] = [[1, 2, 3], [2, 5, 6], [3, 6, 9]]
         known = replace(two_drones(), covariance_m2=covariance_m2)
@@ -163,12 +163,12 @@ class TestWriting:
         assert read_trajectories(path).num_frames == 3
 
     @pytest.mark.parametrize("suffix", SUFFIXES)
-    def test_a_full_disk_leaves_what_was_there(self, tmp_path, suffix, monkeypatch):
-        # Modules that are imported meanwhile would be cached cut off, for everybody.
+    def test_a_full_disk_leaves_the_old_file(self, tmp_path, suffix, monkeypatch):
+        # Modules that are imported under the limit would be cached incompletely, for all processes.
         monkeypatch.setattr(sys, "dont_write_bytecode", True)
         path = tmp_path / f"tracks{suffix}"
         path.write_text("precious")
-        # No file of this process may grow over 64 bytes: writing fails as on a full disk.
+        # No file of this process may become larger than 64 bytes, so that writing fails as on a full disk.
         limits = resource.getrlimit(resource.RLIMIT_FSIZE)
         resource.setrlimit(resource.RLIMIT_FSIZE, (64, limits[1]))
         try:
@@ -191,7 +191,7 @@ def csv_file(tmp_path, *lines, header="frame,time_s,drone,x_m,y_m,z_m,status,num
 
 
 class TestLenientReading:
-    def test_columns_and_rows_in_any_order_some_missing_others_extra(self, tmp_path):
+    def test_any_order_of_rows_and_columns_missing_and_extra_columns(self, tmp_path):
         path = csv_file(
             tmp_path,
             "1.5,2,0.5,3,nice,7",
@@ -233,7 +233,7 @@ class TestLenientReading:
         assert read.drones == ("2", "1")
         assert read.position_m[0, :, 0].tolist() == [1, 2]
 
-    def test_a_byte_order_mark_is_no_part_of_a_name(self, tmp_path):
+    def test_a_byte_order_mark_is_ignored(self, tmp_path):
         path = csv_file(tmp_path, "0,0,a,1,1,1,tracked,8")
         path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
         assert read_trajectories(path).num_frames == 1
@@ -266,27 +266,27 @@ class TestBadFiles:
             ),
             (
                 "0,0,a,2,2,2,tracked,8",
-                "line 3: expected one row per frame and drone, found a second one for frame 0",
+                "line 3: expected one row per frame and drone, found a second row for frame 0",
             ),
             (
                 "0,0.5,b,1,1,1,tracked,8",
-                "line 3: expected 0 s, as another row of this frame has, found 0.5 s",
+                "line 3: expected 0 s as in another row of this frame, found 0.5 s",
             ),
             (
                 "1,,a,1,1,1,tracked,8",
-                "line 3: expected a time_s, or the frame rate to know it by, found neither",
+                "line 3: expected a time_s, or a frame rate to compute it, found neither",
             ),
             ('1,0.04,"a,1,1,1,tracked,8', "expected a CSV table in UTF-8"),
         ],
     )
-    def test_a_line_of_csv(self, tmp_path, line, message):
+    def test_a_wrong_line_of_csv(self, tmp_path, line, message):
         path = csv_file(tmp_path, GOOD, line)
         with pytest.raises(InputError) as caught:
             read_trajectories(path)
         assert str(caught.value).startswith(str(path))
         assert message in str(caught.value)
 
-    def test_the_line_is_that_of_the_file_not_of_the_row(self, tmp_path):
+    def test_messages_name_the_line_of_the_file(self, tmp_path):
         with pytest.raises(InputError, match="line 5: expected a whole number"):
             read_trajectories(csv_file(tmp_path, GOOD, "", "", "x,0,a,1,1,1,tracked,8".replace("x", "nan")))
 
@@ -299,7 +299,7 @@ class TestBadFiles:
             ("", "found frame, drone, x_m, y_m, z_m missing"),
         ],
     )
-    def test_a_header(self, tmp_path, header, message):
+    def test_a_wrong_header(self, tmp_path, header, message):
         with pytest.raises(InputError, match=message):
             read_trajectories(csv_file(tmp_path, header=header))
 
@@ -313,7 +313,7 @@ class TestBadFiles:
             read_trajectories(tmp_path / f"nowhere{suffix}")
 
     @pytest.mark.parametrize("suffix", SUFFIXES)
-    def test_bytes_that_are_no_table(self, tmp_path, suffix):
+    def test_bytes_that_are_not_a_table(self, tmp_path, suffix):
         path = tmp_path / f"noise{suffix}"
         path.write_bytes(np.random.default_rng(0).bytes(500))
         with pytest.raises(InputError, match=f"noise{suffix}: expected a (CSV table in UTF-8|Parquet file)"):
@@ -326,7 +326,7 @@ class TestBadFiles:
         with pytest.raises(InputError, match="expected a Parquet file"):
             read_trajectories(path)
 
-    def test_a_row_of_parquet(self, tmp_path):
+    def test_a_wrong_row_of_parquet(self, tmp_path):
         path = tmp_path / "tracks.parquet"
         write_trajectories(path, two_drones())
         pd.read_parquet(path).assign(status=["tracked", "tracked", "sunk"] * 2).to_parquet(path)
@@ -335,7 +335,7 @@ class TestBadFiles:
         ):
             read_trajectories(path)
 
-    def test_a_column_of_parquet(self, tmp_path):
+    def test_a_wrong_column_of_parquet(self, tmp_path):
         path = tmp_path / "tracks.parquet"
         write_trajectories(path, two_drones())
         pd.read_parquet(path).assign(x_m=["left"] * 6).to_parquet(path)
@@ -372,7 +372,7 @@ class TestTum:
         assert read.drones == turning.drones
         assert read.frame.tolist() == [0, 1, 2]
         np.testing.assert_array_equal(read.position_m, turning.position_m)
-        # Reading brings quaternions to length one, which may change the last bit.
+        # Reading normalises quaternions, which may change the last bit.
         np.testing.assert_allclose(read.orientation_wxyz[:, 0], turning.orientation_wxyz[:, 0], atol=1e-15)
         assert np.isnan(read.orientation_wxyz[2, 1]).all()
 
@@ -412,7 +412,7 @@ class TestTum:
             ("0.04 1 2 3 0 0 0 0", "line 3: expected a quaternion"),
             ("0.06 1 2 3 0 0 0 1", "line 3: expected the time of a frame at 25 fps, found 0.06 s"),
             ("-0.04 1 2 3 0 0 0 1", "line 3: expected the time of a frame"),
-            ("0.0 1 2 3 0 0 0 1", "line 3: expected one line per frame, found a second one for frame 0"),
+            ("0.0 1 2 3 0 0 0 1", "line 3: expected one line per frame, found a second line for frame 0"),
         ],
     )
     def test_a_bad_line(self, tmp_path, line, message):
@@ -423,7 +423,7 @@ class TestTum:
         assert str(path) in str(caught.value)
 
     def test_nothing_to_read(self, tmp_path):
-        with pytest.raises(InputError, match="expected a TUM file, or a folder with some"):
+        with pytest.raises(InputError, match="expected a TUM file, or a folder with TUM files"):
             read_tum(tmp_path, fps=25.0)
         (tmp_path / "empty.tum").write_text("# nothing\n")
         with pytest.raises(InputError, match="expected at least one pose"):

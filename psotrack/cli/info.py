@@ -24,9 +24,9 @@ def info(sequence: Path, force: bool, json_path: Path | None) -> None:
     from rich.console import Console
 
     from psotrack.datasets.dpjait import read_sequence
-    from psotrack.recordings import contents, render
+    from psotrack.recordings import describe_sequence, inventory_table
 
-    content = contents(read_sequence(sequence))
+    content = describe_sequence(read_sequence(sequence))
     answer(json_path, content, force)
     if json_path != Path("-"):
-        Console().print(render(content))
+        Console().print(inventory_table(content))

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from psotrack.clocks.correlated_errors import autocorrelation, widening
 from psotrack.errors import InputError
 from psotrack.geometry import rotation_matrices
-from psotrack.trajectories import GATE_M, UNASSIGNED, Trajectories, of_partners
+from psotrack.trajectories import GATE_M, UNASSIGNED, Trajectories, fixed_partner_values
 
 #: Longest gap of a reference over which positions are interpolated, seconds; for slow references 1.5 sample intervals.
 MAX_GAP_S = 0.1
@@ -214,7 +214,7 @@ class ShiftedPair:
         self, offset_s: float, partner: Int[np.ndarray, "drones"]
     ) -> Float[np.ndarray, "frames drones 3"]:
         time_s = self.time_s + offset_s
-        residual_m = of_partners(self.est_m, partner) - self.position_m(time_s)
+        residual_m = fixed_partner_values(self.est_m, partner) - self.position_m(time_s)
         if self.rotation is None:
             return residual_m
         return np.einsum("fdji,fdj->fdi", self.rotation(time_s), residual_m)

@@ -30,10 +30,10 @@ from psotrack.trajectories.association import (
     AlignedPair,
     align,
     fixed_identity,
+    fixed_partner_values,
     identity_switches,
-    matched_per_frame,
-    of_partners,
     paired_values,
+    partners_per_frame,
 )
 
 
@@ -76,9 +76,9 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
     partner = fixed_identity(pair)
     followed = _follow(pair, partner)
 
-    kept = matched_per_frame(pair.distance_m, keep=True)
+    kept = partners_per_frame(pair.distance_m, keep=True)
     kept_m = paired_values(pair.distance_m, kept)
-    matched_m = paired_values(pair.distance_m, matched_per_frame(pair.distance_m, keep=False))
+    matched_m = paired_values(pair.distance_m, partners_per_frame(pair.distance_m, keep=False))
     id_switches = int(identity_switches(kept).sum())
     counted = _counted_estimates(pair, partner)
     num_known, num_estimated = int(known.sum()), int(counted.sum())
@@ -151,7 +151,7 @@ class _Offset:
 
 
 def _follow(pair: AlignedPair, partner: Int[np.ndarray, "drones"]) -> _Followed:
-    est_m = of_partners(pair.est_m, partner)
+    est_m = fixed_partner_values(pair.est_m, partner)
     residual_m = est_m - pair.ref_m
     offsets, centred_m = zip(
         *(
@@ -163,8 +163,8 @@ def _follow(pair: AlignedPair, partner: Int[np.ndarray, "drones"]) -> _Followed:
     return _Followed(
         pair=pair,
         est_m=est_m,
-        orientation_est_wxyz=of_partners(pair.orientation_est_wxyz, partner),
-        covariance_m2=of_partners(pair.covariance_m2, partner),
+        orientation_est_wxyz=fixed_partner_values(pair.orientation_est_wxyz, partner),
+        covariance_m2=fixed_partner_values(pair.covariance_m2, partner),
         residual_m=residual_m,
         centred_m=np.stack(centred_m, axis=1),
         offsets=offsets,

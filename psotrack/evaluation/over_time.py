@@ -10,9 +10,9 @@ from psotrack.trajectories import Trajectories
 from psotrack.trajectories.association import (
     align,
     fixed_identity,
+    fixed_partner_values,
     identity_switches,
-    matched_per_frame,
-    of_partners,
+    partners_per_frame,
 )
 
 if TYPE_CHECKING:
@@ -33,8 +33,8 @@ def errors_over_time(traj_est: Trajectories, traj_ref: Trajectories) -> DataFram
     import pandas as pd
 
     pair = align(traj_est, traj_ref)
-    error_m = np.linalg.norm(of_partners(pair.est_m, fixed_identity(pair)) - pair.ref_m, axis=-1)
-    switch = identity_switches(matched_per_frame(pair.distance_m, keep=True))
+    error_m = np.linalg.norm(fixed_partner_values(pair.est_m, fixed_identity(pair)) - pair.ref_m, axis=-1)
+    switch = identity_switches(partners_per_frame(pair.distance_m, keep=True))
     frame, drone = np.nonzero(pair.truth_known)
     order = np.lexsort((frame, drone))
     frame, drone = frame[order], drone[order]

@@ -21,9 +21,9 @@ from psotrack.trajectories.association import (
     AlignedPair,
     align,
     fixed_identity,
+    fixed_partner_values,
     identity_switches,
-    matched_per_frame,
-    of_partners,
+    partners_per_frame,
 )
 
 if TYPE_CHECKING:
@@ -114,9 +114,9 @@ def draw_errors(axes: Axes, traj_est: Trajectories, traj_ref: Trajectories) -> N
     """
     pair = align(traj_est, traj_ref)
     partner = fixed_identity(pair)
-    error_m = np.linalg.norm(of_partners(pair.est_m, partner) - pair.ref_m, axis=-1)
+    error_m = np.linalg.norm(fixed_partner_values(pair.est_m, partner) - pair.ref_m, axis=-1)
     missed = pair.truth_known & np.isnan(error_m)
-    switches = identity_switches(matched_per_frame(pair.distance_m, keep=True))
+    switches = identity_switches(partners_per_frame(pair.distance_m, keep=True))
     time_s = _with_gaps(pair, pair.time_s)
     for drone, label in enumerate(_labels(pair, partner)):
         colour = drone_colour(drone)

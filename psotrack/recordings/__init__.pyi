@@ -1,8 +1,8 @@
 from .detections import Detections, read_detections, write_detections
-from .inventory import contents, render
+from .inventory import describe_sequence, inventory_table
 from .mocap import Markers, body_trajectories, read_c3d, write_c3d
 from .sequence import OnboardVideo, Sequence
-from .video import VideoInfo, VideoWriter, join_videos, probe, quiet, read_frames
+from .video import VideoInfo, VideoWriter, join_videos, probe, read_frames, silence_opencv
 
 __all__ = [
     "Detections",
@@ -12,14 +12,14 @@ __all__ = [
     "VideoInfo",
     "VideoWriter",
     "body_trajectories",
-    "contents",
+    "describe_sequence",
+    "inventory_table",
     "join_videos",
     "probe",
-    "quiet",
     "read_c3d",
     "read_detections",
     "read_frames",
-    "render",
+    "silence_opencv",
     "write_c3d",
     "write_detections",
 ]

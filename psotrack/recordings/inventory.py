@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 
-def contents(sequence: Sequence) -> dict[str, Any]:
+def describe_sequence(sequence: Sequence) -> dict[str, Any]:
     """Cameras, videos, detections and reference of a sequence; detections are read whole.
 
     Raises:
@@ -53,7 +53,7 @@ def contents(sequence: Sequence) -> dict[str, Any]:
     }
 
 
-def render(content: dict[str, Any]) -> Table:
+def inventory_table(content: dict[str, Any]) -> Table:
     """The record as a table, one row per camera; those on drones come last."""
     from rich import box
     from rich.table import Table

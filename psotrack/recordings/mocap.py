@@ -19,8 +19,13 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.recordings.cross_poses import CrossPoses, at_times, completed, poses
-from psotrack.recordings.crosses import learn_cross
+from psotrack.recordings.marker_cross_poses import (
+    CrossPoses,
+    complete_markers,
+    estimate_poses,
+    interpolate_poses,
+)
+from psotrack.recordings.marker_crosses import learn_cross
 from psotrack.support import atomic_write
 from psotrack.trajectories import Status, Trajectories
 
@@ -147,7 +152,7 @@ def body_trajectories(
         found = _body_poses(markers, name, columns, where)
         if found is not None:
             rate_hz = _whole_multiple(markers.rate_hz, fps)
-            video = at_times(found, rate_hz, frame / fps + offset_s)
+            video = interpolate_poses(found, rate_hz, frame / fps + offset_s)
             position_m[:, index], orientation_wxyz[:, index] = video.position_m, video.orientation_wxyz
             status[video.bridged, index] = Status.COASTING
     unknown = np.isnan(position_m).any(axis=-1)
@@ -179,7 +184,9 @@ def _body_poses(markers: Markers, name: str, columns: list[int], where: Path) ->
         _logger.warning("%s: no reference for %s: %s", where, name, error)
         return None
     unlabelled = [column for column, label in enumerate(markers.labels) if _is_unlabelled(label)]
-    return poses(cross, completed(cross, position_m, markers.position_m[:, unlabelled]), markers.rate_hz)
+    return estimate_poses(
+        cross, complete_markers(cross, position_m, markers.position_m[:, unlabelled]), markers.rate_hz
+    )
 
 
 def _whole_multiple(rate_hz: float, fps: float) -> float:

@@ -207,7 +207,7 @@ def _writer(
     path: Path, temporary: Path, fps: float, image_size_wh: tuple[int, int], settings: Ordered[int] = ()
 ) -> cv2.VideoWriter:
     codec = cv2.VideoWriter.fourcc(*_CODEC)
-    with quiet():
+    with silence_opencv():
         writer = cv2.VideoWriter(
             os.path.abspath(temporary), cv2.CAP_FFMPEG, codec, fps, image_size_wh, settings
         )
@@ -267,7 +267,7 @@ def _open(path: Path) -> cv2.VideoCapture:
         raise InputError(path, expected="a video", found=(error.strerror or str(error)).lower()) from error
     if empty:
         raise InputError(path, expected="a video", found="an empty file")
-    with quiet():
+    with silence_opencv():
         # An absolute path, because FFmpeg takes what stands before a colon for a protocol.
         capture = cv2.VideoCapture(os.path.abspath(path), cv2.CAP_FFMPEG)
     if not capture.isOpened():
@@ -292,7 +292,7 @@ def _count_packets(path: Path) -> int:
 
 
 @contextlib.contextmanager
-def quiet() -> Iterator[None]:
+def silence_opencv() -> Iterator[None]:
     """No words from OpenCV and FFmpeg about a file that is opened here; this module's errors say it better.
 
     FFmpeg reads its level from the environment at each opening and holds it until the next; a user's own is

@@ -1,7 +1,7 @@
-"""Positions of drones over time, and the files that hold them.
+"""Positions of drones over time, their files, and the association of estimated drones with reference drones.
 
-In: arrays of positions, velocities, covariances and status. Out: `Trajectories`, and CSV, Parquet and TUM files that
-read back to the same numbers.
+In: arrays of positions, velocities, covariances and status. Out: `Trajectories`; CSV, Parquet and TUM files from which
+the same numbers are read back; the estimated drone that belongs to each reference drone.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-from .association import GATE_M, UNASSIGNED, of_partners
+from .association import GATE_M, UNASSIGNED, fixed_partner_values
 from .files import read_trajectories, write_ambiguity, write_trajectories
 from .trajectories import Status, Trajectories
 
@@ -7,7 +7,7 @@ __all__ = [
     "UNASSIGNED",
     "Status",
     "Trajectories",
-    "of_partners",
+    "fixed_partner_values",
     "read_trajectories",
     "write_ambiguity",
     "write_trajectories",

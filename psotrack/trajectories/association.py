@@ -1,7 +1,7 @@
-"""Which estimated drone stands for which true one: once for a whole run, or anew in each frame.
+"""Association of estimated drones with reference drones, for a whole run or for each frame.
 
-`UNASSIGNED` marks a true drone without a partner. All assignments are optimal
-(`scipy.optimize.linear_sum_assignment`), and all of them are blind to the names of the estimated drones.
+The estimated drone that is assigned to a reference drone is called its partner; `UNASSIGNED` marks a reference drone
+without partner. All assignments are optimal (`scipy.optimize.linear_sum_assignment`) and ignore the names of drones.
 """
 
 from __future__ import annotations
@@ -15,29 +15,30 @@ from scipy.optimize import linear_sum_assignment
 from psotrack.errors import InputError
 from psotrack.trajectories import Trajectories
 
-#: An estimate further than this from a true drone is not a sighting of it.
+#: Largest distance between an estimate and a reference drone that it can be assigned to in a frame, metres.
 GATE_M = 0.5
-#: How much of the beginning decides who is who, from the first frame with truth.
+#: Time from the first frame of the reference that decides the assignment for the whole run, seconds.
 IDENTITY_WINDOW_S = 1.0
-#: In place of the index of an estimated drone.
+#: Partner index of a reference drone without partner.
 UNASSIGNED = -1
 
 
 @dataclass(frozen=True)
 class AlignedPair:
-    """An estimate and its reference over the frames that count: those in which some true drone is known.
+    """An estimate and its reference in the evaluated frames: the frames with a known reference position.
 
     Attributes:
         frame: (frames,), numbers of the frames.
-        time_s: (frames,), the reference's times.
-        drones: names of the true drones that are known in some frame.
+        time_s: (frames,), times of the reference, seconds.
+        drones: names of the reference drones with a known position in at least one frame.
         drones_est: names of the estimated drones.
-        ref_m: (frames, drones, 3), NaN where the truth is unknown.
-        est_m: (frames, estimates, 3), NaN where there is no row, or a lost one.
-        orientation_wxyz: (frames, drones, 4), of the truth; NaN where unknown.
-        orientation_est_wxyz: (frames, estimates, 4), of the estimates; NaN where unknown.
-        covariance_m2: (frames, estimates, 3, 3), of the estimates' positions; NaN where unknown.
-        distance_m: (frames, drones, estimates), NaN where either is.
+        ref_m: (frames, drones, 3), reference positions, metres; NaN if unknown.
+        est_m: (frames, estimates, 3), estimated positions, metres; NaN if there is no estimate or its status is lost.
+        orientation_wxyz: (frames, drones, 4), orientations of the reference drones; NaN if unknown.
+        orientation_est_wxyz: (frames, estimates, 4), estimated orientations; NaN if unknown.
+        covariance_m2: (frames, estimates, 3, 3), covariances of the estimated positions, m²; NaN if unknown.
+        distance_m: (frames, drones, estimates), distances between reference drones and estimates, metres; NaN if one
+            of the two is unknown.
     """
 
     frame: Int[np.ndarray, "frames"]
@@ -53,18 +54,18 @@ class AlignedPair:
 
     @property
     def truth_known(self) -> Bool[np.ndarray, "frames drones"]:
-        """(frames, drones), what is there to be found."""
+        """(frames, drones), True where the reference position is known."""
         return np.isfinite(self.ref_m).all(axis=-1)
 
 
 def align(traj_est: Trajectories, traj_ref: Trajectories) -> AlignedPair:
     """Bring an estimate to the frames of its reference, in float64.
 
-    Frames and drones of which nothing is known do not count; neither do the estimate's frames outside the
-    reference. Reference frames that the estimate does not have are missed in full.
+    Reference frames and drones without a known position are left out, and so are the estimate's frames outside the
+    reference. In reference frames that the estimate does not have, all drones count as missed.
 
     Raises:
-        InputError: nothing is known in the reference, or the two have no frame in common.
+        InputError: the reference has no known position, or estimate and reference have no frame in common.
     """
     known = traj_ref.seen
     rows, columns = known.any(axis=1), known.any(axis=0)
@@ -108,12 +109,12 @@ def align(traj_est: Trajectories, traj_ref: Trajectories) -> AlignedPair:
 
 
 def fixed_identity(pair: AlignedPair) -> Int[np.ndarray, "drones"]:
-    """Who is who, decided once: a track that later moves to another drone pays for it, as in the paper.
+    """One partner per reference drone for the whole run, as in the paper: a track that changes drones gets errors.
 
-    One optimal assignment on the mean distance over the first second from the first frame with truth, at
-    whatever distance. Drones without a partner by then (true ones that appear later, tracks that are born
-    later) are assigned to each other in the same way, over all frames. What is left after that stays without:
-    a surplus track is a false one, a surplus true drone is missed.
+    The first optimal assignment uses the mean distance over `IDENTITY_WINDOW_S` from the first reference frame, without
+    a gate. Reference drones and tracks that remain without partner, because they appear later, are assigned to each
+    other by the mean distance over all frames. A track that then has no partner is a false track, and a reference drone
+    without partner is missed.
 
     Returns:
         (drones,), index of the estimated drone, or `UNASSIGNED`.
@@ -129,15 +130,15 @@ def fixed_identity(pair: AlignedPair) -> Int[np.ndarray, "drones"]:
     return partner
 
 
-def matched_per_frame(
+def partners_per_frame(
     distance_m: Float[np.ndarray, "frames drones estimates"], *, keep: bool
 ) -> Int[np.ndarray, "frames drones"]:
-    """Who is who in each frame: as many pairs within `GATE_M` as can be, then the least sum of distances.
+    """Partners in each frame: the largest number of pairs within `GATE_M`, and among these the least sum of distances.
 
     Args:
-        distance_m: (frames, drones, estimates), NaN where either is not seen.
-        keep: pairs of the previous frame that are still within the gate stay (Bernardin and Stiefelhagen
-            2008), so that two drones that pass each other do not count as confused.
+        distance_m: (frames, drones, estimates), distances, metres; NaN if one of the two is not seen.
+        keep: keep the pairs of the previous frame that are still within the gate (Bernardin and Stiefelhagen 2008), so
+            that two drones that pass each other do not count as an identity switch.
 
     Returns:
         (frames, drones), index of the estimated drone, or `UNASSIGNED`.
@@ -159,13 +160,13 @@ def matched_per_frame(
 
 
 def cheapest_partners(cost: Float[np.ndarray, "frames drones estimates"]) -> Int[np.ndarray, "frames drones"]:
-    """(frames, drones), partners of the least sum of costs in each frame, as many as there can be.
+    """(frames, drones), partners with the least sum of costs in each frame; every possible partner is assigned.
 
-    For costs that make a bad pair as good as none.
+    For metrics in which a bad pair costs as much as no pair.
     """
     partners = np.full(cost.shape[:2], UNASSIGNED)
-    for here, partner in zip(cost, partners, strict=True):
-        rows, columns = linear_sum_assignment(here)
+    for frame_cost, partner in zip(cost, partners, strict=True):
+        rows, columns = linear_sum_assignment(frame_cost)
         partner[rows] = columns
     return partners
 
@@ -173,17 +174,22 @@ def cheapest_partners(cost: Float[np.ndarray, "frames drones estimates"]) -> Int
 def paired_values(
     values: Float[np.ndarray, "frames drones estimates"], partners: Int[np.ndarray, "frames drones"]
 ) -> Float[np.ndarray, "frames drones"]:
-    """(frames, drones), between each true drone and its partner; NaN where it has none, or either is not seen."""
+    """(frames, drones), value of each reference drone with its partner of the frame; NaN without a partner."""
     if not values.shape[2]:
         return np.full(partners.shape, np.nan)
     picked = np.take_along_axis(values, partners[..., None], axis=2)[..., 0]
     return np.where(partners == UNASSIGNED, np.nan, picked)
 
 
-def of_partners(
+def fixed_partner_values(
     values: Float[np.ndarray, "frames estimates *rest"], partner: Int[np.ndarray, "drones"]
 ) -> Float[np.ndarray, "frames drones *rest"]:
-    """What belongs to the estimate that stands for each true drone throughout; NaN where none does."""
+    """(frames, drones, ...), values of each reference drone's partner for the whole run; NaN without a partner.
+
+    Args:
+        values: (frames, estimates, ...), values of the estimates.
+        partner: (drones,), partners from `fixed_identity`.
+    """
     picked = np.full((len(values), len(partner), *values.shape[2:]), np.nan)
     assigned = partner != UNASSIGNED
     picked[:, assigned] = values[:, partner[assigned]]
@@ -191,12 +197,12 @@ def of_partners(
 
 
 def identity_switches(partners: Int[np.ndarray, "frames drones"]) -> Bool[np.ndarray, "frames drones"]:
-    """(frames, drones), where a true drone has another partner than when it last had one."""
+    """(frames, drones), True where a reference drone's partner differs from its previous partner."""
     switched = np.zeros(partners.shape, bool)
     last = np.full(partners.shape[1], UNASSIGNED)
-    for here, partner in zip(switched, partners, strict=True):
+    for switched_in_frame, partner in zip(switched, partners, strict=True):
         matched = partner != UNASSIGNED
-        here[:] = matched & (last != UNASSIGNED) & (partner != last)
+        switched_in_frame[:] = matched & (last != UNASSIGNED) & (partner != last)
         last = np.where(matched, partner, last)
     return switched
 
@@ -204,9 +210,9 @@ def identity_switches(partners: Int[np.ndarray, "frames drones"]) -> Bool[np.nda
 def _assign(
     cost: Float[np.ndarray, "drones estimates"],
 ) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
-    """The most pairs of finite cost that there can be, and among those the least sum of costs."""
+    """The largest number of pairs with finite cost, and among these sets of pairs the one with the least sum."""
     possible = np.isfinite(cost)
-    # Dearer than any set of possible pairs, so that one more possible pair always pays.
+    # A forbidden pair costs more than all possible pairs together, so that one more possible pair is always better.
     forbidden = 1.0 + 2.0 * cost[possible].sum()
     rows, columns = linear_sum_assignment(np.where(possible, cost, forbidden))
     kept = possible[rows, columns]
@@ -216,7 +222,7 @@ def _assign(
 def _mean_over_frames(
     distance_m: Float[np.ndarray, "frames drones estimates"],
 ) -> Float[np.ndarray, "drones estimates"]:
-    """Mean over the frames in which both are seen; NaN where there are none."""
+    """Mean over the frames in which both drones are known; NaN without such a frame."""
     both = np.isfinite(distance_m)
     count = both.sum(axis=0)
     total_m = np.where(both, distance_m, 0.0).sum(axis=0)

@@ -1,8 +1,8 @@
-"""Trajectories on disk: CSV and Parquet tables with one row per frame and drone.
+"""Trajectory files: CSV and Parquet tables with one row per frame and drone.
 
-Writing is strict, so that other programs can rely on the columns of `COLUMNS`, in this order, and those of
-`COVARIANCE_COLUMNS` after them where covariances are known. Reading needs `frame`, `drone` and the position, takes
-rows and columns in any order, and leaves others alone.
+Written files always have the columns of `COLUMNS` in this order, followed by the columns of `COVARIANCE_COLUMNS` if
+covariances are known, so that other programs can rely on them. A file to be read needs only `frame`, `drone` and the
+position; rows and columns may have any order, and further columns are ignored.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from psotrack.trajectories.trajectories import Status, Trajectories
 if TYPE_CHECKING:
     import pyarrow as pa
 
-#: Version of the columns, their units and words; a changed meaning is a new version.
+#: Version of the columns' names, units and words; a change of meaning needs a new version.
 SCHEMA_VERSION = 1
 
-#: Columns and their units, in the order in which they are written.
+#: Columns and their units, in written order.
 COLUMNS = {
     "frame": "1",
     "time_s": "s",
@@ -43,35 +43,34 @@ COLUMNS = {
     "status": "tracked, coasting or lost",
 }
 
-#: Columns after those, where covariances of the positions are known: the upper triangle, row by row.
+#: Further columns if covariances of the positions are known: the upper triangle, row by row.
 COVARIANCE_COLUMNS = dict.fromkeys(("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"), "m2")
 _READ = COLUMNS | COVARIANCE_COLUMNS
 _REQUIRED = ("frame", "drone", "x_m", "y_m", "z_m")
 _WORDS = ("drone", "status")
-#: Which of the six columns stands in which place of the matrix.
 _UPPER = np.triu_indices(3)
+#: Index of the covariance column for each element of the matrix.
 _PLACES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 _STATUS = {status.label: status for status in Status}
 
 
-def write_trajectories(path: Path, trajectories: Trajectories, *, force: bool = False) -> None:
-    """Write a table with one row per frame and drone, frames first.
+def write_trajectories(path: Path | str, trajectories: Trajectories, *, force: bool = False) -> None:
+    """Write a table with one row per frame and drone, sorted by frame.
 
-    CSV has the fewest digits that give the same number in the array's own precision, and equal trajectories
-    give equal bytes. Parquet has float64, and units and version of the schema as key-value metadata. What is
-    unknown is an empty field. Where the status is unknown, a drone with a position is `tracked` and one
-    without `lost`.
+    CSV numbers have the fewest digits that give the same number in the array's own precision, and equal trajectories
+    give equal bytes. Parquet has float64, with units and schema version as key-value metadata. Unknown values are empty
+    fields. If the status is unknown, drones with a position are `tracked` and drones without a position are `lost`.
 
     Args:
-        path: ends in .csv or .parquet.
-        trajectories: what to write; orientations have no column.
+        path: path that ends in .csv or .parquet.
+        trajectories: the trajectories; orientations are not written.
         force: replace an existing file.
 
     Raises:
-        InputError: the suffix is another one.
-        OutputError: the file exists and `force` is not set, or it cannot be written; what was there is
-            unchanged.
+        InputError: the path has another suffix.
+        OutputError: the file exists and `force` is not set, or it cannot be written; an older file is unchanged.
     """
+    path = Path(path)
     write = _by_suffix(path, {".csv": _write_csv, ".parquet": _write_parquet})
     refuse_to_overwrite(path, force)
     columns = _to_columns(trajectories)
@@ -80,20 +79,20 @@ def write_trajectories(path: Path, trajectories: Trajectories, *, force: bool = 
 
 
 def write_ambiguity(
-    path: Path,
+    path: Path | str,
     time_s: Float[np.ndarray, "frames"],
     pairs: Int[np.ndarray, "pairs 2"],
     ambiguity: Float[np.ndarray, "frames pairs"],
     *,
     force: bool = False,
 ) -> None:
-    """Write which drones may be taken for each other: a row for each frame and pair where that is not impossible.
+    """Write the probabilities that the labels of two drones are exchanged, one row per frame and pair above 0.
 
     Args:
-        path: of the CSV file: `frame`, `time_s`, `drone`, `other`, `ambiguity`.
-        time_s: of the frames.
-        pairs: two drones each.
-        ambiguity: probability that each pair's labels are exchanged.
+        path: path of the CSV file with the columns `frame`, `time_s`, `drone`, `other`, `ambiguity`.
+        time_s: (frames,), times of the frames, seconds.
+        pairs: (pairs, 2), indices of the two drones.
+        ambiguity: (frames, pairs), probability that the labels of a pair are exchanged.
         force: replace an existing file.
 
     Raises:
@@ -112,21 +111,22 @@ def write_ambiguity(
         _write_csv(temporary, columns)
 
 
-def read_trajectories(path: Path, *, fps: float | None = None) -> Trajectories:
-    """Read a table: `frame`, `drone`, `x_m`, `y_m`, `z_m`, and of the other columns those that are there.
+def read_trajectories(path: Path | str, *, fps: float | None = None) -> Trajectories:
+    """Read a table with the columns `frame`, `drone`, `x_m`, `y_m`, `z_m`, and optionally the other written columns.
 
-    A frame and drone without a row, or with an empty position, is NaN and `lost`. Names of drones may be
-    numbers; their order is that of first appearance.
+    A drone without a row in a frame, or with an empty position, has the position NaN and the status `lost`. Names of
+    drones may be numbers. The drones have the order of their first rows.
 
     Args:
-        path: ends in .csv or .parquet.
+        path: path that ends in .csv or .parquet.
         fps: frames per second, for rows without `time_s`.
 
     Raises:
-        InputError: no such file, a broken line, a column that is missing, a frame number that is none, two
-            rows for one frame and drone, two times for one frame, or no time and no `fps`. The message names
-            file and line.
+        InputError: the file does not exist, a line is broken, a column is missing, a frame number is not a whole
+            number, a frame and drone have two rows, a frame has two times, or there is neither a time nor `fps`. The
+            message names file and line.
     """
+    path = Path(path)
     if fps is not None:
         check_positive("fps", fps)
     read = _by_suffix(path, {".csv": _read_csv, ".parquet": _read_parquet})
@@ -137,7 +137,13 @@ def read_trajectories(path: Path, *, fps: float | None = None) -> Trajectories:
 
 @dataclass(frozen=True)
 class _Table:
-    """Columns as they were read, and how to name the place of a row in a message."""
+    """Columns of a file.
+
+    Attributes:
+        path: path of the file.
+        columns: values by column name.
+        place: gives the line or row of a row index, for messages.
+    """
 
     path: Path
     columns: Mapping[str, Shaped[np.ndarray, "rows"]]
@@ -158,7 +164,7 @@ def _by_suffix(path: Path, functions: Mapping[str, Callable]) -> Callable:
 
 
 def _to_columns(trajectories: Trajectories) -> dict[str, Shaped[np.ndarray, "rows"]]:
-    """One array per column; NaN, or -1 cameras, where nothing is known."""
+    """One array per column; unknown values are NaN, and -1 in `num_cameras`."""
     shape = (trajectories.num_frames, trajectories.num_drones)
     unknown = np.full(shape, np.nan, np.float32)
     velocity_m_s = trajectories.velocity_m_s
@@ -311,7 +317,7 @@ def _from_table(table: _Table, fps: float | None) -> Trajectories:
         raise table.error(
             again,
             expected="one row per frame and drone",
-            found=f"a second one for frame {frame[frame_index[again]]} and drone {columns['drone'][again]}",
+            found=f"a second row for frame {frame[frame_index[again]]} and drone {columns['drone'][again]}",
         )
 
     def grid(*parts: str, missing: float) -> np.ndarray:
@@ -365,19 +371,19 @@ def _whole(values: Float[np.ndarray, "rows"]) -> Bool[np.ndarray, "rows"]:
 def _times(
     table: _Table, frame: Int[np.ndarray, "frames"], frame_index: Int[np.ndarray, "rows"], fps: float | None
 ) -> Float[np.ndarray, "frames"]:
-    """(frames,), the time that the rows of each frame agree on."""
+    """(frames,), times of the frames, seconds; all rows of a frame must agree."""
     time_s = np.full(len(frame), np.nan) if fps is None else frame / fps
     given_s = table.columns.get("time_s", np.full(len(frame_index), np.nan))
     known = np.flatnonzero(~np.isnan(given_s))
-    # Backwards, so that the first row of a frame has the last word.
+    # In reverse order, so that the time of a frame's first row is used.
     time_s[frame_index[known[::-1]]] = given_s[known[::-1]]
-    # Far above any rounding, far below the time between two frames.
+    # The limit is far above rounding errors and far below the time between two frames.
     differs = np.abs(time_s[frame_index[known]] - given_s[known]) > 1e-3
     if differs.any():
         row = int(known[np.argmax(differs)])
-        expected = f"{time_s[frame_index[row]]:g} s, as another row of this frame has"
+        expected = f"{time_s[frame_index[row]]:g} s as in another row of this frame"
         raise table.error(row, expected=expected, found=f"{given_s[row]:g} s")
     if np.isnan(time_s).any():
         row = int(np.argmax(np.isnan(time_s)[frame_index]))
-        raise table.error(row, expected="a time_s, or the frame rate to know it by", found="neither")
+        raise table.error(row, expected="a time_s, or a frame rate to compute it", found="neither")
     return time_s

@@ -1,4 +1,4 @@
-"""`Trajectories`: where every drone is in every frame. What every method yields and every judge reads."""
+"""`Trajectories`: positions of all drones in all frames, the result of tracking and the input of the evaluation."""
 
 from __future__ import annotations
 
@@ -10,43 +10,44 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack.errors import InputError
 
-#: Halves of a covariance may differ by this share of its largest entry: some hundred roundings of float32.
+#: Largest asymmetry of a covariance relative to its largest element: about a hundred roundings of float32.
 SYMMETRY = 1e-5
 
 
 class Status(IntEnum):
-    """What the tracker knows of a drone in a frame."""
+    """Status of a drone in a frame."""
 
+    #: The position comes from a measurement.
     TRACKED = 0
-    #: Predicted over a gap.
+    #: The position is predicted over a gap without measurements.
     COASTING = 1
-    #: The last prediction, kept for people to look at; counts as missed.
+    #: The position is the last prediction, for display only; the drone counts as missed.
     LOST = 2
 
     @property
     def label(self) -> str:
-        """The word in tables and files."""
+        """Word in tables and files."""
         return self.name.lower()
 
 
 @dataclass(frozen=True)
 class Trajectories:
-    """Positions of drones over frames, with what is known beside them.
+    """Positions of drones over frames, with optional further quantities.
 
-    A reference has positions, and orientations where they were recorded; a tracker adds velocities, covariances,
-    fitness, number of cameras and status. What is not known of one drone in one frame is NaN; what is not known at
-    all is None.
+    A reference has positions and, if they were recorded, orientations. A tracker adds velocities, covariances, fitness,
+    number of cameras and status. A value that is unknown for one drone in one frame is NaN; a quantity that is unknown
+    altogether is None.
 
     Attributes:
         frame: (frames,), numbers of the video frames, 0-based, increasing.
-        time_s: (frames,), seconds since frame 0.
+        time_s: (frames,), times since frame 0, seconds.
         drones: one name per drone.
-        position_m: (frames, drones, 3), world, metres.
-        velocity_m_s: (frames, drones, 3), metres per second.
-        covariance_m2: (frames, drones, 3, 3), of the positions, world, square metres; symmetric.
-        orientation_wxyz: (frames, drones, 4), unit quaternions that turn body into world coordinates.
-        fitness: (frames, drones), in [0, 1].
-        num_cameras: (frames, drones), cameras that see the drone.
+        position_m: (frames, drones, 3), positions in the world, metres.
+        velocity_m_s: (frames, drones, 3), velocities in the world, metres per second.
+        covariance_m2: (frames, drones, 3, 3), covariances of the positions, square metres; symmetric.
+        orientation_wxyz: (frames, drones, 4), unit quaternions that turn body coordinates into world coordinates.
+        fitness: (frames, drones), scores in [0, 1].
+        num_cameras: (frames, drones), numbers of cameras that see the drone.
         status: (frames, drones), values of `Status`.
     """
 
@@ -78,9 +79,7 @@ class Trajectories:
             if value is not None and value.shape != shape:
                 raise InputError(f"trajectories.{name}", expected=f"shape {shape}", found=f"{value.shape}")
         if len(set(self.drones)) < drones:
-            raise InputError(
-                "trajectories.drones", expected="a name of its own for each", found=f"{self.drones}"
-            )
+            raise InputError("trajectories.drones", expected="different names", found=f"{self.drones}")
         if np.any(np.diff(self.frame) <= 0):
             raise InputError(
                 "trajectories.frame", expected="increasing frame numbers", found="repeats or steps back"
@@ -100,12 +99,19 @@ class Trajectories:
 
     @property
     def seen(self) -> Bool[np.ndarray, "frames drones"]:
-        """(frames, drones), where there is a position that is not `lost`."""
-        there = np.isfinite(self.position_m).all(axis=-1)
-        return there if self.status is None else there & (self.status != Status.LOST)
+        """(frames, drones), True where the position is known and the status is not `lost`."""
+        finite = np.isfinite(self.position_m).all(axis=-1)
+        return finite if self.status is None else finite & (self.status != Status.LOST)
 
     def at_frames(self, frame: Int[np.ndarray, "wanted"]) -> Trajectories:
-        """The rows of the wanted frame numbers, which must all be there."""
+        """Trajectories of chosen frames only.
+
+        Args:
+            frame: (wanted,), numbers of the frames.
+
+        Raises:
+            InputError: a frame does not exist.
+        """
         index = np.searchsorted(self.frame, frame)
         index_in = np.minimum(index, max(self.num_frames - 1, 0))
         if len(frame) and (self.num_frames == 0 or np.any(self.frame[index_in] != frame)):
@@ -131,7 +137,7 @@ class Trajectories:
 
 
 def _check_symmetric(covariance_m2: Float[np.ndarray, "frames drones 3 3"]) -> None:
-    """Refuse matrices whose halves differ by more than the rounding of float32 sums; NaN is not known, and passes."""
+    """Raise `InputError` for matrices that are not symmetric up to the rounding of float32 sums; NaN passes."""
     asymmetry_m2 = np.abs(covariance_m2 - np.swapaxes(covariance_m2, -1, -2)).max(axis=(-2, -1))
     wrong = asymmetry_m2 > SYMMETRY * np.abs(covariance_m2).max(axis=(-2, -1))
     if wrong.any():

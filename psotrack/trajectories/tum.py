@@ -1,6 +1,6 @@
-"""TUM files: one pose per line, `timestamp tx ty tz qx qy qz qw`, one file per drone; evo reads them.
+"""TUM files: one pose per line, `timestamp tx ty tz qx qy qz qw`, one file per drone; for the program evo.
 
-The format is that of the TUM RGB-D benchmark (Sturm et al., IROS 2012). It knows neither frames nor status.
+The format is that of the TUM RGB-D benchmark (Sturm et al., IROS 2012). It has neither frame numbers nor status.
 """
 
 from __future__ import annotations
@@ -18,20 +18,25 @@ _HEADER = "# timestamp tx ty tz qx qy qz qw"
 _UNKNOWN = "# orientation unknown: 0 0 0 1 in every line"
 
 
-def write_tum(folder: Path, trajectories: Trajectories, *, force: bool = False) -> list[Path]:
-    """Write `folder`/NAME.tum for each drone, with the frames in which it is seen.
+def write_tum(folder: Path | str, trajectories: Trajectories, *, force: bool = False) -> list[Path]:
+    """Write `folder`/NAME.tum for each drone, with the frames in which the drone is seen.
 
-    Numbers have the fewest digits that give the same number in the array's own precision. A drone whose
-    orientation is not known in all of them gets the identity throughout, and a comment that says so.
+    Numbers have the fewest digits that give the same number in the array's own precision. If an orientation of a drone
+    is unknown in one of these frames, all its orientations are written as the identity, with a comment in the file.
+
+    Args:
+        folder: folder of the files.
+        trajectories: the drones' poses.
+        force: replace existing files.
 
     Returns:
-        The files, one per drone.
+        The paths of the files, one per drone.
 
     Raises:
         InputError: a drone's name cannot be the name of a file.
-        OutputError: a file exists and `force` is not set, or it cannot be written; what was there is
-            unchanged.
+        OutputError: a file exists and `force` is not set, or it cannot be written; older files are unchanged.
     """
+    folder = Path(folder)
     for name in trajectories.drones:
         if not name or Path(name).name != name:
             raise InputError("drones", expected="names that can be names of files", found=repr(name))
@@ -45,21 +50,22 @@ def write_tum(folder: Path, trajectories: Trajectories, *, force: bool = False) 
     return paths
 
 
-def read_tum(path: Path, *, fps: float) -> Trajectories:
-    """Read one TUM file, or all `*.tum` of a folder, in order of the names, which name the drones.
+def read_tum(path: Path | str, *, fps: float) -> Trajectories:
+    """Read one TUM file, or all `*.tum` files of a folder in the order of their names, which are the drones' names.
 
     Args:
-        path: file or folder.
-        fps: frames per second; frame k is at k / fps seconds, and every line must be within 0.1 frames.
+        path: path of a file or a folder.
+        fps: frames per second; frame k is at k / fps seconds, and every timestamp must be within 0.1 frames of a frame.
 
     Raises:
-        InputError: nothing to read, a line that is no pose, a time that is no frame's, or two lines for one
+        InputError: there is no file, a line is not a pose, a timestamp belongs to no frame, or two lines belong to one
             frame. The message names file and line.
     """
+    path = Path(path)
     check_positive("fps", fps)
     files = sorted(path.glob("*.tum")) if path.is_dir() else [path]
     if not files or not files[0].is_file():
-        raise InputError(path, expected="a TUM file, or a folder with some", found="none")
+        raise InputError(path, expected="a TUM file, or a folder with TUM files", found="none")
     poses = [_read_file(file, fps) for file in files]
     frame = np.unique(np.concatenate([numbers for numbers, _ in poses]))
     if not len(frame):
@@ -91,7 +97,7 @@ def _lines(trajectories: Trajectories, drone: int) -> list[str]:
 
 
 def _read_file(path: Path, fps: float) -> tuple[np.ndarray, Float[np.ndarray, "rows 7"]]:
-    """Frame numbers, and positions with orientations (x, y, z, w); these are NaN if the file has none."""
+    """Frame numbers, and positions with orientations (x, y, z, w); unknown orientations are NaN."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (UnicodeDecodeError, OSError) as error:
@@ -106,7 +112,7 @@ def _read_file(path: Path, fps: float) -> tuple[np.ndarray, Float[np.ndarray, "r
                 raise InputError(place, expected=f"the time of a frame at {fps:g} fps", found=f"{time_s:g} s")
             if poses.setdefault(frame, pose) is not pose:
                 raise InputError(
-                    place, expected="one line per frame", found=f"a second one for frame {frame}"
+                    place, expected="one line per frame", found=f"a second line for frame {frame}"
                 )
     values = np.array([poses[frame] for frame in sorted(poses)]).reshape(-1, 7)
     values[:, 3:] /= np.linalg.norm(values[:, 3:], axis=1, keepdims=True)

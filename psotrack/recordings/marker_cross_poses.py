@@ -9,7 +9,13 @@ from jaxtyping import Bool, Float, Int
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
-from psotrack.recordings.crosses import TOLERANCE_M, Cross, fit, usual, which_marker
+from psotrack.recordings.marker_crosses import (
+    TOLERANCE_M,
+    Cross,
+    fit_rigid,
+    identify_markers,
+    within_usual_residual,
+)
 
 #: Velocities at the ends of a gap are those of parabolas through what is seen in so long.
 _SLOPE_S = 0.1
@@ -37,7 +43,7 @@ class CrossPoses:
     bridged: Bool[np.ndarray, "frames"]
 
 
-def poses(
+def estimate_poses(
     cross: Cross,
     position_m: Float[np.ndarray, "frames markers 3"],
     rate_hz: float,
@@ -56,7 +62,7 @@ def poses(
         rate_hz: frames per second.
         max_gap_s: longer gaps stay NaN, as do those before the first pose and after the last.
     """
-    found = fit(cross.markers_m, relabelled(cross, position_m))
+    found = fit_rigid(cross.markers_m, correct_labels(cross, position_m))
     known = np.isfinite(found.rotation[:, 0, 0])
     orientation_wxyz = np.full((len(known), 4), np.nan)
     if known.any():
@@ -68,15 +74,15 @@ def poses(
     return _bridged(gappy, rate_hz, max_gap_s)
 
 
-def relabelled(
+def correct_labels(
     cross: Cross, position_m: Float[np.ndarray, "frames markers 3"]
 ) -> Float[np.ndarray, "frames markers 3"]:
     """The markers with swapped labels put right, and strays taken out; frames in which nothing fits are NaN."""
-    residual_m = fit(cross.markers_m, position_m).residual_m
+    residual_m = fit_rigid(cross.markers_m, position_m).residual_m
     right_m = position_m.copy()
-    for frame in np.flatnonzero(np.isfinite(residual_m) & ~usual(residual_m)):
+    for frame in np.flatnonzero(np.isfinite(residual_m) & ~within_usual_residual(residual_m)):
         seen_m = position_m[frame, np.isfinite(position_m[frame]).all(axis=-1)]
-        marker = which_marker(cross, seen_m)
+        marker = identify_markers(cross, seen_m)
         if (marker >= 0).any():
             right_m[frame] = np.nan
             right_m[frame, marker[marker >= 0]] = seen_m[marker >= 0]
@@ -85,7 +91,7 @@ def relabelled(
     return right_m
 
 
-def completed(
+def complete_markers(
     cross: Cross,
     position_m: Float[np.ndarray, "frames markers 3"],
     unlabelled_m: Float[np.ndarray, "frames points 3"],
@@ -102,7 +108,7 @@ def completed(
         for one_m in own_m:
             points_m = points_m[np.linalg.norm(points_m - one_m, axis=1) <= reach_m]
         both_m = np.vstack([own_m, points_m])
-        marker = which_marker(cross, both_m)
+        marker = identify_markers(cross, both_m)
         found, kept = marker >= 0, (marker[: len(own_m)] >= 0).all()
         if kept and found.sum() > len(own_m) and (len(own_m) or found.sum() == len(cross.markers_m)):
             whole_m[frame] = np.nan
@@ -110,7 +116,7 @@ def completed(
     return whole_m
 
 
-def at_times(found: CrossPoses, rate_hz: float, time_s: Float[np.ndarray, "times"]) -> CrossPoses:
+def interpolate_poses(found: CrossPoses, rate_hz: float, time_s: Float[np.ndarray, "times"]) -> CrossPoses:
     """The poses at other times than the recording's frames: between two of them, NaN where one is not known.
 
     Positions are interpolated linearly, which at 100 Hz and 4 m/s² is 0.05 mm off; orientations by slerp.

@@ -66,7 +66,7 @@ class RigidFit:
     num_markers: Int[np.ndarray, "frames"]
 
 
-def fit(
+def fit_rigid(
     markers_m: Float[np.ndarray, "markers 3"], position_m: Float[np.ndarray, "frames markers 3"]
 ) -> RigidFit:
     """The least-squares pose of a body in every frame, from those of its markers that are seen.
@@ -120,14 +120,14 @@ def learn_cross(position_m: Float[np.ndarray, "frames markers 3"], name: str = "
     markers_m, pose = fitted
     for _ in range(_NUM_ROUNDS):
         before_m, markers_m = markers_m, _mean_shape(markers_m, pose, position_m)
-        pose = fit(markers_m, position_m)
+        pose = fit_rigid(markers_m, position_m)
         if np.abs(markers_m - before_m).max() < _SETTLED_M:
             break
     axes = _axes(markers_m, up=np.nanmean(pose.rotation[:, 2], axis=0))
     return Cross(name, markers_m @ axes.T)
 
 
-def which_marker(cross: Cross, points_m: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, "points"]:
+def identify_markers(cross: Cross, points_m: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, "points"]:
     """Which marker of a cross each point is, from the distances alone; points in any order, strays among them.
 
     Returns:
@@ -143,7 +143,7 @@ def which_marker(cross: Cross, points_m: Float[np.ndarray, "points 3"]) -> Int[n
     return nobody
 
 
-def identify(crosses: Ordered[Cross], points_m: Float[np.ndarray, "points 3"]) -> int | None:
+def identify_cross(crosses: Ordered[Cross], points_m: Float[np.ndarray, "points 3"]) -> int | None:
     """Which cross a set of points is, from the lengths of its arms; of a recording, ask for what `learn_cross` made.
 
     Returns:
@@ -176,7 +176,7 @@ def _labellings(
         left = num_markers - marker - 1
         found = found[(found != nobody).sum(axis=1) + left >= min(_FEWEST, num_markers)]
     points_or_none = np.vstack([points_m, np.full((1, 3), np.nan)])
-    residual_m = fit(cross.markers_m, points_or_none[found]).residual_m
+    residual_m = fit_rigid(cross.markers_m, points_or_none[found]).residual_m
     fitting = residual_m <= TOLERANCE_M
     found, residual_m = np.where(found == nobody, -1, found)[fitting], residual_m[fitting]
     count = (found >= 0).sum(axis=1)
@@ -220,7 +220,7 @@ def _better_hand(
     markers_m: Float[np.ndarray, "markers 3"], position_m: Float[np.ndarray, "frames markers 3"]
 ) -> tuple[Float[np.ndarray, "markers 3"], RigidFit] | None:
     """Of a shape and its mirror image, the one that fits; None where markers lie on a line."""
-    hands = [(hand_m, fit(hand_m, position_m)) for hand_m in (markers_m, markers_m * [1.0, 1.0, -1.0])]
+    hands = [(hand_m, fit_rigid(hand_m, position_m)) for hand_m in (markers_m, markers_m * [1.0, 1.0, -1.0])]
     if np.isnan(hands[0][1].residual_m).all():
         return None
     return min(hands, key=lambda hand: float(np.nanmedian(hand[1].residual_m)))
@@ -232,7 +232,7 @@ def _mean_shape(
     position_m: Float[np.ndarray, "frames markers 3"],
 ) -> Float[np.ndarray, "markers 3"]:
     """The mean of the markers in the body's frame over the frames that fit; centred."""
-    fitting: Bool[np.ndarray, "frames"] = usual(pose.residual_m)
+    fitting: Bool[np.ndarray, "frames"] = within_usual_residual(pose.residual_m)
     in_body = np.einsum(
         "fji,fmj->fmi", pose.rotation[fitting], position_m[fitting] - pose.position_m[fitting, None]
     )
@@ -243,7 +243,7 @@ def _mean_shape(
     return mean_m - mean_m.mean(axis=0)
 
 
-def usual(residual_m: Float[np.ndarray, "frames"]) -> Bool[np.ndarray, "frames"]:
+def within_usual_residual(residual_m: Float[np.ndarray, "frames"]) -> Bool[np.ndarray, "frames"]:
     """Where a residual is what it mostly is in this recording, up to its noise; not where it is NaN."""
     known = residual_m[np.isfinite(residual_m)]
     limit_m = 3 * np.median(known) + _NOISE_M if len(known) else 0.0
