@@ -281,7 +281,7 @@ def test_a_full_disk_is_an_error(tmp_path):
         from pathlib import Path
         import numpy as np
         from psotrack.errors import OutputError
-        from psotrack.recordings.mocap import Markers, write_c3d
+        from psotrack.recordings.c3d import Markers, write_c3d
         sys.dont_write_bytecode = True  # a cached module would be cut off too, for everybody
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
         try:

@@ -47,7 +47,7 @@ def test_an_unknown_camera():
 
 
 def test_a_camera_without_video():
-    with pytest.raises(InputError, match="found none for b, d; pass --cameras a,c,e to go without"):
+    with pytest.raises(InputError, match="found none for b, d; pass --cameras a,c,e to leave these out"):
         a_sequence(b=None, d=None).usable()
     assert a_sequence(b=None).usable(["a", "c"]).rig.names == ("a", "c")
 

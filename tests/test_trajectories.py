@@ -80,7 +80,7 @@ def test_at_frames_refuses_missing_frames(wanted):
     [
         ({"frame": np.array([0, 1, 1, 2, 3])}, "increasing frame numbers"),
         ({"frame": np.array([0, 2, 1, 3, 4])}, "increasing frame numbers"),
-        ({"drones": ("a", "b", "a")}, "a name of its own"),
+        ({"drones": ("a", "b", "a")}, "different names"),
         (
             {"covariance_m2": np.broadcast_to(np.eye(3) + np.eye(3, k=1), (FRAMES, DRONES, 3, 3))},
             r"trajectories\.covariance_m2: expected symmetric matrices.*row 0 of drone 0",

@@ -245,7 +245,7 @@ def test_a_full_disk_is_an_error_and_costs_nothing(tmp_path):
         """
     )
     done = subprocess.run([sys.executable, "-c", script, path], capture_output=True, text=True)
-    assert "a.avi: expected to write 200 frames, found" in done.stdout, done.stderr
+    assert "a.avi: expected a file with 200 frames, found" in done.stdout, done.stderr
     assert "is the disk full?" in done.stdout
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
@@ -274,7 +274,7 @@ def test_an_index_that_is_cut_off_is_noticed(tmp_path, missing):
     )
     command = [sys.executable, "-c", script, tmp_path / "a.avi", str(whole - missing)]
     done = subprocess.run(command, capture_output=True, text=True)
-    assert "a.avi: expected to write 200 frames, found their index cut off; is the disk full?" in done.stdout
+    assert "a.avi: expected a file with 200 frames, found an incomplete index of frames; is the disk full?" in done.stdout
     assert not (tmp_path / "a.avi").exists()
 
 
@@ -363,5 +363,5 @@ def test_a_disk_that_is_full_while_joining_costs_nothing(tmp_path):
     )
     command = [sys.executable, "-c", script, tmp_path / "joined.avi", str(size * 3 // 2), *parts]
     done = subprocess.run(command, capture_output=True, text=True)
-    assert "joined.avi: expected to write 40 frames, found" in done.stdout, done.stderr
+    assert "joined.avi: expected a file with 40 frames, found" in done.stdout, done.stderr
     assert sorted(tmp_path.iterdir()) == parts

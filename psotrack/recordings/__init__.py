@@ -1,7 +1,7 @@
 """Recordings: videos, the rig, detections and the reference, as one `Sequence`.
 
-In: files of one recording (videos, detections, C3D). Out: a `Sequence` that says whether the files fit together,
-decoded frames, detections, and reference trajectories made from motion-capture markers.
+In: files of one recording (videos, detections, C3D). Out: a `Sequence`, which checks that its files are consistent;
+decoded frames, detections, and reference trajectories from motion-capture markers.
 """
 
 import lazy_loader

@@ -1,8 +1,8 @@
-"""2D detections: boxes that a detector found, in the files of the DPJAIT dataset (`dl_data/<camera>.csv`).
+"""2D detections of one camera, and their files in the DPJAIT dataset (`dl_data/<camera>.csv`).
 
-One line per frame, comma-separated, no header: the 0-based frame number, then 7 values per detection: x, y,
-w, h, cx, cy, confidence, in pixels (YOLOv5). Frames may be missing, the number of detections differs, and lines may be
-padded with empty fields, which mean nothing.
+A file has one line per frame, comma-separated, without header: the 0-based frame number, then 7 values per detection:
+x, y, w, h, cx, cy, confidence, in pixels (YOLOv5). Frames may be missing, frames have different numbers of detections,
+and lines may be padded with empty fields.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Detections:
     Attributes:
         frame: (detections,), 0-based numbers of the video frames.
         xyxy: (detections, 4), boxes in pixels, in the convention of `psotrack.geometry.boxes`.
-        confidence: (detections,), in [0, 1].
+        confidence: (detections,), confidences of the detector in [0, 1].
     """
 
     frame: Int[np.ndarray, " detections"]
@@ -42,21 +42,21 @@ class Detections:
         return len(self.frame)
 
     def in_frame(self, frame: int) -> Detections:
-        """Those of one frame."""
+        """Detections of one frame."""
         start, stop = np.searchsorted(self.frame, [frame, frame + 1])
         return Detections(self.frame[start:stop], self.xyxy[start:stop], self.confidence[start:stop])
 
 
-def read_detections(path: Path) -> Detections:
-    """The detections of one camera.
+def read_detections(path: Path | str) -> Detections:
+    """Read the detections of one camera.
 
-    Where a box lies is taken from its middle, cx and cy, and its size: that is the same box whatever a
-    detector means by x and y, a corner or the middle.
+    A box is computed from its middle, cx and cy, and its size, because x and y are a corner in the files of some
+    detectors and the middle in others.
 
     Raises:
-        InputError: the file cannot be read, or a line is broken: not 7 values per detection, a value that is
-            no finite number, a size below 0, a confidence outside [0, 1], or a frame that was there before.
-            The message names the line.
+        InputError: the file cannot be read, or a line is wrong: not 7 values per detection, a value that is not a
+            finite number, a size below 0, a confidence outside [0, 1], or a frame that occurred before. The message
+            names the line.
     """
     boxes: dict[int, list[tuple[float, ...]]] = {}
     for row in read_rows(path, _SEPARATOR):
@@ -69,8 +69,8 @@ def read_detections(path: Path) -> Detections:
     return Detections(np.array([frame for frame, _ in found], np.int64), values[:, :4], values[:, 4])
 
 
-def write_detections(path: Path, detections: Detections) -> None:
-    """Write the detections of one camera; frames without any get no line.
+def write_detections(path: Path | str, detections: Detections) -> None:
+    """Write the detections of one camera; frames without detections have no line.
 
     Raises:
         OutputError: the file cannot be written.
@@ -86,7 +86,7 @@ def write_detections(path: Path, detections: Detections) -> None:
 
 
 def _boxes(row: TextRow) -> list[tuple[float, ...]]:
-    """x0, y0, x1, y1, confidence of each detection in a line."""
+    """Left, top, right, bottom and confidence of each detection in a line."""
     size = len(_VALUES)
     # Lines of the dataset are padded with empty fields to the width of the longest line.
     num_values = max((index for index, cell in enumerate(row.cells) if cell), default=0)
@@ -119,5 +119,5 @@ def _box(row: TextRow, start: int) -> tuple[float, ...]:
 
 
 def _column(index: int) -> Column:
-    """The files have no header: columns are called by their numbers, from 1."""
+    """Column with its number from 1 as name, because the files have no header."""
     return Column(index, f"{index + 1}", "", f"{index + 1}")

@@ -1,4 +1,4 @@
-"""What a sequence holds, as a record for programs and a table for people: the command `psotrack info`."""
+"""Inventory of a sequence, as a JSON record and as a table: the command `psotrack info`."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
 
 def describe_sequence(sequence: Sequence) -> dict[str, Any]:
-    """Cameras, videos, detections and reference of a sequence; detections are read whole.
+    """Cameras, videos, detections and reference of a sequence, as plain data. All detections are read.
 
     Raises:
-        InputError: a file of detections is broken.
+        InputError: a file of detections cannot be read.
     """
     cameras: dict[str, dict[str, Any]] = {}
     for index, name in enumerate(sequence.rig.names):
@@ -33,14 +33,14 @@ def describe_sequence(sequence: Sequence) -> dict[str, Any]:
             "detections": len(read_detections(detections)) if detections else None,
         }
     onboard: dict[str, dict[str, Any]] = {}
-    for name, one in (sequence.onboard or {}).items():
+    for name, flown in (sequence.onboard or {}).items():
         onboard[name] = {
-            "video": str(one.video.path),
-            "frames": one.video.num_frames,
-            "fps": one.video.fps,
-            "image_size_wh": list(one.video.image_size_wh),
-            "focal_length_px": None if one.K is None else float(one.K[0, 0]),
-            "frames_with_pose": int(np.isfinite(one.orientation_wxyz).all(axis=1).sum()),
+            "video": str(flown.video.path),
+            "frames": flown.video.num_frames,
+            "fps": flown.video.fps,
+            "image_size_wh": list(flown.video.image_size_wh),
+            "focal_length_px": None if flown.K is None else float(flown.K[0, 0]),
+            "frames_with_pose": int(np.isfinite(flown.orientation_wxyz).all(axis=1).sum()),
         }
     truth = sequence.truth
     return {
@@ -54,7 +54,11 @@ def describe_sequence(sequence: Sequence) -> dict[str, Any]:
 
 
 def inventory_table(content: dict[str, Any]) -> Table:
-    """The record as a table, one row per camera; those on drones come last."""
+    """Table with one row per camera; cameras on drones come last.
+
+    Args:
+        content: record from `describe_sequence`.
+    """
     from rich import box
     from rich.table import Table
 

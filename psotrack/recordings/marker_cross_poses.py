@@ -1,4 +1,4 @@
-"""Poses of marker crosses over time: labels put right, gaps bridged and flagged, any moment in between."""
+"""Poses of marker crosses over time: correction of labels, bridging of gaps, interpolation between frames."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from psotrack.recordings.marker_crosses import (
     within_usual_residual,
 )
 
-#: Velocities at the ends of a gap are those of parabolas through what is seen in so long.
+#: Time before and after a gap from which the velocities at its ends are computed by parabolas, seconds.
 _SLOPE_S = 0.1
-#: Times that are nearer to a frame than this share of the time between two are that frame's: their rounding.
+#: Largest distance of a time from a frame that is ignored as rounding, in frames.
 _SAME_FRAME = 1e-6
 
 
@@ -28,12 +28,13 @@ class CrossPoses:
     """The poses of one cross.
 
     Attributes:
-        position_m: (frames, 3), the centroid of the whole cross as it was learned, world; NaN where it is not known. It
-            does not jump when a marker comes or goes.
-        orientation_wxyz: (frames, 4), unit quaternions, cross to world; NaN where they are not known.
-        residual_m: (frames,), root mean square distance of the markers seen from their places; NaN without a fit.
-        num_markers: (frames,), markers seen that belong to the fit.
-        bridged: (frames,), where the pose is that between the ends of a gap.
+        position_m: (frames, 3), centroid of the learned cross in the world, metres; NaN if unknown. The centroid does
+            not jump when a marker appears or disappears.
+        orientation_wxyz: (frames, 4), unit quaternions from cross to world; NaN if unknown.
+        residual_m: (frames,), root mean square distance of the seen markers from the fitted cross, metres; NaN without
+            a fit.
+        num_markers: (frames,), number of seen markers in the fit.
+        bridged: (frames,), True where the pose is interpolated over a gap.
     """
 
     position_m: Float[np.ndarray, "frames 3"]
@@ -50,45 +51,45 @@ def estimate_poses(
     *,
     max_gap_s: float = 0.5,
 ) -> CrossPoses:
-    """The pose of a cross in every frame of a recording, by least squares; three of its markers are enough.
+    """Poses of a cross in every frame of a recording, by least squares; three seen markers are enough.
 
-    In frames that fit worse than the others, labels are told from the distances anew; what does not fit even then is
-    a gap. Gaps are bridged by a cubic for the position, with the velocities at their ends, and the shortest turn at
-    constant speed (slerp) for the orientation.
+    In frames with an unusually large residual, the labels are corrected from the distances. Frames that do not fit even
+    then are gaps. Gaps are bridged by a cubic for the position, with the velocities at the ends of the gap, and by the
+    shortest turn at constant speed (slerp) for the orientation.
 
     Args:
-        cross: as `learn_cross` made it, its markers in the order of `position_m`.
-        position_m: (frames, markers, 3), world; NaN where a marker is not seen.
-        rate_hz: frames per second.
-        max_gap_s: longer gaps stay NaN, as do those before the first pose and after the last.
+        cross: cross from `learn_cross`, with its markers in the order of `position_m`.
+        position_m: (frames, markers, 3), positions in the world, metres; NaN if a marker is not seen.
+        rate_hz: frames per second of the recording.
+        max_gap_s: longest gap that is bridged, seconds; frames before the first and after the last pose stay NaN.
     """
-    found = fit_rigid(cross.markers_m, correct_labels(cross, position_m))
-    known = np.isfinite(found.rotation[:, 0, 0])
+    fits = fit_rigid(cross.markers_m, correct_labels(cross, position_m))
+    known = np.isfinite(fits.rotation[:, 0, 0])
     orientation_wxyz = np.full((len(known), 4), np.nan)
     if known.any():
-        turns = Rotation.from_matrix(found.rotation[known])
+        turns = Rotation.from_matrix(fits.rotation[known])
         orientation_wxyz[known] = turns.as_quat(scalar_first=True)
-    gappy = CrossPoses(
-        found.position_m, orientation_wxyz, found.residual_m, found.num_markers, np.zeros(len(known), bool)
+    with_gaps = CrossPoses(
+        fits.position_m, orientation_wxyz, fits.residual_m, fits.num_markers, np.zeros(len(known), bool)
     )
-    return _bridged(gappy, rate_hz, max_gap_s)
+    return _bridge_gaps(with_gaps, rate_hz, max_gap_s)
 
 
 def correct_labels(
     cross: Cross, position_m: Float[np.ndarray, "frames markers 3"]
 ) -> Float[np.ndarray, "frames markers 3"]:
-    """The markers with swapped labels put right, and strays taken out; frames in which nothing fits are NaN."""
+    """(frames, markers, 3), markers with corrected labels and without stray points; NaN in frames without a fit."""
     residual_m = fit_rigid(cross.markers_m, position_m).residual_m
-    right_m = position_m.copy()
+    corrected_m = position_m.copy()
     for frame in np.flatnonzero(np.isfinite(residual_m) & ~within_usual_residual(residual_m)):
         seen_m = position_m[frame, np.isfinite(position_m[frame]).all(axis=-1)]
         marker = identify_markers(cross, seen_m)
         if (marker >= 0).any():
-            right_m[frame] = np.nan
-            right_m[frame, marker[marker >= 0]] = seen_m[marker >= 0]
+            corrected_m[frame] = np.nan
+            corrected_m[frame, marker[marker >= 0]] = seen_m[marker >= 0]
         elif residual_m[frame] > TOLERANCE_M:
-            right_m[frame] = np.nan
-    return right_m
+            corrected_m[frame] = np.nan
+    return corrected_m
 
 
 def complete_markers(
@@ -96,39 +97,47 @@ def complete_markers(
     position_m: Float[np.ndarray, "frames markers 3"],
     unlabelled_m: Float[np.ndarray, "frames points 3"],
 ) -> Float[np.ndarray, "frames markers 3"]:
-    """The markers, with those that lost their labels found among unlabelled points by their distances.
+    """Find markers that lost their labels among unlabelled points, by their distances.
 
-    Beside markers that kept their labels, three in all are enough; without any, the whole cross must be there.
+    If a marker has kept its label, three found markers are enough; without any label, all markers must be found.
+
+    Args:
+        cross: the cross.
+        position_m: (frames, markers, 3), labelled markers in the world, metres; NaN if a marker is not seen.
+        unlabelled_m: (frames, points, 3), unlabelled points in the world, metres; NaN if a point is not seen.
+
+    Returns:
+        (frames, markers, 3), labelled and found markers.
     """
-    seen, there = (np.isfinite(points_m).all(axis=-1) for points_m in (position_m, unlabelled_m))
+    seen, seen_unlabelled = (np.isfinite(points_m).all(axis=-1) for points_m in (position_m, unlabelled_m))
     reach_m = 2 * np.linalg.norm(cross.markers_m, axis=1).max() + TOLERANCE_M
-    whole_m = position_m.copy()
-    for frame in np.flatnonzero(~seen.all(axis=1) & there.any(axis=1)):
-        own_m, points_m = position_m[frame, seen[frame]], unlabelled_m[frame, there[frame]]
-        for one_m in own_m:
-            points_m = points_m[np.linalg.norm(points_m - one_m, axis=1) <= reach_m]
+    complete_m = position_m.copy()
+    for frame in np.flatnonzero(~seen.all(axis=1) & seen_unlabelled.any(axis=1)):
+        own_m, points_m = position_m[frame, seen[frame]], unlabelled_m[frame, seen_unlabelled[frame]]
+        for marker_m in own_m:
+            points_m = points_m[np.linalg.norm(points_m - marker_m, axis=1) <= reach_m]
         both_m = np.vstack([own_m, points_m])
         marker = identify_markers(cross, both_m)
         found, kept = marker >= 0, (marker[: len(own_m)] >= 0).all()
         if kept and found.sum() > len(own_m) and (len(own_m) or found.sum() == len(cross.markers_m)):
-            whole_m[frame] = np.nan
-            whole_m[frame, marker[found]] = both_m[found]
-    return whole_m
+            complete_m[frame] = np.nan
+            complete_m[frame, marker[found]] = both_m[found]
+    return complete_m
 
 
 def interpolate_poses(found: CrossPoses, rate_hz: float, time_s: Float[np.ndarray, "times"]) -> CrossPoses:
-    """The poses at other times than the recording's frames: between two of them, NaN where one is not known.
+    """Interpolate poses at any times; NaN if the pose before or after the time is unknown.
 
-    Positions are interpolated linearly, which at 100 Hz and 4 m/s² is 0.05 mm off; orientations by slerp.
+    Positions are interpolated linearly, with an error of 0.05 mm at 100 Hz and 4 m/s²; orientations by slerp.
 
     Args:
-        found: the poses.
-        rate_hz: of the recording, whose frame 0 is at 0 s.
-        time_s: (times,), in any order; outside of the recording there are none.
+        found: poses at the frames of the recording.
+        rate_hz: frames per second of the recording, whose frame 0 is at 0 s.
+        time_s: (times,), times in any order, seconds; poses outside of the recording are NaN.
     """
     before, after, share = _between(len(found.bridged), rate_hz, time_s)
     inside = before >= 0
-    # Where a time is a frame's, `after` is that frame too.
+    # For the time of a frame, `before` and `after` are both this frame.
     position_m = _lerp(found.position_m, before, after, share)
     orientation_wxyz = np.full((len(time_s), 4), np.nan)
     turned = inside & np.isfinite(found.orientation_wxyz[[before, after], 0]).all(axis=0)
@@ -151,7 +160,7 @@ def interpolate_poses(found: CrossPoses, rate_hz: float, time_s: Float[np.ndarra
 def _between(
     num_frames: int, rate_hz: float, time_s: Float[np.ndarray, "times"]
 ) -> tuple[Int[np.ndarray, "times"], Int[np.ndarray, "times"], Float[np.ndarray, "times"]]:
-    """The frames before and after each time, both -1 outside of the recording, and the share of the way between."""
+    """Frames before and after each time (both -1 outside of the recording), and the fraction between them, 0 to 1."""
     index = time_s * rate_hz
     nearest = np.round(index)
     index = np.where(np.abs(index - nearest) < _SAME_FRAME, nearest, index)
@@ -170,37 +179,37 @@ def _lerp(
     after: Int[np.ndarray, "times"],
     share: Float[np.ndarray, "times"],
 ) -> Float[np.ndarray, "times *rest"]:
-    """The values between two frames; NaN where one is NaN, or there is no such frame."""
+    """Linear interpolation between two frames; NaN if one value is NaN or the time is outside of the recording."""
     weight = share.reshape(-1, *[1] * (values.ndim - 1))
     mixed = (1 - weight) * values[before] + weight * values[after]
     mixed[before < 0] = np.nan
     return mixed
 
 
-def _bridged(gappy: CrossPoses, rate_hz: float, max_gap_s: float) -> CrossPoses:
-    """Gaps that are not too long filled."""
-    position_m, orientation_wxyz = gappy.position_m.copy(), gappy.orientation_wxyz.copy()
-    bridged = gappy.bridged.copy()
-    placed = np.flatnonzero(np.isfinite(gappy.position_m[:, 0]))
+def _bridge_gaps(with_gaps: CrossPoses, rate_hz: float, max_gap_s: float) -> CrossPoses:
+    """Poses with gaps up to `max_gap_s` filled."""
+    position_m, orientation_wxyz = with_gaps.position_m.copy(), with_gaps.orientation_wxyz.copy()
+    bridged = with_gaps.bridged.copy()
+    placed = np.flatnonzero(np.isfinite(with_gaps.position_m[:, 0]))
     steps = np.diff(placed)
-    # 5 frames missing of 100 Hz are 0.05 s unseen.
+    # The length of a gap is the number of missing frames: 5 missing frames at 100 Hz are 0.05 s.
     short = (steps > 1) & ((steps - 1) / rate_hz <= max_gap_s + 1e-9)
     for start, end in zip(placed[:-1][short], placed[1:][short], strict=True):
         inner = np.arange(start + 1, end)
         bridged[inner] = True
-        ends = gappy.position_m[[start, end]]
+        ends = with_gaps.position_m[[start, end]]
         chord = (ends[1] - ends[0]) / (end - start)
         reach = max(1, round(_SLOPE_S * rate_hz))
         slopes = [
-            _slope(gappy.position_m, placed[(placed <= start) & (placed >= start - reach)], start, chord),
-            _slope(gappy.position_m, placed[(placed >= end) & (placed <= end + reach)], end, chord),
+            _slope(with_gaps.position_m, placed[(placed <= start) & (placed >= start - reach)], start, chord),
+            _slope(with_gaps.position_m, placed[(placed >= end) & (placed <= end + reach)], end, chord),
         ]
         position_m[inner] = CubicHermiteSpline([start, end], ends, slopes)(inner)
-        turns = gappy.orientation_wxyz[[start, end]]
+        turns = with_gaps.orientation_wxyz[[start, end]]
         if np.isfinite(turns).all():
             slerp = Slerp([start, end], Rotation.from_quat(turns, scalar_first=True))
             orientation_wxyz[inner] = slerp(inner).as_quat(scalar_first=True)
-    return CrossPoses(position_m, orientation_wxyz, gappy.residual_m, gappy.num_markers, bridged)
+    return CrossPoses(position_m, orientation_wxyz, with_gaps.residual_m, with_gaps.num_markers, bridged)
 
 
 def _slope(
@@ -209,7 +218,7 @@ def _slope(
     at: np.integer,
     chord: Float[np.ndarray, "3"],
 ) -> Float[np.ndarray, "3"]:
-    """Metres per frame at one end of a gap; that of the gap's chord where a single pose is near."""
+    """Velocity at one end of a gap, metres per frame; the mean velocity over the gap if only one pose is near."""
     if len(frames) < 2:
         return chord
     return np.polyfit(frames - at, position_m[frames], min(2, len(frames) - 1))[-2]

@@ -1,4 +1,4 @@
-"""`Sequence`: what every source of data yields: videos, calibrated cameras, and a reference where known."""
+"""`Sequence`: one recording with its videos, calibrated cameras and, if known, its reference."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from psotrack.trajectories import Trajectories
 
 @dataclass(frozen=True)
 class OnboardVideo:
-    """The video of a drone's own camera, fixed to its body, without lens distortion.
+    """The video of a camera that is fixed to a drone and has no lens distortion.
 
     Attributes:
-        video: the file.
-        K: (3, 3), intrinsics in pixels; None where they are not known.
-        position_m: (frames, 3), the camera's centre, world; NaN where it is not known.
-        orientation_wxyz: (frames, 4), unit quaternions, camera to world, with camera axes x right, y down, z ahead; NaN
-            where they are not known.
+        video: the video file.
+        K: (3, 3), intrinsics in pixels; None if unknown.
+        position_m: (frames, 3), the camera's centre in the world, metres; NaN if unknown.
+        orientation_wxyz: (frames, 4), unit quaternions from camera to world, with camera axes x right, y down, z
+            forward; NaN if unknown.
     """
 
     video: VideoInfo
@@ -39,17 +39,17 @@ class OnboardVideo:
 class Sequence:
     """Synchronised videos of calibrated cameras that stand still.
 
-    Reading is lenient: a camera may have no video, and videos may differ in length. Using is strict: `usable`
-    says what does not fit, and how to leave it out.
+    A sequence that was just read may be inconsistent: a camera may have no video, and videos may differ in length.
+    `usable` checks the consistency; its messages say how to leave a camera or frames out.
 
     Attributes:
-        name: of the recording.
-        folder: where it lies.
+        name: name of the recording.
+        folder: folder of the recording.
         rig: all calibrated cameras.
-        videos: by camera name; a camera without video is absent.
+        videos: videos by camera name; a camera without video is absent.
         truth: the reference at the video's frames, or None.
-        detections: files of 2D boxes by camera name.
-        onboard: videos of drones' own cameras by the drones' names, or None.
+        detections: files of 2D detections by camera name, or None.
+        onboard: videos of cameras on drones by the drones' names, or None.
     """
 
     name: str
@@ -67,7 +67,7 @@ class Sequence:
 
     @property
     def num_frames(self) -> int:
-        """Frames that every video has."""
+        """Number of frames of the shortest video."""
         return min((video.num_frames for video in self.videos.values()), default=0)
 
     @property
@@ -77,30 +77,30 @@ class Sequence:
         return next(iter(self.videos.values()))
 
     def usable(self, cameras: Ordered[str] | None = None, num_frames: int | None = None) -> Sequence:
-        """This sequence with just the chosen cameras and frames, checked to be fit for tracking.
+        """This sequence with the chosen cameras and frames only, checked to be consistent.
 
         Args:
-            cameras: names to keep; None keeps all.
-            num_frames: leading frames to keep; None keeps all.
+            cameras: names of the cameras to keep; None: all.
+            num_frames: number of frames to keep from the start; None: all.
 
         Raises:
-            InputError: a camera has no video, or videos differ in size, rate or length, or in size from
-                their calibration.
-            SettingsError: a camera is unknown, or there are not so many frames.
+            InputError: a camera has no video; the videos differ in image size, rate or length; or an image size
+                differs from the calibration.
+            SettingsError: a camera is unknown, or a video has fewer than `num_frames` frames.
         """
         rig = self.rig if cameras is None else self.rig.select(cameras)
-        self._check_videos_there(rig)
+        self._check_videos_exist(rig)
         videos = {name: self.videos[name] for name in rig.names}
         for name, video in videos.items():
             calibrated_wh = rig.cameras.image_size_wh[rig.names.index(name)]
-            _check(
-                video, "calibrated", _size((int(calibrated_wh[0]), int(calibrated_wh[1]))), _size_of(video)
-            )
-        _check_alike(videos, _size_of, remedy="go without it by --cameras")
-        _check_alike(videos, _rate_of, remedy="go without it by --cameras")
+            expected = _size_text((int(calibrated_wh[0]), int(calibrated_wh[1])))
+            _check_equal(video, "calibrated", expected, _video_size(video))
+        _check_consistent(videos, _video_size, remedy="leave it out with --cameras")
+        _check_consistent(videos, _video_rate, remedy="leave it out with --cameras")
         shortest = min(video.num_frames for video in videos.values())
         if num_frames is None:
-            _check_alike(videos, _length_of, remedy=f"pass --frames {shortest} to use those that all have")
+            remedy = f"pass --frames {shortest} to use the frames that all videos have"
+            _check_consistent(videos, _video_length, remedy=remedy)
             return replace(self, rig=rig, videos=videos)
         if not 0 < num_frames <= shortest:
             raise SettingsError(
@@ -109,7 +109,7 @@ class Sequence:
         cut = {name: replace(video, num_frames=num_frames) for name, video in videos.items()}
         return replace(self, rig=rig, videos=cut)
 
-    def _check_videos_there(self, rig: CameraRig) -> None:
+    def _check_videos_exist(self, rig: CameraRig) -> None:
         without = [name for name in rig.names if name not in self.videos]
         if without:
             rest = ",".join(name for name in rig.names if name in self.videos)
@@ -117,35 +117,37 @@ class Sequence:
                 self.folder,
                 expected=f"a video for each of the cameras {', '.join(rig.names)}",
                 found=f"none for {', '.join(without)}",
-                remedy=f"pass --cameras {rest} to go without" if rest else "",
+                remedy=f"pass --cameras {rest} to leave these out" if rest else "",
             )
 
 
-def _check(video: VideoInfo, standard: str, expected: str, found: str, remedy: str = "") -> None:
+def _check_equal(video: VideoInfo, standard: str, expected: str, found: str, remedy: str = "") -> None:
     if found != expected:
         raise InputError(video.path, expected=f"{expected} as {standard}", found=found, remedy=remedy)
 
 
-def _check_alike(videos: Mapping[str, VideoInfo], aspect: Callable[[VideoInfo], str], remedy: str) -> None:
-    """Raise unless the videos agree; the one that is blamed differs from what most of them have."""
+def _check_consistent(
+    videos: Mapping[str, VideoInfo], aspect: Callable[[VideoInfo], str], remedy: str
+) -> None:
+    """Raise `InputError` for the first video that differs from most videos in one aspect."""
     usual = Counter(map(aspect, videos.values())).most_common(1)[0][0]
     model = next(video for video in videos.values() if aspect(video) == usual)
     for video in videos.values():
-        _check(video, f"in {model.path.name}", usual, aspect(video), remedy)
+        _check_equal(video, f"in {model.path.name}", usual, aspect(video), remedy)
 
 
-def _size(image_size_wh: tuple[int, int]) -> str:
+def _size_text(image_size_wh: tuple[int, int]) -> str:
     return f"{image_size_wh[0]} x {image_size_wh[1]} pixels"
 
 
-def _size_of(video: VideoInfo) -> str:
-    return _size(video.image_size_wh)
+def _video_size(video: VideoInfo) -> str:
+    return _size_text(video.image_size_wh)
 
 
-def _rate_of(video: VideoInfo) -> str:
-    # Three decimals tell 29.97 from 30, and are what every container holds.
+def _video_rate(video: VideoInfo) -> str:
+    # Three decimals distinguish 29.97 from 30, and every container stores at least three.
     return f"{video.fps:.3f} frames per second"
 
 
-def _length_of(video: VideoInfo) -> str:
+def _video_length(video: VideoInfo) -> str:
     return f"{video.num_frames} frames"

@@ -1,8 +1,8 @@
-"""Videos: what is in them, their frames in order, writing them, and joining them.
+"""Reading, writing and joining of videos.
 
-FFmpeg, inside OpenCV, decodes and encodes. It believes containers, drops frames that it cannot decode and
-fails to write without a word; here each of these is an error that names the file. Frame rates stay as exact
-as the container holds them: 29.97 truncated to 29 is a second lost in every half minute.
+FFmpeg, inside OpenCV, decodes and encodes. FFmpeg trusts the header, drops frames that it cannot decode, and reports no
+failed writes; in this module each of these cases is an error that names the file. Frame rates are as exact as in the
+container: 29 instead of 29.97 would lose a second in half a minute.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from jaxtyping import UInt8
 from psotrack.errors import InputError, OutputError, SettingsError, check_positive
 from psotrack.support import atomic_write
 
-#: MPEG-4 part 2: OpenCV's own wheel encodes and decodes it, and decodes it faster than MJPEG.
+#: MPEG-4 part 2: OpenCV's wheels can encode and decode it, and decoding is faster than with MJPEG.
 _CODEC = "XVID"
 _FFMPEG_LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
 _FFMPEG_QUIET = "-8"
-#: What makes a writer take coded frames, key frames being those that are said to be.
+#: Properties of a writer that takes encoded frames and the flags of key frames.
 _CODED = (cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1, cv2.VIDEOWRITER_PROP_KEY_INTERVAL, 2**31 - 1)
 _opening = threading.Lock()
 
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """A video file that was opened once.
+    """Properties of a video file.
 
     Attributes:
-        path: of the file.
-        num_frames: as the container's header says, above 0; lower it with `dataclasses.replace` to use only
-            the leading frames.
-        fps: frames per second, as exact as the container holds it.
-        image_size_wh: width and height in pixels.
+        path: path of the file.
+        num_frames: number of frames according to the header, above 0; reduce it with `dataclasses.replace` to use only
+            the first frames.
+        fps: frames per second, as exact as in the container.
+        image_size_wh: width and height of the frames in pixels.
     """
 
     path: Path
@@ -51,12 +51,13 @@ class VideoInfo:
     image_size_wh: tuple[int, int]
 
 
-def probe(path: Path) -> VideoInfo:
-    """What the header of a video says. Nothing is decoded: it takes `read_frames` to find a file cut short.
+def probe(path: Path | str) -> VideoInfo:
+    """Read the header of a video. No frame is decoded, so that only `read_frames` notices a file that is cut short.
 
     Raises:
-        InputError: there is no such file, it is empty or no video, or it has no frames.
+        InputError: the file does not exist, is empty, is not a video, or has no frames.
     """
+    path = Path(path)
     capture = _open(path)
     try:
         num_frames = round(capture.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -67,19 +68,20 @@ def probe(path: Path) -> VideoInfo:
     finally:
         capture.release()
     if num_frames < 1:
-        raise InputError(path, expected="a video with frames", found="none in it")
+        raise InputError(path, expected="a video with frames", found="no frames")
     if not (math.isfinite(fps) and fps > 0):
         raise InputError(path, expected="a video with a frame rate", found=f"{fps:g} frames per second")
     return VideoInfo(path, num_frames, fps, (width, height))
 
 
 def read_frames(video: VideoInfo, step: int = 1) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-    """Frames 0, step, 2 step, ... below `video.num_frames`, in order: BGR, (height, width, 3), uint8.
+    """Yield frames 0, step, 2 step, ... below `video.num_frames`, in order: BGR, (height, width, 3), uint8.
 
-    Frames in between are decoded, because that is how video codecs work, but not converted.
+    The codec must decode the frames in between, but they are not converted to BGR.
 
     Raises:
-        InputError: the file ends, or breaks, before its last frame; or a frame has another size.
+        InputError: the file ends or is damaged before its last frame, or a frame has another size.
+        SettingsError: `step` is below 1.
     """
     if step < 1:
         raise SettingsError("step", expected="1 or more", found=f"{step}")
@@ -106,18 +108,19 @@ def read_frames(video: VideoInfo, step: int = 1) -> Iterator[UInt8[np.ndarray, "
 
 
 class VideoWriter:
-    """Writes BGR frames to an .avi file, lossily (MPEG-4); it appears at `path` when the block ends well.
+    """Writes BGR frames to an .avi file with lossy compression (MPEG-4).
 
-    The container holds the frame rate to 0.001 per second.
+    The file appears at `path` when the `with` block ends without an error. The container stores the frame rate to 0.001
+    per second.
 
     Args:
-        path: of the file, ending in .avi; its folder is made.
+        path: path of the file, ending in .avi; its folder is created.
         fps: frames per second.
-        image_size_wh: even width and height in pixels.
+        image_size_wh: width and height in pixels, even numbers.
 
     Raises:
-        SettingsError: the suffix, the rate or the size cannot be written; a frame has another size.
-        OutputError: the file cannot be written, or not wholly: the disk is full.
+        SettingsError: the suffix, the rate or the size is not allowed, or a frame has another size.
+        OutputError: the file cannot be written completely, for example because the disk is full.
 
     Example:
         >>> import tempfile
@@ -128,14 +131,15 @@ class VideoWriter:
         1
     """
 
-    def __init__(self, path: Path, fps: float, image_size_wh: tuple[int, int]) -> None:
+    def __init__(self, path: Path | str, fps: float, image_size_wh: tuple[int, int]) -> None:
+        path = Path(path)
         if path.suffix.lower() != ".avi":
             raise SettingsError("video", expected="a file name ending in .avi", found=path.name)
         check_positive("fps", fps)
         if any(side < 2 or side % 2 for side in image_size_wh):
             raise SettingsError(
                 "image size",
-                expected="even numbers of pixels, as the codec halves the colours",
+                expected="even numbers of pixels, because the codec halves the resolution of colours",
                 found=f"{image_size_wh[0]} x {image_size_wh[1]}",
             )
         self._path = path
@@ -148,7 +152,7 @@ class VideoWriter:
         with contextlib.ExitStack() as stack:
             self._temporary = stack.enter_context(atomic_write(self._path))
             self._writer = _writer(self._path, self._temporary, self._fps, self._size_wh)
-            # From here on __exit__ answers for the temporary file.
+            # From here on __exit__ removes the temporary file.
             self._open_until_exit = stack.pop_all()
         return self
 
@@ -173,19 +177,20 @@ class VideoWriter:
             _check_written(self._path, self._temporary, self._num_frames)
 
 
-def join_videos(path: Path, parts: Ordered[Path]) -> None:
-    """Write the frames of several videos into one, as they are coded; it appears at `path` when it is whole.
+def join_videos(path: Path | str, parts: Ordered[Path | str]) -> None:
+    """Join videos without encoding their frames again; the file appears at `path` when it is complete.
 
-    Decoding it yields what decoding the parts one after the other does, and frames can be sought as in them.
+    Decoding the joined video gives the same frames as decoding the parts, and seeking works as in the parts.
 
     Args:
-        path: of the new file, ending in .avi.
-        parts: videos of one size and one rate that `VideoWriter` wrote, at least one.
+        path: path of the new file, ending in .avi.
+        parts: paths of at least one video of `VideoWriter`, all of one size and one rate.
 
     Raises:
-        InputError: a part cannot be read, ends early, or has another size or rate than the first.
-        OutputError: the file cannot be written, or not wholly: the disk is full.
+        InputError: a part cannot be read, ends early, or has another size or rate than the first part.
+        OutputError: the file cannot be written completely, for example because the disk is full.
     """
+    path = Path(path)
     videos = [probe(part) for part in parts]
     first = videos[0]
     for video in videos:
@@ -212,24 +217,26 @@ def _writer(
             os.path.abspath(temporary), cv2.CAP_FFMPEG, codec, fps, image_size_wh, settings
         )
     if not writer.isOpened():
-        raise OutputError(path, expected="to write a video", found="that it cannot be opened")
+        raise OutputError(path, expected="a video that can be written", found="one that cannot be opened")
     return writer
 
 
 def _check_written(path: Path, temporary: Path, num_frames: int) -> None:
-    # FFmpeg's failed writes are silent, and the header may promise every frame still: count them.
+    # FFmpeg reports no failed writes, and the header may count frames that are missing: count the frames themselves.
     found = _count_packets(temporary) if num_frames else 0
     if found != num_frames or found == 0 or not _has_its_end(temporary):
         raise OutputError(
             path,
-            expected=f"to write {num_frames} frames" if num_frames else "at least one frame",
-            found=f"{found} written" if found != num_frames or found == 0 else "their index cut off",
+            expected=f"a file with {num_frames} frames" if num_frames else "at least one frame",
+            found=f"{found} written"
+            if found != num_frames or found == 0
+            else "an incomplete index of frames",
             remedy="is the disk full? earlier results are unchanged" if num_frames else "",
         )
 
 
 def _has_its_end(path: Path) -> bool:
-    """Whether an AVI file is as long as its chunks `RIFF` say; the last thing in them is the index of frames."""
+    """Whether an AVI file has the length that its `RIFF` chunks state; the index of frames is at their end."""
     size, position = path.stat().st_size, 0
     with path.open("rb") as file:
         while position < size:
@@ -268,7 +275,7 @@ def _open(path: Path) -> cv2.VideoCapture:
     if empty:
         raise InputError(path, expected="a video", found="an empty file")
     with silence_opencv():
-        # An absolute path, because FFmpeg takes what stands before a colon for a protocol.
+        # An absolute path, because FFmpeg reads the text before a colon as a protocol.
         capture = cv2.VideoCapture(os.path.abspath(path), cv2.CAP_FFMPEG)
     if not capture.isOpened():
         raise InputError(path, expected="a video", found="a file that FFmpeg cannot open")
@@ -276,7 +283,7 @@ def _open(path: Path) -> cv2.VideoCapture:
 
 
 def _count_packets(path: Path) -> int:
-    """Number of coded frames in the file, without decoding them: some microseconds each."""
+    """Number of encoded frames in a file, counted without decoding: a few microseconds per frame."""
     try:
         capture = _open(path)
     except InputError:
@@ -293,9 +300,9 @@ def _count_packets(path: Path) -> int:
 
 @contextlib.contextmanager
 def silence_opencv() -> Iterator[None]:
-    """No words from OpenCV and FFmpeg about a file that is opened here; this module's errors say it better.
+    """Suppress the messages of OpenCV and FFmpeg about a file that is opened in this block; errors replace them.
 
-    FFmpeg reads its level from the environment at each opening and holds it until the next; a user's own is
+    FFmpeg reads its log level from the environment whenever a file is opened. A log level that the user has set is
     kept.
     """
     with _opening:
@@ -316,7 +323,7 @@ def _ended_early(video: VideoInfo, index: int) -> InputError:
         video.path,
         expected=f"{video.num_frames} frames",
         found=f"that only {index} can be decoded (frame {index} is missing or broken)",
-        remedy=f"copy it anew; if just its end is missing, --frames {index} uses the rest"
+        remedy=f"copy it again; if only its end is missing, --frames {index} uses the other frames"
         if index
-        else "copy it anew",
+        else "copy it again",
     )
