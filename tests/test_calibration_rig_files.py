@@ -190,7 +190,7 @@ def test_nothing_is_overwritten(tmp_path):
     ("file", "text", "message"),
     [
         ("x.json", "{}", "a file that ends in .csv, .toml, .yml, .yaml, found x.json"),
-        ("x.toml", "[cam_0\n", "x.toml, line 1: expected TOML"),
+        ("x.toml", "[cam_0\n", "x.toml, line 1: expected valid TOML"),
         ("x.toml", "", "at least one camera, found none"),
         (
             "x.toml",

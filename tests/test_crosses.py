@@ -190,7 +190,9 @@ def test_markers_never_seen_together():
 
 
 def test_a_cross_has_its_origin_at_its_centroid():
-    with pytest.raises(SettingsError, match="cross dron4: expected markers with their centroid at the origin"):
+    with pytest.raises(
+        SettingsError, match="cross dron4: expected markers with their centroid at the origin"
+    ):
         Cross("dron4", FOUR_M)
 
 

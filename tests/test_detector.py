@@ -11,7 +11,7 @@ from onnx_models import SIDE, STRIDE, bright_squares
 from psotrack.cli.detect import detect as command
 from psotrack.cli.track import track
 from psotrack.datasets import dpjait
-from psotrack.detection import DetectorSettings, OnnxDetector, detect
+from psotrack.detection import DetectorSettings, OnnxDetector, detect_drones
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.geometry import look_at, make_camera, project
 from psotrack.recordings import VideoWriter, probe, read_detections
@@ -185,7 +185,7 @@ def sequence(tmp_path_factory):
 
 class TestVideos:
     def test_frames(self, models, sequence):
-        found = detect(detector(models, "v5"), "0", probe(sequence / "0.avi"))
+        found = detect_drones(detector(models, "v5"), "0", probe(sequence / "0.avi"))
         assert found.frame.tolist() == [0, 2, 3]
         # Compressed videos change the colours, not the square that fits best.
         np.testing.assert_allclose(found.xyxy, [square(128, 3 + frame, 6) for frame in (0, 2, 3)], atol=1e-4)

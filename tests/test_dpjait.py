@@ -210,7 +210,7 @@ def test_cameras_may_be_without_video(simulated, caplog):
         sequence = dpjait.read_sequence(simulated)
     assert list(sequence.videos) == ["cam1i", "cam3i"]
     assert sequence.rig.cameras.image_size_wh.tolist() == [[64, 48]] * 3
-    assert "camera cam2i has no video: taken to be 64 x 48 like the others" in caplog.text
+    assert "camera cam2i has no video: assuming 64 x 48 pixels like most cameras" in caplog.text
     with pytest.raises(InputError, match="found none for cam2i; pass --cameras cam1i,cam3i"):
         sequence.usable()
     assert sequence.usable(["cam3i", "cam1i"]).num_frames == 5

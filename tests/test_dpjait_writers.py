@@ -151,7 +151,7 @@ def test_poses_that_cannot_be_written(tmp_path):
         SettingsError, match="poses: expected finite numbers, found NaN or infinity at frame 2"
     ):
         dpjait.write_poses(path, position_m, upright)
-    with pytest.raises(SettingsError, match="expected as many orientations as positions"):
+    with pytest.raises(SettingsError, match="expected equal numbers of positions and orientations"):
         dpjait.write_poses(path, np.ones((0, 3)), np.ones((0, 4)))
     assert not path.exists()
 

@@ -363,7 +363,7 @@ def test_which_sequences_are_validated_on(data, tmp_path):
 def test_what_cannot_be_split(data, tmp_path):
     one, other, out = data / "S01_D2_A", data / "S12_D3", tmp_path / "set"
     assert "sequences: expected at least two" in refused(SettingsError, one, "--out", out)
-    assert "one to train on" in refused(
+    assert "one sequence for training" in refused(
         SettingsError, one, other, "--out", out, "--validation", "S12_D3,S01_D2_A"
     )
     assert "found S99" in refused(SettingsError, one, other, "--out", out, "--validation", "S99")
@@ -381,7 +381,7 @@ def test_nothing_is_replaced_unasked_and_nothing_but_a_data_set_at_all(data, mad
     precious = tmp_path / "home"
     precious.mkdir()
     (precious / "thesis.tex").write_text("x")
-    assert "nothing but a data set is replaced" in refused(OutputError, *both, "--out", precious, "--force")
+    assert "only a data set can be replaced" in refused(OutputError, *both, "--out", precious, "--force")
     assert (precious / "thesis.tex").exists()
     again = tmp_path / "set"
     run(*both, "--out", again, "--every", 1, "--jobs", 1)

@@ -156,7 +156,7 @@ def test_a_folder_is_no_video(tmp_path):
 def test_a_video_without_frames(tmp_path):
     path = tmp_path / "a.avi"
     cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"XVID"), 25, (WIDTH, HEIGHT)).release()
-    with pytest.raises(InputError, match="expected a video with frames, found none"):
+    with pytest.raises(InputError, match="expected a video with frames, found no frames"):
         probe(path)
 
 
@@ -274,7 +274,10 @@ def test_an_index_that_is_cut_off_is_noticed(tmp_path, missing):
     )
     command = [sys.executable, "-c", script, tmp_path / "a.avi", str(whole - missing)]
     done = subprocess.run(command, capture_output=True, text=True)
-    assert "a.avi: expected a file with 200 frames, found an incomplete index of frames; is the disk full?" in done.stdout
+    assert (
+        "a.avi: expected a file with 200 frames, found an incomplete index of frames; is the disk full?"
+        in done.stdout
+    )
     assert not (tmp_path / "a.avi").exists()
 
 

@@ -64,7 +64,7 @@ def detect(
       psotrack detect data/Real_Data/R12_D4 --detector drones.onnx --out boxes --size 1280 --confidence 0.4
     """
     from psotrack.detection import DetectorSettings, OnnxDetector
-    from psotrack.detection import detect as detect_in
+    from psotrack.detection import detect_drones as detect_in
     from psotrack.recordings import write_detections
     from psotrack.support import refuse_to_overwrite
 

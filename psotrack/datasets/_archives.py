@@ -1,8 +1,9 @@
-"""ZIP archives of many small files, joined without copies in memory, however many there are.
+"""Joining of ZIP archives with many small files, with constant memory.
 
-Python's own `zipfile` keeps half a kilobyte per entry until an archive is closed; ten minutes of masks have half a
-million. Here entries of parts are copied as they are, and the central directory is spooled to disk. The format is
-PKWARE's APPNOTE 6.3.9, sections 4.3.12 to 4.3.16, its 64-bit records where counts or offsets need them.
+Python's `zipfile` keeps half a kilobyte per entry in memory until an archive is closed, and ten minutes of masks are
+half a million entries. This module copies the entries of the parts unchanged and collects the central directory in a
+temporary file. The format is PKWARE's APPNOTE 6.3.9, sections 4.3.12 to 4.3.16, with 64-bit records for large counts
+and offsets.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import IO
 from psotrack.errors import InputError
 from psotrack.support import atomic_write
 
-#: The first day that the format knows: archives of the same contents have the same bytes.
+#: Date of all entries, the first date of the format, so that archives with equal contents have equal bytes.
 EPOCH = (1980, 1, 1, 0, 0, 0)
 _DOS_EPOCH = (1980 - 1980) << 9 | 1 << 5 | 1
 _LOCAL_SIZE = 30
@@ -31,20 +32,24 @@ _READABLE_FILE = 0o100644 << 16
 _FULL_16, _FULL_32 = 0xFFFF, 0xFFFFFFFF
 
 
-def entry(name: str) -> zipfile.ZipInfo:
-    """What `join_archives` expects of an entry: stored, with the name in ASCII, and no time."""
+def stored_entry(name: str) -> zipfile.ZipInfo:
+    """Entry that `join_archives` can copy: not compressed, with the date `EPOCH`.
+
+    Args:
+        name: name of the file in the archive, in ASCII.
+    """
     return zipfile.ZipInfo(name, EPOCH)
 
 
 def join_archives(path: Path, parts: Ordered[Path]) -> None:
-    """Write the entries of several archives into one; it appears at `path` when it is whole.
+    """Join several archives into one archive, which appears at `path` when it is complete.
 
     Args:
-        path: of the new archive.
-        parts: archives of entries made by `entry`, in the order in which they were written; no name is in two.
+        path: path of the new archive.
+        parts: paths of archives whose entries were made by `stored_entry`; no name occurs in two archives.
 
     Raises:
-        InputError: a part is no archive.
+        InputError: a part is not a ZIP archive.
         OutputError: the file cannot be written.
     """
     with (
@@ -62,19 +67,19 @@ def join_archives(path: Path, parts: Ordered[Path]) -> None:
 
 
 def _copy(part: Path, archive: IO[bytes], central: IO[bytes]) -> int:
-    """Append the entries of a part, and their records; the number of entries."""
+    """Append the entries of a part and their records of the central directory; return the number of entries."""
     base = archive.tell()
     try:
         with zipfile.ZipFile(part) as opened:
             entries = opened.infolist()
     except (OSError, zipfile.BadZipFile) as error:
         raise InputError(part, expected="a ZIP archive", found=str(error)) from error
-    for one in entries:
-        assert (one.compress_type, one.extra) == (zipfile.ZIP_STORED, b"")
-        central.write(_central_record(one, base + one.header_offset))
-    stop = sum(_LOCAL_SIZE + len(one.filename) + one.compress_size for one in entries)
+    for entry in entries:
+        assert (entry.compress_type, entry.extra) == (zipfile.ZIP_STORED, b"")
+        central.write(_central_record(entry, base + entry.header_offset))
+    stop = sum(_LOCAL_SIZE + len(entry.filename) + entry.compress_size for entry in entries)
     with part.open("rb") as data:
-        # As many bytes as the entries have; the part's own central directory follows them.
+        # The bytes of the entries only, without the part's own central directory behind them.
         _copy_bytes(data, archive, stop)
     return len(entries)
 
@@ -87,18 +92,24 @@ def _copy_bytes(data: IO[bytes], archive: IO[bytes], count: int) -> None:
         count -= len(block)
 
 
-def _central_record(one: zipfile.ZipInfo, offset: int) -> bytes:
-    name = one.filename.encode("ascii")
+def _central_record(entry: zipfile.ZipInfo, offset: int) -> bytes:
+    name = entry.filename.encode("ascii")
     far = offset >= _FULL_32
     extra = struct.pack("<HHQ", 1, 8, offset) if far else b""
     version = _VERSION_64 if far else _VERSION
-    sizes = (one.CRC, one.compress_size, one.file_size, len(name), len(extra), 0, 0, 0)
+    sizes = (entry.CRC, entry.compress_size, entry.file_size, len(name), len(extra), 0, 0, 0)
     fixed = (b"PK\1\2", _UNIX | version, version, 0, zipfile.ZIP_STORED, 0, _DOS_EPOCH)
     return _CENTRAL.pack(*fixed, *sizes, _READABLE_FILE, min(offset, _FULL_32)) + name + extra
 
 
 def _end(count: int, start: int, size: int) -> bytes:
-    """What follows the central directory, which has `count` records in `size` bytes from `start` on."""
+    """End records of the archive.
+
+    Args:
+        count: number of records in the central directory.
+        start: offset of the central directory, bytes.
+        size: size of the central directory, bytes.
+    """
     end = _END.pack(
         b"PK\5\6",
         0,

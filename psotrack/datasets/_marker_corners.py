@@ -1,14 +1,19 @@
-"""The table of ArUco markers on the walls: the corners of each in the world.
+"""The table of the ArUco markers on the walls: positions of the markers' corners in the world.
 
-How the dataset publishes it is not known; this is the layout that is written here: `id`, then `x1[m]`,
-`y1[m]`, `z1[m]` to `x4[m]`, `y4[m]`, `z4[m]`: the corners as OpenCV's ArUco counts them, clockwise from the
-marker's own top left when it is looked at.
+The layout in the published dataset is unknown. The written layout has the columns `id`, then `x1[m]`, `y1[m]`, `z1[m]`
+to `x4[m]`, `y4[m]`, `z4[m]`: the corners in the order of OpenCV's ArUco, clockwise from the marker's own top left, seen
+from the front.
 
-Read is whatever can be no other: semicolons, commas or tabs; metres, centimetres or millimetres as the header says,
-`x1[mm]`, `x1 (mm)` or `x1_mm`, and metres where it says none; corners called 1 to 4, 0 to 3 or tl, tr, br, bl, as in
-`x1`, `corner1_x` or `tl_x`; one row for each corner, `id`, `corner`, `x`, `y`, `z`, or `label`, `x`, `y`, `z` with
-labels such as `Marker7:1`, `M7_1` or `7.1`; numbers alone, 13 or 5 in a row.
-Other columns are passed over.
+The reader accepts all layouts that are unambiguous:
+
+- columns separated by semicolons, commas or tabs;
+- lengths in metres, centimetres or millimetres, as in `x1[mm]`, `x1 (mm)` or `x1_mm`; without a unit, metres;
+- corners named 1 to 4, 0 to 3, or tl, tr, br, bl, as in `x1`, `corner1_x` or `tl_x`;
+- one row per corner: `id`, `corner`, `x`, `y`, `z`, or `label`, `x`, `y`, `z` with labels such as `Marker7:1`, `M7_1`
+  or `7.1`;
+- tables without a header, with 13 or 5 numbers per row.
+
+Other columns are ignored.
 """
 
 from __future__ import annotations
@@ -46,45 +51,51 @@ _ID = re.compile(r"(?:[a-z][a-z _:-]*)?(?P<number>\d+)(?:\.0*)?", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class MarkerRow:
-    """The corners of a marker, and where they stand.
+    """The corners of a marker and their place in the file.
 
     Attributes:
         where: file and line, for messages.
-        corners_m: (4, 3), world, metres.
+        corners_m: (4, 3), positions in the world, metres.
     """
 
     where: str
     corners_m: Float[np.ndarray, "4 3"]
 
 
-def read_marker_corners(path: Path) -> dict[int, Float[np.ndarray, "4 3"]]:
-    """Corners, (4, 3), world, metres, by marker id, as they stand: `inside_out.marker_map` checks them.
+def read_marker_corners(path: Path | str) -> dict[int, Float[np.ndarray, "4 3"]]:
+    """Read corners (4, 3) in the world, metres, by marker id.
+
+    The shape of the markers is not checked here, but by `inside_out.marker_map`.
 
     Raises:
-        InputError: the file cannot be read, a column or a corner is missing, an id is there twice, or a value is no
+        InputError: the file cannot be read, a column or a corner is missing, an id occurs twice, or a value is not a
             number. The message names the line.
     """
     return {marker: row.corners_m for marker, row in read_marker_rows(path).items()}
 
 
-def read_marker_rows(path: Path) -> dict[int, MarkerRow]:
-    """The corners by marker id, with where they stand in the file.
+def read_marker_rows(path: Path | str) -> dict[int, MarkerRow]:
+    """Read corners by marker id, with their places in the file.
 
     Raises:
-        InputError: as of `read_marker_corners`.
+        InputError: as `read_marker_corners`.
     """
-    table = _read(path)
-    return _long(table) if table.find("corner") and not table.find("x1") else _wide(table)
+    table = _read_normalised(Path(path))
+    one_row_per_corner = table.find("corner") and not table.find("x1")
+    return _rows_per_corner(table) if one_row_per_corner else _rows_per_marker(table)
 
 
 def split_label(label: str) -> tuple[int, int] | None:
-    """The marker's number and the corner's as it counts them, in labels such as `Marker7:1`, `M7_1` or `7.1`."""
+    """Numbers of the marker and of the corner in a label such as `Marker7:1`, `M7_1` or `7.1`; None for other labels.
+
+    The number of the corner is the label's own number; the first corner may have number 0 or 1.
+    """
     match = _LABEL.fullmatch(label.strip())
     return (int(match[1]), int(match[2])) if match else None
 
 
-def write_marker_corners(path: Path, corners_m: Mapping[int, Float[np.ndarray, "4 3"]]) -> None:
-    """Write corners, (4, 3), world, metres, by marker id.
+def write_marker_corners(path: Path | str, corners_m: Mapping[int, Float[np.ndarray, "4 3"]]) -> None:
+    """Write corners (4, 3) in the world, metres, by marker id.
 
     Raises:
         OutputError: the file cannot be written.
@@ -93,8 +104,8 @@ def write_marker_corners(path: Path, corners_m: Mapping[int, Float[np.ndarray, "
     write_rows(path, [header, *([marker, *corners_m[marker].ravel()] for marker in sorted(corners_m))])
 
 
-def _wide(table: Table) -> dict[int, MarkerRow]:
-    """One row for each marker."""
+def _rows_per_marker(table: Table) -> dict[int, MarkerRow]:
+    """Corners from a table with one row per marker."""
     id_column = table.column("id")
     columns = [table.column(name) for name in _CORNERS]
     metres = np.array([table.factor(column, _METRES) for column in columns])
@@ -108,8 +119,8 @@ def _wide(table: Table) -> dict[int, MarkerRow]:
     return found
 
 
-def _long(table: Table) -> dict[int, MarkerRow]:
-    """One row for each corner."""
+def _rows_per_corner(table: Table) -> dict[int, MarkerRow]:
+    """Corners from a table with one row per corner."""
     id_column, corner_column = table.column("id"), table.column("corner")
     columns = [table.column(axis) for axis in "xyz"]
     metres = np.array([table.factor(column, _METRES) for column in columns])
@@ -152,7 +163,7 @@ def _marker(row: TextRow, column: Column) -> int:
 
 
 def _corner(row: TextRow, column: Column) -> int:
-    """The number of a corner as the file counts it; from 1 where it has a name."""
+    """Number of a corner as in the file; named corners are numbered from 1."""
     text = row.text(column)
     number = _NAMED.get(_bare(text), int(text) if text.isdecimal() else -1)
     if not 0 <= number <= 4:
@@ -161,7 +172,7 @@ def _corner(row: TextRow, column: Column) -> int:
 
 
 def _first_corner(table: Table, column: Column) -> int:
-    """The number of the first corner, 0 or 1."""
+    """Number of the first corner in the file, 0 or 1."""
     zeros = [row for row in table.rows if row.text(column) == "0"]
     fours = [row for row in table.rows if row.text(column) == "4"]
     if zeros and fours:
@@ -169,8 +180,8 @@ def _first_corner(table: Table, column: Column) -> int:
     return 0 if zeros else 1
 
 
-def _read(path: Path) -> Table:
-    """A table whose columns are called `id` and `x1` to `z4`, or `id`, `corner`, `x`, `y` and `z`."""
+def _read_normalised(path: Path) -> Table:
+    """Read a table and name its columns `id` and `x1` to `z4`, or `id`, `corner`, `x`, `y` and `z`."""
     lines = [line for line in read_text(path).splitlines() if line.strip(" ;,\t")]
     if not lines:
         raise InputError(path, expected="a table of marker corners", found="an empty file")
@@ -186,13 +197,13 @@ def _read(path: Path) -> Table:
         columns, rows = _columns(rows[0]), rows[1:]
     if not rows:
         raise InputError(path, expected="rows below the header", found="none")
-    whole = [_whole(row, len(columns)) for row in rows]
-    table = Table(path, columns, tuple(whole))
-    return table if table.find("id") or not table.find("corner") else _unlabelled(table)
+    full_rows = [_with_last_cell(row, len(columns)) for row in rows]
+    table = Table(path, columns, tuple(full_rows))
+    return table if table.find("id") or not table.find("corner") else _with_split_labels(table)
 
 
-def _whole(row: TextRow, count: int) -> TextRow:
-    # An empty cell at the end of a line is cut off with its separator.
+def _with_last_cell(row: TextRow, count: int) -> TextRow:
+    # `read_rows` drops an empty cell at the end of a line.
     cells = row.cells + ("",) * (len(row.cells) == count - 1)
     if len(cells) != count:
         raise InputError(
@@ -204,24 +215,24 @@ def _whole(row: TextRow, count: int) -> TextRow:
     return replace(row, cells=cells)
 
 
-def _unlabelled(table: Table) -> Table:
-    """A table with the two numbers that its labels have in columns of their own."""
+def _with_split_labels(table: Table) -> Table:
+    """The table with the two numbers of its labels in the columns `id` and `corner`."""
     column, end = table.column("corner"), len(table.columns)
     rows = []
     for row in table.rows:
-        named = split_label(row.text(column))
-        if named is None:
+        numbers = split_label(row.text(column))
+        if numbers is None:
             raise row.error(
                 column, "a label such as Marker7:1, of marker 7's first corner", repr(row.text(column))
             )
-        rows.append(replace(row, cells=(*row.cells, *map(str, named))))
+        rows.append(replace(row, cells=(*row.cells, *map(str, numbers))))
     added = (Column(end, "id", "", column.header), Column(end + 1, "corner", "", column.header))
-    others = tuple(one for one in table.columns if one is not column)
+    others = tuple(other for other in table.columns if other is not column)
     return Table(table.path, others + added, tuple(rows))
 
 
 def _columns(header: TextRow) -> tuple[Column, ...]:
-    """The columns by the names that are used here; others keep their own."""
+    """Columns of a header with normalised names; unknown columns keep their names."""
     columns = []
     for index, cell in enumerate(header.cells):
         text = cell.lower().strip("\"' ")

@@ -1,8 +1,9 @@
-"""`drone_masks.zip` of the DPJAIT dataset: where each drone is seen, a binary image per camera, drone and frame.
+"""`drone_masks.zip` of the DPJAIT dataset: silhouettes of drones, one binary image per camera, drone and frame.
 
-How the published archives look inside is not known. Written is `cam1i/dron1/000000.png` and so on: 1-bit PNGs, white
-where the drone is seen, one for every frame, black ones included. Read is any archive, or folder, of images whose paths
-name a camera (`cam1i`, or a serial number), a drone (`dron1`, `drone_1`) and a frame (the last other number).
+The names in the published archives are unknown. The writer names images `cam1i/dron1/000000.png` and so on; they are
+1-bit PNGs, white where the drone is seen, one for every frame, black images included. The reader accepts any archive or
+folder of images whose paths name a camera (`cam1i` or a serial number), a drone (`dron1`, `drone_1`) and a frame (the
+last remaining number).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
-from psotrack.datasets._archives import entry
+from psotrack.datasets._archives import stored_entry
 from psotrack.errors import InputError
 from psotrack.geometry import camera_key, chosen_camera
 
@@ -36,26 +37,34 @@ _NUMBER = re.compile(r"\d+")
 
 
 class MaskWriter:
-    """Writes masks into an archive of its own.
+    """Writes masks into an archive.
 
     Args:
-        path: of the archive; it is there, half written, from the start, so this wants a folder that nobody reads yet.
+        path: path of the archive. The file exists from the start, incomplete, so that its folder should be a temporary
+            one.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the archive cannot be written.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path | str) -> None:
+        self._path = Path(path)
 
     def __enter__(self) -> MaskWriter:
         self._archive = zipfile.ZipFile(self._path, "w", zipfile.ZIP_STORED)
         return self
 
     def write(self, camera: str, drone: int, frame: int, mask: Mask) -> None:
-        """Append the mask of a drone, numbered from 1, in one frame of a camera."""
+        """Append the mask of a drone in one frame of a camera.
+
+        Args:
+            camera: name of the camera.
+            drone: number of the drone, from 1.
+            frame: number of the frame, from 0.
+            mask: (height, width), True where the drone is seen.
+        """
         png = _png(mask) if mask.any() else _empty_png(*mask.shape)
-        self._archive.writestr(entry(f"{camera}/dron{drone}/{frame:06d}.png"), png)
+        self._archive.writestr(stored_entry(f"{camera}/dron{drone}/{frame:06d}.png"), png)
 
     def __exit__(
         self,
@@ -67,12 +76,12 @@ class MaskWriter:
 
 
 class Masks:
-    """Masks in an archive or a folder, decoded when they are asked for; a context manager.
+    """Masks in an archive or a folder, each decoded when it is requested; a context manager.
 
     Attributes:
-        cameras: their names, without `_s`.
-        drones: their numbers.
-        frames: the numbers of the frames that have any.
+        cameras: names of the cameras, without `_s`.
+        drones: numbers of the drones, from 1.
+        frames: numbers of the frames with masks.
     """
 
     def __init__(
@@ -85,10 +94,15 @@ class Masks:
         self.frames: tuple[int, ...] = tuple(frames)
 
     def mask(self, camera: str, drone: int, frame: int) -> Mask:
-        """(height, width), where a drone, numbered from 1, is seen in a frame of a camera.
+        """(height, width), True where a drone is seen.
+
+        Args:
+            camera: name of the camera.
+            drone: number of the drone, from 1.
+            frame: number of the frame.
 
         Raises:
-            InputError: there is no such mask, or it is no image.
+            InputError: the mask does not exist or is not an image.
         """
         key = chosen_camera(camera, self.cameras)
         name = None if key is None else self._names.get((key, drone, frame))
@@ -114,50 +128,51 @@ class Masks:
 
 
 def read_masks(path: Path | str) -> Masks:
-    """The masks in an archive or an unpacked folder.
+    """Open the masks in an archive or an unpacked folder.
 
     Args:
-        path: of either, or of the sequence's folder that holds `drone_masks.zip`.
+        path: path of the archive, of the unpacked folder, or of a sequence's folder with `drone_masks.zip`.
 
     Raises:
-        InputError: it cannot be read, or the path of an image in it does not name camera, drone and frame once.
+        InputError: the path cannot be read, the path of an image does not name camera, drone and frame, or two images
+            belong to one camera, drone and frame.
     """
     path = Path(path)
     if (path / MASKS).exists():
         path = path / MASKS
     if path.is_dir():
         files = sorted(file.relative_to(path).as_posix() for file in path.rglob("*") if file.is_file())
-        return Masks(path, _by_meaning(path, files), None)
+        return Masks(path, _index_images(path, files), None)
     try:
         archive = zipfile.ZipFile(path)
     except (OSError, zipfile.BadZipFile) as error:
         found = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise InputError(path, expected="a ZIP archive or a folder of masks", found=found.lower()) from error
-    return Masks(path, _by_meaning(path, archive.namelist()), archive)
+    return Masks(path, _index_images(path, archive.namelist()), archive)
 
 
-def _by_meaning(path: Path, files: list[str]) -> dict[tuple[str, int, int], str]:
-    """Camera, drone and frame -> the image's name."""
+def _index_images(path: Path, files: list[str]) -> dict[tuple[str, int, int], str]:
+    """Names of the images by camera, drone and frame."""
     names: dict[tuple[str, int, int], str] = {}
     for name in files:
         place = PurePosixPath(name)
         if place.suffix.lower() not in _IMAGE_SUFFIXES or any(part[0] in "._" for part in place.parts):
             continue
-        meaning = _meaning(name.removesuffix(place.suffix))
-        if meaning is None:
+        key = _parse_name(name.removesuffix(place.suffix))
+        if key is None:
             raise InputError(path, expected=_EXPECTED, found=name)
-        if meaning in names:
+        if key in names:
             raise InputError(
-                path, expected="one image per camera, drone and frame", found=f"{names[meaning]} and {name}"
+                path, expected="one image per camera, drone and frame", found=f"{names[key]} and {name}"
             )
-        names[meaning] = name
+        names[key] = name
     if not names:
         raise InputError(path, expected=_EXPECTED, found=", ".join(files[:3]) or "no files")
     return names
 
 
-def _meaning(name: str) -> tuple[str, int, int] | None:
-    """Camera, drone and frame that a path without suffix names."""
+def _parse_name(name: str) -> tuple[str, int, int] | None:
+    """Camera, drone and frame in the path of an image without its suffix."""
     camera, drone = _CAMERA.search(name), _DRONE.search(name)
     if camera is None or drone is None:
         return None
@@ -167,11 +182,13 @@ def _meaning(name: str) -> tuple[str, int, int] | None:
 
 
 def _png(mask: Mask) -> bytes:
-    """The mask as a 1-bit grey PNG (ISO/IEC 15948), 0 or 255 when decoded; five times as fast as OpenCV's own."""
+    """Encode a mask as a 1-bit grey PNG (ISO/IEC 15948) that decodes to 0 and 255; five times as fast as OpenCV."""
     height, width = mask.shape
-    rows = np.zeros((height, 1 + (width + 7) // 8), np.uint8)  # each row starts with its filter, 0 for none
+    rows = np.zeros(
+        (height, 1 + (width + 7) // 8), np.uint8
+    )  # each row starts with its filter; 0 is no filter
     rows[:, 1:] = np.packbits(mask, axis=1)
-    # Runs of equal bytes are nearly all there is.
+    # Run-length encoding is fast, and masks are nearly only runs of equal bytes.
     squeeze = zlib.compressobj(6, zlib.DEFLATED, zlib.MAX_WBITS, 9, zlib.Z_RLE)
     data = squeeze.compress(rows.tobytes()) + squeeze.flush()
     header = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)

@@ -1,8 +1,8 @@
-"""`dronN_markers_25.csv`: where the mocap markers of one simulated drone are, one line per video frame.
+"""`dronN_markers_25.csv`: positions of the motion-capture markers of one simulated drone, one line per video frame.
 
-How the dataset publishes them is not known; this is the layout that is written here: `id`, the frame's number, then
-`A_x[m]`, `A_y[m]`, `A_z[m]` to `D_x[m]`, `D_y[m]`, `D_z[m]`, world coordinates. Unlike in the pose files, line 0 is
-no placeholder.
+The layout in the published dataset is unknown. The written layout has the columns `id` (the number of the frame), then
+`A_x[m]`, `A_y[m]`, `A_z[m]` to `D_x[m]`, `D_y[m]`, `D_z[m]` in world coordinates. Unlike in the pose files, the line of
+frame 0 is a measurement, not a placeholder.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from jaxtyping import Float
 from psotrack.geometry import METRES_PER_UNIT
 from psotrack.support import read_table, write_rows
 
-#: The names of a drone's markers, in the order of the columns.
+#: Names of a drone's markers, in the order of the columns.
 MOCAP_MARKERS = "ABCD"
 _COLUMNS = [f"{marker}_{axis}" for marker in MOCAP_MARKERS for axis in "xyz"]
 
 
 def mocap_markers_file(number: int, fps: float = 25.0) -> str:
-    """The name of the file of drone `number`, 1-based."""
+    """Name of the file of drone `number`, 1-based."""
     return f"dron{number}_markers_{fps:g}.csv"
 
 
-def write_mocap_markers(path: Path, markers_m: Float[np.ndarray, "frames 4 3"]) -> None:
-    """Write the markers of one drone, (frames, 4, 3), world, metres.
+def write_mocap_markers(path: Path | str, markers_m: Float[np.ndarray, "frames 4 3"]) -> None:
+    """Write the marker positions of one drone, (frames, 4, 3), in the world, metres.
 
     Raises:
         OutputError: the file cannot be written.
@@ -36,11 +36,11 @@ def write_mocap_markers(path: Path, markers_m: Float[np.ndarray, "frames 4 3"]) 
     write_rows(path, [header, *rows])
 
 
-def read_mocap_markers(path: Path) -> Float[np.ndarray, "frames 4 3"]:
-    """(frames, 4, 3), the markers of one drone at frames 0, 1, ..., world, metres; NaN where there is no row.
+def read_mocap_markers(path: Path | str) -> Float[np.ndarray, "frames 4 3"]:
+    """Read the marker positions of one drone, (frames, 4, 3), in the world, metres; NaN for frames without a row.
 
     Raises:
-        InputError: the file cannot be read, a column is missing, a frame is there twice, or a value is no number.
+        InputError: the file cannot be read, a column is missing, a frame occurs twice, or a value is not a number.
     """
     table = read_table(path)
     id_column = table.column("id")

@@ -1,12 +1,13 @@
-"""The drones' own cameras in the DPJAIT dataset (the `_A` sequences): videos, poses, intrinsics.
+"""Cameras on drones in the DPJAIT dataset (the `_A` sequences): videos, poses, intrinsics.
 
-How the dataset publishes them is known by the names of the poses alone, `dronN_cam_25.csv`; what is written here:
+Of the published layout only the names of the pose files are known, `dronN_cam_25.csv`. The written layout:
 
 - `dronN_cam_s.avi`: the video.
 - `dronN_cam_25.csv`: the columns of `dronN_pos_25.csv`. The position is the camera's centre; the rotation turns
-  camera into world coordinates, with camera axes x right, y down, z ahead. Row 0 is a placeholder as there.
+  camera into world coordinates, with camera axes x right, y down, z forward. Row 0 is a placeholder, as in
+  `dronN_pos_25.csv`.
 - `drone_cameras_calibration.csv`: `cam_name` (`dronN`), `focal_length_x`, `focal_length_y`, `cx`, `cy`, `width`,
-  `height`; all in pixels, whose centres are at integers, without lens distortion.
+  `height`, in pixels; pixel centres are at integers, and there is no lens distortion.
 """
 
 from __future__ import annotations
@@ -33,24 +34,24 @@ _SIZES = ("width", "height")
 
 
 def onboard_video_file(number: int) -> str:
-    """The name of the video of the camera on drone `number`, 1-based."""
+    """Name of the video of the camera on drone `number`, 1-based."""
     return f"dron{number}_cam_s.avi"
 
 
 def onboard_pose_file(number: int, fps: float = 25.0) -> str:
-    """The name of the file with the poses of the camera on drone `number`, 1-based; `write_poses` writes it."""
+    """Name of the pose file of the camera on drone `number`, 1-based; `write_poses` writes this file."""
     return f"dron{number}_cam_{fps:g}.csv"
 
 
 def is_onboard_video(path: Path) -> bool:
-    """Whether a file's name is that of a video from a drone."""
+    """Whether the file is the video of a camera on a drone, by its name."""
     return _VIDEO.fullmatch(path.name) is not None
 
 
-def read_onboard(folder: Path) -> dict[str, OnboardVideo]:
-    """The videos of the drones' own cameras in a sequence's folder, by the drones' names; empty without any.
+def read_onboard(folder: Path | str) -> dict[str, OnboardVideo]:
+    """Read the videos of cameras on drones in a sequence's folder, by the drones' names; empty without such videos.
 
-    Poses and intrinsics may be missing; where they are there, they must fit the video.
+    Poses and intrinsics may be missing; existing ones must fit the video.
 
     Raises:
         InputError: a file cannot be used. The message names file, line and column.
@@ -69,16 +70,16 @@ def read_onboard(folder: Path) -> dict[str, OnboardVideo]:
                 expected=f"{size_wh[0]} x {size_wh[1]} pixels as {name} has in {ONBOARD_CALIBRATION}",
                 found=f"{video.image_size_wh[0]} x {video.image_size_wh[1]}",
             )
-        position_m, orientation_wxyz = _poses_of(poses.get(number), video)
+        position_m, orientation_wxyz = _video_poses(poses.get(number), video)
         found[name] = OnboardVideo(video, K, position_m, orientation_wxyz)
     return found
 
 
-def read_onboard_calibration(path: Path) -> Intrinsics:
-    """Intrinsics, (3, 3), pixels, with width and height of the image, by the drones' names.
+def read_onboard_calibration(path: Path | str) -> Intrinsics:
+    """Read intrinsics (3, 3), and width and height of the image, in pixels, by the drones' names.
 
     Raises:
-        InputError: the file cannot be read, a column is missing, a camera is there twice, or a value makes no sense.
+        InputError: the file cannot be read, a column is missing, a camera occurs twice, or a value is not allowed.
     """
     table = read_table(path)
     name_column = table.column("cam_name")
@@ -99,25 +100,30 @@ def read_onboard_calibration(path: Path) -> Intrinsics:
     return found
 
 
-def write_onboard_calibration(path: Path, intrinsics: Intrinsics) -> None:
-    """Write intrinsics, (3, 3), pixels, with width and height of the image, by the drones' names.
+def write_onboard_calibration(path: Path | str, intrinsics: Intrinsics) -> None:
+    """Write intrinsics (3, 3), and width and height of the image, in pixels, by the drones' names.
 
     Raises:
-        SettingsError: there are none, or one has skew.
+        SettingsError: there is no camera, or a camera has skew.
         OutputError: the file cannot be written.
     """
     if not intrinsics or any(K[0, 1] for K, _ in intrinsics.values()):
-        raise SettingsError("intrinsics", expected="those of some cameras, without skew", found="others")
+        found = "a camera with skew" if intrinsics else "no camera"
+        raise SettingsError("intrinsics", expected="at least one camera, all without skew", found=found)
     header = ["cam_name", "focal_length_x", "focal_length_y", "cx", "cy", *_SIZES]
     rows = [[name, K[0, 0], K[1, 1], K[0, 2], K[1, 2], *size_wh] for name, (K, size_wh) in intrinsics.items()]
     write_rows(path, [header, *rows])
 
 
 def numbered_files(files: Iterable[Path], pattern: re.Pattern[str]) -> dict[int, Path]:
-    """The files whose names match a pattern, by the number of the drone in its group `number`.
+    """Files whose names match a pattern, by the number of the drone.
+
+    Args:
+        files: paths of the files.
+        pattern: pattern with the number of the drone as group `number`.
 
     Raises:
-        InputError: a drone has two.
+        InputError: a drone has two files.
     """
     found: dict[int, Path] = {}
     for path in files:
@@ -132,17 +138,23 @@ def numbered_files(files: Iterable[Path], pattern: re.Pattern[str]) -> dict[int,
 
 
 def check_rate(path: Path, pattern: re.Pattern[str], fps: float) -> None:
-    """Raise `InputError` unless the rate in a file's name, group `rate` of its pattern, is that of the video."""
+    """Raise `InputError` if the rate in the name of a file differs from the video's rate.
+
+    Args:
+        path: path of the file.
+        pattern: pattern with the rate as group `rate`.
+        fps: frames per second of the video.
+    """
     match = pattern.fullmatch(path.name)
-    # 0.1 %: as exact as containers hold a rate. More would drift.
+    # 0.1 % is the accuracy of rates in containers; a larger difference would drift.
     if match is not None and abs(float(match["rate"]) - fps) > 1e-3 * fps:
         raise InputError(path, expected=f"poses at the {fps:g} Hz of the video", found=f"{match['rate']} Hz")
 
 
-def _poses_of(
+def _video_poses(
     path: Path | None, video: VideoInfo
 ) -> tuple[Float[np.ndarray, "frames 3"], Float[np.ndarray, "frames 4"]]:
-    """Positions and orientations at the frames of a video, NaN where there is none."""
+    """Positions and orientations at the frames of a video; NaN if unknown."""
     position_m = np.full((video.num_frames, 3), np.nan)
     orientation_wxyz = np.full((video.num_frames, 4), np.nan)
     if path is not None:

@@ -1,11 +1,10 @@
 """`dronN_pos_25.csv` of the DPJAIT dataset: the poses of one simulated drone, one line per video frame.
 
-TextRow i belongs to video frame i, but row 0 is a placeholder, (0, 0, -0), so frame 0 has no pose. How the
-published files name the columns of the orientation is not known: any that end in `w`, `x`, `y`, `z` after a
-word with a `q` (`q_w`, `qw`, `quat_w`, ...) are the quaternion, which turns body into world coordinates.
-Euler angles are not read: beside a quaternion they say nothing new, and without one their order would be a
-guess. What is written: `rot_x[rad]`, `rot_y[rad]`, `rot_z[rad]`, with R = Rz Ry Rx, and `q_w`, `q_x`, `q_y`,
-`q_z`.
+Row i belongs to video frame i. Row 0 is a placeholder, (0, 0, -0), so that frame 0 has no pose. The names of the
+orientation columns in the published files are unknown. The reader uses four columns that end in `w`, `x`, `y`, `z`
+after a word with a `q` (`q_w`, `qw`, `quat_w`, ...) as the quaternion, which turns body into world coordinates. Euler
+angles are not read: beside a quaternion they are redundant, and without a quaternion their order would be a guess. The
+written columns are `rot_x[rad]`, `rot_y[rad]`, `rot_z[rad]`, with R = Rz Ry Rx, and `q_w`, `q_x`, `q_y`, `q_z`.
 """
 
 from __future__ import annotations
@@ -25,18 +24,18 @@ Positions = Float[np.ndarray, "frames 3"]
 Orientations = Float[np.ndarray, "frames 4"]
 
 _QUATERNION = re.compile(r"(?P<stem>[a-z_ .]*q[a-z_ .]*?)[_ .]?(?P<axis>[wxyz])")
-#: How far from 1 the norm of a quaternion may be: what rounding to two decimals can do, and no more.
+#: Largest deviation of a quaternion's norm from 1: the effect of rounding to two decimals.
 _NORM_TOLERANCE = 0.02
 
 
-def read_poses(path: Path) -> tuple[Positions, Orientations | None]:
-    """Positions, metres, and orientations (w, x, y, z) at frames 0, 1, ...; NaN where there is no row.
+def read_poses(path: Path | str) -> tuple[Positions, Orientations | None]:
+    """Read positions (metres) and orientations (w, x, y, z) at frames 0, 1, ...; NaN for frames without a row.
 
-    Orientations are None if the file has no quaternions.
+    The orientations are None if the file has no quaternions.
 
     Raises:
-        InputError: the file cannot be read, a column is missing, a frame is there twice, or a value is NaN
-            or no number. The message names line and column.
+        InputError: the file cannot be read, a column is missing, a frame occurs twice, or a value is not a finite
+            number. The message names line and column.
     """
     table = read_table(path)
     id_column = table.column("id")
@@ -56,22 +55,22 @@ def read_poses(path: Path) -> tuple[Positions, Orientations | None]:
     return position_m, orientation_wxyz if quaternion else None
 
 
-def write_poses(path: Path, position_m: Positions, orientation_wxyz: Orientations) -> None:
-    """Write the poses of one drone at all video frames; that of frame 0 becomes the layout's placeholder.
+def write_poses(path: Path | str, position_m: Positions, orientation_wxyz: Orientations) -> None:
+    """Write the poses of one drone at all video frames; the pose of frame 0 is replaced by the layout's placeholder.
 
     Args:
-        path: of the file, named by `pose_file`.
-        position_m: (frames, 3), world, metres.
+        path: path of the file, with a name from `pose_file`.
+        position_m: (frames, 3), positions in the world, metres.
         orientation_wxyz: (frames, 4), unit quaternions that turn body into world coordinates.
 
     Raises:
-        SettingsError: shapes differ, or a number is not finite.
+        SettingsError: the numbers of frames differ, there is no frame, or a number is not finite.
         OutputError: the file cannot be written.
     """
     if len(position_m) != len(orientation_wxyz) or len(position_m) == 0:
         raise SettingsError(
             "poses",
-            expected="as many orientations as positions, at least one",
+            expected="equal numbers of positions and orientations, at least one",
             found=f"{len(position_m)} positions and {len(orientation_wxyz)} orientations",
         )
     poses = np.hstack([position_m, _euler_rad(orientation_wxyz), orientation_wxyz])
@@ -89,12 +88,12 @@ def write_poses(path: Path, position_m: Positions, orientation_wxyz: Orientation
 
 
 def pose_file(number: int, fps: float = 25.0) -> str:
-    """The name of the file of drone `number`, 1-based, with a pose per video frame."""
+    """Name of the pose file of drone `number`, 1-based."""
     return f"dron{number}_pos_{fps:g}.csv"
 
 
 def _euler_rad(orientation_wxyz: Orientations) -> Positions:
-    """Angles about x, y, z with R = Rz Ry Rx."""
+    """Angles about x, y, z in radians, with R = Rz Ry Rx."""
     return Rotation.from_quat(orientation_wxyz, scalar_first=True).as_euler("xyz")
 
 
@@ -109,7 +108,7 @@ def _by_frame(table: Table, column: Column) -> dict[int, TextRow]:
 
 
 def _quaternion_columns(table: Table) -> list[Column]:
-    """The columns of w, x, y, z, or none."""
+    """The columns of w, x, y, z, or an empty list."""
     stems: dict[str, dict[str, Column]] = {}
     for column in table.columns:
         match = _QUATERNION.fullmatch(column.name)

@@ -1,8 +1,8 @@
-"""The DPJAIT dataset (Zenodo, record 14748573): drones in halls, real and simulated, as it is published.
+"""The DPJAIT dataset (Zenodo, record 14748573): real and simulated recordings of drones in halls.
 
-A sequence is a folder: `cameras_calibration.csv`, a video per camera, and a reference: `dronN_pos_25.csv` in
-the simulated half, one `.c3d` in the real one. What it holds is found by looking, never from its name: S05_D8
-has ten drones.
+A sequence is a folder with `cameras_calibration.csv`, one video per camera, and a reference: files `dronN_pos_25.csv`
+in the simulated half, one `.c3d` file in the real half. The reader relies on the files, not on the name of the folder:
+S05_D8 has ten drones.
 """
 
 from __future__ import annotations
@@ -100,14 +100,14 @@ _POSE_FILE = re.compile(r"drone?_?(?P<number>\d+)_pos_(?P<rate>\d+(?:\.\d+)?)\.c
 
 
 def read_sequence(folder: Path | str) -> Sequence:
-    """The sequence in a folder of the dataset, simulated or real.
+    """Read a sequence from a folder of the dataset, simulated or real.
 
-    Cameras may be without video: they get the image size that most videos have. Videos may differ in length;
-    the truth is as long as the longest. `Sequence.usable` is stricter. Videos of drones' own cameras that cannot be
-    used are left out with a warning: how the dataset publishes them is not known, and tracking does without.
+    A camera without video gets the image size of most videos. Videos may differ in length; the reference is as long as
+    the longest video. `Sequence.usable` is stricter. Videos of cameras on drones that cannot be used are left out with
+    a warning, because their published layout is unknown and tracking does not need them.
 
     Raises:
-        InputError: the folder is none of the dataset, or one of its files cannot be used.
+        InputError: the folder does not belong to the dataset, or one of its files cannot be used.
     """
     folder = Path(folder)
     _check_folder(folder)
@@ -128,18 +128,25 @@ def read_sequence(folder: Path | str) -> Sequence:
     )
 
 
-def detection_files(folder: Path, cameras: Ordered[str]) -> dict[str, Path]:
-    """The files in a folder that are named as those in `dl_data` are; a camera without one saw nothing.
+def detection_files(folder: Path | str, cameras: Ordered[str]) -> dict[str, Path]:
+    """Find the detection files of cameras in a folder, by the file names of `dl_data`.
+
+    A camera without a file is absent; it has no detections.
+
+    Args:
+        folder: folder with the files.
+        cameras: names of the cameras.
 
     Raises:
-        InputError: there is none of any camera, or two of one.
+        InputError: no camera has a file, or a camera has two files.
     """
+    folder = Path(folder)
     found = files_by_camera(folder.glob("*.csv"), cameras)
     if not found:
         raise InputError(
             folder,
             expected=f"a folder with files named like the cameras, {cameras[0]}.csv ...",
-            found="none of them" if folder.is_dir() else "no such folder",
+            found="no such file" if folder.is_dir() else "no such folder",
         )
     return found
 
@@ -150,7 +157,9 @@ def _check_folder(folder: Path) -> None:
         remedy = "unpack it first" if folder.suffix.lower() == ".zip" and folder.exists() else ""
         raise InputError(folder, expected="the folder of a sequence", found=found, remedy=remedy)
     if not os.access(folder, os.R_OK | os.X_OK):
-        raise InputError(folder, expected="the folder of a sequence", found="one that may not be read")
+        raise InputError(
+            folder, expected="the folder of a sequence", found="a folder without read permission"
+        )
     if not (folder / CALIBRATION).exists():
         below = sorted(path.parent for path in folder.glob(f"*/{CALIBRATION}"))
         remedy = f"did you mean {below[0]}?" if below else "is it a folder of the DPJAIT dataset?"
@@ -161,7 +170,7 @@ def _onboard(folder: Path) -> Mapping[str, OnboardVideo] | None:
     try:
         return read_onboard(folder) or None
     except InputError as error:
-        _logger.warning("left out, the drones' own cameras: %s", error)
+        _logger.warning("cameras on drones are left out: %s", error)
         return None
 
 
@@ -177,7 +186,7 @@ def _videos(folder: Path, files: Ordered[Path], names: Ordered[str]) -> dict[str
         )
     for path in candidates:
         if path not in found.values():
-            _logger.info("%s: not used, no camera of %s has this name", path, CALIBRATION)
+            _logger.info("%s: not used, because no camera in %s has this name", path, CALIBRATION)
     return {name: probe(path) for name, path in found.items()}
 
 
@@ -185,12 +194,12 @@ def _image_sizes(names: Ordered[str], videos: Mapping[str, VideoInfo]) -> dict[s
     most_wh = Counter(video.image_size_wh for video in videos.values()).most_common(1)[0][0]
     for name in names:
         if name not in videos:
-            _logger.info("camera %s has no video: taken to be %d x %d like the others", name, *most_wh)
+            _logger.info("camera %s has no video: assuming %d x %d pixels like most cameras", name, *most_wh)
     return {name: videos[name].image_size_wh if name in videos else most_wh for name in names}
 
 
 def _truth(files: Ordered[Path], videos: Mapping[str, VideoInfo]) -> Trajectories | None:
-    """The reference at the frames of the longest video; None where there is none."""
+    """The reference at the frames of the longest video, or None."""
     first = next(iter(videos.values()))
     num_frames = max(video.num_frames for video in videos.values())
     poses = _pose_files(files, first)
@@ -207,7 +216,7 @@ def _truth(files: Ordered[Path], videos: Mapping[str, VideoInfo]) -> Trajectorie
 
 
 def _pose_files(files: Ordered[Path], video: VideoInfo) -> dict[int, Path]:
-    """The pose files by the number of the drone."""
+    """Pose files by the number of the drone."""
     found = numbered_files(files, _POSE_FILE)
     for path in found.values():
         check_rate(path, _POSE_FILE, video.fps)

@@ -1,7 +1,7 @@
-"""2D detections: boxes that a neural network finds, markers, and training data for a network.
+"""2D detection of drones by a neural network, training data for such a network, and ArUco dictionaries.
 
-In: videos or images; for training data also a reference. Out: boxes per frame and camera, stored once per video; ArUco
-dictionaries and boards; data sets in YOLO's layout.
+In: videos, and for training data also a reference. Out: boxes per frame and camera, stored once per video; data sets in
+YOLO's layout.
 """
 
 import lazy_loader

@@ -1,5 +1,5 @@
 from .aruco import marker_dictionary
-from .detector import DetectorSettings, OnnxDetector, detect
+from .detector import DetectorSettings, OnnxDetector, detect_drones
 from .labels import LabelSettings
 from .store import stored_detections
 from .training_data import DATA_SET, write_data_set
@@ -9,7 +9,7 @@ __all__ = [
     "DetectorSettings",
     "LabelSettings",
     "OnnxDetector",
-    "detect",
+    "detect_drones",
     "marker_dictionary",
     "stored_detections",
     "write_data_set",

@@ -1,4 +1,4 @@
-"""ArUco markers: OpenCV's dictionaries by their names."""
+"""OpenCV's ArUco dictionaries by their names."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from psotrack.errors import SettingsError
 
 
 def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
-    """OpenCV's dictionary of a name such as 4x4_50 or DICT_4X4_50.
+    """OpenCV's ArUco dictionary with a name such as 4x4_50 or DICT_4X4_50.
 
     Raises:
-        SettingsError: there is none.
+        SettingsError: OpenCV has no dictionary with this name.
     """
     known = {key.lower(): key for key in dir(cv2.aruco) if key.startswith("DICT_")}
     key = known.get(f"dict_{name.lower().removeprefix('dict_')}")

@@ -1,13 +1,13 @@
-"""Detections by a neural network: a YOLO model in ONNX, run by OpenCV over every frame of a video.
+"""Detection of drones by a neural network: a YOLO model in ONNX format, run by OpenCV on every frame of a video.
 
-Frames are fitted into the network's square input with grey around them (letterbox), RGB in [0, 1]. Outputs are told
-apart by their shape:
+Frames are scaled into the network's square input with grey borders (letterbox), RGB in [0, 1]. The shape of the output
+identifies the layout:
 
-- v5 to v7: (1, boxes, 5 + classes), box as middle and size, how sure that it is anything, and of each class;
-- v8, v9, v11: (1, 4 + classes, boxes), box as middle and size, how sure of each class;
-- v10: (1, 300, 6), box as corners, how sure, class.
+- v5 to v7: (1, boxes, 5 + classes): middle and size of the box, confidence of any object, confidence of each class;
+- v8, v9, v11: (1, 4 + classes, boxes): middle and size of the box, confidence of each class;
+- v10: (1, 300, 6): corners of the box, confidence, class.
 
-All boxes are in pixels of the input. What is found counts whatever its class: train the network on drones.
+All boxes are in pixels of the input. Objects of all classes count as drones: use a network that was trained on drones.
 """
 
 from __future__ import annotations
@@ -25,22 +25,23 @@ from psotrack.errors import InputError, SettingsError
 from psotrack.recordings import Detections, VideoInfo, read_frames
 from psotrack.support import Report, no_progress
 
-#: What YOLO's own letterbox has around the image.
+#: Colour of YOLO's own letterbox borders.
 _GREY = (114, 114, 114)
-#: Most boxes of v10, after its own choice; no input has as many in the other layouts.
-_FINISHED = (300, 6)
-#: How far above 1 a score is that was rounded.
+#: Shape of the output of v10, after its own selection of boxes; outputs of other layouts never have this shape.
+_V10_SHAPE = (300, 6)
+#: Largest excess of a score over 1 that is ignored as rounding.
 _ROUNDING = 1e-3
 
 
 @dataclass(frozen=True)
 class DetectorSettings:
-    """What counts as a detection.
+    """Settings of the detection.
 
     Attributes:
-        confidence: least score, in (0, 1].
-        nms: of boxes whose intersection over union is above this, the surest stays; in (0, 1].
-        size: of the network's square input, pixels.
+        confidence: smallest confidence of a detection, in (0, 1].
+        nms: threshold of the non-maximum suppression, in (0, 1]: of boxes with a larger intersection over union, only
+            the box with the highest confidence is kept.
+        size: side of the network's square input, pixels.
     """
 
     confidence: float = 0.25
@@ -60,53 +61,64 @@ class OnnxDetector:
     """A network that finds drones in images.
 
     Args:
-        model: an ONNX file.
-        settings: what counts.
+        model: path of an ONNX file.
+        settings: settings of the detection.
 
     Raises:
-        InputError: there is no such file, or it is no network that OpenCV can read.
+        InputError: the file does not exist, or OpenCV cannot read it.
     """
 
-    def __init__(self, model: Path, settings: DetectorSettings) -> None:
+    def __init__(self, model: Path | str, settings: DetectorSettings) -> None:
+        model = Path(model)
         if not model.is_file():
             raise InputError(model, expected="an ONNX model", found="no such file")
         self.model = model
         self.settings = settings
-        with self._said_in_one_line("an ONNX model that OpenCV can read"):
+        with self._opencv_errors("an ONNX model that OpenCV can read"):
             self._network = cv2.dnn.readNetFromONNX(str(model))
 
     def boxes(
         self, bgr: UInt8[np.ndarray, "height width 3"]
     ) -> tuple[Float[np.ndarray, "found 4"], Float[np.ndarray, "found"]]:
-        """Boxes (xyxy, in the convention of `psotrack.geometry.boxes`) and confidences in an image, the surest first.
+        """Detect drones in an image.
+
+        Args:
+            bgr: (height, width, 3), the image.
+
+        Returns:
+            Boxes (found, 4), xyxy in the convention of `psotrack.geometry.boxes`, and confidences (found,), the highest
+            confidence first.
 
         Raises:
-            InputError: the network cannot take an input of this size, or its output has none of the layouts.
+            InputError: the network cannot take an input of this size, or its output has an unknown layout.
         """
         size = self.settings.size
         image, scale, start = _letterboxed(bgr, size)
-        with self._said_in_one_line(f"a network for images of {size} x {size} pixels", "pass its own --size"):
+        with self._opencv_errors(f"a network for images of {size} x {size} pixels", "pass its own --size"):
             self._network.setInput(cv2.dnn.blobFromImage(image, 1 / 255, swapRB=True))
             output = self._network.forward()
-        xyxy, score = self._decoded(np.asarray(output, np.float64))
-        sure = score >= self.settings.confidence
-        xyxy, score = (xyxy[sure] - np.tile(start, 2)) / np.tile(scale, 2), np.minimum(score[sure], 1.0)
+        xyxy, score = self._decode(np.asarray(output, np.float64))
+        confident = score >= self.settings.confidence
+        xyxy, score = (
+            (xyxy[confident] - np.tile(start, 2)) / np.tile(scale, 2),
+            np.minimum(score[confident], 1.0),
+        )
         height, width = bgr.shape[:2]
         xyxy = np.clip(xyxy, 0, np.tile([width, height], 2))
         xywh = np.hstack([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]])
-        there = (xywh[:, 2:] > 0).all(axis=1)
-        xyxy, xywh, score = xyxy[there], xywh[there], score[there]
-        # OpenCV's order is that of the scores, and its answer to no boxes an empty tuple.
+        inside = (xywh[:, 2:] > 0).all(axis=1)
+        xyxy, xywh, score = xyxy[inside], xywh[inside], score[inside]
+        # OpenCV sorts by score; for no boxes it returns an empty tuple.
         kept = cv2.dnn.NMSBoxes(xywh.tolist(), score.tolist(), self.settings.confidence, self.settings.nms)
         index = np.asarray(kept, np.int64).ravel()
         return xyxy[index], score[index]
 
-    def _decoded(
+    def _decode(
         self, output: Float[np.ndarray, "..."]
     ) -> tuple[Float[np.ndarray, "boxes 4"], Float[np.ndarray, "boxes"]]:
-        """Boxes, xyxy in pixels of the input, and their scores."""
+        """Boxes (xyxy in pixels of the input) and their scores from the network's output."""
         rows, columns = output.shape[1:] if output.ndim == 3 and len(output) == 1 else (0, 0)
-        if (rows, columns) == _FINISHED:
+        if (rows, columns) == _V10_SHAPE:
             xyxy, score = output[0, :, :4], output[0, :, 4]
         elif rows > columns > 5:
             middle, half = output[0, :, :2], output[0, :, 2:4] / 2
@@ -119,7 +131,7 @@ class OnnxDetector:
         else:
             raise InputError(
                 self.model,
-                expected="an output of (1, boxes, 5 + classes) as of YOLOv5 or (1, 4 + classes, boxes) as of YOLOv8",
+                expected="an output of shape (1, boxes, 5 + classes) as YOLOv5 or (1, 4 + classes, boxes) as YOLOv8",
                 found=f"{output.shape}",
             )
         if not (np.isfinite(xyxy).all() and (score >= 0).all() and (score <= 1 + _ROUNDING).all()):
@@ -127,13 +139,13 @@ class OnnxDetector:
                 self.model,
                 expected="finite boxes with scores from 0 to 1",
                 found=f"scores from {score.min():.3g} to {score.max():.3g}",
-                remedy="is it exported with its last layers, and is this YOLO's own layout?",
+                remedy="export the network with its last layers, in YOLO's own layout",
             )
         return xyxy, score
 
     @contextlib.contextmanager
-    def _said_in_one_line(self, expected: str, remedy: str = "") -> Iterator[None]:
-        """What OpenCV says against the network as one line, and nothing of it before."""
+    def _opencv_errors(self, expected: str, remedy: str = "") -> Iterator[None]:
+        """Turn OpenCV's errors in this block into `InputError`, and suppress OpenCV's own messages."""
         level = cv2.utils.logging.getLogLevel()
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         try:
@@ -145,10 +157,16 @@ class OnnxDetector:
             cv2.utils.logging.setLogLevel(level)
 
 
-def detect(
+def detect_drones(
     detector: OnnxDetector, name: str, video: VideoInfo, *, report: Report = no_progress
 ) -> Detections:
-    """The detections in all frames of a video; `name` is what progress is called.
+    """Detect drones in all frames of a video.
+
+    Args:
+        detector: the network.
+        name: name of the progress bar.
+        video: the video.
+        report: shows the progress in frames.
 
     Raises:
         InputError: the video ends early, or the network cannot be used.
@@ -169,13 +187,16 @@ def detect(
 def _letterboxed(
     bgr: UInt8[np.ndarray, "height width 3"], size: int
 ) -> tuple[UInt8[np.ndarray, "size size 3"], Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """The image in the middle of a grey square; and what takes x, y of its edges there: scale, and then start."""
+    """The image in the middle of a grey square, with the scale and the start that map x, y of the image to the square.
+
+    A point p of the image is at p * scale + start in the square.
+    """
     image_wh = np.array([bgr.shape[1], bgr.shape[0]])
     inside_wh = np.maximum(np.round(image_wh * size / image_wh.max()), 1).astype(int)
     start = (size - inside_wh) // 2
     left, top = start.tolist()
     right, bottom = (size - inside_wh - start).tolist()
-    # As YOLO does it, and its networks are trained.
+    # The interpolation with which YOLO networks are trained.
     resized = cv2.resize(bgr, inside_wh.tolist(), interpolation=cv2.INTER_LINEAR)
     image = cv2.copyMakeBorder(resized, top, bottom, left, right, cv2.BORDER_CONSTANT, value=_GREY)
     return np.asarray(image, np.uint8), inside_wh / image_wh, start.astype(np.float64)

@@ -1,8 +1,8 @@
-"""Labels for a detector, made by the reference: each drone's box in space as a box in every image (paper, figure 9).
+"""Labels for a detector from the reference: each drone's box in space becomes a box in every image (paper, figure 9).
 
-A drone's box in space turns with its body where the reference knows how; else it stands along the world's axes. The
-label is the box around its eight projected corners, in the pixel convention of `boxes`, cut at the image's border. It
-holds all of the drone, and more: a box in space has corners where few drones have anything.
+A drone's box in space turns with its body if the reference has orientations; otherwise its sides are parallel to the
+world's axes. The label is the box around the eight projected corners, in the pixel convention of `boxes`, cut at the
+image's border. The label is larger than the drone's outline, because drones do not reach the corners of their boxes.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from psotrack.errors import SettingsError, check_positive
 from psotrack.geometry import NEAR_M, Camera, distort, project, rotation_matrices, to_camera
 from psotrack.trajectories import Trajectories
 
-#: Where lenses are looked at: up to 80 degrees off the axis.
+#: Radii at unit depth at which lens polynomials are sampled: up to 80 degrees from the optical axis.
 _RADII = np.linspace(0.0, 5.7, 571)
 _SIGNS = np.array(list(product((-0.5, 0.5), repeat=3)))
 
 
 @dataclass(frozen=True)
 class LabelSettings:
-    """How drones become labels.
+    """Settings of the labels.
 
     Attributes:
-        drone_size_m: full lengths of a drone's box along its own axes; along the world's where the reference has no
-            orientations.
-        offset_m: from the reference's point to the middle of the box, along the same axes.
-        min_inside: share of a box that must lie in the image.
-        max_hidden: share of what lies in the image that one nearer box may cover.
+        drone_size_m: full lengths of a drone's box along the body's axes, metres; along the world's axes if the
+            reference has no orientations.
+        offset_m: vector from the reference's tracked point to the middle of the box, along the same axes, metres.
+        min_inside: smallest share of a box that must lie in the image.
+        max_hidden: largest share of the visible box that one nearer box may cover.
     """
 
     drone_size_m: tuple[float, float, float]
@@ -50,16 +50,17 @@ class LabelSettings:
 def box_corners(
     truth: Trajectories, size_m: Float[np.ndarray, "*#drones 3"], offset_m: Float[np.ndarray, "*#drones 3"]
 ) -> Float[np.ndarray, "frames drones 8 3"]:
-    """Corners of the drones' boxes, world, metres; NaN where the pose is not known.
+    """Corners of the drones' boxes in the world, metres; NaN if the pose is unknown.
 
     Args:
-        truth: with orientations or without.
-        size_m, offset_m: (3,) or (drones, 3), as in `LabelSettings`.
+        truth: the reference, with or without orientations.
+        size_m: (3,) or (drones, 3), lengths of the boxes as in `LabelSettings`, metres.
+        offset_m: (3,) or (drones, 3), offsets as in `LabelSettings`, metres.
     """
     corners_m = offset_m[..., None, :] + _SIGNS * size_m[..., None, :]
     if truth.orientation_wxyz is not None:
         rotation = _rotations(truth.orientation_wxyz)
-        # (frames, drones, 1, 3, 3) turns (drones or nothing, 8, 3).
+        # Rotations (frames, drones, 1, 3, 3) times corners (8, 3) or (drones, 8, 3).
         corners_m = np.matvec(rotation[:, :, None], corners_m)
     return truth.position_m[:, :, None, :] + corners_m
 
@@ -70,42 +71,43 @@ def label_boxes(
     """Boxes of drones in images, lens distortion included, cut at the image's border.
 
     Args:
-        cameras: with one leading axis.
-        corners_m: (..., drones, 8, 3), from `box_corners`.
-        settings: which boxes count.
+        cameras: cameras with one leading axis.
+        corners_m: (..., drones, 8, 3), corners from `box_corners`, metres.
+        settings: settings of the labels.
 
     Returns:
-        (..., drones, cameras, 4), xyxy in pixels in the convention of `boxes`; NaN where a drone is behind the camera,
-        or beyond what its lens's polynomial holds for, too little of it is in the image, or a nearer one hides it.
+        (..., drones, cameras, 4), xyxy in pixels in the convention of `boxes`. NaN if the drone is behind the camera or
+        outside the valid range of the lens polynomial, too little of the drone is in the image, or a nearer drone hides
+        it.
     """
     points_cam = to_camera(cameras, corners_m[..., None, :])
     pixels, depth = project(cameras, corners_m[..., None, :])
-    # Half a pixel from pixel centres at whole numbers to edges there.
+    # Half a pixel converts from pixel centres at whole numbers to pixel edges at whole numbers.
     whole = np.concatenate([pixels.min(axis=-3), pixels.max(axis=-3)], axis=-1) + 0.5
     size_wh = np.asarray(cameras.image_size_wh)
     cut = np.clip(whole, 0.0, np.concatenate([size_wh, size_wh], axis=-1))
-    # Polynomials of lenses turn back far outside the image, and bring into it what is not there.
+    # Far outside the image a lens polynomial decreases again, and would map points into the image that are not visible.
     radius = np.hypot(points_cam[..., 0], points_cam[..., 1]) / np.maximum(depth, NEAR_M)
-    there = (depth.min(axis=-2) > NEAR_M) & (radius.max(axis=-2) <= _last_radius(cameras))
-    there &= (_area(cut) > 0) & (_area(cut) >= settings.min_inside * _area(whole))
+    in_image = (depth.min(axis=-2) > NEAR_M) & (radius.max(axis=-2) <= _largest_valid_radius(cameras))
+    in_image &= (_area(cut) > 0) & (_area(cut) >= settings.min_inside * _area(whole))
     distance_m = np.linalg.norm(points_cam.mean(axis=-3), axis=-1)
-    visible = there & (_covered(cut, distance_m, there) <= settings.max_hidden)
+    visible = in_image & (_covered_share(cut, distance_m, in_image) <= settings.max_hidden)
     return np.where(visible[..., None], cut, np.nan)
 
 
 def _rotations(
     orientation_wxyz: Float[np.ndarray, "frames drones 4"],
 ) -> Float[np.ndarray, "frames drones 3 3"]:
-    """From body to world; none for drones that never have an orientation, NaN where one is missing."""
+    """Rotations from body to world: identity for drones that never have an orientation, NaN in frames without one."""
     rotation = rotation_matrices(orientation_wxyz)
     rotation[:, np.isnan(rotation[..., 0, 0]).all(axis=0)] = np.eye(3)
     return rotation
 
 
-def _last_radius(cameras: Camera) -> Float[np.ndarray, "cameras"]:
-    """How far off the axis, at unit depth, the polynomial of the lens turns back; infinite where it does not."""
+def _largest_valid_radius(cameras: Camera) -> Float[np.ndarray, "cameras"]:
+    """Radius at unit depth up to which the lens polynomial increases; infinite if it always increases."""
     radius = _RADII[:, None] * np.ones(len(cameras.K))
-    # Half the difference of both sides is the radial part alone.
+    # The difference between both sides of the axis contains the radial distortion only.
     bent = distort(cameras, radius, 0 * radius)[0] - distort(cameras, -radius, 0 * radius)[0]
     turned = np.diff(np.asarray(bent), axis=0) <= 0
     return np.where(turned.any(axis=0), _RADII[turned.argmax(axis=0)], np.inf)
@@ -115,15 +117,15 @@ def _area(xyxy: Float[np.ndarray, "*boxes 4"]) -> Float[np.ndarray, "*boxes"]:
     return (xyxy[..., 2] - xyxy[..., 0]) * (xyxy[..., 3] - xyxy[..., 1])
 
 
-def _covered(
+def _covered_share(
     xyxy: Float[np.ndarray, "*frames drones cameras 4"],
     distance_m: Float[np.ndarray, "*frames drones cameras"],
-    there: Bool[np.ndarray, "*frames drones cameras"],
+    in_image: Bool[np.ndarray, "*frames drones cameras"],
 ) -> Float[np.ndarray, "*frames drones cameras"]:
-    """The largest share of each box that one nearer box covers."""
-    one, other = xyxy[..., :, None, :, :], xyxy[..., None, :, :, :]
-    low, high = np.maximum(one[..., :2], other[..., :2]), np.minimum(one[..., 2:], other[..., 2:])
+    """Largest share of each box that one nearer box covers."""
+    box, other = xyxy[..., :, None, :, :], xyxy[..., None, :, :, :]
+    low, high = np.maximum(box[..., :2], other[..., :2]), np.minimum(box[..., 2:], other[..., 2:])
     common = np.maximum(high - low, 0.0).prod(axis=-1)
-    nearer = there[..., None, :, :] & (distance_m[..., None, :, :] < distance_m[..., :, None, :])
-    share = common / np.maximum(_area(one), 1e-12)
+    nearer = in_image[..., None, :, :] & (distance_m[..., None, :, :] < distance_m[..., :, None, :])
+    share = common / np.maximum(_area(box), 1e-12)
     return np.where(nearer, share, 0.0).max(axis=-2, initial=0.0)

@@ -1,4 +1,4 @@
-"""Detections that a network made, stored: one folder for each model, its settings and the videos' content."""
+"""Stored detections of a network: one folder for each combination of model, settings and contents of the videos."""
 
 from __future__ import annotations
 
@@ -6,38 +6,42 @@ from pathlib import Path
 
 import msgspec
 
-from psotrack.detection.detector import OnnxDetector, detect
+from psotrack.detection.detector import OnnxDetector, detect_drones
 from psotrack.recordings import Sequence, write_detections
 from psotrack.support import Report, digest_file, digest_record, no_progress
 
 
 def stored_detections(
-    detector: OnnxDetector, sequence: Sequence, *, cache: Path, report: Report = no_progress
+    detector: OnnxDetector, sequence: Sequence, *, cache: Path | str, report: Report = no_progress
 ) -> Path:
-    """A folder with the detections of each of a sequence's videos; what is not there yet is made.
+    """Detect drones in the videos of a sequence, unless the detections are stored already.
 
-    Every video's file appears whole or not at all: a call that is interrupted goes on with the next video.
+    The file of a video appears when it is complete. A call after an interruption continues with the first video without
+    a file.
 
     Args:
-        detector: that finds them.
-        sequence: fit for use (see `Sequence.usable`).
-        cache: below which the folder is.
-        report: told of every frame that is looked at.
+        detector: the network.
+        sequence: a consistent sequence (see `Sequence.usable`).
+        cache: folder for stored results.
+        report: shows the progress in frames.
+
+    Returns:
+        Folder with one file of detections per video.
 
     Raises:
         InputError: a video cannot be read, or the network cannot be used.
         OutputError: a file cannot be written.
     """
-    folder = cache / "detections" / _key(detector, sequence)
+    folder = Path(cache) / "detections" / _key(detector, sequence)
     for name, video in sequence.videos.items():
         path = folder / f"{video.path.stem}.csv"
         if not path.exists():
-            write_detections(path, detect(detector, name, video, report=report))
+            write_detections(path, detect_drones(detector, name, video, report=report))
     return folder
 
 
 def _key(detector: OnnxDetector, sequence: Sequence) -> str:
-    """40 hexadecimal digits."""
+    """Name of the folder: 40 hexadecimal digits."""
     made_of = {
         "model": digest_file(detector.model),
         "settings": msgspec.to_builtins(detector.settings),

@@ -1,7 +1,7 @@
-"""YOLO data sets: images, a text file of labels for each, and `data.yaml` that names the parts.
+"""YOLO data sets for training: images, a text file of labels per image, and `data.yaml` with the parts.
 
-This is what the trainers of YOLOv5 and its successors load: the labels of images/PART/NAME.jpg are in
-labels/PART/NAME.txt, a line per drone of its class and its box's middle and size in widths and heights of the image.
+The layout is that of YOLOv5 and its successors. The labels of images/PART/NAME.jpg are in labels/PART/NAME.txt, one
+line per drone: its class, and the middle and size of its box as fractions of the image's width and height.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.recordings import Sequence, VideoInfo, read_frames
 from psotrack.support import Advance, Report, atomic_write, map_in_processes, no_progress, refuse_to_overwrite
 
-#: The file that makes a folder a data set.
+#: Name of the file that describes a data set; every folder with a data set has one.
 DATA_SET = "data.yaml"
 _CLASS = "drone"
 _TRAIN, _VALIDATION = "train", "val"
@@ -31,7 +31,7 @@ _TRAIN, _VALIDATION = "train", "val"
 
 def write_data_set(
     sequences: Ordered[Sequence],
-    out: Path,
+    out: Path | str,
     settings: LabelSettings,
     *,
     validation: Ordered[str] = (),
@@ -40,36 +40,40 @@ def write_data_set(
     jobs: int | None = None,
     report: Report = no_progress,
 ) -> dict[str, dict[str, int]]:
-    """Images and labels of sequences as a YOLO data set, in a new folder.
+    """Write images and labels of sequences as a YOLO data set in a new folder.
 
-    Frames in which the pose of any drone is not known are left out: it may be in the image without a label. Images
-    without drones have an empty file of labels, which trainers take for background.
+    Frames in which the pose of a drone is unknown are left out, because the drone may be in the image without a label.
+    Images without drones have an empty label file, which trainers use as background.
 
     Args:
-        sequences: two or more, each with a reference.
-        out: the folder.
-        settings: what is labelled.
-        validation: names of the sequences to validate on; the others are trained on. The last one where none is given.
-        every: take each so manieth frame.
-        force: replace a data set that is there.
-        jobs: processes at most; None is one per processor.
-        report: told of each frame of each camera.
+        sequences: at least two sequences, each with a reference.
+        out: folder of the data set.
+        settings: settings of the labels.
+        validation: names of the sequences for validation; the other sequences are for training. Empty: the last one.
+        every: step between used frames.
+        force: replace an existing data set.
+        jobs: largest number of processes; None: one per processor.
+        report: shows the progress in frames of all cameras.
 
     Returns:
-        Number of `images` and `labels` in the parts `train` and `val`.
+        Numbers of `images` and `labels` in the parts `train` and `val`.
 
     Raises:
-        SettingsError: sequences of one name, a name that is none of theirs, or nothing to train on; `every` below 1.
-        InputError: a sequence has no reference, none that is known in any frame, or videos that do not fit.
-        OutputError: there is a folder already, or it cannot be written.
+        SettingsError: two sequences have the same name, a validation name is unknown, no sequence is left for training,
+            or `every` is below 1.
+        InputError: a sequence has no reference, no frame with all poses known, or inconsistent videos.
+        OutputError: the folder exists and `force` is not set, or it cannot be written.
     """
-    parts = _parts([one.name for one in sequences], validation)
+    out = Path(out)
+    parts = _parts([sequence.name for sequence in sequences], validation)
     _check_replaceable(out, force)
     if every < 1:
         raise SettingsError("every", expected="1 or more", found=f"{every}")
     with atomic_write(out) as temporary:
         tasks = [
-            task for one in sequences for task in _tasks(one, parts[one.name], settings, every, temporary)
+            task
+            for sequence in sequences
+            for task in _tasks(sequence, parts[sequence.name], settings, every, temporary)
         ]
         for kind, part in product(("images", "labels"), (_TRAIN, _VALIDATION)):
             (temporary / kind / part).mkdir(parents=True)
@@ -84,16 +88,16 @@ def write_data_set(
 
 @dataclass(frozen=True)
 class _Task:
-    """Images of one camera.
+    """The images and labels of one camera.
 
     Attributes:
-        out: the data set's folder.
+        out: folder of the data set.
         part: `train` or `val`.
-        stem: of the names of files.
-        video: of the camera.
-        every: step between frames.
-        frame: (known,), numbers of the frames to take, multiples of `every`.
-        xyxy: (known, drones, 4), NaN where there is no label.
+        stem: beginning of the files' names.
+        video: video of the camera.
+        every: step between used frames.
+        frame: (known,), numbers of the used frames, multiples of `every`.
+        xyxy: (known, drones, 4), labels in pixels; NaN without a label.
     """
 
     out: Path
@@ -106,21 +110,21 @@ class _Task:
 
 
 def _parts(names: Ordered[str], validation: Ordered[str]) -> dict[str, str]:
-    """The part that each sequence belongs to."""
+    """The part of each sequence, `train` or `val`, by the sequence's name."""
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise SettingsError(
             "sequences",
-            expected="a name of its own for each",
+            expected="different names",
             found=f"{twice[0]} more than once",
             remedy="rename a folder",
         )
     if len(names) < 2:
         raise SettingsError(
             "sequences",
-            expected="at least two, as whole ones are trained or validated on",
+            expected="at least two sequences, because a sequence is used either for training or for validation",
             found=", ".join(names) or "none",
-            remedy="frames of one flight on both sides would tell nothing",
+            remedy="add a sequence: validation on frames of the training flight would prove nothing",
         )
     chosen = list(validation) or list(names[-1:])
     unknown = [name for name in chosen if name not in names]
@@ -129,9 +133,9 @@ def _parts(names: Ordered[str], validation: Ordered[str]) -> dict[str, str]:
     if len(set(chosen)) >= len(names):
         raise SettingsError(
             "sequences",
-            expected="at least one to train on beside those to validate on",
-            found=f"{', '.join(names) or 'none'}, all to validate on",
-            remedy="frames of one flight on both sides would tell nothing",
+            expected="at least one sequence for training",
+            found=f"{', '.join(names) or 'none'}, all for validation",
+            remedy="add a sequence, or name fewer for validation",
         )
     return {name: _VALIDATION if name in chosen else _TRAIN for name in names}
 
@@ -141,15 +145,15 @@ def _check_replaceable(out: Path, force: bool) -> None:
     if out.exists() and not (out / DATA_SET).is_file():
         raise OutputError(
             out,
-            expected=f"no such folder, or an earlier data set with its {DATA_SET}",
+            expected=f"a path that does not exist yet, or a data set with a {DATA_SET}",
             found="something else",
-            remedy="name another folder: nothing but a data set is replaced",
+            remedy="name another folder: only a data set can be replaced",
         )
 
 
 def _tasks(sequence: Sequence, part: str, settings: LabelSettings, every: int, out: Path) -> list[_Task]:
     if sequence.truth is None:
-        raise InputError(sequence.folder, expected="a reference that says where drones are", found="none")
+        raise InputError(sequence.folder, expected="a reference with the drones' positions", found="none")
     filmed = [name for name in sequence.rig.names if name in sequence.videos]
     truth, sequence = sequence.truth, sequence.usable(filmed, sequence.num_frames)
     wanted = truth.frame[(truth.frame % every == 0) & (truth.frame < sequence.num_frames)]
@@ -161,7 +165,7 @@ def _tasks(sequence: Sequence, part: str, settings: LabelSettings, every: int, o
         raise InputError(
             sequence.folder,
             expected="frames in which the poses of all drones are known",
-            found=f"none of the {len(wanted)} that were looked at",
+            found=f"no such frame among the {len(wanted)} used frames",
         )
     xyxy = label_boxes(sequence.rig.cameras, corners_m[known], settings)
     return [
@@ -198,14 +202,14 @@ def _write_camera(task: _Task, advance: Advance) -> dict[str, int]:
 
 
 def _lines(xyxy: Float[np.ndarray, "labels 4"], image_size_wh: tuple[int, int]) -> list[str]:
-    """`class cx cy w h` of each box, in widths and heights of the image; six decimals are a hundredth of a pixel."""
+    """Lines `class cx cy w h` as fractions of the image's width and height; six decimals are a hundredth of a pixel."""
     corner, far_corner = xyxy[:, :2] / image_size_wh, xyxy[:, 2:] / image_size_wh
     values = np.hstack([(corner + far_corner) / 2, far_corner - corner])
     return [" ".join(["0", *(f"{value:.6f}" for value in row)]) + "\n" for row in values]
 
 
 def _yaml(folder: Path) -> str:
-    """What trainers look for; texts are written as in JSON, which YAML reads alike."""
+    """Text of `data.yaml`; values are written as JSON, which is valid YAML."""
     rows = {
         "path": str(folder),
         "train": f"images/{_TRAIN}",
