@@ -311,7 +311,7 @@ def test_messages_of_a_file_begin_with_its_path(path):
 
 def test_a_file_that_is_no_toml(path):
     path.write_text("sequences = [\n")
-    with pytest.raises(InputError, match=r"grid.toml.*: expected TOML"):
+    with pytest.raises(InputError, match=r"grid.toml.*: expected valid TOML"):
         load(path)
     with pytest.raises(InputError, match=r"none.toml: expected a file to read"):
         load(path.with_name("none.toml"))
