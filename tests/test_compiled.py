@@ -1,4 +1,4 @@
-"""Compiled programs on disk: found again, renewed where they are spoilt, and never in anybody's way."""
+"""Compile cache on disk: programs are found again, damaged entries are renewed, and trouble is no error."""
 
 import os
 import subprocess
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from helpers import environment_without_jax_settings
 
-#: One program, kept however quickly it compiles; prints what it computes and where JAX keeps programs.
+#: A program that is stored although it compiles fast; it prints its result and the folder of JAX's compile cache.
 PROGRAM = """
 import sys
 from pathlib import Path
@@ -24,7 +24,7 @@ ANSWER = "0.958851"
 
 
 def run(folder: Path, **environment: str) -> list[str]:
-    """What the program prints, a number and a folder; nothing must come on stderr."""
+    """Run the program; return the number and the folder that it prints; stderr must be empty."""
     result = subprocess.run(
         [sys.executable, "-c", PROGRAM, str(folder)],
         capture_output=True,
@@ -50,8 +50,8 @@ def test_a_program_is_compiled_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("size", [0, 300])
-def test_an_entry_that_was_cut_off_is_renewed(tmp_path: Path, size: int) -> None:
-    """JAX by itself never replaces an entry: each run would compile again, and warn."""
+def test_a_truncated_entry_is_renewed(tmp_path: Path, size: int) -> None:
+    """JAX alone never replaces an entry: each run would compile again and warn."""
     run(tmp_path)
     whole = entry(tmp_path).stat().st_size
     os.truncate(entry(tmp_path), size)
@@ -59,12 +59,12 @@ def test_an_entry_that_was_cut_off_is_renewed(tmp_path: Path, size: int) -> None
     assert entry(tmp_path).stat().st_size == whole > 300
 
 
-def test_a_folder_that_cannot_be_made_is_no_obstacle(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_created_is_no_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     assert run(tmp_path / "file" / "compiled")[0] == ANSWER
 
 
-def test_what_a_user_told_jax_is_respected(tmp_path: Path) -> None:
+def test_a_users_own_cache_folder_is_kept(tmp_path: Path) -> None:
     theirs = tmp_path / "theirs"
     assert run(tmp_path / "ours", JAX_COMPILATION_CACHE_DIR=str(theirs)) == [ANSWER, str(theirs)]
     assert not (tmp_path / "ours").exists()

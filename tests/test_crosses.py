@@ -1,4 +1,4 @@
-"""Marker crosses: shapes learned, markers told from distances, poses by least squares, gaps bridged."""
+"""Marker crosses: learning of shapes, identification by distances, poses by least squares, bridging of gaps."""
 
 import itertools
 
@@ -29,7 +29,7 @@ RATE_HZ = 100.0
 
 
 def flight(num_frames, seed=0, rate_hz=RATE_HZ):
-    """Rotations and positions of a drone that sways and turns like one."""
+    """Rotations and positions of a drone in a realistic flight."""
     t = np.arange(num_frames) / rate_hz + seed
     position_m = np.stack([1.5 * np.sin(1.5 * t), 1.2 * np.cos(1.3 * t), 1.5 + 0.3 * np.sin(t)], axis=-1)
     turn = Rotation.from_euler(
@@ -39,7 +39,7 @@ def flight(num_frames, seed=0, rate_hz=RATE_HZ):
 
 
 def recorded(markers_m, num_frames=120, seed=0, noise_m=0.0, rate_hz=RATE_HZ):
-    """(frames, markers, 3), what the mocap system sees of a body in flight."""
+    """(frames, markers, 3), markers of a body in flight as the motion-capture system sees them."""
     turn, position_m = flight(num_frames, seed, rate_hz)
     markers = np.einsum("fij,mj->fmi", turn.as_matrix(), markers_m) + position_m[:, None]
     return markers + noise_m * np.random.default_rng(seed).standard_normal(markers.shape)
@@ -58,7 +58,7 @@ def distances(points_m):
 
 
 @given(seed=st.integers(0, 10_000), num_markers=st.integers(3, 6), noise_mm=st.sampled_from([0.0, 0.5, 5.0]))
-def test_the_fit_is_that_of_scipy(seed, num_markers, noise_mm):
+def test_the_fit_equals_scipys(seed, num_markers, noise_mm):
     rng = np.random.default_rng(seed)
     body_m = rng.uniform(-0.15, 0.15, (num_markers, 3))
     body_m -= body_m.mean(axis=0)
@@ -69,9 +69,9 @@ def test_the_fit_is_that_of_scipy(seed, num_markers, noise_mm):
     if width_m < 0.0051:  # on a line: another test's
         return
     expected, rssd = Rotation.align_vectors(world_m - world_m.mean(axis=0), body_m)
-    # Both are the least-squares rotation in double precision; of thin triangles, the turn is known to fewer digits.
+    # Both are the least-squares rotation in double precision; for thin triangles it has fewer exact digits.
     np.testing.assert_allclose(found.rotation[0], expected.as_matrix(), rtol=0, atol=1e-9)
-    # SciPy's is the root of a difference of squares: 1e-8 where it should be 0.
+    # SciPy's residual is the root of a difference of squares: 1e-8 instead of 0.
     np.testing.assert_allclose(found.residual_m[0], rssd / np.sqrt(num_markers), rtol=0, atol=1e-7)
     np.testing.assert_allclose(found.position_m[0], world_m.mean(axis=0), rtol=0, atol=1e-12)
 
@@ -84,7 +84,7 @@ def test_three_markers_give_the_pose_of_four(unseen):
     found = estimate_poses(cross, markers_m, RATE_HZ)
     assert found.num_markers.tolist() == [4] * 50 + [3] * 70
     assert not found.bridged.any()
-    # Double precision. The mean of the three would be 18 mm off at least.
+    # Double precision. The mean of three markers would be at least 18 mm off.
     np.testing.assert_allclose(found.position_m, centroids(FOUR_M, 120), rtol=0, atol=1e-9)
 
 
@@ -112,7 +112,7 @@ def test_moving_the_world_moves_the_pose(angles, seed):
 
 
 @pytest.mark.parametrize("num_markers", [1, 2, 3])
-def test_markers_on_a_line_have_a_middle_but_no_turn(num_markers):
+def test_markers_on_a_line_have_a_position_but_no_rotation(num_markers):
     line_m = np.array([[0.1, 0.1, 0.1]]) * np.arange(num_markers)[:, None]
     markers_m = recorded(line_m, 20)
     markers_m[10:15, 0] = np.nan
@@ -138,26 +138,26 @@ def test_no_frames_and_no_markers_seen():
 def test_a_cross_is_learned(markers_m):
     cross = learn_cross(recorded(markers_m, 400, noise_m=NOISE_M), "dron4")
     assert cross.name == "dron4"
-    # Five standard errors of a distance of means: 0.3 mm sqrt(2 / 400) each.
+    # Five standard errors of a distance between means, 0.3 mm sqrt(2 / 400).
     np.testing.assert_allclose(distances(cross.markers_m), distances(markers_m), rtol=0, atol=1.1e-4)
 
 
 @pytest.mark.parametrize("markers_m", [FOUR_M, FIVE_M], ids=["four", "five"])
-def test_its_frame_is_the_shapes_own(markers_m):
-    """Whatever was flown: two recordings agree."""
+def test_the_frame_depends_on_the_shape_only(markers_m):
+    """Two recordings of different flights give the same frame."""
     one, other = (learn_cross(recorded(markers_m, seed=seed)) for seed in (1, 2))
     np.testing.assert_allclose(one.markers_m, other.markers_m, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("order", [[0, 1, 2, 3], [0, 3, 1, 2], [0, 2, 3, 1]])
 def test_x_is_along_the_first_beam_of_a_cross_and_z_is_up(order):
-    """The arms of `FOUR_M` are along its axes, and its first marker is ahead."""
+    """The arms of `FOUR_M` are parallel to its axes, and its first marker is at the front."""
     cross = learn_cross(recorded(FOUR_M[order]))
     np.testing.assert_allclose(cross.markers_m, (FOUR_M - FOUR_M.mean(axis=0))[order], rtol=0, atol=1e-9)
 
 
-def test_x_is_at_the_first_marker_where_there_is_no_cross():
-    """A marker within a triangle has none opposite to it; and of three, none has."""
+def test_x_points_to_the_first_marker_without_crossing_beams():
+    """A marker within a triangle has no opposite marker, and three markers have no opposite markers either."""
     for shape_m in (
         np.array([[0.12, 0, 0], [-0.05, 0.1, 0], [-0.07, -0.06, 0], [0.01, 0.01, 0]]),
         FOUR_M[:3],
@@ -170,14 +170,14 @@ def test_x_is_at_the_first_marker_where_there_is_no_cross():
         np.testing.assert_allclose(distances(cross.markers_m), distances(shape_m), rtol=0, atol=1e-9)
 
 
-def test_a_cross_is_learned_though_labels_swap_and_markers_go():
-    """A quarter of the frames with two labels swapped, a tenth with a stray; no frame sees all markers."""
+def test_a_cross_is_learned_despite_swapped_labels_and_unseen_markers():
+    """A quarter of the frames has two swapped labels, a tenth has a stray marker; no frame sees all markers."""
     markers_m = recorded(FIVE_M, 400, noise_m=NOISE_M)
     markers_m[:100, [0, 1]] = markers_m[:100, [1, 0]]
     markers_m[100:140, 2] += 0.5
     markers_m[np.arange(400), np.arange(400) % 5] = np.nan
     cross = learn_cross(markers_m)
-    # 208 clean views of each marker at 0.3 mm.
+    # Each marker has 208 correct positions with noise of 0.3 mm.
     np.testing.assert_allclose(distances(cross.markers_m), distances(FIVE_M), rtol=0, atol=1.5e-4)
 
 
@@ -196,18 +196,18 @@ def test_a_cross_has_its_origin_at_its_centroid():
         Cross("dron4", FOUR_M)
 
 
-# --- which marker is which, and which cross
+# --- identification of markers and crosses
 
 
 @pytest.mark.parametrize("order", list(itertools.permutations(range(4))))
-def test_every_exchange_is_found(order):
+def test_every_permutation_is_found(order):
     cross = learn_cross(recorded(FOUR_M))
     points_m = recorded(FOUR_M, 1, seed=3, noise_m=NOISE_M)[0]
     assert identify_markers(cross, points_m[list(order)]).tolist() == list(order)
     assert identify_markers(cross, points_m[list(order[:3])]).tolist() == list(order[:3])
 
 
-def test_points_among_strays():
+def test_markers_among_stray_points():
     cross = learn_cross(recorded(FIVE_M))
     points_m = recorded(FIVE_M, 1, seed=3, noise_m=NOISE_M)[0]
     strays_m = points_m[0] + np.random.default_rng(0).uniform(-1, 1, (20, 3))
@@ -215,8 +215,8 @@ def test_points_among_strays():
     assert identify_markers(cross, soup_m).tolist() == [-1] * 7 + [3, 0] + [-1] * 13 + [4, 1, 2]
 
 
-def test_a_mirror_image_is_no_match():
-    """All distances fit; no turn does."""
+def test_a_mirror_image_is_not_identified():
+    """All distances of a mirror image fit, but no rotation does."""
     body_m = np.array([[0.1, 0, 0], [0, 0.13, 0], [-0.07, 0, 0], [0.01, 0.02, 0.12]])
     cross = learn_cross(recorded(body_m))
     assert identify_markers(cross, body_m).tolist() == [0, 1, 2, 3]
@@ -235,20 +235,20 @@ def test_a_mirror_image_is_no_match():
     ],
     ids=["none", "two", "larger", "another"],
 )
-def test_what_is_no_cross(points_m):
+def test_points_that_are_not_the_cross(points_m):
     cross = learn_cross(recorded(FOUR_M))
     assert identify_markers(cross, points_m).tolist() == [-1] * len(points_m)
     assert identify_cross([cross], points_m) is None
 
 
-def test_a_symmetric_cross_is_ambiguous_but_is_itself():
+def test_a_symmetric_cross_is_identified_but_its_markers_are_not():
     square = np.array([[0.1, 0, 0], [0, 0.1, 0], [-0.1, 0, 0], [0, -0.1, 0]])
     cross = Cross("square", square)
     assert identify_markers(cross, square + 1.0).tolist() == [-1] * 4
     assert identify_cross([learn_cross(recorded(FOUR_M)), cross], square + 1.0) == 1
 
 
-def test_which_drone_it_is():
+def test_the_drone_is_identified():
     shapes = [FOUR_M, *OTHERS_M]
     crosses = [learn_cross(recorded(shape, seed=index)) for index, shape in enumerate(shapes)]
     for index, shape in enumerate(shapes):
@@ -275,7 +275,7 @@ def test_swapped_labels_change_no_pose():
     assert not found.bridged.any()
     np.testing.assert_array_equal(found.position_m[others], expected.position_m[others])
     np.testing.assert_array_equal(found.orientation_wxyz[others], expected.orientation_wxyz[others])
-    # A marker of 0.3 mm noise fewer: the centroid moves by less than a millimetre.
+    # Without one marker with noise of 0.3 mm the centroid moves by less than a millimetre.
     np.testing.assert_allclose(found.position_m[70], expected.position_m[70], rtol=0, atol=1e-3)
 
 
@@ -309,15 +309,16 @@ def test_gaps_are_bridged_to_half_a_second(gap, bridged):
     if bridged:
         turn, _ = flight(300)
         off_m = np.linalg.norm(found.position_m - centroids(FOUR_M, 300), axis=1)
-        # A cubic over T is off by T^4 / 384 of the fourth derivative, 1.5 m (1.5 / s)^4: 1.2 mm in half a second; and
-        # by T / 8 of the error of its slopes, a tenth of the jerk of 5 m/s^3 times (0.1 s)^2: 0.5 mm. A line: 104 mm.
+        # A cubic over T has the error T^4 / 384 times the fourth derivative, 1.5 m (1.5 / s)^4: 1.2 mm in half a
+        # second; and T / 8 times the error of its slopes, a tenth of the jerk of 5 m/s^3 times (0.1 s)^2: 0.5 mm.
+        # The error of a straight line would be 104 mm.
         assert off_m.max() < 0.003
         body = Rotation.from_quat(found.orientation_wxyz, scalar_first=True)
         off_deg = np.degrees((turn[0].inv() * body[0] * body.inv() * turn).magnitude())
         assert off_deg.max() < 1.0  # T^2 / 8 of 0.34 rad/s^2 of tilting, about two axes
 
 
-def test_gaps_at_the_ends_stay():
+def test_gaps_at_the_ends_are_not_bridged():
     cross, markers_m = learn_cross(recorded(FOUR_M)), recorded(FOUR_M, 100)
     markers_m[:5] = markers_m[95:] = np.nan
     found = estimate_poses(cross, markers_m, RATE_HZ)
@@ -341,7 +342,7 @@ def test_any_time_between_frames(rate_hz, fps, offset_s):
         estimate_poses(cross, recorded(FOUR_M, num_frames, rate_hz=rate_hz), rate_hz), rate_hz, time_s
     )
     turn, position_m = flight(len(time_s), seed=offset_s, rate_hz=fps)
-    # dt^2 / 8 of 4 m/s^2 at 80 Hz is 0.08 mm.
+    # The interpolation error is dt^2 / 8 times 4 m/s^2, at 80 Hz 0.08 mm.
     np.testing.assert_allclose(
         found.position_m, position_m + turn.apply(FOUR_M.mean(axis=0)), rtol=0, atol=1e-4
     )
@@ -352,12 +353,12 @@ def test_any_time_between_frames(rate_hz, fps, offset_s):
     )  # dt^2 / 8 of 0.5 rad/s^2: 6e-4 degrees
 
 
-def test_times_at_frames_are_those_frames():
+def test_at_times_of_frames_poses_are_those_of_the_frames():
     cross, markers_m = learn_cross(recorded(FOUR_M)), recorded(FOUR_M)
     markers_m[60:] = np.nan
     every = estimate_poses(cross, markers_m, RATE_HZ)
     found = interpolate_poses(every, RATE_HZ, np.arange(40) / 25)
-    # Frame 14 of the video is frame 56, the last that is seen: there is nothing between it and the next.
+    # Frame 14 of the video is frame 56, the last seen frame: a later time would need the unseen next frame.
     np.testing.assert_array_equal(found.position_m[:15], every.position_m[:60:4])
     assert np.isnan(found.position_m[15:]).all()
     outside = interpolate_poses(every, RATE_HZ, np.array([-0.01, 1.2, 0.595]))

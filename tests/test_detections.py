@@ -1,4 +1,4 @@
-"""Detection files: read and written back, and broken lines named."""
+"""Detection files: reading, round trips, and errors that name the line."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def test_a_file_by_hand(tmp_path):
 
 
 def test_x_and_y_may_be_the_middle(tmp_path):
-    """Some exports of YOLO put the middle first: the box is the same."""
+    """Some exports of YOLO write the middle as x and y: the box is the same."""
     detections = read_detections(written(tmp_path, "0,25,40,30,40,25,40,0.9"))
     assert detections.xyxy.tolist() == [[10, 20, 40, 60]]
 
@@ -105,7 +105,7 @@ def test_round_trip(tmp_path_factory, found):
     write_detections(path, detections)
     again = read_detections(path)
     np.testing.assert_array_equal(again.frame, detections.frame)
-    # Middle and size instead of corners: a few roundings of numbers up to 2e4.
+    # Corners are computed from middle and size: a few roundings of numbers up to 2e4.
     np.testing.assert_allclose(again.xyxy, detections.xyxy, rtol=0, atol=1e-10)
     np.testing.assert_array_equal(again.confidence, detections.confidence)
 

@@ -1,4 +1,4 @@
-"""A detector in ONNX, with tiny real networks: a white square is found where it was painted, to the pixel."""
+"""The ONNX detector with tiny real networks, which find a painted white square to the pixel."""
 
 import json
 
@@ -34,12 +34,12 @@ def models(tmp_path_factory):
 
 
 def black(size: int):
-    """An image that is twice as wide as the input, and three quarters as high as wide."""
+    """An image with twice the width of the input and an aspect ratio of 4 to 3."""
     return np.zeros((SCALE * size * 3 // 4, SCALE * size, 3), np.uint8)
 
 
 def square(size: int, column: int, row: int):
-    """xyxy in the image of one of the network's squares; above the image there is an eighth of the input in grey."""
+    """xyxy in the image of one of the network's squares; the grey border above is an eighth of the input."""
     x0, y0 = SCALE * STRIDE * column, SCALE * (STRIDE * row - size // 8)
     return [x0, y0, x0 + SCALE * SIDE, y0 + SCALE * SIDE]
 
@@ -61,18 +61,18 @@ class TestLayouts:
         bgr, there = black(size), square(size, 5, 6)
         paint(bgr, there)
         xyxy, confidence = detector(models, layout).boxes(bgr)
-        # Whole pixels, and shrunk by two: exact but for float32.
+        # Whole pixels, reduced by two: exact up to float32.
         np.testing.assert_allclose(xyxy, [there], atol=1e-4)
         assert confidence == pytest.approx(1 / (1 + np.exp(-10)), abs=1e-5)
 
-    def test_two_squares_the_brighter_first(self, models, layout):
+    def test_of_two_squares_the_brighter_is_first(self, models, layout):
         size = SIZES[layout]
         bgr, dim, bright = black(size), square(size, 2, 3), square(size, 9, 7)
         paint(bgr, dim, 200)
         paint(bgr, bright)
         xyxy, confidence = detector(models, layout).boxes(bgr)
         np.testing.assert_allclose(xyxy, [bright, dim], atol=1e-4)
-        # OpenCV's convolutions round as they like: measured 2e-4.
+        # OpenCV's convolutions round: measured 2e-4.
         assert confidence[1] == pytest.approx(1 / (1 + np.exp(-40 * (200 / 255 - 0.75))), abs=1e-3)
         xyxy, _ = detector(models, layout, confidence=0.9).boxes(bgr)
         np.testing.assert_allclose(xyxy, [bright], atol=1e-4)
@@ -83,7 +83,7 @@ class TestLayouts:
 
 
 def test_boxes_that_overlap(models):
-    """A step to each side is three fifths of both, and a quarter black: half a score."""
+    """A box one step beside the square has an intersection over union of three fifths, and half the score."""
     bgr = black(128)
     paint(bgr, square(128, 5, 6))
     _, alone = detector(models, "v8", nms=0.59).boxes(bgr)
@@ -93,7 +93,7 @@ def test_boxes_that_overlap(models):
 
 
 def test_a_box_ends_where_the_image_ends(models):
-    """Of the square that fits best a quarter is in the grey above the image."""
+    """A quarter of the best square is in the grey border above the image."""
     bgr, there = black(128), square(128, 4, 1)
     assert there[1] == -SCALE * STRIDE
     paint(bgr, there)
@@ -110,7 +110,7 @@ def test_an_upright_image_has_grey_beside_it(models):
 
 
 def test_red_is_red(tmp_path, models):
-    """The network gets RGB: one that sees the first channel only sees what is red, the last one of BGR."""
+    """The network gets RGB: a network of the first channel sees red, which is the last channel of BGR."""
     kernel = np.full((3, SIDE, SIDE), 40 / (3 * SIDE * SIDE), np.float32)
     seeing_red = np.stack([3 * kernel[0], 0 * kernel[1], 0 * kernel[2]])
     content = bright_squares("v8", 128)
@@ -149,11 +149,11 @@ class TestWhatCannotBeUsed:
         assert "\n" not in str(error.value)
         assert capfd.readouterr() == ("", "")
 
-    def test_an_output_that_is_none(self, models):
+    def test_an_output_of_unknown_layout(self, models):
         with pytest.raises(InputError, match=r"none.onnx: .* as of YOLOv8, found \(1, 1, 13, 13\)"):
             detector(models, "none").boxes(black(128))
 
-    def test_scores_that_are_none(self, models):
+    def test_scores_outside_0_to_1(self, models):
         with pytest.raises(
             InputError, match=r"logits.onnx: expected .* from 0 to 1, found scores from 0 to 10;"
         ):
@@ -167,7 +167,7 @@ class TestWhatCannotBeUsed:
 
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory):
-    """Two cameras and four frames: a square that moves on in the first, nothing in the second."""
+    """Two cameras and four frames: a moving square in the first camera, nothing in the second."""
     folder = tmp_path_factory.mktemp("data") / "Simulated_Data" / "S02_D1"
     folder.mkdir(parents=True)
     R, t_m = look_at((0.0, -6.0, 2.0), (0.0, 0.0, 1.5))
@@ -187,7 +187,7 @@ class TestVideos:
     def test_frames(self, models, sequence):
         found = detect_drones(detector(models, "v5"), "0", probe(sequence / "0.avi"))
         assert found.frame.tolist() == [0, 2, 3]
-        # Compressed videos change the colours, not the square that fits best.
+        # Compression changes the colours, but not the best square.
         np.testing.assert_allclose(found.xyxy, [square(128, 3 + frame, 6) for frame in (0, 2, 3)], atol=1e-4)
 
     def run(self, models, sequence, out, *arguments):
@@ -204,7 +204,7 @@ class TestVideos:
         np.testing.assert_allclose(found.in_frame(3).xyxy, [square(128, 6, 6)], atol=1e-4)
         assert len(read_detections(tmp_path / "boxes" / "1.csv")) == 0
 
-    def test_nothing_is_replaced_unless_asked(self, models, sequence, tmp_path):
+    def test_files_are_replaced_only_with_force(self, models, sequence, tmp_path):
         (tmp_path / "1.csv").write_text("mine")
         with pytest.raises(OutputError, match=r"1.csv: .*--force"):
             self.run(models, sequence, tmp_path)
@@ -243,7 +243,7 @@ def seen(tmp_path_factory):
 
 
 class TestTracking:
-    """A drone that four cameras see as a square, tracked in one command."""
+    """A sequence of a drone that four cameras see as a square."""
 
     def run(self, models, seen, out, *arguments):
         words = [seen, "--out", out, "--cache", out.parent / "cache", "--detector", models / "v8.onnx"]
@@ -256,11 +256,11 @@ class TestTracking:
         assert found.exit_code == 0
         tracks = read_trajectories(tmp_path / "a.csv")
         assert tracks.num_drones == 1
-        # Squares stand at every 16th pixel: up to 8 pixels off, which are 4.4 cm at 6 m.
+        # The network's squares are 16 pixels apart: errors up to 8 pixels are 4.4 cm at 6 m.
         off_m = np.linalg.norm(tracks.position_m[:, 0] - PLACES_M, axis=-1)
         assert tracks.seen.all()
         assert off_m.max() < 0.08
-        # The second time nothing is looked for, because all of it is there.
+        # The second run uses the stored detections.
         monkeypatch.setattr(OnnxDetector, "boxes", lambda *_: pytest.fail("looked again"))
         again = self.run(models, seen, tmp_path / "b.csv", *arguments)
         assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
@@ -274,6 +274,6 @@ class TestTracking:
             (("--method", "fused", "--detections", "blobs"), r"--detector: .* found --detections blobs"),
         ],
     )
-    def test_a_detector_that_nobody_asks(self, models, seen, tmp_path, arguments, message):
+    def test_detector_options_that_are_not_used(self, models, seen, tmp_path, arguments, message):
         with pytest.raises(SettingsError, match=message):
             self.run(models, seen, tmp_path / "a.csv", *arguments)

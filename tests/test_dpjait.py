@@ -1,4 +1,4 @@
-"""The published layout: a folder of each half is made here by hand, read, and spoilt in every way we know."""
+"""The reader of the published layout: folders of each half are made by hand, read, and damaged in many ways."""
 
 import shutil
 from pathlib import Path
@@ -21,7 +21,7 @@ SERIALS = ("55260362", "56339527", "60881257", "61920488")
 
 @pytest.fixture(scope="session")
 def video(tmp_path_factory):
-    """One small video per number of frames, made once and copied."""
+    """One small video per number of frames, written once and copied."""
     folder = tmp_path_factory.mktemp("videos")
 
     def make(num_frames: int, size_wh: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
@@ -43,7 +43,7 @@ def pose_lines(num_rows: int, x0: float) -> str:
 
 @pytest.fixture
 def simulated(tmp_path, video):
-    """Three cameras, two drones, five frames, named for nine drones."""
+    """Three cameras, two drones, five frames; the name of the folder says nine drones."""
     folder = tmp_path / "Simulated_Data" / "S99_D9"
     folder.mkdir(parents=True)
     cameras = [f"cam{i}i;{i};0.5;8;1.9;{i / 10};0;{1156.3 + i};32;24" for i in (1, 2, 3)]
@@ -145,7 +145,7 @@ def test_a_camera_by_any_of_its_names(half, typed, request):
         (["cam1", "cam1i_s"], "each once, found cam1, cam1i_s"),
     ],
 )
-def test_names_that_are_no_camera_or_one_twice(published, typed, found):
+def test_unknown_and_repeated_camera_names(published, typed, found):
     with pytest.raises(SettingsError, match=f"cameras: expected some of cam1, cam2, .*{found}"):
         dpjait.read_sequence(published).usable(typed)
 
@@ -172,15 +172,16 @@ def test_the_real_half(real):
     assert cameras.dist[2].tolist() == [-0.1, 0.02, 0.001, -0.002]
     truth = sequence.truth
     assert truth.drones == ("dron4", "dron7")
-    # Frame 3 of the video is frame 12 of the recording; the middle marker of three is the centroid. Float32 mm.
+    # Frame 3 of the video is frame 12 of the recording; the middle one of three markers is the centroid. The file has
+    # float32 millimetres.
     np.testing.assert_allclose(truth.position_m[3, 0], np.array([1.0, 2.0, 1.5]) + 0.12 + 0.1, atol=3e-7)
     assert truth.orientation_wxyz is None
     assert truth.seen.all()
 
 
 @pytest.mark.parametrize("half", ["simulated", "real"])
-def test_calibration_means_what_opencv_says(half, request):
-    """A point projects where `cv2.projectPoints` puts it with the file's own numbers: t is no centre."""
+def test_projection_equals_opencvs(half, request):
+    """Points project as with `cv2.projectPoints` and the numbers of the file: t is not the camera's centre."""
     folder = request.getfixturevalue(half)
     rig = dpjait.read_sequence(folder).rig
     line = (folder / "cameras_calibration.csv").read_text().splitlines()[2].split(";")
@@ -192,7 +193,7 @@ def test_calibration_means_what_opencv_says(half, request):
     expected, _ = cv2.projectPoints(in_file_units, rvec, t, K, np.array(line[10:], float))
     pixels, depth_m = project(rig.cameras[1], points_m)
     assert depth_m.min() > 0
-    # Both in double precision; pixels of up to some thousand.
+    # Both in double precision; pixels up to a few thousand.
     np.testing.assert_allclose(pixels, expected[:, 0], rtol=0, atol=1e-8)
 
 
@@ -296,7 +297,7 @@ def test_an_archive(tmp_path):
     fails(tmp_path / "S01.zip", r"S01\.zip: expected the folder of a sequence, found a file; unpack it first")
 
 
-def test_a_folder_of_something_else(tmp_path):
+def test_a_folder_that_is_not_a_sequence(tmp_path):
     fails(
         tmp_path, "expected the file cameras_calibration.csv in it, found none; is it a folder of the DPJAIT"
     )
@@ -417,7 +418,7 @@ def test_two_recordings(real):
     fails(real, r"R99_D2: expected one \.c3d file, found R98\.c3d, R99\.c3d")
 
 
-def test_a_reference_that_is_no_c3d(real):
+def test_a_reference_that_is_not_c3d(real):
     (real / "R99.c3d").write_text("hello " * 400)
     fails(real, r"R99\.c3d: expected a C3D file, found one that ezc3d cannot read")
 
@@ -446,7 +447,7 @@ def test_names_of_the_quaternion(simulated, names, known):
 
 
 def test_quaternion_with_the_scalar_last(simulated):
-    """The names say which is which, not the order."""
+    """The names of the columns decide, not their order."""
     for path in simulated.glob("dron*.csv"):
         change(path, "q_w;q_x;q_y;q_z", "q_x;q_y;q_z;q_w")
     assert dpjait.read_sequence(simulated).truth.orientation_wxyz[1, 0].tolist() == [1, 0, 0, 0]

@@ -1,4 +1,4 @@
-"""Videos, poses and intrinsics of drones' own cameras: written, read back, and spoilt in every way we know."""
+"""Videos, poses and intrinsics of cameras on drones: round trips, and damage in many ways."""
 
 import logging
 
@@ -30,7 +30,7 @@ def write_video(path, size_wh=(WIDTH, HEIGHT), num_frames=FRAMES):
 
 @pytest.fixture
 def folder(tmp_path):
-    """Two cameras on walls, two drones, of which both have a camera."""
+    """Two cameras on walls, and two drones with a camera each."""
     R, t_m = look_at((4.0, 3.0, 2.5), (0.0, 0.0, 1.0))
     one = make_camera(R=R, t_m=t_m, K=np.diag([80.0, 80.0, 1.0]), image_size_wh=(WIDTH, HEIGHT))
     dpjait.write_calibration(tmp_path / dpjait.CALIBRATION, make_rig({"cam1i": one, "cam2i": one}))
@@ -63,7 +63,7 @@ def test_what_is_written_is_read_back(folder):
     assert np.isnan(one.position_m[0]).all(), "the first row is a placeholder"
     assert np.isnan(one.orientation_wxyz[0]).all()
     np.testing.assert_array_equal(one.position_m[1:], np.add(POSITION_M, [0.1, 1.0, 0.0])[1:])
-    # Quaternions are made unit on reading.
+    # The reader normalises quaternions.
     np.testing.assert_allclose(two.orientation_wxyz[1:], ORIENTATION_WXYZ[1:], atol=1e-15)
 
 
@@ -92,16 +92,16 @@ def test_a_sequence_has_them_beside_its_own_cameras(folder):
     sequence = dpjait.read_sequence(folder)
     assert list(sequence.videos) == ["cam1i", "cam2i"]
     assert sequence.truth.drones == ("dron1", "dron2")
-    # The poses of the drones, not of their cameras, which are 0.1 m ahead.
+    # The reference has the poses of the drones, not of their cameras, which are 0.1 m ahead.
     np.testing.assert_array_equal(sequence.truth.position_m[1:, 0], np.add(POSITION_M, [0.0, 1.0, 0.0])[1:])
     assert list(sequence.onboard) == ["dron1", "dron2"]
     assert sequence.usable(num_frames=3).onboard == sequence.onboard
 
 
-def test_a_sequence_without_them_is_as_it_was(folder):
+def test_a_sequence_without_onboard_videos(folder):
     for path in folder.glob("*cam_*"):
         path.unlink()
-    # Intrinsics alone are of no use, and do no harm.
+    # Intrinsics without videos are ignored.
     assert dpjait.read_onboard(folder) == {}
     sequence = dpjait.read_sequence(folder)
     assert sequence.onboard is None
@@ -133,7 +133,7 @@ def test_names_that_mean_the_same(folder, other):
     assert list(dpjait.read_sequence(folder).videos) == ["cam1i", "cam2i"]
 
 
-# --- what does not fit
+# --- inconsistent files
 
 
 def test_two_videos_of_one_drone(folder):
@@ -183,8 +183,8 @@ def test_broken_intrinsics(folder, old, new, message):
         dpjait.read_onboard(folder)
 
 
-def test_a_sequence_does_without_those_that_are_broken(folder, caplog):
-    """Tracking needs the cameras on the walls only."""
+def test_a_sequence_is_read_without_broken_onboard_files(folder, caplog):
+    """Tracking needs only the cameras on the walls."""
     change(folder / "dron1_cam_25.csv", "1.5", "?")
     with caplog.at_level(logging.WARNING):
         sequence = dpjait.read_sequence(folder)
@@ -199,10 +199,10 @@ def test_intrinsics_that_the_table_cannot_hold(tmp_path, intrinsics):
         dpjait.write_onboard_calibration(tmp_path / "x.csv", intrinsics)
 
 
-# --- shown
+# --- the inventory
 
 
-def test_the_table_of_contents_has_a_row_for_each(folder):
+def test_the_inventory_has_a_row_per_onboard_camera(folder):
     content = describe_sequence(dpjait.read_sequence(folder))
     assert content["onboard"]["dron2"] == {
         "video": str(folder / "dron2_cam_s.avi"),

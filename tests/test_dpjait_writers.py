@@ -1,4 +1,4 @@
-"""What the writers of the published layout write, its reader reads back: rigs, poses, markers."""
+"""Round trips through the writers and readers of the published layout: rigs, poses, markers."""
 
 import csv
 from pathlib import Path
@@ -54,7 +54,7 @@ def test_a_rig_comes_back(tmp_path_factory, poses, dist, unit):
     dpjait.write_calibration(path, rig, unit)
     again = read_back(path, rig)
     assert again.names == rig.names
-    # A rotation through its vector and back, and a length through millimetres: roundings of doubles up to 50.
+    # Rotations are converted to vectors and back, lengths to millimetres and back: roundings of doubles up to 50.
     np.testing.assert_allclose(again.cameras.T_cam_world, rig.cameras.T_cam_world, rtol=0, atol=1e-9)
     np.testing.assert_array_equal(again.cameras.K, rig.cameras.K)
     coefficients = again.cameras.dist.shape[-1]
@@ -70,7 +70,7 @@ def test_a_point_projects_as_before(tmp_path_factory, poses, point):
     points_m = np.tile(point, (len(rig), 1))
     before, depth_m = project(rig.cameras, points_m)
     after, _ = project(read_back(path, rig).cameras, points_m)
-    # Points far outside of the image have no useful pixels: the lens's polynomial throws them far away.
+    # Points far outside of the image are left out: the lens polynomial gives them useless pixels.
     normal = (depth_m > 0.5) & (np.abs(before) < 1e4).all(axis=-1)
     np.testing.assert_allclose(after[normal], before[normal], rtol=0, atol=1e-6)
 
@@ -121,14 +121,14 @@ def test_poses_come_back(tmp_path_factory, poses):
     assert np.isnan(orientation_again_wxyz[0]).all()
     np.testing.assert_array_equal(position_again_m[1:], position_m[1:])
     again = Rotation.from_quat(orientation_again_wxyz[1:], scalar_first=True)
-    # Normalised once more: a rounding of the quaternion.
+    # The reader normalises the quaternion, which rounds it.
     assert (again * rotation[1:].inv()).magnitude().max() < 1e-12
-    # The Euler angles of the file, read by another way, are the same rotation: R = Rz Ry Rx.
+    # The Euler angles of the file are the same rotation: R = Rz Ry Rx.
     with path.open() as file:
         rows = list(csv.DictReader(file, delimiter=";"))[1:]
     angles_rad = np.array([[float(row[f"rot_{axis}[rad]"]) for axis in "xyz"] for row in rows])
     Rx, Ry, Rz = (Rotation.from_rotvec(np.eye(3)[axis] * angles_rad[:, axis : axis + 1]) for axis in range(3))
-    # Angles lose half of the digits near gimbal lock: 1e-7 rad is 0.02 seconds of arc.
+    # Near gimbal lock, angles lose half of their digits: 1e-7 rad is 0.02 seconds of arc.
     assert ((Rz * Ry * Rx) * rotation[1:].inv()).magnitude().max() < 1e-6
 
 

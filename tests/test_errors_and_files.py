@@ -1,4 +1,4 @@
-"""What users see when something is wrong, and that nobody ever loses a file."""
+"""Error messages, files that are written completely or not at all, and progress bars."""
 
 import errno
 import os
@@ -11,7 +11,7 @@ from psotrack.errors import InputError, OutputError, PsotrackError, SettingsErro
 from psotrack.support import atomic_write, no_progress, progress_bar, refuse_to_overwrite
 
 
-def test_a_message_is_one_sentence():
+def test_a_message_has_four_parts():
     error = InputError(Path("a/b.csv"), expected="8 columns", found="7", remedy="export it again")
     assert str(error) == f"{Path('a/b.csv')}: expected 8 columns, found 7; export it again"
     assert (
@@ -21,7 +21,7 @@ def test_a_message_is_one_sentence():
 
 
 @pytest.mark.parametrize("kind", [InputError, SettingsError, OutputError])
-def test_errors_cross_processes_whole(kind):
+def test_errors_can_be_pickled(kind):
     error = kind("here", expected="this", found="that", remedy="do so")
     copy = pickle.loads(pickle.dumps(error))
     assert type(copy) is kind
@@ -45,7 +45,7 @@ def names(folder):
 
 @pytest.mark.parametrize("suffix", [".csv", ".avi", ""])
 def test_atomic_write(tmp_path, suffix):
-    """Under its name only when it is whole; the temporary has the same suffix, which writers choose a format by."""
+    """The file gets its name when it is complete; the temporary file has the suffix, which writers need."""
     path = tmp_path / "new" / f"out{suffix}"
     with atomic_write(path) as temporary:
         assert temporary.suffix == suffix or not suffix
@@ -63,7 +63,7 @@ def fail_half_way(path, fault):
 
 
 @pytest.mark.parametrize("fault", [ValueError("no"), KeyboardInterrupt(), SystemExit(1)])
-def test_what_was_there_survives_a_failure(tmp_path, fault):
+def test_an_old_file_survives_a_failure(tmp_path, fault):
     path = tmp_path / "out.csv"
     path.write_text("before")
     with pytest.raises(type(fault)):
@@ -83,8 +83,8 @@ def test_a_full_disk(tmp_path):
     assert names(tmp_path) == ["out.csv"]
 
 
-def test_a_folder_that_cannot_be(tmp_path):
-    """The parent is a file."""
+def test_a_folder_that_cannot_be_created(tmp_path):
+    """The parent of the folder is a file."""
     (tmp_path / "file").write_text("")
     with (
         pytest.raises(OutputError, match="earlier results are unchanged"),
@@ -101,7 +101,7 @@ def test_nothing_written_is_an_error(tmp_path):
     assert path.read_text() == "before"
 
 
-def test_a_folder_takes_the_place_of_a_folder(tmp_path):
+def test_a_folder_replaces_a_folder(tmp_path):
     path = tmp_path / "sequence"
     path.mkdir()
     (path / "old").write_text("old")
@@ -130,7 +130,7 @@ def test_a_folder_that_fails_leaves_the_old_one(tmp_path):
     assert names(tmp_path) == ["sequence"]
 
 
-def test_a_folder_that_was_never_made_leaves_the_old_one(tmp_path):
+def test_a_block_that_writes_nothing_keeps_the_old_folder(tmp_path):
     path = tmp_path / "sequence"
     path.mkdir()
     (path / "old").write_text("old")
@@ -141,7 +141,7 @@ def test_a_folder_that_was_never_made_leaves_the_old_one(tmp_path):
 
 
 def test_two_writers_at_once(tmp_path):
-    """Each has a temporary of its own; the last to finish is there, whole."""
+    """Two writers have different temporary files; the file of the last writer remains, complete."""
     path = tmp_path / "out.csv"
     with atomic_write(path) as first, atomic_write(path) as second:
         assert first != second
@@ -173,8 +173,8 @@ def test_progress_is_quiet_where_there_is_no_terminal(report, capfd):
     assert err.strip() == ""
 
 
-def test_a_file_never_takes_the_place_of_a_folder(tmp_path):
-    """It did, where --force allowed it, and what was in the folder was gone."""
+def test_a_file_never_replaces_a_folder(tmp_path):
+    """Otherwise a user who names a folder with --force would lose its content."""
     folder = tmp_path / "frames.csv"
     folder.mkdir()
     (folder / "mine.png").write_bytes(b"mine")

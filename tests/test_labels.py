@@ -1,4 +1,4 @@
-"""Labels against boxes worked out by hand, OpenCV, and the renderer's masks; data sets as trainers read them."""
+"""Labels against boxes computed by hand, OpenCV, and the renderer's masks; data sets as trainers read them."""
 
 import json
 import math
@@ -35,7 +35,7 @@ SIZE_M = (0.6, 0.4, 0.3)
 
 
 def truth_of(position_m, orientation_wxyz=None):
-    """A reference from (frames, drones, 3) and (frames, drones, 4)."""
+    """A reference from positions (frames, drones, 3) and orientations (frames, drones, 4)."""
     position_m = np.asarray(position_m, np.float64)
     frame = np.arange(len(position_m))
     names = tuple(f"dron{number + 1}" for number in range(position_m.shape[1]))
@@ -57,11 +57,12 @@ def iou(one, other):
     return width * height / (sum(areas) - width * height)
 
 
-# --- boxes in one image, worked out by hand
+# --- boxes in one image, computed by hand
 
 
 def test_a_cube_in_the_middle():
-    # Edges, not pixel centres: the middle of 100 pixels is 50. A metre nearer of 1000 is 0.01 px in 10.
+    # Edges, not pixel centres: the middle of 100 pixels is 50. The front side is nearer by 1 m of 1000 m, which adds
+    # 0.01 px to 10 px.
     np.testing.assert_allclose(labelled((0.0, 0.0, 0.0)), [[40, 30, 60, 50]], atol=0.011)
     tall = LabelSettings(drone_size_m=(1.0, 2.0, 4.0), offset_m=(0.5, 7.0, -1.0))
     np.testing.assert_allclose(labelled((0.0, 0.0, 0.0), settings=tall), [[50, 30, 60, 70]], atol=0.25)
@@ -74,7 +75,7 @@ def test_the_box_turns_with_the_body_and_so_does_its_offset():
     np.testing.assert_allclose(
         labelled((0.0, 0.0, 0.0), orientation_wxyz=turned), [[50 - wide, 30, 50 + wide, 50]], atol=0.03
     )
-    # A quarter turn about z makes ahead (x) of what was towards the camera's back (y): not seen from here.
+    # A quarter turn about z turns the body's x axis onto the line of sight: the offset along x is not visible.
     quarter = [(math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))]
     ahead = LabelSettings(drone_size_m=(2.0, 2.0, 2.0), offset_m=(1.0, 0.0, 0.5))
     np.testing.assert_allclose(
@@ -84,7 +85,7 @@ def test_the_box_turns_with_the_body_and_so_does_its_offset():
 
 
 def test_orientations_that_are_missing():
-    """A drone that never has one has a level box; one that has gaps is not known in them."""
+    """A drone without any orientation has a level box; a drone with gaps has no box in the gaps."""
     truth = truth_of(np.zeros((2, 2, 3)), np.full((2, 2, 4), np.nan))
     truth.orientation_wxyz[0, 1] = (1, 0, 0, 0)
     corners_m = box_corners(truth, np.ones(3), np.zeros(3))
@@ -102,18 +103,18 @@ def test_a_size_and_an_offset_for_each_drone():
 
 @pytest.mark.parametrize(("min_inside", "expected"), [(0.7, [85, 30, 100, 50]), (0.8, [np.nan] * 4)])
 def test_cut_at_the_border(min_inside, expected):
-    """From 85 to 105 in an image of 100: three quarters are in it."""
+    """The box reaches from 85 to 105 in an image of 100 pixels: three quarters are inside."""
     settings = replace(CUBE, min_inside=min_inside)
     np.testing.assert_allclose(labelled((4.5, 0.0, 0.0), settings=settings), [expected], atol=0.06)
 
 
-def test_outside_is_nothing_even_where_no_share_is_asked_for():
+def test_a_box_outside_the_image_has_no_label_even_with_min_inside_0():
     settings = replace(CUBE, min_inside=0.0)
     assert np.isnan(labelled((7.0, 0, 0), (0, 0, -6.0), settings=settings)).all()
 
 
-def test_behind_the_camera_is_nothing():
-    """Behind it, about it, and with one corner beside it."""
+def test_a_drone_behind_the_camera_has_no_label():
+    """Behind the camera, around the camera, and with one corner behind the camera."""
     settings = replace(CUBE, min_inside=0.0)
     assert np.isnan(labelled((0, -2000.0, 0), (0, -1000.0, 0), (0, -999.5, 0), settings=settings)).all()
 
@@ -122,14 +123,14 @@ def test_behind_the_camera_is_nothing():
     ("max_hidden", "hidden"), [(0.74, True), (0.76, False)], ids=["more than allowed", "allowed"]
 )
 def test_a_nearer_drone_hides_a_farther_one(max_hidden, hidden):
-    """Half a metre of two to the side: three quarters are covered."""
+    """The nearer drone is shifted by half a metre of two metres: three quarters are covered."""
     settings = replace(CUBE, max_hidden=max_hidden)
     far, near = labelled((0.0, 5.0, 0.0), (0.5, 0.0, 0.0), settings=settings)
     assert np.isnan(far).all() == hidden
     np.testing.assert_allclose(near, [45, 30, 65, 50], atol=0.03)
 
 
-def test_who_is_not_there_hides_nobody():
+def test_a_drone_without_pose_hides_no_other():
     for nobody in [(0.0, -1500.0, 0.0), (math.nan, math.nan, math.nan)]:
         assert np.isfinite(labelled((0.0, 0.0, 0.0), nobody, settings=replace(CUBE, max_hidden=0.0))[0]).all()
 
@@ -162,8 +163,8 @@ def test_corners_are_where_opencv_projects_them(coefficients):
             np.testing.assert_allclose(found[f, 0, c], expected, atol=1e-9)
 
 
-def test_a_lens_does_not_bring_in_what_is_far_outside():
-    """Its polynomial turns back: 65 degrees off the axis it projects to where 28 degrees are."""
+def test_points_far_outside_are_not_mapped_into_the_image():
+    """The lens polynomial decreases far from the axis: it maps 65 degrees to the radius of 28 degrees."""
     R, t_m = look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
     K = np.array([[1158.0, 0, 962], [0, 1158, 541], [0, 0, 1]])
     bent = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1924, 1082), dist=(-0.17, 0.0, 0.0, 0.0))
@@ -174,7 +175,7 @@ def test_a_lens_does_not_bring_in_what_is_far_outside():
     small = LabelSettings(drone_size_m=(0.3, 0.3, 0.2))
     cameras = rig_of(bent).cameras
     assert np.isnan(labelled(aside, cameras=cameras, settings=small)).all()
-    # In the image's corner there is a label.
+    # A drone in the corner of the image has a label.
     corner = np.array([1.0, -0.8, 0.4]) * 4
     assert np.isfinite(labelled(tuple(corner), cameras=cameras, settings=small)).all()
 
@@ -208,7 +209,7 @@ def test_labels_are_in_the_image_and_in_any_order(seed):
         ({"max_hidden": math.nan}, "max_hidden: expected a share, 0 to 1, found nan"),
     ],
 )
-def test_settings_that_make_no_sense(change, message):
+def test_invalid_settings(change, message):
     with pytest.raises(SettingsError, match=message):
         replace(CUBE, **change)
 
@@ -218,7 +219,7 @@ def test_settings_that_make_no_sense(change, message):
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """Two sequences in which every drone is a box: its label is where the renderer's mask ends."""
+    """Two sequences in which every drone is a box, so that labels are the bounds of the renderer's masks."""
     root = tmp_path_factory.mktemp("data")
     trimesh.creation.box(SIZE_M).export(root / "box.ply", encoding="ascii")
     for name, num_frames in (("S01_D2_A", 4), ("S12_D3", 3)):
@@ -233,7 +234,7 @@ def data(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def made(data, tmp_path_factory):
-    """The data set of both, made by the command in two processes."""
+    """The data set of both sequences, written by the command in two processes."""
     out = tmp_path_factory.mktemp("yolo") / "set"
     answer = run(data / "S01_D2_A", data / "S12_D3", "--out", out, "--jobs", 2, "--json", "-")
     assert answer.exit_code == 0
@@ -267,18 +268,18 @@ def test_labels_are_the_boxes_of_the_masks(data):
                     assert np.isfinite(box).all() == bool(len(rows))
                     if len(rows):
                         mask = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], float)
-                        # A pixel is in the mask where its middle is in the box: it may end half a pixel beyond.
+                        # A pixel is in the mask if its middle is in the box, so that it may end half a pixel outside.
                         assert (mask[:2] >= box[:2] - 0.5).all()
                         assert (mask[2:] <= box[2:] + 0.5).all()
                         overlaps.append(iou(box, mask))
-    # Half a pixel at each side of 20 to 60. Drones hide each other in none of these frames.
+    # Half a pixel at each side of 20 to 60 pixels. In these frames no drone hides another.
     assert len(overlaps) == 3 * 2 * 8
     assert min(overlaps) > 0.85
     assert np.median(overlaps) > 0.92
 
 
 def loaded(out):
-    """The data set as the trainers read it: (part, image's path) -> rows of its labels.
+    """The data set as trainers read it: rows of labels by part and path of the image.
 
     They take the paths of images from `data.yaml`, read by PyYAML's `safe_load`, and replace the last /images/ by
     /labels/ and the suffix by .txt; rows have five numbers, none beyond 1, and are there once.
@@ -323,10 +324,10 @@ def test_a_trainer_loads_it(data, made):
                     expected = expected[np.isfinite(expected).all(axis=-1)]
                     middle, size = found[part, image][:, 1:3], found[part, image][:, 3:]
                     corners = np.hstack([middle - size / 2, middle + size / 2]) * [480, 270, 480, 270]
-                    # Six decimals of 480 pixels.
+                    # Six decimals of a share of 480 pixels.
                     np.testing.assert_allclose(corners, expected, atol=5e-4)
                     stored = cv2.imread(str(image))
-                    # Of quality 95. Another frame of these differs by more, where the drones are.
+                    # The error of JPEG at quality 95. Another frame differs by more at the drones.
                     assert np.abs(stored.astype(int) - shown).mean() < 2.0
 
 
@@ -339,7 +340,7 @@ def test_every_other_frame(data, tmp_path):
 
 
 def test_an_image_without_drones_has_an_empty_file(data, tmp_path):
-    """With an offset of a kilometre nobody is in any image."""
+    """With an offset of a kilometre no drone is in any image."""
     run(
         data / "S01_D2_A",
         data / "S12_D3",
@@ -350,7 +351,7 @@ def test_an_image_without_drones_has_an_empty_file(data, tmp_path):
     assert not any(map(len, found.values()))
 
 
-def test_which_sequences_are_validated_on(data, tmp_path):
+def test_the_sequences_for_validation(data, tmp_path):
     run(
         data / "S01_D2_A",
         data / "S12_D3",
@@ -360,7 +361,7 @@ def test_which_sequences_are_validated_on(data, tmp_path):
     assert parts == {("val", "S01"), ("train", "S12")}
 
 
-def test_what_cannot_be_split(data, tmp_path):
+def test_sequences_that_cannot_be_split(data, tmp_path):
     one, other, out = data / "S01_D2_A", data / "S12_D3", tmp_path / "set"
     assert "sequences: expected at least two" in refused(SettingsError, one, "--out", out)
     assert "one sequence for training" in refused(
@@ -374,7 +375,7 @@ def test_what_cannot_be_split(data, tmp_path):
     assert not out.exists()
 
 
-def test_nothing_is_replaced_unasked_and_nothing_but_a_data_set_at_all(data, made, tmp_path):
+def test_only_a_data_set_is_replaced_and_only_with_force(data, made, tmp_path):
     both = (data / "S01_D2_A", data / "S12_D3")
     out, _ = made
     assert "--force" in refused(OutputError, *both, "--out", out)

@@ -1,4 +1,4 @@
-"""Motion capture: C3D files, markers that come and go, and the rates of recordings and videos."""
+"""Motion capture: C3D files, markers that appear and disappear, and the rates of recordings and videos."""
 
 import re
 import subprocess
@@ -21,7 +21,7 @@ WHERE = Path("R01_D2.c3d")
 
 
 def recording(num_frames=41, drones=("Dron2", "Dron10"), rate_hz=100.0) -> tuple[Markers, np.ndarray]:
-    """Markers of drones on curves, and the centroids, (frames, drones, 3)."""
+    """Markers of drones on curved paths, and the centroids of their markers, (frames, drones, 3)."""
     t = np.arange(num_frames)[:, None] / rate_hz
     paths = [np.hstack([i + np.sin(t + i), np.cos(2 * t), 1 + 0.3 * t]) for i in range(len(drones))]
     position_m = np.concatenate([path[:, None] + CROSS_M for path in paths], axis=1)
@@ -29,7 +29,7 @@ def recording(num_frames=41, drones=("Dron2", "Dron10"), rate_hz=100.0) -> tuple
     return Markers(labels, position_m, rate_hz), np.stack(paths, axis=1) + CROSS_M.mean(axis=0)
 
 
-def test_round_trip_with_ezc3d_as_witness(tmp_path):
+def test_round_trip_checked_by_ezc3d(tmp_path):
     markers, _ = recording()
     markers.position_m[3, 1] = np.nan
     write_c3d(tmp_path / "a.c3d", markers)
@@ -45,7 +45,7 @@ def test_round_trip_with_ezc3d_as_witness(tmp_path):
 
 
 def rewrite(path: Path, **parameters) -> Path:
-    """A C3D file as another program may have written it."""
+    """Write a C3D file as other programs write it."""
     content = ezc3d.c3d(str(path))
     residuals = content["data"]["meta_points"]["residuals"]
     for name, value in parameters.items():
@@ -83,7 +83,7 @@ def test_an_unknown_unit(tmp_path):
 
 
 def test_more_markers_than_one_parameter_holds(tmp_path):
-    """Its length is a byte: the labels from the 256th are in LABELS2. Reflections that nobody named are many."""
+    """A parameter holds 255 labels; further labels are in LABELS2. Recordings have many unlabelled reflections."""
     labels = (*recording()[0].labels, *(f"*{number}" for number in range(300)))
     markers = Markers(labels, np.random.default_rng(0).uniform(1, 2, (5, len(labels), 3)), 100.0)
     write_c3d(tmp_path / "a.c3d", markers)
@@ -93,7 +93,7 @@ def test_more_markers_than_one_parameter_holds(tmp_path):
 @pytest.mark.parametrize(
     ("content", "found"), [(None, "no such file"), (b"", "empty"), (b"hello " * 400, "valid c3d")]
 )
-def test_no_c3d(tmp_path, content, found):
+def test_a_file_that_is_not_c3d(tmp_path, content, found):
     if content is not None:
         (tmp_path / "a.c3d").write_bytes(content)
     with pytest.raises(InputError, match=rf"a\.c3d: expected a C3D file, found .*{found}"):
@@ -102,7 +102,7 @@ def test_no_c3d(tmp_path, content, found):
 
 @pytest.mark.parametrize("part", [0.01, 0.5, 0.9])
 def test_a_truncated_file(tmp_path, part):
-    """ezc3d reads what is there, and says nothing."""
+    """ezc3d reads a truncated file without an error."""
     path = tmp_path / "a.c3d"
     write_c3d(path, recording(num_frames=400)[0])
     content = path.read_bytes()
@@ -111,8 +111,8 @@ def test_a_truncated_file(tmp_path, part):
         read_c3d(path)
 
 
-def test_as_many_frames_as_the_header_can_count(tmp_path):
-    """Its two bytes end at 65,535, 11 minutes at 100 Hz; ezc3d drops the rest and says nothing."""
+def test_the_largest_number_of_frames_in_the_header(tmp_path):
+    """16 bits end at 65,535, which is 11 minutes at 100 Hz; ezc3d drops further frames without an error."""
     markers = Markers(("Dron1:1",), np.ones((65_535, 1, 3)), 100.0)
     write_c3d(tmp_path / "a.c3d", markers)
     assert len(read_c3d(tmp_path / "a.c3d").position_m) == 65_535
@@ -125,7 +125,7 @@ def test_video_frames_are_every_fourth():
     markers, centroid_m = recording()
     truth = body_trajectories(markers, fps=25.0, num_frames=9, where=WHERE)
     assert truth.drones == ("dron2", "dron10")  # by number, though `dron10` sorts first as text
-    # The sums of 5 doubles, in two orders.
+    # Sums of 5 doubles in two orders.
     np.testing.assert_allclose(truth.position_m, centroid_m[0:36:4], rtol=0, atol=1e-12)
     np.testing.assert_allclose(truth.time_s, np.arange(9) / 25)
 
@@ -136,26 +136,26 @@ def test_a_shorter_recording_leaves_nan():
     assert truth.seen[:, 0].tolist() == [True] * 5 + [False] * 4
 
 
-def test_a_marker_unseen_does_not_move_the_position():
-    """The centroid of the others would lie centimetres off."""
+def test_an_unseen_marker_does_not_move_the_position():
+    """The centroid of the seen markers would be centimetres off."""
     markers, centroid_m = recording()
     markers.position_m[5:20, 6] = np.nan
     truth = body_trajectories(markers, fps=25.0, num_frames=9, where=WHERE)
-    # Fits in double precision.
+    # Rounding of fits in double precision.
     np.testing.assert_allclose(truth.position_m, centroid_m[0:36:4], rtol=0, atol=1e-9)
     assert (truth.status == Status.TRACKED).all()
 
 
 def test_the_cross_turns_with_its_body():
-    """The drones of `recording` do not turn: neither do their crosses, and all frames are upright alike."""
+    """The drones of `recording` do not turn, so that the orientations of their crosses are constant and upright."""
     truth = body_trajectories(recording()[0], fps=25.0, num_frames=9, where=WHERE)
     turn = Rotation.from_quat(truth.orientation_wxyz.reshape(-1, 4), scalar_first=True)
-    # The cosine of an angle of 1e-8 is 1 in double precision.
+    # An angle of 1e-8 has the cosine 1 in double precision.
     assert (turn[0].inv() * turn).magnitude().max() < 1e-7
 
 
 def test_gaps_are_bridged_and_flagged_or_stay():
-    """Of dron2, 0.3 s are missing, and of dron10, 0.6 s: two of its five markers are no pose."""
+    """dron2 has a gap of 0.3 s; dron10 has a gap of 0.6 s, because two of its five markers determine no pose."""
     markers, centroid_m = recording(num_frames=141)
     markers.position_m[40:70, :5] = np.nan
     markers.position_m[40:100, 5:8] = np.nan
@@ -166,11 +166,12 @@ def test_gaps_are_bridged_and_flagged_or_stay():
     assert np.isnan(truth.orientation_wxyz[10:25, 1]).all()
     assert (truth.status[10:25, 1] == Status.LOST).all()
     assert (truth.status == Status.TRACKED).sum() == 2 * 36 - 8 - 15
-    # T^4 / 384 of 16 m/s^4, and T / 8 of a slope that is 0.01 s^2 / 10 of 8 m/s^3 off: 0.6 mm.
+    # A cubic has the error T^4 / 384 times 16 m/s^4, and T / 8 times the error of its slopes, 0.01 s^2 / 10 times
+    # 8 m/s^3: 0.6 mm in total.
     np.testing.assert_allclose(truth.position_m[:, 0], centroid_m[::4, 0], rtol=0, atol=1e-3)
 
 
-def test_swapped_labels_and_lost_ones():
+def test_swapped_and_lost_labels():
     markers, centroid_m = recording()
     lost = Markers((*markers.labels, "*3", "Dron10:*4"), np.full((41, 12, 3), np.nan), 100.0)
     lost.position_m[:, :10] = markers.position_m
@@ -183,7 +184,7 @@ def test_swapped_labels_and_lost_ones():
     assert (truth.status == Status.TRACKED).all()
 
 
-def test_a_drone_whose_markers_never_meet_is_none(caplog):
+def test_a_drone_whose_markers_are_never_seen_together_is_lost(caplog):
     markers, centroid_m = recording()
     markers.position_m[:20, 0] = np.nan
     markers.position_m[20:, 1:5] = np.nan
@@ -231,12 +232,12 @@ def test_any_rate(rate_hz, fps):
     truth = body_trajectories(markers, fps=fps, num_frames=20, where=WHERE)
     t = np.arange(20)[:, None] / fps
     path = np.hstack([np.sin(t), np.cos(2 * t), 1 + 0.3 * t]) + CROSS_M.mean(axis=0)
-    # dt^2 / 8 of 4 m/s^2 at 25 Hz is 0.8 mm; the rates' own rounding is 0.1 % at most, here none.
+    # The interpolation error is dt^2 / 8 times 4 m/s^2, at 25 Hz 0.8 mm; these rates have no rounding.
     np.testing.assert_allclose(truth.position_m[:, 0], path, rtol=0, atol=1e-3 * (25 / rate_hz) ** 2 + 1e-9)
 
 
 def test_rates_that_were_rounded_stay_in_step():
-    """A video of 25.001 per second, as a container rounds it, is a frame ahead in 17 minutes; every fourth it stays."""
+    """A rate of 25.001 Hz would be a frame ahead after 17 minutes; as every fourth frame it stays in step."""
     markers, centroid_m = recording(num_frames=400)
     truth = body_trajectories(markers, fps=25.001, num_frames=100, where=WHERE)
     np.testing.assert_allclose(truth.position_m, centroid_m[::4], rtol=0, atol=1e-9)
@@ -249,7 +250,7 @@ def test_a_recording_that_began_at_another_time(offset_s, first):
     assert np.flatnonzero(truth.seen[:, 0])[0] == first
     t = np.arange(first, 9)[:, None] / 25 + offset_s
     path = np.hstack([np.sin(t), np.cos(2 * t), 1 + 0.3 * t]) + CROSS_M.mean(axis=0)
-    # Offsets of 20 and 10 frames, and of 8: no interpolation.
+    # Offsets of whole frames: no interpolation.
     np.testing.assert_allclose(truth.position_m[first:, 0], path, rtol=0, atol=1e-9)
 
 
@@ -274,7 +275,7 @@ def test_a_folder_that_cannot_be_written(tmp_path):
 
 
 def test_a_full_disk_is_an_error(tmp_path):
-    """A file size limit stands for the full disk; ezc3d says nothing of either."""
+    """A limit of the file size simulates the full disk; ezc3d reports no error in either case."""
     script = textwrap.dedent(
         """
         import resource, sys

@@ -1,4 +1,4 @@
-"""`Sequence.usable`: what fits passes, what does not is named with the way out."""
+"""`Sequence.usable`: consistent videos pass; errors name an inconsistent video and a remedy."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +19,7 @@ def a_camera(size_wh=(1920, 1080)):
 
 
 def a_sequence(**changes) -> Sequence:
-    """Five like cameras; `changes` are to the video of one of them, or None for no video."""
+    """Five equal cameras; `changes` change the video of a camera, None removes it."""
     videos = {name: VideoInfo(Path(f"{name}.avi"), 250, 25.0, (1920, 1080)) for name in NAMES}
     for name, change in changes.items():
         if change is None:
@@ -30,7 +30,7 @@ def a_sequence(**changes) -> Sequence:
     return Sequence(name="S01", folder=Path("S01"), rig=rig, videos=videos)
 
 
-def test_what_fits_is_kept():
+def test_consistent_videos_are_kept():
     sequence = a_sequence().usable()
     assert sequence.rig.names == tuple(sequence.videos) == NAMES
     assert (sequence.num_frames, sequence.fps) == (250, 25.0)
@@ -72,14 +72,14 @@ def test_no_videos():
         ({"image_size_wh": (1280, 720)}, "1920 x 1080 pixels as calibrated, found 1280 x 720"),
     ],
 )
-def test_the_odd_one_is_blamed(odd, change, expected):
+def test_the_error_names_the_differing_video(odd, change, expected):
     with pytest.raises(InputError, match=rf"^{odd}\.avi: expected {expected}"):
         a_sequence(**{odd: change}).usable()
     rest = [name for name in NAMES if name != odd]
     assert a_sequence(**{odd: change}).usable(rest).rig.names == tuple(rest)
 
 
-def test_sizes_differ_though_each_is_as_calibrated():
+def test_different_sizes_are_refused_even_if_calibrated():
     sequence = a_sequence(c={"image_size_wh": (1280, 720)})
     sequence.rig.cameras.image_size_wh[2] = (1280, 720)
     with pytest.raises(
@@ -88,7 +88,7 @@ def test_sizes_differ_though_each_is_as_calibrated():
         sequence.usable()
 
 
-def test_rates_that_differ_by_rounding_are_one():
+def test_rates_that_differ_by_rounding_are_equal():
     assert a_sequence(c={"fps": 25.00004}).usable().num_frames == 250
 
 
@@ -98,6 +98,6 @@ def test_leading_frames():
 
 
 @pytest.mark.parametrize("num_frames", [0, -1, 241])
-def test_frames_that_are_not_there(num_frames):
+def test_more_frames_than_exist_are_refused(num_frames):
     with pytest.raises(SettingsError, match=f"frames: expected 1 to 240, .* found {num_frames}"):
         a_sequence(c={"num_frames": 240}).usable(num_frames=num_frames)

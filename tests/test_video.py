@@ -1,4 +1,4 @@
-"""Videos: exact counts and rates, broken files, and a writer that never leaves half a file."""
+"""Videos: exact numbers of frames and rates, broken files, and a writer that never leaves an incomplete file."""
 
 import os
 import re
@@ -24,7 +24,7 @@ def grey(level: int) -> np.ndarray:
 
 
 def noise(num_frames: int) -> np.ndarray:
-    """Frames that compress badly, so that a cut file loses many of them."""
+    """Frames that compress badly, so that a truncated file loses many frames."""
     return np.random.default_rng(0).integers(0, 255, (num_frames, HEIGHT, WIDTH, 3), dtype=np.uint8)
 
 
@@ -63,7 +63,7 @@ def test_a_step_reads_every_nth_frame(tmp_path, step):
     np.testing.assert_array_equal(some, every[::step])
 
 
-def test_leading_frames_alone(tmp_path):
+def test_leading_frames_only(tmp_path):
     video = probe(write(tmp_path / "a.avi", noise(11)))
     assert len(list(read_frames(replace(video, num_frames=4)))) == 4
 
@@ -87,7 +87,7 @@ def test_mp4_with_29_97_by_another_writer(tmp_path):
 
 
 def test_a_name_that_looks_like_a_protocol(tmp_path, monkeypatch):
-    """FFmpeg would take `cam:` for a protocol."""
+    """FFmpeg would read `cam:` as a protocol."""
     write(tmp_path / "cam:1 %02d.avi", noise(3))
     monkeypatch.chdir(tmp_path)
     assert probe(Path("cam:1 %02d.avi")).num_frames == 3
@@ -107,15 +107,15 @@ def test_a_truncated_video_names_file_and_frame(tmp_path, part, capfd):
     assert message.startswith(f"{path}: expected 40 frames, found that only {reached} can be decoded")
     assert 0 < reached < 40
     assert f"--frames {reached}" in message
-    # With a step, the same frame is named.
+    # With a step, the error names the same frame.
     with pytest.raises(InputError, match=f"only {reached} can be decoded"):
         list(read_frames(video, 7))
-    # Its good frames can be used.
+    # The frames before the broken frame can be used.
     assert len(list(read_frames(replace(video, num_frames=reached)))) == reached
     assert capfd.readouterr().err == ""
 
 
-def test_a_hole_in_a_video_is_found(tmp_path, capfd):
+def test_a_damaged_frame_is_found(tmp_path, capfd):
     path = write(tmp_path / "cam1i_s.avi", noise(40))
     content = bytearray(path.read_bytes())
     middle = len(content) // 2
@@ -160,7 +160,7 @@ def test_a_video_without_frames(tmp_path):
         probe(path)
 
 
-def test_opening_leaves_the_process_as_it_was(tmp_path, monkeypatch):
+def test_opening_restores_log_levels(tmp_path, monkeypatch):
     path = write(tmp_path / "a.avi", noise(1))
     level, environment = cv2.utils.logging.getLogLevel(), dict(os.environ)
     probe(path)
@@ -170,7 +170,7 @@ def test_opening_leaves_the_process_as_it_was(tmp_path, monkeypatch):
     assert os.environ["OPENCV_FFMPEG_LOGLEVEL"] == "16"
 
 
-def test_writer_makes_the_folder_and_replaces_only_when_whole(tmp_path):
+def test_writer_makes_the_folder_and_replaces_only_when_complete(tmp_path):
     path = write(tmp_path / "new" / "a.avi", noise(3))
     before = path.read_bytes()
 
@@ -206,7 +206,7 @@ def test_settings_that_cannot_be_written(tmp_path, name, fps, size_wh, where):
 
 
 def test_a_frame_of_another_size_is_refused(tmp_path):
-    """OpenCV drops such a frame without a word."""
+    """OpenCV drops such a frame without an error."""
     path = tmp_path / "a.avi"
     with (
         pytest.raises(SettingsError, match=r"frame: expected shape \(64, 96, 3\)"),
@@ -216,14 +216,14 @@ def test_a_frame_of_another_size_is_refused(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_writing_where_a_file_stands_for_a_folder(tmp_path):
+def test_a_file_in_place_of_the_folder(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(PsotrackError, match=r"a\.avi: expected a path that can be written"):
         write(tmp_path / "file" / "a.avi", noise(1))
 
 
-def test_a_full_disk_is_an_error_and_costs_nothing(tmp_path):
-    """A file size limit stands for the full disk: FFmpeg's writes fail in the same silence."""
+def test_a_full_disk_is_an_error_and_keeps_the_old_file(tmp_path):
+    """A limit of the file size simulates the full disk: FFmpeg reports no error in either case."""
     path = write(tmp_path / "a.avi", noise(2))
     before = path.read_bytes()
     script = textwrap.dedent(
@@ -252,8 +252,8 @@ def test_a_full_disk_is_an_error_and_costs_nothing(tmp_path):
 
 
 @pytest.mark.parametrize("missing", [1, 100, 200])
-def test_an_index_that_is_cut_off_is_noticed(tmp_path, missing):
-    """All frames are there then, and can be counted; the index comes last. Measured: 200 frames take 3200 bytes."""
+def test_an_incomplete_index_is_found(tmp_path, missing):
+    """All frames exist and can be counted, but the index at the end of the file (3200 bytes measured) is incomplete."""
     whole = write(tmp_path / "whole.avi", [grey(level) for level in range(200)]).stat().st_size
     script = textwrap.dedent(
         """
@@ -285,7 +285,7 @@ def test_an_index_that_is_cut_off_is_noticed(tmp_path, missing):
 
 
 def key_frames(path: Path) -> list[bool]:
-    """Which frames a player may start at, as the index of the container (chunk `idx1`) has them."""
+    """Key frames, at which a player may start, from the index of the container (chunk `idx1`)."""
     data = path.read_bytes()
     start = data.rfind(b"idx1")
     entries = np.frombuffer(
@@ -295,7 +295,7 @@ def key_frames(path: Path) -> list[bool]:
 
 
 def moving(num_frames: int, start: int = 0) -> list[np.ndarray]:
-    """Frames of a picture that moves: nothing of one is the same in the next."""
+    """Frames of a moving picture in which no two frames are equal."""
     large = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (64, 400, 3), np.uint8), (0, 0), 2)
     return [large[:, k : k + WIDTH].copy() for k in range(start, start + num_frames)]
 
@@ -312,7 +312,7 @@ def test_a_joined_video_decodes_as_its_parts_do(tmp_path, lengths, capfd):
     assert joined == replace(probe(parts[0]), path=joined.path, num_frames=sum(lengths))
     expected = [frame for part in parts for frame in read_frames(probe(part))]
     np.testing.assert_array_equal(list(read_frames(joined)), expected)
-    # Where a player may start is where the encoder said so.
+    # The key frames are those of the encoder.
     assert key_frames(joined.path) == [key for part in parts for key in key_frames(part)]
     capture = cv2.VideoCapture(str(joined.path), cv2.CAP_FFMPEG)
     for frame in np.random.default_rng(0).permutation(sum(lengths))[:8].tolist():
@@ -346,7 +346,7 @@ def test_a_part_that_ends_early_is_named(tmp_path):
     assert sorted(tmp_path.iterdir()) == parts
 
 
-def test_a_disk_that_is_full_while_joining_costs_nothing(tmp_path):
+def test_a_full_disk_while_joining_keeps_the_old_file(tmp_path):
     parts = [write(tmp_path / f"{i}.avi", noise(20)) for i in range(2)]
     size = parts[0].stat().st_size
     script = textwrap.dedent(
