@@ -1,14 +1,45 @@
 """Error messages, files that are written completely or not at all, and progress bars."""
 
 import errno
+import functools
+import hashlib
 import os
 import pickle
 from pathlib import Path
 
+import numpy as np
 import pytest
+from helpers import ring_rig
 
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError, check_positive
-from psotrack.support import atomic_write, no_progress, progress_bar, refuse_to_overwrite
+from psotrack.geometry import (
+    read_camera_names,
+    read_lenses,
+    read_rig,
+    write_calibration,
+    write_rig,
+)
+from psotrack.recordings import (
+    Detections,
+    Markers,
+    VideoWriter,
+    join_videos,
+    probe,
+    read_c3d,
+    read_detections,
+    write_c3d,
+    write_detections,
+)
+from psotrack.support import (
+    atomic_write,
+    digest_file,
+    digest_record,
+    no_progress,
+    progress_bar,
+    refuse_to_overwrite,
+)
+from psotrack.trajectories import Trajectories, read_trajectories, write_trajectories
+from psotrack.trajectories.tum import read_tum, write_tum
 
 
 def test_a_message_has_four_parts():
@@ -184,3 +215,53 @@ def test_a_file_never_replaces_a_folder(tmp_path):
     ):
         temporary.write_text("a,b")
     assert [path.name for path in tmp_path.rglob("*")] == ["frames.csv", "mine.png"]
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "new"),
+    [
+        ("blake2b", hashlib.blake2b),
+        ("blake2b-160", functools.partial(hashlib.blake2b, digest_size=20)),
+        ("sha256", hashlib.sha256),
+    ],
+)
+def test_digest_of_a_file(tmp_path, algorithm, new):
+    path = tmp_path / "a"
+    path.write_bytes(bytes(range(256)) * 4096)
+    assert digest_file(path, algorithm=algorithm) == new(path.read_bytes()).hexdigest()
+    with pytest.raises(InputError, match=r"b: expected a readable video, found No such file"):
+        digest_file(tmp_path / "b", expected="a readable video")
+
+
+def test_digest_of_a_record_does_not_depend_on_the_order_of_its_keys():
+    assert digest_record({"a": 1, "b": [2.5]}) == digest_record({"b": [2.5], "a": 1})
+    assert digest_record({"a": 1}) != digest_record({"a": 2})
+    assert len(digest_record({})) == 40
+
+
+def test_paths_may_be_text(tmp_path):
+    """Every reader and writer of files takes `str` as well as `Path`; the annotations are checked at each call."""
+
+    def path(name):
+        return f"{tmp_path}/{name}"
+
+    rig = ring_rig(3)
+    write_rig(path("rig.toml"), rig)
+    assert read_rig(path("rig.toml")).names == read_lenses(path("rig.toml")).names == rig.names
+    rig.cameras.K[:, 1, 1], rig.cameras.K[:, 0, 1] = rig.cameras.K[:, 0, 0], 0.0
+    write_calibration(path("rig.csv"), rig)
+    assert read_camera_names(path("rig.csv")) == rig.names
+    write_detections(path("a.csv"), Detections(np.array([0]), np.array([[0.0, 0, 2, 2]]), np.array([0.5])))
+    assert len(read_detections(path("a.csv"))) == 1
+    flight = Trajectories(np.arange(2), np.arange(2) / 25, ("dron1",), np.ones((2, 1, 3)))
+    write_trajectories(path("tracks.csv"), flight)
+    assert read_trajectories(path("tracks.csv")).drones == flight.drones
+    assert write_tum(path("tum"), flight) == [tmp_path / "tum" / "dron1.tum"]
+    assert read_tum(path("tum"), fps=25.0).num_frames == 2
+    write_c3d(path("a.c3d"), Markers(("A",), np.ones((2, 1, 3)), 100.0))
+    assert read_c3d(path("a.c3d")).labels == ("A",)
+    with VideoWriter(path("a.avi"), 25.0, (64, 48)) as writer:
+        writer.write(np.zeros((48, 64, 3), np.uint8))
+    join_videos(path("b.avi"), [path("a.avi"), path("a.avi")])
+    assert probe(path("b.avi")).num_frames == 2
+    assert digest_file(path("a.avi")) != digest_file(path("b.avi"))
