@@ -408,5 +408,5 @@ def test_without_a_reference(data, tmp_path):
     with pytest.raises(InputError, match=r"S01_D2_A: expected a reference .*, found none"):
         write_data_set([replace(one, truth=None), other], tmp_path / "set", LabelSettings(SIZE_M), jobs=1)
     unknown = replace(one.truth, position_m=np.full_like(one.truth.position_m, np.nan))
-    with pytest.raises(InputError, match="found none of the 4"):
+    with pytest.raises(InputError, match="no such frame among the 4 used frames"):
         write_data_set([replace(one, truth=unknown), other], tmp_path / "set", LabelSettings(SIZE_M), jobs=1)

@@ -10,7 +10,7 @@ import numpy as np
 
 from psotrack.errors import InputError
 from psotrack.inside_out.frames.records import Frame, FrameSource
-from psotrack.recordings import quiet
+from psotrack.recordings import silence_opencv
 
 
 def open_stream(address: str, fps: float | None, live: bool) -> FrameSource:
@@ -24,7 +24,7 @@ def open_stream(address: str, fps: float | None, live: bool) -> FrameSource:
     Raises:
         InputError: the stream cannot be opened, or has no frames; or, when frames are read, sizes differ.
     """
-    with quiet():
+    with silence_opencv():
         capture = cv2.VideoCapture(int(address) if address.isdecimal() else address)
     there, first = capture.read() if capture.isOpened() else (False, None)
     if not there or first is None:
