@@ -374,7 +374,7 @@ def test_a_right_rig_is_written_as_it_was(tmp_path):
     tracks = flight(tmp_path / "SEQ", rig, rig)
     out = tmp_path / "same.toml"
     shown = run("adjust", tmp_path / "SEQ", "--tracks", tracks, "--refine-focal-length", "--out", out).stdout
-    assert "no camera is off by more than these detections can tell" in shown
+    assert "no camera is off by more than the uncertainty of these detections" in shown
     assert "the rig is written as it was" in shown
     assert "which may be chance" in shown
     given = read_sequence(tmp_path / "SEQ").rig

@@ -43,7 +43,7 @@ def test_files_are_fused_into_tracks_that_other_commands_read(files, tmp_path) -
     )
     assert done.exit_code == 0, done.output
     assert "dron1: track 0 and track 1" in done.output
-    assert "from frame 60: dron1 is track 1, no more 0" in done.output
+    assert "from frame 60: dron1 is track 1 instead of 0" in done.output
     fused = read_trajectories(out)
     assert fused.drones == ("dron1", "dron2")
     for drone, (truth_m, _) in enumerate(truths):
@@ -99,7 +99,7 @@ def test_options(files, tmp_path) -> None:
             SettingsError,
             "--out: expected a file that ends in .csv",
         ),
-        (["dron1.csv", "dron1.csv", "tracks.csv", "--out", "new.csv"], InputError, "a second one of dron1"),
+        (["dron1.csv", "dron1.csv", "tracks.csv", "--out", "new.csv"], InputError, "a second path of dron1"),
         (["tracks.csv", "tracks.csv", "--out", "new.csv"], InputError, "a camera's path with orientations"),
         (["dron1.csv", "none.csv", "--out", "new.csv"], InputError, "none.csv"),
         (["dron1.csv", "tracks.csv", "--out", "dron2.csv"], OutputError, "pass --force to replace it"),

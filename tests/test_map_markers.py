@@ -156,7 +156,7 @@ def test_a_sequence_provides_video_intrinsics_and_map(walk, tmp_path):
     message = invoke(
         folder, "--drone", "dron5", "--known", "7", "--out", tmp_path / "x.csv", expect=SettingsError
     )
-    assert "expected some of dron1, found dron5" in message
+    assert "expected names among dron1, found dron5" in message
 
 
 def test_a_wrong_map_is_reported_and_changes_the_exit_status(walk, tmp_path):
@@ -191,7 +191,7 @@ def test_measured_corners_in_another_order_are_reported(tmp_path):
     path = tmp_path / "points.csv"
     write_marker_corners(path, {**ROOM, 3: ROOM[3][[3, 2, 1, 0]]})
     printed = invoke(path, "--out", tmp_path / "corners.csv")
-    assert "marker 3: its corners were labelled in another order, and put right" in printed
+    assert "marker 3: its corners were labelled in another order; the order was corrected" in printed
     np.testing.assert_allclose(read_marker_corners(tmp_path / "corners.csv")[3], ROOM[3], atol=1e-12)
     write_marker_corners(path, bent(0.2, 0))
     message = invoke(path, "--out", tmp_path / "other.csv", expect=InputError)

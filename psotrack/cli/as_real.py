@@ -1,4 +1,4 @@
-"""`psotrack as-real`: a simulated sequence in the form of the dataset's real half."""
+"""`psotrack as-real`: convert a simulated sequence to the form of the dataset's real half."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from pathlib import Path
 
 import click
 
-from psotrack.cli.answers import answer, report_to, say
 from psotrack.cli.options import FORCE, JSON, QUIET, SEQUENCE
+from psotrack.cli.output import output_json, print_line, report_to
 
 
 @click.command("as-real")
 @SEQUENCE
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="The data's root folder.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Root folder of the data.")
 @click.option(
     "--offset",
     "offset_s",
@@ -22,10 +22,12 @@ from psotrack.cli.options import FORCE, JSON, QUIET, SEQUENCE
     help="Time in the C3D file at frame 0 of the videos, in seconds.",
 )
 @click.option(
-    "--rate", "rate_hz", type=float, default=100.0, show_default=True, help="Of the C3D file, in hertz."
+    "--rate", "rate_hz", type=float, default=100.0, show_default=True, help="Rate of the C3D file, in hertz."
 )
 @click.option("--three-videos", is_flag=True, help="Leave the last camera's video out, as in R17_D1_A.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the markers' noise and gaps.")
+@click.option(
+    "--seed", type=int, default=0, show_default=True, help="Seed of the noise and the gaps of the markers."
+)
 @FORCE
 @QUIET
 @JSON
@@ -43,7 +45,7 @@ def as_real(
     """Write the simulated sequence SEQ in the form of the dataset's real half.
 
     Writes OUT/Real_Data/RXX_Dn: four cameras with distortion, named by serial number, in millimetres; a C3D file of
-    marker crosses at another rate, that began at another moment, with gaps and swapped labels; detections.
+    marker crosses with another rate and another start time, with gaps and swapped labels; detections.
 
     \b
     Example:
@@ -62,5 +64,5 @@ def as_real(
         force=force,
         report=report_to(quiet),
     )
-    answer(json_path, {"sequence": str(folder)}, force)
-    say(quiet, json_path, f"{folder}")
+    output_json(json_path, {"sequence": str(folder)}, force)
+    print_line(quiet, json_path, f"{folder}")

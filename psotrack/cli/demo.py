@@ -1,4 +1,4 @@
-"""`psotrack demo`: all of it, once, without any data."""
+"""`psotrack demo`: simulate, track and evaluate once, without any data."""
 
 from __future__ import annotations
 
@@ -6,15 +6,19 @@ from pathlib import Path
 
 import click
 
-from psotrack.cli.answers import report_to
 from psotrack.cli.options import FORCE, JOBS, QUIET, compiled_folder
+from psotrack.cli.output import report_to
 
 
 @click.command()
 @click.option(
-    "--out", type=click.Path(path_type=Path), default=Path("psotrack-demo"), show_default=True, help="Folder."
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("psotrack-demo"),
+    show_default=True,
+    help="Folder of the results.",
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Of flights, noise and swarm.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Seed of flights, noise and swarm.")
 @JOBS
 @FORCE
 @QUIET

@@ -1,4 +1,4 @@
-"""`psotrack detect`: detections of a neural network in the videos of a sequence."""
+"""`psotrack detect`: detect drones in the videos of a sequence with a neural network."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from psotrack.cli.answers import answer, report_to, say
 from psotrack.cli.options import CAMERAS, DETECTOR_SIZE, FORCE, FRAMES, JSON, QUIET, SEQUENCE, usable_sequence
+from psotrack.cli.output import output_json, print_line, report_to
 
 
 @click.command()
@@ -18,23 +18,29 @@ from psotrack.cli.options import CAMERAS, DETECTOR_SIZE, FORCE, FRAMES, JSON, QU
     type=click.Path(path_type=Path),
     required=True,
     metavar="MODEL.onnx",
-    help="A YOLO network (v5 to v11), trained on drones.",
+    help="YOLO network (v5 to v11) that was trained on drones.",
 )
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the detections.")
-@click.option("--confidence", type=float, default=0.25, show_default=True, help="Least score that counts.")
+@click.option(
+    "--confidence",
+    type=float,
+    default=0.25,
+    show_default=True,
+    help="Smallest score of a detection that is kept.",
+)
 @click.option(
     "--nms",
     type=float,
     default=0.45,
     show_default=True,
-    help="Intersection over union above which two boxes are of one drone.",
+    help="Intersection over union above which two boxes are taken for one drone.",
 )
 @click.option(
     "--size",
     type=int,
     default=DETECTOR_SIZE,
     show_default=True,
-    help="Of the network's square input, in pixels.",
+    help="Side of the network's square input, in pixels.",
 )
 @CAMERAS
 @FRAMES
@@ -56,7 +62,7 @@ def detect(
 ) -> None:
     """Detect the drones of SEQ in each of its videos with a neural network, as 2D boxes.
 
-    Writes OUT/CAMERA.csv for every camera, in the layout of the dataset's own dl_data.
+    Writes OUT/CAMERA.csv for every camera, in the layout of the dataset's dl_data.
 
     \b
     Examples:
@@ -78,9 +84,9 @@ def detect(
         detections = detect_in(detector, name, video, report=report_to(quiet))
         write_detections(files[name], detections)
         counts[name] = len(detections)
-    answer(json_path, {"out": str(out), "frames": recording.num_frames, "detections": counts}, force)
+    output_json(json_path, {"out": str(out), "frames": recording.num_frames, "detections": counts}, force)
     per_frame = sum(counts.values()) / (len(counts) * recording.num_frames)
-    say(
+    print_line(
         quiet,
         json_path,
         f"{out}: {len(counts)} cameras, {recording.num_frames} frames, {per_frame:.2f} boxes per frame and camera",

@@ -1,4 +1,4 @@
-"""`psotrack doctor`: a sequence's rig checked against its own detections."""
+"""`psotrack doctor`: check a sequence's calibration against its detections."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from psotrack.cli.answers import answer, known, report_to, say
 from psotrack.cli.options import CACHE, FORCE, JOBS, JSON, QUIET, SEQUENCE, cache_folder
+from psotrack.cli.output import finite_or_none, output_json, print_line, report_to
 
 if TYPE_CHECKING:
     from psotrack.doctor import Diagnosis
     from psotrack.geometry import CameraRig
 
-#: Of the exit, where something was found.
+#: Exit code if something was found.
 FOUND = 2
 
 
@@ -27,7 +27,7 @@ FOUND = 2
     default="yolo",
     show_default=True,
     metavar="yolo|blobs|FOLDER",
-    help="Of dl_data, blobs of the foreground, or files in its layout.",
+    help="Detections in dl_data, blobs of the foreground, or a folder of files in the layout of dl_data.",
 )
 @CACHE
 @JOBS
@@ -45,12 +45,13 @@ def doctor(
 ) -> None:
     """Check the calibration of SEQ against the detections of its cameras, before tracking.
 
-    Says which camera, pair or file disagrees, by how much, and what to do: a camera that is turned or moved, late, of
-    another focal length, or exchanged with another; translations that are centres, millimetres that were read as
-    metres, mirrored axes; a reference of another clock, unit or place. Faults that move what a camera sees by less
-    than the noise of its detections are not found. It takes four viewpoints to tell which camera it is.
+    Reports which camera, pair of cameras or file disagrees, by how much, and what to do. It finds a camera that is
+    turned, moved or late, has another focal length, or is exchanged with another camera; translations that are centres;
+    millimetres that were read as metres; mirrored axes; a reference with another clock, unit or origin. Faults that
+    move the drones in the image by less than the noise of the detections are not found. At least four viewpoints are
+    needed to name the faulty camera.
 
-    The exit code is 0 if nothing was found, and 2 if something was.
+    The exit code is 0 if nothing was found, and 2 if something was found.
 
     \b
     Examples:
@@ -75,18 +76,18 @@ def doctor(
         boxes = {name: read_detections(path) for name, path in files.items()}
         sightings = from_detections(boxes, recording.rig, recording.num_frames)
     diagnosis = examine(recording.rig, sightings, fps=recording.fps, reference=recording.truth)
-    answer(json_path, _content(recording.rig, diagnosis), force)
+    output_json(json_path, _content(recording.rig, diagnosis), force)
     if not quiet and json_path != Path("-"):
         _print(recording.rig, diagnosis)
     for finding in diagnosis.findings:
-        say(False, json_path, str(finding))
+        print_line(False, json_path, str(finding))
     if diagnosis.findings:
         sys.exit(FOUND)
-    say(quiet, json_path, f"{recording.name}: nothing disagrees")
+    print_line(quiet, json_path, f"{recording.name}: nothing disagrees")
 
 
 def _rows(rig: CameraRig, diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """What was measured of each camera."""
+    """Measurements of each camera, one row per camera."""
     found = diagnosis.found
     rows = []
     for index, name in enumerate(rig.names):
@@ -99,22 +100,22 @@ def _rows(rig: CameraRig, diagnosis: Diagnosis) -> list[dict[str, Any]]:
                 "explained": float(found.share_of_camera[index]),
                 "residual_px": float(np.median(residual_px)) if len(residual_px) else None,
                 "residual_std": float(np.median(residual_px / noise_px)) if len(residual_px) else None,
-                "late_frames": known(diagnosis.offset_frames[index]),
-                "late_std_frames": known(diagnosis.offset_std_frames[index]),
+                "late_frames": finite_or_none(diagnosis.offset_frames[index]),
+                "late_std_frames": finite_or_none(diagnosis.offset_std_frames[index]),
             }
         )
     return rows
 
 
 def _content(rig: CameraRig, diagnosis: Diagnosis) -> dict[str, Any]:
-    """The diagnosis as JSON has it, with null where there is no number."""
+    """The diagnosis as JSON, with null for missing numbers."""
     fit = diagnosis.reference
     return {
         "findings": [{**vars(finding), "cameras": list(finding.cameras)} for finding in diagnosis.findings],
         "frames": diagnosis.found.num_frames,
         "explained": diagnosis.found.share,
         "cameras": _rows(rig, diagnosis),
-        "epipolar_px": [[known(value) for value in row] for row in diagnosis.epipolar_px],
+        "epipolar_px": [[finite_or_none(value) for value in row] for row in diagnosis.epipolar_px],
         "reference_m": None if fit is None else fit.before_m,
     }
 

@@ -1,4 +1,4 @@
-"""`psotrack evaluate`: tracks against the reference of their sequence."""
+"""`psotrack evaluate`: compare tracks with the reference of their sequence."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import click
 import numpy as np
 
-from psotrack.cli.answers import answer
-from psotrack.cli.options import FORCE, JSON, QUIET, SEQUENCE
+from psotrack.cli.options import FORCE, JSON, QUIET, SEQUENCE, TRACKS, plot_option
+from psotrack.cli.output import output_json
 from psotrack.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
@@ -19,20 +19,13 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("tracks", type=click.Path(path_type=Path))
+@TRACKS
 @SEQUENCE
-@click.option(
-    "--plot",
-    type=click.Path(path_type=Path),
-    is_flag=False,
-    flag_value="",
-    metavar="[PNG]",
-    help="Save 3D paths and error over time.  [default: beside TRACKS, as .png]",
-)
+@plot_option("3D paths and error over time", "beside TRACKS, as .png")
 @click.option(
     "--offset",
     metavar="SECONDS|auto",
-    help="The reference's clock is ahead of the videos' by so much; auto finds it, within 2 s.  [default: 0]",
+    help="Time by which the reference's clock is ahead of the videos'; auto estimates it, up to 2 s.  [default: 0]",
 )
 @FORCE
 @QUIET
@@ -70,7 +63,7 @@ def evaluate(
         truth, offset_s = _shifted_reference(recording, estimate, offset)
     evaluation = compare(estimate, truth)
     content = evaluation.to_dict() | ({"reference_offset_s": offset_s} if offset else {})
-    answer(json_path, content, force)
+    output_json(json_path, content, force)
     if plot is not None:
         picture = plot if plot.name else tracks.with_suffix(".png")
         plots.save_overview(picture, estimate, truth, force=force)
@@ -82,7 +75,7 @@ def evaluate(
 def _shifted_reference(
     recording: Sequence, estimate: Trajectories, offset: str
 ) -> tuple[Trajectories, float]:
-    """The reference of a sequence at the frames of its videos, and by how much its clock is ahead of theirs."""
+    """The reference at the frames of the videos, and the time by which the reference's clock is ahead, seconds."""
     from psotrack.clocks import find_offset, own_reference, shifted
 
     reference = own_reference(recording)

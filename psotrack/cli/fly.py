@@ -1,4 +1,4 @@
-"""`psotrack fly`: a flight by hand, recorded for scenarios."""
+"""`psotrack fly`: fly a simulated drone by hand and record the flight for scenarios."""
 
 from __future__ import annotations
 
@@ -12,13 +12,17 @@ from psotrack.support import refuse_to_overwrite
 
 @click.command()
 @click.option(
-    "--out", type=click.Path(path_type=Path), required=True, metavar="FILE.csv", help="The recording."
+    "--out",
+    type=click.Path(path_type=Path),
+    required=True,
+    metavar="FILE.csv",
+    help="CSV file of the recorded flight.",
 )
 @click.option(
     "--device",
     required=True,
     metavar="gamepad|keyboard|FILE.csv",
-    help="What to fly with; a file has the columns time_s,forward,left,up,turn, each from -1 to 1.",
+    help="Controller; a file has the columns time_s,forward,left,up,turn, the last four from -1 to 1.",
 )
 @click.option(
     "--rate",
@@ -28,21 +32,26 @@ from psotrack.support import refuse_to_overwrite
     show_default=True,
     help="Samples per second.",
 )
-@click.option("--hall", default="laboratory", show_default=True, help="Where; as in scenarios.")
+@click.option(
+    "--hall",
+    default="laboratory",
+    show_default=True,
+    help="Hall in which the drone flies; halls are named as in scenarios.",
+)
 @click.option(
     "--start",
     "start_m",
     type=Numbers(3),
     metavar="X,Y,Z",
     default=(0.0, 0.0, 1.0),
-    help="Where it hovers at first, in metres.  [default: 0,0,1]",
+    help="Position in which the drone hovers at first, in metres.  [default: 0,0,1]",
 )
 @click.option(
     "--max-seconds",
     type=click.FloatRange(1),
     default=300.0,
     show_default=True,
-    help="Longer flights end here.",
+    help="Longest duration of the flight, in seconds.",
 )
 @FORCE
 @QUIET
@@ -58,9 +67,9 @@ def fly(
 ) -> None:
     """Fly a simulated drone by hand and record the flight for a scenario.
 
-    Writes OUT, position and orientation over time, and beside it the same name with .sticks.csv: what the sticks did,
-    which --device flies again. Start, back or Esc ends the flight; so does Ctrl-C, and what was flown is kept.
-    Controllers and the keyboard need pip install 'psotrack[control]'.
+    Writes position and orientation over time to OUT, and the movements of the sticks to a file beside OUT that ends in
+    .sticks.csv. --device repeats a flight from such a file. The buttons start and back, the key Esc and Ctrl-C end the
+    flight; the flight until then is kept. Controllers and the keyboard need: pip install 'psotrack[control]'
 
     \b
     Examples:

@@ -1,4 +1,4 @@
-"""`psotrack fuse`: the paths of on-board cameras and the tracks of static cameras, as one."""
+"""`psotrack fuse`: fuse the paths of on-board cameras with the tracks of static cameras."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from psotrack.cli.answers import answer, check_outputs, say
 from psotrack.cli.options import FORCE, JSON, QUIET
+from psotrack.cli.output import check_outputs, output_json, print_line
 
 if TYPE_CHECKING:
     from psotrack.inside_out import CameraPath, DroneFusion, FusedDrone, FusedTracks, SourceErrors
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("inside", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.argument("outside", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="The fused tracks, a CSV file.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="CSV file of the fused tracks.")
 @click.option(
     "--at",
     "point",
     type=click.Choice(["camera", "middle"]),
     default="camera",
     show_default=True,
-    help="What fused tracks are of: the camera's centre, or the middle of the drone as static cameras see it.",
+    help="Tracked point of the fused tracks: the camera's centre, or the middle of the drone as static cameras see it.",
 )
 @click.option(
     "--max-offset",
     "max_offset_s",
     type=float,
     metavar="SECONDS",
-    help="Find by how much each camera's clock is ahead, from minus this to this.  [default: all clocks are one]",
+    help="Estimate the offset of each on-board camera's clock, up to this.  [default: no clock has an offset]",
 )
 @FORCE
 @QUIET
@@ -48,9 +48,10 @@ def fuse(
 ) -> None:
     """Fuse INSIDE, paths of on-board cameras, with OUTSIDE, tracks of the same drones from static cameras.
 
-    INSIDE are files of `psotrack localise`, one per drone; OUTSIDE is one of `psotrack track`, whose names of drones
-    may be any. Each counts as its covariance says; the scales, the arm from the camera to the middle of the drone, and
-    which track is whose are found. Drones that only one of them has are kept as they are.
+    INSIDE are files of `psotrack localise`, one per drone. OUTSIDE is a file of `psotrack track`; its drones may have
+    other names. Positions are weighted by their covariances. The command estimates the scales of the covariances and
+    the lever arm from the camera to the middle of the drone, and assigns the tracks to the drones. Drones that occur
+    in one input only are kept unchanged.
 
     \b
     Examples:
@@ -70,7 +71,7 @@ def fuse(
     for file in inside:
         path, name = read_camera_path(file)
         if name in paths:
-            raise InputError(file, expected="the path of another drone", found=f"a second one of {name}")
+            raise InputError(file, expected="the path of another drone", found=f"a second path of {name}")
         paths[name] = path
     tracks = read_trajectories(outside)
     if not any(path.seen.any() for path in paths.values()):
@@ -80,16 +81,16 @@ def fuse(
         raise InputError(outside, expected="a position in at least one frame", found="none")
     fused = fuse_paths(paths, tracks, point=point, max_offset_s=max_offset_s)
     write_fused(out, fused, force=force)
-    answer(json_path, _content(fused), force)
+    output_json(json_path, _content(fused), force)
     for drone in fused.drones:
-        say(quiet, json_path, _sentence(drone))
+        print_line(quiet, json_path, _sentence(drone))
     for exchange in fused.identity_swaps:
-        say(
+        print_line(
             quiet,
             json_path,
-            f"from frame {exchange.frame}: {exchange.drone} is track {exchange.after}, no more {exchange.before}",
+            f"from frame {exchange.frame}: {exchange.drone} is track {exchange.after} instead of {exchange.before}",
         )
-    say(
+    print_line(
         quiet,
         json_path,
         f"{out}: {fused.trajectories.num_drones} drones, {fused.trajectories.num_frames} frames{_doubt(fused)}",
@@ -97,10 +98,10 @@ def fuse(
 
 
 def _doubt(fused: FusedTracks) -> str:
-    """What to look at where nothing was fused."""
+    """Advice where nothing was fused; empty otherwise."""
     if any(drone.tracks for drone in fused.drones):
         return ""
-    return "; nothing was fused, as no path is near a track: are all of one recording, and of one clock?"
+    return "; nothing was fused, as no path is near a track: check that all files are from one recording with one clock"
 
 
 def _sentence(drone: FusedDrone) -> str:
@@ -126,7 +127,7 @@ def _sentence(drone: FusedDrone) -> str:
 
 
 def _content(fused: FusedTracks) -> dict[str, Any]:
-    """The report as JSON has it, with null where there is no number."""
+    """The report as JSON, with null for missing numbers."""
     return {
         "point": fused.point,
         "frames": fused.trajectories.num_frames,

@@ -1,4 +1,4 @@
-"""`psotrack info`: what a sequence holds."""
+"""`psotrack info`: show the contents of a sequence."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from psotrack.cli.answers import answer
 from psotrack.cli.options import FORCE, JSON, SEQUENCE
+from psotrack.cli.output import output_json
 
 
 @click.command()
@@ -27,6 +27,6 @@ def info(sequence: Path, force: bool, json_path: Path | None) -> None:
     from psotrack.recordings import describe_sequence, inventory_table
 
     content = describe_sequence(read_sequence(sequence))
-    answer(json_path, content, force)
+    output_json(json_path, content, force)
     if json_path != Path("-"):
         Console().print(inventory_table(content))

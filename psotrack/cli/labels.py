@@ -1,4 +1,4 @@
-"""`psotrack labels`: sequences with a reference as a data set that detectors are trained on."""
+"""`psotrack labels`: write a training set for detectors from sequences with a reference."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ from pathlib import Path
 
 import click
 
-from psotrack.cli.answers import answer, report_to, say
 from psotrack.cli.options import FORCE, JOBS, JSON, QUIET, Numbers
+from psotrack.cli.output import output_json, print_line, report_to
 
 
 @click.command()
 @click.argument(
     "sequences", metavar="SEQ [SEQ ...]", nargs=-1, required=True, type=click.Path(path_type=Path)
 )
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the data set.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the training set.")
 @click.option(
     "--drone-size",
     "drone_size_m",
     type=Numbers(3),
     required=True,
     metavar="X,Y,Z",
-    help="Full lengths in metres, along the drone's axes, or the world's where the reference has no orientations.",
+    help="Full lengths in metres along the drone's axes; along the world's axes if the reference has no orientations.",
 )
 @click.option(
     "--offset",
@@ -29,27 +29,33 @@ from psotrack.cli.options import FORCE, JOBS, JSON, QUIET, Numbers
     type=Numbers(3),
     default=(0.0, 0.0, 0.0),
     metavar="X,Y,Z",
-    help="From the reference's point to the drone's middle, along the same axes.  [default: 0,0,0]",
+    help="Vector from the reference's point to the drone's middle, along the same axes, in metres.  [default: 0,0,0]",
 )
 @click.option(
-    "--every", type=click.IntRange(min=1), default=1, show_default=True, help="Take each so manieth frame."
+    "--every",
+    type=click.IntRange(min=1),
+    default=1,
+    show_default=True,
+    help="Step between the frames that are used.",
 )
 @click.option(
-    "--validation", metavar="NAME,...", help="Sequences to validate on, not to train on.  [default: the last]"
+    "--validation",
+    metavar="NAME,...",
+    help="Sequences for validation, not for training.  [default: the last]",
 )
 @click.option(
     "--min-inside",
     type=float,
     default=0.3,
     show_default=True,
-    help="Share of a box that must lie in the image.",
+    help="Smallest share of a box inside the image.",
 )
 @click.option(
     "--max-hidden",
     type=float,
     default=0.7,
     show_default=True,
-    help="Share of a box that a nearer drone's may cover.",
+    help="Largest share of a box that the box of a nearer drone covers.",
 )
 @JOBS
 @FORCE
@@ -71,8 +77,9 @@ def labels(
 ) -> None:
     """Write a YOLO training set from sequences with a reference.
 
-    Writes OUT/images, OUT/labels (a text file per image, `class cx cy w h`) and OUT/data.yaml. Whole sequences are
-    trained or validated on, at least one of each: frames of one flight resemble each other too much.
+    Writes OUT/images, OUT/labels (a text file per image, `class cx cy w h`) and OUT/data.yaml. Every
+    sequence is used either for training or for validation, because frames of one flight resemble each other too much.
+    At least two sequences are needed.
 
     \b
     Examples:
@@ -92,6 +99,6 @@ def labels(
         jobs=jobs,
         report=report_to(quiet),
     )
-    answer(json_path, counts, force)
+    output_json(json_path, counts, force)
     shown = "; ".join(f"{part}: {of['images']} images, {of['labels']} labels" for part, of in counts.items())
-    say(quiet, json_path, f"{out / DATA_SET}: {shown}")
+    print_line(quiet, json_path, f"{out / DATA_SET}: {shown}")

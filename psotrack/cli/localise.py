@@ -1,4 +1,4 @@
-"""`psotrack localise`: where a drone is, from markers of known places that its own camera sees."""
+"""`psotrack localise`: poses of a drone's camera from markers with known positions."""
 
 from __future__ import annotations
 
@@ -8,8 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from psotrack.cli.answers import answer, check_outputs, report_to, say
-from psotrack.cli.options import FORCE, FRAMES, JSON, QUIET, Numbers
+from psotrack.cli.options import (
+    FORCE,
+    FOV,
+    FRAMES,
+    JSON,
+    QUIET,
+    SCALE_CAMERA,
+    dictionary_option,
+    plot_option,
+)
+from psotrack.cli.output import check_outputs, output_json, print_line, report_to
 from psotrack.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
@@ -20,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _Input:
-    """What is localised, and what comes with it."""
+    """A video, and the markers and intrinsics that its sequence brings along."""
 
     source: FrameSource
     name: str
@@ -31,37 +40,45 @@ class _Input:
 @click.command()
 @click.argument("video")
 @click.option(
-    "--markers", type=click.Path(path_type=Path), help="Table of corners.  [default: that of a sequence]"
+    "--markers", type=click.Path(path_type=Path), help="Table of marker corners.  [default: the sequence's]"
 )
 @click.option(
     "--camera",
     "camera_file",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Its intrinsics: .csv, .toml or .yml.  [default: that of a sequence]",
-)
-@click.option("--camera-name", metavar="NAME", help="Of the camera in FILE, where that has several.")
-@click.option("--scale-camera", is_flag=True, help="Scale intrinsics for another size of the same images.")
-@click.option("--fov", "fov_deg", type=Numbers(2), metavar="H,V", help="Instead: fields of view in degrees.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="A CSV, a row per frame.")
-@click.option("--drone", metavar="NAME", help="Whose video, where VIDEO is a sequence's folder.")
-@click.option(
-    "--name", metavar="NAME", help="Of the drone in the table.  [default: --drone, or VIDEO's name]"
+    help="Intrinsics of the camera: .csv, .toml or .yml.  [default: the sequence's]",
 )
 @click.option(
-    "--dictionary", default="4x4_1000", show_default=True, help="Of the markers; any that OpenCV has."
+    "--camera-name", metavar="NAME", help="Name of the camera in FILE, if FILE has several cameras."
 )
+@SCALE_CAMERA
+@FOV
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, help="CSV file of the poses, one row per frame."
+)
+@click.option("--drone", metavar="NAME", help="Drone whose video is used, if VIDEO is a sequence's folder.")
+@click.option(
+    "--name", metavar="NAME", help="Name of the drone in the table.  [default: --drone, or VIDEO's name]"
+)
+@dictionary_option()
 @click.option(
     "--min-markers",
     type=click.IntRange(min=1),
     default=4,
     show_default=True,
-    help="That a frame must show; poses of fewer than 4 are flagged.",
+    help="Smallest number of markers for a pose; poses from fewer than 4 markers are flagged.",
 )
 @click.option(
-    "--filter/--no-filter", "filtered", default=True, show_default=True, help="Follow the motion, on the fly."
+    "--filter/--no-filter",
+    "filtered",
+    default=True,
+    show_default=True,
+    help="Filter the poses with a motion model.",
 )
-@click.option("--smooth", "smoothed", is_flag=True, help="Afterwards: the best path from all frames.")
+@click.option(
+    "--smooth", "smoothed", is_flag=True, help="Smooth the path: every pose is estimated from all frames."
+)
 @click.option(
     "--map-error",
     "map_error_mm",
@@ -69,7 +86,7 @@ class _Input:
     default=0.0,
     show_default=True,
     metavar="MM",
-    help="Standard deviation of each marker's place in the table.",
+    help="Standard deviation of each marker's position in the table, in millimetres.",
 )
 @click.option(
     "--focal-error",
@@ -78,18 +95,13 @@ class _Input:
     default=0.0,
     show_default=True,
     metavar="PERCENT",
-    help="Standard deviation of the focal length.",
+    help="Standard deviation of the focal length, in percent.",
 )
 @click.option("--fps", type=float, help="Frames per second of a folder of images.")
-@click.option("--live", is_flag=True, help="VIDEO is a camera's number or a stream: newest frames first.")
 @click.option(
-    "--plot",
-    type=click.Path(path_type=Path),
-    is_flag=False,
-    flag_value="",
-    metavar="[PNG]",
-    help="Save the path from above, and the height over time.  [default: beside --out, as .png]",
+    "--live", is_flag=True, help="VIDEO is a camera's number or a stream; always use the newest frame."
 )
+@plot_option("the path from above, and the height over time", "beside --out, as .png")
 @FRAMES
 @FORCE
 @QUIET
@@ -120,12 +132,15 @@ def localise(
 ) -> None:
     """Find the position of the camera of VIDEO in every frame, from the ArUco markers that it sees.
 
-    VIDEO is a video, a folder of images, the address of a stream, or an _A sequence of the dataset, which brings
-    its markers and intrinsics along. With --live, frames are left out that come too fast; Ctrl-C ends it, and what was
-    localised so far is written.
+    VIDEO is a video, a folder of images, the address of a stream, or an _A sequence of the dataset, which contains its
+    markers and intrinsics. With --live, frames that arrive too fast are skipped; Ctrl-C ends the command, which then
+    writes the poses so far.
 
-    What is off in all frames alike, the map or the focal length, is not averaged away by any number of frames:
-    --map-error and --focal-error make poses better, where several markers tell, and covariances honest.
+    Errors of the map and of the focal length are the same in all frames and do not average out. With --map-error and
+    --focal-error the covariances include these errors, and poses from several markers become more accurate.
+
+    In images whose longer side is 2880 pixels or more, such as 3840 x 2160, markers are searched for in an image of
+    half the size, and markers whose sides are shorter than 48 pixels are overlooked.
 
     \b
     Examples:
@@ -156,7 +171,7 @@ def localise(
         refuse_to_overwrite(picture, force)
     given = _input(video, drone, fps, live)
     if markers is None and given.markers is None:
-        raise SettingsError("--markers", expected="a table of corners", found="none")
+        raise SettingsError("--markers", expected="a table of marker corners", found="none")
     marker_map = read_marker_map(Path(str(markers or given.markers)))
     lens = _lens(given, camera_file, camera_name, scale_camera, fov_deg)
     source = given.source.first(num_frames)
@@ -175,7 +190,9 @@ def localise(
             found = replace(found, path=smooth(found.raw, settings.filter))
     except KeyboardInterrupt as stop:
         again = (
-            "a stream is not heard twice" if source.stream else "the same command starts from the first frame"
+            "a stream cannot be read again"
+            if source.stream
+            else "the same command starts from the first frame"
         )
         raise click.ClickException(f"interrupted; nothing is written, and {again}") from stop
     drone_name = name or given.name
@@ -187,12 +204,12 @@ def localise(
     content = _content(found, given.source.name, drone_name, settings.pose.min_markers)
     content |= {"track": str(out), "filtered": filtered, "smoothed": smoothed}
     content |= {"map_error_m": settings.pose.map_error_m, "focal_error": settings.pose.focal_error}
-    answer(json_path, content, force)
-    say(quiet, json_path, _sentence(out, content))
+    output_json(json_path, content, force)
+    print_line(quiet, json_path, _sentence(out, content))
 
 
 def _input(video: str, drone: str | None, fps: float | None, live: bool) -> _Input:
-    """A video, a folder of images, or a stream; or the video of one drone in a sequence."""
+    """The input that VIDEO names: a video, a folder of images, a stream, or one drone's video in a sequence."""
     from psotrack.datasets.dpjait import MARKER_CORNERS, read_onboard
     from psotrack.inside_out import folder_has_images, open_source
 
@@ -239,7 +256,7 @@ def _lens(
 
 
 def _content(found: LocalisedVideo, video: str, name: str, min_markers: int) -> dict[str, Any]:
-    """The answer as JSON has it, with null where there is no number."""
+    """The results as JSON, with null for missing numbers."""
     import numpy as np
 
     from psotrack.inside_out import Flag
@@ -287,14 +304,14 @@ def _sentence(out: Path, content: dict[str, Any]) -> str:
 
 
 def _doubt(content: dict[str, Any]) -> str:
-    """What to look at where no frame has a pose."""
+    """Advice where no frame has a pose; empty otherwise."""
     most = content["most_markers"]
     if content["poses"]:
         return ""
     if not most:
-        return "; no frame shows a marker of the map: are --dictionary and --markers those of this room?"
+        return "; no frame shows a marker of the map: check --dictionary and --markers"
     if content["own_poses"]:
-        return f"; the filter took none of {content['own_poses']} poses: --no-filter keeps them"
+        return f"; the filter rejected all {content['own_poses']} poses: --no-filter keeps them"
     if most < content["min_markers"]:
         return f"; no frame shows more than {most} markers of the map: --min-markers asks for {content['min_markers']}"
-    return "; no pose fits the markers: are --markers, and --camera or --fov, the right ones?"
+    return "; no pose fits the markers: check --markers, and --camera or --fov"

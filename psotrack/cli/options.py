@@ -1,4 +1,4 @@
-"""What the commands have in common: arguments and options, with the defaults of the settings."""
+"""Arguments and options that several commands share, with the defaults of the settings."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from psotrack.silhouettes import Shadows, SilhouetteSettings
 if TYPE_CHECKING:
     from psotrack.recordings import Sequence
 
-#: Defaults are written once, in the settings; the command line shows them.
+#: Settings whose values are the defaults of the command line.
 TRACK = TrackSettings()
 SILHOUETTES = SilhouetteSettings()
-#: Of a network's square input, pixels: what YOLO is trained with.
+#: Side of a detector network's square input, pixels: the size that YOLO networks are trained with.
 DETECTOR_SIZE = 640
 
 Command = Callable[..., None]
 
 
 class Numbers(click.ParamType):
-    """Numbers with commas between them, such as 0.5,0.5,0.2."""
+    """`count` numbers with commas between them, such as 0.5,0.5,0.2."""
 
     def __init__(self, count: int) -> None:
         self.count = count
         self.name = ",".join(["NUMBER"] * count)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """A tuple of floats; what is no string was converted before."""
+        """Tuple of floats from a string; a value that is not a string is returned as it is."""
         if not isinstance(value, str):
             return value
         try:
@@ -50,7 +50,7 @@ class Size(click.ParamType):
     name = "W,H"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """A pair of integers; what is no string was converted before."""
+        """Pair of integers from a string; a value that is not a string is returned as it is."""
         if not isinstance(value, str):
             return value
         words = value.replace("x", ",").split(",")
@@ -59,35 +59,74 @@ class Size(click.ParamType):
         return int(words[0]), int(words[1])
 
 
+TRACKS = click.argument("tracks", type=click.Path(path_type=Path))
 SEQUENCE = click.argument("sequence", metavar="SEQ", type=click.Path(path_type=Path))
-FORCE = click.option("--force", is_flag=True, help="Replace what is there.")
-QUIET = click.option("--quiet", "-q", is_flag=True, help="No progress, no table: errors only.")
+FORCE = click.option("--force", is_flag=True, help="Replace existing files.")
+QUIET = click.option("--quiet", "-q", is_flag=True, help="Print no progress and no results, only errors.")
 JSON = click.option(
     "--json",
     "json_path",
     type=click.Path(path_type=Path),
     metavar="OUT",
-    help="Write the answer as JSON; - is stdout.",
+    help="Write the results as JSON to OUT; - is stdout.",
 )
 JOBS = click.option(
-    "--jobs", type=click.IntRange(min=1), help="Processes at most.  [default: one per processor]"
+    "--jobs", type=click.IntRange(min=1), help="Largest number of processes.  [default: one per processor]"
 )
 CACHE = click.option(
     "--cache",
     type=click.Path(path_type=Path),
     envvar="PSOTRACK_CACHE",
-    help="Of silhouettes and compiled programs.  [default: $PSOTRACK_CACHE, or psotrack in the user's cache folder]",
+    help="Folder of silhouettes and compiled programs.  [default: $PSOTRACK_CACHE, or psotrack in your cache folder]",
 )
 CAMERAS = click.option(
-    "--cameras", metavar="NAME,NAME...", help="Use these cameras only.  [default: all of the calibration]"
+    "--cameras",
+    metavar="NAME,NAME...",
+    help="Use these cameras only.  [default: all cameras of the calibration]",
 )
 FRAMES = click.option(
     "--frames", "num_frames", type=int, metavar="N", help="Use the first N frames only.  [default: all]"
 )
 
 
+FOV = click.option(
+    "--fov",
+    "fov_deg",
+    type=Numbers(2),
+    metavar="H,V",
+    help="Horizontal and vertical field of view in degrees, instead of intrinsics.",
+)
+SCALE_CAMERA = click.option(
+    "--scale-camera",
+    is_flag=True,
+    help="Scale the intrinsics to the size of the images; both must show the same field of view.",
+)
+
+
+def dictionary_option(default: str = "4x4_1000") -> Callable[[Command], Command]:
+    """Option `--dictionary`: the markers' dictionary."""
+    return click.option(
+        "--dictionary",
+        default=default,
+        show_default=True,
+        help="Dictionary of the markers; any dictionary of OpenCV.",
+    )
+
+
+def plot_option(content: str, default_path: str) -> Callable[[Command], Command]:
+    """Option `--plot [PNG]`: a picture of `content`, at `default_path` if no path follows; the value is then empty."""
+    return click.option(
+        "--plot",
+        type=click.Path(path_type=Path),
+        is_flag=False,
+        flag_value="",
+        metavar="[PNG]",
+        help=f"Save {content}.  [default: {default_path}]",
+    )
+
+
 def silhouette_options(command: Command) -> Command:
-    """The options of `SilhouetteSettings` that users turn, for the commands that make silhouettes."""
+    """Options of `SilhouetteSettings`, for the commands that compute silhouettes."""
     for option in (
         click.option(
             "--reduction",
@@ -101,21 +140,21 @@ def silhouette_options(command: Command) -> Command:
             type=click.Choice(get_args(Shadows)),
             default=SILHOUETTES.shadows,
             show_default=True,
-            help="What becomes of MOG2's shadow label: dark bodies and rotor discs get it as well as shadows.",
+            help="Treatment of pixels that MOG2 labels as shadow: shadows, but also dark bodies and rotor discs.",
         ),
         click.option(
             "--shadow-weight",
             type=float,
             default=SILHOUETTES.shadow_weight,
             show_default=True,
-            help="Of a shadow pixel, for --shadows weight.",
+            help="Weight of a shadow pixel, for --shadows weight.",
         ),
         click.option(
             "--var-threshold",
             type=float,
             default=SILHOUETTES.var_threshold,
             show_default=True,
-            help="Squared distance from the background, in standard deviations, that is foreground.",
+            help="Smallest squared distance of a foreground pixel from the background, in variances of the background.",
         ),
         click.option(
             "--min-blob",
@@ -123,25 +162,25 @@ def silhouette_options(command: Command) -> Command:
             type=int,
             default=SILHOUETTES.min_blob_px,
             show_default=True,
-            help="Smaller speckle is removed; in pixels.",
+            help="Smallest foreground blob that is kept, in pixels.",
         ),
     ):
         command = option(command)
     return command
 
 
-def usable_sequence(folder: Path, cameras: str | None, num_frames: int | None) -> Sequence:
-    """What is to be used of a sequence, of what `CAMERAS` and `FRAMES` ask for."""
+def usable_sequence(folder: str | Path, cameras: str | None, num_frames: int | None) -> Sequence:
+    """Sequence with the cameras and frames that the options `CAMERAS` and `FRAMES` select."""
     from psotrack.datasets.dpjait import read_sequence
 
     return read_sequence(folder).usable(cameras.split(",") if cameras else None, num_frames)
 
 
-def cache_folder(chosen: Path | None) -> Path:
-    """Of the stored silhouettes."""
-    return chosen or platformdirs.user_cache_path("psotrack") / "silhouettes"
+def cache_folder(chosen: str | Path | None) -> Path:
+    """Folder of the stored silhouettes: `chosen`, or a folder in the user's cache folder."""
+    return Path(chosen) if chosen else platformdirs.user_cache_path("psotrack") / "silhouettes"
 
 
-def compiled_folder(chosen: Path | None) -> Path:
-    """Of compiled programs, within that of the silhouettes."""
+def compiled_folder(chosen: str | Path | None) -> Path:
+    """Folder of compiled programs, inside the folder of the silhouettes."""
     return cache_folder(chosen) / "compiled"

@@ -1,4 +1,4 @@
-"""`psotrack silhouettes`: the silhouettes of a sequence, made and stored."""
+"""`psotrack silhouettes`: compute and store the silhouettes of a sequence."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Any
 
 import click
 
-from psotrack.cli.answers import answer, report_to, say
 from psotrack.cli.options import (
     CACHE,
     CAMERAS,
@@ -21,6 +20,7 @@ from psotrack.cli.options import (
     silhouette_options,
     usable_sequence,
 )
+from psotrack.cli.output import output_json, print_line, report_to
 from psotrack.silhouettes import SilhouetteSettings
 
 
@@ -47,8 +47,8 @@ def silhouettes(
 ) -> None:
     """Compute and store the silhouettes of SEQ, which `track` reads.
 
-    They are kept under a key of the video's content and every setting: a second call finds them, a changed setting
-    makes new ones.
+    Silhouettes are stored under a key of the video's content and all settings. A second call finds the stored
+    silhouettes; with a changed setting new silhouettes are computed.
 
     \b
     Examples:
@@ -72,6 +72,8 @@ def silhouettes(
         "shape": list(stored.shape),
         "seconds": dict(stored.seconds),
     }
-    answer(json_path, content, force)
+    output_json(json_path, content, force)
     made = "made" if any(stored.seconds.values()) else "already there"
-    say(quiet, json_path, f"{len(stored.cameras)} cameras, {stored.num_frames} frames: {made}, in {where}")
+    print_line(
+        quiet, json_path, f"{len(stored.cameras)} cameras, {stored.num_frames} frames: {made}, in {where}"
+    )

@@ -1,4 +1,4 @@
-"""`psotrack simulate`: sequences from scenarios, their list, and pages that show them beforehand."""
+"""`psotrack simulate`: simulate the sequence of a scenario, list scenarios, or preview one."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any
 
 import click
 
-from psotrack.cli.answers import answer, report_to, say
 from psotrack.cli.options import FORCE, JOBS, JSON, QUIET
+from psotrack.cli.output import output_json, print_line, report_to
 from psotrack.errors import SettingsError
 
 
 @click.command()
 @click.argument("name", required=False)
-@click.option("--out", type=click.Path(path_type=Path), help="The data's root folder.")
+@click.option("--out", type=click.Path(path_type=Path), help="Root folder of the data.")
 @click.option(
     "--scenario",
     "scenario_file",
@@ -29,19 +29,23 @@ from psotrack.errors import SettingsError
     "changes",
     multiple=True,
     metavar="FIELD=VALUE",
-    help="Change a field of the scenario, e.g. imaging.reflections=0; can be given often.",
+    help="Change a field of the scenario, e.g. imaging.reflections=0; may be repeated.",
 )
-@click.option("--list", "listed", is_flag=True, help="Show the scenarios that there are, and end.")
-@click.option("--show", is_flag=True, help="Print the scenario's file, to start your own from, and end.")
+@click.option("--list", "listed", is_flag=True, help="List the scenarios, and end.")
+@click.option("--show", is_flag=True, help="Print the scenario's file, as a start for your own, and end.")
 @click.option(
     "--preview", is_flag=True, help="Save one page of pictures, OUT/NAME.png, instead of the sequence."
 )
-@click.option("--frames", "num_frames", type=int, metavar="N", help="First N frames only.  [default: all]")
-@click.option("--scale", type=float, default=1.0, show_default=True, help="Of the image size.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Of flights and noise.")
+@click.option(
+    "--frames", "num_frames", type=int, metavar="N", help="Simulate the first N frames only.  [default: all]"
+)
+@click.option(
+    "--scale", type=float, default=1.0, show_default=True, help="Scale of the image size; 1 is full size."
+)
+@click.option("--seed", type=int, default=0, show_default=True, help="Seed of flights and noise.")
 @click.option("--masks/--no-masks", default=True, show_default=True, help="Write drone_masks.zip.")
 @click.option(
-    "--onboard/--no-onboard", default=True, show_default=True, help="Make the videos of drones' own cameras."
+    "--onboard/--no-onboard", default=True, show_default=True, help="Render the videos of on-board cameras."
 )
 @JOBS
 @FORCE
@@ -67,8 +71,8 @@ def simulate(
 ) -> None:
     """Simulate a sequence: videos, calibration, ground truth, masks and detections.
 
-    Writes OUT/Simulated_Data/NAME. The same seed makes the same flights and the same pixels; an interrupted call goes
-    on where it was.
+    Writes OUT/Simulated_Data/NAME. The same seed makes the same flights and the same pixels; the same
+    command continues an interrupted simulation.
 
     \b
     Examples:
@@ -120,8 +124,8 @@ def simulate(
             jobs=jobs or os.cpu_count() or 1,
             report=report_to(quiet),
         )
-        answer(json_path, {"preview": str(page)}, force)
-        say(quiet, json_path, f"{page}")
+        output_json(json_path, {"preview": str(page)}, force)
+        print_line(quiet, json_path, f"{page}")
         return
     folder = make(
         recipe,
@@ -135,8 +139,8 @@ def simulate(
         jobs=jobs,
         report=report_to(quiet),
     )
-    answer(json_path, {"sequence": str(folder)}, force)
-    say(quiet, json_path, f"{folder}")
+    output_json(json_path, {"sequence": str(folder)}, force)
+    print_line(quiet, json_path, f"{folder}")
 
 
 def _list(json_path: Path | None, quiet: bool, force: bool) -> None:
@@ -145,18 +149,18 @@ def _list(json_path: Path | None, quiet: bool, force: bool) -> None:
     from psotrack.simulation import catalogue, render
 
     rows = catalogue()
-    answer(json_path, rows, force)
+    output_json(json_path, rows, force)
     if not quiet and json_path != Path("-"):
         Console().print(render(rows))
 
 
 def _change(text: str) -> tuple[str, Any]:
-    """`FIELD=VALUE`, the value as TOML has it; what is no TOML is a text."""
+    """Field and value of `FIELD=VALUE`; the value is parsed as TOML, and kept as a string if it is not valid TOML."""
     field, equals, value = text.partition("=")
     if not equals or not field.strip():
         raise SettingsError("--set", expected="FIELD=VALUE, such as imaging.shutter_s=0.01", found=text)
     try:
         return field.strip(), tomllib.loads(f"value = {value}")["value"]
     except ValueError:
-        # No TOML, or an integer of thousands of digits.
+        # Not valid TOML, or an integer of thousands of digits.
         return field.strip(), value

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from psotrack.cli.answers import answer, report_to, say
 from psotrack.cli.options import CACHE, FORCE, JOBS, JSON, QUIET, cache_folder, compiled_folder
+from psotrack.cli.output import output_json, print_line, report_to
 from psotrack.errors import SettingsError
 from psotrack.support import Report, refuse_to_overwrite
 
@@ -104,9 +104,11 @@ def sweep(
     else:
         outcome = _run_there(grid, out, data, cache, cluster, workers, device, report_to(quiet))
     counts = {state: outcome.count(state) for state in ("finished", "failed", "left")}
-    answer(json_path, counts, force)
+    output_json(json_path, counts, force)
     failed = f", {counts['failed']} failed (see {out}/cells/*.error.json)" if counts["failed"] else ""
-    say(quiet, json_path, f"{out}: {counts['finished']} cells finished now, {counts['left']} before{failed}")
+    print_line(
+        quiet, json_path, f"{out}: {counts['finished']} cells finished now, {counts['left']} before{failed}"
+    )
     if counts["failed"]:
         sys.exit(2)
 
@@ -216,11 +218,15 @@ def _show(
         for cell in cells
     ]
     expected = estimate(cells, Inputs(data, cache, jobs), Store(out) if out else None)
-    answer(json_path, {"cells": listed, "estimate": vars(expected) | {"total_s": expected.total_s}}, force)
+    output_json(
+        json_path, {"cells": listed, "estimate": vars(expected) | {"total_s": expected.total_s}}, force
+    )
     for number, cell in enumerate(listed):
-        say(quiet, json_path, f"{number:4} " + " ".join(f"{name}={value}" for name, value in cell.items()))
-    say(quiet, json_path, f"{len(cells)} cells, {sum(cell.runs for cell in cells)} runs")
-    say(quiet, json_path, f"{expected}")
+        print_line(
+            quiet, json_path, f"{number:4} " + " ".join(f"{name}={value}" for name, value in cell.items())
+        )
+    print_line(quiet, json_path, f"{len(cells)} cells, {sum(cell.runs for cell in cells)} runs")
+    print_line(quiet, json_path, f"{expected}")
 
 
 def _status(folder: Path, quiet: bool, force: bool, json_path: Path | None) -> None:
@@ -228,10 +234,10 @@ def _status(folder: Path, quiet: bool, force: bool, json_path: Path | None) -> N
     from psotrack.sweep import Store
 
     content = Store(folder).status()
-    answer(json_path, content, force)
+    output_json(json_path, content, force)
     for failure in content["errors"]:
-        say(quiet, json_path, f"failed: {failure}")
+        print_line(quiet, json_path, f"failed: {failure}")
     for worker in content["at_work"]:
-        say(quiet, json_path, f"at work: {worker}")
+        print_line(quiet, json_path, f"at work: {worker}")
     numbers = ", ".join(f"{content[name]} {name}" for name in ("finished", "failed", "claimed"))
-    say(quiet, json_path, f"{folder}: {numbers}")
+    print_line(quiet, json_path, f"{folder}: {numbers}")

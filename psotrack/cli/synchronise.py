@@ -1,4 +1,4 @@
-"""`psotrack synchronise`: the offset between the clocks of a sequence's reference and of its videos."""
+"""`psotrack synchronise`: estimate the offset between the clocks of a sequence's reference and of its videos."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from psotrack.cli.answers import answer, say
-from psotrack.cli.options import FORCE, JSON, QUIET, SEQUENCE
+from psotrack.cli.options import FORCE, JSON, QUIET, SEQUENCE, TRACKS, plot_option
+from psotrack.cli.output import output_json, print_line
 
 if TYPE_CHECKING:
     from psotrack.clocks import Offset
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("tracks", type=click.Path(path_type=Path))
+@TRACKS
 @SEQUENCE
 @click.option(
     "--max-offset",
@@ -24,16 +24,9 @@ if TYPE_CHECKING:
     type=float,
     default=2.0,
     show_default=True,
-    help="Offsets from minus this to this are tried, in seconds.",
+    help="Largest offset that is tried, in seconds, in both directions.",
 )
-@click.option(
-    "--plot",
-    type=click.Path(path_type=Path),
-    is_flag=False,
-    flag_value="",
-    metavar="[PNG]",
-    help="Save the mean distance over the offsets.  [default: beside TRACKS, as .offset.png]",
-)
+@plot_option("the mean distance over the offsets", "beside TRACKS, as .offset.png")
 @FORCE
 @QUIET
 @JSON
@@ -48,8 +41,8 @@ def synchronise(
 ) -> None:
     """Find the offset between the clocks of SEQ's reference and of its videos, from the motion in TRACKS.
 
-    The offset with the smallest mean distance, to a fraction of a frame; each drone may have a constant lever arm. A
-    .c3d is read at its own rate, whatever that of the videos.
+    The offset minimises the mean distance between TRACKS and the reference, to a fraction of a frame. Each drone may
+    have a constant lever arm. A .c3d file is read at its own rate, which may differ from the videos'.
 
     \b
     Examples:
@@ -70,13 +63,13 @@ def synchronise(
         reference.orientation_wxyz,
         max_offset_s=max_offset_s,
     )
-    answer(json_path, _content(offset, estimate, reference), force)
+    output_json(json_path, _content(offset, estimate, reference), force)
     if plot is not None:
         save_curve(plot if plot.name else tracks.with_suffix(".offset.png"), offset, force=force)
     before = (
         "nothing to compare" if offset.mean_distance_before_m is None else _mm(offset.mean_distance_before_m)
     )
-    say(
+    print_line(
         quiet,
         json_path,
         f"{recording.name}: the reference's clock is {abs(offset.offset_s):.4f} s "
@@ -91,7 +84,7 @@ def _mm(value_m: float) -> str:
 
 
 def _content(offset: Offset, estimate: Trajectories, reference: Trajectories) -> dict[str, Any]:
-    """The offset as JSON has it, with null where there is no number."""
+    """The offset as JSON, with null for missing numbers."""
     from psotrack.trajectories import UNASSIGNED
 
     drones = [

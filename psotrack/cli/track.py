@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 import msgspec
 
-from psotrack.cli.answers import answer, report_to, say, write_json
 from psotrack.cli.options import (
     CACHE,
     CAMERAS,
@@ -26,6 +25,7 @@ from psotrack.cli.options import (
     silhouette_options,
     usable_sequence,
 )
+from psotrack.cli.output import output_json, print_line, report_to, write_json
 from psotrack.errors import SettingsError
 from psotrack.settings import Method, Score, SwarmKind, TrackSettings
 from psotrack.silhouettes import SilhouetteSettings
@@ -200,10 +200,10 @@ def track(
     identities, time_s = tracked.identities, tracked.trajectories.time_s
     write_ambiguity(ambiguity_path, time_s, identities.pairs, identities.ambiguity, force=force)
     write_json(record_path, tracked.record)
-    answer(json_path, tracked.record, force)
+    output_json(json_path, tracked.record, force)
     seen = tracked.trajectories.seen.mean()
     seconds = tracked.record["seconds"]
-    say(
+    print_line(
         quiet,
         json_path,
         f"{out}: {tracked.trajectories.num_drones} drones, {tracked.trajectories.num_frames} frames, "

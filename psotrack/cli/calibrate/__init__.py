@@ -20,7 +20,7 @@ COMMANDS = {
     ),
     "intrinsics": LazyCommand(
         "psotrack.cli.calibrate.intrinsics",
-        "Find a camera's lens from VIDEO, in which a ChArUco board is moved about.",
+        "Estimate a camera's lens from VIDEO, in which a ChArUco board is moved.",
     ),
 }
 

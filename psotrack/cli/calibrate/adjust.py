@@ -1,4 +1,4 @@
-"""`psotrack calibrate adjust`: a rig that agrees with the drones that its cameras see."""
+"""`psotrack calibrate adjust`: correct a rig by the drones that its cameras see."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import click
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from psotrack.cli.answers import say
 from psotrack.cli.calibrate.options import OUT
 from psotrack.cli.calibrate.shown import row_of, show_cameras
 from psotrack.cli.options import FORCE, JSON, QUIET, SEQUENCE
+from psotrack.cli.output import print_line
 from psotrack.errors import InputError
 from psotrack.support import refuse_to_overwrite
 
@@ -24,9 +24,12 @@ if TYPE_CHECKING:
 @click.command()
 @SEQUENCE
 @click.option(
-    "--tracks", type=click.Path(path_type=Path), required=True, help="Of SEQ's drones, as `track` writes."
+    "--tracks",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="Tracks of SEQ's drones, a file of `track`.",
 )
-@click.option("--fixed", default="", metavar="NAME,NAME...", help="Cameras that stay where they are.")
+@click.option("--fixed", default="", metavar="NAME,NAME...", help="Cameras that are not moved.")
 @click.option("--refine-focal-length", is_flag=True, help="Scale all focal lengths by a common factor, too.")
 @click.option(
     "--noise",
@@ -52,12 +55,12 @@ def adjust(
 ) -> None:
     """Move the cameras of SEQ that disagree with the other cameras about its drones, by a bundle adjustment.
 
-    The points are the middles of SEQ's detections that hold a tracked drone. These are off by about a pixel, in the
-    same way for many frames, which places cameras to a centimetre or two. So only cameras are moved that are off by
-    more than that for certain; if none is, OUT is the rig as it was.
+    The adjustment uses the middles of SEQ's detections that contain a tracked drone. A middle has an error of about a
+    pixel that stays the same for many frames, so that cameras are placed to a centimetre or two. Only cameras whose
+    error is certainly larger are moved. If there is none, OUT is the unchanged rig.
 
-    Where the world's origin is, how its axes are turned and how large it is cannot be seen from drones: where most
-    cameras are off, all are moved, and the rig as a whole stays where it is.
+    Drones show neither the world's origin nor its axes nor its scale. If most cameras disagree, all cameras are moved,
+    and the rig as a whole keeps its origin, axes and scale.
 
     \b
     Example:
@@ -88,17 +91,17 @@ def adjust(
     write_rig(out, improved.rig, force=force)
     rows = _rows(recording.rig, improved, views, held)
     show_cameras(rows, out, quiet, json_path, force)
-    say(quiet, json_path, _in_words(improved, rows))
+    print_line(quiet, json_path, _in_words(improved, rows))
     if refine_focal_length:
         scale, std = improved.everything.focal_scale, improved.everything.focal_scale_std
         done = "" if improved.rescaled else ", which may be chance: they are written as they were"
-        say(quiet, json_path, f"focal lengths x {scale:.5f}, give or take {std:.5f}{done}")
+        print_line(quiet, json_path, f"focal lengths x {scale:.5f}, give or take {std:.5f}{done}")
 
 
 def _rows(
     rig: CameraRig, improved: Improved, views: DroneViews, held: tuple[str, ...]
 ) -> dict[str, dict[str, Any]]:
-    """What is said of each camera."""
+    """Results of each camera, by name."""
     shown = improved.everything if improved.final is None else improved.final
     T, T_before = (np.asarray(one.cameras.T_cam_world) for one in (improved.rig, rig))
     turns = Rotation.from_matrix(T[:, :3, :3] @ T_before[:, :3, :3].swapaxes(-1, -2))
@@ -122,13 +125,13 @@ def _rows(
 
 
 def _in_words(improved: Improved, rows: dict[str, dict[str, Any]]) -> str:
-    """Whether adjusting paid."""
+    """The results in one line."""
     if not improved.moved:
         what = "only the focal lengths are changed" if improved.rescaled else "the rig is written as it was"
         known_mm = [1e3 * float(np.linalg.norm(row["centre_std_m"])) for row in rows.values()]
         told_mm = [value for value in known_mm if value > 0] or [0.0]
         return (
-            "no camera is off by more than these detections can tell, which is "
+            "no camera is off by more than the uncertainty of these detections, which is "
             f"{min(told_mm):.0f} to {max(told_mm):.0f} mm: {what}"
         )
     parts = [

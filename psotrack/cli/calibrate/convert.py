@@ -1,4 +1,4 @@
-"""`psotrack calibrate convert`: calibrations between the files of programs."""
+"""`psotrack calibrate convert`: convert calibrations between the file formats of programs."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Any
 
 import click
 
-from psotrack.cli.answers import PLACE, answer, in_words, say, show
 from psotrack.cli.calibrate.options import SIZE
 from psotrack.cli.options import FORCE, JSON, QUIET
+from psotrack.cli.output import POSITION, format_numbers, output_json, print_line, print_table
 
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 
@@ -23,7 +23,7 @@ _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
     type=click.Choice(list(_METRES)),
     default="m",
     show_default=True,
-    help="Of the lengths in IN; a CSV names its own.",
+    help="Unit of the lengths in IN; a CSV file names its own unit.",
 )
 @FORCE
 @QUIET
@@ -52,11 +52,14 @@ def convert(
         name: {"centre_m": centre.tolist(), "focal_length_px": float(K[0, 0])}
         for name, centre, K in zip(rig.names, rig.cameras.centre_world, rig.cameras.K, strict=True)
     }
-    answer(json_path, {"rig": str(out), "cameras": rows}, force)
-    show(
+    output_json(json_path, {"rig": str(out), "cameras": rows}, force)
+    print_table(
         quiet,
         json_path,
-        ("camera", PLACE, "f (px)"),
-        ((name, in_words(row["centre_m"], 3), f"{row['focal_length_px']:.1f}") for name, row in rows.items()),
+        ("camera", POSITION, "f (px)"),
+        (
+            (name, format_numbers(row["centre_m"], 3), f"{row['focal_length_px']:.1f}")
+            for name, row in rows.items()
+        ),
     )
-    say(quiet, json_path, f"{out}")
+    print_line(quiet, json_path, f"{out}")

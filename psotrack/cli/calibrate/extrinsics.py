@@ -1,4 +1,4 @@
-"""`psotrack calibrate extrinsics`: where cameras stand, from points of known places."""
+"""`psotrack calibrate extrinsics`: estimate the poses of cameras from points with known positions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from psotrack.cli.calibrate.options import OUT, SIZE, noise_option
 from psotrack.cli.calibrate.shown import row_of, show_cameras
-from psotrack.cli.options import FORCE, JSON, QUIET, Numbers
+from psotrack.cli.options import FORCE, FOV, JSON, QUIET, Numbers, dictionary_option
 from psotrack.errors import InputError, SettingsError
 from psotrack.support import refuse_to_overwrite
 
@@ -29,24 +29,31 @@ if TYPE_CHECKING:
 @click.option(
     "--points",
     type=click.Path(path_type=Path),
-    help="Where the points are, if --pairs does not say: point,x_m,y_m,z_m.",
+    help="Positions of the points, if --pairs has none: point,x_m,y_m,z_m.",
 )
 @click.option(
     "--markers",
     type=click.Path(path_type=Path),
     metavar="SEQ",
-    help="Instead of --pairs: find the ArUco markers of SEQ's aruco_corners.csv in its videos.",
+    help="Sequence whose videos show the ArUco markers of its aruco_corners.csv, instead of --pairs.",
 )
-@click.option("--dictionary", default="4x4_1000", show_default=True, help="Of the markers.")
+@dictionary_option()
 @click.option(
     "--intrinsics",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="The cameras' lenses; a file of one camera is for all.",
+    help="Intrinsics of the cameras; those of a file with one camera are used for all cameras.",
 )
-@click.option("--fov", "fov_deg", type=Numbers(2), metavar="H,V", help="Instead: fields of view in degrees.")
-@click.option("--focal-length", "focal_length_mm", type=float, help="Instead: in millimetres, with --sensor.")
-@click.option("--sensor", "sensor_mm", type=Numbers(2), metavar="W,H", help="Its size in millimetres.")
+@FOV
+@click.option(
+    "--focal-length",
+    "focal_length_mm",
+    type=float,
+    help="Focal length in millimetres, with --sensor, instead of intrinsics.",
+)
+@click.option(
+    "--sensor", "sensor_mm", type=Numbers(2), metavar="W,H", help="Size of the sensor in millimetres."
+)
 @SIZE
 @noise_option(1.0)
 @OUT
@@ -67,8 +74,8 @@ def extrinsics(
 ) -> None:
     """Find the poses of cameras, from points whose positions in the world and in the images are known.
 
-    Four points that are not on one line are the least; twelve, spread over the image and in depth, are good. Points
-    that do not agree with the others are left out, and shown.
+    At least four points that are not on one line are needed. Twelve points that are spread over the image and in depth
+    are good. Points that disagree with the other points are left out, and shown.
 
     \b
     Examples:
@@ -114,7 +121,7 @@ def _lenses(
     sensor_mm: tuple[float, float] | None,
     image_size_wh: tuple[int, int] | None,
 ) -> Mapping[str, Any]:
-    """The lens of each camera, from the one of three ways that was chosen."""
+    """Lens of each camera, by name, from intrinsics, fields of view, or focal length and sensor."""
     from psotrack.calibration import lens_of_sensor, lens_of_view
     from psotrack.geometry import read_lenses
 

@@ -1,4 +1,4 @@
-"""`psotrack calibrate intrinsics`: a camera's lens, from a video of a ChArUco board."""
+"""`psotrack calibrate intrinsics`: estimate a camera's lens from a video of a ChArUco board."""
 
 from __future__ import annotations
 
@@ -7,19 +7,21 @@ from pathlib import Path
 import click
 import numpy as np
 
-from psotrack.cli.answers import answer, say, show
 from psotrack.cli.calibrate.options import OUT
-from psotrack.cli.options import FORCE, JSON, QUIET, Size
+from psotrack.cli.options import FORCE, JSON, QUIET, Size, dictionary_option
+from psotrack.cli.output import output_json, print_line, print_table
 from psotrack.support import refuse_to_overwrite
 
 
 @click.command()
 @click.argument("video", type=click.Path(path_type=Path))
-@click.option("--squares", "squares_wh", type=Size(), required=True, help="Of the board, such as 7x5.")
+@click.option(
+    "--squares", "squares_wh", type=Size(), required=True, help="Number of squares of the board, such as 7x5."
+)
 @click.option("--square", "square_m", type=float, required=True, help="Side of a square in metres.")
 @click.option("--marker", "marker_m", type=float, required=True, help="Side of a marker in metres.")
-@click.option("--dictionary", default="4x4_50", show_default=True, help="Of the markers.")
-@click.option("--name", help="Of the camera.  [default: the video's]")
+@dictionary_option("4x4_50")
+@click.option("--name", help="Name of the camera.  [default: the video's name]")
 @OUT
 @FORCE
 @QUIET
@@ -36,9 +38,9 @@ def intrinsics(
     quiet: bool,
     json_path: Path | None,
 ) -> None:
-    """Find a camera's lens from VIDEO, in which a ChArUco board is moved about.
+    """Estimate a camera's lens from VIDEO, in which a ChArUco board is moved.
 
-    Carry the board into all corners of the image, near and far, and tilt it.
+    Move the board through all corners of the image, near and far, and tilt it.
 
     \b
     Example:
@@ -61,9 +63,9 @@ def intrinsics(
         "frames": lens.frame.tolist(),
         "residual_px": lens.residual_px.tolist(),
     }
-    answer(json_path, content, force)
+    output_json(json_path, content, force)
     rows = zip(names, values, lens.std, strict=True)
-    show(
+    print_table(
         quiet,
         json_path,
         ("", "value", "give or take"),
@@ -71,7 +73,7 @@ def intrinsics(
     )
     rms = float(np.sqrt(np.mean(lens.residual_px**2)))
     worst = lens.frame[lens.residual_px.argmax()]
-    say(
+    print_line(
         quiet,
         json_path,
         f"{out}: {len(lens.frame)} views, residual {rms:.2f} px, {lens.residual_px.max():.2f} px in frame {worst}",

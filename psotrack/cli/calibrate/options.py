@@ -1,4 +1,4 @@
-"""What the commands of `calibrate` have in common."""
+"""Options that the commands of `calibrate` share."""
 
 from __future__ import annotations
 
@@ -10,15 +10,21 @@ import click
 from psotrack.cli.options import Size
 
 OUT = click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="A file that ends in .toml, .yml or .csv."
+    "--out",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="Calibration to write: a file that ends in .toml, .yml or .csv.",
 )
 SIZE = click.option(
-    "--size", "image_size_wh", type=Size(), help="Of the images in pixels, where FILE does not have it."
+    "--size",
+    "image_size_wh",
+    type=Size(),
+    help="Size of the images in pixels, if FILE does not contain the size.",
 )
 
 
 def noise_option(default: float) -> Any:
-    """How well points are seen."""
+    """Option `--noise`: standard deviation of points in the image."""
     return click.option(
         "--noise",
         "noise_px",

@@ -1,4 +1,4 @@
-"""How `calibrate` shows where cameras stand, and which points fit worst."""
+"""Tables and JSON of `calibrate`: positions of cameras, and the points that fit worst."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.cli.answers import PLACE, answer, in_words, known, say, show
+from psotrack.cli.output import POSITION, finite_or_none, format_numbers, output_json, print_line, print_table
 
-#: Points that are shown by name, those that fit worst.
+#: Number of points that are shown by name for each camera, those that fit worst.
 _WORST = 5
 
 
@@ -21,7 +21,7 @@ def row_of(
     used: np.ndarray,
     points: Any,
 ) -> dict[str, Any]:
-    """What is said of a camera: where it is, how surely, and which of its points fit worst."""
+    """Row of a camera: position, standard deviation of the position, and the points that fit worst."""
     order = np.argsort(-residual_px)[:_WORST]
     return {
         "centre_m": centre_m.tolist(),
@@ -30,10 +30,10 @@ def row_of(
         "used": int(used.sum()),
         "rms_px": float(np.sqrt(np.mean(residual_px[used] ** 2))) if used.any() else None,
         "worst": [
-            # Behind the camera there is no distance.
+            # A point behind the camera has no distance in the image.
             {
                 "point": str(points[index]),
-                "residual_px": known(residual_px[index]),
+                "residual_px": finite_or_none(residual_px[index]),
                 "used": bool(used[index]),
             }
             for index in order
@@ -44,12 +44,12 @@ def row_of(
 def show_cameras(
     rows: dict[str, dict[str, Any]], out: Path, quiet: bool, json_path: Path | None, force: bool
 ) -> None:
-    """The cameras as JSON, or a table of them and the points that fit worst."""
-    answer(json_path, {"rig": str(out), "cameras": rows}, force)
+    """Show the cameras, as JSON or as a table with the points that fit worst."""
+    output_json(json_path, {"rig": str(out), "cameras": rows}, force)
     adjusted = any("moved_m" in row for row in rows.values())
-    # Where a camera is now is of less interest than how far that is from where it was, and a line is short.
-    place = ("moved (mm)", "turned (deg)", "std (mm)", "verdict") if adjusted else (PLACE, "std (mm)")
-    show(
+    # An adjusted camera's movement matters more than its position, and a line has no room for both.
+    place = ("moved (mm)", "turned (deg)", "std (mm)", "verdict") if adjusted else (POSITION, "std (mm)")
+    print_table(
         quiet,
         json_path,
         ("camera", "points", "rms (px)", *place),
@@ -63,14 +63,14 @@ def show_cameras(
             for name, row in rows.items()
         ),
     )
-    # Names of points may be long, and a column of them narrow.
+    # Names of points may be too long for a column.
     for name, row in rows.items():
-        say(quiet, json_path, f"{name}, worst points (px): {', '.join(map(_worst, row['worst']))}")
-    say(quiet, json_path, f"{out}")
+        print_line(quiet, json_path, f"{name}, worst points (px): {', '.join(map(_worst, row['worst']))}")
+    print_line(quiet, json_path, f"{out}")
 
 
 def _placed(row: dict[str, Any]) -> tuple[str, str]:
-    return in_words(row["centre_m"], 3), in_words([1e3 * std for std in row["centre_std_m"]], 1)
+    return format_numbers(row["centre_m"], 3), format_numbers([1e3 * std for std in row["centre_std_m"]], 1)
 
 
 def _changed(row: dict[str, Any]) -> tuple[str, str, str, str]:

@@ -1,4 +1,4 @@
-"""`psotrack map-markers`: where a room's markers are, from motion capture or videos, and what is wrong with a map."""
+"""`psotrack map-markers`: measure the positions of a room's markers, or check a table of them."""
 
 from psotrack.cli.map_markers.command import FOUND, map_markers
 

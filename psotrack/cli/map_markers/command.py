@@ -1,4 +1,4 @@
-"""`psotrack map-markers`: its options, and what it does."""
+"""The command `psotrack map-markers`."""
 
 from __future__ import annotations
 
@@ -8,67 +8,72 @@ from pathlib import Path
 import click
 import numpy as np
 
-from psotrack.cli.answers import check_outputs, report_to
 from psotrack.cli.map_markers.shown import show_built, show_check, show_measured
 from psotrack.cli.map_markers.sources import Lenses, known_corners, leading, videos_of
-from psotrack.cli.options import FORCE, FRAMES, JSON, QUIET, Numbers
+from psotrack.cli.options import FORCE, FOV, FRAMES, JSON, QUIET, SCALE_CAMERA, Numbers, dictionary_option
+from psotrack.cli.output import check_outputs, report_to
 from psotrack.errors import SettingsError, check_positive
 
-#: Of the exit, where something is wrong with a map.
+#: Exit code if a marker of a map was reported.
 FOUND = 2
-#: Files of measured corners; all others are videos.
+#: Suffixes of files with measured corners; all other files are videos.
 _MEASURED = {".c3d", ".csv", ".txt", ".tsv"}
 
 
 @click.command("map-markers")
 @click.argument("sources", metavar="SOURCE...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
-    "--out", type=click.Path(path_type=Path), help="The table of corners to write; not needed for --check."
+    "--out", type=click.Path(path_type=Path), help="Table of corners to write; not needed with --check."
 )
 @click.option(
     "--known",
     metavar="ID,ID...",
-    help="Markers that say where the world is: in --markers, or one with a --side.",
+    help="Markers that define the world's axes: markers in --markers, or one marker with a --side.",
 )
 @click.option(
     "--markers",
     "table",
     type=click.Path(path_type=Path),
-    help="A table with the corners of the known markers.  [default: SEQ's, if there is no --side]",
+    help="Table with the corners of the known markers.  [default: SEQ's, if there is no --side]",
 )
-@click.option("--side", "side_m", type=float, help="Of the markers' black squares, in metres.")
-@click.option("--estimate-sides", is_flag=True, help="Find the sides of markers that are not known, too.")
+@click.option("--side", "side_m", type=float, help="Side of the markers' black squares, in metres.")
+@click.option("--estimate-sides", is_flag=True, help="Estimate the sides of unknown markers, too.")
 @click.option(
     "--check",
     "checked",
     type=click.Path(path_type=Path),
     metavar="MAP",
-    help="Check this map instead of making one.",
+    help="Check the table MAP instead of writing one.",
 )
-@click.option("--drone", "drones", metavar="NAME,NAME...", help="Whose videos of a sequence.  [default: all]")
+@click.option(
+    "--drone",
+    "drones",
+    metavar="NAME,NAME...",
+    help="Drones of a sequence whose videos are used.  [default: all]",
+)
 @click.option(
     "--camera",
     "--intrinsics",
     "camera_file",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Intrinsics of the videos: .csv, .toml or .yml.  [default: those of a sequence]",
+    help="Intrinsics of the videos' cameras: .csv, .toml or .yml.  [default: the sequence's]",
 )
 @click.option(
     "--camera-name",
     "camera_names",
     metavar="NAME,NAME...",
-    help="Of the camera in FILE, where that has several: one for all videos, or one for each.",
+    help="Names of cameras in FILE, if FILE has several cameras: one for all videos, or one for each video.",
 )
-@click.option("--scale-camera", is_flag=True, help="Scale intrinsics for another size of the same images.")
-@click.option("--fov", "fov_deg", type=Numbers(2), metavar="H,V", help="Instead: fields of view in degrees.")
-@click.option("--dictionary", default="4x4_1000", show_default=True, help="Of the markers.")
+@SCALE_CAMERA
+@FOV
+@dictionary_option()
 @click.option(
     "--seen-from",
     "seen_from_m",
     type=Numbers(3),
     metavar="X,Y,Z",
-    help="A place that all measured markers face.  [default: their middle]",
+    help="Position that all measured markers face, in metres.  [default: the mean of their corners]",
 )
 @FRAMES
 @FORCE
@@ -142,7 +147,7 @@ def map_markers(
         write_marker_corners(out, measured.marker_map.corners_m)
         show_measured(measured, out, quiet, json_path, force)
         return
-    # What can be wrong is looked at before the videos are.
+    # Errors of small files are found before the videos are read, which takes long.
     marker_map = None if checked is None else read_marker_map(checked)
     world = {} if out is None else known_corners(known, table, side_m, sources)
     videos = videos_of(sources, drones, Lenses(camera_file, camera_names, scale_camera, fov_deg))

@@ -1,4 +1,4 @@
-"""What `map-markers` starts from: the corners of known markers, and videos with their lenses."""
+"""Inputs of `map-markers`: the corners of known markers, and videos with their lenses."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def known_corners(
     known: str | None, table: Path | None, side_m: float | None, sources: tuple[Path, ...]
 ) -> dict[int, np.ndarray]:
-    """The corners of the known markers, by id."""
+    """Corners of the known markers, (4, 3) in metres, by id."""
     from psotrack.datasets.dpjait import MARKER_CORNERS
     from psotrack.inside_out import corners_in_own_frame, read_marker_map
 
@@ -46,7 +46,7 @@ def known_corners(
 
 @dataclass(frozen=True)
 class Lenses:
-    """What was said of the videos' lenses."""
+    """Options that give the lenses of the videos."""
 
     file: Path | None
     names: str | None
@@ -54,7 +54,7 @@ class Lenses:
     fov_deg: tuple[float, float] | None
 
     def of(self, video: VideoInfo, index: int, count: int) -> Camera:
-        """The lens of a video, number `index` of `count`."""
+        """Lens of a video, number `index` of `count` videos."""
         from psotrack.inside_out import choose_lens
 
         names = [None] if self.names is None else self.names.split(",")
@@ -70,12 +70,12 @@ class Lenses:
 def videos_of(
     sources: tuple[Path, ...], drones: str | None, lenses: Lenses
 ) -> dict[str, tuple[VideoInfo, Camera]]:
-    """The videos with their lenses, by name."""
+    """Videos with their lenses, by name."""
     from psotrack.recordings import probe
 
     if sources[0].is_dir():
         if len(sources) > 1:
-            raise SettingsError("SOURCE", expected="one sequence, or videos", found=f"{len(sources)} of them")
+            raise SettingsError("SOURCE", expected="one sequence, or videos", found=f"{len(sources)} sources")
         return _of_sequence(sources[0], drones, lenses)
     if drones is not None:
         raise SettingsError("--drone", expected="a sequence's folder as SOURCE", found=f"{sources[0]}")
@@ -97,7 +97,7 @@ def _of_sequence(folder: Path, drones: str | None, lenses: Lenses) -> dict[str, 
     chosen = list(onboard) if drones is None else drones.split(",")
     unknown = [name for name in chosen if name not in onboard]
     if unknown:
-        raise SettingsError("--drone", expected=f"some of {', '.join(onboard)}", found=", ".join(unknown))
+        raise SettingsError("--drone", expected=f"names among {', '.join(onboard)}", found=", ".join(unknown))
     videos = {}
     for index, name in enumerate(chosen):
         video, K = onboard[name].video, onboard[name].K
@@ -110,7 +110,7 @@ def _of_sequence(folder: Path, drones: str | None, lenses: Lenses) -> dict[str, 
 
 
 def leading(video: VideoInfo, num_frames: int | None) -> VideoInfo:
-    """The first frames of a video."""
+    """A video cut to its first `num_frames` frames; None keeps all frames."""
     if num_frames is None:
         return video
     if not 0 < num_frames <= video.num_frames:

@@ -1,4 +1,8 @@
-"""How commands answer: progress, sentences and tables for people, JSON for programs."""
+"""Output of the commands: progress, sentences and tables for people, JSON for programs.
+
+Most functions take the values of three options: `quiet` (--quiet), `json_path` (--json; `-` is stdout) and `force`
+(--force).
+"""
 
 from __future__ import annotations
 
@@ -13,25 +17,25 @@ import click
 from psotrack.errors import SettingsError
 from psotrack.support import Report, atomic_write, no_progress, progress_bar, refuse_to_overwrite
 
-#: Heading of places in a table.
-PLACE = "centre (m)"
+#: Heading of a column of positions; `print_table` keeps each of its cells on one line.
+POSITION = "centre (m)"
 
 
 def report_to(quiet: bool) -> Report:
-    """Whom long work reports to."""
+    """Progress display for long work: none with --quiet, else a bar on stderr."""
     return no_progress if quiet else progress_bar
 
 
-def say(quiet: bool, json_path: Path | None, sentence: str) -> None:
-    """One sentence on stdout, unless that is silent or taken by JSON."""
+def print_line(quiet: bool, json_path: Path | None, sentence: str) -> None:
+    """Print a sentence on stdout; nothing with --quiet or if stdout takes the JSON."""
     if not quiet and json_path != Path("-"):
         click.echo(sentence)
 
 
-def show(
+def print_table(
     quiet: bool, json_path: Path | None, headings: tuple[str, ...], rows: Iterable[tuple[str, ...]]
 ) -> None:
-    """A table of names and numbers on stdout, where `say` would say something; places stay on one line."""
+    """Print a table on stdout, names in the first column and numbers in the others; see `print_line`."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -40,24 +44,29 @@ def show(
         return
     table = Table(box=box.HORIZONTALS, show_edge=False)
     for index, heading in enumerate(headings):
-        table.add_column(heading, justify="right" if index else "left", no_wrap=heading == PLACE)
+        table.add_column(heading, justify="right" if index else "left", no_wrap=heading == POSITION)
     for row in rows:
         table.add_row(*row)
     Console().print(table)
 
 
-def known(value: float) -> float | None:
-    """A number as JSON has it: null for none."""
+def finite_or_none(value: float) -> float | None:
+    """The number, or None (null in JSON) for NaN and infinities."""
     return float(value) if math.isfinite(value) else None
 
 
-def in_words(values: Iterable[float], digits: int) -> str:
-    """Numbers with spaces between them."""
+def format_numbers(values: Iterable[float], digits: int) -> str:
+    """Numbers with `digits` decimals and spaces between them."""
     return " ".join(f"{value:.{digits}f}" for value in values)
 
 
 def check_outputs(out: Path | None, json_path: Path | None, force: bool) -> None:
-    """Refuse, before any work, a table that is no CSV, files that are there, and one file for both."""
+    """Check the output files before any work.
+
+    Raises:
+        SettingsError: `out` is not a CSV file, or `json_path` is the same file.
+        OutputError: a file exists and `force` is not set.
+    """
     if out is not None and out.suffix != ".csv":
         raise SettingsError("--out", expected="a file that ends in .csv", found=out.name)
     for path in (out, json_path):
@@ -67,8 +76,12 @@ def check_outputs(out: Path | None, json_path: Path | None, force: bool) -> None
         raise SettingsError("--json", expected="another file than --out", found=f"{out} twice")
 
 
-def answer(json_path: Path | None, content: Any, force: bool) -> None:
-    """The answer for programs: on stdout, or in a file that was not there."""
+def output_json(json_path: Path | None, content: Any, force: bool) -> None:
+    """Write JSON for programs, to stdout or to a new file.
+
+    Raises:
+        OutputError: the file exists and `force` is not set.
+    """
     if json_path == Path("-"):
         click.echo(json.dumps(content, indent=2, allow_nan=False))
     elif json_path is not None:
@@ -76,7 +89,7 @@ def answer(json_path: Path | None, content: Any, force: bool) -> None:
         write_json(json_path, content)
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Write a JSON file whole."""
-    with atomic_write(path) as temporary:
+def write_json(path: str | Path, content: Any) -> None:
+    """Write a JSON file; an interruption leaves no partial file."""
+    with atomic_write(Path(path)) as temporary:
         temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
