@@ -56,12 +56,14 @@ def _options(command: click.Command, context: click.Context) -> str:
         for param in command.get_params(context)
         if isinstance(param, click.Option) and (record := param.get_help_record(context)) is not None
     ]
-    lines = [
-        f"| `{_cell(names)}` | {_cell(words).replace('[', chr(92) + '[').replace('<', '&lt;')} |"
-        for names, words in records
-    ]
+    lines = [f"| `{_one_line(names)}` | {_escaped(_one_line(words))} |" for names, words in records]
     return "\n".join(["| option | meaning |", "|---|---|", *lines])
 
 
-def _cell(text: str) -> str:
-    return " ".join(text.split()).replace("|", "\\|")
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
+
+
+def _escaped(text: str) -> str:
+    """Text whose bars, brackets and angles Markdown takes literally."""
+    return text.replace("|", "\\|").replace("[", "\\[").replace("<", "&lt;")

@@ -119,9 +119,13 @@ def pivot(
 def markdown(table: pd.DataFrame) -> str:
     """A table in Markdown."""
     lines = [list(table.columns), ["---"] * len(table.columns), *table.to_numpy().tolist()]
-    return "\n".join(
-        f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in line)} |" for line in lines
-    )
+    return "\n".join(f"| {' | '.join(map(_cell, line))} |" for line in lines)
+
+
+def _cell(content: Any) -> str:
+    """A cell of a table; a vertical bar is escaped outside of code only."""
+    text = str(content)
+    return text if text.startswith("`") else text.replace("|", "\\|")
 
 
 def result_table(name: str) -> str:
