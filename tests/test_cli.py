@@ -181,6 +181,7 @@ def test_the_paper_baseline_runs(run: Run, sequence: Path, tmp_path: Path) -> No
     assert (settings["swarm"], settings["score"]) == ("joint", "hard")
 
 
+@pytest.mark.slow
 def test_smoothed_tracks_are_surer(run: Run, sequence: Path, tmp_path: Path) -> None:
     for name, more in (("filtered", ()), ("smoothed", ("--smooth",))):
         assert run(*track(sequence, tmp_path / f"{name}.csv", *more)).code == 0
@@ -222,6 +223,7 @@ def test_drones_that_are_not_there_yet_are_awaited(run: Run, sequence: Path, tmp
     assert pd.read_csv(tmp_path / "t.csv")["drone"].nunique() < 7
 
 
+@pytest.mark.slow
 def test_projection_lines_from_the_sequence_a_folder_and_blobs(
     run: Run, sequence: Path, tmp_path: Path
 ) -> None:

@@ -56,6 +56,7 @@ def test_a_second_sequence_compiles_nothing(compiled):
     assert compiled() == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [{"num_frames": 6, "num_drones": 3}, {"swarm": "joint"}])
 def test_another_shape_or_program_compiles_once(compiled, change):
     """Also shows that the count above can see a compilation."""

@@ -229,6 +229,7 @@ def test_the_level_is_the_finest_that_holds_ring_and_search(distance_m, reach_m,
 # Gradients.
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_finite_differences():
     """On windows that neighbours claim of, of several levels; in float64."""
     pair = np.array([[0.3, -0.2, 1.3], [0.65, -0.05, 1.4]])
@@ -254,6 +255,7 @@ def test_gradients_are_those_of_finite_differences():
     assert np.abs(gradient).min() > 1e-3
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_everywhere():
     """Also beyond the windows, at a camera, behind one, and where a neighbour has claimed all."""
     expected_m = np.stack([TRUTH_M[0], TRUTH_M[0]])

@@ -21,6 +21,8 @@ from psotrack.silhouettes import SilhouetteSettings
 from psotrack.simulation import simulate
 from psotrack.trajectories import Trajectories, write_trajectories
 
+pytestmark = pytest.mark.slow
+
 
 @dataclass(frozen=True)
 class Lab:

@@ -76,6 +76,7 @@ def test_it_follows_the_drones(coverage, swarm):
     assert (info.num_cameras == 5).all()
 
 
+@pytest.mark.slow
 def test_the_hard_score_follows_as_well_as_its_plateau_allows(coverage):
     _, info = track(coverage, score="hard")
     error_m = np.linalg.norm(info.position_m - TRUTH_M, axis=-1)
@@ -94,6 +95,7 @@ def test_velocity_is_estimated(coverage):
     assert error_m_s[0].min() > 0.4
 
 
+@pytest.mark.slow
 def test_chunks_do_not_matter(coverage):
     """The state carries everything over the border of chunks, the random key too: bit for bit."""
     state, params, program = prepared()
@@ -139,6 +141,7 @@ def test_same_seed_same_result(coverage, swarm):
     np.testing.assert_allclose(other.position_m, first.position_m, atol=CELL_M)
 
 
+@pytest.mark.slow
 def test_drones_of_their_own_swarms_interact_by_claims_alone(coverage):
     """Without claims, starting the second drone elsewhere changes no bit of the first."""
     elsewhere_m = TRUTH_M[0] + [[0, 0, 0], [0.1, 0, 0]]

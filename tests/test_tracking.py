@@ -117,6 +117,7 @@ def test_whoever_interrupts_a_batch_is_heard(silhouettes):
     assert 1 <= len(first_frames) <= 3
 
 
+@pytest.mark.slow
 def test_chunk_after_chunk_is_one_program(silhouettes, caplog):
     """It was compiled twice: what is learned of sizes began as another type than it went on with."""
     shorter = replace(silhouettes, num_frames=60, arrays=tuple(array[:60] for array in silhouettes.arrays))
