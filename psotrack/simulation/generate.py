@@ -44,7 +44,7 @@ _logger = logging.getLogger(__name__)
 
 def simulate(
     scenario: str | Scenario,
-    root: Path,
+    root: str | Path,
     *,
     num_frames: int | None = None,
     scale: float = 1.0,

@@ -53,7 +53,7 @@ class _Strip:
 
 
 def save_preview(
-    path: Path,
+    path: str | Path,
     scenario: Scenario,
     *,
     num_frames: int | None = None,
@@ -78,6 +78,7 @@ def save_preview(
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
     num_frames = frames_of(scenario, num_frames)
+    path = Path(path)
     refuse_to_overwrite(path, force)
     scale = _PICTURE_PX / scenario.image_size_wh[0]
     scene = build(scenario, scale=scale, seed=seed)

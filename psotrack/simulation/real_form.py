@@ -50,8 +50,8 @@ _REFLECTION_M = (1.3, -1.1, 0.02)
 
 
 def write_as_real(
-    sequence: Path,
-    root: Path,
+    sequence: str | Path,
+    root: str | Path,
     *,
     rate_hz: float = 100.0,
     offset_s: float = 0.37,

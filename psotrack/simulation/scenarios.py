@@ -391,7 +391,7 @@ def wrong(recipe: Scenario, field: str, *, expected: str, found: str, remedy: st
     return SettingsError(f"scenario {recipe.name}: {field}", expected=expected, found=found, remedy=remedy)
 
 
-def load(path: Path) -> Scenario:
+def load(path: str | Path) -> Scenario:
     """The scenario in a TOML file of the same form as the presets; paths in it start at its folder.
 
     Raises:

@@ -79,7 +79,7 @@ class Recorded:
 # --- files
 
 
-def read_recording(path: Path) -> Recorded:
+def read_recording(path: str | Path) -> Recorded:
     """Read a recording of one drone: one of ours, a trajectory of psotrack, or a pose file of the dataset.
 
     Ours, and trajectories, have the columns `time_s`, `x_m`, `y_m`, `z_m` and, where known, `qw`, `qx`, `qy`, `qz`,
@@ -93,7 +93,7 @@ def read_recording(path: Path) -> Recorded:
     """
     header = read_rows(path, ";")[:1]
     table = read_table(path, ";" if header and len(header[0].cells) > 1 else ",")
-    recorded = _from_poses(path) if table.find("id") and table.find("pos_x") else _from_table(table)
+    recorded = _from_poses(Path(path)) if table.find("id") and table.find("pos_x") else _from_table(table)
     time_s, position_m, orientation_wxyz = recorded
     if len(time_s) < MIN_SAMPLES:
         raise InputError(path, expected=f"at least {MIN_SAMPLES} samples", found=f"{len(time_s)}")
@@ -101,7 +101,7 @@ def read_recording(path: Path) -> Recorded:
 
 
 def write_recording(
-    path: Path,
+    path: str | Path,
     time_s: Float[np.ndarray, "samples"],
     position_m: Float[np.ndarray, "samples 3"],
     orientation_wxyz: Float[np.ndarray, "samples 4"] | None,
