@@ -541,6 +541,7 @@ def test_times_may_be_irregular() -> None:
 # Errors that are common to all frames.
 
 
+@pytest.mark.slow
 def test_errors_common_to_all_frames_are_not_averaged_away() -> None:
     """The effect of each error on the poses changes slowly, and jumps as other markers come into view: 40 cameras."""
     rng, frames, inside, inside_without, gated = np.random.default_rng(44), 12, [], [], 0

@@ -495,6 +495,7 @@ def test_a_larger_marker_makes_a_larger_room():
     )
 
 
+@pytest.mark.slow
 def test_different_sides_are_estimated():
     normals = MarkerMap(ROOM).normals
     sizes = {marker: 0.2 + 0.02 * marker for marker in ROOM}
