@@ -8,7 +8,7 @@ from helpers import ring_rig
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
-from psotrack.calibration import Alike, adjust, improve, in_boxes, off_cameras
+from psotrack.calibration import CommonErrors, adjust, find_drones_in_boxes, find_wrong_cameras, improve
 from psotrack.errors import SettingsError
 from psotrack.geometry import CameraRig, project
 from psotrack.recordings import Detections
@@ -24,7 +24,7 @@ def seen(rng, *, lasting_px=1.0, stated_px=1.0, noise_px=1.0, rig=RIG):
     drone = np.repeat(np.arange(DRONES), FRAMES)
     pixels = project(rig.cameras, points_m[:, None])[0]
     pixels += rng.normal(0, lasting_px, (DRONES, len(rig), 2))[drone] + rng.normal(0, noise_px, pixels.shape)
-    return pixels, Alike(drone, np.full(pixels.shape[:2], stated_px))
+    return pixels, CommonErrors(drone, np.full(pixels.shape[:2], stated_px))
 
 
 def posed(indices, rng, *, turn_deg=0.0, shift_m=0.0):
@@ -41,8 +41,8 @@ def test_lasting_errors_are_in_the_covariance():
     """Of draws with errors of 2 px that last, beside 1 px that does not, 90 % ellipsoids hold 9 of 10 cameras."""
     rng, runs, distances = np.random.default_rng(1), 12, []
     for _ in range(runs):
-        pixels, alike = seen(rng, lasting_px=2.0, stated_px=2.0)
-        adjusted = adjust(RIG, pixels, fixed=("c0", "c3"), alike=[alike])
+        pixels, common_errors = seen(rng, lasting_px=2.0, stated_px=2.0)
+        adjusted = adjust(RIG, pixels, fixed=("c0", "c3"), common_errors=[common_errors])
         off = adjusted.rig.cameras.centre_world - RIG.cameras.centre_world
         distances += [off[i] @ np.linalg.solve(adjusted.centre_covariance_m2[i], off[i]) for i in (1, 2, 4)]
     # The three of a run are not independent: counted as if there were a third of them.
@@ -52,10 +52,13 @@ def test_lasting_errors_are_in_the_covariance():
 
 
 def test_lasting_errors_larger_than_stated_are_noticed():
-    pixels, alike = seen(np.random.default_rng(2), lasting_px=8.0)
+    pixels, common_errors = seen(np.random.default_rng(2), lasting_px=8.0)
     small, stated = (
-        np.trace(adjust(RIG, pixels, alike=kinds).centre_covariance_m2, axis1=1, axis2=2).mean()
-        for kinds in ([replace(alike, std_px=0.1 * alike.std_px)], [replace(alike, std_px=8 * alike.std_px)])
+        np.trace(adjust(RIG, pixels, common_errors=kinds).centre_covariance_m2, axis1=1, axis2=2).mean()
+        for kinds in (
+            [replace(common_errors, std_px=0.1 * common_errors.std_px)],
+            [replace(common_errors, std_px=8 * common_errors.std_px)],
+        )
     )
     # Points and poses take up the greater part of 30 common errors: what is left shows half of them or so.
     assert 0.15 < small / stated < 1.1
@@ -63,8 +66,8 @@ def test_lasting_errors_larger_than_stated_are_noticed():
 
 @pytest.mark.parametrize("seed", range(6))
 def test_a_right_rig_stays_as_it_is(seed):
-    pixels, alike = seen(np.random.default_rng(seed), lasting_px=1.5, stated_px=1.5)
-    improved = improve(RIG, pixels, alike=[alike], refine_focal_length=True)
+    pixels, common_errors = seen(np.random.default_rng(seed), lasting_px=1.5, stated_px=1.5)
+    improved = improve(RIG, pixels, common_errors=[common_errors], refine_focal_length=True)
     assert improved.rig is RIG
     assert (improved.moved, improved.zoomed, improved.rescaled, improved.final) == ((), {}, False, None)
     # What the points alone would have made of it.
@@ -75,8 +78,8 @@ def test_a_right_rig_stays_as_it_is(seed):
 def test_only_the_camera_that_was_pushed_is_moved(turn_deg, shift_m):
     rng = np.random.default_rng(3)
     rig = posed([2], rng, turn_deg=turn_deg, shift_m=shift_m)
-    pixels, alike = seen(rng)
-    improved = improve(rig, pixels, alike=[alike])
+    pixels, common_errors = seen(rng)
+    improved = improve(rig, pixels, common_errors=[common_errors])
     assert (improved.moved, improved.zoomed) == (("c2",), {})
     off_m = improved.rig.cameras.centre_world - RIG.cameras.centre_world
     np.testing.assert_array_equal(off_m[[0, 1, 3, 4]], 0)
@@ -84,26 +87,28 @@ def test_only_the_camera_that_was_pushed_is_moved(turn_deg, shift_m):
     # 1 in 1000 is farther off; the others' are how well the points know them.
     assert off_m[2] @ np.linalg.solve(covariance_m2[2], off_m[2]) < chi2.ppf(0.999, 3)
     np.testing.assert_array_equal(covariance_m2[0], improved.everything.centre_covariance_m2[0])
-    assert improve(rig, pixels, alike=[alike], fixed=("c0", "c1", "c3", "c4")).moved == ("c2",)
-    assert improve(rig, pixels, alike=[alike], fixed=("c2",)).moved != ("c2",)
+    assert improve(rig, pixels, common_errors=[common_errors], fixed=("c0", "c1", "c3", "c4")).moved == (
+        "c2",
+    )
+    assert improve(rig, pixels, common_errors=[common_errors], fixed=("c2",)).moved != ("c2",)
 
 
 def test_where_most_are_off_all_are_moved():
     rng = np.random.default_rng(4)
     rig = posed(range(5), rng, turn_deg=0.6)
-    pixels, alike = seen(rng)
-    adjusted = adjust(rig, pixels, alike=[alike])
-    assert off_cameras(rig, adjusted) == RIG.names
-    improved = improve(rig, pixels, alike=[alike])
+    pixels, common_errors = seen(rng)
+    adjusted = adjust(rig, pixels, common_errors=[common_errors])
+    assert find_wrong_cameras(rig, adjusted) == RIG.names
+    improved = improve(rig, pixels, common_errors=[common_errors])
     np.testing.assert_array_equal(improved.rig.cameras.T_cam_world, adjusted.rig.cameras.T_cam_world)
 
 
 def test_focal_lengths_that_are_off_are_scaled_and_nothing_else():
-    pixels, alike = seen(np.random.default_rng(5))
+    pixels, common_errors = seen(np.random.default_rng(5))
     K = RIG.cameras.K.copy()
     K[:, :2, :2] *= 1.02
     rig = CameraRig(RIG.names, replace(RIG.cameras, K=K))
-    improved = improve(rig, pixels, alike=[alike], refine_focal_length=True)
+    improved = improve(rig, pixels, common_errors=[common_errors], refine_focal_length=True)
     assert (improved.moved, improved.rescaled) == ((), True)
     final = improved.final
     assert abs(final.focal_scale - 1 / 1.02) < 4 * final.focal_scale_std
@@ -112,11 +117,11 @@ def test_focal_lengths_that_are_off_are_scaled_and_nothing_else():
 
 def test_a_camera_with_another_lens_is_not_taken_for_one_that_was_moved():
     """A focal length 2 % too long looks like a camera that is 8 cm too near: both are said, and in the covariance."""
-    pixels, alike = seen(np.random.default_rng(8))
+    pixels, common_errors = seen(np.random.default_rng(8))
     K = RIG.cameras.K.copy()
     K[1, :2, :2] *= 1.02
     rig = CameraRig(RIG.names, replace(RIG.cameras, K=K))
-    improved = improve(rig, pixels, alike=[alike])
+    improved = improve(rig, pixels, common_errors=[common_errors])
     assert (improved.moved, list(improved.zoomed)) == (("c1",), ["c1"])
     scale, std = improved.zoomed["c1"]
     assert abs(scale - 1 / 1.02) < 4 * std
@@ -155,7 +160,7 @@ def test_boxes_that_are_cut_or_touch_others_tell_nothing():
         name: Detections(np.repeat(np.arange(3), len(of)), np.tile(of, (3, 1)), np.ones(3 * len(of)))
         for name, of in zip(RIG.names, boxes, strict=True)
     }
-    views = in_boxes(RIG, found, tracks)
+    views = find_drones_in_boxes(RIG, found, tracks)
     assert views.points == ("a@0", "b@0", "a@1", "b@1", "a@2", "b@2")
     there = np.isfinite(views.points_px).all(axis=-1)
     np.testing.assert_array_equal(there, np.isfinite(views.noise_px))
@@ -164,7 +169,7 @@ def test_boxes_that_are_cut_or_touch_others_tell_nothing():
     np.testing.assert_allclose(views.points_px[1], project(RIG.cameras, position_m[0, 1])[0], atol=1e-9)
     # A pixel, and 5 % of √(40 · 20) px.
     np.testing.assert_allclose(views.noise_px[there], 1 + 0.05 * np.sqrt(800))
-    while_, lasting, *_ = views.alike
+    while_, lasting, *_ = views.common_errors
     np.testing.assert_array_equal(while_.label[[0, 2]] == while_.label[0], True)
     assert len(set(while_.label.tolist())) == 4
     np.testing.assert_array_equal(lasting.label, [0, 1, 0, 1, 0, 1])

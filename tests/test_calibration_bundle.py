@@ -8,7 +8,7 @@ from helpers import ring_rig
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
-from psotrack.calibration import Alike, adjust
+from psotrack.calibration import CommonErrors, adjust
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import CameraRig, project
 
@@ -115,10 +115,10 @@ def test_errors_that_are_alike_count_as_one():
     seven = np.repeat(np.arange(60), 7)
     once = adjust(rig, pixels)
     # Nearly all of the noise is in common, so that the seven together have 1 / 700 of their own.
-    alike = adjust(rig, pixels[seven], 0.1, alike=[Alike(seven, np.ones((420, 4)))])
+    common_errors = adjust(rig, pixels[seven], 0.1, common_errors=[CommonErrors(seven, np.ones((420, 4)))])
     believed = adjust(rig, pixels[seven])
     variance = [
-        np.trace(one.centre_covariance_m2, axis1=1, axis2=2).mean() for one in (once, alike, believed)
+        np.trace(one.centre_covariance_m2, axis1=1, axis2=2).mean() for one in (once, common_errors, believed)
     ]
     # Residuals are 100 times what 0.1 px explains, so that what is stated of independent errors is 1 / 7 here, too.
     assert variance[1] / variance[0] == pytest.approx(8 / 7, rel=0.1)

@@ -23,8 +23,8 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from psotrack.calibration import centre_by_pose, improve, in_boxes
-from psotrack.calibration.gauge import common_motions, departure, metric
+from psotrack.calibration import centre_by_pose, find_drones_in_boxes, improve
+from psotrack.calibration.gauge import common_motions, pose_change_metric, pose_changes
 from psotrack.datasets.dpjait import read_detections, read_sequence
 from psotrack.geometry import CameraRig
 from psotrack.methods import detection_files_of
@@ -100,8 +100,8 @@ def of_sequence(folder: Path) -> pd.DataFrame:
     truth, rng, rows = recording.rig, np.random.default_rng(0), []
     for name, (fault, tampered) in FAULTS.items():
         rig = fault(truth, rng)
-        views = in_boxes(rig, boxes, recording.truth)
-        improved = improve(rig, views.points_px, views.noise_px, alike=views.alike)
+        views = find_drones_in_boxes(rig, boxes, recording.truth)
+        improved = improve(rig, views.points_px, views.noise_px, common_errors=views.common_errors)
         whole = len(improved.moved) == len(rig)
         free_m, _ = errors(truth, rig, improved.everything.rig, whole=True)
         (before_m, before_deg), (after_m, after_deg) = (
@@ -137,12 +137,12 @@ def errors(
 ) -> tuple[Float[np.ndarray, "cameras 3"], Float[np.ndarray, "cameras 3"]]:
     """How far centres, metres, and axes, degrees, are off the truth; if `whole`, off that moved as near as can be."""
     T = np.asarray(given.cameras.T_cam_world)
-    off = departure(T, np.asarray(truth.cameras.T_cam_world))
+    off = pose_changes(T, np.asarray(truth.cameras.T_cam_world))
     if whole:
         motions = common_motions(T)
-        held = motions.T @ metric(T)
+        held = motions.T @ pose_change_metric(T)
         off = off - motions @ np.linalg.solve(held @ motions, held @ off)
-    off = departure(T, np.asarray(now.cameras.T_cam_world)) - off
+    off = pose_changes(T, np.asarray(now.cameras.T_cam_world)) - off
     off = off[:-1].reshape(-1, 6)
     by_pose = np.stack([centre_by_pose(pose[:3, :3], pose[:3, 3]) for pose in T])
     return np.matvec(by_pose, off), np.rad2deg(off[:, :3])

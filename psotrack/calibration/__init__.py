@@ -1,9 +1,9 @@
-"""Calibration: lenses and poses of cameras, and a rig that agrees with what its cameras see.
+"""Calibration: lenses and poses of cameras, and adjustment of a rig to what its cameras see.
 
-In: a data sheet or a video of a ChArUco board (`intrinsics`), points of known position (`marks`, `extrinsics`), or
-detections of drones (`bundle`). Out: lenses and rigs with covariances. `bundle` adjusts all cameras and points
-together, `alike` adds errors that all cameras share to the covariance, and `significance` says which cameras are
-wrong for certain. The files of rigs are read and written in `psotrack.geometry`.
+In: a data sheet or a video of a ChArUco board (`intrinsics`), points of known position (`image_points`, `extrinsics`),
+or detections of drones (`bundle`). Out: lenses and rigs with covariances. `bundle` adjusts all cameras and points
+together, `common_errors` adds errors that many points share to the covariance, and `significance` finds the cameras
+that are wrong for certain. The files of rigs are read and written in `psotrack.geometry`.
 """
 
 import lazy_loader

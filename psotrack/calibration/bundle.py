@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.calibration.alike import Alike, covariance_of_alike
 from psotrack.calibration.bundle_equations import (
     BundleState,
     Problem,
@@ -24,8 +23,9 @@ from psotrack.calibration.bundle_equations import (
     solved,
     weights_of,
 )
+from psotrack.calibration.common_errors import CommonErrors, covariance_of_common_errors
 from psotrack.calibration.derivatives import centre_by_pose
-from psotrack.calibration.gauge import common_motions, metric
+from psotrack.calibration.gauge import common_motions, pose_change_metric
 from psotrack.calibration.residuals import GATE, inflation, spread_px
 from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.geometry import NEAR_M, Camera, CameraRig, to_camera, triangulate
@@ -67,12 +67,12 @@ def adjust(
     *,
     fixed: Ordered[str] = (),
     rescaled: Ordered[str] = (),
-    alike: Ordered[Alike] = (),
+    common_errors: Ordered[CommonErrors] = (),
 ) -> AdjustedRig:
     """The rig, and the points, that explain what the cameras see.
 
     The covariance is that of errors of the stated noise, wider where residuals are larger than it explains, and of
-    those that are alike: the middle of a drone's box is off in the same way for many frames.
+    common errors: the middle of a drone's box is off in the same way for many frames.
 
     Args:
         rig: where the cameras are about.
@@ -80,7 +80,7 @@ def adjust(
         noise_px: standard deviation along x and along y of errors that are independent, one for all or of each.
         fixed: names of cameras that stay where they are.
         rescaled: names of cameras whose focal lengths are multiplied with a common factor.
-        alike: errors that points have in common besides, if any.
+        common_errors: further errors, each of which several points have in common.
 
     Raises:
         SettingsError: the noise is not above 0, or a fixed camera is not in the rig.
@@ -103,7 +103,7 @@ def adjust(
     rows = np.flatnonzero(placed.any(axis=1))
     free, common = _unknowns(rig, fixed, bool(rescaled))
     given = np.asarray(rig.cameras.T_cam_world)
-    held = common.T @ metric(given)
+    held = common.T @ pose_change_metric(given)
     held /= np.sqrt(np.diag(held @ common))[:, None]
     noise = np.where(placed, noise_px, 1.0)[rows]
     zoomed = np.array([name in rescaled for name in rig.names])
@@ -124,8 +124,8 @@ def adjust(
         if (used == before).all():
             break
     _check_seen(rig, used, fixed, rescaled)
-    alike = [Alike(kind.label[rows], kind.std_px[rows]) for kind in alike]
-    return _adjusted(rig, problem, state, used, rows, len(points_px), alike)
+    common_errors = [CommonErrors(kind.label[rows], kind.std_px[rows]) for kind in common_errors]
+    return _adjusted(rig, problem, state, used, rows, len(points_px), common_errors)
 
 
 def _check_seen(
@@ -174,7 +174,7 @@ def _adjusted(
     used: Bool[np.ndarray, "rows cameras"],
     rows: Int[np.ndarray, " rows"],
     num_points: int,
-    alike: Ordered[Alike],
+    common_errors: Ordered[CommonErrors],
 ) -> AdjustedRig:
     """The answer for all points, with the covariance of the cameras."""
     weights = weights_of(problem, state, used, robust=False)
@@ -192,7 +192,7 @@ def _adjusted(
     unknowns = problem.free.shape[1] - problem.common.shape[1] + 3 * int(kept.sum())
     squares = float(np.sum((residual_px / problem.noise_px)[used] ** 2))
     covariance = inflation(squares, 2 * int(used.sum()) - unknowns) * np.linalg.inv(reduced)
-    covariance += covariance_of_alike(problem, state, weights, equations, alike)
+    covariance += covariance_of_common_errors(problem, state, weights, equations, common_errors)
     covariance = problem.free @ covariance @ problem.free.T
     by_camera, centres = [], []
     for index, T in enumerate(state.T_cam_world):

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.calibration.derivatives import reproject
-from psotrack.calibration.gauge import departure
+from psotrack.calibration.gauge import pose_changes
 from psotrack.geometry import Camera
 
 #: Weight of a common motion of the whole rig: so large that it is none, so small that sums keep their digits.
@@ -42,7 +42,7 @@ class Problem:
     free: Float[np.ndarray, "unknowns free"]
     #: (unknowns, motions): common motions that are open, in units of the cameras' own.
     common: Float[np.ndarray, "unknowns motions"]
-    #: (motions, unknowns): from a departure to how much of it is common, in units in which all motions count alike.
+    #: (motions, unknowns): projection of pose changes on the common motions, all of equal weight.
     held: Float[np.ndarray, "motions unknowns"]
 
 
@@ -89,7 +89,7 @@ def _cost(
     problem: Problem, state: BundleState, used: Bool[np.ndarray, "points cameras"], robust: bool
 ) -> float:
     squares = (distance_px(problem, state) / problem.noise_px)[used] ** 2
-    common = problem.held @ departure(problem.given, state.T_cam_world)
+    common = problem.held @ pose_changes(problem.given, state.T_cam_world)
     loss = np.log1p(squares) if robust else squares
     return float(loss.sum() + _HELD * np.sum(common**2))
 
@@ -153,7 +153,7 @@ def equations_of(
     of_cameras += np.diag(damping * np.diag(of_cameras))
     held = problem.held @ free
     of_cameras += _HELD * held.T @ held
-    right -= _HELD * held.T @ problem.held @ departure(problem.given, state.T_cam_world)
+    right -= _HELD * held.T @ problem.held @ pose_changes(problem.given, state.T_cam_world)
     inverse = np.linalg.inv(of_points)
     back = -inverse @ mixed
     step = np.einsum("pij,pj->pi", inverse, point_right)

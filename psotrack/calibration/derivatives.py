@@ -1,4 +1,4 @@
-"""Pixels of known points in a camera, and what they and its centre change by when its pose does, in float64."""
+"""Pixels of known points in a camera, and derivatives of the pixels and of the camera's centre by its pose, float64."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def reproject(
 ) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 3"], Float[np.ndarray, "points 2 3"]]:
     """Pixels of points, and their derivatives by a small turn about the camera's axes (rad) and by its translation.
 
-    They are OpenCV's, of normalised coordinates, so that they hold for a K with skew too.
+    The derivatives are OpenCV's for normalised coordinates, multiplied with K, so that they are valid for skew too.
     """
     turned = np.ascontiguousarray(points_m @ R.T)
     pixels, slopes = pixel_slopes(turned, np.zeros(3), t_m, lens)
@@ -30,7 +30,7 @@ def pixel_slopes(
     t_m: Float[np.ndarray, "3"],
     lens: Camera,
 ) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 unknowns"]]:
-    """Pixels, and their derivatives by a Rodrigues vector, a translation, and more that OpenCV knows."""
+    """Pixels, and their derivatives by OpenCV's unknowns: a Rodrigues vector, a translation, and the intrinsics."""
     K, dist = np.asarray(lens.K), np.asarray(lens.dist)
     bent, by = cv2.projectPoints(points_m[:, None], turn, t_m, np.eye(3), dist if dist.size else None)
     pixels = np.asarray(bent).reshape(-1, 2) @ K[:2, :2].T + K[:2, 2]

@@ -1,4 +1,4 @@
-"""Where a camera stands, from points whose places in the world and in its image are known, in float64.
+"""The pose of a camera, from points whose positions in the world and in the image are known, in float64.
 
 The perspective-n-point problem with a robust start (SQPnP of Terzakis & Lourakis, ECCV 2020, on sets of four points;
 IPPE of Collins & Bartoli, IJCV 2014, where points are in a plane), least squares of the reprojection error with a
@@ -6,7 +6,7 @@ Cauchy loss, and once more without on the points that agree. The covariance is t
 
     C = σ² (JᵀJ)⁻¹,
 
-with σ as stated, or as the residuals say where they are larger than that σ explains.
+with the stated σ, or with the residuals' σ if the residuals are larger than the stated σ explains.
 """
 
 from __future__ import annotations
@@ -18,28 +18,35 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from psotrack.calibration.derivatives import centre_by_pose, reproject
-from psotrack.calibration.pose_search import MIN_POINTS, Pose, distances_px, likely, refined, starts_of
+from psotrack.calibration.pose_search import (
+    MIN_POINTS,
+    Pose,
+    distances_px,
+    find_likely_poses,
+    initial_poses,
+    refine_pose,
+)
 from psotrack.calibration.residuals import GATE, inflation, spread_px
 from psotrack.errors import InputError, check_positive
 from psotrack.geometry import Camera
 
-#: Times the stated σ that half of the points may be off, before nothing is believed.
-_HOPELESS = 10.0
-#: Of the largest extent, below which points have none in a direction.
+#: Largest median residual of a usable pose, in units of the stated σ.
+_MAX_MEDIAN_SIGMAS = 10.0
+#: Points have no extent in a direction if the extent is below this share of the largest extent.
 _FLAT = 1e-3
-#: Two poses are told apart where one is this many times as likely as the other.
+#: A pose is unique if it is this many times as likely as every other pose.
 _ODDS = 100.0
 
 
 @dataclass(frozen=True)
 class Located:
-    """A camera's pose and how sure it is.
+    """A camera's pose and its covariance.
 
     Attributes:
-        T_cam_world: (4, 4), world to camera, metres.
-        covariance: (6, 6), of a small turn about the camera's axes, rad, and of the translation, m.
-        centre_covariance_m2: (3, 3), of the camera's centre, world, m².
-        residual_px: (points,), distances in the image, outliers too.
+        T_cam_world: (4, 4), transform from world to camera, metres.
+        covariance: (6, 6), covariance of a small turn about the camera's axes (rad) and of the translation (m).
+        centre_covariance_m2: (3, 3), covariance of the camera's centre in the world, square metres.
+        residual_px: (points,), distances of all points, outliers included, from their projections, pixels.
         used: (points,), False for outliers.
     """
 
@@ -59,34 +66,35 @@ def locate_camera(
     *,
     name: str = "camera",
 ) -> Located:
-    """The pose of a camera whose lens is known, from points of known places.
+    """Find the pose of a camera with a known lens, from points of known positions.
 
     Args:
-        points_m: (points, 3), world, metres; at least four, not on one line. They may be in a plane.
-        points_px: (points, 2), where the camera sees them.
+        points_m: (points, 3), positions in the world, metres; at least four points, not on one line. All points may be
+            in a plane.
+        points_px: (points, 2), positions in the image, pixels.
         K: (3, 3), intrinsics in pixels.
-        dist: (coefficients,), of the lens, in OpenCV's order.
-        noise_px: standard deviation of `points_px`, along x and along y.
-        name: of the camera, for messages.
+        dist: (coefficients,), distortion coefficients in OpenCV's order.
+        noise_px: standard deviation of `points_px` along each axis, pixels.
+        name: name of the camera in error messages.
 
     Raises:
-        InputError: there are too few points, they are on one line, two poses fit them as well, their axes are
-            mirrored, or no pose fits them.
-        SettingsError: the noise is not above 0.
+        InputError: there are too few points, the points are on one line, two poses fit equally well, the points' axes
+            are mirrored, or no pose fits.
+        SettingsError: `noise_px` is not above 0.
     """
     check_positive("noise_px", noise_px)
     extent_m = _check_points(points_m, points_px, name)
     lens = Camera(np.eye(4), K, dist, np.zeros(2))
-    pose, *others = likely(points_m, points_px, lens, noise_px, extent_m, name)
+    pose, *others = find_likely_poses(points_m, points_px, lens, noise_px, extent_m, name)
     residual_px = distances_px(points_m, points_px, pose, lens)
     _check_fit(points_m, points_px, lens, noise_px, extent_m, residual_px, name)
-    _check_alone(pose, others, name)
+    _check_unique(pose, others, name)
     used = np.ones(len(points_m), bool)
-    # The gate moves with the fit and the fit with the gate; what swings to and fro ends somewhere.
+    # The gate depends on the fit and the fit on the gate. The number of rounds is limited in case they oscillate.
     for _ in range(10):
         within = residual_px <= GATE * max(noise_px, spread_px(residual_px[used], 6))
         before, used = used, within if within.sum() >= MIN_POINTS else used
-        pose = refined(points_m[used], points_px[used], pose, lens, noise_px, loss="linear")
+        pose = refine_pose(points_m[used], points_px[used], pose, lens, noise_px, loss="linear")
         residual_px = distances_px(points_m, points_px, pose, lens)
         if (used == before).all():
             break
@@ -118,8 +126,8 @@ def _check_points(
     return extent_m
 
 
-def _check_alone(pose: Pose, others: list[Pose], name: str) -> None:
-    """Refuse a pose where another one, far from it, is about as likely."""
+def _check_unique(pose: Pose, others: list[Pose], name: str) -> None:
+    """Raise an error if another pose, far from the found pose, is about as likely."""
     for other in others:
         if other.cost - pose.cost < log(_ODDS):
             apart_m = np.linalg.norm(pose.R.T @ pose.t_m - other.R.T @ other.t_m)
@@ -140,14 +148,14 @@ def _check_fit(
     residual_px: Float[np.ndarray, " points"],
     name: str,
 ) -> None:
-    """Refuse what no camera can have seen, and say why where it can be told."""
+    """Raise an error if the pose does not fit most points, and name the cause if it is a mirrored world."""
     typical_px = float(np.median(residual_px))
-    if typical_px <= _HOPELESS * noise_px:
+    if typical_px <= _MAX_MEDIAN_SIGMAS * noise_px:
         return
     if extent_m[2] > _FLAT * extent_m[0]:
         mirrored = points_m * np.array([1.0, 1.0, -1.0])
-        twin = min(starts_of(mirrored, points_px, lens, noise_px, extent_m), key=lambda one: one.cost)
-        twin = refined(mirrored, points_px, twin, lens, noise_px, loss="cauchy")
+        twin = min(initial_poses(mirrored, points_px, lens, noise_px, extent_m), key=lambda one: one.cost)
+        twin = refine_pose(mirrored, points_px, twin, lens, noise_px, loss="cauchy")
         if np.median(distances_px(mirrored, points_px, twin, lens)) < 0.2 * typical_px:
             raise InputError(
                 name,
@@ -173,7 +181,7 @@ def _covariance(
 ) -> Float[np.ndarray, "6 6"]:
     _, by_turn, by_shift = reproject(points_m, pose.R, pose.t_m, lens)
     slopes = np.concatenate([by_turn, by_shift], axis=-1).reshape(-1, 6) / noise_px
-    # A QR instead of JᵀJ, which would square the condition; columns of like length.
+    # QR keeps the condition number that JᵀJ would square. Columns are scaled to the same length.
     scale = np.linalg.norm(slopes, axis=0)
     triangle = np.linalg.qr(slopes / scale, mode="r")
     if np.linalg.cond(triangle) > 1e10:

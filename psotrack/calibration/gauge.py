@@ -1,11 +1,11 @@
-"""What pixels do not say of a rig, its gauge: where the world's origin is, how its axes are turned, how large it is.
+"""The gauge of a rig: position, orientation and scale of the world, which pixels do not determine.
 
-Of all rigs that fit as well, the one is taken that is moved least from what was given: the sum over the cameras of
-their squared shifts, in units of `SHIFT_M`, and turns, in units of `TURN_RAD`, has no slope along the seven common
-motions (inner constraints; Triggs et al. 2000, section 9).
+Of all rigs that fit equally well, the rig that is moved least from the given rig is chosen: the sum over the cameras of
+their squared shifts, in units of `SHIFT_M`, and squared turns, in units of `TURN_RAD`, has no slope along the seven
+common motions (inner constraints; Triggs et al. 2000, section 9).
 
-A rig's unknowns are six per camera, a small turn about its axes (rad) and a change of its translation (m), and the
-logarithm of all focal lengths, last, which no common motion touches.
+A rig's unknowns are six per camera, a small turn about its axes (rad) and a change of its translation (m), and last the
+logarithm of the factor of all focal lengths, which common motions do not change.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from jaxtyping import Float
 from psotrack.calibration.derivatives import centre_by_pose
 from psotrack.geometry import cross_matrices
 
-#: What counts as much as `TURN_RAD` when a rig is moved as little as can be.
+#: Shift of a camera's centre, metres, and turn of a camera, radians, that count equally when a rig is moved.
 SHIFT_M = 0.05
 TURN_RAD = np.deg2rad(0.5)
 
 
 def common_motions(T_cam_world: Float[np.ndarray, "cameras 4 4"]) -> Float[np.ndarray, "unknowns 7"]:
-    """How turns (3), shifts (3) and growth (1) of the whole world move each camera's pose, about their middle."""
+    """Derivatives of the cameras' poses by turns (3), shifts (3) and growth (1) of the world about its middle."""
     centre = _centres(T_cam_world)
     middle = centre.mean(axis=0)
     blocks = []
@@ -42,10 +42,10 @@ def common_motions(T_cam_world: Float[np.ndarray, "cameras 4 4"]) -> Float[np.nd
     return np.vstack([*blocks, np.zeros((1, 7))])
 
 
-def departure(
+def pose_changes(
     given: Float[np.ndarray, "cameras 4 4"], now: Float[np.ndarray, "cameras 4 4"]
 ) -> Float[np.ndarray, " unknowns"]:
-    """How far each camera has gone, in the unknowns: a turn about its axes, and a change of t as of such a step."""
+    """Change of each camera's pose in the rig's unknowns: a turn about its axes, and a change of its translation."""
     parts = []
     for T, c, T_now, c_now in zip(given, _centres(given), now, _centres(now), strict=True):
         R = T[:3, :3]
@@ -58,8 +58,8 @@ def _centres(T_cam_world: Float[np.ndarray, "cameras 4 4"]) -> Float[np.ndarray,
     return -np.einsum("cji,cj->ci", T_cam_world[:, :3, :3], T_cam_world[:, :3, 3])
 
 
-def metric(given: Float[np.ndarray, "cameras 4 4"]) -> Float[np.ndarray, "unknowns unknowns"]:
-    """The squared length of a departure: turns in units of `TURN_RAD`, shifts of the centre in units of `SHIFT_M`."""
+def pose_change_metric(given: Float[np.ndarray, "cameras 4 4"]) -> Float[np.ndarray, "unknowns unknowns"]:
+    """Metric of the poses' changes: turns count in units of `TURN_RAD`, shifts of the centres in units of `SHIFT_M`."""
     squared = np.zeros((6 * len(given) + 1, 6 * len(given) + 1))
     for index, T in enumerate(given):
         by_pose = centre_by_pose(T[:3, :3], T[:3, 3]) / SHIFT_M

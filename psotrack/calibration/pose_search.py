@@ -1,4 +1,4 @@
-"""Poses from known points: starts from sets of four, refined; the most likely first."""
+"""Poses from known points: starts from sets of four points, which are refined; the most likely pose first."""
 
 from __future__ import annotations
 
@@ -17,21 +17,22 @@ from psotrack.calibration.derivatives import pixel_slopes, reproject
 from psotrack.errors import InputError
 from psotrack.geometry import NEAR_M, Camera, project, undistort
 
-#: A pose has six unknowns and a point gives two equations; the fourth point picks one of P3P's four answers.
+#: A pose has six unknowns and a point gives two equations; the fourth point selects one of P3P's four solutions.
 MIN_POINTS = 4
-#: Of the largest extent, below which a second pose, turned over, is looked for.
+#: Points are nearly in a plane if their smallest extent is below this share of the largest extent. Nearly planar points
+#: often fit a second pose, which is searched too.
 _NEARLY_FLAT = 0.1
-#: Sets of four that the start is sought among; with 40 % outliers 13 in 100 of them are clean.
+#: Largest number of sets of four points for initial poses; with 40 % outliers 13 of 100 sets contain no outlier.
 _MOST_SETS = 100
-#: Starts that are refined.
+#: Largest number of initial poses that are refined.
 _MOST_STARTS = 4
-#: Poses that differ by less are the same.
+#: Poses are the same if the camera's orientations differ by less than this, radians.
 _SAME_RAD = np.deg2rad(2.0)
 
 
 @dataclass(frozen=True)
 class Pose:
-    """World to camera: x_cam = R X + t."""
+    """A pose, from world to camera: x_cam = R X + t."""
 
     R: Float[np.ndarray, "3 3"]
     t_m: Float[np.ndarray, "3"]
@@ -44,7 +45,7 @@ class Pose:
         return bool(np.sum(self.R * other.R) > 1 + 2 * np.cos(_SAME_RAD))
 
 
-def likely(
+def find_likely_poses(
     points_m: Float[np.ndarray, "points 3"],
     points_px: Float[np.ndarray, "points 2"],
     lens: Camera,
@@ -52,9 +53,11 @@ def likely(
     extent_m: Float[np.ndarray, "3"],
     name: str,
 ) -> list[Pose]:
-    """Poses that no small change makes better, the most likely first."""
-    started = _distinct(starts_of(points_m, points_px, lens, noise_px, extent_m))
-    found = _distinct(refined(points_m, points_px, start, lens, noise_px, loss="cauchy") for start in started)
+    """Find all poses that are local minima of the robust cost, the most likely pose first."""
+    started = _distinct(initial_poses(points_m, points_px, lens, noise_px, extent_m))
+    found = _distinct(
+        refine_pose(points_m, points_px, start, lens, noise_px, loss="cauchy") for start in started
+    )
     if not found:
         raise InputError(
             name, expected="points that some pose fits", found="none that has them in front of it"
@@ -63,7 +66,7 @@ def likely(
 
 
 def _distinct(poses: Iterable[Pose]) -> list[Pose]:
-    """The cheapest, without those that are much like a cheaper one."""
+    """Keep the poses of smallest cost, without poses that are nearly the same as a pose of smaller cost."""
     found: list[Pose] = []
     for pose in sorted(poses, key=lambda pose: pose.cost):
         if len(found) < _MOST_STARTS and np.isfinite(pose.cost) and not any(map(pose.turned_like, found)):
@@ -71,14 +74,14 @@ def _distinct(poses: Iterable[Pose]) -> list[Pose]:
     return found
 
 
-def starts_of(
+def initial_poses(
     points_m: Float[np.ndarray, "points 3"],
     points_px: Float[np.ndarray, "points 2"],
     lens: Camera,
     noise_px: float,
     extent_m: Float[np.ndarray, "3"],
 ) -> list[Pose]:
-    """Poses from all points, and from sets of four of which some have no outlier."""
+    """Compute poses from all points, and from sets of four points, of which some contain no outlier."""
     normalised = undistort(lens, points_px)
     count = len(points_m)
     if comb(count, MIN_POINTS) <= _MOST_SETS:
@@ -93,7 +96,7 @@ def starts_of(
     if extent_m[2] < _NEARLY_FLAT * extent_m[0]:
         methods.append((flat, cv2.SOLVEPNP_IPPE))
     if count == MIN_POINTS:
-        # With more, some other set of four has a better start.
+        # With more points, another set of four points gives a better initial pose.
         methods.append((points_m, cv2.SOLVEPNP_AP3P))
     solved = [
         pose
@@ -115,7 +118,7 @@ def _solved(
     try:
         _, turns, shifts, _ = cv2.solvePnPGeneric(points_m, normalised, np.eye(3), None, flags=method)
     except cv2.error:
-        # Four points on a line, or the like.
+        # OpenCV fails for degenerate sets, such as four points on a line.
         return []
     poses = [(cv2.Rodrigues(turn)[0], shift.ravel()) for turn, shift in zip(turns, shifts, strict=True)]
     return [(R, t_m) for R, t_m in poses if np.isfinite(R).all() and np.isfinite(t_m).all()]
@@ -137,7 +140,7 @@ def _costs(
     return np.where(np.median(depth, axis=-1) > NEAR_M, loss, np.inf)
 
 
-def refined(
+def refine_pose(
     points_m: Float[np.ndarray, "points 3"],
     points_px: Float[np.ndarray, "points 2"],
     start: Pose,
@@ -146,7 +149,7 @@ def refined(
     *,
     loss: Literal["linear", "cauchy"],
 ) -> Pose:
-    """The pose that minimises the loss of the reprojection error, from a start."""
+    """Minimise the loss of the reprojection error, starting from an initial pose."""
     turned = np.ascontiguousarray(points_m @ start.R.T)
 
     def off(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, " equations"]:
@@ -168,6 +171,6 @@ def distances_px(
     pose: Pose,
     lens: Camera,
 ) -> Float[np.ndarray, " points"]:
-    """Distances in the image; infinite behind the camera."""
+    """Distances of points from their projections, pixels; infinite for points behind the camera."""
     distance = np.linalg.norm(reproject(points_m, pose.R, pose.t_m, lens)[0] - points_px, axis=-1)
     return np.where(points_m @ pose.R[2] + pose.t_m[2] > NEAR_M, distance, np.inf)

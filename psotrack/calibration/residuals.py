@@ -1,4 +1,4 @@
-"""What the residuals of a least-squares fit say of the noise, and of what fits badly."""
+"""Estimates of noise and of covariance factors from the residuals of a least-squares fit."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import chi2
 
-#: Standard deviations from where it should be that make a point an outlier: 4 in a million good ones.
+#: A point is an outlier beyond this number of standard deviations: 4 in a million good points are.
 GATE = 5.0
-#: Residuals that are this unlikely tell that σ is larger than stated.
+#: σ is larger than stated if the residuals' sum of squares has a smaller probability than this.
 UNLIKELY = 0.01
 
 
 def spread_px(distance_px: Float[np.ndarray, " residuals"], unknowns: int) -> float:
-    """σ along x and along y from distances in the image that some outliers are among: by their median.
+    """Estimate σ along each axis from the median of distances in the image, some of which may be outliers.
 
     Args:
-        distance_px: (residuals,), of a fit; 0 is returned where they are no more than the unknowns.
-        unknowns: that were fitted to them.
+        distance_px: (residuals,), distances of a fit, pixels. With no more equations than unknowns the result is 0.
+        unknowns: number of fitted unknowns.
     """
     equations = 2 * len(distance_px)
     if equations <= unknowns:
@@ -29,11 +29,11 @@ def spread_px(distance_px: Float[np.ndarray, " residuals"], unknowns: int) -> fl
 
 
 def inflation(sum_of_squares: float, freedom: int) -> float:
-    """What a covariance is multiplied with, because the residuals are larger than their σ explains; else 1.
+    """Factor of a covariance: above 1 if the residuals are larger than their σ explains, else 1.
 
     Args:
-        sum_of_squares: of residuals in units of their σ.
-        freedom: number of residuals less that of the unknowns.
+        sum_of_squares: sum of squared residuals, each in units of its σ.
+        freedom: degrees of freedom: number of residuals minus number of unknowns.
     """
     if freedom < 1 or sum_of_squares <= chi2.ppf(1 - UNLIKELY, freedom):
         return 1.0

@@ -1,7 +1,7 @@
-"""The doctor: does a rig agree with its own recording, before anybody tracks?
+"""The doctor: checks before tracking whether a rig agrees with its own recording.
 
-In: the rig, and detections or blobs of several cameras; optionally a reference. Out: a `Diagnosis` with findings,
-each of which names a camera, pair or clock, says by how much it disagrees, and what to do.
+In: the rig, and detections or blobs of several cameras; optionally a reference. Out: a `Diagnosis` with findings. Each
+finding names a camera, a pair of cameras or a clock, and says how large the disagreement is and what to do.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""How well a rig agrees with what its cameras see: sightings that lines of sight from three viewpoints explain."""
+"""Agreement of a rig with its cameras' sightings: points that are seen from at least three viewpoints."""
 
 from __future__ import annotations
 
@@ -12,25 +12,27 @@ from psotrack.geometry import Camera, CameraRig, reconstruct, viewpoints
 from psotrack.initiation import room_bounds
 from psotrack.settings import TrackSettings
 
-#: Two viewpoints agree by chance.
+#: Smallest number of viewpoints of a point: two viewpoints often agree by chance.
 MIN_VIEWPOINTS = 3
-#: Squared distance in standard deviations from which on a sighting is another drone's: one in 1000 is farther off.
-UNEXPLAINED = 13.8
+#: Largest squared distance of a sighting from the projection of its point, squared standard deviations: 1 in 1000 right
+#: sightings is farther (χ² distribution, two degrees of freedom).
+MAX_SQUARED_DISTANCE = 13.8
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """What a rig makes of sightings.
+    """Points that a rig triangulates from sightings, each seen from at least three viewpoints.
 
     Attributes:
-        frame: (points,), of each point that is seen from three viewpoints.
-        position_m: (points, 3), world.
-        centre_px: (points, cameras, 2), the sightings that belong to it; NaN for none.
-        noise_px: (points, cameras), their standard deviations.
-        used: (points, cameras), views that agree.
-        residual_px: (points, cameras), distances from where the point is seen; NaN for none.
-        num_sightings: (cameras,), in the frames that were looked at.
-        num_frames: that were looked at.
+        frame: (points,), number of each point's frame.
+        position_m: (points, 3), positions in the world, metres.
+        centre_px: (points, cameras, 2), the point's sightings, pixels; NaN for no sighting.
+        noise_px: (points, cameras), standard deviations of the sightings, pixels; NaN for no sighting.
+        used: (points, cameras), True for sightings that agree with the point.
+        residual_px: (points, cameras), distances of the sightings from the point's projections, pixels; NaN for no
+            sighting.
+        num_sightings: (cameras,), numbers of sightings in the examined frames.
+        num_frames: number of examined frames.
     """
 
     frame: Int[np.ndarray, "points"]
@@ -44,22 +46,22 @@ class Agreement:
 
     @property
     def share(self) -> float:
-        """Of all sightings, those that are explained; one that is of two drones counts twice, in all at most 1."""
+        """Share of all sightings that agree with a point, at most 1: a sighting of two drones counts twice."""
         return min(1.0, float(self.used.sum() / max(self.num_sightings.sum(), 1)))
 
     @property
     def share_of_camera(self) -> Float[np.ndarray, "cameras"]:
-        """The same for each camera."""
+        """(cameras,), share of each camera's sightings that agree with a point, at most 1."""
         return np.minimum(1.0, self.used.sum(axis=0) / np.maximum(self.num_sightings, 1))
 
 
-def agreement(rig: CameraRig, sightings: Sightings, frames: Int[np.ndarray, "chosen"]) -> Agreement:
-    """Match the sightings of some frames over all cameras, and triangulate them.
+def measure_agreement(rig: CameraRig, sightings: Sightings, frames: Int[np.ndarray, "chosen"]) -> Agreement:
+    """Match the sightings of some frames over all cameras, and triangulate the points.
 
     Args:
-        rig: as it is read.
-        sightings: of its cameras.
-        frames: to look at.
+        rig: the rig to check.
+        sightings: sightings of the rig's cameras.
+        frames: (chosen,), numbers of the frames to examine.
     """
     bounds_m = _wide_bounds(rig)
     numbers: list[np.ndarray] = []
@@ -89,7 +91,7 @@ def agreement(rig: CameraRig, sightings: Sightings, frames: Int[np.ndarray, "cho
 def _matched(
     rig: CameraRig, view: CameraSightings, bounds_m: Float[np.ndarray, "2 3"]
 ) -> Int[np.ndarray, "points cameras"]:
-    """Which sightings are of which point; none where a rig is so wrong that its equations are singular."""
+    """Indices of the sightings of each point; no points if the rig is so wrong that the equations are singular."""
     try:
         with np.errstate(all="ignore"):
             found = match(
@@ -101,14 +103,14 @@ def _matched(
 
 
 def num_viewpoints(cameras: Camera, seen: Bool[np.ndarray, "points cameras"]) -> Int[np.ndarray, "points"]:
-    """From how many viewpoints points are seen."""
+    """Number of viewpoints from which each point is seen."""
     label = viewpoints(cameras)
     at = label[:, None] == np.unique(label)
     return (seen.astype(int) @ at.astype(int) > 0).sum(axis=-1)
 
 
 def _wide_bounds(rig: CameraRig) -> Float[np.ndarray, "2 3"]:
-    """The room, and as much below the floor and above: where z = 0 is, a rig that is wrong may not know."""
+    """Bounds of the room, extended by its height upwards and downwards, because a wrong rig may have a wrong floor."""
     bounds_m = room_bounds(rig, TrackSettings())
     height_m = bounds_m[1, 2] - bounds_m[0, 2]
     bounds_m[:, 2] += -height_m, height_m

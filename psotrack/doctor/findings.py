@@ -1,4 +1,4 @@
-"""What a doctor finds, in words: what disagrees, by how much, and what to do."""
+"""Findings in words: what disagrees, by how much, and what to do."""
 
 from __future__ import annotations
 
@@ -6,26 +6,28 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from psotrack.doctor.camera_faults import CameraFault, pose_difference
 from psotrack.doctor.reference_fit import NEAR_M, ReferenceFit
-from psotrack.doctor.suspects import Explanation, change
 from psotrack.geometry import CameraRig
 
-#: A fault must explain so many more of a camera's points. Six freedoms fitted to 30 sound points gain 0.015 by chance.
+#: Smallest gain of a fault, as a share of the camera's points: six parameters fitted to 30 points of a correct camera
+#: gain 0.015 by chance.
 CLEARLY = 0.05
-#: Of two explanations the simpler one is taken if it gives this share of what the better one gives.
+#: The simpler of two explanations is taken if its gain is at least this share of the larger gain.
 ALMOST = 0.9
-#: Scales of rig and reference that differ by less are the same: focal lengths are known to a few per cent.
+#: Smallest relative difference between the scales of rig and reference that is reported: focal lengths are known to a
+#: few per cent.
 SAME_SCALE = 0.03
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that disagrees.
+    """A disagreement between the rig and its recording.
 
     Attributes:
-        kind: a word or two for programs.
-        cameras: names of those that are concerned; none where it is all, or the reference.
-        message: what disagrees, by how much.
+        kind: short name of the kind of disagreement, for programs.
+        cameras: names of the concerned cameras; empty if all cameras or the reference are concerned.
+        message: what disagrees, and by how much.
         remedy: what to do.
     """
 
@@ -38,13 +40,13 @@ class Finding:
         return f"{self.message}; {self.remedy}"
 
 
-def fault_of(rig: CameraRig, index: int, judged: list[Explanation]) -> Finding:
-    """The simplest explanation that is almost as good as the best one, in words."""
-    name, sound = rig.names[index], judged[0]
-    best = max(each.gain for each in judged)
-    fault = next(each for each in judged if each.gain - sound.gain >= ALMOST * (best - sound.gain))
+def describe_camera_fault(rig: CameraRig, index: int, explained: list[CameraFault]) -> Finding:
+    """Describe the simplest explanation whose gain is almost as large as the largest gain."""
+    name, sound = rig.names[index], explained[0]
+    best = max(each.gain for each in explained)
+    fault = next(each for each in explained if each.gain - sound.gain >= ALMOST * (best - sound.gain))
     if best - sound.gain <= CLEARLY:
-        message = f"camera {name}: it explains {sound.gain:.0%} of the drones that the others see, whatever is changed"
+        message = f"camera {name}: it explains {sound.gain:.0%} of the drones that the others see; no correction helps"
         return Finding(
             "disagrees", (name,), message, f"go without it: --cameras without {name}; calibrate it anew"
         )
@@ -63,7 +65,7 @@ def fault_of(rig: CameraRig, index: int, judged: list[Explanation]) -> Finding:
         other = rig.names[int(fault.amount)]
         message = f"camera {name}: what it sees fits the calibration of {other} {numbers}"
         return Finding("exchanged", (name, other), message, "check which video and detections are whose")
-    turn_deg, shift_m = change(rig.cameras[index], fault.camera)
+    turn_deg, shift_m = pose_difference(rig.cameras[index], fault.camera)
     how = f"turned by {turn_deg:.1f} degrees" + (
         f" and moved by {100 * shift_m:.0f} cm" if fault.kind == "moved" else ""
     )
@@ -72,15 +74,15 @@ def fault_of(rig: CameraRig, index: int, judged: list[Explanation]) -> Finding:
     return Finding(fault.kind, (name,), f"camera {name}: it is {how} {numbers}", remedy)
 
 
-def late_clock(name: str, offset: float, std: float) -> Finding:
-    """A clock that is late by `offset` frames, give or take `std`."""
+def describe_late_clock(name: str, offset: float, std: float) -> Finding:
+    """Describe a clock that is late by `offset` frames, with the standard deviation `std` in frames."""
     late = "late" if offset > 0 else "early"
     message = f"camera {name}: its clock is {abs(offset):.2f} frames {late}, give or take {std:.2f}"
     return Finding("clock", (name,), message, "synchronise its video with the others")
 
 
-def reference_findings(fit: ReferenceFit, fps: float) -> list[Finding]:
-    """How the reference is at odds with the rig, if it is."""
+def describe_reference(fit: ReferenceFit, fps: float) -> list[Finding]:
+    """Describe how the reference disagrees with the rig; an empty list if they agree."""
     if fit.agrees and fit.before_m < NEAR_M:
         return []
     numbers = f"(median distance to the detections' points {fit.after_m:.2f} m, not {fit.before_m:.2f} m)"
@@ -104,7 +106,7 @@ def reference_findings(fit: ReferenceFit, fps: float) -> list[Finding]:
 
 
 def _motion_of(fit: ReferenceFit) -> tuple[str, str]:
-    """What lies between reference and rig: the gravest of it, and all of it in words."""
+    """The kind of the largest difference between reference and rig, and a description of all differences."""
     parts, kind = [], "reference moved"
     diagonal = np.diag(fit.R)
     turn_deg = np.rad2deg(np.arccos(np.clip((np.trace(fit.R) - 1) / 2, -1, 1)))

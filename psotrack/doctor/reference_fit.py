@@ -1,4 +1,4 @@
-"""A reference against points that a rig triangulates: another clock, unit, handedness or origin."""
+"""Fit of a reference to triangulated points: offset of the clock, unit, handedness and origin."""
 
 from __future__ import annotations
 
@@ -11,26 +11,29 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.trajectories import Trajectories
 
-#: Reference points are on the drones: lever arms of real recordings are up to 0.15 m.
+#: Largest median distance between reference and points that agree, metres: lever arms of real recordings are up to
+#: 0.15 m.
 NEAR_M = 0.3
-#: Offsets of the clock that are tried, and those that are none, in frames: lever arms pass for less.
+#: Largest offset of the clock that is tried, seconds, and largest offset that is ignored, frames: lever arms look like
+#: small offsets.
 _REACH_S, _NO_OFFSET = 2.0, 1.0
-#: A clearly better offset leaves less than this share of the distance.
+#: An offset is clearly better if the remaining distance is below this share of the distance without an offset.
 _CLEARLY = 0.5
+#: Number of rounds in which points are paired with drones and the motion is fitted.
 _ROUNDS = 20
 
 
 @dataclass(frozen=True)
 class ReferenceFit:
-    """How points and reference are at odds, in median distances.
+    """Differences between points and reference: reference = scale · R · point + shift.
 
     Attributes:
-        before_m: as they are.
-        after_m: with the offset, or with the motion, in the scale of the points.
-        offset_frames: the reference's clock shows so much more than the video's, to a whole frame.
-        scale: reference = scale · R · point + shift.
-        R: (3, 3), a rotation, or one with a mirror.
-        shift_m: (3,).
+        before_m: median distance of the points from the reference as it was read, metres.
+        after_m: median distance with the offset or with the motion, in the scale of the points, metres.
+        offset_frames: offset by which the reference's clock is ahead of the video's, whole frames.
+        scale: scale of the reference relative to the points.
+        R: (3, 3), rotation, or rotation with a mirror.
+        shift_m: (3,), shift, metres.
     """
 
     before_m: float
@@ -42,7 +45,7 @@ class ReferenceFit:
 
     @property
     def agrees(self) -> bool:
-        """Whether nothing has to be changed."""
+        """True if neither an offset nor a motion is needed."""
         return self.offset_frames == 0 and self.scale == 1.0 and not self.shift_m.any()
 
 
@@ -52,13 +55,13 @@ def fit_reference(
     reference: Trajectories,
     fps: float,
 ) -> ReferenceFit:
-    """The clock's offset that brings points to the reference; if none does, the motion and the scale.
+    """Find the offset of the clock that brings the points to the reference; without one, the motion and the scale.
 
     Args:
-        frame: (points,), of each point.
-        point_m: (points, 3), triangulated; which drone each is of is not known.
-        reference: at the video's frames, from 0.
-        fps: frames per second.
+        frame: (points,), number of each point's frame.
+        point_m: (points, 3), triangulated points of unknown drones, metres.
+        reference: reference at the video's frames, from frame 0.
+        fps: frames per second of the video.
     """
     reach = round(_REACH_S * fps)
     median = {}
@@ -78,14 +81,14 @@ def fit_reference(
         return still
     fits = [_iterated(point_m, reference.position_m[frame], start) for start in _starts()]
     after_m, scale, R, shift_m = min(fits, key=lambda fit: fit[0])
-    # Points that are scaled to one spot fit anything: distances are judged in the scale of the rig.
+    # Points that are scaled to one place fit every reference, so distances are compared in the scale of the rig.
     return ReferenceFit(before_m, after_m, 0, scale, R, shift_m) if after_m < NEAR_M else still
 
 
 def _nearest(
     point_m: Float[np.ndarray, "points 3"], reference_m: Float[np.ndarray, "points drones 3"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The nearest drone of the reference to each point, and its distance."""
+    """The reference's drone that is nearest to each point, and its distance."""
     distance = np.nan_to_num(np.linalg.norm(reference_m - point_m[:, None], axis=-1), nan=np.inf)
     nearest = distance.argmin(axis=1)
     rows = np.arange(len(point_m))
@@ -93,7 +96,7 @@ def _nearest(
 
 
 def _without_arm(point_m: np.ndarray, reference_m: np.ndarray) -> float:
-    """The median distance after a median lever arm is taken out."""
+    """Median distance after the median lever arm is subtracted."""
     nearest_m, distance = _nearest(point_m, reference_m)
     there = np.isfinite(distance)
     if there.sum() < len(point_m) / 2:
@@ -103,7 +106,7 @@ def _without_arm(point_m: np.ndarray, reference_m: np.ndarray) -> float:
 
 
 def _starts() -> list[np.ndarray]:
-    """All signed permutations of the axes, and each turned by 45° about the world's vertical."""
+    """Initial rotations: all signed permutations of the axes, and the same turned by 45° about the world's vertical."""
     eighth = Rotation.from_euler("z", 45, degrees=True).as_matrix()
     signed = [
         np.eye(3)[list(order)] * np.array(signs)[:, None]
@@ -116,7 +119,7 @@ def _starts() -> list[np.ndarray]:
 def _iterated(
     point_m: np.ndarray, reference_m: np.ndarray, start: np.ndarray
 ) -> tuple[float, float, np.ndarray, np.ndarray]:
-    """Median distance in the points' scale, scale, rotation, shift: paired with the nearest drones, fitted, again."""
+    """Pair the points with the nearest drones and fit a similarity, repeatedly: median distance, scale, R, shift."""
     all_m = reference_m[np.isfinite(reference_m).all(axis=-1)]
     centre_m, middle_m = np.median(point_m, axis=0), np.median(all_m, axis=0)
     scale = float(np.median(np.abs(all_m - middle_m).sum(-1)) / np.median(np.abs(point_m - centre_m).sum(-1)))
@@ -135,7 +138,7 @@ def _iterated(
 def _similarity(
     from_m: np.ndarray, to_m: np.ndarray, handedness: float
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Least squares (S. Umeyama, PAMI 1991), with the handedness given."""
+    """Fit a similarity of the given handedness by least squares (S. Umeyama, PAMI 1991)."""
     a, b = from_m - from_m.mean(axis=0), to_m - to_m.mean(axis=0)
     U, singular, Vt = np.linalg.svd(b.T @ a)
     signs = np.array([1.0, 1.0, handedness * np.linalg.det(U @ Vt)])

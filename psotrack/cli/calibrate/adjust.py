@@ -66,7 +66,7 @@ def adjust(
     Example:
       psotrack calibrate adjust data/Simulated_Data/S02_D4_A --tracks tracks.csv --out better.toml
     """
-    from psotrack.calibration import improve, in_boxes
+    from psotrack.calibration import find_drones_in_boxes, improve
     from psotrack.datasets.dpjait import read_sequence
     from psotrack.geometry import write_rig
     from psotrack.recordings import read_detections
@@ -78,7 +78,7 @@ def adjust(
         raise InputError(sequence, expected="detections in dl_data", found="none")
     detections = {name: read_detections(path) for name, path in recording.detections.items()}
     flown = read_trajectories(tracks, fps=recording.fps if recording.videos else None)
-    views = in_boxes(recording.rig, detections, flown)
+    views = find_drones_in_boxes(recording.rig, detections, flown)
     held = tuple(name for name in fixed.split(",") if name)
     improved = improve(
         recording.rig,
@@ -86,7 +86,7 @@ def adjust(
         views.noise_px if noise_px is None else noise_px,
         fixed=held,
         refine_focal_length=refine_focal_length,
-        alike=views.alike,
+        common_errors=views.common_errors,
     )
     write_rig(out, improved.rig, force=force)
     rows = _rows(recording.rig, improved, views, held)

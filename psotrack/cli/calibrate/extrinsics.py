@@ -17,7 +17,7 @@ from psotrack.errors import InputError, SettingsError
 from psotrack.support import refuse_to_overwrite
 
 if TYPE_CHECKING:
-    from psotrack.calibration import Marks
+    from psotrack.calibration import ImagePoints
 
 
 @click.command()
@@ -83,14 +83,14 @@ def extrinsics(
       psotrack calibrate extrinsics --pairs pairs.csv --points points.csv --fov 92.4,60.8 --size 1920,1080 --out rig.yml
       psotrack calibrate extrinsics --markers data/Simulated_Data/S01_D2_A --intrinsics rig.toml --out found.toml
     """
-    from psotrack.calibration import locate_camera, read_marks
+    from psotrack.calibration import locate_camera, read_image_points
     from psotrack.geometry import Camera, make_rig, write_rig
 
     if (pairs is None) == (markers is None):
         found = "neither" if pairs is None else "both"
         raise SettingsError("extrinsics", expected="--pairs FILE or --markers SEQ", found=found)
     refuse_to_overwrite(out, force)
-    marks = read_marks(pairs, points) if pairs else _marker_marks(Path(str(markers)), dictionary)
+    marks = read_image_points(pairs, points) if pairs else _marker_marks(Path(str(markers)), dictionary)
     lenses = _lenses(list(marks), **lens)
     cameras: dict[str, Camera] = {}
     rows: dict[str, dict[str, Any]] = {}
@@ -151,7 +151,7 @@ def _lenses(
     )
 
 
-def _marker_marks(folder: Path, dictionary: str) -> dict[str, Marks]:
+def _marker_marks(folder: Path, dictionary: str) -> dict[str, ImagePoints]:
     from psotrack.calibration import find_markers
     from psotrack.datasets.dpjait import MARKER_CORNERS, read_sequence
     from psotrack.inside_out import read_marker_map

@@ -1,4 +1,4 @@
-"""Other ways to read a whole rig: conventions that calibrations are mixed up in, and what follows from each."""
+"""Other interpretations of a whole rig: conventions of calibration files that are often confused."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ from itertools import combinations, product
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.calibration import Alike, adjust
+from psotrack.calibration import CommonErrors, adjust
 from psotrack.correspondence import Sightings
-from psotrack.doctor.agreement import UNEXPLAINED, Agreement, agreement
+from psotrack.doctor.agreement import MAX_SQUARED_DISTANCE, Agreement, measure_agreement
 from psotrack.geometry import Camera, CameraRig, reconstruct
 
-#: Common factors of the focal lengths that are tried at first, and then about the best.
+#: Common factors of the focal lengths: those tried first, and those tried around the best of the first.
 _SCALES = np.exp(np.arange(-0.7, 0.7001, 0.1))
 _FINER = np.exp(np.arange(-0.1, 0.1001, 0.01))
-#: A factor that is nearer to 1 than this is none, because bodies in perspective pass for one; others are off for
-#: certain from so many standard deviations on.
+#: Smallest logarithm of a factor that is reported (the perspective of extended bodies causes smaller ones), and number
+#: of standard deviations from which on a factor is certain.
 _LEAST_OFF, _CERTAIN = 0.02, 3.5
-#: Share of a sighting's noise that others of the same camera have in common: for a while, and over the image.
+#: Standard deviation of errors that sightings of a camera have in common, as a share of the sightings' noise.
 _COMMON = 0.3
 
 
 @dataclass(frozen=True)
-class Reading:
-    """A rig read in another way.
+class RigInterpretation:
+    """A rig that results from another interpretation of the calibration.
 
     Attributes:
-        kind: of the fault that the calibration has if this reading is right.
-        words: what was mixed up.
+        kind: kind of fault that the calibration has if this interpretation is right.
+        words: what was confused.
         remedy: what to do.
-        cameras: names of those that are concerned.
-        rig: as it would be.
+        cameras: names of the concerned cameras.
+        rig: the rig according to this interpretation.
     """
 
     kind: str
@@ -43,33 +43,35 @@ class Reading:
     rig: CameraRig
 
 
-def better_reading(rig: CameraRig, sightings: Sightings, frames: Int[np.ndarray, "chosen"]) -> Reading | None:
-    """The reading that explains clearly more sightings (`halfway`), if there is one.
+def find_better_interpretation(
+    rig: CameraRig, sightings: Sightings, frames: Int[np.ndarray, "chosen"]
+) -> RigInterpretation | None:
+    """Find the interpretation that explains clearly more sightings (`required_share`); None if no interpretation does.
 
     Args:
-        rig: as it was read.
-        sightings: of its cameras.
-        frames: to look at.
+        rig: the rig as it was read.
+        sightings: sightings of the rig's cameras.
+        frames: (chosen,), numbers of the frames to examine.
     """
-    share = agreement(rig, sightings, frames).share
+    share = measure_agreement(rig, sightings, frames).share
 
-    def explained(reading: Reading) -> float:
-        return agreement(reading.rig, sightings, frames).share
+    def explained(interpretation: RigInterpretation) -> float:
+        return measure_agreement(interpretation.rig, sightings, frames).share
 
     best = max([*_conventions(rig), *_exchanges(rig), *_lenses(rig, _SCALES)], key=explained)
     if best.kind == "focal lengths":
         scale = best.rig.cameras.K[0, 0, 0] / rig.cameras.K[0, 0, 0]
         best = max(_lenses(rig, scale * _FINER), key=explained)
-    return best if explained(best) > halfway(share) else None
+    return best if explained(best) > required_share(share) else None
 
 
-def halfway(share: float) -> float:
-    """What a reading must explain to be believed: half of what is missing."""
+def required_share(share: float) -> float:
+    """Share of sightings that an interpretation must explain: the present share and half of the missing share."""
     return (1 + share) / 2
 
 
-def _conventions(rig: CameraRig) -> Iterator[Reading]:
-    """Translation or centre, world to camera or the reverse, camera axes as they are or mirrored."""
+def _conventions(rig: CameraRig) -> Iterator[RigInterpretation]:
+    """Interpretations with translation or centre, world to camera or the reverse, mirrored or normal camera axes."""
     T = rig.cameras.T_cam_world
     for centred, turned, signs in product((False, True), (False, True), product((1.0, -1.0), repeat=3)):
         flip = np.array(signs)
@@ -77,7 +79,8 @@ def _conventions(rig: CameraRig) -> Iterator[Reading]:
             continue
         R = T[:, :3, :3].swapaxes(-1, -2) if turned else T[:, :3, :3]
         t_m = -np.matvec(R, T[:, :3, 3]) if centred else T[:, :3, 3]
-        # A mirrored world keeps an odd number of mirrored camera axes a rotation: z, if cameras are below 0.
+        # With an odd number of mirrored camera axes, an axis of the world is mirrored too, so that R stays a rotation:
+        # z if this brings the cameras above the floor, else x.
         world = np.ones(3)
         world[2 if np.matvec(R.swapaxes(-1, -2), t_m)[:, 2].mean() > 0 else 0] = np.prod(flip)
         cameras = _posed(rig.cameras, flip[:, None] * R * world, flip * t_m)
@@ -86,7 +89,7 @@ def _conventions(rig: CameraRig) -> Iterator[Reading]:
 
 def _convention(
     rig: CameraRig, cameras: Camera, centred: bool, turned: bool, flip: Float[np.ndarray, "3"]
-) -> Reading:
+) -> RigInterpretation:
     words, remedies = [], []
     if centred:
         words.append("its translation is the camera's centre C, which was read as t of x_cam = R X + t")
@@ -106,16 +109,16 @@ def _convention(
     kind = (
         "mirrored axes" if (flip < 0).any() else "translation or centre" if centred else "rotation inverted"
     )
-    return Reading(kind, "; ".join(words), "; ".join(remedies), (), CameraRig(rig.names, cameras))
+    return RigInterpretation(kind, "; ".join(words), "; ".join(remedies), (), CameraRig(rig.names, cameras))
 
 
-def _exchanges(rig: CameraRig) -> Iterator[Reading]:
-    """The calibrations of two cameras exchanged."""
+def _exchanges(rig: CameraRig) -> Iterator[RigInterpretation]:
+    """Interpretations in which the calibrations of two cameras are exchanged."""
     for first, second in combinations(range(len(rig)), 2):
         order = np.arange(len(rig))
         order[[first, second]] = second, first
         names = rig.names[first], rig.names[second]
-        yield Reading(
+        yield RigInterpretation(
             "exchanged",
             "what one of them sees fits the calibration of the other",
             "exchange their lines in the calibration, or the names of their videos and detections",
@@ -124,26 +127,30 @@ def _exchanges(rig: CameraRig) -> Iterator[Reading]:
         )
 
 
-def better_lenses(rig: CameraRig, found: Agreement, clearly: float) -> Reading | None:
-    """All focal lengths times a factor, if points that are matched agree better by `clearly`.
+def find_better_focal_lengths(rig: CameraRig, found: Agreement, clearly: float) -> RigInterpretation | None:
+    """Multiply all focal lengths with a factor, if the matched points then agree better by `clearly`; else None.
 
-    Points move along with the lenses, so that most are still matched where all are wrong by as much.
+    If all lenses are wrong by the same factor, the points move with the lenses, so that most are still matched.
 
     Args:
-        rig: as it was read.
-        found: its points.
-        clearly: share of the views, each by how well it is explained.
+        rig: the rig as it was read.
+        found: points of this rig.
+        clearly: smallest gain, as a share of the views.
     """
     noise_px = np.nan_to_num(found.noise_px, nan=1.0)
 
-    def gain(reading: Reading) -> float:
+    def gain(interpretation: RigInterpretation) -> float:
         lines = reconstruct(
-            reading.rig.cameras, found.centre_px, found.used.astype(float), noise_px=noise_px, robust=False
+            interpretation.rig.cameras,
+            found.centre_px,
+            found.used.astype(float),
+            noise_px=noise_px,
+            robust=False,
         )
         squared = np.nan_to_num(lines.reprojection_px / noise_px, nan=np.inf) ** 2
-        return float(np.where(found.used, np.maximum(0.0, 1 - squared / UNEXPLAINED), 0.0).sum()) / max(
-            found.used.sum(), 1
-        )
+        return float(
+            np.where(found.used, np.maximum(0.0, 1 - squared / MAX_SQUARED_DISTANCE), 0.0).sum()
+        ) / max(found.used.sum(), 1)
 
     as_read = gain(next(_lenses(rig, np.ones(1))))
     best = max(_lenses(rig, _SCALES), key=gain)
@@ -152,15 +159,15 @@ def better_lenses(rig: CameraRig, found: Agreement, clearly: float) -> Reading |
     return best if gain(best) > as_read + clearly else None
 
 
-def certain_lenses(rig: CameraRig, found: Agreement) -> Reading | None:
-    """All focal lengths times a factor, if a bundle adjustment in which cameras stand still finds it off for certain.
+def find_certain_focal_lengths(rig: CameraRig, found: Agreement) -> RigInterpretation | None:
+    """Multiply all focal lengths with a factor, if a bundle adjustment with fixed poses finds it certain; else None.
 
-    With other lenses lines of sight pass each other, the farther from the middle of the image the more, because cameras
-    stand where they do. A few per cent are less than the noise of one sighting, and more than that of a thousand.
+    With wrong focal lengths and right poses, lines of sight miss each other, more so far from the image's middle. An
+    error of a few per cent is smaller than the noise of one sighting, and larger than the noise of a thousand.
 
     Args:
-        rig: as it was read.
-        found: its points.
+        rig: the rig as it was read.
+        found: points of this rig.
     """
     seen_px = np.where(found.used[..., None], found.centre_px, np.nan)
     noise_px = np.nan_to_num(found.noise_px, nan=1.0)
@@ -168,22 +175,26 @@ def certain_lenses(rig: CameraRig, found: Agreement) -> Reading | None:
     from_middle = np.nan_to_num((seen_px - middle_px) / (size_px / 2))
     run = np.cumsum(np.diff(found.frame, prepend=found.frame[:1]) > 1)
     common_px, all_of_it = _COMMON * noise_px, np.zeros_like(run)
-    alike = [Alike(run, common_px)]
-    alike += [Alike(all_of_it, common_px * of) for of in (1.0, *np.moveaxis(from_middle, -1, 0))]
-    adjusted = adjust(rig, seen_px, noise_px, fixed=rig.names, rescaled=rig.names, alike=alike)
+    common_errors = [CommonErrors(run, common_px)]
+    common_errors += [
+        CommonErrors(all_of_it, common_px * of) for of in (1.0, *np.moveaxis(from_middle, -1, 0))
+    ]
+    adjusted = adjust(
+        rig, seen_px, noise_px, fixed=rig.names, rescaled=rig.names, common_errors=common_errors
+    )
     scale, std = adjusted.focal_scale, adjusted.focal_scale_std
     if abs(np.log(scale)) < max(_LEAST_OFF, _CERTAIN * std / scale):
         return None
-    (reading,) = _lenses(rig, np.array([scale]))
-    return replace(reading, words=f"{reading.words}, give or take {100 * std / scale:.1f} %")
+    (interpretation,) = _lenses(rig, np.array([scale]))
+    return replace(interpretation, words=f"{interpretation.words}, give or take {100 * std / scale:.1f} %")
 
 
-def _lenses(rig: CameraRig, scales: Float[np.ndarray, "scales"]) -> Iterator[Reading]:
-    """All focal lengths times a factor."""
+def _lenses(rig: CameraRig, scales: Float[np.ndarray, "scales"]) -> Iterator[RigInterpretation]:
+    """Interpretations in which all focal lengths are multiplied with a factor."""
     for scale in scales.tolist():
         K = rig.cameras.K.copy()
         K[:, :2, :2] *= scale
-        yield Reading(
+        yield RigInterpretation(
             "focal lengths",
             f"all focal lengths are too {'short' if scale > 1 else 'long'}: {abs(100 * (1 / scale - 1)):.0f} % off",
             f"multiply them by {scale:.3f}, or calibrate the lenses anew",

@@ -1,7 +1,7 @@
-"""What cameras see of points: marked by hand, corners of markers of known places, and drones that are tracked.
+"""Points in images: points marked by hand, corners of markers of known positions, and tracked drones.
 
-Marks by hand are a CSV, `camera,point,x_px,y_px,x_m,y_m,z_m`, with one row for each camera that sees a point. Its place
-in the world stands in any of its rows, or in a CSV of its own, `point,x_m,y_m,z_m`.
+Points marked by hand are a CSV file, `camera,point,x_px,y_px,x_m,y_m,z_m`, with one row for each camera that sees a
+point. The position of a point in the world is in any of its rows, or in another CSV file, `point,x_m,y_m,z_m`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.calibration.alike import Alike
+from psotrack.calibration.common_errors import CommonErrors
 from psotrack.correspondence import BORDER_PX, NOISE_PX, NOISE_SHARE
 from psotrack.detection import marker_dictionary
 from psotrack.errors import InputError
@@ -25,24 +25,25 @@ from psotrack.trajectories import Trajectories
 
 _SEPARATOR = ","
 _WORLD = ("x_m", "y_m", "z_m")
-#: Frames of a video that markers are sought in: the median of so many hides what noise there is.
+#: Number of frames of a video in which markers are searched: the median over them hides the noise.
 _FRAMES = 15
-#: Share of those frames that must show a marker, or it is something else.
+#: Smallest share of these frames that must show a marker: a rarer marker is a false detection.
 _SEEN = 0.5
-#: The middle of a drone's box is off by so much of its sides in the same way for as long as the drone flies alike; and
-#: by as much again in all frames of a camera, for its shape; and again, all drones, over a camera's image, for bodies
-#: are near and far, and seen from above or the side.
-_ALIKE_SHARE, _ALIKE_S = 0.015, 1.0
+#: Standard deviation of each kind of common error of boxes, as a share of the box's mean side, and time over which the
+#: first kind lasts, seconds. A drone's error lasts while its attitude is the same; its shape causes another error in
+#: all frames of a camera; and all drones of a camera share an error that varies over the image, because bodies are near
+#: and far, and are seen from above or from the side.
+_COMMON_SHARE, _COMMON_S = 0.015, 1.0
 
 
 @dataclass(frozen=True)
-class Marks:
-    """What one camera sees of known points.
+class ImagePoints:
+    """Points of known position in one camera's image.
 
     Attributes:
-        points: their names.
-        points_m: (points, 3), world, metres.
-        points_px: (points, 2), in the image.
+        points: names of the points.
+        points_m: (points, 3), positions in the world, metres.
+        points_px: (points, 2), positions in the image, pixels.
     """
 
     points: tuple[str, ...]
@@ -52,31 +53,32 @@ class Marks:
 
 @dataclass(frozen=True)
 class DroneViews:
-    """What cameras see of tracked drones, a point for each drone in each frame.
+    """Tracked drones in the images of all cameras, one point per drone and frame.
 
     Attributes:
-        points: their names, `dron1@40` for frame 40.
-        points_px: (points, cameras, 2), middles of boxes; NaN where a camera does not see the drone, or not clearly.
-        noise_px: (points, cameras), standard deviation of what differs from frame to frame; NaN where the point is.
-        alike: what lasts.
+        points: names of the points, such as `dron1@40` for frame 40.
+        points_px: (points, cameras, 2), middles of boxes, pixels; NaN where a camera has no clear box of the drone.
+        noise_px: (points, cameras), standard deviations of the errors that differ from frame to frame, pixels; NaN like
+            `points_px`.
+        common_errors: errors that last over many frames.
     """
 
     points: tuple[str, ...]
     points_px: Float[np.ndarray, "points cameras 2"]
     noise_px: Float[np.ndarray, "points cameras"]
-    alike: tuple[Alike, ...]
+    common_errors: tuple[CommonErrors, ...]
 
 
-def read_marks(path: Path, places: Path | None = None) -> dict[str, Marks]:
-    """The marks of each camera.
+def read_image_points(path: str | Path, places: str | Path | None = None) -> dict[str, ImagePoints]:
+    """Read the image points of each camera from a CSV file.
 
     Args:
-        path: of the marks.
-        places: of the points' places in the world, where the marks do not have them all.
+        path: file with the image points.
+        places: file with the points' positions in the world, if `path` does not contain all positions.
 
     Raises:
-        InputError: a file cannot be read, a column or value is missing, a camera has a point twice, or a point has no
-            place in the world or two. The message names the line.
+        InputError: a file cannot be read, a column or a value is missing, a camera has a point twice, or a point has no
+            position in the world or two different positions. The message names the line.
     """
     table = _read_table(path)
     camera, point = table.column("camera"), table.column("point")
@@ -98,7 +100,7 @@ def read_marks(path: Path, places: Path | None = None) -> dict[str, Marks]:
             )
         of_camera[name] = [row.number(column) for column in pixels]
     return {
-        name: Marks(
+        name: ImagePoints(
             tuple(rows),
             np.array([place_of[point] for point in rows]),
             np.array(list(rows.values())),
@@ -109,20 +111,20 @@ def read_marks(path: Path, places: Path | None = None) -> dict[str, Marks]:
 
 def find_markers(
     video: VideoInfo, corners_m: Mapping[int, Float[np.ndarray, "4 3"]], dictionary: str = "4x4_1000"
-) -> Marks:
-    """The corners of markers of known places that a camera that stands still sees: medians over frames.
+) -> ImagePoints:
+    """Find the corners of markers of known positions in the video of a static camera, as medians over frames.
 
     Args:
-        video: of the camera.
-        corners_m: (4, 3), world, metres, by marker id, in the order of OpenCV's ArUco.
-        dictionary: of the markers, such as 4x4_50.
+        video: the camera's video.
+        corners_m: by marker id, (4, 3), positions of the corners in the world, metres, in the order of OpenCV's ArUco.
+        dictionary: name of the markers' dictionary, such as 4x4_50.
 
     Returns:
-        Points are called `7.1` to `7.4` for the corners of marker 7.
+        Image points; the corners of marker 7 are called `7.1` to `7.4`.
 
     Raises:
         InputError: the video cannot be read.
-        SettingsError: there is no such dictionary.
+        SettingsError: the dictionary does not exist.
     """
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
@@ -136,27 +138,26 @@ def find_markers(
             if marker in corners_m:
                 found.setdefault(marker, []).append(quad.reshape(4, 2).astype(np.float64))
     kept = sorted(marker for marker, quads in found.items() if len(quads) >= _SEEN * frames)
-    return Marks(
+    return ImagePoints(
         tuple(f"{marker}.{corner + 1}" for marker in kept for corner in range(4)),
         np.array([corners_m[marker] for marker in kept]).reshape(-1, 3),
         np.array([np.median(found[marker], axis=0) for marker in kept]).reshape(-1, 2),
     )
 
 
-def in_boxes(
+def find_drones_in_boxes(
     rig: CameraRig, detections: Mapping[str, Detections], tracks: Trajectories, most_frames: int = 500
 ) -> DroneViews:
-    """Where cameras see tracked drones: the middle of the box that holds a drone's projection.
+    """Find tracked drones in the images: the middle of the box that contains a drone's projection.
 
-    A box that holds two drones, and a drone in two boxes, tell nothing; the middles of boxes that the border of the
-    image cuts, or that touch others, are not those of drones. Where there are many frames some are left out, evenly:
-    those beside each other say the same.
+    Not used are boxes that contain two drones, drones in two boxes, boxes that the image's border cuts, and boxes that
+    touch other boxes. Of long tracks only every n-th frame is used, because neighbouring frames have the same errors.
 
     Args:
-        rig: of the tracks.
-        detections: by camera name; cameras without any see nothing.
-        tracks: of the drones.
-        most_frames: that are used.
+        rig: cameras with which the drones were tracked.
+        detections: detections by camera name; a camera without an entry has no detections.
+        tracks: positions of the drones.
+        most_frames: largest number of frames that are used.
     """
     rows = np.arange(0, tracks.num_frames, max(1, -(-tracks.num_frames // most_frames)))
     places_m = np.where(tracks.seen[rows, :, None], tracks.position_m[rows], np.nan)
@@ -167,7 +168,7 @@ def in_boxes(
             xyxy = detections[name].in_frame(frame).xyxy
             clear = _clear(xyxy, np.asarray(rig.cameras.image_size_wh[camera]))
             at = projected[row, :, camera, None]
-            # Pixel centres are at whole numbers, and the edges of boxes half a pixel from them.
+            # Pixel centres are at whole numbers, and edges of boxes are half a pixel away from pixel centres.
             xyxy = xyxy - 0.5
             holds = ((at >= xyxy[:, :2]) & (at <= xyxy[:, 2:])).all(axis=-1)
             holds &= (depth[row, :, camera] > 0)[:, None]
@@ -177,46 +178,52 @@ def in_boxes(
             side_px[row, drone, camera] = np.sqrt((xyxy[box, 2:] - xyxy[box, :2]).prod(axis=-1))
     names = [f"{drone}@{frame}" for frame in tracks.frame[rows].tolist() for drone in tracks.drones]
     drone = np.tile(np.arange(tracks.num_drones), len(rows))
-    second = np.floor(tracks.time_s[rows] / _ALIKE_S).astype(np.int64).repeat(tracks.num_drones)
+    second = np.floor(tracks.time_s[rows] / _COMMON_S).astype(np.int64).repeat(tracks.num_drones)
     points_px, side_px = points_px.reshape(-1, len(rig), 2), side_px.reshape(-1, len(rig))
     return DroneViews(
         tuple(names),
         points_px,
         NOISE_PX + NOISE_SHARE * side_px,
-        _alike(rig, points_px, side_px, drone, (second - second.min(initial=0)) * tracks.num_drones + drone),
+        _make_common_errors(
+            rig, points_px, side_px, drone, (second - second.min(initial=0)) * tracks.num_drones + drone
+        ),
     )
 
 
 def _clear(
     xyxy: Float[np.ndarray, "boxes 4"], image_size_wh: Float[np.ndarray, "2"]
 ) -> Bool[np.ndarray, " boxes"]:
-    """Boxes that neither the border of the image cuts nor another one touches."""
+    """Say which boxes are neither cut by the image's border nor touched by another box."""
     sides = np.minimum(xyxy[:, None, 2:], xyxy[:, 2:]) - np.maximum(xyxy[:, None, :2], xyxy[:, :2])
     touched = (sides > 0).all(axis=-1).sum(axis=1) > 1
     cut = (xyxy[:, :2] < BORDER_PX) | (xyxy[:, 2:] > image_size_wh - BORDER_PX)
     return ~touched & ~cut.any(axis=-1)
 
 
-def _alike(
+def _make_common_errors(
     rig: CameraRig,
     points_px: Float[np.ndarray, "points cameras 2"],
     side_px: Float[np.ndarray, "points cameras"],
     drone: Int[np.ndarray, " points"],
     second: Int[np.ndarray, " points"],
-) -> tuple[Alike, ...]:
-    """What lasts of the boxes' errors: of a drone in a camera, for a while and for good, and of a camera's drones."""
+) -> tuple[CommonErrors, ...]:
+    """Errors of boxes that last: per drone for a second, per drone for the recording, and per camera for all drones."""
     middle_px = np.asarray(rig.cameras.K)[:, :2, 2]
     from_middle = (points_px - middle_px) / (np.asarray(rig.cameras.image_size_wh) / 2)
     everything = np.zeros_like(drone)
     return (
-        Alike(second, _ALIKE_SHARE * side_px),
-        Alike(drone, _ALIKE_SHARE * side_px),
-        *(Alike(everything, _ALIKE_SHARE * side_px * of) for of in (1.0, *np.moveaxis(from_middle, -1, 0))),
+        CommonErrors(second, _COMMON_SHARE * side_px),
+        CommonErrors(drone, _COMMON_SHARE * side_px),
+        *(
+            CommonErrors(everything, _COMMON_SHARE * side_px * of)
+            for of in (1.0, *np.moveaxis(from_middle, -1, 0))
+        ),
     )
 
 
-def _read_table(path: Path) -> Table:
-    """A table whose last cells may be empty, which `delimited.read_table` would take for a short row."""
+def _read_table(path: str | Path) -> Table:
+    """Read a table whose last cells may be empty; `read_table` would take such a row as too short."""
+    path = Path(path)
     header, *rows = read_rows(path, _SEPARATOR) or [TextRow(path, 1, ("",))]
     columns = tuple(Column(index, cell.lower(), "", cell) for index, cell in enumerate(header.cells))
     if not rows:
@@ -235,7 +242,7 @@ def _read_table(path: Path) -> Table:
 def _places(
     table: Table, *, required: bool, known: Mapping[str, list[float]] | None = None
 ) -> dict[str, list[float]]:
-    """Where points are in the world; the same point in several rows is in the same place."""
+    """Positions of points in the world; a point with several rows must have the same position in each row."""
     places = dict(known or {})
     if not required and table.find(_WORLD[0]) is None:
         return places

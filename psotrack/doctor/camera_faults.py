@@ -1,8 +1,8 @@
-"""What is wrong with one camera, judged by points that all others agree on.
+"""Faults of one camera, found with points on which all other cameras agree.
 
-The points are projected into the camera, and its sightings looked for beside them. Each kind of fault is a family of
-other cameras (turned, moved, of another focal length, another one's) or of other times; the member is taken that
-explains most sightings.
+The points are projected into the camera and compared with its sightings. Each kind of fault is a family of modified
+cameras (turned, moved, with another focal length, exchanged with another camera) or of delays. The member that explains
+most sightings is taken.
 """
 
 from __future__ import annotations
@@ -17,35 +17,35 @@ from scipy.spatial.transform import Rotation
 from psotrack.calibration import locate_camera
 from psotrack.clocks import camera_offsets
 from psotrack.correspondence import Sightings
-from psotrack.doctor.agreement import MIN_VIEWPOINTS, UNEXPLAINED, Agreement, num_viewpoints
+from psotrack.doctor.agreement import MAX_SQUARED_DISTANCE, MIN_VIEWPOINTS, Agreement, num_viewpoints
 from psotrack.errors import InputError
 from psotrack.geometry import NEAR_M, Camera, CameraRig, project, reconstruct, undistort
 
-#: Points that others see, below which nothing is said of a camera.
-LEAST_POINTS = 30
-#: Focal lengths and delays that are tried.
+#: Smallest number of points of the other cameras with which a camera is checked.
+MIN_POINTS_OF_CAMERA = 30
+#: Factors of the focal length and delays (frames) that are tried.
 _SCALES = np.exp(np.arange(-0.7, 0.7001, 0.02))
 _FINER = np.exp(np.arange(-0.02, 0.0201, 0.005))
 _DELAYS = np.arange(-5.0, 5.01, 0.25)
-#: Pixels of a cell in which shifts of the image are counted, and rounds in which sightings are paired anew.
+#: Side of a cell of the histogram of image shifts, pixels, and number of rounds in which sightings are paired anew.
 _CELL_PX, _ROUNDS = 16.0, 6
-#: A drone flies no farther than this between frames; less than two are apart.
+#: Largest motion of a drone between two frames, metres; smaller than the distance between two drones.
 _STEP_M = 0.3
-#: Clocks that are apart by less are alike, and so are those that are not beyond it by as many standard deviations.
+#: A clock is late if its offset exceeds this number of frames by more than this number of standard deviations.
 LATE_FRAMES, CLEARLY_STD = 0.25, 3.0
-#: Runs of frames are put so far apart that the slopes of one (`camera_clocks`) do not reach another.
+#: Number of empty frames between two runs, so that velocities of one run (`camera_clocks`) do not use another run.
 _GAP_FRAMES = 15
 
 
 @dataclass(frozen=True)
 class DetectionViews:
-    """What others say that a camera should see, and what it sees in the same frames.
+    """Points of the other cameras, and a camera's sightings in the same frames.
 
     Attributes:
-        point_m: (points, 3), from the other cameras alone.
-        velocity_m: (points, 3), per frame; NaN where the next frames do not show it.
-        box_px: (points, boxes, 2), the camera's sightings in the frame of each point; NaN for none.
-        noise_px: (points, boxes), their standard deviations.
+        point_m: (points, 3), points from the other cameras alone, metres.
+        velocity_m: (points, 3), velocities, metres per frame; NaN if a neighbouring frame does not show the drone.
+        box_px: (points, boxes, 2), the camera's sightings in each point's frame, pixels; NaN for no sighting.
+        noise_px: (points, boxes), standard deviations of the sightings, pixels.
     """
 
     point_m: Float[np.ndarray, "points 3"]
@@ -55,14 +55,14 @@ class DetectionViews:
 
 
 @dataclass(frozen=True)
-class Explanation:
-    """A fault that a camera may have.
+class CameraFault:
+    """A possible fault of a camera.
 
     Attributes:
-        kind: clock, focal length, exchanged, turned, or moved; sound where nothing is wrong.
-        gain: share of the points that the camera's sightings explain, each by how well.
-        camera: as it would be; the one that was read where the fault is none of it.
-        amount: frames late, factor of the focal length, or index of the other camera.
+        kind: clock, focal length, exchanged, turned or moved; sound for no fault.
+        gain: share of the points that the camera's sightings explain (`explained_share`).
+        camera: the camera with the fault corrected; the camera as it was read if the fault is not one of the camera.
+        amount: delay in frames, factor of the focal length, or index of the exchanged camera.
     """
 
     kind: str
@@ -71,8 +71,8 @@ class Explanation:
     amount: float = 0.0
 
 
-def views_of(rig: CameraRig, found: Agreement, sightings: Sightings, index: int) -> DetectionViews:
-    """The points that others agree on without the camera at `index`, and its sightings."""
+def collect_views(rig: CameraRig, found: Agreement, sightings: Sightings, index: int) -> DetectionViews:
+    """Points on which the other cameras agree without the camera at `index`, and the sightings of this camera."""
     others = np.arange(len(rig)) != index
     kept = num_viewpoints(rig.cameras, found.used & others) >= MIN_VIEWPOINTS
     centre_px, used, frame = found.centre_px[kept], found.used[kept] & others, found.frame[kept]
@@ -89,7 +89,7 @@ def views_of(rig: CameraRig, found: Agreement, sightings: Sightings, index: int)
 
 
 def velocities(frame: Int[np.ndarray, "points"], point_m: Float[np.ndarray, "points 3"]) -> np.ndarray:
-    """(points, 3), metres per frame, from the nearest points of the frames before and after; NaN without both."""
+    """(points, 3), velocities from the nearest points of both neighbouring frames, metres per frame; NaN if missing."""
     steps = []
     for direction in (-1, 1):
         step = np.full(point_m.shape, np.nan)
@@ -106,43 +106,45 @@ def velocities(frame: Int[np.ndarray, "points"], point_m: Float[np.ndarray, "poi
     return (steps[0] + steps[1]) / 2
 
 
-def gain_of(camera: Camera, views: DetectionViews, delay_frames: float = 0.0) -> float:
-    """Share of the points that are explained: 1 - distance² / `UNEXPLAINED` of each, and 0 for one that is not."""
+def explained_share(camera: Camera, views: DetectionViews, delay_frames: float = 0.0) -> float:
+    """Share of explained points: each counts 1 - distance² / `MAX_SQUARED_DISTANCE`, and 0 if it is farther."""
     return float(np.sum(_fits(camera, views, delay_frames)[0])) / max(len(views.point_m), 1)
 
 
-def explanations(rig: CameraRig, views: DetectionViews, index: int) -> list[Explanation]:
-    """The camera as it was read, and the best of each kind of fault, the simplest ones first."""
+def explain_camera(rig: CameraRig, views: DetectionViews, index: int) -> list[CameraFault]:
+    """The camera as it was read, and the best fault of each kind, the simplest kinds first."""
     camera = rig.cameras[index]
-    sound = Explanation("sound", gain_of(camera, views), camera)
-    delay = max(_DELAYS.tolist(), key=lambda delay: gain_of(camera, views, delay))
-    scale = max(_SCALES.tolist(), key=lambda scale: gain_of(scaled(camera, scale), views))
-    scale = max((scale * _FINER).tolist(), key=lambda scale: gain_of(scaled(camera, scale), views))
-    lenses = scaled(camera, scale)
+    sound = CameraFault("sound", explained_share(camera, views), camera)
+    delay = max(_DELAYS.tolist(), key=lambda delay: explained_share(camera, views, delay))
+    scale = max(_SCALES.tolist(), key=lambda scale: explained_share(scale_focal_length(camera, scale), views))
+    scale = max(
+        (scale * _FINER).tolist(), key=lambda scale: explained_share(scale_focal_length(camera, scale), views)
+    )
+    lenses = scale_focal_length(camera, scale)
     turned = _turned(camera, views)
     moved = _moved(turned, views)
     faults = [
-        Explanation("clock", gain_of(camera, views, delay), camera, delay),
-        Explanation("focal length", gain_of(lenses, views), lenses, scale),
+        CameraFault("clock", explained_share(camera, views, delay), camera, delay),
+        CameraFault("focal length", explained_share(lenses, views), lenses, scale),
     ]
     for other in range(len(rig)):
         if other != index:
             there = rig.cameras[other]
-            faults.append(Explanation("exchanged", gain_of(there, views), there, float(other)))
-    faults.append(Explanation("turned", gain_of(turned, views), turned))
-    faults.append(Explanation("moved", gain_of(moved, views), moved))
+            faults.append(CameraFault("exchanged", explained_share(there, views), there, float(other)))
+    faults.append(CameraFault("turned", explained_share(turned, views), turned))
+    faults.append(CameraFault("moved", explained_share(moved, views), moved))
     return [sound, *faults]
 
 
-def scaled(camera: Camera, scale: float) -> Camera:
-    """With another focal length."""
+def scale_focal_length(camera: Camera, scale: float) -> Camera:
+    """The camera with its focal lengths multiplied by `scale`."""
     K = camera.K.copy()
     K[..., :2, :2] *= scale
     return replace(camera, K=K)
 
 
-def change(before: Camera, after: Camera) -> tuple[float, float]:
-    """By how many degrees a camera is turned, and by how many metres moved."""
+def pose_difference(before: Camera, after: Camera) -> tuple[float, float]:
+    """The angle by which a camera is turned, degrees, and the distance by which it is moved, metres."""
     R = after.T_cam_world[:3, :3] @ before.T_cam_world[:3, :3].T
     turn_deg = float(np.rad2deg(Rotation.from_matrix(R).magnitude()))
     return turn_deg, float(np.linalg.norm(after.centre_world - before.centre_world))
@@ -151,23 +153,23 @@ def change(before: Camera, after: Camera) -> tuple[float, float]:
 def _fits(
     camera: Camera, views: DetectionViews, delay_frames: float = 0.0, widen: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """For each point how well it is explained, and by which sighting."""
+    """How well each point is explained, from 0 to 1, and the index of the sighting that explains it."""
     moved_m = delay_frames * np.nan_to_num(views.velocity_m)
     pixels, depth = project(camera, views.point_m + moved_m)
     off = np.sum((views.box_px - pixels[:, None]) ** 2, axis=-1) / (widen * views.noise_px) ** 2
     off = np.where(np.isfinite(off) & (depth > NEAR_M)[:, None], off, np.inf)
     best = off.argmin(axis=1)
-    return np.maximum(0.0, 1 - off[np.arange(len(off)), best] / UNEXPLAINED), best
+    return np.maximum(0.0, 1 - off[np.arange(len(off)), best] / MAX_SQUARED_DISTANCE), best
 
 
 def _turned(camera: Camera, views: DetectionViews) -> Camera:
-    """The camera turned about its centre: from the commonest shift of the image to rays that agree."""
+    """The camera turned about its centre: first by the most frequent shift of the image, then until rays agree."""
     starts = [camera, _shifted(camera, views)]
-    return max((_aligned(start, views) for start in starts), key=lambda each: gain_of(each, views))
+    return max((_aligned(start, views) for start in starts), key=lambda each: explained_share(each, views))
 
 
 def _shifted(camera: Camera, views: DetectionViews) -> Camera:
-    """Turned so that most points fall on sightings, to a cell of the image."""
+    """The camera turned so that most points fall on sightings, to the precision of a cell of the histogram."""
     pixels, depth = project(camera, views.point_m)
     off = (views.box_px - pixels[:, None])[depth > NEAR_M].reshape(-1, 2)
     reach = float(camera.image_size_wh.max()) / 2
@@ -191,10 +193,10 @@ def _turned_by(camera: Camera, R: Float[np.ndarray, "3 3"]) -> Camera:
 
 def _aligned(camera: Camera, views: DetectionViews) -> Camera:
     for round_ in range(_ROUNDS):
-        # A cell is wider than the noise.
+        # The first rounds accept larger distances, because a cell is wider than the noise.
         fit, best = _fits(camera, views, widen=3.0 if round_ < _ROUNDS // 2 else 1.0)
         pairs = np.flatnonzero(fit > 0)
-        if len(pairs) < LEAST_POINTS:
+        if len(pairs) < MIN_POINTS_OF_CAMERA:
             return camera
         seen = _rays(undistort(camera, views.box_px[pairs, best[pairs]]))
         T = camera.T_cam_world
@@ -206,13 +208,13 @@ def _aligned(camera: Camera, views: DetectionViews) -> Camera:
 
 
 def _moved(camera: Camera, views: DetectionViews) -> Camera:
-    """The camera where its sightings put it."""
+    """The camera at the position that its sightings give."""
     start = camera
-    # What is moved far has few sightings near where they should be: more come with every round.
+    # A camera that was moved far has few sightings near the projections at first, and more in every round.
     for widen in (3.0, 1.0, 1.0):
         fit, best = _fits(camera, views, widen=widen)
         pairs = np.flatnonzero(fit > 0)
-        if len(pairs) < LEAST_POINTS:
+        if len(pairs) < MIN_POINTS_OF_CAMERA:
             return start
         seen_px = views.box_px[pairs, best[pairs]]
         noise_px = float(np.median(views.noise_px[pairs, best[pairs]]))
@@ -223,7 +225,7 @@ def _moved(camera: Camera, views: DetectionViews) -> Camera:
         except InputError:
             return start
         camera = replace(camera, T_cam_world=located.T_cam_world)
-    return max((start, camera), key=lambda each: gain_of(each, views))
+    return max((start, camera), key=lambda each: explained_share(each, views))
 
 
 def _rays(x: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
@@ -231,13 +233,13 @@ def _rays(x: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
-def late_cameras(
+def find_late_cameras(
     rig: CameraRig, found: Agreement, sound: np.ndarray, fps: float
 ) -> tuple[Float[np.ndarray, "cameras"], Float[np.ndarray, "cameras"], list[int]]:
-    """How late each sound camera is against the median of them, in frames, its standard deviation, and which are late.
+    """Offsets of the sound cameras' clocks from their median, standard deviations, and indices of late cameras.
 
-    Middles of boxes that change with the motion leave a tenth of a frame or two, so that less than
-    `LATE_FRAMES` is none.
+    Middles of boxes that move along the flight direction cause offsets of a tenth of a frame or two, so that offsets
+    below `LATE_FRAMES` are not reported.
     """
     offset, std = np.full((2, len(rig)), np.nan)
     index = np.flatnonzero(sound)
@@ -253,7 +255,7 @@ def late_cameras(
 
 
 def _tracks(found: Agreement) -> Float[np.ndarray, "frames drones cameras 2"]:
-    """The sightings of points that follow each other, so far apart between runs of frames that these do not touch."""
+    """Sightings as tracks: points of consecutive frames that are near each other, with a gap between runs of frames."""
     frames = np.unique(found.frame)
     row = np.cumsum(np.diff(frames, prepend=frames[:1]).clip(0, _GAP_FRAMES))
     most = max(np.bincount(found.frame).tolist(), default=1)
@@ -266,7 +268,7 @@ def _tracks(found: Agreement) -> Float[np.ndarray, "frames drones cameras 2"]:
             distance = np.linalg.norm(found.position_m[here][:, None] - before_m, axis=-1)
             for mine, theirs in zip(*linear_sum_assignment(distance), strict=True):
                 slot[mine] = before[theirs] if distance[mine, theirs] < _STEP_M else -1
-        # A track that begins takes a place that none of the frame before had.
+        # A new track takes a place that no track had in the frame before.
         free = [each for each in range(3 * most) if each not in slot and each not in before]
         slot[slot < 0] = free[: int((slot < 0).sum())]
         tracks_px[at, slot] = np.where(found.used[here][..., None], found.centre_px[here], np.nan)
