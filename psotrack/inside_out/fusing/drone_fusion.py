@@ -117,24 +117,24 @@ def fuse_drone(
     )
     open_arm = Arm(arm_m, _ARM_STD_M)
     middle = middle_m, middle_covariance_m2
-    readings = _readings(path, camera, time_s, *middle, arm_m, point)
-    expected = expected_model(_excess(_difference_m(camera, middle_m, arm_m), readings))
+    readings = _make_readings(path, camera, time_s, *middle, arm_m, point)
+    expected = expected_model(_variance_ratio(_differences_m(camera, middle_m, arm_m), readings))
     out, added_m2 = gate_readings(readings, expected, near)
     gross = out[:, INSIDE].copy()
     if gross.any():
         # The orientation of a gross pose is wrong too: take it from the neighbouring poses.
-        camera = resample_path(_without(path, camera.index[gross]), time_s, clock_s)
-        readings = _readings(path, camera, time_s, *middle, arm_m, point)
+        camera = resample_path(_without_poses(path, camera.index[gross]), time_s, clock_s)
+        readings = _make_readings(path, camera, time_s, *middle, arm_m, point)
         out, added_m2 = gate_readings(readings, expected, near)
-    difference_m = _difference_m(camera, middle_m, arm_m)
-    covariance_m2, model = fit_error_model(_used(readings, out, added_m2), difference_m, open_arm)
+    difference_m = _differences_m(camera, middle_m, arm_m)
+    covariance_m2, model = fit_error_model(_with_gating(readings, out, added_m2), difference_m, open_arm)
     readings = replace(readings, covariance_m2=covariance_m2)
     out, added_m2 = gate_readings(readings, model, near)
-    joint = smooth(_used(readings, out, added_m2), model, open_arm)
+    joint = smooth(_with_gating(readings, out, added_m2), model, open_arm)
     used = readings.known & ~out
     out[:, INSIDE] |= gross
     return DroneFusion(
-        track=_track(joint, path, camera, time_s, used),
+        track=_make_track(joint, path, camera, time_s, used),
         arm_m=joint.arm_m,
         arm_std_m=np.sqrt(np.diag(joint.arm_covariance_m2)),
         inside=_source_errors(model, INSIDE, out),
@@ -142,8 +142,8 @@ def fuse_drone(
     )
 
 
-def path_alone(path: CameraPath, time_s: Float[np.ndarray, "frames"], clock_s: float) -> DroneTrack:
-    """A path as it is, at its samples nearest to the frames."""
+def unfused_path(path: CameraPath, time_s: Float[np.ndarray, "frames"], clock_s: float) -> DroneTrack:
+    """A path without fusion, at its samples nearest to the frames."""
     camera = resample_path(path, time_s, clock_s, coasting=True)
     known = camera.index >= 0
 
@@ -164,7 +164,7 @@ def path_alone(path: CameraPath, time_s: Float[np.ndarray, "frames"], clock_s: f
     )
 
 
-def _readings(
+def _make_readings(
     path: CameraPath,
     camera: ResampledPath,
     time_s: Float[np.ndarray, "frames"],
@@ -193,14 +193,14 @@ def _readings(
     )
 
 
-def _difference_m(
+def _differences_m(
     camera: ResampledPath, middle_m: Float[np.ndarray, "frames 3"], arm_m: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "frames 3"]:
     """(frames, 3), position by the outside less that by inside and arm; NaN where either is unknown."""
     return middle_m - camera.position_m - camera.rotation @ arm_m
 
 
-def _excess(difference_m: Float[np.ndarray, "frames 3"], readings: Readings) -> float:
+def _variance_ratio(difference_m: Float[np.ndarray, "frames 3"], readings: Readings) -> float:
     """Median of the squared differences, divided by its expectation from the stated variances."""
     both = np.isfinite(difference_m).all(axis=1) & readings.known.all(axis=1)
     if not both.any():
@@ -211,13 +211,13 @@ def _excess(difference_m: Float[np.ndarray, "frames 3"], readings: Readings) -> 
     return max(float(np.median((difference_m[both] * normalised).sum(axis=1))) / CHI2_3_MEDIAN, _LEAST_SCALE)
 
 
-def _used(
+def _with_gating(
     readings: Readings, out: Bool[np.ndarray, "frames 2"], added_m2: Float[np.ndarray, "frames 2 3 3"]
 ) -> Readings:
     return replace(readings, known=readings.known & ~out, added_m2=readings.added_m2 + added_m2)
 
 
-def _without(path: CameraPath, rows: Int[np.ndarray, "rows"]) -> CameraPath:
+def _without_poses(path: CameraPath, rows: Int[np.ndarray, "rows"]) -> CameraPath:
     status = path.status.copy()
     status[rows] = Status.LOST
     return replace(path, status=status)
@@ -233,7 +233,7 @@ def _source_errors(model: ErrorModel, source: int, out: Bool[np.ndarray, "frames
     )
 
 
-def _track(
+def _make_track(
     joint: Joint,
     path: CameraPath,
     camera: ResampledPath,

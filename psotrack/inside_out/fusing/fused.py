@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from psotrack.clocks import Offset, find_offset
 from psotrack.errors import InputError
 from psotrack.inside_out.camera_path import CameraPath
-from psotrack.inside_out.fusing.drone_fusion import DroneFusion, DroneTrack, Point, fuse_drone, path_alone
+from psotrack.inside_out.fusing.drone_fusion import DroneFusion, DroneTrack, Point, fuse_drone, unfused_path
 from psotrack.inside_out.fusing.outside_tracks import OutsideTracks, align_tracks, select_track
 from psotrack.inside_out.fusing.pairing import Pairing, pair_tracks
 from psotrack.inside_out.fusing.resampling import ResampledPath, estimate_arm, resample_path
@@ -108,7 +108,7 @@ def fuse(
         raise InputError("inside paths", expected="a pose in at least one frame", found="none")
     if not outside.seen.any():
         raise InputError("outside tracks", expected="a position in at least one frame", found="none")
-    offsets = {name: _offset(name, path, outside, max_offset_s) for name, path in paths.items()}
+    offsets = {name: _find_clock_offset(name, path, outside, max_offset_s) for name, path in paths.items()}
     clocks_s = {name: 0.0 if offset is None else offset.offset_s for name, offset in offsets.items()}
     tracks_in = align_tracks(
         outside, (path.time_s[path.seen] - clocks_s[name] for name, path in paths.items())
@@ -118,21 +118,24 @@ def fuse(
     pairing = _pair(frame, cameras, tracks_in.tracked_m)
     tracks: dict[str, DroneTrack] = {}
     drones = []
-    for (name, path), theirs in zip(paths.items(), pairing.track.T, strict=True):
-        names = tuple(dict.fromkeys(outside.drones[k] for k in theirs if k != UNASSIGNED))
+    for (name, path), own_index in zip(paths.items(), pairing.track.T, strict=True):
+        names = tuple(dict.fromkeys(outside.drones[k] for k in own_index if k != UNASSIGNED))
         found = None
         if names:
-            own = select_track(tracks_in.tracked_m, theirs), select_track(tracks_in.covariance_m2, theirs)
-            found = fuse_drone(path, frame, time_s, clocks_s[name], *own, point)
-        tracks[name] = path_alone(path, time_s, clocks_s[name]) if found is None else found.track
+            own_track = (
+                select_track(tracks_in.tracked_m, own_index),
+                select_track(tracks_in.covariance_m2, own_index),
+            )
+            found = fuse_drone(path, frame, time_s, clocks_s[name], *own_track, point)
+        tracks[name] = unfused_path(path, time_s, clocks_s[name]) if found is None else found.track
         both, one, other = (int((_source(tracks[name]) == source).sum()) for source in (3, 1, 2))
         drones.append(FusedDrone(name, names, offsets[name], both, one, other, found))
-    for name, theirs in zip(outside.drones, pairing.rest.T, strict=True):
-        track = _track_alone(tracks_in, theirs)
+    for name, own_index in zip(outside.drones, pairing.rest.T, strict=True):
+        track = _outside_track(tracks_in, own_index)
         if track.used.any():
-            tracks[_new_name(name, tracks)] = track
+            tracks[_free_name(name, tracks)] = track
     return FusedTracks(
-        trajectories=_together(tracks_in, tracks),
+        trajectories=_join_tracks(tracks_in, tracks),
         point=point,
         drones=tuple(drones),
         identity_swaps=tuple(
@@ -148,7 +151,9 @@ def fuse(
     )
 
 
-def _offset(name: str, path: CameraPath, outside: Trajectories, max_offset_s: float | None) -> Offset | None:
+def _find_clock_offset(
+    name: str, path: CameraPath, outside: Trajectories, max_offset_s: float | None
+) -> Offset | None:
     if max_offset_s is None:
         return None
     known = path.seen & (path.status == Status.TRACKED)
@@ -179,10 +184,10 @@ def _pair(
     return pair_tracks(frame, expected_m, reach_m, middle_m)
 
 
-def _track_alone(outside: OutsideTracks, track: Int[np.ndarray, "frames"]) -> DroneTrack:
-    """An outside track of a drone without a camera, as it is."""
-    own = outside.status[np.arange(len(track)), track]
-    status = np.where(track == UNASSIGNED, int(Status.LOST), own)
+def _outside_track(outside: OutsideTracks, track: Int[np.ndarray, "frames"]) -> DroneTrack:
+    """The outside track of a drone without a camera, unchanged."""
+    own_status = outside.status[np.arange(len(track)), track]
+    status = np.where(track == UNASSIGNED, int(Status.LOST), own_status)
     return DroneTrack(
         position_m=select_track(outside.position_m, track),
         velocity_m_s=select_track(outside.velocity_m_s, track),
@@ -193,7 +198,7 @@ def _track_alone(outside: OutsideTracks, track: Int[np.ndarray, "frames"]) -> Dr
     )
 
 
-def _new_name(name: str, taken: Mapping[str, DroneTrack]) -> str:
+def _free_name(name: str, taken: Mapping[str, DroneTrack]) -> str:
     while name in taken:
         name += " outside"
     return name
@@ -203,7 +208,7 @@ def _source(track: DroneTrack) -> Int[np.ndarray, "frames"]:
     return track.used @ np.array([1, 2])
 
 
-def _together(outside: OutsideTracks, tracks: Mapping[str, DroneTrack]) -> Trajectories:
+def _join_tracks(outside: OutsideTracks, tracks: Mapping[str, DroneTrack]) -> Trajectories:
     def stacked(part: str) -> np.ndarray:
         return np.stack([getattr(track, part) for track in tracks.values()], axis=1)
 

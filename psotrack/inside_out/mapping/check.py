@@ -74,32 +74,32 @@ def check_map(sightings: MarkerSightings, marker_map: MarkerMap) -> MapCheck:
             sightings.name,
             expected="frames that show two markers of the map",
             found="none",
-            remedy="is it this room?",
+            remedy="check that the map and the video are of the same room",
         )
     sightings = sightings.select(kept)
     side_m = float(np.median(marker_map.sides_m))
-    located = _located(sightings, given, side_m)
+    located = _locate_by_map(sightings, given, side_m)
     residual_px = _by_marker(sightings, residuals_px(sightings, located))
-    usual_px = spread_px(np.concatenate([residual_px[marker].ravel() for marker in residual_px]), 0)
+    noise_px = spread_px(np.concatenate([residual_px[marker].ravel() for marker in residual_px]), 0)
     typical = {marker: float(np.median(values)) for marker, values in residual_px.items()}
     # The median of a Rayleigh distribution is 1.18 standard deviations.
-    limit_px = _SUSPECT * 1.18 * usual_px
+    limit_px = _SUSPECT * 1.18 * noise_px
     sound = {marker: given[marker] for marker, value in typical.items() if value <= limit_px}
-    checked = {marker: _unmoved(residual_px.get(marker)) for marker in given}
-    if 2 * len(sound) <= len(typical) or usual_px > _NOISES_PX[0]:
+    checked = {marker: _agreeing_marker(residual_px.get(marker)) for marker in given}
+    if 2 * len(sound) <= len(typical) or noise_px > _NOISES_PX[0]:
         finding = MapFinding(
             "map",
             (),
             f"the map as a whole does not fit the video: {len(sound)} of {len(typical)} markers agree with one another",
             "check that lens, dictionary and map are those of this room, and that no axis is mirrored",
         )
-        return MapCheck((finding,), checked, usual_px, sightings.num_views, not_in_map)
+        return MapCheck((finding,), checked, noise_px, sightings.num_views, not_in_map)
     suspects = [marker for marker in typical if marker not in sound]
     if not suspects:
-        return MapCheck((), checked, usual_px, sightings.num_views, not_in_map)
-    measured, noise_px = _measured(sightings, sound, suspects, located, side_m)
+        return MapCheck((), checked, noise_px, sightings.num_views, not_in_map)
+    measured, noise_px = _measure_suspects(sightings, sound, suspects, located, side_m)
     checked |= {
-        marker: _compared(given[marker], *one, residual_px[marker]) for marker, one in measured.items()
+        marker: _compare_marker(given[marker], *one, residual_px[marker]) for marker, one in measured.items()
     }
     findings = find_faults(
         given, {marker: found for marker, (found, _) in measured.items()}, checked, suspects
@@ -107,7 +107,9 @@ def check_map(sightings: MarkerSightings, marker_map: MarkerMap) -> MapCheck:
     return MapCheck(tuple(findings), checked, noise_px, sightings.num_views, not_in_map)
 
 
-def _located(sightings: MarkerSightings, given: Mapping[int, PlacedMarker], side_m: float) -> MappedScene:
+def _locate_by_map(
+    sightings: MarkerSightings, given: Mapping[int, PlacedMarker], side_m: float
+) -> MappedScene:
     """The scene in which views agree with as many markers as possible, with all markers where the map has them."""
     placer = MarkerPlacer(sightings, side_m)
     scene = make_scene(
@@ -128,7 +130,7 @@ def _by_marker(
     return {marker: residual_px[sightings.marker == marker].ravel() for marker in sightings.ids}
 
 
-def _measured(
+def _measure_suspects(
     sightings: MarkerSightings,
     sound: Mapping[int, PlacedMarker],
     suspects: list[int],
@@ -164,7 +166,7 @@ def _measured(
     }, adjusted.noise_px
 
 
-def _unmoved(residual_px: Float[np.ndarray, " corners"] | None) -> CheckedMarker:
+def _agreeing_marker(residual_px: Float[np.ndarray, " corners"] | None) -> CheckedMarker:
     unknown = np.full(3, np.nan)
     count, typical = (
         (0, np.nan) if residual_px is None else (len(residual_px) // 4, float(np.median(residual_px)))
@@ -172,7 +174,7 @@ def _unmoved(residual_px: Float[np.ndarray, " corners"] | None) -> CheckedMarker
     return CheckedMarker(count, typical, unknown, unknown, np.nan, np.nan, np.nan)
 
 
-def _compared(
+def _compare_marker(
     given: PlacedMarker,
     found: PlacedMarker,
     covariance: Float[np.ndarray, "7 7"],

@@ -58,7 +58,7 @@ class ViewPoses:
 
 
 class MarkerPlacer:
-    """Places markers and locates views from sightings; poses of single squares are computed once, when it is made.
+    """Places markers and locates views from sightings; poses of single squares are computed only once.
 
     Args:
         sightings: markers in views.

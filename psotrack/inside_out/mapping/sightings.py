@@ -66,11 +66,11 @@ class MarkerSightings:
 
     @property
     def ids(self) -> list[int]:
-        """The markers that are seen, increasing."""
+        """Ids of the markers that are seen, in increasing order."""
         return np.unique(self.marker).tolist()
 
     def select(self, kept: Bool[np.ndarray, " sightings"]) -> MarkerSightings:
-        """Some of the sightings, with the views that still have some."""
+        """The sightings that a mask keeps, in the views that still have sightings."""
         views, view = np.unique(self.view[kept], return_inverse=True)
         return MarkerSightings(
             self.lenses,
@@ -152,7 +152,7 @@ def collect_sightings(
             name,
             expected="frames that show markers",
             found="none in any frame",
-            remedy="is --dictionary the one that was printed?",
+            remedy="check that --dictionary names the printed markers",
         )
     return MarkerSightings(
         tuple(lenses),
