@@ -218,12 +218,12 @@ def read_camera_path(path: Path | str) -> tuple[CameraPath, str]:
     velocity_m_s = _numbers(table, *_VELOCITY)
     return (
         CameraPath(
-            frame=_whole(table, "frame"),
+            frame=_counts(table, "frame"),
             time_s=_numbers(table, "time_s")[:, 0],
             position_m=_numbers(table, *_POSITION),
             orientation_wxyz=_numbers(table, *_QUATERNION),
             covariance=covariance,
-            num_markers=_whole(table, "num_markers"),
+            num_markers=_counts(table, "num_markers"),
             reprojection_px=_numbers(table, "reprojection_px")[:, 0],
             ambiguity=_numbers(table, "ambiguity")[:, 0],
             status=np.array([_status(row, table) for row in table.rows]),
@@ -253,7 +253,7 @@ def _numbers(table: Table, *names: str) -> Float[np.ndarray, "rows columns"]:
     )
 
 
-def _whole(table: Table, name: str) -> Int[np.ndarray, "rows"]:
+def _counts(table: Table, name: str) -> Int[np.ndarray, "rows"]:
     column = table.column(name)
     return np.array([row.count(column) for row in table.rows])
 

@@ -57,19 +57,21 @@ def find_position_offset(
     """
     path = _without_jumps(path)
     estimate, points_m = path.trajectories("camera"), position_m[:, None]
-    middle_s, reach_s = _range(estimate, time_s, points_m, max_offset_s)
-    every, body_wxyz = _thinned(estimate, time_s), None if bodies is None else bodies(None)
+    middle_s, reach_s = _offset_range(estimate, time_s, points_m, max_offset_s)
+    every, body_wxyz = _thin_samples(estimate, time_s), None if bodies is None else bodies(None)
     if bodies is not None and body_wxyz is None:
         # Exchange the roles: shift the reference along the path, whose orientations turn the arm.
         reference = Trajectories(
             np.arange(len(time_s))[every], time_s[every], estimate.drones, points_m[every]
         )
         seen_m = np.where(path.seen[:, None], path.position_m, np.nan)
-        start = _found(reference, path.time_s, seen_m[:, None], path.orientation_wxyz, -middle_s, reach_s)
+        start = _find_offset_near(
+            reference, path.time_s, seen_m[:, None], path.orientation_wxyz, -middle_s, reach_s
+        )
         offset_s = -start.offset_s
     else:
         thin_wxyz = None if body_wxyz is None else body_wxyz[every]
-        start = _found(
+        start = _find_offset_near(
             estimate, time_s[every], points_m[every], thin_wxyz, middle_s, reach_s, bodies is not None
         )
         offset_s = start.offset_s
@@ -110,10 +112,12 @@ def find_orientation_offset(
     known = np.isfinite(body_wxyz).all(axis=-1)[:, None, None]
     points_m = np.where(known, middles_m, np.nan) if with_turn else middles_m + _OUT_M * _axes(body_wxyz)
     turned = body_wxyz if with_turn else None
-    middle_s, reach_s = _range(estimate, time_s, points_m, max_offset_s)
-    every = _thinned(estimate, time_s)
+    middle_s, reach_s = _offset_range(estimate, time_s, points_m, max_offset_s)
+    every = _thin_samples(estimate, time_s)
     thin_wxyz = None if turned is None else turned[every]
-    start = _found(estimate, time_s[every], points_m[every], thin_wxyz, middle_s, reach_s, with_turn)
+    start = _find_offset_near(
+        estimate, time_s[every], points_m[every], thin_wxyz, middle_s, reach_s, with_turn
+    )
     bodies = (lambda offset_s: turned) if with_turn else None
     return _refine(estimate, time_s, points_m, bodies, start.offset_s).offset_s
 
@@ -136,7 +140,7 @@ def interpolate_orientations(
     return found
 
 
-def _thinned(estimate: Trajectories, time_s: Float[np.ndarray, "samples"]) -> slice:
+def _thin_samples(estimate: Trajectories, time_s: Float[np.ndarray, "samples"]) -> slice:
     """Every n-th sample, about as many as frames: a wide search with more samples would not be more precise."""
     step_s, frame_s = (float(np.median(np.diff(times))) for times in (time_s, estimate.time_s))
     return slice(None, None, max(1, round(frame_s / step_s)))
@@ -153,7 +157,9 @@ def _refine(
     reach_s = max(_NEAR_S, 2 * float(np.median(np.diff(time_s))))
     for _ in range(_ROUNDS):
         before_s, body_wxyz = offset_s, None if bodies is None else bodies(offset_s)
-        found = _found(estimate, time_s, position_m, body_wxyz, offset_s, reach_s, bodies is not None)
+        found = _find_offset_near(
+            estimate, time_s, position_m, body_wxyz, offset_s, reach_s, bodies is not None
+        )
         offset_s = found.offset_s
         if abs(offset_s - before_s) < _SETTLED_S:
             break
@@ -182,7 +188,7 @@ def _checked_std_s(
     return std_s
 
 
-def _found(
+def _find_offset_near(
     estimate: Trajectories,
     time_s: Float[np.ndarray, "samples"],
     position_m: Float[np.ndarray, "samples drones 3"],
@@ -203,7 +209,7 @@ def _found(
     return replace(found, offset_s=middle_s + found.offset_s)
 
 
-def _range(
+def _offset_range(
     estimate: Trajectories,
     time_s: Float[np.ndarray, "samples"],
     position_m: Float[np.ndarray, "samples drones 3"],

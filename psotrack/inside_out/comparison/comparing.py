@@ -145,7 +145,7 @@ def compare_paths(
         turn_offset_s = clocks.find_orientation_offset(
             path, turns_s, reference_wxyz, with_turn=with_turn, max_offset_s=max_offset_s
         )
-    bodies = _bodies(path, reference_time_s, reference_wxyz, turns_s, turn_offset_s)
+    bodies = _body_orientations(path, reference_time_s, reference_wxyz, turns_s, turn_offset_s)
     offset_s, std_s = clocks.find_position_offset(
         path, reference_time_s, reference_m, bodies if with_lever_arm else None, max_offset_s=max_offset_s
     )
@@ -165,7 +165,7 @@ def compare_paths(
     turning = None
     if reference_wxyz is not None:
         by_s = offset_s if turn_offset_s is None else turn_offset_s
-        turning = _turning(
+        turning = _compare_orientations(
             path,
             clocks.interpolate_orientations(turns_s, reference_wxyz, path.time_s + by_s),
             by_s,
@@ -201,7 +201,7 @@ def mean_rotation(rotations: Rotation) -> Rotation:
     return mean
 
 
-def _bodies(
+def _body_orientations(
     path: CameraPath,
     time_s: Float[np.ndarray, "samples"],
     reference_wxyz: Float[np.ndarray, "turns 4"] | None,
@@ -211,7 +211,7 @@ def _bodies(
     """The reference's own orientations; without any, the orientations of the path, which are the camera's."""
     if reference_wxyz is not None and turn_offset_s is None:
         return lambda offset_s: reference_wxyz
-    by_video_s, wxyz = path.time_s, _poses(path)
+    by_video_s, wxyz = path.time_s, _seen_orientations(path)
     if reference_wxyz is not None and turn_offset_s is not None:
         by_video_s, wxyz = turns_s - turn_offset_s, reference_wxyz
     return lambda offset_s: (
@@ -219,10 +219,10 @@ def _bodies(
     )
 
 
-def _turning(
+def _compare_orientations(
     path: CameraPath, body_wxyz: Float[np.ndarray, "frames 4"], offset_s: float, with_turn: bool
 ) -> OrientationComparison:
-    pose_wxyz = _poses(path)
+    pose_wxyz = _seen_orientations(path)
     known = np.isfinite(body_wxyz).all(axis=-1)
     both = known & np.isfinite(pose_wxyz).all(axis=-1)
     if not both.any():
@@ -239,5 +239,5 @@ def _turning(
     )
 
 
-def _poses(path: CameraPath) -> Float[np.ndarray, "frames 4"]:
+def _seen_orientations(path: CameraPath) -> Float[np.ndarray, "frames 4"]:
     return np.where(path.seen[:, None], path.orientation_wxyz, np.nan)

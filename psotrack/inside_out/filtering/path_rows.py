@@ -65,15 +65,15 @@ def split_path(path: CameraPath) -> list[PoseRow]:
 
 def join_rows(rows: Sequence[PoseRow]) -> CameraPath:
     """The path of these frames, in increasing order; optional values that no frame has are None."""
-    velocity_m_s = _stacked([row.velocity_m_s for row in rows], (3,))
+    velocity_m_s = _stack([row.velocity_m_s for row in rows], (3,))
     chance = np.array([row.chance for row in rows], float)
     common = np.array([row.common for row in rows], float)
     return CameraPath(
         frame=np.array([row.frame for row in rows], int),
         time_s=np.array([row.time_s for row in rows], float),
-        position_m=_stacked([row.position_m for row in rows], (3,)),
-        orientation_wxyz=_stacked([row.orientation_wxyz for row in rows], (4,)),
-        covariance=_stacked([row.covariance for row in rows], (6, 6)),
+        position_m=_stack([row.position_m for row in rows], (3,)),
+        orientation_wxyz=_stack([row.orientation_wxyz for row in rows], (4,)),
+        covariance=_stack([row.covariance for row in rows], (6, 6)),
         num_markers=np.array([row.num_markers for row in rows], int),
         reprojection_px=np.array([row.reprojection_px for row in rows], float),
         ambiguity=np.array([row.ambiguity for row in rows], float),
@@ -135,5 +135,5 @@ def lost_row(raw: PoseRow, *, gated: bool = False) -> PoseRow:
     )
 
 
-def _stacked(values: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
+def _stack(values: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
     return np.array(values, float).reshape(-1, *shape)

@@ -83,9 +83,9 @@ def fit_error_model(
     # Twice, because the duration of errors determines how many frames are independent for the scales.
     for _ in range(2):
         independent = min(1.0, step_s / (2 * time_s))
-        least, own = np.array([_white(rounder, source) for source in (0, 1)]).T
+        least, own = np.array([_white_noise(rounder, source) for source in (0, 1)]).T
         scales, roundness = _scales(apart_m, readings, least, own, independent)
-        rounder = replace(readings, covariance_m2=_rounded(readings.covariance_m2, roundness))
+        rounder = replace(readings, covariance_m2=_equalise_axes(readings.covariance_m2, roundness))
         white = np.minimum(least, (1 - _LEAST_LASTING) * scales)
         time_s = _lasting_s(apart_m, rounder, scales, white, step_s)
     model = ErrorModel(white[None], (scales - white)[None], np.full((1, 2), time_s), np.array([_JERK_M2_S5]))
@@ -94,7 +94,7 @@ def fit_error_model(
     )
 
 
-def _white(readings: Readings, source: int) -> tuple[float, float]:
+def _white_noise(readings: Readings, source: int) -> tuple[float, float]:
     """Variance that is new in every frame, per stated variance, and the whiteness of a source's scatter, 0 to 1.
 
     Fifth differences of white noise are equally large between neighbouring and between every second frames. In the
@@ -139,7 +139,7 @@ def _scales(
 
     def cost(parts: Float[np.ndarray, "3"]) -> float:
         logs, roundness = parts[:2], float(parts[2])
-        S = np.einsum("s,fsij->fij", np.exp(logs), _rounded(stated_m2, roundness))
+        S = np.einsum("s,fsij->fij", np.exp(logs), _equalise_axes(stated_m2, roundness))
         misfit = _normalised(apart_m[both], S) + np.linalg.slogdet(S)[1]
         prior = (logs.mean() / _BOTH_PRIOR) ** 2 + (np.diff(logs)[0] / ratio_prior) ** 2
         lasting = np.log(np.maximum(np.expm1(np.maximum(logs - least, 0.0)), _LEAST_LASTING))
@@ -154,7 +154,7 @@ def _scales(
     return np.exp(best[:2]), float(best[2])
 
 
-def _rounded(
+def _equalise_axes(
     covariance_m2: Float[np.ndarray, "frames 2 3 3"], roundness: float
 ) -> Float[np.ndarray, "frames 2 3 3"]:
     """The covariances, of which a share (`roundness`) of the outside's is made equal along all axes.

@@ -77,16 +77,16 @@ def pair_tracks(
         cost = np.minimum((distance_m[:, path] / reach_m[path]) ** 2, 1.0)
         cost = np.where(there, cost, _MISSING)
         cost[~there.any(axis=1)] = 0.0
-        best = _cheapest(cost, _CHANGE_FRAMES)
+        best = _cheapest_sequence(cost, _CHANGE_FRAMES)
         to_best_m = distance_m[np.arange(num_frames), path, best]
         both = np.isfinite(to_best_m)
         if both.any() and np.mean(to_best_m[both] <= GATE_M) > 0.5:
             track[:, path] = best
     _release_shared(track, distance_m)
-    return Pairing(track, _rest(track, num_tracks), _changes(frame, track))
+    return Pairing(track, _remaining_tracks(track, num_tracks), _find_changes(frame, track))
 
 
-def _cheapest(cost: Float[np.ndarray, "frames states"], change: float) -> Int[np.ndarray, "frames"]:
+def _cheapest_sequence(cost: Float[np.ndarray, "frames states"], change: float) -> Int[np.ndarray, "frames"]:
     """(frames,), the sequence of states with the least sum of costs and changes (Viterbi)."""
     total = np.zeros(cost.shape[1])
     came_from = np.empty(cost.shape, int)
@@ -120,7 +120,7 @@ def _release_shared(
             track[shared & ~first, path] = UNASSIGNED
 
 
-def _changes(
+def _find_changes(
     frame: Int[np.ndarray, "frames"], track: Int[np.ndarray, "frames paths"]
 ) -> tuple[TrackChange, ...]:
     found = []
@@ -134,7 +134,9 @@ def _changes(
     return tuple(sorted(found, key=lambda change: (change.frame, change.drone)))
 
 
-def _rest(track: Int[np.ndarray, "frames paths"], num_tracks: int) -> Int[np.ndarray, "frames tracks"]:
+def _remaining_tracks(
+    track: Int[np.ndarray, "frames paths"], num_tracks: int
+) -> Int[np.ndarray, "frames tracks"]:
     """Tracks of drones without a camera: a path that takes such a drone's track gives it its own track in exchange."""
     held = np.arange(num_tracks)
     current = np.full(track.shape[1], UNASSIGNED)

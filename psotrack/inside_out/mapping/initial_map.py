@@ -193,7 +193,7 @@ def place_markers(
     unreachable: set[int] = set()
     while True:
         views = placer.locate_views(placed, scene)
-        marker = _next(sightings, views, set(placed) | unreachable)
+        marker = _next_marker(sightings, views, set(placed) | unreachable)
         if marker is None:
             return placed
         found = placer.place(marker, views, side_factors)
@@ -261,7 +261,7 @@ def placed_markers(scene: MappedScene) -> dict[int, PlacedMarker]:
     return {marker: PlacedMarker(axes, centre, side) for marker, axes, centre, side in rows}
 
 
-def _next(sightings: MarkerSightings, views: ViewPoses, done: set[int]) -> int | None:
+def _next_marker(sightings: MarkerSightings, views: ViewPoses, done: set[int]) -> int | None:
     """The marker that most views show beside placed markers; None if there is none."""
     sure = np.minimum(views.count, 3)[sightings.view]
     weight = {
