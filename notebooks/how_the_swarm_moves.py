@@ -40,7 +40,7 @@ from psotrack.silhouettes import compute, summed_area_table
 from psotrack.silhouettes.computation import SilhouetteSettings
 from psotrack.simulation import simulate
 from psotrack.support import keep_compiled
-from psotrack.tracking import ScoreSettings, on_device, swarm
+from psotrack.tracking import SoftIoU, on_device, swarm
 from psotrack.tracking.fitness import drone_fitness, joint_fitness, score_inputs
 
 # %%
@@ -80,7 +80,7 @@ start = find_drones(
     reduction=SILHOUETTES.reduction,
     fps=sequence.fps,
     bounds_m=room_bounds(sequence.rig, settings),
-    max_speed_m_s=settings.max_speed_m_s,
+    max_speed_m_s=settings.motion.max_speed_m_s,
 )
 predicted_m = jnp.asarray(start.position_m + start.velocity_m_s * FRAME / sequence.fps, jnp.float32)
 truth_m = sequence.truth.position_m[FRAME, DRONE]
@@ -92,16 +92,17 @@ seen = score_inputs(
     on_device(sequence.rig.cameras),
     jnp.asarray(start.size_m, jnp.float32),
     summed_area_table(jnp.asarray(silhouettes.read(FRAME, FRAME + 1)[0], jnp.int32)),
-    ScoreSettings(reduction=SILHOUETTES.reduction),
+    SoftIoU(),
+    reduction=SILHOUETTES.reduction,
 )
 # Particles have the axes (particles, drones, 3): each drone has a swarm of its own, all of them move at once.
 spread = jax.random.normal(jax.random.key(1), (PARTICLES, *predicted_m.shape))
 first_m = predicted_m + SPREAD_M * spread
 params = swarm.SwarmParams(
-    inertia=jnp.float32(settings.inertia),
-    cognitive=jnp.float32(settings.cognitive),
-    social=jnp.float32(settings.social),
-    max_step=jnp.full(3, settings.max_speed_m_s / sequence.fps, jnp.float32),
+    inertia=jnp.float32(settings.swarm.inertia),
+    cognitive=jnp.float32(settings.swarm.cognitive),
+    social=jnp.float32(settings.swarm.social),
+    max_step=jnp.full(3, settings.motion.max_speed_m_s / sequence.fps, jnp.float32),
     low=predicted_m - HALF_M,
     high=predicted_m + HALF_M,
 )

@@ -42,8 +42,8 @@ published_m = tomllib.loads((TABLE_5 / "published.toml").read_text())  # lowest 
 columns = [
     "sequence",
     "method",
-    "settings.particles",
-    "settings.iterations",
+    "settings.swarm.particles",
+    "settings.swarm.iterations",
     "seed",
     "mean_error_m",
     "id_switches",
@@ -111,11 +111,14 @@ figure
 
 # %%
 sequences, methods = (list(dict.fromkeys(rows[name])) for name in ("sequence", "method"))
-sizes = rows[["settings.particles", "settings.iterations"]].drop_duplicates()
+sizes = rows[["settings.swarm.particles", "settings.swarm.iterations"]].drop_duplicates()
 sizes = sizes.iloc[sizes.prod(axis=1).argsort(kind="stable")]
 place = {size: number for number, size in enumerate(sizes.itertuples(index=False, name=None))}
 where = pd.Series(
-    [place[size] for size in zip(rows["settings.particles"], rows["settings.iterations"], strict=True)]
+    [
+        place[size]
+        for size in zip(rows["settings.swarm.particles"], rows["settings.swarm.iterations"], strict=True)
+    ]
 )
 error_mm, switched = 1e3 * rows["offset_removed_mean_error_m"], rows["id_switches"] > 0
 

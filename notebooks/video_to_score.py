@@ -20,7 +20,6 @@
 
 # %%
 import os
-from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -42,7 +41,7 @@ from psotrack.silhouettes.computation import SilhouetteSettings
 from psotrack.silhouettes.foreground import classify, coverage, learn_background, learning_step
 from psotrack.simulation import simulate
 from psotrack.support import keep_compiled
-from psotrack.tracking import ScoreSettings, on_device
+from psotrack.tracking import SoftIoU, on_device
 from psotrack.tracking.fitness import PAPER_SCORE, camera_scores, drone_fitness, score_inputs
 
 # %%
@@ -120,8 +119,8 @@ boxes = project_boxes(make_extents(cameras, size_m), place_m[None])
 xyxy_px = np.asarray(boxes.xyxy)[0]  # cameras, 4
 
 # %%
-soft = ScoreSettings(reduction=SILHOUETTES.reduction)
-hard = replace(PAPER_SCORE, reduction=SILHOUETTES.reduction)
+soft = SoftIoU()
+hard = PAPER_SCORE
 
 windows = [(scale, "#56b4e9", "-") for scale in soft.windows] + [(soft.ring, "#e69f00", "--")]
 # Edges of the pictures in pixels of the image, whose first pixel's centre is (0, 0).

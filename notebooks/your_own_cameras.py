@@ -49,14 +49,14 @@ from psotrack.geometry import (
     triangulate,
     undistort,
 )
-from psotrack.pipeline import track_from_silhouettes
+from psotrack.pipeline import track_runs
 from psotrack.recordings import VideoWriter, describe_sequence, probe, read_frames
-from psotrack.settings import TrackSettings
+from psotrack.settings import DroneSettings, TrackSettings
 from psotrack.silhouettes import compute, summed_area_table
 from psotrack.silhouettes.computation import SilhouetteSettings
 from psotrack.simulation import simulate
 from psotrack.support import keep_compiled
-from psotrack.tracking import ScoreSettings, on_device
+from psotrack.tracking import SoftIoU, on_device
 from psotrack.tracking.fitness import camera_scores, score_inputs
 
 # %%
@@ -267,9 +267,9 @@ pd.DataFrame(describe_sequence(sequence)["cameras"]).T.drop(columns=["video", "d
 # optional. With `--drones`, other moving things start no tracks.
 
 # %%
-settings = TrackSettings(drones=4, silhouettes=SILHOUETTES)
+settings = TrackSettings(silhouettes=SILHOUETTES, drones=DroneSettings(count=4))
 silhouettes = compute(sequence, SILHOUETTES, cache=DATA / "silhouettes")
-tracked = track_from_silhouettes(sequence, silhouettes, settings)
+tracked = track_runs(sequence, silhouettes, settings)
 tracks = tracked.trajectories
 print(f"{tracks.num_drones} drones, {np.mean(tracks.seen):.0%} of all frames tracked")
 pd.DataFrame(tracked.size_m, columns=["size x (m)", "size y (m)", "size z (m)"]).round(2)
@@ -304,7 +304,7 @@ for drone in range(tracks.num_drones):
     colour = plots.drone_colour(drone)
     top.plot(tracks.time_s, tracks.fitness[:, drone], color=colour, label=f"drone {drone}")
     bottom.plot(tracks.time_s, tracks.num_cameras[:, drone], color=colour, drawstyle="steps-mid")
-top.axhline(settings.min_fitness, color="#2b313a", linestyle=":", label="not found below this")
+top.axhline(settings.status.min_fitness, color="#2b313a", linestyle=":", label="not found below this")
 top.set(ylabel="fitness (0 to 1)", ylim=(0, None))
 bottom.set(xlabel="time (s)", ylabel="cameras with foreground\nat the drone", ylim=(0, len(rig) + 0.5))
 top.legend(frameon=False, ncols=5, loc="lower left", bbox_to_anchor=(0, 1))
@@ -336,12 +336,12 @@ T_turn = np.eye(4)
 T_turn[:3, :3] = Rotation.from_euler("y", TURN_DEG, degrees=True).as_matrix()
 T_cam_world[knocked] = T_turn @ T_cam_world[knocked]
 turned_rig = CameraRig(rig.names, replace(rig.cameras, T_cam_world=T_cam_world))
-turned = track_from_silhouettes(replace(sequence, rig=turned_rig), silhouettes, settings)
+turned = track_runs(replace(sequence, rig=turned_rig), silhouettes, settings)
 
 frames = range(0, sequence.num_frames, 5)
 rigs = {"as calibrated": (rig, tracked), f"gopro3 turned by {TURN_DEG} deg": (turned_rig, turned)}
 mean_score = {}
-soft = ScoreSettings(reduction=SILHOUETTES.reduction)
+soft = SoftIoU()
 scores = jax.jit(
     lambda rig, size_m, tables, at_m: camera_scores(score_inputs(rig, size_m, tables, soft), at_m)
 )

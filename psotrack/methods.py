@@ -1,40 +1,47 @@
-"""The methods of tracking, from what they read to tracks: the swarm, the projection lines, and both together."""
+"""The methods: from the inputs of a run to tracks, by the swarm, by projection lines, or by both.
+
+`Method` is the interface of further methods, given to `psotrack.track(..., method=...)`, or by name as entry points
+of the group `psotrack.methods`.
+"""
 
 from __future__ import annotations
 
-import collections.abc
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol, runtime_checkable
 
-import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.correspondence import from_detections, from_silhouettes
+from psotrack.correspondence import Sightings, from_detections, from_silhouettes
 from psotrack.datasets.dpjait import detection_files, read_detections
 from psotrack.errors import InputError
 from psotrack.fusion import fuse_tracks
-from psotrack.initiation import InitialState, find_initial_state, known_motion, room_bounds
-from psotrack.projection_lines import follow, start_of
-from psotrack.recordings import Sequence
+from psotrack.geometry import CameraRig
+from psotrack.initiation import InitialState
+from psotrack.projection_lines import LineSettings, state_at_first_frame, track_detections
+from psotrack.recordings import Sequence as Recording
 from psotrack.settings import BLOBS, YOLO, TrackSettings
 from psotrack.silhouettes import Silhouettes
-from psotrack.support import Report, digest_file
-from psotrack.tracking import Tracked, track_silhouettes
+from psotrack.support import Report, digest_file, no_progress
+from psotrack.tracking import RunInputs, track_silhouettes
+from psotrack.trajectories import Tracks
+
+#: Group of entry points that adds methods by name.
+METHODS = "psotrack.methods"
 
 
 @dataclass(frozen=True)
-class Point:
-    """Which point of a drone a track is of. Where the body's origin is from there no image shows.
+class TrackedPoint:
+    """Which point of a drone its track is of. No image shows where the body's origin is.
 
     Attributes:
-        drone: its number.
+        drone: number of the drone.
         middle_of: "silhouette" or "box".
-        box_off_m, box_off_std_m: (3,), from the middle of its silhouette to that of its boxes along the world's axes,
-            and the standard error of that; None where nothing tells.
+        box_off_m, box_off_std_m: (3,), from the middle of the silhouette to the middle of the boxes along the world's
+            axes, and its standard error, metres; None where it is not known.
     """
 
     drone: int
@@ -45,102 +52,178 @@ class Point:
 
 @dataclass(frozen=True)
 class MethodResult:
-    """How a run went.
+    """What a method yields for one run.
 
     Attributes:
-        tracked: what it yielded.
-        points: of each drone, what its track is of.
-        start: from where.
-        bounds_m: (2, 3), lowest and highest corner of the room.
+        tracks: of all frames.
+        points: for each drone the point that its track is of.
+        initial: state of the drones at frame 0.
         input_keys: digests of what was read, by camera.
-        seconds: by stage.
+        seconds: by stage; "track" and "compile" at least.
     """
 
-    tracked: Tracked
-    points: tuple[Point, ...]
-    start: InitialState
-    bounds_m: Float[np.ndarray, "2 3"]
+    tracks: Tracks
+    points: tuple[TrackedPoint, ...]
+    initial: InitialState
     input_keys: Mapping[str, str]
     seconds: Mapping[str, float]
 
 
-def track_by_swarm(
-    sequence: Sequence,
-    silhouettes: Silhouettes,
-    settings: collections.abc.Sequence[TrackSettings],
-    detected: collections.abc.Sequence[InitialState | None],
-    report: Report,
-) -> list[MethodResult]:
-    """Runs of the swarm, together.
+@dataclass(frozen=True)
+class MethodInputs:
+    """What a method is given for one run.
 
-    Args:
-        sequence: fit for use.
-        silhouettes: of all of its cameras.
-        settings: of each run.
-        detected: for each run what detections say of frame 0, where they are read.
-        report: told of the frames.
+    Attributes:
+        rig: the cameras.
+        silhouettes: of all cameras; None where the method needs none.
+        sightings: detections of all cameras; None where the method needs none.
+        initial: state of the drones at frame 0.
+        bounds_m: (2, 3), lowest and highest corner of the room, metres.
+        fps: frames per second.
+        settings: of the run.
+    """
+
+    rig: CameraRig
+    silhouettes: Silhouettes | None
+    sightings: Sightings | None
+    initial: InitialState
+    bounds_m: Float[np.ndarray, "2 3"]
+    fps: float
+    settings: TrackSettings
+
+
+@runtime_checkable
+class Method(Protocol):
+    """A method of tracking: called once per run.
+
+    Attributes:
+        reads_detections: whether the method is given detections, besides silhouettes.
+    """
+
+    @property
+    def reads_detections(self) -> bool: ...  # noqa: D102
+
+    def __call__(self, inputs: MethodInputs, report: Report = no_progress) -> Tracks:
+        """The tracks of all frames."""
+        ...
+
+
+@dataclass(frozen=True)
+class DetectionInputs:
+    """Detections of all cameras, and digests of what was read.
+
+    Attributes:
+        sightings: boxes in all frames of all cameras.
+        keys: digests by camera.
+        seconds: that reading took.
+    """
+
+    sightings: Sightings
+    keys: Mapping[str, str]
+    seconds: float
+
+
+def read_sightings(
+    recording: Recording, silhouettes: Silhouettes | None, source: str, report: Report = no_progress
+) -> DetectionInputs:
+    """The detections that `TrackSettings.detections` names.
 
     Raises:
-        InputError: there is nothing to start from.
-        SettingsError: a setting does not fit the sequence.
+        InputError: the detections cannot be read.
     """
     began = time.perf_counter()
-    bounds_m = [room_bounds(sequence.rig, each) for each in settings]
-    starts = _starts(sequence, silhouettes, settings, bounds_m, detected)
-    followed = track_silhouettes(
-        sequence.rig, silhouettes, starts, settings, fps=sequence.fps, bounds_m=bounds_m, report=report
-    )
-    compile_s = sum(tracked.compile_s for tracked in followed)
+    if source == BLOBS:
+        assert silhouettes is not None
+        blobs = from_silhouettes(silhouettes, report)
+        return DetectionInputs(blobs, dict(silhouettes.keys), time.perf_counter() - began)
+    files = detection_files_of(recording, source)
+    detections = {name: read_detections(path) for name, path in files.items()}
+    sightings = from_detections(detections, recording.rig, recording.num_frames)
+    keys = {name: digest_file(path, algorithm="sha256")[:16] for name, path in files.items()}
+    return DetectionInputs(sightings, keys, time.perf_counter() - began)
+
+
+def detection_files_of(recording: Recording, source: str) -> Mapping[str, Path]:
+    """The file of each camera, as `TrackSettings.detections` names them.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    if source != YOLO:
+        return detection_files(Path(source), recording.rig.names)
+    if recording.detections is None:
+        raise InputError(
+            recording.folder,
+            expected="detections in dl_data for --detections yolo",
+            found="none",
+            remedy="use --detections blobs",
+        )
+    return {name: path for name, path in recording.detections.items() if name in recording.rig.names}
+
+
+def track_by_swarm(
+    rig: CameraRig,
+    silhouettes: Silhouettes,
+    runs: Sequence[RunInputs],
+    fps: float,
+    report: Report = no_progress,
+) -> list[MethodResult]:
+    """Results of one or more runs of the swarm, which are tracked together.
+
+    The seconds of a run are its share of the time of all runs.
+    """
+    began = time.perf_counter()
+    tracked = track_silhouettes(rig, silhouettes, runs, fps=fps, report=report)
+    compile_s = sum(seconds for _, seconds in tracked)
     seconds = {
         **silhouettes.seconds,
-        "compile": compile_s / len(settings),
-        "track": (time.perf_counter() - began - compile_s) / len(settings),
+        "compile": compile_s / len(runs),
+        "track": (time.perf_counter() - began - compile_s) / len(runs),
     }
     return [
-        MethodResult(tracked, _middles_of("silhouette", tracked), start, bounds, silhouettes.keys, seconds)
-        for tracked, start, bounds in zip(followed, starts, bounds_m, strict=True)
+        MethodResult(tracks, _points(tracks, "silhouette"), run.initial, silhouettes.keys, seconds)
+        for (tracks, _), run in zip(tracked, runs, strict=True)
     ]
 
 
 def track_by_projection_lines(
-    sequence: Sequence, silhouettes: Silhouettes | None, settings: TrackSettings, report: Report
+    rig: CameraRig,
+    detections: DetectionInputs,
+    settings: LineSettings,
+    *,
+    fps: float,
+    bounds_m: Float[np.ndarray, "2 3"],
+    known: tuple[Float[np.ndarray, "known 3"], Float[np.ndarray, "known 3"]] | None,
+    report: Report = no_progress,
 ) -> MethodResult:
-    """A run of the projection lines.
-
-    Raises:
-        InputError: detections cannot be read.
-    """
+    """The result of one run of the projection lines (see `psotrack.projection_lines.track_detections`)."""
     began = time.perf_counter()
-    bounds_m = room_bounds(sequence.rig, settings)
-    if settings.detections == BLOBS:
-        assert silhouettes is not None
-        sightings, keys = from_silhouettes(silhouettes, report), dict(silhouettes.keys)
-    else:
-        files = detection_files_of(sequence, settings.detections)
-        detections = {name: read_detections(path) for name, path in files.items()}
-        sightings = from_detections(detections, sequence.rig, sequence.num_frames)
-        keys = {name: digest_file(path, algorithm="sha256")[:16] for name, path in files.items()}
-    tracked = follow(
-        sequence.rig.cameras,
-        sightings,
+    tracks = track_detections(
+        rig.cameras,
+        detections.sightings,
         settings,
-        fps=sequence.fps,
+        fps=fps,
         bounds_m=bounds_m,
-        known=known_motion(sequence, settings),
+        known=known,
         report=report,
     )
-    before = {"decode": 0.0, "foreground": 0.0} if silhouettes is None else silhouettes.seconds
-    seconds = {**before, "compile": tracked.compile_s, "track": time.perf_counter() - began}
-    return MethodResult(tracked, _middles_of("box", tracked), start_of(tracked), bounds_m, keys, seconds)
+    seconds = {"compile": 0.0, "track": detections.seconds + time.perf_counter() - began}
+    initial = state_at_first_frame(tracks)
+    return MethodResult(tracks, _points(tracks, "box"), initial, detections.keys, seconds)
 
 
 def fuse_methods(
     swarm: MethodResult, lines: MethodResult, settings: TrackSettings, fps: float
 ) -> MethodResult:
-    """What the two say together."""
+    """The results of both methods for one run, fused."""
     began = time.perf_counter()
-    tracked, middles = fuse_tracks(
-        swarm.tracked, lines.tracked, settings, fps=fps, same_foreground=settings.detections == BLOBS
+    tracks, offset = fuse_tracks(
+        swarm.tracks,
+        lines.tracks,
+        settings.motion,
+        fps=fps,
+        max_coasting_s=settings.status.max_coasting_s,
+        same_foreground=settings.detections == BLOBS,
     )
     seconds = {
         **swarm.seconds,
@@ -148,52 +231,26 @@ def fuse_methods(
         "track": swarm.seconds["track"] + lines.seconds["track"] + time.perf_counter() - began,
     }
     keys = {**swarm.input_keys, **{f"detections of {name}": key for name, key in lines.input_keys.items()}}
-    known = len(swarm.points)
     points = tuple(
-        Point(drone, "silhouette" if drone < known else "box", *told)
-        for drone, told in enumerate(zip(_told(middles.off_m), _told(middles.std_m), strict=True))
+        TrackedPoint(drone, "silhouette" if drone < len(swarm.points) else "box", *known)
+        for drone, known in enumerate(zip(_or_none(offset.offset_m), _or_none(offset.std_m), strict=True))
     )
-    return MethodResult(tracked, points, swarm.start, swarm.bounds_m, keys, seconds)
+    return MethodResult(tracks, points, swarm.initial, keys, seconds)
 
 
-def detection_files_of(sequence: Sequence, detections: str) -> Mapping[str, Path]:
-    """The file of each camera, as `TrackSettings.detections` says.
-
-    Raises:
-        InputError: there is none.
-    """
-    if detections != YOLO:
-        return detection_files(Path(detections), sequence.rig.names)
-    if sequence.detections is None:
-        raise InputError(
-            sequence.folder,
-            expected="detections in dl_data for --detections yolo",
-            found="none",
-            remedy="use --detections blobs",
-        )
-    return {name: path for name, path in sequence.detections.items() if name in sequence.rig.names}
+def track_by_plugin(method: Method, inputs: MethodInputs, report: Report = no_progress) -> MethodResult:
+    """The result of one run of a method that another package or the caller brings."""
+    began = time.perf_counter()
+    tracks = method(inputs, report)
+    keys = {} if inputs.silhouettes is None else dict(inputs.silhouettes.keys)
+    seconds = {"compile": 0.0, "track": time.perf_counter() - began}
+    return MethodResult(tracks, _points(tracks, "silhouette"), inputs.initial, keys, seconds)
 
 
-def _middles_of(what: Literal["silhouette", "box"], tracked: Tracked) -> tuple[Point, ...]:
-    return tuple(Point(drone, what) for drone in range(tracked.info.status.shape[1]))
+def _points(tracks: Tracks, middle_of: Literal["silhouette", "box"]) -> tuple[TrackedPoint, ...]:
+    return tuple(TrackedPoint(drone, middle_of) for drone in range(tracks.num_drones))
 
 
-def _told(values: Float[np.ndarray, "drones 3"]) -> list[list[float] | None]:
-    """What is known of each drone, fit for JSON."""
+def _or_none(values: Float[np.ndarray, "drones 3"]) -> list[list[float] | None]:
+    """The values of each drone as lists, fit for JSON; None where they are not known."""
     return [None if np.isnan(value).any() else value.tolist() for value in values]
-
-
-def _starts(
-    sequence: Sequence,
-    silhouettes: Silhouettes,
-    settings: collections.abc.Sequence[TrackSettings],
-    bounds_m: list[Float[np.ndarray, "2 3"]],
-    detected: collections.abc.Sequence[InitialState | None],
-) -> list[InitialState]:
-    """The start of each run; runs that differ in nothing but their seeds have the same."""
-    starts: dict[TrackSettings, InitialState] = {}
-    alike = [msgspec.structs.replace(each, seed=0) for each in settings]
-    for each, bounds, also in zip(alike, bounds_m, detected, strict=True):
-        if each not in starts:
-            starts[each] = find_initial_state(sequence, silhouettes, each, bounds, also)
-    return [starts[each] for each in alike]

@@ -1,14 +1,18 @@
-"""From a sequence to trajectories: silhouettes or detections, a start, a tracker, and a record of the run.
+"""The pipeline: from a recording to trajectories and a record, stage by stage.
 
-`track_sequence` is what the command line, sweeps and notebooks call.
+    recording -> silhouettes or detections -> room bounds -> initial state -> tracking -> fusion
+              -> identity and smoothing -> record
+
+`track_sequence` is what the command line, sweeps and notebooks call; `track_runs` does the stages for many settings at
+once. Only this module knows the whole recording and the whole settings: each stage is given what it needs, and
+returns a result.
 """
 
 from __future__ import annotations
 
-import collections.abc
 import platform
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -19,24 +23,63 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.errors import InputError
+from psotrack.errors import InputError, SettingsError
 from psotrack.identity import Identities, postprocess
-from psotrack.methods import MethodResult, fuse_methods, track_by_projection_lines, track_by_swarm
-from psotrack.recordings import Sequence
+from psotrack.initiation import (
+    InitialState,
+    StartSource,
+    complete_initial_state,
+    find_initial_state,
+    known_motion,
+    room_bounds,
+    start_source,
+)
+from psotrack.methods import (
+    METHODS,
+    DetectionInputs,
+    Method,
+    MethodInputs,
+    MethodResult,
+    fuse_methods,
+    read_sightings,
+    track_by_plugin,
+    track_by_projection_lines,
+    track_by_swarm,
+)
+from psotrack.projection_lines import LineSettings
+from psotrack.recordings import Sequence as Recording
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
-from psotrack.support import Report, no_progress
-from psotrack.tracking import SizeState
-from psotrack.trajectories import Trajectories
+from psotrack.support import Report, load_plugin, no_progress, plugin_names
+from psotrack.tracking import RunInputs, Score, Search, tracker_settings
+from psotrack.trajectories import DroneSizes, Trajectories
+
+#: The methods of this package.
+BUILT_IN_METHODS = ("swarm", "projection-lines", "fused")
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Parts that the caller brings, instead of those that the settings name.
+
+    Attributes:
+        search: the search in one frame.
+        score: the score of positions in single cameras.
+        method: the method of tracking.
+    """
+
+    search: Search | None = None
+    score: Score | None = None
+    method: Method | None = None
 
 
 @dataclass(frozen=True)
 class TrackedSequence:
-    """What tracking yields.
+    """The result of tracking a sequence.
 
     Attributes:
-        trajectories: every drone in every frame.
-        size_m: (drones, 3), full lengths of each drone along the world's axes, as learned.
+        trajectories: of every drone in every frame.
+        size_m: (drones, 3), full lengths of each drone along the world's axes, as learned, metres.
         identities: which drones may have been taken for each other, and when.
         record: settings, versions, device, input keys and seconds per stage, fit for JSON.
     """
@@ -46,141 +89,125 @@ class TrackedSequence:
     identities: Identities
     record: Mapping[str, Any]
 
+    def __repr__(self) -> str:
+        frames, drones = self.trajectories.num_frames, self.trajectories.num_drones
+        return (
+            f"TrackedSequence({self.record['sequence']}: {drones} drones, {frames} frames, "
+            f"{self.trajectories.seen.mean():.1%} seen, {self.record['seconds']['total']:.1f} s)"
+        )
+
 
 def track_sequence(
-    sequence: Sequence,
+    recording: Recording,
     settings: TrackSettings = TrackSettings(),  # noqa: B008  frozen
     *,
-    cache: Path,
+    cache: Path | str,
     jobs: int | None = None,
+    parts: Parts = Parts(),
     report: Report = no_progress,
 ) -> TrackedSequence:
-    """Track the drones of a sequence from its videos.
+    """Track the drones of a recording from its videos.
 
     Args:
-        sequence: fit for use (see `Sequence.usable`).
-        settings: how.
+        recording: checked for use (see `Sequence.usable`).
+        settings: of the run.
         cache: folder of the stored silhouettes.
-        jobs: processes for the silhouettes; None is one per processor.
+        jobs: number of processes for the silhouettes; None is one per processor.
+        parts: parts that the caller brings.
         report: told of the frames of each stage.
 
     Raises:
         InputError: a video cannot be used, or the drones cannot be found.
-        SettingsError: a setting does not fit the sequence.
+        SettingsError: a setting does not fit the recording.
         OutputError: the silhouettes cannot be stored.
     """
     began = time.perf_counter()
     silhouettes = None
     if settings.needs_silhouettes:
-        silhouettes = compute(sequence, settings.silhouettes, cache=cache, jobs=jobs, report=report)
-    tracked = track_from_silhouettes(sequence, silhouettes, settings, report=report)
+        silhouettes = compute(recording, settings.silhouettes, cache=Path(cache), jobs=jobs, report=report)
+    (tracked,) = track_runs(recording, silhouettes, [settings], parts=parts, report=report)
+    if isinstance(tracked, InputError):
+        raise tracked
     seconds = tracked.record["seconds"] | {"total": round(time.perf_counter() - began, 4)}
     return replace(tracked, record={**tracked.record, "seconds": seconds})
 
 
-def track_from_silhouettes(
-    sequence: Sequence,
-    silhouettes: Silhouettes | None,
-    settings: TrackSettings,
-    *,
-    report: Report = no_progress,
-) -> TrackedSequence:
-    """Track the drones of a sequence of which there are silhouettes.
-
-    Args:
-        sequence: fit for use (see `Sequence.usable`).
-        silhouettes: of all of its cameras; None where `settings` needs none.
-        settings: how.
-        report: told of the frames.
-
-    Raises:
-        InputError: the drones cannot be found, or detections cannot be read.
-        SettingsError: a setting does not fit the sequence.
-    """
-    (tracked,) = track_runs(sequence, silhouettes, [settings], report=report)
-    if isinstance(tracked, InputError):
-        raise tracked
-    return tracked
-
-
 def track_runs(
-    sequence: Sequence,
+    recording: Recording,
     silhouettes: Silhouettes | None,
-    settings: collections.abc.Sequence[TrackSettings],
+    settings: Sequence[TrackSettings],
     *,
+    parts: Parts = Parts(),
     report: Report = no_progress,
 ) -> list[TrackedSequence | InputError]:
-    """Track a sequence once for each of the settings: each as by itself, many swarms in the time of a few.
+    """Track a recording once for each of the settings: each run as if alone, many runs in the time of a few.
 
-    Swarms whose settings differ in seeds and in numbers other than of particles and windows are one batch, which all
-    devices share (`jax.devices()`). The seconds of a run are its share of the batch's.
+    Runs of the swarm whose settings differ only in seeds, and in numbers other than of particles and windows, are one
+    batch, which all devices share (`jax.devices()`). The seconds of a run are its share of the batch's.
 
     Args:
-        sequence: fit for use (see `Sequence.usable`).
-        silhouettes: of all of its cameras; None where no settings need any.
+        recording: checked for use (see `Sequence.usable`).
+        silhouettes: of all cameras; None where no settings need any (see `TrackSettings.needs_silhouettes`).
         settings: of each run.
-        report: told of the frames, in which all runs of a method go on together.
+        parts: parts that the caller brings, for all runs.
+        report: told of the frames, through which all runs of a method go together.
 
     Returns:
-        For each run what it yields, or why nothing.
+        For each run its result, or why there is none.
 
     Raises:
-        InputError: there is nothing to start from, or detections cannot be read.
-        SettingsError: a setting does not fit the sequence.
+        InputError: there is no reference or file to start from, or detections cannot be read.
+        SettingsError: a setting does not fit the recording.
     """
-    ways = {
-        number: track_by_projection_lines(sequence, silhouettes, each, report)
-        for number, each in enumerate(settings)
-        if each.method != "swarm"
-    }
-    swarms = [number for number, each in enumerate(settings) if each.method != "projection-lines"]
-    if swarms:
-        assert silhouettes is not None
-        of_swarms = [settings[number] for number in swarms]
-        detected = [ways[number].start if number in ways else None for number in swarms]
-        followed = track_by_swarm(sequence, silhouettes, of_swarms, detected, report)
-        for number, each, swarm in zip(swarms, of_swarms, followed, strict=True):
-            both = number in ways
-            ways[number] = fuse_methods(swarm, ways[number], each, sequence.fps) if both else swarm
-    return [_finished(sequence, each, ways[number]) for number, each in enumerate(settings)]
-
-
-def _finished(sequence: Sequence, settings: TrackSettings, way: MethodResult) -> TrackedSequence | InputError:
-    """One run's trajectories and record."""
-    tracked = way.tracked
-    if not tracked.info.status.shape[1]:
-        return InputError(
-            sequence.folder,
-            expected="drones",
-            found="none in any frame",
-            remedy="look at what the cameras see with `psotrack silhouettes`, or say where they are with --init FILE",
+    fps, runs = recording.fps, range(len(settings))
+    sources = [start_source(recording, each.init) for each in settings]
+    bounds_m = [room_bounds(recording.rig, each.bounds_m) for each in settings]
+    detections = [_detections(recording, silhouettes, each, parts, report) for each in settings]
+    lines = [
+        None
+        if read is None or not _tracks_detections(each, parts)
+        else track_by_projection_lines(
+            recording.rig,
+            read,
+            _line_settings(each),
+            fps=fps,
+            bounds_m=bounds,
+            known=known_motion(source, each.drones, fps),
+            report=report,
         )
-    followed = time.perf_counter()
-    trajectories, identities = postprocess(tracked, settings, fps=sequence.fps)
-    finish_s = time.perf_counter() - followed
-    own_s = {"track": way.seconds["track"], "compile": way.seconds["compile"], "finish": finish_s}
-    all_seconds = {**way.seconds, **own_s, "total": sum(own_s.values())}
-    record = {
-        "sequence": sequence.name,
-        "frames": trajectories.num_frames,
-        "cameras": list(sequence.rig.names),
-        "settings": msgspec.to_builtins(settings),
-        "seed": settings.seed,
-        "start": {name: value.tolist() for name, value in vars(way.start).items()},
-        "bounds_m": way.bounds_m.tolist(),
-        "drones": _as_learned(tracked.sizes),
-        "arrivals": [asdict(arrival) for arrival in tracked.arrivals],
-        "points": [asdict(point) for point in way.points],
-        "encounters": [asdict(encounter) for encounter in identities.encounters],
-        "input_keys": dict(way.input_keys),
-        "seconds": {stage: round(value, 4) for stage, value in all_seconds.items()},
-        **environment(),
-    }
-    return TrackedSequence(trajectories, np.asarray(tracked.sizes.size_m), identities, record)
+        for each, read, bounds, source in zip(settings, detections, bounds_m, sources, strict=True)
+    ]
+    initial = _initial_states(recording, silhouettes, settings, sources, bounds_m, lines)
+    results: list[MethodResult | None] = list(lines)
+    by_swarm = [run for run in runs if _tracks_silhouettes(settings[run], parts)]
+    if by_swarm:
+        assert silhouettes is not None
+        inputs = [
+            RunInputs(
+                initial[run],
+                bounds_m[run],
+                tracker_settings(settings[run], search=parts.search, score=parts.score),
+            )
+            for run in by_swarm
+        ]
+        swarm = track_by_swarm(recording.rig, silhouettes, inputs, fps, report)
+        for run, result in zip(by_swarm, swarm, strict=True):
+            other = lines[run]
+            results[run] = result if other is None else fuse_methods(result, other, settings[run], fps)
+    for run in runs:
+        method = _other_method(settings[run], parts)
+        if method is not None:
+            read = detections[run]
+            sightings = None if read is None else read.sightings
+            inputs_of_run = MethodInputs(
+                recording.rig, silhouettes, sightings, initial[run], bounds_m[run], fps, settings[run]
+            )
+            results[run] = track_by_plugin(method, inputs_of_run, report)
+    return [_finished(recording, settings[run], results[run], bounds_m[run], silhouettes) for run in runs]
 
 
 def environment() -> dict[str, Any]:
-    """Versions and device: what else a result depends on."""
+    """Versions and device on which a result depends, fit for JSON."""
     packages = ("psotrack", "jax", "jaxlib", "numpy", "opencv-python-headless", "zarr")
     device = jax.devices()[0]
     return {
@@ -189,15 +216,138 @@ def environment() -> dict[str, Any]:
     }
 
 
-def _as_learned(sizes: SizeState) -> list[dict[str, Any]]:
-    """What was learned of each drone, fit for JSON: null for what is not known."""
+def _tracks_silhouettes(settings: TrackSettings, parts: Parts) -> bool:
+    return parts.method is None and settings.method in ("swarm", "fused")
+
+
+def _tracks_detections(settings: TrackSettings, parts: Parts) -> bool:
+    return parts.method is None and settings.method in ("projection-lines", "fused")
+
+
+def _other_method(settings: TrackSettings, parts: Parts) -> Method | None:
+    """The method that the caller brings, or that an entry point names; None for the methods of this package."""
+    if parts.method is not None:
+        return parts.method
+    if settings.method in BUILT_IN_METHODS:
+        return None
+    method: Method | None = load_plugin(METHODS, settings.method)
+    if method is None:
+        names = ", ".join([*BUILT_IN_METHODS, *plugin_names(METHODS)])
+        raise SettingsError("method", expected=f"one of {names}", found=settings.method)
+    return method
+
+
+def _detections(
+    recording: Recording,
+    silhouettes: Silhouettes | None,
+    settings: TrackSettings,
+    parts: Parts,
+    report: Report,
+) -> DetectionInputs | None:
+    """The detections of a run; None where its method reads none."""
+    method = _other_method(settings, parts)
+    reads = _tracks_detections(settings, parts) if method is None else method.reads_detections
+    return read_sightings(recording, silhouettes, settings.detections, report) if reads else None
+
+
+def _line_settings(settings: TrackSettings) -> LineSettings:
+    return LineSettings(settings.motion, settings.drones, settings.status, settings.swarm.spread_m)
+
+
+def _initial_states(
+    recording: Recording,
+    silhouettes: Silhouettes | None,
+    settings: Sequence[TrackSettings],
+    sources: Sequence[StartSource],
+    bounds_m: Sequence[Float[np.ndarray, "2 3"]],
+    lines: Sequence[MethodResult | None],
+) -> list[InitialState]:
+    """The initial state of each run; runs that differ only in their seeds have the same one.
+
+    A run of the projection lines alone starts from its own first frame.
+    """
+    states: dict[TrackSettings, InitialState] = {}
+    of_runs = []
+    for each, source, bounds, of_lines in zip(settings, sources, bounds_m, lines, strict=True):
+        if each.method == "projection-lines" and of_lines is not None:
+            of_runs.append(of_lines.initial)
+            continue
+        without_seed = msgspec.structs.replace(each, seed=0)
+        if without_seed not in states:
+            assert silhouettes is not None
+            found = find_initial_state(
+                recording.rig,
+                silhouettes,
+                source,
+                each.drones,
+                fps=recording.fps,
+                bounds_m=bounds,
+                max_speed_m_s=each.motion.max_speed_m_s,
+            )
+            detected = None if of_lines is None else of_lines.initial
+            states[without_seed] = complete_initial_state(found, detected, each.drones, source)
+        of_runs.append(states[without_seed])
+    return of_runs
+
+
+def _finished(
+    recording: Recording,
+    settings: TrackSettings,
+    result: MethodResult | None,
+    bounds_m: Float[np.ndarray, "2 3"],
+    silhouettes: Silhouettes | None,
+) -> TrackedSequence | InputError:
+    """The trajectories and the record of one run."""
+    assert result is not None
+    tracks = result.tracks
+    if not tracks.num_drones:
+        return InputError(
+            recording.folder,
+            expected="drones",
+            found="none in any frame",
+            remedy="look at what the cameras see with `psotrack silhouettes`, or say where they are with --init FILE",
+        )
+    began = time.perf_counter()
+    trajectories, identities = postprocess(
+        tracks, settings.motion, settings.identity, fps=recording.fps, smoothed=settings.smooth
+    )
+    body_m = trajectories.position_m - settings.drones.body_offset_m
+    trajectories = replace(trajectories, position_m=body_m)
+    of_silhouettes = {"decode": 0.0, "foreground": 0.0} if silhouettes is None else silhouettes.seconds
+    seconds = {**of_silhouettes, **result.seconds, "finish": time.perf_counter() - began}
+    own_s = sum(seconds[stage] for stage in ("track", "compile", "finish"))
+    record = {
+        "sequence": recording.name,
+        "frames": trajectories.num_frames,
+        "cameras": list(recording.rig.names),
+        "settings": msgspec.to_builtins(settings),
+        "seed": settings.seed,
+        "start": {name: value.tolist() for name, value in vars(result.initial).items()},
+        "bounds_m": bounds_m.tolist(),
+        "drones": _sizes_record(tracks.sizes),
+        "arrivals": [asdict(arrival) for arrival in tracks.arrivals],
+        "points": [asdict(point) for point in result.points],
+        "encounters": [asdict(encounter) for encounter in identities.encounters],
+        "input_keys": dict(result.input_keys),
+        "seconds": {stage: round(value, 4) for stage, value in (seconds | {"total": own_s}).items()},
+        **environment(),
+    }
+    return TrackedSequence(trajectories, tracks.sizes.size_m, identities, record)
+
+
+def _sizes_record(sizes: DroneSizes) -> list[dict[str, Any]]:
+    """What was learned of each drone's size, fit for JSON: null for what is not known."""
+
+    def or_none(values: np.ndarray) -> list[float | None]:
+        return [None if np.isnan(value) else float(value) for value in values]
+
     return [
         {
             "drone": drone,
             "size_m": sizes.size_m[drone].tolist(),
-            "size_std_m": sizes.std_m[drone].tolist(),
+            "size_std_m": or_none(sizes.std_m[drone]),
             "size_frames": sizes.num_frames[drone].tolist(),
-            "fill": [None if np.isnan(share) else float(share) for share in sizes.fill[drone]],
+            "fill": or_none(sizes.fill[drone]),
         }
         for drone in range(len(sizes.size_m))
     ]

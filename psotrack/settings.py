@@ -1,11 +1,14 @@
-"""What people set: one checked record, the same for the command line, sweeps and notebooks.
+"""Settings of tracking: one checked record, the same for the command line, sweeps and Python.
 
-Defaults are written here and nowhere else. Importing this is cheap: no JAX, so that workers and `--help` start fast.
+Defaults stand here and nowhere else. The record is nested by part: a name such as `swarm.particles` is the same in TOML
+files, in sweeps and as attributes. Importing this module loads no JAX, so that worker processes and `--help` start
+fast.
 """
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal, get_args
 
 import msgspec
 
@@ -13,122 +16,263 @@ from psotrack.errors import SettingsError, check_positive
 from psotrack.silhouettes import SilhouetteSettings
 
 SwarmKind = Literal["joint", "per-drone"]
-Score = Literal["soft", "hard"]
-Method = Literal["swarm", "projection-lines", "fused"]
-#: Detections that need no folder: the sequence's own, or blobs of its silhouettes.
+
+#: Values of `TrackSettings.detections` that are not folders: the detections of the sequence, or blobs of its
+#: silhouettes.
 YOLO, BLOBS = "yolo", "blobs"
 
+#: Names of settings until version 0.1, and their names today; "" where a setting is gone.
+RENAMED = {
+    "particles": "swarm.particles",
+    "iterations": "swarm.iterations",
+    "refinements": "",
+    "swarm": "swarm.kind",
+    "spread_m": "swarm.spread_m",
+    "inertia": "swarm.inertia",
+    "cognitive": "swarm.cognitive",
+    "social": "swarm.social",
+    "score": "score.kind",
+    "windows": "score.windows",
+    "claims": "score.occlusion",
+    "vertex": "score.vertex",
+    "drones": "drones.count",
+    "drone_size_m": "drones.size_m",
+    "learn_sizes": "drones.learn_sizes",
+    "body_offset_m": "drones.body_offset_m",
+    "max_speed_m_s": "motion.max_speed_m_s",
+    "jerk_density_m2_s5": "motion.jerk_density_m2_s5",
+    "velocity_std_m_s": "motion.velocity_std_m_s",
+    "acceleration_std_m_s2": "motion.acceleration_std_m_s2",
+    "error_share": "motion.error_share",
+    "error_time_s": "motion.error_time_s",
+    "min_fitness": "status.min_fitness",
+    "min_cameras": "status.min_cameras",
+    "max_coasting_s": "status.max_coasting_s",
+    "encounter_m": "identity.encounter_m",
+    "mend": "identity.resolve_swaps",
+}
 
-class TrackSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How a sequence is tracked.
+
+def renamed(name: str) -> str:
+    """What to do about a setting's old name, as the remedy of an error message; "" where the name is no old name."""
+    if name not in RENAMED:
+        return ""
+    return (
+        f"it is called {RENAMED[name]} today" if RENAMED[name] else "this setting is gone: it gained nothing"
+    )
+
+
+def _check_least(name: str, value: int, least: int) -> None:
+    if value < least:
+        raise SettingsError(name, expected=f"at least {least}", found=f"{value}")
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise SettingsError(name, expected=f"one of {', '.join(choices)}", found=value)
+
+
+class _AnswersOldNames(msgspec.StructMeta):
+    """Answers old names of settings with the new ones, where a record is made in Python."""
+
+    def __call__(cls, *args: Any, **kwargs: Any) -> Any:  # noqa: N805
+        for name, value in kwargs.items():
+            # `swarm`, `score` and `drones` are parts today; their old values were no records.
+            is_part = name in cls.__struct_fields__
+            if name in RENAMED and not (is_part and isinstance(value, msgspec.Struct)):
+                raise SettingsError(
+                    name,
+                    expected="a part of the settings" if is_part else "a name that there is",
+                    found=f"{value!r}" if is_part else name,
+                    remedy=renamed(name),
+                )
+        return super().__call__(*args, **kwargs)
+
+
+class SwarmSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The search for the best positions in one frame: a particle swarm, or another search.
 
     Attributes:
-        method: "swarm", of particles over silhouettes; "projection-lines", which triangulates detections; or "fused",
-            both, weighed by how sure they are.
-        detections: of the projection lines: "yolo", those that came with the sequence; "blobs" of its silhouettes; or a
-            folder with a CSV file for each camera.
-        particles: of every swarm.
-        iterations: of the swarm, per frame.
-        refinements: gradient steps after the swarm, per frame.
-        swarm: "joint", one swarm over all drones as in the paper, or "per-drone".
-        score: "soft", concentric windows; or "hard", the paper's one box in whole pixels.
-        seed: of the swarm.
-        init: "auto" finds the drones in the first frames, "truth" takes them from the reference; or a file of
-            tracks, whose first frame counts.
-        drones: how many there are; None takes as many as `init` yields.
-        drone_size_m: full lengths of every drone along x, y and z; None takes them from the first frames.
-        learn_sizes: whether sizes are learned on the way; not where `drone_size_m` says them.
-        body_offset_m: from the body's origin to the middle of the silhouette (with "projection-lines" of the box),
-            along the world's axes. Neither shows where the origin is; who knows it may say.
-        bounds_m: lowest and highest x, y and z of the room: (x0, x1, y0, y1, z0, z1); None derives them from the
-            cameras.
-        max_speed_m_s: of a drone.
-        spread_m: standard deviation of the particles about the prediction.
-        inertia, cognitive, social: of the swarm.
-        jerk_density_m2_s5: of the motion model: how quickly drones change their acceleration (see `motion`).
-        velocity_std_m_s, acceleration_std_m_s2: how uncertain a start is of them.
-        error_share, error_time_s: share of the measured positions' variance that lasts from frame to frame, and how
-            long: what silhouettes show of a drone changes as it turns.
-        min_fitness: below it a drone was not found.
-        min_cameras: fewer than these, and a drone was not found.
-        max_coasting_s: so long a drone that is not found coasts before it is lost.
-        windows: scales of a drone's box that the soft score compares with the foreground.
-        claims: whether foreground that another drone is expected to cover is left out of a drone's score.
-        vertex: whether a drone is where a paraboloid through the score has its vertex, not just the best place tried.
-        encounter_m: drones nearer than this to each other may be taken for each other.
-        mend: whether labels that were exchanged in an encounter are put right.
-        smooth: whether later frames correct earlier ones.
-        silhouettes: how they are made.
+        search: name of the search: "pso", or the name of an entry point of the group `psotrack.searches`.
+        kind: "joint", one swarm over the positions of all drones as in the paper, or "per-drone", one for each drone.
+        particles: number of particles of every swarm.
+        iterations: number of iterations per frame.
+        spread_m: standard deviation of the particles' first positions about the predicted position, metres.
+        inertia, cognitive, social: coefficients w, c1, c2 of particle swarm optimisation.
 
     Raises:
-        SettingsError: a value makes no sense.
+        SettingsError: a value is not allowed.
     """
 
-    method: Method = "swarm"
-    detections: str = YOLO
+    search: str = "pso"
+    kind: SwarmKind = "per-drone"
     particles: int = 30
     iterations: int = 30
-    refinements: int = 0
-    swarm: SwarmKind = "per-drone"
-    score: Score = "soft"
-    seed: int = 0
-    init: str = "auto"
-    drones: int | None = None
-    drone_size_m: tuple[float, float, float] | None = None
-    learn_sizes: bool = True
-    body_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    bounds_m: tuple[float, float, float, float, float, float] | None = None
-    max_speed_m_s: float = 6.0
     spread_m: float = 0.05
     inertia: float = 0.6
     cognitive: float = 1.5
     social: float = 1.5
+
+    def __post_init__(self) -> None:
+        _check_choice("swarm.kind", self.kind, get_args(SwarmKind))
+        _check_least("swarm.particles", self.particles, 2)
+        _check_least("swarm.iterations", self.iterations, 0)
+        check_positive("swarm.spread_m", self.spread_m)
+
+
+class ScoreSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The score of positions against silhouettes.
+
+    Attributes:
+        kind: name of the score: "soft", concentric windows; "hard", the paper's one box in whole pixels; or the name of
+            an entry point of the group `psotrack.scores`.
+        windows: scales of a drone's box that the soft score compares with the foreground.
+        occlusion: whether foreground that another drone is expected to cover is left out of a drone's score.
+        vertex: whether a drone's position is the vertex of a paraboloid through the scores about the best position
+            that was tried, not that position itself.
+    """
+
+    kind: str = "soft"
+    windows: tuple[float, ...] = (0.4, 0.7, 1.0)
+    occlusion: bool = True
+    vertex: bool = True
+
+
+class MotionSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The motion model of the drones, and how measured positions err (see `psotrack.motion`).
+
+    Attributes:
+        max_speed_m_s: largest speed of a drone, m/s.
+        jerk_density_m2_s5: spectral density of the white jerk: how quickly drones change their acceleration.
+        velocity_std_m_s, acceleration_std_m_s2: standard deviations of a new track's velocity and acceleration.
+        error_share: share of the measured positions' variance that lasts from frame to frame, because what silhouettes
+            show of a drone changes only as the drone turns.
+        error_time_s: time constant of these lasting errors, seconds.
+
+    Raises:
+        SettingsError: a value is not allowed.
+    """
+
+    max_speed_m_s: float = 6.0
     jerk_density_m2_s5: float = 1.0
     velocity_std_m_s: float = 1.0
     acceleration_std_m_s2: float = 3.0
     error_share: float = 0.7
     error_time_s: float = 0.4
-    min_fitness: float = 0.1
-    min_cameras: int = 2
-    max_coasting_s: float = 0.5
-    windows: tuple[float, ...] = (0.4, 0.7, 1.0)
-    claims: bool = True
-    vertex: bool = True
-    encounter_m: float = 0.6
-    mend: bool = True
-    smooth: bool = False
-    silhouettes: SilhouetteSettings = SilhouetteSettings()
 
     def __post_init__(self) -> None:
-        for name, least in (
-            ("particles", 2),
-            ("iterations", 0),
-            ("refinements", 0),
-            ("min_cameras", 1),
-            ("seed", 0),
-        ):
-            if getattr(self, name) < least:
-                raise SettingsError(name, expected=f"at least {least}", found=f"{getattr(self, name)}")
-        if self.drones is not None and self.drones < 1:
-            raise SettingsError("drones", expected="at least 1", found=f"{self.drones}")
         for name in (
             "max_speed_m_s",
-            "spread_m",
             "jerk_density_m2_s5",
             "velocity_std_m_s",
             "acceleration_std_m_s2",
             "error_time_s",
         ):
-            check_positive(name, getattr(self, name))
-        for size in self.drone_size_m or ():
-            check_positive("drone_size_m", size)
-        for name, words in (
-            ("method", get_args(Method)),
-            ("swarm", get_args(SwarmKind)),
-            ("score", get_args(Score)),
-        ):
-            if getattr(self, name) not in words:
-                raise SettingsError(name, expected=f"one of {', '.join(words)}", found=getattr(self, name))
+            check_positive(f"motion.{name}", getattr(self, name))
+
+
+class DroneSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is known of the drones beforehand.
+
+    Attributes:
+        count: number of drones; None takes as many as are found.
+        size_m: full lengths of every drone along x, y and z, metres; None takes them from the first frames.
+        learn_sizes: whether sizes are learned while tracking; `size_m` switches this off.
+        body_offset_m: from the body's origin to the middle of the silhouette (with "projection-lines" of the box),
+            along the world's axes, metres. No image shows where the origin is.
+
+    Raises:
+        SettingsError: a value is not allowed.
+    """
+
+    count: int | None = None
+    size_m: tuple[float, float, float] | None = None
+    learn_sizes: bool = True
+    body_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if self.count is not None:
+            _check_least("drones.count", self.count, 1)
+        for length_m in self.size_m or ():
+            check_positive("drones.size_m", length_m)
+
+
+class StatusSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """When a drone counts as found in a frame, and when it is lost.
+
+    Attributes:
+        min_fitness: below this fitness a drone was not found.
+        min_cameras: with foreground in fewer cameras than this a drone was not found.
+        max_coasting_s: seconds for which a drone that is not found coasts on its prediction before it is lost.
+
+    Raises:
+        SettingsError: a value is not allowed.
+    """
+
+    min_fitness: float = 0.1
+    min_cameras: int = 2
+    max_coasting_s: float = 0.5
+
+    def __post_init__(self) -> None:
+        _check_least("status.min_cameras", self.min_cameras, 1)
+
+
+class IdentitySettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Which drones may have been taken for each other, and what to do about it.
+
+    Attributes:
+        encounter_m: drones nearer than this to each other may be taken for each other, metres.
+        resolve_swaps: whether labels that were exchanged in an encounter are put right.
+    """
+
+    encounter_m: float = 0.6
+    resolve_swaps: bool = True
+
+
+class TrackSettings(
+    msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, metaclass=_AnswersOldNames
+):
+    """How a sequence is tracked.
+
+    Attributes:
+        method: "swarm", particles over silhouettes; "projection-lines", triangulated detections; "fused", both,
+            weighted by their covariances; or the name of an entry point of the group `psotrack.methods`.
+        detections: source of the detections of the projection lines: "yolo", those that came with the sequence; "blobs"
+            of its silhouettes; or a folder with a CSV file for each camera.
+        seed: of the random numbers of the swarm.
+        init: "auto" finds the drones in the first frames, "truth" takes them from the reference; or a file of
+            tracks, whose first frame counts.
+        bounds_m: lowest and highest x, y and z of the room, metres: (x0, x1, y0, y1, z0, z1); None derives them from
+            the cameras.
+        smooth: whether later frames correct earlier ones.
+        swarm: the search in one frame.
+        score: the score of positions.
+        motion: the motion model.
+        drones: number and sizes of the drones.
+        status: when a drone is found or lost.
+        identity: encounters of drones.
+        silhouettes: how silhouettes are made.
+
+    Raises:
+        SettingsError: a value is not allowed, or a name is an old one.
+    """
+
+    method: str = "swarm"
+    detections: str = YOLO
+    seed: int = 0
+    init: str = "auto"
+    bounds_m: tuple[float, float, float, float, float, float] | None = None
+    smooth: bool = False
+    swarm: SwarmSettings = SwarmSettings()
+    score: ScoreSettings = ScoreSettings()
+    motion: MotionSettings = MotionSettings()
+    drones: DroneSettings = DroneSettings()
+    status: StatusSettings = StatusSettings()
+    identity: IdentitySettings = IdentitySettings()
+    silhouettes: SilhouetteSettings = SilhouetteSettings()
+
+    def __post_init__(self) -> None:
+        _check_least("seed", self.seed, 0)
         if self.bounds_m is not None and any(
             low >= high for low, high in zip(self.bounds_m[::2], self.bounds_m[1::2], strict=True)
         ):
@@ -136,10 +280,50 @@ class TrackSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     @property
     def needs_silhouettes(self) -> bool:
-        """Whether silhouettes are read."""
+        """Whether a run with these settings needs silhouettes."""
         return self.method != "projection-lines" or self.detections == BLOBS
 
     @property
     def reads_detections(self) -> bool:
-        """Whether files of detections are read."""
-        return self.method != "swarm" and self.detections != BLOBS
+        """Whether a run with these settings reads files of detections."""
+        return self.method in ("projection-lines", "fused") and self.detections != BLOBS
+
+    def changed(self, values: Mapping[str, Any]) -> TrackSettings:
+        """These settings with other values.
+
+        Args:
+            values: dotted names -> values, such as {"swarm.particles": 50}.
+
+        Raises:
+            SettingsError: a name is unknown or old, or a value is not allowed.
+
+        >>> TrackSettings().changed({"swarm.particles": 50, "smooth": True}).swarm.particles
+        50
+        """
+        parts: dict[str, dict[str, Any]] = {}
+        own: dict[str, Any] = {}
+        for name, value in values.items():
+            if name not in setting_names():
+                raise SettingsError(name, expected="the name of a setting", found=name, remedy=renamed(name))
+            part, dot, field = name.partition(".")
+            if dot:
+                parts.setdefault(part, {})[field] = value
+            else:
+                own[name] = value
+        for part, fields in parts.items():
+            own[part] = msgspec.structs.replace(getattr(self, part), **fields)
+        return msgspec.structs.replace(self, **own)
+
+
+def setting_names() -> tuple[str, ...]:
+    """Dotted names of all settings, such as `seed`, `swarm.particles`, `silhouettes.reduction`."""
+    return tuple(_names_in(TrackSettings()))
+
+
+def _names_in(record: msgspec.Struct, prefix: str = "") -> Iterator[str]:
+    for name in record.__struct_fields__:
+        value = getattr(record, name)
+        if isinstance(value, msgspec.Struct):
+            yield from _names_in(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}"

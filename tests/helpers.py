@@ -11,6 +11,7 @@ import pytest
 from filelock import FileLock
 
 from psotrack.geometry import Camera, CameraRig, look_at, make_camera, make_rig, project, undistort
+from psotrack.settings import RENAMED, TrackSettings
 
 #: Lenses as strong as those of action cameras, in OpenCV's order.
 LENSES = {
@@ -133,3 +134,8 @@ def draw_coverage(rig: CameraRig, position_m, size_m, reduction):
             foreground[index, y0:y1, x0:x1] = np.maximum(foreground[index, y0:y1, x0:x1], hit)
     cells = foreground.reshape(len(rig), height // reduction, reduction, width // reduction, reduction)
     return np.round(255 * cells.mean(axis=(2, 4))).astype(np.uint8)
+
+
+def track_settings(**options):
+    """Settings by the names of the command line's options, such as `particles`; dotted names are not needed."""
+    return TrackSettings().changed({RENAMED.get(name, name): value for name, value in options.items()})

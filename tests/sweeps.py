@@ -14,14 +14,14 @@ GRID = """
 sequences = ["S01_D2_A"]
 runs = {runs}
 [settings]
-particles = 8
-swarm = "joint"
-score = "hard"
+swarm.particles = 8
+swarm.kind = "joint"
+score.kind = "hard"
 init = "truth"
-drone_size_m = [0.5, 0.5, 0.2]
+drones.size_m = [0.5, 0.5, 0.2]
 silhouettes.reduction = 2
 [grid]
-iterations = {iterations}
+swarm.iterations = {iterations}
 """
 
 #: Settings that halve the time of compiling. Compiled programs are stored per number of devices, so one device is set.

@@ -11,18 +11,18 @@ from windows import (
     NOISE,
     PIXELS_PER_M,
     best_place,
-    claimed_pixels,
     cut_at,
     each,
     evaluate,
     far_rig,
     middle_px,
+    occluded_pixels,
     pixels,
 )
 
 from psotrack.geometry import make_extents, project_boxes
 from psotrack.tracking.fitness import camera_scores, drone_fitness
-from psotrack.tracking.occlusion import CLAIM, CORE, NUM_NEIGHBOURS
+from psotrack.tracking.occlusion import CORE_SCALE, NUM_NEIGHBOURS, OCCLUDER_SCALE
 from psotrack.tracking.patches import SIDE
 
 SIZES_M = np.array([[1.0, 1.0, 0.5]]).repeat(5, axis=0)
@@ -44,20 +44,20 @@ def ellipse2(drone, camera, patches, middle_m, scale, wider_px=0.0):
     return across**2 + down[:, None] ** 2
 
 
-@pytest.mark.parametrize("claiming", [(True, True, True), (True, False, True), (False, True, False)])
-def test_what_neighbours_claim_is_kept_apart_but_in_the_core(claiming):
+@pytest.mark.parametrize("occluding", [(True, True, True), (True, False, True), (False, True, False)])
+def test_what_neighbours_claim_is_kept_apart_but_in_the_core(occluding):
     size_m = SIZES_M[:3]
-    patches = cut_at(far_rig(1), NOISE, CLOSE_M, size_m, claiming=np.array(claiming))
-    free = pixels(cut_at(far_rig(1), NOISE, CLOSE_M, size_m, claiming=None))
-    apart = claimed_pixels(patches)
+    patches = cut_at(far_rig(1), NOISE, CLOSE_M, size_m, occluding=np.array(occluding))
+    free = pixels(cut_at(far_rig(1), NOISE, CLOSE_M, size_m, occluding=None))
+    apart = occluded_pixels(patches)
     kept_in_core = left_out = 0
     for (drone, camera), window in each(pixels(patches)):
         claimed = np.zeros((SIDE, SIDE), bool)
         for other in range(3):
-            if other != drone and claiming[other]:
+            if other != drone and occluding[other]:
                 half_a_pixel = patches.pixel_px[drone, camera] / 2
-                claimed |= ellipse2(drone, camera, patches, CLOSE_M[other], CLAIM, half_a_pixel) < 1
-        core = ellipse2(drone, camera, patches, CLOSE_M[drone], CORE) < 1
+                claimed |= ellipse2(drone, camera, patches, CLOSE_M[other], OCCLUDER_SCALE, half_a_pixel) < 1
+        core = ellipse2(drone, camera, patches, CLOSE_M[drone], CORE_SCALE) < 1
         taken = claimed & ~core
         np.testing.assert_array_equal(window, np.where(taken, 0, free[drone, camera]))
         np.testing.assert_array_equal(apart[drone, camera], taken & (free[drone, camera] >= 128))
@@ -83,7 +83,7 @@ def test_a_claim_by_hand():
     taken = np.zeros(SIDE, bool)
     taken[39:58] = True
     np.testing.assert_array_equal(left[32], np.where(taken, 0, 255))
-    np.testing.assert_array_equal(claimed_pixels(patches)[0, 0, 32], taken)
+    np.testing.assert_array_equal(occluded_pixels(patches)[0, 0, 32], taken)
     # In that of the right one, at 32.25 and 18.25: pixels 6 to 29 are claimed, the core from 25.27 on is kept.
     taken = np.zeros(SIDE, bool)
     taken[6:25] = True
@@ -92,7 +92,7 @@ def test_a_claim_by_hand():
 
 def test_with_one_drone_nothing_changes():
     one, alone = (
-        cut_at(far_rig(1), NOISE, CLOSE_M[:1], SIZES_M[:1], claiming=claiming) for claiming in (True, None)
+        cut_at(far_rig(1), NOISE, CLOSE_M[:1], SIZES_M[:1], occluding=occluding) for occluding in (True, None)
     )
     np.testing.assert_array_equal(one.tables, alone.tables)
     np.testing.assert_array_equal(one.clear, 1)
@@ -104,7 +104,7 @@ def test_permuting_drones_permutes_windows():
     patches, permuted = (cut_at(far_rig(1), NOISE, CLOSE_M[to], SIZES_M[:3]) for to in (np.arange(3), order))
     assert patches.clear.min() < 0.9
     np.testing.assert_array_equal(pixels(permuted), pixels(patches)[order])
-    np.testing.assert_array_equal(claimed_pixels(permuted), claimed_pixels(patches)[order])
+    np.testing.assert_array_equal(occluded_pixels(permuted), occluded_pixels(patches)[order])
     np.testing.assert_array_equal(permuted.clear, patches.clear[order])
 
 
@@ -118,13 +118,13 @@ def test_only_the_nearest_neighbours_claim():
     everybody = cut_at(far_rig(1), NOISE, expected_m, SIZES_M)
     assert NUM_NEIGHBOURS == 3
     for silent in range(1, 5):
-        claiming = np.arange(5) != silent
-        patches = cut_at(far_rig(1), NOISE, expected_m, SIZES_M, claiming=claiming)
+        occluding = np.arange(5) != silent
+        patches = cut_at(far_rig(1), NOISE, expected_m, SIZES_M, occluding=occluding)
         same = [np.array_equal(*pair) for pair in zip(pixels(patches)[0], pixels(everybody)[0], strict=True)]
         # A nearer one that is silent lets the fourth in; that is another window, too.
         assert same == [silent == 4] * 4
     # Alone, the fourth would claim: it is close.
-    alone = cut_at(far_rig(1), NOISE, expected_m, SIZES_M, claiming=np.arange(5) == 4)
+    alone = cut_at(far_rig(1), NOISE, expected_m, SIZES_M, occluding=np.arange(5) == 4)
     assert (alone.clear[0] < 1).all()
 
 
@@ -138,7 +138,7 @@ def test_the_smallest_drones_are_covered_like_any():
     assert abs(x % 1 - 0.5) > PIXELS_PER_M[0] * 0.01
     np.testing.assert_array_equal(patches.clear[0], 0)
     assert (patches.clear[1] > 0.8).all()
-    fitness = evaluate(drone_fitness, far_rig(1), patches, expected_m, size_m, 1)
+    fitness = evaluate(drone_fitness, far_rig(1), patches, expected_m, size_m)
     assert np.isnan(fitness[0])
     assert fitness[1] > 0
     apart_m = np.array([[-2.0, 0, 0], [0.1, 0, 0]])
@@ -164,7 +164,7 @@ def cut_in_room(images, expected_m, size_m, **how):
 
 def place(images, expected_m, size_m, **how):
     patches = cut_in_room(images, expected_m, size_m, **how)
-    return best_place(RIG, patches, expected_m, size_m, REDUCTION)
+    return best_place(RIG, patches, expected_m, size_m)
 
 
 def flat(width_m, height_m=None):
@@ -179,7 +179,7 @@ def directions(count):
     return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
 
 
-def pulls_m(size_m, apart_m, off_m, claiming):
+def pulls_m(size_m, apart_m, off_m, occluding):
     """(6,), how far a neighbour's silhouette moves the best place, where both are expected somewhat off."""
     rng = np.random.default_rng(0)
     size_m, pulls = np.array(size_m), []
@@ -187,8 +187,8 @@ def pulls_m(size_m, apart_m, off_m, claiming):
         pair = THERE_M + apart_m * np.stack([0 * direction, direction])
         off = rng.standard_normal((2, 3))
         expected = pair + off_m * off / np.linalg.norm(off, axis=-1, keepdims=True)
-        alone = place(drawn(pair[0], size_m[0]), expected, size_m, claiming=False)[0]
-        together = place(drawn(pair, size_m), expected, size_m, claiming=claiming)[0]
+        alone = place(drawn(pair[0], size_m[0]), expected, size_m, occluding=False)[0]
+        together = place(drawn(pair, size_m), expected, size_m, occluding=occluding)[0]
         pulls.append(np.linalg.norm(together - alone))
     return np.array(pulls)
 
@@ -214,8 +214,8 @@ def test_drones_that_almost_touch_keep_their_scores():
         pair = THERE_M + 0.2 * np.stack([0 * direction, direction])
         patches = cut_in_room(drawn(pair, size_m), pair, size_m)
         assert (patches.clear > 0.5).sum(axis=-1).min() < 2
-        best = best_place(RIG, patches, pair + 0.01, size_m, REDUCTION)
-        assert (evaluate(drone_fitness, RIG, patches, best, size_m, REDUCTION) > 0.4).all()
+        best = best_place(RIG, patches, pair + 0.01, size_m)
+        assert (evaluate(drone_fitness, RIG, patches, best, size_m) > 0.4).all()
         # Measured 12 mm, half of a pixel.
         assert np.linalg.norm(best - pair, axis=-1).max() < 0.018
 
@@ -230,9 +230,7 @@ def test_where_nobody_is_near_claims_change_nothing():
     apart = np.asarray(gap_px > 40)
     assert apart.sum() >= 4
     scores = [
-        evaluate(
-            camera_scores, RIG, cut_in_room(images, pair, size_m, claiming=c), pair + 0.02, size_m, REDUCTION
-        )
+        evaluate(camera_scores, RIG, cut_in_room(images, pair, size_m, occluding=c), pair + 0.02, size_m)
         for c in (None, True)
     ]
     for without, with_claims in zip(*scores, strict=True):
@@ -245,12 +243,12 @@ def test_no_drone_lives_on_the_silhouette_of_another():
     size_m = np.stack([flat(0.4)] * 2)
     expected_m = np.stack([THERE_M, THERE_M])
     images = drawn(THERE_M, size_m[0])
-    patches = cut_in_room(images, expected_m, size_m, claiming=[True, False])
-    _, weight = evaluate(camera_scores, RIG, patches, expected_m, size_m, REDUCTION)
+    patches = cut_in_room(images, expected_m, size_m, occluding=[True, False])
+    _, weight = evaluate(camera_scores, RIG, patches, expected_m, size_m)
     np.testing.assert_allclose(weight[1], 0, atol=1e-6)
-    fitness = evaluate(drone_fitness, RIG, patches, expected_m, size_m, REDUCTION)
-    free = cut_in_room(images, expected_m, size_m, claiming=False)
-    unclaimed = evaluate(drone_fitness, RIG, free, expected_m, size_m, REDUCTION)
+    fitness = evaluate(drone_fitness, RIG, patches, expected_m, size_m)
+    free = cut_in_room(images, expected_m, size_m, occluding=False)
+    unclaimed = evaluate(drone_fitness, RIG, free, expected_m, size_m)
     assert np.isnan(fitness[1])
     np.testing.assert_allclose([fitness[0], *unclaimed], fitness[0], atol=1e-6)
     assert fitness[0] > 0.3
@@ -267,10 +265,10 @@ def test_a_drone_that_is_gone_has_no_place_on_a_neighbour_that_passes(apart_m, s
     for direction in directions(4):
         pair = THERE_M + apart_m * np.stack([0 * direction, direction])
         images = drawn(pair[1], size_m[1])
-        for scores, claiming in ((found, True), (free, False)):
-            patches = cut_in_room(images, pair, size_m, claiming=claiming)
-            best = best_place(RIG, patches, pair, size_m, REDUCTION)
-            scores.append(evaluate(drone_fitness, RIG, patches, best, size_m, REDUCTION))
+        for scores, occluding in ((found, True), (free, False)):
+            patches = cut_in_room(images, pair, size_m, occluding=occluding)
+            best = best_place(RIG, patches, pair, size_m)
+            scores.append(evaluate(drone_fitness, RIG, patches, best, size_m))
     gone, passing = np.transpose(found)
     assert gone.mean() < share * passing.mean()
     assert np.transpose(free)[0].mean() > free_share * passing.mean()

@@ -6,32 +6,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ROOM_M, float32, ring_rig
+from helpers import ROOM_M, float32, ring_rig, track_settings
 
-from psotrack.initiation import InitialState
-from psotrack.settings import TrackSettings
 from psotrack.tracking import tracker
-from psotrack.tracking.inputs import tracker_inputs
+from psotrack.tracking.parameters import tracker_params, tracker_program, tracker_settings
 
 
 def run(*, num_frames=5, num_drones=2, seed=0, size_m=0.4, focal=1.0, **settings):
     """Track noise, and wait for the result."""
     rng = np.random.default_rng(seed)
-    start = InitialState(
-        position_m=rng.uniform(-1, 1, (num_drones, 3)),
-        velocity_m_s=np.zeros((num_drones, 3)),
-        size_m=np.full((num_drones, 3), size_m),
-        num_cameras=np.full(num_drones, 3.0),
+    position_m, velocity_m_s = rng.uniform(-1, 1, (num_drones, 3)), np.zeros((num_drones, 3))
+    settings = tracker_settings(
+        track_settings(**({"particles": 7, "iterations": 3, "seed": seed} | settings))
     )
-    settings = TrackSettings(**({"particles": 7, "iterations": 3, "seed": seed} | settings))
-    program, params = tracker_inputs(8, start, settings, fps=25.0 + seed, bounds_m=ROOM_M * (1 + 0.1 * seed))
+    program, sizes_m = tracker_program(settings, 8), np.full((num_drones, 3), size_m)
+    params = tracker_params(settings, sizes_m, fps=25.0 + seed, bounds_m=ROOM_M * (1 + 0.1 * seed))
+    starts = tracker.no_track_starts(num_drones)
     cameras = float32(ring_rig(3).cameras)
     cameras = replace(cameras, K=cameras.K * focal)
-    state = tracker.init(jax.random.key(seed), *float32((start.position_m, start.velocity_m_s)), params)
+    state = tracker.init(jax.random.key(seed), *float32((position_m, velocity_m_s)), params)
     coverage = rng.integers(0, 256, (num_frames, 3, 30, 40)).astype(np.uint8)
-    state, _ = tracker.track(state, coverage, cameras, params, program)
+    state, _ = tracker.track(state, coverage, cameras, params, program, starts)
     # And the next chunk, whose state comes from the device.
-    return jax.block_until_ready(tracker.track(state, jnp.asarray(coverage), cameras, params, program))
+    return jax.block_until_ready(
+        tracker.track(state, jnp.asarray(coverage), cameras, params, program, starts)
+    )
 
 
 @pytest.fixture

@@ -1,5 +1,6 @@
 """The soft IoU: fractions worked by hand where cameras are so far away that metres are pixels, then its properties."""
 
+from dataclasses import dataclass
 from functools import partial
 
 import jax
@@ -12,12 +13,12 @@ from hypothesis import strategies as st
 from windows import best_place, cut_at
 
 from psotrack.silhouettes import summed_area_table
-from psotrack.tracking import ScoreSettings
+from psotrack.tracking import SoftIoU
 from psotrack.tracking.fitness import (
     PAPER_SCORE,
     camera_scores,
     drone_fitness,
-    filled,
+    filled_share,
     joint_fitness,
     score_inputs,
 )
@@ -27,8 +28,16 @@ FAR = {"image_size_wh": (64, 48), "pixels_per_m": 20.0}
 SIZE_M = np.array([[1.0, 1.0, 0.5]])
 PIXEL_M = 1 / 20
 
-ONE_BOX = ScoreSettings(windows=(1.0,), ring=1.5, reduction=1, min_cameras=1)
-HARD = ScoreSettings(windows=(1.0,), ring=1.5, reduction=1, min_cameras=1, whole_pixels=True)
+
+@dataclass(frozen=True)
+class Score(SoftIoU):
+    """The soft IoU, with the reduction of the silhouettes that a test scores."""
+
+    reduction: int = 4
+
+
+ONE_BOX = Score(windows=(1.0,), ring=1.5, reduction=1, min_cameras=1)
+HARD = Score(windows=(1.0,), ring=1.5, reduction=1, min_cameras=1, whole_pixels=True)
 
 # Edges of boxes are good to 1e-5 px here (float32 at 1000 m with a focal length of 20000 px); of 200 px that is 1e-5.
 HAND = 1e-4
@@ -49,7 +58,10 @@ def evaluate(function, rig, images, position_m, size_m=SIZE_M, settings=ONE_BOX)
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _compiled(function, settings, images, cameras, position_m, size_m):
-    return function(score_inputs(cameras, size_m, summed_area_table(images), settings), position_m)
+    return function(
+        score_inputs(cameras, size_m, summed_area_table(images), settings, reduction=settings.reduction),
+        position_m,
+    )
 
 
 def score_at(image, x_px=0.0, settings=ONE_BOX):
@@ -98,7 +110,7 @@ def test_one_box_by_hand(image, expected, settings):
 
 def test_windows_by_hand():
     """A silhouette that fills the box: each window is compared with all of it."""
-    settings = ScoreSettings(windows=(0.5, 0.8, 1.1), ring=1.5, reduction=1, min_cameras=1)
+    settings = Score(windows=(0.5, 0.8, 1.1), ring=1.5, reduction=1, min_cameras=1)
     expected = (0.5**2 + 0.8**2 + 1 / 1.1**2) / 3
     assert score_at(silhouette(DRONE), settings=settings) == pytest.approx(expected, abs=HAND)
 
@@ -116,7 +128,7 @@ def test_hard_edges_are_whole_pixels():
 def test_reduced_silhouettes_score_the_same():
     """Each pixel of a silhouette stands for 4 x 4 pixels of the image."""
     rig = rig_of(far_camera(image_size_wh=(256, 192), pixels_per_m=80))
-    settings = ScoreSettings(windows=(0.5, 1.1), ring=1.5, reduction=4, min_cameras=1)
+    settings = Score(windows=(0.5, 1.1), ring=1.5, reduction=4, min_cameras=1)
     score = evaluate(drone_fitness, rig, silhouette(DRONE), np.zeros((1, 3)), settings=settings)
     assert score.item() == pytest.approx((0.5**2 + 1 / 1.1**2) / 2, abs=HAND)
 
@@ -124,7 +136,7 @@ def test_reduced_silhouettes_score_the_same():
 def test_one_box_is_a_plateau_and_windows_are_not():
     """A silhouette of half the width, moved inside the box: the paper's score cannot tell, the soft one can."""
     image = silhouette((27, 19, 37, 29))
-    windows = ScoreSettings(windows=(0.5, 0.8, 1.1), ring=1.5, reduction=1, min_cameras=1)
+    windows = Score(windows=(0.5, 0.8, 1.1), ring=1.5, reduction=1, min_cameras=1)
     hard = [score_at(image, x, HARD) for x in (0.0, 1.0, 2.0, 4.0)]
     np.testing.assert_allclose(hard, 1 / 2, atol=HAND)
     soft = [score_at(image, x, windows) for x in (0.0, 1.0, 2.0, 4.0)]
@@ -164,7 +176,7 @@ def test_too_few_cameras_is_undefined():
     K[0, 2] += 200
     elsewhere = type(one)(one.T_cam_world, K, one.dist, one.image_size_wh)
     images = np.concatenate([silhouette(DRONE)] * 2)
-    two = ScoreSettings(windows=(1.0,), reduction=1, min_cameras=2)
+    two = Score(windows=(1.0,), reduction=1, min_cameras=2)
     both, blind = rig_of(one, one), rig_of(one, elsewhere)
     assert evaluate(drone_fitness, both, images, np.zeros((1, 3)), settings=two).item() == pytest.approx(
         1, abs=HAND
@@ -191,8 +203,10 @@ def test_filled_is_the_share_of_the_box_that_is_foreground():
     one = far_camera(**FAR)
     rig = rig_of(one, one)
     images = np.concatenate([silhouette((22, 19, 27, 29)), silhouette(DRONE, value=51)])
-    np.testing.assert_allclose(evaluate(filled, rig, images, np.zeros((1, 3))), [[1 / 4, 1 / 5]], atol=HAND)
-    assert not evaluate(filled, rig, images, np.array([[10.0, 0, 0]])).any()
+    np.testing.assert_allclose(
+        evaluate(filled_share, rig, images, np.zeros((1, 3))), [[1 / 4, 1 / 5]], atol=HAND
+    )
+    assert not evaluate(filled_share, rig, images, np.array([[10.0, 0, 0]])).any()
 
 
 # Properties, in a room.
@@ -201,10 +215,8 @@ RIG = ring_rig(5)
 TRUTH_M = np.array([[0.3, -0.2, 1.3], [-0.6, 0.5, 0.9]])
 SIZES_M = np.array([[0.5, 0.5, 0.3], [0.6, 0.6, 0.35]])
 IMAGES = draw_coverage(RIG, TRUTH_M, SIZES_M, reduction=2)
-SOFT = ScoreSettings(reduction=2)
-SETTINGS = pytest.mark.parametrize(
-    "settings", [SOFT, ScoreSettings(windows=(1.0,), whole_pixels=True, reduction=2)]
-)
+SOFT = Score(reduction=2)
+SETTINGS = pytest.mark.parametrize("settings", [SOFT, Score(windows=(1.0,), whole_pixels=True, reduction=2)])
 
 
 def particles(count, seed=0, spread_m=0.2):
@@ -244,7 +256,7 @@ def test_a_particle_alone_scores_the_same():
 def test_fitness_is_in_0_to_1_or_undefined(position_m, seed):
     """In the room and out of it, behind cameras and inside of them, for noise as silhouettes."""
     images = np.random.default_rng(seed).integers(0, 256, (5, 12, 16)).astype(np.uint8)
-    settings = ScoreSettings(reduction=20)
+    settings = Score(reduction=20)
     position_m = np.array(position_m).reshape(2, 3)
     for one in (position_m, RIG.cameras.centre_world[seed % 4 : seed % 4 + 2]):
         fitness = evaluate(drone_fitness, RIG, images, one, SIZES_M, settings)
@@ -301,7 +313,7 @@ def _gradients(cameras, images, position_m, size_m, offset_m):
     """Fitness of both drones, and the gradients of its sum in position, size and offset."""
 
     def each(position_m, size_m, offset_m):
-        view = score_inputs(cameras, size_m, summed_area_table(images), SOFT, offset_m)
+        view = score_inputs(cameras, size_m, summed_area_table(images), SOFT, reduction=2, offset_m=offset_m)
         fitness = drone_fitness(view, position_m)
         return fitness.sum(), fitness
 
@@ -346,7 +358,9 @@ def test_gradients_are_those_of_the_oracle(images, shift_m):
 def _gradients_at(images, cameras, places_m, size_m, offset_m):
     def one(position_m):
         def total(position_m, size_m, offset_m):
-            view = score_inputs(cameras, size_m, summed_area_table(images), SOFT, offset_m)
+            view = score_inputs(
+                cameras, size_m, summed_area_table(images), SOFT, reduction=2, offset_m=offset_m
+            )
             return joint_fitness(view, position_m)
 
         return jax.value_and_grad(total, (0, 1, 2))(position_m, size_m, offset_m)
@@ -382,7 +396,7 @@ def test_fitness_is_highest_where_the_drone_is(place_m, shape):
     place_m, size_m = np.array([place_m]), np.array([[shape[0], shape[0], shape[0] * shape[1]]])
     images = draw_coverage(RIG, place_m, size_m, reduction=2)
     patches = cut_at(RIG, images, place_m, size_m, reach_m=0.15, reduction=2)
-    best_m = best_place(RIG, patches, place_m + 0.03, size_m, 2)
+    best_m = best_place(RIG, patches, place_m + 0.03, size_m)
     # A silhouette's pixel is 3 cm wide at 4 m; five cameras place the middle of an ellipse to a third of it.
     assert np.abs(best_m - place_m).max() < 0.012
     away_m = 0.1 * shape[0] * np.eye(3)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from psotrack.silhouettes import summed_area_table
-from psotrack.tracking import ScoreSettings
+from psotrack.tracking import SoftIoU
 from psotrack.tracking.fitness import camera_scores, score_inputs
 from psotrack.tracking.vertex import SPAN, find_vertex
 
@@ -21,7 +21,7 @@ RIG = ring_rig(6, image_size_wh=(960, 720), coefficients=5)
 def view_of(truth_m, *, rig=RIG, size_m=SIZE_M):
     coverage = draw_coverage(rig, truth_m, size_m, REDUCTION)
     tables = summed_area_table(jnp.asarray(coverage))
-    return score_inputs(float32(rig.cameras), float32(size_m), tables, ScoreSettings(reduction=REDUCTION))
+    return score_inputs(float32(rig.cameras), float32(size_m), tables, SoftIoU(), reduction=REDUCTION)
 
 
 def found(view, position_m, size_m=SIZE_M):

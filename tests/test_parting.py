@@ -6,10 +6,10 @@ from helpers import ROOM_M, ring_rig
 from psotrack.correspondence import CameraSightings, from_detections
 from psotrack.evaluation import evaluate
 from psotrack.geometry import project
-from psotrack.projection_lines import follow
-from psotrack.projection_lines.parting import PART_SHARE, parted
+from psotrack.projection_lines import LineSettings, track_detections
+from psotrack.projection_lines.merged_boxes import PART_SHARE, split_merged_boxes
 from psotrack.recordings import Detections
-from psotrack.settings import TrackSettings
+from psotrack.settings import DroneSettings, MotionSettings, StatusSettings
 from psotrack.trajectories import Trajectories
 
 RIG = ring_rig(5, coefficients=4, image_size_wh=(1920, 1080))
@@ -54,7 +54,7 @@ def test_drones_in_one_box_get_their_own_where_each_has_an_edge_of_it():
     drones_m = two_drones()
     own = boxes_of(drones_m)
     whole = around(own)
-    seen = parted(RIG.cameras, view_of(whole), drones_m, SPAN_M)
+    seen = split_merged_boxes(RIG.cameras, view_of(whole), drones_m, SPAN_M)
     num_placed = []
     for camera in range(len(RIG)):
         edges = own[:, camera] == whole[camera]
@@ -73,7 +73,7 @@ def test_where_exactly_drones_were_expected_makes_no_difference():
     drones_m = np.array([0.0, 0.0, 1.2]) + np.array([np.zeros(3), 0.35 * right + 0.25 * down])
     own = boxes_of(drones_m)
     expected_m = drones_m + 0.03 * np.array([[1.0, -1.0, 0.5], [-1.0, 0.5, 1.0]])
-    seen = parted(RIG.cameras, view_of(around(own)), expected_m, SPAN_M)
+    seen = split_merged_boxes(RIG.cameras, view_of(around(own)), expected_m, SPAN_M)
     # 5 cm of some 4 m are 1.3 % of 150 px, and half of the size goes into the middle.
     middle_px = (own[:, 0, :2] + own[:, 0, 2:]) / 2
     np.testing.assert_allclose(seen.centre_px[0, 1:], middle_px, atol=1.0)
@@ -82,7 +82,7 @@ def test_where_exactly_drones_were_expected_makes_no_difference():
 def test_boxes_that_overlap_but_are_each_of_a_drone_stay_as_they_are():
     own = boxes_of(two_drones())
     view = view_of(*own)
-    seen = parted(RIG.cameras, view, two_drones(), SPAN_M)
+    seen = split_merged_boxes(RIG.cameras, view, two_drones(), SPAN_M)
     np.testing.assert_array_equal(seen.centre_px, view.centre_px)
     np.testing.assert_array_equal(seen.noise_px, view.noise_px)
 
@@ -92,7 +92,7 @@ def test_a_drone_between_others_is_hidden():
     drones_m = np.array([[0.0, 0.0, 0.9], [0.0, 0.0, 1.1], [0.0, 0.0, 1.3]])
     span_m = np.tile(SPAN_M[0], (3, 1))
     own = boxes_of(drones_m, span_m)
-    seen = parted(RIG.cameras, view_of(around(own)), drones_m, span_m)
+    seen = split_merged_boxes(RIG.cameras, view_of(around(own)), drones_m, span_m)
     for camera in range(len(RIG)):
         high = kept(seen, camera)[:, 1]
         assert own[1, camera, 1] not in high
@@ -102,7 +102,7 @@ def test_a_drone_between_others_is_hidden():
 def test_drones_of_unknown_size_take_no_box_apart():
     own = boxes_of(two_drones())
     view = view_of(around(own))
-    seen = parted(RIG.cameras, view, two_drones(), np.full((2, 2), np.nan))
+    seen = split_merged_boxes(RIG.cameras, view, two_drones(), np.full((2, 2), np.nan))
     np.testing.assert_array_equal(seen.centre_px, view.centre_px)
 
 
@@ -143,10 +143,10 @@ def test_drones_whose_boxes_grow_together_keep_their_tracks():
         name: Detections(np.array(frame), np.array(boxes), np.ones(len(frame)))
         for name, (frame, boxes) in images.items()
     }
-    tracked = follow(
+    tracked = track_detections(
         rig.cameras,
         from_detections(detections, rig, len(truth_m)),
-        TrackSettings(),
+        LineSettings(MotionSettings(), DroneSettings(), StatusSettings(), spread_m=0.05),
         fps=FPS,
         bounds_m=ROOM_M,
         known=(truth_m[0], (truth_m[1] - truth_m[0]) * FPS),
@@ -154,7 +154,7 @@ def test_drones_whose_boxes_grow_together_keep_their_tracks():
     frame = np.arange(len(truth_m))
     names = ("0", "1", "2")
     estimate = Trajectories(
-        frame, frame / FPS, names, tracked.info.position_m[:, :3], status=tracked.info.status[:, :3]
+        frame, frame / FPS, names, tracked.position_m[:, :3], status=tracked.status[:, :3]
     )
     errors = evaluate(estimate, Trajectories(frame, frame / FPS, names, truth_m)).to_dict()
     assert errors["id_switches"] == 0

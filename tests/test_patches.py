@@ -26,8 +26,8 @@ from windows import (
 
 from psotrack.geometry import make_extents
 from psotrack.silhouettes import box_sum
-from psotrack.tracking import ScoreSettings
-from psotrack.tracking.fitness import ScoreInputs, camera_scores, drone_fitness, filled
+from psotrack.tracking import SoftIoU
+from psotrack.tracking.fitness import ScoreInputs, camera_scores, drone_fitness, filled_share
 from psotrack.tracking.patches import NUM_LEVELS, SIDE
 
 #: At the middle, beside, over the left upper and right lower borders in most cameras, and out of all images.
@@ -39,7 +39,7 @@ def levels(patches, reduction=1):
     return np.log2(patches.pixel_px / reduction).astype(int)
 
 
-# Windows without claims.
+# Windows without occlusion.
 
 
 @pytest.mark.parametrize("reduction", [1, 4])
@@ -49,7 +49,7 @@ def test_windows_are_means_of_the_whole_image(reduction):
     (Or up to seven pixels beyond, where boxes do not reach.)
     """
     rig = far_rig(reduction)
-    patches = cut_at(rig, NOISE, PLACES_M, SIZES_M, claiming=None, reduction=reduction)
+    patches = cut_at(rig, NOISE, PLACES_M, SIZES_M, occluding=None, reduction=reduction)
     level = levels(patches, reduction)
     np.testing.assert_array_equal(level, np.broadcast_to([0, 1, 2, 3], (5, 4)))
     np.testing.assert_array_equal(patches.clear, 1)
@@ -98,7 +98,7 @@ def _rounded_mean(sums, cell):
 def test_boxes_on_the_grid_of_a_window_are_slice_sums(seed):
     """Sums over boxes with edges on whole pixels of the windows are NumPy's of the silhouettes, halved as often."""
     rng = np.random.default_rng(seed)
-    patches = cut_at(far_rig(1), NOISE, PLACES_M, SIZES_M, claiming=None)
+    patches = cut_at(far_rig(1), NOISE, PLACES_M, SIZES_M, occluding=None)
     ends = np.sort(rng.integers(0, SIDE + 1, (2, 2, *patches.x_px.shape)), axis=1)
     (x0, x1), (y0, y1) = ends
     edges = float32([side[None] for side in (x0, y0, x1, y1)])
@@ -123,9 +123,9 @@ _box_sum = jax.jit(box_sum)
 def test_where_the_border_divides_a_pixel_foreground_counts_in_full():
     """All is foreground: every box is filled, whatever the level, up to the border of an odd image."""
     white = np.full_like(NOISE, 255)
-    patches = cut_at(far_rig(1), white, PLACES_M, SIZES_M, claiming=None)
-    share = evaluate(filled, far_rig(1), patches, PLACES_M, SIZES_M, 1)
-    _, weight = evaluate(camera_scores, far_rig(1), patches, PLACES_M, SIZES_M, 1)
+    patches = cut_at(far_rig(1), white, PLACES_M, SIZES_M, occluding=None)
+    share = evaluate(filled_share, far_rig(1), patches, PLACES_M, SIZES_M)
+    _, weight = evaluate(camera_scores, far_rig(1), patches, PLACES_M, SIZES_M)
     hanging = (weight > 0.5) & (weight < 0.99)
     assert hanging[:, 1:].any()
     # Edges at 1e6 px of focal length are good to 1e-4 px in float32, boxes are 10 px and more.
@@ -148,13 +148,13 @@ def test_scores_are_those_of_whole_images(where):
     rng = np.random.default_rng(1)
     images = rng.integers(0, 256, (5, 122, 162)).astype(np.uint8)
     expected_m = TRUTH_M if where == "in the room" else np.array([[2.6, -2.1, 0.1], [0.3, 2.9, 2.9]])
-    patches = cut_at(RIG, images, expected_m, SIZE_M, reach_m=REACH_M, claiming=None, reduction=REDUCTION)
+    patches = cut_at(RIG, images, expected_m, SIZE_M, reach_m=REACH_M, occluding=None, reduction=REDUCTION)
     fine = levels(patches, REDUCTION) == 0
     offset = rng.standard_normal((50, 2, 3))
     position_m = expected_m + REACH_M * offset / np.linalg.norm(offset, axis=-1, keepdims=True)
-    score, weight = evaluate(camera_scores, RIG, patches, position_m, SIZE_M, REDUCTION)
+    score, weight = evaluate(camera_scores, RIG, patches, position_m, SIZE_M)
     arrays = float32((RIG.cameras, position_m, SIZE_M))
-    whole = evaluate_whole(camera_scores, ScoreSettings(reduction=REDUCTION), images, *arrays)
+    whole = evaluate_whole(camera_scores, REDUCTION, images, *arrays)
     assert (np.asarray(whole[0])[:, fine] > 0.1).any(axis=0).sum() >= 3
     # Edges of boxes are good to 1e-5 px, of 20 px and more.
     np.testing.assert_allclose(score[:, fine], np.asarray(whole[0])[:, fine], atol=1e-5)
@@ -181,7 +181,7 @@ def test_all_is_finite_wherever_drones_are_expected(expected_m, reach_m, camera)
             assert np.isfinite(leaf).all()
         assert ((patches.clear >= 0) & (patches.clear <= 1)).all()
         assert (patches.tables >= 0).all()
-        score, weight = evaluate(camera_scores, RIG, patches, expected, SIZE_M, REDUCTION)
+        score, weight = evaluate(camera_scores, RIG, patches, expected, SIZE_M)
         # Sums are exact to 1e-6 of a box.
         assert ((score >= 0) & (score <= 1 + 1e-5)).all()
         assert ((weight >= 0) & (weight <= 1 + 1e-5)).all()
@@ -231,7 +231,7 @@ def test_the_level_is_the_finest_that_holds_ring_and_search(distance_m, reach_m,
 
 @pytest.mark.slow
 def test_gradients_are_those_of_finite_differences():
-    """On windows that neighbours claim of, of several levels; in float64."""
+    """On windows that neighbours may cover, of several levels; in float64."""
     pair = np.array([[0.3, -0.2, 1.3], [0.65, -0.05, 1.4]])
     images = draw_coverage(RIG, pair, SMALL_M, REDUCTION)
     patches = cut_at(RIG, images, pair, SMALL_M, reach_m=0.65, reduction=REDUCTION)
@@ -239,7 +239,7 @@ def test_gradients_are_those_of_finite_differences():
     assert patches.clear.min() < 0.9
     with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
         windows = jax.tree.map(jnp.asarray, patches)
-        view = ScoreInputs(make_extents(RIG.cameras, SMALL_M), windows, ScoreSettings(reduction=REDUCTION))
+        view = ScoreInputs(make_extents(RIG.cameras, SMALL_M), windows, SoftIoU())
 
         @jax.jit
         def total(position_m):
@@ -257,11 +257,11 @@ def test_gradients_are_those_of_finite_differences():
 
 @pytest.mark.slow
 def test_gradients_are_finite_everywhere():
-    """Also beyond the windows, at a camera, behind one, and where a neighbour has claimed all."""
+    """Also beyond the windows, at a camera, behind one, and where a neighbour may cover all."""
     expected_m = np.stack([TRUTH_M[0], TRUTH_M[0]])
     images = draw_coverage(RIG, TRUTH_M[0], SMALL_M[0], REDUCTION)
     patches = cut_at(
-        RIG, images, expected_m, SMALL_M, reach_m=REACH_M, claiming=[True, False], reduction=REDUCTION
+        RIG, images, expected_m, SMALL_M, reach_m=REACH_M, occluding=[True, False], reduction=REDUCTION
     )
     at_cameras = RIG.cameras.centre_world[:4].reshape(2, 2, 3)
     far = expected_m + 3 * np.random.default_rng(0).standard_normal((5, 2, 3))
@@ -270,6 +270,6 @@ def test_gradients_are_finite_everywhere():
     def gradient(view, position_m):
         return jax.vmap(jax.grad(lambda where: jnp.nansum(drone_fitness(view, where))))(position_m)
 
-    found = evaluate(gradient, RIG, patches, places, SMALL_M, REDUCTION)
+    found = evaluate(gradient, RIG, patches, places, SMALL_M)
     assert np.isfinite(found).all()
     assert np.abs(found[1, 0]).max() > 0

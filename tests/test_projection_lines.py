@@ -7,9 +7,9 @@ from helpers import ROOM_M, ring_rig
 from psotrack.correspondence import from_detections
 from psotrack.evaluation import evaluate
 from psotrack.geometry import project
-from psotrack.projection_lines import follow, start_of
+from psotrack.projection_lines import LineSettings, state_at_first_frame, track_detections
 from psotrack.recordings import Detections
-from psotrack.settings import TrackSettings
+from psotrack.settings import DroneSettings, MotionSettings, StatusSettings
 from psotrack.trajectories import Status, Trajectories
 
 FPS = 25.0
@@ -56,9 +56,15 @@ def detections(truth_m, *, jitter=0.0, missed=0.0, false_alarms=0.0, seed=0, hid
     return found
 
 
-def track(truth_m, settings=TrackSettings(), known=None, **noise):  # noqa: B008  frozen
+def line_settings(count=None):
+    return LineSettings(MotionSettings(), DroneSettings(count=count), StatusSettings(), spread_m=0.05)
+
+
+def track(truth_m, count=None, known=None, **noise):
     sightings = from_detections(detections(truth_m, **noise), RIG, len(truth_m))
-    return follow(RIG.cameras, sightings, settings, fps=FPS, bounds_m=ROOM_M, known=known)
+    return track_detections(
+        RIG.cameras, sightings, line_settings(count), fps=FPS, bounds_m=ROOM_M, known=known
+    )
 
 
 def judged(tracked, truth_m):
@@ -66,10 +72,10 @@ def judged(tracked, truth_m):
     estimate = Trajectories(
         frame,
         frame / FPS,
-        tuple(map(str, range(tracked.info.status.shape[1]))),
-        tracked.info.position_m,
-        covariance_m2=tracked.info.covariance_m2,
-        status=tracked.info.status,
+        tuple(map(str, range(tracked.status.shape[1]))),
+        tracked.position_m,
+        covariance_m2=tracked.covariance_m2,
+        status=tracked.status,
     )
     names = tuple(f"dron{drone}" for drone in range(truth_m.shape[1]))
     return evaluate(estimate, Trajectories(frame, frame / FPS, names, truth_m)).to_dict()
@@ -90,7 +96,7 @@ def test_six_drones_by_a_detector_that_misses_and_invents(seed):
     truth_m = circles(6)
     noise = {"jitter": 0.05, "missed": 0.1, "false_alarms": 0.5, "seed": seed}
     tracked = track(truth_m, **noise)
-    assert tracked.info.status.shape[1] == 6
+    assert tracked.status.shape[1] == 6
     errors = judged(tracked, truth_m)
     assert (errors["missed_rate"], errors["id_switches"]) == (0, 0)
     # Middles are off by 25 mm across and 10 mm up: from seven views that is 13 mm along x and y and 4 mm along z, 17 mm
@@ -119,15 +125,15 @@ def test_a_drone_that_is_thrown_about_stays_itself():
     truth_m = np.stack([x_m, 0 * x_m, 0 * x_m + 1.2], axis=-1)[:, None]
     tracked = track(truth_m, jitter=0.02)
     assert tracked.arrivals == ()
-    assert (tracked.info.status == Status.TRACKED).all()
+    assert (tracked.status == Status.TRACKED).all()
     # What the frames say by themselves, 16 mm as a rule for 5 % and so 6 mm here.
-    assert np.linalg.norm(tracked.info.measured_m - truth_m, axis=-1).max() < 0.04
+    assert np.linalg.norm(tracked.measured_m - truth_m, axis=-1).max() < 0.04
 
 
 def test_a_drone_that_is_lost_coasts_ever_less_certain_and_comes_back_as_itself():
     truth_m = circles(3)
     tracked = track(truth_m, jitter=0.03, hidden=[(1, 25, 50)])
-    info = tracked.info
+    info = tracked
     assert info.status.shape[1] == 3
     which = int(np.nanargmin(np.linalg.norm(info.position_m[20] - truth_m[20, 1], axis=-1)))
     status = info.status[:, which]
@@ -149,25 +155,25 @@ def test_a_drone_that_comes_later_is_new():
     tracked = track(truth_m, jitter=0.03, hidden=[(2, 0, 30)])
     (new,) = tracked.arrivals
     assert (new.frame, new.drone, new.again) == (30, 2, False)
-    assert (tracked.info.status[:30, 2] == Status.LOST).all()
-    assert np.isnan(tracked.info.position_m[:30, 2]).all()
+    assert (tracked.status[:30, 2] == Status.LOST).all()
+    assert np.isnan(tracked.position_m[:30, 2]).all()
 
 
 def test_no_more_drones_than_there_are():
-    tracked = track(circles(3), TrackSettings(drones=2))
-    assert tracked.info.status.shape[1] == 2
+    tracked = track(circles(3), count=2)
+    assert tracked.status.shape[1] == 2
 
 
 def test_without_detections_there_are_no_drones():
     tracked = track(circles(2), missed=1.0)
-    assert tracked.info.status.shape == (FRAMES, 0)
-    assert len(start_of(tracked).position_m) == 0
+    assert tracked.status.shape == (FRAMES, 0)
+    assert len(state_at_first_frame(tracked).position_m) == 0
 
 
 def test_chance_crossings_are_no_drones():
     """Three false alarms in every image, no drone: what agrees once does not agree in five of eight frames."""
     tracked = track(np.empty((40, 0, 3)), false_alarms=3.0)
-    assert tracked.info.status.shape[1] == 0
+    assert tracked.status.shape[1] == 0
 
 
 def test_known_drones_are_there_from_the_first_frame_with_their_numbers():
@@ -177,8 +183,8 @@ def test_known_drones_are_there_from_the_first_frame_with_their_numbers():
     tracked = track(truth_m, known=(truth_m[0, order], velocity_m_s[order]))
     assert tracked.arrivals == ()
     # The start's velocity is the first step's, which on a circle is 0.03 m/s off.
-    np.testing.assert_allclose(tracked.info.position_m[0], truth_m[0, order], atol=2e-3)
-    np.testing.assert_allclose(start_of(tracked).position_m, truth_m[0, order], atol=2e-3)
+    np.testing.assert_allclose(tracked.position_m[0], truth_m[0, order], atol=2e-3)
+    np.testing.assert_allclose(state_at_first_frame(tracked).position_m, truth_m[0, order], atol=2e-3)
 
 
 def test_sizes_are_those_of_the_boxes():
@@ -190,8 +196,8 @@ def test_fitness_is_the_share_of_the_cameras_that_agree():
     truth_m = circles(1)
     everyone = detections(truth_m)
     some = {name: boxes for name, boxes in everyone.items() if name in RIG.names[:6]}
-    tracked = follow(
-        RIG.cameras, from_detections(some, RIG, FRAMES), TrackSettings(), fps=FPS, bounds_m=ROOM_M
+    tracked = track_detections(
+        RIG.cameras, from_detections(some, RIG, FRAMES), line_settings(), fps=FPS, bounds_m=ROOM_M
     )
-    assert (tracked.info.num_cameras[:, 0] == 6).all()
-    np.testing.assert_allclose(tracked.info.fitness[:, 0], 6 / 8)
+    assert (tracked.num_cameras[:, 0] == 6).all()
+    np.testing.assert_allclose(tracked.fitness[:, 0], 6 / 8)

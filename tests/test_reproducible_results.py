@@ -16,7 +16,7 @@ from psotrack.datasets.dpjait import read_sequence
 from psotrack.evaluation import Evaluation, evaluate
 from psotrack.pipeline import track_sequence
 from psotrack.recordings import Sequence
-from psotrack.settings import TrackSettings
+from psotrack.settings import SwarmSettings, TrackSettings
 from psotrack.silhouettes import SilhouetteSettings
 from psotrack.simulation import simulate
 from psotrack.trajectories import Trajectories, write_trajectories
@@ -33,11 +33,9 @@ class Lab:
 
     def track(self, seed: int = 0) -> Trajectories:
         settings = TrackSettings(
-            swarm="joint",
-            particles=100,
-            iterations=70,
             seed=seed,
             silhouettes=SilhouetteSettings(reduction=2, working_reduction=1),
+            swarm=SwarmSettings(kind="joint", particles=100, iterations=70),
         )
         return track_sequence(self.sequence, settings, cache=self.cache, jobs=1).trajectories
 

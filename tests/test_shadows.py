@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import draw_coverage, float32, ring_rig
-from windows import best_place, claimed_pixels, cut_at, evaluate, pixels
+from windows import best_place, cut_at, evaluate, occluded_pixels, pixels
 
 from psotrack.geometry import make_extents, project, project_boxes, undistort
-from psotrack.tracking import ScoreSettings, sizes
+from psotrack.tracking import sizes
 from psotrack.tracking.fitness import drone_fitness
-from psotrack.tracking.occlusion import CLAIM, claims_on
-from psotrack.tracking.shadows import CAST, LOW, low, shadowed
+from psotrack.tracking.occlusion import OCCLUDER_SCALE, find_occluders
+from psotrack.tracking.shadows import CAST, LOW, FloorView, is_low, shadowed_pixels
 
 REDUCTION = 2
 #: A silhouette's pixel is 2.4 cm in the middle of the room.
@@ -58,7 +58,7 @@ def size_m():
         *float32((high,)),
         jnp.ones((1, 1), bool),
         *float32((np.array([[0.45, 0.45, 0.12]]), RIG.cameras)),
-        ScoreSettings(reduction=REDUCTION),
+        sizes.SizeProgram(reduction=REDUCTION),
     )
     return np.asarray(looks.size_m, np.float64)[0]
 
@@ -69,7 +69,7 @@ def cut_in_room(images, expected_m, size_m, **how):
 
 def place(images, expected_m, size_m, floor_z_m=0.0):
     patches = cut_in_room(images, expected_m[None], size_m, floor_z_m=floor_z_m)
-    return best_place(RIG, patches, expected_m[None], size_m, REDUCTION)[0]
+    return best_place(RIG, patches, expected_m[None], size_m)[0]
 
 
 # Which pixels look at a shadow.
@@ -88,13 +88,13 @@ def windows_about(boxes, side_px):
 
 def in_ellipse(pixel, boxes, drone, camera):
     middle = np.array([boxes.x_middle[drone, camera], boxes.y_middle[drone, camera]])
-    half = CLAIM * np.array([boxes.x_half[drone, camera], boxes.y_half[drone, camera]])
+    half = OCCLUDER_SCALE * np.array([boxes.x_half[drone, camera], boxes.y_half[drone, camera]])
     return (((pixel - middle) / half) ** 2).sum(axis=-1) < 1
 
 
 def dark_by_rays(rig, images, boxes, drone, x_px, y_px):
     """(cameras, side, side), float64: rays to the floor, and the votes of all cameras for the cell that they meet."""
-    half_m = CLAIM * SIZES_M[drone, 0] / 2 + CAST * (DRONES_M[drone, 2] - FLOOR_Z_M)
+    half_m = OCCLUDER_SCALE * SIZES_M[drone, 0] / 2 + CAST * (DRONES_M[drone, 2] - FLOOR_Z_M)
     line = (np.arange(CELLS) + 0.5) * 2 / CELLS - 1
     x, y = np.meshgrid(line, line)
     cells = np.stack([x, y, np.zeros_like(x)], axis=-1) * half_m + [*DRONES_M[drone, :2], FLOOR_Z_M]
@@ -138,9 +138,9 @@ def test_dark_pixels_are_those_of_a_ray_caster(coefficients):
     @jax.jit
     def dark_of(images, seen, boxes, expected_m, at_px, floor_z_m):
         nothing = jnp.zeros_like(boxes.x_middle)
-        claims = claims_on(boxes, claiming=jnp.ones(3, bool), pixel_px=nothing)
-        how = {"floor_z_m": floor_z_m, "reduction": REDUCTION}
-        return shadowed(images, seen, boxes, claims, expected_m, at_px, **how)
+        occluders = find_occluders(boxes, occluding=jnp.ones(3, bool), pixel_px=nothing)
+        view = FloorView(seen, boxes, occluders, expected_m, floor_z_m)
+        return shadowed_pixels(images, view, at_px, REDUCTION)
 
     dark = np.asarray(dark_of(images, seen, boxes, *float32((DRONES_M, (x_px, y_px), FLOOR_Z_M))))
     boxes = jax.tree.map(np.asarray, boxes)
@@ -154,8 +154,8 @@ def test_dark_pixels_are_those_of_a_ray_caster(coefficients):
 def test_low_is_less_high_than_wide():
     size_m, heights_m = np.array([0.5, 0.5, 0.1]), np.array([0.0, 0.49, 0.51, 2.0]) * LOW
     position_m = np.stack([np.zeros(4), np.ones(4), heights_m - 1.0], axis=-1)
-    is_low = low(*float32((position_m, size_m[None], -1.0)))
-    np.testing.assert_array_equal(is_low, [True, True, False, False])
+    found = is_low(*float32((position_m, size_m[None], -1.0)))
+    np.testing.assert_array_equal(found, [True, True, False, False])
 
 
 # What shadows do to a place.
@@ -206,9 +206,7 @@ def test_a_drone_on_the_floor_keeps_its_score_and_place(size_m):
         cut_in_room(images, there[None], size_m, floor_z_m=floor_z_m) for floor_z_m in (0.0, FAR_BELOW_M)
     )
     np.testing.assert_array_equal(patches.clear, 1)
-    fitness, unbalanced = (
-        evaluate(drone_fitness, RIG, of, there[None], size_m, REDUCTION) for of in (patches, free)
-    )
+    fitness, unbalanced = (evaluate(drone_fitness, RIG, of, there[None], size_m) for of in (patches, free))
     assert fitness > 0.7 * unbalanced
     # Measured 6 mm; and 32 mm where nothing is done.
     assert (
@@ -220,12 +218,12 @@ def test_windows_of_high_drones_and_of_those_that_do_not_claim_stay_as_they_are(
     """Beside a low drone, whose window does change; bit for bit."""
     images = drawn(at(0.15), LAMPS["three"])
     expected_m = np.stack([at(0.15), at(0.8), at(0.3)])
-    claiming = np.array([True, True, False])
-    cut_here = partial(cut_in_room, images, expected_m, size_m.repeat(3, axis=0), claiming=claiming)
+    occluding = np.array([True, True, False])
+    cut_here = partial(cut_in_room, images, expected_m, size_m.repeat(3, axis=0), occluding=occluding)
     with_floor, without = cut_here(floor_z_m=0.0), cut_here(floor_z_m=NO_FLOOR)
     same = [np.array_equal(*pair) for pair in zip(pixels(with_floor), pixels(without), strict=True)]
     assert same == [False, True, True]
-    np.testing.assert_array_equal(claimed_pixels(with_floor), claimed_pixels(without))
+    np.testing.assert_array_equal(occluded_pixels(with_floor), occluded_pixels(without))
     np.testing.assert_array_equal(with_floor.clear, without.clear)
     high = cut_here(floor_z_m=FAR_BELOW_M)
     np.testing.assert_array_equal(high.tables, without.tables)
@@ -254,7 +252,7 @@ def test_a_neighbour_is_no_shadow(size_m):
     )
     both = size_m.repeat(2, axis=0)
     found = [
-        best_place(RIG, cut_in_room(images, pair, both, floor_z_m=floor_z_m), pair, both, REDUCTION)
+        best_place(RIG, cut_in_room(images, pair, both, floor_z_m=floor_z_m), pair, both)
         for floor_z_m in (0.0, FAR_BELOW_M)
     ]
     # Measured 2 mm.

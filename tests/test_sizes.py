@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from psotrack.geometry import look_at, make_camera, make_rig
-from psotrack.tracking import ScoreSettings, SizeMeasurements, sizes
-from psotrack.tracking.sizes import HALF_PER_STD, MIN_FRAMES, RANGE
+from psotrack.tracking import sizes
+from psotrack.tracking.sizes import HALF_PER_STD, MIN_FRAMES, RANGE, SizeMeasurements, SizeProgram
 
-SETTINGS = ScoreSettings(reduction=2)
+PROGRAM = SizeProgram(reduction=2)
 #: What a learned length is of a filled ellipsoid's.
 LONGER = HALF_PER_STD / 2
 RIG = ring_rig(5, image_size_wh=(640, 480))
@@ -25,7 +25,7 @@ DRAWN = 0.01
 
 def images(position_m, size_m=SIZE_M, rig=RIG):
     """(frames, cameras, height, width); positions and sizes are (frames, [drones,] 3)."""
-    return np.stack([draw_coverage(rig, at, size_m, SETTINGS.reduction) for at in position_m])
+    return np.stack([draw_coverage(rig, at, size_m, PROGRAM.reduction) for at in position_m])
 
 
 def looks_at(coverage, position_m, believed_m, well_seen=None, rig=RIG):
@@ -35,19 +35,21 @@ def looks_at(coverage, position_m, believed_m, well_seen=None, rig=RIG):
     believed_m = np.broadcast_to(believed_m, position_m.shape[1:])
     arrays = float32((position_m, believed_m, rig.cameras))
     return jax.tree.map(
-        np.asarray, sizes.measure_sizes(coverage, arrays[0], seen, arrays[1], arrays[2], SETTINGS)
+        np.asarray, sizes.measure_sizes(coverage, arrays[0], seen, arrays[1], arrays[2], PROGRAM)
     )
 
 
 def started(size_m, pinned=(False, False, False)):
     size_m = np.atleast_2d(size_m)
-    return sizes.init(jnp.asarray(size_m, jnp.float32), np.broadcast_to(pinned, size_m.shape), SETTINGS)
+    return sizes.init(
+        jnp.asarray(size_m, jnp.float32), np.broadcast_to(pinned, size_m.shape), len(PROGRAM.windows)
+    )
 
 
 def chunk(size_m):
     """SizeMeasurements of one drone that showed these sizes (frames, 3), whatever its windows held."""
     size_m = jnp.asarray(size_m, jnp.float32)[:, None]
-    return SizeMeasurements(size_m, jnp.full((*size_m.shape[:2], len(SETTINGS.windows)), 0.5))
+    return SizeMeasurements(size_m, jnp.full((*size_m.shape[:2], len(PROGRAM.windows)), 0.5))
 
 
 @pytest.mark.parametrize(
@@ -74,7 +76,7 @@ def test_low_over_the_floor_nothing_is_learned():
     seen = np.ones((len(PLACES_M), 1), bool)
     shown = [
         sizes.measure_sizes(
-            images(PLACES_M), positions, seen, *float32((SIZE_M[None], RIG.cameras)), SETTINGS, *floor
+            images(PLACES_M), positions, seen, *float32((SIZE_M[None], RIG.cameras)), PROGRAM, *floor
         )
         for floor in ((jnp.float32(0.75),), (jnp.float32(0.0),), ())
     ]
@@ -107,21 +109,21 @@ def textbook_size(rig, coverage, centre_m, believed_m):
             slopes.append((more - halves2) / step)
         slopes = np.stack(slopes, axis=-1)
         height, width = coverage[index].shape
-        x, y = ((np.arange(n) + 0.5) * SETTINGS.reduction for n in (width, height))
+        x, y = ((np.arange(n) + 0.5) * PROGRAM.reduction for n in (width, height))
         inside = [
-            np.clip((SETTINGS.ring * half - np.abs(at - m - 0.5)) / SETTINGS.reduction + 0.5, 0, 1)
+            np.clip((PROGRAM.ring * half - np.abs(at - m - 0.5)) / PROGRAM.reduction + 0.5, 0, 1)
             for at, m, half in zip((x, y), middle, np.sqrt(halves2), strict=True)
         ]
         share = coverage[index] * inside[0] * inside[1][:, None]
         for axis, at in enumerate((x, y)):
             line = share.sum(axis=axis) / share.sum()
-            variance = line @ np.square(at - line @ at) - SETTINGS.reduction**2 / 12
+            variance = line @ np.square(at - line @ at) - PROGRAM.reduction**2 / 12
             rows.append(slopes[axis] / slopes[axis].sum())
             values.append(HALF_PER_STD**2 * variance / halves2[axis])
     rows, values, weight = np.array(rows), np.array(values), np.ones(len(values))
     for _ in range(1 + sizes.REWEIGHTINGS):
         root = np.sqrt(weight)[:, None]
-        start = np.sqrt(sizes.BELIEVED_VIEWS) * np.eye(2)
+        start = np.sqrt(sizes.PRIOR_VIEWS) * np.eye(2)
         factors = np.linalg.lstsq(
             np.concatenate([root * rows, start]),
             np.concatenate([root[:, 0] * values, start.sum(axis=1)]),
@@ -134,7 +136,7 @@ def test_any_outline_shows_the_size_that_float64_says():
     """Two beams across: their views differ widely, so that reweighting has something to do."""
     place = PLACES_M[1]
     beams = np.array([[0.6, 0.12, 0.1], [0.12, 0.3, 0.25]])
-    coverage = draw_coverage(RIG, np.stack([place, place]), beams, SETTINGS.reduction)
+    coverage = draw_coverage(RIG, np.stack([place, place]), beams, PROGRAM.reduction)
     shown = looks_at(coverage[None], place[None], SIZE_M).size_m[0, 0]
     # float32 sums over 64 x 64 cells of tables in pixels: measured 2e-6.
     np.testing.assert_allclose(shown, textbook_size(RIG, coverage, place, SIZE_M), rtol=2e-5)
@@ -265,7 +267,7 @@ def test_empty_images_show_nothing():
 def test_the_order_of_drones_and_cameras_does_not_matter():
     at = np.array([[[0.8, 0.0, 1.2], [-0.6, 0.4, 1.4], [-0.2, -0.9, 1.0]]])
     believed = np.array([[0.5, 0.5, 0.2], [0.4, 0.4, 0.3], [0.6, 0.6, 0.2]])
-    coverage = draw_coverage(RIG, at[0], believed, SETTINGS.reduction)[None]
+    coverage = draw_coverage(RIG, at[0], believed, PROGRAM.reduction)[None]
     order, cameras = [2, 0, 1], [3, 1, 4, 0, 2]
     plain = looks_at(coverage, at, believed)
     other = RIG.select([RIG.names[i] for i in cameras])

@@ -40,7 +40,7 @@ def test_a_worker_is_killed_and_its_cell_runs_again(tmp_path_factory, tmp_path):
     assert done.returncode == 0, done.stderr
     assert died.exists()
     assert json.loads(done.stdout) == {"finished": 4, "failed": 0, "left": 0}
-    assert sorted(all_rows(results)["settings.iterations"]) == [2, 3, 4, 5]
+    assert sorted(all_rows(results)["settings.swarm.iterations"]) == [2, 3, 4, 5]
     manifest = json.loads((results / "_manifest.json").read_text())
     assert [run["cells"] for run in manifest["runs"]] == [4]
     assert list(manifest["inputs"]) == all_rows(results)["input"].unique().tolist()

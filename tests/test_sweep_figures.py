@@ -91,7 +91,7 @@ def rows():
         )
         for seed in (0, 1)
     ]
-    names = ("sequence", "method", "settings.particles", "settings.iterations", "seed")
+    names = ("sequence", "method", "settings.swarm.particles", "settings.swarm.iterations", "seed")
     return pd.DataFrame(table, columns=[*names, "track_ms_per_frame", "mean_error_m"])
 
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.settings import TrackSettings
+from psotrack.settings import ScoreSettings, SwarmSettings, TrackSettings
 from psotrack.silhouettes import SilhouetteSettings
 from psotrack.sweep import Perturbation, grid, key_of, load
 from psotrack.sweep.names import SETTINGS
@@ -19,21 +19,21 @@ FILE = """
 sequences = ["S01_D2_A", "S04_D10"]
 runs = 10
 [settings]
-spread_m = 1
+swarm.spread_m = 1
 silhouettes.reduction = 8
 [methods.paper]
-swarm = "joint"
-score = "hard"
+swarm.kind = "joint"
+score.kind = "hard"
 [methods.ours]
 silhouettes.reduction = 2
 [grid]
-particles = [20, 50, 100]
+swarm.particles = [20, 50, 100]
 "silhouettes.var_threshold" = [8, 9.5]
 cameras = ["all", 4, ["cam1i", "cam2i"]]
 draws = 3
 """
 
-SMALL = {"sequences": ["S01"], "grid": {"particles": [20, 50]}}
+SMALL = {"sequences": ["S01"], "grid": {"swarm.particles": [20, 50]}}
 
 
 def cells_of(**changes):
@@ -60,7 +60,7 @@ def test_every_combination_is_a_cell(path):
         (
             cell.sequence,
             cell.method,
-            cell.settings.particles,
+            cell.settings.swarm.particles,
             cell.settings.silhouettes.var_threshold,
             cell.cameras,
             cell.perturbation.draw,
@@ -73,11 +73,9 @@ def test_every_combination_is_a_cell(path):
 def test_a_cell_has_all_that_was_set(path):
     paper = load(path).cells()[0]
     assert paper.settings == TrackSettings(
-        particles=20,
-        spread_m=1.0,
-        swarm="joint",
-        score="hard",
         silhouettes=SilhouetteSettings(reduction=8, var_threshold=8.0),
+        swarm=SwarmSettings(particles=20, spread_m=1.0, kind="joint"),
+        score=ScoreSettings(kind="hard"),
     )
     assert (paper.runs, paper.seeds, paper.frames) == (10, range(10), None)
     assert paper.perturbation == Perturbation()
@@ -85,14 +83,14 @@ def test_a_cell_has_all_that_was_set(path):
 
 def test_a_method_overrules_what_all_cells_have(path):
     ours = next(cell for cell in load(path).cells() if cell.method == "ours")
-    assert (ours.settings.spread_m, ours.settings.silhouettes.reduction) == (1.0, 2)
+    assert (ours.settings.swarm.spread_m, ours.settings.silhouettes.reduction) == (1.0, 2)
 
 
 def test_axes_are_what_the_grid_varied_as_numbers_and_words(path):
     axes = [dict(cell.axes) for cell in load(path).cells()[:5]]
     kept = [("all", 0), ("4", 0), ("4", 1), ("4", 2), ("cam1i+cam2i", 0)]
     assert axes == [
-        {"particles": 20, "silhouettes.var_threshold": 8.0, "cameras": cameras, "draw": draw}
+        {"swarm.particles": 20, "silhouettes.var_threshold": 8.0, "cameras": cameras, "draw": draw}
         for cameras, draw in kept
     ]
     # A whole number that is meant for a real one is one.
@@ -103,13 +101,13 @@ def test_python_is_the_same_as_toml(path):
     mapping = {
         "sequences": ("S01_D2_A", "S04_D10"),
         "runs": 10,
-        "settings": {"spread_m": 1, "silhouettes.reduction": 8},
+        "settings": {"swarm.spread_m": 1, "silhouettes.reduction": 8},
         "methods": {
-            "paper": {"swarm": "joint", "score": "hard"},
+            "paper": {"swarm.kind": "joint", "score.kind": "hard"},
             "ours": {"silhouettes": {"reduction": 2}},
         },
         "grid": {
-            "particles": (20, 50, 100),
+            "swarm.particles": (20, 50, 100),
             "silhouettes": {"var_threshold": [8, 9.5]},
             "cameras": ["all", 4, ("cam1i", "cam2i")],
             "draws": 3,
@@ -167,7 +165,7 @@ def test_every_setting_can_be_set():
 def test_cells_are_as_many_as_the_lists_say_and_all_have_keys_of_their_own(
     particles, spread_m, cameras, draws
 ):
-    varied = {"particles": particles, "spread_m": spread_m, "cameras": cameras}
+    varied = {"swarm.particles": particles, "swarm.spread_m": spread_m, "cameras": cameras}
     num_drawn = len(set(cameras) - {"all"})
     cells = cells_of(grid=varied | ({"draws": draws} if num_drawn else {}))
     expected = len(particles) * len(spread_m) * (num_drawn * draws + ("all" in cameras))
@@ -183,56 +181,79 @@ WRONG = [
     ),
     (
         {"methods": {"paper": {"swram": "joint"}}},
-        "methods.paper.swram: expected a name that there is, found swram; did you mean swarm?",
+        "methods.paper.swram: expected a name that there is, found swram; .*",
     ),
     ({"settings": {"reduction": 4}}, "settings.reduction: .*; did you mean silhouettes.reduction?"),
     (
         {"settings": {"silhouettes": {"reducton": 4}}},
         "settings.silhouettes.reducton: .*silhouettes.reduction?",
     ),
-    ({"grid": {"partcles": [20]}}, "grid.partcles: .*; did you mean particles?"),
+    ({"grid": {"partcles": [20]}}, "grid.partcles: .*; did you mean swarm.particles?"),
     ({"grid": {"draw": [20]}}, "grid.draw: .*; did you mean draws?"),
+    # Names until version 0.1 are answered with the names of today.
+    ({"grid": {"particles": [20]}}, "grid.particles: .*; it is called swarm.particles today"),
+    ({"settings": {"swarm": "joint"}}, "settings.swarm: .*; it is called swarm.kind today"),
+    ({"settings": {"mend": False}}, "settings.mend: .*; it is called identity.resolve_swaps today"),
+    ({"settings": {"refinements": 3}}, "settings.refinements: .*; this setting is gone: it gained nothing"),
     (
         {"settings": {"zzz": 4}},
-        "settings.zzz: .*; there are method, detections, particles, .*, silhouettes.reduction",
+        "settings.zzz: .*; there are method, detections, init, .*, swarm.particles, .*, silhouettes.reduction",
     ),
     ({"settings": {"silhouettes": 4}}, "settings.silhouettes: expected a table with names, found none"),
     # Right names, wrong places.
     ({"settings": {"cameras": 4}}, "settings.cameras: .*; it belongs in [grid], with a list of values"),
-    ({"particles": 4}, "particles: .*; it belongs in [settings], or in [grid] with a list of values"),
+    (
+        {"swarm.particles": 4},
+        "swarm.particles: .*; it belongs in [settings], or in [grid] with a list of values",
+    ),
     ({"grid": {"seed": [1, 2]}}, "grid.seed: .*; runs are seeds: say runs = 10, and first_seed .*"),
     ({"settings": {"seed": 1}}, "settings.seed: .*; runs are seeds: .*"),
     ({"seed": 1}, "seed: .*; runs are seeds: .*"),
     (
-        {"settings": {"particles": 20}},
-        "grid.particles: expected it in one place, found settings.particles as well",
+        {"settings": {"swarm.particles": 20}},
+        "grid.swarm.particles: expected it in one place, found settings.swarm.particles as well",
     ),
     (
-        {"methods": {"a": {"particles": 20}}},
-        "grid.particles: expected it in one place, found methods.a.particles as well",
+        {"methods": {"a": {"swarm.particles": 20}}},
+        "grid.swarm.particles: expected it in one place, found methods.a.swarm.particles as well",
     ),
     (
         {"settings": {"silhouettes.reduction": 4, "silhouettes": {"reduction": 8}}},
         "settings.silhouettes.reduction: expected it once, found it twice",
     ),
     # Kinds of values.
-    ({"grid": {"particles": [20, True]}}, "grid.particles[1]: expected a whole number, found true"),
-    ({"grid": {"particles": [20.0]}}, "grid.particles[0]: expected a whole number, found 20.0"),
-    ({"grid": {"windows": [[1.0], [0.5, "a"]]}}, 'grid.windows[1][1]: expected a number, found "a"'),
-    ({"settings": {"spread_m": "wide"}}, 'settings.spread_m: expected a number, found "wide"'),
-    ({"settings": {"spread_m": float("nan")}}, "settings.spread_m: expected a finite number, found nan"),
-    ({"settings": {"bounds_m": [1, 2]}}, "settings.bounds_m: expected a list of length 6, found [1, 2]"),
-    ({"settings": {"particles": {}}, "grid": {}}, "settings.particles: expected a whole number, found {}"),
     (
-        {"methods": {"paper": {"swarm": "jont"}}},
-        "methods.paper.swarm: expected one of joint, per-drone, found jont; did you mean joint?",
+        {"grid": {"swarm.particles": [20, True]}},
+        "grid.swarm.particles[1]: expected a whole number, found true",
+    ),
+    ({"grid": {"swarm.particles": [20.0]}}, "grid.swarm.particles[0]: expected a whole number, found 20.0"),
+    (
+        {"grid": {"score.windows": [[1.0], [0.5, "a"]]}},
+        'grid.score.windows[1][1]: expected a number, found "a"',
+    ),
+    ({"settings": {"swarm.spread_m": "wide"}}, 'settings.swarm.spread_m: expected a number, found "wide"'),
+    (
+        {"settings": {"swarm.spread_m": float("nan")}},
+        "settings.swarm.spread_m: expected a finite number, found nan",
+    ),
+    ({"settings": {"bounds_m": [1, 2]}}, "settings.bounds_m: expected a list of length 6, found [1, 2]"),
+    (
+        {"settings": {"swarm.particles": {}}, "grid": {}},
+        "settings.swarm.particles: expected a whole number, found {}",
+    ),
+    (
+        {"methods": {"paper": {"swarm.kind": "jont"}}},
+        "methods.paper.swarm.kind: expected one of joint, per-drone, found jont; did you mean joint?",
     ),
     (
         {"settings": {"silhouettes": {"shadows": "kep"}}},
         "settings.silhouettes.shadows: expected one of .*, found kep; did you mean keep?",
     ),
-    ({"grid": {"particles": 20}}, "grid.particles: expected a list of values, found 20; write [20]"),
-    ({"grid": {"particles": []}}, "grid.particles: expected a list of values, found []"),
+    (
+        {"grid": {"swarm.particles": 20}},
+        "grid.swarm.particles: expected a list of values, found 20; write [20]",
+    ),
+    ({"grid": {"swarm.particles": []}}, "grid.swarm.particles: expected a list of values, found []"),
     (
         {"grid": {"cameras": [0]}},
         'grid.cameras[0]: expected "all", a number above 0, or a list of .*, found 0',
@@ -252,7 +273,7 @@ WRONG = [
     ({"settings": 3}, "settings: expected a table, found 3"),
     ({"methods": {"paper": 3}}, "methods.paper: expected a table, found 3"),
     # Values that make no sense.
-    ({"grid": {"particles": [20, 1]}}, "grid.particles[1]: expected at least 2, found 1"),
+    ({"grid": {"swarm.particles": [20, 1]}}, "grid.swarm.particles[1]: expected at least 2, found 1"),
     ({"grid": {"flipped": [0.5, 2]}}, "grid.flipped[1]: expected a number from 0 to 1, found 2"),
     ({"grid": {"clock_frames": [-1]}}, "grid.clock_frames[0]: expected a number of at least 0, found -1"),
     (
@@ -265,15 +286,15 @@ WRONG = [
     ),
     # Cells.
     (
-        {"grid": {"spread_m": [0.1, 1, 1.0]}},
-        "grid.spread_m[2]: expected cells that differ, found the same as with grid.spread_m[1]",
+        {"grid": {"swarm.spread_m": [0.1, 1, 1.0]}},
+        "grid.swarm.spread_m[2]: expected cells that differ, found the same as with grid.swarm.spread_m[1]",
     ),
     (
         {"sequences": ["a", "a"]},
         "sequences[1]: expected cells that differ, found the same as with sequences[0]",
     ),
     (
-        {"methods": {"a": {}, "b": {"iterations": TrackSettings().iterations}}},
+        {"methods": {"a": {}, "b": {"swarm.iterations": TrackSettings().swarm.iterations}}},
         "methods.b: expected cells that differ, found the same as with methods.a",
     ),
     # What is done to silhouettes does nothing to detections.
@@ -304,8 +325,8 @@ def test_sequences_must_be_given():
 
 
 def test_messages_of_a_file_begin_with_its_path(path):
-    path.write_text(FILE.replace("swarm", "swram"))
-    with pytest.raises(SettingsError, match=f"^{re.escape(str(path))}: methods.paper.swram: "):
+    path.write_text(FILE.replace("swarm.kind", "swram.kind"))
+    with pytest.raises(SettingsError, match=f"^{re.escape(str(path))}: methods.paper.swram.kind: "):
         load(path)
 
 
@@ -330,10 +351,10 @@ INPUT = {"cam1": "ab", "cam2": "cd"}
 
 
 def test_more_runs_are_of_the_same_key():
-    (few,) = grid({"sequences": ["S01"], "runs": 2, "settings": {"particles": 20}}).cells()
-    many = grid({"sequences": ["S01"], "runs": 9, "first_seed": 4, "grid": {"particles": [20, 50]}}).cells()[
-        0
-    ]
+    (few,) = grid({"sequences": ["S01"], "runs": 2, "settings": {"swarm.particles": 20}}).cells()
+    many = grid(
+        {"sequences": ["S01"], "runs": 9, "first_seed": 4, "grid": {"swarm.particles": [20, 50]}}
+    ).cells()[0]
     assert few != many
     assert key_of(few, INPUT) == key_of(many, INPUT)
     assert re.fullmatch("[0-9a-f]{40}", key_of(few, INPUT))
@@ -346,12 +367,12 @@ def test_where_a_sequence_lies_is_not_in_the_key():
 
 
 def test_whatever_decides_the_rows_is_in_the_key():
-    base = {"sequences": ["S01"], "settings": {"particles": 20}, "grid": {}}
+    base = {"sequences": ["S01"], "settings": {"swarm.particles": 20}, "grid": {}}
     changes = [
         {},
         {"sequences": ["S02"]},
-        {"settings": {"particles": 21}},
-        {"settings": {"particles": 20, "silhouettes.reduction": 8}},
+        {"settings": {"swarm.particles": 21}},
+        {"settings": {"swarm.particles": 20, "silhouettes.reduction": 8}},
         {"methods": {"paper": {}}},
         {"grid": {"frames": [100]}},
         {"grid": {"cameras": [2]}},

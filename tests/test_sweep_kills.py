@@ -69,5 +69,5 @@ def test_kills_lose_nothing_and_repeat_nothing(tmp_path_factory, tmp_path):
     logger.info("then two runners finished %s", [count["finished"] for count in counts])
     assert sum(count["finished"] for count in counts) == len(iterations) - len(finished)
     assert finished.items() <= stamps(results).items()
-    assert sorted(all_rows(results)["settings.iterations"]) == iterations
+    assert sorted(all_rows(results)["settings.swarm.iterations"]) == iterations
     assert Store(results).status()["at_work"] == []

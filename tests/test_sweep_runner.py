@@ -22,9 +22,9 @@ from psotrack.sweep.estimates import FRAME_S, WORK_S
 from psotrack.sweep.locks import Locks
 
 SETTINGS = {
-    "particles": 8,
-    "swarm": "joint",
-    "score": "hard",
+    "swarm.particles": 8,
+    "swarm.kind": "joint",
+    "score.kind": "hard",
     "init": "truth",
     "drone_size_m": [0.5, 0.5, 0.2],
     "silhouettes.reduction": 2,
@@ -32,7 +32,7 @@ SETTINGS = {
 METHODS = """
 [methods.usual]
 [methods.calm]
-inertia = 0.4
+swarm.inertia = 0.4
 """
 
 
@@ -91,17 +91,17 @@ def tracker(monkeypatch: pytest.MonkeyPatch) -> Tracker:
 
 
 def varied(*iterations: int, runs: int = 1) -> dict:
-    grid = {"iterations": list(iterations)}
+    grid = {"swarm.iterations": list(iterations)}
     return {"sequences": ["S01_D2_A"], "runs": runs, "settings": SETTINGS, "grid": grid}
 
 
 @pytest.mark.slow
 def test_one_row_per_cell_and_run(swept: Path) -> None:
     rows = all_rows(swept / "results")
-    combinations = set(zip(rows["method"], rows["settings.iterations"], rows["seed"], strict=True))
+    combinations = set(zip(rows["method"], rows["settings.swarm.iterations"], rows["seed"], strict=True))
     assert combinations == {(m, i, s) for m in ("usual", "calm") for i in (3, 6) for s in (0, 1)}
     assert len(rows) == 8
-    assert set(rows["settings.inertia"][rows["method"] == "calm"]) == {0.4}
+    assert set(rows["settings.swarm.inertia"][rows["method"] == "calm"]) == {0.4}
     assert (rows["mean_error_m"] < 0.2).all()
     assert (rows["drones"] == 2).all()
     assert (rows["num_cameras"] == 8).all()
@@ -129,7 +129,7 @@ def test_what_is_finished_is_not_run_again(root: Path, swept: Path) -> None:
     # The manifest has both grids, and of where rows come from what they say themselves.
     manifest = json.loads((swept / "results" / "_manifest.json").read_text())
     assert [run["cells"] for run in manifest["runs"]] == [8, 4]
-    assert manifest["runs"][1]["grid"]["methods"] == {"usual": {}, "calm": {"inertia": 0.4}}
+    assert manifest["runs"][1]["grid"]["methods"] == {"usual": {}, "calm": {"swarm.inertia": 0.4}}
     rows = all_rows(swept / "results")
     assert list(manifest["inputs"]) == rows["input"].unique().tolist()
     assert {run["device"]["processor"] for run in manifest["runs"]} == set(rows["device.processor"])
@@ -233,10 +233,10 @@ def test_a_gpu_that_is_not_there_is_one_line(tmp_path: Path) -> None:
 def test_in_python_the_rows_are_those_of_the_grid(root: Path, tracker: Tracker, tmp_path: Path) -> None:
     out, folders = tmp_path / "out", {"data": root, "cache": root / "cache"}
     rows = sweep(varied(3, 4, runs=2), out, **folders)
-    assert rows[["settings.iterations", "seed"]].to_numpy().tolist() == [[3, 0], [3, 1], [4, 0], [4, 1]]
+    assert rows[["settings.swarm.iterations", "seed"]].to_numpy().tolist() == [[3, 0], [3, 1], [4, 0], [4, 1]]
     assert (rows["missed_rate"] == 1).all()
     rows = sweep(grid_of(varied(5, 4)), out, **folders)
-    assert rows[["settings.iterations", "seed"]].to_numpy().tolist() == [[5, 0], [4, 0]]
+    assert rows[["settings.swarm.iterations", "seed"]].to_numpy().tolist() == [[5, 0], [4, 0]]
     # More runs of a finished cell only add rows.
     (tmp_path / "grid.toml").write_text(grid_file(tmp_path, [3], runs=3).read_text())
     assert sweep(tmp_path / "grid.toml", out, **folders)["seed"].tolist() == [0, 1, 2]
@@ -248,7 +248,7 @@ def test_a_failure_goes_when_the_cell_is_finished(root: Path, tracker: Tracker, 
     out, folders = tmp_path / "out", {"data": root, "cache": root / "cache"}
     tracker.failing = {3}
     rows = sweep(varied(3, 4), out, **folders)
-    assert rows["settings.iterations"].tolist() == [4]
+    assert rows["settings.swarm.iterations"].tolist() == [4]
     assert rows.attrs["errors"] == ["S01_D2_A iterations=3: ZeroDivisionError: planted"]
     (kept,) = (json.loads(path.read_text()) for path in (out / "cells").glob("_*.error.json"))
     assert "in __call__" in kept["where"]

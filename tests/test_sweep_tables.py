@@ -31,7 +31,7 @@ def results(errors_m=ERRORS_M, **more):
             {
                 "sequence": "S01_D2_A",
                 "method": method,
-                "settings.particles": particles,
+                "settings.swarm.particles": particles,
                 "settings.seed": seed,
                 "mean_error_m": error_m,
             }
@@ -129,18 +129,22 @@ def test_the_name_of_scaled_numbers(value, scale, name):
     ("changes", "message"),
     [
         ({"rows_by": ["methd"]}, "rows: expected the name of one column, found methd; did you mean method?"),
-        ({"columns_by": ["partcles"]}, "columns: .*found partcles; did you mean settings.particles?"),
+        ({"columns_by": ["partcles"]}, "columns: .*found partcles; did you mean settings.swarm.particles?"),
         ({"value": "mean_eror_m"}, "value: .*found mean_eror_m; did you mean mean_error_m?"),
-        ({"value": "zzz"}, "value: .*found zzz; there are sequence, method, settings.particles, .*"),
+        ({"value": "zzz"}, "value: .*found zzz; there are sequence, method, settings.swarm.particles, .*"),
         ({"value": "sequence"}, "value: expected a column of numbers, found sequence"),
         ({"rows_by": []}, "rows: expected at least one column, and each only once, found none"),
-        ({"rows_by": ["particles"]}, "rows: .*, found settings.particles twice"),
+        ({"rows_by": ["particles"]}, "rows: .*, found settings.swarm.particles twice"),
         ({"columns_by": ["share"]}, "columns: .*found share; it may be a.share or b.share"),
     ],
 )
 def test_wrong_columns_are_one_line(changes, message):
     rows = results(**{"a.share": 1, "b.share": 1})
-    asked = {"rows_by": ["method"], "columns_by": ["settings.particles"], "value": "mean_error_m"} | changes
+    asked = {
+        "rows_by": ["method"],
+        "columns_by": ["settings.swarm.particles"],
+        "value": "mean_error_m",
+    } | changes
     with pytest.raises(SettingsError, match=f"^{message.replace('?', '[?]')}$"):
         pivot(rows, **asked)
 
@@ -155,7 +159,7 @@ def test_a_warning_names_settings_that_a_figure_mixes(caplog):
         in_mm(results())
         assert caplog.messages == []
         in_mm(results(), columns_by=())
-    assert caplog.messages == ["figures are not only over runs: they mix different settings.particles"]
+    assert caplog.messages == ["figures are not only over runs: they mix different settings.swarm.particles"]
 
 
 def test_mixing_draws_gives_no_warning(caplog):

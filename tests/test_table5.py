@@ -57,7 +57,7 @@ def test_tables_rows_and_figures_and_nothing_twice(data: Path, tmp_path: Path) -
     assert set(rows["method"]) == {"paper", "psotrack"}
     assert (rows["track_ms_per_frame"] > 0).all()
     table = (out / "table5.md").read_text()
-    mean_mm = 1e3 * rows.groupby(["method", "settings.iterations"])["mean_error_m"].mean()
+    mean_mm = 1e3 * rows.groupby(["method", "settings.swarm.iterations"])["mean_error_m"].mean()
     for mean in mean_mm:
         assert f"{mean:.1f} ±" in table
     for name in FIGURES:

@@ -2,19 +2,18 @@
 
 import contextlib
 import threading
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import jax
 import numpy as np
 import pytest
-from helpers import ROOM_M, assert_same, draw_coverage, ring_rig
+from helpers import ROOM_M, assert_same, draw_coverage, ring_rig, track_settings
 
 from psotrack.identity import postprocess
-from psotrack.initiation import InitialState, find_initial_state
-from psotrack.recordings import Sequence, VideoInfo
-from psotrack.settings import TrackSettings
+from psotrack.initiation import InitialState, StartSource, complete_initial_state, find_initial_state
+from psotrack.settings import DroneSettings
 from psotrack.silhouettes import Silhouettes
-from psotrack.tracking import track_silhouettes
+from psotrack.tracking import RunInputs, track_silhouettes, tracker_settings
 from psotrack.trajectories import Status
 
 FPS = 25.0
@@ -24,7 +23,8 @@ RIG = ring_rig(5, image_size_wh=(480, 360))
 SIZE_M = np.array([[0.5, 0.5, 0.3], [0.6, 0.6, 0.35]])
 #: A cell of a silhouette is 2 px; at 4 m and a focal length of 390 px that is 2 cm.
 CELL_M = 0.02
-SETTINGS = TrackSettings(particles=20, iterations=15)
+EFFORT = {"particles": 20, "iterations": 15}
+SETTINGS = track_settings(**EFFORT)
 
 #: The first drone is away for a while and comes back elsewhere; the second enters late.
 AWAY = slice(45, 90)
@@ -61,10 +61,17 @@ def silhouettes():
     )
 
 
+def run_inputs(start, **settings):
+    return RunInputs(start, ROOM_M, tracker_settings(track_settings(**(EFFORT | settings))))
+
+
 def track(silhouettes, start, **settings):
-    chosen = TrackSettings(**(vars_of(SETTINGS) | settings))
-    (tracked,) = track_silhouettes(RIG, silhouettes, [start], [chosen], fps=FPS, bounds_m=[ROOM_M])
-    return tracked, postprocess(tracked, chosen, fps=FPS)[0]
+    ((tracks, _),) = track_silhouettes(RIG, silhouettes, [run_inputs(start, **settings)], fps=FPS)
+    return tracks, trajectories_of(tracks)
+
+
+def trajectories_of(tracks, *, smoothed=False):
+    return postprocess(tracks, SETTINGS.motion, SETTINGS.identity, fps=FPS, smoothed=smoothed)[0]
 
 
 @pytest.fixture(scope="module")
@@ -72,11 +79,8 @@ def batch(silhouettes):
     """Three runs at once: seeds, numbers and starts that differ. Drones are born in one and not in another."""
     starts = [FIRST, FIRST, NOBODY]
     changes = [{"seed": 0}, {"seed": 5, "drones": 1}, {"seed": 2, "iterations": 4, "inertia": 0.5}]
-    settings = [TrackSettings(**(vars_of(SETTINGS) | change)) for change in changes]
-    tracked = track_silhouettes(
-        RIG, silhouettes, starts, settings, fps=FPS, bounds_m=[ROOM_M] * len(settings)
-    )
-    return list(zip(starts, settings, tracked, strict=True))
+    runs = [run_inputs(start, **change) for start, change in zip(starts, changes, strict=True)]
+    return list(zip(runs, track_silhouettes(RIG, silhouettes, runs, fps=FPS), strict=True))
 
 
 @pytest.mark.slow
@@ -84,37 +88,37 @@ def batch(silhouettes):
 def test_a_run_of_a_batch_is_the_run_alone(batch, silhouettes, run):
     """To the last bit, whichever device it was on and whoever was beside it."""
     assert len(jax.devices()) == 2
-    start, settings, tracked = batch[run]
-    (alone,) = track_silhouettes(RIG, silhouettes, [start], [settings], fps=FPS, bounds_m=[ROOM_M])
-    assert tracked.arrivals == alone.arrivals
-    for of in ("info", "sizes", "looks"):
-        assert_same(getattr(tracked, of), getattr(alone, of))
+    inputs, (tracked, _) = batch[run]
+    ((alone, _),) = track_silhouettes(RIG, silhouettes, [inputs], fps=FPS)
+    assert_same(tracked, alone)
 
 
 @pytest.mark.slow
-def test_whoever_interrupts_a_batch_is_heard(silhouettes):
-    """The main thread tracks the first device's share and is interrupted; the other share ends early."""
-    interrupted, first_frames = threading.Event(), []
+def test_an_interrupt_stops_all_devices(silhouettes):
+    """The first device's share raises; the shares of the other devices stop after their present chunk."""
+    begun, raised = [], threading.Event()
 
-    class Watched(Silhouettes):
+    class Slow(Silhouettes):
+        """Silhouettes of which only the thread of the first device reads at once."""
+
         def read(self, start, stop):
-            # The main thread is interrupted before it reads anything: only the other share reads.
-            assert interrupted.wait(300)
-            first_frames.append(start)
+            if threading.current_thread() is not threading.main_thread():
+                assert raised.wait(300)
+                begun.append(start)
             return super().read(start, stop)
 
     @contextlib.contextmanager
     def report(description, total):
-        interrupted.set()
+        raised.set()
         raise KeyboardInterrupt
         yield
 
-    watched = Watched(**{field.name: getattr(silhouettes, field.name) for field in fields(silhouettes)})
-    settings = [TrackSettings(**(vars_of(SETTINGS) | {"seed": seed})) for seed in range(2)]
+    slow = Slow(**vars(silhouettes))
+    runs = [run_inputs(FIRST, seed=seed) for seed in range(2)]
     with pytest.raises(KeyboardInterrupt):
-        track_silhouettes(RIG, watched, [FIRST] * 2, settings, fps=FPS, bounds_m=[ROOM_M] * 2, report=report)
-    # Of six chunks. While the other share tracks its first chunk, the main thread has seconds to stop that share.
-    assert 1 <= len(first_frames) <= 3
+        track_silhouettes(RIG, slow, runs, fps=FPS, report=report)
+    # Two chunks at most: one that was being read when the interrupt came, and one that had begun before it was seen.
+    assert len(begun) <= 2
 
 
 @pytest.mark.slow
@@ -126,16 +130,12 @@ def test_chunk_after_chunk_is_one_program(silhouettes, caplog):
     compiled = [
         record.getMessage().split()[1] for record in caplog.records if "Compiling " in record.getMessage()
     ]
-    assert sum("_follow" in name for name in compiled) == 1
+    assert sum("_track_batch" in name for name in compiled) == 1
 
 
 @pytest.mark.slow
 def test_runs_of_other_seeds_differ(batch):
-    assert (batch[0][2].info.position_m[5] != batch[1][2].info.position_m[5]).any()
-
-
-def vars_of(settings):
-    return {name: getattr(settings, name) for name in settings.__struct_fields__}
+    assert (batch[0][1][0].position_m[5] != batch[1][1][0].position_m[5]).any()
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +166,7 @@ def test_a_drone_that_is_lost_comes_back_as_itself(told):
     tracked, trajectories = told
     assert {arrival.drone for arrival in tracked.arrivals if arrival.again} <= {0}
     status = trajectories.status[:, 0]
-    coasting = round(SETTINGS.max_coasting_s * FPS)
+    coasting = round(SETTINGS.status.max_coasting_s * FPS)
     assert (status[: AWAY.start] == Status.TRACKED).all()
     assert (status[AWAY.start : AWAY.start + coasting] == Status.COASTING).all()
     assert (status[AWAY.start + coasting : AWAY.stop] == Status.LOST).all()
@@ -214,13 +214,12 @@ def test_sizes_may_be_pinned(silhouettes):
     np.testing.assert_allclose(tracked.sizes.size_m, SIZE_M[:1], rtol=1e-6)
 
 
-def test_smoothing_and_offset(told, silhouettes):
-    """Smoothed tracks are surer of themselves and no worse; a body's offset moves them as a whole."""
+def test_smoothing(told, silhouettes):
+    """Smoothed tracks are more certain and no worse."""
     tracked, filtered = told
-    settings = TrackSettings(**(vars_of(SETTINGS) | {"smooth": True, "body_offset_m": (0.0, 0.0, 0.1)}))
-    smoothed, _ = postprocess(tracked, settings, fps=FPS)
+    smoothed = trajectories_of(tracked, smoothed=True)
     seen = filtered.seen & np.isfinite(TRUTH_M).all(axis=-1)
-    error_m = np.linalg.norm(smoothed.position_m + np.array([0.0, 0.0, 0.1]) - TRUTH_M, axis=-1)
+    error_m = np.linalg.norm(smoothed.position_m - TRUTH_M, axis=-1)
     # Silhouettes without noise leave little to smooth: 2 mm before as after.
     assert error_m[seen].mean() < CELL_M / 4
     spread = [np.trace(of.covariance_m2[seen], axis1=-2, axis2=-1).mean() for of in (filtered, smoothed)]
@@ -239,8 +238,7 @@ def test_frames_of_a_recording_that_is_no_multiple_of_a_chunk(silhouettes, told)
 
 def test_detections_tell_of_drones_that_silhouettes_do_not_show(silhouettes, tmp_path):
     """The second drone is none of the silhouettes' at frame 0; a detector may see it, and the first one too."""
-    video = VideoInfo(tmp_path / "a.avi", NUM_FRAMES, FPS, (480, 360))
-    sequence = Sequence("R", tmp_path, RIG, dict.fromkeys(RIG.names, video))
+    source = StartSource("auto", tmp_path)
     hidden_m = np.array([0.9, 0.9, 0.9])
     detected = InitialState(
         np.stack([FIRST.position_m[0] + [0.05, 0.0, -0.1], hidden_m]),
@@ -248,12 +246,15 @@ def test_detections_tell_of_drones_that_silhouettes_do_not_show(silhouettes, tmp
         SIZE_M,
         np.full(2, 4.0),
     )
-    alone = find_initial_state(sequence, silhouettes, SETTINGS, ROOM_M)
-    both = find_initial_state(sequence, silhouettes, SETTINGS, ROOM_M, detected)
+
+    def found(detected, drones=SETTINGS.drones):
+        how = {"fps": FPS, "bounds_m": ROOM_M, "max_speed_m_s": 6.0}
+        state = find_initial_state(RIG, silhouettes, source, drones, **how)
+        return complete_initial_state(state, detected, drones, source)
+
+    alone, both = found(None), found(detected)
     assert len(alone.position_m) == 1
     np.testing.assert_array_equal(both.position_m, [alone.position_m[0], hidden_m])
     np.testing.assert_array_equal(both.size_m, [alone.size_m[0], SIZE_M[1]])
-    one = find_initial_state(sequence, silhouettes, TrackSettings(drones=1), ROOM_M, detected)
-    np.testing.assert_array_equal(one.position_m, alone.position_m)
-    nobody = find_initial_state(sequence, silhouettes, SETTINGS, ROOM_M, NOBODY)
-    np.testing.assert_array_equal(nobody.position_m, alone.position_m)
+    np.testing.assert_array_equal(found(detected, DroneSettings(count=1)).position_m, alone.position_m)
+    np.testing.assert_array_equal(found(NOBODY).position_m, alone.position_m)

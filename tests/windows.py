@@ -10,11 +10,11 @@ from helpers import far_camera, float32, rig_of
 from psotrack.geometry import make_extents
 from psotrack.silhouettes import summed_area_table
 from psotrack.silhouettes.summed_area import LOW_BITS
-from psotrack.tracking import ScoreSettings
+from psotrack.tracking import SoftIoU
 from psotrack.tracking.fitness import ScoreInputs, drone_fitness, score_inputs
-from psotrack.tracking.patches import SIDE, cut
+from psotrack.tracking.patches import SIDE, ExpectedDrones, cut
 
-RING = ScoreSettings().ring
+RING = SoftIoU().ring
 
 # Cameras so far away that metres are pixels, one per level: 15 to 188 silhouette pixels from the middle of a drone of
 # 1 m to the ring's border. No side of the silhouettes is a multiple of 8.
@@ -35,30 +35,36 @@ def middle_px(position_m, pixels_per_m):
 
 
 def cut_at(
-    rig, images, expected_m, size_m, *, reach_m=0.1, claiming=True, reduction=1, floor_z_m=None, offset_m=None
+    rig,
+    images,
+    expected_m,
+    size_m,
+    *,
+    reach_m=0.1,
+    occluding=True,
+    reduction=1,
+    floor_z_m=None,
+    offset_m=None,
 ):
-    """Windows as NumPy arrays; `claiming` is for one or for each of the drones, or None."""
+    """Windows as NumPy arrays; `occluding` is for one or for each of the drones, or None."""
     count = len(expected_m)
     arrays = float32(
         (rig.cameras, np.asarray(expected_m), np.asarray(size_m), np.broadcast_to(reach_m, count))
     )
-    claiming = None if claiming is None else np.broadcast_to(claiming, count)
+    occluding = None if occluding is None else np.broadcast_to(occluding, count)
     return jax.tree.map(
-        np.asarray, _cut(images, *arrays, claiming, reduction, *float32((floor_z_m, offset_m)))
+        np.asarray, _cut(images, *arrays, occluding, reduction, *float32((floor_z_m, offset_m)))
     )
 
 
 @partial(jax.jit, static_argnames="reduction")
-def _cut(images, cameras, expected_m, size_m, reach_m, claiming, reduction, floor_z_m, offset_m):
+def _cut(images, cameras, expected_m, size_m, reach_m, occluding, reduction, floor_z_m, offset_m):
     return cut(
         images,
         make_extents(cameras, size_m, offset_m),
-        expected_m,
-        reach_m=reach_m,
-        claiming=claiming,
+        ExpectedDrones(expected_m, reach_m, occluding, floor_z_m),
         reduction=reduction,
         ring=RING,
-        floor_z_m=floor_z_m,
     )
 
 
@@ -67,8 +73,8 @@ def pixels(patches):
     return _words(patches) & (2**LOW_BITS - 1)
 
 
-def claimed_pixels(patches):
-    """(drones, cameras, rows, columns): which pixels of the windows are claimed foreground."""
+def occluded_pixels(patches):
+    """(drones, cameras, rows, columns): which pixels of the windows are occluded foreground."""
     return _words(patches) >> LOW_BITS
 
 
@@ -82,9 +88,9 @@ def each(windows):
     return (((d, c), windows[d, c]) for d in range(windows.shape[0]) for c in range(windows.shape[1]))
 
 
-def evaluate(function, rig, patches, position_m, size_m, reduction):
+def evaluate(function, rig, patches, position_m, size_m):
     arrays = float32((rig.cameras, np.asarray(position_m), np.asarray(size_m)))
-    return jax.tree.map(np.asarray, _evaluate(function, ScoreSettings(reduction=reduction), patches, *arrays))
+    return jax.tree.map(np.asarray, _evaluate(function, SoftIoU(), patches, *arrays))
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -93,14 +99,15 @@ def _evaluate(function, settings, patches, cameras, position_m, size_m):
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def evaluate_whole(function, settings, images, cameras, position_m, size_m):
-    return function(score_inputs(cameras, size_m, summed_area_table(images), settings), position_m)
+def evaluate_whole(function, reduction, images, cameras, position_m, size_m):
+    inputs = score_inputs(cameras, size_m, summed_area_table(images), SoftIoU(), reduction=reduction)
+    return function(inputs, position_m)
 
 
-def best_place(rig, patches, about_m, size_m, reduction):
+def best_place(rig, patches, about_m, size_m):
     """Where the fitness of each drone is highest: a grid of 9 x 9 x 9, three times finer each time."""
     arrays = float32((rig.cameras, np.asarray(about_m), np.asarray(size_m)))
-    return np.asarray(_best_place(ScoreSettings(reduction=reduction), patches, *arrays), np.float64)
+    return np.asarray(_best_place(SoftIoU(), patches, *arrays), np.float64)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -14,7 +14,7 @@ import pandas as pd
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.errors import PsotrackError
 from psotrack.evaluation import evaluate
-from psotrack.pipeline import track_from_silhouettes
+from psotrack.pipeline import track_runs
 from psotrack.recordings import Sequence
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
@@ -29,9 +29,9 @@ KEPT += ["offset_removed_inside_90_rate", "offset_removed_mean_nees"]
 
 #: Size of the swarm on each sequence.
 EFFORT: dict[str, dict[str, Any]] = {
-    "S01_D2_A": {"swarm": "joint", "particles": 50, "iterations": 50},
-    "S02_D4_A": {"swarm": "per-drone", "particles": 30, "iterations": 20},
-    "S04_D10": {"swarm": "per-drone", "particles": 50, "iterations": 30},
+    "S01_D2_A": {"swarm.kind": "joint", "swarm.particles": 50, "swarm.iterations": 50},
+    "S02_D4_A": {"swarm.kind": "per-drone", "swarm.particles": 30, "swarm.iterations": 20},
+    "S04_D10": {"swarm.kind": "per-drone", "swarm.particles": 50, "swarm.iterations": 30},
 }
 
 
@@ -63,9 +63,11 @@ def figures(sequence: Sequence, silhouettes: Silhouettes, settings: TrackSetting
     """Figures of one run. A run that finds no drones has missed all drones."""
     assert sequence.truth is not None
     try:
-        tracked = track_from_silhouettes(sequence, silhouettes, settings)
+        (tracked,) = track_runs(sequence, silhouettes, [settings])
     except PsotrackError as error:
-        return {"missed_rate": 1.0, "note": f"{error}"}
+        tracked = error
+    if isinstance(tracked, PsotrackError):
+        return {"missed_rate": 1.0, "note": f"{tracked}"}
     errors = evaluate(tracked.trajectories, sequence.truth).to_dict()
     ms = 1e3 * tracked.record["seconds"]["track"] / sequence.num_frames
     found = tracked.trajectories.num_drones

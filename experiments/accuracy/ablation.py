@@ -22,22 +22,20 @@ from psotrack.support import atomic_write
 VARIANTS: dict[str, dict[str, Any]] = {
     "everything, and smoothing": {"smooth": True},
     "everything": {},
-    "10 gradient steps after the swarm": {"refinements": 10},
-    "no paraboloid: the best place tried": {"vertex": False},
-    "no paraboloid, 10 gradient steps": {"vertex": False, "refinements": 10},
-    "one window": {"windows": (1.0,)},
-    "no claims on shared foreground": {"claims": False},
-    "sizes of the first frames": {"learn_sizes": False},
-    "labels are never mended": {"mend": False},
-    "errors taken for white": {"error_share": 0.0},
-    "the paper's hard score": {"score": "hard"},
+    "no paraboloid: the best place tried": {"score.vertex": False},
+    "one window": {"score.windows": (1.0,)},
+    "no occlusion of shared foreground": {"score.occlusion": False},
+    "sizes of the first frames": {"drones.learn_sizes": False},
+    "swaps are not resolved": {"identity.resolve_swaps": False},
+    "errors taken for white": {"motion.error_share": 0.0},
+    "the paper's hard score": {"score.kind": "hard"},
 }
 EVERYTHING = "everything"
 
 
 def run(name: str, variant: str, seed: int, opened: tuple) -> dict[str, Any]:
     """One row."""
-    settings = TrackSettings(seed=seed, **(_runs.EFFORT[name] | VARIANTS[variant]))
+    settings = TrackSettings(seed=seed).changed(_runs.EFFORT[name] | VARIANTS[variant])
     return {"sequence": name, "variant": variant, "seed": seed} | _runs.figures(*opened, settings)
 
 

@@ -24,7 +24,7 @@ from psotrack.datasets.dpjait import read_sequence
 from psotrack.evaluation import evaluate
 from psotrack.evaluation.consistency import consistency
 from psotrack.geometry import project, viewpoints
-from psotrack.pipeline import track_from_silhouettes
+from psotrack.pipeline import track_runs
 from psotrack.recordings import Sequence
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import compute
@@ -289,7 +289,7 @@ def main() -> None:
     table, totals, runs = [], {}, {}
     for name, how in BACKGROUNDS.items():
         settings = TrackSettings(seed=options.seed, silhouettes=how)
-        tracked = track_from_silhouettes(sequence, compute(sequence, how, cache=options.cache), settings)
+        (tracked,) = track_runs(sequence, compute(sequence, how, cache=options.cache), [settings])
         run = judged(tracked.trajectories, position_m)
         runs[name] = run, tracked.record["arrivals"]
         table += [{"background": name, **row(phase, run, sequence.fps)} for phase in plan]

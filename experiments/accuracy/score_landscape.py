@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -33,9 +33,9 @@ from psotrack.silhouettes import SilhouetteSettings, compute
 from psotrack.simulation import Scenario, scenario, simulate
 from psotrack.simulation.scenarios import Drone, Harmonic, Harmonics, Variation
 from psotrack.simulation.world.drones import MODELS
-from psotrack.tracking import ScoreSettings, on_device
+from psotrack.tracking import Score, SoftIoU, on_device
 from psotrack.tracking.fitness import PAPER_SCORE, ScoreInputs, drone_fitness
-from psotrack.tracking.patches import cut
+from psotrack.tracking.patches import ExpectedDrones, cut
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results
@@ -44,8 +44,8 @@ NUM_FRAMES, SCALE = 50, 0.5
 #: At half size: as coarse as silhouettes of the full size are.
 SILHOUETTES = SilhouetteSettings(reduction=2)
 SCORES = {
-    "this score": ScoreSettings(reduction=SILHOUETTES.reduction),
-    "the paper's hard score": replace(PAPER_SCORE, reduction=SILHOUETTES.reduction),
+    "this score": SoftIoU(),
+    "the paper's hard score": PAPER_SCORE,
 }
 #: Half of a slice, and its steps; the maximum is looked for in a cube of that half.
 HALF_M, STEP_M, SOUGHT_M, FINE_M = 0.4, 0.01, 0.12, 0.005
@@ -106,14 +106,14 @@ def load(root: Path) -> Data:
     return Data(images, on_device(sequence.rig.cameras), truth, size_m)
 
 
-@partial(jax.jit, static_argnames="settings")
+@partial(jax.jit, static_argnames="score")
 def scores(
     coverage: jax.Array,
     cameras: Camera,
     size_m: jax.Array,
     about_m: jax.Array,
     offset_m: jax.Array,
-    settings: ScoreSettings,
+    score: Score,
 ) -> jax.Array:
     """(places, drones), the score of every drone at its position moved by each of the offsets (places, 3)."""
     seen = make_extents(cameras, size_m)
@@ -121,19 +121,21 @@ def scores(
     patches = cut(
         coverage,
         seen,
-        about_m,
-        reach_m=jnp.full(drones, 2**0.5 * HALF_M),
-        claiming=None if settings.whole_pixels else jnp.ones(drones, bool),
-        reduction=settings.reduction,
-        ring=settings.ring,
+        ExpectedDrones(
+            about_m,
+            reach_m=jnp.full(drones, 2**0.5 * HALF_M),
+            occluding=None if score.whole_pixels else jnp.ones(drones, bool),
+        ),
+        reduction=SILHOUETTES.reduction,
+        ring=score.ring,
     )
-    view = ScoreInputs(seen, patches, settings)
+    view = ScoreInputs(seen, patches, score)
     # Piece by piece: a slice has as many places as a hundred swarms.
     places = about_m + offset_m[:, None]
     return jnp.nan_to_num(jax.lax.map(lambda one: drone_fitness(view, one), places, batch_size=500))
 
 
-def score_about(data: Data, frame: int, offset_m: np.ndarray, settings: ScoreSettings) -> np.ndarray:
+def score_about(data: Data, frame: int, offset_m: np.ndarray, score: Score) -> np.ndarray:
     """(..., drones), the score of a frame at the truth moved by offsets (..., 3)."""
     found = scores(
         data.coverage[frame],
@@ -141,7 +143,7 @@ def score_about(data: Data, frame: int, offset_m: np.ndarray, settings: ScoreSet
         jnp.asarray(data.size_m, jnp.float32),
         jnp.asarray(data.truth_m[frame], jnp.float32),
         jnp.asarray(offset_m.reshape(-1, 3), jnp.float32),
-        settings,
+        score,
     )
     return np.asarray(found).reshape(*offset_m.shape[:-1], -1)
 
@@ -164,16 +166,16 @@ def summary(data: Data, frames: range) -> pd.DataFrame:
     """One row per model and score, mean over frames."""
     cube = grid(SOUGHT_M, FINE_M, (0, 1, 2)).reshape(-1, 3)
     rows = []
-    for label, settings in SCORES.items():
+    for label, score in SCORES.items():
         best = np.zeros((len(frames), len(MODELS), 3))
         half, top = np.zeros((2, len(frames), len(MODELS)))
         for row, frame in enumerate(frames):
-            found = score_about(data, frame, cube, settings)
+            found = score_about(data, frame, cube, score)
             for drone in range(len(MODELS)):
                 # The middle of the best places, where there are several.
                 best[row, drone] = cube[found[:, drone] == found[:, drone].max()].mean(axis=0)
             for axis in range(3):
-                curve = score_about(data, frame, grid(HALF_M, STEP_M, (axis,)), settings)
+                curve = score_about(data, frame, grid(HALF_M, STEP_M, (axis,)), score)
                 for drone in range(len(MODELS)):
                     half[row, drone] += widths_m(curve[:, drone], 0.5) / 3
                     top[row, drone] += widths_m(curve[:, drone], 0.98) / 3
@@ -200,9 +202,9 @@ def draw(data: Data, frame: int) -> Figure:
         len(MODELS), 2 * count + 1, width_ratios=[1.0] * 2 * count + [1.5], squeeze=False
     )
     line_m = grid(HALF_M, STEP_M, (0,))
-    for half, (label, settings) in enumerate(SCORES.items()):
-        images = [score_about(data, frame, grid(HALF_M, STEP_M, axes), settings) for axes in SLICES]
-        curve = score_about(data, frame, line_m, settings)
+    for half, (label, score) in enumerate(SCORES.items()):
+        images = [score_about(data, frame, grid(HALF_M, STEP_M, axes), score) for axes in SLICES]
+        curve = score_about(data, frame, line_m, score)
         for drone in range(len(MODELS)):
             highest = max(image[..., drone].max() for image in images)
             for column, (axes, image) in enumerate(zip(SLICES, images, strict=True)):

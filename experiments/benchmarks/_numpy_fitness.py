@@ -11,7 +11,8 @@ from typing import Protocol
 import numpy as np
 
 from psotrack.geometry import NEAR_M, Camera
-from psotrack.tracking import ScoreSettings
+from psotrack.tracking import SoftIoU
+from psotrack.tracking.fitness import MIN_WEIGHT
 from psotrack.tracking.patches import FULL
 
 
@@ -30,13 +31,13 @@ class NumpyFitness(Protocol):
 class PlainFitness:
     """Vectorised NumPy as one writes it first: float64, arrays (windows, particles, drones, cameras)."""
 
-    def __init__(self, cameras: Camera, size_m: np.ndarray, settings: ScoreSettings) -> None:
+    def __init__(self, cameras: Camera, size_m: np.ndarray, score: SoftIoU, reduction: int) -> None:
         _check_pinhole(cameras)
         self._rotation = cameras.T_cam_world[:, :3, :3]
         self._t = cameras.T_cam_world[:, :3, 3]
         self._K = cameras.K
         self._shapes = np.einsum("cij,dj,ckj->dcik", self._rotation, (size_m / 2) ** 2, self._rotation)
-        self._settings = settings
+        self._score, self._reduction = score, reduction
 
     @staticmethod
     def tables(coverage: np.ndarray) -> np.ndarray:
@@ -45,11 +46,10 @@ class PlainFitness:
 
     def __call__(self, tables: np.ndarray, position_m: np.ndarray) -> np.ndarray:
         """As `NumpyFitness`."""
-        settings = self._settings
         in_front, x, x_half, y, y_half = self._boxes(position_m)
         height, width = tables.shape[1] - 1, tables.shape[2] - 1
 
-        scales = np.array([*settings.windows, settings.ring]).reshape(-1, 1, 1, 1)
+        scales = np.array([*self._score.windows, self._score.ring]).reshape(-1, 1, 1, 1)
         x0, x1 = np.clip(x - scales * x_half, 0, width), np.clip(x + scales * x_half, 0, width)
         y0, y1 = np.clip(y - scales * y_half, 0, height), np.clip(y + scales * y_half, 0, height)
         foreground = (
@@ -66,7 +66,8 @@ class PlainFitness:
         inside_y = np.clip(y + y_half, 0, height) - np.clip(y - y_half, 0, height)
         weight = np.where(in_front, inside_x * inside_y / np.maximum(4 * x_half * y_half, 1e-6), 0)
         mean = (weight * score).sum(axis=-1) / np.maximum(weight.sum(axis=-1), 1e-6)
-        enough = (weight > 0.5).sum(axis=-1) >= settings.min_cameras
+        least = self._score.min_cameras
+        enough = ((weight > MIN_WEIGHT).sum(axis=-1) >= least) & (weight.sum(axis=-1) > least / 2)
         return np.where(enough, mean, 0).mean(axis=-1)
 
     def _boxes(self, position_m: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -83,7 +84,7 @@ class PlainFitness:
             root = np.sqrt(np.where(in_front, np.maximum(b**2 - a * c, 1e-12), 1))
             focal, middle = self._K[:, axis, axis], self._K[:, axis, 2] + 0.5
             edges += [focal * b / a + middle, focal * root / a]
-        return in_front, *(edge / self._settings.reduction for edge in edges)
+        return in_front, *(edge / self._reduction for edge in edges)
 
 
 def _bilinear(tables: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -109,7 +110,7 @@ class TunedFitness:
     by `take` of flat indices.
     """
 
-    def __init__(self, cameras: Camera, size_m: np.ndarray, settings: ScoreSettings) -> None:
+    def __init__(self, cameras: Camera, size_m: np.ndarray, score: SoftIoU, reduction: int) -> None:
         _check_pinhole(cameras)
         rotation = cameras.T_cam_world[:, :3, :3]
         shapes = np.einsum("cij,dj,ckj->ikdc", rotation, np.square(size_m / 2), rotation)
@@ -118,11 +119,11 @@ class TunedFitness:
         self._shapes = np.ascontiguousarray(shapes, np.float32)
         focal = cameras.K[:, 0, 0], cameras.K[:, 1, 1]
         middle = cameras.K[:, 0, 2] + 0.5, cameras.K[:, 1, 2] + 0.5
-        self._focal = [(value / settings.reduction).astype(np.float32) for value in focal]
-        self._middle = [(value / settings.reduction).astype(np.float32) for value in middle]
-        scales = np.array([*settings.windows, settings.ring], np.float32)
+        self._focal = [(value / reduction).astype(np.float32) for value in focal]
+        self._middle = [(value / reduction).astype(np.float32) for value in middle]
+        scales = np.array([*score.windows, score.ring], np.float32)
         self._scales = scales.reshape(-1, 1, 1, 1)
-        self._min_cameras = settings.min_cameras
+        self._min_cameras = score.min_cameras
 
     @staticmethod
     def tables(coverage: np.ndarray) -> np.ndarray:
@@ -154,7 +155,8 @@ class TunedFitness:
 
         weight = np.where(in_front, inside_x * inside_y / np.maximum(whole_x * whole_y, 1e-6), 0)
         mean = (weight * score).sum(axis=-1) / np.maximum(weight.sum(axis=-1), 1e-6)
-        enough = np.count_nonzero(weight > 0.5, axis=-1) >= self._min_cameras
+        enough = np.count_nonzero(weight > MIN_WEIGHT, axis=-1) >= self._min_cameras
+        enough &= weight.sum(axis=-1) > self._min_cameras / 2
         return np.where(enough, mean, 0).mean(axis=-1)
 
     def _extent(

@@ -23,7 +23,7 @@ from psotrack.initiation import InitialState
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import summed_area_table
 from psotrack.tracking import fitness, on_device
-from psotrack.tracking.inputs import tracker_inputs
+from psotrack.tracking.parameters import find_score
 
 #: The peers' motion model, an alpha-beta filter: it costs nothing beside the swarm.
 POSITION_GAIN, VELOCITY_GAIN = 0.8, 0.3
@@ -41,17 +41,14 @@ class Problem:
     bounds_m: np.ndarray
 
     @property
-    def score(self) -> fitness.ScoreSettings:
+    def score(self) -> fitness.Score:
         """How positions are scored."""
-        program, _ = tracker_inputs(
-            self.reduction, self.start, self.settings, fps=self.fps, bounds_m=self.bounds_m
-        )
-        return program.score
+        return find_score(self.settings.score)
 
     @property
     def reach_m(self) -> float:
         """How far a drone can get in one frame."""
-        return self.settings.max_speed_m_s / self.fps
+        return self.settings.motion.max_speed_m_s / self.fps
 
     def predict(self, position_m: Any, velocity_m_s: Any) -> tuple[Any, Any, Any]:
         """Where the drones are expected next, and the lowest and highest places that they can reach."""
@@ -65,7 +62,7 @@ class Problem:
         innovation = found_m - predicted_m
         velocity = velocity_m_s + VELOCITY_GAIN * self.fps * innovation
         speed = (velocity * velocity).sum(axis=-1, keepdims=True) ** 0.5
-        velocity = velocity / (speed / self.settings.max_speed_m_s).clip(1.0)
+        velocity = velocity / (speed / self.settings.motion.max_speed_m_s).clip(1.0)
         return predicted_m + POSITION_GAIN * innovation, velocity
 
     def first(self) -> tuple[np.ndarray, np.ndarray]:
@@ -83,14 +80,14 @@ class Evosax:
         self._problem = problem
         self._cameras = on_device(problem.rig.cameras)
         self._algorithm = PSO(
-            population_size=problem.settings.particles,
+            population_size=problem.settings.swarm.particles,
             solution=jnp.zeros(problem.start.position_m.size),
             metrics_fn=lambda *_: {},
         )
         self._params = self._algorithm.default_params.replace(
-            inertia_coeff=problem.settings.inertia,
-            cognitive_coeff=problem.settings.cognitive,
-            social_coeff=problem.settings.social,
+            inertia_coeff=problem.settings.swarm.inertia,
+            cognitive_coeff=problem.settings.swarm.cognitive,
+            social_coeff=problem.settings.swarm.social,
         )
         self._track = jax.jit(self._scan)
 
@@ -122,17 +119,21 @@ class Evosax:
         settings, algorithm, params = self._problem.settings, self._algorithm, self._params
         size_m = jnp.asarray(self._problem.start.size_m, jnp.float32)
         view = fitness.score_inputs(
-            self._cameras, size_m, summed_area_table(silhouettes), self._problem.score
+            self._cameras,
+            size_m,
+            summed_area_table(silhouettes),
+            self._problem.score,
+            reduction=self._problem.reduction,
         )
-        shape = (settings.particles, *predicted.shape)
+        shape = (settings.swarm.particles, *predicted.shape)
 
         def cost(population: jax.Array) -> jax.Array:
             return -fitness.joint_fitness(view, population.reshape(shape))
 
         key_spread, key_swarm = jax.random.split(key)
-        spread = settings.spread_m * jax.random.normal(key_spread, shape)
+        spread = settings.swarm.spread_m * jax.random.normal(key_spread, shape)
         particles = (predicted + spread).at[0].set(predicted).at[1].set(position)
-        population = particles.clip(low, high).reshape(settings.particles, -1)
+        population = particles.clip(low, high).reshape(settings.swarm.particles, -1)
 
         def iterate(iteration: jax.Array, state: Any) -> Any:
             key = jax.random.fold_in(key_swarm, iteration)
@@ -141,7 +142,7 @@ class Evosax:
             return algorithm.tell(key, population, cost(population), state, params)[0]
 
         state = algorithm.init(key_swarm, population, cost(population), params)
-        state = jax.lax.fori_loop(0, settings.iterations, iterate, state)
+        state = jax.lax.fori_loop(0, settings.swarm.iterations, iterate, state)
         return state.best_solution.reshape(predicted.shape)
 
 
@@ -157,13 +158,17 @@ class PySwarms:
         settings, dims = problem.settings, problem.start.position_m.size
         # One optimiser for all frames: making one sets up logging four times, which takes longer than a search.
         self._optimiser = GlobalBestPSO(
-            n_particles=settings.particles,
+            n_particles=settings.swarm.particles,
             dimensions=dims,
-            options={"w": settings.inertia, "c1": settings.cognitive, "c2": settings.social},
+            options={
+                "w": settings.swarm.inertia,
+                "c1": settings.swarm.cognitive,
+                "c2": settings.swarm.social,
+            },
             bounds=(np.full(dims, -np.inf), np.full(dims, np.inf)),
             bh_strategy="nearest",
             velocity_clamp=(-problem.reach_m, problem.reach_m),
-            init_pos=np.zeros((settings.particles, dims)),
+            init_pos=np.zeros((settings.swarm.particles, dims)),
         )
 
     def __call__(self, coverage: np.ndarray) -> np.ndarray:
@@ -191,8 +196,8 @@ class PySwarms:
     ) -> np.ndarray:
         settings = self._problem.settings
         tables = self._fitness.tables(silhouettes)
-        shape = (settings.particles, *predicted.shape)
-        spread = settings.spread_m * generator.standard_normal(shape, np.float32)
+        shape = (settings.swarm.particles, *predicted.shape)
+        spread = settings.swarm.spread_m * generator.standard_normal(shape, np.float32)
         particles = predicted + spread
         particles[:2] = predicted, position
 
@@ -201,9 +206,9 @@ class PySwarms:
 
         optimiser = self._optimiser
         optimiser.bounds = low.reshape(-1), high.reshape(-1)
-        optimiser.init_pos = particles.clip(low, high).reshape(settings.particles, -1)
+        optimiser.init_pos = particles.clip(low, high).reshape(settings.swarm.particles, -1)
         optimiser.reset()
-        _, best = optimiser.optimize(cost, settings.iterations, verbose=False)
+        _, best = optimiser.optimize(cost, settings.swarm.iterations, verbose=False)
         return best.reshape(predicted.shape).astype(np.float32)
 
 

@@ -57,8 +57,12 @@ def main() -> None:
     keep_compiled(options.cache / "compiled")
     sequence = read_sequence(options.sequence).usable(num_frames=options.frames)
     silhouettes = compute(sequence, TrackSettings().silhouettes, cache=options.cache)
-    effort = {name: getattr(options, name) for name in ("particles", "iterations", "swarm")}
-    batch = [TrackSettings(seed=seed, **effort) for seed in range(options.runs)]
+    effort = {
+        "swarm.particles": options.particles,
+        "swarm.iterations": options.iterations,
+        "swarm.kind": options.swarm,
+    }
+    batch = [TrackSettings(seed=seed).changed(effort) for seed in range(options.runs)]
     calls = {
         "one run": lambda: track_runs(sequence, silhouettes, batch[:1]),
         f"{options.runs} runs": lambda: track_runs(sequence, silhouettes, batch),

@@ -19,11 +19,11 @@ import zarr
 from zarr.codecs import ZstdCodec
 
 from psotrack.initiation import InitialState
-from psotrack.settings import TrackSettings
+from psotrack.settings import SwarmSettings, TrackSettings
 from psotrack.silhouettes import Silhouettes, open_stored
 from psotrack.silhouettes.store import CHUNK_FRAMES
 from psotrack.support import progress_bar
-from psotrack.tracking import track_silhouettes
+from psotrack.tracking import RunInputs, track_silhouettes, tracker_settings
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results
@@ -34,10 +34,16 @@ import _results
 @click.option("--cameras", default=8, type=click.IntRange(2), help="Cameras of 1920 x 1080 pixels.")
 @click.option("--drones", default=4, type=click.IntRange(1), help="Drones in the room.")
 @click.option(
-    "--particles", default=TrackSettings().particles, type=click.IntRange(2), help="Particles of every swarm."
+    "--particles",
+    default=TrackSettings().swarm.particles,
+    type=click.IntRange(2),
+    help="Particles of every swarm.",
 )
 @click.option(
-    "--iterations", default=TrackSettings().iterations, type=click.IntRange(0), help="Iterations per frame."
+    "--iterations",
+    default=TrackSettings().swarm.iterations,
+    type=click.IntRange(0),
+    help="Iterations per frame.",
 )
 @click.option("--limit-gb", default=2.0, help="Largest resident memory, 10^9 bytes.")
 @click.option(
@@ -62,24 +68,30 @@ def main(
         silhouettes = _store(scene, Path(folder))
         before_gb = _peak_gb()
         began = time.perf_counter()
-        (tracked,) = track_silhouettes(
+        ((tracks, compile_s),) = track_silhouettes(
             scene.rig,
             silhouettes,
-            [start],
-            [TrackSettings(particles=particles, iterations=iterations)],
+            [
+                RunInputs(
+                    start,
+                    _scene.BOUNDS_M,
+                    tracker_settings(
+                        TrackSettings(swarm=SwarmSettings(particles=particles, iterations=iterations))
+                    ),
+                )
+            ],
             fps=_scene.FPS,
-            bounds_m=[_scene.BOUNDS_M],
             report=progress_bar,
         )
-        track_s = time.perf_counter() - began - tracked.compile_s
+        track_s = time.perf_counter() - began - compile_s
     peak_gb = _peak_gb()
 
-    errors_m = np.linalg.norm(tracked.info.position_m - scene.position_m, axis=-1)
+    errors_m = np.linalg.norm(tracks.position_m - scene.position_m, axis=-1)
     print(
         f"{frames} frames of {cameras} cameras, {drones} drones, {particles} particles x {iterations} iterations"
     )
     print(
-        f"tracked in {track_s:.1f} s ({1e3 * track_s / frames:.1f} ms per frame), {tracked.compile_s:.1f} s to compile"
+        f"tracked in {track_s:.1f} s ({1e3 * track_s / frames:.1f} ms per frame), {compile_s:.1f} s to compile"
     )
     print(f"mean error {1e3 * errors_m.mean():.1f} mm")
     print(
@@ -93,7 +105,7 @@ def main(
             "iterations": iterations,
             "track_s": track_s,
             "track_ms_per_frame": 1e3 * track_s / frames,
-            "compile_s": tracked.compile_s,
+            "compile_s": compile_s,
             "mean_error_m": float(errors_m.mean()),
             "peak_gb": peak_gb,
             "before_gb": before_gb,

@@ -19,17 +19,16 @@ import _scene
 import click
 import jax
 import jax.numpy as jnp
-import msgspec
 import numpy as np
 import pandas as pd
 from _numpy_fitness import NumpyFitness, PlainFitness, TunedFitness
 from _peers import Evosax, Problem, PySwarms
 
 from psotrack.initiation import InitialState
-from psotrack.settings import TrackSettings
+from psotrack.settings import SwarmSettings, TrackSettings
 from psotrack.silhouettes import summed_area_table
 from psotrack.tracking import fitness, on_device, tracker
-from psotrack.tracking.inputs import tracker_inputs
+from psotrack.tracking.parameters import tracker_params, tracker_program, tracker_settings
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results
@@ -48,9 +47,12 @@ class Psotrack:
     """psotrack's own tracker: one jitted scan over the frames."""
 
     def __init__(self, problem: Problem) -> None:
-        self._program, self._params = tracker_inputs(
-            problem.reduction, problem.start, problem.settings, fps=problem.fps, bounds_m=problem.bounds_m
+        settings = tracker_settings(problem.settings)
+        self._program = tracker_program(settings, problem.reduction)
+        self._params = tracker_params(
+            settings, problem.start.size_m, fps=problem.fps, bounds_m=problem.bounds_m
         )
+        self._starts = tracker.no_track_starts(len(problem.start.size_m))
         self._cameras = on_device(problem.rig.cameras)
         position, velocity = (
             jnp.asarray(value, jnp.float32)
@@ -60,7 +62,9 @@ class Psotrack:
 
     def __call__(self, coverage: np.ndarray) -> np.ndarray:
         """Positions (frames, drones, 3)."""
-        _, info = tracker.track(self._state, coverage, self._cameras, self._params, self._program)
+        _, info = tracker.track(
+            self._state, coverage, self._cameras, self._params, self._program, self._starts
+        )
         return np.asarray(jax.block_until_ready(info).position_m)
 
 
@@ -110,10 +114,14 @@ def main(
     run = _results.Run("track_stage")
     scene = _scene.scene(frames, drones, cameras)
     coverage = scene.coverage()
-    joint = _problem(scene, TrackSettings(particles=particles, iterations=iterations, swarm="joint"))
-    per_drone = replace(joint, settings=msgspec.structs.replace(joint.settings, swarm="per-drone"))
+    joint = _problem(
+        scene, TrackSettings(swarm=SwarmSettings(particles=particles, iterations=iterations, kind="joint"))
+    )
+    per_drone = replace(joint, settings=joint.settings.changed({"swarm.kind": "per-drone"}))
     size_m, score = joint.start.size_m, joint.score
-    plain, tuned = (kind(scene.rig.cameras, size_m, score) for kind in (PlainFitness, TunedFitness))
+    plain, tuned = (
+        kind(scene.rig.cameras, size_m, score, joint.reduction) for kind in (PlainFitness, TunedFitness)
+    )
     difference = {
         name: _check_same_fitness(numpy_fitness, joint, scene, coverage[0])
         for name, numpy_fitness in (("plain", plain), ("tuned", tuned))
@@ -179,7 +187,11 @@ def _check_same_fitness(
 
     size_m = jnp.asarray(problem.start.size_m, jnp.float32)
     view = fitness.score_inputs(
-        on_device(problem.rig.cameras), size_m, summed_area_table(jnp.asarray(silhouettes)), problem.score
+        on_device(problem.rig.cameras),
+        size_m,
+        summed_area_table(jnp.asarray(silhouettes)),
+        problem.score,
+        reduction=problem.reduction,
     )
     ours = np.asarray(fitness.joint_fitness(view, jnp.asarray(position)))
     difference = float(np.abs(ours - numpy_fitness(numpy_fitness.tables(silhouettes), position)).max())

@@ -36,7 +36,7 @@ TABLES = {
     "Time of the track stage per frame": ("track_ms_per_frame", 1.0, 1),
 }
 #: Columns of results.csv.
-KEPT = ["sequence", "method", "settings.particles", "settings.iterations", "seed", "frames"]
+KEPT = ["sequence", "method", "settings.swarm.particles", "settings.swarm.iterations", "seed", "frames"]
 KEPT += ["mean_error_m", "median_error_m", "p95_error_m", "max_error_m", "offset_removed_mean_error_m"]
 KEPT += ["missed_rate", "id_switches", "mota", "idf1", "hota", "offset_removed_inside_90_rate"]
 KEPT += ["track_ms_per_frame", "runs_in_batch", "commit"]
@@ -140,8 +140,10 @@ def draw(rows: pd.DataFrame, published: dict[str, tuple[float, float]], out: Pat
     figures.save(
         out / "error_against_work.png", figures.error_against_work(rows, published=published), force=True
     )
-    particles, iterations = (rows[f"settings.{name}"].max() for name in ("particles", "iterations"))
-    largest = rows[(rows["settings.particles"] == particles) & (rows["settings.iterations"] == iterations)]
+    particles, iterations = (rows[f"settings.swarm.{name}"].max() for name in ("particles", "iterations"))
+    largest = rows[
+        (rows["settings.swarm.particles"] == particles) & (rows["settings.swarm.iterations"] == iterations)
+    ]
     store, errors = Store(out), {}
     for (sequence, method), runs in largest.groupby(["sequence", "method"], sort=False):
         errors.setdefault(sequence, {})[method] = store.errors(runs["cell"].iloc[0], set(runs["seed"]))

@@ -27,7 +27,7 @@ from psotrack.cli.options import (
 )
 from psotrack.cli.output import output_json, print_line, report_to, write_json
 from psotrack.errors import SettingsError
-from psotrack.settings import Method, Score, SwarmKind, TrackSettings
+from psotrack.settings import RENAMED, SwarmKind, TrackSettings
 from psotrack.silhouettes import SilhouetteSettings
 from psotrack.support import Report, refuse_to_overwrite
 
@@ -45,10 +45,11 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--method",
-    type=click.Choice(get_args(Method)),
     default=TRACK.method,
     show_default=True,
-    help="A swarm over silhouettes, triangulated detections, or both weighed together.",
+    metavar="swarm|projection-lines|fused|NAME",
+    help="A swarm over silhouettes, triangulated detections, both weighted by their covariances, or the method that an "
+    "installed package adds under NAME.",
 )
 @click.option(
     "--detections",
@@ -71,28 +72,30 @@ if TYPE_CHECKING:
     show_default=True,
     help="Of the network's square input, in pixels.",
 )
-@click.option("--particles", type=int, default=TRACK.particles, show_default=True, help="Of every swarm.")
-@click.option("--iterations", type=int, default=TRACK.iterations, show_default=True, help="Per frame.")
 @click.option(
-    "--refinements",
-    type=int,
-    default=TRACK.refinements,
-    show_default=True,
-    help="Gradient steps after the swarm.",
+    "--particles", type=int, default=TRACK.swarm.particles, show_default=True, help="Of every swarm."
 )
+@click.option("--iterations", type=int, default=TRACK.swarm.iterations, show_default=True, help="Per frame.")
 @click.option(
     "--swarm",
     type=click.Choice(get_args(SwarmKind)),
-    default=TRACK.swarm,
+    default=TRACK.swarm.kind,
     show_default=True,
     help="One swarm over all drones, as in the paper, or one for each.",
 )
 @click.option(
     "--score",
-    type=click.Choice(get_args(Score)),
-    default=TRACK.score,
+    default=TRACK.score.kind,
     show_default=True,
-    help="Concentric windows, or the paper's one box in whole pixels.",
+    metavar="soft|hard|NAME",
+    help="Concentric windows, the paper's one box in whole pixels, or the score that a package adds under NAME.",
+)
+@click.option(
+    "--search",
+    default=TRACK.swarm.search,
+    show_default=True,
+    metavar="pso|NAME",
+    help="Particle swarm optimisation, or the search that an installed package adds under NAME.",
 )
 @click.option("--seed", type=int, default=TRACK.seed, show_default=True, help="Of the swarm.")
 @click.option(
@@ -116,7 +119,7 @@ if TYPE_CHECKING:
     "--body-offset",
     "body_offset_m",
     type=Numbers(3),
-    default=TRACK.body_offset_m,
+    default=TRACK.drones.body_offset_m,
     metavar="X,Y,Z",
     help="From a body's origin to the middle of its silhouette (with projection lines: of its box), in metres, along "
     "the world's axes.  [default: 0,0,0]",
@@ -132,7 +135,7 @@ if TYPE_CHECKING:
     "--max-speed",
     "max_speed_m_s",
     type=float,
-    default=TRACK.max_speed_m_s,
+    default=TRACK.motion.max_speed_m_s,
     show_default=True,
     help="Of a drone, in m/s.",
 )
@@ -182,9 +185,7 @@ def track(
     record_path, ambiguity_path = out.with_suffix(".json"), out.with_suffix(".ambiguity.csv")
     for path in (out, record_path, ambiguity_path):
         refuse_to_overwrite(path, force)
-    silhouette_names = SilhouetteSettings.__struct_fields__
-    of_silhouettes = {name: settings.pop(name) for name in silhouette_names if name in settings}
-    chosen = TrackSettings(silhouettes=SilhouetteSettings(**of_silhouettes), **settings)
+    chosen = TrackSettings().changed({_setting_name(option): value for option, value in settings.items()})
     where, usable = cache_folder(cache), usable_sequence(sequence, cameras, num_frames)
     if model is not None:
         chosen = _with_detector(chosen, model, detector_size, usable, where, report_to(quiet))
@@ -209,6 +210,13 @@ def track(
         f"{out}: {tracked.trajectories.num_drones} drones, {tracked.trajectories.num_frames} frames, "
         f"{seen:.1%} seen, {seconds['total']:.1f} s",
     )
+
+
+def _setting_name(option: str) -> str:
+    """The dotted name of the setting that an option sets."""
+    if option in SilhouetteSettings.__struct_fields__:
+        return f"silhouettes.{option}"
+    return "swarm.search" if option == "search" else RENAMED.get(option, option)
 
 
 def _with_detector(

@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, Int
 from psotrack.correspondence import CameraSightings, Sightings, match
 from psotrack.geometry import Camera, CameraRig, reconstruct, viewpoints
 from psotrack.initiation import room_bounds
-from psotrack.settings import TrackSettings
 
 #: Smallest number of viewpoints of a point: two viewpoints often agree by chance.
 MIN_VIEWPOINTS = 3
@@ -111,7 +110,7 @@ def num_viewpoints(cameras: Camera, seen: Bool[np.ndarray, "points cameras"]) ->
 
 def _wide_bounds(rig: CameraRig) -> Float[np.ndarray, "2 3"]:
     """Bounds of the room, extended by its height upwards and downwards, because a wrong rig may have a wrong floor."""
-    bounds_m = room_bounds(rig, TrackSettings())
+    bounds_m = room_bounds(rig)
     height_m = bounds_m[1, 2] - bounds_m[0, 2]
     bounds_m[:, 2] += -height_m, height_m
     return bounds_m

@@ -1,4 +1,11 @@
-from .initial_state import find_initial_state, known_motion, room_bounds
+from .initial_state import (
+    StartSource,
+    complete_initial_state,
+    find_initial_state,
+    known_motion,
+    room_bounds,
+    start_source,
+)
 from .initialisation import FLOOR_CLEARANCE_M, InitialState
 from .new_tracks import TrackCandidate, find_candidates
 from .reidentification import (
@@ -19,7 +26,9 @@ __all__ = [
     "InitialState",
     "LostTracks",
     "PlannedStarts",
+    "StartSource",
     "TrackCandidate",
+    "complete_initial_state",
     "find_candidates",
     "find_false_tracks",
     "find_initial_state",
@@ -28,4 +37,5 @@ __all__ = [
     "plan_starts",
     "reidentify",
     "room_bounds",
+    "start_source",
 ]

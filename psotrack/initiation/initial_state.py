@@ -1,8 +1,9 @@
-"""Where drones are when tracking begins: found in the first frames, or told by the user."""
+"""The initial state: positions, velocities and sizes of the drones at frame 0, found in the first frames or given."""
 
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,31 +13,71 @@ from psotrack.errors import InputError
 from psotrack.geometry import CameraRig
 from psotrack.initiation.initialisation import InitialState, find_drones
 from psotrack.recordings import Sequence
-from psotrack.settings import TrackSettings
+from psotrack.settings import DroneSettings
 from psotrack.silhouettes import Silhouettes
 from psotrack.trajectories import Trajectories, read_trajectories
 
 logger = logging.getLogger(__name__)
 
-#: Frames from which the drones are found. Longer, and their paths are no straight lines any more.
+#: Number of first frames in which the drones are found. Over more frames their paths are no straight lines.
 START_FRAMES = 10
-#: Drones of two starts that are nearer than this are one: the middles of box and silhouette, and some noise.
+#: Two initial positions nearer than this are of one drone, metres: the middles of box and silhouette differ.
 SAME_M = 0.3
+#: A given position takes the size of a found drone that is nearer than this, metres.
+SAME_DRONE_M = 0.5
 
 
-def room_bounds(rig: CameraRig, settings: TrackSettings) -> Float[np.ndarray, "2 3"]:
+@dataclass(frozen=True)
+class StartSource:
+    """Where the initial state comes from.
+
+    Attributes:
+        init: "auto", "truth" or the name of a file of tracks (see `TrackSettings.init`).
+        path: of the recording, or of the file of tracks.
+        given: trajectories whose first frame is the start; None where the drones are to be found.
+    """
+
+    init: str
+    path: Path
+    given: Trajectories | None = None
+
+
+def start_source(sequence: Sequence, init: str) -> StartSource:
+    """Where the initial state comes from, with the given trajectories read.
+
+    Raises:
+        InputError: there is no reference, or the file cannot be read.
+    """
+    if init == "auto":
+        return StartSource(init, sequence.folder)
+    if init != "truth":
+        return StartSource(init, Path(init), read_trajectories(Path(init), fps=sequence.fps))
+    if sequence.truth is None:
+        raise InputError(
+            sequence.folder, expected="a reference for --init truth", found="none", remedy="use --init auto"
+        )
+    return StartSource(init, sequence.folder, sequence.truth)
+
+
+def room_bounds(
+    rig: CameraRig, bounds_m: tuple[float, float, float, float, float, float] | None = None
+) -> Float[np.ndarray, "2 3"]:
     """Lowest and highest corner of the room, metres.
 
-    Where nobody says, the room is what the cameras look into: from each of them along its optical axis, as far beyond
-    the point that all of them look at as they are before it; a metre wider, from the floor at z = 0 (or below the
-    lowest camera, if that is lower) to a metre above the highest one. A few cameras on one side so have the same room
-    as all of them around it.
+    Without given bounds, the room is the space into which the cameras look: from each camera along its optical axis, to
+    twice the distance of the point at which all cameras look; one metre wider on every side, from the floor at z = 0
+    (or below the lowest camera, if that camera is lower) to one metre above the highest camera. So a few cameras on
+    one side have the same room as cameras on all sides.
+
+    Args:
+        rig: of the cameras.
+        bounds_m: given bounds (x0, x1, y0, y1, z0, z1).
     """
-    if settings.bounds_m is not None:
-        return np.array(settings.bounds_m, np.float64).reshape(3, 2).T
+    if bounds_m is not None:
+        return np.array(bounds_m, np.float64).reshape(3, 2).T
     axis, centre = rig.cameras.T_cam_world[:, 2, :3], rig.cameras.centre_world
     across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
-    # The point nearest to all optical axes; cameras that look the same way have none, and get what their spread says.
+    # The point nearest to all optical axes. Parallel axes have none: the spread of the cameras then limits the depth.
     focus = np.linalg.lstsq(across.sum(axis=0), (across @ centre[..., None]).sum(axis=0)[:, 0])[0]
     spread = np.linalg.norm(np.ptp(centre, axis=0))
     depth = np.clip(((focus - centre) * axis).sum(axis=-1), spread / 4, 2 * spread)
@@ -48,72 +89,99 @@ def room_bounds(rig: CameraRig, settings: TrackSettings) -> Float[np.ndarray, "2
 
 
 def find_initial_state(
-    sequence: Sequence,
+    rig: CameraRig,
     silhouettes: Silhouettes,
-    settings: TrackSettings,
+    source: StartSource,
+    drones: DroneSettings,
+    *,
+    fps: float,
     bounds_m: Float[np.ndarray, "2 3"],
-    detected: InitialState | None = None,
+    max_speed_m_s: float,
 ) -> InitialState:
-    """Positions, velocities and sizes of the drones at frame 0, as `settings.init` says.
+    """Positions of the silhouettes' middles, velocities and sizes of the drones at frame 0.
 
-    Positions are of the silhouettes' middles. Drones that are not found may still come (see `tracking`): a start may
-    be empty.
+    Drones that are not found may still come later, so the state may have no drones.
 
     Args:
-        sequence: fit for use.
-        silhouettes: of all of its cameras.
-        settings: how.
-        bounds_m: (2, 3), lowest and highest corner of the room.
-        detected: what detections say of frame 0. With `init` "auto" those of its drones count too that the silhouettes
-            do not tell: one that hangs in the air may be in the background by then.
+        rig: of the cameras.
+        silhouettes: of all cameras of the rig.
+        source: given trajectories, or none.
+        drones: number, sizes and body offset where they are known.
+        fps: frames per second.
+        bounds_m: (2, 3), lowest and highest corner of the room, metres.
+        max_speed_m_s: largest speed of a drone.
 
     Raises:
-        InputError: there is no reference or file to start from, or it has too few drones.
+        InputError: the given trajectories have too few drones, or the size of a drone cannot be found.
     """
-    found = find_drones(
-        sequence.rig.cameras,
+    state = find_drones(
+        rig.cameras,
         silhouettes.read(0, min(START_FRAMES, silhouettes.num_frames)),
         reduction=silhouettes.reduction,
-        fps=sequence.fps,
+        fps=fps,
         bounds_m=bounds_m,
-        max_speed_m_s=settings.max_speed_m_s,
-        drones=settings.drones,
+        max_speed_m_s=max_speed_m_s,
+        drones=drones.count,
     )
-    if settings.init == "auto":
-        start, source = found if detected is None else _with_others(found, detected), sequence.folder
-    else:
-        known, source = _known_start(sequence, settings.init)
-        start = _with_sizes(known, found, sequence.fps, np.array(settings.body_offset_m))
-        wanted = settings.drones or 1
-        if len(start.position_m) < wanted:
+    if source.given is not None:
+        state = _with_sizes(source.given, state, fps, np.array(drones.body_offset_m))
+        wanted = drones.count or 1
+        if len(state.position_m) < wanted:
             raise InputError(
-                source,
-                expected=f"{wanted} drone{'s' * (wanted > 1)} (--init {settings.init})",
-                found=f"{len(start.position_m)}",
+                source.path,
+                expected=f"{wanted} drone{'s' * (wanted > 1)} (--init {source.init})",
+                found=f"{len(state.position_m)}",
                 remedy="say how many there are with --drones",
             )
-    start = InitialState(*(value[: settings.drones] for value in vars(start).values()))
-    if len(start.position_m) < (settings.drones or 0):
-        logger.warning("frame 0: %d of %d drones found", len(start.position_m), settings.drones)
-    if settings.drone_size_m is not None:
-        start = InitialState(
-            start.position_m,
-            start.velocity_m_s,
-            np.broadcast_to(np.array(settings.drone_size_m), start.position_m.shape),
-            start.num_cameras,
-        )
-    if not np.isfinite(start.size_m).all():
+    return state
+
+
+def complete_initial_state(
+    state: InitialState, detected: InitialState | None, drones: DroneSettings, source: StartSource
+) -> InitialState:
+    """The initial state with drones that only detections show, limited to the known number, with known sizes.
+
+    Args:
+        state: from silhouettes, or given.
+        detected: drones that detections show at frame 0; None where no detections are read. They are added where the
+            drones are found and not given: a drone that hovers may be part of the learned background.
+        drones: number and sizes where they are known.
+        source: where the state comes from.
+
+    Raises:
+        InputError: the size of a drone is not known.
+    """
+    if detected is not None and source.given is None:
+        state = _with_others(state, detected)
+    state = InitialState(*(value[: drones.count] for value in vars(state).values()))
+    if len(state.position_m) < (drones.count or 0):
+        logger.warning("frame 0: %d of %d drones found", len(state.position_m), drones.count)
+    if drones.size_m is not None:
+        size_m = np.broadcast_to(np.array(drones.size_m), state.position_m.shape)
+        state = InitialState(state.position_m, state.velocity_m_s, size_m, state.num_cameras)
+    if not np.isfinite(state.size_m).all():
         raise InputError(
-            source,
+            source.path,
             expected="a size for every drone",
             found="drones that no camera sees by themselves",
             remedy="pass --drone-size X,Y,Z",
         )
-    return start
+    return state
+
+
+def known_motion(
+    source: StartSource, drones: DroneSettings, fps: float
+) -> tuple[Float[np.ndarray, "known 3"], Float[np.ndarray, "known 3"]] | None:
+    """Given positions of the silhouettes' middles and velocities at frame 0; None where nothing is given."""
+    if source.given is None:
+        return None
+    none_found = InitialState(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+    state = _with_sizes(source.given, none_found, fps, np.array(drones.body_offset_m))
+    return state.position_m[: drones.count], state.velocity_m_s[: drones.count]
 
 
 def _with_others(found: InitialState, detected: InitialState) -> InitialState:
-    """The found drones, and after them those of the detected ones that are none of them."""
+    """The found drones, and after them the detected drones that are not among the found ones."""
     apart_m = np.linalg.norm(detected.position_m[:, None] - found.position_m[None], axis=-1)
     others = apart_m.min(axis=1, initial=np.inf) > SAME_M
     return InitialState(
@@ -121,59 +189,31 @@ def _with_others(found: InitialState, detected: InitialState) -> InitialState:
     )
 
 
-def known_motion(
-    sequence: Sequence, settings: TrackSettings
-) -> tuple[Float[np.ndarray, "known 3"], Float[np.ndarray, "known 3"]] | None:
-    """Positions of the silhouettes' middles and velocities at frame 0, where `settings.init` tells; None if not.
-
-    Raises:
-        InputError: there is no reference or file to start from.
-    """
-    if settings.init == "auto":
-        return None
-    known, _ = _known_start(sequence, settings.init)
-    nobody = InitialState(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
-    start = _with_sizes(known, nobody, sequence.fps, np.array(settings.body_offset_m))
-    return start.position_m[: settings.drones], start.velocity_m_s[: settings.drones]
-
-
-def _known_start(sequence: Sequence, init: str) -> tuple[Trajectories, Path]:
-    """The trajectories that a start is taken from, and where they come from."""
-    if init != "truth":
-        path = Path(init)
-        return read_trajectories(path, fps=sequence.fps), path
-    if sequence.truth is None:
-        raise InputError(
-            sequence.folder, expected="a reference for --init truth", found="none", remedy="use --init auto"
-        )
-    return sequence.truth, sequence.folder
-
-
 def _with_sizes(
-    known: Trajectories, found: InitialState, fps: float, body_offset_m: Float[np.ndarray, "3"]
+    given: Trajectories, found: InitialState, fps: float, body_offset_m: Float[np.ndarray, "3"]
 ) -> InitialState:
-    """A start from known trajectories: moved to frame 0, with the sizes of the drones that are seen there."""
-    there = np.isfinite(known.position_m).all(axis=-1)
+    """Given trajectories at frame 0, with the sizes of the drones that were found there."""
+    there = np.isfinite(given.position_m).all(axis=-1)
     positions, velocities, sizes, cameras = [], [], [], []
     for drone in np.flatnonzero(there.any(axis=0)):
         rows = np.flatnonzero(there[:, drone])[:2]
-        point = known.position_m[rows, drone]
-        frames = known.frame[rows]
-        if known.velocity_m_s is not None:
-            velocity = known.velocity_m_s[rows[0], drone]
+        point = given.position_m[rows, drone]
+        frames = given.frame[rows]
+        if given.velocity_m_s is not None:
+            velocity = given.velocity_m_s[rows[0], drone]
         elif len(rows) == 2:
             velocity = (point[1] - point[0]) * fps / (frames[1] - frames[0])
         else:
             velocity = np.zeros(3)
         position = point[0] - velocity * frames[0] / fps + body_offset_m
         distance = np.linalg.norm(found.position_m - position, axis=-1)
-        nearest = distance.argmin() if len(distance) and distance.min() < 0.5 else None
+        nearest = distance.argmin() if len(distance) and distance.min() < SAME_DRONE_M else None
         positions.append(position)
         velocities.append(velocity)
         sizes.append(np.full(3, np.nan) if nearest is None else found.size_m[nearest])
         cameras.append(0.0 if nearest is None else found.num_cameras[nearest])
     size = np.array(sizes).reshape(-1, 3)
-    # A drone that no camera sees by itself is taken to be like the others.
+    # A drone that no camera sees by itself gets the median size of the other drones.
     usual = np.nanmedian(size, axis=0) if np.isfinite(size).any() else np.full(3, np.nan)
     return InitialState(
         position_m=np.array(positions).reshape(-1, 3),

@@ -1,4 +1,5 @@
 from .kalman import GATE_999, Covariances, MotionParams, MotionState
+from .params import motion_params
 from .smoothing import check_measurements, estimate_jerk_density, filter_measurements, smooth
 from .white_jerk import white_jerk_noise
 
@@ -10,6 +11,7 @@ __all__ = [
     "check_measurements",
     "estimate_jerk_density",
     "filter_measurements",
+    "motion_params",
     "smooth",
     "white_jerk_noise",
 ]

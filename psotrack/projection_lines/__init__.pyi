@@ -1,7 +1,8 @@
-from .following import follow
-from .results import start_of
+from .results import state_at_first_frame
+from .tracker import LineSettings, track_detections
 
 __all__ = [
-    "follow",
-    "start_of",
+    "LineSettings",
+    "state_at_first_frame",
+    "track_detections",
 ]

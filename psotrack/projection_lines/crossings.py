@@ -1,4 +1,4 @@
-"""One frame of the projection lines: which sightings are of which drone, and where their lines of sight cross."""
+"""One frame: which detections are of which drone, and where their lines of sight cross."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from jaxtyping import Bool, Float, Int
 from psotrack.correspondence import CUT_SHARE, CameraSightings, match
 from psotrack.geometry import NEAR_M, Camera, project, reconstruct
 
-#: No sighting is known better, however well the cameras agree.
+#: Least standard deviation of a detection's middle, pixels, however well the cameras agree.
 LEAST_NOISE_PX = 0.1
-#: Of drones that share a sighting all but one are hidden: its middle is off theirs by so much of its sides, as that of
-#: one that the image's border cuts.
+#: Additional standard deviation of a middle, as a share of the box's sides, where several drones share the box: all but
+#: one are hidden. The value is that of boxes that the image's border cuts.
 SHARED_SHARE = CUT_SHARE
 
 
 @dataclass(frozen=True)
 class Crossings:
-    """Where the lines of sight of sightings cross that are of one drone.
+    """Positions where lines of sight of one drone's detections cross.
 
     Attributes:
-        expected: (crossings,), index of the expected drone that it is; -1 for one that nobody expected.
-        position_m: (crossings, 3).
-        covariance_m2: (crossings, 3, 3), from the noise of the sightings.
-        seen: (crossings, cameras), cameras whose sightings count.
+        expected: (crossings,), index of the expected drone; -1 where no drone was expected.
+        position_m: (crossings, 3), metres.
+        covariance_m2: (crossings, 3, 3), from the noise of the detections.
+        seen: (crossings, cameras), cameras whose detections count.
         disagreement: (crossings,), squared reprojection errors over the noise, per degree of freedom: about 1 where the
             noise is right.
-        span_m: (crossings, 2), width and height of the sightings at that distance, the median of the cameras.
+        span_m: (crossings, 2), width and height of the detections at that distance, median of the cameras, metres.
     """
 
     expected: Int[np.ndarray, "crossings"]
@@ -47,19 +47,18 @@ def crossings(
     expected_covariance_m2: Float[np.ndarray, "drones 3 3"],
     dispersion: Float[np.ndarray, "drones"],
 ) -> Crossings:
-    """Match sightings over the cameras, and triangulate what belongs together without the views that disagree.
+    """Match the detections of all cameras, and triangulate each group without the views that disagree.
 
     Args:
         cameras: with one leading axis.
-        view: the frame.
-        bounds_m: (2, 3), corners of the room.
-        expected_m, expected_covariance_m2: (drones, 3) and (drones, 3, 3), where drones are expected.
-        dispersion: (drones,), how many times larger than `view.noise_px`² the variance of a sighting of each drone has
-            been so far.
+        view: detections of the frame.
+        bounds_m: (2, 3), corners of the room, metres.
+        expected_m, expected_covariance_m2: (drones, 3) and (drones, 3, 3), expected positions and their covariances.
+        dispersion: (drones,), ratio of the variance of each drone's detections so far and `view.noise_px`².
     """
-    # What nobody expected is like what is known.
+    # Detections of an unexpected drone are as noisy as those of the known drones.
     dispersion = np.append(dispersion, np.median(dispersion) if len(dispersion) else 1.0)
-    # In doubt a detector is taken to be as good as it says: what is matched is judged afterwards.
+    # At least the stated noise is used for matching: the groups are judged after they are triangulated.
     scale = np.sqrt(max(1.0, dispersion[-1]))
     groups = match(
         cameras,
@@ -75,7 +74,7 @@ def crossings(
     several = _shared(groups.detection)
     hidden_px = np.where(several, SHARED_SHARE * np.sqrt(size_px.prod(axis=-1)), 0.0)
     noise_px = np.hypot(noise_px, hidden_px)
-    # How well a drone is seen by itself says nothing of the others before it.
+    # The dispersion of a drone alone in its box says nothing about a box that it shares.
     usual = np.where(several, 1.0, np.sqrt(dispersion[groups.expected])[:, None])
     known_px = np.maximum(noise_px * usual, LEAST_NOISE_PX)
     lines = reconstruct(cameras, centre_px, noise_px=np.nan_to_num(known_px, nan=1.0))
@@ -96,12 +95,12 @@ def crossings(
 
 
 def in_view(cameras: Camera, position_m: Float[np.ndarray, "drones 3"]) -> Bool[np.ndarray, "drones cameras"]:
-    """(drones, cameras), cameras in whose images the drones are."""
+    """(drones, cameras), whether a drone is inside a camera's image."""
     pixels, depth = project(cameras, position_m[:, None])
     inside = (pixels >= -0.5) & (pixels <= cameras.image_size_wh - 0.5)
     return np.asarray(inside.all(axis=-1) & (depth > NEAR_M))
 
 
 def _shared(detection: Int[np.ndarray, "groups cameras"]) -> Bool[np.ndarray, "groups cameras"]:
-    """(groups, cameras), whether the sighting is that of several groups."""
+    """(groups, cameras), whether several groups share the detection."""
     return ((detection[:, None] == detection) & (detection >= 0)).sum(axis=1) > 1

@@ -1,4 +1,4 @@
-"""Tracks on their way: what each frame says of them, and what they are to those who come and those who are missed."""
+"""Tracks in progress: their measurements and states, frame by frame, and their role in re-identification."""
 
 from __future__ import annotations
 
@@ -9,13 +9,22 @@ from jaxtyping import Float
 
 from psotrack.initiation import LostTracks, TrackCandidate
 
-#: How wide a drone looks changes as it turns: what counts is what it was in so many frames.
+#: Number of last frames from which a drone's present width is taken: a drone looks wider or narrower as it turns.
 SPAN_FRAMES = 25
 
 
 @dataclass(frozen=True)
-class Found:
-    """What a frame says of a track by itself."""
+class Measurement:
+    """What one frame says of a track by itself.
+
+    Attributes:
+        position_m: (3,), metres.
+        covariance_m2: (3, 3), of the position.
+        disagreement: squared reprojection errors over the noise, per degree of freedom.
+        num_cameras: cameras whose detections count.
+        span_m: (2,), width and height of the drone, metres.
+        surprising: whether the position is too far from the expected one to be an error of measurement.
+    """
 
     position_m: Float[np.ndarray, "3"]
     covariance_m2: Float[np.ndarray, "3 3"]
@@ -27,25 +36,33 @@ class Found:
 
 @dataclass(frozen=True)
 class TrackRow:
-    """What is known of a track after a frame; found is None where the frame did not show it."""
+    """A track after one frame; `measured` is None where the frame did not show the drone."""
 
     frame: int
     position_m: Float[np.ndarray, "3"]
     velocity_m_s: Float[np.ndarray, "3"]
     covariance_m2: Float[np.ndarray, "3 3"]
     num_in_view: int
-    found: Found | None
+    measured: Measurement | None
 
     @property
     def share(self) -> float:
-        """Of the cameras that have it in view, those that saw it."""
-        num_cameras = 0 if self.found is None else self.found.num_cameras
+        """Share of the cameras with the drone in view that saw the drone."""
+        num_cameras = 0 if self.measured is None else self.measured.num_cameras
         return num_cameras / max(num_cameras, self.num_in_view, 1)
 
 
 @dataclass
 class Track:
-    """A track on its way: the number of its drone, once it is one; how much the cameras disagree; all of its frames."""
+    """A track in progress.
+
+    Attributes:
+        drone: number of the drone; None until the track is confirmed to be of a drone.
+        dispersion: disagreement of the cameras, averaged over time.
+        rows: one for each frame.
+        hits: number of frames in which the drone was found.
+        missed: frames since the drone was last found.
+    """
 
     drone: int | None
     dispersion: float
@@ -55,44 +72,44 @@ class Track:
 
     @property
     def share(self) -> float:
-        """Of the cameras that had it in view, those that saw it, in the frames in which it was found."""
-        shares = [row.share for row in self.rows if row.found is not None]
+        """Mean share of the cameras with the drone in view that saw it, over the frames in which it was found."""
+        shares = [row.share for row in self.rows if row.measured is not None]
         return float(np.mean(shares)) if shares else 0.0
 
     @property
     def last_found(self) -> TrackRow:
-        """The last row in which it was found; the first one if it never was."""
-        return next((row for row in reversed(self.rows) if row.found is not None), self.rows[0])
+        """The last row in which the drone was found; the first row if there is none."""
+        return next((row for row in reversed(self.rows) if row.measured is not None), self.rows[0])
 
     @property
     def span_m(self) -> Float[np.ndarray, "2"]:
-        """Width and height, the median of the last frames; NaN if it was not found in them."""
-        spans = [row.found.span_m for row in self.rows[-SPAN_FRAMES:] if row.found is not None]
+        """Width and height, median of the last frames, metres; NaN if the drone was not found in them."""
+        spans = [row.measured.span_m for row in self.rows[-SPAN_FRAMES:] if row.measured is not None]
         return np.median(spans, axis=0) if spans else np.full(2, np.nan)
 
     @property
     def size_m(self) -> Float[np.ndarray, "3"]:
-        """Full lengths along the world's axes, the median of all frames."""
-        spans = [row.found.span_m for row in self.rows if row.found is not None]
+        """Full lengths along the world's axes, median of all frames, metres."""
+        spans = [row.measured.span_m for row in self.rows if row.measured is not None]
         width, height = np.median(spans, axis=0) if spans else np.full(2, np.nan)
         return np.array([width, width, height])
 
 
-def newcomer_of(track: Track) -> TrackCandidate:
-    """A track as a newcomer, at the frame in which it began; its velocity is known by now."""
-    first, now = track.rows[0], track.rows[-1]
+def as_candidate(track: Track) -> TrackCandidate:
+    """A new track as a candidate, at the frame in which it began and with its present velocity."""
+    first, last = track.rows[0], track.rows[-1]
     return TrackCandidate(
-        frame=first.frame - now.frame,
+        frame=first.frame - last.frame,
         position_m=first.position_m,
-        velocity_m_s=now.velocity_m_s,
+        velocity_m_s=last.velocity_m_s,
         size_m=track.size_m,
         num_cameras=first.num_in_view,
         moves=True,
     )
 
 
-def lost_of(tracks: list[Track], frame: int, fps: float) -> LostTracks:
-    """Drones that are missed, as they were when last found."""
+def as_lost_tracks(tracks: list[Track], frame: int, fps: float) -> LostTracks:
+    """Drones that are not found in a frame, as they were when they were last found."""
     last = [track.last_found for track in tracks]
     return LostTracks(
         drone=np.array([track.drone for track in tracks], int),

@@ -2,6 +2,7 @@ from .compiled import keep_compiled
 from .delimited import Column, Table, TextRow, read_rows, read_table, write_rows
 from .figures import COLOURS, drone_colour, save_figure
 from .files import atomic_write, digest_file, digest_record, read_text, refuse_to_overwrite
+from .plugins import load_plugin, plugin_names
 from .processes import map_in_processes
 from .progress import Advance, Report, no_progress, progress_bar
 from .schema import assign, convert, nearest, read_toml
@@ -21,9 +22,11 @@ __all__ = [
     "digest_record",
     "drone_colour",
     "keep_compiled",
+    "load_plugin",
     "map_in_processes",
     "nearest",
     "no_progress",
+    "plugin_names",
     "progress_bar",
     "read_rows",
     "read_table",

@@ -84,17 +84,17 @@ def estimate(cells: Iterable[Cell], inputs: Inputs, store: Store | None) -> Esti
         every = len(sequence.rig)
         cameras = cell.cameras if isinstance(cell.cameras, int) else len(cell.cameras or range(every))
         assert sequence.truth is not None
-        drones = cell.settings.drones or sequence.truth.num_drones
+        drones = cell.settings.drones.count or sequence.truth.num_drones
         settings = cell.settings
         count += 1
         swarm = settings.method != "projection-lines"
-        work = settings.particles * settings.iterations * drones * cameras if swarm else 0
+        work = settings.swarm.particles * settings.swarm.iterations * drones * cameras if swarm else 0
         tracking_s += factor * runs * sequence.num_frames * (FRAME_S + WORK_S * work)
         shape = (
-            settings.particles,
-            settings.swarm,
-            settings.score,
-            settings.windows,
+            settings.swarm.particles,
+            settings.swarm.kind,
+            settings.score.kind,
+            settings.score.windows,
             settings.silhouettes.reduction,
         )
         if swarm:
@@ -137,7 +137,12 @@ def _factor(store: Store | None) -> tuple[float, str]:
 
 def _rule_s(rows: pd.DataFrame) -> pd.Series:
     """What the rule of thumb says of rows' runs."""
-    work = rows["settings.particles"] * rows["settings.iterations"] * rows["drones"] * rows["num_cameras"]
+    work = (
+        rows["settings.swarm.particles"]
+        * rows["settings.swarm.iterations"]
+        * rows["drones"]
+        * rows["num_cameras"]
+    )
     return rows["frames"] * (FRAME_S + WORK_S * work)
 
 

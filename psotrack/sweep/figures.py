@@ -229,8 +229,8 @@ def _cells(rows: pd.DataFrame, error: str) -> pd.DataFrame:
     needed = {
         "sequence": "sequence",
         "method": "method",
-        "particles": "settings.particles",
-        "iterations": "settings.iterations",
+        "particles": "settings.swarm.particles",
+        "iterations": "settings.swarm.iterations",
     }
     for name in (*needed.values(), "track_ms_per_frame", error):
         if name not in rows:

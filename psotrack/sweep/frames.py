@@ -44,8 +44,9 @@ def sweep(
 
     Returns:
         The rows of this grid's cells and seeds, in the grid's order, whatever else lies in the folder. Settings are
-        columns with dots (`settings.particles`), metrics have units in their names; `seconds.*` per run, `device.*`,
-        `versions.*` and `commit` say where a row comes from. `attrs["errors"]` lists cells that failed, by title.
+        columns with dots (`settings.swarm.particles`), metrics have units in their names; `seconds.*` per run,
+        `device.*`, `versions.*` and `commit` say where a row comes from. `attrs["errors"]` lists cells that failed,
+        by title.
 
     Raises:
         InputError: a sequence is not there, or every cell failed.
@@ -59,7 +60,7 @@ def sweep(
                 {"sequences": ["S02_D4_A"], "runs": 5, "grid": {"particles": [20, 50, 100]}},
                 out="results", data="data", cache="cache", report=psotrack.support.progress.terminal,
             )
-            rows.groupby("settings.particles")["mean_error_m"].agg(["mean", "std"])
+            rows.groupby("settings.swarm.particles")["mean_error_m"].agg(["mean", "std"])
     """
     read = load(Path(grid)) if isinstance(grid, Path | str) else grid
     read = read if isinstance(read, Grid) else grid_of(read)

@@ -182,9 +182,10 @@ def grid(mapping: Mapping[str, Any], where: str = "grid") -> Grid:
         SettingsError: something in it is wrong; the message names its place, and the nearest right name.
 
     Example:
-        >>> varied = grid({"sequences": ["S01"], "grid": {"particles": [20, 50], "silhouettes.reduction": [4]}})
+        >>> axes = {"swarm.particles": [20, 50], "silhouettes.reduction": [4]}
+        >>> varied = grid({"sequences": ["S01"], "grid": axes})
         >>> [dict(cell.axes) for cell in varied.cells()]
-        [{'particles': 20, 'silhouettes.reduction': 4}, {'particles': 50, 'silhouettes.reduction': 4}]
+        [{'swarm.particles': 20, 'silhouettes.reduction': 4}, {'swarm.particles': 50, 'silhouettes.reduction': 4}]
     """
     for name in mapping:
         check_name(f"{where}: ", name, _File.__struct_fields__)

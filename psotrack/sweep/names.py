@@ -6,16 +6,12 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from psotrack.errors import SettingsError
-from psotrack.settings import TrackSettings
-from psotrack.silhouettes import SilhouetteSettings
+from psotrack.settings import renamed, setting_names
 from psotrack.support import nearest
 from psotrack.sweep.cells import Perturbation
 
 #: Dotted names of everything that [settings] and [methods] may set.
-SETTINGS = (
-    *(name for name in TrackSettings.__struct_fields__ if name not in ("seed", "silhouettes")),
-    *(f"silhouettes.{name}" for name in SilhouetteSettings.__struct_fields__),
-)
+SETTINGS = tuple(name for name in setting_names() if name != "seed")
 PERTURBATIONS = tuple(name for name in Perturbation.__struct_fields__ if name != "draw")
 
 #: What [grid] may vary besides.
@@ -49,6 +45,10 @@ def check_name(prefix: str, name: str, names: tuple[str, ...]) -> None:
     """Raise `SettingsError` unless the name is one of those; it says what may be meant."""
     if name in names:
         return
+    if renamed(name):
+        raise SettingsError(
+            f"{prefix}{name}", expected="a name that there is", found=name, remedy=renamed(name)
+        )
     if any(other.startswith(f"{name}.") for other in names):
         raise SettingsError(f"{prefix}{name}", expected="a table with names", found="none")
     near = nearest(name, names)

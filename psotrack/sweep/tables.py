@@ -29,9 +29,9 @@ def pivot(
 ) -> pd.DataFrame:
     """Mean and sample standard deviation of a value over the rows that are alike in the named columns.
 
-    Names may leave out their leading parts where one column only ends so: `particles` is `settings.particles`. Rows
-    without the value, of runs that failed, do not count. Where figures are over more than runs and draws, a warning in
-    the log says over what.
+    Names may leave out their leading parts where one column only ends so: `particles` is `settings.swarm.particles`.
+    Rows without the value, of runs that failed, do not count. Where figures are over more than runs and draws, a
+    warning in the log says over what.
 
     Args:
         rows: of results, one per cell and run.

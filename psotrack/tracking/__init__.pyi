@@ -1,20 +1,36 @@
-from .chunks import Arrival, Tracked, on_device, track_silhouettes
-from .fitness import ScoreSettings
-from .inputs import motion_params
-from .sizes import SizeMeasurements, SizeState, init
-from .tracker import COMMON, DISPERSION_FRAMES, TrackerInfo
+from .chunks import RunInputs, on_device, track_silhouettes
+from .fitness import (
+    PAPER_SCORE,
+    Score,
+    ScoreInputs,
+    SoftIoU,
+    camera_scores,
+    camera_weights,
+    foreground_and_area,
+)
+from .parameters import TrackerSettings, find_score, find_search, tracker_settings
+from .search import ParticleSwarm, Search, SearchRegion, particle_swarm
+from .tracker import COMMON, DISPERSION_FRAMES
 
 __all__ = [
     "COMMON",
     "DISPERSION_FRAMES",
-    "Arrival",
-    "ScoreSettings",
-    "SizeMeasurements",
-    "SizeState",
-    "Tracked",
-    "TrackerInfo",
-    "init",
-    "motion_params",
+    "PAPER_SCORE",
+    "ParticleSwarm",
+    "RunInputs",
+    "Score",
+    "ScoreInputs",
+    "Search",
+    "SearchRegion",
+    "SoftIoU",
+    "TrackerSettings",
+    "camera_scores",
+    "camera_weights",
+    "find_score",
+    "find_search",
+    "foreground_and_area",
     "on_device",
+    "particle_swarm",
     "track_silhouettes",
+    "tracker_settings",
 ]

@@ -1,8 +1,8 @@
-"""The drones that are followed, and how they are followed through a chunk of frames: in one run, or in many at once.
+"""Drones tracked through one chunk of frames: in one run, or in many runs at once.
 
-Runs whose drones are as many and whose program is the same are a batch axis: one compiled function, one copy of the
-silhouettes. On a processor each run of a batch is computed after the other, as if it were alone, and to the same bits;
-on an accelerator side by side.
+Runs with the same number of drones and the same program form a batch: one compiled function, one copy of the
+silhouettes. On a CPU the runs of a batch are computed one after the other, each as if it were alone and to the same
+bits; on an accelerator side by side.
 """
 
 from __future__ import annotations
@@ -19,14 +19,20 @@ from jaxtyping import Int, UInt8
 from psotrack._typing import Array
 from psotrack.geometry import Camera
 from psotrack.tracking import sizes, tracker
-from psotrack.tracking.sizes import SizeMeasurements, SizeState
+from psotrack.tracking.sizes import SizeMeasurements, SizeProgram, SizeState
 from psotrack.trajectories import Status
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class TrackedDrones:
-    """All that has the number of drones as a shape."""
+    """Everything of a run whose arrays have an axis of drones.
+
+    Attributes:
+        state: of the tracker.
+        params: of the tracker.
+        sizes: the running estimate of the drones' sizes.
+    """
 
     state: tracker.TrackerState
     params: tracker.TrackerParams
@@ -36,113 +42,123 @@ class TrackedDrones:
         return self.params.size_m.shape[0]
 
 
-#: A crew after a chunk, what is known of the chunk's frames, and the sizes that each of them shows by itself.
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Chunk:
+    """A chunk of silhouettes, and how many of its frames count.
+
+    Attributes:
+        coverage: (frames, cameras, height, width) uint8.
+        num_frames: frames that count; the frames after them only fill the chunk.
+    """
+
+    coverage: UInt8[Array, "frames cameras height width"]
+    num_frames: Int[Array, ""]
+
+
+#: The drones after a chunk, the tracker's info, and the sizes that each frame shows by itself.
 BatchResult = tuple[TrackedDrones, tracker.TrackerInfo, SizeMeasurements]
 
-#: Of records of JAX arrays.
+#: The leaves of a pytree of arrays.
 Leaves = list[Any]
 
 
 def track_batch(
-    crews: Sequence[TrackedDrones],
-    arrivals: Sequence[tracker.TrackStarts],
-    coverage: UInt8[Array, "frames cameras height width"],
-    num_frames: int,
+    runs: Sequence[tuple[TrackedDrones, tracker.TrackStarts]],
+    chunk: Chunk,
     cameras: Camera,
     program: tracker.Program,
     *,
     capacity: int,
     device: jax.Device,
 ) -> list[BatchResult]:
-    """Follow the drones of some runs through a chunk, and learn their sizes.
+    """Track the drones of one or more runs through a chunk, and learn their sizes.
 
     Args:
-        crews: of one run or more, each of as many drones.
-        arrivals: of each run (see `tracker.no_track_starts`).
-        coverage: (frames, cameras, height, width) uint8; a chunk of silhouettes.
-        num_frames: so many of its frames count; what fills the chunk teaches nothing.
-        cameras: in float32.
-        program: of all of the runs.
-        capacity: of the compiled function: so many runs at most. To leave some of it empty costs next to nothing.
-        device: that computes.
+        runs: of each run the drones, and the tracks that start in the chunk. All have the same number of drones.
+        chunk: the silhouettes.
+        cameras: with one leading axis, float32.
+        program: of all runs.
+        capacity: number of runs for which the function is compiled. Unused capacity costs next to nothing.
+        device: computes.
 
     Returns:
-        One for each crew. The info has all frames of the chunk.
+        One result for each run. The info has all frames of the chunk.
     """
-    given = _filled(crews, capacity), _filled(arrivals, capacity), jnp.int32(len(crews))
-    # What was put on a device and what just is there are not alike to JAX, which would compile for each.
-    followed = _follow(*jax.device_put((*given, coverage, jnp.int32(num_frames), cameras), device), program)
-    return followed[: len(crews)]
-
-
-def _filled(some: Sequence[Any], size: int) -> tuple[Any, ...]:
-    """The first stands in for those that are missing."""
-    return (*some, *[some[0]] * (size - len(some)))
+    # The first run fills the places of runs that are missing.
+    filled = (*runs, *[runs[0]] * (capacity - len(runs)))
+    # JAX compiles separately for arrays committed to a device and for uncommitted ones: all are committed.
+    arguments = jax.device_put((filled, jnp.int32(len(runs)), chunk, cameras), device)
+    return _track_batch(*arguments, program)[: len(runs)]
 
 
 @partial(jax.jit, static_argnames="program")
-def _follow(
-    crews: tuple[TrackedDrones, ...],
-    arrivals: tuple[tracker.TrackStarts, ...],
+def _track_batch(
+    runs: tuple[tuple[TrackedDrones, tracker.TrackStarts], ...],
     count: Int[Array, ""],
-    coverage: UInt8[Array, "frames cameras height width"],
-    num_frames: Int[Array, ""],
+    chunk: Chunk,
     cameras: Camera,
     program: tracker.Program,
 ) -> list[BatchResult]:
-    runs = list(zip(crews, arrivals, strict=True))
     structures: list[Any] = []
 
-    # Leaves alone, because records of many runs at once would have axes that they do not declare.
-    def one(leaves: Leaves) -> Leaves:
-        crew, arrivals = jax.tree.unflatten(jax.tree.structure(runs[0]), leaves)
-        leaves, structure = jax.tree.flatten(_one(crew, arrivals, coverage, num_frames, cameras, program))
+    # Leaves instead of records: the arrays of many runs have an axis that the records do not declare.
+    def of_leaves(leaves: Leaves) -> Leaves:
+        drones, starts = jax.tree.unflatten(jax.tree.structure(runs[0]), leaves)
+        leaves, structure = jax.tree.flatten(_track_run(drones, starts, chunk, cameras, program))
         structures.append(structure)
         return leaves
 
     batch = [jnp.stack(leaves) for leaves in zip(*map(jax.tree.leaves, runs), strict=True)]
     side_by_side = jax.default_backend() != "cpu"
-    followed = jax.vmap(one)(batch) if side_by_side else _in_turn(one, batch, count)
-    return [jax.tree.unflatten(structures[0], [leaf[run] for leaf in followed]) for run in range(len(runs))]
+    tracked = jax.vmap(of_leaves)(batch) if side_by_side else _one_after_another(of_leaves, batch, count)
+    return [jax.tree.unflatten(structures[0], [leaf[run] for leaf in tracked]) for run in range(len(runs))]
 
 
-def _one(
-    crew: TrackedDrones,
-    arrivals: tracker.TrackStarts,
-    coverage: UInt8[Array, "frames cameras height width"],
-    num_frames: Int[Array, ""],
+def _track_run(
+    drones: TrackedDrones,
+    starts: tracker.TrackStarts,
+    chunk: Chunk,
     cameras: Camera,
     program: tracker.Program,
 ) -> BatchResult:
-    state, info = tracker.track(crew.state, coverage, cameras, crew.params, program, arrivals)
-    counts = (jnp.arange(coverage.shape[0]) < num_frames)[:, None]
+    """Track the drones of one run through a chunk, then learn their sizes from it."""
+    coverage = chunk.coverage
+    state, info = tracker.track(drones.state, coverage, cameras, drones.params, program, starts)
+    counts = (jnp.arange(coverage.shape[0]) < chunk.num_frames)[:, None]
     well_seen = (info.status == Status.TRACKED) & counts
     position_m = jnp.nan_to_num(info.position_m)
-    floor_z_m = crew.params.bounds_m[0, 2]
-    looks = sizes.measure_sizes(
-        coverage, position_m, well_seen, crew.params.size_m, cameras, program.score, floor_z_m
+    floor_z_m = drones.params.bounds_m[0, 2]
+    measured = sizes.measure_sizes(
+        coverage,
+        position_m,
+        well_seen,
+        drones.params.size_m,
+        cameras,
+        SizeProgram(program.windows, program.score.ring, program.reduction),
+        floor_z_m,
     )
-    learned = sizes.learn_sizes(crew.sizes, looks)
-    return TrackedDrones(state, replace(crew.params, size_m=learned.size_m), learned), info, looks
+    learned = sizes.learn_sizes(drones.sizes, measured)
+    return TrackedDrones(state, replace(drones.params, size_m=learned.size_m), learned), info, measured
 
 
-def _in_turn(one: Callable[[Leaves], Leaves], batch: Leaves, count: Int[Array, ""]) -> Leaves:
-    """The first `count` of a batch, one after the other; the others are left at 0.
+def _one_after_another(of_leaves: Callable[[Leaves], Leaves], batch: Leaves, count: Int[Array, ""]) -> Leaves:
+    """The first `count` runs of a batch, one after the other; the results of the other runs are 0.
 
-    Nothing of the loop is mixed with what it repeats, and its length is not known to the compiler: the same
-    instructions run for a batch of any size, so the same bits come out.
+    Barriers keep the loop apart from the code that it repeats, and the compiler does not know the number of
+    repetitions: the same instructions run for a batch of any size, so the same bits come out.
     """
 
     def at(number: Array) -> Leaves:
         alone = [jax.lax.dynamic_index_in_dim(leaf, number, keepdims=False) for leaf in batch]
-        return jax.lax.optimization_barrier(one(jax.lax.optimization_barrier(alone)))
+        return jax.lax.optimization_barrier(of_leaves(jax.lax.optimization_barrier(alone)))
 
     def body(number: Array, done: Leaves) -> Leaves:
         return [
-            jax.lax.dynamic_update_index_in_dim(everyone, new, number, 0)
-            for everyone, new in zip(done, at(number), strict=True)
+            jax.lax.dynamic_update_index_in_dim(of_all, new, number, 0)
+            for of_all, new in zip(done, at(number), strict=True)
         ]
 
     shapes = jax.eval_shape(at, jnp.int32(0))
-    nothing = [jnp.zeros((batch[0].shape[0], *leaf.shape), leaf.dtype) for leaf in shapes]
-    return jax.lax.fori_loop(0, count, body, nothing)
+    empty = [jnp.zeros((batch[0].shape[0], *leaf.shape), leaf.dtype) for leaf in shapes]
+    return jax.lax.fori_loop(0, count, body, empty)

@@ -1,20 +1,17 @@
-"""Chunk after chunk through a recording: the tracker, what it leaves unexplained, and how large the drones are.
+"""Chunk after chunk through a recording: the tracker, new tracks, and the sizes of the drones.
 
-The compiled tracker follows a fixed number of drones. Between its chunks of frames there is time to look at what it did
-not explain: drones that come (the chunk is then tracked again, with them) and drones that were lost and are back. And
-the drones' sizes are learned.
+The compiled tracker tracks a fixed number of drones. After each chunk of frames, the foreground that no track explains
+is searched for new drones (the chunk is then tracked again, with them) and for lost drones. The drones' sizes are
+learned on the way.
 """
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import threading
 import time
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import TypeVar
 
 import jax
@@ -33,14 +30,15 @@ from psotrack.initiation import (
     plan_starts,
     reidentify,
 )
-from psotrack.settings import TrackSettings
+from psotrack.motion import motion_params
 from psotrack.silhouettes import Silhouettes
-from psotrack.support import Advance, Report, no_progress
+from psotrack.support import Report, no_progress
 from psotrack.tracking import sizes, tracker
-from psotrack.tracking.batch import BatchResult, TrackedDrones, track_batch
-from psotrack.tracking.inputs import motion_params, tracker_inputs, tracker_program
+from psotrack.tracking.batch import BatchResult, Chunk, TrackedDrones, track_batch
+from psotrack.tracking.devices import largest_share, num_used_devices, share_among_devices
+from psotrack.tracking.parameters import TrackerSettings, tracker_params, tracker_program
 from psotrack.tracking.sizes import SizeMeasurements, SizeState
-from psotrack.trajectories import Status
+from psotrack.trajectories import Arrival, DroneSizes, Status, Tracks, unknown_value
 
 logger = logging.getLogger(__name__)
 
@@ -52,49 +50,43 @@ Frames = TypeVar("Frames", tracker.TrackerInfo, SizeMeasurements)
 
 
 @dataclass(frozen=True)
-class Arrival:
-    """A drone that came after the start: frame of the video, which drone, and whether it had been lost before."""
-
-    frame: int
-    drone: int
-    again: bool
-
-
-@dataclass(frozen=True)
-class Tracked:
-    """What tracking yields, by tracks; before anyone asked which track is which drone.
+class RunInputs:
+    """What one run of the tracker starts from.
 
     Attributes:
-        info: NumPy arrays with axes (frames, drones, ...).
-        sizes: what was learned of the drones' sizes.
-        looks: the sizes that each frame shows by itself, NumPy arrays with axes (frames, drones, ...).
-        arrivals: drones that came after the start, or came back.
-        compile_s: seconds that compiling took.
+        initial: positions, velocities and sizes of the drones at frame 0; may have no drones.
+        bounds_m: (2, 3), lowest and highest corner of the room, metres.
+        settings: the tracker's parts of the settings.
     """
 
-    info: tracker.TrackerInfo
-    sizes: SizeState
-    looks: SizeMeasurements
-    arrivals: tuple[Arrival, ...]
-    compile_s: float
+    initial: InitialState
+    bounds_m: Float[np.ndarray, "2 3"]
+    settings: TrackerSettings
 
 
 @dataclass
 class _Run:
-    """A run on its way: what it was told, and what it has found out so far."""
+    """A run in progress: its inputs, and its results so far."""
 
-    settings: TrackSettings
-    bounds_m: Float[np.ndarray, "2 3"]
+    inputs: RunInputs
     program: tracker.Program
-    crew: TrackedDrones
+    drones: TrackedDrones
     infos: list[tracker.TrackerInfo] = field(default_factory=list)
-    looks: list[SizeMeasurements] = field(default_factory=list)
+    measured: list[SizeMeasurements] = field(default_factory=list)
     arrivals: list[Arrival] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
-class _Place:
-    """Where tracking takes place: what runs that go on together share."""
+class _Setting:
+    """What all runs on one device share.
+
+    Attributes:
+        rig: the cameras in float64.
+        cameras: the same cameras in float32, in which the tracker computes.
+        reduction: image pixels per silhouette pixel, along each side.
+        fps: frames per second.
+        device: computes.
+    """
 
     rig: CameraRig
     cameras: Camera
@@ -106,304 +98,288 @@ class _Place:
 def track_silhouettes(
     rig: CameraRig,
     silhouettes: Silhouettes,
-    starts: Sequence[InitialState],
-    settings: Sequence[TrackSettings],
+    runs: Sequence[RunInputs],
     *,
     fps: float,
-    bounds_m: Sequence[Float[np.ndarray, "2 3"]],
     report: Report = no_progress,
-) -> list[Tracked]:
-    """Track all frames, once for each of the settings; all devices share the runs.
-
-    Those of equal shape on a device are one batch (see `crew`). A thread for each device: while one of them computes,
-    the search for newcomers of another one has the processor.
+) -> list[tuple[Tracks, float]]:
+    """Track all frames in one or more runs, which share all devices (`jax.devices()`).
 
     Args:
         rig: of the cameras.
-        silhouettes: of all of them.
-        starts: of each run; may be empty.
-        settings: of each run.
+        silhouettes: of all cameras of the rig.
+        runs: what each run starts from.
         fps: frames per second.
-        bounds_m: of each run, (2, 3): lowest and highest corner of the room.
-        report: told of the frames, in which all runs go on together.
+        report: told of the frames, through which all runs go together.
+
+    Returns:
+        For each run its tracks, and the seconds that compiling took.
     """
-    asked = list(zip(starts, settings, bounds_m, strict=True))
-    programs = [tracker_program(silhouettes.reduction, each) for each in settings]
-    devices = jax.devices()[: len(asked)]
-    # Alike ones in turn, so that of each program every device has as many, or one more.
-    alike = sorted(range(len(asked)), key=lambda number: programs.index(programs[number]))
-    shares = [alike[first :: len(devices)] for first in range(len(devices))]
-    capacity = {program: -(-count // len(devices)) for program, count in Counter(programs).items()}
-
-    def track_share(share: list[int], device: jax.Device, report: Report) -> list[Tracked]:
-        with jax.default_device(device):
-            place = _Place(rig, on_device(rig.cameras), silhouettes.reduction, fps, device)
-            runs = [_begun(*asked[number], place) for number in share]
-            return _tracked(runs, capacity, silhouettes, place, report)
-
-    stopped = threading.Event()
-
-    @contextlib.contextmanager
-    def until_stopped(description: str, total: int) -> Iterator[Advance]:
-        def advance(steps: int) -> None:
-            if stopped.is_set():
-                raise RuntimeError("another share of the runs has failed")
-
-        yield advance
-
-    with ThreadPoolExecutor(len(devices)) as threads:
-        # The first is ours: it tells how far they are, and whoever interrupts us is heard.
-        others = [
-            threads.submit(track_share, *of, until_stopped)
-            for of in zip(shares[1:], devices[1:], strict=True)
-        ]
-        try:
-            done = [track_share(shares[0], devices[0], report), *[other.result() for other in others]]
-        except BaseException:
-            stopped.set()
-            raise
-    by_run = dict(
-        pair for share, of in zip(shares, done, strict=True) for pair in zip(share, of, strict=True)
-    )
+    kinds = [_kind(tracker_program(run.settings, silhouettes.reduction), run.settings) for run in runs]
+    capacity = {kind: largest_share(kinds, kind) for kind in set(kinds)}
+    work = partial(_track_through_chunks, rig, silhouettes, fps, capacity)
+    tracked = share_among_devices(runs, kinds, work, report)
     # Devices compile at the same time.
-    return [
-        replace(by_run[number], compile_s=by_run[number].compile_s / len(devices))
-        for number in range(len(asked))
-    ]
-
-
-def _tracked(
-    runs: list[_Run],
-    capacity: Mapping[tracker.Program, int],
-    silhouettes: Silhouettes,
-    place: _Place,
-    report: Report,
-) -> list[Tracked]:
-    """What some runs yield, which go on together, on one device."""
-    batches = _Batches(place, (CHUNK_FRAMES, len(place.rig), *silhouettes.shape), capacity)
-    with report("track", silhouettes.num_frames) as advance:
-        for first, chunk, frames in _chunks(silhouettes):
-            followed = batches.follow(runs, [None] * len(runs), chunk, frames)
-            coming = [
-                _coming(chunk[:frames], [*run.infos, info], run, place)
-                for run, (_, info, _) in zip(runs, followed, strict=True)
-            ]
-            again = {number: come for number, come in enumerate(coming) if come is not None}
-            for number, come in again.items():
-                _welcome(runs[number], come, first)
-            once_more = batches.follow(
-                [runs[number] for number in again], list(again.values()), chunk, frames
-            )
-            for number, result in zip(again, once_more, strict=True):
-                followed[number] = result
-            for run, (crew, info, looks) in zip(runs, followed, strict=True):
-                run.infos.append(info)
-                run.looks.append(looks)
-                run.crew = _without_holes(crew, run.infos)
-            advance(frames)
-    return [
-        Tracked(
-            info=_joined(run.infos, len(run.crew)),
-            sizes=jax.tree.map(np.asarray, run.crew.sizes),
-            looks=_joined(run.looks, len(run.crew)),
-            arrivals=tuple(run.arrivals),
-            compile_s=batches.compile_s / len(runs),
-        )
-        for run in runs
-    ]
-
-
-class _Batches:
-    """Follows runs, those of equal shape together; compiles for a shape when it is first seen."""
-
-    def __init__(
-        self,
-        place: _Place,
-        chunk_shape: tuple[int, int, int, int],
-        capacity: Mapping[tracker.Program, int],
-    ) -> None:
-        self.compile_s = 0.0
-        self._place = place
-        self._blank = np.zeros(chunk_shape, np.uint8)
-        self._capacity = capacity
-        self._compiled: set[tuple[tracker.Program, int]] = set()
-
-    def follow(
-        self, runs: Sequence[_Run], coming: Sequence[PlannedStarts | None], chunk: np.ndarray, frames: int
-    ) -> list[BatchResult]:
-        """Each run's crew after a chunk, and what is known of its frames, as NumPy arrays."""
-        shapes: dict[tuple[tracker.Program, int], list[int]] = {}
-        for number, run in enumerate(runs):
-            shapes.setdefault((run.program, len(run.crew)), []).append(number)
-        followed: dict[int, BatchResult] = {}
-        for shape, numbers in shapes.items():
-            crews = [runs[number].crew for number in numbers]
-            begin = [_begin(coming[number], shape[1]) for number in numbers]
-            if shape not in self._compiled:
-                self._compile(shape, crews[0])
-            results = self._follow(crews, begin, chunk, frames, shape[0])
-            followed |= dict(zip(numbers, results, strict=True))
-        return [followed[number] for number in range(len(runs))]
-
-    def _follow(
-        self,
-        crews: list[TrackedDrones],
-        begin: list[tracker.TrackStarts],
-        chunk: np.ndarray,
-        frames: int,
-        program: tracker.Program,
-    ) -> list[BatchResult]:
-        results = track_batch(
-            crews,
-            begin,
-            chunk,
-            frames,
-            self._place.cameras,
-            program,
-            capacity=self._capacity[program],
-            device=self._place.device,
-        )
-        return [
-            (crew, *jax.tree.map(lambda leaf: np.asarray(leaf)[:frames], (info, looks)))
-            for crew, info, looks in results
-        ]
-
-    def _compile(self, shape: tuple[tracker.Program, int], crew: TrackedDrones) -> None:
-        # Without iterations a chunk takes no time but the compiler's, which is how compiling is told from tracking.
-        began = time.perf_counter()
-        idle = replace(crew.params, num_iterations=jnp.int32(0), num_refinements=jnp.int32(0))
-        nobody = tracker.no_track_starts(shape[1])
-        self._follow([replace(crew, params=idle)], [nobody], self._blank, len(self._blank), shape[0])
-        self._compiled.add(shape)
-        self.compile_s += time.perf_counter() - began
+    return [(tracks, compile_s / num_used_devices(len(runs))) for tracks, compile_s in tracked]
 
 
 def on_device(cameras: Camera) -> Camera:
-    """The cameras in float32: what the tracker computes in."""
+    """The cameras in float32, in which the tracker computes."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), cameras)
 
 
-def _chunks(silhouettes: Silhouettes) -> Iterator[tuple[int, np.ndarray, int]]:
-    """First frame; a chunk, the last one filled up with empty frames; and the number of frames that count."""
-    for first in range(0, silhouettes.num_frames, CHUNK_FRAMES):
-        chunk = silhouettes.read(first, min(first + CHUNK_FRAMES, silhouettes.num_frames))
-        frames = len(chunk)
-        if frames < CHUNK_FRAMES:
-            chunk = np.concatenate([chunk, np.zeros((CHUNK_FRAMES - frames, *chunk.shape[1:]), np.uint8)])
-        yield first, chunk, frames
+def _kind(program: tracker.Program, settings: TrackerSettings) -> Hashable:
+    """What is compiled for a run, besides its number of drones: runs of one kind can be one batch."""
+    return program, jax.tree.structure(settings.search)
 
 
-def _begun(
-    start: InitialState, settings: TrackSettings, bounds_m: Float[np.ndarray, "2 3"], place: _Place
-) -> _Run:
-    program, params = tracker_inputs(place.reduction, start, settings, fps=place.fps, bounds_m=bounds_m)
-    position, velocity = (jnp.asarray(value, jnp.float32) for value in (start.position_m, start.velocity_m_s))
-    state = tracker.init(jax.random.key(settings.seed), position, velocity, params)
-    crew = TrackedDrones(state, params, _sizes(params.size_m, settings, program))
-    return _Run(settings, bounds_m, program, crew)
+def _track_through_chunks(
+    rig: CameraRig,
+    silhouettes: Silhouettes,
+    fps: float,
+    capacity: dict[Hashable, int],
+    inputs: list[RunInputs],
+    device: jax.Device,
+    report: Report,
+) -> list[tuple[Tracks, float]]:
+    """Track some runs together through all chunks, on one device."""
+    setting = _Setting(rig, on_device(rig.cameras), silhouettes.reduction, fps, device)
+    batches = _Batches(setting, (CHUNK_FRAMES, len(rig), *silhouettes.shape), capacity)
+    runs = [_begin(each, setting) for each in inputs]
+    with report("track", silhouettes.num_frames) as advance:
+        for first, coverage, num_frames in _chunks(silhouettes):
+            tracked = batches.track(runs, [None] * len(runs), coverage, num_frames)
+            planned = [
+                _plan_new_tracks(coverage[:num_frames], [*run.infos, info], run, setting)
+                for run, (_, info, _) in zip(runs, tracked, strict=True)
+            ]
+            again = {number: starts for number, starts in enumerate(planned) if starts is not None}
+            for number, starts in again.items():
+                _add_tracks(runs[number], starts, first)
+            tracked_again = batches.track(
+                [runs[number] for number in again], list(again.values()), coverage, num_frames
+            )
+            for number, result in zip(again, tracked_again, strict=True):
+                tracked[number] = result
+            for run, (drones, info, measured) in zip(runs, tracked, strict=True):
+                run.infos.append(info)
+                run.measured.append(measured)
+                run.drones = _without_false_tracks(drones, run.infos)
+            advance(num_frames)
+    return [(_tracks(run), batches.compile_s / len(runs)) for run in runs]
 
 
-def _sizes(size_m: Array, settings: TrackSettings, program: tracker.Program) -> SizeState:
-    pinned = not settings.learn_sizes or settings.drone_size_m is not None
-    return sizes.init(size_m, jnp.full(size_m.shape, pinned), program.score)
-
-
-def _begin(coming: PlannedStarts | None, num_drones: int) -> tracker.TrackStarts:
-    """The same for the tracker."""
-    if coming is None:
-        return tracker.no_track_starts(num_drones)
-    return tracker.TrackStarts(
-        frame=jnp.asarray(coming.begin_frame, jnp.int32),
-        position_m=jnp.asarray(coming.begin_position_m, jnp.float32),
-        velocity_m_s=jnp.asarray(coming.begin_velocity_m_s, jnp.float32),
+def _tracks(run: _Run) -> Tracks:
+    """The results of all chunks of a run."""
+    num_drones = len(run.drones)
+    learned = jax.tree.map(np.asarray, run.drones.sizes)
+    info, measured = _joined(run.infos, num_drones), _joined(run.measured, num_drones)
+    return Tracks(
+        **vars(info),
+        measured_size_m=np.asarray(measured.size_m),
+        sizes=DroneSizes(
+            learned.size_m, np.asarray(run.drones.sizes.std_m), learned.num_frames, learned.fill
+        ),
+        arrivals=tuple(run.arrivals),
     )
 
 
-def _coming(
-    chunk: np.ndarray, infos: list[tracker.TrackerInfo], run: _Run, place: _Place
+class _Batches:
+    """Tracks runs, those of equal shape together; compiles for a shape when it first occurs."""
+
+    def __init__(
+        self,
+        setting: _Setting,
+        chunk_shape: tuple[int, int, int, int],
+        capacity: dict[Hashable, int],
+    ) -> None:
+        self.compile_s = 0.0
+        self._setting = setting
+        self._blank = np.zeros(chunk_shape, np.uint8)
+        self._capacity = capacity
+        self._compiled: set[Hashable] = set()
+
+    def track(
+        self,
+        runs: Sequence[_Run],
+        planned: Sequence[PlannedStarts | None],
+        coverage: np.ndarray,
+        num_frames: int,
+    ) -> list[BatchResult]:
+        """Each run's drones after a chunk, and the info of the chunk's frames, as NumPy arrays."""
+        by_shape: dict[tuple[Hashable, int], list[int]] = {}
+        for number, run in enumerate(runs):
+            shape = (_kind(run.program, run.inputs.settings), len(run.drones))
+            by_shape.setdefault(shape, []).append(number)
+        results: dict[int, BatchResult] = {}
+        for shape, numbers in by_shape.items():
+            program, kind = runs[numbers[0]].program, shape[0]
+            on_this_device = partial(
+                track_batch,
+                cameras=self._setting.cameras,
+                program=program,
+                capacity=self._capacity[kind],
+                device=self._setting.device,
+            )
+            if shape not in self._compiled:
+                began = time.perf_counter()
+                # A chunk without iterations takes only the compiler's time: so compiling is told from tracking.
+                idle = _without_iterations(runs[numbers[0]].drones)
+                starts = tracker.no_track_starts(len(idle))
+                jax.block_until_ready(
+                    on_this_device([(idle, starts)], Chunk(self._blank, np.array(len(self._blank), np.int32)))
+                )
+                self._compiled.add(shape)
+                self.compile_s += time.perf_counter() - began
+            batch = [
+                (runs[number].drones, _track_starts(planned[number], len(runs[number].drones)))
+                for number in numbers
+            ]
+            tracked = on_this_device(batch, Chunk(coverage, np.array(num_frames, np.int32)))
+            for number, (drones, *frames) in zip(numbers, tracked, strict=True):
+                info, measured = jax.tree.map(lambda leaf: np.asarray(leaf)[:num_frames], frames)
+                results[number] = drones, info, measured
+        return [results[number] for number in range(len(runs))]
+
+
+def _without_iterations(drones: TrackedDrones) -> TrackedDrones:
+    return replace(drones, params=replace(drones.params, num_iterations=jnp.int32(0)))
+
+
+def _chunks(silhouettes: Silhouettes) -> Iterator[tuple[int, np.ndarray, int]]:
+    """First frame, coverage, and number of frames of each chunk; empty frames fill up the last chunk."""
+    for first in range(0, silhouettes.num_frames, CHUNK_FRAMES):
+        coverage = silhouettes.read(first, min(first + CHUNK_FRAMES, silhouettes.num_frames))
+        num_frames = len(coverage)
+        if num_frames < CHUNK_FRAMES:
+            empty = np.zeros((CHUNK_FRAMES - num_frames, *coverage.shape[1:]), np.uint8)
+            coverage = np.concatenate([coverage, empty])
+        yield first, coverage, num_frames
+
+
+def _begin(inputs: RunInputs, setting: _Setting) -> _Run:
+    """A run before the first frame."""
+    initial, settings = inputs.initial, inputs.settings
+    program = tracker_program(settings, setting.reduction)
+    params = tracker_params(settings, initial.size_m, fps=setting.fps, bounds_m=inputs.bounds_m)
+    position, velocity = (
+        jnp.asarray(value, jnp.float32) for value in (initial.position_m, initial.velocity_m_s)
+    )
+    state = tracker.init(jax.random.key(settings.seed), position, velocity, params)
+    drones = TrackedDrones(state, params, _initial_sizes(params.size_m, settings, program))
+    return _Run(inputs, program, drones)
+
+
+def _initial_sizes(size_m: Array, settings: TrackerSettings, program: tracker.Program) -> SizeState:
+    pinned = not settings.drones.learn_sizes or settings.drones.size_m is not None
+    return sizes.init(size_m, jnp.full(size_m.shape, pinned), len(program.windows))
+
+
+def _track_starts(planned: PlannedStarts | None, num_drones: int) -> tracker.TrackStarts:
+    """Planned starts as the tracker's arrays."""
+    if planned is None:
+        return tracker.no_track_starts(num_drones)
+    return tracker.TrackStarts(
+        frame=jnp.asarray(planned.begin_frame, jnp.int32),
+        position_m=jnp.asarray(planned.begin_position_m, jnp.float32),
+        velocity_m_s=jnp.asarray(planned.begin_velocity_m_s, jnp.float32),
+    )
+
+
+def _plan_new_tracks(
+    coverage: np.ndarray, infos: list[tracker.TrackerInfo], run: _Run, setting: _Setting
 ) -> PlannedStarts | None:
-    """Drones that come, or come back, in the last of the chunks that were tracked; None if there are none."""
-    settings, crew, fps, frames = run.settings, run.crew, place.fps, len(chunk)
-    size_m = np.asarray(crew.params.size_m, np.float64)
-    whole = _joined(infos, len(crew))
+    """Where tracks start, or start again, in the last chunk that was tracked; None if no track starts."""
+    settings, drones, fps = run.inputs.settings, run.drones, setting.fps
+    size_m = np.asarray(drones.params.size_m, np.float64)
+    whole = _joined(infos, len(drones))
     lost = find_lost_tracks(
         np.asarray(whole.position_m, np.float64),
         np.asarray(whole.velocity_m_s, np.float64),
         np.asarray(whole.status) == Status.TRACKED,
         size_m,
-        chunk_frames=frames,
+        chunk_frames=len(coverage),
         fps=fps,
     )
-    births = None if settings.drones is None else max(settings.drones - len(crew), 0)
-    if births == 0 and not len(lost.drone):
-        # Whatever is there is nobody; with noisy silhouettes to look at it takes long.
+    count = settings.drones.count
+    max_births = None if count is None else max(count - len(drones), 0)
+    if max_births == 0 and not len(lost.drone):
+        # No birth is allowed and no drone is lost, so the search would find nothing. It is slow on noisy silhouettes.
         return None
-    found = find_candidates(
-        place.rig.cameras,
-        chunk,
+    candidates = find_candidates(
+        setting.rig.cameras,
+        coverage,
         np.asarray(infos[-1].position_m, np.float64),
-        _explains(infos),
+        _known_well(infos),
         size_m,
-        reduction=place.reduction,
+        reduction=setting.reduction,
         fps=fps,
-        bounds_m=run.bounds_m,
-        max_speed_m_s=settings.max_speed_m_s,
+        bounds_m=run.inputs.bounds_m,
+        max_speed_m_s=settings.motion.max_speed_m_s,
     )
-    who = reidentify(
-        found,
+    assignment = reidentify(
+        candidates,
         lost,
         fps=fps,
-        bounds_m=run.bounds_m,
-        max_speed_m_s=settings.max_speed_m_s,
-        max_births=births,
+        bounds_m=run.inputs.bounds_m,
+        max_speed_m_s=settings.motion.max_speed_m_s,
+        max_births=max_births,
     )
-    coming = plan_starts(found, who, lost, len(crew))
-    return coming if (coming.begin_frame >= 0).any() else None
+    planned = plan_starts(candidates, assignment, lost, len(drones))
+    return planned if (planned.begin_frame >= 0).any() else None
 
 
-def _without_holes(crew: TrackedDrones, infos: list[tracker.TrackerInfo]) -> TrackedDrones:
-    """The crew without the tracks that turned out to be of no drone: they are sought no more."""
-    whole = _joined(infos, len(crew))
-    none = find_false_tracks(
+def _without_false_tracks(drones: TrackedDrones, infos: list[tracker.TrackerInfo]) -> TrackedDrones:
+    """The drones without the tracks that turned out to be of no drone: these are absent from now on."""
+    whole = _joined(infos, len(drones))
+    is_false = find_false_tracks(
         np.asarray(whole.position_m, np.float64),
         np.asarray(whole.status) == Status.TRACKED,
-        np.asarray(crew.params.size_m, np.float64),
+        np.asarray(drones.params.size_m, np.float64),
     )
-    return replace(crew, state=replace(crew.state, present=crew.state.present & ~jnp.asarray(none)))
+    present = drones.state.present & ~jnp.asarray(is_false)
+    return replace(drones, state=replace(drones.state, present=present))
 
 
-def _explains(infos: list[tracker.TrackerInfo]) -> Bool[np.ndarray, "frames drones"]:
-    """Where in the last chunk a drone is known well enough to explain foreground, as it is to claim some."""
+def _known_well(infos: list[tracker.TrackerInfo]) -> Bool[np.ndarray, "frames drones"]:
+    """In which frames of the last chunk a drone's position is known well enough to explain foreground.
+
+    The limit is the tracker's limit for occlusion: at most `MAX_OCCLUDING_FRAMES` since the drone was found.
+    """
     tracked = _joined(infos[-2:], infos[-1].status.shape[1]).status == Status.TRACKED
-    frames, recent = len(tracked), np.array(tracked)
-    for shift in range(1, tracker.MAX_CLAIMING_FRAMES + 1):
-        recent[shift:] |= tracked[: frames - shift]
-    return recent[frames - len(infos[-1].status) :]
+    num_frames, recent = len(tracked), np.array(tracked)
+    for shift in range(1, tracker.MAX_OCCLUDING_FRAMES + 1):
+        recent[shift:] |= tracked[: num_frames - shift]
+    return recent[num_frames - len(infos[-1].status) :]
 
 
-def _welcome(run: _Run, coming: PlannedStarts, first_frame: int) -> None:
-    """Make room in the crew for those that are born, absent yet; and tell people of all that come."""
-    num_known, settings, born = len(run.crew), run.settings, coming.born_size_m
-    if len(born):
-        if settings.drone_size_m is not None:
-            born = np.broadcast_to(np.array(settings.drone_size_m), born.shape)
-        crew = run.crew
-        size_m = jnp.concatenate([crew.params.size_m, jnp.asarray(born, jnp.float32)])
-        params = replace(crew.params, size_m=size_m, motion=motion_params(settings, len(size_m)))
-        added = _sizes(size_m[num_known:], settings, run.program)
-        run.crew = TrackedDrones(
-            tracker.with_added_tracks(crew.state, params), params, sizes.with_added_drones(crew.sizes, added)
+def _add_tracks(run: _Run, planned: PlannedStarts, first_frame: int) -> None:
+    """Add the drones that are new, absent until their first frame; note and log all starts."""
+    num_known, settings, born_m = len(run.drones), run.inputs.settings, planned.born_size_m
+    if len(born_m):
+        if settings.drones.size_m is not None:
+            born_m = np.broadcast_to(np.array(settings.drones.size_m), born_m.shape)
+        drones = run.drones
+        size_m = jnp.concatenate([drones.params.size_m, jnp.asarray(born_m, jnp.float32)])
+        params = replace(drones.params, size_m=size_m, motion=motion_params(settings.motion, len(size_m)))
+        added = _initial_sizes(size_m[num_known:], settings, run.program)
+        run.drones = TrackedDrones(
+            tracker.with_added_tracks(drones.state, params),
+            params,
+            sizes.with_added_drones(drones.sizes, added),
         )
-    run.arrivals += _named(coming, first_frame, num_known)
+    for drone in np.flatnonzero(planned.begin_frame >= 0).tolist():
+        arrival = Arrival(first_frame + int(planned.begin_frame[drone]), drone, again=drone < num_known)
+        logger.info("frame %d: drone %d %s", arrival.frame, drone, "is back" if arrival.again else "is new")
+        run.arrivals.append(arrival)
 
 
 def _joined(parts: list[Frames], num_drones: int) -> Frames:
-    """All frames of the parts; of drones that a part does not know nothing is known."""
+    """All frames of the parts; values of drones that a part does not have are unknown."""
 
     def filled(value: np.ndarray, name: str) -> np.ndarray:
         missing = [(0, 0), (0, num_drones - value.shape[1]), *[(0, 0)] * (value.ndim - 2)]
-        unknown = np.nan if value.dtype.kind == "f" else Status.LOST if name == "status" else 0
-        return np.pad(value, missing, constant_values=unknown)
+        return np.pad(value, missing, constant_values=unknown_value(name, value.dtype))
 
     return type(parts[0])(
         **{
@@ -411,13 +387,3 @@ def _joined(parts: list[Frames], num_drones: int) -> Frames:
             for each in fields(parts[0])
         }
     )
-
-
-def _named(coming: PlannedStarts, first_frame: int, num_known: int) -> list[Arrival]:
-    """What to tell people of those that come."""
-    arrivals = []
-    for drone in np.flatnonzero(coming.begin_frame >= 0).tolist():
-        arrival = Arrival(first_frame + int(coming.begin_frame[drone]), drone, again=drone < num_known)
-        logger.info("frame %d: drone %d %s", arrival.frame, drone, "is back" if arrival.again else "is new")
-        arrivals.append(arrival)
-    return arrivals

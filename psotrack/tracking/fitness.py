@@ -1,23 +1,27 @@
-"""The soft IoU of boxes against silhouettes: how well positions of drones explain what the cameras see.
+"""The score: how well positions of drones explain the silhouettes of all cameras, as a soft IoU of boxes.
 
-For one drone in one camera, with its box scaled about its middle by s (a window) and a larger ring that holds what
-foreground there is around it:
+For one drone in one camera, with the drone's box scaled about its middle by s (a window), and a larger ring that bounds
+the foreground around the drone:
 
     IoU_s = F_s / (A_s + F_ring - F_s)        score = mean over windows of IoU_s
 
-F is foreground and A is area, both inside the image and without the foreground that another drone claims: whether that
-is this drone's nobody knows. Foreground in the ring that the window leaves
-unexplained makes the union larger.
+F is foreground and A is area, both inside the image and without the foreground that another drone may cover. Foreground
+in the ring that the window does not contain makes the union larger.
 
-One window at s = 1 is the paper's overlap of box and silhouette: a plateau, because every box that holds the whole
-silhouette scores the same. Concentric windows, some smaller than the silhouette, have their maximum where the
-silhouette's middle is.
+One window at s = 1 is the paper's overlap of box and silhouette. That score is a plateau, because every box that holds
+the whole silhouette has the same score. Concentric windows, of which some are smaller than the silhouette, have their
+maximum where the silhouette's middle is.
+
+`Score` is the interface of a camera's score, `SoftIoU` the score of this package. Another score is any frozen, hashable
+object with the same attributes and method: given to `psotrack.track(..., score=...)`, or by name as an entry point of
+the group `psotrack.scores`, which maps `ScoreSettings` to a score.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -28,143 +32,198 @@ from psotrack.geometry import Boxes, Camera, Extents, make_extents, project_boxe
 from psotrack.silhouettes import box_sum, of_packed_box_sums
 from psotrack.tracking.patches import FULL, Patches, whole_images
 
-#: So much of a window's area counts in any case: little that agrees, where nearly all is claimed, is no full agreement.
+#: A window's area counts with at least this share of itself, so that a little foreground in a window that other drones
+#: cover nearly completely is no full agreement.
 LEAST_AREA = 0.7
-#: A camera that counts less does not see the drone.
+#: A camera of smaller weight does not see the drone.
 MIN_WEIGHT = 0.1
 
 
-@dataclass(frozen=True)
-class ScoreSettings:
-    """What is compiled in.
+@runtime_checkable
+class Score(Protocol):
+    """The score of positions in single cameras. Compiled in: frozen and hashable.
 
     Attributes:
-        windows: scales of the box that are compared with the foreground.
-        ring: scale of the box that bounds the foreground which belongs to the drone.
-        whole_pixels: round edges to whole pixels of the reduced silhouettes, as the paper's hard score does.
-        reduction: image pixels per silhouette pixel, along each side.
-        min_cameras: a drone that fewer cameras see has no score.
+        ring: scale of the largest box about a drone's position that the score reads.
+        whole_pixels: whether edges of boxes are rounded to whole pixels of the reduced silhouettes.
+        min_cameras: a drone that fewer cameras see has no fitness.
     """
 
-    windows: tuple[float, ...] = (0.4, 0.7, 1.0)
-    ring: float = 1.5
-    whole_pixels: bool = False
-    reduction: int = 4
-    min_cameras: int = 2
+    @property
+    def ring(self) -> float: ...  # noqa: D102
 
+    @property
+    def whole_pixels(self) -> bool: ...  # noqa: D102
 
-#: The baseline: one box with edges on whole pixels, as in the paper.
-PAPER_SCORE = ScoreSettings(windows=(1.0,), whole_pixels=True)
+    @property
+    def min_cameras(self) -> int: ...  # noqa: D102
+
+    def camera_scores(
+        self, inputs: ScoreInputs, position_m: Float[Array, "*batch drones 3"]
+    ) -> tuple[Float[Array, "*batch drones cameras"], Float[Array, "*batch drones cameras"]]:
+        """Scores in [0, 1] of every drone in every camera, and the weight of each camera in [0, 1]."""
+        ...
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ScoreInputs:
-    """What the score of one frame reads.
+    """What a score reads of one frame.
 
     Attributes:
-        extents: of the drones in the cameras.
+        extents: extents of the drones in the cameras.
         patches: the frame's silhouettes about the drones.
-        settings: static.
+        score: the score; static.
     """
 
     extents: Extents
     patches: Patches
-    settings: ScoreSettings = field(metadata={"static": True})
+    score: Score = field(metadata={"static": True})
+
+
+@dataclass(frozen=True)
+class SoftIoU:
+    """The mean soft IoU over concentric windows (see the module).
+
+    Attributes:
+        windows: scales of the box that are compared with the foreground.
+        ring: scale of the box that bounds the foreground which belongs to the drone.
+        whole_pixels: whether edges are rounded to whole pixels of the reduced silhouettes, as in the paper.
+        min_cameras: a drone that fewer cameras see has no fitness.
+    """
+
+    windows: tuple[float, ...] = (0.4, 0.7, 1.0)
+    ring: float = 1.5
+    whole_pixels: bool = False
+    min_cameras: int = 2
+
+    def camera_scores(
+        self, inputs: ScoreInputs, position_m: Float[Array, "*batch drones 3"]
+    ) -> tuple[Float[Array, "*batch drones cameras"], Float[Array, "*batch drones cameras"]]:
+        """See `Score`."""
+        boxes = project_boxes(inputs.extents, position_m)
+        patches, rounded = inputs.patches, self.whole_pixels
+        in_ring = _of_windows(patches, boxes, (self.ring,), lambda foreground, area: foreground, rounded)[0]
+
+        def iou(foreground: Array, area: Array) -> Array:
+            # Rounding alone can make the foreground of a window larger than that of the ring.
+            return foreground / jnp.maximum(area + jnp.maximum(in_ring - foreground, 0.0), 1e-6)
+
+        score = _of_windows(patches, boxes, self.windows, iou, rounded).mean(axis=0)
+        return score, camera_weights(inputs, boxes)
+
+
+#: The paper's score: one box with edges on whole pixels.
+PAPER_SCORE = SoftIoU(windows=(1.0,), whole_pixels=True)
 
 
 def score_inputs(
     cameras: Camera,
     size_m: Float[Array, "drones 3"],
     tables: Tables,
-    settings: ScoreSettings,
+    score: Score,
+    *,
+    reduction: int,
     offset_m: Float[Array, "drones 3"] | None = None,
 ) -> ScoreInputs:
-    """The scene of one frame, all of its images, for drones of these sizes and offsets (see `boxes.extents`)."""
-    return ScoreInputs(
-        make_extents(cameras, size_m, offset_m), whole_images(tables, settings.reduction), settings
-    )
+    """What the score reads of the whole images of one frame.
+
+    Args:
+        cameras: with one leading axis.
+        size_m: (drones, 3), full lengths of the drones, metres.
+        tables: (height + 1, cameras, width + 1), summed-area tables of the silhouettes.
+        score: the score.
+        reduction: image pixels per silhouette pixel, along each side.
+        offset_m: (drones, 3), from each drone's position to the middle of its extent (see `geometry.boxes.extents`).
+    """
+    return ScoreInputs(make_extents(cameras, size_m, offset_m), whole_images(tables, reduction), score)
+
+
+def foreground_and_area(
+    inputs: ScoreInputs, boxes: Boxes, scales: tuple[float, ...]
+) -> tuple[Float[Array, "scales *batch"], Float[Array, "scales *batch"]]:
+    """Foreground in boxes that are scaled about their middles, and the area of these boxes, in pixels of the patches.
+
+    Both are cut at the image's border, and without the foreground that another drone may cover.
+    """
+    rounded = inputs.score.whole_pixels
+    foreground = _of_windows(inputs.patches, boxes, scales, lambda foreground, area: foreground, rounded)
+    return foreground, _of_windows(inputs.patches, boxes, scales, lambda foreground, area: area, rounded)
+
+
+def camera_weights(inputs: ScoreInputs, boxes: Boxes) -> Float[Array, "*batch drones cameras"]:
+    """Weight of each camera: the share of the box inside the image (0 behind the camera) times its unoccluded share."""
+    return inputs.patches.clear * _share_in_image(inputs.patches, boxes)
 
 
 def camera_scores(
-    score_inputs: ScoreInputs, position_m: Float[Array, "*batch drones 3"]
+    inputs: ScoreInputs, position_m: Float[Array, "*batch drones 3"]
 ) -> tuple[Float[Array, "*batch drones cameras"], Float[Array, "*batch drones cameras"]]:
-    """Soft IoU of every drone in every camera, and how much each camera counts.
+    """Scores in [0, 1] of every drone in every camera, and the weight of each camera, as `inputs.score` defines them.
 
     Args:
-        score_inputs: of one frame, for as many drones.
-        position_m: (..., drones, 3), world.
-
-    Returns:
-        Scores in [0, 1]; and weights: the share of the drone's box that lies inside the image (0 behind the camera),
-        times the share that no other drone claims.
+        inputs: of one frame.
+        position_m: (..., drones, 3), positions of the drones, world, metres.
     """
-    boxes = project_boxes(score_inputs.extents, position_m)
-    in_ring = _of_windows(
-        score_inputs, boxes, (score_inputs.settings.ring,), lambda foreground, area: foreground
-    )[0]
-
-    def iou(foreground: Array, area: Array) -> Array:
-        # The inner maximum is for rounding alone: a window may hold a hair more than the ring.
-        return foreground / jnp.maximum(area + jnp.maximum(in_ring - foreground, 0.0), 1e-6)
-
-    score = _of_windows(score_inputs, boxes, score_inputs.settings.windows, iou).mean(axis=0)
-    return score, score_inputs.patches.clear * _share_in_image(score_inputs, boxes)
+    return inputs.score.camera_scores(inputs, position_m)
 
 
-def filled(
-    score_inputs: ScoreInputs, position_m: Float[Array, "*batch drones 3"]
+def filled_share(
+    inputs: ScoreInputs, position_m: Float[Array, "*batch drones 3"]
 ) -> Float[Array, "*batch drones cameras"]:
     """Share of every drone's box that is foreground; 0 where most of the box is outside the image."""
-    boxes = project_boxes(score_inputs.extents, position_m)
+    boxes = project_boxes(inputs.extents, position_m)
+    rounded = inputs.score.whole_pixels
     share = _of_windows(
-        score_inputs, boxes, (1.0,), lambda foreground, area: foreground / jnp.maximum(area, 1e-6)
+        inputs.patches,
+        boxes,
+        (1.0,),
+        lambda foreground, area: foreground / jnp.maximum(area, 1e-6),
+        rounded,
     )
-    return jnp.where(_share_in_image(score_inputs, boxes) > 0.5, share[0], 0.0)
+    return jnp.where(_share_in_image(inputs.patches, boxes) > 0.5, share[0], 0.0)
 
 
 def drone_fitness(
-    score_inputs: ScoreInputs, position_m: Float[Array, "*batch drones 3"]
+    inputs: ScoreInputs, position_m: Float[Array, "*batch drones 3"]
 ) -> Float[Array, "*batch drones"]:
-    """Fitness of each drone: the mean of its scores over the cameras that see it; NaN where too few do.
+    """Fitness of each drone: the weighted mean of its scores over the cameras; NaN where too few cameras see it.
 
-    A camera counts by the share of the box that its image holds, so that the fitness stays continuous at the border,
-    and by the share that is clear of other drones. Cameras that hardly count do not see it; nor do many that each
-    count for little, if together they are less than half of the least number.
+    A camera's weight is the share of the box inside the image, so that the fitness is continuous at the border, times
+    the share that is clear of other drones. A camera of less weight than `MIN_WEIGHT` does not see the drone. Neither
+    do several cameras of small weight, if the sum of their weights is less than half of the least number of cameras.
     """
-    score, weight = camera_scores(score_inputs, position_m)
+    score, weight = camera_scores(inputs, position_m)
     total = weight.sum(axis=-1)
     mean = (weight * score).sum(axis=-1) / jnp.maximum(total, 1e-6)
-    least = score_inputs.settings.min_cameras
+    least = inputs.score.min_cameras
     enough = ((weight > MIN_WEIGHT).sum(axis=-1) >= least) & (total > least / 2)
     return jnp.where(enough, mean, jnp.nan)
 
 
-def joint_fitness(
-    score_inputs: ScoreInputs, position_m: Float[Array, "*batch drones 3"]
-) -> Float[Array, "*batch"]:
-    """Mean fitness over all drones, the paper's. A drone without a score counts 0: losing one is no gain."""
-    return jnp.nan_to_num(drone_fitness(score_inputs, position_m)).mean(axis=-1)
+def joint_fitness(inputs: ScoreInputs, position_m: Float[Array, "*batch drones 3"]) -> Float[Array, "*batch"]:
+    """Mean fitness over all drones, the paper's. A drone without fitness counts 0, so losing a drone gains nothing."""
+    return jnp.nan_to_num(drone_fitness(inputs, position_m)).mean(axis=-1)
 
 
 def _of_windows(
-    score_inputs: ScoreInputs, boxes: Boxes, scales: tuple[float, ...], then: Callable[[Array, Array], Array]
+    patches: Patches,
+    boxes: Boxes,
+    scales: tuple[float, ...],
+    then: Callable[[Array, Array], Array],
+    whole_pixels: bool = False,
 ) -> Float[Array, "scales *batch"]:
-    """What follows from foreground and area of the boxes scaled about their middles and cut at the image.
+    """`then(foreground, area)` of the boxes scaled about their middles and cut at the image.
 
-    Both are in pixels of the patches, without the foreground that is claimed.
+    Foreground and area are in pixels of the patches, without the foreground that other drones may cover.
     """
-    patches = score_inputs.patches
 
     def interval(middle: Array, half: Array, length_px: int, first_px: Array) -> tuple[Array, Array]:
         half = jnp.asarray(scales, half.dtype).reshape(-1, *[1] * half.ndim) * half
         ends = [jnp.clip(end, 0, length_px) for end in (middle - half, middle + half)]
-        if score_inputs.settings.whole_pixels:
-            # Of the silhouettes as they are, however coarse the window is.
-            ends = [
-                score_inputs.settings.reduction * jnp.round(end / score_inputs.settings.reduction)
-                for end in ends
-            ]
+        if whole_pixels:
+            # Whole pixels of the silhouettes, however coarse the window is.
+            ends = [patches.reduction * jnp.round(end / patches.reduction) for end in ends]
         low, high = ((end - first_px) / patches.pixel_px for end in ends)
         return low, high
 
@@ -174,14 +233,14 @@ def _of_windows(
     if not patches.packed:
         return then(box_sum(patches.tables, patches.number, x0, y0, x1, y1) / FULL, area)
 
-    def of_sums(foreground: Array, claimed: Array, area: Array) -> Array:
-        return then(foreground / FULL, jnp.maximum(area - claimed, LEAST_AREA * area))
+    def of_sums(foreground: Array, occluded: Array, area: Array) -> Array:
+        return then(foreground / FULL, jnp.maximum(area - occluded, LEAST_AREA * area))
 
     return of_packed_box_sums(of_sums, patches.tables, patches.number, x0, y0, x1, y1, area)
 
 
-def _share_in_image(score_inputs: ScoreInputs, boxes: Boxes) -> Float[Array, "*batch drones cameras"]:
-    width_px, height_px = score_inputs.patches.size_wh_px
+def _share_in_image(patches: Patches, boxes: Boxes) -> Float[Array, "*batch drones cameras"]:
+    width_px, height_px = patches.size_wh_px
 
     def inside(middle: Array, half: Array, length_px: int) -> Array:
         return jnp.clip(middle + half, 0, length_px) - jnp.clip(middle - half, 0, length_px)

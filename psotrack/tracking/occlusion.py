@@ -1,7 +1,7 @@
-"""Whose foreground it is: what neighbours are expected to cover of a drone's window.
+"""Occlusion: the foreground in a drone's window that other drones are expected to cover.
 
-A neighbour claims its ellipse, a little enlarged. Claimed foreground is no evidence of this drone, except in the core
-of its own ellipse, which it is expected to cover itself.
+Every other drone is taken to cover an ellipse a little larger than its own. Foreground in that ellipse says nothing
+about this drone, except in the core of this drone's own ellipse, which this drone is expected to cover itself.
 """
 
 from __future__ import annotations
@@ -16,78 +16,78 @@ from jaxtyping import Bool, Float, Int
 from psotrack._typing import Array
 from psotrack.geometry import Boxes
 
-#: Other drones that are looked at, per drone and camera: those whose ellipses come nearest.
+#: Largest number of other drones that are considered per drone and camera: those whose ellipses are nearest.
 NUM_NEIGHBOURS = 3
-#: What a drone claims is that much larger than its ellipse along each axis: outlines are no ellipses.
-CLAIM = 1.15
-#: Where this drone is expected to cover what is claimed: its ellipse, that much smaller along each axis.
-CORE = 0.7
-#: Points of an ellipse that are asked about: a power of two, so that shares of them are exact.
+#: Scale of the ellipse that an occluding drone is taken to cover: outlines of drones are no ellipses.
+OCCLUDER_SCALE = 1.15
+#: Scale of the ellipse in which this drone's own foreground always counts.
+CORE_SCALE = 0.7
+#: Points of an ellipse that are tested for occlusion: a power of two, so that shares of them are exact.
 _NUM_POINTS = 128
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Claims:
-    """The ellipses that claim from every drone in every camera, nearest first.
+class Occluders:
+    """Ellipses of other drones that may cover each drone in each camera, nearest first.
 
     Attributes:
-        x_middle, y_middle, x_half, y_half: in pixels of the image.
-        near: whether there is one of this rank.
+        x_middle, y_middle, x_half, y_half: middles and half lengths of the ellipses, image pixels.
+        exists: whether there is an ellipse of this rank.
     """
 
     x_middle: Float[Array, "ranks drones cameras"]
     y_middle: Float[Array, "ranks drones cameras"]
     x_half: Float[Array, "ranks drones cameras"]
     y_half: Float[Array, "ranks drones cameras"]
-    near: Bool[Array, "ranks drones cameras"]
+    exists: Bool[Array, "ranks drones cameras"]
 
     def cover(
         self, x_px: Float[Array, "drones cameras *#points"], y_px: Float[Array, "drones cameras *#points"]
     ) -> Bool[Array, "ranks drones cameras *points"]:
-        """Which points of the image, some for every drone and camera, are in each of the ellipses."""
+        """Which image points, several per drone and camera, lie in each of the ellipses."""
         inner = (slice(None),) * 3 + (None,) * (x_px.ndim - 2)
         distance2 = ellipse_distance2(
             x_px, y_px, self.x_middle[inner], self.y_middle[inner], self.x_half[inner], self.y_half[inner]
         )
-        return (distance2 < 1) & self.near[inner]
+        return (distance2 < 1) & self.exists[inner]
 
 
 def ellipse_distance2(
     x_px: Array, y_px: Array, x_middle: Array, y_middle: Array, x_half: Array, y_half: Array
 ) -> Array:
-    """Squared distance from an ellipse's middle, in its halves: 1 is on the ellipse."""
+    """Squared distance from an ellipse's middle in units of its half lengths: 1 is on the ellipse."""
     return jnp.square((x_px - x_middle) / x_half) + jnp.square((y_px - y_middle) / y_half)
 
 
-def claims_on(
-    boxes: Boxes, *, claiming: Bool[Array, "drones"], pixel_px: Float[Array, "drones cameras"]
-) -> Claims:
-    """What is claimed from each drone in each camera.
+def find_occluders(
+    boxes: Boxes, *, occluding: Bool[Array, "drones"], pixel_px: Float[Array, "drones cameras"]
+) -> Occluders:
+    """The ellipses of other drones that may cover each drone in each camera.
 
     Args:
-        boxes: of the drones where they are expected.
-        claiming: (drones,), whether a drone's expected place is good enough to claim foreground.
-        pixel_px: pixels of the image per pixel of the drone's window. A claim takes every pixel that it touches.
+        boxes: boxes of the drones at their expected positions.
+        occluding: (drones,), whether a drone's expected position is certain enough to occlude other drones.
+        pixel_px: image pixels per pixel of the drone's window. An ellipse covers every pixel that it touches.
     """
-    drones = claiming.shape[0]
-    order, near = _nearest(boxes, claiming & ~jnp.eye(drones, dtype=bool), min(NUM_NEIGHBOURS, drones - 1))
+    drones = occluding.shape[0]
+    order, exists = _nearest(boxes, occluding & ~jnp.eye(drones, dtype=bool), min(NUM_NEIGHBOURS, drones - 1))
 
     def of_order(of: Array) -> Array:
         return jnp.take_along_axis(of[:, None], order, axis=0)
 
-    return Claims(
+    return Occluders(
         x_middle=of_order(boxes.x_middle),
         y_middle=of_order(boxes.y_middle),
-        x_half=of_order(CLAIM * boxes.x_half) + pixel_px / 2,
-        y_half=of_order(CLAIM * boxes.y_half) + pixel_px / 2,
-        near=near,
+        x_half=of_order(OCCLUDER_SCALE * boxes.x_half) + pixel_px / 2,
+        y_half=of_order(OCCLUDER_SCALE * boxes.y_half) + pixel_px / 2,
+        exists=exists,
     )
 
 
-def clear_share(claims: Claims, boxes: Boxes) -> Float[Array, "drones cameras"]:
-    """Share of each drone's ellipse that no other drone claims, however small it is in the image."""
-    # Evenly spread over the disc (Vogel's spiral).
+def unoccluded_share(occluders: Occluders, boxes: Boxes) -> Float[Array, "drones cameras"]:
+    """Share of each drone's ellipse that no other drone covers, however small the ellipse is in the image."""
+    # Points are spread evenly over the disc (Vogel's spiral).
     rank = np.arange(_NUM_POINTS)
     radius, angle = np.sqrt((rank + 0.5) / _NUM_POINTS), np.pi * (3 - 5**0.5) * rank
     x_px, y_px = (
@@ -97,20 +97,20 @@ def clear_share(claims: Claims, boxes: Boxes) -> Float[Array, "drones cameras"]:
             (boxes.y_middle, boxes.y_half, radius * np.sin(angle)),
         )
     )
-    taken = jnp.any(claims.cover(x_px, y_px), axis=0)
-    return 1 - jnp.sum(taken, axis=-1, dtype=jnp.float32) / _NUM_POINTS
+    covered = jnp.any(occluders.cover(x_px, y_px), axis=0)
+    return 1 - jnp.sum(covered, axis=-1, dtype=jnp.float32) / _NUM_POINTS
 
 
 def _nearest(
-    boxes: Boxes, claiming: Bool[Array, "drones others"], ranks: int
+    boxes: Boxes, occluding: Bool[Array, "drones others"], ranks: int
 ) -> tuple[Int[Array, "ranks drones cameras"], Bool[Array, "ranks drones cameras"]]:
-    """Which of the others that claim come nearest to every drone in every camera, and whether there are as many."""
+    """For every drone and camera the nearest occluding drones, and whether there is one of each rank."""
 
     def gap2(middle: Array, half: Array) -> Array:
         return jnp.square((middle - middle[:, None]) / jnp.maximum(half[:, None] + half, 1e-3))
 
     gap = gap2(boxes.x_middle, boxes.x_half) + gap2(boxes.y_middle, boxes.y_half)
-    gap = jnp.where(claiming[..., None] & boxes.in_front, gap, jnp.inf)
+    gap = jnp.where(occluding[..., None] & boxes.in_front, gap, jnp.inf)
     order = jnp.argsort(gap, axis=1)[:, :ranks]
-    near = jnp.isfinite(jnp.take_along_axis(gap, order, axis=1))
-    return jnp.swapaxes(order, 0, 1), jnp.swapaxes(near, 0, 1)
+    exists = jnp.isfinite(jnp.take_along_axis(gap, order, axis=1))
+    return jnp.swapaxes(order, 0, 1), jnp.swapaxes(exists, 0, 1)

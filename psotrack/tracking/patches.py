@@ -1,14 +1,15 @@
-"""What each camera shows around each drone: small windows of the silhouettes, cut where the drones are expected.
+"""Patches: what each camera shows around each drone, small windows of the silhouettes where drones are expected.
 
-A window is as coarse as it must be to hold drone, ring and search in `SIDE` pixels: silhouettes are halved for drones
-that are near. All that the swarm reads is then a few kilobytes per drone and camera, however large the image is.
+A window is coarse enough to hold the drone, the ring around it and the search in `SIDE` pixels: silhouettes are halved
+for drones that are near. So the swarm reads only a few kilobytes per drone and camera, however large the image is.
 
-Drones share images. Foreground that something else is expected to cover (see `claims`) is kept apart in the window: it
-may be this drone's or not, so it counts neither for nor against it. And the camera counts less by as much of the drone
-as other drones claim. So no drone can live on another's silhouette.
+Drones share images. Foreground that another drone is expected to cover (see `occlusion`) is counted apart in the
+window: it may be this drone's or not, so it counts neither for nor against this drone. The camera's weight is reduced
+by the share of the drone that other drones may cover. So no drone can be placed on another drone's silhouette.
 
-Foreground before floor that is in shadow (see `shadows`) would be there without the drone. Its place is taken by the
-drone as it is expected: what is below must balance what is above, or the place would be drawn to one side.
+Foreground in front of floor that is in shadow (see `shadows`) would be there without the drone too. It is replaced by
+the foreground that is usual at that place of a drone's box: without any foreground below the drone, the drone would
+be drawn upwards.
 """
 
 from __future__ import annotations
@@ -23,37 +24,44 @@ from jaxtyping import Bool, Float, Int
 from psotrack._typing import Array, Coverage, Positions, Tables
 from psotrack.geometry import Boxes, Extents, project_boxes
 from psotrack.silhouettes import pack, summed_area_table
-from psotrack.tracking.occlusion import CORE, Claims, claims_on, clear_share, ellipse_distance2
-from psotrack.tracking.shadows import low, shadowed
+from psotrack.tracking.occlusion import (
+    CORE_SCALE,
+    Occluders,
+    ellipse_distance2,
+    find_occluders,
+    unoccluded_share,
+)
+from psotrack.tracking.shadows import FloorView, is_low, shadowed_pixels
 
 #: Pixels of a window, along each side.
 SIDE = 64
-#: Silhouettes as they are, halved, halved again ...
+#: Levels of the image pyramid: silhouettes as they are, halved, halved again ...
 NUM_LEVELS = 4
 #: x and y of all pixels of windows, (drones, cameras, 1, side) and (drones, cameras, side, 1).
 Middles = tuple[Float[Array, "drones cameras 1 side"], Float[Array, "drones cameras side 1"]]
 
-#: What one fully covered pixel of the silhouettes counts.
+#: Value of a fully covered pixel of the silhouettes.
 FULL = 255
-#: How full of foreground a drone's box is, from its middle to its border and beyond: all, less by the distance (in
-#: halves of the box, along the farther axis), none from here on. Silhouettes of four quadrotors fill 0.8 to 0.9, 0.6 to
-#: 0.7 and 0.4 to 0.5 of boxes of scale 0.4, 0.7 and 1; this, 0.83, 0.63 and 0.43.
+#: How full of foreground a drone's box is: this number less the distance from the box's middle (in half lengths of the
+#: box, along the farther axis). Silhouettes of four quadrotors fill 0.8 to 0.9, 0.6 to 0.7 and 0.4 to 0.5 of boxes of
+#: scale 0.4, 0.7 and 1; this model 0.83, 0.63 and 0.43.
 _EMPTY = 1.1
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Patches:
-    """The windows of all drones in all cameras; the axis of drones is 1 where they share whole images.
+    """The windows of all drones in all cameras; the axis of drones is 1 where the drones share whole images.
 
     Attributes:
-        tables: (height + 1, windows, width + 1), summed-area tables; window (drone, camera) is the
-            (drone x cameras + camera)-th. A fully covered pixel counts `FULL`.
-        x_px, y_px: left and upper edges in the image.
-        pixel_px: pixels of the image per pixel of the window, along each side.
-        clear: share of the drone's ellipse that no other drone claims.
-        size_wh_px: of the part of the image that silhouettes cover.
-        packed: whether tables hold, beside the foreground, how many pixels of claimed foreground there are.
+        tables: (height + 1, windows, width + 1), summed-area tables; window (drone, camera) has the number
+            drone x cameras + camera. A fully covered pixel has the value `FULL`.
+        x_px, y_px: left and upper edges of the windows in the image.
+        pixel_px: image pixels per pixel of the window, along each side.
+        clear: share of the drone's ellipse that no other drone may cover.
+        size_wh_px: width and height of the part of the image that silhouettes cover.
+        reduction: image pixels per silhouette pixel, along each side.
+        packed: whether the tables also count the pixels of occluded foreground.
     """
 
     tables: Int[Array, "height1 windows width1"]
@@ -62,88 +70,87 @@ class Patches:
     pixel_px: Float[Array, "*drones cameras"]
     clear: Float[Array, "*drones cameras"]
     size_wh_px: tuple[int, int] = field(metadata={"static": True})
+    reduction: int = field(metadata={"static": True})
     packed: bool = field(metadata={"static": True})
 
     @property
     def number(self) -> Int[Array, "*drones cameras"]:
-        """Which table each window is."""
+        """The number of each window's table."""
         return jnp.arange(self.tables.shape[1]).reshape(self.x_px.shape)
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ExpectedDrones:
+    """Where windows are cut.
+
+    Attributes:
+        position_m: (drones, 3), expected positions, metres.
+        reach_m: (drones,), distance from there within which a drone is searched for, metres.
+        occluding: (drones,), whether a drone's expected position is certain enough to occlude other drones; None where
+            no drone occludes another.
+        floor_z_m: height of the floor on which occluding drones cast shadows, metres; None where they cast none.
+    """
+
+    position_m: Positions
+    reach_m: Float[Array, "drones"]
+    occluding: Bool[Array, "drones"] | None = None
+    floor_z_m: Float[Array, ""] | None = None
+
+
 def whole_images(tables: Tables, reduction: int) -> Patches:
-    """Windows that all drones share: the whole image of each camera, with nothing claimed."""
+    """The whole image of each camera as a window that all drones share, without occlusion."""
     height1, cameras, width1 = tables.shape
     zero, one = jnp.zeros((1, cameras)), jnp.ones((1, cameras))
     size_wh = ((width1 - 1) * reduction, (height1 - 1) * reduction)
-    return Patches(tables, zero, zero, reduction * one, one, size_wh, packed=False)
+    return Patches(tables, zero, zero, reduction * one, one, size_wh, reduction, packed=False)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class _Grid:
-    """Where windows lie in the pyramid: rows and columns of their pixels at their level."""
+    """Places of the windows in the pyramid: rows and columns of their pixels at their level."""
 
     level: Int[Array, "drones cameras"]
     row: Int[Array, "drones cameras side"]
     column: Int[Array, "drones cameras side"]
 
     def middles_px(self, pixel_px: Float[Array, "drones cameras"]) -> Middles:
-        """In pixels of the image, to be broadcast against one another."""
+        """x and y of the pixels' middles in the image, in shapes that broadcast against each other."""
         x_px, y_px = ((of.astype(jnp.float32) + 0.5) * pixel_px[..., None] for of in (self.column, self.row))
         return x_px[..., None, :], y_px[..., :, None]
 
 
 def cut(
-    coverage: Coverage,
-    seen: Extents,
-    expected_m: Positions,
-    *,
-    reach_m: Float[Array, "drones"],
-    claiming: Bool[Array, "drones"] | None,
-    reduction: int,
-    ring: float,
-    floor_z_m: Float[Array, ""] | None = None,
+    coverage: Coverage, extents: Extents, expected: ExpectedDrones, *, reduction: int, ring: float
 ) -> Patches:
     """The windows of one frame.
 
     Args:
         coverage: (cameras, height, width), 0..255, silhouettes reduced by `reduction`.
-        seen: the drones' extents in the cameras.
-        expected_m: (drones, 3), where the drones are expected.
-        reach_m: (drones,), how far from there they are searched for.
-        claiming: (drones,), whether a drone's expected place is good enough to claim foreground; None: nobody claims.
+        extents: the drones' extents in the cameras.
+        expected: where the drones are expected.
         reduction: image pixels per silhouette pixel, along each side.
-        ring: scale of the largest window that is scored.
-        floor_z_m: height of the floor on which drones that claim cast shadows; None: they cast none.
+        ring: scale of the largest box that is scored.
     """
-    boxes = project_boxes(seen, expected_m)
-    grid = _grid(boxes, seen, reach_m, reduction, ring)
+    boxes = project_boxes(extents, expected.position_m)
+    grid = _grid(boxes, extents, expected.reach_m, reduction, ring)
     pixel_px = _pixel_px(grid.level, reduction)
     value = _read(_pyramid(coverage), coverage.shape, grid)
     clear: Array = jnp.ones(pixel_px.shape)
-    # With nobody to claim there is nothing to keep apart: the swarm then reads plain tables.
-    packed = claiming is not None and len(expected_m) > 1
-    if claiming is not None:
-        claims = claims_on(boxes, claiming=claiming, pixel_px=pixel_px)
+    # Without other drones nothing is counted apart: the swarm then reads plain tables.
+    packed = expected.occluding is not None and len(expected.position_m) > 1
+    if expected.occluding is not None:
+        occluders = find_occluders(boxes, occluding=expected.occluding, pixel_px=pixel_px)
         at_px = grid.middles_px(pixel_px)
         shown = value
-        if floor_z_m is not None:
-            shown = _beside_shadows(
-                value,
-                coverage,
-                seen,
-                claims,
-                expected_m,
-                at_px,
-                claiming=claiming,
-                floor_z_m=floor_z_m,
-                reduction=reduction,
-            )
+        if expected.floor_z_m is not None:
+            shown = _without_shadows(value, coverage, extents, occluders, expected, at_px, reduction)
         if packed:
-            clear = clear_share(claims, boxes)
-            claimed = _claimed(claims, boxes, at_px)
-            # Half covered is covered: what is claimed is only counted.
-            shown = pack(jnp.where(claimed, 0, shown), claimed & (2 * value > FULL))
+            clear = unoccluded_share(occluders, boxes)
+            occluded = _occluded(occluders, boxes, at_px)
+            # Occluded foreground is only counted: a pixel that is half covered or more counts as foreground.
+            shown = pack(jnp.where(occluded, 0, shown), occluded & (2 * value > FULL))
         value = shown
     return Patches(
         tables=summed_area_table(value.reshape(-1, SIDE, SIDE)),
@@ -152,22 +159,25 @@ def cut(
         pixel_px=pixel_px,
         clear=clear,
         size_wh_px=(reduction * coverage.shape[2], reduction * coverage.shape[1]),
+        reduction=reduction,
         packed=packed,
     )
 
 
-def _grid(boxes: Boxes, seen: Extents, reach_m: Float[Array, "drones"], reduction: int, ring: float) -> _Grid:
-    """The finest level at which ring and search fit into a window, and the window about the expected middle."""
+def _grid(
+    boxes: Boxes, extents: Extents, reach_m: Float[Array, "drones"], reduction: int, ring: float
+) -> _Grid:
+    """The finest level at which ring and search region fit into a window about the expected position."""
     half_px = jnp.maximum(boxes.x_half, boxes.y_half)
-    # Pixels per metre at the drone, from its own size: the ellipse's largest half.
-    half_m = jnp.sqrt(jnp.maximum(jnp.maximum(seen.s_xx, seen.s_yy), 1e-6))
+    # Half length of the drone that appears as the larger half length of its ellipse: it gives pixels per metre.
+    half_m = jnp.sqrt(jnp.maximum(jnp.maximum(extents.s_xx, extents.s_yy), 1e-6))
     wanted = (ring * half_px + reach_m[:, None] * half_px / half_m) / reduction
-    # The middle lies anywhere in the pixel that is right of the window's own middle: one pixel less on that side.
+    # The expected middle lies anywhere in the pixel to the right of the window's middle: one pixel less on that side.
     level = jnp.ceil(jnp.log2(jnp.maximum(wanted, 1.0) / (SIDE / 2 - 1)))
     level = jnp.where(boxes.in_front, jnp.clip(level, 0, NUM_LEVELS - 1), 0).astype(jnp.int32)
 
     def line(middle_px: Array) -> Array:
-        # What is not in front of the camera has its window off the image, where there is nothing.
+        # A drone behind the camera gets a window outside of the image, where there is no foreground.
         middle = jnp.where(boxes.in_front, middle_px, -1e5) / _pixel_px(level, reduction)
         first = jnp.clip(jnp.floor(middle), -1e5, 1e5).astype(jnp.int32) - SIDE // 2
         return first[..., None] + jnp.arange(SIDE)
@@ -181,10 +191,10 @@ def _pixel_px(level: Int[Array, "drones cameras"], reduction: int) -> Float[Arra
 
 
 def _pyramid(coverage: Coverage) -> Int[Array, "pixels"]:
-    """All levels of all cameras, one after the other: means, rounded once from exact sums."""
+    """All levels of all cameras in one array, level after level: means, rounded once from exact sums."""
     step = 2 ** (NUM_LEVELS - 1)
     _, height, width = coverage.shape
-    # Boxes end at the image's border, which may divide a coarse pixel. Its share beyond looks like the share inside.
+    # Boxes end at the image's border, which may lie inside a coarse pixel: beyond the border the image is repeated.
     beyond = [(0, 0), (0, -height % step), (0, -width % step)]
     image = jnp.pad(coverage, beyond, mode="edge").astype(jnp.int32)
     levels = [image]
@@ -198,7 +208,7 @@ def _pyramid(coverage: Coverage) -> Int[Array, "pixels"]:
 def _read(
     pyramid: Int[Array, "pixels"], shape: tuple[int, ...], grid: _Grid
 ) -> Int[Array, "drones cameras side side"]:
-    """The windows' pixels; nothing outside of the image and its padding."""
+    """The windows' pixels; 0 outside of the image and its padding."""
     num_cameras, height, width = shape
     step = 2 ** (NUM_LEVELS - 1)
     heights, widths = (
@@ -216,45 +226,44 @@ def _read(
     return jnp.where(row_inside[..., None] & column_inside[..., None, :], value, 0)
 
 
-def _claimed(claims: Claims, boxes: Boxes, at_px: Middles) -> Bool[Array, "drones cameras side side"]:
-    """The pixels whose middles are claimed and not in the drone's core."""
+def _occluded(occluders: Occluders, boxes: Boxes, at_px: Middles) -> Bool[Array, "drones cameras side side"]:
+    """The pixels whose middles other drones may cover and that are not in the drone's core."""
     own = [of[..., None, None] for of in (boxes.x_middle, boxes.y_middle, boxes.x_half, boxes.y_half)]
-    beyond_core = ellipse_distance2(*at_px, *own) >= CORE**2
-    return claims.cover(*at_px).any(axis=0) & beyond_core
+    beyond_core = ellipse_distance2(*at_px, *own) >= CORE_SCALE**2
+    return occluders.cover(*at_px).any(axis=0) & beyond_core
 
 
-def _beside_shadows(
+def _without_shadows(
     value: Int[Array, "drones cameras side side"],
     coverage: Coverage,
-    seen: Extents,
-    claims: Claims,
-    expected_m: Positions,
+    extents: Extents,
+    occluders: Occluders,
+    expected: ExpectedDrones,
     at_px: Middles,
-    *,
-    claiming: Bool[Array, "drones"],
-    floor_z_m: Float[Array, ""],
     reduction: int,
 ) -> Int[Array, "drones cameras side side"]:
-    """The windows of low drones with no more foreground before shadows than drones have where they are expected."""
-    is_low = claiming & low(expected_m, seen.size_m, floor_z_m)
+    """The windows, with no more foreground than usual where low drones stand in front of shadows."""
+    assert expected.occluding is not None
+    assert expected.floor_z_m is not None
+    floor_z_m = expected.floor_z_m
+    low = expected.occluding & is_low(expected.position_m, extents.size_m, floor_z_m)
 
-    def balanced() -> Array:
-        # No drone is in the floor. One that is expected there would hide from itself what is shadow.
-        least_m = floor_z_m + seen.size_m[:, 2] / 2
-        above_m = jnp.asarray(expected_m).at[:, 2].max(least_m)
-        boxes = project_boxes(seen, above_m)
-        dark = shadowed(
-            coverage, seen, boxes, claims, above_m, at_px, floor_z_m=floor_z_m, reduction=reduction
-        )
+    def with_usual_foreground() -> Array:
+        # No drone is inside of the floor. A drone expected there would hide its own shadow.
+        least_m = floor_z_m + extents.size_m[:, 2] / 2
+        above_m = jnp.asarray(expected.position_m).at[:, 2].max(least_m)
+        boxes = project_boxes(extents, above_m)
+        view = FloorView(extents, boxes, occluders, above_m, floor_z_m)
+        dark = shadowed_pixels(coverage, view, at_px, reduction)
         usual = jnp.round(FULL * _usual_share(boxes, at_px)).astype(value.dtype)
-        return jnp.where(dark & is_low[:, None, None, None], jnp.minimum(value, usual), value)
+        return jnp.where(dark & low[:, None, None, None], jnp.minimum(value, usual), value)
 
-    # Most of the time all drones are high, and there is nothing to do.
-    return jax.lax.cond(is_low.any(), balanced, lambda: value)
+    # Mostly all drones are high, and the windows stay as they are.
+    return jax.lax.cond(low.any(), with_usual_foreground, lambda: value)
 
 
 def _usual_share(boxes: Boxes, at_px: Middles) -> Float[Array, "drones cameras side side"]:
-    """How full of foreground drones are, pixel by pixel."""
+    """Share of each pixel that is foreground of a usual drone in these boxes."""
     x_px, y_px = at_px
 
     def off(at_px: Array, middle: Array, half: Array) -> Array:

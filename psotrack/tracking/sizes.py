@@ -3,11 +3,12 @@
 A drone's size does not change, and the first frames, from which the initial size comes, may be poor. `measure_sizes`
 measures the size that every frame shows, `learn_sizes` takes a chunk of such measurements into the running estimate.
 
-What is measured is the spread of a silhouette about its own middle, so that it does not matter how well the drone is
-placed. Of a filled ellipse the variance along a direction is a quarter of the squared half length (M. R. Teague, Image
+Measured is the spread of a silhouette about its own middle, so the measurement does not depend on how well the drone is
+placed. The variance of a filled ellipse along a direction is a quarter of the squared half length (M. R. Teague, Image
 analysis via the general theory of moments, JOSA 70(8), 1980), and the squared half lengths of an ellipsoid's outlines
-are nearly linear in those of the ellipsoid (Hartley & Zisserman 2004, section 8.3): the views of a frame give level and
-upright length by least squares. The two level lengths change together, because drones turn.
+are nearly linear in the squared half lengths of the ellipsoid (Hartley & Zisserman 2004, section 8.3): the views of a
+frame give the horizontal and the vertical length by least squares. The two horizontal lengths change together, because
+drones turn.
 """
 
 from __future__ import annotations
@@ -21,41 +22,56 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from psotrack._typing import Array, Coverage, Positions
 from psotrack.geometry import Boxes, Camera, make_extents, project_boxes
-from psotrack.tracking.fitness import ScoreSettings
-from psotrack.tracking.patches import FULL, Patches, cut
-from psotrack.tracking.shadows import low
+from psotrack.tracking.patches import FULL, ExpectedDrones, Patches, cut
+from psotrack.tracking.shadows import is_low
 
-#: Half lengths per standard deviation of the foreground: 2 for an ellipse, the root of 6 for a rhombus. Drones, with
-#: arms that end in points and rotors at their widest, are between.
+#: Half length over the standard deviation of the foreground: 2 for an ellipse, the square root of 6 for a rhombus.
+#: Drones, whose arms end in points and whose rotors are widest, lie between the two.
 HALF_PER_STD = 2.2
-#: What a learned length may be at most, and one divided by it at least, of the start's.
+#: Largest ratio of a learned length and the initial length, in either direction.
 RANGE = 2.0
-#: A start counts as so many frames, and its lengths are off by so much, as a standard deviation of their logarithms.
+#: Weight of the initial size, in frames, and its standard deviation, of the logarithm of a length.
 START_FRAMES, START_STD = 5, 0.15
-#: A chunk with fewer good frames says nothing: its median is not safe from bad ones.
+#: Least number of good frames in a chunk: the median of fewer is not safe from bad ones.
 MIN_FRAMES = 5
-#: A camera in which less of the drone's box is foreground does not see it, or not all of it.
+#: Least share of the drone's box that must be foreground in a camera that shows the drone whole.
 MIN_FILLED = 0.15
-#: Neighbours reach so much farther than their ellipses: outlines are no ellipses.
+#: Scale of a neighbour's ellipse within which the neighbour may have foreground: outlines are no ellipses.
 NEIGHBOUR = 1.15
-#: Squared lengths of single views scatter by this share, with yaw and tilt; views that are farther off count less.
+#: Standard deviation of squared lengths of single views, as a share of them, from yaw and tilt; views that deviate more
+#: have less weight.
 VIEW_STD = 0.25
-#: What is believed of a length counts as so much of a view that shows it alone. Of what comes out the frame's own views
-#: must make up the second share, or the frame says too little.
-BELIEVED_VIEWS, MIN_SHARE = 0.01, 0.9
-#: How often views are weighed by how far off they are.
+#: Weight of the present size, in views that show a length alone; and the share of the result that the frame's own views
+#: must make up, or the frame says too little.
+PRIOR_VIEWS, MIN_SHARE = 0.01, 0.9
+#: Iterations in which views are weighted by their deviation.
 REWEIGHTINGS = 2
+
+
+@dataclass(frozen=True)
+class SizeProgram:
+    """What is compiled into the measurement of sizes.
+
+    Attributes:
+        windows: scales of the drone's box whose filling is measured.
+        ring: scale of the box that bounds the foreground which belongs to the drone.
+        reduction: image pixels per silhouette pixel, along each side.
+    """
+
+    windows: tuple[float, ...] = (0.4, 0.7, 1.0)
+    ring: float = 1.5
+    reduction: int = 4
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SizeMeasurements:
-    """What frames show, each by itself. NaN where a drone was not clearly seen.
+    """Sizes that single frames show; NaN where a drone was not clearly seen.
 
     Attributes:
-        size_m: (frames, drones, 3), full lengths along the world's axes. Of flat drones that are only seen from above
-            the height is NaN alone.
-        fill: (frames, drones, windows), share of each of the score's windows that is foreground, mean over the views.
+        size_m: (frames, drones, 3), full lengths along the world's axes, metres. The height alone is NaN for a flat
+            drone that is only seen from above.
+        fill: (frames, drones, windows), share of each window that is foreground, mean over the views.
     """
 
     size_m: Float[Array, "*frames drones 3"]
@@ -65,14 +81,14 @@ class SizeMeasurements:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SizeState:
-    """What is known of every drone's size.
+    """The running estimate of every drone's size.
 
     Attributes:
-        start_m, size_m: (drones, 3), full lengths along the world's axes: first, and now.
+        start_m, size_m: (drones, 3), full lengths along the world's axes, metres: initial and present.
         pinned: (drones, 3), lengths that stay as they are.
-        num_frames, num_chunks: (drones, 3), from which each length was learned.
-        scatter: (drones, 3), squared deviations of the chunks from their mean, of logarithms, times frames.
-        fill: (drones, windows), the profile: how full each of the score's windows is; NaN before any frame.
+        num_frames, num_chunks: (drones, 3), numbers of frames and chunks from which each length was learned.
+        scatter: (drones, 3), squared deviations of the chunks' logarithms from their mean, times frames.
+        fill: (drones, windows), share of each window that is foreground; NaN before any frame.
     """
 
     start_m: Positions
@@ -85,14 +101,23 @@ class SizeState:
 
     @property
     def std_m(self) -> Positions:
-        """(drones, 3), standard errors: from how far chunks scatter, because frames of one chunk are much alike."""
+        """(drones, 3), standard errors, metres.
+
+        They come from the scatter of chunks, because errors within a chunk are correlated.
+        """
         weight = (self.num_frames + START_FRAMES) * (self.num_chunks + 1)
         std = self.size_m * jnp.sqrt(self.scatter / weight.astype(jnp.float32))
         return jnp.where(self.pinned, 0.0, std)
 
 
-def init(size_m: Positions, pinned: Bool[Array, "drones 3"], settings: ScoreSettings) -> SizeState:
-    """What is known before the first frame; where x or y is pinned, both are."""
+def init(size_m: Positions, pinned: Bool[Array, "drones 3"], num_windows: int) -> SizeState:
+    """The estimate before the first frame.
+
+    Args:
+        size_m: (drones, 3), initial full lengths, metres.
+        pinned: (drones, 3), lengths that stay as they are; where x or y is pinned, both are.
+        num_windows: number of windows whose filling is measured.
+    """
     size_m = jnp.asarray(size_m, jnp.float32)
     none = jnp.zeros(size_m.shape, jnp.int32)
     level = pinned[:, :2].any(axis=1)
@@ -103,23 +128,23 @@ def init(size_m: Positions, pinned: Bool[Array, "drones 3"], settings: ScoreSett
         num_frames=none,
         num_chunks=none,
         scatter=jnp.full(size_m.shape, START_FRAMES * START_STD**2, jnp.float32),
-        fill=jnp.full((size_m.shape[0], len(settings.windows)), jnp.nan, jnp.float32),
+        fill=jnp.full((size_m.shape[0], num_windows), jnp.nan, jnp.float32),
     )
 
 
 def with_added_drones(state: SizeState, added: SizeState) -> SizeState:
-    """The state with more drones at its end."""
+    """The estimate with the drones of `added` after those of `state`."""
     return jax.tree.map(lambda first, last: jnp.concatenate([first, last]), state, added)
 
 
 @jax.jit
-def learn_sizes(state: SizeState, looks: SizeMeasurements) -> SizeState:
-    """The estimate with a chunk of frames in it.
+def learn_sizes(state: SizeState, measured: SizeMeasurements) -> SizeState:
+    """The estimate after one more chunk of frames.
 
-    The chunk's median, which bad frames do not move as long as they are the fewer, enters a mean over all frames. So
-    the estimate settles, and the start's part in it fades.
+    The chunk's median, which a minority of bad frames does not move, enters a mean over all frames. So the estimate
+    settles, and the influence of the initial size fades.
     """
-    ratio = jnp.log(looks.size_m / state.size_m)
+    ratio = jnp.log(measured.size_m / state.size_m)
     frames = jnp.isfinite(ratio).sum(axis=0, dtype=jnp.int32)
     enough = frames >= MIN_FRAMES
     off = jnp.where(enough, jnp.nanmedian(ratio, axis=0), 0.0)
@@ -128,11 +153,11 @@ def learn_sizes(state: SizeState, looks: SizeMeasurements) -> SizeState:
     size_m = state.size_m * jnp.exp(gain * off)
     size_m = jnp.clip(size_m, state.start_m / RANGE, state.start_m * RANGE)
 
-    # The profile has no start that would be worth anything.
+    # The filling has no initial value.
     seen = state.num_frames[:, :1].astype(jnp.float32)
     fill_gain = new[:, :1] / jnp.maximum(new[:, :1] + seen, 1.0)
     before = jnp.where(seen > 0, state.fill, 0.0)
-    fill = before + fill_gain * (jnp.nan_to_num(jnp.nanmedian(looks.fill, axis=0)) - before)
+    fill = before + fill_gain * (jnp.nan_to_num(jnp.nanmedian(measured.fill, axis=0)) - before)
     return replace(
         state,
         size_m=jnp.where(state.pinned, state.size_m, size_m),
@@ -143,49 +168,51 @@ def learn_sizes(state: SizeState, looks: SizeMeasurements) -> SizeState:
     )
 
 
-@partial(jax.jit, static_argnames="settings")
+@partial(jax.jit, static_argnames="program")
 def measure_sizes(
     coverage: UInt8[Array, "frames cameras height width"],
     position_m: Float[Array, "frames drones 3"],
     well_seen: Bool[Array, "frames drones"],
     size_m: Positions,
     cameras: Camera,
-    settings: ScoreSettings,
+    program: SizeProgram,
     floor_z_m: Float[Array, ""] | None = None,
 ) -> SizeMeasurements:
-    """The size that every frame shows of every drone.
+    """The size of every drone in every frame.
 
-    A view counts if the drone's surroundings are within the image and clear of other drones; a frame, if two views do.
+    A view counts if the drone's surroundings are inside the image and clear of other drones; a frame counts if two
+    views count.
 
     Args:
-        coverage: (frames, cameras, height, width), 0..255, silhouettes reduced by `settings.reduction`.
-        position_m: (frames, drones, 3), world; any value where not well seen.
-        well_seen: (frames, drones), whether a drone was found, and is there at all.
-        size_m: (drones, 3), full lengths that are believed so far; within a factor of 1.5 or so they do not matter.
+        coverage: (frames, cameras, height, width), 0..255, silhouettes reduced by `program.reduction`.
+        position_m: (frames, drones, 3), world, metres; any value where a drone is not well seen.
+        well_seen: (frames, drones), whether a drone was found.
+        size_m: (drones, 3), present full lengths, metres; the result hardly depends on them within a factor of 1.5.
         cameras: with one leading axis.
-        settings: of the score; of its windows the profile is taken.
-        floor_z_m: height of the floor: what is low over it may have its shadow in its silhouette, and does not count.
+        program: windows, ring and reduction.
+        floor_z_m: height of the floor, metres. The silhouette of a drone that is low over the floor may contain its
+            shadow, so such a drone is not measured.
     """
 
     def one(frame: tuple[Array, Array, Array]) -> SizeMeasurements:
         image, position, seen = frame
-        return _look(
-            image, jnp.where(seen[:, None], position, 0.0), seen, size_m, cameras, settings, floor_z_m
+        return _measure(
+            image, jnp.where(seen[:, None], position, 0.0), seen, size_m, cameras, program, floor_z_m
         )
 
     return jax.lax.map(one, (coverage, position_m, well_seen))
 
 
-def _look(
+def _measure(
     coverage: Coverage,
     position_m: Positions,
     well_seen: Bool[Array, "drones"],
     size_m: Positions,
     cameras: Camera,
-    settings: ScoreSettings,
+    program: SizeProgram,
     floor_z_m: Float[Array, ""] | None,
 ) -> SizeMeasurements:
-    """The look of one frame."""
+    """The sizes that one frame shows."""
 
     def boxes_of(factors: Float[Array, "2"]) -> Boxes:
         factor = jnp.sqrt(jnp.stack([factors[0], factors[0], factors[1]]))
@@ -201,18 +228,16 @@ def _look(
     patches = cut(
         coverage,
         make_extents(cameras, size_m),
-        position_m,
-        reach_m=jnp.zeros_like(size_m[:, 0]),
-        # Views in which a neighbour could claim anything do not count.
-        claiming=None,
-        reduction=settings.reduction,
-        ring=settings.ring,
+        # Views in which another drone could occlude the drone do not count.
+        ExpectedDrones(position_m, reach_m=jnp.zeros_like(size_m[:, 0])),
+        reduction=program.reduction,
+        ring=program.ring,
     )
-    spread, fill, filled = _measured(patches, boxes, settings)
-    counts = _counts(boxes, patches, settings.ring, well_seen) & (filled >= MIN_FILLED)
+    spread, fill, filled = _moments(patches, boxes, program)
+    counts = _usable_views(boxes, patches, program.ring, well_seen) & (filled >= MIN_FILLED)
     if floor_z_m is not None:
-        counts &= ~low(position_m, size_m, floor_z_m)[:, None]
-    factors, share = _fitted(design, HALF_PER_STD**2 * spread, counts)
+        counts &= ~is_low(position_m, size_m, floor_z_m)[:, None]
+    factors, share = _fit_lengths(design, HALF_PER_STD**2 * spread, counts)
     good = (counts.sum(axis=-1) >= 2)[:, None] & (share >= MIN_SHARE) & (factors > 0)
     factors = jnp.where(good, jnp.sqrt(jnp.where(good, factors, 1.0)), jnp.nan)
     views = jnp.where(good[:, :1], counts.sum(axis=-1, keepdims=True).astype(jnp.float32), jnp.nan)
@@ -222,16 +247,20 @@ def _look(
     )
 
 
-def _measured(
-    patches: Patches, boxes: Boxes, settings: ScoreSettings
+def _moments(
+    patches: Patches, boxes: Boxes, program: SizeProgram
 ) -> tuple[
     Float[Array, "drones cameras 2"], Float[Array, "drones cameras windows"], Float[Array, "drones cameras"]
 ]:
-    """Of the foreground in the ring: variances along columns and rows in squared halves of the box, how full each of
-    the windows is, and the box itself."""
+    """Moments of the foreground in the ring.
+
+    Returns:
+        Variances along columns and rows in squared half lengths of the box, the filled share of each window, and the
+        filled share of the box.
+    """
     image = jnp.diff(jnp.diff(patches.tables, axis=0), axis=2).transpose(1, 0, 2)
     image = image.reshape(*patches.x_px.shape, *image.shape[1:]).astype(jnp.float32) / FULL
-    scales = jnp.asarray((*settings.windows, 1.0, settings.ring))
+    scales = jnp.asarray((*program.windows, 1.0, program.ring))
 
     def line(first_px: Array, middle_px: Array, half_px: Array) -> tuple[Array, Array, Array]:
         pixel = (patches.pixel_px / half_px)[..., None]
@@ -248,7 +277,7 @@ def _measured(
     def variance(of: Array, at: Array, pixel: Array) -> Array:
         of = of / jnp.maximum(of.sum(axis=-1, keepdims=True), 1e-6)
         middle = (of * at).sum(axis=-1, keepdims=True)
-        # A pixel is as wide as it is: Sheppard's correction.
+        # Sheppard's correction for the width of a pixel.
         return (of * jnp.square(at - middle)).sum(axis=-1) - jnp.square(pixel[..., 0]) / 12
 
     across = jnp.einsum("dci,dcij,dcj->dcj", y_inside[..., -1, :], image, x_inside[..., -1, :])
@@ -257,10 +286,10 @@ def _measured(
     return spread, full[..., :-2], full[..., -2]
 
 
-def _counts(
+def _usable_views(
     boxes: Boxes, patches: Patches, ring: float, well_seen: Bool[Array, "drones"]
 ) -> Bool[Array, "drones cameras"]:
-    """Which views show the drone alone and whole: the ring is within the image, and no other drone within the ring."""
+    """Which views show the drone alone and whole: the ring is inside the image, and no other drone is in the ring."""
     width_px, height_px = patches.size_wh_px
 
     def within(middle: Array, half: Array, length_px: int) -> Array:
@@ -275,23 +304,27 @@ def _counts(
     return whole & boxes.in_front & ~(met & others[..., None]).any(axis=1) & well_seen[:, None]
 
 
-def _fitted(
+def _fit_lengths(
     design: Float[Array, "drones cameras 2 2"],
     squares: Float[Array, "drones cameras 2"],
     counts: Bool[Array, "drones cameras"],
 ) -> tuple[Float[Array, "drones 2"], Float[Array, "drones 2"]]:
-    """Squared level and upright lengths, as factors of what they were taken for, by least squares that outlying views
-    move little; and on what share of each the views have a say."""
+    """Squared horizontal and vertical lengths by least squares that outlying views influence little.
+
+    Returns:
+        (drones, 2), the squared lengths as factors of the present ones; and (drones, 2), the share of each that comes
+        from the views and not from the present size.
+    """
     counting = jnp.broadcast_to(counts[..., None], squares.shape).astype(jnp.float32)
 
     def solved(weight: Array) -> tuple[Array, Array]:
         weighted = weight[..., None] * design
-        normal = jnp.einsum("dcki,dckj->dij", weighted, design) + BELIEVED_VIEWS * jnp.eye(2)
-        right = jnp.einsum("dcki,dck->di", weighted, squares) + BELIEVED_VIEWS
+        normal = jnp.einsum("dcki,dckj->dij", weighted, design) + PRIOR_VIEWS * jnp.eye(2)
+        right = jnp.einsum("dcki,dck->di", weighted, squares) + PRIOR_VIEWS
         cross, other = normal[:, :1, 1], jnp.stack([normal[:, 1, 1], normal[:, 0, 0]], axis=-1)
         inverse = other / (other[:, :1] * other[:, 1:] - jnp.square(cross))
         factors = inverse * (right - cross * right[:, ::-1] / other)
-        return factors, 1 - BELIEVED_VIEWS * inverse
+        return factors, 1 - PRIOR_VIEWS * inverse
 
     factors, share = solved(counting)
     for _ in range(REWEIGHTINGS):

@@ -1,11 +1,11 @@
-"""The tracker: where swarm and fitness meet, frame after frame.
+"""The tracker: where the search and the score meet, frame after frame.
 
-Each frame is searched from where the motion model expects the drones (a warm start): particles around the
-prediction, bounded by what a drone can reach and by the room, in windows of the silhouettes that are cut there. A few
-gradient steps finish what the swarm began. What is found, with its covariance, corrects the motion model (a Kalman
-filter); where nothing is found the drone coasts on its prediction, less and less certain, and after a while is lost.
+Each frame is searched from the positions that the motion model predicts (a warm start): particles about the prediction,
+bounded by a drone's largest distance in one frame and by the room, in windows of the silhouettes that are cut there.
+The position that is found corrects the motion model, with its covariance (a Kalman filter). A drone that is not found
+coasts on its prediction with growing covariance, and after a while it is lost.
 
-`step` does one frame, `track` is a scan of it over a chunk of frames. A live source calls `step`, so online and
+`step` does one frame, `track` is a scan of `step` over a chunk of frames. A live source calls `step`, so online and
 offline are the same code, and the state crosses chunk borders. Tracks may start in any frame (`TrackStarts`): until
 then their drones are absent, and the number of drones, which is a shape, need not change while they start.
 """
@@ -23,27 +23,34 @@ from jaxtyping import Bool, Float, Int, UInt8
 from psotrack._typing import Array, Coverage, Key, Positions
 from psotrack.geometry import Camera, make_extents
 from psotrack.motion import MotionParams, MotionState, kalman
-from psotrack.tracking import swarm
-from psotrack.tracking.fitness import ScoreInputs, ScoreSettings, drone_fitness, filled, joint_fitness
-from psotrack.tracking.patches import cut
-from psotrack.tracking.refinement import climb
+from psotrack.tracking.fitness import (
+    Score,
+    ScoreInputs,
+    SoftIoU,
+    drone_fitness,
+    filled_share,
+    joint_fitness,
+)
+from psotrack.tracking.patches import ExpectedDrones, cut
+from psotrack.tracking.search import Search, SearchRegion
 from psotrack.tracking.vertex import find_vertex
 from psotrack.trajectories import Status
 
-#: Share of a drone's box that must be foreground for its camera to count as seeing it.
+#: Least share of a drone's box that must be foreground for its camera to count as seeing the drone.
 MIN_FILLED = 0.1
-#: Particles start about the prediction; windows reach that many of their standard deviations beyond the ring.
+#: Distance from the prediction that windows contain beyond the ring, in standard deviations of the particles.
 REACH_SIGMAS = 3.0
-#: A drone that was not found for more frames is not expected anywhere well enough to claim foreground.
-MAX_CLAIMING_FRAMES = 4
-#: Dispersion before a frame has told any, and the number of frames that it is averaged over.
+#: Largest number of frames since a drone was last found for which its expected position may occlude other drones.
+MAX_OCCLUDING_FRAMES = 4
+#: Initial dispersion of a track, and the number of frames over which the dispersion is averaged.
 DISPERSION, DISPERSION_FRAMES = 1e-3, 25
-#: Cameras do not disagree about what they have in common: a size that does not fit, a clock, a rotor that none sees.
-#: The variance of the measured positions is that many times what the cameras' disagreement says.
+#: Ratio of the measured positions' variance and the variance that follows from the cameras' disagreement. Errors that
+#: all cameras have in common do not appear as disagreement: a wrong size, a clock, a rotor that no camera sees.
 COMMON = 2.0
-#: Ellipsoids whose middles are nearer than so much of their size, along every axis, are of one drone.
+#: Two ellipsoids are of one drone if the distance of their middles is less than this share of their size on every axis.
 MIN_APART = 0.5
-#: To be found again a lost drone needs that many times the fitness: about its last place there may be anything.
+#: A lost drone is found again only with this many times the least fitness: any foreground may be near its last
+#: position.
 REGAIN = 3.0
 
 
@@ -52,52 +59,51 @@ class Program:
     """What is compiled in: a change of any of these compiles anew.
 
     Attributes:
-        num_particles: of every swarm.
-        joint: one swarm over all drones (the paper's) instead of one per drone.
-        claims: whether foreground that another drone is expected to cover says nothing about a drone.
-        refined: whether there are gradient steps after the swarm at all.
-        vertex: whether a drone is where the score's paraboloid has its vertex, not just its best position tried.
-        score: how positions are scored.
+        num_particles: number of particles of every swarm.
+        joint: one search over the positions of all drones (the paper's) instead of one per drone.
+        occlusion: whether foreground that another drone is expected to cover is left out of a drone's score.
+        vertex: whether a drone's position is the vertex of a paraboloid through the scores, not the best position
+        tried.
+        score: the score of positions.
+        windows: scales of a drone's box whose filling is reported with the learned sizes.
+        reduction: image pixels per silhouette pixel, along each side.
     """
 
     num_particles: int = 100
     joint: bool = False
-    claims: bool = True
-    refined: bool = False
+    occlusion: bool = True
     vertex: bool = True
-    score: ScoreSettings = field(default_factory=ScoreSettings)
+    score: Score = field(default_factory=SoftIoU)
+    windows: tuple[float, ...] = (0.4, 0.7, 1.0)
+    reduction: int = 4
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class TrackerParams:
-    """Knobs; all may differ between calls without a new compilation.
+    """Numbers that may differ between calls without a new compilation.
 
     Attributes:
-        num_iterations: of the swarm, per frame.
-        num_refinements: gradient steps after it.
-        size_m: (drones, 3), full lengths of each drone's extent.
-        bounds_m: (2, 3), lowest and highest corner of the room.
+        num_iterations: iterations of the search per frame.
+        size_m: (drones, 3), full lengths of each drone's extent, metres.
+        bounds_m: (2, 3), lowest and highest corner of the room, metres.
         dt_s: seconds between frames.
-        max_speed_m_s: of a drone; bounds the search and the velocity.
-        spread_m: standard deviation of the particles about the prediction.
-        inertia, cognitive, social: of the swarm.
-        motion: how drones move.
-        min_fitness: below it a drone was not found.
-        min_cameras: fewer than these, and a drone was not found.
-        max_coasting_frames: after so many frames without being found a drone is lost.
+        max_speed_m_s: largest speed of a drone, m/s; bounds the search and the velocity.
+        spread_m: standard deviation of the particles about the prediction, metres.
+        search: the search in one frame.
+        motion: the motion model.
+        min_fitness: below this fitness a drone was not found.
+        min_cameras: with foreground in fewer cameras than this a drone was not found.
+        max_coasting_frames: after more frames than this without being found a drone is lost.
     """
 
     num_iterations: Int[Array, ""]
-    num_refinements: Int[Array, ""]
     size_m: Positions
     bounds_m: Float[Array, "2 3"]
     dt_s: Float[Array, ""]
     max_speed_m_s: Float[Array, ""]
     spread_m: Float[Array, ""]
-    inertia: Float[Array, ""]
-    cognitive: Float[Array, ""]
-    social: Float[Array, ""]
+    search: Search
     motion: MotionParams
     min_fitness: Float[Array, ""]
     min_cameras: Int[Array, ""]
@@ -110,11 +116,11 @@ class TrackerState:
     """What the next frame needs.
 
     Attributes:
-        key: consumed and replaced by every frame.
+        key: random key; consumed and replaced by every frame.
         motion: position, velocity and acceleration after the last frame.
-        present: (drones,), whether the drone has arrived yet.
+        present: (drones,), whether the drone's track has started.
         missed: (drones,), frames since the drone was last found.
-        dispersion: (drones,), how much the cameras disagree, averaged over time (see `uncertainty`).
+        dispersion: (drones,), disagreement of the cameras, averaged over time (phi of `vertex`).
     """
 
     key: Key
@@ -127,11 +133,11 @@ class TrackerState:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class TrackStarts:
-    """Drones that begin, or begin anew, within a chunk.
+    """Tracks that start, or start again, within a chunk of frames.
 
     Attributes:
-        frame: (drones,), the frame of the chunk, from 0; negative for all others.
-        position_m, velocity_m_s: (drones, 3), in that frame.
+        frame: (drones,), the frame of the chunk in which a track starts, from 0; negative for all other drones.
+        position_m, velocity_m_s: (drones, 3), position and velocity in that frame, metres and m/s.
     """
 
     frame: Int[Array, "drones"]
@@ -142,9 +148,10 @@ class TrackStarts:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class TrackerInfo:
-    """What people look at, per frame; status holds values of `Status`. Of absent drones nothing is known: NaN.
+    """Results per frame, for people and for the stages after the tracker; NaN for absent drones.
 
-    Measured is what the frame says by itself, whether or not it was believed; all else has the past in it.
+    "Measured" is what the frame says by itself, whether or not the motion model believed it; every other array
+    depends on the frames before as well. `status` holds values of `Status`.
     """
 
     position_m: Float[Array, "*frames drones 3"]
@@ -162,7 +169,7 @@ def init(key: Key, position_m: Positions, velocity_m_s: Positions, params: Track
     drones = position_m.shape[0]
     return TrackerState(
         key=key,
-        motion=_begun(position_m, velocity_m_s, params),
+        motion=_motion_before(position_m, velocity_m_s, params),
         present=jnp.ones(drones, bool),
         missed=jnp.zeros(drones, jnp.int32),
         dispersion=jnp.full(drones, DISPERSION, jnp.float32),
@@ -170,7 +177,7 @@ def init(key: Key, position_m: Positions, velocity_m_s: Positions, params: Track
 
 
 def with_added_tracks(state: TrackerState, params: TrackerParams) -> TrackerState:
-    """The state with as many drones as `params` has sizes for; those added at the end are absent."""
+    """The state with as many drones as `params` has sizes for; the added drones are last, and absent."""
     more = params.size_m.shape[0] - state.missed.shape[0]
     middle = jnp.broadcast_to(params.bounds_m.mean(axis=0), (more, 3))
     added = init(state.key, middle, jnp.zeros((more, 3)), params)
@@ -188,7 +195,7 @@ def with_added_tracks(state: TrackerState, params: TrackerParams) -> TrackerStat
 
 
 def no_track_starts(num_drones: int) -> TrackStarts:
-    """Nobody arrives."""
+    """No track starts."""
     zero = jnp.zeros((num_drones, 3))
     return TrackStarts(jnp.full(num_drones, -1, jnp.int32), zero, zero)
 
@@ -199,37 +206,40 @@ def step(
     """One frame: predict, search, correct.
 
     Args:
+        state: after the frame before.
         coverage: (cameras, height, width), silhouettes of the frame, 0..255, reduced.
+        cameras: with one leading axis, float32.
+        params: numbers.
+        program: what is compiled in.
     """
-    key_next, key_spread, key_swarm = jax.random.split(state.key, 3)
-    low, high = _reachable(state, params)
+    key_next, key_spread, key_search = jax.random.split(state.key, 3)
+    region = _reachable(state, params)
     was_lost = state.missed > params.max_coasting_frames
     predicted = kalman.predict(state.motion, params.dt_s, params.motion)
-    # Nobody knows where to a lost drone goes, nor how uncertain that is.
+    # The motion of a lost drone is not known: it stays where it was lost.
     predicted = kalman.select_drones(was_lost | ~state.present, state.motion, predicted)
-    expected = jnp.clip(predicted.apparent_m, low, high)
-    view = _view(state, coverage, cameras, expected, params, program)
-    found = _search(key_spread, key_swarm, view, expected, state, params, program, (low, high))
-    if program.refined:
-        found = climb(
-            lambda position: drone_fitness(view, position), found, params.num_refinements, low, high
-        )
-    sharp = find_vertex(view, found, params.size_m)
-    found = jnp.clip(sharp.position_m, low, high) if program.vertex else found
-    fitness, num_cameras = _evidence(view, found, params)
+    expected = jnp.clip(predicted.apparent_m, region.low, region.high)
+    inputs = _score_inputs(state, coverage, cameras, expected, params, program)
+    first = _first_particles(key_spread, expected, state, params, program)
+    best = _search(key_search, inputs, first, region, params, program)
+    vertex = find_vertex(inputs, best, params.size_m)
+    found = jnp.clip(vertex.position_m, region.low, region.high) if program.vertex else best
+    fitness = drone_fitness(inputs, found)
+    num_cameras = (filled_share(inputs, found) >= MIN_FILLED).sum(axis=-1)
     enough = params.min_fitness * jnp.where(was_lost, REGAIN, 1.0)
-    # Farther off there may be another drone: who it is takes more than a frame to tell (see `lifecycle`).
+    # A lost drone is found again only near its last position. Farther away there may be another drone: which drone that
+    # is takes more than one frame to tell (see `psotrack.initiation.reidentification`).
     near = jnp.linalg.norm(found - state.motion.apparent_m, axis=-1) < params.size_m.max(axis=-1)
     was_found = state.present & (fitness >= enough) & (num_cameras >= params.min_cameras)
     was_found &= near | ~was_lost
-    dispersion = _averaged(state.dispersion, sharp.dispersion, was_found)
-    covariance = COMMON * dispersion[:, None, None] * sharp.inverse_curvature_m2
+    dispersion = _averaged(state.dispersion, vertex.dispersion, was_found)
+    covariance = COMMON * dispersion[:, None, None] * vertex.inverse_curvature_m2
 
     plausible = kalman.log_likelihood(predicted, found, covariance, params.motion)
-    was_found &= ~_yields(found, was_found, -plausible, params.size_m)
+    was_found &= ~_displaced(found, was_found, -plausible, params.size_m)
     corrected, _ = kalman.update(predicted, found, covariance, was_found, params.motion)
-    anew = kalman.init(found, jnp.zeros_like(found), covariance, params.motion)
-    corrected = kalman.select_drones(was_found & was_lost, anew, corrected)
+    restarted = kalman.init(found, jnp.zeros_like(found), covariance, params.motion)
+    corrected = kalman.select_drones(was_found & was_lost, restarted, corrected)
     missed = jnp.where(was_found, 0, state.missed + 1)
     lost = missed > params.max_coasting_frames
     after = kalman.limit_motion(
@@ -251,56 +261,48 @@ def step(
         num_cameras=num_cameras,
         status=status.astype(jnp.int32),
     )
-    return TrackerState(key_next, after, state.present, missed, dispersion), _of_those_present(
+    return TrackerState(key_next, after, state.present, missed, dispersion), _without_absent(
         info, state.present
     )
 
 
+@partial(jax.jit, static_argnames="program")
 def track(
     state: TrackerState,
     coverage: UInt8[Array, "frames cameras height width"],
     cameras: Camera,
     params: TrackerParams,
     program: Program,
-    arrivals: TrackStarts | None = None,
+    starts: TrackStarts,
 ) -> tuple[TrackerState, TrackerInfo]:
     """`step` over a chunk of frames, one compiled scan.
 
     Args:
+        state: before the first frame.
         coverage: (frames, cameras, height, width) uint8; a chunk of silhouettes.
-        arrivals: drones that begin in this chunk; None is nobody, and compiles nothing else.
+        cameras: with one leading axis, float32.
+        params: numbers.
+        program: what is compiled in.
+        starts: tracks that start in this chunk (see `no_track_starts`).
 
     Returns:
         The state after the last frame, and the info of every frame along a leading axis.
     """
-    arrivals = no_track_starts(state.missed.shape[0]) if arrivals is None else arrivals
-    return _track(state, coverage, cameras, params, program, arrivals)
 
-
-@partial(jax.jit, static_argnames="program")
-def _track(
-    state: TrackerState,
-    coverage: UInt8[Array, "frames cameras height width"],
-    cameras: Camera,
-    params: TrackerParams,
-    program: Program,
-    arrivals: TrackStarts,
-) -> tuple[TrackerState, TrackerInfo]:
     def one(carry: TrackerState, frame: Any) -> tuple[TrackerState, TrackerInfo]:
         number, silhouettes = frame
-        return step(
-            with_started_tracks(carry, arrivals, number, params), silhouettes, cameras, params, program
-        )
+        started = with_started_tracks(carry, starts, number, params)
+        return step(started, silhouettes, cameras, params, program)
 
     return jax.lax.scan(one, state, (jnp.arange(coverage.shape[0]), coverage))
 
 
 def with_started_tracks(
-    state: TrackerState, arrivals: TrackStarts, frame: Int[Array, ""], params: TrackerParams
+    state: TrackerState, starts: TrackStarts, frame: Int[Array, ""], params: TrackerParams
 ) -> TrackerState:
-    """The state before a frame, with the drones that arrive in it."""
-    begins = arrivals.frame == frame
-    begun = _begun(arrivals.position_m, arrivals.velocity_m_s, params)
+    """The state before a frame, with the tracks that start in the frame."""
+    begins = starts.frame == frame
+    begun = _motion_before(starts.position_m, starts.velocity_m_s, params)
     return replace(
         state,
         motion=kalman.select_drones(begins, begun, state.motion),
@@ -310,16 +312,15 @@ def with_started_tracks(
     )
 
 
-def _begun(position_m: Positions, velocity_m_s: Positions, params: TrackerParams) -> MotionState:
-    """Drones that will be at these positions in the next frame."""
-    # One step back, so that the first prediction is the given position.
+def _motion_before(position_m: Positions, velocity_m_s: Positions, params: TrackerParams) -> MotionState:
+    """Motion states one frame before the drones are at these positions: the first prediction is the position."""
     before = position_m - velocity_m_s * params.dt_s
     covariance = jnp.broadcast_to(jnp.square(params.spread_m) * jnp.eye(3), (position_m.shape[0], 3, 3))
     return kalman.init(before, velocity_m_s, covariance, params.motion)
 
 
-def _of_those_present(info: TrackerInfo, present: Bool[Array, "drones"]) -> TrackerInfo:
-    """The info with NaN for what nobody knows of absent drones."""
+def _without_absent(info: TrackerInfo, present: Bool[Array, "drones"]) -> TrackerInfo:
+    """The info with NaN, and status lost, for absent drones."""
 
     def known(value: Array) -> Array:
         if not jnp.issubdtype(value.dtype, jnp.floating):
@@ -330,7 +331,7 @@ def _of_those_present(info: TrackerInfo, present: Bool[Array, "drones"]) -> Trac
     return replace(known_info, status=jnp.where(present, info.status, Status.LOST))
 
 
-def _view(
+def _score_inputs(
     state: TrackerState,
     coverage: Coverage,
     cameras: Camera,
@@ -338,97 +339,100 @@ def _view(
     params: TrackerParams,
     program: Program,
 ) -> ScoreInputs:
-    """What the score reads: windows about where drones are expected."""
-    seen = make_extents(cameras, params.size_m)
+    """What the score reads: windows about the expected positions of the drones."""
+    in_cameras = make_extents(cameras, params.size_m)
     patches = cut(
         coverage,
-        seen,
-        expected,
-        reach_m=REACH_SIGMAS * params.spread_m * _frames_since_found(state, params)[:, 0],
-        claiming=_claiming(state, expected, params) if program.claims else None,
-        floor_z_m=params.bounds_m[0, 2],
-        reduction=program.score.reduction,
+        in_cameras,
+        ExpectedDrones(
+            position_m=expected,
+            reach_m=REACH_SIGMAS * params.spread_m * _frames_since_found(state, params)[:, 0],
+            occluding=_occluding(state, expected, params) if program.occlusion else None,
+            floor_z_m=params.bounds_m[0, 2],
+        ),
+        reduction=program.reduction,
         ring=program.score.ring,
     )
-    return ScoreInputs(seen, patches, program.score)
+    return ScoreInputs(in_cameras, patches, program.score)
 
 
-def _reachable(state: TrackerState, params: TrackerParams) -> tuple[Positions, Positions]:
-    """Bounds of the search for each drone: where it can have got to since it was last found, within the room."""
+def _reachable(state: TrackerState, params: TrackerParams) -> SearchRegion:
+    """Bounds of the search for each drone: what it can have reached since it was last found, within the room."""
     reach = params.max_speed_m_s * params.dt_s * _frames_since_found(state, params)
     low, high = params.bounds_m
     position = state.motion.apparent_m
-    return jnp.clip(position - reach, low, high), jnp.clip(position + reach, low, high)
+    return SearchRegion(
+        low=jnp.clip(position - reach, low, high),
+        high=jnp.clip(position + reach, low, high),
+        max_step=jnp.broadcast_to(params.max_speed_m_s * params.dt_s, (3,)),
+    )
 
 
 def _frames_since_found(state: TrackerState, params: TrackerParams) -> Float[Array, "drones 1"]:
-    """From 1; no more than until a drone is lost, or it would be sought ever farther away with as few particles."""
+    """Frames since each drone was last found, from 1.
+
+    The number grows until the drone is lost and then stays: a region that grows further would be searched with too few
+    particles.
+    """
     missed = jnp.minimum(state.missed, params.max_coasting_frames)
     return 1.0 + missed[:, None].astype(jnp.float32)
 
 
+def _first_particles(
+    key: Key, expected: Positions, state: TrackerState, params: TrackerParams, program: Program
+) -> Float[Array, "particles drones 3"]:
+    """First positions of the particles: about the expected position, more widely the longer a drone was not found."""
+    spread = params.spread_m * _frames_since_found(state, params)
+    shape = (program.num_particles, *expected.shape)
+    first = expected + spread * jax.random.normal(key, shape)
+    # Two particles are the expected and the last position: a drone that flies on, or hovers, is found at once.
+    return jnp.asarray(first).at[0].set(expected).at[1].set(state.motion.apparent_m)
+
+
 def _search(
-    key_spread: Key,
-    key_swarm: Key,
-    view: ScoreInputs,
-    predicted: Positions,
-    state: TrackerState,
+    key: Key,
+    inputs: ScoreInputs,
+    first: Float[Array, "particles drones 3"],
+    region: SearchRegion,
     params: TrackerParams,
     program: Program,
-    bounds: tuple[Positions, Positions],
 ) -> Positions:
-    """The best positions that the swarm finds about the prediction."""
-    particles, drones = program.num_particles, predicted.shape[0]
-    spread = params.spread_m * _frames_since_found(state, params)
-    start = predicted + spread * jax.random.normal(key_spread, (particles, drones, 3))
-    # The prediction and the last position are particles too: a drone that flies on, or stands, is found at once.
-    start = jnp.asarray(start).at[0].set(predicted).at[1].set(state.motion.apparent_m)
-
+    """The positions of largest fitness that the search finds."""
+    particles, drones, _ = first.shape
     groups = (1, 3 * drones) if program.joint else (drones, 3)
 
     def objective(position: Array) -> Array:
         position = position.reshape(particles, drones, 3)
-        return joint_fitness(view, position)[:, None] if program.joint else drone_fitness(view, position)
+        return joint_fitness(inputs, position)[:, None] if program.joint else drone_fitness(inputs, position)
 
-    swarm_params = swarm.SwarmParams(
-        inertia=params.inertia,
-        cognitive=params.cognitive,
-        social=params.social,
-        max_step=jnp.broadcast_to(params.max_speed_m_s * params.dt_s, groups[1:]),
-        low=bounds[0].reshape(groups),
-        high=bounds[1].reshape(groups),
+    of_groups = SearchRegion(
+        low=region.low.reshape(groups),
+        high=region.high.reshape(groups),
+        max_step=jnp.broadcast_to(region.max_step[0], groups[1:]),
     )
-    final = swarm.run(
-        key_swarm, objective, start.reshape(particles, *groups), swarm_params, params.num_iterations
-    )
-    return final.gbest_position.reshape(drones, 3)
+    best = params.search(key, objective, first.reshape(particles, *groups), of_groups, params.num_iterations)
+    return best.reshape(drones, 3)
 
 
-def _evidence(
-    view: ScoreInputs, position_m: Positions, params: TrackerParams
-) -> tuple[Float[Array, "drones"], Int[Array, "drones"]]:
-    """Fitness of each drone where it was found, and the number of cameras that have foreground there."""
-    num_cameras = (filled(view, position_m) >= MIN_FILLED).sum(axis=-1)
-    return drone_fitness(view, position_m), num_cameras
+def _occluding(state: TrackerState, expected: Positions, params: TrackerParams) -> Bool[Array, "drones"]:
+    """Which drones' expected positions are certain enough to occlude other drones."""
+    known = state.present & (state.missed <= MAX_OCCLUDING_FRAMES)
+    return known & ~_displaced(expected, known, state.missed, params.size_m)
 
 
-def _claiming(state: TrackerState, expected: Positions, params: TrackerParams) -> Bool[Array, "drones"]:
-    """Which drones are expected somewhere well enough to claim foreground there."""
-    known = state.present & (state.missed <= MAX_CLAIMING_FRAMES)
-    return known & ~_yields(expected, known, state.missed, params.size_m)
-
-
-def _yields(
+def _displaced(
     position_m: Positions,
     there: Bool[Array, "drones"],
     doubt: Array,
     size_m: Positions,
 ) -> Bool[Array, "drones"]:
-    """Which drones cannot be where they seem to be, because a drone of less doubt is there: no drone is ever two.
+    """Which drones cannot be at their positions, because a drone of less doubt is there: one drone has one track.
 
     Args:
+        position_m: (drones, 3), positions, metres.
         there: (drones,), which drones count.
-        doubt: (drones,); where it is equal the number of the drone decides.
+        doubt: (drones,); of two drones of equal doubt the one with the higher number is displaced.
+        size_m: (drones, 3), full lengths, metres.
     """
     apart = (position_m[:, None] - position_m) / (MIN_APART * (size_m[:, None] + size_m) / 2)
     conflict = (jnp.square(apart).sum(axis=-1) < 1) & there[:, None] & there
@@ -441,6 +445,6 @@ def _yields(
 def _averaged(
     dispersion: Float[Array, "drones"], latest: Float[Array, "drones"], was_found: Bool[Array, "drones"]
 ) -> Float[Array, "drones"]:
-    """The dispersion with this frame's in it: eight cameras of one frame say it roughly."""
+    """The dispersion averaged with that of this frame: the few cameras of one frame say it only roughly."""
     believed = was_found & jnp.isfinite(latest)
     return dispersion + jnp.where(believed, latest - dispersion, 0.0) / DISPERSION_FRAMES

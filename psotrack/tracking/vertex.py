@@ -1,14 +1,15 @@
-"""Where exactly a drone is, and how far off that may be: a paraboloid through the score about the best position.
+"""The vertex of the score: a drone's position to millimetres and its covariance, from a paraboloid through the scores.
 
-The score is made of pixels, and its maximum is a corner of a rugged top: off by a third of the width over which the
-score falls off smoothly. The vertex of the paraboloid that fits the score best on a grid of 27 places about it
-is not: it uses the slopes on all sides. The same paraboloids, one per camera, tell how sure it is. Each camera's hill,
-weighted as the fitness weighs it, has a slope at the common vertex, by which it would move the drone, and a curvature,
-by which it insists; along its ray it is flat. For an estimate that maximises a sum of such terms the covariance is
+The score is made of pixels: its largest value is at a corner of a rugged top, and that corner is off by a third of the
+width over which the score falls off smoothly. The vertex of the paraboloid that fits the scores best on a grid of 27
+positions about the corner is better, because the paraboloid uses the slopes on all sides. The paraboloids of the single
+cameras give the covariance. Each camera's paraboloid, weighted as in the fitness, has a slope at the common vertex (the
+direction in which this camera alone would move the drone) and a curvature, which is zero along the camera's ray. For an
+estimate that maximises a sum of such terms the covariance is
 
     C = phi H^-1,      H = -sum of the cameras' curvatures,      phi = sum of slope^T H^-1 slope over the cameras / 3,
 
-the sandwich of H. White (1982), Econometrica 50(1), its filling taken to be of the same shape as H, as in
+the sandwich estimator of H. White (1982), Econometrica 50(1), with a middle matrix proportional to H, as in
 quasi-likelihood (McCullagh & Nelder 1989, chapter 9).
 """
 
@@ -24,9 +25,9 @@ from jaxtyping import Float
 from psotrack._typing import Array, Positions
 from psotrack.tracking.fitness import ScoreInputs, camera_scores
 
-#: Half of the grid, in parts of the drone's size. From 0.12 to 0.3 the errors are the same within a tenth.
+#: Half width of the grid, as a share of the drone's size. From 0.12 to 0.3 the errors differ by less than a tenth.
 SPAN = 0.2
-#: Of the largest curvature: what is flatter, or bent the wrong way, counts as this flat.
+#: Least curvature, as a share of the largest one: smaller and negative curvatures are replaced by this one.
 FLATTEST = 0.02
 
 #: Corners, edges, faces and the middle of a cube of side 2.
@@ -35,7 +36,7 @@ _MIDDLE = len(_CUBE) // 2
 
 
 def _least_squares() -> tuple[np.ndarray, np.ndarray]:
-    """From 27 values on the cube to the slope (3, 27) and curvature (3, 3, 27) of the best paraboloid."""
+    """Matrices that map 27 scores on the cube to slope (3, 27) and curvature (3, 3, 27) of the fitted paraboloid."""
     pairs = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
     products = np.stack([_CUBE[:, i] * _CUBE[:, j] for i, j in pairs], axis=-1)
     solve = np.linalg.pinv(np.concatenate([np.ones((len(_CUBE), 1)), _CUBE, products], axis=-1))
@@ -52,12 +53,12 @@ _SLOPE, _CURVATURE = _least_squares()
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Vertex:
-    """The vertex of the score, and how sharp it is.
+    """The vertex of the score, and its sharpness.
 
     Attributes:
-        position_m: (drones, 3), the vertex; no farther from where it was sought than the grid.
+        position_m: (drones, 3), the vertex, metres; never outside of the grid.
         inverse_curvature_m2: (drones, 3, 3), H^-1: symmetric and positive definite.
-        dispersion: (drones,), phi of this frame; infinite where no more than one camera has a say.
+        dispersion: (drones,), phi of this frame; infinite where no more than one camera sees the drone.
     """
 
     position_m: Positions
@@ -65,17 +66,17 @@ class Vertex:
     dispersion: Float[Array, "drones"]
 
 
-def find_vertex(scene: ScoreInputs, position_m: Positions, size_m: Positions) -> Vertex:
-    """The paraboloid through the scores about the best positions.
+def find_vertex(inputs: ScoreInputs, position_m: Positions, size_m: Positions) -> Vertex:
+    """The vertex of the paraboloid through the scores about the best positions.
 
     Args:
-        scene: of the frame.
-        position_m: (drones, 3), where the fitness is largest.
-        size_m: (drones, 3), full lengths.
+        inputs: what the score reads of the frame.
+        position_m: (drones, 3), positions of the largest fitness, metres.
+        size_m: (drones, 3), full lengths of the drones, metres.
     """
-    # In units of the span all three axes are alike, and flat is flat.
+    # In units of the span the curvatures along the three axes can be compared.
     span_m = SPAN * size_m
-    score, weight = camera_scores(scene, position_m + span_m * jnp.asarray(_CUBE, span_m.dtype)[:, None, :])
+    score, weight = camera_scores(inputs, position_m + span_m * jnp.asarray(_CUBE, span_m.dtype)[:, None, :])
     weight = weight[_MIDDLE]
     share = weight / jnp.maximum(weight.sum(axis=-1, keepdims=True), 1e-6)
     slope = jnp.einsum("ik,kdc,dc->dci", jnp.asarray(_SLOPE, score.dtype), score, share)
@@ -84,10 +85,10 @@ def find_vertex(scene: ScoreInputs, position_m: Positions, size_m: Positions) ->
     bent = jnp.maximum(bent, FLATTEST * jnp.maximum(bent[:, -1:], 1e-6))
     inverse = jnp.einsum("dik,dk,djk->dij", axes, 1 / bent, axes)
     to_vertex = jnp.clip(jnp.einsum("dij,dj->di", inverse, slope.sum(axis=1)), -1.0, 1.0)
-    # What each camera still wants when all have agreed.
+    # Slopes of the single cameras at the common vertex.
     slope = slope - jnp.einsum("dcij,dj->dci", curvature, to_vertex)
     spread = jnp.einsum("dci,dij,dcj->d", slope, inverse, slope) / 3
-    # Each camera measures two numbers and the position takes three: the residuals are smaller than the errors.
+    # Each camera measures two numbers and the position has three: residuals are smaller than errors.
     cameras = jnp.square(share.sum(axis=-1)) / jnp.maximum(jnp.square(share).sum(axis=-1), 1e-6)
     spread = spread * cameras / jnp.maximum(cameras - 1.5, 0.1)
     return Vertex(

@@ -1,14 +1,19 @@
 from .association import GATE_M, UNASSIGNED, fixed_partner_values
 from .files import read_trajectories, write_ambiguity, write_trajectories
+from .tracks import Arrival, DroneSizes, Tracks, unknown_value
 from .trajectories import Status, Trajectories
 
 __all__ = [
     "GATE_M",
     "UNASSIGNED",
+    "Arrival",
+    "DroneSizes",
     "Status",
+    "Tracks",
     "Trajectories",
     "fixed_partner_values",
     "read_trajectories",
+    "unknown_value",
     "write_ambiguity",
     "write_trajectories",
 ]

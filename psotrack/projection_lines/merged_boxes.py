@@ -1,6 +1,7 @@
-"""Boxes of several drones taken apart: blobs that have grown together, drones of which a detector made one.
+"""Boxes that hold several drones, split: blobs that touch, and drones that a detector merged into one box.
 
-The middle of such a box is that of no drone. But its edges are still those of drones: of those that are farthest out.
+The middle of such a box is the middle of no drone. But each edge of the box is the edge of a drone: of the outermost
+one.
 """
 
 from __future__ import annotations
@@ -13,16 +14,17 @@ from jaxtyping import Bool, Float, Int
 from psotrack.correspondence import CameraSightings
 from psotrack.geometry import NEAR_M, Camera, project
 
-#: A drone that is placed by one edge and its size is off by so much of its sides more: they differ as it turns.
+#: Additional standard deviation of a middle that follows from one edge and the drone's size, as a share of the box's
+#: sides: the size changes as the drone turns.
 PART_SHARE = 0.1
 
 
 @dataclass(frozen=True)
 class _Outlines:
-    """Boxes from corner to corner, pixel centres at whole numbers.
+    """Boxes by their corners; pixel centres are at whole numbers.
 
     Attributes:
-        lower_px, upper_px: (..., 2).
+        lower_px, upper_px: (..., 2), corners of smallest and largest x and y.
     """
 
     lower_px: Float[np.ndarray, "*boxes 2"]
@@ -40,24 +42,24 @@ class _Outlines:
         return shared / (self.size_px.prod(axis=-1) + other.size_px.prod(axis=-1) - shared)
 
 
-def parted(
+def split_merged_boxes(
     cameras: Camera,
     view: CameraSightings,
     expected_m: Float[np.ndarray, "drones 3"],
     span_m: Float[np.ndarray, "drones 2"],
 ) -> CameraSightings:
-    """The view with a box for each of several drones in the place of one for all of them.
+    """The frame's boxes, with boxes of several drones replaced by one box for each drone whose place is known.
 
-    A box is of several drones if the middles of several are expected in it, and the box around all of these fits it
-    better than that of any one of them. Each of its edges is that of the drone which is expected farthest out there. A
-    drone that has an edge along either axis is placed by these and by its size; of the others nothing is known here:
-    they are hidden.
+    A box is of several drones if several drones are expected in it, and if the box around all of them fits it better
+    than the box of any single one. A drone that has an edge of the box on both axes is placed by these edges and its
+    size. The places of the other drones are not known: they are hidden.
 
     Args:
         cameras: with one leading axis.
-        view: the frame.
-        expected_m: (drones, 3), where drones are expected.
-        span_m: (drones, 2), their widths and heights; NaN where not known, which takes no box apart.
+        view: boxes of the frame.
+        expected_m: (drones, 3), expected positions, metres.
+        span_m: (drones, 2), widths and heights of the drones, metres; NaN where they are not known: then no box is
+            split.
     """
     outlines, inside = _expected(cameras, view, expected_m, span_m)
     camera, box = np.nonzero(inside.sum(axis=0) > 1)
@@ -65,7 +67,7 @@ def parted(
         return view
     half_px = view.size_px[camera, box] / 2
     seen = _Outlines(view.centre_px[camera, box] - half_px, view.centre_px[camera, box] + half_px)
-    # (boxes, drones, 2): the drones that are expected in each of the boxes; no others are ever farther out.
+    # (boxes, drones, 2): only drones that are expected in the box can have its edges.
     members = inside[:, camera, box].T
     lower_px = np.where(members[..., None], outlines.lower_px[:, camera].swapaxes(0, 1), np.inf)
     upper_px = np.where(members[..., None], outlines.upper_px[:, camera].swapaxes(0, 1), -np.inf)
@@ -75,7 +77,7 @@ def parted(
     alone[row, drone] = each.iou(_Outlines(seen.lower_px[row], seen.upper_px[row]))
     together = _Outlines(lower_px.min(axis=1), upper_px.max(axis=1)).iou(seen)
     several = together > alone.max(axis=-1)
-    # Whether each edge of the box is this drone's.
+    # Whether the lower and the upper edge of the box are this drone's.
     first = several[row, None] & (lower_px.argmin(axis=1)[row] == drone[:, None])
     last = several[row, None] & (upper_px.argmax(axis=1)[row] == drone[:, None])
     placed = (first | last).all(axis=-1)
@@ -94,7 +96,7 @@ def _expected(
     expected_m: Float[np.ndarray, "drones 3"],
     span_m: Float[np.ndarray, "drones 2"],
 ) -> tuple[_Outlines, Bool[np.ndarray, "drones cameras boxes"]]:
-    """(drones, cameras, 2), the boxes that are expected, and whether their middles are in those that are seen."""
+    """The expected boxes (drones, cameras, 2), and in which of the frame's boxes the drones are expected."""
     pixels, depth = project(cameras, expected_m[:, None])
     focal_px = np.stack([cameras.K[:, 0, 0], cameras.K[:, 1, 1]], axis=-1)
     half_px = span_m[:, None] * focal_px / np.maximum(depth, NEAR_M)[..., None] / 2
@@ -106,7 +108,7 @@ def _expected(
 def _without(
     view: CameraSightings, camera: Int[np.ndarray, "gone"], box: Int[np.ndarray, "gone"]
 ) -> CameraSightings:
-    """The view without some boxes."""
+    """The frame's boxes without some of them."""
     centre_px, size_px, noise_px = view.centre_px.copy(), view.size_px.copy(), view.noise_px.copy()
     for values in (centre_px, size_px, noise_px):
         values[camera, box] = np.nan
@@ -120,7 +122,7 @@ def _with(
     size_px: Float[np.ndarray, "more 2"],
     noise_px: Float[np.ndarray, "more"],
 ) -> CameraSightings:
-    """The view with more boxes; `camera` is in ascending order."""
+    """The frame's boxes and some more; `camera` is in ascending order."""
     place = np.arange(len(camera)) - np.searchsorted(camera, camera)
     room = int(place.max(initial=-1)) + 1
 

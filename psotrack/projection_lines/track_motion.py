@@ -1,0 +1,118 @@
+"""The motion model of all tracks in float64, in arrays that have room for more tracks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from psotrack._typing import Array
+from psotrack.motion import MotionParams, MotionState, kalman, motion_params
+from psotrack.settings import MotionSettings
+
+#: The arrays' length is a multiple of this number: each length is compiled once.
+ROOM = 16
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class _Limits:
+    """Seconds between frames, corners of the room (2, 3), and a drone's largest speed."""
+
+    dt_s: Float[Array, ""]
+    bounds_m: Float[Array, "2 3"]
+    max_speed_m_s: Float[Array, ""]
+
+
+class TrackMotion:
+    """Motion states of the tracks, each in a slot of the arrays.
+
+    Attributes:
+        state: states of all slots, on the host.
+    """
+
+    def __init__(self, settings: MotionSettings, fps: float, bounds_m: Float[np.ndarray, "2 3"]) -> None:
+        self._settings = settings
+        self._limits = _Limits(np.array(1 / fps), bounds_m, np.array(settings.max_speed_m_s))
+        self._params = _params(settings, 0)
+        self.state = _states_at_origin(0, self._params)
+
+    def __len__(self) -> int:
+        return len(self.state.position_m)
+
+    def grow(self) -> None:
+        """Make room for more tracks."""
+        self._params = _params(self._settings, len(self) + ROOM)
+        more = _states_at_origin(ROOM, _params(self._settings, ROOM))
+        self.state = _on_host(jax.tree.map(lambda *both: np.concatenate(both), self.state, more))
+
+    def place(
+        self,
+        slot: int,
+        position_m: Float[np.ndarray, "3"],
+        velocity_m_s: Float[np.ndarray, "3"],
+        covariance_m2: Float[np.ndarray, "3 3"],
+        velocity_std_m_s: float,
+    ) -> None:
+        """Start the motion of a track, or start it anew."""
+        params = replace(_params(self._settings, 1), velocity_std_m_s=jnp.float64(velocity_std_m_s))
+        begun = kalman.init(position_m[None], velocity_m_s[None], covariance_m2[None], params)
+        for each in fields(MotionState):
+            getattr(self.state, each.name)[slot] = np.asarray(getattr(begun, each.name))[0]
+
+    def predict(self) -> None:
+        """Go on to the next frame."""
+        self.state = _on_host(_predict(self.state, self._limits.dt_s, self._params))
+
+    def correct(
+        self,
+        measured_m: Float[np.ndarray, "slots 3"],
+        covariance_m2: Float[np.ndarray, "slots 3 3"],
+        was_measured: Bool[np.ndarray, "slots"],
+        lost: Bool[np.ndarray, "slots"],
+    ) -> None:
+        """Correct by the measured positions, within the room and the largest speed; lost tracks are at rest."""
+        measurements = (measured_m, covariance_m2, was_measured)
+        self.state = _on_host(_correct(self.state, measurements, lost, self._limits, self._params))
+
+
+def _params(settings: MotionSettings, room: int) -> MotionParams:
+    return jax.tree.map(lambda value: np.asarray(value, np.float64), motion_params(settings, room))
+
+
+def _states_at_origin(room: int, params: MotionParams) -> MotionState:
+    zero = np.zeros((room, 3))
+    return _on_host(kalman.init(zero, zero, np.tile(np.eye(3), (room, 1, 1)), params))
+
+
+def _on_host(state: MotionState) -> MotionState:
+    """The state in NumPy arrays of its own."""
+    return jax.tree.map(np.array, state)
+
+
+@jax.jit
+def _predict(state: MotionState, dt_s: Float[Array, ""], params: MotionParams) -> MotionState:
+    return kalman.predict(state, dt_s, params)
+
+
+@jax.jit
+def _correct(
+    state: MotionState,
+    measurements: tuple[Float[Array, "drones 3"], Float[Array, "drones 3 3"], Bool[Array, "drones"]],
+    lost: Bool[Array, "drones"],
+    limits: _Limits,
+    params: MotionParams,
+) -> MotionState:
+    measured_m, covariance_m2, was_measured = measurements
+    state, _ = kalman.update(state, measured_m, covariance_m2, was_measured, params)
+    return kalman.limit_motion(
+        state,
+        ~was_measured,
+        lost,
+        dt_s=limits.dt_s,
+        bounds_m=limits.bounds_m,
+        max_speed_m_s=limits.max_speed_m_s,
+    )

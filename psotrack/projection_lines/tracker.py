@@ -1,0 +1,292 @@
+"""The tracks of all drones through all frames: predict, match, triangulate, correct."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.correspondence import CameraSightings, Sightings
+from psotrack.geometry import Camera, viewpoints
+from psotrack.initiation import FLOOR_CLEARANCE_M, NEW, SPEED_SHARE, reidentify
+from psotrack.motion import GATE_999
+from psotrack.projection_lines.crossings import crossings, in_view
+from psotrack.projection_lines.merged_boxes import split_merged_boxes
+from psotrack.projection_lines.results import as_tracks
+from psotrack.projection_lines.track_motion import TrackMotion
+from psotrack.projection_lines.tracks import Measurement, Track, TrackRow, as_candidate, as_lost_tracks
+from psotrack.settings import DroneSettings, MotionSettings, StatusSettings
+from psotrack.support import Report, no_progress
+from psotrack.tracking import DISPERSION_FRAMES
+from psotrack.trajectories import Tracks
+
+#: A track that was found in this many of its first frames is of a drone.
+CONFIRMED_HITS, FIRST_FRAMES = 5, 8
+#: Least share of the cameras with the drone in view that must see the drone; fewer lines of sight cross by chance.
+#: Detectors miss drones and drones hide each other: half of the cameras would be too many.
+MIN_SHARE = 0.4
+#: A position nearer than this to a track is taken for a part of the track, metres.
+SEPARATION_M = 0.25
+#: A position that this many viewpoints agree on is believed wherever it was expected; two viewpoints agree by chance.
+TRUSTED_VIEWPOINTS = 3
+#: Squared distance from the expected position, normalised by covariance, from which on a drone is elsewhere if trusted
+#: viewpoints say so. The filter treats positions beyond its gate as outliers, which is right up to twice the gate.
+SURPRISING = 2 * GATE_999
+
+
+@dataclass(frozen=True)
+class LineSettings:
+    """The parts of the settings that the projection lines read (see `psotrack.settings`).
+
+    Attributes:
+        motion, drones, status: parts of `TrackSettings`.
+        spread_m: standard deviation of a new track's position, metres.
+    """
+
+    motion: MotionSettings
+    drones: DroneSettings
+    status: StatusSettings
+    spread_m: float
+
+
+def track_detections(
+    cameras: Camera,
+    sightings: Sightings,
+    settings: LineSettings,
+    *,
+    fps: float,
+    bounds_m: Float[np.ndarray, "2 3"],
+    known: tuple[Float[np.ndarray, "known 3"], Float[np.ndarray, "known 3"]] | None = None,
+    report: Report = no_progress,
+) -> Tracks:
+    """Track the drones through all frames by their detections.
+
+    The fitness is the share of the cameras with the drone in view whose detections agree on the drone. Sizes are those
+    of the boxes, as wide along x as along y.
+
+    Args:
+        cameras: with one leading axis.
+        sightings: detections of all cameras.
+        settings: the parts of the settings that the projection lines read.
+        fps: frames per second.
+        bounds_m: (2, 3), lowest and highest corner of the room, metres.
+        known: positions and velocities of the drones at frame 0; None finds the drones.
+        report: told of the frames.
+    """
+    # x64 holds in this scope only: nothing outside of it computes differently.
+    with jax.enable_x64(True):
+        tracker = _Tracker(cameras, settings, fps, bounds_m)
+        if known is not None:
+            tracker.start_known(*known)
+        with report("track", sightings.num_frames) as advance:
+            for frame in range(sightings.num_frames):
+                tracker.step(frame, sightings.at(frame))
+                advance(1)
+    return as_tracks(tracker.tracks_of_drones(), sightings.num_frames)
+
+
+class _Tracker:
+    """Tracks in progress, in slots of the motion model's arrays."""
+
+    def __init__(
+        self, cameras: Camera, settings: LineSettings, fps: float, bounds_m: Float[np.ndarray, "2 3"]
+    ) -> None:
+        self._cameras = cameras
+        self._viewpoint = viewpoints(cameras)
+        self._settings = settings
+        self._fps = fps
+        self._bounds_m = bounds_m
+        self._motion = TrackMotion(settings.motion, fps, bounds_m)
+        self._max_coasting_frames = round(settings.status.max_coasting_s * fps)
+        self._num_drones = 0
+        self._slots: list[Track | None] = []
+        self._ended: list[Track] = []
+
+    def start_known(
+        self, position_m: Float[np.ndarray, "known 3"], velocity_m_s: Float[np.ndarray, "known 3"]
+    ) -> None:
+        """Start tracks of drones that will be at these positions in the next frame."""
+        for position, velocity in zip(position_m, velocity_m_s, strict=True):
+            before_m = position - velocity / self._fps
+            track = Track(self._num_drones, 1.0)
+            self._start(track, before_m, velocity, self._settings.motion.velocity_std_m_s)
+            self._num_drones += 1
+
+    def step(self, frame: int, view: CameraSightings) -> None:
+        """One frame: predict, match, correct, end and confirm tracks."""
+        self._motion.predict()
+        measured = self._measure(view)
+        self._correct(measured)
+        self._append_rows(frame, measured)
+        self._end_lost_tracks()
+        self._confirm_tracks()
+
+    def tracks_of_drones(self) -> list[Track]:
+        """The tracks that are of drones; several may be of one drone."""
+        tracks = [*self._ended, *(track for _, track in self._active())]
+        return [track for track in tracks if track.drone is not None]
+
+    def _active(self) -> list[tuple[int, Track]]:
+        """Slots and tracks that have not ended."""
+        return [(slot, track) for slot, track in enumerate(self._slots) if track is not None]
+
+    def _start(
+        self,
+        track: Track,
+        position_m: Float[np.ndarray, "3"],
+        velocity_m_s: Float[np.ndarray, "3"],
+        velocity_std_m_s: float,
+    ) -> int:
+        """Put a track into a free slot, and return the slot."""
+        if None not in self._slots:
+            self._motion.grow()
+            self._slots += [None] * (len(self._motion) - len(self._slots))
+        slot = self._slots.index(None)
+        self._slots[slot] = track
+        covariance_m2 = np.square(self._settings.spread_m) * np.eye(3)
+        self._motion.place(slot, position_m, velocity_m_s, covariance_m2, velocity_std_m_s)
+        return slot
+
+    def _end(self, slot: int) -> None:
+        track = self._slots[slot]
+        assert track is not None
+        self._ended.append(track)
+        self._slots[slot] = None
+
+    def _measure(self, view: CameraSightings) -> dict[int, Measurement]:
+        """The frame's measurements by slot; a position that is of no track starts one."""
+        slots, tracks = [slot for slot, _ in self._active()], [track for _, track in self._active()]
+        expected_m = np.asarray(self._motion.state.apparent_m[slots])
+        expected_m2 = np.asarray(self._motion.state.covariance[slots, :3, :3])
+        span_m = np.array([track.span_m for track in tracks]).reshape(-1, 2)
+        crossed = crossings(
+            self._cameras,
+            split_merged_boxes(self._cameras, view, expected_m, span_m),
+            self._bounds_m + np.array([[0.0, 0.0, FLOOR_CLEARANCE_M], [0.0, 0.0, 0.0]]),
+            expected_m,
+            expected_m2,
+            np.array([track.dispersion for track in tracks]),
+        )
+        usual = float(np.median([track.dispersion for track in tracks])) if tracks else 1.0
+        measured: dict[int, Measurement] = {}
+        # Expected positions first: a position that nothing expected may be a part of one of those drones.
+        for row in np.argsort(crossed.expected < 0, kind="stable").tolist():
+            number, seen, position_m = int(crossed.expected[row]), crossed.seen[row], crossed.position_m[row]
+            num_viewpoints = len(set(self._viewpoint[seen].tolist()))
+            if seen.sum() < max(self._settings.status.min_cameras, 2) or num_viewpoints < 2:
+                continue
+            if number >= 0:
+                slot = slots[number]
+            elif (distance_m := np.linalg.norm(expected_m - position_m, axis=-1)).min(
+                initial=np.inf
+            ) < SEPARATION_M:
+                # The track's covariance was too small, as when a drone turns sharply.
+                number = int(distance_m.argmin())
+                slot = slots[number]
+                if slot in measured:
+                    continue
+            else:
+                speed_m_s = SPEED_SHARE * self._settings.motion.max_speed_m_s
+                slot = self._start(Track(None, usual), position_m, np.zeros(3), speed_m_s)
+            surprising = False
+            if number >= 0:
+                off_m = position_m - expected_m[number]
+                spread_m2 = expected_m2[number] + crossed.covariance_m2[row]
+                surprising = bool(off_m @ np.linalg.solve(spread_m2, off_m) >= SURPRISING)
+            if not surprising or num_viewpoints >= TRUSTED_VIEWPOINTS:
+                measured[slot] = Measurement(
+                    position_m,
+                    crossed.covariance_m2[row],
+                    float(crossed.disagreement[row]),
+                    int(seen.sum()),
+                    crossed.span_m[row],
+                    surprising,
+                )
+        return measured
+
+    def _correct(self, measured: dict[int, Measurement]) -> None:
+        """Correct the motion model by the measurements."""
+        room = len(self._slots)
+        measured_m, covariance_m2 = np.zeros((room, 3)), np.tile(np.eye(3), (room, 1, 1))
+        was_measured, lost = np.zeros((2, room), bool)
+        for slot, track in self._active():
+            if slot in measured:
+                measured_m[slot] = measured[slot].position_m
+                covariance_m2[slot] = measured[slot].covariance_m2
+                was_measured[slot] = True
+            track.missed = 0 if slot in measured else track.missed + 1
+            lost[slot] = track.missed > self._max_coasting_frames
+        predicted_m_s = np.asarray(self._motion.state.velocity_m_s)
+        self._motion.correct(measured_m, covariance_m2, was_measured, lost)
+        for slot, one in measured.items():
+            if one.surprising:
+                # The filter would treat the position as an outlier for a second, but all viewpoints agree on it.
+                speed_m_s = SPEED_SHARE * self._settings.motion.max_speed_m_s
+                self._motion.place(slot, one.position_m, predicted_m_s[slot], one.covariance_m2, speed_m_s)
+
+    def _append_rows(self, frame: int, measured: dict[int, Measurement]) -> None:
+        """Append the frame's row to each track."""
+        position_m, velocity_m_s, covariance_m2 = (
+            np.asarray(getattr(self._motion.state, name))
+            for name in ("position_m", "velocity_m_s", "position_covariance_m2")
+        )
+        num_in_view = in_view(self._cameras, position_m).sum(axis=-1)
+        for slot, track in self._active():
+            one = measured.get(slot)
+            state = (position_m[slot], velocity_m_s[slot], covariance_m2[slot])
+            track.rows.append(TrackRow(frame, *state, int(num_in_view[slot]), one))
+            if one is not None:
+                track.hits += 1
+                track.dispersion += (one.disagreement - track.dispersion) / DISPERSION_FRAMES
+
+    def _end_lost_tracks(self) -> None:
+        """End tracks of lost drones, and tracks that come from chance crossings of lines of sight."""
+        for slot, track in self._active():
+            too_few = len(track.rows) - track.hits > FIRST_FRAMES - CONFIRMED_HITS
+            too_few |= track.hits >= CONFIRMED_HITS and track.share < MIN_SHARE
+            by_chance = track.drone is None and too_few
+            if by_chance or track.missed > self._max_coasting_frames:
+                self._end(slot)
+
+    def _confirm_tracks(self) -> None:
+        """Assign drones to tracks that were found often enough: a drone that is missed, or a new drone."""
+        unconfirmed = [
+            (slot, track)
+            for slot, track in self._active()
+            if track.drone is None and track.hits >= CONFIRMED_HITS
+        ]
+        if not unconfirmed:
+            return
+        missed = self._missed_drones()
+        count = self._settings.drones.count
+        assignment = reidentify(
+            tuple(as_candidate(track) for _, track in unconfirmed),
+            as_lost_tracks([track for _, track in missed], unconfirmed[0][1].rows[-1].frame, self._fps),
+            fps=self._fps,
+            bounds_m=self._bounds_m,
+            max_speed_m_s=self._settings.motion.max_speed_m_s,
+            max_births=None if count is None else max(count - self._num_drones, 0),
+        )
+        for (slot, track), assigned in zip(unconfirmed, assignment.tolist(), strict=True):
+            if assigned >= 0:
+                former_slot, former = missed[assigned]
+                track.drone = former.drone
+                if former_slot is not None:
+                    self._end(former_slot)
+            elif assigned == NEW:
+                track.drone = self._num_drones
+                self._num_drones += 1
+            else:
+                self._end(slot)
+
+    def _missed_drones(self) -> list[tuple[int | None, Track]]:
+        """The last track of each drone that is not found now, with its slot if the track has not ended."""
+        ended: list[tuple[int | None, Track]] = [(None, track) for track in self._ended]
+        last = {track.drone: (slot, track) for slot, track in [*ended, *self._active()]}
+        return [
+            (slot, track)
+            for drone, (slot, track) in last.items()
+            if drone is not None and (slot is None or track.missed > 0)
+        ]

@@ -1,0 +1,79 @@
+"""Devices: runs shared among all devices, one thread for each device."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+import jax
+
+from psotrack.support import Advance, Report
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+#: Works on some jobs on one device, and reports its progress.
+Work = Callable[[list[Job], jax.Device, Report], list[Result]]
+
+
+def share_among_devices(
+    jobs: Sequence[Job], kinds: Sequence[Hashable], work: Work[Job, Result], report: Report
+) -> list[Result]:
+    """The results of all jobs, in the order of the jobs.
+
+    While one device computes, the Python code of another device's thread has the processor. The calling thread works on
+    the first share itself: it reports the progress, and receives an interrupt.
+
+    Args:
+        jobs: what to do.
+        kinds: of each job, what is compiled for it. Jobs of one kind are spread evenly over the devices.
+        work: does some of the jobs on one device.
+        report: told of the progress of the first device.
+    """
+    devices = jax.devices()[: len(jobs)]
+    by_kind = sorted(range(len(jobs)), key=lambda number: kinds.index(kinds[number]))
+    shares = [by_kind[first :: len(devices)] for first in range(len(devices))]
+    stopped = threading.Event()
+
+    def work_on(share: list[int], device: jax.Device, report: Report) -> list[Result]:
+        with jax.default_device(device):
+            return work([jobs[number] for number in share], device, report)
+
+    @contextlib.contextmanager
+    def until_stopped(description: str, total: int) -> Iterator[Advance]:
+        def advance(steps: int) -> None:
+            if stopped.is_set():
+                raise RuntimeError("another share of the runs has failed")
+
+        yield advance
+
+    with ThreadPoolExecutor(len(devices)) as threads:
+        others = [
+            threads.submit(work_on, share, device, until_stopped)
+            for share, device in zip(shares[1:], devices[1:], strict=True)
+        ]
+        try:
+            done = [work_on(shares[0], devices[0], report), *[other.result() for other in others]]
+        except BaseException:
+            stopped.set()
+            raise
+    results = {
+        number: result
+        for share, of_share in zip(shares, done, strict=True)
+        for number, result in zip(share, of_share, strict=True)
+    }
+    return [results[number] for number in range(len(jobs))]
+
+
+def largest_share(kinds: Sequence[Hashable], kind: Hashable) -> int:
+    """Largest number of jobs of a kind that `share_among_devices` gives to one device."""
+    devices = len(jax.devices()[: len(kinds)])
+    return -(-sum(other == kind for other in kinds) // devices)
+
+
+def num_used_devices(num_jobs: int) -> int:
+    """Number of devices that work on so many jobs."""
+    return len(jax.devices()[:num_jobs])

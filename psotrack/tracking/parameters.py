@@ -1,0 +1,157 @@
+"""What the tracker is compiled for and called with, from its parts of the settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.errors import SettingsError
+from psotrack.motion import motion_params
+from psotrack.settings import (
+    DroneSettings,
+    MotionSettings,
+    ScoreSettings,
+    StatusSettings,
+    SwarmSettings,
+    TrackSettings,
+)
+from psotrack.support import load_plugin, plugin_names
+from psotrack.tracking import tracker
+from psotrack.tracking.fitness import PAPER_SCORE, Score, SoftIoU
+from psotrack.tracking.search import Search, particle_swarm
+
+#: Groups of entry points that add searches and scores by name.
+SEARCHES, SCORES = "psotrack.searches", "psotrack.scores"
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """The parts of the settings that the tracker reads (see `psotrack.settings`), and its search and score.
+
+    Attributes:
+        swarm, score, motion, drones, status: parts of `TrackSettings`.
+        search: the search in one frame.
+        camera_score: the score of positions in single cameras.
+        seed: of the random numbers.
+    """
+
+    swarm: SwarmSettings
+    score: ScoreSettings
+    motion: MotionSettings
+    drones: DroneSettings
+    status: StatusSettings
+    search: Search
+    camera_score: Score
+    seed: int = 0
+
+
+def tracker_settings(
+    settings: TrackSettings, *, search: Search | None = None, score: Score | None = None
+) -> TrackerSettings:
+    """The tracker's parts of the settings of a run.
+
+    Args:
+        settings: of the run.
+        search: instead of the search that the settings name.
+        score: instead of the score that the settings name.
+
+    Raises:
+        SettingsError: the settings name a search or a score that does not exist.
+    """
+    return TrackerSettings(
+        settings.swarm,
+        settings.score,
+        settings.motion,
+        settings.drones,
+        settings.status,
+        search=find_search(settings.swarm) if search is None else search,
+        camera_score=find_score(settings.score) if score is None else score,
+        seed=settings.seed,
+    )
+
+
+def find_search(settings: SwarmSettings) -> Search:
+    """The search that `settings.search` names.
+
+    Raises:
+        SettingsError: there is no search of this name.
+    """
+    if settings.search == "pso":
+        return particle_swarm(settings)
+    make = load_plugin(SEARCHES, settings.search)
+    if make is None:
+        names = ", ".join(["pso", *plugin_names(SEARCHES)])
+        raise SettingsError("swarm.search", expected=f"one of {names}", found=settings.search)
+    search: Search = make(settings)
+    return search
+
+
+def find_score(settings: ScoreSettings) -> Score:
+    """The score that `settings.kind` names.
+
+    Raises:
+        SettingsError: there is no score of this name.
+    """
+    if settings.kind == "soft":
+        return SoftIoU(windows=settings.windows)
+    if settings.kind == "hard":
+        return PAPER_SCORE
+    make = load_plugin(SCORES, settings.kind)
+    if make is None:
+        names = ", ".join(["soft", "hard", *plugin_names(SCORES)])
+        raise SettingsError("score.kind", expected=f"one of {names}", found=settings.kind)
+    score: Score = make(settings)
+    return score
+
+
+def tracker_program(settings: TrackerSettings, reduction: int) -> tracker.Program:
+    """What is compiled in: runs whose programs are equal can be one batch.
+
+    Args:
+        settings: the tracker's parts of the settings.
+        reduction: image pixels per silhouette pixel, along each side.
+    """
+    # The paper's score has neither occlusion nor a slope from which a vertex could be found.
+    hard = settings.camera_score == PAPER_SCORE
+    return tracker.Program(
+        num_particles=settings.swarm.particles,
+        joint=settings.swarm.kind == "joint",
+        occlusion=settings.score.occlusion and not hard,
+        vertex=settings.score.vertex and not hard,
+        score=settings.camera_score,
+        windows=PAPER_SCORE.windows if hard else settings.score.windows,
+        reduction=reduction,
+    )
+
+
+def tracker_params(
+    settings: TrackerSettings,
+    size_m: Float[np.ndarray, "drones 3"],
+    *,
+    fps: float,
+    bounds_m: Float[np.ndarray, "2 3"],
+) -> tracker.TrackerParams:
+    """The numbers with which the tracker is called.
+
+    Args:
+        settings: the tracker's parts of the settings.
+        size_m: (drones, 3), initial full lengths of the drones, metres.
+        fps: frames per second.
+        bounds_m: (2, 3), lowest and highest corner of the room, metres.
+    """
+    return tracker.TrackerParams(
+        num_iterations=jnp.int32(settings.swarm.iterations),
+        size_m=jnp.asarray(size_m, jnp.float32),
+        bounds_m=jnp.asarray(bounds_m, jnp.float32),
+        dt_s=jnp.float32(1 / fps),
+        max_speed_m_s=jnp.float32(settings.motion.max_speed_m_s),
+        spread_m=jnp.float32(settings.swarm.spread_m),
+        search=settings.search,
+        motion=motion_params(settings.motion, len(size_m)),
+        min_fitness=jnp.float32(settings.status.min_fitness),
+        min_cameras=jnp.int32(settings.status.min_cameras),
+        max_coasting_frames=jnp.int32(round(settings.status.max_coasting_s * fps)),
+    )

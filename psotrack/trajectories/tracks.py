@@ -1,0 +1,139 @@
+"""Tracks: what every method of tracking yields, before identity swaps are resolved and later frames are used.
+
+A method says nothing here that only that method knows: numbers that a method does not have are NaN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from psotrack.trajectories.trajectories import Status
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """A drone that came after frame 0, or that came back.
+
+    Attributes:
+        frame: number of the video's frame in which its track starts.
+        drone: number of the drone.
+        again: whether the drone was tracked before, and lost.
+    """
+
+    frame: int
+    drone: int
+    again: bool
+
+
+@dataclass(frozen=True)
+class DroneSizes:
+    """What was learned of the drones' sizes.
+
+    Attributes:
+        size_m: (drones, 3), full lengths along the world's axes, metres.
+        std_m: (drones, 3), standard errors of the lengths, metres; NaN where they are not known.
+        num_frames: (drones, 3), frames from which each length was learned.
+        fill: (drones, windows), share of each of the score's windows that is foreground; NaN where it is not known.
+    """
+
+    size_m: Float[np.ndarray, "drones 3"]
+    std_m: Float[np.ndarray, "drones 3"]
+    num_frames: Int[np.ndarray, "drones 3"]
+    fill: Float[np.ndarray, "drones windows"]
+
+    def joined(self, other: DroneSizes) -> DroneSizes:
+        """These drones, and after them the drones of `other`."""
+        windows = max(self.fill.shape[1], other.fill.shape[1])
+        fills = [
+            np.pad(one.fill, [(0, 0), (0, windows - one.fill.shape[1])], constant_values=np.nan)
+            for one in (self, other)
+        ]
+        return DroneSizes(
+            np.concatenate([self.size_m, other.size_m]),
+            np.concatenate([self.std_m, other.std_m]),
+            np.concatenate([self.num_frames, other.num_frames]),
+            np.concatenate(fills),
+        )
+
+    def of_drones(self, drones: Int[np.ndarray, "chosen"]) -> DroneSizes:
+        """The sizes of some drones, in the order of `drones`."""
+        return DroneSizes(self.size_m[drones], self.std_m[drones], self.num_frames[drones], self.fill[drones])
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Tracks of a whole recording, NumPy arrays with axes (frames, drones, ...).
+
+    "Measured" is what a frame says by itself, whether or not the motion model believed it; every other array depends on
+    the frames before as well. Of a drone that is not there yet nothing is known: NaN.
+
+    Attributes:
+        position_m, velocity_m_s: (frames, drones, 3), world.
+        covariance_m2: (frames, drones, 3, 3), of the positions.
+        measured_m: (frames, drones, 3), position that the frame says by itself.
+        measured_covariance_m2: (frames, drones, 3, 3), of the measured positions.
+        fitness: (frames, drones), how well the frame fits the position, in [0, 1].
+        num_cameras: (frames, drones), cameras that see the drone.
+        status: (frames, drones), values of `Status`.
+        measured_size_m: (frames, drones, 3), size that the frame shows by itself; NaN where it shows none.
+        sizes: what was learned of the drones' sizes.
+        arrivals: drones that came after frame 0, or that came back.
+    """
+
+    position_m: Float[np.ndarray, "frames drones 3"]
+    velocity_m_s: Float[np.ndarray, "frames drones 3"]
+    covariance_m2: Float[np.ndarray, "frames drones 3 3"]
+    measured_m: Float[np.ndarray, "frames drones 3"]
+    measured_covariance_m2: Float[np.ndarray, "frames drones 3 3"]
+    fitness: Float[np.ndarray, "frames drones"]
+    num_cameras: Int[np.ndarray, "frames drones"]
+    status: Int[np.ndarray, "frames drones"]
+    measured_size_m: Float[np.ndarray, "frames drones 3"]
+    sizes: DroneSizes
+    arrivals: tuple[Arrival, ...] = ()
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames."""
+        return self.status.shape[0]
+
+    @property
+    def num_drones(self) -> int:
+        """Number of drones."""
+        return self.status.shape[1]
+
+    def with_arrays(self, change: Callable[[str, np.ndarray], np.ndarray]) -> Tracks:
+        """These tracks with each array of axes (frames, drones, ...) replaced by `change(name, array)`."""
+        changed: dict[str, Any] = {name: change(name, getattr(self, name)) for name in ARRAYS}
+        return replace(self, **changed)
+
+    def found_m(self) -> Float[np.ndarray, "frames drones 3"]:
+        """(frames, drones, 3), measured positions in float64; NaN in frames in which a drone was not found."""
+        found = self.status == Status.TRACKED
+        return np.where(found[..., None], np.asarray(self.measured_m, np.float64), np.nan)
+
+
+#: Names of the arrays of `Tracks` with axes (frames, drones, ...).
+ARRAYS = (
+    "position_m",
+    "velocity_m_s",
+    "covariance_m2",
+    "measured_m",
+    "measured_covariance_m2",
+    "fitness",
+    "num_cameras",
+    "status",
+    "measured_size_m",
+)
+
+
+def unknown_value(name: str, dtype: np.dtype) -> float | int:
+    """The value of an array of `Tracks` where nothing is known of a drone: NaN, lost, or 0."""
+    if name == "status":
+        return int(Status.LOST)
+    return np.nan if dtype.kind == "f" else 0
