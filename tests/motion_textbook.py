@@ -1,7 +1,7 @@
-"""Flights with white jerk, and what a textbook makes of them: written without `motion`, in plain float64 NumPy.
+"""Flights with white jerk, and a textbook filter and smoother, written without `psotrack.motion` in float64 NumPy.
 
-The textbook's state is position, velocity and acceleration, and where errors last, that error: (9,) or (12,). What is
-measured is the sum of the first and the last. `motion` has the sum in its state, instead.
+The textbook's state is position, velocity and acceleration, (9,), and the lasting error if there is one, (12,). A
+measurement observes position plus lasting error. `psotrack.motion` has this sum in its state instead.
 """
 
 from dataclasses import dataclass, replace
@@ -14,13 +14,13 @@ from psotrack.motion import MotionParams
 
 DT_S = 1 / 25
 
-#: From the state of `motion` to the textbook's.
+#: Maps the state of `psotrack.motion` to the textbook's.
 TO_TEXTBOOK = np.eye(12) - np.eye(12, k=9)
 
 
 @dataclass(frozen=True)
 class Model:
-    """The numbers of `MotionParams`, of one drone."""
+    """Values of `MotionParams` for one drone."""
 
     density: float = 30.0
     velocity_std: float = 1.0
@@ -33,7 +33,7 @@ class Model:
         return np.eye(3, 12) + np.eye(3, 12, k=9) if self.error_share else np.eye(3, 9)
 
     def start(self, measured_m, covariance_m2):
-        """The first measurement says what it is the sum of, z = p + b + w: nothing is known of p, and b is as it is."""
+        """Initial mean and covariance from the first measurement z = p + b + w, with no prior of p and that of b."""
         rest = np.diag(np.repeat([self.velocity_std**2, self.acceleration_std**2], 3))
         spread = block_diag(covariance_m2, rest)
         mean = np.concatenate([measured_m, np.zeros(len(self.H.T) - 3)])
@@ -45,7 +45,7 @@ class Model:
         return mean, spread
 
     def transition(self, dt_s, covariance_m2):
-        """F and Q, where the last measurement had this covariance."""
+        """F and Q after a last measurement of this covariance."""
         F, Q = transition(dt_s, self.density)
         if self.error_share:
             left, begun = decay(dt_s, self.error_time_s)
@@ -57,13 +57,13 @@ class Model:
         return (1 - self.error_share) * covariance_m2
 
     def params(self, drones):
-        """Params of drones that are all alike, float64."""
+        """Equal params for all drones, float64."""
         rest = (self.velocity_std, self.acceleration_std, self.error_share, self.error_time_s)
         return MotionParams(np.full(drones, self.density), *map(np.float64, rest))
 
 
 def van_loan(rate, noise, dt_s):
-    """F and Q of dx = rate x dt + white noise, by the matrix exponential (1978), which knows no closed form."""
+    """F and Q of dx = rate x dt + white noise, by the matrix exponential (C. F. Van Loan, 1978)."""
     size = len(rate)
     both = expm(np.block([[-rate, noise], [np.zeros((size, size)), rate.T]]) * dt_s)
     F = both[size:, size:].T
@@ -80,13 +80,13 @@ def transition(dt_s, density):
 
 @cache
 def decay(dt_s, time_s):
-    """What is left of an error of variance 1, and the variance of what is new to it, so that it keeps that variance."""
+    """Decay factor of an error of variance 1, and the variance of its new part, so that the variance stays 1."""
     left, begun = van_loan(np.array([[-1 / time_s]]), np.array([[2 / time_s]]), dt_s)
     return left.item(), begun.item()
 
 
 def textbook_filter(model, time_s, measured_m, covariance_m2, was_measured):
-    """One drone, born in frame 0: means, covariances and NIS of every frame, by inverse and P - K S K^T."""
+    """Filter one drone from frame 0: means, covariances and NIS of every frame, by inverses and P - K S Kᵀ."""
     H = model.H
     x, P = model.start(measured_m[0], covariance_m2[0])
     means, covariances, nis, last = [x], [P], [np.nan], covariance_m2[0]
@@ -107,10 +107,9 @@ def textbook_filter(model, time_s, measured_m, covariance_m2, was_measured):
 
 
 def textbook_smoother(model, time_s, measured_m, covariance_m2, was_measured):
-    """The same as `textbook_filter` given all frames, without any recursion: one Gaussian over all states at once.
+    """Smooth one drone without recursion: condition one joint Gaussian of all states on all measurements.
 
-    All states together have a joint normal prior; the measurements condition it. In the first frame the position is
-    known by its measurement alone.
+    In the first frame, only the measurement determines the position.
     """
     frames = len(time_s)
     start, P = model.start(measured_m[0], covariance_m2[0])
@@ -138,7 +137,7 @@ def textbook_smoother(model, time_s, measured_m, covariance_m2, was_measured):
 
 @dataclass(frozen=True)
 class Flown:
-    """What was flown, (frames, drones, 9), and what was measured of it."""
+    """A flight: true states, (frames, drones, 9), and measurements."""
 
     time_s: np.ndarray
     state: np.ndarray
@@ -149,7 +148,7 @@ class Flown:
 
     @property
     def measurements(self):
-        """What `smooth` and `estimate_jerk_density` take, but the params."""
+        """Arguments of `smooth` and `estimate_jerk_density` without the params."""
         return self.time_s, self.measured_m, self.covariance_m2, self.was_measured
 
     @property
@@ -157,15 +156,15 @@ class Flown:
         return self.model.params(self.was_measured.shape[1])
 
     def of(self, drone, born=0):
-        """What the textbook takes, from the frame that a drone was born in."""
+        """Arguments of the textbook functions for one drone, from its first frame."""
         return self.model, self.time_s[born:], *(part[born:, drone] for part in self.measurements[1:])
 
 
 def fly(seed, *, frames, drones, std_m=0.01, dt_s=DT_S, steady=False, **numbers):
-    """Flights that obey the model to the letter, measured in every frame with errors that obey their covariances.
+    """Simulate flights that obey the model, measured in every frame with errors that obey their covariances.
 
-    Each measurement has a covariance of its own, or where `steady` each drone: ellipsoids that point anywhere, some ten
-    times as long as wide. `numbers` are those of `Model`.
+    Each measurement has its own covariance, or each drone if `steady`: ellipsoids of random directions, with axes in a
+    ratio of about ten. `numbers` are attributes of `Model`.
     """
     rng = np.random.default_rng(seed)
     model = Model(**numbers)
@@ -189,7 +188,7 @@ def fly(seed, *, frames, drones, std_m=0.01, dt_s=DT_S, steady=False, **numbers)
         shape[:] = shape[0]
     white = np.einsum("tdij,tdj->tdi", shape, rng.normal(size=(frames, drones, 3)))
     left, begun = decay(dt_s, model.error_time_s)
-    # What is new to the error that lasts is as large as the measurement before.
+    # The new part of the lasting error has the covariance of the previous measurement.
     share = np.full(frames, begun * model.error_share)
     share[0] = model.error_share
     lasting = np.sqrt(share)[:, None, None] * np.einsum(
@@ -201,7 +200,7 @@ def fly(seed, *, frames, drones, std_m=0.01, dt_s=DT_S, steady=False, **numbers)
         time_s=time_s,
         state=states,
         measured_m=states[..., :3] + lasting + np.sqrt(1 - model.error_share) * white,
-        # No covariance is that of a flat disc.
+        # The added term keeps every covariance positive definite.
         covariance_m2=shape @ np.swapaxes(shape, -1, -2) + 1e-12 * np.eye(3),
         was_measured=np.ones((frames, drones), bool),
         model=model,
@@ -209,13 +208,13 @@ def fly(seed, *, frames, drones, std_m=0.01, dt_s=DT_S, steady=False, **numbers)
 
 
 def calm(flown):
-    """The same with errors half as large as they claim to be: no measurement is beyond the gate."""
+    """Halve the errors of a flight but not their covariances, so that no measurement is beyond the gate."""
     truth_m = flown.state[..., :3]
     return replace(flown, measured_m=truth_m + (flown.measured_m - truth_m) / 2)
 
 
 def without(flown, unknown):
-    """Nothing measured where `unknown`, and NaN to show that it is not used."""
+    """Remove measurements where `unknown`; their values become NaN, so that a use of them would show."""
     measured_m, covariance_m2 = flown.measured_m.copy(), flown.covariance_m2.copy()
     measured_m[unknown], covariance_m2[unknown] = np.nan, np.nan
     return replace(
@@ -224,17 +223,17 @@ def without(flown, unknown):
 
 
 def some_unknown(flown, seed, share=0.3):
-    """Some frames without a measurement, but not the first."""
+    """Remove the measurements of random frames, but not of the first one."""
     unknown = np.random.default_rng(seed).random(flown.was_measured.shape) < share
     unknown[0] = False
     return without(flown, unknown)
 
 
 def motion_params(density, drones, velocity_std=1.0, acceleration_std=2.0, **error):
-    """Params of drones that are all alike, float64."""
+    """Equal params for all drones, float64."""
     return Model(density, velocity_std, acceleration_std, **error).params(drones)
 
 
 def nees(error, covariance):
-    """e^T C^-1 e over the last axes."""
+    """Normalised squared error eᵀ C⁻¹ e over the last axes."""
     return (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(axis=-1)

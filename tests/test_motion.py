@@ -1,4 +1,4 @@
-"""The motion model: against a textbook, against statistics, and in float32 for longer than any flight."""
+"""The motion model, compared with a textbook filter and with statistics, and in float32 over long flights."""
 
 from dataclasses import replace
 
@@ -47,7 +47,7 @@ def filtered(state, params, dt_s, measured_m, covariance_m2, was_measured):
 
 
 def run(flown, dtype=jnp.float32):
-    """The filter over frames 1 and on, from a state at the measurement of frame 0, as NumPy."""
+    """Filter frames 1 and later, from an initial state at the measurement of frame 0; NumPy arrays."""
     with jax.enable_x64(dtype == jnp.float64):
         dt_s = np.diff(flown.time_s)
         first, covariance, there, params = numbers(
@@ -81,18 +81,18 @@ class TestAgainstTheTextbook:
 
         expected, _ = quad_vec(response, 0, dt_s, epsabs=0, epsrel=1e-13)
         with jax.enable_x64(True):
-            # Both to float64; the quadrature says 1e-13.
+            # Both are float64; the tolerance of the quadrature is 1e-13.
             np.testing.assert_allclose(white_jerk_noise(jnp.float64(dt_s)), expected, rtol=1e-12)
 
     @pytest.mark.parametrize("error_share", [0.0, 0.5, 0.95])
     @pytest.mark.parametrize(
-        # float64: sums of a hundred terms, and the textbook's own subtractions. float32: 6e-8 of a position of some
-        # metres per frame, against accelerations that weigh it by 1 / dt^2; measured 4e-6 m and 3e-4 m/s2.
+        # float64: rounding of sums of 100 terms, and cancellation in the textbook's formulas. float32: rounding of 6e-8
+        # of a few metres per frame, which accelerations divide by dt². Measured 4e-6 m and 3e-4 m/s².
         ("dtype", "tolerance"),
         [(jnp.float64, (1e-12, 1e-11, 1e-10, 1e-12)), (jnp.float32, (4e-5, 4e-4, 3e-3, 4e-5))],
     )
     def test_means_covariances_and_nis(self, dtype, tolerance, error_share):
-        """Where errors are white the textbook has no error in its state: then the rest must be as if ours had not."""
+        """If errors are white, the textbook has no lasting error in its state, and the other components must agree."""
         flown = some_unknown(calm(fly(1, frames=60, drones=3, error_share=error_share, error_time_s=0.3)), 2)
         states, nis = run(flown, dtype)
         all_means, all_covariances = as_textbook(states)
@@ -100,25 +100,25 @@ class TestAgainstTheTextbook:
             means, covariances, expected_nis = textbook_filter(*flown.of(drone))
             size = means.shape[1]
             assert size == (12 if error_share else 9)
-            # Nothing here is beyond the gate, of which the textbook knows nothing.
+            # No measurement is beyond the gate, because the textbook filter has none.
             assert np.nanmax(expected_nis) < GATE_999
             for part, limit in enumerate(tolerance[: size // 3]):
                 here = slice(3 * part, 3 * part + 3)
                 np.testing.assert_allclose(all_means[:, drone, here], means[1:, here], rtol=0, atol=limit)
-            # In units of the standard deviations, so that metres and m/s2 count alike.
+            # The difference is in units of the standard deviations, so that metres and m/s² have the same weight.
             unit = np.sqrt(np.diagonal(covariances[1:], axis1=1, axis2=2))
             difference = (all_covariances[:, drone, :size, :size] - covariances[1:]) / (
                 unit[:, :, None] * unit[:, None, :]
             )
             # Measured 3e-13 and 1.4e-4.
             assert np.abs(difference).max() < (1e-11 if dtype == jnp.float64 else 2e-3)
-            # NIS squares an innovation of millimetres, known to micrometres in float32.
+            # NIS squares an innovation of millimetres, whose rounding error in float32 is micrometres.
             np.testing.assert_allclose(
                 nis[:, drone], expected_nis[1:], rtol=1e-10 if dtype == jnp.float64 else 5e-3
             )
 
-    def test_white_errors_leave_no_trace(self):
-        """Not a bit of anything depends on how long errors last when none does."""
+    def test_the_time_constant_of_absent_errors_has_no_effect(self):
+        """Without lasting errors, no bit of the result depends on their time constant."""
         flown = some_unknown(calm(fly(1, frames=60, drones=3)), 2)
         states, nis = run(flown)
         others, other_nis = run(replace(flown, model=Model(error_time_s=7.0)))
@@ -131,14 +131,14 @@ class TestAgainstTheTextbook:
 
     @pytest.mark.parametrize("error_share", [0.0, 0.5])
     def test_prediction_is_the_flow(self, error_share):
-        """Two halves make a whole; nothing moves in no time."""
+        """Two predictions in a row equal one prediction, and a prediction over 0 s changes nothing."""
         flown = fly(3, frames=2, drones=4, error_share=error_share)
         with jax.enable_x64(True):
             measured, covariance, params = numbers(
                 (flown.measured_m[0], flown.covariance_m2[0], flown.params), jnp.float64
             )
             state = init(measured, measured, covariance, params)
-            # A state that knows something of the error, and of the error of what.
+            # After an update, the state has correlations with the lasting error.
             state, _ = update(state, measured + 0.01, covariance, jnp.ones(4, bool), params)
             state = predict(state, jnp.float64(0.04), params)
             whole = predict(state, jnp.float64(0.3), params)
@@ -165,23 +165,23 @@ class TestGaps:
         flown.was_measured[30:50] = False
         states, nis = run(flown)
         spread = np.trace(states.position_covariance_m2, axis1=2, axis2=3)
-        # Row k is of frame k + 1.
+        # Row k belongs to frame k + 1.
         assert (np.diff(spread[28:49], axis=0) > 0).all()
-        # 0.8 s of jerk: by the closed form the root of 3 * 30 * 0.8^5 / 20 is 1.2 m; and what was not known before it.
+        # The jerk of 0.8 s alone gives sqrt(3 * 30 * 0.8**5 / 20) = 1.2 m.
         assert (spread[48] > 1.0**2).all()
         assert (spread[49] < 0.05**2).all()
         assert np.isnan(nis[29:49]).all()
         assert np.isfinite(nis[49:]).all()
 
     def test_an_error_is_forgotten_in_a_gap(self):
-        """What it was; not that there will be one, as large as that of the last measurement."""
+        """The mean of the lasting error decays; its variance returns to that of the last measurement."""
         flown = fly(4, frames=60, drones=3, error_share=0.5)
         flown.was_measured[30:] = False
         states, _ = run(flown)
         assert (np.linalg.norm(states.error_m[28], axis=-1) > 1e-4).all()
         for ahead in (1, 10, 29):
             left = np.exp(-ahead * DT_S / 0.4)
-            # Float32, step by step.
+            # Rounding of float32 in every step.
             np.testing.assert_allclose(
                 states.error_m[28 + ahead], left * states.error_m[28], rtol=1e-4, atol=1e-8
             )
@@ -189,7 +189,7 @@ class TestGaps:
             expected = left**2 * before + (1 - left**2) * 0.5 * flown.covariance_m2[29]
             np.testing.assert_allclose(spread, expected, rtol=0, atol=1e-4 * expected.max())
 
-    def test_what_is_not_measured_changes_nothing(self):
+    def test_a_drone_without_a_measurement_keeps_its_state(self):
         flown = fly(5, frames=2, drones=2, error_share=0.5)
         measured, covariance, params = float32((flown.measured_m, flown.covariance_m2, flown.params))
         state = init(measured[0], measured[0], covariance[0], params)
@@ -204,8 +204,8 @@ class TestGaps:
 
 
 @pytest.mark.parametrize("flights", [0.0, 0.5], indirect=True)
-class TestHonesty:
-    """Flights that obey the model: the filter's own numbers must say how far off it is."""
+class TestConsistency:
+    """On flights that obey the model, the filter's covariances must agree with its errors."""
 
     DRONES, FRAMES = 200, 60
 
@@ -218,14 +218,14 @@ class TestHonesty:
     def test_nis(self, flights):
         """Innovations of frames and drones are independent: their sum is chi-square with 3 degrees for each."""
         nis = flights[2]
-        # A thousandth is beyond the gate and counts as it is. One seed in a thousand would fail by chance.
+        # One NIS in 1,000 is beyond the gate. One seed in 1,000 fails by chance.
         low, high = chi2.ppf([0.0005, 0.9995], 3 * nis.size) / nis.size
         assert low < nis.mean() < high
         assert 0.0003 < np.mean(nis > GATE_999) < 0.002
 
     @pytest.mark.parametrize("frame", [1, 3, 10, 30, FRAMES - 1])
     def test_nees(self, flights, frame):
-        """Of all nine numbers of a drone; drones are independent, frames are not."""
+        """NEES of position, velocity and acceleration; drones are independent, frames are not."""
         flown, states, _ = flights
         mean, covariance = (part[frame - 1] for part in as_textbook(states))
         value = nees(mean[:, :9] - flown.state[frame], covariance[:, :9, :9])
@@ -234,7 +234,7 @@ class TestHonesty:
 
     @pytest.mark.parametrize("frame", [1, 10, FRAMES - 1])
     def test_nees_of_the_position(self, flights, frame):
-        """As people will take it: `position_m`, and whether it is within 90 % of `position_covariance_m2`."""
+        """NEES of `position_m`, and the share of positions inside of the 90 % ellipsoids of their covariances."""
         flown, states, _ = flights
         error_m = states.position_m[frame - 1] - flown.state[frame, :, :3]
         value = nees(error_m, states.position_covariance_m2[frame - 1].astype(np.float64))
@@ -251,19 +251,19 @@ class TestHonesty:
             low, high = chi2.ppf([0.0005, 0.9995], 3 * nis.size) / nis.size
             assert not low < nis.mean() < high
 
-    def test_the_filter_is_better_than_what_it_is_given(self, flights):
+    def test_the_filter_is_better_than_its_measurements(self, flights):
         flown, states, _ = flights
         error_m = states.position_m[20:] - flown.state[21:, :, :3]
         raw_m = flown.measured_m[21:] - flown.state[21:, :, :3]
-        # Measured 0.56 of it, and 0.80 where half of the errors last.
+        # Measured: 0.56 of the measurements' error, and 0.80 where half of the variance is lasting.
         assert np.sqrt((error_m**2).mean()) < (0.9 if flown.model.error_share else 0.7) * np.sqrt(
             (raw_m**2).mean()
         )
 
 
 @pytest.mark.parametrize("density", [1.0, 30.0])
-def test_who_takes_lasting_errors_for_white_knows_less_than_he_thinks(density):
-    """The reason why errors are in the state: the same flights, filtered with and without."""
+def test_lasting_errors_that_are_treated_as_white_make_the_filter_overconfident(density):
+    """This is why lasting errors are in the state: the same flights, filtered with and without them."""
     drones, frames = 200, 60
     flown = fly(6, frames=frames, drones=drones, density=density, error_share=0.5, steady=True)
     inside, off_m = [], []
@@ -273,18 +273,18 @@ def test_who_takes_lasting_errors_for_white_knows_less_than_he_thinks(density):
         value = nees(error_m, states.position_covariance_m2[-1].astype(np.float64))
         inside.append(np.mean(value < chi2.ppf(0.9, 3)))
         off_m.append(np.sqrt((error_m**2).mean()))
-    honest, believer = inside
-    # Of 200 drones, one seed in a thousand beyond.
+    modelled, treated_as_white = inside
+    # The limits for 200 drones are exceeded by one seed in 1,000.
     low, high = binom.ppf([0.0005, 0.9995], drones, 0.9) / drones
-    assert low <= honest <= high
+    assert low <= modelled <= high
     # Measured 0.73 and 0.80.
-    assert believer < low
-    # Nor is he nearer to the truth.
+    assert treated_as_white < low
+    # The positions are not better either.
     assert off_m[0] < 1.02 * off_m[1]
 
 
 def least_correlation(covariance):
-    """Least eigenvalue of the covariances in units of their standard deviations."""
+    """Smallest eigenvalue of the covariances in units of their standard deviations."""
     covariance = covariance.astype(np.float64)
     unit = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     return np.linalg.eigvalsh(covariance / (unit[..., :, None] * unit[..., None, :])).min(axis=-1)
@@ -294,7 +294,7 @@ class TestFloat32:
     FRAMES, DRONES = 10_000, 6
 
     def long_flight(self, decades, flattest, error_share):
-        """Measurements of all sizes, gaps of up to four seconds, slow and wild drones."""
+        """A flight with measurements of all precisions, gaps of up to four seconds, and slow and fast drones."""
         rng = np.random.default_rng(7)
         shape = (self.FRAMES, self.DRONES)
         turn = Rotation.random(self.FRAMES * self.DRONES, rng=rng).as_matrix().reshape(*shape, 3, 3)
@@ -305,7 +305,7 @@ class TestFloat32:
         return Flown(
             time_s=np.arange(self.FRAMES) * DT_S,
             state=np.zeros((*shape, 9)),
-            # But for the gate, what is measured does not matter to the covariances.
+            # Apart from the gate, covariances do not depend on the measured positions.
             measured_m=np.zeros((*shape, 3)),
             covariance_m2=turn * std_m[..., None, :] ** 2 @ np.swapaxes(turn, -1, -2),
             was_measured=was_measured,
@@ -314,7 +314,7 @@ class TestFloat32:
 
     @pytest.mark.parametrize("error_share", [0.0, 0.5, 0.99])
     def test_positive_definite_for_ten_thousand_frames(self, error_share):
-        """From a micrometre to a metre in one measurement: nearer to singular than float32 can say."""
+        """Deviations from a micrometre to a metre in one measurement are closer to singular than float32 resolves."""
         flown = self.long_flight((-3, 0), 4, error_share)
         assert np.linalg.cond(flown.covariance_m2).max() > 1 / np.finfo(np.float32).eps
         states, _ = run(flown)
@@ -326,17 +326,17 @@ class TestFloat32:
 
     @pytest.mark.parametrize("error_share", [0.0, 0.5])
     def test_right_for_ten_thousand_frames(self, error_share):
-        """A millimetre to a decimetre, up to thirty times as long as wide: cameras of a hall."""
+        """Deviations from a millimetre to a decimetre, with axes in ratios up to 30, as from the cameras of a hall."""
         flown = self.long_flight((-2, -1), 1.5, error_share)
         both = [run(flown, dtype)[0] for dtype in (jnp.float32, jnp.float64)]
         for name in ("covariance", "position_covariance_m2"):
             variance, expected = (np.diagonal(getattr(states, name), axis1=-2, axis2=-1) for states in both)
-            # Rounding 6e-8 of the largest variance counts a thousandfold for the least. Measured 5e-3 at worst.
+            # Rounding of 6e-8 of the largest variance is 1,000 times larger for the smallest. Measured 5e-3 at worst.
             np.testing.assert_allclose(variance, expected, rtol=1e-2)
 
     @pytest.mark.parametrize("std_m", [1e-4, 1e-3, 1e-2])
     def test_a_precise_measurement_after_a_long_gap(self, std_m):
-        """Ten metres of not knowing, then a tenth of a millimetre: P - K S K^T would leave rounding, or less than 0."""
+        """After an uncertainty of ten metres, P - K S Kᵀ of a precise measurement would be rounding or negative."""
         results = []
         for dtype in (jnp.float32, jnp.float64):
             with jax.enable_x64(dtype == jnp.float64):
@@ -351,8 +351,8 @@ class TestFloat32:
             np.testing.assert_allclose(np.diagonal(rounded[0]), np.diagonal(expected[0]), rtol=1e-4)
             assert least_correlation(rounded).min() > 0
 
-    def test_a_position_that_is_known_while_its_error_is_not(self):
-        """Its variance is lost in the rounding of the two that it is the difference of; it must not be 0 or less."""
+    def test_a_precise_position_with_a_vague_lasting_error(self):
+        """The position's variance is a difference that rounding makes 0 or negative; the result must be positive."""
         rng = np.random.default_rng(9)
         shape = rng.normal(size=(50, 3, 3))
         error = shape @ np.swapaxes(shape, 1, 2)
@@ -361,13 +361,13 @@ class TestFloat32:
         covariance[:, :3, 9:] = covariance[:, 9:, :3] = covariance[:, 9:, 9:] = error
         state = kalman.state_from_mean(*float32((np.zeros((50, 12)), covariance, error)))
         assert least_correlation(np.asarray(state.position_covariance_m2)).min() > 0
-        # Nor may it be said to be much worse known than it is: to some roundings of the error's variance.
+        # The variance must not grow by more than a few rounding units of the lasting error's variance.
         spread, limit = (np.trace(each, axis1=1, axis2=2) for each in (state.position_covariance_m2, error))
         assert (spread < 1e-5 * limit).all()
 
     @pytest.mark.parametrize("std_m", [100.0, 1e6])
-    def test_a_measurement_that_says_nothing_costs_little(self, std_m):
-        """Its error lasts no less than others; in float32 the position would drown in it, to hundreds of kilometres."""
+    def test_a_measurement_without_information_costs_little(self, std_m):
+        """Its lasting error would be hundreds of kilometres, and in float32 the position would lose its digits."""
         frames = 80
         covariance_m2 = np.broadcast_to(1e-4 * np.eye(3), (frames, 1, 3, 3)).copy()
         was_measured = np.ones((frames, 1), bool)
@@ -386,15 +386,15 @@ class TestFloat32:
                 )
             )
             spread_m.append(np.sqrt(states.position_covariance_m2[:, 0, 0, 0]))
-        # The next measurement counts as if errors had begun anew, and so for less, but soon as if nothing had been.
-        # Measured 10.8 mm at frame 50, 14.0 against 9.3 mm in the frame after, and 9.4 against 8.8 mm 10 frames later.
+        # The next measurements have less weight, because the lasting error is new; this fades within ten frames.
+        # Measured 10.8 mm at frame 50, 14.0 against 9.3 mm in the next frame, and 9.4 against 8.8 mm 10 frames later.
         without, with_it = spread_m
         np.testing.assert_allclose(with_it[49], without[49], rtol=1e-3)
         assert with_it[50] < 1.6 * without[50]
         np.testing.assert_allclose(with_it[60:], without[60:], rtol=0.1)
 
     def test_covariances_that_are_flat_in_float32(self):
-        """Two cameras on one side: a millimetre across, metres along. Their sum has no Cholesky factor in float32."""
+        """Two cameras on one side measure to a millimetre across and metres along; float32 has no Cholesky factor."""
         rng = np.random.default_rng(8)
         turn = Rotation.random(50, rng=rng).as_matrix()
         flat = turn @ np.diag([1e-7, 1e-7, 1e2]) @ np.swapaxes(turn, -1, -2)
@@ -409,7 +409,7 @@ class TestFloat32:
         assert np.isfinite(nis).all()
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after))
         assert least_correlation(np.asarray(after.covariance)).min() > 0
-        # A measurement never adds to what is not known, but for rounding: 6e-8 of 100 m2, times gains of some 1e-2.
+        # A measurement never raises a variance, apart from rounding: 6e-8 of 100 m², times gains of about 1e-2.
         variance, before = (np.diagonal(each.covariance, axis1=1, axis2=2) for each in (after, state))
         assert (variance <= before * 1.5).all()
 
@@ -418,7 +418,7 @@ class TestOutliers:
     @pytest.fixture(scope="class")
     @classmethod
     def expecting(cls):
-        """A state that expects its measurement to a centimetre or so, R, and params with errors that last."""
+        """A state that predicts its measurement to about a centimetre, R, and params with lasting errors."""
         flown = fly(9, frames=60, drones=3, error_share=0.5)
         states, _ = run(flown)
         with jax.enable_x64(True):
@@ -433,9 +433,9 @@ class TestOutliers:
             return predict(last, jnp.float64(DT_S), params), covariance, params
 
     def at(self, expecting, nis, direction=(0.6, 0.0, 0.8)):
-        """A measurement whose NIS is this."""
+        """A measurement with a given NIS."""
         state, covariance, _ = expecting
-        # Of the apparent position, and half of R, which is the white share.
+        # S is the covariance of the apparent position plus the white share, half of R.
         S = (np.asarray(state.covariance)[:, :3, :3] + np.asarray(covariance) / 2)[0]
         direction = np.array(direction)
         return np.asarray(state.apparent_m) + direction * np.sqrt(
@@ -446,7 +446,7 @@ class TestOutliers:
         assert pytest.approx(chi2.ppf(0.999, 3), rel=1e-12) == GATE_999
 
     @pytest.mark.parametrize("nis", [1.0, 16.0, 17.0, 100.0, 1e4])
-    def test_what_is_beyond_the_gate_counts_as_if_measured_worse(self, expecting, nis):
+    def test_beyond_the_gate_a_measurement_has_a_larger_covariance(self, expecting, nis):
         state, covariance, params = expecting
         measured, S = self.at(expecting, nis)
         excess = max(nis / GATE_999, 1)
@@ -454,7 +454,7 @@ class TestOutliers:
             after, found = update(state, jnp.asarray(measured), covariance, jnp.array([True]), params)
             log_density = log_likelihood(state, jnp.asarray(measured), covariance, params)
         np.testing.assert_allclose(found, nis, rtol=1e-9)
-        # By the textbook, with R grown such that S is `excess` times itself.
+        # The textbook's update, with R increased so that S becomes `excess` times S.
         P, H = np.asarray(state.covariance)[0], np.eye(3, 12)
         K = P @ H.T @ np.linalg.inv(excess * S)
         innovation = measured[0] - np.asarray(state.apparent_m)[0]
@@ -463,7 +463,7 @@ class TestOutliers:
         expected = multivariate_normal(np.zeros(3), excess * S).logpdf(innovation)
         np.testing.assert_allclose(log_density, expected, rtol=1e-9)
 
-    def test_the_farther_off_the_less_it_moves(self, expecting):
+    def test_a_farther_outlier_moves_the_state_less(self, expecting):
         state, covariance, params = expecting
         moved = []
         for nis in (GATE_999, 100.0, 1e4, 1e6):
@@ -472,17 +472,18 @@ class TestOutliers:
                 after, _ = update(state, measured, covariance, jnp.array([True]), params)
             moved.append(float(np.linalg.norm(after.apparent_m - state.apparent_m)))
         assert moved == sorted(moved, reverse=True)
-        # At the gate about four standard deviations of the state; of S the more.
+        # A measurement at the gate moves the state by about four of its standard deviations.
         assert moved[0] < 4.1 * np.sqrt(np.linalg.eigvalsh(np.asarray(state.covariance)[0, :3, :3]).max())
 
     @pytest.mark.parametrize("error_share", [0.0, 0.5])
-    def test_a_drone_that_did_jump_is_followed(self, error_share):
-        """Half a metre along each axis, from frame 50 on."""
+    def test_a_drone_that_really_jumps_is_followed(self, error_share):
+        """The jump is half a metre along each axis in frame 50."""
         flown = fly(10, frames=100, drones=20, error_share=error_share)
         jump_m = 0.5 * (np.arange(100) >= 50)[:, None, None]
         states, _ = run(replace(flown, measured_m=flown.measured_m + jump_m))
         off_m = np.linalg.norm(states.position_m - (flown.state[:, :, :3] + jump_m)[1:], axis=-1)
-        # Not at once, at frame 50 (row 49); but a second later. Measured 0.83, and 0.03 or 0.04 m, as before the jump.
+        # The filter rejects the jump in frame 50 (row 49) and has followed it a second later. Measured 0.83 m, and 0.03
+        # or 0.04 m, as before the jump.
         assert off_m[49].min() > 0.8
         assert off_m[80:].max() < 0.06
 
@@ -500,7 +501,7 @@ class TestSymmetries:
             covariance_m2=turn @ flown.covariance_m2 @ turn.T,
         )
         (here, nis), (there, nis_there) = run(flown, jnp.float64), run(turned, jnp.float64)
-        # Accelerations are positions of 1e-10 m over dt^2.
+        # Rounding errors of positions, 1e-10 m, are divided by dt² in accelerations.
         np.testing.assert_allclose(there.position_m, here.position_m @ turn.T + shift_m, rtol=0, atol=1e-9)
         np.testing.assert_allclose(there.velocity_m_s, here.velocity_m_s @ turn.T, rtol=0, atol=1e-7)
         np.testing.assert_allclose(
@@ -512,8 +513,8 @@ class TestSymmetries:
             there.position_covariance_m2, expected_m2, rtol=0, atol=1e-6 * expected_m2.max()
         )
 
-    def test_drones_do_not_know_of_each_other(self):
-        """Alone or in company, bit for bit but for the compiler's choice of order: to float32."""
+    def test_drones_do_not_affect_each_other(self):
+        """A drone has the same states alone and with others, apart from float32 rounding in the compiler's order."""
         flown = some_unknown(fly(11, frames=60, drones=3, error_share=0.5), 12)
         together, _ = run(flown)
         alone, _ = run(
@@ -527,7 +528,7 @@ class TestSymmetries:
         np.testing.assert_allclose(alone.position_m[:, 0], together.position_m[:, 1], rtol=0, atol=1e-5)
 
 
-def test_means_come_apart_and_together():
+def test_a_mean_is_split_and_joined():
     mean = jnp.arange(24.0).reshape(2, 12)
     state = kalman.state_from_mean(mean, jnp.zeros((2, 12, 12)), jnp.zeros((2, 3, 3)))
     assert state.velocity_m_s.tolist() == [[3, 4, 5], [15, 16, 17]]
@@ -536,21 +537,21 @@ def test_means_come_apart_and_together():
     np.testing.assert_array_equal(state.mean, mean)
 
 
-def test_the_start_is_what_was_given():
+def test_the_initial_state_is_the_given_one():
     position, velocity = jnp.ones((2, 3)), 2 * jnp.ones((2, 3))
     covariance = jnp.broadcast_to(jnp.diag(jnp.array([1.0, 2.0, 3.0])), (2, 3, 3))
     state = init(position, velocity, covariance, motion_params(30.0, 2, 0.5, 4.0, error_share=0.25))
     np.testing.assert_array_equal(state.mean, [[1] * 3 + [2] * 3 + [0] * 6] * 2)
     np.testing.assert_array_equal(state.position_m, position)
     expected = np.diag([0.75, 1.5, 2.25, 0.25, 0.25, 0.25, 16, 16, 16, 0.25, 0.5, 0.75])
-    # The position's variances are held above rounding, 1e-6 of their sum.
+    # The position's variances have a floor of 1e-6 of their sum.
     np.testing.assert_allclose(state.covariance, [expected] * 2, rtol=0, atol=1e-5)
-    # Whatever the share, the position is known as well as was said.
+    # The covariance of the position does not depend on the share of the lasting error.
     np.testing.assert_allclose(state.position_covariance_m2, covariance, rtol=0, atol=2e-5)
     np.testing.assert_allclose(state.noise_m2, covariance, rtol=0, atol=1e-5)
 
 
-def test_other_numbers_compile_nothing(caplog):
+def test_other_values_need_no_compilation(caplog):
     step = jax.jit(
         lambda state, dt_s, params, *measured: update(predict(state, dt_s, params), *measured, params)
     )

@@ -1,4 +1,4 @@
-"""The smoother and the strength of the jerk: against one Gaussian over all frames, statistics, and symmetries."""
+"""The smoother and the estimate of the jerk density, compared with one joint Gaussian, statistics, and symmetries."""
 
 from dataclasses import replace
 
@@ -32,10 +32,10 @@ def smoothed(flown: Flown):
 
 class TestSmoothing:
     @pytest.mark.parametrize("error_share", [0.0, 1e-6, 0.5, 0.95])
-    def test_it_is_the_gaussian_given_all_frames(self, error_share):
-        """Gaps, times that are not evenly spaced, and a drone that is first seen in frame 5.
+    def test_the_result_is_the_gaussian_given_all_frames(self, error_share):
+        """The recording has gaps, uneven times, and a drone that is first measured in frame 5.
 
-        Where errors are white the textbook has no error in its state: then the rest must be as if ours had not.
+        If errors are white, the textbook has no lasting error in its state, and the other components must agree.
         """
         flown = calm(fly(1, frames=30, drones=2, error_share=error_share, error_time_s=0.3))
         unknown = np.random.default_rng(2).random((30, 2)) < 0.3
@@ -44,10 +44,10 @@ class TestSmoothing:
         flown = without(replace(flown, time_s=time_s), unknown)
         result = smoothed(flown)
         for drone, born in ((0, 0), (1, 5)):
-            # Nothing is beyond the gate, of which the textbook knows nothing.
+            # No measurement is beyond the gate, because the textbook filter has none.
             assert np.nanmax(textbook_filter(*flown.of(drone, born))[2]) < 16
             mean, covariance = textbook_smoother(*flown.of(drone, born))
-            # Float64 throughout; the textbook inverts one matrix of some 60 x 60. Measured 8e-12, 8e-11, 8e-10.
+            # Both are float64, and the textbook inverts a matrix of about 60 x 60. Measured 8e-12, 8e-11, 8e-10.
             for part, expected, limit in (
                 (result.position_m, mean[:, :3], 1e-9),
                 (result.velocity_m_s, mean[:, 3:6], 1e-8),
@@ -57,8 +57,8 @@ class TestSmoothing:
                 np.testing.assert_allclose(part[born:, drone], expected, rtol=0, atol=limit)
                 assert np.isnan(part[:born, drone]).all()
 
-    def test_white_errors_leave_no_trace(self):
-        """Not a bit of anything depends on how long errors last when none does."""
+    def test_the_time_constant_of_absent_errors_has_no_effect(self):
+        """Without lasting errors, no bit of the result depends on their time constant."""
         flown = some_unknown(fly(1, frames=30, drones=2), 2)
         other = replace(flown, model=Model(error_time_s=7.0))
         for one, same in zip(*(vars(smoothed(each)).values() for each in (flown, other)), strict=True):
@@ -66,7 +66,7 @@ class TestSmoothing:
         density = [estimate_jerk_density(*flown.measurements, each.params) for each in (flown, other)]
         np.testing.assert_array_equal(*density)
 
-    def test_it_beats_the_filter_which_beats_what_is_measured(self):
+    def test_the_smoother_beats_the_filter_and_the_filter_the_measurements(self):
         flown = fly(4, frames=100, drones=20)
         filtered_m = np.stack([textbook_filter(*flown.of(drone))[0] for drone in range(20)], axis=1)[..., :3]
         raw, filtered, after = (
@@ -78,8 +78,8 @@ class TestSmoothing:
 
     @pytest.mark.parametrize("unknown", [0.0, 0.4])
     @pytest.mark.parametrize("error_share", [0.0, 0.5])
-    def test_it_knows_how_far_off_it_is(self, unknown, error_share):
-        """NEES of independent drones is chi-square with 3 degrees each; one seed in a thousand fails by chance."""
+    def test_covariances_cover_the_errors(self, unknown, error_share):
+        """NEES of independent drones is chi-square with 3 degrees each; one seed in 1,000 fails by chance."""
         drones = 300
         flown = some_unknown(
             fly(5, frames=60, drones=drones, error_share=error_share, steady=True), 6, unknown
@@ -90,8 +90,8 @@ class TestSmoothing:
             value = nees(result.position_m[frame] - flown.state[frame, :, :3], result.covariance_m2[frame])
             assert low < value.mean() < high, frame
 
-    def test_who_takes_lasting_errors_for_white_knows_less_than_he_thinks(self):
-        """Nor is he nearer to the truth."""
+    def test_lasting_errors_that_are_treated_as_white_make_the_smoother_overconfident(self):
+        """Its positions are not better either."""
         flown = fly(5, frames=60, drones=300, density=1.0, error_share=0.5, steady=True)
         inside, off_m = [], []
         for each in (flown, replace(flown, model=replace(flown.model, error_share=0.0))):
@@ -112,10 +112,10 @@ class TestSmoothing:
         spread = np.trace(result.covariance_m2, axis1=-2, axis2=-1)
         assert (np.diff(spread[39:49], axis=0) > 0).all()
         assert (np.diff(spread[50:61], axis=0) < 0).all()
-        # After the last measurement it only grows.
+        # After the last measurement the uncertainty only grows.
         assert (np.diff(spread[89:], axis=0) > 0).all()
 
-    def test_after_the_last_measurement_it_flies_on(self):
+    def test_after_the_last_measurement_the_drone_is_predicted(self):
         unknown = np.zeros((30, 2), bool)
         unknown[20:] = True
         flown = without(fly(8, frames=30, drones=2, error_share=0.5), unknown)
@@ -126,7 +126,7 @@ class TestSmoothing:
             + ahead_s * result.velocity_m_s[19]
             + ahead_s**2 / 2 * result.acceleration_m_s2[19]
         )
-        # Ten steps of float64 at some metres.
+        # Ten steps in float64 with positions of a few metres.
         np.testing.assert_allclose(result.position_m[19:], expected, rtol=0, atol=1e-11)
 
     def test_a_drone_that_is_never_measured(self):
@@ -139,12 +139,13 @@ class TestSmoothing:
             np.testing.assert_array_equal(part[:, 0], same[:, 0])
 
     @pytest.mark.parametrize("error_share", [0.0, 0.5])
-    def test_an_outlier_counts_for_little(self, error_share):
+    def test_an_outlier_has_little_weight(self, error_share):
         flown = fly(10, frames=100, drones=20, error_share=error_share)
         wild = flown.measured_m.copy()
         wild[50] += 0.5
         result, clean = smoothed(replace(flown, measured_m=wild)), smoothed(flown)
-        # By 0.87 m; measured 6 mm at most, where the smoothed standard deviation over three axes is 4 and 12 mm.
+        # The outlier is 0.87 m off. Measured: it moves positions by up to 6 mm, where the smoothed standard deviation
+        # over three axes is 4 mm (white errors) and 12 mm (lasting errors).
         moved_m = np.linalg.norm(result.position_m - clean.position_m, axis=-1)
         assert moved_m.max() < 0.012
 
@@ -159,7 +160,7 @@ class TestSmoothing:
         for value in vars(result).values():
             assert np.isfinite(value).all()
         assert np.linalg.eigvalsh(result.covariance_m2).min() > 0
-        # Bridging 108 s says little; that it says so is the point.
+        # A gap of 108 s leaves hundreds of metres of uncertainty, and the covariance must say so.
         assert np.trace(result.covariance_m2[1500, 1]) > 100.0**2
 
 
@@ -178,7 +179,7 @@ class TestSymmetries:
             )
         )
         here = smoothed(flown)
-        # Float64, with covariances that are flat to 1e-5.
+        # The arithmetic is float64; the condition number of the covariances is 1e5.
         np.testing.assert_allclose(turned.position_m, here.position_m @ turn.T + shift_m, rtol=0, atol=1e-8)
         np.testing.assert_allclose(turned.velocity_m_s, here.velocity_m_s @ turn.T, rtol=0, atol=1e-6)
         np.testing.assert_allclose(
@@ -190,13 +191,13 @@ class TestSymmetries:
 
     @given(st.integers(0, 2**32 - 1))
     @settings(max_examples=15, deadline=None)
-    def test_the_film_may_run_backwards(self, seed):
-        """White jerk and errors that last have no direction of time. What is known of the start has: next to nothing.
+    def test_reversed_time_gives_reversed_tracks(self, seed):
+        """White jerk and lasting errors are symmetric in time. The prior of the first state is not, so it is vague.
 
-        The gate has, too: what is beyond it depends on what came before, and so nothing is.
+        The gate is not symmetric either, so no measurement is beyond the gate.
         """
         unknown = np.random.default_rng(seed).random((30, 2)) < 0.3
-        # Measured at both ends: before the first measurement there is nothing, after the last a prediction.
+        # Both ends are measured, because frames before the first measurement are NaN, and those after the last are not.
         unknown[[0, -1]] = False
         flown = without(calm(fly(seed, frames=30, drones=2, error_share=0.5, steady=True)), unknown)
         flown = replace(flown, model=replace(flown.model, velocity_std=1e3, acceleration_std=1e5))
@@ -209,7 +210,7 @@ class TestSymmetries:
             flown.model,
         )
         forth, back = smoothed(flown), smoothed(back)
-        # Starting values of 1 km/s and 10 km/s^2 pull by some 1e-7 of what is not known, a few m/s and 10 m/s2.
+        # Priors of 1 km/s and 100 km/s² change the result by about 1e-7 of its uncertainty, a few m/s and 10 m/s².
         np.testing.assert_allclose(back.position_m[::-1], forth.position_m, rtol=0, atol=1e-6)
         np.testing.assert_allclose(-back.velocity_m_s[::-1], forth.velocity_m_s, rtol=0, atol=1e-4)
         np.testing.assert_allclose(back.acceleration_m_s2[::-1], forth.acceleration_m_s2, rtol=0, atol=1e-2)
@@ -221,17 +222,17 @@ class TestJerkDensity:
 
     @pytest.mark.parametrize("error_share", [0.0, 0.5])
     @pytest.mark.parametrize("density", [0.3, 30.0, 3000.0])
-    def test_it_is_found_from_the_measurements(self, density, error_share):
+    def test_the_density_is_found_from_the_measurements(self, density, error_share):
         flown = fly(12, frames=self.FRAMES, drones=8, density=density, error_share=error_share, steady=True)
         flown = some_unknown(flown, 13, 0.1)
         found = estimate_jerk_density(*flown.measurements, motion_params(30.0, 8, error_share=error_share))
         off = np.log10(found / density)
-        # 24 s are some 100 independent looks at the jerk along three axes: each drone to a tenth of a decade or so,
-        # eight of them to a third of that. Measured 0.06 and 0.01 at the most.
+        # 24 s have about 100 independent samples of the jerk along three axes. They give the density of one drone to
+        # about a tenth of a decade, and the mean of eight drones to a third of that. Measured 0.06 and 0.01 at most.
         assert np.abs(off).max() < 0.2
         assert abs(off.mean()) < 0.05
 
-    def test_outliers_do_not_pass_for_jerk(self):
+    def test_outliers_do_not_raise_the_density(self):
         flown = fly(14, frames=self.FRAMES, drones=8)
         rng = np.random.default_rng(15)
         wild = rng.random(flown.was_measured.shape) < 0.03
@@ -240,18 +241,18 @@ class TestJerkDensity:
         found = estimate_jerk_density(
             *replace(flown, measured_m=measured_m).measurements, motion_params(30.0, 8)
         )
-        # As if there were none.
+        # The limit is that of flights without outliers.
         assert np.abs(np.log10(found / 30.0)).max() < 0.3
 
-    def test_a_drone_that_is_hardly_measured_gets_what_was_expected(self):
+    def test_a_drone_with_almost_no_measurements_keeps_the_prior(self):
         unknown = np.zeros((30, 2), bool)
         unknown[1:, 0], unknown[:, 1] = True, True
         flown = without(fly(16, frames=30, drones=2), unknown)
         found = estimate_jerk_density(*flown.measurements, motion_params(70.0, 2))
-        # A prior alone is a parabola, whose vertex is found to rounding, and the params are float32.
+        # The prior alone is a parabola, whose vertex is found to rounding.
         np.testing.assert_allclose(found, 70.0, rtol=1e-6)
 
-    def test_a_drone_that_hangs_in_the_air_is_calm(self):
+    def test_a_hovering_drone_has_a_small_density(self):
         rng = np.random.default_rng(17)
         flown = fly(17, frames=self.FRAMES, drones=8)
         still = replace(
@@ -259,11 +260,11 @@ class TestJerkDensity:
             measured_m=rng.normal(scale=0.01, size=flown.measured_m.shape),
             covariance_m2=np.broadcast_to(1e-4 * np.eye(3), flown.covariance_m2.shape),
         )
-        # Three hundred times less, in spite of the prior: in 24 s it accelerates to less than 1 m/s2.
+        # The density is 300 times below the prior; it corresponds to accelerations below 1 m/s² within 24 s.
         assert (estimate_jerk_density(*still.measurements, flown.params) < 0.1).all()
 
 
-class TestWhatIsRefused:
+class TestRefusedInput:
     def changed(self, **changes):
         flown = fly(18, frames=30, drones=2)
         for name, (index, value) in changes.items():
@@ -287,24 +288,24 @@ class TestWhatIsRefused:
             ),
         ],
     )
-    def test_in_one_line(self, function, changes, message):
+    def test_the_message_names_the_first_wrong_value(self, function, changes, message):
         flown = self.changed(**changes)
         with pytest.raises(InputError, match=message):
             function(*flown.measurements, flown.params)
 
-    def test_what_is_not_measured_may_be_anything(self):
+    def test_values_without_a_measurement_are_ignored(self):
         flown = self.changed(was_measured=((4, 1), False), covariance_m2=((4, 1), np.diag([1, 1, -1])))
         assert np.isfinite(smoothed(flown).position_m).all()
 
 
-def test_double_precision_stays_within():
+def test_double_precision_does_not_leave_the_call():
     flown = fly(19, frames=30, drones=2)
     assert smoothed(flown).position_m.dtype == np.float64
     assert not jax.config.jax_enable_x64
     assert jax.numpy.zeros(1).dtype == np.float32
 
 
-def test_other_numbers_compile_nothing(caplog):
+def test_other_values_need_no_compilation(caplog):
     def both(seed, density):
         flown = some_unknown(fly(seed, frames=8, drones=2), seed)
         smooth(*flown.measurements, motion_params(density, 2))

@@ -1,9 +1,9 @@
-"""Bundle adjustment: cameras and points moved together until the points project to where they are seen, in float64.
+"""Bundle adjustment: move cameras and points together until the points project to their measured pixels, in float64.
 
 Triggs, McLauchlan, Hartley & Fitzgibbon (2000), "Bundle adjustment, a modern synthesis": Levenberg-Marquardt with the
-points eliminated by the Schur complement, a Cauchy loss by reweighting, and once more without on what agrees.
+points eliminated (`psotrack.estimation`), first with a robust loss, then with squared residuals of the inliers.
 
-Pixels alone do not say where the world's origin is, how its axes are turned, or how large it is: see `gauge`.
+Pixels do not determine the world's origin, the directions of its axes, or its scale: see `gauge`.
 """
 
 from __future__ import annotations
@@ -14,15 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.calibration.bundle_equations import (
-    BundleState,
-    Problem,
-    distance_px,
-    equations_of,
-    scaled,
-    solved,
-    weights_of,
-)
+from psotrack.calibration.bundle_equations import Bundle, BundleState, Problem, scale_focal_lengths
 from psotrack.calibration.common_errors import CommonErrors, covariance_of_common_errors
 from psotrack.calibration.derivatives import centre_by_pose
 from psotrack.calibration.gauge import common_motions, pose_change_metric
@@ -33,20 +25,21 @@ from psotrack.geometry import NEAR_M, Camera, CameraRig, to_camera, triangulate
 
 @dataclass(frozen=True)
 class AdjustedRig:
-    """A rig that its data agree with.
+    """Result of a bundle adjustment.
 
     Attributes:
-        rig: adjusted.
+        rig: the adjusted cameras.
         points_m: (points, 3), world, metres; NaN where fewer than two cameras see a point.
-        residual_px: (points, cameras), distances in the image, outliers too; NaN where a camera does not see a point.
-        used: (points, cameras), False for outliers and what is not seen.
-        covariance: (cameras, 6, 6), of a small turn about the camera's axes, rad, and of the translation, m, the rig as
-            a whole being held; 0 for cameras that are fixed.
-        joint_covariance: (unknowns, unknowns), the same of all cameras together; last the logarithm of the focal
-            lengths' factor.
-        centre_covariance_m2: (cameras, 3, 3), of the centres, world, m².
-        focal_scale: what focal lengths were multiplied with; 1 where they are fixed.
-        focal_scale_std: its standard deviation; 0 where they are fixed.
+        residual_px: (points, cameras), distances in the image, also of outliers; NaN where a camera does not see a
+            point.
+        used: (points, cameras), False for outliers and for unseen points.
+        covariance: (cameras, 6, 6), covariance of a small turn about the camera's axes, rad, and of the translation, m,
+            while the rig as a whole is held; 0 for fixed cameras.
+        joint_covariance: (unknowns, unknowns), covariance of the unknowns of all cameras, and of the logarithm of the
+            focal lengths' factor, which is last.
+        centre_covariance_m2: (cameras, 3, 3), covariances of the camera centres, world, m².
+        focal_scale: factor on the focal lengths; 1 where they are fixed.
+        focal_scale_std: standard deviation of the factor; 0 where the focal lengths are fixed.
     """
 
     rig: CameraRig
@@ -69,22 +62,22 @@ def adjust(
     rescaled: Ordered[str] = (),
     common_errors: Ordered[CommonErrors] = (),
 ) -> AdjustedRig:
-    """The rig, and the points, that explain what the cameras see.
+    """Adjust the cameras of a rig, and triangulate the points, so that projections agree with measured pixels.
 
-    The covariance is that of errors of the stated noise, wider where residuals are larger than it explains, and of
-    common errors: the middle of a drone's box is off in the same way for many frames.
+    The covariance is that of independent errors with the stated noise, or larger if the residuals are larger, plus
+    that of errors in common: for example, the middle of a drone's box has the same error in many frames.
 
     Args:
-        rig: where the cameras are about.
-        points_px: (points, cameras, 2), the same points in all cameras; NaN where a camera does not see one.
-        noise_px: standard deviation along x and along y of errors that are independent, one for all or of each.
-        fixed: names of cameras that stay where they are.
-        rescaled: names of cameras whose focal lengths are multiplied with a common factor.
-        common_errors: further errors, each of which several points have in common.
+        rig: approximate cameras.
+        points_px: (points, cameras, 2), pixels of the same points in all cameras; NaN where a camera does not see one.
+        noise_px: standard deviation of independent errors along x and along y: one number, or one of each pixel.
+        fixed: names of cameras that do not move.
+        rescaled: names of cameras whose focal lengths are multiplied by a common factor.
+        common_errors: errors that several points have in common.
 
     Raises:
-        SettingsError: the noise is not above 0, or a fixed camera is not in the rig.
-        InputError: the points do not fix the cameras: the message names one that sees too few with others.
+        SettingsError: the noise is not above 0, or `fixed` or `rescaled` names a camera that is not in the rig.
+        InputError: the points do not determine the cameras; the message names a camera that sees too few points.
     """
     noise_px = np.broadcast_to(np.asarray(noise_px, np.float64), points_px.shape[:2])
     for what, names in (("fixed", fixed), ("rescaled", rescaled)):
@@ -98,7 +91,7 @@ def adjust(
         check_positive("noise_px", float(noise_px[placed].min()))
     placed &= (placed.sum(axis=1) >= 2)[:, None]
     start_m = triangulate(rig.cameras, np.where(placed[..., None], points_px, np.nan))
-    placed &= (np.isfinite(start_m).all(axis=-1) & _before(rig.cameras, start_m))[:, None]
+    placed &= (np.isfinite(start_m).all(axis=-1) & _is_in_front(rig.cameras, start_m))[:, None]
     _check_seen(rig, placed, fixed, rescaled)
     rows = np.flatnonzero(placed.any(axis=1))
     free, common = _unknowns(rig, fixed, bool(rescaled))
@@ -106,33 +99,30 @@ def adjust(
     held = common.T @ pose_change_metric(given)
     held /= np.sqrt(np.diag(held @ common))[:, None]
     noise = np.where(placed, noise_px, 1.0)[rows]
-    zoomed = np.array([name in rescaled for name in rig.names])
-    problem = Problem(rig.cameras, given, points_px[rows], noise, zoomed, free, common, held)
-    state, used = BundleState(given, start_m[rows]), placed[rows]
-    state = solved(problem, state, used, robust=True)
-    residual_px = distance_px(problem, state)
+    is_rescaled = np.array([name in rescaled for name in rig.names])
+    problem = Problem(rig.cameras, given, points_px[rows], noise, is_rescaled, free, common, held)
+    bundle = Bundle(problem, BundleState(given, start_m[rows]), placed[rows], robust=True).solved()
     unknowns = free.shape[1] - common.shape[1] + 3 * len(rows)
-    # The gate moves with the fit and the fit with the gate; what swings to and fro ends somewhere.
+    # The gate depends on the fit and the fit on the gate. The loop ends if they alternate.
     for _ in range(5):
-        sigmas = residual_px / noise
-        within = placed[rows] & (sigmas <= GATE * max(1.0, spread_px(sigmas[used], unknowns)))
-        # A point that one camera is left to see has no say, and no place.
-        within &= (within.sum(axis=1) >= 2)[:, None]
-        before, used = used, within
-        state = solved(problem, state, used, robust=False)
-        residual_px = distance_px(problem, state)
-        if (used == before).all():
+        sigmas = bundle.distance_px / noise
+        inliers = placed[rows] & (sigmas <= GATE * max(1.0, spread_px(sigmas[bundle.used], unknowns)))
+        # A point in one camera alone has no position.
+        inliers &= (inliers.sum(axis=1) >= 2)[:, None]
+        before, bundle = bundle, replace(bundle, used=inliers, robust=False).solved()
+        if (bundle.used == before.used).all():
             break
-    _check_seen(rig, used, fixed, rescaled)
+    _check_seen(rig, bundle.used, fixed, rescaled)
     common_errors = [CommonErrors(kind.label[rows], kind.std_px[rows]) for kind in common_errors]
-    return _adjusted(rig, problem, state, used, rows, len(points_px), common_errors)
+    return _adjusted(rig, bundle, rows, len(points_px), common_errors)
 
 
 def _check_seen(
     rig: CameraRig, placed: Bool[np.ndarray, "points cameras"], fixed: Ordered[str], rescaled: Ordered[str]
 ) -> None:
+    """Check that every camera that may move sees enough points."""
     for name, count in zip(rig.names, placed.sum(axis=0).tolist(), strict=True):
-        # Six unknowns of the pose; with fewer points it swings freely.
+        # A pose has six unknowns, and fewer points leave it almost free.
         if count < 6 and name not in fixed:
             raise InputError(
                 f"camera {name}",
@@ -140,12 +130,12 @@ def _check_seen(
                 found=f"{count}",
                 remedy="leave it out, or keep it fixed",
             )
-    telling = int(placed[:, [rig.names.index(name) for name in rescaled]].sum())
-    if rescaled and telling < 6:
+    observations = int(placed[:, [rig.names.index(name) for name in rescaled]].sum())
+    if rescaled and observations < 6:
         raise InputError(
             "focal lengths",
             expected="at least 6 points that another camera sees too",
-            found=f"{telling}",
+            found=f"{observations}",
             remedy="keep them",
         )
 
@@ -153,14 +143,17 @@ def _check_seen(
 def _unknowns(
     rig: CameraRig, fixed: Ordered[str], rescaled: bool
 ) -> tuple[Float[np.ndarray, "unknowns free"], Float[np.ndarray, "unknowns motions"]]:
-    """What is sought, of 6 unknowns per camera and the focal lengths' logarithm; and the motions that are open."""
+    """Select the free unknowns, and the common motions that fixed cameras leave free.
+
+    Unknowns are six per camera and the logarithm of the focal lengths' factor.
+    """
     count = len(rig)
-    sought = np.array([name not in fixed for name in rig.names])
-    free = np.eye(6 * count + 1)[:, np.append(np.repeat(sought, 6), rescaled)]
+    is_free = np.array([name not in fixed for name in rig.names])
+    free = np.eye(6 * count + 1)[:, np.append(np.repeat(is_free, 6), rescaled)]
     motions = common_motions(np.asarray(rig.cameras.T_cam_world))
-    held = motions[np.append(np.repeat(~sought, 6), False)]
+    held = motions[np.append(np.repeat(~is_free, 6), False)]
     if held.size:
-        # Those that leave the fixed cameras where they are.
+        # Keep the motions that do not move the fixed cameras.
         _, strength, axes = np.linalg.svd(held)
         rank = int((strength > 1e-9 * strength[0]).sum())
         motions = motions @ axes[rank:].T
@@ -169,30 +162,28 @@ def _unknowns(
 
 def _adjusted(
     rig: CameraRig,
-    problem: Problem,
-    state: BundleState,
-    used: Bool[np.ndarray, "rows cameras"],
+    bundle: Bundle,
     rows: Int[np.ndarray, " rows"],
     num_points: int,
     common_errors: Ordered[CommonErrors],
 ) -> AdjustedRig:
-    """The answer for all points, with the covariance of the cameras."""
-    weights = weights_of(problem, state, used, robust=False)
-    equations = equations_of(problem, state, weights, damping=0.0)
-    reduced = equations.reduced
-    scale = np.sqrt(np.diag(reduced))
-    if scale.size and np.linalg.cond(reduced / np.outer(scale, scale)) > 1e14:
+    """Make the result for all points, with the covariance of the cameras."""
+    problem, state, used = bundle.problem, bundle.state, bundle.used
+    equations = bundle.equations().reduced()
+    information = equations.information
+    scale = np.sqrt(np.diag(information))
+    if scale.size and np.linalg.cond(information / np.outer(scale, scale)) > 1e14:
         raise InputError(
             "cameras",
             expected="points that tie all cameras together",
             found="some that see none of the others' points",
         )
-    residual_px = distance_px(problem, state)
+    residual_px = bundle.distance_px
     kept = used.any(axis=1)
     unknowns = problem.free.shape[1] - problem.common.shape[1] + 3 * int(kept.sum())
     squares = float(np.sum((residual_px / problem.noise_px)[used] ** 2))
-    covariance = inflation(squares, 2 * int(used.sum()) - unknowns) * np.linalg.inv(reduced)
-    covariance += covariance_of_common_errors(problem, state, weights, equations, common_errors)
+    covariance = inflation(squares, 2 * int(used.sum()) - unknowns) * np.linalg.inv(information)
+    covariance += covariance_of_common_errors(bundle, equations, common_errors)
     covariance = problem.free @ covariance @ problem.free.T
     by_camera, centres = [], []
     for index, T in enumerate(state.T_cam_world):
@@ -208,7 +199,9 @@ def _adjusted(
     all_used = np.zeros((num_points, len(rig)), bool)
     all_used[rows] = used
     return AdjustedRig(
-        CameraRig(rig.names, replace(scaled(rig.cameras, factor), T_cam_world=state.T_cam_world)),
+        CameraRig(
+            rig.names, replace(scale_focal_lengths(rig.cameras, factor), T_cam_world=state.T_cam_world)
+        ),
         points_m,
         all_residual_px,
         all_used,
@@ -220,6 +213,6 @@ def _adjusted(
     )
 
 
-def _before(cameras: Camera, points_m: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, " points"]:
-    """Points that are in front of most cameras."""
+def _is_in_front(cameras: Camera, points_m: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, " points"]:
+    """(points,), True where a point is in front of most cameras."""
     return np.median(to_camera(cameras, points_m[:, None, :])[..., 2], axis=-1) > NEAR_M

@@ -1,8 +1,9 @@
-"""The least squares of a bundle adjustment: Levenberg-Marquardt with the points eliminated (see `bundle`)."""
+"""Residuals, derivatives and normal equations of a bundle adjustment, for `psotrack.estimation` (see `bundle`)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -10,18 +11,20 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack.calibration.derivatives import reproject
 from psotrack.calibration.gauge import pose_changes
+from psotrack.estimation import NormalEquations, Step, cauchy_loss, cauchy_weight, levenberg_marquardt
 from psotrack.geometry import Camera
 
-#: Weight of a common motion of the whole rig: so large that it is none, so small that sums keep their digits.
-_HELD = 1e6
-#: Relative change of the cost that ends the search; of the robust one, which only finds the outliers.
-_SETTLED, _SETTLED_ROBUST = 1e-10, 1e-4
-_MOST_STEPS = 100
+#: Weight of the constraint on common motions of the rig: large enough to suppress them, and small enough that sums with
+#: the other equations keep their digits.
+_GAUGE_WEIGHT = 1e6
+#: Relative change of the cost that ends the search; the robust search only has to find the outliers.
+_LEAST_GAIN, _LEAST_GAIN_ROBUST = 1e-10, 1e-4
+_MAX_STEPS = 200
 
 
 @dataclass(frozen=True)
 class BundleState:
-    """What is sought."""
+    """Unknowns of a bundle adjustment: poses (cameras, 4, 4), points (points, 3), world, and a focal length factor."""
 
     T_cam_world: Float[np.ndarray, "cameras 4 4"]
     points_m: Float[np.ndarray, "points 3"]
@@ -30,158 +33,167 @@ class BundleState:
 
 @dataclass(frozen=True)
 class Problem:
-    """What does not change while it is solved."""
+    """Data of a bundle adjustment.
+
+    Attributes:
+        lenses: intrinsics of the cameras.
+        given: (cameras, 4, 4), poses before the adjustment, camera from world.
+        points_px: (points, cameras, 2), pixels.
+        noise_px: (points, cameras), standard deviation of a pixel along x and along y.
+        rescaled: (cameras,), True where the focal length is multiplied by the common factor.
+        free: (unknowns, free), maps the free unknowns to all unknowns; fixed cameras have no free unknowns.
+        common: (unknowns, motions), free common motions of the rig, in units of the cameras' unknowns.
+        held: (motions, unknowns), maps changes of the given poses to the common motions, all in equal units.
+    """
 
     lenses: Camera
     given: Float[np.ndarray, "cameras 4 4"]
     points_px: Float[np.ndarray, "points cameras 2"]
     noise_px: Float[np.ndarray, "points cameras"]
-    #: (cameras,), whose focal lengths are multiplied.
     rescaled: Bool[np.ndarray, " cameras"]
-    #: (unknowns, free): from the unknowns that are sought to all of them; fixed cameras have none.
     free: Float[np.ndarray, "unknowns free"]
-    #: (unknowns, motions): common motions that are open, in units of the cameras' own.
     common: Float[np.ndarray, "unknowns motions"]
-    #: (motions, unknowns): projection of pose changes on the common motions, all of equal weight.
     held: Float[np.ndarray, "motions unknowns"]
 
 
 @dataclass(frozen=True)
-class Equations:
-    """The normal equations with the points eliminated.
+class Bundle:
+    """A state of the problem with its residuals, `estimation.least_squares.Linearised`.
 
     Attributes:
-        reduced: (free, free), the Schur complement, the rig as a whole being held.
-        right: (free,).
-        back: (points, 3, free): from the cameras' steps to those of the points.
-        point_step: (points, 3), of the points where the cameras stand still.
+        problem: data of the adjustment.
+        state: values of the unknowns.
+        used: (points, cameras), True for the observations that count.
+        robust: whether the loss is Cauchy's instead of the squared residual.
     """
 
-    reduced: Float[np.ndarray, "free free"]
-    right: Float[np.ndarray, " free"]
-    back: Float[np.ndarray, "points 3 free"]
-    point_step: Float[np.ndarray, "points 3"]
+    problem: Problem
+    state: BundleState
+    used: Bool[np.ndarray, "points cameras"]
+    robust: bool = False
+
+    @cached_property
+    def _projected(
+        self,
+    ) -> tuple[Float[np.ndarray, "points cameras 2"], Float[np.ndarray, "points cameras 2 6"]]:
+        """Projections, and their derivatives by a small turn of the camera (rad) and by its translation (m)."""
+        pixels, slopes = [], []
+        for index, T in enumerate(self.state.T_cam_world):
+            projected, by_turn, by_shift = reproject(
+                self.state.points_m, T[:3, :3], T[:3, 3], self._lens(index)
+            )
+            pixels.append(projected)
+            slopes.append(np.concatenate([by_turn, by_shift], axis=-1))
+        return np.stack(pixels, axis=1), np.stack(slopes, axis=1)
+
+    @cached_property
+    def distance_px(self) -> Float[np.ndarray, "points cameras"]:
+        """(points, cameras), distances in the image between projections and measured pixels."""
+        return np.asarray(np.linalg.norm(self._projected[0] - self.problem.points_px, axis=-1))
+
+    @cached_property
+    def _squares(self) -> Float[np.ndarray, "points cameras"]:
+        """(points, cameras), squared distances in standard deviations; 0 where not used."""
+        return np.where(self.used, self.distance_px / self.problem.noise_px, 0.0) ** 2
+
+    @cached_property
+    def _common(self) -> Float[np.ndarray, " motions"]:
+        """(motions,), common motions of the rig since the given poses."""
+        return self.problem.held @ pose_changes(self.problem.given, self.state.T_cam_world)
+
+    @cached_property
+    def cost(self) -> float:
+        """Sum of the losses, and the gauge constraint."""
+        loss = cauchy_loss(self._squares) if self.robust else self._squares
+        return float(loss.sum() + _GAUGE_WEIGHT * np.sum(self._common**2))
+
+    @property
+    def weights(self) -> Float[np.ndarray, "points cameras"]:
+        """(points, cameras), weights of the residuals, px⁻²; 0 where not used."""
+        weight = cauchy_weight(self._squares) if self.robust else 1.0
+        return self.used * weight / self.problem.noise_px**2
+
+    def slopes(
+        self, index: int, seen: Int[np.ndarray, " seen"]
+    ) -> tuple[Float[np.ndarray, "seen 2 7"], Float[np.ndarray, "seen 2 3"], Float[np.ndarray, "seen 2"]]:
+        """Derivatives and residuals of one camera's pixels.
+
+        Returns:
+            (seen, 2, 7), derivatives by the camera's six unknowns and by the logarithm of the focal lengths' factor;
+            (seen, 2, 3), derivatives by the points; and (seen, 2), measured minus projected pixels.
+        """
+        pixels, by_pose = (part[seen, index] for part in self._projected)
+        # A larger focal length moves pixels away from the principal point.
+        centre_px = np.asarray(self._lens(index).K)[:2, 2]
+        by_focal = self.problem.rescaled[index] * (pixels - centre_px)[..., None]
+        by_point = by_pose[..., 3:] @ self.state.T_cam_world[index, :3, :3]
+        return (
+            np.concatenate([by_pose, by_focal], axis=-1),
+            by_point,
+            self.problem.points_px[seen, index] - pixels,
+        )
+
+    def equations(self) -> NormalEquations:
+        """Normal equations; the points are the blocks."""
+        count, free, weights = len(self.problem.given), self.problem.free, self.weights
+        points, size = len(self.state.points_m), 6 * count + 1
+        information, right = np.zeros((size, size)), np.zeros(size)
+        of_points, point_right = np.zeros((points, 3, 3)), np.zeros((points, 3))
+        coupling = np.zeros((points, 3, size))
+        for index in range(count):
+            seen = np.flatnonzero(weights[:, index])
+            if not len(seen):
+                continue
+            by_camera, by_point, off = self.slopes(index, seen)
+            weight = weights[seen, index]
+            columns = camera_columns(index, count)
+            information[np.ix_(columns, columns)] += np.einsum("p,pki,pkj->ij", weight, by_camera, by_camera)
+            right[columns] += np.einsum("p,pki,pk->i", weight, by_camera, off)
+            of_points[seen] += np.einsum("p,pki,pkj->pij", weight, by_point, by_point)
+            point_right[seen] += np.einsum("p,pki,pk->pi", weight, by_point, off)
+            rows = np.ix_(seen, np.arange(3), columns)
+            coupling[rows] += np.einsum("p,pki,pkj->pij", weight, by_point, by_camera)
+        # A point without a used observation stays where it is.
+        of_points[np.einsum("pii->p", of_points) == 0] = np.eye(3)
+        held = self.problem.held @ free
+        return NormalEquations(
+            free.T @ information @ free + _GAUGE_WEIGHT * held.T @ held,
+            free.T @ right - _GAUGE_WEIGHT * held.T @ self._common,
+            of_points,
+            point_right,
+            coupling @ free,
+        )
+
+    def moved(self, step: Step) -> Bundle:
+        """Turn and shift the cameras, shift the points, and scale the focal lengths."""
+        if step.blocks is None:
+            raise TypeError("expected a step with blocks, found none")
+        whole = self.problem.free @ step.shared
+        T = self.state.T_cam_world.copy()
+        for index in range(len(T)):
+            turn, shift = whole[6 * index : 6 * index + 3], whole[6 * index + 3 : 6 * index + 6]
+            T[index, :3, :3] = cv2.Rodrigues(turn)[0] @ T[index, :3, :3]
+            T[index, :3, 3] += shift
+        focal_scale = self.state.focal_scale * float(np.exp(whole[-1]))
+        return replace(self, state=BundleState(T, self.state.points_m + step.blocks, focal_scale))
+
+    def solved(self) -> Bundle:
+        """Lower the cost from this state."""
+        least_gain = _LEAST_GAIN_ROBUST if self.robust else _LEAST_GAIN
+        return levenberg_marquardt(self, max_steps=_MAX_STEPS, least_gain=least_gain)
+
+    def _lens(self, index: int) -> Camera:
+        lens = self.problem.lenses[index]
+        return scale_focal_lengths(lens, self.state.focal_scale) if self.problem.rescaled[index] else lens
 
 
-def solved(
-    problem: Problem, state: BundleState, used: Bool[np.ndarray, "points cameras"], *, robust: bool
-) -> BundleState:
-    """Levenberg-Marquardt from a state; damping grows where a step does not help."""
-    damping, cost = 1e-4, _cost(problem, state, used, robust)
-    for _ in range(_MOST_STEPS):
-        weights = weights_of(problem, state, used, robust)
-        for _ in range(12):
-            tried = _moved(problem, state, equations_of(problem, state, weights, damping))
-            tried_cost = _cost(problem, tried, used, robust)
-            if tried_cost <= cost:
-                break
-            damping = max(damping, 1e-6) * 10
-        else:
-            return state
-        gained, cost, state = cost - tried_cost, tried_cost, tried
-        damping *= 0.1
-        if gained <= (_SETTLED_ROBUST if robust else _SETTLED) * cost:
-            return state
-    return state
+def camera_columns(index: int, num_cameras: int) -> Int[np.ndarray, "7"]:
+    """(7,), indices of a camera's six unknowns, and of the focal lengths' factor, among all unknowns."""
+    return np.append(np.arange(6 * index, 6 * index + 6), 6 * num_cameras)
 
 
-def _cost(
-    problem: Problem, state: BundleState, used: Bool[np.ndarray, "points cameras"], robust: bool
-) -> float:
-    squares = (distance_px(problem, state) / problem.noise_px)[used] ** 2
-    common = problem.held @ pose_changes(problem.given, state.T_cam_world)
-    loss = np.log1p(squares) if robust else squares
-    return float(loss.sum() + _HELD * np.sum(common**2))
-
-
-def weights_of(
-    problem: Problem, state: BundleState, used: Bool[np.ndarray, "points cameras"], robust: bool
-) -> Float[np.ndarray, "points cameras"]:
-    """1 / variance of what counts, less where it is far off and the loss robust; else 0."""
-    squares = np.where(used, distance_px(problem, state) / problem.noise_px, 0.0) ** 2
-    return used / (1 + squares if robust else 1.0) / problem.noise_px**2
-
-
-def distance_px(problem: Problem, state: BundleState) -> Float[np.ndarray, "points cameras"]:
-    """Distances in the image between projections and what is seen."""
-    columns = []
-    for index, T in enumerate(state.T_cam_world):
-        pixels, _, _ = reproject(state.points_m, T[:3, :3], T[:3, 3], _lens(problem, state, index))
-        columns.append(np.linalg.norm(pixels - problem.points_px[:, index], axis=-1))
-    return np.stack(columns, axis=-1)
-
-
-def _lens(problem: Problem, state: BundleState, index: int) -> Camera:
-    return (
-        scaled(problem.lenses[index], state.focal_scale) if problem.rescaled[index] else problem.lenses[index]
-    )
-
-
-def scaled(lenses: Camera, focal_scale: float | Float[np.ndarray, " cameras"]) -> Camera:
-    """Lenses with their focal lengths multiplied, by one factor or each by its own."""
+def scale_focal_lengths(lenses: Camera, focal_scale: float | Float[np.ndarray, " cameras"]) -> Camera:
+    """Multiply the focal lengths of lenses by one factor, or by one factor each."""
     K = np.array(lenses.K)
     K[..., :2, :2] *= np.asarray(focal_scale)[..., None, None]
     return replace(lenses, K=K)
-
-
-def equations_of(
-    problem: Problem, state: BundleState, weights: Float[np.ndarray, "points cameras"], damping: float
-) -> Equations:
-    """The normal equations at a state; a share `damping` of the diagonal is added to it."""
-    count, free = len(problem.given), problem.free
-    points = len(state.points_m)
-    of_cameras, right = np.zeros((6 * count + 1, 6 * count + 1)), np.zeros(6 * count + 1)
-    of_points, point_right = np.zeros((points, 3, 3)), np.zeros((points, 3))
-    mixed = np.zeros((points, 3, 6 * count + 1))
-    for index in range(count):
-        seen = np.flatnonzero(weights[:, index])
-        if not len(seen):
-            continue
-        by_camera, off = slopes_of(problem, state, index, seen)
-        by_point = by_camera[..., 3:6] @ state.T_cam_world[index, :3, :3]
-        weight = weights[seen, index]
-        columns = np.append(np.arange(6 * index, 6 * index + 6), 6 * count)
-        of_cameras[np.ix_(columns, columns)] += np.einsum("p,pki,pkj->ij", weight, by_camera, by_camera)
-        right[columns] += np.einsum("p,pki,pk->i", weight, by_camera, off)
-        of_points[seen] += np.einsum("p,pki,pkj->pij", weight, by_point, by_point)
-        point_right[seen] += np.einsum("p,pki,pk->pi", weight, by_point, off)
-        mixed[np.ix_(seen, np.arange(3), columns)] += np.einsum("p,pki,pkj->pij", weight, by_point, by_camera)
-    of_points += np.eye(3) * damping * np.einsum("pii->p", of_points)[:, None, None] / 3
-    # A point that nobody is left to see stays where it is.
-    of_points[np.einsum("pii->p", of_points) == 0] = np.eye(3)
-    of_cameras, right, mixed = free.T @ of_cameras @ free, free.T @ right, mixed @ free
-    of_cameras += np.diag(damping * np.diag(of_cameras))
-    held = problem.held @ free
-    of_cameras += _HELD * held.T @ held
-    right -= _HELD * held.T @ problem.held @ pose_changes(problem.given, state.T_cam_world)
-    inverse = np.linalg.inv(of_points)
-    back = -inverse @ mixed
-    step = np.einsum("pij,pj->pi", inverse, point_right)
-    reduced = of_cameras + np.einsum("pki,pkj->ij", mixed, back)
-    return Equations(reduced, right - np.einsum("pki,pk->i", mixed, step), back, step)
-
-
-def slopes_of(
-    problem: Problem, state: BundleState, index: int, seen: Int[np.ndarray, " seen"]
-) -> tuple[Float[np.ndarray, "seen 2 7"], Float[np.ndarray, "seen 2"]]:
-    """Derivatives of a camera's pixels by its own six unknowns and the focal length's, and what they are off by."""
-    T, lens = state.T_cam_world[index], _lens(problem, state, index)
-    pixels, by_turn, by_shift = reproject(state.points_m[seen], T[:3, :3], T[:3, 3], lens)
-    # Focal lengths times e^x: pixels move away from the middle of the image.
-    by_focal = problem.rescaled[index] * (pixels - np.asarray(lens.K)[:2, 2])[..., None]
-    return np.concatenate([by_turn, by_shift, by_focal], axis=-1), problem.points_px[seen, index] - pixels
-
-
-def _moved(problem: Problem, state: BundleState, equations: Equations) -> BundleState:
-    step = np.linalg.lstsq(equations.reduced, equations.right, rcond=None)[0]
-    whole = problem.free @ step
-    T = state.T_cam_world.copy()
-    for index in range(len(T)):
-        turn, shift = whole[6 * index : 6 * index + 3], whole[6 * index + 3 : 6 * index + 6]
-        T[index, :3, :3] = cv2.Rodrigues(turn)[0] @ T[index, :3, :3]
-        T[index, :3, 3] += shift
-    return BundleState(
-        T,
-        state.points_m + equations.point_step + equations.back @ step,
-        state.focal_scale * float(np.exp(whole[-1])),
-    )

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.calibration.bundle_equations import BundleState, Equations, Problem, slopes_of
+from psotrack.calibration.bundle_equations import Bundle, camera_columns
+from psotrack.estimation import ReducedEquations
 
 #: Smallest information about a common error, in units of its stated precision, with which the residuals can check its
 #: size.
@@ -36,10 +37,8 @@ class CommonErrors:
 
 
 def covariance_of_common_errors(
-    problem: Problem,
-    state: BundleState,
-    weights: Float[np.ndarray, "points cameras"],
-    equations: Equations,
+    bundle: Bundle,
+    equations: ReducedEquations,
     common_errors: Ordered[CommonErrors],
 ) -> Float[np.ndarray, "free free"]:
     """Covariance of the unknowns that common errors add.
@@ -47,22 +46,20 @@ def covariance_of_common_errors(
     If the residuals show that the errors of a kind are larger than stated, the larger size is used.
 
     Args:
-        problem: the bundle adjustment's problem.
-        state: the solution.
-        weights: (points, cameras), weights at the solution.
-        equations: normal equations at the solution, without damping.
+        bundle: the solution of the bundle adjustment.
+        equations: reduced normal equations at the solution, without damping.
         common_errors: the kinds of common errors of the problem's points.
     """
-    free = problem.free.shape[1]
+    weights, free = bundle.weights, bundle.problem.free.shape[1]
     pulled = np.zeros((free, free))
     for kind in common_errors:
         size = int(kind.label.max(initial=-1)) + 1
         of_kind, squares, expected = np.zeros((free, free)), 0.0, 0.0
-        for index in range(len(problem.given)):
+        for index in range(len(bundle.problem.given)):
             seen = np.flatnonzero(weights[:, index])
             if not len(seen):
                 continue
-            slopes, off = _reduced_slopes(problem, state, equations, index, seen)
+            slopes, off = _reduced_slopes(bundle, equations, index, seen)
             weight, std = weights[seen, index], kind.std_px[seen, index]
             pull, information, shown = np.zeros((size, 2, free)), np.zeros(size), np.zeros((size, 2))
             np.add.at(pull, kind.label[seen], (weight * std)[:, None, None] * slopes)
@@ -73,16 +70,14 @@ def covariance_of_common_errors(
             squares += float(np.sum((shown[known] / information[known, None]) ** 2))
             expected += float(2 * np.sum(1 + 1 / information[known]))
         pulled += of_kind * max(1.0, squares / expected if expected else 1.0)
-    inverse = np.linalg.inv(equations.reduced)
+    inverse = np.linalg.inv(equations.information)
     return inverse @ pulled @ inverse
 
 
 def _reduced_slopes(
-    problem: Problem, state: BundleState, equations: Equations, index: int, seen: Int[np.ndarray, " seen"]
+    bundle: Bundle, equations: ReducedEquations, index: int, seen: Int[np.ndarray, " seen"]
 ) -> tuple[Float[np.ndarray, "seen 2 free"], Float[np.ndarray, "seen 2"]]:
     """Derivatives of a camera's pixels by the unknowns, where the points follow the cameras; and the residuals."""
-    by_camera, off = slopes_of(problem, state, index, seen)
-    count = len(problem.given)
-    columns = np.append(np.arange(6 * index, 6 * index + 6), 6 * count)
-    by_point = by_camera[..., 3:6] @ state.T_cam_world[index, :3, :3]
-    return by_camera @ problem.free[columns] + by_point @ equations.back[seen], off
+    by_camera, by_point, off = bundle.slopes(index, seen)
+    free = bundle.problem.free[camera_columns(index, len(bundle.problem.given))]
+    return by_camera @ free - by_point @ equations.gain[seen], off

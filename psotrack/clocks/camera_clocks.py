@@ -2,7 +2,7 @@
 
 A late camera sees a drone where the other cameras will see the drone later: its detection is off the epipolar lines by
 the drone's motion in the image times the delay. The offsets of all cameras and the points in space are estimated
-together by Gauss-Newton steps in which the points are eliminated (Schur complement), until the offsets do not change.
+together by Gauss-Newton steps in which the points are eliminated (`psotrack.estimation`), until the offsets settle.
 Each detection is weighted by how well it fits (S. Geman and D. E. McClure, Statistical Methods for Tomographic Image
 Reconstruction, 1987).
 
@@ -20,10 +20,11 @@ from jaxtyping import Bool, Float
 
 from psotrack.clocks.correlated_errors import autocorrelation, widening
 from psotrack.errors import SettingsError, check_positive
+from psotrack.estimation import NormalEquations, cauchy_weight, gauss_newton
 from psotrack.geometry import MAX_CONDITION, NEAR_M, Camera, CameraRig, project_with_jacobian, triangulate
 
-#: Largest number of rounds, and number of rounds until the weights have settled.
-_ROUNDS, _WEIGHT_ROUNDS = 40, 6
+#: Number of rounds without a step until the weights have settled, and largest number of steps.
+_WEIGHT_ROUNDS, _MAX_STEPS = 5, 35
 #: The iteration ends when no offset changes by more than this, frames.
 _SETTLED = 1e-4
 #: A detection at this multiple of the median distance has a weight of 1/4.
@@ -90,33 +91,41 @@ def camera_offsets(
     check_positive("max_offset_frames", max_offset_frames)
     if points_px.shape[2] != len(rig):
         raise SettingsError("points_px", expected=f"{len(rig)} cameras", found=f"{points_px.shape[2]}")
-    reach = max(1, round(_REACH_S * fps))
-    offset = np.zeros(len(rig))
+    problem = _Problem(rig.cameras, points_px, max(1, round(_REACH_S * fps)), max_offset_frames)
     weights = np.ones(points_px.shape[:-1])
-    rms_before_px = np.nan
-    for number in range(_ROUNDS):
-        system = _linearise(rig.cameras, _interpolate_at_common_times(points_px, offset), weights, reach)
-        weights = system.weights
-        if number < _WEIGHT_ROUNDS - 1:
-            # Offsets are not changed before the weights have excluded the outliers.
-            rms_before_px = system.rms_px
-            continue
-        stiffness = system.variance_px2 / max_offset_frames**2
-        normal = system.normal + stiffness * np.eye(len(rig))
-        step = np.linalg.solve(normal, system.gradient.sum(axis=0) - stiffness * offset)
-        previous, offset = offset, np.clip(offset + step, -max_offset_frames, max_offset_frames)
-        offset -= offset.mean()
-        if np.abs(offset - previous).max() < _SETTLED:
-            break
-    std = _standard_deviations(system, max_offset_frames)
-    return CameraOffsets(offset, std, rms_before_px, system.rms_px)
+    # Offsets are not changed before the weights have excluded the outliers.
+    for _ in range(_WEIGHT_ROUNDS):
+        before = _linearise(problem, np.zeros(len(rig)), weights)
+        weights = before.weights
+    after = gauss_newton(_linearise(problem, np.zeros(len(rig)), weights), max_steps=_MAX_STEPS)
+    std_frames = _standard_deviations(after, max_offset_frames)
+    return CameraOffsets(after.offset_frames, std_frames, before.rms_px, after.rms_px)
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Data of the estimate.
+
+    Attributes:
+        cameras: the calibrated cameras.
+        points_px: (frames, drones, cameras, 2), detections, pixels.
+        reach: number of frames before and after a frame through which a velocity is fitted.
+        max_offset_frames: standard deviation of the offsets' prior distribution, and largest offset, frames.
+    """
+
+    cameras: Camera
+    points_px: Float[np.ndarray, "frames drones cameras 2"]
+    reach: int
+    max_offset_frames: float
 
 
 @dataclass(frozen=True)
 class _System:
-    """Normal equations of the offsets with the points eliminated, and the quantities from which they were made.
+    """Normal equations at given offsets with the points eliminated, `estimation.least_squares.Reweighted`.
 
     Attributes:
+        problem: data of the estimate.
+        offset_frames: (cameras,), offsets at which the problem was linearised, frames.
         normal: (cameras, cameras), left side, squared pixels per squared frame.
         gradient: (frames, cameras), right side of each frame, squared pixels per frame.
         weights: (frames, drones, cameras), weights of the detections; 0 where there is no detection.
@@ -128,6 +137,8 @@ class _System:
         rms_px: weighted root mean square distance of the detections from the projections, pixels.
     """
 
+    problem: _Problem
+    offset_frames: Float[np.ndarray, "cameras"]
     normal: Float[np.ndarray, "cameras cameras"]
     gradient: Float[np.ndarray, "frames cameras"]
     weights: Float[np.ndarray, "frames drones cameras"]
@@ -137,17 +148,31 @@ class _System:
     variance_px2: float
     rms_px: float
 
+    def moved(self) -> _System:
+        """Take a step with the prior, keep the offsets within their limit, and keep their mean at 0."""
+        limit = self.problem.max_offset_frames
+        stiffness = self.variance_px2 / limit**2
+        normal = self.normal + stiffness * np.eye(len(self.offset_frames))
+        right = self.gradient.sum(axis=0) - stiffness * self.offset_frames
+        offset_frames = self.offset_frames + NormalEquations(normal, right).solved().shared
+        offset_frames = np.clip(offset_frames, -limit, limit)
+        return _linearise(self.problem, offset_frames - offset_frames.mean(), self.weights)
+
+    def is_settled(self, before: _System) -> bool:
+        return bool(np.abs(self.offset_frames - before.offset_frames).max() < _SETTLED)
+
 
 def _linearise(
-    cameras: Camera,
-    seen_px: Float[np.ndarray, "frames drones cameras 2"],
+    problem: _Problem,
+    offset_frames: Float[np.ndarray, "cameras"],
     weights: Float[np.ndarray, "frames drones cameras"],
-    reach: int,
 ) -> _System:
     """Linearise |e - u δ - J ΔX|², where δ are changes of the offsets, ΔX changes of the points, and u = J V.
 
-    V are the velocities of the points, and e the detections minus the projections.
+    V are the velocities of the points, and e the detections minus the projections. `weights` are those of the previous
+    round, for the triangulation.
     """
+    cameras, seen_px = problem.cameras, _interpolate_at_common_times(problem.points_px, offset_frames)
     point_m = triangulate(cameras, seen_px, np.maximum(weights, 1e-9))
     pixels, depth, J = project_with_jacobian(cameras, np.nan_to_num(point_m)[:, :, None])
     e = seen_px - pixels
@@ -157,30 +182,49 @@ def _linearise(
     weights = _robust_weights(e, there)
     point_normal = np.einsum("fdc,fdcik,fdcil->fdkl", weights, J, J)
     known = np.linalg.cond(point_normal) < MAX_CONDITION
-    inverse = np.linalg.inv(np.where(known[..., None, None], point_normal, np.eye(3)))
+    point_normal = np.where(known[..., None, None], point_normal, np.eye(3))
     squares, total = float((weights * (e**2).sum(axis=-1)).sum()), float(weights.sum())
     # Each triangulated point uses up three degrees of freedom.
     freedom = 2 * total - 3 * float((weights.max(axis=-1) * known).sum())
     variance_px2 = squares / max(freedom, 1.0) + 1e-12
 
-    spread_m2 = np.where(known, variance_px2 * np.trace(inverse, axis1=-2, axis2=-1), np.inf)
-    velocity_m, noise_m2 = _fit_velocities(point_m, spread_m2, reach)
+    trace_m2 = np.trace(np.linalg.inv(point_normal), axis1=-2, axis2=-1)
+    spread_m2 = np.where(known, variance_px2 * trace_m2, np.inf)
+    velocity_m, noise_m2 = _fit_velocities(point_m, spread_m2, problem.reach)
     moving = known & ((velocity_m**2).sum(axis=-1) > _CLEARLY**2 * noise_m2)
     u = np.einsum("fdcij,fdj->fdci", J, np.where(moving[..., None], velocity_m, 0.0))
-    B = np.einsum("fdc,fdcik,fdci->fdck", weights, J, u)
-    B_inverse = np.einsum("fdck,fdkl->fdcl", B, inverse)
-    pull = np.einsum("fdc,fdcik,fdci->fdk", weights, J, e)
-    normal = -np.einsum("fdcl,fdbl->cb", B_inverse, B)
-    normal[np.diag_indices(len(normal))] += np.einsum("fdc,fdci,fdci->c", weights, u, u)
-    gradient = np.einsum("fdc,fdci,fdci->fc", weights, u, e) - np.einsum("fdcl,fdl->fc", B_inverse, pull)
+    coupling = np.einsum("fdc,fdcik,fdci->fdkc", weights, J, u)
+    point_right = np.einsum("fdc,fdcik,fdci->fdk", weights, J, e)
+    gradient = np.einsum("fdc,fdci,fdci->fc", weights, u, e)
+    num_cameras = len(offset_frames)
+    reduced = NormalEquations(
+        np.diag(np.einsum("fdc,fdci,fdci->c", weights, u, u)),
+        gradient.sum(axis=0),
+        point_normal.reshape(-1, 3, 3),
+        point_right.reshape(-1, 3),
+        coupling.reshape(-1, 3, num_cameras),
+    ).reduced()
+    inverse, gain = reduced.block_covariance.reshape(point_normal.shape), reduced.gain.reshape(coupling.shape)
+    gradient -= np.einsum("fdlc,fdl->fc", gain, point_right)
     # The derivative of camera b's equation by camera c's weighted residual: u_b if b = c, less J_c M⁻¹ J_bᵀ w u_b.
-    influence = -np.einsum("fdcik,fdbk->bfdci", J, B_inverse)
-    index = np.arange(len(normal))
+    influence = -np.einsum("fdcik,fdkb->bfdci", J, gain)
+    index = np.arange(num_cameras)
     influence[index, :, :, index] += np.moveaxis(u, 2, 0)
     influence *= there[..., None]
     leverage = np.einsum("fdcik,fdkl,fdcil,fdc->fdc", J, inverse, J, weights) / 2
     rms_px = np.sqrt(squares / total) if total else np.nan
-    return _System(normal, gradient, weights, e, influence, leverage, variance_px2, rms_px)
+    return _System(
+        problem,
+        offset_frames,
+        reduced.information,
+        gradient,
+        weights,
+        e,
+        influence,
+        leverage,
+        variance_px2,
+        rms_px,
+    )
 
 
 def _robust_weights(
@@ -193,7 +237,7 @@ def _robust_weights(
     checked = checked if checked.any() else there
     median_px = float(np.median(distance_px[checked])) if checked.any() else 0.0
     scale_px = _MEDIANS * max(median_px, _MIN_MEDIAN_PX)
-    return there / (1 + (distance_px / scale_px) ** 2) ** 2
+    return there * cauchy_weight((distance_px / scale_px) ** 2) ** 2
 
 
 def _interpolate_at_common_times(

@@ -1,28 +1,27 @@
-"""Least squares in the image: points in space whose projections are nearest to pixels, in float64.
+"""Points in space whose projections are nearest to given pixels: least squares in the image, in float64.
 
-Squared distances between pixels and projections, in standard deviations of the pixels, lens included (Hartley &
-Zisserman 2004, section 12.3), made small by Levenberg's damped Gauss-Newton steps for all points at once.
+The cost of a point is the sum of squared distances between pixels and projections, in standard deviations of the
+pixels, lens included (Hartley & Zisserman 2004, section 12.3). All points are fitted at once, as a batch.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
 
+from psotrack.estimation import Damping, NormalEquations, Step, levenberg_marquardt
 from psotrack.geometry.cameras import NEAR_M, Camera, distort, to_camera
 
-#: Steps shorter than this, in standard deviations of the point, are the last.
-_SETTLED = 1e-4
-#: Levenberg's damping at first and at least, as a share of the diagonal; a step that fails makes it this much larger.
-_DAMPING, _STIFFER = 1e-9, 1e3
-#: A view may have a direction that it alone decides: no covariance, a residual of rounding errors, t of about 0.
+#: A step shorter than this is not taken, standard deviations of the point.
+_LEAST_LENGTH = 1e-4
+#: Two steps suffice near the solution, so the damping is nearly 0 and returns to that value after each success. A step
+#: that fails must be damped much more.
+_DAMPING = Damping(first=1e-9, least=1e-9, largest=np.inf, increase=1e3, decrease=0.0)
+#: Added to the variances of a residual: a view can decide a direction alone, and its residual there has no variance.
 _RIDGE = 1e-8
-
-#: Residuals in standard deviations (points, equations), two per camera; their derivative by the position; and their sum
-#: of squares (points,), infinite where a point is behind a camera that sees it.
-_Image = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -30,14 +29,14 @@ class ImageFit:
     """Points fitted to pixels.
 
     Attributes:
-        position_m: (points, 3); NaN where there was no start, or the views that count do not fix a point.
-        covariance_m2: (points, 3, 3), (JᵀJ)⁻¹ with J in standard deviations of the pixels; of no meaning without a
-            position.
-        cost: (points,), sum of squared residuals in standard deviations; infinite where there is no position, and where
-            it is behind a camera that counts.
-        disagreement: (points, cameras), t = rᵀ S⁻¹ r of each view's residual r. In the fit that r takes part in, r has
-            the covariance S = I - J C Jᵀ, so that t is χ² with two degrees of freedom (studentised residuals: Cook &
-            Weisberg 1982, section 2.1). 0 for views that do not count.
+        position_m: (points, 3), world, metres; NaN without a start, and where the used views do not fix the point.
+        covariance_m2: (points, 3, 3), (JᵀJ)⁻¹ with J in standard deviations of the pixels, m²; meaningless where the
+            position is NaN.
+        cost: (points,), sum of squared residuals in standard deviations; infinite where the position is NaN or behind
+            a used camera.
+        disagreement: (points, cameras), t = rᵀ S⁻¹ r of each view's residual r, where S = I - J C Jᵀ is the covariance
+            of r in the fit with covariance C. t is χ² with two degrees of freedom (studentised residuals: Cook &
+            Weisberg 1982, section 2.1). 0 for unused views.
     """
 
     position_m: Float[np.ndarray, "points 3"]
@@ -53,53 +52,91 @@ def fit_in_image(
     start_m: Float[np.ndarray, "points 3"],
     num_steps: int,
 ) -> ImageFit:
-    """Points of least squared distance in the image, near where they start.
+    """Find the points of least squared distance in the image, near their starts.
 
     Args:
-        cameras: with one leading axis.
-        points_px: (points, cameras, 2); what does not count may be NaN.
-        scale: (points, cameras), 1 / standard deviation of each view's pixel; 0 for views that do not count.
-        start_m: (points, 3), NaN for none.
-        num_steps: at most; none makes a point worse. Near the solution two do.
+        cameras: cameras with one leading axis.
+        points_px: (points, cameras, 2), pixels; unused views may be NaN.
+        scale: (points, cameras), 1 / standard deviation of each view's pixel; 0 for unused views.
+        start_m: (points, 3), world, metres; NaN for a point without a start.
+        num_steps: largest number of steps; no step makes a point worse. Two suffice near the solution.
     """
-    there = np.isfinite(start_m).all(axis=-1)
-    position_m = np.where(there[:, None], start_m, 0.0)
-    residual, jacobian, cost = _in_image(cameras, points_px, scale, position_m)
-    damping = np.full(len(position_m), _DAMPING)
-    for _ in range(num_steps):
-        step = _step(residual, jacobian, damping)
-        moved = np.matvec(jacobian, step)
-        if (np.vecdot(moved, moved) < _SETTLED**2).all():
-            break
-        tried = _in_image(cameras, points_px, scale, position_m + step)
-        better = tried[2] < cost
-        damping = np.where(better, _DAMPING, damping * _STIFFER)
-        position_m = np.where(better[:, None], position_m + step, position_m)
-        residual = np.where(better[:, None], tried[0], residual)
-        jacobian = np.where(better[:, None, None], tried[1], jacobian)
-        cost = np.where(better, tried[2], cost)
-    normal = _normal(jacobian)
-    there &= np.linalg.cond(normal) < 1 / np.finfo(float).eps
-    covariance_m2 = np.linalg.inv(np.where(there[:, None, None], normal, np.eye(3)))
+    has_start = np.isfinite(start_m).all(axis=-1)
+    start = _linearise(_Views(cameras, points_px, scale), np.where(has_start[:, None], start_m, 0.0))
+    fit = levenberg_marquardt(start, max_steps=num_steps, least_length=_LEAST_LENGTH, damping=_DAMPING)
+    information = fit.information
+    is_fixed = has_start & (np.linalg.cond(information) < 1 / np.finfo(float).eps)
+    covariance_m2 = np.linalg.inv(np.where(is_fixed[:, None, None], information, np.eye(3)))
     return ImageFit(
-        np.where(there[:, None], position_m, np.nan),
+        np.where(is_fixed[:, None], fit.position_m, np.nan),
         covariance_m2,
-        np.where(there, cost, np.inf),
-        _disagreement(residual, jacobian, covariance_m2),
+        np.where(is_fixed, fit.cost, np.inf),
+        _disagreement(fit.residual, fit.jacobian, covariance_m2),
     )
+
+
+@dataclass(frozen=True)
+class _Views:
+    """Pixels of all points in all cameras; attributes as in `fit_in_image`."""
+
+    cameras: Camera
+    points_px: Float[np.ndarray, "points cameras 2"]
+    scale: Float[np.ndarray, "points cameras"]
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Points with their residuals, `estimation.least_squares.Linearised`.
+
+    Attributes:
+        views: the pixels.
+        position_m: (points, 3), world, metres.
+        residual: (points, equations), measured minus projected in standard deviations, two equations per camera.
+        jacobian: (points, equations, 3), derivatives of the projections by the position.
+        cost: (points,), sums of squared residuals; infinite where a point is behind a used camera.
+    """
+
+    views: _Views
+    position_m: Float[np.ndarray, "points 3"]
+    residual: Float[np.ndarray, "points equations"]
+    jacobian: Float[np.ndarray, "points equations 3"]
+    cost: Float[np.ndarray, "points"]
+
+    @cached_property
+    def information(self) -> Float[np.ndarray, "points 3 3"]:
+        """(points, 3, 3), inverse covariances of the positions, m⁻²."""
+        return self.jacobian.swapaxes(-1, -2) @ self.jacobian
+
+    def equations(self) -> NormalEquations:
+        return NormalEquations(self.information, np.matvec(self.jacobian.swapaxes(-1, -2), self.residual))
+
+    def moved(self, step: Step) -> _Points:
+        return _linearise(self.views, self.position_m + step.shared)
+
+
+def _linearise(views: _Views, position_m: Float[np.ndarray, "points 3"]) -> _Points:
+    pixels, depth, jacobian = project_with_jacobian(views.cameras, position_m[:, None, :])
+    scale = views.scale
+    is_used = scale > 0
+    residual = np.where(is_used[..., None], (views.points_px - pixels) * scale[..., None], 0.0)
+    residual = residual.reshape(len(scale), 2 * scale.shape[1])
+    is_behind = ((depth < NEAR_M) & is_used).any(axis=-1)
+    cost = np.where(is_behind, np.inf, np.vecdot(residual, residual))
+    jacobian = (jacobian * scale[..., None, None]).reshape(*residual.shape, 3)
+    return _Points(views, position_m, residual, jacobian, cost)
 
 
 def project_with_jacobian(
     cameras: Camera, points_world: Float[np.ndarray, "*#points 3"]
 ) -> tuple[Float[np.ndarray, "*#points 2"], Float[np.ndarray, "*#points"], Float[np.ndarray, "*#points 2 3"]]:
-    """Pixels and depth as `cameras.project` has them, and the derivative of the pixels by the world point.
+    """Project points, and differentiate the pixels by the points.
 
     Args:
-        cameras: with leading axes (*batch).
-        points_world: (..., 3), metres; for every camera of a rig at every point, pass `points[..., None, :]`.
+        cameras: cameras with leading axes (*batch).
+        points_world: (..., 3), metres; pass `points[..., None, :]` for every camera of a rig at every point.
 
     Returns:
-        (..., 2) pixels, (...) metres, and (..., 2, 3) pixels per metre.
+        (..., 2), pixels as in `cameras.project`; (...), depths, metres; and (..., 2, 3), derivatives, pixels per metre.
     """
     points_cam = np.asarray(to_camera(cameras, points_world))
     depth = points_cam[..., 2]
@@ -109,7 +146,7 @@ def project_with_jacobian(
     K, R = cameras.K, cameras.T_cam_world[..., :3, :3]
     u = K[..., 0, 0] * bent_x + K[..., 0, 1] * bent_y + K[..., 0, 2]
     v = K[..., 1, 1] * bent_y + K[..., 1, 2]
-    # d(x, y) / d world = (r1 - x r3, r2 - y r3) / z: the rows of the linear equations.
+    # d(x, y) / d world = (r1 - x r3, r2 - y r3) / z, with the rows r1, r2, r3 of the rotation.
     x_by_world = (R[..., 0, :] - x[..., None] * R[..., 2, :]) / z[..., None]
     y_by_world = (R[..., 1, :] - y[..., None] * R[..., 2, :]) / z[..., None]
     (xx, xy), (yx, yy) = _lens_derivative(cameras, x, y)
@@ -123,7 +160,7 @@ def project_with_jacobian(
 def _lens_derivative(
     cameras: Camera, x: Float[np.ndarray, "*#points"], y: Float[np.ndarray, "*#points"]
 ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Of `cameras.distort` by x and y, each (..., 1): ((x by x, x by y), (y by x, y by y))."""
+    """Derivatives of `cameras.distort`, each (..., 1): ((x by x, x by y), (y by x, y by y))."""
     coefficients = cameras.dist.shape[-1]
     if coefficients == 0:
         return (np.ones(1), np.zeros(1)), (np.zeros(1), np.ones(1))
@@ -133,7 +170,7 @@ def _lens_derivative(
     r2 = x * x + y * y
     below = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
     radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / below
-    # By r²; that of r² by x is 2 x.
+    # The derivative of `radial` by r²; the derivative of r² by x is 2 x.
     slope = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
     xx = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
     yy = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
@@ -141,40 +178,12 @@ def _lens_derivative(
     return (xx[..., None], xy[..., None]), (xy[..., None], yy[..., None])
 
 
-def _step(
-    residual: Float[np.ndarray, "points equations"],
-    jacobian: Float[np.ndarray, "points equations 3"],
-    damping: Float[np.ndarray, "points"],
-) -> Float[np.ndarray, "points 3"]:
-    """Of Gauss and Newton, with Levenberg's damping."""
-    normal = _normal(jacobian)
-    # A little more, because a point that no view fixes has a diagonal of zeros.
-    stiff = damping[:, None] * (normal.diagonal(axis1=-2, axis2=-1) + 1e-12)
-    damped = normal + stiff[..., None] * np.eye(3)
-    return -np.linalg.solve(damped, np.matvec(jacobian.swapaxes(-1, -2), residual)[..., None])[..., 0]
-
-
-def _in_image(
-    cameras: Camera,
-    points_px: Float[np.ndarray, "points cameras 2"],
-    scale: Float[np.ndarray, "points cameras"],
-    position_m: Float[np.ndarray, "points 3"],
-) -> _Image:
-    pixels, depth, jacobian = project_with_jacobian(cameras, position_m[:, None, :])
-    counts = scale > 0
-    residual = np.where(counts[..., None], (pixels - points_px) * scale[..., None], 0.0)
-    residual = residual.reshape(len(scale), 2 * scale.shape[1])
-    behind = ((depth < NEAR_M) & counts).any(axis=-1)
-    cost = np.where(behind, np.inf, np.vecdot(residual, residual))
-    return residual, (jacobian * scale[..., None, None]).reshape(*residual.shape, 3), cost
-
-
 def _disagreement(
     residual: Float[np.ndarray, "points equations"],
     jacobian: Float[np.ndarray, "points equations 3"],
     covariance_m2: Float[np.ndarray, "points 3 3"],
 ) -> Float[np.ndarray, "points cameras"]:
-    """rᵀ S⁻¹ r of each view's two residuals r, of covariance S = I - J C Jᵀ in standard deviations."""
+    """(points, cameras), rᵀ S⁻¹ r of each view's two residuals r with covariance S = I - J C Jᵀ."""
     r = residual.reshape(len(residual), residual.shape[1] // 2, 2)
     J = jacobian.reshape(*r.shape, 3)
     JC = (jacobian @ covariance_m2).reshape(J.shape)
@@ -183,7 +192,3 @@ def _disagreement(
     xy = -np.vecdot(JC[..., 0, :], J[..., 1, :])
     x, y = r[..., 0], r[..., 1]
     return (yy * x * x - 2 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
-
-
-def _normal(jacobian: Float[np.ndarray, "points equations 3"]) -> Float[np.ndarray, "points 3 3"]:
-    return jacobian.swapaxes(-1, -2) @ jacobian

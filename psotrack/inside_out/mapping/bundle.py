@@ -1,51 +1,64 @@
-"""Bundle adjustment of markers: cameras and markers are moved together until squares are where they are seen.
+"""Bundle adjustment of markers: move cameras and markers together until the squares project to where they are seen.
 
 Triggs, McLauchlan, Hartley & Fitzgibbon (2000), "Bundle adjustment, a modern synthesis": Levenberg-Marquardt with the
-cameras eliminated by the Schur complement, a Cauchy loss by reweighting, and once more without on what agrees. A marker
-is a rigid square: six unknowns, and a seventh, the logarithm of its side, where that is sought. Markers that are fixed
-say where the world is; at least one must be.
+cameras eliminated (`psotrack.estimation`), first with a robust loss, then with squared residuals of the inliers. A
+marker is a rigid square with six unknowns, and a seventh, the logarithm of its side, where the side is estimated. Fixed
+markers define the world's axes; at least one marker must be fixed.
 
-Ink, exposure and blur move the sides of a square in its image, inwards or outwards, by a fraction of a pixel that is
-the same near and far: a square seems smaller and farther away than it is, the more so the farther. That inset, one for
-each video, is sought as well; one of 0.3 px that is unheeded bends a room by centimetres. What else is wrong with a
-model is wrong in all views, and takes itself for an inset: so its prior counts as often as there are views.
+Ink, exposure and blur move the sides of a square in its image, inwards or outwards, by a fraction of a pixel that does
+not depend on the distance. The square then seems smaller and farther away, and the effect grows with the distance. The
+inset, one unknown for each video, models it; an inset of 0.3 px that is left out bends a room by centimetres. Other
+errors of the model are also the same in all views and would be taken for an inset. Therefore the weight of the inset's
+prior is proportional to the number of views.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence as Ordered
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import GATE, spread_px
-from psotrack.inside_out.mapping.scene import MappedScene, linearised, outward, residuals_px
+from psotrack.estimation import (
+    NormalEquations,
+    ReducedEquations,
+    Step,
+    cauchy_loss,
+    cauchy_weight,
+    covariance_from_information,
+    levenberg_marquardt,
+)
+from psotrack.inside_out.mapping.scene import Linearised, MappedScene, linearised, outward
 from psotrack.inside_out.mapping.sightings import MarkerSightings
 
-#: Relative change of the cost that ends the search; of the robust one, which only finds the outliers.
-_SETTLED, _SETTLED_ROBUST = 1e-9, 1e-3
-_MOST_STEPS = 100
-#: Standard deviation of the inset: grey levels that are the light to the power of 0.4 to 0.6, where 0.5 was thought.
+#: Relative change of the cost that ends the search; the robust search only has to find the outliers.
+_LEAST_GAIN, _LEAST_GAIN_ROBUST = 1e-9, 1e-3
+_MAX_STEPS = 200
+#: Standard deviation of the inset, px: from cameras with a gamma of 0.4 to 0.6 where the detector assumes 0.5.
 _INSET_PX = 0.05
-#: By how much it differs among markers, as light and sharpness do.
+#: Standard deviation of the inset among markers, px, because light and sharpness differ.
 _INSET_APART_PX = 0.02
-#: What corners are never better than, in pixels.
+#: Smallest standard deviation of a corner, px.
 _FINEST_PX = 0.01
+#: Number of residuals of a marker in one view.
+_RESIDUALS = 8
 
 
 @dataclass(frozen=True)
 class AdjustedMap:
-    """A scene that the images agree with.
+    """Result of the adjustment of a scene.
 
     Attributes:
-        scene: adjusted.
-        residual_px: (sightings, 4), distances in the image, outliers too.
+        scene: the adjusted scene.
+        residual_px: (sightings, 4), distances in the image, also of outliers.
         used: (sightings,), False for outliers.
-        covariance: (markers, 7, 7), of the centre along the world's axes (m), of a small turn about them (rad), and of
-            the logarithm of the side; 0 for what is fixed.
-        noise_px: standard deviation of a corner along x and along y, as the residuals say.
+        covariance: (markers, 7, 7), covariance of the centre along the world's axes (m), of a small turn about them
+            (rad), and of the logarithm of the side; 0 for fixed unknowns.
+        noise_px: standard deviation of a corner along x and along y, estimated from the residuals.
     """
 
     scene: MappedScene
@@ -57,14 +70,122 @@ class AdjustedMap:
 
 @dataclass(frozen=True)
 class _Problem:
+    """Data of the adjustment.
+
+    Attributes:
+        sightings: measured corners.
+        free: (unknowns,), True for the estimated ones of 7 unknowns per marker and one inset per video.
+        noise_px: standard deviation of a corner along x and along y.
+        columns: (sightings, 8), indices of the unknowns on which a sighting depends.
+        inset_weight: (videos,), weight of the squared inset, px⁻².
+    """
+
     sightings: MarkerSightings
-    #: (unknowns,), which of 7 unknowns per marker, and of one per video, are sought.
     free: Bool[np.ndarray, " unknowns"]
     noise_px: float
-    #: (sightings, 8), of the unknowns, that a sighting depends on.
     columns: Int[np.ndarray, "sightings 8"]
-    #: (videos,), weight of the squared inset.
-    held: Float[np.ndarray, " videos"]
+    inset_weight: Float[np.ndarray, " videos"]
+
+
+@dataclass(frozen=True)
+class _Bundle:
+    """A scene with its residuals, `estimation.least_squares.Linearised`.
+
+    Attributes:
+        problem: data of the adjustment.
+        scene: values of the unknowns.
+        used: (sightings,), True for the sightings that count.
+        robust: whether the loss is Cauchy's instead of the squared residual.
+    """
+
+    problem: _Problem
+    scene: MappedScene
+    used: Bool[np.ndarray, " sightings"]
+    robust: bool
+
+    @cached_property
+    def slopes(self) -> Linearised:
+        """Residuals and derivatives of all sightings."""
+        return linearised(self.problem.sightings, self.scene)
+
+    @property
+    def residual_px(self) -> Float[np.ndarray, "sightings 4"]:
+        """(sightings, 4), distances in the image, infinite behind the camera."""
+        return np.asarray(np.linalg.norm(self.slopes.off, axis=-1))
+
+    @cached_property
+    def squares(self) -> Float[np.ndarray, " sightings"]:
+        """(sightings,), squared distances over a marker's four corners in standard deviations; 8 on average."""
+        return np.asarray(((self.residual_px / self.problem.noise_px) ** 2).sum(axis=-1))
+
+    @cached_property
+    def cost(self) -> float:
+        """Sum of the losses and of the prior of the insets."""
+        # If a marker is confused with another marker, all its corners are wrong: they share one loss.
+        squares = self.squares[self.used]
+        loss = cauchy_loss(squares, float(_RESIDUALS)) if self.robust else squares
+        return float(loss.sum() + np.sum(self.problem.inset_weight * self.scene.inset_px**2))
+
+    @property
+    def weights(self) -> Float[np.ndarray, " sightings"]:
+        """(sightings,), weights of the residuals, px⁻²; 0 where not used."""
+        squares = np.where(self.used, self.squares, 0.0)
+        weight = cauchy_weight(squares, float(_RESIDUALS)) if self.robust else 1.0
+        return self.used * weight / self.problem.noise_px**2
+
+    def equations(self) -> NormalEquations:
+        """Normal equations; the views are the blocks, markers and insets the shared unknowns."""
+        problem, scene, weights = self.problem, self.scene, self.weights
+        views, unknowns, free = problem.sightings.num_views, len(problem.free), problem.free
+        kept = np.flatnonzero(weights)
+        off = self.slopes.off[kept].reshape(-1, _RESIDUALS, 1)
+        by_view = self.slopes.by_view[kept].reshape(-1, _RESIDUALS, 6)
+        by_rest = self.slopes.by_rest[kept].reshape(-1, _RESIDUALS, 8)
+        view, columns, weight = problem.sightings.view[kept], problem.columns[kept], weights[kept, None, None]
+        weighted_view, weighted = ((weight * part).swapaxes(1, 2) for part in (by_view, by_rest))
+        of_views, view_right = np.zeros((views, 6, 6)), np.zeros((views, 6))
+        information, right = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+        coupling = np.zeros((views, 6, unknowns))
+        np.add.at(of_views, view, weighted_view @ by_view)
+        np.add.at(view_right, view, (weighted_view @ off)[..., 0])
+        np.add.at(information, (columns[:, :, None], columns[:, None, :]), weighted @ by_rest)
+        np.add.at(right, columns, (weighted @ off)[..., 0])
+        np.add.at(coupling.swapaxes(1, 2), (view[:, None], columns), (weighted_view @ by_rest).swapaxes(1, 2))
+        inset = np.arange(unknowns - len(scene.inset_px), unknowns)
+        information[inset, inset] += problem.inset_weight
+        right[inset] -= problem.inset_weight * scene.inset_px
+        # A view without a used sighting stays where it is.
+        of_views[np.einsum("vii->v", of_views) == 0] = np.eye(6)
+        return NormalEquations(
+            information[np.ix_(free, free)], right[free], of_views, view_right, coupling[..., free]
+        )
+
+    def moved(self, step: Step) -> _Bundle:
+        """Move views and markers, and change sides and insets."""
+        if step.blocks is None:
+            raise TypeError("expected a step with blocks, found none")
+        scene, of_views = self.scene, step.blocks
+        whole = np.zeros(len(self.problem.free))
+        whole[self.problem.free] = step.shared
+        of_markers = whole[: 7 * len(scene.ids)].reshape(-1, 7)
+        moved = MappedScene(
+            Rotation.from_rotvec(of_views[:, :3]).as_matrix() @ scene.R_cam_world,
+            scene.t_m + of_views[:, 3:],
+            scene.ids,
+            Rotation.from_rotvec(of_markers[:, 3:6]).as_matrix() @ scene.R_world_marker,
+            scene.centre_m + of_markers[:, :3],
+            scene.side_m * np.exp(np.clip(of_markers[:, 6], -1, 1)),
+            scene.inset_px + whole[7 * len(scene.ids) :],
+        )
+        return replace(self, scene=moved)
+
+    def solved(self) -> _Bundle:
+        """Lower the cost from this scene."""
+        # A marker behind a camera at the start has no derivative, so it does not count.
+        start = replace(self, used=self.used & np.isfinite(self.squares))
+        least_gain = _LEAST_GAIN_ROBUST if self.robust else _LEAST_GAIN
+        found = levenberg_marquardt(start, max_steps=_MAX_STEPS, least_gain=least_gain)
+        return replace(found, used=self.used)
 
 
 def adjust(
@@ -75,35 +196,31 @@ def adjust(
     noise_px: float = 0.3,
     estimate_sides: bool = False,
 ) -> AdjustedMap:
-    """The scene that explains what is seen.
+    """Adjust a scene so that its projections agree with the measured corners.
 
-    The covariance is that of the noise that the residuals tell of: of noise that is new in every frame, and of errors
-    that a marker's corner has in all of them, which many frames do not take away.
+    The covariance is that of noise that is independent in every frame, and of errors that a marker's corner has in all
+    frames and that many frames do not average out. Both are estimated from the residuals.
 
     Args:
-        sightings: of markers that are all in the scene, in views that are all in it.
-        start: near the answer.
-        fixed: ids of markers that stay where they are.
-        noise_px: standard deviation of a corner along x and along y, about: it tells outliers at the start.
-        estimate_sides: of the markers that are not fixed.
+        sightings: corners of markers in views; the scene has all these markers and views.
+        start: approximate scene.
+        fixed: ids of markers that do not move.
+        noise_px: approximate standard deviation of a corner along x and along y, to find outliers at the start.
+        estimate_sides: whether the sides of markers that are not fixed are unknowns.
     """
-    problem = _problem(sightings, start, fixed, noise_px, estimate_sides)
-    everything = np.ones(len(sightings.view), bool)
-    scene = _solved(problem, start, everything, robust=True)
-    residual_px = residuals_px(sightings, scene)
-    used = everything
-    unknowns = int(problem.free.sum()) + 6 * sightings.num_views
-    # The gate moves with the fit and the fit with the gate; what swings to and fro ends somewhere.
+    bundle = _robust_fit(sightings, start, fixed, noise_px, estimate_sides)
+    unknowns = int(bundle.problem.free.sum()) + 6 * sightings.num_views
+    # The gate depends on the fit and the fit on the gate. The loop ends if they alternate.
     for _ in range(5):
-        sigma_px = max(_FINEST_PX, spread_px(residual_px[used].ravel(), unknowns))
-        problem = replace(problem, noise_px=sigma_px)
-        within = residual_px.max(axis=1) <= GATE * sigma_px
-        before, used = used, within
-        scene = _solved(problem, scene, used, robust=False)
-        residual_px = residuals_px(sightings, scene)
-        if (used == before).all():
+        residual_px = bundle.residual_px
+        sigma_px = max(_FINEST_PX, spread_px(residual_px[bundle.used].ravel(), unknowns))
+        problem = replace(bundle.problem, noise_px=sigma_px)
+        inliers = residual_px.max(axis=1) <= GATE * sigma_px
+        before = bundle
+        bundle = _Bundle(problem, before.scene, inliers, robust=False).solved()
+        if (bundle.used == before.used).all():
             break
-    return AdjustedMap(scene, residual_px, used, _covariance(problem, scene, used), sigma_px)
+    return AdjustedMap(bundle.scene, bundle.residual_px, bundle.used, _covariance(bundle), sigma_px)
 
 
 def improved(
@@ -114,148 +231,52 @@ def improved(
     noise_px: float,
     estimate_sides: bool = False,
 ) -> MappedScene:
-    """As `adjust`, with the robust loss alone: good enough to go on from."""
+    """Adjust a scene as `adjust` does, with the robust loss alone: faster, for a scene that is adjusted again."""
+    return _robust_fit(sightings, start, fixed, noise_px, estimate_sides).scene
+
+
+def _robust_fit(
+    sightings: MarkerSightings,
+    start: MappedScene,
+    fixed: Ordered[int],
+    noise_px: float,
+    estimate_sides: bool,
+) -> _Bundle:
     problem = _problem(sightings, start, fixed, noise_px, estimate_sides)
-    return _solved(problem, start, np.ones(len(sightings.view), bool), robust=True)
+    return _Bundle(problem, start, np.ones(len(sightings.view), bool), robust=True).solved()
 
 
 def _problem(
     sightings: MarkerSightings, start: MappedScene, fixed: Ordered[int], noise_px: float, estimate_sides: bool
 ) -> _Problem:
-    sought = np.tile(np.array([True] * 6 + [estimate_sides]), (len(start.ids), 1))
-    sought[np.isin(start.ids, fixed)] = False
-    free = np.concatenate([sought.ravel(), np.ones(len(sightings.lenses), bool)])
+    is_free = np.tile(np.array([True] * 6 + [estimate_sides]), (len(start.ids), 1))
+    is_free[np.isin(start.ids, fixed)] = False
+    free = np.concatenate([is_free.ravel(), np.ones(len(sightings.lenses), bool)])
     video = 7 * len(start.ids) + sightings.lens[sightings.view]
     columns = np.concatenate([7 * start.rows(sightings)[:, None] + np.arange(7), video[:, None]], axis=1)
     views = np.bincount(sightings.lens, minlength=len(sightings.lenses))
     return _Problem(sightings, free, noise_px, columns, np.maximum(views, 1) / _INSET_PX**2)
 
 
-@dataclass(frozen=True)
-class _Normal:
-    """The normal equations: of the views, of what else is sought, and what couples the two."""
-
-    views: Float[np.ndarray, "views 6 6"]
-    view_right: Float[np.ndarray, "views 6"]
-    rest: Float[np.ndarray, "free free"]
-    right: Float[np.ndarray, " free"]
-    mixed: Float[np.ndarray, "views 6 free"]
-
-
-def _normal(problem: _Problem, scene: MappedScene, weights: Float[np.ndarray, " sightings"]) -> _Normal:
-    views, unknowns, free = problem.sightings.num_views, len(problem.free), problem.free
-    kept = np.flatnonzero(weights)
-    slopes = linearised(problem.sightings, scene)
-    off, by_view = slopes.off[kept].reshape(-1, 8, 1), slopes.by_view[kept].reshape(-1, 8, 6)
-    by_rest = slopes.by_rest[kept].reshape(-1, 8, 8)
-    view, columns, weight = problem.sightings.view[kept], problem.columns[kept], weights[kept, None, None]
-    weighted_view, weighted = ((weight * part).swapaxes(1, 2) for part in (by_view, by_rest))
-    of_views, view_right = np.zeros((views, 6, 6)), np.zeros((views, 6))
-    rest, right, mixed = np.zeros((unknowns, unknowns)), np.zeros(unknowns), np.zeros((views, 6, unknowns))
-    np.add.at(of_views, view, weighted_view @ by_view)
-    np.add.at(view_right, view, (weighted_view @ off)[..., 0])
-    np.add.at(rest, (columns[:, :, None], columns[:, None, :]), weighted @ by_rest)
-    np.add.at(right, columns, (weighted @ off)[..., 0])
-    np.add.at(mixed.swapaxes(1, 2), (view[:, None], columns), (weighted_view @ by_rest).swapaxes(1, 2))
-    inset = np.arange(unknowns - len(scene.inset_px), unknowns)
-    rest[inset, inset] += problem.held
-    right[inset] -= problem.held * scene.inset_px
-    # A view of which nothing is used stays where it is.
-    of_views[np.einsum("vii->v", of_views) == 0] = np.eye(6)
-    return _Normal(of_views, view_right, rest[np.ix_(free, free)], right[free], mixed[..., free])
-
-
-def _reduced(
-    normal: _Normal, damping: float
-) -> tuple[Float[np.ndarray, "views 6 6"], Float[np.ndarray, "free free"], Float[np.ndarray, " free"]]:
-    """The views' inverses, and the equations that are left when the views are eliminated (the Schur complement)."""
-    inverse = np.linalg.inv(normal.views * (1 + damping * np.eye(6)))
-    flat = normal.mixed.reshape(-1, normal.mixed.shape[-1])
-    back = (inverse @ normal.mixed).reshape(flat.shape)
-    reduced = normal.rest * (1 + damping * np.eye(len(normal.rest))) - flat.T @ back
-    return inverse, (reduced + reduced.T) / 2, normal.right - back.T @ normal.view_right.reshape(-1)
-
-
-def _moved(problem: _Problem, scene: MappedScene, normal: _Normal, damping: float) -> MappedScene:
-    inverse, reduced, right = _reduced(normal, damping)
-    scale = np.sqrt(np.maximum(np.diag(reduced), 1e-300))
-    # A ridge that changes nothing, but where there is nothing.
-    step = (
-        np.linalg.solve(reduced / np.outer(scale, scale) + 1e-12 * np.eye(len(scale)), right / scale) / scale
-    )
-    of_views = np.einsum("vij,vj->vi", inverse, normal.view_right - normal.mixed @ step)
-    whole = np.zeros(len(problem.free))
-    whole[problem.free] = step
-    of_markers = whole[: 7 * len(scene.ids)].reshape(-1, 7)
-    return MappedScene(
-        Rotation.from_rotvec(of_views[:, :3]).as_matrix() @ scene.R_cam_world,
-        scene.t_m + of_views[:, 3:],
-        scene.ids,
-        Rotation.from_rotvec(of_markers[:, 3:6]).as_matrix() @ scene.R_world_marker,
-        scene.centre_m + of_markers[:, :3],
-        scene.side_m * np.exp(np.clip(of_markers[:, 6], -1, 1)),
-        scene.inset_px + whole[7 * len(scene.ids) :],
-    )
-
-
-def _solved(
-    problem: _Problem, scene: MappedScene, used: Bool[np.ndarray, " sightings"], *, robust: bool
-) -> MappedScene:
-    """Levenberg-Marquardt from a scene; damping grows where a step does not help."""
-    damping, squares = 1e-4, _squares(problem, scene)
-    # What is behind a camera at the start has no slope, and no say.
-    used = used & np.isfinite(squares)
-    for _ in range(_MOST_STEPS):
-        weights = used / (1 + np.where(used, squares, 0.0) / 8 if robust else 1.0) / problem.noise_px**2
-        normal, cost = _normal(problem, scene, weights), _cost(problem, squares[used], scene, robust)
-        for _ in range(10):
-            tried = _moved(problem, scene, normal, damping)
-            tried_squares = _squares(problem, tried)
-            tried_cost = _cost(problem, tried_squares[used], tried, robust)
-            if tried_cost <= cost:
-                break
-            damping = max(damping, 1e-7) * 10
-        else:
-            return scene
-        scene, squares = tried, tried_squares
-        damping *= 0.1
-        if cost - tried_cost <= (_SETTLED_ROBUST if robust else _SETTLED) * cost:
-            return scene
-    return scene
-
-
-def _squares(problem: _Problem, scene: MappedScene) -> Float[np.ndarray, " sightings"]:
-    """Squared distances over a marker's four corners, in units of the noise; 8 on average."""
-    return ((residuals_px(problem.sightings, scene) / problem.noise_px) ** 2).sum(axis=-1)
-
-
-def _cost(
-    problem: _Problem, squares: Float[np.ndarray, " sightings"], scene: MappedScene, robust: bool
-) -> float:
-    # All four corners of a marker are wrong together, where it is another marker: they share their loss.
-    loss = 8 * np.log1p(squares / 8) if robust else squares
-    return float(loss.sum() + np.sum(problem.held * scene.inset_px**2))
-
-
-def _covariance(
-    problem: _Problem, scene: MappedScene, used: Bool[np.ndarray, " sightings"]
-) -> Float[np.ndarray, "markers 7 7"]:
-    """Of noise that is new in every frame, of errors that a marker's corner has in all of them, and of the inset."""
-    weights = used / problem.noise_px**2
-    normal = _normal(problem, scene, weights)
-    of_views, reduced, _ = _reduced(normal, damping=0.0)
-    count, sought = len(scene.ids), len(reduced) - len(scene.inset_px)
-    of_markers, by_inset = reduced[:sought, :sought], reduced[:sought, sought:]
-    scale = np.sqrt(np.diag(of_markers))
-    inverse = np.linalg.inv(of_markers / np.outer(scale, scale)) / np.outer(scale, scale)
-    by_alike = inverse @ _alike_pulls(problem, scene, weights, of_views, normal.mixed)[:sought]
-    # Outward for all four corners of a marker, by root two where its sides move by one.
-    apart = np.sqrt(2) * by_alike.reshape(sought, count, 4, 2)[..., 0].sum(axis=-1)
-    common = inverse @ by_inset
+def _covariance(bundle: _Bundle) -> Float[np.ndarray, "markers 7 7"]:
+    """(markers, 7, 7), covariance from noise of each frame, from lasting errors of the corners, and from the insets."""
+    problem, scene = bundle.problem, bundle.scene
+    equations = bundle.equations()
+    reduced = equations.reduced()
+    count, size = len(scene.ids), len(reduced.information) - len(scene.inset_px)
+    of_markers, by_inset = reduced.information[:size, :size], reduced.information[:size, size:]
+    try:
+        inverse = covariance_from_information(of_markers)
+    except np.linalg.LinAlgError:
+        # A marker whose sightings are all outliers is undetermined, so no covariance is known.
+        inverse = np.full(of_markers.shape, np.nan)
+    by_corner = inverse @ _corner_pulls(bundle, reduced)[:size]
+    # All four corners of a marker move outwards by sqrt(2) px where its sides move by 1 px.
+    by_marker = np.sqrt(2) * by_corner.reshape(size, count, 4, 2)[..., 0].sum(axis=-1)
     parts = [
-        _alike_px(problem, scene, used) * by_alike,
-        _INSET_APART_PX * apart,
-        _INSET_PX * common,
+        _lasting_px(bundle) * by_corner,
+        _INSET_APART_PX * by_marker,
+        _INSET_PX * (inverse @ by_inset),
     ]
     whole = np.zeros((7 * count, 7 * count))
     rows = problem.free[: 7 * count]
@@ -264,46 +285,47 @@ def _covariance(
 
 
 def _axes(sightings: MarkerSightings) -> Float[np.ndarray, "sightings 4 2 2"]:
-    """Columns: outward from the middle of the marker, and across."""
+    """(sightings, 4, 2, 2), unit vectors as columns: away from the middle of the marker, and across."""
     out = outward(sightings)
     out = out / np.linalg.norm(out, axis=-1, keepdims=True)
     return np.stack([out, np.stack([-out[..., 1], out[..., 0]], axis=-1)], axis=-1)
 
 
-def _alike_px(problem: _Problem, scene: MappedScene, used: Bool[np.ndarray, " sightings"]) -> float:
-    """Standard deviation of what a corner is off in all frames, along each axis, from the means of residuals.
+def _lasting_px(bundle: _Bundle) -> float:
+    """Standard deviation of a corner's error that all frames share, along each axis, from the mean residuals.
 
-    Of the eight of a marker its own six unknowns hide six.
+    Each marker has eight mean residuals, and its own six unknowns hide six of them.
     """
-    off = linearised(problem.sightings, scene).off[used]
-    along = np.einsum("scx,scxk->sck", off, _axes(problem.sightings)[used]).reshape(-1, 8)
+    problem, scene, used = bundle.problem, bundle.scene, bundle.used
+    along = np.einsum("scx,scxk->sck", bundle.slopes.off[used], _axes(problem.sightings)[used])
     row = scene.rows(problem.sightings)[used]
     counts = np.bincount(row, minlength=len(scene.ids))
-    sums = np.zeros((len(scene.ids), 8))
-    np.add.at(sums, row, along)
+    sums = np.zeros((len(scene.ids), _RESIDUALS))
+    np.add.at(sums, row, along.reshape(-1, _RESIDUALS))
     seen = counts > 0
     squares = (sums[seen] ** 2).sum(axis=1) / counts[seen] ** 2
     hidden = problem.free[: 7 * len(scene.ids)].reshape(-1, 7).sum(axis=1)[seen]
     white = problem.noise_px**2 / counts[seen]
-    return float(np.sqrt(np.mean(np.maximum(squares / (8 - hidden) - white, 0.0))))
+    return float(np.sqrt(np.mean(np.maximum(squares / (_RESIDUALS - hidden) - white, 0.0))))
 
 
-def _alike_pulls(
-    problem: _Problem,
-    scene: MappedScene,
-    weights: Float[np.ndarray, " sightings"],
-    inverse_of_views: Float[np.ndarray, "views 6 6"],
-    mixed: Float[np.ndarray, "views 6 free"],
-) -> Float[np.ndarray, "free alike"]:
-    """How errors of 1 px that a marker's corner has in all frames, along each axis, pull on what is sought."""
+def _corner_pulls(bundle: _Bundle, reduced: ReducedEquations) -> Float[np.ndarray, "free errors"]:
+    """(free, errors), right-hand sides for an error of 1 px of one corner of a marker along one axis in all frames.
+
+    There are eight errors per marker. The views are eliminated.
+    """
+    problem, scene, weights = bundle.problem, bundle.scene, bundle.weights
     sightings, kept = problem.sightings, np.flatnonzero(weights)
-    slopes, axes = linearised(sightings, scene), _axes(sightings)[kept] * weights[kept, None, None, None]
-    by_view = np.einsum("scxf,scxk->sfck", slopes.by_view[kept], axes).reshape(len(kept), 6, 8)
-    by_rest = np.einsum("scxf,scxk->sfck", slopes.by_rest[kept], axes).reshape(len(kept), 8, 8)
-    alike = 8 * scene.rows(sightings)[kept][:, None] + np.arange(8)
-    of_views = np.zeros((sightings.num_views, 8 * len(scene.ids), 6))
-    of_views[sightings.view[kept][:, None], alike] = by_view.swapaxes(1, 2)
-    pulls = np.zeros((len(problem.free), 8 * len(scene.ids)))
-    np.add.at(pulls, (problem.columns[kept][:, :, None], alike[:, None, :]), by_rest)
-    through = np.einsum("vij,vaj->via", inverse_of_views, of_views).reshape(-1, pulls.shape[1])
-    return pulls[problem.free] - mixed.reshape(-1, mixed.shape[-1]).T @ through
+    axes = _axes(sightings)[kept] * weights[kept, None, None, None]
+    by_view = np.einsum("scxf,scxk->sfck", bundle.slopes.by_view[kept], axes).reshape(
+        len(kept), 6, _RESIDUALS
+    )
+    by_rest = np.einsum("scxf,scxk->sfck", bundle.slopes.by_rest[kept], axes).reshape(
+        len(kept), 8, _RESIDUALS
+    )
+    errors = _RESIDUALS * scene.rows(sightings)[kept][:, None] + np.arange(_RESIDUALS)
+    of_views = np.zeros((sightings.num_views, _RESIDUALS * len(scene.ids), 6))
+    of_views[sightings.view[kept][:, None], errors] = by_view.swapaxes(1, 2)
+    pulls = np.zeros((len(problem.free), _RESIDUALS * len(scene.ids)))
+    np.add.at(pulls, (problem.columns[kept][:, :, None], errors[:, None, :]), by_rest)
+    return pulls[problem.free] - np.tensordot(reduced.gain, of_views, axes=([0, 1], [0, 2]))

@@ -1,51 +1,52 @@
-"""Linear equations of one frame's corners: in the pose, in what all corners share, and in what each marker has.
+"""Linear equations of one frame's corners, in the pose, in two unknowns of all corners, and in the markers' places.
 
-A corner's error has four parts: its own; what its whole marker hangs off its place; and, one number each for all
-corners of a frame, an inset, because the white about a black marker shines into it and each corner is found inside of
-where it is, and what the focal length is off. With r the residuals, J and S their derivatives by the pose with the
-inset and the focal length and by a marker's place, what is minimised is
+The error of a corner has four parts: its own error; the error of its marker's place; an inset, because the white around
+a black marker shines into the marker, and each corner is found too far inside; and the error of the focal length. Inset
+and focal length are one number each for all corners of a frame. With residuals r, derivatives J by the pose, the inset
+and the focal length, and derivatives S by a marker's place, the cost is
 
-    Σ |r - J x - S d|² / own² + Σ |d|² / place² + (inset / its deviation)² + (focal length / its deviation)²,
+    Σ |r - J x - S d|² / own² + Σ |d|² / place² + (inset / its deviation)² + (focal length / its deviation)².
 
-with each marker's d eliminated as in bundle adjustment (Triggs et al., Bundle adjustment: a modern synthesis, 2000,
-section 6.1). Both variances are estimated with it, from the residuals and from how many unknowns the data determine
-(MacKay, Bayesian interpolation, Neural Computation 4(3), 1992), with a scaled inverse χ² prior. The principal point is
-no unknown: what it is off, a turn of the camera makes up for but for what the edge of a wide image shows.
+The places d are eliminated (`psotrack.estimation`). Both variances, own² and place², are estimated from the residuals
+and from the number of unknowns that the data determine (MacKay, Bayesian interpolation, Neural Computation 4(3), 1992),
+with a scaled inverse χ² prior. The principal point is not an unknown, because a turn of the camera has almost the same
+effect, except at the edge of a wide image.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from psotrack.calibration import reproject
+from psotrack.estimation import NormalEquations, covariance_from_information
 from psotrack.geometry import NEAR_M, Camera
 
 #: Standard deviation of the inset, px.
 INSET_STD_PX = 0.5
-#: Information on inset and focal length before anything is seen; the latter is counted in its standard deviations.
-_KNOWN = np.array([1 / INSET_STD_PX**2, 1.0])
-#: Weight of what is stated of a variance, as a number of residuals.
+#: Prior information on the inset and on the focal length, whose unit is its stated standard deviation.
+_PRIOR = np.array([1 / INSET_STD_PX**2, 1.0])
+#: Weight of a stated variance, as a number of residuals.
 PRIOR_RESIDUALS = 3.0
-#: Variance of an unknown, as a multiple of what it were alone, beyond which the markers leave the pose free.
-_FREE = 1e12
+#: Ratio of an unknown's variance to its variance if all others were known, above which the pose is undetermined.
+_LARGEST_INFLATION = 1e12
 
 
 @dataclass(frozen=True)
 class SeenCorners:
-    """One frame's markers, and the lens that saw them.
+    """Markers of one frame, and the lens of the camera.
 
     Attributes:
-        corners_px: (markers, 4, 2).
-        corners_m: (markers, 4, 3), world.
+        corners_px: (markers, 4, 2), measured pixels.
+        corners_m: (markers, 4, 3), places of the corners in the map, world, metres.
         inward: (markers, 4, 2), unit vectors in the image from each corner into its marker.
-        lens: intrinsics; its pose is ignored.
+        lens: intrinsics; the pose is ignored.
         noise_px: stated standard deviation of a corner along x and along y.
         place_m: stated standard deviation of a marker's place along each axis.
-        map_share: of its variance, what is due to the map, and the same in every frame.
-        focal_error: stated standard deviation of the focal length, as a share of it.
+        map_share: share of that variance that comes from the map and is the same in every frame.
+        focal_error: stated standard deviation of the focal length, as a share of the focal length.
     """
 
     corners_px: Float[np.ndarray, "markers 4 2"]
@@ -60,7 +61,7 @@ class SeenCorners:
 
 @dataclass(frozen=True)
 class Noise:
-    """Variances of a corner's own error and of a marker's place, and the number of residuals that each is from."""
+    """Variances of a corner's own error and of a marker's place, with the degrees of freedom of each estimate."""
 
     own_px2: float
     place_m2: float
@@ -68,20 +69,20 @@ class Noise:
     place_freedom: float
 
     def widened(self) -> Noise:
-        """With what is not known of the variances themselves: those of Student's t."""
+        """Variances of Student's t distributions, which include the uncertainty of the variances themselves."""
         own, place = (freedom / (freedom - 2) for freedom in (self.own_freedom, self.place_freedom))
         return Noise(own * self.own_px2, place * self.place_m2, self.own_freedom, self.place_freedom)
 
 
 @dataclass(frozen=True)
 class Solution:
-    """A step, the covariance of what it steps in, its length in standard deviations, and what each marker adds.
+    """Solution of the equations of one frame.
 
     Attributes:
-        step: (8,), of position along the world's axes (m), turn about the camera's own (rad), inset (px), and focal
-            length (in its stated deviations).
-        covariance: (8, 8), of the same.
-        length: square, in standard deviations.
+        step: (8,), step of position along the world's axes (m), turn about the camera's axes (rad), inset (px), and
+            focal length (stated standard deviations).
+        covariance: (8, 8), covariance of these unknowns.
+        length: squared length of the step in standard deviations.
         places_m2: (markers, 3, 3), covariances of the markers' places if the pose were known.
     """
 
@@ -93,12 +94,12 @@ class Solution:
 
 @dataclass(frozen=True)
 class Sums:
-    """The equations of the corners that count, multiplied with their transposes: 8 unknowns, and the right side.
+    """Sums over the equations of the used corners, each a row of 8 derivatives and a residual.
 
     Attributes:
-        total: (9, 9), of all.
-        by_place: (markers, 3, 9), of the derivatives by each marker's place with its equations.
-        count: of equations.
+        total: (9, 9), rows multiplied with their transposes, sum over all rows.
+        by_place: (markers, 3, 9), derivatives by a marker's place multiplied with the rows, sums over each marker.
+        count: number of equations.
     """
 
     total: Float[np.ndarray, "9 9"]
@@ -106,29 +107,36 @@ class Sums:
     count: int
 
     def solved(self, noise: Noise, extra: Float[np.ndarray, "2"]) -> Solution | None:
-        """The step that minimises the sum; None where it leaves the pose free."""
-        by_place = self.by_place / noise.own_px2
-        places_m2 = np.linalg.inv(by_place[..., :3] + np.eye(3) / noise.place_m2)
-        reduced = self.total / noise.own_px2 - (by_place.swapaxes(1, 2) @ places_m2 @ by_place).sum(axis=0)
-        add_known(reduced, extra)
-        information, toward = reduced[:8, :8], reduced[:8, 8]
-        if not information.diagonal().min() > 0:
-            return None
-        scale = np.sqrt(information.diagonal())
-        scale = scale * scale[:, None]
+        """Minimise the cost over the linear equations; None where they leave the pose undetermined.
+
+        Args:
+            noise: variances of the errors.
+            extra: (2,), inset and focal length at which the equations were made.
+        """
+        total, by_place = self.total / noise.own_px2, self.by_place / noise.own_px2
+        equations = NormalEquations(
+            information=total[:8, :8],
+            right=total[:8, 8],
+            block_information=by_place[..., :3] + np.eye(3) / noise.place_m2,
+            block_right=by_place[..., 8],
+            coupling=by_place[..., :8],
+        )
+        reduced = with_prior(equations, extra).reduced()
         try:
-            inverse = np.linalg.inv(information / scale)
+            covariance = covariance_from_information(reduced.information, _LARGEST_INFLATION)
         except np.linalg.LinAlgError:
             return None
-        # The diagonal says how many times more is unknown of each because the others are unknown too.
-        if not 0 < inverse.diagonal().min() <= inverse.diagonal().max() < _FREE:
-            return None
-        covariance = inverse / scale
-        step = covariance @ toward
-        return Solution(step, (covariance + covariance.T) / 2, float(step @ toward), places_m2)
+        step = covariance @ reduced.right
+        return Solution(step, covariance, float(step @ reduced.right), reduced.block_covariance)
 
     def noise(self, solution: Solution, noise: Noise, seen: SeenCorners) -> Noise:
-        """The variances from what a step leaves."""
+        """Estimate the variances from the residuals after a step.
+
+        Args:
+            solution: the step.
+            noise: variances with which the step was computed.
+            seen: markers of the frame, with the stated variances.
+        """
         left = np.append(-solution.step, 1.0)
         gain = solution.places_m2 @ self.by_place / noise.own_px2
         off_m = gain @ left
@@ -136,7 +144,7 @@ class Sums:
         uncertain_m2 = np.trace(solution.places_m2, axis1=1, axis2=2).sum()
         uncertain_m2 += np.sum((gain @ solution.covariance) * gain)
         of_places = max(off_m.size - uncertain_m2 / noise.place_m2, 0.0)
-        of_pose = 8 - _KNOWN @ solution.covariance.diagonal()[6:]
+        of_pose = 8 - _PRIOR @ solution.covariance.diagonal()[6:]
         own_freedom = PRIOR_RESIDUALS + max(self.count - of_pose - of_places, 0.0)
         place_freedom = PRIOR_RESIDUALS + of_places
         square = left @ self.total @ left - 2 * np.sum(off_m * (self.by_place @ left))
@@ -149,27 +157,29 @@ class Sums:
         )
 
     def common(self, solution: Solution, noise: Noise, map_share: float) -> Float[np.ndarray, "6 errors"]:
-        """What one standard deviation of each error that all frames have in common does to the pose.
+        """Effect on the pose of one standard deviation of each error that is the same in all frames.
 
         Returns:
-            (6, 3 markers + 1): by the place of each marker in the map along x, y, z, and by the focal length.
+            (6, 3 markers + 1), errors of the place of each marker in the map along x, y, z, and of the focal length.
         """
-        # The step is linear in what was seen, to which a marker off its place, or another focal length, adds. The
-        # derivatives by a marker's place are those by the camera's, which it takes the other way.
+        # The step is linear in the residuals, and an error of a place or of the focal length adds to the residuals. The
+        # derivatives by a marker's place are those by the camera's position with the opposite sign.
         gain = solution.places_m2 @ self.by_place[..., :8] / noise.own_px2
         places = (gain @ solution.covariance[:, :6]).reshape(-1, 6) * np.sqrt(map_share / noise.place_m2)
         return -np.concatenate([places, solution.covariance[7:, :6]]).T
 
 
-def add_known(total: Float[np.ndarray, "9 9"], extra: Float[np.ndarray, "2"]) -> None:
-    """Add to equations what is known of inset and focal length before anything is seen."""
-    total[[6, 7], [6, 7]] += _KNOWN
-    total[6:8, 8] -= _KNOWN * extra
+def with_prior(equations: NormalEquations, extra: Float[np.ndarray, "2"]) -> NormalEquations:
+    """Add the prior of inset and focal length to equations that were made at the values `extra` of both."""
+    information, right = equations.information.copy(), equations.right.copy()
+    information[[6, 7], [6, 7]] += _PRIOR
+    right[6:8] -= _PRIOR * extra
+    return replace(equations, information=information, right=right)
 
 
-def log_known(extra: Float[np.ndarray, "2"]) -> float:
-    """Logarithm of their density, but for a constant."""
-    return -0.5 * float(_KNOWN @ extra**2)
+def log_prior(extra: Float[np.ndarray, "2"]) -> float:
+    """Logarithm of the prior density of inset and focal length, without its constant."""
+    return -0.5 * float(_PRIOR @ extra**2)
 
 
 def seen_markers(
@@ -181,7 +191,7 @@ def seen_markers(
     map_error_m: float = 0.0,
     focal_error: float = 0.0,
 ) -> SeenCorners:
-    """One frame's markers, ready to be fitted; a marker is off its place by the map, and in this frame."""
+    """Make the data of a fit; errors of the map and of this frame add to the error of a marker's place."""
     to_next = _unit(corners_px[:, [1, 2, 3, 0]] - corners_px)
     inward = _unit(to_next - to_next[:, [3, 0, 1, 2]])
     off_m = float(np.hypot(place_m, map_error_m))
@@ -196,14 +206,15 @@ def equations(
     R_world_cam: Float[np.ndarray, "3 3"],
     extra: Float[np.ndarray, "2"],
 ) -> tuple[Float[np.ndarray, "markers 4 2 9"], Float[np.ndarray, "markers 4"]]:
-    """Each corner's pixel by position, turn, inset and focal length, and from where it should be to where it is.
+    """Linearise the projections of all corners.
 
     Returns:
-        (markers, 4, 2, 9), derivatives and the right side; and (markers, 4), how far ahead of the camera each is, m.
+        (markers, 4, 2, 9), derivatives of each pixel by position, turn, inset and focal length, and its residual,
+        measured minus projected; and (markers, 4), depths of the corners, metres.
     """
     x_cam = (seen.corners_m - position_m).reshape(-1, 3) @ R_world_cam
     depth_m = x_cam[:, 2].copy()
-    # What is behind has no place in the image; any place before the camera keeps the numbers finite.
+    # A corner behind the camera has no projection; a point in front of the camera keeps the numbers finite.
     x_cam[depth_m <= NEAR_M] = (0.0, 0.0, 1.0)
     pixels, by_turn, by_shift = reproject(x_cam, np.eye(3), np.zeros(3), seen.lens)
     by_extra = np.stack(
@@ -216,7 +227,7 @@ def equations(
 
 
 def summed(rows: Float[np.ndarray, "markers 4 2 9"], fits: Bool[np.ndarray, "markers 4"]) -> Sums:
-    """The equations of the corners that fit."""
+    """Sum the equations of the corners that fit."""
     chosen = (rows * fits[..., None, None]).reshape(-1, 8, 9)
     transposed = chosen.swapaxes(1, 2)
     return Sums((transposed @ chosen).sum(axis=0), transposed[:, :3] @ chosen, 2 * int(fits.sum()))

@@ -1,8 +1,9 @@
-"""The most likely pose near a start: robust steps first, then those of all corners that fit, and which ones do.
+"""The most likely pose near a start, and the corners that fit the pose.
 
-Which corners and markers fit, studentised residuals tell: residuals in units of their own standard deviations (Cook &
-Weisberg, Residuals and influence in regression, 1982, section 2.2). The covariance is the inverse of the information,
-with the inset, the focal length and the markers' places integrated out (see `equations`).
+Robust steps come first, then steps with all corners that fit (`psotrack.estimation.gauss_newton`). Studentised
+residuals, which are residuals in units of their own standard deviations, decide which corners and markers fit (Cook &
+Weisberg, Residuals and influence in regression, 1982, section 2.2). The covariance is the inverse of the information
+after the elimination of the inset, the focal length and the markers' places (see `equations`).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from psotrack.calibration import spread_px
+from psotrack.estimation import NormalEquations, cauchy_weight, gauss_newton
 from psotrack.geometry import NEAR_M
 from psotrack.inside_out.pose.equations import (
     PRIOR_RESIDUALS,
@@ -22,48 +24,48 @@ from psotrack.inside_out.pose.equations import (
     SeenCorners,
     Solution,
     Sums,
-    add_known,
     equations,
-    log_known,
+    log_prior,
     summed,
+    with_prior,
 )
 
-#: Probability that a good corner, or the mean of a good marker, is taken for an outlier.
+#: Probability that a good corner, or the mean of a good marker, is rejected as an outlier.
 FALSE_ALARM = 1e-3
-#: Corners that a marker needs: with two bad ones nobody knows what was found.
+#: Smallest number of corners of a marker that fit; a marker with two bad corners may be anything.
 MIN_CORNERS = 3
-#: Times its stated deviation that a marker's place is taken to be off at first: what begins too large shrinks within
-#: few steps, what begins too small takes many to grow.
-_START = 10.0
-#: Times the stated noise, and metres off their places, that corners and markers may be before nothing is believed.
-_HOPELESS, _HOPELESS_M = 30.0, 0.05
-#: Of Gauss-Newton, with robust weights and without; and the step from which on no corner comes back.
-_MOST_STEPS, _SETTLED = 12, 5
-#: Squares of steps in standard deviations: near enough for robust weights, and the last one.
-_NEAR, _LAST = 1.0, 1e-2
-#: Scales of the robust weights within which a corner counts from then on.
+#: First estimate of the deviation of a marker's place, as a multiple of the stated one. An estimate that is too large
+#: shrinks within few steps, and one that is too small grows slowly.
+_FIRST_PLACE_SCALE = 10.0
+#: Deviations above which a fit is rejected: of corners, as a multiple of the stated noise, and of places, metres.
+_LARGEST_NOISE_SCALE, _LARGEST_PLACE_M = 30.0, 0.05
+#: Largest number of robust steps and of steps without robust weights; and the step from which no corner is taken back.
+_MAX_STEPS, _NO_RETURN = 12, 5
+#: Squared lengths in standard deviations of the last robust step and of the last step.
+_LAST_ROBUST, _LAST = 1.0, 1e-2
+#: A corner fits the robust pose if its distance is below this multiple of the robust scale.
 _WITHIN = 4.0
-#: A start may be far off: longest steps in rad, and of the markers' distance.
+#: Longest step, because a start may be far off: rad, and as a share of the markers' distance.
 _LONGEST = 0.3
-#: Share of a residual's own variance that is left to it at least.
-_LEAST = 0.02
-#: Logarithm of the density of a corner that is not where it should be: somewhere within about 100 x 100 px.
+#: Smallest variance of a residual, as a share of the corner's own variance.
+_LEAST_VARIANCE = 0.02
+#: Logarithm of the density of an outlier's pixel, which may lie anywhere within about 100 x 100 px.
 _LOG_ANYWHERE = -2 * log(100.0)
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A pose that no small change makes better.
+    """The most likely pose near a start.
 
     Attributes:
         position_m: (3,), the camera's centre, world.
         R_world_cam: (3, 3), camera to world.
-        covariance: (6, 6), as in `CameraPath`.
-        common: (6, 3 markers + 1), what one standard deviation of each marker's place in the map along each axis, and
-            of the focal length, does to it.
-        fits: (markers, 4), corners that the pose explains.
-        reprojection_px: root mean square of their distances in the image.
-        log_evidence: logarithm of the probability density of all corners, whatever the pose is near this one.
+        covariance: (6, 6), covariance as in `CameraPath`.
+        common: (6, 3 markers + 1), effects of one standard deviation of each marker's place in the map along each axis,
+            and of the focal length.
+        fits: (markers, 4), True for corners that fit the pose.
+        reprojection_px: root mean square distance of these corners in the image.
+        log_evidence: logarithm of the probability density of all corners, integrated over poses near this one.
     """
 
     position_m: Float[np.ndarray, "3"]
@@ -76,7 +78,7 @@ class Fit:
 
     @property
     def used(self) -> Bool[np.ndarray, "markers"]:
-        """(markers,), those that the pose explains."""
+        """(markers,), True for markers of which a corner fits."""
         return np.any(self.fits, axis=1)
 
 
@@ -86,56 +88,44 @@ def fit(
     R_world_cam: Float[np.ndarray, "3 3"],
     fits: Bool[np.ndarray, "markers 4"] | None = None,
 ) -> Fit | None:
-    """The pose near a start, and the corners that it explains.
+    """Fit a pose near a start, and find the corners that fit.
 
     Args:
-        seen: the frame's markers.
-        position_m: (3,), the camera's centre, world.
-        R_world_cam: (3, 3), camera to world.
-        fits: (markers, 4), corners that the start explains; None takes those that robust steps end at.
+        seen: markers of the frame.
+        position_m: (3,), the camera's centre, world, at the start.
+        R_world_cam: (3, 3), camera to world, at the start.
+        fits: (markers, 4), True for corners that fit the start; None to find them by robust steps.
 
     Returns:
-        None where the markers leave the pose free, or it explains none of them.
+        The fit; None where the markers leave the pose undetermined, or no pose explains them.
     """
     pose = _Pose(position_m, R_world_cam, np.zeros(2))
     if fits is None:
-        pose, fits = _robust(seen, pose)
-    noise = Noise(seen.noise_px**2, (_START * seen.place_m) ** 2, PRIOR_RESIDUALS, PRIOR_RESIDUALS)
-    for number in range(_MOST_STEPS):
-        rows, depth_m = equations(seen, pose.position_m, pose.R_world_cam, pose.extra)
-        ahead = depth_m > NEAR_M
-        sums = summed(rows, fits & ahead)
-        solution = sums.solved(noise, pose.extra)
-        if solution is None:
-            return None
-        pose = pose.stepped(solution.step, depth_m)
-        off_px = rows @ np.append(-solution.step, 1.0)
-        explained = fits & ahead
-        if number > 0:
-            # By the noise that is stated nothing is judged, only by what the residuals have made of it.
-            explained = _explained(off_px, rows[..., :8], ahead, fits, solution.covariance, noise)
-        if number >= _SETTLED:
-            # The gates move with the fit and the fit with the gates; what swings to and fro ends outside.
-            explained &= fits
-        noise, length = sums.noise(solution, noise, seen), solution.length
-        if number > 0 and length < _LAST and (explained == fits).all():
-            break
-        fits, before = explained, fits
-    else:
-        # The last step was that of the corners before.
-        fits = before
-    if length > _NEAR:
+        start = _RobustFit(seen, pose, np.zeros(seen.corners_px.shape[:2], bool), np.inf)
+        robust = gauss_newton(start, max_steps=_MAX_STEPS)
+        pose, fits = robust.pose, robust.fits
+    noise = Noise(
+        seen.noise_px**2, (_FIRST_PLACE_SCALE * seen.place_m) ** 2, PRIOR_RESIDUALS, PRIOR_RESIDUALS
+    )
+    try:
+        found = gauss_newton(_NoiseFit(seen, pose, fits, noise), max_steps=_MAX_STEPS)
+    except np.linalg.LinAlgError:
         return None
-    return _fitted(seen, pose, fits, off_px, sums, noise)
+    if found.last is None or found.last.solution.length > _LAST_ROBUST:
+        return None
+    return _fitted(seen, found.pose, found.last, found.noise)
 
 
 @dataclass(frozen=True)
 class _Pose:
+    """A pose as in `Fit`, with the inset (px) and the focal length (stated standard deviations) in `extra`, (2,)."""
+
     position_m: Float[np.ndarray, "3"]
     R_world_cam: Float[np.ndarray, "3 3"]
     extra: Float[np.ndarray, "2"]
 
-    def stepped(self, step: Float[np.ndarray, "8"], depth_m: Float[np.ndarray, "markers 4"]) -> _Pose:
+    def moved(self, step: Float[np.ndarray, "8"], depth_m: Float[np.ndarray, "markers 4"]) -> _Pose:
+        """Take a step, shortened to the longest one; `depth_m` are the depths of the corners."""
         distance_m = np.maximum(depth_m, NEAR_M).mean()
         longest = max(np.linalg.norm(step[:3]) / distance_m, np.linalg.norm(step[3:6]), _LONGEST)
         step = step * (_LONGEST / longest)
@@ -143,22 +133,125 @@ class _Pose:
         return _Pose(self.position_m + step[:3], self.R_world_cam @ turn, self.extra + step[6:])
 
 
-def _fitted(
-    seen: SeenCorners,
-    pose: _Pose,
-    fits: Bool[np.ndarray, "markers 4"],
-    off_px: Float[np.ndarray, "markers 4 2"],
-    sums: Sums,
-    noise: Noise,
-) -> Fit | None:
-    """What is to be said of a pose and of the corners that it explains; None where nothing is to be believed."""
+@dataclass(frozen=True)
+class _RobustFit:
+    """A pose that is fitted with Cauchy weights, `estimation.least_squares.Reweighted`.
+
+    Attributes:
+        seen: markers of the frame.
+        pose: the pose.
+        fits: (markers, 4), True for corners near the pose of the previous step.
+        length: squared length of the previous step in standard deviations; 0 if no further step is possible.
+    """
+
+    seen: SeenCorners
+    pose: _Pose
+    fits: Bool[np.ndarray, "markers 4"]
+    length: float
+
+    def moved(self) -> _RobustFit:
+        """Take a step with weights whose scale is the median of the distances."""
+        pose = self.pose
+        rows, depth_m = equations(self.seen, pose.position_m, pose.R_world_cam, pose.extra)
+        distance_px = np.where(depth_m > NEAR_M, np.linalg.norm(rows[..., 8], axis=-1), np.inf)
+        scale_px = max(self.seen.noise_px, spread_px(distance_px.ravel(), 6))
+        fits = distance_px < _WITHIN * scale_px
+        stopped = _RobustFit(self.seen, pose, fits, 0.0)
+        if not np.isfinite(scale_px):
+            return stopped
+        weighted = rows * np.sqrt(cauchy_weight((distance_px / scale_px) ** 2))[..., None, None] / scale_px
+        weighted = weighted.reshape(-1, 9)
+        total = weighted.T @ weighted
+        normal = with_prior(NormalEquations(total[:8, :8], total[:8, 8]), pose.extra)
+        try:
+            step = normal.solved().shared
+        except np.linalg.LinAlgError:
+            return stopped
+        return _RobustFit(self.seen, pose.moved(step, depth_m), fits, float(step @ normal.right))
+
+    def is_settled(self, before: _RobustFit) -> bool:
+        return self.length < _LAST_ROBUST
+
+
+@dataclass(frozen=True)
+class _LastStep:
+    """The last step of a `_NoiseFit`.
+
+    Attributes:
+        fits: (markers, 4), True for the corners that it used.
+        off_px: (markers, 4, 2), linearised residuals after the step.
+        sums: sums of the equations.
+        solution: the step.
+    """
+
+    fits: Bool[np.ndarray, "markers 4"]
+    off_px: Float[np.ndarray, "markers 4 2"]
+    sums: Sums
+    solution: Solution
+
+
+@dataclass(frozen=True)
+class _NoiseFit:
+    """A pose that is fitted together with the noise and the fitting corners, `estimation.least_squares.Reweighted`.
+
+    Attributes:
+        seen: markers of the frame.
+        pose: the pose.
+        fits: (markers, 4), True for corners that fit.
+        noise: variances of the errors.
+        number: number of steps so far.
+        last: the last step; None before the first one.
+    """
+
+    seen: SeenCorners
+    pose: _Pose
+    fits: Bool[np.ndarray, "markers 4"]
+    noise: Noise
+    number: int = 0
+    last: _LastStep | None = None
+
+    def moved(self) -> _NoiseFit:
+        """Take a step, find the corners that fit, and estimate the noise."""
+        pose, fits, noise = self.pose, self.fits, self.noise
+        rows, depth_m = equations(self.seen, pose.position_m, pose.R_world_cam, pose.extra)
+        is_ahead = depth_m > NEAR_M
+        sums = summed(rows, fits & is_ahead)
+        solution = sums.solved(noise, pose.extra)
+        if solution is None:
+            raise np.linalg.LinAlgError("expected markers that determine the pose")
+        off_px = rows @ np.append(-solution.step, 1.0)
+        still_fits = fits & is_ahead
+        if self.number > 0:
+            # The stated noise judges no corner; the noise that the residuals show does.
+            still_fits = _explained(off_px, rows[..., :8], is_ahead, fits, solution.covariance, noise)
+        if self.number >= _NO_RETURN:
+            # The gates depend on the fit and the fit on the gates. A corner that alternates stays out.
+            still_fits &= fits
+        return _NoiseFit(
+            self.seen,
+            pose.moved(solution.step, depth_m),
+            still_fits,
+            sums.noise(solution, noise, self.seen),
+            self.number + 1,
+            _LastStep(fits, off_px, sums, solution),
+        )
+
+    def is_settled(self, before: _NoiseFit) -> bool:
+        if self.last is None or before.number == 0 or self.last.solution.length >= _LAST:
+            return False
+        return bool((self.fits == before.fits).all())
+
+
+def _fitted(seen: SeenCorners, pose: _Pose, last: _LastStep, noise: Noise) -> Fit | None:
+    """Make the result from the last step and the noise; None where residuals are too large to trust the pose."""
+    fits, off_px, sums = last.fits, last.off_px, last.sums
     widened = noise.widened()
     solution: Solution | None = sums.solved(widened, pose.extra)
-    hopeless = noise.own_px2 > (_HOPELESS * seen.noise_px) ** 2 or noise.place_m2 > _HOPELESS_M**2
-    if solution is None or hopeless:
+    too_large = noise.own_px2 > (_LARGEST_NOISE_SCALE * seen.noise_px) ** 2
+    if solution is None or too_large or noise.place_m2 > _LARGEST_PLACE_M**2:
         return None
     covariance = solution.covariance[:6, :6]
-    # The inset is part of what was measured: the distance in the image is without it.
+    # The inset is an error of the measurement, so the reported distances are without the inset.
     distance_px = np.linalg.norm(off_px + pose.extra[0] * seen.inward, axis=-1)[fits]
     return Fit(
         pose.position_m,
@@ -167,30 +260,8 @@ def _fitted(
         sums.common(solution, widened, seen.map_share),
         fits,
         float(np.sqrt(np.mean(distance_px**2))),
-        _log_evidence(off_px[fits], fits.size, covariance, seen.noise_px) + log_known(pose.extra),
+        _log_evidence(off_px[fits], fits.size, covariance, seen.noise_px) + log_prior(pose.extra),
     )
-
-
-def _robust(seen: SeenCorners, pose: _Pose) -> tuple[_Pose, Bool[np.ndarray, "markers 4"]]:
-    """Steps with the weights of a Cauchy loss, whose scale is the residuals' median, and what is within them then."""
-    for _ in range(_MOST_STEPS):
-        rows, depth_m = equations(seen, pose.position_m, pose.R_world_cam, pose.extra)
-        distance_px = np.where(depth_m > NEAR_M, np.linalg.norm(rows[..., 8], axis=-1), np.inf)
-        scale_px = max(seen.noise_px, spread_px(distance_px.ravel(), 6))
-        fits = distance_px < _WITHIN * scale_px
-        if not np.isfinite(scale_px):
-            break
-        weighted = (rows / np.hypot(scale_px, distance_px)[..., None, None]).reshape(-1, 9)
-        total = weighted.T @ weighted
-        add_known(total, pose.extra)
-        try:
-            step = np.linalg.solve(total[:8, :8], total[:8, 8])
-        except np.linalg.LinAlgError:
-            break
-        pose = pose.stepped(step, depth_m)
-        if step @ total[:8, 8] < _NEAR:
-            break
-    return pose, fits
 
 
 def _explained(
@@ -201,7 +272,7 @@ def _explained(
     covariance: Float[np.ndarray, "8 8"],
     noise: Noise,
 ) -> Bool[np.ndarray, "markers 4"]:
-    """Corners, and markers' means, whose studentised residuals are within the gates."""
+    """(markers, 4), True for corners whose studentised residual, and whose marker's mean one, is within the gate."""
     used = np.any(fits, axis=1)
     good = ahead & _within(off_px, slopes, np.ones(fits.shape), covariance, noise, fits)
     count = np.maximum(good.sum(axis=1), 1)
@@ -210,7 +281,7 @@ def _explained(
     within = _within(mean_px, mean_slopes, count, covariance, noise, used)
     kept = within & (good.sum(axis=1) >= MIN_CORNERS)
     if used.sum() == 1:
-        # Its four corners are two equations more than the unknowns: they cannot tell which of them is bad.
+        # The corners of a single marker give two equations more than unknowns, too few to find a bad corner.
         good[used], kept[used] = ahead[used], True
     return good & kept[:, None]
 
@@ -223,9 +294,17 @@ def _within(
     noise: Noise,
     fitted: Bool[np.ndarray, "*items"],
 ) -> Bool[np.ndarray, "*items"]:
-    """Whether residuals, each the mean of so many corners, are as small as their covariance says.
+    """True for residuals that are within the gate of their covariance.
 
-    That is less than the noise where they were fitted, else more.
+    The covariance is smaller than the noise for corners that were used in the fit, and larger for others.
+
+    Args:
+        off_px: (items, 2), residuals, each the mean over corners.
+        slopes: (items, 2, 8), derivatives, the same means.
+        count: (items,), number of corners of each mean.
+        covariance: (8, 8), covariance of the unknowns.
+        noise: variances of the errors.
+        fitted: (items,), True for items that were used in the fit.
     """
     own_px2 = noise.own_px2 / count
     by_place = slopes[..., :3]
@@ -233,8 +312,8 @@ def _within(
     sign = np.where(fitted, -1.0, 1.0)
     of_place = noise.place_m2 * (by_place * by_place).sum(axis=-1)
     variance = of_place + sign[..., None] * (half * slopes).sum(axis=-1)
-    # A residual that has no freedom left says nothing.
-    least = _LEAST * own_px2
+    # A residual without freedom has a variance of 0 and tells nothing.
+    least = _LEAST_VARIANCE * own_px2
     xx, yy = (np.maximum(own_px2 + variance[..., axis], least) for axis in (0, 1))
     xy = noise.place_m2 * (by_place[..., 0, :] * by_place[..., 1, :]).sum(axis=-1)
     xy += sign * (half[..., 0, :] * slopes[..., 1, :]).sum(axis=-1)
@@ -254,8 +333,17 @@ def _log_evidence(
     covariance: Float[np.ndarray, "6 6"],
     stated_px: float,
 ) -> float:
-    """Logarithm of a density: of residuals whose variance is integrated out (Student's t), of the other corners, which
-    may be anywhere, and of the poses that explain them (Laplace's approximation)."""
+    """Logarithm of the density of all corners of a frame.
+
+    Residuals of fitting corners have Student's t distribution, because their variance is integrated out. Other corners
+    have a uniform density. The poses are integrated out by Laplace's approximation.
+
+    Args:
+        off_px: (corners, 2), residuals of the fitting corners.
+        num_corners: number of all corners.
+        covariance: (6, 6), covariance of the pose.
+        stated_px: stated standard deviation of a corner.
+    """
     count, prior_px2 = off_px.size, PRIOR_RESIDUALS * stated_px**2
     half = (PRIOR_RESIDUALS + count) / 2
     of_fitted = lgamma(half) - lgamma(PRIOR_RESIDUALS / 2) - count / 2 * log(pi * prior_px2)

@@ -1,0 +1,237 @@
+"""The least-squares core against SciPy and dense linear algebra, and the backward pass against one joint Gaussian."""
+
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from psotrack.estimation import (
+    Damping,
+    NormalEquations,
+    Step,
+    backward_step,
+    cauchy_loss,
+    cauchy_weight,
+    covariance_from_information,
+    gauss_newton,
+    levenberg_marquardt,
+)
+
+TIME_S = np.linspace(0.0, 3.0, 25)
+
+
+def curve(params):
+    """(..., times), amplitude times exp(-rate t) plus offset, and its derivatives (..., times, 3)."""
+    amplitude, rate, offset = (params[..., k, None] for k in range(3))
+    decay = np.exp(-rate * TIME_S)
+    slopes = np.stack([decay, -amplitude * TIME_S * decay, np.ones_like(decay)], axis=-1)
+    return amplitude * decay + offset, slopes
+
+
+@dataclass(frozen=True)
+class Curves:
+    """A batch of curves, or one curve, that are fitted to values."""
+
+    params: np.ndarray
+    values: np.ndarray
+    robust: bool = False
+
+    @property
+    def squares(self):
+        return (self.values - curve(self.params)[0]) ** 2
+
+    @property
+    def cost(self):
+        loss = cauchy_loss(self.squares) if self.robust else self.squares
+        return loss.sum(axis=-1)
+
+    def equations(self):
+        predicted, slopes = curve(self.params)
+        weights = cauchy_weight(self.squares) if self.robust else np.ones(self.squares.shape)
+        weighted = (slopes * weights[..., None]).swapaxes(-1, -2)
+        return NormalEquations(weighted @ slopes, np.matvec(weighted, self.values - predicted))
+
+    def moved(self, step):
+        return replace(self, params=self.params + step.shared)
+
+
+def measured_curves(seed, count=None):
+    rng = np.random.default_rng(seed)
+    shape = () if count is None else (count,)
+    params = np.stack(
+        [rng.uniform(2, 5, shape), rng.uniform(0.5, 2, shape), rng.uniform(-1, 1, shape)], axis=-1
+    )
+    return params, curve(params)[0] + rng.normal(0, 0.1, (*shape, len(TIME_S)))
+
+
+@pytest.mark.parametrize("robust", [False, True])
+def test_a_fit_is_scipys(robust):
+    _, values = measured_curves(1)
+    if robust:
+        values[[3, 11]] += [20.0, -30.0]
+    start = Curves(np.array([1.0, 0.1, 0.0]), values, robust)
+    found = levenberg_marquardt(start, max_steps=200, least_gain=1e-14)
+    expected = least_squares(
+        lambda params: curve(params)[0] - values,
+        start.params,
+        lambda params: curve(params)[1],
+        loss="cauchy" if robust else "linear",
+        xtol=1e-15,
+        ftol=1e-15,
+        gtol=1e-12,
+    )
+    # Reweighted steps converge linearly, so the last digits of the parameters are open.
+    np.testing.assert_allclose(found.params, expected.x, atol=1e-5 if robust else 1e-8)
+    assert found.cost == pytest.approx(2 * expected.cost, rel=1e-9)
+
+
+def test_problems_of_a_batch_do_not_affect_each_other():
+    _, values = measured_curves(2, count=8)
+    # The start of one problem is far away, so that it needs more steps and damping than the others.
+    params = np.tile([1.0, 0.1, 0.0], (8, 1))
+    params[3] = [-40.0, 6.0, 20.0]
+    damping = Damping(first=1e-3, increase=100.0, decrease=0.01, largest=1e12)
+    together = levenberg_marquardt(Curves(params, values), max_steps=60, damping=damping, least_length=1e-9)
+    for k in range(8):
+        alone = levenberg_marquardt(
+            Curves(params[k], values[k]), max_steps=60, damping=damping, least_length=1e-9
+        )
+        np.testing.assert_allclose(together.params[k], alone.params, rtol=1e-7, atol=1e-8)
+
+
+def test_no_step_raises_a_cost():
+    _, values = measured_curves(3, count=20)
+    rng = np.random.default_rng(3)
+    state = Curves(rng.normal(0, 1, (20, 3)), values)
+    for steps in (1, 2, 3, 5, 8):
+        after = levenberg_marquardt(state, max_steps=steps)
+        assert (after.cost <= state.cost).all()
+        state = after
+
+
+def test_a_problem_that_is_solved_stays_as_it_is():
+    params, _ = measured_curves(4)
+    start = Curves(params, curve(params)[0])
+    assert levenberg_marquardt(start, max_steps=50, least_length=1e-6) is start
+
+
+def coupled_equations(seed, blocks=5, m=3, n=4):
+    """Normal equations with blocks, and the same equations as one dense matrix."""
+    rng = np.random.default_rng(seed)
+    jacobian = np.zeros((blocks, 10, blocks * m + n))
+    for k in range(blocks):
+        jacobian[k, :, k * m : k * m + m] = rng.normal(size=(10, m))
+        jacobian[k, :, blocks * m :] = rng.normal(size=(10, n))
+    J, r = jacobian.reshape(-1, blocks * m + n), rng.normal(size=10 * blocks)
+    A, b = J.T @ J, J.T @ r
+    cut = blocks * m
+    diagonal = [slice(k * m, k * m + m) for k in range(blocks)]
+    equations = NormalEquations(
+        A[cut:, cut:],
+        b[cut:],
+        np.stack([A[rows, rows] for rows in diagonal]),
+        b[:cut].reshape(blocks, m),
+        A[:cut, cut:].reshape(blocks, m, n),
+    )
+    return equations, A, b
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.3])
+def test_elimination_of_blocks_is_the_dense_solution(damping):
+    equations, A, b = coupled_equations(5)
+    step = equations.damped(damping).solved()
+    expected = np.linalg.solve(A + damping * np.diag(np.diag(A)), b)
+    np.testing.assert_allclose(np.concatenate([step.blocks.ravel(), step.shared]), expected, atol=1e-10)
+
+
+def test_the_covariance_of_the_shared_unknowns_is_that_of_the_dense_inverse():
+    equations, A, _ = coupled_equations(6)
+    found = covariance_from_information(equations.reduced().information)
+    np.testing.assert_allclose(found, np.linalg.inv(A)[15:, 15:], rtol=1e-9, atol=1e-12)
+
+
+def test_an_undetermined_unknown_has_no_covariance_and_is_not_moved():
+    information = np.array([[4.0, 0.0], [0.0, 0.0]])
+    with pytest.raises(np.linalg.LinAlgError):
+        covariance_from_information(information)
+    nearly = np.array([[1.0, 1.0], [1.0, 1.0 + 1e-9]])
+    assert covariance_from_information(nearly)[0, 0] > 1e8
+    with pytest.raises(np.linalg.LinAlgError):
+        covariance_from_information(nearly, largest_inflation=1e6)
+    step = NormalEquations(information, np.array([2.0, 0.0])).damped(1e-9).solved()
+    np.testing.assert_allclose(step.shared, [0.5, 0.0], rtol=1e-8)
+
+
+def test_equations_without_blocks_cannot_be_reduced():
+    with pytest.raises(TypeError, match="expected equations with blocks, found none"):
+        NormalEquations(np.eye(2), np.zeros(2)).reduced()
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A mean whose noise is estimated with it: values that are farther off than three deviations do not count."""
+
+    values: np.ndarray
+    mean: float
+    std: float
+
+    def moved(self):
+        inliers = self.values[np.abs(self.values - self.mean) < 3 * self.std]
+        information = np.full((1, 1), len(inliers) / self.std**2)
+        equations = NormalEquations(information, np.sum(inliers - self.mean, keepdims=True) / self.std**2)
+        mean = self.mean + equations.solved().shared[0]
+        return Scale(self.values, float(mean), float(np.sqrt(np.mean((inliers - mean) ** 2))))
+
+    def is_settled(self, before):
+        return abs(self.mean - before.mean) < 1e-12
+
+
+def test_steps_with_changing_weights_end_where_they_settle():
+    rng = np.random.default_rng(7)
+    values = np.concatenate([rng.normal(5.0, 0.2, 200), [50.0, 60.0]])
+    found = gauss_newton(Scale(values, 0.0, 100.0), max_steps=50)
+    assert found.mean == pytest.approx(5.0, abs=0.06)
+    assert found.std == pytest.approx(0.2, rel=0.2)
+    once = gauss_newton(Scale(values, 0.0, 100.0), max_steps=1)
+    assert once.mean == pytest.approx(values.mean())
+
+
+def test_a_step_has_the_shape_of_its_equations():
+    equations, _, _ = coupled_equations(8)
+    step = equations.solved()
+    assert isinstance(step, Step)
+    assert step.shared.shape == (4,)
+    assert step.blocks.shape == (5, 3)
+
+
+@pytest.mark.parametrize("xp", [np, jnp])
+def test_the_backward_step_conditions_on_the_next_frame(xp):
+    """Two frames: the smoothed first frame is the Gaussian given a measurement of the second frame.
+
+    A component without variance, and without a transition into others, stays as it is.
+    """
+    rng = np.random.default_rng(9)
+    n = 4
+    root, noise_root, F = rng.normal(size=(n, n)), rng.normal(size=(n, n)), rng.normal(size=(n, n))
+    P, Q = root @ root.T, noise_root @ noise_root.T
+    for matrix in (P, Q, F):
+        matrix[3], matrix[:, 3] = 0.0, 0.0
+    F[3, 3] = 1.0
+    H, R, z = rng.normal(size=(2, n)), np.eye(2), np.array([1.0, -2.0])
+    predicted = F @ P @ F.T + Q
+    gain = predicted @ H.T @ np.linalg.inv(H @ predicted @ H.T + R)
+    later_mean, later_P = gain @ z, predicted - gain @ H @ predicted
+    H_now = H @ F
+    S = H_now @ P @ H_now.T + H @ Q @ H.T + R
+    gain_now = P @ H_now.T @ np.linalg.inv(S)
+    change, covariance = backward_step(
+        *(xp.asarray(part) for part in (P, F, Q, predicted, later_P, later_mean[:, None]))
+    )
+    # JAX computes in float32 here.
+    tolerance = 1e-10 if xp is np else 1e-3
+    np.testing.assert_allclose(change[:, 0], gain_now @ z, atol=tolerance)
+    np.testing.assert_allclose(covariance, P - gain_now @ H_now @ P, atol=tolerance)
+    np.testing.assert_array_equal(np.asarray(covariance)[3], 0.0)
+    np.testing.assert_array_equal(covariance, np.asarray(covariance).T)
