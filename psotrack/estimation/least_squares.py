@@ -69,11 +69,12 @@ class NormalEquations:
         Raises:
             numpy.linalg.LinAlgError: the equations are singular.
         """
-        if self.block_information is None:
+        if self.block_right is None:
             return Step(np.linalg.solve(self.information, self.right[..., None])[..., 0])
         reduced = self.reduced()
         shared = np.linalg.solve(reduced.information, reduced.right)
-        return Step(shared, reduced.block_step - reduced.gain @ shared)
+        alone = np.matvec(reduced.block_covariance, self.block_right)
+        return Step(shared, alone - reduced.gain @ shared)
 
     def reduced(self) -> ReducedEquations:
         """Eliminate the blocks.
@@ -93,7 +94,6 @@ class NormalEquations:
             information=self.information - (explained + explained.T) / 2,
             right=self.right - flat_gain.T @ self.block_right.ravel(),
             block_covariance=covariance,
-            block_step=np.matvec(covariance, self.block_right),
             gain=gain,
         )
 
@@ -106,14 +106,12 @@ class ReducedEquations:
         information: (n, n), inverse of the covariance of the shared unknowns.
         right: (n,), right-hand side.
         block_covariance: (blocks, m, m), covariance of each block if the shared unknowns were known.
-        block_step: (blocks, m), step of each block if the shared unknowns do not move.
         gain: (blocks, m, n): a step x of the shared unknowns changes the step of each block by -gain @ x.
     """
 
     information: Float[np.ndarray, "n n"]
     right: Float[np.ndarray, " n"]
     block_covariance: Float[np.ndarray, "blocks m m"]
-    block_step: Float[np.ndarray, "blocks m"]
     gain: Float[np.ndarray, "blocks m n"]
 
 
