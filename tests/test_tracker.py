@@ -122,6 +122,7 @@ def test_every_frame_draws_anew(coverage):
     assert len({jax.random.key_data(key).tobytes() for key in (state.key, once.key, twice.key)}) == 3
 
 
+@pytest.mark.slow
 def test_online_is_offline(coverage):
     """`step`, frame by frame as a live source would call it, and `track` yield the same."""
     state, params, program = prepared()

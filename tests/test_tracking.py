@@ -203,12 +203,14 @@ def test_a_recording_may_begin_without_drones(silhouettes):
         assert np.median(error_m) < CELL_M / 2
 
 
+@pytest.mark.slow
 def test_nobody_is_born_beyond_the_number_of_drones(silhouettes):
     tracked, trajectories = track(silhouettes, FIRST, drones=1)
     assert trajectories.num_drones == 1
     assert all(arrival.again for arrival in tracked.arrivals)
 
 
+@pytest.mark.slow
 def test_sizes_may_be_pinned(silhouettes):
     tracked, _ = track(silhouettes, FIRST, drones=1, learn_sizes=False)
     np.testing.assert_allclose(tracked.sizes.size_m, SIZE_M[:1], rtol=1e-6)
