@@ -40,7 +40,7 @@ from scipy.spatial.transform import Rotation
 from psotrack.datasets.dpjait import CALIBRATION, read_sequence, write_calibration
 from psotrack.evaluation import evaluate, plots
 from psotrack.geometry import (
-    CameraRig,
+    Rig,
     make_camera,
     make_extents,
     make_rig,
@@ -189,7 +189,7 @@ T_first_room[:3, :3] = turn.as_matrix()
 T_first_room[:3, 3] = first_middle_m - turn.apply(middle_m)
 
 moved = replace(first_rig.cameras, T_cam_world=first_rig.cameras.T_cam_world @ T_first_room)
-rig = CameraRig(first_rig.names, moved)
+rig = Rig(first_rig.names, moved)
 
 scale = np.linalg.norm(in_first_m - first_middle_m) / np.linalg.norm(marks_m - middle_m)
 left_m = np.linalg.norm(triangulate(rig.cameras, clicked_px) - marks_m, axis=1)
@@ -335,7 +335,7 @@ T_cam_world = rig.cameras.T_cam_world.copy()
 T_turn = np.eye(4)
 T_turn[:3, :3] = Rotation.from_euler("y", TURN_DEG, degrees=True).as_matrix()
 T_cam_world[knocked] = T_turn @ T_cam_world[knocked]
-turned_rig = CameraRig(rig.names, replace(rig.cameras, T_cam_world=T_cam_world))
+turned_rig = Rig(rig.names, replace(rig.cameras, T_cam_world=T_cam_world))
 turned = track_runs(replace(sequence, rig=turned_rig), silhouettes, settings)
 
 frames = range(0, sequence.num_frames, 5)

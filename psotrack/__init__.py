@@ -1,9 +1,35 @@
 """psotrack: 3D positions of several drones, in every frame, from calibrated camera videos alone.
 
-The flow is one way: video -> foreground -> silhouettes -> tracker -> trajectories -> evaluation. Importing the
-package has no effects: no device is chosen, no setting of JAX is touched.
+    import psotrack as pt
+
+    if __name__ == "__main__":  # silhouettes are made by several processes
+        recording = pt.read_recording("data/Simulated_Data/S02_D4_A")
+        tracked = pt.track(recording)
+        print(tracked.trajectories.position_m.shape)  # (frames, drones, 3), metres
+        print(pt.evaluate(tracked.trajectories, recording.truth).mean_error_m)
+
+Recordings and files
+    read_recording, Recording, read_c3d, read_trajectories, write_trajectories, simulate
+Tracking
+    track, track_runs, TrackSettings and its parts (SwarmSettings, ScoreSettings, MotionSettings, DroneSettings,
+    StatusSettings, IdentitySettings), TrackedSequence, Trajectories
+Judging
+    evaluate, Evaluation, find_offset
+Cameras
+    Rig, make_camera, make_rig, read_rig, write_rig, project, triangulate
+Inside-out
+    localise_video, read_marker_map, MarkerMap, detect_markers
+Bring your own
+    Search, SearchRegion, Score, ScoreInputs, Method, MethodInputs, BackgroundModel, Detector, background_model
+
+Names are loaded when they are first used. Importing the package has no effects: no device is chosen and no setting of
+JAX is changed. Every part of the package is a room with its own documentation: `help(psotrack.tracking)`, for example.
 """
 
 from importlib.metadata import version as _version
 
+import lazy_loader
+
 __version__ = _version("psotrack")
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -19,7 +19,7 @@ from psotrack.correspondence import Sightings, from_detections, from_silhouettes
 from psotrack.datasets.dpjait import detection_files, read_detections
 from psotrack.errors import InputError
 from psotrack.fusion import fuse_tracks
-from psotrack.geometry import CameraRig
+from psotrack.geometry import Rig
 from psotrack.initiation import InitialState
 from psotrack.projection_lines import LineSettings, state_at_first_frame, track_detections
 from psotrack.recordings import Sequence as Recording
@@ -83,7 +83,7 @@ class MethodInputs:
         settings: of the run.
     """
 
-    rig: CameraRig
+    rig: Rig
     silhouettes: Silhouettes | None
     sightings: Sightings | None
     initial: InitialState
@@ -162,7 +162,7 @@ def detection_files_of(recording: Recording, source: str) -> Mapping[str, Path]:
 
 
 def track_by_swarm(
-    rig: CameraRig,
+    rig: Rig,
     silhouettes: Silhouettes,
     runs: Sequence[RunInputs],
     fps: float,
@@ -187,7 +187,7 @@ def track_by_swarm(
 
 
 def track_by_projection_lines(
-    rig: CameraRig,
+    rig: Rig,
     detections: DetectionInputs,
     settings: LineSettings,
     *,

@@ -49,7 +49,7 @@ from psotrack.methods import (
 from psotrack.projection_lines import LineSettings
 from psotrack.recordings import Sequence as Recording
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import Silhouettes, compute
+from psotrack.silhouettes import BackgroundModel, Silhouettes, compute
 from psotrack.support import Report, load_plugin, no_progress, plugin_names
 from psotrack.tracking import RunInputs, Score, Search, tracker_settings
 from psotrack.trajectories import DroneSizes, Trajectories
@@ -66,11 +66,13 @@ class Parts:
         search: the search in one frame.
         score: the score of positions in single cameras.
         method: the method of tracking.
+        background: the background model that makes the silhouettes.
     """
 
     search: Search | None = None
     score: Score | None = None
     method: Method | None = None
+    background: BackgroundModel | None = None
 
 
 @dataclass(frozen=True)
@@ -124,7 +126,14 @@ def track_sequence(
     began = time.perf_counter()
     silhouettes = None
     if settings.needs_silhouettes:
-        silhouettes = compute(recording, settings.silhouettes, cache=Path(cache), jobs=jobs, report=report)
+        silhouettes = compute(
+            recording,
+            settings.silhouettes,
+            cache=Path(cache),
+            jobs=jobs,
+            background=parts.background,
+            report=report,
+        )
     (tracked,) = track_runs(recording, silhouettes, [settings], parts=parts, report=report)
     if isinstance(tracked, InputError):
         raise tracked

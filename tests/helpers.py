@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
-from psotrack.geometry import Camera, CameraRig, look_at, make_camera, make_rig, project, undistort
+from psotrack.geometry import Camera, Rig, look_at, make_camera, make_rig, project, undistort
 from psotrack.settings import RENAMED, TrackSettings
 
 #: Lenses as strong as those of action cameras, in OpenCV's order.
@@ -85,12 +85,12 @@ def float32(tree):
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), tree)
 
 
-def moved(rig: CameraRig, R, shift_m) -> CameraRig:
+def moved(rig: Rig, R, shift_m) -> Rig:
     """The rig after the whole world was turned by R and then shifted."""
     T_old_new = np.eye(4)
     T_old_new[:3, :3], T_old_new[:3, 3] = R.T, -R.T @ np.asarray(shift_m)
     cams = rig.cameras
-    return CameraRig(rig.names, Camera(cams.T_cam_world @ T_old_new, cams.K, cams.dist, cams.image_size_wh))
+    return Rig(rig.names, Camera(cams.T_cam_world @ T_old_new, cams.K, cams.dist, cams.image_size_wh))
 
 
 def assert_same(actual, desired, atol=0.0):
@@ -107,7 +107,7 @@ def sphere_points(count):
     return np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=-1)
 
 
-def draw_coverage(rig: CameraRig, position_m, size_m, reduction):
+def draw_coverage(rig: Rig, position_m, size_m, reduction):
     """(cameras, height, width) uint8 coverage of ellipsoids, by casting a ray through the centre of every pixel.
 
     Independent of `boxes`: a pixel is foreground where its ray meets an ellipsoid.

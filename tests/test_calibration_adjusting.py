@@ -10,7 +10,7 @@ from scipy.stats import binom, chi2
 
 from psotrack.calibration import CommonErrors, adjust, find_drones_in_boxes, find_wrong_cameras, improve
 from psotrack.errors import SettingsError
-from psotrack.geometry import CameraRig, project
+from psotrack.geometry import Rig, project
 from psotrack.recordings import Detections
 from psotrack.trajectories import Trajectories
 
@@ -34,7 +34,7 @@ def posed(indices, rng, *, turn_deg=0.0, shift_m=0.0):
         T[index, :3, :3] = Rotation.from_rotvec(turn).as_matrix() @ T[index, :3, :3]
         centre = RIG.cameras.centre_world[index] + shift_m * shift / np.linalg.norm(shift)
         T[index, :3, 3] = -T[index, :3, :3] @ centre
-    return CameraRig(RIG.names, replace(RIG.cameras, T_cam_world=T))
+    return Rig(RIG.names, replace(RIG.cameras, T_cam_world=T))
 
 
 def test_lasting_errors_are_in_the_covariance():
@@ -107,7 +107,7 @@ def test_focal_lengths_that_are_off_are_scaled_and_nothing_else():
     pixels, common_errors = seen(np.random.default_rng(5))
     K = RIG.cameras.K.copy()
     K[:, :2, :2] *= 1.02
-    rig = CameraRig(RIG.names, replace(RIG.cameras, K=K))
+    rig = Rig(RIG.names, replace(RIG.cameras, K=K))
     improved = improve(rig, pixels, common_errors=[common_errors], refine_focal_length=True)
     assert (improved.moved, improved.rescaled) == ((), True)
     final = improved.final
@@ -120,7 +120,7 @@ def test_a_camera_with_another_lens_is_not_taken_for_one_that_was_moved():
     pixels, common_errors = seen(np.random.default_rng(8))
     K = RIG.cameras.K.copy()
     K[1, :2, :2] *= 1.02
-    rig = CameraRig(RIG.names, replace(RIG.cameras, K=K))
+    rig = Rig(RIG.names, replace(RIG.cameras, K=K))
     improved = improve(rig, pixels, common_errors=[common_errors])
     assert (improved.moved, list(improved.zoomed)) == (("c1",), ["c1"])
     scale, std = improved.zoomed["c1"]

@@ -10,17 +10,17 @@ from scipy.stats import binom, chi2
 
 from psotrack.calibration import CommonErrors, adjust
 from psotrack.errors import InputError, SettingsError
-from psotrack.geometry import CameraRig, project
+from psotrack.geometry import Rig, project
 
 
-def jittered(rig: CameraRig, rng, *, turn_deg=0.6, shift_m=0.03, skip=()) -> CameraRig:
+def jittered(rig: Rig, rng, *, turn_deg=0.6, shift_m=0.03, skip=()) -> Rig:
     T = rig.cameras.T_cam_world.copy()
     for index, name in enumerate(rig.names):
         if name not in skip:
             R = Rotation.from_rotvec(rng.normal(0, np.deg2rad(turn_deg), 3)).as_matrix() @ T[index, :3, :3]
             T[index, :3, :3] = R
             T[index, :3, 3] = -R @ (rig.cameras.centre_world[index] + rng.normal(0, shift_m, 3))
-    return CameraRig(rig.names, replace(rig.cameras, T_cam_world=T))
+    return Rig(rig.names, replace(rig.cameras, T_cam_world=T))
 
 
 def flown(rig, rng, count, *, noise_px=1.0, unseen=0.2):
@@ -133,7 +133,7 @@ def test_a_common_focal_length_is_found():
     wide = jittered(rig, rng)
     wrong_K = wide.cameras.K.copy()
     wrong_K[:, :2, :2] *= 1.02
-    adjusted = adjust(CameraRig(rig.names, replace(wide.cameras, K=wrong_K)), pixels, rescaled=rig.names)
+    adjusted = adjust(Rig(rig.names, replace(wide.cameras, K=wrong_K)), pixels, rescaled=rig.names)
     # Limit: four standard deviations.
     assert abs(adjusted.focal_scale - 1 / 1.02) < 4 * adjusted.focal_scale_std
     assert adjusted.focal_scale_std < 0.002

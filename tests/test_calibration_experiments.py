@@ -11,7 +11,7 @@ import pandas as pd
 from helpers import moved, ring_rig
 from scipy.spatial.transform import Rotation
 
-from psotrack.geometry import CameraRig
+from psotrack.geometry import Rig
 
 FOLDER = Path(__file__).parents[1] / "experiments" / "calibration"
 
@@ -41,7 +41,7 @@ def test_errors_of_a_rig_that_is_held_as_a_whole():
     assert np.linalg.norm(off_m, axis=1).min() > 1e-3
     T = rig.cameras.T_cam_world.copy()
     T[2, 0, 3] += 0.05
-    pushed = CameraRig(rig.names, replace(rig.cameras, T_cam_world=T))
+    pushed = Rig(rig.names, replace(rig.cameras, T_cam_world=T))
     off_m, _ = errors(rig, pushed, pushed, whole=False)
     np.testing.assert_allclose(np.linalg.norm(off_m, axis=1), [0, 0, 0.05, 0, 0], atol=1e-12)
     np.testing.assert_allclose(errors(rig, pushed, rig, whole=False)[0], 0, atol=1e-12)

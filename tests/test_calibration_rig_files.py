@@ -6,7 +6,7 @@ import pytest
 from helpers import LENSES, assert_same, ring_rig
 
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.geometry import CameraRig, make_rig, project, read_lenses, read_rig, write_rig
+from psotrack.geometry import Rig, make_rig, project, read_lenses, read_rig, write_rig
 
 #: As anipose 1.1 writes: tables cam_0 ..., lengths in the board's unit.
 ANIPOSE = """[cam_0]
@@ -77,7 +77,7 @@ distortion_coefficients: !!opencv-matrix
 
 
 def named(rig, *names):
-    return CameraRig((*names, *rig.names[len(names) :]), rig.cameras)
+    return Rig((*names, *rig.names[len(names) :]), rig.cameras)
 
 
 @pytest.mark.parametrize("coefficients", sorted(LENSES))

@@ -15,7 +15,7 @@ from psotrack.cli.calibrate import calibrate
 from psotrack.datasets.dpjait import read_sequence, write_calibration, write_detections, write_marker_corners
 from psotrack.errors import PsotrackError
 from psotrack.geometry import (
-    CameraRig,
+    Rig,
     look_at,
     make_camera,
     make_rig,
@@ -323,7 +323,7 @@ def flight(folder, rig, wrong):
 def square_pixels(rig):
     K = rig.cameras.K.copy()
     K[:, 1, 1] = K[:, 0, 0]
-    return CameraRig(rig.names, replace(rig.cameras, K=K))
+    return Rig(rig.names, replace(rig.cameras, K=K))
 
 
 def test_a_rig_is_adjusted_to_its_drones(tmp_path):
@@ -332,7 +332,7 @@ def test_a_rig_is_adjusted_to_its_drones(tmp_path):
     # One camera was pushed: by 1 degree about its own centre, and by 3 cm.
     R = Rotation.from_rotvec([0.01, -0.012, 0.006]).as_matrix() @ T[2, :3, :3]
     T[2, :3, :3], T[2, :3, 3] = R, -R @ (centres(rig)[2] + (0.02, -0.02, 0.01))
-    wrong = CameraRig(rig.names, replace(rig.cameras, T_cam_world=T))
+    wrong = Rig(rig.names, replace(rig.cameras, T_cam_world=T))
     tracks = flight(tmp_path / "SEQ", rig, wrong)
     fixed = ("--fixed", "c0,c1,c3,c4", "--noise", "0.5")
     out = tmp_path / "better.csv"

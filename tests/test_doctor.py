@@ -16,7 +16,7 @@ from psotrack.cli.doctor import doctor
 from psotrack.correspondence import from_detections
 from psotrack.datasets.dpjait import write_calibration, write_detections, write_poses
 from psotrack.doctor import Agreement, examine, sampled_frames
-from psotrack.geometry import CameraRig, project
+from psotrack.geometry import Rig, project
 from psotrack.recordings import Detections
 from psotrack.trajectories import Trajectories
 
@@ -99,7 +99,7 @@ def only_finding(*args, **kwargs):
 def posed(R, t_m, rig=RIG):
     T = rig.cameras.T_cam_world.copy()
     T[:, :3, :3], T[:, :3, 3] = R, t_m
-    return CameraRig(rig.names, replace(rig.cameras, T_cam_world=T))
+    return Rig(rig.names, replace(rig.cameras, T_cam_world=T))
 
 
 def with_one(index, turn=(0.0, 0.0, 0.0), shift_m=(0.0, 0.0, 0.0)):
@@ -113,7 +113,7 @@ def with_one(index, turn=(0.0, 0.0, 0.0), shift_m=(0.0, 0.0, 0.0)):
 def with_intrinsics(index, factor, rows=2):
     K = RIG.cameras.K.copy()
     K[index, :2, :rows] *= factor
-    return CameraRig(RIG.names, replace(RIG.cameras, K=K))
+    return Rig(RIG.names, replace(RIG.cameras, K=K))
 
 
 R, T_M = RIG.cameras.T_cam_world[:, :3, :3], RIG.cameras.T_cam_world[:, :3, 3]
@@ -291,7 +291,7 @@ def test_the_command(tmp_path):
     small = ring_rig(4)
     K = small.cameras.K.copy()
     K[:, 1, 1] = K[:, 0, 0]
-    small = CameraRig(small.names, replace(small.cameras, K=K))
+    small = Rig(small.names, replace(small.cameras, K=K))
     seen = seen_by(small, TRUTH_M)
     folder = write_sequence(tmp_path / "sound", small, seen, TRUTH_M)
     result = CliRunner(env={"COLUMNS": "200"}).invoke(doctor, [str(folder)], catch_exceptions=False)

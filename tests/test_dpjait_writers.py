@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.datasets import dpjait
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.geometry import CameraRig, make_camera, make_rig, project
+from psotrack.geometry import Rig, make_camera, make_rig, project
 
 finite = st.floats(-50, 50)
 triples = st.tuples(finite, finite, finite)
@@ -25,7 +25,7 @@ rotations = st.one_of(
 SIZE_WH = (1920, 1080)
 
 
-def rig_of(poses, dist=(), focal_length_px=1156.3) -> CameraRig:
+def rig_of(poses, dist=(), focal_length_px=1156.3) -> Rig:
     cameras = {}
     for index, (rotation, t_m) in enumerate(poses):
         f = focal_length_px + 10 * index
@@ -39,7 +39,7 @@ def rig_of(poses, dist=(), focal_length_px=1156.3) -> CameraRig:
     return make_rig(cameras)
 
 
-def read_back(path: Path, rig: CameraRig) -> CameraRig:
+def read_back(path: Path, rig: Rig) -> Rig:
     return dpjait.read_calibration(path, dict.fromkeys(rig.names, SIZE_WH))
 
 

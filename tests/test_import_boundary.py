@@ -49,6 +49,7 @@ ROOMS = [
     "inside_out",
     "methods",
     "pipeline",
+    "api",
     "evaluation",
     "simulation",
     "demo",
@@ -104,7 +105,7 @@ CORE = {
     "tracking.vertex",
     "trajectories.trajectories",
 }
-CORE_MAY_USE = {"jax", "jaxtyping", "lazy_loader", "numpy", "optax"}
+CORE_MAY_USE = {"jax", "jaxtyping", "lazy_loader", "numpy"}
 
 #: Module or room -> modules and rooms that it must not import, although the order of rooms allows it.
 STRANGERS = {

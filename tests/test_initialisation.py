@@ -9,7 +9,7 @@ from helpers import ROOM_M, draw_coverage, ring_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from psotrack.geometry import CameraRig, project
+from psotrack.geometry import Rig, project
 from psotrack.initiation.initialisation import choose_paths, find_drones, with_usual_size
 from psotrack.initiation.paths import propose_paths
 from psotrack.silhouettes import find_blobs, stack_blobs
@@ -228,7 +228,7 @@ def test_a_view_that_shows_nothing_speaks_against_two_that_agree():
     assert len(found_in(coverage, rig).position_m) == 0
     away = rig.cameras.T_cam_world.copy()
     away[2, :3] = np.diag([-1.0, 1.0, -1.0]) @ away[2, :3]
-    elsewhere = CameraRig(rig.names, replace(rig.cameras, T_cam_world=away))
+    elsewhere = Rig(rig.names, replace(rig.cameras, T_cam_world=away))
     assert len(found_in(coverage, elsewhere).position_m) == 1
 
 

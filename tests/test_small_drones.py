@@ -8,7 +8,7 @@ from helpers import ROOM_M, draw_coverage, ring_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from psotrack.geometry import CameraRig
+from psotrack.geometry import Rig
 from psotrack.initiation import find_candidates
 from psotrack.initiation.initialisation import find_drones
 from psotrack.silhouettes import find_blobs, stack_blobs
@@ -35,12 +35,12 @@ def both():
     return drawn(ONE, OTHER)
 
 
-def magnified(rig: CameraRig, times: int) -> CameraRig:
+def magnified(rig: Rig, times: int) -> Rig:
     """Cameras with so many times as many pixels along each side."""
     K = rig.cameras.K * np.array([[times], [times], [1]])
     # The corner of the image stays at half a pixel before the middle of the first one.
     K[:, :2, 2] += (times - 1) / 2
-    return CameraRig(
+    return Rig(
         rig.names, replace(rig.cameras, K=K, image_size_wh=times * np.asarray(rig.cameras.image_size_wh))
     )
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from psotrack.geometry import (
-    CameraRig,
+    Rig,
     match_views,
     project,
     triangulate,
@@ -84,7 +84,7 @@ def test_the_pseudoinverse_of_the_paper():
     rig, points = ring_rig(5), points_in_room(11)
     one = np.broadcast_to(rig.cameras.K[0], (5, 3, 3)).copy()
     one[:, 1, 1] = one[:, 0, 0]
-    rig = CameraRig(rig.names, replace(rig.cameras, K=one))
+    rig = Rig(rig.names, replace(rig.cameras, K=one))
     pixels = pixels_of(rig, points) + np.random.default_rng(4).normal(0, 1.0, (11, 5, 2))
     P = one @ rig.cameras.T_cam_world[:, :3]
     for n in range(11):

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from _numpy_fitness import NumpyFitness
 
-from psotrack.geometry import CameraRig
+from psotrack.geometry import Rig
 from psotrack.initiation import InitialState
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import summed_area_table
@@ -33,7 +33,7 @@ POSITION_GAIN, VELOCITY_GAIN = 0.8, 0.3
 class Problem:
     """What is tracked, and how."""
 
-    rig: CameraRig
+    rig: Rig
     reduction: int
     start: InitialState
     settings: TrackSettings

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from psotrack.geometry import Camera, CameraRig, look_at, make_camera, make_rig, project
+from psotrack.geometry import Camera, Rig, look_at, make_camera, make_rig, project
 
 IMAGE_SIZE_WH = (1920, 1080)
 REDUCTION = 4
@@ -41,7 +41,7 @@ class Scene:
         size_m: (drones, 3).
     """
 
-    rig: CameraRig
+    rig: Rig
     position_m: np.ndarray
     velocity_m_s: np.ndarray
     size_m: np.ndarray

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.correspondence import Matches, match
-from psotrack.geometry import CameraRig, look_at, make_camera, make_rig, project
+from psotrack.geometry import Rig, look_at, make_camera, make_rig, project
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results
@@ -85,14 +85,14 @@ def main(
 
 
 def _timed(
-    rig: CameraRig, points: list[Float[np.ndarray, "_ 2"]], noise: list[Float[np.ndarray, "_"]]
+    rig: Rig, points: list[Float[np.ndarray, "_ 2"]], noise: list[Float[np.ndarray, "_"]]
 ) -> tuple[float, Matches]:
     start = time.perf_counter()
     matches = match(rig.cameras, points, noise, bounds_m=_BOUNDS_M)
     return time.perf_counter() - start, matches
 
 
-def _rig(count: int) -> CameraRig:
+def _rig(count: int) -> Rig:
     """Cameras on an ellipse through the corners of the room, each a little higher than the last."""
     cameras = {}
     for i in range(count):
@@ -115,7 +115,7 @@ def _apart(count: int, rng: np.random.Generator) -> Float[np.ndarray, "drones 3"
 
 
 def _detections(
-    rig: CameraRig,
+    rig: Rig,
     drones: Float[np.ndarray, "drones 3"],
     count: int,
     noise_px: float,

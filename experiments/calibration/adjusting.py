@@ -26,7 +26,7 @@ from scipy.stats import chi2
 from psotrack.calibration import centre_by_pose, find_drones_in_boxes, improve
 from psotrack.calibration.gauge import common_motions, pose_change_metric, pose_changes
 from psotrack.datasets.dpjait import read_detections, read_sequence
-from psotrack.geometry import CameraRig
+from psotrack.geometry import Rig
 from psotrack.methods import detection_files_of
 from psotrack.settings import YOLO
 
@@ -37,34 +37,34 @@ HERE = Path(__file__).parent
 #: The camera that is tampered with.
 ONE = 2
 
-Fault = Callable[[CameraRig, np.random.Generator], CameraRig]
+Fault = Callable[[Rig, np.random.Generator], Rig]
 
 
-def sound(rig: CameraRig, rng: np.random.Generator) -> CameraRig:
+def sound(rig: Rig, rng: np.random.Generator) -> Rig:
     """Nothing wrong."""
     return rig
 
 
-def jittered(rig: CameraRig, rng: np.random.Generator) -> CameraRig:
+def jittered(rig: Rig, rng: np.random.Generator) -> Rig:
     """Every camera turned about its own centre, by 0.2 degrees about each axis."""
     T = rig.cameras.T_cam_world.copy()
     turns = Rotation.from_rotvec(rng.normal(0, 0.2, (len(rig), 3)), degrees=True).as_matrix()
     T[:, :3] = turns @ T[:, :3]
-    return CameraRig(rig.names, replace(rig.cameras, T_cam_world=T))
+    return Rig(rig.names, replace(rig.cameras, T_cam_world=T))
 
 
-def moved(rig: CameraRig, rng: np.random.Generator) -> CameraRig:
+def moved(rig: Rig, rng: np.random.Generator) -> Rig:
     """One camera moved by 5 cm."""
     T, shift = rig.cameras.T_cam_world.copy(), rng.normal(size=3)
     T[ONE, :3, 3] += 0.05 * shift / np.linalg.norm(shift)
-    return CameraRig(rig.names, replace(rig.cameras, T_cam_world=T))
+    return Rig(rig.names, replace(rig.cameras, T_cam_world=T))
 
 
-def longer(rig: CameraRig, rng: np.random.Generator) -> CameraRig:
+def longer(rig: Rig, rng: np.random.Generator) -> Rig:
     """The focal length of one camera 2 % too long."""
     K = rig.cameras.K.copy()
     K[ONE, :2, :2] *= 1.02
-    return CameraRig(rig.names, replace(rig.cameras, K=K))
+    return Rig(rig.names, replace(rig.cameras, K=K))
 
 
 #: And the cameras that have it.
@@ -133,7 +133,7 @@ def of_sequence(folder: Path) -> pd.DataFrame:
 
 
 def errors(
-    truth: CameraRig, given: CameraRig, now: CameraRig, *, whole: bool
+    truth: Rig, given: Rig, now: Rig, *, whole: bool
 ) -> tuple[Float[np.ndarray, "cameras 3"], Float[np.ndarray, "cameras 3"]]:
     """How far centres, metres, and axes, degrees, are off the truth; if `whole`, off that moved as near as can be."""
     T = np.asarray(given.cameras.T_cam_world)

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from psotrack.correspondence import from_detections
 from psotrack.datasets.dpjait import read_detections, read_sequence
 from psotrack.doctor import Diagnosis, examine
-from psotrack.geometry import CameraRig
+from psotrack.geometry import Rig
 from psotrack.methods import detection_files_of
 from psotrack.recordings import Detections
 from psotrack.settings import YOLO
@@ -40,13 +40,13 @@ SHOWN = ("nothing", "a camera turned by 1 degree", "a camera moved by 0.2 m", "a
 MOST_PX = 30
 
 Boxes = Mapping[str, Detections]
-Fault = Callable[[CameraRig, Boxes], tuple[CameraRig, Boxes]]
+Fault = Callable[[Rig, Boxes], tuple[Rig, Boxes]]
 
 
 def turned(degrees: float) -> Fault:
     """One camera turned about its upright axis."""
 
-    def fault(rig: CameraRig, boxes: Boxes) -> tuple[CameraRig, Boxes]:
+    def fault(rig: Rig, boxes: Boxes) -> tuple[Rig, Boxes]:
         R, centre = rig.cameras.T_cam_world[:, :3, :3].copy(), rig.cameras.centre_world
         R[ONE] = Rotation.from_rotvec([0.0, degrees, 0.0], degrees=True).as_matrix() @ R[ONE]
         return _posed(rig, R, -np.matvec(R, centre)), boxes
@@ -57,7 +57,7 @@ def turned(degrees: float) -> Fault:
 def moved(shift_m: float) -> Fault:
     """One camera moved sideways."""
 
-    def fault(rig: CameraRig, boxes: Boxes) -> tuple[CameraRig, Boxes]:
+    def fault(rig: Rig, boxes: Boxes) -> tuple[Rig, Boxes]:
         t_m = rig.cameras.T_cam_world[:, :3, 3].copy()
         t_m[ONE, 0] += shift_m
         return _posed(rig, rig.cameras.T_cam_world[:, :3, :3], t_m), boxes
@@ -68,7 +68,7 @@ def moved(shift_m: float) -> Fault:
 def late(frames: int) -> Fault:
     """One camera's video begins some frames late."""
 
-    def fault(rig: CameraRig, boxes: Boxes) -> tuple[CameraRig, Boxes]:
+    def fault(rig: Rig, boxes: Boxes) -> tuple[Rig, Boxes]:
         name = rig.names[ONE]
         seen, there = boxes[name], boxes[name].frame >= frames
         shifted = Detections(seen.frame[there] - frames, seen.xyxy[there], seen.confidence[there])
@@ -77,24 +77,24 @@ def late(frames: int) -> Fault:
     return fault
 
 
-def centres(rig: CameraRig, boxes: Boxes) -> tuple[CameraRig, Boxes]:
+def centres(rig: Rig, boxes: Boxes) -> tuple[Rig, Boxes]:
     """Centres written where translations belong."""
     return _posed(rig, rig.cameras.T_cam_world[:, :3, :3], rig.cameras.centre_world), boxes
 
 
-def millimetres(rig: CameraRig, boxes: Boxes) -> tuple[CameraRig, Boxes]:
+def millimetres(rig: Rig, boxes: Boxes) -> tuple[Rig, Boxes]:
     """Millimetres read as metres."""
     T = rig.cameras.T_cam_world
     return _posed(rig, T[:, :3, :3], 1e3 * T[:, :3, 3]), boxes
 
 
-def opengl(rig: CameraRig, boxes: Boxes) -> tuple[CameraRig, Boxes]:
+def opengl(rig: Rig, boxes: Boxes) -> tuple[Rig, Boxes]:
     """Camera axes as OpenGL has them."""
     flip, T = np.array([1.0, -1.0, -1.0]), rig.cameras.T_cam_world
     return _posed(rig, flip[:, None] * T[:, :3, :3], flip * T[:, :3, 3]), boxes
 
 
-def exchanged(rig: CameraRig, boxes: Boxes) -> tuple[CameraRig, Boxes]:
+def exchanged(rig: Rig, boxes: Boxes) -> tuple[Rig, Boxes]:
     """The videos of two cameras under each other's name."""
     one, other = rig.names[ONE], rig.names[OTHER]
     return rig, {**boxes, one: boxes[other], other: boxes[one]}
@@ -103,10 +103,10 @@ def exchanged(rig: CameraRig, boxes: Boxes) -> tuple[CameraRig, Boxes]:
 def longer(share: float, of: int | slice) -> Fault:
     """Focal lengths too long by a share."""
 
-    def fault(rig: CameraRig, boxes: Boxes) -> tuple[CameraRig, Boxes]:
+    def fault(rig: Rig, boxes: Boxes) -> tuple[Rig, Boxes]:
         K = rig.cameras.K.copy()
         K[of, :2, :2] *= 1 + share
-        return CameraRig(rig.names, replace(rig.cameras, K=K)), boxes
+        return Rig(rig.names, replace(rig.cameras, K=K)), boxes
 
     return fault
 
@@ -174,10 +174,10 @@ def draw(figure: Figure, said: Mapping[str, Diagnosis], names: tuple[str, ...]) 
     bar.set_label("median distance from the other's\nepipolar lines (px)", fontsize=9)
 
 
-def _posed(rig: CameraRig, R: np.ndarray, t_m: np.ndarray) -> CameraRig:
+def _posed(rig: Rig, R: np.ndarray, t_m: np.ndarray) -> Rig:
     T = rig.cameras.T_cam_world.copy()
     T[:, :3, :3], T[:, :3, 3] = R, t_m
-    return CameraRig(rig.names, replace(rig.cameras, T_cam_world=T))
+    return Rig(rig.names, replace(rig.cameras, T_cam_world=T))
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from psotrack.calibration.derivatives import centre_by_pose
 from psotrack.calibration.gauge import common_motions, pose_change_metric
 from psotrack.calibration.residuals import GATE, inflation, spread_px
 from psotrack.errors import InputError, SettingsError, check_positive
-from psotrack.geometry import NEAR_M, Camera, CameraRig, to_camera, triangulate
+from psotrack.geometry import NEAR_M, Camera, Rig, to_camera, triangulate
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class AdjustedRig:
         focal_scale_std: standard deviation of the factor; 0 where the focal lengths are fixed.
     """
 
-    rig: CameraRig
+    rig: Rig
     points_m: Float[np.ndarray, "points 3"]
     residual_px: Float[np.ndarray, "points cameras"]
     used: Bool[np.ndarray, "points cameras"]
@@ -54,7 +54,7 @@ class AdjustedRig:
 
 
 def adjust(
-    rig: CameraRig,
+    rig: Rig,
     points_px: Float[np.ndarray, "points cameras 2"],
     noise_px: float | Float[np.ndarray, "points cameras"] = 1.0,
     *,
@@ -118,7 +118,7 @@ def adjust(
 
 
 def _check_seen(
-    rig: CameraRig, placed: Bool[np.ndarray, "points cameras"], fixed: Ordered[str], rescaled: Ordered[str]
+    rig: Rig, placed: Bool[np.ndarray, "points cameras"], fixed: Ordered[str], rescaled: Ordered[str]
 ) -> None:
     """Check that every camera that may move sees enough points."""
     for name, count in zip(rig.names, placed.sum(axis=0).tolist(), strict=True):
@@ -141,7 +141,7 @@ def _check_seen(
 
 
 def _unknowns(
-    rig: CameraRig, fixed: Ordered[str], rescaled: bool
+    rig: Rig, fixed: Ordered[str], rescaled: bool
 ) -> tuple[Float[np.ndarray, "unknowns free"], Float[np.ndarray, "unknowns motions"]]:
     """Select the free unknowns, and the common motions that fixed cameras leave free.
 
@@ -161,7 +161,7 @@ def _unknowns(
 
 
 def _adjusted(
-    rig: CameraRig,
+    rig: Rig,
     bundle: Bundle,
     rows: Int[np.ndarray, " rows"],
     num_points: int,
@@ -199,9 +199,7 @@ def _adjusted(
     all_used = np.zeros((num_points, len(rig)), bool)
     all_used[rows] = used
     return AdjustedRig(
-        CameraRig(
-            rig.names, replace(scale_focal_lengths(rig.cameras, factor), T_cam_world=state.T_cam_world)
-        ),
+        Rig(rig.names, replace(scale_focal_lengths(rig.cameras, factor), T_cam_world=state.T_cam_world)),
         points_m,
         all_residual_px,
         all_used,

@@ -18,7 +18,7 @@ from psotrack.calibration.common_errors import CommonErrors
 from psotrack.correspondence import BORDER_PX, NOISE_PX, NOISE_SHARE
 from psotrack.detection import marker_dictionary
 from psotrack.errors import InputError
-from psotrack.geometry import CameraRig, project
+from psotrack.geometry import Rig, project
 from psotrack.recordings import Detections, VideoInfo, read_frames
 from psotrack.support import Column, Table, TextRow, read_rows
 from psotrack.trajectories import Trajectories
@@ -146,7 +146,7 @@ def find_markers(
 
 
 def find_drones_in_boxes(
-    rig: CameraRig, detections: Mapping[str, Detections], tracks: Trajectories, most_frames: int = 500
+    rig: Rig, detections: Mapping[str, Detections], tracks: Trajectories, most_frames: int = 500
 ) -> DroneViews:
     """Find tracked drones in the images: the middle of the box that contains a drone's projection.
 
@@ -201,7 +201,7 @@ def _clear(
 
 
 def _make_common_errors(
-    rig: CameraRig,
+    rig: Rig,
     points_px: Float[np.ndarray, "points cameras 2"],
     side_px: Float[np.ndarray, "points cameras"],
     drone: Int[np.ndarray, " points"],

@@ -20,7 +20,7 @@ from psotrack.calibration.bundle import AdjustedRig, adjust
 from psotrack.calibration.common_errors import CommonErrors
 from psotrack.calibration.gauge import common_motions, pose_change_metric, pose_changes
 from psotrack.errors import InputError
-from psotrack.geometry import CameraRig
+from psotrack.geometry import Rig
 
 #: Largest probability that a camera of a correct rig is called wrong.
 FALSE_ALARM = 0.01
@@ -47,7 +47,7 @@ class Improved:
             cameras from `final`, for others from `everything`.
     """
 
-    rig: CameraRig
+    rig: Rig
     moved: tuple[str, ...]
     zoomed: dict[str, tuple[float, float]]
     rescaled: bool
@@ -57,7 +57,7 @@ class Improved:
 
 
 def improve(
-    rig: CameraRig,
+    rig: Rig,
     points_px: Float[np.ndarray, "points cameras 2"],
     noise_px: float | Float[np.ndarray, "points cameras"] = 1.0,
     *,
@@ -102,7 +102,7 @@ def _surprise(adjusted: AdjustedRig) -> float:
 
 
 def _zoomed(
-    rig: CameraRig,
+    rig: Rig,
     points_px: Float[np.ndarray, "points cameras 2"],
     noise_px: float | Float[np.ndarray, "points cameras"],
     common_errors: Ordered[CommonErrors],
@@ -130,7 +130,7 @@ def _zoomed(
     return found
 
 
-def find_wrong_cameras(rig: CameraRig, adjusted: AdjustedRig, fixed: Ordered[str] = ()) -> tuple[str, ...]:
+def find_wrong_cameras(rig: Rig, adjusted: AdjustedRig, fixed: Ordered[str] = ()) -> tuple[str, ...]:
     """Names of the cameras that are wrong by more than the covariance explains.
 
     If more than `MOST_OFF` of the cameras are wrong, all cameras that are not fixed are returned.
@@ -161,7 +161,7 @@ def find_wrong_cameras(rig: CameraRig, adjusted: AdjustedRig, fixed: Ordered[str
 
 
 def _information(
-    rig: CameraRig, adjusted: AdjustedRig, fixed: Ordered[str]
+    rig: Rig, adjusted: AdjustedRig, fixed: Ordered[str]
 ) -> tuple[Float[np.ndarray, "unknowns unknowns"], Float[np.ndarray, " unknowns"]]:
     """Λ of the cameras that may move, which does not depend on common motions, and b = Λ x."""
     given = np.asarray(rig.cameras.T_cam_world)

@@ -14,7 +14,7 @@ from psotrack.cli.output import finite_or_none, output_json, print_line, report_
 
 if TYPE_CHECKING:
     from psotrack.doctor import Diagnosis
-    from psotrack.geometry import CameraRig
+    from psotrack.geometry import Rig
 
 #: Exit code if something was found.
 FOUND = 2
@@ -86,7 +86,7 @@ def doctor(
     print_line(quiet, json_path, f"{recording.name}: nothing disagrees")
 
 
-def _rows(rig: CameraRig, diagnosis: Diagnosis) -> list[dict[str, Any]]:
+def _rows(rig: Rig, diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Measurements of each camera, one row per camera."""
     found = diagnosis.found
     rows = []
@@ -107,7 +107,7 @@ def _rows(rig: CameraRig, diagnosis: Diagnosis) -> list[dict[str, Any]]:
     return rows
 
 
-def _content(rig: CameraRig, diagnosis: Diagnosis) -> dict[str, Any]:
+def _content(rig: Rig, diagnosis: Diagnosis) -> dict[str, Any]:
     """The diagnosis as JSON, with null for missing numbers."""
     fit = diagnosis.reference
     return {
@@ -120,7 +120,7 @@ def _content(rig: CameraRig, diagnosis: Diagnosis) -> dict[str, Any]:
     }
 
 
-def _print(rig: CameraRig, diagnosis: Diagnosis) -> None:
+def _print(rig: Rig, diagnosis: Diagnosis) -> None:
     from rich import box
     from rich.console import Console
     from rich.table import Table

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 from psotrack.clocks.correlated_errors import autocorrelation, widening
 from psotrack.errors import SettingsError, check_positive
 from psotrack.estimation import NormalEquations, cauchy_weight, gauss_newton
-from psotrack.geometry import MAX_CONDITION, NEAR_M, Camera, CameraRig, project_with_jacobian, triangulate
+from psotrack.geometry import MAX_CONDITION, NEAR_M, Camera, Rig, project_with_jacobian, triangulate
 
 #: Number of rounds without a step until the weights have settled, and largest number of steps.
 _WEIGHT_ROUNDS, _MAX_STEPS = 5, 35
@@ -62,7 +62,7 @@ class CameraOffsets:
 
 
 def camera_offsets(
-    rig: CameraRig,
+    rig: Rig,
     points_px: Float[np.ndarray, "frames drones cameras 2"],
     fps: float,
     *,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.geometry import CameraRig
+from psotrack.geometry import Rig
 from psotrack.recordings import Detections
 from psotrack.silhouettes import Silhouettes, find_blobs
 from psotrack.support import Report, no_progress
@@ -90,7 +90,7 @@ class Sightings:
         return CameraSightings(self.centre_px[frame], self.size_px[frame], self.noise_px[frame])
 
 
-def from_detections(detections: Mapping[str, Detections], rig: CameraRig, num_frames: int) -> Sightings:
+def from_detections(detections: Mapping[str, Detections], rig: Rig, num_frames: int) -> Sightings:
     """Make sightings from the boxes of a detector.
 
     Args:

@@ -1,11 +1,12 @@
 from .aruco import marker_dictionary
-from .detector import DetectorSettings, OnnxDetector, detect_drones
+from .detector import Detector, DetectorSettings, OnnxDetector, detect_drones
 from .labels import LabelSettings
 from .store import stored_detections
 from .training_data import DATA_SET, write_data_set
 
 __all__ = [
     "DATA_SET",
+    "Detector",
     "DetectorSettings",
     "LabelSettings",
     "OnnxDetector",

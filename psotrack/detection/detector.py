@@ -13,17 +13,19 @@ All boxes are in pixels of the input. Objects of all classes count as drones: us
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
 
 import cv2
+import msgspec
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.recordings import Detections, VideoInfo, read_frames
-from psotrack.support import Report, no_progress
+from psotrack.support import Report, digest_file, no_progress
 
 #: Colour of YOLO's own letterbox borders.
 _GREY = (114, 114, 114)
@@ -57,6 +59,24 @@ class DetectorSettings:
             raise SettingsError("size", expected="1 pixel or more", found=f"{self.size}")
 
 
+@runtime_checkable
+class Detector(Protocol):
+    """Finds drones in images.
+
+    Attributes:
+        key: everything on which the detections depend, as plain data fit for JSON. Detections are stored under it.
+    """
+
+    @property
+    def key(self) -> Mapping[str, Any]: ...  # noqa: D102
+
+    def boxes(
+        self, bgr: UInt8[np.ndarray, "height width 3"]
+    ) -> tuple[Float[np.ndarray, "found 4"], Float[np.ndarray, "found"]]:
+        """Boxes (xyxy in pixels, see `psotrack.geometry.boxes`) and confidences in [0, 1] of the drones in an image."""
+        ...
+
+
 class OnnxDetector:
     """A network that finds drones in images.
 
@@ -76,6 +96,11 @@ class OnnxDetector:
         self.settings = settings
         with self._opencv_errors("an ONNX model that OpenCV can read"):
             self._network = cv2.dnn.readNetFromONNX(str(model))
+
+    @property
+    def key(self) -> Mapping[str, Any]:
+        """See `Detector`."""
+        return {"model": digest_file(self.model), "settings": msgspec.to_builtins(self.settings)}
 
     def boxes(
         self, bgr: UInt8[np.ndarray, "height width 3"]
@@ -158,7 +183,7 @@ class OnnxDetector:
 
 
 def detect_drones(
-    detector: OnnxDetector, name: str, video: VideoInfo, *, report: Report = no_progress
+    detector: Detector, name: str, video: VideoInfo, *, report: Report = no_progress
 ) -> Detections:
     """Detect drones in all frames of a video.
 

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import msgspec
-
-from psotrack.detection.detector import OnnxDetector, detect_drones
+from psotrack.detection.detector import Detector, detect_drones
 from psotrack.recordings import Sequence, write_detections
 from psotrack.support import Report, digest_file, digest_record, no_progress
 
 
 def stored_detections(
-    detector: OnnxDetector, sequence: Sequence, *, cache: Path | str, report: Report = no_progress
+    detector: Detector, sequence: Sequence, *, cache: Path | str, report: Report = no_progress
 ) -> Path:
     """Detect drones in the videos of a sequence, unless the detections are stored already.
 
@@ -40,11 +38,10 @@ def stored_detections(
     return folder
 
 
-def _key(detector: OnnxDetector, sequence: Sequence) -> str:
+def _key(detector: Detector, sequence: Sequence) -> str:
     """Name of the folder: 40 hexadecimal digits."""
     made_of = {
-        "model": digest_file(detector.model),
-        "settings": msgspec.to_builtins(detector.settings),
+        **detector.key,
         "videos": {
             name: [video.num_frames, digest_file(video.path)] for name, video in sequence.videos.items()
         },

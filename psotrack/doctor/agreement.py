@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.correspondence import CameraSightings, Sightings, match
-from psotrack.geometry import Camera, CameraRig, reconstruct, viewpoints
+from psotrack.geometry import Camera, Rig, reconstruct, viewpoints
 from psotrack.initiation import room_bounds
 
 #: Smallest number of viewpoints of a point: two viewpoints often agree by chance.
@@ -54,7 +54,7 @@ class Agreement:
         return np.minimum(1.0, self.used.sum(axis=0) / np.maximum(self.num_sightings, 1))
 
 
-def measure_agreement(rig: CameraRig, sightings: Sightings, frames: Int[np.ndarray, "chosen"]) -> Agreement:
+def measure_agreement(rig: Rig, sightings: Sightings, frames: Int[np.ndarray, "chosen"]) -> Agreement:
     """Match the sightings of some frames over all cameras, and triangulate the points.
 
     Args:
@@ -88,7 +88,7 @@ def measure_agreement(rig: CameraRig, sightings: Sightings, frames: Int[np.ndarr
 
 
 def _matched(
-    rig: CameraRig, view: CameraSightings, bounds_m: Float[np.ndarray, "2 3"]
+    rig: Rig, view: CameraSightings, bounds_m: Float[np.ndarray, "2 3"]
 ) -> Int[np.ndarray, "points cameras"]:
     """Indices of the sightings of each point; no points if the rig is so wrong that the equations are singular."""
     try:
@@ -108,7 +108,7 @@ def num_viewpoints(cameras: Camera, seen: Bool[np.ndarray, "points cameras"]) ->
     return (seen.astype(int) @ at.astype(int) > 0).sum(axis=-1)
 
 
-def _wide_bounds(rig: CameraRig) -> Float[np.ndarray, "2 3"]:
+def _wide_bounds(rig: Rig) -> Float[np.ndarray, "2 3"]:
     """Bounds of the room, extended by its height upwards and downwards, because a wrong rig may have a wrong floor."""
     bounds_m = room_bounds(rig)
     height_m = bounds_m[1, 2] - bounds_m[0, 2]

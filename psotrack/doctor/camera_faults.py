@@ -19,7 +19,7 @@ from psotrack.clocks import camera_offsets
 from psotrack.correspondence import Sightings
 from psotrack.doctor.agreement import MAX_SQUARED_DISTANCE, MIN_VIEWPOINTS, Agreement, num_viewpoints
 from psotrack.errors import InputError
-from psotrack.geometry import NEAR_M, Camera, CameraRig, project, reconstruct, undistort
+from psotrack.geometry import NEAR_M, Camera, Rig, project, reconstruct, undistort
 
 #: Smallest number of points of the other cameras with which a camera is checked.
 MIN_POINTS_OF_CAMERA = 30
@@ -71,7 +71,7 @@ class CameraFault:
     amount: float = 0.0
 
 
-def collect_views(rig: CameraRig, found: Agreement, sightings: Sightings, index: int) -> DetectionViews:
+def collect_views(rig: Rig, found: Agreement, sightings: Sightings, index: int) -> DetectionViews:
     """Points on which the other cameras agree without the camera at `index`, and the sightings of this camera."""
     others = np.arange(len(rig)) != index
     kept = num_viewpoints(rig.cameras, found.used & others) >= MIN_VIEWPOINTS
@@ -111,7 +111,7 @@ def explained_share(camera: Camera, views: DetectionViews, delay_frames: float =
     return float(np.sum(_fits(camera, views, delay_frames)[0])) / max(len(views.point_m), 1)
 
 
-def explain_camera(rig: CameraRig, views: DetectionViews, index: int) -> list[CameraFault]:
+def explain_camera(rig: Rig, views: DetectionViews, index: int) -> list[CameraFault]:
     """The camera as it was read, and the best fault of each kind, the simplest kinds first."""
     camera = rig.cameras[index]
     sound = CameraFault("sound", explained_share(camera, views), camera)
@@ -234,7 +234,7 @@ def _rays(x: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
 
 
 def find_late_cameras(
-    rig: CameraRig, found: Agreement, sound: np.ndarray, fps: float
+    rig: Rig, found: Agreement, sound: np.ndarray, fps: float
 ) -> tuple[Float[np.ndarray, "cameras"], Float[np.ndarray, "cameras"], list[int]]:
     """Offsets of the sound cameras' clocks from their median, standard deviations, and indices of late cameras.
 

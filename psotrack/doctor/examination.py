@@ -36,7 +36,7 @@ from psotrack.doctor.rig_interpretations import (
     find_certain_focal_lengths,
     required_share,
 )
-from psotrack.geometry import CameraRig
+from psotrack.geometry import Rig
 from psotrack.trajectories import Trajectories
 
 #: Number of runs of consecutive frames that are examined, and number of frames per run. Runs show the motion.
@@ -80,7 +80,7 @@ class Diagnosis:
 
 
 def examine(
-    rig: CameraRig, sightings: Sightings, *, fps: float, reference: Trajectories | None = None
+    rig: Rig, sightings: Sightings, *, fps: float, reference: Trajectories | None = None
 ) -> Diagnosis:
     """Find faults of a rig from sightings of moving drones.
 
@@ -151,7 +151,7 @@ def sampled_frames(num_frames: int) -> Int[np.ndarray, "chosen"]:
     return frames[frames < num_frames]
 
 
-def _check_numbers(rig: CameraRig) -> tuple[list[Finding], CameraRig]:
+def _check_numbers(rig: Rig) -> tuple[list[Finding], Rig]:
     """Find implausible lengths and principal points, and correct both: findings, and the corrected rig."""
     findings = []
     cameras = rig.cameras
@@ -174,10 +174,10 @@ def _check_numbers(rig: CameraRig) -> tuple[list[Finding], CameraRig]:
         cameras = replace(cameras, T_cam_world=T)
     of_lenses, K = _check_principal_points(rig)
     findings += of_lenses
-    return findings, CameraRig(rig.names, replace(cameras, K=K))
+    return findings, Rig(rig.names, replace(cameras, K=K))
 
 
-def _check_principal_points(rig: CameraRig) -> tuple[list[Finding], np.ndarray]:
+def _check_principal_points(rig: Rig) -> tuple[list[Finding], np.ndarray]:
     """Find principal points of another image size, one finding per ratio; return the findings and the corrected K."""
     cameras, K = rig.cameras, np.array(rig.cameras.K)
     ratio = K[:, :2, 2] / ((cameras.image_size_wh - 1) / 2)
@@ -220,7 +220,7 @@ def _nothing_agrees(found: Agreement) -> Finding:
 
 
 def _find_wrong_cameras(
-    rig: CameraRig, found: Agreement, sightings: Sightings, frames: Int[np.ndarray, "chosen"]
+    rig: Rig, found: Agreement, sightings: Sightings, frames: Int[np.ndarray, "chosen"]
 ) -> tuple[list[Finding], np.ndarray]:
     """Find faults of single cameras, the worst camera first, and say which cameras are sound.
 
@@ -251,7 +251,7 @@ def _find_wrong_cameras(
     return findings, sound
 
 
-def _median_epipolar_distances(rig: CameraRig, found: Agreement) -> Float[np.ndarray, "cameras cameras"]:
+def _median_epipolar_distances(rig: Rig, found: Agreement) -> Float[np.ndarray, "cameras cameras"]:
     median_px = np.full((len(rig), len(rig)), np.nan)
     for first, second in combinations(range(len(rig)), 2):
         both = np.isfinite(found.noise_px[:, [first, second]]).all(axis=1)

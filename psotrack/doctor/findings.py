@@ -8,7 +8,7 @@ import numpy as np
 
 from psotrack.doctor.camera_faults import CameraFault, pose_difference
 from psotrack.doctor.reference_fit import NEAR_M, ReferenceFit
-from psotrack.geometry import CameraRig
+from psotrack.geometry import Rig
 
 #: Smallest gain of a fault, as a share of the camera's points: six parameters fitted to 30 points of a correct camera
 #: gain 0.015 by chance.
@@ -40,7 +40,7 @@ class Finding:
         return f"{self.message}; {self.remedy}"
 
 
-def describe_camera_fault(rig: CameraRig, index: int, explained: list[CameraFault]) -> Finding:
+def describe_camera_fault(rig: Rig, index: int, explained: list[CameraFault]) -> Finding:
     """Describe the simplest explanation whose gain is almost as large as the largest gain."""
     name, sound = rig.names[index], explained[0]
     best = max(each.gain for each in explained)

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from psotrack.calibration import CommonErrors, adjust
 from psotrack.correspondence import Sightings
 from psotrack.doctor.agreement import MAX_SQUARED_DISTANCE, Agreement, measure_agreement
-from psotrack.geometry import Camera, CameraRig, reconstruct
+from psotrack.geometry import Camera, Rig, reconstruct
 
 #: Common factors of the focal lengths: those tried first, and those tried around the best of the first.
 _SCALES = np.exp(np.arange(-0.7, 0.7001, 0.1))
@@ -40,11 +40,11 @@ class RigInterpretation:
     words: str
     remedy: str
     cameras: tuple[str, ...]
-    rig: CameraRig
+    rig: Rig
 
 
 def find_better_interpretation(
-    rig: CameraRig, sightings: Sightings, frames: Int[np.ndarray, "chosen"]
+    rig: Rig, sightings: Sightings, frames: Int[np.ndarray, "chosen"]
 ) -> RigInterpretation | None:
     """Find the interpretation that explains clearly more sightings (`required_share`); None if no interpretation does.
 
@@ -70,7 +70,7 @@ def required_share(share: float) -> float:
     return (1 + share) / 2
 
 
-def _conventions(rig: CameraRig) -> Iterator[RigInterpretation]:
+def _conventions(rig: Rig) -> Iterator[RigInterpretation]:
     """Interpretations with translation or centre, world to camera or the reverse, mirrored or normal camera axes."""
     T = rig.cameras.T_cam_world
     for centred, turned, signs in product((False, True), (False, True), product((1.0, -1.0), repeat=3)):
@@ -88,7 +88,7 @@ def _conventions(rig: CameraRig) -> Iterator[RigInterpretation]:
 
 
 def _convention(
-    rig: CameraRig, cameras: Camera, centred: bool, turned: bool, flip: Float[np.ndarray, "3"]
+    rig: Rig, cameras: Camera, centred: bool, turned: bool, flip: Float[np.ndarray, "3"]
 ) -> RigInterpretation:
     words, remedies = [], []
     if centred:
@@ -109,10 +109,10 @@ def _convention(
     kind = (
         "mirrored axes" if (flip < 0).any() else "translation or centre" if centred else "rotation inverted"
     )
-    return RigInterpretation(kind, "; ".join(words), "; ".join(remedies), (), CameraRig(rig.names, cameras))
+    return RigInterpretation(kind, "; ".join(words), "; ".join(remedies), (), Rig(rig.names, cameras))
 
 
-def _exchanges(rig: CameraRig) -> Iterator[RigInterpretation]:
+def _exchanges(rig: Rig) -> Iterator[RigInterpretation]:
     """Interpretations in which the calibrations of two cameras are exchanged."""
     for first, second in combinations(range(len(rig)), 2):
         order = np.arange(len(rig))
@@ -123,11 +123,11 @@ def _exchanges(rig: CameraRig) -> Iterator[RigInterpretation]:
             "what one of them sees fits the calibration of the other",
             "exchange their lines in the calibration, or the names of their videos and detections",
             names,
-            CameraRig(rig.names, rig.cameras[order]),
+            Rig(rig.names, rig.cameras[order]),
         )
 
 
-def find_better_focal_lengths(rig: CameraRig, found: Agreement, clearly: float) -> RigInterpretation | None:
+def find_better_focal_lengths(rig: Rig, found: Agreement, clearly: float) -> RigInterpretation | None:
     """Multiply all focal lengths with a factor, if the matched points then agree better by `clearly`; else None.
 
     If all lenses are wrong by the same factor, the points move with the lenses, so that most are still matched.
@@ -159,7 +159,7 @@ def find_better_focal_lengths(rig: CameraRig, found: Agreement, clearly: float) 
     return best if gain(best) > as_read + clearly else None
 
 
-def find_certain_focal_lengths(rig: CameraRig, found: Agreement) -> RigInterpretation | None:
+def find_certain_focal_lengths(rig: Rig, found: Agreement) -> RigInterpretation | None:
     """Multiply all focal lengths with a factor, if a bundle adjustment with fixed poses finds it certain; else None.
 
     With wrong focal lengths and right poses, lines of sight miss each other, more so far from the image's middle. An
@@ -189,7 +189,7 @@ def find_certain_focal_lengths(rig: CameraRig, found: Agreement) -> RigInterpret
     return replace(interpretation, words=f"{interpretation.words}, give or take {100 * std / scale:.1f} %")
 
 
-def _lenses(rig: CameraRig, scales: Float[np.ndarray, "scales"]) -> Iterator[RigInterpretation]:
+def _lenses(rig: Rig, scales: Float[np.ndarray, "scales"]) -> Iterator[RigInterpretation]:
     """Interpretations in which all focal lengths are multiplied with a factor."""
     for scale in scales.tolist():
         K = rig.cameras.K.copy()
@@ -199,7 +199,7 @@ def _lenses(rig: CameraRig, scales: Float[np.ndarray, "scales"]) -> Iterator[Rig
             f"all focal lengths are too {'short' if scale > 1 else 'long'}: {abs(100 * (1 / scale - 1)):.0f} % off",
             f"multiply them by {scale:.3f}, or calibrate the lenses anew",
             (),
-            CameraRig(rig.names, replace(rig.cameras, K=K)),
+            Rig(rig.names, replace(rig.cameras, K=K)),
         )
 
 

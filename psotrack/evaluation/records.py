@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
+from psotrack.support import short_repr
+
 
 @dataclass(frozen=True)
 class ErrorSummary:
@@ -107,7 +109,7 @@ def drone_label(drone: str, track: str | None) -> str:
     return drone if track in (None, drone) else f"{drone} (track {track})"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Evaluation(ErrorSummary, Hota, Gospa, PathErrors, Consistency):
     """Figures of an estimate compared with its reference; see `evaluate` for the definitions."""
 
@@ -121,6 +123,8 @@ class Evaluation(ErrorSummary, Hota, Gospa, PathErrors, Consistency):
     matched_mean_error_m: float | None
     offset_removed_mean_error_m: float | None
     per_drone: tuple[DroneEvaluation, ...]
+
+    __repr__ = short_repr
 
     def to_dict(self) -> dict[str, Any]:
         """The figures with the contract's keys, for strict JSON; None becomes null."""

@@ -3,7 +3,7 @@ from .camera_names import camera_key, chosen_camera, files_by_camera
 from .cameras import (
     NEAR_M,
     Camera,
-    CameraRig,
+    Rig,
     distort,
     look_at,
     make_camera,
@@ -33,8 +33,8 @@ __all__ = [
     "NEAR_M",
     "Boxes",
     "Camera",
-    "CameraRig",
     "Extents",
+    "Rig",
     "camera_key",
     "chosen_camera",
     "cross_matrices",

@@ -25,13 +25,14 @@ from jaxtyping import Float
 from psotrack._typing import Array
 from psotrack.errors import SettingsError
 from psotrack.geometry.camera_names import chosen_camera
+from psotrack.support import short_repr
 
 #: Smallest depth of a point that has a projection, metres.
 NEAR_M = 1e-3
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Camera:
     """One camera, or several cameras along a leading axis.
 
@@ -47,6 +48,8 @@ class Camera:
     dist: Float[Array, "*batch coefficients"]
     image_size_wh: Float[Array, "*batch 2"]
 
+    __repr__ = short_repr
+
     @property
     def centre_world(self) -> Float[Array, "*batch 3"]:
         """(..., 3), the centre of projection in the world, metres: -Rᵀ t."""
@@ -59,7 +62,7 @@ class Camera:
 
 
 @dataclass(frozen=True)
-class CameraRig:
+class Rig:
     """Named cameras that stand still; arrays are float64 on the host.
 
     Compiled code gets `cameras` without the names, so that rigs of equal shape share a compiled program.
@@ -75,7 +78,7 @@ class CameraRig:
     def __len__(self) -> int:
         return len(self.names)
 
-    def select(self, names: Ordered[str]) -> CameraRig:
+    def select(self, names: Ordered[str]) -> Rig:
         """A rig of chosen cameras, in the order of `names`.
 
         Args:
@@ -93,7 +96,7 @@ class CameraRig:
         if len(set(kept)) < len(kept):
             twice = ", ".join(name for name in names if kept.count(found[name] or "") > 1)
             raise SettingsError("cameras", expected=f"{expected}, each once", found=twice)
-        return CameraRig(tuple(kept), self.cameras[np.array([self.names.index(name) for name in kept])])
+        return Rig(tuple(kept), self.cameras[np.array([self.names.index(name) for name in kept])])
 
 
 def make_camera(
@@ -136,7 +139,7 @@ def make_camera(
     return Camera(T, K, coefficients, np.asarray(image_size_wh, np.float64))
 
 
-def make_rig(named: dict[str, Camera]) -> CameraRig:
+def make_rig(named: dict[str, Camera]) -> Rig:
     """Make a rig from single cameras by name.
 
     Shorter lists of distortion coefficients are padded with zeros, which do not change the projection.
@@ -148,7 +151,7 @@ def make_rig(named: dict[str, Camera]) -> CameraRig:
         replace(camera, dist=np.pad(camera.dist, (0, coefficients - camera.dist.shape[-1])))
         for camera in named.values()
     ]
-    return CameraRig(tuple(named), jax.tree.map(lambda *leaves: np.stack(leaves), *padded))
+    return Rig(tuple(named), jax.tree.map(lambda *leaves: np.stack(leaves), *padded))
 
 
 def look_at(

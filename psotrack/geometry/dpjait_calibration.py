@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry.camera_names import camera_key
-from psotrack.geometry.cameras import Camera, CameraRig, make_camera, make_rig
+from psotrack.geometry.cameras import Camera, Rig, make_camera, make_rig
 from psotrack.support import Column, Table, TextRow, read_table, write_rows
 
 #: Units of lengths in the headers of the dataset's tables.
@@ -43,7 +43,7 @@ def read_camera_names(path: Path | str) -> tuple[str, ...]:
     return tuple(names.values())
 
 
-def read_calibration(path: Path | str, image_sizes_wh: Mapping[str, tuple[int, int]]) -> CameraRig:
+def read_calibration(path: Path | str, image_sizes_wh: Mapping[str, tuple[int, int]]) -> Rig:
     """Read the cameras of a calibration file, in metres.
 
     Args:
@@ -73,7 +73,7 @@ def read_calibration(path: Path | str, image_sizes_wh: Mapping[str, tuple[int, i
     return make_rig(cameras)
 
 
-def write_calibration(path: Path | str, rig: CameraRig, unit: Literal["m", "mm"] = "m") -> None:
+def write_calibration(path: Path | str, rig: Rig, unit: Literal["m", "mm"] = "m") -> None:
     """Write a rig to a calibration file; `read_calibration` reads the same numbers to 1e-12.
 
     Distortion columns are written if a camera has distortion, as in the real half of the dataset. The simulated half
@@ -105,7 +105,7 @@ def write_calibration(path: Path | str, rig: CameraRig, unit: Literal["m", "mm"]
     write_rows(path, [header, *rows])
 
 
-def _calibration_row(rig: CameraRig, index: int, unit: str, num_coefficients: int) -> list[object]:
+def _calibration_row(rig: Rig, index: int, unit: str, num_coefficients: int) -> list[object]:
     camera: Camera = rig.cameras[index]
     return [
         rig.names[index],
@@ -116,7 +116,7 @@ def _calibration_row(rig: CameraRig, index: int, unit: str, num_coefficients: in
     ]
 
 
-def _check_writable(rig: CameraRig) -> None:
+def _check_writable(rig: Rig) -> None:
     K = rig.cameras.K
     if np.any(K[:, 0, 0] != K[:, 1, 1]) or np.any(K[:, 0, 1]):
         raise SettingsError(

@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, OutputError
 from psotrack.geometry.camera_fields import CameraFields, camera_from_fields
-from psotrack.geometry.cameras import Camera, CameraRig, make_rig
+from psotrack.geometry.cameras import Camera, Rig, make_rig
 from psotrack.geometry.dpjait_calibration import read_calibration, write_calibration
 from psotrack.support import atomic_write, read_text, read_toml, refuse_to_overwrite
 
@@ -39,7 +39,7 @@ _CALISCOPE = "camera_array"
 
 def read_rig(
     path: Path | str, image_size_wh: tuple[int, int] | None = None, *, metres_per_unit: float = 1.0
-) -> CameraRig:
+) -> Rig:
     """Read the cameras of a rig file, in metres.
 
     Args:
@@ -53,17 +53,17 @@ def read_rig(
     return _read(Path(path), image_size_wh, metres_per_unit, placed=True)
 
 
-def read_lenses(path: Path | str, image_size_wh: tuple[int, int] | None = None) -> CameraRig:
+def read_lenses(path: Path | str, image_size_wh: tuple[int, int] | None = None) -> Rig:
     """Read only the lenses of a rig file: all cameras stand at the world's origin.
 
     Arguments and errors are those of `read_rig`, but the file need not have poses.
     """
     rig = _read(Path(path), image_size_wh, 1.0, placed=False)
     origin = np.tile(np.eye(4), (len(rig), 1, 1))
-    return CameraRig(rig.names, replace(rig.cameras, T_cam_world=origin))
+    return Rig(rig.names, replace(rig.cameras, T_cam_world=origin))
 
 
-def write_rig(path: Path | str, rig: CameraRig, *, force: bool = False) -> None:
+def write_rig(path: Path | str, rig: Rig, *, force: bool = False) -> None:
     """Write a rig to a file; the suffix of the path selects the format.
 
     Args:
@@ -84,9 +84,7 @@ def write_rig(path: Path | str, rig: CameraRig, *, force: bool = False) -> None:
     write(path, rig)
 
 
-def _read(
-    path: Path, image_size_wh: tuple[int, int] | None, metres_per_unit: float, *, placed: bool
-) -> CameraRig:
+def _read(path: Path, image_size_wh: tuple[int, int] | None, metres_per_unit: float, *, placed: bool) -> Rig:
     read = _by_suffix(
         path, {".csv": _read_csv, ".toml": _toml_fields, ".yml": _yaml_fields, ".yaml": _yaml_fields}
     )
@@ -102,7 +100,7 @@ def _read(
     return make_rig(cameras)
 
 
-def _read_csv(path: Path, image_size_wh: tuple[int, int] | None) -> CameraRig:
+def _read_csv(path: Path, image_size_wh: tuple[int, int] | None) -> Rig:
     if image_size_wh is None:
         raise InputError(
             path,
@@ -178,7 +176,7 @@ def _values(node: Any) -> Any:
     return node.real() if node.isReal() or node.isInt() else None
 
 
-def _write_toml(path: Path, rig: CameraRig) -> None:
+def _write_toml(path: Path, rig: Rig) -> None:
     caliscope = path.name.startswith(_CALISCOPE)
     # Numbers have leading zeros, because anipose sorts the tables by name: cam_10 would come before cam_2.
     digits = len(str(len(rig) - 1))
@@ -206,7 +204,7 @@ def _write_toml(path: Path, rig: CameraRig) -> None:
         temporary.write_text("\n\n".join(blocks) + "\n", encoding="utf-8")
 
 
-def _write_yaml(path: Path, rig: CameraRig) -> None:
+def _write_yaml(path: Path, rig: Rig) -> None:
     with atomic_write(path) as temporary:
         storage = cv2.FileStorage(str(temporary), cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_FORMAT_YAML)
         if not storage.isOpened():

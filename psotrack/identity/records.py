@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.errors import SettingsError, check_positive
+from psotrack.support import short_repr
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class Encounter:
     outcome: LabelOutcome
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Identities:
     """Which track each drone is in every frame.
 
@@ -91,6 +92,8 @@ class Identities:
     pairs: Int[np.ndarray, "pairs 2"]
     ambiguity: Float[np.ndarray, "frames pairs"]
     encounters: tuple[Encounter, ...]
+
+    __repr__ = short_repr
 
 
 def relabelled(value: np.ndarray, order: Int[np.ndarray, "frames drones"]) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import InputError
-from psotrack.geometry import CameraRig
+from psotrack.geometry import Rig
 from psotrack.initiation.initialisation import InitialState, find_drones
 from psotrack.recordings import Sequence
 from psotrack.settings import DroneSettings
@@ -60,7 +60,7 @@ def start_source(sequence: Sequence, init: str) -> StartSource:
 
 
 def room_bounds(
-    rig: CameraRig, bounds_m: tuple[float, float, float, float, float, float] | None = None
+    rig: Rig, bounds_m: tuple[float, float, float, float, float, float] | None = None
 ) -> Float[np.ndarray, "2 3"]:
     """Lowest and highest corner of the room, metres.
 
@@ -89,7 +89,7 @@ def room_bounds(
 
 
 def find_initial_state(
-    rig: CameraRig,
+    rig: Rig,
     silhouettes: Silhouettes,
     source: StartSource,
     drones: DroneSettings,

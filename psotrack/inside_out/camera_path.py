@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from psotrack.errors import InputError
 from psotrack.geometry import rotation_matrices
-from psotrack.support import Table, TextRow, read_table, refuse_to_overwrite, write_rows
+from psotrack.support import Table, TextRow, read_table, refuse_to_overwrite, short_repr, write_rows
 from psotrack.trajectories import Status, Trajectories
 
 #: Axes of the covariance: the world's axes, in metres, then small turns about the camera's axes, in radians.
@@ -52,7 +52,7 @@ class Flag(IntFlag):
         return "+".join(flag.name.lower() for flag in Flag if flag in self and flag.name)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class CameraPath:
     """Poses of a camera over frames. Values that are not known are NaN.
 
@@ -91,6 +91,8 @@ class CameraPath:
     velocity_m_s: Float[np.ndarray, "frames 3"] | None = None
     chance: Float[np.ndarray, "frames"] | None = None
     common: Float[np.ndarray, "frames 6 errors"] | None = None
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         for name, shape in {"position_m": (3,), "orientation_wxyz": (4,), "covariance": (6, 6)}.items():

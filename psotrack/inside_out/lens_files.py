@@ -11,7 +11,7 @@ from jaxtyping import Float
 from psotrack.calibration import lens_of_view
 from psotrack.datasets.dpjait import read_onboard_calibration
 from psotrack.errors import InputError, SettingsError
-from psotrack.geometry import Camera, CameraRig, make_camera, make_rig, read_lenses
+from psotrack.geometry import Camera, Rig, make_camera, make_rig, read_lenses
 from psotrack.support import read_table
 
 #: Largest distance of the optical axis from the middle of the image, as a share of its size, for files that do not
@@ -111,7 +111,7 @@ def scale_lens(lens: Camera, image_size_wh: Size) -> Camera:
     return replace(lens, K=K, image_size_wh=np.array(image_size_wh, np.float64))
 
 
-def _read_cameras(path: Path, image_size_wh: Size) -> CameraRig:
+def _read_cameras(path: Path, image_size_wh: Size) -> Rig:
     if path.suffix.lower() == ".csv" and read_table(path).find("focal_length_x") is not None:
         return make_rig(
             {

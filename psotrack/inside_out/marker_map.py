@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 
 from psotrack.datasets.dpjait import MarkerRow, read_marker_rows
 from psotrack.errors import InputError
+from psotrack.support import short_repr
 
 #: Largest deviation of a corner from its square, as a share of the side. Corners measured by motion capture are off by
 #: some 3 mm each: three standard deviations of one corner against the three others, 2 x 3 x 3 mm, are 9 % of 0.2 m.
@@ -31,7 +32,7 @@ _IN_PLANE = 1.0
 _OBJECT_EXTENT = 10.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class MarkerMap:
     """Markers with known corners.
 
@@ -41,6 +42,8 @@ class MarkerMap:
     """
 
     corners_m: Mapping[int, Float[np.ndarray, "4 3"]]
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         if not self.corners_m:

@@ -2,13 +2,14 @@ from .c3d import Markers, read_c3d, write_c3d
 from .detections import Detections, read_detections, write_detections
 from .inventory import describe_sequence, inventory_table
 from .marker_bodies import body_trajectories
-from .sequence import OnboardVideo, Sequence
+from .sequence import OnboardVideo, Recording, Sequence
 from .video import VideoInfo, VideoWriter, join_videos, probe, read_frames, silence_opencv
 
 __all__ = [
     "Detections",
     "Markers",
     "OnboardVideo",
+    "Recording",
     "Sequence",
     "VideoInfo",
     "VideoWriter",

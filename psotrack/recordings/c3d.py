@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.support import atomic_write
+from psotrack.support import atomic_write, short_repr
 
 _METRES_PER_UNIT = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "dm": 0.1, "m": 1.0, "in": 0.0254, "ft": 0.3048}
 _BLOCK_BYTES = 512
@@ -27,7 +27,7 @@ _INTEL = 84
 _MAX_FRAMES = 2**16 - 1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Markers:
     """Marker positions over the frames of a motion-capture recording.
 
@@ -40,6 +40,8 @@ class Markers:
     labels: tuple[str, ...]
     position_m: Float[np.ndarray, "frames markers 3"]
     rate_hz: float
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         if self.position_m.shape[1:] != (len(self.labels), 3):

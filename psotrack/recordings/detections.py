@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.errors import InputError
-from psotrack.support import Column, TextRow, read_rows, write_rows
+from psotrack.support import Column, TextRow, read_rows, short_repr, write_rows
 
 _SEPARATOR = ","
 _VALUES = ("x", "y", "w", "h", "cx", "cy", "confidence")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Detections:
     """Boxes in the frames of one camera, as parallel arrays ordered by frame.
 
@@ -33,6 +33,8 @@ class Detections:
     frame: Int[np.ndarray, " detections"]
     xyxy: Float[np.ndarray, "detections 4"]
     confidence: Float[np.ndarray, " detections"]
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         if np.any(np.diff(self.frame) < 0):

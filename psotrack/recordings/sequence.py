@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.geometry import CameraRig
+from psotrack.geometry import Rig
 from psotrack.recordings.video import VideoInfo
+from psotrack.support import short_repr
 from psotrack.trajectories import Trajectories
 
 
@@ -35,7 +36,7 @@ class OnboardVideo:
     orientation_wxyz: Float[np.ndarray, "frames 4"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Sequence:
     """Synchronised videos of calibrated cameras that stand still.
 
@@ -54,11 +55,13 @@ class Sequence:
 
     name: str
     folder: Path
-    rig: CameraRig
+    rig: Rig
     videos: Mapping[str, VideoInfo]
     truth: Trajectories | None = None
     detections: Mapping[str, Path] | None = None
     onboard: Mapping[str, OnboardVideo] | None = None
+
+    __repr__ = short_repr
 
     @property
     def fps(self) -> float:
@@ -109,7 +112,7 @@ class Sequence:
         cut = {name: replace(video, num_frames=num_frames) for name, video in videos.items()}
         return replace(self, rig=rig, videos=cut)
 
-    def _check_videos_exist(self, rig: CameraRig) -> None:
+    def _check_videos_exist(self, rig: Rig) -> None:
         without = [name for name in rig.names if name not in self.videos]
         if without:
             rest = ",".join(name for name in rig.names if name in self.videos)
@@ -151,3 +154,7 @@ def _video_rate(video: VideoInfo) -> str:
 
 def _video_length(video: VideoInfo) -> str:
     return f"{video.num_frames} frames"
+
+
+#: The name of a `Sequence` in the public face.
+Recording = Sequence

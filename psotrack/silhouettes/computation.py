@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.recordings import Sequence
-from psotrack.silhouettes.foreground import check_whole
+from psotrack.silhouettes.foreground import BackgroundModel, check_whole
 from psotrack.silhouettes.store import (
     SilhouetteSettings,
     Task,
@@ -27,14 +27,14 @@ from psotrack.silhouettes.store import (
     remove_stale,
     store,
 )
-from psotrack.support import Report, map_in_processes, no_progress
+from psotrack.support import Report, map_in_processes, no_progress, short_repr
 
 __all__ = ["SilhouetteSettings", "Silhouettes", "compute"]
 
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Silhouettes:
     """Stored silhouettes of all cameras of a sequence.
 
@@ -56,6 +56,8 @@ class Silhouettes:
     shape: tuple[int, int]
     seconds: Mapping[str, float]
     arrays: tuple[zarr.Array | UInt8[np.ndarray, "frames height width"], ...]
+
+    __repr__ = short_repr
 
     def read(self, start: int, stop: int) -> UInt8[np.ndarray, "frames cameras height width"]:
         """Read the coverage of the frames [start, stop), 0 to 255: (frames, cameras, height, width).
@@ -88,6 +90,7 @@ def compute(
     *,
     cache: Path | str,
     jobs: int | None = None,
+    background: BackgroundModel | None = None,
     report: Report = no_progress,
 ) -> Silhouettes:
     """Silhouettes of a sequence, read from the store; missing silhouettes are computed and stored.
@@ -100,6 +103,7 @@ def compute(
         settings: settings of the silhouettes.
         cache: folder of the store; made if it does not exist.
         jobs: largest number of processes; None is one per processor.
+        background: background model instead of MOG2; None is MOG2 with the given settings.
         report: progress bar for the frames of all cameras, including the frames from which the background is learned.
 
     Raises:
@@ -115,8 +119,8 @@ def compute(
     videos = [sequence.videos[name] for name in cameras]
     shape = reduced_shape(videos[0], settings.reduction)
     with ThreadPoolExecutor(jobs) as threads:
-        keys = list(threads.map(partial(key_of, settings=settings), videos))
-    tasks = [Task(video, settings, cache, key) for video, key in zip(videos, keys, strict=True)]
+        keys = list(threads.map(partial(key_of, settings=settings, background=background), videos))
+    tasks = [Task(video, settings, cache, key, background) for video, key in zip(videos, keys, strict=True)]
     seconds = _make_missing(tasks, shape, jobs, report)
     return Silhouettes(
         cameras=cameras,

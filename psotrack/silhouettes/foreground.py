@@ -12,8 +12,9 @@ No step shifts the mask: images are reduced by whole factors, by area, and speck
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
-from typing import Literal, get_args
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 import cv2
 import msgspec
@@ -82,6 +83,59 @@ def check_whole(name: str, value: object, *, lowest: int) -> None:
 def learning_step(num_frames: int, settings: ForegroundSettings) -> int:
     """Distance between two frames from which the background is learned, frames."""
     return math.ceil(num_frames / settings.num_learning_frames)
+
+
+@runtime_checkable
+class BackgroundModel(Protocol):
+    """Separates foreground from background in the video of one camera. Used in several processes: can be pickled.
+
+    Attributes:
+        key: everything on which the foreground depends, as plain data fit for JSON. Silhouettes are stored under it.
+    """
+
+    @property
+    def key(self) -> Mapping[str, Any]: ...  # noqa: D102
+
+    def foreground(
+        self,
+        learning: Iterable[UInt8[np.ndarray, "height width 3"]],
+        frames: Iterable[UInt8[np.ndarray, "height width 3"]],
+    ) -> Iterator[UInt8[np.ndarray, "working_height working_width"]]:
+        """The foreground of each of `frames`, against the background of `learning`.
+
+        Args:
+            learning: BGR frames from the whole video.
+            frames: BGR frames in their order.
+
+        Yields:
+            0 for background, 255 for foreground, values between them for foreground of less weight; each image is
+            the frame reduced by `SilhouetteSettings.working_reduction` along each side.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Mog2:
+    """The background model of this package (see the module).
+
+    Attributes:
+        settings: of the foreground.
+    """
+
+    settings: ForegroundSettings
+
+    @property
+    def key(self) -> Mapping[str, Any]:
+        """See `BackgroundModel`."""
+        return {"mog2": msgspec.to_builtins(self.settings)}
+
+    def foreground(
+        self,
+        learning: Iterable[UInt8[np.ndarray, "height width 3"]],
+        frames: Iterable[UInt8[np.ndarray, "height width 3"]],
+    ) -> Iterator[UInt8[np.ndarray, "working_height working_width"]]:
+        """See `BackgroundModel`."""
+        return foreground(learning, frames, self.settings)
 
 
 def foreground(

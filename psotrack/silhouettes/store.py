@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -23,10 +24,11 @@ from zarr.codecs import ZstdCodec
 from psotrack.errors import OutputError, SettingsError
 from psotrack.recordings import VideoInfo, read_frames
 from psotrack.silhouettes.foreground import (
+    BackgroundModel,
     ForegroundSettings,
+    Mog2,
     check_whole,
     coverage,
-    foreground,
     learning_step,
 )
 from psotrack.support import Advance, digest_file, digest_record
@@ -74,20 +76,23 @@ class Task:
     settings: SilhouetteSettings
     cache: Path
     key: str
+    background: BackgroundModel | None = None
 
 
-def key_of(video: VideoInfo, settings: SilhouetteSettings) -> str:
-    """Digest of a video's content, number of frames and settings: 40 hexadecimal digits.
+def key_of(video: VideoInfo, settings: SilhouetteSettings, background: BackgroundModel | None = None) -> str:
+    """Digest of a video's content, number of frames, settings and background model: 40 hexadecimal digits.
 
     Raises:
         InputError: the video cannot be read.
     """
-    made_of = {
+    made_of: dict[str, Any] = {
         "schema": SCHEMA,
         "content": digest_file(video.path, expected="a readable video"),
         "num_frames": video.num_frames,
         "settings": msgspec.to_builtins(settings),
     }
+    if background is not None:
+        made_of["background"] = dict(background.key)
     return digest_record(made_of)
 
 
@@ -170,10 +175,10 @@ def _write(folder: Path, shape: tuple[int, int], task: Task, advance: Advance) -
         overwrite=True,
     )
     started, seconds = time.perf_counter(), {"decode": 0.0, "foreground": 0.0}
-    masks = foreground(
+    background = Mog2(settings) if task.background is None else task.background
+    masks = background.foreground(
         _decoded(video, learning_step(video.num_frames, settings), seconds, advance),
         _decoded(video, 1, seconds, advance),
-        settings,
     )
     chunk = np.empty((CHUNK_FRAMES, *shape), np.uint8)
     for index, mask in enumerate(masks):

@@ -30,7 +30,7 @@ from psotrack.datasets.dpjait import (
     write_detections,
 )
 from psotrack.errors import InputError, SettingsError, check_positive
-from psotrack.geometry import Camera, CameraRig, to_pixels, undistort
+from psotrack.geometry import Camera, Rig, to_pixels, undistort
 from psotrack.recordings import Markers, Sequence, VideoInfo, VideoWriter, read_frames, write_c3d
 from psotrack.support import Advance, Report, atomic_write, no_progress, refuse_to_overwrite
 
@@ -124,7 +124,7 @@ def _number(name: str) -> int:
 # --- cameras and what they see
 
 
-def _real_rig(rig: CameraRig) -> CameraRig:
+def _real_rig(rig: Rig) -> Rig:
     """The cameras where they are, with the real half's intrinsics, lens and names."""
     cameras = rig.cameras
     scale = float(cameras.image_size_wh[0, 0]) / _SIMULATED_WIDTH_PX
@@ -133,7 +133,7 @@ def _real_rig(rig: CameraRig) -> CameraRig:
     focal_px = _FOCAL_LENGTH_PX * scale
     K = np.array([[focal_px, 0.0, cx], [0.0, focal_px, cy], [0.0, 0.0, 1.0]])
     size_wh = np.array([2.0 * round(side * scale / 2) for side in _SIZE_WH])
-    return CameraRig(
+    return Rig(
         SERIALS,
         replace(
             cameras,

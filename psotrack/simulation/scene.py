@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import SettingsError, check_positive
-from psotrack.geometry import Camera, CameraRig, look_at, make_camera, make_rig
+from psotrack.geometry import Camera, Rig, look_at, make_camera, make_rig
 from psotrack.simulation.flights.motion import Flight
 from psotrack.simulation.flights.planning import frame_times_s, plan
 from psotrack.simulation.scenarios import CameraPlace, Scenario
@@ -39,7 +39,7 @@ class Scene:
     scenario: Scenario
     seed: int
     scale: float
-    rig: CameraRig
+    rig: Rig
     flights: tuple[Flight, ...]
     models: tuple[DroneModel, ...]
 
@@ -82,7 +82,7 @@ def build(scenario: Scenario, *, scale: float = 1.0, seed: int = 0) -> Scene:
     return Scene(scenario, seed, scale, rig, flights, models)
 
 
-def _rig(scenario: Scenario, scale: float, seed: int) -> CameraRig:
+def _rig(scenario: Scenario, scale: float, seed: int) -> Rig:
     """The cameras, each as far from its record as the scenario's spread and the seed have it."""
     places = camera_places(scenario)
     spread = scenario.camera_spread

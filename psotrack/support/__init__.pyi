@@ -1,10 +1,11 @@
 from .compiled import keep_compiled
 from .delimited import Column, Table, TextRow, read_rows, read_table, write_rows
 from .figures import COLOURS, drone_colour, save_figure
-from .files import atomic_write, digest_file, digest_record, read_text, refuse_to_overwrite
+from .files import atomic_write, digest_file, digest_record, read_text, refuse_to_overwrite, user_cache
 from .plugins import load_plugin, plugin_names
 from .processes import map_in_processes
 from .progress import Advance, Report, no_progress, progress_bar
+from .representation import short_repr
 from .schema import assign, convert, nearest, read_toml
 from .standard_errors import standard_error
 
@@ -34,6 +35,8 @@ __all__ = [
     "read_toml",
     "refuse_to_overwrite",
     "save_figure",
+    "short_repr",
     "standard_error",
+    "user_cache",
     "write_rows",
 ]

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
+import platformdirs
 
 from psotrack.errors import InputError, OutputError
 
@@ -127,3 +128,9 @@ def _remove(path: Path) -> None:
     else:
         with contextlib.suppress(OSError):
             path.unlink()
+
+
+def user_cache() -> Path:
+    """The user's cache folder for silhouettes and compiled programs: $PSOTRACK_CACHE, or the system's usual place."""
+    chosen = os.environ.get("PSOTRACK_CACHE")
+    return Path(chosen) if chosen else platformdirs.user_cache_path("psotrack") / "silhouettes"

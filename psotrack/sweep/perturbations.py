@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import SettingsError
-from psotrack.geometry import CameraRig
+from psotrack.geometry import Rig
 from psotrack.recordings import Sequence
 from psotrack.silhouettes import Silhouettes
 from psotrack.sweep.cells import Perturbation
@@ -119,7 +119,7 @@ def _of_each(silhouettes: Silhouettes) -> Iterator[_Frames]:
         yield _of_cameras(silhouettes, (name,)).read(0, silhouettes.num_frames)[:, 0]
 
 
-def _turned(rig: CameraRig, angle_deg: float, rngs: list[np.random.Generator]) -> CameraRig:
+def _turned(rig: Rig, angle_deg: float, rngs: list[np.random.Generator]) -> Rig:
     """Cameras turned about their own centres, each about an axis of its own, all directions equally likely."""
     T_cam_world = rig.cameras.T_cam_world.copy()
     for camera, rng in enumerate(rngs):

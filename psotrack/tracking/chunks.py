@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from psotrack._typing import Array
-from psotrack.geometry import Camera, CameraRig
+from psotrack.geometry import Camera, Rig
 from psotrack.initiation import (
     InitialState,
     PlannedStarts,
@@ -88,7 +88,7 @@ class _Setting:
         device: computes.
     """
 
-    rig: CameraRig
+    rig: Rig
     cameras: Camera
     reduction: int
     fps: float
@@ -96,7 +96,7 @@ class _Setting:
 
 
 def track_silhouettes(
-    rig: CameraRig,
+    rig: Rig,
     silhouettes: Silhouettes,
     runs: Sequence[RunInputs],
     *,
@@ -134,7 +134,7 @@ def _kind(program: tracker.Program, settings: TrackerSettings) -> Hashable:
 
 
 def _track_through_chunks(
-    rig: CameraRig,
+    rig: Rig,
     silhouettes: Silhouettes,
     fps: float,
     capacity: dict[Hashable, int],

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from psotrack.support import short_repr
 from psotrack.trajectories.trajectories import Status
 
 
@@ -65,7 +66,7 @@ class DroneSizes:
         return DroneSizes(self.size_m[drones], self.std_m[drones], self.num_frames[drones], self.fill[drones])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Tracks:
     """Tracks of a whole recording, NumPy arrays with axes (frames, drones, ...).
 
@@ -96,6 +97,8 @@ class Tracks:
     measured_size_m: Float[np.ndarray, "frames drones 3"]
     sizes: DroneSizes
     arrivals: tuple[Arrival, ...] = ()
+
+    __repr__ = short_repr
 
     @property
     def num_frames(self) -> int:

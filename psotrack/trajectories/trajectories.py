@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.errors import InputError
+from psotrack.support import short_repr
 
 #: Largest asymmetry of a covariance relative to its largest element: about a hundred roundings of float32.
 SYMMETRY = 1e-5
@@ -30,7 +31,7 @@ class Status(IntEnum):
         return self.name.lower()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Trajectories:
     """Positions of drones over frames, with optional further quantities.
 
@@ -61,6 +62,8 @@ class Trajectories:
     num_cameras: Int[np.ndarray, "frames drones"] | None = None
     status: Int[np.ndarray, "frames drones"] | None = None
     covariance_m2: Float[np.ndarray, "frames drones 3 3"] | None = None
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         frames, drones = len(self.frame), len(self.drones)

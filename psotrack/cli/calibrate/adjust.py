@@ -18,7 +18,7 @@ from psotrack.support import refuse_to_overwrite
 
 if TYPE_CHECKING:
     from psotrack.calibration import DroneViews, Improved
-    from psotrack.geometry import CameraRig
+    from psotrack.geometry import Rig
 
 
 @click.command()
@@ -99,7 +99,7 @@ def adjust(
 
 
 def _rows(
-    rig: CameraRig, improved: Improved, views: DroneViews, held: tuple[str, ...]
+    rig: Rig, improved: Improved, views: DroneViews, held: tuple[str, ...]
 ) -> dict[str, dict[str, Any]]:
     """Results of each camera, by name."""
     shown = improved.everything if improved.final is None else improved.final

@@ -1,0 +1,67 @@
+from .api import background_model, detect_markers, read_recording, track
+from .clocks import find_offset
+from .detection import Detector
+from .evaluation import Evaluation, evaluate
+from .geometry import Rig, make_camera, make_rig, project, read_rig, triangulate, write_rig
+from .inside_out import MarkerMap, localise_video, read_marker_map
+from .methods import Method, MethodInputs
+from .pipeline import TrackedSequence, track_runs
+from .recordings import Recording, read_c3d
+from .settings import (
+    DroneSettings,
+    IdentitySettings,
+    MotionSettings,
+    ScoreSettings,
+    StatusSettings,
+    SwarmSettings,
+    TrackSettings,
+)
+from .silhouettes import BackgroundModel
+from .simulation import simulate
+from .tracking import Score, ScoreInputs, Search, SearchRegion
+from .trajectories import Trajectories, read_trajectories, write_trajectories
+
+__version__: str
+
+__all__ = [
+    "BackgroundModel",
+    "Detector",
+    "DroneSettings",
+    "Evaluation",
+    "IdentitySettings",
+    "MarkerMap",
+    "Method",
+    "MethodInputs",
+    "MotionSettings",
+    "Recording",
+    "Rig",
+    "Score",
+    "ScoreInputs",
+    "ScoreSettings",
+    "Search",
+    "SearchRegion",
+    "StatusSettings",
+    "SwarmSettings",
+    "TrackSettings",
+    "TrackedSequence",
+    "Trajectories",
+    "background_model",
+    "detect_markers",
+    "evaluate",
+    "find_offset",
+    "localise_video",
+    "make_camera",
+    "make_rig",
+    "project",
+    "read_c3d",
+    "read_marker_map",
+    "read_recording",
+    "read_rig",
+    "read_trajectories",
+    "simulate",
+    "track",
+    "track_runs",
+    "triangulate",
+    "write_rig",
+    "write_trajectories",
+]

@@ -1,0 +1,116 @@
+"""The functions of the public face that are more than a name: reading a recording, tracking it, and single steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypedDict, Unpack
+
+import numpy as np
+from jaxtyping import UInt8
+
+from psotrack.datasets.dpjait import read_sequence
+from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
+from psotrack.methods import Method
+from psotrack.pipeline import Parts, TrackedSequence, track_sequence
+from psotrack.recordings import Sequence as Recording
+from psotrack.settings import TrackSettings
+from psotrack.silhouettes import BackgroundModel, ForegroundSettings, Mog2
+from psotrack.support import no_progress, progress_bar, user_cache
+from psotrack.tracking import Score, Search
+
+
+class BroughtParts(TypedDict, total=False):
+    """Parts that a caller of `track` may bring, instead of those that the settings name.
+
+    Attributes:
+        search: the search in one frame (see `Search`).
+        score: the score of positions in single cameras (see `Score`).
+        method: the method of tracking (see `Method`).
+        background: the background model (see `BackgroundModel`).
+    """
+
+    search: Search
+    score: Score
+    method: Method
+    background: BackgroundModel
+
+
+def read_recording(
+    folder: Path | str, *, cameras: Sequence[str] | None = None, num_frames: int | None = None
+) -> Recording:
+    """Read a recording in the layout of the DPJAIT dataset, checked to be fit for tracking.
+
+    Args:
+        folder: of the recording: calibration, one video per camera, and a reference where there is one.
+        cameras: names of the cameras to use; None uses all.
+        num_frames: number of first frames to use; None uses all.
+
+    Raises:
+        InputError: the folder or one of its files cannot be used; the message says what to do.
+        SettingsError: a camera is unknown, or the videos have fewer frames.
+    """
+    return read_sequence(folder).usable(cameras, num_frames)
+
+
+def track(
+    recording: Recording | Path | str,
+    settings: TrackSettings | Mapping[str, Any] | None = None,
+    *,
+    cache: Path | str | None = None,
+    jobs: int | None = None,
+    progress: bool = False,
+    **brought: Unpack[BroughtParts],
+) -> TrackedSequence:
+    """Track the drones of a recording.
+
+    Silhouettes are made by several processes: in a script, call this function below `if __name__ == "__main__":`.
+
+    Args:
+        recording: from `read_recording`, or its folder.
+        settings: settings, or dotted names and values such as {"swarm.particles": 50}; None takes the defaults.
+        cache: folder of stored silhouettes; None takes the user's cache folder.
+        jobs: number of processes for the silhouettes; None is one per processor.
+        progress: whether to show progress bars.
+        **brought: parts that the caller brings: `search`, `score`, `method`, `background`.
+
+    Raises:
+        InputError: a file cannot be used, or no drones are found.
+        SettingsError: a setting does not exist, or does not fit the recording.
+    """
+    if not isinstance(recording, Recording):
+        recording = read_recording(recording)
+    if not isinstance(settings, TrackSettings):
+        settings = TrackSettings().changed(settings or {})
+    return track_sequence(
+        recording,
+        settings,
+        cache=user_cache() if cache is None else cache,
+        jobs=jobs,
+        parts=Parts(**brought),
+        report=progress_bar if progress else no_progress,
+    )
+
+
+def detect_markers(
+    image: UInt8[np.ndarray, "height width"] | UInt8[np.ndarray, "height width 3"],
+    dictionary: str = "4x4_1000",
+) -> DetectedMarkers:
+    """ArUco markers in an image, with corners to a tenth of a pixel.
+
+    Args:
+        image: grey, or BGR as OpenCV reads it.
+        dictionary: name of the markers' dictionary.
+
+    Raises:
+        SettingsError: there is no dictionary of this name.
+    """
+    import cv2
+
+    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    return MarkerDetector(dictionary).detect(np.asarray(grey, np.uint8))
+
+
+def background_model(settings: ForegroundSettings | None = None) -> Mog2:
+    """The background model of this package, MOG2 (Zivkovic 2004), with given or default settings."""
+    return Mog2(ForegroundSettings() if settings is None else settings)

@@ -1,0 +1,96 @@
+"""`import psotrack as pt`: what it offers, that it is lazy, and that the README's example runs on it."""
+
+import inspect
+import subprocess
+import sys
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pytest
+
+import psotrack as pt
+from psotrack.errors import SettingsError
+from psotrack.geometry import project_boxes
+from psotrack.silhouettes import ForegroundSettings
+from psotrack.support import short_repr
+from psotrack.tracking import SoftIoU, camera_weights, foreground_and_area, tracker_settings
+
+
+def test_every_name_is_there_and_documented():
+    assert 30 <= len(pt.__all__) <= 45
+    for name in pt.__all__:
+        value = getattr(pt, name)
+        if inspect.isclass(value) or inspect.isfunction(value):
+            assert len(value.__doc__) > 30, name
+        assert name in pt.__doc__, name
+
+
+def test_importing_loads_nothing_heavy():
+    code = "import sys, psotrack; print(sorted({'jax', 'cv2', 'pandas', 'zarr', 'scipy', 'numpy'} & set(sys.modules)))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+def test_markers_in_an_image_in_grey_or_colour():
+    image = np.full((400, 400), 255, np.uint8)
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    image[100:300, 100:300] = cv2.aruco.generateImageMarker(dictionary, 7, 200)
+    for one in (image, cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)):
+        seen = pt.detect_markers(one, "4x4_50")
+        assert seen.ids.tolist() == [7]
+
+
+def test_the_background_model_sees_what_is_new():
+    rng = np.random.default_rng(0)
+    empty = [rng.normal(100, 1, (48, 64, 3)).clip(0, 255).astype(np.uint8) for _ in range(20)]
+    drone = empty[0].copy()
+    drone[10:30, 20:40] = 10
+    model = pt.background_model(ForegroundSettings(working_reduction=1, min_blob_px=0))
+    assert isinstance(model, pt.BackgroundModel)
+    (mask,) = model.foreground(empty, [drone])
+    assert (mask[12:28, 22:38] > 0).all()
+    assert (mask[35:, :] == 0).all()
+
+
+def test_a_repr_fits_a_terminal():
+    frames = np.arange(5000)
+    trajectories = pt.Trajectories(frames, frames / 25, ("a", "b"), np.zeros((5000, 2, 3)))
+    lines = repr(trajectories).splitlines()
+    assert len(lines) < 15
+    assert max(map(len, lines)) <= 100
+    assert "float64 (5000, 2, 3)" in repr(trajectories)
+
+    @dataclass(frozen=True, repr=False)
+    class Long:
+        text: str
+        __repr__ = short_repr
+
+    assert len(repr(Long(1000 * "x"))) < 100
+
+
+@dataclass(frozen=True)
+class Dice:
+    """A score of one's own: twice the foreground in the box, over the box and the foreground around it."""
+
+    ring: float = 1.5
+    whole_pixels: bool = False
+    min_cameras: int = 2
+
+    def camera_scores(self, inputs, position_m):
+        boxes = project_boxes(inputs.extents, position_m)
+        foreground, area = foreground_and_area(inputs, boxes, (1.0, self.ring))
+        score = 2 * foreground[0] / (area[0] + foreground[1] + 1e-6)
+        return score.clip(0, 1), camera_weights(inputs, boxes)
+
+
+def test_scores_are_interchangeable():
+    for score in (Dice(), SoftIoU()):
+        assert isinstance(score, pt.Score)
+        assert hash(score) == hash(type(score)())
+
+
+@pytest.mark.parametrize("settings", [{"swarm.search": "annealing"}, {"score.kind": "dice"}])
+def test_an_unknown_plugin_is_one_line(settings):
+    with pytest.raises(SettingsError, match=r"expected one of .*, found (annealing|dice)"):
+        tracker_settings(pt.TrackSettings().changed(settings))
