@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from psotrack.geometry import Rig
-from psotrack.initiation import find_candidates
+from psotrack.initiation import KnownDrones, find_candidates
 from psotrack.initiation.initialisation import find_drones
 from psotrack.silhouettes import find_blobs, stack_blobs
 
@@ -51,14 +51,12 @@ def start_of(coverage, rig=SMALL, reduction=REDUCTION):
     )
 
 
-def newcomers_in(coverage, *known_m, rig=SMALL, reduction=REDUCTION):
+def candidates_in(coverage, *known_m, rig=SMALL, reduction=REDUCTION):
     known = np.stack(known_m, axis=1) if known_m else np.empty((len(coverage), 0, 3))
     return find_candidates(
         rig.cameras,
         coverage,
-        known,
-        np.ones(known.shape[:2], bool),
-        np.broadcast_to(SIZE_M, (len(known_m), 3)),
+        KnownDrones(known, np.ones(known.shape[:2], bool), np.broadcast_to(SIZE_M, (len(known_m), 3))),
         reduction=reduction,
         fps=FPS,
         bounds_m=ROOM_M,
@@ -110,12 +108,12 @@ def test_drones_of_a_few_cells_are_found_at_the_start(both):
 @pytest.mark.parametrize("times", [1, 2])
 def test_drones_of_a_few_cells_are_found_when_they_come(both, times):
     """A bug of the first version: newcomers were looked for at half the size, of which a small drone is a cell."""
-    found = newcomers_in(both, ONE, rig=magnified(SMALL, times), reduction=times * REDUCTION)
+    found = candidates_in(both, ONE, rig=magnified(SMALL, times), reduction=times * REDUCTION)
     assert_found([one.position_m for one in found], OTHER[found[0].frame], atol=CELL_M / 2)
 
 
 def test_known_drones_of_a_few_cells_leave_nobody(both):
-    assert newcomers_in(both, ONE, OTHER) == ()
+    assert candidates_in(both, ONE, OTHER) == ()
 
 
 def thinned(coverage, share, seed=0):
@@ -128,7 +126,7 @@ def test_a_silhouette_full_of_holes_is_a_drone(seed):
     """A bug of the first version: a camera that showed less than a quarter of the drone was said not to see it."""
     rig = ring_rig(6, image_size_wh=(240, 180))
     coverage = thinned(drawn(OTHER, rig=rig), 0.22, seed)
-    found = newcomers_in(coverage, rig=rig)
+    found = candidates_in(coverage, rig=rig)
     assert_found([one.position_m for one in found], OTHER[found[0].frame], atol=CELL_M / 2)
 
 
@@ -139,4 +137,4 @@ def test_noise_everywhere_is_nobody(seed):
     noise = 255 * (rng.random((25, 6, 45, 60)) < 0.03).astype(np.uint8)
     rig = ring_rig(6, image_size_wh=(120, 90))
     assert len(start_of(noise[:10], rig).position_m) == 0
-    assert newcomers_in(noise, rig=rig) == ()
+    assert candidates_in(noise, rig=rig) == ()

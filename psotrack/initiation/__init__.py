@@ -1,7 +1,7 @@
-"""Track initiation: where are drones that no track explains, and were they tracked before.
+"""Track initiation and re-identification: find drones that have no track, and find lost drones again.
 
 In: silhouettes, the rig, and the tracks so far. Out: the initial state of the drones in frame 0, candidates for new
-tracks in each chunk of frames, and which lost track each candidate continues.
+tracks in each chunk of frames, and the assignment of candidates to lost tracks.
 """
 
 import lazy_loader

@@ -7,7 +7,7 @@ from .initial_state import (
     start_source,
 )
 from .initialisation import FLOOR_CLEARANCE_M, InitialState
-from .new_tracks import TrackCandidate, find_candidates
+from .new_tracks import KnownDrones, TrackCandidate, find_candidates
 from .reidentification import (
     NEW,
     SPEED_SHARE,
@@ -24,6 +24,7 @@ __all__ = [
     "NEW",
     "SPEED_SHARE",
     "InitialState",
+    "KnownDrones",
     "LostTracks",
     "PlannedStarts",
     "StartSource",

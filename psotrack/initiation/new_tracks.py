@@ -1,11 +1,11 @@
-"""Drones that the tracks of a chunk of frames do not explain: a newcomer is a place for the tracker to begin at.
+"""Track initiation: find drones without a track in a chunk of frames.
 
-Where unexplained foreground agrees over three or more viewpoints it is followed through the chunk, and is a newcomer if
-it behaves as a drone does: it stays, it moves no faster than one, it is as large as one, it is clear of the floor and
-of all known drones, and hardly a camera that ought to see it does not.
+A place where at least three viewpoints show residual foreground is followed through the chunk. It becomes a track
+candidate if it behaves like a drone: it persists, its speed and its size are a drone's, it keeps a distance to the
+floor and to all known drones, and nearly all cameras that should see it do see it.
 
-A drone that is found a second late leaves a gap; one that does not exist stays for the rest of the video. So every rule
-errs on the side of no newcomer.
+A drone that is found a second late costs a short gap, but a false track may last to the end of the video. So each rule
+prefers to miss a candidate.
 """
 
 from __future__ import annotations
@@ -19,45 +19,60 @@ from jaxtyping import Bool, Float, UInt8
 from psotrack.geometry import Camera, match_views, project, viewpoints
 from psotrack.initiation.initialisation import FLOOR_CLEARANCE_M, InitialState, find_drones
 from psotrack.initiation.residual_foreground import (
-    NOTHING,
-    Glance,
-    Known,
-    Rest,
+    NOT_FOUND,
+    Observation,
+    ProjectedDrones,
+    ResidualForeground,
     SearchVolume,
-    both,
-    glance,
-    known,
-    rest,
+    observe,
+    project_drones,
+    subtract_drones,
 )
 from psotrack.silhouettes import LEAST_RADIUS_CELLS, find_blobs
 
-#: Of so many frames in a row, a newcomer must be seen in so many.
-OF_FRAMES, MIN_FRAMES = 10, 8
-#: Over so many frames in which nothing is seen a newcomer is followed.
+#: A candidate must be found in at least `MIN_FRAMES` of `WINDOW_FRAMES` consecutive frames.
+WINDOW_FRAMES, MIN_FRAMES = 10, 8
+#: Largest number of consecutive frames in which a followed place is not found.
 MAX_GAP = 5
-#: Its foreground is nowhere spread out by more than this, as a mean square, while it is followed.
+#: Largest ratio by which the spread of the foreground may grow while a place is followed.
 MAX_GROWTH = 1.5
-#: Every so many frames one is searched for newcomers: whatever is there for `OF_FRAMES` is met.
+#: Distance between two frames that are searched, frames; less than `WINDOW_FRAMES`, so that no candidate is missed.
 SEARCH_STEP = 8
-#: A newcomer is at most so many times smaller or larger than the known drones; or of such a span, if none is known.
+#: Largest ratio between the spans of a candidate and of the known drones; limits of the span without known drones.
 SIZE_RATIO, SPANS_M = 2.0, (0.1, 1.5)
-#: What moves by less than this share of its span within `OF_FRAMES` stands still.
+#: A candidate that moves by less than this share of its span within `WINDOW_FRAMES` stands still.
 MIN_TRAVEL = 0.04
-#: What goes farther than this share of its span has come from elsewhere.
-MIN_WAY = 0.5
+#: A candidate moves if its last place is farther from its first than this share of its span.
+MIN_DISPLACEMENT = 0.5
+
+
+@dataclass(frozen=True)
+class KnownDrones:
+    """Drones that were tracked in a chunk.
+
+    Attributes:
+        position_m: (frames, drones, 3), positions; any value, NaN included, where the drone does not explain
+            foreground.
+        explains: (frames, drones), whether the position is good enough to explain foreground.
+        size_m: (drones, 3), full lengths along the world's axes.
+    """
+
+    position_m: Float[np.ndarray, "frames drones 3"]
+    explains: Bool[np.ndarray, "frames drones"]
+    size_m: Float[np.ndarray, "drones 3"]
 
 
 @dataclass(frozen=True)
 class TrackCandidate:
-    """A drone that no track explains.
+    """A drone without a track.
 
     Attributes:
-        frame: of the chunk, the first in which it is there.
-        position_m, velocity_m_s: (3,), in that frame.
+        frame: first frame in which the drone is found, counted from the chunk's first frame.
+        position_m, velocity_m_s: (3,), position and velocity in this frame.
         size_m: (3,), full lengths along the world's axes.
-        num_cameras: that see it in that frame.
-        moves: whether it changes its place. What does not may be a hole in the background, where a drone stood while
-            the background was learned.
+        num_cameras: number of cameras that see the drone in this frame.
+        moves: whether the drone moves. A candidate that does not move may be a ghost: foreground at a place where a
+            drone stood while the background was learned.
     """
 
     frame: int
@@ -71,80 +86,82 @@ class TrackCandidate:
 def find_candidates(
     cameras: Camera,
     coverage: UInt8[np.ndarray, "frames cameras height width"],
-    position_m: Float[np.ndarray, "frames drones 3"],
-    explains: Bool[np.ndarray, "frames drones"],
-    size_m: Float[np.ndarray, "drones 3"],
+    known: KnownDrones,
     *,
     reduction: int,
     fps: float,
     bounds_m: Float[np.ndarray, "2 3"],
     max_speed_m_s: float,
 ) -> tuple[TrackCandidate, ...]:
-    """Drones in a chunk of frames that are none of those that were tracked in it.
+    """Find drones in a chunk of frames that are none of the known drones.
 
     Args:
-        cameras: with one leading axis, of the image (not reduced).
-        coverage: (frames, cameras, height, width), silhouettes.
-        position_m: (frames, drones, 3), of the known drones; any value, NaN too, where they explain nothing.
-        explains: (frames, drones), where a known drone is known well enough to explain foreground.
-        size_m: (drones, 3), of the known drones, full lengths along the world's axes.
+        cameras: cameras with one leading axis, for the full image.
+        coverage: (frames, cameras, height, width), silhouettes of the chunk.
+        known: drones that were tracked in the chunk.
         reduction: image pixels per silhouette pixel, along each side.
         fps: frames per second.
         bounds_m: (2, 3), corners of the room; its lowest z is the floor, on which shadows lie.
-        max_speed_m_s: of a drone.
+        max_speed_m_s: largest speed of a drone.
 
     Returns:
-        None in a chunk of fewer than `OF_FRAMES` frames.
+        Candidates; an empty tuple for a chunk of fewer than `WINDOW_FRAMES` frames.
     """
     clear_m = bounds_m + np.array([[0.0, 0.0, FLOOR_CLEARANCE_M], [0.0, 0.0, 0.0]])
-    spans_m = _spans(size_m)
-    room = SearchVolume(cameras, viewpoints(cameras), clear_m, reduction)
-    drones = known(room, np.where(explains[..., None], position_m, np.nan), size_m)
+    spans_m = _span_limits(known.size_m)
+    volume = SearchVolume(cameras, viewpoints(cameras), clear_m, reduction)
+    explaining_m = np.where(known.explains[..., None], known.position_m, np.nan)
+    drones = project_drones(volume, explaining_m, known.size_m)
     find = partial(
         find_drones, cameras, reduction=reduction, fps=fps, bounds_m=bounds_m, max_speed_m_s=max_speed_m_s
     )
     found: list[TrackCandidate] = []
-    paths: list[list[Glance]] = []
-    for frame in range(0, len(coverage) - OF_FRAMES + SEARCH_STEP, SEARCH_STEP):
-        proposals = _proposals(room, rest(coverage[frame], drones, frame), spans_m)
-        beside = _beside(frame, len(coverage))
-        there = _proposals(room, rest(coverage[beside], drones, beside), spans_m) if proposals else []
+    paths: list[list[Observation]] = []
+    for frame in range(0, len(coverage) - WINDOW_FRAMES + SEARCH_STEP, SEARCH_STEP):
+        proposals = _propose_places(volume, subtract_drones(coverage[frame], drones, frame), spans_m)
+        next_frame = frame + 1 if frame + 1 < len(coverage) else frame - 1
+        next_places = (
+            _propose_places(volume, subtract_drones(coverage[next_frame], drones, next_frame), spans_m)
+            if proposals
+            else []
+        )
         for place, size in proposals:
-            shift = (beside - frame) * _shift(place, size, there, max_speed_m_s / fps)
-            path = _followed(room, coverage, drones, frame, place, size, shift)
-            newcomer = _judged(path, size, fps, max_speed_m_s)
-            if newcomer is not None and newcomer.moves:
-                # One frame with known drones beside it says little of the size, which says what foreground is its own.
-                best = _best_seen(path)
-                size = _size(find(coverage[best : best + OF_FRAMES]), path[best], size)
-                path = _followed(room, coverage, drones, frame, path[frame].position_m, size, shift)
-                newcomer = _judged(path, size, fps, max_speed_m_s)
-            if newcomer is None or not spans_m[0] <= size.max() <= spans_m[1]:
+            shift = (next_frame - frame) * _nearest_shift(place, size, next_places, max_speed_m_s / fps)
+            path = _follow_place(volume, coverage, drones, frame, place, size, shift)
+            candidate = _make_candidate(path, size, fps, max_speed_m_s)
+            if candidate is not None and candidate.moves:
+                # The size decides what foreground is the drone's own, and a single frame in which known drones are near
+                # gives a poor size. So measure the size again, in the frames with most cameras.
+                best = _best_window(path)
+                size = _nearest_size(find(coverage[best : best + WINDOW_FRAMES]), path[best], size)
+                path = _follow_place(volume, coverage, drones, frame, path[frame].position_m, size, shift)
+                candidate = _make_candidate(path, size, fps, max_speed_m_s)
+            if candidate is None or not spans_m[0] <= size.max() <= spans_m[1]:
                 continue
-            if any(_continues(path, earlier, max_speed_m_s / fps) for earlier in paths):
+            if any(_is_continuation(path, earlier, max_speed_m_s / fps) for earlier in paths):
                 continue
             paths.append(path)
-            found.append(newcomer)
-            drones = both(drones, known(room, _places(path)[:, None], size[None]))
+            found.append(candidate)
+            drones = drones.join(project_drones(volume, _places(path)[:, None], size[None]))
     return tuple(found)
 
 
-def _proposals(
-    room: SearchVolume, left: Rest, spans_m: tuple[float, float]
+def _propose_places(
+    volume: SearchVolume, residual: ResidualForeground, spans_m: tuple[float, float]
 ) -> list[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]]:
-    """Places in a frame where three viewpoints have foreground of a drone's size, and that size."""
-    cameras = room.cameras
-    corners = np.stack(np.meshgrid(*room.bounds_m.T), axis=-1).reshape(-1, 1, 3)
+    """Places in a frame where three viewpoints show foreground of a drone's size, each with this size."""
+    cameras = volume.cameras
+    corners = np.stack(np.meshgrid(*volume.bounds_m.T), axis=-1).reshape(-1, 1, 3)
     farthest_m = np.linalg.norm(corners - cameras.centre_world, axis=-1).max(axis=0)
     focal_px = np.stack([cameras.K[:, 0, 0], cameras.K[:, 1, 1]], axis=-1)
     least_px = spans_m[0] * focal_px.min(axis=-1) / farthest_m
-    blobs = [find_blobs(image, room.reduction) for image in left.foreground]
-    large = [one.size_px.max(axis=-1) >= least for one, least in zip(blobs, least_px, strict=True)]
-    centre_px = [one.centre_px[keep] for one, keep in zip(blobs, large, strict=True)]
-    size_px = [one.size_px[keep] for one, keep in zip(blobs, large, strict=True)]
-    # The middle of a drone's blob is nearer to its projection than half of the blob's smaller side.
-    radius_px = [np.maximum(size.min(axis=-1) / 2, LEAST_RADIUS_CELLS * room.reduction) for size in size_px]
-    points, support = match_views(cameras, centre_px, radius_px, room.bounds_m)
+    blobs = [find_blobs(image, volume.reduction) for image in residual.foreground]
+    large = [view.size_px.max(axis=-1) >= least for view, least in zip(blobs, least_px, strict=True)]
+    centre_px = [view.centre_px[keep] for view, keep in zip(blobs, large, strict=True)]
+    size_px = [view.size_px[keep] for view, keep in zip(blobs, large, strict=True)]
+    # Half of the blob's smaller side is an upper limit of the distance from its middle to the drone's projection.
+    radius_px = [np.maximum(size.min(axis=-1) / 2, LEAST_RADIUS_CELLS * volume.reduction) for size in size_px]
+    points, support = match_views(cameras, centre_px, radius_px, volume.bounds_m)
     _, depth = project(cameras, points[:, None])
     proposals = []
     for row, point in enumerate(points):
@@ -156,39 +173,45 @@ def _proposals(
     return proposals
 
 
-def _followed(
-    room: SearchVolume,
+def _follow_place(
+    volume: SearchVolume,
     coverage: UInt8[np.ndarray, "frames cameras height width"],
-    drones: Known,
+    drones: ProjectedDrones,
     frame: int,
     position_m: Float[np.ndarray, "3"],
     size_m: Float[np.ndarray, "3"],
     shift_m: Float[np.ndarray, "3"],
-) -> list[Glance]:
-    """What is at a place in a frame, and wherever it is before and after it: a glance for each frame.
+) -> list[Observation]:
+    """Observe a drone in one frame, and follow it to the frames before and after: one observation per frame.
 
-    It moves by about `shift_m` from that frame to the next.
+    Args:
+        volume: the cameras, and the region where drones may be.
+        coverage: (frames, cameras, height, width), silhouettes of the chunk.
+        drones: the known drones.
+        frame: frame in which the drone is at `position_m`.
+        position_m: (3,), place of the drone.
+        size_m: (3,), full lengths of the drone.
+        shift_m: (3,), expected displacement from this frame to the next.
     """
 
-    def look(at: int, place: Float[np.ndarray, "3"]) -> Glance:
-        left = rest(coverage[at], drones, at)
-        return glance(room, left, drones.position_m[at], drones.size_m, place, size_m)
+    def observe_at(at: int, place: Float[np.ndarray, "3"]) -> Observation:
+        residual = subtract_drones(coverage[at], drones, at)
+        return observe(volume, residual, drones.position_m[at], drones.size_m, place, size_m)
 
-    path = [NOTHING] * len(coverage)
-    path[frame] = look(frame, position_m)
+    path = [NOT_FOUND] * len(coverage)
+    path[frame] = observe_at(frame, position_m)
     for step, end in ((1, len(coverage)), (-1, -1)):
         place, shift, last = path[frame].position_m, step * shift_m, frame
-        for at in range(frame + step, end, step) if path[frame].there else ():
+        for at in range(frame + step, end, step) if path[frame].found else ():
             gap = abs(at - last)
-            seen = look(at, place + gap * shift)
-            if seen.there and seen.spread > MAX_GROWTH * path[frame].spread:
-                # A drone and the hole that it leaves are one for a while. What comes apart is no place to begin at;
-                # what is left once they are apart is one.
+            seen = observe_at(at, place + gap * shift)
+            if seen.found and seen.spread > MAX_GROWTH * path[frame].spread:
+                # A drone that departs and its ghost are one blob at first. Begin no track before they are apart.
                 if step == 1:
-                    return [NOTHING] * len(path)
+                    return [NOT_FOUND] * len(path)
                 break
-            if seen.there:
-                # The mean of the last shifts: a single one is as noisy as the places.
+            if seen.found:
+                # The mean over the last shifts, because a single shift is as noisy as the places.
                 shift = (shift + (seen.position_m - place) / gap) / 2
                 place, last, path[at] = seen.position_m, at, seen
             elif gap > MAX_GAP:
@@ -196,41 +219,36 @@ def _followed(
     return path
 
 
-def _beside(frame: int, num_frames: int) -> int:
-    """The next frame, or the one before the last."""
-    return frame + 1 if frame + 1 < num_frames else frame - 1
-
-
-def _shift(
+def _nearest_shift(
     place_m: Float[np.ndarray, "3"],
     size_m: Float[np.ndarray, "3"],
-    beside: list[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]],
+    next_places: list[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]],
     reach_m: float,
 ) -> Float[np.ndarray, "3"]:
-    """How far it is to the nearest place beside of about its span; 0 if that is farther than anything moves.
+    """Shift to the nearest place of similar span in the next frame; 0 if it is farther than a drone can move.
 
-    A flat drone that sinks fast is out of its ellipse by the next frame: it must be known where to look for it.
+    A flat drone that sinks fast leaves its ellipse within one frame, so the search in the next frame needs this shift.
     """
     span = size_m.max()
-    alike = [place for place, size in beside if 1 / SIZE_RATIO <= size.max() / span <= SIZE_RATIO]
-    shifts = np.array([place - place_m for place in alike]).reshape(-1, 3)
+    similar = [place for place, size in next_places if 1 / SIZE_RATIO <= size.max() / span <= SIZE_RATIO]
+    shifts = np.array([place - place_m for place in similar]).reshape(-1, 3)
     distance = np.linalg.norm(shifts, axis=-1)
     return shifts[distance.argmin()] if (distance <= reach_m).any() else np.zeros(3)
 
 
-def _judged(
-    path: list[Glance], size_m: Float[np.ndarray, "3"], fps: float, max_speed_m_s: float
+def _make_candidate(
+    path: list[Observation], size_m: Float[np.ndarray, "3"], fps: float, max_speed_m_s: float
 ) -> TrackCandidate | None:
-    """The newcomer, if what was followed is one."""
-    there = np.array([one.there for one in path])
-    for frame in np.flatnonzero(there[: max(len(there) - OF_FRAMES + 1, 0)]).tolist():
-        rows = frame + np.flatnonzero(there[frame : frame + OF_FRAMES])
+    """Make a candidate of a followed place; None if the place does not behave like a drone."""
+    found = np.array([seen.found for seen in path])
+    for frame in np.flatnonzero(found[: max(len(found) - WINDOW_FRAMES + 1, 0)]).tolist():
+        rows = frame + np.flatnonzero(found[frame : frame + WINDOW_FRAMES])
         if len(rows) < MIN_FRAMES:
             continue
         places = _places(path)[rows]
         if np.linalg.norm(places[-1] - places[0]) * fps > max_speed_m_s * (rows[-1] - rows[0]):
             continue
-        # A drone turns within half a second: a straight line would be off by centimetres at its ends.
+        # A drone turns within half a second, and the ends of a straight line would be wrong by centimetres.
         _, velocity, position = np.polyfit((rows - frame) / fps, places, 2)
         return TrackCandidate(
             frame=frame,
@@ -238,49 +256,51 @@ def _judged(
             velocity_m_s=velocity * min(1.0, max_speed_m_s / max(float(np.linalg.norm(velocity)), 1e-9)),
             size_m=size_m,
             num_cameras=path[frame].num_cameras,
-            moves=_moves(_places(path)[there], float(size_m.max())),
+            moves=_is_moving(_places(path)[found], float(size_m.max())),
         )
     return None
 
 
-def _moves(places_m: Float[np.ndarray, "places 3"], span_m: float) -> bool:
-    """Whether it moves at first and at last, or has come from elsewhere.
+def _is_moving(places_m: Float[np.ndarray, "places 3"], span_m: float) -> bool:
+    """Whether a candidate has moved far, or moves both in its first and in its last frames.
 
-    A hole only seems to move, while the drone is still over it, and by a quarter of its span.
+    A ghost seems to move, by a quarter of its span, while the drone that departs still overlaps it.
     """
-    if float(np.linalg.norm(places_m[-1] - places_m[0])) > MIN_WAY * span_m:
+    if float(np.linalg.norm(places_m[-1] - places_m[0])) > MIN_DISPLACEMENT * span_m:
         return True
-    ends = (places_m[:OF_FRAMES], places_m[-OF_FRAMES:])
+    ends = (places_m[:WINDOW_FRAMES], places_m[-WINDOW_FRAMES:])
     return all(float(np.linalg.norm(np.ptp(end, axis=0))) > MIN_TRAVEL * span_m for end in ends)
 
 
-def _places(path: list[Glance]) -> Float[np.ndarray, "frames 3"]:
-    """(frames, 3), NaN where nothing is there."""
-    return np.array([one.position_m if one.there else NOTHING.position_m for one in path])
+def _places(path: list[Observation]) -> Float[np.ndarray, "frames 3"]:
+    """(frames, 3), places along a path; NaN where the drone is not found."""
+    return np.array([seen.position_m if seen.found else NOT_FOUND.position_m for seen in path])
 
 
-def _continues(path: list[Glance], earlier: list[Glance], reach_m: float) -> bool:
-    """Whether one begins where the earlier one has got to by then: a drone that one loses from sight for a while."""
-    begin, end = (np.flatnonzero([one.there for one in each]) for each in (path, earlier))
+def _is_continuation(path: list[Observation], earlier: list[Observation], reach_m: float) -> bool:
+    """Whether a path begins within reach of the end of an earlier path: a drone that was hidden for a while."""
+    begin, end = (np.flatnonzero([seen.found for seen in each]) for each in (path, earlier))
     distance = np.linalg.norm(path[begin[0]].position_m - earlier[end[-1]].position_m)
     return bool(begin[0] > end[-1] and distance <= reach_m * (begin[0] - end[-1]))
 
 
-def _best_seen(path: list[Glance]) -> int:
-    """The frame with which the `OF_FRAMES` begin in which most cameras see it."""
-    seeing = np.array([one.num_cameras * one.there for one in path])
-    total = np.convolve(seeing, np.ones(OF_FRAMES), mode="valid")
-    return int(np.where(seeing[: len(total)] > 0, total, -1).argmax())
+def _best_window(path: list[Observation]) -> int:
+    """First frame of the `WINDOW_FRAMES` frames in which most cameras see the drone."""
+    num_cameras = np.array([seen.num_cameras * seen.found for seen in path])
+    total = np.convolve(num_cameras, np.ones(WINDOW_FRAMES), mode="valid")
+    return int(np.where(num_cameras[: len(total)] > 0, total, -1).argmax())
 
 
-def _size(start: InitialState, at: Glance, size_m: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Size of the drone of the start that is at a place; if there is none, what it was taken to be."""
-    distance = np.linalg.norm(start.position_m - at.position_m, axis=-1)
-    near = np.flatnonzero((distance < size_m.max() / 2) & np.isfinite(start.size_m).all(axis=-1))
-    return start.size_m[near[distance[near].argmin()]] if len(near) else size_m
+def _nearest_size(
+    state: InitialState, seen: Observation, size_m: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3"]:
+    """Size of the drone of an initial state that is at an observed place; `size_m` if there is no such drone."""
+    distance = np.linalg.norm(state.position_m - seen.position_m, axis=-1)
+    near = np.flatnonzero((distance < size_m.max() / 2) & np.isfinite(state.size_m).all(axis=-1))
+    return state.size_m[near[distance[near].argmin()]] if len(near) else size_m
 
 
-def _spans(known_m: Float[np.ndarray, "drones 3"]) -> tuple[float, float]:
-    """Least and largest span of a newcomer."""
+def _span_limits(known_m: Float[np.ndarray, "drones 3"]) -> tuple[float, float]:
+    """Smallest and largest span of a candidate, given the sizes of the known drones."""
     spans = known_m.max(axis=-1)
     return (float(spans.min()) / SIZE_RATIO, float(spans.max()) * SIZE_RATIO) if len(spans) else SPANS_M

@@ -1,9 +1,9 @@
-"""Drones that are lost and come back: who a newcomer is, and where the tracker begins it.
+"""Re-identification: assign track candidates to lost drones, and plan where the tracker starts their tracks.
 
-A newcomer is one of the lost drones where time, motion and size allow it, and else is born. A drone that stood still
-when it vanished is most probably still there: it has landed, or the background model has swallowed it. When such a
-drone flies off, the place where it stood becomes foreground, a hole in the background that does not move; what flew off
-from there is the drone, even if the hole is taken for it by then.
+A candidate is a lost drone if time, motion and size agree, and else a new drone. A drone that stood still when it was
+lost is most probably still there: it has landed, or the background model has learned it. When such a drone departs, its
+place becomes foreground that does not move, a ghost. The candidate that departs from this place is the drone, even if
+the drone's track follows the ghost by then.
 """
 
 from __future__ import annotations
@@ -15,49 +15,52 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
 from psotrack.initiation.new_tracks import TrackCandidate
-from psotrack.initiation.ornstein_uhlenbeck import POSITION_STD_M, log_normal, log_wandered
+from psotrack.initiation.ornstein_uhlenbeck import POSITION_STD_M, log_normal, log_transition
 
-#: In an assignment: a drone that was not there before.
+#: Value of an assignment: the candidate is a new drone.
 NEW = -1
-#: In an assignment: no drone, as far as one can tell.
-NOBODY = -2
+#: Value of an assignment: the candidate is no drone, or nothing shows that it is one.
+NO_DRONE = -2
 
-#: The standard deviation of a drone's velocity along each axis, as a share of its largest speed.
+#: Standard deviation of a drone's velocity along each axis, as a share of the largest speed.
 SPEED_SHARE = 1 / 3
-#: How well spans are measured (of their logarithm), and what spans there are.
+#: Standard deviation of the logarithm of a measured span, and smallest and largest span of a drone.
 SPAN_STD, SPANS_M = 0.2, (0.1, 1.5)
-#: A drone that was slower when it vanished stood still, and as likely as this it stays until it is seen to fly off: it
-#: vanished in front of the cameras, and flown off it would be foreground.
+#: A drone that was slower than this when it was lost stood still. It stayed there with this probability, because a
+#: drone that departs in front of the cameras would be foreground.
 STILL_M_S, STAYED_PROBABILITY = 0.2, 0.99
-#: Its speed is that over its last so many seconds, or so many: half swallowed, it seems to creep away.
+#: Durations before the loss over which the speed is measured, seconds. A drone that the background model is learning
+#: seems to creep, so it stood still if it was slow over one of them.
 STILL_S = (1.0, 0.5)
-#: What was so many spans from there, or had been within the last seconds, stayed or flew off from there.
-STAYED_SPANS, FLOWN_OFF_S = 0.6, 0.6
-#: How much likelier a newcomer is a new drone than one that may be anywhere by now; if it does not move, no drone.
+#: A candidate stayed at a place, or departed from it, if it is nearer than this number of spans, or was within the last
+#: seconds.
+STAYED_SPANS, DEPARTURE_S = 0.6, 0.6
+#: Odds of a new drone against a lost drone that may be anywhere, and of no drone if the candidate does not move.
 NEW_ODDS, NO_DRONE_ODDS = 0.1, 10.0
-#: Two drones whose middles are nearer than so much of their size, along every axis, are in the same place.
+#: Two drones are at the same place if their distance along every axis is below this share of their mean size.
 SAME_PLACE = 0.5
-#: A drone that was tracked for so long while the newcomer was there is another one; less, and its track was failing.
+#: Longest time for which a lost drone may be tracked while the candidate is there, seconds; after a longer time they
+#: are two drones, after a shorter time the track was failing.
 MAX_OVERLAP_S = 0.4
-#: Beyond reach is farther than a drone can fly, and so many standard deviations of the place.
+#: A candidate is out of reach if it is farther than a drone can fly plus this number of standard deviations.
 REACH_SIGMAS = 5.0
 
-#: Logarithms for an assignment: beyond reach, less than that, ruled out.
-_UNREACHABLE, _UNKNOWN_BUT_PINNED, _NEVER = -1e6, -1e7, -1e9
+#: Log likelihoods of the assignment: out of reach; new drone while no new drone is allowed; impossible.
+_UNREACHABLE, _NEW_NOT_ALLOWED, _IMPOSSIBLE = -1e6, -1e7, -1e9
 
 
 @dataclass(frozen=True)
 class LostTracks:
-    """Drones that may come back, as they were when last seen before the end of a chunk.
+    """Drones that may be found again, in their last state before the end of a chunk.
 
     Attributes:
-        drone: (lost,), which of all drones.
-        position_m, velocity_m_s: (lost, 3), when last seen; of a drone that stood still, where it stood, and 0.
-        seconds: (lost,), from then to the first frame of the chunk; below 0 if that was within the chunk.
+        drone: (lost,), index of the drone.
+        position_m, velocity_m_s: (lost, 3), state when last seen; for a drone that stood still, its place and 0.
+        seconds: (lost,), time from then to the chunk's first frame; negative if the drone was lost within the chunk.
         size_m: (lost, 3), full lengths along the world's axes.
-        doubtful: (lost,), whether it is tracked again, but only where it had vanished, and has not moved since: that
-            may be the hole that it left. Such a drone comes back only as what flew off from there.
-        left_m: (places, 3), where any drone ever stood when it vanished: where it is no more there may be a hole.
+        doubtful: (lost,), whether the drone is tracked again, but only at the place where it was lost, without moving
+            since. This track may follow a ghost. Such a drone is only assigned to a candidate that departs from there.
+        left_m: (places, 3), all places where drones stood still when they were lost. There may be ghosts.
     """
 
     drone: Int[np.ndarray, "lost"]
@@ -71,12 +74,12 @@ class LostTracks:
 
 @dataclass(frozen=True)
 class PlannedStarts:
-    """Where in a chunk the tracker begins drones; those that are born come after the known ones.
+    """Initial states of tracks that start in a chunk; new drones come after the known drones.
 
     Attributes:
-        begin_frame: (drones,), of the chunk; -1 where a drone goes on as it was.
-        begin_position_m, begin_velocity_m_s: (drones, 3), in that frame; 0 where a drone goes on.
-        born_size_m: (born, 3), full lengths of those that are born.
+        begin_frame: (drones,), frame of the chunk in which the track starts; -1 where a track continues.
+        begin_position_m, begin_velocity_m_s: (drones, 3), state in this frame; 0 where a track continues.
+        born_size_m: (born, 3), full lengths of the new drones.
     """
 
     begin_frame: Int[np.ndarray, "drones"]
@@ -90,28 +93,28 @@ def find_false_tracks(
     tracked: Bool[np.ndarray, "frames drones"],
     size_m: Float[np.ndarray, "drones 3"],
 ) -> Bool[np.ndarray, "drones"]:
-    """Tracks that are of no drone: they never moved, and a drone that did was where they stand.
+    """Find false tracks, which follow ghosts: tracks that never moved, at a place where a moving drone was.
 
-    A drone that lands and stays for most of a video is background from the first frame on: until it lands, and when it
-    has taken off, its place is foreground that looks like a drone.
+    If a drone lands and stays for most of a video, the background model learns it. Before it lands and after it
+    departs, its place is foreground that looks like a drone.
 
     Args:
-        position_m: (frames, drones, 3), from the first frame of the video.
-        tracked: (frames, drones), whether a drone was found, not only predicted.
+        position_m: (frames, drones, 3), positions from the first frame of the video.
+        tracked: (frames, drones), whether the drone was found, and not only predicted.
         size_m: (drones, 3), full lengths along the world's axes.
     """
     found_m = np.where(tracked[..., None], position_m, np.nan)
-    never_moved, taken = np.zeros((2, len(size_m)), bool)
+    never_moved, is_false = np.zeros((2, len(size_m)), bool)
     for drone in np.flatnonzero(tracked.any(axis=0)).tolist():
-        never_moved[drone] = _within_its_place(found_m[tracked[:, drone], drone], size_m[drone])
+        never_moved[drone] = _stayed(found_m[tracked[:, drone], drone], size_m[drone])
     for drone in np.flatnonzero(never_moved).tolist():
         reach_m = SAME_PLACE * (size_m + size_m[drone]) / 2
-        apart = np.linalg.norm((found_m - np.nanmedian(found_m[:, drone], axis=0)) / reach_m, axis=-1)
-        taken[drone] = bool((apart[:, ~never_moved] < 1).any())
-    return taken
+        distance = np.linalg.norm((found_m - np.nanmedian(found_m[:, drone], axis=0)) / reach_m, axis=-1)
+        is_false[drone] = bool((distance[:, ~never_moved] < 1).any())
+    return is_false
 
 
-def _within_its_place(position_m: Float[np.ndarray, "frames 3"], size_m: Float[np.ndarray, "3"]) -> bool:
+def _stayed(position_m: Float[np.ndarray, "frames 3"], size_m: Float[np.ndarray, "3"]) -> bool:
     return float(np.linalg.norm(np.ptp(position_m, axis=0))) < STAYED_SPANS * float(size_m.max())
 
 
@@ -124,13 +127,13 @@ def find_lost_tracks(
     chunk_frames: int,
     fps: float,
 ) -> LostTracks:
-    """The drones that may come back at the end of a chunk. Holes do not.
+    """Find the drones that are lost at the end of a chunk and may be found again; false tracks are left out.
 
     Args:
-        position_m, velocity_m_s: (frames, drones, 3), from the first frame of the video to the last of the chunk.
-        tracked: (frames, drones), whether a drone was found, not only predicted.
+        position_m, velocity_m_s: (frames, drones, 3), states from the video's first frame to the chunk's last.
+        tracked: (frames, drones), whether the drone was found, and not only predicted.
         size_m: (drones, 3), full lengths along the world's axes.
-        chunk_frames: so many of the frames are the chunk's.
+        chunk_frames: number of frames of the chunk, which are the last of the frames.
         fps: frames per second.
     """
     drones, last, places, velocities, doubtful, left = [], [], [], [], [], []
@@ -138,19 +141,19 @@ def find_lost_tracks(
         tracked.any(axis=0) & ~find_false_tracks(position_m, tracked, size_m)
     ).tolist():
         seen = np.flatnonzero(tracked[:, drone])
-        vanished = seen[np.flatnonzero(np.diff(seen, append=len(tracked)) > 1)]
-        if not len(vanished):
+        losses = seen[np.flatnonzero(np.diff(seen, append=len(tracked)) > 1)]
+        if not len(losses):
             continue
-        stood = [_stood(position_m[:, drone], seen[seen <= end], fps) for end in vanished.tolist()]
-        left += [place for place in stood if place is not None]
-        still = _within_its_place(position_m[seen[seen >= vanished[-1]], drone], size_m[drone])
-        there_now = bool(tracked[-1, drone])
-        if still or not there_now:
+        standing = [_standing_place(position_m[:, drone], seen[seen <= end], fps) for end in losses.tolist()]
+        left += [place for place in standing if place is not None]
+        stayed = _stayed(position_m[seen[seen >= losses[-1]], drone], size_m[drone])
+        tracked_now = bool(tracked[-1, drone])
+        if stayed or not tracked_now:
             drones.append(drone)
-            last.append(vanished[-1])
-            places.append(position_m[vanished[-1], drone] if stood[-1] is None else stood[-1])
-            velocities.append(velocity_m_s[vanished[-1], drone] if stood[-1] is None else np.zeros(3))
-            doubtful.append(there_now)
+            last.append(losses[-1])
+            places.append(position_m[losses[-1], drone] if standing[-1] is None else standing[-1])
+            velocities.append(velocity_m_s[losses[-1], drone] if standing[-1] is None else np.zeros(3))
+            doubtful.append(tracked_now)
     columns = np.array(drones, int)
     return LostTracks(
         drone=columns,
@@ -163,10 +166,10 @@ def find_lost_tracks(
     )
 
 
-def _stood(
+def _standing_place(
     position_m: Float[np.ndarray, "frames 3"], seen: Int[np.ndarray, "seen"], fps: float
 ) -> Float[np.ndarray, "3"] | None:
-    """Where a drone stood when it was last seen; None if it moved."""
+    """Place of a drone that stood still when it was last seen; None if it moved."""
     for seconds in STILL_S:
         recent = seen[seen >= seen[-1] - seconds * fps]
         moved_m = float(np.linalg.norm(np.ptp(position_m[recent], axis=0)))
@@ -176,89 +179,90 @@ def _stood(
 
 
 def reidentify(
-    newcomers: tuple[TrackCandidate, ...],
+    candidates: tuple[TrackCandidate, ...],
     lost: LostTracks,
     *,
     fps: float,
     bounds_m: Float[np.ndarray, "2 3"],
     max_speed_m_s: float,
     max_births: int | None = None,
-) -> Int[np.ndarray, "newcomers"]:
-    """Which newcomer is which lost drone: the assignment of the largest likelihood.
+) -> Int[np.ndarray, "candidates"]:
+    """Assign candidates to lost drones with the largest total likelihood.
 
-    A drone's velocity wanders (see `wandering`): over a short gap it is expected where it was heading, over a long one
-    anywhere within reach. If it stood, it most probably stayed there. The alternative is a drone that nobody knows,
-    anywhere in the room.
+    A drone's velocity is an Ornstein-Uhlenbeck process (see `ornstein_uhlenbeck`): after a short gap a drone is
+    expected on its course, after a long gap anywhere within reach. A drone that stood still most probably stayed. The
+    alternative is a new drone anywhere in the room.
 
     Args:
-        newcomers: of a chunk.
-        lost: drones that may come back, seen from the same chunk.
+        candidates: candidates of a chunk.
+        lost: drones that may be found again, from the same chunk.
         fps: frames per second.
         bounds_m: (2, 3), corners of the room.
-        max_speed_m_s: of a drone.
-        max_births: so many drones may be new; None is any number. If it is 0, a newcomer that moves is a lost drone
-            even where that is unlikely.
+        max_speed_m_s: largest speed of a drone.
+        max_births: largest number of new drones; None for any number. If it is 0, a candidate that moves is assigned to
+            a lost drone even if that is unlikely.
 
     Returns:
-        (newcomers,), a row of `lost`, or `NEW`, or `NOBODY`. What does not move is never new; nor is what hardly does
-        where a drone has stood.
+        (candidates,), a row of `lost`, or `NEW`, or `NO_DRONE`. A candidate that does not move is never new; neither is
+        a slow candidate at a place where a drone stood still.
     """
     count = len(lost.drone)
     log_volume = float(np.log(np.prod(bounds_m[1] - bounds_m[0])))
-    holes = [any(_flew_off(other, one) for other in newcomers) for one in newcomers]
-    new = [
-        one.moves and not hole and not _left(one, lost) for one, hole in zip(newcomers, holes, strict=True)
+    is_ghost = [any(_departs_from(other, one) for other in candidates) for one in candidates]
+    may_be_new = [
+        one.moves and not ghost and not _is_dying_ghost(one, lost)
+        for one, ghost in zip(candidates, is_ghost, strict=True)
     ]
-    scores = np.full((len(newcomers), count + len(newcomers)), _NEVER)
-    for row, newcomer in enumerate(newcomers):
-        log_anywhere = log_normal(newcomer.velocity_m_s, (SPEED_SHARE * max_speed_m_s) ** 2) - log_volume
-        odds = NEW_ODDS if newcomer.moves else NO_DRONE_ODDS
-        unknown = log_anywhere + np.log(odds / np.log(SPANS_M[1] / SPANS_M[0]))
-        scores[row, count + row] = _UNKNOWN_BUT_PINNED if newcomer.moves and max_births == 0 else unknown
-        for column in range(0 if holes[row] else count):
+    scores = np.full((len(candidates), count + len(candidates)), _IMPOSSIBLE)
+    for row, candidate in enumerate(candidates):
+        log_anywhere = log_normal(candidate.velocity_m_s, (SPEED_SHARE * max_speed_m_s) ** 2) - log_volume
+        odds = NEW_ODDS if candidate.moves else NO_DRONE_ODDS
+        log_new = log_anywhere + np.log(odds / np.log(SPANS_M[1] / SPANS_M[0]))
+        scores[row, count + row] = _NEW_NOT_ALLOWED if candidate.moves and max_births == 0 else log_new
+        for column in range(0 if is_ghost[row] else count):
             scores[row, column] = _log_likelihood(
-                newcomer, lost, column, fps, log_anywhere, max_speed_m_s, bounds_m
+                candidate, lost, column, fps, log_anywhere, max_speed_m_s, bounds_m
             )
-    chosen = np.full(len(newcomers), NOBODY)
+    chosen = np.full(len(candidates), NO_DRONE)
     births = 0
     for row, column in zip(
         *(each.tolist() for each in linear_sum_assignment(scores, maximize=True)), strict=True
     ):
         if column < count:
             chosen[row] = column
-        elif new[row] and (max_births is None or births < max_births):
+        elif may_be_new[row] and (max_births is None or births < max_births):
             chosen[row] = NEW
             births += 1
     return chosen
 
 
 def plan_starts(
-    newcomers: tuple[TrackCandidate, ...],
-    assignment: Int[np.ndarray, "newcomers"],
+    candidates: tuple[TrackCandidate, ...],
+    assignment: Int[np.ndarray, "candidates"],
     lost: LostTracks,
     num_drones: int,
 ) -> PlannedStarts:
-    """Where the tracker begins the newcomers of a chunk.
+    """Plan where the tracker starts the tracks of a chunk's candidates.
 
     Args:
-        newcomers: of the chunk.
-        assignment: (newcomers,), from `reidentify`.
-        lost: what it refers to.
-        num_drones: that the tracker has so far.
+        candidates: candidates of the chunk.
+        assignment: (candidates,), from `reidentify`.
+        lost: the lost drones to which the assignment refers.
+        num_drones: number of drones that the tracker has so far.
     """
     again, born = np.flatnonzero(assignment >= 0), np.flatnonzero(assignment == NEW)
     drones = np.concatenate([lost.drone[assignment[again]], num_drones + np.arange(len(born))])
     begin_frame = np.full(num_drones + len(born), -1)
     position, velocity = np.zeros((2, num_drones + len(born), 3))
     for drone, row in zip(drones.tolist(), [*again.tolist(), *born.tolist()], strict=True):
-        begin_frame[drone] = newcomers[row].frame
-        position[drone], velocity[drone] = newcomers[row].position_m, newcomers[row].velocity_m_s
-    sizes = np.array([newcomers[row].size_m for row in born.tolist()]).reshape(-1, 3)
+        begin_frame[drone] = candidates[row].frame
+        position[drone], velocity[drone] = candidates[row].position_m, candidates[row].velocity_m_s
+    sizes = np.array([candidates[row].size_m for row in born.tolist()]).reshape(-1, 3)
     return PlannedStarts(begin_frame, position, velocity, sizes)
 
 
 def _log_likelihood(
-    newcomer: TrackCandidate,
+    candidate: TrackCandidate,
     lost: LostTracks,
     row: int,
     fps: float,
@@ -266,49 +270,50 @@ def _log_likelihood(
     max_speed_m_s: float,
     bounds_m: Float[np.ndarray, "2 3"],
 ) -> float:
-    """Logarithm of how likely a lost drone is seen again as the newcomer: a density over place, velocity and span."""
+    """Log likelihood of a lost drone being the candidate: a density over position, velocity and span."""
     place, velocity, span = lost.position_m[row], lost.velocity_m_s[row], float(lost.size_m[row].max())
-    log_span = log_normal(np.log(newcomer.size_m.max(keepdims=True) / span), SPAN_STD**2)
+    log_span = log_normal(np.log(candidate.size_m.max(keepdims=True) / span), SPAN_STD**2)
     variance = (SPEED_SHARE * max_speed_m_s) ** 2
     log_stayed = -np.inf
     near_m = STAYED_SPANS * span
     still = float(np.linalg.norm(velocity)) < STILL_M_S
-    if still and _distance_on_the_way(newcomer, place) < near_m:
+    if still and _smallest_distance(candidate, place) < near_m:
         log_stayed = np.log(STAYED_PROBABILITY / (4 / 3 * np.pi * near_m**3))
-        log_stayed += log_normal(newcomer.velocity_m_s, variance)
+        log_stayed += log_normal(candidate.velocity_m_s, variance)
     if lost.doubtful[row]:
-        return log_stayed + log_span if newcomer.moves and log_stayed > -np.inf else _NEVER
-    gap_s = newcomer.frame / fps + float(lost.seconds[row])
+        return log_stayed + log_span if candidate.moves and log_stayed > -np.inf else _IMPOSSIBLE
+    gap_s = candidate.frame / fps + float(lost.seconds[row])
     if gap_s < -MAX_OVERLAP_S:
-        return _NEVER
+        return _IMPOSSIBLE
     gap_s = max(gap_s, 0.0)
-    distance = float(np.linalg.norm(newcomer.position_m - place))
+    distance = float(np.linalg.norm(candidate.position_m - place))
     if distance > max_speed_m_s * gap_s + REACH_SIGMAS * POSITION_STD_M:
         return _UNREACHABLE - distance
-    was, seen = np.stack([place, velocity]), np.stack([newcomer.position_m, newcomer.velocity_m_s])
-    log_flown = max(log_wandered(was, seen, gap_s, variance, bounds_m), log_anywhere)
+    before = np.stack([place, velocity])
+    after = np.stack([candidate.position_m, candidate.velocity_m_s])
+    log_flown = max(log_transition(before, after, gap_s, variance, bounds_m), log_anywhere)
     log_flown += np.log(1 - STAYED_PROBABILITY) if still else 0.0
     return max(log_stayed, log_flown) + log_span
 
 
-def _flew_off(newcomer: TrackCandidate, hole: TrackCandidate) -> bool:
-    """Whether a newcomer flew off from the place of one that does not move; or hardly, while the drone is over it."""
-    near_m = STAYED_SPANS * float(hole.size_m.max())
-    speed, creep = (float(np.linalg.norm(one.velocity_m_s)) for one in (newcomer, hole))
-    faster = newcomer.moves and (not hole.moves or creep < min(speed, STILL_M_S))
-    return faster and _distance_on_the_way(newcomer, hole.position_m) < near_m
+def _departs_from(candidate: TrackCandidate, ghost: TrackCandidate) -> bool:
+    """Whether a candidate departs from another candidate that stands still, or creeps while the drone overlaps it."""
+    near_m = STAYED_SPANS * float(ghost.size_m.max())
+    speed, creep = (float(np.linalg.norm(one.velocity_m_s)) for one in (candidate, ghost))
+    faster = candidate.moves and (not ghost.moves or creep < min(speed, STILL_M_S))
+    return faster and _smallest_distance(candidate, ghost.position_m) < near_m
 
 
-def _left(newcomer: TrackCandidate, lost: LostTracks) -> bool:
-    """Whether a newcomer is where a drone stood when it vanished, and seems to creep at most, as dying holes do."""
-    near_m = STAYED_SPANS * float(newcomer.size_m.max())
-    creeps = float(np.linalg.norm(newcomer.velocity_m_s)) < STILL_M_S
-    return creeps and bool((np.linalg.norm(lost.left_m - newcomer.position_m, axis=-1) < near_m).any())
+def _is_dying_ghost(candidate: TrackCandidate, lost: LostTracks) -> bool:
+    """Whether a candidate is slow and at a place where a drone stood still, as a ghost that the background absorbs."""
+    near_m = STAYED_SPANS * float(candidate.size_m.max())
+    creeps = float(np.linalg.norm(candidate.velocity_m_s)) < STILL_M_S
+    return creeps and bool((np.linalg.norm(lost.left_m - candidate.position_m, axis=-1) < near_m).any())
 
 
-def _distance_on_the_way(newcomer: TrackCandidate, place_m: Float[np.ndarray, "3"]) -> float:
-    """How near it was to a place when it was first seen, or on a straight way to there."""
-    speed2 = float(newcomer.velocity_m_s @ newcomer.velocity_m_s)
-    off = newcomer.position_m - place_m
-    ago_s = np.clip(off @ newcomer.velocity_m_s / max(speed2, 1e-9), 0.0, FLOWN_OFF_S)
-    return float(np.linalg.norm(off - ago_s * newcomer.velocity_m_s))
+def _smallest_distance(candidate: TrackCandidate, place_m: Float[np.ndarray, "3"]) -> float:
+    """Smallest distance of a candidate from a place, when it was first seen or within `DEPARTURE_S` before."""
+    speed2 = float(candidate.velocity_m_s @ candidate.velocity_m_s)
+    offset = candidate.position_m - place_m
+    ago_s = np.clip(offset @ candidate.velocity_m_s / max(speed2, 1e-9), 0.0, DEPARTURE_S)
+    return float(np.linalg.norm(offset - ago_s * candidate.velocity_m_s))

@@ -23,6 +23,7 @@ from psotrack._typing import Array
 from psotrack.geometry import Camera, Rig
 from psotrack.initiation import (
     InitialState,
+    KnownDrones,
     PlannedStarts,
     find_candidates,
     find_false_tracks,
@@ -309,9 +310,7 @@ def _plan_new_tracks(
     candidates = find_candidates(
         setting.rig.cameras,
         coverage,
-        np.asarray(infos[-1].position_m, np.float64),
-        _known_well(infos),
-        size_m,
+        KnownDrones(np.asarray(infos[-1].position_m, np.float64), _known_well(infos), size_m),
         reduction=setting.reduction,
         fps=fps,
         bounds_m=run.inputs.bounds_m,
