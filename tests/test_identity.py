@@ -450,10 +450,11 @@ class TestLabellings:
                     labellings.begin(z, R, np.r_[np.full(9, DT_S), 0.0], np.ones(10, bool), model.params(1))
                     for z, R in start
                 ]
-                bank = labellings.joined(*banks)
+                bank = labellings.join(*banks)
                 change = labellings.change_log_probability(~np.eye(2, dtype=bool), 0.2)
                 for k in rows:
-                    inputs = (measured_m[k], covariance_m2[k], np.ones(2, bool), change, np.zeros((2, 2)))
+                    frame = labellings.FrameMeasurements(measured_m[k], covariance_m2[k], np.ones(2, bool))
+                    inputs = (frame, change, np.zeros((2, 2)))
                     bank, before = labellings.step(bank, np.float64(DT_S), *inputs, model.params(2))
             np.testing.assert_allclose(
                 np.exp(np.asarray(bank.log_probability)), np.exp(exact), rtol=0, atol=limit
@@ -506,7 +507,7 @@ class TestLabellings:
         rng = np.random.default_rng(0)
         before = rng.random((3, 3, 3))
         before /= before.sum(axis=1, keepdims=True)
-        found = labellings.smoothed(before, 2)
+        found = labellings.smooth_labels(before, 2)
         joint = np.einsum("ab,b->ab", before[1], before[2][:, 2])
         np.testing.assert_allclose(
             found, [joint.sum(axis=1), joint.sum(axis=0), [0, 0, 1]], rtol=0, atol=1e-15
@@ -517,8 +518,8 @@ class TestLabellings:
         cost = 1.5 * (1 - np.eye(2))
         for stretch, expected in ((1, [0] * 6), (4, [0, 1, 1, 1, 1, 0])):
             right = np.eye(2)[[0] + [1] * stretch + [0] * (5 - stretch)]
-            assert labellings.path(right, cost).tolist() == expected
-        assert labellings.path(np.eye(2)[[0, 0, 1, 1]], 10 * cost).tolist()[-1] == 1
+            assert labellings.best_path(right, cost).tolist() == expected
+        assert labellings.best_path(np.eye(2)[[0, 0, 1, 1]], 10 * cost).tolist()[-1] == 1
 
     def test_joined_keeps_what_was_known(self):
         kept, index = labellings.embedding(2, 1)
@@ -534,7 +535,8 @@ class TestLikeness:
         white_m = 0.01 * rng.normal(size=(2000, 2, 3))
         stuck_m = np.repeat(white_m[::50], 50, axis=0)
         worth = [
-            np.linalg.inv(likeness.learn(time_s, off_m + 0.3).precision_m2) for off_m in (white_m, stuck_m)
+            np.linalg.inv(likeness.learn_likeness(time_s, off_m + 0.3).precision_m2)
+            for off_m in (white_m, stuck_m)
         ]
         # Variances of 40 looks each are known to a sixth, three times that is allowed for.
         for found, times in zip(worth, (1 + 1, 1 + 50), strict=True):
@@ -546,7 +548,7 @@ class TestLikeness:
         evidence = []
         for seed in range(100):
             size_m = 0.3 + 0.01 * lasting(np.random.default_rng(seed), (300, 2, 3))
-            known = likeness.learn(time_s, size_m[:250])
+            known = likeness.learn_likeness(time_s, size_m[:250])
             fit = sum(likeness.log_likelihood(known, row, np.ones(2, bool)) for row in size_m[250:])
             evidence.append(fit[0, 1] + fit[1, 0] - fit[0, 0] - fit[1, 1])
         # Measured 97 of 100 below 1.
@@ -555,7 +557,7 @@ class TestLikeness:
     def test_what_is_not_clear_says_nothing(self):
         time_s = np.arange(500) * DT_S
         size_m = np.array([[0.3], [0.4]]) + 0.01 * np.random.default_rng(1).normal(size=(500, 2, 3))
-        known = likeness.learn(time_s, size_m)
+        known = likeness.learn_likeness(time_s, size_m)
         assert likeness.log_likelihood(known, size_m[0], np.array([True, False]))[:, 1].tolist() == [0, 0]
         unknown_m = np.array([[0.3, 0.3, 0.3], [np.nan] * 3])
         assert likeness.log_likelihood(known, unknown_m, np.ones(2, bool))[:, 1].tolist() == [0, 0]
@@ -564,18 +566,18 @@ class TestLikeness:
     def test_too_little_is_nothing(self):
         time_s = np.arange(500) * DT_S
         size_m = 0.01 * np.random.default_rng(1).normal(size=(500, 2, 3))
-        assert likeness.learn(time_s, size_m) is not None
-        assert likeness.learn(time_s[:100], size_m[:100]) is None
-        assert likeness.learn(time_s[:0], size_m[:0]) is None
+        assert likeness.learn_likeness(time_s, size_m) is not None
+        assert likeness.learn_likeness(time_s[:100], size_m[:100]) is None
+        assert likeness.learn_likeness(time_s[:0], size_m[:0]) is None
         size_m[100:, 1] = np.nan
-        assert likeness.learn(time_s, size_m) is None
+        assert likeness.learn_likeness(time_s, size_m) is None
 
     def test_a_wild_size_does_not_spoil_what_is_learned(self):
         time_s = np.arange(500) * DT_S
         size_m = np.array([[0.3], [0.4]]) + 0.01 * np.random.default_rng(1).normal(size=(500, 2, 3))
-        known = likeness.learn(time_s, size_m)
+        known = likeness.learn_likeness(time_s, size_m)
         size_m[::50] = 5.0
-        spoilt = likeness.learn(time_s, size_m)
+        spoilt = likeness.learn_likeness(time_s, size_m)
         # Ten of 500 frames drawn in to four deviations: 0.8 mm at most.
         np.testing.assert_allclose(spoilt.typical_m, known.typical_m, rtol=0, atol=0.0015)
 

@@ -1,4 +1,4 @@
-"""Drones whose labels are in doubt together: how such a group begins, grows, and goes through a frame."""
+"""Groups of drones whose labels are uncertain: how a group starts, grows, and is updated with a frame."""
 
 from __future__ import annotations
 
@@ -12,43 +12,44 @@ from psotrack.identity import labellings, likeness
 from psotrack.identity.labellings import Bank
 from psotrack.identity.likeness import Likeness
 from psotrack.identity.records import IdentityParams
-from psotrack.identity.tracks import Tracks
+from psotrack.identity.tracks import MeasuredTracks
 from psotrack.motion import MotionParams
 
-#: Drones in one group; of more, the nearest are grouped first. Four have 24 labellings, five 120.
+#: Largest number of drones in a group; the nearest drones are grouped first. Four drones have 24 labellings, five 120.
 _MAX_GROUP = 4
 
-#: Farther apart than so many times `encounter_m`, and drones that were near are separate again.
+#: Drones that were near are separate again when their distance exceeds this number times `encounter_m`.
 _HYSTERESIS = 1.25
 
-#: Exchanges of two tracks per second while they are near. A pass lasts some tenths of a second: after it, an exchange
-#: was as likely as not, for all one knows without having looked.
+#: Rate of swaps of two tracks while they are near, per second. An encounter lasts some tenths of a second, so without
+#: measurements a swap and no swap are about equally likely after it.
 _EXCHANGES_PER_S = 5.0
 
-#: Tracks pull at each other when they are near: standard deviation that is added where they meet, as a share of
-#: `encounter_m`; farther apart it falls with the square of what is left of that distance.
+#: Near tracks attract each other. This is the added standard deviation at distance 0, as a share of `encounter_m`; it
+#: falls to 0 at `encounter_m`, with the square of the remaining distance.
 _PULL = 0.1
 
-#: Drones that meet give way to one another: their jerk density then, in terms of what it is all in all. Where it is
-#: too large more encounters stay undecided, where it is too small labels are exchanged wrongly.
+#: Ratio of the jerk density during encounters to the usual jerk density, because drones avoid each other. A larger
+#: value leaves more encounters undecided; a smaller value swaps labels wrongly.
 _AGILITY = 10.0
 
-#: Measurements from which a motion state is learned; it forgets the older ones within half as many.
+#: Number of measurements from which a motion state is estimated; older measurements have no more influence.
 _WARM_UP = 32
 
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Drones whose labels are in doubt together.
+    """Drones whose labels are uncertain together.
 
     Attributes:
-        drones, tracks: (drones,), their labels, and the tracks that these had at first: the first labelling.
-        first: frame.
-        apart: (drones, drones), tracks that have not been near yet, or not any more.
-        distance_m: (drones, drones), between their tracks when both were measured last; infinite if never.
-        near_s: when any two were near last.
-        likeness: what tells them apart by size, if anything does.
-        log_probability, before: of every frame, as `labellings.step` has them.
+        drones, tracks: (drones,), labels of the drones, and their tracks at the beginning: the first labelling.
+        first: first frame of the group.
+        apart: (drones, drones), whether the two tracks are separate: not near yet, or separate again.
+        distance_m: (drones, drones), distance of the tracks when both were last measured; infinite if never.
+        near_s: time when two drones of the group were last near, seconds.
+        bank: motion states and probabilities of all labellings.
+        likeness: sizes that distinguish the drones; None if the sizes are not known well enough.
+        log_probability, before: one array per frame, as `labellings.step` returns them.
     """
 
     drones: Int[np.ndarray, "drones"]
@@ -63,15 +64,15 @@ class Group:
     before: tuple[np.ndarray, ...] = ()
 
 
-def grouped(
+def update_groups(
     groups: list[Group],
     frame: int,
     order: Int[np.ndarray, "frames drones"],
-    tracks: Tracks,
+    tracks: MeasuredTracks,
     motion: MotionParams,
     params: IdentityParams,
 ) -> list[Group]:
-    """The groups of the frame before, joined by the tracks that are near in this one, the nearest first."""
+    """Join the previous frame's groups by the tracks that are near in this frame, the nearest tracks first."""
     distance_m = tracks.distance_m[frame]
     near = np.argwhere(np.triu(distance_m < params.encounter_m))
     for pair in near[np.argsort(distance_m[tuple(near.T)], kind="stable")].tolist():
@@ -80,41 +81,41 @@ def grouped(
             continue
         groups = [group for group in groups if group not in known]
         one, other = (
-            group or _alone(track, frame, order, tracks, motion, params)
+            group or _single_group(track, frame, order, tracks, motion, params)
             for group, track in zip(known, pair, strict=True)
         )
-        groups.append(_with_likeness(_joined(one, other), tracks, order))
+        groups.append(_with_likeness(_join(one, other), tracks, order))
     return groups
 
 
 def _size(group: Group | None) -> int:
-    """Number of drones; who is in no group is alone."""
+    """Number of drones of a group; 1 for a drone without a group."""
     return 1 if group is None else len(group.drones)
 
 
-def _with_likeness(group: Group, tracks: Tracks, order: Int[np.ndarray, "frames drones"]) -> Group:
-    """The group with what could be learned of the sizes of its drones before they met."""
+def _with_likeness(group: Group, tracks: MeasuredTracks, order: Int[np.ndarray, "frames drones"]) -> Group:
+    """The group with the sizes of its drones, learned from the frames before the encounter."""
     past = slice(0, group.first)
     seen_m = np.where(tracks.clear[past, :, None], tracks.size_m[past], np.nan)
     seen_m = seen_m[np.arange(group.first)[:, None], order[past, group.drones]]
-    return replace(group, likeness=likeness.learn(tracks.time_s[past], seen_m))
+    return replace(group, likeness=likeness.learn_likeness(tracks.time_s[past], seen_m))
 
 
-def _alone(
+def _single_group(
     track: int,
     frame: int,
     order: Int[np.ndarray, "frames drones"],
-    tracks: Tracks,
+    tracks: MeasuredTracks,
     motion: MotionParams,
     params: IdentityParams,
 ) -> Group:
-    """A group of one drone, as it was last known before a frame."""
+    """A group of one drone, with its motion state before a frame."""
     drone = int(np.flatnonzero(order[frame] == track)[0])
     rows = np.flatnonzero(tracks.was_measured[np.arange(frame), order[:frame, drone]])[-_WARM_UP:]
     place = (rows, order[rows, drone])
     measured_m, covariance_m2 = tracks.measured_m[place], tracks.covariance_m2[place]
     if not len(rows):
-        # It appears here: where, is for the frame itself to say.
+        # The drone appears in this frame, so only this frame's measurement gives its place.
         rows = np.array([frame])
         measured_m = tracks.measured_m[rows, track]
         covariance_m2 = params.encounter_m**2 * np.eye(3)[None]
@@ -129,7 +130,7 @@ def _alone(
         padded(covariance_m2),
         np.concatenate([np.zeros(missing), dt_s]),
         np.arange(_WARM_UP) > missing,
-        _of_drones(motion, np.array([drone])),
+        _encounter_motion(motion, np.array([drone])),
     )
     return Group(
         np.array([drone]),
@@ -142,11 +143,11 @@ def _alone(
     )
 
 
-def _joined(one: Group, other: Group) -> Group:
-    """One group of two; what either has been through is told in labellings of both together."""
+def _join(one: Group, other: Group) -> Group:
+    """Join two groups; their histories become histories of the labellings of all drones."""
     kept, index = labellings.embedding(len(one.drones), len(other.drones))
     num_frames = max(len(one.before), len(other.before))
-    # What mixes the two was not possible so far, and stayed what it was.
+    # Labellings that mix the two groups were impossible so far.
     log_probability = np.where(kept, 0.0, labellings.LEAST_LOG) * np.ones((num_frames, 1))
     before = np.where(kept[:, None] & kept, 1.0, np.eye(len(kept))) * np.ones((num_frames, 1, 1))
     for part, pick in ((one, index[:, 0]), (other, index[:, 1])):
@@ -165,16 +166,16 @@ def _joined(one: Group, other: Group) -> Group:
         apart=apart,
         distance_m=distance_m,
         near_s=max(one.near_s, other.near_s),
-        bank=labellings.joined(one.bank, other.bank),
+        bank=labellings.join(one.bank, other.bank),
         log_probability=tuple(log_probability),
         before=tuple(before),
     )
 
 
 def _history(group: Group, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
-    """Log probabilities (frames, labellings) and `before` (frames, labellings, labellings) of the last so many frames.
+    """Log probabilities (frames, labellings) and `before` (frames, labellings, labellings) of the last frames.
 
-    In those before the group began, its labels were right.
+    In frames before the group started, the first labelling is certain.
     """
     num = len(group.bank.log_probability)
     missing = num_frames - len(group.before)
@@ -185,8 +186,10 @@ def _history(group: Group, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def advanced(group: Group, frame: int, tracks: Tracks, motion: MotionParams, params: IdentityParams) -> Group:
-    """The group after one frame more."""
+def update_group(
+    group: Group, frame: int, tracks: MeasuredTracks, motion: MotionParams, params: IdentityParams
+) -> Group:
+    """Update a group with one frame."""
     here = group.tracks
     now_m = tracks.distance_m[frame][np.ix_(here, here)]
     distance_m = np.where(np.isnan(now_m), group.distance_m, now_m)
@@ -196,12 +199,14 @@ def advanced(group: Group, frame: int, tracks: Tracks, motion: MotionParams, par
     bank, before = labellings.step(
         group.bank,
         dt_s,
-        tracks.measured_m[frame, here],
-        tracks.covariance_m2[frame, here] + pull_m[:, None, None] ** 2 * np.eye(3),
-        tracks.was_measured[frame, here],
+        labellings.FrameMeasurements(
+            tracks.measured_m[frame, here],
+            tracks.covariance_m2[frame, here] + pull_m[:, None, None] ** 2 * np.eye(3),
+            tracks.was_measured[frame, here],
+        ),
         labellings.change_log_probability(near | ~group.apart, _EXCHANGES_PER_S * dt_s),
         likeness.log_likelihood(group.likeness, tracks.size_m[frame, here], tracks.clear[frame, here]),
-        _of_drones(motion, group.drones),
+        _encounter_motion(motion, group.drones),
     )
     return replace(
         group,
@@ -215,12 +220,12 @@ def advanced(group: Group, frame: int, tracks: Tracks, motion: MotionParams, par
 
 
 def _pull_m(distance_m: Float[np.ndarray, "drones"], params: IdentityParams) -> Float[np.ndarray, "drones"]:
-    """(drones,), standard deviation that tracks get because of the nearest other."""
+    """(drones,), added standard deviation of each track because of the nearest other track."""
     nearness = np.maximum(1 - distance_m / params.encounter_m, 0.0)
     return _PULL * params.encounter_m * nearness**2
 
 
-def _of_drones(motion: MotionParams, drones: Int[np.ndarray, "drones"]) -> MotionParams:
-    """In float64, of these drones only, when they meet."""
+def _encounter_motion(motion: MotionParams, drones: Int[np.ndarray, "drones"]) -> MotionParams:
+    """Motion parameters of some drones during an encounter, in float64."""
     params = jax.tree.map(lambda value: np.asarray(value, np.float64), motion)
     return replace(params, jerk_density_m2_s5=_AGILITY * params.jerk_density_m2_s5[drones])

@@ -1,4 +1,4 @@
-"""What identity is settled by, and what comes of it."""
+"""Parameters and results of the resolution of identity swaps."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from psotrack.support import short_repr
 
 @dataclass(frozen=True)
 class IdentityParams:
-    """When labels are in doubt, and when they are not any more.
+    """Parameters that decide when labels are uncertain and when they are settled.
 
     Attributes:
-        encounter_m: drones nearer than this may be taken for each other: about twice a drone's size, as their
-            silhouettes then touch in some view.
-        decision_probability: labels are exchanged if that is at least so probable. High, because trackers exchange
-            drones more seldom than the even odds that are assumed here.
-        patience_s: so long after drones were last near, what is undecided stays as it is: their motion before tells
-            nothing any more.
+        encounter_m: drones nearer than this may be confused: about twice a drone's size, because their silhouettes then
+            touch in some views.
+        decision_probability: smallest probability of a swap that is undone. It is high, because trackers swap drones
+            less often than the even odds that are assumed here.
+        patience_s: time after the last near frame after which undecided labels are kept, seconds: the motion before the
+            encounter says nothing more by then.
 
     Raises:
-        SettingsError: a value makes no sense.
+        SettingsError: a value is out of range.
     """
 
     encounter_m: float = 0.6
@@ -44,13 +44,13 @@ class IdentityParams:
 
 
 class LabelOutcome(StrEnum):
-    """What became of the labels of two drones that met."""
+    """Outcome of an encounter for the labels of its two drones."""
 
     KEPT = "kept"
     SWAPPED = "swapped"
-    #: Kept, for want of evidence.
+    #: Kept, because the evidence was too weak.
     UNDECIDED = "undecided"
-    #: The recording ends before it is settled; what is said of it may still change.
+    #: The recording ends before a decision; more frames may change the result.
     OPEN = "open"
 
 
@@ -59,12 +59,12 @@ class Encounter:
     """Two drones that met.
 
     Attributes:
-        drones: their labels, the lower one first.
-        first_frame: when they, or others of their group, came near.
-        closest_frame, distance_m: when they were nearest, and how near.
-        last_frame: when it was decided; the last of the recording, if it was not.
-        log_odds: natural logarithm of the odds that their tracks have been exchanged, in the last frame.
-        outcome: what was done.
+        drones: labels of the two drones, the lower label first.
+        first_frame: first frame of the group of drones that contains the two.
+        closest_frame, distance_m: frame of the smallest distance, and this distance.
+        last_frame: frame of the decision; the recording's last frame if there was none.
+        log_odds: natural logarithm of the odds of a swap, in the last frame.
+        outcome: outcome for the labels.
     """
 
     drones: tuple[int, int]
@@ -78,14 +78,14 @@ class Encounter:
 
 @dataclass(frozen=True, repr=False)
 class Identities:
-    """Which track each drone is in every frame.
+    """Track of each drone in every frame.
 
     Attributes:
-        order: (frames, drones), the track of each drone; `np.take_along_axis` applies it (see `relabelled`).
-        pairs: (pairs, 2), labels of two drones, the lower one first.
-        ambiguity: (frames, pairs), the probability that, with the labels of `order`, the track of one of the two is
-            the other drone, given all frames up to this one. 0 outside of encounters.
-        encounters: in the order in which they were settled.
+        order: (frames, drones), index of each drone's track; `relabelled` applies it.
+        pairs: (pairs, 2), labels of two drones, the lower label first.
+        ambiguity: (frames, pairs), probability that `order` confuses the two drones, given all frames up to this frame;
+            0 outside encounters.
+        encounters: encounters in the order of their decisions.
     """
 
     order: Int[np.ndarray, "frames drones"]
@@ -97,5 +97,5 @@ class Identities:
 
 
 def relabelled(value: np.ndarray, order: Int[np.ndarray, "frames drones"]) -> np.ndarray:
-    """(frames, drones, ...), what was by tracks, by drones."""
+    """Reorder an array (frames, tracks, ...) into (frames, drones, ...)."""
     return np.take_along_axis(value, order.reshape(*order.shape, *[1] * (value.ndim - 2)), axis=1)

@@ -1,4 +1,4 @@
-"""When the labels of a group are settled, and what that makes of them."""
+"""Decide the labels of a group, and record its encounters."""
 
 from __future__ import annotations
 
@@ -12,34 +12,39 @@ from jaxtyping import Float
 from psotrack.identity import labellings
 from psotrack.identity.groups import Group
 from psotrack.identity.records import Encounter, Identities, IdentityParams, LabelOutcome
-from psotrack.identity.tracks import Tracks
+from psotrack.identity.tracks import MeasuredTracks
 
 _log = logging.getLogger(__name__)
 
-#: Exchanging tracks for a while and back again must set right more than twice so many frames.
-_EXCHANGE_COST_FRAMES = 3.0
+#: Cost of a swap, frames: two swaps, there and back, must make more than twice this number of frames right.
+_SWAP_COST_FRAMES = 3.0
 
 
 def is_settled(group: Group, time_s: float, params: IdentityParams) -> bool:
-    """Whether labels are certain and drones separate, or nothing more is to be expected.
+    """Whether the labels are certain and a drone has left the group, or `patience_s` has passed.
 
-    Of more than two drones it is enough that one has left: who stays behind begins anew, with a group of its own.
+    In a group of more than two drones, the drones that stay near each other start a new group.
     """
     sure = np.exp(group.log_probability[-1].max()) >= params.decision_probability
     left = group.apart.all(axis=1).any()
     return bool((sure and left) or time_s - group.near_s >= params.patience_s)
 
 
-def settled(
-    group: Group, found: Identities, tracks: Tracks, params: IdentityParams, *, still_open: bool = False
+def settle(
+    group: Group,
+    found: Identities,
+    tracks: MeasuredTracks,
+    params: IdentityParams,
+    *,
+    still_open: bool = False,
 ) -> Identities:
-    """What is found with a group's labels decided, after its last frame."""
+    """Decide a group's labels after its last frame, and add them and its encounters to the identities."""
     num = len(group.drones)
     rows = slice(group.first, group.first + len(group.before))
     log_probability = np.array(group.log_probability)
     chosen = _decision(log_probability[-1], num, params)
-    probability = labellings.smoothed(np.array(group.before), chosen)
-    taken = labellings.path(probability, _EXCHANGE_COST_FRAMES * labellings.exchanges(num))
+    probability = labellings.smooth_labels(np.array(group.before), chosen)
+    taken = labellings.best_path(probability, _SWAP_COST_FRAMES * labellings.exchanges(num))
     track = group.tracks[labellings.labellings(num)[taken]]
 
     order = found.order.copy()
@@ -58,7 +63,7 @@ def settled(
         distance_m = np.where(np.isnan(distance_m), np.inf, distance_m)
         if distance_m.min() >= params.encounter_m:
             continue
-        # Of the tracks as they were given.
+        # Odds for the tracks before resolution.
         swapped = np.logaddexp.reduce(log_probability[-1][wrong[0]])
         right = np.logaddexp.reduce(log_probability[-1][~wrong[0]])
         if still_open:
@@ -85,7 +90,7 @@ def settled(
 def _decision(
     log_probability: Float[np.ndarray, "labellings"], num_drones: int, params: IdentityParams
 ) -> int:
-    """The labelling with the fewest exchanges of those that the most probable one does not exclude."""
+    """The labelling with the fewest swaps among those that the most probable labelling does not exclude."""
     odds = np.log(params.decision_probability) - np.log1p(-params.decision_probability)
     possible = log_probability > log_probability.max() - odds
     number = np.where(possible, labellings.exchanges(num_drones)[0], np.inf)
