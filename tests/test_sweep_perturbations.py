@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from psotrack.errors import SettingsError
 from psotrack.recordings import Sequence, VideoInfo
 from psotrack.silhouettes import Silhouettes
-from psotrack.sweep import Perturbation, perturbed
-from psotrack.sweep.perturbations import chosen
+from psotrack.sweep import Perturbation, perturb
+from psotrack.sweep.perturbations import choose_cameras
 
 FRAMES, REDUCTION = 70, 4
 EVERYTHING = Perturbation(extrinsics_deg=0.3, clock_frames=1.5, flipped=0.05)
@@ -48,23 +48,23 @@ def frames_of(silhouettes):
 
 def test_nothing_is_done_to_what_is_not_perturbed():
     sequence, silhouettes = flown()
-    assert perturbed(sequence, silhouettes, Perturbation(draw=3), None) == (sequence, silhouettes)
+    assert perturb(sequence, silhouettes, Perturbation(draw=3), None) == (sequence, silhouettes)
 
 
 def test_all_is_a_function_of_the_draw():
-    once, again = (perturbed(*flown(), EVERYTHING, 3) for _ in range(2))
+    once, again = (perturb(*flown(), EVERYTHING, 3) for _ in range(2))
     assert once[0].rig.names == again[0].rig.names
     np.testing.assert_array_equal(once[0].rig.cameras.T_cam_world, again[0].rig.cameras.T_cam_world)
     np.testing.assert_array_equal(frames_of(once[1]), frames_of(again[1]))
-    other = perturbed(*flown(), ANOTHER_DRAW, ("c0", "c1"))
-    same_cameras = perturbed(*flown(), EVERYTHING, ("c0", "c1"))
+    other = perturb(*flown(), ANOTHER_DRAW, ("c0", "c1"))
+    same_cameras = perturb(*flown(), EVERYTHING, ("c0", "c1"))
     assert not np.allclose(other[0].rig.cameras.T_cam_world, same_cameras[0].rig.cameras.T_cam_world)
     assert (frames_of(other[1]) != frames_of(same_cameras[1])).any()
 
 
 def test_the_input_is_left_as_it_was():
     sequence, silhouettes = flown()
-    perturbed(sequence, silhouettes, EVERYTHING, 2)
+    perturb(sequence, silhouettes, EVERYTHING, 2)
     untouched, unflipped = flown()
     np.testing.assert_array_equal(sequence.rig.cameras.T_cam_world, untouched.rig.cameras.T_cam_world)
     np.testing.assert_array_equal(frames_of(silhouettes), frames_of(unflipped))
@@ -75,18 +75,18 @@ def test_the_input_is_left_as_it_was():
 
 def test_what_is_drawn_for_one_kind_does_not_depend_on_the_others():
     sequence, silhouettes = flown()
-    together, late_and_flipped = perturbed(sequence, silhouettes, EVERYTHING, None)
-    turned, _ = perturbed(sequence, silhouettes, Perturbation(extrinsics_deg=0.3), None)
+    together, late_and_flipped = perturb(sequence, silhouettes, EVERYTHING, None)
+    turned, _ = perturb(sequence, silhouettes, Perturbation(extrinsics_deg=0.3), None)
     np.testing.assert_array_equal(together.rig.cameras.T_cam_world, turned.rig.cameras.T_cam_world)
     # Clocks first, pixels then: one after the other is both at once.
-    _, late = perturbed(sequence, silhouettes, Perturbation(clock_frames=1.5), None)
-    _, flipped = perturbed(sequence, late, Perturbation(flipped=0.05), None)
+    _, late = perturb(sequence, silhouettes, Perturbation(clock_frames=1.5), None)
+    _, flipped = perturb(sequence, late, Perturbation(flipped=0.05), None)
     np.testing.assert_array_equal(frames_of(late_and_flipped), frames_of(flipped))
 
 
 def test_what_is_drawn_for_a_camera_does_not_depend_on_which_others_there_are():
-    every = perturbed(*flown(), EVERYTHING, None)
-    few = perturbed(*flown(), EVERYTHING, ("c3", "c1"))
+    every = perturb(*flown(), EVERYTHING, None)
+    few = perturb(*flown(), EVERYTHING, ("c3", "c1"))
     np.testing.assert_array_equal(
         few[0].rig.cameras.T_cam_world, every[0].rig.cameras.T_cam_world[np.array([3, 1])]
     )
@@ -97,7 +97,7 @@ def test_what_is_drawn_for_a_camera_does_not_depend_on_which_others_there_are():
 
 
 def test_cameras_are_kept_by_name():
-    sequence, silhouettes = perturbed(*flown(), Perturbation(), ("c4", "c2"))
+    sequence, silhouettes = perturb(*flown(), Perturbation(), ("c4", "c2"))
     assert sequence.rig.names == silhouettes.cameras == tuple(silhouettes.keys) == ("c4", "c2")
     assert tuple(sequence.videos) == ("c4", "c2")
     assert [array[0, 0, 0] for array in silhouettes.arrays] == [
@@ -106,15 +106,15 @@ def test_cameras_are_kept_by_name():
 
 
 def test_a_number_of_cameras_is_drawn():
-    sequence, silhouettes = perturbed(*flown(), Perturbation(draw=2), 3)
-    assert sequence.rig.names == silhouettes.cameras == chosen(("c0", "c1", "c2", "c3", "c4"), 3, 2)
+    sequence, silhouettes = perturb(*flown(), Perturbation(draw=2), 3)
+    assert sequence.rig.names == silhouettes.cameras == choose_cameras(("c0", "c1", "c2", "c3", "c4"), 3, 2)
 
 
 def test_cameras_that_are_not_there():
     with pytest.raises(SettingsError, match=r"cameras: expected some of c0, .*, found c9"):
-        perturbed(*flown(), Perturbation(), ("c0", "c9"))
+        perturb(*flown(), Perturbation(), ("c0", "c9"))
     with pytest.raises(SettingsError, match="cameras: expected 1 to 5, as many as there are, found 6"):
-        perturbed(*flown(), Perturbation(), 6)
+        perturb(*flown(), Perturbation(), 6)
 
 
 @given(num_cameras=st.integers(1, 7), data=st.data())
@@ -122,16 +122,16 @@ def test_draws_go_through_all_subsets_before_any_comes_again(num_cameras, data):
     names = tuple("abcdefg"[:num_cameras])
     count = data.draw(st.integers(1, num_cameras))
     every = list(combinations(names, count))
-    drawn = [chosen(names, count, draw) for draw in range(len(every))]
+    drawn = [choose_cameras(names, count, draw) for draw in range(len(every))]
     # `combinations` keeps the order of the names, as subsets must.
     assert sorted(drawn) == every
-    assert chosen(names, count, len(every)) == drawn[0]
+    assert choose_cameras(names, count, len(every)) == drawn[0]
 
 
 def test_no_camera_is_drawn_more_often_than_others():
     """Chance has no favourites: of 20 cameras each is in as many of the first subsets."""
     names = tuple(map(str, range(20)))
-    drawn = [int(name) for draw in range(400) for name in chosen(names, 3, draw)]
+    drawn = [int(name) for draw in range(400) for name in choose_cameras(names, 3, draw)]
     counts = np.bincount(drawn, minlength=20)
     # 400 of 1140 subsets: 60 +- 5.8 of each camera (hypergeometric); 5 standard deviations.
     assert np.abs(counts - 60).max() < 29
@@ -142,7 +142,7 @@ def test_no_camera_is_drawn_more_often_than_others():
 
 def test_cameras_turn_about_their_own_centres_by_the_angle():
     sequence, silhouettes = flown(7)
-    turned, same = perturbed(sequence, silhouettes, Perturbation(extrinsics_deg=0.2, draw=4), None)
+    turned, same = perturb(sequence, silhouettes, Perturbation(extrinsics_deg=0.2, draw=4), None)
     assert same is silhouettes
     before, after = (each.rig.cameras for each in (sequence, turned))
     # Metres; rounding of float64 at some metres.
@@ -161,7 +161,7 @@ def test_a_wider_turn_is_about_the_same_axis():
     before = sequence.rig.cameras.T_cam_world[:, :3, :3]
     vectors = []
     for angle in (0.1, 0.4):
-        turned, _ = perturbed(sequence, silhouettes, Perturbation(extrinsics_deg=angle), None)
+        turned, _ = perturb(sequence, silhouettes, Perturbation(extrinsics_deg=angle), None)
         after = turned.rig.cameras.T_cam_world[:, :3, :3]
         vectors.append(Rotation.from_matrix(after @ before.swapaxes(-1, -2)).as_rotvec())
     np.testing.assert_allclose(vectors[1], 4 * vectors[0], rtol=1e-6)
@@ -176,7 +176,7 @@ def test_late_cameras_show_what_was(clock_frames):
     ramp = np.tile((3 * np.arange(FRAMES)).astype(np.uint8)[:, None, None], (1, 5, 7))
     sequence, silhouettes = flown(40, ramp)
     silhouettes = replace(silhouettes, arrays=(ramp,) * 40)
-    same, late = perturbed(sequence, silhouettes, Perturbation(clock_frames=clock_frames), None)
+    same, late = perturb(sequence, silhouettes, Perturbation(clock_frames=clock_frames), None)
     assert same is sequence
     shown = frames_of(late)[..., 0, 0].astype(float)
     # From the frames where nothing is clipped; the mean takes the rounding to grey levels out, which is at most a half.
@@ -195,7 +195,7 @@ def test_a_mixture_by_hand():
     """One camera's lateness is read off its first change; every value then is the mixture of its two frames."""
     frames = np.random.default_rng(5).integers(0, 256, (120, 3, 4), np.uint8)
     sequence, silhouettes = flown(2, frames)
-    _, late = perturbed(sequence, silhouettes, Perturbation(clock_frames=4.0, draw=6), None)
+    _, late = perturb(sequence, silhouettes, Perturbation(clock_frames=4.0, draw=6), None)
     for camera in range(2):
         before, after = frames_of(silhouettes)[:, camera].astype(float), frames_of(late)[:, camera]
         padded = np.concatenate([np.repeat(before[:1], 6, axis=0), before])
@@ -222,7 +222,7 @@ def test_flipped_pixels_have_the_moments_of_the_binomial():
         frames[:, 5 * part : 5 * part + 5] = round(255 * count / pixels)
     sequence, silhouettes = flown(2, frames)
     silhouettes = replace(silhouettes, arrays=(frames, frames))
-    same, noisy = perturbed(sequence, silhouettes, Perturbation(flipped=share), None)
+    same, noisy = perturb(sequence, silhouettes, Perturbation(flipped=share), None)
     assert same is sequence
     values = frames_of(noisy)
     counts = np.round(values / 255 * pixels)
@@ -244,7 +244,7 @@ def test_all_pixels_flipped_is_the_negative():
     frames[:, 2] = 255
     frames[:, 3] = 64  # 4 of 16 pixels; their negative is 12.
     sequence, silhouettes = flown(1, frames)
-    _, negative = perturbed(sequence, silhouettes, Perturbation(flipped=1.0), None)
+    _, negative = perturb(sequence, silhouettes, Perturbation(flipped=1.0), None)
     expected = np.full((60, 5, 7), 255)
     expected[:, 2] = 0
     expected[:, 3] = 191

@@ -1,7 +1,7 @@
-"""Sweeps: a grid of settings, tracked and evaluated cell by cell, and tables of the results.
+"""Sweeps: track and evaluate with every combination of a grid of settings, and make tables of the results.
 
-In: a grid (a TOML file or a mapping) and the sequences. Out: one stored result per cell, so that an interrupted sweep
-goes on where it stopped and several machines can share one, and pandas tables of the results.
+In: a grid (a TOML file or a mapping) and the sequences. Out: one stored result per cell of the grid, and pandas tables
+of the results. An interrupted sweep continues where it stopped, and several processes and machines can share a sweep.
 """
 
 import lazy_loader

@@ -4,7 +4,7 @@ from .frames import sweep
 from .grid_files import Cell, Grid, Perturbation, cameras_label, grid, key_of, load
 from .inputs import Inputs
 from .machine import Device, share_processors, use_device
-from .perturbations import perturbed
+from .perturbations import perturb
 from .printing import render
 from .runner import SweepOutcome, run
 from .store import Store
@@ -23,7 +23,7 @@ __all__ = [
     "grid",
     "key_of",
     "load",
-    "perturbed",
+    "perturb",
     "pivot",
     "render",
     "run",

@@ -1,7 +1,7 @@
-"""Results as figures: error against work, error over time, errors drone by drone.
+"""Figures of results: error against work, error over time, and errors per drone.
 
-The functions that draw make a figure of Matplotlib's that `pyplot`, with its global state, knows nothing of; a notebook
-shows what they return, `save` keeps it.
+Each function returns a Matplotlib figure that is not registered with `pyplot`, which has global state. A notebook shows
+the returned figure, and `save` writes it to a file.
 """
 
 from __future__ import annotations
@@ -24,16 +24,17 @@ if TYPE_CHECKING:
 _DARK, _GREY, _LIGHT = "#2b313a", "#9aa3ad", "#e3e6ea"
 _DPI = 150
 _MARKERS = "osD^vP"
-#: Between the boxes of a drone, in parts of the distance between drones.
+#: Width of all boxes of a drone, as a share of the distance between drones.
 _BOXES = 0.8
 
 
-def save(path: Path, figure: Figure, *, force: bool = False) -> None:
+def save(path: Path | str, figure: Figure, *, force: bool = False) -> None:
     """Save a figure as PNG.
 
     Raises:
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
+    path = Path(path)
     refuse_to_overwrite(path, force)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, format="png", dpi=_DPI)
@@ -42,9 +43,10 @@ def save(path: Path, figure: Figure, *, force: bool = False) -> None:
 def pareto_front(
     work: Float[np.ndarray, "cells"], error: Float[np.ndarray, "cells"]
 ) -> Int[np.ndarray, "front"]:
-    """The cells than which no other is better in one and at least as good in the other, by ascending work.
+    """Indices of the Pareto front, by ascending work: cells that no other cell dominates.
 
-    NaN is never on it; of cells that are equal in both the first is.
+    A cell dominates another if it is better in work or error and at least as good in the other. NaN is never on the
+    front; of equal cells only the first is.
     """
     order = np.lexsort((error, work))
     order = order[np.isfinite(work[order]) & np.isfinite(error[order])]
@@ -58,14 +60,14 @@ def error_against_work(
     error: str = "mean_error_m",
     published: Mapping[str, tuple[float, float]] | None = None,
 ) -> Figure:
-    """What a millimetre costs: a panel per sequence, a point per cell, the Pareto front of all methods as a line.
+    """Figure of error against work: a panel per sequence, a point per cell, the Pareto front of all methods as a line.
 
-    Points on the front are named by particles x iterations. Bars are the standard deviation over runs.
+    Points on the front are labelled with particles x iterations. Bars are the standard deviation over runs.
 
     Args:
-        rows: of results, one per cell and run (`sweep`).
-        error: the column of errors, metres.
-        published: sequence -> lowest and highest error that others published, metres; drawn as a band.
+        rows: results, one row per cell and run, from `sweep`.
+        error: name of the column of errors, metres.
+        published: lowest and highest published error of a sequence, metres, drawn as a band.
     """
     cells = _cells(rows, error)
     sequences, methods = list(dict.fromkeys(cells["sequence"])), list(dict.fromkeys(cells["method"]))
@@ -98,11 +100,11 @@ def error_against_work(
                 linewidth=0.8,
                 label=method,
             )
-        said = np.inf
+        labelled = np.inf
         for _, point in front.iterrows():
-            if point["error"] > 0.99 * said:
-                continue  # no better to the eye, and its name would cover the other's
-            said = point["error"]
+            if point["error"] > 0.99 * labelled:
+                continue  # the label would cover the previous point's label
+            labelled = point["error"]
             axes.annotate(
                 f"{point['particles']:.0f} x {point['iterations']:.0f}",
                 (point["work"], point["error"]),
@@ -126,8 +128,8 @@ def error_over_time(errors: Mapping[str, pd.DataFrame], title: str = "") -> Figu
     """A panel per method: each drone's error in the run of median error, and the identity switches of all runs.
 
     Args:
-        errors: method -> rows of `errors_over_time` with a column `seed`.
-        title: above all.
+        errors: rows of `errors_over_time` with a column `seed`, by method.
+        title: title of the figure.
     """
     figure = _figure(9.0, 0.8 + 2.1 * len(errors))
     panels = figure.subplots(len(errors), 1, sharex=True, squeeze=False)[:, 0]
@@ -170,7 +172,7 @@ def error_over_time(errors: Mapping[str, pd.DataFrame], title: str = "") -> Figu
                 )
         error_mm = 1e3 * run["error_m"].dropna()
         if error_mm.max() > 10 * error_mm.median():
-            # What is smaller than nearly all would take half of the scale.
+            # A few very small errors would take half of the logarithmic scale.
             axes.set_yscale("log")
             axes.set_ylim(bottom=error_mm.quantile(0.02))
             _plain_numbers(axes, "y")
@@ -187,10 +189,10 @@ def error_over_time(errors: Mapping[str, pd.DataFrame], title: str = "") -> Figu
 def error_per_drone(errors: Mapping[str, Mapping[str, pd.DataFrame]]) -> Figure:
     """A panel per sequence, a box per drone and method: the errors of all frames and runs.
 
-    A box holds the middle half, its line is the median, the whiskers hold 90 %.
+    A box holds the middle half of the errors, its line is the median, and the whiskers hold 90 % of the errors.
 
     Args:
-        errors: sequence -> method -> rows of `errors_over_time`.
+        errors: rows of `errors_over_time`, by sequence and method.
     """
     figure = _figure(9.0, 0.8 + 2.3 * len(errors))
     panels = figure.subplots(len(errors), 1, squeeze=False)[:, 0]
@@ -247,7 +249,7 @@ def _cells(rows: pd.DataFrame, error: str) -> pd.DataFrame:
 
 
 def _median_run(rows: pd.DataFrame) -> Any:
-    """The seed of the run whose mean error is the median of all, the lower one of two."""
+    """Seed of the run with the median mean error; of two runs in the middle, the run with the smaller error."""
     means = rows.groupby("seed")["error_m"].mean().sort_values()
     return means.index[(len(means) - 1) // 2]
 
@@ -273,7 +275,7 @@ def _finish(axes: Axes, x: str, y: str, title: str) -> None:
 
 
 def _plain_numbers(axes: Axes, which: str = "both") -> None:
-    """Numbers such as 20 and 50 on a logarithmic scale, not powers of ten."""
+    """Print numbers such as 20 and 50 on a logarithmic scale instead of powers of ten."""
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
     for name, axis in (("x", axes.xaxis), ("y", axes.yaxis)):
@@ -284,7 +286,7 @@ def _plain_numbers(axes: Axes, which: str = "both") -> None:
 
 
 def _legend(figure: Figure, panels: Iterable[Axes]) -> None:
-    """One for all panels, below them."""
+    """Add one legend for all panels, below the panels."""
     labelled = {
         label: handle
         for axes in panels

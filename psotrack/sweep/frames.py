@@ -1,4 +1,4 @@
-"""A grid in, a pandas frame out: sweeps for notebooks and scripts."""
+"""Sweeps for notebooks and scripts: run a grid and return the results as a pandas frame."""
 
 from __future__ import annotations
 
@@ -26,31 +26,30 @@ def sweep(
     workers: int | None = None,
     report: Report = no_progress,
 ) -> pd.DataFrame:
-    """Track with every combination of a grid's settings: one row per cell and run, as `psotrack sweep` keeps them.
+    """Track with every combination of a grid's settings; returns one row per cell and run, as `psotrack sweep` stores.
 
-    What `out` holds already is not run again: the same call again takes seconds, and one with a larger grid runs what
-    is new. Other programs may work on the same folder at the same time.
+    Finished cells in `out` are not run again: the same call takes seconds the second time, and a call with a larger
+    grid runs only the new cells. Other programs may work on the same folder at the same time.
 
     Args:
         grid: a grid, its TOML file, or a mapping with the same content.
         out: folder of the results.
         data: root folder of the sequences that the grid names.
         cache: folder of the stored silhouettes.
-        jobs: processes for the silhouettes; None is one per processor.
-        cluster: "local", or the address of a Dask scheduler, whose workers do the work; None does it here. Scripts call
-            this below `if __name__ == "__main__":` then.
-        workers: processes of the local cluster; None is one per processor.
-        report: told of the cells.
+        jobs: number of processes that make silhouettes; None is one per processor.
+        cluster: "local" for a cluster on this machine, the address of a Dask scheduler, or None for this process. With
+            a local cluster, scripts must make this call below `if __name__ == "__main__":`.
+        workers: number of processes of the local cluster; None is one per processor.
+        report: progress bar for the cells.
 
     Returns:
-        The rows of this grid's cells and seeds, in the grid's order, whatever else lies in the folder. Settings are
-        columns with dots (`settings.swarm.particles`), metrics have units in their names; `seconds.*` per run,
-        `device.*`, `versions.*` and `commit` say where a row comes from. `attrs["errors"]` lists cells that failed,
-        by title.
+        Rows of the grid's cells and seeds only, in the grid's order. Settings are columns with dots
+        (`settings.swarm.particles`), and metrics have units in their names. `seconds.*`, `device.*`, `versions.*` and
+        `commit` record the time and the origin of a row. `attrs["errors"]` lists failed cells by title.
 
     Raises:
-        InputError: a sequence is not there, or every cell failed.
-        SettingsError: something in the grid is wrong.
+        InputError: a sequence does not exist, or every cell failed.
+        SettingsError: a value of the grid is wrong.
         OutputError: the results cannot be written.
 
     Example:

@@ -21,7 +21,7 @@ from psotrack.silhouettes import key_of as silhouettes_key_of
 from psotrack.support import digest_file
 from psotrack.sweep.cells import Cell
 from psotrack.sweep.locks import Locks
-from psotrack.sweep.perturbations import perturbed
+from psotrack.sweep.perturbations import perturb
 
 #: Folders below the data's root in which a sequence is looked for.
 HALVES = ("Simulated_Data", "Real_Data", ".")
@@ -102,12 +102,12 @@ class Inputs:
         sequence = self.sequence_of(cell)
         try:
             if not cell.settings.needs_silhouettes:
-                return Input(*perturbed(sequence, None, cell.perturbation, cell.cameras))
+                return Input(*perturb(sequence, None, cell.perturbation, cell.cameras))
             with self.locks.attempt(self.silhouettes_lock(cell), f"silhouettes of {cell.sequence}") as locked:
                 if not locked:
                     return None
                 silhouettes = compute(sequence, cell.settings.silhouettes, cache=self.cache, jobs=self.jobs)
-            return Input(*perturbed(sequence, silhouettes, cell.perturbation, cell.cameras))
+            return Input(*perturb(sequence, silhouettes, cell.perturbation, cell.cameras))
         except PsotrackError as error:
             return error
 

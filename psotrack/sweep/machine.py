@@ -1,4 +1,4 @@
-"""What rows say of where they come from: device, processor, versions, commit; and the choice of the device."""
+"""Choice of the device, and the origin of results: device, processor, versions and commit."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _PACKAGE = Path(__file__).parents[1]
 
 
 def use_device(device: Device) -> None:
-    """Have JAX compute there. To be called before anything touches a device.
+    """Make JAX compute on a device. Call it before JAX uses any device.
 
     Raises:
-        SettingsError: there is none, or JAX does not find it, or computes elsewhere already.
+        SettingsError: JAX does not find the device, or already uses another device.
     """
     import jax
 
@@ -30,7 +30,10 @@ def use_device(device: Device) -> None:
     remedy = "NVIDIA's need its driver and `pip install 'psotrack[cuda]'`" if device == "gpu" else ""
     try:
         found = jax.default_backend()
-    except (RuntimeError, AssertionError) as error:  # the latter where JAX has no support for it installed
+    except (
+        RuntimeError,
+        AssertionError,
+    ) as error:  # AssertionError if JAX is installed without support for the device
         why = str(error).partition("\n")[0] or "none that JAX knows"
         raise SettingsError("--device", expected=f"a {device}", found=why, remedy=remedy) from error
     if found != device:
@@ -40,12 +43,12 @@ def use_device(device: Device) -> None:
 
 
 def share_processors(count: int | None = None) -> None:
-    """Have JAX see the processors as so many devices, which share the runs of a batch. Before anything touches one.
+    """Make JAX treat processors as separate devices, which share the runs of a batch. Call it before JAX uses a device.
 
-    Nothing changes where a user has told XLA otherwise, or a device is in use.
+    Nothing changes if the user has set XLA_FLAGS, or if JAX already uses a device.
 
     Args:
-        count: how many; None for all that this process may use.
+        count: number of devices; None is one per processor that this process may use.
     """
     import jax
 
@@ -55,12 +58,12 @@ def share_processors(count: int | None = None) -> None:
 
 
 def processors() -> int:
-    """How many this process may use."""
+    """Number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def provenance() -> dict[str, Any]:
-    """Versions, device and commit, nested, fit for JSON."""
+    """Versions, device and commit, as nested tables for JSON."""
     known = environment()
     device = known["device"] | {"processor": _processor(), "processors": processors()}
     return {"versions": known["versions"], "device": device, "commit": commit()}
@@ -68,9 +71,9 @@ def provenance() -> dict[str, Any]:
 
 @cache
 def commit(package: Path = _PACKAGE) -> str:
-    """Of the package, "-dirty" if files were changed since; "" if it does not lie in a git checkout of its own."""
+    """Commit of the package, with "-dirty" after changes; "" if the package is not in a git checkout of its own."""
     try:
-        # An installed package may lie below somebody else's checkout, whose commit says nothing.
+        # An installed package may be inside the checkout of another project, whose commit says nothing.
         _git(package, "ls-files", "--error-unmatch", "__init__.py")
         return _git(package, "describe", "--always", "--dirty", "--exclude=*", "--abbrev=12")
     except (OSError, subprocess.CalledProcessError):

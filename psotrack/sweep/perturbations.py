@@ -1,8 +1,8 @@
-"""What laboratories have: fewer cameras, calibration that is a little off, clocks that differ, noise.
+"""Perturbations as in laboratories: fewer cameras, errors of the calibration, clocks that differ, and noise.
 
-Everything is drawn by the perturbation's `draw`, and for each kind and camera from a stream of its own: what is drawn
-for one does not depend on what else is done, on how much, or on which other cameras there are. So the cells of a
-grid differ in nothing but what the grid varies.
+All random numbers depend on the perturbation's `draw`. Each kind of perturbation and each camera has its own random
+stream, so its random numbers do not depend on other perturbations, on their size, or on the other cameras. So the cells
+of a grid differ only in what the grid varies.
 """
 
 from __future__ import annotations
@@ -21,76 +21,80 @@ from psotrack.recordings import Sequence
 from psotrack.silhouettes import Silhouettes
 from psotrack.sweep.cells import Perturbation
 
-#: Each kind's stream; the numbers are part of the results.
+#: Random stream of each kind of perturbation; these numbers decide the results.
 _CAMERAS, _EXTRINSICS, _CLOCKS, _FLIPS = range(4)
 
-#: Frames in memory at once, as wider numbers; part of the results too.
+#: Number of frames that are converted at once; it decides the results too.
 _BLOCK_FRAMES = 50
 
 _Frames = UInt8[np.ndarray, "frames height width"]
 
 
-def perturbed(
+def perturb(
     sequence: Sequence,
     silhouettes: Silhouettes | None,
     perturbation: Perturbation,
     cameras: tuple[str, ...] | int | None,
 ) -> tuple[Sequence, Silhouettes | None]:
-    """The input of a cell.
+    """Apply a perturbation to a sequence and its silhouettes, and select cameras.
 
     Args:
-        sequence: fit for use, with all of its cameras.
-        silhouettes: of all of its cameras; what is changed of them is in memory then, under the same keys. None where
-            nothing is read of them.
-        perturbation: what is done.
-        cameras: the names of those to keep; how many of them, chosen by the draw (see `chosen`); or None for all.
+        sequence: a usable sequence with all its cameras.
+        silhouettes: silhouettes of all cameras; None for a method that reads none. Changed silhouettes are in memory,
+            under the same keys.
+        perturbation: the perturbation.
+        cameras: names of the cameras to keep; or their number, for a choice by `choose_cameras`; or None for all.
 
     Raises:
-        SettingsError: there are no such cameras, or not so many.
+        SettingsError: a camera does not exist, or there are fewer cameras than asked for.
     """
     every = sequence.rig.names
     if isinstance(cameras, int):
-        kept = chosen(every, cameras, perturbation.draw)
+        kept = choose_cameras(every, cameras, perturbation.draw)
     else:
         kept = sequence.rig.select(cameras).names if cameras else every
     if kept != every:
         sequence = sequence.usable(list(kept))
         silhouettes = None if silhouettes is None else _of_cameras(silhouettes, kept)
-    # A camera's number is that of the whole rig.
+    # Random streams depend on the camera's index in the whole rig.
     index = [every.index(name) for name in kept]
     if perturbation.extrinsics_deg:
         rngs = [_rng(_EXTRINSICS, perturbation.draw, camera) for camera in index]
-        sequence = replace(sequence, rig=_turned(sequence.rig, perturbation.extrinsics_deg, rngs))
+        sequence = replace(sequence, rig=_turn_cameras(sequence.rig, perturbation.extrinsics_deg, rngs))
     if silhouettes is not None and perturbation.clock_frames:
         rngs = [_rng(_CLOCKS, perturbation.draw, camera) for camera in index]
         late_frames = [rng.uniform(0, perturbation.clock_frames) for rng in rngs]
         arrays = [
-            _late(stored, late) for stored, late in zip(_of_each(silhouettes), late_frames, strict=True)
+            _delay(stored, late)
+            for stored, late in zip(_frames_by_camera(silhouettes), late_frames, strict=True)
         ]
         silhouettes = replace(silhouettes, arrays=tuple(arrays))
     if silhouettes is not None and perturbation.flipped:
         rngs = [_rng(_FLIPS, perturbation.draw, camera) for camera in index]
         arrays = [
-            _flipped(stored, perturbation.flipped, silhouettes.reduction**2, rng)
-            for stored, rng in zip(_of_each(silhouettes), rngs, strict=True)
+            _flip_pixels(stored, perturbation.flipped, silhouettes.reduction**2, rng)
+            for stored, rng in zip(_frames_by_camera(silhouettes), rngs, strict=True)
         ]
         silhouettes = replace(silhouettes, arrays=tuple(arrays))
     return sequence, silhouettes
 
 
-def chosen(names: tuple[str, ...], count: int, draw: int) -> tuple[str, ...]:
-    """So many of the names, in their order: another subset for each draw, until there is no other.
+def choose_cameras(names: tuple[str, ...], count: int, draw: int) -> tuple[str, ...]:
+    """Choose cameras: a different subset for each draw, until all subsets have been chosen.
 
     Args:
-        names: to choose from.
-        count: how many.
-        draw: 0, 1, ...; as many as there are subsets yield each of them once.
+        names: names of all cameras.
+        count: number of cameras to choose.
+        draw: number of the draw, from 0.
+
+    Returns:
+        The chosen names, in the order of `names`.
 
     Raises:
-        SettingsError: there are not so many.
+        SettingsError: `count` is not between 1 and the number of cameras.
     """
     if not 0 < count <= len(names):
-        expected = f"1 to {len(names)}, as many as there are"
+        expected = f"1 to {len(names)}, the number of cameras"
         raise SettingsError("cameras", expected=expected, found=f"{count}")
     rng = _rng(_CAMERAS)
     drawn: dict[tuple[int, ...], None] = {}
@@ -104,7 +108,7 @@ def _rng(kind: int, draw: int = 0, camera: int = 0) -> np.random.Generator:
 
 
 def _of_cameras(silhouettes: Silhouettes, names: tuple[str, ...]) -> Silhouettes:
-    """The silhouettes as if there were no other cameras."""
+    """Silhouettes of some cameras only."""
     return replace(
         silhouettes,
         cameras=names,
@@ -113,27 +117,27 @@ def _of_cameras(silhouettes: Silhouettes, names: tuple[str, ...]) -> Silhouettes
     )
 
 
-def _of_each(silhouettes: Silhouettes) -> Iterator[_Frames]:
-    """All frames of one camera after the other."""
+def _frames_by_camera(silhouettes: Silhouettes) -> Iterator[_Frames]:
+    """Yield all frames of each camera, one camera at a time."""
     for name in silhouettes.cameras:
         yield _of_cameras(silhouettes, (name,)).read(0, silhouettes.num_frames)[:, 0]
 
 
-def _turned(rig: Rig, angle_deg: float, rngs: list[np.random.Generator]) -> Rig:
-    """Cameras turned about their own centres, each about an axis of its own, all directions equally likely."""
+def _turn_cameras(rig: Rig, angle_deg: float, rngs: list[np.random.Generator]) -> Rig:
+    """Turn each camera about its centre, around a random axis with uniformly distributed direction."""
     T_cam_world = rig.cameras.T_cam_world.copy()
     for camera, rng in enumerate(rngs):
         axis = rng.normal(size=3)
         turn = Rotation.from_rotvec(np.radians(angle_deg) * axis / np.linalg.norm(axis)).as_matrix()
-        # R and t alike, so that the centre, -R^T t, stays.
+        # R and t are both turned, so that the centre -R^T t does not change.
         T_cam_world[camera, :3] = turn @ T_cam_world[camera, :3]
     return replace(rig, cameras=replace(rig.cameras, T_cam_world=T_cam_world))
 
 
-def _late(stored: _Frames, frames: float) -> _Frames:
-    """A camera that is late: at frame f it shows what was at f - `frames`, mixed of the two nearest.
+def _delay(stored: _Frames, frames: float) -> _Frames:
+    """Delay a camera: frame f becomes frame f - `frames`, interpolated between the two nearest frames.
 
-    Before its first frame it shows its first.
+    Frames before the first one are equal to the first frame.
     """
     whole = math.floor(frames)
     share = np.float32(frames - whole)
@@ -145,8 +149,8 @@ def _late(stored: _Frames, frames: float) -> _Frames:
     return late
 
 
-def _flipped(stored: _Frames, share: float, pixels: int, rng: np.random.Generator) -> _Frames:
-    """Silhouettes with full-size pixels the other way round, `pixels` of them in each of the values."""
+def _flip_pixels(stored: _Frames, share: float, pixels: int, rng: np.random.Generator) -> _Frames:
+    """Flip a random share of the full-size pixels; each value of the silhouettes stands for `pixels` pixels."""
     noisy = np.empty_like(stored)
     for block in _blocks(len(stored)):
         count = np.round(stored[block] / 255 * pixels).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Tables of results: mean and sample standard deviation over runs, as papers print them."""
+"""Tables of results: mean and sample standard deviation over runs."""
 
 from __future__ import annotations
 
@@ -16,45 +16,46 @@ from psotrack.support import nearest
 
 logger = logging.getLogger(__name__)
 
-#: What a table has of each combination.
+#: Columns of a table for each combination of labels.
 FIGURES = ("mean", "std", "runs")
 
-#: Columns that say what was run, besides `settings.*` and `perturbation.*`; `draw` and seeds are chance.
+#: Columns that describe a run, besides `settings.*` and `perturbation.*`; then the columns that only choose random
+#: numbers.
 _DESCRIBING = ("sequence", "method", "cameras", "frames", "extrinsics_deg", "clock_frames", "flipped")
-_CHANCE = ("settings.seed", "perturbation.draw")
+_RANDOM = ("settings.seed", "perturbation.draw")
 
 
 def pivot(
     rows: pd.DataFrame, *, rows_by: list[str], columns_by: list[str], value: str, scale: float = 1.0
 ) -> pd.DataFrame:
-    """Mean and sample standard deviation of a value over the rows that are alike in the named columns.
+    """Mean and sample standard deviation of a value over all rows with the same values in the named columns.
 
-    Names may leave out their leading parts where one column only ends so: `particles` is `settings.swarm.particles`.
-    Rows without the value, of runs that failed, do not count. Where figures are over more than runs and draws, a
-    warning in the log says over what.
+    A name may be the end of a column's name if no other column ends with it: `particles` is `settings.swarm.particles`. Rows
+    without the value, of runs that failed, do not count. If the rows of a figure differ in more than seeds and draws, a
+    warning in the log names the other columns.
 
     Args:
-        rows: of results, one per cell and run.
+        rows: results, one row per cell and run.
         rows_by: columns whose values label the table's rows; at least one.
-        columns_by: columns whose values label its columns.
+        columns_by: columns whose values label the table's columns.
         value: the column of numbers.
-        scale: their factor; 1000 makes metres millimetres, in their name too.
+        scale: factor of the numbers; 1000 turns metres into millimetres, also in the numbers' name.
 
     Returns:
-        Rows and columns in the order of numbers and of words; below each label of the columns "mean", "std" (NaN for a
-        single run) and "runs", how many counted. `attrs["value"]` names the numbers.
+        Rows and columns sorted by numbers and words. Below each label of the columns there are "mean", "std" (NaN for a
+        single run) and "runs", the number of runs. `attrs["value"]` is the numbers' name.
 
     Raises:
-        SettingsError: a column does not exist, is named twice or by too little of its name, or is none of numbers.
+        SettingsError: a column does not exist, its name is ambiguous or given twice, or the value is not numeric.
     """
     names = [str(name) for name in rows.columns]
-    axes = [_resolved("rows", name, names) for name in rows_by]
-    axes += [_resolved("columns", name, names) for name in columns_by]
+    axes = [_find_column("rows", name, names) for name in rows_by]
+    axes += [_find_column("columns", name, names) for name in columns_by]
     twice = [name for index, name in enumerate(axes) if name in axes[:index]]
     if twice or not rows_by:
         found = f"{twice[0]} twice" if twice else "none"
         raise SettingsError("rows", expected="at least one column, and each only once", found=found)
-    measured = _resolved("value", value, names)
+    measured = _find_column("value", value, names)
     try:
         numbers = pd.to_numeric(rows[measured]).astype(float)
     except (ValueError, TypeError) as error:
@@ -81,8 +82,8 @@ def pivot(
     return result
 
 
-def _resolved(where: str, name: str, names: list[str]) -> str:
-    """The column of that name, or the only one whose name ends so."""
+def _find_column(where: str, name: str, names: list[str]) -> str:
+    """The column with a name, or the only column whose name ends with it."""
     ends = [other for other in names if other == name] or [
         other for other in names if other.endswith(f".{name}")
     ]
@@ -96,7 +97,7 @@ def _resolved(where: str, name: str, names: list[str]) -> str:
 
 
 def _labels(column: Iterable[Any]) -> list[Any]:
-    """Numbers and words that can be compared and printed; "-" for nothing."""
+    """Labels that can be compared and printed: numbers and words, "-" for missing values."""
     return [_label(value) for value in column]
 
 
@@ -107,7 +108,7 @@ def _label(value: Any) -> Any:
         return " ".join(f"{_label(part)}" for part in value)
     if pd.isna(value):
         return "-"
-    # Columns with gaps hold whole numbers as floats.
+    # pandas stores whole numbers as floats in columns with missing values.
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
@@ -141,11 +142,11 @@ def _index(keys: list[tuple[Any, ...]], names: list[str]) -> pd.Index:
 
 
 def _warn_if_mixed(rows: pd.DataFrame, keys: list[tuple[Any, ...]], others: list[str]) -> None:
-    """Say which columns that describe runs differ within a figure of the table."""
+    """Log a warning with the columns that describe runs and differ within a figure of the table."""
     describing = [
         name
         for name in others
-        if name in _DESCRIBING or (name.startswith(("settings.", "perturbation.")) and name not in _CHANCE)
+        if name in _DESCRIBING or (name.startswith(("settings.", "perturbation.")) and name not in _RANDOM)
     ]
     num_groups = len(set(keys))
     mixed = [
@@ -156,7 +157,7 @@ def _warn_if_mixed(rows: pd.DataFrame, keys: list[tuple[Any, ...]], others: list
 
 
 def _scaled(value: str, scale: float) -> str:
-    """The name of the numbers: of thousandths where that is what the scale makes."""
+    """Name of the scaled numbers: metres become millimetres and seconds milliseconds if the scale is 1000."""
     if scale == 1:
         return value
     thousandths = re.fullmatch(r"(.*(?<!_m)_)([ms])", value) if scale == 1000 else None
