@@ -108,6 +108,9 @@ def test_one_row_per_cell_and_run(swept: Path) -> None:
     assert (rows["frames"] > 0).all()
     assert {"seconds.track", "versions.jax", "device.kind", "device.processor", "commit"} <= set(rows.columns)
     assert {"perturbation.flipped", "runs_in_batch", "seconds.compile"} <= set(rows.columns)
+    # The folder is one Parquet data set, with failures, errors and a manifest in it.
+    data_set = pd.read_parquet(swept / "results")
+    pd.testing.assert_frame_equal(data_set, Store(swept / "results").rows(), check_dtype=False)
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import logging
 import time
 import traceback
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from psotrack.errors import InputError, OutputError, PsotrackError
-from psotrack.evaluation import errors_over_time, evaluate
+from psotrack.evaluation import Evaluation, errors_over_time, evaluate
 from psotrack.pipeline import TrackedSequence, track_runs
 from psotrack.support import Report, no_progress
 from psotrack.sweep.cells import Cell, key_of, name_of, title
@@ -235,12 +235,15 @@ def _run_seeds(
 
 def _figures(result: TrackedSequence | InputError, given: Input) -> dict[str, Any]:
     """Evaluation and duration of a run. A run that finds no drones has missed all drones."""
+    # All runs have the same columns, so that programs can read all cells as one data set.
     if isinstance(result, InputError):
-        return {"missed_rate": 1.0, "note": str(result)}
+        metrics = [field.name for field in fields(Evaluation) if field.name not in ("frames", "per_drone")]
+        return dict.fromkeys(metrics, np.nan) | {"missed_rate": 1.0, "note": str(result)}
     assert given.sequence.truth is not None
     errors = evaluate(result.trajectories, given.sequence.truth).to_dict()
+    del errors["per_drone"]
+    figures = {"note": ""} | {name: np.nan if value is None else value for name, value in errors.items()}
     seconds = result.record["seconds"]
-    figures = {key: value for key, value in errors.items() if np.isscalar(value)}
     figures |= {f"seconds.{stage}": value for stage, value in seconds.items()}
     return figures | {"track_ms_per_frame": 1e3 * seconds["track"] / given.sequence.num_frames}
 
