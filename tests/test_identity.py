@@ -1,4 +1,4 @@
-"""Who is who after drones have met: against all histories of labels one by one, on flights, and by frequencies."""
+"""Identities after encounters: compared with all histories of labels, on simulated flights, and by frequencies."""
 
 from collections import deque
 from dataclasses import dataclass, replace
@@ -20,15 +20,15 @@ from psotrack.simulation.flights import planning
 
 ENCOUNTER_M = 0.6
 PARAMS = IdentityParams(encounter_m=ENCOUNTER_M)
-#: As gently as the simulator's drones fly, and those above that meet.
+#: A motion model as gentle as the flights of the simulator and of these tests.
 GENTLE = Model(density=1.0)
-#: What drones that meet are taken to do more than they do all in all.
+#: Ratio of the jerk density during encounters to the usual jerk density.
 AGILITY = 10.0
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What a tracker hands over, and which of its tracks each drone is in truth."""
+    """Output of a tracker, and the true track of each drone."""
 
     time_s: np.ndarray
     measured_m: np.ndarray
@@ -39,7 +39,7 @@ class Seen:
 
 
 def seen(flown_m, std_m=0.01, seed=0, exchanges=(), size_m=None):
-    """Flights (frames, drones, 3), measured with white errors; from each frame of `exchanges` on, tracks permuted."""
+    """Measure flights (frames, drones, 3) with white errors; permute the tracks from each frame of `exchanges` on."""
     frames, drones, _ = flown_m.shape
     rng = np.random.default_rng(seed)
     std_m = np.broadcast_to(std_m, (frames, drones))
@@ -58,7 +58,7 @@ def seen(flown_m, std_m=0.01, seed=0, exchanges=(), size_m=None):
 
 
 def by_tracks(whole, truth):
-    """The same with each drone's columns where the tracks of `truth` are."""
+    """Move each drone's columns to the columns of its tracks in `truth`."""
     column = np.argsort(truth, axis=1)
 
     def moved(value):
@@ -90,7 +90,7 @@ def outcomes(found):
 
 
 def apart_m(flown_m):
-    """(frames, drones), to the nearest other."""
+    """(frames, drones), distance to the nearest other drone."""
     distance_m = np.linalg.norm(flown_m[:, :, None] - flown_m[:, None], axis=-1)
     distance_m[:, np.eye(flown_m.shape[1], dtype=bool)] = np.inf
     return distance_m.min(axis=-1)
@@ -110,21 +110,21 @@ SECONDS = (np.arange(100) - 50) * DT_S
 
 
 def passing(side_m=0.3, speed_m_s=1.0):
-    """Two drones that fly straight on, nearest in frame 50."""
+    """Two drones on straight courses, nearest in frame 50."""
     x, y = speed_m_s * SECONDS, np.full(100, side_m / 2)
     one = np.stack([x, y, np.ones(100)], axis=-1)
     return np.stack([one, one * [-1, -1, 1]], axis=1)
 
 
 def turning_back(nearest_m=0.3, speed_m_s=1.0):
-    """Two drones that come head on, and turn back: a hyperbola over time."""
+    """Two drones that approach head on and turn back: a hyperbola over time."""
     x = np.sqrt((speed_m_s * SECONDS) ** 2 + (nearest_m / 2) ** 2)
     one = np.stack([x, np.zeros(100), np.ones(100)], axis=-1)
     return np.stack([one, one * [-1, -1, 1]], axis=1)
 
 
 def hovering(together_m=0.15, hover_s=1.4):
-    """Two drones that come together, stay, and go back to where they came from, in 160 frames."""
+    """Two drones that meet, stay together, and return to where they came from, in 160 frames."""
     still = np.maximum(np.abs((np.arange(160) - 50) * DT_S) - hover_s / 2, 0.0)
     x = together_m / 2 + still**2 / (still + 0.3)
     one = np.stack([x, np.zeros(160), np.ones(160)], axis=-1)
@@ -132,7 +132,7 @@ def hovering(together_m=0.15, hover_s=1.4):
 
 
 def merging(flown_m, merge_m=0.3):
-    """What is seen of two drones whose silhouettes are one where they are nearer than this: both are in its middle."""
+    """Two drones whose silhouettes merge below a distance; then both are measured in the merged silhouette's middle."""
     share = np.clip(2 * (1 - apart_m(flown_m) / merge_m), 0, 1)[..., None]
     return flown_m + share * (flown_m.mean(axis=1, keepdims=True) - flown_m)
 
@@ -166,7 +166,7 @@ class TestTwoDrones:
 
     @pytest.mark.parametrize("exchanged", [False, True])
     def test_who_hovers_together_is_ambiguous(self, exchanged):
-        """Both are on one silhouette for more than a second: nobody can say who comes out on which side."""
+        """Both drones share a silhouette for more than a second, so their identities after it cannot be known."""
         found = resolved(seen(merging(hovering()), exchanges=[(50, (1, 0))] * exchanged))
         assert outcomes(found) == [LabelOutcome.UNDECIDED]
         assert (found.order == [0, 1]).all()
@@ -177,7 +177,7 @@ class TestTwoDrones:
 
     @pytest.mark.parametrize("exchanged", [False, True])
     def test_sizes_tell_who_hovered(self, exchanged):
-        """One is a fifth larger than the other; as the errors last, that takes some tenths of a second."""
+        """One drone is a fifth larger; because errors are correlated, the decision takes some tenths of a second."""
         flown_m = np.concatenate([np.repeat(hovering()[:1], 200, axis=0), merging(hovering())])
         usual_m = np.array([[0.36, 0.36, 0.12], [0.30, 0.30, 0.10]])
         size_m = usual_m + 0.01 * lasting(np.random.default_rng(1), (360, 2, 3))
@@ -209,7 +209,7 @@ class TestTwoDrones:
 
     @pytest.mark.parametrize("exchanged", [False, True])
     def test_a_stretch_without_measurements(self, exchanged):
-        """Neither is seen for eight frames, when they are nearest; or one is, by what is taken for the other."""
+        """Around the closest frame, for eight frames no drone is measured, or one of them on the other's track."""
         tracks = seen(passing(0.15), exchanges=[(50, (1, 0))] * exchanged)
         for hidden in ([0, 1], [0], [1]):
             was_measured = tracks.was_measured.copy()
@@ -234,7 +234,7 @@ class TestTwoDrones:
 
     @pytest.mark.parametrize("exchanged", [False, True])
     def test_merged_silhouettes_in_a_pass(self, exchanged):
-        """For some tenths of a second both are seen in the same place; their course before tells, or nothing does."""
+        """For some tenths of a second both are measured at the same place; only their earlier course may decide."""
         tracks = seen(merging(passing(0.15)), exchanges=[(50, (1, 0))] * exchanged)
         found = resolved(tracks)
         assert outcomes(found) == [LabelOutcome.SWAPPED if exchanged else LabelOutcome.KEPT]
@@ -256,7 +256,7 @@ class TestTwoDrones:
         np.testing.assert_array_equal(found.order, tracks.truth)
 
     def test_a_drone_that_never_comes_back(self):
-        """After `patience_s` the encounter is closed, as it is."""
+        """After `patience_s` the encounter ends without a decision."""
         tracks = seen(passing())
         was_measured = tracks.was_measured.copy()
         was_measured[50:, 1] = False
@@ -268,7 +268,7 @@ class TestTwoDrones:
 
 
 def meeting_in_the_middle(drones, nearest_m=0.25, speed_m_s=1.0):
-    """Drones from all sides that pass one another, all nearest in frame 50."""
+    """Drones from all sides that pass each other, all nearest in frame 50."""
     angle = 2 * np.pi * np.arange(drones) / drones
     ahead = np.stack([np.cos(angle), np.sin(angle), np.zeros(drones)], axis=-1)
     aside = np.stack([-np.sin(angle), np.cos(angle), np.zeros(drones)], axis=-1)
@@ -276,7 +276,7 @@ def meeting_in_the_middle(drones, nearest_m=0.25, speed_m_s=1.0):
 
 
 def assert_mended(found, tracks):
-    """Right labels but about the exchange: which of several tracks went first may be a frame off."""
+    """Assert correct labels, except near the swaps, where the order of several swaps may differ by a frame."""
     wrong = np.flatnonzero((found.order != tracks.truth).any(axis=1))
     assert len(wrong) <= 2
     assert (np.abs(wrong - 50) <= 2).all()
@@ -295,7 +295,7 @@ class TestMoreDrones:
             assert encounter.outcome is (LabelOutcome.SWAPPED if mixed else LabelOutcome.KEPT)
 
     def test_two_exchanges_at_different_times(self):
-        """Three tracks change places in two steps: each is mended where it was."""
+        """Three tracks are permuted in two steps, and each step is undone in its frame."""
         tracks = seen(meeting_in_the_middle(3), exchanges=[(46, (1, 0, 2)), (54, (0, 2, 1))])
         np.testing.assert_array_equal(resolved(tracks).order, tracks.truth)
 
@@ -308,7 +308,7 @@ class TestMoreDrones:
         assert (found.ambiguity[:, (found.pairs != 4).all(axis=1)] > 0).any(axis=0).all()
 
     def test_two_encounters_become_one(self):
-        """Two pairs meet by themselves, and then one another, while their labels are still in doubt."""
+        """Two pairs meet separately, and then both pairs meet, while their labels are still uncertain."""
         one = passing(0.3, 0.3)
         flown_m = np.concatenate([one, one + np.array([0.0, 1.6, 0.0])], axis=1)
         flown_m[..., 1] += np.array([1.0, 1.0, -1.0, -1.0]) * np.clip(SECONDS[:, None] + 0.4, 0, 1) * 0.55
@@ -319,13 +319,13 @@ class TestMoreDrones:
         assert {encounter.first_frame for encounter in found.encounters} != {0}
 
     def test_five_at_once_are_more_than_one_group_holds(self):
-        """Right labels stay right, and what is reported is a probability."""
+        """Correct labels stay correct, and the reported ambiguity is a probability."""
         found = resolved(seen(meeting_in_the_middle(5)))
         assert (found.order == np.arange(5)).all()
         assert ((found.ambiguity >= 0) & (found.ambiguity <= 1)).all()
 
     def test_who_leaves_a_group_is_settled_before_those_who_stay(self):
-        """Two fly side by side all the time, a third one passes."""
+        """Two drones fly side by side all the time, and a third drone passes."""
         still = np.stack([np.array([[0.0, y, 1.0]]) for y in (0.0, 0.45)], axis=1).repeat(100, axis=0)
         third = np.stack([2 * SECONDS, np.full(100, -0.3), np.ones(100)], axis=-1)[:, None]
         tracks = seen(np.concatenate([still, third], axis=1), exchanges=[(50, (2, 1, 0))])
@@ -353,15 +353,15 @@ class TestMoreDrones:
                 was_measured=tracks.was_measured[:, names],
             )
         )
-        # Drone and track `names[i]` are called i now.
+        # Drone and track `names[i]` have the index i after the permutation.
         np.testing.assert_array_equal(names[renamed.order], found.order[:, names])
         column = {tuple(sorted(names[pair])): index for index, pair in enumerate(renamed.pairs)}
         columns = [column[tuple(pair)] for pair in found.pairs]
-        # Sums of 24 terms in another order, over a hundred frames.
+        # The tolerance is for sums of 24 terms in another order, over a hundred frames.
         np.testing.assert_allclose(renamed.ambiguity[:, columns], found.ambiguity, rtol=0, atol=1e-9)
 
     def test_the_first_frames_by_themselves(self):
-        """Chunk by chunk comes out as all at once does, up to the first frame that is still in doubt."""
+        """The first frames alone give the same result as all frames, up to the first frame that is still uncertain."""
         time_s = np.arange(300) * DT_S
         x = 1.5 * np.sin(time_s[:, None] * [1.1, 0.9, 1.3] + [0.0, 2.0, 4.0])
         flown_m = np.stack([x, 0.1 * np.arange(3) * np.ones_like(x), np.ones_like(x)], axis=-1)
@@ -429,7 +429,7 @@ class TestLabellings:
     @pytest.mark.parametrize("share", [0.0, 0.5])
     @pytest.mark.parametrize(("frames", "limit", "limit_m"), [(1, 1e-9, 1e-9), (7, 0.02, 0.003)])
     def test_all_histories_one_by_one(self, frames, limit, limit_m, share):
-        """Exact after one frame. After seven, of 128 histories, merging costs little: measured 0.8 mm."""
+        """Exact after one frame. After seven frames, with 128 histories, merging changes little: measured 0.8 mm."""
         model = Model(density=10.0, error_share=share)
         for seed in range(3):
             rng = np.random.default_rng(seed)
@@ -437,7 +437,7 @@ class TestLabellings:
                 [np.outer(np.arange(20) * DT_S, 0.1 * rng.normal(size=3)) for _ in range(2)], axis=1
             )
             flown_m += 0.01 * rng.normal(size=(2, 3)) - flown_m[13]
-            # Half as far off as it is said to be: nothing is beyond the gate, of which a textbook knows nothing.
+            # Errors are half of their standard deviation, so that none is beyond the gate, which the textbook lacks.
             measured_m = flown_m + 0.01 * rng.normal(size=flown_m.shape)
             covariance_m2 = np.broadcast_to(0.02**2 * np.eye(3), (20, 2, 3, 3))
             start = [(measured_m[:10, drone], covariance_m2[:10, drone]) for drone in (0, 1)]
@@ -465,7 +465,7 @@ class TestLabellings:
 
     @pytest.mark.parametrize("drones", [1, 2, 3, 4])
     def test_exchanges_are_counted(self, drones):
-        """By trying all exchanges until every labelling has been reached."""
+        """Compared with a search through all swaps until every labelling is reached."""
         all_of = [tuple(row) for row in labellings.labellings(drones).tolist()]
         assert all_of[0] == tuple(range(drones))
         assert set(all_of) == set(permutations(range(drones)))
@@ -484,26 +484,26 @@ class TestLabellings:
         active = np.zeros((3, 3), bool)
         active[0, 2] = active[2, 0] = True
         log_change = labellings.change_log_probability(active, 0.25)
-        # Of two outcomes of odds 4 to 1, whatever drones the tracks 0 and 2 are.
+        # Two outcomes with odds 4 to 1, for all drones on the tracks 0 and 2.
         for before, row in zip(labellings.labellings(3), np.exp(log_change), strict=True):
             swapped = (labellings.labellings(3) == np.array([2, 1, 0])[before]).all(axis=1)
             same = (labellings.labellings(3) == before).all(axis=1)
             np.testing.assert_allclose(row, 0.2 * swapped + 0.8 * same, rtol=0, atol=1e-12)
 
     def test_confusions_by_hand(self):
-        """Reported 0, 1, 2; in truth drone 0 is on track 1, 1 on 2, and 2 on 0: all are taken for one another."""
+        """Reported 0, 1, 2; in truth drone 0 is on track 1, 1 on 2, and 2 on 0: all pairs are confused."""
         wrong = labellings.confusions(3)
         index = {tuple(row): at for at, row in enumerate(labellings.labellings(3).tolist())}
         assert wrong[0, index[1, 2, 0]].tolist() == [True, True, True]
         assert wrong[0, index[1, 0, 2]].tolist() == [True, False, False]
         assert wrong[0, index[2, 1, 0]].tolist() == [False, True, False]
-        # What is reported as it is, is right.
+        # A labelling that is reported correctly confuses no pair.
         assert not wrong[np.arange(6), np.arange(6)].any()
-        # Reported 1, 0, 2, in truth 2, 0, 1: track 1 passes for drone 0 and is 2; track 2 passes for 2 and is 0.
+        # Reported 1, 0, 2, in truth 2, 0, 1: track 1 is reported as 0 and is 2; track 2 is reported as 2 and is 0.
         assert wrong[index[1, 0, 2], index[2, 0, 1]].tolist() == [False, True, False]
 
     def test_smoothed_is_bayes_rule_backwards(self):
-        """Against the joint distribution of three frames of a chain of three labellings."""
+        """Compared with the joint distribution of three frames of a chain of three labellings."""
         rng = np.random.default_rng(0)
         before = rng.random((3, 3, 3))
         before /= before.sum(axis=1, keepdims=True)
@@ -514,7 +514,7 @@ class TestLabellings:
         )
 
     def test_path_by_hand(self):
-        """One wrong frame is not worth two changes of cost 1.5 each; four are."""
+        """One wrong frame does not justify two changes of cost 1.5 each; four wrong frames do."""
         cost = 1.5 * (1 - np.eye(2))
         for stretch, expected in ((1, [0] * 6), (4, [0, 1, 1, 1, 1, 0])):
             right = np.eye(2)[[0] + [1] * stretch + [0] * (5 - stretch)]
@@ -529,7 +529,7 @@ class TestLabellings:
 
 class TestLikeness:
     def test_a_second_of_one_look_is_worth_one_look(self):
-        """Errors that stay for 2 s against errors that are new in every frame: fifty frames for one."""
+        """Errors that last for 2 s, compared with independent errors: fifty frames count as one."""
         rng = np.random.default_rng(0)
         time_s = np.arange(2000) * DT_S
         white_m = 0.01 * rng.normal(size=(2000, 2, 3))
@@ -538,12 +538,12 @@ class TestLikeness:
             np.linalg.inv(likeness.learn_likeness(time_s, off_m + 0.3).precision_m2)
             for off_m in (white_m, stuck_m)
         ]
-        # Variances of 40 looks each are known to a sixth, three times that is allowed for.
+        # Variances of 40 values are known to a sixth; the limit is three times as much.
         for found, times in zip(worth, (1 + 1, 1 + 50), strict=True):
             np.testing.assert_allclose(np.diag(found), times * 0.01**2, rtol=0.5)
 
     def test_drones_that_are_alike_are_not_told_apart(self):
-        """Of a hundred pairs with errors that last, the evidence of two seconds is for neither in nearly all."""
+        """With correlated errors, two seconds decide nothing in nearly all of a hundred pairs of equal drones."""
         time_s = np.arange(250) * DT_S
         evidence = []
         for seed in range(100):
@@ -578,7 +578,7 @@ class TestLikeness:
         known = likeness.learn_likeness(time_s, size_m)
         size_m[::50] = 5.0
         spoilt = likeness.learn_likeness(time_s, size_m)
-        # Ten of 500 frames drawn in to four deviations: 0.8 mm at most.
+        # Ten of 500 frames, clipped to four deviations, change the mean by at most 0.8 mm.
         np.testing.assert_allclose(spoilt.typical_m, known.typical_m, rtol=0, atol=0.0015)
 
 
@@ -606,7 +606,7 @@ class TestRefusals:
 
 class TestFrequencies:
     def test_probabilities_are_how_often_labels_are_wrong(self):
-        """A hundred encounters whose flights, errors and exchanges obey the model.
+        """A hundred encounters whose flights, errors and swaps follow the model.
 
         While two are near their tracks are exchanged five times per second, and errors are as large as they are taken
         to be there. Where something is in doubt, as many labels are wrong as it says, to within 4 standard deviations
@@ -643,16 +643,16 @@ class TestFrequencies:
             inside = (probability >= low) & (probability <= high)
             number, expected = inside.sum(), np.clip(probability[inside].mean(), 0.04, 0.96)
             least, most = binom.ppf([3e-5, 1 - 3e-5], number, expected)
-            # Certain labels may be right more often than in 96 of 100.
+            # Labels that are nearly certain may be right more often than in 96 of 100 encounters.
             assert wrong[inside].sum() >= (0 if high <= 0.02 else least), (low, high)
             assert wrong[inside].sum() <= (number if low >= 0.98 else most), (low, high)
             assert number >= 4, (low, high)
-        # And they tell something: labels that are taken to be right are, and the reverse.
+        # The probabilities are informative: probable labels are right, improbable labels are wrong.
         assert ((probability > 0.5) == wrong).mean() > 0.85
 
     @pytest.mark.parametrize("name", ["S01_D2_A", "S04_D10"])
     def test_flights_of_the_simulator(self, name):
-        """Every exchange is mended and no right label is exchanged, at any noise: passes at 0.3 and 0.4 m."""
+        """At any noise, every swap is undone and no correct label is changed, for passes at 0.3 and 0.4 m."""
         recipe = scenario(name)
         flights = planning.plan(recipe, 0)
         time_s = planning.frame_times_s(recipe, recipe.num_frames)
@@ -680,7 +680,7 @@ class TestFrequencies:
 
 
 def white_jerk_meetings(rng, pairs, frames=50, density=AGILITY):
-    """Flights (frames, 2 * pairs, 3) with white jerk, pairs far from one another, and (frames, pairs) who is near."""
+    """Flights (frames, 2 * pairs, 3) with white jerk, pairs far apart, and (frames, pairs), whether a pair is near."""
     F, Q = Model(density=density).transition(DT_S, np.eye(3))
     root = np.linalg.cholesky(Q)
     middle = frames // 2
@@ -694,7 +694,7 @@ def white_jerk_meetings(rng, pairs, frames=50, density=AGILITY):
     )
     state = np.empty((frames, 2 * pairs, 9))
     for direction in (1, -1):
-        # Backwards in time, velocities are reversed.
+        # In reversed time, velocities have the opposite sign.
         mirror = np.repeat([1.0, direction, 1.0], 3)
         now = start * mirror
         for frame in range(middle, frames if direction > 0 else -1, direction):

@@ -1,4 +1,4 @@
-"""Drones of a dozen pixels and less: a few cells of a silhouette, which are rough, thin and not all there."""
+"""Drones of at most a dozen pixels: a few cells of a silhouette, with rough edges and gaps."""
 
 from dataclasses import replace
 
@@ -36,9 +36,9 @@ def both():
 
 
 def magnified(rig: Rig, times: int) -> Rig:
-    """Cameras with so many times as many pixels along each side."""
+    """Cameras with `times` as many pixels along each side."""
     K = rig.cameras.K * np.array([[times], [times], [1]])
-    # The corner of the image stays at half a pixel before the middle of the first one.
+    # The corner of the image stays half a pixel before the middle of the first pixel.
     K[:, :2, 2] += (times - 1) / 2
     return Rig(
         rig.names, replace(rig.cameras, K=K, image_size_wh=times * np.asarray(rig.cameras.image_size_wh))
@@ -72,8 +72,8 @@ def assert_found(position_m, *truth_m, atol):
 
 @settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 8))
-def test_blobs_are_the_same_however_many_pixels_a_cell_has(seed, times):
-    """A bug of the first version: the least area was one of image pixels, and fine silhouettes had no small blobs."""
+def test_blobs_do_not_depend_on_the_pixels_per_cell(seed, times):
+    """Regression: the smallest area was in image pixels, so fine silhouettes had no small blobs."""
     rng = np.random.default_rng(seed)
     image = 255 * (rng.random((20, 30)) < 0.1).astype(np.uint8)
     one, other = find_blobs(image, 1), find_blobs(image, times)
@@ -91,39 +91,39 @@ def test_a_single_cell_is_noise():
 
 
 @pytest.mark.parametrize("times", [2, 4])
-def test_starts_are_the_same_however_many_pixels_a_cell_has(both, times):
+def test_initial_states_do_not_depend_on_the_pixels_per_cell(both, times):
     one = start_of(both[:10])
     other = start_of(both[:10], magnified(SMALL, times), times * REDUCTION)
-    # The lenses' and the lines' equations are the same but for rounding in float64.
+    # The equations are the same except for rounding in float64.
     for name, value in vars(one).items():
         np.testing.assert_allclose(getattr(other, name), value, atol=1e-6, err_msg=name)
 
 
-def test_drones_of_a_few_cells_are_found_at_the_start(both):
-    """A bug of the first version: blobs of ten cells were too small."""
+def test_drones_of_a_few_cells_are_in_the_initial_state(both):
+    """Regression: blobs of ten cells were too small."""
     start = start_of(both[:10])
     assert_found(start.position_m, ONE[0], OTHER[0], atol=CELL_M / 2)
 
 
 @pytest.mark.parametrize("times", [1, 2])
-def test_drones_of_a_few_cells_are_found_when_they_come(both, times):
-    """A bug of the first version: newcomers were looked for at half the size, of which a small drone is a cell."""
+def test_drones_of_a_few_cells_become_candidates(both, times):
+    """Regression: candidates were searched at half the resolution, where a small drone is one cell."""
     found = candidates_in(both, ONE, rig=magnified(SMALL, times), reduction=times * REDUCTION)
     assert_found([one.position_m for one in found], OTHER[found[0].frame], atol=CELL_M / 2)
 
 
-def test_known_drones_of_a_few_cells_leave_nobody(both):
+def test_known_drones_of_a_few_cells_explain_all_foreground(both):
     assert candidates_in(both, ONE, OTHER) == ()
 
 
 def thinned(coverage, share, seed=0):
-    """The silhouettes with so much of their cells left, drawn anew in every frame."""
+    """Keep a random share of the cells in every frame."""
     return coverage * (np.random.default_rng(seed).random(coverage.shape) < share)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_silhouette_full_of_holes_is_a_drone(seed):
-    """A bug of the first version: a camera that showed less than a quarter of the drone was said not to see it."""
+def test_a_silhouette_with_many_gaps_is_a_drone(seed):
+    """Regression: a camera that showed less than a quarter of the drone did not count."""
     rig = ring_rig(6, image_size_wh=(240, 180))
     coverage = thinned(drawn(OTHER, rig=rig), 0.22, seed)
     found = candidates_in(coverage, rig=rig)
@@ -131,8 +131,8 @@ def test_a_silhouette_full_of_holes_is_a_drone(seed):
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_noise_everywhere_is_nobody(seed):
-    """A few of the cells of every image, drawn anew in every frame: no place has more than what is about it."""
+def test_noise_everywhere_is_no_drone(seed):
+    """A few random cells in every image: no place has more foreground than its surroundings."""
     rng = np.random.default_rng(seed)
     noise = 255 * (rng.random((25, 6, 45, 60)) < 0.03).astype(np.uint8)
     rig = ring_rig(6, image_size_wh=(120, 90))
