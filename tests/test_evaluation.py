@@ -1,4 +1,4 @@
-"""Metrics on flights of five frames whose answers are worked by hand, against brute force, and by their invariants."""
+"""Metrics: compared with results by hand on flights of five frames, with brute force, and by invariants."""
 
 import itertools
 import json
@@ -100,7 +100,7 @@ class TestFiveFrames:
         assert evaluation.frames == 5
         assert evaluation.per_drone[1].frames == 3
         assert evaluation.mean_error_m == pytest.approx(3 * 0.2 / 8, abs=ROUNDING)
-        # The track of the drone that nobody knows is no false positive.
+        # The track of the drone without known position is no false positive.
         assert (evaluation.missed_rate, evaluation.mota, evaluation.idf1) == (0, 1, 1)
 
     def test_a_track_that_leaves_its_unknown_drone_for_another_is_judged(self):
@@ -218,7 +218,7 @@ class TestContract:
 
 
 def same(first, second, tolerance: float) -> None:
-    """Equal evaluations, but for rounding, the names of the estimates and the order of the drones."""
+    """Assert equal evaluations, except for rounding, names of the estimates and the order of the drones."""
     one, two = first.to_dict(), second.to_dict()
     for evaluation in (one, two):
         evaluation["per_drone"].sort(key=lambda drone: drone["drone"])
@@ -237,7 +237,7 @@ def same(first, second, tolerance: float) -> None:
 
 
 def with_covariances(est, ref):
-    """The same with orientations and covariances in the estimate, as random as they can be."""
+    """Random flights, with random orientations and covariances of the estimate."""
     rng = np.random.default_rng(est.num_frames)
     root = rng.normal(0, 0.1, (est.num_frames, est.num_drones, 3, 3))
     orientation_wxyz = Rotation.random(est.num_frames * est.num_drones, rng=rng).as_quat(scalar_first=True)
@@ -333,7 +333,7 @@ class TestAgainstBruteForce:
         for here_m, partner in zip(distance_m, partners_per_frame(distance_m, keep=False), strict=True):
 
             def worth(pairing, here_m=here_m):
-                """Most pairs first, then the least sum of distances; impossible pairs are worth nothing at all."""
+                """Value of an assignment: first the number of possible pairs, then the smallest sum of distances."""
                 lengths_m = [here_m[d, e] for d, e in enumerate(pairing) if e != UNASSIGNED]
                 possible = all(length_m <= GATE_M for length_m in lengths_m)
                 return (len(lengths_m), -sum(lengths_m)) if possible else (-1, 0.0)

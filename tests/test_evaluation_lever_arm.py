@@ -1,4 +1,4 @@
-"""The lever arm of each drone: how well it is known, before and after, in the JSON and in the table."""
+"""The lever arm of each drone, its standard error, and both in the JSON and in the table."""
 
 import io
 import json
@@ -26,7 +26,7 @@ def autoregressive(rng, count: int, persistence: float):
 
 
 def turning_flight(num_frames: int = 400, noise_m: float = 0.0):
-    """One drone that flies and turns, tracked at the end of its arm."""
+    """A drone that flies and turns; the tracked point is at the end of the lever arm."""
     rng = np.random.default_rng(0)
     time_s = np.arange(num_frames) / 25
     ref_m = np.stack([np.cos(time_s), np.sin(0.7 * time_s), 1 + 0.2 * np.sin(2 * time_s)], axis=-1)[:, None]

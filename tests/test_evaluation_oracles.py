@@ -1,4 +1,4 @@
-"""The same numbers as trackeval and motmetrics give on random flights.
+"""Comparison with the packages trackeval and motmetrics on random flights.
 
 trackeval 1.3.0 is the code of HOTA's authors; motmetrics 1.4.0 implements CLEAR and IDF1 on its own. trackeval asks for
 opencv-python, which takes the place of the headless one; it is no part of the `test` extra for that, and these
@@ -30,16 +30,16 @@ def apart(seed: int) -> tuple[Trajectories, Trajectories]:
     num_frames, num_drones = 20, 4
     ref_m = np.zeros((num_frames, num_drones, 3)) + np.arange(num_drones)[:, None] * [3.0, 0.0, 0.0]
     ref_m += rng.normal(0, 0.1, ref_m.shape)
-    # A third are further off than the gate.
+    # A third of the distances exceed the gate.
     est_m = ref_m + rng.normal(0, 0.25, ref_m.shape)
     known, seen = rng.random((2, num_frames, num_drones)) > 0.15
-    # So that frame 0 says who is who, and every drone is known.
+    # Frame 0 defines the identities, and every drone is known in it.
     known[0], seen[0] = True, True
     est_m[~seen] = np.nan
     ref_m[~known] = np.nan
     for start in rng.integers(3, num_frames, 3):
         est_m[start:] = est_m[start:, rng.permutation(num_drones)]
-    # A track whose own drone is unknown is absent too: that we do not count it is told by other tests.
+    # Tracks are removed where their drone is unknown; other tests show that such tracks do not count.
     est_m[~known] = np.nan
     false_m = np.where(rng.random((num_frames, 1, 1)) < 0.5, 50.0, np.nan) + np.zeros(3)
     frame = np.arange(num_frames)

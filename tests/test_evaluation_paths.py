@@ -1,4 +1,4 @@
-"""ATE, RPE and the honesty of covariances on five frames worked by hand, and against independent formulas."""
+"""ATE, RPE and consistency: compared with results by hand on five frames and with independent formulas."""
 
 from dataclasses import replace
 
@@ -111,7 +111,7 @@ class TestRelative:
         assert evaluate(est, truth).rpe_1s_rmse_m == pytest.approx(0.3, abs=ROUNDING)
 
     def test_a_second_is_counted_in_frame_numbers_and_not_in_rows(self):
-        # Nobody knows frame 2, which is no row then: 1 to 3 is one row on, 0 to 2 and 2 to 4 are not there.
+        # Frame 2 is unknown and has no row: the pair 1 and 3 is in consecutive rows, 0 and 2, 2 and 4 are no pairs.
         truth, est = on_x_axis([0, 0, None, 0, 0]), on_x_axis([0.1, 0, 7, 0.3, 0.9])
         assert evaluate(est, truth).rpe_1s_rmse_m == pytest.approx(0.3, abs=ROUNDING)
 

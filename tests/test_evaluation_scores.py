@@ -1,4 +1,4 @@
-"""HOTA and GOSPA on five frames worked by hand, and GOSPA as the metric that it is."""
+"""HOTA and GOSPA: compared with results by hand on five frames; GOSPA satisfies the axioms of a metric."""
 
 import numpy as np
 import pytest
@@ -62,7 +62,7 @@ class TestHota:
     def test_a_track_whose_drone_nobody_knows_is_no_false_positive(self):
         truth = on_x_axis([0] * 5, [10, 10, None, None, 10])
         assert hota_of(on_x_axis([0] * 5, [10] * 5), truth) == pytest.approx((1,) * 4, abs=ROUNDING)
-        # A surplus track is: TP = 8, FP = 5.
+        # A false track counts: TP = 8, FP = 5.
         deta = hota_of(on_x_axis([0] * 5, [10] * 5, [50] * 5), truth)[1]
         assert deta == pytest.approx(8 / 13, abs=ROUNDING)
 

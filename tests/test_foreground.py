@@ -1,4 +1,4 @@
-"""Foreground against scenes that are drawn from known shapes, and against plain NumPy and SciPy."""
+"""Foreground of scenes with known shapes, and comparisons with NumPy and SciPy."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ RADIUS_PX = 9.0
 
 
 def _scene(rng: np.random.Generator) -> np.ndarray:
-    """A room: smooth texture, no edges that a pixel's noise could cross."""
+    """Image of a room: smooth texture without edges."""
     coarse = rng.integers(90, 190, (HEIGHT // 20, WIDTH // 20, 3)).astype(np.float32)
     return cv2.resize(coarse, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
 
@@ -64,7 +64,7 @@ def test_a_disc_of_known_centre_stays_where_it_is(working_reduction: int, reduct
         for mask in foreground(frames, frames, knobs)
     ]
     error_px = np.array(found) - centres
-    # One centroid scatters by the rounding of the edge, 0.05 to 0.25 px; a shift shows in the mean of 60.
+    # Rounding of the edge scatters one centroid by 0.05 to 0.25 px; the mean of 60 centroids would show a shift.
     assert np.abs(error_px.mean(axis=0)).max() < 0.1
     assert error_px.std(axis=0).max() < 0.5
 
@@ -74,7 +74,7 @@ def test_silhouette_has_the_area_of_the_shape() -> None:
     scene = _scene(rng)
     frames = [_frame(scene, rng, (30.0 + 5 * i, 60.0)) for i in range(20)]
     (mask,) = foreground(frames, frames[7:8], ForegroundSettings(working_reduction=1))
-    # Pixels that the edge crosses count as soon as they differ from the room: up to half a pixel all around.
+    # Pixels on the edge count if they differ from the room: up to half a pixel on all sides.
     assert np.pi * RADIUS_PX**2 <= np.count_nonzero(mask) <= np.pi * (RADIUS_PX + 1) ** 2
 
 
@@ -98,7 +98,7 @@ def test_order_of_learning_does_not_matter() -> None:
     knobs = ForegroundSettings(working_reduction=1)
     (forward,) = foreground(frames, frames[:1], knobs)
     (backward,) = foreground(frames[::-1], frames[:1], knobs)
-    # Variances follow a recursion that is not quite a mean: pixels on the disc's edge may differ.
+    # The recursion of the variances is only nearly a mean, so pixels on the disc's edge may differ.
     assert np.count_nonzero(forward != backward) < 0.1 * np.count_nonzero(forward)
 
 

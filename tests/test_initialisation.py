@@ -1,4 +1,4 @@
-"""Drones in the first frames, from silhouettes that are drawn by casting rays at ellipsoids."""
+"""Drones in the first frames, from silhouettes of ellipsoids that are drawn by ray casting."""
 
 from dataclasses import replace
 from functools import cache
@@ -38,7 +38,7 @@ def found_in(coverage, rig=RIG):
 
 
 def matched(start, position_m):
-    """Rows of the start in the order of the known drones; every drone once."""
+    """Rows of the initial state in the order of the known drones; each drone is found once."""
     assert len(start.position_m) == len(position_m)
     nearest = np.linalg.norm(start.position_m - np.asarray(position_m)[:, None], axis=-1).argmin(axis=1)
     assert len(set(nearest.tolist())) == len(position_m)
@@ -52,17 +52,17 @@ SIZES_M = [[0.5, 0.5, 0.3], [0.6, 0.6, 0.25], [0.4, 0.4, 0.4]]
 
 @pytest.mark.parametrize("num_drones", [1, 2, 3])
 def test_position_velocity_and_size(num_drones):
-    """Three of them touch in some of the images: the middle of a blob that two share places neither."""
+    """Three drones share blobs in some images; the middle of a shared blob is at no drone."""
     drones = slice(num_drones)
     coverage = drawn(flight(DRONES_M[drones], VELOCITIES_M_S[drones]), SIZES_M[drones])
     start = found_in(coverage)
     rows = matched(start, DRONES_M[drones])
-    # A blob's middle is good to half a cell in each of five views and seven frames; limit one cell.
+    # The error of a blob's middle is half a cell in each of five views and seven frames; limit one cell.
     np.testing.assert_allclose(start.position_m[rows], DRONES_M[drones], atol=CELL_M)
-    # Half a cell over the nearer half of a quarter of a second: it is the velocity at the end of a parabola.
+    # Half a cell over half of a quarter of a second, because it is the velocity at the end of a parabola.
     np.testing.assert_allclose(start.velocity_m_s[rows], VELOCITIES_M_S[drones], atol=0.5 * CELL_M / 0.12)
-    # A cell belongs to the blob from a quarter of its area on: at most one cell too wide, half a cell at each end.
-    # The height is a difference of squares of such numbers, good to two cells.
+    # A cell belongs to a blob if a quarter is covered, so a blob is at most half a cell too wide at each end.
+    # The height is computed from a difference of squares; limit two cells.
     np.testing.assert_allclose(start.size_m[rows, :2], np.array(SIZES_M)[drones, :2], atol=1.5 * CELL_M)
     np.testing.assert_allclose(start.size_m[rows, 2], np.array(SIZES_M)[drones, 2], atol=2 * CELL_M)
     assert (start.num_cameras >= 3).all()
@@ -85,7 +85,7 @@ def test_one_frame_is_enough_for_positions():
 
 
 def test_noise_that_does_not_persist_is_no_drone():
-    """Blobs at other places in every frame, besides a drone."""
+    """A drone, and noise blobs at different places in every frame."""
     coverage = drawn(flight(DRONES_M[:1], VELOCITIES_M_S[:1]), SIZES_M[:1])
     rng = np.random.default_rng(0)
     for image in coverage.reshape(-1, 120, 160):
@@ -96,7 +96,7 @@ def test_noise_that_does_not_persist_is_no_drone():
 
 
 def test_a_shadow_on_the_floor_is_no_drone():
-    """Shadows agree between all views and move as their drones do: only their height tells them."""
+    """Shadows look the same in all views and move like their drones; only their height differs."""
     drone, speed, shadow_size = [0.2, 0.1, 1.5], [1.0, 0.0, 0.0], [0.4, 0.4, 0.02]
     shadows = [[0.25, 0.1, 0.0], [-0.8, -0.6, 0.0], [0.9, -0.5, 0.0]]
     path = flight([drone, *shadows], [speed] * 4)
@@ -106,7 +106,7 @@ def test_a_shadow_on_the_floor_is_no_drone():
 
 
 def test_blobs_at_the_border_do_not_count():
-    """A drone that two images cut: its place and size come from the other cameras."""
+    """Two images cut the drone off; its place and size come from the other cameras."""
     height, width = 240, 320
     rng = np.random.default_rng(0)
     for _ in range(2000):
@@ -124,7 +124,7 @@ def test_blobs_at_the_border_do_not_count():
 
 
 def test_two_drones_that_hide_each_other_in_one_view():
-    """Both on one ray of camera 0, which sees one blob: the others tell them apart."""
+    """Two drones on one ray of camera 0, which shows one blob; the other cameras separate them."""
     near = np.array([0.4, 0.1, 1.4])
     ray = near - RIG.cameras.centre_world[0]
     far = near + 1.1 * ray / np.linalg.norm(ray)
@@ -150,7 +150,7 @@ def test_blobs_by_hand():
 
 
 def seen_by(*names):
-    """The rig of some cameras of the five, and their rows in what all of them see."""
+    """The rig of some of the five cameras, and the silhouettes of these cameras."""
     return RIG.select(names), [RIG.names.index(name) for name in names]
 
 
@@ -166,7 +166,7 @@ def test_the_order_of_the_cameras_does_not_matter(order):
     start = found_in(coverage)
     mixed = found_in(coverage[:, order], RIG.select([RIG.names[i] for i in order]))
     rows = matched(mixed, start.position_m)
-    # Paths that end in one cube of 2 cm are one, and which of them it is may differ before the last fits.
+    # Paths that end in the same cube of 2 cm are merged, and which path stays may differ before the last fits.
     np.testing.assert_allclose(mixed.position_m[rows], start.position_m, atol=0.005)
     np.testing.assert_allclose(mixed.size_m[rows], start.size_m, atol=0.01)
     np.testing.assert_allclose(mixed.num_cameras[rows], start.num_cameras, atol=0.5)
@@ -185,7 +185,7 @@ def test_three_or_four_cameras(names):
 
 @pytest.mark.parametrize(("num_frames", "num_found"), [(1, 0), (7, 0), (8, 2), (10, 2)])
 def test_two_viewpoints_need_time(num_frames, num_found):
-    """Two drones in two views that no rays but their own explain."""
+    """Two drones in two views, without crossings of rays to different drones."""
     rig, rows = seen_by("c0", "c1")
     drones = [[0.5, -0.4, 1.6], [-0.2, 0.3, 0.9]]
     start = found_in(drawn(flight(drones, VELOCITIES_M_S[:2], num_frames), SIZES_M[:2])[:, rows], rig)
@@ -195,14 +195,14 @@ def test_two_viewpoints_need_time(num_frames, num_found):
 
 
 def coplanar_with(one, other, spread_m=0.5):
-    """Two places in one plane with two cameras, so that rays to different drones cross too."""
+    """Two places in a plane with two cameras, so that rays to different drones cross too."""
     centre = RIG.cameras.centre_world[[RIG.names.index(name) for name in (one, other)]]
     middle, along = np.array([0.1, -0.1, 1.2]), centre[1] - centre[0]
     return [middle + sign * spread_m * along / np.linalg.norm(along) for sign in (-1, 1)]
 
 
 def test_what_two_views_cannot_tell_is_not_found():
-    """Four crossings of four rays that stay as they are: two drones, but which two?"""
+    """Four rays with four crossings that do not move: two drones, at unknown crossings."""
     rig, rows = seen_by("c0", "c1")
     drones = coplanar_with("c0", "c1")
     coverage = drawn(flight(drones, np.zeros((2, 3)), 10), SIZES_M[0])
@@ -212,7 +212,7 @@ def test_what_two_views_cannot_tell_is_not_found():
 
 
 def test_motion_tells_what_two_views_cannot():
-    """The same places in the first frame; then one rises and the other sinks."""
+    """The same places in the first frame; then one drone rises and the other sinks."""
     rig, rows = seen_by("c0", "c1")
     drones = coplanar_with("c0", "c1")
     coverage = drawn(flight(drones, [[0, 0, 1.0], [0, 0, -1.0]], 10), SIZES_M[0])
@@ -221,7 +221,7 @@ def test_motion_tells_what_two_views_cannot():
 
 
 def test_a_view_that_shows_nothing_speaks_against_two_that_agree():
-    """A drone that the third of three cameras does not see: in its view none can be, out of its view one can."""
+    """The third of three cameras does not see a drone: so there is none within its view, but one may be outside."""
     rig, rows = seen_by("c0", "c1", "c3")
     coverage = drawn(flight(DRONES_M[:1], VELOCITIES_M_S[:1], 10), SIZES_M[:1])[:, rows]
     coverage[:, 2] = 0
@@ -238,7 +238,7 @@ def behind(near, camera, gap_m):
 
 
 def test_two_drones_in_one_blob_of_three_cameras():
-    """Two clean views each, and a view that they share: found where they are, with the sizes of the clean views."""
+    """Each drone has two views of its own and a shared view; its place and size come from its own views."""
     rig, rows = seen_by("c0", "c1", "c3")
     near = np.array([0.4, 0.1, 1.4])
     drones = [near, behind(near, 0, 0.9)]
@@ -249,7 +249,7 @@ def test_two_drones_in_one_blob_of_three_cameras():
 
 
 def test_the_number_of_drones_is_knowledge():
-    """Of two drones one has a clean view only once. Never more than the number are found, and no second one without."""
+    """One of two drones has only one view of its own; it is found if and only if the number of drones is given."""
     rig, rows = seen_by("c0", "c1")
     near = np.array([0.4, 0.1, 1.4])
     drones = [near, behind(near, 0, 1.1)]
@@ -278,7 +278,7 @@ def test_one_that_no_camera_sees_by_itself_has_the_size_of_the_others():
 
 
 def test_blobs_that_agree_on_nothing_are_no_drones():
-    """A bug of the first version: paths were proposed, none was a drone, and refining none of them failed."""
+    """Regression: if no proposed path is a drone, refining no paths failed."""
     coverage = np.zeros((10, 5, 120, 160), np.uint8)
     coverage[:, 0, 40:60, 50:70] = coverage[:, 1, 30:50, 90:110] = 255
     assert found_in(coverage).position_m.shape == (0, 3)
@@ -300,7 +300,7 @@ def test_the_order_of_the_blobs_does_not_matter(random):
 
     found = chosen(frames)
     again = chosen([[mixed(blobs) for blobs in images] for images in frames])
-    # As for the order of the cameras, before the last fits.
+    # As with the order of the cameras: before the last fits, another path may stay.
     np.testing.assert_allclose(again[np.lexsort(again.T)], found[np.lexsort(found.T)], atol=0.01)
 
 
@@ -319,7 +319,7 @@ def test_silhouettes_full_of_noise_take_no_more_than_their_largest_blobs():
 
 
 def test_the_height_of_a_low_drone_has_no_shadow_in_it():
-    """A drone near the floor and a dark disc below it are one blob; the same blob in the air is one tall drone."""
+    """A drone near the floor and its shadow are one blob; the same blob in the air is one tall drone."""
     size_m, disc_m = np.array([0.5, 0.5, 0.14]), np.array([0.5, 0.5, 0.02])
     heights = {}
     for z_m in (0.2, 1.4):

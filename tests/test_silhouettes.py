@@ -1,4 +1,4 @@
-"""The store of silhouettes: what is computed, when it is computed again, what survives an interruption."""
+"""The store of silhouettes: its content, when silhouettes are computed again, and interruptions."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _write_video(path: Path, seed: int, num_frames: int = NUM_FRAMES) -> None:
 
 
 def _sequence(folder: Path) -> Sequence:
-    """Whatever videos are in a folder."""
+    """A sequence of all videos in a folder."""
     R, t_m = look_at((0.0, 0.0, 1.0), (5.0, 0.0, 1.0))
     K = np.array([[100.0, 0, 81], [0, 100, 59], [0, 0, 1]])
     videos = {path.stem: probe(path) for path in sorted(folder.glob("*.avi"))}
@@ -71,7 +71,7 @@ def folder(recorded: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The name of every frame's video, as they are decoded in this process."""
+    """Names of the videos of all frames that are decoded in this process, in order."""
     names: list[str] = []
 
     def counted(video, step=1):  # type: ignore[no-untyped-def]
@@ -84,7 +84,7 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def _expected(sequence: Sequence, settings: SilhouetteSettings = SETTINGS) -> np.ndarray:
-    """The same without store, workers or chunks: (frames, cameras, height, width)."""
+    """Silhouettes without store, workers or chunks: (frames, cameras, height, width)."""
     step = silhouette_store.learning_step(sequence.num_frames, settings)
     factor = settings.reduction // settings.working_reduction
     return np.stack(
@@ -270,7 +270,7 @@ def test_damage_after_opening_is_an_error_not_background(folder: Path, tmp_path:
         silhouettes.read(0, 5)
 
 
-# --- what goes wrong ---
+# --- errors ---
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
@@ -358,7 +358,7 @@ def _run(
     """
     program = f"""
         import contextlib, os, signal, sys
-        # A suite that was started in the background hands down that SIGINT is ignored.
+        # A test run in the background ignores SIGINT, and its children inherit this.
         signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.path.insert(0, {str(Path(__file__).parent)!r})
         from pathlib import Path
@@ -392,11 +392,11 @@ def _run(
 
 
 def _finished(cache: Path) -> list[str]:
-    """Keys of what is stored."""
+    """Keys of the stored silhouettes."""
     return [path.name for path in cache.glob("[!.]*")]
 
 
-# Of 120: 10 of each camera teach the background, 30 are its frames, and the first 25 of those are a chunk.
+# Numbers of 120 frames: for each camera, the background is learned from 10 frames, then come 30 frames; a chunk is 25.
 @pytest.mark.parametrize("after_frames", [0, 1, 75, 100])
 @pytest.mark.parametrize("whole_group", [False, True])
 def test_killed_call_resumes(
@@ -407,7 +407,7 @@ def test_killed_call_resumes(
     killed = _run(folder, cache, fate=f"os.kill({whom}, signal.SIGKILL)", after_frames=after_frames)
     assert killed.returncode == -signal.SIGKILL
     if not whole_group:
-        # The workers noticed that nobody listens, and took their unfinished work with them.
+        # The workers noticed that their parent has ended, and removed their unfinished folders.
         assert not _leftovers(cache)
     sequence = _sequence(folder)
     keys = {name: silhouette_store.key_of(video, SETTINGS) for name, video in sequence.videos.items()}
@@ -449,8 +449,8 @@ def test_full_disk(folder: Path, tmp_path: Path) -> None:
     full = _run(
         folder,
         cache,
-        # No file may grow beyond 4 kB, and pure noise does not fit: the write fails as on a full disk. Nor may modules
-        # be cached, which would be cut off for everybody.
+        # Files are limited to 4 kB, so writing noise fails as on a full disk. Compiled modules are not written, because
+        # they would be cut off too.
         before="import resource, sys; sys.dont_write_bytecode = True; "
         "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))",
         settings="SilhouetteSettings(reduction=2, min_blob_px=0, var_threshold=0.1)",

@@ -1,4 +1,4 @@
-"""Box sums: NumPy slices are the oracle of whole boxes, area weights in float64 that of fractional ones."""
+"""Box sums: compared with NumPy slices for whole boxes, and with area weights in float64 for fractional boxes."""
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ def coverage(shape, seed=0):
 
 
 def area_weighted_sum(image, x0, y0, x1, y1):
-    """The share of every pixel that lies in the box, times the pixel, in float64."""
+    """Sum over all pixels of the pixel's share in the box times its value, in float64."""
     shares = []
     for low, high, count in ((y0, y1, image.shape[0]), (x0, x1, image.shape[1])):
         pixel = np.arange(count)
@@ -44,7 +44,7 @@ def test_table_is_the_cumulative_sum_with_a_border_of_zeros(shape, dtype):
 
 
 def test_whole_boxes_are_slice_sums():
-    """Every box with whole edges in a 5 x 7 image, exactly; several cameras at once."""
+    """All boxes with whole edges in a 5 x 7 image are exact, for several cameras at once."""
     images = coverage((2, 5, 7))
     edges = [
         (x0, y0, x1, y1) for x0 in range(8) for x1 in range(x0, 8) for y0 in range(6) for y1 in range(y0, 6)
@@ -95,14 +95,14 @@ def test_boxes_are_cut_at_the_border():
 
 
 def test_exact_where_sums_exceed_float32():
-    """A full 1080p image sums to 5e8, beyond float32's 2^24: a small box at its end must not feel it."""
+    """The sum of a 1080p image is 5e8, beyond float32's 2^24, which must not affect a small box at the image's end."""
     images = np.full((1, 1080, 1920), 255, np.uint8)
     boxes = np.array([[[1917, 1078, 1920, 1080]], [[1900.5, 1070.25, 1903.0, 1071.0]]])
     assert sums(images, np.zeros(1), boxes).ravel().tolist() == [3 * 2 * 255, 2.5 * 0.75 * 255]
 
 
 def test_sets_and_cameras_are_not_mixed_up():
-    """Seven sets of eleven boxes, each in the table of its own camera, against one box at a time."""
+    """Seven sets of eleven boxes, each in its camera's table, give the same as one box at a time."""
     rng = np.random.default_rng(3)
     images = coverage((5, 13, 17))
     camera = rng.integers(0, 5, 11)
@@ -122,7 +122,7 @@ def test_gradient_is_the_line_that_an_edge_sweeps():
         return box_sum(summed_area_table(image), jnp.zeros(1, jnp.int32), *edges.reshape(4, 1, 1)).sum()
 
     gradient = jax.jit(jax.grad(total))(jnp.asarray(edges, jnp.float32))
-    # The sum is linear while no edge crosses into another pixel, so differences of any such step are exact.
+    # The sum is linear as long as no edge enters another pixel, so such differences are exact.
     steps = 0.1 * np.eye(4)
     expected = [
         (area_weighted_sum(image[0], *(edges + s)) - area_weighted_sum(image[0], *(edges - s))) / 0.2
@@ -171,7 +171,7 @@ def test_packed_sums_are_those_of_either_image():
 
 
 def test_packed_sums_are_exact_to_the_last_bit():
-    """Everything at its largest: 64 x 64 pixels of 255 take 20 bits, 4095 of the other image the rest."""
+    """The largest sums: 64 x 64 pixels of 255 take 20 bits, and 4095 pixels of the other image the rest."""
     low, high = np.full((1, 64, 64), 255, np.int32), np.ones((1, 64, 64), bool)
     high[0, 5, 9] = False
     whole = np.array([[[0.0, 0, 64, 64]]])
@@ -197,5 +197,5 @@ def test_gradient_of_packed_sums_is_that_of_either_image():
         return jnp.prod(jnp.stack(list(sums)))
 
     found, expected = (jax.jit(jax.grad(of))(jnp.asarray(edges, jnp.float32)) for of in (of_packed, of_each))
-    # The same float32 arithmetic, perhaps fused otherwise.
+    # The same float32 arithmetic, but the compiler may fuse it differently.
     np.testing.assert_allclose(found, expected, rtol=1e-4)

@@ -1,4 +1,4 @@
-"""Figures of sweeps: what is drawn are the numbers; and the frame of errors over time that two of them show."""
+"""Figures of sweeps show the results' numbers; and the errors over time that two of the figures show."""
 
 import cv2
 import numpy as np
@@ -35,7 +35,7 @@ class TestErrorsOverTime:
         assert list(errors["frame"]) == [*range(NUM_FRAMES)] * 2
         np.testing.assert_allclose(errors["time_s"], errors["frame"] / 25)
         np.testing.assert_allclose(errors["error_m"][:40], 0.02)
-        # The other one's place, and 20 mm more or less.
+        # The distance to the other drone, plus or minus 20 mm.
         np.testing.assert_allclose(errors["error_m"][40:50], 3.02)
         np.testing.assert_allclose(errors["error_m"][90:], 2.98)
         assert list(np.flatnonzero(errors["error_m"].isna())) == [*range(60, 70)]
@@ -58,7 +58,7 @@ numbers = st.one_of(st.integers(0, 5).map(float), st.just(float("nan")))
 
 @given(st.lists(st.tuples(numbers, numbers), max_size=12))
 def test_the_front_is_what_nothing_dominates(cells):
-    """By comparing all with all; of equal ones the first."""
+    """Compared with a search through all pairs of cells; of equal cells only the first is on the front."""
     work, error = np.array(cells, float).reshape(-1, 2).T
 
     def dominated(one):
@@ -104,7 +104,7 @@ class TestErrorAgainstWork:
         figure = figures.error_against_work(rows(), published={"S02": (0.068, 0.068)})
         first, second = figure.axes
         assert [axes.get_title(loc="left") for axes in (first, second)] == ["S01", "S02"]
-        # 20 x 50 of the paper's is the least work, 30 x 50 of ours the least error.
+        # The paper's method with 20 x 50 has the smallest work, ours with 30 x 50 the smallest error.
         np.testing.assert_allclose(lines_of(first)["Pareto front"], [(10, 50.5), (15, 20.5)])
         assert [text.get_text() for text in first.texts] == ["20 x 50", "30 x 50"]
         bars = {container.get_label(): container for container in first.containers}
@@ -121,7 +121,7 @@ class TestErrorAgainstWork:
 
 
 def errors():
-    """Three runs of the flights' errors; in the last they are twice as large, and nothing is switched."""
+    """Errors of three runs; in the last run they are twice as large, without identity switches."""
     parts = [errors_over_time(*flights()).assign(seed=seed) for seed in (3, 4, 5)]
     parts[2] = parts[2].assign(error_m=2 * parts[2]["error_m"], switch=False)
     parts[1] = parts[1].assign(error_m=1.5 * parts[1]["error_m"])
@@ -145,7 +145,7 @@ def test_error_per_drone():
     (axes,) = figures.error_per_drone({"S02": {"paper": one, "ours": one.assign(error_m=0.01)}}).axes
     assert [label.get_text() for label in axes.get_xticklabels()] == ["dron1", "dron2"]
     medians = sorted(line.get_ydata()[0] for line in axes.lines if line.get_color() == "white")
-    # Of dron1: three times 40 frames of 20, 30, 40 mm and ten of metres.
+    # The drone dron1 has 40 frames of 20, 30 and 40 mm, and ten frames of metres in each run.
     np.testing.assert_allclose(medians[:2], 10.0)
     assert medians[2] == pytest.approx(30.0)
 

@@ -1,4 +1,4 @@
-"""What is done to a cell's input: judged by hand-worked frames, SciPy's angles and the binomial's own moments."""
+"""Perturbations of a cell's input: compared with frames by hand, SciPy's angles and moments of the binomial."""
 
 import math
 from dataclasses import replace
@@ -24,7 +24,7 @@ ANOTHER_DRAW = Perturbation(extrinsics_deg=0.3, clock_frames=1.5, flipped=0.05, 
 
 
 def flown(num_cameras=5, frames=None):
-    """A sequence, and silhouettes that have the given (frames, height, width) in every camera."""
+    """A sequence, and silhouettes with the same array (frames, height, width) in every camera."""
     rig = ring_rig(num_cameras, image_size_wh=(28, 20))
     if frames is None:
         frames = np.random.default_rng(3).integers(0, 256, (FRAMES, 5, 7), np.uint8)
@@ -46,7 +46,7 @@ def frames_of(silhouettes):
     return silhouettes.read(0, silhouettes.num_frames)
 
 
-def test_nothing_is_done_to_what_is_not_perturbed():
+def test_an_empty_perturbation_changes_nothing():
     sequence, silhouettes = flown()
     assert perturb(sequence, silhouettes, Perturbation(draw=3), None) == (sequence, silhouettes)
 
@@ -70,7 +70,7 @@ def test_the_input_is_left_as_it_was():
     np.testing.assert_array_equal(frames_of(silhouettes), frames_of(unflipped))
 
 
-# --- streams of chance
+# --- random streams
 
 
 def test_what_is_drawn_for_one_kind_does_not_depend_on_the_others():
@@ -78,7 +78,7 @@ def test_what_is_drawn_for_one_kind_does_not_depend_on_the_others():
     together, late_and_flipped = perturb(sequence, silhouettes, EVERYTHING, None)
     turned, _ = perturb(sequence, silhouettes, Perturbation(extrinsics_deg=0.3), None)
     np.testing.assert_array_equal(together.rig.cameras.T_cam_world, turned.rig.cameras.T_cam_world)
-    # Clocks first, pixels then: one after the other is both at once.
+    # Clocks are perturbed before pixels, so both perturbations at once are the same as one after the other.
     _, late = perturb(sequence, silhouettes, Perturbation(clock_frames=1.5), None)
     _, flipped = perturb(sequence, late, Perturbation(flipped=0.05), None)
     np.testing.assert_array_equal(frames_of(late_and_flipped), frames_of(flipped))
@@ -129,7 +129,7 @@ def test_draws_go_through_all_subsets_before_any_comes_again(num_cameras, data):
 
 
 def test_no_camera_is_drawn_more_often_than_others():
-    """Chance has no favourites: of 20 cameras each is in as many of the first subsets."""
+    """All of 20 cameras are chosen equally often in the first subsets."""
     names = tuple(map(str, range(20)))
     drawn = [int(name) for draw in range(400) for name in choose_cameras(names, 3, draw)]
     counts = np.bincount(drawn, minlength=20)
@@ -152,7 +152,7 @@ def test_cameras_turn_about_their_own_centres_by_the_angle():
     np.testing.assert_allclose(np.degrees(rotation.magnitude()), 0.2, rtol=1e-9)
     np.testing.assert_array_equal(after.T_cam_world[:, 3], before.T_cam_world[:, 3])
     axes = rotation.as_rotvec() / rotation.magnitude()[:, None]
-    # No two cameras turn about the same axis.
+    # All cameras turn about different axes.
     assert np.abs(axes @ axes.T - np.eye(7)).max() < 0.999
 
 
@@ -184,7 +184,7 @@ def test_late_cameras_show_what_was(clock_frames):
     lateness = behind.mean(axis=0)
     assert np.abs(behind - lateness).max() < 0.5
     expected = np.maximum(3 * (np.arange(FRAMES)[:, None] - lateness), 0)
-    # A half from rounding, and a half from that of the lateness.
+    # A half from rounding of the values, and a half from rounding of the delay.
     assert np.abs(shown - expected).max() <= 1.01
     # Uniform from 0: 40 of them leave 1/41 free at either end on average, and 0.25 with a probability of 1e-5.
     assert -1 / 6 <= lateness.min() <= 0.25 * clock_frames + 1 / 6
@@ -192,7 +192,7 @@ def test_late_cameras_show_what_was(clock_frames):
 
 
 def test_a_mixture_by_hand():
-    """One camera's lateness is read off its first change; every value then is the mixture of its two frames."""
+    """A camera's delay follows from its first change; all values are then interpolated between two frames."""
     frames = np.random.default_rng(5).integers(0, 256, (120, 3, 4), np.uint8)
     sequence, silhouettes = flown(2, frames)
     _, late = perturb(sequence, silhouettes, Perturbation(clock_frames=4.0, draw=6), None)
@@ -226,7 +226,7 @@ def test_flipped_pixels_have_the_moments_of_the_binomial():
     assert same is sequence
     values = frames_of(noisy)
     counts = np.round(values / 255 * pixels)
-    # Whole pixels, and nothing else.
+    # All values stand for whole numbers of pixels.
     np.testing.assert_array_equal(np.round(255 * counts / pixels), values)
     num = values[:, :, :5].size
     variance = pixels * share * (1 - share)

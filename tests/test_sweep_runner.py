@@ -44,7 +44,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def swept(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with grids and results: of four cells, and of four that fail."""
+    """A folder with grids and results of four cells that finish and four cells that fail."""
     folder = tmp_path_factory.mktemp("sweep")
     whole = grid_file(folder, [3, 6], runs=2)
     whole.write_text(whole.read_text() + METHODS)
@@ -57,7 +57,7 @@ def swept(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def called(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, list[str], str]:
-    """`psotrack WORDS` in this process: exit code, lines on stdout, stderr. For what computes nothing."""
+    """Run `psotrack WORDS` in this process: exit code, lines on stdout, stderr. For commands that compute nothing."""
     code = 0
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["psotrack", *map(str, words)])
@@ -70,7 +70,7 @@ def called(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, lis
 
 
 class Tracker:
-    """Finds no drones, and fails where it is told to."""
+    """Replaces the tracker: finds no drones, and fails for some numbers of iterations."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.runs: list[tuple[int, list[int]]] = []
@@ -129,7 +129,7 @@ def test_what_is_finished_is_not_run_again(root: Path, swept: Path) -> None:
     assert again.returncode == 0, again.stderr
     assert "0 cells finished now, 4 before" in again.stdout
     assert stamps(swept / "results") == before
-    # The manifest has both grids, and of where rows come from what they say themselves.
+    # The manifest has both grids, and the same origin as the rows.
     manifest = json.loads((swept / "results" / "_manifest.json").read_text())
     assert [run["cells"] for run in manifest["runs"]] == [8, 4]
     assert manifest["runs"][1]["grid"]["methods"] == {"usual": {}, "calm": {"swarm.inertia": 0.4}}
@@ -151,7 +151,7 @@ def test_a_table_of_the_results(swept: Path, capsys: pytest.CaptureFixture[str])
     assert code == 0
     assert "usual" in lines[0]
     assert "calm" in lines[0]
-    # The columns are the sequences where the rows are the methods.
+    # If the rows are methods, the default columns are the sequences.
     code, lines, _ = called(capsys, "table", swept / "results", "--rows", "method")
     assert code == 0
     assert "S01_D2_A" in lines[2]
@@ -178,7 +178,7 @@ def test_an_estimate_says_what_it_is_made_of(
     assert "for 6 cells (tracking " in known
     assert f"estimated from 8 runs on this device in {swept / 'results'}" in known
     assert "silhouettes" not in known
-    # Finished cells take no time; without results there is but the rule of thumb, and silhouettes may be missing.
+    # Finished cells take no time; without results the rule of thumb is used, and silhouettes may be missing.
     assert estimated(swept / "good.toml", swept / "results") == "nothing to run"
     unknown = estimated(swept / "good.toml", swept / "nothing", swept / "nothing")
     assert "estimated from a rule of thumb" in unknown
@@ -187,7 +187,7 @@ def test_an_estimate_says_what_it_is_made_of(
 
 @pytest.mark.slow
 def test_an_estimate_follows_the_rows_and_the_work(root: Path, tracker: Tracker, tmp_path: Path) -> None:
-    """Rows that took ten times as long as the rule says make all ten times as long, what was never run included."""
+    """If rows took ten times as long as by the rule of thumb, the estimate of all cells is ten times as long."""
     store, inputs = Store(tmp_path), Inputs(root, root / "cache")
     by_rule = estimate(grid_of(varied(3)).cells(), inputs, store)
     work = 8 * 3 * 2 * 8
@@ -311,7 +311,7 @@ def test_one_alone_makes_the_silhouettes(root: Path, tmp_path: Path) -> None:
 
 
 def test_a_commit_is_that_of_a_checkout_or_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A package that is installed below somebody else's checkout has no commit of that."""
+    """A package that is installed inside the checkout of another project does not have that project's commit."""
 
     def commit(folder: Path) -> str:
         machine.commit.cache_clear()

@@ -71,7 +71,7 @@ def test_figures_are_those_of_pandas_whatever_is_missing(numbers):
     oracle = rows.groupby(["a", "b"])["value"].agg(["mean", "std", "count"])
     for a, b in itertools.product(table.index, table.columns.get_level_values("b").unique()):
         expected = oracle.loc[(a, b)] if (a, b) in oracle.index else [math.nan, math.nan, 0]
-        # pandas sums in another order: rounding of float64 at 1e3, and of its variance.
+        # pandas sums in another order; the tolerance is float64 rounding at 1e3, and of the variance.
         np.testing.assert_allclose(table.loc[a, b], expected, rtol=1e-9, atol=1e-6)
 
 

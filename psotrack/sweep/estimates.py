@@ -1,4 +1,4 @@
-"""How long what is left of a grid will take: a simple model, corrected by the rows that there are."""
+"""Estimate of the time that a grid will take: a simple model, scaled by the stored results."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from psotrack.sweep.inputs import Inputs, source_of
 from psotrack.sweep.machine import provenance
 from psotrack.sweep.store import Store
 
-#: The rule of thumb, measured on two cores of an AMD EPYC: a run's seconds per frame, and per frame and particle x
-#: iteration x drone x camera; of compiling a program; and of making silhouettes of a million pixels, on one core.
+#: Rule of thumb, measured on two cores of an AMD EPYC, seconds: per frame of a run; per frame, particle, iteration,
+#: drone and camera; per compiled program; and per million pixels of silhouettes on one core.
 FRAME_S, WORK_S, COMPILE_S, MEGAPIXEL_S = 0.02, 0.8e-6, 10.0, 0.008
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Seconds that a grid will take, roughly.
+    """Rough estimate of the time that a grid will take, seconds.
 
     Attributes:
-        cells: that are to be run, of those whose input can be read.
-        unread: cells whose input cannot.
-        tracking_s: of their runs; those of a cell are taken to cost as much together as one by one.
-        compiling_s: of the programs that they need, which may be stored already.
-        silhouettes_s: of those that are not stored.
-        basis: in words, where the numbers come from.
+        cells: number of cells to run whose input can be read.
+        unread: number of cells whose input cannot be read.
+        tracking_s: time of all runs; a batch of runs is assumed to cost as much as the runs one by one.
+        compiling_s: time of compiling; compiled programs that are stored already are included.
+        silhouettes_s: time of making the silhouettes that are not stored.
+        basis: origin of the numbers, in words.
     """
 
     cells: int
@@ -43,7 +43,7 @@ class Estimate:
 
     @property
     def total_s(self) -> float:
-        """All of it."""
+        """Sum of all times."""
         return self.tracking_s + self.compiling_s + self.silhouettes_s
 
     def __str__(self) -> str:
@@ -61,12 +61,12 @@ class Estimate:
 
 
 def estimate(cells: Iterable[Cell], inputs: Inputs, store: Store | None) -> Estimate:
-    """How long the cells will take that are not finished.
+    """Estimate the time of the unfinished cells.
 
     Args:
-        cells: of a grid.
-        inputs: where they are read.
-        store: of the results; what is finished there does not count, and says how good the model is. None without any.
+        cells: cells of a grid.
+        inputs: inputs of the cells.
+        store: stored results, whose finished cells do not count, and whose times scale the model; None for no results.
     """
     factor, basis = _factor(store)
     count = unread = 0
@@ -107,7 +107,7 @@ def estimate(cells: Iterable[Cell], inputs: Inputs, store: Store | None) -> Esti
 
 
 def _in_words(seconds: float) -> str:
-    """Two figures of it are more than are known."""
+    """Format a time with few digits, because the estimate is rough."""
     for limit, unit_s, unit in ((120, 1, "s"), (7200, 60, "min"), (172800, 3600, "h")):
         if seconds < limit:
             return f"{seconds / unit_s:.0f} {unit}"
@@ -115,7 +115,7 @@ def _in_words(seconds: float) -> str:
 
 
 def _factor(store: Store | None) -> tuple[float, str]:
-    """How much slower than by the rule of thumb the runs in a folder were, on this device if there are such."""
+    """Median ratio of stored times to the rule of thumb, from this device if it has runs, and a description."""
     rule = "a rule of thumb, of two cores of an AMD EPYC"
     try:
         rows = store.rows() if store else pd.DataFrame()
@@ -136,7 +136,7 @@ def _factor(store: Store | None) -> tuple[float, str]:
 
 
 def _rule_s(rows: pd.DataFrame) -> pd.Series:
-    """What the rule of thumb says of rows' runs."""
+    """Time of each row's run by the rule of thumb, seconds."""
     work = (
         rows["settings.swarm.particles"]
         * rows["settings.swarm.iterations"]
@@ -147,7 +147,7 @@ def _rule_s(rows: pd.DataFrame) -> pd.Series:
 
 
 def _silhouettes_s(cell: Cell, inputs: Inputs) -> float:
-    """Of the silhouettes that are not stored, in as many processes as there will be."""
+    """Time of making a cell's missing silhouettes, with all processes."""
     sequence, keys, settings = inputs.sequence_of(cell), inputs.keys_of(cell), cell.settings.silhouettes
     megapixels = [
         video.num_frames * video.image_size_wh[0] * video.image_size_wh[1] / 1e6
