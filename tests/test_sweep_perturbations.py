@@ -113,7 +113,7 @@ def test_a_number_of_cameras_is_drawn():
 def test_cameras_that_are_not_there():
     with pytest.raises(SettingsError, match=r"cameras: expected some of c0, .*, found c9"):
         perturb(*flown(), Perturbation(), ("c0", "c9"))
-    with pytest.raises(SettingsError, match="cameras: expected 1 to 5, as many as there are, found 6"):
+    with pytest.raises(SettingsError, match="cameras: expected 1 to 5, the number of cameras, found 6"):
         perturb(*flown(), Perturbation(), 6)
 
 
