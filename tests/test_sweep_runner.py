@@ -26,7 +26,7 @@ SETTINGS = {
     "swarm.kind": "joint",
     "score.kind": "hard",
     "init": "truth",
-    "drone_size_m": [0.5, 0.5, 0.2],
+    "drones.size_m": [0.5, 0.5, 0.2],
     "silhouettes.reduction": 2,
 }
 METHODS = """
@@ -78,7 +78,7 @@ class Tracker:
         monkeypatch.setattr(runner, "track_runs", self)
 
     def __call__(self, sequence: object, silhouettes: object, settings: list) -> list[InputError]:
-        iterations = settings[0].iterations
+        iterations = settings[0].swarm.iterations
         if iterations in self.failing:
             raise ZeroDivisionError("planted")
         self.runs.append((iterations, [each.seed for each in settings]))
@@ -209,7 +209,13 @@ def test_a_dry_run_shows_the_cells(tmp_path: Path, capsys: pytest.CaptureFixture
     path = grid_file(tmp_path, [3, 6], runs=2)
     code, lines, _ = called(capsys, "sweep", path, "--dry-run")
     assert code == 0
-    assert lines[1].split()[1:] == ["sequence=S01_D2_A", "method=", "cameras=all", "runs=2", "iterations=6"]
+    assert lines[1].split()[1:] == [
+        "sequence=S01_D2_A",
+        "method=",
+        "cameras=all",
+        "runs=2",
+        "swarm.iterations=6",
+    ]
     assert lines[2:] == ["2 cells, 4 runs", "nothing to run; without 2 cells whose input cannot be read"]
 
 
@@ -252,7 +258,7 @@ def test_a_failure_goes_when_the_cell_is_finished(root: Path, tracker: Tracker, 
     tracker.failing = {3}
     rows = sweep(varied(3, 4), out, **folders)
     assert rows["settings.swarm.iterations"].tolist() == [4]
-    assert rows.attrs["errors"] == ["S01_D2_A iterations=3: ZeroDivisionError: planted"]
+    assert rows.attrs["errors"] == ["S01_D2_A swarm.iterations=3: ZeroDivisionError: planted"]
     (kept,) = (json.loads(path.read_text()) for path in (out / "cells").glob("_*.error.json"))
     assert "in __call__" in kept["where"]
     tracker.failing = set()
@@ -267,7 +273,7 @@ def test_a_failure_to_read_goes_too(root: Path, tracker: Tracker, tmp_path: Path
     shutil.copytree(root / "Simulated_Data" / "S01_D2_A", data / "S01_D2_A")
     video = next((data / "S01_D2_A").glob("*.mp4"), None) or next((data / "S01_D2_A").glob("*.avi"))
     video.rename(tmp_path / video.name)
-    with pytest.raises(InputError, match=r"all failed: S01_D2_A iterations=3: .*expected a video"):
+    with pytest.raises(InputError, match=r"all failed: S01_D2_A swarm.iterations=3: .*expected a video"):
         sweep(varied(3), tmp_path / "out", data=data, cache=root / "cache")
     assert Store(tmp_path / "out").status()["failed"] == 1
     (tmp_path / video.name).rename(video)

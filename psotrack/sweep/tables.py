@@ -30,9 +30,9 @@ def pivot(
 ) -> pd.DataFrame:
     """Mean and sample standard deviation of a value over all rows with the same values in the named columns.
 
-    A name may be the end of a column's name if no other column ends with it: `particles` is `settings.swarm.particles`. Rows
-    without the value, of runs that failed, do not count. If the rows of a figure differ in more than seeds and draws, a
-    warning in the log names the other columns.
+    A name may be the end of a column's name if no other column ends with it: `particles` is `settings.swarm.particles`.
+    Rows without the value, of runs that failed, do not count. If the rows of a figure differ in more than seeds and
+    draws, a warning in the log names the other columns.
 
     Args:
         rows: results, one row per cell and run.
