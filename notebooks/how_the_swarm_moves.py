@@ -79,7 +79,7 @@ start = find_drones(
     silhouettes.read(0, 10),
     reduction=SILHOUETTES.reduction,
     fps=sequence.fps,
-    bounds_m=room_bounds(sequence.rig, settings),
+    bounds_m=room_bounds(sequence.rig),
     max_speed_m_s=settings.motion.max_speed_m_s,
 )
 predicted_m = jnp.asarray(start.position_m + start.velocity_m_s * FRAME / sequence.fps, jnp.float32)

@@ -35,7 +35,6 @@ from psotrack.geometry import make_extents, project_boxes
 from psotrack.initiation import room_bounds
 from psotrack.initiation.initialisation import find_drones
 from psotrack.recordings import read_frames
-from psotrack.settings import TrackSettings
 from psotrack.silhouettes import compute, summed_area_table
 from psotrack.silhouettes.computation import SilhouetteSettings
 from psotrack.silhouettes.foreground import classify, coverage, learn_background, learning_step
@@ -104,7 +103,7 @@ start = find_drones(
     silhouettes.read(0, 10),
     reduction=SILHOUETTES.reduction,
     fps=sequence.fps,
-    bounds_m=room_bounds(sequence.rig, TrackSettings()),
+    bounds_m=room_bounds(sequence.rig),
     max_speed_m_s=6.0,
 )
 # The drone that is looked at is the one of those found that begins nearest to it.
@@ -172,9 +171,12 @@ plt.show()
 
 # %%
 tables = summed_area_table(jnp.asarray(seen, jnp.int32))
-score, weight = camera_scores(score_inputs(cameras, size_m, tables, soft), place_m[None])
+score, weight = camera_scores(
+    score_inputs(cameras, size_m, tables, soft, reduction=SILHOUETTES.reduction), place_m[None]
+)
 moved, _ = camera_scores(
-    score_inputs(cameras, size_m, tables, soft), place_m[None] + jnp.array([0.15, 0.0, 0.0])
+    score_inputs(cameras, size_m, tables, soft, reduction=SILHOUETTES.reduction),
+    place_m[None] + jnp.array([0.15, 0.0, 0.0]),
 )
 
 figure, axes = plt.subplots(figsize=(9, 2.8), layout="constrained")
@@ -205,8 +207,12 @@ slices = {"x": "y", "y": "z"}  # what is to the right, what is up
 scores = {"soft score": soft, "the paper's hard score": hard}
 
 figure, panels = plt.subplots(2, 3, figsize=(13, 7.4), layout="constrained")
-for row, (label, settings) in zip(panels, scores.items(), strict=True):
-    fitness_at = jax.jit(partial(drone_fitness, score_inputs(cameras, size_m, tables, settings)))
+for row, (label, compared) in zip(panels, scores.items(), strict=True):
+    fitness_at = jax.jit(
+        partial(
+            drone_fitness, score_inputs(cameras, size_m, tables, compared, reduction=SILHOUETTES.reduction)
+        )
+    )
     for panel, (right, up) in zip(row, slices.items(), strict=False):
         offset_m = np.zeros((*across_m.shape, 3))
         offset_m[..., "xyz".index(right)], offset_m[..., "xyz".index(up)] = across_m, up_m
@@ -260,10 +266,10 @@ plt.show()
 # The same score over the whole hall, at the height of this drone.
 
 # %%
-low_m, high_m = room_bounds(sequence.rig, TrackSettings())
+low_m, high_m = room_bounds(sequence.rig)
 x_m, y_m = np.arange(low_m[0], high_m[0], ROOM_STEP_M), np.arange(low_m[1], high_m[1], ROOM_STEP_M)
 room_m = np.stack([*np.meshgrid(x_m, y_m), np.full((len(y_m), len(x_m)), truth_m[DRONE, 2])], axis=-1)
-view = score_inputs(cameras, size_m, tables, soft)
+view = score_inputs(cameras, size_m, tables, soft, reduction=SILHOUETTES.reduction)
 height = np.asarray(drone_fitness(view, jnp.asarray(room_m[..., None, :], jnp.float32)))[..., 0]
 
 figure, axes = plt.subplots(figsize=(9, 6.4), layout="constrained")

@@ -269,7 +269,7 @@ pd.DataFrame(describe_sequence(sequence)["cameras"]).T.drop(columns=["video", "d
 # %%
 settings = TrackSettings(silhouettes=SILHOUETTES, drones=DroneSettings(count=4))
 silhouettes = compute(sequence, SILHOUETTES, cache=DATA / "silhouettes")
-tracked = track_runs(sequence, silhouettes, settings)
+(tracked,) = track_runs(sequence, silhouettes, [settings])
 tracks = tracked.trajectories
 print(f"{tracks.num_drones} drones, {np.mean(tracks.seen):.0%} of all frames tracked")
 pd.DataFrame(tracked.size_m, columns=["size x (m)", "size y (m)", "size z (m)"]).round(2)
@@ -336,14 +336,16 @@ T_turn = np.eye(4)
 T_turn[:3, :3] = Rotation.from_euler("y", TURN_DEG, degrees=True).as_matrix()
 T_cam_world[knocked] = T_turn @ T_cam_world[knocked]
 turned_rig = Rig(rig.names, replace(rig.cameras, T_cam_world=T_cam_world))
-turned = track_runs(replace(sequence, rig=turned_rig), silhouettes, settings)
+(turned,) = track_runs(replace(sequence, rig=turned_rig), silhouettes, [settings])
 
 frames = range(0, sequence.num_frames, 5)
 rigs = {"as calibrated": (rig, tracked), f"gopro3 turned by {TURN_DEG} deg": (turned_rig, turned)}
 mean_score = {}
 soft = SoftIoU()
 scores = jax.jit(
-    lambda rig, size_m, tables, at_m: camera_scores(score_inputs(rig, size_m, tables, soft), at_m)
+    lambda rig, size_m, tables, at_m: camera_scores(
+        score_inputs(rig, size_m, tables, soft, reduction=SILHOUETTES.reduction), at_m
+    )
 )
 for label, (of_rig, of_tracks) in rigs.items():
     cameras, size_m = on_device(of_rig.cameras), jnp.asarray(of_tracks.size_m, jnp.float32)
