@@ -421,7 +421,7 @@ def test_a_second_run_need_not_compile(sequence: Path, tmp_path: Path) -> None:
             check=True,
         )
         # Lesser programs compile in about the time from which on they are worth keeping: either way is right.
-        compiled = (tmp_path / "cache" / "compiled").glob("jit__follow-*")
+        compiled = (tmp_path / "cache" / "compiled").glob("jit__track_batch-*")
         kept.append({path.name: path.stat().st_mtime_ns for path in compiled})
     assert kept[0]
     assert kept[0] == kept[1]

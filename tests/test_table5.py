@@ -10,7 +10,7 @@ import pytest
 import sweeps
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
-TWO_METHODS = "[methods.paper]\n[methods.psotrack]\nspread_m = 0.06\n[grid]"
+TWO_METHODS = "[methods.paper]\n[methods.psotrack]\nswarm.spread_m = 0.06\n[grid]"
 GRID = sweeps.GRID.format(runs=2, iterations=[2, 3]).replace("[grid]", TWO_METHODS)
 FIGURES = ("error_against_work", "error_over_time_S01_D2_A", "error_per_drone")
 
