@@ -73,7 +73,7 @@ INSIDE_OUT = [
     "fusing",
 ]
 
-#: At most so many files at the package's root.
+#: Largest number of files at the package's root.
 MOST_ROOT_FILES = 10
 
 #: Modules and rooms that may use JAX and NumPy only.

@@ -439,7 +439,7 @@ def test_after_a_gap_markers_that_agree_beyond_chance_are_accepted_at_once() -> 
     assert (path.status[90:94] == Status.TRACKED).all()
     assert (path.status[90:] != Status.LOST).all()
     assert np.linalg.norm(path.position_m[90:] - position_m[90:], axis=1).max() < 0.05
-    # Without such markers more poses are needed, because nothing is predicted after so long a gap.
+    # Without such markers more poses are needed: the gap is too long for the motion to predict a pose.
     assert (filter_path(raw).status[90:99] == Status.LOST).all()
 
 

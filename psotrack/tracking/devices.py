@@ -75,5 +75,5 @@ def largest_share(kinds: Sequence[Hashable], kind: Hashable) -> int:
 
 
 def num_used_devices(num_jobs: int) -> int:
-    """Number of devices that work on so many jobs."""
+    """Number of devices that work on `num_jobs` jobs."""
     return len(jax.devices()[:num_jobs])

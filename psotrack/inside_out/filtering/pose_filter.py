@@ -253,7 +253,7 @@ def _is_anywhere(state: PoseState) -> bool:
 def _is_predicted(state: PoseState, params: PoseFilterParams) -> bool:
     """Whether the last pose is predicted by the motion rather than an outlier.
 
-    Its density must exceed that of an outlier within a metre and a radian by so much that it is an outlier less often
-    than good poses are gated.
+    The density of the pose must exceed the density of an outlier within a metre and a radian by the factor
+    1 / `false_alarm`: then outliers are accepted less often than good poses are rejected.
     """
     return bool(state.log_density > -np.log(params.false_alarm))
