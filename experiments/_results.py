@@ -241,14 +241,17 @@ def reasons(result: Result) -> list[str]:
 
 
 def newer_files(commit: str, code: Sequence[str]) -> list[str]:
-    """Files of the code whose content changed between a commit and HEAD; docstrings and comments do not count."""
+    """Files of the code whose content changed between a commit and HEAD.
+
+    Docstrings, comments and the messages of errors do not count.
+    """
     names = _git("diff", "--name-only", "--no-renames", commit, "HEAD", "--", *code).splitlines()
     return [name for name in names if not _same_code(commit, name)]
 
 
 def _same_code(commit: str, name: str) -> bool:
-    """Whether a Python file differs from that of the commit in docstrings, comments and layout only."""
-    if not name.endswith(".py"):
+    """Whether a Python file differs from that of the commit in docstrings, comments, messages and layout only."""
+    if not name.endswith((".py", ".pyi")):
         return False
     old, new = (_git("show", f"{at}:{name}", default=None) for at in (commit, "HEAD"))
     if old is None or new is None:
@@ -260,9 +263,11 @@ def _same_code(commit: str, name: str) -> bool:
 
 
 def _stripped(source: str) -> str:
-    """The syntax tree of a source without docstrings."""
+    """The syntax tree of a source without docstrings and without the arguments of errors, which hold messages only."""
     tree = ast.parse(source)
     for node in ast.walk(tree):
+        if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
+            node.exc = node.exc.func
         if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
             body = node.body
             if body and isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant):

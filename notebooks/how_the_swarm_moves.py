@@ -71,25 +71,25 @@ keep_compiled(Path("data", "compiled"))
 folder = DATA / "Simulated_Data" / "S02_D4_A"
 if not folder.exists():  # the same recording as in the quickstart
     simulate("S02_D4_A", DATA, num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
-sequence = read_sequence(folder).usable()
+recording = read_sequence(folder).usable()
 settings = TrackSettings(silhouettes=SILHOUETTES)
-silhouettes = compute(sequence, SILHOUETTES, cache=DATA / "silhouettes")
+silhouettes = compute(recording, SILHOUETTES, cache=DATA / "silhouettes")
 start = find_drones(
-    sequence.rig.cameras,
+    recording.rig.cameras,
     silhouettes.read(0, 10),
     reduction=SILHOUETTES.reduction,
-    fps=sequence.fps,
-    bounds_m=room_bounds(sequence.rig),
+    fps=recording.fps,
+    bounds_m=room_bounds(recording.rig),
     max_speed_m_s=settings.motion.max_speed_m_s,
 )
-predicted_m = jnp.asarray(start.position_m + start.velocity_m_s * FRAME / sequence.fps, jnp.float32)
-truth_m = sequence.truth.position_m[FRAME, DRONE]
+predicted_m = jnp.asarray(start.position_m + start.velocity_m_s * FRAME / recording.fps, jnp.float32)
+truth_m = recording.truth.position_m[FRAME, DRONE]
 shown = int(jnp.linalg.norm(predicted_m - truth_m, axis=1).argmin())
 print(f"the prediction is {1e3 * np.linalg.norm(predicted_m[shown] - truth_m):.0f} mm off")
 
 # %%
 seen = score_inputs(
-    on_device(sequence.rig.cameras),
+    on_device(recording.rig.cameras),
     jnp.asarray(start.size_m, jnp.float32),
     summed_area_table(jnp.asarray(silhouettes.read(FRAME, FRAME + 1)[0], jnp.int32)),
     SoftIoU(),
@@ -102,7 +102,7 @@ params = swarm.SwarmParams(
     inertia=jnp.float32(settings.swarm.inertia),
     cognitive=jnp.float32(settings.swarm.cognitive),
     social=jnp.float32(settings.swarm.social),
-    max_step=jnp.full(3, settings.motion.max_speed_m_s / sequence.fps, jnp.float32),
+    max_step=jnp.full(3, settings.motion.max_speed_m_s / recording.fps, jnp.float32),
     low=predicted_m - HALF_M,
     high=predicted_m + HALF_M,
 )

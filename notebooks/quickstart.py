@@ -27,7 +27,7 @@ import pandas as pd
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.demo import save_picture
 from psotrack.evaluation import evaluate, plots, tables
-from psotrack.pipeline import track_sequence
+from psotrack.pipeline import track_recording
 from psotrack.recordings import read_frames
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes.computation import SilhouetteSettings
@@ -60,19 +60,19 @@ keep_compiled(Path("data", "compiled"))  # the second run does not wait for the 
 folder = DATA / "Simulated_Data" / "S02_D4_A"
 if not folder.exists():
     simulate("S02_D4_A", DATA, num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
-sequence = read_sequence(folder).usable()
+recording = read_sequence(folder).usable()
 
-print(f"{sequence.num_frames} frames at {sequence.fps:g} per second")
+print(f"{recording.num_frames} frames at {recording.fps:g} per second")
 for name, video, centre_m in zip(
-    sequence.rig.names, sequence.videos.values(), sequence.rig.cameras.centre_world, strict=True
+    recording.rig.names, recording.videos.values(), recording.rig.cameras.centre_world, strict=True
 ):
     width, height = video.image_size_wh
     x, y, z = centre_m
     print(f"{name}: {width} x {height} pixels, hangs at x = {x:5.2f}, y = {y:5.2f}, z = {z:4.2f} m")
 
 # %%
-name = sequence.rig.names[0]
-first_frame = next(read_frames(sequence.videos[name]))
+name = recording.rig.names[0]
+first_frame = next(read_frames(recording.videos[name]))
 figure, axes = plt.subplots(figsize=(9, 5.2), dpi=64, layout="constrained")
 axes.imshow(first_frame[:, :, ::-1])  # OpenCV has blue first
 axes.set(xlabel="x (pixels)", ylabel="y (pixels)", title=f"camera {name}, frame 0")
@@ -90,7 +90,9 @@ plt.show()
 # are.
 
 # %%
-tracked = track_sequence(sequence, TrackSettings(seed=1, silhouettes=SILHOUETTES), cache=DATA / "silhouettes")
+tracked = track_recording(
+    recording, TrackSettings(seed=1, silhouettes=SILHOUETTES), cache=DATA / "silhouettes"
+)
 tracked.trajectories.position_m.shape  # frames, drones, x y z in metres
 
 # %%
@@ -104,7 +106,7 @@ pd.Series(tracked.record["seconds"], name="seconds").to_frame().T.round(1)
 
 # %%
 picture = DATA / "quickstart.png"
-save_picture(picture, sequence, tracked)
+save_picture(picture, recording, tracked)
 figure, axes = plt.subplots(figsize=(13, 4.6), layout="constrained")
 axes.imshow(plt.imread(picture))
 axes.set_axis_off()
@@ -118,7 +120,7 @@ plt.show()
 # ## How good is it?
 
 # %%
-evaluation = evaluate(tracked.trajectories, sequence.truth)
+evaluation = evaluate(tracked.trajectories, recording.truth)
 print(f"mean error {1e3 * evaluation.mean_error_m:.0f} mm")
 print(
     f"mean error without each drone's constant offset {1e3 * evaluation.offset_removed_mean_error_m:.1f} mm"
@@ -130,7 +132,7 @@ tables.to_frame(evaluation)[columns].round(4)
 
 # %%
 figure, axes = plt.subplots(figsize=(9, 3.4), layout="constrained")
-plots.draw_errors(axes, tracked.trajectories, sequence.truth)
+plots.draw_errors(axes, tracked.trajectories, recording.truth)
 plt.show()
 
 # %% [markdown]
@@ -152,7 +154,7 @@ frame[["frame", "time_s", "drone", "x_m", "y_m", "z_m", "fitness", "num_cameras"
 
 # %%
 figure, panels = plt.subplots(3, 1, figsize=(9, 4.6), sharex=True, layout="constrained")
-colours = plots.colours_of_estimates(tracked.trajectories, sequence.truth)
+colours = plots.colours_of_estimates(tracked.trajectories, recording.truth)
 for colour, (drone, rows) in zip(colours, frame.groupby("drone"), strict=True):
     for panel, axis in zip(panels, "xyz", strict=True):
         std_m = rows[f"cov_{axis}{axis}"] ** 0.5

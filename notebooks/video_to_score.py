@@ -62,9 +62,9 @@ keep_compiled(Path("data", "compiled"))
 folder = DATA / "Simulated_Data" / "S02_D4_A"
 if not folder.exists():  # the same recording as in the quickstart
     simulate("S02_D4_A", DATA, num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
-sequence = read_sequence(folder).usable()
-truth_m = sequence.truth.position_m[FRAME]
-names = sequence.rig.names
+recording = read_sequence(folder).usable()
+truth_m = recording.truth.position_m[FRAME]
+names = recording.rig.names
 
 # %% [markdown]
 # ## Frame → foreground → silhouette
@@ -77,14 +77,14 @@ names = sequence.rig.names
 # %%
 images, masks = [], []
 for camera in CAMERAS:
-    video = sequence.videos[names[camera]]
+    video = recording.videos[names[camera]]
     model = learn_background(read_frames(video, learning_step(video.num_frames, SILHOUETTES)), SILHOUETTES)
     for image in islice(read_frames(video), FRAME + 1):  # in order: what was seen leaves traces in the model
         mask = classify(model, image, SILHOUETTES)
     images.append(image)
     masks.append(mask)
 
-silhouettes = compute(sequence, SILHOUETTES, cache=DATA / "silhouettes")
+silhouettes = compute(recording, SILHOUETTES, cache=DATA / "silhouettes")
 seen = silhouettes.read(FRAME, FRAME + 1)[0]  # cameras, height, width
 for camera, mask in zip(CAMERAS, masks, strict=True):  # just so they are made
     made = coverage(mask, SILHOUETTES.reduction // SILHOUETTES.working_reduction)
@@ -99,20 +99,20 @@ for camera, mask in zip(CAMERAS, masks, strict=True):  # just so they are made
 
 # %%
 start = find_drones(
-    sequence.rig.cameras,
+    recording.rig.cameras,
     silhouettes.read(0, 10),
     reduction=SILHOUETTES.reduction,
-    fps=sequence.fps,
-    bounds_m=room_bounds(sequence.rig),
+    fps=recording.fps,
+    bounds_m=room_bounds(recording.rig),
     max_speed_m_s=6.0,
 )
 # The drone that is looked at is the one of those found that begins nearest to it.
-path_m = sequence.truth.position_m[1:10, DRONE].mean(axis=0)
+path_m = recording.truth.position_m[1:10, DRONE].mean(axis=0)
 found = np.linalg.norm(start.position_m - path_m, axis=1).argmin()
 size_m = jnp.asarray(start.size_m[found : found + 1], jnp.float32)
 print("size of the drone, x y z:", np.round(start.size_m[found], 2), "m")
 
-cameras = on_device(sequence.rig.cameras)
+cameras = on_device(recording.rig.cameras)
 place_m = jnp.asarray(truth_m[DRONE], jnp.float32)
 boxes = project_boxes(make_extents(cameras, size_m), place_m[None])
 xyxy_px = np.asarray(boxes.xyxy)[0]  # cameras, 4
@@ -180,7 +180,7 @@ moved, _ = camera_scores(
 )
 
 figure, axes = plt.subplots(figsize=(9, 2.8), layout="constrained")
-number = np.arange(len(sequence.rig))
+number = np.arange(len(recording.rig))
 axes.bar(number - 0.2, score[0], 0.4, label="at the true position", color="#0072b2")
 axes.bar(number + 0.2, moved[0], 0.4, label="0.15 m beside it, along x", color="#9aa3ad")
 axes.set_xticks(number, names)
@@ -266,7 +266,7 @@ plt.show()
 # The same score over the whole hall, at the height of this drone.
 
 # %%
-low_m, high_m = room_bounds(sequence.rig)
+low_m, high_m = room_bounds(recording.rig)
 x_m, y_m = np.arange(low_m[0], high_m[0], ROOM_STEP_M), np.arange(low_m[1], high_m[1], ROOM_STEP_M)
 room_m = np.stack([*np.meshgrid(x_m, y_m), np.full((len(y_m), len(x_m)), truth_m[DRONE, 2])], axis=-1)
 view = score_inputs(cameras, size_m, tables, soft, reduction=SILHOUETTES.reduction)
@@ -275,7 +275,7 @@ height = np.asarray(drone_fitness(view, jnp.asarray(room_m[..., None, :], jnp.fl
 figure, axes = plt.subplots(figsize=(9, 6.4), layout="constrained")
 shown = axes.pcolormesh(x_m, y_m, height, vmin=0, shading="nearest", rasterized=True)
 figure.colorbar(shown, label="fitness (0 to 1)")
-x, y, _ = sequence.rig.cameras.centre_world.T
+x, y, _ = recording.rig.cameras.centre_world.T
 axes.plot(x, y, "^", color="#9aa3ad", markersize=8, label="camera")
 axes.plot(*truth_m[DRONE, :2], "+", color="white", markersize=14, label="this drone")
 others_m = np.delete(truth_m, DRONE, axis=0)

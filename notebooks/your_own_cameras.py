@@ -50,7 +50,7 @@ from psotrack.geometry import (
     undistort,
 )
 from psotrack.pipeline import track_runs
-from psotrack.recordings import VideoWriter, describe_sequence, probe, read_frames
+from psotrack.recordings import VideoWriter, describe_recording, probe, read_frames
 from psotrack.settings import DroneSettings, TrackSettings
 from psotrack.silhouettes import compute, summed_area_table
 from psotrack.silhouettes.computation import SilhouetteSettings
@@ -246,7 +246,7 @@ plt.show()
 # DPJAIT dataset's: one focal length per camera, no skew, k1, k2, p1, p2. With OpenCV, calibrate with
 # `CALIB_FIX_ASPECT_RATIO` and `CALIB_FIX_K3`. If yours has two focal lengths or more coefficients,
 # `write_calibration` says so; then stay in Python, where nothing is lost: `Sequence(name, folder, rig, videos)` from
-# `psotrack.recordings.sequence`, with `videos` from `psotrack.recordings.video.probe`, is all that the rest of this notebook needs.
+# `psotrack.recordings.Recording`, with `videos` from `psotrack.recordings.video.probe`, is all that the rest of this notebook needs.
 
 # %%
 FOLDER.mkdir(exist_ok=True)
@@ -254,8 +254,8 @@ write_calibration(FOLDER / CALIBRATION, rig)
 for name in rig.names:
     shutil.copy(FOREIGN / f"{name}.avi", FOLDER)
 
-sequence = read_sequence(FOLDER).usable()  # says what does not fit: sizes, rates, lengths, names
-pd.DataFrame(describe_sequence(sequence)["cameras"]).T.drop(columns=["video", "detections"])
+recording = read_sequence(FOLDER).usable()  # says what does not fit: sizes, rates, lengths, names
+pd.DataFrame(describe_recording(recording)["cameras"]).T.drop(columns=["video", "detections"])
 
 # %% [markdown]
 # The same as a table in the terminal: `psotrack info my_recording`. Videos must begin at the same moment; a camera
@@ -268,8 +268,8 @@ pd.DataFrame(describe_sequence(sequence)["cameras"]).T.drop(columns=["video", "d
 
 # %%
 settings = TrackSettings(silhouettes=SILHOUETTES, drones=DroneSettings(count=4))
-silhouettes = compute(sequence, SILHOUETTES, cache=DATA / "silhouettes")
-(tracked,) = track_runs(sequence, silhouettes, [settings])
+silhouettes = compute(recording, SILHOUETTES, cache=DATA / "silhouettes")
+(tracked,) = track_runs(recording, silhouettes, [settings])
 tracks = tracked.trajectories
 print(f"{tracks.num_drones} drones, {np.mean(tracks.seen):.0%} of all frames tracked")
 pd.DataFrame(tracked.size_m, columns=["size x (m)", "size y (m)", "size z (m)"]).round(2)
@@ -284,7 +284,7 @@ seen = make_extents(cameras, jnp.asarray(tracked.size_m, jnp.float32))
 xyxy_px = np.asarray(project_boxes(seen, jnp.asarray(tracks.position_m[FRAME], jnp.float32)).xyxy)
 figure, panels = plt.subplots(2, 4, figsize=(13, 4.2), dpi=64, layout="constrained")
 for number, (panel, name) in enumerate(zip(panels.flat, rig.names, strict=True)):
-    image = next(islice(read_frames(sequence.videos[name]), FRAME, None))
+    image = next(islice(read_frames(recording.videos[name]), FRAME, None))
     panel.imshow(image[:, :, ::-1])
     for drone, (left, top, right, bottom) in enumerate(xyxy_px[:, number] - 0.5):
         edge = plots.drone_colour(drone)
@@ -336,9 +336,9 @@ T_turn = np.eye(4)
 T_turn[:3, :3] = Rotation.from_euler("y", TURN_DEG, degrees=True).as_matrix()
 T_cam_world[knocked] = T_turn @ T_cam_world[knocked]
 turned_rig = Rig(rig.names, replace(rig.cameras, T_cam_world=T_cam_world))
-(turned,) = track_runs(replace(sequence, rig=turned_rig), silhouettes, [settings])
+(turned,) = track_runs(replace(recording, rig=turned_rig), silhouettes, [settings])
 
-frames = range(0, sequence.num_frames, 5)
+frames = range(0, recording.num_frames, 5)
 rigs = {"as calibrated": (rig, tracked), f"gopro3 turned by {TURN_DEG} deg": (turned_rig, turned)}
 mean_score = {}
 soft = SoftIoU()
@@ -373,7 +373,7 @@ print(
 
 # %% [markdown]
 # *What to see: with the rig as it was calibrated all cameras score alike. With one turned, that camera's bar falls far
-# below the others, which lose little. Leave it out (`--cameras`, or `sequence.usable(cameras=[...])`) or calibrate it
+# below the others, which lose little. Leave it out (`--cameras`, or `recording.usable(cameras=[...])`) or calibrate it
 # again.*
 #
 # | What you see | Look at | Likely cause |

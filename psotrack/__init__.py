@@ -12,7 +12,7 @@ Recordings and files
     read_recording, Recording, read_c3d, read_trajectories, write_trajectories, simulate
 Tracking
     track, track_runs, TrackSettings and its parts (SwarmSettings, ScoreSettings, MotionSettings, DroneSettings,
-    StatusSettings, IdentitySettings), TrackedSequence, Trajectories
+    StatusSettings, IdentitySettings), TrackedRecording, Trajectories
 Judging
     evaluate, Evaluation, find_offset
 Cameras

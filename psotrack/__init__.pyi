@@ -5,7 +5,7 @@ from .evaluation import Evaluation, evaluate
 from .geometry import Rig, make_camera, make_rig, project, read_rig, triangulate, write_rig
 from .inside_out import MarkerMap, localise_video, read_marker_map
 from .methods import Method, MethodInputs
-from .pipeline import TrackedSequence, track_runs
+from .pipeline import TrackedRecording, track_runs
 from .recordings import Recording, read_c3d
 from .settings import (
     DroneSettings,
@@ -43,7 +43,7 @@ __all__ = [
     "StatusSettings",
     "SwarmSettings",
     "TrackSettings",
-    "TrackedSequence",
+    "TrackedRecording",
     "Trajectories",
     "background_model",
     "detect_markers",

@@ -12,8 +12,8 @@ from jaxtyping import UInt8
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
 from psotrack.methods import Method
-from psotrack.pipeline import Parts, TrackedSequence, track_sequence
-from psotrack.recordings import Sequence as Recording
+from psotrack.pipeline import Parts, TrackedRecording, track_recording
+from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import BackgroundModel, ForegroundSettings, Mog2
 from psotrack.support import no_progress, progress_bar, user_cache
@@ -61,7 +61,7 @@ def track(
     jobs: int | None = None,
     progress: bool = False,
     **brought: Unpack[BroughtParts],
-) -> TrackedSequence:
+) -> TrackedRecording:
     """Track the drones of a recording.
 
     Silhouettes are made by several processes: in a script, call this function below `if __name__ == "__main__":`.
@@ -82,7 +82,7 @@ def track(
         recording = read_recording(recording)
     if not isinstance(settings, TrackSettings):
         settings = TrackSettings().changed(settings or {})
-    return track_sequence(
+    return track_recording(
         recording,
         settings,
         cache=user_cache() if cache is None else cache,

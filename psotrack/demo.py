@@ -13,8 +13,8 @@ from jaxtyping import Float, UInt8
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.evaluation import evaluate, plots, tables
 from psotrack.geometry import make_extents, project_boxes
-from psotrack.pipeline import TrackedSequence, track_sequence
-from psotrack.recordings import Sequence, read_frames
+from psotrack.pipeline import TrackedRecording, track_recording
+from psotrack.recordings import Recording, read_frames
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import SilhouetteSettings
 from psotrack.simulation import simulate
@@ -66,14 +66,14 @@ def run(
         report=report,
     )
     simulated = time.perf_counter()
-    sequence = read_sequence(folder).usable()
+    recording = read_sequence(folder).usable()
     settings = TrackSettings(seed=seed, silhouettes=SILHOUETTES)
-    tracked = track_sequence(sequence, settings, cache=out / "silhouettes", jobs=jobs, report=report)
+    tracked = track_recording(recording, settings, cache=out / "silhouettes", jobs=jobs, report=report)
     write_trajectories(tracks, tracked.trajectories, force=force)
     ended = time.perf_counter()
-    assert sequence.truth is not None, "the simulator writes one"
-    evaluation = evaluate(tracked.trajectories, sequence.truth)
-    save_picture(picture, sequence, tracked)
+    assert recording.truth is not None, "the simulator writes one"
+    evaluation = evaluate(tracked.trajectories, recording.truth)
+    save_picture(picture, recording, tracked)
     seconds = tracked.record["seconds"]
     stages = {
         "simulate": simulated - began,
@@ -83,15 +83,17 @@ def run(
         "evaluate, draw": time.perf_counter() - ended,
         "all": time.perf_counter() - began,
     }
-    return Demo(tables.render(evaluation, title=sequence.name), _stage_table(stages), picture)
+    return Demo(tables.render(evaluation, title=recording.name), _stage_table(stages), picture)
 
 
-def save_picture(path: Path, sequence: Sequence, tracked: TrackedSequence, frame: int | None = None) -> None:
+def save_picture(
+    path: Path, recording: Recording, tracked: TrackedRecording, frame: int | None = None
+) -> None:
     """Save frames of four cameras with the tracked boxes, beside the paths in 3D, as PNG.
 
     Args:
         path: of the picture.
-        sequence: with a reference.
+        recording: recording with a reference.
         tracked: what was tracked in it.
         frame: which is shown; None takes the middle one.
     """
@@ -100,15 +102,15 @@ def save_picture(path: Path, sequence: Sequence, tracked: TrackedSequence, frame
     from matplotlib.patches import Rectangle
 
     frame = tracked.trajectories.num_frames // 2 if frame is None else frame
-    assert sequence.truth is not None
-    xyxy_px = _boxes(sequence, tracked, frame)
-    colours = plots.colours_of_estimates(tracked.trajectories, sequence.truth)
+    assert recording.truth is not None
+    xyxy_px = _boxes(recording, tracked, frame)
+    colours = plots.colours_of_estimates(tracked.trajectories, recording.truth)
     figure = Figure(figsize=(16, 5.6))
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 2, left=0.005, right=0.55, bottom=0.01, top=0.95, wspace=0.03, hspace=0.12)
-    for shown, name in enumerate(sequence.rig.names[:SHOWN_CAMERAS]):
+    for shown, name in enumerate(recording.rig.names[:SHOWN_CAMERAS]):
         axes = figure.add_subplot(grid[shown // 2, shown % 2])
-        axes.imshow(_frame_of(sequence, name, frame))
+        axes.imshow(_frame_of(recording, name, frame))
         for drone, colour in enumerate(colours):
             # Edges of pixels are half a pixel from their centres, which is what the axes count.
             x0, y0, x1, y1 = xyxy_px[drone, shown] - 0.5
@@ -116,20 +118,22 @@ def save_picture(path: Path, sequence: Sequence, tracked: TrackedSequence, frame
         axes.set_title(f"{name}, frame {frame}", fontsize=9)
         axes.set_axis_off()
     paths = figure.add_axes((0.56, 0.0, 0.42, 0.88), projection="3d")
-    plots.draw_trajectories(paths, tracked.trajectories, sequence.truth)
+    plots.draw_trajectories(paths, tracked.trajectories, recording.truth)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=120)
 
 
-def _boxes(sequence: Sequence, tracked: TrackedSequence, frame: int) -> Float[np.ndarray, "drones cameras 4"]:
-    cameras = on_device(sequence.rig.cameras)
+def _boxes(
+    recording: Recording, tracked: TrackedRecording, frame: int
+) -> Float[np.ndarray, "drones cameras 4"]:
+    cameras = on_device(recording.rig.cameras)
     seen = make_extents(cameras, np.asarray(tracked.size_m, np.float32))
     position: Float[np.ndarray, "drones 3"] = tracked.trajectories.position_m[frame].astype(np.float32)
     return np.asarray(project_boxes(seen, position).xyxy)
 
 
-def _frame_of(sequence: Sequence, camera: str, frame: int) -> UInt8[np.ndarray, "height width 3"]:
-    for index, image in enumerate(read_frames(sequence.videos[camera])):
+def _frame_of(recording: Recording, camera: str, frame: int) -> UInt8[np.ndarray, "height width 3"]:
+    for index, image in enumerate(read_frames(recording.videos[camera])):
         if index == frame:
             return image[:, :, ::-1]
     raise AssertionError("the tracker has read as many frames")

@@ -22,7 +22,7 @@ from psotrack.fusion import fuse_tracks
 from psotrack.geometry import Rig
 from psotrack.initiation import InitialState
 from psotrack.projection_lines import LineSettings, state_at_first_frame, track_detections
-from psotrack.recordings import Sequence as Recording
+from psotrack.recordings import Recording
 from psotrack.settings import BLOBS, YOLO, TrackSettings
 from psotrack.silhouettes import Silhouettes
 from psotrack.support import Report, digest_file, no_progress

@@ -3,7 +3,7 @@
     recording -> silhouettes or detections -> room bounds -> initial state -> tracking -> fusion
               -> identity and smoothing -> record
 
-`track_sequence` is what the command line, sweeps and notebooks call; `track_runs` does the stages for many settings at
+`track_recording` is what the command line, sweeps and notebooks call; `track_runs` does the stages for many settings at
 once. Only this module knows the whole recording and the whole settings: each stage is given what it needs, and
 returns a result.
 """
@@ -47,7 +47,7 @@ from psotrack.methods import (
     track_by_swarm,
 )
 from psotrack.projection_lines import LineSettings
-from psotrack.recordings import Sequence as Recording
+from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import BackgroundModel, Silhouettes, compute
 from psotrack.support import Report, load_plugin, no_progress, plugin_names
@@ -76,7 +76,7 @@ class Parts:
 
 
 @dataclass(frozen=True)
-class TrackedSequence:
+class TrackedRecording:
     """The result of tracking a sequence.
 
     Attributes:
@@ -94,12 +94,12 @@ class TrackedSequence:
     def __repr__(self) -> str:
         frames, drones = self.trajectories.num_frames, self.trajectories.num_drones
         return (
-            f"TrackedSequence({self.record['sequence']}: {drones} drones, {frames} frames, "
+            f"TrackedRecording({self.record['sequence']}: {drones} drones, {frames} frames, "
             f"{self.trajectories.seen.mean():.1%} seen, {self.record['seconds']['total']:.1f} s)"
         )
 
 
-def track_sequence(
+def track_recording(
     recording: Recording,
     settings: TrackSettings = TrackSettings(),  # noqa: B008  frozen
     *,
@@ -107,11 +107,11 @@ def track_sequence(
     jobs: int | None = None,
     parts: Parts = Parts(),
     report: Report = no_progress,
-) -> TrackedSequence:
+) -> TrackedRecording:
     """Track the drones of a recording from its videos.
 
     Args:
-        recording: checked for use (see `Sequence.usable`).
+        recording: checked for use (see `Recording.usable`).
         settings: of the run.
         cache: folder of the stored silhouettes.
         jobs: number of processes for the silhouettes; None is one per processor.
@@ -148,14 +148,14 @@ def track_runs(
     *,
     parts: Parts = Parts(),
     report: Report = no_progress,
-) -> list[TrackedSequence | InputError]:
+) -> list[TrackedRecording | InputError]:
     """Track a recording once for each of the settings: each run as if alone, many runs in the time of a few.
 
     Runs of the swarm whose settings differ only in seeds, and in numbers other than of particles and windows, are one
     batch, which all devices share (`jax.devices()`). The seconds of a run are its share of the batch's.
 
     Args:
-        recording: checked for use (see `Sequence.usable`).
+        recording: checked for use (see `Recording.usable`).
         silhouettes: of all cameras; None where no settings need any (see `TrackSettings.needs_silhouettes`).
         settings: of each run.
         parts: parts that the caller brings, for all runs.
@@ -305,7 +305,7 @@ def _finished(
     result: MethodResult | None,
     bounds_m: Float[np.ndarray, "2 3"],
     silhouettes: Silhouettes | None,
-) -> TrackedSequence | InputError:
+) -> TrackedRecording | InputError:
     """The trajectories and the record of one run."""
     assert result is not None
     tracks = result.tracks
@@ -341,7 +341,7 @@ def _finished(
         "seconds": {stage: round(value, 4) for stage, value in (seconds | {"total": own_s}).items()},
         **environment(),
     }
-    return TrackedSequence(trajectories, tracks.sizes.size_m, identities, record)
+    return TrackedRecording(trajectories, tracks.sizes.size_m, identities, record)
 
 
 def _sizes_record(sizes: DroneSizes) -> list[dict[str, Any]]:

@@ -16,7 +16,7 @@ import pytest
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.evaluation import evaluate
 from psotrack.geometry import project
-from psotrack.pipeline import track_sequence
+from psotrack.pipeline import track_recording
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import SilhouetteSettings
 from psotrack.simulation import Scenario, simulate, write_recording
@@ -112,7 +112,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     assert sequence.truth is not None
     # What stands still for a second is background.
     how = SilhouetteSettings(reduction=1, working_reduction=1, min_blob_px=4, learning_rate=0.02)
-    tracked = track_sequence(sequence, TrackSettings(silhouettes=how), cache=root / "cache", jobs=1)
+    tracked = track_recording(sequence, TrackSettings(silhouettes=how), cache=root / "cache", jobs=1)
     cameras, position_m = sequence.rig.cameras, sequence.truth.position_m
     pixels, depth = project(cameras, position_m[:, :, None])
     inside = (pixels >= 0) & (pixels < cameras.image_size_wh) & (depth > 0)[..., None]

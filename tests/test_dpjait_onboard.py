@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from psotrack.datasets import dpjait
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import look_at, make_camera, make_rig
-from psotrack.recordings import VideoWriter, describe_sequence, inventory_table
+from psotrack.recordings import VideoWriter, describe_recording, inventory_table
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 5
 K = np.array([[30.5, 0.0, 31.5], [0.0, 30.25, 23.5], [0.0, 0.0, 1.0]])
@@ -105,7 +105,7 @@ def test_a_sequence_without_onboard_videos(folder):
     assert dpjait.read_onboard(folder) == {}
     sequence = dpjait.read_sequence(folder)
     assert sequence.onboard is None
-    assert describe_sequence(sequence)["onboard"] is None
+    assert describe_recording(sequence)["onboard"] is None
 
 
 @pytest.mark.parametrize("missing", ["dron1_cam_25.csv", dpjait.ONBOARD_CALIBRATION])
@@ -203,7 +203,7 @@ def test_intrinsics_that_the_table_cannot_hold(tmp_path, intrinsics):
 
 
 def test_the_inventory_has_a_row_per_onboard_camera(folder):
-    content = describe_sequence(dpjait.read_sequence(folder))
+    content = describe_recording(dpjait.read_sequence(folder))
     assert content["onboard"]["dron2"] == {
         "video": str(folder / "dron2_cam_s.avi"),
         "frames": FRAMES,

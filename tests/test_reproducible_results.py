@@ -14,8 +14,8 @@ import pytest
 
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.evaluation import Evaluation, evaluate
-from psotrack.pipeline import track_sequence
-from psotrack.recordings import Sequence
+from psotrack.pipeline import track_recording
+from psotrack.recordings import Recording
 from psotrack.settings import SwarmSettings, TrackSettings
 from psotrack.silhouettes import SilhouetteSettings
 from psotrack.simulation import simulate
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.slow
 class Lab:
     """A simulated sequence and where its silhouettes are kept."""
 
-    sequence: Sequence
+    sequence: Recording
     cache: Path
 
     def track(self, seed: int = 0) -> Trajectories:
@@ -37,7 +37,7 @@ class Lab:
             silhouettes=SilhouetteSettings(reduction=2, working_reduction=1),
             swarm=SwarmSettings(kind="joint", particles=100, iterations=70),
         )
-        return track_sequence(self.sequence, settings, cache=self.cache, jobs=1).trajectories
+        return track_recording(self.sequence, settings, cache=self.cache, jobs=1).trajectories
 
     def judge(self, trajectories: Trajectories) -> Evaluation:
         assert self.sequence.truth is not None

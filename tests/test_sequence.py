@@ -1,4 +1,4 @@
-"""`Sequence.usable`: consistent videos pass; errors name an inconsistent video and a remedy."""
+"""`Recording.usable`: consistent videos pass; errors name an inconsistent video and a remedy."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import make_camera, make_rig
-from psotrack.recordings import Sequence, VideoInfo
+from psotrack.recordings import Recording, VideoInfo
 
 NAMES = ("a", "b", "c", "d", "e")
 
@@ -18,7 +18,7 @@ def a_camera(size_wh=(1920, 1080)):
     return make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=size_wh)
 
 
-def a_sequence(**changes) -> Sequence:
+def a_sequence(**changes) -> Recording:
     """Five equal cameras; `changes` change the video of a camera, None removes it."""
     videos = {name: VideoInfo(Path(f"{name}.avi"), 250, 25.0, (1920, 1080)) for name in NAMES}
     for name, change in changes.items():
@@ -27,7 +27,7 @@ def a_sequence(**changes) -> Sequence:
         else:
             videos[name] = replace(videos[name], **change)
     rig = make_rig({name: a_camera() for name in NAMES})
-    return Sequence(name="S01", folder=Path("S01"), rig=rig, videos=videos)
+    return Recording(name="S01", folder=Path("S01"), rig=rig, videos=videos)
 
 
 def test_consistent_videos_are_kept():

@@ -22,7 +22,7 @@ import pytest
 
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
 from psotrack.geometry import look_at, make_camera, make_rig
-from psotrack.recordings import Sequence, VideoWriter, probe, read_frames
+from psotrack.recordings import Recording, VideoWriter, probe, read_frames
 from psotrack.silhouettes import Silhouettes, compute
 from psotrack.silhouettes import store as silhouette_store
 from psotrack.silhouettes.computation import SilhouetteSettings
@@ -46,13 +46,13 @@ def _write_video(path: Path, seed: int, num_frames: int = NUM_FRAMES) -> None:
             writer.write(np.clip(image, 0, 255).astype(np.uint8))
 
 
-def _sequence(folder: Path) -> Sequence:
+def _sequence(folder: Path) -> Recording:
     """A sequence of all videos in a folder."""
     R, t_m = look_at((0.0, 0.0, 1.0), (5.0, 0.0, 1.0))
     K = np.array([[100.0, 0, 81], [0, 100, 59], [0, 0, 1]])
     videos = {path.stem: probe(path) for path in sorted(folder.glob("*.avi"))}
     rig = make_rig({name: make_camera(R=R, t_m=t_m, K=K, image_size_wh=SIZE_WH) for name in videos})
-    return Sequence(folder.name, folder, rig, videos)
+    return Recording(folder.name, folder, rig, videos)
 
 
 @pytest.fixture(scope="session")
@@ -83,7 +83,7 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return names
 
 
-def _expected(sequence: Sequence, settings: SilhouetteSettings = SETTINGS) -> np.ndarray:
+def _expected(sequence: Recording, settings: SilhouetteSettings = SETTINGS) -> np.ndarray:
     """Silhouettes without store, workers or chunks: (frames, cameras, height, width)."""
     step = silhouette_store.learning_step(sequence.num_frames, settings)
     factor = settings.reduction // settings.working_reduction

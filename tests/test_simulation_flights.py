@@ -16,6 +16,7 @@ from psotrack.simulation.flights.planning import frame_times_s, plan
 from psotrack.simulation.scenarios import (
     Crossing,
     Drone,
+    FlightFromFile,
     FollowingFlight,
     Formation,
     Harmonic,
@@ -23,7 +24,6 @@ from psotrack.simulation.scenarios import (
     Limits,
     NearPass,
     Orbit,
-    Recording,
     Variation,
     Waypoints,
 )
@@ -246,7 +246,7 @@ def test_a_recording_replays_whatever_the_seed_and_others_fly_relative_to_it(tmp
     (flown,) = plan(scene_of(ORBIT), 0)
     samples_s = np.arange(0.0, 12.0, 0.01)
     write_recording(tmp_path / "r.csv", samples_s, flown.position_m(samples_s), None)
-    replay = Recording(file=str(tmp_path / "r.csv"), start_s=1.0)
+    replay = FlightFromFile(file=str(tmp_path / "r.csv"), start_s=1.0)
     wingman = Formation(leader=1, offset_m=(0.0, 0.9, 0.0))
     time_s = frame_times_s(S02, 250)
     for seed in (0, 1):

@@ -22,7 +22,7 @@ from psotrack.simulation.flights.dynamics import DYNAMICS, Space, Sticks
 from psotrack.simulation.flights.motion import Heading
 from psotrack.simulation.flights.piloting import Sample, fly, read_sticks, until, write_sticks
 from psotrack.simulation.flights.recordings import read_recording, recorded_flight
-from psotrack.simulation.scenarios import Recording
+from psotrack.simulation.scenarios import FlightFromFile
 
 LABORATORY = space_in("laboratory")
 OUTDOORS = Space(np.full(3, -1e6), np.full(3, 1e6))
@@ -237,7 +237,7 @@ def test_what_was_flown_replays_as_it_was(tmp_path):
     """Through the file and its spline: the flight between its samples too."""
     rows = [(0, 1, 0.3, 0.1, 0.5), (0.9, -0.4, 1, 0, -1), (1.8, 0, 0, 0.6, 0), (2.5, 1, -1, -1, 0.3), (4,)]
     record(tmp_path / "loop.csv", rows)
-    replay = recorded_flight(Recording(file=str(tmp_path / "loop.csv")), Heading(1.0))
+    replay = recorded_flight(FlightFromFile(file=str(tmp_path / "loop.csv")), Heading(1.0))
     fine = flown(*rows, rate_hz=STEP_HZ)
     assert np.all(np.diff(fine.position_m, axis=0).any(axis=1)), "a flight that stands still proves nothing"
     np.testing.assert_allclose(replay.position_m(fine.time_s[::10]), fine.position_m[::10], atol=1e-12)

@@ -18,7 +18,7 @@ from psotrack.simulation.flights.formulas import HarmonicFlight
 from psotrack.simulation.flights.motion import Heading
 from psotrack.simulation.flights.planning import plan
 from psotrack.simulation.flights.recordings import Recorded, RecordedFlight, read_recording, recorded_flight
-from psotrack.simulation.scenarios import Drone, Limits, Recording
+from psotrack.simulation.scenarios import Drone, FlightFromFile, Limits
 from psotrack.trajectories import Trajectories, write_trajectories
 
 HEADING = Heading(0.4, 0.6, 0.8, 0.1)
@@ -165,7 +165,7 @@ def test_a_recording_elsewhere_and_at_another_time_is_the_same_flight_there(rate
 def test_the_start_and_the_offset_of_a_record_are_applied(tmp_path):
     path = tmp_path / "loop.csv"
     write_recording(path, EVEN_S + 3.0, FORMULA.position_m(EVEN_S), FORMULA.orientation_wxyz(EVEN_S))
-    record = Recording(file=str(path), start_s=2.5, offset_m=(1.0, -2.0, 0.5))
+    record = FlightFromFile(file=str(path), start_s=2.5, offset_m=(1.0, -2.0, 0.5))
     replay = recorded_flight(record, HEADING)
     time_s = np.arange(180) / 25
     np.testing.assert_allclose(
@@ -205,7 +205,7 @@ def test_more_frames_than_the_recording_lasts_are_refused_with_the_number_that_f
 def test_a_scenario_with_more_frames_than_its_recording_is_refused_when_it_is_planned(tmp_path):
     path = tmp_path / "loop.csv"
     write_recording(path, EVEN_S, FORMULA.position_m(EVEN_S), None)
-    drone = Drone(flight=Recording(file=str(path)))
+    drone = Drone(flight=FlightFromFile(file=str(path)))
     limits = Limits(
         max_speed_m_s=3.0,
         max_acceleration_m_s2=5.0,
@@ -231,7 +231,7 @@ def test_a_start_behind_the_end_is_refused(tmp_path):
     with pytest.raises(
         SettingsError, match=r"^start_s of .*loop\.csv: expected below its 0\.7 s, found 0\.7$"
     ):
-        recorded_flight(Recording(file=str(path), start_s=0.7), HEADING)
+        recorded_flight(FlightFromFile(file=str(path), start_s=0.7), HEADING)
 
 
 # --- files

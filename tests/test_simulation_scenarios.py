@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from psotrack.errors import InputError, SettingsError
 from psotrack.simulation import build, load, preset_names, preset_text, replaced, scenario
 from psotrack.simulation.flights.planning import frame_times_s, plan
-from psotrack.simulation.scenarios import Mesh, NearPass, Recording
+from psotrack.simulation.scenarios import FlightFromFile, Mesh, NearPass
 from psotrack.simulation.world.halls import RIGS
 
 S02 = scenario("S02_D4_A")
@@ -141,8 +141,8 @@ def test_paths_in_a_file_start_at_its_folder(tmp_path, monkeypatch):
         one, two, three = load(given_path).drones
         folder = tmp_path / "mine"
         assert one.model == Mesh(file=str(folder / "shapes/a.obj"), scale=0.01)
-        assert one.flight == Recording(file=str(folder / "r.csv"))
-        assert two.flight == Recording(file="/elsewhere/r.csv", start_s=2.5)
+        assert one.flight == FlightFromFile(file=str(folder / "r.csv"))
+        assert two.flight == FlightFromFile(file="/elsewhere/r.csv", start_s=2.5)
         assert three == scenario("S12_D3").drones[2]
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import SettingsError
-from psotrack.recordings import Sequence, VideoInfo
+from psotrack.recordings import Recording, VideoInfo
 from psotrack.silhouettes import Silhouettes
 from psotrack.sweep import Perturbation, perturb
 from psotrack.sweep.perturbations import choose_cameras
@@ -38,7 +38,7 @@ def flown(num_cameras=5, frames=None):
         seconds={},
         arrays=tuple(frames + np.uint8(camera) for camera in range(num_cameras)),
     )
-    return Sequence(name="S", folder=Path("S"), rig=rig, videos=videos), silhouettes
+    return Recording(name="S", folder=Path("S"), rig=rig, videos=videos), silhouettes
 
 
 def frames_of(silhouettes):

@@ -15,7 +15,7 @@ from psotrack.datasets.dpjait import read_sequence
 from psotrack.errors import PsotrackError
 from psotrack.evaluation import evaluate
 from psotrack.pipeline import track_runs
-from psotrack.recordings import Sequence
+from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
 from psotrack.support import keep_compiled
@@ -52,24 +52,24 @@ def cache_folder(data: Path) -> Path:
     return data / "silhouettes"
 
 
-def opened(name: str, data: Path, seed: int = 0) -> tuple[Sequence, Silhouettes]:
+def opened(name: str, data: Path, seed: int = 0) -> tuple[Recording, Silhouettes]:
     """A simulated sequence and its silhouettes; both are made if they are not there."""
     keep_compiled(cache_folder(data) / "compiled")
-    sequence = read_sequence(simulated(name, data, seed)).usable()
-    return sequence, compute(sequence, TrackSettings().silhouettes, cache=cache_folder(data))
+    recording = read_sequence(simulated(name, data, seed)).usable()
+    return recording, compute(recording, TrackSettings().silhouettes, cache=cache_folder(data))
 
 
-def figures(sequence: Sequence, silhouettes: Silhouettes, settings: TrackSettings) -> dict[str, Any]:
+def figures(recording: Recording, silhouettes: Silhouettes, settings: TrackSettings) -> dict[str, Any]:
     """Figures of one run. A run that finds no drones has missed all drones."""
-    assert sequence.truth is not None
+    assert recording.truth is not None
     try:
-        (tracked,) = track_runs(sequence, silhouettes, [settings])
+        (tracked,) = track_runs(recording, silhouettes, [settings])
     except PsotrackError as error:
         tracked = error
     if isinstance(tracked, PsotrackError):
         return {"missed_rate": 1.0, "note": f"{tracked}"}
-    errors = evaluate(tracked.trajectories, sequence.truth).to_dict()
-    ms = 1e3 * tracked.record["seconds"]["track"] / sequence.num_frames
+    errors = evaluate(tracked.trajectories, recording.truth).to_dict()
+    ms = 1e3 * tracked.record["seconds"]["track"] / recording.num_frames
     found = tracked.trajectories.num_drones
     return {key: errors[key] for key in KEPT} | {"drones_found": found, "track_ms_per_frame": ms}
 

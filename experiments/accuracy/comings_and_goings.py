@@ -25,7 +25,7 @@ from psotrack.evaluation import evaluate
 from psotrack.evaluation.consistency import consistency
 from psotrack.geometry import project, viewpoints
 from psotrack.pipeline import track_runs
-from psotrack.recordings import Sequence
+from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import compute
 from psotrack.silhouettes.computation import SilhouetteSettings
@@ -59,7 +59,7 @@ class Phase:
     end: int
 
 
-def opened(data: Path) -> Sequence:
+def opened(data: Path) -> Recording:
     """The simulated sequence, which is made if it is not there."""
     recipe = scenarios.load(SCENARIO)
     folder = data / "seed0" / "Simulated_Data" / recipe.name
@@ -69,20 +69,20 @@ def opened(data: Path) -> Sequence:
     return read_sequence(folder).usable()
 
 
-def views(sequence: Sequence, position_m: np.ndarray) -> np.ndarray:
+def views(recording: Recording, position_m: np.ndarray) -> np.ndarray:
     """(frames, drones), viewpoints whose images hold the drones' origins."""
-    cameras = sequence.rig.cameras
+    cameras = recording.rig.cameras
     pixels, depth = project(cameras, position_m[..., None, :])
     inside = ((pixels >= 0) & (pixels < cameras.image_size_wh)).all(axis=-1) & (depth > 0)
     of_viewpoint = viewpoints(cameras)
     return sum(inside[..., of_viewpoint == one].any(axis=-1).astype(int) for one in np.unique(of_viewpoint))
 
 
-def phases(sequence: Sequence) -> list[Phase]:
+def phases(recording: Recording) -> list[Phase]:
     """All drones from the first frame to the last."""
-    position_m = _known(sequence)
-    seen = views(sequence, position_m)
-    words = np.select([seen < 2, seen == 2, _still(position_m, sequence.fps)], [UNSEEN, BY_TWO, STILL], SEEN)
+    position_m = _known(recording)
+    seen = views(recording, position_m)
+    words = np.select([seen < 2, seen == 2, _still(position_m, recording.fps)], [UNSEEN, BY_TWO, STILL], SEEN)
     found = []
     for drone, of_drone in enumerate(words.T):
         ends = [*np.flatnonzero(of_drone[1:] != of_drone[:-1]) + 1, len(of_drone)]
@@ -93,9 +93,9 @@ def phases(sequence: Sequence) -> list[Phase]:
     return found
 
 
-def _known(sequence: Sequence) -> np.ndarray:
+def _known(recording: Recording) -> np.ndarray:
     """(frames, drones, 3); frame 0, of which the dataset says nothing, like the next."""
-    position_m = sequence.truth.position_m.copy()
+    position_m = recording.truth.position_m.copy()
     position_m[0] = position_m[1]
     return position_m
 
@@ -176,17 +176,17 @@ def _mean(values: np.ndarray) -> float:
     return float(values.mean()) if len(values) else np.nan
 
 
-def summary(sequence: Sequence, run: Judged) -> dict[str, Any]:
+def summary(recording: Recording, run: Judged) -> dict[str, Any]:
     """What a run says on the whole: of drones that two viewpoints see or more."""
-    truth = sequence.truth
-    there = views(sequence, truth.position_m)[..., None] >= 2
+    truth = recording.truth
+    there = views(recording, truth.position_m)[..., None] >= 2
     evaluation = evaluate(
         run.trajectories, replace(truth, position_m=np.where(there, truth.position_m, np.nan))
     )
     nobody = run.tracked & (run.drone < 0)
     return {
         "tracks": run.trajectories.num_drones,
-        "tracked_nobody_s": float(nobody.sum() / sequence.fps),
+        "tracked_nobody_s": float(nobody.sum() / recording.fps),
         "id_switches": evaluation.id_switches,
         "missed_rate": evaluation.missed_rate,
         "mota": evaluation.mota,
@@ -284,18 +284,18 @@ def main() -> None:
     options = parser.parse_args()
     started = _results.Run("comings_and_goings")
 
-    sequence = opened(options.data)
-    position_m, plan = _known(sequence), phases(sequence)
+    recording = opened(options.data)
+    position_m, plan = _known(recording), phases(recording)
     table, totals, runs = [], {}, {}
     for name, how in BACKGROUNDS.items():
         settings = TrackSettings(seed=options.seed, silhouettes=how)
-        (tracked,) = track_runs(sequence, compute(sequence, how, cache=options.cache), [settings])
+        (tracked,) = track_runs(recording, compute(recording, how, cache=options.cache), [settings])
         run = judged(tracked.trajectories, position_m)
         runs[name] = run, tracked.record["arrivals"]
-        table += [{"background": name, **row(phase, run, sequence.fps)} for phase in plan]
-        totals[name] = summary(sequence, run)
+        table += [{"background": name, **row(phase, run, recording.fps)} for phase in plan]
+        totals[name] = summary(recording, run)
     frame = pd.DataFrame(table)
-    draw(runs, plan, sequence.fps, options.picture)
+    draw(runs, plan, recording.fps, options.picture)
     started.save(options.out, rows=frame, figures={"runs": totals}, files=[options.picture], decimals="%.4g")
     for name, part in frame.groupby("background", sort=False):
         print(f"\n{name}: {json.dumps(totals[name])}")

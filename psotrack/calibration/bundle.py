@@ -8,7 +8,7 @@ Pixels do not determine the world's origin, the directions of its axes, or its s
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Ordered
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -58,9 +58,9 @@ def adjust(
     points_px: Float[np.ndarray, "points cameras 2"],
     noise_px: float | Float[np.ndarray, "points cameras"] = 1.0,
     *,
-    fixed: Ordered[str] = (),
-    rescaled: Ordered[str] = (),
-    common_errors: Ordered[CommonErrors] = (),
+    fixed: Sequence[str] = (),
+    rescaled: Sequence[str] = (),
+    common_errors: Sequence[CommonErrors] = (),
 ) -> AdjustedRig:
     """Adjust the cameras of a rig, and triangulate the points, so that projections agree with measured pixels.
 
@@ -118,7 +118,7 @@ def adjust(
 
 
 def _check_seen(
-    rig: Rig, placed: Bool[np.ndarray, "points cameras"], fixed: Ordered[str], rescaled: Ordered[str]
+    rig: Rig, placed: Bool[np.ndarray, "points cameras"], fixed: Sequence[str], rescaled: Sequence[str]
 ) -> None:
     """Check that every camera that may move sees enough points."""
     for name, count in zip(rig.names, placed.sum(axis=0).tolist(), strict=True):
@@ -141,7 +141,7 @@ def _check_seen(
 
 
 def _unknowns(
-    rig: Rig, fixed: Ordered[str], rescaled: bool
+    rig: Rig, fixed: Sequence[str], rescaled: bool
 ) -> tuple[Float[np.ndarray, "unknowns free"], Float[np.ndarray, "unknowns motions"]]:
     """Select the free unknowns, and the common motions that fixed cameras leave free.
 
@@ -165,7 +165,7 @@ def _adjusted(
     bundle: Bundle,
     rows: Int[np.ndarray, " rows"],
     num_points: int,
-    common_errors: Ordered[CommonErrors],
+    common_errors: Sequence[CommonErrors],
 ) -> AdjustedRig:
     """Make the result for all points, with the covariance of the cameras."""
     problem, state, used = bundle.problem, bundle.state, bundle.used

@@ -8,7 +8,7 @@ the independent errors (the sandwich of P. J. Huber 1967; Liang & Zeger 1986 for
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Ordered
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,7 +39,7 @@ class CommonErrors:
 def covariance_of_common_errors(
     bundle: Bundle,
     equations: ReducedEquations,
-    common_errors: Ordered[CommonErrors],
+    common_errors: Sequence[CommonErrors],
 ) -> Float[np.ndarray, "free free"]:
     """Covariance of the unknowns that common errors add.
 

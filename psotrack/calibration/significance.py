@@ -9,7 +9,7 @@ one more nor all that are left together gain more than chance.
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Ordered
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,9 +61,9 @@ def improve(
     points_px: Float[np.ndarray, "points cameras 2"],
     noise_px: float | Float[np.ndarray, "points cameras"] = 1.0,
     *,
-    fixed: Ordered[str] = (),
+    fixed: Sequence[str] = (),
     refine_focal_length: bool = False,
-    common_errors: Ordered[CommonErrors] = (),
+    common_errors: Sequence[CommonErrors] = (),
 ) -> Improved:
     """Adjust only those cameras that are wrong by more than errors in the images explain.
 
@@ -105,7 +105,7 @@ def _zoomed(
     rig: Rig,
     points_px: Float[np.ndarray, "points cameras 2"],
     noise_px: float | Float[np.ndarray, "points cameras"],
-    common_errors: Ordered[CommonErrors],
+    common_errors: Sequence[CommonErrors],
     final: AdjustedRig,
     moved: tuple[str, ...],
 ) -> dict[str, tuple[float, float]]:
@@ -130,7 +130,7 @@ def _zoomed(
     return found
 
 
-def find_wrong_cameras(rig: Rig, adjusted: AdjustedRig, fixed: Ordered[str] = ()) -> tuple[str, ...]:
+def find_wrong_cameras(rig: Rig, adjusted: AdjustedRig, fixed: Sequence[str] = ()) -> tuple[str, ...]:
     """Names of the cameras that are wrong by more than the covariance explains.
 
     If more than `MOST_OFF` of the cameras are wrong, all cameras that are not fixed are returned.
@@ -161,7 +161,7 @@ def find_wrong_cameras(rig: Rig, adjusted: AdjustedRig, fixed: Ordered[str] = ()
 
 
 def _information(
-    rig: Rig, adjusted: AdjustedRig, fixed: Ordered[str]
+    rig: Rig, adjusted: AdjustedRig, fixed: Sequence[str]
 ) -> tuple[Float[np.ndarray, "unknowns unknowns"], Float[np.ndarray, " unknowns"]]:
     """Λ of the cameras that may move, which does not depend on common motions, and b = Λ x."""
     given = np.asarray(rig.cameras.T_cam_world)

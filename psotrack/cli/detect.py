@@ -6,7 +6,16 @@ from pathlib import Path
 
 import click
 
-from psotrack.cli.options import CAMERAS, DETECTOR_SIZE, FORCE, FRAMES, JSON, QUIET, SEQUENCE, usable_sequence
+from psotrack.cli.options import (
+    CAMERAS,
+    DETECTOR_SIZE,
+    FORCE,
+    FRAMES,
+    JSON,
+    QUIET,
+    SEQUENCE,
+    usable_recording,
+)
 from psotrack.cli.output import output_json, print_line, report_to
 
 
@@ -75,7 +84,7 @@ def detect(
     from psotrack.support import refuse_to_overwrite
 
     detector = OnnxDetector(model, DetectorSettings(confidence, nms, size))
-    recording = usable_sequence(sequence, cameras, num_frames)
+    recording = usable_recording(sequence, cameras, num_frames)
     files = {name: out / f"{video.path.stem}.csv" for name, video in recording.videos.items()}
     for path in files.values():
         refuse_to_overwrite(path, force)

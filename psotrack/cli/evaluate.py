@@ -14,7 +14,7 @@ from psotrack.cli.output import output_json
 from psotrack.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
-    from psotrack.recordings import Sequence
+    from psotrack.recordings import Recording
     from psotrack.trajectories import Trajectories
 
 
@@ -73,7 +73,7 @@ def evaluate(
 
 
 def _shifted_reference(
-    recording: Sequence, estimate: Trajectories, offset: str
+    recording: Recording, estimate: Trajectories, offset: str
 ) -> tuple[Trajectories, float]:
     """The reference at the frames of the videos, and the time by which the reference's clock is ahead, seconds."""
     from psotrack.clocks import find_offset, own_reference, shifted

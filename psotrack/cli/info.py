@@ -24,9 +24,9 @@ def info(sequence: Path, force: bool, json_path: Path | None) -> None:
     from rich.console import Console
 
     from psotrack.datasets.dpjait import read_sequence
-    from psotrack.recordings import describe_sequence, inventory_table
+    from psotrack.recordings import describe_recording, inventory_table
 
-    content = describe_sequence(read_sequence(sequence))
+    content = describe_recording(read_sequence(sequence))
     output_json(json_path, content, force)
     if json_path != Path("-"):
         Console().print(inventory_table(content))

@@ -13,7 +13,7 @@ from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Shadows, SilhouetteSettings
 
 if TYPE_CHECKING:
-    from psotrack.recordings import Sequence
+    from psotrack.recordings import Recording
 
 #: Settings whose values are the defaults of the command line.
 TRACK = TrackSettings()
@@ -169,7 +169,7 @@ def silhouette_options(command: Command) -> Command:
     return command
 
 
-def usable_sequence(folder: str | Path, cameras: str | None, num_frames: int | None) -> Sequence:
+def usable_recording(folder: str | Path, cameras: str | None, num_frames: int | None) -> Recording:
     """Sequence with the cameras and frames that the options `CAMERAS` and `FRAMES` select."""
     from psotrack.datasets.dpjait import read_sequence
 

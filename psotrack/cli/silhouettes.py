@@ -18,7 +18,7 @@ from psotrack.cli.options import (
     SEQUENCE,
     cache_folder,
     silhouette_options,
-    usable_sequence,
+    usable_recording,
 )
 from psotrack.cli.output import output_json, print_line, report_to
 from psotrack.silhouettes import SilhouetteSettings
@@ -59,7 +59,7 @@ def silhouettes(
 
     where = cache_folder(cache)
     stored = compute(
-        usable_sequence(sequence, cameras, num_frames),
+        usable_recording(sequence, cameras, num_frames),
         SilhouetteSettings(**settings),
         cache=where,
         jobs=jobs,

@@ -23,7 +23,7 @@ from psotrack.cli.options import (
     cache_folder,
     compiled_folder,
     silhouette_options,
-    usable_sequence,
+    usable_recording,
 )
 from psotrack.cli.output import output_json, print_line, report_to, write_json
 from psotrack.errors import SettingsError
@@ -32,7 +32,7 @@ from psotrack.silhouettes import SilhouetteSettings
 from psotrack.support import Report, refuse_to_overwrite
 
 if TYPE_CHECKING:
-    from psotrack.recordings import Sequence
+    from psotrack.recordings import Recording
 
 
 @click.command()
@@ -176,7 +176,7 @@ def track(
       psotrack track data/Real_Data/R12_D4 --out both.csv --method fused --detector drones.onnx --detector-size 1280
       psotrack track data/Simulated_Data/S02_D4_A --out paper.parquet --swarm joint --particles 100 --iterations 70
     """
-    from psotrack.pipeline import track_sequence
+    from psotrack.pipeline import track_recording
     from psotrack.support import keep_compiled
     from psotrack.trajectories import write_ambiguity, write_trajectories
 
@@ -186,11 +186,11 @@ def track(
     for path in (out, record_path, ambiguity_path):
         refuse_to_overwrite(path, force)
     chosen = TrackSettings().changed({_setting_name(option): value for option, value in settings.items()})
-    where, usable = cache_folder(cache), usable_sequence(sequence, cameras, num_frames)
+    where, usable = cache_folder(cache), usable_recording(sequence, cameras, num_frames)
     if model is not None:
         chosen = _with_detector(chosen, model, detector_size, usable, where, report_to(quiet))
     keep_compiled(compiled_folder(cache))
-    tracked = track_sequence(
+    tracked = track_recording(
         usable,
         chosen,
         cache=where,
@@ -220,7 +220,7 @@ def _setting_name(option: str) -> str:
 
 
 def _with_detector(
-    settings: TrackSettings, model: Path, size: int, sequence: Sequence, cache: Path, report: Report
+    settings: TrackSettings, model: Path, size: int, sequence: Recording, cache: Path, report: Report
 ) -> TrackSettings:
     """The settings, with what a network finds in the videos for detections."""
     from psotrack.detection import DetectorSettings, OnnxDetector, stored_detections

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 from psotrack.clocks.camera_clocks import CameraOffsets, camera_offsets
 from psotrack.clocks.time_shift import ShiftedPair, refused, shifted
 from psotrack.errors import InputError, SettingsError
-from psotrack.recordings import Sequence, body_trajectories, read_c3d
+from psotrack.recordings import Recording, body_trajectories, read_c3d
 from psotrack.support import COLOURS, save_figure, standard_error
 from psotrack.trajectories import Trajectories
 
@@ -151,7 +151,7 @@ def find_offset(
     )
 
 
-def own_reference(sequence: Sequence) -> Trajectories:
+def own_reference(recording: Recording) -> Trajectories:
     """The reference of a sequence at its own rate and with its own clock: the .c3d file, or else the pose files.
 
     Orientations are returned only if every position has an orientation.
@@ -159,14 +159,14 @@ def own_reference(sequence: Sequence) -> Trajectories:
     Raises:
         InputError: the sequence has no reference, or the .c3d file cannot be used.
     """
-    reference = sequence.truth
-    for path in sequence.folder.iterdir():
+    reference = recording.truth
+    for path in recording.folder.iterdir():
         if path.suffix.lower() == ".c3d":
             markers = read_c3d(path)
             num_frames = len(markers.position_m)
             reference = body_trajectories(markers, fps=markers.rate_hz, num_frames=num_frames, where=path)
     if reference is None:
-        raise InputError(sequence.folder, expected="a reference to synchronise with", found="none")
+        raise InputError(recording.folder, expected="a reference to synchronise with", found="none")
     if reference.orientation_wxyz is not None:
         turned = np.isfinite(reference.orientation_wxyz).all(axis=-1)
         if not turned[reference.seen].all():

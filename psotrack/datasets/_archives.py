@@ -12,7 +12,7 @@ import shutil
 import struct
 import tempfile
 import zipfile
-from collections.abc import Sequence as Ordered
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO
 
@@ -41,7 +41,7 @@ def stored_entry(name: str) -> zipfile.ZipInfo:
     return zipfile.ZipInfo(name, EPOCH)
 
 
-def join_archives(path: Path, parts: Ordered[Path]) -> None:
+def join_archives(path: Path, parts: Sequence[Path]) -> None:
     """Join several archives into one archive, which appears at `path` when it is complete.
 
     Args:

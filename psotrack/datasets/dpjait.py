@@ -11,8 +11,7 @@ import logging
 import os
 import re
 from collections import Counter
-from collections.abc import Mapping
-from collections.abc import Sequence as Ordered
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +43,7 @@ from psotrack.geometry import files_by_camera, read_calibration, read_camera_nam
 from psotrack.recordings import (
     Detections,
     OnboardVideo,
-    Sequence,
+    Recording,
     VideoInfo,
     body_trajectories,
     probe,
@@ -99,11 +98,11 @@ _VIDEO_SUFFIXES = {".avi", ".mp4"}
 _POSE_FILE = re.compile(r"drone?_?(?P<number>\d+)_pos_(?P<rate>\d+(?:\.\d+)?)\.csv", re.IGNORECASE)
 
 
-def read_sequence(folder: Path | str) -> Sequence:
+def read_sequence(folder: Path | str) -> Recording:
     """Read a sequence from a folder of the dataset, simulated or real.
 
     A camera without video gets the image size of most videos. Videos may differ in length; the reference is as long as
-    the longest video. `Sequence.usable` is stricter. Videos of cameras on drones that cannot be used are left out with
+    the longest video. `Recording.usable` is stricter. Videos of cameras on drones that cannot be used are left out with
     a warning, because their published layout is unknown and tracking does not need them.
 
     Raises:
@@ -117,7 +116,7 @@ def read_sequence(folder: Path | str) -> Sequence:
     videos = _videos(folder, files, names)
     rig = read_calibration(calibration, _image_sizes(names, videos))
     detections = files_by_camera((folder / DETECTIONS).glob("*.csv"), names)
-    return Sequence(
+    return Recording(
         name=folder.resolve().name,
         folder=folder,
         rig=rig,
@@ -128,7 +127,7 @@ def read_sequence(folder: Path | str) -> Sequence:
     )
 
 
-def detection_files(folder: Path | str, cameras: Ordered[str]) -> dict[str, Path]:
+def detection_files(folder: Path | str, cameras: Sequence[str]) -> dict[str, Path]:
     """Find the detection files of cameras in a folder, by the file names of `dl_data`.
 
     A camera without a file is absent; it has no detections.
@@ -174,7 +173,7 @@ def _onboard(folder: Path) -> Mapping[str, OnboardVideo] | None:
         return None
 
 
-def _videos(folder: Path, files: Ordered[Path], names: Ordered[str]) -> dict[str, VideoInfo]:
+def _videos(folder: Path, files: Sequence[Path], names: Sequence[str]) -> dict[str, VideoInfo]:
     videos = [path for path in files if path.suffix.lower() in _VIDEO_SUFFIXES]
     candidates = [path for path in videos if not is_onboard_video(path)]
     found = files_by_camera(candidates, names)
@@ -190,7 +189,7 @@ def _videos(folder: Path, files: Ordered[Path], names: Ordered[str]) -> dict[str
     return {name: probe(path) for name, path in found.items()}
 
 
-def _image_sizes(names: Ordered[str], videos: Mapping[str, VideoInfo]) -> dict[str, tuple[int, int]]:
+def _image_sizes(names: Sequence[str], videos: Mapping[str, VideoInfo]) -> dict[str, tuple[int, int]]:
     most_wh = Counter(video.image_size_wh for video in videos.values()).most_common(1)[0][0]
     for name in names:
         if name not in videos:
@@ -198,7 +197,7 @@ def _image_sizes(names: Ordered[str], videos: Mapping[str, VideoInfo]) -> dict[s
     return {name: videos[name].image_size_wh if name in videos else most_wh for name in names}
 
 
-def _truth(files: Ordered[Path], videos: Mapping[str, VideoInfo]) -> Trajectories | None:
+def _truth(files: Sequence[Path], videos: Mapping[str, VideoInfo]) -> Trajectories | None:
     """The reference at the frames of the longest video, or None."""
     first = next(iter(videos.values()))
     num_frames = max(video.num_frames for video in videos.values())
@@ -215,7 +214,7 @@ def _truth(files: Ordered[Path], videos: Mapping[str, VideoInfo]) -> Trajectorie
     return None
 
 
-def _pose_files(files: Ordered[Path], video: VideoInfo) -> dict[int, Path]:
+def _pose_files(files: Sequence[Path], video: VideoInfo) -> dict[int, Path]:
     """Pose files by the number of the drone."""
     found = numbered_files(files, _POSE_FILE)
     for path in found.values():

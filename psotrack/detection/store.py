@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from psotrack.detection.detector import Detector, detect_drones
-from psotrack.recordings import Sequence, write_detections
+from psotrack.recordings import Recording, write_detections
 from psotrack.support import Report, digest_file, digest_record, no_progress
 
 
 def stored_detections(
-    detector: Detector, sequence: Sequence, *, cache: Path | str, report: Report = no_progress
+    detector: Detector, recording: Recording, *, cache: Path | str, report: Report = no_progress
 ) -> Path:
     """Detect drones in the videos of a sequence, unless the detections are stored already.
 
@@ -19,7 +19,7 @@ def stored_detections(
 
     Args:
         detector: the network.
-        sequence: a consistent sequence (see `Sequence.usable`).
+        recording: a consistent recording (see `Recording.usable`).
         cache: folder for stored results.
         report: shows the progress in frames.
 
@@ -30,20 +30,20 @@ def stored_detections(
         InputError: a video cannot be read, or the network cannot be used.
         OutputError: a file cannot be written.
     """
-    folder = Path(cache) / "detections" / _key(detector, sequence)
-    for name, video in sequence.videos.items():
+    folder = Path(cache) / "detections" / _key(detector, recording)
+    for name, video in recording.videos.items():
         path = folder / f"{video.path.stem}.csv"
         if not path.exists():
             write_detections(path, detect_drones(detector, name, video, report=report))
     return folder
 
 
-def _key(detector: Detector, sequence: Sequence) -> str:
+def _key(detector: Detector, recording: Recording) -> str:
     """Name of the folder: 40 hexadecimal digits."""
     made_of = {
         **detector.key,
         "videos": {
-            name: [video.num_frames, digest_file(video.path)] for name, video in sequence.videos.items()
+            name: [video.num_frames, digest_file(video.path)] for name, video in recording.videos.items()
         },
     }
     return digest_record(made_of)

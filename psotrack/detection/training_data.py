@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Sequence as Ordered
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 
 from psotrack.detection.labels import LabelSettings, box_corners, label_boxes
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.recordings import Sequence, VideoInfo, read_frames
+from psotrack.recordings import Recording, VideoInfo, read_frames
 from psotrack.support import Advance, Report, atomic_write, map_in_processes, no_progress, refuse_to_overwrite
 
 #: Name of the file that describes a data set; every folder with a data set has one.
@@ -30,11 +30,11 @@ _TRAIN, _VALIDATION = "train", "val"
 
 
 def write_data_set(
-    sequences: Ordered[Sequence],
+    recordings: Sequence[Recording],
     out: Path | str,
     settings: LabelSettings,
     *,
-    validation: Ordered[str] = (),
+    validation: Sequence[str] = (),
     every: int = 1,
     force: bool = False,
     jobs: int | None = None,
@@ -46,7 +46,7 @@ def write_data_set(
     Images without drones have an empty label file, which trainers use as background.
 
     Args:
-        sequences: at least two sequences, each with a reference.
+        recordings: at least two recordings, each with a reference.
         out: folder of the data set.
         settings: settings of the labels.
         validation: names of the sequences for validation; the other sequences are for training. Empty: the last one.
@@ -65,15 +65,15 @@ def write_data_set(
         OutputError: the folder exists and `force` is not set, or it cannot be written.
     """
     out = Path(out)
-    parts = _parts([sequence.name for sequence in sequences], validation)
+    parts = _parts([recording.name for recording in recordings], validation)
     _check_replaceable(out, force)
     if every < 1:
         raise SettingsError("every", expected="1 or more", found=f"{every}")
     with atomic_write(out) as temporary:
         tasks = [
             task
-            for sequence in sequences
-            for task in _tasks(sequence, parts[sequence.name], settings, every, temporary)
+            for recording in recordings
+            for task in _tasks(recording, parts[recording.name], settings, every, temporary)
         ]
         for kind, part in product(("images", "labels"), (_TRAIN, _VALIDATION)):
             (temporary / kind / part).mkdir(parents=True)
@@ -109,7 +109,7 @@ class _Task:
     xyxy: Float[np.ndarray, "known drones 4"]
 
 
-def _parts(names: Ordered[str], validation: Ordered[str]) -> dict[str, str]:
+def _parts(names: Sequence[str], validation: Sequence[str]) -> dict[str, str]:
     """The part of each sequence, `train` or `val`, by the sequence's name."""
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
@@ -151,34 +151,34 @@ def _check_replaceable(out: Path, force: bool) -> None:
         )
 
 
-def _tasks(sequence: Sequence, part: str, settings: LabelSettings, every: int, out: Path) -> list[_Task]:
-    if sequence.truth is None:
-        raise InputError(sequence.folder, expected="a reference with the drones' positions", found="none")
-    filmed = [name for name in sequence.rig.names if name in sequence.videos]
-    truth, sequence = sequence.truth, sequence.usable(filmed, sequence.num_frames)
-    wanted = truth.frame[(truth.frame % every == 0) & (truth.frame < sequence.num_frames)]
+def _tasks(recording: Recording, part: str, settings: LabelSettings, every: int, out: Path) -> list[_Task]:
+    if recording.truth is None:
+        raise InputError(recording.folder, expected="a reference with the drones' positions", found="none")
+    filmed = [name for name in recording.rig.names if name in recording.videos]
+    truth, recording = recording.truth, recording.usable(filmed, recording.num_frames)
+    wanted = truth.frame[(truth.frame % every == 0) & (truth.frame < recording.num_frames)]
     corners_m = box_corners(
         truth.at_frames(wanted), np.array(settings.drone_size_m), np.array(settings.offset_m)
     )
     known = np.isfinite(corners_m).all(axis=(1, 2, 3))
     if not known.any():
         raise InputError(
-            sequence.folder,
+            recording.folder,
             expected="frames in which the poses of all drones are known",
             found=f"no such frame among the {len(wanted)} used frames",
         )
-    xyxy = label_boxes(sequence.rig.cameras, corners_m[known], settings)
+    xyxy = label_boxes(recording.rig.cameras, corners_m[known], settings)
     return [
         _Task(
             out,
             part,
-            f"{sequence.name}_{name}",
-            sequence.videos[name],
+            f"{recording.name}_{name}",
+            recording.videos[name],
             every,
             wanted[known],
             xyxy[:, :, index],
         )
-        for index, name in enumerate(sequence.rig.names)
+        for index, name in enumerate(recording.rig.names)
     ]
 
 

@@ -13,7 +13,7 @@ and tracers in the tracker. Both use the same projection.
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Ordered
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -78,7 +78,7 @@ class Rig:
     def __len__(self) -> int:
         return len(self.names)
 
-    def select(self, names: Ordered[str]) -> Rig:
+    def select(self, names: Sequence[str]) -> Rig:
         """A rig of chosen cameras, in the order of `names`.
 
         Args:
@@ -105,7 +105,7 @@ def make_camera(
     t_m: Float[np.ndarray, "3"],
     K: Float[np.ndarray, "3 3"],
     image_size_wh: tuple[int, int],
-    dist: Ordered[float] = (),
+    dist: Sequence[float] = (),
 ) -> Camera:
     """Make one camera from its calibration and check the numbers; arrays are float64.
 
@@ -155,7 +155,7 @@ def make_rig(named: dict[str, Camera]) -> Rig:
 
 
 def look_at(
-    centre_m: Ordered[float], target_m: Ordered[float], up: Ordered[float] = (0.0, 0.0, 1.0)
+    centre_m: Sequence[float], target_m: Sequence[float], up: Sequence[float] = (0.0, 0.0, 1.0)
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
     """R and t of a camera at `centre_m` whose optical axis passes through `target_m` and whose image is upright.
 

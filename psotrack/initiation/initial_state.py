@@ -12,7 +12,7 @@ from jaxtyping import Float
 from psotrack.errors import InputError
 from psotrack.geometry import Rig
 from psotrack.initiation.initialisation import InitialState, find_drones
-from psotrack.recordings import Sequence
+from psotrack.recordings import Recording
 from psotrack.settings import DroneSettings
 from psotrack.silhouettes import Silhouettes
 from psotrack.trajectories import Trajectories, read_trajectories
@@ -42,21 +42,21 @@ class StartSource:
     given: Trajectories | None = None
 
 
-def start_source(sequence: Sequence, init: str) -> StartSource:
+def start_source(recording: Recording, init: str) -> StartSource:
     """Where the initial state comes from, with the given trajectories read.
 
     Raises:
         InputError: there is no reference, or the file cannot be read.
     """
     if init == "auto":
-        return StartSource(init, sequence.folder)
+        return StartSource(init, recording.folder)
     if init != "truth":
-        return StartSource(init, Path(init), read_trajectories(Path(init), fps=sequence.fps))
-    if sequence.truth is None:
+        return StartSource(init, Path(init), read_trajectories(Path(init), fps=recording.fps))
+    if recording.truth is None:
         raise InputError(
-            sequence.folder, expected="a reference for --init truth", found="none", remedy="use --init auto"
+            recording.folder, expected="a reference for --init truth", found="none", remedy="use --init auto"
         )
-    return StartSource(init, sequence.folder, sequence.truth)
+    return StartSource(init, recording.folder, recording.truth)
 
 
 def room_bounds(

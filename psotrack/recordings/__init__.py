@@ -1,6 +1,6 @@
-"""Recordings: videos, the rig, detections and the reference, as one `Sequence`.
+"""Recordings: videos, the rig, detections and the reference, as one `Recording`.
 
-In: files of one recording (videos, detections, C3D). Out: a `Sequence`, which checks that its files are consistent;
+In: files of one recording (videos, detections, C3D). Out: a `Recording`, which checks that its files are consistent;
 decoded frames, detections, and reference trajectories from motion-capture markers.
 """
 

@@ -1,8 +1,8 @@
 from .c3d import Markers, read_c3d, write_c3d
 from .detections import Detections, read_detections, write_detections
-from .inventory import describe_sequence, inventory_table
+from .inventory import describe_recording, inventory_table
 from .marker_bodies import body_trajectories
-from .sequence import OnboardVideo, Recording, Sequence
+from .recording import OnboardVideo, Recording
 from .video import VideoInfo, VideoWriter, join_videos, probe, read_frames, silence_opencv
 
 __all__ = [
@@ -10,11 +10,10 @@ __all__ = [
     "Markers",
     "OnboardVideo",
     "Recording",
-    "Sequence",
     "VideoInfo",
     "VideoWriter",
     "body_trajectories",
-    "describe_sequence",
+    "describe_recording",
     "inventory_table",
     "join_videos",
     "probe",

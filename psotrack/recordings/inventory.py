@@ -7,22 +7,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from psotrack.recordings.detections import read_detections
-from psotrack.recordings.sequence import Sequence
+from psotrack.recordings.recording import Recording
 
 if TYPE_CHECKING:
     from rich.table import Table
 
 
-def describe_sequence(sequence: Sequence) -> dict[str, Any]:
+def describe_recording(recording: Recording) -> dict[str, Any]:
     """Cameras, videos, detections and reference of a sequence, as plain data. All detections are read.
 
     Raises:
         InputError: a file of detections cannot be read.
     """
     cameras: dict[str, dict[str, Any]] = {}
-    for index, name in enumerate(sequence.rig.names):
-        cam, video = sequence.rig.cameras[index], sequence.videos.get(name)
-        detections = (sequence.detections or {}).get(name)
+    for index, name in enumerate(recording.rig.names):
+        cam, video = recording.rig.cameras[index], recording.videos.get(name)
+        detections = (recording.detections or {}).get(name)
         cameras[name] = {
             "video": str(video.path) if video else None,
             "frames": video.num_frames if video else None,
@@ -33,7 +33,7 @@ def describe_sequence(sequence: Sequence) -> dict[str, Any]:
             "detections": len(read_detections(detections)) if detections else None,
         }
     onboard: dict[str, dict[str, Any]] = {}
-    for name, flown in (sequence.onboard or {}).items():
+    for name, flown in (recording.onboard or {}).items():
         onboard[name] = {
             "video": str(flown.video.path),
             "frames": flown.video.num_frames,
@@ -42,10 +42,10 @@ def describe_sequence(sequence: Sequence) -> dict[str, Any]:
             "focal_length_px": None if flown.K is None else float(flown.K[0, 0]),
             "frames_with_pose": int(np.isfinite(flown.orientation_wxyz).all(axis=1).sum()),
         }
-    truth = sequence.truth
+    truth = recording.truth
     return {
-        "name": sequence.name,
-        "folder": str(sequence.folder),
+        "name": recording.name,
+        "folder": str(recording.folder),
         "cameras": cameras,
         "onboard": onboard or None,
         "drones": list(truth.drones) if truth else None,
@@ -57,7 +57,7 @@ def inventory_table(content: dict[str, Any]) -> Table:
     """Table with one row per camera; cameras on drones come last.
 
     Args:
-        content: record from `describe_sequence`.
+        content: record from `describe_recording`.
     """
     from rich import box
     from rich.table import Table

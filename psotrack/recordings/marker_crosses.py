@@ -7,7 +7,7 @@ least squares (Kabsch 1976; Umeyama 1991, without scale); the shape is a general
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Ordered
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -156,7 +156,7 @@ def identify_markers(cross: Cross, points_m: Float[np.ndarray, "points 3"]) -> I
     return marker_of_point
 
 
-def identify_cross(crosses: Ordered[Cross], points_m: Float[np.ndarray, "points 3"]) -> int | None:
+def identify_cross(crosses: Sequence[Cross], points_m: Float[np.ndarray, "points 3"]) -> int | None:
     """Identify the cross to which a set of points belongs, from the distances between the points.
 
     Args:

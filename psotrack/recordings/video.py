@@ -11,8 +11,7 @@ import contextlib
 import math
 import os
 import threading
-from collections.abc import Iterator
-from collections.abc import Sequence as Ordered
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -177,7 +176,7 @@ class VideoWriter:
             _check_written(self._path, self._temporary, self._num_frames)
 
 
-def join_videos(path: Path | str, parts: Ordered[Path | str]) -> None:
+def join_videos(path: Path | str, parts: Sequence[Path | str]) -> None:
     """Join videos without encoding their frames again; the file appears at `path` when it is complete.
 
     Decoding the joined video gives the same frames as decoding the parts, and seeking works as in the parts.
@@ -209,7 +208,7 @@ def join_videos(path: Path | str, parts: Ordered[Path | str]) -> None:
 
 
 def _writer(
-    path: Path, temporary: Path, fps: float, image_size_wh: tuple[int, int], settings: Ordered[int] = ()
+    path: Path, temporary: Path, fps: float, image_size_wh: tuple[int, int], settings: Sequence[int] = ()
 ) -> cv2.VideoWriter:
     codec = cv2.VideoWriter.fourcc(*_CODEC)
     with silence_opencv():

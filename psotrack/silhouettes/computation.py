@@ -15,7 +15,7 @@ import zarr
 from jaxtyping import UInt8
 
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.recordings import Sequence
+from psotrack.recordings import Recording
 from psotrack.silhouettes.foreground import BackgroundModel, check_whole
 from psotrack.silhouettes.store import (
     SilhouetteSettings,
@@ -85,7 +85,7 @@ class Silhouettes:
 
 
 def compute(
-    sequence: Sequence,
+    recording: Recording,
     settings: SilhouetteSettings = SilhouetteSettings(),  # noqa: B008  frozen
     *,
     cache: Path | str,
@@ -99,7 +99,7 @@ def compute(
     frames and all settings. After an interruption, the next call computes only the missing cameras.
 
     Args:
-        sequence: a sequence with a video for each camera, all of the same length and size.
+        recording: a recording with a video for each camera, all of the same length and size.
         settings: settings of the silhouettes.
         cache: folder of the store; made if it does not exist.
         jobs: largest number of processes; None is one per processor.
@@ -114,9 +114,9 @@ def compute(
     cache = Path(cache)
     jobs = jobs if jobs is not None else os.cpu_count() or 1
     check_whole("jobs", jobs, lowest=1)
-    sequence = sequence.usable()
-    cameras = sequence.rig.names
-    videos = [sequence.videos[name] for name in cameras]
+    recording = recording.usable()
+    cameras = recording.rig.names
+    videos = [recording.videos[name] for name in cameras]
     shape = reduced_shape(videos[0], settings.reduction)
     with ThreadPoolExecutor(jobs) as threads:
         keys = list(threads.map(partial(key_of, settings=settings, background=background), videos))
@@ -126,7 +126,7 @@ def compute(
         cameras=cameras,
         keys=dict(zip(cameras, keys, strict=True)),
         reduction=settings.reduction,
-        num_frames=sequence.num_frames,
+        num_frames=recording.num_frames,
         shape=shape,
         seconds=seconds,
         arrays=tuple(_open(task, shape) for task in tasks),

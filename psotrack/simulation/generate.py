@@ -30,7 +30,7 @@ from psotrack.errors import InputError, SettingsError
 from psotrack.simulation import scenarios
 from psotrack.simulation.imaging.onboard import intrinsics, onboard_poses
 from psotrack.simulation.labels.mocap import mocap_markers_m
-from psotrack.simulation.scenarios import Mesh, Recording, Scenario
+from psotrack.simulation.scenarios import FlightFromFile, Mesh, Scenario
 from psotrack.simulation.scene import Scene, build
 from psotrack.simulation.segments import Stream, Work, draw, join, join_masks, segment_folder, segments
 from psotrack.simulation.unfinished import Unfinished, unfinished
@@ -122,7 +122,7 @@ def _record(scene: Scene, num_frames: int, masks: bool, onboard: bool) -> bytes:
 def _digests(recipe: Scenario) -> dict[str, str]:
     """SHA-256 of the files that a scenario names."""
     parts = itertools.chain.from_iterable((drone.model, drone.flight) for drone in recipe.drones)
-    files = sorted({part.file for part in parts if isinstance(part, Mesh | Recording)})
+    files = sorted({part.file for part in parts if isinstance(part, Mesh | FlightFromFile)})
     try:
         return {file: hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in files}
     except OSError as error:

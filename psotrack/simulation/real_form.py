@@ -31,7 +31,7 @@ from psotrack.datasets.dpjait import (
 )
 from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.geometry import Camera, Rig, to_pixels, undistort
-from psotrack.recordings import Markers, Sequence, VideoInfo, VideoWriter, read_frames, write_c3d
+from psotrack.recordings import Markers, Recording, VideoInfo, VideoWriter, read_frames, write_c3d
 from psotrack.support import Advance, Report, atomic_write, no_progress, refuse_to_overwrite
 
 #: The bodies of the dataset's cameras; the fifth was a spare.
@@ -174,7 +174,7 @@ def _through(
 # --- the C3D file
 
 
-def _simulated_markers(simulated: Sequence) -> Float[np.ndarray, "frames drones markers 3"]:
+def _simulated_markers(simulated: Recording) -> Float[np.ndarray, "frames drones markers 3"]:
     """(frames, drones, markers, 3), world, at the frames of the videos."""
     paths = (simulated.folder / mocap_markers_file(number, simulated.fps) for number in itertools.count(1))
     drones = [read_mocap_markers(path) for path in itertools.takewhile(Path.exists, paths)]

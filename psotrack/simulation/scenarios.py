@@ -132,7 +132,7 @@ class Waypoints(_Record, frozen=True, kw_only=True, tag_field="kind", tag="waypo
     hover_s: NotNegative = 1.0
 
 
-class Recording(_Record, frozen=True, kw_only=True, tag_field="kind", tag="recording"):
+class FlightFromFile(_Record, frozen=True, kw_only=True, tag_field="kind", tag="recording"):
     """What was recorded before: a CSV of positions and, where it has them, orientations, at any rate.
 
     Attributes:
@@ -146,7 +146,9 @@ class Recording(_Record, frozen=True, kw_only=True, tag_field="kind", tag="recor
     offset_m: Vector = (0.0, 0.0, 0.0)
 
 
-FlightRecord = Harmonics | Orbit | Crossing | Formation | FollowingFlight | NearPass | Waypoints | Recording
+FlightRecord = (
+    Harmonics | Orbit | Crossing | Formation | FollowingFlight | NearPass | Waypoints | FlightFromFile
+)
 
 
 # --- drones
@@ -431,7 +433,7 @@ def _located(drone: Drone, folder: Path) -> Drone:
     files = {
         field: msgspec.structs.replace(part, file=str(folder / part.file))
         for field, part in (("flight", drone.flight), ("model", drone.model))
-        if isinstance(part, Recording | Mesh)
+        if isinstance(part, FlightFromFile | Mesh)
     }
     return msgspec.structs.replace(drone, **files)
 

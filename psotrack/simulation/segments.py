@@ -7,7 +7,7 @@ what is joined of them in the end.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence as Ordered
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -91,7 +91,7 @@ def draw(work: Work, advance: Advance) -> None:
                 _draw_onboard(work, artist, temporary, frames, advance)
 
 
-def join(stream: Stream, parts: Ordered[Path], folder: Path) -> None:
+def join(stream: Stream, parts: Sequence[Path], folder: Path) -> None:
     """Write a stream's video and, if it is a static camera's, its detections into `folder`, and free the disk.
 
     Args:
@@ -112,7 +112,7 @@ def join(stream: Stream, parts: Ordered[Path], folder: Path) -> None:
         (part / _VIDEO).unlink(missing_ok=True)
 
 
-def join_masks(parts: Ordered[Path], folder: Path) -> None:
+def join_masks(parts: Sequence[Path], folder: Path) -> None:
     """Write the archive of all masks into `folder`.
 
     Args:
@@ -152,7 +152,7 @@ def _draw_onboard(
 
 
 def _write_masks(
-    writer: MaskWriter, camera: str, frame: int, drones: Ordered[Silhouette], scene: Scene, cam: Pinhole
+    writer: MaskWriter, camera: str, frame: int, drones: Sequence[Silhouette], scene: Scene, cam: Pinhole
 ) -> None:
     """One mask per drone of the scene, black where the camera has none of it."""
     in_view = {one.number: one.mask() for one in drones}
@@ -161,7 +161,7 @@ def _write_masks(
         writer.write(camera, number, frame, in_view.get(number, black))
 
 
-def _concatenated(found: Ordered[Detections]) -> Detections:
+def _concatenated(found: Sequence[Detections]) -> Detections:
     return Detections(
         np.concatenate([one.frame for one in found]),
         np.concatenate([one.xyxy for one in found]),

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
-from collections.abc import Sequence as Ordered
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -168,7 +167,7 @@ def read_table(path: Path | str, separator: str = ";") -> Table:
     return Table(path, columns, tuple(rows))
 
 
-def write_rows(path: Path | str, rows: Iterable[Ordered[object]], separator: str = ";") -> None:
+def write_rows(path: Path | str, rows: Iterable[Sequence[object]], separator: str = ";") -> None:
     """Write rows of cells as lines. Floats have all their digits, so that reading gives the same numbers.
 
     Raises:

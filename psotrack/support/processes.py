@@ -8,8 +8,7 @@ import signal
 import threading
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterator
-from collections.abc import Sequence as Ordered
+from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
@@ -26,7 +25,7 @@ GRACE_S = 5.0
 
 
 def map_in_processes(
-    function: Callable[[_Task, Advance], _Result], tasks: Ordered[_Task], *, jobs: int, advance: Advance
+    function: Callable[[_Task, Advance], _Result], tasks: Sequence[_Task], *, jobs: int, advance: Advance
 ) -> list[_Result]:
     """Compute `[function(task, advance) for task in tasks]` in up to `jobs` processes.
 

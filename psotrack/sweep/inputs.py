@@ -15,7 +15,7 @@ import numpy as np
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.errors import InputError, PsotrackError
 from psotrack.methods import detection_files_of
-from psotrack.recordings import Sequence
+from psotrack.recordings import Recording
 from psotrack.silhouettes import Silhouettes, SilhouetteSettings, compute
 from psotrack.silhouettes import key_of as silhouettes_key_of
 from psotrack.support import digest_file
@@ -34,7 +34,7 @@ Source = tuple[str, int | None, SilhouetteSettings | None]
 class Input:
     """A sequence after a cell's perturbation, and its silhouettes; None for a method that reads no silhouettes."""
 
-    sequence: Sequence
+    sequence: Recording
     silhouettes: Silhouettes | None
 
 
@@ -53,7 +53,7 @@ class Inputs:
     cache: Path
     jobs: int | None = None
     locks: Locks = field(default_factory=Locks)
-    _sources: dict[Source, tuple[Sequence, dict[str, str]]] = field(default_factory=dict)
+    _sources: dict[Source, tuple[Recording, dict[str, str]]] = field(default_factory=dict)
     _last: tuple[Any, Input | PsotrackError] | None = None
 
     def keys_of(self, cell: Cell) -> dict[str, str]:
@@ -72,7 +72,7 @@ class Inputs:
             keys |= {f"detections of {name}": digest_file(path) for name, path in files.items()}
         return keys
 
-    def sequence_of(self, cell: Cell) -> Sequence:
+    def sequence_of(self, cell: Cell) -> Recording:
         """Sequence of a cell, with all cameras.
 
         Raises:
@@ -115,7 +115,7 @@ class Inputs:
         """Path of the lock that one process holds while it makes a cell's silhouettes."""
         return self.cache / f".{input_digest(self._source(cell)[1])}.lock"
 
-    def _source(self, cell: Cell) -> tuple[Sequence, dict[str, str]]:
+    def _source(self, cell: Cell) -> tuple[Recording, dict[str, str]]:
         """Sequence of a cell, with all cameras, and digests of its content."""
         source = source_of(cell)
         if source not in self._sources:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.errors import SettingsError
 from psotrack.geometry import Rig
-from psotrack.recordings import Sequence
+from psotrack.recordings import Recording
 from psotrack.silhouettes import Silhouettes
 from psotrack.sweep.cells import Perturbation
 
@@ -31,15 +31,15 @@ _Frames = UInt8[np.ndarray, "frames height width"]
 
 
 def perturb(
-    sequence: Sequence,
+    recording: Recording,
     silhouettes: Silhouettes | None,
     perturbation: Perturbation,
     cameras: tuple[str, ...] | int | None,
-) -> tuple[Sequence, Silhouettes | None]:
+) -> tuple[Recording, Silhouettes | None]:
     """Apply a perturbation to a sequence and its silhouettes, and select cameras.
 
     Args:
-        sequence: a usable sequence with all its cameras.
+        recording: a usable recording with all its cameras.
         silhouettes: silhouettes of all cameras; None for a method that reads none. Changed silhouettes are in memory,
             under the same keys.
         perturbation: the perturbation.
@@ -48,19 +48,19 @@ def perturb(
     Raises:
         SettingsError: a camera does not exist, or there are fewer cameras than asked for.
     """
-    every = sequence.rig.names
+    every = recording.rig.names
     if isinstance(cameras, int):
         kept = choose_cameras(every, cameras, perturbation.draw)
     else:
-        kept = sequence.rig.select(cameras).names if cameras else every
+        kept = recording.rig.select(cameras).names if cameras else every
     if kept != every:
-        sequence = sequence.usable(list(kept))
+        recording = recording.usable(list(kept))
         silhouettes = None if silhouettes is None else _of_cameras(silhouettes, kept)
     # Random streams depend on the camera's index in the whole rig.
     index = [every.index(name) for name in kept]
     if perturbation.extrinsics_deg:
         rngs = [_rng(_EXTRINSICS, perturbation.draw, camera) for camera in index]
-        sequence = replace(sequence, rig=_turn_cameras(sequence.rig, perturbation.extrinsics_deg, rngs))
+        recording = replace(recording, rig=_turn_cameras(recording.rig, perturbation.extrinsics_deg, rngs))
     if silhouettes is not None and perturbation.clock_frames:
         rngs = [_rng(_CLOCKS, perturbation.draw, camera) for camera in index]
         late_frames = [rng.uniform(0, perturbation.clock_frames) for rng in rngs]
@@ -76,7 +76,7 @@ def perturb(
             for stored, rng in zip(_frames_by_camera(silhouettes), rngs, strict=True)
         ]
         silhouettes = replace(silhouettes, arrays=tuple(arrays))
-    return sequence, silhouettes
+    return recording, silhouettes
 
 
 def choose_cameras(names: tuple[str, ...], count: int, draw: int) -> tuple[str, ...]:

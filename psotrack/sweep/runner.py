@@ -16,7 +16,7 @@ import pandas as pd
 
 from psotrack.errors import InputError, OutputError, PsotrackError
 from psotrack.evaluation import Evaluation, errors_over_time, evaluate
-from psotrack.pipeline import TrackedSequence, track_runs
+from psotrack.pipeline import TrackedRecording, track_runs
 from psotrack.support import Report, no_progress
 from psotrack.sweep.cells import Cell, key_of, name_of, title
 from psotrack.sweep.grid_files import Grid, cameras_label
@@ -233,7 +233,7 @@ def _run_seeds(
     return pd.DataFrame(rows), pd.concat([_errors(seed, result, given) for seed, result in runs])
 
 
-def _figures(result: TrackedSequence | InputError, given: Input) -> dict[str, Any]:
+def _figures(result: TrackedRecording | InputError, given: Input) -> dict[str, Any]:
     """Evaluation and duration of a run. A run that finds no drones has missed all drones."""
     # All runs have the same columns, so that programs can read all cells as one data set.
     if isinstance(result, InputError):
@@ -248,7 +248,7 @@ def _figures(result: TrackedSequence | InputError, given: Input) -> dict[str, An
     return figures | {"track_ms_per_frame": 1e3 * seconds["track"] / given.sequence.num_frames}
 
 
-def _errors(seed: int, result: TrackedSequence | InputError, given: Input) -> pd.DataFrame:
+def _errors(seed: int, result: TrackedRecording | InputError, given: Input) -> pd.DataFrame:
     """Errors of a run's frames; no rows for a run that finds no drones."""
     if isinstance(result, InputError):
         return pd.DataFrame({"seed": pd.Series(dtype=int)})

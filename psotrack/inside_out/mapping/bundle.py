@@ -14,7 +14,7 @@ prior is proportional to the number of views.
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Ordered
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -191,7 +191,7 @@ class _Bundle:
 def adjust(
     sightings: MarkerSightings,
     start: MappedScene,
-    fixed: Ordered[int],
+    fixed: Sequence[int],
     *,
     noise_px: float = 0.3,
     estimate_sides: bool = False,
@@ -226,7 +226,7 @@ def adjust(
 def improved(
     sightings: MarkerSightings,
     start: MappedScene,
-    fixed: Ordered[int],
+    fixed: Sequence[int],
     *,
     noise_px: float,
     estimate_sides: bool = False,
@@ -238,7 +238,7 @@ def improved(
 def _robust_fit(
     sightings: MarkerSightings,
     start: MappedScene,
-    fixed: Ordered[int],
+    fixed: Sequence[int],
     noise_px: float,
     estimate_sides: bool,
 ) -> _Bundle:
@@ -247,7 +247,11 @@ def _robust_fit(
 
 
 def _problem(
-    sightings: MarkerSightings, start: MappedScene, fixed: Ordered[int], noise_px: float, estimate_sides: bool
+    sightings: MarkerSightings,
+    start: MappedScene,
+    fixed: Sequence[int],
+    noise_px: float,
+    estimate_sides: bool,
 ) -> _Problem:
     is_free = np.tile(np.array([True] * 6 + [estimate_sides]), (len(start.ids), 1))
     is_free[np.isin(start.ids, fixed)] = False

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from collections.abc import Sequence as Ordered
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -84,7 +83,7 @@ class MarkerSightings:
 
 
 def find_sightings(
-    videos: Ordered[tuple[VideoInfo, Camera]],
+    videos: Sequence[tuple[VideoInfo, Camera]],
     dictionary: str = "4x4_1000",
     *,
     most_frames: int = 300,
@@ -127,7 +126,7 @@ def find_sightings(
 
 
 def collect_sightings(
-    seen: Iterable[FrameMarkers], lenses: Ordered[Camera], name: str = "video"
+    seen: Iterable[FrameMarkers], lenses: Sequence[Camera], name: str = "video"
 ) -> MarkerSightings:
     """The sightings of frames. Two markers with one id in a frame are left out: at least one is misread.
 

@@ -13,7 +13,7 @@ from psotrack.simulation.flights.limits import Excess, excess
 from psotrack.simulation.flights.motion import Flight
 from psotrack.simulation.flights.recordings import recorded_flight
 from psotrack.simulation.flights.varying import Turn, draws, heading_of, make, no_draws
-from psotrack.simulation.scenarios import Recording, Scenario, wrong
+from psotrack.simulation.scenarios import FlightFromFile, Scenario, wrong
 
 #: Variations are tried in turn until limits hold; a scenario that fails this often cannot keep them.
 NUM_ATTEMPTS = 400
@@ -73,7 +73,7 @@ def _recorded(scenario: Scenario, time_s: Float[np.ndarray, "frames"]) -> dict[i
     """The flights that replay a recording, by the index of their drone; each is read once, and has all frames."""
     recorded: dict[int, Flight] = {}
     for index, drone in enumerate(scenario.drones):
-        if isinstance(drone.flight, Recording):
+        if isinstance(drone.flight, FlightFromFile):
             flight = recorded_flight(drone.flight, heading_of(drone, Turn(), scenario.variation))
             flight.check(time_s)
             recorded[index] = flight

@@ -16,7 +16,7 @@ from psotrack.datasets.dpjait import read_poses
 from psotrack.errors import InputError, SettingsError
 from psotrack.simulation.flights.motion import Flight, Heading
 from psotrack.simulation.flights.resampling import MIN_SAMPLES, spline
-from psotrack.simulation.scenarios import Recording
+from psotrack.simulation.scenarios import FlightFromFile
 from psotrack.support import Column, Table, TextRow, read_rows, read_table, write_rows
 
 #: More than half an exposure, which reaches beyond the first and the last frame.
@@ -172,7 +172,7 @@ def _unit(row: TextRow, columns: list[Column]) -> Float[np.ndarray, "4"]:
 # --- flights
 
 
-def recorded_flight(record: Recording, heading: Heading) -> RecordedFlight:
+def recorded_flight(record: FlightFromFile, heading: Heading) -> RecordedFlight:
     """The flight of a scenario's record; the heading is for recordings without orientations.
 
     Raises:

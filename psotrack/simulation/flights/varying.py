@@ -6,8 +6,7 @@ harmonic, and a shift of the centre. Drones of one group share their draw, headi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from collections.abc import Sequence as Ordered
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,6 +23,7 @@ from psotrack.simulation.flights.motion import Flight, Heading
 from psotrack.simulation.scenarios import (
     Crossing,
     Drone,
+    FlightFromFile,
     FlightRecord,
     FollowingFlight,
     Formation,
@@ -31,7 +31,6 @@ from psotrack.simulation.scenarios import (
     Harmonics,
     NearPass,
     Orbit,
-    Recording,
     Scenario,
     Variation,
     Vector,
@@ -86,7 +85,7 @@ def draws(scenario: Scenario, rng: np.random.Generator) -> Draws:
     return tuple(result)
 
 
-def _draw(drones: Ordered[Drone], uniform: Callable[..., Float[np.ndarray, "*shape"]]) -> Draw:
+def _draw(drones: Sequence[Drone], uniform: Callable[..., Float[np.ndarray, "*shape"]]) -> Draw:
     """Enough for the longest of their flights."""
     harmonics = max(_num_harmonics(drone.flight) for drone in drones)
     points = max(len(drone.flight.points_m) if isinstance(drone.flight, Waypoints) else 0 for drone in drones)
@@ -94,7 +93,7 @@ def _draw(drones: Ordered[Drone], uniform: Callable[..., Float[np.ndarray, "*sha
 
 
 def _num_harmonics(record: FlightRecord) -> int:
-    if isinstance(record, Recording | FollowingFlight):
+    if isinstance(record, FlightFromFile | FollowingFlight):
         return 0
     # The period of waypoints is varied like that of a harmonic.
     return 1 if isinstance(record, Waypoints) else len(_as_harmonics(record).terms)
@@ -115,7 +114,7 @@ def make(scenario: Scenario, drawn: Draws, recorded: Mapping[int, Flight]) -> tu
         drone, (draw, turn) = scenario.drones[index], drawn[index]
         heading = heading_of(drone, turn, scenario.variation)
         match drone.flight:
-            case Recording():
+            case FlightFromFile():
                 made[index] = recorded[index]
             case FollowingFlight(leader=leader, delay_s=delay_s):
                 made[index] = DelayedFlight(made[leader - 1], delay_s, heading)

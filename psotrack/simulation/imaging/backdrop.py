@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Ordered
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -40,7 +40,7 @@ def render(room: Room, cam: Pinhole, imaging: Imaging) -> Backdrop:
 
 
 def light_of(
-    surfaces: Ordered[Surface], cam: Pinhole, antialiasing: bool
+    surfaces: Sequence[Surface], cam: Pinhole, antialiasing: bool
 ) -> Float[np.ndarray, "height width 3"]:
     """(height, width, 3), linear BGR: light of textured surfaces, before the lens blurs it."""
     view = full_view(cam, _MAGNIFICATION if antialiasing else 1)
@@ -60,7 +60,7 @@ def light_of(
 
 
 def numbers_and_depth(
-    surfaces: Ordered[Surface], view: RasterView
+    surfaces: Sequence[Surface], view: RasterView
 ) -> tuple[Int[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"]]:
     """Which surface is seen, -1 where none is, and its depth in metres along the optical axis."""
     corners = np.stack([surface.corners_m for surface in surfaces])

@@ -7,7 +7,7 @@ any point, what lies beyond a plane can be drawn first, whatever else there is.
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Ordered
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,7 +54,7 @@ class Order:
         pieces: of all surfaces.
     """
 
-    def __init__(self, surfaces: Ordered[Surface]) -> None:
+    def __init__(self, surfaces: Sequence[Surface]) -> None:
         self._normals = np.array([surface.normal for surface in surfaces]).reshape(-1, 3)
         self.pieces: list[Piece] = []
         self._root = self._node([Piece(index, surface.corners_m) for index, surface in enumerate(surfaces)])

@@ -6,7 +6,7 @@ A drone's quality is how well it can be detected: 1 - (1 - v)^2 of the share v o
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Ordered
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,7 +40,7 @@ class _Target:
     quality: float
 
 
-def detect(scene: Scene, camera_index: int, frame: int, seen: Ordered[Silhouette]) -> Detections:
+def detect(scene: Scene, camera_index: int, frame: int, seen: Sequence[Silhouette]) -> Detections:
     """The boxes that a detector finds in one frame of a camera, the surest first, with edges to 0.01 px.
 
     They depend on what is seen, the scenario's `detector`, and (seed, camera, frame) alone.
@@ -79,7 +79,7 @@ def iou(a: Box, b: Box) -> float:
     return shared / float(union) if union > 0 else 0.0
 
 
-def _targets(seen: Ordered[Silhouette]) -> list[_Target]:
+def _targets(seen: Sequence[Silhouette]) -> list[_Target]:
     targets = []
     for one in seen:
         box = one.xyxy

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
-from collections.abc import Sequence as Ordered
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -148,7 +147,7 @@ def _lamp(centre: Float[np.ndarray, "3"], size_m: tuple[float, float]) -> Surfac
 
 
 def _marker_places(
-    walls: Ordered[Surface], hall: Hall
+    walls: Sequence[Surface], hall: Hall
 ) -> list[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]]:
     """Top left corner of each sheet, and the direction along it: spread over the walls, at changing heights."""
     sheet_m = hall.marker_size_m * (1 + 2 * _MARKER_MARGIN)

@@ -1,10 +1,9 @@
-"""`Sequence`: one recording with its videos, calibrated cameras and, if known, its reference."""
+"""`Recording`: one recording with its videos, calibrated cameras and, if known, its reference."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
-from collections.abc import Sequence as Ordered
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -37,10 +36,10 @@ class OnboardVideo:
 
 
 @dataclass(frozen=True, repr=False)
-class Sequence:
+class Recording:
     """Synchronised videos of calibrated cameras that stand still.
 
-    A sequence that was just read may be inconsistent: a camera may have no video, and videos may differ in length.
+    A recording that was just read may be inconsistent: a camera may have no video, and videos may differ in length.
     `usable` checks the consistency; its messages say how to leave a camera or frames out.
 
     Attributes:
@@ -79,8 +78,8 @@ class Sequence:
             raise InputError(self.folder, expected="at least one video", found="none")
         return next(iter(self.videos.values()))
 
-    def usable(self, cameras: Ordered[str] | None = None, num_frames: int | None = None) -> Sequence:
-        """This sequence with the chosen cameras and frames only, checked to be consistent.
+    def usable(self, cameras: Sequence[str] | None = None, num_frames: int | None = None) -> Recording:
+        """This recording with the chosen cameras and frames only, checked to be consistent.
 
         Args:
             cameras: names of the cameras to keep; None: all.
@@ -154,7 +153,3 @@ def _video_rate(video: VideoInfo) -> str:
 
 def _video_length(video: VideoInfo) -> str:
     return f"{video.num_frames} frames"
-
-
-#: The name of a `Sequence` in the public face.
-Recording = Sequence
