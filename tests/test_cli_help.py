@@ -77,6 +77,14 @@ def test_help_and_names_of_commands_import_no_heavy_package() -> None:
         assert answer.stdout.splitlines()[-1] == "imported:", arguments
 
 
+@pytest.mark.parametrize("command", ["localise", "silhouettes", "simulate", "sweep", "track"])
+def test_help_of_a_command_imports_the_defaults_of_settings_alone(command: str) -> None:
+    answer = subprocess.run(
+        [sys.executable, "-c", REPORT_IMPORTS, command, "--help"], capture_output=True, text=True, check=True
+    )
+    assert answer.stdout.splitlines()[-1] == "imported: msgspec"
+
+
 def test_help_is_quick() -> None:
     seconds = []
     for _ in range(3):

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from psotrack.errors import SettingsError
+from psotrack.silhouettes import ForegroundSettings
 from psotrack.silhouettes.foreground import (
-    ForegroundSettings,
     classify,
     coverage,
     foreground,

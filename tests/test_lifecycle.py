@@ -23,7 +23,8 @@ from psotrack.initiation import (
 )
 from psotrack.initiation.reidentification import NO_DRONE
 from psotrack.initiation.residual_foreground import SearchVolume, project_drones, subtract_drones
-from psotrack.silhouettes.foreground import ForegroundSettings, foreground, learning_step
+from psotrack.silhouettes import ForegroundSettings
+from psotrack.silhouettes.foreground import foreground, learning_step
 
 FPS = 25.0
 REDUCTION = 2

@@ -1,7 +1,8 @@
 from .blobs import LEAST_RADIUS_CELLS, ViewBlobs, find_blobs, stack_blobs
 from .computation import Silhouettes, compute
-from .foreground import BackgroundModel, ForegroundSettings, Mog2, Shadows, check_whole
-from .store import SilhouetteSettings, key_of, open_stored, reduced_shape
+from .foreground import BackgroundModel, Mog2
+from .settings import ForegroundSettings, Shadows, SilhouetteSettings, check_whole
+from .store import key_of, open_stored, reduced_shape
 from .summed_area import box_sum, of_packed_box_sums, pack, summed_area_table
 
 __all__ = [

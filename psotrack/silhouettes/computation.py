@@ -16,9 +16,9 @@ from jaxtyping import UInt8
 
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.recordings import Recording
-from psotrack.silhouettes.foreground import BackgroundModel, check_whole
+from psotrack.silhouettes.foreground import BackgroundModel
+from psotrack.silhouettes.settings import SilhouetteSettings, check_whole
 from psotrack.silhouettes.store import (
-    SilhouetteSettings,
     Task,
     frames_to_decode,
     key_of,

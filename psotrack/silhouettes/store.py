@@ -21,16 +21,10 @@ import zarr
 from jaxtyping import UInt8
 from zarr.codecs import ZstdCodec
 
-from psotrack.errors import OutputError, SettingsError
+from psotrack.errors import OutputError
 from psotrack.recordings import VideoInfo, read_frames
-from psotrack.silhouettes.foreground import (
-    BackgroundModel,
-    ForegroundSettings,
-    Mog2,
-    check_whole,
-    coverage,
-    learning_step,
-)
+from psotrack.silhouettes.foreground import BackgroundModel, Mog2, coverage, learning_step
+from psotrack.silhouettes.settings import SilhouetteSettings
 from psotrack.support import Advance, digest_file, digest_record
 
 logger = logging.getLogger(__name__)
@@ -43,29 +37,6 @@ CHUNK_FRAMES = 25
 
 #: An unfinished folder that was not changed for this long was left by a process that was killed, seconds.
 _STALE_S = 24 * 3600
-
-
-class SilhouetteSettings(ForegroundSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of silhouettes: `ForegroundSettings` and the reduction.
-
-    Attributes:
-        reduction: each stored value covers `reduction` x `reduction` pixels; a multiple of `working_reduction`.
-
-    Raises:
-        SettingsError: a value is out of range.
-    """
-
-    reduction: int = 4
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_whole("reduction", self.reduction, lowest=1)
-        if self.reduction % self.working_reduction:
-            raise SettingsError(
-                "reduction",
-                expected=f"a multiple of working_reduction, {self.working_reduction}",
-                found=f"{self.reduction}",
-            )
 
 
 @dataclass(frozen=True)
