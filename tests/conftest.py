@@ -1,4 +1,4 @@
-"""Settings of the whole test session: checked shapes, strict JAX, one folder of compiled programs, same examples."""
+"""Settings of the test session: types and shapes are checked, JAX is strict, compiled programs are shared."""
 
 import importlib
 import os
@@ -17,10 +17,11 @@ import pytest
 from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
 
-# jaxtyping and beartype check the types and shapes of every annotated call of the package. Before it is imported.
+# jaxtyping and beartype check the types and shapes of every annotated call of the package. The hook must be installed
+# before the package is imported.
 install_import_hook("psotrack", "beartype.beartype")
 
-# int32 + float32 and the like must be written out: an implicit promotion loses bits of exact sums.
+# Conversions such as int32 to float32 must be explicit: an implicit promotion loses bits of exact sums.
 # Rank promotion stays allowed: the package broadcasts particles x drones x cameras against cameras on purpose.
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
@@ -40,10 +41,10 @@ settings.load_profile("psotrack")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Import the whole package.
+    """Import the whole package, so that a failure can be repeated.
 
-    Hypothesis also draws the constants that it finds in imported modules. If the tests that ran before decided which
-    modules are imported, a failure could not be repeated.
+    Hypothesis also draws the constants that it finds in imported modules. Without this import, the examples of a test
+    would depend on the modules that earlier tests imported.
     """
     import psotrack
 

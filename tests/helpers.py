@@ -1,4 +1,4 @@
-"""Rigs and silhouettes for tests, made without the code that they test (`boxes`, `fitness`)."""
+"""Rigs and silhouettes for tests, made without the code under test (`boxes`, `fitness`)."""
 
 import os
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from filelock import FileLock
 from psotrack.geometry import Camera, Rig, look_at, make_camera, make_rig, project, undistort
 from psotrack.settings import RENAMED, TrackSettings
 
-#: Lenses as strong as those of action cameras, in OpenCV's order.
+#: Number of distortion coefficients -> coefficients in OpenCV's order, as strong as the distortion of action cameras.
 LENSES = {
     0: (),
     4: (-0.12, 0.03, 0.0008, -0.0005),
@@ -25,7 +25,7 @@ ROOM_M = np.array([[-3.0, -3.0, 0.0], [3.0, 3.0, 3.0]])
 
 
 def ring_rig(num_cameras, *, coefficients=0, image_size_wh=(320, 240), radius_m=4.0, height_m=2.4):
-    """Cameras on a circle that look at the middle of the room, no two alike (each has its own focal length)."""
+    """Rig of cameras on a circle that look at the middle of the room; each camera has its own focal length."""
     cameras = {}
     for i in range(num_cameras):
         angle = 2 * np.pi * i / num_cameras + 0.2
@@ -42,9 +42,10 @@ def ring_rig(num_cameras, *, coefficients=0, image_size_wh=(320, 240), radius_m=
 
 
 def far_camera(*, image_size_wh, pixels_per_m, distance_m=1000.0):
-    """A camera so far away on the y axis that metres are pixels: x is to the right, z is up.
+    """Camera so far away on the y axis that its image is a parallel projection: x is to the right, z is up.
 
-    The origin projects to the middle of the image, which is between pixels where the sides are even.
+    A metre has `pixels_per_m` pixels. The origin projects to the middle of the image, which lies between two pixels if
+    the side is even.
     """
     R, t_m = look_at((0.0, -distance_m, 0.0), (0.0, 0.0, 0.0))
     width, height = image_size_wh
@@ -53,9 +54,9 @@ def far_camera(*, image_size_wh, pixels_per_m, distance_m=1000.0):
     return make_camera(R=R, t_m=t_m, K=K, image_size_wh=image_size_wh)
 
 
-def rig_of(*cameras):
-    """A rig of unnamed cameras."""
-    return make_rig({str(i): one for i, one in enumerate(cameras)})
+def make_unnamed_rig(*cameras):
+    """Rig of the given cameras, which are named "0", "1" and so on."""
+    return make_rig({str(i): camera for i, camera in enumerate(cameras)})
 
 
 def environment_without_jax_settings() -> dict[str, str]:
@@ -64,9 +65,9 @@ def environment_without_jax_settings() -> dict[str, str]:
 
 
 def make_once(tmp_path_factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
-    """The folder `name` with what `make` writes into it; made by the first worker of a run that asks for it.
+    """The folder `name`, which `make` fills once per test run: the first worker that needs the folder calls `make`.
 
-    Tests must not change the folder: the tests of all workers read it.
+    Tests must not change the folder, because the tests of all workers read it.
     """
     base = tmp_path_factory.getbasetemp()
     # Each worker has a folder of its own within the folder of the run.
@@ -81,12 +82,12 @@ def make_once(tmp_path_factory: pytest.TempPathFactory, name: str, make: Callabl
 
 
 def float32(tree):
-    """A pytree of JAX float32 arrays: what the tracker computes in."""
+    """Convert a pytree to JAX float32 arrays, the type in which the tracker computes."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), tree)
 
 
-def moved(rig: Rig, R, shift_m) -> Rig:
-    """The rig after the whole world was turned by R and then shifted."""
+def move_world(rig: Rig, R, shift_m) -> Rig:
+    """Rig after the whole world was turned by R, (3, 3), and then shifted by `shift_m`, (3,)."""
     T_old_new = np.eye(4)
     T_old_new[:3, :3], T_old_new[:3, 3] = R.T, -R.T @ np.asarray(shift_m)
     cams = rig.cameras
@@ -94,42 +95,42 @@ def moved(rig: Rig, R, shift_m) -> Rig:
 
 
 def assert_same(actual, desired, atol=0.0):
-    """Every array of one pytree equals that of the other; exactly, where no tolerance is given."""
+    """Assert that two pytrees have the same structure and equal arrays; exactly equal, unless `atol` is given."""
     assert jax.tree.structure(actual) == jax.tree.structure(desired)
-    for one, other in zip(jax.tree.leaves(actual), jax.tree.leaves(desired), strict=True):
-        np.testing.assert_allclose(one, other, rtol=0, atol=atol)
+    for actual_leaf, desired_leaf in zip(jax.tree.leaves(actual), jax.tree.leaves(desired), strict=True):
+        np.testing.assert_allclose(actual_leaf, desired_leaf, rtol=0, atol=atol)
 
 
 def sphere_points(count):
-    """Points spread evenly over the unit sphere (Fibonacci lattice)."""
+    """(count, 3), points spread evenly over the unit sphere (Fibonacci lattice)."""
     i = np.arange(count) + 0.5
     z, angle = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
     return np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=-1)
 
 
 def draw_coverage(rig: Rig, position_m, size_m, reduction):
-    """(cameras, height, width) uint8 coverage of ellipsoids, by casting a ray through the centre of every pixel.
+    """(cameras, height, width) uint8, coverage by ellipsoids, from a ray through the centre of every pixel.
 
-    Independent of `boxes`: a pixel is foreground where its ray meets an ellipsoid.
+    A pixel is foreground if its ray meets an ellipsoid. The function does not use `boxes`, so it can test that module.
     """
     position_m, size_m = np.atleast_2d(position_m), np.atleast_2d(size_m)
     width, height = rig.cameras.image_size_wh[0].astype(int)
     foreground = np.zeros((len(rig), height, width))
     for index in range(len(rig)):
-        one = rig.cameras[index]
-        R = one.T_cam_world[:3, :3]
+        camera = rig.cameras[index]
+        R = camera.T_cam_world[:3, :3]
         for centre, size in zip(position_m, np.broadcast_to(size_m, position_m.shape), strict=True):
-            pixel, depth = project(one, centre)
-            reach = 2.0 * one.K[1, 1] * size.max() / max(depth, 0.1)
+            pixel, depth = project(camera, centre)
+            reach = 2.0 * camera.K[1, 1] * size.max() / max(depth, 0.1)
             (x0, y0), (x1, y1) = (
                 np.clip(np.floor(pixel + sign * reach), 0, (width, height)).astype(int) for sign in (-1, 1)
             )
             if depth < size.max() or x0 >= x1 or y0 >= y1:
                 continue
             grid = np.stack(np.meshgrid(np.arange(x0, x1), np.arange(y0, y1)), axis=-1).astype(float)
-            ray = np.concatenate([undistort(one, grid), np.ones((*grid.shape[:2], 1))], axis=-1) @ R
+            ray = np.concatenate([undistort(camera, grid), np.ones((*grid.shape[:2], 1))], axis=-1) @ R
             # In units of the semi-axes the ellipsoid is the unit sphere.
-            ray, start = ray / (size / 2), (one.centre_world - centre) / (size / 2)
+            ray, start = ray / (size / 2), (camera.centre_world - centre) / (size / 2)
             hit = (ray @ start) ** 2 >= (ray * ray).sum(axis=-1) * (start @ start - 1)
             foreground[index, y0:y1, x0:x1] = np.maximum(foreground[index, y0:y1, x0:x1], hit)
     cells = foreground.reshape(len(rig), height // reduction, reduction, width // reduction, reduction)
@@ -137,5 +138,5 @@ def draw_coverage(rig: Rig, position_m, size_m, reduction):
 
 
 def track_settings(**options):
-    """Settings by the names of the command line's options, such as `particles`; dotted names are not needed."""
+    """Tracking settings; options have the names of the command line, such as `particles`, or dotted names."""
     return TrackSettings().changed({RENAMED.get(name, name): value for name, value in options.items()})

@@ -1,7 +1,7 @@
-"""Flights with white jerk, and a textbook filter and smoother, written without `psotrack.motion` in float64 NumPy.
+"""Simulated flights with white jerk, and a textbook filter and smoother in float64 NumPy, as oracles for `motion`.
 
-The textbook's state is position, velocity and acceleration, (9,), and the lasting error if there is one, (12,). A
-measurement observes position plus lasting error. `psotrack.motion` has this sum in its state instead.
+The textbook's state is position, velocity and acceleration, (9,), or with a lasting error of the measurements, (12,).
+A measurement observes position plus lasting error. The state of `psotrack.motion` contains this sum instead.
 """
 
 from dataclasses import dataclass, replace
@@ -14,13 +14,13 @@ from psotrack.motion import MotionParams
 
 DT_S = 1 / 25
 
-#: Maps the state of `psotrack.motion` to the textbook's.
+#: (12, 12), maps the state of `psotrack.motion` to the textbook's state.
 TO_TEXTBOOK = np.eye(12) - np.eye(12, k=9)
 
 
 @dataclass(frozen=True)
 class Model:
-    """Values of `MotionParams` for one drone."""
+    """Motion model of one drone, with the values of `MotionParams`."""
 
     density: float = 30.0
     velocity_std: float = 1.0
@@ -30,10 +30,14 @@ class Model:
 
     @property
     def H(self):
+        """(3, 9) or (3, 12), the measurement matrix."""
         return np.eye(3, 12) + np.eye(3, 12, k=9) if self.error_share else np.eye(3, 9)
 
     def start(self, measured_m, covariance_m2):
-        """Initial mean and covariance from the first measurement z = p + b + w, with no prior of p and that of b."""
+        """Initial mean and covariance from the first measurement z = p + b + w.
+
+        The position p has no prior; the lasting error b has its stationary prior; w is white noise.
+        """
         rest = np.diag(np.repeat([self.velocity_std**2, self.acceleration_std**2], 3))
         spread = block_diag(covariance_m2, rest)
         mean = np.concatenate([measured_m, np.zeros(len(self.H.T) - 3)])
@@ -45,7 +49,7 @@ class Model:
         return mean, spread
 
     def transition(self, dt_s, covariance_m2):
-        """F and Q after a last measurement of this covariance."""
+        """F and Q of a time step; `covariance_m2` is the covariance of the previous measurement."""
         F, Q = transition(dt_s, self.density)
         if self.error_share:
             left, begun = decay(dt_s, self.error_time_s)
@@ -54,16 +58,17 @@ class Model:
         return F, Q
 
     def white(self, covariance_m2):
+        """(..., 3, 3), the part of a measurement's covariance that is independent from frame to frame."""
         return (1 - self.error_share) * covariance_m2
 
     def params(self, drones):
-        """Equal params for all drones, float64."""
+        """`MotionParams` in float64 with the same values for all drones."""
         rest = (self.velocity_std, self.acceleration_std, self.error_share, self.error_time_s)
         return MotionParams(np.full(drones, self.density), *map(np.float64, rest))
 
 
 def van_loan(rate, noise, dt_s):
-    """F and Q of dx = rate x dt + white noise, by the matrix exponential (C. F. Van Loan, 1978)."""
+    """F and Q of dx = rate · x dt + white noise, by the matrix exponential (C. F. Van Loan, 1978)."""
     size = len(rate)
     both = expm(np.block([[-rate, noise], [np.zeros((size, size)), rate.T]]) * dt_s)
     F = both[size:, size:].T
@@ -80,13 +85,16 @@ def transition(dt_s, density):
 
 @cache
 def decay(dt_s, time_s):
-    """Decay factor of an error of variance 1, and the variance of its new part, so that the variance stays 1."""
+    """Decay factor of an error of variance 1, and the variance of the noise that keeps the variance at 1."""
     left, begun = van_loan(np.array([[-1 / time_s]]), np.array([[2 / time_s]]), dt_s)
     return left.item(), begun.item()
 
 
 def textbook_filter(model, time_s, measured_m, covariance_m2, was_measured):
-    """Filter one drone from frame 0: means, covariances and NIS of every frame, by inverses and P - K S Kᵀ."""
+    """Filter one drone from frame 0; return the means, covariances and NIS of all frames.
+
+    The update uses explicit inverses and P - K H P.
+    """
     H = model.H
     x, P = model.start(measured_m[0], covariance_m2[0])
     means, covariances, nis, last = [x], [P], [np.nan], covariance_m2[0]
@@ -136,8 +144,17 @@ def textbook_smoother(model, time_s, measured_m, covariance_m2, was_measured):
 
 
 @dataclass(frozen=True)
-class Flown:
-    """A flight: true states, (frames, drones, 9), and measurements."""
+class SimulatedFlight:
+    """Simulated drones and their measurements.
+
+    Attributes:
+        time_s: (frames,), times of the frames, seconds.
+        state: (frames, drones, 9), true positions, velocities and accelerations.
+        measured_m: (frames, drones, 3), measured positions, metres.
+        covariance_m2: (frames, drones, 3, 3), covariances of the measurements.
+        was_measured: (frames, drones), False where a measurement is missing.
+        model: motion model that the drones obey.
+    """
 
     time_s: np.ndarray
     state: np.ndarray
@@ -148,23 +165,23 @@ class Flown:
 
     @property
     def measurements(self):
-        """Arguments of `smooth` and `estimate_jerk_density` without the params."""
+        """Arguments of `smooth` and `estimate_jerk_density`, except the params."""
         return self.time_s, self.measured_m, self.covariance_m2, self.was_measured
 
     @property
     def params(self):
         return self.model.params(self.was_measured.shape[1])
 
-    def of(self, drone, born=0):
-        """Arguments of the textbook functions for one drone, from its first frame."""
-        return self.model, self.time_s[born:], *(part[born:, drone] for part in self.measurements[1:])
+    def textbook_arguments(self, drone, first=0):
+        """Arguments of the textbook functions for one drone, from frame `first` on."""
+        return self.model, self.time_s[first:], *(part[first:, drone] for part in self.measurements[1:])
 
 
-def fly(seed, *, frames, drones, std_m=0.01, dt_s=DT_S, steady=False, **numbers):
-    """Simulate flights that obey the model, measured in every frame with errors that obey their covariances.
+def simulate_flight(seed, *, frames, drones, std_m=0.01, dt_s=DT_S, steady=False, **numbers):
+    """Simulate drones that obey the model, measured in every frame with errors that obey their covariances.
 
-    Each measurement has its own covariance, or each drone if `steady`: ellipsoids of random directions, with axes in a
-    ratio of about ten. `numbers` are attributes of `Model`.
+    Covariances are ellipsoids of random directions, whose axes differ by a factor of about ten. Each measurement has
+    its own covariance; if `steady`, all measurements of a drone have the same. `numbers` are attributes of `Model`.
     """
     rng = np.random.default_rng(seed)
     model = Model(**numbers)
@@ -196,7 +213,7 @@ def fly(seed, *, frames, drones, std_m=0.01, dt_s=DT_S, steady=False, **numbers)
     )
     for k in range(1, frames):
         lasting[k] += left * lasting[k - 1]
-    return Flown(
+    return SimulatedFlight(
         time_s=time_s,
         state=states,
         measured_m=states[..., :3] + lasting + np.sqrt(1 - model.error_share) * white,
@@ -207,14 +224,14 @@ def fly(seed, *, frames, drones, std_m=0.01, dt_s=DT_S, steady=False, **numbers)
     )
 
 
-def calm(flown):
-    """Halve the errors of a flight but not their covariances, so that no measurement is beyond the gate."""
+def halve_errors(flown):
+    """Flight with half the measurement errors and the same covariances, so that no measurement is beyond the gate."""
     truth_m = flown.state[..., :3]
     return replace(flown, measured_m=truth_m + (flown.measured_m - truth_m) / 2)
 
 
-def without(flown, unknown):
-    """Remove measurements where `unknown`; their values become NaN, so that a use of them would show."""
+def remove_measurements(flown, unknown):
+    """Flight without the measurements where `unknown`; their values become NaN, so that any use of them would show."""
     measured_m, covariance_m2 = flown.measured_m.copy(), flown.covariance_m2.copy()
     measured_m[unknown], covariance_m2[unknown] = np.nan, np.nan
     return replace(
@@ -222,18 +239,18 @@ def without(flown, unknown):
     )
 
 
-def some_unknown(flown, seed, share=0.3):
-    """Remove the measurements of random frames, but not of the first one."""
+def remove_random_measurements(flown, seed, share=0.3):
+    """Flight without a random share of its measurements; the first frame keeps all of its measurements."""
     unknown = np.random.default_rng(seed).random(flown.was_measured.shape) < share
     unknown[0] = False
-    return without(flown, unknown)
+    return remove_measurements(flown, unknown)
 
 
 def motion_params(density, drones, velocity_std=1.0, acceleration_std=2.0, **error):
-    """Equal params for all drones, float64."""
+    """`MotionParams` in float64 with the same values for all drones."""
     return Model(density, velocity_std, acceleration_std, **error).params(drones)
 
 
 def nees(error, covariance):
-    """Normalised squared error eᵀ C⁻¹ e over the last axes."""
+    """Normalised estimation error squared, eᵀ C⁻¹ e, over the last axis."""
     return (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(axis=-1)

@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from helpers import LENSES, float32, moved, ring_rig, sphere_points
+from helpers import LENSES, float32, move_world, ring_rig, sphere_points
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -87,7 +87,7 @@ def test_moving_world_and_rig_together_leaves_boxes(shift_m, coefficients):
     rig = ring_rig(3, coefficients=coefficients)
     position_m, size_m = drones(2)
     xyxy, _ = boxes(rig, position_m, size_m)
-    shifted, _ = boxes(moved(rig, np.eye(3), shift_m), position_m + shift_m, size_m)
+    shifted, _ = boxes(move_world(rig, np.eye(3), shift_m), position_m + shift_m, size_m)
     # Coordinates up to 10 m in float32 are exact to 1e-6 m: at 1.5 m depth and 300 px focal length 2e-4 px.
     np.testing.assert_allclose(shifted, xyxy, atol=3e-3)
 
@@ -99,7 +99,7 @@ def test_turning_world_and_rig_together_leaves_boxes_of_spheres(turn, shift_m, c
     size_m = np.array([[0.4] * 3, [0.25] * 3])
     R = Rotation.from_rotvec(turn).as_matrix()
     xyxy, _ = boxes(rig, position_m, size_m)
-    turned, _ = boxes(moved(rig, R, shift_m), position_m @ R.T + shift_m, size_m)
+    turned, _ = boxes(move_world(rig, R, shift_m), position_m @ R.T + shift_m, size_m)
     np.testing.assert_allclose(turned, xyxy, atol=3e-3)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from helpers import moved, ring_rig
+from helpers import move_world, ring_rig
 from scipy.spatial.transform import Rotation
 
 from psotrack.geometry import Rig
@@ -32,7 +32,7 @@ def test_errors_of_a_rig_that_is_held_as_a_whole():
     """The truth moved as a whole is no error of cameras, where that cannot be told; a camera that was pushed is."""
     errors = runpy.run_path(str(FOLDER / "adjusting.py"))["errors"]
     rig = ring_rig(5)
-    as_a_whole = moved(rig, Rotation.from_rotvec([1e-4, 2e-4, -1e-4]).as_matrix(), (1e-3, -2e-3, 1e-3))
+    as_a_whole = move_world(rig, Rotation.from_rotvec([1e-4, 2e-4, -1e-4]).as_matrix(), (1e-3, -2e-3, 1e-3))
     off_m, off_deg = errors(as_a_whole, rig, rig, whole=True)
     # Of 2 mm and 0.014 degrees; the motions are linear in them.
     assert np.abs(off_m).max() < 1e-6

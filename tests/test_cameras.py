@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import LENSES, far_camera, float32, moved, rig_of, ring_rig
+from helpers import LENSES, far_camera, float32, make_unnamed_rig, move_world, ring_rig
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -81,7 +81,9 @@ def test_moving_world_and_rig_together_changes_no_pixel(turn, shift_m, coefficie
     rig, points = ring_rig(3, coefficients=coefficients), points_in_room(5)
     R = Rotation.from_rotvec(turn).as_matrix()
     pixels, depth = project(rig.cameras, points[:, None, :])
-    pixels_moved, depth_moved = project(moved(rig, R, shift_m).cameras, (points @ R.T + shift_m)[:, None, :])
+    pixels_moved, depth_moved = project(
+        move_world(rig, R, shift_m).cameras, (points @ R.T + shift_m)[:, None, :]
+    )
     # Shifts of 10 m cost a digit or two of float64's sixteen.
     np.testing.assert_allclose(pixels_moved, pixels, atol=1e-9)
     np.testing.assert_allclose(depth_moved, depth, atol=1e-12)
@@ -202,6 +204,6 @@ def test_impossible_cameras_are_refused(change, message):
 
 def test_a_far_camera_makes_metres_pixels():
     """The rig that the tests of the fitness use has 20 pixels per metre and the origin in the middle of the image."""
-    rig = rig_of(far_camera(image_size_wh=(64, 48), pixels_per_m=20))
+    rig = make_unnamed_rig(far_camera(image_size_wh=(64, 48), pixels_per_m=20))
     pixels, _ = project(rig.cameras, np.array([[[0.0, 0, 0]], [[1.0, 0, 0.5]]]))
     np.testing.assert_allclose(pixels[:, 0], [[31.5, 23.5], [51.5, 13.5]], atol=1e-9)

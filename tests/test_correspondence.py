@@ -5,7 +5,7 @@ from itertools import product
 import cv2
 import numpy as np
 import pytest
-from helpers import LENSES, moved, rig_of, ring_rig
+from helpers import LENSES, make_unnamed_rig, move_world, ring_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
@@ -252,7 +252,7 @@ def test_cameras_side_by_side_are_one_viewpoint(least):
     rig = ring_rig(5, image_size_wh=LARGE_WH)
     drones = apart(2, np.random.default_rng(1))
     for spots, enough in (((0,) * 3 + tuple(range(1, least - 1)), False), (range(least), True)):
-        some = rig_of(*(rig.cameras[i] for i in spots))
+        some = make_unnamed_rig(*(rig.cameras[i] for i in spots))
         points = list(pixels_of(some, drones).swapaxes(0, 1))
         assert len(matched(some, points, 1.0, min_views=least).position_m) == (2 if enough else 0)
 
@@ -302,7 +302,7 @@ def test_expected_drones_that_pass_each_other(seed):
 
 def overlapping():
     """Two drones in line with the second of three cameras, 2.5 standard deviations from the middle of both there."""
-    rig = rig_of(*(ring_rig(5, image_size_wh=LARGE_WH).cameras[i] for i in (0, 1, 3)))
+    rig = make_unnamed_rig(*(ring_rig(5, image_size_wh=LARGE_WH).cameras[i] for i in (0, 1, 3)))
     centre = rig.cameras.centre_world[1]
     near = np.array([0.1, 0.3, 1.2])
     far = near + 0.8 * (near - centre) / np.linalg.norm(near - centre)
@@ -380,7 +380,7 @@ def test_ambiguity_is_a_likelihood_ratio(off_px):
     The drones would still have three views each, so that this and no more tells the assignments apart: a detection that
     is explained by a group that nobody expects saves nothing.
     """
-    rig = rig_of(*(ring_rig(7, image_size_wh=LARGE_WH).cameras[i] for i in (0, 1, 3, 5)))
+    rig = make_unnamed_rig(*(ring_rig(7, image_size_wh=LARGE_WH).cameras[i] for i in (0, 1, 3, 5)))
     nowhere = np.array([0.3, -0.2, 1.1])
     drones = np.stack([0.8 * nowhere + 0.2 * centre for centre in rig.cameras.centre_world[:2]])
     points = list(pixels_of(rig, drones).swapaxes(0, 1))
@@ -400,7 +400,7 @@ def test_ambiguity_of_the_other_pairing(off_px):
 
     It has detections of all four places, and those of the other two are a little off: SciPy has the two costs.
     """
-    rig = rig_of(*(ring_rig(5, image_size_wh=LARGE_WH).cameras[i] for i in (0, 1, 3)))
+    rig = make_unnamed_rig(*(ring_rig(5, image_size_wh=LARGE_WH).cameras[i] for i in (0, 1, 3)))
     first, second = rig.cameras.centre_world[:2]
     drone, crossed = (
         np.array([0.3, -0.2, 1.1]) + share * np.array([0.3, -0.2, 1.1] - first) for share in (0, 0.25)
@@ -471,7 +471,7 @@ def test_order_and_place_do_not_matter(seed):
     shift_m = rng.uniform(-5, 5, 3)
     wide = np.stack([shift_m - 6.0, shift_m + 6.0])
     noise = [np.full(len(one), 2.0) for one in points]
-    there = match(moved(rig, R, shift_m).cameras, points, noise, bounds_m=wide)
+    there = match(move_world(rig, R, shift_m).cameras, points, noise, bounds_m=wide)
     here = match(rig.cameras, points, noise, bounds_m=wide - shift_m)
     assert groups_of(there) == groups_of(here)
 
@@ -485,7 +485,7 @@ def test_what_is_always_so(seed):
     drones = apart(int(rng.integers(1, 6)), rng, least_m=0.1)
     points, _ = observed(rig, drones, rng, noise_px=3.0, missed=0.3, false=int(rng.integers(0, 4)))
     points.append(points[0][:0])
-    rig = rig_of(*(rig.cameras[c] for c in [*range(len(rig)), 0]))
+    rig = make_unnamed_rig(*(rig.cameras[c] for c in [*range(len(rig)), 0]))
     known = drones[: rng.integers(0, len(drones) + 1)]
     matches = matched(
         rig,

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from helpers import rig_of
+from helpers import make_unnamed_rig
 from onnx_models import SIDE, STRIDE, bright_squares
 
 from psotrack.cli.detect import detect as command
@@ -172,7 +172,7 @@ def sequence(tmp_path_factory):
     folder.mkdir(parents=True)
     R, t_m = look_at((0.0, -6.0, 2.0), (0.0, 0.0, 1.5))
     one = make_camera(R=R, t_m=t_m, K=np.diag([1100.0, 1100.0, 1.0]), image_size_wh=(256, 192))
-    dpjait.write_calibration(folder / dpjait.CALIBRATION, rig_of(one, one))
+    dpjait.write_calibration(folder / dpjait.CALIBRATION, make_unnamed_rig(one, one))
     for name in "01":
         with VideoWriter(folder / f"{name}.avi", 25.0, (256, 192)) as writer:
             for frame in range(4):
@@ -229,7 +229,7 @@ def seen(tmp_path_factory):
         R, t_m = look_at((x_m, y_m, 2.0), (0.0, 0.0, 1.5))
         K = np.array([[1100.0, 0.0, 127.5], [0.0, 1100.0, 95.5], [0.0, 0.0, 1.0]])
         cameras.append(make_camera(R=R, t_m=t_m, K=K, image_size_wh=(256, 192)))
-    rig = rig_of(*cameras)
+    rig = make_unnamed_rig(*cameras)
     dpjait.write_calibration(folder / dpjait.CALIBRATION, rig)
     middles, _ = project(rig.cameras, PLACES_M[:, None])
     for index, name in enumerate(rig.names):

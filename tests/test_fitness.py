@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 import scipy.ndimage
-from helpers import draw_coverage, far_camera, float32, rig_of, ring_rig
+from helpers import draw_coverage, far_camera, float32, make_unnamed_rig, ring_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from windows import best_place, cut_at
@@ -66,7 +66,7 @@ def _compiled(function, settings, images, cameras, position_m, size_m):
 
 def score_at(image, x_px=0.0, settings=ONE_BOX):
     """Fitness of one drone in one camera, moved to the right by pixels."""
-    rig = rig_of(far_camera(**FAR))
+    rig = make_unnamed_rig(far_camera(**FAR))
     return evaluate(drone_fitness, rig, image, np.array([[x_px * PIXEL_M, 0, 0]]), settings=settings).item()
 
 
@@ -127,7 +127,7 @@ def test_hard_edges_are_whole_pixels():
 
 def test_reduced_silhouettes_score_the_same():
     """Each pixel of a silhouette stands for 4 x 4 pixels of the image."""
-    rig = rig_of(far_camera(image_size_wh=(256, 192), pixels_per_m=80))
+    rig = make_unnamed_rig(far_camera(image_size_wh=(256, 192), pixels_per_m=80))
     settings = Score(windows=(0.5, 1.1), ring=1.5, reduction=4, min_cameras=1)
     score = evaluate(drone_fitness, rig, silhouette(DRONE), np.zeros((1, 3)), settings=settings)
     assert score.item() == pytest.approx((0.5**2 + 1 / 1.1**2) / 2, abs=HAND)
@@ -159,7 +159,9 @@ def test_a_camera_counts_by_what_its_image_holds_of_the_box(whole_view):
     K = one.K.copy()
     K[0, 2] += 32
     at_border = far_camera(**FAR)
-    rig = rig_of(one, one, type(one)(at_border.T_cam_world, K, at_border.dist, at_border.image_size_wh))
+    rig = make_unnamed_rig(
+        one, one, type(one)(at_border.T_cam_world, K, at_border.dist, at_border.image_size_wh)
+    )
     full, half = silhouette(DRONE), silhouette((54, 19, 64, 29))
     images = np.concatenate([full * whole_view, full * whole_view, half * cut_view]).astype(np.uint8)
     scores, weights = evaluate(camera_scores, rig, images, np.zeros((1, 3)))
@@ -177,7 +179,7 @@ def test_too_few_cameras_is_undefined():
     elsewhere = type(one)(one.T_cam_world, K, one.dist, one.image_size_wh)
     images = np.concatenate([silhouette(DRONE)] * 2)
     two = Score(windows=(1.0,), reduction=1, min_cameras=2)
-    both, blind = rig_of(one, one), rig_of(one, elsewhere)
+    both, blind = make_unnamed_rig(one, one), make_unnamed_rig(one, elsewhere)
     assert evaluate(drone_fitness, both, images, np.zeros((1, 3)), settings=two).item() == pytest.approx(
         1, abs=HAND
     )
@@ -188,7 +190,7 @@ def test_too_few_cameras_is_undefined():
 
 
 def test_joint_is_the_mean_over_drones_and_undefined_counts_zero():
-    rig = rig_of(far_camera(**FAR))
+    rig = make_unnamed_rig(far_camera(**FAR))
     image = silhouette(DRONE, (22, 4, 32, 14))
     size_m = SIZE_M.repeat(3, axis=0)
     # The first fills its box, the second half of it, the third is out of the image.
@@ -201,7 +203,7 @@ def test_joint_is_the_mean_over_drones_and_undefined_counts_zero():
 
 def test_filled_is_the_share_of_the_box_that_is_foreground():
     one = far_camera(**FAR)
-    rig = rig_of(one, one)
+    rig = make_unnamed_rig(one, one)
     images = np.concatenate([silhouette((22, 19, 27, 29)), silhouette(DRONE, value=51)])
     np.testing.assert_allclose(
         evaluate(filled_share, rig, images, np.zeros((1, 3))), [[1 / 4, 1 / 5]], atol=HAND

@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from motion_textbook import (
     DT_S,
     TO_TEXTBOOK,
-    Flown,
     Model,
-    calm,
+    SimulatedFlight,
     decay,
-    fly,
+    halve_errors,
     motion_params,
     nees,
-    some_unknown,
+    remove_random_measurements,
+    simulate_flight,
     textbook_filter,
     transition,
 )
@@ -93,11 +93,14 @@ class TestAgainstTheTextbook:
     )
     def test_means_covariances_and_nis(self, dtype, tolerance, error_share):
         """If errors are white, the textbook has no lasting error in its state, and the other components must agree."""
-        flown = some_unknown(calm(fly(1, frames=60, drones=3, error_share=error_share, error_time_s=0.3)), 2)
+        flown = remove_random_measurements(
+            halve_errors(simulate_flight(1, frames=60, drones=3, error_share=error_share, error_time_s=0.3)),
+            2,
+        )
         states, nis = run(flown, dtype)
         all_means, all_covariances = as_textbook(states)
         for drone in range(3):
-            means, covariances, expected_nis = textbook_filter(*flown.of(drone))
+            means, covariances, expected_nis = textbook_filter(*flown.textbook_arguments(drone))
             size = means.shape[1]
             assert size == (12 if error_share else 9)
             # No measurement is beyond the gate, because the textbook filter has none.
@@ -119,7 +122,7 @@ class TestAgainstTheTextbook:
 
     def test_the_time_constant_of_absent_errors_has_no_effect(self):
         """Without lasting errors, no bit of the result depends on their time constant."""
-        flown = some_unknown(calm(fly(1, frames=60, drones=3)), 2)
+        flown = remove_random_measurements(halve_errors(simulate_flight(1, frames=60, drones=3)), 2)
         states, nis = run(flown)
         others, other_nis = run(replace(flown, model=Model(error_time_s=7.0)))
         for one, other in zip(jax.tree.leaves(states), jax.tree.leaves(others), strict=True):
@@ -132,7 +135,7 @@ class TestAgainstTheTextbook:
     @pytest.mark.parametrize("error_share", [0.0, 0.5])
     def test_prediction_is_the_flow(self, error_share):
         """Two predictions in a row equal one prediction, and a prediction over 0 s changes nothing."""
-        flown = fly(3, frames=2, drones=4, error_share=error_share)
+        flown = simulate_flight(3, frames=2, drones=4, error_share=error_share)
         with jax.enable_x64(True):
             measured, covariance, params = numbers(
                 (flown.measured_m[0], flown.covariance_m2[0], flown.params), jnp.float64
@@ -161,7 +164,7 @@ class TestAgainstTheTextbook:
 
 class TestGaps:
     def test_uncertainty_grows_in_a_gap_and_shrinks_after(self):
-        flown = fly(4, frames=60, drones=3, error_share=0.5)
+        flown = simulate_flight(4, frames=60, drones=3, error_share=0.5)
         flown.was_measured[30:50] = False
         states, nis = run(flown)
         spread = np.trace(states.position_covariance_m2, axis1=2, axis2=3)
@@ -175,7 +178,7 @@ class TestGaps:
 
     def test_an_error_is_forgotten_in_a_gap(self):
         """The mean of the lasting error decays; its variance returns to that of the last measurement."""
-        flown = fly(4, frames=60, drones=3, error_share=0.5)
+        flown = simulate_flight(4, frames=60, drones=3, error_share=0.5)
         flown.was_measured[30:] = False
         states, _ = run(flown)
         assert (np.linalg.norm(states.error_m[28], axis=-1) > 1e-4).all()
@@ -190,7 +193,7 @@ class TestGaps:
             np.testing.assert_allclose(spread, expected, rtol=0, atol=1e-4 * expected.max())
 
     def test_a_drone_without_a_measurement_keeps_its_state(self):
-        flown = fly(5, frames=2, drones=2, error_share=0.5)
+        flown = simulate_flight(5, frames=2, drones=2, error_share=0.5)
         measured, covariance, params = float32((flown.measured_m, flown.covariance_m2, flown.params))
         state = init(measured[0], measured[0], covariance[0], params)
         state = predict(state, jnp.float32(DT_S), params)
@@ -212,7 +215,7 @@ class TestConsistency:
     @pytest.fixture(scope="class")
     @classmethod
     def flights(cls, request):
-        flown = fly(6, frames=cls.FRAMES, drones=cls.DRONES, error_share=request.param)
+        flown = simulate_flight(6, frames=cls.FRAMES, drones=cls.DRONES, error_share=request.param)
         return flown, *run(flown)
 
     def test_nis(self, flights):
@@ -265,7 +268,7 @@ class TestConsistency:
 def test_lasting_errors_that_are_treated_as_white_make_the_filter_overconfident(density):
     """This is why lasting errors are in the state: the same flights, filtered with and without them."""
     drones, frames = 200, 60
-    flown = fly(6, frames=frames, drones=drones, density=density, error_share=0.5, steady=True)
+    flown = simulate_flight(6, frames=frames, drones=drones, density=density, error_share=0.5, steady=True)
     inside, off_m = [], []
     for model in (flown.model, replace(flown.model, error_share=0.0)):
         states, _ = run(replace(flown, model=model))
@@ -302,7 +305,7 @@ class TestFloat32:
         was_measured = np.ones(shape, bool)
         for start in range(500, self.FRAMES, 700):
             was_measured[start : start + rng.integers(1, 100), rng.integers(self.DRONES)] = False
-        return Flown(
+        return SimulatedFlight(
             time_s=np.arange(self.FRAMES) * DT_S,
             state=np.zeros((*shape, 9)),
             # Apart from the gate, covariances do not depend on the measured positions.
@@ -376,7 +379,7 @@ class TestFloat32:
             covariance_m2[50] = std_m**2 * np.eye(3)
             was_measured[50] = number
             states, _ = run(
-                Flown(
+                SimulatedFlight(
                     time_s=np.arange(frames) * DT_S,
                     state=np.zeros((frames, 1, 9)),
                     measured_m=np.zeros((frames, 1, 3)),
@@ -419,7 +422,7 @@ class TestOutliers:
     @classmethod
     def expecting(cls):
         """A state that predicts its measurement to about a centimetre, R, and params with lasting errors."""
-        flown = fly(9, frames=60, drones=3, error_share=0.5)
+        flown = simulate_flight(9, frames=60, drones=3, error_share=0.5)
         states, _ = run(flown)
         with jax.enable_x64(True):
             last, covariance, params = numbers(
@@ -478,7 +481,7 @@ class TestOutliers:
     @pytest.mark.parametrize("error_share", [0.0, 0.5])
     def test_a_drone_that_really_jumps_is_followed(self, error_share):
         """The jump is half a metre along each axis in frame 50."""
-        flown = fly(10, frames=100, drones=20, error_share=error_share)
+        flown = simulate_flight(10, frames=100, drones=20, error_share=error_share)
         jump_m = 0.5 * (np.arange(100) >= 50)[:, None, None]
         states, _ = run(replace(flown, measured_m=flown.measured_m + jump_m))
         off_m = np.linalg.norm(states.position_m - (flown.state[:, :, :3] + jump_m)[1:], axis=-1)
@@ -493,7 +496,9 @@ class TestSymmetries:
     @settings(max_examples=15, deadline=None)
     def test_a_turned_world_gives_turned_states(self, seed, std_m):
         rng = np.random.default_rng(seed)
-        flown = some_unknown(fly(seed, frames=12, drones=2, std_m=std_m, error_share=0.5), seed)
+        flown = remove_random_measurements(
+            simulate_flight(seed, frames=12, drones=2, std_m=std_m, error_share=0.5), seed
+        )
         turn, shift_m = Rotation.random(rng=rng).as_matrix(), rng.uniform(-3, 3, 3)
         turned = replace(
             flown,
@@ -515,7 +520,7 @@ class TestSymmetries:
 
     def test_drones_do_not_affect_each_other(self):
         """A drone has the same states alone and with others, apart from float32 rounding in the compiler's order."""
-        flown = some_unknown(fly(11, frames=60, drones=3, error_share=0.5), 12)
+        flown = remove_random_measurements(simulate_flight(11, frames=60, drones=3, error_share=0.5), 12)
         together, _ = run(flown)
         alone, _ = run(
             replace(
@@ -557,7 +562,7 @@ def test_other_values_need_no_compilation(caplog):
     )
 
     def call(seed, density, dt_s):
-        flown = fly(seed, frames=1, drones=3)
+        flown = simulate_flight(seed, frames=1, drones=3)
         measured, covariance = float32((flown.measured_m[0], flown.covariance_m2[0]))
         params = motion_params(density, 3, velocity_std=density, error_share=dt_s, error_time_s=density)
         state = init(measured, measured, covariance, params)

@@ -8,16 +8,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from motion_textbook import (
-    Flown,
     Model,
-    calm,
-    fly,
+    SimulatedFlight,
+    halve_errors,
     motion_params,
     nees,
-    some_unknown,
+    remove_measurements,
+    remove_random_measurements,
+    simulate_flight,
     textbook_filter,
     textbook_smoother,
-    without,
 )
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
@@ -26,7 +26,7 @@ from psotrack.errors import InputError
 from psotrack.motion import estimate_jerk_density, smooth
 
 
-def smoothed(flown: Flown):
+def smoothed(flown: SimulatedFlight):
     return smooth(*flown.measurements, flown.params)
 
 
@@ -37,16 +37,18 @@ class TestSmoothing:
 
         If errors are white, the textbook has no lasting error in its state, and the other components must agree.
         """
-        flown = calm(fly(1, frames=30, drones=2, error_share=error_share, error_time_s=0.3))
+        flown = halve_errors(
+            simulate_flight(1, frames=30, drones=2, error_share=error_share, error_time_s=0.3)
+        )
         unknown = np.random.default_rng(2).random((30, 2)) < 0.3
         unknown[0, 0], unknown[:5, 1], unknown[5, 1] = False, True, False
         time_s = flown.time_s + np.random.default_rng(3).uniform(-0.0005, 0.0005, 30)
-        flown = without(replace(flown, time_s=time_s), unknown)
+        flown = remove_measurements(replace(flown, time_s=time_s), unknown)
         result = smoothed(flown)
         for drone, born in ((0, 0), (1, 5)):
             # No measurement is beyond the gate, because the textbook filter has none.
-            assert np.nanmax(textbook_filter(*flown.of(drone, born))[2]) < 16
-            mean, covariance = textbook_smoother(*flown.of(drone, born))
+            assert np.nanmax(textbook_filter(*flown.textbook_arguments(drone, born))[2]) < 16
+            mean, covariance = textbook_smoother(*flown.textbook_arguments(drone, born))
             # Both are float64, and the textbook inverts a matrix of about 60 x 60. Measured 8e-12, 8e-11, 8e-10.
             for part, expected, limit in (
                 (result.position_m, mean[:, :3], 1e-9),
@@ -59,7 +61,7 @@ class TestSmoothing:
 
     def test_the_time_constant_of_absent_errors_has_no_effect(self):
         """Without lasting errors, no bit of the result depends on their time constant."""
-        flown = some_unknown(fly(1, frames=30, drones=2), 2)
+        flown = remove_random_measurements(simulate_flight(1, frames=30, drones=2), 2)
         other = replace(flown, model=Model(error_time_s=7.0))
         for one, same in zip(*(vars(smoothed(each)).values() for each in (flown, other)), strict=True):
             np.testing.assert_array_equal(one, same)
@@ -67,8 +69,10 @@ class TestSmoothing:
         np.testing.assert_array_equal(*density)
 
     def test_the_smoother_beats_the_filter_and_the_filter_the_measurements(self):
-        flown = fly(4, frames=100, drones=20)
-        filtered_m = np.stack([textbook_filter(*flown.of(drone))[0] for drone in range(20)], axis=1)[..., :3]
+        flown = simulate_flight(4, frames=100, drones=20)
+        filtered_m = np.stack(
+            [textbook_filter(*flown.textbook_arguments(drone))[0] for drone in range(20)], axis=1
+        )[..., :3]
         raw, filtered, after = (
             np.sqrt(((position_m - flown.state[..., :3])[20:-20] ** 2).mean())
             for position_m in (flown.measured_m, filtered_m, smoothed(flown).position_m)
@@ -81,8 +85,8 @@ class TestSmoothing:
     def test_covariances_cover_the_errors(self, unknown, error_share):
         """NEES of independent drones is chi-square with 3 degrees each; one seed in 1,000 fails by chance."""
         drones = 300
-        flown = some_unknown(
-            fly(5, frames=60, drones=drones, error_share=error_share, steady=True), 6, unknown
+        flown = remove_random_measurements(
+            simulate_flight(5, frames=60, drones=drones, error_share=error_share, steady=True), 6, unknown
         )
         result = smoothed(flown)
         low, high = chi2.ppf([0.0005, 0.9995], 3 * drones) / drones
@@ -92,7 +96,7 @@ class TestSmoothing:
 
     def test_lasting_errors_that_are_treated_as_white_make_the_smoother_overconfident(self):
         """Its positions are not better either."""
-        flown = fly(5, frames=60, drones=300, density=1.0, error_share=0.5, steady=True)
+        flown = simulate_flight(5, frames=60, drones=300, density=1.0, error_share=0.5, steady=True)
         inside, off_m = [], []
         for each in (flown, replace(flown, model=replace(flown.model, error_share=0.0))):
             result = smoothed(each)
@@ -108,7 +112,11 @@ class TestSmoothing:
     def test_gaps_are_bridged_from_both_sides(self):
         unknown = np.zeros((100, 20), bool)
         unknown[40:60], unknown[90:] = True, True
-        result = smoothed(without(fly(7, frames=100, drones=20, error_share=0.5, steady=True), unknown))
+        result = smoothed(
+            remove_measurements(
+                simulate_flight(7, frames=100, drones=20, error_share=0.5, steady=True), unknown
+            )
+        )
         spread = np.trace(result.covariance_m2, axis1=-2, axis2=-1)
         assert (np.diff(spread[39:49], axis=0) > 0).all()
         assert (np.diff(spread[50:61], axis=0) < 0).all()
@@ -118,7 +126,7 @@ class TestSmoothing:
     def test_after_the_last_measurement_the_drone_is_predicted(self):
         unknown = np.zeros((30, 2), bool)
         unknown[20:] = True
-        flown = without(fly(8, frames=30, drones=2, error_share=0.5), unknown)
+        flown = remove_measurements(simulate_flight(8, frames=30, drones=2, error_share=0.5), unknown)
         result = smoothed(flown)
         ahead_s = (flown.time_s[19:] - flown.time_s[19])[:, None, None]
         expected = (
@@ -132,15 +140,15 @@ class TestSmoothing:
     def test_a_drone_that_is_never_measured(self):
         unknown = np.zeros((30, 2), bool)
         unknown[:, 1] = True
-        flown = fly(9, frames=30, drones=2, error_share=0.5)
-        result, alone = smoothed(without(flown, unknown)), smoothed(flown)
+        flown = simulate_flight(9, frames=30, drones=2, error_share=0.5)
+        result, alone = smoothed(remove_measurements(flown, unknown)), smoothed(flown)
         for part, same in zip(vars(result).values(), vars(alone).values(), strict=True):
             assert np.isnan(part[:, 1]).all()
             np.testing.assert_array_equal(part[:, 0], same[:, 0])
 
     @pytest.mark.parametrize("error_share", [0.0, 0.5])
     def test_an_outlier_has_little_weight(self, error_share):
-        flown = fly(10, frames=100, drones=20, error_share=error_share)
+        flown = simulate_flight(10, frames=100, drones=20, error_share=error_share)
         wild = flown.measured_m.copy()
         wild[50] += 0.5
         result, clean = smoothed(replace(flown, measured_m=wild)), smoothed(flown)
@@ -156,7 +164,11 @@ class TestSmoothing:
         unknown[0] = False
         unknown[1000:1500, 0], unknown[200:, 1] = True, True
         unknown[2900, 1] = False
-        result = smoothed(without(fly(11, frames=frames, drones=2, error_share=error_share), unknown))
+        result = smoothed(
+            remove_measurements(
+                simulate_flight(11, frames=frames, drones=2, error_share=error_share), unknown
+            )
+        )
         for value in vars(result).values():
             assert np.isfinite(value).all()
         assert np.linalg.eigvalsh(result.covariance_m2).min() > 0
@@ -169,7 +181,7 @@ class TestSymmetries:
     @settings(max_examples=15, deadline=None)
     def test_a_turned_world_gives_turned_tracks(self, seed):
         rng = np.random.default_rng(seed)
-        flown = some_unknown(fly(seed, frames=30, drones=2, error_share=0.5), seed)
+        flown = remove_random_measurements(simulate_flight(seed, frames=30, drones=2, error_share=0.5), seed)
         turn, shift_m = Rotation.random(rng=rng).as_matrix(), rng.uniform(-3, 3, 3)
         turned = smoothed(
             replace(
@@ -199,9 +211,11 @@ class TestSymmetries:
         unknown = np.random.default_rng(seed).random((30, 2)) < 0.3
         # Both ends are measured, because frames before the first measurement are NaN, and those after the last are not.
         unknown[[0, -1]] = False
-        flown = without(calm(fly(seed, frames=30, drones=2, error_share=0.5, steady=True)), unknown)
+        flown = remove_measurements(
+            halve_errors(simulate_flight(seed, frames=30, drones=2, error_share=0.5, steady=True)), unknown
+        )
         flown = replace(flown, model=replace(flown.model, velocity_std=1e3, acceleration_std=1e5))
-        back = Flown(
+        back = SimulatedFlight(
             -flown.time_s[::-1],
             flown.state[::-1],
             flown.measured_m[::-1],
@@ -223,8 +237,10 @@ class TestJerkDensity:
     @pytest.mark.parametrize("error_share", [0.0, 0.5])
     @pytest.mark.parametrize("density", [0.3, 30.0, 3000.0])
     def test_the_density_is_found_from_the_measurements(self, density, error_share):
-        flown = fly(12, frames=self.FRAMES, drones=8, density=density, error_share=error_share, steady=True)
-        flown = some_unknown(flown, 13, 0.1)
+        flown = simulate_flight(
+            12, frames=self.FRAMES, drones=8, density=density, error_share=error_share, steady=True
+        )
+        flown = remove_random_measurements(flown, 13, 0.1)
         found = estimate_jerk_density(*flown.measurements, motion_params(30.0, 8, error_share=error_share))
         off = np.log10(found / density)
         # 24 s have about 100 independent samples of the jerk along three axes. They give the density of one drone to
@@ -233,7 +249,7 @@ class TestJerkDensity:
         assert abs(off.mean()) < 0.05
 
     def test_outliers_do_not_raise_the_density(self):
-        flown = fly(14, frames=self.FRAMES, drones=8)
+        flown = simulate_flight(14, frames=self.FRAMES, drones=8)
         rng = np.random.default_rng(15)
         wild = rng.random(flown.was_measured.shape) < 0.03
         wild[0] = False
@@ -247,14 +263,14 @@ class TestJerkDensity:
     def test_a_drone_with_almost_no_measurements_keeps_the_prior(self):
         unknown = np.zeros((30, 2), bool)
         unknown[1:, 0], unknown[:, 1] = True, True
-        flown = without(fly(16, frames=30, drones=2), unknown)
+        flown = remove_measurements(simulate_flight(16, frames=30, drones=2), unknown)
         found = estimate_jerk_density(*flown.measurements, motion_params(70.0, 2))
         # The prior alone is a parabola, whose vertex is found to rounding.
         np.testing.assert_allclose(found, 70.0, rtol=1e-6)
 
     def test_a_hovering_drone_has_a_small_density(self):
         rng = np.random.default_rng(17)
-        flown = fly(17, frames=self.FRAMES, drones=8)
+        flown = simulate_flight(17, frames=self.FRAMES, drones=8)
         still = replace(
             flown,
             measured_m=rng.normal(scale=0.01, size=flown.measured_m.shape),
@@ -266,7 +282,7 @@ class TestJerkDensity:
 
 class TestRefusedInput:
     def changed(self, **changes):
-        flown = fly(18, frames=30, drones=2)
+        flown = simulate_flight(18, frames=30, drones=2)
         for name, (index, value) in changes.items():
             getattr(flown, name)[index] = value
         return flown
@@ -299,7 +315,7 @@ class TestRefusedInput:
 
 
 def test_double_precision_does_not_leave_the_call():
-    flown = fly(19, frames=30, drones=2)
+    flown = simulate_flight(19, frames=30, drones=2)
     assert smoothed(flown).position_m.dtype == np.float64
     assert not jax.config.jax_enable_x64
     assert jax.numpy.zeros(1).dtype == np.float32
@@ -307,7 +323,7 @@ def test_double_precision_does_not_leave_the_call():
 
 def test_other_values_need_no_compilation(caplog):
     def both(seed, density):
-        flown = some_unknown(fly(seed, frames=8, drones=2), seed)
+        flown = remove_random_measurements(simulate_flight(seed, frames=8, drones=2), seed)
         smooth(*flown.measurements, motion_params(density, 2))
         estimate_jerk_density(*flown.measurements, motion_params(density, 2))
         lines = [record.getMessage() for record in caplog.records if "Compiling" in record.getMessage()]

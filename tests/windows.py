@@ -5,7 +5,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from helpers import far_camera, float32, rig_of
+from helpers import far_camera, float32, make_unnamed_rig
 
 from psotrack.geometry import make_extents
 from psotrack.silhouettes import summed_area_table
@@ -26,7 +26,9 @@ NOISE = np.random.default_rng(0).integers(0, 256, (4, *SHAPE)).astype(np.uint8)
 def far_rig(reduction):
     height, width = SHAPE
     sides = (width * reduction, height * reduction)
-    return rig_of(*(far_camera(image_size_wh=sides, pixels_per_m=reduction * ppm) for ppm in PIXELS_PER_M))
+    return make_unnamed_rig(
+        *(far_camera(image_size_wh=sides, pixels_per_m=reduction * ppm) for ppm in PIXELS_PER_M)
+    )
 
 
 def middle_px(position_m, pixels_per_m):
