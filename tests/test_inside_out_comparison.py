@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.inside_out import CameraPath
-from psotrack.inside_out.comparison import Statistics, compare_paths, mean_rotation, wrap_deg
+from psotrack.inside_out.comparison import PathReference, Statistics, compare_paths, mean_rotation, wrap_deg
 from psotrack.inside_out.comparison.clocks import interpolate_orientations
 from psotrack.inside_out.comparison.plots import RECONSTRUCTED, REFERENCE, save_path_errors, save_paths
 from psotrack.trajectories import Status
@@ -49,6 +49,11 @@ def turned(time_s, seed=1) -> Rotation:
     """Orientations of a body that turns around and sways a little, so that yaw passes 180 degrees, at each time."""
     sway_deg = 12.0 * flown_m(time_s, 1.0, seed)
     return Rotation.from_euler("ZYX", sway_deg * [15, 1, 1] + [170, -18, 0], degrees=True)
+
+
+def compare(path, time_s, position_m, wxyz=None, *, orientation_time_s=None, **options):
+    """Comparison of a path with a reference of these times, positions and orientations."""
+    return compare_paths(path, PathReference(time_s, position_m, wxyz, orientation_time_s), **options)
 
 
 def wxyz_of(rotation: Rotation):
@@ -93,7 +98,7 @@ class TestTablesByHand:
         error_m = np.array([0.01, 0.02, 0.03, 0.04, 0.10])
         position_m = self.level_m(self.TIME_S) + error_m[:, None] * [0, 0, 1]
         path = path_of(self.TIME_S, position_m, np.tile([1.0, 0, 0, 0], (5, 1)))
-        found = compare_paths(
+        found = compare(
             path, self.SAMPLES_S, self.level_m(self.SAMPLES_S), with_lever_arm=False, max_offset_s=0.1
         )
         # The offset is found to 1e-6 s, in which the drone flies 1e-5 m: 5e-9 m beside an error of 0.01 m.
@@ -113,7 +118,7 @@ class TestTablesByHand:
         yaw_deg, error_deg = 176.0 + 2 * np.arange(5), np.array([1.0, 3.0, -2.0, 0.5, -5.0])
         path = path_of(self.TIME_S, self.level_m(self.TIME_S), wxyz_of(self.going_about(yaw_deg + error_deg)))
         yaws_deg = 176.0 + 2 * FPS * (self.SAMPLES_S - 0.2)
-        found = compare_paths(
+        found = compare(
             path,
             self.SAMPLES_S,
             self.level_m(self.SAMPLES_S),
@@ -165,7 +170,7 @@ class TestAngles:
         errors = Rotation.from_rotvec(rng.normal(0, 0.3, (path.num_frames, 3)))
         poses = Rotation.from_quat(path.orientation_wxyz, scalar_first=True) * errors
         time_s, position_m, wxyz = recording(seconds=8)
-        found = compare_paths(
+        found = compare(
             replace(path, orientation_wxyz=wxyz_of(poses)),
             time_s,
             position_m,
@@ -236,7 +241,7 @@ class TestClocks:
         if turn_clock_s is not None:
             orientation_time_s, _, wxyz = recording(rate_hz=40, clock_s=turn_clock_s)
             turns = {"orientation_time_s": orientation_time_s}
-        found = compare_paths(path, time_s, position_m, wxyz, **turns)
+        found = compare(path, time_s, position_m, wxyz, **turns)
         # The aim is 0.1 frame. Here the noise allows a fiftieth of a frame.
         assert abs(found.offset_s - clock_s) * FPS < 0.05
         assert found.offset_std_s * FPS < 0.05
@@ -262,7 +267,7 @@ class TestClocks:
         """The path's orientations turn the arm, which is returned in the camera's axes."""
         path = filmed(ARM_M, TURN, noise_m=0.005, noise_deg=0.2)
         time_s, position_m, _ = recording(clock_s=0.3137)
-        found = compare_paths(path, time_s, position_m)
+        found = compare(path, time_s, position_m)
         assert abs(found.offset_s - 0.3137) * FPS < 0.05
         np.testing.assert_allclose(found.lever_arm_m, TURN.inv().apply(ARM_M), atol=0.0024)
         assert found.turning is None
@@ -276,7 +281,7 @@ class TestClocks:
         path = replace(path, position_m=moved_m + np.random.default_rng(1).normal(0, 0.002, moved_m.shape))
         turns_s, _, wxyz = recording(rate_hz=40, clock_s=turn_clock_s or 0)
         by_own_clock = {} if turn_clock_s is None else {"orientation_time_s": turns_s}
-        found = compare_paths(path, time_s + 0.7, slow_m[1], wxyz if by_own_clock else None, **by_own_clock)
+        found = compare(path, time_s + 0.7, slow_m[1], wxyz if by_own_clock else None, **by_own_clock)
         assert abs(found.offset_s - 0.7) * FPS < 0.05
         np.testing.assert_allclose(
             np.linalg.norm(found.lever_arm_m), np.linalg.norm([0.2, -0.1, 0.12]), atol=2e-3
@@ -287,7 +292,7 @@ class TestClocks:
         path = filmed(noise_deg=0.2)
         turns_s, _, wxyz = recording(rate_hz=40, clock_s=turn_clock_s)
         time_s, position_m, _ = recording()
-        found = compare_paths(
+        found = compare(
             path, time_s, position_m, wxyz, orientation_time_s=turns_s, with_turn=False, with_lever_arm=False
         )
         assert abs(found.turning.offset_s - turn_clock_s) * FPS < 0.05
@@ -307,7 +312,7 @@ class TestClocks:
         turns_s, _, turns_wxyz = recording(rate_hz=40, clock_s=0.4)
         wrong = replace(path, position_m=position_m, orientation_wxyz=orientation_wxyz)
         for turns, wxyz_used in (({}, wxyz), ({"orientation_time_s": turns_s}, turns_wxyz)):
-            found = compare_paths(wrong, time_s, reference_m, wxyz_used, **turns)
+            found = compare(wrong, time_s, reference_m, wxyz_used, **turns)
             assert abs(found.offset_s + 0.2719) * FPS < 0.1
             assert abs(found.turning.offset_s - (0.4 if turns else -0.2719)) * FPS < 0.1
             # No outlier is left out: 10 km stay in the mean and the maximum.
@@ -324,7 +329,7 @@ class TestClocks:
         time_s, position_m, wxyz = recording()
         position_m[(time_s > 8) & (time_s < 8.5)] = np.nan
         wxyz[(time_s > 9) & (time_s < 10)] = np.nan
-        found = compare_paths(path, time_s, position_m, wxyz)
+        found = compare(path, time_s, position_m, wxyz)
         assert abs(found.offset_s) * FPS < 0.05
         lost = np.isin(path.frame, [*range(40, 60), *range(80, 90)])
         # Both ends of a gap are right to a step of 10 ms.
@@ -342,7 +347,7 @@ class TestClocks:
     def test_the_comparison_does_not_depend_on_the_worlds_axes(self, seed, later_s):
         path = filmed(ARM_M, TURN, noise_m=0.01, noise_deg=0.5, seed=seed, seconds=8)
         time_s, position_m, wxyz = recording(rate_hz=50, seconds=12)
-        first = compare_paths(path, time_s, position_m, wxyz)
+        first = compare(path, time_s, position_m, wxyz)
         world = Rotation.random(rng=np.random.default_rng(seed))
         moved = replace(
             path,
@@ -351,7 +356,7 @@ class TestClocks:
             orientation_wxyz=wxyz_of(world * Rotation.from_quat(path.orientation_wxyz, scalar_first=True)),
         )
         turned_wxyz = wxyz_of(world * Rotation.from_quat(wxyz, scalar_first=True))
-        again = compare_paths(moved, time_s + later_s, world.apply(position_m) + 7.0, turned_wxyz)
+        again = compare(moved, time_s + later_s, world.apply(position_m) + 7.0, turned_wxyz)
         # Offsets are found to 1e-6 s, in which the camera moves by 1e-6 m and turns by 1e-4 degrees.
         assert again.offset_s == pytest.approx(first.offset_s, abs=5e-6)
         np.testing.assert_allclose(again.distance_m, first.distance_m, atol=2e-5)
@@ -362,7 +367,7 @@ class TestClocks:
 class TestRefusedComparisons:
     def refused(self, text, path, *reference, error=InputError, **options):
         with pytest.raises(error, match=text) as caught:
-            compare_paths(path, *reference, **options)
+            compare(path, *reference, **options)
         assert "\n" not in str(caught.value)
 
     def test_clocks_too_far_apart(self):
@@ -432,7 +437,7 @@ class TestRefusedComparisons:
 @pytest.fixture(scope="module")
 def flown():
     path = filmed(ARM_M, TURN, noise_m=0.05, noise_deg=0.5)
-    return path, compare_paths(path, *recording())
+    return path, compare(path, *recording())
 
 
 class TestPlots:
@@ -453,7 +458,7 @@ class TestPlots:
         # A pose far away does not change the scale of the plot; the caption counts it.
         wild = replace(path, position_m=path.position_m.copy())
         wild.position_m[100] = 1e4
-        save_paths(tmp_path / "wild.png", wild, compare_paths(wild, *recording()), caption="a flight")
+        save_paths(tmp_path / "wild.png", wild, compare(wild, *recording()), caption="a flight")
         # Measured 0.99 of the pixels: a piece of the line is missing.
         assert (
             self.of_colour(tmp_path / "wild.png", REFERENCE).sum()
@@ -464,12 +469,10 @@ class TestPlots:
         path, comparison = flown
         wild = replace(path, position_m=path.position_m.copy())
         wild.position_m[100] += 500.0
-        save_path_errors(
-            tmp_path / "errors.png", {"one": comparison, "other": compare_paths(wild, *recording())}
-        )
+        save_path_errors(tmp_path / "errors.png", {"one": comparison, "other": compare(wild, *recording())})
         picture = cv2.imread(str(tmp_path / "errors.png"))
         assert picture.std() > 5
         # Without orientations there is only one panel.
         time_s, position_m, _ = recording()
-        save_path_errors(tmp_path / "distances.png", {"one": compare_paths(path, time_s, position_m)})
+        save_path_errors(tmp_path / "distances.png", {"one": compare(path, time_s, position_m)})
         assert cv2.imread(str(tmp_path / "distances.png")).shape[0] < 0.6 * picture.shape[0]

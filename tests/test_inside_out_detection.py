@@ -36,19 +36,13 @@ def pattern(marker, dictionary="4x4_1000", cell_px=20):
     return image, np.array([[low, low], [high, low], [high, high], [low, high]])
 
 
-def draw(
-    markers,
-    *,
-    size_wh=SIZE_WH,
-    dictionary="4x4_1000",
-    lens=None,
-    exponent=2.0,
-    black=40,
-    white=200,
-    wall=140,
-):
+#: Grey levels of drawn images: black and white cells of markers, and the wall.
+BLACK, WHITE, WALL = 40, 200, 140
+
+
+def draw(markers, *, size_wh=SIZE_WH, dictionary="4x4_1000", lens=None, exponent=2.0):
     """An image of a wall with markers at given corners, (4, 2) each, drawn by casting rays through fine pixels."""
-    drawn = np.full(size_wh[::-1], wall, np.uint8)
+    drawn = np.full(size_wh[::-1], WALL, np.uint8)
     for marker, corners in markers:
         image, own = pattern(marker, dictionary)
         towards = cv2.getPerspectiveTransform(corners.astype(np.float32), own.astype(np.float32))
@@ -67,8 +61,8 @@ def draw(
         there = grid @ towards[:, :2].T + towards[:, 2]
         there = np.round(there[..., :2] / there[..., 2:]).astype(int)
         inside = ((there >= 0) & (there < image.shape[0])).all(axis=-1)
-        fine = np.where(inside, 0.0, float(wall))
-        fine[inside] = black + (white - black) * (image[there[inside][:, 1], there[inside][:, 0]] / 255)
+        fine = np.where(inside, 0.0, float(WALL))
+        fine[inside] = BLACK + (WHITE - BLACK) * (image[there[inside][:, 1], there[inside][:, 0]] / 255)
         # The light of a pixel is the mean of its fine pixels; its grey level is a root of the light.
         light = (fine**exponent).reshape(high[1] - low[1], FINE, high[0] - low[0], FINE).mean(axis=(1, 3))
         coarse = light ** (1 / exponent)

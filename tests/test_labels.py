@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.cli.labels import labels
 from psotrack.datasets.dpjait import read_masks, read_sequence
-from psotrack.detection import LabelSettings, write_data_set
+from psotrack.detection import FrameSelection, LabelSettings, write_data_set
 from psotrack.detection.labels import box_corners, label_boxes
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
 from psotrack.geometry import look_at, make_camera, project
@@ -371,7 +371,7 @@ def test_sequences_that_cannot_be_split(data, tmp_path):
     assert "S01_D2_A more than once" in refused(SettingsError, one, one, "--out", out)
     assert run(one, other, "--out", out, "--every", 0).exit_code == 2
     with pytest.raises(SettingsError, match="every: expected 1 or more, found 0"):
-        write_data_set(list(map(read_sequence, (one, other))), out, LabelSettings(SIZE_M), every=0)
+        FrameSelection(every=0)
     assert not out.exists()
 
 

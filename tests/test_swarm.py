@@ -13,14 +13,13 @@ from hypothesis import strategies as st
 
 from psotrack.tracking import swarm
 
+#: Coefficients of a swarm where a test sets no others.
+COEFFICIENTS = {"inertia": 0.6, "cognitive": 1.5, "social": 1.5}
 
-def params(
-    groups=1, dims=2, *, inertia=0.6, cognitive=1.5, social=1.5, max_step=10.0, low=-100.0, high=100.0
-):
+
+def params(groups=1, dims=2, *, max_step=10.0, low=-100.0, high=100.0, **coefficients):
     return swarm.SwarmParams(
-        inertia=jnp.float32(inertia),
-        cognitive=jnp.float32(cognitive),
-        social=jnp.float32(social),
+        **{name: jnp.float32(value) for name, value in (COEFFICIENTS | coefficients).items()},
         max_step=jnp.full(dims, max_step, jnp.float32),
         low=jnp.full((groups, dims), low, jnp.float32),
         high=jnp.full((groups, dims), high, jnp.float32),

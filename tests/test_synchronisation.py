@@ -1,7 +1,7 @@
 """Clocks: shifted copies of motion that is known at any time, so that the offset is known exactly."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -263,9 +263,27 @@ class TestWhatCannotBeTold:
             find_offset(unseen, time_s, position_m, max_offset_s=1.0)
 
 
-def seen_by(rig, paths, late_frames, *, num_frames=300, noise_px=1.0, missed=0.1, wrong=0.02, seed=0):
+@dataclass(frozen=True)
+class DetectionErrors:
+    """Errors of simulated detections.
+
+    Attributes:
+        noise_px: standard deviation of a detection, pixels.
+        missed: share of the detections that are missing.
+        wrong: share of the detections that are anywhere in the image.
+        seed: seed of all random numbers.
+    """
+
+    noise_px: float = 1.0
+    missed: float = 0.1
+    wrong: float = 0.02
+    seed: int = 0
+
+
+def seen_by(rig, paths, late_frames, *, num_frames=300, **errors):
     """(frames, drones, cameras, 2), by OpenCV: each camera sees each drone where it was at k + its own offset."""
-    rng = np.random.default_rng(seed)
+    errors = DetectionErrors(**errors)
+    rng = np.random.default_rng(errors.seed)
     points_px = np.full((num_frames, len(paths), len(rig), 2), np.nan)
     for number, late in enumerate(late_frames):
         time_s = (np.arange(num_frames) + late) / FPS
@@ -274,10 +292,10 @@ def seen_by(rig, paths, late_frames, *, num_frames=300, noise_px=1.0, missed=0.1
         for drone, path in enumerate(paths):
             projected = cv2.projectPoints(path(time_s), cv2.Rodrigues(R)[0], t, one.K, one.dist)[0]
             points_px[:, drone, number] = projected[:, 0]
-    points_px += rng.normal(0, noise_px, points_px.shape)
-    stray = rng.random(points_px.shape[:-1]) < wrong
+    points_px += rng.normal(0, errors.noise_px, points_px.shape)
+    stray = rng.random(points_px.shape[:-1]) < errors.wrong
     points_px[stray] = rng.uniform((0, 0), (1920, 1080), (int(stray.sum()), 2))
-    points_px[rng.random(points_px.shape[:-1]) < missed] = np.nan
+    points_px[rng.random(points_px.shape[:-1]) < errors.missed] = np.nan
     return points_px
 
 

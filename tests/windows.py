@@ -36,38 +36,26 @@ def middle_px(position_m, pixels_per_m):
     return SHAPE[1] / 2 + pixels_per_m * position_m[0], SHAPE[0] / 2 - pixels_per_m * position_m[2]
 
 
-def cut_at(
-    rig,
-    images,
-    expected_m,
-    size_m,
-    *,
-    reach_m=0.1,
-    occluding=True,
-    reduction=1,
-    floor_z_m=None,
-    offset_m=None,
-):
-    """Windows as NumPy arrays; `occluding` is for one or for each of the drones, or None."""
+def cut_at(rig, images, expected_m, size_m, *, reduction=1, **expected):
+    """Windows as NumPy arrays; `expected` holds further arguments of `expected_drones`."""
+    arrays = float32((rig.cameras, np.asarray(size_m)))
+    windows = _cut(images, *arrays, expected_drones(expected_m, **expected), reduction)
+    return jax.tree.map(np.asarray, windows)
+
+
+def expected_drones(expected_m, *, reach_m=0.1, occluding=True, floor_z_m=None):
+    """Expected drones; `reach_m` and `occluding` are one value for all drones or one for each."""
     count = len(expected_m)
-    arrays = float32(
-        (rig.cameras, np.asarray(expected_m), np.asarray(size_m), np.broadcast_to(reach_m, count))
+    position_m, reach_m, floor_z_m = float32(
+        (np.asarray(expected_m), np.broadcast_to(reach_m, count), floor_z_m)
     )
     occluding = None if occluding is None else np.broadcast_to(occluding, count)
-    return jax.tree.map(
-        np.asarray, _cut(images, *arrays, occluding, reduction, *float32((floor_z_m, offset_m)))
-    )
+    return ExpectedDrones(position_m, reach_m, occluding, floor_z_m)
 
 
 @partial(jax.jit, static_argnames="reduction")
-def _cut(images, cameras, expected_m, size_m, reach_m, occluding, reduction, floor_z_m, offset_m):
-    return cut(
-        images,
-        make_extents(cameras, size_m, offset_m),
-        ExpectedDrones(expected_m, reach_m, occluding, floor_z_m),
-        reduction=reduction,
-        ring=RING,
-    )
+def _cut(images, cameras, size_m, expected, reduction):
+    return cut(images, make_extents(cameras, size_m), expected, reduction=reduction, ring=RING)
 
 
 def pixels(patches):

@@ -26,7 +26,7 @@ from _sightings import Sightings, detected, mislabelled
 
 from psotrack.errors import PsotrackError
 from psotrack.inside_out import CameraPath
-from psotrack.inside_out.comparison import PathComparison, compare_paths
+from psotrack.inside_out.comparison import PathComparison, PathReference, compare_paths
 from psotrack.inside_out.comparison.plots import save_path_errors, save_paths
 from psotrack.support import atomic_write
 
@@ -135,10 +135,12 @@ def compared(recording: Recording, path: CameraPath) -> PathComparison:
     reference = recording.reference
     return compare_paths(
         path,
-        reference.time_s,
-        reference.position_m,
-        reference.orientation_wxyz,
-        orientation_time_s=reference.orientation_time_s,
+        PathReference(
+            reference.time_s,
+            reference.position_m,
+            reference.orientation_wxyz,
+            reference.orientation_time_s,
+        ),
     )
 
 

@@ -14,7 +14,7 @@ from psotrack.errors import SettingsError
 from psotrack.support import Report, refuse_to_overwrite
 
 if TYPE_CHECKING:
-    from psotrack.sweep import Device, Grid, SweepOutcome
+    from psotrack.sweep import Cluster, Device, Grid, Inputs, Store, SweepOutcome
 
 
 @click.command()
@@ -87,22 +87,26 @@ def sweep(
         return
     if grid_file is None:
         raise SettingsError("sweep", expected="a GRID.toml, or --status DIR", found="neither")
-    if workers is not None and cluster != "local":
-        raise SettingsError("--workers", expected="--cluster local with it", found=cluster or "no --cluster")
-    from psotrack.sweep import load
+    if workers is not None and cluster is None:
+        raise SettingsError("--workers", expected="--cluster local with it", found="no --cluster")
+    from psotrack.sweep import Cluster, load
 
+    where = None if cluster is None else Cluster(cluster, workers, device)
     grid = load(grid_file)
     if dry_run:
-        _show(grid, out, data, cache_folder(cache), jobs, quiet, force, json_path)
+        from psotrack.sweep import Inputs, Store
+
+        inputs = Inputs(data, cache_folder(cache), jobs)
+        _show(grid, inputs, Store(out) if out else None, quiet, force, json_path)
         return
     if out is None:
         raise SettingsError("--out", expected="the folder to write to", found="none")
     if json_path not in (None, Path("-")):
         refuse_to_overwrite(json_path, force)  # now, not after hours
-    if cluster is None:
+    if where is None:
         outcome = _run_here(grid, out, data, cache, jobs, device, report_to(quiet))
     else:
-        outcome = _run_there(grid, out, data, cache, cluster, workers, device, report_to(quiet))
+        outcome = _run_on_cluster(grid, out, data, cache, where, report_to(quiet))
     counts = {state: outcome.count(state) for state in ("finished", "failed", "left")}
     output_json(json_path, counts, force)
     failed = f", {counts['failed']} failed (see {out}/cells/*.error.json)" if counts["failed"] else ""
@@ -122,7 +126,7 @@ def _run_here(
     device: Device | None,
     report: Report,
 ) -> SweepOutcome:
-    """In this process."""
+    """Run the cells in this process."""
     from psotrack.support import keep_compiled
     from psotrack.sweep import run, share_processors, use_device
 
@@ -133,24 +137,14 @@ def _run_here(
     return run(grid, out, data=data, cache=cache_folder(cache), jobs=jobs, report=report)
 
 
-def _run_there(
-    grid: Grid,
-    out: Path,
-    data: Path,
-    cache: Path | None,
-    cluster: str,
-    workers: int | None,
-    device: Device | None,
-    report: Report,
+def _run_on_cluster(
+    grid: Grid, out: Path, data: Path, cache: Path | None, cluster: Cluster, report: Report
 ) -> SweepOutcome:
-    """By the workers of a cluster."""
+    """Run the cells as tasks of a cluster's workers."""
     from psotrack.sweep import run_on_cluster, use_device
 
-    use_device("cpu")  # this process computes nothing: a GPU is for the workers
-    folders = {"data": data, "cache": cache_folder(cache)}
-    return run_on_cluster(
-        grid, out, **folders, address=cluster, workers=workers, device=device, report=report
-    )
+    use_device("cpu")  # This process computes nothing, and must not take a GPU from the workers.
+    return run_on_cluster(grid, out, data=data, cache=cache_folder(cache), cluster=cluster, report=report)
 
 
 @click.command()
@@ -194,17 +188,10 @@ def table(folder: Path, rows_by: str, columns_by: str | None, value: str, scale:
 
 
 def _show(
-    grid: Grid,
-    out: Path | None,
-    data: Path,
-    cache: Path,
-    jobs: int | None,
-    quiet: bool,
-    force: bool,
-    json_path: Path | None,
+    grid: Grid, inputs: Inputs, store: Store | None, quiet: bool, force: bool, json_path: Path | None
 ) -> None:
-    """The cells of a grid, and how long they will take."""
-    from psotrack.sweep import Inputs, Store, cameras_label, estimate
+    """Print the cells of a grid, and an estimate of the time that they take."""
+    from psotrack.sweep import cameras_label, estimate
 
     cells = grid.cells()
     listed = [
@@ -217,7 +204,7 @@ def _show(
         }
         for cell in cells
     ]
-    expected = estimate(cells, Inputs(data, cache, jobs), Store(out) if out else None)
+    expected = estimate(cells, inputs, store)
     output_json(
         json_path, {"cells": listed, "estimate": vars(expected) | {"total_s": expected.total_s}}, force
     )

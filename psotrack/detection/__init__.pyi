@@ -2,12 +2,13 @@ from .aruco import marker_dictionary
 from .detector import Detector, DetectorSettings, OnnxDetector, detect_drones
 from .labels import LabelSettings
 from .store import stored_detections
-from .training_data import DATA_SET, write_data_set
+from .training_data import DATA_SET, FrameSelection, write_data_set
 
 __all__ = [
     "DATA_SET",
     "Detector",
     "DetectorSettings",
+    "FrameSelection",
     "LabelSettings",
     "OnnxDetector",
     "detect_drones",

@@ -29,13 +29,32 @@ _CLASS = "drone"
 _TRAIN, _VALIDATION = "train", "val"
 
 
+@dataclass(frozen=True)
+class FrameSelection:
+    """The frames of a data set: which frames are used, and which sequences are for validation.
+
+    Attributes:
+        validation: names of the sequences for validation; the other sequences are for training. Empty: the last one.
+        every: step between used frames.
+
+    Raises:
+        SettingsError: `every` is below 1.
+    """
+
+    validation: Sequence[str] = ()
+    every: int = 1
+
+    def __post_init__(self) -> None:
+        if self.every < 1:
+            raise SettingsError("every", expected="1 or more", found=f"{self.every}")
+
+
 def write_data_set(
     recordings: Sequence[Recording],
     out: Path | str,
     settings: LabelSettings,
     *,
-    validation: Sequence[str] = (),
-    every: int = 1,
+    selection: FrameSelection = FrameSelection(),
     force: bool = False,
     jobs: int | None = None,
     report: Report = no_progress,
@@ -49,8 +68,7 @@ def write_data_set(
         recordings: at least two recordings, each with a reference.
         out: folder of the data set.
         settings: settings of the labels.
-        validation: names of the sequences for validation; the other sequences are for training. Empty: the last one.
-        every: step between used frames.
+        selection: the used frames.
         force: replace an existing data set.
         jobs: largest number of processes; None: one per processor.
         report: shows the progress in frames of all cameras.
@@ -59,21 +77,19 @@ def write_data_set(
         Numbers of `images` and `labels` in the parts `train` and `val`.
 
     Raises:
-        SettingsError: two sequences have the same name, a validation name is unknown, no sequence is left for training,
-            or `every` is below 1.
+        SettingsError: two sequences have the same name, a validation name is unknown, or no sequence is left for
+            training.
         InputError: a sequence has no reference, no frame with all poses known, or inconsistent videos.
         OutputError: the folder exists and `force` is not set, or it cannot be written.
     """
     out = Path(out)
-    parts = _parts([recording.name for recording in recordings], validation)
+    parts = _parts([recording.name for recording in recordings], selection.validation)
     _check_replaceable(out, force)
-    if every < 1:
-        raise SettingsError("every", expected="1 or more", found=f"{every}")
     with atomic_write(out) as temporary:
         tasks = [
             task
             for recording in recordings
-            for task in _tasks(recording, parts[recording.name], settings, every, temporary)
+            for task in _tasks(recording, parts[recording.name], settings, selection.every, temporary)
         ]
         for kind, part in product(("images", "labels"), (_TRAIN, _VALIDATION)):
             (temporary / kind / part).mkdir(parents=True)

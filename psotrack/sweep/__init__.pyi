@@ -1,4 +1,4 @@
-from .cluster import run_on_cluster
+from .cluster import Cluster, run_on_cluster
 from .estimates import estimate
 from .frames import sweep
 from .grid_files import Cell, Grid, Perturbation, cameras_label, grid, key_of, load
@@ -12,6 +12,7 @@ from .tables import pivot
 
 __all__ = [
     "Cell",
+    "Cluster",
     "Device",
     "Grid",
     "Inputs",

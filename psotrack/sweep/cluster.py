@@ -43,11 +43,36 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
+class Cluster:
+    """A Dask cluster for a sweep.
+
+    Attributes:
+        address: address of the cluster's scheduler; "local" starts a cluster on this machine for each call.
+        workers: number of processes of the local cluster; None is one per processor, or one if `device` is "gpu".
+        device: device on which the workers compute; None leaves the choice to JAX.
+
+    Raises:
+        SettingsError: `workers` is given for a cluster that is not local.
+    """
+
+    address: str = "local"
+    workers: int | None = None
+    device: Device | None = None
+
+    def __post_init__(self) -> None:
+        if self.workers is not None and self.address != "local":
+            raise SettingsError(
+                "--workers", expected="--cluster local with it", found=f"--cluster {self.address}"
+            )
+
+
+@dataclass(frozen=True)
 class _Job:
     """Settings of a sweep that its workers need.
 
     Attributes:
-        out, data, cache, device: as in `run_on_cluster`.
+        out, data, cache: folders, as in `run_on_cluster`.
+        device: device on which the workers compute; None leaves the choice to JAX.
         devices: number of JAX devices that share a worker's batches; None is one per processor.
         token: text that differs from sweep to sweep, so that a worker reads files again for each sweep.
     """
@@ -66,9 +91,7 @@ def run_on_cluster(
     *,
     data: Path | str,
     cache: Path | str,
-    address: str = "local",
-    workers: int | None = None,
-    device: Device | None = None,
+    cluster: Cluster = Cluster(),
     report: Report = no_progress,
 ) -> SweepOutcome:
     """Run the unfinished cells of a grid as tasks of a cluster; otherwise the same as `runner.run`.
@@ -78,18 +101,14 @@ def run_on_cluster(
         out: folder of the results. All workers must see `out`, `data` and `cache` under the same paths.
         data: root folder of the sequences that the grid names.
         cache: folder of the stored silhouettes and of compiled programs.
-        address: address of the cluster's scheduler; "local" starts a cluster on this machine for this call.
-        workers: number of processes of the local cluster; None is one per processor, or one if `device` is "gpu".
-        device: device on which the workers compute; None leaves the choice to JAX.
+        cluster: the cluster.
         report: progress bar for the cells.
 
     Raises:
         InputError: a sequence does not exist, or there is no cluster at the address.
         OutputError: the results cannot be written.
-        SettingsError: Dask is not installed, or `workers` is given for a cluster that is not local.
+        SettingsError: Dask is not installed.
     """
-    if workers is not None and address != "local":
-        raise SettingsError("--workers", expected="--cluster local with it", found=f"--cluster {address}")
     dask = _distributed()
     out, data, cache = (Path(os.path.abspath(folder)) for folder in (out, data, cache))
     # Each row names the device on which it was made, which may differ from this one.
@@ -102,13 +121,13 @@ def run_on_cluster(
             cells.append(cell)
         else:
             results.append(result)
-    local = workers or (1 if device == "gpu" else processors())
-    devices = max(1, processors() // local) if address == "local" else None
-    job = _Job(out, data, cache, device, devices, secrets.token_hex(8))
+    workers = cluster.workers or (1 if cluster.device == "gpu" else processors())
+    devices = max(1, processors() // workers) if cluster.address == "local" else None
+    job = _Job(out, data, cache, cluster.device, devices, secrets.token_hex(8))
     with report("sweep", len(cells) + len(results)) as advance:
         advance(len(results))
         if cells:
-            with _client(dask, address, local) as client:
+            with _client(dask, cluster.address, workers) as client:
                 for result in _results(dask, client, cells, job, inputs, store):
                     results.append(result)
                     advance(1)

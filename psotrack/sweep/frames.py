@@ -10,8 +10,10 @@ import pandas as pd
 
 from psotrack.errors import InputError
 from psotrack.support import Report, no_progress
+from psotrack.sweep.cluster import Cluster, run_on_cluster
 from psotrack.sweep.grid_files import Grid, load
 from psotrack.sweep.grid_files import grid as grid_of
+from psotrack.sweep.runner import run
 from psotrack.sweep.store import Store
 
 
@@ -22,8 +24,7 @@ def sweep(
     data: Path | str = "data",
     cache: Path | str,
     jobs: int | None = None,
-    cluster: str | None = None,
-    workers: int | None = None,
+    cluster: Cluster | str | None = None,
     report: Report = no_progress,
 ) -> pd.DataFrame:
     """Track with every combination of a grid's settings; returns one row per cell and run, as `psotrack sweep` stores.
@@ -37,9 +38,8 @@ def sweep(
         data: root folder of the sequences that the grid names.
         cache: folder of the stored silhouettes.
         jobs: number of processes that make silhouettes; None is one per processor.
-        cluster: "local" for a cluster on this machine, the address of a Dask scheduler, or None for this process. With
-            a local cluster, scripts must make this call below `if __name__ == "__main__":`.
-        workers: number of processes of the local cluster; None is one per processor.
+        cluster: a `Cluster`, "local" for a cluster on this machine, the address of a Dask scheduler, or None for this
+            process. With a local cluster, scripts must make this call below `if __name__ == "__main__":`.
         report: progress bar for the cells.
 
     Returns:
@@ -56,7 +56,7 @@ def sweep(
         How the error falls with the number of particles:
 
             rows = sweep(
-                {"sequences": ["S02_D4_A"], "runs": 5, "grid": {"particles": [20, 50, 100]}},
+                {"sequences": ["S02_D4_A"], "runs": 5, "grid": {"swarm.particles": [20, 50, 100]}},
                 out="results", data="data", cache="cache", report=psotrack.support.progress.terminal,
             )
             rows.groupby("settings.swarm.particles")["mean_error_m"].agg(["mean", "std"])
@@ -65,15 +65,10 @@ def sweep(
     read = read if isinstance(read, Grid) else grid_of(read)
     out, data, cache = Path(out), Path(data), Path(cache)
     if cluster is None:
-        from psotrack.sweep.runner import run
-
         outcome = run(read, out, data=data, cache=cache, jobs=jobs, report=report)
     else:
-        from psotrack.sweep.cluster import run_on_cluster
-
-        outcome = run_on_cluster(
-            read, out, data=data, cache=cache, address=cluster, workers=workers, report=report
-        )
+        cluster = Cluster(cluster) if isinstance(cluster, str) else cluster
+        outcome = run_on_cluster(read, out, data=data, cache=cache, cluster=cluster, report=report)
     if not outcome.seeds:
         found = f"that all failed: {outcome.errors[0]}"
         raise InputError(out, expected="a cell that can be run", found=found)

@@ -1,6 +1,6 @@
 """Comparison of a camera's path with a reference, by the paper's procedure (Tables 7 and 8).
 
-In: a `CameraPath`, and positions (and orientations) of a reference on clocks of its own. Out: a `PathComparison` with
+In: a `CameraPath`, and a `PathReference` with clocks of its own. Out: a `PathComparison` with
 clock offsets, lever arm, and distances and angles in every frame; `plots` draws it. Others use `compare_paths`, its
 results and `Statistics`; `visibility.visible_markers` says which markers a camera could see.
 
@@ -10,6 +10,7 @@ Imports go in this order: `clocks`, `comparing`, `plots`; `visibility` stands al
 from psotrack.inside_out.comparison.comparing import (
     OrientationComparison,
     PathComparison,
+    PathReference,
     Statistics,
     compare_paths,
     mean_rotation,
@@ -19,6 +20,7 @@ from psotrack.inside_out.comparison.comparing import (
 __all__ = [
     "OrientationComparison",
     "PathComparison",
+    "PathReference",
     "Statistics",
     "compare_paths",
     "mean_rotation",

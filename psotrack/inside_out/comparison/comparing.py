@@ -53,6 +53,24 @@ class Statistics:
 
 
 @dataclass(frozen=True)
+class PathReference:
+    """A reference for a camera's path: poses of the drone that carries the camera, by clocks other than the video's.
+
+    Attributes:
+        time_s: (samples,), times of the positions by the reference's clock, seconds.
+        position_m: (samples, 3), positions, world, metres; NaN where unknown.
+        orientation_wxyz: (turns, 4), orientations, body to world, at `orientation_time_s`, or at `time_s` if that is
+            None; NaN where unknown; None if the reference has no orientations.
+        orientation_time_s: (turns,), times of the orientations if they have a clock of their own, seconds.
+    """
+
+    time_s: Float[np.ndarray, "samples"]
+    position_m: Float[np.ndarray, "samples 3"]
+    orientation_wxyz: Float[np.ndarray, "turns 4"] | None = None
+    orientation_time_s: Float[np.ndarray, "turns"] | None = None
+
+
+@dataclass(frozen=True)
 class OrientationComparison:
     """Orientations of a path and its reference at corresponding frames. Values that are not known are NaN.
 
@@ -109,11 +127,8 @@ class PathComparison:
 
 def compare_paths(
     path: CameraPath,
-    reference_time_s: Float[np.ndarray, "samples"],
-    reference_m: Float[np.ndarray, "samples 3"],
-    reference_wxyz: Float[np.ndarray, "turns 4"] | None = None,
+    reference: PathReference,
     *,
-    orientation_time_s: Float[np.ndarray, "turns"] | None = None,
     with_lever_arm: bool = True,
     with_turn: bool = True,
     max_offset_s: float | None = None,
@@ -125,11 +140,7 @@ def compare_paths(
 
     Args:
         path: path at the times of the video.
-        reference_time_s: (samples,), times of the reference's positions by its own clock, seconds.
-        reference_m: (samples, 3), positions, world, metres; NaN where unknown.
-        reference_wxyz: (turns, 4), orientations, body to world, at `reference_time_s` or else `orientation_time_s`; NaN
-            where unknown.
-        orientation_time_s: (turns,), times of the orientations if they have a clock of their own, seconds.
+        reference: poses by the reference.
         with_lever_arm: estimate a constant lever arm in the body.
         with_turn: estimate a constant turn between the camera's axes and the body's; without it the axes are the same.
         max_offset_s: offsets from minus this to this are tried, seconds; None tries all offsets at which half of the
@@ -139,21 +150,26 @@ def compare_paths(
         SettingsError: the range is smaller than a step of the reference.
         InputError: the two have nothing in common, or the motion does not determine the offset; see `find_offset`.
     """
-    turns_s, turn_offset_s = reference_time_s, None
-    if reference_wxyz is not None and orientation_time_s is not None:
-        turns_s = orientation_time_s
+    reference_wxyz = reference.orientation_wxyz
+    turns_s, turn_offset_s = reference.time_s, None
+    if reference_wxyz is not None and reference.orientation_time_s is not None:
+        turns_s = reference.orientation_time_s
         turn_offset_s = clocks.find_orientation_offset(
             path, turns_s, reference_wxyz, with_turn=with_turn, max_offset_s=max_offset_s
         )
-    bodies = _body_orientations(path, reference_time_s, reference_wxyz, turns_s, turn_offset_s)
+    bodies = _body_orientations(path, reference.time_s, reference_wxyz, turns_s, turn_offset_s)
     offset_s, std_s = clocks.find_position_offset(
-        path, reference_time_s, reference_m, bodies if with_lever_arm else None, max_offset_s=max_offset_s
+        path,
+        reference.time_s,
+        reference.position_m,
+        bodies if with_lever_arm else None,
+        max_offset_s=max_offset_s,
     )
     turned = bodies(offset_s) if with_lever_arm else None
     placed = time_shift.ShiftedPair.of(
         path.trajectories("camera"),
-        reference_time_s,
-        reference_m[:, None],
+        reference.time_s,
+        reference.position_m[:, None],
         None if turned is None else turned[:, None],
         with_lever_arm,
     )
