@@ -163,11 +163,11 @@ def refused(points, pixels, *, noise_px=1.0):
     return str(error.value)
 
 
-def test_what_no_pose_can_be_found_from_is_refused():
+def test_points_that_determine_no_pose_are_refused():
     rng = np.random.default_rng(9)
     one, points = view(rng)
     pixels = project(one, points)[0]
-    assert "at least 4 points of known place, found 3" in refused(points[:3], pixels[:3])
+    assert "at least 4 points of known position, found 3" in refused(points[:3], pixels[:3])
     line = np.array([0, 0, 1.0]) + np.arange(5)[:, None] * np.array([0.2, 0.1, 0.05])
     assert "not all on one line" in refused(line, project(one, line)[0])
     broken = points.copy()

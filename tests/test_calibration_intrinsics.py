@@ -78,14 +78,14 @@ def probe_of(folder, poses):
     return board_video(folder / "board.avi", poses)
 
 
-def test_boards_that_tell_too_little_are_refused(tmp_path):
+def test_boards_that_do_not_determine_the_lens_are_refused(tmp_path):
     with pytest.raises(InputError, match="at least 8 frames that show 8 corners"):
         lens_of_board(probe_of(tmp_path, [((0, 0, 0), (0, 0, 0.4))] * 5), BOARD)
     (tmp_path / "board.avi").unlink()
-    # Of the second the fit ends at a focal length of 320 000 px, with which boards seem tilted: it was taken once.
+    # The fit to the second video ends at a focal length of 320 000 px, with which parallel boards seem tilted.
     for step_m, distance_m in ((0.003, 0.4), (0.005, 0.45)):
         flat = [((0, 0, 3.0 * i), (step_m * i, 0, distance_m)) for i in range(10)]
-        with pytest.raises(InputError, match="views that fix the focal length"):
+        with pytest.raises(InputError, match="views that determine the focal length"):
             lens_of_board(probe_of(tmp_path, flat), BOARD)
     with pytest.raises(SettingsError, match=r"board\.marker_m"):
         Board((7, 5), 0.04, 0.05)

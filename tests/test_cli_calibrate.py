@@ -162,7 +162,7 @@ def test_a_point_in_two_places_is_refused(tmp_path):
         "extrinsics", "--pairs", pairs, *lens
     )
     pairs = write_lines(tmp_path / "pairs.csv", "camera,point,x_px,y_px,x_m,y_m,z_m", "c0,p,1,2,0,0,1")
-    assert "camera c0: expected at least 4 points of known place, found 1" in refused(
+    assert "camera c0: expected at least 4 points of known position, found 1" in refused(
         "extrinsics", "--pairs", pairs, *lens
     )
 
@@ -277,7 +277,7 @@ def test_intrinsics_of_a_board(tmp_path):
     assert "fx_px" in shown
     assert "residual" in shown
     wrong = ("--squares", "8x6", "--square", "0.04", "--marker", "0.03", "--dictionary", "6x6_50")
-    assert "is it this board?" in refused(
+    assert "those of the printed board" in refused(
         "intrinsics", tmp_path / "board.avi", *wrong, "--out", tmp_path / "x.yml"
     )
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from psotrack.geometry import Rig, project
-from psotrack.initiation.initialisation import choose_paths, find_drones, with_usual_size
+from psotrack.initiation.initialisation import choose_paths, fill_unknown_sizes, find_drones
 from psotrack.initiation.paths import propose_paths
 from psotrack.silhouettes import find_blobs, stack_blobs
 from psotrack.silhouettes.blobs import MOST_BLOBS, Blobs
@@ -272,9 +272,9 @@ def test_the_number_of_drones_is_knowledge():
 
 def test_one_that_no_camera_sees_by_itself_has_the_size_of_the_others():
     sizes = np.array([[0.4, 0.4, 0.3], [np.nan] * 3, [0.6, 0.6, 0.2]])
-    assert with_usual_size(sizes)[1].tolist() == [0.5, 0.5, 0.25]
-    assert np.isnan(with_usual_size(np.full((2, 3), np.nan))).all()
-    assert with_usual_size(np.empty((0, 3))).shape == (0, 3)
+    assert fill_unknown_sizes(sizes)[1].tolist() == [0.5, 0.5, 0.25]
+    assert np.isnan(fill_unknown_sizes(np.full((2, 3), np.nan))).all()
+    assert fill_unknown_sizes(np.empty((0, 3))).shape == (0, 3)
 
 
 def test_blobs_that_agree_on_nothing_are_no_drones():

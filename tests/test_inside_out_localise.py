@@ -2,6 +2,9 @@
 
 import json
 import signal
+import subprocess
+import sys
+import textwrap
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -642,7 +645,7 @@ def test_markers_are_needed(room, tmp_path):
 def test_the_image_of_another_size_is_named(tmp_path):
     for name, shape in (("a1.png", (20, 30)), ("a2.png", (20, 32))):
         cv2.imwrite(str(tmp_path / name), np.zeros(shape, np.uint8))
-    with pytest.raises(InputError, match=r"a2.png: expected 30 x 20 pixels as a1.png has, found 32 x 20"):
+    with pytest.raises(InputError, match=r"a2.png: expected 30 x 20 pixels as in a1.png, found 32 x 20"):
         list(open_source(tmp_path, fps=25.0).frames())
 
 
@@ -687,6 +690,41 @@ def test_reading_ahead_keeps_order_and_raises_errors():
     with pytest.raises(InputError, match="frame 1"):
         found.extend(read_ahead(broken()))
     assert list(read_ahead(iter([]))) == []
+
+
+def test_ctrl_c_ends_the_wait_for_an_item_though_another_thread_received_the_signal():
+    program = """
+        import signal, threading, time
+        from psotrack.inside_out.frames import read_ahead
+
+        # A test run in the background ignores SIGINT, and its children inherit this.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        # The kernel gives the signal to this thread, because the main thread and the reader block the signal.
+        threading.Thread(target=time.sleep, args=(300,), daemon=True).start()
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+
+        def frames():
+            print("reading", flush=True)
+            time.sleep(300)
+            yield 0
+
+        list(read_ahead(frames()))
+    """
+    with subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(program)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as child:
+        try:
+            assert child.stdout.readline() == "reading\n"
+            child.send_signal(signal.SIGINT)
+            # One second suffices on an idle machine.
+            _, stderr = child.communicate(timeout=30)
+        finally:
+            child.kill()
+    assert child.returncode == -signal.SIGINT
+    assert stderr.endswith("KeyboardInterrupt\n")
 
 
 def test_newest_items_are_used_and_the_last_is_never_left_out():

@@ -34,7 +34,7 @@ class AdjustedRig:
             point.
         used: (points, cameras), False for outliers and for unseen points.
         covariance: (cameras, 6, 6), covariance of a small turn about the camera's axes, rad, and of the translation, m,
-            while the rig as a whole is held; 0 for fixed cameras.
+            without common motions of the whole rig; 0 for fixed cameras.
         joint_covariance: (unknowns, unknowns), covariance of the unknowns of all cameras, and of the logarithm of the
             focal lengths' factor, which is last.
         centre_covariance_m2: (cameras, 3, 3), covariances of the camera centres, world, m².
@@ -64,13 +64,16 @@ def adjust(
 ) -> AdjustedRig:
     """Adjust the cameras of a rig, and triangulate the points, so that projections agree with measured pixels.
 
-    The covariance is that of independent errors with the stated noise, or larger if the residuals are larger, plus
-    that of errors in common: for example, the middle of a drone's box has the same error in many frames.
+    The covariance has two parts. The first part comes from independent errors with the stated noise, or with larger
+    noise if the residuals are larger. The second part comes from common errors: for example, the middle of a drone's
+    box has the same error in many frames.
 
     Args:
         rig: approximate cameras.
-        points_px: (points, cameras, 2), pixels of the same points in all cameras; NaN where a camera does not see one.
-        noise_px: standard deviation of independent errors along x and along y: one number, or one of each pixel.
+        points_px: (points, cameras, 2), pixels of the same points in all cameras; NaN where a camera does not see a
+            point.
+        noise_px: standard deviation of independent errors along x and along y, pixels: one number, or (points,
+            cameras).
         fixed: names of cameras that do not move.
         rescaled: names of cameras whose focal lengths are multiplied by a common factor.
         common_errors: errors that several points have in common.
@@ -85,7 +88,7 @@ def adjust(
         if unknown:
             raise SettingsError(what, expected=f"some of {', '.join(rig.names)}", found=", ".join(unknown))
     if len(set(fixed)) == len(rig) and not rescaled:
-        raise SettingsError("fixed", expected="a camera that may move", found="all of them")
+        raise SettingsError("fixed", expected="a camera that may move", found="all cameras")
     placed = np.isfinite(points_px).all(axis=-1)
     if placed.any():
         check_positive("noise_px", float(noise_px[placed].min()))
@@ -107,7 +110,7 @@ def adjust(
     for _ in range(5):
         sigmas = bundle.distance_px / noise
         inliers = placed[rows] & (sigmas <= GATE * max(1.0, spread_px(sigmas[bundle.used], unknowns)))
-        # A point in one camera alone has no position.
+        # A point that only one camera sees has no position.
         inliers &= (inliers.sum(axis=1) >= 2)[:, None]
         before, bundle = bundle, replace(bundle, used=inliers, robust=False).solved()
         if (bundle.used == before.used).all():
@@ -128,7 +131,7 @@ def _check_seen(
                 f"camera {name}",
                 expected="at least 6 points that another camera sees too",
                 found=f"{count}",
-                remedy="leave it out, or keep it fixed",
+                remedy="leave the camera out, or keep it fixed",
             )
     observations = int(placed[:, [rig.names.index(name) for name in rescaled]].sum())
     if rescaled and observations < 6:
@@ -136,7 +139,7 @@ def _check_seen(
             "focal lengths",
             expected="at least 6 points that another camera sees too",
             found=f"{observations}",
-            remedy="keep them",
+            remedy="do not rescale the focal lengths",
         )
 
 
@@ -175,8 +178,8 @@ def _adjusted(
     if scale.size and np.linalg.cond(information / np.outer(scale, scale)) > 1e14:
         raise InputError(
             "cameras",
-            expected="points that tie all cameras together",
-            found="some that see none of the others' points",
+            expected="points that connect all cameras",
+            found="cameras that share no points with the others",
         )
     residual_px = bundle.distance_px
     kept = used.any(axis=1)

@@ -24,7 +24,13 @@ _MAX_STEPS = 200
 
 @dataclass(frozen=True)
 class BundleState:
-    """Unknowns of a bundle adjustment: poses (cameras, 4, 4), points (points, 3), world, and a focal length factor."""
+    """Unknowns of a bundle adjustment.
+
+    Attributes:
+        T_cam_world: (cameras, 4, 4), transforms from world to camera, metres.
+        points_m: (points, 3), positions of the points in the world, metres.
+        focal_scale: common factor of the focal lengths.
+    """
 
     T_cam_world: Float[np.ndarray, "cameras 4 4"]
     points_m: Float[np.ndarray, "points 3"]
@@ -193,7 +199,7 @@ def camera_columns(index: int, num_cameras: int) -> Int[np.ndarray, "7"]:
 
 
 def scale_focal_lengths(lenses: Camera, focal_scale: float | Float[np.ndarray, " cameras"]) -> Camera:
-    """Multiply the focal lengths of lenses by one factor, or by one factor each."""
+    """Multiply the focal lengths of all lenses by one factor, or by one factor per lens."""
     K = np.array(lenses.K)
     K[..., :2, :2] *= np.asarray(focal_scale)[..., None, None]
     return replace(lenses, K=K)

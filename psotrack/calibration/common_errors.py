@@ -1,7 +1,7 @@
-"""Errors that a camera has in common for many points, while least squares assume independent errors.
+"""Errors that many points of a camera have in common, whereas least squares assume independent errors.
 
 A detector draws its boxes around a drone's outline, and the middle of the outline is not the drone's middle. A part of
-this error differs from frame to frame, and a part lasts. If the lasting parts of a camera's errors e have the
+this error differs from frame to frame, and another part lasts. If the lasting parts of a camera's errors e have the
 covariance S, the estimate x = A⁻¹ Jᵀ W e of least squares has the covariance A⁻¹ Jᵀ W S W J A⁻¹ in addition to that of
 the independent errors (the sandwich of P. J. Huber 1967; Liang & Zeger 1986 for groups).
 """
@@ -41,7 +41,7 @@ def covariance_of_common_errors(
     equations: ReducedEquations,
     common_errors: Sequence[CommonErrors],
 ) -> Float[np.ndarray, "free free"]:
-    """Covariance of the unknowns that common errors add.
+    """Compute the covariance that common errors add to the covariance of the unknowns.
 
     If the residuals show that the errors of a kind are larger than stated, the larger size is used.
 

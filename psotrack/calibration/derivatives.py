@@ -30,7 +30,7 @@ def pixel_slopes(
     t_m: Float[np.ndarray, "3"],
     lens: Camera,
 ) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 unknowns"]]:
-    """Pixels, and their derivatives by OpenCV's unknowns: a Rodrigues vector, a translation, and the intrinsics."""
+    """Pixels of points, and their derivatives by OpenCV's unknowns: Rodrigues vector, translation and intrinsics."""
     K, dist = np.asarray(lens.K), np.asarray(lens.dist)
     bent, by = cv2.projectPoints(points_m[:, None], turn, t_m, np.eye(3), dist if dist.size else None)
     pixels = np.asarray(bent).reshape(-1, 2) @ K[:2, :2].T + K[:2, 2]

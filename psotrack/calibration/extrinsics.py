@@ -1,8 +1,9 @@
 """The pose of a camera, from points whose positions in the world and in the image are known, in float64.
 
-The perspective-n-point problem with a robust start (SQPnP of Terzakis & Lourakis, ECCV 2020, on sets of four points;
-IPPE of Collins & Bartoli, IJCV 2014, where points are in a plane), least squares of the reprojection error with a
-Cauchy loss, and once more without on the points that agree. The covariance is that of least squares,
+The perspective-n-point problem is solved in three steps. Closed-form solvers give initial poses (SQPnP of Terzakis &
+Lourakis, ECCV 2020, on sets of four points; IPPE of Collins & Bartoli, IJCV 2014, for points in a plane). Least squares
+of the reprojection error with a Cauchy loss finds the outliers. Least squares without the outliers gives the pose and
+its covariance,
 
     C = σ² (JᵀJ)⁻¹,
 
@@ -111,7 +112,7 @@ def _check_points(
     """The extents of the points along their principal axes, largest first."""
     if len(points_m) != len(points_px) or len(points_m) < MIN_POINTS:
         raise InputError(
-            name, expected=f"at least {MIN_POINTS} points of known place", found=f"{len(points_m)}"
+            name, expected=f"at least {MIN_POINTS} points of known position", found=f"{len(points_m)}"
         )
     if not (np.isfinite(points_m).all() and np.isfinite(points_px).all()):
         raise InputError(name, expected="points with finite coordinates", found="NaN or infinity")
@@ -120,8 +121,8 @@ def _check_points(
         raise InputError(
             name,
             expected="points that are not all on one line",
-            found=f"{len(points_m)} that are",
-            remedy="mark some beside it",
+            found=f"{len(points_m)} points on one line",
+            remedy="mark points beside this line",
         )
     return extent_m
 
@@ -134,8 +135,8 @@ def _check_unique(pose: Pose, others: list[Pose], name: str) -> None:
             raise InputError(
                 name,
                 expected="points that only one pose fits",
-                found=f"two poses, {apart_m:.2g} m apart, that fit as well",
-                remedy="mark more points, some of them off the plane of the others",
+                found=f"two poses, {apart_m:.2g} m apart, that fit equally well",
+                remedy="mark more points that are not in the plane of the others",
             )
 
 
@@ -154,20 +155,20 @@ def _check_fit(
         return
     if extent_m[2] > _FLAT * extent_m[0]:
         mirrored = points_m * np.array([1.0, 1.0, -1.0])
-        twin = min(initial_poses(mirrored, points_px, lens, noise_px, extent_m), key=lambda one: one.cost)
+        twin = min(initial_poses(mirrored, points_px, lens, noise_px, extent_m), key=lambda pose: pose.cost)
         twin = refine_pose(mirrored, points_px, twin, lens, noise_px, loss="cauchy")
         if np.median(distances_px(mirrored, points_px, twin, lens)) < 0.2 * typical_px:
             raise InputError(
                 name,
                 expected="points in right-handed axes",
-                found="a mirrored world, which they fit",
-                remedy="one axis points the wrong way, or two are swapped",
+                found="points that fit a mirrored world",
+                remedy="reverse the axis that has the wrong sign, or swap back two axes",
             )
     raise InputError(
         name,
         expected=f"a pose that most points fit to about {noise_px:g} px",
-        found=f"{typical_px:.0f} px for half of them",
-        remedy="are points mixed up, or is it another camera's lens?",
+        found=f"a median distance of {typical_px:.0f} px",
+        remedy="check for points that are mixed up, and for the lens of another camera",
     )
 
 
@@ -179,13 +180,18 @@ def _covariance(
     residual_px: Float[np.ndarray, " points"],
     name: str,
 ) -> Float[np.ndarray, "6 6"]:
+    """Covariance of a small turn about the camera's axes (rad) and of the translation (m)."""
     _, by_turn, by_shift = reproject(points_m, pose.R, pose.t_m, lens)
     slopes = np.concatenate([by_turn, by_shift], axis=-1).reshape(-1, 6) / noise_px
     # QR keeps the condition number that JᵀJ would square. Columns are scaled to the same length.
     scale = np.linalg.norm(slopes, axis=0)
     triangle = np.linalg.qr(slopes / scale, mode="r")
     if np.linalg.cond(triangle) > 1e10:
-        raise InputError(name, expected="points that fix the camera's pose", found="some that leave it free")
+        raise InputError(
+            name,
+            expected="points that determine the camera's pose",
+            found="points that leave it undetermined",
+        )
     half = np.linalg.inv(triangle) / scale[:, None]
     factor = inflation(float(np.sum((residual_px / noise_px) ** 2)), 2 * len(points_m) - 6)
     return factor * half @ half.T

@@ -30,9 +30,9 @@ _FRAMES = 15
 #: Smallest share of these frames that must show a marker: a rarer marker is a false detection.
 _SEEN = 0.5
 #: Standard deviation of each kind of common error of boxes, as a share of the box's mean side, and time over which the
-#: first kind lasts, seconds. A drone's error lasts while its attitude is the same; its shape causes another error in
-#: all frames of a camera; and all drones of a camera share an error that varies over the image, because bodies are near
-#: and far, and are seen from above or from the side.
+#: first kind lasts, seconds. There are three kinds. The first lasts as long as a drone's attitude is the same. The
+#: second comes from the drone's shape and is the same in all frames of a camera. The third is shared by all drones of a
+#: camera and varies over the image, because the camera sees drones at different distances and elevations.
 _COMMON_SHARE, _COMMON_S = 0.015, 1.0
 
 
@@ -150,8 +150,8 @@ def find_drones_in_boxes(
 ) -> DroneViews:
     """Find tracked drones in the images: the middle of the box that contains a drone's projection.
 
-    Not used are boxes that contain two drones, drones in two boxes, boxes that the image's border cuts, and boxes that
-    touch other boxes. Of long tracks only every n-th frame is used, because neighbouring frames have the same errors.
+    Boxes that contain two drones, drones in two boxes, boxes that the image's border cuts, and boxes that touch other
+    boxes are not used. Of long tracks only every n-th frame is used, because neighbouring frames have the same errors.
 
     Args:
         rig: cameras with which the drones were tracked.
@@ -193,7 +193,7 @@ def find_drones_in_boxes(
 def _clear(
     xyxy: Float[np.ndarray, "boxes 4"], image_size_wh: Float[np.ndarray, "2"]
 ) -> Bool[np.ndarray, " boxes"]:
-    """Say which boxes are neither cut by the image's border nor touched by another box."""
+    """(boxes,), True for boxes that the image's border does not cut and that no other box touches."""
     sides = np.minimum(xyxy[:, None, 2:], xyxy[:, 2:]) - np.maximum(xyxy[:, None, :2], xyxy[:, :2])
     touched = (sides > 0).all(axis=-1).sum(axis=1) > 1
     cut = (xyxy[:, :2] < BORDER_PX) | (xyxy[:, 2:] > image_size_wh - BORDER_PX)
@@ -215,14 +215,14 @@ def _make_common_errors(
         CommonErrors(second, _COMMON_SHARE * side_px),
         CommonErrors(drone, _COMMON_SHARE * side_px),
         *(
-            CommonErrors(everything, _COMMON_SHARE * side_px * of)
-            for of in (1.0, *np.moveaxis(from_middle, -1, 0))
+            CommonErrors(everything, _COMMON_SHARE * side_px * factor)
+            for factor in (1.0, *np.moveaxis(from_middle, -1, 0))
         ),
     )
 
 
 def _read_table(path: str | Path) -> Table:
-    """Read a table whose last cells may be empty; `read_table` would take such a row as too short."""
+    """Read a table whose last cells may be empty; `read_table` would refuse such a row as too short."""
     path = Path(path)
     header, *rows = read_rows(path, _SEPARATOR) or [TextRow(path, 1, ("",))]
     columns = tuple(Column(index, cell.lower(), "", cell) for index, cell in enumerate(header.cells))

@@ -1,6 +1,6 @@
-"""Intrinsics: from what a data sheet says, and from a video of a ChArUco board that is moved about.
+"""Intrinsics of a camera, from its data sheet, or from a video in which a ChArUco board is moved.
 
-The calibration is Z. Zhang's (PAMI 22(11), 2000), as OpenCV has it, with k1, k2, p1, p2.
+The calibration is Z. Zhang's method (PAMI 22(11), 2000) as implemented in OpenCV, with the coefficients k1, k2, p1, p2.
 """
 
 from __future__ import annotations
@@ -16,20 +16,21 @@ from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.geometry import Camera, make_camera
 from psotrack.recordings import VideoInfo, read_frames
 
-#: Views that a calibration needs: fewer fix k1, k2, p1, p2 badly.
+#: Smallest number of views: fewer views determine k1, k2, p1, p2 badly.
 _MIN_VIEWS = 8
-#: Corners that a view needs: with fewer the board's own pose is loose.
+#: Smallest number of corners in a view: fewer corners determine the board's pose badly.
 _MIN_CORNERS = 8
-#: Views that are used; more do not tell more, once they are spread.
+#: Largest number of views that are used: more views add little, because the chosen views differ most.
 _MOST_VIEWS = 40
-#: Frames that boards are sought in.
+#: Largest number of frames in which the board is searched; limits the time for long videos.
 _MOST_FRAMES = 300
-#: Share of the focal length that its standard deviation may be.
-_LOOSE = 0.02
-#: What two of the boards must differ by.
-_TILTED_DEG = 10.0
-#: Widths of an image that a focal length may be: 20 are a field of view of 3 degrees.
-_MOST_WIDTHS = 20.0
+#: Largest standard deviation of the focal length, as a share of the focal length.
+_MAX_FOCAL_ERROR = 0.02
+#: Smallest angle between the planes of the board in the two views that differ most, degrees: views of parallel boards
+#: do not determine the focal length.
+_MIN_TILT_DEG = 10.0
+#: Largest focal length, in image widths: 20 widths are a field of view of 3 degrees.
+_MAX_FOCAL_WIDTHS = 20.0
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Board:
         squares_wh: columns and rows of squares.
         square_m: side of a square in metres.
         marker_m: side of a marker in metres.
-        dictionary: of its markers, such as 4x4_50.
+        dictionary: name of the markers' dictionary, such as 4x4_50.
     """
 
     squares_wh: tuple[int, int]
@@ -60,7 +61,7 @@ class Board:
             )
 
     def opencv(self) -> cv2.aruco.CharucoBoard:
-        """The board as OpenCV knows it."""
+        """The board as an object of OpenCV."""
         return cv2.aruco.CharucoBoard(
             self.squares_wh, self.square_m, self.marker_m, marker_dictionary(self.dictionary)
         )
@@ -68,13 +69,13 @@ class Board:
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics from a video, and how well they fit.
+    """Intrinsics from a video, with standard deviations and residuals.
 
     Attributes:
-        camera: at the world's origin.
+        camera: intrinsics; the pose is the world's origin.
         std: (8,), standard deviations of fx, fy, cx, cy in pixels, and of k1, k2, p1, p2.
         frame: (views,), numbers of the frames that were used.
-        residual_px: (views,), root mean square reprojection error of each.
+        residual_px: (views,), root mean square reprojection error of each view, pixels.
     """
 
     camera: Camera
@@ -84,7 +85,9 @@ class Lens:
 
 
 def lens_of_view(horizontal_deg: float, vertical_deg: float, image_size_wh: tuple[int, int]) -> Camera:
-    """A lens without distortion from its field of view, from edge to edge of the image; at the world's origin.
+    """Make a lens without distortion from its field of view, from edge to edge of the image.
+
+    The pose of the camera is the world's origin.
 
     Raises:
         SettingsError: an angle is not between 0 and 180 degrees.
@@ -94,13 +97,17 @@ def lens_of_view(horizontal_deg: float, vertical_deg: float, image_size_wh: tupl
         raise SettingsError(
             "field of view", expected="angles between 0 and 180 degrees", found=f"{angles_deg.tolist()}"
         )
-    return _plain(np.array(image_size_wh) / 2 / np.tan(np.deg2rad(angles_deg) / 2), image_size_wh)
+    return _undistorted_camera(
+        np.array(image_size_wh) / 2 / np.tan(np.deg2rad(angles_deg) / 2), image_size_wh
+    )
 
 
 def lens_of_sensor(
     focal_length_mm: float, sensor_mm: tuple[float, float], image_size_wh: tuple[int, int]
 ) -> Camera:
-    """A lens without distortion from its focal length and the sensor's width and height; at the world's origin.
+    """Make a lens without distortion from its focal length and the sensor's width and height.
+
+    The pose of the camera is the world's origin.
 
     Raises:
         SettingsError: a length is not above 0.
@@ -109,29 +116,29 @@ def lens_of_sensor(
         ("focal_length_mm", "sensor_mm", "sensor_mm"), (focal_length_mm, *sensor_mm), strict=True
     ):
         check_positive(name, length_mm)
-    return _plain(focal_length_mm * np.array(image_size_wh) / np.array(sensor_mm), image_size_wh)
+    return _undistorted_camera(focal_length_mm * np.array(image_size_wh) / np.array(sensor_mm), image_size_wh)
 
 
 def lens_of_board(video: VideoInfo, board: Board) -> Lens:
-    """The lens of a camera before which a ChArUco board is moved about.
+    """Estimate the lens of a camera from a video in which a ChArUco board is moved.
 
-    Of all views those are used that differ most in where, how large and how tilted the board is.
+    The views that differ most in the position, size and tilt of the board are used.
 
     Raises:
-        InputError: the video cannot be read, too few views show enough of the board, or they are too much alike to fix
-            the focal length.
-        SettingsError: there is no such dictionary.
+        InputError: the video cannot be read, too few views show enough corners of the board, or the views differ too
+            little to determine the focal length.
+        SettingsError: the dictionary does not exist.
     """
     model = board.opencv()
-    views = _views(video, model)
+    views = _find_views(video, model)
     if len(views) < _MIN_VIEWS:
         raise InputError(
             video.path,
             expected=f"at least {_MIN_VIEWS} frames that show {_MIN_CORNERS} corners of the board",
             found=f"{len(views)}",
-            remedy="is it this board? squares, dictionary and markers must be those that were printed",
+            remedy="check that squares, dictionary and markers are those of the printed board",
         )
-    chosen = _spread([view.outline for view in views], _MOST_VIEWS)
+    chosen = _choose_spread([view.outline for view in views], _MOST_VIEWS)
     used = [views[index] for index in sorted(chosen)]
     rms, K, dist, turns, _, std, _, per_view = cv2.calibrateCameraExtended(
         [view.points_m for view in used],
@@ -142,18 +149,18 @@ def lens_of_board(video: VideoInfo, board: Board) -> Lens:
         flags=cv2.CALIB_FIX_K3,
     )
     std = np.asarray(std, np.float64).ravel()[:8]
-    # Boards that all face the camera fit every focal length, and the deviation of one is rubbish.
+    # Boards that are all parallel to the image fit every focal length, and its stated deviation is then meaningless.
     normals = np.array([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
-    tilted = np.rad2deg(np.arccos(np.clip((normals @ normals.T).min(), -1, 1)))
-    # So is their tilt, where the fit ran away to a focal length of hundreds of images.
-    endless = K[0, 0] > _MOST_WIDTHS * video.image_size_wh[0]
-    loose = not (std[:2] < _LOOSE * np.diag(K)[:2]).all()
-    if not np.isfinite(rms) or endless or tilted < _TILTED_DEG or loose:
+    tilt_deg = np.rad2deg(np.arccos(np.clip((normals @ normals.T).min(), -1, 1)))
+    # The estimated tilts are meaningless too if the fit diverged to a very large focal length.
+    diverged = K[0, 0] > _MAX_FOCAL_WIDTHS * video.image_size_wh[0]
+    uncertain = not (std[:2] < _MAX_FOCAL_ERROR * np.diag(K)[:2]).all()
+    if not np.isfinite(rms) or diverged or tilt_deg < _MIN_TILT_DEG or uncertain:
         raise InputError(
             video.path,
-            expected=f"views that fix the focal length to {_LOOSE:.0%}",
-            found=f"boards that are tilted by {tilted:.0f} degrees at most, and {std[0] / K[0, 0]:.1%}",
-            remedy="tilt the board, and carry it into all corners of the image",
+            expected=f"views that determine the focal length to {_MAX_FOCAL_ERROR:.0%}",
+            found=f"boards whose tilts differ by at most {tilt_deg:.0f} degrees, and {std[0] / K[0, 0]:.1%}",
+            remedy="tilt the board, and move it into all corners of the image",
         )
     return Lens(
         make_camera(
@@ -171,14 +178,23 @@ def lens_of_board(video: VideoInfo, board: Board) -> Lens:
 
 @dataclass(frozen=True)
 class _View:
+    """Corners of the board in one frame.
+
+    Attributes:
+        frame: number of the frame.
+        points_m: (corners, 1, 3), positions on the board, metres.
+        points_px: (corners, 1, 2), positions in the image, pixels.
+        outline: (8,), positions of the board's four corners, in image widths and heights.
+    """
+
     frame: int
     points_m: np.ndarray
     points_px: np.ndarray
-    #: (8,), where the board's four corners are, in image sizes.
     outline: Float[np.ndarray, "8"]
 
 
-def _views(video: VideoInfo, model: cv2.aruco.CharucoBoard) -> list[_View]:
+def _find_views(video: VideoInfo, model: cv2.aruco.CharucoBoard) -> list[_View]:
+    """Find the frames that show enough corners of the board."""
     detector = cv2.aruco.CharucoDetector(model)
     columns, rows = model.getChessboardSize()
     side = model.getSquareLength()
@@ -193,17 +209,17 @@ def _views(video: VideoInfo, model: cv2.aruco.CharucoBoard) -> list[_View]:
         points_px = np.asarray(corners).reshape(-1, 1, 2)
         homography, _ = cv2.findHomography(points_m[:, 0, :2], points_px[:, 0])
         if homography is None:
-            # All corners on one line.
+            # All corners are on one line.
             continue
         outline = cv2.perspectiveTransform(corners_m[:, None], homography)[:, 0] / video.image_size_wh
         views.append(_View(index * step, points_m, points_px, outline.ravel()))
     return views
 
 
-def _spread(outlines: list[Float[np.ndarray, "8"]], count: int) -> list[int]:
-    """Indices of views that are far from one another: each next one is the farthest from those before it."""
+def _choose_spread(outlines: list[Float[np.ndarray, "8"]], count: int) -> list[int]:
+    """Choose views that differ most: each next view is the farthest from the views chosen before."""
     outline = np.array(outlines)
-    # The first is the farthest from the middle of all.
+    # The first view is the farthest from the median of all views.
     chosen = [int(np.linalg.norm(outline - np.median(outline, axis=0), axis=1).argmax())]
     distance = np.linalg.norm(outline - outline[chosen[0]], axis=1)
     while len(chosen) < min(count, len(outline)):
@@ -212,8 +228,8 @@ def _spread(outlines: list[Float[np.ndarray, "8"]], count: int) -> list[int]:
     return chosen
 
 
-def _plain(focal_length_px: Float[np.ndarray, "2"], image_size_wh: tuple[int, int]) -> Camera:
-    # Pixel centres are at whole numbers: the middle of the image is half a pixel from half its size.
+def _undistorted_camera(focal_length_px: Float[np.ndarray, "2"], image_size_wh: tuple[int, int]) -> Camera:
+    # Pixel centres are at whole numbers, so the middle of the image is (size - 1) / 2.
     cx, cy = (np.array(image_size_wh) - 1) / 2
     K = np.array([[focal_length_px[0], 0.0, cx], [0.0, focal_length_px[1], cy], [0.0, 0.0, 1.0]])
     return make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=image_size_wh)

@@ -1,4 +1,4 @@
-"""Poses from known points: starts from sets of four points, which are refined; the most likely pose first."""
+"""Search for poses that fit known points: initial poses from sets of four points are refined by least squares."""
 
 from __future__ import annotations
 
@@ -32,15 +32,20 @@ _SAME_RAD = np.deg2rad(2.0)
 
 @dataclass(frozen=True)
 class Pose:
-    """A pose, from world to camera: x_cam = R X + t."""
+    """A pose, from world to camera: x_cam = R X + t.
+
+    Attributes:
+        R: (3, 3), rotation from world to camera.
+        t_m: (3,), translation, metres.
+        cost: robust cost: minus the logarithm of the likelihood.
+    """
 
     R: Float[np.ndarray, "3 3"]
     t_m: Float[np.ndarray, "3"]
-    #: The robust cost: minus the logarithm of the likelihood.
     cost: float = np.inf
 
-    def turned_like(self, other: Pose) -> bool:
-        """Whether the camera looks almost the same way."""
+    def has_orientation_of(self, other: Pose) -> bool:
+        """Whether the orientations of both poses are almost the same."""
         # The trace of a rotation by an angle is 1 + 2 cos(angle).
         return bool(np.sum(self.R * other.R) > 1 + 2 * np.cos(_SAME_RAD))
 
@@ -60,7 +65,9 @@ def find_likely_poses(
     )
     if not found:
         raise InputError(
-            name, expected="points that some pose fits", found="none that has them in front of it"
+            name,
+            expected="points that a pose fits",
+            found="no pose with most points in front of the camera",
         )
     return found
 
@@ -69,7 +76,11 @@ def _distinct(poses: Iterable[Pose]) -> list[Pose]:
     """Keep the poses of smallest cost, without poses that are nearly the same as a pose of smaller cost."""
     found: list[Pose] = []
     for pose in sorted(poses, key=lambda pose: pose.cost):
-        if len(found) < _MOST_STARTS and np.isfinite(pose.cost) and not any(map(pose.turned_like, found)):
+        if (
+            len(found) < _MOST_STARTS
+            and np.isfinite(pose.cost)
+            and not any(map(pose.has_orientation_of, found))
+        ):
             found.append(pose)
     return found
 

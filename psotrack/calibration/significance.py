@@ -1,10 +1,10 @@
 """Significance of a bundle adjustment: which cameras moved by more than the errors explain, and which should stay.
 
-A change of camera i alone, all others standing still, is judged by how much better the rig then agrees: with x the
-changes of all cameras' poses, Λ its information, b = Λ x, and S some cameras, b_Sᵀ Λ_SS⁻¹ b_S is what moving just those
-gains, and one camera more gains χ² of six degrees of freedom by chance. Cameras are taken one after the other, that
-which gains most first (forward selection), so that one that was pushed does not drag the others along, until neither
-one more nor all that are left together gain more than chance.
+Let x be the changes of all cameras' poses, Λ the information of x, and b = Λ x. If only the cameras of a set S move,
+the cost falls by b_Sᵀ Λ_SS⁻¹ b_S (the gain of S). If the rig is correct, one more camera in S raises the gain by a χ²
+variable of six degrees of freedom. Cameras are added to S one by one, the camera of largest gain first (forward
+selection), so that a camera that was pushed does not make the correct cameras look wrong. The selection ends when
+neither one more camera nor all other cameras together gain more than chance explains.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from psotrack.geometry import Rig
 
 #: Largest probability that a camera of a correct rig is called wrong.
 FALSE_ALARM = 0.01
-#: If more than this share of the cameras is wrong, too few cameras remain as a reference.
+#: Largest share of wrong cameras: if more cameras are wrong, too few correct cameras remain as a reference.
 MOST_OFF = 0.5
 #: A wrong focal length looks like a shift along the optical axis. The focal length may be wrong if its median residual
 #: is at most this multiple of the pose's: for a camera that was turned or moved otherwise, it is much larger.
@@ -33,7 +33,7 @@ AS_WELL = 1.2
 
 @dataclass(frozen=True)
 class Improved:
-    """A rig in which only those cameras are changed that are wrong for certain.
+    """A rig in which only cameras that are certainly wrong were changed.
 
     Attributes:
         rig: the improved rig; the given rig if no camera is wrong.
@@ -41,7 +41,7 @@ class Improved:
         zoomed: cameras that were moved, but may have another focal length instead: by name, the factor of the focal
             length and its standard deviation.
         rescaled: whether all focal lengths were multiplied with a common factor.
-        everything: the adjustment in which all cameras may move that are not fixed.
+        everything: the adjustment in which all cameras that are not fixed may move.
         final: the adjustment in which correct cameras are fixed; None if nothing was changed.
         centre_covariance_m2: (cameras, 3, 3), covariances of the centres in the world, square metres: for moved
             cameras from `final`, for others from `everything`.
@@ -65,12 +65,18 @@ def improve(
     refine_focal_length: bool = False,
     common_errors: Sequence[CommonErrors] = (),
 ) -> Improved:
-    """Adjust only those cameras that are wrong by more than errors in the images explain.
-
-    Arguments and errors are those of `bundle.adjust`, and in addition:
+    """Adjust only the cameras that are wrong by more than errors in the images explain.
 
     Args:
-        refine_focal_length: multiply all focal lengths with a common factor if this factor differs from 1 for certain.
+        rig: see `bundle.adjust`.
+        points_px: see `bundle.adjust`.
+        noise_px: see `bundle.adjust`.
+        fixed: see `bundle.adjust`.
+        common_errors: see `bundle.adjust`.
+        refine_focal_length: multiply all focal lengths with a common factor if this factor certainly differs from 1.
+
+    Raises:
+        SettingsError, InputError: see `bundle.adjust`.
     """
     every = rig.names if refine_focal_length else ()
     everything = adjust(rig, points_px, noise_px, fixed=fixed, rescaled=every, common_errors=common_errors)
@@ -115,7 +121,7 @@ def _zoomed(
     found = {}
     for name in moved:
         index = rig.names.index(name)
-        hidden = np.array([one in moved and one != name for one in rig.names])
+        hidden = np.array([other in moved and other != name for other in rig.names])
         seen_px = np.where(hidden[:, None], np.nan, points_px)
         try:
             lens = adjust(
@@ -124,7 +130,7 @@ def _zoomed(
         except InputError:
             # No focal length makes this camera's sightings agree with the other cameras.
             continue
-        by_lens, by_pose = (np.nanmedian(one.residual_px[:, index]) for one in (lens, final))
+        by_lens, by_pose = (np.nanmedian(adjusted.residual_px[:, index]) for adjusted in (lens, final))
         if by_lens < AS_WELL * by_pose:
             found[name] = lens.focal_scale, lens.focal_scale_std
     return found
@@ -144,26 +150,26 @@ def find_wrong_cameras(rig: Rig, adjusted: AdjustedRig, fixed: Sequence[str] = (
     information, pull = _information(rig, adjusted, fixed)
     off: list[int] = []
     least = float(chi2.isf(FALSE_ALARM / max(len(may_move), 1), 6))
-    everyone = list(range(len(may_move)))
+    candidates = list(range(len(may_move)))
     freedom = 6 * len(may_move) - (7 if len(may_move) == len(rig) else 0)
-    gained, most = 0.0, _gain(information, pull, everyone) if everyone else 0.0
+    gained, most = 0.0, _gain(information, pull, candidates) if candidates else 0.0
     while len(off) < len(may_move):
         if len(off) > MOST_OFF * len(rig):
             return tuple(rig.names[index] for index in may_move)
-        gains = {one: _gain(information, pull, [*off, one]) for one in everyone if one not in off}
-        best = max(gains, key=lambda one: gains[one])
-        # Many cameras can each be wrong by too little to be found, and together by too much.
+        gains = {index: _gain(information, pull, [*off, index]) for index in candidates if index not in off}
+        best = max(gains, key=lambda index: gains[index])
+        # The errors of several cameras may be significant together although no single one is.
         left = freedom - 6 * len(off)
         if gains[best] - gained < least and (left < 1 or most - gained < chi2.isf(FALSE_ALARM, left)):
             break
         off, gained = [*off, best], gains[best]
-    return tuple(rig.names[may_move[one]] for one in sorted(off))
+    return tuple(rig.names[may_move[index]] for index in sorted(off))
 
 
 def _information(
     rig: Rig, adjusted: AdjustedRig, fixed: Sequence[str]
 ) -> tuple[Float[np.ndarray, "unknowns unknowns"], Float[np.ndarray, " unknowns"]]:
-    """Λ of the cameras that may move, which does not depend on common motions, and b = Λ x."""
+    """Information Λ of the changes x of the cameras that may move, without common motions; and b = Λ x."""
     given = np.asarray(rig.cameras.T_cam_world)
     rows = np.flatnonzero(np.repeat([name not in fixed for name in rig.names], 6))
     inverse = np.linalg.inv(adjusted.joint_covariance[np.ix_(rows, rows)])
@@ -181,5 +187,6 @@ def _gain(
     pull: Float[np.ndarray, " unknowns"],
     moved: list[int],
 ) -> float:
-    rows = np.concatenate([np.arange(6 * one, 6 * one + 6) for one in moved])
+    """Decrease of the cost if only the given cameras move."""
+    rows = np.concatenate([np.arange(6 * index, 6 * index + 6) for index in moved])
     return float(pull[rows] @ np.linalg.lstsq(information[np.ix_(rows, rows)], pull[rows], rcond=None)[0])

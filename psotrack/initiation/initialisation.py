@@ -1,7 +1,7 @@
-"""Where the drones are in the first frames, how fast, and how large: found from the silhouettes alone.
+"""Positions, velocities and sizes of the drones in the first frames, found from the silhouettes alone.
 
-Paths through blobs of foreground that several viewpoints agree on are weighed against one another (see `paths`); what
-explains blobs that nothing else explains, all the time, is a drone. Its size comes from the blobs that nobody shares.
+Candidates are paths through blobs of foreground in several viewpoints (see `paths`). A path is a drone if it fits, in
+most frames, blobs that no other chosen path fits. A drone's size is estimated from blobs that hold no other drone.
 """
 
 from __future__ import annotations
@@ -15,31 +15,35 @@ from psotrack.geometry import Camera, viewpoints
 from psotrack.initiation.paths import Paths, by_viewpoint, propose_paths, refine_paths
 from psotrack.silhouettes import find_blobs, stack_blobs
 
-#: What has its middle nearer to the floor is a shadow: a drone that stands on its legs is higher.
+#: Smallest height of a drone's middle above the floor, metres. A path below this height is a shadow, because the middle
+#: of a drone that stands on its legs is higher.
 FLOOR_CLEARANCE_M = 0.08
-#: Over the floor, no drone is taken to be higher than so much of its width.
-HIGHEST = 0.3
-#: No two drones are nearer to one another than this, on average.
+#: Largest height of a drone that is low over the floor, as a share of its width.
+MAX_HEIGHT_SHARE = 0.3
+#: Smallest mean distance of two drones, metres.
 SEPARATION_M = 0.3
-#: In fewer frames than this, two viewpoints see rays cross by chance for too long.
-LEAST_FRAMES = 8
-#: An explanation with so much less evidence (of 2 from two viewpoints) is no rival.
-CLEARLY = 0.15
-#: So many paths are weighed against one another.
-MOST_RIVALS = 16
-#: Two viewpoints show a drone in so many of the frames, three in half of them.
-NEARLY_ALWAYS = 0.75
+#: Smallest number of frames in which a path that only two viewpoints show can be a drone. In fewer frames, rays to
+#: different drones may cross by chance in every frame.
+MIN_FRAMES_OF_TWO_VIEWS = 8
+#: Evidence that the frames must lose without a path that only two viewpoints show; the evidence of two viewpoints is 2
+#: at most.
+MIN_LOST_EVIDENCE = 0.15
+#: Largest number of paths of two viewpoints that are compared with each other, because the time grows exponentially.
+MAX_RIVALS = 16
+#: Smallest share of the frames in which each of two viewpoints must show a drone; with three viewpoints, half of the
+#: frames suffice.
+SHARE_OF_TWO_VIEWS = 0.75
 
 
 @dataclass(frozen=True)
 class InitialState:
-    """Drones at frame 0.
+    """Positions, velocities and sizes of the drones at frame 0.
 
     Attributes:
-        position_m: (drones, 3).
-        velocity_m_s: (drones, 3).
-        size_m: (drones, 3), full lengths along the world's axes.
-        num_cameras: (drones,), cameras that saw the drone, on average.
+        position_m: (drones, 3), positions in the world, metres.
+        velocity_m_s: (drones, 3), velocities, metres per second.
+        size_m: (drones, 3), full lengths along the world's axes, metres.
+        num_cameras: (drones,), mean number of cameras that show the drone.
     """
 
     position_m: Float[np.ndarray, "drones 3"]
@@ -58,20 +62,21 @@ def find_drones(
     max_speed_m_s: float,
     drones: int | None = None,
 ) -> InitialState:
-    """The drones that are there throughout the first frames, best seen first.
+    """Find the drones that the silhouettes show throughout the first frames.
 
     Args:
-        cameras: with one leading axis, of the image (not reduced).
-        coverage: (frames, cameras, height, width), silhouettes of the first frames; ten are plenty.
+        cameras: cameras with one leading axis, for images of full size.
+        coverage: (frames, cameras, height, width), silhouettes of the first frames; ten frames suffice.
         reduction: image pixels per silhouette pixel, along each side.
         fps: frames per second.
-        bounds_m: (2, 3), corners of the room; its lowest z is the floor, on which shadows lie.
-        max_speed_m_s: of a drone.
-        drones: how many there are, where that is known: never more are found, and the last ones on less evidence.
+        bounds_m: (2, 3), corners of the room, metres; the lowest z is the floor, on which shadows lie.
+        max_speed_m_s: largest speed of a drone, metres per second.
+        drones: number of drones, if it is known: at most this number is found, and weaker evidence suffices for the
+            last drones.
 
     Returns:
-        Those for which the frames speak, on the whole; possibly none. Drones that no camera sees by themselves have
-        the usual size of the others, or NaN where there is none.
+        The drones, possibly none; the drone that most cameras show is first. A drone whose blobs all hold another drone
+        too has the median size of the other drones, or NaN if no size is known.
     """
     seen = stack_blobs(
         [[find_blobs(image, reduction) for image in images] for images in coverage], len(cameras.K), reduction
@@ -79,7 +84,7 @@ def find_drones(
     time_s = np.arange(len(coverage)) / fps
     if not seen.whole.any():
         return InitialState(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
-    # Shadows on the floor agree between all views as drones do, and they move with them; but they are flat on it.
+    # Shadows on the floor agree in all views and move with the drones, but a shadow has no height above the floor.
     floor_z_m = float(bounds_m[0, 2])
     bounds_m = bounds_m + np.array([[0.0, 0.0, FLOOR_CLEARANCE_M], [0.0, 0.0, 0.0]])
     paths = propose_paths(cameras, seen, time_s, bounds_m, max_speed_m_s)
@@ -87,29 +92,34 @@ def find_drones(
     num_cameras = paths.covered.any(axis=-1).sum(axis=-1).mean(axis=-1)
     paths = paths[np.argsort(-num_cameras, kind="stable")]
     own_m = np.where(paths.alone[..., None], paths.size_m, np.nan)
-    sizes_m = np.array([_size(cameras, *of) for of in zip(paths.position_m, own_m, strict=True)]).reshape(
-        -1, 3
-    )
+    sizes_m = np.array(
+        [_estimate_size(cameras, *path) for path in zip(paths.position_m, own_m, strict=True)]
+    ).reshape(-1, 3)
     height_m = np.median(paths.position_m[..., 2], axis=1) - floor_z_m
     return InitialState(
         position_m=paths.coefficient[:, 0],
         velocity_m_s=paths.coefficient[:, 1],
-        size_m=with_usual_size(_without_shadows(sizes_m, height_m)),
+        size_m=fill_unknown_sizes(_limit_heights(sizes_m, height_m)),
         num_cameras=np.sort(num_cameras)[::-1],
     )
 
 
-def _without_shadows(
+def _limit_heights(
     size_m: Float[np.ndarray, "drones 3"], height_m: Float[np.ndarray, "drones"]
 ) -> Float[np.ndarray, "drones 3"]:
-    """Sizes of which those of low drones are no higher than drones are: their blobs hold their shadows, below them."""
+    """Sizes, with limited heights of low drones: the blob of a low drone holds its shadow, which is below the drone.
+
+    Args:
+        size_m: (drones, 3), estimated sizes, metres.
+        height_m: (drones,), heights of the drones above the floor, metres.
+    """
     low = height_m < size_m[:, 0]
-    highest_m = np.where(low, HIGHEST * size_m[:, 0], np.inf)
+    highest_m = np.where(low, MAX_HEIGHT_SHARE * size_m[:, 0], np.inf)
     return np.column_stack([size_m[:, :2], np.minimum(size_m[:, 2], highest_m)])
 
 
-def with_usual_size(size_m: Float[np.ndarray, "drones 3"]) -> Float[np.ndarray, "drones 3"]:
-    """Sizes with the median of all for drones whose own is not known; NaN where none is known."""
+def fill_unknown_sizes(size_m: Float[np.ndarray, "drones 3"]) -> Float[np.ndarray, "drones 3"]:
+    """Replace sizes that are NaN with the median of the known sizes; NaN stays where no size is known."""
     known = np.isfinite(size_m).all(axis=-1)
     return np.where(known[:, None], size_m, np.median(size_m[known], axis=0)) if known.any() else size_m
 
@@ -117,22 +127,26 @@ def with_usual_size(size_m: Float[np.ndarray, "drones 3"]) -> Float[np.ndarray, 
 def choose_paths(
     paths: Paths, viewpoint: Int[np.ndarray, "cameras"], drones: int | None = None
 ) -> Int[np.ndarray, "chosen"]:
-    """The paths that are drones: first those that three viewpoints or more show, then those that two do.
+    """Choose the paths that are drones: first paths that three or more viewpoints show, then paths that two show.
 
-    A path's evidence is how well it fits blobs that no chosen path has, its own, summed over the viewpoints; less
-    the share of frames in which a viewpoint should show something there and does not. The best goes first. Two views
-    alone cannot tell drones from crossings of different drones' rays, except by time: they count where nothing
-    speaks against them, they fit well, and no other path that explains the same blobs is nearly as good.
+    The evidence for a path is the fit of blobs that no chosen path has, summed over the viewpoints, minus the share of
+    frames in which a viewpoint should show the path and does not. The path with the most evidence is chosen first. Two
+    viewpoints cannot tell a drone from crossing rays to different drones in a single frame. So a path that only two
+    viewpoints show must fit well in nearly all frames, must be missing in no viewpoint, and must explain its blobs
+    clearly better than every other path.
 
     Args:
-        paths: of `propose_paths`.
-        viewpoint: (cameras,), of `viewpoints`.
-        drones: how many there are, where that is known.
+        paths: result of `propose_paths`.
+        viewpoint: (cameras,), the viewpoint of each camera, from `viewpoints`.
+        drones: number of drones, if it is known.
+
+    Returns:
+        (chosen,), indices of the chosen paths, in the order of choice.
     """
     free = np.ones(paths.covered.shape[1:], bool)
     left = np.arange(len(paths))
     chosen: list[int] = []
-    for rule in (_three_views, _two_views, *((_known_to_be_there,) if drones else ())):
+    for rule in (_shown_by_three_views, _shown_by_two_views, *((_shown_weakly,) if drones else ())):
         while len(chosen) != drones:
             evidence = _evidence(paths[left], viewpoint, free)
             fits = rule(paths[left], evidence)
@@ -142,20 +156,21 @@ def choose_paths(
             chosen.append(best)
             frame, camera = np.nonzero(paths.blob[best] >= 0)
             free[frame, camera, paths.blob[best, frame, camera]] = False
-            left = left[_apart(paths, best)[left] >= SEPARATION_M]
+            left = left[_mean_distance_m(paths, best)[left] >= SEPARATION_M]
     return np.array(chosen, int)
 
 
 @dataclass(frozen=True)
 class _Evidence:
-    """What speaks for each path while some have been chosen.
+    """Evidence for each path that is not chosen yet.
 
     Attributes:
-        own: (paths, frames, cameras), whether it fits a blob that no chosen path has.
-        share: (paths, viewpoints), of the frames with such a blob.
-        covered: (paths, viewpoints), share of the frames with anything there.
-        against: (paths,), viewpoints that should show something there and do not, as shares of the frames.
-        total: (paths,), see `choose_paths`.
+        own: (paths, frames, cameras), whether the path fits a blob that no chosen path has.
+        share: (paths, viewpoints), share of the frames with such a blob.
+        covered: (paths, viewpoints), share of the frames with any foreground at the path.
+        against: (paths,), share of the frames in which a viewpoint should show the path and does not, summed over the
+            viewpoints.
+        total: (paths,), the evidence (see `choose_paths`).
     """
 
     own: Bool[np.ndarray, "paths frames cameras"]
@@ -171,85 +186,104 @@ def _evidence(
     own = paths.has_one_of(free)
     fit = by_viewpoint(own * paths.fit, viewpoint).mean(axis=1).sum(axis=-1)
     share, covered, in_view = (
-        by_viewpoint(of, viewpoint) for of in (own, np.any(paths.covered, axis=-1), paths.in_view)
+        by_viewpoint(value, viewpoint) for value in (own, np.any(paths.covered, axis=-1), paths.in_view)
     )
     against = (in_view & ~covered).mean(axis=1).sum(axis=-1)
     return _Evidence(own, share.mean(axis=1), covered.mean(axis=1), against, fit - against)
 
 
-def _three_views(paths: Paths, evidence: _Evidence) -> Bool[np.ndarray, "paths"]:
-    """Blobs of its own in three viewpoints, in half of the frames, and no more viewpoints speak against it than for it.
+def _shown_by_three_views(paths: Paths, evidence: _Evidence) -> Bool[np.ndarray, "paths"]:
+    """Whether each path has own blobs in at least three viewpoints, each in half of the frames.
 
-    Silhouettes of small or dark drones flicker: that one is not seen says much less than that it is.
+    The evidence against a path may be as large as the evidence for it, because silhouettes of small or dark drones
+    flicker: a missing blob says much less than a blob.
     """
     views = (evidence.share >= 0.5).sum(axis=-1)
     return (views >= 3) & (evidence.against <= evidence.share.sum(axis=-1))
 
 
-def _two_views(paths: Paths, evidence: _Evidence) -> Bool[np.ndarray, "paths"]:
-    """Blobs of its own in two viewpoints, nearly always and well fitting, and no other explanation of them."""
-    views = (evidence.share >= NEARLY_ALWAYS).sum(axis=-1)
+def _shown_by_two_views(paths: Paths, evidence: _Evidence) -> Bool[np.ndarray, "paths"]:
+    """Whether each path fits own blobs in two viewpoints well, in nearly all frames, and no other paths explain them.
+
+    Of paths that are near each other or share blobs, at most one is a drone. A path is needed if the largest total
+    evidence of compatible paths is clearly smaller without this path and the paths near it.
+    """
+    views = (evidence.share >= SHARE_OF_TWO_VIEWS).sum(axis=-1)
     fits = (views >= 2) & (evidence.against < 0.25) & (evidence.total >= 0.75 * evidence.share.sum(axis=-1))
-    fits &= paths.blob.shape[1] >= LEAST_FRAMES
-    rivals = np.flatnonzero(fits)[np.argsort(-evidence.total[fits])][:MOST_RIVALS]
+    fits &= paths.blob.shape[1] >= MIN_FRAMES_OF_TWO_VIEWS
+    rivals = np.flatnonzero(fits)[np.argsort(-evidence.total[fits])][:MAX_RIVALS]
     weight, own, blob, position_m = (
-        of[rivals] for of in (evidence.total, evidence.own, paths.blob, paths.position_m)
+        value[rivals] for value in (evidence.total, evidence.own, paths.blob, paths.position_m)
     )
     same = np.linalg.norm(position_m[:, None] - position_m, axis=-1).mean(axis=-1) < SEPARATION_M
     shared = (own & own[:, None] & (blob == blob[:, None])).mean(axis=2).max(axis=-1) >= 0.5
-    best = _best_together(weight, same | shared, weight > 0)
-    needed = [best - _best_together(weight, same | shared, ~near) >= CLEARLY for near in same]
+    best = _max_compatible_weight(weight, same | shared, weight > 0)
+    needed = [
+        best - _max_compatible_weight(weight, same | shared, ~near) >= MIN_LOST_EVIDENCE for near in same
+    ]
     fits[:] = False
     fits[rivals] = needed
     return fits
 
 
-def _best_together(
+def _max_compatible_weight(
     weight: Float[np.ndarray, "paths"],
     exclusive: Bool[np.ndarray, "paths paths"],
     left: Bool[np.ndarray, "paths"],
 ) -> float:
-    """The largest total weight of paths of which no two exclude each other."""
+    """Largest total weight of paths of which no two exclude each other (maximum weight independent set).
+
+    Args:
+        weight: (paths,), weights of the paths.
+        exclusive: (paths, paths), whether two paths exclude each other.
+        left: (paths,), paths that may be used.
+    """
     if not left.any():
         return 0.0
-    one = int(left.argmax())
+    first = int(left.argmax())
     rest = left.copy()
-    rest[one] = False
-    with_it = weight[one] + _best_together(weight, exclusive, rest & ~exclusive[one])
-    if not (rest & exclusive[one]).any():
-        return with_it
-    return max(with_it, _best_together(weight, exclusive, rest))
+    rest[first] = False
+    with_first = weight[first] + _max_compatible_weight(weight, exclusive, rest & ~exclusive[first])
+    if not (rest & exclusive[first]).any():
+        return with_first
+    return max(with_first, _max_compatible_weight(weight, exclusive, rest))
 
 
-def _known_to_be_there(paths: Paths, evidence: _Evidence) -> Bool[np.ndarray, "paths"]:
-    """A blob of its own in one viewpoint, and something there in another, in half of the frames."""
+def _shown_weakly(paths: Paths, evidence: _Evidence) -> Bool[np.ndarray, "paths"]:
+    """Whether each path has own blobs in one viewpoint, and any foreground in another, each in half of the frames."""
     views = (evidence.covered >= 0.5).sum(axis=-1)
     return (evidence.share.max(axis=-1) >= 0.5) & (views >= 2) & (evidence.against < 0.5)
 
 
-def _apart(paths: Paths, one: int | np.integer) -> Float[np.ndarray, "paths"]:
-    """Mean distance of every path from one of them, metres."""
-    return np.linalg.norm(paths.position_m - paths.position_m[one], axis=-1).mean(axis=-1)
+def _mean_distance_m(paths: Paths, index: int | np.integer) -> Float[np.ndarray, "paths"]:
+    """Mean distance of every path from the path of an index, metres."""
+    return np.linalg.norm(paths.position_m - paths.position_m[index], axis=-1).mean(axis=-1)
 
 
-def _size(
+def _estimate_size(
     cameras: Camera, position_m: Float[np.ndarray, "frames 3"], size_m: Float[np.ndarray, "frames cameras 2"]
 ) -> Float[np.ndarray, "3"]:
-    """Full lengths of an ellipsoid, equal along x and y, whose outlines are as wide and as high as the blobs.
+    """Full lengths of an ellipsoid, equal along x and y, whose outlines are as wide and as high as the blobs, metres.
 
-    Seen at elevation e, an ellipsoid of semi-axes a (level) and c (upright) is a wide and
-    sqrt(a² sin² e + c² cos² e) high. Medians over frames, so that a few bad blobs do not count. Of the cameras, those
-    that look from the side tell most of the height: they are weighted by the inverse of the variance of c²,
-    where all h and a are off by the same share.
+    At elevation e, an ellipsoid with the semi-axes a (horizontal) and c (vertical) has an outline with the semi-axes a
+    and h = sqrt(a² sin² e + c² cos² e). Medians over the frames suppress a few bad blobs. Cameras that look from the
+    side determine the height best: the weight of a camera is the inverse of the variance of c² if all h and a have the
+    same relative error.
+
+    Args:
+        cameras: cameras with one leading axis.
+        position_m: (frames, 3), positions of the drone, metres.
+        size_m: (frames, cameras, 2), width and height of the drone's own blobs at the drone's depth, metres; NaN where
+            a camera has no such blob.
     """
     ray = position_m[:, None, :] - cameras.centre_world
     sin2 = np.median((ray[..., 2] / np.linalg.norm(ray, axis=-1)) ** 2, axis=0)
     seen = np.isfinite(size_m).any(axis=(0, 2))
     if not seen.any():
         return np.full(3, np.nan)
-    level = float(np.nanmedian(size_m[..., 0]))
-    high2, sin2 = (np.nanmedian(size_m[:, seen, 1], axis=0) / level) ** 2, sin2[seen]
-    weight = (1 - sin2) ** 2 / (high2**2 + sin2**2)
-    upright2 = np.average((high2 - sin2) / (1 - sin2), weights=weight)
-    # Flat drones seen from above say little of their height; it is never below a tenth of the span.
-    return level * np.array([1.0, 1.0, np.sqrt(max(upright2, 0.01))])
+    horizontal = float(np.nanmedian(size_m[..., 0]))
+    height2, sin2 = (np.nanmedian(size_m[:, seen, 1], axis=0) / horizontal) ** 2, sin2[seen]
+    weight = (1 - sin2) ** 2 / (height2**2 + sin2**2)
+    vertical2 = np.average((height2 - sin2) / (1 - sin2), weights=weight)
+    # Blobs of flat drones seen from above determine the height badly. It is a tenth of the width at least.
+    return horizontal * np.array([1.0, 1.0, np.sqrt(max(vertical2, 0.01))])

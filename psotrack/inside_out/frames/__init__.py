@@ -1,8 +1,8 @@
 """Frames of one camera, from a video file, a folder of images or a live stream.
 
-In: a path, an address or a device. Out: a `FrameSource`, which says what is known of the frames and reads them one by
+In: a path, an address or a device. Out: a `FrameSource`, which describes the frames and reads them one by
 one as `Frame` (number, time, image). Other rooms use `open_source`, `FrameSource`, `Frame`, `folder_has_images` and
-`read_ahead`, which reads frames in a thread of its own.
+`read_ahead`, which reads frames in a separate thread.
 
 Imports go in this order: `records`, `image_folder`, `stream`, `opening`; `prefetch` stands alone.
 """

@@ -18,7 +18,7 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 
 def folder_has_images(folder: Path | str) -> bool:
-    """Whether a folder has images in it."""
+    """Whether a folder contains images."""
     return bool(_image_paths(Path(folder)))
 
 
@@ -29,10 +29,10 @@ def natural_key(path: Path) -> list[tuple[int, str]]:
 
 
 def open_image_folder(folder: Path, fps: float | None) -> FrameSource:
-    """Images of a folder, in natural order, as frames at `fps` frames per second.
+    """Open the images of a folder, in natural order, as frames at `fps` frames per second.
 
     Raises:
-        InputError: the folder cannot be read or has no images; or, when frames are read, sizes differ.
+        InputError: the folder cannot be read or has no images; or, when frames are read, image sizes differ.
         SettingsError: `fps` is None.
     """
     paths = _image_paths(folder)
@@ -48,7 +48,7 @@ def open_image_folder(folder: Path, fps: float | None) -> FrameSource:
             if bgr.shape != (height, width, 3):
                 raise InputError(
                     path,
-                    expected=f"{width} x {height} pixels as {paths[0].name} has",
+                    expected=f"{width} x {height} pixels as in {paths[0].name}",
                     found=f"{bgr.shape[1]} x {bgr.shape[0]}",
                 )
             yield Frame(number, number / fps, bgr)

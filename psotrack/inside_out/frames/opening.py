@@ -18,12 +18,12 @@ def open_source(source: Path | str, *, fps: float | None = None, live: bool = Fa
     Args:
         source: path of a video or a folder; or address of a stream, such as rtsp://camera/1; or, with `live`, number
             of a device.
-        fps: frames per second: required for a folder of images, and for a video whose header is wrong.
-        live: use the newest frame of a stream, and leave out frames that come meanwhile.
+        fps: frames per second; required for a folder of images, and for a video whose header has a wrong rate.
+        live: always use the newest frame of a stream, and leave out the frames before.
 
     Raises:
-        InputError: the source cannot be read, or has no frames, or images differ in size.
-        SettingsError: the rate is missing or not above 0.
+        InputError: the source cannot be read or has no frames, or its images differ in size.
+        SettingsError: `fps` is missing or not above 0.
     """
     if fps is not None:
         check_positive("--fps", fps)

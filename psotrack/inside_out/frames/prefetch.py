@@ -12,14 +12,19 @@ _Item = TypeVar("_Item")
 
 #: Largest number of items that wait to be used.
 _AHEAD = 4
+#: Longest uninterrupted wait for an item, seconds. Python handles Ctrl-C in the main thread only; if another thread
+#: received the signal, or on Windows, the signal does not end the wait.
+_WAIT_S = 0.1
 
 
 def read_ahead(items: Iterator[_Item], *, newest: bool = False) -> Iterator[_Item]:
-    """The same items, produced in a thread, a few ahead of the item in use. Errors of the thread are raised here.
+    """Iterate over items that a thread produces, a few items ahead of the item in use.
+
+    Errors of the thread are raised here. Ctrl-C ends the iteration within about a second, even if the thread hangs.
 
     Args:
         items: iterator that the thread runs.
-        newest: leave out older items, instead of waiting, where items are produced faster than they are used.
+        newest: leave out older items if items are produced faster than they are used; else the thread waits.
     """
     done = object()
     waiting: queue.Queue[object] = queue.Queue(maxsize=1 if newest else _AHEAD)
@@ -52,11 +57,18 @@ def read_ahead(items: Iterator[_Item], *, newest: bool = False) -> Iterator[_Ite
     thread = threading.Thread(target=work, daemon=True, name="psotrack-frames")
     thread.start()
     try:
-        while (item := waiting.get()) is not done:
+        while (item := _get(waiting)) is not done:
             if isinstance(item, BaseException):
                 raise item
             yield item  # type: ignore[misc]
     finally:
         stop.set()
-        # A camera that does not answer must not block the program.
+        # A camera that does not respond must not block the program.
         thread.join(timeout=1.0)
+
+
+def _get(waiting: queue.Queue[object]) -> object:
+    """Get the next item; Ctrl-C can interrupt the wait."""
+    while True:
+        with contextlib.suppress(queue.Empty):
+            return waiting.get(timeout=_WAIT_S)

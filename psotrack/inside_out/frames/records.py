@@ -33,12 +33,12 @@ class FrameSource:
     """Frames of one camera, and what is known of them before they are read.
 
     Attributes:
-        name: name for messages: a path, a device or an address.
+        name: name in messages: a path, a device or an address.
         image_size_wh: width and height in pixels.
         num_frames: number of frames; None for a stream.
-        frames: returns the frames from the first on; a stream can be read only once.
+        frames: function that returns the frames, from the first one; a stream can be read only once.
         stream: whether the frames come from a stream.
-        newest: whether to leave out frames of a stream that come faster than they are used.
+        newest: whether frames of a stream that come faster than they are used are left out.
     """
 
     name: str
@@ -49,7 +49,7 @@ class FrameSource:
     newest: bool = False
 
     def first(self, num_frames: int | None) -> FrameSource:
-        """The source limited to its first `num_frames` frames; None keeps all frames.
+        """Limit the source to its first `num_frames` frames; None keeps all frames.
 
         Raises:
             SettingsError: the source has fewer frames.

@@ -1,4 +1,4 @@
-"""Frames from a stream: a network address, or a camera at this computer."""
+"""Frames from a stream: a network address, or a camera connected to this computer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from psotrack.recordings import silence_opencv
 
 
 def open_stream(address: str, fps: float | None, live: bool) -> FrameSource:
-    """Frames of a stream.
+    """Open the frames of a stream.
 
     Args:
         address: address of the stream, such as rtsp://camera/1, or number of a device.
@@ -22,7 +22,7 @@ def open_stream(address: str, fps: float | None, live: bool) -> FrameSource:
         live: leave out frames that come faster than they are used.
 
     Raises:
-        InputError: the stream cannot be opened, or has no frames; or, when frames are read, sizes differ.
+        InputError: the stream cannot be opened or has no frames; or, when frames are read, frame sizes differ.
     """
     with silence_opencv():
         capture = cv2.VideoCapture(int(address) if address.isdecimal() else address)
@@ -53,7 +53,7 @@ def open_stream(address: str, fps: float | None, live: bool) -> FrameSource:
 
 
 class _Clock:
-    """Times of a stream's frames: by a given rate, else by the stream's timestamps, else by the times of arrival.
+    """Times of a stream's frames: from a given rate, else from the stream's timestamps, else from the times of arrival.
 
     Args:
         stamp_s: returns the timestamp of the frame that was read last, seconds.
@@ -66,13 +66,13 @@ class _Clock:
         self._time_s, self._stamped = 0.0, True
 
     def time_s(self, number: int) -> float:
-        """Time of the frame that was read last, seconds; later than that of the frame before."""
+        """Time of the frame that was read last, seconds; always later than the time of the frame before."""
         if self._fps is not None:
             return number / self._fps
         if number == 0:
             return 0.0
         stamp_s = self._stamp_s()
-        # Some cameras give no timestamps, and the timestamps of some streams start again.
+        # Some cameras give no timestamps, and the timestamps of some streams restart at 0.
         self._stamped &= stamp_s > self._last_stamp_s
         if self._stamped:
             self._time_s += stamp_s - self._last_stamp_s

@@ -5,7 +5,7 @@ In: corners of markers in the image (pixels) and in the world (metres), the lens
 `estimate_pose` and these records, and nothing else of this room.
 
 Imports go in this order: `records`; `equations` (linear equations of the corners); `fit` (the most likely pose near
-an initial pose); `initial_poses` (poses by closed-form solvers); `estimating` (all of it).
+an initial pose); `initial_poses` (poses by closed-form solvers); `estimating` (the complete estimation).
 """
 
 from psotrack.inside_out.pose.estimating import estimate_pose

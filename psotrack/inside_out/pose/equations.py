@@ -43,9 +43,9 @@ class SeenCorners:
         corners_m: (markers, 4, 3), places of the corners in the map, world, metres.
         inward: (markers, 4, 2), unit vectors in the image from each corner into its marker.
         lens: intrinsics; the pose is ignored.
-        noise_px: stated standard deviation of a corner along x and along y.
-        place_m: stated standard deviation of a marker's place along each axis.
-        map_share: share of that variance that comes from the map and is the same in every frame.
+        noise_px: stated standard deviation of a corner along x and along y, pixels.
+        place_m: stated standard deviation of a marker's place along each axis, metres.
+        map_share: share of the variance of a marker's place that comes from the map and is the same in every frame.
         focal_error: stated standard deviation of the focal length, as a share of the focal length.
     """
 
@@ -61,7 +61,14 @@ class SeenCorners:
 
 @dataclass(frozen=True)
 class Noise:
-    """Variances of a corner's own error and of a marker's place, with the degrees of freedom of each estimate."""
+    """Variances of a corner's own error and of a marker's place, with the degrees of freedom of both estimates.
+
+    Attributes:
+        own_px2: variance of a corner's own error along x and along y, square pixels.
+        place_m2: variance of a marker's place along each axis, square metres.
+        own_freedom: degrees of freedom of `own_px2`.
+        place_freedom: degrees of freedom of `place_m2`.
+    """
 
     own_px2: float
     place_m2: float
@@ -107,7 +114,7 @@ class Sums:
     count: int
 
     def solved(self, noise: Noise, extra: Float[np.ndarray, "2"]) -> Solution | None:
-        """Minimise the cost over the linear equations; None where they leave the pose undetermined.
+        """Minimise the cost over the linear equations; None if the equations do not determine the pose.
 
         Args:
             noise: variances of the errors.
@@ -160,7 +167,8 @@ class Sums:
         """Effect on the pose of one standard deviation of each error that is the same in all frames.
 
         Returns:
-            (6, 3 markers + 1), errors of the place of each marker in the map along x, y, z, and of the focal length.
+            (6, 3 markers + 1), effects of an error of each marker's place in the map along x, y and z, and of an error
+            of the focal length.
         """
         # The step is linear in the residuals, and an error of a place or of the focal length adds to the residuals. The
         # derivatives by a marker's place are those by the camera's position with the opposite sign.
@@ -191,7 +199,7 @@ def seen_markers(
     map_error_m: float = 0.0,
     focal_error: float = 0.0,
 ) -> SeenCorners:
-    """Make the data of a fit; errors of the map and of this frame add to the error of a marker's place."""
+    """Make the data of a fit; the error of a marker's place is the sum of errors of the map and of this frame."""
     to_next = _unit(corners_px[:, [1, 2, 3, 0]] - corners_px)
     inward = _unit(to_next - to_next[:, [3, 0, 1, 2]])
     off_m = float(np.hypot(place_m, map_error_m))

@@ -67,7 +67,7 @@ def estimate_pose(
         settings.focal_error,
     )
     poses = _likely_poses(corners, undistort(lens, corners.corners_px))
-    # One or two markers of many may agree by chance: any single marker has a pose that explains it.
+    # One or two of many markers may agree by chance, because every single marker has a pose that explains this marker.
     poses = [pose for pose in poses if pose.used.sum() >= min(_ENOUGH_MARKERS, len(corners_px) / 2)]
     if not poses:
         return None
@@ -87,10 +87,10 @@ def estimate_pose(
 
 
 def _chance(corners: SeenCorners, best: Fit) -> float:
-    """Expected number of sets of as many markers that agree by chance: all but one fall near their projections.
+    """Expected number of sets of markers, as large as the used set, that agree by chance.
 
-    This is an upper bound on the probability: sizes and orientations of the markers, which would have to agree as well,
-    are left out.
+    Markers agree if all but one fall near their projections. The number is an upper bound on the probability, because
+    the sizes and orientations of the markers, which would have to agree too, are left out.
     """
     count, others = len(best.used), int(best.used.sum()) - 1
     near_px = LOOSE * max(corners.noise_px, best.reprojection_px)
@@ -99,9 +99,9 @@ def _chance(corners: SeenCorners, best: Fit) -> float:
 
 
 def _likely_poses(corners: SeenCorners, rays: Float[np.ndarray, "markers 4 2"]) -> list[Fit]:
-    """Different poses that explain all markers or some of them, the most likely first."""
+    """Different poses that explain all markers or a part of the markers, the most likely pose first."""
     found = _distinct(fit(corners, *pose) for pose in pose_of_all(corners, rays))
-    # If all markers agree, or at least three and more than half of them, no other pose explains as many as well.
+    # If all markers agree, or at least three markers and more than half of all, no other pose explains an equal number.
     enough, near_px = min(max(3, len(rays) // 2 + 1), len(rays)), LOOSE * corners.noise_px
     if not found or found[0].used.sum() < enough or found[0].reprojection_px > near_px:
         by_pairs = poses_of_pairs(corners, rays)
@@ -113,7 +113,7 @@ def _likely_poses(corners: SeenCorners, rays: Float[np.ndarray, "markers 4 2"]) 
 
 
 def _distinct(fits: Iterable[Fit | None]) -> list[Fit]:
-    """Fits, the most likely first, without those that are the same pose as a more likely one."""
+    """Fits, the most likely first, without fits of the same pose as a more likely fit."""
     found: list[Fit] = []
     for pose in sorted((pose for pose in fits if pose is not None), key=lambda pose: -pose.log_evidence):
         if not any(

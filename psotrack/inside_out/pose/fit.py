@@ -1,4 +1,4 @@
-"""The most likely pose near a start, and the corners that fit the pose.
+"""The most likely pose near an initial pose, and the corners that fit the most likely pose.
 
 Robust steps come first, then steps with all corners that fit (`psotrack.estimation.gauss_newton`). Studentised
 residuals, which are residuals in units of their own standard deviations, decide which corners and markers fit (Cook &
@@ -34,18 +34,19 @@ from psotrack.inside_out.pose.equations import (
 FALSE_ALARM = 1e-3
 #: Smallest number of corners of a marker that fit; a marker with two bad corners may be anything.
 MIN_CORNERS = 3
-#: First estimate of the deviation of a marker's place, as a multiple of the stated one. An estimate that is too large
-#: shrinks within few steps, and one that is too small grows slowly.
+#: First estimate of the deviation of a marker's place, as a multiple of the stated deviation. An estimate that is too
+#: large shrinks within few steps, and an estimate that is too small grows slowly.
 _FIRST_PLACE_SCALE = 10.0
 #: Deviations above which a fit is rejected: of corners, as a multiple of the stated noise, and of places, metres.
 _LARGEST_NOISE_SCALE, _LARGEST_PLACE_M = 30.0, 0.05
-#: Largest number of robust steps and of steps without robust weights; and the step from which no corner is taken back.
+#: Largest number of robust steps and of steps without robust weights; and the step from which a rejected corner stays
+#: rejected.
 _MAX_STEPS, _NO_RETURN = 12, 5
 #: Squared lengths in standard deviations of the last robust step and of the last step.
 _LAST_ROBUST, _LAST = 1.0, 1e-2
 #: A corner fits the robust pose if its distance is below this multiple of the robust scale.
 _WITHIN = 4.0
-#: Longest step, because a start may be far off: rad, and as a share of the markers' distance.
+#: Longest step, because an initial pose may be far off: rad, and as a share of the markers' distance.
 _LONGEST = 0.3
 #: Smallest variance of a residual, as a share of the corner's own variance.
 _LEAST_VARIANCE = 0.02
@@ -55,10 +56,10 @@ _LOG_ANYWHERE = -2 * log(100.0)
 
 @dataclass(frozen=True)
 class Fit:
-    """The most likely pose near a start.
+    """The most likely pose near an initial pose.
 
     Attributes:
-        position_m: (3,), the camera's centre, world.
+        position_m: (3,), the camera's centre, world, metres.
         R_world_cam: (3, 3), camera to world.
         covariance: (6, 6), covariance as in `CameraPath`.
         common: (6, 3 markers + 1), effects of one standard deviation of each marker's place in the map along each axis,
@@ -78,7 +79,7 @@ class Fit:
 
     @property
     def used(self) -> Bool[np.ndarray, "markers"]:
-        """(markers,), True for markers of which a corner fits."""
+        """(markers,), True for markers with at least one corner that fits."""
         return np.any(self.fits, axis=1)
 
 
@@ -88,16 +89,16 @@ def fit(
     R_world_cam: Float[np.ndarray, "3 3"],
     fits: Bool[np.ndarray, "markers 4"] | None = None,
 ) -> Fit | None:
-    """Fit a pose near a start, and find the corners that fit.
+    """Fit a pose near an initial pose, and find the corners that fit.
 
     Args:
         seen: markers of the frame.
-        position_m: (3,), the camera's centre, world, at the start.
-        R_world_cam: (3, 3), camera to world, at the start.
-        fits: (markers, 4), True for corners that fit the start; None to find them by robust steps.
+        position_m: (3,), the camera's centre in the initial pose, world, metres.
+        R_world_cam: (3, 3), camera to world, in the initial pose.
+        fits: (markers, 4), True for corners that fit the initial pose; None to find these corners by robust steps.
 
     Returns:
-        The fit; None where the markers leave the pose undetermined, or no pose explains them.
+        The fit; None if the markers do not determine the pose, or no pose explains the markers.
     """
     pose = _Pose(position_m, R_world_cam, np.zeros(2))
     if fits is None:
@@ -125,7 +126,7 @@ class _Pose:
     extra: Float[np.ndarray, "2"]
 
     def moved(self, step: Float[np.ndarray, "8"], depth_m: Float[np.ndarray, "markers 4"]) -> _Pose:
-        """Take a step, shortened to the longest one; `depth_m` are the depths of the corners."""
+        """Take a step, shortened to the longest step; `depth_m` are the depths of the corners, metres."""
         distance_m = np.maximum(depth_m, NEAR_M).mean()
         longest = max(np.linalg.norm(step[:3]) / distance_m, np.linalg.norm(step[3:6]), _LONGEST)
         step = step * (_LONGEST / longest)
@@ -178,7 +179,7 @@ class _LastStep:
     """The last step of a `_NoiseFit`.
 
     Attributes:
-        fits: (markers, 4), True for the corners that it used.
+        fits: (markers, 4), True for the corners that the step used.
         off_px: (markers, 4, 2), linearised residuals after the step.
         sums: sums of the equations.
         solution: the step.
@@ -222,7 +223,7 @@ class _NoiseFit:
         off_px = rows @ np.append(-solution.step, 1.0)
         still_fits = fits & is_ahead
         if self.number > 0:
-            # The stated noise judges no corner; the noise that the residuals show does.
+            # Corners are judged by the noise that the residuals show; in the first step only the stated noise is known.
             still_fits = _explained(off_px, rows[..., :8], is_ahead, fits, solution.covariance, noise)
         if self.number >= _NO_RETURN:
             # The gates depend on the fit and the fit on the gates. A corner that alternates stays out.
@@ -243,7 +244,7 @@ class _NoiseFit:
 
 
 def _fitted(seen: SeenCorners, pose: _Pose, last: _LastStep, noise: Noise) -> Fit | None:
-    """Make the result from the last step and the noise; None where residuals are too large to trust the pose."""
+    """Make the result from the last step and the noise; None if the residuals are too large for a usable pose."""
     fits, off_px, sums = last.fits, last.off_px, last.sums
     widened = noise.widened()
     solution: Solution | None = sums.solved(widened, pose.extra)
@@ -272,7 +273,7 @@ def _explained(
     covariance: Float[np.ndarray, "8 8"],
     noise: Noise,
 ) -> Bool[np.ndarray, "markers 4"]:
-    """(markers, 4), True for corners whose studentised residual, and whose marker's mean one, is within the gate."""
+    """(markers, 4), True if the studentised residual of the corner, and the mean one of its marker, are in the gate."""
     used = np.any(fits, axis=1)
     good = ahead & _within(off_px, slopes, np.ones(fits.shape), covariance, noise, fits)
     count = np.maximum(good.sum(axis=1), 1)
@@ -312,15 +313,15 @@ def _within(
     sign = np.where(fitted, -1.0, 1.0)
     of_place = noise.place_m2 * (by_place * by_place).sum(axis=-1)
     variance = of_place + sign[..., None] * (half * slopes).sum(axis=-1)
-    # A residual without freedom has a variance of 0 and tells nothing.
+    # A residual without degrees of freedom has a variance of 0 and no information.
     least = _LEAST_VARIANCE * own_px2
     xx, yy = (np.maximum(own_px2 + variance[..., axis], least) for axis in (0, 1))
     xy = noise.place_m2 * (by_place[..., 0, :] * by_place[..., 1, :]).sum(axis=-1)
     xy += sign * (half[..., 0, :] * slopes[..., 1, :]).sum(axis=-1)
     x, y = off_px[..., 0], off_px[..., 1]
     square = (yy * x * x - 2 * xy * x * y + xx * y * y) / np.maximum(xx * yy - xy * xy, least * least)
-    # Satterthwaite's freedom of a sum of variances, and the gate of 2 F(2, freedom), which exceeds x with a probability
-    # of (1 + x / freedom)^(-freedom / 2).
+    # Satterthwaite's degrees of freedom of a sum of variances, and the gate of 2 F(2, freedom), which exceeds x with a
+    # probability of (1 + x / freedom)^(-freedom / 2).
     place_px2 = of_place.mean(axis=-1)
     parts = own_px2**2 / noise.own_freedom + place_px2**2 / noise.place_freedom
     freedom = (own_px2 + place_px2) ** 2 / parts

@@ -24,11 +24,12 @@ InitialPose = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]
 #: Largest distance of a corner from its projection, in stated standard deviations of a corner, at which an initial
 #: pose of few markers still explains the corner.
 LOOSE = 15.0
-#: Number of pairs of markers that poses are computed from. With 40 % wrong markers a third of the pairs is right.
+#: Largest number of pairs of markers from which poses are computed. With 40 % wrong markers a third of the pairs is
+#: right.
 _MOST_PAIRS = 55
-#: Number of markers in a frame up to which poses of single markers are computed, too.
+#: Largest number of markers in a frame for which poses of single markers are computed too.
 _FEW_MARKERS = 3
-#: Number of initial poses that are worth a fit.
+#: Largest number of initial poses that are fitted.
 _MOST_INITIAL_POSES = 4
 #: Ratio of the smallest to the largest extent of markers below which they may have a second, mirrored pose.
 _NEARLY_FLAT = 0.1
@@ -44,7 +45,7 @@ def pose_of_all(corners: SeenCorners, rays: Float[np.ndarray, "markers 4 2"]) ->
 def poses_of_pairs(
     corners: SeenCorners, rays: Float[np.ndarray, "markers 4 2"]
 ) -> list[tuple[InitialPose, Bool[np.ndarray, "markers 4"]]]:
-    """Poses of pairs of markers that explain most corners, with these corners; no two explain the same markers."""
+    """Poses of pairs of markers that explain most corners, with these corners; each pose explains other markers."""
     poses = list(_poses_of_few(corners, rays))
     if not poses:
         return []
@@ -102,7 +103,7 @@ def projection_distances_px(
 
 
 def _poses_of_few(corners: SeenCorners, rays: Float[np.ndarray, "markers 4 2"]) -> Iterator[InitialPose]:
-    """Poses of pairs of markers, from opposite corners of both; in frames of few markers, of single ones as well."""
+    """Poses of pairs of markers, from two opposite corners of each; in frames of few markers, of single markers too."""
     count = len(rays)
     pairs = list(combinations(range(count), 2))
     if len(pairs) > _MOST_PAIRS:
@@ -124,7 +125,7 @@ def _solve(
             corners_m.reshape(-1, 3), rays.reshape(-1, 2), np.eye(3), None, flags=method
         )
     except cv2.error:
-        # Degenerate corners, such as corners on one line.
+        # OpenCV fails for degenerate corners, such as corners on one line.
         return []
     poses = [
         (np.asarray(cv2.Rodrigues(turn)[0]).T, shift.ravel())

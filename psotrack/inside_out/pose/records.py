@@ -16,10 +16,10 @@ class PoseSettings:
 
     Attributes:
         min_markers: smallest number of markers that a pose is estimated from, 1 or more.
-        noise_px: standard deviation of a corner along x and along y, pixels; corrected by residuals where there are
-            enough of them.
+        noise_px: standard deviation of a corner along x and along y, pixels; corrected by the residuals if there are
+            enough residuals.
         place_m: standard deviation of the error that all corners of a marker share in one frame, along each axis of
-            the world, metres; corrected by residuals as well.
+            the world, metres; corrected by the residuals too.
         map_error_m: standard deviation of a marker's position in the map along each axis, metres; the same error in
             every frame.
         focal_error: standard deviation of the focal length, as a share of the focal length; the same error in every
@@ -68,13 +68,13 @@ class MarkerPose:
         R_world_cam: (3, 3), camera to world; camera axes x right, y down, z ahead.
         covariance: (6, 6), as in `CameraPath`: of the position along the world's axes (m) and of a small turn about the
             camera's axes (rad).
-        used: (markers,), the markers that the pose explains.
+        used: (markers,), True for the markers that the pose explains.
         reprojection_px: root mean square distance, over the used corners, between image and projection, pixels.
         ambiguity: probability that another pose is the right one, 0 to 1/2.
         common: (6, 3 markers + 1), a matrix square root of the part of the covariance that comes from errors common
-            to all frames: a column per axis of each marker's position in the map, and one for the focal length, each
+            to all frames: one column per axis of each marker's position in the map, and one for the focal length, each
             for an error of one standard deviation.
-        chance: upper bound on the probability that this many markers agree by chance although all were misread.
+        chance: upper bound on the probability that the used markers agree by chance although all ids are wrong.
     """
 
     position_m: Float[np.ndarray, "3"]
