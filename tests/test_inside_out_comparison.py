@@ -1,4 +1,4 @@
-"""Comparison of a camera's path with a reference: tables worked by hand, planted clock offsets, arms and turns."""
+"""Comparison of a camera's path with a reference: tables by hand, and known clock offsets, lever arms and turns."""
 
 from dataclasses import replace
 
@@ -46,7 +46,7 @@ def flown_m(time_s, speed_m_s=1.0, seed=0):
 
 
 def turned(time_s, seed=1) -> Rotation:
-    """Orientations of a body that turns around and sways a little, so that yaw passes 180 degrees, at each time."""
+    """Orientations of a body that turns about the vertical and sways a little; yaw passes 180 degrees."""
     sway_deg = 12.0 * flown_m(time_s, 1.0, seed)
     return Rotation.from_euler("ZYX", sway_deg * [15, 1, 1] + [170, -18, 0], degrees=True)
 
@@ -61,7 +61,7 @@ def wxyz_of(rotation: Rotation):
 
 
 def recording(rate_hz=100.0, seconds=13.0, clock_s=0.0):
-    """Times by a clock that is ahead, and positions and orientations of the body at these times."""
+    """Times by a clock that is `clock_s` ahead, and positions and orientations of the body at these times."""
     time_s = 0.0031 + np.arange(int(seconds * rate_hz)) / rate_hz
     return time_s + clock_s, flown_m(time_s), wxyz_of(turned(time_s))
 
@@ -94,18 +94,18 @@ class TestTablesByHand:
         return Rotation.from_euler("Z", np.reshape(yaw_deg, (-1, 1)), degrees=True) * ahead
 
     def test_table_7(self):
-        """Errors are vertical, so that no offset makes them smaller."""
+        """All errors are vertical, so no clock offset makes them smaller."""
         error_m = np.array([0.01, 0.02, 0.03, 0.04, 0.10])
         position_m = self.level_m(self.TIME_S) + error_m[:, None] * [0, 0, 1]
         path = path_of(self.TIME_S, position_m, np.tile([1.0, 0, 0, 0], (5, 1)))
         found = compare(
             path, self.SAMPLES_S, self.level_m(self.SAMPLES_S), with_lever_arm=False, max_offset_s=0.1
         )
-        # The offset is found to 1e-6 s, in which the drone flies 1e-5 m: 5e-9 m beside an error of 0.01 m.
+        # The offset is found to 1e-6 s, in which the drone flies 1e-5 m. This adds 5e-9 m to an error of 0.01 m.
         assert found.offset_s == pytest.approx(0, abs=2e-6)
         np.testing.assert_allclose(found.distance_m, error_m, atol=1e-8)
         table = Statistics.of(found.distance_m)
-        # Squared deviations of -3, -2, -1, 0 and 6 hundredths: 50 / 5.
+        # Deviations of -3, -2, -1, 0 and 6 hundredths have a mean square of 50 / 5.
         expected = [0.20 / 5, 0.03, np.sqrt(50 / 5) / 100, 0.01, 0.10]
         assert [table.mean, table.median, table.std, table.minimum, table.maximum] == pytest.approx(expected)
         assert table.count == 5
@@ -114,7 +114,7 @@ class TestTablesByHand:
         np.testing.assert_allclose(found.distance_to_point_m, found.distance_m)
 
     def test_table_8(self):
-        """Yaw goes from 176 to 184 degrees, which is -176 degrees: differences are wrapped."""
+        """Yaw goes from 176 to 184 degrees, which is the same as -176 degrees, so differences must be wrapped."""
         yaw_deg, error_deg = 176.0 + 2 * np.arange(5), np.array([1.0, 3.0, -2.0, 0.5, -5.0])
         path = path_of(self.TIME_S, self.level_m(self.TIME_S), wxyz_of(self.going_about(yaw_deg + error_deg)))
         yaws_deg = 176.0 + 2 * FPS * (self.SAMPLES_S - 0.2)
@@ -127,14 +127,14 @@ class TestTablesByHand:
             with_turn=False,
             max_offset_s=0.1,
         )
-        # 50 degrees per second, for an offset error of 2e-6 s.
+        # The body turns by 50 degrees per second, and the offset has an error of 2e-6 s.
         np.testing.assert_allclose(found.turning.difference_deg[:, 2], error_deg, atol=1e-4)
         np.testing.assert_allclose(found.turning.difference_deg[:, :2], 0, atol=1e-6)
         np.testing.assert_allclose(found.turning.angle_deg, np.abs(error_deg), atol=1e-4)
         np.testing.assert_array_equal(found.turning.turn_wxyz, [1, 0, 0, 0])
         assert found.turning.offset_s == found.offset_s
         table = Statistics.of(found.turning.difference_deg[:, 2])
-        # Deviations from the mean of -1/2 are 1.5, 3.5, -1.5, 1 and -4.5; their squares average 38 / 5.
+        # Deviations from the mean of -1/2 are 1.5, 3.5, -1.5, 1 and -4.5, with a mean square of 38 / 5.
         expected = [-2.5 / 5, 0.5, np.sqrt(38 / 5), -5.0, 3.0]
         assert [table.mean, table.median, table.std, table.minimum, table.maximum] == pytest.approx(
             expected, abs=1e-4
@@ -164,7 +164,7 @@ class TestAngles:
     @given(st.integers(0, 2**32 - 1))
     @settings(max_examples=5)
     def test_differences_and_angles_of_random_orientations(self, seed):
-        """Against SciPy's Euler angles of the body, and the magnitude of the rotation between the two."""
+        """Compared with SciPy's Euler angles of the body, and with the angle of the rotation between the two."""
         path = filmed(seconds=4)
         rng = np.random.default_rng(seed)
         errors = Rotation.from_rotvec(rng.normal(0, 0.3, (path.num_frames, 3)))
@@ -179,7 +179,7 @@ class TestAngles:
             with_turn=False,
             max_offset_s=0.1,
         ).turning
-        # Great arcs over h = 10 ms miss h² / 8 of an angular acceleration of up to 20 rad/s²: 2.5e-4 rad.
+        # Great arcs over h = 10 ms have an error of h² / 8 times the angular acceleration, up to 20 rad/s²: 2.5e-4 rad.
         np.testing.assert_allclose(found.angle_deg, np.degrees(errors.magnitude()), atol=0.02)
         ahead = Rotation.from_matrix(LOOKS_AHEAD).inv()
         euler_deg = [
@@ -196,7 +196,7 @@ class TestAngles:
         near = true * Rotation.from_rotvec(rng.normal(0, 0.01, (200, 3)))
         wild = Rotation.random(int(200 * share / (1 - share)), rng=rng)
         found = mean_rotation(Rotation.concatenate([near, wild]))
-        # The mean of 200 rotations with 0.01 rad: 0.0007 along each axis; outliers move it by a few times as much.
+        # The mean of 200 rotations with errors of 0.01 rad is good to 0.0007 rad along each axis; outliers add to that.
         assert (true.inv() * found).magnitude() < (0.0025 if share == 0 else 0.006)
 
     def test_orientations_between_samples_equal_scipys_except_in_gaps(self):
@@ -233,8 +233,8 @@ class TestClocks:
         ("clock_s", "turn_clock_s"),
         [(0.3137, None), (-0.2719, None), (-0.2719, 0.1573), (512.2345, -77.03)],
     )
-    def test_planted_offsets_arm_and_turn_are_found(self, clock_s, turn_clock_s):
-        """Positions at 100 Hz by one clock; orientations by the same clock, or at 40 Hz by another clock."""
+    def test_known_offsets_arm_and_turn_are_found(self, clock_s, turn_clock_s):
+        """Positions are at 100 Hz by one clock; orientations are by the same clock, or at 40 Hz by another clock."""
         path = filmed(ARM_M, TURN, noise_m=0.005, noise_deg=0.2)
         time_s, position_m, wxyz = recording(clock_s=clock_s)
         turns = {}
@@ -242,20 +242,20 @@ class TestClocks:
             orientation_time_s, _, wxyz = recording(rate_hz=40, clock_s=turn_clock_s)
             turns = {"orientation_time_s": orientation_time_s}
         found = compare(path, time_s, position_m, wxyz, **turns)
-        # The aim is 0.1 frame. Here the noise allows a fiftieth of a frame.
+        # The required accuracy is 0.1 frame. Here the noise allows a fiftieth of a frame.
         assert abs(found.offset_s - clock_s) * FPS < 0.05
         assert found.offset_std_s * FPS < 0.05
         expected_s = clock_s if turn_clock_s is None else turn_clock_s
         assert abs(found.turning.offset_s - expected_s) * FPS < 0.05
-        # Medians of 250 values: of 5 mm, 0.4 mm; of 0.2 degrees, 0.015. Six times as much.
+        # Medians of 250 values with noise of 5 mm and 0.2 degrees are good to 0.4 mm and 0.015 degrees; limits 6 times.
         np.testing.assert_allclose(found.lever_arm_m, ARM_M, atol=0.0024)
         turn = Rotation.from_quat(found.turning.turn_wxyz, scalar_first=True)
         assert np.degrees((TURN.inv() * turn).magnitude()) < 0.1
-        # The mean distance in three dimensions is √(8 / π) of the noise along each axis, to 42 % / √250; three times.
-        of_noise = np.sqrt(8 / np.pi)
-        assert np.mean(found.distance_m) == pytest.approx(0.005 * of_noise, rel=0.08)
-        assert np.mean(found.turning.angle_deg) == pytest.approx(0.2 * of_noise, rel=0.08)
-        # The arm of 0.13 m, within the noise.
+        # The mean distance is √(8 / π) times the noise along each axis, good to 42 % / √250; limit three times that.
+        mean_norm = np.sqrt(8 / np.pi)
+        assert np.mean(found.distance_m) == pytest.approx(0.005 * mean_norm, rel=0.08)
+        assert np.mean(found.turning.angle_deg) == pytest.approx(0.2 * mean_norm, rel=0.08)
+        # The length of the arm, 0.13 m, within the noise.
         assert np.mean(found.distance_to_point_m) == pytest.approx(np.linalg.norm(ARM_M), abs=0.002)
         body_m = flown_m(path.time_s) + turned(path.time_s).apply(ARM_M)
         np.testing.assert_allclose(found.reference_m, body_m, atol=0.006)
@@ -274,7 +274,7 @@ class TestClocks:
 
     @pytest.mark.parametrize("turn_clock_s", [None, 0.1573])
     def test_a_slow_drone_with_a_long_lever_arm_that_turns(self, turn_clock_s):
-        """With a constant arm in the world instead of the body, most of the visible motion would be the arm's."""
+        """If the arm were constant in the world instead of the body, it would cause most of the visible motion."""
         path, (time_s, _, _) = filmed(noise_deg=0.2), recording()
         slow_m = [flown_m(each_s, speed_m_s=0.3) for each_s in (path.time_s, time_s)]
         moved_m = slow_m[0] + turned(path.time_s).apply([0.2, -0.1, 0.12])
@@ -300,7 +300,7 @@ class TestClocks:
         assert np.median(found.turning.angle_deg) < 0.5
 
     def test_outliers_are_counted_and_do_not_move_the_clocks(self):
-        """Every eighth pose is anywhere in the room, and one pose is ten kilometres away."""
+        """Every eighth pose is anywhere in the room, and one pose is at a distance of ten kilometres."""
         path = filmed(ARM_M, TURN, noise_m=0.005, noise_deg=0.2)
         wild = np.arange(3, path.num_frames, 8)
         rng = np.random.default_rng(2)
@@ -315,7 +315,7 @@ class TestClocks:
             found = compare(wrong, time_s, reference_m, wxyz_used, **turns)
             assert abs(found.offset_s + 0.2719) * FPS < 0.1
             assert abs(found.turning.offset_s - (0.4 if turns else -0.2719)) * FPS < 0.1
-            # No outlier is left out: 10 km stay in the mean and the maximum.
+            # No outlier is left out: the distance of 10 km is in the mean and in the maximum.
             assert Statistics.of(found.distance_m).count == path.num_frames
             assert np.max(found.distance_m) > 9e3
             assert np.max(found.turning.angle_deg) > 90
@@ -332,7 +332,7 @@ class TestClocks:
         found = compare(path, time_s, position_m, wxyz)
         assert abs(found.offset_s) * FPS < 0.05
         lost = np.isin(path.frame, [*range(40, 60), *range(80, 90)])
-        # Both ends of a gap are right to a step of 10 ms.
+        # The ends of a gap are exact to one step of 10 ms.
         no_position = (path.time_s > 7.99) & (path.time_s < 8.51)
         no_turn = (path.time_s > 8.99) & (path.time_s < 10.01)
         np.testing.assert_array_equal(np.isnan(found.distance_m), lost | no_position | no_turn)
@@ -371,7 +371,7 @@ class TestRefusedComparisons:
         assert "\n" not in str(caught.value)
 
     def test_clocks_too_far_apart(self):
-        """The two have nothing in common at any allowed offset."""
+        """Path and reference have no common time at any allowed offset."""
         time_s, position_m, _ = recording(clock_s=100)
         self.refused(
             "expected positions of both at offsets within 2 s, found none",
@@ -416,7 +416,7 @@ class TestRefusedComparisons:
         path.position_m[:] = still_m + rng.normal(0, 0.01, path.position_m.shape)
         time_s, _, wxyz = recording()
         reference_m = np.tile(still_m, (len(time_s), 1))
-        # Turning does not help.
+        # Known orientations do not help.
         self.refused("hover", path, time_s, reference_m)
         self.refused("hover", path, time_s, reference_m, wxyz)
         self.refused("hover", path, time_s, reference_m, wxyz, orientation_time_s=time_s)
@@ -442,8 +442,8 @@ def flown():
 
 class TestPlots:
     @staticmethod
-    def of_colour(png, colour):
-        """Which pixels have about this colour, #rrggbb."""
+    def has_colour(png, colour):
+        """Mask of the pixels with about this colour, #rrggbb."""
         bgr = [int(colour[place : place + 2], 16) for place in (5, 3, 1)]
         return np.abs(cv2.imread(str(png)).astype(int) - bgr).max(axis=-1) < 40
 
@@ -452,17 +452,17 @@ class TestPlots:
         png = tmp_path / "paths.png"
         save_paths(png, path, comparison, caption="a flight")
         for colour in (RECONSTRUCTED, REFERENCE):
-            assert self.of_colour(png, colour).sum() > 500
+            assert self.has_colour(png, colour).sum() > 500
         with pytest.raises(OutputError, match="expected a path that does not exist yet"):
             save_paths(png, path, comparison)
         # A pose far away does not change the scale of the plot; the caption counts it.
         wild = replace(path, position_m=path.position_m.copy())
         wild.position_m[100] = 1e4
         save_paths(tmp_path / "wild.png", wild, compare(wild, *recording()), caption="a flight")
-        # Measured 0.99 of the pixels: a piece of the line is missing.
+        # Measured 0.99 of the pixels, because a piece of the line is missing.
         assert (
-            self.of_colour(tmp_path / "wild.png", REFERENCE).sum()
-            > 0.9 * self.of_colour(png, REFERENCE).sum()
+            self.has_colour(tmp_path / "wild.png", REFERENCE).sum()
+            > 0.9 * self.has_colour(png, REFERENCE).sum()
         )
 
     def test_errors_over_time(self, tmp_path, flown):

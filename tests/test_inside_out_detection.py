@@ -1,4 +1,4 @@
-"""Detection of markers and their corners, against drawn images whose corners are known."""
+"""Detection of markers and their corners in drawn images with known corners."""
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ from psotrack.inside_out.detection import MarkerDetector, refine_corners
 from psotrack.inside_out.detection.gamma import estimate_gamma
 
 SIZE_WH = (640, 480)
-#: Samples per pixel along each side of drawn images: every edge is right to 1/16 of a pixel.
+#: Samples per pixel along each side of drawn images: every edge is good to 1/16 of a pixel.
 FINE = 8
 #: Width of the white zone around a marker, cells.
 QUIET = 1.0
@@ -41,7 +41,7 @@ BLACK, WHITE, WALL = 40, 200, 140
 
 
 def draw(markers, *, size_wh=SIZE_WH, dictionary="4x4_1000", lens=None, exponent=2.0):
-    """An image of a wall with markers at given corners, (4, 2) each, drawn by casting rays through fine pixels."""
+    """An image of a wall with markers at given corners, (4, 2) each, drawn by one ray for each sample."""
     drawn = np.full(size_wh[::-1], WALL, np.uint8)
     for marker, corners in markers:
         image, own = pattern(marker, dictionary)
@@ -57,13 +57,13 @@ def draw(markers, *, size_wh=SIZE_WH, dictionary="4x4_1000", lens=None, exponent
         grid = np.stack(np.meshgrid(*axes), axis=-1)
         if lens is not None:
             grid = undistort(lens, grid) @ lens.K[:2, :2].T + lens.K[:2, 2]
-        # Position of each fine pixel in the marker's image.
+        # Positions of the samples in the marker's image.
         there = grid @ towards[:, :2].T + towards[:, 2]
         there = np.round(there[..., :2] / there[..., 2:]).astype(int)
         inside = ((there >= 0) & (there < image.shape[0])).all(axis=-1)
         fine = np.where(inside, 0.0, float(WALL))
         fine[inside] = BLACK + (WHITE - BLACK) * (image[there[inside][:, 1], there[inside][:, 0]] / 255)
-        # The light of a pixel is the mean of its fine pixels; its grey level is a root of the light.
+        # The light of a pixel is the mean of its samples; its grey level is a root of the light.
         light = (fine**exponent).reshape(high[1] - low[1], FINE, high[0] - low[0], FINE).mean(axis=(1, 3))
         coarse = light ** (1 / exponent)
         part = drawn[low[1] : high[1], low[0] : high[0]]
@@ -73,9 +73,9 @@ def draw(markers, *, size_wh=SIZE_WH, dictionary="4x4_1000", lens=None, exponent
 
 
 def degraded(image, *, blur_px=0.0, moved_px=0, noise=0.0, exponent=2.0, gain=1.0):
-    """The image through a soft lens, moved to the right during the exposure, brighter, with noise, and clipped.
+    """The image with blur, motion to the right during the exposure, other brightness, noise, and clipping.
 
-    Blur is applied to light, of which grey levels are a root.
+    Blur is applied to the light, and grey levels are roots of the light.
     """
     light = image.astype(float) ** exponent
     soft = cv2.GaussianBlur(light, (0, 0), blur_px) if blur_px else light
@@ -108,7 +108,7 @@ def errors_px(image, corners):
     return np.linalg.norm(found.corners_px - true, axis=-1)
 
 
-def error_px(found, corners):
+def largest_error_px(found, corners):
     return float(np.linalg.norm(found - corners, axis=-1).max())
 
 
@@ -127,36 +127,36 @@ def opencv_corners(image):
 @pytest.mark.parametrize(
     ("changes", "limits_px"),
     [
-        # Limits for the square and for the oblique marker. Measured 0.04 and 0.10: samples are half a pixel apart.
+        # Limits for the square and the oblique marker. Measured 0.04 and 0.10: samples are half a pixel apart.
         ({}, (0.1, 0.2)),
-        # Measured 0.02 and 0.12: blur moves no edge, but the cells of the oblique marker are as narrow as the blur.
+        # Measured 0.02 and 0.12: blur moves no edge, but cells of the oblique marker are as narrow as the blur.
         ({"blur_px": 1.5}, (0.1, 0.25)),
         # Measured 0.03 and 0.12.
         ({"moved_px": 5}, (0.1, 0.25)),
-        # Measured 0.21 and 0.31: with contrast 160, 16 points on an edge, each from a few samples.
+        # Measured 0.21 and 0.31: the contrast is 160, and each edge has 16 points from a few samples each.
         ({"noise": 8.0}, (0.5, 0.5)),
     ],
     ids=["sharp", "soft", "moved", "noisy"],
 )
 @pytest.mark.parametrize(("corners", "which"), [(SQUARE, 0), (OBLIQUE, 1)], ids=["square", "oblique"])
-def test_corners_are_where_the_marker_was_drawn(corners, which, changes, limits_px):
+def test_corners_are_found_at_their_drawn_positions(corners, which, changes, limits_px):
     found = MarkerDetector().detect(degraded(draw([(17, corners)]), **changes))
     assert found.ids.tolist() == [17]
-    assert error_px(found.corners_px[0], corners) < limits_px[which]
+    assert largest_error_px(found.corners_px[0], corners) < limits_px[which]
 
 
 @pytest.mark.parametrize("changes", [{"blur_px": 1.5}, {"moved_px": 5}], ids=["soft", "moved"])
-def test_corners_are_better_than_those_of_opencv_where_images_are_blurred(changes):
-    """OpenCV looks at the corners themselves, which blur rounds off: measured 40 times the error."""
+def test_corners_are_better_than_opencvs_in_blurred_images(changes):
+    """OpenCV uses the pixels around a corner, which blur makes round. Its error was measured 40 times larger."""
     image = degraded(draw([(17, SQUARE)]), **changes)
-    ours = error_px(MarkerDetector().detect(image).corners_px[0], SQUARE)
-    assert 3 * ours < error_px(opencv_corners(image)[17], SQUARE)
+    ours = largest_error_px(MarkerDetector().detect(image).corners_px[0], SQUARE)
+    assert 3 * ours < largest_error_px(opencv_corners(image)[17], SQUARE)
 
 
 @pytest.mark.parametrize("exponent", [1.0, 1.8, 2.4])
 @pytest.mark.parametrize("changes", [{}, {"blur_px": 2.5}, {"moved_px": 9}], ids=["sharp", "soft", "moved"])
 def test_corners_are_right_for_every_gamma(changes, exponent):
-    """Renderers blend grey levels, cameras light. With a gamma of 2, blurred grey images are 1.5 pixels off."""
+    """Renderers blend grey levels, cameras blend light. A fixed gamma of 2 gives 1.5 pixels in blurred grey images."""
     # Measured 0.09 at most.
     assert errors_px(*scene(exponent=exponent, **changes)).max() < 0.15
 
@@ -166,27 +166,27 @@ def test_gamma_is_estimated_from_markers(exponent):
     image, corners = scene(exponent=exponent, blur_px=1.5)
     white = np.concatenate([white_cells(marker) for marker in corners])
     gamma = estimate_gamma(image, np.stack(list(corners.values())), np.full((3, 4), 4.0), white, None)
-    # The estimate is linear between the two measured powers, 1 and 2.2, where the truth is curved: measured 0.06.
+    # The estimate is linear between the two measured powers, 1 and 2.2, but the truth is curved. Measured 0.06.
     assert gamma == pytest.approx(exponent, abs=0.12)
 
 
 def test_a_blur_of_most_of_a_cell_moves_no_corner():
-    """The search for an edge must reach as far as its blur: within four pixels most of this transition is missed."""
+    """The search for an edge must reach as far as the blur: four pixels would miss most of this transition."""
     # Measured 0.07.
     assert errors_px(*scene(moved_px=15)).max() < 0.15
 
 
 @pytest.mark.parametrize("exponent", [1.0, 2.2])
 def test_clipped_white_moves_corners_little(exponent):
-    """An image that was blurred and then clipped has wide white, like a high power: otherwise off by 0.3 to 1.0."""
+    """Blurred and clipped images have wide white areas, as with a high power. Uncorrected errors are 0.3 to 1.0."""
     # Measured 0.04.
     assert errors_px(*scene(exponent=exponent, blur_px=2.0, gain=1.3)).max() < 0.1
 
 
 def test_blur_before_and_after_encoding_moves_corners_little():
-    """Scaling or compressing a video blurs it again. Edges with unequal blurs are then a little off."""
+    """Scaling or compression blurs a video again, in grey levels. Edges with unequal blurs are then a little off."""
     image, corners = scene(moved_px=5)
-    # Measured 0.24; in light 0.48.
+    # Measured 0.24; 0.48 if the second blur were in light.
     assert np.median(errors_px(cv2.GaussianBlur(image, (0, 0), 1.5), corners)) < 0.35
 
 
@@ -199,8 +199,8 @@ def test_compression_and_noise_move_corners_little():
 
 @pytest.mark.parametrize(("gain", "noise"), [(0.2, 3.0), (0.1, 1.5)])
 def test_dim_light_hides_no_markers(gain, noise):
-    """Without equalised brightness, black in dim images misses a threshold that is made for bright images."""
-    # Measured 0.61: contrast is 11 and 21 times the noise.
+    """Without equalised brightness, black in dim images fails a threshold for bright images."""
+    # Measured 0.61: the contrast is 11 and 21 times the noise.
     assert errors_px(*scene(exponent=2.2, gain=gain, noise=noise)).max() < 1.0
 
 
@@ -214,7 +214,7 @@ def test_black_cells_of_a_large_marker_do_not_count_as_white():
     """Neighbouring black cells of this marker are nearly as wide as the square in which white is searched."""
     around = 0.1 + np.deg2rad(np.array([225, 315, 405, 495]))
     corners = np.array([320.3, 240.6]) + 210 * np.stack([np.cos(around), np.sin(around)], axis=-1)
-    # The lower half of 17 is black, with its border. Measured 0.02.
+    # The lower half of marker 17 is black, including its border. Measured 0.02.
     assert errors_px(draw([(17, corners)]), {17: corners}).max() < 0.1
 
 
@@ -222,7 +222,7 @@ def test_large_images_are_searched_shrunk_and_refined_in_full_size():
     image = np.full((2160, 3840), 140, np.uint8)
     shown, corners = scene()
     image[1500:1980, 3001:3641] = shown
-    # Measured as in the small image: 0.05.
+    # Measured 0.05, as in the small image.
     assert (
         errors_px(image, {marker: at + np.array([3001, 1500]) for marker, at in corners.items()}).max() < 0.1
     )
@@ -235,7 +235,7 @@ def test_any_dictionary_of_opencv(dictionary):
     found = MarkerDetector(dictionary).detect(draw([(7, SQUARE)], dictionary=dictionary))
     assert found.ids.tolist() == [7]
     # Measured 0.04.
-    assert error_px(found.corners_px[0], SQUARE) < 0.1
+    assert largest_error_px(found.corners_px[0], SQUARE) < 0.1
 
 
 def test_an_unknown_dictionary_is_one_line():
@@ -245,7 +245,7 @@ def test_an_unknown_dictionary_is_one_line():
 
 @pytest.mark.parametrize("side_px", [18, 24, 40])
 def test_small_markers_in_large_images_are_found(side_px):
-    """OpenCV's defaults find no marker with sides below 14.4 pixels in images of this width."""
+    """In images of this width, OpenCV's defaults find no marker with sides below 14.4 pixels."""
     corners = np.array(
         [[700.0, 400.0], [700 + side_px, 401], [699 + side_px, 401 + side_px], [700, 399 + side_px]]
     )
@@ -255,7 +255,7 @@ def test_small_markers_in_large_images_are_found(side_px):
     found = MarkerDetector().detect(image)
     assert found.ids.tolist() == [3]
     # Measured 0.13.
-    assert error_px(found.corners_px[0], corners) < 0.25
+    assert largest_error_px(found.corners_px[0], corners) < 0.25
 
 
 def test_corners_are_right_in_images_of_a_lens_with_distortion():
@@ -270,9 +270,9 @@ def test_corners_are_right_in_images_of_a_lens_with_distortion():
     rays = (straight - lens.K[:2, 2]) / 400
     corners = np.stack(distort(lens, *rays.T), axis=-1) * 400 + lens.K[:2, 2]
     image = draw([(5, straight)], lens=lens)
-    # Measured 0.04; straight lines through bent edges miss the corners by 0.85.
-    assert error_px(MarkerDetector(lens=lens).detect(image).corners_px[0], corners) < 0.1
-    assert error_px(MarkerDetector().detect(image).corners_px[0], corners) > 0.4
+    # Measured 0.04; straight lines through the bent edges miss the corners by 0.85.
+    assert largest_error_px(MarkerDetector(lens=lens).detect(image).corners_px[0], corners) < 0.1
+    assert largest_error_px(MarkerDetector().detect(image).corners_px[0], corners) > 0.4
 
 
 def test_only_the_wanted_markers_are_found():
@@ -283,7 +283,7 @@ def test_only_the_wanted_markers_are_found():
         # Ids that the dictionary does not have are ignored.
         found = MarkerDetector(ids=[5000, wanted, 3]).detect(image)
         assert found.ids.tolist() == [wanted]
-        # The gamma is then estimated from one marker instead of two, which moves corners by 0.01 pixels.
+        # The gamma is estimated from one marker instead of two, which moves corners by 0.01 pixels.
         np.testing.assert_allclose(found.corners_px, whole.select(whole.ids == wanted).corners_px, atol=0.03)
 
 
@@ -309,14 +309,14 @@ def test_an_image_without_markers_gives_an_empty_result(noise):
 
 def test_a_hidden_part_of_an_edge_moves_no_corner():
     image = draw([(17, SQUARE)])
-    # A dark object over a fifth of the right edge, with an edge of its own beside the marker's.
+    # A dark object covers a fifth of the right edge; its own edge is beside the marker's edge.
     image[225:245, 360:380] = 30
     found = refine_corners(image, SQUARE[None] + 0.5, white_cells(17))
     # Measured 0.04.
-    assert error_px(found[0], SQUARE) < 0.2
+    assert largest_error_px(found[0], SQUARE) < 0.2
 
 
-def test_corners_without_edges_stay():
+def test_corners_without_edges_do_not_move():
     flat = np.full((480, 640), 128, np.uint8)
     assert np.array_equal(refine_corners(flat, SQUARE[None], white_cells(17)), SQUARE[None])
     assert refine_corners(flat, np.zeros((0, 4, 2)), np.zeros((0, 6, 6), bool)).shape == (0, 4, 2)
@@ -330,11 +330,11 @@ def test_corners_without_edges_stay():
     side=st.floats(40, 120),
     marker=st.integers(0, 999),
 )
-def test_any_place_and_turn(angle, x, y, side, marker):
-    """Corners come in the marker's own order, clockwise from its own top left, at every turn."""
+def test_any_position_and_turn(angle, x, y, side, marker):
+    """Corners have the marker's own order, clockwise from its own top left corner, at every turn."""
     around = angle + np.pi / 4 * np.array([5, 7, 9, 11])
     corners = np.array([x, y]) + side / np.sqrt(2) * np.stack([np.cos(around), np.sin(around)], axis=-1)
     found = MarkerDetector().detect(draw([(marker, corners)]))
     assert found.ids.tolist() == [marker]
-    # Measured 0.2 at most, with sides of 40 pixels that are nearly upright and sharp.
-    assert error_px(found.corners_px[0], corners) < 0.3
+    # Measured 0.2 at most, for sides of 40 pixels that are nearly upright and sharp.
+    assert largest_error_px(found.corners_px[0], corners) < 0.3

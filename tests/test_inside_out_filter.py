@@ -1,5 +1,5 @@
-"""The causal filter over camera poses: its manifold against SciPy, its arithmetic against a textbook filter, its
-covariance against ground truth, and outliers, wrong first poses, gaps and ambiguous poses."""
+"""The causal filter of camera poses: its rotations compared with SciPy, its arithmetic with a textbook filter, its
+covariance with ground truth; outliers, wrong first poses, gaps and ambiguous poses."""
 
 from dataclasses import replace
 
@@ -37,7 +37,7 @@ NINETY = chi2.ppf(0.9, 3)
 
 
 def spread() -> np.ndarray:
-    """Covariance of poses: shifts to the side and turns about the vertical axis are correlated, as in real poses."""
+    """Covariance of a pose: shifts to the side and turns about the vertical axis are correlated, as in real poses."""
     covariance = np.diag([STD_M**2] * 3 + [STD_RAD**2] * 3)
     covariance[0, 4] = covariance[4, 0] = 0.8 * STD_M * STD_RAD
     covariance[1, 3] = covariance[3, 1] = -0.8 * STD_M * STD_RAD
@@ -45,7 +45,7 @@ def spread() -> np.ndarray:
 
 
 def flight(frames, *, acceleration=2.0, wobble=2.0, seed=0):
-    """A camera with white forces through a damping, and raw poses with partly lasting errors.
+    """A camera with random forces and damping, and raw poses with partly lasting errors.
 
     The motion differs from the filter's, and so does the duration of lasting errors (half a second).
 
@@ -117,14 +117,14 @@ def misplaced(path: CameraPath, rows, shift_m, turn=(0.0, 0.0, 0.0)) -> CameraPa
 
 
 def errors(path: CameraPath, position_m, truth):
-    """Truth less estimate, (seen, 3) each, along the world's axes and about the camera's, in frames with a pose."""
+    """Truth minus estimate in frames with a pose, (seen, 3) each: along the world's, and about the camera's axes."""
     seen = path.seen
     turn = Rotation.from_quat(path.orientation_wxyz[seen], scalar_first=True).inv() * truth[seen]
     return position_m[seen] - path.position_m[seen], turn.as_rotvec()
 
 
 def share_within(error, covariance) -> float:
-    """Share of errors within the 90 % ellipsoids."""
+    """Share of errors inside their 90 % ellipsoids."""
     return float((np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error) < NINETY).mean())
 
 
@@ -140,7 +140,7 @@ turns = st.lists(st.floats(-1.7, 1.7), min_size=3, max_size=3).map(np.array)
 
 @given(turns, turns)
 def test_turns_equal_scipys(first, second) -> None:
-    """`turned` and `turn_between`, to rounding, for tiny angles as well."""
+    """`turned` and `turn_between` agree to rounding, also for tiny angles."""
     for scale in (1.0, 1e-3, 1e-9):
         start = Rotation.from_rotvec(first)
         wxyz = start.as_quat(scalar_first=True)[None]
@@ -164,7 +164,7 @@ def test_jacobians_are_numerical_derivatives(scale, turn) -> None:
             Rotation.from_rotvec(turn) * Rotation.from_rotvec(sign * step_rad) for sign in (1, -1)
         )
         inverse[:, axis] = (ahead.as_rotvec() - behind.as_rotvec()) / (2 * small)
-    # Central differences: errors of the order of the squared step, and of rounding divided by the step, 1e-10.
+    # Central differences have errors of the squared step, and rounding errors divided by the step, 1e-10.
     np.testing.assert_allclose(manifold.right_jacobian(turn[None])[0], right, atol=2e-9)
     np.testing.assert_allclose(manifold.right_jacobian_inverse(turn[None])[0], inverse, atol=2e-9)
 
@@ -184,7 +184,8 @@ NONE = np.zeros((6, 0))
 def test_translation_of_a_camera_without_turns_equals_a_textbook_filter() -> None:
     """Kalman's equations in textbook form, for position, velocity, acceleration and the lasting error.
 
-    F and Q from the matrix exponential (C. F. Van Loan, Computing integrals involving the matrix exponential, 1978).
+    F and Q come from the matrix exponential (C. F. Van Loan, Computing integrals involving the matrix exponential,
+    1978).
     """
     rng = np.random.default_rng(1)
     noise = rng.normal(size=(3, 3))
@@ -220,7 +221,7 @@ def test_translation_of_a_camera_without_turns_equals_a_textbook_filter() -> Non
         found = np.concatenate(
             [motion.position_m, motion.velocity_m_s, motion.acceleration_m_s2, motion.lasting[:, :3]], axis=1
         )
-        # Measured: 1e-11 of the largest value of each kind; velocities' variances of 25 are cancelled to 1e-3.
+        # Measured 1e-11 of the largest value of each kind; velocity variances of 25 are reduced to 1e-3.
         np.testing.assert_allclose(found[0], x, rtol=1e-8, atol=1e-9)
         np.testing.assert_allclose(motion.covariance[0][np.ix_(part, part)], P, rtol=1e-7, atol=1e-10)
 
@@ -242,9 +243,9 @@ def test_transition_matrix_is_the_derivative_of_the_motion() -> None:
 
 
 def test_covariance_of_one_level_is_consistent() -> None:
-    """Cameras that move as the level assumes: the normalised estimation error squared (NEES) is 21 on average.
+    """For cameras that move as the level assumes, the normalised estimation error squared (NEES) is 21 on average.
 
-    Two errors are common to all frames, with another effect on each frame's pose.
+    Two errors are common to all frames, with a different effect on each frame's pose.
     """
     rng = np.random.default_rng(3)
     frames, runs, dt_s = 6, 60, 0.04
@@ -284,13 +285,13 @@ def test_covariance_of_one_level_is_consistent() -> None:
 
 @pytest.mark.parametrize(("acceleration", "wobble"), [(0.2, 0.5), (2.0, 2.0), (25.0, 25.0)])
 def test_filter_improves_poses_for_hovering_and_racing_cameras(acceleration, wobble) -> None:
-    """The filter knows neither how the camera flies nor how long errors last."""
+    """The filter has no knowledge of the camera's motion and of the duration of lasting errors."""
     raw, position_m, truth = flight(150, acceleration=acceleration, wobble=wobble, seed=6)
     path = filter_path(raw)
     assert (path.status[2:] != Status.LOST).all()
     off_m, off_rad = errors(path, position_m, truth)
     raw_off_m, raw_off_rad = errors(raw, position_m, truth)
-    # Most of the error lasts and cannot be separated from motion: the gain is small.
+    # Most of the error is lasting and cannot be separated from motion, so the gain is small.
     assert np.median(np.linalg.norm(off_m, axis=1)) < 1.03 * np.median(np.linalg.norm(raw_off_m, axis=1))
     assert np.median(np.linalg.norm(off_rad, axis=1)) < 1.03 * np.median(np.linalg.norm(raw_off_rad, axis=1))
     covariance = path.covariance[path.seen]
@@ -299,14 +300,14 @@ def test_filter_improves_poses_for_hovering_and_racing_cameras(acceleration, wob
     speed_error = np.linalg.norm(
         path.velocity_m_s[10:] - np.gradient(position_m, raw.time_s, axis=0)[10:], axis=1
     )
-    # The white error divided by the time of some frames, and the change of a racing camera's acceleration in a frame.
+    # The white error divided by the duration of a few frames, plus the change of acceleration in a frame.
     assert np.median(speed_error) < 0.1 + acceleration / FPS
 
 
 def test_good_poses_are_gated_as_seldom_as_stated() -> None:
     raw, _, _ = flight(300, acceleration=0.5, wobble=0.3, seed=6)
     path = filter_path(raw, PoseFilterParams(false_alarm=0.03))
-    # 9 of 300 are expected where level and errors are as assumed; 20 would be 4 sigma more.
+    # 9 of 300 are expected if level and errors are as assumed; 20 would be 4 standard deviations more.
     assert 1 <= ((path.flags & Flag.GATED) > 0).sum() <= 20
 
 
@@ -317,13 +318,13 @@ def test_too_large_covariances_are_scaled_down() -> None:
     late = slice(100, None)
     off_m, _ = errors(path, position_m, truth)
     assert share_within(off_m[late], path.covariance[path.seen][late, :3, :3]) > 0.8
-    # A quarter is right; the filter reaches a little less.
+    # A quarter would be right; the filter scales a little less.
     assert 0.15 < np.trace(path.covariance[-1]) / np.trace(raw.covariance[-1]) < 0.4
 
 
 @pytest.mark.parametrize("near", [False, True])
 def test_outliers_are_not_used(near) -> None:
-    """2 in 100 poses are elsewhere, the very first pose too, and two runs of several frames."""
+    """2 in 100 poses are wrong, including the first pose, and two runs of several frames."""
     raw, position_m, truth = flight(150, seed=8)
     bad = np.zeros(150, bool)
     bad[[0, 15, 40, 90]] = True
@@ -331,7 +332,7 @@ def test_outliers_are_not_used(near) -> None:
     shift_m, turn = ([0.0, 0.15, 0.0], [0.0, 0.0, 0.03]) if near else ([1.5, -2.0, 0.3], [0.0, 0.9, 0.0])
     path = filter_path(misplaced(raw, bad, shift_m, turn))
     off_m, off_rad = errors(path, position_m, truth)
-    # 8 frames are 0.32 s: 0.1 m and 6 degrees at 2 m/s2 and 2 rad/s2, and more where accelerations happen to be larger.
+    # In 8 frames, 0.32 s, the error is 0.1 m and 6 degrees at 2 m/s2 and 2 rad/s2, and more at larger accelerations.
     assert np.linalg.norm(off_m, axis=1).max() < 0.25
     assert np.degrees(np.linalg.norm(off_rad, axis=1)).max() < 12.0
     assert (path.flags[bad][1:] & Flag.GATED).all()
@@ -354,7 +355,7 @@ def test_a_wrong_first_state_is_replaced_when_more_poses_contradict_it() -> None
     raw, position_m, _ = flight(40, seed=11)
     path = filter_path(misplaced(raw, slice(0, 4), [3.0, 0.0, 0.0]))
     assert path.status[3] == Status.TRACKED
-    # Four poses supported the state; the fifth pose against it is one more.
+    # Four poses supported the state; the fifth pose that contradicts it makes a majority.
     assert (path.status[4:8] == Status.COASTING).all()
     assert (path.status[8:] == Status.TRACKED).all()
     assert np.linalg.norm(path.position_m[8:] - position_m[8:], axis=1).max() < 0.03
@@ -395,7 +396,7 @@ def test_gaps_are_bridged_for_the_longest_gap() -> None:
     assert (path.status[102:120] == Status.LOST).all()
     for value in (path.position_m, path.orientation_wxyz, path.covariance, path.ambiguity, path.velocity_m_s):
         assert np.isnan(value[102:120]).all()
-    # It hovered, and is where a hovering camera would be: no further pose is needed to confirm it.
+    # The camera hovered and is where a hovering camera would be, so no further pose is needed for confirmation.
     assert (path.status[120:130] == Status.TRACKED).all()
     off_m, off_rad = errors(path, position_m, truth)
     covariance = path.covariance[path.seen]
@@ -407,7 +408,7 @@ def test_gaps_are_bridged_for_the_longest_gap() -> None:
 
 
 def planted(acceleration, *, chance=None):
-    """A flight with a gap of a second, after which five poses agree with one another, 2.3 m off."""
+    """A flight with a gap of a second, after which five poses agree with each other but are 2.3 m off."""
     raw, position_m, _ = flight(150, acceleration=acceleration, wobble=0.5, seed=40)
     raw = replace(raw, chance=None if chance is None else np.full(150, chance))
     return misplaced(without(raw, slice(60, 85)), slice(85, 90), [2.3, 0.0, 0.0]), position_m
@@ -418,7 +419,7 @@ def test_wrong_poses_that_agree_after_a_gap_are_not_accepted(acceleration) -> No
     raw, position_m = planted(acceleration)
     path = filter_path(raw)
     assert (path.status[85:90] == Status.LOST).all()
-    # The right poses are accepted when they are one more than the wrong ones, and enough to contradict a state.
+    # The right poses are accepted when they are one more than the wrong poses and enough to contradict a state.
     assert (path.status[100:] == Status.TRACKED).all()
     assert np.nanmax(np.linalg.norm(path.position_m[85:] - position_m[85:], axis=1)) < 0.05
     smoothed = smooth(raw)
@@ -439,7 +440,7 @@ def test_after_a_gap_markers_that_agree_beyond_chance_are_accepted_at_once() -> 
     assert (path.status[90:94] == Status.TRACKED).all()
     assert (path.status[90:] != Status.LOST).all()
     assert np.linalg.norm(path.position_m[90:] - position_m[90:], axis=1).max() < 0.05
-    # Without such markers more poses are needed: the gap is too long for the motion to predict a pose.
+    # Without such markers more poses are needed, because the gap is too long for the motion to predict a pose.
     assert (filter_path(raw).status[90:99] == Status.LOST).all()
 
 
@@ -462,16 +463,16 @@ def test_an_unambiguous_first_pose_is_returned_at_once(chance, ambiguity, first)
 
 
 @pytest.mark.parametrize("frames", [1, 2])
-def test_a_first_pose_counts_where_the_recording_is_too_short_to_confirm_it(frames) -> None:
+def test_a_first_pose_counts_if_the_recording_is_too_short_to_confirm_it(frames) -> None:
     raw, _, _ = flight(5, seed=43)
     path = filter_path(join_rows(split_path(raw)[:frames]), PoseFilterParams().within(frames))
-    # The first pose cannot be confirmed when it comes, and the filter is causal.
+    # The first pose cannot be confirmed in its own frame, because the filter is causal.
     assert (path.status[: frames - 1] == Status.LOST).all()
     assert path.status[-1] == Status.TRACKED
 
 
 @pytest.mark.parametrize("frames", [0, 1, 2])
-def test_paths_with_hardly_a_pose(frames) -> None:
+def test_paths_with_few_poses(frames) -> None:
     raw, _, _ = flight(5, seed=15)
     rows = split_path(raw)[:frames]
     path = filter_path(join_rows(rows))
@@ -518,7 +519,7 @@ def test_the_next_pose_is_predicted_frame_by_frame() -> None:
         predicted = expected(run, params)
         assert (predicted is None) == (k < 3)
         if predicted is not None and k > 10:
-            # 2 m/s2 move the camera by 2 mm within a frame; the rest are poses' errors of 4 mm along each axis.
+            # 2 m/s2 move the camera by 2 mm within a frame; the remaining error comes from poses, 4 mm along each axis.
             assert np.linalg.norm(predicted.position_m - position_m[k]) < 0.03
         run, row = step(run, row, params)
         rows.append(row)
@@ -528,7 +529,7 @@ def test_the_next_pose_is_predicted_frame_by_frame() -> None:
 
 
 def test_times_may_be_irregular() -> None:
-    """A live stream with randomly dropped frames is followed as closely as its frames allow."""
+    """A live stream with randomly dropped frames is followed as accurately as its frames allow."""
     raw, position_m, truth = flight(200, acceleration=0.5, wobble=0.3, seed=20)
     kept = np.flatnonzero(np.random.default_rng(21).random(200) < 0.4)
     some = join_rows([split_path(raw)[k] for k in kept])
@@ -543,7 +544,7 @@ def test_times_may_be_irregular() -> None:
 
 @pytest.mark.slow
 def test_errors_common_to_all_frames_are_not_averaged_away() -> None:
-    """The effect of each error on the poses changes slowly, and jumps as other markers come into view: 40 cameras."""
+    """The effect of an error on the poses changes slowly, and jumps when other markers come into view."""
     rng, frames, inside, inside_without, gated = np.random.default_rng(44), 12, [], [], 0
     scale = np.array([[0.012] * 3 + [0.002] * 3]).T
     for seed in range(40):
@@ -565,10 +566,10 @@ def test_errors_common_to_all_frames_are_not_averaged_away() -> None:
         inside.append([within_90(filtered, position_m, k) for k in (7, 10)])
         inside[-1].append(within_90(smooth(with_common), position_m, 5))
         inside_without.append(within_90(filter_path(raw), position_m, 7))
-    # Three standard deviations of a share of 40 below 0.9; the poses' own covariances are, if anything, too wide.
+    # Three standard deviations of a share of 40 below 0.9; the poses' own covariances are rather too wide.
     assert (np.mean(inside, axis=0) > 0.9 - 3 * np.sqrt(0.09 / 40)).all()
     assert np.mean(inside_without) < 0.5
-    # A jump that other markers explain is no outlier.
+    # A jump that other visible markers explain is no outlier.
     assert gated <= 0.01 * 40 * frames
 
 
@@ -581,8 +582,8 @@ def within_90(path: CameraPath, position_m, k) -> bool:
 # Ambiguous poses.
 
 
-def test_an_ambiguous_pose_is_weighted_by_how_well_it_fits() -> None:
-    """After a gap, where two poses are possible, it has half of the weight; where the motion is known, all of it."""
+def test_an_ambiguous_pose_is_weighted_by_its_agreement_with_the_motion() -> None:
+    """After a gap, when two poses are possible, the pose has half its weight; with a known motion it has all of it."""
     params = PoseFilterParams()
     state = init(a_pose())
     for k in range(1, 20):
@@ -640,7 +641,7 @@ def test_turning_and_shifting_the_world_turns_and_shifts_the_path(turn, shift_m,
     np.testing.assert_array_equal(moved_path.status, here.status)
     np.testing.assert_array_equal(moved_path.flags, here.flags)
     seen = here.seen
-    # Rounding: positions of 100 m to 1e-14, over a hundred steps.
+    # Rounding of positions of 100 m, 1e-14 relative, over a hundred steps.
     np.testing.assert_allclose(
         moved_path.position_m[seen], here.position_m[seen] @ world.as_matrix().T + shift_m, atol=1e-8
     )

@@ -1,4 +1,4 @@
-"""Fusion of inside-out and outside-in: against dense Gaussians, on flights with ground truth, and with faulty input."""
+"""Fusion of inside-out and outside-in tracks, compared with dense Gaussians and ground truth, and with faulty input."""
 
 from dataclasses import replace
 
@@ -30,7 +30,7 @@ INSIDE_M, OUTSIDE_M = np.array([0.001, 0.001, 0.003]), np.array([0.004, 0.004, 0
 
 
 def flight(rng, num_frames, offset_s=0.0):
-    """Position (frames, 3) and rotation of a camera that flies and turns smoothly."""
+    """Positions (frames, 3) and rotations of a camera that flies and turns smoothly."""
     time_s = np.arange(num_frames) / FPS + offset_s
     frequency, phase = rng.uniform(0.1, 0.5, (3, 3, 1)), rng.uniform(0, 6, (3, 3, 1))
     waves = np.sin(2 * np.pi * frequency * time_s + phase).sum(axis=0).T
@@ -40,7 +40,7 @@ def flight(rng, num_frames, offset_s=0.0):
 
 
 def lasting(rng, num_frames, time_s=0.3):
-    """(frames, 3), Gauss-Markov errors with a variance of 1."""
+    """Gauss-Markov errors with a variance of 1: (frames, 3)."""
     left = np.exp(-1 / FPS / time_s)
     values = rng.normal(size=(num_frames, 3))
     for k in range(1, num_frames):
@@ -48,13 +48,13 @@ def lasting(rng, num_frames, time_s=0.3):
     return values
 
 
-def recording(seed, num_frames=150, num_drones=1, *, stated=1.0, apart_m=4.0):
-    """Paths by name, outside tracks, and the cameras' true positions (drones, frames, 3) and rotations."""
+def recording(seed, num_frames=150, num_drones=1, *, stated=1.0, distance_m=4.0):
+    """Inside paths by name, outside tracks, and each drone's true camera positions (frames, 3) and rotations."""
     rng = np.random.default_rng(seed)
     paths, middles, truths = {}, [], []
     for drone in range(num_drones):
         position_m, rotation = flight(rng, num_frames)
-        position_m = position_m + np.array([apart_m * drone, 0, 0])
+        position_m = position_m + np.array([distance_m * drone, 0, 0])
         white = rng.normal(size=(num_frames, 3)) * np.sqrt(0.5)
         error = rotation.apply((white + np.sqrt(0.5) * lasting(rng, num_frames)) * INSIDE_M)
         covariance = np.zeros((num_frames, 6, 6))
@@ -187,7 +187,7 @@ def test_smoother_and_likelihood_equal_the_joint_gaussian() -> None:
     expected, spread = mean + gain @ (y - H @ mean), prior - gain @ H @ prior
     found = smooth(readings, MODEL, arm)
     n = len(readings.time_s)
-    # Variances begin at 100 beside some of 1e-3: half of the digits of float64 are more than enough.
+    # Initial variances are 100, and others 1e-3, so half of the digits of float64 are enough.
     np.testing.assert_allclose(found.position_m, expected.reshape(n, 18)[:, :3], atol=1e-8)
     np.testing.assert_allclose(found.velocity_m_s, expected.reshape(n, 18)[:, 3:6], atol=1e-7)
     np.testing.assert_allclose(found.arm_m, expected[15:18], atol=1e-8)
@@ -199,7 +199,7 @@ def test_smoother_and_likelihood_equal_the_joint_gaussian() -> None:
 
 
 def test_transition_is_the_integral_of_its_differential_equation() -> None:
-    """Van Loan 1978: F and Q of dx = A x dt + noise by one matrix exponential."""
+    """F and Q of dx = A x dt + noise, by one matrix exponential (Van Loan, 1978)."""
     dt_s, jerk = 0.07, 30.0
     A, W = np.zeros((18, 18)), np.zeros((18, 18))
     A[:3, 3:6] = A[3:6, 6:9] = np.eye(3)
@@ -209,13 +209,13 @@ def test_transition_is_the_integral_of_its_differential_equation() -> None:
     whole = expm(dt_s * np.block([[-A, W], [np.zeros_like(A), A.T]]))
     F, Q = whole[18:, 18:].T, whole[18:, 18:].T @ whole[:18, 18:]
     found_F, found_Q = transition(dt_s, MODEL)
-    # Rounding of some hundred operations.
+    # Rounding of a few hundred operations.
     np.testing.assert_allclose(found_F[0], F, atol=1e-12)
     np.testing.assert_allclose(found_Q[0], Q, atol=1e-12)
 
 
 def test_errors_agree_with_theory_by_monte_carlo() -> None:
-    """Flights with white jerk and lasting errors, drawn from the model: the NEES of the fused position averages 3."""
+    """Flights with white jerk and lasting errors are drawn from the model; the fused position's NEES averages 3."""
     rng, n, dt_s = np.random.default_rng(2), 40, 0.04
     model = ErrorModel(
         np.array([[0.5, 0.1]]), np.array([[0.5, 0.9]]), np.array([[0.3, 0.3]]), np.array([20.0])
@@ -250,7 +250,7 @@ def test_errors_agree_with_theory_by_monte_carlo() -> None:
         for k in (0, n // 2):
             error_m = found.position_m[k] - truth[k, :3]
             nees.append(error_m @ np.linalg.solve(found.covariance_m2[k], error_m))
-    # The mean of 120 draws of chi-square with 3 degrees of freedom has a standard deviation of 0.22: four of them.
+    # The mean of 120 draws of chi-square with 3 degrees of freedom has a standard deviation of 0.22; limit 4 of them.
     assert np.mean(nees) == pytest.approx(3.0, abs=0.9)
 
 
@@ -260,7 +260,7 @@ def test_a_source_with_huge_covariances_changes_nothing() -> None:
     vague_m2 = readings.covariance_m2.copy()
     vague_m2[:, 1] *= 1e14
     found, expected = smooth(replace(readings, covariance_m2=vague_m2), MODEL, arm), smooth(alone, MODEL, arm)
-    # The other source has a weight of 1e-14, for positions of about a metre; rounding is as large.
+    # The second source has a weight of 1e-14 for positions of about a metre, which is as small as rounding.
     np.testing.assert_allclose(found.position_m, expected.position_m, atol=1e-9)
     np.testing.assert_allclose(found.covariance_m2, expected.covariance_m2, atol=1e-9)
 
@@ -270,7 +270,7 @@ def test_a_source_with_huge_covariances_changes_nothing() -> None:
 
 @pytest.mark.parametrize("stated", [0.4, 1.0, 2.5])
 def test_fused_tracks_are_better_than_both_sources_with_consistent_covariances(stated) -> None:
-    """This holds also where both sources state errors that are too small or too large."""
+    """Also if both sources state errors that are too small or too large."""
     better, nees, off = [], [], []
     for seed in range(3):
         paths, outside, ((truth_m, rotation),) = recording(seed, stated=stated)
@@ -288,15 +288,15 @@ def test_fused_tracks_are_better_than_both_sources_with_consistent_covariances(s
         assert fused.trajectories.drones == ("dron1",)
         assert (drone.frames_both, drone.frames_inside, drone.frames_outside) == (150, 0, 0)
         assert (fused.source == 3).all()
-        # From about 40 independent frames and a prior of the ratio: within a factor of 1.6.
+        # Estimated from about 40 independent frames and a prior of the ratio: good to a factor of 1.6.
         assert 1 / 1.6 < drone.fusion.inside.scale * stated < 1.6
         assert 1 / 1.6 < drone.fusion.outside.scale * stated < 1.6
-    # With weights 1 / variance alone the ratio would be about 0.85; the motion removes part of the white errors.
+    # With weights of 1 / variance alone, the ratio would be about 0.85; the motion model removes some white errors.
     assert max(better) < 1.0
     assert np.mean(better) < 0.85
-    # 3 with a known model; scales, durations and jerk are estimated from lasting errors. Measured 2.6 to 3.6.
+    # NEES is 3 with a known model; here scales, durations and jerk are estimated from lasting errors. Measured 2.6-3.6.
     assert 1.5 < np.mean(nees) < 6
-    # Standard errors: the worst of 9 is below 3.3 in 99 of 100 cases; half as much again for the same reason.
+    # The largest of 9 is below 3.3 standard errors in 99 of 100 cases; limit 1.5 times that, for the same reason.
     assert np.abs(off).max() < 5
 
 
@@ -305,7 +305,7 @@ def test_one_source_with_too_large_stated_errors_is_weighted_by_its_scatter(insi
     paths, tracks, ((truth_m, _),) = recording(22)
     path = replace(paths["dron1"], covariance=inside**2 * paths["dron1"].covariance)
     fused = fuse({"dron1": path}, replace(tracks, covariance_m2=outside**2 * tracks.covariance_m2))
-    # Measured 0.65 to 0.9 over seeds; 0.7 where both state the right errors.
+    # Measured 0.65 to 0.9 for several seeds; 0.7 if both sources state the right errors.
     assert rms(fused.trajectories.position_m[:, 0] - truth_m) < rms(path.position_m - truth_m)
 
 
@@ -313,12 +313,12 @@ def test_few_common_frames_and_a_drone_at_rest() -> None:
     paths, outside, ((truth_m, _),) = recording(23, 60)
     few = fuse(paths, unseen(outside, np.r_[0:20, 23:60]))
     assert few.drones[0].frames_both == 3
-    # One source alone: the motion removes part of its white errors.
+    # With one source alone, the motion model removes a part of the white errors.
     assert rms(few.trajectories.position_m[:, 0] - truth_m) < rms(paths["dron1"].position_m - truth_m)
     at_m, turns = np.tile(truth_m[0], (60, 1)), Rotation.from_rotvec(np.zeros((60, 3)))
     still = path_of(at_m, turns, paths["dron1"].covariance)
     fused = fuse(still, tracks_of((at_m + ARM_M)[:, None], outside.covariance_m2))
-    # Without any error only rounding remains.
+    # The input has no errors, so only rounding remains.
     np.testing.assert_allclose(fused.trajectories.position_m[:, 0], at_m, atol=1e-9)
     np.testing.assert_allclose(fused.drones[0].fusion.arm_m, ARM_M, atol=1e-9)
 
@@ -357,7 +357,7 @@ def test_the_clock_offset_of_a_camera_is_estimated() -> None:
 
 
 def test_samples_between_frames_are_used_at_their_own_times() -> None:
-    """A camera at the same rate, half a step later, of a drone at up to 4 m/s: no interpolation, and no lag."""
+    """The camera has the same rate, half a step later; the drone flies at up to 4 m/s: no interpolation, and no lag."""
     rng = np.random.default_rng(8)
     _, outside, ((truth_m, _),) = recording(8)
     again = np.random.default_rng(8)
@@ -366,7 +366,7 @@ def test_samples_between_frames_are_used_at_their_own_times() -> None:
     path = path_of(between_m + rng.normal(scale=0.001, size=(150, 3)), rotation, covariance, first_s=0.02)
     fused = fuse({"dron1": path}, outside)
     assert fused.drones[0].frames_both >= 149
-    # 1.7 mm of noise; a lag of half a step would be 20 mm.
+    # The noise is 1.7 mm; a lag of half a step would be 20 mm.
     assert rms(fused.trajectories.position_m[:, 0] - truth_m) < 0.0025
 
 
@@ -381,10 +381,10 @@ def test_gaps_of_either_source_are_bridged_without_a_jump() -> None:
     assert (fused.source[outside_gap] == 1).all()
     assert (fused.trajectories.status == Status.TRACKED).all()
     error_m = fused.trajectories.position_m[:, 0] - truth_m
-    # Jumps between frames are those of lasting errors: a twentieth of the outside's errors.
+    # Jumps between frames are those of the lasting errors, a twentieth of the outside's errors.
     assert np.abs(np.diff(error_m, axis=0)).max() < 0.003
     spread_m = np.sqrt(np.trace(fused.trajectories.covariance_m2[:, 0], axis1=1, axis2=2))
-    # The orientation is unknown in the gap, and with it the direction of the arm of 0.12 m.
+    # In the gap, the orientation is unknown, and so is the direction of the arm of 0.12 m.
     assert spread_m[55] > 2 * spread_m[20]
     assert np.linalg.norm(error_m[55]) < 4 * spread_m[55]
     assert np.isnan(fused.trajectories.orientation_wxyz[45:65, 0]).all()
@@ -438,14 +438,14 @@ def test_the_source_with_gross_errors_is_left_out(which) -> None:
     assert (counts.outside if which == "inside" else counts.inside).gated <= 2
     right = np.setdiff1d(np.arange(150), wrong)
     error_m = np.linalg.norm(fused.trajectories.position_m[:, 0] - truth_m, axis=1)
-    # As good as without gross errors, except for the missing frames.
+    # The result is as good as without gross errors, except for the missing frames.
     assert rms(error_m[right][:, None]) < 1.5 * rms(plain.trajectories.position_m[:, 0] - truth_m)
-    # The outside alone is off by 7 mm, and by as much again where the arm's direction is interpolated between poses.
+    # The outside alone is off by 7 mm, and by 7 mm more if the arm's direction is interpolated between poses.
     assert error_m[wrong].max() < (0.04 if which == "inside" else 0.015)
 
 
 def test_identity_swaps_are_resolved() -> None:
-    paths, outside, _ = recording(13, num_drones=2, apart_m=1.5)
+    paths, outside, _ = recording(13, num_drones=2, distance_m=1.5)
     exchanged_m = outside.position_m.copy()
     exchanged_m[70:, [0, 1]] = exchanged_m[70:, [1, 0]]
     swapped = replace(outside, position_m=exchanged_m[:, [1, 0]], drones=("b", "a"))
@@ -460,7 +460,7 @@ def test_identity_swaps_are_resolved() -> None:
 
 
 def test_a_drone_without_a_camera_keeps_its_track_through_an_identity_swap() -> None:
-    paths, outside, _ = recording(14, num_drones=2, apart_m=1.5)
+    paths, outside, _ = recording(14, num_drones=2, distance_m=1.5)
     exchanged_m = outside.position_m.copy()
     exchanged_m[70:, [0, 1]] = exchanged_m[70:, [1, 0]]
     fused = fuse({"dron1": paths["dron1"]}, replace(outside, position_m=exchanged_m))
@@ -540,15 +540,15 @@ def test_a_motion_that_determines_no_offset_is_refused() -> None:
 def test_turning_and_shifting_the_world_turns_and_shifts_the_result(turn, shift_m, seed) -> None:
     paths, outside, _ = recording(seed, 60)
     R, path = Rotation.from_rotvec(turn), paths["dron1"]
-    of_both = np.zeros((6, 6))
-    of_both[:3, :3], of_both[3:, 3:] = R.as_matrix(), np.eye(3)
+    turn_both = np.zeros((6, 6))
+    turn_both[:3, :3], turn_both[3:, 3:] = R.as_matrix(), np.eye(3)
     turned = replace(
         path,
         position_m=R.apply(path.position_m) + shift_m,
         orientation_wxyz=(R * Rotation.from_quat(path.orientation_wxyz, scalar_first=True)).as_quat(
             scalar_first=True
         ),
-        covariance=of_both @ path.covariance @ of_both.T,
+        covariance=turn_both @ path.covariance @ turn_both.T,
     )
     spread_m2 = R.as_matrix() @ outside.covariance_m2 @ R.as_matrix().T
     moved = replace(
@@ -557,7 +557,7 @@ def test_turning_and_shifting_the_world_turns_and_shifts_the_result(turn, shift_
         covariance_m2=(spread_m2 + spread_m2.swapaxes(-1, -2)) / 2,
     )
     expected, found = fuse(paths, outside), fuse({"dron1": turned}, moved)
-    # The search for the scales ends about 1e-5 from its minimum, where the cost is flat: measured 2e-6 m.
+    # The search for the scales ends about 1e-5 from its minimum, because the cost is flat there. Measured 2e-6 m.
     np.testing.assert_allclose(
         found.trajectories.position_m[:, 0],
         R.apply(expected.trajectories.position_m[:, 0]) + shift_m,
@@ -567,7 +567,7 @@ def test_turning_and_shifting_the_world_turns_and_shifts_the_result(turn, shift_
 
 
 def test_a_single_gross_reading_has_little_effect() -> None:
-    """No other source has a reading. A drone that jumped must be followed, but a single frame has little weight."""
+    """Only one source has readings. A drone that jumps must be followed, but a single frame has little weight."""
     rng = np.random.default_rng(4)
     readings = readings_of(rng, 30)
     smooth_m = np.broadcast_to(np.sin(readings.time_s)[:, None, None], (30, 2, 3)).copy()
@@ -591,7 +591,7 @@ def test_the_uncertainty_of_orientations_in_a_gap_grows_with_time() -> None:
     assert (np.diff(spread[19:30]) > 0).all()
     assert (np.diff(spread[30:41]) < 0).all()
     off_rad = (Rotation.from_matrix(camera.rotation).inv() * rotation).magnitude()
-    # Three axes; four standard deviations.
+    # A limit of four standard deviations over three axes.
     assert (off_rad[20:40] < 4 * np.sqrt(spread[20:40])).all()
-    # Rounding of some operations.
+    # Rounding of a few operations.
     assert off_rad[[0, 19, 40, 59]].max() < 1e-7

@@ -1,4 +1,4 @@
-"""`psotrack localise`: from videos, folders and streams of a drawn room to the path of the camera in the room."""
+"""`psotrack localise`: from videos, image folders and streams of a drawn room to the path of the camera in the room."""
 
 import json
 import signal
@@ -42,8 +42,8 @@ FPS = 25.0
 SIDE_M = 0.3
 FRAMES = 12
 LENS = lens_of_view(70.0, 55.4, SIZE_WH)
-#: Frames in which only three markers, or nothing, is drawn.
-FEW, NONE = 6, 8
+#: Number of the frame with only three markers, and of the frame without markers.
+FEW_MARKERS_FRAME, NO_MARKERS_FRAME = 6, 8
 
 
 @dataclass(frozen=True)
@@ -86,14 +86,14 @@ def wall_markers():
 
 
 def drawn(corners_m, posed):
-    """An image of markers whose printed side is visible, drawn in light at three times the size and then reduced."""
+    """An image of markers seen from their front, drawn in light at three times the size and then reduced."""
     width, height = SIZE_WH
     image = np.full((3 * height, 3 * width), 150.0**2, np.float32)
     for marker, corners in corners_m.items():
         pixels, depth = project(posed, corners)
         if depth.min() < 0.3:
             continue
-        # Four cells, two of border, and one of white at each side.
+        # A marker has four cells, two cells of border, and one white cell at each side.
         cell = 24
         own = cv2.copyMakeBorder(
             cv2.aruco.generateImageMarker(marker_dictionary("4x4_1000"), marker, 6 * cell),
@@ -116,7 +116,7 @@ def drawn(corners_m, posed):
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
-    """Twelve frames, in which the camera goes right and forward: as images, as a video, and its calibration."""
+    """A room with twelve frames of a camera that moves to the right and forward: images, video and calibration."""
     folder = tmp_path_factory.mktemp("room")
     corners_m = wall_markers()
     write_marker_corners(folder / "corners.csv", corners_m)
@@ -129,11 +129,13 @@ def room(tmp_path_factory):
             R, t_m = look_at(tuple(centre), (0.5 + 0.03 * index, 4.0, 1.5))
             posed = make_camera(R=R, t_m=t_m, K=LENS.K, image_size_wh=SIZE_WH)
             shown = corners_m
-            if index in (FEW, NONE):
-                shown = {} if index == NONE else {marker: corners_m[marker] for marker in (5, 8, 17)}
+            if index in (FEW_MARKERS_FRAME, NO_MARKERS_FRAME):
+                shown = (
+                    {} if index == NO_MARKERS_FRAME else {marker: corners_m[marker] for marker in (5, 8, 17)}
+                )
             # A marker that is not in the map, in every frame.
-            stranger = {900: np.array([[0, 3.9, 0.6], [0.3, 3.9, 0.6], [0.3, 3.9, 0.3], [0, 3.9, 0.3]])}
-            image = drawn(shown | ({} if index == NONE else stranger), posed)
+            unmapped = {900: np.array([[0, 3.9, 0.6], [0.3, 3.9, 0.6], [0.3, 3.9, 0.3], [0, 3.9, 0.3]])}
+            image = drawn(shown | ({} if index == NO_MARKERS_FRAME else unmapped), posed)
             # File names without leading zeros: 10 must come after 9.
             cv2.imwrite(str(folder / "images" / f"frame{index}.png"), image)
             writer.write(image)
@@ -153,9 +155,9 @@ def run(*arguments):
     return result
 
 
-def ordinary(path):
-    """Frames in which all walls are drawn."""
-    return ~np.isin(path.frame, (FEW, NONE))
+def shows_all_markers(path):
+    """Mask of frames in which all markers are drawn."""
+    return ~np.isin(path.frame, (FEW_MARKERS_FRAME, NO_MARKERS_FRAME))
 
 
 def error_m(path, room):
@@ -168,18 +170,18 @@ def error_deg(path, room, rows):
     return np.rad2deg((found.inv() * true).magnitude())
 
 
-def test_the_path_from_a_folder_of_images_is_the_cameras(room, tmp_path):
+def test_the_path_from_a_folder_of_images_agrees_with_the_cameras(room, tmp_path):
     out = tmp_path / "track.csv"
     result = run(
         room.folder / "images", "--fps", 25, "--markers", room.markers, "--camera", room.lens,
         "--out", out, "--no-filter",
     )  # fmt: skip
     path, name = read_camera_path(out)
-    there = ordinary(path)
+    there = shows_all_markers(path)
     assert name == "images"
     np.testing.assert_array_equal(path.frame, np.arange(FRAMES))
     np.testing.assert_allclose(path.time_s, np.arange(FRAMES) / 25, rtol=1e-12)
-    # Measured 4.4 mm and 0.06 degrees: an error of a tenth of a pixel in each of 36 corners, 4 m away.
+    # Measured 4.4 mm and 0.06 degrees, from an error of a tenth of a pixel in each of 36 corners at 4 m.
     assert error_m(path, room)[there].max() < 0.01
     assert error_deg(path, room, there).max() < 0.15
     assert (path.status[there] == Status.TRACKED).all()
@@ -196,7 +198,7 @@ def test_a_video_gives_the_same_path_as_its_images(room, tmp_path):
         run(source, *options, "--markers", room.markers, "--camera", room.lens, "--out", out, "--no-filter")
         tracks[source.stem] = read_camera_path(out)[0]
     video, images = tracks["flight"], tracks["images"]
-    # The codec is lossy: a marker may be missing, and the path was measured to move by 1 mm.
+    # The codec is lossy: a marker may be missing, and positions move by 1 mm (measured).
     np.testing.assert_allclose(video.num_markers, images.num_markers, atol=1)
     np.testing.assert_allclose(video.position_m, images.position_m, atol=0.005)
 
@@ -204,14 +206,14 @@ def test_a_video_gives_the_same_path_as_its_images(room, tmp_path):
 def test_frames_with_few_or_no_markers_are_reported(room, tmp_path):
     source = open_source(room.folder / "images", fps=FPS)
     raw = localise_video(source, room.marker_map, LENS, LocaliseSettings(filter=None)).path
-    assert (raw.status[[FEW, NONE]] == Status.LOST).all()
-    assert raw.num_markers[[FEW, NONE]].tolist() == [3, 0]
-    assert raw.flags[[FEW, NONE]].tolist() == [Flag.FEW_MARKERS, 0]
-    assert np.isnan(raw.position_m[[FEW, NONE]]).all()
+    assert (raw.status[[FEW_MARKERS_FRAME, NO_MARKERS_FRAME]] == Status.LOST).all()
+    assert raw.num_markers[[FEW_MARKERS_FRAME, NO_MARKERS_FRAME]].tolist() == [3, 0]
+    assert raw.flags[[FEW_MARKERS_FRAME, NO_MARKERS_FRAME]].tolist() == [Flag.FEW_MARKERS, 0]
+    assert np.isnan(raw.position_m[[FEW_MARKERS_FRAME, NO_MARKERS_FRAME]]).all()
 
 
 @pytest.mark.parametrize(
-    ("options", "doubt"),
+    ("options", "advice"),
     [
         (["--fov", "70,55.4", "--dictionary", "5x5_1000"], "no frame shows a marker of the map: check --dictionary"),
         (["--fov", "70,55.4", "--min-markers", "14"], "of the map: --min-markers asks for 14"),
@@ -220,15 +222,15 @@ def test_frames_with_few_or_no_markers_are_reported(room, tmp_path):
         (["--fov", "70,55.4", "--frames", "1", "--no-filter"], None),
     ],
 )  # fmt: skip
-def test_without_any_pose_the_output_says_what_to_check(room, tmp_path, options, doubt):
-    said = run(room.video, "--markers", room.markers, *options, "--out", tmp_path / "track.csv").output
-    if doubt is None:
-        assert "flight in 1 of 1 frames" in said
-        assert "check --" not in said
+def test_without_any_pose_the_output_says_what_to_check(room, tmp_path, options, advice):
+    output = run(room.video, "--markers", room.markers, *options, "--out", tmp_path / "track.csv").output
+    if advice is None:
+        assert "flight in 1 of 1 frames" in output
+        assert "check --" not in output
     else:
-        assert "flight in 0 of" in said
-        assert doubt in said
-    assert said.count("\n") == 1
+        assert "flight in 0 of" in output
+        assert advice in output
+    assert output.count("\n") == 1
 
 
 def test_fewer_markers_are_allowed_and_flagged(room, tmp_path):
@@ -246,13 +248,13 @@ def test_fewer_markers_are_allowed_and_flagged(room, tmp_path):
         1,
     )
     path, _ = read_camera_path(out)
-    assert path.status[[FEW, NONE]].tolist() == [Status.TRACKED, Status.LOST]
-    assert path.flags[FEW] & Flag.FEW_MARKERS
-    # Three markers in a plane, 4 m away: measured 31 mm, and 12 mm without the codec.
-    assert error_m(path, room)[FEW] < 0.1
+    assert path.status[[FEW_MARKERS_FRAME, NO_MARKERS_FRAME]].tolist() == [Status.TRACKED, Status.LOST]
+    assert path.flags[FEW_MARKERS_FRAME] & Flag.FEW_MARKERS
+    # Three markers in a plane at 4 m. Measured 31 mm, and 12 mm without the codec.
+    assert error_m(path, room)[FEW_MARKERS_FRAME] < 0.1
 
 
-def test_the_first_frame_has_a_pose_where_its_markers_agree_beyond_chance(room, tmp_path):
+def test_the_first_frame_has_a_pose_if_its_markers_agree_beyond_chance(room, tmp_path):
     run(room.video, "--markers", room.markers, "--camera", room.lens, "--out", tmp_path / "track.csv")
     path, _ = read_camera_path(tmp_path / "track.csv")
     assert path.seen.all()
@@ -260,7 +262,7 @@ def test_the_first_frame_has_a_pose_where_its_markers_agree_beyond_chance(room, 
     assert error_m(path, room).max() < 0.02
 
 
-@pytest.mark.parametrize(("frame", "options"), [(0, []), (FEW, ["--min-markers", 1])])
+@pytest.mark.parametrize(("frame", "options"), [(0, []), (FEW_MARKERS_FRAME, ["--min-markers", 1])])
 @pytest.mark.parametrize("smooth", [[], ["--smooth"]])
 def test_a_folder_with_one_image_has_its_pose(room, tmp_path, frame, options, smooth):
     (tmp_path / "one").mkdir()
@@ -271,12 +273,12 @@ def test_a_folder_with_one_image_has_its_pose(room, tmp_path, frame, options, sm
     path, _ = read_camera_path(out)
     assert "one in 1 of 1 frames" in result.output
     assert path.status.tolist() == [Status.TRACKED]
-    # Three markers in a plane: measured 12 mm.
+    # Three markers in a plane. Measured 12 mm.
     assert np.linalg.norm(path.position_m[0] - room.position_m[frame]) < 0.05
 
 
 def test_the_covariance_includes_the_error_of_the_focal_length(room, tmp_path):
-    """A lens 1 % too long and a marker 5 mm too high in the map: stated errors improve poses and covariances."""
+    """The lens is 1 % too long and the map has a marker 5 mm too high: stated errors improve poses and covariances."""
     lens = tmp_path / "lens.toml"
     K = LENS.K * np.array([[1.01, 1.01, 1], [1.01, 1.01, 1], [1, 1, 1]])
     write_rig(
@@ -311,7 +313,7 @@ def test_a_plot_distinguishes_bridged_frames_from_gaps(room, tmp_path):
 
     def share(png):
         image = cv2.imread(str(png))[..., ::-1].astype(int)
-        # The background is a solid block, in contrast to lines of the grid.
+        # The background is a solid block, in contrast to the lines of the grid.
         return {
             name: np.mean(
                 cv2.erode((np.abs(image - rgb).max(axis=-1) < 3).astype(np.uint8), np.ones((size, size)))
@@ -351,7 +353,7 @@ def test_the_filter_bridges_frames_without_markers(room, tmp_path):
     path, name = read_camera_path(out)
     content = json.loads(report.read_text())
     assert name == "dron1"
-    assert (path.status[[FEW, NONE]] == Status.COASTING).all()
+    assert (path.status[[FEW_MARKERS_FRAME, NO_MARKERS_FRAME]] == Status.COASTING).all()
     # Measured 3 mm, because the motion is even.
     assert np.nanmax(error_m(path, room)) < 0.02
     assert path.velocity_m_s is not None
@@ -382,7 +384,7 @@ def test_a_field_of_view_replaces_a_calibration_file(room, tmp_path):
 
 
 def test_a_stream_gives_the_same_path_as_its_file(room, tmp_path):
-    """FFmpeg opens a file by its address; the timestamps in the file are its times."""
+    """FFmpeg opens a file by its address; its times are the timestamps in the file."""
     for name, source in (("file", room.video), ("stream", f"file://{room.video}")):
         run(source, "--markers", room.markers, "--camera", room.lens, "--out", tmp_path / f"{name}.csv")
     (file, _), (stream, name) = (read_camera_path(tmp_path / f"{name}.csv") for name in ("file", "stream"))
@@ -392,7 +394,7 @@ def test_a_stream_gives_the_same_path_as_its_file(room, tmp_path):
 
 
 class Capture:
-    """A camera that shows images without timestamps; then its user presses Ctrl-C, or the stream ends."""
+    """A camera that shows images without timestamps and then calls `press`, or ends the stream."""
 
     def __init__(self, images, press=None):
         self.images, self.press, self.released = list(images), press, threading.Event()
@@ -429,16 +431,16 @@ def test_ctrl_c_ends_a_live_stream_and_keeps_its_frames(room, tmp_path, monkeypa
             raise KeyboardInterrupt
 
     def press():
-        # Some frame must have been localised before Ctrl-C, and the stream must not end before Ctrl-C arrives.
+        # A frame must have been localised before Ctrl-C, and the stream must not end before Ctrl-C arrives.
         assert kept.wait(300)
-        # A signal that comes just before the main thread begins to wait for the next frame does not wake that thread.
+        # A signal that comes just before the main thread waits for the next frame does not wake the main thread.
         for _ in range(300):
             signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
             if heard.wait(1):
                 return
         pytest.fail("no signal was heard")
 
-    capture = Capture(room.images[:FEW], press)
+    capture = Capture(room.images[:FEW_MARKERS_FRAME], press)
     monkeypatch.setattr(cv2, "VideoCapture", lambda device: opened.append(device) or capture)
     monkeypatch.setattr("psotrack.inside_out.localising.video.localise_frames", followed)
     out, before = tmp_path / "track.csv", signal.signal(signal.SIGINT, interrupt)
@@ -451,8 +453,8 @@ def test_ctrl_c_ends_a_live_stream_and_keeps_its_frames(room, tmp_path, monkeypa
     assert opened == [0]
     assert capture.released.wait(300)
     assert "ended by Ctrl-C" in result.output
-    # The first and the last frame are always used; frames that come while another one is in use are left out.
-    assert set(path.frame.tolist()) <= set(range(FEW))
+    # The first and the last frame are always used; frames that arrive while another frame is processed are left out.
+    assert set(path.frame.tolist()) <= set(range(FEW_MARKERS_FRAME))
     np.testing.assert_allclose(path.time_s, path.frame / 25, rtol=1e-12)
     assert error_m(path, room).max() < 0.01
 
@@ -464,7 +466,7 @@ def test_a_stream_that_ends_is_not_interrupted(room, monkeypatch):
     )
     assert found.path.num_frames == 5
     assert not found.interrupted
-    # Without timestamps, times are those of arrival.
+    # Without timestamps, the times are those of arrival.
     assert (np.diff(found.path.time_s) > 0).all()
 
 
@@ -507,7 +509,7 @@ def sequence(room, tmp_path):
 
 def test_a_sequence_provides_markers_and_intrinsics(room, sequence, tmp_path):
     out = tmp_path / "track.csv"
-    # A stray picture does not make it a folder of images.
+    # A picture in the folder does not make it a folder of images.
     cv2.imwrite(str(sequence / "plot.png"), np.zeros((20, 30), np.uint8))
     run(sequence, "--drone", "dron2", "--out", out)
     path, name = read_camera_path(out)
@@ -547,7 +549,7 @@ def test_intrinsics_for_another_size_are_refused_in_one_line_with_the_file(room,
 
 
 def test_a_scaled_lens_maps_to_the_same_position_in_the_scaled_image():
-    """The edges of the image, half a pixel beyond the outer centres, stay where they are."""
+    """The edges of the image, half a pixel beyond the centres of the outer pixels, do not move."""
     small, large = LENS, scale_lens(LENS, (1920, 1440))
     points = np.random.default_rng(0).uniform((-1, -1, 2), (1, 1, 4), (20, 3))
     np.testing.assert_allclose(
@@ -653,7 +655,7 @@ def test_an_unreadable_folder_is_named(tmp_path, monkeypatch):
     def refused(_):
         raise PermissionError(13, "Permission denied")
 
-    # Tests may run as root, who may read every folder.
+    # Tests may run as root, and root may read every folder.
     monkeypatch.setattr(Path, "iterdir", refused)
     with pytest.raises(InputError, match="expected a folder to read, found permission denied"):
         open_source(tmp_path)
@@ -738,6 +740,6 @@ def test_newest_items_are_used_and_the_last_is_never_left_out():
     for item in read_ahead(many(), newest=True):
         found.append(item)
         assert made.wait(300)
-    # While the first item was in use, all others came; the last one replaced those before it.
+    # While the first item was processed, all other items were made; the last item replaced the items before it.
     assert found[-1] == 49
     assert len(found) <= 2

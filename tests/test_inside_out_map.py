@@ -30,7 +30,7 @@ SIDE_M = 0.4
 
 
 def on_wall(centre_m, inward, side_m=SIDE_M):
-    """Corners of an upright marker on a wall."""
+    """Corners (4, 3) of an upright marker on a wall, metres."""
     front = np.array(inward, float)
     up = np.array([0.0, 0.0, 1.0])
     return np.array(centre_m, float) + side_m * SQUARE @ np.stack([np.cross(up, front), up, front])
@@ -67,7 +67,7 @@ LENSES = (
 
 
 def seen_in(corners_m, lens, source, num_views, *, noise_px=0.0, seed=0):
-    """Markers in the view of a camera that is carried through a room and turns around more than once."""
+    """Frames of a camera that is carried through a room and turns around more than once, with the visible markers."""
     rng = np.random.default_rng(seed)
     frames = []
     for view in range(num_views):
@@ -84,7 +84,7 @@ def seen_in(corners_m, lens, source, num_views, *, noise_px=0.0, seed=0):
             normal = np.cross(corners[3] - corners[1], corners[2] - corners[0])
             faces = normal @ (centre - corners.mean(axis=0)) > 0
             inside = ((pixels > 0) & (pixels < lens.image_size_wh - 1)).all()
-            # The polynomial of the distortion folds back far outside of the image.
+            # The polynomial of the distortion folds back far outside the image.
             if (
                 faces
                 and inside
@@ -97,17 +97,17 @@ def seen_in(corners_m, lens, source, num_views, *, noise_px=0.0, seed=0):
     return frames
 
 
-def sightings(corners_m=ROOM, num_views=28, videos=1, **how):
+def sightings(corners_m=ROOM, num_views=28, videos=1, **options):
     frames = [
         frame
         for source in range(videos)
-        for frame in seen_in(corners_m, LENSES[source], source, num_views, **how)
+        for frame in seen_in(corners_m, LENSES[source], source, num_views, **options)
     ]
     return collect_sightings(frames, LENSES[:videos])
 
 
 def errors_m(built, truth=ROOM):
-    """(markers, 4), distances of corners from the truth."""
+    """Distances of corners from their true positions, metres: (markers, 4)."""
     ids = built.ids.tolist()
     return np.linalg.norm(
         built.marker_map.all_corners_m - np.array([truth[marker] for marker in ids]), axis=-1
@@ -182,7 +182,7 @@ def test_layouts_of_tables(tmp_path, text):
     found = read_marker_map(path)
     assert set(found.corners_m) == set(ROOM)
     for marker, corners in ROOM.items():
-        # Millimetres are divided by 1000: rounding in the last digits.
+        # Millimetres are divided by 1000, with rounding in the last digits.
         np.testing.assert_allclose(found.corners_m[marker], corners, atol=1e-12)
         np.testing.assert_array_equal(read_marker_corners(path)[marker], found.corners_m[marker])
 
@@ -219,7 +219,7 @@ def bent(distance_m, axis):
     return with_corners(3, corners)
 
 
-#: Line 4 of our layout belongs to marker 3.
+#: Line 4 of the standard layout belongs to marker 3.
 BAD_PLACES = {
     "not planar": (
         bent(0.05, 1),
@@ -258,23 +258,23 @@ def test_impossible_markers_are_refused(tmp_path, corners, message):
         read_marker_map(path)
 
 
-OURS, LONG = LAYOUTS["ours"], LAYOUTS["long"]
-THIRD = OURS.splitlines()[3]
+STANDARD, LONG = LAYOUTS["ours"], LAYOUTS["long"]
+THIRD = STANDARD.splitlines()[3]
 BAD_TEXTS = {
     "an empty cell": (
-        OURS.replace(THIRD, ";".join("" if i == 5 else cell for i, cell in enumerate(THIRD.split(";")))),
+        STANDARD.replace(THIRD, ";".join("" if i == 5 else cell for i, cell in enumerate(THIRD.split(";")))),
         r"line 4, column y2\[m\]: expected a value, found nothing",
     ),
     "an empty cell at the end": (
-        OURS.replace(THIRD, THIRD.rpartition(";")[0] + ";"),
+        STANDARD.replace(THIRD, THIRD.rpartition(";")[0] + ";"),
         r"line 4, column z4\[m\]: expected a value, found nothing",
     ),
     "three corners": (
-        OURS.replace(THIRD, ";".join(THIRD.split(";")[:10])),
+        STANDARD.replace(THIRD, ";".join(THIRD.split(";")[:10])),
         r"line 4: expected 13 values, found 10; a marker has four corners",
     ),
     "three corners in a header": (
-        "\n".join(";".join(line.split(";")[:10]) for line in OURS.splitlines()),
+        "\n".join(";".join(line.split(";")[:10]) for line in STANDARD.splitlines()),
         r"corners.csv: expected a column x4, found only",
     ),
     "three corners below each other": (
@@ -282,7 +282,7 @@ BAD_TEXTS = {
         r"line 10 to 12, marker 3: expected 4 corners, found none of number 3; add it, or leave the marker out",
     ),
     "a marker twice": (
-        OURS.replace("\n4;", "\n3;"),
+        STANDARD.replace("\n4;", "\n3;"),
         r"line 5, column id: expected each marker once, found 3 again",
     ),
     "a corner twice": (
@@ -294,19 +294,19 @@ BAD_TEXTS = {
         r"line 5, column corner: .* because line 10 has corner 0",
     ),
     "no number": (
-        OURS.replace("\n3;", "\nthree;"),
+        STANDARD.replace("\n3;", "\nthree;"),
         r"line 4, column id: expected a marker's number, found 'three'",
     ),
     "decimal commas": (
-        OURS.replace("3.0;", "3,0;"),
+        STANDARD.replace("3.0;", "3,0;"),
         r"column y1\[m\]: expected a number.*; write decimals with a point",
     ),
-    "another unit": (OURS.replace("x1[m]", "x1[in]"), r"expected a column x1\[m\].* found x1\[in\]"),
+    "another unit": (STANDARD.replace("x1[m]", "x1[in]"), r"expected a column x1\[m\].* found x1\[in\]"),
     "a column twice": (
-        OURS.replace("y2[m]", "x_2[m]"),
+        STANDARD.replace("y2[m]", "x_2[m]"),
         r"line 1: expected each column once, found x2\[m\] and x_2\[m\]",
     ),
-    "no rows": (OURS.splitlines()[0], "expected rows below the header, found none"),
+    "no rows": (STANDARD.splitlines()[0], "expected rows below the header, found none"),
     "nothing": ("\n", "expected a table of marker corners, found an empty file"),
     "other numbers": ("1;2;3;4\n5;6;7;8\n", "line 1: expected a header, or numbers in rows of 13"),
     "another label": (
@@ -350,7 +350,7 @@ def test_markers_on_the_outside_of_a_box_face_outwards(tmp_path):
 
 
 @given(st.tuples(*[st.floats(-3, 3)] * 3), st.tuples(*[st.floats(-9, 9)] * 3), st.floats(0.05, 1.0))
-def test_the_square_fitted_to_a_square_is_itself(turn, centre, side_m):
+def test_the_square_fitted_to_a_square_is_the_same_square(turn, centre, side_m):
     axes = Rotation.from_rotvec(turn).as_matrix()
     found_axes, found_centre, found_side = fit_square(np.array(centre) + side_m * SQUARE @ axes.T)
     # Double precision, for numbers up to 10.
@@ -359,7 +359,7 @@ def test_the_square_fitted_to_a_square_is_itself(turn, centre, side_m):
     assert found_side == pytest.approx(side_m, rel=1e-9)
 
 
-def test_the_fitted_square_is_nearer_than_any_other():
+def test_the_fitted_square_is_nearer_than_other_squares():
     rng = np.random.default_rng(1)
     points = ROOM[5] + 0.005 * rng.standard_normal((4, 3))
     axes, centre, side = fit_square(points)
@@ -376,7 +376,7 @@ def test_the_fitted_square_is_nearer_than_any_other():
 
 @pytest.mark.parametrize("order", [[0, 1, 2, 3], [0, 3, 2, 1], [2, 0, 3, 1], [1, 0, 3, 2]])
 def test_corners_in_any_order_are_sorted(tmp_path, order):
-    """Only the first order is one that a camera sees; the corners of upright markers are sorted by the up direction."""
+    """The first order is right, as a camera sees the marker; other orders are corrected by the direction up."""
     path = tmp_path / "points.csv"
     write_marker_corners(path, with_corners(3, ROOM[3][order]))
     found = fit_squares(read_measured_corners(path))
@@ -424,12 +424,12 @@ def test_corners_of_a_c3d(tmp_path, labels):
     path = tmp_path / "room.c3d"
     markers = recorded(ROOM, labels, noise_m=0.0005)
     markers.position_m[:11, 3] = np.nan
-    # A label that was on another point for a while.
+    # For a few frames, the label is on another point.
     markers.position_m[5:12, 8] += 0.5
     write_c3d(path, markers)
     found = fit_squares(read_measured_corners(path))
     for marker, corners in ROOM.items():
-        # Medians of 20 to 30 frames: 0.0005 m x 1.25 / sqrt(20) = 0.14 mm; five of them.
+        # Medians of 20 to 30 frames are good to 0.0005 m x 1.25 / sqrt(20) = 0.14 mm; limit five times that.
         np.testing.assert_allclose(found.marker_map.corners_m[marker], corners, atol=7e-4)
         assert found.residual_m[marker].max() < 1e-3
 
@@ -458,7 +458,7 @@ def test_measured_corners_without_a_square_are_refused(tmp_path):
 
 @pytest.mark.parametrize("videos", [1, 2])
 def test_exact_images_give_the_exact_map(videos):
-    """Two videos have different lenses, one of them with distortion."""
+    """Two videos have different lenses; one lens has distortion."""
     built = build_map(sightings(videos=videos), {7: ROOM[7]})
     assert set(built.ids) == set(ROOM)
     assert built.unplaced == ()
@@ -475,13 +475,13 @@ def test_the_known_marker_stays_and_has_no_uncertainty():
     assert (built.std_m[~built.known] > 0).all()
 
 
-def test_a_single_known_side_makes_the_markers_axes_the_worlds():
-    """The whole map moves with the known marker: the same images in another world."""
+def test_a_single_known_side_makes_the_axes_of_the_marker_those_of_the_world():
+    """The map moves with the known marker: the same images give the same map in another world."""
     given_world = build_map(sightings(noise_px=0.2), {7: ROOM[7]})
     own_world = build_map(sightings(noise_px=0.2), {7: corners_in_own_frame(SIDE_M)})
     axes, centre, _ = fit_square(ROOM[7])
     moved = own_world.marker_map.all_corners_m @ axes.T + centre
-    # Both searches end where the cost decreases by less than a share of 1e-9.
+    # Both searches end when the relative decrease of the cost is less than 1e-9.
     np.testing.assert_allclose(moved, given_world.marker_map.all_corners_m, atol=1e-5)
 
 
@@ -489,7 +489,7 @@ def test_a_larger_marker_makes_a_larger_room():
     built = build_map(sightings(), {7: corners_in_own_frame(2 * SIDE_M)})
     np.testing.assert_allclose(built.marker_map.sides_m, 2 * SIDE_M, rtol=1e-12)
     distance = np.linalg.norm(built.marker_map.centres_m[0] - built.marker_map.centres_m[8])
-    # As exact as the map is.
+    # The tolerance is the accuracy of the map.
     assert distance == pytest.approx(
         2 * np.linalg.norm(ROOM[1].mean(axis=0) - ROOM[9].mean(axis=0)), abs=1e-5
     )
@@ -507,40 +507,42 @@ def test_different_sides_are_estimated():
 
 
 def test_an_inset_of_corners_is_estimated():
-    """Corners that a detector finds too far inside. Without the inset, squares that look too small enlarge the room."""
+    """The detector finds corners too far inside. Without an inset, squares that seem too small enlarge the room."""
     exact = sightings(videos=2)
     inset_px = np.array([0.3, 0.15])[exact.lens[exact.view]][:, None, None]
     found = replace(exact, corners_px=exact.corners_px - inset_px * outward(exact))
     built = build_map(found, {7: ROOM[7]})
-    # Most of the inset is found, because the prior expects less. The covariance contains the rest.
+    # Most of the inset is found, because the prior expects a smaller inset. The covariance contains the rest.
     assert (np.abs(built.inset_px - [0.2, 0.1]) < 0.05).all()
     off_m = np.linalg.norm(built.marker_map.centres_m - MarkerMap(ROOM).centres_m, axis=1)[~built.known]
     assert (off_m < 3 * np.linalg.norm(built.std_m[~built.known], axis=1)).all()
 
 
 def test_sightings_with_wrong_ids_are_left_out():
-    honest = sightings(noise_px=0.2, num_views=40)
+    right = sightings(noise_px=0.2, num_views=40)
     rng = np.random.default_rng(3)
-    wrong = rng.random(len(honest.view)) < 0.04
-    marker = np.where(wrong, rng.integers(1, 17, len(wrong)), honest.marker)
-    # Ids that are twice in a view are left out when sightings are collected.
+    wrong = rng.random(len(right.view)) < 0.04
+    marker = np.where(wrong, rng.integers(1, 17, len(wrong)), right.marker)
+    # Ids that occur twice in a view are left out when sightings are collected.
     frames = [
         FrameMarkers(
-            0, float(honest.time_s[view]), marker[honest.view == view], honest.corners_px[honest.view == view]
+            0, float(right.time_s[view]), marker[right.view == view], right.corners_px[right.view == view]
         )
-        for view in range(honest.num_views)
+        for view in range(right.num_views)
     ]
     built = build_map(collect_sightings(frames, LENSES[:1]), {7: ROOM[7]})
-    clean = build_map(honest, {7: ROOM[7]})
+    clean = build_map(right, {7: ROOM[7]})
     assert set(built.ids) == set(ROOM)
     assert 0 < built.outliers.sum() <= wrong.sum() + 2
-    # As good as without wrong ids, except for the missing sightings.
+    # The map is as good as without wrong ids, except for the missing sightings.
     assert errors_m(built).max() < 1.5 * errors_m(clean).max()
 
 
 def test_markers_without_a_connection_are_not_placed():
-    lonely = FrameMarkers(0, 99.0, np.array([40]), np.array([[[10.0, 10], [50, 10], [50, 50], [10, 50]]]))
-    found = collect_sightings([*seen_in(ROOM, LENSES[0], 0, 20), lonely], LENSES[:1])
+    unconnected = FrameMarkers(
+        0, 99.0, np.array([40]), np.array([[[10.0, 10], [50, 10], [50, 50], [10, 50]]])
+    )
+    found = collect_sightings([*seen_in(ROOM, LENSES[0], 0, 20), unconnected], LENSES[:1])
     built = build_map(found, {7: ROOM[7]})
     assert built.unplaced == (40,)
     assert 40 not in built.marker_map
@@ -560,7 +562,7 @@ def test_unusable_known_markers():
 
 @pytest.mark.slow
 def test_the_covariance_agrees_with_the_errors():
-    """Noise that is new in every frame: the normalised squared errors of the centres average 3 over repeated draws."""
+    """Noise is independent in every frame: normalised squared errors of the centres average 3 over repeated draws."""
     normalised = []
     for seed in range(12):
         built = build_map(sightings(noise_px=0.3, num_views=50, seed=seed), {7: ROOM[7]})
@@ -569,8 +571,8 @@ def test_the_covariance_agrees_with_the_errors():
         )
         for error, covariance in zip(off[~built.known], built.covariance[~built.known, :3, :3], strict=True):
             normalised.append(error @ np.linalg.solve(covariance, error))
-    # Less than 3, because the covariance allows for errors common to all frames, which these corners do not have. The
-    # 15 markers of a room share errors, so that 12 rooms have about 60 degrees of freedom: 3 +- 0.5.
+    # The mean is less than 3, because the covariance allows for errors common to all frames, which these corners do not
+    # have. The 15 markers of a room share errors, so 12 rooms have about 60 degrees of freedom: 3 +- 0.5.
     assert 1.2 < np.mean(normalised) < 4.0
 
 

@@ -1,4 +1,4 @@
-"""Poses from one frame's markers: exact cases, SciPy and Monte Carlo, wrong markers, second poses, refused input."""
+"""Poses from the markers of one frame: exact cases, SciPy, random draws, wrong markers, second poses, refused input."""
 
 from dataclasses import replace
 
@@ -31,14 +31,14 @@ SIDE_M = 0.3
 
 
 def marker(centre_m, right, down, side_m=SIDE_M):
-    """(4, 3), corners clockwise from the top left as corners from the front."""
+    """Corners (4, 3) of a marker, clockwise from the top left when seen from the front."""
     right, down = np.asarray(right, float), np.asarray(down, float)
     offsets = [-right - down, right - down, right + down, -right + down]
     return np.asarray(centre_m) + side_m / 2 * np.array(offsets)
 
 
 def two_walls(count=10):
-    """(count, 4, 3), markers on the walls y = 4 and x = 5, at three heights."""
+    """Corners (count, 4, 3) of markers on the walls y = 4 and x = 5, at three heights."""
     on_y = [marker((x, 4.0, 1.2 + 0.7 * (i % 3)), (1, 0, 0), (0, 0, -1)) for i, x in enumerate(range(5))]
     on_x = [
         marker((5.0, 3.0 - y, 1.5 + 0.7 * (i % 3)), (0, -1, 0), (0, 0, -1)) for i, y in enumerate(range(5))
@@ -47,7 +47,7 @@ def two_walls(count=10):
 
 
 def one_wall(count=9):
-    """(count, 4, 3), markers on the wall y = 4."""
+    """Corners (count, 4, 3) of markers on the wall y = 4."""
     return np.array([marker((x - 1, 4.0, z + 1), (1, 0, 0), (0, 0, -1)) for x in range(3) for z in range(3)])[
         :count
     ]
@@ -59,7 +59,7 @@ def looking(centre_m=(-0.8, -2.5, 1.3), target_m=(3.0, 3.0, 1.8), coefficients=0
 
 
 def longer_lens(view, by):
-    """The camera with a focal length that is longer by this share."""
+    """The camera with a focal length that is longer by the share `by`."""
     return replace(view, K=view.K * np.array([[1 + by, 1 + by, 1], [1 + by, 1 + by, 1], [1, 1, 1]]))
 
 
@@ -74,7 +74,7 @@ def corners_of(view, corners_m, rng=None, noise_px=0.0):
 
 
 def error(found, view):
-    """(6,), error of position along the world's axes and of turn about the camera's, in the covariance's order."""
+    """Errors (6,) in the covariance's order: position along the world's axes, and turn about the camera's axes."""
     R_world_cam = view.T_cam_world[:3, :3].T
     turn = Rotation.from_matrix(found.R_world_cam.T @ R_world_cam).as_rotvec()
     return np.concatenate([view.centre_world - found.position_m, turn])
@@ -90,7 +90,7 @@ def squared_deviations(found, view):
 def test_exact_corners_give_the_pose_exactly(coefficients, count):
     view, corners_m = looking(coefficients=coefficients), two_walls(count)
     found = estimate_pose(corners_of(view, corners_m), corners_m, lens_of(view), ANY_NUMBER)
-    # The last step converges quadratically: the remaining error is far below a standard deviation.
+    # The last step converges quadratically, so the remaining error is far below a standard deviation.
     np.testing.assert_allclose(error(found, view), 0, atol=1e-9)
     assert found.used.all()
     assert found.reprojection_px < 1e-6
@@ -113,7 +113,7 @@ def test_derivatives_equal_finite_differences():
 
     rows, depth_m = equations(corners, view.centre_world, R_world_cam, np.zeros(2))
     slopes = approx_fprime(np.zeros(8), off_px, 1e-7).reshape(3, 4, 2, 8)
-    # A finite step of 1e-7 has a curvature error of 1e-5 px and a rounding error of 1e-6 px.
+    # A finite step of 1e-7 has an error of 1e-5 px from curvature and of 1e-6 px from rounding.
     np.testing.assert_allclose(rows[..., :8], slopes, rtol=1e-4, atol=0.01)
     np.testing.assert_allclose(depth_m, project(view, corners_m)[1], rtol=1e-12)
 
@@ -125,7 +125,7 @@ def test_elimination_equals_scipys_least_squares_over_all_unknowns():
     noise, count, focal_error = Noise(0.4**2, 0.003**2, 10.0, 10.0), 6, 0.005
     placed_m = corners_m + 0.003 * rng.normal(size=(count, 1, 3))
     corners_px = corners_of(longer_lens(view, 0.003), placed_m, rng, 0.4)
-    # Of a marker's stated deviation, a share of 0.6 is the map's.
+    # A share of 0.6 of the stated deviation of a marker is an error of the map.
     corners = seen_markers(corners_px, corners_m, lens_of(view), 0.4, 0.0024, 0.0018, focal_error)
     position_m, R, nuisance = view.centre_world, view.T_cam_world[:3, :3].T, np.zeros(2)
     for _ in range(6):
@@ -150,7 +150,7 @@ def test_elimination_equals_scipys_least_squares_over_all_unknowns():
     start[6:8] = nuisance
     result = best_for(corners_px, start)
     deviation = np.sqrt(np.diag(solution.covariance))
-    # Derivatives are taken at the markers' positions in the map, 3 mm in 5 m from their fitted positions.
+    # Derivatives are mapped_m at the markers' positions in the map, 3 mm from their fitted positions at 5 m.
     np.testing.assert_allclose((result.x[:8] - start[:8]) / deviation, 0, atol=0.01)
     expected = np.linalg.inv(result.jac.T @ result.jac)[:8, :8]
     np.testing.assert_allclose(
@@ -162,17 +162,17 @@ def test_elimination_equals_scipys_least_squares_over_all_unknowns():
     common = sums.common(solution, noise, corners.map_share)
     there, off_m = longer_lens(view, 0.003), np.zeros((count, 1, 3))
     off_m[4, 0, 2] = 0.003 * 0.6
-    for column, view_of_it, moved_m in (
+    for column, changed_view, moved_m in (
         (3 * 4 + 2, there, placed_m + off_m),
         (-1, longer_lens(view, 0.003 + focal_error), placed_m),
     ):
-        by_px = project(view_of_it, moved_m)[0] - project(there, placed_m)[0]
+        by_px = project(changed_view, moved_m)[0] - project(there, placed_m)[0]
         moved = best_for(corners_px + by_px, result.x).x[:6] - result.x[:6]
-        # The problem is nearly linear, and the covariance is right to a hundredth.
+        # The problem is nearly linear, and the covariance is good to a hundredth.
         np.testing.assert_allclose(common[:, column] / deviation[:6], moved / deviation[:6], atol=0.02)
 
 
-def test_pose_equals_scipys_where_the_map_is_exact():
+def test_the_pose_equals_scipys_for_an_exact_map():
     rng = np.random.default_rng(1)
     view, corners_m = looking(coefficients=5), two_walls(8)
     corners_px = corners_of(view, corners_m, rng, 0.3)
@@ -192,12 +192,12 @@ def test_pose_equals_scipys_where_the_map_is_exact():
     )
     result = least_squares(residuals, start, x_scale="jac", xtol=1e-14, ftol=1e-14)
     deviation_m = np.sqrt(np.diag(found.covariance)[:3])
-    # Our noise is estimated, so that the prior of the inset has a slightly different weight.
+    # The noise is estimated, so the prior of the inset has a slightly different weight than in SciPy's problem.
     np.testing.assert_allclose((found.position_m - result.x[:3]) / deviation_m, 0, atol=0.02)
 
 
 def placements(rng, count, noise_px, place_m, stated, number):
-    """Poses and cameras: random positions of the camera, noise of the corners, offsets of the markers."""
+    """Estimated poses and true cameras, with random positions of the camera, noise of corners and marker offsets."""
     for _ in range(number):
         view = looking(
             rng.uniform((-1.5, -3, 0.8), (0.0, -1, 2)), rng.uniform((2.5, 3, 1.2), (3.5, 3.5, 2.2))
@@ -214,17 +214,17 @@ def placements(rng, count, noise_px, place_m, stated, number):
         pytest.param(1.0, 0.0, SETTINGS, 0.85, id="more noise than stated"),
         pytest.param(0.1, 0.0, SETTINGS, 0.85, id="less noise than stated"),
         pytest.param(0.3, 0.003, PoseSettings(place_m=0.003), 0.85, id="marker offsets as stated"),
-        # The variance of 8 markers' offsets is known loosely, because the pose takes 6 unknowns.
+        # The variance of the offsets of 8 markers is not well known, because the pose takes up 6 unknowns.
         pytest.param(0.3, 0.003, SETTINGS, 0.7, id="marker offsets thirty times as stated"),
     ],
 )
-def test_covariance_is_honest(noise_px, place_m, stated, least):
+def test_covariances_agree_with_the_errors(noise_px, place_m, stated, least):
     poses = placements(np.random.default_rng(2), 8, noise_px, place_m, stated, 120)
     squares = np.array([squared_deviations(found, view) for found, view in poses])
     share = np.mean(squares < chi2.ppf(0.9, 6))
-    # Three standard deviations of a share of 120.
+    # A limit of three standard deviations of a share of 120.
     assert share > least - 3 * np.sqrt(least * (1 - least) / 120)
-    # The covariance is not too wide either: deviations are at most one and a half times too large.
+    # The covariance must not be too wide either: deviations are at most one and a half times too large.
     assert np.median(squares) > chi2.median(6) / 1.5**2
 
 
@@ -232,7 +232,7 @@ def test_covariance_is_honest(noise_px, place_m, stated, least):
     ("map_error_m", "focal_error"), [(0.002, 0.0), (0.0, 0.005), (0.002, 0.005)], ids=["map", "focal", "both"]
 )
 def test_covariance_includes_errors_of_the_map_and_of_the_focal_length(map_error_m, focal_error):
-    """Six markers, noise of 0.1 px; each pose has another map and another lens."""
+    """Six markers with noise of 0.1 px; each pose has another map and another lens."""
     rng = np.random.default_rng(12)
     with_errors = PoseSettings(map_error_m=map_error_m, focal_error=focal_error)
     views = [view for _, view in placements(np.random.default_rng(13), 6, 0.1, 0.0, SETTINGS, 100)]
@@ -251,7 +251,7 @@ def test_covariance_includes_errors_of_the_map_and_of_the_focal_length(map_error
             off.append(np.linalg.norm(miss_m))
             of_common = found.common @ found.common.T
             assert np.linalg.eigvalsh(found.covariance - of_common)[0] > 0
-    # Three standard deviations of a share of 100.
+    # A limit of three standard deviations of a share of 100.
     assert np.mean(inside) > 0.9 - 3 * np.sqrt(0.09 / 100)
     assert np.mean(inside_without) < np.mean(inside) - 0.05
     # Markers on two walls determine the focal length; one pose cannot separate the errors of the map.
@@ -266,15 +266,15 @@ def test_chance_is_the_expected_number_of_sets_of_markers_that_agree():
         count: estimate_pose(corners_px[:count], corners_m[:count], lens_of(view), ANY_NUMBER).chance
         for count in (1, 2, 4)
     }
-    # The area within 15 times the stated 0.2 px of a place, as a share of an image of 1920 x 1080.
+    # The area within 15 times the stated 0.2 px of a marker's position, as a share of an image of 1920 x 1080.
     near = np.pi * 3.0**2 / (1920 * 1080)
     assert found[1] == 1.0
     assert found[2] == pytest.approx(2 * near)
     assert found[4] == pytest.approx(4 * near**3)
-    # Any two of the four other markers could agree with the first.
+    # Any two of the four other markers could agree with the first marker.
     wrong_px = np.concatenate([corners_px[:3], corners_px[2:] + rng.uniform(200, 400, (2, 1, 2))])
-    taken_m = np.concatenate([corners_m[:3], two_walls(6)[4:]])
-    some = estimate_pose(wrong_px, taken_m, lens_of(view), ANY_NUMBER)
+    mapped_m = np.concatenate([corners_m[:3], two_walls(6)[4:]])
+    some = estimate_pose(wrong_px, mapped_m, lens_of(view), ANY_NUMBER)
     np.testing.assert_array_equal(some.used, [True] * 3 + [False] * 2)
     assert some.chance == pytest.approx(5 * 6 * near**2)
 
@@ -304,7 +304,7 @@ def test_pose_follows_a_transformed_world_and_reordered_markers(axis, shift_m, s
     one = estimate_pose(corners_px, corners_m, lens_of(view), SETTINGS)
     other = estimate_pose(corners_px[order], corners_m[order] @ R.T + shift_m, lens_of(view), SETTINGS)
     np.testing.assert_array_equal(other.used, one.used[order])
-    # Both fits stop within a tenth of a deviation of the same minimum; deviations are about 1 mm and 0.2 mrad.
+    # Both fits end within a tenth of a deviation of the same minimum; deviations are about 1 mm and 0.2 mrad.
     np.testing.assert_allclose(R.T @ (other.position_m - shift_m), one.position_m, atol=1e-4)
     np.testing.assert_allclose(R.T @ other.R_world_cam, one.R_world_cam, atol=2e-5)
     turned = np.kron(np.eye(2), R)
@@ -324,10 +324,10 @@ def test_markers_with_the_id_of_another_are_left_out(wrong):
         view, corners_m = looking(), two_walls(10)
         corners_px = corners_of(view, corners_m, rng, 0.2)
         swapped = rng.permutation(10)[:wrong]
-        taken = corners_m.copy()
+        mapped_m = corners_m.copy()
         for index in swapped:
-            taken[index] = corners_m[rng.choice([i for i in range(10) if i != index])]
-        found = estimate_pose(corners_px, taken, lens_of(view), SETTINGS)
+            mapped_m[index] = corners_m[rng.choice([i for i in range(10) if i != index])]
+        found = estimate_pose(corners_px, mapped_m, lens_of(view), SETTINGS)
         np.testing.assert_array_equal(np.flatnonzero(~found.used), np.sort(swapped))
         assert squared_deviations(found, view) < chi2.ppf(0.9999, 6)
 
@@ -351,18 +351,18 @@ def test_one_bad_corner_excludes_the_corner_and_two_exclude_the_marker():
     assert clean.used.all()
     assert one.used.all()
     np.testing.assert_array_equal(two.used, np.arange(8) != 2)
-    # Excluded corners have no influence: the pose equals that of the other markers to a tenth of a deviation.
+    # Excluded corners have no effect: the pose equals that of the other markers to a tenth of a deviation.
     np.testing.assert_allclose(two.position_m, without.position_m, atol=1e-4)
     assert one.reprojection_px < 1.0
-    # 31 corners have nearly the information of 32.
+    # 31 corners have almost the information of 32 corners.
     assert np.trace(one.covariance[:3, :3]) == pytest.approx(np.trace(clean.covariance[:3, :3]), rel=0.5)
 
 
 def test_good_markers_are_excluded_as_seldom_as_stated():
     found = [one.used for one, _ in placements(np.random.default_rng(4), 10, 0.3, 0.0, SETTINGS, 60)]
-    thrown = np.sum(~np.array(found))
-    # A marker is excluded by its mean, or by two of its corners, which is much rarer.
-    assert thrown <= binom.ppf(0.9999, 600, 2 * FALSE_ALARM)
+    num_excluded = np.sum(~np.array(found))
+    # A marker is excluded by the mean of its corners, or by two of its corners, which is much rarer.
+    assert num_excluded <= binom.ppf(0.9999, 600, 2 * FALSE_ALARM)
 
 
 def far_marker(rng, angle_deg=20.0, distance_m=7.0):
@@ -373,17 +373,17 @@ def far_marker(rng, angle_deg=20.0, distance_m=7.0):
     return view, one, corners_of(view, one, rng, 0.3)
 
 
-def test_ambiguity_of_a_single_marker_is_how_often_the_other_pose_is_right():
+def test_the_ambiguity_of_a_single_marker_is_the_probability_of_the_other_pose():
     rng = np.random.default_rng(5)
     stated, wrong = [], []
     for _ in range(120):
         view, corners_m, corners_px = far_marker(rng)
         found = estimate_pose(corners_px, corners_m, lens_of(view), ANY_NUMBER)
         stated.append(found.ambiguity)
-        # The mirrored pose sees the marker turned to the other side.
+        # In the mirrored pose, the marker is turned to the other side.
         wrong.append(np.rad2deg(np.linalg.norm(error(found, view)[3:])) > 20)
     assert 0.1 < np.mean(stated) < 0.5
-    # Three standard deviations of the count, and a fifth for the approximations.
+    # Three standard deviations of the count, plus a fifth for approximations.
     limit = 3 * np.sqrt(np.mean(stated) / 120) + 0.2 * np.mean(stated)
     assert abs(np.mean(wrong) - np.mean(stated)) < limit
 
@@ -431,13 +431,13 @@ def test_two_markers_that_contradict_each_other_are_ambiguous_without_an_expecte
     view, all_m = looking(), two_walls(10)
     corners_m = all_m[[0, 1]]
     corners_px = corners_of(view, corners_m, rng, 0.2)
-    taken = np.stack([corners_m[0], all_m[8]])
-    found = estimate_pose(corners_px, taken, lens_of(view), ANY_NUMBER)
+    mapped_m = np.stack([corners_m[0], all_m[8]])
+    found = estimate_pose(corners_px, mapped_m, lens_of(view), ANY_NUMBER)
     assert found is None or (found.used.sum() == 1 and found.ambiguity > 0.01)
     expected = ExpectedPose(
         view.centre_world + 0.05, view.T_cam_world[:3, :3].T, np.diag([0.01] * 3 + [0.003] * 3)
     )
-    found = estimate_pose(corners_px, taken, lens_of(view), ANY_NUMBER, expected)
+    found = estimate_pose(corners_px, mapped_m, lens_of(view), ANY_NUMBER, expected)
     np.testing.assert_array_equal(found.used, [True, False])
     assert found.ambiguity < 0.01
     assert squared_deviations(found, view) < chi2.ppf(0.9999, 6)
@@ -446,9 +446,9 @@ def test_two_markers_that_contradict_each_other_are_ambiguous_without_an_expecte
 def test_a_marker_that_the_map_places_behind_the_camera_is_left_out():
     view, corners_m = looking(), two_walls(6)
     corners_px = corners_of(view, corners_m)
-    taken = corners_m.copy()
-    taken[3] = marker((0.0, -4.0, 1.5), (-1, 0, 0), (0, 0, -1))
-    found = estimate_pose(corners_px, taken, lens_of(view), SETTINGS)
+    mapped_m = corners_m.copy()
+    mapped_m[3] = marker((0.0, -4.0, 1.5), (-1, 0, 0), (0, 0, -1))
+    found = estimate_pose(corners_px, mapped_m, lens_of(view), SETTINGS)
     np.testing.assert_array_equal(found.used, np.arange(6) != 3)
     np.testing.assert_allclose(error(found, view), 0, atol=1e-9)
 
@@ -462,7 +462,7 @@ def test_too_few_markers_give_no_pose():
     assert estimate_pose(corners_px, corners_m, lens_of(view), SETTINGS) is not None
 
 
-def test_markers_that_do_not_determine_a_pose_give_none():
+def test_markers_that_do_not_determine_a_pose_give_no_pose():
     view = looking()
     # All corners lie on one line, in the image and in the map.
     line_m = np.array([[[x + 0.1 * i, 4.0, 1.5] for i in range(4)] for x in range(5)])

@@ -113,16 +113,16 @@ def test_without_a_model_the_smoother_uses_the_estimated_model() -> None:
         np.testing.assert_array_equal(getattr(smooth(raw, params, model), name), value)
 
 
-def test_the_model_tells_calm_from_violent_flights_and_wide_covariances_from_right_ones() -> None:
+def test_the_model_distinguishes_calm_from_violent_flights_and_wide_from_correct_covariances() -> None:
     calm, _, _ = flight(100, acceleration=0.5, wobble=0.5, seed=33)
     violent, _, _ = flight(100, acceleration=8.0, wobble=8.0, seed=33)
-    of_calm, of_violent = (estimate_motion_model(raw, PoseFilterParams()) for raw in (calm, violent))
+    calm_model, violent_model = (estimate_motion_model(raw, PoseFilterParams()) for raw in (calm, violent))
     # A factor of 16 in acceleration is a factor of 256 in density. The levels of the filter are a factor of 100 apart.
-    assert np.median(of_violent.jerk_density_m2_s5) > 30 * np.median(of_calm.jerk_density_m2_s5)
-    assert np.median(of_violent.wobble_density_rad2_s3) > 10 * np.median(of_calm.wobble_density_rad2_s3)
+    assert np.median(violent_model.jerk_density_m2_s5) > 30 * np.median(calm_model.jerk_density_m2_s5)
+    assert np.median(violent_model.wobble_density_rad2_s3) > 10 * np.median(calm_model.wobble_density_rad2_s3)
     wide = estimate_motion_model(replace(calm, covariance=9 * calm.covariance), PoseFilterParams())
-    assert np.median(wide.noise_scale) < 0.5 * np.median(of_calm.noise_scale)
-    assert 0.5 < np.median(of_calm.noise_scale) < 2.0
+    assert np.median(wide.noise_scale) < 0.5 * np.median(calm_model.noise_scale)
+    assert 0.5 < np.median(calm_model.noise_scale) < 2.0
 
 
 @pytest.mark.parametrize(("acceleration", "wobble"), [(0.5, 0.5), (8.0, 8.0)])
@@ -133,14 +133,16 @@ def test_the_smoother_is_better_than_the_filter_and_its_covariances_are_right(ac
     assert (smoothed.status == Status.TRACKED).mean() > 0.88
     assert (smoothed.status != Status.LOST).all()
     off_m, off_rad = errors(smoothed, position_m, truth)
-    of_filter_m, of_filter_rad = errors(filtered, position_m, truth)
-    assert median_mm(off_m) < median_mm(of_filter_m)
-    assert median_mm(off_rad) < 1.02 * median_mm(of_filter_rad)
+    filter_off_m, filter_off_rad = errors(filtered, position_m, truth)
+    assert median_mm(off_m) < median_mm(filter_off_m)
+    assert median_mm(off_rad) < 1.02 * median_mm(filter_off_rad)
     assert 0.75 < share_within(off_m, smoothed.covariance[:, :3, :3]) < 1.0
     assert 0.7 < share_within(off_rad, smoothed.covariance[:, 3:, 3:]) < 1.0
     speed_m_s = np.gradient(position_m, raw.time_s, axis=0)
-    of_speed = np.linalg.norm(smoothed.velocity_m_s - speed_m_s, axis=1)[2:-2]
-    assert np.median(of_speed) < np.median(np.linalg.norm(filtered.velocity_m_s - speed_m_s, axis=1)[2:-2])
+    speed_error_m_s = np.linalg.norm(smoothed.velocity_m_s - speed_m_s, axis=1)[2:-2]
+    assert np.median(speed_error_m_s) < np.median(
+        np.linalg.norm(filtered.velocity_m_s - speed_m_s, axis=1)[2:-2]
+    )
 
 
 def test_gaps_are_bridged_from_both_sides() -> None:
@@ -160,10 +162,10 @@ def test_gaps_are_bridged_from_both_sides() -> None:
     # The uncertainty is largest in the middle of the gap, and far below that of the filter.
     assert 36 <= 30 + variance_m2[30:50].argmax() <= 43
     assert variance_m2[40] < 0.3 * np.trace(filtered.covariance[40, :3, :3])
-    told = np.flatnonzero(path.seen)
+    seen_frames = np.flatnonzero(path.seen)
     off_m, _ = errors(path, position_m, truth)
-    inside = np.isin(told, np.r_[30:50])
-    off_m, covariance = off_m[inside], path.covariance[told][inside, :3, :3]
+    inside = np.isin(seen_frames, np.r_[30:50])
+    off_m, covariance = off_m[inside], path.covariance[seen_frames][inside, :3, :3]
     # 21.1 is exceeded by chi-square with 3 degrees of freedom once in 10,000.
     assert (np.einsum("ni,nij,nj->n", off_m, np.linalg.inv(covariance), off_m) < 21.1).all()
 

@@ -1,4 +1,4 @@
-"""Markers that a camera could see: markers placed by hand, and OpenCV's projection."""
+"""Visible markers, compared with markers placed by hand and with OpenCV's projection."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from psotrack.geometry import make_camera
 from psotrack.inside_out import MarkerMap
 from psotrack.inside_out.comparison.visibility import visible_markers
 
-#: At the origin, x to the right, y down, z ahead; a metre at a distance of 1 m is 100 px, in an image of 201 x 101.
+#: A camera at the origin (x to the right, y down, z ahead); a metre at 1 m is 100 px in an image of 201 x 101.
 LENS = make_camera(
     R=np.eye(3),
     t_m=np.zeros(3),
@@ -37,21 +37,21 @@ def seen(*markers, position_m=ORIGIN, wxyz=AHEAD, **options):
     ("corners", "expected"),
     [
         (square_m([0, 0, 1]), True),
-        (square_m([0, 0, -1], turn_deg=180), False),  # Behind, though it faces the camera.
-        (square_m([0, 0, 1], turn_deg=180), False),  # Seen from its back.
+        (square_m([0, 0, -1], turn_deg=180), False),  # Behind the camera, though it faces the camera.
+        (square_m([0, 0, 1], turn_deg=180), False),  # Seen from the back.
         (square_m([0, 0, 1], turn_deg=-45), True),
         (square_m([1.2, 0, 1]), False),  # To the right of the image.
-        # Its right edge at 100 + 100 (0.904 + 0.1) = 200.4 px; the image ends at 200.5.
+        # The right edge is at 100 + 100 (0.904 + 0.1) = 200.4 px; the image ends at 200.5 px.
         (square_m([0.904, 0, 1]), True),
         (square_m([0.906, 0, 1]), False),
-        (square_m([0, -0.404, 1]), True),  # Its upper edge at -0.4 px.
+        (square_m([0, -0.404, 1]), True),  # The upper edge is at -0.4 px.
         (square_m([0, -0.406, 1]), False),
         (square_m([0, 0, 1.65]), True),  # 20 / 1.65 = 12.1 px.
         (square_m([0, 0, 1.7]), False),  # 11.8 px.
-        (square_m([0, 0, 1], turn_deg=70), False),  # 7 px wide, though 20 high.
+        (square_m([0, 0, 1], turn_deg=70), False),  # 7 px wide, and 20 px high.
     ],
 )
-def test_hand_placed_markers(corners, expected):
+def test_markers_placed_by_hand(corners, expected):
     assert seen(corners).tolist() == [[expected]]
 
 

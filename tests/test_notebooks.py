@@ -1,4 +1,4 @@
-"""The notebooks: script and .ipynb hold the same; what is committed has been run and can be read; all of it runs."""
+"""The notebooks: script and .ipynb have the same cells; committed notebooks have been run, and all notebooks run."""
 
 import ast
 import os
@@ -14,16 +14,16 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 SCRIPTS = sorted((ROOT / "notebooks").glob("[a-z]*.py"))
-#: So that people can read them where repositories are shown, and clone them.
-MOST_BYTES = 1_000_000
-#: What begins like this lies on somebody's machine; on this one, wherever the checkout is.
-MACHINE = re.compile(rf"(?<![\w.])(/(home|root|tmp|Users)/|[A-Z]:\\|{re.escape(str(ROOT))})")
+#: Largest size of a notebook, bytes: repository pages show larger files slowly or not at all.
+MAX_BYTES = 1_000_000
+#: Beginnings of paths on a particular machine, including the folder of this checkout.
+MACHINE_PATH = re.compile(rf"(?<![\w.])(/(home|root|tmp|Users)/|[A-Z]:\\|{re.escape(str(ROOT))})")
 
 each = pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
 
 
 def committed(script):
-    """The notebook that is paired with a script."""
+    """The committed notebook of a script."""
     return nbformat.read(script.with_suffix(".ipynb"), as_version=4)
 
 
@@ -54,7 +54,7 @@ def test_committed_notebook_has_been_run_from_top_to_bottom(script):
 
 
 @each
-def test_every_picture_is_followed_by_what_to_see(script):
+def test_every_picture_is_followed_by_a_what_to_see_cell(script):
     notebook = committed(script)
     after = [
         following
@@ -62,13 +62,13 @@ def test_every_picture_is_followed_by_what_to_see(script):
         if has_picture(cell)
     ]
     assert after
-    # A photograph of the hall at the beginning needs it as much as the last curve.
+    # This includes photographs of the hall at the beginning.
     assert all(cell.cell_type == "markdown" and cell.source.startswith("*What to see") for cell in after)
     assert not has_picture(notebook.cells[-1])
 
 
 @each
-def test_committed_notebook_shows_no_trouble_and_no_machine(script):
+def test_committed_notebook_shows_no_errors_and_no_paths_of_a_machine(script):
     notebook = committed(script)
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
     assert not [
@@ -78,13 +78,13 @@ def test_committed_notebook_shows_no_trouble_and_no_machine(script):
     texts += [
         text for output in outputs for kind, text in output.get("data", {}).items() if "image" not in kind
     ]
-    assert not [text for text in texts if MACHINE.search(text)]
+    assert not [text for text in texts if MACHINE_PATH.search(text)]
 
 
 @each
 def test_committed_notebook_is_small_and_its_metadata_are_stable(script):
     path = script.with_suffix(".ipynb")
-    assert path.stat().st_size < MOST_BYTES
+    assert path.stat().st_size < MAX_BYTES
     notebook = committed(script)
     assert notebook.metadata.kernelspec.name == "python3"
     assert "version" not in notebook.metadata.get("language_info", {})
@@ -93,13 +93,13 @@ def test_committed_notebook_is_small_and_its_metadata_are_stable(script):
 
 @each
 def test_functions_are_in_the_package(script):
-    # An animation has to be told how to draw a frame.
+    # An animation needs one function that draws a frame.
     assert sum(isinstance(node, ast.FunctionDef) for node in ast.walk(ast.parse(script.read_text()))) <= 1
 
 
 @pytest.fixture(scope="module")
 def copies(tmp_path_factory):
-    """The notebooks in a folder of their own, beside the results that one of them reads."""
+    """Copies of the notebooks in a separate folder, with a link to the results that one notebook reads."""
     root = tmp_path_factory.mktemp("checkout")
     (root / "experiments").symlink_to(ROOT / "experiments")
     folder = root / "notebooks"
@@ -112,7 +112,7 @@ def copies(tmp_path_factory):
 @pytest.mark.slow
 @each
 def test_notebook_runs_at_tiny_size(script, copies):
-    """By nbmake, in a pytest of its own: this one makes errors of the warnings of Jupyter's machinery."""
+    """Run by nbmake in another pytest process, because this one turns warnings of Jupyter's machinery into errors."""
     command = [
         sys.executable,
         "-m",
@@ -121,11 +121,11 @@ def test_notebook_runs_at_tiny_size(script, copies):
         "-p",
         "no:cacheprovider",
         "--nbmake",
-        # Five minutes for a cell, its default, are not enough for the compiler of any machine.
+        # The default, five minutes for a cell, is not enough for the compiler on slow machines.
         "--nbmake-timeout=7200",
         f"{script.stem}.ipynb",
     ]
-    # Most of the time is the compiler's, at this size.
+    # At this size the compiler takes most of the time.
     environment = os.environ | {"PSOTRACK_NOTEBOOKS": "tiny", "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
     ran = subprocess.run(command, cwd=copies, env=environment, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stdout + ran.stderr

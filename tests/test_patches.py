@@ -1,6 +1,6 @@
-"""Windows of the silhouettes: NumPy sums of the whole images are the oracles.
+"""Windows cut from the silhouettes, compared with NumPy sums over the whole images.
 
-Cameras are so far away that metres are pixels where anything is worked out by hand.
+In tests by hand, cameras are so far away that metres are pixels.
 """
 
 import jax
@@ -30,7 +30,7 @@ from psotrack.tracking import SoftIoU
 from psotrack.tracking.fitness import ScoreInputs, camera_scores, drone_fitness, filled_share
 from psotrack.tracking.patches import NUM_LEVELS, SIDE
 
-#: At the middle, beside, over the left upper and right lower borders in most cameras, and out of all images.
+#: In the middle; beside it; over the upper left and lower right borders in most cameras; outside all images.
 PLACES_M = np.array([[0.01, 0, 0.02], [0.53, 0, 0.21], [-1.213, 0, 0.83], [1.24, 0, -0.87], [40.0, 0, 3.0]])
 SIZES_M = np.array([[1.0, 1.0, 0.5]]).repeat(5, axis=0)
 
@@ -44,9 +44,9 @@ def levels(patches, reduction=1):
 
 @pytest.mark.parametrize("reduction", [1, 4])
 def test_windows_are_means_of_the_whole_image(reduction):
-    """Every pixel of every window is the mean of the silhouette over its area, rounded; nothing beyond the image.
+    """Every pixel of every window is the rounded mean of the silhouette over the pixel's area, and 0 beyond the image.
 
-    (Or up to seven pixels beyond, where boxes do not reach.)
+    Beyond the image means beyond its padding of up to seven pixels, which boxes do not reach.
     """
     rig = far_rig(reduction)
     patches = cut_at(rig, NOISE, PLACES_M, SIZES_M, occluding=None, reduction=reduction)
@@ -65,7 +65,7 @@ def test_windows_are_means_of_the_whole_image(reduction):
         np.testing.assert_array_equal(window[whole], expected[whole])
         assert not window[outside].any()
         hanging += whole.any() and outside.any()
-        # The window is about the drone: its middle lies in the pixel right of and below the window's middle.
+        # The drone's middle is in the pixel to the right of and below the window's middle.
         x, y = middle_px(PLACES_M[drone], PIXELS_PER_M[camera])
         assert 0 <= x / cell - column / cell - SIDE / 2 < 1
         assert 0 <= y / cell - row / cell - SIDE / 2 < 1
@@ -74,7 +74,7 @@ def test_windows_are_means_of_the_whole_image(reduction):
 
 
 def _means(image, row, column, cell):
-    """Means over the window's pixels, which of them lie wholly in the image, and which beyond it and its padding."""
+    """Means over the window's pixels; masks of pixels wholly inside the image, and of pixels beyond its padding."""
     y, x = row + np.arange(SIDE * cell), column + np.arange(SIDE * cell)
 
     def within(height, width):
@@ -96,7 +96,7 @@ def _rounded_mean(sums, cell):
 
 @given(st.integers(0, 2**16))
 def test_boxes_on_the_grid_of_a_window_are_slice_sums(seed):
-    """Sums over boxes with edges on whole pixels of the windows are NumPy's of the silhouettes, halved as often."""
+    """Sums over boxes with edges on the windows' pixels equal NumPy's sums over the reduced silhouettes."""
     rng = np.random.default_rng(seed)
     patches = cut_at(far_rig(1), NOISE, PLACES_M, SIZES_M, occluding=None)
     ends = np.sort(rng.integers(0, SIDE + 1, (2, 2, *patches.x_px.shape)), axis=1)
@@ -110,7 +110,7 @@ def test_boxes_on_the_grid_of_a_window_are_slice_sums(seed):
             for first, end in ((patches.x_px, ends[0]), (patches.y_px, ends[1]))
         )
         if right > SHAPE[1] // 8 * 8 or bottom > SHAPE[0] // 8 * 8:
-            continue  # The border divides a pixel: the next test.
+            continue  # The image border divides a pixel; the next test covers this case.
         n = cell[d, c]
         fine = NOISE[c, max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)].astype(int)
         cells = fine.reshape(fine.shape[0] // n, n, fine.shape[1] // n, n).sum(axis=(1, 3))
@@ -120,19 +120,19 @@ def test_boxes_on_the_grid_of_a_window_are_slice_sums(seed):
 _box_sum = jax.jit(box_sum)
 
 
-def test_where_the_border_divides_a_pixel_foreground_counts_in_full():
-    """All is foreground: every box is filled, whatever the level, up to the border of an odd image."""
+def test_at_the_image_border_a_divided_pixel_counts_in_full():
+    """In images that are all foreground, every box is full at every level, up to the border of an odd image."""
     white = np.full_like(NOISE, 255)
     patches = cut_at(far_rig(1), white, PLACES_M, SIZES_M, occluding=None)
     share = evaluate(filled_share, far_rig(1), patches, PLACES_M, SIZES_M)
     _, weight = evaluate(camera_scores, far_rig(1), patches, PLACES_M, SIZES_M)
     hanging = (weight > 0.5) & (weight < 0.99)
     assert hanging[:, 1:].any()
-    # Edges at 1e6 px of focal length are good to 1e-4 px in float32, boxes are 10 px and more.
+    # With a focal length of 1e6 px, edges are good to 1e-4 px in float32; boxes are at least 10 px wide.
     np.testing.assert_allclose(share, weight > 0.5, atol=1e-4)
 
 
-# Scores, in a room.
+# Scores in a room.
 
 REDUCTION = 2
 RIG = ring_rig(5, image_size_wh=(324, 244))
@@ -143,8 +143,8 @@ SMALL_M = np.array([[0.4, 0.4, 0.25]]).repeat(2, axis=0)
 
 
 @pytest.mark.parametrize("where", ["in the room", "all about"])
-def test_scores_are_those_of_whole_images(where):
-    """Within reach of where a drone is expected, windows of the finest level hold all that its score reads."""
+def test_scores_agree_with_those_from_whole_images(where):
+    """Within reach of the expected position, a window of the finest level contains all pixels that the score reads."""
     rng = np.random.default_rng(1)
     images = rng.integers(0, 256, (5, 122, 162)).astype(np.uint8)
     expected_m = TRUTH_M if where == "in the room" else np.array([[2.6, -2.1, 0.1], [0.3, 2.9, 2.9]])
@@ -156,10 +156,10 @@ def test_scores_are_those_of_whole_images(where):
     arrays = float32((RIG.cameras, position_m, SIZE_M))
     whole = evaluate_whole(camera_scores, REDUCTION, images, *arrays)
     assert (np.asarray(whole[0])[:, fine] > 0.1).any(axis=0).sum() >= 3
-    # Edges of boxes are good to 1e-5 px, of 20 px and more.
+    # Edges of boxes are good to 1e-5 px, and boxes are at least 20 px wide.
     np.testing.assert_allclose(score[:, fine], np.asarray(whole[0])[:, fine], atol=1e-5)
     np.testing.assert_array_equal(weight, whole[1])
-    # Some of them hang over the border, and some cameras do not see them.
+    # Outside the room, some boxes extend over the image border, and some cameras do not see the drones.
     assert (
         fine.all() if where == "in the room" else ((weight > 0) & (weight < 1)).any() and (weight == 0).any()
     )
@@ -170,8 +170,8 @@ def test_scores_are_those_of_whole_images(where):
     st.floats(0, 5, width=32),
     st.integers(0, 4),
 )
-def test_all_is_finite_wherever_drones_are_expected(expected_m, reach_m, camera):
-    """In the room and out of it, behind cameras and inside of them."""
+def test_scores_are_finite_for_any_expected_position(expected_m, reach_m, camera):
+    """Expected positions inside and outside the room, behind cameras, and at a camera's centre."""
     images = NOISE[:1, :122, :162].repeat(5, axis=0)
     somewhere = np.array(expected_m).reshape(2, 3)
     at_camera = np.stack([RIG.cameras.centre_world[camera], somewhere[1]])
@@ -182,7 +182,7 @@ def test_all_is_finite_wherever_drones_are_expected(expected_m, reach_m, camera)
         assert ((patches.clear >= 0) & (patches.clear <= 1)).all()
         assert (patches.tables >= 0).all()
         score, weight = evaluate(camera_scores, RIG, patches, expected, SIZE_M)
-        # Sums are exact to 1e-6 of a box.
+        # Sums are exact to 1e-6 of a box's area.
         assert ((score >= 0) & (score <= 1 + 1e-5)).all()
         assert ((weight >= 0) & (weight <= 1 + 1e-5)).all()
         T_cam_world = RIG.cameras.T_cam_world
@@ -198,10 +198,10 @@ def test_all_is_finite_wherever_drones_are_expected(expected_m, reach_m, camera)
     st.tuples(st.floats(0, 2), st.floats(0, 2)),
     st.sampled_from([0.2, 0.5, 1.0]),
 )
-# 31.7 pixels are needed to every side, and the middle is far to the right in its pixel.
+# 31.7 pixels are needed on every side, and the middle is far to the right in its pixel.
 @example(11.04, 0.5, (1.9, 0.3), 0.5)
-def test_the_level_is_the_finest_that_holds_ring_and_search(distance_m, reach_m, shift_px, size):
-    """A ball on the axis of a camera, wherever in a pixel that is."""
+def test_the_level_is_the_finest_that_contains_ring_and_search(distance_m, reach_m, shift_px, size):
+    """A ball on the optical axis, for any position of the axis within a pixel."""
     focal_px, radius_m = 800.0, size / 2
     camera = far_camera(image_size_wh=(640, 480), pixels_per_m=focal_px / distance_m, distance_m=distance_m)
     middle_px = camera.K[:2, 2] + shift_px + 0.5
@@ -211,7 +211,7 @@ def test_the_level_is_the_finest_that_holds_ring_and_search(distance_m, reach_m,
         rig_of(camera), image, np.zeros((1, 3)), np.full((1, 3), size), reach_m=reach_m, reduction=REDUCTION
     )
     level, pixel_px = levels(patches, REDUCTION).item(), patches.pixel_px.item()
-    # The tangents to a ball from outside of it; displaced by as much as its radius it moves by that much, at most.
+    # Tangents to a ball from outside. If the ball moves by its radius, its image moves by at most half its width.
     half_px = focal_px * radius_m / np.sqrt(distance_m**2 - radius_m**2)
     needed_px = (RING + reach_m / radius_m) * half_px
     assert 0 <= level < NUM_LEVELS
@@ -222,7 +222,7 @@ def test_the_level_is_the_finest_that_holds_ring_and_search(distance_m, reach_m,
             assert first.item() + SIDE * pixel_px >= middle + needed_px - slack
     else:
         assert level == NUM_LEVELS - 1
-    # A window half as coarse would not hold it wherever its middle is in a pixel.
+    # A window of half the pixel size would not contain the ring and search for every position within a pixel.
     assert level == 0 or needed_px >= (SIDE / 2 - 1) * pixel_px / 2 - slack
 
 
@@ -230,8 +230,8 @@ def test_the_level_is_the_finest_that_holds_ring_and_search(distance_m, reach_m,
 
 
 @pytest.mark.slow
-def test_gradients_are_those_of_finite_differences():
-    """On windows that neighbours may cover, of several levels; in float64."""
+def test_gradients_agree_with_finite_differences():
+    """Windows of several levels that neighbours may cover, in float64."""
     pair = np.array([[0.3, -0.2, 1.3], [0.65, -0.05, 1.4]])
     images = draw_coverage(RIG, pair, SMALL_M, REDUCTION)
     patches = cut_at(RIG, images, pair, SMALL_M, reach_m=0.65, reduction=REDUCTION)
@@ -247,8 +247,8 @@ def test_gradients_are_those_of_finite_differences():
 
         position_m = pair + 0.013
         gradient = np.asarray(jax.jit(jax.grad(total))(position_m))
-        # Smooth but for kinks at pixels' borders, which a micrometre does not meet here; its square is 1e-12, and
-        # rounding costs 1e-16 / 1e-6.
+        # The score is smooth except at borders of pixels, which steps of a micrometre do not cross here. The error is
+        # the square of the step, 1e-12, plus rounding, 1e-16 / 1e-6.
         steps = 1e-6 * np.eye(6).reshape(6, 2, 3)
         expected = [(total(position_m + s) - total(position_m - s)) / 2e-6 for s in steps]
     np.testing.assert_allclose(gradient.ravel(), expected, atol=1e-6)
@@ -257,7 +257,7 @@ def test_gradients_are_those_of_finite_differences():
 
 @pytest.mark.slow
 def test_gradients_are_finite_everywhere():
-    """Also beyond the windows, at a camera, behind one, and where a neighbour may cover all."""
+    """Also beyond the windows, at a camera, behind a camera, and where a neighbour may cover the whole drone."""
     expected_m = np.stack([TRUTH_M[0], TRUTH_M[0]])
     images = draw_coverage(RIG, TRUTH_M[0], SMALL_M[0], REDUCTION)
     patches = cut_at(

@@ -1,4 +1,4 @@
-"""Drones by the lines of sight of their detections: exact boxes, and what detectors make of them."""
+"""Tracking drones by the lines of sight of their detections: exact boxes, and boxes with the errors of detectors."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ SPAN_M = np.array([0.5, 0.2])
 
 
 def circles(num_drones, frames=FRAMES, speed_m_s=1.0):
-    """(frames, drones, 3): drones on circles one above the other, at least 0.35 m apart."""
+    """Positions (frames, drones, 3) of drones on horizontal circles, one above the other, at least 0.35 m apart."""
     time_s = np.arange(frames)[:, None] / FPS
     drone = np.arange(num_drones)
     radius_m = 0.8 + 0.1 * (drone % 3)
@@ -29,7 +29,7 @@ def circles(num_drones, frames=FRAMES, speed_m_s=1.0):
 
 
 def detections(truth_m, *, jitter=0.0, missed=0.0, false_alarms=0.0, seed=0, hidden=()):
-    """The boxes of every camera, about where the drones' middles project to; some hidden (drone, first, last frame)."""
+    """Boxes around the projected positions in every camera, but for drones in `hidden`: (drone, first, last frame)."""
     rng = np.random.default_rng(seed)
     width_height = RIG.cameras.image_size_wh[0]
     found = {}
@@ -41,7 +41,7 @@ def detections(truth_m, *, jitter=0.0, missed=0.0, false_alarms=0.0, seed=0, hid
                 size = RIG.cameras.K[index, 0, 0] * SPAN_M / z
                 # The middle of the pixel at (0, 0) is half a pixel from the image's corner.
                 middle = pixel + 0.5 + jitter * size * rng.standard_normal(2)
-                is_hidden = any(drone == who and first <= number < last for who, first, last in hidden)
+                is_hidden = any(drone == lost and first <= number < last for lost, first, last in hidden)
                 inside = (middle > 0).all() and (middle < width_height).all()
                 if inside and not is_hidden and rng.random() >= missed:
                     frame.append(number)
@@ -67,7 +67,7 @@ def track(truth_m, count=None, known=None, **noise):
     )
 
 
-def judged(tracked, truth_m):
+def evaluation(tracked, truth_m):
     frame = np.arange(len(truth_m))
     estimate = Trajectories(
         frame,
@@ -83,74 +83,73 @@ def judged(tracked, truth_m):
 
 def test_perfect_boxes_give_the_drones_to_a_millimetre():
     truth_m = circles(4)
-    errors = judged(track(truth_m), truth_m)
+    errors = evaluation(track(truth_m), truth_m)
     assert (errors["missed_rate"], errors["id_switches"], errors["mota"]) == (0, 0, 1)
-    # All that is left is that the velocity is not known in the first frames.
+    # The remaining errors come from the unknown velocity in the first frames.
     assert errors["mean_error_m"] < 1e-3
     assert errors["max_error_m"] < 5e-3
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_six_drones_by_a_detector_that_misses_and_invents(seed):
-    """A tenth of the boxes missed, their middles off by 5 % of their sides, a false alarm in every second image."""
+def test_six_drones_with_missed_boxes_and_false_alarms(seed):
+    """A tenth of the boxes is missing, centres are off by 5 % of the sides, half of the images have a false alarm."""
     truth_m = circles(6)
     noise = {"jitter": 0.05, "missed": 0.1, "false_alarms": 0.5, "seed": seed}
     tracked = track(truth_m, **noise)
     assert tracked.status.shape[1] == 6
-    errors = judged(tracked, truth_m)
+    errors = evaluation(tracked, truth_m)
     assert (errors["missed_rate"], errors["id_switches"]) == (0, 0)
-    # Middles are off by 25 mm across and 10 mm up: from seven views that is 13 mm along x and y and 4 mm along z, 17 mm
-    # in all on average. The filter takes most of it to last, and gains a little.
+    # Box centres are off by 25 mm across and 10 mm up. From seven views that gives 13 mm along x and y and 4 mm along
+    # z, 17 mm in total on average. The filter treats most of the error as lasting, so it gains little.
     assert errors["mean_error_m"] < 0.017
-    # The covariances take errors to last, which those of this detector do not.
+    # The covariances assume lasting errors, but the errors of this detector are independent.
     assert 0.85 < errors["inside_90_rate"] <= 1.0
 
 
-def test_two_drones_that_pass_at_30_cm_are_not_exchanged():
+def test_two_drones_that_pass_at_30_cm_keep_their_identities():
     time_s = np.arange(FRAMES) / FPS - 1.5
     middle = np.zeros_like(time_s)
     first = np.stack([time_s, middle - 0.15, middle + 1.2], axis=-1)
     second = np.stack([-time_s, middle + 0.15, middle + 1.2], axis=-1)
     truth_m = np.stack([first, second], axis=1)
-    errors = judged(track(truth_m, jitter=0.05, missed=0.05), truth_m)
+    errors = evaluation(track(truth_m, jitter=0.05, missed=0.05), truth_m)
     assert (errors["missed_rate"], errors["id_switches"]) == (0, 0)
-    # As above, and sometimes a view takes one for the other.
+    # As above; in addition, a view sometimes takes one drone for the other.
     assert errors["mean_error_m"] < 0.022
 
 
-def test_a_drone_that_is_thrown_about_stays_itself():
-    """Its track is surer than it should be, after a second at rest: 2 g to and fro, with jerks of 120 m/s3."""
+def test_a_drone_that_accelerates_hard_after_a_rest_keeps_its_track():
+    """After a second at rest the track is too certain; then the drone moves to and fro with jerks of 120 m/s3."""
     time_s = np.arange(FRAMES) / FPS - 1.0
     x_m = np.where(time_s > 0, 0.5 * (1 - np.cos(2 * np.pi * time_s)), 0.0)
     truth_m = np.stack([x_m, 0 * x_m, 0 * x_m + 1.2], axis=-1)[:, None]
     tracked = track(truth_m, jitter=0.02)
     assert tracked.arrivals == ()
     assert (tracked.status == Status.TRACKED).all()
-    # What the frames say by themselves, 16 mm as a rule for 5 % and so 6 mm here.
+    # The error of single frames: about 16 mm for jitter of 5 %, so 6 mm here.
     assert np.linalg.norm(tracked.measured_m - truth_m, axis=-1).max() < 0.04
 
 
-def test_a_drone_that_is_lost_coasts_ever_less_certain_and_comes_back_as_itself():
+def test_a_lost_drone_coasts_with_growing_uncertainty_and_is_found_again():
     truth_m = circles(3)
     tracked = track(truth_m, jitter=0.03, hidden=[(1, 25, 50)])
-    info = tracked
-    assert info.status.shape[1] == 3
-    which = int(np.nanargmin(np.linalg.norm(info.position_m[20] - truth_m[20, 1], axis=-1)))
-    status = info.status[:, which]
+    assert tracked.status.shape[1] == 3
+    which = int(np.nanargmin(np.linalg.norm(tracked.position_m[20] - truth_m[20, 1], axis=-1)))
+    status = tracked.status[:, which]
     coasting = np.flatnonzero(status[25:50] == Status.COASTING)
-    # Half a second, the default, and the frame in which it ends.
+    # Half a second, the default, plus the frame in which it ends.
     assert 12 <= len(coasting) <= 13
     assert coasting[0] == 0
-    variance = np.trace(info.covariance_m2[25 : 25 + len(coasting), which], axis1=1, axis2=2)
+    variance = np.trace(tracked.covariance_m2[25 : 25 + len(coasting), which], axis1=1, axis2=2)
     assert (np.diff(variance) > 0).all()
     assert (status[40:50] == Status.LOST).all()
     assert (status[50:] == Status.TRACKED).all()
     (again,) = tracked.arrivals
     assert (again.frame, again.drone, again.again) == (50, which, True)
-    assert np.linalg.norm(info.position_m[60, which] - truth_m[60, 1]) < 0.03
+    assert np.linalg.norm(tracked.position_m[60, which] - truth_m[60, 1]) < 0.03
 
 
-def test_a_drone_that_comes_later_is_new():
+def test_a_drone_that_appears_later_is_a_new_drone():
     truth_m = circles(3)
     tracked = track(truth_m, jitter=0.03, hidden=[(2, 0, 30)])
     (new,) = tracked.arrivals
@@ -159,7 +158,7 @@ def test_a_drone_that_comes_later_is_new():
     assert np.isnan(tracked.position_m[:30, 2]).all()
 
 
-def test_no_more_drones_than_there_are():
+def test_the_number_of_drones_is_limited_to_the_given_count():
     tracked = track(circles(3), count=2)
     assert tracked.status.shape[1] == 2
 
@@ -171,31 +170,31 @@ def test_without_detections_there_are_no_drones():
 
 
 def test_chance_crossings_are_no_drones():
-    """Three false alarms in every image, no drone: what agrees once does not agree in five of eight frames."""
+    """Three false alarms in every image and no drone: lines that meet once do not meet in five of eight frames."""
     tracked = track(np.empty((40, 0, 3)), false_alarms=3.0)
     assert tracked.status.shape[1] == 0
 
 
-def test_known_drones_are_there_from_the_first_frame_with_their_numbers():
+def test_known_drones_are_tracked_from_the_first_frame_in_the_given_order():
     truth_m = circles(3)
     order = [2, 0, 1]
     velocity_m_s = (truth_m[1] - truth_m[0]) * FPS
     tracked = track(truth_m, known=(truth_m[0, order], velocity_m_s[order]))
     assert tracked.arrivals == ()
-    # The start's velocity is the first step's, which on a circle is 0.03 m/s off.
+    # The initial velocity is that of the first step, which on a circle is 0.03 m/s off.
     np.testing.assert_allclose(tracked.position_m[0], truth_m[0, order], atol=2e-3)
     np.testing.assert_allclose(state_at_first_frame(tracked).position_m, truth_m[0, order], atol=2e-3)
 
 
-def test_sizes_are_those_of_the_boxes():
+def test_sizes_agree_with_the_boxes():
     tracked = track(circles(2))
     np.testing.assert_allclose(tracked.sizes.size_m, [[0.5, 0.5, 0.2]] * 2, rtol=0.02)
 
 
 def test_fitness_is_the_share_of_the_cameras_that_agree():
     truth_m = circles(1)
-    everyone = detections(truth_m)
-    some = {name: boxes for name, boxes in everyone.items() if name in RIG.names[:6]}
+    detections_of_all = detections(truth_m)
+    some = {name: boxes for name, boxes in detections_of_all.items() if name in RIG.names[:6]}
     tracked = track_detections(
         RIG.cameras, from_detections(some, RIG, FRAMES), line_settings(), fps=FPS, bounds_m=ROOM_M
     )

@@ -1,4 +1,4 @@
-"""`import psotrack as pt`: what it offers, that it is lazy, and that the README's example runs on it."""
+"""`import psotrack as pt`: its names and their documentation, lazy loading, and short output of `repr`."""
 
 import inspect
 import subprocess
@@ -41,7 +41,7 @@ def test_markers_in_an_image_in_grey_or_colour():
         assert seen.ids.tolist() == [7]
 
 
-def test_the_background_model_sees_what_is_new():
+def test_the_background_model_finds_a_new_object():
     rng = np.random.default_rng(0)
     empty = [rng.normal(100, 1, (48, 64, 3)).clip(0, 255).astype(np.uint8) for _ in range(20)]
     drone = empty[0].copy()
@@ -71,7 +71,7 @@ def test_a_repr_fits_a_terminal():
 
 @dataclass(frozen=True)
 class Dice:
-    """A score of one's own: twice the foreground in the box, over the box and the foreground around it."""
+    """A score from outside the package: the Dice coefficient of box and foreground within the ring around the box."""
 
     ring: float = 1.5
     whole_pixels: bool = False

@@ -1,7 +1,7 @@
-"""Reproducible results on S02_D4_A-like data, by the paper's swarm (joint, 100 particles x 70 iterations), end to end.
+"""Results on data like S02_D4_A with the paper's swarm (joint, 100 particles x 70 iterations), from videos to errors.
 
-Half the image size and two seconds of flight, so that it runs in a minute; silhouettes at half the reduction keep the
-drones as many cells large as at full size.
+Images have half the size and the flight takes two seconds, so that the test takes a minute. Silhouettes have half the
+usual reduction, so that drones are as many cells wide as at full size.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 
 @dataclass(frozen=True)
 class Lab:
-    """A simulated sequence and where its silhouettes are kept."""
+    """A simulated sequence and the cache folder of its silhouettes."""
 
     sequence: Recording
     cache: Path
@@ -39,7 +39,7 @@ class Lab:
         )
         return track_recording(self.sequence, settings, cache=self.cache, jobs=1).trajectories
 
-    def judge(self, trajectories: Trajectories) -> Evaluation:
+    def evaluate(self, trajectories: Trajectories) -> Evaluation:
         assert self.sequence.truth is not None
         return evaluate(trajectories, self.sequence.truth)
 
@@ -56,9 +56,9 @@ def tracked(lab: Lab) -> Trajectories:
     return lab.track()
 
 
-def test_error_is_within_what_the_readme_states(lab: Lab, tracked: Trajectories) -> None:
-    """At most 0.025 m, the figure for full size (the paper: 0.068 m); no swap, nothing missed, nobody invented."""
-    evaluation = lab.judge(tracked)
+def test_error_is_within_the_documented_limit(lab: Lab, tracked: Trajectories) -> None:
+    """At most 0.025 m, the limit at full size (the paper has 0.068 m); no identity swaps, misses or false tracks."""
+    evaluation = lab.evaluate(tracked)
     assert evaluation.mean_error_m <= 0.025
     assert evaluation.id_switches == 0
     assert evaluation.missed_rate == 0
@@ -71,12 +71,12 @@ def test_one_seed_gives_identical_tracks(lab: Lab, tracked: Trajectories, tmp_pa
     assert (tmp_path / "again.csv").read_bytes() == (tmp_path / "first.csv").read_bytes()
 
 
-def test_other_seeds_give_nearly_the_same(lab: Lab, tracked: Trajectories) -> None:
-    """The swarm finds the same maximum: what is left between seeds is how far it had converged."""
+def test_other_seeds_give_nearly_the_same_tracks(lab: Lab, tracked: Trajectories) -> None:
+    """The swarm finds the same maximum with every seed; seeds differ only by how far the swarm has converged."""
     other = lab.track(seed=1)
     apart_m = np.linalg.norm(other.position_m - tracked.position_m, axis=-1)
     assert apart_m.max() > 0
-    # Measured at full size over 250 frames: mean 0.0008 m, 99 % below 0.007 m, largest 0.022 m, where the score has
-    # two maxima side by side. A cell of the silhouettes is about 0.01 m at the drones.
+    # Measured at full size over 250 frames: mean 0.0008 m, 99 % below 0.007 m, largest 0.022 m where the score has two
+    # neighbouring maxima. A cell of the silhouettes is about 0.01 m at the drones.
     assert apart_m.mean() < 0.002
     assert apart_m.max() < 0.03

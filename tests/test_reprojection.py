@@ -42,7 +42,7 @@ def opencv_pixels(rig, index, points):
     return pixels[:, 0], by[:, 3:6].reshape(-1, 2, 3) @ R
 
 
-def unlike_rig(num_cameras):
+def varied_rig(num_cameras):
     """Cameras without a common number: different focal lengths, principal points and lenses."""
     cameras = []
     for i in range(num_cameras):
@@ -65,7 +65,7 @@ def unlike_rig(num_cameras):
 
 
 @pytest.mark.parametrize("coefficients", sorted(LENSES))
-def test_the_derivative_is_opencvs(coefficients):
+def test_the_derivative_agrees_with_opencv(coefficients):
     rig, points = ring_rig(3, coefficients=coefficients), points_in_room(13)
     skewed_K = rig.cameras.K.copy()
     skewed_K[:, 0, 1] = 12.0
@@ -82,8 +82,8 @@ def test_the_derivative_is_opencvs(coefficients):
         np.testing.assert_allclose(jacobian[:, c], expected, rtol=0, atol=1e-9)
         # OpenCV has no skew: the skew times v is added to u.
         expected[:, 0] += 12.0 / rig.cameras.K[c, 1, 1] * expected[:, 1]
-        of_skewed = project_with_jacobian(skewed, points[:, None])[2][:, c]
-        np.testing.assert_allclose(of_skewed, expected, rtol=0, atol=1e-9)
+        skewed_jacobian = project_with_jacobian(skewed, points[:, None])[2][:, c]
+        np.testing.assert_allclose(skewed_jacobian, expected, rtol=0, atol=1e-9)
 
 
 # --- exact cases
@@ -126,12 +126,12 @@ def test_without_refinement_it_equals_triangulate():
 
 
 def test_every_camera_with_its_own_numbers():
-    """Three known bugs of such programs: undistortion with the distorted radius, the intrinsics of the first two
-    cameras used for every pair, poses of the wrong cameras.
+    """Three bugs of other programs: undistortion with the distorted radius, the intrinsics of the first two cameras
+    used for every pair, and poses of the wrong cameras.
 
-    OpenCV makes the pixels. With each bug put into rig or pixels, the error is far larger than without.
+    OpenCV makes the pixels. With any of the bugs put into the rig or the pixels, the error is far larger than without.
     """
-    rig, points = unlike_rig(5), points_in_room(17)
+    rig, points = varied_rig(5), points_in_room(17)
     cams = rig.cameras
     pixels = np.stack([opencv_pixels(rig, c, points)[0] for c in range(5)], axis=1)
     np.testing.assert_allclose(reconstruct(cams, pixels).position_m, points, atol=1e-6)
@@ -155,7 +155,7 @@ def test_every_camera_with_its_own_numbers():
 
 
 @pytest.mark.parametrize("coefficients", sorted(LENSES))
-def test_refined_as_by_scipy(coefficients):
+def test_refined_points_agree_with_scipy(coefficients):
     """Levenberg-Marquardt on OpenCV's pixels, with a noise and a weight per view; its Jacobian gives the covariance."""
     rig, points = ring_rig(5, coefficients=coefficients), points_in_room(7)
     rng = np.random.default_rng(3)
@@ -186,7 +186,7 @@ def test_refined_as_by_scipy(coefficients):
         np.testing.assert_allclose(found.reprojection_px[n], distance, rtol=0, atol=1e-3)
 
 
-def test_refined_is_never_worse_than_linear():
+def test_refined_points_are_never_worse_than_linear_points():
     """Also within a metre of a camera with noise of half a drone's width, where Gauss-Newton steps overshoot."""
     rig, rng = ring_rig(2), np.random.default_rng(0)
     nearness = rng.uniform(0.8, 0.98, (3000, 1))

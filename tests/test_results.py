@@ -1,4 +1,4 @@
-"""Records of the experiments' results: what they hold, and when a result counts as older than its code."""
+"""Records of the experiments' results: their content, and when a result is older than its code."""
 
 import json
 import shutil
@@ -29,8 +29,8 @@ run.save(Path("experiments/results"), figures={"answer": 42})
 
 
 def git(folder: Path, *words: str) -> None:
-    who = ["-c", "user.name=n", "-c", "user.email=e@example.org"]
-    subprocess.run(["git", *who, *words], cwd=folder, check=True, capture_output=True)
+    identity = ["-c", "user.name=n", "-c", "user.email=e@example.org"]
+    subprocess.run(["git", *identity, *words], cwd=folder, check=True, capture_output=True)
 
 
 def results(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
@@ -86,7 +86,7 @@ def test_changed_code_makes_a_result_older(project: Path) -> None:
     assert results(project, "check").returncode == 0
 
 
-def test_words_do_not_make_a_result_older(project: Path) -> None:
+def test_docstrings_and_comments_do_not_make_a_result_older(project: Path) -> None:
     (project / "library" / "a.py").write_text('"""A module with better words."""\n\n# A reason.\nSIZE = 1\n')
     commit(project)
     assert results(project, "check").returncode == 0
@@ -111,7 +111,7 @@ def test_a_file_that_was_edited_by_hand_is_named(project: Path) -> None:
     assert "speed.csv is not the file that the record describes" in named.stdout
 
 
-def test_a_failing_command_is_named_and_the_exit_code_says_so(project: Path) -> None:
+def test_a_failing_command_is_named_and_the_exit_code_is_1(project: Path) -> None:
     (project / "experiments" / "speed.py").write_text("raise SystemExit(3)\n")
     failed = results(project, "make")
     assert failed.returncode == 1

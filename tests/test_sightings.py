@@ -1,4 +1,4 @@
-"""Where cameras see something: boxes of a detector and blobs of foreground, in arrays."""
+"""Sightings as arrays, from the boxes of a detector and from blobs of foreground."""
 
 import numpy as np
 from helpers import draw_coverage, ring_rig
@@ -11,12 +11,12 @@ from psotrack.silhouettes import Silhouettes
 RIG = ring_rig(8, coefficients=4, image_size_wh=(1920, 1080))
 
 
-def test_a_box_is_where_its_middle_is_and_one_at_the_border_says_less():
+def test_a_sighting_is_at_the_middle_of_its_box_and_is_less_certain_at_the_image_border():
     boxes = np.array([[10.0, 20.0, 30.0, 60.0], [0.0, 20.0, 20.0, 60.0]])
     given = {RIG.names[2]: Detections(np.array([1, 1]), boxes, np.ones(2))}
     sightings = from_detections(given, RIG, 3)
     assert sightings.centre_px.shape == (3, 8, 2, 2)
-    # Columns 10 to 29: their middle is 19.5, as the first column's middle is 0.
+    # The box covers columns 10 to 29; the middle of column 0 is at 0, so the box's middle is at 19.5.
     np.testing.assert_array_equal(sightings.centre_px[1, 2], [[19.5, 39.5], [9.5, 39.5]])
     np.testing.assert_array_equal(sightings.size_px[1, 2], [[20, 40], [20, 40]])
     assert sightings.noise_px[1, 2, 1] > 3 * sightings.noise_px[1, 2, 0]
@@ -43,5 +43,5 @@ def test_blobs_of_silhouettes_are_sightings():
     )
     sightings = from_silhouettes(silhouettes)
     assert sightings.centre_px.shape == (30, 4, 1, 2)
-    # The image of a sphere is not quite about that of its middle; and cells are 2 px.
+    # The image of a sphere is not exactly centred on the image of its middle, and cells are 2 px wide.
     np.testing.assert_allclose(sightings.centre_px[-1, :, 0], project(rig.cameras, position_m)[0], atol=1.5)

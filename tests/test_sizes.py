@@ -1,4 +1,4 @@
-"""Sizes from silhouettes: ellipsoids of known size, a float64 oracle for outlines that are none, then how it learns."""
+"""Sizes from silhouettes: ellipsoids of known size, a float64 oracle for other outlines, and how sizes are learned."""
 
 import jax
 import jax.numpy as jnp
@@ -13,23 +13,23 @@ from psotrack.tracking import sizes
 from psotrack.tracking.sizes import HALF_PER_STD, MIN_FRAMES, RANGE, SizeMeasurements, SizeProgram
 
 PROGRAM = SizeProgram(reduction=2)
-#: What a learned length is of a filled ellipsoid's.
-LONGER = HALF_PER_STD / 2
+#: Learned length of a filled ellipsoid divided by its true length.
+LENGTH_RATIO = HALF_PER_STD / 2
 RIG = ring_rig(5, image_size_wh=(640, 480))
 SIZE_M = np.array([0.5, 0.5, 0.2])
 PLACES_M = np.array([[0.0, 0.0, 1.2], [0.7, -0.5, 0.9], [-0.6, 0.4, 1.5], [0.3, 0.8, 1.1], [-0.9, -0.7, 1.0]])
 
-#: Edges of drawn silhouettes are good to a quarter of a pixel, drones are 25 pixels high or more.
-DRAWN = 0.01
+#: Relative error of drawn sizes: edges are good to a quarter of a pixel, and drones are at least 25 pixels high.
+DRAWING_ERROR = 0.01
 
 
 def images(position_m, size_m=SIZE_M, rig=RIG):
-    """(frames, cameras, height, width); positions and sizes are (frames, [drones,] 3)."""
+    """Silhouettes, (frames, cameras, height, width), of drones; positions and sizes are (frames, [drones,] 3)."""
     return np.stack([draw_coverage(rig, at, size_m, PROGRAM.reduction) for at in position_m])
 
 
-def looks_at(coverage, position_m, believed_m, well_seen=None, rig=RIG):
-    """SizeMeasurements at drones where they are, or where they are said to be; NumPy."""
+def measure(coverage, position_m, believed_m, well_seen=None, rig=RIG):
+    """Size measurements, NumPy arrays, of drones at positions (frames, [drones,] 3) with `believed_m` as sizes."""
     position_m = position_m if position_m.ndim == 3 else position_m[:, None]
     seen = np.ones(position_m.shape[:2], bool) if well_seen is None else well_seen
     believed_m = np.broadcast_to(believed_m, position_m.shape[1:])
@@ -39,7 +39,7 @@ def looks_at(coverage, position_m, believed_m, well_seen=None, rig=RIG):
     )
 
 
-def started(size_m, pinned=(False, False, False)):
+def initial_sizes(size_m, pinned=(False, False, False)):
     size_m = np.atleast_2d(size_m)
     return sizes.init(
         jnp.asarray(size_m, jnp.float32), np.broadcast_to(pinned, size_m.shape), len(PROGRAM.windows)
@@ -47,7 +47,7 @@ def started(size_m, pinned=(False, False, False)):
 
 
 def chunk(size_m):
-    """SizeMeasurements of one drone that showed these sizes (frames, 3), whatever its windows held."""
+    """Measurements of one drone with the given sizes (frames, 3); all windows are half full."""
     size_m = jnp.asarray(size_m, jnp.float32)[:, None]
     return SizeMeasurements(size_m, jnp.full((*size_m.shape[:2], len(PROGRAM.windows)), 0.5))
 
@@ -55,23 +55,23 @@ def chunk(size_m):
 @pytest.mark.parametrize(
     ("size_m", "coefficients"), [((0.5, 0.5, 0.2), 0), ((0.35, 0.35, 0.3), 5), ((0.6, 0.6, 0.4), 5)]
 )
-def test_an_ellipsoid_shows_its_size_wherever_it_is(size_m, coefficients):
+def test_an_ellipsoid_has_the_same_measured_size_everywhere(size_m, coefficients):
     rig = ring_rig(5, image_size_wh=(640, 480), coefficients=coefficients)
-    shown = looks_at(images(PLACES_M, np.array(size_m), rig), PLACES_M, size_m, rig=rig).size_m
-    # Moments are of bent outlines, boxes of the bent middles of their sides: measured 0.6 % of the height at most.
-    np.testing.assert_allclose(shown / size_m, LONGER, rtol=1.5 * DRAWN)
+    shown = measure(images(PLACES_M, np.array(size_m), rig), PLACES_M, size_m, rig=rig).size_m
+    # Moments are those of bent outlines, and boxes those of bent middles of the sides. Measured 0.6 % of the height.
+    np.testing.assert_allclose(shown / size_m, LENGTH_RATIO, rtol=1.5 * DRAWING_ERROR)
 
 
-def test_where_the_drone_is_thought_to_be_does_not_matter():
+def test_the_expected_position_hardly_changes_the_measured_size():
     coverage = images(PLACES_M)
-    there = looks_at(coverage, PLACES_M, SIZE_M).size_m
-    beside = looks_at(coverage, PLACES_M + np.array([0.03, -0.03, 0.03]), SIZE_M).size_m
-    # 5 cm at 3 m and more: distances change by up to 1.5 %, elevations by a degree. Measured 1.6 %, of the height.
+    there = measure(coverage, PLACES_M, SIZE_M).size_m
+    beside = measure(coverage, PLACES_M + np.array([0.03, -0.03, 0.03]), SIZE_M).size_m
+    # Of 5 cm at 3 m and more, distances change by up to 1.5 % and elevations by a degree. Measured 1.6 % of the height.
     np.testing.assert_allclose(beside, there, rtol=0.025)
 
 
-def test_low_over_the_floor_nothing_is_learned():
-    """What is seen there may be drone and shadow together. The drone is 0.5 m wide."""
+def test_close_above_the_floor_nothing_is_learned():
+    """Foreground close to the floor may be a drone together with its shadow. The drone is 0.5 m wide."""
     positions = float32(PLACES_M[:, None])
     seen = np.ones((len(PLACES_M), 1), bool)
     shown = [
@@ -88,7 +88,7 @@ def test_low_over_the_floor_nothing_is_learned():
 
 
 def outline_halves2(cam, centre_m, size_m):
-    """Squared halves of the box of an ellipsoid's outline, from its dual conic P Q* P^T, float64."""
+    """Squared half sides (2,) and centre (2,) of the box of an ellipsoid's outline, from its dual conic P Q* P^T."""
     P = cam.K @ cam.T_cam_world[:3]
     middle = np.concatenate([centre_m, [1.0]])
     Q = np.diag([*np.square(np.asarray(size_m) / 2), 0.0]) - np.outer(middle, middle)
@@ -98,7 +98,7 @@ def outline_halves2(cam, centre_m, size_m):
 
 
 def textbook_size(rig, coverage, centre_m, believed_m):
-    """The size that one frame shows: central moments by plain sums, least squares by LAPACK, three times."""
+    """The size from one frame: central moments by plain sums, and least squares by LAPACK, three times."""
     rows, values = [], []
     for index in range(len(rig)):
         halves2, middle = outline_halves2(rig.cameras[index], centre_m, believed_m)
@@ -132,71 +132,71 @@ def textbook_size(rig, coverage, centre_m, believed_m):
     return believed_m * np.sqrt(factors)[[0, 0, 1]]
 
 
-def test_any_outline_shows_the_size_that_float64_says():
-    """Two beams across: their views differ widely, so that reweighting has something to do."""
+def test_the_size_of_any_outline_agrees_with_float64():
+    """Two crossed beams: the cameras' views differ widely, so reweighting has an effect."""
     place = PLACES_M[1]
     beams = np.array([[0.6, 0.12, 0.1], [0.12, 0.3, 0.25]])
     coverage = draw_coverage(RIG, np.stack([place, place]), beams, PROGRAM.reduction)
-    shown = looks_at(coverage[None], place[None], SIZE_M).size_m[0, 0]
-    # float32 sums over 64 x 64 cells of tables in pixels: measured 2e-6.
+    shown = measure(coverage[None], place[None], SIZE_M).size_m[0, 0]
+    # float32 sums over 64 x 64 cells of tables in pixels. Measured 2e-6.
     np.testing.assert_allclose(shown, textbook_size(RIG, coverage, place, SIZE_M), rtol=2e-5)
 
 
-def test_windows_are_as_full_as_an_ellipse_fills_them():
-    """Corners of 0.4 and 0.7 of the box are within the ellipse (0.7 sqrt 2 < 1); of the box it fills pi / 4."""
-    fill = looks_at(images(PLACES_M), PLACES_M, SIZE_M).fill
+def test_windows_have_the_fill_of_an_ellipse():
+    """Windows of 0.4 and 0.7 of the box lie inside the ellipse (0.7 sqrt 2 < 1), which fills pi / 4 of the box."""
+    fill = measure(images(PLACES_M), PLACES_M, SIZE_M).fill
     expected = np.broadcast_to([1.0, 1.0, np.pi / 4], fill.shape)
-    # Seen near and from the side the ellipse leans, so that 0.7 loses corners; a cell is a tenth of the smallest half.
+    # A near ellipse seen from the side leans and misses corners of the window of 0.7; cells are a tenth of a half side.
     np.testing.assert_allclose(fill, expected, atol=0.03)
 
 
 @pytest.mark.parametrize("wrong", [0.8, 1.2])
-def test_a_wrong_start_is_mended_within_three_chunks(wrong):
-    state = started(wrong * LONGER * SIZE_M)
+def test_a_wrong_initial_size_is_corrected_within_three_chunks(wrong):
+    state = initial_sizes(wrong * LENGTH_RATIO * SIZE_M)
     coverage = images(PLACES_M)
     for _ in range(3):
-        # Five places, five times each: a chunk of 25 frames.
-        looks = looks_at(coverage, PLACES_M, np.asarray(state.size_m))
-        state = sizes.learn_sizes(state, jax.tree.map(lambda value: jnp.tile(value, (5, 1, 1)), looks))
-    # What is left of the start after 75 frames is 5 / 80 of 20 %; its surroundings were measured in wrong windows once.
-    np.testing.assert_allclose(state.size_m[0], LONGER * SIZE_M, rtol=0.0125 + DRAWN)
-    assert (np.abs(np.asarray(state.size_m)[0] / (LONGER * SIZE_M) - 1) < np.abs(wrong - 1) / 8).all()
+        # Five positions, pair times each: a chunk of 25 frames.
+        measured = measure(coverage, PLACES_M, np.asarray(state.size_m))
+        state = sizes.learn_sizes(state, jax.tree.map(lambda value: jnp.tile(value, (5, 1, 1)), measured))
+    # After 75 frames, 5 / 80 of the initial error of 20 % remains; the first chunk had windows of a wrong size.
+    np.testing.assert_allclose(state.size_m[0], LENGTH_RATIO * SIZE_M, rtol=0.0125 + DRAWING_ERROR)
+    assert (np.abs(np.asarray(state.size_m)[0] / (LENGTH_RATIO * SIZE_M) - 1) < np.abs(wrong - 1) / 8).all()
 
 
-def test_a_fifth_of_bad_frames_changes_little():
-    """Silhouettes of which the left half is missing, or that have something attached, one frame in five."""
+def test_bad_frames_in_a_fifth_of_a_chunk_have_little_effect():
+    """In one frame of pair, the left half of each silhouette is missing."""
     good = images(PLACES_M)
     bad = good.copy()
     column = np.arange(good.shape[-1])
     for view in bad[2]:
         view[:, column < np.median(np.nonzero(view)[1])] = 0
-    five = looks_at(good, PLACES_M, SIZE_M), looks_at(bad, PLACES_M, SIZE_M)
-    assert np.abs(five[1].size_m[2] / five[0].size_m[2] - 1).max() > 0.2
+    pair = measure(good, PLACES_M, SIZE_M), measure(bad, PLACES_M, SIZE_M)
+    assert np.abs(pair[1].size_m[2] / pair[0].size_m[2] - 1).max() > 0.2
     learned = [
         sizes.learn_sizes(
-            started(SIZE_M), jax.tree.map(lambda value: jnp.tile(value, (5, 1, 1)), looks)
+            initial_sizes(SIZE_M), jax.tree.map(lambda value: jnp.tile(value, (5, 1, 1)), measured)
         ).size_m
-        for looks in five
+        for measured in pair
     ]
-    # The median is now another of the good frames, which differ by what drawing costs.
-    np.testing.assert_allclose(learned[1], learned[0], rtol=2 * DRAWN)
+    # The median is another good frame, and good frames differ by the errors of drawing.
+    np.testing.assert_allclose(learned[1], learned[0], rtol=2 * DRAWING_ERROR)
 
 
 @given(
     st.lists(st.floats(0.9, 1.1), min_size=13, max_size=13),
     st.lists(st.floats(0.01, 100.0), min_size=12, max_size=12),
 )
-def test_bad_frames_move_nothing_while_they_are_the_fewer(good, bad):
-    """Whatever twelve of 25 frames show, the estimate stays among what start and the others say."""
+def test_a_minority_of_bad_frames_does_not_move_the_size_out_of_the_good_range(good, bad):
+    """Twelve of 25 frames have any sizes; the learned size stays between the initial size and the other 13 sizes."""
     shown = np.array([*good, *bad])[:, None] * SIZE_M
-    learned = np.asarray(sizes.learn_sizes(started(SIZE_M), chunk(shown)).size_m)[0] / SIZE_M
-    # Some roundings of float32 logarithms.
+    learned = np.asarray(sizes.learn_sizes(initial_sizes(SIZE_M), chunk(shown)).size_m)[0] / SIZE_M
+    # Several roundings of float32 logarithms.
     assert (learned >= min(*good, 1.0) - 1e-5).all()
     assert (learned <= max(*good, 1.0) + 1e-5).all()
 
 
-def test_frames_that_show_nothing_change_nothing():
-    state = started(SIZE_M)
+def test_frames_without_a_measurement_change_nothing():
+    state = initial_sizes(SIZE_M)
     nothing = sizes.learn_sizes(
         state, jax.tree.map(lambda value: value * jnp.nan, chunk(np.tile(SIZE_M, (25, 1))))
     )
@@ -207,8 +207,8 @@ def test_frames_that_show_nothing_change_nothing():
 
 
 @pytest.mark.parametrize(("shown", "bound"), [(100.0, RANGE), (0.01, 1 / RANGE)])
-def test_lengths_stay_within_range_of_the_start(shown, bound):
-    state = started(SIZE_M)
+def test_lengths_stay_within_a_range_about_the_initial_length(shown, bound):
+    state = initial_sizes(SIZE_M)
     for _ in range(3):
         state = sizes.learn_sizes(state, chunk(np.tile(shown * SIZE_M, (25, 1))))
     np.testing.assert_allclose(state.size_m[0], bound * SIZE_M, rtol=1e-6)
@@ -218,22 +218,22 @@ def test_lengths_stay_within_range_of_the_start(shown, bound):
     ("pinned", "kept"),
     [((True, True, True), (0, 1, 2)), ((False, False, True), (2,)), ((False, True, False), (0, 1))],
 )
-def test_what_is_pinned_stays(pinned, kept):
-    """One level length pins both: they are learned together."""
-    state = sizes.learn_sizes(started(SIZE_M, pinned), chunk(np.tile(1.5 * SIZE_M, (25, 1))))
+def test_pinned_lengths_do_not_change(pinned, kept):
+    """A pinned horizontal length pins both horizontal lengths, because they are learned together."""
+    state = sizes.learn_sizes(initial_sizes(SIZE_M, pinned), chunk(np.tile(1.5 * SIZE_M, (25, 1))))
     changed = ~np.isclose(state.size_m[0], SIZE_M, rtol=1e-6)
     np.testing.assert_array_equal(np.flatnonzero(~changed), kept)
     np.testing.assert_array_equal(np.asarray(state.std_m)[0] == 0, ~changed)
     assert state.num_frames[0, 0] == 25
 
 
-def test_level_lengths_change_by_the_same_share():
-    state = sizes.learn_sizes(started([0.6, 0.3, 0.2]), chunk(np.tile([0.66, 0.33, 0.2], (25, 1))))
+def test_horizontal_lengths_change_by_the_same_factor():
+    state = sizes.learn_sizes(initial_sizes([0.6, 0.3, 0.2]), chunk(np.tile([0.66, 0.33, 0.2], (25, 1))))
     np.testing.assert_allclose(state.size_m[0, 0] / state.size_m[0, 1], 2.0, rtol=1e-6)
 
 
-def test_the_height_of_a_flat_drone_seen_from_above_stays_at_the_start():
-    """Cameras on the ceiling, straight above: heights change their views by next to nothing."""
+def test_the_height_of_a_flat_drone_seen_from_above_keeps_its_initial_value():
+    """Cameras on the ceiling look straight down, so the height has almost no effect on their views."""
     overhead = {}
     for i in range(3):
         R, t_m = look_at((0.3 * i, -0.2 * i, 5.0), (0.3 * i, -0.2 * i + 0.01, 0.0), up=(0.0, 1.0, 0.0))
@@ -242,26 +242,26 @@ def test_the_height_of_a_flat_drone_seen_from_above_stays_at_the_start():
     rig = make_rig(overhead)
     places = np.array([[0.3, -0.2, 1.0]])
     flat = np.array([0.5, 0.5, 0.08])
-    shown = looks_at(images(places, flat, rig), places, flat * [1, 1, 2], rig=rig).size_m[0, 0]
-    np.testing.assert_allclose(shown[:2], LONGER * flat[:2], rtol=2 * DRAWN)
+    shown = measure(images(places, flat, rig), places, flat * [1, 1, 2], rig=rig).size_m[0, 0]
+    np.testing.assert_allclose(shown[:2], LENGTH_RATIO * flat[:2], rtol=2 * DRAWING_ERROR)
     assert np.isnan(shown[2])
-    state = sizes.learn_sizes(started(flat * [0.9, 0.9, 2]), chunk(np.tile(shown, (25, 1))))
+    state = sizes.learn_sizes(initial_sizes(flat * [0.9, 0.9, 2]), chunk(np.tile(shown, (25, 1))))
     np.testing.assert_allclose(state.size_m[0, 2], 2 * flat[2], rtol=1e-6)
     assert state.num_frames[0].tolist() == [25, 25, 0]
 
 
-def test_what_is_unclear_is_nan_and_nothing_else():
-    """Two drones side by side, one that all images cut, one that was not found and is nowhere, one that is alone."""
+def test_only_unclear_drones_have_nan():
+    """Two drones side by side; one that all images cut off; one that was not found and has no position; one alone."""
     at = np.array([[0.9, 0.0, 1.2], [0.9, 0.12, 1.2], [0.1, -0.1, 3.3], [np.nan] * 3, [-0.9, -0.7, 1.0]])
     there = np.isfinite(at).all(axis=-1)
-    looks = looks_at(images([at[there]]), at[None], SIZE_M, well_seen=there[None])
-    assert np.isfinite(looks.size_m[0]).all(axis=-1).tolist() == [False, False, False, False, True]
-    assert np.isfinite(looks.fill[0]).all(axis=-1).tolist() == [False, False, False, False, True]
+    measured = measure(images([at[there]]), at[None], SIZE_M, well_seen=there[None])
+    assert np.isfinite(measured.size_m[0]).all(axis=-1).tolist() == [False, False, False, False, True]
+    assert np.isfinite(measured.fill[0]).all(axis=-1).tolist() == [False, False, False, False, True]
 
 
 def test_empty_images_show_nothing():
     blank = np.zeros((1, len(RIG), 240, 320), np.uint8)
-    assert np.isnan(looks_at(blank, PLACES_M[:1], SIZE_M).size_m).all()
+    assert np.isnan(measure(blank, PLACES_M[:1], SIZE_M).size_m).all()
 
 
 def test_the_order_of_drones_and_cameras_does_not_matter():
@@ -269,20 +269,20 @@ def test_the_order_of_drones_and_cameras_does_not_matter():
     believed = np.array([[0.5, 0.5, 0.2], [0.4, 0.4, 0.3], [0.6, 0.6, 0.2]])
     coverage = draw_coverage(RIG, at[0], believed, PROGRAM.reduction)[None]
     order, cameras = [2, 0, 1], [3, 1, 4, 0, 2]
-    plain = looks_at(coverage, at, believed)
+    plain = measure(coverage, at, believed)
     other = RIG.select([RIG.names[i] for i in cameras])
-    turned = looks_at(coverage[:, cameras], at[:, order], believed[order], rig=other)
+    turned = measure(coverage[:, cameras], at[:, order], believed[order], rig=other)
     assert np.isfinite(plain.size_m).all()
-    # Sums over cameras in another order: a few roundings.
+    # Sums over cameras have another order, with a few different roundings.
     assert_same(turned, jax.tree.map(lambda value: value[:, order], plain), atol=1e-5)
 
 
-def test_standard_errors_are_as_large_as_the_errors():
-    """Twelve chunks that are off by 5 % each, all their frames alike."""
+def test_standard_errors_agree_with_the_errors():
+    """Twelve chunks with independent errors of 5 %; all frames of a chunk have the same error."""
     rng = np.random.default_rng(5)
     drones = 400
     off = 0.05 * rng.standard_normal((12, drones, 1))
-    state = started(np.tile(SIZE_M, (drones, 1)))
+    state = initial_sizes(np.tile(SIZE_M, (drones, 1)))
     for chunk_off in off:
         shown = np.broadcast_to(SIZE_M * np.exp(chunk_off), (25, drones, 3))
         state = sizes.learn_sizes(
@@ -290,20 +290,20 @@ def test_standard_errors_are_as_large_as_the_errors():
         )
     error = np.log(np.asarray(state.size_m) / SIZE_M).std(axis=0)
     stated = np.sqrt(np.square(state.std_m / state.size_m).mean(axis=0))
-    # 400 drones tell their errors to 4 %; the start, here exact, counts as a thirteenth chunk that was off by 15 %.
+    # The error of 400 drones is good to 4 %; the exact initial size counts as a thirteenth chunk with an error of 15 %.
     np.testing.assert_allclose(stated, error, rtol=0.15)
 
 
-def test_the_profile_is_a_mean_over_all_frames():
-    state = started(SIZE_M)
+def test_the_fill_is_a_mean_over_all_frames():
+    state = initial_sizes(SIZE_M)
     shown = jnp.asarray(np.tile(SIZE_M, (25, 1)), jnp.float32)[:, None]
     for value, frames in ((0.2, 25), (0.6, 15)):
         state = sizes.learn_sizes(state, SizeMeasurements(shown[:frames], jnp.full((frames, 1, 3), value)))
     np.testing.assert_allclose(state.fill, (25 * 0.2 + 15 * 0.6) / 40, rtol=1e-6)
 
 
-def test_drones_that_come_later_begin_at_their_own_start():
-    before = sizes.learn_sizes(started(SIZE_M), chunk(np.tile(1.1 * SIZE_M, (25, 1))))
-    both = sizes.with_added_drones(before, started(2 * SIZE_M))
+def test_added_drones_begin_with_their_own_initial_size():
+    before = sizes.learn_sizes(initial_sizes(SIZE_M), chunk(np.tile(1.1 * SIZE_M, (25, 1))))
+    both = sizes.with_added_drones(before, initial_sizes(2 * SIZE_M))
     assert_same(jax.tree.map(lambda value: value[:1], both), before)
-    assert_same(jax.tree.map(lambda value: value[1:], both), started(2 * SIZE_M))
+    assert_same(jax.tree.map(lambda value: value[1:], both), initial_sizes(2 * SIZE_M))

@@ -1,4 +1,4 @@
-"""The swarm: a trace by hand, functions with known maxima, and what must never happen."""
+"""The particle swarm: one step worked out by hand, functions with known maxima, and invariants."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -45,12 +45,12 @@ def spread(particles, groups, dims, seed=0, scale=5.0):
 
 
 def begin(objective, position, knobs):
-    """The swarm at the start, evaluated."""
+    """The initial swarm after its evaluation."""
     return swarm.evaluate(objective, swarm.init(position, knobs))
 
 
 def advance(key, objective, state, knobs):
-    """The swarm after a move, evaluated: what people see of an iteration."""
+    """The swarm after one move and its evaluation, as at the end of an iteration."""
     return swarm.evaluate(objective, swarm.move(key, state, knobs))
 
 
@@ -60,7 +60,7 @@ step = jax.jit(advance, static_argnums=1)
 
 
 def random_factors(key, shape):
-    """The hash of the key and the element's number, in Python's own whole numbers."""
+    """The hash of the key and the element's number, in Python integers."""
 
     def mixed(word):
         for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
@@ -82,12 +82,15 @@ def low_half(word):
 
 @pytest.mark.parametrize("max_step", [10.0, 0.75])
 def test_one_step_of_three_particles_by_hand(max_step):
-    """Two groups with different leaders. Catches: r1 and r2 shared over dimensions, the best of another group or of
-    another particle as attractor, bests taken before the move, a clamp before the sum."""
+    """Two groups with different leaders.
+
+    The test fails if r1 and r2 are shared over dimensions, if the attractor is the best of another group or of another
+    particle, if bests are taken before the move, or if the clamp comes before the sum.
+    """
     position = np.array([[[1, 2], [4, 0]], [[3, -1], [1, 1]], [[-2, 2], [0, 3]]], np.float32)
     knobs = params(groups=2, inertia=0.5, cognitive=1.2, social=0.8, max_step=max_step)
     before = init(sphere, position, knobs)
-    # Particle 0 leads group 0 (-5 against -10 and -8), particle 1 group 1 (-2 against -16 and -9).
+    # Particle 0 leads group 0 (-5 against -10 and -8), and particle 1 leads group 1 (-2 against -16 and -9).
     assert before.gbest_fitness.tolist() == [-5, -2]
     assert before.gbest_position.tolist() == [[1, 2], [1, 1]]
 
@@ -119,7 +122,7 @@ def test_one_step_of_three_particles_by_hand(max_step):
             expected_position[particle, group, dim] = here + expected_velocity[particle, group, dim]
         if np.square(expected_position[particle, group]).sum() < np.square(pbest[particle, group]).sum():
             expected_pbest[particle, group] = expected_position[particle, group]
-    # A handful of float32 operations on numbers below 5: 6e-7 each.
+    # A few float32 operations on numbers below 5, with rounding errors of 6e-7 each.
     np.testing.assert_allclose(after.velocity, expected_velocity, atol=5e-6)
     np.testing.assert_allclose(after.position, expected_position, atol=5e-6)
     np.testing.assert_allclose(after.pbest_position, expected_pbest, atol=5e-6)
@@ -133,7 +136,7 @@ def test_one_step_of_three_particles_by_hand(max_step):
 @pytest.mark.parametrize(("groups", "dims"), [(1, 6), (2, 3), (5, 2)])
 def test_sphere(groups, dims):
     final = run(jax.random.key(0), sphere, spread(40, groups, dims), params(groups, dims), 150)
-    # A converging swarm loses about a tenth of its radius per iteration: measured 1e-9, limit 1e-3.
+    # A converging swarm loses about a tenth of its radius per iteration. Measured 1e-9, limit 1e-3.
     np.testing.assert_allclose(final.gbest_position, 0, atol=1e-3)
     np.testing.assert_allclose(final.gbest_fitness, 0, atol=1e-6)
 
@@ -141,12 +144,12 @@ def test_sphere(groups, dims):
 @pytest.mark.parametrize("seed", range(5))
 def test_rosenbrock(seed):
     final = run(jax.random.key(seed), rosenbrock, spread(50, 2, 2, seed), params(2), 300)
-    # The valley is flat (curvature 1/4 along it), float32 sees 1e-7 of it: measured 0, limit 2e-2.
+    # The valley is flat (curvature 1/4 along it), and float32 resolves 1e-7 of the fitness. Measured 0, limit 2e-2.
     np.testing.assert_allclose(final.gbest_position, 1, atol=2e-2)
 
 
 def ripples(position):
-    """Many maxima, and NaN in stripes."""
+    """A function with many maxima, and NaN in stripes."""
     height = jnp.cos(3 * position).sum(axis=-1) - 0.1 * jnp.square(position).sum(axis=-1)
     return jnp.where(jnp.sin(7 * position[..., 0]) > 0.5, jnp.nan, height)
 
@@ -163,9 +166,8 @@ def path_of_bests(key, position, knobs):
 
 
 @given(st.integers(0, 2**30), st.floats(0, 1.2), st.floats(0, 3), st.floats(0, 3), st.floats(0.0625, 8))
-def test_what_always_holds(seed, inertia, cognitive, social, max_step):
-    """For any knobs: bests never worsen, are never NaN, are what was evaluated, and nobody leaves the bounds or
-    outruns the clamp."""
+def test_invariants_hold_for_any_settings(seed, inertia, cognitive, social, max_step):
+    """Bests never become worse or NaN and are values of the function; particles keep to bounds and largest step."""
     knobs = params(
         3, 2, inertia=inertia, cognitive=cognitive, social=social, max_step=max_step, low=-3.0, high=2.0
     )
@@ -177,7 +179,7 @@ def test_what_always_holds(seed, inertia, cognitive, social, max_step):
     np.testing.assert_array_equal(states.gbest_fitness, states.pbest_fitness.max(axis=1))
     defined = np.isfinite(states.pbest_fitness)
     evaluated = np.asarray(jax.vmap(ripples)(states.pbest_position))
-    # Evaluated once inside of the compiled loop and once outside.
+    # The function is evaluated once inside the compiled loop and once outside.
     np.testing.assert_allclose(states.pbest_fitness[defined], evaluated[defined], atol=1e-5)
     assert (states.position >= -3).all()
     assert (states.position <= 2).all()
@@ -185,8 +187,8 @@ def test_what_always_holds(seed, inertia, cognitive, social, max_step):
     assert (np.abs(np.diff(states.position, axis=0)) <= max_step * (1 + 1e-6) + 1e-6).all()
 
 
-def test_one_defined_particle_leads():
-    """Two of three start undefined: the third is the best, and the others are pulled to it."""
+def test_a_single_defined_particle_leads():
+    """Two of three particles are undefined at first: the third is the best and attracts the others."""
 
     def right_half(position):
         return jnp.where(position[..., 0] > 0, sphere(position), jnp.nan)
@@ -198,7 +200,7 @@ def test_one_defined_particle_leads():
     final = run(jax.random.key(0), right_half, position, params(), 60)
     assert np.isfinite(final.gbest_fitness).all()
     assert final.gbest_position[0, 0] > 0
-    # Alone the leader would rest where it is, at -18: what is better was found by those who were pulled over.
+    # The leader alone would stay at its place with a fitness of -18; the attracted particles found better places.
     assert final.gbest_fitness[0] > -18
 
 
@@ -211,7 +213,7 @@ def test_undefined_everywhere_stays_undefined_and_finite():
 
 
 def test_an_undefined_start_recovers():
-    """Nobody is defined at first; as soon as one is, it leads."""
+    """At first no particle is defined; the first particle that is defined leads."""
 
     def far_right(position):
         return jnp.where(position[..., 0] > 4, -position[..., 0], jnp.nan)
@@ -225,24 +227,24 @@ def test_an_undefined_start_recovers():
     assert after.gbest_position[0, 0] > 4
 
 
-def test_particles_outside_the_bounds_are_brought_in():
+def test_particles_outside_the_bounds_are_moved_to_the_bounds():
     start = init(sphere, spread(20, 2, 3, scale=50.0), params(2, 3, low=-1.0, high=2.0))
     assert start.position.min() == -1
     assert start.position.max() == 2
     np.testing.assert_array_equal(start.pbest_position, start.position)
 
 
-def test_nobody_sticks_to_a_bound():
-    """A particle that ran into the bound has no velocity left that would hold it there."""
+def test_a_particle_does_not_stick_to_a_bound():
+    """A particle that has reached a bound keeps no velocity across the bound."""
     knobs = params(low=-1.0, high=1.0, inertia=1.0, cognitive=0.0, social=0.0)
     start = init(sphere, jnp.array([[[0.9, 0.0]], [[-0.9, 0.5]]]), knobs)
     start = replace(start, velocity=jnp.array([[[5.0, 0.25]], [[-5.0, 0.25]]]))
     after = step(jax.random.key(0), sphere, start, knobs)
     np.testing.assert_allclose(after.position, [[[1, 0.25]], [[-1, 0.75]]], atol=1e-6)
     np.testing.assert_allclose(after.velocity, [[[0, 0.25]], [[0, 0.25]]], atol=1e-6)
-    # And it is found again by the pull of the best, which lies inside.
+    # If all particles start in one corner, no attraction moves them: the best is the corner.
     final = run(jax.random.key(1), sphere, jnp.ones((10, 1, 2)), params(low=-1.0, high=1.0), 100)
-    # All start in one corner, where nothing pulls: the best is the corner itself.
+    # Otherwise the best, which lies inside, attracts the particles at the bound.
     np.testing.assert_allclose(final.gbest_position, 1)
     final = run(jax.random.key(1), sphere, spread(10, 1, 2, scale=1.0) + 0.9, params(low=-1.0, high=1.0), 100)
     np.testing.assert_allclose(final.gbest_position, 0, atol=1e-2)
@@ -255,7 +257,7 @@ def test_a_maximum_on_the_bound_is_reached():
     np.testing.assert_allclose(final.gbest_position, 7)
 
 
-def test_same_key_same_result_and_another_key_another():
+def test_the_same_key_gives_the_same_result_and_another_key_another_result():
     def search(seed):
         return run(jax.random.key(seed), rosenbrock, spread(10, 2, 2), params(2), 20)
 
@@ -277,7 +279,7 @@ def test_without_jit_the_result_is_the_same():
 
 
 def test_groups_do_not_interact():
-    """Another objective in the second of three groups changes nothing in the others."""
+    """Another objective in the second of three groups changes nothing in the other groups."""
 
     def objective(position, weight):
         return sphere(position - weight[:, None])
@@ -308,20 +310,20 @@ def test_groups_find_maxima_of_their_own():
 
 
 def test_run_is_init_steps_and_a_last_evaluation():
-    """No iteration is the evaluated start; more of them continue the same path."""
+    """With 0 iterations, the result is the evaluated start; more iterations continue the same path."""
     position, knobs, key = spread(6, 2, 2), params(2), jax.random.key(0)
     assert_same(run(key, sphere, position, knobs, 0), init(sphere, position, knobs))
     state = swarm.init(position, knobs)
     for i in range(3):
         state = jax.jit(swarm.step, static_argnums=1)(jax.random.fold_in(key, i), sphere, state, knobs)
-    # Fused multiply-adds differ in the last bits, within the loop and out of it.
+    # Fused multiply-adds differ in the last bits inside and outside the loop.
     assert_same(run(key, sphere, position, knobs, 3), swarm.evaluate(sphere, state), atol=1e-5)
     fitness = [float(run(key, sphere, position, knobs, n).gbest_fitness.sum()) for n in range(6)]
     assert (np.diff(fitness) >= 0).all()
 
 
 def test_random_factors_are_uniform_and_independent():
-    """The two factors come from halves of one word: moments of 70,000 of each, to five standard errors."""
+    """The two factors come from the halves of one word. Moments of 70,000 factors, within five standard errors."""
     state = swarm.init(jnp.zeros((10_000, 1, 7)), params(1, 7))
     pulled = replace(state, pbest_position=state.position + 1.0, gbest_position=jnp.zeros((1, 7)))
     led = replace(state, gbest_position=jnp.ones((1, 7)))
@@ -332,17 +334,17 @@ def test_random_factors_are_uniform_and_independent():
         assert factor.max() < 1
         assert factor.mean() == pytest.approx(1 / 2, abs=5 * np.sqrt(1 / 12 / 70_000))
         assert factor.var() == pytest.approx(1 / 12, abs=5 * np.sqrt(1 / 180 / 70_000))
-    # Nor do they follow each other, from one element, particle or iteration to the next.
+    # Factors are not correlated from one element, particle or iteration to the next either.
     later = np.asarray(swarm.move(jax.random.fold_in(jax.random.key(0), 1), pulled, knobs).position).ravel()
     for one, other in ((r1, r2), (r1[1:], r1[:-1]), (r1[7:], r1[:-7]), (r1[1:], r2[:-1]), (r1, later)):
         assert abs(np.corrcoef(one, other)[0, 1]) < 5 / np.sqrt(69_000)
-    # As many fall into each of 256 bins as should: chi-squared with 255 degrees, its mean and five deviations.
+    # Counts in 256 bins: chi-squared with 255 degrees of freedom, limit at its mean plus five standard deviations.
     for factor in (r1, r2):
         counts = np.histogram(factor, bins=256, range=(0, 1))[0]
         assert (np.square(counts - 70_000 / 256) / (70_000 / 256)).sum() < 255 + 5 * np.sqrt(2 * 255)
 
 
-def test_knobs_and_number_of_iterations_compile_nothing_new():
+def test_other_settings_and_numbers_of_iterations_need_no_compilation():
     traces = 0
 
     def counted(position):
@@ -357,5 +359,5 @@ def test_knobs_and_number_of_iterations_compile_nothing_new():
         jax.random.key(1), spread(6, 2, 2, 1), params(2, inertia=0.3, low=-1.0, max_step=0.1), jnp.int32(50)
     )
     assert traces == once
-    # Once for the start and once for the body of the loop, however many iterations there are.
+    # The function is traced for the start and for the body of the loop, for any number of iterations.
     assert once <= 3

@@ -1,4 +1,4 @@
-"""Clocks: shifted copies of motion that is known at any time, so that the offset is known exactly."""
+"""Clock offsets, compared with motion that is known at any time, so that the true offset is known exactly."""
 
 import json
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ FPS = 25.0
 
 
 def drifting(number: int = 0, speed_m_s: float = 1.0):
-    """Motion of about this speed that never repeats, at any times (...,): (..., 3)."""
+    """A function of times (...,) that returns positions (..., 3); the motion never repeats and has about this speed."""
     rng = np.random.default_rng(number)
     rate, phase = rng.uniform(0.4, 1.6, (4, 3)), rng.uniform(0, 2 * np.pi, (4, 3))
     size_m = speed_m_s / np.sqrt(6) / rate
@@ -40,7 +40,10 @@ def drifting(number: int = 0, speed_m_s: float = 1.0):
 
 
 def estimate_of(*paths, seconds=12.0, start_s=3.0, offset_s=0.0, noise_m=0.0, fps=FPS, seed=0):
-    """What a tracker finds of drones that are at `path(t)` by the reference's clock, `offset_s` ahead of its own."""
+    """Tracks of drones whose true positions are `path(t)` by the reference's clock.
+
+    The reference's clock is `offset_s` ahead of the clock of the tracks.
+    """
     time_s = start_s - offset_s + np.arange(int(seconds * fps)) / fps
     position_m = np.stack([path(time_s + offset_s) for path in paths], axis=1)
     position_m = position_m + np.random.default_rng(seed).normal(0, noise_m, position_m.shape)
@@ -48,7 +51,7 @@ def estimate_of(*paths, seconds=12.0, start_s=3.0, offset_s=0.0, noise_m=0.0, fp
 
 
 def correlated(rng, shape, correlation):
-    """Noise of standard deviation 1 that a first-order autoregression makes along the first axis."""
+    """Noise of standard deviation 1 from a first-order autoregression along the first axis."""
     noise = rng.normal(size=shape)
     for row in range(1, len(noise)):
         noise[row] = correlation * noise[row - 1] + np.sqrt(1 - correlation**2) * noise[row]
@@ -56,13 +59,13 @@ def correlated(rng, shape, correlation):
 
 
 def headings(paths, time_s):
-    """(frames, drones), directions in which drones fly, radians."""
+    """Directions in which the drones fly, radians: (frames, drones)."""
     step_m = np.stack([path(time_s + 0.01) - path(time_s - 0.01) for path in paths], axis=1)
     return np.arctan2(step_m[..., 1], step_m[..., 0])
 
 
 def turned(yaw_rad, offset_m):
-    """(frames, drones, 3), offsets (drones, 3) in the drones' axes, turned about the vertical by the yaw angles."""
+    """Offsets (drones, 3) in the drones' axes, turned about the vertical by the yaw angles: (frames, drones, 3)."""
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
     x, y, z = offset_m.T
     return np.stack([cos * x - sin * y, sin * x + cos * y, z + 0 * cos], axis=-1)
@@ -82,19 +85,19 @@ class TestFindOffset:
         found = find_offset(
             estimate, *reference_of(drifting(0), drifting(1), rate_hz=rate_hz), max_offset_s=1.0
         )
-        # Splines of 25 Hz through motion of at most 1.6 rad/s: (h w)⁴ / 384 of it, 4e-8 m; measured 3e-6 s.
+        # Splines at 25 Hz of motion of at most 1.6 rad/s have an error of (h w)⁴ / 384, 4e-8 m. Measured 3e-6 s.
         assert found.offset_s == pytest.approx(offset_s, abs=2e-5)
         assert found.mean_distance_m < 1e-5
         assert found.mean_distance_before_m > 0.2
         assert (found.overlap, found.partner.tolist()) == (1.0, [0, 1])
         np.testing.assert_allclose(found.lever_arm_m, 0, atol=1e-5)
-        # The first step: whole samples of the reference.
+        # The first step compares whole samples of the reference.
         assert np.abs(found.curve_s[np.nanargmin(found.curve_m)] - offset_s) <= 0.5001 / rate_hz
         assert found.curve_s[[0, -1]] == pytest.approx([-1, 1], abs=1 / rate_hz)
 
     @pytest.mark.parametrize("name", ["S01_D2_A", "S02_D4_A"])
     def test_simulated_flights_with_arms_and_noise(self, name):
-        """The figure to reach: 0.1 frame, of arms of 0.12 m on drones that turn, and noise of 20 mm."""
+        """The required accuracy is 0.1 frame, with lever arms of 0.12 m on drones that turn, and noise of 20 mm."""
         flights = plan(scenario(name), 3)
         rng, offset_s = np.random.default_rng(1), 0.1234
         time_s = np.arange(900) / 100
@@ -115,14 +118,14 @@ class TestFindOffset:
         )
         assert abs(found.offset_s - offset_s) * FPS < 0.1
         assert found.std_s * FPS < 0.05
-        # Noise of three parts of 20 mm: a mean distance of √(8 / π) of it. A median of 187 is known to 2 mm; along what
-        # it shares with the motion less well.
+        # Noise of 20 mm along three axes has a mean length of √(8 / π) times 20 mm. A median of 187 positions is
+        # good to 2 mm; along directions in which the arm looks like motion it is less accurate.
         assert found.mean_distance_m == pytest.approx(0.02 * np.sqrt(8 / np.pi), rel=0.05)
         np.testing.assert_allclose(found.lever_arm_m, arm_m, atol=0.012)
 
     @pytest.mark.parametrize("errors", ["independent", "correlated", "turning"])
     def test_the_true_offset_is_within_two_standard_deviations(self, errors):
-        """Forty draws: at least 85 % inside, which is 2 % below chance for 95 %; not too wide."""
+        """Of 40 draws at least 85 % are inside; chance gives fewer in 2 % of cases if 95 % is right."""
         normalised, spread = [], []
         for seed in range(40):
             rng = np.random.default_rng(seed)
@@ -134,7 +137,7 @@ class TestFindOffset:
             elif errors == "correlated":
                 error_m = 0.02 * correlated(rng, shape, 0.95)
             else:
-                # The tracked point is off the reference's point, and turns with the drone.
+                # The tracked point is beside the reference's point and turns with the drone.
                 yaw_rad = rng.uniform(0.4, 1.2, 2) * estimate.time_s[:, None]
                 error_m = turned(yaw_rad, 0.02 * rng.normal(size=(2, 3))) + 0.005 * rng.normal(size=shape)
             estimate = replace(estimate, position_m=estimate.position_m + error_m)
@@ -147,8 +150,8 @@ class TestFindOffset:
         if errors == "independent":
             assert 0.6 < np.sqrt(np.mean(np.square(normalised))) < 1.4
 
-    def test_an_arm_along_the_way_is_not_taken_for_time(self):
-        """A drone that flies ahead, faster and slower: its arm of 0.12 m is as far as 0.12 s."""
+    def test_a_lever_arm_along_the_flight_is_not_taken_for_an_offset(self):
+        """The drone flies straight ahead with changing speed: at 1 m/s, an arm of 0.12 m is as long as 0.12 s."""
 
         def ahead(time_s):
             time_s = np.asarray(time_s)
@@ -163,7 +166,7 @@ class TestFindOffset:
         assert without.offset_s == pytest.approx(0.2 + 0.12, abs=0.05)
         assert (without.lever_arm_m == 0).all()
 
-    def test_drones_in_any_order_one_of_them_false_and_one_missing(self):
+    def test_drones_in_another_order_with_a_false_track_and_a_missing_drone(self):
         paths = [drifting(number) for number in range(3)]
         false = [lambda t: drifting(7)(t) - [0, 9, 0]]
         estimate = estimate_of(paths[2], *false, paths[0], offset_s=0.25, noise_m=0.01)
@@ -173,8 +176,8 @@ class TestFindOffset:
         assert np.isnan(found.lever_arm_m[1]).all()
         assert found.overlap == pytest.approx(2 / 3)
 
-    def test_an_exchange_of_two_drones_does_not_matter_much(self):
-        """Distances, not squares: one sixth of the frames with the wrong drone is outvoted."""
+    def test_an_identity_swap_has_little_effect(self):
+        """The cost is a sum of distances, not of squares, so a sixth of the frames with the wrong drone is outvoted."""
         estimate = estimate_of(drifting(0), drifting(1), offset_s=0.25, noise_m=0.01)
         estimate.position_m[250:] = estimate.position_m[250:, ::-1]
         found = find_offset(estimate, *reference_of(drifting(0), drifting(1)), max_offset_s=0.5)
@@ -182,7 +185,7 @@ class TestFindOffset:
 
     @pytest.mark.parametrize(("gap_s", "bridged"), [(0.08, True), (0.5, False)])
     def test_long_gaps_are_not_bridged(self, gap_s, bridged):
-        """Where the reference is not known the estimate is 5 m off: it costs where it is compared."""
+        """Within the reference's gap, the estimate is 5 m off: the distance is large only if the gap is compared."""
         time_s, position_m = reference_of(drifting(0))
         gap = (time_s > 8) & (time_s < 8 + gap_s)
         position_m[gap] = np.nan
@@ -196,7 +199,7 @@ class TestFindOffset:
 
     @given(st.integers(0, 2**32 - 1), st.floats(-100, 100), st.floats(0, 6.3))
     @settings(max_examples=6)
-    def test_where_the_clock_and_the_world_begin_does_not_matter(self, seed, later_s, turn):
+    def test_the_origins_of_clock_and_world_do_not_matter(self, seed, later_s, turn):
         estimate = estimate_of(drifting(0), drifting(1), offset_s=0.2, noise_m=0.02, seed=seed, seconds=6)
         time_s, position_m = reference_of(drifting(0), drifting(1), rate_hz=50, seconds=10)
         first = find_offset(estimate, time_s, position_m, max_offset_s=0.4)
@@ -205,18 +208,18 @@ class TestFindOffset:
             estimate, time_s=estimate.time_s + later_s, position_m=estimate.position_m[:, ::-1] @ R.T + 4.0
         )
         again = find_offset(moved, time_s + later_s, position_m @ R.T + 4.0, max_offset_s=0.4)
-        # Medians of the parts turn only nearly with the world: a fraction of the standard deviation of 2 ms.
+        # Medians along the axes turn only approximately with the world: a fraction of the standard deviation of 2 ms.
         assert again.offset_s == pytest.approx(first.offset_s, abs=1e-3)
         assert again.partner.tolist() == first.partner.tolist()[::-1] == [1, 0]
 
 
-class TestWhatCannotBeTold:
+class TestRefusedInput:
     def refused(self, path, text, *, max_offset_s=1.0, offset_s=0.2, **others):
         estimate = estimate_of(path, offset_s=offset_s, noise_m=0.02, **others)
         with pytest.raises(InputError, match=text):
             find_offset(estimate, *reference_of(path), max_offset_s=max_offset_s)
 
-    def test_drones_that_sway_a_little(self):
+    def test_drones_that_move_only_a_little(self):
         self.refused(
             drifting(0, 0.01), "motion that tells the offset to a frame, 0.04 s, found a standard dev"
         )
@@ -247,10 +250,10 @@ class TestWhatCannotBeTold:
             drifting(0), r"within 0.3 s, found it at an end, \+0.3 s; widen", max_offset_s=0.3, offset_s=0.9
         )
 
-    def test_no_time_in_common(self):
+    def test_no_common_time(self):
         self.refused(drifting(0), "positions of both at offsets within 1 s, found none", start_s=60.0)
 
-    def test_what_makes_no_sense(self):
+    def test_invalid_arguments_are_refused(self):
         estimate, (time_s, position_m) = estimate_of(drifting(0)), reference_of(drifting(0))
         with pytest.raises(SettingsError, match=r"max_offset_s: expected a step of the reference, 0.01 s"):
             find_offset(estimate, time_s, position_m, max_offset_s=0.001)
@@ -280,13 +283,13 @@ class DetectionErrors:
     seed: int = 0
 
 
-def seen_by(rig, paths, late_frames, *, num_frames=300, **errors):
-    """(frames, drones, cameras, 2), by OpenCV: each camera sees each drone where it was at k + its own offset."""
+def detected_points(rig, paths, offsets_frames, *, num_frames=300, **errors):
+    """Pixels (frames, drones, cameras, 2) by OpenCV; camera c sees frame k at the time (k + offset of c) / FPS."""
     errors = DetectionErrors(**errors)
     rng = np.random.default_rng(errors.seed)
     points_px = np.full((num_frames, len(paths), len(rig), 2), np.nan)
-    for number, late in enumerate(late_frames):
-        time_s = (np.arange(num_frames) + late) / FPS
+    for number, offset_frames in enumerate(offsets_frames):
+        time_s = (np.arange(num_frames) + offset_frames) / FPS
         one = rig.cameras[number]
         R, t = one.T_cam_world[:3, :3], one.T_cam_world[:3, 3]
         for drone, path in enumerate(paths):
@@ -299,42 +302,45 @@ def seen_by(rig, paths, late_frames, *, num_frames=300, **errors):
     return points_px
 
 
-def near(number, speed_m_s=1.0):
+def path_near_origin(number, speed_m_s=1.0):
     path = drifting(number, speed_m_s)
     return lambda time_s: path(time_s) - [3.0 * number, 0, 0.3]
 
 
 RIG = ring_rig(8, coefficients=5, image_size_wh=(1920, 1080), radius_m=6.0)
-LATE = np.array([0.4, -1.0, 0.75, -0.2, 1.0, -0.6, 0.15, -0.5])
-DRONES = [near(number) for number in range(3)]
+OFFSET_FRAMES = np.array([0.4, -1.0, 0.75, -0.2, 1.0, -0.6, 0.15, -0.5])
+DRONES = [path_near_origin(number) for number in range(3)]
 
 
 class TestCameraOffsets:
     def test_a_ring_with_noise_and_wrong_detections(self):
-        found = camera_offsets(RIG, seen_by(RIG, DRONES, LATE), FPS)
-        # The figure to reach is 0.1; measured 0.011, as the standard deviations say.
-        np.testing.assert_allclose(found.offset_frames, LATE, atol=0.03)
+        found = camera_offsets(RIG, detected_points(RIG, DRONES, OFFSET_FRAMES), FPS)
+        # The required accuracy is 0.1 frame. Measured 0.011, in agreement with the standard deviations.
+        np.testing.assert_allclose(found.offset_frames, OFFSET_FRAMES, atol=0.03)
         assert found.offset_frames.mean() == pytest.approx(0, abs=1e-12)
         assert (found.std_frames < 0.02).all()
         assert found.rms_before_px > 2 * found.rms_after_px
-        # Noise of 1 px in two parts is √2 px, of which points take a share, and interpolation.
+        # Noise of 1 px in x and y is √2 px. The fitted points take up a part of the noise, and so does interpolation.
         assert found.rms_after_px < np.sqrt(2)
 
     def test_without_noise(self):
-        points_px = seen_by(RIG, DRONES, LATE, noise_px=0, missed=0, wrong=0)
+        points_px = detected_points(RIG, DRONES, OFFSET_FRAMES, noise_px=0, missed=0, wrong=0)
         found = camera_offsets(RIG, points_px, FPS)
-        # Linear interpolation of pixels over a frame is off by an eighth of the acceleration: 0.03 px of 5.
-        np.testing.assert_allclose(found.offset_frames, LATE, atol=3e-3)
+        # Linear interpolation of pixels over a frame has an error of an eighth of the acceleration, at most 0.03 px.
+        np.testing.assert_allclose(found.offset_frames, OFFSET_FRAMES, atol=3e-3)
 
     @pytest.mark.parametrize("errors", ["independent", "correlated", "turning", "calibration"])
     def test_the_true_offsets_are_within_two_standard_deviations(self, errors):
-        """Of 8 x 7 offsets at least 85 %, which is 0.5 % below chance for 95 %; and not several times too wide."""
-        late = LATE - LATE.mean()
+        """Of 8 x 7 offsets at least 85 % are inside; chance gives fewer in 0.5 % of cases if 95 % is right.
+
+        The standard deviations must not be several times too large either.
+        """
+        offset_frames = OFFSET_FRAMES - OFFSET_FRAMES.mean()
         normalised, spread = [], []
         for seed in range(8):
             rng = np.random.default_rng(seed)
-            paths = [near(3 * seed + number) for number in range(2)]
-            points_px = seen_by(RIG, paths, late, num_frames=90, noise_px=0.5, seed=seed)
+            paths = [path_near_origin(3 * seed + number) for number in range(2)]
+            points_px = detected_points(RIG, paths, offset_frames, num_frames=90, noise_px=0.5, seed=seed)
             if errors == "correlated":
                 points_px += 1.5 * correlated(rng, points_px.shape, 0.9)
             elif errors == "turning":
@@ -346,54 +352,56 @@ class TestCameraOffsets:
             elif errors == "calibration":
                 points_px += 2 * rng.normal(size=(8, 2))
             found = camera_offsets(RIG, points_px, FPS)
-            normalised.append((found.offset_frames - late) / found.std_frames)
-            spread.append(np.stack([found.offset_frames - late, found.std_frames], axis=-1))
+            normalised.append((found.offset_frames - offset_frames) / found.std_frames)
+            spread.append(np.stack([found.offset_frames - offset_frames, found.std_frames], axis=-1))
         assert np.mean(np.abs(normalised) < 2) >= 0.85
         error, std = np.sqrt(np.mean(np.square(spread), axis=(0, 1)))
         assert std < 2 * error
 
-    def test_cameras_that_are_right_stay_so(self):
-        found = camera_offsets(RIG, seen_by(RIG, DRONES, np.zeros(8)), FPS)
+    def test_offsets_of_zero_are_found(self):
+        found = camera_offsets(RIG, detected_points(RIG, DRONES, np.zeros(8)), FPS)
         assert np.abs(found.offset_frames).max() < 0.03
         assert found.rms_before_px == pytest.approx(found.rms_after_px, rel=0.02)
 
     @pytest.mark.parametrize("num_cameras", [2, 3])
     def test_few_cameras_and_large_offsets(self, num_cameras):
         rig = RIG.select(RIG.names[:num_cameras])
-        late = np.linspace(-3, 3, num_cameras)
-        found = camera_offsets(rig, seen_by(rig, DRONES, late), FPS)
-        np.testing.assert_allclose(found.offset_frames, late, atol=0.1)
+        offset_frames = np.linspace(-3, 3, num_cameras)
+        found = camera_offsets(rig, detected_points(rig, DRONES, offset_frames), FPS)
+        np.testing.assert_allclose(found.offset_frames, offset_frames, atol=0.1)
 
     def test_the_order_of_cameras_does_not_matter(self):
-        points_px, order = seen_by(RIG, DRONES, LATE), np.array([3, 0, 7, 1, 6, 2, 5, 4])
+        points_px, order = detected_points(RIG, DRONES, OFFSET_FRAMES), np.array([3, 0, 7, 1, 6, 2, 5, 4])
         first = camera_offsets(RIG, points_px, FPS)
         rig = RIG.select([RIG.names[i] for i in order])
         second = camera_offsets(rig, points_px[:, :, order], FPS)
-        # It stops where steps are below 1e-4.
+        # The iteration stops when steps are below 1e-4 frames.
         np.testing.assert_allclose(second.offset_frames, first.offset_frames[order], atol=1e-3)
 
-    def test_nothing_is_known_of_drones_that_hover(self):
-        found = camera_offsets(RIG, seen_by(RIG, [near(0, 0.0)], LATE), FPS, max_offset_frames=4.0)
+    def test_offsets_from_hovering_drones_are_uncertain(self):
+        found = camera_offsets(
+            RIG, detected_points(RIG, [path_near_origin(0, 0.0)], OFFSET_FRAMES), FPS, max_offset_frames=4.0
+        )
         assert (found.std_frames > 2.0).all()
         assert np.abs(found.offset_frames).max() <= 4.0
 
-    def test_nothing_is_known_of_a_camera_without_detections(self):
-        points_px = seen_by(RIG, DRONES, LATE)
+    def test_the_offset_of_a_camera_without_detections_is_uncertain(self):
+        points_px = detected_points(RIG, DRONES, OFFSET_FRAMES)
         points_px[:, :, 5] = np.nan
         found = camera_offsets(RIG, points_px, FPS, max_offset_frames=4.0)
         others = np.arange(8) != 5
-        apart = found.offset_frames[others] - LATE[others]
+        apart = found.offset_frames[others] - OFFSET_FRAMES[others]
         np.testing.assert_allclose(apart, apart.mean(), atol=0.03)
         assert found.std_frames[5] > 2.0
         assert found.std_frames[5] > 5 * found.std_frames[others].max()
 
     @pytest.mark.parametrize("shape", [(0, 1), (1, 1), (10, 0), (10, 2)])
-    def test_nothing_at_all(self, shape):
+    def test_without_detections_all_offsets_are_zero(self, shape):
         found = camera_offsets(RIG, np.full((*shape, 8, 2), np.nan), FPS)
         assert (found.offset_frames == 0).all()
         assert np.isnan([found.rms_before_px, found.rms_after_px]).all()
 
-    def test_what_makes_no_sense(self):
+    def test_invalid_arguments_are_refused(self):
         with pytest.raises(SettingsError, match="points_px: expected 8 cameras, found 5"):
             camera_offsets(RIG, np.zeros((10, 1, 5, 2)), FPS)
         with pytest.raises(SettingsError, match="max_offset_frames"):
@@ -402,7 +410,7 @@ class TestCameraOffsets:
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    """A real sequence without much in its videos: its .c3d at 100 Hz began 0.4321 s before them."""
+    """A real sequence with black videos, and tracks. The .c3d file, at 100 Hz, begins 0.4321 s before the videos."""
     folder = tmp_path_factory.mktemp("data") / "Real_Data" / "R12_D2"
     folder.mkdir(parents=True)
     R, t_m = look_at((0.0, -6.0, 2.0), (0.0, 0.0, 1.5))

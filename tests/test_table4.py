@@ -1,4 +1,4 @@
-"""The command that makes the paper's Table 4, on a very small sequence: every sequence at hand, by every method."""
+"""The script that makes the paper's Table 4, on one very small sequence, with two methods."""
 
 import shutil
 import subprocess
@@ -49,7 +49,7 @@ def test_every_sequence_by_every_method(data: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     rows = pd.read_csv(out / "results.csv").set_index("method")
     assert list(rows["sequence"]) == ["S01_D2_A"] * 2
-    # Both methods begin at the truth; boxes and blobs are of a quarter of the pixels.
+    # Both methods begin at the true positions; the images have a quarter of the pixels.
     assert (rows["mean_error_m"] < 0.1).all()
     assert (rows["id_switches"] == 0).all()
     table = (out / "table4.md").read_text()
@@ -58,8 +58,10 @@ def test_every_sequence_by_every_method(data: Path, tmp_path: Path) -> None:
     assert "## FNR" in table
 
 
-def test_changed_detections_are_another_input(data: Path, tmp_path: Path) -> None:
-    """Whose cell is run anew; that of the blobs, which they are nothing to, is not."""
+def test_after_a_change_of_detections_only_methods_that_use_them_run_again(
+    data: Path, tmp_path: Path
+) -> None:
+    """The method with detections runs again; the method with blobs does not use detections, and does not run again."""
     copied = tmp_path / "copied"
     shutil.copytree(data / "Simulated_Data", copied / "Simulated_Data")
     (copied / "cache").symlink_to(data / "cache")

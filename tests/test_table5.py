@@ -1,4 +1,4 @@
-"""The command that makes the paper's Table 5, on a very small sequence: what it writes, and nothing of it twice."""
+"""The script that makes the paper's Table 5, on one very small sequence: its files, and no repeated work."""
 
 import subprocess
 import sys
@@ -47,7 +47,7 @@ def stamps(out: Path) -> dict[str, int]:
     return {str(path.relative_to(out)): path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
 
 
-def test_tables_rows_and_figures_and_nothing_twice(data: Path, tmp_path: Path) -> None:
+def test_table_rows_and_figures_are_made_once(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "table5"
     done = table5(data, out)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""The command that makes Tables 6 to 8, on a small sequence that is drawn here, not by the simulator's renderer."""
+"""The script that makes Tables 6 to 8, on a small sequence that is drawn here, not by the simulator's renderer."""
 
 import functools
 import shutil
@@ -135,7 +135,7 @@ def results(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_tables_rows_and_figures(results: Path) -> None:
+def test_table_rows_and_figures(results: Path) -> None:
     every = pd.read_csv(results / "results.csv")
     assert len(every) == 2 * 2 * len(METHODS)
     # With one drone, the row of all drones equals its row.
@@ -156,13 +156,13 @@ def test_tables_rows_and_figures(results: Path) -> None:
     assert (wrong["position_max_m"][["filter", "smoother"]] < 0.02).all()
     # The paper's method has no covariances.
     assert rows["inside_90_rate"].isna().tolist() == [method == "paper" for _, method in rows.index]
-    # The aim for clocks that are seconds off.
+    # The required accuracy for clocks with offsets of seconds.
     assert (rows["offset_s"].abs() > 0.1).all()
     for name in ("offset_s_off_frames", "orientation_offset_s_off_frames"):
         assert (rows[name].abs() < 0.1).all()
     for axis, arm_m in zip("xyz", ARM_M, strict=True):
         assert rows[f"lever_arm_{axis}_m"].to_numpy() == pytest.approx(arm_m, abs=0.005)
-    # On good paths the procedure and the truth agree, except for the parts of the errors that arm and turn remove.
+    # On good paths the procedure and the ground truth agree, except for errors that the fitted arm and turn absorb.
     assert clean["distance_m.median"].to_numpy() == pytest.approx(clean["position_median_m"], rel=0.4)
     assert (clean["distance_to_point_m.median"] > 0.1).all()
     table = (results / "table7.md").read_text()
@@ -195,7 +195,7 @@ def test_figures(results: Path, name: str) -> None:
 
 
 @pytest.mark.slow
-def test_again_beside_a_sequence_that_cannot_be_used(data: Path, results: Path) -> None:
+def test_a_second_run_beside_a_sequence_that_cannot_be_used(data: Path, results: Path) -> None:
     """Markers are not detected again, and the results of all other sequences are shown."""
     kept = results / "detections" / "S99_D1_A_dron1.npz"
     before, table = kept.stat().st_mtime_ns, (results / "table7.md").read_text()
@@ -233,7 +233,7 @@ def test_a_recording_in_the_form_of_a_real_one(data: Path, tmp_path: Path) -> No
     rows = rows[rows["drone"] == "dron1"]
     assert (rows["offset_s"] - 2.0).abs().max() * FPS < 0.1
     assert (rows["orientation_offset_s"] == rows["offset_s"]).all()
-    # From the middle of the cross, in a frame of its own with arbitrary axes.
+    # The arm begins at the middle of the cross, whose axes are arbitrary.
     arm_m = np.linalg.norm(rows[[f"lever_arm_{axis}_m" for axis in "xyz"]], axis=1)
     assert arm_m == pytest.approx(np.linalg.norm(ARM_M - cross_m.mean(axis=0)), abs=0.003)
     ours = rows[rows["method"] != "paper"]
@@ -270,7 +270,7 @@ def test_markers_with_wrong_ids(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_the_drones_own_videos_are_simulated_where_they_are_not_there(
+def test_missing_onboard_videos_are_simulated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.syspath_prepend(EXPERIMENT)
@@ -285,7 +285,7 @@ def test_the_drones_own_videos_are_simulated_where_they_are_not_there(
     assert "simulating the drones' own videos of S01_D2_A" in capsys.readouterr().out
     rows = pd.read_csv(tmp_path / "results.csv")
     assert set(rows["drone"]) == {"dron1", "dron2", "all"}
-    # The aim at full size; at half the size, pixels are twice as large.
+    # The required accuracy at full size; at half the size, pixels are twice as large.
     assert (rows[rows["method"] == "filter"]["position_median_m"] < 0.02).all()
     assert small(tmp_path / "data") == tmp_path / "data"
     assert capsys.readouterr().out == ""

@@ -1,4 +1,4 @@
-"""Boxes of several drones taken apart: boxes whose every edge is known, and flights in which boxes grow together."""
+"""Splitting boxes of several drones: boxes with known edges, and flights in which boxes merge."""
 
 import numpy as np
 from helpers import ROOM_M, ring_rig
@@ -14,111 +14,114 @@ from psotrack.trajectories import Trajectories
 
 RIG = ring_rig(5, coefficients=4, image_size_wh=(1920, 1080))
 FPS = 25.0
-#: Width and height of one drone and of another.
+#: Width and height of the two drones, metres.
 SPAN_M = np.array([[0.5, 0.2], [0.3, 0.3]])
 
 
-def boxes_of(drones_m, span_m=SPAN_M, rig=RIG):
-    """(drones, cameras, 4), the boxes that the cameras see, pixel centres at whole numbers."""
+def true_boxes(drones_m, span_m=SPAN_M, rig=RIG):
+    """Boxes in which the cameras see the drones: (drones, cameras, 4). Pixel centres are at whole numbers."""
     pixels, depth = project(rig.cameras, drones_m[:, None])
     focal_px = np.diagonal(rig.cameras.K, axis1=-2, axis2=-1)[:, :2]
     half_px = span_m[:, None] * focal_px / depth[..., None] / 2
     return np.concatenate([pixels - half_px, pixels + half_px], axis=-1)
 
 
-def around(boxes):
-    """The box around boxes, along the first axis."""
+def enclosing_box(boxes):
+    """The smallest box that contains all boxes along the first axis."""
     return np.concatenate([boxes[..., :2].min(axis=0), boxes[..., 2:].max(axis=0)], axis=-1)
 
 
-def view_of(*boxes, noise_px=3.0):
-    """Views of (cameras, 4) boxes each."""
+def sightings_of(*boxes, noise_px=3.0):
+    """Sightings from arrays of boxes, each (cameras, 4)."""
     boxes = np.stack(boxes, axis=1)
     noise = np.full(boxes.shape[:2], noise_px)
     return CameraSightings((boxes[..., :2] + boxes[..., 2:]) / 2, boxes[..., 2:] - boxes[..., :2], noise)
 
 
-def kept(view, camera):
-    """The boxes of a camera, (boxes, 4)."""
+def boxes_in_camera(view, camera):
+    """The boxes in one camera's image: (boxes, 4)."""
     there = np.isfinite(view.noise_px[camera])
     centre_px, half_px = view.centre_px[camera, there], view.size_px[camera, there] / 2
     return np.concatenate([centre_px - half_px, centre_px + half_px], axis=-1)
 
 
 def two_drones():
-    """One beside and a little above the other; in some cameras the narrow one is wholly before or behind the other."""
+    """Positions of two drones side by side, the second a little higher than the first.
+
+    In some cameras, the whole narrow drone is in front of or behind the wide drone.
+    """
     return np.array([[0.0, 0.0, 1.0], [0.2, 0.15, 1.24]])
 
 
-def test_drones_in_one_box_get_their_own_where_each_has_an_edge_of_it():
+def test_a_drone_in_a_merged_box_gets_its_own_box_if_edges_of_the_merged_box_are_its_own():
     drones_m = two_drones()
-    own = boxes_of(drones_m)
-    whole = around(own)
-    seen = split_merged_boxes(RIG.cameras, view_of(whole), drones_m, SPAN_M)
+    own = true_boxes(drones_m)
+    whole = enclosing_box(own)
+    seen = split_merged_boxes(RIG.cameras, sightings_of(whole), drones_m, SPAN_M)
     num_placed = []
     for camera in range(len(RIG)):
         edges = own[:, camera] == whole[camera]
         placed = (edges[:, :2] | edges[:, 2:]).all(axis=-1)
-        np.testing.assert_allclose(kept(seen, camera), own[placed, camera], atol=1e-9)
+        np.testing.assert_allclose(boxes_in_camera(seen, camera), own[placed, camera], atol=1e-9)
         num_placed.append(placed.sum())
-    # Both ways it may be are there.
+    # Some cameras place one drone, and some place both.
     assert {1, 2} <= set(num_placed)
     off_px = PART_SHARE * np.sqrt(seen.size_px[:, 1:].prod(axis=-1))
     np.testing.assert_allclose(seen.noise_px[:, 1:], np.hypot(3.0, off_px), rtol=1e-12)
 
 
-def test_where_exactly_drones_were_expected_makes_no_difference():
-    """Edges are seen; only sizes depend on how far away the drones were thought to be."""
+def test_the_expected_positions_hardly_change_the_boxes():
+    """The edges come from the image; only the sizes depend on the expected distances of the drones."""
     right, down, _ = RIG.cameras.T_cam_world[0, :3, :3]
     drones_m = np.array([0.0, 0.0, 1.2]) + np.array([np.zeros(3), 0.35 * right + 0.25 * down])
-    own = boxes_of(drones_m)
+    own = true_boxes(drones_m)
     expected_m = drones_m + 0.03 * np.array([[1.0, -1.0, 0.5], [-1.0, 0.5, 1.0]])
-    seen = split_merged_boxes(RIG.cameras, view_of(around(own)), expected_m, SPAN_M)
-    # 5 cm of some 4 m are 1.3 % of 150 px, and half of the size goes into the middle.
+    seen = split_merged_boxes(RIG.cameras, sightings_of(enclosing_box(own)), expected_m, SPAN_M)
+    # An error of 5 cm at about 4 m is 1.3 % of 150 px, and half of the size goes into the centre.
     middle_px = (own[:, 0, :2] + own[:, 0, 2:]) / 2
     np.testing.assert_allclose(seen.centre_px[0, 1:], middle_px, atol=1.0)
 
 
-def test_boxes_that_overlap_but_are_each_of_a_drone_stay_as_they_are():
-    own = boxes_of(two_drones())
-    view = view_of(*own)
+def test_overlapping_boxes_of_one_drone_each_do_not_change():
+    own = true_boxes(two_drones())
+    view = sightings_of(*own)
     seen = split_merged_boxes(RIG.cameras, view, two_drones(), SPAN_M)
     np.testing.assert_array_equal(seen.centre_px, view.centre_px)
     np.testing.assert_array_equal(seen.noise_px, view.noise_px)
 
 
-def test_a_drone_between_others_is_hidden():
-    """Three in a row, one over the other: no edge says how high the middle one is."""
+def test_a_drone_in_the_middle_of_a_merged_box_is_hidden():
+    """Three drones in a column: no edge of the box gives the height of the middle drone."""
     drones_m = np.array([[0.0, 0.0, 0.9], [0.0, 0.0, 1.1], [0.0, 0.0, 1.3]])
     span_m = np.tile(SPAN_M[0], (3, 1))
-    own = boxes_of(drones_m, span_m)
-    seen = split_merged_boxes(RIG.cameras, view_of(around(own)), drones_m, span_m)
+    own = true_boxes(drones_m, span_m)
+    seen = split_merged_boxes(RIG.cameras, sightings_of(enclosing_box(own)), drones_m, span_m)
     for camera in range(len(RIG)):
-        high = kept(seen, camera)[:, 1]
+        high = boxes_in_camera(seen, camera)[:, 1]
         assert own[1, camera, 1] not in high
         assert len(high) <= 2
 
 
-def test_drones_of_unknown_size_take_no_box_apart():
-    own = boxes_of(two_drones())
-    view = view_of(around(own))
+def test_drones_of_unknown_size_split_no_box():
+    own = true_boxes(two_drones())
+    view = sightings_of(enclosing_box(own))
     seen = split_merged_boxes(RIG.cameras, view, two_drones(), np.full((2, 2), np.nan))
     np.testing.assert_array_equal(seen.centre_px, view.centre_px)
 
 
-def grown_together(boxes):
-    """Boxes that touch made one, as long as there are any, as foreground does."""
+def merged(boxes):
+    """Boxes after all boxes that overlap have been merged, as drones that overlap become one foreground blob."""
     boxes = list(boxes)
     for i, one in enumerate(boxes):
         for j in range(i + 1, len(boxes)):
             if (np.maximum(one, boxes[j])[:2] < np.minimum(one, boxes[j])[2:]).all():
-                both = around(np.stack([one, boxes[j]]))
-                return grown_together([both, *boxes[:i], *boxes[i + 1 : j], *boxes[j + 1 :]])
+                both = enclosing_box(np.stack([one, boxes[j]]))
+                return merged([both, *boxes[:i], *boxes[i + 1 : j], *boxes[j + 1 :]])
     return boxes
 
 
-def test_drones_whose_boxes_grow_together_keep_their_tracks():
-    """Three in a row, 0.3 m from each other, as two come towards the third that stands between them, and pass it."""
+def test_drones_whose_boxes_merge_keep_their_tracks():
+    """Three drones 0.3 m apart in depth: two fly towards the third, which stands between them, and pass the third."""
     rig = ring_rig(8, coefficients=4, image_size_wh=(1920, 1080))
     along_m = np.arange(60) / FPS - 1.2
     middle = np.zeros_like(along_m)
@@ -135,8 +138,8 @@ def test_drones_whose_boxes_grow_together_keep_their_tracks():
     images = {name: ([], []) for name in rig.names}
     for number, drones_m in enumerate(truth_m):
         for index, name in enumerate(rig.names):
-            own = boxes_of(drones_m, span_m, rig)[:, index] + 0.5 + rng.normal(0.0, 1.0, (3, 4))
-            for box in grown_together(own):
+            own = true_boxes(drones_m, span_m, rig)[:, index] + 0.5 + rng.normal(0.0, 1.0, (3, 4))
+            for box in merged(own):
                 images[name][0].append(number)
                 images[name][1].append(box)
     detections = {
@@ -158,7 +161,7 @@ def test_drones_whose_boxes_grow_together_keep_their_tracks():
     )
     errors = evaluate(estimate, Trajectories(frame, frame / FPS, names, truth_m)).to_dict()
     assert errors["id_switches"] == 0
-    # The one between has no edge of its own for two frames. Measured 1.1 % and 1.8 mm; 3.3 % and 3.6 mm where the
-    # middles of boxes that have grown together are taken for those of drones.
+    # The middle drone has no edge of its own for two frames. Measured 1.1 % and 1.8 mm; 3.3 % and 3.6 mm if the centres
+    # of merged boxes were used as centres of drones.
     assert errors["missed_rate"] < 0.02
     assert errors["mean_error_m"] < 0.0025

@@ -1,4 +1,4 @@
-"""Track candidates in silhouettes of ellipsoids that are drawn by ray casting, and their re-identification by hand."""
+"""Track candidates in silhouettes of ellipsoids that are drawn by ray casting, and re-identification of lost drones."""
 
 from dataclasses import replace
 from itertools import permutations
@@ -39,7 +39,7 @@ SIZE_M = np.array([0.5, 0.5, 0.3])
 
 
 def path(position_m, velocity_m_s=(0.0, 0.0, 0.0), acceleration_m_s2=(0.0, 0.0, 0.0)):
-    """(frames, 3)."""
+    """Positions on a parabola over time: (frames, 3)."""
     bend = np.asarray(acceleration_m_s2) * TIME_S**2 / 2
     return np.asarray(position_m) + np.asarray(velocity_m_s) * TIME_S + bend
 
@@ -51,7 +51,7 @@ def drawn(*paths_m, size_m=SIZE_M, rig=RIG):
 
 
 def drawn_alone(path_m, size_m, rig):
-    """Silhouettes of one drone, kept in a dictionary, because ray casting is slow and tests share paths."""
+    """Silhouettes of one drone, kept in a dictionary because ray casting is slow and tests share paths."""
     key = (path_m.tobytes(), size_m.tobytes(), len(rig))
     if key not in _DRAWN:
         # A drone that stands still looks the same in every frame.
@@ -320,14 +320,14 @@ def test_a_drone_departs_that_the_background_model_has_learned():
     # In the first of ten frames the ghost is still beside the drone. Measured 3 cm, limit 6.
     np.testing.assert_allclose(found[0].position_m, flight[found[0].frame], atol=2 * CELL_M)
     stood = lost((place, (0.0, 0.0, 0.0), 2.0))
-    assert assign(found, stood, max_speed_m_s=MAX_SPEED_M_S) == [0]
+    assert assigned_drones(found, stood, max_speed_m_s=MAX_SPEED_M_S) == [0]
 
     # A second later the drone is known and the ghost has not changed.
     ghost = np.repeat(coverage[-1:], NUM_FRAMES, axis=0)
     found = candidates_in(ghost, np.broadcast_to(flight[-1], (NUM_FRAMES, 3)).copy(), rig=rig)
     assert [one.moves for one in found] == [False]
     np.testing.assert_allclose(found[0].position_m, place, atol=CELL_M)
-    assert assign(found, lost()) == [NO_DRONE]
+    assert assigned_drones(found, lost()) == [NO_DRONE]
 
 
 # --- re-identification
@@ -341,7 +341,7 @@ def candidate(position_m=(0.0, 0.0, 1.0), velocity_m_s=(1.0, 0.0, 0.0), *, frame
 
 
 def lost(*rows, left_m=()):
-    """Lost drones from rows of position, velocity, seconds and, where they differ, keywords span_m and doubtful."""
+    """Lost drones from rows of position, velocity, seconds and an optional dictionary of `span_m` and `doubtful`."""
     full = [{"span_m": 0.5, "doubtful": False} | (row[3] if len(row) > 3 else {}) for row in rows]
     return LostTracks(
         drone=10 + np.arange(len(rows)),
@@ -356,7 +356,7 @@ def lost(*rows, left_m=()):
     )
 
 
-def assign(found, gone, **keywords):
+def assigned_drones(found, gone, **keywords):
     keywords = {"fps": FPS, "bounds_m": ROOM_M, "max_speed_m_s": 6.0} | keywords
     return reidentify(tuple(found), gone, **keywords).tolist()
 
@@ -365,38 +365,38 @@ AHEAD = ((-0.5, 0.0, 1.0), (1.0, 0.0, 0.0), 0.5)
 
 
 def test_without_lost_drones_a_candidate_is_new():
-    assert assign([candidate()], lost()) == [NEW]
-    assert assign([], lost()) == []
+    assert assigned_drones([candidate()], lost()) == [NEW]
+    assert assigned_drones([], lost()) == []
 
 
 def test_the_drone_on_course_is_chosen():
     """Two drones were lost half a metre away: one flew towards the candidate's place, one away from it."""
     away = ((0.5, 0.0, 1.0), (1.0, 0.0, 0.0), 0.5)
-    assert assign([candidate()], lost(away, AHEAD)) == [1]
+    assert assigned_drones([candidate()], lost(away, AHEAD)) == [1]
 
 
 def test_each_lost_drone_is_one_candidate():
     """The first lost drone fits both candidates best, but only one candidate gets it."""
     also = ((-0.6, 0.5, 1.0), (1.0, 0.0, 0.0), 0.5)
-    assert assign([candidate(), candidate((0.0, 0.2, 1.0))], lost(AHEAD, also)) == [0, 1]
-    assert assign([candidate((0.0, 0.2, 1.0)), candidate()], lost(AHEAD, also)) == [1, 0]
-    assert sorted(assign([candidate(), candidate((0.0, 0.2, 1.0))], lost(AHEAD))) == [NEW, 0]
+    assert assigned_drones([candidate(), candidate((0.0, 0.2, 1.0))], lost(AHEAD, also)) == [0, 1]
+    assert assigned_drones([candidate((0.0, 0.2, 1.0)), candidate()], lost(AHEAD, also)) == [1, 0]
+    assert sorted(assigned_drones([candidate(), candidate((0.0, 0.2, 1.0))], lost(AHEAD))) == [NEW, 0]
 
 
 def test_a_candidate_out_of_reach_is_new_unless_new_drones_are_not_allowed():
     """At six metres per second for half a second, the reach is three metres."""
     far = ((-4.5, 0.0, 1.0), (1.0, 0.0, 0.0), 0.5)
-    assert assign([candidate()], lost(far)) == [NEW]
-    assert assign([candidate()], lost(far), max_births=0) == [0]
-    assert assign([candidate()], lost((*far[:2], 10.0))) == [0]
+    assert assigned_drones([candidate()], lost(far)) == [NEW]
+    assert assigned_drones([candidate()], lost(far), max_births=0) == [0]
+    assert assigned_drones([candidate()], lost((*far[:2], 10.0))) == [0]
 
 
 def test_after_a_long_time_the_size_decides():
     gone = ((2.0, 2.0, 1.0), (0.0, 1.0, 0.0), 20.0)
-    assert assign([candidate(span_m=0.55)], lost(gone)) == [0]
-    assert assign([candidate(span_m=1.0)], lost(gone)) == [NEW]
-    assert assign([candidate(span_m=0.9)], lost(gone, (*gone, {"span_m": 0.9}))) == [1]
-    assert assign([candidate(span_m=1.0)], lost(gone), max_births=0) == [0]
+    assert assigned_drones([candidate(span_m=0.55)], lost(gone)) == [0]
+    assert assigned_drones([candidate(span_m=1.0)], lost(gone)) == [NEW]
+    assert assigned_drones([candidate(span_m=0.9)], lost(gone, (*gone, {"span_m": 0.9}))) == [1]
+    assert assigned_drones([candidate(span_m=1.0)], lost(gone), max_births=0) == [0]
 
 
 def test_a_drone_comes_back_near_the_place_where_it_left():
@@ -407,26 +407,26 @@ def test_a_drone_comes_back_near_the_place_where_it_left():
     left = (-1.5, -2.0, 3.0), (0.0, 0.0, 2.0), 3.5
     also = (-1.5, 0.5, 3.0), (0.0, 0.0, 2.0), 5.5
     back = candidate((-0.5, -1.7, 2.8), (1.4, 0.2, -2.5), span_m=0.46)
-    assert assign([back], lost((*left, {"span_m": 0.5}), (*also, {"span_m": 0.46}))) == [0]
-    assert assign([back], lost((*also, {"span_m": 0.46}), (*left, {"span_m": 0.5}))) == [1]
+    assert assigned_drones([back], lost((*left, {"span_m": 0.5}), (*also, {"span_m": 0.46}))) == [0]
+    assert assigned_drones([back], lost((*also, {"span_m": 0.46}), (*left, {"span_m": 0.5}))) == [1]
     # Sizes that differ by a third decide.
-    assert assign([back], lost((*left, {"span_m": 0.62}), (*also, {"span_m": 0.46}))) == [1]
+    assert assigned_drones([back], lost((*left, {"span_m": 0.62}), (*also, {"span_m": 0.46}))) == [1]
 
 
 def test_the_number_of_new_drones_is_limited():
     found = [candidate(), candidate((1.0, 1.0, 1.0)), candidate((-1.0, 1.0, 1.0))]
-    assert assign(found, lost()) == [NEW] * 3
-    assert sorted(assign(found, lost(), max_births=2)) == [NO_DRONE, NEW, NEW]
-    assert assign(found, lost(), max_births=0) == [NO_DRONE] * 3
+    assert assigned_drones(found, lost()) == [NEW] * 3
+    assert sorted(assigned_drones(found, lost(), max_births=2)) == [NO_DRONE, NEW, NEW]
+    assert assigned_drones(found, lost(), max_births=0) == [NO_DRONE] * 3
 
 
 def test_a_candidate_that_does_not_move_is_never_new():
     still = candidate(velocity_m_s=(0.0, 0.0, 0.0), moves=False)
-    assert assign([still], lost()) == [NO_DRONE]
-    # Neither is it a lost drone that may be anywhere: a chair that a person has moved is as likely.
-    assert assign([still], lost(((2.0, 2.0, 1.0), (0.0, 1.0, 0.0), 20.0))) == [NO_DRONE]
-    # It is the drone that stood there when it was lost, after any time.
-    assert assign([still], lost(((0.0, 0.1, 1.0), (0.05, 0.0, 0.0), 20.0))) == [0]
+    assert assigned_drones([still], lost()) == [NO_DRONE]
+    # The lost drone may be anywhere by then, so the candidate may as well be a chair that a person has moved.
+    assert assigned_drones([still], lost(((2.0, 2.0, 1.0), (0.0, 1.0, 0.0), 20.0))) == [NO_DRONE]
+    # A drone that stood at the candidate's place when it was lost is assigned, after any time.
+    assert assigned_drones([still], lost(((0.0, 0.1, 1.0), (0.05, 0.0, 0.0), 20.0))) == [0]
 
 
 def test_a_ghost_is_not_the_drone_that_departed_from_it():
@@ -434,9 +434,9 @@ def test_a_ghost_is_not_the_drone_that_departed_from_it():
     stood = ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 20.0)
     ghost = candidate((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), moves=False)
     drone = candidate((0.5, 0.0, 1.0), (1.0, 0.0, 0.0), frame=5)
-    assert assign([ghost, drone], lost(stood)) == [NO_DRONE, 0]
+    assert assigned_drones([ghost, drone], lost(stood)) == [NO_DRONE, 0]
     passing_by = candidate((0.5, 0.0, 1.0), (0.0, 1.0, 0.0), frame=5)
-    assert assign([ghost, passing_by], lost(stood)) == [0, NEW]
+    assert assigned_drones([ghost, passing_by], lost(stood)) == [0, NEW]
 
 
 def test_a_drone_that_stood_still_when_it_was_lost_has_stayed():
@@ -447,49 +447,49 @@ def test_a_drone_that_stood_still_when_it_was_lost_has_stayed():
     coming = candidate((0.0, -2.7, 2.7), (0.0, 0.0, -2.0))
     stood = ((0.0, 0.3, 1.5), (0.0, 0.0, 0.0), 2.6)
     flew = ((0.0, 0.3, 1.5), (0.0, 0.0, 2.0), 2.6)
-    assert assign([coming], lost(stood)) == [NEW]
-    assert assign([coming], lost(flew)) == [0]
+    assert assigned_drones([coming], lost(stood)) == [NEW]
+    assert assigned_drones([coming], lost(flew)) == [0]
     # If no drone can be new, it is the drone that stood still; of two lost drones, it is the one that flew.
-    assert assign([coming], lost(stood), max_births=0) == [0]
-    assert assign([coming], lost(stood, flew)) == [1]
+    assert assigned_drones([coming], lost(stood), max_births=0) == [0]
+    assert assigned_drones([coming], lost(stood, flew)) == [1]
 
 
 def test_a_ghost_that_seems_to_move_is_no_drone():
-    """While the drone overlaps its ghost, the ghost seems to creep upwards; the drone is the faster candidate."""
+    """While the drone overlaps its ghost, the ghost seems to move slowly upwards; the drone is the faster candidate."""
     stood = ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 20.0)
     ghost = candidate((0.0, 0.0, 1.05), (0.0, -0.02, 0.13))
     drone = candidate((0.1, 0.0, 1.3), (0.1, 0.0, 1.5), frame=9)
-    assert assign([ghost, drone], lost(stood)) == [NO_DRONE, 0]
-    assert assign([ghost, drone], lost()) == [NO_DRONE, NEW]
+    assert assigned_drones([ghost, drone], lost(stood)) == [NO_DRONE, 0]
+    assert assigned_drones([ghost, drone], lost()) == [NO_DRONE, NEW]
     # A slow and a fast drone at different places are two drones.
     elsewhere = candidate((1.0, 0.0, 1.3), (0.1, 0.0, 1.5), frame=9)
-    assert assign([ghost, elsewhere], lost(stood)) == [0, NEW]
+    assert assigned_drones([ghost, elsewhere], lost(stood)) == [0, NEW]
 
 
-def test_a_dying_ghost_is_not_new():
+def test_a_fading_ghost_is_not_new():
     """While the background model learns the floor again, the rest of the ghost seems to move."""
     dying = candidate((2.2, 1.4, 1.5), (-0.1, 0.04, 0.01))
-    assert assign([dying], lost(left_m=[(2.2, 1.3, 1.5)])) == [NO_DRONE]
-    # A slow drone elsewhere is new, and so is a fast drone there; a drone that was lost there may be found again.
-    assert assign([dying], lost(left_m=[(1.2, 1.3, 1.5)])) == [NEW]
-    assert assign([candidate((2.2, 1.4, 1.5))], lost(left_m=[(2.2, 1.3, 1.5)])) == [NEW]
+    assert assigned_drones([dying], lost(left_m=[(2.2, 1.3, 1.5)])) == [NO_DRONE]
+    # A slow candidate elsewhere is new, and so is a fast candidate at this place; a drone lost here may be found again.
+    assert assigned_drones([dying], lost(left_m=[(1.2, 1.3, 1.5)])) == [NEW]
+    assert assigned_drones([candidate((2.2, 1.4, 1.5))], lost(left_m=[(2.2, 1.3, 1.5)])) == [NEW]
     stood = ((2.2, 1.3, 1.5), (0.0, 0.0, 0.0), 5.0)
-    assert assign([dying], lost(stood, left_m=[(2.2, 1.3, 1.5)])) == [0]
+    assert assigned_drones([dying], lost(stood, left_m=[(2.2, 1.3, 1.5)])) == [0]
 
 
 def test_a_ghost_does_not_keep_a_track():
     """A drone found again at the place of its loss may be a ghost; a candidate that departs from there is the drone."""
     held = ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 20.0, {"doubtful": True})
-    assert assign([candidate((0.6, 0.0, 1.0))], lost(held)) == [0]
-    assert assign([candidate((0.6, 0.0, 1.0), (0.0, 1.0, 0.0))], lost(held)) == [NEW]
-    assert assign([candidate((2.0, 0.0, 1.0))], lost(held), max_births=0) == [NO_DRONE]
+    assert assigned_drones([candidate((0.6, 0.0, 1.0))], lost(held)) == [0]
+    assert assigned_drones([candidate((0.6, 0.0, 1.0), (0.0, 1.0, 0.0))], lost(held)) == [NEW]
+    assert assigned_drones([candidate((2.0, 0.0, 1.0))], lost(held), max_births=0) == [NO_DRONE]
 
 
 def test_a_drone_that_was_tracked_elsewhere_at_the_same_time_is_another_drone():
     """The drone is lost in frame 20 of the chunk, and the candidate is there from frame 2 on: both for 0.7 s."""
     here = ((0.3, 0.0, 1.0), (1.0, 0.0, 0.0), -20 / FPS)
-    assert assign([candidate(frame=2)], lost(here)) == [NEW]
-    assert assign([candidate(frame=18)], lost(here)) == [0]
+    assert assigned_drones([candidate(frame=2)], lost(here)) == [NEW]
+    assert assigned_drones([candidate(frame=18)], lost(here)) == [0]
 
 
 def oracle_log_density(one, position_m, velocity_m_s, gap_s, sigma_m_s, time_s=1.0):
@@ -544,14 +544,14 @@ def test_the_assignment_has_the_largest_likelihood(seed):
         ]
     )
     best = max(permutations(range(3)), key=lambda columns: score[range(3), columns].sum())
-    assert assign(found, gone, max_births=0) == list(best)
+    assert assigned_drones(found, gone, max_births=0) == list(best)
 
 
 # --- lost drones and planned starts
 
 
 def history(*rows):
-    """(frames, drones), whether each drone was tracked, from words of x and dots."""
+    """Whether each drone was tracked, (frames, drones), from strings of `x` (tracked) and dots (not tracked)."""
     return np.array([[letter == "x" for letter in row] for row in rows]).T
 
 
@@ -575,7 +575,7 @@ def test_lost_drones_by_hand():
 
 
 def test_a_track_that_never_moved_where_a_drone_was_is_false():
-    """One track stands; one lands at its place; one passes above; one hovers elsewhere. The first is false."""
+    """One track stands still; one lands at its place; one passes above; one hovers elsewhere. The first is false."""
     position = np.full((12, 4, 3), np.nan)
     position[:6, 0] = (1.0, 0.0, 0.1)
     position[:8, 1] = (1.0, 0.0, 0.1)
@@ -596,8 +596,10 @@ def test_a_track_that_never_moved_where_a_drone_was_is_false():
 
 
 def test_a_drone_that_the_background_learns_only_seems_to_move():
-    """Ten frames at 10 frames per second. One drone stood until the rest of its blob crept away; one flew slowly; one
-    stopped; one has just landed.
+    """Ten frames at 10 frames per second, with four drones.
+
+    The first drone stood still until the rest of its blob moved slowly away; the second flew slowly; the third stopped;
+    the fourth has just landed.
     """
     position = np.zeros((12, 4, 3))
     position[..., 1] = (0.0, 1.0, 2.0, 3.0)
