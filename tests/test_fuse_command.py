@@ -18,7 +18,7 @@ from psotrack.trajectories import read_trajectories, write_trajectories
 def files(tmp_path_factory):
     """Two paths, the tracks with an identity swap at frame 60, and the ground truth."""
     folder = tmp_path_factory.mktemp("fuse")
-    paths, outside, truths = recording(31, 100, num_drones=2, apart_m=1.5)
+    paths, outside, truths = recording(31, 100, num_drones=2, distance_m=1.5)
     outside.position_m[60:, [0, 1]] = outside.position_m[60:, [1, 0]]
     paths["dron1"] = without(paths["dron1"], slice(20, 30))
     write_trajectories(folder / "tracks.csv", unseen(outside, slice(80, 90)))
