@@ -12,7 +12,7 @@ import pytest
 import trimesh
 import yaml
 from click.testing import CliRunner
-from helpers import far_camera, rig_of, ring_rig
+from helpers import far_camera, make_unnamed_rig, ring_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -29,7 +29,7 @@ from psotrack.simulation.scenarios import Mesh
 from psotrack.trajectories import Trajectories
 
 #: 100 x 80 pixels, 10 to the metre, from y = -1000 m: x is to the right, z is up.
-FAR = rig_of(far_camera(image_size_wh=(100, 80), pixels_per_m=10.0)).cameras
+FAR = make_unnamed_rig(far_camera(image_size_wh=(100, 80), pixels_per_m=10.0)).cameras
 CUBE = LabelSettings(drone_size_m=(2.0, 2.0, 2.0))
 SIZE_M = (0.6, 0.4, 0.3)
 
@@ -173,7 +173,7 @@ def test_points_far_outside_are_not_mapped_into_the_image():
     assert (pixel > 0).all()
     assert (pixel < (1924, 1082)).all()
     small = LabelSettings(drone_size_m=(0.3, 0.3, 0.2))
-    cameras = rig_of(bent).cameras
+    cameras = make_unnamed_rig(bent).cameras
     assert np.isnan(labelled(aside, cameras=cameras, settings=small)).all()
     # A drone in the corner of the image has a label.
     corner = np.array([1.0, -0.8, 0.4]) * 4

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import draw_coverage, far_camera, float32, rig_of, ring_rig
+from helpers import draw_coverage, far_camera, float32, make_unnamed_rig, ring_rig
 from hypothesis import example, given
 from hypothesis import strategies as st
 from windows import (
@@ -208,7 +208,12 @@ def test_the_level_is_the_finest_that_contains_ring_and_search(distance_m, reach
     camera.K[:2, 2] += shift_px
     image = np.zeros((1, 240, 320), np.uint8)
     patches = cut_at(
-        rig_of(camera), image, np.zeros((1, 3)), np.full((1, 3), size), reach_m=reach_m, reduction=REDUCTION
+        make_unnamed_rig(camera),
+        image,
+        np.zeros((1, 3)),
+        np.full((1, 3), size),
+        reach_m=reach_m,
+        reduction=REDUCTION,
     )
     level, pixel_px = levels(patches, REDUCTION).item(), patches.pixel_px.item()
     # Tangents to a ball from outside. If the ball moves by its radius, its image moves by at most half its width.

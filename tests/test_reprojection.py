@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from helpers import LENSES, moved, rig_of, ring_rig
+from helpers import LENSES, make_unnamed_rig, move_world, ring_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
@@ -58,7 +58,7 @@ def varied_rig(num_cameras):
                 dist=dist,
             )
         )
-    return rig_of(*cameras)
+    return make_unnamed_rig(*cameras)
 
 
 # --- the image and its derivative
@@ -285,7 +285,7 @@ def epipolar_direction(rig, of, to, point):
 
 
 def test_of_three_views_the_wrong_one_is_found_only_if_the_others_alone_agree():
-    rig, point = rig_of(*(ring_rig(5).cameras[i] for i in (0, 1, 3))), np.array([0.2, 0.1, 1.2])
+    rig, point = make_unnamed_rig(*(ring_rig(5).cameras[i] for i in (0, 1, 3))), np.array([0.2, 0.1, 1.2])
     exact = pixels_of(rig, point)
     along = [epipolar_direction(rig, 0, to, point) for to in (1, 2)]
     # The error is across both epipolar lines: neither of the other views agrees with the wrong view.
@@ -309,7 +309,7 @@ def test_two_cameras_at_one_position_do_not_outvote_a_third():
     one, other = (ring_rig(5).cameras[i] for i in (0, 2))
     T = one.T_cam_world.copy()
     T[:3, 3] += (0.02, 0.0, 0.0)
-    rig, point = rig_of(one, replace(one, T_cam_world=T), other), np.array([0.2, 0.1, 1.2])
+    rig, point = make_unnamed_rig(one, replace(one, T_cam_world=T), other), np.array([0.2, 0.1, 1.2])
     pixels = pixels_of(rig, point)
     x, y = epipolar_direction(rig, 2, 0, point)
     pixels[2] += 40 * np.array([-y, x])
@@ -353,7 +353,7 @@ def test_too_few_views_is_nan(num_seeing):
 
 def test_rays_from_one_position_are_nan():
     one = ring_rig(3).cameras[0]
-    rig = rig_of(one, one, one)
+    rig = make_unnamed_rig(one, one, one)
     found = reconstruct(rig.cameras, pixels_of(rig, points_in_room(3)))
     assert np.isnan(found.position_m).all()
     assert not found.used.any()
@@ -366,13 +366,13 @@ def test_rays_that_meet_behind_the_cameras_are_nan_and_a_camera_that_looks_away_
     for centre, target in looks.values():
         R, t_m = look_at(centre, target)
         spread.append(make_camera(R=R, t_m=t_m, K=K, image_size_wh=(320, 240)))
-    found = reconstruct(rig_of(*spread).cameras, np.full((2, 2, 2), 130.0))
+    found = reconstruct(make_unnamed_rig(*spread).cameras, np.full((2, 2, 2), 130.0))
     assert np.isnan(found.position_m).all()
     # The point is behind the last camera, whose pixel belongs to another object.
     ring = ring_rig(5)
     R, t_m = look_at((0.0, 3.0, 1.2), (0.0, 6.0, 1.2))
     away = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(320, 240))
-    rig, point = rig_of(*(ring.cameras[i] for i in range(4)), away), np.array([0.2, 0.1, 1.2])
+    rig, point = make_unnamed_rig(*(ring.cameras[i] for i in range(4)), away), np.array([0.2, 0.1, 1.2])
     pixels = np.concatenate([pixels_of(ring, point)[:4], [[160.0, 120.0]]])
     found = reconstruct(rig.cameras, pixels)
     assert found.used.tolist() == [True] * 4 + [False]
@@ -429,7 +429,7 @@ def test_the_order_of_cameras_does_not_matter(seed):
 def test_points_move_with_the_world(seed):
     rig, pixels = some_views(seed)
     R, shift_m = Rotation.random(rng=seed).as_matrix(), np.random.default_rng(seed).normal(size=3) * 10
-    one, other = reconstruct(rig.cameras, pixels), reconstruct(moved(rig, R, shift_m).cameras, pixels)
+    one, other = reconstruct(rig.cameras, pixels), reconstruct(move_world(rig, R, shift_m).cameras, pixels)
     np.testing.assert_array_equal(one.used, other.used)
     np.testing.assert_allclose(one.position_m @ R.T + shift_m, other.position_m, rtol=0, atol=2e-6)
     np.testing.assert_allclose(R @ one.covariance_m2 @ R.T, other.covariance_m2, rtol=1e-3, atol=1e-9)

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from helpers import rig_of, ring_rig
+from helpers import make_unnamed_rig, ring_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -417,7 +417,7 @@ def recording(tmp_path_factory):
     one = make_camera(
         R=R, t_m=t_m, K=np.diag([1100.0, 1100.0, 1.0]), image_size_wh=(64, 48), dist=(0.0, 0.0, 0.0, 0.0)
     )
-    dpjait.write_calibration(folder / dpjait.CALIBRATION, rig_of(one), "mm")
+    dpjait.write_calibration(folder / dpjait.CALIBRATION, make_unnamed_rig(one), "mm")
     with VideoWriter(folder / "0.avi", FPS, (64, 48)) as writer:
         for _ in range(150):
             writer.write(np.zeros((48, 64, 3), np.uint8))

@@ -5,7 +5,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from helpers import ROOM_M, draw_coverage, float32, rig_of, ring_rig
+from helpers import ROOM_M, draw_coverage, float32, make_unnamed_rig, ring_rig
 from scipy.linalg import expm
 from scipy.stats import multivariate_normal, norm
 
@@ -204,7 +204,7 @@ def test_three_viewpoints_are_enough_and_two_are_not():
     first, second = three.cameras[0], three.cameras[1]
     T = second.T_cam_world.copy()
     T[0, 3] += 0.1
-    twin = rig_of(first, second, replace(second, T_cam_world=T))
+    twin = make_unnamed_rig(first, second, replace(second, T_cam_world=T))
     images = np.concatenate([drawn(OTHER, rig=three)[:, :2], drawn(OTHER, rig=three)[:, 1:2]], axis=1)
     assert candidates_in(images, rig=twin) == ()
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from helpers import LENSES, ROOM_M, rig_of, ring_rig
+from helpers import LENSES, ROOM_M, make_unnamed_rig, ring_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -122,7 +122,7 @@ def test_too_few_cameras_is_nan(num_seeing):
 def test_rays_from_one_position_are_nan():
     """Two cameras at one position see a point along one ray, without depth. So does a single camera with weight."""
     one = ring_rig(3).cameras[0]
-    rig = rig_of(one, one)
+    rig = make_unnamed_rig(one, one)
     pixels = pixels_of(rig, points_in_room(3))
     assert np.isnan(triangulate(rig.cameras, pixels)).all()
     rig = ring_rig(3)
@@ -208,7 +208,7 @@ def test_a_path_that_one_camera_sees_is_nan():
 
 def test_cameras_side_by_side_share_a_viewpoint():
     rig = ring_rig(4)
-    doubled = rig_of(*(rig.cameras[i] for i in (0, 1, 0, 2, 1, 3)))
+    doubled = make_unnamed_rig(*(rig.cameras[i] for i in (0, 1, 0, 2, 1, 3)))
     label = viewpoints(doubled.cameras)
     assert label[0] == label[2]
     assert label[1] == label[4]
@@ -276,12 +276,12 @@ def test_missing_and_false_points(seed):
 def test_two_cameras_at_one_position_do_not_count_twice():
     """Three cameras at two positions see a point: two viewpoints are too few."""
     rig, drones = ring_rig(5), points_in_room(1)
-    doubled = rig_of(*(rig.cameras[i] for i in (0, 0, 2)))
+    doubled = make_unnamed_rig(*(rig.cameras[i] for i in (0, 0, 2)))
     points, _ = observed(doubled, drones, 0)
     radius = [np.full(len(p), 4.0) for p in points]
     assert match_views(doubled.cameras, points, radius, ROOM_M)[0].shape == (0, 3)
     assert len(match_views(doubled.cameras, points, radius, ROOM_M, min_viewpoints=2)[0]) == 1
-    third = rig_of(*(rig.cameras[i] for i in (0, 1, 2)))
+    third = make_unnamed_rig(*(rig.cameras[i] for i in (0, 1, 2)))
     points, _ = observed(third, drones, 0)
     assert len(match_views(third.cameras, points, radius, ROOM_M)[0]) == 1
 
@@ -306,7 +306,7 @@ def test_the_order_of_cameras_and_points_does_not_matter(seed):
 
 def test_a_point_that_two_drones_share_does_not_hide_them():
     """One camera sees the middle of two drones. The point on which the other two cameras agree remains a candidate."""
-    rig = rig_of(*(ring_rig(5).cameras[i] for i in (0, 1, 3)))
+    rig = make_unnamed_rig(*(ring_rig(5).cameras[i] for i in (0, 1, 3)))
     drones = np.array([[0.3, 0.2, 1.4], [0.1, -0.1, 1.3]])
     pixels = pixels_of(rig, drones)
     points = [pixels[:, 0].mean(axis=0)[None], pixels[:, 1], pixels[:, 2]]
