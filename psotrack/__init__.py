@@ -20,7 +20,8 @@ Cameras
 Inside-out
     localise_video, read_marker_map, MarkerMap, detect_markers
 Bring your own
-    Search, SearchRegion, Score, ScoreInputs, Method, MethodInputs, BackgroundModel, Detector, background_model
+    Search, SearchRegion, Score, ScoreInputs, Method, MethodInputs, BackgroundModel, Detector, background_model,
+    register_plugin
 
 Names are loaded when they are first used. Importing the package has no effects: no device is chosen and no setting of
 JAX is changed. Every part of the package is a room with its own documentation: `help(psotrack.tracking)`, for example.

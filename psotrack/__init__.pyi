@@ -18,6 +18,7 @@ from .settings import (
 )
 from .silhouettes import BackgroundModel
 from .simulation import simulate
+from .support import register_plugin
 from .tracking import Score, ScoreInputs, Search, SearchRegion
 from .trajectories import Trajectories, read_trajectories, write_trajectories
 
@@ -58,6 +59,7 @@ __all__ = [
     "read_recording",
     "read_rig",
     "read_trajectories",
+    "register_plugin",
     "simulate",
     "track",
     "track_runs",

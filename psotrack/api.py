@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from psotrack.datasets.dpjait import read_sequence
+from psotrack.detection import Detector
 from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
 from psotrack.methods import Method
 from psotrack.pipeline import Parts, TrackedRecording, track_recording
@@ -28,12 +29,14 @@ class BroughtParts(TypedDict, total=False):
         score: the score of positions in single cameras (see `Score`).
         method: the method of tracking (see `Method`).
         background: the background model (see `BackgroundModel`).
+        detector: the detector of drones in images (see `Detector`).
     """
 
     search: Search
     score: Score
     method: Method
     background: BackgroundModel
+    detector: Detector
 
 
 def read_recording(
@@ -69,10 +72,10 @@ def track(
     Args:
         recording: from `read_recording`, or its folder.
         settings: settings, or dotted names and values such as {"swarm.particles": 50}; None takes the defaults.
-        cache: folder of stored silhouettes; None takes the user's cache folder.
+        cache: folder of stored silhouettes and detections; None takes the user's cache folder.
         jobs: number of processes for the silhouettes; None is one per processor.
         progress: whether to show progress bars.
-        **brought: parts that the caller brings: `search`, `score`, `method`, `background`.
+        **brought: parts that the caller brings: `search`, `score`, `method`, `background`, `detector`.
 
     Raises:
         InputError: a file cannot be used, or no drones are found.

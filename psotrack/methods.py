@@ -1,7 +1,7 @@
 """The methods: from the inputs of a run to tracks, by the swarm, by projection lines, or by both.
 
-`Method` is the interface of further methods, given to `psotrack.track(..., method=...)`, or by name as entry points
-of the group `psotrack.methods`.
+`Method` is the interface of further methods, given to `psotrack.track(..., method=...)`, or by name as plugins (see
+`psotrack.support.plugins`).
 """
 
 from __future__ import annotations
@@ -28,9 +28,6 @@ from psotrack.silhouettes import Silhouettes
 from psotrack.support import Report, digest_file, no_progress
 from psotrack.tracking import RunInputs, track_silhouettes
 from psotrack.trajectories import Tracks
-
-#: Group of entry points that adds methods by name.
-METHODS = "psotrack.methods"
 
 
 @dataclass(frozen=True)
@@ -71,16 +68,16 @@ class MethodResult:
 
 @dataclass(frozen=True)
 class MethodInputs:
-    """What a method is given for one run.
+    """Inputs of a method for one run.
 
     Attributes:
-        rig: the cameras.
-        silhouettes: of all cameras; None where the method needs none.
-        sightings: detections of all cameras; None where the method needs none.
-        initial: state of the drones at frame 0.
+        rig: the cameras, calibrated.
+        silhouettes: silhouettes of all cameras (`Silhouettes.read` gives the coverage of some frames, 0 to 255).
+        sightings: detections of all cameras in all frames; None for a method that does not read detections.
+        initial: positions, velocities and sizes of the drones at frame 0, (drones, 3), metres and m/s.
         bounds_m: (2, 3), lowest and highest corner of the room, metres.
         fps: frames per second.
-        settings: of the run.
+        settings: settings of the run; the seed of random numbers is `settings.seed`.
     """
 
     rig: Rig
@@ -94,7 +91,10 @@ class MethodInputs:
 
 @runtime_checkable
 class Method(Protocol):
-    """A method of tracking: called once per run.
+    """A method of tracking: from silhouettes or detections of the whole recording to tracks.
+
+    A method is called once per run, outside of any compiled function; its inputs and results are NumPy arrays. The
+    stages after the method (identity, smoothing, body offset, record) are the same for all methods.
 
     Attributes:
         reads_detections: whether the method is given detections, besides silhouettes.
@@ -104,7 +104,16 @@ class Method(Protocol):
     def reads_detections(self) -> bool: ...  # noqa: D102
 
     def __call__(self, inputs: MethodInputs, report: Report = no_progress) -> Tracks:
-        """The tracks of all frames."""
+        """Track the drones through all frames.
+
+        Args:
+            inputs: inputs of the run.
+            report: shows progress: `with report("name", num_frames) as advance:`, then `advance(1)` per frame.
+
+        Returns:
+            Tracks of all frames, with as many drones as the method found. NaN stands for numbers that the method does
+            not have.
+        """
         ...
 
 

@@ -23,6 +23,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
+from psotrack.detection import Detector, stored_detections
 from psotrack.errors import InputError, SettingsError
 from psotrack.identity import Identities, postprocess
 from psotrack.initiation import (
@@ -35,7 +36,6 @@ from psotrack.initiation import (
     start_source,
 )
 from psotrack.methods import (
-    METHODS,
     DetectionInputs,
     Method,
     MethodInputs,
@@ -48,9 +48,9 @@ from psotrack.methods import (
 )
 from psotrack.projection_lines import LineSettings
 from psotrack.recordings import Recording
-from psotrack.settings import TrackSettings
+from psotrack.settings import YOLO, TrackSettings
 from psotrack.silhouettes import BackgroundModel, Silhouettes, compute
-from psotrack.support import Report, load_plugin, no_progress, plugin_names
+from psotrack.support import Report, check_interface, identify, make_plugin, no_progress
 from psotrack.tracking import RunInputs, Score, Search, tracker_settings
 from psotrack.trajectories import DroneSizes, Trajectories
 
@@ -66,13 +66,39 @@ class Parts:
         search: the search in one frame.
         score: the score of positions in single cameras.
         method: the method of tracking.
-        background: the background model that makes the silhouettes.
+        background: the background model that makes the silhouettes; only `track_recording` makes silhouettes.
+        detector: makes the detections; only `track_recording` makes detections.
+
+    Raises:
+        SettingsError: a part lacks an attribute or a method of its interface.
     """
 
     search: Search | None = None
     score: Score | None = None
     method: Method | None = None
     background: BackgroundModel | None = None
+    detector: Detector | None = None
+
+    def __post_init__(self) -> None:
+        for kind, interface in _INTERFACES.items():
+            if getattr(self, kind) is not None:
+                check_interface(kind, getattr(self, kind), interface)
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """Identities of the parts that the caller brings, by kind, fit for JSON."""
+        brought = {kind: getattr(self, kind) for kind in _INTERFACES}
+        return {kind: identify(part) for kind, part in brought.items() if part is not None}
+
+
+#: Interface of each of `Parts`.
+_INTERFACES: dict[str, type] = {
+    "search": Search,
+    "score": Score,
+    "method": Method,
+    "background": BackgroundModel,
+    "detector": Detector,
+}
 
 
 @dataclass(frozen=True)
@@ -113,7 +139,7 @@ def track_recording(
     Args:
         recording: checked for use (see `Recording.usable`).
         settings: of the run.
-        cache: folder of the stored silhouettes.
+        cache: folder of the stored silhouettes and detections.
         jobs: number of processes for the silhouettes; None is one per processor.
         parts: parts that the caller brings.
         report: told of the frames of each stage.
@@ -124,6 +150,10 @@ def track_recording(
         OutputError: the silhouettes cannot be stored.
     """
     began = time.perf_counter()
+    if parts.detector is not None:
+        _check_detector_is_used(settings, parts)
+        folder = stored_detections(parts.detector, recording, cache=cache, report=report)
+        settings = msgspec.structs.replace(settings, detections=str(folder))
     silhouettes = None
     if settings.needs_silhouettes:
         silhouettes = compute(
@@ -212,7 +242,9 @@ def track_runs(
                 recording.rig, silhouettes, sightings, initial[run], bounds_m[run], fps, settings[run]
             )
             results[run] = track_by_plugin(method, inputs_of_run, report)
-    return [_finished(recording, settings[run], results[run], bounds_m[run], silhouettes) for run in runs]
+    return [
+        _finished(recording, settings[run], parts, results[run], bounds_m[run], silhouettes) for run in runs
+    ]
 
 
 def environment() -> dict[str, Any]:
@@ -239,11 +271,22 @@ def _other_method(settings: TrackSettings, parts: Parts) -> Method | None:
         return parts.method
     if settings.method in BUILT_IN_METHODS:
         return None
-    method: Method | None = load_plugin(METHODS, settings.method)
-    if method is None:
-        names = ", ".join([*BUILT_IN_METHODS, *plugin_names(METHODS)])
-        raise SettingsError("method", expected=f"one of {names}", found=settings.method)
+    method: Method = make_plugin(
+        "method", settings.method, settings, interface=Method, setting="method", built_in=BUILT_IN_METHODS
+    )
     return method
+
+
+def _check_detector_is_used(settings: TrackSettings, parts: Parts) -> None:
+    """Raise `SettingsError` if a detector is brought, but the method reads no detections or reads other ones."""
+    method = _other_method(settings, parts)
+    if not (_tracks_detections(settings, parts) if method is None else method.reads_detections):
+        name = settings.method if method is None else type(method).__name__
+        expected = "a method that reads detections, such as projection-lines or fused"
+        raise SettingsError("detector", expected=expected, found=f"method {name}")
+    if settings.detections != YOLO:
+        found = f"detections {settings.detections} as well"
+        raise SettingsError("detector", expected="detections from one source", found=found)
 
 
 def _detections(
@@ -302,6 +345,7 @@ def _initial_states(
 def _finished(
     recording: Recording,
     settings: TrackSettings,
+    parts: Parts,
     result: MethodResult | None,
     bounds_m: Float[np.ndarray, "2 3"],
     silhouettes: Silhouettes | None,
@@ -330,6 +374,7 @@ def _finished(
         "frames": trajectories.num_frames,
         "cameras": list(recording.rig.names),
         "settings": msgspec.to_builtins(settings),
+        **({"parts": parts.record} if parts.record else {}),
         "seed": settings.seed,
         "start": {name: value.tolist() for name, value in vars(result.initial).items()},
         "bounds_m": bounds_m.tolist(),

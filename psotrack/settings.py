@@ -93,7 +93,7 @@ class SwarmSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """The search for the best positions in one frame: a particle swarm, or another search.
 
     Attributes:
-        search: name of the search: "pso", or the name of an entry point of the group `psotrack.searches`.
+        search: name of the search: "pso", or the name of a plugin.
         kind: "joint", one swarm over the positions of all drones as in the paper, or "per-drone", one for each drone.
         particles: number of particles of every swarm.
         iterations: number of iterations per frame.
@@ -125,7 +125,7 @@ class ScoreSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     Attributes:
         kind: name of the score: "soft", concentric windows; "hard", the paper's one box in whole pixels; or the name of
-            an entry point of the group `psotrack.scores`.
+            a plugin.
         windows: scales of a drone's box that the soft score compares with the foreground.
         occlusion: whether foreground that another drone is expected to cover is left out of a drone's score.
         vertex: whether a drone's position is the vertex of a paraboloid through the scores about the best position
@@ -236,7 +236,7 @@ class TrackSettings(
 
     Attributes:
         method: "swarm", particles over silhouettes; "projection-lines", triangulated detections; "fused", both,
-            weighted by their covariances; or the name of an entry point of the group `psotrack.methods`.
+            weighted by their covariances; or the name of a plugin.
         detections: source of the detections of the projection lines: "yolo", those that came with the sequence; "blobs"
             of its silhouettes; or a folder with a CSV file for each camera.
         seed: of the random numbers of the swarm.

@@ -270,8 +270,8 @@ class TestTracking:
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
-            ((), r"--detector: expected --method projection-lines or fused.*found --method swarm"),
-            (("--method", "fused", "--detections", "blobs"), r"--detector: .* found --detections blobs"),
+            ((), r"detector: expected .* such as projection-lines or fused, found method swarm"),
+            (("--method", "fused", "--detections", "blobs"), r"detector: .* found detections blobs"),
         ],
     )
     def test_detector_options_that_are_not_used(self, models, seen, tmp_path, arguments, message):

@@ -23,11 +23,11 @@ from psotrack.cli.output import output_json, print_line, report_to
 @SEQUENCE
 @click.option(
     "--detector",
-    "model",
-    type=click.Path(path_type=Path),
+    "chosen",
     required=True,
-    metavar="MODEL.onnx",
-    help="YOLO network (v5 to v11) that was trained on drones.",
+    metavar="MODEL.onnx|NAME",
+    help="YOLO network (v5 to v11) that was trained on drones, or the detector that an installed package adds under "
+    "NAME.",
 )
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the detections.")
 @click.option(
@@ -58,7 +58,7 @@ from psotrack.cli.output import output_json, print_line, report_to
 @JSON
 def detect(
     sequence: Path,
-    model: Path,
+    chosen: str,
     out: Path,
     confidence: float,
     nms: float,
@@ -78,12 +78,12 @@ def detect(
       psotrack detect data/Simulated_Data/S02_D4_A --detector drones.onnx --out boxes
       psotrack detect data/Real_Data/R12_D4 --detector drones.onnx --out boxes --size 1280 --confidence 0.4
     """
-    from psotrack.detection import DetectorSettings, OnnxDetector
+    from psotrack.detection import DetectorSettings, find_detector
     from psotrack.detection import detect_drones as detect_in
     from psotrack.recordings import write_detections
     from psotrack.support import refuse_to_overwrite
 
-    detector = OnnxDetector(model, DetectorSettings(confidence, nms, size))
+    detector = find_detector(chosen, DetectorSettings(confidence, nms, size))
     recording = usable_recording(sequence, cameras, num_frames)
     files = {name: out / f"{video.path.stem}.csv" for name, video in recording.videos.items()}
     for path in files.values():

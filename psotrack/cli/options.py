@@ -89,6 +89,13 @@ FRAMES = click.option(
 )
 
 
+BACKGROUND = click.option(
+    "--background",
+    default="mog2",
+    show_default=True,
+    metavar="mog2|NAME",
+    help="MOG2, or the background model that an installed package adds under NAME.",
+)
 FOV = click.option(
     "--fov",
     "fov_deg",

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from psotrack.cli.options import (
+    BACKGROUND,
     CACHE,
     CAMERAS,
     FORCE,
@@ -27,6 +28,7 @@ from psotrack.silhouettes import SilhouetteSettings
 @click.command()
 @SEQUENCE
 @silhouette_options
+@BACKGROUND
 @CAMERAS
 @FRAMES
 @CACHE
@@ -43,26 +45,28 @@ def silhouettes(
     quiet: bool,
     force: bool,
     json_path: Path | None,
+    background: str,
     **settings: Any,
 ) -> None:
     """Compute and store the silhouettes of SEQ, which `track` reads.
 
-    Silhouettes are stored under a key of the video's content and all settings. A second call finds the stored
-    silhouettes; with a changed setting new silhouettes are computed.
+    Silhouettes are stored under a key of the video's content, all settings and the background model. A second call
+    finds the stored silhouettes; with a changed setting new silhouettes are computed.
 
     \b
     Examples:
       psotrack silhouettes data/Simulated_Data/S02_D4_A
       psotrack silhouettes data/Simulated_Data/S02_D4_A --shadows drop --json -
     """
-    from psotrack.silhouettes import compute
+    from psotrack.silhouettes import compute, find_background
 
-    where = cache_folder(cache)
+    where, chosen = cache_folder(cache), SilhouetteSettings(**settings)
     stored = compute(
         usable_recording(sequence, cameras, num_frames),
-        SilhouetteSettings(**settings),
+        chosen,
         cache=where,
         jobs=jobs,
+        background=find_background(background, chosen),
         report=report_to(quiet),
     )
     content = {

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 import click
-import msgspec
 
 from psotrack.cli.options import (
+    BACKGROUND,
     CACHE,
     CAMERAS,
     DETECTOR_SIZE,
@@ -29,10 +29,7 @@ from psotrack.cli.output import output_json, print_line, report_to, write_json
 from psotrack.errors import SettingsError
 from psotrack.settings import RENAMED, SwarmKind, TrackSettings
 from psotrack.silhouettes import SilhouetteSettings
-from psotrack.support import Report, refuse_to_overwrite
-
-if TYPE_CHECKING:
-    from psotrack.recordings import Recording
+from psotrack.support import refuse_to_overwrite
 
 
 @click.command()
@@ -60,10 +57,9 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--detector",
-    "model",
-    type=click.Path(path_type=Path),
-    metavar="MODEL.onnx",
-    help="Instead of --detections: a YOLO network (v5 to v11) that finds the drones; what it finds is kept.",
+    metavar="MODEL.onnx|NAME",
+    help="Instead of --detections: a YOLO network (v5 to v11) that finds the drones, or the detector that an installed "
+    "package adds under NAME; the detections are kept.",
 )
 @click.option(
     "--detector-size",
@@ -141,6 +137,7 @@ if TYPE_CHECKING:
 )
 @click.option("--smooth", is_flag=True, default=TRACK.smooth, help="Let later frames correct earlier ones.")
 @silhouette_options
+@BACKGROUND
 @CAMERAS
 @FRAMES
 @CACHE
@@ -158,7 +155,8 @@ def track(
     force: bool,
     quiet: bool,
     json_path: Path | None,
-    model: Path | None,
+    background: str,
+    detector: str | None,
     detector_size: int,
     **settings: Any,
 ) -> None:
@@ -176,7 +174,9 @@ def track(
       psotrack track data/Real_Data/R12_D4 --out both.csv --method fused --detector drones.onnx --detector-size 1280
       psotrack track data/Simulated_Data/S02_D4_A --out paper.parquet --swarm joint --particles 100 --iterations 70
     """
-    from psotrack.pipeline import track_recording
+    from psotrack.detection import DetectorSettings, find_detector
+    from psotrack.pipeline import Parts, track_recording
+    from psotrack.silhouettes import find_background
     from psotrack.support import keep_compiled
     from psotrack.trajectories import write_ambiguity, write_trajectories
 
@@ -186,15 +186,17 @@ def track(
     for path in (out, record_path, ambiguity_path):
         refuse_to_overwrite(path, force)
     chosen = TrackSettings().changed({_setting_name(option): value for option, value in settings.items()})
-    where, usable = cache_folder(cache), usable_recording(sequence, cameras, num_frames)
-    if model is not None:
-        chosen = _with_detector(chosen, model, detector_size, usable, where, report_to(quiet))
+    parts = Parts(
+        background=find_background(background, chosen.silhouettes),
+        detector=None if detector is None else find_detector(detector, DetectorSettings(size=detector_size)),
+    )
     keep_compiled(compiled_folder(cache))
     tracked = track_recording(
-        usable,
+        usable_recording(sequence, cameras, num_frames),
         chosen,
-        cache=where,
+        cache=cache_folder(cache),
         jobs=jobs,
+        parts=parts,
         report=report_to(quiet),
     )
     write_trajectories(out, tracked.trajectories, force=force)
@@ -217,20 +219,3 @@ def _setting_name(option: str) -> str:
     if option in SilhouetteSettings.__struct_fields__:
         return f"silhouettes.{option}"
     return "swarm.search" if option == "search" else RENAMED.get(option, option)
-
-
-def _with_detector(
-    settings: TrackSettings, model: Path, size: int, sequence: Recording, cache: Path, report: Report
-) -> TrackSettings:
-    """The settings, with what a network finds in the videos for detections."""
-    from psotrack.detection import DetectorSettings, OnnxDetector, stored_detections
-
-    if settings.method == "swarm":
-        expected = "--method projection-lines or fused, which read detections"
-        raise SettingsError("--detector", expected=expected, found="--method swarm")
-    if settings.detections != TRACK.detections:
-        found = f"--detections {settings.detections} as well"
-        raise SettingsError("--detector", expected="detections from one source", found=found)
-    detector = OnnxDetector(model, DetectorSettings(size=size))
-    folder = stored_detections(detector, sequence, cache=cache, report=report)
-    return msgspec.structs.replace(settings, detections=str(folder))

@@ -25,7 +25,7 @@ from jaxtyping import Float, Int, UInt8
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.recordings import Detections, VideoInfo, read_frames
-from psotrack.support import Report, digest_file, no_progress
+from psotrack.support import Report, digest_file, make_plugin, no_progress
 
 #: Colour of YOLO's own letterbox borders.
 _GREY = (114, 114, 114)
@@ -63,8 +63,11 @@ class DetectorSettings:
 class Detector(Protocol):
     """Finds drones in images.
 
+    The detector works on NumPy arrays, outside of any compiled function, in the calling process, one frame at a time.
+
     Attributes:
-        key: everything on which the detections depend, as plain data fit for JSON. Detections are stored under it.
+        key: everything on which the detections depend, as plain data fit for JSON. Detections are stored under the
+            class's name and this key; with an equal key, stored detections are used again.
     """
 
     @property
@@ -73,7 +76,15 @@ class Detector(Protocol):
     def boxes(
         self, bgr: UInt8[np.ndarray, "height width 3"]
     ) -> tuple[Float[np.ndarray, "found 4"], Float[np.ndarray, "found"]]:
-        """Boxes (xyxy in pixels, see `psotrack.geometry.boxes`) and confidences in [0, 1] of the drones in an image."""
+        """Find the drones in an image.
+
+        Args:
+            bgr: (height, width, 3) uint8, the frame of one camera, blue first.
+
+        Returns:
+            Boxes (found, 4), xyxy in pixels of the frame: x0, y0, x1, y1 with 0 <= x0 < x1 <= width, edges as in
+            `psotrack.geometry.boxes`, where pixel 0 reaches from 0 to 1; and confidences (found,) in [0, 1].
+        """
         ...
 
 
@@ -182,6 +193,25 @@ class OnnxDetector:
             cv2.utils.logging.setLogLevel(level)
 
 
+def find_detector(name: str, settings: DetectorSettings) -> Detector:
+    """The detector that `--detector` names: an ONNX file, or a plugin.
+
+    Args:
+        name: path of an ONNX file, or name of a plugin.
+        settings: settings of the detection.
+
+    Raises:
+        InputError: the file does not exist, or OpenCV cannot read it.
+        SettingsError: there is neither such a file nor such a plugin.
+    """
+    if Path(name).suffix.lower() == ".onnx" or Path(name).exists():
+        return OnnxDetector(name, settings)
+    detector: Detector = make_plugin(
+        "detector", name, settings, interface=Detector, setting="detector", built_in=["MODEL.onnx (a file)"]
+    )
+    return detector
+
+
 def detect_drones(
     detector: Detector, name: str, video: VideoInfo, *, report: Report = no_progress
 ) -> Detections:
@@ -201,12 +231,26 @@ def detect_drones(
     scores: list[Float[np.ndarray, "_"]] = [np.empty(0)]
     with report(name, video.num_frames) as advance:
         for number, bgr in enumerate(read_frames(video)):
-            xyxy, score = detector.boxes(bgr)
+            xyxy, score = _checked_boxes(detector, number, *detector.boxes(bgr))
             frame.append(np.full(len(score), number))
             boxes.append(xyxy)
             scores.append(score)
             advance(1)
     return Detections(np.concatenate(frame), np.concatenate(boxes), np.concatenate(scores))
+
+
+def _checked_boxes(
+    detector: Detector, number: int, xyxy: object, score: object
+) -> tuple[Float[np.ndarray, "found 4"], Float[np.ndarray, "found"]]:
+    """Boxes and confidences of a frame as float64, with a clear error where a detector gives other arrays."""
+    boxes, confidence = np.asarray(xyxy, np.float64), np.asarray(score, np.float64)
+    if boxes.ndim != 2 or boxes.shape[1] != 4 or confidence.shape != boxes.shape[:1]:
+        raise SettingsError(
+            f"detector {type(detector).__name__}",
+            expected="boxes of shape (found, 4) and confidences of shape (found,)",
+            found=f"{boxes.shape} and {confidence.shape} in frame {number}",
+        )
+    return boxes, confidence
 
 
 def _letterboxed(

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from psotrack.detection.detector import Detector, detect_drones
+from psotrack.detection.detector import Detector, OnnxDetector, detect_drones
 from psotrack.recordings import Recording, write_detections
-from psotrack.support import Report, digest_file, digest_record, no_progress
+from psotrack.support import Report, digest_file, digest_record, identify, no_progress
 
 
 def stored_detections(
@@ -41,7 +41,7 @@ def stored_detections(
 def _key(detector: Detector, recording: Recording) -> str:
     """Name of the folder: 40 hexadecimal digits."""
     made_of = {
-        **detector.key,
+        **(detector.key if isinstance(detector, OnnxDetector) else identify(detector)),
         "videos": {
             name: [video.num_frames, digest_file(video.path)] for name, video in recording.videos.items()
         },

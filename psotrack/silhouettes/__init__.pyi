@@ -1,6 +1,6 @@
 from .blobs import LEAST_RADIUS_CELLS, ViewBlobs, find_blobs, stack_blobs
 from .computation import Silhouettes, compute
-from .foreground import BackgroundModel, Mog2
+from .foreground import BackgroundModel, Mog2, find_background
 from .settings import ForegroundSettings, Shadows, SilhouetteSettings, check_whole
 from .store import key_of, open_stored, reduced_shape
 from .summed_area import box_sum, of_packed_box_sums, pack, summed_area_table
@@ -17,6 +17,7 @@ __all__ = [
     "box_sum",
     "check_whole",
     "compute",
+    "find_background",
     "find_blobs",
     "key_of",
     "of_packed_box_sums",

@@ -21,7 +21,11 @@ import msgspec
 import numpy as np
 from jaxtyping import UInt8
 
-from psotrack.silhouettes.settings import ForegroundSettings
+from psotrack.silhouettes.settings import ForegroundSettings, SilhouetteSettings
+from psotrack.support import make_plugin
+
+#: Name of the background model of this package.
+MOG2 = "mog2"
 
 #: MOG2's label of shadow pixels; foreground is 255.
 _SHADOW = 127
@@ -40,10 +44,15 @@ def learning_step(num_frames: int, settings: ForegroundSettings) -> int:
 
 @runtime_checkable
 class BackgroundModel(Protocol):
-    """Separates foreground from background in the video of one camera. Used in several processes: can be pickled.
+    """Separates foreground from background in the video of one camera.
+
+    The model works on NumPy arrays, outside of any compiled function. Each camera's video is treated by itself, in
+    several processes, so the object must be picklable, of a class that a module defines; with `jobs=1` everything runs
+    in the calling process, where a class of a notebook works too.
 
     Attributes:
-        key: everything on which the foreground depends, as plain data fit for JSON. Silhouettes are stored under it.
+        key: everything on which the foreground depends, as plain data fit for JSON. Silhouettes are stored under the
+            class's name and this key; with an equal key, stored silhouettes are used again.
     """
 
     @property
@@ -56,13 +65,18 @@ class BackgroundModel(Protocol):
     ) -> Iterator[UInt8[np.ndarray, "working_height working_width"]]:
         """The foreground of each of `frames`, against the background of `learning`.
 
+        Both iterables decode the video while they are read, each at most once; a list of all frames may not fit in
+        memory.
+
         Args:
-            learning: BGR frames from the whole video.
-            frames: BGR frames in their order.
+            learning: (height, width, 3) uint8 BGR frames, at most `silhouettes.num_learning_frames`, spread over the
+                whole video.
+            frames: (height, width, 3) uint8 BGR frames, all frames in their order.
 
         Yields:
-            0 for background, 255 for foreground, values between them for foreground of less weight; each image is
-            the frame reduced by `SilhouetteSettings.working_reduction` along each side.
+            One uint8 mask per frame: 0 for background, 255 for foreground, values between them for foreground of less
+            weight. A mask has the height and width of the frame, divided by `silhouettes.working_reduction` and
+            rounded up; pixel (i, j) covers the frame's pixels [r * i, r * i + r) x [r * j, r * j + r).
         """
         ...
 
@@ -89,6 +103,20 @@ class Mog2:
     ) -> Iterator[UInt8[np.ndarray, "working_height working_width"]]:
         """See `BackgroundModel`."""
         return foreground(learning, frames, self.settings)
+
+
+def find_background(name: str, settings: SilhouetteSettings) -> BackgroundModel | None:
+    """The background model of a name: "mog2" or a plugin; None for MOG2, which is the default of `compute`.
+
+    Raises:
+        SettingsError: there is no background model of this name.
+    """
+    if name == MOG2:
+        return None
+    model: BackgroundModel = make_plugin(
+        "background", name, settings, interface=BackgroundModel, setting="background", built_in=[MOG2]
+    )
+    return model
 
 
 def foreground(

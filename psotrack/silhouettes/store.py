@@ -21,11 +21,11 @@ import zarr
 from jaxtyping import UInt8
 from zarr.codecs import ZstdCodec
 
-from psotrack.errors import OutputError
+from psotrack.errors import OutputError, SettingsError
 from psotrack.recordings import VideoInfo, read_frames
 from psotrack.silhouettes.foreground import BackgroundModel, Mog2, coverage, learning_step
 from psotrack.silhouettes.settings import SilhouetteSettings
-from psotrack.support import Advance, digest_file, digest_record
+from psotrack.support import Advance, digest_file, digest_record, identify
 
 logger = logging.getLogger(__name__)
 
@@ -63,7 +63,7 @@ def key_of(video: VideoInfo, settings: SilhouetteSettings, background: Backgroun
         "settings": msgspec.to_builtins(settings),
     }
     if background is not None:
-        made_of["background"] = dict(background.key)
+        made_of["background"] = identify(background)
     return digest_record(made_of)
 
 
@@ -152,13 +152,37 @@ def _write(folder: Path, shape: tuple[int, int], task: Task, advance: Advance) -
         _decoded(video, 1, seconds, advance),
     )
     chunk = np.empty((CHUNK_FRAMES, *shape), np.uint8)
+    index = -1
     for index, mask in enumerate(masks):
+        _check_mask(mask, index, task)
         chunk[index % CHUNK_FRAMES] = coverage(mask, settings.reduction // settings.working_reduction)
         count = index % CHUNK_FRAMES + 1
         if count == CHUNK_FRAMES or index + 1 == video.num_frames:
             array[index + 1 - count : index + 1] = chunk[:count]
+    if index + 1 < video.num_frames:
+        raise SettingsError(
+            _model_name(task), expected=f"{video.num_frames} masks, one per frame", found=f"{index + 1}"
+        )
     seconds["foreground"] = time.perf_counter() - started - seconds["decode"]
     return seconds
+
+
+def _check_mask(mask: object, index: int, task: Task) -> None:
+    """Raise `SettingsError` unless a background model's mask has the right type and shape, and belongs to a frame."""
+    shape = reduced_shape(task.video, task.settings.working_reduction)
+    is_mask = isinstance(mask, np.ndarray) and mask.dtype == np.uint8 and mask.shape == shape
+    if not is_mask or index >= task.video.num_frames:
+        found = f"{mask.dtype} {mask.shape}" if isinstance(mask, np.ndarray) else type(mask).__name__
+        raise SettingsError(
+            _model_name(task),
+            expected=f"{task.video.num_frames} masks of type uint8 and shape {shape}, the frame's height and width "
+            f"divided by silhouettes.working_reduction = {task.settings.working_reduction}",
+            found=f"{found} as mask {index}",
+        )
+
+
+def _model_name(task: Task) -> str:
+    return f"background model {type(task.background or Mog2).__name__}"
 
 
 def _decoded(

@@ -2,7 +2,7 @@ from .compiled import keep_compiled
 from .delimited import Column, Table, TextRow, read_rows, read_table, write_rows
 from .figures import COLOURS, drone_colour, save_figure
 from .files import atomic_write, digest_file, digest_record, read_text, refuse_to_overwrite, user_cache
-from .plugins import load_plugin, plugin_names
+from .plugins import PluginKind, check_interface, identify, make_plugin, plugin_names, register_plugin
 from .processes import map_in_processes
 from .progress import Advance, Report, no_progress, progress_bar
 from .representation import short_repr
@@ -13,17 +13,20 @@ __all__ = [
     "COLOURS",
     "Advance",
     "Column",
+    "PluginKind",
     "Report",
     "Table",
     "TextRow",
     "assign",
     "atomic_write",
+    "check_interface",
     "convert",
     "digest_file",
     "digest_record",
     "drone_colour",
+    "identify",
     "keep_compiled",
-    "load_plugin",
+    "make_plugin",
     "map_in_processes",
     "nearest",
     "no_progress",
@@ -34,6 +37,7 @@ __all__ = [
     "read_text",
     "read_toml",
     "refuse_to_overwrite",
+    "register_plugin",
     "save_figure",
     "short_repr",
     "standard_error",

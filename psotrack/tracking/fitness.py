@@ -13,8 +13,8 @@ the whole silhouette has the same score. Concentric windows, of which some are s
 maximum where the silhouette's middle is.
 
 `Score` is the interface of a camera's score, `SoftIoU` the score of this package. Another score is any frozen, hashable
-object with the same attributes and method: given to `psotrack.track(..., score=...)`, or by name as an entry point of
-the group `psotrack.scores`, which maps `ScoreSettings` to a score.
+object with the same attributes and method: given to `psotrack.track(..., score=...)`, or by name as a plugin (see
+`psotrack.support.plugins`).
 """
 
 from __future__ import annotations
@@ -41,12 +41,17 @@ MIN_WEIGHT = 0.1
 
 @runtime_checkable
 class Score(Protocol):
-    """The score of positions in single cameras. Compiled in: frozen and hashable.
+    """The score of positions in single cameras.
+
+    The score is compiled in: it must be frozen and hashable, for example a frozen dataclass of plain numbers, and its
+    method is called inside a compiled function (`jax.jit`), so it consists of JAX operations without branches on
+    values. Two equal scores share one compiled program.
 
     Attributes:
-        ring: scale of the largest box about a drone's position that the score reads.
+        ring: scale of the largest box about a drone's position that the score reads, at least 1. Only the part of the
+            silhouettes inside this box (and where the search may move it) is at hand.
         whole_pixels: whether edges of boxes are rounded to whole pixels of the reduced silhouettes.
-        min_cameras: a drone that fewer cameras see has no fitness.
+        min_cameras: a drone that fewer cameras see has no fitness (NaN).
     """
 
     @property
@@ -61,7 +66,21 @@ class Score(Protocol):
     def camera_scores(
         self, inputs: ScoreInputs, position_m: Float[Array, "*batch drones 3"]
     ) -> tuple[Float[Array, "*batch drones cameras"], Float[Array, "*batch drones cameras"]]:
-        """Scores in [0, 1] of every drone in every camera, and the weight of each camera in [0, 1]."""
+        """Scores in [0, 1] of every drone in every camera, and the weight of each camera in [0, 1].
+
+        The fitness of a drone is the mean of its scores, weighted by these weights (see `drone_fitness`). The tracker
+        also fits a paraboloid through the scores, so a score that changes smoothly gives better positions.
+
+        Args:
+            inputs: extents of the drones and silhouettes of one frame. `psotrack.geometry.project_boxes` gives the
+                drones' boxes, `psotrack.tracking.foreground_and_area` the foreground in scaled boxes, and
+                `psotrack.tracking.camera_weights` the usual weights.
+            position_m: (..., drones, 3), positions in the world, metres, float32; the leading axes are particles.
+
+        Returns:
+            Scores (..., drones, cameras), finite, larger is better; weights of the same shape, 0 where the camera does
+            not see the drone.
+        """
         ...
 
 

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.errors import SettingsError
 from psotrack.motion import motion_params
 from psotrack.settings import (
     DroneSettings,
@@ -18,13 +17,10 @@ from psotrack.settings import (
     SwarmSettings,
     TrackSettings,
 )
-from psotrack.support import load_plugin, plugin_names
+from psotrack.support import make_plugin
 from psotrack.tracking import tracker
 from psotrack.tracking.fitness import PAPER_SCORE, Score, SoftIoU
 from psotrack.tracking.search import Search, particle_swarm
-
-#: Groups of entry points that add searches and scores by name.
-SEARCHES, SCORES = "psotrack.searches", "psotrack.scores"
 
 
 @dataclass(frozen=True)
@@ -81,12 +77,9 @@ def find_search(settings: SwarmSettings) -> Search:
     """
     if settings.search == "pso":
         return particle_swarm(settings)
-    make = load_plugin(SEARCHES, settings.search)
-    if make is None:
-        names = ", ".join(["pso", *plugin_names(SEARCHES)])
-        raise SettingsError("swarm.search", expected=f"one of {names}", found=settings.search)
-    search: Search = make(settings)
-    return search
+    return make_plugin(
+        "search", settings.search, settings, interface=Search, setting="swarm.search", built_in=["pso"]
+    )
 
 
 def find_score(settings: ScoreSettings) -> Score:
@@ -99,12 +92,9 @@ def find_score(settings: ScoreSettings) -> Score:
         return SoftIoU(windows=settings.windows)
     if settings.kind == "hard":
         return PAPER_SCORE
-    make = load_plugin(SCORES, settings.kind)
-    if make is None:
-        names = ", ".join(["soft", "hard", *plugin_names(SCORES)])
-        raise SettingsError("score.kind", expected=f"one of {names}", found=settings.kind)
-    score: Score = make(settings)
-    return score
+    return make_plugin(
+        "score", settings.kind, settings, interface=Score, setting="score.kind", built_in=["soft", "hard"]
+    )
 
 
 def tracker_program(settings: TrackerSettings, reduction: int) -> tracker.Program:

@@ -1,8 +1,7 @@
 """The search in one frame: from first positions to the position of largest objective.
 
 `Search` is the interface; `particle_swarm` makes the search of this package. Another search is any object with the same
-`__call__`: given to `psotrack.track(..., search=...)`, or by name as an entry point of the group `psotrack.searches`,
-which maps `SwarmSettings` to a search.
+`__call__`: given to `psotrack.track(..., search=...)`, or by name as a plugin (see `psotrack.support.plugins`).
 """
 
 from __future__ import annotations
@@ -23,10 +22,10 @@ from psotrack.tracking.swarm import Objective
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SearchRegion:
-    """Where to search.
+    """Bounds and step size of a search, float32, metres.
 
     Attributes:
-        low, high: (groups, dims), bounds of the positions.
+        low, high: (groups, dims), bounds of the positions: the part of the room that a drone can have reached.
         max_step: (dims,), a drone's largest distance in one frame, per dimension: the largest sensible step.
     """
 
@@ -39,9 +38,16 @@ class SearchRegion:
 class Search(Protocol):
     """Finds the positions of largest objective, for several groups that are independent of one another.
 
-    A search is a JAX pytree and is called inside of a compiled function: its arrays may change without a new
-    compilation, everything else is compiled in. `jax.tree_util.register_static` makes a frozen dataclass of plain
-    settings such a pytree.
+    The tracker calls the search once per frame, inside a compiled function (`jax.jit`, in a scan over the frames, and
+    under `jax.vmap` where an accelerator computes several runs at once). So the search must be a pure function of its
+    arguments, written with JAX operations; loops over iterations use `jax.lax.fori_loop`, because the number of
+    iterations is traced. Shapes (particles, groups, dims) are static.
+
+    The search itself is a JAX pytree: its arrays may change without a new compilation, everything else is compiled in.
+    `jax.tree_util.register_static` makes a frozen, hashable dataclass of plain settings such a pytree.
+
+    With `swarm.kind = "per-drone"` there is one group of 3 dims (x, y, z, metres) per drone. With "joint" there is one
+    group of 3 dims per drone, drone after drone.
     """
 
     def __call__(
@@ -52,15 +58,20 @@ class Search(Protocol):
         region: SearchRegion,
         num_iterations: Int[Array, ""],
     ) -> Float[Array, "groups dims"]:
-        """The best position of each group.
+        """Find the best position of each group: (groups, dims), metres, float32 and finite.
 
         Args:
-            key: for random numbers; consumed.
-            objective: maps positions (particles, groups, dims) to values (particles, groups), which are maximised. NaN
-                is worse than every number.
-            first: (particles, groups, dims), the first positions to evaluate.
+            key: a JAX random key (`jax.random.key`); consumed.
+            objective: maps positions (particles, groups, dims) to values (particles, groups) in [0, 1], which are
+                maximised. The number of particles is fixed. A value is NaN where too few cameras see the drone; NaN is
+                worse than every number, and all values of a group may be NaN.
+            first: (particles, groups, dims), the first positions to evaluate, metres; some may lie outside the bounds.
+                Position 0 is the tracker's prediction, position 1 the drone's last position, and the other positions
+                are drawn about the prediction with the standard deviation `swarm.spread_m`. So a search that begins
+                here is warm-started.
             region: bounds and step size.
-            num_iterations: number of evaluations of all particles; the first positions may be one more.
+            num_iterations: scalar int32, traced: number of evaluations of all particles besides the evaluation of the
+                first positions. A search calls the objective `num_iterations + 1` times.
         """
         ...
 
