@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from psotrack.simulation import simulate
+from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import progress_bar
 
 
@@ -20,7 +20,8 @@ def simulated(name: str, data: Path, seed: int, *, onboard: bool = False) -> Pat
     folder = data / f"{'onboard' if onboard else 'seed'}{seed}" / "Simulated_Data" / name
     if not folder.exists():
         print(f"simulating {folder}", flush=True)
-        simulate(name, folder.parents[1], seed=seed, masks=False, onboard=onboard, report=progress_bar)
+        settings = SimulationSettings(seed=seed, masks=False, onboard=onboard)
+        simulate(name, folder.parents[1], settings, report=progress_bar)
     return folder
 
 

@@ -38,7 +38,7 @@ from psotrack.initiation.initialisation import find_drones
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import compute, summed_area_table
 from psotrack.silhouettes.computation import SilhouetteSettings
-from psotrack.simulation import simulate
+from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import keep_compiled
 from psotrack.tracking import SoftIoU, on_device, swarm
 from psotrack.tracking.fitness import drone_fitness, joint_fitness, score_inputs
@@ -70,7 +70,8 @@ keep_compiled(Path("data", "compiled"))
 # %%
 folder = DATA / "Simulated_Data" / "S02_D4_A"
 if not folder.exists():  # the same recording as in the quickstart
-    simulate("S02_D4_A", DATA, num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
+    simulation = SimulationSettings(num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
+    simulate("S02_D4_A", DATA, simulation)
 recording = read_sequence(folder).usable()
 settings = TrackSettings(silhouettes=SILHOUETTES)
 silhouettes = compute(recording, SILHOUETTES, cache=DATA / "silhouettes")

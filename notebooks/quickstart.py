@@ -31,7 +31,7 @@ from psotrack.pipeline import track_recording
 from psotrack.recordings import read_frames
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes.computation import SilhouetteSettings
-from psotrack.simulation import simulate
+from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import keep_compiled
 from psotrack.trajectories import write_trajectories
 
@@ -59,7 +59,8 @@ keep_compiled(Path("data", "compiled"))  # the second run does not wait for the 
 # %%
 folder = DATA / "Simulated_Data" / "S02_D4_A"
 if not folder.exists():
-    simulate("S02_D4_A", DATA, num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
+    simulation = SimulationSettings(num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
+    simulate("S02_D4_A", DATA, simulation)
 recording = read_sequence(folder).usable()
 
 print(f"{recording.num_frames} frames at {recording.fps:g} per second")

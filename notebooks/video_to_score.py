@@ -38,7 +38,7 @@ from psotrack.recordings import read_frames
 from psotrack.silhouettes import compute, summed_area_table
 from psotrack.silhouettes.computation import SilhouetteSettings
 from psotrack.silhouettes.foreground import classify, coverage, learn_background, learning_step
-from psotrack.simulation import simulate
+from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import keep_compiled
 from psotrack.tracking import SoftIoU, on_device
 from psotrack.tracking.fitness import PAPER_SCORE, camera_scores, drone_fitness, score_inputs
@@ -61,7 +61,8 @@ keep_compiled(Path("data", "compiled"))
 # %%
 folder = DATA / "Simulated_Data" / "S02_D4_A"
 if not folder.exists():  # the same recording as in the quickstart
-    simulate("S02_D4_A", DATA, num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
+    simulation = SimulationSettings(num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
+    simulate("S02_D4_A", DATA, simulation)
 recording = read_sequence(folder).usable()
 truth_m = recording.truth.position_m[FRAME]
 names = recording.rig.names

@@ -54,7 +54,7 @@ from psotrack.recordings import VideoWriter, describe_recording, probe, read_fra
 from psotrack.settings import DroneSettings, TrackSettings
 from psotrack.silhouettes import compute, summed_area_table
 from psotrack.silhouettes.computation import SilhouetteSettings
-from psotrack.simulation import simulate
+from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import keep_compiled
 from psotrack.tracking import SoftIoU, on_device
 from psotrack.tracking.fitness import camera_scores, score_inputs
@@ -85,7 +85,8 @@ keep_compiled(Path("data", "compiled"))
 # %%
 folder = DATA / "Simulated_Data" / "S02_D4_A"
 if not folder.exists():
-    simulate("S02_D4_A", DATA, num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
+    simulation = SimulationSettings(num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
+    simulate("S02_D4_A", DATA, simulation)
 simulated = read_sequence(folder).usable()
 FOREIGN.mkdir(exist_ok=True)
 calibration = {}

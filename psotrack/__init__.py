@@ -9,7 +9,8 @@
         print(pt.evaluate(tracked.trajectories, recording.truth).mean_error_m)
 
 Recordings and files
-    read_recording, Recording, read_c3d, read_trajectories, write_trajectories, simulate
+    read_recording, Recording, read_c3d, read_trajectories, write_trajectories, simulate,
+    SimulationSettings
 Tracking
     track, track_runs, TrackSettings and its parts (SwarmSettings, ScoreSettings, MotionSettings, DroneSettings,
     StatusSettings, IdentitySettings), TrackedRecording, Trajectories

@@ -17,7 +17,7 @@ from .settings import (
     TrackSettings,
 )
 from .silhouettes import BackgroundModel
-from .simulation import simulate
+from .simulation import SimulationSettings, simulate
 from .support import register_plugin
 from .tracking import Score, ScoreInputs, Search, SearchRegion
 from .trajectories import Trajectories, read_trajectories, write_trajectories
@@ -41,6 +41,7 @@ __all__ = [
     "ScoreSettings",
     "Search",
     "SearchRegion",
+    "SimulationSettings",
     "StatusSettings",
     "SwarmSettings",
     "TrackSettings",

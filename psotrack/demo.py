@@ -17,7 +17,7 @@ from psotrack.pipeline import TrackedRecording, track_recording
 from psotrack.recordings import Recording, read_frames
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import SilhouetteSettings
-from psotrack.simulation import simulate
+from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import Report, atomic_write, no_progress, refuse_to_overwrite
 from psotrack.tracking import on_device
 from psotrack.trajectories import write_trajectories
@@ -56,11 +56,7 @@ def run(
     folder = simulate(
         NAME,
         out,
-        num_frames=NUM_FRAMES,
-        scale=SCALE,
-        seed=seed,
-        masks=False,
-        onboard=False,
+        SimulationSettings(NUM_FRAMES, SCALE, seed, masks=False, onboard=False),
         jobs=jobs,
         force=force,
         report=report,

@@ -19,7 +19,7 @@ from psotrack.geometry import project
 from psotrack.pipeline import track_recording
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import SilhouetteSettings
-from psotrack.simulation import Scenario, simulate, write_recording
+from psotrack.simulation import Scenario, SimulationSettings, simulate, write_recording
 from psotrack.trajectories import Status, Trajectories
 
 pytestmark = pytest.mark.slow
@@ -107,7 +107,7 @@ class Run:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     root = tmp_path_factory.mktemp("comings")
-    folder = simulate(scenario(root), root, scale=0.25, seed=0, masks=False, jobs=1)
+    folder = simulate(scenario(root), root, SimulationSettings(scale=0.25, seed=0, masks=False), jobs=1)
     sequence = read_sequence(folder).usable()
     assert sequence.truth is not None
     # What stands still for a second is background.

@@ -24,7 +24,7 @@ from psotrack.detection.labels import box_corners, label_boxes
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
 from psotrack.geometry import look_at, make_camera, project
 from psotrack.recordings import read_frames
-from psotrack.simulation import scenario, simulate
+from psotrack.simulation import SimulationSettings, scenario, simulate
 from psotrack.simulation.scenarios import Mesh
 from psotrack.trajectories import Trajectories
 
@@ -228,7 +228,7 @@ def data(tmp_path_factory):
             msgspec.structs.replace(drone, model=Mesh(file=str(root / "box.ply"))) for drone in recipe.drones
         )
         recipe = msgspec.structs.replace(recipe, drones=boxes)
-        simulate(recipe, root, num_frames=num_frames, scale=0.25, onboard=False, jobs=1)
+        simulate(recipe, root, SimulationSettings(num_frames=num_frames, scale=0.25, onboard=False), jobs=1)
     return root / "Simulated_Data"
 
 

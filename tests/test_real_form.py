@@ -15,7 +15,14 @@ from psotrack.datasets.dpjait import read_detections, read_mocap_markers, read_p
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.geometry import project
 from psotrack.recordings import body_trajectories, read_c3d, read_frames
-from psotrack.simulation import replaced, scenario, simulate, write_as_real
+from psotrack.simulation import (
+    RealFormSettings,
+    SimulationSettings,
+    replaced,
+    scenario,
+    simulate,
+    write_as_real,
+)
 from psotrack.simulation.real_form import SERIALS
 from psotrack.trajectories import Status
 
@@ -27,12 +34,19 @@ def simulated(tmp_path_factory):
     """Four drones before the four cameras in the corners, a quarter of full size."""
     recipe = replaced(scenario("S02_D4_A"), {"cameras": "laboratory_corners", "markers": False})
     root = tmp_path_factory.mktemp("simulated")
-    return simulate(recipe, root, num_frames=NUM_FRAMES, scale=0.25, masks=False, onboard=False, jobs=1)
+    return simulate(
+        recipe,
+        root,
+        SimulationSettings(num_frames=NUM_FRAMES, scale=0.25, masks=False, onboard=False),
+        jobs=1,
+    )
 
 
 @pytest.fixture(scope="module")
 def real(simulated, tmp_path_factory):
-    return write_as_real(simulated, tmp_path_factory.mktemp("real"), offset_s=OFFSET_S, seed=3)
+    return write_as_real(
+        simulated, tmp_path_factory.mktemp("real"), RealFormSettings(offset_s=OFFSET_S, seed=3)
+    )
 
 
 def opencv(camera):
@@ -184,7 +198,7 @@ def test_markers_hide_and_labels_swap(real):
 
 @pytest.mark.parametrize("offset_s", [-0.5, 0.0, 1.0])
 def test_where_the_recording_begins(simulated, tmp_path, offset_s):
-    folder = write_as_real(simulated, tmp_path, offset_s=offset_s, rate_hz=120.0)
+    folder = write_as_real(simulated, tmp_path, RealFormSettings(offset_s=offset_s, rate_hz=120.0))
     recording = read_c3d(folder / "R02_D4.c3d")
     # The videos' last frame is at 0.96 s.
     assert len(recording.position_m) == round((0.96 + offset_s) * 120 - 0.25) + 1
@@ -195,7 +209,7 @@ def test_where_the_recording_begins(simulated, tmp_path, offset_s):
 
 
 def test_three_videos(simulated, tmp_path):
-    folder = write_as_real(simulated, tmp_path, three_videos=True)
+    folder = write_as_real(simulated, tmp_path, RealFormSettings(three_videos=True))
     sequence = read_sequence(folder)
     assert sequence.rig.names == SERIALS
     assert tuple(sequence.videos) == tuple(sequence.detections) == SERIALS[:3]
@@ -207,8 +221,8 @@ def test_three_videos(simulated, tmp_path):
 
 
 def test_the_seed_decides(simulated, real, tmp_path):
-    one = write_as_real(simulated, tmp_path / "one", offset_s=OFFSET_S, seed=3)
-    other = write_as_real(simulated, tmp_path / "other", offset_s=OFFSET_S, seed=4)
+    one = write_as_real(simulated, tmp_path / "one", RealFormSettings(offset_s=OFFSET_S, seed=3))
+    other = write_as_real(simulated, tmp_path / "other", RealFormSettings(offset_s=OFFSET_S, seed=4))
     assert (one / "R02_D4.c3d").read_bytes() == (real / "R02_D4.c3d").read_bytes()
     assert (other / "R02_D4.c3d").read_bytes() != (real / "R02_D4.c3d").read_bytes()
 
@@ -220,9 +234,9 @@ def test_what_cannot_be_written(simulated, real, tmp_path):
     ):
         write_as_real(simulated, real.parents[1])
     with pytest.raises(SettingsError, match=r"offset_s: expected more than -0\.96 s, .* found -1"):
-        write_as_real(simulated, tmp_path, offset_s=-1.0)
+        write_as_real(simulated, tmp_path, RealFormSettings(offset_s=-1.0))
     with pytest.raises(SettingsError, match="rate_hz: expected a number above 0, found 0"):
-        write_as_real(simulated, tmp_path, rate_hz=0.0)
+        write_as_real(simulated, tmp_path, RealFormSettings(rate_hz=0.0))
     short = Path(shutil.copytree(simulated, tmp_path / "S77"))
     (short / "cam4i_s.avi").unlink()
     with pytest.raises(InputError, match="S77: expected videos of 4 cameras, found 3"):
@@ -252,7 +266,9 @@ def test_command(simulated, tmp_path):
     result = CliRunner().invoke(as_real, [*map(str, words)], catch_exceptions=False)
     folder = tmp_path / "Real_Data" / "R02_D4"
     assert (result.exit_code, json.loads(result.stdout)) == (0, {"sequence": str(folder)})
-    own = write_as_real(simulated, tmp_path / "own", offset_s=0.2, rate_hz=120.0, three_videos=True)
+    own = write_as_real(
+        simulated, tmp_path / "own", RealFormSettings(offset_s=0.2, rate_hz=120.0, three_videos=True)
+    )
     for path in own.iterdir():
         if path.is_file():
             assert (folder / path.name).read_bytes() == path.read_bytes(), path.name

@@ -7,7 +7,14 @@ import pytest
 from click.testing import CliRunner
 
 from psotrack.cli import cli
-from psotrack.simulation import replaced, scenario, simulate, write_as_real
+from psotrack.simulation import (
+    RealFormSettings,
+    SimulationSettings,
+    replaced,
+    scenario,
+    simulate,
+    write_as_real,
+)
 from psotrack.simulation.real_form import SERIALS
 
 pytestmark = pytest.mark.slow
@@ -22,8 +29,10 @@ OFFSET_OFF_S = 0.004
 def recording(tmp_path_factory):
     root = tmp_path_factory.mktemp("data")
     recipe = replaced(scenario("S02_D4_A"), {"cameras": "laboratory_corners", "markers": False})
-    simulated = simulate(recipe, root, num_frames=150, scale=0.35, masks=False, onboard=False)
-    return write_as_real(simulated, root, offset_s=OFFSET_S)
+    simulated = simulate(
+        recipe, root, SimulationSettings(num_frames=150, scale=0.35, masks=False, onboard=False)
+    )
+    return write_as_real(simulated, root, RealFormSettings(offset_s=OFFSET_S))
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from psotrack.pipeline import track_recording
 from psotrack.recordings import Recording
 from psotrack.settings import SwarmSettings, TrackSettings
 from psotrack.silhouettes import SilhouetteSettings
-from psotrack.simulation import simulate
+from psotrack.simulation import SimulationSettings, simulate
 from psotrack.trajectories import Trajectories, write_trajectories
 
 pytestmark = pytest.mark.slow
@@ -47,7 +47,12 @@ class Lab:
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
     root = tmp_path_factory.mktemp("lab")
-    folder = simulate("S02_D4_A", root, num_frames=50, scale=0.5, seed=0, masks=False, onboard=False, jobs=1)
+    folder = simulate(
+        "S02_D4_A",
+        root,
+        SimulationSettings(num_frames=50, scale=0.5, seed=0, masks=False, onboard=False),
+        jobs=1,
+    )
     return Lab(read_sequence(folder).usable(), root / "cache")
 
 

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+from dataclasses import replace
 
 import cv2
 import msgspec
@@ -29,12 +30,20 @@ from psotrack.datasets.dpjait import (
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.geometry import project
 from psotrack.recordings import VideoWriter, probe, read_detections, read_frames
-from psotrack.simulation import CameraRenderer, build, replaced, scenario, segments, simulate
+from psotrack.simulation import (
+    CameraRenderer,
+    SimulationSettings,
+    build,
+    replaced,
+    scenario,
+    segments,
+    simulate,
+)
 from psotrack.simulation.imaging.onboard import OnboardRenderer
 from psotrack.simulation.unfinished import unfinished
 
 NAME = "S02_D4_A"
-SMALL = {"num_frames": 3, "scale": 0.1}
+SMALL = SimulationSettings(num_frames=3, scale=0.1)
 #: Two cameras and two drones, for tests that interrupt.
 PAIR = msgspec.structs.replace(
     replaced(
@@ -48,14 +57,14 @@ PAIR = msgspec.structs.replace(
     ),
     drones=scenario(NAME).drones[:2],
 )
-TINY = {"num_frames": 7, "scale": 0.04}
+TINY = SimulationSettings(num_frames=7, scale=0.04)
 #: An encoder of MPEG-4 at its lowest quality in use is above that; a wrong picture is near 15 dB.
 LEAST_PSNR_DB = 28.0
 
 
 @pytest.fixture(scope="module")
 def sequence_folder(tmp_path_factory):
-    return simulate(NAME, tmp_path_factory.mktemp("once"), jobs=1, **SMALL)
+    return simulate(NAME, tmp_path_factory.mktemp("once"), SMALL, jobs=1)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +72,7 @@ def pair_folder(tmp_path_factory):
     """What the interrupted ones must come to."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(segments, "SEGMENT_FRAMES", 2)
-        return simulate(PAIR, tmp_path_factory.mktemp("pair"), jobs=1, **TINY)
+        return simulate(PAIR, tmp_path_factory.mktemp("pair"), TINY, jobs=1)
 
 
 @pytest.fixture
@@ -188,13 +197,15 @@ def test_the_record_knows_the_files_that_a_scenario_names(tmp_path):
     recipe = replaced(
         PAIR, {"drones": [{"flight": {"kind": "recording", "file": str(path)}}], "num_frames": 2}
     )
-    folder = simulate(recipe, tmp_path, scale=0.04, jobs=1)
+    folder = simulate(recipe, tmp_path, SimulationSettings(scale=0.04), jobs=1)
     record = json.loads((folder / "simulation.json").read_text())
     assert record["sha256"] == {str(path): hashlib.sha256(path.read_bytes()).hexdigest()}
 
 
 def test_parts_can_be_left_out(tmp_path):
-    folder = simulate(PAIR, tmp_path, num_frames=1, scale=0.04, jobs=1, masks=False, onboard=False)
+    folder = simulate(
+        PAIR, tmp_path, SimulationSettings(num_frames=1, scale=0.04, masks=False, onboard=False), jobs=1
+    )
     names = set(contents(folder))
     assert "cam1i_s.avi" in names
     assert "dl_data/cam1i_s.csv" in names
@@ -202,7 +213,9 @@ def test_parts_can_be_left_out(tmp_path):
 
 
 def test_another_rate_is_in_the_names_and_is_read(tmp_path):
-    folder = simulate(replaced(PAIR, {"fps": 12.5}), tmp_path, num_frames=2, scale=0.04, jobs=1)
+    folder = simulate(
+        replaced(PAIR, {"fps": 12.5}), tmp_path, SimulationSettings(num_frames=2, scale=0.04), jobs=1
+    )
     assert {"dron1_pos_12.5.csv", "dron1_markers_12.5.csv", "dron1_cam_12.5.csv"} <= set(contents(folder))
     sequence = read_sequence(folder)
     assert sequence.videos["cam1"].fps == 12.5
@@ -228,7 +241,7 @@ def test_scale_keeps_the_world_and_shrinks_the_pictures():
 
 def test_segments_change_no_truth_and_no_picture_before_the_codec(pair_folder, tmp_path):
     """In one piece, the codec sees other neighbours; everything else is the same to the byte."""
-    whole = contents(simulate(PAIR, tmp_path, jobs=1, **TINY))
+    whole = contents(simulate(PAIR, tmp_path, TINY, jobs=1))
     parts = contents(pair_folder)
     assert whole.keys() == parts.keys()
     assert {name for name in whole if whole[name] != parts[name]} == {
@@ -238,7 +251,7 @@ def test_segments_change_no_truth_and_no_picture_before_the_codec(pair_folder, t
 
 @pytest.mark.usefixtures("short_segments")
 def test_the_number_of_jobs_changes_no_byte(pair_folder, tmp_path):
-    assert contents(simulate(PAIR, tmp_path, jobs=2, **TINY)) == contents(pair_folder)
+    assert contents(simulate(PAIR, tmp_path, TINY, jobs=2)) == contents(pair_folder)
 
 
 # --- interruptions
@@ -265,7 +278,7 @@ def interrupting(after_frames):
 def test_an_interrupted_call_goes_on_with_the_segment_where_it_stopped(pair_folder, tmp_path):
     place = tmp_path / "Simulated_Data"
     with pytest.raises(KeyboardInterrupt):
-        simulate(PAIR, tmp_path, jobs=1, report=interrupting(12), **TINY)
+        simulate(PAIR, tmp_path, TINY, jobs=1, report=interrupting(12))
     assert [path.name for path in place.iterdir()] == [f".{NAME}.unfinished"]
     # Seven frames of one camera, and five of the next: its segments of frames 0-1 and 2-3.
     kept = {path: path.stat().st_mtime_ns for path in place.rglob("video.avi")}
@@ -275,9 +288,9 @@ def test_an_interrupted_call_goes_on_with_the_segment_where_it_stopped(pair_fold
     assert not list(place.rglob("*.partial*"))
     with pytest.raises(KeyboardInterrupt):
         # What is there is counted at once.
-        simulate(PAIR, tmp_path, jobs=1, report=interrupting(12), **TINY)
+        simulate(PAIR, tmp_path, TINY, jobs=1, report=interrupting(12))
     assert kept == {path: path.stat().st_mtime_ns for path in place.rglob("video.avi")}
-    folder = simulate(PAIR, tmp_path, jobs=1, **TINY)
+    folder = simulate(PAIR, tmp_path, TINY, jobs=1)
     assert contents(folder) == contents(pair_folder)
     assert beside(folder) == [NAME]
 
@@ -299,11 +312,11 @@ def test_an_interruption_after_the_last_frame_costs_no_frame(pair_folder, tmp_pa
     with monkeypatch.context() as patch:
         patch.setattr(places[step], interrupt)
         with pytest.raises(KeyboardInterrupt):
-            simulate(PAIR, tmp_path, jobs=1, **TINY)
+            simulate(PAIR, tmp_path, TINY, jobs=1)
     # What is joined is not on the disk twice.
     assert bool(list(tmp_path.rglob("video.avi"))) == step.startswith("join")
     monkeypatch.setattr("psotrack.simulation.segments.CameraRenderer", interrupt)
-    folder = simulate(PAIR, tmp_path, jobs=1, **TINY)
+    folder = simulate(PAIR, tmp_path, TINY, jobs=1)
     assert contents(folder) == contents(pair_folder)
     assert beside(folder) == [NAME]
 
@@ -317,7 +330,7 @@ KILLED = """
     import threading
     from pathlib import Path
     import msgspec
-    from psotrack.simulation import Scenario, segments, simulate
+    from psotrack.simulation import Scenario, SimulationSettings, segments, simulate
 
     def kill():
         os.kill(os.getpid(), signal.SIGKILL)
@@ -340,7 +353,7 @@ KILLED = """
         segments.SEGMENT_FRAMES = 2
         folder, jobs, frames, delay_s = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4])
         recipe = msgspec.json.decode(sys.stdin.buffer.read(), type=Scenario)
-        simulate(recipe, Path(folder), num_frames=7, scale=0.04, jobs=jobs, report=report)
+        simulate(recipe, Path(folder), SimulationSettings(num_frames=7, scale=0.04), jobs=jobs, report=report)
 """
 
 
@@ -361,7 +374,7 @@ def test_killed_at_random_moments_it_comes_to_the_same_bytes(pair_folder, tmp_pa
         assert sorted(path.name for path in place.iterdir()) == [f".{NAME}.lock", f".{NAME}.unfinished"]
         made.append(len(list(place.rglob("[0-9]*/video.avi"))))
     assert made[-1] > 1, "what was whole has been kept"
-    assert contents(simulate(PAIR, tmp_path, jobs=1, **TINY)) == contents(pair_folder)
+    assert contents(simulate(PAIR, tmp_path, TINY, jobs=1)) == contents(pair_folder)
     assert [path.name for path in place.iterdir()] == [NAME]
 
 
@@ -372,7 +385,7 @@ def test_a_death_between_the_two_moves_of_a_replacement_loses_nothing(pair_folde
     aside = folder.with_name(f".{NAME}.old")
     shutil.copytree(pair_folder, aside)
     with pytest.raises(OutputError, match="expected a path that does not exist yet, found an existing"):
-        simulate(PAIR, tmp_path, jobs=1, seed=1, **TINY)
+        simulate(PAIR, tmp_path, replace(TINY, seed=1), jobs=1)
     assert contents(folder) == contents(pair_folder)
     assert beside(folder) == [NAME]
 
@@ -390,7 +403,7 @@ def test_a_replacement_that_cannot_be_moved_leaves_the_old_sequence(pair_folder,
     with pytest.raises(
         OutputError, match=r"S02_D4_A: expected a path that can be written, found Input/output error"
     ):
-        simulate(PAIR, tmp_path, num_frames=1, scale=0.04, jobs=1, force=True)
+        simulate(PAIR, tmp_path, SimulationSettings(num_frames=1, scale=0.04), jobs=1, force=True)
     assert contents(folder) == contents(pair_folder)
     assert beside(folder) == [f".{NAME}.unfinished", NAME]
 
@@ -399,8 +412,8 @@ def test_a_replacement_that_cannot_be_moved_leaves_the_old_sequence(pair_folder,
 @pytest.mark.parametrize("other", [{"seed": 5}, {"num_frames": 6}])
 def test_what_other_settings_left_unfinished_is_not_used(pair_folder, tmp_path, other):
     with pytest.raises(KeyboardInterrupt):
-        simulate(PAIR, tmp_path, jobs=1, report=interrupting(4), **{**TINY, **other})
-    assert contents(simulate(PAIR, tmp_path, jobs=1, **TINY)) == contents(pair_folder)
+        simulate(PAIR, tmp_path, replace(TINY, **other), jobs=1, report=interrupting(4))
+    assert contents(simulate(PAIR, tmp_path, TINY, jobs=1)) == contents(pair_folder)
 
 
 def test_a_worker_that_outlives_its_call_leaves_nothing_to_another_record(tmp_path):
@@ -417,10 +430,10 @@ def test_two_calls_at_once_do_not_meet(tmp_path):
         (growing.folder / "half").write_text("")
         message = r"S02_D4_A: expected to be the only one who writes it, found another simulation at work on it; wait"
         with pytest.raises(OutputError, match=message):
-            simulate(PAIR, tmp_path, jobs=1, **TINY)
+            simulate(PAIR, tmp_path, TINY, jobs=1)
         assert (growing.folder / "half").exists()
     # A lock ends with whoever held it.
-    simulate(PAIR, tmp_path, num_frames=1, scale=0.04, jobs=1)
+    simulate(PAIR, tmp_path, SimulationSettings(num_frames=1, scale=0.04), jobs=1)
     assert beside(folder) == [NAME]
 
 
@@ -452,13 +465,13 @@ def test_a_full_disk_leaves_no_sequence_and_keeps_what_was_whole(pair_folder, tm
         from pathlib import Path
         import msgspec
         from psotrack.errors import OutputError
-        from psotrack.simulation import Scenario, segments, simulate
+        from psotrack.simulation import Scenario, SimulationSettings, segments, simulate
         segments.SEGMENT_FRAMES = 2
         sys.dont_write_bytecode = True  # a cached module would be cut off too, for everybody
         resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
         recipe = msgspec.json.decode(sys.stdin.buffer.read(), type=Scenario)
         try:
-            simulate(recipe, Path(sys.argv[1]), num_frames=7, scale=0.04, jobs=1)
+            simulate(recipe, Path(sys.argv[1]), SimulationSettings(num_frames=7, scale=0.04), jobs=1)
         except OutputError as error:
             print(error)
         """
@@ -471,7 +484,7 @@ def test_a_full_disk_leaves_no_sequence_and_keeps_what_was_whole(pair_folder, tm
     assert done.stdout.count(b"\n") == 1
     assert not (tmp_path / "Simulated_Data" / NAME).exists()
     monkeypatch.setattr(segments, "SEGMENT_FRAMES", 2)
-    assert contents(simulate(PAIR, tmp_path, jobs=1, **TINY)) == contents(pair_folder)
+    assert contents(simulate(PAIR, tmp_path, TINY, jobs=1)) == contents(pair_folder)
 
 
 # --- refusals
@@ -484,11 +497,11 @@ def test_a_sequence_that_exists_is_left_alone_unless_forced(pair_folder, tmp_pat
         OutputError,
         match=r"S02_D4_A: expected a path that does not exist yet, found an existing folder; pass --force",
     ):
-        simulate(PAIR, tmp_path, jobs=1, **TINY)
+        simulate(PAIR, tmp_path, TINY, jobs=1)
     with pytest.raises(KeyboardInterrupt):
-        simulate(PAIR, tmp_path, jobs=1, seed=1, force=True, report=interrupting(2), **TINY)
+        simulate(PAIR, tmp_path, replace(TINY, seed=1), jobs=1, force=True, report=interrupting(2))
     assert contents(folder) == before, "until the new one is whole, the old one stays"
-    simulate(PAIR, tmp_path, jobs=1, seed=1, force=True, **TINY)
+    simulate(PAIR, tmp_path, replace(TINY, seed=1), jobs=1, force=True)
     after = contents(folder)
     assert after.keys() == before.keys()
     assert after["dron1_pos_25.csv"] != before["dron1_pos_25.csv"]
@@ -516,8 +529,10 @@ def test_a_sequence_that_exists_is_left_alone_unless_forced(pair_folder, tmp_pat
     ],
 )  # fmt: skip
 def test_settings_that_make_no_sense_are_refused_before_anything_is_written(settings, message, tmp_path):
+    recipe, jobs = settings.get("scenario", NAME), settings.get("jobs")
+    settings = replace(SMALL, **{name: settings[name] for name in settings.keys() - {"scenario", "jobs"}})
     with pytest.raises(SettingsError, match=message):
-        simulate(**{"scenario": NAME, "root": tmp_path, **SMALL, **settings})
+        simulate(recipe, tmp_path, settings, jobs=jobs)
     assert not list(tmp_path.iterdir())
 
 
@@ -531,13 +546,13 @@ def test_the_largest_images_are_the_largest_that_a_video_takes(tmp_path):
 def test_a_place_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "Simulated_Data").write_text("a file where the folder should be")
     with pytest.raises(OutputError, match=r"Simulated_Data"):
-        simulate(NAME, tmp_path, jobs=1, **SMALL)
+        simulate(NAME, tmp_path, SMALL, jobs=1)
 
 
 def test_a_file_of_the_scenario_that_is_missing_is_named(tmp_path):
     recipe = replaced(PAIR, {"drones[0].model": {"file": str(tmp_path / "none.ply")}})
     with pytest.raises(InputError, match=r"none\.ply"):
-        simulate(recipe, tmp_path, **TINY)
+        simulate(recipe, tmp_path, TINY)
     assert not list(tmp_path.iterdir())
 
 
@@ -549,6 +564,6 @@ def test_progress_counts_every_frame_of_every_video(tmp_path):
         counted.append(total)
         yield lambda steps: counted.append(-steps)
 
-    simulate(PAIR, tmp_path, num_frames=2, scale=0.05, jobs=1, report=report)
+    simulate(PAIR, tmp_path, SimulationSettings(num_frames=2, scale=0.05), jobs=1, report=report)
     assert counted[0] == 2 * (2 + 2)
     assert sum(counted) == 0

@@ -29,7 +29,7 @@ from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import compute
 from psotrack.silhouettes.computation import SilhouetteSettings
-from psotrack.simulation import scenarios, simulate
+from psotrack.simulation import SimulationSettings, scenarios, simulate
 from psotrack.support import atomic_write
 from psotrack.trajectories import Status, Trajectories
 
@@ -65,7 +65,7 @@ def opened(data: Path) -> Recording:
     folder = data / "seed0" / "Simulated_Data" / recipe.name
     if not folder.exists():
         print(f"simulating {folder}", flush=True)
-        simulate(recipe, folder.parents[1], masks=False, onboard=False)
+        simulate(recipe, folder.parents[1], SimulationSettings(masks=False, onboard=False))
     return read_sequence(folder).usable()
 
 

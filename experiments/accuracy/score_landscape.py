@@ -30,7 +30,7 @@ from psotrack.initiation import room_bounds
 from psotrack.initiation.initialisation import find_drones
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import SilhouetteSettings, compute
-from psotrack.simulation import Scenario, scenario, simulate
+from psotrack.simulation import Scenario, SimulationSettings, scenario, simulate
 from psotrack.simulation.scenarios import Drone, Harmonic, Harmonics, Variation
 from psotrack.simulation.world.drones import MODELS
 from psotrack.tracking import Score, SoftIoU, on_device
@@ -87,7 +87,7 @@ def load(root: Path) -> Data:
     made = recipe()
     folder = root / "Simulated_Data" / made.name
     if not folder.exists():
-        simulate(made, root, scale=SCALE, masks=False, onboard=False)
+        simulate(made, root, SimulationSettings(scale=SCALE, masks=False, onboard=False))
     sequence = read_sequence(folder).usable()
     coverage = compute(sequence, SILHOUETTES, cache=root / "silhouettes")
     images = coverage.read(0, coverage.num_frames)

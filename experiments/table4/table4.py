@@ -86,12 +86,12 @@ def main() -> None:
 
 def simulated(data: Path) -> Path:
     """Root folder of the data, after the missing sequences were simulated."""
-    from psotrack.simulation import simulate
+    from psotrack.simulation import SimulationSettings, simulate
 
     for name in SIMULATED:
         if not (data / "Simulated_Data" / name).is_dir():
             print(f"simulating {name}", flush=True)
-            simulate(name, data, seed=0, masks=False, onboard=False, report=progress_bar)
+            simulate(name, data, SimulationSettings(masks=False, onboard=False), report=progress_bar)
     return data
 
 

@@ -74,13 +74,14 @@ def main() -> None:
 
 def simulated(grid: Grid, data: Path, *, quick: bool) -> Path:
     """Root folder of the data, after the missing sequences were simulated."""
-    from psotrack.simulation import simulate
+    from psotrack.simulation import SimulationSettings, simulate
 
     for name in grid.sequences:
         if not (data / "Simulated_Data" / name).is_dir():
             print(f"simulating {name}", flush=True)
             size = {"num_frames": QUICK_FRAMES, "scale": QUICK_SCALE} if quick else {}
-            simulate(name, data, seed=0, masks=False, onboard=False, report=progress_bar, **size)
+            settings = SimulationSettings(masks=False, onboard=False, **size)
+            simulate(name, data, settings, report=progress_bar)
     return data
 
 

@@ -77,16 +77,15 @@ def simulated(data: Path, *, num_frames: int | None = None, scale: float = 1.0) 
 
     Of the cameras in the room one of few pixels is left: only the drones' own videos are wanted.
     """
-    from psotrack.simulation import replaced, scenario, simulate
+    from psotrack.simulation import SimulationSettings, replaced, scenario, simulate
 
     corner = {"position_m": (2.9, 2.1, 2.5), "target_m": (0.0, 0.0, 1.0)}
     for name in SIMULATED:
         if not (data / "Simulated_Data" / name).is_dir():
             print(f"simulating the drones' own videos of {name}", flush=True)
             recipe = replaced(scenario(name), {"cameras": [corner], "image_size_wh": [160, 160]})
-            simulate(
-                recipe, data, num_frames=num_frames, scale=scale, seed=0, masks=False, report=progress_bar
-            )
+            settings = SimulationSettings(num_frames, scale, masks=False)
+            simulate(recipe, data, settings, report=progress_bar)
     return data
 
 

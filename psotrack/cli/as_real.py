@@ -52,15 +52,12 @@ def as_real(
       psotrack simulate S02_D4_A --set cameras=laboratory_corners --no-masks --no-onboard --out data
       psotrack as-real data/Simulated_Data/S02_D4_A --out data
     """
-    from psotrack.simulation import write_as_real
+    from psotrack.simulation import RealFormSettings, write_as_real
 
     folder = write_as_real(
         sequence,
         out,
-        rate_hz=rate_hz,
-        offset_s=offset_s,
-        three_videos=three_videos,
-        seed=seed,
+        RealFormSettings(rate_hz, offset_s, three_videos, seed),
         force=force,
         report=report_to(quiet),
     )

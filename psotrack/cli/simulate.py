@@ -86,7 +86,7 @@ def simulate(
     if listed:
         _list(json_path, quiet, force)
         return
-    from psotrack.simulation import load, preset_text, replaced, scenario
+    from psotrack.simulation import SimulationSettings, load, preset_text, replaced, scenario
     from psotrack.simulation import simulate as make
 
     if (name is None) == (scenario_file is None):
@@ -130,11 +130,7 @@ def simulate(
     folder = make(
         recipe,
         out,
-        num_frames=num_frames,
-        scale=scale,
-        seed=seed,
-        masks=masks,
-        onboard=onboard,
+        SimulationSettings(num_frames, scale, seed, masks, onboard),
         force=force,
         jobs=jobs,
         report=report_to(quiet),

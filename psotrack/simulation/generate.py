@@ -6,6 +6,7 @@ import hashlib
 import itertools
 import logging
 import os
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -42,81 +43,92 @@ _PIECES_PER_JOB = 4
 _logger = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True)
+class SimulationSettings:
+    """What a simulation makes of a scenario. Scenario and settings together decide every byte of the sequence.
+
+    Attributes:
+        num_frames: number of first frames to simulate; None: all frames of the scenario.
+        scale: scale of the image size; 1 is the scenario's full size.
+        seed: seed of the flights and the noise, 0 or more.
+        masks: whether to write `drone_masks.zip`.
+        onboard: whether to render the videos of on-board cameras, if the scenario has on-board cameras.
+    """
+
+    num_frames: int | None = None
+    scale: float = 1.0
+    seed: int = 0
+    masks: bool = True
+    onboard: bool = True
+
+
 def simulate(
     scenario: str | Scenario,
     root: str | Path,
+    settings: SimulationSettings | None = None,
     *,
-    num_frames: int | None = None,
-    scale: float = 1.0,
-    seed: int = 0,
-    masks: bool = True,
-    onboard: bool = True,
     force: bool = False,
     jobs: int | None = None,
     report: Report = no_progress,
 ) -> Path:
-    """Simulate a sequence into ROOT/Simulated_Data/NAME, as the published archive would hold it.
+    """Simulate a sequence in the folder ROOT/Simulated_Data/NAME, in the layout of the DPJAIT dataset.
 
-    The same scenario, scale and seed give the same files on one machine, whatever the number of jobs; fewer frames
-    are the first of the same flight. Work goes on in a hidden folder beside the sequence, which becomes the sequence
-    when all of it is there: a call that was interrupted, killed even, finds there what it had finished.
+    On one machine, the same scenario and settings give the same files for every number of jobs. A simulation of fewer
+    frames shows the beginning of the same flight. The sequence is made in a hidden folder beside its final place and
+    moved there when it is complete. If a call is interrupted or killed, the next call with the same scenario and
+    settings keeps the finished parts.
 
     Args:
-        scenario: a record, or the name of one that comes with the package.
-        root: folder of the dataset.
-        num_frames: the first so many frames; None for all of the scenario.
-        scale: of the images, 1 is full size.
-        seed: varies flights and noise.
-        masks: whether to write `drone_masks.zip`.
-        onboard: whether to make the videos of drones' own cameras, where the scenario has such.
-        force: whether to replace a sequence that is there.
-        jobs: processes that draw at once; None for one per processor.
-        report: told of every frame of every video.
+        scenario: the scenario, or the name of a scenario of the package, such as "S02_D4_A".
+        root: root folder of the data.
+        settings: number of frames, scale, seed and parts of the sequence; None: the defaults.
+        force: whether to replace an existing sequence.
+        jobs: number of drawing processes; None: one per processor.
+        report: shows the progress in frames of all videos.
 
     Returns:
-        The sequence's folder.
+        Folder of the sequence.
 
     Raises:
-        SettingsError: there is no such scenario, or a number makes no sense.
-        InputError: a mesh or a recording of the scenario cannot be used.
-        OutputError: the sequence exists and `force` is not set, another call is at work on it, or it cannot be
-            written.
+        SettingsError: the scenario does not exist, or a setting is out of its range.
+        InputError: a mesh or a recorded flight of the scenario cannot be used.
+        OutputError: the sequence exists and `force` is not set, another call is making it, or it cannot be written.
     """
     recipe = scenarios.scenario(scenario) if isinstance(scenario, str) else scenario
-    frames = scenarios.frames_of(recipe, num_frames)
+    settings = settings or SimulationSettings()
+    frames = scenarios.frames_of(recipe, settings.num_frames)
     if jobs is not None and jobs < 1:
         raise SettingsError("jobs", expected="1 or more", found=f"{jobs}")
-    scene = build(recipe, scale=scale, seed=seed)
+    scene = build(recipe, scale=settings.scale, seed=settings.seed)
     folder = Path(root) / "Simulated_Data" / recipe.name
-    onboard = onboard and recipe.onboard is not None
-    if onboard:
-        # Their images have a size of their own, which the scale may not fit: told now, not after hours of drawing.
+    settings = replace(settings, num_frames=frames, onboard=settings.onboard and recipe.onboard is not None)
+    if settings.onboard:
+        # On-board images have their own size. Check here, not after hours of drawing, that the scale fits it.
         intrinsics(scene)
-    record = _record(scene, frames, masks, onboard)
-    with unfinished(folder, record, force) as growing:
+    with unfinished(folder, _record(scene, settings), force) as growing:
         if not growing.complete:
-            _write_streams(scene, growing, frames, masks, onboard, jobs or os.cpu_count() or 1, report)
+            _write_streams(scene, growing, frames, settings, jobs or os.cpu_count() or 1, report)
             _write_tables(scene, growing.folder, frames)
-            if onboard:
+            if settings.onboard:
                 _write_onboard_tables(scene, growing.folder, frames)
         growing.finish()
     return folder
 
 
-def _record(scene: Scene, num_frames: int, masks: bool, onboard: bool) -> bytes:
-    """Everything that decides what the files will be."""
-    settings = {
+def _record(scene: Scene, settings: SimulationSettings) -> bytes:
+    """Everything that decides the content of the sequence, as JSON."""
+    record = {
         "version": __version__,
         "libraries": {"numpy": np.__version__, "opencv": cv2.__version__},
-        "frames": num_frames,
+        "frames": settings.num_frames,
         "scale": scene.scale,
         "seed": scene.seed,
-        "masks": masks,
-        "onboard": onboard,
+        "masks": settings.masks,
+        "onboard": settings.onboard,
         "sha256": _digests(scene.scenario),
         "scenario": scene.scenario,
     }
-    return msgspec.json.format(msgspec.json.encode(settings), indent=1)
+    return msgspec.json.format(msgspec.json.encode(record), indent=1)
 
 
 def _digests(recipe: Scenario) -> dict[str, str]:
@@ -138,10 +150,15 @@ def _streams(scene: Scene, onboard: bool) -> list[Stream]:
 
 
 def _write_streams(
-    scene: Scene, growing: Unfinished, num_frames: int, masks: bool, onboard: bool, jobs: int, report: Report
+    scene: Scene,
+    growing: Unfinished,
+    num_frames: int,
+    settings: SimulationSettings,
+    jobs: int,
+    report: Report,
 ) -> None:
     """Draw all segments that are not there yet, and join them."""
-    streams, every = _streams(scene, onboard), segments(num_frames)
+    streams, every = _streams(scene, settings.onboard), segments(num_frames)
     parts = {
         stream: [segment_folder(growing.segments / stream.name, frames) for frames in every]
         for stream in streams
@@ -152,7 +169,7 @@ def _write_streams(
     }
     pieces = -(-_PIECES_PER_JOB * jobs // len(streams))
     works = [
-        Work(scene, stream, masks, growing.segments / stream.name, piece)
+        Work(scene, stream, settings.masks, growing.segments / stream.name, piece)
         for stream in streams
         for piece in _cut(missing[stream], pieces)
     ]
@@ -165,7 +182,7 @@ def _write_streams(
     with report("simulate", total) as advance:
         advance(total - waiting)
         map_in_processes(draw, works, jobs=jobs, advance=advance)
-    if masks:
+    if settings.masks:
         join_masks(
             [part for stream in streams if not stream.onboard for part in parts[stream]], growing.folder
         )

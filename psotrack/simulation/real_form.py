@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -49,55 +49,67 @@ _HIDDEN_PER_S, _HIDDEN_S, _SWAPPED_S = 0.1, 0.08, 0.2
 _REFLECTION_M = (1.3, -1.1, 0.02)
 
 
+@dataclass(frozen=True)
+class RealFormSettings:
+    """Properties of a recording in the real form that the simulated sequence does not decide.
+
+    Attributes:
+        rate_hz: rate of the C3D file, hertz.
+        offset_s: time in the C3D file at frame 0 of the videos, seconds; positive if the C3D file begins first.
+        three_videos: whether to leave out the last camera's video, as in R17_D1_A.
+        seed: seed of the markers' noise, gaps and swapped labels.
+    """
+
+    rate_hz: float = 100.0
+    offset_s: float = 0.37
+    three_videos: bool = False
+    seed: int = 0
+
+
 def write_as_real(
     sequence: str | Path,
     root: str | Path,
+    settings: RealFormSettings | None = None,
     *,
-    rate_hz: float = 100.0,
-    offset_s: float = 0.37,
-    three_videos: bool = False,
-    seed: int = 0,
     force: bool = False,
     report: Report = no_progress,
 ) -> Path:
-    """Write a simulated sequence into ROOT/Real_Data/RXX_Dn, as the real half of the archive would hold it.
+    """Write a simulated sequence in the folder ROOT/Real_Data/RXX_Dn, in the form of the dataset's real half.
 
-    Videos are taken through the lens and coded again. The lens shows more than the simulation: the outermost 6 % of a
-    picture repeat its border. Reference positions between the simulation's frames are cubic splines of its markers;
-    before its first frame the drones stand still. A sequence of `psotrack simulate NAME --set
-    cameras=laboratory_corners --no-masks --no-onboard` has all that is used.
+    The images are distorted by the lens and encoded again. The lens shows more than the simulated image: the outermost
+    6 % of an image repeat the border of the simulated one. Marker positions between the frames of the simulation are
+    cubic splines; before frame 0 the drones stand still. `psotrack simulate NAME --set cameras=laboratory_corners
+    --no-masks --no-onboard` makes a sequence with all that this function uses.
 
     Args:
         sequence: folder of the simulated sequence; its first four cameras are used.
-        root: folder of the dataset.
-        rate_hz: of the C3D file.
-        offset_s: time in the C3D file at frame 0 of the videos; above 0 where it began first.
-        three_videos: whether the last camera has no video, as in R17_D1_A.
-        seed: of the markers' noise, gaps and swapped labels.
-        force: whether to replace a sequence that is there.
-        report: told of every frame of every video.
+        root: root folder of the data.
+        settings: properties of the C3D file and the number of videos; None: the defaults.
+        force: whether to replace an existing sequence.
+        report: shows the progress in frames of all videos.
 
     Returns:
-        The folder of the new sequence.
+        Folder of the new sequence.
 
     Raises:
-        InputError: the sequence cannot be read, or has fewer than four cameras or no files of markers.
-        SettingsError: the rate is not above 0, or the C3D file would begin after the videos.
+        InputError: the sequence cannot be read, has fewer than four cameras, or has no files of markers.
+        SettingsError: the rate is not above 0, or the C3D file would begin after the end of the videos.
         OutputError: the new sequence exists and `force` is not set, or it cannot be written.
     """
-    check_positive("rate_hz", rate_hz)
+    settings = settings or RealFormSettings()
+    check_positive("rate_hz", settings.rate_hz)
     simulated = read_sequence(sequence)
     if len(simulated.videos) < len(SERIALS):
         found = f"{len(simulated.videos)}"
         raise InputError(sequence, expected=f"videos of {len(SERIALS)} cameras", found=found)
     markers_m = _simulated_markers(simulated)
-    rng = np.random.default_rng(seed)
-    recording = _recording(markers_m, simulated.fps, rate_hz, offset_s, rng)
+    rng = np.random.default_rng(settings.seed)
+    recording = _recording(markers_m, simulated.fps, settings, rng)
     names = [name for name in simulated.rig.names if name in simulated.videos][: len(SERIALS)]
     rig = _real_rig(simulated.rig.select(names))
     folder = Path(root) / "Real_Data" / f"R{_number(simulated.name):02d}_D{markers_m.shape[1]}"
     refuse_to_overwrite(folder, force)
-    filmed = list(zip(rig.names, names, strict=True))[: len(SERIALS) - three_videos]
+    filmed = list(zip(rig.names, names, strict=True))[: len(SERIALS) - settings.three_videos]
     with (
         atomic_write(folder) as growing,
         report("lens", sum(simulated.videos[name].num_frames for _, name in filmed)) as advance,
@@ -187,11 +199,11 @@ def _simulated_markers(simulated: Recording) -> Float[np.ndarray, "frames drones
 def _recording(
     markers_m: Float[np.ndarray, "frames drones markers 3"],
     fps: float,
-    rate_hz: float,
-    offset_s: float,
+    settings: RealFormSettings,
     rng: np.random.Generator,
 ) -> Markers:
     """What a mocap system would have recorded, until the videos end."""
+    rate_hz, offset_s = settings.rate_hz, settings.offset_s
     num_frames, num_drones, per_drone, _ = markers_m.shape
     last_s = (num_frames - 1) / fps
     if not -last_s < offset_s < np.inf:
