@@ -15,6 +15,8 @@ from psotrack.errors import InputError
 from psotrack.sweep import Store, locks
 
 KEY = "0" * 40
+#: A run in a manifest.
+RUN = {"grid": {"settings": {}, "methods": {}, "axes": {}}}
 
 
 @pytest.fixture
@@ -107,7 +109,7 @@ def test_the_folder_is_a_parquet_data_set_of_the_rows(tmp_path: Path) -> None:
     add(store, KEY, rows(0, 1))
     add(store, "1" * 40, rows(2))
     store.add_failure("2" * 40, "no such camera", {"sequence": "S01", "method": "ours"})
-    store.change_manifest(lambda manifest: manifest["runs"].append(1))
+    store.change_manifest(lambda manifest: manifest["runs"].append(RUN))
     with store.lock("3" * 40, "S01 ours"):
         pd.testing.assert_frame_equal(pd.read_parquet(tmp_path), store.rows())
 
@@ -116,7 +118,7 @@ def test_a_folder_of_an_older_version_stays_usable(tmp_path: Path) -> None:
     store = Store(tmp_path)
     add(store, KEY, rows(0, 1))
     store.add_failure(KEY, "no such camera", {"sequence": "S01", "method": "ours"})
-    store.change_manifest(lambda manifest: manifest["runs"].append(1))
+    store.change_manifest(lambda manifest: manifest["runs"].append(RUN))
     failure = tmp_path / "cells" / f"_{KEY}.error.json"
     for path in (tmp_path / "_errors", failure, tmp_path / "_manifest.json"):
         path.rename(path.with_name(path.name[1:]))
@@ -124,7 +126,7 @@ def test_a_folder_of_an_older_version_stays_usable(tmp_path: Path) -> None:
         assert len(store.errors(KEY, [0])) == 2
         assert store.failure(KEY) == "no such camera"
         assert store.status()["failed"] == 1
-        assert store.manifest()["runs"] == [1]
+        assert store.manifest()["runs"] == [RUN]
         store.tidy()
     pd.testing.assert_frame_equal(pd.read_parquet(tmp_path), store.rows())
     assert failure.exists()
@@ -282,14 +284,14 @@ def test_one_process_at_a_time_changes_the_manifest(tmp_path: Path) -> None:
 
     def count() -> None:
         for _ in range(5):
-            store.change_manifest(lambda manifest: manifest["runs"].append(1))
+            store.change_manifest(lambda manifest: manifest["runs"].append(RUN))
 
     threads = [threading.Thread(target=count) for _ in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert store.manifest()["runs"] == [1] * 20
+    assert store.manifest()["runs"] == [RUN] * 20
 
 
 def test_missing_results_are_one_clear_line(tmp_path: Path) -> None:

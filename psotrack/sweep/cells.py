@@ -99,6 +99,18 @@ def key_of(cell: Cell, input_keys: Mapping[str, str]) -> str:
         cell: whose key it is.
         input_keys: digests of all that is read: silhouettes by camera, calibration, reference.
     """
+    settings = msgspec.to_builtins(msgspec.structs.replace(cell.settings, seed=0))
+    return digest_cell(cell, settings, input_keys)
+
+
+def digest_cell(cell: Cell, settings: Mapping[str, Any], input_keys: Mapping[str, str]) -> str:
+    """Digest of a cell's input and settings: 40 hexadecimal digits.
+
+    Args:
+        cell: the cell.
+        settings: the cell's settings, as nested tables.
+        input_keys: digests of everything that the cell reads.
+    """
     made_of = {
         "schema": SCHEMA,
         "sequence": Path(cell.sequence).name,
@@ -106,7 +118,7 @@ def key_of(cell: Cell, input_keys: Mapping[str, str]) -> str:
         "cameras": cell.cameras,
         "frames": cell.frames,
         "perturbation": msgspec.to_builtins(cell.perturbation),
-        "settings": msgspec.to_builtins(msgspec.structs.replace(cell.settings, seed=0)),
+        "settings": settings,
         "input": dict(input_keys),
     }
     return hashlib.blake2b(msgspec.json.encode(made_of, order="deterministic"), digest_size=20).hexdigest()

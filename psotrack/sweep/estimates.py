@@ -14,6 +14,7 @@ from psotrack.silhouettes import open_stored, reduced_shape
 from psotrack.sweep.cells import Cell, key_of
 from psotrack.sweep.inputs import Inputs, source_of
 from psotrack.sweep.machine import provenance
+from psotrack.sweep.older_folders import older_key_of
 from psotrack.sweep.store import Store
 
 #: Rule of thumb, measured on two cores of an AMD EPYC, seconds: per frame of a run; per frame, particle, iteration,
@@ -73,7 +74,7 @@ def estimate(cells: Iterable[Cell], inputs: Inputs, store: Store | None) -> Esti
     tracking_s, programs, silhouettes_s = 0.0, set(), {}
     for cell in cells:
         try:
-            done = store.finished_seeds(key_of(cell, inputs.keys_of(cell))) if store else set()
+            done = _finished_seeds(cell, inputs, store) if store else set()
             sequence = inputs.sequence_of(cell)
         except PsotrackError:
             unread += 1
@@ -104,6 +105,13 @@ def estimate(cells: Iterable[Cell], inputs: Inputs, store: Store | None) -> Esti
     return Estimate(
         count, unread, tracking_s, COMPILE_S * len(programs), sum(silhouettes_s.values(), 0.0), basis
     )
+
+
+def _finished_seeds(cell: Cell, inputs: Inputs, store: Store) -> set[int]:
+    """Seeds of a cell's finished runs, of this version or of version 0.1."""
+    input_keys = inputs.keys_of(cell)
+    keys = (key_of(cell, input_keys), older_key_of(cell, input_keys))
+    return set().union(*(store.finished_seeds(key) for key in keys if key is not None))
 
 
 def _in_words(seconds: float) -> str:

@@ -25,6 +25,7 @@ from psotrack.sweep.locks import POLL_S
 from psotrack.sweep.machine import provenance
 from psotrack.sweep.manifest import note_input, note_run
 from psotrack.sweep.names import flat
+from psotrack.sweep.older_folders import older_key_of, older_name_of
 from psotrack.sweep.store import Store
 
 logger = logging.getLogger(__name__)
@@ -156,11 +157,16 @@ def find_finished(cell: Cell, inputs: Inputs, store: Store) -> Result | None:
     Raises:
         PsotrackError: the cell's input cannot be read.
     """
-    key = key_of(cell, inputs.keys_of(cell))
+    keys = inputs.keys_of(cell)
+    key, older_key = key_of(cell, keys), older_key_of(cell, keys)
+    if older_key is not None and store.finished_seeds(older_key):
+        with store.lock(key, title(cell)) as locked:
+            if locked:
+                store.adopt(older_key, key)
     if not set(cell.seeds) <= store.finished_seeds(key):
         return None
     # The runner that finished the cell may have been killed before it removed the record of an earlier failure.
-    store.remove_failure(name_of(cell))
+    _remove_failure(cell, store)
     return Result(cell, "left", key)
 
 
@@ -185,12 +191,19 @@ def run_cell(cell: Cell, inputs: Inputs, store: Store) -> Result:
                 return Result(cell, "busy", key)
             store.change_manifest(lambda manifest: note_input(manifest, cell, keys))
             store.add(key, *_run_seeds(cell, key, missing, given, input_digest(keys)))
-            store.remove_failure(name_of(cell))
+            _remove_failure(cell, store)
         return Result(cell, "finished", key)
     except OutputError:
         raise
     except Exception as error:
         return store_failure(cell, key, error, store)
+
+
+def _remove_failure(cell: Cell, store: Store) -> None:
+    """Remove the record of a cell's earlier failure, in this version or in version 0.1."""
+    for name in (name_of(cell), older_name_of(cell)):
+        if name is not None:
+            store.remove_failure(name)
 
 
 def store_failure(cell: Cell, key: str | None, error: Exception, store: Store) -> Result:

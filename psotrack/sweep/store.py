@@ -7,8 +7,9 @@
     DIR/_manifest.json               what was run, with which versions, on which machine, from which input
 
 Programs that read DIR as one Parquet data set, such as `pandas.read_parquet`, skip names that begin with a dot or an
-underscore, and so read exactly the rows of the finished cells. Folders of older versions lack the underscores; they can
-be read, and a runner that continues one renames its files.
+underscore, and so read exactly the rows of the finished cells. Folders of version 0.1 lack the underscores, and their
+rows have other names of settings (see `older_folders`). Both can be read, and a sweep that continues such a folder
+renames files, and columns of the cells that it needs.
 
 A cell's file appears whole or not at all. KEY is made of everything that decides the cell's rows (see `cells.key_of`).
 NAME is made of the same without the content of the input: a cell whose input cannot be read has no KEY.
@@ -19,7 +20,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ import pandas as pd
 from psotrack.errors import InputError
 from psotrack.support import atomic_write
 from psotrack.sweep.locks import Locks
+from psotrack.sweep.older_folders import rename_columns, rename_manifest
 
 #: A temporary file that is older was left by a runner that was killed, seconds.
 _LEFT_BEHIND_S = 3600.0
@@ -47,8 +49,30 @@ class Store:
 
     def finished_seeds(self, key: str) -> set[int]:
         """Seeds of a cell's finished runs."""
-        path = self._rows_path(key)
-        return set(pd.read_parquet(path, columns=["seed"])["seed"].tolist()) if path.exists() else set()
+        try:
+            return set(pd.read_parquet(self._rows_path(key), columns=["seed"])["seed"].tolist())
+        except FileNotFoundError:
+            return set()
+
+    def adopt(self, older_key: str, key: str) -> None:
+        """Move the results of a cell, if version 0.1 stored any, to the cell's key and names of today.
+
+        Nothing is lost if the process is killed: the older files are removed last, and the next call continues. The
+        caller holds the cell's lock.
+
+        Args:
+            older_key: the cell's key in version 0.1.
+            key: the cell's key.
+
+        Raises:
+            OutputError: the files cannot be written.
+        """
+        older_rows, older_errors = self._rows_path(older_key), _present(self._errors_path(older_key))
+        if older_rows.exists() and older_errors.exists():
+            rows = rename_columns(pd.read_parquet(older_rows)).assign(cell=key)
+            self.add(key, rows, pd.read_parquet(older_errors))
+            older_rows.unlink()
+        older_errors.unlink(missing_ok=True)
 
     def lock(self, key: str, work: str = "") -> AbstractContextManager[bool]:
         """Try to lock a cell until the block ends; yields whether the cell is locked for this process.
@@ -107,11 +131,10 @@ class Store:
             InputError: there are no results.
         """
         if seeds is None:
-            parts = [pd.read_parquet(path) for path in self._cell_files("parquet")]
+            parts = _read_cells(self._cell_files("parquet"))
         else:
-            paths = {self._rows_path(key): wanted for key, wanted in seeds.items()}
-            tables = [(pd.read_parquet(path), wanted) for path, wanted in paths.items() if path.exists()]
-            parts = [table[table["seed"].isin(list(wanted))] for table, wanted in tables]
+            tables = [(_read_cells([self._rows_path(key)]), wanted) for key, wanted in seeds.items()]
+            parts = [table[table["seed"].isin(list(wanted))] for read, wanted in tables for table in read]
         if not parts:
             raise InputError(self.folder, expected="results of a sweep", found="no finished cell")
         return pd.concat(parts, ignore_index=True)
@@ -155,7 +178,8 @@ class Store:
 
     def manifest(self) -> dict[str, Any]:
         """Content of the manifest: runs and inputs; both are empty before the first run."""
-        return _read_if_present(self.folder / "_manifest.json") or {"runs": [], "inputs": {}}
+        content = _read_if_present(self.folder / "_manifest.json")
+        return rename_manifest(content) if content else {"runs": [], "inputs": {}}
 
     def change_manifest(self, change: Callable[[dict[str, Any]], None]) -> None:
         """Change the manifest while no other runner does.
@@ -210,6 +234,16 @@ def _present(path: Path) -> Path:
     if path.parent.name == "_errors":
         older = path.parent.with_name("errors") / path.name
     return older if older.exists() and not path.exists() else path
+
+
+def _read_cells(paths: Iterable[Path]) -> list[pd.DataFrame]:
+    """Rows of each cell, with today's names of settings; files that do not exist are left out."""
+    parts = []
+    for path in paths:
+        # Another process may remove the file of a cell that version 0.1 stored (see `Store.adopt`).
+        with contextlib.suppress(FileNotFoundError):
+            parts.append(rename_columns(pd.read_parquet(path)))
+    return parts
 
 
 def _read_if_present(path: Path) -> dict[str, Any] | None:

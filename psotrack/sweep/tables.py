@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from psotrack.errors import SettingsError
+from psotrack.settings import renamed
 from psotrack.support import nearest
 
 logger = logging.getLogger(__name__)
@@ -89,10 +90,13 @@ def _find_column(where: str, name: str, names: list[str]) -> str:
     ]
     if len(ends) == 1:
         return ends[0]
-    near = nearest(name, names)
-    remedy = f"did you mean {near}?" if near else f"there are {', '.join(names)}"
+    near, today = nearest(name, names), renamed(name.removeprefix("settings."))
     if ends:
         remedy = f"it may be {' or '.join(ends)}"
+    elif today:
+        remedy = today
+    else:
+        remedy = f"did you mean {near}?" if near else f"there are {', '.join(names)}"
     raise SettingsError(where, expected="the name of one column", found=name, remedy=remedy)
 
 
