@@ -41,7 +41,7 @@ _LEAST_APART_M, _FOUND_M = 0.5, 0.1
 @click.option(
     "--results", type=click.Path(path_type=Path), help="Write the result and its record into this folder."
 )
-def main(
+def main(  # noqa: PLR0913  # A click command has one parameter per option.
     drones: int,
     cameras: int,
     detections: int,
