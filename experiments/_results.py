@@ -253,7 +253,7 @@ def _same_code(commit: str, name: str) -> bool:
     """Whether a Python file differs from that of the commit in docstrings, comments, messages and layout only."""
     if not name.endswith((".py", ".pyi")):
         return False
-    old, new = (_git("show", f"{at}:{name}", default=None) for at in (commit, "HEAD"))
+    old, new = (_content(at, name) for at in (commit, "HEAD"))
     if old is None or new is None:
         return False
     try:
@@ -262,6 +262,13 @@ def _same_code(commit: str, name: str) -> bool:
         return False
 
 
+@cache
+def _content(commit: str, name: str) -> str | None:
+    """Content of a file at a commit; None where the commit has no such file."""
+    return _git("show", f"{commit}:{name}", default=None)
+
+
+@cache
 def _stripped(source: str) -> str:
     """The syntax tree of a source without docstrings and without the arguments of errors, which hold messages only."""
     tree = ast.parse(source)

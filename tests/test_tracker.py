@@ -1,4 +1,4 @@
-"""The tracker, from silhouettes that are drawn by casting rays at moving ellipsoids."""
+"""The tracker of one chunk. Silhouettes of moving ellipsoids are drawn by casting rays."""
 
 from dataclasses import replace
 
@@ -52,7 +52,7 @@ def track(
     occlusion=True,
     **settings,
 ):
-    """The state at the end and the info of every frame, as NumPy."""
+    """State after the last frame, and the info of every frame as NumPy arrays."""
     state, params, program = prepared(position_m, velocity_m_s, size_m=size_m, **settings)
     program = replace(program, occlusion=program.occlusion and occlusion)
     state, info = tracker.track(state, coverage, CAMERAS, params, program, NO_STARTS)
@@ -74,7 +74,7 @@ def test_it_follows_the_drones(coverage, swarm):
     _, info = track(coverage, swarm=swarm, **effort)
     assert info.position_m.shape == (NUM_FRAMES, 2, 3)
     error_m = np.linalg.norm(info.position_m - TRUTH_M, axis=-1)
-    # The middle of an ellipse is placed to a fraction of a cell by five views; limit one cell, in every frame.
+    # Five views place the middle of an ellipse to a fraction of a cell. The limit is one cell, in every frame.
     assert error_m.max() < CELL_M
     assert (info.status == Status.TRACKED).all()
     assert ((info.fitness > 0.2) & (info.fitness <= 1)).all()
@@ -91,18 +91,18 @@ def test_the_hard_score_follows_as_well_as_its_plateau_allows(coverage):
 
 
 def test_velocity_is_estimated(coverage):
-    """Starting from a wrong velocity of 0, the estimate comes to the truth."""
+    """The initial velocity is wrong (0); the estimate converges to the true velocity."""
     _, info = track(coverage, velocity_m_s=np.zeros((2, 3)))
     error_m_s = np.linalg.norm(info.velocity_m_s - VELOCITY_M_S, axis=-1)
-    # The filter averages over a few frames: a third of a cell of noise over three frames is 0.08 m/s, and it lags by
-    # three frames, in which these curves turn by 0.2 m/s. Measured 0.09, limit 0.4.
+    # The filter averages over about three frames: noise of a third of a cell gives 0.08 m/s, and the lag of three
+    # frames, in which the velocity turns by 0.2 m/s, adds to that. Measured 0.09, limit 0.4.
     assert np.median(error_m_s[10:]) < 0.4
     assert error_m_s[0].min() > 0.4
 
 
 @pytest.mark.slow
 def test_chunks_do_not_matter(coverage):
-    """The state carries everything over the border of chunks, the random key too: bit for bit."""
+    """Two chunks give the same bits as one: the state holds all that the next chunk needs, the random key too."""
     state, params, program = prepared()
     whole_state, whole = tracker.track(state, coverage, CAMERAS, params, program, NO_STARTS)
     state, first = tracker.track(state, coverage[:12], CAMERAS, params, program, NO_STARTS)
@@ -114,8 +114,8 @@ def test_chunks_do_not_matter(coverage):
     assert state.key == whole_state.key
 
 
-def test_every_frame_draws_anew(coverage):
-    """The key is replaced: two frames of one state's key would search with the same random numbers."""
+def test_every_frame_uses_new_random_numbers(coverage):
+    """The state's key is replaced; with the same key, two frames would search with the same random numbers."""
     state, params, program = prepared()
     once, _ = tracker.track(state, coverage[:12], CAMERAS, params, program, NO_STARTS)
     twice, _ = tracker.track(once, coverage[12:], CAMERAS, params, program, NO_STARTS)
@@ -124,13 +124,13 @@ def test_every_frame_draws_anew(coverage):
 
 @pytest.mark.slow
 def test_online_is_offline(coverage):
-    """`step`, frame by frame as a live source would call it, and `track` yield the same."""
+    """`step`, called frame by frame as by a live source, gives the result of `track`."""
     state, params, program = prepared()
     _, whole = tracker.track(state, coverage, CAMERAS, params, program, NO_STARTS)
     live = jax.jit(tracker.step, static_argnames="program")
     for frame in range(6):
         state, info = live(state, coverage[frame], CAMERAS, params, program)
-        # Compiled twice, so last bits may differ, and a swarm may take another turn for it: to the same maximum.
+        # Two compiled programs differ in the last bits, after which a swarm may move differently to the same maximum.
         np.testing.assert_allclose(info.position_m, whole.position_m[frame], atol=CELL_M / 3)
         np.testing.assert_array_equal(info.status, whole.status[frame])
 
@@ -143,13 +143,13 @@ def test_same_seed_same_result(coverage, swarm):
     _, other = track(coverage, swarm=swarm, seed=4, **effort)
     assert_same(first, second)
     assert not np.array_equal(first.position_m, other.position_m)
-    # Another seed ends at the same maximum.
+    # A swarm with another seed converges to the same maximum.
     np.testing.assert_allclose(other.position_m, first.position_m, atol=CELL_M)
 
 
 @pytest.mark.slow
 def test_drones_of_their_own_swarms_interact_by_occlusion_alone(coverage):
-    """Without occlusion, starting the second drone elsewhere changes no bit of the first."""
+    """Without occlusion, another initial position of the second drone changes no bit of the first drone's track."""
     elsewhere_m = TRUTH_M[0] + [[0, 0, 0], [0.1, 0, 0]]
     (_, info), (_, changed) = (
         track(coverage, position_m=position_m, occlusion=False) for position_m in (TRUTH_M[0], elsewhere_m)
@@ -159,7 +159,7 @@ def test_drones_of_their_own_swarms_interact_by_occlusion_alone(coverage):
 
 
 def test_drones_that_pass_close_keep_their_identities():
-    """Head on at 1.5 m/s each, 0.3 m between their middles; 0.05 m between their hulls."""
+    """Two drones meet head on at 1.5 m/s each. Their middles pass at 0.3 m, their hulls at 0.05 m."""
     along_m = 1.5 * (TIME_S - TIME_S[NUM_FRAMES // 2])
     beside_m, height_m = np.full(NUM_FRAMES, 0.15), np.full(NUM_FRAMES, 1.3)
     paths = ([along_m, beside_m, height_m], [-along_m, -beside_m, height_m])
@@ -172,11 +172,11 @@ def test_drones_that_pass_close_keep_their_identities():
         _, info = track(images, truth_m[0], velocity_m_s, size_m=size_m, occlusion=occlusion)
         error_m = np.linalg.norm(info.position_m - truth_m, axis=-1)
         assert (info.status == Status.TRACKED).all()
-        # A tenth of the distance at which they pass; measured 11 mm, in any frame.
+        # A tenth of the distance at which the drones pass, in every frame; measured 11 mm.
         assert error_m.max() < CELL_M
         passing = np.linalg.norm(truth_m[:, 0] - truth_m[:, 1], axis=-1) < 0.6
         rms_m[occlusion] = np.sqrt(np.mean(error_m[passing] ** 2))
-    # While they pass. Measured 6.0 mm with occlusion and 8.0 mm without, the same for three seeds to 0.3 mm.
+    # During the pass: measured 6.0 mm with occlusion and 8.0 mm without; three seeds agree to 0.3 mm.
     assert rms_m[True] < 0.9 * rms_m[False]
 
 
@@ -186,7 +186,7 @@ GONE, BACK, GONE_AGAIN = 4, 15, 20
 
 @pytest.fixture(scope="module")
 def interrupted():
-    """Two drones that hover; the first is gone, comes back, and goes again."""
+    """Silhouettes of two drones that hover; the first drone vanishes, returns, and vanishes again."""
     both, second = (draw_coverage(RIG, HOVER_M[first:], SIZE_M[first:], REDUCTION) for first in (0, 1))
     frame = np.arange(NUM_FRAMES)
     there = (frame < GONE) | ((frame >= BACK) & (frame < GONE_AGAIN))
@@ -194,31 +194,33 @@ def interrupted():
 
 
 def test_a_drone_that_vanishes_coasts_is_lost_and_comes_back(interrupted):
-    # Where it is sought grows with the time since it was found: at 1.2 m/s by 0.6 m, short of its neighbour.
+    # The search region grows with the time since the drone was last found: at 1.2 m/s by 0.6 m, which does not reach
+    # the neighbour.
     _, info = track(interrupted, HOVER_M, np.zeros((2, 3)), max_coasting_s=5 / FPS, max_speed_m_s=1.2)
     status = info.status[:, 0]
     assert (status[:GONE] == Status.TRACKED).all()
     assert (status[GONE : GONE + 5] == Status.COASTING).all()
     assert (status[GONE + 5 : BACK] == Status.LOST).all()
     assert (status[BACK:GONE_AGAIN] == Status.TRACKED).all()
-    # The count starts anew.
+    # The count of missed frames starts again at zero.
     assert (status[GONE_AGAIN:] == Status.COASTING).all()
     error_m = np.linalg.norm(info.position_m - HOVER_M, axis=-1)
-    # Found again at once, though the drift of 5 frames at a few cm/s lies between.
+    # The drone is found at once, although the prediction drifted for 5 frames at a few cm/s.
     assert error_m[BACK + 1 : GONE_AGAIN, 0].max() < CELL_M
-    # In one view its neighbour is where it is sought; one view is not enough.
+    # In one view the neighbour lies in the search region; one view is not enough.
     assert (info.num_cameras[GONE:BACK, 0] <= 1).all()
-    # Its neighbour does not mind.
+    # The neighbour is tracked all the time.
     assert (info.status[:, 1] == Status.TRACKED).all()
     assert error_m[:, 1].max() < CELL_M
 
 
-def test_a_lost_drone_is_not_what_comes_within_its_reach():
-    """More than its span off it may be another one; the tracker, which knows one frame, leaves that to others."""
+def test_a_lost_drone_does_not_take_over_another_drone():
+    """A drone that appears farther away than a drone's span may be another drone; re-identification decides that."""
     gone, other = HOVER_M.copy(), HOVER_M.copy()
     other[0] += (0.7, 0.0, 0.0)
     before, alone, after = (
-        draw_coverage(RIG, *of, REDUCTION) for of in ((gone, SIZE_M), (gone[1:], SIZE_M[1:]), (other, SIZE_M))
+        draw_coverage(RIG, *drones, REDUCTION)
+        for drones in ((gone, SIZE_M), (gone[1:], SIZE_M[1:]), (other, SIZE_M))
     )
     silhouettes = np.stack([before] * 4 + [alone] * 12 + [after] * (NUM_FRAMES - 16))
     _, info = track(silhouettes, HOVER_M, np.zeros((2, 3)), max_coasting_s=5 / FPS, max_speed_m_s=3.0)
@@ -227,20 +229,20 @@ def test_a_lost_drone_is_not_what_comes_within_its_reach():
 
 
 def test_coasting_goes_straight_on(coverage):
-    """Without any foreground a drone flies on at its last velocity, and stands still once it is lost."""
+    """Without foreground a track continues at its last velocity, and stands still after the drone is lost."""
     state, info = track(np.zeros_like(coverage), max_coasting_s=8 / FPS)
     assert (info.status[:8] == Status.COASTING).all()
     assert (info.status[8:] == Status.LOST).all()
     straight = TRUTH_M[0] + TIME_S[:8, None, None] * VELOCITY_M_S[0]
-    # Eight sums of float32.
+    # Rounding of eight float32 additions.
     np.testing.assert_allclose(info.position_m[:8], straight, atol=1e-5)
     np.testing.assert_allclose(info.position_m[9:], info.position_m[8:-1], atol=1e-6)
     assert not info.velocity_m_s[8:].any()
     np.testing.assert_array_equal(state.missed, NUM_FRAMES)
 
 
-def test_the_room_holds_them(coverage):
-    """Coasting into a wall at 5 m/s, a drone stops at it."""
+def test_tracks_stay_in_the_room(coverage):
+    """A track that coasts into a wall at 5 m/s stops at the wall."""
     _, info = track(
         np.zeros_like(coverage),
         position_m=np.array([[2.8, 0, 1.5], [0, 0, 0.2]]),
@@ -253,14 +255,14 @@ def test_the_room_holds_them(coverage):
     np.testing.assert_allclose(info.position_m[-1], [[3, 0, 1.5], [0, 0, 0]], atol=1e-6)
 
 
-def test_nobody_flies_faster_than_allowed(coverage):
-    """Silhouettes that jump 0.8 m in one frame pull nobody along at once."""
+def test_no_track_is_faster_than_the_largest_speed(coverage):
+    """Silhouettes that jump by 0.8 m in one frame move the tracks by the allowed distance only."""
     jumping = coverage.copy()
     jumping[12:] = draw_coverage(RIG, TRUTH_M[11] + [0.0, 0.8, 0.0], SIZE_M, REDUCTION)
     _, info = track(jumping, max_speed_m_s=2.0)
     speed_m_s = np.linalg.norm(info.velocity_m_s, axis=-1)
     assert speed_m_s.max() <= 2.0 * (1 + 1e-5)
-    # The reach is a box about the last position, and grows while a drone is not found.
+    # The search region is a box about the last position, and grows while the drone is not found.
     reach_m = 2.0 / FPS * np.ones(3)
     moved_m = np.abs(np.diff(info.position_m, axis=0))
     found = (info.status[1:] == Status.TRACKED) & (info.status[:-1] == Status.TRACKED)
@@ -277,7 +279,7 @@ def test_num_cameras_counts_those_with_foreground(coverage):
     assert (info.status == Status.TRACKED).all()
 
 
-def test_fewer_cameras_than_wanted_is_not_found(coverage):
+def test_too_few_cameras_do_not_find_a_drone(coverage):
     blinded = coverage.copy()
     blinded[:, 2:] = 0
     _, info = track(blinded, min_cameras=3)
@@ -286,7 +288,7 @@ def test_fewer_cameras_than_wanted_is_not_found(coverage):
 
 
 def test_no_iterations_still_evaluates_the_start(coverage):
-    """The particles are placed about the prediction and the best of them is taken."""
+    """With no iterations, the result is the best of the initial particles, which lie about the prediction."""
     _, info = track(coverage, iterations=0)
     assert np.isfinite(info.position_m).all()
     assert np.linalg.norm(info.position_m - TRUTH_M, axis=-1).max() < 0.2

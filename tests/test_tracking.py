@@ -1,4 +1,4 @@
-"""Drones that come and go, through the chunks of a recording whose silhouettes are drawn by casting rays."""
+"""Tracking a whole recording chunk by chunk: drones enter, leave and return. Silhouettes are drawn by casting rays."""
 
 import contextlib
 import threading
@@ -45,7 +45,7 @@ def paths():
 
 
 TRUTH_M = paths()
-NOBODY = InitialState(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+NO_DRONES = InitialState(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
 FIRST = InitialState(TRUTH_M[:1, 0], np.array([[0.25, 0.1, 0.05]]), SIZE_M[:1], np.array([5.0]))
 
 
@@ -53,8 +53,8 @@ FIRST = InitialState(TRUTH_M[:1, 0], np.array([[0.25, 0.1, 0.05]]), SIZE_M[:1], 
 def silhouettes():
     there = np.isfinite(TRUTH_M).all(axis=-1)
     images = [
-        draw_coverage(RIG, positions[who], SIZE_M[who], REDUCTION)
-        for positions, who in zip(TRUTH_M, there, strict=True)
+        draw_coverage(RIG, positions[visible], SIZE_M[visible], REDUCTION)
+        for positions, visible in zip(TRUTH_M, there, strict=True)
     ]
     arrays = tuple(np.moveaxis(np.array(images), 1, 0))
     return Silhouettes(
@@ -77,8 +77,8 @@ def trajectories_of(tracks, *, smoothed=False):
 
 @pytest.fixture(scope="module")
 def batch(silhouettes):
-    """Three runs at once: seeds, numbers and starts that differ. Drones are born in one and not in another."""
-    starts = [FIRST, FIRST, NOBODY]
+    """Three runs in one batch, with different seeds, numbers of drones and initial states."""
+    starts = [FIRST, FIRST, NO_DRONES]
     changes = [{"seed": 0}, {"seed": 5, "drones": 1}, {"seed": 2, "iterations": 4, "inertia": 0.5}]
     runs = [run_inputs(start, **change) for start, change in zip(starts, changes, strict=True)]
     return list(zip(runs, track_silhouettes(RIG, silhouettes, runs, fps=FPS), strict=True))
@@ -87,7 +87,7 @@ def batch(silhouettes):
 @pytest.mark.slow
 @pytest.mark.parametrize("run", range(3))
 def test_a_run_of_a_batch_is_the_run_alone(batch, silhouettes, run):
-    """To the last bit, whichever device it was on and whoever was beside it."""
+    """The bits do not depend on the device of the run and on the other runs of the batch."""
     assert len(jax.devices()) == 2
     inputs, (tracked, _) = batch[run]
     ((alone, _),) = track_silhouettes(RIG, silhouettes, [inputs], fps=FPS)
@@ -104,7 +104,7 @@ def test_an_interrupt_stops_all_devices(silhouettes):
     begun, raised = [], threading.Event()
 
     class Slow(Silhouettes):
-        """Silhouettes of which only the thread of the first device reads at once."""
+        """Silhouettes that the threads of other devices read only after the first device has raised."""
 
         def read(self, start, stop):
             if threading.current_thread() is not threading.main_thread():
@@ -122,13 +122,13 @@ def test_an_interrupt_stops_all_devices(silhouettes):
     runs = [run_inputs(FIRST, seed=seed) for seed in range(2)]
     with pytest.raises(KeyboardInterrupt):
         track_silhouettes(RIG, slow, runs, fps=FPS, report=report)
-    # Two chunks at most: one that was being read when the interrupt came, and one that had begun before it was seen.
+    # At most two chunks: the chunk that was being read, and the chunk that began before the thread saw the interrupt.
     assert len(begun) <= 2
 
 
 @pytest.mark.slow
-def test_chunk_after_chunk_is_one_program(silhouettes, caplog):
-    """It was compiled twice: what is learned of sizes began as another type than it went on with."""
+def test_all_chunks_run_the_same_program(silhouettes, caplog):
+    """The learned sizes once began as another type than later chunks used, so the program was compiled twice."""
     shorter = replace(silhouettes, num_frames=60, arrays=tuple(array[:60] for array in silhouettes.arrays))
     with jax.log_compiles(), caplog.at_level("WARNING", logger="jax"):
         track(shorter, FIRST, drones=1, particles=6)
@@ -144,31 +144,29 @@ def test_runs_of_other_seeds_differ(batch):
 
 
 @pytest.fixture(scope="module")
-def told(silhouettes):
-    """Both tracked from a start that knows the first drone alone."""
+def tracked_from_first(silhouettes):
+    """Tracks and trajectories of both drones; the initial state holds the first drone alone."""
     return track(silhouettes, FIRST)
 
 
-def test_a_drone_that_enters_is_born(told):
-    tracked, trajectories = told
-    born = [arrival for arrival in tracked.arrivals if not arrival.again]
-    assert [arrival.drone for arrival in born] == [1]
-    # It is there from this frame on; nobody has seen it before.
-    assert ENTERS <= born[0].frame <= ENTERS + 2
-    before = trajectories.position_m[: born[0].frame, 1]
+def test_a_drone_that_enters_gets_a_new_track(tracked_from_first):
+    tracked, trajectories = tracked_from_first
+    new = [arrival for arrival in tracked.arrivals if not arrival.again]
+    assert [arrival.drone for arrival in new] == [1]
+    # The track begins where the drone enters, and has no position before.
+    assert ENTERS <= new[0].frame <= ENTERS + 2
+    before = trajectories.position_m[: new[0].frame, 1]
     assert np.isnan(before).all()
-    assert not trajectories.seen[: born[0].frame, 1].any()
-    error_m = np.linalg.norm(
-        trajectories.position_m[born[0].frame :, 1] - TRUTH_M[born[0].frame :, 1], axis=-1
-    )
-    # Placed to a fraction of a cell, but for its first frames, which begin from a coarse place. Limit two cells.
+    assert not trajectories.seen[: new[0].frame, 1].any()
+    error_m = np.linalg.norm(trajectories.position_m[new[0].frame :, 1] - TRUTH_M[new[0].frame :, 1], axis=-1)
+    # The median is a fraction of a cell. The first frames start from a coarse position; their limit is two cells.
     assert np.median(error_m) < CELL_M / 2
     assert error_m.max() < 2 * CELL_M
 
 
-def test_a_drone_that_is_lost_comes_back_as_itself(told):
-    """The swarm finds it about its last place, or else what the tracks leave unexplained shows where it is."""
-    tracked, trajectories = told
+def test_a_drone_that_returns_keeps_its_number(tracked_from_first):
+    """The swarm finds the drone near its last position, or the residual foreground shows where the drone is."""
+    tracked, trajectories = tracked_from_first
     assert {arrival.drone for arrival in tracked.arrivals if arrival.again} <= {0}
     status = trajectories.status[:, 0]
     coasting = round(SETTINGS.status.max_coasting_s * FPS)
@@ -180,25 +178,25 @@ def test_a_drone_that_is_lost_comes_back_as_itself(told):
     assert error_m.max() < 2 * CELL_M
 
 
-def test_coasting_is_ever_less_certain(told):
-    _, trajectories = told
+def test_covariance_grows_while_a_drone_coasts(tracked_from_first):
+    _, trajectories = tracked_from_first
     coasting = trajectories.status[:, 0] == Status.COASTING
     spread = np.trace(trajectories.covariance_m2[coasting, 0], axis1=-2, axis2=-1)
     assert (np.diff(spread) > 0).all()
     assert spread[-1] > 100 * np.trace(trajectories.covariance_m2[AWAY.start - 1, 0])
 
 
-def test_sizes_are_learned(told):
-    """From starts that are a fifth too large; a moment's half length is a tenth more than an ellipse's."""
-    tracked, _ = told
+def test_sizes_are_learned(tracked_from_first):
+    """Sizes are measured by second moments, whose half length is a tenth more than the half axis of an ellipse."""
+    tracked, _ = tracked_from_first
     assert (tracked.sizes.num_frames[0] > 40).all()
     # Measured 1.08 to 1.12 of the drawn lengths.
     np.testing.assert_allclose(tracked.sizes.size_m / SIZE_M, 1.1, atol=0.06)
 
 
 def test_a_recording_may_begin_without_drones(silhouettes):
-    """The first drone is there from the first frame, so that it is only found late if one looks late."""
-    tracked, trajectories = track(silhouettes, NOBODY)
+    """The first drone is visible from the first frame, and its track begins there."""
+    tracked, trajectories = track(silhouettes, NO_DRONES)
     assert trajectories.num_drones == 2
     assert [(arrival.frame, arrival.again) for arrival in tracked.arrivals[:1]] == [(0, False)]
     for drone in range(2):
@@ -209,42 +207,42 @@ def test_a_recording_may_begin_without_drones(silhouettes):
 
 
 @pytest.mark.slow
-def test_nobody_is_born_beyond_the_number_of_drones(silhouettes):
+def test_no_track_is_added_beyond_the_number_of_drones(silhouettes):
     tracked, trajectories = track(silhouettes, FIRST, drones=1)
     assert trajectories.num_drones == 1
     assert all(arrival.again for arrival in tracked.arrivals)
 
 
 @pytest.mark.slow
-def test_sizes_may_be_pinned(silhouettes):
+def test_sizes_stay_where_learning_is_off(silhouettes):
     tracked, _ = track(silhouettes, FIRST, drones=1, learn_sizes=False)
     np.testing.assert_allclose(tracked.sizes.size_m, SIZE_M[:1], rtol=1e-6)
 
 
-def test_smoothing(told, silhouettes):
-    """Smoothed tracks are more certain and no worse."""
-    tracked, filtered = told
+def test_smoothing(tracked_from_first, silhouettes):
+    """Smoothing makes covariances smaller and errors no larger."""
+    tracked, filtered = tracked_from_first
     smoothed = trajectories_of(tracked, smoothed=True)
     seen = filtered.seen & np.isfinite(TRUTH_M).all(axis=-1)
     error_m = np.linalg.norm(smoothed.position_m - TRUTH_M, axis=-1)
-    # Silhouettes without noise leave little to smooth: 2 mm before as after.
+    # Silhouettes without noise leave little to smooth: the mean error is 2 mm before and after.
     assert error_m[seen].mean() < CELL_M / 4
     spread = [np.trace(of.covariance_m2[seen], axis1=-2, axis2=-1).mean() for of in (filtered, smoothed)]
     assert spread[1] < spread[0]
     np.testing.assert_array_equal(smoothed.status, filtered.status)
 
 
-def test_frames_of_a_recording_that_is_no_multiple_of_a_chunk(silhouettes, told):
-    """The last chunk is filled up with empty frames, of which nothing is to be seen."""
+def test_frames_of_a_recording_that_is_no_multiple_of_a_chunk(silhouettes, tracked_from_first):
+    """The last chunk is filled up with empty frames, which do not change the result."""
     assert NUM_FRAMES % 25
     shorter = replace(silhouettes, num_frames=40, arrays=tuple(array[:40] for array in silhouettes.arrays))
     _, trajectories = track(shorter, FIRST)
     assert trajectories.num_frames == 40
-    np.testing.assert_array_equal(trajectories.position_m[:25], told[1].position_m[:25, :1])
+    np.testing.assert_array_equal(trajectories.position_m[:25], tracked_from_first[1].position_m[:25, :1])
 
 
-def test_detections_tell_of_drones_that_silhouettes_do_not_show(silhouettes, tmp_path):
-    """The second drone is none of the silhouettes' at frame 0; a detector may see it, and the first one too."""
+def test_detections_add_drones_that_silhouettes_do_not_show(silhouettes, tmp_path):
+    """At frame 0 the silhouettes show the first drone alone, and the detections show both drones."""
     source = StartSource("auto", tmp_path)
     hidden_m = np.array([0.9, 0.9, 0.9])
     detected = InitialState(
@@ -264,4 +262,4 @@ def test_detections_tell_of_drones_that_silhouettes_do_not_show(silhouettes, tmp
     np.testing.assert_array_equal(both.position_m, [alone.position_m[0], hidden_m])
     np.testing.assert_array_equal(both.size_m, [alone.size_m[0], SIZE_M[1]])
     np.testing.assert_array_equal(found(detected, DroneSettings(count=1)).position_m, alone.position_m)
-    np.testing.assert_array_equal(found(NOBODY).position_m, alone.position_m)
+    np.testing.assert_array_equal(found(NO_DRONES).position_m, alone.position_m)
