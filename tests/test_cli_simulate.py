@@ -71,6 +71,7 @@ def test_fields_are_changed_from_the_command_line(tmp_path):
     assert len({round(float(focal), 3) for focal in rig.cameras.K[:, 0, 0]}) == 4
 
 
+@pytest.mark.slow
 def test_a_page_of_pictures_instead_of_the_sequence(tmp_path):
     answer = run("S01_D2_A", "--preview", "--out", tmp_path, "--frames", "3", "--jobs", "1", "--json", "-")
     page = tmp_path / "S01_D2_A.png"

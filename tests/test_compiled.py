@@ -49,7 +49,7 @@ def test_a_program_is_compiled_once(tmp_path: Path) -> None:
     assert entry(folder).stat().st_mtime_ns == written
 
 
-@pytest.mark.parametrize("size", [0, 300])
+@pytest.mark.parametrize("size", [pytest.param(0, marks=pytest.mark.slow), 300])
 def test_a_truncated_entry_is_renewed(tmp_path: Path, size: int) -> None:
     """JAX alone never replaces an entry: each run would compile again and warn."""
     run(tmp_path)

@@ -414,7 +414,7 @@ def planted(acceleration, *, chance=None):
     return misplaced(without(raw, slice(60, 85)), slice(85, 90), [2.3, 0.0, 0.0]), position_m
 
 
-@pytest.mark.parametrize("acceleration", [0.5, 2.0])
+@pytest.mark.parametrize("acceleration", [0.5, pytest.param(2.0, marks=pytest.mark.slow)])
 def test_wrong_poses_that_agree_after_a_gap_are_not_accepted(acceleration) -> None:
     raw, position_m = planted(acceleration)
     path = filter_path(raw)

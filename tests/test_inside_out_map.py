@@ -456,7 +456,7 @@ def test_measured_corners_without_a_square_are_refused(tmp_path):
 # Maps from videos
 
 
-@pytest.mark.parametrize("videos", [1, 2])
+@pytest.mark.parametrize("videos", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_exact_images_give_the_exact_map(videos):
     """Two videos have different lenses; one lens has distortion."""
     built = build_map(sightings(videos=videos), {7: ROOM[7]})
@@ -485,6 +485,7 @@ def test_a_single_known_side_makes_the_axes_of_the_marker_those_of_the_world():
     np.testing.assert_allclose(moved, given_world.marker_map.all_corners_m, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_larger_marker_makes_a_larger_room():
     built = build_map(sightings(), {7: corners_in_own_frame(2 * SIDE_M)})
     np.testing.assert_allclose(built.marker_map.sides_m, 2 * SIDE_M, rtol=1e-12)

@@ -125,7 +125,9 @@ def test_the_model_distinguishes_calm_from_violent_flights_and_wide_from_correct
     assert 0.5 < np.median(calm_model.noise_scale) < 2.0
 
 
-@pytest.mark.parametrize(("acceleration", "wobble"), [(0.5, 0.5), (8.0, 8.0)])
+@pytest.mark.parametrize(
+    ("acceleration", "wobble"), [(0.5, 0.5), pytest.param(8.0, 8.0, marks=pytest.mark.slow)]
+)
 def test_the_smoother_is_better_than_the_filter_and_its_covariances_are_right(acceleration, wobble) -> None:
     raw, position_m, truth = flight(100, acceleration=acceleration, wobble=wobble, seed=33)
     filtered, smoothed = filter_path(raw), smooth(raw)

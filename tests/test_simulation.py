@@ -358,6 +358,7 @@ KILLED = """
 
 
 @pytest.mark.usefixtures("short_segments")
+@pytest.mark.slow
 def test_killed_at_random_moments_it_comes_to_the_same_bytes(pair_folder, tmp_path):
     (tmp_path / "run.py").write_text(textwrap.dedent(KILLED))
     rng = np.random.default_rng(0)

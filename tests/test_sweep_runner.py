@@ -232,6 +232,7 @@ def test_what_is_wrong_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.skipif(shutil.which("nvidia-smi") is not None, reason="there may be a GPU")
+@pytest.mark.slow
 def test_a_gpu_that_is_not_there_is_one_line(tmp_path: Path) -> None:
     result = psotrack(tmp_path, "sweep", grid_file(tmp_path, [3]), "--out", tmp_path, "--device", "gpu")
     assert result.returncode == 2

@@ -123,7 +123,10 @@ class TestFindOffset:
         assert found.mean_distance_m == pytest.approx(0.02 * np.sqrt(8 / np.pi), rel=0.05)
         np.testing.assert_allclose(found.lever_arm_m, arm_m, atol=0.012)
 
-    @pytest.mark.parametrize("errors", ["independent", "correlated", "turning"])
+    @pytest.mark.parametrize(
+        "errors",
+        ["correlated", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("independent", "turning"))],
+    )
     def test_the_true_offset_is_within_two_standard_deviations(self, errors):
         """Of 40 draws at least 85 % are inside; chance gives fewer in 2 % of cases if 95 % is right."""
         normalised, spread = [], []

@@ -67,7 +67,7 @@ def prepared(position_m=TRUTH_M[0], velocity_m_s=VELOCITY_M_S[0], *, size_m=SIZE
     return tracker.init(jax.random.key(settings.seed), where, speed, params), params, program
 
 
-@pytest.mark.parametrize("swarm", ["per-drone", "joint"])
+@pytest.mark.parametrize("swarm", ["per-drone", pytest.param("joint", marks=pytest.mark.slow)])
 def test_it_follows_the_drones(coverage, swarm):
     # The joint swarm searches six dimensions at once, which takes more particles.
     effort = {"particles": 60, "iterations": 40} if swarm == "joint" else {}
@@ -114,6 +114,7 @@ def test_chunks_do_not_matter(coverage):
     assert state.key == whole_state.key
 
 
+@pytest.mark.slow
 def test_every_frame_uses_new_random_numbers(coverage):
     """The state's key is replaced; with the same key, two frames would search with the same random numbers."""
     state, params, program = prepared()
@@ -135,7 +136,7 @@ def test_online_is_offline(coverage):
         np.testing.assert_array_equal(info.status, whole.status[frame])
 
 
-@pytest.mark.parametrize("swarm", ["per-drone", "joint"])
+@pytest.mark.parametrize("swarm", ["per-drone", pytest.param("joint", marks=pytest.mark.slow)])
 def test_same_seed_same_result(coverage, swarm):
     effort = {"particles": 60, "iterations": 40} if swarm == "joint" else {}
     _, first = track(coverage, swarm=swarm, seed=3, **effort)
@@ -158,6 +159,7 @@ def test_drones_of_their_own_swarms_interact_by_occlusion_alone(coverage):
     assert not np.array_equal(changed.position_m[0, 1], info.position_m[0, 1])
 
 
+@pytest.mark.slow
 def test_drones_that_pass_close_keep_their_identities():
     """Two drones meet head on at 1.5 m/s each. Their middles pass at 0.3 m, their hulls at 0.05 m."""
     along_m = 1.5 * (TIME_S - TIME_S[NUM_FRAMES // 2])

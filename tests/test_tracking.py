@@ -194,6 +194,7 @@ def test_sizes_are_learned(tracked_from_first):
     np.testing.assert_allclose(tracked.sizes.size_m / SIZE_M, 1.1, atol=0.06)
 
 
+@pytest.mark.slow
 def test_a_recording_may_begin_without_drones(silhouettes):
     """The first drone is visible from the first frame, and its track begins there."""
     tracked, trajectories = track(silhouettes, NO_DRONES)
@@ -232,6 +233,7 @@ def test_smoothing(tracked_from_first, silhouettes):
     np.testing.assert_array_equal(smoothed.status, filtered.status)
 
 
+@pytest.mark.slow
 def test_frames_of_a_recording_that_is_no_multiple_of_a_chunk(silhouettes, tracked_from_first):
     """The last chunk is filled up with empty frames, which do not change the result."""
     assert NUM_FRAMES % 25
