@@ -1,6 +1,6 @@
-"""Tiny networks in ONNX, encoded by hand: a convolution that finds bright squares, with the outputs of YOLO's versions.
+"""Tiny ONNX networks, encoded by hand: a convolution finds bright squares, and the output has a layout of YOLO.
 
-The fields and their numbers are those of onnx.proto; protobuf's wire format is varints, and bytes with their lengths.
+The field numbers are from onnx.proto. Protobuf's wire format has varints, and bytes preceded by their length.
 """
 
 import struct
@@ -8,7 +8,7 @@ import struct
 import numpy as np
 
 _FLOAT, _INT64 = 1, 7
-#: The network's boxes: squares of this side, at every so many pixels.
+#: Side of the network's square boxes, and distance between neighbouring boxes, both in pixels of the input.
 SIDE, STRIDE = 32, 8
 
 
@@ -21,7 +21,7 @@ def _varint(value: int) -> bytes:
 
 
 def _field(number: int, value) -> bytes:
-    """One field: an int as a varint, a float in four bytes, all else with its length before it."""
+    """Encode one field: an int as a varint, a float in four bytes, other values preceded by their length."""
     if isinstance(value, int):
         return _varint(number << 3) + _varint(value)
     if isinstance(value, float):
@@ -62,7 +62,7 @@ def _value(name: str, shape) -> bytes:
 
 
 def model(nodes: list[bytes], tensors: dict[str, np.ndarray], input_shape, output_shape) -> bytes:
-    """A model whose graph goes from `images` to `output`."""
+    """Encode a model whose input is called `images` and whose output is called `output`."""
     graph = _message(
         *((1, node) for node in nodes),
         (2, "tiny"),
@@ -74,14 +74,14 @@ def model(nodes: list[bytes], tensors: dict[str, np.ndarray], input_shape, outpu
 
 
 def bright_squares(layout: str, size: int) -> bytes:
-    """A network for (1, 3, size, size): a square of `SIDE` at every `STRIDE` pixels scores by its mean brightness.
+    """Encode a network for images (1, 3, size, size) that gives each square box a score from its mean brightness.
 
-    The score is sigmoid(40 (mean - 0.75)): 0.9999 for white, 0.5 where a quarter is black, 1e-13 for black.
+    The score is sigmoid(40 (mean - 0.75)): 0.9999 for white, 0.5 if a quarter is black, 1e-13 for black.
 
     Args:
-        layout: "v5", "v8" or "v10" (of the first 300 squares); "logits", which is "v8" without the sigmoid; or "none",
-            which is no layout at all.
-        size: of the input.
+        layout: layout of the output: "v5", "v8", "v10" (the first 300 boxes only), "logits" ("v8" without the
+            sigmoid), or "none" (a layout that the detector does not know).
+        size: side of the input image, pixels.
     """
     cells = (size - SIDE) // STRIDE + 1
     n = cells * cells
@@ -105,7 +105,7 @@ def bright_squares(layout: str, size: int) -> bytes:
         _node("Reshape", ["map", "flat"], "scores"),
     ]
     if layout in ("v8", "logits"):
-        # Two classes, the first of which is never there.
+        # Two classes; the score of the first class is always 0.
         tensors["zero"] = np.zeros((1, 1, n), np.float32)
         nodes.append(_node("Concat", ["boxes", "zero", "scores"], "output", axis=1))
         return model(nodes, tensors, (1, 3, size, size), (1, 6, n))

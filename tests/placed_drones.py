@@ -1,4 +1,4 @@
-"""Drones of known shape at known places, for tests of what cameras make of them."""
+"""Drones of known shape at known places, for tests of the images, masks and labels of the simulator."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from psotrack.simulation.world.shapes import box
 
 
 def straight_flight(position_m, velocity_m_s=(0.0, 0.0, 0.0)):
-    """A flight through a point at time 0 at some speed: the middle of a very slow, very long swing."""
+    """Flight on an almost straight line through `position_m` at time 0: the middle of a slow, long oscillation."""
     angular = 1e-3
     velocity = np.array([velocity_m_s], float)
     zero = np.zeros((1, 3))
@@ -24,7 +24,7 @@ def straight_flight(position_m, velocity_m_s=(0.0, 0.0, 0.0)):
 
 
 def with_drones(scene, *placed):
-    """The scene with only these drones: (model, flight, paint) each."""
+    """The scene with other drones; each element of `placed` is a tuple (model, flight, paint in BGR)."""
     recipe = msgspec.structs.replace(
         scene.scenario,
         drones=tuple(
@@ -36,25 +36,26 @@ def with_drones(scene, *placed):
 
 
 def cube(side_m):
-    """A model whose silhouette's middle is its origin: all paint, and rotors too small to be seen."""
+    """Painted cube around the origin, whose rotors are too small to be visible."""
     triangles = box((0.0, 0.0, 0.0), (side_m, side_m, side_m))
     return DroneModel(triangles, np.ones(len(triangles)), np.zeros((1, 3)), np.array([1e-6]))
 
 
 def ray_point(scene, index, pixel, depth_m):
-    """The world point that camera `index` sees in a pixel at a depth."""
+    """(3,), the point in the world that camera `index` sees in `pixel` at depth `depth_m`, metres."""
     cam = scene.rig.cameras[index]
     R, t = cam.T_cam_world[:3, :3], cam.T_cam_world[:3, 3]
     return R.T @ (depth_m * np.linalg.inv(cam.K) @ [*pixel, 1.0] - t)
 
 
 def drone_masks(scene, cam, backdrop_depth_m, frame):
-    """(height, width): which drone is seen in a pixel in the middle of the exposure, its number from 1, or 0."""
+    """(height, width), number of the visible drone per pixel, from 1 on, at the middle of the exposure; 0 for none."""
     numbers = np.zeros((cam.height, cam.width), np.uint8)
-    for one in silhouettes(scene, cam, backdrop_depth_m, frame):
-        numbers[one.window.slices][one.seen] = one.number
+    for silhouette in silhouettes(scene, cam, backdrop_depth_m, frame):
+        numbers[silhouette.window.slices][silhouette.seen] = silhouette.number
     return numbers
 
 
 def pixel_of(scene, index, point_m):
+    """(2,), the pixel in which camera `index` sees a point of the world."""
     return project(scene.rig.cameras[index], np.asarray(point_m, float))[0]

@@ -1,4 +1,4 @@
-"""Boxes: the oracle samples the ellipsoid's surface densely and projects it by `cameras.project` in float64."""
+"""Boxes of drones: the oracle projects dense samples of the ellipsoid's surface by `cameras.project` in float64."""
 
 import jax
 import numpy as np
@@ -23,10 +23,10 @@ def boxes(rig, position_m, size_m):
 
 
 def sampled_boxes(rig, position_m, size_m, num_points=20_000):
-    """(drones, cameras, 4): the smallest boxes around sampled surface points."""
+    """(drones, cameras, 4), the smallest boxes around sampled surface points."""
     surface = position_m[:, None] + sphere_points(num_points) * size_m[:, None] / 2
     pixels, _ = project(rig.cameras, surface[..., None, :])
-    # Pixel centres are at whole numbers, box edges between pixels.
+    # Pixel centres are at whole numbers, and box edges lie between pixels.
     return np.concatenate([pixels.min(axis=1), pixels.max(axis=1)], axis=-1) + 0.5
 
 
@@ -63,19 +63,19 @@ def test_boxes_touch_the_outline(num_drones, num_cameras, coefficients):
     assert xyxy.shape == (num_drones, num_cameras, 4)
     assert in_front.all()
     sampled = sampled_boxes(rig, position_m, size_m)
-    # Samples are 0.025 rad apart, so the outermost misses the outline by up to (0.025 / sqrt 2)^2 / 2 of the half
-    # width, at 30 px 0.005 px; float32 adds 0.001 px (see test_cameras). The lens is applied to the middles of the
-    # sides, not to the touching points: measured 0.043 px for boxes of 14 to 44 px with these lenses, limit 0.06.
+    # Samples are 0.025 rad apart, so the outermost sample misses the outline by up to (0.025 / sqrt 2)^2 / 2 of the
+    # half width: 0.005 px at 30 px. Float32 adds 0.001 px (see test_cameras). Distortion is applied to the middles of
+    # the sides, not to the points of contact: measured 0.043 px for boxes of 14 to 44 px with these lenses, limit 0.06.
     np.testing.assert_allclose(xyxy, sampled, atol=0.06 if coefficients else 0.01)
 
 
 def test_the_box_of_a_large_near_ellipsoid_is_exact():
-    """One metre large at one metre: the box of the middle cross-section would be tens of pixels too small."""
+    """An ellipsoid of 1 m at a distance of 1 m: the box of its middle cross-section is tens of pixels too small."""
     rig = ring_rig(3)
     position_m = rig.cameras.centre_world[:1] + 1.3 * rig.cameras.T_cam_world[:1, 2, :3] + [[0.1, 0.2, 0.1]]
     size_m = np.array([[1.0, 0.8, 0.9]])
     xyxy, _ = boxes(rig, position_m, size_m)
-    # Half widths of 200 px: sampling misses 0.03 px.
+    # With half widths of 200 px, the outermost sample misses the outline by 0.03 px.
     np.testing.assert_allclose(xyxy, sampled_boxes(rig, position_m, size_m), atol=0.05)
 
 
@@ -83,7 +83,7 @@ shifts = st.lists(st.floats(-3, 3), min_size=3, max_size=3)
 
 
 @given(shifts, st.sampled_from(sorted(LENSES)))
-def test_moving_world_and_rig_together_leaves_boxes(shift_m, coefficients):
+def test_moving_world_and_rig_together_changes_no_box(shift_m, coefficients):
     rig = ring_rig(3, coefficients=coefficients)
     position_m, size_m = drones(2)
     xyxy, _ = boxes(rig, position_m, size_m)
@@ -93,7 +93,7 @@ def test_moving_world_and_rig_together_leaves_boxes(shift_m, coefficients):
 
 
 @given(st.lists(st.floats(-np.pi, np.pi), min_size=3, max_size=3), shifts, st.sampled_from(sorted(LENSES)))
-def test_turning_world_and_rig_together_leaves_boxes_of_spheres(turn, shift_m, coefficients):
+def test_turning_world_and_rig_together_changes_no_box_of_a_sphere(turn, shift_m, coefficients):
     rig = ring_rig(3, coefficients=coefficients)
     position_m, _ = drones(2)
     size_m = np.array([[0.4] * 3, [0.25] * 3])
@@ -111,13 +111,13 @@ def test_particles_drones_and_cameras_broadcast():
     assert together.shape == (7, 2, 5, 4)
     for particle in range(7):
         alone, _ = boxes(rig, position_m[particle], size_m)
-        # The same arithmetic; the compiler may fuse operations differently.
+        # Both are the same arithmetic, but the compiler may fuse operations differently.
         np.testing.assert_allclose(together[particle], alone, atol=1e-3)
 
 
 @pytest.mark.parametrize("distance_m", [-3.0, -0.05, 0.0, 0.1, 0.199])
 def test_behind_or_around_the_camera_is_flagged_and_finite(distance_m):
-    """A drone behind or around the camera has no valid box, but its numbers and gradients are finite."""
+    """A drone behind or around a camera has no valid box, but the box's numbers and gradients are finite."""
     rig = ring_rig(3, coefficients=5)
     position_m = rig.cameras.centre_world[:1] + distance_m * rig.cameras.T_cam_world[:1, 2, :3]
     size_m = np.full((1, 3), 0.4)

@@ -1,4 +1,4 @@
-"""Bundle adjustment of simulated rigs: errors, covariances, gauge, focal lengths, and refused input."""
+"""Bundle adjustment of simulated rigs: errors, covariances, gauge, focal lengths, and invalid input."""
 
 from dataclasses import replace
 
@@ -14,6 +14,7 @@ from psotrack.geometry import Rig, project
 
 
 def jittered(rig: Rig, rng, *, turn_deg=0.6, shift_m=0.03, skip=()) -> Rig:
+    """The rig with random errors of turn and shift in all cameras but those named in `skip`."""
     T = rig.cameras.T_cam_world.copy()
     for index, name in enumerate(rig.names):
         if name not in skip:
@@ -23,15 +24,16 @@ def jittered(rig: Rig, rng, *, turn_deg=0.6, shift_m=0.03, skip=()) -> Rig:
     return Rig(rig.names, replace(rig.cameras, T_cam_world=T))
 
 
-def flown(rig, rng, count, *, noise_px=1.0, unseen=0.2):
+def observe(rig, rng, count, *, noise_px=1.0, unseen=0.2):
+    """`count` random points, (count, 3), and their noisy pixels, (count, cameras, 2); unseen ones are NaN."""
     points = rng.uniform((-1.5, -1.5, 0.3), (1.5, 1.5, 2.3), (count, 3))
     pixels = project(rig.cameras, points[:, None])[0] + rng.normal(0, noise_px, (count, len(rig), 2))
     pixels[rng.random((count, len(rig))) < unseen] = np.nan
     return points, pixels
 
 
-def similar(points, others):
-    """Apply to points the similarity transform that brings them nearest to other points (Umeyama 1991)."""
+def align(points, others):
+    """Apply to `points` the similarity transform that brings them nearest to `others` (Umeyama 1991)."""
     a, b = points - points.mean(axis=0), others - others.mean(axis=0)
     U, strength, Vt = np.linalg.svd(b.T @ a)
     sign = np.array([1, 1, np.sign(np.linalg.det(U @ Vt))])
@@ -41,7 +43,7 @@ def similar(points, others):
 def test_a_jittered_rig_is_adjusted_to_the_ground_truth():
     rng = np.random.default_rng(0)
     rig = ring_rig(5, coefficients=4, image_size_wh=(1920, 1080))
-    points, pixels = flown(rig, rng, 151)
+    points, pixels = observe(rig, rng, 151)
     seen = np.isfinite(pixels).all(axis=-1)
     wrong = seen & (rng.random(seen.shape) < 0.03)
     pixels[wrong] += rng.choice([-1, 1], (wrong.sum(), 2)) * rng.uniform(25, 200, (wrong.sum(), 2))
@@ -49,9 +51,9 @@ def test_a_jittered_rig_is_adjusted_to_the_ground_truth():
     adjusted = adjust(given_rig, pixels, 1.0)
     truth = rig.cameras.centre_world
     assert np.linalg.norm(given_rig.cameras.centre_world - truth, axis=1).mean() > 0.03
-    off = np.linalg.norm(similar(adjusted.rig.cameras.centre_world, truth) - truth, axis=1)
+    off = np.linalg.norm(align(adjusted.rig.cameras.centre_world, truth) - truth, axis=1)
     std = np.sqrt(np.trace(adjusted.centre_covariance_m2, axis1=1, axis2=2))
-    # Alignment of five centres removes a part of the errors, so that four standard deviations are a loose limit.
+    # Aligning five centres removes a part of the errors, so four standard deviations are a loose limit.
     assert (off < 4 * std).all()
     assert std.max() < 0.004
     # Outliers are found; if a point has two views and one is wrong, both are left out.
@@ -61,7 +63,7 @@ def test_a_jittered_rig_is_adjusted_to_the_ground_truth():
     there = np.isfinite(adjusted.points_m).all(axis=1)
     # A pixel is 2.6 mm at 4 m; points with two views from one side have larger errors.
     assert (
-        np.median(np.linalg.norm(similar(adjusted.points_m[there], points[there]) - points[there], axis=1))
+        np.median(np.linalg.norm(align(adjusted.points_m[there], points[there]) - points[there], axis=1))
         < 0.005
     )
 
@@ -72,7 +74,7 @@ def test_the_covariance_of_the_rig_covers_the_errors():
     rig = ring_rig(5, image_size_wh=(1920, 1080))
     distances = []
     for _ in range(runs):
-        _, pixels = flown(rig, rng, 31)
+        _, pixels = observe(rig, rng, 31)
         adjusted = adjust(jittered(rig, rng, skip=("c0", "c3")), pixels, 1.0, fixed=("c0", "c3"))
         off = adjusted.rig.cameras.centre_world - rig.cameras.centre_world
         # Fixed cameras keep every bit.
@@ -89,7 +91,7 @@ def test_the_rig_as_a_whole_is_not_moved():
     """From exact pixels, the adjusted cameras fit, and their distance to the given cameras is the smallest possible."""
     rng = np.random.default_rng(2)
     rig = ring_rig(5, image_size_wh=(1920, 1080))
-    _, pixels = flown(rig, rng, 61, noise_px=0.0)
+    _, pixels = observe(rig, rng, 61, noise_px=0.0)
     given_rig = jittered(rig, rng)
     adjusted = adjust(given_rig, pixels, 1.0)
     assert np.nanmax(adjusted.residual_px) < 1e-3
@@ -106,8 +108,8 @@ def test_the_rig_as_a_whole_is_not_moved():
     assert np.abs(torque).max() < 0.02 * np.linalg.norm(turns, axis=1).sum() / np.deg2rad(0.5) ** 2
 
 
-def test_errors_in_common_count_once():
-    """Seven copies of each error give the covariance of one copy, if the errors are declared as common."""
+def test_common_errors_count_once():
+    """Seven copies of each point give the covariance of one copy, if their errors are declared as common."""
     rng = np.random.default_rng(6)
     rig = ring_rig(4, image_size_wh=(1920, 1080))
     points = rng.uniform((-1.5, -1.5, 0.3), (1.5, 1.5, 2.3), (60, 3))
@@ -118,8 +120,8 @@ def test_errors_in_common_count_once():
     common_errors = adjust(rig, pixels[seven], 0.1, common_errors=[CommonErrors(seven, np.ones((420, 4)))])
     treated_as_independent = adjust(rig, pixels[seven])
     variance = [
-        np.trace(one.centre_covariance_m2, axis1=1, axis2=2).mean()
-        for one in (once, common_errors, treated_as_independent)
+        np.trace(adjusted.centre_covariance_m2, axis1=1, axis2=2).mean()
+        for adjusted in (once, common_errors, treated_as_independent)
     ]
     # The residuals exceed 0.1 px, so the independent part is inflated to 1 / 7 of one copy's variance.
     assert variance[1] / variance[0] == pytest.approx(8 / 7, rel=0.1)
@@ -129,7 +131,7 @@ def test_errors_in_common_count_once():
 def test_a_common_focal_length_is_found():
     rng = np.random.default_rng(4)
     rig = ring_rig(5, image_size_wh=(1920, 1080))
-    _, pixels = flown(rig, rng, 151)
+    _, pixels = observe(rig, rng, 151)
     wide = jittered(rig, rng)
     wrong_K = wide.cameras.K.copy()
     wrong_K[:, :2, :2] *= 1.02
@@ -150,7 +152,7 @@ def test_a_common_focal_length_is_found():
 def test_points_or_settings_that_determine_no_rig_are_refused():
     rng = np.random.default_rng(5)
     rig = ring_rig(3, image_size_wh=(1920, 1080))
-    _, pixels = flown(rig, rng, 23, unseen=0.0)
+    _, pixels = observe(rig, rng, 23, unseen=0.0)
     blind = pixels.copy()
     blind[5:, 1] = np.nan
     with pytest.raises(

@@ -1,4 +1,4 @@
-"""Where cameras stand: OpenCV and exact cases, honest covariances, and what is refused."""
+"""Poses of cameras from known points: compared with OpenCV and exact cases, covariances, and invalid input."""
 
 from dataclasses import replace
 
@@ -21,14 +21,14 @@ NO_LENS = np.zeros(0)
 
 
 def view(rng, *, count=12, nearest_m=3.5, farthest_m=6.5, dist=(), K=K):
-    """A camera 5 m from what it looks at, and points in a grid of cells of its image, at various depths."""
+    """A camera 5 m from its target, and points at random depths, one in each cell of a grid of its image."""
     angle = rng.uniform(0, 2 * np.pi)
     R, t_m = look_at((5 * np.cos(angle), 5 * np.sin(angle), 2.0), (0.0, 0.0, 1.0))
     one = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080), dist=dist)
     cells = np.array([(i, j) for i in range(4) for j in range(3)] * (count // 12 + 1))[:count]
     pixels = (cells + rng.uniform(0.1, 0.9, (count, 2))) * (480, 360)
     rays = np.concatenate([pixels, np.ones((count, 1))], axis=1) @ np.linalg.inv(K).T
-    # The lens moves the pixels a little: they are points near those rays.
+    # Distortion moves the pixels of the points a little; they only need to be near the middles of the cells.
     return one, (rays * rng.uniform(nearest_m, farthest_m, (count, 1)) - t_m) @ R
 
 
@@ -37,7 +37,7 @@ def centre(T):
 
 
 @pytest.mark.parametrize("coefficients", sorted(LENSES))
-def test_derivatives_are_those_of_differences(coefficients):
+def test_derivatives_equal_finite_differences(coefficients):
     rng = np.random.default_rng(0)
     skewed = K + np.array([[0, 3.0, 0], [0, 0, 0], [0, 0, 0]])
     one, points = view(rng, count=7, dist=LENSES[coefficients], K=skewed)
@@ -49,10 +49,10 @@ def test_derivatives_are_those_of_differences(coefficients):
         return project(replace(one, T_cam_world=T), points)[0].ravel()
 
     found, by_turn, by_shift = reproject(points, R, t_m, one)
-    # Both are the same formula, of numbers of about 1000.
+    # Both evaluate the same formula; the pixels are about 1000.
     np.testing.assert_allclose(found, project(one, points)[0], atol=1e-9)
     slopes = approx_fprime(np.zeros(6), pixels, 1e-7).reshape(-1, 2, 6)
-    # A step of 1e-7 bends by 1e-4 px and rounds at 1e-6 px.
+    # With a step of 1e-7, curvature costs 1e-4 px and rounding 1e-6 px.
     np.testing.assert_allclose(np.concatenate([by_turn, by_shift], axis=-1), slopes, rtol=1e-4, atol=0.01)
 
 
@@ -61,12 +61,12 @@ def test_derivatives_are_those_of_differences(coefficients):
 def test_exact_points_give_the_camera(count, coefficients):
     one, points = view(np.random.default_rng(count), count=count, dist=LENSES[coefficients])
     located = locate_camera(points, project(one, points)[0], one.K, one.dist)
-    # Least squares ends at 1e-8 of the cost's scale.
+    # The least squares stop at 1e-8 of the cost's scale.
     np.testing.assert_allclose(located.T_cam_world, one.T_cam_world, atol=1e-6)
     assert located.used.all()
 
 
-def test_it_is_the_least_squares_pose_of_opencv():
+def test_the_pose_equals_opencvs_least_squares_pose():
     rng = np.random.default_rng(3)
     one, points = view(rng, dist=LENSES[5])
     pixels = project(one, points)[0] + rng.normal(0, 1, (12, 2))
@@ -74,13 +74,13 @@ def test_it_is_the_least_squares_pose_of_opencv():
     turn, t_m = cv2.Rodrigues(one.T_cam_world[:3, :3])[0], one.T_cam_world[:3, 3:].copy()
     turn, t_m = cv2.solvePnPRefineLM(points, pixels, one.K, one.dist, turn, t_m)
     np.testing.assert_allclose(located.T_cam_world[:3, :3], cv2.Rodrigues(turn)[0], atol=1e-6)
-    # Two searches that end at the same bottom to a millionth of its width, which is 8 mm.
+    # Both searches end within a millionth of the minimum's width, which is 8 mm.
     np.testing.assert_allclose(located.T_cam_world[:3, 3], t_m.ravel(), atol=1e-6)
 
 
 @pytest.mark.parametrize(("nearest_m", "farthest_m"), [(2.5, 7.5), (4.5, 5.5)])
 def test_twelve_points_and_a_pixel_of_noise(nearest_m, farthest_m):
-    """The centre is within 1 cm at 5 m where points are spread in depth, and its 90 % ellipsoid holds 90 %."""
+    """If the points are spread in depth, the centre's error is below 1 cm at 5 m; 90 % ellipsoids contain 90 %."""
     rng, runs = np.random.default_rng(1), 100
     errors_m, distances = [], []
     for _ in range(runs):
@@ -89,17 +89,17 @@ def test_twelve_points_and_a_pixel_of_noise(nearest_m, farthest_m):
         off = centre(located.T_cam_world) - one.centre_world
         errors_m.append(np.linalg.norm(off))
         distances.append(off @ np.linalg.solve(located.centre_covariance_m2, off))
-    # What chance allows once in a thousand tests, on either side.
+    # The limits are exceeded by chance once in a thousand tests.
     for share in (0.5, 0.9):
         inside = int((np.array(distances) < chi2.ppf(share, 3)).sum())
         assert binom.ppf(0.0005, runs, share) <= inside <= binom.ppf(0.9995, runs, share)
     if nearest_m < 3:
-        # Measured over 1000: median 4.6 mm, 95 % below 10.1 mm.
+        # Measured in 1000 runs: median 4.6 mm, 95 % below 10.1 mm.
         assert np.median(errors_m) < 0.006
         assert np.percentile(errors_m, 90) < 0.01
 
 
-def test_outliers_are_found_and_do_not_count():
+def test_outliers_are_found_and_not_used():
     rng = np.random.default_rng(5)
     one, points = view(rng, count=13)
     pixels = project(one, points)[0] + rng.normal(0, 1, (13, 2))
@@ -109,7 +109,7 @@ def test_outliers_are_found_and_do_not_count():
     located = locate_camera(points, spoilt, K, NO_LENS)
     assert np.flatnonzero(~located.used).tolist() == wrong.tolist()
     without = locate_camera(np.delete(points, wrong, 0), np.delete(pixels, wrong, 0), K, NO_LENS)
-    # The same points, started from elsewhere.
+    # Both use the same points, but start from different poses.
     np.testing.assert_allclose(located.T_cam_world, without.T_cam_world, atol=1e-6)
     assert (located.residual_px[wrong] > 30).all()
 
@@ -122,18 +122,18 @@ def test_noise_larger_than_stated_widens_the_covariance():
     large = locate_camera(points, project(one, points)[0] + 4 * off, K, NO_LENS, noise_px=1.0)
     assert large.used.all()
     ratio = np.sqrt(large.centre_covariance_m2.trace() / small.centre_covariance_m2.trace())
-    # 36 points tell σ to a tenth.
+    # 36 points determine the standard deviation to 10 %.
     assert 3 < ratio < 5
 
 
-def test_points_in_a_plane_do():
+def test_points_in_a_plane_determine_the_pose():
     rng = np.random.default_rng(7)
     R, t_m = look_at((4.0, 1.0, 2.5), (0.0, 0.0, 0.0))
     one = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080))
     points = np.concatenate([rng.uniform(-1.5, 1.5, (12, 2)), np.zeros((12, 1))], axis=1)
     located = locate_camera(points, project(one, points)[0] + rng.normal(0, 1, (12, 2)), K, NO_LENS)
     off = centre(located.T_cam_world) - one.centre_world
-    # 99.9 %.
+    # The 99.9 % ellipsoid contains the true centre.
     assert off @ np.linalg.solve(located.centre_covariance_m2, off) < chi2.ppf(0.999, 3)
 
 
@@ -155,7 +155,8 @@ def test_moving_the_world_moves_the_camera_with_it(turn, shift_m):
     )
 
 
-def refused(points, pixels, *, noise_px=1.0):
+def error_message(points, pixels, *, noise_px=1.0):
+    """Message of the error for these points, which must be one line with the name of the camera."""
     with pytest.raises(InputError) as error:
         locate_camera(points, pixels, K, NO_LENS, noise_px, name="camera c7")
     assert str(error.value).startswith("camera c7: ")
@@ -167,33 +168,33 @@ def test_points_that_determine_no_pose_are_refused():
     rng = np.random.default_rng(9)
     one, points = view(rng)
     pixels = project(one, points)[0]
-    assert "at least 4 points of known position, found 3" in refused(points[:3], pixels[:3])
+    assert "at least 4 points of known position, found 3" in error_message(points[:3], pixels[:3])
     line = np.array([0, 0, 1.0]) + np.arange(5)[:, None] * np.array([0.2, 0.1, 0.05])
-    assert "not all on one line" in refused(line, project(one, line)[0])
+    assert "not all on one line" in error_message(line, project(one, line)[0])
     broken = points.copy()
     broken[2, 1] = np.nan
-    assert "NaN" in refused(broken, pixels)
-    mirrored = refused(points * np.array([1, -1, 1]), pixels)
+    assert "NaN" in error_message(broken, pixels)
+    mirrored = error_message(points * np.array([1, -1, 1]), pixels)
     assert "right-handed axes" in mirrored
     assert "mirrored" in mirrored
-    assert "mixed up" in refused(points, pixels[rng.permutation(12)])
+    assert "mixed up" in error_message(points, pixels[rng.permutation(12)])
     with pytest.raises(SettingsError, match="noise_px"):
         locate_camera(points, pixels, K, NO_LENS, 0.0)
 
 
 def test_a_small_plane_far_away_has_two_poses():
-    """A sheet of 20 cm at 8 m, hardly tilted: turned to the other side it looks the same."""
+    """A sheet of 20 cm at a distance of 8 m, tilted a little, looks the same if it is tilted to the other side."""
     R, t_m = look_at((0.9, 0.0, 8.0), (0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
     one = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080))
     sheet = np.array([(x, y, 0) for x in (-0.1, 0.0, 0.1) for y in (-0.1, 0.1)])
     rng = np.random.default_rng(0)
-    assert "two poses" in refused(sheet, project(one, sheet)[0] + rng.normal(0, 0.5, (6, 2)))
+    assert "two poses" in error_message(sheet, project(one, sheet)[0] + rng.normal(0, 0.5, (6, 2)))
 
 
 def test_spread_and_inflation():
     rng = np.random.default_rng(10)
     distance = np.linalg.norm(rng.normal(0, 2.0, (20001, 2)), axis=1)
-    # A median of 20,000 is known to 1 %.
+    # A median of 20,000 values has an error of 1 %.
     assert spread_px(distance, 0) == pytest.approx(2.0, rel=0.03)
     assert spread_px(distance, 20001) == pytest.approx(2.0 * np.sqrt(2), rel=0.03)
     assert spread_px(np.ones(3), 6) == 0.0

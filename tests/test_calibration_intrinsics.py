@@ -1,4 +1,4 @@
-"""Lenses: from a data sheet, and from a board that OpenCV draws."""
+"""Intrinsics from a data sheet, and from videos of a board that OpenCV draws."""
 
 import cv2
 import numpy as np
@@ -12,12 +12,12 @@ from psotrack.recordings import VideoWriter, probe
 
 
 def test_lenses_of_a_data_sheet():
-    """The dataset's action camera, 92.45 x 60.83 degrees; and half of a sensor that a ray at 45 degrees meets."""
+    """The dataset's action camera, 92.45 x 60.83 degrees, and a sensor whose edge is seen at 45 degrees."""
     lens = lens_of_view(92.45, 60.83, (3840, 2160))
     edges = project(
         lens, np.array([[np.tan(np.deg2rad(92.45 / 2)), 0, 1], [0, -np.tan(np.deg2rad(60.83 / 2)), 1]])
     )[0]
-    # Pixel centres are at whole numbers: the image ends half a pixel after the last one.
+    # Pixel centres are at whole numbers: the image ends half a pixel after the last pixel's centre.
     np.testing.assert_allclose(edges, [[3839.5, 1079.5], [1919.5, -0.5]], atol=1e-9)
     lens = lens_of_sensor(8.0, (16.0, 12.0), (640, 480))
     np.testing.assert_allclose(project(lens, np.array([1.0, 0, 1.0]))[0], [639.5, 239.5], atol=1e-9)
@@ -32,20 +32,20 @@ BOARD_K = np.array([[620.0, 0, 322.0], [0, 625.0, 236.0], [0, 0, 1]])
 
 
 def board_video(path, poses, size_wh=(640, 480)):
-    """The board drawn by OpenCV and warped by the homography of each pose (turn, distance, shift)."""
+    """Video of the board, drawn by OpenCV and warped by the homography of each pose (turn in degrees, shift in m)."""
     per_m = 4000.0
     sheet = BOARD.opencv().generateImage((int(0.28 * per_m), int(0.2 * per_m)))
     with VideoWriter(path, 25.0, size_wh) as writer:
         for turn, shift in poses:
             R = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
-            # Pixel (u, v) of the sheet is at ((u + 0.5) / per_m, (v + 0.5) / per_m) of the board.
+            # Pixel (u, v) of the sheet lies at ((u + 0.5) / per_m, (v + 0.5) / per_m) on the board, metres.
             to_board = np.array(
                 [[1 / per_m, 0, 0.5 / per_m - 0.14], [0, 1 / per_m, 0.5 / per_m - 0.1], [0, 0, 1]]
             )
             H = BOARD_K @ np.column_stack([R[:, 0], R[:, 1], shift]) @ to_board
             large = cv2.warpPerspective(
                 sheet,
-                np.diag([3.0, 3.0, 1.0]) @ OFFSET @ H,
+                np.diag([3.0, 3.0, 1.0]) @ TO_LARGE_CENTRES @ H,
                 (3 * size_wh[0], 3 * size_wh[1]),
                 borderValue=200,
             )
@@ -54,8 +54,8 @@ def board_video(path, poses, size_wh=(640, 480)):
     return probe(path)
 
 
-#: Three times as large, pixel p is at 3 p + 1.
-OFFSET = np.array([[1, 0, 1 / 3], [0, 1, 1 / 3], [0, 0, 1.0]])
+#: Shift by a third of a pixel: if an image is enlarged three times, the centre of pixel p moves to 3 p + 1.
+TO_LARGE_CENTRES = np.array([[1, 0, 1 / 3], [0, 1, 1 / 3], [0, 0, 1.0]])
 
 
 def test_a_lens_from_a_board(tmp_path):
@@ -64,9 +64,9 @@ def test_a_lens_from_a_board(tmp_path):
         (rng.uniform(-35, 35, 3), (rng.uniform(-0.1, 0.1), rng.uniform(-0.08, 0.08), rng.uniform(0.32, 0.55)))
         for _ in range(30)
     ]
-    lens = lens_of_board(probe_of(tmp_path, poses), BOARD)
+    lens = lens_of_board(board_video(tmp_path / "board.avi", poses), BOARD)
     found = np.array([*np.diag(lens.camera.K)[:2], *lens.camera.K[:2, 2]])
-    # Corners are found to a tenth of a pixel; an error of 5 standard deviations has a chance of one in a million.
+    # Corners have errors of a tenth of a pixel; an error of 5 standard deviations has a chance of one in a million.
     assert (np.abs(found - [620, 625, 322, 236]) < 5 * lens.std[:4] + 0.5).all()
     assert (np.abs(found - [620, 625, 322, 236]) < [6, 6, 4, 4]).all()
     assert np.abs(lens.camera.dist).max() < 0.1
@@ -74,19 +74,17 @@ def test_a_lens_from_a_board(tmp_path):
     assert len(lens.frame) > 20
 
 
-def probe_of(folder, poses):
-    return board_video(folder / "board.avi", poses)
-
-
-def test_boards_that_do_not_determine_the_lens_are_refused(tmp_path):
+def test_videos_that_do_not_determine_the_lens_are_refused(tmp_path):
+    path = tmp_path / "board.avi"
     with pytest.raises(InputError, match="at least 8 frames that show 8 corners"):
-        lens_of_board(probe_of(tmp_path, [((0, 0, 0), (0, 0, 0.4))] * 5), BOARD)
-    (tmp_path / "board.avi").unlink()
-    # The fit to the second video ends at a focal length of 320 000 px, with which parallel boards seem tilted.
+        lens_of_board(board_video(path, [((0, 0, 0), (0, 0, 0.4))] * 5), BOARD)
+    path.unlink()
+    # Regression: for the second set of poses, the fit ends at a focal length of 320 000 px, with which the boards seem
+    # tilted, and that lens was accepted.
     for step_m, distance_m in ((0.003, 0.4), (0.005, 0.45)):
         flat = [((0, 0, 3.0 * i), (step_m * i, 0, distance_m)) for i in range(10)]
         with pytest.raises(InputError, match="views that determine the focal length"):
-            lens_of_board(probe_of(tmp_path, flat), BOARD)
+            lens_of_board(board_video(path, flat), BOARD)
     with pytest.raises(SettingsError, match=r"board\.marker_m"):
         Board((7, 5), 0.04, 0.05)
     with pytest.raises(SettingsError, match="at least 3 x 3 squares"):

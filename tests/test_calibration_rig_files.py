@@ -1,4 +1,4 @@
-"""Rigs on disk: every layout there and back, files of other programs as they stand, and what is wrong with a file."""
+"""Files of rigs: writing and reading every layout, files of other programs, and errors in a file."""
 
 import cv2
 import numpy as np
@@ -8,7 +8,7 @@ from helpers import LENSES, assert_same, ring_rig
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.geometry import Rig, make_rig, project, read_lenses, read_rig, write_rig
 
-#: As anipose 1.1 writes: tables cam_0 ..., lengths in the board's unit.
+#: File as anipose 1.1 writes it: tables cam_0 ..., lengths in the board's unit.
 ANIPOSE = """[cam_0]
 name = "A"
 size = [ 1280, 720,]
@@ -30,7 +30,7 @@ adjusted = false
 error = 0.26
 """
 
-#: As caliscope writes: numbers for names, and cameras that it was told to ignore; an older one has matrices.
+#: File as caliscope writes it: numbers as names, and ignored cameras. Older files have rotation matrices, as camera 0.
 CALISCOPE = """[cameras.0]
 cam_id = 0
 size = [1280, 720]
@@ -58,7 +58,7 @@ translation = "null"
 rotation = "null"
 """
 
-#: As OpenCV's own sample for calibration writes.
+#: File as OpenCV's sample program for calibration writes it.
 SAMPLE = """%YAML:1.0
 ---
 image_width: 640
@@ -82,13 +82,14 @@ def named(rig, *names):
 
 @pytest.mark.parametrize("coefficients", sorted(LENSES))
 @pytest.mark.parametrize("file", ["rig.yml", "rig.yaml", "rig.toml", "camera_array.toml"])
-def test_rigs_come_back(tmp_path, file, coefficients):
-    # Eleven cameras, so that their tables sort; a serial number, a word of YAML, and what must be quoted.
+def test_a_rig_is_read_as_it_was_written(tmp_path, file, coefficients):
+    # Eleven cameras, whose tables must not be sorted as text. Three names that need care: a serial number, a word of
+    # YAML, and characters that must be quoted.
     rig = named(ring_rig(11, coefficients=coefficients), "60881257", "true", 'a "b" \\ é: #')
     write_rig(tmp_path / file, rig)
     back = read_rig(tmp_path / file)
     assert back.names == rig.names
-    # To the last bit, but for what passes through Rodrigues vectors: some roundings of numbers up to 1.
+    # Exact, except rotations that are stored as Rodrigues vectors: some roundings of numbers up to 1.
     rounding = 2e-15 if file.endswith("toml") else 0.0
     np.testing.assert_allclose(back.cameras.T_cam_world, rig.cameras.T_cam_world, rtol=0, atol=rounding)
     np.testing.assert_array_equal(back.cameras.T_cam_world[:, :3, 3], rig.cameras.T_cam_world[:, :3, 3])
@@ -100,7 +101,7 @@ def test_rigs_come_back(tmp_path, file, coefficients):
         assert not back.cameras.dist.any()
 
 
-def test_the_datasets_layout_comes_back(tmp_path):
+def test_a_rig_in_the_datasets_layout_is_read_as_it_was_written(tmp_path):
     K = np.array([[1157.0, 0, 960.5], [0, 1157.0, 540.25], [0, 0, 1]])
     rig = ring_rig(5, coefficients=4, image_size_wh=(1920, 1080))
     one = rig.cameras[2]
@@ -108,19 +109,19 @@ def test_the_datasets_layout_comes_back(tmp_path):
     write_rig(tmp_path / "rig.csv", rig)
     back = read_rig(tmp_path / "rig.csv", (1920, 1080))
     assert back.names == rig.names
-    # Rotations pass through Rodrigues vectors.
+    # Rotations are stored as Rodrigues vectors.
     assert_same(back.cameras, rig.cameras, atol=2e-15)
     with pytest.raises(InputError, match=r"rig\.csv: expected the size of the images.*pass --size"):
         read_rig(tmp_path / "rig.csv")
 
 
-def test_what_the_datasets_layout_cannot_hold_is_said_in_a_line(tmp_path):
+def test_a_rig_that_the_datasets_layout_cannot_hold_is_refused(tmp_path):
     with pytest.raises(SettingsError, match="one focal length per camera and no skew"):
         write_rig(tmp_path / "rig.csv", ring_rig(2))
     assert not list(tmp_path.iterdir())
 
 
-def test_the_file_of_anipose(tmp_path):
+def test_a_file_of_anipose(tmp_path):
     path = tmp_path / "calibration.toml"
     path.write_text(ANIPOSE)
     rig = read_rig(path, metres_per_unit=1e-3)
@@ -131,11 +132,11 @@ def test_the_file_of_anipose(tmp_path):
     expected = cv2.projectPoints(
         1e3 * point_m[None], np.array([0.5, 0.25, -0.125]), np.array([-94.5, 8.25, 500.0]), K, dist
     )[0]
-    # The same formula, in metres and in millimetres.
+    # Both evaluate the same formula, in metres and in millimetres.
     np.testing.assert_allclose(project(rig.cameras[0], point_m)[0], expected[0, 0], atol=1e-9)
 
 
-def test_the_file_of_caliscope(tmp_path):
+def test_a_file_of_caliscope(tmp_path):
     path = tmp_path / "camera_array.toml"
     path.write_text(CALISCOPE)
     with pytest.raises(
@@ -152,7 +153,7 @@ def test_the_file_of_caliscope(tmp_path):
     )
 
 
-def test_the_file_of_opencvs_sample(tmp_path):
+def test_a_file_of_opencvs_sample(tmp_path):
     path = tmp_path / "left.yml"
     path.write_text(SAMPLE)
     lenses = read_lenses(path)
@@ -164,7 +165,7 @@ def test_the_file_of_opencvs_sample(tmp_path):
         read_rig(path)
 
 
-def test_opencv_reads_what_is_written(tmp_path):
+def test_opencv_reads_a_written_rig(tmp_path):
     rig = ring_rig(3, coefficients=5)
     write_rig(tmp_path / "rig.yml", rig)
     storage = cv2.FileStorage(str(tmp_path / "rig.yml"), cv2.FILE_STORAGE_READ)
@@ -174,7 +175,7 @@ def test_opencv_reads_what_is_written(tmp_path):
     np.testing.assert_array_equal(second.getNode("t").mat().ravel(), rig.cameras.T_cam_world[1, :3, 3])
 
 
-def test_nothing_is_overwritten(tmp_path):
+def test_an_existing_file_is_overwritten_only_by_force(tmp_path):
     path = tmp_path / "rig.toml"
     write_rig(path, ring_rig(2))
     before = path.read_bytes()
@@ -183,7 +184,7 @@ def test_nothing_is_overwritten(tmp_path):
     assert path.read_bytes() == before
     write_rig(path, ring_rig(3), force=True)
     assert len(read_rig(path)) == 3
-    assert [one.name for one in tmp_path.iterdir()] == ["rig.toml"]
+    assert [file.name for file in tmp_path.iterdir()] == ["rig.toml"]
 
 
 @pytest.mark.parametrize(
@@ -244,7 +245,7 @@ def test_nothing_is_overwritten(tmp_path):
         ("x.csv", "cam_name\n", "x.csv, line 1"),
     ],
 )
-def test_what_is_wrong_is_said_in_a_line(tmp_path, file, text, message, capfd):
+def test_an_invalid_file_gives_an_error_of_one_line(tmp_path, file, text, message, capfd):
     (tmp_path / file).write_text(text)
     with pytest.raises(InputError) as error:
         read_rig(tmp_path / file, (10, 10) if file.endswith("csv") else None)
@@ -255,6 +256,6 @@ def test_what_is_wrong_is_said_in_a_line(tmp_path, file, text, message, capfd):
 
 
 @pytest.mark.parametrize("file", ["no.toml", "no.yml", "no.csv"])
-def test_a_file_that_is_not_there(tmp_path, file):
+def test_a_missing_file_is_refused(tmp_path, file):
     with pytest.raises(InputError, match="expected a file to read"):
         read_rig(tmp_path / file, (10, 10))

@@ -1,4 +1,4 @@
-"""The path of a moving camera: its angles against SciPy's, and its table written and read."""
+"""The path of a moving camera: its angles are compared with SciPy's, and its table is written and read."""
 
 from pathlib import Path
 
@@ -11,11 +11,12 @@ from psotrack.inside_out import CameraPath, Flag, read_camera_path, write_camera
 from psotrack.inside_out.camera_path import roll_pitch_yaw_deg
 from psotrack.trajectories import Status, read_trajectories
 
-#: Columns: axes of a camera that looks along the world's x axis: right is -y, down is -z.
+#: (3, 3), columns are the axes (right, down, ahead) of a camera that looks along the world's x axis.
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
-def some_path(with_velocity: bool = True) -> CameraPath:
+def example_path(with_velocity: bool = True) -> CameraPath:
+    """Path of six frames with random poses and all kinds of status and flags; frame 5 has no pose."""
     rng = np.random.default_rng(3)
     root = rng.normal(size=(6, 6, 6))
     covariance = root @ root.swapaxes(-1, -2)
@@ -41,11 +42,11 @@ def some_path(with_velocity: bool = True) -> CameraPath:
     ("turn", "expected_deg"),
     [
         ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]),
-        # About the world's z, counterclockwise from above.
+        # About the world's z axis, counterclockwise as seen from above.
         ([0.0, 0.0, 30.0], [0.0, 0.0, 30.0]),
-        # About the world's y, which is the body's left: the nose goes down.
+        # About the world's y axis, which points to the body's left: the nose goes down.
         ([0.0, 20.0, 0.0], [0.0, 20.0, 0.0]),
-        # About the world's x, which is ahead: the right side goes down.
+        # About the world's x axis, which points ahead: the right side goes down.
         ([10.0, 0.0, 0.0], [10.0, 0.0, 0.0]),
         ([0.0, 0.0, 180.0], [0.0, 0.0, 180.0]),
     ],
@@ -53,16 +54,16 @@ def some_path(with_velocity: bool = True) -> CameraPath:
 def test_angles_of_a_camera_turned_from_the_x_axis(turn, expected_deg) -> None:
     turned = Rotation.from_rotvec(turn, degrees=True).as_matrix() @ AHEAD
     found = roll_pitch_yaw_deg(Rotation.from_matrix(turned).as_quat(scalar_first=True))
-    # Rounding of an angle below 180 degrees; 180 and -180 are the same.
+    # Rounding of angles below 180 degrees; 180 and -180 degrees are the same angle.
     np.testing.assert_allclose((found - expected_deg + 180) % 360 - 180, 0, atol=1e-12)
 
 
-def test_angles_equal_scipys() -> None:
+def test_angles_equal_those_of_scipy() -> None:
     rng = np.random.default_rng(5)
     orientation = Rotation.random(200, rng=rng)
     found = roll_pitch_yaw_deg(orientation.as_quat(scalar_first=True).reshape(50, 4, 4)).reshape(-1, 3)
     body = Rotation.from_matrix(orientation.as_matrix() @ AHEAD.T)
-    # Near a pitch of 90 degrees angles lose half of their digits.
+    # Near a pitch of 90 degrees, angles lose half of their digits.
     np.testing.assert_allclose(found, body.as_euler("ZYX", degrees=True)[:, ::-1], atol=1e-6)
 
 
@@ -77,7 +78,7 @@ def test_angles_straight_down_and_without_a_pose() -> None:
 
 @pytest.mark.parametrize("with_velocity", [True, False])
 def test_a_table_is_read_as_it_was_written(tmp_path: Path, with_velocity: bool) -> None:
-    written = some_path(with_velocity)
+    written = example_path(with_velocity)
     write_camera_path(tmp_path / "path.csv", written, "dron2")
     read, name = read_camera_path(tmp_path / "path.csv")
     assert name == "dron2"
@@ -86,7 +87,7 @@ def test_a_table_is_read_as_it_was_written(tmp_path: Path, with_velocity: bool) 
 
 
 def test_the_reader_of_tracks_reads_the_table(tmp_path: Path) -> None:
-    written = some_path()
+    written = example_path()
     write_camera_path(tmp_path / "path.csv", written, "dron2")
     tracks, own = read_trajectories(tmp_path / "path.csv"), written.trajectories("dron2")
     assert tracks.drones == ("dron2",)
@@ -99,7 +100,7 @@ def test_the_reader_of_tracks_reads_the_table(tmp_path: Path) -> None:
 def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "path.csv").write_text("mine")
     with pytest.raises(OutputError, match=r"path\.csv"):
-        write_camera_path(tmp_path / "path.csv", some_path(), "dron1")
+        write_camera_path(tmp_path / "path.csv", example_path(), "dron1")
     assert (tmp_path / "path.csv").read_text() == "mine"
 
 
@@ -116,7 +117,7 @@ def test_invalid_values_are_refused_with_their_line(
     tmp_path: Path, before: str, after: str, message: str
 ) -> None:
     path = tmp_path / "path.csv"
-    write_camera_path(path, some_path(), "dron2")
+    write_camera_path(path, example_path(), "dron2")
     path.write_text(path.read_text().replace(before, after, 1))
     with pytest.raises(InputError, match=message):
         read_camera_path(path)

@@ -1,4 +1,4 @@
-"""Projection: OpenCV is the oracle for lenses, rigid motions of the world are the oracle for the geometry."""
+"""Projection: OpenCV is the oracle for distortion, and rigid motions of the world are the oracle for the geometry."""
 
 import cv2
 import jax
@@ -26,7 +26,7 @@ def opencv_pixels(one, points):
 
 @pytest.mark.parametrize("coefficients", sorted(LENSES))
 @pytest.mark.parametrize("num_cameras", [1, 3, 5])
-def test_pixels_are_those_of_opencv(num_cameras, coefficients):
+def test_pixels_equal_those_of_opencv(num_cameras, coefficients):
     rig, points = ring_rig(num_cameras, coefficients=coefficients), points_in_room(7)
     pixels, depth = project(rig.cameras, points[:, None, :])
     assert pixels.shape == (7, num_cameras, 2)
@@ -56,7 +56,7 @@ def test_undistort_is_the_inverse(coefficients):
     rig, points = ring_rig(3, coefficients=coefficients), points_in_room(31)
     pixels, _ = project(rig.cameras, points[:, None, :])
     in_camera = to_camera(rig.cameras, points[:, None, :])
-    # The iteration contracts by about a third per round at the image's corner: 20 rounds leave 1e-9.
+    # At the image's corner, an iteration reduces the error to about a third: 20 iterations leave 1e-9.
     np.testing.assert_allclose(
         undistort(rig.cameras, pixels), in_camera[..., :2] / in_camera[..., 2:], atol=1e-8
     )
@@ -84,7 +84,7 @@ def test_moving_world_and_rig_together_changes_no_pixel(turn, shift_m, coefficie
     pixels_moved, depth_moved = project(
         move_world(rig, R, shift_m).cameras, (points @ R.T + shift_m)[:, None, :]
     )
-    # Shifts of 10 m cost a digit or two of float64's sixteen.
+    # Shifts of 10 m cost one or two of float64's sixteen digits.
     np.testing.assert_allclose(pixels_moved, pixels, atol=1e-9)
     np.testing.assert_allclose(depth_moved, depth, atol=1e-12)
 
@@ -116,8 +116,8 @@ def test_float32_is_close_to_float64(coefficients):
     expected, _ = project(rig.cameras, points[:, None, :])
     pixels, _ = jax.jit(project)(float32(rig.cameras), jnp.asarray(points[:, None, :], jnp.float32))
     assert pixels.dtype == jnp.float32
-    # A coordinate of up to 8 m is rounded to 2.4e-7 m, a few times over; at 1 m and a focal length of 280 px that
-    # is 1e-4 px per rounding. Measured 6e-5, limit 1e-3.
+    # Coordinates of up to 8 m are rounded to 2.4e-7 m a few times. At a depth of 1 m and a focal length of 280 px, a
+    # rounding is 1e-4 px. Measured 6e-5, limit 1e-3.
     np.testing.assert_allclose(pixels, expected, atol=1e-3)
 
 
@@ -153,7 +153,7 @@ def test_make_rig_pads_short_lenses():
         np.testing.assert_allclose(project(rig.cameras[i], points)[0], project(one, points)[0], rtol=1e-14)
 
 
-def test_select_keeps_the_order_asked_for():
+def test_select_returns_cameras_in_the_given_order():
     rig = ring_rig(5)
     some = rig.select(["c3", "c0"])
     assert some.names == ("c3", "c0")
@@ -165,7 +165,7 @@ def test_select_keeps_the_order_asked_for():
     ("names", "message"),
     [(["c0", "c7", "x"], "expected some of c0, c1, c2, found c7, x"), ([], "found none")],
 )
-def test_select_names_what_is_missing(names, message):
+def test_select_refuses_unknown_names_and_no_names(names, message):
     with pytest.raises(SettingsError, match=message):
         ring_rig(3).select(names)
 
@@ -202,8 +202,8 @@ def test_impossible_cameras_are_refused(change, message):
         make_camera(**(GOOD | change))
 
 
-def test_a_far_camera_makes_metres_pixels():
-    """The rig that the tests of the fitness use has 20 pixels per metre and the origin in the middle of the image."""
+def test_a_far_camera_has_equal_pixels_per_metre_at_all_depths():
+    """The rig of the fitness tests has 20 pixels per metre, and the origin in the middle of the image."""
     rig = make_unnamed_rig(far_camera(image_size_wh=(64, 48), pixels_per_m=20))
     pixels, _ = project(rig.cameras, np.array([[[0.0, 0, 0]], [[1.0, 0, 0.5]]]))
     np.testing.assert_allclose(pixels[:, 0], [[31.5, 23.5], [51.5, 13.5]], atol=1e-9)

@@ -1,7 +1,8 @@
-"""Drones that come, leave, land and fly out of all but two cameras, from rendered video, nobody saying how many.
+"""Tracking an unknown number of drones in rendered video: drones appear, leave, land and fly out of two cameras.
 
-Four cameras and a quarter of the image size, so that it runs in a minute; silhouettes that are not reduced keep the
-drones as many cells large as at full size. The full scenario is `experiments/accuracy/comings_and_goings.toml`.
+The scenario has four cameras and a quarter of the image size, so that it runs in a minute. Its silhouettes are not
+reduced, so drones cover as many cells as at full size. The full scenario is
+`experiments/accuracy/comings_and_goings.toml`.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ FPS, NUM_FRAMES = 25.0, 190
 FLIES_OUT, COMES, LANDS = DRONES = range(3)
 LANDS_S, TAKES_OFF_S = 1.4, 4.8
 
-#: In a hall with a ceiling so high that there is a place which no camera sees.
+#: Scenario in a hall whose ceiling is so high that a region below the ceiling is outside all images.
 SCENARIO = {
     "name": "comings_and_goings",
     "hall": "large_hall",
@@ -52,7 +53,11 @@ def waypoints(points_m: list[list[float]], speed_m_s: float, hover_s: float) -> 
 
 
 def scenario(folder: Path) -> Scenario:
-    """One flies out to where two cameras see it; one comes, goes and comes back; one lands and takes off."""
+    """Scenario with three drones.
+
+    The first flies to a region that two cameras see; the second appears, leaves and returns; the third lands and
+    takes off.
+    """
     place, up = np.array([1.0, 0.2, 0.12]), np.array([0.0, 0.0, 1.0])
     time_s = np.arange(0, NUM_FRAMES / FPS + 0.1, 0.1)
     height_m = 1.1 * (1 - _eased(time_s / LANDS_S)) + 1.2 * _eased((time_s - TAKES_OFF_S) / 1.6)
@@ -65,42 +70,41 @@ def scenario(folder: Path) -> Scenario:
         ),
         LANDS: ("tall_cross", {"kind": "recording", "file": str(folder / "landing.csv")}),
     }
-    # What stands turns no more than it moves: it would never become background.
+    # Drones do not sway in yaw, because a landed drone that sways would never become background.
     rows = [{"model": model, "flight": flight, "yaw_sway_deg": 0.0} for model, flight in drones.values()]
     return msgspec.convert(SCENARIO | {"drones": rows}, Scenario)
 
 
 def _eased(share: np.ndarray) -> np.ndarray:
-    """From rest to rest (the cosine's acceleration is no more than a drone can do)."""
+    """Smooth motion from 0 to 1, from rest to rest, with an acceleration that a drone can fly."""
     return (1 - np.cos(np.pi * np.clip(share, 0, 1))) / 2
 
 
 @dataclass(frozen=True)
 class Run:
-    """What was tracked, and what is true.
+    """Tracks and ground truth of the scenario.
 
     Attributes:
-        truth: of drones that two cameras see or more; NaN where they do not.
-        seen_by: (frames, drones), cameras whose images hold the drone's origin.
-        at: (frames, tracks, drones), metres.
+        trajectories: the tracks.
+        truth: ground truth of the drones; NaN in frames in which fewer than two cameras see a drone.
+        seen_by: (frames, drones), number of cameras whose images contain the drone's origin.
+        distance_m: (frames, tracks, drones), distances from tracks to drones, metres.
     """
 
     trajectories: Trajectories
     truth: Trajectories
     seen_by: np.ndarray
-    at: np.ndarray
+    distance_m: np.ndarray
 
     def track_of(self, drone: int) -> int:
-        """The one track that is ever at a drone."""
-        (track,) = np.flatnonzero((self.near(drone) & self.tracked).any(axis=0))
+        """Number of the only track that is within half a metre of a drone in any frame."""
+        near = self.distance_m[..., drone] < 0.5
+        (track,) = np.flatnonzero((near & self.tracked).any(axis=0))
         return int(track)
-
-    def near(self, drone: int) -> np.ndarray:
-        """(frames, tracks), within half a metre of it."""
-        return self.at[..., drone] < 0.5
 
     @property
     def tracked(self) -> np.ndarray:
+        """(frames, tracks), whether the status is `TRACKED`."""
         return self.trajectories.status == Status.TRACKED
 
 
@@ -108,52 +112,52 @@ class Run:
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     root = tmp_path_factory.mktemp("comings")
     folder = simulate(scenario(root), root, SimulationSettings(scale=0.25, seed=0, masks=False), jobs=1)
-    sequence = read_sequence(folder).usable()
-    assert sequence.truth is not None
-    # What stands still for a second is background.
-    how = SilhouetteSettings(reduction=1, working_reduction=1, min_blob_px=4, learning_rate=0.02)
-    tracked = track_recording(sequence, TrackSettings(silhouettes=how), cache=root / "cache", jobs=1)
-    cameras, position_m = sequence.rig.cameras, sequence.truth.position_m
+    recording = read_sequence(folder).usable()
+    assert recording.truth is not None
+    # With this learning rate, a drone that stands still becomes background after a second.
+    silhouettes = SilhouetteSettings(reduction=1, working_reduction=1, min_blob_px=4, learning_rate=0.02)
+    tracked = track_recording(recording, TrackSettings(silhouettes=silhouettes), cache=root / "cache", jobs=1)
+    cameras, position_m = recording.rig.cameras, recording.truth.position_m
     pixels, depth = project(cameras, position_m[:, :, None])
     inside = (pixels >= 0) & (pixels < cameras.image_size_wh) & (depth > 0)[..., None]
     seen_by = inside.all(axis=-1).sum(axis=-1)
-    # The dataset says nothing of frame 0.
+    # The dataset's files have no position for frame 0.
     seen_by[0] = seen_by[1]
     known_m = np.where(seen_by[..., None] >= 2, position_m, np.nan)
-    apart_m = tracked.trajectories.position_m[:, :, None] - position_m[:, None]
+    offset_m = tracked.trajectories.position_m[:, :, None] - position_m[:, None]
     return Run(
         tracked.trajectories,
-        replace(sequence.truth, position_m=known_m),
+        replace(recording.truth, position_m=known_m),
         seen_by,
-        np.nan_to_num(np.linalg.norm(apart_m, axis=-1), nan=np.inf),
+        np.nan_to_num(np.linalg.norm(offset_m, axis=-1), nan=np.inf),
     )
 
 
-def test_everyone_is_one_drone_and_nobody_is_invented(run: Run) -> None:
-    """Three tracks, each at one drone only, no two at one; and they keep to them."""
+def test_each_drone_has_one_track_and_there_are_no_false_tracks(run: Run) -> None:
+    """There are three tracks, one per drone, and no identity switch."""
     assert run.trajectories.num_drones == len(DRONES)
     assert sorted(run.track_of(drone) for drone in DRONES) == list(DRONES)
     assert evaluate(run.trajectories, run.truth).id_switches == 0
-    nobody = run.tracked & (run.at.min(axis=-1) > 0.5)
-    # One that flies out of sight at 2 m/s may be said to be there for a few frames more. Measured 0.
-    assert nobody.sum() <= 5
+    false = run.tracked & (run.distance_m.min(axis=-1) > 0.5)
+    # A drone that flies out of sight at 2 m/s may have the status `TRACKED` for a few more frames. Measured 0.
+    assert false.sum() <= 5
 
 
-def test_a_drone_that_comes_is_tracked_within_a_second(run: Run) -> None:
-    """It must be there for ten frames of one chunk of 25, of which its first nine may be those of the chunk before."""
+def test_a_drone_that_appears_is_tracked_after_ten_frames(run: Run) -> None:
+    """A new track needs ten frames; the first nine of them may be in the previous chunk."""
     tracked = run.tracked[:, run.track_of(COMES)]
     first_seen = int(np.argmax(run.seen_by[:, COMES] >= 3))
     assert not tracked[: first_seen - 3].any()
     assert 0 <= int(tracked.argmax()) - first_seen <= 9
 
 
-def test_a_drone_that_goes_coasts_less_and_less_certain_and_then_is_lost(run: Run) -> None:
+def test_a_drone_that_leaves_coasts_with_growing_covariance_and_then_is_lost(run: Run) -> None:
     track = run.track_of(COMES)
     status = run.trajectories.status[:, track]
     left, back = _unseen(run)
     assert (status[left - 10 : left - 2] == Status.TRACKED).all()
     coasting = left - 2 + np.flatnonzero(status[left - 2 : back] == Status.COASTING)
-    # Half a second, in one piece.
+    # It coasts for half a second without interruption.
     assert len(coasting) == 12
     assert (np.diff(coasting) == 1).all()
     variance_m2 = np.trace(run.trajectories.covariance_m2[:, track], axis1=-2, axis2=-1)
@@ -161,16 +165,16 @@ def test_a_drone_that_goes_coasts_less_and_less_certain_and_then_is_lost(run: Ru
     assert (status[coasting[-1] + 1 : back - 2] == Status.LOST).all()
 
 
-def test_a_drone_that_comes_back_is_itself(run: Run) -> None:
-    """Unseen for two seconds, half a metre from where it went; the one that is lost meanwhile stood elsewhere."""
+def test_a_drone_that_returns_keeps_its_identity(run: Run) -> None:
+    """It returns after two seconds, half a metre from where it left, while another drone is lost elsewhere."""
     status = run.trajectories.status[:, run.track_of(COMES)]
     left, back = _unseen(run)
     assert (status[back + 9 :] == Status.TRACKED).all()
     assert (run.trajectories.status[left:back, run.track_of(LANDS)] == Status.LOST).any()
 
 
-def test_a_drone_that_stands_is_swallowed_and_takes_off_as_itself(run: Run) -> None:
-    """It is lost while it is background; when it takes off it leaves a hole, which is nobody."""
+def test_a_landed_drone_becomes_background_and_keeps_its_identity_when_it_takes_off(run: Run) -> None:
+    """It is lost while it is background; the false foreground that it leaves when it takes off is no track."""
     status = run.trajectories.status[:, run.track_of(LANDS)]
     landed, flying = int(LANDS_S * FPS), int((TAKES_OFF_S + 1.0) * FPS)
     assert (status[:landed] == Status.TRACKED).all()
@@ -178,7 +182,7 @@ def test_a_drone_that_stands_is_swallowed_and_takes_off_as_itself(run: Run) -> N
     assert (status[flying:] == Status.TRACKED).all()
 
 
-def test_two_cameras_are_enough_and_the_covariance_says_how_good_they_are(run: Run) -> None:
+def test_two_cameras_are_enough_and_the_covariance_is_larger(run: Run) -> None:
     track = run.track_of(FLIES_OUT)
     by_two, by_four = (np.flatnonzero(run.seen_by[:, FLIES_OUT] == number) for number in (2, 4))
     assert len(by_two) > 50
@@ -188,17 +192,18 @@ def test_two_cameras_are_enough_and_the_covariance_says_how_good_they_are(run: R
     covariance_m2 = run.trajectories.covariance_m2[:, track]
     nees = np.einsum("ni,nij,nj->n", residual_m, np.linalg.inv(covariance_m2), residual_m)
     std_m = np.sqrt(np.trace(covariance_m2, axis1=-2, axis2=-1))
-    # Ten metres away and from one side, where a cell is 36 mm wide; before, 14 to 32. Measured 83 mm and 21 mm.
+    # With two cameras, both on one side and ten metres away, a cell is 36 mm wide; with four, 14 to 32 mm. Measured
+    # errors: 83 mm and 21 mm.
     error_m = np.linalg.norm(residual_m, axis=-1)
     assert np.nanmean(error_m[by_two]) < 0.15
     assert np.nanmean(error_m[by_four]) < 0.04
-    # Measured 1.7 times as much.
+    # Measured: 1.7 times as large.
     assert std_m[by_two].mean() > 1.3 * std_m[by_four].mean()
-    # 3 for honest covariances. Two seconds are few samples of errors that last for half of one. Measured 6.9.
+    # The expected value is 3, but two seconds contain few samples of errors that last for half a second. Measured 6.9.
     assert nees[by_two].mean() < 14
 
 
 def _unseen(run: Run) -> tuple[int, int]:
-    """The frames in which the drone that comes and goes leaves the sight of two cameras, and is back in it."""
+    """Frame in which fewer than two cameras see the drone `COMES` for the first time, and the frame of its return."""
     frames = np.flatnonzero((np.arange(NUM_FRAMES) > 60) & (run.seen_by[:, COMES] < 2))
     return int(frames[0]), int(frames[-1]) + 1

@@ -1,4 +1,4 @@
-"""How often the tracker is compiled: once per shape and `Program`, for whatever numbers it is then called with."""
+"""Compilations of the tracker: one per `Program` and shapes of the inputs, for all values of the inputs."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from psotrack.tracking.parameters import tracker_params, tracker_program, tracke
 
 
 def run(*, num_frames=5, num_drones=2, seed=0, size_m=0.4, focal=1.0, **settings):
-    """Track noise, and wait for the result."""
+    """Track two chunks of random silhouettes, and wait for the result."""
     rng = np.random.default_rng(seed)
     position_m, velocity_m_s = rng.uniform(-1, 1, (num_drones, 3)), np.zeros((num_drones, 3))
     settings = tracker_settings(
@@ -27,7 +27,7 @@ def run(*, num_frames=5, num_drones=2, seed=0, size_m=0.4, focal=1.0, **settings
     state = tracker.init(jax.random.key(seed), *float32((position_m, velocity_m_s)), params)
     coverage = rng.integers(0, 256, (num_frames, 3, 30, 40)).astype(np.uint8)
     state, _ = tracker.track(state, coverage, cameras, params, program, starts)
-    # And the next chunk, whose state comes from the device.
+    # The state of the second chunk is already on the device.
     return jax.block_until_ready(
         tracker.track(state, jnp.asarray(coverage), cameras, params, program, starts)
     )
@@ -35,7 +35,7 @@ def run(*, num_frames=5, num_drones=2, seed=0, size_m=0.4, focal=1.0, **settings
 
 @pytest.fixture
 def compiled(caplog):
-    """Call it for the names of what was compiled since the last call."""
+    """Function that returns the names of the programs that were compiled since its last call."""
     with jax.log_compiles(), caplog.at_level("WARNING", logger="jax"):
 
         def since_last():
@@ -46,7 +46,7 @@ def compiled(caplog):
         yield since_last
 
 
-def test_a_second_sequence_compiles_nothing(compiled):
+def test_other_values_of_the_inputs_compile_nothing(compiled):
     run()
     assert any("track" in name for name in compiled())
     run(seed=1, size_m=0.7, focal=1.1, iterations=9, max_speed_m_s=3.0, inertia=0.4, min_fitness=0.3)
@@ -58,7 +58,7 @@ def test_a_second_sequence_compiles_nothing(compiled):
 @pytest.mark.slow
 @pytest.mark.parametrize("change", [{"num_frames": 6, "num_drones": 3}, {"swarm": "joint"}])
 def test_another_shape_or_program_compiles_once(compiled, change):
-    """Also shows that the count above can see a compilation."""
+    """Another number of frames and drones, or another swarm, compiles once; so the test above can see a compilation."""
     run()
     compiled()
     run(**change)

@@ -1,4 +1,4 @@
-"""Who belongs to whom: OpenCV's epipolar lines, a search of all assignments in small scenes, truth in large ones."""
+"""Correspondence of detections: OpenCV's epipolar lines, all assignments of small scenes, the truth of large scenes."""
 
 from itertools import product
 
@@ -20,11 +20,12 @@ LARGE_WH = (1280, 960)
 
 
 def pixels_of(rig, points):
+    """(..., cameras, 2), pixels of points in all cameras."""
     return project(rig.cameras, np.asarray(points)[..., None, :])[0]
 
 
-def apart(count, rng, least_m=0.6):
-    """Points in the room, none nearer than `least_m` to another."""
+def separate_points(count, rng, least_m=0.6):
+    """(count, 3), points in the room with distances of at least `least_m`, metres."""
     points = np.empty((0, 3))
     while len(points) < count:
         point = rng.uniform((-1.5, -1.5, 0.3), (1.5, 1.5, 2.3))
@@ -34,7 +35,7 @@ def apart(count, rng, least_m=0.6):
 
 
 def observed(rig, drones, rng, *, noise_px, missed=0.0, false=0):
-    """For each camera its detections in random order, and which drone each is of (-1: of none)."""
+    """Simulate detections: per camera, their pixels in random order, and the number of each one's drone (-1: none)."""
     pixels = pixels_of(rig, drones)
     points, owners = [], []
     for c in range(len(rig)):
@@ -48,11 +49,13 @@ def observed(rig, drones, rng, *, noise_px, missed=0.0, false=0):
 
 
 def matched(rig, points, noise_px, **options):
-    noise = [np.full(len(one), float(noise_px)) for one in points]
+    """Match detections that all have the same noise."""
+    noise = [np.full(len(detections), float(noise_px)) for detections in points]
     return match(rig.cameras, points, noise, bounds_m=BOUNDS_M, **options)
 
 
 def groups_of(matches):
+    """Set of the groups; a group is a tuple with a detection's index per camera, or -1."""
     return {tuple(row) for row in matches.detection.tolist()}
 
 
@@ -60,13 +63,13 @@ def groups_of(matches):
 
 
 def bent_by_opencv(cam, straight):
-    """Where the lens puts the pixels of a camera without one."""
+    """Pixels after distortion by OpenCV, from pixels without distortion."""
     rays = np.column_stack([straight, np.ones(len(straight))]) @ np.linalg.inv(cam.K).T
     return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), cam.K, np.array(cam.dist))[0][:, 0]
 
 
 @pytest.mark.parametrize("coefficients", sorted(LENSES))
-def test_distances_from_opencvs_epipolar_lines(coefficients):
+def test_distances_from_epipolar_lines_equal_opencvs(coefficients):
     rig = ring_rig(5, coefficients=coefficients)
     rng = np.random.default_rng(0)
     a, b = rig.cameras[1], rig.cameras[3]
@@ -77,29 +80,29 @@ def test_distances_from_opencvs_epipolar_lines(coefficients):
     cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
     F = np.linalg.inv(b.K).T @ cross @ R @ np.linalg.inv(a.K)
     found = epipolar_distance(a, b, *bent)
-    for side, (of, on) in enumerate(((0, 1), (1, 0))):
-        lines = cv2.computeCorrespondEpilines(straight[of][:, None], of + 1, F)[:, 0]
-        off = np.abs(lines[:, :2] @ straight[on].T + lines[:, 2:])
-        # Lenses are undone to 1e-8 (see test_cameras), which is 3e-6 px.
+    for side, (first, second) in enumerate(((0, 1), (1, 0))):
+        lines = cv2.computeCorrespondEpilines(straight[first][:, None], first + 1, F)[:, 0]
+        off = np.abs(lines[:, :2] @ straight[second].T + lines[:, 2:])
+        # Distortion is inverted to 1e-8 (see test_cameras), which is 3e-6 px.
         np.testing.assert_allclose(found[..., side], off if side == 0 else off.T, atol=1e-5)
 
 
-def test_what_is_seen_of_one_point_is_on_its_epipolar_lines():
+def test_pixels_of_one_point_are_on_their_epipolar_lines():
     rig = ring_rig(3, coefficients=5)
-    pixels = pixels_of(rig, apart(4, np.random.default_rng(0)))
+    pixels = pixels_of(rig, separate_points(4, np.random.default_rng(0)))
     distance = epipolar_distance(rig.cameras[0], rig.cameras[2], pixels[:, 0], pixels[:, 2])
-    # Lenses are undone to 1e-8, which is 3e-6 px.
+    # Distortion is inverted to 1e-8, which is 3e-6 px.
     np.testing.assert_allclose(distance[np.arange(4), np.arange(4)], 0.0, atol=1e-5)
     assert (distance[~np.eye(4, dtype=bool)] > 0.1).all()
     nothing = epipolar_distance(rig.cameras[0], rig.cameras[2], pixels[:0, 0], pixels[:, 2])
     assert nothing.shape == (0, 4, 2)
 
 
-# --- the least total
+# --- the least total cost
 
 
 def reprojection_cost(rig, points, group, noise_px):
-    """Least squared distance in standard deviations of a group's detections, by SciPy."""
+    """Least sum of squared reprojection errors of a group, in standard deviations, by SciPy."""
     seen = [c for c, index in enumerate(group) if index >= 0]
     picked = np.array([points[c][group[c]] for c in seen])
 
@@ -110,10 +113,10 @@ def reprojection_cost(rig, points, group, noise_px):
 
 
 def least_total(rig, points, noise_px):
-    """Groups of three cameras with the least total cost: all assignments are tried."""
+    """Groups with the least total cost for three cameras, and this cost, by a search of all assignments."""
     triples = [
         (triple, cost)
-        for triple in product(*(range(len(one)) for one in points))
+        for triple in product(*(range(len(detections)) for detections in points))
         if (cost := reprojection_cost(rig, points, triple, noise_px)) < 3 * UNEXPLAINED_COST
     ]
     best, chosen = UNEXPLAINED_COST * sum(map(len, points)), frozenset()
@@ -124,18 +127,19 @@ def least_total(rig, points, noise_px):
             best, chosen = total, frozenset(groups)
         for number in range(start, len(triples)):
             triple, cost = triples[number]
-            again = len(used & set(enumerate(triple)))
-            # Two detections of its own, and one that it shares at most.
-            if again < 2:
-                price = NEW_GROUP_COST + cost + SHARED_COST * again - UNEXPLAINED_COST * (3 - again)
-                search(number + 1, used | set(enumerate(triple)), [*groups, triple], total + price)
+            shared = len(used & set(enumerate(triple)))
+            # A group may share at most one of its three detections.
+            if shared < 2:
+                change = NEW_GROUP_COST + cost + SHARED_COST * shared - UNEXPLAINED_COST * (3 - shared)
+                search(number + 1, used | set(enumerate(triple)), [*groups, triple], total + change)
 
     search(0, frozenset(), [], best)
     return set(chosen), best
 
 
-def total_of(rig, points, groups, noise_px):
-    left = set().union(*({(c, i) for i in range(len(one))} for c, one in enumerate(points)))
+def total_cost(rig, points, groups, noise_px):
+    """Total cost of an assignment: costs of groups, of shared detections and of unexplained detections."""
+    left = set().union(*({(c, i) for i in range(len(detections))} for c, detections in enumerate(points)))
     total = 0.0
     for group in groups:
         taken = {(c, i) for c, i in enumerate(group) if i >= 0}
@@ -147,67 +151,69 @@ def total_of(rig, points, groups, noise_px):
 
 
 @pytest.mark.parametrize("seed", range(16))
-def test_all_assignments_searched(seed):
-    """Two or three drones and a false detection or none, three cameras: the groups are those with the least total."""
+def test_groups_have_the_least_total_cost_of_all_assignments(seed):
+    """Three cameras, two or three drones, and at most one false detection per camera."""
     rng = np.random.default_rng(seed)
     rig = ring_rig(3, image_size_wh=LARGE_WH, coefficients=(0, 5)[seed % 2])
-    drones = apart(2 + seed % 2, rng)
+    drones = separate_points(2 + seed % 2, rng)
     points, _ = observed(rig, drones, rng, noise_px=3.0, missed=0.1, false=seed // 2 % 2)
     expected, _ = least_total(rig, points, 3.0)
     assert groups_of(matched(rig, points, 3.0)) == expected
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_no_worse_than_the_truth(seed):
-    """What cannot be searched: six drones, seven cameras. The total is at most that of the true groups."""
+def test_the_total_cost_is_not_above_that_of_the_true_groups(seed):
+    """Six drones and seven cameras have too many assignments to try all of them."""
     rng = np.random.default_rng(seed)
     rig = ring_rig(7, image_size_wh=LARGE_WH)
-    drones = apart(6, rng)
+    drones = separate_points(6, rng)
     points, owners = observed(rig, drones, rng, noise_px=2.0, missed=0.1, false=2)
     truth = [
         tuple(np.flatnonzero(owner == drone)[0] if (owner == drone).any() else -1 for owner in owners)
         for drone in range(6)
     ]
-    found = total_of(rig, points, groups_of(matched(rig, points, 2.0)), 2.0)
-    # Points by weighted linear equations and not by the least reprojection error: measured 0.01, of 13.8 for one view.
-    assert found <= total_of(rig, points, truth, 2.0) + 0.1
+    found = total_cost(rig, points, groups_of(matched(rig, points, 2.0)), 2.0)
+    # `match` computes points from weighted linear equations, not from the least reprojection error. Measured excess
+    # 0.01; an unexplained detection costs 13.8.
+    assert found <= total_cost(rig, points, truth, 2.0) + 0.1
 
 
-# --- truth
+# --- comparison with the truth
 
 
 @pytest.mark.parametrize("noise_px", [1.0, 2.0, 3.0])
-def test_truth(noise_px):
-    """Ten scenes of six drones, seven cameras, one in ten missed, two false detections in every image."""
+def test_drones_are_found_and_few_groups_are_false(noise_px):
+    """Ten scenes of six drones and seven cameras; 10 % of detections are missing, two per image are false."""
     found = wrong = drones_seen = 0
     for seed in range(10):
         rng = np.random.default_rng(seed)
         rig = ring_rig(7, image_size_wh=LARGE_WH, coefficients=5)
-        drones = apart(6, rng)
+        drones = separate_points(6, rng)
         points, owners = observed(rig, drones, rng, noise_px=noise_px, missed=0.1, false=2)
         matches = matched(rig, points, noise_px)
         detected = np.array([[(owner == drone).any() for owner in owners] for drone in range(6)])
         drones_seen += int((detected.sum(axis=1) >= 3).sum())
         distance = np.linalg.norm(matches.position_m[:, None] - drones, axis=-1)
-        # A pixel is 4 mm at 4 m; of three views or more, some nearly in line, five standard deviations.
+        # A pixel is 4 mm at 4 m. The limit is five standard deviations, because some groups have only three views that
+        # are nearly in line.
         near = distance < 5 * 0.004 * noise_px
         assert (near.sum(axis=0) <= 1).all()
         found += int(near.any(axis=0).sum())
         wrong += int((~near.any(axis=1)).sum())
     assert drones_seen == 60
-    # Not found: who is seen three or four times, one of them more than 3.7 standard deviations off (1 in 1000).
+    # A drone with three or four views is not found if an error is above 3.7 standard deviations (1 in 1000).
     assert found >= 59
-    # A false group takes three detections that meet by chance, of two false ones per image and what others left.
+    # A false group needs three detections whose rays meet by chance.
     assert wrong <= 1
 
 
 def test_positions_and_costs():
-    """Costs are mean squared distances from where OpenCV projects the position, in standard deviations."""
+    """Costs are mean squared distances to OpenCV's projections of the positions, in standard deviations."""
     rng = np.random.default_rng(4)
     rig = ring_rig(5, image_size_wh=LARGE_WH, coefficients=5)
-    drones = apart(3, rng)
+    drones = separate_points(3, rng)
     points, owners = observed(rig, drones, rng, noise_px=1.5)
-    noise = [rng.uniform(1.0, 4.0, len(one)) for one in points]
+    noise = [rng.uniform(1.0, 4.0, len(detections)) for detections in points]
     matches = match(rig.cameras, points, noise, bounds_m=BOUNDS_M)
     assert len(matches.position_m) == 3
     for position, row, cost in zip(matches.position_m, matches.detection, matches.cost, strict=True):
@@ -218,50 +224,50 @@ def test_positions_and_costs():
                 position[None], cv2.Rodrigues(R)[0], t, rig.cameras.K[c], np.array(rig.cameras.dist[c])
             )[0][0, 0]
             squared.append(np.sum(((pixel - points[c][index]) / noise[c][index]) ** 2))
-        # Costs are of the straightened image, where a pixel is up to 5 % of one in size away from a pixel here.
+        # Costs are computed in the undistorted image, whose pixels differ in size by up to 5 % from those here.
         assert cost == pytest.approx(np.mean(squared), rel=0.15)
     assert {tuple(owners[c][i] for c, i in enumerate(row)) for row in matches.detection} == {
         (drone,) * 5 for drone in range(3)
     }
 
 
-# --- what two views say
+# --- groups with two views
 
 
-def test_two_views_alone_are_not_trusted():
+def test_two_views_are_no_group_without_a_prediction():
     rig = ring_rig(5, image_size_wh=LARGE_WH)
-    drones = apart(2, np.random.default_rng(0))
+    drones = separate_points(2, np.random.default_rng(0))
     points = list(pixels_of(rig, drones).swapaxes(0, 1))
     points[1] = points[3] = points[4] = np.empty((0, 2))
     assert not len(matched(rig, points, 1.0).position_m)
-    # A prediction of one of them speaks for it, and for no other.
+    # A prediction of one drone permits a group for that drone only.
     with_prediction = matched(
         rig, points, 1.0, expected_m=drones[1:], expected_covariance_m2=0.01 * np.eye(3)[None]
     )
     assert with_prediction.detection.tolist() == [[1, -1, 1, -1, -1]]
     assert with_prediction.expected.tolist() == [0]
     np.testing.assert_allclose(with_prediction.position_m, drones[1:], atol=1e-6)
-    # Where no camera has two detections there is nothing to confuse.
-    alone = matched(rig, [one[:1] for one in points], 1.0)
+    # If no camera has two detections, no detections can be confused.
+    alone = matched(rig, [detections[:1] for detections in points], 1.0)
     assert alone.detection.tolist() == [[0, -1, 0, -1, -1]]
     assert alone.expected.tolist() == [-1]
 
 
 @pytest.mark.parametrize("least", [3, 4])
-def test_cameras_side_by_side_are_one_viewpoint(least):
+def test_cameras_at_one_place_count_as_one_view(least):
     rig = ring_rig(5, image_size_wh=LARGE_WH)
-    drones = apart(2, np.random.default_rng(1))
-    for spots, enough in (((0,) * 3 + tuple(range(1, least - 1)), False), (range(least), True)):
-        some = make_unnamed_rig(*(rig.cameras[i] for i in spots))
-        points = list(pixels_of(some, drones).swapaxes(0, 1))
-        assert len(matched(some, points, 1.0, min_views=least).position_m) == (2 if enough else 0)
+    drones = separate_points(2, np.random.default_rng(1))
+    for places, enough in (((0,) * 3 + tuple(range(1, least - 1)), False), (range(least), True)):
+        placed = make_unnamed_rig(*(rig.cameras[i] for i in places))
+        points = list(pixels_of(placed, drones).swapaxes(0, 1))
+        assert len(matched(placed, points, 1.0, min_views=least).position_m) == (2 if enough else 0)
 
 
-def test_expected_drones_are_named():
-    """Whatever the order of the predictions; a prediction elsewhere takes nothing, and its drone is new."""
+def test_groups_have_the_number_of_their_prediction():
+    """Predictions may have any order; a prediction far from its drone has no group, and the drone's group is new."""
     rng = np.random.default_rng(2)
     rig = ring_rig(5, image_size_wh=LARGE_WH)
-    drones = apart(4, rng)
+    drones = separate_points(4, rng)
     points, owners = observed(rig, drones, rng, noise_px=1.0, false=1)
     order = np.array([2, 0, 3])
     expected_m = drones[order] + rng.normal(scale=0.03, size=(3, 3))
@@ -276,15 +282,15 @@ def test_expected_drones_are_named():
     named = dict(zip(matches.expected.tolist(), matches.position_m, strict=False))
     assert sorted(matches.expected.tolist()) == [-1, -1, 0, 1]
     for number in (0, 1):
-        # A pixel is 4 mm, of five views.
+        # A pixel is 4 mm, and a group has five views.
         assert np.linalg.norm(named[number] - drones[order[number]]) < 0.02
         row = matches.detection[matches.expected == number][0]
         assert all(owners[c][i] == order[number] for c, i in enumerate(row) if i >= 0)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_expected_drones_that_pass_each_other(seed):
-    """Nearer than a prediction is sure: both predictions are nearest to the same detections, and both get their own."""
+def test_predictions_of_drones_that_pass_each_other(seed):
+    """Both predictions are nearest to the same detections, but each gets the detections of its own drone."""
     rng = np.random.default_rng(seed)
     rig = ring_rig(3, image_size_wh=LARGE_WH)
     drones = np.array([[0.1, 0.0, 1.2], [0.1, 0.12, 1.25]])
@@ -297,11 +303,14 @@ def test_expected_drones_that_pass_each_other(seed):
         assert [owners[c][i] for c, i in enumerate(row)] == [number] * 3
 
 
-# --- merged, false, ambiguous
+# --- merged, false and ambiguous detections
 
 
 def overlapping():
-    """Two drones in line with the second of three cameras, 2.5 standard deviations from the middle of both there."""
+    """Three cameras, and two drones in line with the second camera.
+
+    Returns the rig, the pixels per camera, and the distance between the drones in the second camera, pixels.
+    """
     rig = make_unnamed_rig(*(ring_rig(5, image_size_wh=LARGE_WH).cameras[i] for i in (0, 1, 3)))
     centre = rig.cameras.centre_world[1]
     near = np.array([0.1, 0.3, 1.2])
@@ -316,30 +325,30 @@ def test_a_merged_detection_is_shared():
     points[1] = points[1].mean(axis=0)[None]
     matches = matched(rig, points, noise_px)
     assert groups_of(matches) == {(0, 0, 0), (1, 0, 1)}
-    # So far from the middle it is cheaper to leave one drone unexplained.
+    # If the merged detection is too far from both drones, it is cheaper to leave a drone's detections unexplained.
     assert len(matched(rig, points, width_px / 8.0).position_m) < 2
 
 
-def test_what_nobody_saw_together_is_nothing():
+def test_random_detections_or_none_give_no_groups():
     rig = ring_rig(6, image_size_wh=LARGE_WH)
     rng = np.random.default_rng(0)
     points = [rng.uniform((0, 0), LARGE_WH, (2, 2)) for _ in range(6)]
     assert not len(matched(rig, points, 1.0).position_m)
     assert not len(matched(rig, [np.empty((0, 2))] * 6, 1.0).position_m)
-    one = [points[0], *[np.empty((0, 2))] * 5]
-    assert matched(rig, one, 1.0).detection.shape == (0, 6)
-    waited = matched(
+    one_camera = [points[0], *[np.empty((0, 2))] * 5]
+    assert matched(rig, one_camera, 1.0).detection.shape == (0, 6)
+    predicted_only = matched(
         rig,
         [np.empty((0, 2))] * 6,
         1.0,
         expected_m=np.zeros((2, 3)),
         expected_covariance_m2=np.broadcast_to(np.eye(3), (2, 3, 3)),
     )
-    assert waited.expected.shape == (0,)
+    assert predicted_only.expected.shape == (0,)
 
 
-def test_what_is_not_finite_is_no_detection():
-    """Not even of a drone where all cameras look, in the middle of their images."""
+def test_detections_that_are_not_finite_are_ignored():
+    """The first drone is near the middle of all images, where NaN could be mistaken for a valid detection."""
     rig = ring_rig(4, image_size_wh=LARGE_WH, coefficients=4)
     drones = np.array([[0.1, -0.1, 1.2], [1.0, 0.5, 1.8]])
     points = list(pixels_of(rig, drones).swapaxes(0, 1))
@@ -347,12 +356,12 @@ def test_what_is_not_finite_is_no_detection():
     assert groups_of(matched(rig, points, 1.0)) == {(0, -1, 0, 0), (1, 1, -1, 1)}
 
 
-def test_one_camera_tells_nothing():
+def test_one_camera_gives_no_groups():
     rig = ring_rig(1)
     assert matched(rig, [np.array([[100.0, 80.0], [10.0, 90.0]])], 1.0).position_m.shape == (0, 3)
 
 
-def test_out_of_bounds_is_nothing():
+def test_drones_out_of_bounds_are_ignored():
     rig = ring_rig(5, image_size_wh=LARGE_WH)
     drones = np.array([[0.0, 0.0, 1.0], [1.0, 0.5, 2.0]])
     points = list(pixels_of(rig, drones).swapaxes(0, 1))
@@ -362,12 +371,12 @@ def test_out_of_bounds_is_nothing():
     assert matches.detection.tolist() == [[1] * 5]
 
 
-def test_one_drone_detected_twice_is_one():
-    """Two boxes on one drone in one image do not make two drones of it, however bad its other views are."""
+def test_a_drone_detected_twice_in_one_image_is_one_group():
+    """The noise is larger than stated, so that the second detection fits the drone as well as the first."""
     rig = ring_rig(8, image_size_wh=LARGE_WH)
     for seed in range(10):
         rng = np.random.default_rng(seed)
-        drones = apart(3, rng)
+        drones = separate_points(3, rng)
         points, _ = observed(rig, drones, rng, noise_px=5.0)
         points[2] = np.vstack([points[2], points[2][:1] + rng.normal(scale=8.0, size=2)])
         assert len(matched(rig, points, 3.0).position_m) == 3
@@ -375,30 +384,30 @@ def test_one_drone_detected_twice_is_one():
 
 @pytest.mark.parametrize("off_px", [1.0, 2.0, 4.0])
 def test_ambiguity_is_a_likelihood_ratio(off_px):
-    """A third place, where a ray of each of two drones meets a false detection: SciPy has its cost.
+    """A false detection is near the crossing of a ray of each of two drones: SciPy gives the cost of that group.
 
-    The drones would still have three views each, so that this and no more tells the assignments apart: a detection that
-    is explained by a group that nobody expects saves nothing.
+    Both drones would keep three views, so only this cost decides between the two assignments.
     """
     rig = make_unnamed_rig(*(ring_rig(7, image_size_wh=LARGE_WH).cameras[i] for i in (0, 1, 3, 5)))
-    nowhere = np.array([0.3, -0.2, 1.1])
-    drones = np.stack([0.8 * nowhere + 0.2 * centre for centre in rig.cameras.centre_world[:2]])
+    crossing = np.array([0.3, -0.2, 1.1])
+    drones = np.stack([0.8 * crossing + 0.2 * centre for centre in rig.cameras.centre_world[:2]])
     points = list(pixels_of(rig, drones).swapaxes(0, 1))
     alone = matched(rig, points, 1.0)
     assert alone.ambiguity.tolist() == [0.0, 0.0]
-    points[2] = np.vstack([points[2], pixels_of(rig, nowhere)[2] + (0.0, off_px)])
+    points[2] = np.vstack([points[2], pixels_of(rig, crossing)[2] + (0.0, off_px)])
     matches = matched(rig, points, 1.0)
     assert groups_of(matches) == groups_of(alone) == {(0, 0, 0, 0), (1, 1, 1, 1)}
     expected = np.exp(-reprojection_cost(rig, points, (0, 1, 2, -1), 1.0) / 2)
-    # Points by weighted linear equations are not quite those of the least reprojection error: limit 5 %.
+    # `match` computes points from weighted linear equations, not from the least reprojection error: limit 5 %.
     np.testing.assert_allclose(matches.ambiguity, expected, rtol=0.05)
 
 
 @pytest.mark.parametrize("off_px", [1.0, 2.0])
 def test_ambiguity_of_the_other_pairing(off_px):
-    """Two drones in a plane with two cameras: crossed, their rays meet in two other places. So it is the third's word.
+    """Two drones are in a plane with two cameras, so their rays also cross in two other places.
 
-    It has detections of all four places, and those of the other two are a little off: SciPy has the two costs.
+    The third camera has detections of all four places, and the detections of the two wrong places are a little off.
+    SciPy gives the costs of the two wrong groups.
     """
     rig = make_unnamed_rig(*(ring_rig(5, image_size_wh=LARGE_WH).cameras[i] for i in (0, 1, 3)))
     first, second = rig.cameras.centre_world[:2]
@@ -415,26 +424,25 @@ def test_ambiguity_of_the_other_pairing(off_px):
     matches = matched(rig, points, 1.0)
     assert groups_of(matches) == {(0, 0, 0), (1, 1, 1)}
     cost = sum(reprojection_cost(rig, points, group, 1.0) for group in ((0, 1, 2), (1, 0, 3)))
-    # Points by weighted linear equations are not quite those of the least reprojection error: limit 5 %.
+    # `match` computes points from weighted linear equations, not from the least reprojection error: limit 5 %.
     np.testing.assert_allclose(matches.ambiguity, np.exp(-cost / 2), rtol=0.05)
     assert matched(rig, [*points[:2], third[:2]], 1.0).ambiguity.tolist() == [0.0, 0.0]
 
 
-def test_which_box_of_a_drone_is_not_ambiguous():
-    """Three of five cameras have a second box, of a place 1 cm higher: half a pixel's noise decides which is taken."""
+def test_two_boxes_of_one_drone_are_not_ambiguous():
+    """Three of five cameras have a second box 1 cm higher; whichever box is in the group, the drone is the same."""
     rig = ring_rig(5, image_size_wh=LARGE_WH)
-    drones = apart(2, np.random.default_rng(0))
+    drones = separate_points(2, np.random.default_rng(0))
     points = list(pixels_of(rig, drones).swapaxes(0, 1))
     higher = pixels_of(rig, drones[0] + np.array([0.0, 0.0, 0.01]))
     for c in range(3):
         points[c] = np.vstack([points[c], higher[c]])
     matches = matched(rig, points, 2.0)
     assert groups_of(matches) >= {(0,) * 5, (1,) * 5}
-    # Wherever they are taken from, the drone is there.
     assert not matches.ambiguity.any()
 
 
-def test_settings_that_make_no_sense():
+def test_invalid_settings_are_refused():
     rig = ring_rig(3)
     nothing = [np.empty((0, 2))] * 3
     with pytest.raises(SettingsError, match="predictions with covariances"):
@@ -450,15 +458,15 @@ def test_settings_that_make_no_sense():
 
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_order_and_place_do_not_matter(seed):
-    """Cameras and detections in another order, the world turned and shifted: the same groups."""
+def test_order_and_world_frame_do_not_matter(seed):
+    """Groups are the same with cameras and detections in another order, and in a turned and shifted world."""
     rng = np.random.default_rng(seed)
     rig = ring_rig(6, image_size_wh=LARGE_WH)
-    drones = apart(int(rng.integers(1, 6)), rng)
+    drones = separate_points(int(rng.integers(1, 6)), rng)
     points, _ = observed(rig, drones, rng, noise_px=2.0, missed=0.1, false=1)
     matches = matched(rig, points, 2.0)
     order = rng.permutation(6)
-    within = [rng.permutation(len(one)) for one in points]
+    within = [rng.permutation(len(detections)) for detections in points]
     mixed_rig = rig.select([rig.names[c] for c in order])
     mixed = matched(mixed_rig, [points[c][within[c]] for c in order], 2.0)
     back = np.full_like(mixed.detection, -1)
@@ -470,7 +478,7 @@ def test_order_and_place_do_not_matter(seed):
     R = Rotation.from_rotvec([0.0, 0.0, rng.uniform(0, 2 * np.pi)]).as_matrix()
     shift_m = rng.uniform(-5, 5, 3)
     wide = np.stack([shift_m - 6.0, shift_m + 6.0])
-    noise = [np.full(len(one), 2.0) for one in points]
+    noise = [np.full(len(detections), 2.0) for detections in points]
     there = match(move_world(rig, R, shift_m).cameras, points, noise, bounds_m=wide)
     here = match(rig.cameras, points, noise, bounds_m=wide - shift_m)
     assert groups_of(there) == groups_of(here)
@@ -478,11 +486,14 @@ def test_order_and_place_do_not_matter(seed):
 
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_what_is_always_so(seed):
-    """Each group has its viewpoints and a place in bounds; no detection is of two unless one has two of its own."""
+def test_invariants_of_groups(seed):
+    """Positions are in bounds, costs and ambiguities are valid, and each group has enough views.
+
+    Two of the cameras are at the same place, and one of these two has no detections.
+    """
     rng = np.random.default_rng(seed)
     rig = ring_rig(int(rng.integers(2, 6)), image_size_wh=LARGE_WH)
-    drones = apart(int(rng.integers(1, 6)), rng, least_m=0.1)
+    drones = separate_points(int(rng.integers(1, 6)), rng, least_m=0.1)
     points, _ = observed(rig, drones, rng, noise_px=3.0, missed=0.3, false=int(rng.integers(0, 4)))
     points.append(points[0][:0])
     rig = make_unnamed_rig(*(rig.cameras[c] for c in [*range(len(rig)), 0]))
@@ -502,4 +513,4 @@ def test_what_is_always_so(seed):
     assert (seen.sum(axis=1) >= np.where((matches.expected >= 0) | single, 2, 3)).all()
     named = matches.expected[matches.expected >= 0]
     assert len(set(named.tolist())) == len(named)
-    assert (matches.detection < np.array([len(one) for one in points])).all()
+    assert (matches.detection < np.array([len(detections) for detections in points])).all()

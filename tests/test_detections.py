@@ -1,4 +1,4 @@
-"""Detection files: reading, round trips, and errors that name the line."""
+"""Detection files: reading, writing and reading again, and errors that name the line."""
 
 import numpy as np
 import pytest
@@ -11,14 +11,14 @@ from psotrack.recordings import Detections, read_detections, write_detections
 LINE = "4,10,20,30,40,25,40,0.9"
 
 
-def written(tmp_path, text, name="cam1i_s.csv"):
+def write_file(tmp_path, text, name="cam1i_s.csv"):
     path = tmp_path / name
     path.write_bytes(text.encode())
     return path
 
 
-def test_a_file_by_hand(tmp_path):
-    detections = read_detections(written(tmp_path, f"{LINE}\n7\n9,{LINE[2:]},1,2,3,4,2.5,4,0.25\n"))
+def test_a_file_is_read(tmp_path):
+    detections = read_detections(write_file(tmp_path, f"{LINE}\n7\n9,{LINE[2:]},1,2,3,4,2.5,4,0.25\n"))
     assert detections.frame.tolist() == [4, 9, 9]
     assert detections.xyxy.tolist() == [[10, 20, 40, 60], [10, 20, 40, 60], [1, 2, 4, 6]]
     assert detections.confidence.tolist() == [0.9, 0.9, 0.25]
@@ -27,8 +27,8 @@ def test_a_file_by_hand(tmp_path):
 
 
 def test_x_and_y_may_be_the_middle(tmp_path):
-    """Some exports of YOLO write the middle as x and y: the box is the same."""
-    detections = read_detections(written(tmp_path, "0,25,40,30,40,25,40,0.9"))
+    """Some exports of YOLO have the middle of the box as x and y; the box that is read is the same."""
+    detections = read_detections(write_file(tmp_path, "0,25,40,30,40,25,40,0.9"))
     assert detections.xyxy.tolist() == [[10, 20, 40, 60]]
 
 
@@ -53,15 +53,15 @@ def test_x_and_y_may_be_the_middle(tmp_path):
         "an empty detection between two",
     ],
 )
-def test_harmless_differences(tmp_path, text):
-    detections = read_detections(written(tmp_path, text))
+def test_variants_of_the_format_are_read(tmp_path, text):
+    detections = read_detections(write_file(tmp_path, text))
     assert set(detections.frame.tolist()) <= {2, 4}
     assert np.all(np.diff(detections.frame) >= 0)
     np.testing.assert_array_equal(detections.xyxy, [[10, 20, 40, 60]] * len(detections))
 
 
 def test_no_detections_at_all(tmp_path):
-    assert len(read_detections(written(tmp_path, ""))) == 0
+    assert len(read_detections(write_file(tmp_path, ""))) == 0
 
 
 @pytest.mark.parametrize(
@@ -81,10 +81,10 @@ def test_no_detections_at_all(tmp_path):
 )
 def test_a_broken_line_is_named(tmp_path, broken, expected):
     with pytest.raises(InputError, match=rf"cam1i_s\.csv, {expected}"):
-        read_detections(written(tmp_path, f"{LINE}\n{broken}\n"))
+        read_detections(write_file(tmp_path, f"{LINE}\n{broken}\n"))
 
 
-def test_no_text(tmp_path):
+def test_a_file_that_is_not_text_is_refused(tmp_path):
     path = tmp_path / "cam1i_s.csv"
     path.write_bytes(b"\xff\xfe\x00\x01")
     with pytest.raises(InputError, match=r"cam1i_s\.csv: expected UTF-8 text, found an invalid byte"):
@@ -96,7 +96,7 @@ boxes = st.tuples(pixels, pixels, st.floats(0, 1e4), st.floats(0, 1e4), st.float
 
 
 @given(found=st.lists(st.tuples(st.integers(0, 9), boxes), max_size=12))
-def test_round_trip(tmp_path_factory, found):
+def test_detections_are_read_as_they_were_written(tmp_path_factory, found):
     found = sorted(found, key=lambda item: item[0])
     values = np.array([box for _, box in found], np.float64).reshape(-1, 5)
     xyxy = np.hstack([values[:, :2], values[:, :2] + values[:, 2:4]])
@@ -105,7 +105,7 @@ def test_round_trip(tmp_path_factory, found):
     write_detections(path, detections)
     again = read_detections(path)
     np.testing.assert_array_equal(again.frame, detections.frame)
-    # Corners are computed from middle and size: a few roundings of numbers up to 2e4.
+    # The file has a corner and a size per box: a few roundings of numbers up to 2e4.
     np.testing.assert_allclose(again.xyxy, detections.xyxy, rtol=0, atol=1e-10)
     np.testing.assert_array_equal(again.confidence, detections.confidence)
 

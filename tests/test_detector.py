@@ -1,4 +1,4 @@
-"""The ONNX detector with tiny real networks, which find a painted white square to the pixel."""
+"""The ONNX detector with tiny real networks, which find painted white squares exactly."""
 
 import json
 
@@ -17,11 +17,11 @@ from psotrack.geometry import look_at, make_camera, project
 from psotrack.recordings import VideoWriter, probe, read_detections
 from psotrack.trajectories import read_trajectories
 
-#: Of the network's input for each layout; v10 has 300 boxes, for which it takes 18 x 18.
+#: Layout of the output -> side of the network's input, pixels. "v10" needs at least 300 boxes, so 18 x 18 boxes.
 SIZES = {"v5": 128, "v8": 128, "v10": 168}
-#: Pixels of the image for each of the network's.
+#: Pixels of the image per pixel of the network's input.
 SCALE = 2
-#: Where a drone is in the world, metres, by frame.
+#: (frames, 3), positions of a drone, metres.
 PLACES_M = np.linspace([-0.3, -0.2, 1.4], [0.3, 0.2, 1.6], 12)
 
 
@@ -34,12 +34,12 @@ def models(tmp_path_factory):
 
 
 def black(size: int):
-    """An image with twice the width of the input and an aspect ratio of 4 to 3."""
+    """Black image with twice the width of the network's input and an aspect ratio of 4 to 3."""
     return np.zeros((SCALE * size * 3 // 4, SCALE * size, 3), np.uint8)
 
 
 def square(size: int, column: int, row: int):
-    """xyxy in the image of one of the network's squares; the grey border above is an eighth of the input."""
+    """xyxy of one of the network's squares in the image; the grey border above the image is an eighth of the input."""
     x0, y0 = SCALE * STRIDE * column, SCALE * (STRIDE * row - size // 8)
     return [x0, y0, x0 + SCALE * SIDE, y0 + SCALE * SIDE]
 
@@ -56,16 +56,16 @@ def detector(models, layout, **settings):
 
 @pytest.mark.parametrize("layout", SIZES)
 class TestLayouts:
-    def test_a_square(self, models, layout):
+    def test_a_square_is_found(self, models, layout):
         size = SIZES[layout]
         bgr, there = black(size), square(size, 5, 6)
         paint(bgr, there)
         xyxy, confidence = detector(models, layout).boxes(bgr)
-        # Whole pixels, reduced by two: exact up to float32.
+        # The square's edges are whole pixels of the network's input: exact up to rounding of float32.
         np.testing.assert_allclose(xyxy, [there], atol=1e-4)
         assert confidence == pytest.approx(1 / (1 + np.exp(-10)), abs=1e-5)
 
-    def test_of_two_squares_the_brighter_is_first(self, models, layout):
+    def test_the_brighter_of_two_squares_is_first(self, models, layout):
         size = SIZES[layout]
         bgr, dim, bright = black(size), square(size, 2, 3), square(size, 9, 7)
         paint(bgr, dim, 200)
@@ -77,13 +77,13 @@ class TestLayouts:
         xyxy, _ = detector(models, layout, confidence=0.9).boxes(bgr)
         np.testing.assert_allclose(xyxy, [bright], atol=1e-4)
 
-    def test_nothing(self, models, layout):
+    def test_a_black_image_has_no_boxes(self, models, layout):
         xyxy, confidence = detector(models, layout).boxes(black(SIZES[layout]))
         assert (xyxy.shape, confidence.shape) == ((0, 4), (0,))
 
 
-def test_boxes_that_overlap(models):
-    """A box one step beside the square has an intersection over union of three fifths, and half the score."""
+def test_overlapping_boxes_are_suppressed(models):
+    """A box one stride beside the square has an intersection over union of 3/5 with the square, and half its score."""
     bgr = black(128)
     paint(bgr, square(128, 5, 6))
     _, alone = detector(models, "v8", nms=0.59).boxes(bgr)
@@ -92,7 +92,7 @@ def test_boxes_that_overlap(models):
     np.testing.assert_allclose(all_five, [1, 0.5, 0.5, 0.5, 0.5], atol=1e-3)
 
 
-def test_a_box_ends_where_the_image_ends(models):
+def test_boxes_are_clipped_to_the_image(models):
     """A quarter of the best square is in the grey border above the image."""
     bgr, there = black(128), square(128, 4, 1)
     assert there[1] == -SCALE * STRIDE
@@ -101,7 +101,7 @@ def test_a_box_ends_where_the_image_ends(models):
     np.testing.assert_allclose(xyxy, [[there[0], 0, *there[2:]]], atol=1e-4)
 
 
-def test_an_upright_image_has_grey_beside_it(models):
+def test_an_upright_image_gets_grey_borders_at_its_sides(models):
     bgr, there = black(128), square(128, 5, 6)
     paint(bgr, there)
     upright = np.ascontiguousarray(bgr.transpose(1, 0, 2))
@@ -109,14 +109,14 @@ def test_an_upright_image_has_grey_beside_it(models):
     np.testing.assert_allclose(xyxy, [[there[1], there[0], there[3], there[2]]], atol=1e-4)
 
 
-def test_red_is_red(tmp_path, models):
-    """The network gets RGB: a network of the first channel sees red, which is the last channel of BGR."""
+def test_the_network_gets_rgb(tmp_path, models):
+    """A network that uses only its first channel finds a red square, and no blue one."""
     kernel = np.full((3, SIDE, SIDE), 40 / (3 * SIDE * SIDE), np.float32)
-    seeing_red = np.stack([3 * kernel[0], 0 * kernel[1], 0 * kernel[2]])
+    red_only = np.stack([3 * kernel[0], 0 * kernel[1], 0 * kernel[2]])
     content = bright_squares("v8", 128)
     assert content.count(kernel.tobytes()) == 1
     path = tmp_path / "red.onnx"
-    path.write_bytes(content.replace(kernel.tobytes(), seeing_red.tobytes()))
+    path.write_bytes(content.replace(kernel.tobytes(), red_only.tobytes()))
     bgr = black(128)
     paint(bgr, square(128, 2, 3), (255, 0, 0))
     paint(bgr, square(128, 9, 6), (0, 0, 255))
@@ -124,8 +124,8 @@ def test_red_is_red(tmp_path, models):
     np.testing.assert_allclose(xyxy, [square(128, 9, 6)], atol=1e-4)
 
 
-class TestWhatCannotBeUsed:
-    def test_no_file(self, tmp_path):
+class TestInvalidModels:
+    def test_a_missing_file(self, tmp_path):
         with pytest.raises(InputError, match=r"gone.onnx: expected an ONNX model, found no such file"):
             OnnxDetector(tmp_path / "gone.onnx", DetectorSettings())
 
@@ -160,14 +160,14 @@ class TestWhatCannotBeUsed:
             detector(models, "logits").boxes(np.full_like(black(128), 255))
 
     @pytest.mark.parametrize("settings", [{"confidence": 0.0}, {"nms": 1.5}, {"size": 0}])
-    def test_settings(self, settings):
+    def test_invalid_settings(self, settings):
         with pytest.raises(SettingsError, match=next(iter(settings))):
             DetectorSettings(**settings)
 
 
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory):
-    """Two cameras and four frames: a moving square in the first camera, nothing in the second."""
+    """Folder with two videos of four frames: a moving square in the first video, an empty second video."""
     folder = tmp_path_factory.mktemp("data") / "Simulated_Data" / "S02_D1"
     folder.mkdir(parents=True)
     R, t_m = look_at((0.0, -6.0, 2.0), (0.0, 0.0, 1.5))
@@ -184,17 +184,17 @@ def sequence(tmp_path_factory):
 
 
 class TestVideos:
-    def test_frames(self, models, sequence):
+    def test_boxes_of_all_frames(self, models, sequence):
         found = detect_drones(detector(models, "v5"), "0", probe(sequence / "0.avi"))
         assert found.frame.tolist() == [0, 2, 3]
-        # Compression changes the colours, but not the best square.
+        # Compression changes the colours, but not which square has the highest score.
         np.testing.assert_allclose(found.xyxy, [square(128, 3 + frame, 6) for frame in (0, 2, 3)], atol=1e-4)
 
     def run(self, models, sequence, out, *arguments):
         options = ["--detector", models / "v8.onnx", "--out", out, "--size", "128", *arguments]
         return CliRunner().invoke(command, [str(sequence), *map(str, options)], catch_exceptions=False)
 
-    def test_command(self, models, sequence, tmp_path):
+    def test_the_command_writes_a_file_per_camera(self, models, sequence, tmp_path):
         result = self.run(models, sequence, tmp_path / "boxes")
         assert result.exit_code == 0
         assert "2 cameras, 4 frames, 0.38 boxes per frame and camera" in result.stdout
@@ -211,7 +211,7 @@ class TestVideos:
         assert not (tmp_path / "0.csv").exists()
         assert self.run(models, sequence, tmp_path, "--force").exit_code == 0
 
-    def test_json_of_some_cameras_and_frames(self, models, sequence, tmp_path):
+    def test_json_of_selected_cameras_and_frames(self, models, sequence, tmp_path):
         result = self.run(models, sequence, tmp_path / "b", "--cameras", "0", "--frames", "3", "--json", "-")
         assert json.loads(result.stdout) == {
             "out": str(tmp_path / "b"),
@@ -221,7 +221,8 @@ class TestVideos:
 
 
 @pytest.fixture(scope="module")
-def seen(tmp_path_factory):
+def flight_folder(tmp_path_factory):
+    """Folder with the videos of four cameras, which see a flying drone as a white square."""
     folder = tmp_path_factory.mktemp("tracked") / "Simulated_Data" / "S02_D1"
     folder.mkdir(parents=True)
     cameras = []
@@ -243,16 +244,24 @@ def seen(tmp_path_factory):
 
 
 class TestTracking:
-    """A sequence of a drone that four cameras see as a square."""
+    """`psotrack track` with a detector, on the videos of four cameras."""
 
-    def run(self, models, seen, out, *arguments):
-        words = [seen, "--out", out, "--cache", out.parent / "cache", "--detector", models / "v8.onnx"]
+    def run(self, models, flight_folder, out, *arguments):
+        words = [
+            flight_folder,
+            "--out",
+            out,
+            "--cache",
+            out.parent / "cache",
+            "--detector",
+            models / "v8.onnx",
+        ]
         words += ["--detector-size", "128", *arguments]
         return CliRunner().invoke(track, [*map(str, words)], catch_exceptions=False)
 
-    def test_in_one_command_and_its_detections_are_kept(self, models, seen, tmp_path, monkeypatch):
+    def test_detections_are_made_by_the_command_and_kept(self, models, flight_folder, tmp_path, monkeypatch):
         arguments = ("--method", "projection-lines", "--json", "-")
-        found = self.run(models, seen, tmp_path / "a.csv", *arguments)
+        found = self.run(models, flight_folder, tmp_path / "a.csv", *arguments)
         assert found.exit_code == 0
         tracks = read_trajectories(tmp_path / "a.csv")
         assert tracks.num_drones == 1
@@ -262,7 +271,7 @@ class TestTracking:
         assert off_m.max() < 0.08
         # The second run uses the stored detections.
         monkeypatch.setattr(OnnxDetector, "boxes", lambda *_: pytest.fail("looked again"))
-        again = self.run(models, seen, tmp_path / "b.csv", *arguments)
+        again = self.run(models, flight_folder, tmp_path / "b.csv", *arguments)
         assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
         keys = [json.loads(result.stdout)["input_keys"] for result in (found, again)]
         assert keys[0] == keys[1]
@@ -274,6 +283,6 @@ class TestTracking:
             (("--method", "fused", "--detections", "blobs"), r"detector: .* found detections blobs"),
         ],
     )
-    def test_detector_options_that_are_not_used(self, models, seen, tmp_path, arguments, message):
+    def test_detector_options_that_are_not_used(self, models, flight_folder, tmp_path, arguments, message):
         with pytest.raises(SettingsError, match=message):
-            self.run(models, seen, tmp_path / "a.csv", *arguments)
+            self.run(models, flight_folder, tmp_path / "a.csv", *arguments)

@@ -1,4 +1,4 @@
-"""A rig against its own data: faults that are planted one by one are named, and sound rigs are left in peace."""
+"""Checks of a rig against its detections: each single fault is named, and a correct rig gives no finding."""
 
 import json
 import re
@@ -20,7 +20,7 @@ from psotrack.geometry import Rig, project
 from psotrack.recordings import Detections
 from psotrack.trajectories import Trajectories
 
-#: Two minutes of small calls, each of which is checked.
+#: The tests take two minutes, because types are checked in many small calls.
 pytestmark = pytest.mark.slow
 
 FPS, FRAMES = 25.0, 30
@@ -28,7 +28,7 @@ SPAN_M = np.array([0.5, 0.2])
 
 
 def flights(num_drones, frames=FRAMES, seed=0):
-    """(frames + 1, drones, 3): closed curves through the room, each drone on its own level, at about 1.5 m/s."""
+    """(frames, drones, 3), curves through the room, each drone at its own height, with speeds of about 1.5 m/s."""
     rng = np.random.default_rng(seed)
     time_s = np.arange(frames)[:, None] / FPS
     phase = rng.uniform(0, 2 * np.pi, (3, num_drones))
@@ -39,7 +39,17 @@ def flights(num_drones, frames=FRAMES, seed=0):
 
 
 def seen_by(rig, truth_m, *, late=None, missed=0.05, false_alarms=0.1, jitter=0.02, seed=0):
-    """Boxes about the drones' middles as a detector finds them; a late camera sees them later (frames, by index)."""
+    """Simulate a detector's boxes around the drones.
+
+    Args:
+        rig: the true rig.
+        truth_m: (frames, drones, 3), true positions.
+        late: index of a camera -> delay of its clock, frames.
+        missed: share of drones that have no box.
+        false_alarms: share of frames that have a false box.
+        jitter: standard deviation of a box's middle, relative to its size.
+        seed: of the random numbers.
+    """
     rng = np.random.default_rng(seed)
     number = np.arange(len(truth_m))
     found = {}
@@ -66,7 +76,7 @@ def seen_by(rig, truth_m, *, late=None, missed=0.05, false_alarms=0.1, jitter=0.
     return found
 
 
-def reference_of(position_m):
+def make_reference(position_m):
     frame = np.arange(len(position_m))
     names = tuple(f"dron{drone + 1}" for drone in range(position_m.shape[1]))
     return Trajectories(frame, frame / FPS, names, position_m)
@@ -74,7 +84,7 @@ def reference_of(position_m):
 
 @pytest.fixture(autouse=True)
 def _checked_once(request):
-    """Types are checked in the test of the command, where all of it runs; in every test that takes minutes."""
+    """Check types only in the test of the command, which runs all of the code; checks in every test take minutes."""
     jaxtyping.config.update("jaxtyping_disable", request.function is not test_the_command)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
@@ -87,7 +97,7 @@ SEEN = seen_by(RIG, TRUTH_M)
 
 def examined(rig, seen=SEEN, reference_m=TRUTH_M):
     sightings = from_detections(seen, rig, FRAMES)
-    reference = None if reference_m is None else reference_of(reference_m)
+    reference = None if reference_m is None else make_reference(reference_m)
     return examine(rig, sightings, fps=FPS, reference=reference)
 
 
@@ -96,21 +106,22 @@ def only_finding(*args, **kwargs):
     return finding
 
 
-def posed(R, t_m, rig=RIG):
+def with_poses(R, t_m, rig=RIG):
     T = rig.cameras.T_cam_world.copy()
     T[:, :3, :3], T[:, :3, 3] = R, t_m
     return Rig(rig.names, replace(rig.cameras, T_cam_world=T))
 
 
-def with_one(index, turn=(0.0, 0.0, 0.0), shift_m=(0.0, 0.0, 0.0)):
-    """One camera turned about its own axes, in degrees, and moved."""
+def with_displaced_camera(index, turn=(0.0, 0.0, 0.0), shift_m=(0.0, 0.0, 0.0)):
+    """The rig with one camera that is turned about its own axes, degrees, and moved, metres."""
     R, centre = RIG.cameras.T_cam_world[:, :3, :3].copy(), RIG.cameras.centre_world.copy()
     R[index] = Rotation.from_rotvec(turn, degrees=True).as_matrix() @ R[index]
     centre[index] += shift_m
-    return posed(R, -np.matvec(R, centre))
+    return with_poses(R, -np.matvec(R, centre))
 
 
 def with_intrinsics(index, factor, rows=2):
+    """The rig with scaled intrinsics: with rows=2 the focal lengths, with rows=3 also the principal point."""
     K = RIG.cameras.K.copy()
     K[index, :2, :rows] *= factor
     return Rig(RIG.names, replace(RIG.cameras, K=K))
@@ -120,8 +131,8 @@ R, T_M = RIG.cameras.T_cam_world[:, :3, :3], RIG.cameras.T_cam_world[:, :3, 3]
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_nothing_is_wrong_with_sound_rigs(seed):
-    """Rigs of 4 to 6 cameras, 2 or 3 drones, with and without lenses, detectors good and bad."""
+def test_a_correct_rig_has_no_findings(seed):
+    """Rigs of 4 to 6 cameras, 2 or 3 drones, with and without distortion, with good and bad detectors."""
     rng = np.random.default_rng(seed)
     num_cameras, num_drones = 4 + seed % 3, 2 + seed % 2
     rig = ring_rig(num_cameras, coefficients=(0, 4, 5, 8)[seed % 4], image_size_wh=(1920, 1080))
@@ -130,44 +141,44 @@ def test_nothing_is_wrong_with_sound_rigs(seed):
     diagnosis = examined(rig, seen_by(rig, truth_m, seed=seed, **noise), truth_m)
     assert diagnosis.findings == ()
     assert diagnosis.reference.before_m < 0.05
-    # Errors of a quarter of a frame are complained of.
+    # An error of a quarter of a frame would be a finding.
     assert np.nanmax(np.abs(diagnosis.offset_frames)) < 0.25
 
 
 @pytest.mark.parametrize("degrees", [1.0, 8.0])
-def test_a_camera_that_is_turned(degrees):
-    finding = only_finding(with_one(2, turn=(0.0, degrees, 0.0)))
+def test_a_turned_camera(degrees):
+    finding = only_finding(with_displaced_camera(2, turn=(0.0, degrees, 0.0)))
     assert (finding.kind, finding.cameras) == ("turned", ("c2",))
     assert f"turned by {degrees:.1f} degrees" in finding.message
 
 
-def test_a_camera_that_was_moved():
+def test_a_moved_camera():
     seen = seen_by(RIG, TRUTH_M, missed=0.0, false_alarms=0.0, jitter=0.0)
-    finding = only_finding(with_one(4, shift_m=(0.3, 0.3, 0.0)), seen)
+    finding = only_finding(with_displaced_camera(4, shift_m=(0.3, 0.3, 0.0)), seen)
     assert (finding.kind, finding.cameras) == ("moved", ("c4",))
-    # Without noise, the drones put it where it was, but for what is paired with the wrong drone.
+    # Without noise, the shift is found exactly, except for errors from boxes that are matched with the wrong drone.
     (moved_cm,) = (float(word) for word in finding.message.split() if word.isdigit() and int(word) > 9)
     assert abs(moved_cm - 42.4) < 3.5
 
 
 @pytest.mark.parametrize("delay", [0.6, 3.0])
-def test_a_camera_that_is_late(delay):
+def test_a_late_camera(delay):
     diagnosis = examined(RIG, seen_by(RIG, TRUTH_M, late={1: delay}))
     (finding,) = diagnosis.findings
     assert (finding.kind, finding.cameras) == ("clock", ("c1",))
     assert "late" in finding.message
-    said = float(finding.message.split(" frames")[0].split()[-1])
-    assert abs(said - delay) < 0.3
+    reported = float(finding.message.split(" frames")[0].split()[-1])
+    assert abs(reported - delay) < 0.3
 
 
-def test_translation_that_is_the_centre():
-    finding = only_finding(posed(R, RIG.cameras.centre_world))
+def test_camera_centres_instead_of_translations():
+    finding = only_finding(with_poses(R, RIG.cameras.centre_world))
     assert (finding.kind, finding.cameras) == ("translation or centre", ())
     assert "rotation" not in finding.message
 
 
 def test_poses_from_camera_to_world():
-    finding = only_finding(posed(R.swapaxes(1, 2), RIG.cameras.centre_world))
+    finding = only_finding(with_poses(R.swapaxes(1, 2), RIG.cameras.centre_world))
     assert finding.kind == "translation or centre"
     assert "from camera to world" in finding.message
 
@@ -175,29 +186,29 @@ def test_poses_from_camera_to_world():
 @pytest.mark.parametrize(
     ("factor", "words"), [(1e3, "millimetres were read as metres"), (1e-3, "metres were read as millimetres")]
 )
-def test_a_unit_that_was_mistaken(factor, words):
-    finding = only_finding(posed(R, factor * T_M))
+def test_a_wrong_unit_of_length(factor, words):
+    finding = only_finding(with_poses(R, factor * T_M))
     assert finding.kind == "unit"
     assert words in finding.message
 
 
-def test_camera_axes_as_in_opengl():
+def test_camera_axes_of_opengl():
     flip = np.array([1.0, -1.0, -1.0])
-    finding = only_finding(posed(flip[:, None] * R, flip * T_M))
+    finding = only_finding(with_poses(flip[:, None] * R, flip * T_M))
     assert finding.kind == "mirrored axes"
     assert "y, z are mirrored as in OpenGL" in finding.message
 
 
 def test_a_left_handed_world():
-    """The third axis of world and cameras mirrored, which leaves rotations rotations."""
+    """The third axis of the world and of the cameras is mirrored, so rotations remain rotations."""
     flip = np.array([1.0, 1.0, -1.0])
-    finding = only_finding(posed(flip[:, None] * R * flip, flip * T_M))
+    finding = only_finding(with_poses(flip[:, None] * R * flip, flip * T_M))
     assert finding.kind == "mirrored axes"
     assert "left-handed" in finding.message
 
 
-def test_two_cameras_that_are_exchanged():
-    """Of four: no three agree then."""
+def test_two_exchanged_cameras():
+    """With two of four cameras exchanged, no three cameras agree."""
     rig = ring_rig(4, image_size_wh=(1920, 1080))
     seen = seen_by(rig, TRUTH_M)
     seen["c1"], seen["c3"] = seen["c3"], seen["c1"]
@@ -205,7 +216,7 @@ def test_two_cameras_that_are_exchanged():
     assert (finding.kind, finding.cameras) == ("exchanged", ("c1", "c3"))
 
 
-def test_a_focal_length_that_is_wrong():
+def test_a_wrong_focal_length():
     finding = only_finding(with_intrinsics(3, 1.06))
     assert (finding.kind, finding.cameras) == ("focal length", ("c3",))
     assert "6 % too long" in finding.message
@@ -219,7 +230,7 @@ def test_all_focal_lengths_wrong():
 
 @pytest.mark.parametrize("factor", [0.96, 1.04])
 def test_all_focal_lengths_a_little_wrong(factor):
-    """Too little for any single sighting, and for any single camera."""
+    """The error is too small to be visible in a single sighting or in a single camera."""
     finding = only_finding(with_intrinsics(slice(None), factor))
     assert (finding.kind, finding.cameras) == ("focal lengths", ())
     found = re.search(r"too (long|short): 4 % off, give or take (\S+) %", finding.message)
@@ -228,7 +239,7 @@ def test_all_focal_lengths_a_little_wrong(factor):
     assert 0 < float(found[2]) < 1.1
 
 
-def test_intrinsics_of_images_half_as_large():
+def test_intrinsics_for_half_the_image_size():
     finding = only_finding(with_intrinsics(slice(None), 0.5, rows=3))
     assert finding.kind == "image size"
     assert finding.cameras == RIG.names
@@ -245,27 +256,27 @@ def test_intrinsics_of_images_half_as_large():
         ("reference", "of this flight", flights(2, seed=9) * [0.2, 3.0, 1.0]),
     ],
 )
-def test_a_reference_at_odds_with_the_rig(kind, words, reference_m):
+def test_a_reference_that_contradicts_the_rig(kind, words, reference_m):
     finding = only_finding(RIG, reference_m=reference_m)
     assert finding.kind == kind
     assert words in str(finding)
 
 
-def test_detections_of_another_flight_fit_no_reading():
-    """Each camera sees a flight of its own: nothing is made up to explain it."""
+def test_detections_of_different_flights_have_no_explanation():
+    """Each camera sees another flight, so no fault of the rig may be reported."""
     seen = {name: seen_by(RIG, flights(2, seed=20 + index))[name] for index, name in enumerate(RIG.names)}
     assert only_finding(RIG, seen).kind == "no agreement"
 
 
 @pytest.mark.parametrize("num_boxes", [0, 1])
-def test_hardly_anything_seen(num_boxes):
+def test_too_few_detections(num_boxes):
     seen = {name: Detections(boxes.frame[:num_boxes], boxes.xyxy[:num_boxes], boxes.confidence[:num_boxes])
             for name, boxes in SEEN.items()}  # fmt: skip
     assert only_finding(RIG, seen).kind == "too little seen"
     assert only_finding(RIG, {}).kind == "too little seen"
 
 
-def test_frames_are_those_of_the_video():
+def test_sampled_frames_are_in_the_video():
     for num_frames in (0, 1, 10, 15, 40, 5000):
         frames = sampled_frames(num_frames)
         assert len(frames) == min(num_frames, 60) or 15 <= len(frames) <= 60
@@ -293,26 +304,26 @@ def test_the_command(tmp_path):
     K[:, 1, 1] = K[:, 0, 0]
     small = Rig(small.names, replace(small.cameras, K=K))
     seen = seen_by(small, TRUTH_M)
-    folder = write_sequence(tmp_path / "sound", small, seen, TRUTH_M)
+    folder = write_sequence(tmp_path / "correct", small, seen, TRUTH_M)
     result = CliRunner(env={"COLUMNS": "200"}).invoke(doctor, [str(folder)], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     assert "nothing disagrees" in result.output
 
-    centred = posed(small.cameras.T_cam_world[:, :3, :3], small.cameras.centre_world, small)
-    folder = write_sequence(tmp_path / "centred", centred, seen, TRUTH_M)
+    with_centres = with_poses(small.cameras.T_cam_world[:, :3, :3], small.cameras.centre_world, small)
+    folder = write_sequence(tmp_path / "with_centres", with_centres, seen, TRUTH_M)
     result = CliRunner(env={"COLUMNS": "200"}).invoke(doctor, [str(folder), "-q"], catch_exceptions=False)
     assert result.exit_code == 2
     assert result.output.count("\n") == 1
     assert "write t = -R C" in result.output
     result = CliRunner().invoke(doctor, [str(folder), "--json", "-"], catch_exceptions=False)
     assert result.exit_code == 2
-    answer = json.loads(result.output)
-    assert [finding["kind"] for finding in answer["findings"]] == ["translation or centre"]
-    assert [row["camera"] for row in answer["cameras"]] == list(small.names)
+    content = json.loads(result.output)
+    assert [finding["kind"] for finding in content["findings"]] == ["translation or centre"]
+    assert [row["camera"] for row in content["cameras"]] == list(small.names)
 
 
-def test_no_more_than_everything_is_explained():
-    """Boxes of two drones that are one in an image count for both."""
+def test_the_share_of_explained_sightings_is_at_most_one():
+    """A merged box of two drones is used by both drones, but counts as one sighting."""
     merged = Agreement(
         frame=np.zeros(2, int),
         position_m=np.zeros((2, 3)),
@@ -327,8 +338,8 @@ def test_no_more_than_everything_is_explained():
     assert merged.share == 6 / 7
 
 
-def test_a_sound_rig_that_is_hardly_used_is_not_blamed():
-    """Two drones over a few frames: all agree, but it is too little to judge by."""
+def test_a_correct_rig_with_few_frames_gets_no_finding_about_the_rig():
+    """Ten frames of two drones agree with the rig, but are too few to judge it."""
     truth_m = flights(2)[:10]
     seen = from_detections(seen_by(RIG, truth_m), RIG, len(truth_m))
     (finding,) = examine(RIG, seen, fps=FPS).findings

@@ -1,4 +1,4 @@
-"""The least-squares core against SciPy and dense linear algebra, and the backward pass against one joint Gaussian."""
+"""Estimation: least squares are compared with SciPy and dense algebra, the backward pass with one joint Gaussian."""
 
 from dataclasses import dataclass, replace
 
@@ -23,7 +23,7 @@ TIME_S = np.linspace(0.0, 3.0, 25)
 
 
 def curve(params):
-    """(..., times), amplitude times exp(-rate t) plus offset, and its derivatives (..., times, 3)."""
+    """(..., times), the values amplitude · exp(-rate t) + offset, and their derivatives, (..., times, 3)."""
     amplitude, rate, offset = (params[..., k, None] for k in range(3))
     decay = np.exp(-rate * TIME_S)
     slopes = np.stack([decay, -amplitude * TIME_S * decay, np.ones_like(decay)], axis=-1)
@@ -32,7 +32,13 @@ def curve(params):
 
 @dataclass(frozen=True)
 class Curves:
-    """A batch of curves, or one curve, that are fitted to values."""
+    """Problem of fitting one curve, or each curve of a batch, to values.
+
+    Attributes:
+        params: (..., 3), amplitude, rate and offset.
+        values: (..., times), the values to fit.
+        robust: whether the loss is Cauchy's instead of squares.
+    """
 
     params: np.ndarray
     values: np.ndarray
@@ -58,6 +64,7 @@ class Curves:
 
 
 def measured_curves(seed, count=None):
+    """True params, and values with noise, of one curve or of `count` curves."""
     rng = np.random.default_rng(seed)
     shape = () if count is None else (count,)
     params = np.stack(
@@ -67,7 +74,7 @@ def measured_curves(seed, count=None):
 
 
 @pytest.mark.parametrize("robust", [False, True])
-def test_a_fit_is_scipys(robust):
+def test_a_fit_equals_scipys(robust):
     _, values = measured_curves(1)
     if robust:
         values[[3, 11]] += [20.0, -30.0]
@@ -82,14 +89,14 @@ def test_a_fit_is_scipys(robust):
         ftol=1e-15,
         gtol=1e-12,
     )
-    # Reweighted steps converge linearly, so the last digits of the parameters are open.
+    # Reweighted steps converge linearly, so the last digits of the parameters differ.
     np.testing.assert_allclose(found.params, expected.x, atol=1e-5 if robust else 1e-8)
     assert found.cost == pytest.approx(2 * expected.cost, rel=1e-9)
 
 
 def test_problems_of_a_batch_do_not_affect_each_other():
     _, values = measured_curves(2, count=8)
-    # The start of one problem is far away, so that it needs more steps and damping than the others.
+    # One problem starts far from its solution, so that it needs more steps and damping than the other problems.
     params = np.tile([1.0, 0.1, 0.0], (8, 1))
     params[3] = [-40.0, 6.0, 20.0]
     damping = Damping(first=1e-3, increase=100.0, decrease=0.01, largest=1e12)
@@ -111,14 +118,14 @@ def test_no_step_raises_a_cost():
         state = after
 
 
-def test_a_problem_that_is_solved_stays_as_it_is():
+def test_a_solved_problem_is_not_changed():
     params, _ = measured_curves(4)
     start = Curves(params, curve(params)[0])
     assert levenberg_marquardt(start, max_steps=50, least_length=1e-6) is start
 
 
 def coupled_equations(seed, blocks=5, m=3, n=4):
-    """Normal equations with blocks, and the same equations as one dense matrix."""
+    """Normal equations with blocks, and the same equations as a dense matrix and its right side."""
     rng = np.random.default_rng(seed)
     jacobian = np.zeros((blocks, 10, blocks * m + n))
     for k in range(blocks):
@@ -139,14 +146,14 @@ def coupled_equations(seed, blocks=5, m=3, n=4):
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.3])
-def test_elimination_of_blocks_is_the_dense_solution(damping):
+def test_elimination_of_blocks_gives_the_dense_solution(damping):
     equations, A, b = coupled_equations(5)
     step = equations.damped(damping).solved()
     expected = np.linalg.solve(A + damping * np.diag(np.diag(A)), b)
     np.testing.assert_allclose(np.concatenate([step.blocks.ravel(), step.shared]), expected, atol=1e-10)
 
 
-def test_the_covariance_of_the_shared_unknowns_is_that_of_the_dense_inverse():
+def test_the_covariance_of_shared_unknowns_equals_the_dense_inverse():
     equations, A, _ = coupled_equations(6)
     found = covariance_from_information(equations.reduced().information)
     np.testing.assert_allclose(found, np.linalg.inv(A)[15:, 15:], rtol=1e-9, atol=1e-12)
@@ -171,7 +178,7 @@ def test_equations_without_blocks_cannot_be_reduced():
 
 @dataclass(frozen=True)
 class Scale:
-    """A mean whose noise is estimated with it: values that are farther off than three deviations do not count."""
+    """Problem of estimating a mean and its noise; values more than three standard deviations off are not used."""
 
     values: np.ndarray
     mean: float
@@ -188,7 +195,7 @@ class Scale:
         return abs(self.mean - before.mean) < 1e-12
 
 
-def test_steps_with_changing_weights_end_where_they_settle():
+def test_steps_with_changing_weights_converge():
     rng = np.random.default_rng(7)
     values = np.concatenate([rng.normal(5.0, 0.2, 200), [50.0, 60.0]])
     found = gauss_newton(Scale(values, 0.0, 100.0), max_steps=50)
@@ -208,9 +215,9 @@ def test_a_step_has_the_shape_of_its_equations():
 
 @pytest.mark.parametrize("xp", [np, jnp])
 def test_the_backward_step_conditions_on_the_next_frame(xp):
-    """Two frames: the smoothed first frame is the Gaussian given a measurement of the second frame.
+    """The smoothed first of two frames is the Gaussian conditioned on a measurement of the second frame.
 
-    A component without variance, and without a transition into others, stays as it is.
+    A component without variance, and without a transition into other components, is not changed.
     """
     rng = np.random.default_rng(9)
     n = 4

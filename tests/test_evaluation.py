@@ -1,4 +1,4 @@
-"""Metrics: compared with results by hand on flights of five frames, with brute force, and by invariants."""
+"""Metrics of an evaluation: compared with results by hand for five frames and with brute force, and invariants."""
 
 import itertools
 import json
@@ -17,7 +17,7 @@ from psotrack.trajectories import GATE_M, UNASSIGNED, Status
 from psotrack.trajectories.association import align, fixed_identity, identity_switches, partners_per_frame
 
 
-def numbers(evaluation, *names):
+def select_metrics(evaluation, *names):
     return {name: getattr(evaluation, name) for name in names}
 
 
@@ -25,7 +25,9 @@ class TestFiveFrames:
     def test_no_confusion(self):
         evaluation = evaluate(on_x_axis([0.1] * 5, [10, 10, 10.2, 10.2, 10.4]), TRUTH)
         errors_m = [0.1] * 5 + [0, 0, 0.2, 0.2, 0.4]
-        assert numbers(evaluation, "frames", "drones", "missed_rate", "id_switches", "mota", "idf1") == {
+        assert select_metrics(
+            evaluation, "frames", "drones", "missed_rate", "id_switches", "mota", "idf1"
+        ) == {
             "frames": 5,
             "drones": 2,
             "missed_rate": 0.0,
@@ -41,11 +43,11 @@ class TestFiveFrames:
         # Five deviations of 0.03, two of 0.13, two of 0.07, one of 0.27.
         variance_m2 = (5 * 0.03**2 + 2 * 0.13**2 + 2 * 0.07**2 + 0.27**2) / 10
         assert evaluation.std_error_m == pytest.approx(variance_m2**0.5, abs=ROUNDING)
-        # Of ten sorted errors, the 95th percentile lies at place 8.55: between 0.2 and 0.4.
+        # The 95th percentile of ten sorted errors is at rank 8.55, counted from 0: between 0.2 and 0.4.
         assert evaluation.p95_error_m == pytest.approx(0.2 + 0.55 * 0.2, abs=ROUNDING)
         assert evaluation.max_error_m == pytest.approx(max(errors_m), abs=ROUNDING)
 
-    def test_a_swap_costs(self):
+    def test_a_swap(self):
         evaluation = evaluate(on_x_axis([0, 0, 0, 10, 10], [10, 10, 10, 0, 0]), TRUTH)
         assert evaluation.mean_error_m == pytest.approx(4 * 10 / 10, abs=ROUNDING)
         assert evaluation.matched_mean_error_m == 0.0
@@ -55,7 +57,7 @@ class TestFiveFrames:
         assert evaluation.idf1 == pytest.approx(2 * 6 / (10 + 10), abs=ROUNDING)
         assert evaluation.missed_rate == 0.0
 
-    def test_missed_drone(self):
+    def test_a_missed_drone(self):
         evaluation = evaluate(on_x_axis([10.2] * 5), TRUTH)
         assert evaluation.mean_error_m == pytest.approx(1 / 5, abs=ROUNDING)
         assert evaluation.missed_rate == 5 / 10
@@ -70,14 +72,14 @@ class TestFiveFrames:
         )
         assert (found.estimate, found.missed_rate) == ("d0", 0)
 
-    def test_false_track(self):
+    def test_a_false_track(self):
         evaluation = evaluate(on_x_axis([50] * 5, [10] * 5, [0] * 5), TRUTH)
         assert evaluation.mean_error_m == 0.0
         assert evaluation.missed_rate == 0.0
         assert evaluation.mota == 1 - 5 / 10
         assert evaluation.idf1 == pytest.approx(2 * 10 / (10 + 15), abs=ROUNDING)
 
-    def test_lost_rows_are_missed_and_coasting_ones_are_not(self):
+    def test_lost_rows_are_missed_and_coasting_rows_are_not(self):
         status = np.full((5, 2), Status.TRACKED)
         status[2:4, 1], status[4, 1] = Status.LOST, Status.COASTING
         evaluation = evaluate(on_x_axis([0] * 5, [10, 10, 99, 99, 10.2], status=status), TRUTH)
@@ -86,31 +88,31 @@ class TestFiveFrames:
         assert evaluation.mota == pytest.approx(1 - 2 / 10, abs=ROUNDING)
         assert evaluation.idf1 == pytest.approx(2 * 8 / (10 + 8), abs=ROUNDING)
 
-    def test_frames_that_the_estimate_does_not_have_are_missed(self):
+    def test_frames_without_an_estimate_are_missed(self):
         evaluation = evaluate(on_x_axis([0, 0], [10, 10], frame=[1, 3]), TRUTH)
         assert evaluation.frames == 5
         assert evaluation.missed_rate == pytest.approx(6 / 10, abs=ROUNDING)
 
-    def test_frames_outside_the_reference_do_not_count(self):
+    def test_frames_outside_the_reference_are_ignored(self):
         outside = on_x_axis([0] * 7, [10] * 5 + [99] * 2)
         assert evaluate(outside, TRUTH) == evaluate(on_x_axis([0] * 5, [10] * 5), TRUTH)
 
-    def test_unknown_truth_of_one_drone_does_not_count(self):
+    def test_unknown_positions_of_the_reference_are_ignored(self):
         evaluation = evaluate(on_x_axis([0] * 5, [10.2] * 5), on_x_axis([0] * 5, [10, 10, None, None, 10]))
         assert evaluation.frames == 5
         assert evaluation.per_drone[1].frames == 3
         assert evaluation.mean_error_m == pytest.approx(3 * 0.2 / 8, abs=ROUNDING)
-        # The track of the drone without known position is no false positive.
+        # The track of a drone whose position is unknown is no false positive.
         assert (evaluation.missed_rate, evaluation.mota, evaluation.idf1) == (0, 1, 1)
 
-    def test_a_track_that_leaves_its_unknown_drone_for_another_is_judged(self):
+    def test_a_track_that_moves_from_its_unknown_drone_to_another_is_a_false_positive(self):
         evaluation = evaluate(
             on_x_axis([0] * 5, [10, 10, 0.3, 0.3, 10]), on_x_axis([0] * 5, [10, 10, None, None, 10])
         )
         assert evaluation.mota == pytest.approx(1 - 2 / 8, abs=ROUNDING)
         assert evaluation.idf1 == pytest.approx(2 * 8 / (8 + 10), abs=ROUNDING)
 
-    def test_frames_and_drones_without_any_truth_do_not_count(self):
+    def test_frames_and_drones_without_known_positions_are_ignored(self):
         truth = on_x_axis([0, 0, None, 0, 0], [None] * 5)
         evaluation = evaluate(on_x_axis([0.1, 0.1, 9, 0.1, 0.1]), truth)
         assert (evaluation.frames, evaluation.drones, len(evaluation.per_drone)) == (4, 1, 1)
@@ -123,7 +125,7 @@ class TestFiveFrames:
         assert evaluation.mota == pytest.approx(1 - 2 / 10, abs=ROUNDING)
         assert evaluation.idf1 == pytest.approx(2 * 9 / (10 + 10), abs=ROUNDING)
 
-    def test_motp_keeps_pairs_of_the_previous_frame_and_matching_anew_does_not(self):
+    def test_motp_keeps_pairs_of_the_previous_frame_and_the_matched_error_does_not(self):
         truth = on_x_axis([0] * 5, [0.4] * 5)
         evaluation = evaluate(on_x_axis([0, 0, 0.3, 0, 0], [0.4, 0.4, 0.1, 0.4, 0.4]), truth)
         assert evaluation.id_switches == 0
@@ -138,7 +140,7 @@ class TestFiveFrames:
         assert evaluation.mota == pytest.approx(1 - (1 + 1) / 5, abs=ROUNDING)
         assert evaluation.idf1 == pytest.approx(2 * 2 / (5 + 4), abs=ROUNDING)
 
-    def test_drones_that_appear_after_the_first_second_are_assigned_to_what_is_left(self):
+    def test_drones_that_appear_after_the_first_second_get_the_remaining_tracks(self):
         truth = on_x_axis([0] * 5, [None, None, 10, 10, 10])
         evaluation = evaluate(on_x_axis([None, None, None, 10.1, 10.1], [0.1] * 5), truth)
         assert [drone.estimate for drone in evaluation.per_drone] == ["d1", "d0"]
@@ -149,7 +151,7 @@ class TestFiveFrames:
         evaluation = evaluate(on_x_axis([0, 0, 10, 10, 10], [10, 10, 0, 0, 0]), TRUTH)
         assert [drone.estimate for drone in evaluation.per_drone] == ["d0", "d1"]
 
-    def test_offset_in_the_world_without_orientation(self):
+    def test_without_orientations_offsets_are_in_the_world_frame(self):
         evaluation = evaluate(on_x_axis([0.1, 0.1, 0.1, 0.2, 0.5], [9] * 5), TRUTH)
         first, second = evaluation.per_drone
         assert (first.offset_frame, second.offset_frame) == ("world", "world")
@@ -158,7 +160,7 @@ class TestFiveFrames:
         assert first.offset_removed_mean_error_m == pytest.approx((3 * 0.1 + 0 + 0.3) / 5, abs=ROUNDING)
         assert evaluation.offset_removed_mean_error_m == pytest.approx(0.6 / 10, abs=ROUNDING)
 
-    def test_nothing_found(self):
+    def test_an_estimate_without_positions(self):
         evaluation = evaluate(on_x_axis([None] * 5), TRUTH)
         assert evaluation.missed_rate == 1.0
         assert evaluation.mota == 0.0
@@ -166,9 +168,9 @@ class TestFiveFrames:
         assert evaluation.mean_error_m is None
         assert evaluation.motp_m is None
 
-    def test_no_estimated_drones_at_all(self):
-        nobody = replace(on_x_axis([0] * 5), drones=(), position_m=np.empty((5, 0, 3)))
-        assert evaluate(nobody, TRUTH).missed_rate == 1.0
+    def test_an_estimate_without_drones(self):
+        empty = replace(on_x_axis([0] * 5), drones=(), position_m=np.empty((5, 0, 3)))
+        assert evaluate(empty, TRUTH).missed_rate == 1.0
 
 
 KEYS = [
@@ -198,7 +200,7 @@ class TestContract:
     def test_keys_in_order(self):
         assert list(evaluate(TRUTH, TRUTH).to_dict()) == KEYS
 
-    def test_strict_json_even_where_nothing_is_known(self):
+    def test_json_is_strict_if_values_are_undefined(self):
         text = json.dumps(evaluate(on_x_axis([0] * 5), TRUTH).to_dict(), allow_nan=False)
         seen, missed = json.loads(text)["per_drone"]
         assert (seen["drone"], seen["offset_m"]) == ("d0", [0, 0, 0])
@@ -217,8 +219,8 @@ class TestContract:
             evaluate(TRUTH, on_x_axis([None] * 5))
 
 
-def same(first, second, tolerance: float) -> None:
-    """Assert equal evaluations, except for rounding, names of the estimates and the order of the drones."""
+def assert_same(first, second, tolerance: float) -> None:
+    """Assert that two evaluations are equal, up to rounding, names of the estimates and the order of the drones."""
     one, two = first.to_dict(), second.to_dict()
     for evaluation in (one, two):
         evaluation["per_drone"].sort(key=lambda drone: drone["drone"])
@@ -237,7 +239,7 @@ def same(first, second, tolerance: float) -> None:
 
 
 def with_covariances(est, ref):
-    """Random flights, with random orientations and covariances of the estimate."""
+    """Estimate and reference, with random orientations and covariances added to the estimate."""
     rng = np.random.default_rng(est.num_frames)
     root = rng.normal(0, 0.1, (est.num_frames, est.num_drones, 3, 3))
     orientation_wxyz = Rotation.random(est.num_frames * est.num_drones, rng=rng).as_quat(scalar_first=True)
@@ -254,11 +256,11 @@ class TestProperties:
     def test_names_and_order_of_the_estimates_do_not_matter(self, seed, order):
         est, ref = random_flights(seed)
         shuffled = replace(est, drones=tuple("wxyz"), position_m=est.position_m[:, list(order)])
-        same(evaluate(est, ref), evaluate(shuffled, ref), ROUNDING)
+        assert_same(evaluate(est, ref), evaluate(shuffled, ref), ROUNDING)
 
     @given(seeds, st.permutations(range(3)))
     @settings(max_examples=30, deadline=None)
-    def test_the_order_of_the_true_drones_does_not_matter(self, seed, order):
+    def test_the_order_of_the_references_drones_does_not_matter(self, seed, order):
         est, ref = random_flights(seed)
         shuffled = replace(
             ref,
@@ -266,7 +268,7 @@ class TestProperties:
             position_m=ref.position_m[:, list(order)],
             orientation_wxyz=ref.orientation_wxyz[:, list(order)],
         )
-        same(evaluate(est, ref), evaluate(est, shuffled), ROUNDING)
+        assert_same(evaluate(est, ref), evaluate(est, shuffled), ROUNDING)
 
     @given(seeds)
     @settings(max_examples=30, deadline=None)
@@ -288,20 +290,21 @@ class TestProperties:
         R = turn.as_matrix()
         moved[0] = replace(moved[0], covariance_m2=R @ est.covariance_m2 @ R.T)
         first, second = evaluate(est, ref), evaluate(*moved)
-        # An offset is a vector, of the body here, and turns with nothing; those in the world turn with it.
+        # Offsets in the body frame do not turn with the world. All drones here have orientations, so all offsets are
+        # in the body frame.
         for drone, other in zip(first.per_drone, second.per_drone, strict=True):
             if drone.offset_m is not None:
                 assert drone.offset_frame == other.offset_frame == "body"
-        # Positions of 10 m keep 2e-15 m of a float64, divided by a standard deviation of 0.1 m, squared, and
-        # turns keep 1e-16 rad but for the arc cosine near 180 degrees: 1e-8. No distance of a random draw lies
-        # so near to the gate.
-        same(first, second, 1e-9)
+        # In float64, positions of 10 m are exact to 2e-15 m; NEES divides by the squared standard deviation of 0.1 m.
+        # Angles are exact to 1e-16 rad, and near 180 degrees, because of the arc cosine, to 1e-8. No distance of these
+        # random flights is that close to the gate.
+        assert_same(first, second, 1e-9)
 
     @given(seeds)
     @settings(max_examples=30, deadline=None)
     def test_a_constant_offset_in_the_body_is_found_and_removed(self, seed):
         _, ref = random_flights(seed)
-        # Apart by more than the offsets are long, so that identities are clear.
+        # Drones are farther apart than the offsets are long, so that identities are clear.
         ref = replace(ref, position_m=ref.position_m + np.arange(3)[:, None] * [5.0, 0.0, 0.0])
         offset_m = np.random.default_rng(seed).uniform(-0.2, 0.2, (3, 3))
         body_to_world = Rotation.from_quat(ref.orientation_wxyz.reshape(-1, 4), scalar_first=True)
@@ -314,7 +317,7 @@ class TestProperties:
 
     @given(seeds)
     @settings(max_examples=30, deadline=None)
-    def test_a_track_judged_by_itself_is_perfect(self, seed):
+    def test_a_reference_evaluated_against_itself_is_perfect(self, seed):
         _, ref = random_flights(seed)
         evaluation = evaluate(ref, ref)
         assert (evaluation.max_error_m, evaluation.missed_rate, evaluation.id_switches) == (0, 0, 0)
@@ -327,18 +330,18 @@ class TestProperties:
 
 class TestAgainstBruteForce:
     @pytest.mark.parametrize("seed", range(5))
-    def test_matching_of_a_frame(self, seed):
+    def test_matching_within_a_frame(self, seed):
         est, ref = random_flights(seed)
         distance_m = align(est, ref).distance_m
         for here_m, partner in zip(distance_m, partners_per_frame(distance_m, keep=False), strict=True):
 
-            def worth(pairing, here_m=here_m):
-                """Value of an assignment: first the number of possible pairs, then the smallest sum of distances."""
+            def value(pairing, here_m=here_m):
+                """Sort key of an assignment: first the number of pairs, then minus the sum of distances."""
                 lengths_m = [here_m[d, e] for d, e in enumerate(pairing) if e != UNASSIGNED]
                 possible = all(length_m <= GATE_M for length_m in lengths_m)
                 return (len(lengths_m), -sum(lengths_m)) if possible else (-1, 0.0)
 
-            assert worth(tuple(partner)) == pytest.approx(max(map(worth, pairings(3, 4))), abs=ROUNDING)
+            assert value(tuple(partner)) == pytest.approx(max(map(value, pairings(3, 4))), abs=ROUNDING)
 
     @pytest.mark.parametrize("seed", range(5))
     def test_identity_of_the_first_second(self, seed):
@@ -359,6 +362,6 @@ class TestAgainstBruteForce:
         most = max(near[:, range(3), order].sum() for order in itertools.permutations(range(4), 3))
         assert evaluate(est, ref).idf1 == pytest.approx(2 * most / (7 * 3 + 7 * 4), abs=ROUNDING)
 
-    def test_switches(self):
+    def test_identity_switches(self):
         partners = np.array([[0, 1], [0, -1], [1, 1], [-1, 0], [1, 0]])
         assert identity_switches(partners).astype(int).tolist() == [[0, 0], [0, 0], [1, 0], [0, 1], [0, 0]]

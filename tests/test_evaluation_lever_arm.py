@@ -1,4 +1,4 @@
-"""The lever arm of each drone, its standard error, and both in the JSON and in the table."""
+"""The offset of each drone's tracked point and its standard error: values, JSON and table."""
 
 import io
 import json
@@ -18,7 +18,7 @@ ARM_M = np.array([0.03, -0.02, -0.117])
 
 
 def autoregressive(rng, count: int, persistence: float):
-    """Of unit variance, and its first value of that too."""
+    """(count,), stationary autoregressive series of variance 1."""
     values = rng.normal(size=count)
     for i in range(1, count):
         values[i] = persistence * values[i - 1] + np.sqrt(1 - persistence**2) * values[i]
@@ -26,7 +26,7 @@ def autoregressive(rng, count: int, persistence: float):
 
 
 def turning_flight(num_frames: int = 400, noise_m: float = 0.0):
-    """A drone that flies and turns; the tracked point is at the end of the lever arm."""
+    """Estimate and reference of a drone that flies and turns; the tracked point is at the end of the lever arm."""
     rng = np.random.default_rng(0)
     time_s = np.arange(num_frames) / 25
     ref_m = np.stack([np.cos(time_s), np.sin(0.7 * time_s), 1 + 0.2 * np.sin(2 * time_s)], axis=-1)[:, None]
@@ -42,20 +42,20 @@ def turning_flight(num_frames: int = 400, noise_m: float = 0.0):
 
 class TestStandardError:
     @pytest.mark.parametrize(("persistence", "skip"), [(0.0, 1), (0.5, 1), (0.9, 1), (0.0, 4), (0.9, 4)])
-    def test_it_is_the_spread_of_means(self, persistence, skip):
-        """The oracle is the spread itself, over 300 series of 1000 frames; where frames are every fourth too."""
+    def test_it_equals_the_spread_of_means(self, persistence, skip):
+        """The oracle is the spread of the means of 300 series of 1000 frames; with `skip`, frame numbers have gaps."""
         rng = np.random.default_rng(1)
         series = np.stack([autoregressive(rng, 1000, persistence) for _ in range(300)], axis=1)
         error = standard_error(series, skip * np.arange(1000))
         spread = series.mean(axis=0).std()
-        # The spread of 300 is known to 4 %; measured 0.995 to 1.023 of it.
+        # The spread of 300 means has an error of 4 %; measured ratios are 0.995 to 1.023.
         assert np.sqrt((error**2).mean()) == pytest.approx(spread, rel=0.15)
 
     def test_two_values(self):
         # s² = (0.1² + 0.1²) / (2 - 1), divided by 2: 0.1².
         assert standard_error(np.array([[0.1], [0.3]]), np.arange(2)) == pytest.approx(0.1)
 
-    def test_rows_that_are_not_there_do_not_count(self):
+    def test_rows_with_nan_are_ignored(self):
         values = np.random.default_rng(2).normal(size=(50, 3))
         with_gaps = np.insert(values, [20, 50], np.nan, axis=0)
         np.testing.assert_allclose(
@@ -66,53 +66,54 @@ class TestStandardError:
         assert np.isnan(standard_error(values[:1], np.arange(1))).all()
         assert np.isnan(standard_error(np.full((5, 2), np.nan), np.arange(5))).all()
 
-    def test_never_less_than_that_of_independent_frames(self):
+    def test_it_is_not_below_the_standard_error_of_independent_frames(self):
         flipping = np.tile([[1.0], [-1.0]], (50, 1))
         assert standard_error(flipping, np.arange(100))[0] == pytest.approx(1 / np.sqrt(99))
 
 
 class TestLeverArm:
-    def test_in_the_body_it_is_exact_where_nothing_else_is_off(self):
+    def test_in_the_body_frame_it_is_exact_without_noise(self):
         evaluation = evaluate(*turning_flight())
         (drone,) = evaluation.per_drone
         assert drone.offset_frame == "body"
         np.testing.assert_allclose(drone.offset_m, ARM_M, atol=ROUNDING)
         np.testing.assert_allclose(drone.offset_standard_error_m, 0, atol=ROUNDING)
-        # Before, and after.
+        # Errors with the offset, and with the offset removed.
         assert evaluation.mean_error_m == pytest.approx(np.linalg.norm(ARM_M))
         assert evaluation.offset_removed_mean_error_m == pytest.approx(0, abs=ROUNDING)
 
-    def test_in_the_world_an_arm_that_turns_is_known_less_well(self):
+    def test_in_the_world_frame_the_offset_of_a_turning_drone_is_less_certain(self):
         est, ref = turning_flight(noise_m=0.02)
         (body,) = evaluate(est, ref).per_drone
         (world,) = evaluate(est, replace(ref, orientation_wxyz=None)).per_drone
         assert world.offset_frame == "world"
-        # 20 mm / √400 = 1 mm, each part by its own spread: √(1/800) = 4 % off, and some correlation by chance.
+        # The standard error is 20 mm / √400 = 1 mm. Each component is estimated from its own spread, with an error of
+        # √(1/800) = 4 %, and frames are correlated by chance.
         np.testing.assert_allclose(body.offset_standard_error_m, 1e-3, rtol=0.3)
         assert np.abs(np.subtract(body.offset_m, ARM_M)).max() < 4e-3
-        # Of the horizontal parts a turning arm of 36 mm leaves nothing but a mean that comes to 0 over five turns.
+        # The horizontal components, 36 mm, turn with the drone, so that their mean over five turns is nearly 0.
         assert world.offset_standard_error_m[0] > 2 * body.offset_standard_error_m[0]
         assert world.offset_m[2] == pytest.approx(ARM_M[2], abs=5e-3)
 
-    def test_seen_once(self):
+    def test_one_frame_has_no_standard_error(self):
         (drone,) = evaluate(on_x_axis([None, 2, None]), on_x_axis([0, 0, 0])).per_drone
         assert drone.offset_m == (2, 0, 0)
         assert drone.offset_standard_error_m is None
 
-    def test_json(self):
+    def test_json_has_the_standard_error_beside_the_offset(self):
         (drone,) = evaluate(*turning_flight(noise_m=0.02)).to_dict()["per_drone"]
         keys = list(drone)
         place = keys.index("offset_m")
         assert keys[place : place + 3] == ["offset_m", "offset_standard_error_m", "offset_frame"]
         assert len(json.loads(json.dumps(drone, allow_nan=False))["offset_standard_error_m"]) == 3
 
-    def test_data_frame(self):
+    def test_data_frame_has_a_column_per_component(self):
         evaluation = evaluate(*turning_flight(noise_m=0.02))
         frame = tables.to_frame(evaluation)
         assert frame["offset_standard_error_z_m"][0] == evaluation.per_drone[0].offset_standard_error_m[2]
         assert "offset_standard_error_m" not in frame
 
-    def test_table(self):
+    def test_the_table_shows_the_largest_standard_error(self):
         def printed(evaluation):
             console = Console(file=io.StringIO(), width=80)
             console.print(tables.render(evaluation))

@@ -1,8 +1,8 @@
-"""Comparison with the packages trackeval and motmetrics on random flights.
+"""Metrics compared with the packages trackeval and motmetrics on random flights.
 
-trackeval 1.3.0 is the code of HOTA's authors; motmetrics 1.4.0 implements CLEAR and IDF1 on its own. trackeval asks for
-opencv-python, which takes the place of the headless one; it is no part of the `test` extra for that, and these
-tests of it are skipped where it is not installed.
+trackeval 1.3.0 is the code of HOTA's authors; motmetrics 1.4.0 is an independent implementation of CLEAR and IDF1.
+trackeval depends on opencv-python, which would replace opencv-python-headless. Therefore trackeval is not in the `test`
+extra, and its tests are skipped if it is not installed.
 """
 
 from dataclasses import replace
@@ -18,14 +18,14 @@ from psotrack.trajectories import GATE_M, Trajectories
 
 
 def crowded(seed: int) -> tuple[Trajectories, Trajectories]:
-    """Within a metre, so that many pairs are possible; estimates come and go, all true drones are always known."""
+    """Flights within a metre, so that many pairs are possible; some estimates are missing, but no reference."""
     est, _ = random_flights(seed, num_frames=12)
     _, ref = random_flights(seed, num_frames=12, missing=0)
     return est, ref
 
 
 def apart(seed: int) -> tuple[Trajectories, Trajectories]:
-    """Drones 3 m apart, unknown and missed now and then, and tracks that change hands, drift off or are false."""
+    """Flights 3 m apart, with missing positions, identity switches, distances beyond the gate and a false track."""
     rng = np.random.default_rng(seed)
     num_frames, num_drones = 20, 4
     ref_m = np.zeros((num_frames, num_drones, 3)) + np.arange(num_drones)[:, None] * [3.0, 0.0, 0.0]
@@ -50,14 +50,14 @@ def apart(seed: int) -> tuple[Trajectories, Trajectories]:
 
 
 def frames(est: Trajectories, ref: Trajectories):
-    """Per frame: numbers of the known drones, of the estimates that are there, and the distances between them."""
+    """Iterate over frames: numbers of the known drones, numbers of the present estimates, and their distances."""
     for ref_m, est_m, known, seen in zip(ref.position_m, est.position_m, ref.seen, est.seen, strict=True):
         drones, estimates = np.flatnonzero(known), np.flatnonzero(seen)
         yield drones, estimates, np.linalg.norm(ref_m[drones, None] - est_m[None, estimates], axis=-1)
 
 
 def for_trackeval(est: Trajectories, ref: Trajectories, zero_at_m: float):
-    """What its metrics take, with the similarity 1 - distance / `zero_at_m`."""
+    """Input of trackeval's metrics, with the similarity 1 - distance / `zero_at_m`."""
     drones, estimates, distances_m = zip(*frames(est, ref), strict=True)
     return {
         "num_gt_ids": ref.num_drones,
@@ -88,8 +88,8 @@ class TestTrackeval:
     def test_clear_and_identity(self, flights, seed):
         metrics = pytest.importorskip("trackeval").metrics
         est, ref = flights(seed)
-        # It takes the pairs with the most similarity, we the most pairs and then the nearest: the same where one more
-        # pair is always worth more than all distances together.
+        # trackeval maximises the total similarity; psotrack maximises the number of pairs and then minimises the
+        # distances. Both are the same if one more pair always counts more than all distances together.
         zero_at_m = 100.0
         config = {"PRINT_CONFIG": False, "THRESHOLD": 1 - GATE_M / zero_at_m}
         data = for_trackeval(est, ref, zero_at_m)
@@ -97,13 +97,14 @@ class TestTrackeval:
         clear = metrics.CLEAR(config).eval_sequence(data)
         assert ours.id_switches == clear["IDSW"]
         assert ours.mota == pytest.approx(clear["MOTA"], abs=ROUNDING)
-        # Distances are 1 - similarity of 100 m, of which float64 keeps 1e-14 m.
+        # Distances are computed from similarities on a scale of 100 m, which float64 keeps to 1e-14 m.
         assert ours.motp_m == pytest.approx(zero_at_m * (1 - clear["MOTP"]), abs=1e-11)
         identity = metrics.Identity(config).eval_sequence(data)
         assert ours.idf1 == pytest.approx(identity["IDF1"], abs=ROUNDING)
 
 
 def with_motmetrics(est: Trajectories, ref: Trajectories):
+    """Metrics of motmetrics."""
     accumulator = motmetrics.MOTAccumulator(auto_id=True)
     for drones, estimates, distance_m in frames(est, ref):
         accumulator.update(drones, estimates, np.where(distance_m <= GATE_M, distance_m, np.nan))
@@ -126,8 +127,8 @@ class TestMotmetrics:
     @settings(max_examples=20)
     def test_crowded(self, seed):
         est, ref = crowded(seed)
-        # It takes up pairs of long ago, we those of the previous frame only: the same where no drone is ever missed,
-        # that is where all estimates are within the gate of all drones, and at least as many.
+        # motmetrics keeps pairs from all earlier frames, psotrack only pairs of the previous frame. Both are the same
+        # if no drone is ever missed: all estimates are within the gate of all drones, and there are enough estimates.
         est = replace(est, position_m=0.25 * est.position_m)
         ref = replace(ref, position_m=0.25 * ref.position_m)
         est.position_m[est.seen.sum(axis=1) < ref.num_drones] = 0.1

@@ -1,4 +1,4 @@
-"""HOTA and GOSPA: compared with results by hand on five frames; GOSPA satisfies the axioms of a metric."""
+"""HOTA and GOSPA: compared with results by hand for five frames; GOSPA satisfies the axioms of a metric."""
 
 import numpy as np
 import pytest
@@ -15,25 +15,26 @@ def hota_of(est, ref=TRUTH):
 
 
 def gospa_of(est, ref=TRUTH):
-    """Localisation, missed, false, and all: squares, in m2."""
+    """Squares of GOSPA's parts for localisation, missed drones and false tracks, and of GOSPA itself, m2."""
     evaluation = evaluate(est, ref)
     parts_m = (evaluation.gospa_localisation_m, evaluation.gospa_missed_m, evaluation.gospa_false_m)
     return [part_m**2 for part_m in (*parts_m, evaluation.gospa_m)]
 
 
 class TestHota:
-    """Similarity is 1 - distance / 0.5 m; the 19 thresholds are 0.05 to 0.95."""
+    """Tests of HOTA, whose similarity is 1 - distance / 0.5 m and whose 19 thresholds are 0.05 to 0.95."""
 
     def test_localisation_decides_which_thresholds_are_reached(self):
-        # 0.12 m is a similarity of 0.76, which reaches the 15 thresholds up to 0.75. At those all ten pairs match, at
-        # the other four none, where LocA is 1 by convention.
+        # 0.12 m is a similarity of 0.76, which reaches the 15 thresholds up to 0.75. At these 15 thresholds all ten
+        # pairs match. At the other four thresholds no pair matches, and LocA is 1 by convention.
         hota, deta, assa, loca = hota_of(on_x_axis([0.12] * 5, [10.12] * 5))
         assert (hota, deta, assa) == pytest.approx((15 / 19,) * 3, abs=ROUNDING)
         assert loca == pytest.approx((15 * 0.76 + 4) / 19, abs=ROUNDING)
 
-    def test_a_swap_costs_association_alone(self):
-        # Each drone matches one track in 3 frames: TPA = 3, FNA = FPA = 2, so 3/7 for each of the 3 matches; and the
-        # other track in 2 frames: TPA = 2, FNA = FPA = 3, so 2/8 for each of 2. Mean: (3 x 3/7 + 2 x 1/4) / 5 = 5/14.
+    def test_a_swap_lowers_only_the_association_accuracy(self):
+        # Each drone matches one track in 3 frames: TPA = 3, FNA = FPA = 2, so 3/7 for each of these 3 matches. It
+        # matches the other track in 2 frames: TPA = 2, FNA = FPA = 3, so 2/8 for each of these 2 matches. The mean is
+        # (3 x 3/7 + 2 x 1/4) / 5 = 5/14.
         hota, deta, assa, loca = hota_of(on_x_axis([0, 0, 0, 10, 10], [10, 10, 10, 0, 0]))
         assert (deta, loca) == (1, 1)
         assert assa == pytest.approx(5 / 14, abs=ROUNDING)
@@ -41,25 +42,26 @@ class TestHota:
 
     def test_a_split_track_with_a_miss_and_false_positives(self):
         est = on_x_axis([0, 0, None, None, None], [None, None, None, 0, 0], [50] * 5)
-        # TP = 4, FN = 1, FP = 5: DetA = 4/10. Either half: TPA = 2, FNA = 3, FPA = 0: AssA = 2/5.
+        # TP = 4, FN = 1, FP = 5: DetA = 4/10. Each half of the track: TPA = 2, FNA = 3, FPA = 0: AssA = 2/5.
         hota, deta, assa, loca = hota_of(est, on_x_axis([0] * 5))
         assert (hota, deta, assa, loca) == pytest.approx((0.4, 0.4, 0.4, 1), abs=ROUNDING)
 
-    def test_tracks_that_fit_as_a_whole_are_matched_though_others_are_nearer(self):
+    def test_tracks_with_the_best_global_fit_are_matched_although_others_are_nearer(self):
         truth = on_x_axis([0] * 5, [0.4] * 5)
         est = on_x_axis([0, 0, 0.32, 0, 0], [0.4, 0.4, 0.08, 0.4, 0.4])
-        # In frame 2 each track is 0.32 m from its own drone (similarity 0.36) and 0.08 m from the other's (0.84);
-        # in the other frames 0 m (1) and 0.4 m (0.2).
-        # Soft overlap of own tracks: 4 x 1 / (1.2 + 1.2 - 1) + 0.36 / (1.2 + 1.2 - 0.36) = 3.0336, so they fit to
-        # 3.0336 / (10 - 3.0336) = 0.4355; of crossed ones: 4 x 0.2 / 2.2 + 0.84 / 1.56 = 0.9021, 0.0992.
-        # Own tracks win in frame 2: 0.4355 x 0.36 > 0.0992 x 0.84.
-        # So the 7 thresholds up to 0.35 are perfect. At the other 12, frame 2 is two misses and two false positives:
-        # DetA = 8 / (8 + 2 + 2), AssA = 4 / (4 + 1 + 1), both 2/3.
+        # In frame 2 each track is 0.32 m from its own drone (similarity 0.36) and 0.08 m from the other drone (0.84).
+        # In the other frames the distances are 0 m (1) and 0.4 m (0.2).
+        # The soft overlap of a drone and its own track is 4 x 1 / (1.2 + 1.2 - 1) + 0.36 / (1.2 + 1.2 - 0.36) = 3.0336,
+        # which is a global alignment score of 3.0336 / (10 - 3.0336) = 0.4355. With the other track, the overlap is
+        # 4 x 0.2 / 2.2 + 0.84 / 1.56 = 0.9021, and the score 0.0992.
+        # In frame 2 drones are matched with their own tracks, because 0.4355 x 0.36 > 0.0992 x 0.84.
+        # So the 7 thresholds up to 0.35 are perfect. At the other 12 thresholds, frame 2 has two misses and two false
+        # positives: DetA = 8 / (8 + 2 + 2), AssA = 4 / (4 + 1 + 1), both 2/3.
         hota, deta, assa, loca = hota_of(est, truth)
         assert (hota, deta, assa) == pytest.approx(((7 + 12 * 2 / 3) / 19,) * 3, abs=ROUNDING)
         assert loca == pytest.approx((7 * (8 + 2 * 0.36) / 10 + 12) / 19, abs=ROUNDING)
 
-    def test_a_track_whose_drone_nobody_knows_is_no_false_positive(self):
+    def test_a_track_of_an_unknown_drone_is_no_false_positive(self):
         truth = on_x_axis([0] * 5, [10, 10, None, None, 10])
         assert hota_of(on_x_axis([0] * 5, [10] * 5), truth) == pytest.approx((1,) * 4, abs=ROUNDING)
         # A false track counts: TP = 8, FP = 5.
@@ -69,16 +71,16 @@ class TestHota:
     def test_nothing_matches(self):
         assert hota_of(on_x_axis([None] * 5)) == (0, 0, 0, None)
         assert hota_of(on_x_axis([50] * 5)) == (0, 0, 0, None)
-        # The lowest threshold is 0.475 m.
+        # The lowest threshold corresponds to 0.475 m.
         assert hota_of(on_x_axis([0.48] * 5)) == (0, 0, 0, None)
 
 
 class TestGospa:
-    """With the cut-off c = 0.5 m, a missed drone and a false track cost c^2 / 2 = 0.125 m2 each."""
+    """Tests of GOSPA with the cut-off c = 0.5 m: a missed drone and a false track cost c^2 / 2 = 0.125 m2 each."""
 
     def test_decomposition(self):
         est = on_x_axis([0.1] * 5, [10, 10, 10.6, None, 10.3], [None, 50, None, None, None])
-        # In m2, by frames:   0     1             2                   3              4
+        # Costs in m2, frame: 0     1             2                   3              4
         # localisation        0.01  0.01          0.01                0.01           0.01 + 0.09
         # missed                                  0.125 (0.6 > 0.5)   0.125
         # false                     0.125         0.125
@@ -92,11 +94,11 @@ class TestGospa:
         assert gospa_of(on_x_axis([0, 0, 10, 10, 0], [10, 10, 0, 0, 10])) == [0, 0, 0, 0]
 
     def test_one_perfect_pair_may_be_worth_more_than_two_poor_ones(self):
-        # Two pairs of 0.49 m would cost 2 x 0.2401 = 0.4802; one of 0 m, a miss and a false one cost 0.25.
+        # Two pairs of 0.49 m would cost 2 x 0.2401 = 0.4802; a pair of 0 m, a miss and a false track cost 0.25.
         parts = gospa_of(on_x_axis([0.98] * 5, [0.49] * 5), on_x_axis([0] * 5, [0.49] * 5))
         assert parts == pytest.approx([0, 0.125, 0.125, 0.25], abs=ROUNDING)
 
-    def test_a_pair_at_the_cut_off_costs_what_both_cost_alone(self):
+    def test_a_pair_at_the_cut_off_costs_as_much_as_a_miss_and_a_false_track(self):
         assert gospa_of(on_x_axis([0] * 5, [10.5] * 5))[3] == pytest.approx(0.25, abs=ROUNDING)
 
     def test_nothing_found(self):
@@ -127,7 +129,7 @@ class TestGospa:
 
         assert distance_m(four, three) == pytest.approx(distance_m(three, four), abs=ROUNDING)
         for first, second, third in ((four, three, two), (three, four, two), (four, two, three)):
-            way_round_m = distance_m(first, second) + distance_m(second, third)
-            assert distance_m(first, third) <= way_round_m + ROUNDING
-        there, back = evaluate(four, three), evaluate(three, four)
-        assert there.gospa_missed_m == pytest.approx(back.gospa_false_m, abs=ROUNDING)
+            detour_m = distance_m(first, second) + distance_m(second, third)
+            assert distance_m(first, third) <= detour_m + ROUNDING
+        forward, reverse = evaluate(four, three), evaluate(three, four)
+        assert forward.gospa_missed_m == pytest.approx(reverse.gospa_false_m, abs=ROUNDING)

@@ -1,4 +1,4 @@
-"""Tables and plots of an evaluation: they fit in a terminal, and show the evaluation's numbers."""
+"""Tables and plots of an evaluation: they show the evaluation's numbers, and tables fit in a terminal."""
 
 import io
 import subprocess
@@ -19,12 +19,16 @@ from psotrack.evaluation import evaluate, plots, tables
 from psotrack.trajectories import Status, Trajectories
 
 NUM_FRAMES = 50
-#: Drones of the reference, with the tracks that follow them.
+#: Labels of the reference's drones, with the numbers of their tracks.
 LABELS = ["dron0 (track 0)", "dron1 (track 1)", "dron2 (track 2)"]
 
 
 def flights(num_drones: int = 3, *, swap: bool = False, names: tuple[str, ...] = ()):
-    """Drones on circles; the estimate is 20 mm off, lacks drone 2 in frames 10 to 19, and may swap from frame 40."""
+    """Estimate and reference of drones on circles.
+
+    The estimate has an offset of 20 mm, and drone 2 is lost in frames 10 to 19. With `swap`, the first two tracks are
+    exchanged from frame 40 on.
+    """
     frame = np.arange(NUM_FRAMES)
     angle = frame[:, None] / 10 + np.arange(num_drones)
     ref_m = np.stack([np.cos(angle) + 2 * np.arange(num_drones), np.sin(angle), 1 + 0 * angle], axis=-1)
@@ -63,14 +67,14 @@ class TestTable:
             "+0",
             "+0",
         ]
-        # Ten frames of 50 are lost; of 150, that is one in fifteen.
+        # The third drone is lost in 10 of its 50 frames; of all 150 positions, that is 6.7 %.
         assert rows["dron2 (track 2)"][5] == "20.0%"
         assert rows["all"] == ["20.0", "20.0", "0.0", "20.0", "20.0", "6.7%", "0.0"]
         text = "\n".join(lines)
         assert "MOTA 0.933, MOTP 20.0 mm, IDF1 0.966, identity switches 0" in text
-        # 0.02 m reaches all thresholds: DetA = 140/150; AssA: 50 + 50 matches of 1 and 40 of 40/50, over 140.
+        # 0.02 m reaches all thresholds: DetA = 140/150, and AssA is the mean of 100 matches of 1 and 40 of 40/50.
         assert "HOTA      0.938: DetA 0.933, AssA 0.943, LocA 0.960" in text
-        # Squares: of 2.8 drones by 400 mm2; of 0.2 missed by 125,000 mm2.
+        # Mean squares: 2.8 drones with 400 mm2 each, and 0.2 missed drones with 125,000 mm2 each.
         assert "GOSPA     162 mm: localisation 33.5, missed 158, false 0.0" in text
         assert "RMSE      ATE 20.0 mm (0.0 aligned), RPE over 1 s 0.0 mm" in text
         assert "ellipsoid" not in text
@@ -80,7 +84,7 @@ class TestTable:
         est, ref = flights()
         covariance_m2 = np.broadcast_to(1e-4 * np.eye(3), (NUM_FRAMES, 3, 3, 3))
         lines = printed(tables.render(evaluate(replace(est, covariance_m2=covariance_m2), ref)))
-        # 20 mm are twice a standard deviation of 10 mm, and an offset.
+        # The error of 20 mm is two standard deviations of 10 mm, so NEES is 4; without the offset, NEES is 0.
         row = "ellipsoid of 90 % holds 100.0% (100.0% centred), mean NEES 4 ("
         assert any(line.startswith(row) for line in lines)
 
@@ -91,14 +95,14 @@ class TestTable:
         text = "\n".join(printed(tables.render(evaluate(*both))))
         assert "RPE over 1 s 0.0 mm and 0.00 deg" in text
 
-    def test_eighty_columns_hold_ten_drones_that_are_far_off(self):
+    def test_ten_drones_with_large_errors_fit_into_eighty_columns(self):
         est, ref = flights(10, swap=True, names=tuple(f"[red]d_{number}" for number in range(10)))
         est.position_m[30:, :5] += 3.0
         covariance_m2 = np.broadcast_to(1e-8 * np.eye(3), (NUM_FRAMES, 10, 3, 3))
         est = replace(est, covariance_m2=covariance_m2)
         lines = printed(tables.render(evaluate(est, ref), "S04_D10"))
         assert max(map(len, lines)) <= 80
-        # No name is cut off, and no part of a name is taken for a style.
+        # No name is cut off, and no part of a name is interpreted as a style.
         assert [line.split()[0] for line in lines if "d_" in line] == [f"[red]d_{n}" for n in range(10)]
         assert sum("…" in line for line in lines) == 0
         # No line of the scores is folded.
@@ -106,7 +110,7 @@ class TestTable:
         first_words = [line[:10].strip() for line in scores]
         assert first_words == ["CLEAR", "", "HOTA", "GOSPA", "RMSE", "ellipsoid", "centred"]
 
-    def test_metres_where_errors_are_metres(self):
+    def test_large_errors_are_shown_in_metres(self):
         est, ref = flights()
         est.position_m[:, :, 2] += 4.0
         lines = printed(tables.render(evaluate(est, ref)))
@@ -114,13 +118,13 @@ class TestTable:
         row = next(line for line in lines if line.startswith("dron0")).split()
         assert (row[3], row[-3:]) == ("4.00", ["+0.0", "+0.0", "+4.0"])
 
-    def test_a_drone_that_was_never_seen(self):
+    def test_a_missed_drone(self):
         est, ref = flights()
         est.status[:, 2] = Status.LOST
         row = next(line for line in printed(tables.render(evaluate(est, ref))) if line.startswith("dron2"))
         assert row.split() == ["dron2", "-", "-", "-", "-", "-", "100.0%", "-", "-"]
 
-    def test_data_frame(self):
+    def test_data_frame_of_drones(self):
         est, ref = flights()
         est.status[:, 2] = Status.LOST
         frame = tables.to_frame(evaluate(est, ref))
@@ -141,7 +145,7 @@ def labels(axes) -> list[str]:
 
 
 class TestPictures:
-    def test_errors_in_millimetres_with_gaps_where_missed(self):
+    def test_errors_in_millimetres_have_gaps_where_a_drone_is_missed(self):
         axes = axes_of()
         plots.draw_errors(axes, *flights())
         line = next(line for line in axes.lines if line.get_label() == LABELS[2])
@@ -164,11 +168,11 @@ class TestPictures:
         axes = axes_of()
         plots.draw_errors(axes, est, ref)
         line = next(line for line in axes.lines if line.get_label() == LABELS[0])
-        # 45 frames with truth, and one gap between them.
+        # The line has 45 frames with a reference, and one NaN for the gap.
         assert len(line.get_ydata()) == 46
         assert np.flatnonzero(np.isnan(line.get_ydata())).tolist() == [25]
 
-    def test_paths_in_one_scale(self):
+    def test_all_axes_of_the_paths_have_one_scale(self):
         est, ref = flights()
         axes = axes_of("3d")
         plots.draw_trajectories(axes, est, ref)
@@ -189,7 +193,7 @@ class TestPictures:
         assert labels(axes)[-1] == "false track"
 
     @pytest.mark.parametrize("save", [plots.save_trajectories, plots.save_errors, plots.save_overview])
-    def test_png_with_the_drone_colour_each_drone(self, tmp_path, save):
+    def test_a_png_file_has_the_colour_of_each_drone(self, tmp_path, save):
         path = tmp_path / "picture.png"
         est, ref = flights()
         # Each drone has a different error, so that no line hides another.
@@ -198,7 +202,7 @@ class TestPictures:
         rgb = cv2.imread(str(path))[..., ::-1].reshape(-1, 3).astype(int)
         for drone in range(3):
             colour = np.round(np.array(to_rgb(plots.drone_colour(drone))) * 255)
-            # Lines are a few hundred pixels long; a line behind its reference still has visible edges.
+            # Lines are a few hundred pixels long; a line behind the line of its reference still has visible edges.
             assert (np.abs(rgb - colour).max(axis=1) <= 2).sum() > 100
 
     def test_an_existing_plot_is_replaced_only_by_force(self, tmp_path):
@@ -219,13 +223,13 @@ class TestPictures:
 
 
 def test_importing_loads_neither_pandas_nor_matplotlib():
-    """Importing loads neither Matplotlib nor pandas, and drawing does not load pyplot, which has global state."""
+    """Drawing does not load pyplot either, which has global state."""
     code = (
         "import sys; from psotrack.evaluation import plots, tables; import psotrack.trajectories.files;"
         "assert not {'matplotlib', 'pandas', 'pyarrow'} & set(sys.modules), set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
-    # In a process of its own, because other tests may have imported pyplot.
+    # A separate process is needed, because other tests may have imported pyplot.
     code = (
         "import sys, test_evaluation_shown as shown; shown.plots.draw_errors(shown.axes_of(), *shown.flights());"
         "assert 'matplotlib.pyplot' not in sys.modules"

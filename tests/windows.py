@@ -1,4 +1,4 @@
-"""Windows of the silhouettes as tests look at them: cut, unpacked, scored, and searched for the best place."""
+"""Functions that cut, unpack and score windows of the silhouettes, and search them for the best position of a drone."""
 
 from functools import partial
 
@@ -16,8 +16,9 @@ from psotrack.tracking.patches import SIDE, ExpectedDrones, cut
 
 RING = SoftIoU().ring
 
-# Cameras so far away that metres are pixels, one per level: 15 to 188 silhouette pixels from the middle of a drone of
-# 1 m to the ring's border. No side of the silhouettes is a multiple of 8.
+# Cameras so far away that their images are parallel projections, one camera per level of the pyramid: 15 to 188
+# silhouette pixels from the middle of a drone of 1 m to the ring's border. No side of the silhouettes is a multiple
+# of 8.
 SHAPE = (213, 301)
 PIXELS_PER_M = np.array([20.0, 60.0, 120.0, 250.0])
 NOISE = np.random.default_rng(0).integers(0, 256, (4, *SHAPE)).astype(np.uint8)
@@ -32,19 +33,19 @@ def far_rig(reduction):
 
 
 def middle_px(position_m, pixels_per_m):
-    """In silhouette pixels, counted from the left upper corner: x is to the right, z is up."""
+    """(x, y) of a position in silhouette pixels from the upper left corner; the world's x is to the right, z is up."""
     return SHAPE[1] / 2 + pixels_per_m * position_m[0], SHAPE[0] / 2 - pixels_per_m * position_m[2]
 
 
 def cut_at(rig, images, expected_m, size_m, *, reduction=1, **expected):
-    """Windows as NumPy arrays; `expected` holds further arguments of `expected_drones`."""
+    """Cut windows and return them as NumPy arrays; `expected` are further arguments of `expected_drones`."""
     arrays = float32((rig.cameras, np.asarray(size_m)))
     windows = _cut(images, *arrays, expected_drones(expected_m, **expected), reduction)
     return jax.tree.map(np.asarray, windows)
 
 
 def expected_drones(expected_m, *, reach_m=0.1, occluding=True, floor_z_m=None):
-    """Expected drones; `reach_m` and `occluding` are one value for all drones or one for each."""
+    """Expected drones; `reach_m` and `occluding` have one value for all drones or one value per drone."""
     count = len(expected_m)
     position_m, reach_m, floor_z_m = float32(
         (np.asarray(expected_m), np.broadcast_to(reach_m, count), floor_z_m)
@@ -59,22 +60,23 @@ def _cut(images, cameras, size_m, expected, reduction):
 
 
 def pixels(patches):
-    """(drones, cameras, rows, columns): the windows' foreground, 0..255, from their tables."""
+    """(drones, cameras, rows, columns), foreground of the windows' pixels, 0..255, from the summed-area tables."""
     return _words(patches) & (2**LOW_BITS - 1)
 
 
 def occluded_pixels(patches):
-    """(drones, cameras, rows, columns): which pixels of the windows are occluded foreground."""
+    """(drones, cameras, rows, columns), whether a pixel of a window is occluded foreground."""
     return _words(patches) >> LOW_BITS
 
 
 def _words(patches):
-    # Sums may run over; their differences do not.
+    # Sums of packed numbers may overflow; their differences are exact nevertheless.
     windows = np.diff(np.diff(patches.tables, axis=0), axis=2).swapaxes(0, 1)
     return windows.reshape(*patches.x_px.shape, SIDE, SIDE)
 
 
 def each(windows):
+    """Iterate over ((drone, camera), window)."""
     return (((d, c), windows[d, c]) for d in range(windows.shape[0]) for c in range(windows.shape[1]))
 
 
@@ -95,7 +97,7 @@ def evaluate_whole(function, reduction, images, cameras, position_m, size_m):
 
 
 def best_place(rig, patches, about_m, size_m):
-    """Where the fitness of each drone is highest: a grid of 9 x 9 x 9, three times finer each time."""
+    """(drones, 3), positions of highest fitness, by four searches of a grid of 9 x 9 x 9, each three times finer."""
     arrays = float32((rig.cameras, np.asarray(about_m), np.asarray(size_m)))
     return np.asarray(_best_place(SoftIoU(), patches, *arrays), np.float64)
 
