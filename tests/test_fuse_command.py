@@ -1,4 +1,4 @@
-"""`psotrack fuse` on files: tracks that other commands read, a report, and errors in one line."""
+"""`psotrack fuse` on files: the tracks, the report, and error messages of one line."""
 
 import json
 from dataclasses import replace
@@ -16,7 +16,7 @@ from psotrack.trajectories import read_trajectories, write_trajectories
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """Two paths, the tracks with an identity swap at frame 60, and the ground truth."""
+    """Folder with two camera paths and with tracks that have an identity swap at frame 60, and the ground truth."""
     folder = tmp_path_factory.mktemp("fuse")
     paths, outside, truths = recording(31, 100, num_drones=2, distance_m=1.5)
     outside.position_m[60:, [0, 1]] = outside.position_m[60:, [1, 0]]
@@ -47,7 +47,7 @@ def test_files_are_fused_into_tracks_that_other_commands_read(files, tmp_path) -
     fused = read_trajectories(out)
     assert fused.drones == ("dron1", "dron2")
     for drone, (truth_m, _) in enumerate(truths):
-        # Frames without a pose are as good as the outside, 7 mm, with an interpolated direction of the arm.
+        # In frames without a pose, errors are those of the outside tracks, 7 mm, and of an interpolated orientation.
         assert rms(fused.position_m[:, drone] - truth_m) < 0.005
     assert np.isfinite(fused.covariance_m2).all()
     assert fused.seen.all()
@@ -56,9 +56,9 @@ def test_files_are_fused_into_tracks_that_other_commands_read(files, tmp_path) -
     assert first.endswith("both,tracked")
     content = json.loads(report.read_text())
     assert content["point"] == "camera"
-    assert [one["frame"] for one in content["exchanges"]] == [60, 60]
+    assert [exchange["frame"] for exchange in content["exchanges"]] == [60, 60]
     drone = content["drones"][0]
-    # Track 0, which is lost from frame 80 to 89, belongs to the second drone there.
+    # Track 0 is lost from frame 80 to 89, and in these frames it belongs to the second drone.
     assert (drone["frames_both"], drone["frames_inside"], drone["frames_outside"]) == (90, 0, 10)
     assert content["drones"][1]["frames_inside"] == 10
     assert np.allclose(drone["lever_arm_m"], [0.01, 0.03, -0.12], atol=0.005)
@@ -67,7 +67,7 @@ def test_files_are_fused_into_tracks_that_other_commands_read(files, tmp_path) -
     assert drone["inside"]["scale"] > 0
 
 
-def test_options(files, tmp_path) -> None:
+def test_point_offset_and_force_options(files, tmp_path) -> None:
     folder, _ = files
     out = tmp_path / "fused.csv"
     words = (
@@ -84,7 +84,7 @@ def test_options(files, tmp_path) -> None:
     content = json.loads(done.output)
     assert content["point"] == "middle"
     assert content["others"] == ["0"]
-    # Both clocks are the same: within four standard deviations.
+    # Both clocks are the same. The limit is four standard deviations.
     assert abs(content["drones"][0]["offset_s"]) < 4 * content["drones"][0]["offset_std_s"]
     before = out.read_bytes()
     assert run(*words, "-q", "--force").output == ""

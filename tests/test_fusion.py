@@ -1,4 +1,4 @@
-"""Two methods' tracks as one: made-up tracks of which every error is known."""
+"""Fusion of the tracks of two methods: simulated tracks whose errors are known."""
 
 import numpy as np
 import pytest
@@ -11,19 +11,30 @@ from psotrack.trajectories import Arrival, DroneSizes, Status, Tracks
 
 FPS, FRAMES = 25.0, 200
 SETTINGS, MAX_COASTING_S = MotionSettings(), 0.5
-#: Errors of the swarm are small along x and large along y; those of the lines the other way round.
+#: (3,), standard deviations along x, y and z, metres. Errors of the swarm are small along x and large along y; errors
+#: of the projection lines are large along x and small along y.
 SWARM_STD_M, LINES_STD_M = np.array([0.005, 0.02, 0.01]), np.array([0.02, 0.005, 0.01])
 
 
 def paths(num_drones):
-    """(frames, drones, 3): drones on circles, a metre apart."""
+    """(frames, drones, 3), positions of drones on circles at heights a metre apart."""
     angle = np.arange(FRAMES)[:, None] / FPS + 2.0 * np.arange(num_drones)
     height_m = np.broadcast_to(1.0 + np.arange(num_drones), angle.shape)
     return np.stack([np.cos(angle), np.sin(angle), height_m], axis=-1)
 
 
 def tracked(truth_m, std_m, *, seed, factor=1.0, hidden=(), offset_m=(0.0, 0.0, 0.0), arrivals=()):
-    """What a method would yield that measures the truth with such errors; hidden is (drone, first, last frame)."""
+    """Simulate the result of a method.
+
+    Args:
+        truth_m: (frames, drones, 3), true positions.
+        std_m: (3,), standard deviations of the measurements, metres.
+        seed: of the random errors.
+        factor: the stated covariance divided by the true covariance.
+        hidden: tuples (drone, first frame, end frame) of frames in which a drone is lost.
+        offset_m: (3,), offset of all measurements, metres.
+        arrivals: arrivals that the method reports.
+    """
     rng = np.random.default_rng(seed)
     measured_m = truth_m + std_m * rng.standard_normal(truth_m.shape) + offset_m
     status = np.full(truth_m.shape[:2], int(Status.TRACKED))
@@ -49,71 +60,72 @@ def tracked(truth_m, std_m, *, seed, factor=1.0, hidden=(), offset_m=(0.0, 0.0, 
     )
 
 
-def fuse(swarm, lines, **how):
-    return fuse_tracks(swarm, lines, SETTINGS, fps=FPS, max_coasting_s=MAX_COASTING_S, **how)
+def fuse(swarm, lines, **options):
+    return fuse_tracks(swarm, lines, SETTINGS, fps=FPS, max_coasting_s=MAX_COASTING_S, **options)
 
 
-def both(truth_m, swarm=None, lines=None, **how):
+def simulate_and_fuse(truth_m, swarm=None, lines=None, **options):
+    """Tracks of the swarm, tracks of the projection lines, and the fused tracks."""
     first = tracked(truth_m, SWARM_STD_M, seed=0, **(swarm or {}))
-    # Whose covariances the fusion takes to be of the cameras' disagreement alone.
+    # The fusion enlarges the covariances of the projection lines by `COMMON`, for errors that all cameras share.
     second = tracked(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON, **(lines or {}))
-    return first, second, fuse(first, second, **how)[0]
+    return first, second, fuse(first, second, **options)[0]
 
 
 def test_information_adds_up():
     truth_m = paths(3)
-    first, second, together = both(truth_m)
-    # About each drone's own median, as the middle that counts is known no better; and by the median of that, as one
-    # frame in 1000 is beyond the gate, where the swarm's alone counts.
-    off_m = together.measured_m - truth_m
+    first, second, fused = simulate_and_fuse(truth_m)
+    # Errors are relative to each drone's median, because the tracked point has an unknown offset. Their spread is
+    # computed from a median, because one frame in 1000 is beyond the gate, where only the swarm's measurement is used.
+    off_m = fused.measured_m - truth_m
     std_m = 1.4826 * np.median(np.abs(off_m - np.median(off_m, axis=0)), axis=(0, 1))
     expected_m = 1 / np.sqrt(1 / SWARM_STD_M**2 + 1 / LINES_STD_M**2)
-    # The spread of 600 is known to 4 % so.
+    # The spread of 600 errors, computed from a median, has an error of 4 %.
     np.testing.assert_allclose(std_m, expected_m, rtol=0.1)
-    # The lines have another error, that of the offset of the middles.
+    # The measurements of the projection lines also have the error of the offset between the middles.
     _, middles = fuse(first, second)
     expected_m2 = 1 / (1 / SWARM_STD_M**2 + 1 / (LINES_STD_M**2 + middles.std_m**2))
-    diagonal_m2 = np.diagonal(together.measured_covariance_m2, axis1=-2, axis2=-1)
+    diagonal_m2 = np.diagonal(fused.measured_covariance_m2, axis1=-2, axis2=-1)
     np.testing.assert_allclose(np.median(diagonal_m2, axis=0), expected_m2, rtol=1e-9)
-    assert (together.status == Status.TRACKED).all()
+    assert (fused.status == Status.TRACKED).all()
 
 
-def test_the_middle_of_a_silhouette_is_what_counts():
-    """Boxes whose middles are 8 cm higher: nothing of that is seen in what comes of it."""
+def test_the_fused_point_is_the_middle_of_the_silhouette():
+    """Middles of the boxes are 8 cm above those of the silhouettes; the fused tracks do not have this offset."""
     truth_m = paths(2)
-    _, _, together = both(truth_m, lines={"offset_m": (0.01, 0.0, 0.08)})
-    off_m = (together.measured_m - truth_m).mean(axis=(0, 1))
+    _, _, fused = simulate_and_fuse(truth_m, lines={"offset_m": (0.01, 0.0, 0.08)})
+    off_m = (fused.measured_m - truth_m).mean(axis=(0, 1))
     np.testing.assert_allclose(off_m, 0.0, atol=0.003)
 
 
-def test_the_offset_of_the_middles_is_told_with_its_error():
+def test_the_offset_between_the_middles_has_a_standard_error():
     truth_m, off_m = paths(4), np.array([0.01, 0.0, 0.08])
     first = tracked(truth_m, SWARM_STD_M, seed=0)
     second = tracked(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON, offset_m=off_m)
-    # A tenth of the frames has another drone in its place.
+    # In a tenth of the frames, the first drone's measurement is that of another object.
     second.measured_m[20:40, 0] += 0.2
     _, middles = fuse(first, second)
-    # A median of 200 differences, of errors that do not last.
+    # Standard error of a median of 200 independent differences.
     expected_m = np.sqrt(np.pi / 2 * (SWARM_STD_M**2 + LINES_STD_M**2) / FRAMES)
-    # Never less, but for what is clipped of the tails; what looks as if it lasted, by chance, makes it more.
+    # The estimate may be a little smaller, because tails are clipped, and larger, if errors are correlated by chance.
     assert (middles.std_m[1:] > 0.85 * expected_m).all()
     assert (middles.std_m[1:] < 2.0 * expected_m).all()
     assert (np.abs(middles.offset_m - off_m) < 4 * middles.std_m).all()
 
 
-def test_an_offset_from_errors_that_last_is_known_less_well():
+def test_the_offset_is_less_certain_with_correlated_errors():
     truth_m = paths(1)
     first = tracked(truth_m, np.full(3, 1e-6), seed=0)
     second = tracked(truth_m, np.full(3, 1e-6), seed=1, factor=1 / COMMON)
     lasting_m = np.repeat(np.random.default_rng(2).normal(0.0, 0.01, (FRAMES // 10, 1, 3)), 10, axis=0)
     second.measured_m[:] += lasting_m
     _, middles = fuse(first, second)
-    # 20 independent errors, not 200: from so few the spread is known to a quarter.
+    # There are 20 independent errors, not 200, so the spread has an error of about a quarter.
     expected_m = np.sqrt(np.pi / 2 / 20) * 0.01
     np.testing.assert_allclose(middles.std_m / expected_m, 1.0, atol=0.6)
 
 
-def test_who_is_seen_by_one_alone_has_no_offset():
+def test_a_drone_found_by_one_method_only_has_no_offset():
     truth_m = paths(3)
     swarm, lines = tracked(truth_m[:, :2], SWARM_STD_M, seed=0), tracked(truth_m[:, 1:], LINES_STD_M, seed=1)
     _, middles = fuse(swarm, lines)
@@ -121,92 +133,93 @@ def test_who_is_seen_by_one_alone_has_no_offset():
     np.testing.assert_array_equal(np.isnan(middles.offset_m), np.isnan(middles.std_m))
 
 
-def test_a_place_by_the_lines_alone_is_as_uncertain_as_the_offset_makes_it():
+def test_a_position_from_lines_alone_has_the_offsets_uncertainty():
     hidden = [(0, 50, 100)]
     first = tracked(paths(1), SWARM_STD_M, seed=0, hidden=hidden)
     second = tracked(paths(1), LINES_STD_M, seed=1, factor=1 / COMMON)
-    together, middles = fuse(first, second)
-    diagonal_m2 = np.diagonal(together.measured_covariance_m2[60, 0])
+    fused, middles = fuse(first, second)
+    diagonal_m2 = np.diagonal(fused.measured_covariance_m2[60, 0])
     np.testing.assert_allclose(diagonal_m2, LINES_STD_M**2 + middles.std_m[0] ** 2, rtol=1e-9)
 
 
-def test_errors_of_the_same_foreground_say_less():
-    """The best linear estimate of two that err alike: less sure than that of two that do not."""
-    first, second, apart = both(paths(2))
-    alike, middles = fuse(first, second, same_foreground=True)
-    # Axis by axis the least variance of a weighted mean (Lagrange): 1 / (1' S^-1 1).
-    one_m, other_m = SWARM_STD_M + 0 * middles.std_m, np.hypot(LINES_STD_M, middles.std_m)
-    cross_m2 = COMMON_CORRELATION * one_m * other_m
-    joint_m2 = np.moveaxis(np.array([[one_m**2, cross_m2], [cross_m2, other_m**2]]), (0, 1), (-2, -1))
+def test_methods_with_the_same_foreground_have_correlated_errors():
+    """The best linear estimate from correlated errors has a larger covariance than that from independent errors."""
+    first, second, independent = simulate_and_fuse(paths(2))
+    correlated, middles = fuse(first, second, same_foreground=True)
+    # The least variance of a weighted mean is 1 / (1ᵀ S⁻¹ 1) along each axis.
+    swarm_m, lines_m = SWARM_STD_M + 0 * middles.std_m, np.hypot(LINES_STD_M, middles.std_m)
+    cross_m2 = COMMON_CORRELATION * swarm_m * lines_m
+    joint_m2 = np.moveaxis(np.array([[swarm_m**2, cross_m2], [cross_m2, lines_m**2]]), (0, 1), (-2, -1))
     expected_m2 = 1 / np.linalg.inv(joint_m2).sum(axis=(-2, -1))
-    diagonal_m2 = np.diagonal(alike.measured_covariance_m2, axis1=-2, axis2=-1)
+    diagonal_m2 = np.diagonal(correlated.measured_covariance_m2, axis1=-2, axis2=-1)
     np.testing.assert_allclose(np.median(diagonal_m2, axis=0), expected_m2, rtol=1e-9)
-    less = np.median(np.linalg.det(apart.measured_covariance_m2))
-    assert np.median(np.linalg.det(alike.measured_covariance_m2)) > less
+    smaller = np.median(np.linalg.det(independent.measured_covariance_m2))
+    assert np.median(np.linalg.det(correlated.measured_covariance_m2)) > smaller
 
 
-def test_what_only_the_blobs_of_the_same_foreground_show_is_no_drone():
+def test_with_the_same_foreground_a_track_of_lines_alone_is_no_drone():
     truth_m = paths(3)
     swarm, lines = tracked(truth_m[:, :2], SWARM_STD_M, seed=0), tracked(truth_m, LINES_STD_M, seed=1)
     assert fuse(swarm, lines)[0].status.shape[1] == 3
     assert fuse(swarm, lines, same_foreground=True)[0].status.shape[1] == 2
 
 
-def test_where_one_does_not_see_a_drone_the_other_one_does():
+def test_where_one_method_has_no_measurement_the_other_is_used():
     truth_m = paths(2)
     hidden = [(0, 50, 100)]
-    first, second, together = both(truth_m, swarm={"hidden": hidden}, lines={"hidden": [(1, 120, 150)]})
-    assert (together.status == Status.TRACKED).all()
-    # Alone, moved by the offset of the middles and no more.
-    moved_m = together.measured_m[50:100, 0] - second.measured_m[50:100, 0]
+    first, second, fused = simulate_and_fuse(
+        truth_m, swarm={"hidden": hidden}, lines={"hidden": [(1, 120, 150)]}
+    )
+    assert (fused.status == Status.TRACKED).all()
+    # Measurements of the lines alone are only moved by the constant offset between the middles.
+    moved_m = fused.measured_m[50:100, 0] - second.measured_m[50:100, 0]
     assert np.ptp(moved_m, axis=0).max() < 1e-12
-    np.testing.assert_array_equal(together.measured_m[120:150, 1], first.measured_m[120:150, 1])
-    assert np.linalg.norm(together.position_m[50:100, 0] - truth_m[50:100, 0], axis=-1).max() < 0.06
+    np.testing.assert_array_equal(fused.measured_m[120:150, 1], first.measured_m[120:150, 1])
+    assert np.linalg.norm(fused.position_m[50:100, 0] - truth_m[50:100, 0], axis=-1).max() < 0.06
 
 
-def test_what_neither_sees_coasts_and_is_lost():
+def test_a_drone_without_measurements_coasts_and_is_lost():
     truth_m = paths(1)
     hidden = {"hidden": [(0, 50, 100)]}
-    _, _, together = both(truth_m, swarm=hidden, lines=hidden)
-    status = together.status[:, 0]
+    _, _, fused = simulate_and_fuse(truth_m, swarm=hidden, lines=hidden)
+    status = fused.status[:, 0]
     frames = round(MAX_COASTING_S * FPS)
     assert (status[50 : 50 + frames] == Status.COASTING).all()
     assert (status[50 + frames : 100] == Status.LOST).all()
-    variance = np.trace(together.covariance_m2[49:100, 0], axis1=1, axis2=2)
+    variance = np.trace(fused.covariance_m2[49:100, 0], axis1=1, axis2=2)
     assert (np.diff(variance) > 0).all()
 
 
-def test_drones_that_only_the_lines_know_come_after_the_others():
+def test_drones_found_only_by_the_lines_come_last():
     truth_m = paths(3)
     swarm = tracked(truth_m[:, [2, 0]], SWARM_STD_M, seed=0, arrivals=[Arrival(3, 1, again=False)])
     arrivals = [Arrival(9, 0, again=False), Arrival(20, 1, again=True)]
     lines = tracked(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON, arrivals=arrivals)
-    together, _ = fuse(swarm, lines)
-    np.testing.assert_allclose(together.measured_m, truth_m[:, [2, 0, 1]], atol=0.1)
-    # The first of the lines' arrivals is of a drone that the swarm knows.
-    assert together.arrivals == (Arrival(3, 1, again=False), Arrival(20, 2, again=True))
-    assert together.sizes.size_m.shape == (3, 3)
-    assert together.measured_size_m.shape == (FRAMES, 3, 3)
+    fused, _ = fuse(swarm, lines)
+    np.testing.assert_allclose(fused.measured_m, truth_m[:, [2, 0, 1]], atol=0.1)
+    # The first arrival of the projection lines is ignored, because the swarm has a track of this drone.
+    assert fused.arrivals == (Arrival(3, 1, again=False), Arrival(20, 2, again=True))
+    assert fused.sizes.size_m.shape == (3, 3)
+    assert fused.measured_size_m.shape == (FRAMES, 3, 3)
 
 
-def test_where_they_disagree_it_is_the_swarm_that_counts():
+def test_where_the_methods_disagree_the_swarm_is_used():
     truth_m = paths(1)
     swarm = tracked(truth_m, SWARM_STD_M, seed=0)
     lines = tracked(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON)
     lines.measured_m[80:90] += 0.5
-    together, _ = fuse(swarm, lines)
-    np.testing.assert_array_equal(together.measured_m[80:90], swarm.measured_m[80:90])
+    fused, _ = fuse(swarm, lines)
+    np.testing.assert_array_equal(fused.measured_m[80:90], swarm.measured_m[80:90])
 
 
-@pytest.mark.parametrize("who", ["swarm", "lines"])
-def test_one_of_them_may_find_nobody(who):
+@pytest.mark.parametrize("method", ["swarm", "lines"])
+def test_one_method_may_have_no_tracks(method):
     truth_m = paths(2)
-    some, nobody = tracked(truth_m, SWARM_STD_M, seed=0), tracked(truth_m[:, :0], SWARM_STD_M, seed=0)
-    pair = (some, nobody) if who == "swarm" else (nobody, some)
-    together, _ = fuse(*pair)
-    np.testing.assert_array_equal(together.measured_m, some.measured_m)
+    found, empty = tracked(truth_m, SWARM_STD_M, seed=0), tracked(truth_m[:, :0], SWARM_STD_M, seed=0)
+    fused, _ = fuse(found, empty) if method == "swarm" else fuse(empty, found)
+    np.testing.assert_array_equal(fused.measured_m, found.measured_m)
 
 
-def test_nobody_may_find_anybody():
-    nobody = tracked(paths(0), SWARM_STD_M, seed=0)
-    assert fuse(nobody, nobody)[0].status.shape == (FRAMES, 0)
+def test_both_methods_may_have_no_tracks():
+    empty = tracked(paths(0), SWARM_STD_M, seed=0)
+    assert fuse(empty, empty)[0].status.shape == (FRAMES, 0)

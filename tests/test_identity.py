@@ -1,4 +1,4 @@
-"""Identities after encounters: compared with all histories of labels, on simulated flights, and by frequencies."""
+"""Identity swaps: compared with all label histories, tested on simulated flights, and frequencies of wrong labels."""
 
 from collections import deque
 from dataclasses import dataclass, replace
@@ -20,15 +20,24 @@ from psotrack.simulation.flights import planning
 
 ENCOUNTER_M = 0.6
 PARAMS = IdentityParams(encounter_m=ENCOUNTER_M)
-#: A motion model as gentle as the flights of the simulator and of these tests.
+#: Motion model with a low jerk density, like the flights of the simulator and of these tests.
 GENTLE = Model(density=1.0)
 #: Ratio of the jerk density during encounters to the usual jerk density.
 AGILITY = 10.0
 
 
 @dataclass(frozen=True)
-class Seen:
-    """Output of a tracker, and the true track of each drone."""
+class LabelledTracks:
+    """Simulated output of a tracker, and the true track of each drone.
+
+    Attributes:
+        time_s: (frames,), times of the frames, seconds.
+        measured_m: (frames, tracks, 3), measured positions, metres.
+        covariance_m2: (frames, tracks, 3, 3), covariances of the measurements.
+        was_measured: (frames, tracks), False where a measurement is missing.
+        truth: (frames, drones), number of the track that follows each drone.
+        size_m: (frames, tracks, 3), measured sizes, metres; None without size measurements.
+    """
 
     time_s: np.ndarray
     measured_m: np.ndarray
@@ -38,15 +47,15 @@ class Seen:
     size_m: np.ndarray | None = None
 
 
-def seen(flown_m, std_m=0.01, seed=0, exchanges=(), size_m=None):
-    """Measure flights (frames, drones, 3) with white errors; permute the tracks from each frame of `exchanges` on."""
+def simulate_tracks(flown_m, std_m=0.01, seed=0, exchanges=(), size_m=None):
+    """Measure flights (frames, drones, 3) with white errors; `exchanges` are (first frame, permutation of tracks)."""
     frames, drones, _ = flown_m.shape
     rng = np.random.default_rng(seed)
     std_m = np.broadcast_to(std_m, (frames, drones))
     truth = np.tile(np.arange(drones), (frames, 1))
     for frame, permutation in exchanges:
         truth[frame:] = np.array(permutation)[truth[frame]]
-    whole = Seen(
+    by_drones = LabelledTracks(
         time_s=np.arange(frames) * DT_S,
         measured_m=flown_m + std_m[..., None] * rng.normal(size=flown_m.shape),
         covariance_m2=std_m[..., None, None] ** 2 * np.eye(3),
@@ -54,22 +63,22 @@ def seen(flown_m, std_m=0.01, seed=0, exchanges=(), size_m=None):
         truth=truth,
         size_m=size_m,
     )
-    return by_tracks(whole, truth)
+    return order_by_tracks(by_drones, truth)
 
 
-def by_tracks(whole, truth):
-    """Move each drone's columns to the columns of its tracks in `truth`."""
+def order_by_tracks(by_drones, truth):
+    """Move the columns of each drone to the columns of its tracks in `truth`."""
     column = np.argsort(truth, axis=1)
 
-    def moved(value):
+    def reorder(value):
         return None if value is None else relabelled(value, column)
 
     return replace(
-        whole,
-        measured_m=moved(whole.measured_m),
-        covariance_m2=moved(whole.covariance_m2),
-        was_measured=moved(whole.was_measured),
-        size_m=moved(whole.size_m),
+        by_drones,
+        measured_m=reorder(by_drones.measured_m),
+        covariance_m2=reorder(by_drones.covariance_m2),
+        was_measured=reorder(by_drones.was_measured),
+        size_m=reorder(by_drones.size_m),
     )
 
 
@@ -89,15 +98,15 @@ def outcomes(found):
     return [encounter.outcome for encounter in found.encounters]
 
 
-def apart_m(flown_m):
-    """(frames, drones), distance to the nearest other drone."""
+def nearest_distance_m(flown_m):
+    """(frames, drones), distance to the nearest other drone, metres."""
     distance_m = np.linalg.norm(flown_m[:, :, None] - flown_m[:, None], axis=-1)
     distance_m[:, np.eye(flown_m.shape[1], dtype=bool)] = np.inf
     return distance_m.min(axis=-1)
 
 
-def lasting(rng, shape, time_s=0.4):
-    """(frames, ...), errors of variance 1 that last for some time: a first-order autoregression."""
+def correlated_errors(rng, shape, time_s=0.4):
+    """(frames, ...), errors of variance 1 with a correlation time, seconds: a first-order autoregression."""
     left = np.exp(-DT_S / time_s)
     error = np.empty(shape)
     error[0] = rng.normal(size=shape[1:])
@@ -106,6 +115,7 @@ def lasting(rng, shape, time_s=0.4):
     return error
 
 
+#: Times of 100 frames before and after frame 50, seconds.
 SECONDS = (np.arange(100) - 50) * DT_S
 
 
@@ -132,23 +142,23 @@ def hovering(together_m=0.15, hover_s=1.4):
 
 
 def merging(flown_m, merge_m=0.3):
-    """Two drones whose silhouettes merge below a distance; then both are measured in the merged silhouette's middle."""
-    share = np.clip(2 * (1 - apart_m(flown_m) / merge_m), 0, 1)[..., None]
+    """Positions that are measured if silhouettes merge below a distance: both drones are at the middle of both."""
+    share = np.clip(2 * (1 - nearest_distance_m(flown_m) / merge_m), 0, 1)[..., None]
     return flown_m + share * (flown_m.mean(axis=1, keepdims=True) - flown_m)
 
 
 class TestTwoDrones:
     @pytest.mark.parametrize("std_m", [0.005, 0.01, 0.02, 0.03])
     @pytest.mark.parametrize("flight", [passing, turning_back])
-    def test_right_labels_are_kept(self, flight, std_m):
-        tracks = seen(flight(), std_m)
+    def test_correct_labels_are_kept(self, flight, std_m):
+        tracks = simulate_tracks(flight(), std_m)
         found = resolved(tracks)
         np.testing.assert_array_equal(found.order, tracks.truth)
         (encounter,) = found.encounters
         assert encounter.outcome is LabelOutcome.KEPT
         assert encounter.drones == (0, 1)
         assert encounter.log_odds < np.log(0.01)
-        # Errors of some hundredths shift the frame where tenths of a metre are the least.
+        # Errors of a few centimetres shift the frame of the least distance, which is 0.3 m.
         assert abs(encounter.closest_frame - 50) <= 3
         assert encounter.distance_m == pytest.approx(0.3, abs=6 * std_m)
         assert encounter.first_frame < 45 < 55 < encounter.last_frame < 75
@@ -156,50 +166,52 @@ class TestTwoDrones:
     @pytest.mark.parametrize("std_m", [0.005, 0.03])
     @pytest.mark.parametrize("frame", [46, 50, 53])
     @pytest.mark.parametrize("flight", [passing, turning_back])
-    def test_swapped_labels_are_mended(self, flight, frame, std_m):
-        tracks = seen(flight(), std_m, exchanges=[(frame, (1, 0))])
+    def test_swapped_labels_are_corrected(self, flight, frame, std_m):
+        tracks = simulate_tracks(flight(), std_m, exchanges=[(frame, (1, 0))])
         found = resolved(tracks)
         assert outcomes(found) == [LabelOutcome.SWAPPED]
         assert found.encounters[0].log_odds > np.log(99)
-        # 0.3 m apart and more, one frame tells; of 0.03 m, two.
+        # At distances of 0.3 m and more, labels are wrong in one frame; with errors of 0.03 m, in two frames.
         assert (found.order != tracks.truth).any(axis=1).sum() <= 2
 
     @pytest.mark.parametrize("exchanged", [False, True])
-    def test_who_hovers_together_is_ambiguous(self, exchanged):
+    def test_drones_that_hover_together_are_ambiguous(self, exchanged):
         """Both drones share a silhouette for more than a second, so their identities after it cannot be known."""
-        found = resolved(seen(merging(hovering()), exchanges=[(50, (1, 0))] * exchanged))
+        found = resolved(simulate_tracks(merging(hovering()), exchanges=[(50, (1, 0))] * exchanged))
         assert outcomes(found) == [LabelOutcome.UNDECIDED]
         assert (found.order == [0, 1]).all()
         last = found.encounters[0].last_frame
-        # Even odds, but for what is left of the course that they had more than a second ago: measured 0.41 to 0.62.
+        # Odds are nearly even; the course of more than a second ago has little influence. Measured 0.41 to 0.62.
         assert (np.abs(found.ambiguity[[50, 60, 70, last], 0] - 0.5) < 0.15).all()
         assert (found.ambiguity[last + 1 :] == 0).all()
 
     @pytest.mark.parametrize("exchanged", [False, True])
-    def test_sizes_tell_who_hovered(self, exchanged):
+    def test_sizes_decide_the_identities_of_drones_that_hovered(self, exchanged):
         """One drone is a fifth larger; because errors are correlated, the decision takes some tenths of a second."""
         flown_m = np.concatenate([np.repeat(hovering()[:1], 200, axis=0), merging(hovering())])
         usual_m = np.array([[0.36, 0.36, 0.12], [0.30, 0.30, 0.10]])
-        size_m = usual_m + 0.01 * lasting(np.random.default_rng(1), (360, 2, 3))
-        # Where silhouettes merge, sizes are those of both together.
-        size_m[apart_m(flown_m) < 0.3] = 0.5
-        tracks = seen(flown_m, exchanges=[(250, (1, 0))] * exchanged, size_m=size_m)
+        size_m = usual_m + 0.01 * correlated_errors(np.random.default_rng(1), (360, 2, 3))
+        # The measured size of merged silhouettes is that of both drones together.
+        size_m[nearest_distance_m(flown_m) < 0.3] = 0.5
+        tracks = simulate_tracks(flown_m, exchanges=[(250, (1, 0))] * exchanged, size_m=size_m)
         found = resolved(tracks)
         assert outcomes(found) == [LabelOutcome.SWAPPED if exchanged else LabelOutcome.KEPT]
-        # While they are one silhouette nobody can say which frame it was.
-        apart = apart_m(flown_m) > 0.3
-        np.testing.assert_array_equal(found.order[apart], tracks.truth[apart])
+        # The frame of the swap cannot be determined while the silhouettes are merged.
+        separate = nearest_distance_m(flown_m) > 0.3
+        np.testing.assert_array_equal(found.order[separate], tracks.truth[separate])
 
     @pytest.mark.parametrize("exchanged", [False, True])
-    def test_sizes_of_drones_that_are_alike_tell_nothing(self, exchanged):
+    def test_equal_sizes_decide_nothing(self, exchanged):
         flown_m = np.concatenate([np.repeat(hovering()[:1], 200, axis=0), merging(hovering())])
-        size_m = np.array([0.36, 0.36, 0.12]) + 0.01 * lasting(np.random.default_rng(2), (360, 2, 3))
-        found = resolved(seen(flown_m, exchanges=[(250, (1, 0))] * exchanged, size_m=size_m))
+        size_m = np.array([0.36, 0.36, 0.12]) + 0.01 * correlated_errors(
+            np.random.default_rng(2), (360, 2, 3)
+        )
+        found = resolved(simulate_tracks(flown_m, exchanges=[(250, (1, 0))] * exchanged, size_m=size_m))
         assert outcomes(found) == [LabelOutcome.UNDECIDED]
         assert abs(found.ambiguity[found.encounters[0].last_frame, 0] - 0.5) < 0.2
 
     def test_ambiguity_begins_with_the_encounter_and_ends_with_it(self):
-        found = resolved(seen(passing(0.2), 0.02))
+        found = resolved(simulate_tracks(passing(0.2), 0.02))
         (encounter,) = found.encounters
         opened = np.zeros(100, bool)
         opened[encounter.first_frame : encounter.last_frame + 1] = True
@@ -208,25 +220,25 @@ class TestTwoDrones:
         np.testing.assert_array_equal(found.pairs, [[0, 1]])
 
     @pytest.mark.parametrize("exchanged", [False, True])
-    def test_a_stretch_without_measurements(self, exchanged):
-        """Around the closest frame, for eight frames no drone is measured, or one of them on the other's track."""
-        tracks = seen(passing(0.15), exchanges=[(50, (1, 0))] * exchanged)
+    def test_frames_without_measurements(self, exchanged):
+        """In eight frames around the closest frame, both tracks or one of them have no measurements."""
+        tracks = simulate_tracks(passing(0.15), exchanges=[(50, (1, 0))] * exchanged)
         for hidden in ([0, 1], [0], [1]):
             was_measured = tracks.was_measured.copy()
             was_measured[46:54, hidden] = False
             measured_m = np.where(was_measured[..., None], tracks.measured_m, np.nan)
             found = resolved(replace(tracks, was_measured=was_measured, measured_m=measured_m))
             assert outcomes(found) == [LabelOutcome.SWAPPED if exchanged else LabelOutcome.KEPT]
-            # What is not measured is nobody's: only frames outside of the stretch count.
+            # Labels are undefined in frames without measurements.
             assert (found.order == tracks.truth)[was_measured.all(axis=1)].all()
 
-    def test_exchanged_and_back_again(self):
-        """Twenty frames with the wrong labels in an encounter that ends with the right ones."""
-        tracks = seen(passing(0.4, 0.1), exchanges=[(40, (1, 0)), (60, (1, 0))])
+    def test_labels_swapped_twice_in_an_encounter(self):
+        """An encounter has wrong labels for twenty frames, and ends with the correct labels."""
+        tracks = simulate_tracks(passing(0.4, 0.1), exchanges=[(40, (1, 0)), (60, (1, 0))])
         np.testing.assert_array_equal(resolved(tracks).order, tracks.truth)
 
-    def test_far_apart_nothing_is_said(self):
-        tracks = seen(passing(0.8))
+    def test_distant_drones_have_no_encounter(self):
+        tracks = simulate_tracks(passing(0.8))
         found = resolved(tracks)
         assert found.encounters == ()
         assert (found.ambiguity == 0).all()
@@ -234,30 +246,30 @@ class TestTwoDrones:
 
     @pytest.mark.parametrize("exchanged", [False, True])
     def test_merged_silhouettes_in_a_pass(self, exchanged):
-        """For some tenths of a second both are measured at the same place; only their earlier course may decide."""
-        tracks = seen(merging(passing(0.15)), exchanges=[(50, (1, 0))] * exchanged)
+        """For a few tenths of a second both drones are measured at one place; only their earlier course can decide."""
+        tracks = simulate_tracks(merging(passing(0.15)), exchanges=[(50, (1, 0))] * exchanged)
         found = resolved(tracks)
         assert outcomes(found) == [LabelOutcome.SWAPPED if exchanged else LabelOutcome.KEPT]
         np.testing.assert_array_equal(found.order[[0, -1]], tracks.truth[[0, -1]])
 
     def test_a_drone_that_appears_beside_another(self):
-        tracks = seen(passing())
+        tracks = simulate_tracks(passing())
         was_measured = tracks.was_measured.copy()
         was_measured[:48, 1] = False
         found = resolved(replace(tracks, was_measured=was_measured))
         assert outcomes(found) == [LabelOutcome.KEPT]
         assert (found.order == [0, 1]).all()
 
-    def test_a_meeting_that_does_not_end(self):
-        tracks = seen(passing()[:51], exchanges=[(48, (1, 0))])
+    def test_an_encounter_that_lasts_until_the_end(self):
+        tracks = simulate_tracks(passing()[:51], exchanges=[(48, (1, 0))])
         found = resolved(tracks)
         assert outcomes(found) == [LabelOutcome.OPEN]
         assert found.encounters[0].last_frame == 50
         np.testing.assert_array_equal(found.order, tracks.truth)
 
-    def test_a_drone_that_never_comes_back(self):
+    def test_a_drone_that_is_lost_in_an_encounter(self):
         """After `patience_s` the encounter ends without a decision."""
-        tracks = seen(passing())
+        tracks = simulate_tracks(passing())
         was_measured = tracks.was_measured.copy()
         was_measured[50:, 1] = False
         params = IdentityParams(encounter_m=ENCOUNTER_M, patience_s=0.8)
@@ -268,15 +280,15 @@ class TestTwoDrones:
 
 
 def meeting_in_the_middle(drones, nearest_m=0.25, speed_m_s=1.0):
-    """Drones from all sides that pass each other, all nearest in frame 50."""
+    """(100, drones, 3), drones that come from all sides and pass each other, nearest in frame 50."""
     angle = 2 * np.pi * np.arange(drones) / drones
     ahead = np.stack([np.cos(angle), np.sin(angle), np.zeros(drones)], axis=-1)
     aside = np.stack([-np.sin(angle), np.cos(angle), np.zeros(drones)], axis=-1)
     return speed_m_s * SECONDS[:, None, None] * ahead + nearest_m * aside
 
 
-def assert_mended(found, tracks):
-    """Assert correct labels, except near the swaps, where the order of several swaps may differ by a frame."""
+def assert_corrected(found, tracks):
+    """Assert correct labels, except in two frames near the swaps, because the order of several swaps may differ."""
     wrong = np.flatnonzero((found.order != tracks.truth).any(axis=1))
     assert len(wrong) <= 2
     assert (np.abs(wrong - 50) <= 2).all()
@@ -284,26 +296,26 @@ def assert_mended(found, tracks):
 
 class TestMoreDrones:
     @pytest.mark.parametrize("permutation", list(permutations(range(3))))
-    def test_three_that_meet_at_once(self, permutation):
-        tracks = seen(meeting_in_the_middle(3), exchanges=[(50, permutation)])
+    def test_three_drones_that_meet_at_once(self, permutation):
+        tracks = simulate_tracks(meeting_in_the_middle(3), exchanges=[(50, permutation)])
         found = resolved(tracks)
-        assert_mended(found, tracks)
+        assert_corrected(found, tracks)
         assert len(found.encounters) == 3
         for encounter in found.encounters:
             one, other = encounter.drones
             mixed = permutation[one] == other or permutation[other] == one
             assert encounter.outcome is (LabelOutcome.SWAPPED if mixed else LabelOutcome.KEPT)
 
-    def test_two_exchanges_at_different_times(self):
-        """Three tracks are permuted in two steps, and each step is undone in its frame."""
-        tracks = seen(meeting_in_the_middle(3), exchanges=[(46, (1, 0, 2)), (54, (0, 2, 1))])
+    def test_two_swaps_at_different_times(self):
+        """Three tracks are permuted in two steps, and each step is corrected in its frame."""
+        tracks = simulate_tracks(meeting_in_the_middle(3), exchanges=[(46, (1, 0, 2)), (54, (0, 2, 1))])
         np.testing.assert_array_equal(resolved(tracks).order, tracks.truth)
 
-    def test_four_and_a_bystander(self):
+    def test_four_drones_that_meet_and_one_far_away(self):
         flown_m = np.concatenate([meeting_in_the_middle(4), np.full((100, 1, 3), 2.0)], axis=1)
-        tracks = seen(flown_m, exchanges=[(50, (2, 3, 1, 0, 4))])
+        tracks = simulate_tracks(flown_m, exchanges=[(50, (2, 3, 1, 0, 4))])
         found = resolved(tracks)
-        assert_mended(found, tracks)
+        assert_corrected(found, tracks)
         assert (found.ambiguity[:, (found.pairs == 4).any(axis=1)] == 0).all()
         assert (found.ambiguity[:, (found.pairs != 4).all(axis=1)] > 0).any(axis=0).all()
 
@@ -312,23 +324,25 @@ class TestMoreDrones:
         one = passing(0.3, 0.3)
         flown_m = np.concatenate([one, one + np.array([0.0, 1.6, 0.0])], axis=1)
         flown_m[..., 1] += np.array([1.0, 1.0, -1.0, -1.0]) * np.clip(SECONDS[:, None] + 0.4, 0, 1) * 0.55
-        assert apart_m(flown_m).min() > 0.1
-        tracks = seen(flown_m, exchanges=[(40, (1, 0, 2, 3)), (45, (0, 1, 3, 2)), (63, (2, 1, 0, 3))])
+        assert nearest_distance_m(flown_m).min() > 0.1
+        tracks = simulate_tracks(
+            flown_m, exchanges=[(40, (1, 0, 2, 3)), (45, (0, 1, 3, 2)), (63, (2, 1, 0, 3))]
+        )
         found = resolved(tracks)
         np.testing.assert_array_equal(found.order, tracks.truth)
         assert {encounter.first_frame for encounter in found.encounters} != {0}
 
-    def test_five_at_once_are_more_than_one_group_holds(self):
-        """Correct labels stay correct, and the reported ambiguity is a probability."""
-        found = resolved(seen(meeting_in_the_middle(5)))
+    def test_five_drones_at_once_exceed_the_size_of_a_group(self):
+        """Correct labels are kept, and the reported ambiguity is a probability."""
+        found = resolved(simulate_tracks(meeting_in_the_middle(5)))
         assert (found.order == np.arange(5)).all()
         assert ((found.ambiguity >= 0) & (found.ambiguity <= 1)).all()
 
-    def test_who_leaves_a_group_is_settled_before_those_who_stay(self):
-        """Two drones fly side by side all the time, and a third drone passes."""
+    def test_a_drone_that_leaves_a_group_is_decided_before_the_group_ends(self):
+        """Two drones stay side by side, and a third drone passes them."""
         still = np.stack([np.array([[0.0, y, 1.0]]) for y in (0.0, 0.45)], axis=1).repeat(100, axis=0)
         third = np.stack([2 * SECONDS, np.full(100, -0.3), np.ones(100)], axis=-1)[:, None]
-        tracks = seen(np.concatenate([still, third], axis=1), exchanges=[(50, (2, 1, 0))])
+        tracks = simulate_tracks(np.concatenate([still, third], axis=1), exchanges=[(50, (2, 1, 0))])
         found = resolved(tracks)
         np.testing.assert_array_equal(found.order, tracks.truth)
         (passed,) = (encounter for encounter in found.encounters if encounter.drones == (0, 2))
@@ -341,7 +355,9 @@ class TestMoreDrones:
     def test_names_of_drones_do_not_matter(self, seed):
         rng = np.random.default_rng(seed)
         flown_m = meeting_in_the_middle(4, rng.uniform(0.05, 0.4), rng.uniform(0.5, 2.0))
-        tracks = seen(flown_m, rng.uniform(0.005, 0.03), seed, [(rng.integers(44, 57), rng.permutation(4))])
+        tracks = simulate_tracks(
+            flown_m, rng.uniform(0.005, 0.03), seed, [(rng.integers(44, 57), rng.permutation(4))]
+        )
         tracks.was_measured[rng.random((100, 4)) < 0.1] = False
         names = rng.permutation(4)
         found = resolved(tracks)
@@ -360,12 +376,12 @@ class TestMoreDrones:
         # The tolerance is for sums of 24 terms in another order, over a hundred frames.
         np.testing.assert_allclose(renamed.ambiguity[:, columns], found.ambiguity, rtol=0, atol=1e-9)
 
-    def test_the_first_frames_by_themselves(self):
+    def test_the_first_frames_alone_give_the_same_result(self):
         """The first frames alone give the same result as all frames, up to the first frame that is still uncertain."""
         time_s = np.arange(300) * DT_S
         x = 1.5 * np.sin(time_s[:, None] * [1.1, 0.9, 1.3] + [0.0, 2.0, 4.0])
         flown_m = np.stack([x, 0.1 * np.arange(3) * np.ones_like(x), np.ones_like(x)], axis=-1)
-        tracks = seen(flown_m, 0.02, exchanges=[(100, (1, 0, 2)), (200, (0, 2, 1))])
+        tracks = simulate_tracks(flown_m, 0.02, exchanges=[(100, (1, 0, 2)), (200, (0, 2, 1))])
         whole = resolved(tracks)
         assert len(whole.encounters) > 8
         for frames in range(20, 300, 56):
@@ -381,18 +397,20 @@ class TestMoreDrones:
             assert found.encounters[:settled] == whole.encounters[:settled]
 
     def test_one_drone(self):
-        found = resolved(seen(passing()[:, :1]))
+        found = resolved(simulate_tracks(passing()[:, :1]))
         assert (found.order == 0).all()
         assert found.pairs.shape == (0, 2)
         assert found.ambiguity.shape == (100, 0)
 
 
 def all_histories(model, start, frames, rate):
-    """Exact posterior of the labels of two drones after the frames, and their mean states, history by history.
+    """Exact log posterior of the two labellings after the frames, and mean states, from all label histories.
 
     Args:
-        start: per drone, the measurements and covariances that its state is learned from.
-        frames: measurements (2, 3) and covariances (2, 3, 3), by tracks, of every frame.
+        model: motion model of both drones.
+        start: measurements and covariances of each drone before the encounter.
+        frames: measurements (2, 3) and covariances (2, 3, 3) of the two tracks, for each frame of the encounter.
+        rate: odds of a swap in a frame.
     """
     H, weights, means = model.H, {0: [], 1: []}, {0: [], 1: []}
     stay, go = -np.log1p(rate), np.log(rate) - np.log1p(rate)
@@ -428,7 +446,7 @@ def all_histories(model, start, frames, rate):
 class TestLabellings:
     @pytest.mark.parametrize("share", [0.0, 0.5])
     @pytest.mark.parametrize(("frames", "limit", "limit_m"), [(1, 1e-9, 1e-9), (7, 0.02, 0.003)])
-    def test_all_histories_one_by_one(self, frames, limit, limit_m, share):
+    def test_the_posterior_equals_that_of_all_histories(self, frames, limit, limit_m, share):
         """Exact after one frame. After seven frames, with 128 histories, merging changes little: measured 0.8 mm."""
         model = Model(density=10.0, error_share=share)
         for seed in range(3):
@@ -437,7 +455,7 @@ class TestLabellings:
                 [np.outer(np.arange(20) * DT_S, 0.1 * rng.normal(size=3)) for _ in range(2)], axis=1
             )
             flown_m += 0.01 * rng.normal(size=(2, 3)) - flown_m[13]
-            # Errors are half of their standard deviation, so that none is beyond the gate, which the textbook lacks.
+            # Errors are half as large as stated, so that none is beyond the gate, which the oracle does not have.
             measured_m = flown_m + 0.01 * rng.normal(size=flown_m.shape)
             covariance_m2 = np.broadcast_to(0.02**2 * np.eye(3), (20, 2, 3, 3))
             start = [(measured_m[:10, drone], covariance_m2[:10, drone]) for drone in (0, 1)]
@@ -464,8 +482,8 @@ class TestLabellings:
             np.testing.assert_allclose(np.asarray(bank.state.position_m), position_m, rtol=0, atol=limit_m)
 
     @pytest.mark.parametrize("drones", [1, 2, 3, 4])
-    def test_exchanges_are_counted(self, drones):
-        """Compared with a search through all swaps until every labelling is reached."""
+    def test_numbers_of_exchanges_equal_those_of_a_search(self, drones):
+        """The oracle is a breadth-first search through all swaps."""
         all_of = [tuple(row) for row in labellings.labellings(drones).tolist()]
         assert all_of[0] == tuple(range(drones))
         assert set(all_of) == set(permutations(range(drones)))
@@ -480,20 +498,21 @@ class TestLabellings:
                         left.append(later)
             np.testing.assert_array_equal(labellings.exchanges(drones)[index], [steps[row] for row in all_of])
 
-    def test_changes_are_exchanges_of_tracks_that_may(self):
+    def test_changes_exchange_only_active_pairs_of_tracks(self):
         active = np.zeros((3, 3), bool)
         active[0, 2] = active[2, 0] = True
         log_change = labellings.change_log_probability(active, 0.25)
-        # Two outcomes with odds 4 to 1, for all drones on the tracks 0 and 2.
+        # Each labelling has two outcomes with odds of 4 to 1: unchanged, or tracks 0 and 2 exchanged.
         for before, row in zip(labellings.labellings(3), np.exp(log_change), strict=True):
             swapped = (labellings.labellings(3) == np.array([2, 1, 0])[before]).all(axis=1)
             same = (labellings.labellings(3) == before).all(axis=1)
             np.testing.assert_allclose(row, 0.2 * swapped + 0.8 * same, rtol=0, atol=1e-12)
 
     def test_confusions_by_hand(self):
-        """Reported 0, 1, 2; in truth drone 0 is on track 1, 1 on 2, and 2 on 0: all pairs are confused."""
+        """Confused pairs of three drones, for a reported and a true labelling."""
         wrong = labellings.confusions(3)
         index = {tuple(row): at for at, row in enumerate(labellings.labellings(3).tolist())}
+        # Reported 0, 1, 2; in truth drone 0 is on track 1, drone 1 on track 2 and drone 2 on track 0: all are confused.
         assert wrong[0, index[1, 2, 0]].tolist() == [True, True, True]
         assert wrong[0, index[1, 0, 2]].tolist() == [True, False, False]
         assert wrong[0, index[2, 1, 0]].tolist() == [False, True, False]
@@ -502,8 +521,8 @@ class TestLabellings:
         # Reported 1, 0, 2, in truth 2, 0, 1: track 1 is reported as 0 and is 2; track 2 is reported as 2 and is 0.
         assert wrong[index[1, 0, 2], index[2, 0, 1]].tolist() == [False, True, False]
 
-    def test_smoothed_is_bayes_rule_backwards(self):
-        """Compared with the joint distribution of three frames of a chain of three labellings."""
+    def test_smoothed_labels_equal_the_joint_distributions_marginals(self):
+        """The oracle is the joint distribution of three frames of a chain with three labellings."""
         rng = np.random.default_rng(0)
         before = rng.random((3, 3, 3))
         before /= before.sum(axis=1, keepdims=True)
@@ -513,48 +532,48 @@ class TestLabellings:
             found, [joint.sum(axis=1), joint.sum(axis=0), [0, 0, 1]], rtol=0, atol=1e-15
         )
 
-    def test_path_by_hand(self):
-        """One wrong frame does not justify two changes of cost 1.5 each; four wrong frames do."""
+    def test_best_path_by_hand(self):
+        """Two changes of cost 1.5 each are too expensive for one frame, but not for four frames."""
         cost = 1.5 * (1 - np.eye(2))
         for stretch, expected in ((1, [0] * 6), (4, [0, 1, 1, 1, 1, 0])):
             right = np.eye(2)[[0] + [1] * stretch + [0] * (5 - stretch)]
             assert labellings.best_path(right, cost).tolist() == expected
         assert labellings.best_path(np.eye(2)[[0, 0, 1, 1]], 10 * cost).tolist()[-1] == 1
 
-    def test_joined_keeps_what_was_known(self):
+    def test_labellings_of_a_joined_group_keep_those_of_its_parts(self):
         kept, index = labellings.embedding(2, 1)
         assert kept.tolist() == [True, False, True, False, False, False]
         np.testing.assert_array_equal(index[kept], [[0, 0], [1, 0]])
 
 
 class TestLikeness:
-    def test_a_second_of_one_look_is_worth_one_look(self):
-        """Errors that last for 2 s, compared with independent errors: fifty frames count as one."""
+    def test_correlated_size_measurements_count_less(self):
+        """Size errors that are constant for 2 s, compared with independent errors: fifty frames count as one."""
         rng = np.random.default_rng(0)
         time_s = np.arange(2000) * DT_S
         white_m = 0.01 * rng.normal(size=(2000, 2, 3))
-        stuck_m = np.repeat(white_m[::50], 50, axis=0)
-        worth = [
+        constant_m = np.repeat(white_m[::50], 50, axis=0)
+        covariances_m2 = [
             np.linalg.inv(likeness.learn_likeness(time_s, off_m + 0.3).precision_m2)
-            for off_m in (white_m, stuck_m)
+            for off_m in (white_m, constant_m)
         ]
-        # Variances of 40 values are known to a sixth; the limit is three times as much.
-        for found, times in zip(worth, (1 + 1, 1 + 50), strict=True):
+        # Variances of 40 values have errors of a sixth; the limit is three times as large.
+        for found, times in zip(covariances_m2, (1 + 1, 1 + 50), strict=True):
             np.testing.assert_allclose(np.diag(found), times * 0.01**2, rtol=0.5)
 
-    def test_drones_that_are_alike_are_not_told_apart(self):
-        """With correlated errors, two seconds decide nothing in nearly all of a hundred pairs of equal drones."""
+    def test_drones_of_equal_size_are_not_distinguished(self):
+        """With correlated errors, two seconds decide nothing for nearly all of a hundred pairs of equal drones."""
         time_s = np.arange(250) * DT_S
         evidence = []
         for seed in range(100):
-            size_m = 0.3 + 0.01 * lasting(np.random.default_rng(seed), (300, 2, 3))
+            size_m = 0.3 + 0.01 * correlated_errors(np.random.default_rng(seed), (300, 2, 3))
             known = likeness.learn_likeness(time_s, size_m[:250])
             fit = sum(likeness.log_likelihood(known, row, np.ones(2, bool)) for row in size_m[250:])
             evidence.append(fit[0, 1] + fit[1, 0] - fit[0, 0] - fit[1, 1])
         # Measured 97 of 100 below 1.
         assert (np.abs(evidence) < 1).mean() > 0.9
 
-    def test_what_is_not_clear_says_nothing(self):
+    def test_unclear_or_unknown_sizes_have_no_likelihood(self):
         time_s = np.arange(500) * DT_S
         size_m = np.array([[0.3], [0.4]]) + 0.01 * np.random.default_rng(1).normal(size=(500, 2, 3))
         known = likeness.learn_likeness(time_s, size_m)
@@ -563,7 +582,7 @@ class TestLikeness:
         assert likeness.log_likelihood(known, unknown_m, np.ones(2, bool))[:, 1].tolist() == [0, 0]
         assert likeness.log_likelihood(None, unknown_m, np.ones(2, bool)).tolist() == [[0, 0], [0, 0]]
 
-    def test_too_little_is_nothing(self):
+    def test_too_few_size_measurements_are_not_used(self):
         time_s = np.arange(500) * DT_S
         size_m = 0.01 * np.random.default_rng(1).normal(size=(500, 2, 3))
         assert likeness.learn_likeness(time_s, size_m) is not None
@@ -572,7 +591,7 @@ class TestLikeness:
         size_m[100:, 1] = np.nan
         assert likeness.learn_likeness(time_s, size_m) is None
 
-    def test_a_wild_size_does_not_spoil_what_is_learned(self):
+    def test_outliers_hardly_change_the_typical_size(self):
         time_s = np.arange(500) * DT_S
         size_m = np.array([[0.3], [0.4]]) + 0.01 * np.random.default_rng(1).normal(size=(500, 2, 3))
         known = likeness.learn_likeness(time_s, size_m)
@@ -582,7 +601,7 @@ class TestLikeness:
         np.testing.assert_allclose(spoilt.typical_m, known.typical_m, rtol=0, atol=0.0015)
 
 
-class TestRefusals:
+class TestInvalidInput:
     @pytest.mark.parametrize(
         ("name", "value"),
         [
@@ -593,25 +612,26 @@ class TestRefusals:
             ("decision_probability", 1.0),
         ],
     )
-    def test_settings_that_make_no_sense(self, name, value):
+    def test_invalid_settings(self, name, value):
         with pytest.raises(SettingsError, match=name):
             IdentityParams(**{name: value})
 
-    def test_measurements_that_are_none(self):
-        tracks = seen(passing())
+    def test_measurements_that_are_not_finite(self):
+        tracks = simulate_tracks(passing())
         tracks.measured_m[7, 1, 2] = np.nan
         with pytest.raises(InputError, match="row 7, drone 1"):
             resolved(tracks)
 
 
 class TestFrequencies:
-    def test_probabilities_are_how_often_labels_are_wrong(self):
+    def test_ambiguities_are_the_frequencies_of_wrong_labels(self):
         """A hundred encounters whose flights, errors and swaps follow the model.
 
-        While two are near their tracks are exchanged five times per second, and errors are as large as they are taken
-        to be there. Where something is in doubt, as many labels are wrong as it says, to within 4 standard deviations
-        of the binomial distribution, of which one test in some thousand fails by chance. Where labels are held to be
-        certain, few are wrong: measured 1 and 2 % of four hundred, for the histories that were merged.
+        While two drones are near, their tracks are exchanged five times per second, and measurement errors are as large
+        as the model assumes. In each interval of the ambiguity, the number of wrong labels agrees with the ambiguity,
+        to within 4 standard deviations of the binomial distribution, which is exceeded by chance in one of some
+        thousand tests. Labels with a low ambiguity are rarely wrong: measured 1 and 2 % of four hundred, because label
+        histories are merged.
         """
         rate = 5.0 * DT_S
         probability, wrong = [], []
@@ -619,17 +639,17 @@ class TestFrequencies:
             rng = np.random.default_rng(seed)
             flown_m, near = white_jerk_meetings(rng, pairs=20)
             std_m = rng.uniform(0.005, 0.03)
-            nearness = np.clip(1 - apart_m(flown_m) / ENCOUNTER_M, 0, 1)
+            nearness = np.clip(1 - nearest_distance_m(flown_m) / ENCOUNTER_M, 0, 1)
             noise_m = np.hypot(std_m, 0.1 * ENCOUNTER_M * nearness**2)
             truth = np.tile(np.arange(40), (len(flown_m), 1))
             for frame, pair in np.argwhere(near & (rng.random(near.shape) < rate / (1 + rate))):
                 truth[frame:, 2 * pair : 2 * pair + 2] = truth[frame:, 2 * pair : 2 * pair + 2][:, ::-1]
-            tracks = seen(flown_m + noise_m[..., None] * rng.normal(size=flown_m.shape), 0.0)
+            tracks = simulate_tracks(flown_m + noise_m[..., None] * rng.normal(size=flown_m.shape), 0.0)
             covariance_m2 = np.broadcast_to(std_m**2 * np.eye(3), (*noise_m.shape, 3, 3))
-            found = resolved(by_tracks(replace(tracks, covariance_m2=covariance_m2), truth))
+            found = resolved(order_by_tracks(replace(tracks, covariance_m2=covariance_m2), truth))
             for pair in range(20):
                 column = (found.pairs == [2 * pair, 2 * pair + 1]).all(axis=1).argmax()
-                # One frame of each, soon after they were nearest: the next would be no independent case.
+                # One frame per encounter, soon after the closest frame, because neighbouring frames are dependent.
                 row = 25 + rng.integers(10)
                 if found.ambiguity[row, column] > 0:
                     swapped = found.order[row, 2 * pair] != 2 * pair
@@ -652,7 +672,7 @@ class TestFrequencies:
 
     @pytest.mark.parametrize("name", ["S01_D2_A", "S04_D10"])
     def test_flights_of_the_simulator(self, name):
-        """At any noise, every swap is undone and no correct label is changed, for passes at 0.3 and 0.4 m."""
+        """For passes at 0.3 and 0.4 m and all noise levels, swaps are corrected and correct labels are kept."""
         recipe = scenario(name)
         flights = planning.plan(recipe, 0)
         time_s = planning.frame_times_s(recipe, recipe.num_frames)
@@ -666,13 +686,13 @@ class TestFrequencies:
                 for frames in np.split(near, np.flatnonzero(np.diff(near) > 1) + 1) if len(near) else []:
                     meetings += 1
                     nearest = frames[distance_m[frames, one, other].argmin()]
-                    # Before the first frame no tracks were exchanged: what it says is who is who.
+                    # The first frame defines the identities, so it has no swap.
                     if nearest > 0 and rng.random() < 0.5:
                         exchanges.append((nearest, one, other))
             truth = np.tile(np.arange(flown_m.shape[1]), (len(time_s), 1))
             for frame, one, other in exchanges:
                 truth[frame:, [one, other]] = truth[frame:, [other, one]]
-            found = resolved(by_tracks(seen(flown_m, std_m, seed), truth))
+            found = resolved(order_by_tracks(simulate_tracks(flown_m, std_m, seed), truth))
             np.testing.assert_array_equal(found.order, truth)
             assert len(found.encounters) == meetings > len(exchanges) > 0
             certain = [abs(encounter.log_odds) > np.log(99) for encounter in found.encounters]
@@ -680,7 +700,10 @@ class TestFrequencies:
 
 
 def white_jerk_meetings(rng, pairs, frames=50, density=AGILITY):
-    """Flights (frames, 2 * pairs, 3) with white jerk, pairs far apart, and (frames, pairs), whether a pair is near."""
+    """Flights of pairs of drones with white jerk; the pairs are far from each other.
+
+    Returns positions, (frames, 2 * pairs, 3), and whether the drones of a pair are near each other, (frames, pairs).
+    """
     F, Q = Model(density=density).transition(DT_S, np.eye(3))
     root = np.linalg.cholesky(Q)
     middle = frames // 2

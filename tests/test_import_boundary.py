@@ -1,6 +1,6 @@
-"""The shape of the house: who imports whom, what the core may use, and that importing has no effects.
+"""The order of imports between rooms, the libraries that the core may use, and the effects of importing the package.
 
-Imports are read from the syntax tree of every module, those inside of functions too, so that no path is missed.
+Imports are read from the syntax tree of every module, so that imports inside functions are checked too.
 """
 
 import ast
@@ -108,7 +108,7 @@ CORE = {
 CORE_MAY_USE = {"jax", "jaxtyping", "lazy_loader", "numpy"}
 
 #: Module or room -> modules and rooms that it must not import, although the order of rooms allows it.
-STRANGERS = {
+FORBIDDEN = {
     "tracking.swarm": {"tracking.fitness", "geometry"},
     "tracking.fitness": {"tracking.swarm"},
     "simulation": {"geometry.boxes", "tracking", "silhouettes", "pipeline", "methods"},
@@ -117,9 +117,10 @@ STRANGERS = {
 
 
 def imports(source, package="psotrack"):
-    """Dotted names of the modules that a source imports when it runs, relative imports resolved in `package`.
+    """Set of the dotted names that a source imports when it runs; relative imports are resolved in `package`.
 
-    `from a import b` yields a.b too, because b may be a module. What only type checkers read is left out.
+    For `from a import b` the set contains a.b too, because b may be a module. Imports below `if TYPE_CHECKING` are left
+    out.
     """
     found = set()
 
@@ -141,24 +142,24 @@ def imports(source, package="psotrack"):
     return found
 
 
-def name_of(path):
-    """The dotted name of a file relative to the package: `tracking.swarm`, `tracking` for its `__init__`."""
+def module_name(path):
+    """Dotted name of a file relative to the package: `tracking.swarm`, or `tracking` for its `__init__`."""
     return ".".join(part for part in path.with_suffix("").parts if part != "__init__")
 
 
-def is_within(name, places):
-    """Whether a dotted name is one of the places, or below one."""
-    return any(name == place or name.startswith(f"{place}.") for place in places)
+def is_within(name, parents):
+    """Whether a dotted name is one of `parents`, or below one of them."""
+    return any(name == parent or name.startswith(f"{parent}.") for parent in parents)
 
 
-def source_of(name):
-    """`geometry.Camera` is in `geometry.cameras`: where a name that a room exports comes from."""
+def resolve_export(name):
+    """Module that defines a name which a room exports: `geometry.Camera` -> `geometry.cameras`."""
     room, *rest = name.split(".")
     return f"{room}.{EXPORTS[room][rest[0]]}" if rest and rest[0] in EXPORTS.get(room, {}) else name
 
 
-def exports():
-    """Room -> name -> the module of the room that it is from, read from the rooms' `__init__.pyi`."""
+def read_exports():
+    """Room -> exported name -> module of the room that defines the name, read from the rooms' `__init__.pyi`."""
     found = {}
     for stub in PACKAGE.glob("*/__init__.pyi"):
         tree = ast.parse(stub.read_text(encoding="utf-8"))
@@ -171,13 +172,13 @@ def exports():
     return found
 
 
-EXPORTS = exports()
+EXPORTS = read_exports()
 
 
-def complaints(path, source):
-    """The imports of a module, at a path relative to the package, that break the rules above."""
-    me = name_of(path) or "__init__"
-    room = me.split(".")[0]
+def find_violations(path, source):
+    """Messages for the imports of a module that break the rules above; the path is relative to the package."""
+    importer = module_name(path) or "__init__"
+    room = importer.split(".")[0]
     if room == "__init__":
         return []
     if room not in ROOMS:
@@ -186,7 +187,7 @@ def complaints(path, source):
     for name in sorted(imports(source, ".".join(["psotrack", *path.parts[:-1]]))):
         top, _, rest = name.partition(".")
         if top != "psotrack":
-            if is_within(me, CORE) and top not in CORE_MAY_USE and top not in sys.stdlib_module_names:
+            if is_within(importer, CORE) and top not in CORE_MAY_USE and top not in sys.stdlib_module_names:
                 wrong.append(f"{path}: the core imports {name}")
             continue
         other = rest.split(".")[0]
@@ -195,29 +196,29 @@ def complaints(path, source):
         if ROOMS.index(other) > ROOMS.index(room):
             wrong.append(f"{path}: {room} imports {other}, a higher room")
         if room == other == "inside_out":
-            mine, its = (part.split(".")[1] if "." in part else "" for part in (me, rest))
-            if {mine, its} <= set(INSIDE_OUT) and INSIDE_OUT.index(its) > INSIDE_OUT.index(mine):
-                wrong.append(f"{path}: inside_out.{mine} imports inside_out.{its}, a higher room")
-        origin = source_of(rest)
-        for knower, unknown in STRANGERS.items():
-            if is_within(me, {knower}) and is_within(origin, unknown):
-                wrong.append(f"{path}: {knower} does not know {origin}")
+            inner, imported = (part.split(".")[1] if "." in part else "" for part in (importer, rest))
+            if {inner, imported} <= set(INSIDE_OUT) and INSIDE_OUT.index(imported) > INSIDE_OUT.index(inner):
+                wrong.append(f"{path}: inside_out.{inner} imports inside_out.{imported}, a higher room")
+        origin = resolve_export(rest)
+        for place, forbidden in FORBIDDEN.items():
+            if is_within(importer, {place}) and is_within(origin, forbidden):
+                wrong.append(f"{path}: {place} must not import {origin}")
         private = [part for part in rest.split(".")[1:] if part.startswith("_") and part != "__init__"]
         if private and other != room:
             wrong.append(f"{path}: {rest} is private to {other}")
     return wrong
 
 
-def test_every_module_keeps_to_the_order_of_rooms():
+def test_every_module_obeys_the_rules_of_imports():
     wrong = []
     for path in sorted(PACKAGE.rglob("*.py")):
-        wrong += complaints(path.relative_to(PACKAGE), path.read_text(encoding="utf-8"))
+        wrong += find_violations(path.relative_to(PACKAGE), path.read_text(encoding="utf-8"))
     assert wrong == []
 
 
-def test_the_lists_name_nothing_that_is_gone():
-    names = {name_of(path.relative_to(PACKAGE)) for path in PACKAGE.rglob("*.py")}
-    listed = {*ROOMS, *CORE, *STRANGERS, *(f"inside_out.{room}" for room in INSIDE_OUT)}
+def test_the_lists_contain_existing_modules_and_all_rooms():
+    names = {module_name(path.relative_to(PACKAGE)) for path in PACKAGE.rglob("*.py")}
+    listed = {*ROOMS, *CORE, *FORBIDDEN, *(f"inside_out.{room}" for room in INSIDE_OUT)}
     assert listed <= names
     assert {name.split(".")[0] for name in names if name} <= set(ROOMS)
 
@@ -228,7 +229,7 @@ def test_few_files_stand_at_the_root():
 
 @pytest.mark.parametrize("room", sorted(EXPORTS))
 def test_a_room_exports_what_its_stub_says(room):
-    """Names are loaded when they are asked for: each of them must be there, and the room must say what it is for."""
+    """Each lazily loaded name exists, and the room has a docstring that describes it."""
     module = importlib.import_module(f"psotrack.{room}")
     assert set(dir(module)) >= set(EXPORTS[room])
     for name in EXPORTS[room]:
@@ -237,7 +238,7 @@ def test_a_room_exports_what_its_stub_says(room):
 
 
 @pytest.mark.parametrize(
-    ("path", "source", "complaint"),
+    ("path", "source", "message"),
     [
         ("geometry/boxes.py", "import cv2", "the core imports cv2"),
         (
@@ -248,17 +249,17 @@ def test_a_room_exports_what_its_stub_says(room):
         ("geometry/cameras.py", "import matplotlib.pyplot as plt", "the core imports matplotlib.pyplot"),
         (
             "geometry/cameras.py",
-            "from psotrack.recordings import Sequence",
+            "from psotrack.recordings import Recording",
             "imports recordings, a higher room",
         ),
         ("geometry/cameras.py", "from psotrack import recordings", "imports recordings, a higher room"),
         (
             "tracking/swarm.py",
             "from psotrack.tracking.fitness import camera_scores",
-            "does not know tracking.fitness",
+            "must not import tracking.fitness",
         ),
-        ("tracking/swarm.py", "from psotrack.geometry import Camera", "does not know geometry.cameras"),
-        ("tracking/fitness.py", "import psotrack.tracking.swarm", "does not know tracking.swarm"),
+        ("tracking/swarm.py", "from psotrack.geometry import Camera", "must not import geometry.cameras"),
+        ("tracking/fitness.py", "import psotrack.tracking.swarm", "must not import tracking.swarm"),
         (
             "tracking/chunks.py",
             "from psotrack.evaluation import evaluate",
@@ -267,24 +268,24 @@ def test_a_room_exports_what_its_stub_says(room):
         (
             "evaluation/metrics.py",
             "from ..tracking import tracker",
-            "evaluation does not know tracking.tracker",
+            "evaluation must not import tracking.tracker",
         ),
-        ("simulation/renderer.py", "from ..geometry import project_boxes", "does not know geometry.boxes"),
+        ("simulation/renderer.py", "from ..geometry import project_boxes", "must not import geometry.boxes"),
         (
             "simulation/renderer.py",
             "if True:\n    from psotrack.tracking import fitness as f",
-            "does not know tracking",
+            "must not import tracking",
         ),
         ("cli/track.py", "from psotrack.datasets._poses import read_poses", "private to datasets"),
         ("inside_out/pose/fit.py", "from psotrack.inside_out.filtering.bank import init", "a higher room"),
         ("novelty.py", "", "not in the list of rooms"),
     ],
 )
-def test_a_planted_import_is_found(path, source, complaint):
-    assert any(complaint in wrong for wrong in complaints(Path(path), source))
+def test_a_forbidden_import_is_found(path, source, message):
+    assert any(message in wrong for wrong in find_violations(Path(path), source))
 
 
-def test_what_is_allowed_is_not_complained_of():
+def test_allowed_imports_give_no_message():
     source = """
 from typing import TYPE_CHECKING
 import numpy as np
@@ -295,15 +296,16 @@ if TYPE_CHECKING:
     import cv2
     from psotrack.pipeline import TrackSettings
 """
-    assert complaints(Path("tracking/tracker.py"), source) == []
+    assert find_violations(Path("tracking/tracker.py"), source) == []
     assert (
-        complaints(Path("evaluation/tables.py"), "from psotrack.evaluation.metrics import Evaluation") == []
+        find_violations(Path("evaluation/tables.py"), "from psotrack.evaluation.metrics import Evaluation")
+        == []
     )
 
 
 EFFECTS = """
 import os, sys
-import cv2, jax  # These two set variables of their own.
+import cv2, jax  # These two libraries set environment variables.
 before = dict(os.environ)
 import {module}
 assert dict(os.environ) == before, "environment variables"
@@ -313,8 +315,8 @@ assert not heavy, heavy
 """
 
 
-def python(code, **environment):
-    """Run code in a fresh interpreter, where no test has imported anything yet."""
+def run_python(code, **environment):
+    """Run code in a new interpreter, in which no module of the package is imported yet."""
     return subprocess.run(
         [sys.executable, "-c", code],
         capture_output=True,
@@ -326,18 +328,19 @@ def python(code, **environment):
 
 @pytest.mark.parametrize("module", ["psotrack", "psotrack.cli"])
 def test_importing_has_no_effects(module):
-    """With a platform that does not exist, any use of a device fails: importing must not need one."""
-    result = python(EFFECTS.format(module=module), JAX_PLATFORMS="nowhere")
+    """With a JAX platform that does not exist, any use of a device fails; importing must not use a device."""
+    result = run_python(EFFECTS.format(module=module), JAX_PLATFORMS="nowhere")
     assert result.returncode == 0, result.stderr
 
 
-def test_a_device_would_have_been_noticed():
-    result = python("import jax; jax.devices()", JAX_PLATFORMS="nowhere")
+def test_using_a_device_fails_on_an_unknown_platform():
+    """Show that the test above can fail."""
+    result = run_python("import jax; jax.devices()", JAX_PLATFORMS="nowhere")
     assert result.returncode != 0
     assert "nowhere" in result.stderr
 
 
-def with_examples():
+def modules_with_examples():
     return sorted(
         path.relative_to(PACKAGE.parent).with_suffix("").as_posix().replace("/", ".")
         for path in PACKAGE.rglob("*.py")
@@ -345,7 +348,7 @@ def with_examples():
     )
 
 
-@pytest.mark.parametrize("name", with_examples())
+@pytest.mark.parametrize("name", modules_with_examples())
 def test_examples_in_docstrings_run(name):
     result = doctest.testmod(importlib.import_module(name), optionflags=doctest.NORMALIZE_WHITESPACE)
     assert result.attempted > 0
@@ -353,13 +356,13 @@ def test_examples_in_docstrings_run(name):
 
 
 def test_annotations_are_enforced():
-    """The hook that checks shapes is on: without it these calls would be wrong silently, or fail somewhere deep."""
-    rig_of_three = np.zeros((7, 2, 3))  # (points, 2, cameras) instead of (points, cameras, 2).
+    """The hook that checks shapes is active: without it, wrong shapes give wrong results or errors deep in the code."""
+    swapped_axes = np.zeros((7, 2, 3))  # (points, 2, cameras) instead of (points, cameras, 2).
     with pytest.raises(jaxtyping.TypeCheckError, match="points_px"):
-        triangulate(ring_rig(3).cameras, rig_of_three)
+        triangulate(ring_rig(3).cameras, swapped_axes)
     edges = [jnp.zeros((2, 3))] * 3
     with pytest.raises(jaxtyping.TypeCheckError, match="y1"):
-        # The last edge has sets and boxes swapped.
+        # The axes of the last edge are swapped.
         box_sum(jnp.zeros((5, 3, 5), jnp.int32), jnp.arange(3), *edges, jnp.zeros((3, 2)))
     with pytest.raises(jaxtyping.TypeCheckError, match="tables"):
         box_sum(jnp.zeros((5, 3, 5), jnp.float32), jnp.arange(3), *edges, jnp.zeros((2, 3)))
