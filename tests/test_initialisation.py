@@ -1,4 +1,4 @@
-"""Initial states of drones from the silhouettes of the first frames; silhouettes are draw_frames by ray casting."""
+"""Initial states of drones from the silhouettes of the first frames; silhouettes are drawn by ray casting."""
 
 from dataclasses import replace
 from functools import cache
@@ -237,7 +237,7 @@ def test_a_camera_without_a_blob_rejects_a_drone_in_its_view():
 
 
 def point_behind(near, camera, gap_m):
-    """(3,), the point `gap_m` point_behind the point `near` on the ray of a camera."""
+    """(3,), the point `gap_m` metres behind the point `near` on the ray of a camera."""
     ray = np.asarray(near) - RIG.cameras.centre_world[camera]
     return near + gap_m * ray / np.linalg.norm(ray)
 
