@@ -1,4 +1,4 @@
-"""Figures of sweeps show the results' numbers; and the errors over time that two of the figures show."""
+"""Figures of sweeps, whose lines and bars must equal the results, and the errors over time in two of the figures."""
 
 import cv2
 import numpy as np
@@ -16,7 +16,10 @@ NUM_FRAMES = 50
 
 
 def flights():
-    """Two drones 3 m apart; the estimate is 20 mm off, misses the second for ten frames, swaps from frame 40 on."""
+    """An estimate and a reference of two drones that are 3 m apart.
+
+    The estimate has an error of 20 mm, misses the second drone for ten frames, and swaps the drones from frame 40 on.
+    """
     frame = np.arange(NUM_FRAMES)
     ref_m = np.zeros((NUM_FRAMES, 2, 3)) + np.array([[0.0, 0, 1], [3.0, 0, 1]])
     est_m = ref_m + np.array([0.02, 0, 0])
@@ -41,13 +44,13 @@ class TestErrorsOverTime:
         assert list(np.flatnonzero(errors["error_m"].isna())) == [*range(60, 70)]
         assert list(np.flatnonzero(errors["switch"])) == [40, 90]
 
-    def test_as_evaluated(self):
+    def test_summaries_equal_those_of_evaluate(self):
         errors, evaluation = errors_over_time(*flights()), evaluate(*flights())
         assert errors["error_m"].mean() == pytest.approx(evaluation.mean_error_m)
         assert errors["error_m"].isna().mean() == pytest.approx(evaluation.missed_rate)
         assert errors["switch"].sum() == evaluation.id_switches
 
-    def test_where_truth_is_unknown_there_is_no_row(self):
+    def test_frames_without_a_reference_have_no_row(self):
         estimate, reference = flights()
         reference.position_m[5:8, 0] = np.nan
         assert len(errors_over_time(estimate, reference)) == 2 * NUM_FRAMES - 3
@@ -57,7 +60,7 @@ numbers = st.one_of(st.integers(0, 5).map(float), st.just(float("nan")))
 
 
 @given(st.lists(st.tuples(numbers, numbers), max_size=12))
-def test_the_front_is_what_nothing_dominates(cells):
+def test_no_cell_dominates_a_cell_of_the_front(cells):
     """Compared with a search through all pairs of cells; of equal cells only the first is on the front."""
     work, error = np.array(cells, float).reshape(-1, 2).T
 
@@ -80,7 +83,10 @@ def test_the_front_is_what_nothing_dominates(cells):
 
 
 def rows():
-    """Errors of 30 and 50 mm of one method, 20 mm of the other, twice each; work as particles times iterations."""
+    """Two runs of three cells: errors of 30 and 50 mm of one method, and of 20 mm of the other.
+
+    The work is proportional to particles times iterations.
+    """
     table = [
         (sequence, method, particles, iterations, seed, particles * iterations / 100, error_m + 0.001 * seed)
         for sequence in ("S01", "S02")
@@ -115,7 +121,7 @@ class TestErrorAgainstWork:
         assert first.get_xlabel() == "track stage (ms per frame)"
         assert first.get_ylabel() == "mean error (mm)"
 
-    def test_a_column_is_missing(self):
+    def test_a_missing_column_is_an_error(self):
         with pytest.raises(SettingsError, match="track_ms_per_frame"):
             figures.error_against_work(rows().drop(columns="track_ms_per_frame"))
 
@@ -150,7 +156,7 @@ def test_error_per_drone():
     assert medians[2] == pytest.approx(30.0)
 
 
-def test_saved_whole_and_not_twice(tmp_path):
+def test_a_saved_figure_is_only_replaced_with_force(tmp_path):
     path = tmp_path / "figures" / "work.png"
     figures.save(path, figures.error_against_work(rows()))
     assert cv2.imread(str(path)).std() > 5

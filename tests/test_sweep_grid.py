@@ -1,4 +1,4 @@
-"""Grids: which cells a file stands for, that what is wrong is one line with its place, and what a key is made of."""
+"""Grids: the cells of a file, errors in one line with the place in the file, and the content of keys."""
 
 import itertools
 import pickle
@@ -48,7 +48,7 @@ def path(tmp_path):
 
 
 def test_every_combination_is_a_cell(path):
-    # Written out anew: 3 draws where cameras are drawn, 1 elsewhere.
+    # Three draws where the cameras are a number, and one draw otherwise.
     cameras = [(None, 0), (4, 0), (4, 1), (4, 2), (("cam1i", "cam2i"), 0)]
     expected = [
         (sequence, method, particles, threshold, *kept)
@@ -70,7 +70,7 @@ def test_every_combination_is_a_cell(path):
     assert found == expected
 
 
-def test_a_cell_has_all_that_was_set(path):
+def test_a_cell_has_the_settings_of_the_file(path):
     paper = load(path).cells()[0]
     assert paper.settings == TrackSettings(
         silhouettes=SilhouetteSettings(reduction=8, var_threshold=8.0),
@@ -81,23 +81,23 @@ def test_a_cell_has_all_that_was_set(path):
     assert paper.perturbation == Perturbation()
 
 
-def test_a_method_overrules_what_all_cells_have(path):
+def test_settings_of_a_method_replace_settings_of_all_cells(path):
     ours = next(cell for cell in load(path).cells() if cell.method == "ours")
     assert (ours.settings.swarm.spread_m, ours.settings.silhouettes.reduction) == (1.0, 2)
 
 
-def test_axes_are_what_the_grid_varied_as_numbers_and_words(path):
+def test_axes_are_the_varied_values_as_numbers_and_words(path):
     axes = [dict(cell.axes) for cell in load(path).cells()[:5]]
     kept = [("all", 0), ("4", 0), ("4", 1), ("4", 2), ("cam1i+cam2i", 0)]
     assert axes == [
         {"swarm.particles": 20, "silhouettes.var_threshold": 8.0, "cameras": cameras, "draw": draw}
         for cameras, draw in kept
     ]
-    # A whole number that is meant for a real one is one.
+    # A whole number becomes a float where the setting is a float.
     assert isinstance(axes[0]["silhouettes.var_threshold"], float)
 
 
-def test_python_is_the_same_as_toml(path):
+def test_a_mapping_gives_the_same_cells_as_toml(path):
     mapping = {
         "sequences": ("S01_D2_A", "S04_D10"),
         "runs": 10,
@@ -116,7 +116,7 @@ def test_python_is_the_same_as_toml(path):
     assert grid(mapping).cells() == load(path).cells()
 
 
-def test_paths_of_sequences_may_be_paths(tmp_path):
+def test_sequences_may_be_path_objects(tmp_path):
     assert cells_of(sequences=[tmp_path])[0].sequence == str(tmp_path)
 
 
@@ -126,7 +126,7 @@ def test_without_axes_and_methods_there_is_one_cell_per_sequence():
     assert list(cell.seeds) == [5, 6]
 
 
-def test_perturbations_and_frames_are_axes_too():
+def test_perturbations_and_frames_can_be_varied():
     varied = {"extrinsics_deg": [0, 0.2], "clock_frames": [1], "flipped": [0.03], "frames": [100]}
     cells = cells_of(grid=varied | {"draws": 2})
     assert [cell.perturbation for cell in cells] == [
@@ -144,7 +144,7 @@ def test_perturbations_and_frames_are_axes_too():
     }
 
 
-def test_chance_is_drawn_once_unless_more_is_said():
+def test_without_draws_there_is_one_random_draw():
     assert [cell.perturbation.draw for cell in cells_of(grid={"cameras": [3, 4]})] == [0, 0]
 
 
@@ -162,7 +162,7 @@ def test_every_setting_can_be_set():
     cameras=st.lists(st.one_of(st.just("all"), st.integers(1, 9)), min_size=1, max_size=4, unique=True),
     draws=st.integers(1, 3),
 )
-def test_cells_are_as_many_as_the_lists_say_and_all_have_keys_of_their_own(
+def test_there_is_one_cell_per_combination_and_every_cell_has_its_own_key(
     particles, spread_m, cameras, draws
 ):
     varied = {"swarm.particles": particles, "swarm.spread_m": spread_m, "cameras": cameras}
@@ -177,11 +177,11 @@ WRONG = [
     # Names.
     (
         {"sequnces": ["S01"]},
-        "sequnces: expected a name that there is, found sequnces; did you mean sequences?",
+        "sequnces: expected an allowed name, found sequnces; did you mean sequences?",
     ),
     (
         {"methods": {"paper": {"swram": "joint"}}},
-        "methods.paper.swram: expected a name that there is, found swram; .*",
+        "methods.paper.swram: expected an allowed name, found swram; .*",
     ),
     ({"settings": {"reduction": 4}}, "settings.reduction: .*; did you mean silhouettes.reduction?"),
     (
@@ -190,14 +190,14 @@ WRONG = [
     ),
     ({"grid": {"partcles": [20]}}, "grid.partcles: .*; did you mean swarm.particles?"),
     ({"grid": {"draw": [20]}}, "grid.draw: .*; did you mean draws?"),
-    # Names until version 0.1 are answered with the names of today.
+    # The error for a name of version 0.1 says the name of today.
     ({"grid": {"particles": [20]}}, "grid.particles: .*; it is called swarm.particles today"),
     ({"settings": {"swarm": "joint"}}, "settings.swarm: .*; it is called swarm.kind today"),
     ({"settings": {"mend": False}}, "settings.mend: .*; it is called identity.resolve_swaps today"),
     ({"settings": {"refinements": 3}}, "settings.refinements: .*; this setting is gone: it gained nothing"),
     (
         {"settings": {"zzz": 4}},
-        "settings.zzz: .*; there are method, detections, init, .*, swarm.particles, .*, silhouettes.reduction",
+        "settings.zzz: .*; allowed names are method, detections, init, .*, swarm.particles, .*, silhouettes.reduction",
     ),
     ({"settings": {"silhouettes": 4}}, "settings.silhouettes: expected a table with names, found none"),
     # Right names, wrong places.
@@ -206,20 +206,23 @@ WRONG = [
         {"swarm.particles": 4},
         "swarm.particles: .*; it belongs in [settings], or in [grid] with a list of values",
     ),
-    ({"grid": {"seed": [1, 2]}}, "grid.seed: .*; runs are seeds: say runs = 10, and first_seed .*"),
-    ({"settings": {"seed": 1}}, "settings.seed: .*; runs are seeds: .*"),
-    ({"seed": 1}, "seed: .*; runs are seeds: .*"),
+    (
+        {"grid": {"seed": [1, 2]}},
+        "grid.seed: .*; every run has a seed of its own: set runs = 10, and first_seed .*",
+    ),
+    ({"settings": {"seed": 1}}, "settings.seed: .*; every run has a seed of its own: .*"),
+    ({"seed": 1}, "seed: .*; every run has a seed of its own: .*"),
     (
         {"settings": {"swarm.particles": 20}},
-        "grid.swarm.particles: expected it in one place, found settings.swarm.particles as well",
+        "grid.swarm.particles: expected the name in one place, found settings.swarm.particles as well",
     ),
     (
         {"methods": {"a": {"swarm.particles": 20}}},
-        "grid.swarm.particles: expected it in one place, found methods.a.swarm.particles as well",
+        "grid.swarm.particles: expected the name in one place, found methods.a.swarm.particles as well",
     ),
     (
         {"settings": {"silhouettes.reduction": 4, "silhouettes": {"reduction": 8}}},
-        "settings.silhouettes.reduction: expected it once, found it twice",
+        "settings.silhouettes.reduction: expected the name once, found the name twice",
     ),
     # Kinds of values.
     (
@@ -272,7 +275,7 @@ WRONG = [
     ({"sequences": ["S01", 2]}, "sequences[1]: expected text, found 2"),
     ({"settings": 3}, "settings: expected a table, found 3"),
     ({"methods": {"paper": 3}}, "methods.paper: expected a table, found 3"),
-    # Values that make no sense.
+    # Values that are out of range.
     ({"grid": {"swarm.particles": [20, 1]}}, "grid.swarm.particles[1]: expected at least 2, found 1"),
     ({"grid": {"flipped": [0.5, 2]}}, "grid.flipped[1]: expected a number from 0 to 1, found 2"),
     ({"grid": {"clock_frames": [-1]}}, "grid.clock_frames[0]: expected a number of at least 0, found -1"),
@@ -287,31 +290,31 @@ WRONG = [
     # Cells.
     (
         {"grid": {"swarm.spread_m": [0.1, 1, 1.0]}},
-        "grid.swarm.spread_m[2]: expected cells that differ, found the same as with grid.swarm.spread_m[1]",
+        "grid.swarm.spread_m[2]: expected cells that differ, found the same cell as with grid.swarm.spread_m[1]",
     ),
     (
         {"sequences": ["a", "a"]},
-        "sequences[1]: expected cells that differ, found the same as with sequences[0]",
+        "sequences[1]: expected cells that differ, found the same cell as with sequences[0]",
     ),
     (
         {"methods": {"a": {}, "b": {"swarm.iterations": TrackSettings().swarm.iterations}}},
-        "methods.b: expected cells that differ, found the same as with methods.a",
+        "methods.b: expected cells that differ, found the same cell as with methods.a",
     ),
-    # What is done to silhouettes does nothing to detections.
+    # A perturbation of silhouettes has no effect on detections.
     (
         {"settings": {"method": "projection-lines"}, "grid": {"flipped": [0.0, 0.03]}},
-        "grid.flipped[1]: expected 0 where detections are tracked, as it is done to silhouettes, found 0.03",
+        "grid.flipped[1]: expected 0 for a method that reads detections, .*, found 0.03",
     ),
-    ({"grid": {"draws": 3}}, "grid.draws: expected something to draw: a number of cameras, .*"),
+    ({"grid": {"draws": 3}}, "grid.draws: expected a random choice in [grid]: a number of cameras, .*"),
     (
         {"grid": {"flipped": [0.0], "cameras": [["a"]], "draws": 3}},
-        "grid.draws: expected something to draw: .*",
+        "grid.draws: expected a random choice in [grid]: .*",
     ),
 ]
 
 
 @pytest.mark.parametrize(("changes", "sentence"), WRONG)
-def test_what_is_wrong_is_one_line_with_its_place(changes, sentence):
+def test_an_error_is_one_line_with_the_place_in_the_file(changes, sentence):
     with pytest.raises(SettingsError) as caught:
         grid(SMALL | changes, where="table5.toml")
     pattern = re.escape(f"table5.toml: {sentence}").replace(re.escape(".*"), ".*")
@@ -330,7 +333,7 @@ def test_messages_of_a_file_begin_with_its_path(path):
         load(path)
 
 
-def test_a_file_that_is_no_toml(path):
+def test_a_file_that_is_not_toml(path):
     path.write_text("sequences = [\n")
     with pytest.raises(InputError, match=r"grid.toml.*: expected valid TOML"):
         load(path)
@@ -338,7 +341,7 @@ def test_a_file_that_is_no_toml(path):
         load(path.with_name("none.toml"))
 
 
-def test_a_perturbation_is_checked_wherever_it_comes_from():
+def test_a_perturbation_made_in_python_is_checked():
     with pytest.raises(SettingsError, match="extrinsics_deg: expected a number from 0 to 180, found nan"):
         Perturbation(extrinsics_deg=float("nan"))
     with pytest.raises(SettingsError, match="clock_frames: expected a number of at least 0, found inf"):
@@ -350,7 +353,7 @@ def test_a_perturbation_is_checked_wherever_it_comes_from():
 INPUT = {"cam1": "ab", "cam2": "cd"}
 
 
-def test_more_runs_are_of_the_same_key():
+def test_the_number_of_runs_is_not_in_the_key():
     (few,) = grid({"sequences": ["S01"], "runs": 2, "settings": {"swarm.particles": 20}}).cells()
     many = grid(
         {"sequences": ["S01"], "runs": 9, "first_seed": 4, "grid": {"swarm.particles": [20, 50]}}
@@ -360,13 +363,13 @@ def test_more_runs_are_of_the_same_key():
     assert re.fullmatch("[0-9a-f]{40}", key_of(few, INPUT))
 
 
-def test_where_a_sequence_lies_is_not_in_the_key():
+def test_the_place_of_a_sequence_is_not_in_the_key():
     (one,) = grid({"sequences": ["S01"]}).cells()
     (other,) = grid({"sequences": ["/data/elsewhere/S01"]}).cells()
     assert key_of(one, INPUT) == key_of(other, dict(reversed(INPUT.items())))
 
 
-def test_whatever_decides_the_rows_is_in_the_key():
+def test_everything_that_decides_the_rows_is_in_the_key():
     base = {"sequences": ["S01"], "settings": {"swarm.particles": 20}, "grid": {}}
     changes = [
         {},
@@ -385,6 +388,6 @@ def test_whatever_decides_the_rows_is_in_the_key():
     assert len(set(keys)) == len(keys)
 
 
-def test_cells_travel_to_other_processes(path):
+def test_cells_can_be_pickled(path):
     cells = load(path).cells()
     assert pickle.loads(pickle.dumps(cells)) == cells

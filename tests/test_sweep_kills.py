@@ -19,10 +19,11 @@ logger = logging.getLogger(__name__)
 
 KILLS = int(os.environ.get("PSOTRACK_KILLS", "3"))
 
-#: Cells per kill: enough that some are always left.
+#: Number of cells per kill: large enough that unfinished cells are always left.
 CELLS = 3
 
-#: `psotrack`, which kills itself before the N-th operation on a file in a folder: python -c KILLED N FOLDER WORDS.
+#: Program that runs `psotrack WORDS` and kills itself before its N-th operation on a file in FOLDER:
+#: python -c KILLED N FOLDER WORDS.
 KILLED = """
 import os, signal, sys
 
@@ -39,7 +40,7 @@ sys.addaudithook(on_event)
 from psotrack.cli import main
 main()
 """
-#: A runner makes OPERATIONS of them in a folder with three unfinished cells; each cell takes about a third.
+#: Number of file operations of a runner in a folder with three unfinished cells; each cell takes about a third.
 OPERATIONS = 60
 
 

@@ -51,7 +51,7 @@ def test_an_empty_perturbation_changes_nothing():
     assert perturb(sequence, silhouettes, Perturbation(draw=3), None) == (sequence, silhouettes)
 
 
-def test_all_is_a_function_of_the_draw():
+def test_equal_draws_give_equal_results_and_other_draws_differ():
     once, again = (perturb(*flown(), EVERYTHING, 3) for _ in range(2))
     assert once[0].rig.names == again[0].rig.names
     np.testing.assert_array_equal(once[0].rig.cameras.T_cam_world, again[0].rig.cameras.T_cam_world)
@@ -62,7 +62,7 @@ def test_all_is_a_function_of_the_draw():
     assert (frames_of(other[1]) != frames_of(same_cameras[1])).any()
 
 
-def test_the_input_is_left_as_it_was():
+def test_the_input_does_not_change():
     sequence, silhouettes = flown()
     perturb(sequence, silhouettes, EVERYTHING, 2)
     untouched, unflipped = flown()
@@ -73,7 +73,7 @@ def test_the_input_is_left_as_it_was():
 # --- random streams
 
 
-def test_what_is_drawn_for_one_kind_does_not_depend_on_the_others():
+def test_random_numbers_of_one_perturbation_do_not_depend_on_the_other_perturbations():
     sequence, silhouettes = flown()
     together, late_and_flipped = perturb(sequence, silhouettes, EVERYTHING, None)
     turned, _ = perturb(sequence, silhouettes, Perturbation(extrinsics_deg=0.3), None)
@@ -84,7 +84,7 @@ def test_what_is_drawn_for_one_kind_does_not_depend_on_the_others():
     np.testing.assert_array_equal(frames_of(late_and_flipped), frames_of(flipped))
 
 
-def test_what_is_drawn_for_a_camera_does_not_depend_on_which_others_there_are():
+def test_random_numbers_of_a_camera_do_not_depend_on_the_other_cameras():
     every = perturb(*flown(), EVERYTHING, None)
     few = perturb(*flown(), EVERYTHING, ("c3", "c1"))
     np.testing.assert_array_equal(
@@ -105,12 +105,12 @@ def test_cameras_are_kept_by_name():
     ]
 
 
-def test_a_number_of_cameras_is_drawn():
+def test_a_number_of_cameras_is_a_random_choice():
     sequence, silhouettes = perturb(*flown(), Perturbation(draw=2), 3)
     assert sequence.rig.names == silhouettes.cameras == choose_cameras(("c0", "c1", "c2", "c3", "c4"), 3, 2)
 
 
-def test_cameras_that_are_not_there():
+def test_cameras_that_do_not_exist():
     with pytest.raises(SettingsError, match=r"cameras: expected some of c0, .*, found c9"):
         perturb(*flown(), Perturbation(), ("c0", "c9"))
     with pytest.raises(SettingsError, match="cameras: expected 1 to 5, the number of cameras, found 6"):
@@ -118,7 +118,7 @@ def test_cameras_that_are_not_there():
 
 
 @given(num_cameras=st.integers(1, 7), data=st.data())
-def test_draws_go_through_all_subsets_before_any_comes_again(num_cameras, data):
+def test_draws_use_every_subset_before_a_subset_is_repeated(num_cameras, data):
     names = tuple("abcdefg"[:num_cameras])
     count = data.draw(st.integers(1, num_cameras))
     every = list(combinations(names, count))
@@ -128,8 +128,7 @@ def test_draws_go_through_all_subsets_before_any_comes_again(num_cameras, data):
     assert choose_cameras(names, count, len(every)) == drawn[0]
 
 
-def test_no_camera_is_drawn_more_often_than_others():
-    """All of 20 cameras are chosen equally often in the first subsets."""
+def test_every_camera_is_chosen_equally_often():
     names = tuple(map(str, range(20)))
     drawn = [int(name) for draw in range(400) for name in choose_cameras(names, 3, draw)]
     counts = np.bincount(drawn, minlength=20)
@@ -171,7 +170,7 @@ def test_a_wider_turn_is_about_the_same_axis():
 
 
 @pytest.mark.parametrize("clock_frames", [0.5, 1.0, 3.7])
-def test_late_cameras_show_what_was(clock_frames):
+def test_late_cameras_show_earlier_frames(clock_frames):
     """Brightness 3 f at frame f: a camera that is late by s shows 3 (f - s), and 0 before its first frame."""
     ramp = np.tile((3 * np.arange(FRAMES)).astype(np.uint8)[:, None, None], (1, 5, 7))
     sequence, silhouettes = flown(40, ramp)
@@ -179,20 +178,20 @@ def test_late_cameras_show_what_was(clock_frames):
     same, late = perturb(sequence, silhouettes, Perturbation(clock_frames=clock_frames), None)
     assert same is sequence
     shown = frames_of(late)[..., 0, 0].astype(float)
-    # From the frames where nothing is clipped; the mean takes the rounding to grey levels out, which is at most a half.
+    # Only frames without clipped values are used. The mean removes rounding to grey levels, which is at most a half.
     behind = np.arange(FRAMES)[4:, None] - shown[4:] / 3
     lateness = behind.mean(axis=0)
     assert np.abs(behind - lateness).max() < 0.5
     expected = np.maximum(3 * (np.arange(FRAMES)[:, None] - lateness), 0)
     # A half from rounding of the values, and a half from rounding of the delay.
     assert np.abs(shown - expected).max() <= 1.01
-    # Uniform from 0: 40 of them leave 1/41 free at either end on average, and 0.25 with a probability of 1e-5.
+    # The smallest of 40 uniform delays is 1/41 of the range on average, and above 0.25 with a probability of 1e-5.
     assert -1 / 6 <= lateness.min() <= 0.25 * clock_frames + 1 / 6
     assert 0.75 * clock_frames - 1 / 6 <= lateness.max() <= clock_frames + 1 / 6
 
 
-def test_a_mixture_by_hand():
-    """A camera's delay follows from its first change; all values are then interpolated between two frames."""
+def test_a_delayed_frame_is_interpolated_between_two_frames():
+    """For some delay, all values equal values that are interpolated between two frames by hand."""
     frames = np.random.default_rng(5).integers(0, 256, (120, 3, 4), np.uint8)
     sequence, silhouettes = flown(2, frames)
     _, late = perturb(sequence, silhouettes, Perturbation(clock_frames=4.0, draw=6), None)
@@ -217,7 +216,7 @@ def test_a_mixture_by_hand():
 def test_flipped_pixels_have_the_moments_of_the_binomial():
     share, pixels = 0.03, REDUCTION**2
     frames = np.zeros((600, 20, 20), np.uint8)
-    # A quarter each: nothing, 4 and 12 of the 16 pixels, all of them.
+    # In each quarter of the image, 0, 4, 12 or 16 of 16 pixels are foreground.
     for part, count in enumerate((0, 4, 12, 16)):
         frames[:, 5 * part : 5 * part + 5] = round(255 * count / pixels)
     sequence, silhouettes = flown(2, frames)
@@ -226,7 +225,7 @@ def test_flipped_pixels_have_the_moments_of_the_binomial():
     assert same is sequence
     values = frames_of(noisy)
     counts = np.round(values / 255 * pixels)
-    # All values stand for whole numbers of pixels.
+    # Every value is a whole number of pixels.
     np.testing.assert_array_equal(np.round(255 * counts / pixels), values)
     num = values[:, :, :5].size
     variance = pixels * share * (1 - share)
@@ -234,12 +233,12 @@ def test_flipped_pixels_have_the_moments_of_the_binomial():
         found = counts[:, :, 5 * part : 5 * part + 5]
         mean = count * (1 - share) + (pixels - count) * share
         assert abs(found.mean() - mean) < 5 * math.sqrt(variance / num)
-        # The kurtosis of these is below 6, so that the variance is known to sqrt(5 / num).
+        # The kurtosis of these counts is below 6, so the variance has a relative error of at most sqrt(5 / num).
         assert abs(found.var() / variance - 1) < 5 * math.sqrt(5 / num)
     assert (values[:, 0] != values[:, 1]).any()
 
 
-def test_all_pixels_flipped_is_the_negative():
+def test_flipping_all_pixels_gives_the_negative():
     frames = np.zeros((60, 5, 7), np.uint8)
     frames[:, 2] = 255
     frames[:, 3] = 64  # 4 of 16 pixels; their negative is 12.

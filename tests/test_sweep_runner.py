@@ -1,5 +1,7 @@
-"""Sweeps on a very small sequence: cells, rows, resuming, failures, tables, estimates; real ones, and with a tracker
-that finds nothing where what it finds does not matter."""
+"""Sweeps on a very small sequence: cells, rows, resuming, failures, tables and estimates.
+
+Some tests replace the tracker by a tracker that finds no drones, because they do not look at the tracks.
+"""
 
 import json
 import os
@@ -39,7 +41,7 @@ swarm.inertia = 0.4
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data folder, and a cache."""
+    """A data folder with a small sequence, and a cache."""
     return small_sequence(tmp_path_factory)
 
 
@@ -115,7 +117,9 @@ def test_one_row_per_cell_and_run(swept: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_cell_that_fails_does_not_stop_the_others(swept: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_cell_that_fails_does_not_stop_the_other_cells(
+    swept: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     _, status, _ = called(capsys, "sweep", "--status", swept / "results")
     assert status[-1].endswith("4 finished, 4 failed, 0 claimed")
     assert len(status) == 5
@@ -123,7 +127,7 @@ def test_a_cell_that_fails_does_not_stop_the_others(swept: Path, capsys: pytest.
 
 
 @pytest.mark.slow
-def test_what_is_finished_is_not_run_again(root: Path, swept: Path) -> None:
+def test_finished_cells_are_not_run_again(root: Path, swept: Path) -> None:
     before = stamps(swept / "results")
     words = ("--data", root, "--out", swept / "results", "--device", "cpu")
     again = psotrack(root, "sweep", swept / "good.toml", *words)
@@ -163,7 +167,7 @@ def test_a_table_of_the_results(swept: Path, capsys: pytest.CaptureFixture[str])
 
 
 @pytest.mark.slow
-def test_an_estimate_says_what_it_is_made_of(
+def test_an_estimate_says_its_parts_and_its_basis(
     root: Path, swept: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def estimated(grid: Path, out: Path, cache: Path = root / "cache") -> str:
@@ -220,7 +224,7 @@ def test_a_dry_run_shows_the_cells(tmp_path: Path, capsys: pytest.CaptureFixture
     assert lines[2:] == ["2 cells, 4 runs", "nothing to run; without 2 cells whose input cannot be read"]
 
 
-def test_what_is_wrong_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_error_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = grid_file(tmp_path, [3])
     code, _, err = called(capsys, "sweep", path, "--out", tmp_path, "--workers", 2)
     assert (code, err.count("\n")) == (2, 1)
@@ -233,7 +237,7 @@ def test_what_is_wrong_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture
 
 @pytest.mark.skipif(shutil.which("nvidia-smi") is not None, reason="there may be a GPU")
 @pytest.mark.slow
-def test_a_gpu_that_is_not_there_is_one_line(tmp_path: Path) -> None:
+def test_a_missing_gpu_is_one_line(tmp_path: Path) -> None:
     result = psotrack(tmp_path, "sweep", grid_file(tmp_path, [3]), "--out", tmp_path, "--device", "gpu")
     assert result.returncode == 2
     assert result.stderr.count("\n") == 1
@@ -241,7 +245,7 @@ def test_a_gpu_that_is_not_there_is_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_in_python_the_rows_are_those_of_the_grid(root: Path, tracker: Tracker, tmp_path: Path) -> None:
+def test_in_python_the_rows_are_the_rows_of_the_grid(root: Path, tracker: Tracker, tmp_path: Path) -> None:
     out, folders = tmp_path / "out", {"data": root, "cache": root / "cache"}
     rows = sweep(varied(3, 4, runs=2), out, **folders)
     assert rows[["settings.swarm.iterations", "seed"]].to_numpy().tolist() == [[3, 0], [3, 1], [4, 0], [4, 1]]
@@ -309,7 +313,7 @@ def test_an_interrupted_move_of_an_older_cell_is_continued(
 
 
 @pytest.mark.slow
-def test_a_failure_goes_when_the_cell_is_finished(root: Path, tracker: Tracker, tmp_path: Path) -> None:
+def test_a_failure_is_removed_when_the_cell_is_finished(root: Path, tracker: Tracker, tmp_path: Path) -> None:
     out, folders = tmp_path / "out", {"data": root, "cache": root / "cache"}
     tracker.failing = {3}
     rows = sweep(varied(3, 4), out, **folders)
@@ -324,7 +328,9 @@ def test_a_failure_goes_when_the_cell_is_finished(root: Path, tracker: Tracker, 
 
 
 @pytest.mark.slow
-def test_a_failure_to_read_goes_too(root: Path, tracker: Tracker, tmp_path: Path) -> None:
+def test_a_failure_to_read_is_removed_when_the_cell_is_finished(
+    root: Path, tracker: Tracker, tmp_path: Path
+) -> None:
     data = tmp_path / "data"
     shutil.copytree(root / "Simulated_Data" / "S01_D2_A", data / "S01_D2_A")
     video = next((data / "S01_D2_A").glob("*.mp4"), None) or next((data / "S01_D2_A").glob("*.avi"))
@@ -339,7 +345,7 @@ def test_a_failure_to_read_goes_too(root: Path, tracker: Tracker, tmp_path: Path
 
 
 @pytest.mark.slow
-def test_a_runner_waits_for_others_and_does_what_they_leave(
+def test_a_runner_waits_for_locked_cells_and_runs_them_when_they_are_unlocked(
     root: Path, tracker: Tracker, tmp_path: Path
 ) -> None:
     grid, out = grid_of(varied(3, 4)), tmp_path / "out"
@@ -360,7 +366,7 @@ def test_a_runner_waits_for_others_and_does_what_they_leave(
 
 
 @pytest.mark.slow
-def test_one_alone_makes_the_silhouettes(root: Path, tmp_path: Path) -> None:
+def test_only_one_process_at_a_time_makes_the_silhouettes(root: Path, tmp_path: Path) -> None:
     cell = grid_of(varied(3)).cells()[0]
     inputs = Inputs(root, tmp_path / "cache", jobs=1)
     inputs.keys_of(cell)
@@ -372,14 +378,14 @@ def test_one_alone_makes_the_silhouettes(root: Path, tmp_path: Path) -> None:
     assert given.silhouettes.num_frames == 6
 
 
-def test_a_commit_is_that_of_a_checkout_or_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_commit_is_empty_outside_of_a_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A package that is installed inside the checkout of another project does not have that project's commit."""
 
     def commit(folder: Path) -> str:
         machine.commit.cache_clear()
         return machine.commit(folder)
 
-    # Settings of the user's git, and variables that a git hook sets, must not decide.
+    # The result must not depend on the settings of the user's git, or on variables that a git hook sets.
     monkeypatch.setenv("GIT_CONFIG_GLOBAL", os.devnull)
     for name in ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE"):
         monkeypatch.delenv(name, raising=False)

@@ -1,4 +1,4 @@
-"""Tables: figures are compared with the standard library's, layouts with texts written by hand."""
+"""Tables: figures equal those of the standard library and of pandas; layouts equal texts written by hand."""
 
 import csv
 import io
@@ -46,7 +46,7 @@ def in_mm(rows, rows_by=("method",), columns_by=("particles",)):
     return pivot(rows, rows_by=list(rows_by), columns_by=list(columns_by), value="mean_error_m", scale=1000.0)
 
 
-def test_figures_are_those_of_the_standard_library():
+def test_figures_equal_the_standard_librarys():
     table = in_mm(results())
     assert table.attrs["value"] == "mean_error_mm"
     for (method, particles), runs in ERRORS_M.items():
@@ -65,7 +65,7 @@ def test_figures_are_those_of_the_standard_library():
         max_size=30,
     )
 )
-def test_figures_are_those_of_pandas_whatever_is_missing(numbers):
+def test_figures_with_missing_values_equal_those_of_pandas(numbers):
     rows = pd.DataFrame(numbers, columns=["a", "b", "value"]).astype({"value": float})
     table = pivot(rows, rows_by=["a"], columns_by=["b"], value="value")
     oracle = rows.groupby(["a", "b"])["value"].agg(["mean", "std", "count"])
@@ -75,7 +75,7 @@ def test_figures_are_those_of_pandas_whatever_is_missing(numbers):
         np.testing.assert_allclose(table.loc[a, b], expected, rtol=1e-9, atol=1e-6)
 
 
-def test_the_order_of_rows_does_not_matter_and_that_of_labels_is_natural():
+def test_labels_are_sorted_by_numbers_and_words_for_every_order_of_rows():
     rows = pd.DataFrame({"cameras": ["all", "10", "4", "cam10", "cam2"], "n": [100, 20, 3, 1, 2], "v": 1.0})
     for shuffled in (rows, rows.iloc[::-1]):
         assert list(pivot(shuffled, rows_by=["n"], columns_by=[], value="v").index) == [1, 2, 3, 20, 100]
@@ -140,16 +140,16 @@ def test_the_name_of_scaled_numbers(value, scale, name):
 )
 def test_wrong_columns_are_one_line(changes, message):
     rows = results(**{"a.share": 1, "b.share": 1})
-    asked = {
+    arguments = {
         "rows_by": ["method"],
         "columns_by": ["settings.swarm.particles"],
         "value": "mean_error_m",
     } | changes
     with pytest.raises(SettingsError, match=f"^{message.replace('?', '[?]')}$"):
-        pivot(rows, **asked)
+        pivot(rows, **arguments)
 
 
-def test_a_whole_name_goes_before_the_end_of_another():
+def test_a_column_with_the_exact_name_is_preferred():
     rows = pd.DataFrame({"frames": [1], "settings.frames": [2], "v": [3]})
     assert list(pivot(rows, rows_by=["frames"], columns_by=[], value="v").index) == [1]
 
@@ -198,7 +198,7 @@ def test_whole_numbers_have_no_decimals():
     widths=st.tuples(st.integers(1, 3), st.integers(1, 12)),
     magnitude=st.sampled_from([1e-4, 1.0, 1e3]),
 )
-def test_text_fits_and_loses_nothing(widths, magnitude):
+def test_text_is_at_most_80_characters_wide_and_complete(widths, magnitude):
     """For any number of columns, no line is wider than 80, and every figure is printed once per row."""
     rows = pd.DataFrame(
         [
@@ -252,7 +252,7 @@ def test_latex():
     )
 
 
-def test_latex_escapes_its_special_signs():
+def test_special_characters_of_latex_are_escaped():
     rows = pd.DataFrame({"name": [r"a\b~c^d&%$#_{}"], "v": [None]}).astype({"v": float})
     line = render(pivot(rows, rows_by=["name"], columns_by=[], value="v"), "latex").splitlines()[-3]
     escaped = r"a\textbackslash b\textasciitilde c\textasciicircum d\&\%\$\#\_\{\}"

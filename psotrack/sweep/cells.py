@@ -1,4 +1,4 @@
-"""Cells: one combination of a grid each, and the key under which its results are kept."""
+"""Cells, the combinations of a grid, and the key under which the results of a cell are stored."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from psotrack.errors import SettingsError
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import check_whole
 
-#: Part of every key: to be raised whenever the same cell would give other rows.
+#: Part of every key. Raise it when the same cell would give other rows.
 SCHEMA = 1
 
 
 class Perturbation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is done to a cell's input before it is tracked; 0 is nothing.
+    """Errors that are added to a cell's input before tracking; 0 adds no error.
 
     Attributes:
-        extrinsics_deg: every camera is turned about its own centre by so much, about an axis of chance.
-        clock_frames: every camera is late by 0 to so many frames, parts of frames included.
-        flipped: share of the full-size silhouettes' pixels that are the other way round.
-        draw: which of the draws of chance it is.
+        extrinsics_deg: angle by which every camera is turned about its own centre, around a random axis, degrees.
+        clock_frames: largest delay of a camera, frames; each camera gets a random delay from 0 to this, with fractions.
+        flipped: share of the full-size silhouettes' pixels that are inverted.
+        draw: number of the random draw, from 0.
 
     Raises:
-        SettingsError: a value makes no sense.
+        SettingsError: a value is out of range.
     """
 
     extrinsics_deg: float = 0.0
@@ -46,25 +46,25 @@ class Perturbation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         check_whole("draw", self.draw, lowest=0)
 
     @property
-    def by_chance(self) -> bool:
-        """Whether anything of it is drawn."""
+    def is_random(self) -> bool:
+        """Whether the perturbation uses random numbers."""
         return any((self.extrinsics_deg, self.clock_frames, self.flipped))
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One combination of a grid, to be run some times.
+    """One combination of a grid.
 
     Attributes:
-        sequence: as the grid names it: a folder, or a name under the data's root.
-        method: the name of its [methods.NAME] table; "" if there are none.
-        cameras: names; or how many, drawn by `perturbation.draw`; None for all.
-        frames: the first so many; None for all.
-        perturbation: what is done to the input.
-        settings: of every run, with seed 0 in place of its own.
-        runs: how many.
-        axes: what the grid varied: dotted names -> values, cameras as text.
-        first_seed: of the first run.
+        sequence: the sequence, as the grid names it: a folder, or a name under the data's root.
+        method: name of the cell's table [methods.NAME]; "" if the grid has no such tables.
+        cameras: names of the cameras; or their number, for a random choice by `perturbation.draw`; None for all.
+        frames: number of frames, from the first on; None for all frames.
+        perturbation: errors that are added to the input.
+        settings: settings of every run; the seed is 0, and each run replaces it by its own.
+        runs: number of runs.
+        axes: values that the grid varies, by dotted name; cameras as text.
+        first_seed: seed of the first run.
     """
 
     sequence: str
@@ -79,25 +79,25 @@ class Cell:
 
     @property
     def seeds(self) -> range:
-        """Of the runs, in order."""
+        """Seeds of the runs, in order."""
         return range(self.first_seed, self.first_seed + self.runs)
 
     @property
-    def by_chance(self) -> bool:
-        """Whether anything but the swarm is drawn."""
-        return isinstance(self.cameras, int) or self.perturbation.by_chance
+    def is_random(self) -> bool:
+        """Whether the cell's input depends on random numbers."""
+        return isinstance(self.cameras, int) or self.perturbation.is_random
 
 
 def key_of(cell: Cell, input_keys: Mapping[str, str]) -> str:
-    """A name for what a cell's runs yield: 40 hexadecimal digits, of everything that decides a row but its seed.
+    """Key of a cell's results: a digest, 40 hexadecimal digits, of everything except the seed that decides a row.
 
-    Not of `runs`, `first_seed` and `axes`: within a cell a row has its seed for a name, so that more runs of a finished
-    cell only add rows. A sequence counts by its last name and its content, not by where it lies; a method counts by
-    name too, because rows bear it.
+    `runs`, `first_seed` and `axes` are not part of the key. Rows of a cell are distinguished by their seeds, so more
+    runs of a finished cell only add rows. The key contains the name of the sequence's folder and the sequence's
+    content, but not the folder's place. It contains the method's name, because rows have a column with this name.
 
     Args:
-        cell: whose key it is.
-        input_keys: digests of all that is read: silhouettes by camera, calibration, reference.
+        cell: the cell.
+        input_keys: digests of everything that the cell reads: silhouettes by camera, calibration, reference.
     """
     settings = msgspec.to_builtins(msgspec.structs.replace(cell.settings, seed=0))
     return digest_cell(cell, settings, input_keys)
@@ -125,11 +125,11 @@ def digest_cell(cell: Cell, settings: Mapping[str, Any], input_keys: Mapping[str
 
 
 def name_of(cell: Cell) -> str:
-    """What a cell's failure is kept under, whether or not its input can be read."""
+    """Name under which a cell's failure is stored; it does not depend on whether the cell's input can be read."""
     return key_of(cell, {"sequence": cell.sequence})
 
 
 def title(cell: Cell) -> str:
-    """A cell in a line."""
+    """Description of a cell in one line."""
     axes = (f"{name}={value}" for name, value in cell.axes.items())
     return " ".join(word for word in (Path(cell.sequence).name, cell.method, *axes) if word)

@@ -1,7 +1,7 @@
-"""Run the cells of a grid as tasks of a Dask cluster: on this machine, or on several that share a file system.
+"""Run the cells of a grid as tasks of a Dask cluster: on this machine, or on several machines that share a file system.
 
-As without a cluster, only the folder of results says what is finished: workers lock cells and write their rows. So
-workers may be killed, cells may run again, and other runners may work on the same folder.
+As without a cluster, workers lock cells in the folder of results and write the cells' rows there. So workers may be
+killed, cells may run again, and other runners may work on the same folder.
 """
 
 from __future__ import annotations
@@ -61,9 +61,7 @@ class Cluster:
 
     def __post_init__(self) -> None:
         if self.workers is not None and self.address != "local":
-            raise SettingsError(
-                "--workers", expected="--cluster local with it", found=f"--cluster {self.address}"
-            )
+            raise SettingsError("--workers", expected="--cluster local", found=f"--cluster {self.address}")
 
 
 @dataclass(frozen=True)
@@ -94,7 +92,7 @@ def run_on_cluster(
     cluster: Cluster = Cluster(),
     report: Report = no_progress,
 ) -> SweepOutcome:
-    """Run the unfinished cells of a grid as tasks of a cluster; otherwise the same as `runner.run`.
+    """Run the unfinished cells of a grid as tasks of a cluster; see `runner.run` for runs without a cluster.
 
     Args:
         grid: the cells to run.
@@ -153,10 +151,10 @@ def _client(dask: Any, address: str, workers: int) -> Iterator[Client]:
         with (
             dask.LocalCluster(
                 n_workers=workers,
-                threads_per_worker=1,  # JAX has threads of its own
+                threads_per_worker=1,  # JAX starts threads itself.
                 processes=True,
-                memory_limit=0,  # the system's
-                dashboard_address="127.0.0.1:0",  # any port: another sweep may have the usual one
+                memory_limit=0,  # Dask sets no limit besides the system's.
+                dashboard_address="127.0.0.1:0",  # Any free port: another sweep may use the default port.
             ) as cluster,
             dask.Client(cluster) as client,
         ):
@@ -199,9 +197,9 @@ def _results(
         except dask.KilledWorker as error:
             yield store_failure(futures[future], None, error, store)
         except CancelledError as error:
-            remedy = "what is finished is kept, and the same command goes on"
+            remedy = "finished cells are kept, and the same command continues the sweep"
             raise InputError(
-                "--cluster", expected="a running scheduler", found="that it has ended", remedy=remedy
+                "--cluster", expected="a running scheduler", found="a scheduler that has ended", remedy=remedy
             ) from error
 
 

@@ -56,9 +56,9 @@ class Estimate:
             ("compiling", self.compiling_s),
             ("silhouettes", self.silhouettes_s),
         )
-        said = ", ".join(f"{name} {_in_words(seconds)}" for name, seconds in parts if seconds)
+        listed = ", ".join(f"{name} {_in_words(seconds)}" for name, seconds in parts if seconds)
         total = f"about {_in_words(self.total_s)} for {self.cells} cells"
-        return f"{total} ({said}), estimated from {self.basis}{unread}"
+        return f"{total} ({listed}), estimated from {self.basis}{unread}"
 
 
 def estimate(cells: Iterable[Cell], inputs: Inputs, store: Store | None) -> Estimate:
@@ -69,7 +69,7 @@ def estimate(cells: Iterable[Cell], inputs: Inputs, store: Store | None) -> Esti
         inputs: inputs of the cells.
         store: stored results, whose finished cells do not count, and whose times scale the model; None for no results.
     """
-    factor, basis = _factor(store)
+    factor, basis = _fit_factor(store)
     count = unread = 0
     tracking_s, programs, silhouettes_s = 0.0, set(), {}
     for cell in cells:
@@ -122,9 +122,9 @@ def _in_words(seconds: float) -> str:
     return f"{seconds / 86400:.0f} days"
 
 
-def _factor(store: Store | None) -> tuple[float, str]:
+def _fit_factor(store: Store | None) -> tuple[float, str]:
     """Median ratio of stored times to the rule of thumb, from this device if it has runs, and a description."""
-    rule = "a rule of thumb, of two cores of an AMD EPYC"
+    rule = "a rule of thumb, measured on two cores of an AMD EPYC"
     try:
         rows = store.rows() if store else pd.DataFrame()
     except InputError:

@@ -1,7 +1,7 @@
-"""What is to be run: a grid in TOML, or the same as a mapping, and the cells that it stands for.
+"""Grids: sequences, settings and values to vary, from a TOML file or a mapping, and the cells of a grid.
 
-Everything is checked when the grid is read, the settings of every cell included: what is wrong is named by its place in
-the file, such as `grid.particles[1]`, before anything runs.
+A grid and the settings of all its cells are checked when the grid is read, before any cell runs. Errors name the place
+in the file, such as `grid.swarm.particles[1]`.
 """
 
 from __future__ import annotations
@@ -24,22 +24,23 @@ from psotrack.sweep.names import INPUTS, PERTURBATIONS, SETTINGS, check_name, fl
 
 __all__ = ["Cell", "Grid", "Perturbation", "grid", "key_of", "load"]
 
-#: A value of a cell: its place in the file, its name, and itself as it was written.
+#: A value of a cell: place in the file, dotted name, and the value as it is in the file.
 _Choice = tuple[str, str, Any]
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A grid whose names are right; `dataclasses.replace` makes another one of it.
+    """A grid whose names are checked; `dataclasses.replace` makes a changed grid.
 
     Attributes:
         sequences: folders, or names under the data's root.
-        runs: of every cell, with the seeds `first_seed`, `first_seed` + 1, ...
-        settings: dotted names -> values, of every cell.
-        methods: names -> such settings, which overrule those of every cell.
-        axes: dotted names -> lists of values; every combination is a cell.
-        draws: how often what is drawn by chance is drawn; None is once.
-        where: what messages begin with.
+        runs: number of runs of every cell.
+        first_seed: seed of a cell's first run; the following runs have the following seeds.
+        settings: values of all cells, by dotted name.
+        methods: for each method, by name, values that replace values of `settings`, by dotted name.
+        axes: lists of values, by dotted name; every combination of values is a cell.
+        draws: number of random draws for cells that depend on random numbers; None is a single draw.
+        where: beginning of error messages, such as the file's path.
     """
 
     sequences: tuple[str, ...]
@@ -52,10 +53,10 @@ class Grid:
     where: str
 
     def cells(self) -> tuple[Cell, ...]:
-        """Every combination, in the order of the file: sequences, methods, axes, draws.
+        """All cells, in the order of the file: by sequence, method, axes and draw.
 
         Raises:
-            SettingsError: a value does not fit, or two cells are the same; the message names the place.
+            SettingsError: a value is not allowed, or two cells are the same; the message names the place in the file.
         """
         options = [
             [(f"grid.{name}[{index}]", name, value) for index, value in enumerate(values)]
@@ -65,7 +66,7 @@ class Grid:
             (places, cell)
             for method in self.methods or ("",)
             for choices in itertools.product(*options)
-            for places, cell in self._draws(method, choices)
+            for places, cell in self._cells_of_draws(method, choices)
         ]
         placed = [
             ((f"sequences[{index}]", *places), replace(cell, sequence=sequence))
@@ -73,16 +74,21 @@ class Grid:
             for places, cell in variants
         ]
         self._check_different(placed)
-        if self.draws is not None and not any(cell.by_chance for _, cell in placed):
-            expected = f"something to draw: a number of cameras, {', '.join(PERTURBATIONS)}"
-            raise self._error("grid.draws", expected=expected, found="nothing of it")
+        if self.draws is not None and not any(cell.is_random for _, cell in placed):
+            expected = f"a random choice in [grid]: a number of cameras, {', '.join(PERTURBATIONS)}"
+            raise self._error("grid.draws", expected=expected, found="none")
         return tuple(cell for _, cell in placed)
 
-    def _draws(self, method: str, choices: tuple[_Choice, ...]) -> Iterator[tuple[tuple[str, ...], Cell]]:
-        """The cells of one combination, of no sequence yet, each with its places: one per draw, if any is drawn."""
+    def _cells_of_draws(
+        self, method: str, choices: tuple[_Choice, ...]
+    ) -> Iterator[tuple[tuple[str, ...], Cell]]:
+        """Yield places and cell of each draw of one combination; the cells have no sequence yet.
+
+        A combination that uses no random numbers has one cell.
+        """
         cell = self._cell(method, choices)
         places = (f"methods.{method}", *(place for place, _, _ in choices))
-        for draw in range(self.draws or 1) if cell.by_chance else (0,):
+        for draw in range(self.draws or 1) if cell.is_random else (0,):
             perturbation = msgspec.structs.replace(cell.perturbation, draw=draw)
             axes = cell.axes if self.draws is None else {**cell.axes, "draw": draw}
             yield places, replace(cell, perturbation=perturbation, axes=axes)
@@ -99,10 +105,10 @@ class Grid:
         settings = self._record(TrackSettings, nested(values, SETTINGS), places)
         perturbation = self._record(Perturbation, nested(values, PERTURBATIONS), places)
         if settings.reads_detections:
-            # Silently they would do nothing.
+            # These perturbations change silhouettes, and would have no effect on detections.
             for name in ("clock_frames", "flipped"):
                 if getattr(perturbation, name):
-                    expected = "0 where detections are tracked, as it is done to silhouettes"
+                    expected = "0 for a method that reads detections, because it changes silhouettes only"
                     raise self._error(places[name], expected=expected, found=f"{values[name]}")
         cameras, frames = self._cameras(values, places), values.get("frames")
         if frames is not None:
@@ -113,11 +119,11 @@ class Grid:
         return Cell("", method, cameras, frames, perturbation, settings, self.runs, axes, self.first_seed)
 
     def _record(self, kind: type[msgspec.Struct], data: dict[str, Any], places: Mapping[str, str]) -> Any:
-        """The record of these data."""
+        """A checked record; errors name the place of the wrong value in the file."""
         try:
             return convert(data, kind, _unplaced)
         except SettingsError as fault:
-            # Which knows the field, or its last name if it is of a record's own checks, but nothing of the file.
+            # The error names the field, perhaps by its last part only, but not the field's place in the file.
             field, _, sentence = str(fault).partition(": expected ")
             expected, _, found = sentence.partition(", found ")
             raise self._error(place_of(field, places), expected=expected, found=found) from None
@@ -143,14 +149,14 @@ class Grid:
             if first is not places:
                 pairs = [(one, other) for one, other in zip(places, first, strict=True) if one != other]
                 here, there = (" and ".join(names) for names in zip(*pairs, strict=True))
-                raise self._error(here, expected="cells that differ", found=f"the same as with {there}")
+                raise self._error(here, expected="cells that differ", found=f"the same cell as with {there}")
 
     def _error(self, place: str, *, expected: str, found: str, remedy: str = "") -> SettingsError:
         return SettingsError(f"{self.where}: {place}", expected=expected, found=found, remedy=remedy)
 
 
 class _File(msgspec.Struct, frozen=True, kw_only=True):
-    """What a grid's file holds; tables are looked into one by one."""
+    """Content of a grid's file; each table is checked separately."""
 
     sequences: Annotated[tuple[Annotated[str, msgspec.Meta(min_length=1)], ...], msgspec.Meta(min_length=1)]
     runs: Annotated[int, msgspec.Meta(ge=1)] = 1
@@ -161,25 +167,25 @@ class _File(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def load(path: Path) -> Grid:
-    """The grid in a TOML file.
+    """Read a grid from a TOML file.
 
     Raises:
-        InputError: the file cannot be read, or is no TOML.
-        SettingsError: something in it is wrong; the message names its place, and the nearest right name.
+        InputError: the file cannot be read, or is not TOML.
+        SettingsError: a name or value is wrong; the message says its place in the file, and the nearest allowed name.
     """
     return grid(read_toml(path), where=str(path))
 
 
 def grid(mapping: Mapping[str, Any], where: str = "grid") -> Grid:
-    """The grid that a mapping describes, as TOML would.
+    """Make a grid from a mapping with the same content as a TOML file.
 
     Args:
         mapping: `sequences`, `runs`, `first_seed`, `settings`, `methods` and `grid`; names of settings are dotted, or
-            lead into nested mappings.
-        where: what messages begin with.
+            lead to inner mappings.
+        where: beginning of error messages, such as the file's path.
 
     Raises:
-        SettingsError: something in it is wrong; the message names its place, and the nearest right name.
+        SettingsError: a name or value is wrong; the message says its place, and the nearest allowed name.
 
     Example:
         >>> axes = {"swarm.particles": [20, 50], "silhouettes.reduction": [4]}
@@ -212,7 +218,7 @@ def grid(mapping: Mapping[str, Any], where: str = "grid") -> Grid:
         }.items():
             if name in set_there:
                 found = f"{place}.{name} as well"
-                raise SettingsError(f"{where}: grid.{name}", expected="it in one place", found=found)
+                raise SettingsError(f"{where}: grid.{name}", expected="the name in one place", found=found)
     checked = Grid(
         file.sequences,
         file.runs,
@@ -232,7 +238,7 @@ def _unplaced(field: str, expected: str, found: str, remedy: str) -> SettingsErr
 
 
 def cameras_label(cameras: tuple[str, ...] | int | None) -> str:
-    """A cell's cameras in a word: `all`, `4`, `cam1+cam2`."""
+    """Text for a cell's cameras: `all`, their number such as `4`, or names such as `cam1+cam2`."""
     if cameras is None:
         return "all"
     return str(cameras) if isinstance(cameras, int) else "+".join(cameras)

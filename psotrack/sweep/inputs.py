@@ -26,7 +26,7 @@ from psotrack.sweep.perturbations import perturb
 #: Folders below the data's root in which a sequence is looked for.
 HALVES = ("Simulated_Data", "Real_Data", ".")
 
-#: Sequence, number of frames and settings, which decide what silhouettes a cell needs; no settings where it needs none.
+#: Sequence, number of frames and settings of the silhouettes that a cell needs; None if it needs no silhouettes.
 Source = tuple[str, int | None, SilhouetteSettings | None]
 
 
@@ -61,7 +61,7 @@ class Inputs:
 
         Raises:
             InputError: a file cannot be read.
-            SettingsError: the sequence has fewer frames than the cell asks for.
+            SettingsError: the sequence has fewer frames than the cell needs.
         """
         sequence, keys = self._source(cell)
         keys = dict(keys)
@@ -77,7 +77,7 @@ class Inputs:
 
         Raises:
             InputError: the sequence cannot be read.
-            SettingsError: the sequence has fewer frames than the cell asks for.
+            SettingsError: the sequence has fewer frames than the cell needs.
         """
         return self._source(cell)[0]
 
@@ -137,7 +137,7 @@ class Inputs:
 
 
 def source_of(cell: Cell) -> Source:
-    """Everything that decides what silhouettes a cell needs."""
+    """Sequence, number of frames and settings of the silhouettes that a cell needs."""
     settings = cell.settings
     return cell.sequence, cell.frames, settings.silhouettes if settings.needs_silhouettes else None
 

@@ -34,8 +34,8 @@ POLL_S = 0.2
 class Locks:
     """The locks that one runner takes.
 
-    A runner keeps its `Locks` as long as it waits: whether a lock of another machine has lapsed shows only to a process
-    that has watched the lock's file for `LEASE_S`.
+    A runner keeps its `Locks` as long as it waits, because a process finds out whether a lock of another machine has
+    lapsed only by watching the lock's file for `LEASE_S`.
     """
 
     def __init__(self) -> None:
@@ -84,7 +84,7 @@ class Locks:
             if not lease.is_locked and _acquire(lease):
                 lease.release()
                 return None
-            # This process has not watched the file, so the clocks of both machines must do here.
+            # This process has not watched the file, so the clocks of both machines are compared instead.
             if time.time() - path.stat().st_mtime > LEASE_S:
                 return None
             owner = lease.owner

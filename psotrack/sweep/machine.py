@@ -27,14 +27,12 @@ def use_device(device: Device) -> None:
     import jax
 
     jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[device])
-    remedy = "NVIDIA's need its driver and `pip install 'psotrack[cuda]'`" if device == "gpu" else ""
+    remedy = "a GPU needs NVIDIA's driver and `pip install 'psotrack[cuda]'`" if device == "gpu" else ""
     try:
         found = jax.default_backend()
-    except (
-        RuntimeError,
-        AssertionError,
-    ) as error:  # AssertionError if JAX is installed without support for the device
-        why = str(error).partition("\n")[0] or "none that JAX knows"
+    except (RuntimeError, AssertionError) as error:
+        # JAX raises AssertionError if it is installed without support for the device.
+        why = str(error).partition("\n")[0] or "no device that JAX can use"
         raise SettingsError("--device", expected=f"a {device}", found=why, remedy=remedy) from error
     if found != device:
         raise SettingsError(
@@ -64,9 +62,9 @@ def processors() -> int:
 
 def provenance() -> dict[str, Any]:
     """Versions, device and commit, as nested tables for JSON."""
-    known = environment()
-    device = known["device"] | {"processor": _processor(), "processors": processors()}
-    return {"versions": known["versions"], "device": device, "commit": commit()}
+    this = environment()
+    device = this["device"] | {"processor": _processor(), "processors": processors()}
+    return {"versions": this["versions"], "device": device, "commit": commit()}
 
 
 @cache

@@ -30,9 +30,9 @@ def note_run(manifest: dict[str, Any], grid: Grid, origin: Mapping[str, Any]) ->
         grid: the grid.
         origin: versions, device and commit.
     """
-    asked = {name: value for name, value in asdict(grid).items() if name != "where"}
+    content = {name: value for name, value in asdict(grid).items() if name != "where"}
     # The entry must compare equal to one that was read from JSON, where tuples are lists.
-    entry = json.loads(json.dumps({"grid": asked, "cells": len(grid.cells()), **origin}))
+    entry = json.loads(json.dumps({"grid": content, "cells": len(grid.cells()), **origin}))
     now = datetime.now(UTC).isoformat(timespec="milliseconds")
     for run in manifest["runs"]:
         if {name: value for name, value in run.items() if name not in ("first", "last")} == entry:

@@ -1,4 +1,4 @@
-"""The names in a grid: which there are, where each belongs, and where in the file a value was written."""
+"""Names in the file of a grid: the allowed names of each table, and the place of each value in the file."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ from psotrack.settings import renamed, setting_names
 from psotrack.support import nearest
 from psotrack.sweep.cells import Perturbation
 
-#: Dotted names of everything that [settings] and [methods] may set.
+#: Dotted names that the tables [settings] and [methods.NAME] may contain.
 SETTINGS = tuple(name for name in setting_names() if name != "seed")
+#: Names of the perturbations that [grid] may vary.
 PERTURBATIONS = tuple(name for name in Perturbation.__struct_fields__ if name != "draw")
 
-#: What [grid] may vary besides.
+#: Names that [grid] may vary in addition to the settings.
 INPUTS = ("cameras", "frames", *PERTURBATIONS)
 
 
 def table(where: str, place: str, content: Any, names: tuple[str, ...]) -> dict[str, Any]:
-    """Dotted names -> values of a table.
+    """Values of a table, by dotted name.
 
     Args:
-        where: what messages begin with.
-        place: of the table in the file.
-        content: dotted names, or tables in tables.
-        names: that it may have.
+        where: beginning of error messages, such as the file's path.
+        place: name of the table in the file.
+        content: the table; its names are dotted, or lead to inner tables.
+        names: allowed names.
 
     Raises:
-        SettingsError: it is no table, or has another name, or one twice.
+        SettingsError: `content` is not a table, a name is not allowed, or a name occurs twice.
     """
     if not isinstance(content, Mapping):
         raise SettingsError(f"{where}: {place}", expected="a table", found=f"{content!r}")
@@ -36,35 +37,41 @@ def table(where: str, place: str, content: Any, names: tuple[str, ...]) -> dict[
     for name, value in flat(content):
         check_name(f"{where}: {place}.", name, names)
         if name in values:
-            raise SettingsError(f"{where}: {place}.{name}", expected="it once", found="it twice")
+            raise SettingsError(f"{where}: {place}.{name}", expected="the name once", found="the name twice")
         values[name] = value
     return values
 
 
 def check_name(prefix: str, name: str, names: tuple[str, ...]) -> None:
-    """Raise `SettingsError` unless the name is one of those; it says what may be meant."""
+    """Raise `SettingsError` if a name is not allowed; the error suggests a name.
+
+    Args:
+        prefix: beginning of the error message: the file and the table.
+        name: the name.
+        names: allowed names.
+    """
     if name in names:
         return
     if renamed(name):
         raise SettingsError(
-            f"{prefix}{name}", expected="a name that there is", found=name, remedy=renamed(name)
+            f"{prefix}{name}", expected="the name of a setting", found=name, remedy=renamed(name)
         )
     if any(other.startswith(f"{name}.") for other in names):
         raise SettingsError(f"{prefix}{name}", expected="a table with names", found="none")
     near = nearest(name, names)
     if name == "seed":
-        remedy = "runs are seeds: say runs = 10, and first_seed where they shall not begin with 0"
+        remedy = "every run has a seed of its own: set runs = 10, and first_seed if the first seed is not 0"
     elif name in INPUTS:
         remedy = "it belongs in [grid], with a list of values"
     elif name in SETTINGS:
         remedy = "it belongs in [settings], or in [grid] with a list of values"
     else:
-        remedy = f"did you mean {near}?" if near else f"there are {', '.join(names)}"
-    raise SettingsError(f"{prefix}{name}", expected="a name that there is", found=name, remedy=remedy)
+        remedy = f"did you mean {near}?" if near else f"allowed names are {', '.join(names)}"
+    raise SettingsError(f"{prefix}{name}", expected="an allowed name", found=name, remedy=remedy)
 
 
 def flat(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted names and values; an empty table is a value."""
+    """Dotted names and values of a nested table; an empty inner table is a value."""
     for name, value in content.items():
         if isinstance(value, Mapping) and value:
             yield from flat(value, f"{prefix}{name}.")
@@ -73,7 +80,7 @@ def flat(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
 
 
 def nested(values: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
-    """Tables in tables, of those dotted names that are among `names`."""
+    """Nested tables from dotted names and values; dotted names that are not among `names` are left out."""
     data: dict[str, Any] = {}
     for name, value in values.items():
         if name in names:
@@ -86,10 +93,15 @@ def nested(values: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def place_of(field: str, places: Mapping[str, str]) -> str:
-    """Where in the file a field of a record was written, which may be an item of it, or its last name only."""
+    """Place in the file of a field of a record.
+
+    Args:
+        field: dotted name of the field, or the name's last part, followed by the index of an item if it has one.
+        places: places in the file, by dotted name.
+    """
     name, bracket, item = field.partition("[")
     for dotted, place in places.items():
         if name in (dotted, dotted.rpartition(".")[2]):
             return f"{place}{bracket}{item}"
-    # What was written does not go with the default of this.
+    # The file does not contain the field: a value in the file does not fit the field's default.
     return f"the default of {field}"

@@ -24,7 +24,7 @@ _DIGITS = 3
 
 
 def render(table: pd.DataFrame, format: str = "text", *, decimals: int | None = None) -> str:
-    """Print a table of `pivot` into a text that ends with a line break.
+    """Text of a table of `pivot`, with a line break at the end.
 
     Args:
         table: a table of `pivot`.
@@ -109,7 +109,7 @@ def _cells(table: pd.DataFrame, form: str, decimals: int) -> pd.DataFrame:
 def _cell(mean: float, std: float, form: str, decimals: int) -> str:
     if math.isnan(mean):
         return "-"
-    # The form of a single run is that of both numbers, without what stands between them.
+    # For a single run, the form is shortened to one number: the text between the two numbers is left out.
     alone = re.sub(r"\{\}.*\{\}", "{}", form)
     numbers = [f"{value:.{decimals}f}" for value in (mean, std) if not math.isnan(value)]
     return (form if len(numbers) == 2 else alone).format(*numbers)
