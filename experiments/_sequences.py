@@ -1,4 +1,4 @@
-"""Simulate the sequences that experiments work on, unless they are there already.
+"""Simulate the sequences that experiments use, unless they exist already.
 
     python experiments/_sequences.py S01_D2_A S02_D4_A --data data --seeds 2
 

@@ -1,4 +1,4 @@
-"""What the studies of this folder share: sequences, one run of the tracker, and rows that survive an interrupt."""
+"""Shared parts of the studies of this folder: sequences, a run of the tracker, and rows that are kept after Ctrl-C."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results
 from _sequences import simulated
 
+#: Figures of `evaluate` that a row has.
 KEPT = ["offset_removed_mean_error_m", "mean_error_m", "max_error_m", "missed_rate", "id_switches", "hota"]
 KEPT += ["offset_removed_inside_90_rate", "offset_removed_mean_nees"]
 
@@ -52,15 +53,15 @@ def cache_folder(data: Path) -> Path:
     return data / "silhouettes"
 
 
-def opened(name: str, data: Path, seed: int = 0) -> tuple[Recording, Silhouettes]:
-    """A simulated sequence and its silhouettes; both are made if they are not there."""
+def open_sequence(name: str, data: Path, seed: int = 0) -> tuple[Recording, Silhouettes]:
+    """Read a simulated sequence and its silhouettes; make both if they are missing."""
     keep_compiled(cache_folder(data) / "compiled")
     recording = read_sequence(simulated(name, data, seed)).usable()
     return recording, compute(recording, TrackSettings().silhouettes, cache=cache_folder(data))
 
 
 def figures(recording: Recording, silhouettes: Silhouettes, settings: TrackSettings) -> dict[str, Any]:
-    """Figures of one run. A run that finds no drones has missed all drones."""
+    """Figures of one run. A run that finds no drones misses all drones."""
     assert recording.truth is not None
     try:
         (tracked,) = track_runs(recording, silhouettes, [settings])
@@ -90,8 +91,8 @@ def save_rows(
 ) -> pd.DataFrame:
     """Compute rows one after the other, and save them with their record.
 
-    Rows that are done are kept in `data`/partial until all are done, so that an interrupted study goes on where it was,
-    as long as neither the code nor the command has changed.
+    Finished rows are kept in `data`/partial until all rows are finished, so that the same command continues an
+    interrupted study, if the code has not changed.
 
     Args:
         run: the run of the experiment.
@@ -119,7 +120,7 @@ def save_rows(
 
 
 def _read_partial(path: Path, code_state: str) -> dict[str, dict[str, Any]]:
-    """Rows that an interrupted run of the same code has left."""
+    """Read the rows that an interrupted run of the same code has finished."""
     if not path.exists():
         return {}
     kept = json.loads(path.read_text(encoding="utf-8"))

@@ -1,9 +1,9 @@
-"""What each part of the tracker contributes: each is left out in turn, on three sequences, three flights of each.
+"""Contribution of each part of the tracker: each part is left out in turn, on three flights of three sequences.
 
     python experiments/accuracy/ablation.py --data data
 
-Simulates the sequences that are missing, tracks them, and writes one row per run and a picture; prints the means. An
-interrupted study goes on where it was.
+Simulates missing sequences, tracks all sequences, writes one row per run and a picture, and prints the means. The same
+command continues an interrupted study.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import pandas as pd
 from psotrack.settings import TrackSettings
 from psotrack.support import atomic_write
 
-#: Settings that leave a part out, or add one that is off by default.
+#: Name of a variant -> settings that leave a part out, or add a part that is off by default.
 VARIANTS: dict[str, dict[str, Any]] = {
     "everything, and smoothing": {"smooth": True},
     "everything": {},
@@ -34,13 +34,13 @@ EVERYTHING = "everything"
 
 
 def run(name: str, variant: str, seed: int, opened: tuple) -> dict[str, Any]:
-    """One row."""
+    """Track one flight with one variant; returns the row of the result."""
     settings = TrackSettings(seed=seed).changed(_runs.EFFORT[name] | VARIANTS[variant])
     return {"sequence": name, "variant": variant, "seed": seed} | _runs.figures(*opened, settings)
 
 
 def draw(table: pd.DataFrame, path: Path) -> None:
-    """Error of every variant on every sequence; a dot per seed, a line at the error of everything."""
+    """Draw the error of each variant on each sequence: a dot per seed, and a line at the error of the whole tracker."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -76,21 +76,21 @@ def draw(table: pd.DataFrame, path: Path) -> None:
 
 
 def main() -> None:
-    """Track, write, print, draw."""
+    """Track all flights, write and draw the result, and print the means."""
     parser = _runs.parser(__doc__)
     parser.add_argument("--picture", type=Path, default=Path("experiments/pictures/ablation.png"))
-    parser.add_argument("--sequence", choices=_runs.EFFORT, action="append", help="[default: all of them]")
-    parser.add_argument("--variant", choices=VARIANTS, action="append", help="[default: all of them]")
+    parser.add_argument("--sequence", choices=_runs.EFFORT, action="append", help="[default: all]")
+    parser.add_argument("--variant", choices=VARIANTS, action="append", help="[default: all]")
     parser.add_argument("--seeds", type=int, default=3, help="seeds of flight and swarm: 0, 1, ...")
     options = parser.parse_args()
 
     started = _runs.start("ablation")
-    # One flight after the other, so that an interrupted study has rows of every sequence and variant.
+    # Seeds are the outer loop, so that an interrupted study has rows of every sequence and variant.
     rows = (
         (f"{name} {variant} {seed}", partial(run, name, variant, seed, opened))
         for seed in range(options.seeds)
         for name in options.sequence or _runs.EFFORT
-        for opened in [_runs.opened(name, options.data, seed)]
+        for opened in [_runs.open_sequence(name, options.data, seed)]
         for variant in options.variant or VARIANTS
     )
     table = _runs.save_rows(

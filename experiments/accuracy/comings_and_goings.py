@@ -1,11 +1,11 @@
-"""Drones that come, leave, land, hover, and fly out of all but two cameras: what is said of each of them, and when.
+"""Tracking of drones that come, leave, land, hover, and are visible to only two cameras.
 
     python experiments/accuracy/comings_and_goings.py --data data
 
-Simulates `comings_and_goings.toml` if it is not there, and tracks it without being told how many drones there are, once
-against the background of the whole video and once against one that is learned on, which swallows what stands still for
-three seconds. Writes one row per drone and phase of its flight (CSV), the machine's description (JSON) and a figure
-(PNG); prints the table. A quarter of an hour on two cores, nearly all of it for the videos.
+Simulates `comings_and_goings.toml` if the sequence is missing, and tracks it twice without the number of drones: with
+the background of the whole video, and with a background that adapts and absorbs drones that stand still for three
+seconds. Writes one row per drone and phase of its flight (CSV), the record (JSON) and a figure (PNG), and prints the
+table.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ BACKGROUNDS = {
     "background of the whole video": SilhouetteSettings(),
     "background that is learned on": SilhouetteSettings(learning_rate=0.01),
 }
-#: Slower than this for so long is standing still.
+#: A drone stands still if it is slower than this speed for at least this time, seconds.
 STILL_M_S, STILL_S = 0.03, 3.0
-#: A track farther than this from every drone is of none.
+#: Largest distance of a track from its drone, metres; a track that is farther from every drone is false.
 GATE_M = 0.5
 UNSEEN, BY_TWO, STILL, SEEN = "unseen", "seen by two", "still", "seen"
 COLOURS = {Status.TRACKED: "tab:green", Status.COASTING: "tab:orange", Status.LOST: "tab:red"}
@@ -51,7 +51,14 @@ COLOURS = {Status.TRACKED: "tab:green", Status.COASTING: "tab:orange", Status.LO
 
 @dataclass(frozen=True)
 class Phase:
-    """Some of the frames of one drone, in which the same can be asked of a tracker."""
+    """Consecutive frames of one drone with one kind of visibility.
+
+    Attributes:
+        drone: index of the drone.
+        word: kind of visibility: `UNSEEN`, `BY_TWO`, `STILL` or `SEEN`.
+        first: first frame.
+        end: frame after the last frame.
+    """
 
     drone: int
     word: str
@@ -59,8 +66,8 @@ class Phase:
     end: int
 
 
-def opened(data: Path) -> Recording:
-    """The simulated sequence, which is made if it is not there."""
+def open_sequence(data: Path) -> Recording:
+    """Read the simulated sequence; make it if it is missing."""
     recipe = scenarios.load(SCENARIO)
     folder = data / "seed0" / "Simulated_Data" / recipe.name
     if not folder.exists():
@@ -70,7 +77,7 @@ def opened(data: Path) -> Recording:
 
 
 def views(recording: Recording, position_m: np.ndarray) -> np.ndarray:
-    """(frames, drones), viewpoints whose images hold the drones' origins."""
+    """(frames, drones), number of viewpoints whose images contain the drone's origin."""
     cameras = recording.rig.cameras
     pixels, depth = project(cameras, position_m[..., None, :])
     inside = ((pixels >= 0) & (pixels < cameras.image_size_wh)).all(axis=-1) & (depth > 0)
@@ -79,8 +86,8 @@ def views(recording: Recording, position_m: np.ndarray) -> np.ndarray:
 
 
 def phases(recording: Recording) -> list[Phase]:
-    """All drones from the first frame to the last."""
-    position_m = _known(recording)
+    """Phases of all drones, from the first frame to the last."""
+    position_m = _true_positions_m(recording)
     seen = views(recording, position_m)
     words = np.select([seen < 2, seen == 2, _still(position_m, recording.fps)], [UNSEEN, BY_TWO, STILL], SEEN)
     found = []
@@ -93,15 +100,15 @@ def phases(recording: Recording) -> list[Phase]:
     return found
 
 
-def _known(recording: Recording) -> np.ndarray:
-    """(frames, drones, 3); frame 0, of which the dataset says nothing, like the next."""
+def _true_positions_m(recording: Recording) -> np.ndarray:
+    """(frames, drones, 3), true positions, metres; frame 0, which the dataset lacks, gets the positions of frame 1."""
     position_m = recording.truth.position_m.copy()
     position_m[0] = position_m[1]
     return position_m
 
 
 def _still(position_m: np.ndarray, fps: float) -> np.ndarray:
-    """(frames, drones), whether a drone stands still for long."""
+    """(frames, drones), whether a drone stands still, for at least `STILL_S`."""
     slow = np.linalg.norm(np.gradient(position_m, axis=0), axis=-1) * fps < STILL_M_S
     still = np.zeros_like(slow)
     for drone, of_drone in enumerate(slow.T):
@@ -112,13 +119,17 @@ def _still(position_m: np.ndarray, fps: float) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Judged:
-    """What a run says, beside the truth.
+class ComparedTracks:
+    """Tracks of a run, compared with the true positions.
 
     Attributes:
-        drone: (frames, tracks), which one a track is at where it is tracked, and else was at last; -1 for none.
-        tracked, coasting: (frames, tracks).
-        residual_m: (frames, tracks, 3), from that drone, without the median of the track; NaN where not tracked.
+        trajectories: the tracks.
+        drone: (frames, tracks), index of the drone at the track; of the last drone where the status is not tracked; -1
+            for none.
+        tracked: (frames, tracks), whether the status is tracked.
+        coasting: (frames, tracks), whether the status is coasting.
+        residual_m: (frames, tracks, 3), offset from the drone without the median offset of the track, metres; NaN where
+            the status is not tracked.
     """
 
     trajectories: Trajectories
@@ -128,8 +139,8 @@ class Judged:
     residual_m: np.ndarray
 
 
-def judged(trajectories: Trajectories, position_m: np.ndarray) -> Judged:
-    """Tracks and the drones that they are at."""
+def compare_tracks(trajectories: Trajectories, position_m: np.ndarray) -> ComparedTracks:
+    """Compare tracks with the true positions (frames, drones, 3)."""
     status = trajectories.status
     apart_m = trajectories.position_m[:, :, None] - position_m[:, None]
     distance_m = np.nan_to_num(np.linalg.norm(apart_m, axis=-1), nan=np.inf)
@@ -141,11 +152,11 @@ def judged(trajectories: Trajectories, position_m: np.ndarray) -> Judged:
     residual_m[~tracked | (drone < 0)] = np.nan
     for track in np.flatnonzero(np.isfinite(residual_m[..., 0]).any(axis=0)):
         residual_m[:, track] -= np.nanmedian(residual_m[:, track], axis=0)
-    return Judged(trajectories, drone, tracked, status == Status.COASTING, residual_m)
+    return ComparedTracks(trajectories, drone, tracked, status == Status.COASTING, residual_m)
 
 
-def row(phase: Phase, run: Judged, fps: float) -> dict[str, Any]:
-    """What a run says of a phase."""
+def row(phase: Phase, run: ComparedTracks, fps: float) -> dict[str, Any]:
+    """Row of the result for one phase."""
     frames = slice(phase.first, phase.end)
     at = run.drone[frames] == phase.drone
     tracks = at & run.tracked[frames]
@@ -153,7 +164,7 @@ def row(phase: Phase, run: Judged, fps: float) -> dict[str, Any]:
     residual_m = np.where(tracks[..., None], run.residual_m[frames], np.nan)
     covariance_m2 = run.trajectories.covariance_m2[frames]
     std_mm = 1e3 * np.sqrt(np.trace(covariance_m2, axis1=-2, axis2=-1))
-    honest = consistency(residual_m, residual_m, covariance_m2)
+    calibrated = consistency(residual_m, residual_m, covariance_m2)
     return {
         "drone": phase.drone + 1,
         "phase": phase.word,
@@ -167,8 +178,8 @@ def row(phase: Phase, run: Judged, fps: float) -> dict[str, Any]:
         "error_mm": 1e3 * _mean(np.linalg.norm(residual_m, axis=-1)[tracks]),
         "std_mm": _mean(std_mm[tracks]),
         "coasting_to_std_mm": max(std_mm[at & run.coasting[frames]].tolist(), default=np.nan),
-        "inside_90": honest.inside_90_rate,
-        "nees": honest.mean_nees,
+        "inside_90": calibrated.inside_90_rate,
+        "nees": calibrated.mean_nees,
     }
 
 
@@ -176,17 +187,17 @@ def _mean(values: np.ndarray) -> float:
     return float(values.mean()) if len(values) else np.nan
 
 
-def summary(recording: Recording, run: Judged) -> dict[str, Any]:
-    """What a run says on the whole: of drones that two viewpoints see or more."""
+def summary(recording: Recording, run: ComparedTracks) -> dict[str, Any]:
+    """Figures of a whole run, over drones that at least two viewpoints see."""
     truth = recording.truth
     there = views(recording, truth.position_m)[..., None] >= 2
     evaluation = evaluate(
         run.trajectories, replace(truth, position_m=np.where(there, truth.position_m, np.nan))
     )
-    nobody = run.tracked & (run.drone < 0)
+    false_tracks = run.tracked & (run.drone < 0)
     return {
         "tracks": run.trajectories.num_drones,
-        "tracked_nobody_s": float(nobody.sum() / recording.fps),
+        "tracked_nobody_s": float(false_tracks.sum() / recording.fps),
         "id_switches": evaluation.id_switches,
         "missed_rate": evaluation.missed_rate,
         "mota": evaluation.mota,
@@ -198,10 +209,12 @@ def summary(recording: Recording, run: Judged) -> dict[str, Any]:
     }
 
 
-def draw(runs: dict[str, tuple[Judged, tuple[Any, ...]]], plan: list[Phase], fps: float, path: Path) -> None:
-    """A row per drone: what it does as a grey line, below it the tracks that are at it, in the colour of their status.
+def draw(
+    runs: dict[str, tuple[ComparedTracks, tuple[Any, ...]]], plan: list[Phase], fps: float, path: Path
+) -> None:
+    """Draw a row per drone: its phases as a grey line, and below it its tracks in the colours of their status.
 
-    Where a track begins, or begins anew, is its number.
+    The number of a track stands where the track begins or begins again.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -247,7 +260,7 @@ def draw(runs: dict[str, tuple[Judged, tuple[Any, ...]]], plan: list[Phase], fps
                 color="tab:blue" if arrival["again"] else "black",
                 markersize=6,
             )
-        axes.set_yticks(range(drones + 1), [*(f"dron{drone + 1}" for drone in range(drones)), "nobody"])
+        axes.set_yticks(range(drones + 1), [*(f"dron{drone + 1}" for drone in range(drones)), "no drone"])
         axes.set_ylim(drones + 0.6, -0.6)
         axes.set_title(name, fontsize=10)
         axes.grid(visible=True, axis="x", alpha=0.3)
@@ -270,27 +283,29 @@ def draw(runs: dict[str, tuple[Judged, tuple[Any, ...]]], plan: list[Phase], fps
 
 
 def main() -> None:
-    """Track, write, print, draw."""
+    """Track with both backgrounds, write and draw the result, and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--data", type=Path, default=Path("data"), help="the data's root folder")
-    parser.add_argument("--cache", type=Path, default=Path("data/silhouettes"), help="of the silhouettes")
+    parser.add_argument(
+        "--cache", type=Path, default=Path("data/silhouettes"), help="folder of the silhouettes"
+    )
     parser.add_argument(
         "--out", type=Path, default=Path("experiments/accuracy/results"), help="folder of results"
     )
     parser.add_argument("--picture", type=Path, default=Path("experiments/pictures/comings_and_goings.png"))
-    parser.add_argument("--seed", type=int, default=0, help="of the swarm")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the swarm")
     options = parser.parse_args()
     started = _results.Run("comings_and_goings")
 
-    recording = opened(options.data)
-    position_m, plan = _known(recording), phases(recording)
+    recording = open_sequence(options.data)
+    position_m, plan = _true_positions_m(recording), phases(recording)
     table, totals, runs = [], {}, {}
     for name, how in BACKGROUNDS.items():
         settings = TrackSettings(seed=options.seed, silhouettes=how)
         (tracked,) = track_runs(recording, compute(recording, how, cache=options.cache), [settings])
-        run = judged(tracked.trajectories, position_m)
+        run = compare_tracks(tracked.trajectories, position_m)
         runs[name] = run, tracked.record["arrivals"]
         table += [{"background": name, **row(phase, run, recording.fps)} for phase in plan]
         totals[name] = summary(recording, run)

@@ -1,9 +1,9 @@
-"""The accuracy that the README states: simulated sequences, full size, silhouettes from the videos.
+"""Accuracy table of the README: simulated sequences of full size, silhouettes from the videos.
 
     python experiments/accuracy/measure.py --data data
 
-Simulates three flights of each sequence into --data unless they are there, tracks them with each method, and writes one
-row per run. It prints the commands that it runs. An interrupted study goes on where it was.
+Simulates three flights of each sequence into --data unless they exist, tracks them with each method, writes one row per
+run, and prints its commands. The same command continues an interrupted study.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ JOINT, HARD = ("--swarm", "joint"), ("--score", "hard")
 
 
 def effort(particles: int, iterations: int) -> tuple[str, ...]:
-    """Flags of the swarm's size."""
+    """Options for the size of the swarm."""
     return "--particles", str(particles), "--iterations", str(iterations)
 
 
@@ -52,7 +52,7 @@ KEPT += ["offset_removed_inside_90_rate", "missed_rate", "id_switches", "mota", 
 
 
 def psotrack(*words: str) -> str:
-    """Run the command line as a user would; show the command and return what it printed."""
+    """Run a command of psotrack; print the command and return its output."""
     print("$ psotrack", *words, flush=True)
     return subprocess.run(
         [sys.executable, "-m", "psotrack", *words], check=True, stdout=subprocess.PIPE, text=True
@@ -60,7 +60,7 @@ def psotrack(*words: str) -> str:
 
 
 def measured(name: str, method: str, seed: int, data: Path) -> dict[str, Any]:
-    """One row."""
+    """Track and evaluate one flight with one method; returns the row of the result."""
     sequence = str(_runs.simulated(name, data, seed))
     number = list(METHODS[name]).index(method)
     tracks = data / "tracks" / f"{name}-{seed}-{number}.csv"
@@ -75,7 +75,7 @@ def measured(name: str, method: str, seed: int, data: Path) -> dict[str, Any]:
 def main() -> None:
     """Simulate, track, evaluate, and print the table."""
     parser = _runs.parser(__doc__)
-    parser.add_argument("--sequence", choices=METHODS, action="append", help="[default: all of them]")
+    parser.add_argument("--sequence", choices=METHODS, action="append", help="[default: all]")
     parser.add_argument(
         "--method", choices=sorted({one for of in METHODS.values() for one in of}), action="append"
     )

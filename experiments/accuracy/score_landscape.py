@@ -1,10 +1,10 @@
-"""The score about a drone's true position, for each of the five drone models, beside the paper's hard score.
+"""The score around a drone's true position, for each of the five drone models, beside the paper's hard score.
 
     python experiments/accuracy/score_landscape.py --data data --out experiments/pictures
 
 Simulates a short sequence with one drone of each model (half size, two seconds), makes its silhouettes as `psotrack
-track` does, and draws score_landscape.png: three slices of 0.8 m through the truth, and a curve along x. Prints where
-the maximum is and how wide it is, mean over frames.
+track` does, and draws score_landscape.png: three slices of 0.8 m through the true position, and a curve along x. Prints
+the position and the width of the maximum, means over frames.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results
 
 NUM_FRAMES, SCALE = 50, 0.5
-#: At half size: as coarse as silhouettes of the full size are.
+#: Cells of 2 x 2 pixels at half the image size show the same detail as cells of 4 x 4 pixels at full size.
 SILHOUETTES = SilhouetteSettings(reduction=2)
 SCORES = {
     "this score": SoftIoU(),
     "the paper's hard score": PAPER_SCORE,
 }
-#: Half of a slice, and its steps; the maximum is looked for in a cube of that half.
+#: Half side and step of a slice, and half side and step of the cube in which the maximum is searched, metres.
 HALF_M, STEP_M, SOUGHT_M, FINE_M = 0.4, 0.01, 0.12, 0.005
-#: The slices: what is to the right, what is up.
+#: Slices: axis to the right, and axis upwards.
 SLICES = ((0, 1), (0, 2), (1, 2))
 AXIS = "xyz"
 COLOURS = {"this score": "#1a6fb5", "the paper's hard score": "#c2571a"}
@@ -57,7 +57,7 @@ INK = "#2b313a"
 
 
 def recipe() -> Scenario:
-    """One drone of each model in the laboratory, side by side, each swinging to and fro."""
+    """Scenario with one drone of each model in the laboratory, side by side; each drone swings back and forth."""
     drones = []
     for index, name in enumerate(MODELS):
         swing = Harmonic(
@@ -74,7 +74,14 @@ def recipe() -> Scenario:
 
 @dataclass(frozen=True)
 class Data:
-    """What scores are made of: silhouettes (frames, cameras, height, width), and the drones in the models' order."""
+    """Data of the scores; drones are in the order of the models.
+
+    Attributes:
+        coverage: (frames, cameras, height, width), silhouettes.
+        cameras: the cameras.
+        truth_m: (frames, drones, 3), true positions, metres.
+        size_m: (drones, 3), sizes found in the first frames, metres.
+    """
 
     coverage: np.ndarray
     cameras: Camera
@@ -83,7 +90,7 @@ class Data:
 
 
 def load(root: Path) -> Data:
-    """The silhouettes of the sequence, simulated if need be, and the sizes that the tracker would start with."""
+    """Read the sequence and compute its silhouettes and initial sizes; simulate the sequence if it is missing."""
     made = recipe()
     folder = root / "Simulated_Data" / made.name
     if not folder.exists():
@@ -115,7 +122,7 @@ def scores(
     offset_m: jax.Array,
     score: Score,
 ) -> jax.Array:
-    """(places, drones), the score of every drone at its position moved by each of the offsets (places, 3)."""
+    """(places, drones), the score of every drone at its position plus each of the offsets (places, 3)."""
     seen = make_extents(cameras, size_m)
     drones = len(size_m)
     patches = cut(
@@ -130,13 +137,15 @@ def scores(
         ring=score.ring,
     )
     view = ScoreInputs(seen, patches, score)
-    # Piece by piece: a slice has as many places as a hundred swarms.
+    # In batches, because a slice has thousands of places and would not fit into memory.
     places = about_m + offset_m[:, None]
-    return jnp.nan_to_num(jax.lax.map(lambda one: drone_fitness(view, one), places, batch_size=500))
+    return jnp.nan_to_num(
+        jax.lax.map(lambda position_m: drone_fitness(view, position_m), places, batch_size=500)
+    )
 
 
 def score_about(data: Data, frame: int, offset_m: np.ndarray, score: Score) -> np.ndarray:
-    """(..., drones), the score of a frame at the truth moved by offsets (..., 3)."""
+    """(..., drones), the score of a frame at the true positions plus offsets (..., 3)."""
     found = scores(
         data.coverage[frame],
         data.cameras,
@@ -149,7 +158,7 @@ def score_about(data: Data, frame: int, offset_m: np.ndarray, score: Score) -> n
 
 
 def grid(half_m: float, step_m: float, axes: tuple[int, ...]) -> np.ndarray:
-    """(n, ..., 3), offsets along some of the axes, the others 0."""
+    """(n, ..., 3), offsets on a grid along the given axes; the offset along other axes is 0."""
     line = np.arange(-round(half_m / step_m), round(half_m / step_m) + 1) * step_m
     offset_m = np.zeros((*[len(line)] * len(axes), 3))
     for axis, values in zip(axes, np.meshgrid(*[line] * len(axes), indexing="ij"), strict=True):
@@ -163,7 +172,7 @@ def widths_m(curve: np.ndarray, share: float) -> float:
 
 
 def summary(data: Data, frames: range) -> pd.DataFrame:
-    """One row per model and score, mean over frames."""
+    """One row per model and score, means over frames."""
     cube = grid(SOUGHT_M, FINE_M, (0, 1, 2)).reshape(-1, 3)
     rows = []
     for label, score in SCORES.items():
@@ -172,7 +181,7 @@ def summary(data: Data, frames: range) -> pd.DataFrame:
         for row, frame in enumerate(frames):
             found = score_about(data, frame, cube, score)
             for drone in range(len(MODELS)):
-                # The middle of the best places, where there are several.
+                # Several places may have the best score: their mean counts.
                 best[row, drone] = cube[found[:, drone] == found[:, drone].max()].mean(axis=0)
             for axis in range(3):
                 curve = score_about(data, frame, grid(HALF_M, STEP_M, (axis,)), score)
@@ -191,11 +200,13 @@ def summary(data: Data, frames: range) -> pd.DataFrame:
                     "half-width at half height, mm": 1e3 * half[:, drone].mean(),
                 }
             )
-    return pd.DataFrame(rows).sort_values("model", key=lambda of: of.map(list(MODELS).index), kind="stable")
+    return pd.DataFrame(rows).sort_values(
+        "model", key=lambda names: names.map(list(MODELS).index), kind="stable"
+    )
 
 
 def draw(data: Data, frame: int) -> Figure:
-    """A row per model: slices of either score, and both along x."""
+    """Draw a row per model: slices of both scores, and curves of both along x."""
     count = len(SLICES)
     figure = Figure(figsize=(15.0, 10.4), layout="constrained")
     panels = figure.subplots(
@@ -230,7 +241,7 @@ def draw(data: Data, frame: int) -> Figure:
 
 
 def draw_slice(panel: Axes, image: np.ndarray, axes: tuple[int, int]) -> None:
-    """One slice in shares of the highest score; a cross at the truth, a ring at the slice's maximum."""
+    """Draw one slice in shares of the highest score; a cross is the true position, a ring the slice's maximum."""
     edge = HALF_M + STEP_M / 2
     panel.imshow(image.T, origin="lower", extent=(-edge, edge, -edge, edge), vmin=0, vmax=1, cmap="viridis")
     line = np.linspace(-HALF_M, HALF_M, len(image))
@@ -245,7 +256,7 @@ def draw_slice(panel: Axes, image: np.ndarray, axes: tuple[int, int]) -> None:
 
 
 def main() -> None:
-    """Simulate, draw the page, print the table."""
+    """Simulate the sequence, draw the picture, and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

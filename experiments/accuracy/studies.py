@@ -1,10 +1,10 @@
-"""How accuracy suffers from what laboratories have: fewer cameras, poor calibration, clocks that differ, noise.
+"""Accuracy with fewer cameras, poor calibration, unequal clocks, noise, and coarser silhouettes.
 
     python experiments/accuracy/studies.py --data data
 
-Five grids (`studies/*.toml`) over three flights of S02_D4_A, joint swarm of 100 x 70, drones found by themselves; each
-can be run by `psotrack sweep` alone, and an interrupted study goes on where it was. Simulates the sequences that are
-missing; writes one row per run and a picture; prints means and worst values.
+Five grids (`studies/*.toml`) over three flights of S02_D4_A, joint swarm of 100 x 70, drones found automatically.
+`psotrack sweep` can run each grid alone, and the same command continues an interrupted study. Simulates missing
+sequences, writes one row per run and a picture, and prints means and worst values.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from psotrack.support import atomic_write, keep_compiled, progress_bar
 from psotrack.sweep import load, sweep
 
 GRIDS = Path(__file__).parent / "studies"
-#: Study -> the column that it varies, and what an axis says of it.
+#: Study -> column that varies, and label of its axis.
 STUDIES = {
     "cameras": ("num_cameras", "cameras, of 8"),
     "calibration": ("perturbation.extrinsics_deg", "cameras turned by (degrees)"),
@@ -31,8 +31,8 @@ ERROR = "offset_removed_mean_error_m"
 KEPT = ["study", "level", "flight", "draw", *_runs.KEPT]
 
 
-def rows_of(study: str, data: Path) -> pd.DataFrame:
-    """One row per run of a study."""
+def run_study(study: str, data: Path) -> pd.DataFrame:
+    """Run a study; returns one row per run."""
     grid = load(GRIDS / f"{study}.toml")
     for sequence in grid.sequences:
         seed = int(Path(sequence).parts[0].removeprefix("seed"))
@@ -51,27 +51,27 @@ def rows_of(study: str, data: Path) -> pd.DataFrame:
 
 
 def draw(table: pd.DataFrame, path: Path) -> None:
-    """A panel per study: a dot per run, a line through the means."""
+    """Draw a panel per study: a dot per run, and a line through the means."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(14, 3.4), layout="constrained")
     FigureCanvasAgg(figure)
-    for axes, (study, of) in zip(
+    for axes, (study, runs) in zip(
         figure.subplots(1, table["study"].nunique(), sharey=True, squeeze=False)[0],
         table.groupby("study", sort=False),
         strict=True,
     ):
-        levels = np.unique(of["level"])
-        place = np.searchsorted(levels, of["level"])
-        axes.plot(place, 1e3 * of[ERROR], "o", color="tab:blue", markersize=4, alpha=0.4)
-        means = of.groupby("level")[[ERROR, "missed_rate", "id_switches"]].mean()
+        levels = np.unique(runs["level"])
+        place = np.searchsorted(levels, runs["level"])
+        axes.plot(place, 1e3 * runs[ERROR], "o", color="tab:blue", markersize=4, alpha=0.4)
+        means = runs.groupby("level")[[ERROR, "missed_rate", "id_switches"]].mean()
         axes.plot(range(len(levels)), 1e3 * means[ERROR], color="tab:blue", linewidth=1)
         for index, (missed, switches) in enumerate(means[["missed_rate", "id_switches"]].to_numpy()):
-            said = [f"{missed:.1%} missed"] * int(missed > 0) + [f"{switches:.1f} switches"] * int(
+            labels = [f"{missed:.1%} missed"] * int(missed > 0) + [f"{switches:.1f} switches"] * int(
                 switches > 0
             )
-            axes.annotate("\n".join(said), (index, 3.2), fontsize=7, ha="center")
+            axes.annotate("\n".join(labels), (index, 3.2), fontsize=7, ha="center")
         axes.set_yscale("log")
         axes.set_ylim(3, 300)
         axes.set_yticks([], minor=True)
@@ -86,13 +86,15 @@ def draw(table: pd.DataFrame, path: Path) -> None:
 
 
 def main() -> None:
-    """Track, write, print, draw."""
+    """Run the studies, write and draw the result, and print the means."""
     parser = _runs.parser(__doc__)
     parser.add_argument("--picture", type=Path, default=Path("experiments/pictures/studies.png"))
-    parser.add_argument("--study", choices=STUDIES, action="append", help="[default: all of them]")
+    parser.add_argument("--study", choices=STUDIES, action="append", help="[default: all]")
     options = parser.parse_args()
     run = _runs.start("studies")
-    table = pd.concat([rows_of(study, options.data) for study in options.study or STUDIES], ignore_index=True)
+    table = pd.concat(
+        [run_study(study, options.data) for study in options.study or STUDIES], ignore_index=True
+    )
     draw(table, options.picture)
     run.save(options.out, rows=table, files=[options.picture])
     grouped = table.drop(columns=["flight", "draw"]).groupby(["study", "level"], sort=False)

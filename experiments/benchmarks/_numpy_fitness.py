@@ -1,7 +1,7 @@
-"""psotrack's fitness in vectorised NumPy, which is what pyswarms drives: written plainly, and tuned by hand.
+"""psotrack's fitness in vectorised NumPy for pyswarms: a plain version, and a version tuned by hand.
 
-Both cover all particles, drones, cameras and windows at once, and are the same function of the same silhouettes.
-Cameras have no lens distortion and no skew here, which spares NumPy work that psotrack's general code has to do.
+Both versions compute all particles, drones, cameras and windows at once, and return the same values. The cameras must
+have no lens distortion and no skew, so NumPy does less work than psotrack's general code.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from psotrack.tracking.patches import FULL
 
 
 class NumpyFitness(Protocol):
-    """The mean fitness over drones of whole constellations, as `psotrack.tracking.fitness.joint_fitness`."""
+    """Mean fitness over the drones of each particle, as in `psotrack.tracking.fitness.joint_fitness`."""
 
     def tables(self, coverage: np.ndarray) -> np.ndarray:
         """Summed-area tables (cameras, height + 1, width + 1) of silhouettes, in whole pixels."""
@@ -29,7 +29,7 @@ class NumpyFitness(Protocol):
 
 
 class PlainFitness:
-    """Vectorised NumPy as one writes it first: float64, arrays (windows, particles, drones, cameras)."""
+    """Plain vectorised NumPy: float64, arrays (windows, particles, drones, cameras)."""
 
     def __init__(self, cameras: Camera, size_m: np.ndarray, score: SoftIoU, reduction: int) -> None:
         _check_pinhole(cameras)
@@ -71,7 +71,7 @@ class PlainFitness:
         return np.where(enough, mean, 0).mean(axis=-1)
 
     def _boxes(self, position_m: np.ndarray) -> tuple[np.ndarray, ...]:
-        """In front of the camera or not; middle and half of the box along x and along y, in reduced pixels."""
+        """Whether a drone is in front of the camera; middle and half side of its box along x and y, reduced pixels."""
         centre = np.einsum("cij,pdj->pdci", self._rotation, position_m) + self._t
         z, s_zz = centre[..., 2], self._shapes[..., 2, 2]
         in_front = z**2 * np.sign(z) > s_zz + NEAR_M
@@ -88,7 +88,7 @@ class PlainFitness:
 
 
 def _bilinear(tables: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Tables read at fractional places (..., cameras), each camera in its own."""
+    """Read each camera's table at fractional positions (..., cameras), with bilinear interpolation."""
     camera = np.arange(len(tables))
     column = np.minimum(x.astype(int), tables.shape[2] - 2)
     row = np.minimum(y.astype(int), tables.shape[1] - 2)
@@ -104,10 +104,10 @@ def _check_pinhole(cameras: Camera) -> None:
 
 
 class TunedFitness:
-    """Written for speed as NumPy allows it.
+    """NumPy tuned for speed.
 
-    float32, cameras last and contiguous, one small matrix product per coordinate, no read computed twice, table lookups
-    by `take` of flat indices.
+    Arrays are float32, with contiguous cameras as the last axis. There is one small matrix product per coordinate, no
+    table is read twice at one place, and tables are read by `take` with flat indices.
     """
 
     def __init__(self, cameras: Camera, size_m: np.ndarray, score: SoftIoU, reduction: int) -> None:
@@ -169,7 +169,7 @@ class TunedFitness:
         axis: int,
         last: int,
     ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
-        """Along one axis: edges of all windows cut at the image, the box's length, and how much the image holds."""
+        """Along one axis: edges of all windows clipped to the image, length of the box, and length inside the image."""
         b = along * z - s_along_z
         root = np.sqrt(np.maximum(b * b - a * (along * along - s_along), 1e-12)) / a
         middle = self._focal[axis] * (b / a) + self._middle[axis]

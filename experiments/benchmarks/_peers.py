@@ -1,8 +1,8 @@
-"""The same tracking by other people's swarms, as their users would write it for speed.
+"""The same tracking with the swarms of other libraries, written for speed.
 
-Each frame is searched as psotrack's tracker does it: as many particles with the same spread about the same
-prediction, within the same bounds, for as many iterations, with the same inertia and pulls. What psotrack does beside
-that (evidence, coasting, losing) is left out, in the peers' favour.
+Each frame is searched as in psotrack's tracker: the same number of particles and iterations, the same spread around the
+same prediction, the same bounds, inertia and pulls. Other work of psotrack (evidence, coasting, loss of drones) is left
+out, which makes the other libraries faster.
 """
 
 from __future__ import annotations
@@ -25,13 +25,22 @@ from psotrack.silhouettes import summed_area_table
 from psotrack.tracking import fitness, on_device
 from psotrack.tracking.parameters import find_score
 
-#: The peers' motion model, an alpha-beta filter: it costs nothing beside the swarm.
+#: Gains of the alpha-beta filter, the motion model of the other libraries; its time is negligible beside the swarm.
 POSITION_GAIN, VELOCITY_GAIN = 0.8, 0.3
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What is tracked, and how."""
+    """Data and settings of the tracking.
+
+    Attributes:
+        rig: the cameras.
+        reduction: image pixels per silhouette pixel, along each side.
+        start: initial state of the drones.
+        settings: settings of psotrack; the other libraries use the swarm's part.
+        fps: frames per second.
+        bounds_m: (2, 3), corners of the room, metres.
+    """
 
     rig: Rig
     reduction: int
@@ -42,16 +51,16 @@ class Problem:
 
     @property
     def score(self) -> fitness.Score:
-        """How positions are scored."""
+        """The score of positions."""
         return find_score(self.settings.score)
 
     @property
     def reach_m(self) -> float:
-        """How far a drone can get in one frame."""
+        """Largest distance that a drone flies in one frame, metres."""
         return self.settings.motion.max_speed_m_s / self.fps
 
     def predict(self, position_m: Any, velocity_m_s: Any) -> tuple[Any, Any, Any]:
-        """Where the drones are expected next, and the lowest and highest places that they can reach."""
+        """Predicted positions in the next frame, and the lowest and highest coordinates within reach."""
         low, high = self.bounds_m.astype(np.float32)
         lowest = (position_m - self.reach_m).clip(low, high)
         highest = (position_m + self.reach_m).clip(low, high)
@@ -66,7 +75,7 @@ class Problem:
         return predicted_m + POSITION_GAIN * innovation, velocity
 
     def first(self) -> tuple[np.ndarray, np.ndarray]:
-        """Position and velocity before the first frame, so that the first prediction is the start."""
+        """Position and velocity before the first frame, so that the first prediction is the initial state."""
         velocity = self.start.velocity_m_s.astype(np.float32)
         return (self.start.position_m - velocity / self.fps).astype(np.float32), velocity
 
@@ -156,7 +165,8 @@ class PySwarms:
         self._problem = problem
         self._fitness = fitness
         settings, dims = problem.settings, problem.start.position_m.size
-        # One optimiser for all frames: making one sets up logging four times, which takes longer than a search.
+        # One optimiser for all frames, because the constructor sets up logging four times, which is slower than a
+        # search.
         self._optimiser = GlobalBestPSO(
             n_particles=settings.swarm.particles,
             dimensions=dims,
@@ -173,7 +183,7 @@ class PySwarms:
 
     def __call__(self, coverage: np.ndarray) -> np.ndarray:
         """Positions (frames, drones, 3)."""
-        # pyswarms draws from NumPy's global generator and no other.
+        # pyswarms uses only NumPy's global generator.
         np.random.seed(self._problem.settings.seed)  # noqa: NPY002
         generator = np.random.default_rng(self._problem.settings.seed)
         position, velocity = self._problem.first()
@@ -213,7 +223,7 @@ class PySwarms:
 
 
 def _silence_pyswarms() -> None:
-    """Keep pyswarms from writing a `report.log` into the working directory, which it does when it is imported."""
+    """Prevent pyswarms from writing `report.log` into the working directory when it is imported."""
     with tempfile.NamedTemporaryFile("w", suffix=".yaml", delete=False) as file:
         file.write("version: 1\ndisable_existing_loggers: false\n")
     atexit.register(os.unlink, file.name)

@@ -1,7 +1,7 @@
-"""A scene without files: drones that are ellipsoids fly on closed paths, and their outlines are drawn into cameras.
+"""A scene in memory: ellipsoidal drones fly on closed paths, and their outlines are drawn into the images of cameras.
 
-The outline of an ellipsoid is a circle in coordinates that make it a unit sphere, so every outline is exact and owes
-nothing to the quadrics of `psotrack.geometry.boxes`.
+In coordinates in which the ellipsoid is a unit sphere, its outline is a circle. So every outline is exact, and does not
+depend on the quadrics of `psotrack.geometry.boxes`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ BOUNDS_M = np.array([[-6.0, -5.0, -0.2], [6.0, 5.0, 4.0]])
 #: Full lengths of every drone, metres.
 DRONE_SIZE_M = np.array([0.48, 0.48, 0.24])
 
-#: A path is closed after so many frames.
+#: Period of the closed paths, frames.
 PERIOD_FRAMES = 250
 
 _OUTLINE_POINTS = 64
@@ -35,10 +35,10 @@ class Scene:
     """Cameras around a room and the drones' paths in it.
 
     Attributes:
-        rig: of cameras without lens distortion.
-        position_m: (frames, drones, 3), the truth.
-        velocity_m_s: (frames, drones, 3).
-        size_m: (drones, 3).
+        rig: cameras without lens distortion.
+        position_m: (frames, drones, 3), true positions, metres.
+        velocity_m_s: (frames, drones, 3), true velocities, metres per second.
+        size_m: (drones, 3), full lengths, metres.
     """
 
     rig: Rig
@@ -66,10 +66,10 @@ class Scene:
 
 
 def scene(num_frames: int, num_drones: int, num_cameras: int) -> Scene:
-    """The scene; the same every time.
+    """Make the scene; it is the same in every call.
 
     Cameras hang on an ellipse of 10 x 8 m, 3 m high, and look at the middle of the room. Drones fly on Lissajous
-    curves at up to about 2 m/s, one above another, so that they are apart at all times but cover each other in views.
+    curves at up to about 2 m/s, one above another, so that they never touch but occlude each other in images.
     """
     named = {}
     for index in range(num_cameras):
@@ -109,7 +109,7 @@ def _outline_px(one: Camera, centre_m: np.ndarray, size_m: np.ndarray) -> np.nda
 
 
 def _draw(canvas: np.ndarray, outline_px: np.ndarray) -> None:
-    """Fill an outline at full size, in the patch that holds it, and add its coverage to the reduced canvas."""
+    """Fill an outline at full size, in the patch that contains it, and add its coverage to the reduced canvas."""
     size = canvas.shape[1], canvas.shape[0]
     low = np.clip(np.floor((outline_px.min(axis=0) - 1) / REDUCTION), 0, size).astype(int)
     high = np.clip(np.ceil((outline_px.max(axis=0) + 2) / REDUCTION), 0, size).astype(int)

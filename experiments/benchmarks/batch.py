@@ -1,9 +1,9 @@
-"""How much longer many runs of a sequence take than one: the batch axis of `pipeline.track_runs`.
+"""Time of many runs of a sequence beside the time of one run: the batch axis of `pipeline.track_runs`.
 
     python experiments/benchmarks/batch.py data/Simulated_Data/S02_D4_A --cache cache
 
-Silhouettes and compiled programs are made before anything is timed. One run and a batch are timed in turn; each ends
-with trajectories and their evaluation's input on the host. Prints device, versions, shapes, medians and their ratio.
+Silhouettes and compiled programs are made before the timing. One run and a batch are timed in turn; each timing ends
+when the trajectories are on the host. Prints device, versions, shapes, medians and their ratio.
 """
 
 from __future__ import annotations
@@ -38,12 +38,14 @@ def seconds(call: Callable[[], object]) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Time, print."""
+    """Time one run and a batch, and print the ratio."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("sequence", type=Path)
-    parser.add_argument("--cache", type=Path, required=True, help="of silhouettes and compiled programs")
+    parser.add_argument(
+        "--cache", type=Path, required=True, help="folder of silhouettes and compiled programs"
+    )
     parser.add_argument("--runs", type=int, default=10)
     parser.add_argument("--particles", type=int, default=50)
     parser.add_argument("--iterations", type=int, default=50)

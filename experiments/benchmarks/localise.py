@@ -1,6 +1,7 @@
-"""Time localising a camera by markers on walls: a video that is drawn, or one of a sequence.
+"""Time of localising a camera by markers on walls, in a drawn video or in the video of a sequence.
 
-One process. For two cores of a larger machine: `taskset -c 0,1 python localise.py`. Options: `localise.py --help`.
+Runs in one process. To use two cores of a larger machine: `taskset -c 0,1 python localise.py`. Options: `localise.py
+--help`.
 """
 
 from __future__ import annotations
@@ -29,27 +30,29 @@ import _results
 _SIZES_WH = {"1920x1080": (1920, 1080), "3840x2160": (3840, 2160)}
 _FPS = 25.0
 _SIDE_M = 0.3
-#: The camera goes to and fro before a wall.
+#: Period of the camera's movement in front of a wall, frames.
 _PERIOD_FRAMES = 200
-#: Of the image, per cell of a marker's own.
+#: Pixels per cell in the picture of a single marker.
 _CELL_PX = 24
 
 
 @click.command(context_settings={"show_default": True})
-@click.option("--sequence", type=click.Path(path_type=Path), help="An _A sequence instead of what is drawn.")
-@click.option("--drone", default="dron1", help="Whose camera, with --sequence.")
 @click.option(
-    "--size", default="1920x1080", type=click.Choice(list(_SIZES_WH)), help="Of what is drawn, pixels."
+    "--sequence", type=click.Path(path_type=Path), help="Folder of an _A sequence instead of a drawn video."
 )
-@click.option("--frames", default=250, type=click.IntRange(1), help="Of the video.")
-@click.option("--repeats", default=5, type=click.IntRange(1), help="Runs.")
+@click.option("--drone", default="dron1", help="Drone that carries the camera, with --sequence.")
+@click.option(
+    "--size", default="1920x1080", type=click.Choice(list(_SIZES_WH)), help="Size of the drawn video, pixels."
+)
+@click.option("--frames", default=250, type=click.IntRange(1), help="Number of frames.")
+@click.option("--repeats", default=5, type=click.IntRange(1), help="Number of timed runs.")
 @click.option(
     "--results", type=click.Path(path_type=Path), help="Write the result and its record into this folder."
 )
 def main(
     sequence: Path | None, drone: str, size: str, frames: int, repeats: int, results: Path | None
 ) -> None:
-    """Localise a video; print frames per second, milliseconds per stage, and what they were measured on."""
+    """Localise a video; print frames per second, milliseconds per stage, and the machine."""
     started = _results.Run("localise")
     with tempfile.TemporaryDirectory() as folder:
         if sequence is None:
@@ -65,7 +68,7 @@ def main(
             lens = make_camera(R=np.eye(3), t_m=np.zeros(3), K=one.K, image_size_wh=one.video.image_size_wh)
         source = open_source(video)
         source = source.first(min(frames, source.num_frames or frames))
-        # The first run is not counted: it compiles, imports and reads the video from the disk.
+        # The first run is not timed, because it compiles, imports and reads the video from the disk.
         runs = [localise_video(source, marker_map, lens) for _ in range(1 + repeats)][1:]
     click.echo(f"{platform.machine()}, {cv2.getNumberOfCPUs()} processors; psotrack {psotrack.__version__}")
     click.echo(
@@ -103,7 +106,7 @@ def _show(runs: list[LocalisedVideo], image_size_wh: tuple[int, int], markers: i
 
 
 def _wall() -> MarkerMap:
-    """Twenty-eight markers on a wall at y = 4, in rows."""
+    """Map of 28 markers on a wall at y = 4 m, in rows."""
     corners = {}
     for index in range(28):
         x, z = -3.5 + index % 7, 0.4 + 0.7 * (index // 7)
@@ -114,7 +117,7 @@ def _wall() -> MarkerMap:
 
 
 def _draw(path: Path, marker_map: MarkerMap, lens: Camera, frames: int) -> None:
-    """A video before the wall, which has a texture and coloured boards; larger ones have larger pixels of it."""
+    """Draw a video of a camera in front of the wall, which has a texture and coloured boards."""
     size_wh = (int(lens.image_size_wh[0]), int(lens.image_size_wh[1]))
     background = cv2.resize(_background(), size_wh, interpolation=cv2.INTER_LINEAR)
     with VideoWriter(path, _FPS, size_wh) as writer:
@@ -143,7 +146,7 @@ def _background() -> np.ndarray:
 
 
 def _add_marker(image: np.ndarray, marker: int, corners_px: np.ndarray) -> None:
-    """Draw one marker with a cell of white around it, in the part of the image that holds it."""
+    """Draw one marker, with a border of one white cell, in the part of the image that contains it."""
     low = np.maximum(np.floor(1.3 * corners_px.min(axis=0) - 0.3 * corners_px.max(axis=0)), 0).astype(int)
     high = np.ceil(1.3 * corners_px.max(axis=0) - 0.3 * corners_px.min(axis=0)).astype(int)
     high = np.minimum(high, image.shape[1::-1])

@@ -1,6 +1,6 @@
-"""Time matching over cameras: drones in a room, cameras around it, detections with noise, missed and false ones.
+"""Time of matching detections over cameras in a simulated room; detections have noise, and some are missed or false.
 
-One process. For one core set OMP_NUM_THREADS=1 and OPENBLAS_NUM_THREADS=1. Options: `matching.py --help`.
+Runs in one process. To use one core, set OMP_NUM_THREADS=1 and OPENBLAS_NUM_THREADS=1. Options: `matching.py --help`.
 """
 
 from __future__ import annotations
@@ -19,23 +19,29 @@ from psotrack.geometry import Rig, look_at, make_camera, make_rig, project
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results
 
-#: Of the room, and how near to its walls no drone comes.
+#: Corners of the room, and smallest distance of a drone from the walls, metres.
 _BOUNDS_M, _MARGIN_M = np.array([[-5.0, -4.0, 0.0], [5.0, 4.0, 4.0]]), 0.5
 _SIZE_WH, _FOCAL_PX = (1920, 1080), 1000.0
+#: Smallest distance of two drones, and largest error of a found drone, metres.
 _LEAST_APART_M, _FOUND_M = 0.5, 0.1
 
 
 @click.command(context_settings={"show_default": True})
-@click.option("--drones", default=10, type=click.IntRange(1), help="In the room.")
-@click.option("--cameras", default=8, type=click.IntRange(3), help="On its walls.")
-@click.option("--detections", default=12, type=click.IntRange(1), help="Of each camera, false ones included.")
+@click.option("--drones", default=10, type=click.IntRange(1), help="Drones in the room.")
+@click.option("--cameras", default=8, type=click.IntRange(3), help="Cameras on the walls.")
+@click.option(
+    "--detections",
+    default=12,
+    type=click.IntRange(1),
+    help="Detections per camera, false detections included.",
+)
 @click.option("--noise", "noise_px", default=2.0, help="Standard deviation of a detection, pixels.")
 @click.option(
     "--missed", default=0.1, type=click.FloatRange(0, 1), help="Share of drones that a camera misses."
 )
-@click.option("--frames", default=100, type=click.IntRange(1), help="Scenes.")
+@click.option("--frames", default=100, type=click.IntRange(1), help="Number of scenes.")
 @click.option(
-    "--repeats", default=5, type=click.IntRange(1), help="Timings of every scene; the least counts."
+    "--repeats", default=5, type=click.IntRange(1), help="Timings of every scene; the smallest counts."
 )
 @click.option("--seed", default=0, help="Seed of the scenes.")
 @click.option(
@@ -52,13 +58,13 @@ def main(  # noqa: PLR0913  # A click command has one parameter per option.
     seed: int,
     results: Path | None,
 ) -> None:
-    """Time matching, without predictions; print milliseconds per frame, and what was found."""
+    """Time matching without predictions; print milliseconds per frame and the share of drones that were found."""
     run = _results.Run("matching")
     rig = _rig(cameras)
     rng = np.random.default_rng(seed)
     least_ms, found, false, error_m = [], 0, 0, []
     for _ in range(frames):
-        truth = _apart(drones, rng)
+        truth = _draw_positions_m(drones, rng)
         points = _detections(rig, truth, detections, noise_px, missed, rng)
         noise = [np.full(len(one), noise_px) for one in points]
         times, matches = zip(*(_timed(rig, points, noise) for _ in range(repeats)), strict=True)
@@ -93,7 +99,7 @@ def _timed(
 
 
 def _rig(count: int) -> Rig:
-    """Cameras on an ellipse through the corners of the room, each a little higher than the last."""
+    """Cameras on an ellipse through the corners of the room, each a little higher than the camera before."""
     cameras = {}
     for i in range(count):
         angle = 2 * np.pi * (i + 0.5) / count
@@ -105,7 +111,7 @@ def _rig(count: int) -> Rig:
     return make_rig(cameras)
 
 
-def _apart(count: int, rng: np.random.Generator) -> Float[np.ndarray, "drones 3"]:
+def _draw_positions_m(count: int, rng: np.random.Generator) -> Float[np.ndarray, "drones 3"]:
     points = np.empty((0, 3))
     while len(points) < count:
         point = rng.uniform(_BOUNDS_M[0] + _MARGIN_M, _BOUNDS_M[1] - _MARGIN_M)
@@ -122,7 +128,7 @@ def _detections(
     missed: float,
     rng: np.random.Generator,
 ) -> list[Float[np.ndarray, "_ 2"]]:
-    """For each camera (`count`, 2): the drones that it sees, in its image or not, and false ones for the rest."""
+    """For each camera (`count`, 2): drones that are not missed, also outside the image, and false detections."""
     points = []
     for pixels in project(rig.cameras, drones[:, None])[0].swapaxes(0, 1):
         seen = pixels[rng.random(len(drones)) >= missed][:count]

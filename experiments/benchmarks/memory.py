@@ -1,6 +1,6 @@
 """Peak resident memory of tracking a long sequence: 3,000 frames of 8 cameras, against a limit of 2 GB.
 
-Draws silhouettes, stores them as psotrack does, and tracks them from the store by psotrack's own pipeline. The exit
+Draws silhouettes, stores them in psotrack's format, and tracks the stored silhouettes by psotrack's pipeline. The exit
 code is 1 if the memory exceeds the limit. `python experiments/benchmarks/memory.py --help`.
 """
 
@@ -116,7 +116,7 @@ def main(
 
 
 def _store(scene: _scene.Scene, folder: Path) -> Silhouettes:
-    """The scene's silhouettes in a store; paths are closed, so one period is drawn and written again and again."""
+    """Store the silhouettes of a scene; paths are closed, so one period is drawn and written repeatedly."""
     num_frames, names = len(scene.position_m), scene.rig.names
     arrays = [
         zarr.create_array(
@@ -150,7 +150,7 @@ def _store(scene: _scene.Scene, folder: Path) -> Silhouettes:
 
 def _peak_gb() -> float:
     """Largest resident memory of this process so far, 10^9 bytes."""
-    # Linux counts in KiB, macOS in bytes.
+    # The unit is KiB on Linux and bytes on macOS.
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
 

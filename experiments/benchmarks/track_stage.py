@@ -1,7 +1,8 @@
-"""Time the track stage: psotrack, evosax's PSO on psotrack's fitness, pyswarms on the same fitness in NumPy.
+"""Time of the track stage: psotrack, evosax's PSO on psotrack's fitness, pyswarms on the same fitness in NumPy.
 
-One process, one run. Every method is warmed up, then timed in turn, over and over, so that whatever else the machine
-does hits all alike; what is timed ends when the result is there. `python experiments/benchmarks/track_stage.py --help`.
+Runs in one process. Every method is warmed up. Then the methods are timed in turn, repeatedly, so that other load of
+the machine affects all methods equally. A timing ends when the result is on the host. `python
+experiments/benchmarks/track_stage.py --help`.
 """
 
 from __future__ import annotations
@@ -35,8 +36,7 @@ import _results
 
 PEERS = ("evosax", "pyswarms")
 
-#: Largest difference between psotrack's fitness and NumPy's, which lie in [0, 1]. psotrack's is float32, so it shows
-#: even against the plain one's float64; measured: 4e-7.
+#: Largest difference between psotrack's fitness, which is float32, and NumPy's; both lie in [0, 1].
 TOLERANCE = 1e-5
 
 #: Tracks the silhouettes (frames, cameras, height, width) and returns positions (frames, drones, 3).
@@ -70,14 +70,15 @@ class Psotrack:
 
 @dataclass(frozen=True)
 class Timing:
-    """What is said about one method.
+    """Times and error of one method.
 
     Attributes:
-        median_ms, min_ms, max_ms: per frame, over the repeats.
-        cpu_ms: median processor time per frame, over all threads; a busy machine hardly changes it.
-        ratio: median over the repeats of its time to that of the first method in the same repeat.
-        mean_error_mm: over frames and drones, so that nobody is fast by not converging.
-        warm_up_s: of the first call, which compiles.
+        method: name of the method.
+        median_ms, min_ms, max_ms: wall time per frame over the repeats, milliseconds.
+        cpu_ms: median processor time per frame, over all threads, milliseconds; hardly changed by other load.
+        ratio: median over the repeats of the ratio to the time of the first method in the same repeat.
+        mean_error_mm: mean error over frames and drones; shows whether a fast method has converged.
+        warm_up_s: time of the first call, which compiles, seconds.
     """
 
     method: str
@@ -93,10 +94,10 @@ class Timing:
 @click.command(context_settings={"show_default": True})
 @click.option("--frames", default=25, type=click.IntRange(2), help="Frames that are tracked.")
 @click.option("--repeats", default=5, type=click.IntRange(1), help="Timings of every method.")
-@click.option("--particles", default=100, type=click.IntRange(2), help="Of the swarm.")
-@click.option("--iterations", default=70, type=click.IntRange(1), help="Of the swarm, per frame.")
-@click.option("--drones", default=4, type=click.IntRange(1), help="In the room.")
-@click.option("--cameras", default=8, type=click.IntRange(2), help="Around it, 1920 x 1080 pixels each.")
+@click.option("--particles", default=100, type=click.IntRange(2), help="Particles of the swarm.")
+@click.option("--iterations", default=70, type=click.IntRange(1), help="Iterations per frame.")
+@click.option("--drones", default=4, type=click.IntRange(1), help="Drones in the room.")
+@click.option("--cameras", default=8, type=click.IntRange(2), help="Cameras of 1920 x 1080 pixels.")
 @click.option(
     "--results", type=click.Path(path_type=Path), help="Write the result and its record into this folder."
 )
@@ -178,7 +179,7 @@ def _problem(scene: _scene.Scene, settings: TrackSettings) -> Problem:
 def _check_same_fitness(
     numpy_fitness: NumpyFitness, problem: Problem, scene: _scene.Scene, silhouettes: np.ndarray
 ) -> float:
-    """Largest difference from psotrack's fitness, at drones and anywhere, out of the room and of view too."""
+    """Largest difference from psotrack's fitness, at positions near the drones and anywhere, also out of view."""
     generator = np.random.default_rng(0)
     truth = scene.position_m[0]
     near = truth + generator.normal(scale=0.1, size=(500, *truth.shape))
@@ -216,7 +217,7 @@ def _time(
     times_ms: dict[str, list[float]] = {name: [] for name in names}
     cpu_ms: dict[str, list[float]] = {name: [] for name in names}
     for repeat in range(repeats):
-        # Another one goes first each time, so that no method always follows the same one.
+        # Each repeat begins with another method, so that the order of the methods has no effect.
         first = repeat % len(names)
         for name in names[first:] + names[:first]:
             began, cpu_began = time.perf_counter(), time.process_time()

@@ -1,8 +1,9 @@
-"""How well a camera is placed from twelve hand-marked points, 1 px off, about five metres away: Monte Carlo.
+"""Accuracy of a camera's pose from twelve hand-marked points, about five metres away, by Monte Carlo simulation.
 
     python experiments/calibration/extrinsics.py
 
-Points are spread over the image, and in depth as far as each row says. "In 90 %" is the share of true centres inside
+Marks have a standard deviation of 1 px. Points are spread over the image, and in depth over the range of each row of
+the table. "In 90 %" is the share of true centres inside
 the 90 % ellipsoid of the covariance that `locate_camera` states. Writes OUT/extrinsics.csv.
 """
 
@@ -28,19 +29,19 @@ HERE = Path(__file__).parent
 K = np.array([[1157.0, 0.0, 959.5], [0.0, 1157.0, 539.5], [0.0, 0.0, 1.0]])
 SIZE_WH = (1920, 1080)
 AWAY_M, NOISE_PX = 5.0, 1.0
-#: Nearest and farthest point along the optical axis.
+#: Range of depths in words -> depths of the nearest and the farthest possible point along the optical axis, metres.
 DEPTHS_M = {"2.5 to 7.5 m": (2.5, 7.5), "3.5 to 6.5 m": (3.5, 6.5), "4.5 to 5.5 m": (4.5, 5.5)}
-#: The image is cut into as many cells as there are points.
+#: Columns and rows of cells of the image; each cell has one point.
 COLUMNS, ROWS = 4, 3
 
 
 def main() -> None:
-    """Draw, locate, and show."""
+    """Draw points, locate the camera, and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--draws", type=int, default=500, help="Of each row.")
-    parser.add_argument("--out", type=Path, default=HERE / "results", help="Folder of the table.")
+    parser.add_argument("--draws", type=int, default=500, help="number of cameras for each row")
+    parser.add_argument("--out", type=Path, default=HERE / "results", help="folder of the table")
     options = parser.parse_args()
     run = _results.Run("extrinsics")
     rows = [summary(words, range_m, options.draws) for words, range_m in DEPTHS_M.items()]
@@ -50,7 +51,7 @@ def main() -> None:
 
 
 def summary(words: str, range_m: tuple[float, float], draws: int) -> dict[str, object]:
-    """Errors of the centre over draws of points and noise."""
+    """Row of the table: errors of the camera's centre over random points and noise."""
     off_m, inside = [], []
     for one, points_m, points_px in scenes(range_m, draws):
         located = locate_camera(points_m, points_px, K, np.zeros(0), NOISE_PX)
@@ -71,7 +72,7 @@ def summary(words: str, range_m: tuple[float, float], draws: int) -> dict[str, o
 def scenes(
     range_m: tuple[float, float], draws: int
 ) -> Iterator[tuple[Camera, Float[np.ndarray, "points 3"], Float[np.ndarray, "points 2"]]]:
-    """Cameras that look at a room's middle, points, and where they are marked."""
+    """Draw cameras that look at the middle of a room, with points and the marked pixels of the points."""
     rng = np.random.default_rng(0)
     cell_px = np.array(SIZE_WH) / [COLUMNS, ROWS]
     cells = np.stack(np.meshgrid(np.arange(COLUMNS), np.arange(ROWS)), axis=-1).reshape(-1, 2)

@@ -1,10 +1,10 @@
-"""What the doctor says of a sound rig with one fault in it, fault by fault.
+"""Findings of the doctor for a correct rig with one planted fault, fault by fault.
 
     python experiments/calibration/faults.py data/Simulated_Data/S02_D4_A --out experiments/pictures
 
-Reads a sequence with its detections, plants each fault in the calibration or in the detections, and asks `psotrack
-doctor`'s own function. Writes results/faults.json beside this file, and doctor_faults.png, which shows for some faults
-how far each pair of cameras disagrees.
+Reads a sequence with its detections, plants each fault in the calibration or in the detections, and calls the function
+of `psotrack doctor`. Writes results/faults.json beside this file, and doctor_faults.png, which shows the disagreement
+of each pair of cameras for some faults.
 """
 
 from __future__ import annotations
@@ -32,11 +32,12 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results
 
 HERE = Path(__file__).parent
-#: The camera that is tampered with, and another one.
-ONE, OTHER = 2, 5
+#: Index of the camera that gets the fault, and of the camera that it is exchanged with.
+FAULTY, OTHER = 2, 5
+#: Faults in the picture.
 SHOWN = ("nothing", "a camera turned by 1 degree", "a camera moved by 0.2 m", "a camera late by 3 frames")
 
-#: Where the colours end.
+#: Largest distance on the colour scale, pixels.
 MOST_PX = 30
 
 Boxes = Mapping[str, Detections]
@@ -44,32 +45,32 @@ Fault = Callable[[Rig, Boxes], tuple[Rig, Boxes]]
 
 
 def turned(degrees: float) -> Fault:
-    """One camera turned about its upright axis."""
+    """Turn one camera about its vertical axis."""
 
     def fault(rig: Rig, boxes: Boxes) -> tuple[Rig, Boxes]:
         R, centre = rig.cameras.T_cam_world[:, :3, :3].copy(), rig.cameras.centre_world
-        R[ONE] = Rotation.from_rotvec([0.0, degrees, 0.0], degrees=True).as_matrix() @ R[ONE]
+        R[FAULTY] = Rotation.from_rotvec([0.0, degrees, 0.0], degrees=True).as_matrix() @ R[FAULTY]
         return _posed(rig, R, -np.matvec(R, centre)), boxes
 
     return fault
 
 
 def moved(shift_m: float) -> Fault:
-    """One camera moved sideways."""
+    """Move one camera sideways."""
 
     def fault(rig: Rig, boxes: Boxes) -> tuple[Rig, Boxes]:
         t_m = rig.cameras.T_cam_world[:, :3, 3].copy()
-        t_m[ONE, 0] += shift_m
+        t_m[FAULTY, 0] += shift_m
         return _posed(rig, rig.cameras.T_cam_world[:, :3, :3], t_m), boxes
 
     return fault
 
 
 def late(frames: int) -> Fault:
-    """One camera's video begins some frames late."""
+    """Let the video of one camera begin some frames late."""
 
     def fault(rig: Rig, boxes: Boxes) -> tuple[Rig, Boxes]:
-        name = rig.names[ONE]
+        name = rig.names[FAULTY]
         seen, there = boxes[name], boxes[name].frame >= frames
         shifted = Detections(seen.frame[there] - frames, seen.xyxy[there], seen.confidence[there])
         return rig, {**boxes, name: shifted}
@@ -78,34 +79,34 @@ def late(frames: int) -> Fault:
 
 
 def centres(rig: Rig, boxes: Boxes) -> tuple[Rig, Boxes]:
-    """Centres written where translations belong."""
+    """Write the cameras' centres in place of the translations."""
     return _posed(rig, rig.cameras.T_cam_world[:, :3, :3], rig.cameras.centre_world), boxes
 
 
 def millimetres(rig: Rig, boxes: Boxes) -> tuple[Rig, Boxes]:
-    """Millimetres read as metres."""
+    """Read millimetres as metres."""
     T = rig.cameras.T_cam_world
     return _posed(rig, T[:, :3, :3], 1e3 * T[:, :3, 3]), boxes
 
 
 def opengl(rig: Rig, boxes: Boxes) -> tuple[Rig, Boxes]:
-    """Camera axes as OpenGL has them."""
+    """Use the camera axes of OpenGL."""
     flip, T = np.array([1.0, -1.0, -1.0]), rig.cameras.T_cam_world
     return _posed(rig, flip[:, None] * T[:, :3, :3], flip * T[:, :3, 3]), boxes
 
 
 def exchanged(rig: Rig, boxes: Boxes) -> tuple[Rig, Boxes]:
-    """The videos of two cameras under each other's name."""
-    one, other = rig.names[ONE], rig.names[OTHER]
+    """Exchange the names of two cameras' videos."""
+    one, other = rig.names[FAULTY], rig.names[OTHER]
     return rig, {**boxes, one: boxes[other], other: boxes[one]}
 
 
-def longer(share: float, of: int | slice) -> Fault:
-    """Focal lengths too long by a share."""
+def longer(share: float, cameras: int | slice) -> Fault:
+    """Make focal lengths too long by a share."""
 
     def fault(rig: Rig, boxes: Boxes) -> tuple[Rig, Boxes]:
         K = rig.cameras.K.copy()
-        K[of, :2, :2] *= 1 + share
+        K[cameras, :2, :2] *= 1 + share
         return Rig(rig.names, replace(rig.cameras, K=K)), boxes
 
     return fault
@@ -122,49 +123,52 @@ FAULTS: dict[str, Fault] = {
     "centres read as translations": centres,
     "millimetres read as metres": millimetres,
     "camera axes as in OpenGL": opengl,
-    "a focal length 6 % too long": longer(0.06, ONE),
+    "a focal length 6 % too long": longer(0.06, FAULTY),
     "all focal lengths 10 % too long": longer(0.1, slice(None)),
     "all focal lengths 4 % too long": longer(0.04, slice(None)),
 }
 
 
 def main() -> None:
-    """Plant, ask, and write what is said."""
+    """Plant the faults, examine each rig, and write the findings."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("sequence", type=Path)
-    parser.add_argument("--out", type=Path, default=HERE.parent / "pictures", help="Folder of the picture.")
-    parser.add_argument("--results", type=Path, default=HERE / "results", help="Folder of the record.")
+    parser.add_argument("--out", type=Path, default=HERE.parent / "pictures", help="folder of the picture")
+    parser.add_argument("--results", type=Path, default=HERE / "results", help="folder of the record")
     options = parser.parse_args()
     run = _results.Run("faults")
     recording = read_sequence(options.sequence)
     boxes = {name: read_detections(path) for name, path in detection_files_of(recording, YOLO).items()}
-    said = {}
+    diagnoses = {}
     for name, fault in FAULTS.items():
         rig, tampered = fault(recording.rig, boxes)
         sightings = from_detections(tampered, rig, recording.num_frames)
-        said[name] = examine(rig, sightings, fps=recording.fps, reference=recording.truth)
-        print(f"{name}: {words(said[name])}", flush=True)
+        diagnoses[name] = examine(rig, sightings, fps=recording.fps, reference=recording.truth)
+        print(f"{name}: {words(diagnoses[name])}", flush=True)
     names = recording.rig.names
     save_figure(
-        options.out / "doctor_faults.png", (13.0, 3.9), lambda figure: draw(figure, said, names), force=True
+        options.out / "doctor_faults.png",
+        (13.0, 3.9),
+        lambda figure: draw(figure, diagnoses, names),
+        force=True,
     )
-    found = {name: words(diagnosis) for name, diagnosis in said.items()}
+    found = {name: words(diagnosis) for name, diagnosis in diagnoses.items()}
     run.save(options.results, figures={"found": found}, files=[options.out / "doctor_faults.png"])
 
 
 def words(diagnosis: Diagnosis) -> str:
-    """The findings in a line."""
+    """The findings in one line."""
     return "; ".join(finding.message for finding in diagnosis.findings) or "nothing disagrees"
 
 
-def draw(figure: Figure, said: Mapping[str, Diagnosis], names: tuple[str, ...]) -> None:
-    """A matrix of cameras for each of some faults."""
+def draw(figure: Figure, diagnoses: Mapping[str, Diagnosis], names: tuple[str, ...]) -> None:
+    """Draw a matrix of all pairs of cameras for each fault in `SHOWN`."""
     axes = figure.subplots(1, len(SHOWN), sharey=True)
     for axis, name in zip(axes, SHOWN, strict=True):
         picture = axis.imshow(
-            np.log10(said[name].epipolar_px), cmap="viridis", vmin=0, vmax=np.log10(MOST_PX)
+            np.log10(diagnoses[name].epipolar_px), cmap="viridis", vmin=0, vmax=np.log10(MOST_PX)
         )
         axis.set_title("a sound rig" if name == "nothing" else name, fontsize=10)
         axis.set_xticks(range(len(names)), names, rotation=90, fontsize=8)

@@ -1,8 +1,8 @@
-"""The five drone models, to one scale, and their silhouettes as a camera at 5 m sees them.
+"""Pictures of the five drone models at one scale, and their silhouettes in a camera at 5 m.
 
     python experiments/simulation/drone_models.py --out experiments/pictures
 
-Writes drone_models.png: each model from three sides with its size over all, rotors included.
+Writes drone_models.png: each model from three sides, with its full size, rotors included.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ PAINT_BGR = {
 }
 #: Azimuth and elevation from which a picture is taken; x is ahead of the drone, and upwards when seen from above.
 VIEWS = {"three-quarter": (38.0, 27.0), "from the left": (90.0, 0.0), "from above": (180.0, 89.9)}
-#: A long lens from afar, nearly parallel, and one of the scenarios' cameras.
+#: Distance of a long lens with nearly parallel rays, and distance and focal length of a camera of the scenarios.
 FAR_M, NEAR_M, FOCAL_PX = 8.0, 5.0, 1156.3
 PX_PER_M, WIDTH_M, OVERSAMPLED = 480, 0.92, 3
 GREY, INK = 0.72, "#2b313a"
 
 
 def hovering() -> Scene:
-    """One of each model, level and still in the laboratory."""
+    """Scene with one drone of each model, horizontal and still, in the laboratory."""
     drones = []
     for x, name in zip((-2.0, -1.0, 0.0, 1.0, 2.0), MODELS, strict=True):
         still = Harmonics(
@@ -67,7 +67,7 @@ def view_of(
 
 
 def portrait(scene: Scene, drone: int, height_m: float, angles: tuple[float, float]) -> np.ndarray:
-    """RGB of one model before grey."""
+    """RGB picture of one model in front of grey."""
     at_m = scene.positions_m(1)[0, drone]
     view = view_of(at_m, height_m, angles, FAR_M, OVERSAMPLED * PX_PER_M * FAR_M)
     posed = posing.pose(scene, drone, np.zeros(1))
@@ -78,7 +78,7 @@ def portrait(scene: Scene, drone: int, height_m: float, angles: tuple[float, flo
 
 
 def silhouette(model: DroneModel, height_m: float, angles: tuple[float, float]) -> np.ndarray:
-    """What a camera at 5 m has of it: black where the body or a rotor disc is."""
+    """Silhouette in a camera at 5 m: black where the body or a rotor disc is."""
     view = view_of(np.zeros(3), height_m, angles, NEAR_M, FOCAL_PX)
     triangles = np.concatenate([model.triangles_m, disc_fans(model)])
     shown, depth = raster.empty_buffers(view)
@@ -87,12 +87,12 @@ def silhouette(model: DroneModel, height_m: float, angles: tuple[float, float]) 
 
 
 def over_all_m(model: DroneModel) -> np.ndarray:
-    """(3,), its size along x, y and z, rotors included."""
+    """(3,), size along x, y and z, rotors included, metres."""
     return np.ptp(np.concatenate([model.triangles_m, disc_fans(model)]).reshape(-1, 3), axis=0)
 
 
 def main() -> None:
-    """Draw the page."""
+    """Draw the picture."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

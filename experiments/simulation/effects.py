@@ -1,4 +1,4 @@
-"""Pictures of what each effect of the simulator's cameras does: the same view without it and with it.
+"""Pictures of each effect of the simulator's cameras: the same view without and with the effect.
 
     python experiments/simulation/effects.py --out experiments/pictures
 
@@ -29,7 +29,7 @@ from psotrack.support import COLOURS
 
 Vector = tuple[float, float, float]
 
-#: Only what a picture is about is on.
+#: Settings of a camera without effects; each picture switches on one effect.
 OFF = Imaging(
     antialiasing=True,
     shutter_s=0,
@@ -179,7 +179,7 @@ def scene_of(pair: Pair, imaging: Imaging) -> Scenario:
 
 
 def view(pair: Pair, changes: dict[str, Any]) -> np.ndarray:
-    """(rows, columns, 3), RGB: the part of the frame that the picture is about."""
+    """(rows, columns, 3), RGB: the part of the frame that the picture shows."""
     scene = build(scene_of(pair, msgspec.structs.replace(OFF, **changes)))
     frame = CameraRenderer(scene, 0).frame(0)
     (x, y), _ = project(scene.rig.cameras[0], np.array(pair.aim_m or pair.at_m))
@@ -207,7 +207,7 @@ def picture(pair: Pair) -> Image.Image:
 
 
 def save_small(page: Image.Image, path: Path) -> None:
-    """As PNG of 256 colours: a quarter of the size, and no difference that these pictures are about."""
+    """Save as PNG of 256 colours: a quarter of the size, without a visible difference."""
     page.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
@@ -249,7 +249,7 @@ def drift() -> Figure:
 
 
 def flicker() -> Figure:
-    """Light of the lamps, and what is left of it in frames of three shutters."""
+    """Draw the light of the lamps, and the brightness of frames with three shutter times."""
     figure, (lamps, frames) = curves(2)
     shown = Imaging(flicker=0.3, shutter_s=0)
     time_s = np.linspace(0, 0.08, 800)

@@ -1,8 +1,8 @@
-"""Where the simulator's time goes: processor milliseconds per frame of one camera, stage by stage.
+"""Time of the simulator: processor milliseconds per frame of one camera, stage by stage.
 
     python experiments/simulation/speed.py --scenario S02_D4_A --frames 60
 
-Everything runs on one thread. Cameras and segments are drawn in parallel by `psotrack simulate`, so one second of video
+The script uses one thread. Cameras and segments are drawn in parallel by `psotrack simulate`, so one second of video
 (25 frames) of eight cameras takes about 200 times the total, divided by the cores.
 """
 
@@ -44,7 +44,7 @@ def stage(name: str) -> Iterator[None]:
 
 
 def static_camera(scene: Scene, frames: range, folder: Path) -> None:
-    """All that is made of one static camera."""
+    """Make the video, detections and masks of one static camera."""
     with stage("set-up"):
         renderer = CameraRenderer(scene, 0)
     size_wh = renderer.cam.width, renderer.cam.height
@@ -67,7 +67,7 @@ def static_camera(scene: Scene, frames: range, folder: Path) -> None:
 
 
 def onboard_camera(scene: Scene, frames: range, folder: Path) -> None:
-    """The video of the first drone's own camera."""
+    """Make the video of the first drone's own camera."""
     renderer = OnboardRenderer(scene, 0)
     with VideoWriter(folder / "onboard.avi", 25.0, (renderer.width, renderer.height)) as video:
         for frame in frames:
@@ -76,7 +76,7 @@ def onboard_camera(scene: Scene, frames: range, folder: Path) -> None:
 
 
 def main() -> None:
-    """Draw, and print the table."""
+    """Time the scenarios, and print and save the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

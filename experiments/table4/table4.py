@@ -1,10 +1,10 @@
 """The paper's Table 4, triangulation based on projection lines, beside the swarm: mean and median error, and FNR.
 
-    python experiments/table4/table4.py            # S01_D2_A, S02_D4_A and S04_D10, simulated where they are not there
+    python experiments/table4/table4.py            # S01_D2_A, S02_D4_A and S04_D10, simulated if they are missing
     python experiments/table4/table4.py --data FOLDER_OF_THE_DATASET    # every sequence in it that has a reference
 
 FNR is the share of frames and drones that were missed. Writes results.csv, table4.md and the files of `psotrack sweep`
-to --out. Cells that are finished there are not run again.
+to --out. Finished cells in --out are not run again.
 """
 
 from __future__ import annotations

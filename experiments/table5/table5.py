@@ -1,11 +1,11 @@
-"""The paper's Table 5, beside ours: mean errors at its numbers of particles and iterations, over ten runs.
+"""The paper's Table 5 beside ours: mean errors over ten runs for each number of particles and iterations.
 
-    python experiments/table5/table5.py            # 540 runs, an hour on two cores; interrupted, it goes on
-    python experiments/table5/table5.py --quick    # a small form of it: five minutes, the second time seconds
+    python experiments/table5/table5.py            # 540 runs; the same command continues an interrupted call
+    python experiments/table5/table5.py --quick    # a few settings on short sequences
     python experiments/table5/table5.py --data FOLDER_OF_THE_DATASET
 
-Without --data it simulates the sequences that are missing. Writes results.csv (one row per run), _manifest.json,
-table5.md and pictures to --out. Cells that are finished there are not run again.
+Without --data, missing sequences are simulated. Writes results.csv (one row per run), _manifest.json,
+table5.md and pictures to --out. Finished cells in --out are not run again.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ QUICK_FRAMES, QUICK_SCALE = 50, 0.5
 
 
 def main() -> None:
-    """Simulate, track, and show."""
+    """Simulate the missing sequences, track, and show the tables."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--quick", action="store_true", help="a small form of it, in minutes")
+    parser.add_argument("--quick", action="store_true", help="a few settings on short sequences")
     parser.add_argument("--grid", type=Path, help="[default: grid.toml or quick.toml, beside this file]")
     parser.add_argument(
         "--data", type=Path, help="root folder of the sequences [default: simulated into OUT]"

@@ -1,4 +1,4 @@
-"""What the tables are made of: one flight by one method, and several of them together."""
+"""Measures of one flight by one method, and of several flights together."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ ANGLES = ("roll", "pitch", "yaw")
 
 @dataclass(frozen=True)
 class Measures:
-    """Frame by frame, NaN where it is not known.
+    """Measures of each frame; NaN where a measure is not known.
 
     Attributes:
         distance_m, distance_to_point_m, difference_deg, angle_deg: by the paper's procedure: see `PathComparison`.
-        error_m, error_deg: from the true pose of the camera, at the video's own times; of real recordings, which have
-            none, the distances and angles.
+        error_m, error_deg: errors against the true pose of the camera, at the video's times; real recordings have no
+            true pose, and here the reference takes its place.
         inside_90: whether the true position lies in the 90 % ellipsoid of the estimate.
-        posed: whether there is a pose.
-        enough: whether as many markers are visible as the paper asks for.
+        posed: whether the frame has a pose.
+        enough: whether at least `MIN_MARKERS` markers are visible, as the paper requires.
     """
 
     distance_m: Float[np.ndarray, "frames"]
@@ -43,8 +43,8 @@ class Measures:
     enough: Bool[np.ndarray, "frames"]
 
 
-def measured(recording: Recording, path: CameraPath, comparison: PathComparison) -> Measures:
-    """Of one flight by one method."""
+def measure(recording: Recording, path: CameraPath, comparison: PathComparison) -> Measures:
+    """Compute the measures of one flight by one method."""
     turning, unknown = comparison.turning, np.full(path.num_frames, np.nan)
     if recording.truth is not None:
         true_m, true_wxyz = recording.truth.position_m, recording.truth.orientation_wxyz
@@ -67,7 +67,7 @@ def measured(recording: Recording, path: CameraPath, comparison: PathComparison)
 
 
 def together(several: Iterable[Measures]) -> Measures:
-    """All frames of all of them."""
+    """Join the frames of several flights."""
     several = list(several)
     return Measures(
         *(np.concatenate([getattr(one, field.name) for one in several]) for field in fields(Measures))
@@ -75,14 +75,14 @@ def together(several: Iterable[Measures]) -> Measures:
 
 
 def row(measures: Measures) -> dict[str, float]:
-    """The numbers of a row of the tables."""
+    """Numbers of one row of the tables."""
     numbers = {
-        "position_median_m": _of(np.nanmedian, measures.error_m),
-        "position_p99_m": _of(lambda values: np.nanpercentile(values, 99), measures.error_m),
-        "position_max_m": _of(np.nanmax, measures.error_m),
-        "orientation_median_deg": _of(np.nanmedian, measures.error_deg),
+        "position_median_m": _statistic(np.nanmedian, measures.error_m),
+        "position_p99_m": _statistic(lambda values: np.nanpercentile(values, 99), measures.error_m),
+        "position_max_m": _statistic(np.nanmax, measures.error_m),
+        "orientation_median_deg": _statistic(np.nanmedian, measures.error_deg),
         "posed_rate": float(np.mean(measures.posed[measures.enough])) if measures.enough.any() else np.nan,
-        "inside_90_rate": _of(np.nanmean, measures.inside_90),
+        "inside_90_rate": _statistic(np.nanmean, measures.inside_90),
     }
     tables = {
         "distance_m": measures.distance_m,
@@ -96,7 +96,7 @@ def row(measures: Measures) -> dict[str, float]:
     return numbers
 
 
-def _of(function: object, values: Float[np.ndarray, "frames"]) -> float:
+def _statistic(function: object, values: Float[np.ndarray, "frames"]) -> float:
     return float(function(values)) if np.isfinite(values).any() else np.nan
 
 
@@ -114,7 +114,7 @@ def _angles_deg(
 def _inside_90(
     off_m: Float[np.ndarray, "frames 3"], covariance_m2: Float[np.ndarray, "frames 3 3"]
 ) -> Float[np.ndarray, "frames"]:
-    """1 or 0; NaN where there is no estimate, truth or covariance."""
+    """1 where the true position is in the 90 % ellipsoid, else 0; NaN without estimate, true position or covariance."""
     inside = np.full(len(off_m), np.nan)
     both = np.isfinite(off_m).all(axis=-1) & np.isfinite(covariance_m2).all(axis=(-2, -1))
     if both.any():

@@ -1,4 +1,4 @@
-"""The ways from stored markers to poses that Table 7 compares: the paper's, and ours in its three stages."""
+"""Methods from stored markers to poses that Table 7 compares: the paper's, and the three stages of psotrack's."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from psotrack.inside_out.filtering.path_rows import join_rows
 from psotrack.inside_out.localising import localise_frames, pose_row
 from psotrack.inside_out.pose import MarkerPose
 
-#: What the paper asks for.
+#: Smallest number of markers of a pose in the paper.
 MIN_MARKERS = 4
 
 
 def paths(recording: Recording, seen: Sightings) -> dict[str, CameraPath]:
-    """A path by each method."""
-    markers = [_known(recording, seen, frame) for frame in range(recording.video.num_frames)]
+    """Compute the camera's path by each method."""
+    markers = [_markers_in_map(recording, seen, frame) for frame in range(recording.video.num_frames)]
     settings = LocaliseSettings(pose=PoseSettings(min_markers=MIN_MARKERS))
     single = replace(settings, filter=None)
-    raw, filtered = _followed(recording, markers, settings)
+    raw, filtered = _localise(recording, markers, settings)
     return {
-        "paper": join_rows([pose_row(*one, _of_all(one[2], recording), single) for one in markers]),
-        "single frames": _followed(recording, markers, single)[0],
+        "paper": join_rows([pose_row(*one, _paper_pose(one[2], recording), single) for one in markers]),
+        "single frames": _localise(recording, markers, single)[0],
         "filter": filtered,
         "smoother": smooth(raw),
     }
@@ -36,23 +36,23 @@ def paths(recording: Recording, seen: Sightings) -> dict[str, CameraPath]:
 _Markers = tuple[int, float, DetectedMarkers]
 
 
-def _known(recording: Recording, seen: Sightings, frame: int) -> _Markers:
-    """The markers of the map in a frame."""
+def _markers_in_map(recording: Recording, seen: Sightings, frame: int) -> _Markers:
+    """Number, time (seconds) and markers of a frame, without markers that are not in the map."""
     markers = seen.in_frame(frame)
     known = markers.select(np.isin(markers.ids, recording.marker_map.ids))
     return frame, frame / recording.video.fps, known
 
 
-def _followed(
+def _localise(
     recording: Recording, markers: list[_Markers], settings: LocaliseSettings
 ) -> tuple[CameraPath, CameraPath]:
-    """Each frame's own poses, and what the filter makes of them."""
+    """Path of the poses of single frames, and path of the filter."""
     rows = list(localise_frames(markers, recording.marker_map, recording.lens, settings))
     return join_rows([raw for raw, _ in rows]), join_rows([row for _, row in rows])
 
 
-def _of_all(markers: DetectedMarkers, recording: Recording) -> MarkerPose | None:
-    """The least squares of all corners of all markers, right and wrong ones alike: the paper's way."""
+def _paper_pose(markers: DetectedMarkers, recording: Recording) -> MarkerPose | None:
+    """Pose by least squares of all corners of all markers, without rejection of outliers: the paper's method."""
     if len(markers) < MIN_MARKERS:
         return None
     lens = recording.lens

@@ -1,4 +1,4 @@
-"""The recordings of Table 7: a drone's own video, the map of the markers, and a reference by clocks of its own."""
+"""Recordings of Table 7: a drone's own video, the map of the markers, and a reference with its own clocks."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from psotrack.support import progress_bar
 from psotrack.trajectories import Trajectories
 
 SIMULATED = ("S01_D2_A", "S02_D4_A")
-#: What the paper says of its GoPro, for videos that come without intrinsics.
+#: Horizontal and vertical field of view of the paper's GoPro, degrees, for videos without intrinsics.
 FOV_DEG = (92.45, 60.83)
-#: Of a simulated reference: as the paper's Vicon, and its IMU.
+#: Sample rates of a simulated reference, like those of the paper's Vicon system and IMU.
 POSITIONS_HZ, ORIENTATIONS_HZ = 100.0, 25.0
-#: How far the clocks of a simulated reference are off, at most, to either side.
+#: Largest offset of the clocks of a simulated reference, seconds, to either side.
 CLOCKS_S = 5.0
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What was recorded beside the video, of the drone's body.
+    """Recorded motion of the drone's body.
 
     Attributes:
-        time_s: (samples,), by its own clock.
-        position_m: (samples, 3), world.
-        orientation_wxyz: (turns, 4), body to world, or None.
-        orientation_time_s: (turns,), where they come by another clock.
-        planted_s: how far the two clocks were set ahead of the video's, where that is known.
+        time_s: (samples,), times of the positions by their own clock, seconds.
+        position_m: (samples, 3), positions in the world, metres.
+        orientation_wxyz: (turns, 4), orientations, body to world, or None.
+        orientation_time_s: (turns,), times of the orientations, seconds, if they have another clock.
+        planted_s: offsets of the two clocks ahead of the video's clock, seconds, in simulated recordings.
     """
 
     time_s: Float[np.ndarray, "samples"]
@@ -56,11 +56,11 @@ class Recording:
 
     Attributes:
         sequence, drone: names.
-        video: of the drone's own camera.
-        lens: its intrinsics.
-        marker_map: of the room.
-        reference: what the paper's procedure is given.
-        truth: the camera's poses at the frames, of simulated sequences; None of real ones.
+        video: video of the drone's own camera.
+        lens: intrinsics of this camera.
+        marker_map: markers of the room.
+        reference: input of the paper's procedure.
+        truth: true poses of the camera in simulated sequences; None in real sequences.
     """
 
     sequence: str
@@ -73,9 +73,9 @@ class Recording:
 
 
 def simulated(data: Path, *, num_frames: int | None = None, scale: float = 1.0) -> Path:
-    """The data's root, with the sequences that were not there.
+    """Simulate the missing sequences; returns the root folder of the data.
 
-    Of the cameras in the room one of few pixels is left: only the drones' own videos are wanted.
+    The room has only one camera with few pixels, because only the drones' own videos are used.
     """
     from psotrack.simulation import SimulationSettings, replaced, scenario, simulate
 
@@ -90,10 +90,10 @@ def simulated(data: Path, *, num_frames: int | None = None, scale: float = 1.0) 
 
 
 def at_hand(data: Path) -> list[Path]:
-    """The folders of all sequences with markers below a folder.
+    """Find the folders of all sequences with markers below a folder.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no such sequence.
     """
     folders = [path.parent for path in data.glob(f"*/*/{CALIBRATION}") if path.parent.name.endswith("_A")]
     if not folders:
@@ -103,10 +103,10 @@ def at_hand(data: Path) -> list[Path]:
 
 
 def recordings(folder: Path) -> Iterator[Recording]:
-    """Those of all drones of a sequence that have a camera.
+    """Read the recordings of all drones of a sequence that carry a camera.
 
     Raises:
-        InputError: there is none, or a file cannot be used.
+        InputError: no drone carries a camera, or a file cannot be used.
     """
     if not (folder / MARKER_CORNERS).exists():
         raise InputError(folder / MARKER_CORNERS, expected="the corners of its markers", found="no such file")
@@ -123,7 +123,7 @@ def recordings(folder: Path) -> Iterator[Recording]:
             video=onboard.video,
             lens=_lens(onboard),
             marker_map=marker_map,
-            reference=_apart(body, f"{sequence.name} {name}") if known else body,
+            reference=_with_other_clocks(body, f"{sequence.name} {name}") if known else body,
             truth=onboard if known else None,
         )
 
@@ -136,7 +136,7 @@ def _lens(onboard: OnboardVideo) -> Camera:
 
 
 def _flight(flights: Trajectories, name: str, folder: Path) -> Reference:
-    """That of the drone of this name, or of the only one that there is."""
+    """Reference of the drone of this name, or of the only drone."""
     if name not in flights.drones and len(flights.drones) > 1:
         raise InputError(folder, expected=f"{name} in its reference", found=f"{', '.join(flights.drones)}")
     drone = flights.drones.index(name) if name in flights.drones else 0
@@ -149,8 +149,8 @@ def _flight(flights: Trajectories, name: str, folder: Path) -> Reference:
     )
 
 
-def _apart(body: Reference, name: str) -> Reference:
-    """A simulated flight as two recorders would have it that know nothing of the video: other rates, other clocks."""
+def _with_other_clocks(body: Reference, name: str) -> Reference:
+    """Resample a simulated flight as two independent recorders would store it: with other rates and other clocks."""
     rng = np.random.default_rng(zlib.crc32(name.encode()))
     clock_s, turn_clock_s = rng.uniform(-CLOCKS_S, CLOCKS_S, 2)
     if body.orientation_wxyz is None:

@@ -21,12 +21,12 @@ DICTIONARY = "4x4_1000"
 
 @dataclass(frozen=True)
 class Sightings:
-    """Of all frames, one after the other.
+    """Detected markers of all frames.
 
     Attributes:
-        frame: (seen,), in which each marker is seen, not decreasing.
-        ids: (seen,), what it is taken for.
-        corners_px: (seen, 4, 2).
+        frame: (seen,), frame of each detected marker, not decreasing.
+        ids: (seen,), id of each detected marker.
+        corners_px: (seen, 4, 2), corners in the image, pixels.
     """
 
     frame: Int[np.ndarray, "seen"]
@@ -34,13 +34,13 @@ class Sightings:
     corners_px: Float[np.ndarray, "seen 4 2"]
 
     def in_frame(self, frame: int) -> DetectedMarkers:
-        """Those of one frame."""
+        """Markers of one frame."""
         first, last = np.searchsorted(self.frame, [frame, frame + 1])
         return DetectedMarkers(self.ids[first:last], self.corners_px[first:last])
 
 
 def detected(recording: Recording, kept: Path) -> Sightings:
-    """The markers of the map in a video; from the file `kept`, if nothing that decides on them has changed since."""
+    """Detect the markers of the map in a video, or read them from the file `kept` if its inputs have not changed."""
     video, ids = recording.video, recording.marker_map.ids
     made_of = _made_of(recording)
     if kept.exists():
@@ -64,7 +64,7 @@ def detected(recording: Recording, kept: Path) -> Sightings:
 
 
 def _made_of(recording: Recording) -> str:
-    """All that decides which markers are found, and where."""
+    """Text that changes whenever an input of the detection changes."""
     video, lens, status = recording.video, recording.lens, recording.video.path.stat()
     sources = sorted(Path(str(detection.__file__)).parent.glob("*.py"))
     detector = zlib.crc32(b"".join(source.read_bytes() for source in sources))
@@ -73,10 +73,10 @@ def _made_of(recording: Recording) -> str:
 
 
 def mislabelled(seen: Sightings, share: float, marker_map: MarkerMap, rng: np.random.Generator) -> Sightings:
-    """The same with each marker of the map taken, with a probability, for any other marker of it."""
+    """Replace the id of each marker, with the probability `share`, by the id of another marker of the map."""
     ids, known = seen.ids.copy(), marker_map.ids
     wrong = np.flatnonzero(np.isin(ids, known) & (rng.random(len(ids)) < share))
-    # So many places further on in the list of all: never its own.
+    # A shift of at least 1 and less than the number of markers never gives the same id.
     places = np.searchsorted(known, ids[wrong]) + rng.integers(1, len(known), len(wrong))
     ids[wrong] = known[places % len(known)]
     return replace(seen, ids=ids)

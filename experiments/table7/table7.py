@@ -1,11 +1,11 @@
 """The paper's Tables 6, 7 and 8 and figure 11: a drone's own camera and markers on the walls, against a reference.
 
-    python experiments/table7/table7.py            # S01_D2_A and S02_D4_A, simulated where they are not there
+    python experiments/table7/table7.py            # S01_D2_A and S02_D4_A, simulated if they are missing
     python experiments/table7/table7.py --data FOLDER_OF_THE_DATASET    # every sequence *_A in it
 
-Every video is searched for markers once. The markers are kept in --out, and every method works from them: once as they
-are, and once with a share of them mistaken for other markers. Writes results.csv, table6.csv, table7.md and pictures to
---out.
+Every video is searched for markers once. The markers are kept in --out, and every method uses these markers: once
+unchanged, and once with a share of them mistaken for other markers. Writes results.csv, table6.csv, table7.md and
+pictures to --out.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from _measures import ANGLES, Measures, measured, row, together
+from _measures import ANGLES, Measures, measure, row, together
 from _methods import paths
 from _recordings import Recording, at_hand, recordings, simulated
 from _sightings import Sightings, detected, mislabelled
@@ -115,7 +115,7 @@ def flight(recording: Recording, out: Path) -> Flight:
         for method, path in found.items():
             key = dict(zip(KEYS, (recording.sequence, recording.drone, wrong, method), strict=True))
             one = comparisons[method]
-            cases.append((key | clocks(recording, one), measured(recording, path, one)))
+            cases.append((key | clocks(recording, one), measure(recording, path, one)))
             print(
                 f"{name}, {wrong:.0%} wrong, {method}: {1e3 * np.nanmean(one.distance_m):.1f} mm", flush=True
             )

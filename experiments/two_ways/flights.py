@@ -1,10 +1,10 @@
-"""Outside-in, inside-out and fused tracks of six simulated flights: errors, and how often fusion is no worse.
+"""Outside-in, inside-out and fused tracks of six simulated flights: errors, and how often fusion is at least as good.
 
     python experiments/two_ways/flights.py --data data
 
-Simulates S01_D2_A and S02_D4_A with three seeds each, with the drones' own cameras, unless they are there. Tracks and
-localises with the commands that it prints, fuses, and compares as `two_ways.py` does. Files that are there already are
-not made again, so delete DATA/two_ways after a change of the code. Writes one row per drone and range of 50 frames.
+Simulates S01_D2_A and S02_D4_A with three seeds each, with the drones' own cameras, unless they exist. Tracks and
+localises with commands that are printed, fuses, and compares as `two_ways.py` does. Existing files are not made
+again, so delete DATA/two_ways after a change of the code. Writes one row per drone and range of 50 frames.
 """
 
 from __future__ import annotations

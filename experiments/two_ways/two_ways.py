@@ -4,8 +4,8 @@
     python experiments/two_ways/two_ways.py SEQ INSIDE.csv [INSIDE.csv ...] OUTSIDE.csv --range 25 --out rows.csv
 
 INSIDE are paths of `psotrack localise`, whose drones are named as in SEQ's reference; OUTSIDE is a file of `psotrack
-track`. Each track's constant offset from the reference is taken out in the body: a camera, the middle of a silhouette
-and a body's origin are different points. Only frames that both methods cover count.
+track`. The constant offset of each track from the reference is removed in the axes of the body, because a camera, the
+middle of a silhouette and a body's origin are different points. Only frames that both methods cover count.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Compared:
 
 
 def main() -> None:
-    """Fuse, compare, print."""
+    """Fuse the tracks, compare them, and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -47,7 +47,7 @@ def main() -> None:
     parser.add_argument("inside", type=Path, nargs="+", help="INSIDE.csv, one per drone, then OUTSIDE.csv")
     parser.add_argument("--range", type=int, default=50, metavar="FRAMES", help="[default: 50]")
     parser.add_argument("--out", type=Path, help="write a row per drone and range as CSV")
-    parser.add_argument("--force", action="store_true", help="replace what is there")
+    parser.add_argument("--force", action="store_true", help="replace an existing file")
     options = parser.parse_args()
     *inside, outside = options.inside
     try:
