@@ -96,7 +96,7 @@ seen = score_inputs(
     SoftIoU(),
     reduction=SILHOUETTES.reduction,
 )
-# Particles have the axes (particles, drones, 3): each drone has a swarm of its own, all of them move at once.
+# Particles have the axes (particles, drones, 3): each drone has its own swarm, and all swarms move at once.
 spread = jax.random.normal(jax.random.key(1), (PARTICLES, *predicted_m.shape))
 first_m = predicted_m + SPREAD_M * spread
 params = swarm.SwarmParams(
@@ -127,7 +127,7 @@ line_m = np.arange(-round(HALF_M / STEP_M), round(HALF_M / STEP_M) + 1) * STEP_M
 middle_m = np.asarray(predicted_m[shown])
 x_m, y_m = middle_m[0] + line_m, middle_m[1] + line_m
 place_m = np.stack([*np.meshgrid(x_m, y_m), np.full((len(line_m),) * 2, best_m[-1, 2])], axis=-1)
-# A place for one drone is a place for all of them here; only the column of the one that is shown is looked at.
+# Each position is scored for all drones; only the score of the shown drone is used.
 everywhere_m = jnp.asarray(np.repeat(place_m[:, :, None], len(predicted_m), axis=2), jnp.float32)
 ground = np.asarray(fitness(everywhere_m))[..., shown]
 
@@ -172,17 +172,17 @@ Image(filename=DATA / "swarm.gif")
 
 # %% [markdown]
 # *What to see. Left, from above: the score's landscape at the drone's height, thirty particles (white, with the last
-# step as a line), the best place that was found so far (ring), and the truth (dark cross). The particles
-# begin as a wide cloud about the prediction, are pulled over the hill, swing through to its other side, and settle on
-# the top. Right: the score of every particle and the best so far. The best is nearly final after a few iterations;
-# the rest of the time goes into the last millimetres.*
+# step as a line), the best position so far (ring), and the true position (dark cross). The particles
+# begin as a wide cloud around the prediction, are pulled over the hill, swing to its other side, and settle on
+# the top. Right: the score of every particle and the best score so far. The best score is nearly final after a few
+# iterations; the remaining iterations improve the position by millimetres.*
 #
-# ## One swarm for each drone, or one for all?
+# ## One swarm for each drone, or one swarm for all drones?
 #
 # The paper has one swarm in which a particle is a guess of *all* drones at once: 12 numbers for four drones. Its score
 # is the mean over the drones, so a particle that is right about three drones and wrong about one has a mediocre score,
-# and attracts no other particle. Separate swarms share only the images. Both kinds get the same number of particles
-# and iterations, that is, of evaluations of the score:
+# and attracts no other particle. Separate swarms share only the images. Both kinds get the same numbers of particles
+# and iterations, and so the same number of evaluations of the score:
 
 # %%
 joint = jax.jit(lambda position_m: joint_fitness(seen, position_m.reshape(PARTICLES, -1, 3))[:, None])
@@ -194,7 +194,7 @@ all_at_once = swarm.SwarmParams(
     low=params.low.reshape(1, -1),
     high=params.high.reshape(1, -1),
 )
-# The top of each hill, from a swarm that has all the time of the world.
+# The top of each hill, from a swarm with many particles and iterations.
 top_m = swarm.run(jax.random.key(0), fitness, jnp.tile(first_m, (10, 1, 1)), params, 300).gbest_position
 
 distance_mm = {"a swarm per drone": [], "one swarm for all": []}

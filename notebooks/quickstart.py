@@ -15,7 +15,7 @@
 # 3D, in every frame?
 #
 # This notebook simulates such a recording, shows it, tracks the drones, compares the tracks with the ground truth, and
-# writes a table. It takes about two minutes on two cores, and half a minute when it runs again.
+# writes a table. The second run is faster, because silhouettes and compiled programs are stored.
 
 # %%
 import os
@@ -80,8 +80,8 @@ axes.set(xlabel="x (pixels)", ylabel="y (pixels)", title=f"camera {name}, frame 
 plt.show()
 
 # %% [markdown]
-# *What to see: four drones, the nearest some fifty pixels wide: two left of the middle, two before the far corner. The
-# tracker uses only their silhouettes: no markers, no colours, no model of a drone's appearance.*
+# *What to see: four small drones: two left of the middle, two in front of the far corner. The tracker uses only their
+# silhouettes: no markers, no colours, no model of a drone's appearance.*
 
 # %% [markdown]
 # ## Track
@@ -116,7 +116,7 @@ plt.show()
 # %% [markdown]
 # *What to see. Left: four of the cameras half-way through the recording; each box is the tracked position with the
 # learned size, projected into the camera, and sits on its drone. A colour is one drone in all pictures. Right: the
-# tracked paths (solid), the true ones (dashed, drawn over them), and their shadows on the floor. Axes are in metres.*
+# tracked paths (solid), the true paths (dashed), and the shadows of both on the floor. Axes are in metres.*
 #
 # ## How good is it?
 
@@ -137,13 +137,13 @@ plots.draw_errors(axes, tracked.trajectories, recording.truth)
 plt.show()
 
 # %% [markdown]
-# *What to see: each drone's distance from the truth, frame by frame. Each curve keeps a constant height: the offset
-# between the body's origin, which the ground truth describes, and the silhouette's middle, which cameras show. The
-# offset is constant in each drone's body, and `--body-offset` removes it. The third column of the table is the error
-# without the offset. Gaps and bars at the top would be frames in which a drone is missed; dotted lines would be
+# *What to see: each drone's distance from the ground truth, frame by frame. Each curve keeps a constant height: the
+# offset between the body's origin, which the ground truth describes, and the silhouette's middle, which cameras show.
+# The offset is constant in each drone's body, and `--body-offset` removes it. The third column of the table is the
+# error without the offset. Gaps and bars at the top would be frames in which a drone is missed; dotted lines would be
 # identity swaps.*
 #
-# ## Take the numbers away
+# ## Save the tracks
 #
 # This file is the same as that of `psotrack track SEQ --out tracks.parquet`: one row per frame and drone.
 
@@ -176,10 +176,10 @@ panels[-1].set_xlabel("time (s)")
 plt.show()
 
 # %% [markdown]
-# *What to see: the coordinates of each drone, in colours as above. The bands are the tracker's own standard deviation,
-# drawn twenty times as wide, because at its true width, some millimetres, it would vanish in the line; it is wide in
-# the first frames, when little is known of how the drones move. Numbers of drones are the tracker's; the tracker does
-# not know the names in the ground truth.*
+# *What to see: the coordinates of each drone, in colours as above. The bands are the standard deviation that the
+# tracker states, drawn twenty times as wide, because the true width would vanish in the line. The bands are wide in
+# the first frames, because the velocities are not known yet. The numbers of the drones are the tracker's; the tracker
+# does not know the names in the ground truth.*
 #
 # Next: [how a score comes from a video](video_to_score.ipynb), [how the swarm moves](how_the_swarm_moves.ipynb),
-# [your own cameras](your_own_cameras.ipynb), [what the swarm's size costs and buys](table_5.ipynb).
+# [your own cameras](your_own_cameras.ipynb), [error and time against the size of the swarm](table_5.ipynb).

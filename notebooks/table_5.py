@@ -9,7 +9,7 @@
 # ---
 
 # %% [markdown]
-# # Table 5, and what a millimetre costs
+# # Table 5: error and time against the size of the swarm
 #
 # The paper's Table 5 tracks three sequences with 20, 50 and 100 particles and 20, 50 and 70 iterations, several times
 # each, because a swarm is random. `make table5` does the same with the paper's method (one swarm for all drones, one
@@ -65,7 +65,7 @@ Markdown(render(table, "markdown", decimals=1))
 
 # %% [markdown]
 # Millimetres, mean ± standard deviation over the runs; measured from the drones' origins, so each drone's constant
-# offset from its silhouette's middle is included, 10 to 25 mm that no image shows. The same without the offset:
+# offset between origin and silhouette's middle, which no image shows, is included. The same without the offset:
 
 # %%
 table = pivot(
@@ -78,7 +78,7 @@ table = pivot(
 Markdown(render(table, "markdown", decimals=1))
 
 # %% [markdown]
-# The paper's own figures, on its own videos. Videos, silhouettes, sizes, initial states and motion model differ from
+# The paper's own errors, on its own videos. Videos, silhouettes, sizes, initial states and motion model differ from
 # ours: compare the two methods above with each other, not with these figures.
 
 # %%
@@ -96,7 +96,7 @@ figure
 # *What to see: a point is one number of particles and iterations with one method; to the right is more time per frame,
 # up is a larger mean error, both on logarithmic scales; bars are the standard deviation over the runs. The dark line
 # is the Pareto front: no other point is both faster and more accurate than a point on it. Where the front is flat,
-# more work does not lower the error. The band is what the paper published.*
+# more work does not lower the error. The band is the range that the paper published.*
 
 # %%
 figure = error_against_work(rows, error="offset_removed_mean_error_m")
@@ -104,8 +104,8 @@ figure.set_dpi(DPI)
 figure
 
 # %% [markdown]
-# *What to see: the same without the constant offsets, which hide what the swarm contributes. Here the slope of a method
-# shows whether it still gains by more particles or iterations.*
+# *What to see: the same without the constant offsets, which hide the contribution of the swarm. The slope of a method
+# shows whether more particles or iterations still lower the error.*
 #
 # ## Run by run
 
@@ -158,11 +158,11 @@ panels[0, 0].legend(frameon=False)
 plt.show()
 
 # %% [markdown]
-# *What to see: every run by itself. A short column is a method whose runs agree; a long column is a method whose
+# *What to see: every single run. A short column is a method whose runs agree; a long column is a method whose
 # result depends on the seed. Rings are runs with identity swaps: their errors are far above those of other runs, and a
 # mean over runs mixes both kinds.*
 #
-# ## Where it came from
+# ## Origin of the results
 
 # %%
 manifest = json.loads((RESULTS / "_manifest.json").read_text())

@@ -11,8 +11,8 @@
 # %% [markdown]
 # # From a video to a score
 #
-# The tracker computes, a million times per second, how well a drone at a given point would explain what the cameras
-# see. The result is a number in [0, 1], the soft IoU. This notebook computes it step by step:
+# For very many points per frame, the tracker computes how well a drone at the point explains the cameras' images. The
+# result is a number in [0, 1], the soft IoU. This notebook computes it step by step:
 #
 # frame → foreground → silhouette → box of a drone at a point → overlap of the two
 #
@@ -107,7 +107,7 @@ start = find_drones(
     bounds_m=room_bounds(recording.rig),
     max_speed_m_s=6.0,
 )
-# The drone that is looked at is the one of those found that begins nearest to it.
+# Of the found drones, the drone nearest to the initial position of the shown drone is used.
 path_m = recording.truth.position_m[1:10, DRONE].mean(axis=0)
 found = np.linalg.norm(start.position_m - path_m, axis=1).argmin()
 size_m = jnp.asarray(start.size_m[found : found + 1], jnp.float32)
@@ -157,8 +157,8 @@ plt.show()
 # %% [markdown]
 # *What to see, from left to right: one drone, cut out of the frame; the foreground, drone and rotors; the foreground
 # at the tracker's resolution; and the three windows (solid, 0.4, 0.7 and 1 times the drone's box) and the ring
-# (dashed, 1.5 times) of a drone that is at the true position. Above, a camera that sees it alone: the windows sit on
-# the silhouette. Below, one in whose view a second drone is right behind: two drones, one silhouette.*
+# (dashed, 1.5 times) of a drone at the true position. Above, a camera that sees the drone alone: the windows are on
+# the silhouette. Below, a camera in which a second drone is directly behind: two drones, one silhouette.*
 #
 # ## Box and silhouette → soft IoU
 #
@@ -190,14 +190,14 @@ axes.legend(frameon=False, ncols=2, loc="lower left", bbox_to_anchor=(0, 1))
 plt.show()
 
 # %% [markdown]
-# *What to see: nearly every camera prefers the true position, some more than others: those that look along x hardly
-# notice a step along x. And `cam1`, where two drones are one silhouette, is wrong. No single camera knows where the
-# drone is; the mean over all of them does. (The tracker goes further: what another drone is expected to cover says
-# nothing about this one; see `psotrack.tracking.occlusion`.)*
+# *What to see: nearly every camera prefers the true position. A camera that looks along x hardly notices a step along
+# x. `cam1`, in which two drones are one silhouette, prefers the wrong position. No single camera determines the
+# position; the mean over all cameras does. (The tracker also leaves out the part of an image that another drone is
+# expected to cover; see `psotrack.tracking.occlusion`.)*
 #
 # ## The landscape around a drone
 #
-# Now the score as a function of the point: slices through the true position. Beside it the score of the paper: one
+# The score as a function of the point: slices through the true position. Beside it the score of the paper: one
 # window, with edges rounded to whole pixels.
 
 # %%
@@ -259,8 +259,8 @@ plt.show()
 # true position (cross) is near its top. Right, the top of the hill, 0.1 m to either side: the soft score is smooth, so
 # a parabola through it gives the position of the top to millimetres. The hard score changes in steps, because a box
 # changes only when an edge reaches the next pixel: neighbouring positions have the same score, and the choice between
-# them is random. The top is some ten millimetres beside the true position, because the ground truth describes the
-# body's origin and the score the silhouette's middle.*
+# them is random. The top is a little beside the true position, because the ground truth describes the body's
+# origin, and the score describes the silhouette's middle.*
 #
 # ## The landscape of the room
 #
@@ -289,10 +289,10 @@ axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, facecolor="#2b313a
 plt.show()
 
 # %% [markdown]
-# *What to see: one bright hill, a few decimetres wide, in a dark plain. The drone is at this hill. The faint patches
-# are places where foreground in two or three cameras agrees by chance: rays from cameras to the other drones, which
-# are higher or lower, cross there. In most of the room the score has no slope towards the hill. A swarm finds the hill
-# because it starts at the position that the motion model predicts. In the first frame positions are found in another
-# way, from blobs that agree between cameras (`psotrack.initiation.initialisation`).*
+# *What to see: one narrow bright hill in a dark plain. The drone is at this hill. At the faint patches, foreground in
+# a few cameras agrees by chance: rays from cameras to the other drones, which are higher or lower, cross there. In
+# most of the room the score has no slope towards the hill. A swarm finds the hill because it starts at the position
+# that the motion model predicts. In the first frame positions are found in another way, from blobs that agree between
+# cameras (`psotrack.initiation.initialisation`).*
 #
 # Next: [how the swarm moves](how_the_swarm_moves.ipynb) in this landscape.

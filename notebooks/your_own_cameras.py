@@ -18,7 +18,7 @@
 # 2. the rig is checked with points that you know,
 # 3. rig and videos become a folder that every command of psotrack reads,
 # 4. the drones are tracked,
-# 5. and if something is wrong: how to see what.
+# 5. if something is wrong, the cause is found.
 
 # %%
 import json
@@ -75,12 +75,12 @@ plt.rcParams.update({"figure.dpi": 80, "font.size": 9})
 keep_compiled(Path("data", "compiled"))
 
 # %% [markdown]
-# ## What stands for your files
+# ## Files of this example
 #
-# Skip these two cells when you have files of your own. They turn a simulated recording into one from another program:
-# other names, lens distortion (the videos are resampled), millimetres, and the first camera's frame as world, as after
-# stereo calibration. Besides videos and calibration there are *marks*: six points whose positions in the room you know
-# (tape on the floor, a pole), and where you clicked on them in each picture.
+# Skip these two cells if you have your own files. The cells change a simulated recording into a recording of another
+# program: with other names, lens distortion (the videos are resampled), millimetres, and the first camera's frame as
+# the world, as after stereo calibration. Besides videos and calibration there are *marks*: six points whose positions
+# in the room you know (tape on the floor, a pole), with the pixels where you clicked on them in each picture.
 
 # %%
 folder = DATA / "Simulated_Data" / "S02_D4_A"
@@ -128,7 +128,7 @@ marks_m = np.array(
 )
 clicked_px, depth_m = project(bent.cameras, marks_m[:, None])
 inside = (depth_m > 0) & ((clicked_px >= 0) & (clicked_px < bent.cameras.image_size_wh)).all(axis=-1)
-# Nobody clicks better than half a pixel.
+# Marks that are clicked by hand have an error of about half a pixel.
 clicked_px = np.where(inside[..., None], np.round(2 * clicked_px) / 2, np.nan)
 np.savez(FOREIGN / "marks.npz", marks_m=marks_m, clicked_px=clicked_px)
 
@@ -150,10 +150,10 @@ print(*sorted(path.name for path in FOREIGN.iterdir()), sep=", ")
 # %% [markdown]
 # ## 1. The calibration becomes a rig
 #
-# `make_camera` takes what OpenCV's `calibrateCamera` and `stereoCalibrate` give: `R` and `t` from the world to the camera
-# ($x_{cam} = R\,x_{world} + t$; if you have the camera's position $C$ instead, $t = -R\,C$), `K` in pixels, and 0, 4,
-# 5 or 8 distortion coefficients in OpenCV's order. Rotation vectors become matrices with SciPy. Lengths become metres
-# here, once.
+# `make_camera` takes what OpenCV's `calibrateCamera` and `stereoCalibrate` give: `R` and `t` from the world to the
+# camera ($x_{cam} = R\,x_{world} + t$; if you have the camera's position $C$ instead, $t = -R\,C$), `K` in pixels,
+# and 0, 4, 5 or 8 distortion coefficients in OpenCV's order. SciPy converts rotation vectors to matrices. Lengths are
+# converted to metres here.
 
 # %%
 calibration = json.loads((FOREIGN / "calibration.json").read_text())
@@ -206,8 +206,8 @@ print(
 #
 # ## 2. Check the rig
 #
-# Project the known points and compare them with the pictures. This finds nearly every mistake: `R` for its transpose,
-# `t` for the centre, a camera's name for another's, a video of another size than the calibration's.
+# Project the known points and compare them with the pictures. This finds nearly every mistake: a transposed `R`,
+# the centre in place of `t`, exchanged names of cameras, a video of another size than the calibration's.
 
 # %%
 projected_px, depth_m = project(rig.cameras, marks_m[:, None])
@@ -237,17 +237,17 @@ for panel, number in zip(panels, (0, 2), strict=True):
 plt.show()
 
 # %% [markdown]
-# *What to see: in each picture the six marks, as they were clicked (crosses) and as the rig projects them (rings):
-# every cross is in the middle of its ring. From the mark in the middle of the floor the axes of the room go out, a
-# metre each: x orange, y green, z blue. z points up, and ends near the top of the pole, at 1.2 m.*
+# *What to see: in each picture the six clicked marks (crosses) and their projections by the rig (rings): every cross is
+# in the middle of its ring. The axes of the room, one metre each, begin at the mark in the middle of the floor: x
+# orange, y green, z blue. z points up, and ends near the top of the pole, at 1.2 m.*
 #
 # ## 3. A folder that psotrack reads
 #
 # One calibration file, and one video per camera, named like the camera (`.avi` or `.mp4`). The file's layout is the
 # DPJAIT dataset's: one focal length per camera, no skew, k1, k2, p1, p2. With OpenCV, calibrate with
-# `CALIB_FIX_ASPECT_RATIO` and `CALIB_FIX_K3`. If yours has two focal lengths or more coefficients,
-# `write_calibration` says so; then stay in Python, where nothing is lost: `Sequence(name, folder, rig, videos)` from
-# `psotrack.recordings.Recording`, with `videos` from `psotrack.recordings.video.probe`, is all that the rest of this notebook needs.
+# `CALIB_FIX_ASPECT_RATIO` and `CALIB_FIX_K3`. If your calibration has two focal lengths or more
+# coefficients, `write_calibration` raises an error. Then use Python: the rest of this notebook needs only
+# `psotrack.recordings.Recording(name, folder, rig, videos)`, with `videos` from `psotrack.recordings.probe`.
 
 # %%
 FOLDER.mkdir(exist_ok=True)
@@ -259,8 +259,8 @@ recording = read_sequence(FOLDER).usable()  # says what does not fit: sizes, rat
 pd.DataFrame(describe_recording(recording)["cameras"]).T.drop(columns=["video", "detections"])
 
 # %% [markdown]
-# The same as a table in the terminal: `psotrack info my_recording`. Videos must begin at the same moment; a camera
-# that is 20 ms late costs a drone at 2 m/s up to 40 mm in its view.
+# `psotrack info my_recording` prints the same as a table. Videos must begin at the same moment; a camera
+# that is 20 ms late shows a drone at 2 m/s up to 40 mm from its true position.
 #
 # ## 4. Track
 #
@@ -297,7 +297,7 @@ plt.show()
 
 # %% [markdown]
 # *What to see: one frame in all eight cameras, 960 x 540 pixels each, with the tracked boxes; a colour is a drone.
-# Every box is around a drone, or where one is hidden behind a pillar or another drone.*
+# Every box is around a drone, which may be hidden behind a pillar or another drone.*
 
 # %%
 figure, (top, bottom) = plt.subplots(2, 1, figsize=(9, 4.2), sharex=True, layout="constrained")
@@ -314,20 +314,20 @@ bottom.grid(alpha=0.3)
 plt.show()
 
 # %% [markdown]
-# *What to see: a steady fitness of about 0.4, far above the dotted line, and nearly all cameras at nearly all times:
-# as it should be. A drop of one curve is a drone that is hidden or leaves; a drop of all of them, light that changes.*
+# *What to see: a steady fitness, far above the dotted line, and nearly all cameras at nearly all times. This is a good
+# result. If one curve drops, a drone is hidden or leaves; if all curves drop, the light changes.*
 #
-# This recording has a ground truth, because it was made from a simulation:
+# This recording has a ground truth, because it is simulated:
 
 # %%
 evaluation = evaluate(tracks, simulated.truth)
 print(f"mean error {1e3 * evaluation.mean_error_m:.0f} mm, identity switches {evaluation.id_switches}")
 
 # %% [markdown]
-# ## 5. When it fails: which camera is it?
+# ## 5. Find the camera that is wrong
 #
-# A tripod was moved after the calibration: `gopro3` now looks a little to the side. The tracker still works, a little
-# less accurately, because seven cameras outvote one. Each camera's own score at the tracked positions shows which
+# A tripod was moved after the calibration: `gopro3` looks a little to the side. The tracker still works, a little
+# less accurately, because seven cameras are right. Each camera's own score at the tracked positions shows which
 # camera is wrong.
 
 # %%
@@ -373,16 +373,16 @@ print(
 )
 
 # %% [markdown]
-# *What to see: with the rig as it was calibrated all cameras score alike. With one turned, that camera's bar falls far
-# below the others, which lose little. Leave it out (`--cameras`, or `recording.usable(cameras=[...])`) or calibrate it
-# again.*
+# *What to see: with the correct rig all cameras have similar scores. If one camera is turned, its bar falls far below
+# the bars of the other cameras, which fall a little. Leave the camera out (`--cameras`, or
+# `recording.usable(cameras=[...])`) or calibrate it again.*
 #
 # | What you see | Look at | Likely cause |
 # |---|---|---|
 # | no drones found | silhouettes: `compute(...).read(0, 10)`, camera by camera | the drones stand still for most of the video; `var_threshold` too high for dark drones before a dark wall |
-# | drones where there are none | the same | shadows, people, moving curtains: `shadows="drop"`, `bounds_m` |
-# | marks are off by 10 pixels and more in one camera | its picture with the marks | the camera was moved, or the video has another size or crop than the calibration |
+# | false drones | silhouettes, as above | shadows, people, moving curtains: `shadows="drop"`, `bounds_m` |
+# | marks are off by 10 pixels or more in one camera | the picture of this camera with the marks | the camera was moved, or the video has another size or crop than the calibration |
 # | marks are off in all cameras | scale and axes in step 1 | millimetres, transposed `R`, centres taken for `t` |
 # | boxes beside the drones that swing with their speed | one camera's score against the speed | videos do not begin at the same moment |
 # | boxes right, but too large or small | `tracked.size_m` | shadows in the silhouettes; say the size with `drone_size_m` |
-# | two drones change names | `tracked.identities.encounters` | they passed each other; see how near, and from how many sides that is seen |
+# | two drones change names | `tracked.identities.encounters` | they passed each other; look at their distance and at the number of viewpoints |
