@@ -1,4 +1,4 @@
-"""`psotrack simulate` as people type it: the list, pages of pictures, scenarios of one's own, bad input."""
+"""The command `psotrack simulate`: the list of scenarios, previews, scenario files, and bad input."""
 
 import json
 import re
@@ -14,25 +14,25 @@ from psotrack.errors import PsotrackError
 from psotrack.simulation import build, preview
 
 SMALL = ("--frames", "2", "--scale", "0.1", "--jobs", "1", "--no-onboard", "--quiet")
-#: What the paper says of its simulated half: frames of all sequences, and frames times drones.
+#: Totals that the paper states for its simulated half: frames of all sequences, and frames times drones.
 TOTAL_FRAMES, TOTAL_FLIGHT = (20 * 60 + 3) * 25, (91 * 60 + 25) * 25
 
 
-def run(*arguments):
+def run_simulate(*arguments):
     return CliRunner().invoke(cli.cli, ["simulate", *map(str, arguments)], catch_exceptions=False)
 
 
-def refused(*arguments):
-    """The message of what goes wrong on purpose, which `main` prints as one line."""
+def refusal_message(*arguments):
+    """Run a command that must fail, and return its error message, which must be one line."""
     with pytest.raises(PsotrackError) as error:
-        run(*arguments)
+        run_simulate(*arguments)
     message = str(error.value)
     assert "\n" not in message
     return message
 
 
-def test_the_list_names_all_thirteen_with_what_they_hold():
-    rows = json.loads(run("--list", "--json", "-").stdout)
+def test_the_list_shows_all_thirteen_scenarios():
+    rows = json.loads(run_simulate("--list", "--json", "-").stdout)
     assert [row["name"][:3] for row in rows] == [f"S{number:02d}" for number in range(1, 14)]
     assert sum(row["frames"] for row in rows) == TOTAL_FRAMES
     assert sum(row["frames"] * row["drones"] for row in rows) == TOTAL_FLIGHT
@@ -42,58 +42,62 @@ def test_the_list_names_all_thirteen_with_what_they_hold():
         "S13_D3": 4,
     }
     assert all(row["markers"] == row["onboard"] == row["name"].endswith("_A") for row in rows)
-    # As measured on the dataset: fast ones, and those flown by hand.
+    # Speeds measured on the dataset: the fast sequences, and the sequences flown by hand.
     speed = {row["name"][:3]: row["mean_speed_m_s"] for row in rows}
     assert all(3.4 <= speed[name] <= 4.0 for name in ("S08", "S09", "S10"))
     assert all(0.25 <= speed[name] <= 0.43 for name in ("S11", "S12", "S13"))
-    shown = run("--list").stdout
+    shown = run_simulate("--list").stdout
     for row in rows:
         line = next(line for line in shown.splitlines() if row["name"] in line)
         assert re.search(rf"{row['drones']} +│? *{row['cameras']} +│? *{row['frames']}\b", line), line
 
 
-def test_a_preset_is_a_file_to_start_ones_own_from(tmp_path):
-    text = run("S01_D2_A", "--show").stdout
+def test_a_preset_can_be_edited_into_a_new_scenario(tmp_path):
+    text = run_simulate("S01_D2_A", "--show").stdout
     assert tomllib.loads(text)["name"] == "S01_D2_A"
     mine = tmp_path / "mine.toml"
     mine.write_text(text.replace('name = "S01_D2_A"', 'name = "MINE"'))
-    answer = run("--scenario", mine, "--out", tmp_path, "--json", "-", *SMALL)
+    result = run_simulate("--scenario", mine, "--out", tmp_path, "--json", "-", *SMALL)
     folder = tmp_path / "Simulated_Data" / "MINE"
-    assert json.loads(answer.stdout) == {"sequence": str(folder)}
-    sequence = read_sequence(folder).usable()
-    assert (len(sequence.rig), sequence.num_frames, len(sequence.truth.drones)) == (8, 2, 2)
+    assert json.loads(result.stdout) == {"sequence": str(folder)}
+    recording = read_sequence(folder).usable()
+    assert (len(recording.rig), recording.num_frames, len(recording.truth.drones)) == (8, 2, 2)
 
 
 def test_fields_are_changed_from_the_command_line(tmp_path):
     changes = ("--set", "camera_spread.focal_length=0.05", "--set", "name=OTHER")
-    run("S11_D4", "--out", tmp_path, *changes, *SMALL)
+    run_simulate("S11_D4", "--out", tmp_path, *changes, *SMALL)
     rig = read_sequence(tmp_path / "Simulated_Data" / "OTHER").rig
     assert len({round(float(focal), 3) for focal in rig.cameras.K[:, 0, 0]}) == 4
 
 
 @pytest.mark.slow
-def test_a_page_of_pictures_instead_of_the_sequence(tmp_path):
-    answer = run("S01_D2_A", "--preview", "--out", tmp_path, "--frames", "3", "--jobs", "1", "--json", "-")
+def test_preview_writes_one_picture_and_no_sequence(tmp_path):
+    result = run_simulate(
+        "S01_D2_A", "--preview", "--out", tmp_path, "--frames", "3", "--jobs", "1", "--json", "-"
+    )
     page = tmp_path / "S01_D2_A.png"
-    assert json.loads(answer.stdout) == {"preview": str(page)}
+    assert json.loads(result.stdout) == {"preview": str(page)}
     assert [path.name for path in tmp_path.iterdir()] == [page.name]
     image = cv2.imread(str(page))
     assert image.shape[1] == 1600
-    # Pictures of rooms have thousands of colours; a page with its pictures left white has some hundreds.
+    # A page with rendered rooms has thousands of colours; a page without pictures has a few hundred.
     assert len(set(map(tuple, image[::4, ::4].reshape(-1, 3).tolist()))) > 5000
-    assert "pass --force" in refused("S01_D2_A", "--preview", "--out", tmp_path, "--frames", "3")
+    assert "pass --force" in refusal_message("S01_D2_A", "--preview", "--out", tmp_path, "--frames", "3")
 
 
-def test_a_page_is_of_the_seed_that_was_asked_for(tmp_path, monkeypatch):
-    """All of it: its pictures as well as its plans."""
+def test_preview_uses_the_given_seed(tmp_path, monkeypatch):
+    """The flight plans and all four pictures are made from the given seed."""
     seeds = []
 
-    def noting(recipe, *, scale, seed):
+    def build_and_record_seed(recipe, *, scale, seed):
         seeds.append(seed)
         return build(recipe, scale=scale, seed=seed)
 
-    monkeypatch.setattr(preview, "build", noting)
-    run("S11_D4", "--preview", "--out", tmp_path, "--seed", "7", "--frames", "1", "--jobs", "1", "--quiet")
+    monkeypatch.setattr(preview, "build", build_and_record_seed)
+    run_simulate(
+        "S11_D4", "--preview", "--out", tmp_path, "--seed", "7", "--frames", "1", "--jobs", "1", "--quiet"
+    )
     assert len(seeds) == 1 + 4
     assert set(seeds) == {7}
 
@@ -121,5 +125,5 @@ def test_a_page_is_of_the_seed_that_was_asked_for(tmp_path, monkeypatch):
 )
 def test_bad_input_is_one_line_and_writes_nothing(arguments, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert message in refused(*arguments)
+    assert message in refusal_message(*arguments)
     assert not list(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""The reader of the published layout: folders of each half are made by hand, read, and damaged in many ways."""
+"""The reader of the dataset: hand-made folders of both halves are read, and damaged in many ways."""
 
 import shutil
 from pathlib import Path
@@ -13,15 +13,17 @@ from psotrack.geometry import project
 from psotrack.recordings import Markers, VideoWriter, write_c3d
 
 WIDTH, HEIGHT, FPS = 64, 48, 25.0
-SIMULATED = "cam_name;cam_x[m];cam_y[m];cam_z[m];cam_or_x[rad];cam_or_y[rad];cam_or_z[rad];focal_length;cx;cy"
-REAL = SIMULATED.replace("[m]", "[mm]") + ";coeff_1;coeff_2;coeff_3;coeff_4"
-POSES = "id;pos_x[m];pos_y[m];pos_z[m];rot_x[rad];rot_y[rad];rot_z[rad];q_w;q_x;q_y;q_z"
+SIMULATED_HEADER = (
+    "cam_name;cam_x[m];cam_y[m];cam_z[m];cam_or_x[rad];cam_or_y[rad];cam_or_z[rad];focal_length;cx;cy"
+)
+REAL_HEADER = SIMULATED_HEADER.replace("[m]", "[mm]") + ";coeff_1;coeff_2;coeff_3;coeff_4"
+POSE_HEADER = "id;pos_x[m];pos_y[m];pos_z[m];rot_x[rad];rot_y[rad];rot_z[rad];q_w;q_x;q_y;q_z"
 SERIALS = ("55260362", "56339527", "60881257", "61920488")
 
 
 @pytest.fixture(scope="session")
-def video(tmp_path_factory):
-    """One small video per number of frames, written once and copied."""
+def make_video(tmp_path_factory):
+    """Return a function that writes a small black video once and returns its path."""
     folder = tmp_path_factory.mktemp("videos")
 
     def make(num_frames: int, size_wh: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
@@ -38,32 +40,32 @@ def video(tmp_path_factory):
 def pose_lines(num_rows: int, x0: float) -> str:
     rows = ["0;0;0;-0;0;0;0;1;0;0;0"]
     rows += [f"{i};{x0 + 0.1 * i};2;1.5;0;0;0;0;0;0;1" for i in range(1, num_rows)]
-    return "\n".join([POSES, *rows]) + "\n"
+    return "\n".join([POSE_HEADER, *rows]) + "\n"
 
 
 @pytest.fixture
-def simulated(tmp_path, video):
-    """Three cameras, two drones, five frames; the name of the folder says nine drones."""
+def simulated_folder(tmp_path, make_video):
+    """A simulated sequence of three cameras, two drones and five frames; its folder name states nine drones."""
     folder = tmp_path / "Simulated_Data" / "S99_D9"
     folder.mkdir(parents=True)
     cameras = [f"cam{i}i;{i};0.5;8;1.9;{i / 10};0;{1156.3 + i};32;24" for i in (1, 2, 3)]
-    (folder / "cameras_calibration.csv").write_text("\n".join([SIMULATED, *cameras]) + "\n")
+    (folder / "cameras_calibration.csv").write_text("\n".join([SIMULATED_HEADER, *cameras]) + "\n")
     for i in (1, 2, 3):
-        shutil.copy(video(5), folder / f"cam{i}i_s.avi")
+        shutil.copy(make_video(5), folder / f"cam{i}i_s.avi")
     (folder / "dron1_pos_25.csv").write_text(pose_lines(5, 0.0))
     (folder / "dron2_pos_25.csv").write_text(pose_lines(5, 1.0))
     return folder
 
 
 @pytest.fixture
-def real(tmp_path, video):
-    """Four cameras by serial number, two drones at 100 Hz, five frames."""
+def real_folder(tmp_path, make_video):
+    """A real sequence of four cameras named by serial number, two drones at 100 Hz, and five frames."""
     folder = tmp_path / "Real_Data" / "R99_D2"
     folder.mkdir(parents=True)
     cameras = [f"{name};-100;250.5;6000;1.9;0.1;0;1158.7;32;24;-0.1;0.02;0.001;-0.002" for name in SERIALS]
-    (folder / "cameras_calibration.csv").write_text("\n".join([REAL, *cameras]) + "\n")
+    (folder / "cameras_calibration.csv").write_text("\n".join([REAL_HEADER, *cameras]) + "\n")
     for name in SERIALS:
-        shutil.copy(video(5), folder / f"{name}.avi")
+        shutil.copy(make_video(5), folder / f"{name}.avi")
     t = np.arange(20)[:, None, None]
     position_m = np.tile([1.0, 2.0, 1.5], (20, 6, 1)) + 0.01 * t + 0.1 * np.arange(6)[None, :, None]
     labels = tuple(f"Dron{drone}:Dron{drone}{i}" for drone in (4, 7) for i in (1, 2, 3))
@@ -71,68 +73,68 @@ def real(tmp_path, video):
     return folder
 
 
-def change(path: Path, old: str, new: str) -> None:
+def replace_in_file(path: Path, old: str, new: str) -> None:
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
 
 
-def test_the_simulated_half(simulated):
-    sequence = dpjait.read_sequence(simulated)
-    assert sequence.name == "S99_D9"
-    assert sequence.rig.names == ("cam1i", "cam2i", "cam3i")
-    assert [sequence.videos[name].path.name for name in sequence.rig.names] == [
+def test_the_simulated_half(simulated_folder):
+    recording = dpjait.read_sequence(simulated_folder)
+    assert recording.name == "S99_D9"
+    assert recording.rig.names == ("cam1i", "cam2i", "cam3i")
+    assert [recording.videos[name].path.name for name in recording.rig.names] == [
         "cam1i_s.avi",
         "cam2i_s.avi",
         "cam3i_s.avi",
     ]
-    assert (sequence.fps, sequence.num_frames) == (25.0, 5)
-    cameras = sequence.rig.cameras
+    assert (recording.fps, recording.num_frames) == (25.0, 5)
+    cameras = recording.rig.cameras
     assert cameras.image_size_wh.tolist() == [[64, 48]] * 3
-    assert cameras.K[:, 0, 0].tolist() == [1157.3, 1158.3, 1159.3]  # of each camera's own
+    assert cameras.K[:, 0, 0].tolist() == [1157.3, 1158.3, 1159.3]  # each camera has its own focal length
     assert cameras.dist.shape == (3, 0)
-    truth = sequence.truth
-    assert truth.drones == ("dron1", "dron2")  # counted, whatever the folder's name says
+    truth = recording.truth
+    assert truth.drones == ("dron1", "dron2")  # the files count, not the name of the folder
     assert np.isnan(truth.position_m[0]).all()  # the placeholder
     assert np.isnan(truth.orientation_wxyz[0]).all()
     np.testing.assert_allclose(truth.position_m[1:, 1, 0], [1.1, 1.2, 1.3, 1.4], rtol=0, atol=1e-12)
     assert truth.orientation_wxyz[4, 0].tolist() == [0, 0, 0, 1]
     assert truth.time_s.tolist() == [0, 0.04, 0.08, 0.12, 0.16]
-    assert sequence.detections is None
-    assert sequence.usable().num_frames == 5
+    assert recording.detections is None
+    assert recording.usable().num_frames == 5
 
 
 @pytest.fixture
-def published(simulated, video):
-    """The simulated half as published: ten cameras called `cam1` in the calibration, files called `cam1i_s`."""
+def published_folder(simulated_folder, make_video):
+    """The simulated half as published: ten cameras, named `cam1` in the calibration and `cam1i_s` in file names."""
     names = [f"cam{i}" for i in range(1, 11)]
     cameras = [f"{name};{i};0.5;8;1.9;0;0;{1156.3 + i};32;24" for i, name in enumerate(names, start=1)]
-    (simulated / "cameras_calibration.csv").write_text("\n".join([SIMULATED, *cameras]) + "\n")
-    (simulated / "dl_data").mkdir()
+    (simulated_folder / "cameras_calibration.csv").write_text("\n".join([SIMULATED_HEADER, *cameras]) + "\n")
+    (simulated_folder / "dl_data").mkdir()
     for i, name in enumerate(names, start=1):
-        shutil.copy(video(5), simulated / f"{name}i_s.avi")
-        (simulated / "dl_data" / f"{name}i_s.csv").write_text(f"{i},10,20,30,40,25,40,0.66,,,,,,,\n")
-    return simulated
+        shutil.copy(make_video(5), simulated_folder / f"{name}i_s.avi")
+        (simulated_folder / "dl_data" / f"{name}i_s.csv").write_text(f"{i},10,20,30,40,25,40,0.66,,,,,,,\n")
+    return simulated_folder
 
 
-def test_the_simulated_half_as_published(published):
-    """Calibration `cam1`, files `cam1i_s`: `cam1i_s` belongs to `cam1`, `cam10i_s` does not."""
-    sequence = dpjait.read_sequence(published)
+def test_the_simulated_half_as_published(published_folder):
+    """The file `cam1i_s` belongs to the camera `cam1` of the calibration; the file `cam10i_s` does not."""
+    recording = dpjait.read_sequence(published_folder)
     names = tuple(f"cam{i}" for i in range(1, 11))
-    assert sequence.rig.names == names
-    assert {name: video.path.name for name, video in sequence.videos.items()} == {
+    assert recording.rig.names == names
+    assert {name: video.path.name for name, video in recording.videos.items()} == {
         name: f"{name}i_s.avi" for name in names
     }
     for i, name in enumerate(names, start=1):
-        assert dpjait.read_detections(sequence.detections[name]).frame.tolist() == [i]
+        assert dpjait.read_detections(recording.detections[name]).frame.tolist() == [i]
 
 
 @pytest.mark.parametrize("typed", ["cam1", "cam1i", "cam1i_s", "CAM1"])
-@pytest.mark.parametrize("half", ["simulated", "published"])
-def test_a_camera_by_any_of_its_names(half, typed, request):
-    sequence = dpjait.read_sequence(request.getfixturevalue(half))
-    kept = sequence.usable([typed, "cam3"])
-    assert kept.rig.names == (sequence.rig.names[0], sequence.rig.names[2])
+@pytest.mark.parametrize("half", ["simulated_folder", "published_folder"])
+def test_a_camera_is_selected_by_any_of_its_names(half, typed, request):
+    recording = dpjait.read_sequence(request.getfixturevalue(half))
+    kept = recording.usable([typed, "cam3"])
+    assert kept.rig.names == (recording.rig.names[0], recording.rig.names[2])
     assert list(kept.videos) == list(kept.rig.names)
     assert kept.rig.cameras.K[:, 0, 0].tolist() == [1157.3, 1159.3]
 
@@ -145,182 +147,192 @@ def test_a_camera_by_any_of_its_names(half, typed, request):
         (["cam1", "cam1i_s"], "each once, found cam1, cam1i_s"),
     ],
 )
-def test_unknown_and_repeated_camera_names(published, typed, found):
+def test_unknown_and_repeated_camera_names(published_folder, typed, found):
     with pytest.raises(SettingsError, match=f"cameras: expected some of cam1, cam2, .*{found}"):
-        dpjait.read_sequence(published).usable(typed)
+        dpjait.read_sequence(published_folder).usable(typed)
 
 
-def test_the_longest_name_and_the_exact_file(simulated, video):
+def test_a_file_belongs_to_the_camera_with_the_longest_matching_name(simulated_folder, make_video):
     """`left_back_s` belongs to `left_back`, not to `left`; `left.avi` comes before `left_debug.avi`."""
     names = ("left", "left_back")
     cameras = [f"{name};1;0.5;8;1.9;0;0;1156.3;32;24" for name in names]
-    (simulated / "cameras_calibration.csv").write_text("\n".join([SIMULATED, *cameras]) + "\n")
+    (simulated_folder / "cameras_calibration.csv").write_text("\n".join([SIMULATED_HEADER, *cameras]) + "\n")
     for name in ("left_back_s", "left", "left_debug"):
-        shutil.copy(video(5), simulated / f"{name}.avi")
-    videos = dpjait.read_sequence(simulated).videos
-    assert {name: one.path.name for name, one in videos.items()} == {
+        shutil.copy(make_video(5), simulated_folder / f"{name}.avi")
+    videos = dpjait.read_sequence(simulated_folder).videos
+    assert {name: video.path.name for name, video in videos.items()} == {
         "left": "left.avi",
         "left_back": "left_back_s.avi",
     }
 
 
-def test_the_real_half(real):
-    sequence = dpjait.read_sequence(real)
-    assert sequence.rig.names == SERIALS
-    cameras = sequence.rig.cameras
+def test_the_real_half(real_folder):
+    recording = dpjait.read_sequence(real_folder)
+    assert recording.rig.names == SERIALS
+    cameras = recording.rig.cameras
     np.testing.assert_allclose(cameras.T_cam_world[0, :3, 3], [-0.1, 0.2505, 6.0], rtol=0, atol=1e-12)
     assert cameras.dist[2].tolist() == [-0.1, 0.02, 0.001, -0.002]
-    truth = sequence.truth
+    truth = recording.truth
     assert truth.drones == ("dron4", "dron7")
-    # Frame 3 of the video is frame 12 of the recording; the middle one of three markers is the centroid. The file has
-    # float32 millimetres.
+    # Frame 3 of the video is frame 12 of the mocap recording; the second of three markers is the centroid. The file
+    # stores float32 millimetres.
     np.testing.assert_allclose(truth.position_m[3, 0], np.array([1.0, 2.0, 1.5]) + 0.12 + 0.1, atol=3e-7)
     assert truth.orientation_wxyz is None
     assert truth.seen.all()
 
 
-@pytest.mark.parametrize("half", ["simulated", "real"])
-def test_projection_equals_opencvs(half, request):
-    """Points project as with `cv2.projectPoints` and the numbers of the file: t is not the camera's centre."""
+@pytest.mark.parametrize("half", ["simulated_folder", "real_folder"])
+def test_projection_agrees_with_opencv(half, request):
+    """Projection agrees with `cv2.projectPoints` and the values of the file: t is not the camera's centre."""
     folder = request.getfixturevalue(half)
     rig = dpjait.read_sequence(folder).rig
     line = (folder / "cameras_calibration.csv").read_text().splitlines()[2].split(";")
     t, rvec = np.array(line[1:4], float), np.array(line[4:7], float)
     f, cx, cy = (float(value) for value in line[7:10])
     points_m = np.random.default_rng(0).uniform(-2, 2, (7, 3))
-    in_file_units = points_m * (1000 if half == "real" else 1)
+    in_file_units = points_m * (1000 if half == "real_folder" else 1)
     K = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]])
     expected, _ = cv2.projectPoints(in_file_units, rvec, t, K, np.array(line[10:], float))
     pixels, depth_m = project(rig.cameras[1], points_m)
     assert depth_m.min() > 0
-    # Both in double precision; pixels up to a few thousand.
+    # Both compute in double precision with pixels up to a few thousand.
     np.testing.assert_allclose(pixels, expected[:, 0], rtol=0, atol=1e-8)
 
 
-def test_the_folder_as_people_type_it(simulated, monkeypatch):
-    monkeypatch.chdir(simulated.parent)
-    for typed in ("S99_D9", "S99_D9/", "./S99_D9//", simulated):
+def test_forms_of_the_path_of_a_sequence(simulated_folder, monkeypatch):
+    monkeypatch.chdir(simulated_folder.parent)
+    for typed in ("S99_D9", "S99_D9/", "./S99_D9//", simulated_folder):
         assert dpjait.read_sequence(typed).name == "S99_D9"
-    monkeypatch.chdir(simulated)
+    monkeypatch.chdir(simulated_folder)
     assert dpjait.read_sequence(".").name == "S99_D9"
 
 
-def test_cameras_may_be_without_video(simulated, caplog):
-    (simulated / "cam2i_s.avi").unlink()
+def test_cameras_may_be_without_video(simulated_folder, caplog):
+    (simulated_folder / "cam2i_s.avi").unlink()
     with caplog.at_level("INFO"):
-        sequence = dpjait.read_sequence(simulated)
-    assert list(sequence.videos) == ["cam1i", "cam3i"]
-    assert sequence.rig.cameras.image_size_wh.tolist() == [[64, 48]] * 3
+        recording = dpjait.read_sequence(simulated_folder)
+    assert list(recording.videos) == ["cam1i", "cam3i"]
+    assert recording.rig.cameras.image_size_wh.tolist() == [[64, 48]] * 3
     assert "camera cam2i has no video: assuming 64 x 48 pixels like most cameras" in caplog.text
     with pytest.raises(InputError, match="found none for cam2i; pass --cameras cam1i,cam3i"):
-        sequence.usable()
-    assert sequence.usable(["cam3i", "cam1i"]).num_frames == 5
+        recording.usable()
+    assert recording.usable(["cam3i", "cam1i"]).num_frames == 5
 
 
-def test_videos_may_differ_in_length(simulated, video):
-    shutil.copy(video(7), simulated / "cam2i_s.avi")
-    sequence = dpjait.read_sequence(simulated)
-    assert sequence.num_frames == 5
-    assert sequence.truth.num_frames == 7
-    assert sequence.truth.seen[:, 0].tolist() == [False, True, True, True, True, False, False]
+def test_videos_may_differ_in_length(simulated_folder, make_video):
+    shutil.copy(make_video(7), simulated_folder / "cam2i_s.avi")
+    recording = dpjait.read_sequence(simulated_folder)
+    assert recording.num_frames == 5
+    assert recording.truth.num_frames == 7
+    assert recording.truth.seen[:, 0].tolist() == [False, True, True, True, True, False, False]
     with pytest.raises(InputError, match=r"cam2i_s\.avi: expected 5 frames as in cam1i_s\.avi, found 7"):
-        sequence.usable()
+        recording.usable()
 
 
-def test_a_video_of_another_size(simulated, video):
-    shutil.copy(video(5, (96, 64)), simulated / "cam1i_s.avi")
-    sequence = dpjait.read_sequence(simulated)
+def test_a_video_of_another_size(simulated_folder, make_video):
+    shutil.copy(make_video(5, (96, 64)), simulated_folder / "cam1i_s.avi")
+    recording = dpjait.read_sequence(simulated_folder)
     with pytest.raises(
         InputError, match=r"cam1i_s\.avi: expected 64 x 48 pixels as in cam2i_s\.avi, found 96"
     ):
-        sequence.usable()
+        recording.usable()
 
 
-def test_poses_beyond_the_videos_are_cut(simulated):
-    (simulated / "dron1_pos_25.csv").write_text(pose_lines(9, 0.0))
-    assert dpjait.read_sequence(simulated).truth.num_frames == 5
+def test_poses_after_the_end_of_the_videos_are_dropped(simulated_folder):
+    (simulated_folder / "dron1_pos_25.csv").write_text(pose_lines(9, 0.0))
+    assert dpjait.read_sequence(simulated_folder).truth.num_frames == 5
 
 
-def test_missing_poses_are_nan(simulated):
-    (simulated / "dron1_pos_25.csv").write_text(pose_lines(3, 0.0))
-    change(simulated / "dron2_pos_25.csv", "\n3;", "\n12;")
-    truth = dpjait.read_sequence(simulated).truth
+def test_missing_poses_are_nan(simulated_folder):
+    (simulated_folder / "dron1_pos_25.csv").write_text(pose_lines(3, 0.0))
+    replace_in_file(simulated_folder / "dron2_pos_25.csv", "\n3;", "\n12;")
+    truth = dpjait.read_sequence(simulated_folder).truth
     assert truth.seen[:, 0].tolist() == [False, True, True, False, False]
     assert truth.seen[:, 1].tolist() == [False, True, True, False, True]
 
 
-def test_ten_drones_are_in_the_order_of_their_numbers(simulated):
+def test_ten_drones_are_in_the_order_of_their_numbers(simulated_folder):
     for number in range(3, 11):
-        (simulated / f"drone{number}_pos_25.csv").write_text(pose_lines(5, number))  # spelt as others do
-    truth = dpjait.read_sequence(simulated).truth
+        (simulated_folder / f"drone{number}_pos_25.csv").write_text(
+            pose_lines(5, number)
+        )  # the other spelling, `drone`
+    truth = dpjait.read_sequence(simulated_folder).truth
     assert truth.drones == tuple(f"dron{number}" for number in range(1, 11))
     assert truth.position_m[1, 9, 0] == pytest.approx(10.1)
 
 
-def test_no_reference(simulated):
-    for path in simulated.glob("dron*.csv"):
+def test_no_reference(simulated_folder):
+    for path in simulated_folder.glob("dron*.csv"):
         path.unlink()
-    assert dpjait.read_sequence(simulated).truth is None
+    assert dpjait.read_sequence(simulated_folder).truth is None
 
 
-def test_detections_are_found_by_camera(simulated):
-    (simulated / "dl_data").mkdir()
-    (simulated / "dl_data" / "cam2i_s.csv").write_text("1,10,20,4,6,12,23,0.5\n")
-    detections = dpjait.read_sequence(simulated).detections
+def test_detections_are_assigned_to_cameras(simulated_folder):
+    (simulated_folder / "dl_data").mkdir()
+    (simulated_folder / "dl_data" / "cam2i_s.csv").write_text("1,10,20,4,6,12,23,0.5\n")
+    detections = dpjait.read_sequence(simulated_folder).detections
     assert list(detections) == ["cam2i"]
     assert dpjait.read_detections(detections["cam2i"]).xyxy.tolist() == [[10, 20, 14, 26]]
 
 
-def test_other_videos_are_left_alone(simulated, video, caplog):
-    shutil.copy(video(7), simulated / "dron1_fpv.mp4")
+def test_other_videos_are_ignored(simulated_folder, make_video, caplog):
+    shutil.copy(make_video(7), simulated_folder / "dron1_fpv.mp4")
     with caplog.at_level("INFO"):
-        assert dpjait.read_sequence(simulated).truth.num_frames == 5
+        assert dpjait.read_sequence(simulated_folder).truth.num_frames == 5
     assert "dron1_fpv.mp4: not used" in caplog.text
 
 
-def test_serial_numbers_with_a_prefix(real):
-    (real / f"{SERIALS[0]}.avi").rename(real / f"cam_{SERIALS[0]}.avi")
-    assert list(dpjait.read_sequence(real).videos) == list(SERIALS)
+def test_serial_numbers_with_a_prefix(real_folder):
+    (real_folder / f"{SERIALS[0]}.avi").rename(real_folder / f"cam_{SERIALS[0]}.avi")
+    assert list(dpjait.read_sequence(real_folder).videos) == list(SERIALS)
 
 
-def fails(folder, message):
+def assert_reading_fails(folder, message):
     with pytest.raises(InputError, match=message):
         dpjait.read_sequence(folder)
 
 
 def test_no_such_folder(tmp_path):
-    fails(tmp_path / "nix", "nix: expected the folder of a sequence, found nothing")
+    assert_reading_fails(tmp_path / "nix", "nix: expected the folder of a sequence, found nothing")
 
 
 def test_an_archive(tmp_path):
     (tmp_path / "S01.zip").write_bytes(b"PK")
-    fails(tmp_path / "S01.zip", r"S01\.zip: expected the folder of a sequence, found a file; unpack it first")
+    assert_reading_fails(
+        tmp_path / "S01.zip", r"S01\.zip: expected the folder of a sequence, found a file; unpack it first"
+    )
 
 
 def test_a_folder_that_is_not_a_sequence(tmp_path):
-    fails(
+    assert_reading_fails(
         tmp_path, "expected the file cameras_calibration.csv in it, found none; is it a folder of the DPJAIT"
     )
 
 
-def test_the_folder_above(simulated):
-    fails(simulated.parent, "cameras_calibration.csv in it, found none; did you mean .*/S99_D9")
+def test_the_parent_folder_of_a_sequence(simulated_folder):
+    assert_reading_fails(
+        simulated_folder.parent, "cameras_calibration.csv in it, found none; did you mean .*/S99_D9"
+    )
 
 
-def test_no_videos_at_all(simulated):
-    for path in simulated.glob("*.avi"):
+def test_no_videos_at_all(simulated_folder):
+    for path in simulated_folder.glob("*.avi"):
         path.unlink()
-    fails(simulated, r"S99_D9: expected videos named like the cameras, cam1i\.avi \.\.\., found no \.avi")
+    assert_reading_fails(
+        simulated_folder, r"S99_D9: expected videos named like the cameras, cam1i\.avi \.\.\., found no \.avi"
+    )
 
 
-def test_two_videos_of_one_camera(simulated, video):
-    shutil.copy(video(5), simulated / "cam1i.avi")
-    fails(simulated, r"cam1i_s\.avi: expected one such file per camera, found cam1i\.avi as well")
+def test_two_videos_of_one_camera(simulated_folder, make_video):
+    shutil.copy(make_video(5), simulated_folder / "cam1i.avi")
+    assert_reading_fails(
+        simulated_folder, r"cam1i_s\.avi: expected one such file per camera, found cam1i\.avi as well"
+    )
 
 
-def test_a_broken_video(simulated):
-    (simulated / "cam1i_s.avi").write_bytes(b"")
-    fails(simulated, r"cam1i_s\.avi: expected a video, found an empty file")
+def test_a_broken_video(simulated_folder):
+    (simulated_folder / "cam1i_s.avi").write_bytes(b"")
+    assert_reading_fails(simulated_folder, r"cam1i_s\.avi: expected a video, found an empty file")
 
 
 @pytest.mark.parametrize(
@@ -342,28 +354,28 @@ def test_a_broken_video(simulated):
         ("1158.3", "-1158.3", ", line 3, column focal_length: expected a focal length above 0"),
     ],
 )
-def test_an_unreadable_calibration(simulated, old, new, message):
-    path = simulated / "cameras_calibration.csv"
+def test_an_unreadable_calibration(simulated_folder, old, new, message):
+    path = simulated_folder / "cameras_calibration.csv"
     text = path.read_text()
     path.write_text(text.replace(old, new) if len(old) == 1 else text.replace(old, new, 1))
-    fails(simulated, rf"cameras_calibration\.csv{message}")
+    assert_reading_fails(simulated_folder, rf"cameras_calibration\.csv{message}")
 
 
-@pytest.mark.parametrize(("text", "found"), [("", "an empty file"), (f"{SIMULATED}\n", "none")])
-def test_an_empty_calibration(simulated, text, found):
-    (simulated / "cameras_calibration.csv").write_text(text)
-    fails(simulated, f"cameras_calibration.csv.*expected .*, found {found}")
+@pytest.mark.parametrize(("text", "found"), [("", "an empty file"), (f"{SIMULATED_HEADER}\n", "none")])
+def test_an_empty_calibration(simulated_folder, text, found):
+    (simulated_folder / "cameras_calibration.csv").write_text(text)
+    assert_reading_fails(simulated_folder, f"cameras_calibration.csv.*expected .*, found {found}")
 
 
-def test_too_many_coefficients(real):
-    change(real / "cameras_calibration.csv", "coeff_4", "coeff_4;coeff_5")
-    text = (real / "cameras_calibration.csv").read_text()
-    (real / "cameras_calibration.csv").write_text(text.replace("-0.002", "-0.002;0"))
-    fails(real, "expected 4 distortion coefficients, found 5")
+def test_too_many_coefficients(real_folder):
+    replace_in_file(real_folder / "cameras_calibration.csv", "coeff_4", "coeff_4;coeff_5")
+    text = (real_folder / "cameras_calibration.csv").read_text()
+    (real_folder / "cameras_calibration.csv").write_text(text.replace("-0.002", "-0.002;0"))
+    assert_reading_fails(real_folder, "expected 4 distortion coefficients, found 5")
 
 
 @pytest.mark.parametrize(
-    "spoil",
+    "change_text",
     [
         lambda text: "\ufeff" + text,
         lambda text: text.replace("\n", "\r\n"),
@@ -374,15 +386,15 @@ def test_too_many_coefficients(real):
     ],
     ids=["byte order mark", "Windows", "last separator", "blank lines", "spaces", "upper case"],
 )
-def test_harmless_differences(simulated, spoil):
-    before = dpjait.read_sequence(simulated)
+def test_harmless_differences_are_accepted(simulated_folder, change_text):
+    original = dpjait.read_sequence(simulated_folder)
     for name in ("cameras_calibration.csv", "dron1_pos_25.csv"):
-        path = simulated / name
-        path.write_bytes(spoil(path.read_text()).encode())
-    after = dpjait.read_sequence(simulated)
-    assert after.rig.names == before.rig.names
-    np.testing.assert_array_equal(after.rig.cameras.T_cam_world, before.rig.cameras.T_cam_world)
-    np.testing.assert_array_equal(after.truth.position_m, before.truth.position_m)
+        path = simulated_folder / name
+        path.write_bytes(change_text(path.read_text()).encode())
+    changed = dpjait.read_sequence(simulated_folder)
+    assert changed.rig.names == original.rig.names
+    np.testing.assert_array_equal(changed.rig.cameras.T_cam_world, original.rig.cameras.T_cam_world)
+    np.testing.assert_array_equal(changed.truth.position_m, original.truth.position_m)
 
 
 @pytest.mark.parametrize(
@@ -398,33 +410,37 @@ def test_harmless_differences(simulated, spoil):
         ("pos_x", "x", r"csv: expected a column pos_x, found only id, x\[m\]"),
     ],
 )
-def test_a_broken_reference(simulated, old, new, message):
-    change(simulated / "dron1_pos_25.csv", old, new)
-    fails(simulated, f"dron1_pos_25.*{message}")
+def test_a_broken_reference(simulated_folder, old, new, message):
+    replace_in_file(simulated_folder / "dron1_pos_25.csv", old, new)
+    assert_reading_fails(simulated_folder, f"dron1_pos_25.*{message}")
 
 
-def test_a_reference_at_another_rate(simulated):
-    (simulated / "dron2_pos_25.csv").rename(simulated / "dron2_pos_100.csv")
-    fails(simulated, r"dron2_pos_100\.csv: expected poses at the 25 Hz of the video, found 100 Hz")
+def test_a_reference_at_another_rate(simulated_folder):
+    (simulated_folder / "dron2_pos_25.csv").rename(simulated_folder / "dron2_pos_100.csv")
+    assert_reading_fails(
+        simulated_folder, r"dron2_pos_100\.csv: expected poses at the 25 Hz of the video, found 100 Hz"
+    )
 
 
-def test_a_drone_twice(simulated):
-    shutil.copy(simulated / "dron1_pos_25.csv", simulated / "drone1_pos_25.csv")
-    fails(simulated, r"drone1_pos_25\.csv: expected one file per drone, found dron1_pos_25\.csv as well")
+def test_two_files_of_one_drone(simulated_folder):
+    shutil.copy(simulated_folder / "dron1_pos_25.csv", simulated_folder / "drone1_pos_25.csv")
+    assert_reading_fails(
+        simulated_folder, r"drone1_pos_25\.csv: expected one file per drone, found dron1_pos_25\.csv as well"
+    )
 
 
-def test_two_recordings(real):
-    shutil.copy(real / "R99.c3d", real / "R98.c3d")
-    fails(real, r"R99_D2: expected one \.c3d file, found R98\.c3d, R99\.c3d")
+def test_two_recordings(real_folder):
+    shutil.copy(real_folder / "R99.c3d", real_folder / "R98.c3d")
+    assert_reading_fails(real_folder, r"R99_D2: expected one \.c3d file, found R98\.c3d, R99\.c3d")
 
 
-def test_a_reference_that_is_not_c3d(real):
-    (real / "R99.c3d").write_text("hello " * 400)
-    fails(real, r"R99\.c3d: expected a C3D file, found one that ezc3d cannot read")
+def test_a_reference_that_is_not_c3d(real_folder):
+    (real_folder / "R99.c3d").write_text("hello " * 400)
+    assert_reading_fails(real_folder, r"R99\.c3d: expected a C3D file, found one that ezc3d cannot read")
 
 
 @pytest.mark.parametrize(
-    ("names", "known"),
+    ("names", "recognised"),
     [
         ("q_w;q_x;q_y;q_z", True),
         ("qw;qx;qy;qz", True),
@@ -436,18 +452,18 @@ def test_a_reference_that_is_not_c3d(real):
         ("a;b;c;d", False),
     ],
 )
-def test_names_of_the_quaternion(simulated, names, known):
-    for path in simulated.glob("dron*.csv"):
-        change(path, "q_w;q_x;q_y;q_z", names)
-    orientation_wxyz = dpjait.read_sequence(simulated).truth.orientation_wxyz
-    if known:
+def test_column_names_of_the_quaternion(simulated_folder, names, recognised):
+    for path in simulated_folder.glob("dron*.csv"):
+        replace_in_file(path, "q_w;q_x;q_y;q_z", names)
+    orientation_wxyz = dpjait.read_sequence(simulated_folder).truth.orientation_wxyz
+    if recognised:
         assert orientation_wxyz[1, 0].tolist() == [0, 0, 0, 1]
     else:
         assert orientation_wxyz is None
 
 
-def test_quaternion_with_the_scalar_last(simulated):
+def test_quaternion_with_the_scalar_last(simulated_folder):
     """The names of the columns decide, not their order."""
-    for path in simulated.glob("dron*.csv"):
-        change(path, "q_w;q_x;q_y;q_z", "q_x;q_y;q_z;q_w")
-    assert dpjait.read_sequence(simulated).truth.orientation_wxyz[1, 0].tolist() == [1, 0, 0, 0]
+    for path in simulated_folder.glob("dron*.csv"):
+        replace_in_file(path, "q_w;q_x;q_y;q_z", "q_x;q_y;q_z;q_w")
+    assert dpjait.read_sequence(simulated_folder).truth.orientation_wxyz[1, 0].tolist() == [1, 0, 0, 0]

@@ -1,4 +1,4 @@
-"""Videos, poses and intrinsics of cameras on drones: round trips, and damage in many ways."""
+"""Videos, poses and intrinsics of on-board cameras: round trips, and damaged files."""
 
 import logging
 
@@ -30,10 +30,10 @@ def write_video(path, size_wh=(WIDTH, HEIGHT), num_frames=FRAMES):
 
 @pytest.fixture
 def folder(tmp_path):
-    """Two cameras on walls, and two drones with a camera each."""
+    """A sequence of two wall cameras and two drones, each with an on-board camera."""
     R, t_m = look_at((4.0, 3.0, 2.5), (0.0, 0.0, 1.0))
-    one = make_camera(R=R, t_m=t_m, K=np.diag([80.0, 80.0, 1.0]), image_size_wh=(WIDTH, HEIGHT))
-    dpjait.write_calibration(tmp_path / dpjait.CALIBRATION, make_rig({"cam1i": one, "cam2i": one}))
+    camera = make_camera(R=R, t_m=t_m, K=np.diag([80.0, 80.0, 1.0]), image_size_wh=(WIDTH, HEIGHT))
+    dpjait.write_calibration(tmp_path / dpjait.CALIBRATION, make_rig({"cam1i": camera, "cam2i": camera}))
     for name in ("cam1i_s.avi", "cam2i_s.avi", "dron1_cam_s.avi", "dron2_cam_s.avi"):
         write_video(tmp_path / name)
     for number in (1, 2):
@@ -47,24 +47,24 @@ def folder(tmp_path):
     return tmp_path
 
 
-def change(path, old, new):
+def replace_in_file(path, old, new):
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
 
 
-def test_what_is_written_is_read_back(folder):
+def test_written_onboard_files_are_read_back(folder):
     found = dpjait.read_onboard(folder)
     assert list(found) == ["dron1", "dron2"]
-    one, two = found.values()
-    assert (one.video.path.name, one.video.num_frames) == ("dron1_cam_s.avi", FRAMES)
-    np.testing.assert_array_equal(one.K, K)
-    np.testing.assert_array_equal(two.K - one.K, np.diag([1.0, 1.0, 0.0]))
-    assert np.isnan(one.position_m[0]).all(), "the first row is a placeholder"
-    assert np.isnan(one.orientation_wxyz[0]).all()
-    np.testing.assert_array_equal(one.position_m[1:], np.add(POSITION_M, [0.1, 1.0, 0.0])[1:])
+    first, second = found.values()
+    assert (first.video.path.name, first.video.num_frames) == ("dron1_cam_s.avi", FRAMES)
+    np.testing.assert_array_equal(first.K, K)
+    np.testing.assert_array_equal(second.K - first.K, np.diag([1.0, 1.0, 0.0]))
+    assert np.isnan(first.position_m[0]).all(), "the first row is a placeholder"
+    assert np.isnan(first.orientation_wxyz[0]).all()
+    np.testing.assert_array_equal(first.position_m[1:], np.add(POSITION_M, [0.1, 1.0, 0.0])[1:])
     # The reader normalises quaternions.
-    np.testing.assert_allclose(two.orientation_wxyz[1:], ORIENTATION_WXYZ[1:], atol=1e-15)
+    np.testing.assert_allclose(second.orientation_wxyz[1:], ORIENTATION_WXYZ[1:], atol=1e-15)
 
 
 @given(
@@ -74,7 +74,7 @@ def test_what_is_written_is_read_back(folder):
         max_size=4,
     )
 )
-def test_any_intrinsics_come_back(tmp_path_factory, cameras):
+def test_written_intrinsics_are_read_back(tmp_path_factory, cameras):
     path = tmp_path_factory.getbasetemp() / dpjait.ONBOARD_CALIBRATION
     intrinsics = {
         f"dron{number}": (np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), (width, height))
@@ -88,14 +88,14 @@ def test_any_intrinsics_come_back(tmp_path_factory, cameras):
         assert again[name][1] == size_wh
 
 
-def test_a_sequence_has_them_beside_its_own_cameras(folder):
-    sequence = dpjait.read_sequence(folder)
-    assert list(sequence.videos) == ["cam1i", "cam2i"]
-    assert sequence.truth.drones == ("dron1", "dron2")
-    # The reference has the poses of the drones, not of their cameras, which are 0.1 m ahead.
-    np.testing.assert_array_equal(sequence.truth.position_m[1:, 0], np.add(POSITION_M, [0.0, 1.0, 0.0])[1:])
-    assert list(sequence.onboard) == ["dron1", "dron2"]
-    assert sequence.usable(num_frames=3).onboard == sequence.onboard
+def test_a_recording_has_onboard_cameras_beside_its_fixed_cameras(folder):
+    recording = dpjait.read_sequence(folder)
+    assert list(recording.videos) == ["cam1i", "cam2i"]
+    assert recording.truth.drones == ("dron1", "dron2")
+    # The reference holds the poses of the drones, not of the on-board cameras 0.1 m in front.
+    np.testing.assert_array_equal(recording.truth.position_m[1:, 0], np.add(POSITION_M, [0.0, 1.0, 0.0])[1:])
+    assert list(recording.onboard) == ["dron1", "dron2"]
+    assert recording.usable(num_frames=3).onboard == recording.onboard
 
 
 def test_a_sequence_without_onboard_videos(folder):
@@ -103,33 +103,33 @@ def test_a_sequence_without_onboard_videos(folder):
         path.unlink()
     # Intrinsics without videos are ignored.
     assert dpjait.read_onboard(folder) == {}
-    sequence = dpjait.read_sequence(folder)
-    assert sequence.onboard is None
-    assert describe_recording(sequence)["onboard"] is None
+    recording = dpjait.read_sequence(folder)
+    assert recording.onboard is None
+    assert describe_recording(recording)["onboard"] is None
 
 
 @pytest.mark.parametrize("missing", ["dron1_cam_25.csv", dpjait.ONBOARD_CALIBRATION])
 def test_a_video_alone_is_enough(folder, missing):
     (folder / missing).unlink()
-    one = dpjait.read_onboard(folder)["dron1"]
-    assert (one.K is None) == (missing == dpjait.ONBOARD_CALIBRATION)
-    assert np.isnan(one.orientation_wxyz).all() == (missing == "dron1_cam_25.csv")
-    assert one.position_m.shape == (FRAMES, 3)
+    onboard = dpjait.read_onboard(folder)["dron1"]
+    assert (onboard.K is None) == (missing == dpjait.ONBOARD_CALIBRATION)
+    assert np.isnan(onboard.orientation_wxyz).all() == (missing == "dron1_cam_25.csv")
+    assert onboard.position_m.shape == (FRAMES, 3)
 
 
-@pytest.mark.parametrize(("rows", "known"), [(3, 2), (9, 4)])
-def test_poses_may_be_fewer_or_more_than_frames(folder, rows, known):
+@pytest.mark.parametrize(("rows", "num_known"), [(3, 2), (9, 4)])
+def test_poses_may_be_fewer_or_more_than_frames(folder, rows, num_known):
     turns = np.tile([1.0, 0.0, 0.0, 0.0], (rows, 1))
     dpjait.write_poses(folder / dpjait.onboard_pose_file(1), np.ones((rows, 3)), turns)
-    one = dpjait.read_onboard(folder)["dron1"]
-    assert one.position_m.shape == (FRAMES, 3)
-    assert np.isfinite(one.position_m).all(axis=1).sum() == known
+    onboard = dpjait.read_onboard(folder)["dron1"]
+    assert onboard.position_m.shape == (FRAMES, 3)
+    assert np.isfinite(onboard.position_m).all(axis=1).sum() == num_known
 
 
-@pytest.mark.parametrize("other", ["drone1_cam.avi", "Dron_1_cam_s.AVI", "dron1_cam.mp4"])
-def test_names_that_mean_the_same(folder, other):
-    (folder / "dron1_cam_s.avi").rename(folder / other)
-    assert dpjait.read_onboard(folder)["dron1"].video.path.name == other
+@pytest.mark.parametrize("file_name", ["drone1_cam.avi", "Dron_1_cam_s.AVI", "dron1_cam.mp4"])
+def test_other_spellings_of_the_file_name_are_accepted(folder, file_name):
+    (folder / "dron1_cam_s.avi").rename(folder / file_name)
+    assert dpjait.read_onboard(folder)["dron1"].video.path.name == file_name
     assert list(dpjait.read_sequence(folder).videos) == ["cam1i", "cam2i"]
 
 
@@ -156,8 +156,8 @@ def test_poses_at_another_rate(folder):
         dpjait.read_onboard(folder)
 
 
-def test_a_pose_that_is_no_number(folder):
-    change(folder / "dron1_cam_25.csv", "1.5", "one and a half")
+def test_a_pose_that_is_not_a_number(folder):
+    replace_in_file(folder / "dron1_cam_25.csv", "1.5", "one and a half")
     with pytest.raises(InputError, match=r"dron1_cam_25\.csv, line 3, column pos_z\[m\]: expected a number"):
         dpjait.read_onboard(folder)
 
@@ -178,19 +178,19 @@ def test_a_pose_that_is_no_number(folder):
     ],
 )
 def test_broken_intrinsics(folder, old, new, message):
-    change(folder / dpjait.ONBOARD_CALIBRATION, old, new)
+    replace_in_file(folder / dpjait.ONBOARD_CALIBRATION, old, new)
     with pytest.raises(InputError, match=rf"drone_cameras_calibration\.csv.*{message}"):
         dpjait.read_onboard(folder)
 
 
 def test_a_sequence_is_read_without_broken_onboard_files(folder, caplog):
-    """Tracking needs only the cameras on the walls."""
-    change(folder / "dron1_cam_25.csv", "1.5", "?")
+    """Tracking needs only the wall cameras."""
+    replace_in_file(folder / "dron1_cam_25.csv", "1.5", "?")
     with caplog.at_level(logging.WARNING):
-        sequence = dpjait.read_sequence(folder)
-    assert sequence.onboard is None
+        recording = dpjait.read_sequence(folder)
+    assert recording.onboard is None
     assert "dron1_cam_25.csv, line 3" in caplog.text
-    assert sequence.truth is not None
+    assert recording.truth is not None
 
 
 @pytest.mark.parametrize("intrinsics", [{}, {"dron1": (K + np.eye(3, k=1), (WIDTH, HEIGHT))}])

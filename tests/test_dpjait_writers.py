@@ -1,4 +1,4 @@
-"""Round trips through the writers and readers of the published layout: rigs, poses, markers."""
+"""Round trips through the writers and readers of the dataset's file layout: rigs, poses, markers."""
 
 import csv
 from pathlib import Path
@@ -15,7 +15,7 @@ from psotrack.geometry import Rig, make_camera, make_rig, project
 
 finite = st.floats(-50, 50)
 triples = st.tuples(finite, finite, finite)
-#: All rotations, and those near half a turn, where the Rodrigues vector is delicate.
+#: All rotations, and rotations near half a turn, where the Rodrigues vector is nearly ambiguous.
 rotations = st.one_of(
     st.tuples(*[st.floats(-4, 4)] * 3).map(Rotation.from_rotvec),
     st.tuples(*[st.floats(-1e-9, 1e-9)] * 3).map(
@@ -25,7 +25,7 @@ rotations = st.one_of(
 SIZE_WH = (1920, 1080)
 
 
-def rig_of(poses, dist=(), focal_length_px=1156.3) -> Rig:
+def make_test_rig(poses, dist=(), focal_length_px=1156.3) -> Rig:
     cameras = {}
     for index, (rotation, t_m) in enumerate(poses):
         f = focal_length_px + 10 * index
@@ -48,13 +48,13 @@ def read_back(path: Path, rig: Rig) -> Rig:
     dist=st.one_of(st.just(()), st.tuples(*[st.floats(-0.5, 0.5)] * 4)),
     unit=st.sampled_from(["m", "mm"]),
 )
-def test_a_rig_comes_back(tmp_path_factory, poses, dist, unit):
+def test_a_written_rig_is_read_back(tmp_path_factory, poses, dist, unit):
     path = tmp_path_factory.getbasetemp() / "cameras_calibration.csv"
-    rig = rig_of(poses, dist)
+    rig = make_test_rig(poses, dist)
     dpjait.write_calibration(path, rig, unit)
     again = read_back(path, rig)
     assert again.names == rig.names
-    # Rotations are converted to vectors and back, lengths to millimetres and back: roundings of doubles up to 50.
+    # Rotations are converted to vectors and back, lengths to millimetres and back, which rounds doubles up to 50.
     np.testing.assert_allclose(again.cameras.T_cam_world, rig.cameras.T_cam_world, rtol=0, atol=1e-9)
     np.testing.assert_array_equal(again.cameras.K, rig.cameras.K)
     coefficients = again.cameras.dist.shape[-1]
@@ -63,27 +63,27 @@ def test_a_rig_comes_back(tmp_path_factory, poses, dist, unit):
 
 
 @given(poses=st.lists(st.tuples(rotations, triples), min_size=1, max_size=3), point=triples)
-def test_a_point_projects_as_before(tmp_path_factory, poses, point):
+def test_a_rig_that_is_read_back_projects_to_the_same_pixels(tmp_path_factory, poses, point):
     path = tmp_path_factory.getbasetemp() / "cameras_calibration.csv"
-    rig = rig_of(poses, (-0.1, 0.02, 0.001, -0.002))
+    rig = make_test_rig(poses, (-0.1, 0.02, 0.001, -0.002))
     dpjait.write_calibration(path, rig, "mm")
     points_m = np.tile(point, (len(rig), 1))
-    before, depth_m = project(rig.cameras, points_m)
-    after, _ = project(read_back(path, rig).cameras, points_m)
-    # Points far outside of the image are left out: the lens polynomial gives them useless pixels.
-    normal = (depth_m > 0.5) & (np.abs(before) < 1e4).all(axis=-1)
-    np.testing.assert_allclose(after[normal], before[normal], rtol=0, atol=1e-6)
+    pixels_before, depth_m = project(rig.cameras, points_m)
+    pixels_after, _ = project(read_back(path, rig).cameras, points_m)
+    # Points far outside the image are left out, because the lens polynomial is not valid there.
+    compared = (depth_m > 0.5) & (np.abs(pixels_before) < 1e4).all(axis=-1)
+    np.testing.assert_allclose(pixels_after[compared], pixels_before[compared], rtol=0, atol=1e-6)
 
 
 def test_the_header_is_the_published_one(tmp_path):
     path = tmp_path / "cameras_calibration.csv"
     poses = [(Rotation.identity(), (1.0, 2.0, 3.0))]
-    dpjait.write_calibration(path, rig_of(poses))
+    dpjait.write_calibration(path, make_test_rig(poses))
     assert path.read_text().splitlines() == [
         "cam_name;cam_x[m];cam_y[m];cam_z[m];cam_or_x[rad];cam_or_y[rad];cam_or_z[rad];focal_length;cx;cy",
         "cam1i;1.0;2.0;3.0;0.0;0.0;0.0;1156.3;960.25;540.0",
     ]
-    dpjait.write_calibration(path, rig_of(poses, (0.1, 0.0, 0.0, 0.0)), "mm")
+    dpjait.write_calibration(path, make_test_rig(poses, (0.1, 0.0, 0.0, 0.0)), "mm")
     assert path.read_text().splitlines() == [
         "cam_name;cam_x[mm];cam_y[mm];cam_z[mm];cam_or_x[rad];cam_or_y[rad];cam_or_z[rad];focal_length;cx;cy"
         ";coeff_1;coeff_2;coeff_3;coeff_4",
@@ -91,27 +91,29 @@ def test_the_header_is_the_published_one(tmp_path):
     ]
 
 
-def test_rigs_that_the_layout_cannot_hold(tmp_path):
+def test_rigs_that_the_file_format_cannot_hold_are_refused(tmp_path):
     path = tmp_path / "cameras_calibration.csv"
     pose = [(Rotation.identity(), (0.0, 0.0, 5.0))]
     with pytest.raises(SettingsError, match="distortion by k1, k2, p1, p2 alone"):
-        dpjait.write_calibration(path, rig_of(pose, (0.1, 0.0, 0.0, 0.0, 0.01)))
-    dpjait.write_calibration(path, rig_of(pose, (0.1, 0.0, 0.0, 0.0, 0.0)))  # a fifth of zero can be left out
+        dpjait.write_calibration(path, make_test_rig(pose, (0.1, 0.0, 0.0, 0.0, 0.01)))
+    dpjait.write_calibration(
+        path, make_test_rig(pose, (0.1, 0.0, 0.0, 0.0, 0.0))
+    )  # a fifth coefficient of zero can be left out
     K = np.array([[1000, 0, 960], [0, 1001, 540], [0, 0, 1.0]])
-    two = make_rig({"a": make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=SIZE_WH)})
+    two_focal_lengths = make_rig({"a": make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=SIZE_WH)})
     with pytest.raises(SettingsError, match="one focal length per camera and no skew"):
-        dpjait.write_calibration(path, two)
+        dpjait.write_calibration(path, two_focal_lengths)
 
 
 def test_a_failed_write_leaves_the_file(tmp_path):
     path = tmp_path / "file" / "cameras_calibration.csv"
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cameras_calibration"):
-        dpjait.write_calibration(path, rig_of([(Rotation.identity(), (0.0, 0.0, 5.0))]))
+        dpjait.write_calibration(path, make_test_rig([(Rotation.identity(), (0.0, 0.0, 5.0))]))
 
 
 @given(poses=st.lists(st.tuples(triples, rotations), min_size=2, max_size=9))
-def test_poses_come_back(tmp_path_factory, poses):
+def test_written_poses_are_read_back(tmp_path_factory, poses):
     path = tmp_path_factory.getbasetemp() / dpjait.pose_file(1)
     position_m = np.array([position for position, _ in poses])
     rotation = Rotation.concatenate([rotation for _, rotation in poses])
@@ -123,12 +125,12 @@ def test_poses_come_back(tmp_path_factory, poses):
     again = Rotation.from_quat(orientation_again_wxyz[1:], scalar_first=True)
     # The reader normalises the quaternion, which rounds it.
     assert (again * rotation[1:].inv()).magnitude().max() < 1e-12
-    # The Euler angles of the file are the same rotation: R = Rz Ry Rx.
+    # The Euler angles in the file are the same rotation: R = Rz Ry Rx.
     with path.open() as file:
         rows = list(csv.DictReader(file, delimiter=";"))[1:]
     angles_rad = np.array([[float(row[f"rot_{axis}[rad]"]) for axis in "xyz"] for row in rows])
     Rx, Ry, Rz = (Rotation.from_rotvec(np.eye(3)[axis] * angles_rad[:, axis : axis + 1]) for axis in range(3))
-    # Near gimbal lock, angles lose half of their digits: 1e-7 rad is 0.02 seconds of arc.
+    # Near gimbal lock, Euler angles lose half of their digits: the error is up to 1e-7 rad.
     assert ((Rz * Ry * Rx) * rotation[1:].inv()).magnitude().max() < 1e-6
 
 
@@ -169,7 +171,7 @@ def test_a_first_row_with_a_pose_is_a_pose(tmp_path):
         st.integers(0, 999), st.lists(triples, min_size=4, max_size=4).map(np.array), min_size=1, max_size=5
     )
 )
-def test_marker_corners_come_back(tmp_path_factory, corners):
+def test_written_marker_corners_are_read_back(tmp_path_factory, corners):
     path = tmp_path_factory.getbasetemp() / dpjait.MARKER_CORNERS
     dpjait.write_marker_corners(path, corners)
     again = dpjait.read_marker_corners(path)

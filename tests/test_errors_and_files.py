@@ -1,4 +1,4 @@
-"""Error messages, files that are written completely or not at all, and progress bars."""
+"""Error messages, atomic writing of files and folders, digests, and progress bars."""
 
 import errno
 import functools
@@ -51,11 +51,11 @@ def test_a_message_has_four_parts():
     )
 
 
-@pytest.mark.parametrize("kind", [InputError, SettingsError, OutputError])
-def test_errors_can_be_pickled(kind):
-    error = kind("here", expected="this", found="that", remedy="do so")
+@pytest.mark.parametrize("error_class", [InputError, SettingsError, OutputError])
+def test_errors_can_be_pickled(error_class):
+    error = error_class("here", expected="this", found="that", remedy="do so")
     copy = pickle.loads(pickle.dumps(error))
-    assert type(copy) is kind
+    assert type(copy) is error_class
     assert str(copy) == str(error)
     assert isinstance(copy, PsotrackError)
 
@@ -70,13 +70,16 @@ def test_check_positive_accepts():
     check_positive("fps", 1e-9)
 
 
-def names(folder):
+def file_names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".avi", ""])
 def test_atomic_write(tmp_path, suffix):
-    """The file gets its name when it is complete; the temporary file has the suffix, which writers need."""
+    """The file appears under its name when it is complete.
+
+    The temporary file keeps the suffix, because writers choose the file format by the suffix.
+    """
     path = tmp_path / "new" / f"out{suffix}"
     with atomic_write(path) as temporary:
         assert temporary.suffix == suffix or not suffix
@@ -84,34 +87,34 @@ def test_atomic_write(tmp_path, suffix):
         temporary.write_text("whole")
         assert not path.exists()
     assert path.read_text() == "whole"
-    assert names(path.parent) == [path.name]
+    assert file_names(path.parent) == [path.name]
 
 
-def fail_half_way(path, fault):
+def fail_half_way(path, error):
     with atomic_write(path) as temporary:
         temporary.write_text("half")
-        raise fault
+        raise error
 
 
-@pytest.mark.parametrize("fault", [ValueError("no"), KeyboardInterrupt(), SystemExit(1)])
-def test_an_old_file_survives_a_failure(tmp_path, fault):
+@pytest.mark.parametrize("error", [ValueError("no"), KeyboardInterrupt(), SystemExit(1)])
+def test_an_old_file_survives_a_failure(tmp_path, error):
     path = tmp_path / "out.csv"
     path.write_text("before")
-    with pytest.raises(type(fault)):
-        fail_half_way(path, fault)
+    with pytest.raises(type(error)):
+        fail_half_way(path, error)
     assert path.read_text() == "before"
-    assert names(tmp_path) == ["out.csv"]
+    assert file_names(tmp_path) == ["out.csv"]
 
 
 def test_a_full_disk(tmp_path):
     path = tmp_path / "out.csv"
     path.write_text("before")
     message = r"out\.csv: expected a path that can be written, found No space left .* unchanged"
-    with pytest.raises(OutputError, match=message) as caught:
+    with pytest.raises(OutputError, match=message) as error_info:
         fail_half_way(path, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
-    assert caught.value.__cause__.errno == errno.ENOSPC
+    assert error_info.value.__cause__.errno == errno.ENOSPC
     assert path.read_text() == "before"
-    assert names(tmp_path) == ["out.csv"]
+    assert file_names(tmp_path) == ["out.csv"]
 
 
 def test_a_folder_that_cannot_be_created(tmp_path):
@@ -139,9 +142,9 @@ def test_a_folder_replaces_a_folder(tmp_path):
     with atomic_write(path) as temporary:
         temporary.mkdir()
         (temporary / "new").write_text("new")
-        assert names(path) == ["old"]
-    assert names(path) == ["new"]
-    assert names(tmp_path) == ["sequence"]
+        assert file_names(path) == ["old"]
+    assert file_names(path) == ["new"]
+    assert file_names(tmp_path) == ["sequence"]
 
 
 def fail_half_way_in_a_folder(path):
@@ -151,14 +154,14 @@ def fail_half_way_in_a_folder(path):
         raise KeyboardInterrupt
 
 
-def test_a_folder_that_fails_leaves_the_old_one(tmp_path):
+def test_a_failed_write_of_a_folder_leaves_the_old_folder(tmp_path):
     path = tmp_path / "sequence"
     path.mkdir()
     (path / "old").write_text("old")
     with pytest.raises(KeyboardInterrupt):
         fail_half_way_in_a_folder(path)
-    assert names(path) == ["old"]
-    assert names(tmp_path) == ["sequence"]
+    assert file_names(path) == ["old"]
+    assert file_names(tmp_path) == ["sequence"]
 
 
 def test_a_block_that_writes_nothing_keeps_the_old_folder(tmp_path):
@@ -167,8 +170,8 @@ def test_a_block_that_writes_nothing_keeps_the_old_folder(tmp_path):
     (path / "old").write_text("old")
     with pytest.raises(OutputError), atomic_write(path):
         pass
-    assert names(path) == ["old"]
-    assert names(tmp_path) == ["sequence"]
+    assert file_names(path) == ["old"]
+    assert file_names(tmp_path) == ["sequence"]
 
 
 def test_two_writers_at_once(tmp_path):
@@ -179,7 +182,7 @@ def test_two_writers_at_once(tmp_path):
         first.write_text("first")
         second.write_text("second")
     assert path.read_text() == "first"
-    assert names(tmp_path) == ["out.csv"]
+    assert file_names(tmp_path) == ["out.csv"]
 
 
 def test_refuse_to_overwrite(tmp_path):
@@ -205,7 +208,7 @@ def test_progress_is_quiet_where_there_is_no_terminal(report, capfd):
 
 
 def test_a_file_never_replaces_a_folder(tmp_path):
-    """Otherwise a user who names a folder with --force would lose its content."""
+    """Otherwise a user who passes --force and the path of a folder would lose the folder's content."""
     folder = tmp_path / "frames.csv"
     folder.mkdir()
     (folder / "mine.png").write_bytes(b"mine")
@@ -225,7 +228,7 @@ def test_a_file_never_replaces_a_folder(tmp_path):
         ("sha256", hashlib.sha256),
     ],
 )
-def test_digest_of_a_file(tmp_path, algorithm, new):
+def test_digest_file(tmp_path, algorithm, new):
     path = tmp_path / "a"
     path.write_bytes(bytes(range(256)) * 4096)
     assert digest_file(path, algorithm=algorithm) == new(path.read_bytes()).hexdigest()
@@ -233,13 +236,13 @@ def test_digest_of_a_file(tmp_path, algorithm, new):
         digest_file(tmp_path / "b", expected="a readable video")
 
 
-def test_digest_of_a_record_does_not_depend_on_the_order_of_its_keys():
+def test_digest_record_ignores_the_order_of_the_keys():
     assert digest_record({"a": 1, "b": [2.5]}) == digest_record({"b": [2.5], "a": 1})
     assert digest_record({"a": 1}) != digest_record({"a": 2})
     assert len(digest_record({})) == 40
 
 
-def test_paths_may_be_text(tmp_path):
+def test_paths_may_be_strings(tmp_path):
     """Every reader and writer of files takes `str` as well as `Path`; the annotations are checked at each call."""
 
     def path(name):

@@ -1,4 +1,4 @@
-"""Foreground of scenes with known shapes, and comparisons with NumPy and SciPy."""
+"""Foreground of drawn scenes with known shapes, and comparisons with NumPy and SciPy."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ HEIGHT, WIDTH = 120, 160
 RADIUS_PX = 9.0
 
 
-def _scene(rng: np.random.Generator) -> np.ndarray:
-    """Image of a room: smooth texture without edges."""
+def _make_background(rng: np.random.Generator) -> np.ndarray:
+    """Make the image of an empty room: a smooth texture without edges."""
     coarse = rng.integers(90, 190, (HEIGHT // 20, WIDTH // 20, 3)).astype(np.float32)
     return cv2.resize(coarse, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
 
 
-def _frame(
-    scene: np.ndarray,
+def _draw_frame(
+    background: np.ndarray,
     rng: np.random.Generator,
     *centres_xy: tuple[float, float],
     radius_px: float = RADIUS_PX,
 ) -> np.ndarray:
-    """The room with dark discs, antialiased by their distance to the edge, and noise of 2 grey levels."""
+    """Draw dark discs with antialiased edges on the background, and add noise of 2 grey levels."""
     y, x = np.mgrid[:HEIGHT, :WIDTH]
-    image = scene.copy()
+    image = background.copy()
     for centre_x, centre_y in centres_xy:
         inside = np.clip(radius_px - np.hypot(x - centre_x, y - centre_y) + 0.5, 0, 1)[..., None]
         image = image * (1 - inside) + 25.0 * inside
@@ -46,66 +46,69 @@ def _frame(
 
 
 def _centroid_px(cells: np.ndarray, cell_px: int) -> np.ndarray:
-    """Centre (x, y) of coverage in pixels of the full image, whose first pixel's centre is (0, 0)."""
+    """Return the centroid (x, y) of a coverage image.
+
+    The unit is pixels of the full image; the centre of the first pixel is (0, 0).
+    """
     weights = cells.astype(np.float64)
     y, x = np.indices(cells.shape) * cell_px + (cell_px - 1) / 2
     return np.array([(x * weights).sum(), (y * weights).sum()]) / weights.sum()
 
 
 @pytest.mark.parametrize(("working_reduction", "reduction"), [(1, 1), (1, 4), (2, 4), (4, 4), (3, 6)])
-def test_a_disc_of_known_centre_stays_where_it_is(working_reduction: int, reduction: int) -> None:
+def test_a_disc_is_found_at_its_true_centre(working_reduction: int, reduction: int) -> None:
     rng = np.random.default_rng(5)
-    scene = _scene(rng)
-    knobs = ForegroundSettings(working_reduction=working_reduction)
+    background = _make_background(rng)
+    fg_settings = ForegroundSettings(working_reduction=working_reduction)
     centres = rng.uniform([30, 30], [WIDTH - 30, HEIGHT - 30], (60, 2))
-    frames = [_frame(scene, rng, (x, y)) for x, y in centres]
+    frames = [_draw_frame(background, rng, (x, y)) for x, y in centres]
     found = [
         _centroid_px(coverage(mask, reduction // working_reduction), reduction)
-        for mask in foreground(frames, frames, knobs)
+        for mask in foreground(frames, frames, fg_settings)
     ]
     error_px = np.array(found) - centres
-    # Rounding of the edge scatters one centroid by 0.05 to 0.25 px; the mean of 60 centroids would show a shift.
+    # Rounding at the edge scatters a centroid by 0.05 to 0.25 px; the mean of 60 centroids would show a shift.
     assert np.abs(error_px.mean(axis=0)).max() < 0.1
     assert error_px.std(axis=0).max() < 0.5
 
 
 def test_silhouette_has_the_area_of_the_shape() -> None:
     rng = np.random.default_rng(6)
-    scene = _scene(rng)
-    frames = [_frame(scene, rng, (30.0 + 5 * i, 60.0)) for i in range(20)]
+    background = _make_background(rng)
+    frames = [_draw_frame(background, rng, (30.0 + 5 * i, 60.0)) for i in range(20)]
     (mask,) = foreground(frames, frames[7:8], ForegroundSettings(working_reduction=1))
-    # Pixels on the edge count if they differ from the room: up to half a pixel on all sides.
+    # Pixels on the edge that differ from the background count as foreground: up to half a pixel on all sides.
     assert np.pi * RADIUS_PX**2 <= np.count_nonzero(mask) <= np.pi * (RADIUS_PX + 1) ** 2
 
 
-@pytest.mark.parametrize("standing", [range(0, 18), range(22, 40)])
-def test_a_drone_that_stands_is_seen_and_leaves_no_ghost(standing: range) -> None:
+@pytest.mark.parametrize("hovering_frames", [range(0, 18), range(22, 40)])
+def test_a_hovering_drone_is_foreground_and_leaves_no_ghost(hovering_frames: range) -> None:
     rng = np.random.default_rng(7)
-    scene = _scene(rng)
-    centres = [(40.0, 60.0) if i in standing else (60.0 + 2 * i, 40.0) for i in range(40)]
-    frames = [_frame(scene, rng, centre) for centre in centres]
-    knobs = ForegroundSettings(working_reduction=1)
-    for centre, mask in zip(centres, foreground(frames, frames, knobs), strict=True):
+    background = _make_background(rng)
+    centres = [(40.0, 60.0) if i in hovering_frames else (60.0 + 2 * i, 40.0) for i in range(40)]
+    frames = [_draw_frame(background, rng, centre) for centre in centres]
+    fg_settings = ForegroundSettings(working_reduction=1)
+    for centre, mask in zip(centres, foreground(frames, frames, fg_settings), strict=True):
         area_px = np.pi * RADIUS_PX**2
         assert np.abs(_centroid_px(mask, 1) - centre).max() < 0.5
         assert 0.9 * area_px < np.count_nonzero(mask) < 1.4 * area_px
 
 
-def test_order_of_learning_does_not_matter() -> None:
+def test_the_order_of_the_learning_frames_hardly_matters() -> None:
     rng = np.random.default_rng(8)
-    scene = _scene(rng)
-    frames = [_frame(scene, rng, (20.0 + 3 * i, 60.0)) for i in range(40)]
-    knobs = ForegroundSettings(working_reduction=1)
-    (forward,) = foreground(frames, frames[:1], knobs)
-    (backward,) = foreground(frames[::-1], frames[:1], knobs)
-    # The recursion of the variances is only nearly a mean, so pixels on the disc's edge may differ.
+    background = _make_background(rng)
+    frames = [_draw_frame(background, rng, (20.0 + 3 * i, 60.0)) for i in range(40)]
+    fg_settings = ForegroundSettings(working_reduction=1)
+    (forward,) = foreground(frames, frames[:1], fg_settings)
+    (backward,) = foreground(frames[::-1], frames[:1], fg_settings)
+    # The recursive estimate of the variance depends slightly on the order, so pixels on the disc's edge may differ.
     assert np.count_nonzero(forward != backward) < 0.1 * np.count_nonzero(forward)
 
 
-def test_without_learning_rate_the_background_stays() -> None:
+def test_the_background_is_constant_at_learning_rate_zero() -> None:
     rng = np.random.default_rng(9)
-    scene = _scene(rng)
-    frames = [_frame(scene, rng, (20.0 + 3 * i, 60.0)) for i in range(40)]
+    background = _make_background(rng)
+    frames = [_draw_frame(background, rng, (20.0 + 3 * i, 60.0)) for i in range(40)]
     model = learn_background(frames, ForegroundSettings())
     first = classify(model, frames[3], ForegroundSettings())
     for _ in range(60):
@@ -119,14 +122,14 @@ def test_without_learning_rate_the_background_stays() -> None:
 @pytest.mark.parametrize(("shadows", "level"), [("keep", 255), ("drop", 0), ("weight", 64)])
 def test_shadow_label_is_kept_dropped_or_weighted(shadows: str, level: int) -> None:
     rng = np.random.default_rng(10)
-    scene = _scene(rng)
-    empty = [_frame(scene, rng) for _ in range(20)]
-    shaded = scene.copy()
+    background = _make_background(rng)
+    empty = [_draw_frame(background, rng) for _ in range(20)]
+    shaded = background.copy()
     shaded[40:80, 60:100] *= 0.65  # the same hue, darker: MOG2's definition of a shadow
-    frame = _frame(shaded, rng, (30.0, 30.0))
-    knobs = ForegroundSettings(working_reduction=1, shadows=shadows, shadow_weight=0.25)
-    (mask,) = foreground(empty, [frame], knobs)
-    # Noise may lift single pixels over the shadow's border in colour.
+    frame = _draw_frame(shaded, rng, (30.0, 30.0))
+    fg_settings = ForegroundSettings(working_reduction=1, shadows=shadows, shadow_weight=0.25)
+    (mask,) = foreground(empty, [frame], fg_settings)
+    # Noise may move the colour of single pixels outside the range that MOG2 accepts as shadow.
     assert np.mean(mask[45:75, 65:95] == level) > 0.95
     assert mask[30, 30] == 255
     assert mask[100, 130] == 0
@@ -137,8 +140,8 @@ def test_shadow_label_is_kept_dropped_or_weighted(shadows: str, level: int) -> N
     min_blob_px=st.integers(0, 12),
 )
 @settings(max_examples=60, deadline=None)
-def test_speckle_goes_and_all_else_stays(pixels: list[int], min_blob_px: int) -> None:
-    """Oracle: SciPy's labels, blob by blob."""
+def test_remove_speckle_removes_only_small_blobs(pixels: list[int], min_blob_px: int) -> None:
+    """The oracle labels blobs by SciPy and removes each small blob."""
     mask = np.zeros((20, 30), np.uint8)
     mask.flat[pixels] = np.arange(len(pixels)) % 2 * 155 + 100
     labels, count = ndimage.label(mask, np.ones((3, 3)))
@@ -149,15 +152,15 @@ def test_speckle_goes_and_all_else_stays(pixels: list[int], min_blob_px: int) ->
     np.testing.assert_array_equal(remove_speckle(mask, min_blob_px), expected)
 
 
-def test_smallest_blob_is_in_pixels_of_the_full_image() -> None:
+def test_min_blob_px_counts_pixels_of_the_full_image() -> None:
     rng = np.random.default_rng(11)
-    scene = _scene(rng)
-    empty = [_frame(scene, rng) for _ in range(20)]
-    frame = _frame(scene, rng, (40.0, 40.0), radius_px=3.0)  # about 28 px, 7 at half the size
+    background = _make_background(rng)
+    empty = [_draw_frame(background, rng) for _ in range(20)]
+    frame = _draw_frame(background, rng, (40.0, 40.0), radius_px=3.0)  # about 28 px, 7 at half the size
     for working_reduction in (1, 2):
         for min_blob_px, seen in ((12, True), (100, False)):
-            knobs = ForegroundSettings(working_reduction=working_reduction, min_blob_px=min_blob_px)
-            (mask,) = foreground(empty, [frame], knobs)
+            fg_settings = ForegroundSettings(working_reduction=working_reduction, min_blob_px=min_blob_px)
+            (mask,) = foreground(empty, [frame], fg_settings)
             assert mask.any() == seen
 
 
@@ -166,18 +169,18 @@ def test_smallest_blob_is_in_pixels_of_the_full_image() -> None:
 )
 @settings(max_examples=100, deadline=None)
 def test_coverage_is_the_mean_of_its_pixels(height: int, width: int, reduction: int, seed: int) -> None:
-    """Oracle: the mean over a NumPy slice, with background beyond the border."""
+    """The oracle is the mean of a NumPy slice, with background beyond the image border."""
     mask = np.random.default_rng(seed).choice(np.array([0, 127, 255], np.uint8), (height, width))
     cells = coverage(mask, reduction)
     assert cells.shape == (-(-height // reduction), -(-width // reduction))
     for i, j in np.ndindex(*cells.shape):
         inside = mask[reduction * i : reduction * (i + 1), reduction * j : reduction * (j + 1)]
-        # Rounded to a whole number, halves to either side; the rest is float32's.
+        # Coverage is rounded to a whole number, and a half may go up or down; 1e-4 covers float32's rounding.
         assert abs(float(cells[i, j]) - inside.sum(dtype=int) / reduction**2) <= 0.5 + 1e-4
 
 
 @pytest.mark.parametrize("shape", [(119, 159), (1, 1), (5, 3)])
-def test_any_size_works_at_half_scale(shape: tuple[int, int]) -> None:
+def test_any_image_size_works_at_half_scale(shape: tuple[int, int]) -> None:
     rng = np.random.default_rng(12)
     empty = rng.integers(100, 110, (9, *shape, 3), dtype=np.uint8)
     dark = np.full((*shape, 3), 10, np.uint8)
@@ -190,7 +193,7 @@ def test_learning_frames_spread_over_the_video(num_frames: int, num_learning_fra
     step = learning_step(num_frames, ForegroundSettings(num_learning_frames=num_learning_frames))
     used = range(0, num_frames, step)
     assert 1 <= len(used) <= num_learning_frames
-    # Rounding the step up may cost frames, but never half of them.
+    # Rounding the step up drops less than half of the frames.
     assert len(used) >= min(num_frames, num_learning_frames) / 2
 
 
@@ -208,7 +211,7 @@ def test_learning_frames_spread_over_the_video(num_frames: int, num_learning_fra
         ({"shadows": "maybe"}, "shadows: expected one of keep, drop, weight, found maybe"),
     ],
 )
-def test_settings_that_make_no_sense(setting: dict[str, object], message: str) -> None:
+def test_invalid_settings_are_refused(setting: dict[str, object], message: str) -> None:
     with pytest.raises(SettingsError) as raised:
         ForegroundSettings(**setting)
     assert str(raised.value) == message

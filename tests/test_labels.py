@@ -1,4 +1,4 @@
-"""Labels against boxes computed by hand, OpenCV, and the renderer's masks; data sets as trainers read them."""
+"""Labels, compared with boxes computed by hand, by OpenCV and from rendered masks; data sets as trainers read them."""
 
 import json
 import math
@@ -28,14 +28,14 @@ from psotrack.simulation import SimulationSettings, scenario, simulate
 from psotrack.simulation.scenarios import Mesh
 from psotrack.trajectories import Trajectories
 
-#: 100 x 80 pixels, 10 to the metre, from y = -1000 m: x is to the right, z is up.
+#: A distant camera at y = -1000 m with 100 x 80 pixels and 10 pixels per metre; x is to the right, z is up.
 FAR = make_unnamed_rig(far_camera(image_size_wh=(100, 80), pixels_per_m=10.0)).cameras
 CUBE = LabelSettings(drone_size_m=(2.0, 2.0, 2.0))
 SIZE_M = (0.6, 0.4, 0.3)
 
 
-def truth_of(position_m, orientation_wxyz=None):
-    """A reference from positions (frames, drones, 3) and orientations (frames, drones, 4)."""
+def make_reference(position_m, orientation_wxyz=None):
+    """Make a reference from positions (frames, drones, 3) in metres and orientations (frames, drones, 4)."""
     position_m = np.asarray(position_m, np.float64)
     frame = np.arange(len(position_m))
     names = tuple(f"dron{number + 1}" for number in range(position_m.shape[1]))
@@ -44,9 +44,9 @@ def truth_of(position_m, orientation_wxyz=None):
     return Trajectories(frame, frame / 25, names, position_m, orientation_wxyz=orientation_wxyz)
 
 
-def labelled(*position_m, cameras=FAR, settings=CUBE, orientation_wxyz=None):
-    """(drones, 4), labels of the first camera."""
-    truth = truth_of([position_m], None if orientation_wxyz is None else [orientation_wxyz])
+def compute_labels(*position_m, cameras=FAR, settings=CUBE, orientation_wxyz=None):
+    """Return the label boxes of the first camera, (drones, 4), pixels."""
+    truth = make_reference([position_m], None if orientation_wxyz is None else [orientation_wxyz])
     corners_m = box_corners(truth, np.array(settings.drone_size_m), np.array(settings.offset_m))
     return label_boxes(cameras, corners_m, settings)[0, :, 0]
 
@@ -61,11 +61,11 @@ def iou(one, other):
 
 
 def test_a_cube_in_the_middle():
-    # Edges, not pixel centres: the middle of 100 pixels is 50. The front side is nearer by 1 m of 1000 m, which adds
+    # Coordinates are pixel edges, so the middle of 100 pixels is 50. The front side is 1 m nearer of 1000 m, which adds
     # 0.01 px to 10 px.
-    np.testing.assert_allclose(labelled((0.0, 0.0, 0.0)), [[40, 30, 60, 50]], atol=0.011)
+    np.testing.assert_allclose(compute_labels((0.0, 0.0, 0.0)), [[40, 30, 60, 50]], atol=0.011)
     tall = LabelSettings(drone_size_m=(1.0, 2.0, 4.0), offset_m=(0.5, 7.0, -1.0))
-    np.testing.assert_allclose(labelled((0.0, 0.0, 0.0), settings=tall), [[50, 30, 60, 70]], atol=0.25)
+    np.testing.assert_allclose(compute_labels((0.0, 0.0, 0.0), settings=tall), [[50, 30, 60, 70]], atol=0.25)
 
 
 def test_the_box_turns_with_the_body_and_so_does_its_offset():
@@ -73,20 +73,22 @@ def test_the_box_turns_with_the_body_and_so_does_its_offset():
     turned = [(math.cos(half), 0.0, 0.0, math.sin(half))]
     wide = 10 * math.sqrt(2)
     np.testing.assert_allclose(
-        labelled((0.0, 0.0, 0.0), orientation_wxyz=turned), [[50 - wide, 30, 50 + wide, 50]], atol=0.03
+        compute_labels((0.0, 0.0, 0.0), orientation_wxyz=turned), [[50 - wide, 30, 50 + wide, 50]], atol=0.03
     )
     # A quarter turn about z turns the body's x axis onto the line of sight: the offset along x is not visible.
     quarter = [(math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))]
     ahead = LabelSettings(drone_size_m=(2.0, 2.0, 2.0), offset_m=(1.0, 0.0, 0.5))
     np.testing.assert_allclose(
-        labelled((0.0, 0.0, 0.0), settings=ahead, orientation_wxyz=quarter), [[40, 25, 60, 45]], atol=0.03
+        compute_labels((0.0, 0.0, 0.0), settings=ahead, orientation_wxyz=quarter),
+        [[40, 25, 60, 45]],
+        atol=0.03,
     )
-    np.testing.assert_allclose(labelled((0.0, 0.0, 0.0), settings=ahead), [[50, 25, 70, 45]], atol=0.03)
+    np.testing.assert_allclose(compute_labels((0.0, 0.0, 0.0), settings=ahead), [[50, 25, 70, 45]], atol=0.03)
 
 
-def test_orientations_that_are_missing():
+def test_missing_orientations():
     """A drone without any orientation has a level box; a drone with gaps has no box in the gaps."""
-    truth = truth_of(np.zeros((2, 2, 3)), np.full((2, 2, 4), np.nan))
+    truth = make_reference(np.zeros((2, 2, 3)), np.full((2, 2, 4), np.nan))
     truth.orientation_wxyz[0, 1] = (1, 0, 0, 0)
     corners_m = box_corners(truth, np.ones(3), np.zeros(3))
     assert np.isfinite(corners_m[:, 0]).all()
@@ -95,28 +97,28 @@ def test_orientations_that_are_missing():
 
 
 def test_a_size_and_an_offset_for_each_drone():
-    truth = truth_of([[(0, 0, 0), (0, 0, 0)]])
+    truth = make_reference([[(0, 0, 0), (0, 0, 0)]])
     corners_m = box_corners(truth, np.array([[1.0, 1, 1], [2, 4, 6]]), np.array([[0.0, 0, 0], [1, 0, 0]]))
     assert np.ptp(corners_m[0], axis=1).tolist() == [[1, 1, 1], [2, 4, 6]]
     assert corners_m[0].mean(axis=1).tolist() == [[0, 0, 0], [1, 0, 0]]
 
 
 @pytest.mark.parametrize(("min_inside", "expected"), [(0.7, [85, 30, 100, 50]), (0.8, [np.nan] * 4)])
-def test_cut_at_the_border(min_inside, expected):
+def test_a_box_is_cut_at_the_image_border(min_inside, expected):
     """The box reaches from 85 to 105 in an image of 100 pixels: three quarters are inside."""
     settings = replace(CUBE, min_inside=min_inside)
-    np.testing.assert_allclose(labelled((4.5, 0.0, 0.0), settings=settings), [expected], atol=0.06)
+    np.testing.assert_allclose(compute_labels((4.5, 0.0, 0.0), settings=settings), [expected], atol=0.06)
 
 
 def test_a_box_outside_the_image_has_no_label_even_with_min_inside_0():
     settings = replace(CUBE, min_inside=0.0)
-    assert np.isnan(labelled((7.0, 0, 0), (0, 0, -6.0), settings=settings)).all()
+    assert np.isnan(compute_labels((7.0, 0, 0), (0, 0, -6.0), settings=settings)).all()
 
 
 def test_a_drone_behind_the_camera_has_no_label():
-    """Behind the camera, around the camera, and with one corner behind the camera."""
+    """The three drones are behind the camera, around the camera, and with one corner behind the camera."""
     settings = replace(CUBE, min_inside=0.0)
-    assert np.isnan(labelled((0, -2000.0, 0), (0, -1000.0, 0), (0, -999.5, 0), settings=settings)).all()
+    assert np.isnan(compute_labels((0, -2000.0, 0), (0, -1000.0, 0), (0, -999.5, 0), settings=settings)).all()
 
 
 @pytest.mark.parametrize(
@@ -125,14 +127,16 @@ def test_a_drone_behind_the_camera_has_no_label():
 def test_a_nearer_drone_hides_a_farther_one(max_hidden, hidden):
     """The nearer drone is shifted by half a metre of two metres: three quarters are covered."""
     settings = replace(CUBE, max_hidden=max_hidden)
-    far, near = labelled((0.0, 5.0, 0.0), (0.5, 0.0, 0.0), settings=settings)
+    far, near = compute_labels((0.0, 5.0, 0.0), (0.5, 0.0, 0.0), settings=settings)
     assert np.isnan(far).all() == hidden
     np.testing.assert_allclose(near, [45, 30, 65, 50], atol=0.03)
 
 
-def test_a_drone_without_pose_hides_no_other():
-    for nobody in [(0.0, -1500.0, 0.0), (math.nan, math.nan, math.nan)]:
-        assert np.isfinite(labelled((0.0, 0.0, 0.0), nobody, settings=replace(CUBE, max_hidden=0.0))[0]).all()
+def test_a_drone_without_pose_hides_no_other_drone():
+    for hidden_drone in [(0.0, -1500.0, 0.0), (math.nan, math.nan, math.nan)]:
+        assert np.isfinite(
+            compute_labels((0.0, 0.0, 0.0), hidden_drone, settings=replace(CUBE, max_hidden=0.0))[0]
+        ).all()
 
 
 def test_no_drones():
@@ -140,19 +144,21 @@ def test_no_drones():
 
 
 @pytest.mark.parametrize("coefficients", [0, 4, 5, 8])
-def test_corners_are_where_opencv_projects_them(coefficients):
+def test_boxes_agree_with_corners_projected_by_opencv(coefficients):
     rig = ring_rig(5, coefficients=coefficients)
     rng = np.random.default_rng(0)
     position_m = rng.uniform((-1, -1, 0.8), (1, 1, 1.8), (7, 1, 3))
     wxyz = Rotation.random(7, rng=1).as_quat(scalar_first=True)[:, None]
     size_m, offset_m = np.array([0.5, 0.3, 0.2]), np.array([0.05, -0.1, 0.02])
     found = label_boxes(
-        rig.cameras, box_corners(truth_of(position_m, wxyz), size_m, offset_m), LabelSettings(tuple(size_m))
+        rig.cameras,
+        box_corners(make_reference(position_m, wxyz), size_m, offset_m),
+        LabelSettings(tuple(size_m)),
     )
     signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     for f in range(7):
-        turn = Rotation.from_quat(wxyz[f, 0], scalar_first=True)
-        corners_m = position_m[f, 0] + turn.apply(offset_m + signs * size_m / 2)
+        orientation = Rotation.from_quat(wxyz[f, 0], scalar_first=True)
+        corners_m = position_m[f, 0] + orientation.apply(offset_m + signs * size_m / 2)
         for c in range(5):
             one = rig.cameras[c]
             rotation, _ = cv2.Rodrigues(one.T_cam_world[:3, :3])
@@ -168,37 +174,37 @@ def test_points_far_outside_are_not_mapped_into_the_image():
     R, t_m = look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
     K = np.array([[1158.0, 0, 962], [0, 1158, 541], [0, 0, 1]])
     bent = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1924, 1082), dist=(-0.17, 0.0, 0.0, 0.0))
-    aside = (2.0, -2.0 * math.tan(math.radians(65)), 0.0)
-    pixel, _ = project(bent, np.array(aside))
+    far_outside_m = (2.0, -2.0 * math.tan(math.radians(65)), 0.0)
+    pixel, _ = project(bent, np.array(far_outside_m))
     assert (pixel > 0).all()
     assert (pixel < (1924, 1082)).all()
     small = LabelSettings(drone_size_m=(0.3, 0.3, 0.2))
     cameras = make_unnamed_rig(bent).cameras
-    assert np.isnan(labelled(aside, cameras=cameras, settings=small)).all()
+    assert np.isnan(compute_labels(far_outside_m, cameras=cameras, settings=small)).all()
     # A drone in the corner of the image has a label.
     corner = np.array([1.0, -0.8, 0.4]) * 4
-    assert np.isfinite(labelled(tuple(corner), cameras=cameras, settings=small)).all()
+    assert np.isfinite(compute_labels(tuple(corner), cameras=cameras, settings=small)).all()
 
 
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_labels_are_in_the_image_and_in_any_order(seed):
+def test_labels_are_inside_the_image_and_do_not_depend_on_the_order(seed):
     rng = np.random.default_rng(seed)
     rig = ring_rig(3, coefficients=4)
     position_m = rng.uniform((-6, -6, -1), (6, 6, 4), (2, 5, 3))
     chosen = LabelSettings((0.8, 0.6, 0.4), min_inside=rng.uniform(), max_hidden=rng.uniform())
     order = rng.permutation(5)
 
-    def labels_of(position_m):
-        corners_m = box_corners(truth_of(position_m), np.array(chosen.drone_size_m), np.zeros(3))
+    def compute_boxes(position_m):
+        corners_m = box_corners(make_reference(position_m), np.array(chosen.drone_size_m), np.zeros(3))
         return label_boxes(rig.cameras, corners_m, chosen)
 
-    found = labels_of(position_m)
-    np.testing.assert_array_equal(labels_of(position_m[:, order]), found[:, order])
-    there = found[np.isfinite(found).all(axis=-1)]
+    found = compute_boxes(position_m)
+    np.testing.assert_array_equal(compute_boxes(position_m[:, order]), found[:, order])
+    visible_boxes = found[np.isfinite(found).all(axis=-1)]
     assert np.isfinite(found).all(axis=-1).sum() == np.isfinite(found).any(axis=-1).sum()
-    assert ((there >= 0) & (there <= (320, 240, 320, 240))).all()
-    assert (there[:, 2:] > there[:, :2]).all()
+    assert ((visible_boxes >= 0) & (visible_boxes <= (320, 240, 320, 240))).all()
+    assert (visible_boxes[:, 2:] > visible_boxes[:, :2]).all()
 
 
 @pytest.mark.parametrize(
@@ -214,7 +220,7 @@ def test_invalid_settings(change, message):
         replace(CUBE, **change)
 
 
-# --- sequences of the simulator, whose drones are boxes
+# --- simulated sequences, in which drones are boxes
 
 
 @pytest.fixture(scope="module")
@@ -233,56 +239,57 @@ def data(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def made(data, tmp_path_factory):
-    """The data set of both sequences, written by the command in two processes."""
+def written_data_set(data, tmp_path_factory):
+    """Folder and printed counts of the data set of both sequences, written by the command in two processes."""
     out = tmp_path_factory.mktemp("yolo") / "set"
-    answer = run(data / "S01_D2_A", data / "S12_D3", "--out", out, "--jobs", 2, "--json", "-")
-    assert answer.exit_code == 0
-    return out, json.loads(answer.stdout)
+    result = run_labels(data / "S01_D2_A", data / "S12_D3", "--out", out, "--jobs", 2, "--json", "-")
+    assert result.exit_code == 0
+    return out, json.loads(result.stdout)
 
 
-def run(*arguments):
-    words = [*map(str, arguments), "--drone-size", ",".join(map(str, SIZE_M)), "--quiet"]
-    return CliRunner().invoke(labels, words, catch_exceptions=False)
+def run_labels(*arguments):
+    command_arguments = [*map(str, arguments), "--drone-size", ",".join(map(str, SIZE_M)), "--quiet"]
+    return CliRunner().invoke(labels, command_arguments, catch_exceptions=False)
 
 
-def refused(error, *arguments):
-    with pytest.raises(error) as caught:
-        run(*arguments)
-    assert isinstance(caught.value, PsotrackError)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
+def refusal_message(error, *arguments):
+    with pytest.raises(error) as error_info:
+        run_labels(*arguments)
+    assert isinstance(error_info.value, PsotrackError)
+    assert "\n" not in str(error_info.value)
+    return str(error_info.value)
 
 
 def test_labels_are_the_boxes_of_the_masks(data):
-    sequence = read_sequence(data / "S01_D2_A")
-    corners_m = box_corners(sequence.truth, np.array(SIZE_M), np.zeros(3))
-    found = label_boxes(sequence.rig.cameras, corners_m, LabelSettings(SIZE_M))
+    recording = read_sequence(data / "S01_D2_A")
+    corners_m = box_corners(recording.truth, np.array(SIZE_M), np.zeros(3))
+    found = label_boxes(recording.rig.cameras, corners_m, LabelSettings(SIZE_M))
     overlaps = []
-    with read_masks(sequence.folder) as masks:
-        for frame in range(1, sequence.num_frames):
+    with read_masks(recording.folder) as masks:
+        for frame in range(1, recording.num_frames):
             for drone in range(2):
-                for index, name in enumerate(sequence.rig.names):
+                for index, name in enumerate(recording.rig.names):
                     rows, columns = np.nonzero(masks.mask(name, drone + 1, frame))
                     box = found[frame, drone, index]
                     assert np.isfinite(box).all() == bool(len(rows))
                     if len(rows):
                         mask = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], float)
-                        # A pixel is in the mask if its middle is in the box, so that it may end half a pixel outside.
+                        # The mask holds pixels whose centre is in the box, so it may end half a pixel outside.
                         assert (mask[:2] >= box[:2] - 0.5).all()
                         assert (mask[2:] <= box[2:] + 0.5).all()
                         overlaps.append(iou(box, mask))
-    # Half a pixel at each side of 20 to 60 pixels. In these frames no drone hides another.
+    # Each side may differ by half a pixel of 20 to 60 pixels. In these frames no drone hides another drone.
     assert len(overlaps) == 3 * 2 * 8
     assert min(overlaps) > 0.85
     assert np.median(overlaps) > 0.92
 
 
-def loaded(out):
-    """The data set as trainers read it: rows of labels by part and path of the image.
+def load_data_set(out):
+    """Read the data set like a trainer: (part, path of the image) -> rows of labels.
 
-    They take the paths of images from `data.yaml`, read by PyYAML's `safe_load`, and replace the last /images/ by
-    /labels/ and the suffix by .txt; rows have five numbers, none beyond 1, and are there once.
+    A trainer reads the image folders from `data.yaml` by PyYAML's `safe_load`, and finds the labels of an image by
+    replacing the last /images/ by /labels/ and the suffix by .txt. A row has five numbers from 0 to 1, and no row is
+    repeated.
     """
     content = yaml.safe_load((out / "data.yaml").read_text(encoding="utf-8"))
     assert set(content) == {"path", "train", "val", "nc", "names"}
@@ -303,20 +310,20 @@ def loaded(out):
     return found
 
 
-def test_a_trainer_loads_it(data, made):
-    out, counts = made
-    found = loaded(out)
+def test_the_data_set_can_be_loaded_by_a_trainer(data, written_data_set):
+    out, counts = written_data_set
+    found = load_data_set(out)
     assert len(list((out / "labels").glob("*/*.txt"))) == len(found)
     for part, name, frames, cameras in (("train", "S01_D2_A", 3, 8), ("val", "S12_D3", 2, 4)):
-        rows = [value for (of, _), value in found.items() if of == part]
+        rows = [value for (part_of_image, _), value in found.items() if part_of_image == part]
         # Frame 0 has no pose in the dataset, so it is left out.
         assert counts[part] == {"images": frames * cameras, "labels": sum(map(len, rows))}
         assert len(rows) == frames * cameras
-        sequence = read_sequence(data / name)
-        corners_m = box_corners(sequence.truth, np.array(SIZE_M), np.zeros(3))
-        boxes = label_boxes(sequence.rig.cameras, corners_m, LabelSettings(SIZE_M))
-        for index, camera_name in enumerate(sequence.rig.names):
-            for frame, shown in enumerate(read_frames(sequence.videos[camera_name])):
+        recording = read_sequence(data / name)
+        corners_m = box_corners(recording.truth, np.array(SIZE_M), np.zeros(3))
+        boxes = label_boxes(recording.rig.cameras, corners_m, LabelSettings(SIZE_M))
+        for index, camera_name in enumerate(recording.rig.names):
+            for frame, shown in enumerate(read_frames(recording.videos[camera_name])):
                 image = out / "images" / part / f"{name}_{camera_name}_{frame:06d}.jpg"
                 assert image.exists() == (frame > 0)
                 if frame:
@@ -324,82 +331,86 @@ def test_a_trainer_loads_it(data, made):
                     expected = expected[np.isfinite(expected).all(axis=-1)]
                     middle, size = found[part, image][:, 1:3], found[part, image][:, 3:]
                     corners = np.hstack([middle - size / 2, middle + size / 2]) * [480, 270, 480, 270]
-                    # Six decimals of a share of 480 pixels.
+                    # The file holds shares of 480 pixels with six decimals.
                     np.testing.assert_allclose(corners, expected, atol=5e-4)
                     stored = cv2.imread(str(image))
-                    # The error of JPEG at quality 95. Another frame differs by more at the drones.
+                    # The limit is above the error of JPEG at quality 95; at the drones, another frame differs more.
                     assert np.abs(stored.astype(int) - shown).mean() < 2.0
 
 
 def test_every_other_frame(data, tmp_path):
-    answer = run(data / "S12_D3", data / "S01_D2_A", "--out", tmp_path / "set", "--every", 2, "--jobs", 1)
-    assert answer.exit_code == 0
-    assert answer.stdout == ""
-    frames = {(part, image.stem[-6:]) for part, image in loaded(tmp_path / "set")}
+    result = run_labels(
+        data / "S12_D3", data / "S01_D2_A", "--out", tmp_path / "set", "--every", 2, "--jobs", 1
+    )
+    assert result.exit_code == 0
+    assert result.stdout == ""
+    frames = {(part, image.stem[-6:]) for part, image in load_data_set(tmp_path / "set")}
     assert frames == {("train", "000002"), ("val", "000002")}
 
 
-def test_an_image_without_drones_has_an_empty_file(data, tmp_path):
-    """With an offset of a kilometre no drone is in any image."""
-    run(
+def test_an_image_without_drones_has_an_empty_label_file(data, tmp_path):
+    """An offset of one kilometre moves all drones out of all images."""
+    run_labels(
         data / "S01_D2_A",
         data / "S12_D3",
         *("--out", tmp_path / "set", "--offset", "0,0,-1000", "--every", 2, "--jobs", 1),
     )
-    found = loaded(tmp_path / "set")
+    found = load_data_set(tmp_path / "set")
     assert len(found) == 12
     assert not any(map(len, found.values()))
 
 
-def test_the_sequences_for_validation(data, tmp_path):
-    run(
+def test_sequences_for_validation_can_be_chosen(data, tmp_path):
+    run_labels(
         data / "S01_D2_A",
         data / "S12_D3",
         *("--out", tmp_path / "set", "--validation", "S01_D2_A", "--every", 2, "--jobs", 1),
     )
-    parts = {(part, image.name[:3]) for part, image in loaded(tmp_path / "set")}
+    parts = {(part, image.name[:3]) for part, image in load_data_set(tmp_path / "set")}
     assert parts == {("val", "S01"), ("train", "S12")}
 
 
 def test_sequences_that_cannot_be_split(data, tmp_path):
     one, other, out = data / "S01_D2_A", data / "S12_D3", tmp_path / "set"
-    assert "sequences: expected at least two" in refused(SettingsError, one, "--out", out)
-    assert "one sequence for training" in refused(
+    assert "sequences: expected at least two" in refusal_message(SettingsError, one, "--out", out)
+    assert "one sequence for training" in refusal_message(
         SettingsError, one, other, "--out", out, "--validation", "S12_D3,S01_D2_A"
     )
-    assert "found S99" in refused(SettingsError, one, other, "--out", out, "--validation", "S99")
-    assert "S01_D2_A more than once" in refused(SettingsError, one, one, "--out", out)
-    assert run(one, other, "--out", out, "--every", 0).exit_code == 2
+    assert "found S99" in refusal_message(SettingsError, one, other, "--out", out, "--validation", "S99")
+    assert "S01_D2_A more than once" in refusal_message(SettingsError, one, one, "--out", out)
+    assert run_labels(one, other, "--out", out, "--every", 0).exit_code == 2
     with pytest.raises(SettingsError, match="every: expected 1 or more, found 0"):
         FrameSelection(every=0)
     assert not out.exists()
 
 
-def test_only_a_data_set_is_replaced_and_only_with_force(data, made, tmp_path):
+def test_only_a_data_set_is_replaced_and_only_with_force(data, written_data_set, tmp_path):
     both = (data / "S01_D2_A", data / "S12_D3")
-    out, _ = made
-    assert "--force" in refused(OutputError, *both, "--out", out)
+    out, _ = written_data_set
+    assert "--force" in refusal_message(OutputError, *both, "--out", out)
     precious = tmp_path / "home"
     precious.mkdir()
     (precious / "thesis.tex").write_text("x")
-    assert "only a data set can be replaced" in refused(OutputError, *both, "--out", precious, "--force")
+    assert "only a data set can be replaced" in refusal_message(
+        OutputError, *both, "--out", precious, "--force"
+    )
     assert (precious / "thesis.tex").exists()
     again = tmp_path / "set"
-    run(*both, "--out", again, "--every", 1, "--jobs", 1)
-    run(*both, "--out", again, "--every", 2, "--jobs", 1, "--force")
-    assert {image.stem[-6:] for _, image in loaded(again)} == {"000002"}
+    run_labels(*both, "--out", again, "--every", 1, "--jobs", 1)
+    run_labels(*both, "--out", again, "--every", 2, "--jobs", 1, "--force")
+    assert {image.stem[-6:] for _, image in load_data_set(again)} == {"000002"}
 
 
 def test_a_broken_video_leaves_nothing_behind(data, tmp_path):
     one, other = (read_sequence(data / name) for name in ("S01_D2_A", "S12_D3"))
     short = {name: replace(video, num_frames=9) for name, video in one.videos.items()}
     truth = one.truth
-    longer = Trajectories(
+    longer_reference = Trajectories(
         np.arange(9), np.arange(9) / 25, truth.drones, np.broadcast_to(truth.position_m[1], (9, 2, 3))
     )
-    promising = replace(one, videos=short, truth=longer)
+    with_wrong_length = replace(one, videos=short, truth=longer_reference)
     with pytest.raises(InputError, match="only 4 can be decoded"):
-        write_data_set([promising, other], tmp_path / "set", LabelSettings(SIZE_M), jobs=1)
+        write_data_set([with_wrong_length, other], tmp_path / "set", LabelSettings(SIZE_M), jobs=1)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -1,4 +1,4 @@
-"""The store of silhouettes: its content, when silhouettes are computed again, and interruptions."""
+"""The store of silhouettes: its content, the reasons to compute silhouettes again, and interruptions."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ from psotrack.silhouettes.foreground import coverage, foreground
 from psotrack.support import Advance, map_in_processes
 
 NUM_FRAMES = 30
-SIZE_WH = (162, 118)  # no multiple of 4
+SIZE_WH = (162, 118)  # not multiples of 4
 SETTINGS = SilhouetteSettings(num_learning_frames=10)
 
 
 def _write_video(path: Path, seed: int, num_frames: int = NUM_FRAMES) -> None:
-    """Dark discs that move in front of smooth texture, with noise."""
+    """Write a video of a dark disc that moves in front of a smooth texture, with noise."""
     rng = np.random.default_rng(seed)
     coarse = rng.integers(90, 190, (5, 7, 3)).astype(np.float32)
-    scene = cv2.resize(coarse, SIZE_WH, interpolation=cv2.INTER_CUBIC)
+    background = cv2.resize(coarse, SIZE_WH, interpolation=cv2.INTER_CUBIC)
     with VideoWriter(path, 25.0, SIZE_WH) as writer:
         for index in range(num_frames):
-            image = scene + rng.normal(0, 2, scene.shape)
+            image = background + rng.normal(0, 2, background.shape)
             cv2.circle(image, (20 + 4 * index, 30 + 10 * seed), 9, (25, 25, 25), -1, cv2.LINE_AA)
             writer.write(np.clip(image, 0, 255).astype(np.uint8))
 
 
-def _sequence(folder: Path) -> Recording:
-    """A sequence of all videos in a folder."""
+def _make_recording(folder: Path) -> Recording:
+    """Make a recording of all videos in a folder."""
     R, t_m = look_at((0.0, 0.0, 1.0), (5.0, 0.0, 1.0))
     K = np.array([[100.0, 0, 81], [0, 100, 59], [0, 0, 1]])
     videos = {path.stem: probe(path) for path in sorted(folder.glob("*.avi"))}
@@ -56,7 +56,7 @@ def _sequence(folder: Path) -> Recording:
 
 
 @pytest.fixture(scope="session")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def video_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recorded")
     for seed in range(3):
         _write_video(folder / f"cam{seed + 1}.avi", seed)
@@ -64,28 +64,28 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def folder(recorded: Path, tmp_path: Path) -> Path:
-    """Three videos that a test may change."""
-    return Path(shutil.copytree(recorded, tmp_path / "videos"))
+def folder(video_folder: Path, tmp_path: Path) -> Path:
+    """Folder with three videos that a test may change."""
+    return Path(shutil.copytree(video_folder, tmp_path / "videos"))
 
 
 @pytest.fixture
-def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Names of the videos of all frames that are decoded in this process, in order."""
+def decoded_videos(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """List that gets the name of the video of each frame that this process decodes, in order."""
     names: list[str] = []
 
-    def counted(video, step=1):  # type: ignore[no-untyped-def]
+    def read_and_count(video, step=1):  # type: ignore[no-untyped-def]
         for frame in read_frames(video, step):
             names.append(video.path.stem)
             yield frame
 
-    monkeypatch.setattr(silhouette_store, "read_frames", counted)
+    monkeypatch.setattr(silhouette_store, "read_frames", read_and_count)
     return names
 
 
-def _expected(sequence: Recording, settings: SilhouetteSettings = SETTINGS) -> np.ndarray:
-    """Silhouettes without store, workers or chunks: (frames, cameras, height, width)."""
-    step = silhouette_store.learning_step(sequence.num_frames, settings)
+def _expected(recording: Recording, settings: SilhouetteSettings = SETTINGS) -> np.ndarray:
+    """Compute silhouettes without store, workers or chunks, (frames, cameras, height, width)."""
+    step = silhouette_store.learning_step(recording.num_frames, settings)
     factor = settings.reduction // settings.working_reduction
     return np.stack(
         [
@@ -93,73 +93,77 @@ def _expected(sequence: Recording, settings: SilhouetteSettings = SETTINGS) -> n
                 coverage(mask, factor)
                 for mask in foreground(read_frames(video, step), read_frames(video), settings)
             ]
-            for video in sequence.videos.values()
+            for video in recording.videos.values()
         ],
         axis=1,
     )
 
 
-def _all(silhouettes: Silhouettes) -> np.ndarray:
+def _read_all(silhouettes: Silhouettes) -> np.ndarray:
     return silhouettes.read(0, silhouettes.num_frames)
 
 
-def _leftovers(cache: Path) -> list[Path]:
+def _unfinished_folders(cache: Path) -> list[Path]:
     return list(cache.glob(".*"))
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_silhouettes_are_those_of_the_videos(folder: Path, tmp_path: Path, jobs: int) -> None:
-    sequence = _sequence(folder)
-    silhouettes = compute(sequence, SETTINGS, cache=tmp_path / "cache", jobs=jobs)
+def test_stored_silhouettes_equal_direct_computation(folder: Path, tmp_path: Path, jobs: int) -> None:
+    recording = _make_recording(folder)
+    silhouettes = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=jobs)
     assert silhouettes.cameras == ("cam1", "cam2", "cam3")
     assert silhouettes.shape == (30, 41)
     assert (silhouettes.num_frames, silhouettes.reduction) == (NUM_FRAMES, 4)
-    everything = _all(silhouettes)
-    assert everything.dtype == np.uint8
-    assert everything.flags.c_contiguous
-    np.testing.assert_array_equal(everything, _expected(sequence))
-    assert everything.any(axis=(2, 3)).all(), "a disc is in every frame of every camera"
-    assert _leftovers(tmp_path / "cache") == []
+    all_frames = _read_all(silhouettes)
+    assert all_frames.dtype == np.uint8
+    assert all_frames.flags.c_contiguous
+    np.testing.assert_array_equal(all_frames, _expected(recording))
+    assert all_frames.any(axis=(2, 3)).all(), "every frame of every camera shows a disc"
+    assert _unfinished_folders(tmp_path / "cache") == []
 
 
 @pytest.mark.parametrize(("start", "stop"), [(0, 0), (0, 1), (7, 26), (24, 26), (25, 30), (30, 30)])
-def test_any_part_can_be_read(recorded: Path, shared: Silhouettes, start: int, stop: int) -> None:
-    part = shared.read(start, stop)
-    assert part.shape == (stop - start, 3, 30, 41)
-    np.testing.assert_array_equal(part, _all(shared)[start:stop])
+def test_any_range_of_frames_can_be_read(
+    video_folder: Path, shared_silhouettes: Silhouettes, start: int, stop: int
+) -> None:
+    frames = shared_silhouettes.read(start, stop)
+    assert frames.shape == (stop - start, 3, 30, 41)
+    np.testing.assert_array_equal(frames, _read_all(shared_silhouettes)[start:stop])
 
 
 @pytest.mark.parametrize(("start", "stop"), [(-1, 5), (5, 31), (6, 5)])
-def test_frames_that_are_not_there(shared: Silhouettes, start: int, stop: int) -> None:
+def test_missing_frames_are_refused(shared_silhouettes: Silhouettes, start: int, stop: int) -> None:
     with pytest.raises(SettingsError, match=f"frames: expected a part of 0 to 30, found {start} to {stop}"):
-        shared.read(start, stop)
+        shared_silhouettes.read(start, stop)
 
 
 @pytest.fixture(scope="session")
-def shared(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Silhouettes:
-    return compute(_sequence(recorded), SETTINGS, cache=tmp_path_factory.mktemp("cache"), jobs=1)
+def shared_silhouettes(video_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Silhouettes:
+    return compute(_make_recording(video_folder), SETTINGS, cache=tmp_path_factory.mktemp("cache"), jobs=1)
 
 
-def test_second_call_reads_without_decoding(folder: Path, tmp_path: Path, decoded: list[str]) -> None:
-    first = compute(_sequence(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    assert len(decoded) == 3 * (NUM_FRAMES + 10)
+def test_second_call_reads_without_decoding(folder: Path, tmp_path: Path, decoded_videos: list[str]) -> None:
+    first = compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
+    assert len(decoded_videos) == 3 * (NUM_FRAMES + 10)
     assert first.seconds["decode"] > 0
     assert first.seconds["foreground"] > 0
-    decoded.clear()
-    second = compute(_sequence(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    assert decoded == []
+    decoded_videos.clear()
+    second = compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
+    assert decoded_videos == []
     assert second.seconds == {"decode": 0.0, "foreground": 0.0}
     assert second.keys == first.keys
-    np.testing.assert_array_equal(_all(second), _all(first))
+    np.testing.assert_array_equal(_read_all(second), _read_all(first))
 
 
-def test_name_and_place_of_a_video_do_not_matter(folder: Path, tmp_path: Path, decoded: list[str]) -> None:
-    compute(_sequence(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    decoded.clear()
+def test_name_and_folder_of_a_video_are_not_in_the_key(
+    folder: Path, tmp_path: Path, decoded_videos: list[str]
+) -> None:
+    compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
+    decoded_videos.clear()
     moved = Path(shutil.copytree(folder, tmp_path / "moved"))
     (moved / "cam3.avi").rename(moved / "other.avi")
-    compute(_sequence(moved), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    assert decoded == []
+    compute(_make_recording(moved), SETTINGS, cache=tmp_path / "cache", jobs=1)
+    assert decoded_videos == []
 
 
 @pytest.mark.parametrize(
@@ -175,79 +179,81 @@ def test_name_and_place_of_a_video_do_not_matter(folder: Path, tmp_path: Path, d
         {"min_blob_px": 33},
     ],
 )
-def test_every_setting_is_in_the_key(recorded: Path, change: dict[str, object]) -> None:
-    video = probe(recorded / "cam1.avi")
+def test_every_setting_is_in_the_key(video_folder: Path, change: dict[str, object]) -> None:
+    video = probe(video_folder / "cam1.avi")
     changed = msgspec.structs.replace(SETTINGS, **change)
     assert silhouette_store.key_of(video, changed) != silhouette_store.key_of(video, SETTINGS)
 
 
-def test_no_setting_is_missing_in_the_test_above() -> None:
+def test_the_test_of_the_key_covers_every_setting() -> None:
     changes = test_every_setting_is_in_the_key.pytestmark[0].args[1]
     assert {name for change in changes for name in change} == set(SilhouetteSettings.__struct_fields__)
 
 
-def test_changed_setting_computes_anew_and_keeps_the_old(
-    folder: Path, tmp_path: Path, decoded: list[str]
+def test_a_changed_setting_computes_again_and_keeps_the_old_silhouettes(
+    folder: Path, tmp_path: Path, decoded_videos: list[str]
 ) -> None:
-    sequence = _sequence(folder)
-    first = compute(sequence, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    before = _all(first)
-    decoded.clear()
+    recording = _make_recording(folder)
+    first = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
+    before = _read_all(first)
+    decoded_videos.clear()
     changed = msgspec.structs.replace(SETTINGS, reduction=2)
-    second = compute(sequence, changed, cache=tmp_path / "cache", jobs=1)
-    assert len(decoded) == 3 * (NUM_FRAMES + 10)
-    np.testing.assert_array_equal(_all(second), _expected(sequence, changed))
-    np.testing.assert_array_equal(_all(first), before)
+    second = compute(recording, changed, cache=tmp_path / "cache", jobs=1)
+    assert len(decoded_videos) == 3 * (NUM_FRAMES + 10)
+    np.testing.assert_array_equal(_read_all(second), _expected(recording, changed))
+    np.testing.assert_array_equal(_read_all(first), before)
 
 
-def test_changed_video_is_done_anew_and_it_alone(folder: Path, tmp_path: Path, decoded: list[str]) -> None:
-    compute(_sequence(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    decoded.clear()
+def test_only_a_changed_video_is_computed_again(
+    folder: Path, tmp_path: Path, decoded_videos: list[str]
+) -> None:
+    compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
+    decoded_videos.clear()
     _write_video(folder / "cam2.avi", seed=5)
-    sequence = _sequence(folder)
-    silhouettes = compute(sequence, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    assert set(decoded) == {"cam2"}
-    np.testing.assert_array_equal(_all(silhouettes), _expected(sequence))
+    recording = _make_recording(folder)
+    silhouettes = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
+    assert set(decoded_videos) == {"cam2"}
+    np.testing.assert_array_equal(_read_all(silhouettes), _expected(recording))
 
 
-def test_fewer_frames_are_other_silhouettes(folder: Path, tmp_path: Path) -> None:
-    sequence = _sequence(folder)
-    everything = compute(sequence, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    few = sequence.usable(num_frames=12)
-    silhouettes = compute(few, SETTINGS, cache=tmp_path / "cache", jobs=1)
+def test_fewer_frames_have_another_key(folder: Path, tmp_path: Path) -> None:
+    recording = _make_recording(folder)
+    all_frames = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
+    shorter = recording.usable(num_frames=12)
+    silhouettes = compute(shorter, SETTINGS, cache=tmp_path / "cache", jobs=1)
     assert silhouettes.num_frames == 12
-    assert set(silhouettes.keys.values()).isdisjoint(everything.keys.values())
-    np.testing.assert_array_equal(_all(silhouettes), _expected(few))
+    assert set(silhouettes.keys.values()).isdisjoint(all_frames.keys.values())
+    np.testing.assert_array_equal(_read_all(silhouettes), _expected(shorter))
 
 
-def test_two_cameras_of_one_content_are_done_once(folder: Path, tmp_path: Path, decoded: list[str]) -> None:
+def test_equal_videos_are_computed_once(folder: Path, tmp_path: Path, decoded_videos: list[str]) -> None:
     shutil.copy(folder / "cam1.avi", folder / "cam2.avi")
-    silhouettes = compute(_sequence(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    assert len(decoded) == 2 * (NUM_FRAMES + 10)
-    everything = _all(silhouettes)
-    np.testing.assert_array_equal(everything[:, 0], everything[:, 1])
+    silhouettes = compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
+    assert len(decoded_videos) == 2 * (NUM_FRAMES + 10)
+    all_frames = _read_all(silhouettes)
+    np.testing.assert_array_equal(all_frames[:, 0], all_frames[:, 1])
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_progress_adds_up(folder: Path, tmp_path: Path, jobs: int) -> None:
-    told: list[tuple[str, int]] = []
+    started: list[tuple[str, int]] = []
     done: list[int] = []
 
     @contextlib.contextmanager
     def report(description: str, total: int) -> Iterator[Advance]:
-        told.append((description, total))
+        started.append((description, total))
         yield done.append
 
     for _ in range(2):
-        compute(_sequence(folder), SETTINGS, cache=tmp_path / "cache", jobs=jobs, report=report)
-    assert told == [("silhouettes", 3 * (NUM_FRAMES + 10))], "and nothing the second time"
+        compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=jobs, report=report)
+    assert started == [("silhouettes", 3 * (NUM_FRAMES + 10))], "the second call reports no progress"
     assert sum(done) == 3 * (NUM_FRAMES + 10)
 
 
 @pytest.mark.parametrize("damage", ["chunk", "metadata", "shape"])
-def test_damaged_silhouettes_are_made_anew(folder: Path, tmp_path: Path, damage: str) -> None:
-    sequence = _sequence(folder)
-    first = compute(sequence, SETTINGS, cache=tmp_path / "cache", jobs=1)
+def test_damaged_silhouettes_are_computed_again(folder: Path, tmp_path: Path, damage: str) -> None:
+    recording = _make_recording(folder)
+    first = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
     stored = tmp_path / "cache" / first.keys["cam2"]
     if damage == "chunk":
         (stored / "c" / "1" / "0" / "0").unlink()
@@ -256,12 +262,12 @@ def test_damaged_silhouettes_are_made_anew(folder: Path, tmp_path: Path, damage:
     else:
         text = (stored / "zarr.json").read_text()
         (stored / "zarr.json").write_text(text.replace("41", "40"))
-    again = compute(sequence, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    np.testing.assert_array_equal(_all(again), _expected(sequence))
+    again = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
+    np.testing.assert_array_equal(_read_all(again), _expected(recording))
 
 
 def test_damage_after_opening_is_an_error_not_background(folder: Path, tmp_path: Path) -> None:
-    silhouettes = compute(_sequence(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
+    silhouettes = compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
     chunk = tmp_path / "cache" / silhouettes.keys["cam2"] / "c" / "0" / "0" / "0"
     content = bytearray(chunk.read_bytes())
     content[len(content) // 2] ^= 0xFF
@@ -274,87 +280,90 @@ def test_damage_after_opening_is_an_error_not_background(folder: Path, tmp_path:
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_truncated_video_is_named_and_the_others_stay(folder: Path, tmp_path: Path, jobs: int) -> None:
-    sequence = _sequence(folder)
+def test_a_truncated_video_is_named_and_the_other_videos_are_kept(
+    folder: Path, tmp_path: Path, jobs: int
+) -> None:
+    recording = _make_recording(folder)
     video = folder / "cam3.avi"
     content = video.read_bytes()
     video.write_bytes(content[: len(content) * 2 // 3])
-    with pytest.raises(InputError) as raised:
-        compute(sequence, SETTINGS, cache=tmp_path / "cache", jobs=jobs)
-    assert str(raised.value).startswith(f"{video}: expected {NUM_FRAMES} frames, found ")
-    assert _leftovers(tmp_path / "cache") == []
+    with pytest.raises(InputError) as error_info:
+        compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=jobs)
+    assert str(error_info.value).startswith(f"{video}: expected {NUM_FRAMES} frames, found ")
+    assert _unfinished_folders(tmp_path / "cache") == []
     video.write_bytes(content)
     np.testing.assert_array_equal(
-        _all(compute(sequence, SETTINGS, cache=tmp_path / "cache", jobs=1)), _expected(sequence)
+        _read_all(compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)), _expected(recording)
     )
 
 
 def test_missing_video(folder: Path, tmp_path: Path) -> None:
-    sequence = _sequence(folder)
+    recording = _make_recording(folder)
     (folder / "cam2.avi").unlink()
     with pytest.raises(InputError, match=r"cam2\.avi: expected a readable video, found No such file"):
-        compute(sequence, SETTINGS, cache=tmp_path / "cache")
+        compute(recording, SETTINGS, cache=tmp_path / "cache")
 
 
 def test_camera_without_video(folder: Path, tmp_path: Path) -> None:
-    sequence = _sequence(folder)
-    videos = {name: video for name, video in sequence.videos.items() if name != "cam2"}
+    recording = _make_recording(folder)
+    videos = {name: video for name, video in recording.videos.items() if name != "cam2"}
     with pytest.raises(InputError, match=r"expected a video for each of the cameras .* found none for cam2"):
-        compute(replace(sequence, videos=videos), SETTINGS, cache=tmp_path / "cache")
+        compute(replace(recording, videos=videos), SETTINGS, cache=tmp_path / "cache")
 
 
 def test_videos_of_different_length(folder: Path, tmp_path: Path) -> None:
     _write_video(folder / "cam2.avi", seed=1, num_frames=20)
     with pytest.raises(InputError, match=r"cam2\.avi: expected 30 frames as in cam1\.avi, found 20 frames"):
-        compute(_sequence(folder), SETTINGS, cache=tmp_path / "cache")
+        compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache")
 
 
 @pytest.mark.parametrize("reduction", [0, -4, 3, True])
-def test_reductions_that_make_no_sense(reduction: int) -> None:
+def test_invalid_reductions_are_refused(reduction: int) -> None:
     with pytest.raises(SettingsError, match="reduction: expected a "):
         SilhouetteSettings(reduction=reduction)
 
 
 def test_jobs_below_one(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="jobs: expected a whole number of at least 1, found 0"):
-        compute(_sequence(folder), SETTINGS, cache=tmp_path / "cache", jobs=0)
+        compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=0)
 
 
 def test_cache_that_is_a_file(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "cache").write_text("mine")
     with pytest.raises(OutputError, match="cache: expected a folder to write to, found File exists"):
-        compute(_sequence(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
+        compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
     assert (tmp_path / "cache").read_text() == "mine"
 
 
-def test_remains_of_killed_processes_go_after_a_day(folder: Path, tmp_path: Path) -> None:
+def test_unfinished_folders_of_killed_processes_are_removed_after_a_day(folder: Path, tmp_path: Path) -> None:
     old, young = tmp_path / "cache" / ".a.1.partial", tmp_path / "cache" / ".b.2.partial"
-    for remains in (old, young):
-        remains.mkdir(parents=True)
-        (remains / "zarr.json").write_text("{}")
+    for partial in (old, young):
+        partial.mkdir(parents=True)
+        (partial / "zarr.json").write_text("{}")
     two_days_ago = time.time() - 48 * 3600
     for path in (old / "zarr.json", old):
         os.utime(path, (two_days_ago, two_days_ago))
-    compute(_sequence(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    assert _leftovers(tmp_path / "cache") == [young]
+    compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
+    assert _unfinished_folders(tmp_path / "cache") == [young]
 
 
 # --- other processes ---
 
 
-def _run(
+def _run_program(
     folder: Path,
     cache: Path,
     *,
     before: str = "",
     settings: str = "SETTINGS",
-    fate: str = "pass",
+    action: str = "pass",
     after_frames: int = 0,
 ) -> subprocess.CompletedProcess[str]:
-    """A program that computes the silhouettes of a folder in two processes of its own.
+    """Run a program that computes the silhouettes of a folder in two worker processes.
 
-    It meets its fate by itself, when so many frames were reported: a test that looked for the moment from outside might
-    come too late. It has ended when nobody writes to its stderr any more, which its workers share.
+    The program runs the statement `action` itself after `after_frames` reported frames, because a test that watched the
+    program from outside might react too late. `run` waits until stderr is closed, that is until the program and its
+    workers have ended.
     """
     program = f"""
         import contextlib, os, signal, sys
@@ -362,7 +371,7 @@ def _run(
         signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.path.insert(0, {str(Path(__file__).parent)!r})
         from pathlib import Path
-        from test_silhouettes import SETTINGS, SilhouetteSettings, _sequence, compute
+        from test_silhouettes import SETTINGS, SilhouetteSettings, _make_recording, compute
         {before}
 
         @contextlib.contextmanager
@@ -373,13 +382,13 @@ def _run(
                 nonlocal done
                 done += steps
                 if done >= {after_frames}:
-                    {fate}
+                    {action}
 
             advance(0)
             yield advance
 
         compute(
-            _sequence(Path({str(folder)!r})), {settings}, cache=Path({str(cache)!r}), jobs=2, report=report
+            _make_recording(Path({str(folder)!r})), {settings}, cache=Path({str(cache)!r}), jobs=2, report=report
         )
     """
     return subprocess.run(
@@ -391,66 +400,70 @@ def _run(
     )
 
 
-def _finished(cache: Path) -> list[str]:
-    """Keys of the stored silhouettes."""
+def _stored_keys(cache: Path) -> list[str]:
+    """Return the keys of the stored silhouettes."""
     return [path.name for path in cache.glob("[!.]*")]
 
 
-# Numbers of 120 frames: for each camera, the background is learned from 10 frames, then come 30 frames; a chunk is 25.
+# There are 120 frames in total: each camera has 10 frames to learn the background and 30 frames; a chunk has 25 frames.
 @pytest.mark.parametrize("after_frames", [0, 1, 75, 100])
 @pytest.mark.parametrize("whole_group", [False, True])
-def test_killed_call_resumes(
-    folder: Path, tmp_path: Path, decoded: list[str], after_frames: int, whole_group: bool
+def test_a_killed_computation_is_resumed(
+    folder: Path, tmp_path: Path, decoded_videos: list[str], after_frames: int, whole_group: bool
 ) -> None:
     cache = tmp_path / "cache"
-    whom = "0" if whole_group else "os.getpid()"
-    killed = _run(folder, cache, fate=f"os.kill({whom}, signal.SIGKILL)", after_frames=after_frames)
+    target = "0" if whole_group else "os.getpid()"
+    killed = _run_program(
+        folder, cache, action=f"os.kill({target}, signal.SIGKILL)", after_frames=after_frames
+    )
     assert killed.returncode == -signal.SIGKILL
     if not whole_group:
-        # The workers noticed that their parent has ended, and removed their unfinished folders.
-        assert not _leftovers(cache)
-    sequence = _sequence(folder)
-    keys = {name: silhouette_store.key_of(video, SETTINGS) for name, video in sequence.videos.items()}
-    finished = _finished(cache)
-    resumed = compute(sequence, SETTINGS, cache=cache, jobs=1)
-    assert set(decoded) == {name for name, key in keys.items() if key not in finished}
-    np.testing.assert_array_equal(_all(resumed), _expected(sequence))
+        # The workers notice the end of their parent and remove their unfinished folders.
+        assert not _unfinished_folders(cache)
+    recording = _make_recording(folder)
+    keys = {name: silhouette_store.key_of(video, SETTINGS) for name, video in recording.videos.items()}
+    finished = _stored_keys(cache)
+    resumed = compute(recording, SETTINGS, cache=cache, jobs=1)
+    assert set(decoded_videos) == {name for name, key in keys.items() if key not in finished}
+    np.testing.assert_array_equal(_read_all(resumed), _expected(recording))
 
 
 def test_ctrl_c_leaves_nothing(folder: Path, tmp_path: Path) -> None:
-    interrupted = _run(
+    interrupted = _run_program(
         folder,
         tmp_path / "cache",
-        # Workers that are slow to clear up are not made to end: how long that takes is nothing to this test.
+        # A long grace period keeps slow workers from being killed; their duration is not part of this test.
         before="from psotrack.support import processes; processes.GRACE_S = 3600",
-        fate="os.kill(0, signal.SIGINT)",  # as a terminal does: to the workers too
+        action="os.kill(0, signal.SIGINT)",  # like a terminal, also to the workers
         after_frames=1,
     )
     assert interrupted.returncode == -signal.SIGINT
-    assert interrupted.stderr.count("Traceback") == 1, "the workers end without a word"
-    assert _leftovers(tmp_path / "cache") == []
+    assert interrupted.stderr.count("Traceback") == 1, "the workers print no traceback"
+    assert _unfinished_folders(tmp_path / "cache") == []
 
 
-def test_two_calls_at_once_do_no_harm(folder: Path, tmp_path: Path, decoded: list[str]) -> None:
+def test_two_computations_at_once_do_not_disturb_each_other(
+    folder: Path, tmp_path: Path, decoded_videos: list[str]
+) -> None:
     cache = tmp_path / "cache"
     with ThreadPoolExecutor(2) as threads:
-        both = list(threads.map(lambda _: _run(folder, cache), range(2)))
-    assert [(one.returncode, one.stderr) for one in both] == [(0, "")] * 2
-    assert _leftovers(cache) == []
-    sequence = _sequence(folder)
-    silhouettes = compute(sequence, SETTINGS, cache=cache, jobs=1)
-    assert decoded == []
-    np.testing.assert_array_equal(_all(silhouettes), _expected(sequence))
+        both = list(threads.map(lambda _: _run_program(folder, cache), range(2)))
+    assert [(result.returncode, result.stderr) for result in both] == [(0, "")] * 2
+    assert _unfinished_folders(cache) == []
+    recording = _make_recording(folder)
+    silhouettes = compute(recording, SETTINGS, cache=cache, jobs=1)
+    assert decoded_videos == []
+    np.testing.assert_array_equal(_read_all(silhouettes), _expected(recording))
 
 
 def test_full_disk(folder: Path, tmp_path: Path) -> None:
     cache = tmp_path / "cache"
-    before = _all(compute(_sequence(folder), SETTINGS, cache=cache, jobs=1))
-    full = _run(
+    before = _read_all(compute(_make_recording(folder), SETTINGS, cache=cache, jobs=1))
+    full = _run_program(
         folder,
         cache,
-        # Files are limited to 4 kB, so writing noise fails as on a full disk. Compiled modules are not written, because
-        # they would be cut off too.
+        # Files are limited to 4 kB, so writing noise fails as on a full disk. Bytecode is not written, because the
+        # limit would truncate it too.
         before="import resource, sys; sys.dont_write_bytecode = True; "
         "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))",
         settings="SilhouetteSettings(reduction=2, min_blob_px=0, var_threshold=0.1)",
@@ -458,9 +471,11 @@ def test_full_disk(folder: Path, tmp_path: Path) -> None:
     assert full.returncode == 1
     assert "OutputError" in full.stderr
     assert "expected to write silhouettes, found File too large; what was stored before" in full.stderr
-    assert _leftovers(cache) == []
-    assert len(_finished(cache)) == 3
-    np.testing.assert_array_equal(_all(compute(_sequence(folder), SETTINGS, cache=cache, jobs=1)), before)
+    assert _unfinished_folders(cache) == []
+    assert len(_stored_keys(cache)) == 3
+    np.testing.assert_array_equal(
+        _read_all(compute(_make_recording(folder), SETTINGS, cache=cache, jobs=1)), before
+    )
 
 
 def test_workers_do_not_import_jax() -> None:
@@ -485,12 +500,12 @@ def test_results_come_in_the_order_of_tasks() -> None:
     assert sorted(done) == [1, 3, 4, 5]
 
 
-def test_errors_of_workers_come_as_themselves() -> None:
+def test_errors_of_workers_keep_their_type_and_message() -> None:
     with pytest.raises(SettingsError, match=r"^task: expected a number of at least 0, found -2$"):
         map_in_processes(_double, [1, -2, 3], jobs=2, advance=lambda steps: None)
 
 
-def test_worker_that_dies() -> None:
+def test_a_worker_that_dies_is_an_error() -> None:
     with pytest.raises(
         PsotrackError, match="a worker process: expected a result, found that the process died"
     ):

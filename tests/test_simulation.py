@@ -1,4 +1,4 @@
-"""Simulated sequences on disk: layout, determinism, resuming after any interruption, refusing."""
+"""Simulated sequences on disk: file layout, determinism, resuming after interruptions, and refused input."""
 
 import contextlib
 import errno
@@ -44,7 +44,7 @@ from psotrack.simulation.unfinished import unfinished
 
 NAME = "S02_D4_A"
 SMALL = SimulationSettings(num_frames=3, scale=0.1)
-#: Two cameras and two drones, for tests that interrupt.
+#: A scenario of two cameras and two drones, for the tests that interrupt the simulation.
 PAIR = msgspec.structs.replace(
     replaced(
         scenario(NAME),
@@ -58,8 +58,9 @@ PAIR = msgspec.structs.replace(
     drones=scenario(NAME).drones[:2],
 )
 TINY = SimulationSettings(num_frames=7, scale=0.04)
-#: An encoder of MPEG-4 at its lowest quality in use is above that; a wrong picture is near 15 dB.
-LEAST_PSNR_DB = 28.0
+#: Smallest accepted similarity of a decoded and a rendered frame, dB. The MPEG-4 encoder at its lowest quality in
+#: use is above this limit; a wrong frame is near 15 dB.
+MIN_PSNR_DB = 28.0
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +70,7 @@ def sequence_folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def pair_folder(tmp_path_factory):
-    """What the interrupted ones must come to."""
+    """Folder of an uninterrupted simulation, to which interrupted simulations are compared."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(segments, "SEGMENT_FRAMES", 2)
         return simulate(PAIR, tmp_path_factory.mktemp("pair"), TINY, jobs=1)
@@ -80,7 +81,7 @@ def short_segments(monkeypatch):
     monkeypatch.setattr(segments, "SEGMENT_FRAMES", 2)
 
 
-def contents(folder):
+def read_contents(folder):
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob("*"))
@@ -88,45 +89,45 @@ def contents(folder):
     }
 
 
-def beside(folder):
+def names_in_parent(folder):
     return sorted(path.name for path in folder.parent.iterdir())
 
 
-def test_the_reader_of_the_published_layout_finds_all_of_it(sequence_folder, tmp_path):
+def test_read_sequence_finds_every_file(sequence_folder, tmp_path):
     assert sequence_folder.parts[-2:] == ("Simulated_Data", NAME)
-    sequence = read_sequence(sequence_folder).usable()
-    assert list(sequence.videos) == list(sequence.rig.names)
-    assert [video.path.name for video in sequence.videos.values()] == [f"cam{i}i_s.avi" for i in range(1, 9)]
-    for video in sequence.videos.values():
+    recording = read_sequence(sequence_folder).usable()
+    assert list(recording.videos) == list(recording.rig.names)
+    assert [video.path.name for video in recording.videos.values()] == [f"cam{i}i_s.avi" for i in range(1, 9)]
+    for video in recording.videos.values():
         assert (video.num_frames, video.fps, video.image_size_wh) == (3, 25.0, (192, 108))
     scene = build(scenario(NAME), scale=0.1)
     assert {path.name for path in (sequence_folder / DETECTIONS).iterdir()} == {
         f"cam{i}i_s.csv" for i in range(1, 9)
     }
-    assert set(sequence.onboard) == {"dron1", "dron2", "dron3", "dron4"}
+    assert set(recording.onboard) == {"dron1", "dron2", "dron3", "dron4"}
     for field in ("T_cam_world", "K"):
         np.testing.assert_allclose(
-            getattr(sequence.rig.cameras, field), getattr(scene.rig.cameras, field), atol=1e-9
+            getattr(recording.rig.cameras, field), getattr(scene.rig.cameras, field), atol=1e-9
         )
     markers = read_marker_corners(sequence_folder / MARKER_CORNERS)
     assert set(markers) == set(range(1, 42))
-    assert [path.name for path in sequence_folder.parent.iterdir()] == [NAME], "nothing is left beside it"
+    assert [path.name for path in sequence_folder.parent.iterdir()] == [NAME], "no temporary file is left"
 
 
-def test_the_truth_on_disk_is_the_flight_and_frame_0_has_none(sequence_folder):
+def test_the_ground_truth_is_the_flight_and_is_missing_in_frame_0(sequence_folder):
     truth = read_sequence(sequence_folder).truth
     scene = build(scenario(NAME), scale=0.1)
     assert np.isnan(truth.position_m[0]).all()
     time_s = np.array([1, 2]) / 25
     for drone, flight in enumerate(scene.flights):
-        # Text holds sixteen digits.
+        # The text files hold sixteen digits.
         np.testing.assert_allclose(truth.position_m[1:, drone], flight.position_m(time_s), atol=1e-12)
         np.testing.assert_allclose(
             truth.orientation_wxyz[1:, drone], flight.orientation_wxyz(time_s), atol=1e-9
         )
 
 
-def test_videos_show_what_the_renderers_draw_at_those_frames(sequence_folder):
+def test_videos_show_the_rendered_frames(sequence_folder):
     scene = build(scenario(NAME), scale=0.1)
     drawn = {f"cam{i + 1}i_s.avi": CameraRenderer(scene, i) for i in (1, 6)}
     drawn["dron3_cam_s.avi"] = OnboardRenderer(scene, 2)
@@ -134,63 +135,63 @@ def test_videos_show_what_the_renderers_draw_at_those_frames(sequence_folder):
         frames = list(read_frames(probe(sequence_folder / name)))
         assert len(frames) == 3
         for frame, shown in enumerate(frames):
-            assert cv2.PSNR(shown, renderer.frame(frame)) > LEAST_PSNR_DB
+            assert cv2.PSNR(shown, renderer.frame(frame)) > MIN_PSNR_DB
 
 
-def test_masks_are_what_the_renderer_would_draw_for_every_drone_camera_and_frame(sequence_folder):
+def test_masks_agree_with_the_renderer_for_every_drone_camera_and_frame(sequence_folder):
     scene = build(scenario(NAME), scale=0.1)
     with read_masks(sequence_folder) as masks:
-        assert masks.cameras == tuple(f"{name}i" for name in scene.rig.names)  # named as the files
+        assert masks.cameras == tuple(f"{name}i" for name in scene.rig.names)  # named like the video files
         assert (masks.drones, masks.frames) == ((1, 2, 3, 4), (0, 1, 2))
         for index, camera in enumerate(scene.rig.names):
-            one = CameraRenderer(scene, index)
+            renderer = CameraRenderer(scene, index)
             for frame in masks.frames:
-                numbers = drone_masks(scene, one.cam, one.backdrop.depth_m, frame)
+                numbers = drone_masks(scene, renderer.cam, renderer.backdrop.depth_m, frame)
                 for drone in masks.drones:
                     np.testing.assert_array_equal(masks.mask(camera, drone, frame), numbers == drone)
 
 
-def test_detections_lie_about_the_drones(sequence_folder):
-    sequence = read_sequence(sequence_folder)
-    assert list(sequence.detections) == list(sequence.rig.names)
-    near = total = 0
-    for index, path in enumerate(sequence.detections.values()):
+def test_detections_lie_on_the_drones(sequence_folder):
+    recording = read_sequence(sequence_folder)
+    assert list(recording.detections) == list(recording.rig.names)
+    num_near = num_boxes = 0
+    for index, path in enumerate(recording.detections.values()):
         found = read_detections(path)
         for frame in (1, 2):
-            pixels, _ = project(sequence.rig.cameras[index], sequence.truth.position_m[frame])
+            pixels, _ = project(recording.rig.cameras[index], recording.truth.position_m[frame])
             for box in found.in_frame(frame).xyxy:
                 middle = (box[:2] + box[2:]) / 2 - 0.5
-                total += 1
-                # A box's middle is off the body's origin by a share of its size, jitter and drawing included.
-                near += np.linalg.norm(pixels - middle, axis=-1).min() < np.linalg.norm(box[2:] - box[:2])
-    # 64 drones, boxes of about 10 px: some half are found. A false alarm may be among them.
-    assert total > 15
-    assert near >= total - 2
+                num_boxes += 1
+                # A box's centre differs from the body's origin by less than the box's diagonal.
+                num_near += np.linalg.norm(pixels - middle, axis=-1).min() < np.linalg.norm(box[2:] - box[:2])
+    # About half of the 64 drones, boxes of about 10 px, are detected; at most two boxes may be false detections.
+    assert num_boxes > 15
+    assert num_near >= num_boxes - 2
 
 
-def test_mocap_markers_go_with_the_poses(sequence_folder):
+def test_mocap_markers_lie_above_the_drones(sequence_folder):
     truth = read_sequence(sequence_folder).truth
     for drone in range(4):
         markers = read_mocap_markers(sequence_folder / f"dron{drone + 1}_markers_25.csv")
         assert markers.shape == (3, 4, 3)
-        # The cross is above the body, some centimetres to a decimetre from its origin.
+        # The marker cross is above the body, at most 0.35 m from the body's origin.
         offset = markers[1:] - truth.position_m[1:, drone, None]
         assert np.all(np.linalg.norm(offset, axis=-1) < 0.35)
         assert np.all(offset[..., 2] > 0)
 
 
-def test_the_record_says_how_to_make_it_again(sequence_folder):
+def test_the_record_holds_all_inputs_of_the_simulation(sequence_folder):
     record = json.loads((sequence_folder / "simulation.json").read_text())
     assert {key: record[key] for key in ("frames", "scale", "seed", "masks", "onboard")} == {
         "frames": 3, "scale": 0.1, "seed": 0, "masks": True, "onboard": True,
     }  # fmt: skip
-    # With other versions an unfinished sequence is begun anew: its halves might differ.
+    # Another version starts an unfinished sequence again, because its two halves might differ.
     assert record["version"] == __version__
     assert record["libraries"] == {"numpy": np.__version__, "opencv": cv2.__version__}
     assert msgspec.convert(record["scenario"], type(PAIR)) == scenario(NAME)
 
 
-def test_the_record_knows_the_files_that_a_scenario_names(tmp_path):
+def test_the_record_holds_digests_of_the_files_of_the_scenario(tmp_path):
     path = tmp_path / "hover.csv"
     rows = [f"{k / 10},0.0,0.0,1.5" for k in range(40)]
     path.write_text("\n".join(["time_s,x_m,y_m,z_m", *rows]) + "\n")
@@ -202,47 +203,49 @@ def test_the_record_knows_the_files_that_a_scenario_names(tmp_path):
     assert record["sha256"] == {str(path): hashlib.sha256(path.read_bytes()).hexdigest()}
 
 
-def test_parts_can_be_left_out(tmp_path):
+def test_masks_and_onboard_videos_can_be_left_out(tmp_path):
     folder = simulate(
         PAIR, tmp_path, SimulationSettings(num_frames=1, scale=0.04, masks=False, onboard=False), jobs=1
     )
-    names = set(contents(folder))
+    names = set(read_contents(folder))
     assert "cam1i_s.avi" in names
     assert "dl_data/cam1i_s.csv" in names
     assert not any("mask" in name or "_cam" in name or name.startswith("drone") for name in names)
 
 
-def test_another_rate_is_in_the_names_and_is_read(tmp_path):
+def test_the_frame_rate_stands_in_file_names_and_is_read_back(tmp_path):
     folder = simulate(
         replaced(PAIR, {"fps": 12.5}), tmp_path, SimulationSettings(num_frames=2, scale=0.04), jobs=1
     )
-    assert {"dron1_pos_12.5.csv", "dron1_markers_12.5.csv", "dron1_cam_12.5.csv"} <= set(contents(folder))
-    sequence = read_sequence(folder)
-    assert sequence.videos["cam1"].fps == 12.5
-    assert sequence.truth.time_s.tolist() == [0.0, 0.08]
-    assert np.isfinite(sequence.onboard["dron1"].position_m[1]).all()
+    assert {"dron1_pos_12.5.csv", "dron1_markers_12.5.csv", "dron1_cam_12.5.csv"} <= set(
+        read_contents(folder)
+    )
+    recording = read_sequence(folder)
+    assert recording.videos["cam1"].fps == 12.5
+    assert recording.truth.time_s.tolist() == [0.0, 0.08]
+    assert np.isfinite(recording.onboard["dron1"].position_m[1]).all()
 
 
-def test_fewer_frames_are_the_first_of_the_same_flight(sequence_folder):
+def test_fewer_frames_are_the_first_frames_of_the_same_flight(sequence_folder):
     longer = build(scenario(NAME), scale=0.1).positions_m(250)
     truth = read_sequence(sequence_folder).truth
     np.testing.assert_allclose(truth.position_m[1:], longer[1:3], atol=1e-12)
 
 
-def test_scale_keeps_the_world_and_shrinks_the_pictures():
+def test_scale_keeps_the_world_and_shrinks_the_images():
     large, small = (build(scenario(NAME), scale=scale) for scale in (1.0, 0.3))
     np.testing.assert_array_equal(large.positions_m(5), small.positions_m(5))
     np.testing.assert_array_equal(large.rig.cameras.T_cam_world, small.rig.cameras.T_cam_world)
     assert large.rig.cameras.K[0].tolist() == [[1156.3, 0, 960], [0, 1156.3, 540], [0, 0, 1]]
-    # A point's distance from the corner of the image, which is at -0.5, shrinks by the scale.
+    # The image's corner is at -0.5 px, and the distance of a point from that corner shrinks by the scale.
     np.testing.assert_allclose(small.rig.cameras.K[0, :2, 2] + 0.5, 0.3 * np.array([960.5, 540.5]))
     assert np.all(small.rig.cameras.image_size_wh % 2 == 0)
 
 
-def test_segments_change_no_truth_and_no_picture_before_the_codec(pair_folder, tmp_path):
-    """In one piece, the codec sees other neighbours; everything else is the same to the byte."""
-    whole = contents(simulate(PAIR, tmp_path, TINY, jobs=1))
-    parts = contents(pair_folder)
+def test_segments_change_only_the_encoded_videos(pair_folder, tmp_path):
+    """A video that is encoded in segments differs in bytes; all other files are equal to the byte."""
+    whole = read_contents(simulate(PAIR, tmp_path, TINY, jobs=1))
+    parts = read_contents(pair_folder)
     assert whole.keys() == parts.keys()
     assert {name for name in whole if whole[name] != parts[name]} == {
         "cam1i_s.avi", "cam2i_s.avi", "dron1_cam_s.avi", "dron2_cam_s.avi",
@@ -251,18 +254,18 @@ def test_segments_change_no_truth_and_no_picture_before_the_codec(pair_folder, t
 
 @pytest.mark.usefixtures("short_segments")
 def test_the_number_of_jobs_changes_no_byte(pair_folder, tmp_path):
-    assert contents(simulate(PAIR, tmp_path, TINY, jobs=2)) == contents(pair_folder)
+    assert read_contents(simulate(PAIR, tmp_path, TINY, jobs=2)) == read_contents(pair_folder)
 
 
 # --- interruptions
 
 
-def interrupting(after_frames):
-    """A report that is Ctrl-C after so many frames."""
+def interrupt_after(after_frames):
+    """Return a progress report that raises KeyboardInterrupt (Ctrl-C) after `after_frames` frames."""
     done = 0
 
     @contextlib.contextmanager
-    def report(description, total):
+    def report(description, num_boxes):
         def advance(steps):
             nonlocal done
             done += steps
@@ -275,31 +278,33 @@ def interrupting(after_frames):
 
 
 @pytest.mark.usefixtures("short_segments")
-def test_an_interrupted_call_goes_on_with_the_segment_where_it_stopped(pair_folder, tmp_path):
-    place = tmp_path / "Simulated_Data"
+def test_an_interrupted_simulation_continues_at_its_segment(pair_folder, tmp_path):
+    parent = tmp_path / "Simulated_Data"
     with pytest.raises(KeyboardInterrupt):
-        simulate(PAIR, tmp_path, TINY, jobs=1, report=interrupting(12))
-    assert [path.name for path in place.iterdir()] == [f".{NAME}.unfinished"]
-    # Seven frames of one camera, and five of the next: its segments of frames 0-1 and 2-3.
-    kept = {path: path.stat().st_mtime_ns for path in place.rglob("video.avi")}
+        simulate(PAIR, tmp_path, TINY, jobs=1, report=interrupt_after(12))
+    assert [path.name for path in parent.iterdir()] == [f".{NAME}.unfinished"]
+    # Seven frames of the first camera, and the segments of frames 0-1 and 2-3 of the second camera.
+    kept = {path: path.stat().st_mtime_ns for path in parent.rglob("video.avi")}
     assert sorted("/".join(path.parts[-3:-1]) for path in kept) == [
         *(f"cam1i/{start:06d}" for start in (0, 2, 4, 6)), *(f"cam2i/{start:06d}" for start in (0, 2)),
     ]  # fmt: skip
-    assert not list(place.rglob("*.partial*"))
+    assert not list(parent.rglob("*.partial*"))
     with pytest.raises(KeyboardInterrupt):
-        # What is there is counted at once.
-        simulate(PAIR, tmp_path, TINY, jobs=1, report=interrupting(12))
-    assert kept == {path: path.stat().st_mtime_ns for path in place.rglob("video.avi")}
+        # The existing frames are reported as done at the start, which raises the interruption.
+        simulate(PAIR, tmp_path, TINY, jobs=1, report=interrupt_after(12))
+    assert kept == {path: path.stat().st_mtime_ns for path in parent.rglob("video.avi")}
     folder = simulate(PAIR, tmp_path, TINY, jobs=1)
-    assert contents(folder) == contents(pair_folder)
-    assert beside(folder) == [NAME]
+    assert read_contents(folder) == read_contents(pair_folder)
+    assert names_in_parent(folder) == [NAME]
 
 
 @pytest.mark.usefixtures("short_segments")
 @pytest.mark.parametrize("step", ["join_videos", "join_archives", "write_onboard_calibration", "rmtree"])
-def test_an_interruption_after_the_last_frame_costs_no_frame(pair_folder, tmp_path, monkeypatch, step):
-    """While videos or masks are joined, tables written, segments cleared away."""
-    places = {
+def test_an_interruption_after_the_last_frame_renders_no_frame_again(
+    pair_folder, tmp_path, monkeypatch, step
+):
+    """The interruption comes while videos or masks are joined, tables are written, or segments are removed."""
+    targets = {
         "join_videos": "psotrack.simulation.segments.join_videos",
         "join_archives": "psotrack.simulation.segments.join_archives",
         "write_onboard_calibration": "psotrack.simulation.generate.write_onboard_calibration",
@@ -310,19 +315,20 @@ def test_an_interruption_after_the_last_frame_costs_no_frame(pair_folder, tmp_pa
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(places[step], interrupt)
+        patch.setattr(targets[step], interrupt)
         with pytest.raises(KeyboardInterrupt):
             simulate(PAIR, tmp_path, TINY, jobs=1)
-    # What is joined is not on the disk twice.
+    # Segments are removed after joining, so that no frame is on the disk twice.
     assert bool(list(tmp_path.rglob("video.avi"))) == step.startswith("join")
     monkeypatch.setattr("psotrack.simulation.segments.CameraRenderer", interrupt)
     folder = simulate(PAIR, tmp_path, TINY, jobs=1)
-    assert contents(folder) == contents(pair_folder)
-    assert beside(folder) == [NAME]
+    assert read_contents(folder) == read_contents(pair_folder)
+    assert names_in_parent(folder) == [NAME]
 
 
-#: Simulates into a folder, with so many jobs; kills itself some time after so many frames, or with the frame after.
-KILLED = """
+#: Script that simulates into a folder with `jobs` processes and kills itself `delay_s` seconds after `frames` frames,
+#: or at the next frame if that comes earlier.
+KILLED_SCRIPT = """
     import contextlib
     import os
     import signal
@@ -359,36 +365,36 @@ KILLED = """
 
 @pytest.mark.usefixtures("short_segments")
 @pytest.mark.slow
-def test_killed_at_random_moments_it_comes_to_the_same_bytes(pair_folder, tmp_path):
-    (tmp_path / "run.py").write_text(textwrap.dedent(KILLED))
+def test_a_simulation_killed_at_random_moments_ends_with_the_same_bytes(pair_folder, tmp_path):
+    (tmp_path / "run.py").write_text(textwrap.dedent(KILLED_SCRIPT))
     rng = np.random.default_rng(0)
-    place = tmp_path / "Simulated_Data"
+    parent = tmp_path / "Simulated_Data"
     made = [0]
     for jobs in (2, 1):
-        # Some frames more than there were at its start, and some fraction of the next.
+        # The process is killed a few frames after the frames that existed at its start, plus a random delay.
         moment = 2 * made[-1] + rng.integers(4, 9), rng.uniform(0, 0.04)
         command = [sys.executable, tmp_path / "run.py", tmp_path, *map(str, (jobs, *moment))]
-        # It has ended when nobody has its stderr any more, which its workers share.
+        # `run` waits until stderr is closed, that is until the process and all of its workers have ended.
         killed = subprocess.run(command, input=msgspec.json.encode(PAIR), capture_output=True, check=False)
         assert killed.returncode == -signal.SIGKILL, killed
-        # The lock's file stays, but its lock has ended with the process.
-        assert sorted(path.name for path in place.iterdir()) == [f".{NAME}.lock", f".{NAME}.unfinished"]
-        made.append(len(list(place.rglob("[0-9]*/video.avi"))))
-    assert made[-1] > 1, "what was whole has been kept"
-    assert contents(simulate(PAIR, tmp_path, TINY, jobs=1)) == contents(pair_folder)
-    assert [path.name for path in place.iterdir()] == [NAME]
+        # The lock file remains, but the lock ended with the process.
+        assert sorted(path.name for path in parent.iterdir()) == [f".{NAME}.lock", f".{NAME}.unfinished"]
+        made.append(len(list(parent.rglob("[0-9]*/video.avi"))))
+    assert made[-1] > 1, "complete segments are kept"
+    assert read_contents(simulate(PAIR, tmp_path, TINY, jobs=1)) == read_contents(pair_folder)
+    assert [path.name for path in parent.iterdir()] == [NAME]
 
 
 @pytest.mark.usefixtures("short_segments")
-def test_a_death_between_the_two_moves_of_a_replacement_loses_nothing(pair_folder, tmp_path):
-    """With --force the old sequence steps aside first: whoever comes next puts it back."""
+def test_a_kill_between_the_two_moves_of_a_replacement_loses_nothing(pair_folder, tmp_path):
+    """--force first renames the old sequence; after a kill, the next call restores the old sequence."""
     folder = tmp_path / "Simulated_Data" / NAME
     aside = folder.with_name(f".{NAME}.old")
     shutil.copytree(pair_folder, aside)
     with pytest.raises(OutputError, match="expected a path that does not exist yet, found an existing"):
         simulate(PAIR, tmp_path, replace(TINY, seed=1), jobs=1)
-    assert contents(folder) == contents(pair_folder)
-    assert beside(folder) == [NAME]
+    assert read_contents(folder) == read_contents(pair_folder)
+    assert names_in_parent(folder) == [NAME]
 
 
 def test_a_replacement_that_cannot_be_moved_leaves_the_old_sequence(pair_folder, tmp_path, monkeypatch):
@@ -405,19 +411,19 @@ def test_a_replacement_that_cannot_be_moved_leaves_the_old_sequence(pair_folder,
         OutputError, match=r"S02_D4_A: expected a path that can be written, found Input/output error"
     ):
         simulate(PAIR, tmp_path, SimulationSettings(num_frames=1, scale=0.04), jobs=1, force=True)
-    assert contents(folder) == contents(pair_folder)
-    assert beside(folder) == [f".{NAME}.unfinished", NAME]
+    assert read_contents(folder) == read_contents(pair_folder)
+    assert names_in_parent(folder) == [f".{NAME}.unfinished", NAME]
 
 
 @pytest.mark.usefixtures("short_segments")
 @pytest.mark.parametrize("other", [{"seed": 5}, {"num_frames": 6}])
-def test_what_other_settings_left_unfinished_is_not_used(pair_folder, tmp_path, other):
+def test_segments_of_other_settings_are_not_used(pair_folder, tmp_path, other):
     with pytest.raises(KeyboardInterrupt):
-        simulate(PAIR, tmp_path, replace(TINY, **other), jobs=1, report=interrupting(4))
-    assert contents(simulate(PAIR, tmp_path, TINY, jobs=1)) == contents(pair_folder)
+        simulate(PAIR, tmp_path, replace(TINY, **other), jobs=1, report=interrupt_after(4))
+    assert read_contents(simulate(PAIR, tmp_path, TINY, jobs=1)) == read_contents(pair_folder)
 
 
-def test_a_worker_that_outlives_its_call_leaves_nothing_to_another_record(tmp_path):
+def test_different_records_have_different_segment_folders(tmp_path):
     folders = []
     for record in (b"one", b"other"):
         with unfinished(tmp_path / NAME, record, force=False) as growing:
@@ -425,27 +431,27 @@ def test_a_worker_that_outlives_its_call_leaves_nothing_to_another_record(tmp_pa
     assert folders[0] != folders[1]
 
 
-def test_two_calls_at_once_do_not_meet(tmp_path):
+def test_a_second_simulation_of_the_same_sequence_is_refused(tmp_path):
     folder = tmp_path / "Simulated_Data" / NAME
-    with unfinished(folder, b"somebody else's", force=False) as growing:
+    with unfinished(folder, b"another record", force=False) as growing:
         (growing.folder / "half").write_text("")
         message = r"S02_D4_A: expected to be the only one who writes it, found another simulation at work on it; wait"
         with pytest.raises(OutputError, match=message):
             simulate(PAIR, tmp_path, TINY, jobs=1)
         assert (growing.folder / "half").exists()
-    # A lock ends with whoever held it.
+    # The lock ended with the other simulation, so a new simulation can start.
     simulate(PAIR, tmp_path, SimulationSettings(num_frames=1, scale=0.04), jobs=1)
-    assert beside(folder) == [NAME]
+    assert names_in_parent(folder) == [NAME]
 
 
 def test_the_simulator_is_imported_where_there_is_no_fcntl():
-    """As on Windows."""
+    """Windows has no module `fcntl`."""
     code = "import sys; sys.modules['fcntl'] = None; from psotrack.simulation import simulate"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.parametrize("code", [errno.ENOLCK, errno.EIO])
-def test_a_file_system_without_locks_keeps_nobody_out_and_a_broken_one_is_named(tmp_path, monkeypatch, code):
+def test_a_file_system_without_locks_is_accepted_and_a_broken_one_is_an_error(tmp_path, monkeypatch, code):
     def fail(descriptor, operation):
         raise OSError(code, os.strerror(code))
 
@@ -458,8 +464,8 @@ def test_a_file_system_without_locks_keeps_nobody_out_and_a_broken_one_is_named(
         assert growing.folder.is_dir()
 
 
-def test_a_full_disk_leaves_no_sequence_and_keeps_what_was_whole(pair_folder, tmp_path, monkeypatch):
-    """A file size limit stands for the full disk."""
+def test_a_full_disk_leaves_no_sequence_and_keeps_complete_segments(pair_folder, tmp_path, monkeypatch):
+    """A limit on the file size stands for a full disk."""
     script = textwrap.dedent(
         """
         import resource, sys
@@ -468,7 +474,7 @@ def test_a_full_disk_leaves_no_sequence_and_keeps_what_was_whole(pair_folder, tm
         from psotrack.errors import OutputError
         from psotrack.simulation import Scenario, SimulationSettings, segments, simulate
         segments.SEGMENT_FRAMES = 2
-        sys.dont_write_bytecode = True  # a cached module would be cut off too, for everybody
+        sys.dont_write_bytecode = True  # the limit would truncate the bytecode of other processes too
         resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
         recipe = msgspec.json.decode(sys.stdin.buffer.read(), type=Scenario)
         try:
@@ -477,7 +483,7 @@ def test_a_full_disk_leaves_no_sequence_and_keeps_what_was_whole(pair_folder, tm
             print(error)
         """
     )
-    # Segments of a few kilobytes fit, joined videos do not.
+    # The limit is above the size of a segment (a few kilobytes) and below the size of a joined video.
     limit = str((pair_folder / "cam1i_s.avi").stat().st_size - 1000)
     command = [sys.executable, "-c", script, tmp_path, limit]
     done = subprocess.run(command, input=msgspec.json.encode(PAIR), capture_output=True)
@@ -485,25 +491,25 @@ def test_a_full_disk_leaves_no_sequence_and_keeps_what_was_whole(pair_folder, tm
     assert done.stdout.count(b"\n") == 1
     assert not (tmp_path / "Simulated_Data" / NAME).exists()
     monkeypatch.setattr(segments, "SEGMENT_FRAMES", 2)
-    assert contents(simulate(PAIR, tmp_path, TINY, jobs=1)) == contents(pair_folder)
+    assert read_contents(simulate(PAIR, tmp_path, TINY, jobs=1)) == read_contents(pair_folder)
 
 
 # --- refusals
 
 
-def test_a_sequence_that_exists_is_left_alone_unless_forced(pair_folder, tmp_path):
+def test_an_existing_sequence_is_replaced_only_by_force(pair_folder, tmp_path):
     folder = shutil.copytree(pair_folder, tmp_path / "Simulated_Data" / NAME)
-    before = contents(folder)
+    before = read_contents(folder)
     with pytest.raises(
         OutputError,
         match=r"S02_D4_A: expected a path that does not exist yet, found an existing folder; pass --force",
     ):
         simulate(PAIR, tmp_path, TINY, jobs=1)
     with pytest.raises(KeyboardInterrupt):
-        simulate(PAIR, tmp_path, replace(TINY, seed=1), jobs=1, force=True, report=interrupting(2))
-    assert contents(folder) == before, "until the new one is whole, the old one stays"
+        simulate(PAIR, tmp_path, replace(TINY, seed=1), jobs=1, force=True, report=interrupt_after(2))
+    assert read_contents(folder) == before, "the old sequence stays until the new sequence is complete"
     simulate(PAIR, tmp_path, replace(TINY, seed=1), jobs=1, force=True)
-    after = contents(folder)
+    after = read_contents(folder)
     assert after.keys() == before.keys()
     assert after["dron1_pos_25.csv"] != before["dron1_pos_25.csv"]
     assert after["cam1i_s.avi"] != before["cam1i_s.avi"]
@@ -529,7 +535,7 @@ def test_a_sequence_that_exists_is_left_alone_unless_forced(pair_folder, tmp_pat
         ({"jobs": 0}, r"^jobs: expected 1 or more, found 0$"),
     ],
 )  # fmt: skip
-def test_settings_that_make_no_sense_are_refused_before_anything_is_written(settings, message, tmp_path):
+def test_invalid_settings_are_refused_before_anything_is_written(settings, message, tmp_path):
     recipe, jobs = settings.get("scenario", NAME), settings.get("jobs")
     settings = replace(SMALL, **{name: settings[name] for name in settings.keys() - {"scenario", "jobs"}})
     with pytest.raises(SettingsError, match=message):
@@ -537,20 +543,20 @@ def test_settings_that_make_no_sense_are_refused_before_anything_is_written(sett
     assert not list(tmp_path.iterdir())
 
 
-def test_the_largest_images_are_the_largest_that_a_video_takes(tmp_path):
+def test_the_size_limit_of_images_is_the_limit_of_the_video_writer(tmp_path):
     with VideoWriter(tmp_path / "fits.avi", 25.0, (8190, 32)) as video:
         video.write(np.zeros((32, 8190, 3), np.uint8))
     with pytest.raises(OutputError), VideoWriter(tmp_path / "wide.avi", 25.0, (8192, 32)):
         pass
 
 
-def test_a_place_that_cannot_be_written_is_named(tmp_path):
+def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "Simulated_Data").write_text("a file where the folder should be")
     with pytest.raises(OutputError, match=r"Simulated_Data"):
         simulate(NAME, tmp_path, SMALL, jobs=1)
 
 
-def test_a_file_of_the_scenario_that_is_missing_is_named(tmp_path):
+def test_a_missing_file_of_the_scenario_is_named(tmp_path):
     recipe = replaced(PAIR, {"drones[0].model": {"file": str(tmp_path / "none.ply")}})
     with pytest.raises(InputError, match=r"none\.ply"):
         simulate(recipe, tmp_path, TINY)
@@ -558,13 +564,13 @@ def test_a_file_of_the_scenario_that_is_missing_is_named(tmp_path):
 
 
 def test_progress_counts_every_frame_of_every_video(tmp_path):
-    counted = []
+    progress = []
 
     @contextlib.contextmanager
-    def report(description, total):
-        counted.append(total)
-        yield lambda steps: counted.append(-steps)
+    def report(description, num_boxes):
+        progress.append(num_boxes)
+        yield lambda steps: progress.append(-steps)
 
     simulate(PAIR, tmp_path, SimulationSettings(num_frames=2, scale=0.05), jobs=1, report=report)
-    assert counted[0] == 2 * (2 + 2)
-    assert sum(counted) == 0
+    assert progress[0] == 2 * (2 + 2)
+    assert sum(progress) == 0

@@ -1,4 +1,4 @@
-"""Drone models and meshes against trimesh, OpenCV's polygons, and the files that trimesh writes."""
+"""Drone models and meshes, compared with trimesh, OpenCV's polygons, and files that trimesh writes."""
 
 import itertools
 import subprocess
@@ -29,15 +29,15 @@ def as_trimesh(triangles):
 # --- the five models
 
 
-def test_there_are_five_and_an_unknown_one_is_refused_with_their_names():
+def test_there_are_five_models_and_an_unknown_name_is_refused():
     assert list(drones.MODELS) == ["x_frame", "x_frame_racer", "camera_drone", "hexacopter", "tall_cross"]
     with pytest.raises(SettingsError, match=r"x_frame_racer.*found quadcopter"):
         drones.model("quadcopter")
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_every_part_is_closed_and_faces_outwards(name):
-    """Oracle: trimesh's edges and volumes, part by part."""
+def test_every_part_is_a_closed_surface_that_faces_outwards(name):
+    """The oracle is trimesh, which computes the edges and the volume of each part."""
     parts = as_trimesh(MODELS[name].triangles_m).split(only_watertight=False)
     assert len(parts) > 10
     for part in parts:
@@ -58,12 +58,12 @@ def test_every_part_is_closed_and_faces_outwards(name):
         ("tall_cross", 4, 0.40, 0.58),
     ],
 )
-def test_models_are_of_the_size_that_they_state(name, rotors, motor_to_motor_m, over_all_m):
+def test_models_have_their_stated_sizes(name, rotors, motor_to_motor_m, over_all_m):
     model = MODELS[name]
-    hubs = model.rotor_centres_m
-    assert len(hubs) == rotors
-    widest = max(np.linalg.norm(a - b) for a, b in itertools.combinations(hubs, 2))
-    assert widest == pytest.approx(motor_to_motor_m, abs=0.005)  # stated to the centimetre
+    rotor_centres_m = model.rotor_centres_m
+    assert len(rotor_centres_m) == rotors
+    widest = max(np.linalg.norm(a - b) for a, b in itertools.combinations(rotor_centres_m, 2))
+    assert widest == pytest.approx(motor_to_motor_m, abs=0.005)  # stated sizes are rounded to 0.01 m
     points = np.concatenate([model.triangles_m, drones.disc_fans(model)]).reshape(-1, 3)
     assert np.ptp(points, axis=0).max() == pytest.approx(over_all_m, abs=0.006)
     assert np.linalg.norm(points, axis=-1).max() <= model.radius_m + 1e-12
@@ -74,7 +74,7 @@ def test_rotors_turn_above_their_motors_without_touching_each_other(name):
     model = MODELS[name]
     vertices = model.triangles_m.reshape(-1, 3)
     for hub, radius in zip(model.rotor_centres_m, model.rotor_radii_m, strict=True):
-        # The hub's cap is a cylinder of 6 mm around it.
+        # The rotor's cap is a cylinder with a radius of 6 mm around the rotor's centre.
         assert np.linalg.norm(vertices - hub, axis=-1).min() < 0.008
         swept = np.linalg.norm(vertices[:, :2] - hub[:2], axis=-1) < radius
         own_motor = np.linalg.norm(vertices[:, :2] - hub[:2], axis=-1) < 0.02
@@ -86,7 +86,7 @@ def test_rotors_turn_above_their_motors_without_touching_each_other(name):
         assert apart or abs(a[2] - b[2]) > 0.01
 
 
-def test_discs_have_each_rotors_own_radius():
+def test_each_rotor_disc_has_the_radius_of_its_rotor():
     model = drones.DroneModel(
         shapes.box((0.0, 0.0, 0.0), (0.1, 0.1, 0.1)),
         np.ones(12),
@@ -102,8 +102,8 @@ def test_discs_have_each_rotors_own_radius():
     assert model.radius_m == pytest.approx(np.hypot(0.3, np.hypot(0.1, 0.2)) + 0.4)
 
 
-def outline(model, azimuth_deg, elevation_deg, size_px=64):
-    """Its shape alone: the parallel projection, brought to one size and the middle of an image."""
+def draw_outline(model, azimuth_deg, elevation_deg, size_px=64):
+    """Draw the parallel projection of a model, scaled to a fixed size and centred in a square image."""
     azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     up = np.array(
@@ -121,34 +121,36 @@ def outline(model, azimuth_deg, elevation_deg, size_px=64):
 @pytest.mark.parametrize(("elevation_deg", "limit"), [(0.0, 0.62), (25.0, 0.78)])
 @pytest.mark.parametrize("pair", list(itertools.combinations(MODELS, 2)), ids=" ".join)
 def test_silhouettes_differ_in_shape_not_only_in_size(pair, elevation_deg, limit):
-    """The best overlap (IoU) of two models over headings, seen from the side and as cameras look down on them."""
+    """The largest overlap (IoU) of two models over all headings is limited, from the side and from above."""
     first, second = (MODELS[name] for name in pair)
     overlaps = []
     for azimuth, other_azimuth in itertools.product((0.0, 20.0, 40.0), range(0, 360, 15)):
-        one, other = (
-            outline(first, azimuth, elevation_deg),
-            outline(second, float(other_azimuth), elevation_deg),
+        first_outline, second_outline = (
+            draw_outline(first, azimuth, elevation_deg),
+            draw_outline(second, float(other_azimuth), elevation_deg),
         )
-        overlaps.append((one & other).sum() / (one | other).sum())
-    # Measured: at most 0.57 from the side (hexacopter and tall_cross), 0.74 from above (x_frame and tall_cross).
+        overlaps.append((first_outline & second_outline).sum() / (first_outline | second_outline).sum())
+    # Largest measured overlaps: 0.57 from the side (hexacopter, tall_cross), 0.74 from above (x_frame, tall_cross).
     assert max(overlaps) < limit
 
 
 # --- markers
 
 
-def pairwise_m(cross):
+def pairwise_distances_m(cross):
     return np.sort([np.linalg.norm(a - b) for a, b in itertools.combinations(cross, 2)])
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_crosses_of_markers_are_asymmetric_and_tell_ten_drones_apart(name):
+def test_marker_crosses_are_asymmetric_and_differ_between_ten_drones(name):
     crosses = [drones.marker_cross(MODELS[name], number) for number in range(1, 11)]
     for cross in crosses:
-        assert np.diff(pairwise_m(cross)).min() > 0.012  # as their table says
-    # Whatever rotates, moves or mirrors a cross keeps its distances: one of the six must differ.
+        assert (
+            np.diff(pairwise_distances_m(cross)).min() > 0.012
+        )  # the value that the table of crosses states
+    # Rotating, moving or mirroring a cross keeps its six distances, so at least one distance must differ.
     for a, b in itertools.combinations(crosses, 2):
-        assert np.abs(pairwise_m(a) - pairwise_m(b)).max() > 0.019  # 20 mm, rounded
+        assert np.abs(pairwise_distances_m(a) - pairwise_distances_m(b)).max() > 0.019  # 20 mm, rounded
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -157,7 +159,7 @@ def test_markers_form_a_cross_on_top_of_the_drone(name):
     a, b, c, d = drones.marker_cross(model, 3)
     top = model.triangles_m[..., 2].max()
     assert np.all(np.array([a, b, c, d])[:, 2] > top)
-    # A ahead, C behind it, B to the left, D to the right; arms cross at right angles above the origin.
+    # A is in front, C behind, B to the left, D to the right; the arms cross at right angles above the origin.
     assert a[0] > 0 > c[0]
     assert b[1] > 0 > d[1]
     np.testing.assert_array_equal([a[1], c[1], b[0], d[0]], 0.0)
@@ -168,7 +170,7 @@ def test_markers_form_a_cross_on_top_of_the_drone(name):
 
 @pytest.fixture
 def cube(tmp_path):
-    """Writes a cube of 0.2 m as trimesh exports it; returns the path and its triangles."""
+    """Return a function that lets trimesh export a cube of 0.2 m and returns the file's path and the triangles."""
 
     def write(suffix, scale=1.0, **options):
         shape = trimesh.creation.box((0.2 * scale, 0.2 * scale, 0.2 * scale))
@@ -179,7 +181,7 @@ def cube(tmp_path):
     return write
 
 
-KINDS = {
+MESH_FORMATS = {
     "obj": (".obj", {}),
     "ply": (".ply", {}),
     "ply ascii": (".ply", {"encoding": "ascii"}),
@@ -187,13 +189,13 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_mesh_that_was_exported_comes_back_with_the_same_triangles(kind, tmp_path):
-    suffix, options = KINDS[kind]
+@pytest.mark.parametrize("mesh_format", MESH_FORMATS)
+def test_an_exported_mesh_is_read_with_the_same_triangles(mesh_format, tmp_path):
+    suffix, options = MESH_FORMATS[mesh_format]
     written = as_trimesh(MODELS["hexacopter"].triangles_m)
     written.export(tmp_path / f"drone{suffix}", **options)
     model = drones.model(Mesh(file=str(tmp_path / f"drone{suffix}")))
-    # PLY holds float32, OBJ eight decimals: some 1e-8 m.
+    # PLY holds float32 and OBJ eight decimals, so coordinates are exact to about 1e-8 m.
     np.testing.assert_allclose(model.triangles_m, written.triangles, atol=4e-8)
     np.testing.assert_array_equal(model.paint, 1.0)
     assert model.rotor_centres_m.shape == (0, 3)
@@ -201,9 +203,9 @@ def test_a_mesh_that_was_exported_comes_back_with_the_same_triangles(kind, tmp_p
     assert model.radius_m == pytest.approx(np.linalg.norm(written.vertices, axis=-1).max(), abs=1e-7)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_scale_origin_and_rotors_are_exact(kind, cube):
-    suffix, options = KINDS[kind]
+@pytest.mark.parametrize("mesh_format", MESH_FORMATS)
+def test_scale_origin_and_rotors_are_exact(mesh_format, cube):
+    suffix, options = MESH_FORMATS[mesh_format]
     path, triangles = cube(suffix, scale=1280.0, **options)  # 256 units: exact in every format
     rotors = (
         Rotor(centre_m=(0.1, 0.2, 0.3), radius_m=0.05),
@@ -215,7 +217,7 @@ def test_scale_origin_and_rotors_are_exact(kind, cube):
     np.testing.assert_array_equal(model.rotor_radii_m, [0.05, 0.07])
 
 
-def test_polygons_materials_parts_and_odd_encodings_are_read(tmp_path, capfd):
+def test_polygons_materials_parts_and_latin_1_are_read(tmp_path, capfd):
     path = tmp_path / "drone.obj"
     text = """# Fl\xfcgel
 mtllib missing.mtl
@@ -236,7 +238,7 @@ f 1 1 2
     model = drones.model(Mesh(file=str(path)))
     a, b, c = model.triangles_m.swapaxes(0, 1)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=-1) / 2
-    # The pentagon, a square with a roof, and the triangle that is half of the square; the one without area is gone.
+    # The pentagon is a square and a roof, the triangle is half of the square, and the face without area is dropped.
     assert len(area) == 4
     assert area.sum() == pytest.approx(0.25 + 0.0625 + 0.125)
     assert capfd.readouterr() == ("", "")
@@ -298,13 +300,13 @@ _TRIANGLE = "v 0 0 0\nv 0.3 0 0\nv 0 0.3 0\n"
         ),
     ],
 )
-def test_what_is_no_drone_is_refused_in_one_line(name, content, message, tmp_path, capfd):
+def test_files_that_hold_no_drone_are_refused_in_one_line(name, content, message, tmp_path, capfd):
     path = tmp_path / name
     path.write_text(content)
-    with pytest.raises(InputError, match=message) as caught:
+    with pytest.raises(InputError, match=message) as error_info:
         drones.model(Mesh(file=str(path)))
-    assert str(caught.value).startswith(f"{path}: ")
-    assert "\n" not in str(caught.value)
+    assert str(error_info.value).startswith(f"{path}: ")
+    assert "\n" not in str(error_info.value)
     assert capfd.readouterr() == ("", "")
 
 
@@ -322,7 +324,7 @@ def test_rotors_in_the_units_of_the_mesh_are_refused(rotor, reach, cube):
         drones.model(Mesh(file=str(path), scale=1 / 1024, rotors=(fits, rotor)))
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path):
+def test_a_missing_file_is_named(tmp_path):
     for path in (tmp_path / "none.obj", tmp_path):
         expected = "No such file" if path.suffix else "no suffix"
         with pytest.raises(InputError, match=f"{path}: expected .*{expected}"):
@@ -336,11 +338,11 @@ def test_a_file_that_is_not_there_is_named(tmp_path):
     at=st.integers(0, 1000),
     noise=st.binary(max_size=12),
 )
-def test_damaged_files_are_refused_or_read_never_anything_else(suffix, cut, at, noise, tmp_path):
+def test_damaged_files_are_either_read_or_refused(suffix, cut, at, noise, tmp_path):
     path = tmp_path / f"damaged{suffix}"
-    whole = trimesh.creation.box((0.2, 0.2, 0.2)).export(file_type=suffix[1:])
-    whole = whole.encode() if isinstance(whole, str) else whole
-    path.write_bytes(whole[:at] + noise + whole[at + len(noise) : len(whole) - cut])
+    content = trimesh.creation.box((0.2, 0.2, 0.2)).export(file_type=suffix[1:])
+    content = content.encode() if isinstance(content, str) else content
+    path.write_bytes(content[:at] + noise + content[at + len(noise) : len(content) - cut])
     try:
         model = drones.model(Mesh(file=str(path)))
     except InputError:
@@ -349,7 +351,7 @@ def test_damaged_files_are_refused_or_read_never_anything_else(suffix, cut, at, 
     assert np.isfinite(model.normals).all()
 
 
-def test_a_users_mesh_flies_in_a_scene(tmp_path):
+def test_a_mesh_of_the_user_is_rendered_in_a_scene(tmp_path):
     trimesh.creation.icosphere(subdivisions=2, radius=0.3).export(tmp_path / "ball.obj")
     recipe = scenario("S02_D4_A")
     ball = msgspec.structs.replace(
@@ -362,10 +364,10 @@ def test_a_users_mesh_flies_in_a_scene(tmp_path):
     shown = renderer.clean_frame(20)
     radius_px = int(0.3 * 1156.3 * 0.2 / float(depth_m[0]))
     inside, outside = (np.s_[y, x + share * radius_px // 10] for share in (8, 14))
-    assert shown[inside].max() < 20, "black"
-    assert shown[outside].min() > 50, "the wall behind it"
+    assert shown[inside].max() < 20, "the ball is black"
+    assert shown[outside].min() > 50, "the wall behind the ball is brighter"
 
 
-def test_nothing_waits_for_trimesh_until_a_mesh_is_named():
+def test_trimesh_is_not_imported_without_a_mesh():
     code = "import sys, psotrack.simulation.world.drones; sys.exit('trimesh' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,4 +1,4 @@
-"""What each effect of `scenarios.Imaging` does to pictures, against formulas and geometry of other origin."""
+"""Effects of `scenarios.Imaging` on images, compared with formulas and geometry that the simulator does not use."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ from psotrack.simulation.scenarios import Imaging
 from psotrack.simulation.world.lighting import AMBIENT
 
 S02 = scenario("S02_D4_A")
-#: Edges without stairs, and nothing else.
+#: Settings with antialiasing and without any other effect.
 PLAIN = Imaging(
     shutter_s=0.0,
     lens_blur_px=0.0,
@@ -34,7 +34,7 @@ PLAIN = Imaging(
 BLACK = (0.0, 0.0, 0.0)
 
 
-def imaging(**changes):
+def plain_imaging(**changes):
     return msgspec.structs.replace(PLAIN, **changes)
 
 
@@ -43,25 +43,32 @@ def scene():
     return build(S02, scale=0.25)
 
 
-def renderer(scene, settings, *placed, index=0):
-    """The camera of a scene with other settings, and with only these drones: (model, flight, paint) each."""
+def make_renderer(scene, settings, *placed, index=0):
+    """Make the renderer of a camera for other imaging settings and other drones.
+
+    Args:
+        scene: scene whose room and cameras are used.
+        settings: imaging settings.
+        placed: drones that replace the scene's drones, each as (model, flight, paint).
+        index: index of the camera.
+    """
     recipe = msgspec.structs.replace(scene.scenario, imaging=settings)
     return CameraRenderer(with_drones(replace(scene, scenario=recipe), *placed), index)
 
 
-def standing(model, position_m, paint=BLACK):
+def hovering(model, position_m, paint=BLACK):
     return model, straight_flight(position_m), paint
 
 
-def share_covered(scene, settings, *placed, index=0):
-    """(height, width): the share of the backdrop's light that black drones take away."""
-    one = renderer(scene, settings, *placed, index=index)
-    empty = sensor.undevelop(sensor.develop(one.backdrop.light)).sum(axis=-1)
-    return 1 - sensor.undevelop(one.clean_frame(0)).sum(axis=-1) / empty
+def covered_share(scene, settings, *placed, index=0):
+    """Return the share of the backdrop's light that black drones hide, (height, width)."""
+    camera = make_renderer(scene, settings, *placed, index=index)
+    empty = sensor.undevelop(sensor.develop(camera.backdrop.light)).sum(axis=-1)
+    return 1 - sensor.undevelop(camera.clean_frame(0)).sum(axis=-1) / empty
 
 
-def moments(weight):
-    """Mean (x, y) and variance along x and y."""
+def mean_and_variance(weight):
+    """Return the weighted mean (x, y) and the variances along x and y, pixels and squared pixels."""
     rows, columns = np.indices(weight.shape)
     mean = np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
     variance = [
@@ -70,26 +77,26 @@ def moments(weight):
     return mean, np.array(variance) / weight.sum()
 
 
-def test_grey_levels_survive_the_way_to_light_and_back():
+def test_develop_inverts_undevelop():
     levels = np.arange(256, dtype=np.uint8).reshape(1, 256, 1).repeat(3, axis=-1)
     back = sensor.develop(sensor.undevelop(levels))
-    # Level 1 is a hundred-thousandth of the light of level 255: black.
+    # Levels 0 and 1 are left out: level 1 has a hundred-thousandth of the light of level 255.
     np.testing.assert_array_equal(back[0, 2:], levels[0, 2:])
 
 
-# --- off is off
+# --- effects that are switched off
 
 
-def test_with_everything_off_there_are_only_the_colours_of_the_room_and_of_the_drones(scene):
-    settings = imaging(antialiasing=False)
-    one = renderer(scene, settings, standing(cube(0.3), (0.3, -0.2, 1.4)))
-    frame, empty = one.clean_frame(0), sensor.develop(one.backdrop.light)
-    covered = drone_masks(one.scene, one.cam, one.backdrop.depth_m, 0) > 0
+def test_without_effects_pixels_have_the_colour_of_the_room_or_of_a_drone(scene):
+    settings = plain_imaging(antialiasing=False)
+    camera = make_renderer(scene, settings, hovering(cube(0.3), (0.3, -0.2, 1.4)))
+    frame, empty = camera.clean_frame(0), sensor.develop(camera.backdrop.light)
+    covered = drone_masks(camera.scene, camera.cam, camera.backdrop.depth_m, 0) > 0
     assert covered.sum() > 300
-    # A black body under samples at pixel centres: pixels are either its or the room's.
+    # Each pixel is sampled once, at its centre, so it shows either the black body or the room.
     assert not frame[covered].any()
     np.testing.assert_array_equal(frame[~covered], empty[~covered])
-    np.testing.assert_array_equal(one.frame(0), frame)
+    np.testing.assert_array_equal(camera.frame(0), frame)
 
 
 @pytest.mark.parametrize(
@@ -102,15 +109,15 @@ def test_with_everything_off_there_are_only_the_colours_of_the_room_and_of_the_d
         ({"reflections": 0.04}, "floor"),
     ],
 )
-def test_an_effect_of_optics_changes_something_and_only_where_it_should(scene, effect, places):
-    cubes = standing(cube(0.3), (0.3, -0.2, 0.4))
-    without = imaging(antialiasing=False)
-    off = renderer(scene, without, cubes)
-    on = renderer(scene, msgspec.structs.replace(without, **effect), cubes)
-    changed = (off.clean_frame(0) != on.clean_frame(0)).any(axis=-1)
+def test_an_optical_effect_changes_only_the_expected_pixels(scene, effect, places):
+    cubes = hovering(cube(0.3), (0.3, -0.2, 0.4))
+    without = plain_imaging(antialiasing=False)
+    without_effect = make_renderer(scene, without, cubes)
+    with_effect = make_renderer(scene, msgspec.structs.replace(without, **effect), cubes)
+    changed = (without_effect.clean_frame(0) != with_effect.clean_frame(0)).any(axis=-1)
     assert changed.sum() > 100
     if places == "floor":
-        assert not changed[~off.backdrop.floor].any()
+        assert not changed[~without_effect.backdrop.floor].any()
 
 
 @pytest.mark.parametrize(
@@ -124,56 +131,62 @@ def test_an_effect_of_optics_changes_something_and_only_where_it_should(scene, e
         {"jpeg_quality": 50},
     ],
 )
-def test_an_effect_of_the_sensor_changes_something_and_is_all_there_is(effect):
+def test_each_sensor_effect_changes_the_image(effect):
     rng = np.random.default_rng(3)
     image = cv2.GaussianBlur(rng.integers(0, 256, (48, 64, 3)).astype(np.uint8), (0, 0), 2)
-    off, on = (sensor.Sensor(settings, 0, 0, (48, 64)) for settings in (PLAIN, imaging(**effect)))
-    np.testing.assert_array_equal(off.expose(image, 3, 0.12), image)
-    assert (on.expose(image, 3, 0.12) != image).mean() > 0.2
+    without_effect, with_effect = (
+        sensor.Sensor(settings, 0, 0, (48, 64)) for settings in (PLAIN, plain_imaging(**effect))
+    )
+    np.testing.assert_array_equal(without_effect.expose(image, 3, 0.12), image)
+    assert (with_effect.expose(image, 3, 0.12) != image).mean() > 0.2
 
 
-def test_frames_are_the_same_alone_and_in_any_order_with_everything_on(scene):
+def test_frames_do_not_depend_on_the_order_of_rendering(scene):
     settings = msgspec.structs.replace(Imaging(), jpeg_quality=60, flicker=0.3, exposure_drift=0.05)
     recipe = msgspec.structs.replace(S02, imaging=settings)
-    everything = replace(scene, scenario=recipe)
-    one, other = CameraRenderer(everything, 2), CameraRenderer(everything, 2)
-    forwards = [one.frame(frame) for frame in (5, 90)]
-    backwards = [other.frame(frame) for frame in (90, 5)]
-    np.testing.assert_array_equal(forwards, backwards[::-1])
+    all_effects_scene = replace(scene, scenario=recipe)
+    camera, second = CameraRenderer(all_effects_scene, 2), CameraRenderer(all_effects_scene, 2)
+    forward = [camera.frame(frame) for frame in (5, 90)]
+    backward = [second.frame(frame) for frame in (90, 5)]
+    np.testing.assert_array_equal(forward, backward[::-1])
 
 
 # --- optics
 
 
 @pytest.mark.parametrize("sigma_px", [1.0, 2.0])
-def test_the_lens_widens_what_it_draws_by_its_variance(scene, sigma_px):
-    placed = standing(cube(0.2), (0.3, -0.2, 1.4))
+def test_lens_blur_adds_its_variance_to_the_silhouette(scene, sigma_px):
+    placed = hovering(cube(0.2), (0.3, -0.2, 1.4))
     x, y = pixel_of(scene, 0, (0.3, -0.2, 1.4)).astype(int)
     window = np.s_[y - 24 : y + 25, x - 24 : x + 25]
     widths = []
     for blur_px in (0.0, sigma_px):
-        widths.append(moments(share_covered(scene, imaging(lens_blur_px=blur_px), placed)[window])[1])
-    # The tails of the blur are rounded off with 8 bits: measured 0.94 to 0.97 of the variance.
+        widths.append(
+            mean_and_variance(covered_share(scene, plain_imaging(lens_blur_px=blur_px), placed)[window])[1]
+        )
+    # Rounding to 8 bits cuts off the tails of the blur: measured 0.94 to 0.97 of the variance.
     np.testing.assert_allclose(np.subtract(*widths[::-1]), sigma_px**2, rtol=0.1)
 
 
-def test_motion_blur_is_as_long_as_the_way_during_the_exposure(scene):
+def test_motion_blur_is_as_long_as_the_motion_during_the_exposure(scene):
     speed_m_s, shutter_s = 4.0, 1 / 40
     along = np.array(scene.rig.cameras[0].T_cam_world)[0, :3]  # the camera's own x axis
     flight = straight_flight((0.3, -0.2, 1.4), tuple(speed_m_s * along))
     still, moving = (
-        share_covered(scene, imaging(shutter_s=time_s), (cube(0.1), flight, BLACK))
+        covered_share(scene, plain_imaging(shutter_s=time_s), (cube(0.1), flight, BLACK))
         for time_s in (0.0, shutter_s)
     )
-    frozen = share_covered(scene, PLAIN, standing(cube(0.1), (0.3, -0.2, 1.4)))
+    frozen = covered_share(scene, PLAIN, hovering(cube(0.1), (0.3, -0.2, 1.4)))
     np.testing.assert_array_equal(still, frozen)
     x, y = pixel_of(scene, 0, (0.3, -0.2, 1.4)).astype(int)
     window = np.s_[y - 20 : y + 21, x - 20 : x + 21]
-    (middle, before), (moved, after) = moments(still[window]), moments(moving[window])
+    (middle, before), (moved, after) = mean_and_variance(still[window]), mean_and_variance(moving[window])
     depth_m = project(scene.rig.cameras[0], np.array([0.3, -0.2, 1.4]))[1]
     length_px = float(scene.rig.cameras.K[0, 0, 0] / depth_m * speed_m_s * shutter_s)
-    # Eight positions, evenly over the way L, have the variance L^2 / 12 (1 - 1 / 64).
-    assert after[0] - before[0] == pytest.approx(length_px**2 / 12 * 63 / 64, rel=0.1)  # 8 bits at the rim
+    # Eight positions, spaced evenly over a length L, have the variance L^2 / 12 (1 - 1 / 64).
+    assert after[0] - before[0] == pytest.approx(
+        length_px**2 / 12 * 63 / 64, rel=0.1
+    )  # rounding to 8 bits at the edge
     assert after[1] - before[1] == pytest.approx(0, abs=0.1)
     np.testing.assert_allclose(moved, middle, atol=0.1)
 
@@ -181,7 +194,7 @@ def test_motion_blur_is_as_long_as_the_way_during_the_exposure(scene):
 def test_a_drone_without_rotors_is_drawn(scene):
     bare = replace(cube(0.3), rotor_centres_m=np.zeros((0, 3)), rotor_radii_m=np.zeros(0))
     settings = msgspec.structs.replace(Imaging(), exposure_drift=0.0)
-    frame = renderer(scene, settings, standing(bare, (0.3, -0.2, 0.4))).clean_frame(0)
+    frame = make_renderer(scene, settings, hovering(bare, (0.3, -0.2, 0.4))).clean_frame(0)
     x, y = pixel_of(scene, 0, (0.3, -0.2, 0.4)).round().astype(int)
     assert not frame[y, x].any()
 
@@ -189,8 +202,8 @@ def test_a_drone_without_rotors_is_drawn(scene):
 # --- the floor as a mirror
 
 
-def test_the_share_that_is_mirrored_is_that_of_glass():
-    """Fresnel's equations for unpolarised light, refractive index 1.5: 4 % at normal incidence."""
+def test_fresnel_agrees_with_glass():
+    """The oracle is Fresnel's equations for unpolarised light; an index of 1.5 reflects 4 % at normal incidence."""
     index = 1.5
     cosine = np.linspace(0, 1, 50)
     inside = np.sqrt(1 - (1 - cosine**2) / index**2)
@@ -200,127 +213,137 @@ def test_the_share_that_is_mirrored_is_that_of_glass():
     schlick = reflections.fresnel(cosine, 0.04)
     assert schlick[-1] == pytest.approx(0.04)
     assert schlick[0] == pytest.approx(1.0)
-    # It is an approximation, within a few hundredths; measured 0.03 at most.
+    # Schlick's formula is an approximation; the largest measured error is 0.03.
     np.testing.assert_allclose(schlick, exact, atol=0.04)
 
 
 def test_the_floor_mirrors_more_where_it_is_seen_at_a_lower_angle(scene):
-    one = renderer(scene, imaging(reflections=0.1))
-    eye = -one.cam.R.T @ one.cam.t_m
+    camera = make_renderer(scene, plain_imaging(reflections=0.1))
+    eye = -camera.cam.R.T @ camera.cam.t_m
     for floor_m in ((-1.5, -1.0, 0.0), (0.5, 0.0, 0.0), (2.5, 2.0, 0.0)):
         x, y = pixel_of(scene, 0, floor_m).round().astype(int)
         cosine = eye[2] / np.linalg.norm(eye - floor_m)
-        # Half a pixel is up to a percent of the distance here.
-        assert one.mirror.share[y, x] == pytest.approx(0.1 + 0.9 * (1 - cosine) ** 5, rel=0.02)
-    assert not one.mirror.share[~one.backdrop.floor].any()
+        # Rounding to the pixel, up to half a pixel, changes the distance by up to one percent here.
+        assert camera.mirror.share[y, x] == pytest.approx(0.1 + 0.9 * (1 - cosine) ** 5, rel=0.02)
+    assert not camera.mirror.share[~camera.backdrop.floor].any()
 
 
 @pytest.mark.parametrize("index", [0, 4, 6])
-def test_a_mirror_image_is_where_the_drone_would_be_below_the_floor(scene, index):
+def test_the_mirror_image_is_the_drone_reflected_at_the_floor(scene, index):
     centre = np.array([0.3, -0.2, 0.9])
-    one = renderer(
-        scene, imaging(reflections=0.5, lens_blur_px=0.5), standing(cube(0.3), centre), index=index
+    camera = make_renderer(
+        scene, plain_imaging(reflections=0.5, lens_blur_px=0.5), hovering(cube(0.3), centre), index=index
     )
-    change = sensor.undevelop(one.clean_frame(0)) - sensor.undevelop(sensor.develop(one.backdrop.light))
-    # A black body takes away mirrored light: the share of it is what the mirror image covers.
-    covered = -change.sum(axis=-1) / np.maximum(one.mirror.share * one.mirror.light.sum(axis=-1), 1e-3)
+    change = sensor.undevelop(camera.clean_frame(0)) - sensor.undevelop(sensor.develop(camera.backdrop.light))
+    # The mirror image of a black body hides mirrored light; the hidden share is the coverage of the mirror image.
+    covered = -change.sum(axis=-1) / np.maximum(camera.mirror.share * camera.mirror.light.sum(axis=-1), 1e-3)
     corners = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) * 0.15 + centre
     below = corners * [1, 1, -1]
-    pixels = cv2.projectPoints(below, cv2.Rodrigues(one.cam.R)[0], one.cam.t_m, one.cam.K, None)[0][:, 0]
+    pixels = cv2.projectPoints(below, cv2.Rodrigues(camera.cam.R)[0], camera.cam.t_m, camera.cam.K, None)[0][
+        :, 0
+    ]
     (x, y), reach = pixels.mean(axis=0).round().astype(int), 24
     window = np.s_[y - reach : y + reach + 1, x - reach : x + reach + 1]
     covered = np.where(covered[window] > 0.03, covered[window], 0)
     shape = cv2.moments(cv2.convexHull((64 * pixels).round().astype(np.int32)))
     expected = np.array([shape["m10"], shape["m01"]]) / shape["m00"] / 64
-    # 8 bits, four passes over a rim of some 60 pixels, and the mean of those passes: measured 0.10 px at most.
-    np.testing.assert_allclose(moments(covered)[0] + [x - reach, y - reach], expected, atol=0.15)
+    # Rounding to 8 bits and the four blur passes at the edge shift the centre: measured 0.10 px at most.
+    np.testing.assert_allclose(mean_and_variance(covered)[0] + [x - reach, y - reach], expected, atol=0.15)
     assert covered.sum() == pytest.approx(shape["m00"] / 64**2, rel=0.08)
-    assert drone_masks(one.scene, one.cam, one.backdrop.depth_m, 0)[y, x] == 0
+    assert drone_masks(camera.scene, camera.cam, camera.backdrop.depth_m, 0)[y, x] == 0
 
 
 @pytest.mark.parametrize("height_m", [0.7, 1.2])
-def test_a_rough_floor_blurs_what_it_mirrors_the_more_the_higher_it_is(scene, monkeypatch, height_m):
+def test_a_rough_floor_blurs_the_mirror_image_of_a_higher_drone_more(scene, monkeypatch, height_m):
     centre, rough_rad = np.array([0.3, -0.2, height_m]), 0.02
     x, y = pixel_of(scene, 0, centre * [1, 1, -1]).astype(int)
     window = np.s_[y - 24 : y + 25, x - 24 : x + 25]
     widths = []
     for roughness_rad in (0.0, rough_rad):
         monkeypatch.setattr(reflections, "ROUGHNESS_RAD", roughness_rad)
-        one = renderer(scene, imaging(reflections=0.5), standing(cube(0.3), centre))
-        change = sensor.undevelop(one.clean_frame(0)) - sensor.undevelop(sensor.develop(one.backdrop.light))
-        covered = -change.sum(axis=-1) / (one.mirror.share * one.mirror.light.sum(axis=-1) + 1e-9)
-        widths.append(moments(covered[window])[1])
-    # A direction that is off by an angle at the floor is off by the floor's share of the way at the eye.
-    eye_m = -one.cam.R.T @ one.cam.t_m
-    sigma_px = rough_rad * one.cam.K[0, 0] * height_m / (height_m + eye_m[2])
-    # The tails of the blur are rounded off with 8 bits: measured 0.92 to 0.95 of the variance.
+        camera = make_renderer(scene, plain_imaging(reflections=0.5), hovering(cube(0.3), centre))
+        change = sensor.undevelop(camera.clean_frame(0)) - sensor.undevelop(
+            sensor.develop(camera.backdrop.light)
+        )
+        covered = -change.sum(axis=-1) / (camera.mirror.share * camera.mirror.light.sum(axis=-1) + 1e-9)
+        widths.append(mean_and_variance(covered[window])[1])
+    # Seen by the camera, an angle at the floor is reduced by the ratio of drone-floor distance to the whole path.
+    eye_m = -camera.cam.R.T @ camera.cam.t_m
+    sigma_px = rough_rad * camera.cam.K[0, 0] * height_m / (height_m + eye_m[2])
+    # Rounding to 8 bits cuts off the tails of the blur: measured 0.92 to 0.95 of the variance.
     np.testing.assert_allclose(np.subtract(*widths[::-1]), sigma_px**2, rtol=0.15)
 
 
-def test_a_rough_floor_blurs_the_room_the_more_the_farther_behind_it(scene, monkeypatch):
-    """What stands on it not at all; what is half as far behind it as the eye is before it, by a third of the most."""
-    rough = renderer(scene, imaging(reflections=0.5)).mirror
+def test_a_rough_floor_blurs_the_mirror_image_of_distant_walls_more(scene, monkeypatch):
+    """The foot of a wall is not blurred.
+
+    A point half as far behind the mirroring floor point as the camera is in front of it is blurred by a third of the
+    largest blur.
+    """
+    rough = make_renderer(scene, plain_imaging(reflections=0.5)).mirror
     monkeypatch.setattr(reflections, "ROUGHNESS_RAD", 0.0)
-    one = renderer(scene, imaging(reflections=0.5))
-    smooth = one.mirror
-    beyond = 1 - one.backdrop.depth_m / smooth.depth_m
-    blurred = cv2.GaussianBlur(smooth.light, (0, 0), 0.006 * one.cam.K[0, 0] / 3)
-    foot, third = (one.backdrop.floor & (np.abs(beyond - share) < 0.01) for share in (0.0, 1 / 3))
+    camera = make_renderer(scene, plain_imaging(reflections=0.5))
+    smooth = camera.mirror
+    beyond = 1 - camera.backdrop.depth_m / smooth.depth_m
+    blurred = cv2.GaussianBlur(smooth.light, (0, 0), 0.006 * camera.cam.K[0, 0] / 3)
+    foot, third = (camera.backdrop.floor & (np.abs(beyond - share) < 0.01) for share in (0.0, 1 / 3))
     assert min(foot.sum(), third.sum()) > 100
-    # Within 0.01 of those shares: measured 0.001 and 0.004, of light up to 3.
+    # Pixels are within 0.01 of the two shares: measured differences 0.001 and 0.004, at light values up to 3.
     np.testing.assert_allclose(rough.light[foot], smooth.light[foot], atol=0.01)
     np.testing.assert_allclose(rough.light[third], blurred[third], atol=0.01)
-    assert np.abs(blurred - smooth.light)[third].max() > 0.1, "an edge, or the test would say nothing"
+    assert np.abs(blurred - smooth.light)[third].max() > 0.1, "the region must contain an edge"
 
 
 @pytest.mark.parametrize(("beyond_m", "seen"), [(-0.6, True), (0.6, False)])
 def test_mirrored_furniture_hides_what_is_behind_it(scene, beyond_m, seen):
     pillar = np.array([-1.975, 2.875, 0.0])
     index, found = 1, None
-    one = renderer(scene, imaging(reflections=0.5), index=index)
+    camera = make_renderer(scene, plain_imaging(reflections=0.5), index=index)
     for height_m in np.arange(0.3, 2.0, 0.1):
         pixel = pixel_of(scene, index, pillar - [0, 0, height_m])
         x, y = pixel.round().astype(int)
         if (
-            5 < x < one.cam.width - 5
-            and 5 < y < one.cam.height - 5
-            and one.backdrop.floor[y - 4 : y + 5, x - 4 : x + 5].all()
+            5 < x < camera.cam.width - 5
+            and 5 < y < camera.cam.height - 5
+            and camera.backdrop.floor[y - 4 : y + 5, x - 4 : x + 5].all()
         ):
             found = pixel, height_m
             break
     assert found, "the foot of a pillar must be mirrored somewhere"
     pixel, height_m = found
-    ray = one.cam.R.T @ np.linalg.inv(one.cam.K) @ [*pixel, 1.0]
+    ray = camera.cam.R.T @ np.linalg.inv(camera.cam.K) @ [*pixel, 1.0]
     depth_m = project(scene.rig.cameras[index], pillar - [0, 0, height_m])[1]
-    eye = -one.cam.R.T @ one.cam.t_m
+    eye = -camera.cam.R.T @ camera.cam.t_m
     position = (eye + (depth_m + beyond_m) * ray) * [1, 1, -1]
-    with_cube = renderer(scene, imaging(reflections=0.5), standing(cube(0.15), position), index=index)
+    with_cube = make_renderer(
+        scene, plain_imaging(reflections=0.5), hovering(cube(0.15), position), index=index
+    )
     x, y = pixel.round().astype(int)
-    darker = sensor.develop(one.backdrop.light)[y, x].astype(int) - with_cube.clean_frame(0)[y, x]
+    darker = sensor.develop(camera.backdrop.light)[y, x].astype(int) - with_cube.clean_frame(0)[y, x]
     assert (darker.max() > 10) == seen
 
 
-def test_shadows_dim_only_what_the_floor_does_not_mirror(scene):
+def test_shadows_dim_only_the_diffuse_light_of_the_floor(scene):
     model, at_m = cube(0.4), np.array([1.0, -0.5, 0.5])
-    one = renderer(scene, imaging(reflections=0.5, shadows=True), standing(model, at_m))
-    dull = renderer(scene, imaging(shadows=True), standing(model, at_m))
-    gain = one.shadows.floor_gain(0.0)
+    camera = make_renderer(scene, plain_imaging(reflections=0.5, shadows=True), hovering(model, at_m))
+    dull = make_renderer(scene, plain_imaging(shadows=True), hovering(model, at_m))
+    gain = camera.shadows.floor_gain(0.0)
     row, column = np.unravel_index(gain.argmin(), gain.shape)
     cell_m = 10.0 / gain.shape[1]
     foot = np.array([(column + 0.5) * cell_m - 5.0, 4.0 - (row + 0.5) * cell_m, 0.0])
     checked = 0
-    for aside in ((0.0, 0.0), (-0.25, 0.0), (-0.3, 0.2), (0.0, -0.3)):
-        point = foot + np.array([*aside, 0.0])
+    for offset_m in ((0.0, 0.0), (-0.25, 0.0), (-0.3, 0.2), (0.0, -0.3)):
+        point = foot + np.array([*offset_m, 0.0])
         x, y = pixel_of(scene, 0, point).round().astype(int)
-        # Only where neither the cube nor its mirror image is before the floor.
+        # Skip points where the cube or its mirror image hides the floor.
         cubes = [pixel_of(scene, 0, at_m * [1, 1, sign]) for sign in (1, -1)]
         if min(np.hypot(*(cube_px - [x, y])) for cube_px in cubes) < 26:
             continue
         i, j = int((4.0 - point[1]) / cell_m), int((point[0] + 5.0) / cell_m)
-        share = one.mirror.share[y, x]
-        expected = gain[i, j] * (1 - share) * dull.backdrop.light[y, x] + share * one.mirror.light[y, x]
-        # A pixel is four cells wide, and two roundings to 8 bits.
-        np.testing.assert_allclose(sensor.undevelop(one.clean_frame(0))[y, x], expected, rtol=0.04)
+        share = camera.mirror.share[y, x]
+        expected = gain[i, j] * (1 - share) * dull.backdrop.light[y, x] + share * camera.mirror.light[y, x]
+        # The tolerance covers pixels that are four cells wide and two roundings to 8 bits.
+        np.testing.assert_allclose(sensor.undevelop(camera.clean_frame(0))[y, x], expected, rtol=0.04)
         checked += 1
     assert checked >= 1
     assert gain.min() < 0.9
@@ -330,12 +353,12 @@ def test_shadows_dim_only_what_the_floor_does_not_mirror(scene):
 
 
 @pytest.mark.parametrize("height_m", [0.06, 0.2, 0.6])
-def test_ambient_light_that_a_thing_blocks_is_what_random_rays_hit(height_m):
-    """Rays from floor points, as many as the cosine of their angle says (Malley's method)."""
+def test_blocked_ambient_light_agrees_with_random_rays(height_m):
+    """Random rays from floor points have a cosine-weighted density (Malley's method)."""
     cell_m, half = 0.02, 100
     outline = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
     outline[half - 8 : half + 7, half - 3 : half + 13] = 0.6
-    low, high = np.array([-3.5, -8.5]) * cell_m, np.array([12.5, 6.5]) * cell_m  # x and y of its edges
+    low, high = np.array([-3.5, -8.5]) * cell_m, np.array([12.5, 6.5]) * cell_m  # (x, y) of the corners
     blocked = shadows.ambient_blocked(outline, cell_m, height_m)
     rng = np.random.default_rng(1)
     radius, angle = np.sqrt(rng.uniform(size=200_000)), rng.uniform(0, 2 * np.pi, 200_000)
@@ -344,47 +367,52 @@ def test_ambient_light_that_a_thing_blocks_is_what_random_rays_hit(height_m):
     for column, row in ((0, 0), (5, -1), (13, 0), (20, 10), (-30, 4)):
         at = rays + np.array([column, row]) * cell_m
         expected = 0.6 * np.mean(np.all((at > low) & (at < high), axis=-1))
-        # 200,000 rays know a share to 0.001; measured 0.0011 at most.
+        # 200,000 rays estimate a share with a standard error of 0.001; measured difference 0.0011 at most.
         assert blocked[half + row, half + column] == pytest.approx(expected, abs=0.004)
 
 
-def test_under_the_middle_of_a_disc_the_blocked_share_is_the_known_form_factor():
+def test_the_blocked_share_below_a_disc_is_its_form_factor():
     cell_m, half, radius_m, height_m = 0.02, 120, 0.3, 0.4
     rows, columns = np.mgrid[-half : half + 1, -half : half + 1] * cell_m
     disc = (np.hypot(rows, columns) < radius_m).astype(np.float32)
     blocked = shadows.ambient_blocked(disc, cell_m, height_m)
-    # 0.01 is a third of a cell at the rim.
+    # 0.01 corresponds to a third of a cell at the disc's edge.
     assert blocked[half, half] == pytest.approx(radius_m**2 / (radius_m**2 + height_m**2), abs=0.01)
 
 
-def square_above(side_m, height_m):
-    """Form factor of a level square whose middle is straight above: four times that of its quarter, by its corner."""
+def square_form_factor(side_m, height_m):
+    """Return the form factor of a horizontal square whose centre is straight above the point.
+
+    The form factor is four times the form factor of a quarter square, whose corner is straight above the point.
+    """
     half = side_m / 2
     slant = np.hypot(half, height_m)
     return 4 * 2 * half / slant * np.arctan(half / slant) / (2 * np.pi)
 
 
-def test_contact_shadows_are_dark_on_the_floor_and_gone_above(scene):
+def test_contact_shadows_agree_with_the_form_factor_and_end_at_a_height(scene):
     side_m, foot = 0.3, np.array([0.41, 0.21, 0.0])  # in the middle of a cell
     all_light = scene.room.panels.on_faces(foot, np.array([[0.0, 0.0, 1.0]]))[0]
     for height_m in (0.05, 0.15, 0.35, 0.7):
-        flying = standing(cube(side_m), (*foot[:2], height_m + side_m / 2))
-        gain = renderer(scene, imaging(contact_shadows=True), flying).shadows.floor_gain(0.0)
-        expected = 1 - AMBIENT / all_light * square_above(side_m, height_m)
-        # The outline is up to a cell of 0.01 m wider: 7 % of what is blocked.
+        flying = hovering(cube(side_m), (*foot[:2], height_m + side_m / 2))
+        gain = make_renderer(scene, plain_imaging(contact_shadows=True), flying).shadows.floor_gain(0.0)
+        expected = 1 - AMBIENT / all_light * square_form_factor(side_m, height_m)
+        # The rasterised outline is up to one cell (0.01 m) wider, which is 7 % of the blocked light.
         assert gain.min() == pytest.approx(expected, abs=0.08 * (1 - expected) + 0.002)
-    high = standing(cube(side_m), (*foot[:2], 1.9))
-    assert renderer(scene, imaging(contact_shadows=True), high).shadows.floor_gain(0.0).min() == 1.0
+    high = hovering(cube(side_m), (*foot[:2], 1.9))
+    assert (
+        make_renderer(scene, plain_imaging(contact_shadows=True), high).shadows.floor_gain(0.0).min() == 1.0
+    )
 
 
 def test_a_rotor_lets_three_quarters_of_the_light_through(scene):
     radius_m, height_m, foot = 0.3, 0.3, np.array([0.41, 0.21, 0.0])
     rotor = replace(cube(0.01), rotor_radii_m=np.array([radius_m]))
-    flying = standing(rotor, (*foot[:2], height_m))
-    gain = renderer(scene, imaging(contact_shadows=True), flying).shadows.floor_gain(0.0)
+    flying = hovering(rotor, (*foot[:2], height_m))
+    gain = make_renderer(scene, plain_imaging(contact_shadows=True), flying).shadows.floor_gain(0.0)
     all_light = scene.room.panels.on_faces(foot, np.array([[0.0, 0.0, 1.0]]))[0]
     expected = 1 - AMBIENT / all_light * 0.25 * radius_m**2 / (radius_m**2 + height_m**2)
-    # A cell of 0.01 m at its rim is 7 % of it.
+    # One cell of 0.01 m at the disc's edge is 7 % of the blocked light.
     assert gain.min() == pytest.approx(expected, abs=0.08 * (1 - expected))
 
 
@@ -392,14 +420,14 @@ def test_a_rotor_lets_three_quarters_of_the_light_through(scene):
 def test_shadows_turn_with_their_drone(scene, yaw_rad):
     bar = replace(cube(0.3), triangles_m=cube(0.3).triangles_m * [2.0, 0.2, 0.2])
     flight = replace(straight_flight((0.4, 0.2, 0.08)), heading=Heading(yaw_rad))
-    one = renderer(scene, imaging(contact_shadows=True), (bar, flight, BLACK))
-    lost = 1 - one.shadows.floor_gain(0.0)
+    camera = make_renderer(scene, plain_imaging(contact_shadows=True), (bar, flight, BLACK))
+    lost = 1 - camera.shadows.floor_gain(0.0)
     assert lost.max() > 0.1
-    # Rows of the floor's map count down where y counts up.
+    # Row numbers of the floor's map grow in the direction of -y.
     rows, columns = np.indices(lost.shape)
     spread = np.cov(np.stack([columns, -rows]).reshape(2, -1), aweights=lost.ravel())
     angle_rad = np.arctan2(2 * spread[0, 1], spread[0, 0] - spread[1, 1]) / 2
-    # The axis of a bar of 30 x 3 cells.
+    # The bar covers 30 x 3 cells; the tolerance covers the rasterisation of its axis.
     assert angle_rad == pytest.approx(yaw_rad, abs=0.02)
 
 
@@ -414,61 +442,67 @@ def test_shadows_turn_with_their_drone(scene, yaw_rad):
     phase_rad=st.floats(0, 6),
 )
 def test_flicker_is_the_mean_of_the_lamps_over_the_exposure(flicker, mains_hz, shutter_s, time_s, phase_rad):
-    settings = imaging(flicker=flicker, mains_hz=mains_hz, shutter_s=shutter_s)
+    settings = plain_imaging(flicker=flicker, mains_hz=mains_hz, shutter_s=shutter_s)
     during_s = time_s + shutter_s * ((np.arange(4000) + 0.5) / 4000 - 0.5)
     lamps = 1 - flicker * np.cos(2 * np.pi * mains_hz * during_s + phase_rad / 2) ** 2
-    # The midpoint rule's error is (pi / 4000)^2 / 6 for so few waves per step; means over time are 1 - flicker / 2.
+    # The error of the midpoint rule is (pi / 4000)^2 / 6 with at most about one wave per exposure; the mean over time
+    # is 1 - flicker / 2.
     expected = lamps.mean() / (1 - flicker / 2)
     assert sensor.flicker_gain(settings, phase_rad, time_s) == pytest.approx(expected, abs=1e-5)
 
 
-def test_lamps_beat_slowly_with_frames_and_not_at_all_at_whole_half_waves():
+def test_flicker_beats_with_the_frame_rate_and_vanishes_at_whole_half_waves():
     frames_s = np.arange(0, 50, 0.04)
-    slow = [sensor.flicker_gain(imaging(flicker=0.4, shutter_s=1 / 500), 0.3, t) for t in frames_s]
+    slow = [sensor.flicker_gain(plain_imaging(flicker=0.4, shutter_s=1 / 500), 0.3, t) for t in frames_s]
     slow = np.array(slow)
-    # Lamps at 100.04 Hz, frames at 25: a beat of 0.04 Hz, 625 frames long.
+    # Lamps flicker at 100.04 Hz and frames come at 25 Hz, which beats at 0.04 Hz: one period is 625 frames.
     np.testing.assert_allclose(slow[625:], slow[:-625], atol=1e-6)
     assert np.ptp(slow[:625]) == pytest.approx(0.4 / (1 - 0.2) * np.sinc(0.2), rel=0.01)
     assert np.abs(np.diff(slow)).max() < 0.003
     whole = [
-        sensor.flicker_gain(imaging(flicker=0.4, shutter_s=0.01, mains_hz=50.0), 0.3, t) for t in frames_s
+        sensor.flicker_gain(plain_imaging(flicker=0.4, shutter_s=0.01, mains_hz=50.0), 0.3, t)
+        for t in frames_s
     ]
     np.testing.assert_allclose(whole, 1.0, atol=1e-12)
 
 
-def test_all_cameras_see_the_same_lamps():
-    gains = [sensor.Sensor(imaging(flicker=0.4), 5, stream, (8, 8)).gains(1.23) for stream in (0, 3, 1001)]
+def test_flicker_is_equal_in_all_cameras():
+    gains = [
+        sensor.Sensor(plain_imaging(flicker=0.4), 5, stream, (8, 8)).gains(1.23) for stream in (0, 3, 1001)
+    ]
     np.testing.assert_array_equal(gains, [gains[0]] * 3)
-    assert sensor.Sensor(imaging(flicker=0.4), 6, 0, (8, 8)).gains(1.23)[0] != gains[0][0]
+    assert sensor.Sensor(plain_imaging(flicker=0.4), 6, 0, (8, 8)).gains(1.23)[0] != gains[0][0]
 
 
 @pytest.mark.parametrize("effect", ["exposure_drift", "white_balance_drift"])
-def test_drift_has_its_standard_deviation_and_is_slow(effect):
+def test_drift_is_slow_and_has_the_given_standard_deviation(effect):
     sigma = 0.02
-    sensors = [sensor.Sensor(imaging(**{effect: sigma}), 0, stream, (8, 8)) for stream in range(400)]
-    gains = np.array([[one.gains(time_s) for time_s in (3.0, 50.0, 200.0, 1000.0)] for one in sensors]) - 1
-    # 400 cameras at four times, far apart: 1600 numbers, or more, know a standard deviation to 2 %.
+    sensors = [sensor.Sensor(plain_imaging(**{effect: sigma}), 0, stream, (8, 8)) for stream in range(400)]
+    gains = (
+        np.array([[camera.gains(time_s) for time_s in (3.0, 50.0, 200.0, 1000.0)] for camera in sensors]) - 1
+    )
+    # 400 cameras at four distant times give at least 1600 independent numbers: a standard error of 2 %.
     assert gains.std() == pytest.approx(sigma, rel=0.06)
     assert abs(gains.mean()) < 4 * sigma / np.sqrt(1600)
     if effect == "exposure_drift":
-        assert np.ptp(gains, axis=-1).max() < 1e-12, "all channels alike"
+        assert np.ptp(gains, axis=-1).max() < 1e-12, "all channels have the same gain"
     else:
         np.testing.assert_allclose(gains.mean(axis=-1), 0, atol=1e-12)  # colours change, brightness does not
     course = np.array([sensors[0].gains(t) for t in np.arange(0, 60, 0.04)])
-    # The fastest of the sinusoids takes 5 s: their sum cannot change by more than this in a frame.
+    # The shortest period of the sinusoids is 5 s, which limits the change of their sum from frame to frame.
     assert np.abs(np.diff(course, axis=0)).max() < 0.04 * 2 * np.pi / 5 * sigma * np.sqrt(2 * 6) * np.sqrt(
         1.5
     )
     assert course.std() > 0.2 * sigma
 
 
-def test_gains_are_gains_of_light():
-    one = sensor.Sensor(imaging(exposure_drift=0.1, white_balance_drift=0.1), 2, 1, (16, 16))
+def test_gains_multiply_linear_light():
+    camera = sensor.Sensor(plain_imaging(exposure_drift=0.1, white_balance_drift=0.1), 2, 1, (16, 16))
     image = np.full((16, 16, 3), 150, np.uint8)
     for time_s in (0.0, 7.0, 31.0):
-        ratio = sensor.undevelop(one.expose(image, 0, time_s)) / sensor.undevelop(image)
-        # Half a grey level of 150 is 0.33 %, times gamma in light.
-        np.testing.assert_allclose(ratio[0, 0], one.gains(time_s), rtol=0.008)
+        ratio = sensor.undevelop(camera.expose(image, 0, time_s)) / sensor.undevelop(image)
+        # Half a grey level of 150 is 0.33 %, which gamma multiplies in linear light.
+        np.testing.assert_allclose(ratio[0, 0], camera.gains(time_s), rtol=0.008)
 
 
 # --- noise and JPEG
@@ -476,26 +510,30 @@ def test_gains_are_gains_of_light():
 
 @pytest.mark.parametrize(("read", "shot"), [(1.0, 3.0), (0.0, 5.0), (2.5, 0.0)])
 @pytest.mark.parametrize("level", [16, 100, 220])
-def test_the_variance_of_noise_is_that_of_reading_plus_that_of_light(read, shot, level):
-    one = sensor.Sensor(imaging(read_noise=read, shot_noise=shot), 0, 0, (120, 160))
+def test_noise_variance_is_the_sum_of_read_and_shot_noise(read, shot, level):
+    camera = sensor.Sensor(plain_imaging(read_noise=read, shot_noise=shot), 0, 0, (120, 160))
     image = np.full((120, 160, 3), level, np.uint8)
-    frames = np.stack([one.expose(image, frame, frame / 25) for frame in range(8)]).astype(float)
-    # Rounding to whole grey levels adds 1/12. Of 460,000 numbers, neighbours share some; measured within 2 %.
+    frames = np.stack([camera.expose(image, frame, frame / 25) for frame in range(8)]).astype(float)
+    # Rounding to whole grey levels adds 1/12. Neighbouring pixels are correlated; measured within 2 %.
     assert frames.var() == pytest.approx(read**2 + shot**2 * level / 255 + 1 / 12, rel=0.05)
     assert frames.mean() == pytest.approx(level, abs=0.1)
 
 
-def blockiness(image):
-    """How much more neighbours differ across the borders of JPEG's blocks than within them."""
+def measure_blockiness(image):
+    """Return the ratio of the difference of neighbours across JPEG block borders to the difference inside blocks."""
     steps = np.abs(np.diff(image.astype(float), axis=1)).mean(axis=(0, 2))
     border = np.arange(len(steps)) % 8 == 7
     return steps[border].mean() / steps[~border].mean()
 
 
-def test_blocks_show_more_the_lower_the_quality(scene):
-    image = renderer(scene, imaging(lens_blur_px=1.0), standing(cube(0.3), (0.3, -0.2, 1.4))).clean_frame(0)
+def test_lower_jpeg_quality_shows_more_blocks(scene):
+    image = make_renderer(
+        scene, plain_imaging(lens_blur_px=1.0), hovering(cube(0.3), (0.3, -0.2, 1.4))
+    ).clean_frame(0)
     found = [
-        blockiness(sensor.Sensor(imaging(jpeg_quality=quality), 0, 0, image.shape[:2]).expose(image, 0, 0.0))
+        measure_blockiness(
+            sensor.Sensor(plain_imaging(jpeg_quality=quality), 0, 0, image.shape[:2]).expose(image, 0, 0.0)
+        )
         for quality in (0, 90, 40, 10)
     ]
     assert found[0] < 1.1

@@ -1,4 +1,7 @@
-"""Masks against OpenCV's projection and polygons, archives against `zipfile`, detections against their settings."""
+"""Masks, mask archives, detections and mocap markers of the simulator.
+
+Masks are compared with OpenCV's projection and polygons, archives with `zipfile`, detections with their settings.
+"""
 
 import math
 import struct
@@ -45,25 +48,27 @@ def scene():
     return build(S02, scale=0.5)
 
 
-def hovering(position_m):
-    """A flight that stays at a point."""
+def make_hovering_flight(position_m):
+    """Make a flight that stays at a point."""
     nothing = np.zeros((1, 3))
     return HarmonicFlight(np.array(position_m, float), nothing, np.ones(1), nothing, Heading(yaw_rad=0.4))
 
 
 def with_drones(scene, *placed):
-    """The scene with only these drones: (model, position) each."""
+    """Return the scene with other drones, each given as (model, position)."""
     models, positions = zip(*placed, strict=True)
-    return replace(scene, models=tuple(models), flights=tuple(hovering(position) for position in positions))
+    return replace(
+        scene, models=tuple(models), flights=tuple(make_hovering_flight(position) for position in positions)
+    )
 
 
-def cam_and_depth(scene, index):
-    """A camera, and a room that hides nothing."""
+def empty_room_view(scene, index):
+    """Return a camera and the depth image, metres, of a room in which nothing hides a drone."""
     cam = pinhole(scene.rig.cameras[index])
     return cam, np.full((cam.height, cam.width), NO_ROOM_M, np.float32)
 
 
-def opencv_pixels(scene, index, points_m):
+def project_by_opencv(scene, index, points_m):
     cam = scene.rig.cameras[index]
     rotation, _ = cv2.Rodrigues(cam.T_cam_world[:3, :3])
     pixels, _ = cv2.projectPoints(
@@ -82,7 +87,7 @@ def cube(side_m):
     return drones.DroneModel(triangles, np.ones(len(triangles)), np.zeros((0, 3)), np.zeros(0))
 
 
-def sphere_file(path, radius_m):
+def write_sphere_file(path, radius_m):
     points = radius_m * sphere_points(400)
     faces = ConvexHull(points).simplices
     header = ["ply", "format ascii 1.0", f"element vertex {len(points)}"]
@@ -97,77 +102,85 @@ def sphere_file(path, radius_m):
 
 
 @pytest.mark.parametrize("index", [0, 3, 6])
-def test_the_mask_of_a_ball_from_a_mesh_file_is_about_its_projected_centre(scene, index, tmp_path):
-    """The mesh's own centroid by cv2.projectPoints, under 1 px, anywhere in the image."""
-    ball = drones.model(Mesh(file=str(sphere_file(tmp_path / "ball.ply", 0.1))))
-    cam, depth_m = cam_and_depth(scene, index)
+def test_the_mask_of_a_ball_is_centred_on_the_projected_centre(scene, index, tmp_path):
+    """`cv2.projectPoints` projects the centre of the mesh; the mask's centroid is within 1 px."""
+    ball = drones.model(Mesh(file=str(write_sphere_file(tmp_path / "ball.ply", 0.1))))
+    cam, depth_m = empty_room_view(scene, index)
     rng = np.random.default_rng(index)
-    looked_at = 0
+    num_checked = 0
     for position in rng.uniform((-2.5, -1.8, 0.6), (2.5, 1.8, 2.3), (12, 3)):
-        expected = opencv_pixels(scene, index, position)[0]
+        expected = project_by_opencv(scene, index, position)[0]
         mask = drone_masks(with_drones(scene, (ball, position)), cam, depth_m, 0)
         if mask.any() and not (mask[[0, -1]].any() or mask[:, [0, -1]].any()):
-            looked_at += 1
-            # Measured 0.3 px at most: a ball's outline is an ellipse whose middle is not quite its centre.
+            num_checked += 1
+            # Measured 0.3 px at most: the outline is an ellipse whose centre differs from the projected centre.
             assert np.linalg.norm(centroid(mask) - expected) < 1.0
-    assert looked_at >= 6
+    assert num_checked >= 6
 
 
 @pytest.mark.parametrize("frame", [3, 120, 249])
 @pytest.mark.parametrize("index", [0, 4, 7])
-def test_masks_of_the_models_are_where_opencv_projects_and_fills_their_faces(scene, index, frame):
-    cam, depth_m = cam_and_depth(scene, index)
+def test_masks_of_the_models_agree_with_polygons_filled_by_opencv(scene, index, frame):
+    cam, depth_m = empty_room_view(scene, index)
     turn = Rotation.from_quat(scene.orientations_wxyz(frame + 1)[-1], scalar_first=True).as_matrix()
     at_m = scene.positions_m(frame + 1)[-1]
     found = silhouettes(scene, cam, depth_m, frame)
     assert found
-    for one in found:
-        if one.xyxy is None or not (one.xyxy[0] > 0 and one.xyxy[2] < cam.width):
+    for drone_silhouette in found:
+        if drone_silhouette.xyxy is None or not (
+            drone_silhouette.xyxy[0] > 0 and drone_silhouette.xyxy[2] < cam.width
+        ):
             continue
         alone = replace(
-            scene, models=(scene.models[one.number - 1],), flights=(scene.flights[one.number - 1],)
+            scene,
+            models=(scene.models[drone_silhouette.number - 1],),
+            flights=(scene.flights[drone_silhouette.number - 1],),
         )
-        (mask,) = (single.mask() for single in silhouettes(alone, cam, depth_m, frame))
-        model = scene.models[one.number - 1]
+        (mask,) = (silhouette.mask() for silhouette in silhouettes(alone, cam, depth_m, frame))
+        model = scene.models[drone_silhouette.number - 1]
         angle = np.linspace(0, 2 * np.pi, 60)[:, None]
         rim = np.hstack([np.cos(angle), np.sin(angle), 0 * angle])
         polygons_m = [*model.triangles_m]
         for hub, radius in zip(model.rotor_centres_m, model.rotor_radii_m, strict=True):
             polygons_m.append(hub + radius * rim)
-        # Filled 32 times as large: OpenCV's polygons hold their outlines, half a pixel to every side.
+        # Draw 32 times as large, because OpenCV's polygons include their outline: half a pixel on every side.
         x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
         corner = np.array([x - 2, y - 2])
         canvas = np.zeros((32 * (height + 4), 32 * (width + 4)), np.uint8)
         for polygon in polygons_m:
-            pixels = opencv_pixels(scene, index, polygon @ turn[one.number - 1].T + at_m[one.number - 1])
+            pixels = project_by_opencv(
+                scene,
+                index,
+                polygon @ turn[drone_silhouette.number - 1].T + at_m[drone_silhouette.number - 1],
+            )
             cv2.fillConvexPoly(canvas, (32 * (pixels - corner + 0.5) - 0.5).round().astype(np.int32), 1)
         middle = (centroid(canvas) + 0.5) / 32 - 0.5 + corner
-        # Measured 0.4 px at most: thin arms are hit or missed as a whole by one sample per pixel.
+        # Measured 0.4 px at most: with one sample per pixel, a thin arm is drawn fully or not at all.
         assert np.linalg.norm(centroid(mask) - middle) < 1.0
-        # Measured 4 % at most, of the smallest: an area of 200 px has a rim of 100.
+        # Measured 4 % at most, for the smallest mask: 100 of its 200 px lie on the edge.
         assert mask.sum() == pytest.approx(canvas.sum() / 32**2, rel=0.07)
-        assert one.whole_px >= mask.sum()
+        assert drone_silhouette.whole_px >= mask.sum()
 
 
-def test_near_hides_far_whatever_their_order(scene):
-    cam, depth_m = cam_and_depth(scene, 0)
+def test_the_nearer_drone_hides_the_farther_drone_in_either_order(scene):
+    cam, depth_m = empty_room_view(scene, 0)
     centre = scene.rig.cameras.centre_world[0]
     towards = np.array([0.0, 0.0, 1.4]) - centre
     near, far = centre + 0.5 * towards, centre + 0.9 * towards + np.array([0.0, 0.0, 0.3])
-    one = silhouettes(with_drones(scene, (cube(0.3), near), (cube(0.3), far)), cam, depth_m, 0)
-    other = silhouettes(with_drones(scene, (cube(0.3), far), (cube(0.3), near)), cam, depth_m, 0)
-    np.testing.assert_array_equal(one[0].mask(), other[1].mask())
-    np.testing.assert_array_equal(one[1].mask(), other[0].mask())
+    first = silhouettes(with_drones(scene, (cube(0.3), near), (cube(0.3), far)), cam, depth_m, 0)
+    second = silhouettes(with_drones(scene, (cube(0.3), far), (cube(0.3), near)), cam, depth_m, 0)
+    np.testing.assert_array_equal(first[0].mask(), second[1].mask())
+    np.testing.assert_array_equal(first[1].mask(), second[0].mask())
     (alone,) = silhouettes(with_drones(scene, (cube(0.3), near)), cam, depth_m, 0)
     (behind,) = silhouettes(with_drones(scene, (cube(0.3), far)), cam, depth_m, 0)
-    np.testing.assert_array_equal(one[0].mask(), alone.mask())
-    assert one[0].seen_share == alone.seen_share == 1.0
-    np.testing.assert_array_equal(one[1].mask(), behind.mask() & ~alone.mask())
-    assert 0.05 < one[1].seen_share < 0.95, "some of it, or the test would say nothing"
+    np.testing.assert_array_equal(first[0].mask(), alone.mask())
+    assert first[0].seen_share == alone.seen_share == 1.0
+    np.testing.assert_array_equal(first[1].mask(), behind.mask() & ~alone.mask())
+    assert 0.05 < first[1].seen_share < 0.95, "the far drone must be partly hidden"
 
 
 def test_the_room_hides_drones(scene):
-    cam, depth_m = cam_and_depth(scene, 0)
+    cam, depth_m = empty_room_view(scene, 0)
     placed = with_drones(scene, (cube(0.3), (0.0, 0.0, 1.4)))
     (free,) = silhouettes(placed, cam, depth_m, 0)
     x = round(centroid(free.mask())[0])
@@ -183,36 +196,36 @@ def test_the_room_hides_drones(scene):
     assert (hidden.seen_share, hidden.xyxy) == (0.0, None)
 
 
-def test_what_the_images_edge_cuts_off_counts_as_unseen(scene):
-    cam, depth_m = cam_and_depth(scene, 0)
+def test_parts_outside_the_image_count_as_unseen(scene):
+    cam, depth_m = empty_room_view(scene, 0)
     R, t = scene.rig.cameras.T_cam_world[0, :3, :3], scene.rig.cameras.T_cam_world[0, :3, 3]
     for x, share in ((-0.5, 0.5), (cam.width - 0.5, 0.5), (cam.width / 2, 1.0)):
         ray = np.linalg.inv(cam.K) @ [x, cam.height / 2, 1.0]
-        (one,) = silhouettes(with_drones(scene, (cube(0.3), R.T @ (4.0 * ray - t))), cam, depth_m, 0)
-        assert one.seen_share == pytest.approx(share, abs=0.1)  # a turned cube is not symmetric
+        (silhouette,) = silhouettes(with_drones(scene, (cube(0.3), R.T @ (4.0 * ray - t))), cam, depth_m, 0)
+        assert silhouette.seen_share == pytest.approx(share, abs=0.1)  # a turned cube is not symmetric
     behind = R.T @ (np.array([0.0, 0.0, -2.0]) - t)
     assert silhouettes(with_drones(scene, (cube(0.3), behind)), cam, depth_m, 0) == []
-    # Around the camera itself: no window is too large.
+    # A cube around the camera fills the whole image.
     (around,) = silhouettes(
         with_drones(scene, (cube(3.0), scene.rig.cameras.centre_world[0])), cam, depth_m, 0
     )
     assert around.seen_share == 1.0
 
 
-def test_masks_of_one_camera_are_disjoint_and_boxes_hold_them(scene):
-    one = CameraRenderer(scene, 4)
+def test_masks_of_one_camera_are_disjoint_and_boxes_bound_them(scene):
+    renderer = CameraRenderer(scene, 4)
     for frame in range(0, 250, 25):
-        found = silhouettes(scene, one.cam, one.backdrop.depth_m, frame)
-        numbers = drone_masks(scene, one.cam, one.backdrop.depth_m, frame)
-        for single in found:
-            np.testing.assert_array_equal(single.mask(), numbers == single.number)
-            if single.xyxy is not None:
-                x, y, width, height = cv2.boundingRect((numbers == single.number).astype(np.uint8))
-                assert single.xyxy.tolist() == [x, y, x + width, y + height]
+        found = silhouettes(scene, renderer.cam, renderer.backdrop.depth_m, frame)
+        numbers = drone_masks(scene, renderer.cam, renderer.backdrop.depth_m, frame)
+        for silhouette in found:
+            np.testing.assert_array_equal(silhouette.mask(), numbers == silhouette.number)
+            if silhouette.xyxy is not None:
+                x, y, width, height = cv2.boundingRect((numbers == silhouette.number).astype(np.uint8))
+                assert silhouette.xyxy.tolist() == [x, y, x + width, y + height]
 
 
 def test_masks_and_frames_agree():
-    """What differs from the empty room, where nothing but drones does, is what the masks say."""
+    """Without shadows, reflections and noise, a frame differs from the empty room exactly inside the masks."""
     plain = {"shadows": False, "contact_shadows": False, "reflections": 0, "exposure_drift": 0, "flicker": 0}
     plain |= {"white_balance_drift": 0, "read_noise": 0, "shot_noise": 0, "shutter_s": 0, "lens_blur_px": 0}
     recipe = replaced(S02, {f"imaging.{field}": value for field, value in plain.items()})
@@ -228,7 +241,7 @@ def test_masks_and_frames_agree():
             assert np.median(difference[mask]) > 20
             near = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
             assert not difference[~near].any()
-            # One sample per pixel against eight: they differ in rims of thin arms. Measured 0.88 to 0.90.
+            # Masks have one sample per pixel and frames eight, so the edges of thin arms differ. Measured 0.88 to 0.90.
             changed = difference > 10
             assert (changed & mask).sum() > 0.8 * (changed | mask).sum()
 
@@ -236,14 +249,14 @@ def test_masks_and_frames_agree():
 # --- archives
 
 
-def blobs(seed, shape=(54, 97)):
+def random_mask(seed, shape=(54, 97)):
     return np.random.default_rng(seed).random(shape) > 0.7
 
 
 def write_part(path, camera, frames):
     with MaskWriter(path) as writer:
         for frame in frames:
-            writer.write(camera, 1, frame, blobs(frame))
+            writer.write(camera, 1, frame, random_mask(frame))
             writer.write(camera, 2, frame, np.zeros((54, 97), bool))
     return path
 
@@ -257,8 +270,8 @@ def parts(tmp_path):
     ]
 
 
-def check(path):
-    """What an archive of `parts` holds, and that Python's own reader finds no fault with it."""
+def check_joined_archive(path):
+    """Check the content of the archive that joins `parts`, and that Python's `zipfile` accepts the archive."""
     with zipfile.ZipFile(path) as archive:
         assert archive.testzip() is None
         assert len(archive.namelist()) == 20
@@ -267,20 +280,20 @@ def check(path):
         assert (masks.cameras, masks.drones, masks.frames) == (("cam1i", "cam2i"), (1, 2), (0, 1, 2, 3, 4))
         for camera in masks.cameras:
             for frame in masks.frames:
-                np.testing.assert_array_equal(masks.mask(camera, 1, frame), blobs(frame))
+                np.testing.assert_array_equal(masks.mask(camera, 1, frame), random_mask(frame))
                 assert not masks.mask(f"{camera}_s", 2, frame).any()
 
 
-def test_joined_archives_read_as_one(tmp_path, parts):
+def test_joined_archives_are_read_as_one_archive(tmp_path, parts):
     join_archives(tmp_path / "all.zip", parts)
-    check(tmp_path / "all.zip")
+    check_joined_archive(tmp_path / "all.zip")
     before = (tmp_path / "all.zip").read_bytes()
     join_archives(tmp_path / "all.zip", parts)
     assert (tmp_path / "all.zip").read_bytes() == before
 
 
-def test_more_entries_than_16_bits_count_are_all_found(tmp_path):
-    """65,536 entries and more need the 64-bit records of ZIP."""
+def test_archives_of_more_than_65535_entries_are_read(tmp_path):
+    """More than 65,535 entries need the 64-bit records of ZIP."""
     counts = (40_000, 26_000)
     halves = [tmp_path / f"half_{number}.zip" for number in range(2)]
     for number, (path, count) in enumerate(zip(halves, counts, strict=True)):
@@ -294,27 +307,27 @@ def test_more_entries_than_16_bits_count_are_all_found(tmp_path):
         for name in (names[0], names[65_535], names[65_536], names[-1]):
             assert archive.read(name) == name[2:].encode()
     content = (tmp_path / "all.zip").read_bytes()
-    # Other readers take the number of entries, on this disk and in total, from the 64-bit record.
+    # Other readers read the two counts of entries (on this disk, in total) from the 64-bit record.
     record = content.rfind(b"PK\x06\x06")
     assert struct.unpack_from("<QQ", content, record + 24) == (sum(counts),) * 2
 
 
 def test_entries_beyond_4_gb_are_found(tmp_path, parts):
-    """Behind 5 GB of nothing, which take no space on the disk."""
+    """The entries follow a sparse gap of 5 GB, which takes no space on the disk."""
     with (tmp_path / "all.zip").open("wb") as archive, (tmp_path / "central").open("w+b") as central:
         archive.seek(5_000_000_000)
-        count = sum(_archives._copy(part, archive, central) for part in parts)
+        count = sum(_archives._copy(second_box, archive, central) for second_box in parts)
         start, size = archive.tell(), central.tell()
         central.seek(0)
         archive.write(central.read() + _archives._end(count, start, size))
-    check(tmp_path / "all.zip")
+    check_joined_archive(tmp_path / "all.zip")
 
 
-def test_masks_are_pngs_of_one_bit(tmp_path, parts):
+def test_masks_are_one_bit_png_images(tmp_path, parts):
     with zipfile.ZipFile(parts[0]) as archive:
         for name in archive.namelist():
             data = archive.read(name)
-            # Width, height, bit depth and colour type, as the standard has them.
+            # Width, height, bit depth and colour type as the PNG standard defines them.
             assert data[16:26] == (97).to_bytes(4, "big") + (54).to_bytes(4, "big") + b"\x01\x00"
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
             assert image.dtype == np.uint8
@@ -333,7 +346,7 @@ def test_masks_are_pngs_of_one_bit(tmp_path, parts):
     ],
 )
 @pytest.mark.parametrize("unpacked", [False, True])
-def test_other_layouts_are_read_where_they_say_what_is_what(tmp_path, layout, unpacked):
+def test_layouts_that_name_camera_drone_and_frame_are_read(tmp_path, layout, unpacked):
     name = layout.split("/")[0].format(camera=2, drone=1, frame=0)
     camera = "60881252" if name.isdigit() and len(name) == 8 else "cam2i"
     with zipfile.ZipFile(tmp_path / "masks.zip", "w") as archive:
@@ -341,12 +354,12 @@ def test_other_layouts_are_read_where_they_say_what_is_what(tmp_path, layout, un
         archive.writestr("readme.txt", b"")
         for drone in (1, 2):
             for frame in (0, 7):
-                _, png = cv2.imencode(".png", 255 * blobs(10 * drone + frame).astype(np.uint8))
+                _, png = cv2.imencode(".png", 255 * random_mask(10 * drone + frame).astype(np.uint8))
                 archive.writestr(layout.format(camera=2, drone=drone, frame=frame), png.tobytes())
         archive.extractall(tmp_path / "masks")
     with read_masks(tmp_path / ("masks" if unpacked else "masks.zip")) as masks:
         assert (masks.cameras, masks.drones, masks.frames) == ((camera,), (1, 2), (0, 7))
-        np.testing.assert_array_equal(masks.mask(camera, 2, 7), blobs(27))
+        np.testing.assert_array_equal(masks.mask(camera, 2, 7), random_mask(27))
         with pytest.raises(
             InputError, match=r"masks.*: expected a mask of dron3 in frame 7 of cam2i, found none"
         ):
@@ -398,21 +411,21 @@ def test_broken_archives_and_images_are_named(tmp_path):
 # --- detections
 
 
-def seen_as(scene, xyxy, number=1, share=1.0):
-    """A drone that is seen as a full rectangle, that share of its whole."""
+def make_silhouette(scene, xyxy, number=1, share=1.0):
+    """Make the silhouette of a drone: a full rectangle, which is the share `share` of the unoccluded silhouette."""
     x0, y0, x1, y1 = xyxy
     window = RasterView(pinhole(scene.rig.cameras[0]), x0, y0, x1 - x0, y1 - y0)
     return Silhouette(number, window, np.ones(window.shape, bool), round((x1 - x0) * (y1 - y0) / share))
 
 
-def with_detector(scene, **values):
+def scene_with_detector(scene, **values):
     quiet = {"jitter": 0, "miss_rate": 0, "double_rate": 0, "false_alarms_per_frame": 0} | values
     recipe = replaced(S02, {f"detector.{field}": value for field, value in quiet.items()})
     return replace(scene, scenario=recipe)
 
 
 def binomial_bounds(count, rate):
-    """Five standard deviations about the mean: with the seeds of these tests that is the truth or a mistake."""
+    """Return mean minus and plus five standard deviations; a correct detector stays inside."""
     spread = 5 * math.sqrt(count * rate * (1 - rate)) + 1
     return count * rate - spread, count * rate + spread
 
@@ -421,41 +434,45 @@ LARGE = (300, 200, 380, 250)
 
 
 def test_without_noise_the_detector_reports_the_boxes_that_are_seen(scene):
-    others = [seen_as(scene, LARGE), seen_as(scene, (500, 100, 590, 160), 2)]
-    found = detect(with_detector(scene), 0, 17, others)
+    others = [make_silhouette(scene, LARGE), make_silhouette(scene, (500, 100, 590, 160), 2)]
+    found = detect(scene_with_detector(scene), 0, 17, others)
     assert found.frame.tolist() == [17, 17]
     assert sorted(found.xyxy.tolist()) == [[300, 200, 380, 250], [500, 100, 590, 160]]
 
 
 @pytest.mark.parametrize("rate", [0.0, 0.03, 0.3, 1.0])
-def test_misses_and_doubles_are_as_frequent_as_they_are_set(scene, rate):
+def test_misses_and_double_detections_have_their_set_rates(scene, rate):
     frames = 800
-    missing = with_detector(scene, miss_rate=rate)
-    found = sum(len(detect(missing, 0, frame, [seen_as(scene, LARGE)])) for frame in range(frames))
+    missing = scene_with_detector(scene, miss_rate=rate)
+    found = sum(len(detect(missing, 0, frame, [make_silhouette(scene, LARGE)])) for frame in range(frames))
     low, high = binomial_bounds(frames, 1 - rate)
     assert low <= found <= high
-    twice = with_detector(scene, double_rate=rate)
-    doubled = [detect(twice, 0, frame, [seen_as(scene, LARGE)]) for frame in range(frames)]
+    twice = scene_with_detector(scene, double_rate=rate)
+    doubled = [detect(twice, 0, frame, [make_silhouette(scene, LARGE)]) for frame in range(frames)]
     low, high = binomial_bounds(frames, rate)
-    assert low <= sum(len(one) == 2 for one in doubled) <= high
-    for one in doubled:
-        # Otherwise a network would have taken both for one (its own threshold is 0.45).
-        assert len(one) < 2 or iou(one.xyxy[0], one.xyxy[1]) < 0.45
+    assert low <= sum(len(detections) == 2 for detections in doubled) <= high
+    for detections in doubled:
+        # A network's non-maximum suppression, with a threshold of 0.45, would have merged boxes of a larger IoU.
+        assert len(detections) < 2 or iou(detections.xyxy[0], detections.xyxy[1]) < 0.45
 
 
-def test_of_a_double_the_detector_is_less_sure_than_of_the_box_it_lies_on(scene):
-    twice = with_detector(scene, double_rate=1.0)
-    found = [detect(twice, 0, frame, [seen_as(scene, LARGE)]) for frame in range(400)]
-    larger = [np.argsort(np.prod(one.xyxy[:, 2:] - one.xyxy[:, :2], axis=1)) for one in found]
-    part, whole = np.mean([one.confidence[order] for one, order in zip(found, larger, strict=True)], axis=0)
-    # The rest above 0.25 is 0.1 + 0.8 q with q = 1 and 0.4; means of 400 are known to 0.004.
-    assert whole == pytest.approx(0.25 + 0.75 * 0.9, abs=0.016)
-    assert part == pytest.approx(0.25 + 0.75 * 0.42, abs=0.016)
+def test_the_second_box_of_a_double_detection_has_less_confidence(scene):
+    twice = scene_with_detector(scene, double_rate=1.0)
+    found = [detect(twice, 0, frame, [make_silhouette(scene, LARGE)]) for frame in range(400)]
+    larger = [
+        np.argsort(np.prod(detections.xyxy[:, 2:] - detections.xyxy[:, :2], axis=1)) for detections in found
+    ]
+    second_box, first_box = np.mean(
+        [detections.confidence[order] for detections, order in zip(found, larger, strict=True)], axis=0
+    )
+    # Confidence is 0.25 + 0.75 (0.1 + 0.8 q) with q = 1 and 0.4; a mean of 400 values has a standard error of 0.004.
+    assert first_box == pytest.approx(0.25 + 0.75 * 0.9, abs=0.016)
+    assert second_box == pytest.approx(0.25 + 0.75 * 0.42, abs=0.016)
 
 
 @pytest.mark.parametrize(
     ("side_px", "share", "rate"),
-    # 1 - (1 - v)^2 and 1 - exp(-(s / 10)^2), worked out.
+    # Values of 1 - (1 - v)^2 for the visible share v, and of 1 - exp(-(s / 10)^2) for the size s.
     [
         (100, 1.0, 1.0),
         (20, 1.0, 0.9817),
@@ -465,90 +482,97 @@ def test_of_a_double_the_detector_is_less_sure_than_of_the_box_it_lies_on(scene)
         (100, 0.1, 0.19),
     ],
 )
-def test_the_small_and_the_hidden_are_missed_more_often(scene, side_px, share, rate):
+def test_small_and_occluded_drones_are_missed_more_often(scene, side_px, share, rate):
     frames = 800
-    one = seen_as(scene, (300, 200, 300 + side_px, 200 + side_px), share=share)
-    quiet = with_detector(scene)
-    found = sum(len(detect(quiet, 0, frame, [one])) for frame in range(frames))
+    silhouette = make_silhouette(scene, (300, 200, 300 + side_px, 200 + side_px), share=share)
+    quiet = scene_with_detector(scene)
+    found = sum(len(detect(quiet, 0, frame, [silhouette])) for frame in range(frames))
     low, high = binomial_bounds(frames, rate)
     assert low <= found <= high
 
 
-def test_jitter_is_that_share_of_the_box(scene):
-    shaky = with_detector(scene, jitter=0.05)
-    boxes = np.concatenate([detect(shaky, 0, frame, [seen_as(scene, LARGE)]).xyxy for frame in range(2000)])
+def test_jitter_is_a_share_of_the_size_of_the_box(scene):
+    shaky = scene_with_detector(scene, jitter=0.05)
+    boxes = np.concatenate(
+        [detect(shaky, 0, frame, [make_silhouette(scene, LARGE)]).xyxy for frame in range(2000)]
+    )
     size = boxes[:, 2:] - boxes[:, :2]
     shift = ((boxes[:, :2] + boxes[:, 2:]) / 2 - [340, 225]) / [80, 50]
-    # The deviation of 2000 draws is known to 1.6 %, their mean to 0.0011; four times that.
+    # With 2000 draws the standard error is 1.6 % of the deviation and 0.0011 of the mean; tolerances are four times
+    # that.
     np.testing.assert_allclose(shift.std(axis=0), 0.05, rtol=0.065)
     np.testing.assert_allclose(shift.mean(axis=0), 0.0, atol=0.0045)
     np.testing.assert_allclose((size / [80, 50]).std(axis=0), 0.05, rtol=0.065)
     np.testing.assert_allclose((size / [80, 50]).mean(axis=0), 1.0, atol=0.006)
 
 
-def test_false_alarms_are_poisson_as_large_as_drones_and_anywhere(scene):
-    noisy = with_detector(scene, false_alarms_per_frame=0.7, miss_rate=1.0)
-    found = [detect(noisy, 0, frame, [seen_as(scene, LARGE)]) for frame in range(2000)]
-    counts = np.array([len(one) for one in found])
-    # The mean of 2000 Poisson numbers is known to 0.019, their variance to 0.034.
+def test_false_alarms_are_poisson_distributed_and_spread_over_the_image(scene):
+    noisy = scene_with_detector(scene, false_alarms_per_frame=0.7, miss_rate=1.0)
+    found = [detect(noisy, 0, frame, [make_silhouette(scene, LARGE)]) for frame in range(2000)]
+    counts = np.array([len(detections) for detections in found])
+    # The mean of 2000 Poisson numbers has a standard error of 0.019, their variance of 0.034.
     assert counts.mean() == pytest.approx(0.7, abs=0.08)
     assert counts.var() == pytest.approx(0.7, abs=0.14)
-    boxes = np.concatenate([one.xyxy for one in found])
+    boxes = np.concatenate([detections.xyxy for detections in found])
     size = boxes[:, 2:] - boxes[:, :2]
     np.testing.assert_allclose(np.median(size, axis=0), [80, 50], rtol=0.1)
     width, height = scene.rig.cameras.image_size_wh[0]
     middle = (boxes[:, :2] + boxes[:, 2:]) / 2 / [width, height]
     np.testing.assert_allclose(middle.mean(axis=0), 0.5, atol=0.05)
     assert np.all(np.ptp(middle, axis=0) > 0.8)
-    # Also where no drone is seen.
+    # False alarms also come in frames without a drone.
     assert sum(len(detect(noisy, 0, frame, [])) for frame in range(200)) > 90
 
 
 @pytest.mark.parametrize(("right", "merged"), [(20, True), (27, True), (33, False), (60, False), (90, False)])
-def test_boxes_that_overlap_much_become_one(scene, right, merged):
-    # Shifted by 20 and 27 of 80 px, IoU is 0.6 and 0.49; by 33, 0.42.
+def test_boxes_with_large_overlap_are_merged(scene, right, merged):
+    # A shift by 20, 27 or 33 of 80 px gives an IoU of 0.6, 0.49 or 0.42.
     x0, y0, x1, y1 = LARGE
-    pair = [seen_as(scene, LARGE), seen_as(scene, (x0 + right, y0, x1 + right, y1), 2)]
-    found = detect(with_detector(scene, merge_iou=0.45), 0, 0, pair)
+    pair = [make_silhouette(scene, LARGE), make_silhouette(scene, (x0 + right, y0, x1 + right, y1), 2)]
+    found = detect(scene_with_detector(scene, merge_iou=0.45), 0, 0, pair)
     assert len(found) == (1 if merged else 2)
     if merged:
         assert found.xyxy.tolist() == [[x0, y0, x1 + right, y1]]
 
 
-def test_confidence_goes_with_how_well_a_drone_is_seen(scene):
-    frames, quiet = 400, with_detector(scene)
+def test_confidence_grows_with_the_visible_share(scene):
+    frames, quiet = 400, scene_with_detector(scene)
     means = []
     for share in (1.0, 0.6, 0.3):
-        one = seen_as(scene, LARGE, share=share)
-        found = [detect(quiet, 0, frame, [one]).confidence for frame in range(frames)]
+        silhouette = make_silhouette(scene, LARGE, share=share)
+        found = [detect(quiet, 0, frame, [silhouette]).confidence for frame in range(frames)]
         means.append(np.concatenate(found).mean())
-    alarms = with_detector(scene, false_alarms_per_frame=1.0)
+    alarms = scene_with_detector(scene, false_alarms_per_frame=1.0)
     false = np.concatenate([detect(alarms, 0, frame, []).confidence for frame in range(frames)])
     means.append(false.mean())
     assert means[0] > 0.85
-    # Each is known to 0.01.
+    # Each mean has a standard error of 0.01.
     assert np.all(np.diff(means) < -0.05)
     assert false.min() >= 0.25
 
 
-def test_confidence_goes_with_how_good_a_box_is(scene):
-    shaky = with_detector(scene, jitter=0.15)
+def test_confidence_grows_with_the_quality_of_the_box(scene):
+    shaky = scene_with_detector(scene, jitter=0.15)
     truth = np.array(LARGE, float)
     pairs = []
     for frame in range(600):
-        one = detect(shaky, 0, frame, [seen_as(scene, LARGE)])
+        detections = detect(shaky, 0, frame, [make_silhouette(scene, LARGE)])
         pairs += [
-            (iou(box, truth), confidence) for box, confidence in zip(one.xyxy, one.confidence, strict=True)
+            (iou(box, truth), confidence)
+            for box, confidence in zip(detections.xyxy, detections.confidence, strict=True)
         ]
     quality, confidence = np.array(pairs).T
-    # Measured 0.66.
+    # Measured rank correlation 0.66.
     assert spearmanr(quality, confidence).statistic > 0.5
 
 
-def test_boxes_keep_to_the_image_and_come_surest_first(scene):
-    wild = with_detector(scene, jitter=0.5, double_rate=0.5, false_alarms_per_frame=2.0)
+def test_boxes_lie_inside_the_image_in_order_of_confidence(scene):
+    wild = scene_with_detector(scene, jitter=0.5, double_rate=0.5, false_alarms_per_frame=2.0)
     width, height = (int(side) for side in scene.rig.cameras.image_size_wh[0])
-    at_edges = [seen_as(scene, (0, 0, 60, 40)), seen_as(scene, (width - 30, height - 50, width, height), 2)]
+    at_edges = [
+        make_silhouette(scene, (0, 0, 60, 40)),
+        make_silhouette(scene, (width - 30, height - 50, width, height), 2),
+    ]
     for frame in range(200):
         found = detect(wild, 0, frame, at_edges)
         assert np.all(found.xyxy >= 0)
@@ -558,26 +582,26 @@ def test_boxes_keep_to_the_image_and_come_surest_first(scene):
         assert np.all((found.confidence >= 0) & (found.confidence <= 1))
 
 
-def test_detections_depend_on_seed_camera_and_frame_alone(scene):
-    one = [seen_as(scene, LARGE)]
-    shaky = with_detector(scene, jitter=0.1)
-    first = detect(shaky, 0, 5, one).xyxy.tolist()
-    detect(shaky, 0, 6, one)
-    assert detect(shaky, 0, 5, one).xyxy.tolist() == first
+def test_detections_depend_only_on_seed_camera_and_frame(scene):
+    silhouettes_seen = [make_silhouette(scene, LARGE)]
+    shaky = scene_with_detector(scene, jitter=0.1)
+    first = detect(shaky, 0, 5, silhouettes_seen).xyxy.tolist()
+    detect(shaky, 0, 6, silhouettes_seen)
+    assert detect(shaky, 0, 5, silhouettes_seen).xyxy.tolist() == first
     others = [(shaky, 1, 5), (shaky, 0, 6), (replace(shaky, seed=1), 0, 5)]
     for arguments in others:
-        assert detect(*arguments, one).xyxy.tolist() != first
+        assert detect(*arguments, silhouettes_seen).xyxy.tolist() != first
 
 
-def test_a_drone_that_is_hidden_wholly_is_no_target(scene):
-    one = seen_as(scene, LARGE)
-    hidden = replace(one, seen=np.zeros_like(one.seen))
-    assert len(detect(with_detector(scene), 0, 0, [hidden])) == 0
+def test_a_fully_hidden_drone_is_not_detected(scene):
+    silhouette = make_silhouette(scene, LARGE)
+    hidden = replace(silhouette, seen=np.zeros_like(silhouette.seen))
+    assert len(detect(scene_with_detector(scene), 0, 0, [hidden])) == 0
 
 
 @given(st.lists(st.integers(0, 12), min_size=8, max_size=8))
 @settings(max_examples=60, deadline=None)
-def test_iou_is_that_of_counted_pixels(corners):
+def test_iou_agrees_with_counted_pixels(corners):
     boxes = np.sort(np.reshape(corners, (2, 2, 2)), axis=1).reshape(2, 4)
     canvases = []
     for x0, y0, x1, y1 in boxes:
@@ -592,7 +616,7 @@ def test_iou_is_that_of_counted_pixels(corners):
 # --- mocap markers
 
 
-def test_markers_are_fixed_to_the_body_and_tell_drones_apart(scene, tmp_path):
+def test_markers_are_fixed_to_the_body_and_differ_between_drones(scene, tmp_path):
     markers = mocap_markers_m(scene, 40)
     assert markers.shape == (40, 4, 4, 3)
     position, orientation = scene.positions_m(40), scene.orientations_wxyz(40)
@@ -602,7 +626,7 @@ def test_markers_are_fixed_to_the_body_and_tell_drones_apart(scene, tmp_path):
         in_body = np.stack(
             [turn.inv().apply(markers[:, drone, marker] - position[:, drone]) for marker in range(4)], axis=1
         )
-        # Quaternions hold sixteen digits.
+        # Quaternions are rounded to sixteen digits.
         np.testing.assert_allclose(in_body, np.broadcast_to(in_body[:1], in_body.shape), atol=1e-12)
         assert np.all(in_body[0, :, 2] > scene.models[drone].triangles_m[..., 2].max())
         distances.append(
@@ -611,8 +635,8 @@ def test_markers_are_fixed_to_the_body_and_tell_drones_apart(scene, tmp_path):
         path = tmp_path / f"dron{drone + 1}_markers_25.csv"
         write_mocap_markers(path, markers[:, drone])
         np.testing.assert_array_equal(read_mocap_markers(path), markers[:, drone])
-    for one, other in combinations(distances, 2):
-        assert np.abs(np.subtract(one, other)).max() > 0.015, "a mocap system sees millimetres"
+    for first, second in combinations(distances, 2):
+        assert np.abs(np.subtract(first, second)).max() > 0.015, "crosses differ clearly"
 
 
 def test_marker_files_with_gaps_and_faults(tmp_path):

@@ -1,4 +1,4 @@
-"""Recordings as flights: every format, every complaint, and resampling against the formula that was sampled."""
+"""Recorded flights: file formats, error messages, and resampling compared with the formula that was sampled."""
 
 import re
 import shutil
@@ -22,7 +22,7 @@ from psotrack.simulation.scenarios import Drone, FlightFromFile, Limits
 from psotrack.trajectories import Trajectories, write_trajectories
 
 HEADING = Heading(0.4, 0.6, 0.8, 0.1)
-#: Up to 2.4 m/s, 4 m/s^2 and 23 degrees of tilt: as lively as the scenarios of the dataset.
+#: A flight with up to 2.4 m/s, 4 m/s^2 and 23 degrees of tilt, similar to the scenarios of the dataset.
 FORMULA = HarmonicFlight(
     centre_m=np.array([0.1, -0.2, 1.5]),
     amplitude_m=np.array([[1.5, 1.2, 0.2], [0.2, 0.1, 0.1]]),
@@ -31,32 +31,32 @@ FORMULA = HarmonicFlight(
     heading=HEADING,
 )
 EVEN_S = np.arange(1001) / 100
-#: 70 to 160 Hz.
+#: Uneven sample times at rates of 70 to 160 Hz, seconds.
 UNEVEN_S = np.cumsum(np.random.default_rng([5]).uniform(0.006, 0.0145, 1001))
 FRAMES_S = np.arange(240) / 25
 
 
-def sampled(time_s, *, oriented=False, noise_m=0.0):
+def sample_formula(time_s, *, oriented=False, noise_m=0.0):
     position_m = FORMULA.position_m(time_s)
     position_m = position_m + np.random.default_rng([7]).normal(0.0, noise_m, position_m.shape)
     return Recorded(time_s, position_m, FORMULA.orientation_wxyz(time_s) if oriented else None)
 
 
-def flight(recorded, heading=HEADING, start_s=0.0, offset_m=(0.0, 0.0, 0.0)):
+def make_replay(recorded, heading=HEADING, start_s=0.0, offset_m=(0.0, 0.0, 0.0)):
     return RecordedFlight(recorded, heading, start_s, np.array(offset_m), "loop.csv")
 
 
 def angle_deg(a, b):
-    """(times,), between two stacks of rotation matrices."""
+    """Return the angles between two stacks of rotation matrices, (times,), degrees."""
     return np.degrees(Rotation.from_matrix(np.swapaxes(a, -1, -2) @ b).magnitude())
 
 
-def lines(*rows, separator=","):
+def csv_lines(*rows, separator=","):
     return "".join(f"{separator.join(map(str, row))}\n" for row in rows)
 
 
-def table(separator=",", header=("time_s", "x_m", "y_m", "z_m"), count=8):
-    return lines(
+def csv_table(separator=",", header=("time_s", "x_m", "y_m", "z_m"), count=8):
+    return csv_lines(
         header,
         *((k / 10, k, 2 * k, 3 * k, 1, 0, 0, 0)[: len(header)] for k in range(count)),
         separator=separator,
@@ -67,31 +67,33 @@ def table(separator=",", header=("time_s", "x_m", "y_m", "z_m"), count=8):
 
 
 @pytest.mark.parametrize("time_s", [EVEN_S, UNEVEN_S, np.arange(260) / 25], ids=["100 Hz", "uneven", "25 Hz"])
-def test_a_clean_recording_is_the_formula_again_at_any_time(time_s):
-    replay = flight(sampled(time_s))
-    asked_s = FRAMES_S + 0.0137
-    true_s = asked_s + time_s[0]
-    # The error of a quintic spline is of order h^6 x^(6), for its derivatives one and two orders less. At 25 Hz, where
-    # it is largest: measured 2e-8 m, 2e-6 m/s and 2e-4 m/s^2 (all near the ends, where it is one-sided).
-    np.testing.assert_allclose(replay.position_m(asked_s), FORMULA.position_m(true_s), atol=1e-6)
-    np.testing.assert_allclose(replay.velocity_m_s(asked_s), FORMULA.velocity_m_s(true_s), atol=1e-4)
+def test_a_recording_without_noise_replays_the_formula_at_any_time(time_s):
+    replay = make_replay(sample_formula(time_s))
+    query_s = FRAMES_S + 0.0137
+    true_s = query_s + time_s[0]
+    # The error of a quintic spline has order h^6 x^(6), and its derivatives have one and two orders less. The largest
+    # errors, at 25 Hz near the ends: measured 2e-8 m, 2e-6 m/s and 2e-4 m/s^2.
+    np.testing.assert_allclose(replay.position_m(query_s), FORMULA.position_m(true_s), atol=1e-6)
+    np.testing.assert_allclose(replay.velocity_m_s(query_s), FORMULA.velocity_m_s(true_s), atol=1e-4)
     np.testing.assert_allclose(
-        replay.acceleration_m_s2(asked_s), FORMULA.acceleration_m_s2(true_s), atol=5e-3
+        replay.acceleration_m_s2(query_s), FORMULA.acceleration_m_s2(true_s), atol=5e-3
     )
 
 
-def test_without_orientations_the_attitude_follows_from_the_acceleration_and_the_heading():
-    replay = flight(sampled(EVEN_S))
-    # 1e-4 m/s^2 of 9.81 are 6e-4 degrees.
+def test_without_orientations_the_attitude_follows_acceleration_and_heading():
+    replay = make_replay(sample_formula(EVEN_S))
+    # An error of 1e-4 m/s^2 relative to 9.81 m/s^2 tilts the thrust by 6e-4 degrees.
     assert angle_deg(replay.rotation(FRAMES_S), FORMULA.rotation(FRAMES_S)).max() < 6e-4
 
 
 @pytest.mark.parametrize("rate_hz", [25, 100])
-def test_recorded_orientations_are_kept_whatever_the_heading(rate_hz):
-    replay = flight(sampled(np.arange(10 * rate_hz) / rate_hz, oriented=True), heading=Heading(2.0))
+def test_recorded_orientations_are_kept_for_any_heading(rate_hz):
+    replay = make_replay(
+        sample_formula(np.arange(10 * rate_hz) / rate_hz, oriented=True), heading=Heading(2.0)
+    )
     between_s = FRAMES_S + 0.0137
-    # A cubic spline of rotations is off by h^4 / 384 times the fourth derivative, about 25 rad/s^4: 1e-5 degrees at
-    # 25 Hz, measured too. Near the ends, where its curvature is taken to be 0: measured 0.014 degrees.
+    # The error of a cubic spline of rotations is h^4 / 384 times the fourth derivative, about 25 rad/s^4: 1e-5 degrees
+    # at 25 Hz, as measured. Near the ends the spline sets the curvature to 0: measured 0.014 degrees.
     assert angle_deg(replay.rotation(between_s), FORMULA.rotation(between_s))[20:-20].max() < 3e-5
     assert angle_deg(replay.rotation(between_s), FORMULA.rotation(between_s)).max() < 0.03
     signs = (replay.orientation_wxyz(between_s) * FORMULA.orientation_wxyz(between_s)).sum(axis=1)
@@ -99,50 +101,52 @@ def test_recorded_orientations_are_kept_whatever_the_heading(rate_hz):
 
 
 @pytest.mark.parametrize(("time_s", "oriented"), [(EVEN_S, False), (UNEVEN_S, False), (EVEN_S, True)])
-def test_noise_of_a_millimetre_makes_no_wild_accelerations(time_s, oriented):
-    noisy = sampled(time_s, oriented=oriented, noise_m=1e-3)
-    replay, asked_s = flight(noisy), FRAMES_S + 0.1
-    true_s = asked_s + time_s[0]
+def test_noise_of_a_millimetre_gives_small_errors_of_the_acceleration(time_s, oriented):
+    noisy = sample_formula(time_s, oriented=oriented, noise_m=1e-3)
+    replay, query_s = make_replay(noisy), FRAMES_S + 0.1
+    true_s = query_s + time_s[0]
     interpolated = make_interp_spline(noisy.time_s, noisy.position_m, k=5)(true_s, 2)
-    assert np.abs(interpolated - FORMULA.acceleration_m_s2(true_s)).max() > 100, "noise that does no harm"
-    wrong_m_s2 = replay.acceleration_m_s2(asked_s) - FORMULA.acceleration_m_s2(true_s)
-    # Least squares with 25 samples a knot: measured 0.015 m/s^2 as standard deviation, 0.06 at most.
+    assert np.abs(interpolated - FORMULA.acceleration_m_s2(true_s)).max() > 100, (
+        "interpolation must amplify the noise"
+    )
+    wrong_m_s2 = replay.acceleration_m_s2(query_s) - FORMULA.acceleration_m_s2(true_s)
+    # Least squares with 25 samples per knot: measured standard deviation 0.015 m/s^2, largest error 0.06 m/s^2.
     assert np.abs(wrong_m_s2).max() < 0.2
     assert wrong_m_s2.std() < 0.03
-    # A third of the noise is left of positions, measured 0.8 mm at most.
-    assert np.abs(replay.position_m(asked_s) - FORMULA.position_m(true_s)).max() < 1.2e-3
-    # 0.2 of 9.81 m/s^2 are 1.2 degrees.
-    assert angle_deg(replay.rotation(asked_s), FORMULA.rotation(true_s)).max() < 1.2
-    # At the ends, where samples are on one side only: measured 0.18 and 0.54 m/s^2.
+    # A third of the noise of the positions remains, measured 0.8 mm at most.
+    assert np.abs(replay.position_m(query_s) - FORMULA.position_m(true_s)).max() < 1.2e-3
+    # An error of 0.2 m/s^2 relative to 9.81 m/s^2 tilts the thrust by 1.2 degrees.
+    assert angle_deg(replay.rotation(query_s), FORMULA.rotation(true_s)).max() < 1.2
+    # At the two ends, with samples on one side only: measured 0.18 and 0.54 m/s^2.
     end_s = np.array([0.0, noisy.duration_s])
     assert np.abs(replay.acceleration_m_s2(end_s) - FORMULA.acceleration_m_s2(time_s[[0, -1]])).max() < 1.0
 
 
-def test_two_samples_of_nearly_one_moment_make_no_wild_accelerations_either():
-    """Noise of 0.01 mm does no harm at 100 Hz, but between two samples half a millisecond apart."""
+def test_two_nearly_simultaneous_samples_give_small_errors_of_the_acceleration():
+    """Noise of 0.01 mm is harmless at 100 Hz, but harmful between two samples that are half a millisecond apart."""
     time_s = np.sort(np.append(EVEN_S, 4.0005))
-    noisy, asked_s = sampled(time_s, noise_m=1e-5), np.linspace(3.9, 4.1, 401)
-    true_m_s2 = FORMULA.acceleration_m_s2(asked_s)
-    interpolated = make_interp_spline(noisy.time_s, noisy.position_m, k=5)(asked_s, 2)
-    assert np.abs(interpolated - true_m_s2).max() > 5, "noise that does no harm"
-    # Least squares with 25 samples a knot: measured 0.0005 m/s^2.
-    assert np.abs(flight(noisy).acceleration_m_s2(asked_s) - true_m_s2).max() < 0.01
+    noisy, query_s = sample_formula(time_s, noise_m=1e-5), np.linspace(3.9, 4.1, 401)
+    true_m_s2 = FORMULA.acceleration_m_s2(query_s)
+    interpolated = make_interp_spline(noisy.time_s, noisy.position_m, k=5)(query_s, 2)
+    assert np.abs(interpolated - true_m_s2).max() > 5, "interpolation must amplify the noise"
+    # Least squares with 25 samples per knot: measured 0.0005 m/s^2.
+    assert np.abs(make_replay(noisy).acceleration_m_s2(query_s) - true_m_s2).max() < 0.01
 
 
 def test_a_gap_in_a_noisy_recording_is_bridged_without_an_excursion():
     kept = (EVEN_S < 4.0) | (EVEN_S > 4.4)
-    whole = sampled(EVEN_S, noise_m=1e-3)
-    replay = flight(Recorded(EVEN_S[kept], whole.position_m[kept], None))
+    whole = sample_formula(EVEN_S, noise_m=1e-3)
+    replay = make_replay(Recorded(EVEN_S[kept], whole.position_m[kept], None))
     missing_s = np.linspace(4.0, 4.4, 21)
-    # Measured 0.5 mm.
+    # Largest measured error 0.5 mm.
     assert np.abs(replay.position_m(missing_s) - FORMULA.position_m(missing_s)).max() < 2e-3
 
 
 @pytest.mark.parametrize("count", [6, 7, 8, 30])
-def test_the_shortest_recordings_replay_with_noise_too(count):
+def test_the_shortest_recordings_are_replayed_with_noise(count):
     time_s = np.arange(count) / 100
-    replay = flight(sampled(time_s, noise_m=1e-3))
-    # At most the noise's largest value, a quarter of a hundred samples' at 3.5 mm, and what smoothing it moves.
+    replay = make_replay(sample_formula(time_s, noise_m=1e-3))
+    # The tolerance is the largest value of the noise, about 3.5 mm, and the shift by smoothing.
     np.testing.assert_allclose(replay.position_m(time_s), FORMULA.position_m(time_s), atol=5e-3)
 
 
@@ -151,18 +155,20 @@ def test_the_shortest_recordings_replay_with_noise_too(count):
     st.tuples(*[st.floats(-5, 5)] * 3),
     st.floats(-100.0, 1000.0),
 )
-def test_a_recording_elsewhere_and_at_another_time_is_the_same_flight_there(rate_hz, offset_m, later_s):
+def test_shifting_a_recording_in_space_and_time_shifts_the_flight(rate_hz, offset_m, later_s):
     time_s = np.arange(2 * rate_hz) / rate_hz
-    here = sampled(time_s)
+    here = sample_formula(time_s)
     there = Recorded(time_s + later_s, here.position_m + offset_m, None)
-    asked_s = np.linspace(0.0, 1.9, 20)
-    # Times near 1000 s have steps of 1e-13 s; splines' systems multiply them by less than 1e4, at 2 m/s.
+    query_s = np.linspace(0.0, 1.9, 20)
+    # Times near 1000 s are rounded to 1e-13 s; the spline's equations amplify this by less than 1e4, at 2 m/s.
     np.testing.assert_allclose(
-        flight(there).position_m(asked_s), flight(here, offset_m=offset_m).position_m(asked_s), atol=1e-8
+        make_replay(there).position_m(query_s),
+        make_replay(here, offset_m=offset_m).position_m(query_s),
+        atol=1e-8,
     )
 
 
-def test_the_start_and_the_offset_of_a_record_are_applied(tmp_path):
+def test_start_and_offset_of_a_flight_are_applied(tmp_path):
     path = tmp_path / "loop.csv"
     write_recording(path, EVEN_S + 3.0, FORMULA.position_m(EVEN_S), FORMULA.orientation_wxyz(EVEN_S))
     record = FlightFromFile(file=str(path), start_s=2.5, offset_m=(1.0, -2.0, 0.5))
@@ -174,16 +180,16 @@ def test_the_start_and_the_offset_of_a_record_are_applied(tmp_path):
     assert angle_deg(replay.rotation(time_s), FORMULA.rotation(time_s + 2.5)).max() < 0.06
 
 
-def test_half_an_exposure_beyond_the_ends_is_flown_on():
-    replay = flight(sampled(EVEN_S))
+def test_a_flight_is_extrapolated_by_half_an_exposure():
+    replay = make_replay(sample_formula(EVEN_S))
     edge_s = np.array([-0.02, -0.004, 10.004, 10.02])
-    # The third derivative is below 7.5 m/s^3 per axis: j t^3 / 6 is 10 micrometres; j t^2 / 2 is 1.5 mm/s.
+    # The jerk j is below 7.5 m/s^3 per axis: j t^3 / 6 is 10 micrometres, and j t^2 / 2 is 1.5 mm/s.
     np.testing.assert_allclose(replay.position_m(edge_s), FORMULA.position_m(edge_s), atol=1.1e-5)
     np.testing.assert_allclose(replay.velocity_m_s(edge_s), FORMULA.velocity_m_s(edge_s), atol=1.6e-3)
 
 
-def test_more_frames_than_the_recording_lasts_are_refused_with_the_number_that_fits():
-    replay = flight(sampled(EVEN_S), start_s=2.0)
+def test_too_many_frames_are_refused_with_the_number_that_fits():
+    replay = make_replay(sample_formula(EVEN_S), start_s=2.0)
     time_s = np.arange(500) / 25
     replay.check(time_s[:201])
     sentence = (
@@ -191,7 +197,7 @@ def test_more_frames_than_the_recording_lasts_are_refused_with_the_number_that_f
     )
     with pytest.raises(SettingsError, match=f"^{re.escape(sentence)}$"):
         replay.check(time_s[:202])
-    for ask in (
+    for method in (
         replay.check,
         replay.position_m,
         replay.velocity_m_s,
@@ -199,7 +205,7 @@ def test_more_frames_than_the_recording_lasts_are_refused_with_the_number_that_f
         replay.rotation,
     ):
         with pytest.raises(SettingsError, match=r"expected a recording of at least 21\.96 s, found 10 s"):
-            ask(time_s)
+            method(time_s)
 
 
 def test_a_scenario_with_more_frames_than_its_recording_is_refused_when_it_is_planned(tmp_path):
@@ -225,9 +231,9 @@ def test_a_scenario_with_more_frames_than_its_recording_is_refused_when_it_is_pl
         plan(msgspec.structs.replace(fits, num_frames=252), 0)
 
 
-def test_a_start_behind_the_end_is_refused(tmp_path):
+def test_a_start_after_the_end_is_refused(tmp_path):
     path = tmp_path / "loop.csv"
-    path.write_text(table())
+    path.write_text(csv_table())
     with pytest.raises(
         SettingsError, match=r"^start_s of .*loop\.csv: expected below its 0\.7 s, found 0\.7$"
     ):
@@ -238,15 +244,15 @@ def test_a_start_behind_the_end_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("oriented", [True, False])
-def test_what_is_written_reads_back_as_the_same_numbers(tmp_path, oriented):
+def test_a_written_recording_is_read_back_exactly(tmp_path, oriented):
     path = tmp_path / "new" / "loop.csv"
-    recorded = sampled(UNEVEN_S, oriented=oriented)
+    recorded = sample_formula(UNEVEN_S, oriented=oriented)
     write_recording(path, recorded.time_s, recorded.position_m, recorded.orientation_wxyz)
     again = read_recording(path)
     np.testing.assert_array_equal(again.time_s, recorded.time_s)
     np.testing.assert_array_equal(again.position_m, recorded.position_m)
     if oriented:
-        # Reading brings quaternions to length 1 once more.
+        # Reading normalises the quaternions again, which may change the last digit.
         np.testing.assert_allclose(again.orientation_wxyz, recorded.orientation_wxyz, atol=1e-15)
     else:
         assert again.orientation_wxyz is None
@@ -256,20 +262,20 @@ def test_what_is_written_reads_back_as_the_same_numbers(tmp_path, oriented):
 def test_semicolons_and_other_columns_are_read_too(tmp_path):
     path = tmp_path / "loop.csv"
     header = ("time_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
-    path.write_text(table(";", header))
+    path.write_text(csv_table(";", header))
     recorded = read_recording(path)
     np.testing.assert_array_equal(recorded.position_m[:, 1], 2.0 * np.arange(8))
     np.testing.assert_array_equal(recorded.orientation_wxyz, np.tile([1.0, 0, 0, 0], (8, 1)))
 
 
-def test_a_pose_file_of_the_dataset_replays_without_its_placeholder(tmp_path):
+def test_a_pose_file_of_the_dataset_is_read_without_its_placeholder(tmp_path):
     path = tmp_path / "dron3_pos_25.csv"
     time_s = np.arange(50) / 25
     write_poses(path, FORMULA.position_m(time_s), FORMULA.orientation_wxyz(time_s))
     recorded = read_recording(path)
     np.testing.assert_array_equal(recorded.time_s, time_s[1:])
     np.testing.assert_array_equal(recorded.position_m, FORMULA.position_m(time_s)[1:])
-    # Its quaternions have all digits; what differs is the length that reading brings back to 1.
+    # The file holds all digits of the quaternions; reading normalises them, which may change the last digits.
     np.testing.assert_allclose(recorded.orientation_wxyz, FORMULA.orientation_wxyz(time_s)[1:], atol=1e-12)
 
 
@@ -302,54 +308,63 @@ def test_a_trajectory_of_one_drone_is_a_recording(tmp_path):
 QUATERNIONS = ("time_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 BROKEN = {
     "stuck": (
-        table().replace("0.3,", "0.2,"),
+        csv_table().replace("0.3,", "0.2,"),
         "line 5, column time_s: expected a time after that of line 4, 0.2, found 0.2",
     ),
     "backwards": (
-        table().replace("0.3,", "0.1,"),
+        csv_table().replace("0.3,", "0.1,"),
         "line 5, column time_s: expected a time after that of line 4",
     ),
-    "short": (table(count=5), "loop.csv: expected at least 6 samples, found 5"),
+    "short": (csv_table(count=5), "loop.csv: expected at least 6 samples, found 5"),
     "nan": (
-        table().replace("0.3,3,6", "0.3,3,nan"),
+        csv_table().replace("0.3,3,6", "0.3,3,nan"),
         "line 5, column y_m: expected a finite number, found 'nan'",
     ),
-    "empty": (table().replace("0.3,3,6", "0.3,3,"), "line 5, column y_m: expected a value, found nothing"),
-    "word": (table().replace("0.3,3,6", "0.3,3,six"), "line 5, column y_m: expected a number, found 'six'"),
-    "time": (table().replace("0.3,3", "noon,3"), "line 5, column time_s: expected a number, found 'noon'"),
+    "empty": (
+        csv_table().replace("0.3,3,6", "0.3,3,"),
+        "line 5, column y_m: expected a value, found nothing",
+    ),
+    "word": (
+        csv_table().replace("0.3,3,6", "0.3,3,six"),
+        "line 5, column y_m: expected a number, found 'six'",
+    ),
+    "time": (
+        csv_table().replace("0.3,3", "noon,3"),
+        "line 5, column time_s: expected a number, found 'noon'",
+    ),
     "no height": (
-        table(header=("time_s", "x_m", "y_m", "h")),
+        csv_table(header=("time_s", "x_m", "y_m", "h")),
         "expected a column z_m, found only time_s, x_m, y_m, h",
     ),
-    "no time": (table(header=("t", "x_m", "y_m", "z_m")), "expected a column time_s"),
-    "half a quaternion": (table(header=QUATERNIONS[:6]), "expected a column qy, found only"),
+    "no time": (csv_table(header=("t", "x_m", "y_m", "z_m")), "expected a column time_s"),
+    "half a quaternion": (csv_table(header=QUATERNIONS[:6]), "expected a column qy, found only"),
     "long quaternion": (
-        table(header=QUATERNIONS).replace("0.3,3,6,9,1", "0.3,3,6,9,1.1"),
+        csv_table(header=QUATERNIONS).replace("0.3,3,6,9,1", "0.3,3,6,9,1.1"),
         "line 5, column qw: expected a quaternion of length 1, found length 1.1",
     ),
     "nothing": ("", "line 1: expected columns separated by ',', found an empty file"),
-    "no rows": (table(count=0), "expected rows below the header, found none"),
-    "ragged": (table() + "0.9,1,2\n", "line 10: expected 4 values as in the header, found 3"),
+    "no rows": (csv_table(count=0), "expected rows below the header, found none"),
+    "ragged": (csv_table() + "0.9,1,2\n", "line 10: expected 4 values as in the header, found 3"),
 }
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_what_is_broken_is_named_by_file_line_and_column(tmp_path, name):
-    text, complaint = BROKEN[name]
+def test_errors_in_a_file_are_named_by_file_line_and_column(tmp_path, name):
+    text, message = BROKEN[name]
     (tmp_path / "loop.csv").write_text(text)
     with pytest.raises(InputError) as error:
         read_recording(tmp_path / "loop.csv")
     assert "loop.csv" in str(error.value)
-    assert complaint in str(error.value)
+    assert message in str(error.value)
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path):
+def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(InputError, match=r"none\.csv: expected a file to read, found no such file"):
         read_recording(tmp_path / "none.csv")
 
 
 @pytest.mark.parametrize(
-    ("time_s", "index", "value", "complaint"),
+    ("time_s", "index", "value", "message"),
     [
         (np.arange(5.0), None, 0.0, "at least 6 samples, found 5"),
         (np.array([0.0, 1, 2, 2, 4, 5]), None, 0.0, "times that increase, found 2 s at sample 3"),
@@ -357,16 +372,16 @@ def test_a_file_that_is_not_there_is_named(tmp_path):
         (np.arange(6.0), 2, np.inf, "finite numbers, found NaN or infinity at sample 2"),
     ],
 )
-def test_what_makes_no_recording_is_not_written(tmp_path, time_s, index, value, complaint):
+def test_invalid_recordings_are_not_written(tmp_path, time_s, index, value, message):
     position_m = np.zeros((len(time_s), 3))
     if index is not None:
         position_m[index, 1] = value
-    with pytest.raises(SettingsError, match=complaint):
+    with pytest.raises(SettingsError, match=message):
         write_recording(tmp_path / "loop.csv", time_s, position_m, None)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_that_cannot_be_written_is_one_clear_error(tmp_path):
+def test_a_folder_that_cannot_be_written_is_an_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="expected a path that can be written"):
         write_recording(tmp_path / "file" / "loop.csv", EVEN_S, FORMULA.position_m(EVEN_S), None)

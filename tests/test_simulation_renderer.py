@@ -1,4 +1,4 @@
-"""The simulator's pictures against independent geometry: `cameras.project`, OpenCV's markers, plane equations."""
+"""Rendered frames, compared with independent geometry: `geometry.project`, OpenCV's markers, plane equations."""
 
 from dataclasses import replace
 
@@ -25,20 +25,20 @@ def renderer(scene):
     return CameraRenderer(scene, 0)
 
 
-def masks(one, frame):
-    return drone_masks(one.scene, one.cam, one.backdrop.depth_m, frame)
+def number_image(camera_renderer, frame):
+    return drone_masks(camera_renderer.scene, camera_renderer.cam, camera_renderer.backdrop.depth_m, frame)
 
 
-# --- the rasteriser behind our camera convention
+# --- the rasteriser and the camera convention
 
 
 @pytest.mark.parametrize(
     ("window", "magnification"), [((0, 0, 200, 120), 8), ((37, 21, 90, 70), 8), ((60, 10, 51, 83), 7)]
 )
-def test_a_drawn_square_is_where_the_camera_model_projects_it(window, magnification):
+def test_a_drawn_square_lies_at_its_projection(window, magnification):
     rng = np.random.default_rng(5)
     R, t = look_at((1.0, -4.0, 2.0), (0.2, 0.1, 1.0))
-    K = np.array([[150.0, 0.0, 91.3], [0.0, 150.0, 66.8], [0.0, 0.0, 1.0]])  # well off the image's middle
+    K = np.array([[150.0, 0.0, 91.3], [0.0, 150.0, 66.8], [0.0, 0.0, 1.0]])  # far from the image's centre
     cam = make_camera(R=R, t_m=t, K=K, image_size_wh=(200, 120))
     view = raster.RasterView(raster.pinhole(cam), *window, magnification)
     errors = []
@@ -48,21 +48,22 @@ def test_a_drawn_square_is_where_the_camera_model_projects_it(window, magnificat
         colour, depth = raster.empty_buffers(view)
         raster.draw(view, corners[[[0, 1, 2], [0, 2, 3]]], np.ones((2, 1, 3)), colour, depth)
         rows, columns = np.nonzero(colour[..., 0])
-        # A sample's place in the camera's pixels, from the meaning of window and magnification alone.
+        # Position of a sample in camera pixels, computed from the definitions of window and magnification.
         found = [
             (np.mean(i) + 0.5) / magnification - 0.5 + first
             for i, first in ((columns, window[0]), (rows, window[1]))
         ]
         errors.append(found - project(cam, centre)[0])
-        # OpenCV keeps depth as a float32 between its near and far planes: half a millimetre at 5 m.
+        # OpenCV stores depth as float32 between the near and the far plane: half a millimetre at 5 m.
         np.testing.assert_allclose(depth[rows, columns], project(cam, centre)[1], rtol=1e-4)
     errors = np.array(errors)
-    # One sample is 1/7 or 1/8 px: a square's centroid is uncertain by half of that, the mean of forty by a sixth of it.
+    # A sample is 1/7 or 1/8 px wide: the error of one centroid is at most half a sample, and the standard error of the
+    # mean of forty centroids is a sixth of that.
     assert np.abs(errors).max() < 0.5 / 7
     assert np.abs(errors.mean(axis=0)).max() < 0.5 / 7 / 3
 
 
-def test_a_floor_that_reaches_behind_the_camera_is_cut_there_not_lost():
+def test_a_floor_that_reaches_behind_the_camera_is_clipped():
     R, t = look_at((0.0, 0.0, 1.5), (3.0, 0.0, 1.2))
     cam = make_camera(
         R=R, t_m=t, K=np.array([[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]]), image_size_wh=(80, 60)
@@ -76,13 +77,13 @@ def test_a_floor_that_reaches_behind_the_camera_is_cut_there_not_lost():
     downwards = rays @ R[:, 2]
     expected = np.where(downwards < 0, -1.5 / np.minimum(downwards, -1e-9), np.inf)
     at = rays @ R * np.where(np.isfinite(expected), expected, 0)[..., None]
-    # A pixel's width inside the floor's edge, which is 0.15 m away at 9 m here.
+    # Leave out a strip at the floor's edge that is wider than a pixel, which covers 0.15 m at 9 m.
     inside = np.isfinite(expected) & (np.abs(at[..., :2]).max(axis=-1) < 8.7)
     assert inside.sum() > 1000
     np.testing.assert_allclose(depth[inside], expected[inside], rtol=1e-4)  # float32 over 9 m
 
 
-def test_what_lies_wholly_behind_the_camera_is_not_drawn():
+def test_objects_behind_the_camera_are_not_drawn():
     R, t = look_at((0.0, 0.0, 1.5), (3.0, 0.0, 1.5))
     cam = make_camera(
         R=R, t_m=t, K=np.array([[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]]), image_size_wh=(80, 60)
@@ -97,22 +98,23 @@ def test_what_lies_wholly_behind_the_camera_is_not_drawn():
 # --- the backdrop
 
 
-def test_markers_are_seen_where_the_table_says():
-    one = build(S02, scale=0.6)
-    # Linear light: gamma lets white bleed over black, which moves every corner inwards by another 0.2 px.
-    image = np.clip(250 * CameraRenderer(one, 0).backdrop.light, 0, 255).astype(np.uint8)
+def test_markers_are_detected_at_their_projection():
+    scene = build(S02, scale=0.6)
+    # The image is in linear light, because gamma spreads white over black and moves each corner inwards by 0.2 px.
+    image = np.clip(250 * CameraRenderer(scene, 0).backdrop.light, 0, 255).astype(np.uint8)
     settings = cv2.aruco.DetectorParameters()
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     dictionary = cv2.aruco.getPredefinedDictionary(rooms.MARKER_DICTIONARY)
     corners, ids, _ = cv2.aruco.ArucoDetector(dictionary, settings).detectMarkers(image)
-    assert set(ids.ravel()) <= set(range(1, 42)) == set(one.room.marker_corners_m)
+    assert set(ids.ravel()) <= set(range(1, 42)) == set(scene.room.marker_corners_m)
     assert len(ids) >= 6
     errors = [
-        found.reshape(4, 2) - project(one.rig.cameras[0], one.room.marker_corners_m[int(marker)])[0]
+        found.reshape(4, 2) - project(scene.rig.cameras[0], scene.room.marker_corners_m[int(marker)])[0]
         for marker, found in zip(ids.ravel(), corners, strict=True)
     ]
-    # OpenCV finds corners of a blurred black square 0.2 to 0.4 px within it (measured median 0.40 px). A shift that
-    # all of them share would be ours; the mean of 60 corners knows it to 0.05 px (measured 0.07 px).
+    # OpenCV finds the corners of a blurred black square 0.2 to 0.4 px inside the square (measured median 0.40 px). A
+    # common shift of all corners would be an error of the renderer; the mean of 60 corners has a standard error of
+    # 0.05 px (measured shift 0.07 px).
     assert np.median(np.linalg.norm(errors, axis=-1)) < 0.5
     assert np.abs(np.mean(errors, axis=(0, 1))).max() < 0.15
 
@@ -123,17 +125,17 @@ def test_markers_are_seen_where_the_table_says():
 @pytest.mark.parametrize("velocity_m_s", [(0.0, 0.0, 0.0), (1.0, -2.0, 1.0)])
 @pytest.mark.parametrize("index", [0, 3, 6])
 def test_a_drone_of_known_centre_is_drawn_at_its_projection(scene, index, velocity_m_s):
-    """Pixels before the codec have no shift: still, and moving, when the blur must lie evenly about the truth."""
+    """Frames before encoding have no shift; the blur of a moving drone is centred on the projection."""
     centre = np.array([0.3, -0.2, 1.45])
     black = with_drones(scene, (cube(0.3), straight_flight(centre, velocity_m_s), (0.0, 0.0, 0.0)))
-    one = CameraRenderer(black, index)
-    with_it = sensor.undevelop(one.clean_frame(0)).mean(axis=-1)
-    without = sensor.undevelop(sensor.develop(one.backdrop.light)).mean(axis=-1)
+    camera_renderer = CameraRenderer(black, index)
+    with_it = sensor.undevelop(camera_renderer.clean_frame(0)).mean(axis=-1)
+    without = sensor.undevelop(sensor.develop(camera_renderer.backdrop.light)).mean(axis=-1)
     x, y = pixel_of(scene, index, centre).round().astype(int)
     window = np.s_[y - 20 : y + 21, x - 20 : x + 21]
-    # A black body takes away a share of the backdrop's light: the share of each pixel that it covers.
+    # A black body hides the backdrop's light in proportion to the covered share of each pixel.
     covered = 1 - (with_it / without)[window]
-    # Below 0.03 lies the rounding to 8 bits, and the drone's own shadow.
+    # Shares up to 0.03 come from the rounding to 8 bits and from the drone's own shadow.
     covered = np.where(covered > 0.03, covered, 0.0)
     rows, columns = np.mgrid[y - 20 : y + 21, x - 20 : x + 21]
     found = np.array([(covered * columns).sum(), (covered * rows).sum()]) / covered.sum()
@@ -141,19 +143,19 @@ def test_a_drone_of_known_centre_is_drawn_at_its_projection(scene, index, veloci
     hull = cv2.convexHull((64 * project(scene.rig.cameras[index], corners)[0]).round().astype(np.int32))
     moments = cv2.moments(hull)
     expected = np.array([moments["m10"], moments["m01"]]) / moments["m00"] / 64
-    # Rounding to 8 bits at the rim, and 8 samples per pixel over a rim of some 60 pixels: a few hundredths.
+    # Rounding to 8 bits, and 8 samples per pixel over an edge of about 60 pixels, give errors of a few hundredths.
     np.testing.assert_allclose(found, expected, atol=0.08)
-    # And the area, which says that edges are covered by halves: within the rim's own uncertainty.
+    # The area agrees within the uncertainty of the edge, so edge pixels are covered partly.
     assert covered.sum() == pytest.approx(moments["m00"] / 64**2, rel=0.05)
 
 
 @pytest.mark.parametrize("frame", [0, 100, 200])
 @pytest.mark.parametrize("index", [0, 4, 7])
-def test_silhouettes_are_about_their_projected_origins(scene, index, frame):
-    one = CameraRenderer(scene, index)
-    mask = masks(one, frame)
+def test_silhouettes_lie_around_the_projected_origins(scene, index, frame):
+    camera_renderer = CameraRenderer(scene, index)
+    mask = number_image(camera_renderer, frame)
     origins = project(scene.rig.cameras[index], scene.positions_m(frame + 1)[-1])
-    seen = 0
+    num_seen = 0
     for drone, (pixel, depth_m) in enumerate(zip(*origins, strict=True)):
         rows, columns = np.nonzero(mask == drone + 1)
         radius_px = (
@@ -165,25 +167,26 @@ def test_silhouettes_are_about_their_projected_origins(scene, index, frame):
         )
         if len(rows) < 0.15 * radius_px**2:
             continue  # hidden by another drone or a pillar
-        seen += 1
+        num_seen += 1
         assert columns.min() - 1 <= pixel[0] <= columns.max() + 1
         assert rows.min() - 1 <= pixel[1] <= rows.max() + 1
-        # Bodies and legs are lopsided by up to 5 cm of a radius of 25 to 30 cm, more where a part is hidden.
+        # The centroid of body and legs is up to 5 cm from the origin, at a radius of 25 to 30 cm, and farther where a
+        # part is hidden.
         assert np.hypot(columns.mean() - pixel[0], rows.mean() - pixel[1]) < 0.35 * radius_px + 1
-    assert seen >= 2
+    assert num_seen >= 2
 
 
-def test_frames_differ_from_the_empty_room_in_the_masks_and_the_shadows_only(renderer):
+def test_frames_differ_from_the_empty_room_only_in_masks_and_shadows(renderer):
     frame = renderer.clean_frame(60).astype(int)
     changed = np.abs(frame - sensor.develop(renderer.backdrop.light)).max(axis=-1) > 2
-    mask = masks(renderer, 60) > 0
-    # Blur of the lens and of motion reach some pixels beyond the mask at mid-exposure.
+    mask = number_image(renderer, 60) > 0
+    # Lens blur and motion blur reach a few pixels beyond the mask at mid-exposure.
     near = cv2.dilate(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
     assert not (changed & ~near & ~renderer.backdrop.floor).any()
     assert (changed & mask).sum() > 0.5 * mask.sum(), "drones must be seen"
 
 
-def test_near_hides_far_whatever_their_order(scene):
+def test_the_nearer_drone_hides_the_farther_drone_in_either_order(scene):
     pixel = (240.0, 150.0)
     red, blue = (0.02, 0.02, 0.6), (0.6, 0.02, 0.02)
     near = (cube(0.3), straight_flight(ray_point(scene, 0, pixel, 3.5)), red)
@@ -191,14 +194,14 @@ def test_near_hides_far_whatever_their_order(scene):
     a, b = CameraRenderer(with_drones(scene, near, far), 0), CameraRenderer(with_drones(scene, far, near), 0)
     alone = CameraRenderer(with_drones(scene, near), 0)
     x, y = (int(side) for side in pixel)
-    assert masks(a, 0)[y, x] == 1
-    assert masks(b, 0)[y, x] == 2
-    # The far cube's silhouette lies wholly within the near one's: nothing of it is seen.
-    assert not (masks(a, 0) == 2).any()
+    assert number_image(a, 0)[y, x] == 1
+    assert number_image(b, 0)[y, x] == 2
+    # The far cube's silhouette lies inside the near cube's silhouette, so the far cube is fully hidden.
+    assert not (number_image(a, 0) == 2).any()
     window = np.s_[y - 8 : y + 9, x - 8 : x + 9]
     np.testing.assert_array_equal(a.clean_frame(0)[window], b.clean_frame(0)[window])
     np.testing.assert_array_equal(a.clean_frame(0)[window], alone.clean_frame(0)[window])
-    assert a.clean_frame(0)[y, x, 2] > 3 * a.clean_frame(0)[y, x, 0], "the near one is red"
+    assert a.clean_frame(0)[y, x, 2] > 3 * a.clean_frame(0)[y, x, 0], "the near cube is red"
 
 
 def test_a_pillar_hides_a_drone_behind_it(scene):
@@ -208,53 +211,59 @@ def test_a_pillar_hides_a_drone_behind_it(scene):
     small = cube(0.1)
     for behind_m, visible in ((0.8, False), (-0.8, True)):
         flight = straight_flight(ray_point(scene, 3, pixel, depth_m + behind_m))
-        one = CameraRenderer(with_drones(scene, (small, flight, (0.0, 0.0, 0.0))), 3)
-        assert masks(one, 0).any() == visible
+        camera_renderer = CameraRenderer(with_drones(scene, (small, flight, (0.0, 0.0, 0.0))), 3)
+        assert number_image(camera_renderer, 0).any() == visible
         x, y = pixel.astype(int)
-        darker = sensor.develop(one.backdrop.light)[y, x].astype(int) - one.clean_frame(0)[y, x]
+        darker = (
+            sensor.develop(camera_renderer.backdrop.light)[y, x].astype(int)
+            - camera_renderer.clean_frame(0)[y, x]
+        )
         assert (darker.max() > 20) == visible
 
 
-def test_rotor_discs_let_the_backdrop_through(scene):
+def test_rotor_discs_are_partly_transparent(scene):
     bare = cube(0.02)
     disc = replace(bare, rotor_radii_m=np.array([0.3]))
     centre = np.array([0.0, 0.0, 1.2])
-    one = CameraRenderer(with_drones(scene, (disc, straight_flight(centre), (0.0, 0.0, 0.0))), 0)
+    camera_renderer = CameraRenderer(with_drones(scene, (disc, straight_flight(centre), (0.0, 0.0, 0.0))), 0)
     x, y = pixel_of(scene, 0, centre + np.array([0.1, 0.1, 0.0])).round().astype(int)
     share = (
-        sensor.undevelop(one.clean_frame(0))[y, x]
-        / sensor.undevelop(sensor.develop(one.backdrop.light))[y, x]
+        sensor.undevelop(camera_renderer.clean_frame(0))[y, x]
+        / sensor.undevelop(sensor.develop(camera_renderer.backdrop.light))[y, x]
     )
     assert np.all((share > 0.4) & (share < 0.9))
 
 
-def test_rotors_dim_what_is_behind_them_whatever_their_order_and_walls_hide_them(scene):
+def test_rotors_dim_the_background_in_either_order_and_walls_hide_rotors(scene):
     rotor = replace(cube(0.02), rotor_radii_m=np.array([0.3]))
     places = [straight_flight(ray_point(scene, 0, (240.0, 150.0), depth_m)) for depth_m in (3.5, 6.0)]
-    two = with_drones(scene, *((rotor, flight, (0.0, 0.0, 0.0)) for flight in places))
+    two_rotors = with_drones(scene, *((rotor, flight, (0.0, 0.0, 0.0)) for flight in places))
     view = raster.full_view(raster.pinhole(scene.rig.cameras[0]))
-    posed = []
+    poses = []
     for drone, light in ((0, 0.0), (1, 1.0)):
-        one = posing.pose(two, drone, np.zeros(1))
-        opacity_light = np.broadcast_to([0.5, light, 0.0], one.disc_opacity_light.shape)
-        posed.append(replace(one, disc_opacity_light=opacity_light))
-    # Beside the hubs. The far one, half of whose light is seen: half of it, and half of the half behind it. Before a
-    # wall that hides it there is the near one, which is dark; before one that hides both, nothing.
+        pose = posing.pose(two_rotors, drone, np.zeros(1))
+        opacity_light = np.broadcast_to([0.5, light, 0.0], pose.disc_opacity_light.shape)
+        poses.append(replace(pose, disc_opacity_light=opacity_light))
+    # The pixel is beside the hubs; each rotor has an opacity of 0.5. Without a wall, the far bright rotor adds light
+    # 0.5 * 0.5, and a quarter of the background is visible. A wall at 5 m hides the far rotor, and only the dark near
+    # rotor remains. A wall at 2 m hides both rotors.
     for wall_m, light, clear in ((raster.FAR_M, 0.25, 0.25), (5.0, 0.0, 0.5), (2.0, 0.0, 1.0)):
-        for order in (posed, posed[::-1]):
-            seen = posing.sample(view, order, 0, np.full(view.shape, wall_m, np.float32))
-            np.testing.assert_allclose(seen[150, 252], [light, light, light, clear], atol=1e-6)
+        for order in (poses, poses[::-1]):
+            num_seen = posing.sample(view, order, 0, np.full(view.shape, wall_m, np.float32))
+            np.testing.assert_allclose(num_seen[150, 252], [light, light, light, clear], atol=1e-6)
 
 
-def test_a_drone_under_a_lamp_has_its_darkest_shadow_at_its_foot(scene):
+def test_the_darkest_shadow_is_straight_below_a_drone_under_a_lamp(scene):
     lamp = scene.room.panels.centres_m[3]
     below = np.array([lamp[0], lamp[1], 1.2])
-    one = CameraRenderer(with_drones(scene, (drones.model("x_frame"), straight_flight(below), (0.1,) * 3)), 0)
-    gain = one.shadows.floor_gain(0.0)
+    camera_renderer = CameraRenderer(
+        with_drones(scene, (drones.model("x_frame"), straight_flight(below), (0.1,) * 3)), 0
+    )
+    gain = camera_renderer.shadows.floor_gain(0.0)
     row, column = np.unravel_index(gain.argmin(), gain.shape)
     cell_m = 10.0 / gain.shape[1]
     at_m = np.array([(column + 0.5) * cell_m - 5.0, 4.0 - (row + 0.5) * cell_m])
-    # The model's own middle is a few centimetres off its origin.
+    # The model's centre is a few centimetres from its origin.
     np.testing.assert_allclose(at_m, below[:2], atol=0.05)
     assert 0.5 < gain.min() < 0.95
     assert gain.max() == 1.0
@@ -263,13 +272,15 @@ def test_a_drone_under_a_lamp_has_its_darkest_shadow_at_its_foot(scene):
 # --- the sensor
 
 
-def test_noise_is_fair_and_grows_with_brightness():
-    eye = sensor.Sensor(S02.imaging, 0, 0, (120, 160))
+def test_noise_has_mean_zero_and_grows_with_brightness():
+    camera_sensor = sensor.Sensor(S02.imaging, 0, 0, (120, 160))
     sigmas = []
     for level in (20, 120, 220):
         image = np.full((120, 160, 3), level, np.uint8)
-        frames = np.stack([eye.expose(image, frame, frame / 25) for frame in range(40)]).astype(float)
-        # Flicker and its random part are below a percent, and shift the mean by less than that.
+        frames = np.stack([camera_sensor.expose(image, frame, frame / 25) for frame in range(40)]).astype(
+            float
+        )
+        # Flicker and drift are below one percent and shift the mean by less than that.
         assert abs(frames.mean() - level) < 0.01 * level + 0.1
         sigmas.append(np.std(frames - frames.mean(axis=(1, 2, 3), keepdims=True)))
     assert sigmas[0] < sigmas[1] < sigmas[2]
@@ -277,7 +288,7 @@ def test_noise_is_fair_and_grows_with_brightness():
     assert sigmas[2] < 3.5
 
 
-def test_noise_is_new_in_every_frame_and_every_camera_and_the_same_again():
+def test_noise_depends_on_seed_camera_and_frame_only():
     image = np.full((60, 80, 3), 120, np.uint8)
 
     def expose(seed, index, frame):
@@ -286,11 +297,11 @@ def test_noise_is_new_in_every_frame_and_every_camera_and_the_same_again():
     np.testing.assert_array_equal(expose(1, 2, 3), expose(1, 2, 3))
     for other in ((1, 2, 4), (1, 3, 3), (2, 2, 3)):
         a, b = (shown - shown.mean() for shown in (expose(1, 2, 3), expose(*other)))
-        # 14,400 numbers of which neighbours share some noise: independent ones correlate by about 0.01.
+        # With 14,400 numbers and correlated neighbours, independent noise has a correlation of about 0.01.
         assert abs((a * b).mean() / (a.std() * b.std())) < 0.06
 
 
-def test_a_frame_depends_on_nothing_that_was_drawn_before(scene, renderer):
+def test_a_frame_does_not_depend_on_frames_drawn_before(scene, renderer):
     renderer.frame(7)
     np.testing.assert_array_equal(renderer.frame(60), CameraRenderer(scene, 0).frame(60))
 
@@ -299,10 +310,11 @@ def test_a_frame_depends_on_nothing_that_was_drawn_before(scene, renderer):
 
 
 @pytest.mark.parametrize("name", drones.MODELS)
-def test_models_are_closed_face_outwards_and_have_sizes_of_drones(name):
+def test_models_are_closed_face_outwards_and_have_the_size_of_drones(name):
     model = drones.model(name)
     a, b, c = model.triangles_m.swapaxes(0, 1)
-    # The divergence theorem: faces of closed solids sum to zero, and enclose a volume above 0 if they look outwards.
+    # By the divergence theorem, the face vectors of closed solids sum to zero, and the enclosed volume is positive if
+    # faces point outwards.
     np.testing.assert_allclose(np.cross(b - a, c - a).sum(axis=0), 0.0, atol=1e-9)
     assert np.einsum("fi,fi->", a, np.cross(b, c)) > 0
     assert len(model.rotor_centres_m) >= 4

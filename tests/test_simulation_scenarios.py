@@ -1,4 +1,4 @@
-"""Scenarios: the thirteen of the dataset, files of one's own, changed fields, and what is refused before drawing."""
+"""Scenarios: the thirteen presets of the dataset, scenario files, changed fields, and errors before rendering."""
 
 import json
 import math
@@ -37,7 +37,7 @@ DATASET = {
 }
 
 
-# --- the thirteen
+# --- the thirteen presets
 
 
 def test_the_presets_are_the_sequences_of_the_dataset():
@@ -52,8 +52,8 @@ def test_the_presets_are_the_sequences_of_the_dataset():
         assert recipe.description
 
 
-def test_they_last_as_long_as_the_paper_says():
-    """Its totals: 20 minutes 3 seconds, and 91 minutes 25 seconds times the drones, to the second."""
+def test_the_total_duration_is_that_of_the_paper():
+    """The paper states 20 min 3 s in total, and 91 min 25 s when each sequence is counted once per drone."""
     recipes = [scenario(name) for name in preset_names()]
     assert sum(recipe.num_frames for recipe in recipes) / 25 == 20 * 60 + 3
     assert sum(recipe.num_frames * len(recipe.drones) for recipe in recipes) / 25 == 91 * 60 + 25
@@ -73,29 +73,29 @@ def test_mean_speeds_are_those_measured_on_the_dataset(name):
             assert 0.5 <= np.mean(speed) <= 3.0
 
 
-def test_drones_are_apart_in_shape_or_paint_and_all_five_shapes_fly():
-    shapes = set()
+def test_drones_of_a_preset_differ_and_all_five_models_are_used():
+    models = set()
     for name in preset_names():
         drones = scenario(name).drones
         assert len({(drone.model, drone.paint_bgr) for drone in drones}) == len(drones)
-        shapes |= {drone.model for drone in drones}
-    assert shapes == {"x_frame", "x_frame_racer", "camera_drone", "hexacopter", "tall_cross"}
+        models |= {drone.model for drone in drones}
+    assert models == {"x_frame", "x_frame_racer", "camera_drone", "hexacopter", "tall_cross"}
 
 
-def test_the_two_of_s01_meet_at_the_distance_that_swaps_trackers():
+def test_the_two_drones_of_s01_pass_each_other_at_30_cm():
     recipe = scenario("S01_D2_A")
     time_s = frame_times_s(recipe, recipe.num_frames)
     for seed in (0, 1, 2):
-        one, other = (flight.position_m(time_s) for flight in plan(recipe, seed))
-        gap_m = np.linalg.norm(one - other, axis=-1)
+        first, second = (flight.position_m(time_s) for flight in plan(recipe, seed))
+        gap_m = np.linalg.norm(first - second, axis=-1)
         meetings = (gap_m[1:-1] < gap_m[:-2]) & (gap_m[1:-1] < gap_m[2:])
         assert np.count_nonzero(meetings) >= 5
-        # They pass at 1.1 m/s and less, so within half a frame of the nearest: sqrt(0.3^2 + 0.022^2) m.
+        # At up to 1.1 m/s, a frame is at most half a frame time from the closest approach: sqrt(0.3^2 + 0.022^2) m.
         np.testing.assert_allclose(gap_m[1:-1][meetings], 0.3, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", DATASET)
-def test_every_sequence_is_a_scene_whose_drones_all_cameras_see_most_of_the_time(name):
+def test_all_cameras_see_the_drones_of_every_preset_most_of_the_time(name):
     scene = build(scenario(name), scale=0.1)
     position_m = scene.positions_m(scene.scenario.num_frames)[::25].reshape(-1, 3)
     for cam in (scene.rig.cameras[index] for index in range(len(scene.rig))):
@@ -108,27 +108,27 @@ def test_every_sequence_is_a_scene_whose_drones_all_cameras_see_most_of_the_time
 # --- files
 
 
-def written(tmp_path, text, name="mine.toml"):
+def write_scenario(tmp_path, text, name="mine.toml"):
     path = tmp_path / name
     path.write_text(text, encoding="utf-8")
     return path
 
 
 @pytest.mark.parametrize("name", ["S02_D4_A", "S06_D6", "S13_D3"])
-def test_a_file_like_a_preset_is_that_scenario(name, tmp_path):
-    assert load(written(tmp_path, preset_text(name))) == scenario(name)
+def test_a_file_with_the_text_of_a_preset_is_that_preset(name, tmp_path):
+    assert load(write_scenario(tmp_path, preset_text(name))) == scenario(name)
 
 
-def test_an_unknown_scenario_is_answered_with_those_there_are():
-    for ask in (scenario, preset_text):
+def test_an_unknown_scenario_is_refused_and_the_presets_are_named():
+    for function in (scenario, preset_text):
         with pytest.raises(SettingsError, match=r"^scenario: expected one of S01_D2_A, .*S13_D3, found S99$"):
-            ask("S99")
+            function("S99")
 
 
-def test_paths_in_a_file_start_at_its_folder(tmp_path, monkeypatch):
+def test_paths_in_a_scenario_file_are_relative_to_its_folder(tmp_path, monkeypatch):
     (tmp_path / "mine").mkdir()
     head, _, _, third = preset_text("S12_D3").split("[[drones]]")
-    path = written(
+    path = write_scenario(
         tmp_path / "mine",
         head
         + '[[drones]]\nmodel = { file = "shapes/a.obj", scale = 0.01 }\n'
@@ -138,12 +138,12 @@ def test_paths_in_a_file_start_at_its_folder(tmp_path, monkeypatch):
     )
     monkeypatch.chdir(tmp_path)
     for given_path in (path, Path("mine/mine.toml")):
-        one, two, three = load(given_path).drones
+        first, second, third_drone = load(given_path).drones
         folder = tmp_path / "mine"
-        assert one.model == Mesh(file=str(folder / "shapes/a.obj"), scale=0.01)
-        assert one.flight == FlightFromFile(file=str(folder / "r.csv"))
-        assert two.flight == FlightFromFile(file="/elsewhere/r.csv", start_s=2.5)
-        assert three == scenario("S12_D3").drones[2]
+        assert first.model == Mesh(file=str(folder / "shapes/a.obj"), scale=0.01)
+        assert first.flight == FlightFromFile(file=str(folder / "r.csv"))
+        assert second.flight == FlightFromFile(file="/elsewhere/r.csv", start_s=2.5)
+        assert third_drone == scenario("S12_D3").drones[2]
 
 
 @pytest.mark.parametrize(
@@ -187,17 +187,17 @@ def test_paths_in_a_file_start_at_its_folder(tmp_path, monkeypatch):
          'found "../up"'),
     ],
 )  # fmt: skip
-def test_each_wrong_field_of_a_file_is_one_line_that_names_it(old, new, sentence, tmp_path):
+def test_a_wrong_field_of_a_file_is_named_in_one_line(old, new, sentence, tmp_path):
     text = preset_text("S02_D4_A")
     assert old in text
-    path = written(tmp_path, text.replace(old, new, 1))
-    with pytest.raises(InputError) as refused:
+    path = write_scenario(tmp_path, text.replace(old, new, 1))
+    with pytest.raises(InputError) as error_info:
         load(path)
-    assert str(refused.value) == f"{path}: {sentence}"
+    assert str(error_info.value) == f"{path}: {sentence}"
 
 
-def test_an_unknown_field_at_the_top_is_answered_with_all_and_the_nearest(tmp_path):
-    path = written(tmp_path, preset_text("S02_D4_A").replace("markers", "marker"))
+def test_an_unknown_field_is_refused_and_the_nearest_field_is_suggested(tmp_path):
+    path = write_scenario(tmp_path, preset_text("S02_D4_A").replace("markers", "marker"))
     with pytest.raises(
         InputError, match=r"toml: marker: expected one of name, .*, found marker; did you mean markers\?$"
     ):
@@ -217,11 +217,11 @@ def test_an_unknown_field_at_the_top_is_answered_with_all_and_the_nearest(tmp_pa
         ("", ": name: expected a value, found none"),
     ],
 )
-def test_what_is_no_toml_is_named_with_its_line(text, where, tmp_path):
-    path = written(tmp_path, text)
-    with pytest.raises(InputError) as refused:
+def test_invalid_toml_is_named_with_its_line(text, where, tmp_path):
+    path = write_scenario(tmp_path, text)
+    with pytest.raises(InputError) as error_info:
         load(path)
-    assert str(refused.value).startswith(f"{path}{where}")
+    assert str(error_info.value).startswith(f"{path}{where}")
 
 
 def test_files_that_cannot_be_read_are_named(tmp_path):
@@ -235,23 +235,25 @@ def test_files_that_cannot_be_read_are_named(tmp_path):
         load(tmp_path / "bytes.toml")
 
 
-def paths_of(value, path=""):
-    """Every field of plain data, by its dotted path."""
+def field_paths(value, path=""):
+    """Yield the dotted path of every field of nested dictionaries and lists."""
     if path:
         yield path
     if isinstance(value, dict):
         for key, inner in value.items():
-            yield from paths_of(inner, f"{path}.{key}" if path else key)
+            yield from field_paths(inner, f"{path}.{key}" if path else key)
     elif isinstance(value, list):
         for index, inner in enumerate(value):
-            yield from paths_of(inner, f"{path}[{index}]")
+            yield from field_paths(inner, f"{path}[{index}]")
 
 
-def plain(recipe):
+def to_plain_data(recipe):
     return msgspec.json.decode(msgspec.json.encode(recipe))
 
 
-EVERY_PATH = [path for name in ("S02_D4_A", "S06_D6", "S12_D3") for path in paths_of(plain(scenario(name)))]
+EVERY_PATH = [
+    path for name in ("S02_D4_A", "S06_D6", "S12_D3") for path in field_paths(to_plain_data(scenario(name)))
+]
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
     lambda inner: (
@@ -262,15 +264,15 @@ VALUES = st.recursive(
 
 
 @given(name=st.sampled_from(["S02_D4_A", "S06_D6", "S12_D3"]), path=st.sampled_from(EVERY_PATH), value=VALUES)
-def test_whatever_is_put_into_a_field_it_is_a_scenario_or_one_line_of_refusal(name, path, value):
+def test_any_value_of_a_field_is_accepted_or_refused_in_one_line(name, path, value):
     try:
         recipe = replaced(scenario(name), {path: value})
     except SettingsError as error:
         refusal = str(error)
     else:
-        assert all(math.isfinite(number) for number in numbers(plain(recipe)))
+        assert all(math.isfinite(number) for number in numbers(to_plain_data(recipe)))
         return
-    # It begins with the field, with what it is a part of, or with one within what was put there.
+    # The message begins with the field, with its parent, or with a field inside the given value.
     assert refusal.startswith(path.rpartition(".")[0])
     assert ": expected " in refusal
     assert not {"\n", "`", "$"} & set(refusal.replace(json.dumps(value, default=str)[:60], ""))
@@ -287,7 +289,7 @@ def numbers(value):
 # --- changed fields
 
 
-def test_replaced_changes_what_it_is_told_and_nothing_else():
+def test_replaced_changes_only_the_given_fields():
     changed = replaced(
         S02,
         {
@@ -317,7 +319,7 @@ def test_replaced_changes_what_it_is_told_and_nothing_else():
     assert replaced(S02, {}) == S02
 
 
-def test_a_part_that_is_not_there_yet_begins_with_its_defaults():
+def test_a_missing_part_starts_from_its_defaults():
     assert replaced(scenario("S04_D10"), {"onboard.pitch_deg": -20}).onboard == msgspec.structs.replace(
         S02.onboard, pitch_deg=-20.0
     )
@@ -344,7 +346,7 @@ def test_a_part_that_is_not_there_yet_begins_with_its_defaults():
         ),
         ("tracker.inertia", 0.5, "tracker: expected one of name, .*, found tracker"),
         ("fps", math.inf, "fps: expected a finite number, found inf"),
-        # What no codec, no memory or no patience is enough for.
+        # Values beyond the limits of codecs, memory or computing time.
         ("fps", 0.01, "fps: expected a number of at least 0.1, found 0.01"),
         ("fps", 1e5, "fps: expected a number of at most 1000, found 100000.0"),
         (
@@ -365,47 +367,47 @@ def test_a_part_that_is_not_there_yet_begins_with_its_defaults():
         ),
     ],
 )
-def test_a_change_that_fits_no_field_is_refused_by_its_path(path, value, sentence):
-    with pytest.raises(SettingsError) as refused:
+def test_an_invalid_change_is_refused_and_its_path_is_named(path, value, sentence):
+    with pytest.raises(SettingsError) as error_info:
         replaced(S02, {path: value})
     start, _, end = sentence.partition(".*")
-    assert str(refused.value).startswith(start)
-    assert str(refused.value).endswith(end)
+    assert str(error_info.value).startswith(start)
+    assert str(error_info.value).endswith(end)
 
 
 # --- cameras that differ
 
 
-def test_without_spread_cameras_are_their_records_whatever_the_seed():
+def test_without_spread_cameras_do_not_depend_on_the_seed():
     for seed in (0, 7):
         K = build(S02, seed=seed).rig.cameras.K
         np.testing.assert_array_equal(K, np.tile([[1156.3, 0, 960], [0, 1156.3, 540], [0, 0, 1]], (8, 1, 1)))
 
 
-def test_with_spread_cameras_differ_by_the_seed_and_the_rig_says_how():
+def test_with_spread_the_intrinsics_depend_on_the_seed():
     spread = replaced(S02, {"camera_spread": {"focal_length": 0.02, "principal_point_px": 12.0}})
-    scene, again, other = (build(spread, seed=seed) for seed in (3, 3, 4))
+    scene, again, other_seed = (build(spread, seed=seed) for seed in (3, 3, 4))
     K = scene.rig.cameras.K
     np.testing.assert_array_equal(K, again.rig.cameras.K)
-    assert np.abs(K - other.rig.cameras.K).max() > 1
+    assert np.abs(K - other_seed.rig.cameras.K).max() > 1
     np.testing.assert_array_equal(scene.rig.cameras.T_cam_world, build(S02).rig.cameras.T_cam_world)
-    # Flights are the seed's, with or without.
+    # The spread of the cameras does not change the flights of a seed.
     np.testing.assert_array_equal(scene.positions_m(20), build(S02, seed=3).positions_m(20))
-    # Pixels stay square, and draws beyond 2.5 standard deviations are cut off.
+    # Pixels stay square, and random draws are limited to 2.5 standard deviations.
     np.testing.assert_array_equal(K[:, 0, 0], K[:, 1, 1])
     assert np.all(np.abs(K[:, 0, 0] / 1156.3 - 1) <= 0.05 + 1e-12)
     assert np.all(np.abs(K[:, :2, 2] - [960, 540]) <= 30 + 1e-9)
-    # At another scale they are the same cameras.
+    # Another scale gives the same cameras.
     small = build(spread, seed=3, scale=0.5).rig.cameras.K
     np.testing.assert_allclose(small[:, 0, 0], K[:, 0, 0] / 2, rtol=1e-12)
     np.testing.assert_allclose(small[:, :2, 2] + 0.5, (K[:, :2, 2] + 0.5) / 2, rtol=1e-12)
 
 
-def test_the_spread_is_the_standard_deviation_of_many_cameras():
+def test_the_spread_is_the_standard_deviation_of_the_cameras():
     places = msgspec.structs.replace(S02, cameras=RIGS["laboratory"] * 100)
     spread = replaced(places, {"camera_spread": {"focal_length": 0.02, "principal_point_px": 12.0}})
     K = build(spread, scale=1.0).rig.cameras.K
-    # 800 draws: the standard deviation's own is 2.5 %, and cutting the tails takes 3 % off.
+    # With 800 draws the standard deviation has a standard error of 2.5 %, and cutting the tails reduces it by 3 %.
     assert np.std(K[:, 0, 0] / 1156.3) == pytest.approx(0.02, rel=0.12)
     assert np.std(K[:, 0, 2]) == pytest.approx(12.0, rel=0.12)
     assert np.std(K[:, 1, 2]) == pytest.approx(12.0, rel=0.12)
@@ -463,17 +465,17 @@ CAMERA = {"position_m": [-4.0, -3.0, 2.5], "target_m": [0.0, 0.0, 1.2]}
          "onboard.shutter_s: expected at most 0.04 s, the time between two frames, found 0.05"),
     ],
 )  # fmt: skip
-def test_what_does_not_fit_the_world_is_refused_by_field(changes, sentence):
-    with pytest.raises(SettingsError) as refused:
+def test_values_that_do_not_fit_the_hall_are_refused_and_the_field_is_named(changes, sentence):
+    with pytest.raises(SettingsError) as error_info:
         build(replaced(S02, changes), scale=0.1)
-    assert str(refused.value).startswith(f"scenario S02_D4_A: {sentence}")
+    assert str(error_info.value).startswith(f"scenario S02_D4_A: {sentence}")
 
 
-def test_a_square_picture_with_equal_angles_on_board_fits():
+def test_a_square_onboard_image_with_equal_angles_is_accepted():
     build(replaced(S02, {"onboard.fov_deg": [90.0, 90.0], "onboard.image_size_wh": [800, 800]}), scale=0.1)
 
 
-def test_files_that_a_scenario_needs_are_missed_before_anything_is_drawn(tmp_path):
+def test_missing_files_of_a_scenario_are_named_before_rendering(tmp_path):
     missing = str(tmp_path / "none")
     for path, value in (
         ("model", {"file": f"{missing}.obj"}),
@@ -483,7 +485,7 @@ def test_files_that_a_scenario_needs_are_missed_before_anything_is_drawn(tmp_pat
             build(replaced(S02, {f"drones[0].{path}": value}), scale=0.1)
 
 
-def test_near_passes_of_the_presets_are_the_only_exceptions_and_stated_in_their_files():
+def test_only_near_passes_of_the_presets_are_below_the_minimum_distance():
     for name in preset_names():
         near = [d.flight.distance_m for d in scenario(name).drones if isinstance(d.flight, NearPass)]
         raw = tomllib.loads(preset_text(name))

@@ -12,32 +12,32 @@ from psotrack.trajectories import Status, Trajectories
 FRAMES, DRONES = 5, 3
 
 
-def trajectories(**changes) -> Trajectories:
+def make_trajectories(**changes) -> Trajectories:
     frame = np.arange(10, 10 + 2 * FRAMES, 2)
     position_m = np.arange(FRAMES * DRONES * 3, dtype=float).reshape(FRAMES, DRONES, 3)
     values = {"frame": frame, "time_s": frame / 25, "drones": ("a", "b", "c"), "position_m": position_m}
     return Trajectories(**(values | changes))
 
 
-def everything() -> Trajectories:
+def make_full_trajectories() -> Trajectories:
     rng = np.random.default_rng(0)
-    return trajectories(
+    return make_trajectories(
         velocity_m_s=rng.normal(size=(FRAMES, DRONES, 3)),
         orientation_wxyz=rng.normal(size=(FRAMES, DRONES, 4)),
         fitness=rng.random((FRAMES, DRONES)),
         num_cameras=rng.integers(0, 9, (FRAMES, DRONES)),
         status=rng.integers(0, 3, (FRAMES, DRONES)),
-        covariance_m2=covariances(rng),
+        covariance_m2=random_covariances(rng),
     )
 
 
-def covariances(rng):
+def random_covariances(rng):
     root = rng.normal(size=(FRAMES, DRONES, 3, 3))
     return root @ np.swapaxes(root, -1, -2)
 
 
 def test_counts():
-    assert (trajectories().num_frames, trajectories().num_drones) == (FRAMES, DRONES)
+    assert (make_trajectories().num_frames, make_trajectories().num_drones) == (FRAMES, DRONES)
 
 
 def test_seen_needs_a_complete_position_that_is_not_lost():
@@ -45,17 +45,17 @@ def test_seen_needs_a_complete_position_that_is_not_lost():
     position_m[1, 0, 2] = np.nan
     status = np.full((FRAMES, DRONES), Status.TRACKED)
     status[2, 1], status[3, 1] = Status.LOST, Status.COASTING
-    unseen = np.argwhere(~trajectories(position_m=position_m, status=status).seen)
+    unseen = np.argwhere(~make_trajectories(position_m=position_m, status=status).seen)
     assert unseen.tolist() == [[1, 0], [2, 1]]
-    assert np.argwhere(~trajectories(position_m=position_m).seen).tolist() == [[1, 0]]
+    assert np.argwhere(~make_trajectories(position_m=position_m).seen).tolist() == [[1, 0]]
 
 
 def test_status_words():
     assert [status.label for status in Status] == ["tracked", "coasting", "lost"]
 
 
-def test_at_frames_picks_rows_of_all_arrays():
-    full = everything()
+def test_at_frames_selects_the_same_rows_of_every_array():
+    full = make_full_trajectories()
     picked = full.at_frames(np.array([12, 18]))
     assert picked.frame.tolist() == [12, 18]
     assert picked.drones == full.drones
@@ -65,14 +65,14 @@ def test_at_frames_picks_rows_of_all_arrays():
         np.testing.assert_array_equal(getattr(picked, name), getattr(full, name)[[1, 4]])
 
 
-def test_at_frames_keeps_unknown_quantities_none():
-    assert trajectories().at_frames(np.array([10])).velocity_m_s is None
+def test_at_frames_keeps_none_for_unknown_quantities():
+    assert make_trajectories().at_frames(np.array([10])).velocity_m_s is None
 
 
 @pytest.mark.parametrize("wanted", [[11], [10, 20], [8]], ids=["between", "after", "before"])
 def test_at_frames_refuses_missing_frames(wanted):
     with pytest.raises(InputError, match=f"expected frames {wanted[0]} to {wanted[-1]}"):
-        trajectories().at_frames(np.array(wanted))
+        make_trajectories().at_frames(np.array(wanted))
 
 
 @pytest.mark.parametrize(
@@ -89,22 +89,22 @@ def test_at_frames_refuses_missing_frames(wanted):
 )
 def test_invalid_arrays_are_refused(changes, message):
     with pytest.raises(InputError, match=message):
-        trajectories(**changes)
+        make_trajectories(**changes)
 
 
 def test_a_known_covariance_must_be_symmetric_within_rounding():
     """Matrices with NaN are not checked."""
     rng = np.random.default_rng(1)
-    # One half differs by the last bit of float32.
-    rounded = covariances(rng).astype(np.float32)
+    # The upper and the lower half differ by the last bit of float32.
+    rounded = random_covariances(rng).astype(np.float32)
     rounded[..., 0, 2] = np.nextafter(rounded[..., 2, 0], np.float32(np.inf))
     rounded[1, 2] = np.nan
     rounded[2, 0, 0, 1] = np.nan
-    kept = trajectories(covariance_m2=rounded).covariance_m2
+    kept = make_trajectories(covariance_m2=rounded).covariance_m2
     np.testing.assert_array_equal(kept, rounded)
 
 
 def test_a_covariance_of_wrong_shape_is_refused():
     # With the tests' import hook the annotations are checked before the shapes; both messages name the field.
     with pytest.raises((InputError, jaxtyping.TypeCheckError), match="covariance_m2"):
-        trajectories(covariance_m2=np.zeros((FRAMES, DRONES + 1, 3, 3)))
+        make_trajectories(covariance_m2=np.zeros((FRAMES, DRONES + 1, 3, 3)))

@@ -1,4 +1,4 @@
-"""Tables and TUM files of trajectories: exact columns, exact round trips, and errors that name the line."""
+"""Trajectories in CSV, Parquet and TUM files: exact columns, exact round trips, and errors that name the line."""
 
 import json
 import resource
@@ -39,7 +39,7 @@ def two_drones(dtype=np.float32) -> Trajectories:
     )
 
 
-def assert_same(read: Trajectories, written: Trajectories, dtype=np.float64) -> None:
+def assert_equal_trajectories(read: Trajectories, written: Trajectories, dtype=np.float64) -> None:
     """Assert equality to the last bit in the precision of the written arrays."""
     assert read.drones == written.drones
     for name in ("frame", "time_s", "num_cameras", "status"):
@@ -55,7 +55,8 @@ class TestRoundTrip:
     @staticmethod
     @st.composite
     def arguments(draw, dtype):
-        # Not yet a `Trajectories`: the type checker samples elements at random, which a strategy must not do.
+        # The strategy draws arguments, not a `Trajectories`: the type checker samples array elements at random,
+        # and a hypothesis strategy must be deterministic.
         frames, drones = draw(st.integers(1, 4)), draw(st.integers(1, 3))
         names = st.text("ab 1,;\"'#é", min_size=1, max_size=5).map(str.strip).filter(bool)
         numbers = st.floats(allow_infinity=False, width=32 if dtype == np.float32 else 64)
@@ -63,7 +64,7 @@ class TestRoundTrip:
 
         def floats(*parts):
             values = draw(hnp.arrays(dtype, (frames, drones, *parts), elements=numbers))
-            # At least one known number: a quantity that is unknown altogether is read back as None.
+            # At least one number is not NaN: an array of NaN only is read back as None.
             values[0, 0] = draw(known)
             return values
 
@@ -90,25 +91,25 @@ class TestRoundTrip:
     @pytest.mark.parametrize("dtype", [np.float32, np.float64])
     @given(data=st.data())
     @settings(max_examples=40, deadline=None)
-    def test_nothing_changes(self, suffix, dtype, data, tmp_path_factory):
+    def test_reading_gives_what_was_written(self, suffix, dtype, data, tmp_path_factory):
         path = tmp_path_factory.getbasetemp() / f"round_trip_{dtype.__name__}{suffix}"
         written = Trajectories(**data.draw(self.arguments(dtype)))
         write_trajectories(path, written, force=True)
-        assert_same(read_trajectories(path), written, dtype)
+        assert_equal_trajectories(read_trajectories(path), written, dtype)
 
     @pytest.mark.parametrize("suffix", SUFFIXES)
     def test_unknown_quantities_are_none(self, tmp_path, suffix):
         path = tmp_path / f"tracks{suffix}"
-        bare = replace(two_drones(), velocity_m_s=None, fitness=None, num_cameras=None, status=None)
-        write_trajectories(path, bare)
+        without_extras = replace(two_drones(), velocity_m_s=None, fitness=None, num_cameras=None, status=None)
+        write_trajectories(path, without_extras)
         read = read_trajectories(path)
         assert (read.velocity_m_s, read.fitness, read.num_cameras) == (None, None, None)
-        np.testing.assert_array_equal(read.seen, bare.seen)
+        np.testing.assert_array_equal(read.seen, without_extras.seen)
         assert read.status.tolist() == [[0, 0], [0, 0], [0, 2]]
 
 
 class TestWriting:
-    def test_csv_to_the_letter(self, tmp_path):
+    def test_exact_content_of_a_csv_file(self, tmp_path):
         write_trajectories(tmp_path / "tracks.csv", two_drones())
         assert (tmp_path / "tracks.csv").read_bytes().decode().split("\n") == [
             HEADER,
@@ -131,7 +132,7 @@ class TestWriting:
         assert json.loads(metadata[b"psotrack.units"]) == COLUMNS
         assert list(COLUMNS) == HEADER.split(",")
 
-    def test_covariances_are_six_more_columns(self, tmp_path):
+    def test_covariances_add_six_columns(self, tmp_path):
         covariance_m2 = np.full((3, 2, 3, 3), np.nan)
         covariance_m2[0, 1] = [[1, 2, 3], [2, 5, 6], [3, 6, 9]]
         known = replace(two_drones(), covariance_m2=covariance_m2)
@@ -164,11 +165,11 @@ class TestWriting:
 
     @pytest.mark.parametrize("suffix", SUFFIXES)
     def test_a_full_disk_leaves_the_old_file(self, tmp_path, suffix, monkeypatch):
-        # Modules that are imported under the limit would be cached incompletely, for all processes.
+        # A module that is imported under the limit would leave an incomplete bytecode file for other processes.
         monkeypatch.setattr(sys, "dont_write_bytecode", True)
         path = tmp_path / f"tracks{suffix}"
         path.write_text("precious")
-        # No file of this process may become larger than 64 bytes, so that writing fails as on a full disk.
+        # This process cannot write a file above 64 bytes, so writing fails as on a full disk.
         limits = resource.getrlimit(resource.RLIMIT_FSIZE)
         resource.setrlimit(resource.RLIMIT_FSIZE, (64, limits[1]))
         try:
@@ -191,7 +192,7 @@ def csv_file(tmp_path, *lines, header="frame,time_s,drone,x_m,y_m,z_m,status,num
 
 
 class TestLenientReading:
-    def test_any_order_of_rows_and_columns_missing_and_extra_columns(self, tmp_path):
+    def test_rows_and_columns_in_any_order_with_missing_and_extra_columns(self, tmp_path):
         path = csv_file(
             tmp_path,
             "1.5,2,0.5,3,nice,7",
@@ -218,7 +219,7 @@ class TestLenientReading:
         read = read_trajectories(csv_file(tmp_path, "3,,a,1,1,1,tracked,8", "3,0.12,b,1,1,1,tracked,8"))
         assert read.time_s.tolist() == [0.12]
 
-    def test_parquet_with_whole_numbers_for_names(self, tmp_path):
+    def test_parquet_with_integers_as_drone_names(self, tmp_path):
         path = tmp_path / "tracks.parquet"
         table = {
             "frame": [0, 0],
@@ -281,10 +282,10 @@ class TestBadFiles:
     )
     def test_a_wrong_line_of_csv(self, tmp_path, line, message):
         path = csv_file(tmp_path, GOOD, line)
-        with pytest.raises(InputError) as caught:
+        with pytest.raises(InputError) as error_info:
             read_trajectories(path)
-        assert str(caught.value).startswith(str(path))
-        assert message in str(caught.value)
+        assert str(error_info.value).startswith(str(path))
+        assert message in str(error_info.value)
 
     def test_messages_name_the_line_of_the_file(self, tmp_path):
         with pytest.raises(InputError, match="line 5: expected a whole number"):
@@ -348,7 +349,7 @@ class TestTum:
         orientation_wxyz = Rotation.random(6, rng=np.random.default_rng(0)).as_quat(scalar_first=True)
         return replace(two_drones(np.float64), orientation_wxyz=orientation_wxyz.reshape(3, 2, 4))
 
-    def test_to_the_letter(self, tmp_path):
+    def test_exact_content_of_a_tum_file(self, tmp_path):
         first, second = write_tum(tmp_path / "tum", two_drones())
         assert (first.name, second.name) == ("dron1.tum", "dron2.tum")
         assert second.read_text().splitlines() == [
@@ -398,7 +399,7 @@ class TestTum:
         assert read_tum(tmp_path, fps=25.0).num_drones == 2
 
     @pytest.mark.parametrize("name", ["a/b", ""])
-    def test_names_that_cannot_be_files(self, tmp_path, name):
+    def test_drone_names_that_cannot_be_file_names(self, tmp_path, name):
         with pytest.raises(InputError, match="names that can be names of files"):
             write_tum(tmp_path, replace(two_drones(), drones=("fine", name)))
         assert not list(tmp_path.iterdir())
@@ -418,9 +419,9 @@ class TestTum:
     def test_a_bad_line(self, tmp_path, line, message):
         path = tmp_path / "dron1.tum"
         path.write_text(f"# timestamp tx ty tz qx qy qz qw\n0 1 2 3 0 0 0 1\n{line}\n")
-        with pytest.raises(InputError, match=message) as caught:
+        with pytest.raises(InputError, match=message) as error_info:
             read_tum(path, fps=25.0)
-        assert str(path) in str(caught.value)
+        assert str(path) in str(error_info.value)
 
     def test_nothing_to_read(self, tmp_path):
         with pytest.raises(InputError, match="expected a TUM file, or a folder with TUM files"):

@@ -1,4 +1,4 @@
-"""Videos: exact numbers of frames and rates, broken files, and a writer that never leaves an incomplete file."""
+"""Videos: exact frame counts and frame rates, broken files, and a writer that never leaves an incomplete file."""
 
 import os
 import re
@@ -24,7 +24,7 @@ def grey(level: int) -> np.ndarray:
 
 
 def noise(num_frames: int) -> np.ndarray:
-    """Frames that compress badly, so that a truncated file loses many frames."""
+    """Make frames of noise, which compress badly, so that a truncated file loses many frames."""
     return np.random.default_rng(0).integers(0, 255, (num_frames, HEIGHT, WIDTH, 3), dtype=np.uint8)
 
 
@@ -43,13 +43,14 @@ def test_frame_rate_is_not_truncated(tmp_path, fps):
 
 
 @pytest.mark.parametrize("num_frames", [1, 2, 13, 61])
-def test_what_is_written_is_read(tmp_path, num_frames):
+def test_reading_gives_the_written_frames(tmp_path, num_frames):
     levels = 16 * np.random.default_rng(0).permutation(64)[:num_frames] % 256
     path = write(tmp_path / "a.avi", [grey(level) for level in levels])
     video = probe(path)
     assert video == VideoInfo(path, num_frames, 25.0, (WIDTH, HEIGHT))
     read = [frame.mean() for frame in read_frames(video)]
-    # The codec moves flat frames by up to 3.7 of 255 (measured); levels differ by 16, so a shift fails.
+    # The codec changes the level of flat frames by up to 3.7 of 255 (measured). Levels differ by 16, so a shift by one
+    # frame fails.
     np.testing.assert_allclose(read, levels, atol=6)
     assert next(read_frames(video)).shape == (HEIGHT, WIDTH, 3)
 
@@ -57,10 +58,10 @@ def test_what_is_written_is_read(tmp_path, num_frames):
 @pytest.mark.parametrize("step", [1, 2, 5, 100])
 def test_a_step_reads_every_nth_frame(tmp_path, step):
     video = probe(write(tmp_path / "a.avi", noise(11)))
-    every = list(read_frames(video))
-    some = list(read_frames(video, step))
-    assert len(some) == len(range(0, 11, step))
-    np.testing.assert_array_equal(some, every[::step])
+    all_frames = list(read_frames(video))
+    selected = list(read_frames(video, step))
+    assert len(selected) == len(range(0, 11, step))
+    np.testing.assert_array_equal(selected, all_frames[::step])
 
 
 def test_leading_frames_only(tmp_path):
@@ -93,16 +94,16 @@ def test_a_name_that_looks_like_a_protocol(tmp_path, monkeypatch):
     assert probe(Path("cam:1 %02d.avi")).num_frames == 3
 
 
-@pytest.mark.parametrize("part", [0.2, 0.5, 0.95])
-def test_a_truncated_video_names_file_and_frame(tmp_path, part, capfd):
+@pytest.mark.parametrize("fraction", [0.2, 0.5, 0.95])
+def test_a_truncated_video_names_file_and_frame(tmp_path, fraction, capfd):
     path = write(tmp_path / "cam1i_s.avi", noise(40))
     content = path.read_bytes()
-    path.write_bytes(content[: int(part * len(content))])
+    path.write_bytes(content[: int(fraction * len(content))])
     video = probe(path)
-    assert video.num_frames == 40  # the header still says so
-    with pytest.raises(InputError) as caught:
+    assert video.num_frames == 40  # the header still states 40 frames
+    with pytest.raises(InputError) as error_info:
         list(read_frames(video))
-    message = str(caught.value)
+    message = str(error_info.value)
     reached = int(re.search(r"only (\d+) can be decoded", message)[1])
     assert message.startswith(f"{path}: expected 40 frames, found that only {reached} can be decoded")
     assert 0 < reached < 40
@@ -126,7 +127,7 @@ def test_a_damaged_frame_is_found(tmp_path, capfd):
     assert capfd.readouterr().err == ""
 
 
-def test_missing(tmp_path):
+def test_a_missing_file(tmp_path):
     with pytest.raises(InputError, match=r"nix\.avi: expected a video, found no such file"):
         probe(tmp_path / "nix.avi")
 
@@ -140,7 +141,7 @@ def test_missing(tmp_path):
         (b"RIFF\x00\x10\x00\x00AVI ", "a file that FFmpeg cannot open"),
     ],
 )
-def test_no_video(tmp_path, content, found, capfd):
+def test_files_that_are_no_videos(tmp_path, content, found, capfd):
     path = tmp_path / "a.avi"
     path.write_bytes(content)
     with pytest.raises(InputError, match=rf"a\.avi: expected a video, found {found}"):
@@ -223,7 +224,7 @@ def test_a_file_in_place_of_the_folder(tmp_path):
 
 
 def test_a_full_disk_is_an_error_and_keeps_the_old_file(tmp_path):
-    """A limit of the file size simulates the full disk: FFmpeg reports no error in either case."""
+    """A limit on the file size stands for a full disk: FFmpeg reports an error in neither case."""
     path = write(tmp_path / "a.avi", noise(2))
     before = path.read_bytes()
     script = textwrap.dedent(
@@ -233,7 +234,7 @@ def test_a_full_disk_is_an_error_and_keeps_the_old_file(tmp_path):
         import numpy as np
         from psotrack.errors import OutputError
         from psotrack.recordings.video import VideoWriter
-        sys.dont_write_bytecode = True  # a cached module would be cut off too, for everybody
+        sys.dont_write_bytecode = True  # the limit would truncate the bytecode of other processes too
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
         rng = np.random.default_rng(0)
         try:
@@ -251,10 +252,10 @@ def test_a_full_disk_is_an_error_and_keeps_the_old_file(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("missing", [1, 100, 200])
-def test_an_incomplete_index_is_found(tmp_path, missing):
+@pytest.mark.parametrize("missing_bytes", [1, 100, 200])
+def test_an_incomplete_index_is_found(tmp_path, missing_bytes):
     """All frames exist and can be counted, but the index at the end of the file (3200 bytes measured) is incomplete."""
-    whole = write(tmp_path / "whole.avi", [grey(level) for level in range(200)]).stat().st_size
+    complete_size = write(tmp_path / "whole.avi", [grey(level) for level in range(200)]).stat().st_size
     script = textwrap.dedent(
         """
         import resource, sys
@@ -262,7 +263,7 @@ def test_an_incomplete_index_is_found(tmp_path, missing):
         import numpy as np
         from psotrack.errors import OutputError
         from psotrack.recordings.video import VideoWriter
-        sys.dont_write_bytecode = True  # a cached module would be cut off too, for everybody
+        sys.dont_write_bytecode = True  # the limit would truncate the bytecode of other processes too
         resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
         try:
             with VideoWriter(Path(sys.argv[1]), 25.0, (96, 64)) as writer:
@@ -272,7 +273,7 @@ def test_an_incomplete_index_is_found(tmp_path, missing):
             print(error)
         """
     )
-    command = [sys.executable, "-c", script, tmp_path / "a.avi", str(whole - missing)]
+    command = [sys.executable, "-c", script, tmp_path / "a.avi", str(complete_size - missing_bytes)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert (
         "a.avi: expected a file with 200 frames, found an incomplete index of frames; is the disk full?"
@@ -285,7 +286,7 @@ def test_an_incomplete_index_is_found(tmp_path, missing):
 
 
 def key_frames(path: Path) -> list[bool]:
-    """Key frames, at which a player may start, from the index of the container (chunk `idx1`)."""
+    """Return for each frame whether the index of the container (chunk `idx1`) marks it as a key frame."""
     data = path.read_bytes()
     start = data.rfind(b"idx1")
     entries = np.frombuffer(
@@ -294,8 +295,8 @@ def key_frames(path: Path) -> list[bool]:
     return (entries.reshape(-1, 4)[:, 1] & 0x10 > 0).tolist()
 
 
-def moving(num_frames: int, start: int = 0) -> list[np.ndarray]:
-    """Frames of a moving picture in which no two frames are equal."""
+def moving_picture(num_frames: int, start: int = 0) -> list[np.ndarray]:
+    """Make frames of a moving picture; no two of its frames are equal."""
     large = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (64, 400, 3), np.uint8), (0, 0), 2)
     return [large[:, k : k + WIDTH].copy() for k in range(start, start + num_frames)]
 
@@ -304,7 +305,7 @@ def moving(num_frames: int, start: int = 0) -> list[np.ndarray]:
 def test_a_joined_video_decodes_as_its_parts_do(tmp_path, lengths, capfd):
     starts = np.cumsum([0, *lengths])
     parts = [
-        write(tmp_path / f"{i}.avi", moving(length, start), 29.97)
+        write(tmp_path / f"{i}.avi", moving_picture(length, start), 29.97)
         for i, (length, start) in enumerate(zip(lengths, starts, strict=False))
     ]
     join_videos(tmp_path / "joined.avi", parts)
@@ -312,7 +313,7 @@ def test_a_joined_video_decodes_as_its_parts_do(tmp_path, lengths, capfd):
     assert joined == replace(probe(parts[0]), path=joined.path, num_frames=sum(lengths))
     expected = [frame for part in parts for frame in read_frames(probe(part))]
     np.testing.assert_array_equal(list(read_frames(joined)), expected)
-    # The key frames are those of the encoder.
+    # Joining keeps the key frames that the encoder chose for the parts.
     assert key_frames(joined.path) == [key for part in parts for key in key_frames(part)]
     capture = cv2.VideoCapture(str(joined.path), cv2.CAP_FFMPEG)
     for frame in np.random.default_rng(0).permutation(sum(lengths))[:8].tolist():
@@ -356,7 +357,7 @@ def test_a_full_disk_while_joining_keeps_the_old_file(tmp_path):
         from psotrack.errors import OutputError
         from psotrack.recordings.video import join_videos
         target, limit, *parts = sys.argv[1:]
-        sys.dont_write_bytecode = True  # a cached module would be cut off too, for everybody
+        sys.dont_write_bytecode = True  # the limit would truncate the bytecode of other processes too
         resource.setrlimit(resource.RLIMIT_FSIZE, (int(limit), int(limit)))
         try:
             join_videos(Path(target), [Path(part) for part in parts])

@@ -1,4 +1,4 @@
-"""`Recording.usable`: consistent videos pass; errors name an inconsistent video and a remedy."""
+"""`Recording.usable` accepts consistent videos; its errors name the inconsistent video and a remedy."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,55 +13,59 @@ from psotrack.recordings import Recording, VideoInfo
 NAMES = ("a", "b", "c", "d", "e")
 
 
-def a_camera(size_wh=(1920, 1080)):
+def make_test_camera(size_wh=(1920, 1080)):
     K = np.array([[1000, 0, 960], [0, 1000, 540], [0, 0, 1.0]])
     return make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=size_wh)
 
 
-def a_sequence(**changes) -> Recording:
-    """Five equal cameras; `changes` change the video of a camera, None removes it."""
+def make_recording(**changes) -> Recording:
+    """Make a recording of five equal cameras.
+
+    Args:
+        changes: Camera name -> fields of its `VideoInfo` that differ; None removes the camera's video.
+    """
     videos = {name: VideoInfo(Path(f"{name}.avi"), 250, 25.0, (1920, 1080)) for name in NAMES}
     for name, change in changes.items():
         if change is None:
             del videos[name]
         else:
             videos[name] = replace(videos[name], **change)
-    rig = make_rig({name: a_camera() for name in NAMES})
+    rig = make_rig({name: make_test_camera() for name in NAMES})
     return Recording(name="S01", folder=Path("S01"), rig=rig, videos=videos)
 
 
 def test_consistent_videos_are_kept():
-    sequence = a_sequence().usable()
-    assert sequence.rig.names == tuple(sequence.videos) == NAMES
-    assert (sequence.num_frames, sequence.fps) == (250, 25.0)
+    recording = make_recording().usable()
+    assert recording.rig.names == tuple(recording.videos) == NAMES
+    assert (recording.num_frames, recording.fps) == (250, 25.0)
 
 
 def test_cameras_are_chosen_in_the_order_given():
-    sequence = a_sequence().usable(["d", "b"])
-    assert sequence.rig.names == tuple(sequence.videos) == ("d", "b")
+    recording = make_recording().usable(["d", "b"])
+    assert recording.rig.names == tuple(recording.videos) == ("d", "b")
 
 
 def test_an_unknown_camera():
     with pytest.raises(SettingsError, match="cameras: expected some of a, b, c, d, e, found z"):
-        a_sequence().usable(["a", "z"])
+        make_recording().usable(["a", "z"])
 
 
 def test_a_camera_without_video():
     with pytest.raises(InputError, match="found none for b, d; pass --cameras a,c,e to leave these out"):
-        a_sequence(b=None, d=None).usable()
-    assert a_sequence(b=None).usable(["a", "c"]).rig.names == ("a", "c")
+        make_recording(b=None, d=None).usable()
+    assert make_recording(b=None).usable(["a", "c"]).rig.names == ("a", "c")
 
 
 def test_no_videos():
-    sequence = a_sequence(**dict.fromkeys(NAMES))
-    assert sequence.num_frames == 0
+    recording = make_recording(**dict.fromkeys(NAMES))
+    assert recording.num_frames == 0
     with pytest.raises(InputError, match="S01: expected at least one video, found none"):
-        _ = sequence.fps
+        _ = recording.fps
     with pytest.raises(InputError, match=r"found none for a, b, c, d, e$"):
-        sequence.usable()
+        recording.usable()
 
 
-@pytest.mark.parametrize("odd", ["a", "c"], ids=["the first", "a later one"])
+@pytest.mark.parametrize("camera", ["a", "c"], ids=["the first", "a later one"])
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
@@ -72,32 +76,32 @@ def test_no_videos():
         ({"image_size_wh": (1280, 720)}, "1920 x 1080 pixels as calibrated, found 1280 x 720"),
     ],
 )
-def test_the_error_names_the_differing_video(odd, change, expected):
-    with pytest.raises(InputError, match=rf"^{odd}\.avi: expected {expected}"):
-        a_sequence(**{odd: change}).usable()
-    rest = [name for name in NAMES if name != odd]
-    assert a_sequence(**{odd: change}).usable(rest).rig.names == tuple(rest)
+def test_the_error_names_the_differing_video(camera, change, expected):
+    with pytest.raises(InputError, match=rf"^{camera}\.avi: expected {expected}"):
+        make_recording(**{camera: change}).usable()
+    rest = [name for name in NAMES if name != camera]
+    assert make_recording(**{camera: change}).usable(rest).rig.names == tuple(rest)
 
 
 def test_different_sizes_are_refused_even_if_calibrated():
-    sequence = a_sequence(c={"image_size_wh": (1280, 720)})
-    sequence.rig.cameras.image_size_wh[2] = (1280, 720)
+    recording = make_recording(c={"image_size_wh": (1280, 720)})
+    recording.rig.cameras.image_size_wh[2] = (1280, 720)
     with pytest.raises(
         InputError, match=r"^c\.avi: expected 1920 x 1080 pixels as in a\.avi, found 1280 x 720"
     ):
-        sequence.usable()
+        recording.usable()
 
 
 def test_rates_that_differ_by_rounding_are_equal():
-    assert a_sequence(c={"fps": 25.00004}).usable().num_frames == 250
+    assert make_recording(c={"fps": 25.00004}).usable().num_frames == 250
 
 
 def test_leading_frames():
-    sequence = a_sequence(c={"num_frames": 240}).usable(num_frames=240)
-    assert {video.num_frames for video in sequence.videos.values()} == {240}
+    recording = make_recording(c={"num_frames": 240}).usable(num_frames=240)
+    assert {video.num_frames for video in recording.videos.values()} == {240}
 
 
 @pytest.mark.parametrize("num_frames", [0, -1, 241])
 def test_more_frames_than_exist_are_refused(num_frames):
     with pytest.raises(SettingsError, match=f"frames: expected 1 to 240, .* found {num_frames}"):
-        a_sequence(c={"num_frames": 240}).usable(num_frames=num_frames)
+        make_recording(c={"num_frames": 240}).usable(num_frames=num_frames)
