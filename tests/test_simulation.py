@@ -520,7 +520,7 @@ def test_an_existing_sequence_is_replaced_only_by_force(pair_folder, tmp_path):
     ("settings", "message"),
     [
         ({"scenario": "S99"}, r"^scenario: expected one of .*S02_D4_A.*, found S99$"),
-        ({"num_frames": 0}, r"^frames: expected 1 to 250, as many as S02_D4_A has, found 0$"),
+        ({"num_frames": 0}, r"^frames: expected 1 to 250, the length of S02_D4_A, found 0$"),
         ({"num_frames": -3}, r"^frames: .* found -3$"),
         ({"num_frames": 251}, r"^frames: .* found 251$"),
         ({"scale": 0.0}, r"^scale: expected a number above 0, found 0$"),

@@ -1,4 +1,4 @@
-"""Scenario, seed, scale -> a sequence on disk, in the layout of the DPJAIT dataset."""
+"""Simulation of a sequence: from a scenario and settings to a folder in the layout of the DPJAIT dataset."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ from psotrack.simulation.segments import Stream, Work, draw, join, join_masks, s
 from psotrack.simulation.unfinished import Unfinished, unfinished
 from psotrack.support import Report, map_in_processes, no_progress
 
-#: Pieces of work per process: few, because each starts with a camera's backdrop, and enough to end together.
+#: Pieces of work per process. Few, because each piece first draws a camera's backdrop; more than one, so that all
+#: processes end at about the same time.
 _PIECES_PER_JOB = 4
 
 _logger = logging.getLogger(__name__)
@@ -132,7 +133,7 @@ def _record(scene: Scene, settings: SimulationSettings) -> bytes:
 
 
 def _digests(recipe: Scenario) -> dict[str, str]:
-    """SHA-256 of the files that a scenario names."""
+    """SHA-256 digests of the files that a scenario names, by path."""
     parts = itertools.chain.from_iterable((drone.model, drone.flight) for drone in recipe.drones)
     files = sorted({part.file for part in parts if isinstance(part, Mesh | FlightFromFile)})
     try:
@@ -143,7 +144,8 @@ def _digests(recipe: Scenario) -> dict[str, str]:
 
 
 def _streams(scene: Scene, onboard: bool) -> list[Stream]:
-    # As published: the calibration says `cam1`, the files of that camera are `cam1i_s.avi` and `dl_data/cam1i_s.csv`.
+    # As in the published dataset, the calibration says `cam1`, and that camera's files are `cam1i_s.avi` and
+    # `dl_data/cam1i_s.csv`.
     static = [Stream(f"{name}i", index) for index, name in enumerate(scene.rig.names)]
     drones = range(len(scene.flights)) if onboard else ()
     return static + [Stream(f"dron{drone + 1}_cam", drone, onboard=True) for drone in drones]
@@ -157,7 +159,7 @@ def _write_streams(
     jobs: int,
     report: Report,
 ) -> None:
-    """Draw all segments that are not there yet, and join them."""
+    """Draw all missing segments, and join the segments of each stream."""
     streams, every = _streams(scene, settings.onboard), segments(num_frames)
     parts = {
         stream: [segment_folder(growing.segments / stream.name, frames) for frames in every]
@@ -177,7 +179,7 @@ def _write_streams(
     total = len(streams) * num_frames
     if waiting < total:
         _logger.info(
-            "%s: %d of %d frames are there from an earlier call", growing.target, total - waiting, total
+            "%s: %d of %d frames were drawn by an earlier call", growing.target, total - waiting, total
         )
     with report("simulate", total) as advance:
         advance(total - waiting)
@@ -191,7 +193,7 @@ def _write_streams(
 
 
 def _cut(frames: list[range], pieces: int) -> list[tuple[range, ...]]:
-    """Consecutive segments in up to so many pieces of about equal size."""
+    """Divide consecutive segments into at most `pieces` pieces of about equal size."""
     size = -(-len(frames) // pieces) or 1
     return [tuple(frames[start : start + size]) for start in range(0, len(frames), size)]
 

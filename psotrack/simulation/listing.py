@@ -1,4 +1,4 @@
-"""The scenarios that there are, as records for programs and as a table for people."""
+"""List of the package's scenarios, as records and as a table for the terminal."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def catalogue() -> list[dict[str, Any]]:
-    """One record per scenario; the speed is the mean over its drones and frames, for seed 0."""
+    """One record per scenario of the package; the speed is the mean over drones and frames for seed 0."""
     rows = []
     for name in preset_names():
         recipe = scenario(name)
@@ -39,7 +39,7 @@ def catalogue() -> list[dict[str, Any]]:
 
 
 def render(rows: list[dict[str, Any]]) -> Table:
-    """The records as a table, one row per scenario."""
+    """Table of the records of `catalogue`, one row per scenario."""
     from rich import box
     from rich.table import Table
 

@@ -1,4 +1,4 @@
-"""Contact sheets: one page that shows what a sequence will look like, drawn in seconds, before any video is made."""
+"""Preview: one page with images and plans of a scenario, drawn in seconds, before any video is made."""
 
 from __future__ import annotations
 
@@ -29,11 +29,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Width of one picture, and when in the sequence those of one camera are taken.
+#: Width of one image, pixels.
 _PICTURE_PX = 480
+#: Times of the images of one camera, as shares of the sequence's length.
 _MOMENTS = (0.05, 0.5, 0.95)
 _DPI = 100
-#: Of the page, in inches.
+#: Width of the page and height of the plans, inches.
 _PAGE_WIDTH, _PLANS_HEIGHT = 16.0, 4.6
 _PICTURES_PER_ROW = 6
 
@@ -42,7 +43,16 @@ Image = UInt8[np.ndarray, "height width 3"]
 
 @dataclass(frozen=True)
 class _Strip:
-    """What to draw: some frames of one camera, or one frame of the own cameras of some drones."""
+    """Images to draw: several frames of one static camera, or one frame of the on-board cameras of several drones.
+
+    Attributes:
+        scenario: the scenario.
+        seed: seed of the flights and the noise.
+        scale: scale of the image size.
+        camera_index: index of the static camera; None for on-board cameras.
+        frames: numbers of the frames.
+        drones: indices of the drones whose on-board images are drawn.
+    """
 
     scenario: Scenario
     seed: int
@@ -62,19 +72,22 @@ def save_preview(
     jobs: int,
     report: Report = no_progress,
 ) -> Path:
-    """Save a PNG of pictures of every camera, some of the drones' own, and plans of the paths.
+    """Save a PNG with images of every static camera, images of several on-board cameras, and plans of the flights.
 
     Args:
-        path: of the PNG.
-        scenario: what to show.
-        num_frames: the first so many frames of it; None for all.
-        seed: varies flights and noise.
-        force: whether to replace a file that is there.
-        jobs: cameras that are drawn at once.
-        report: told of every picture.
+        path: path of the PNG.
+        scenario: the scenario to show.
+        num_frames: number of first frames to show; None: all.
+        seed: seed of the flights and the noise.
+        force: whether to replace an existing file.
+        jobs: number of cameras that are drawn at the same time.
+        report: shows the progress in cameras.
+
+    Returns:
+        Path of the PNG.
 
     Raises:
-        SettingsError: the scenario cannot be built, or has not so many frames.
+        SettingsError: the scenario cannot be built, or has fewer frames than `num_frames`.
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
     num_frames = frames_of(scenario, num_frames)
@@ -145,14 +158,14 @@ def _page(scene: Scene, strips: list[_Strip], pictures: list[list[Image]], num_f
 def _draw_plan(
     axes: Axes, scene: Scene, position_m: Float[np.ndarray, "frames drones 3"], across: int, up: int
 ) -> None:
-    """The hall, the cameras and the paths, seen along one axis."""
+    """Draw the hall, the cameras and the flights, projected along one axis."""
     from matplotlib.patches import Rectangle
 
     length, width, height = HALLS[scene.scenario.hall].size_m
     lower, upper = np.array([-length / 2, -width / 2, 0.0]), np.array([length / 2, width / 2, height])
     corner, extent = lower[[across, up]], (upper - lower)[[across, up]]
     axes.add_patch(Rectangle(tuple(corner), *extent, facecolor="none", edgecolor="#9aa3ad"))
-    for drone, colour in _numbered(position_m.shape[1]):
+    for drone, colour in _colours(position_m.shape[1]):
         path = position_m[:, drone]
         axes.plot(path[:, across], path[:, up], color=colour, linewidth=0.8)
         axes.plot(path[0, across], path[0, up], "o", color=colour, markersize=5, label=f"dron{drone + 1}")
@@ -167,16 +180,20 @@ def _draw_plan(
 
 
 def _draw_facts(axes: Axes, scene: Scene, position_m: Float[np.ndarray, "frames drones 3"]) -> None:
-    """Speed of every drone and the distance of the two that are nearest, over time."""
+    """Draw the speed of every drone and the smallest distance between two drones, over time."""
     fps = scene.scenario.fps
     time_s = np.arange(len(position_m)) / fps
     speed = np.linalg.norm(np.diff(position_m, axis=0), axis=-1) * fps
-    for drone, colour in _numbered(position_m.shape[1]):
+    for drone, colour in _colours(position_m.shape[1]):
         axes.plot(time_s[1:], speed[:, drone], color=colour, linewidth=0.8)
     nearest = _nearest_m(position_m)
     if nearest is not None:
         axes.plot(
-            time_s, nearest, color="black", linewidth=1.6, label=f"nearest two (least {nearest.min():.2f} m)"
+            time_s,
+            nearest,
+            color="black",
+            linewidth=1.6,
+            label=f"smallest distance (minimum {nearest.min():.2f} m)",
         )
         axes.legend(fontsize=8, loc="upper right")
     mean = f", mean speed {speed.mean():.2f} m/s" if speed.size else ""
@@ -185,7 +202,7 @@ def _draw_facts(axes: Axes, scene: Scene, position_m: Float[np.ndarray, "frames 
 
 
 def _nearest_m(position_m: Float[np.ndarray, "frames drones 3"]) -> Float[np.ndarray, "frames"] | None:
-    """(frames,), the distance between the two drones that are nearest; None for a single drone."""
+    """(frames,), smallest distance between two drones, metres; None for a single drone."""
     first, second = np.triu_indices(position_m.shape[1], 1)
     if not len(first):
         return None
@@ -195,11 +212,12 @@ def _nearest_m(position_m: Float[np.ndarray, "frames drones 3"]) -> Float[np.nda
 def _mark_drones(axes: Axes, cam: Camera, position_m: Float[np.ndarray, "drones 3"]) -> None:
     pixels, depth_m = project(cam, position_m)
     width, height = (int(side) for side in cam.image_size_wh)
-    for drone, colour in _numbered(len(position_m)):
+    for drone, colour in _colours(len(position_m)):
         x, y = pixels[drone]
         if depth_m[drone] > 0 and 0 <= x < width and 0 <= y < height:
             axes.plot(x, y, "o", markerfacecolor="none", markeredgecolor=colour, markersize=9, linewidth=0.6)
 
 
-def _numbered(num_drones: int) -> list[tuple[int, str]]:
+def _colours(num_drones: int) -> list[tuple[int, str]]:
+    """Index and colour of each drone."""
     return [(drone, COLOURS[drone % len(COLOURS)]) for drone in range(num_drones)]

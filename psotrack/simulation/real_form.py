@@ -1,9 +1,9 @@
-"""A simulated sequence in the form of a real one: the stand-in for the half of DPJAIT that a Vicon system recorded.
+"""Conversion of a simulated sequence to the form of the real half of DPJAIT, which a Vicon system recorded.
 
-What differs there is made here: four cameras by serial number with one lens, 1924 x 1082 pixels with distortion,
-calibration in millimetres, videos named by serial number, and for a reference one C3D file of marker crosses at 100 Hz
-that began at another moment than the videos, with noise, markers that are hidden for a while and labels that get
-swapped. There are no poses and no masks. The middle of a cross is not the drone's: evaluation finds the lever arm.
+The real half differs from the simulated half: four cameras of one type with lens distortion, 1924 x 1082 pixels, named
+by serial number, calibration in millimetres. The reference is one C3D file of marker crosses at 100 Hz. It begins at
+another time than the videos, and has noise, hidden markers and swapped labels. There are no poses and no masks. The
+middle of a cross is not the drone's body origin: evaluation finds the lever arm.
 """
 
 from __future__ import annotations
@@ -34,18 +34,20 @@ from psotrack.geometry import Camera, Rig, to_pixels, undistort
 from psotrack.recordings import Markers, Recording, VideoInfo, VideoWriter, read_frames, write_c3d
 from psotrack.support import Advance, Report, atomic_write, no_progress, refuse_to_overwrite
 
-#: The bodies of the dataset's cameras; the fifth was a spare.
+#: Serial numbers of the dataset's cameras, without the fifth camera, which was a spare.
 SERIALS = ("55260362", "56339527", "60881257", "61016180")
-#: What the real half's calibration says, for pictures of that size; pictures of other sizes get a part of it.
+#: Focal length, principal point and image size in the real half's calibration; scaled for images of other sizes.
 _FOCAL_LENGTH_PX, _CENTRE_PX, _SIZE_WH = 1158.7, (962.0, 541.0), (1924, 1082)
+#: Width of the simulated images at full size.
 _SIMULATED_WIDTH_PX = 1920
-#: k1, k2, p1, p2: a mild barrel, as lenses of this angle have; what the dataset's lenses have is not known.
+#: Distortion k1, k2, p1, p2: a weak barrel distortion, usual for this field of view. The distortion of the dataset's
+#: lenses is not known.
 _LENS = np.array([-0.08, 0.02, 0.0004, -0.0003])
-#: Of a marker's position, root mean square along each axis.
+#: Standard deviation of a marker's position along each axis.
 _NOISE_M = 0.0002
-#: How often a marker is hidden, and how long on average; how long two labels of each drone are swapped.
+#: Rate at which a marker gets hidden, mean duration, and duration of the one swap of two labels of each drone.
 _HIDDEN_PER_S, _HIDDEN_S, _SWAPPED_S = 0.1, 0.08, 0.2
-#: Something else that reflects, lying on the floor: it has no name.
+#: Position of an unlabelled reflection on the floor.
 _REFLECTION_M = (1.3, -1.1, 0.02)
 
 
@@ -118,29 +120,30 @@ def write_as_real(
         write_c3d(growing / f"{folder.name}.c3d", recording)
         for serial, name in filmed:
             before, lens = (
-                one.cameras[one.names.index(key)] for one, key in ((simulated.rig, name), (rig, serial))
+                any_rig.cameras[any_rig.names.index(key)]
+                for any_rig, key in ((simulated.rig, name), (rig, serial))
             )
             _write_video(growing / f"{serial}.avi", simulated.videos[name], before, lens, advance)
             if simulated.detections and name in simulated.detections:
-                boxes = _bent(read_detections(simulated.detections[name]), before, lens)
+                boxes = _distort_boxes(read_detections(simulated.detections[name]), before, lens)
                 write_detections(growing / DETECTIONS / f"{serial}.csv", boxes)
     return folder
 
 
 def _number(name: str) -> int:
-    """That of the simulated sequence; 99 where its name has none."""
+    """Number in the name of the simulated sequence; 99 if the name has no number."""
     match = re.match(r"[A-Za-z]*(\d+)", name)
     return int(match[1]) if match else 99
 
 
-# --- cameras and what they see
+# --- cameras, videos and boxes
 
 
 def _real_rig(rig: Rig) -> Rig:
-    """The cameras where they are, with the real half's intrinsics, lens and names."""
+    """Cameras with the simulated poses, and with the real half's intrinsics, distortion and names."""
     cameras = rig.cameras
     scale = float(cameras.image_size_wh[0, 0]) / _SIMULATED_WIDTH_PX
-    # The corner of the image, which stays where it is, is at -0.5.
+    # Pixel centres have integer coordinates, so the image's corner, which the scale does not move, is at -0.5.
     cx, cy = ((centre + 0.5) * scale - 0.5 for centre in _CENTRE_PX)
     focal_px = _FOCAL_LENGTH_PX * scale
     K = np.array([[focal_px, 0.0, cx], [0.0, focal_px, cy], [0.0, 0.0, 1.0]])
@@ -159,27 +162,27 @@ def _real_rig(rig: Rig) -> Rig:
 def _write_video(path: Path, video: VideoInfo, before: Camera, lens: Camera, advance: Advance) -> None:
     width, height = (int(side) for side in lens.image_size_wh)
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
-    xs, ys = np.moveaxis(_through(lens, before, pixels).astype(np.float32), -1, 0)
+    xs, ys = np.moveaxis(_convert_pixels(lens, before, pixels).astype(np.float32), -1, 0)
     with VideoWriter(path, video.fps, (width, height)) as writer:
         for frame in read_frames(video):
             writer.write(cv2.remap(frame, xs, ys, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
             advance(1)
 
 
-def _bent(detections: Detections, before: Camera, lens: Camera) -> Detections:
-    """The boxes around what the lens makes of boxes: of their corners and the middles of their sides."""
+def _distort_boxes(detections: Detections, before: Camera, lens: Camera) -> Detections:
+    """Boxes around the distorted corners and distorted middles of the sides of the given boxes."""
     x0, y0, x1, y1 = detections.xyxy.T
     xs, ys = (np.stack([low, (low + high) / 2, high], axis=-1) for low, high in ((x0, x1), (y0, y1)))
     grid = np.stack(np.broadcast_arrays(xs[:, None, :], ys[:, :, None]), axis=-1).reshape(-1, 9, 2)
-    seen = _through(before, lens, grid)
+    seen = _convert_pixels(before, lens, grid)
     return replace(detections, xyxy=np.hstack([seen.min(axis=1), seen.max(axis=1)]))
 
 
-def _through(
-    one: Camera, other: Camera, pixels: Float[np.ndarray, "*points 2"]
+def _convert_pixels(
+    camera: Camera, other: Camera, pixels: Float[np.ndarray, "*points 2"]
 ) -> Float[np.ndarray, "*points 2"]:
-    """Where another camera at the same place sees what one sees at some pixels."""
-    rays = undistort(one, pixels)
+    """Pixels of a second camera with the same pose that show the same points as the given pixels of a camera."""
+    rays = undistort(camera, pixels)
     return np.asarray(to_pixels(other, np.concatenate([rays, np.ones_like(rays[..., :1])], axis=-1)))
 
 
@@ -187,12 +190,12 @@ def _through(
 
 
 def _simulated_markers(simulated: Recording) -> Float[np.ndarray, "frames drones markers 3"]:
-    """(frames, drones, markers, 3), world, at the frames of the videos."""
+    """(frames, drones, markers, 3), positions of the markers at the frames of the videos, world, metres."""
     paths = (simulated.folder / mocap_markers_file(number, simulated.fps) for number in itertools.count(1))
     drones = [read_mocap_markers(path) for path in itertools.takewhile(Path.exists, paths)]
     if not drones:
         expected = f"markers of its drones, {mocap_markers_file(1, simulated.fps)} ..."
-        raise InputError(simulated.folder, expected=expected, found="none", remedy="simulate it anew")
+        raise InputError(simulated.folder, expected=expected, found="none", remedy="simulate it again")
     return np.stack(drones, axis=1)
 
 
@@ -202,12 +205,12 @@ def _recording(
     settings: RealFormSettings,
     rng: np.random.Generator,
 ) -> Markers:
-    """What a mocap system would have recorded, until the videos end."""
+    """Markers as a mocap system would record them, until the end of the videos."""
     rate_hz, offset_s = settings.rate_hz, settings.offset_s
     num_frames, num_drones, per_drone, _ = markers_m.shape
     last_s = (num_frames - 1) / fps
     if not -last_s < offset_s < np.inf:
-        expected = f"more than {-last_s:g} s, as the videos are over by then"
+        expected = f"more than {-last_s:g} s, because the videos have ended by then"
         raise SettingsError("offset_s", expected=expected, found=f"{offset_s:g}")
     time_s = np.arange(int((last_s + offset_s) * rate_hz + 1e-6) + 1) / rate_hz - offset_s
     spline = CubicSpline(np.arange(num_frames) / fps, markers_m.reshape(num_frames, -1))
@@ -228,7 +231,7 @@ def _recording(
 def _hidden(
     num_frames: int, num_markers: int, rate_hz: float, rng: np.random.Generator
 ) -> Bool[np.ndarray, "frames markers"]:
-    """Spells in which a marker is not seen: they begin at any time, and last as long as they happen to."""
+    """Whether each marker is hidden in each frame: intervals with random starts and exponential durations."""
     hidden = np.zeros((num_frames, num_markers), bool)
     for marker in range(num_markers):
         starts = np.flatnonzero(rng.random(num_frames) < _HIDDEN_PER_S / rate_hz)

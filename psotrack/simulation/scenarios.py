@@ -1,7 +1,7 @@
-"""Scenarios: small declarative records of who flies where, how, and before which cameras. Data, not code.
+"""Scenarios: records that describe drones, flights, cameras, hall and imaging of a simulated sequence.
 
-The thirteen of the dataset are the TOML files of `presets/`; a user's own is a file of the same form. Numbers of
-drones count from 1, as in the names of the files that are written.
+The thirteen scenarios of the dataset are the TOML files in `presets/`; users write files of the same form. Drone
+numbers start at 1, as in the names of the written files.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 GreyLevels = Annotated[float, msgspec.Meta(ge=0, le=255)]
-#: More than anybody means; beyond it, a slip of the finger would fill the memory.
+#: Counts have an upper limit, far above all useful values, so that a mistyped number does not fill the memory.
 Count = Annotated[int, msgspec.Meta(ge=1, le=1_000_000)]
 Reflectance = tuple[Share, Share, Share]
 
 
 class _Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A part of a scenario: immutable, unknown fields refused."""
+    """Base of the parts of a scenario: immutable, unknown fields are refused."""
 
 
 # --- flights
 
 
 class Harmonic(_Record, frozen=True, kw_only=True):
-    """One term of a flight: `amplitude_m * sin(2 pi t / period_s + phase_deg)` along each axis."""
+    """One term of a flight of sinusoids: `amplitude_m * sin(2 pi t / period_s + phase_deg)` along each axis."""
 
     amplitude_m: Vector
     period_s: Positive
@@ -44,19 +44,24 @@ class Harmonic(_Record, frozen=True, kw_only=True):
 
 
 class Harmonics(_Record, frozen=True, kw_only=True, tag_field="kind", tag="harmonics"):
-    """A sum of sinusoids about a centre."""
+    """A flight that is a sum of sinusoids about a centre."""
 
     centre_m: Vector
     terms: Annotated[tuple[Harmonic, ...], msgspec.Meta(min_length=1)]
 
 
 class Orbit(_Record, frozen=True, kw_only=True, tag_field="kind", tag="orbit"):
-    """An ellipse around a centre, rising and falling on the way; at phase 0 the drone is at +x.
+    """A flight on an ellipse around a centre, with a sinusoidal change of height; at phase 0 the drone is at +x.
 
     Attributes:
-        radius_m: along x and y.
-        clockwise: seen from above.
-        rise_m, rise_period_s, rise_phase_deg: how far it rises and falls from the centre's height, and how slowly.
+        centre_m: centre of the ellipse, world.
+        radius_m: radii along x and y.
+        period_s: time of one revolution.
+        phase_deg: angle on the ellipse at time 0.
+        clockwise: direction of the flight, seen from above.
+        rise_m: amplitude of the change of height.
+        rise_period_s: period of the change of height.
+        rise_phase_deg: phase of the change of height at time 0.
     """
 
     centre_m: Vector
@@ -70,7 +75,7 @@ class Orbit(_Record, frozen=True, kw_only=True, tag_field="kind", tag="orbit"):
 
 
 class Crossing(_Record, frozen=True, kw_only=True, tag_field="kind", tag="crossing"):
-    """To and fro between two points, slowing down at both ends; at phase 0 it starts at the first."""
+    """A flight back and forth between two points, slower near both; at phase 0 the drone starts at the first point."""
 
     start_m: Vector
     end_m: Vector
@@ -79,10 +84,11 @@ class Crossing(_Record, frozen=True, kw_only=True, tag_field="kind", tag="crossi
 
 
 class Formation(_Record, frozen=True, kw_only=True, tag_field="kind", tag="formation"):
-    """At a constant offset from another drone.
+    """A flight at a constant offset from another drone.
 
     Attributes:
-        leader: its number.
+        leader: number of the other drone.
+        offset_m: position relative to the other drone, world axes.
     """
 
     leader: Count
@@ -90,11 +96,11 @@ class Formation(_Record, frozen=True, kw_only=True, tag_field="kind", tag="forma
 
 
 class FollowingFlight(_Record, frozen=True, kw_only=True, tag_field="kind", tag="following"):
-    """On the path of another drone, some time behind it.
+    """A flight on the path of another drone, later or earlier than that drone.
 
     Attributes:
-        leader: its number.
-        delay_s: how long behind; ahead below 0.
+        leader: number of the other drone.
+        delay_s: delay after the other drone; negative if this drone flies ahead.
     """
 
     leader: Count
@@ -102,13 +108,16 @@ class FollowingFlight(_Record, frozen=True, kw_only=True, tag_field="kind", tag=
 
 
 class NearPass(_Record, frozen=True, kw_only=True, tag_field="kind", tag="near_pass"):
-    """Past another drone, to and fro, at a stated distance: `side * distance_m + swing_m * sin(...)` from it.
+    """A flight back and forth past another drone, at the offset `side * distance_m + swing_m * sin(...)` from it.
 
     Attributes:
-        other: the number of the drone that is passed.
-        distance_m: between body origins when they are nearest, twice per period.
-        side: on which side of the other it passes; any length, perpendicular to `swing_m`.
-        swing_m: how far away it is at its farthest, in which direction.
+        other: number of the other drone.
+        distance_m: smallest distance between the body origins, reached twice per period.
+        side: direction from the other drone to this drone when the distance is smallest; of any length, perpendicular
+            to `swing_m`.
+        swing_m: amplitude of the movement past the other drone, a vector in world axes.
+        period_s: period of the movement.
+        phase_deg: phase of the movement at time 0.
     """
 
     other: Count
@@ -120,11 +129,12 @@ class NearPass(_Record, frozen=True, kw_only=True, tag_field="kind", tag="near_p
 
 
 class Waypoints(_Record, frozen=True, kw_only=True, tag_field="kind", tag="waypoints"):
-    """From point to point, from rest to rest, as people fly by hand; after the last comes the first again.
+    """A closed flight through points, with a stop at each point, as people fly by hand.
 
     Attributes:
+        points_m: the points, world; the first point follows the last.
         speed_m_s: mean speed between two points.
-        hover_s: how long it stands still at each.
+        hover_s: time that the drone stands still at each point.
     """
 
     points_m: Annotated[tuple[Vector, ...], msgspec.Meta(min_length=2)]
@@ -133,12 +143,12 @@ class Waypoints(_Record, frozen=True, kw_only=True, tag_field="kind", tag="waypo
 
 
 class FlightFromFile(_Record, frozen=True, kw_only=True, tag_field="kind", tag="recording"):
-    """What was recorded before: a CSV of positions and, where it has them, orientations, at any rate.
+    """A recorded flight: a CSV file of positions and optional orientations, at any rate.
 
     Attributes:
-        file: its path; a relative one starts at the scenario's file.
-        start_s: of the recording, which becomes the first frame.
-        offset_m: added to its positions.
+        file: path of the CSV file; a relative path starts at the folder of the scenario's file.
+        start_s: time in the recorded flight that becomes the first frame.
+        offset_m: vector that is added to the positions.
     """
 
     file: str
@@ -155,20 +165,20 @@ FlightRecord = (
 
 
 class Rotor(_Record, frozen=True, kw_only=True):
-    """A rotor of a mesh: its hub and its radius, in the body frame."""
+    """A rotor of a mesh: centre of its hub, and radius, in the body frame."""
 
     centre_m: Vector
     radius_m: Positive
 
 
 class Mesh(_Record, frozen=True, kw_only=True):
-    """A user's own drone: a mesh file, OBJ or PLY.
+    """A drone model from a mesh file, OBJ or PLY.
 
     Attributes:
-        file: its path; a relative one starts at the scenario's file.
+        file: path of the mesh; a relative path starts at the folder of the scenario's file.
         scale: metres per unit of the file.
-        origin_m: the point of the scaled mesh that is the body origin; x is ahead, z up.
-        rotors: none are drawn unless they are listed here.
+        origin_m: point of the scaled mesh that is the body origin; x is ahead, z is up.
+        rotors: rotors to draw; empty: no rotors.
     """
 
     file: str
@@ -178,14 +188,17 @@ class Mesh(_Record, frozen=True, kw_only=True):
 
 
 class Drone(_Record, frozen=True, kw_only=True):
-    """A drone: its shape, its paint, and its flight.
+    """A drone: model, paint and flight.
 
     Attributes:
-        model: a name in `world.drones.MODELS`, or a mesh.
-        paint_bgr: reflectance of its paint, linear, 0 to 1 (dark grey is 0.1).
-        group: drones of one group are varied alike by a seed, so that what keeps them apart stays.
-        yaw_deg, yaw_sway_deg, yaw_period_s: heading, and how far and how slowly it turns to and fro; a recording with
-            orientations has its own.
+        flight: the flight.
+        model: name of a model in `world.drones.MODELS`, or a mesh.
+        paint_bgr: reflectance of the paint, linear, 0 to 1 (dark grey is 0.1).
+        group: name of a group; a seed changes the flights of a group in the same way, so that the drones of the group
+            keep their distances.
+        yaw_deg: mean heading; not used for recorded flights with orientations, nor are the next two.
+        yaw_sway_deg: amplitude of the sinusoidal change of heading.
+        yaw_period_s: period of the change of heading.
     """
 
     flight: FlightRecord
@@ -201,7 +214,14 @@ class Drone(_Record, frozen=True, kw_only=True):
 
 
 class CameraPlace(_Record, frozen=True, kw_only=True):
-    """Where a camera hangs and looks, with intrinsics for pictures of the scenario's `image_size_wh`."""
+    """Position, viewing direction and intrinsics of a static camera, for images of the scenario's `image_size_wh`.
+
+    Attributes:
+        position_m: camera centre, world.
+        target_m: point that the camera looks at, world.
+        focal_length_px: focal length.
+        principal_point_px: principal point.
+    """
 
     position_m: Vector
     target_m: Vector
@@ -210,11 +230,11 @@ class CameraPlace(_Record, frozen=True, kw_only=True):
 
 
 class CameraSpread(_Record, frozen=True, kw_only=True):
-    """How far cameras differ from their records, drawn with the seed: standard deviations, 0 for not at all.
+    """Standard deviations of the random differences between the cameras and their records; 0 is no difference.
 
     Attributes:
-        focal_length: relative.
-        principal_point_px: along x and along y.
+        focal_length: standard deviation of the focal length, relative.
+        principal_point_px: standard deviation of the principal point along x and along y.
     """
 
     focal_length: Annotated[float, msgspec.Meta(ge=0, le=0.2)] = 0.0
@@ -222,12 +242,13 @@ class CameraSpread(_Record, frozen=True, kw_only=True):
 
 
 class OnboardCamera(_Record, frozen=True, kw_only=True):
-    """The camera on each drone, fixed to its body (the `_A` sequences).
+    """The on-board camera of each drone, fixed to the drone's body (the `_A` sequences).
 
     Attributes:
+        image_size_wh: width and height of the images at full size, pixels.
         fov_deg: horizontal and vertical field of view (the paper's GoPro has 92.45 x 60.83).
-        position_m: of its centre, in the body frame.
-        pitch_deg: how far it looks up (above 0) or down from straight ahead.
+        position_m: camera centre in the body frame.
+        pitch_deg: angle of the viewing direction above the drone's x axis; negative below.
         shutter_s: exposure time.
     """
 
@@ -239,22 +260,24 @@ class OnboardCamera(_Record, frozen=True, kw_only=True):
 
 
 class Imaging(_Record, frozen=True, kw_only=True):
-    """What makes pictures look like a camera's. Every effect is off at 0 (or false).
+    """Effects of a real camera and of real light. Each effect is off at 0 (or false).
 
     Attributes:
-        antialiasing: edges without stairs.
-        shutter_s: exposure time, which blurs what moves.
-        lens_blur_px: standard deviation.
-        shadows: soft shadows of the lamps on the floor.
-        contact_shadows: the dark under what is close to the floor, where ambient light does not get.
-        reflections: share of light that the floor mirrors when looked at steeply; it grows towards grazing angles.
+        antialiasing: whether edges are smoothed.
+        shutter_s: exposure time, which decides the motion blur.
+        lens_blur_px: standard deviation of the lens's blur.
+        shadows: whether drones cast soft shadows of the lamps on the floor.
+        contact_shadows: whether ambient light is weaker under drones that are close to the floor.
+        reflections: share of light that the floor reflects at normal incidence; the share grows towards grazing angles.
         exposure_drift: standard deviation of the slow relative change of brightness, per camera.
-        white_balance_drift: the same for colours against one another.
-        flicker: how far lamps dim between two half waves of the mains.
-        mains_hz: the mains' frequency; that of the lamps is twice this.
-        read_noise: standard deviation at black, in grey levels.
-        shot_noise: standard deviation at full scale, in grey levels; grows with the root of brightness.
-        jpeg_quality: 1 to 100, as cameras that send JPEG have it; blocks show below 40; 0 is no JPEG at all.
+        white_balance_drift: standard deviation of the slow relative change of the colour channels, per camera.
+        flicker: relative drop of the lamps' light between two half waves of the mains.
+        mains_hz: frequency of the mains; the lamps flicker at twice this frequency.
+        read_noise: standard deviation of the noise at black, grey levels.
+        shot_noise: standard deviation of the noise at full scale, grey levels; proportional to the square root of
+            brightness.
+        jpeg_quality: quality of the JPEG compression in the camera, 1 to 100; blocks are visible below 40; 0 is no JPEG
+            compression.
     """
 
     antialiasing: bool = True
@@ -273,14 +296,15 @@ class Imaging(_Record, frozen=True, kw_only=True):
 
 
 class SimulatedDetector(_Record, frozen=True, kw_only=True):
-    """The noise of a detector of boxes, with what a good network does on such videos as default.
+    """Errors of a simulated detector of boxes; the defaults are those of a good network on similar videos.
 
     Attributes:
-        jitter: standard deviation of a box's middle and size, as a share of its size.
-        miss_rate: of drones that are seen whole and large; what is hidden or small is missed more often.
-        double_rate: share of drones that get a second box.
-        false_alarms_per_frame: mean number, per camera.
-        merge_iou: boxes of two drones that overlap more become one.
+        jitter: standard deviation of a box's middle and size, as a share of the box's size.
+        miss_rate: share of missed detections of large, fully visible drones; hidden or small drones are missed more
+            often.
+        double_rate: share of drones with a second box.
+        false_alarms_per_frame: mean number of false alarms per frame and camera.
+        merge_iou: overlap above which the boxes of two drones become one box.
     """
 
     jitter: NotNegative = 0.04
@@ -294,11 +318,16 @@ class SimulatedDetector(_Record, frozen=True, kw_only=True):
 
 
 class Limits(_Record, frozen=True, kw_only=True):
-    """What every flight of a scenario keeps to, whatever the seed.
+    """Limits that the flights of a scenario keep for every seed.
 
     Attributes:
-        min_distance_m: between any two drones, except those that the scenario lets pass nearer.
-        lower_m, upper_m: corners of the box that body origins stay in.
+        max_speed_m_s: largest speed.
+        max_acceleration_m_s2: largest acceleration.
+        max_tilt_deg: largest angle between a drone's z axis and the vertical.
+        min_distance_m: smallest distance between two drones; pairs of drones with a smaller distance in the scenario
+            itself are excepted.
+        lower_m: lower corner of the box that the body origins stay in, world.
+        upper_m: upper corner of this box, world.
     """
 
     max_speed_m_s: Positive
@@ -310,14 +339,16 @@ class Limits(_Record, frozen=True, kw_only=True):
 
 
 class Variation(_Record, frozen=True, kw_only=True):
-    """How far a seed moves flights; recordings, and offsets, distances and delays from other drones, stay as they are.
+    """Largest changes that a seed makes to flights, in both directions.
+
+    Recorded flights do not change, nor do offsets, distances and delays relative to other drones.
 
     Attributes:
-        phase_deg: of sinusoids, to either side.
-        centre_m: of centres and waypoints, to either side, along each axis.
-        size: of sinusoids, relative, to either side.
-        period: of sinusoids, and of the way around waypoints; relative, to either side.
-        yaw_deg: of headings, to either side.
+        phase_deg: largest change of a sinusoid's phase.
+        centre_m: largest change of a centre or waypoint along each axis.
+        size: largest relative change of a sinusoid's amplitude.
+        period: largest relative change of a sinusoid's period, and of the time of a round through waypoints.
+        yaw_deg: largest change of a heading.
     """
 
     phase_deg: NotNegative = 25.0
@@ -328,19 +359,25 @@ class Variation(_Record, frozen=True, kw_only=True):
 
 
 class Scenario(_Record, frozen=True, kw_only=True):
-    """One sequence to simulate.
+    """Description of one simulated sequence.
 
     Attributes:
-        description: one line for people.
-        hall: a name in `world.halls.HALLS`.
-        cameras: where they are, or the name of a rig in `world.halls.RIGS`.
-        num_frames: as long as flights are planned for.
-        limits: what flights keep to.
+        name: name of the sequence's folder.
+        description: one line about the flights.
+        hall: name of a hall in `world.halls.HALLS`.
+        cameras: the static cameras, or the name of a rig in `world.halls.RIGS`.
+        num_frames: number of frames that the flights are planned for.
+        drones: the drones.
+        limits: limits of the flights.
         fps: frames per second.
-        image_size_wh: of the cameras at full size; fewer pixels than their intrinsics are for are a smaller field of
-            view.
+        image_size_wh: width and height of the static cameras' images at full size, pixels; the intrinsics do not change
+            with the size, so a smaller image has a smaller field of view.
         markers: whether ArUco markers hang on the walls.
-        onboard: the camera on each drone; none without it.
+        onboard: on-board camera of each drone; None: no on-board cameras.
+        camera_spread: random differences between the cameras and their records.
+        imaging: effects of camera and light.
+        detector: errors of the simulated detector.
+        variation: changes that a seed makes to the flights.
     """
 
     name: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
@@ -361,26 +398,26 @@ class Scenario(_Record, frozen=True, kw_only=True):
 
 
 def scenario(name: str) -> Scenario:
-    """The scenario of that name.
+    """Scenario of the package with a given name.
 
     Raises:
-        SettingsError: there is none; the message lists those there are.
+        SettingsError: no scenario has this name; the message lists the names.
     """
     return msgspec.toml.decode(preset_text(name), type=Scenario)
 
 
 def preset_names() -> tuple[str, ...]:
-    """The names of the scenarios that come with the package, in order."""
+    """Names of the package's scenarios, sorted."""
     return tuple(
         sorted(path.name.removesuffix(".toml") for path in _PRESETS.iterdir() if path.name.endswith(".toml"))
     )
 
 
 def preset_text(name: str) -> str:
-    """The file of a scenario that comes with the package, a model for one's own.
+    """Text of the TOML file of a scenario of the package.
 
     Raises:
-        SettingsError: there is none of that name; the message lists those there are.
+        SettingsError: no scenario has this name; the message lists the names.
     """
     names = preset_names()
     if name not in names:
@@ -389,15 +426,15 @@ def preset_text(name: str) -> str:
 
 
 def wrong(recipe: Scenario, field: str, *, expected: str, found: str, remedy: str = "") -> SettingsError:
-    """The error that names a field of a scenario whose value is of the right kind but makes no sense there."""
+    """Error about a field of a scenario whose value has the right type but is not possible."""
     return SettingsError(f"scenario {recipe.name}: {field}", expected=expected, found=found, remedy=remedy)
 
 
 def load(path: str | Path) -> Scenario:
-    """The scenario in a TOML file of the same form as the presets; paths in it start at its folder.
+    """Read a scenario from a TOML file of the same form as the presets; relative paths start at the file's folder.
 
     Raises:
-        InputError: the file cannot be read, is no TOML, or has a wrong field, which the message names.
+        InputError: the file cannot be read, is not valid TOML, or has a wrong field; the message names the field.
     """
 
     def error(field: str, expected: str, found: str, remedy: str) -> InputError:
@@ -409,14 +446,15 @@ def load(path: str | Path) -> Scenario:
 
 
 def replaced(recipe: Scenario, changes: Mapping[str, Any]) -> Scenario:
-    """The scenario with other values in some of its fields.
+    """Copy of a scenario with other values in some fields.
 
     Args:
-        changes: dotted path of a field -> plain value, as TOML has them:
+        recipe: the scenario.
+        changes: new plain values, as in TOML, by dotted path of the field:
             `{"imaging.reflections": 0, "drones[0].model": "tall_cross"}`.
 
     Raises:
-        SettingsError: there is no such field, or the value does not fit it; the message names the field.
+        SettingsError: a field does not exist, or a value does not fit the field; the message names the field.
     """
 
     def error(field: str, expected: str, found: str, remedy: str) -> SettingsError:
@@ -429,7 +467,7 @@ def replaced(recipe: Scenario, changes: Mapping[str, Any]) -> Scenario:
 
 
 def _located(drone: Drone, folder: Path) -> Drone:
-    """The drone with the paths of its files made absolute."""
+    """Copy of a drone with absolute paths of its files."""
     files = {
         field: msgspec.structs.replace(part, file=str(folder / part.file))
         for field, part in (("flight", drone.flight), ("model", drone.model))
@@ -439,15 +477,15 @@ def _located(drone: Drone, folder: Path) -> Drone:
 
 
 def frames_of(recipe: Scenario, wanted: int | None) -> int:
-    """How many frames to make: all, or the first so many.
+    """Number of frames to simulate: `wanted`, or all frames of the scenario if `wanted` is None.
 
     Raises:
-        SettingsError: the scenario has not so many.
+        SettingsError: `wanted` is below 1, or larger than the scenario's number of frames.
     """
     if wanted is None:
         return recipe.num_frames
     if not 0 < wanted <= recipe.num_frames:
         raise SettingsError(
-            "frames", expected=f"1 to {recipe.num_frames}, as many as {recipe.name} has", found=f"{wanted}"
+            "frames", expected=f"1 to {recipe.num_frames}, the length of {recipe.name}", found=f"{wanted}"
         )
     return wanted

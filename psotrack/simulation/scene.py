@@ -1,4 +1,4 @@
-"""A scene: one scenario with one seed, ready to be drawn: flights, drones, room and rig."""
+"""A scene: flights, drone models, room and cameras of one scenario for one seed, ready to be drawn."""
 
 from __future__ import annotations
 
@@ -17,23 +17,24 @@ from psotrack.simulation.validation import camera_places, check, check_flights
 from psotrack.simulation.world.drones import DroneModel, model
 from psotrack.simulation.world.rooms import Room, room
 
-#: Smaller pictures than this show nothing; larger ones cannot be written, as MPEG-4 counts a side in 13 bits.
+#: Smallest and largest side of an image, pixels. Smaller images show nothing; larger images cannot be written, because
+#: MPEG-4 stores a side in 13 bits.
 _MIN_SIDE_PX, _MAX_SIDE_PX = 32, 8190
-#: Keeps the draws of the cameras apart from those of the flights, whose second number counts attempts.
+#: Second number of the cameras' random seed. It differs from the flights' second numbers, which count attempts.
 _FOR_CAMERAS = 1_000_003
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything that a camera could see.
+    """Everything that a camera can see.
 
     Attributes:
-        scenario: the record.
-        seed: what varies the flights and the noise.
-        scale: of images, 1 is full size.
-        rig: the cameras at that scale.
-        flights: one per drone.
-        models: one per drone.
+        scenario: the scenario.
+        seed: seed of the flights and the noise.
+        scale: scale of the image size; 1 is full size.
+        rig: static cameras at this scale.
+        flights: flight of each drone.
+        models: model of each drone.
     """
 
     scenario: Scenario
@@ -45,31 +46,36 @@ class Scene:
 
     @property
     def room(self) -> Room:
-        """The room, its textures as fine as the scale needs; built at the first use in a process."""
+        """Room with textures at the resolution that the scale needs; built at the first use in a process."""
         return room(self.scenario.hall, self.scenario.markers, self.scale)
 
     def time_s(self, frame: int) -> float:
-        """Middle of the exposure of a frame."""
+        """Time of the middle of a frame's exposure, seconds."""
         return frame / self.scenario.fps
 
     def positions_m(self, num_frames: int) -> Float[np.ndarray, "frames drones 3"]:
-        """(frames, drones, 3), the truth: where the body origins are in the middle of each exposure."""
+        """(frames, drones, 3), ground truth: body origins in the middle of each exposure, world, metres."""
         time_s = frame_times_s(self.scenario, num_frames)
         return np.stack([flight.position_m(time_s) for flight in self.flights], axis=1)
 
     def orientations_wxyz(self, num_frames: int) -> Float[np.ndarray, "frames drones 4"]:
-        """(frames, drones, 4), the truth: unit quaternions, body to world."""
+        """(frames, drones, 4), ground truth: unit quaternions, body to world."""
         time_s = frame_times_s(self.scenario, num_frames)
         return np.stack([flight.orientation_wxyz(time_s) for flight in self.flights], axis=1)
 
 
 def build(scenario: Scenario, *, scale: float = 1.0, seed: int = 0) -> Scene:
-    """The scene of a scenario.
+    """Build the scene of a scenario.
+
+    Args:
+        scenario: the scenario.
+        scale: scale of the image size; 1 is full size.
+        seed: seed of the flights and the noise, 0 or more.
 
     Raises:
-        SettingsError: the scale is not above 0 or gives images of almost no pixels or too many, the seed is
-            negative, or the scenario names what does not exist, does not fit its hall, or cannot keep its limits.
-        InputError: a mesh or a recording cannot be used.
+        SettingsError: the scale is not above 0 or gives too small or too large images, the seed is negative, a hall,
+            rig or model does not exist, or the scenario does not fit its hall or cannot keep its limits.
+        InputError: a mesh or a recorded flight cannot be used.
     """
     check_positive("scale", scale)
     if seed < 0:
@@ -83,21 +89,22 @@ def build(scenario: Scenario, *, scale: float = 1.0, seed: int = 0) -> Scene:
 
 
 def _rig(scenario: Scenario, scale: float, seed: int) -> Rig:
-    """The cameras, each as far from its record as the scenario's spread and the seed have it."""
+    """Cameras of the scenario, with random deviations of the size that `camera_spread` gives."""
     places = camera_places(scenario)
     spread = scenario.camera_spread
     normal = np.random.default_rng([seed, _FOR_CAMERAS]).standard_normal((len(places), 3))
-    # Without its tails, so that no lens turns into another or looks out of its side.
+    # Without the tails of the distribution, which would give implausible lenses.
     draws = np.clip(normal, -2.5, 2.5) * [spread.focal_length, *2 * [spread.principal_point_px]]
     return make_rig(
         {
-            f"cam{index}": _camera(_moved(place, draw), scenario, scale)
+            f"cam{index}": _camera(_change_lens(place, draw), scenario, scale)
             for index, (place, draw) in enumerate(zip(places, draws, strict=True), start=1)
         }
     )
 
 
-def _moved(place: CameraPlace, draw: Float[np.ndarray, "3"]) -> CameraPlace:
+def _change_lens(place: CameraPlace, draw: Float[np.ndarray, "3"]) -> CameraPlace:
+    """Camera with a changed lens: relative focal length, and principal point right and down in pixels."""
     longer, right_px, down_px = draw.tolist()
     cx, cy = place.principal_point_px
     return msgspec.structs.replace(
@@ -108,10 +115,10 @@ def _moved(place: CameraPlace, draw: Float[np.ndarray, "3"]) -> CameraPlace:
 
 
 def image_size_wh(scenario: Scenario, scale: float) -> tuple[int, int]:
-    """Width and height at a scale, even because video codecs want them so.
+    """Width and height of the static cameras' images at a scale, even numbers as video codecs need.
 
     Raises:
-        SettingsError: images of that scale have almost no pixels, or more than a video can.
+        SettingsError: images of this scale are too small, or too large for a video.
     """
     sides = [side * scale for side in scenario.image_size_wh]
     if max(sides) > _MAX_SIDE_PX:
@@ -131,7 +138,7 @@ def image_size_wh(scenario: Scenario, scale: float) -> tuple[int, int]:
 def _camera(place: CameraPlace, scenario: Scenario, scale: float) -> Camera:
     R, t_m = look_at(place.position_m, place.target_m)
     focal = place.focal_length_px * scale
-    # Pixel centres are at integers, so the corner of the image, which stays where it is, is at -0.5.
+    # Pixel centres have integer coordinates, so the image's corner, which the scale does not move, is at -0.5.
     cx, cy = ((centre + 0.5) * scale - 0.5 for centre in place.principal_point_px)
     K = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
     return make_camera(R=R, t_m=t_m, K=K, image_size_wh=image_size_wh(scenario, scale))

@@ -1,7 +1,7 @@
-"""Videos, masks and detections in segments: some frames of one camera, whole or absent, drawn by any process.
+"""Segments: consecutive frames of one camera with their video, masks and detections, each drawn by one process.
 
-A segment depends on the scene and its frames alone, so neither the number of processes nor an interruption changes
-what is joined of them in the end.
+A segment's folder is either complete or absent. A segment depends only on the scene and its frame numbers, so neither
+the number of processes nor an interruption changes the joined files.
 """
 
 from __future__ import annotations
@@ -23,19 +23,20 @@ from psotrack.simulation.labels.masks import Silhouette, silhouettes
 from psotrack.simulation.scene import Scene
 from psotrack.support import Advance, atomic_write
 
-#: Frames per segment: ten groups of pictures of the codec, and some ten seconds of work that an interruption costs.
+#: Frames per segment: ten groups of pictures of the codec. An interruption costs at most one segment per process,
+#: about ten seconds of work.
 SEGMENT_FRAMES = 120
 _VIDEO, _BOXES, _MASKS = "video.avi", "detections.csv", "masks.zip"
 
 
 @dataclass(frozen=True)
 class Stream:
-    """What one camera sees over time: a static one, or that of a drone.
+    """The images of one camera over time.
 
     Attributes:
-        name: with which the camera's files begin.
-        index: of the static camera, or of the drone.
-        onboard: which of the two.
+        name: beginning of the names of the camera's files.
+        index: index of the static camera, or of the drone that carries the camera.
+        onboard: whether the camera is on board of a drone.
     """
 
     name: str
@@ -44,7 +45,7 @@ class Stream:
 
     @property
     def video_file(self) -> str:
-        """The name of its video."""
+        """File name of the stream's video."""
         return f"{self.name}_s.avi"
 
 
@@ -53,11 +54,11 @@ class Work:
     """Segments of one stream that one process draws, one after the other.
 
     Attributes:
-        scene: what is seen.
-        stream: by which camera.
+        scene: the scene to draw.
+        stream: the camera's stream.
         masks: whether to write the drones' masks.
-        folder: of the stream's segments.
-        segments: the frames of each.
+        folder: folder of the stream's segments.
+        segments: frame numbers of each segment.
     """
 
     scene: Scene
@@ -68,18 +69,18 @@ class Work:
 
 
 def segments(num_frames: int) -> list[range]:
-    """The frames of each segment."""
+    """Frame numbers of each segment."""
     starts = range(0, num_frames, SEGMENT_FRAMES)
     return [range(start, min(start + SEGMENT_FRAMES, num_frames)) for start in starts]
 
 
 def segment_folder(folder: Path, frames: range) -> Path:
-    """Where a segment is, once it is whole."""
+    """Folder of a complete segment, inside the folder of its stream's segments."""
     return folder / f"{frames.start:06d}"
 
 
 def draw(work: Work, advance: Advance) -> None:
-    """Draw segments; `advance` counts frames."""
+    """Draw the segments of one piece of work; `advance` counts frames."""
     scene, stream = work.scene, work.stream
     artist = OnboardRenderer(scene, stream.index) if stream.onboard else CameraRenderer(scene, stream.index)
     for frames in work.segments:
@@ -92,15 +93,15 @@ def draw(work: Work, advance: Advance) -> None:
 
 
 def join(stream: Stream, parts: Sequence[Path], folder: Path) -> None:
-    """Write a stream's video and, if it is a static camera's, its detections into `folder`, and free the disk.
+    """Join the segments' videos, and the detections of a static camera, and delete the segments' videos.
 
     Args:
-        stream: whose files they are.
-        parts: its segments, in order.
-        folder: of the sequence.
+        stream: the stream to write.
+        parts: folders of the stream's segments, in order.
+        folder: folder of the sequence.
 
     Raises:
-        OutputError: a file cannot be written; nothing is freed then.
+        OutputError: a file cannot be written; the segments' videos are kept in this case.
     """
     if not stream.onboard:
         with atomic_write(folder / DETECTIONS / f"{stream.name}_s.csv") as temporary:
@@ -113,14 +114,14 @@ def join(stream: Stream, parts: Sequence[Path], folder: Path) -> None:
 
 
 def join_masks(parts: Sequence[Path], folder: Path) -> None:
-    """Write the archive of all masks into `folder`.
+    """Write the archive of all masks.
 
     Args:
-        parts: the segments of all static cameras, in order.
-        folder: of the sequence.
+        parts: folders of the segments of all static cameras, in order.
+        folder: folder of the sequence.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the archive cannot be written.
     """
     join_archives(folder / MASKS, [part / _MASKS for part in parts])
 
@@ -154,7 +155,7 @@ def _draw_onboard(
 def _write_masks(
     writer: MaskWriter, camera: str, frame: int, drones: Sequence[Silhouette], scene: Scene, cam: Pinhole
 ) -> None:
-    """One mask per drone of the scene, black where the camera has none of it."""
+    """Write one mask per drone of the scene; the mask of a drone that the camera does not see is black."""
     in_view = {one.number: one.mask() for one in drones}
     black = np.zeros((cam.height, cam.width), bool)
     for number in range(1, len(scene.flights) + 1):

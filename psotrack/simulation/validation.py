@@ -1,4 +1,4 @@
-"""What a scenario cannot say of itself: whether it fits the halls, the rigs and the models that there are."""
+"""Checks that a scenario fits the halls, camera rigs and drone models of the package."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from psotrack.simulation.scenarios import CameraPlace, OnboardCamera, Scenario, 
 from psotrack.simulation.world.drones import MODELS
 from psotrack.simulation.world.halls import HALLS, RIGS, Hall
 
-#: Pixels of a camera are square to within this share; the paper's GoPro is to within 0.0002.
+#: Largest relative difference between a pixel's width and height. The paper's GoPro has 0.0002.
 _SQUARE = 0.05
 
 
 def check(scenario: Scenario) -> None:
-    """Refuse a scenario that cannot be drawn, before flights are planned.
+    """Refuse a scenario that cannot be drawn, before its flights are planned.
 
     Raises:
-        SettingsError: hall, rig or model do not exist; a camera is not in the hall, or in a piece of furniture, or
-            looks nowhere; the limits are not in the hall; exposures are longer than a frame, or the camera on board
-            has no pinhole image. The message names the field.
+        SettingsError: the hall, the rig or a model does not exist; a camera is outside the hall, inside a piece of
+            furniture, or has no viewing direction; the limits are outside the hall; an exposure is longer than the time
+            between two frames; or the on-board camera cannot be a pinhole camera. The message names the field.
     """
     _check_named(scenario)
     hall = HALLS[scenario.hall]
@@ -38,7 +38,7 @@ def check_flights(scenario: Scenario, flights: tuple[Flight, ...]) -> None:
     """Refuse flights through furniture.
 
     Raises:
-        SettingsError: which drone's, where and when.
+        SettingsError: a drone is inside a piece of furniture; the message says which drone, where and when.
     """
     time_s = frame_times_s(scenario, scenario.num_frames)
     for index, flight in enumerate(flights):
@@ -56,10 +56,10 @@ def check_flights(scenario: Scenario, flights: tuple[Flight, ...]) -> None:
 
 
 def camera_places(scenario: Scenario) -> tuple[CameraPlace, ...]:
-    """The cameras of a scenario, those of a named rig looked up.
+    """Cameras of a scenario, listed in the scenario or taken from the rig that the scenario names.
 
     Raises:
-        SettingsError: there is no rig of that name; the message lists those there are.
+        SettingsError: the named rig does not exist; the message lists the rigs.
     """
     if not isinstance(scenario.cameras, str):
         return scenario.cameras
@@ -151,7 +151,7 @@ def _extent(hall: Hall) -> str:
 
 
 def _in_furniture(points_m: Float[np.ndarray, "points 3"], hall: Hall) -> Bool[np.ndarray, "points"]:
-    """(points,), whether a point is in one of the hall's boxes."""
+    """(points,), whether each point is inside one of the hall's boxes."""
     corners = np.array([(box.lower_m, box.upper_m) for box in hall.boxes]).reshape(-1, 2, 3)
     inside = (points_m[:, None] >= corners[:, 0]) & (points_m[:, None] <= corners[:, 1])
     return np.any(np.all(inside, axis=-1), axis=-1)
