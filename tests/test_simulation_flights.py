@@ -424,7 +424,7 @@ def test_limits_broken_by_variation_are_named_with_their_count():
     limits = msgspec.structs.replace(WIDE, lower_m=(-2.5, -2.5, 1.0), upper_m=(2.5, 2.5, 1.0))
     with pytest.raises(
         SettingsError,
-        match=r"^scenario T: drones\[0\].flight: expected positions from .*; 400 of 400 variations failed there: ",
+        match=r"^scenario T: drones\[0\].flight: expected positions from .*; 400 of 400 variations broke this limit: ",
     ):
         plan(make_scenario(CROSSINGS[0], limits=limits, variation=Variation()), 0)
 

@@ -235,7 +235,7 @@ def test_a_start_after_the_end_is_refused(tmp_path):
     path = tmp_path / "loop.csv"
     path.write_text(csv_table())
     with pytest.raises(
-        SettingsError, match=r"^start_s of .*loop\.csv: expected below its 0\.7 s, found 0\.7$"
+        SettingsError, match=r"^start_s of .*loop\.csv: expected less than its duration, 0\.7 s, found 0\.7$"
     ):
         recorded_flight(FlightFromFile(file=str(path), start_s=0.7), HEADING)
 

@@ -1,1 +1,1 @@
-"""Where drones are at any time: from formulas, from recordings, and from a person at the controls."""
+"""Flights: positions and attitudes of drones over time, from formulas, recorded files, and flying by hand."""

@@ -1,4 +1,4 @@
-"""Whether the flights of a scenario make sense together, before any is made: whom they follow, past whom they fly."""
+"""Checks of a scenario's flights before they are made: leaders of relative flights, near passes, waypoints."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from psotrack.simulation.scenarios import (
     wrong,
 )
 
-#: Cosine of the angle between a near pass's side and its swing, which should be 0; the distance is short by half of
-#: its square, which is nothing.
+#: Largest cosine of the angle between a near pass's side and its swing, which should be perpendicular. The relative
+#: error of the distance is half of the cosine's square, which is negligible.
 _PERPENDICULAR = 1e-6
 
 
 def followed(record: FlightRecord) -> tuple[str, int] | None:
-    """The field and the number of the drone that a flight is relative to."""
+    """Field and number of the drone that a flight is relative to; None for an independent flight."""
     if isinstance(record, Formation | FollowingFlight):
         return "leader", record.leader
     if isinstance(record, NearPass):
@@ -29,7 +29,7 @@ def followed(record: FlightRecord) -> tuple[str, int] | None:
 
 
 def flying_order(scenario: Scenario) -> tuple[int, ...]:
-    """Indices of the drones, each after the one that its flight is relative to.
+    """Indices of the drones in an order in which each drone comes after the drone that its flight is relative to.
 
     Raises:
         SettingsError: a flight is relative to a drone that does not exist, or, along a chain, to itself.
@@ -42,7 +42,7 @@ def flying_order(scenario: Scenario) -> tuple[int, ...]:
 
 
 def _chain(scenario: Scenario, index: int) -> list[int]:
-    """The drone, the one it is relative to, the one that that is relative to, ..."""
+    """Index of a drone, then of the drone that its flight is relative to, and so on along the chain."""
     chain = [index]
     while relation := followed(scenario.drones[chain[-1]].flight):
         name, number = relation
@@ -63,11 +63,11 @@ def _chain(scenario: Scenario, index: int) -> list[int]:
 
 
 def check_records(scenario: Scenario) -> None:
-    """Refuse what no seed can make a flight.
+    """Refuse near passes and waypoints that are impossible for every seed.
 
     Raises:
-        SettingsError: a near pass without a side or swing, or one whose side is not perpendicular to its swing;
-            waypoints that are flown to too fast, or one that is there twice in a row. The message names the field.
+        SettingsError: a near pass has no side or no swing, or its side is not perpendicular to its swing; the speed
+            between waypoints is above the limit, or two consecutive waypoints are equal. The message names the field.
     """
     for index, drone in enumerate(scenario.drones):
         if isinstance(drone.flight, NearPass):
@@ -88,12 +88,12 @@ def _check_near_pass(scenario: Scenario, field: str, record: NearPass) -> None:
             f"{field}.side",
             expected="a direction perpendicular to swing_m",
             found=f"one at {np.degrees(np.arccos(np.clip(cosine, -1, 1))):.4g} degrees to it",
-            remedy="otherwise distance_m is not where they are nearest",
+            remedy="otherwise distance_m is not the smallest distance",
         )
 
 
 def _check_waypoints(scenario: Scenario, field: str, record: Waypoints) -> None:
-    # Between two frames, where limits are not looked at, it could be there already.
+    # A fast drone could reach the next waypoint between two frames, where the limits are not checked.
     if record.speed_m_s > scenario.limits.max_speed_m_s:
         raise wrong(
             scenario,
@@ -109,7 +109,7 @@ def _check_waypoints(scenario: Scenario, field: str, record: Waypoints) -> None:
             raise wrong(
                 scenario,
                 f"{field}.points_m[{following}]",
-                expected="another point than the one before (after the last comes the first)",
+                expected="a point that differs from the previous one (the first point follows the last)",
                 found=f"{list(there)} again",
-                remedy="hover_s is how long it stands still",
+                remedy="to stand still at a point, set hover_s",
             )

@@ -1,7 +1,8 @@
-"""What a person flies with: a game controller, the keyboard, or a file that says what the sticks do.
+"""Input devices for flying by hand: a game controller, the keyboard, or a file of stick positions.
 
-The sticks are those of mode 2, which most pilots know: left stick up and turn, right stick forward and left.
-Controllers and windows come through pyglet, an extra (`pip install 'psotrack[control]'`) that is imported when used.
+The sticks are in mode 2, which most pilots know: the left stick controls climb and turn, the right stick controls
+forward and sideways motion. Controllers and windows need pyglet, an extra (`pip install 'psotrack[control]'`) that is
+imported at the first use.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from psotrack.simulation.flights.dynamics import FlightState, Space, Sticks
 from psotrack.simulation.flights.panel import PygletPanel, pyglet_module
 from psotrack.simulation.flights.piloting import Sample, read_sticks
 
-#: Around the middle, where springs do not bring sticks back to exactly 0.
+#: Half width of the range around the middle that counts as 0, because springs do not return sticks exactly to 0.
 DEAD_ZONE = 0.12
-#: How often sticks are read; the flight itself is integrated in finer steps.
+#: Time between two readings of the sticks; the flight itself is integrated in finer steps.
 _POLL_S = 1 / 60
 
 GAMEPAD_HELP = (
@@ -36,7 +37,7 @@ KEYBOARD_HELP = (
     "arrows up, down: rise, sink      arrows left, right: turn",
     "Esc: end",
 )
-#: Key names of pyglet, and what each adds to the sticks.
+#: Stick positions that each key adds, by the key's name in pyglet.
 KEYS: Mapping[str, Sticks] = {
     "W": Sticks(forward=1.0),
     "S": Sticks(forward=-1.0),
@@ -50,19 +51,19 @@ KEYS: Mapping[str, Sticks] = {
 
 
 class Device(ABC):
-    """Where sticks' samples come from; closed at the end of a `with` block."""
+    """Source of stick samples; closed at the end of a `with` block."""
 
     @abstractmethod
     def samples(self) -> Iterator[Sample]:
-        """Samples of the sticks, times increasing from 0, until the flight is over."""
+        """Yield samples of the sticks with times that increase from 0, until the flight ends."""
 
     @abstractmethod
     def watch(self, time_s: float, state: FlightState) -> None:
-        """Show the pilot where the drone is."""
+        """Show the drone's state to the pilot."""
 
     @abstractmethod
     def close(self) -> None:
-        """Give back what was opened."""
+        """Release the controller and the window."""
 
     def __enter__(self) -> Device:
         return self
@@ -74,14 +75,14 @@ class Device(ABC):
 
 
 def open_device(name: str, space: Space) -> Device:
-    """The device of that name: `gamepad`, `keyboard`, or a file of `read_sticks`.
+    """Open the device `gamepad` or `keyboard`, or a file in the format of `read_sticks`.
 
     Args:
-        name: of the device, or path of the file.
-        space: that is flown in, for the pilot's window.
+        name: name of the device, or path of the file.
+        space: space of the flight, which the pilot's window shows.
 
     Raises:
-        SettingsError: pyglet is not installed, no controller is plugged in, or there is no display.
+        SettingsError: pyglet is not installed, no controller is connected, or there is no display.
         InputError: the file cannot be used.
     """
     if name == "gamepad":
@@ -95,44 +96,44 @@ def open_device(name: str, space: Space) -> Device:
 
 @dataclass(frozen=True)
 class ScriptedDevice(Device):
-    """Sticks that were written down, or recorded; the last sample's time is the end."""
+    """Stick samples from a file; the flight ends at the time of the last sample."""
 
     script: tuple[Sample, ...]
 
     def samples(self) -> Iterator[Sample]:
-        """All of them at once: nobody waits."""
+        """Yield all samples without waiting."""
         return iter(self.script)
 
     def watch(self, time_s: float, state: FlightState) -> None:
-        """Nobody looks."""
+        """Do nothing: there is no window."""
 
     def close(self) -> None:
-        """Nothing was opened."""
+        """Do nothing: there is no controller and no window."""
 
 
-# --- people
+# --- live devices
 
 
 @runtime_checkable
 class Panel(Protocol):
-    """The window that a pilot looks at."""
+    """The pilot's window."""
 
     @property
     def closed(self) -> bool:
-        """Whether the pilot pressed Esc or closed it."""
+        """Whether the pilot pressed Esc or closed the window."""
 
     def pump(self) -> None:
-        """Let events arrive: keys, sticks, the window's closing."""
+        """Process events of keys, sticks and the window."""
 
     def draw(self, time_s: float, state: FlightState) -> None:
-        """Show where the drone is."""
+        """Draw the drone's state."""
 
     def close(self) -> None:
-        """Take the window away."""
+        """Close the window."""
 
 
 class LiveDevice(Device):
-    """A device that a person holds, read at 60 Hz of the wall clock."""
+    """A device that a person operates, read at 60 Hz of the wall clock."""
 
     def __init__(
         self,
@@ -147,14 +148,14 @@ class LiveDevice(Device):
 
     @abstractmethod
     def sticks(self) -> Sticks:
-        """Where they stand now."""
+        """Current positions of the sticks."""
 
     def stop(self, *signal_and_frame: object) -> None:
-        """End the flight with the next sample; a signal's handler too."""
+        """End the flight with the next sample; also the handler of SIGINT."""
         self._stopped = True
 
     def __enter__(self) -> Device:
-        # Ctrl-C ends a flight as Esc does, between two samples: what was flown is worth keeping.
+        # Ctrl-C ends the flight between two samples, as Esc does, so that the flight up to then is kept.
         self._handler = signal.signal(signal.SIGINT, self.stop)
         return super().__enter__()
 
@@ -165,7 +166,7 @@ class LiveDevice(Device):
         super().__exit__(kind, error, trace)
 
     def samples(self) -> Iterator[Sample]:
-        """Where the sticks stand at 60 Hz, or as often as the machine manages; the last is the end."""
+        """Yield stick samples at 60 Hz, or as fast as the machine can; the last sample ends the flight."""
         begin_s = self._clock()
         polls = 0
         while True:
@@ -173,44 +174,44 @@ class LiveDevice(Device):
             yield Sample(self._clock() - begin_s, self.sticks())
             if self._stopped or self._panel.closed:
                 return
-            # From the beginning, not from now: so the time that drawing takes does not add up.
+            # Time is counted from the beginning of the flight, so that the time of drawing does not accumulate.
             polls = max(polls + 1, int((self._clock() - begin_s) / _POLL_S))
             self._sleep(max(0.001, polls * _POLL_S - (self._clock() - begin_s)))
 
     def watch(self, time_s: float, state: FlightState) -> None:
-        """Show the pilot where the drone is."""
+        """Show the drone's state to the pilot."""
         self._panel.draw(time_s, state)
 
     def close(self) -> None:
-        """Take the window away."""
+        """Close the window."""
         self._panel.close()
 
 
 class KeyboardDevice(LiveDevice):
-    """Keys that are down are sticks at their ends."""
+    """The keyboard: a pressed key moves a stick to its end."""
 
     def __init__(self, panel: Panel, is_down: Callable[[str], bool], **timing: Any) -> None:
         super().__init__(panel, **timing)
         self._is_down = is_down
 
     def sticks(self) -> Sticks:
-        """The sum of what the keys mean that are down."""
+        """Sum of the stick positions of all pressed keys."""
         down = [meaning for name, meaning in KEYS.items() if self._is_down(name)]
         return Sticks(*(sum(axis) for axis in zip(Sticks(), *down, strict=True)))
 
 
 class GamepadDevice(LiveDevice):
-    """A game controller: any that pyglet knows the layout of."""
+    """A game controller with a layout that pyglet knows."""
 
     def __init__(self, panel: Panel, controller: Any, **timing: Any) -> None:
         super().__init__(panel, **timing)
         self._controller = controller
         self._sticks = Sticks()
-        # Events, because the values that pyglet can be asked for point up on one system and down on another.
+        # Events are used, because the sign of pyglet's polled values depends on the operating system.
         controller.push_handlers(on_stick_motion=self._move, on_button_press=self._press)
 
     def _move(self, controller: Any, stick: str, vector: tuple[float, float]) -> None:
-        right, up = (_live(value) for value in vector)
+        right, up = (_without_dead_zone(value) for value in vector)
         if stick == "leftstick":
             self._sticks = self._sticks._replace(up=up, turn=0.0 - right)
         elif stick == "rightstick":
@@ -221,29 +222,29 @@ class GamepadDevice(LiveDevice):
             self.stop()
 
     def sticks(self) -> Sticks:
-        """Both sticks, without their dead zones."""
+        """Positions of both sticks, without their dead zones."""
         return self._sticks
 
     def close(self) -> None:
-        """Give back the controller, and take the window away."""
+        """Release the controller, and close the window."""
         self._controller.close()
         super().close()
 
 
-def _live(value: float) -> float:
-    """A stick's axis without its dead zone, still reaching its ends."""
+def _without_dead_zone(value: float) -> float:
+    """Position along one axis of a stick, 0 in the dead zone and continuous from there to both ends."""
     beyond = (abs(value) - DEAD_ZONE) / (1 - DEAD_ZONE)
     return math.copysign(min(beyond, 1.0), value) if beyond > 0 else 0.0
 
 
-# --- opening them
+# --- opening devices
 
 
 def _open_gamepad(space: Space) -> GamepadDevice:
     pads = pyglet_module("input", "gamepad")
     try:
         controllers = pads.get_controllers()
-    except OSError:  # Linux without any input devices has not even their folder.
+    except OSError:  # Linux without input devices does not even have their folder.
         controllers = []
     if not controllers:
         raise SettingsError(

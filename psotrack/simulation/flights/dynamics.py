@@ -1,11 +1,11 @@
-"""How a drone flies by hand: sticks to wished-for velocities, those to thrust, thrust to motion.
+"""Dynamics of a drone that is flown by hand: from stick positions to velocity commands, thrust and motion.
 
-The drone's autopilot asks for the acceleration that brings the wished-for velocity in a given time, within what tilt
-and climb allow. The thrust follows with the lag of attitude and rotors (first order), linear drag works against it, and
-all is integrated with a fixed step (semi-implicit Euler). Near walls and floor the autopilot brakes, by the exponential
+The autopilot commands the acceleration that reaches the commanded velocity in a given time, within the limits of tilt
+and climb. The thrust follows with a first-order lag of attitude and rotors, drag is linear, and the motion is
+integrated with a fixed step (semi-implicit Euler). Near walls and floor the autopilot brakes with the exponential
 control barrier of Nguyen and Sreenath ("Exponential control barrier functions for enforcing high relative-degree
-safety-critical constraints", American Control Conference, 2016), so that limits hold there too; a hard stop is behind
-it.
+safety-critical constraints", American Control Conference, 2016), so that the limits also hold there. A hard stop at the
+walls remains for cases that the barrier does not cover.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from psotrack.errors import SettingsError
 from psotrack.simulation.flights.motion import GRAVITY_M_S2
 from psotrack.simulation.world.halls import HALLS
 
-#: From a wall to the body's origin: half of a drone, rotors included.
+#: Smallest distance from a wall to the body origin: half the size of a drone with rotors.
 _CLEARANCE_M = 0.4
-#: The height of the body's origin when it stands.
+#: Height of the body origin of a drone that stands on the floor.
 _ON_FLOOR_M = 0.15
 
 Vector = Float[np.ndarray, "3"]
 
 
 class Sticks(NamedTuple):
-    """Where the sticks stand, each from -1 to 1; as the pilot on board sees it."""
+    """Positions of the sticks, each from -1 to 1, in the drone's own directions."""
 
     forward: float = 0.0
     left: float = 0.0
@@ -39,18 +39,19 @@ class Sticks(NamedTuple):
 
 @dataclass(frozen=True)
 class Dynamics:
-    """A drone and its autopilot.
+    """Parameters of a drone and its autopilot.
 
     Attributes:
-        max_speed_m_s: level, in any direction.
-        max_climb_m_s: up or down.
-        max_turn_rad_s: of the heading, to the left above 0.
-        max_tilt_deg: of the thrust against the vertical.
-        max_climb_m_s2: of the thrust along the vertical, without gravity.
-        response_s: in which the velocity loop wants to be where the sticks are.
+        max_speed_m_s: largest horizontal speed.
+        max_climb_m_s: largest vertical speed, up or down.
+        max_turn_rad_s: largest rate of the heading.
+        max_tilt_deg: largest angle between the thrust and the vertical.
+        max_climb_m_s2: largest vertical acceleration by the thrust, without gravity.
+        response_s: time in which the autopilot tries to reach the commanded velocity.
         lag_s: time constant of attitude, thrust and turning.
-        drag_per_s: deceleration over speed.
-        braking_per_s: how hard it brakes before walls; from full speed it begins twice speed over this away from them.
+        drag_per_s: deceleration by drag, divided by the speed.
+        braking_per_s: strength of braking near walls; braking from a speed v begins at the distance
+            2 v / braking_per_s.
     """
 
     max_speed_m_s: float = 2.5
@@ -65,7 +66,7 @@ class Dynamics:
 
     @property
     def max_acceleration_m_s2(self) -> float:
-        """What no flight exceeds: full tilt at full thrust, with the drag of full speed."""
+        """Upper bound of the acceleration of every flight: full tilt at full thrust, plus the drag at full speed."""
         level = np.tan(np.radians(self.max_tilt_deg)) * (GRAVITY_M_S2 + self.max_climb_m_s2)
         return float(
             np.hypot(
@@ -75,23 +76,28 @@ class Dynamics:
         )
 
 
-#: A small drone in a hall.
+#: Dynamics of a small drone in a hall.
 DYNAMICS = Dynamics()
 
 
 @dataclass(frozen=True)
 class Space:
-    """Where the body's origin may be: a box, (3,) each."""
+    """Box that the body origin stays in.
+
+    Attributes:
+        lower_m: (3,), lower corner, world.
+        upper_m: (3,), upper corner, world.
+    """
 
     lower_m: Vector
     upper_m: Vector
 
 
 def space_in(hall: str) -> Space:
-    """What a drone can fly in without touching floor, walls or ceiling; furniture does not stop it.
+    """Space in which a drone touches neither floor nor walls nor ceiling of a hall; furniture is ignored.
 
     Raises:
-        SettingsError: there is no such hall.
+        SettingsError: no hall has this name.
     """
     if hall not in HALLS:
         raise SettingsError("hall", expected=f"one of {', '.join(HALLS)}", found=hall)
@@ -102,12 +108,14 @@ def space_in(hall: str) -> Space:
 
 @dataclass(frozen=True)
 class FlightState:
-    """A drone in flight.
+    """State of a drone in flight.
 
     Attributes:
-        position_m, velocity_m_s: (3,), world.
-        push_m_s2: (3,), thrust over mass, without what carries the weight.
-        yaw_rad, turn_rad_s: heading and its rate.
+        position_m: (3,), world.
+        velocity_m_s: (3,), world.
+        push_m_s2: (3,), thrust divided by mass, without the part that carries the weight.
+        yaw_rad: heading.
+        turn_rad_s: rate of the heading, positive to the left.
     """
 
     position_m: Vector
@@ -118,17 +126,19 @@ class FlightState:
 
     @classmethod
     def hovering(cls, position_m: Vector) -> FlightState:
-        """At rest, looking along x."""
+        """State of a drone at rest that points along x."""
         return cls(position_m, np.zeros(3), np.zeros(3))
 
 
 def step(state: FlightState, sticks: Sticks, dynamics: Dynamics, space: Space, step_s: float) -> FlightState:
-    """The state one step later, the sticks as they are."""
+    """State after one step with constant stick positions."""
     x_m, v_m_s = state.position_m, state.velocity_m_s
-    wished_m_s = _wished_velocity(sticks, state.yaw_rad, dynamics)
-    # Thrust against the drag of what is wished for: without it the speed would stay below.
-    # Within limits already here: braking would shrink with a wish that is beyond them.
-    push = _possible((wished_m_s - v_m_s) / dynamics.response_s + dynamics.drag_per_s * wished_m_s, dynamics)
+    commanded_m_s = _commanded_velocity(sticks, state.yaw_rad, dynamics)
+    # The thrust compensates the drag at the commanded velocity; otherwise the drone would not reach this velocity.
+    # The thrust is limited already here, because the second limit would weaken the braking of a too large command.
+    push = _limit_thrust(
+        (commanded_m_s - v_m_s) / dynamics.response_s + dynamics.drag_per_s * commanded_m_s, dynamics
+    )
     braking, drag = dynamics.braking_per_s, dynamics.drag_per_s * v_m_s
     push = np.clip(
         push,
@@ -136,7 +146,7 @@ def step(state: FlightState, sticks: Sticks, dynamics: Dynamics, space: Space, s
         braking * (braking * (space.upper_m - x_m) - 2 * v_m_s) + drag,
     )
     follow = -np.expm1(-step_s / dynamics.lag_s)
-    push = state.push_m_s2 + follow * (_possible(push, dynamics) - state.push_m_s2)
+    push = state.push_m_s2 + follow * (_limit_thrust(push, dynamics) - state.push_m_s2)
     turn = state.turn_rad_s + follow * (sticks.turn * dynamics.max_turn_rad_s - state.turn_rad_s)
     v_m_s = v_m_s + step_s * (push - dynamics.drag_per_s * v_m_s)
     x_m = x_m + step_s * v_m_s
@@ -145,8 +155,8 @@ def step(state: FlightState, sticks: Sticks, dynamics: Dynamics, space: Space, s
     return FlightState(stopped_m, v_m_s, push, state.yaw_rad + step_s * turn, turn)
 
 
-def _wished_velocity(sticks: Sticks, yaw_rad: float, dynamics: Dynamics) -> Vector:
-    # Both sticks' axes at full would be faster than one.
+def _commanded_velocity(sticks: Sticks, yaw_rad: float, dynamics: Dynamics) -> Vector:
+    # Forward and left at full deflection together are limited to the speed of one of them.
     level = dynamics.max_speed_m_s / max(1.0, float(np.hypot(sticks.forward, sticks.left)))
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
     return np.array(
@@ -158,10 +168,10 @@ def _wished_velocity(sticks: Sticks, yaw_rad: float, dynamics: Dynamics) -> Vect
     )
 
 
-def _possible(push_m_s2: Vector, dynamics: Dynamics) -> Vector:
-    """The nearest thrust within the limits; height comes first.
+def _limit_thrust(push_m_s2: Vector, dynamics: Dynamics) -> Vector:
+    """Thrust within the limits that is nearest to a given thrust; the vertical part has priority.
 
-    These thrusts are a convex set, so that the lag, which mixes them, does not leave it either.
+    The possible thrusts are a convex set, so a mixture of two possible thrusts, as the lag makes, is possible too.
     """
     up = float(np.clip(push_m_s2[2], -dynamics.max_climb_m_s2, dynamics.max_climb_m_s2))
     level = float(np.hypot(push_m_s2[0], push_m_s2[1]))

@@ -1,4 +1,4 @@
-"""Flights from formulas, all with exact derivatives: sums of harmonics, sums of flights, and ways from rest to rest."""
+"""Flights from formulas with exact derivatives: harmonics, relative and delayed flights, and waypoints."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ Vectors = Float[np.ndarray, "times 3"]
 
 @dataclass(frozen=True)
 class HarmonicFlight(Flight):
-    """A sum of sinusoids about a centre.
+    """A flight that is a sum of sinusoids about a centre.
 
     Attributes:
-        centre_m: (3,).
-        amplitude_m: (harmonics, 3).
+        centre_m: (3,), centre, world.
+        amplitude_m: (harmonics, 3), amplitudes along each axis.
         angular_rad_s: (harmonics,), angular frequencies.
-        phase_rad: (harmonics, 3).
+        phase_rad: (harmonics, 3), phases at time 0.
+        heading: heading of the drone.
     """
 
     centre_m: Float[np.ndarray, "3"]
@@ -32,7 +33,7 @@ class HarmonicFlight(Flight):
 
     def _derivative(self, time_s: Times, order: int) -> Vectors:
         w = self.angular_rad_s[:, None]
-        # The n-th derivative of sin is sin a quarter turn per order ahead.
+        # The n-th derivative of the sine is the sine with n quarter turns added to its angle.
         angle = w * time_s[:, None, None] + self.phase_rad + order * np.pi / 2
         return (self.amplitude_m * w**order * np.sin(angle)).sum(axis=1)
 
@@ -51,11 +52,12 @@ class HarmonicFlight(Flight):
 
 @dataclass(frozen=True)
 class RelativeFlight(Flight):
-    """A flight seen from another: the sum of both.
+    """A flight relative to another flight: the sum of the other flight and an offset.
 
     Attributes:
-        other: the flight of the other drone.
-        offset: from there, in axes of the world; its heading is not used.
+        other: flight of the other drone.
+        offset: offset from the other drone over time, world axes; its heading is not used.
+        heading: heading of the drone.
     """
 
     other: Flight
@@ -77,11 +79,12 @@ class RelativeFlight(Flight):
 
 @dataclass(frozen=True)
 class DelayedFlight(Flight):
-    """Another flight, later.
+    """The flight of another drone with a delay.
 
     Attributes:
-        leader: the flight of the other drone.
-        delay_s: how much later; before time 0 the leader flies by the same formula.
+        leader: flight of the other drone; its formula also holds before time 0.
+        delay_s: the delay.
+        heading: heading of the drone.
     """
 
     leader: Flight
@@ -101,19 +104,20 @@ class DelayedFlight(Flight):
         return self.leader.acceleration_m_s2(time_s - self.delay_s)
 
 
-#: The share of the way after a share t of the time with least jerk, from rest to rest: 10 t^3 - 15 t^4 + 6 t^5
-#: (Flash and Hogan, "The coordination of arm movements", 1985), and its two derivatives.
+#: Share of the distance after a share t of the time, for the motion with minimum jerk from rest to rest, and its two
+#: derivatives: 10 t^3 - 15 t^4 + 6 t^5 (Flash and Hogan, "The coordination of arm movements", 1985).
 _MINIMUM_JERK = tuple(np.polynomial.Polynomial([0.0, 0.0, 0.0, 10.0, -15.0, 6.0]).deriv(n) for n in (0, 1, 2))
 
 
 @dataclass(frozen=True)
 class WaypointFlight(Flight):
-    """Around a closed loop of points, standing still at each, with least jerk between them.
+    """A flight around a closed loop of points, with a stop at each point and minimum jerk between the points.
 
     Attributes:
-        points_m: (points, 3); after the last comes the first again.
-        moving_s: (points,), how long it moves from each point to the next.
-        hover_s: how long it stands still at each point, before it moves.
+        points_m: (points, 3), world; the first point follows the last.
+        moving_s: (points,), times of the motion from each point to the next.
+        hover_s: time that the drone stands still at each point before it moves.
+        heading: heading of the drone.
     """
 
     points_m: Float[np.ndarray, "points 3"]
@@ -124,12 +128,12 @@ class WaypointFlight(Flight):
     def _derivative(self, time_s: Times, order: int) -> Vectors:
         ends_s = np.cumsum(self.moving_s + self.hover_s)
         loop_s = time_s % ends_s[-1]
-        # Rounding can put a time at the very end of the loop behind the last leg.
+        # Rounding can place the end of the loop after the last leg.
         leg = np.minimum(np.searchsorted(ends_s, loop_s, side="right"), len(ends_s) - 1)
         moving_s = self.moving_s[leg]
         share = np.clip((loop_s - ends_s[leg]) / moving_s + 1, 0, 1)
-        way_m = (np.roll(self.points_m, -1, axis=0) - self.points_m)[leg]
-        moved = (_MINIMUM_JERK[order](share) / moving_s**order)[:, None] * way_m
+        leg_m = (np.roll(self.points_m, -1, axis=0) - self.points_m)[leg]
+        moved = (_MINIMUM_JERK[order](share) / moving_s**order)[:, None] * leg_m
         return self.points_m[leg] + moved if order == 0 else moved
 
     def position_m(self, time_s: Times) -> Vectors:

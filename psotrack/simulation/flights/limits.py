@@ -1,4 +1,4 @@
-"""Whether flights keep to the limits of their scenario, and where and when they do not."""
+"""Check of flights against the limits of their scenario."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from psotrack.simulation.scenarios import Limits, NearPass, Scenario
 
 @dataclass(frozen=True)
 class Excess:
-    """A limit that a flight breaks, where it does so most.
+    """The largest violation of a limit by a flight.
 
     Attributes:
-        field: the flight's, in the scenario.
-        limit: what was expected; the same text for the same limit of the same drone.
-        found: the value, and when.
-        time_s: when.
+        field: the flight's field in the scenario.
+        limit: the limit, as text for a message; the same text for the same limit of the same drone.
+        found: value and time of the violation, as text for a message.
+        time_s: time of the violation.
     """
 
     field: str
@@ -31,25 +31,25 @@ class Excess:
 def excess(
     flights: tuple[Flight, ...], scenario: Scenario, time_s: Float[np.ndarray, "times"]
 ) -> Excess | None:
-    """The first limit that the flights break at any of the times, or None.
+    """Find the first limit that the flights violate at any of the given times; None if they keep all limits.
 
-    In the order: bounds, speed, acceleration, tilt, distance. Drones that a near pass brings together are held to
-    its distance by its formula, not here.
+    The limits are checked in the order bounds, speed, acceleration, tilt, distance. The distance of two drones in a
+    near pass is not checked, because it follows from the formula of the near pass.
     """
     limits = scenario.limits
     position_m = np.stack([flight.position_m(time_s) for flight in flights])
     outside_m = np.maximum(limits.lower_m - position_m, position_m - limits.upper_m).max(axis=-1)
-    # What overflows is NaN, which is not above any limit.
+    # The comparison is negated, because a position that overflows is NaN, and NaN is not above any limit.
     if not outside_m.max() <= 0:
         drone, at = _worst(outside_m)
         x, y, z = position_m[drone, at]
         lower, upper = list(limits.lower_m), list(limits.upper_m)
         limit = f"positions from {lower} (limits.lower_m) to {upper} (limits.upper_m)"
         return _excess(drone, limit, f"[{x:.3f}, {y:.3f}, {z:.3f}]", time_s[at])
-    return _too_wild(flights, limits, time_s) or _too_near(position_m, scenario, time_s)
+    return _excess_of_motion(flights, limits, time_s) or _excess_of_distance(position_m, scenario, time_s)
 
 
-def _too_wild(
+def _excess_of_motion(
     flights: tuple[Flight, ...], limits: Limits, time_s: Float[np.ndarray, "times"]
 ) -> Excess | None:
     for name, unit, measure in (
@@ -78,7 +78,7 @@ def _tilt_deg(flight: Flight, time_s: Float[np.ndarray, "times"]) -> Float[np.nd
     return np.degrees(np.arccos(np.clip(flight.rotation(time_s)[:, 2, 2], -1, 1)))
 
 
-def _too_near(
+def _excess_of_distance(
     position_m: Float[np.ndarray, "drones times 3"], scenario: Scenario, time_s: Float[np.ndarray, "times"]
 ) -> Excess | None:
     least_m = scenario.limits.min_distance_m

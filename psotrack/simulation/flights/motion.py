@@ -1,7 +1,7 @@
-"""What a flight is: a position with its derivatives at any time, and the attitude that they demand.
+"""Flights: positions with derivatives at any time, and the attitudes that follow from the acceleration.
 
-A multirotor pushes along its body's z axis only, so that axis points along a + g (Mellinger and Kumar, "Minimum snap
-trajectory generation and control for quadrotors", 2011; drag is left out); the heading is free.
+The thrust of a multirotor acts along its body's z axis only, so this axis points along a + g (Mellinger and Kumar,
+"Minimum snap trajectory generation and control for quadrotors", 2011; drag is neglected). The heading is free.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ GRAVITY_M_S2 = 9.81
 
 @dataclass(frozen=True)
 class Heading:
-    """A drone that looks around: `yaw + sway sin(angular t + phase)`, radians and rad/s."""
+    """Heading of a drone over time: `yaw + sway sin(angular t + phase)`, radians and rad/s."""
 
     yaw_rad: float = 0.0
     sway_rad: float = 0.0
@@ -26,14 +26,14 @@ class Heading:
     phase_rad: float = 0.0
 
     def at(self, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times"]:
-        """(times,), radians."""
+        """(times,), heading at each time, radians."""
         return self.yaw_rad + self.sway_rad * np.sin(self.angular_rad_s * time_s + self.phase_rad)
 
 
 def attitude(
     thrust_m_s2: Float[np.ndarray, "times 3"], yaw_rad: Float[np.ndarray, "times"]
 ) -> Float[np.ndarray, "times 3 3"]:
-    """(times, 3, 3), body to world: z along the thrust, x as near to the heading as that allows."""
+    """(times, 3, 3), body to world: z along the thrust, x as near to the heading as possible."""
     body_z = thrust_m_s2 / np.linalg.norm(thrust_m_s2, axis=-1, keepdims=True)
     ahead = np.stack([np.cos(yaw_rad), np.sin(yaw_rad), np.zeros_like(yaw_rad)], axis=-1)
     body_y = np.cross(body_z, ahead)
@@ -42,18 +42,18 @@ def attitude(
 
 
 def quaternions_wxyz(rotation: Float[np.ndarray, "times 3 3"]) -> Float[np.ndarray, "times 4"]:
-    """(times, 4), unit quaternions, scalar first, with a sign that does not jump from one time to the next."""
+    """(times, 4), unit quaternions, scalar first; their signs do not change from one time to the next."""
     wxyz = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
-    # Not the sign itself, which is 0 after half a turn.
+    # `np.sign` would be 0 after half a turn.
     flips = np.where((wxyz[1:] * wxyz[:-1]).sum(axis=-1) < 0, -1.0, 1.0)
     return wxyz * np.cumprod(np.concatenate([[1.0], flips]))[:, None]
 
 
 class Flight(ABC):
-    """A position that can be derived twice, at any time.
+    """A twice differentiable position over time, with a heading.
 
     Attributes:
-        heading: where its x axis points, seen from above.
+        heading: direction of the drone's x axis, seen from above.
     """
 
     heading: Heading
@@ -71,10 +71,10 @@ class Flight(ABC):
         """(times, 3), world, gravity not included."""
 
     def rotation(self, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3 3"]:
-        """(times, 3, 3), body to world: z along a + g, x as near to the heading as that allows."""
+        """(times, 3, 3), body to world: z along a + g, x as near to the heading as possible."""
         thrust_m_s2 = self.acceleration_m_s2(time_s) + np.array([0.0, 0.0, GRAVITY_M_S2])
         return attitude(thrust_m_s2, self.heading.at(time_s))
 
     def orientation_wxyz(self, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 4"]:
-        """(times, 4), unit quaternions body to world, with a sign that does not jump from one time to the next."""
+        """(times, 4), unit quaternions, body to world; their signs do not change from one time to the next."""
         return quaternions_wxyz(self.rotation(time_s))

@@ -1,6 +1,6 @@
-"""The pilot's window: what the keys or sticks do, where the drone is from above, its height, its speed.
+"""The pilot's window: help for keys or sticks, the drone in the hall seen from above, its height and its speed.
 
-It is made with pyglet, an extra (`pip install 'psotrack[control]'`), imported when the window opens.
+The window needs pyglet, an extra (`pip install 'psotrack[control]'`) that is imported when the window opens.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from psotrack.simulation.flights.dynamics import FlightState, Space
 _PLAN_PX = 520
 _MARGIN_PX = 30
 _LINE_PX = 20
-#: Beside the plan: the column that shows the height.
+#: Width of the column beside the plan that shows the height.
 _HEIGHT_PX = 40
 _DRONE_PX = 7
 _AHEAD_PX = 24
@@ -27,10 +27,10 @@ _ORANGE = (255, 170, 60, 255)
 
 
 def pyglet_module(name: str, device: str) -> ModuleType:
-    """A module of pyglet, such as `input`.
+    """Import a module of pyglet, such as `input`.
 
     Raises:
-        SettingsError: pyglet is not installed, or there is no display with OpenGL, which it needs.
+        SettingsError: pyglet is not installed, or there is no display with OpenGL, which pyglet needs.
     """
     try:
         importlib.import_module("pyglet")
@@ -45,12 +45,12 @@ def pyglet_module(name: str, device: str) -> ModuleType:
         return importlib.import_module(f"pyglet.{name}")
     except (
         Exception
-    ) as error:  # Importing opens a display; what fails then has no class that could be imported.
+    ) as error:  # The import opens a display, and the classes of its errors cannot be imported before.
         raise no_display(device, error) from error
 
 
 def no_display(device: str, error: Exception) -> SettingsError:
-    """What to tell somebody whose machine cannot open a window."""
+    """Error for a machine that cannot open a window."""
     return SettingsError(
         f"device {device}",
         expected="a display with OpenGL for the pilot's window",
@@ -60,19 +60,15 @@ def no_display(device: str, error: Exception) -> SettingsError:
 
 
 class PygletPanel:
-    """A window with the hall from above; satisfies `devices.Panel`.
+    """A window with the hall seen from above; satisfies `devices.Panel`."""
 
-    Attributes:
-        closed: once the pilot pressed Esc or closed the window.
-    """
-
-    def __init__(self, device: str, space: Space, explained: tuple[str, ...]) -> None:
+    def __init__(self, device: str, space: Space, help_lines: tuple[str, ...]) -> None:
         self._pyglet = {name: pyglet_module(name, device) for name in ("app", "shapes", "text", "window")}
         self._space = space
         length_m, width_m = (space.upper_m - space.lower_m)[:2]
         self._px_per_m = _PLAN_PX / max(length_m, width_m)
         self._plan_px = np.array([length_m, width_m]) * self._px_per_m
-        self._text_px = _LINE_PX * (len(explained) + 1)
+        self._text_px = _LINE_PX * (len(help_lines) + 1)
         extra_px = np.array([_MARGIN_PX + _HEIGHT_PX, _MARGIN_PX + self._text_px])
         size_px = self._plan_px + extra_px + 2 * _MARGIN_PX
         window = self._pyglet["window"]
@@ -82,12 +78,12 @@ class PygletPanel:
             )
         except (
             Exception
-        ) as error:  # No display, or none of its screens has OpenGL: pyglet has a class for each.
+        ) as error:  # pyglet has different classes for a missing display and for screens without OpenGL.
             raise no_display(device, error) from error
         self._keys = window.key.KeyStateHandler()
         self._window.push_handlers(self._keys)
         self._pyglet["app"].platform_event_loop.start()
-        self._explained = explained
+        self._help_lines = help_lines
 
     @property
     def closed(self) -> bool:
@@ -95,17 +91,17 @@ class PygletPanel:
         return bool(self._window.has_exit)
 
     def is_down(self, name: str) -> bool:
-        """Whether the key of that name is held."""
+        """Whether the named key is pressed."""
         return self._keys[getattr(self._pyglet["window"].key, name)]
 
     def pump(self) -> None:
-        """Let events arrive: keys, sticks, the window's closing."""
+        """Process events of keys, sticks and the window."""
         self._pyglet["app"].platform_event_loop.step(0.0)
         self._window.switch_to()
         self._window.dispatch_events()
 
     def draw(self, time_s: float, state: FlightState) -> None:
-        """Show where the drone is."""
+        """Draw the drone's state."""
         x, y, z = state.position_m
         speed = float(np.linalg.norm(state.velocity_m_s))
         yaw_deg = np.degrees(state.yaw_rad) % 360
@@ -113,7 +109,7 @@ class PygletPanel:
             f"{time_s:6.1f} s   x {x:+.2f}   y {y:+.2f}   z {z:.2f} m   {speed:.2f} m/s   {yaw_deg:3.0f} deg"
         )
         self._window.clear()
-        for row, (line, colour) in enumerate([(now, _WHITE), *((line, _GREY) for line in self._explained)]):
+        for row, (line, colour) in enumerate([(now, _WHITE), *((line, _GREY) for line in self._help_lines)]):
             height_px = _MARGIN_PX + self._text_px - row * _LINE_PX
             label = self._pyglet["text"].Label(line, x=_MARGIN_PX, y=height_px, font_size=11, color=colour)
             label.draw()
@@ -135,6 +131,6 @@ class PygletPanel:
         shapes.Rectangle(left, bottom + share * self._plan_px[1] - 2, _HEIGHT_PX, 4, color=_ORANGE).draw()
 
     def close(self) -> None:
-        """Take the window away."""
+        """Close the window."""
         self._window.close()
         self._pyglet["app"].platform_event_loop.stop()

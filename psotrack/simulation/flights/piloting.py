@@ -1,6 +1,6 @@
-"""Flying by hand: samples of sticks to a recording at a target rate.
+"""Flying by hand: from stick samples to a recorded flight at a given rate.
 
-All of it is a function of the samples and their times, so that who replays them flies the same flight.
+The flight depends only on the samples and their times, so the same samples give the same flight again.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from psotrack.simulation.flights.motion import GRAVITY_M_S2, attitude
 from psotrack.simulation.flights.recordings import Recorded
 from psotrack.support import Column, TextRow, read_table, write_rows
 
-#: Steps per second, at least: several in each time constant of the dynamics.
+#: Smallest number of integration steps per second: several steps in each time constant of the dynamics.
 _MIN_STEPS_HZ = 250.0
-#: Sticks' times come from divisions and clocks: so much of a step is rounding.
+#: Rounding error of sample times, which come from divisions and clocks, as a share of a step.
 _ROUNDING = 1e-6
 
 _HEADER = ("time_s", *Sticks._fields)
 
 
 class Sample(NamedTuple):
-    """The sticks at a time, which hold until the next."""
+    """Stick positions from a time on, until the next sample."""
 
     time_s: float
     sticks: Sticks
@@ -36,7 +36,12 @@ class Sample(NamedTuple):
 
 @dataclass(frozen=True)
 class Flown:
-    """What was flown, and the sticks that did it."""
+    """A flight by hand and the stick samples that made it.
+
+    Attributes:
+        recorded: samples of the flight.
+        samples: samples of the sticks.
+    """
 
     recorded: Recorded
     samples: tuple[Sample, ...]
@@ -51,19 +56,19 @@ def fly(
     rate_hz: float = 25.0,
     watch: Callable[[float, FlightState], None] = lambda time_s, state: None,
 ) -> Flown:
-    """Fly as the sticks say, from hovering, until the last sample's time.
+    """Simulate a flight that stick samples control, from hovering until the time of the last sample.
 
     Args:
-        samples: of the sticks, times increasing from 0; may wait for a person.
-        start_m: (3,), where it hovers at time 0.
-        space: what it stays in.
-        dynamics: of the drone.
-        rate_hz: of the recording, whose times are exactly k / rate_hz.
-        watch: called with each sample's time and the state then.
+        samples: samples of the sticks, with times that increase from 0; the iterator may wait for a person.
+        start_m: (3,), position at time 0, where the drone hovers.
+        space: space that the drone stays in.
+        dynamics: dynamics of the drone.
+        rate_hz: rate of the recorded flight; its times are exactly k / rate_hz.
+        watch: function that is called with the time of each sample and the state at that time.
 
     Raises:
-        SettingsError: the start is outside of the space, the rate is not above 0, sticks' times do not increase, or
-            the flight ended before there were enough samples for a `Recorded`.
+        SettingsError: the start is outside the space, the rate is not above 0, the samples' times do not increase, or
+            the flight is too short for a `Recorded`.
     """
     check(start_m, space, rate_hz)
     per_record = int(np.ceil(_MIN_STEPS_HZ / rate_hz))
@@ -89,7 +94,7 @@ def fly(
 
 
 def check(start_m: Vector, space: Space, rate_hz: float) -> None:
-    """Raise the `SettingsError` of `fly` that need not wait for a pilot."""
+    """Check start and rate before the flight; raises the same `SettingsError` as `fly`."""
     check_positive("rate", rate_hz)
     if not np.all((start_m >= space.lower_m) & (start_m <= space.upper_m)):
         lower, upper, start = (
@@ -99,7 +104,7 @@ def check(start_m: Vector, space: Space, rate_hz: float) -> None:
 
 
 def until(samples: Iterable[Sample], end_s: float) -> Iterator[Sample]:
-    """The samples before a time, and a last one at it if there are later ones."""
+    """Yield the samples before a time, and one last sample at this time if there are later samples."""
     sticks = Sticks()
     for sample in samples:
         if sample.time_s >= end_s:
@@ -123,11 +128,11 @@ def _recorded(states: list[FlightState], rate_hz: float) -> Recorded:
 
 
 def read_sticks(path: Path) -> tuple[Sample, ...]:
-    """Read the sticks of a flight: `time_s,forward,left,up,turn`, each from -1 to 1, held until the next row.
+    """Read stick samples: `time_s,forward,left,up,turn`, positions from -1 to 1 that hold until the next row.
 
     Raises:
-        InputError: the file cannot be read, a column is missing, times do not increase from 0, or a stick is beyond
-            its ends. The message names file, line and column.
+        InputError: the file cannot be read, a column is missing, the times do not increase from 0, or a stick position
+            is not from -1 to 1. The message names file, line and column.
     """
     table = read_table(path, ",")
     time_column, *stick_columns = (table.column(name) for name in _HEADER)
@@ -142,7 +147,7 @@ def read_sticks(path: Path) -> tuple[Sample, ...]:
 
 
 def write_sticks(path: Path, samples: Iterable[Sample]) -> None:
-    """Write what `read_sticks` reads, with all digits, so that the same flight can be flown again.
+    """Write stick samples in the format of `read_sticks`, with all digits, so that they give the same flight again.
 
     Raises:
         OutputError: the file cannot be written.

@@ -1,4 +1,4 @@
-"""From a scenario and a seed to flights that keep the scenario's limits for its whole length."""
+"""Flights of a scenario for a seed, within the scenario's limits."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from psotrack.simulation.flights.recordings import recorded_flight
 from psotrack.simulation.flights.varying import Turn, draws, heading_of, make, no_draws
 from psotrack.simulation.scenarios import FlightFromFile, Scenario, wrong
 
-#: Variations are tried in turn until limits hold; a scenario that fails this often cannot keep them.
+#: Largest number of random variations that are tried until one keeps the limits.
 NUM_ATTEMPTS = 400
-#: Every so many frames are looked at first: most variations that fail do so there.
+#: Step between the frames that are checked first, frames. Most variations that violate a limit do so at these frames.
 _STRIDE = 6
 
 
 def frame_times_s(scenario: Scenario, num_frames: int) -> Float[np.ndarray, "frames"]:
-    """(frames,), the middle of each frame's exposure."""
+    """(frames,), time of the middle of each frame's exposure."""
     return np.arange(num_frames) / scenario.fps
 
 
 def plan(scenario: Scenario, seed: int) -> tuple[Flight, ...]:
-    """One flight per drone, varied by the seed, all within the scenario's limits for its whole length.
+    """Flight of each drone, varied by the seed, within the scenario's limits in all frames.
 
     Raises:
-        SettingsError: no variation keeps the limits, or flights do not make sense together; the message names the
-            field of the flight.
-        InputError: a recording cannot be used.
+        SettingsError: no variation keeps the limits, or a relative flight, near pass or waypoint is impossible; the
+            message names the field of the flight.
+        InputError: a recorded flight cannot be used.
     """
     check_records(scenario)
     flying_order(scenario)
@@ -48,14 +48,14 @@ def plan(scenario: Scenario, seed: int) -> tuple[Flight, ...]:
             found = excess(flights, scenario, time_s)
             if not found:
                 return flights
-            # What failed at this frame will often fail there again.
+            # Other variations often violate a limit at the same frame, so check this frame early.
             few_s = np.append(few_s, found.time_s)
         excesses.append(found)
     raise _refusal(scenario, excess(make(scenario, no_draws(scenario), recorded), scenario, time_s), excesses)
 
 
 def _refusal(scenario: Scenario, nominal: Excess | None, varied: list[Excess]) -> SettingsError:
-    """Names what is wrong without any variation, or else what is wrong most often."""
+    """Error that names the limit that the flights violate without variation, or else the most frequent violation."""
     if nominal:
         return wrong(scenario, nominal.field, expected=nominal.limit, found=nominal.found)
     (field, limit), times = Counter((one.field, one.limit) for one in varied).most_common(1)[0]
@@ -65,12 +65,12 @@ def _refusal(scenario: Scenario, nominal: Excess | None, varied: list[Excess]) -
         field,
         expected=limit,
         found=example.found,
-        remedy=f"{times} of {len(varied)} variations failed there: lower variation, or leave more room",
+        remedy=f"{times} of {len(varied)} variations broke this limit: lower variation, or leave more room",
     )
 
 
 def _recorded(scenario: Scenario, time_s: Float[np.ndarray, "frames"]) -> dict[int, Flight]:
-    """The flights that replay a recording, by the index of their drone; each is read once, and has all frames."""
+    """Recorded flights by the index of their drone, read once and checked to cover all frames."""
     recorded: dict[int, Flight] = {}
     for index, drone in enumerate(scenario.drones):
         if isinstance(drone.flight, FlightFromFile):

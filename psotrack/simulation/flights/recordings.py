@@ -1,4 +1,4 @@
-"""Flights that were recorded, by motion capture, by a simulator, or by hand with `psotrack fly`: files and replay."""
+"""Recorded flights, from motion capture, a simulator or `psotrack fly`: reading, writing and replaying."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ from psotrack.simulation.flights.resampling import MIN_SAMPLES, spline
 from psotrack.simulation.scenarios import FlightFromFile
 from psotrack.support import Column, Table, TextRow, read_rows, read_table, write_rows
 
-#: More than half an exposure, which reaches beyond the first and the last frame.
+#: Largest time before the first and after the last sample that a flight is extrapolated to. It is longer than half an
+#: exposure, because the exposures of the first and last frame reach beyond the samples.
 _BEYOND_S = 0.1
-#: Times of frames and of samples come from different divisions.
+#: Tolerance for times of frames and times of samples, which come from different divisions.
 _ROUNDING_S = 1e-6
-#: How far from 1 the norm of a quaternion may be: what rounding to two decimals can do, and no more.
+#: Largest difference between 1 and the norm of a quaternion: the effect of rounding to two decimals.
 _NORM_TOLERANCE = 0.02
 
 _POSITION = ("x_m", "y_m", "z_m")
@@ -36,10 +37,10 @@ Vectors = Float[np.ndarray, "times 3"]
 
 @dataclass(frozen=True)
 class Recorded:
-    """The samples of a flight.
+    """Samples of a flight.
 
     Attributes:
-        time_s: (samples,), increasing, at least `MIN_SAMPLES`.
+        time_s: (samples,), increasing times of at least `MIN_SAMPLES` samples.
         position_m: (samples, 3), world.
         orientation_wxyz: (samples, 4), unit quaternions that turn body into world coordinates, or None.
 
@@ -72,7 +73,7 @@ class Recorded:
 
     @property
     def duration_s(self) -> float:
-        """From the first to the last sample."""
+        """Time from the first to the last sample."""
         return float(self.time_s[-1] - self.time_s[0])
 
 
@@ -80,16 +81,16 @@ class Recorded:
 
 
 def read_recording(path: str | Path) -> Recorded:
-    """Read a recording of one drone: one of ours, a trajectory of psotrack, or a pose file of the dataset.
+    """Read the recorded flight of one drone from a file of `write_recording`, a trajectory, or a pose file of DPJAIT.
 
-    Ours, and trajectories, have the columns `time_s`, `x_m`, `y_m`, `z_m` and, where known, `qw`, `qx`, `qy`, `qz`,
-    with commas or semicolons between them; a trajectory's `drone` must be the same in all rows. A pose file
-    (`dronN_pos_25.csv`) has its rate in its name; its placeholder at frame 0 is left out.
+    Recorded flights and trajectories have the columns `time_s`, `x_m`, `y_m`, `z_m` and, optionally, `qw`, `qx`, `qy`,
+    `qz`, separated by commas or semicolons; the column `drone` of a trajectory must have the same value in all rows. A
+    pose file (`dronN_pos_25.csv`) has its rate in its name; its placeholder at frame 0 is left out.
 
     Raises:
-        InputError: the file cannot be read, a column is missing, times do not increase, there are fewer than
-            `MIN_SAMPLES` samples, or a value is NaN, none, or of a quaternion not of length 1. The message names file,
-            line and column.
+        InputError: the file cannot be read, a column is missing, the times do not increase, there are fewer than
+            `MIN_SAMPLES` samples, a value is missing or NaN, or a quaternion does not have length 1. The message names
+            file, line and column.
     """
     header = read_rows(path, ";")[:1]
     table = read_table(path, ";" if header and len(header[0].cells) > 1 else ",")
@@ -109,8 +110,8 @@ def write_recording(
     """Write `time_s,x_m,y_m,z_m[,qw,qx,qy,qz]`, all digits, so that reading gives the same numbers.
 
     Raises:
-        SettingsError: the samples make no `Recorded`.
-        OutputError: the file cannot be written; what was there is unchanged.
+        SettingsError: the samples are not valid for `Recorded`.
+        OutputError: the file cannot be written; an existing file is unchanged.
     """
     recorded = Recorded(time_s, position_m, orientation_wxyz)
     columns = [recorded.time_s[:, None], recorded.position_m]
@@ -129,7 +130,7 @@ def _from_poses(path: Path) -> _Samples:
     rate_hz = float(match["rate_hz"]) if match else 0.0
     if rate_hz == 0:
         raise InputError(
-            path, expected="a pose file named like dron1_pos_25.csv, by its rate", found=path.name
+            path, expected="a pose file with its rate in its name, such as dron1_pos_25.csv", found=path.name
         )
     position_m, orientation_wxyz = read_poses(path)
     frame = np.flatnonzero(np.isfinite(position_m).all(axis=1))
@@ -158,7 +159,9 @@ def _check_one_drone(table: Table) -> None:
     name = table.rows[0].text(column)
     for row in table.rows:
         if row.text(column) != name:
-            raise row.error(column, f"one drone, {name} as above", row.text(column), "keep the rows of one")
+            raise row.error(
+                column, f"one drone, {name} as above", row.text(column), "keep the rows of one drone only"
+            )
 
 
 def _unit(row: TextRow, columns: list[Column]) -> Float[np.ndarray, "4"]:
@@ -173,17 +176,17 @@ def _unit(row: TextRow, columns: list[Column]) -> Float[np.ndarray, "4"]:
 
 
 def recorded_flight(record: FlightFromFile, heading: Heading) -> RecordedFlight:
-    """The flight of a scenario's record; the heading is for recordings without orientations.
+    """Read the recorded flight that a scenario names; `heading` is used if the file has no orientations.
 
     Raises:
-        InputError: the file is no recording (`read_recording`).
-        SettingsError: it ends before `start_s`.
+        InputError: `read_recording` cannot read the file.
+        SettingsError: the recorded flight ends before `start_s`.
     """
     recorded = read_recording(Path(record.file))
     if record.start_s >= recorded.duration_s:
         raise SettingsError(
             f"start_s of {record.file}",
-            expected=f"below its {recorded.duration_s:g} s",
+            expected=f"less than its duration, {recorded.duration_s:g} s",
             found=f"{record.start_s:g}",
         )
     return RecordedFlight(recorded, heading, record.start_s, np.array(record.offset_m), record.file)
@@ -191,17 +194,17 @@ def recorded_flight(record: FlightFromFile, heading: Heading) -> RecordedFlight:
 
 @dataclass(frozen=True)
 class RecordedFlight(Flight):
-    """A recording as a flight.
+    """A recorded flight that is replayed.
 
-    It flies on for a moment before its first and after its last sample, because exposures do. Asked for other times
-    that it does not have, it raises `SettingsError`, which says how many of them it has.
+    The flight is extrapolated by a short time before the first and after the last sample, for the exposures of the
+    first and last frame. Times further outside raise `SettingsError`; the message says how many times are inside.
 
     Attributes:
-        recorded: its samples.
-        heading: for recordings without orientations, whose attitude follows from their acceleration.
-        start_s: after its first sample; the flight's time 0.
-        offset_m: (3,), added to its positions.
-        name: for messages.
+        recorded: samples of the flight.
+        heading: heading for samples without orientations; their attitude follows from the acceleration.
+        start_s: time after the first sample that becomes the flight's time 0.
+        offset_m: (3,), vector that is added to the positions.
+        name: name for messages.
     """
 
     recorded: Recorded
@@ -212,7 +215,7 @@ class RecordedFlight(Flight):
 
     @cached_property
     def _splines(self) -> tuple[BSpline, BSpline, BSpline]:
-        """Position, velocity and acceleration over the recording's own time."""
+        """Position, velocity and acceleration over the time of the samples."""
         position = spline(self.recorded.time_s, self.recorded.position_m)
         return position, position.derivative(1), position.derivative(2)
 
@@ -224,13 +227,13 @@ class RecordedFlight(Flight):
         return RotationSpline(self.recorded.time_s, Rotation.from_quat(orientation_wxyz, scalar_first=True))
 
     def check(self, time_s: Times) -> None:
-        """Raise `SettingsError` if the recording does not have all of these times of frames."""
+        """Raise `SettingsError` if a given time of a frame is outside the samples."""
         self._own_time(time_s, _ROUNDING_S)
 
     def _own_time(
         self, time_s: Times, beyond_s: float = _BEYOND_S
     ) -> tuple[Times, Float[np.ndarray, "times 1"]]:
-        """Times of the recording, and by how much those that were asked for are beyond its ends."""
+        """Times within the samples that are nearest to the given times, and the differences to the given times."""
         samples_s = self.recorded.time_s
         first_s = self.start_s + float(np.min(time_s, initial=0.0))
         if first_s < -beyond_s:
@@ -238,7 +241,7 @@ class RecordedFlight(Flight):
                 self.name,
                 expected=f"a start_s of at least {self.start_s - first_s:.6g} s",
                 found=f"{self.start_s:.6g} s",
-                remedy="who follows behind begins where it was before",
+                remedy="the drone that follows with a delay begins at an earlier point of the recording",
             )
         own_s = samples_s[0] + self.start_s + time_s
         inside_s = np.clip(own_s, samples_s[0], samples_s[-1])
@@ -269,7 +272,7 @@ class RecordedFlight(Flight):
         return self._splines[2](self._own_time(time_s)[0])
 
     def rotation(self, time_s: Times) -> Float[np.ndarray, "times 3 3"]:
-        """(times, 3, 3), body to world: as recorded, or else as the acceleration demands."""
+        """(times, 3, 3), body to world: as recorded, or from the acceleration if no orientations were recorded."""
         if self._attitude is None:
             return super().rotation(time_s)
         return self._attitude(self._own_time(time_s)[0]).as_matrix()

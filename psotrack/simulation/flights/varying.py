@@ -1,7 +1,8 @@
-"""From the records of a scenario to flights, moved by a draw as far as the scenario's variation allows.
+"""Flights from a scenario's records, with random changes within the scenario's variation.
 
-Formulas become sums of harmonics, so one kind of draw fits them all: a shift of phase, a size and a period per
-harmonic, and a shift of the centre. Drones of one group share their draw, headings apart.
+All formulas are written as sums of harmonics, so that the same random numbers apply to all of them: a change of phase,
+size and period of each harmonic, and a change of the centre. Drones of one group have the same random numbers, except
+for the heading.
 """
 
 from __future__ import annotations
@@ -40,12 +41,14 @@ from psotrack.simulation.scenarios import (
 
 @dataclass(frozen=True)
 class Draw:
-    """Where between its extremes, -1 to 1, a seed puts each part of a flight.
+    """Random numbers from -1 to 1 for one flight; the scenario's variation multiplies them.
 
     Attributes:
-        phase, size, period: (harmonics,).
-        centre: (3,).
-        points: (points, 3), of waypoints.
+        phase: (harmonics,), changes of the phases.
+        centre: (3,), change of the centre.
+        size: (harmonics,), changes of the amplitudes.
+        period: (harmonics,), changes of the periods.
+        points: (points, 3), changes of the waypoints.
     """
 
     phase: Float[np.ndarray, "harmonics"]
@@ -57,7 +60,12 @@ class Draw:
 
 @dataclass(frozen=True)
 class Turn:
-    """Where between -1 and 1 a seed puts a heading, and where in its sway it begins."""
+    """Random numbers for a heading.
+
+    Attributes:
+        yaw: change of the mean heading, -1 to 1; the scenario's variation multiplies it.
+        sway_phase_rad: phase of the change of heading at time 0.
+    """
 
     yaw: float = 0.0
     sway_phase_rad: float = 0.0
@@ -67,26 +75,28 @@ Draws = tuple[tuple[Draw, Turn], ...]
 
 
 def no_draws(scenario: Scenario) -> Draws:
-    """One per drone; they leave flights as the scenario has them."""
+    """Zeros for each drone, which leave the scenario's flights unchanged."""
     return tuple((_draw([drone], lambda *shape: np.zeros(shape)), Turn()) for drone in scenario.drones)
 
 
 def draws(scenario: Scenario, rng: np.random.Generator) -> Draws:
-    """One per drone; those of one group are the same, but for the turn."""
+    """Random numbers for each drone; drones of one group have the same numbers, except for the heading."""
     drawn: dict[str | int, Draw] = {}
     result = []
     for index, drone in enumerate(scenario.drones):
-        alike = [other for other in scenario.drones if other.group == drone.group] if drone.group else [drone]
+        members = (
+            [other for other in scenario.drones if other.group == drone.group] if drone.group else [drone]
+        )
         group = drone.group or index
         if group not in drawn:
-            drawn[group] = _draw(alike, lambda *shape: rng.uniform(-1, 1, shape))
+            drawn[group] = _draw(members, lambda *shape: rng.uniform(-1, 1, shape))
         turn = Turn(float(rng.uniform(-1, 1)), float(rng.uniform(0, 2 * np.pi)))
         result.append((drawn[group], turn))
     return tuple(result)
 
 
 def _draw(drones: Sequence[Drone], uniform: Callable[..., Float[np.ndarray, "*shape"]]) -> Draw:
-    """Enough for the longest of their flights."""
+    """Random numbers for drones of one group, enough for the flight with the most harmonics or waypoints."""
     harmonics = max(_num_harmonics(drone.flight) for drone in drones)
     points = max(len(drone.flight.points_m) if isinstance(drone.flight, Waypoints) else 0 for drone in drones)
     return Draw(uniform(harmonics), uniform(3), uniform(harmonics), uniform(harmonics), uniform(points, 3))
@@ -95,16 +105,17 @@ def _draw(drones: Sequence[Drone], uniform: Callable[..., Float[np.ndarray, "*sh
 def _num_harmonics(record: FlightRecord) -> int:
     if isinstance(record, FlightFromFile | FollowingFlight):
         return 0
-    # The period of waypoints is varied like that of a harmonic.
+    # A flight through waypoints uses one number: the change of its period.
     return 1 if isinstance(record, Waypoints) else len(_as_harmonics(record).terms)
 
 
 def make(scenario: Scenario, drawn: Draws, recorded: Mapping[int, Flight]) -> tuple[Flight, ...]:
-    """The flights, one per drone, moved by their draws.
+    """Make the flight of each drone, changed by its random numbers.
 
     Args:
-        drawn: one per drone.
-        recorded: the flights of those drones that replay a recording, by index; they stay as they are.
+        scenario: the scenario.
+        drawn: random numbers of each drone.
+        recorded: recorded flights by the index of their drone; these flights do not change.
 
     Raises:
         SettingsError: a flight is relative to a drone that does not exist or, along a chain, to itself.
@@ -119,7 +130,7 @@ def make(scenario: Scenario, drawn: Draws, recorded: Mapping[int, Flight]) -> tu
             case FollowingFlight(leader=leader, delay_s=delay_s):
                 made[index] = DelayedFlight(made[leader - 1], delay_s, heading)
             case Formation(leader=other) | NearPass(other=other) as record:
-                # A stated offset or distance is not varied.
+                # Offset and distance that the scenario gives are not varied.
                 unmoved = replace(draw, centre=np.zeros(3))
                 offset = _harmonic_flight(_as_harmonics(record), unmoved, scenario.variation, heading)
                 made[index] = RelativeFlight(made[other - 1], offset, heading)
@@ -131,7 +142,7 @@ def make(scenario: Scenario, drawn: Draws, recorded: Mapping[int, Flight]) -> tu
 
 
 def heading_of(drone: Drone, turn: Turn, variation: Variation) -> Heading:
-    """Where the drone looks, moved by its draw."""
+    """Heading of a drone over time, changed by its random numbers."""
     return Heading(
         float(np.radians(drone.yaw_deg + turn.yaw * variation.yaw_deg)),
         float(np.radians(drone.yaw_sway_deg)),
@@ -144,13 +155,13 @@ def _harmonic_flight(record: Harmonics, draw: Draw, variation: Variation, headin
     amplitude = np.array([term.amplitude_m for term in record.terms], np.float64).reshape(-1, 3)
     period_s = np.array([term.period_s for term in record.terms], np.float64)
     phase_deg = np.array([term.phase_deg for term in record.terms], np.float64).reshape(-1, 3)
-    some = slice(len(record.terms))
+    terms = slice(len(record.terms))
     return HarmonicFlight(
         centre_m=np.array(record.centre_m, np.float64) + draw.centre * variation.centre_m,
-        amplitude_m=amplitude * (1 + variation.size * draw.size[some])[:, None],
-        angular_rad_s=2 * np.pi / (period_s * (1 + variation.period * draw.period[some])),
-        # One shift of phase per harmonic: its axes keep their relation, an orbit stays an orbit.
-        phase_rad=np.radians(phase_deg + (variation.phase_deg * draw.phase[some])[:, None]),
+        amplitude_m=amplitude * (1 + variation.size * draw.size[terms])[:, None],
+        angular_rad_s=2 * np.pi / (period_s * (1 + variation.period * draw.period[terms])),
+        # All axes of a harmonic get the same change of phase, so that an orbit stays an orbit.
+        phase_rad=np.radians(phase_deg + (variation.phase_deg * draw.phase[terms])[:, None]),
         heading=heading,
     )
 
@@ -158,13 +169,13 @@ def _harmonic_flight(record: Harmonics, draw: Draw, variation: Variation, headin
 def _waypoint_flight(record: Waypoints, draw: Draw, variation: Variation, heading: Heading) -> WaypointFlight:
     points_m = np.array(record.points_m, np.float64)
     points_m = points_m + draw.points[: len(points_m)] * variation.centre_m
-    way_m = np.linalg.norm(np.roll(points_m, -1, axis=0) - points_m, axis=-1)
+    leg_m = np.linalg.norm(np.roll(points_m, -1, axis=0) - points_m, axis=-1)
     slower = float(1 + variation.period * draw.period[0])
-    return WaypointFlight(points_m, way_m / record.speed_m_s * slower, record.hover_s * slower, heading)
+    return WaypointFlight(points_m, leg_m / record.speed_m_s * slower, record.hover_s * slower, heading)
 
 
 def _as_harmonics(record: Harmonics | Orbit | Crossing | Formation | NearPass) -> Harmonics:
-    """The same flight, or offset from another, as a sum of harmonics."""
+    """Flight of a record as a sum of harmonics; for a formation or near pass, the offset from the other drone."""
     match record:
         case Harmonics():
             return record
