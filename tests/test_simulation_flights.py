@@ -266,7 +266,7 @@ def test_a_recorded_flight_does_not_depend_on_the_seed_and_can_be_followed(tmp_p
     behind = FollowingFlight(leader=1, delay_s=1.5)
     plan(make_scenario(msgspec.structs.replace(replay, start_s=1.5), behind), 0)
     with pytest.raises(
-        SettingsError, match=r"r.csv: expected a start_s of at least 1.5 s, found 1 s; who foll"
+        SettingsError, match=r"r.csv: expected a start_s of at least 1.5 s, found 1 s; the drone that foll"
     ):
         plan(make_scenario(replay, behind), 0)
 
@@ -481,11 +481,11 @@ POINTS = Waypoints(points_m=((0.0, 0.0, 1.0), (1.0, 0.0, 1.0), (0.0, 1.0, 1.0)),
         ),
         (
             (msgspec.structs.replace(POINTS, points_m=(*POINTS.points_m, (0.0, 1.0, 1.0))),),
-            r"drones\[0\].flight.points_m\[3\]: expected another point .*, found \[0.0, 1.0, 1.0\] again; ",
+            r"drones\[0\].flight.points_m\[3\]: expected a point that differs .*, found \[0.0, 1.0, 1.0\] again; ",
         ),
         (
             (msgspec.structs.replace(POINTS, points_m=(*POINTS.points_m, (0.0, 0.0, 1.0))),),
-            r"drones\[0\].flight.points_m\[0\]: expected another point .*, found \[0.0, 0.0, 1.0\] again; ",
+            r"drones\[0\].flight.points_m\[0\]: expected a point that differs .*, found \[0.0, 0.0, 1.0\] again; ",
         ),
     ],
 )

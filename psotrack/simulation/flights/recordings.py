@@ -130,7 +130,7 @@ def _from_poses(path: Path) -> _Samples:
     rate_hz = float(match["rate_hz"]) if match else 0.0
     if rate_hz == 0:
         raise InputError(
-            path, expected="a pose file with its rate in its name, such as dron1_pos_25.csv", found=path.name
+            path, expected="a pose file named like dron1_pos_25.csv, with its rate", found=path.name
         )
     position_m, orientation_wxyz = read_poses(path)
     frame = np.flatnonzero(np.isfinite(position_m).all(axis=1))

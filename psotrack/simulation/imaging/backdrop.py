@@ -1,4 +1,4 @@
-"""What a camera sees of the empty room: colour and depth, drawn once."""
+"""The empty room in a camera's image: colour and depth, drawn once."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from psotrack.simulation.imaging.raster import Pinhole, RasterView, draw, empty_
 from psotrack.simulation.scenarios import Imaging
 from psotrack.simulation.world.rooms import Room, Surface
 
-#: Samples per pixel along each side, for edges and textures without stairs.
+#: Samples per pixel along each side, for anti-aliasing.
 _MAGNIFICATION = 2
 
 
 @dataclass(frozen=True)
 class Backdrop:
-    """The empty room in one camera.
+    """The empty room in one camera's image.
 
     Attributes:
-        light: (height, width, 3), linear BGR.
-        depth_m: (height, width), along the optical axis, at pixel centres.
-        floor: (height, width), where the floor is seen.
+        light: (height, width, 3), linear BGR light.
+        depth_m: (height, width), depth along the optical axis at pixel centres.
+        floor: (height, width), True at the pixels that show the floor.
     """
 
     light: Float[np.ndarray, "height width 3"]
@@ -33,7 +33,7 @@ class Backdrop:
 
 
 def render(room: Room, cam: Pinhole, imaging: Imaging) -> Backdrop:
-    """Draw the empty room into one camera."""
+    """Draw the empty room for one camera."""
     number, depth = numbers_and_depth(room.surfaces, full_view(cam))
     light = lens_blur(light_of(room.surfaces, cam, imaging.antialiasing), imaging.lens_blur_px)
     return Backdrop(light, depth, np.equal(number, 0))
@@ -42,7 +42,7 @@ def render(room: Room, cam: Pinhole, imaging: Imaging) -> Backdrop:
 def light_of(
     surfaces: Sequence[Surface], cam: Pinhole, antialiasing: bool
 ) -> Float[np.ndarray, "height width 3"]:
-    """(height, width, 3), linear BGR: light of textured surfaces, before the lens blurs it."""
+    """(height, width, 3), linear BGR light of textured surfaces, without the lens's blur."""
     view = full_view(cam, _MAGNIFICATION if antialiasing else 1)
     number, _ = numbers_and_depth(surfaces, view)
     light = np.zeros((*view.shape, 3), np.float32)
@@ -62,7 +62,7 @@ def light_of(
 def numbers_and_depth(
     surfaces: Sequence[Surface], view: RasterView
 ) -> tuple[Int[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"]]:
-    """Which surface is seen, -1 where none is, and its depth in metres along the optical axis."""
+    """Index of the visible surface at each pixel, -1 without a surface, and its depth along the optical axis."""
     corners = np.stack([surface.corners_m for surface in surfaces])
     triangles = corners[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3)
     colours = np.repeat(np.arange(1.0, len(corners) + 1), 2)[:, None, None]
@@ -72,12 +72,12 @@ def numbers_and_depth(
 
 
 def lens_blur(light: Float[np.ndarray, "*shape"], sigma_px: float) -> Float[np.ndarray, "*shape"]:
-    """What the lens makes of light; the same light at 0."""
+    """Light after a Gaussian blur of the lens; unchanged if `sigma_px` is 0."""
     return cv2.GaussianBlur(light, (0, 0), sigma_px) if sigma_px > 0 else light
 
 
 def texel_to_camera(surface: Surface, cam: Pinhole) -> Float[np.ndarray, "3 3"]:
-    """(3, 3), from a texel (column, row, 1) to camera coordinates of that point of the surface."""
+    """(3, 3), matrix from a texel (column, row, 1) to the camera coordinates of the texel's point on the surface."""
     rows, columns = surface.texture.shape[:2]
     edges = [cam.R @ edge for edge in (surface.along_m, surface.down_m)]
     plane = np.column_stack([*edges, cam.R @ surface.corner_m + cam.t_m])

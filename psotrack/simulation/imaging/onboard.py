@@ -1,8 +1,8 @@
-"""The drones' own cameras: action cameras, fixed to the body, that see the room and the other drones.
+"""On-board cameras: action cameras, fixed to the drone's body, that see the room and the other drones.
 
-Every frame is drawn anew, several times: samples that lie elsewhere in the pixel and at another time of the exposure
-make edges without stairs and motion blur in one. The drone that carries the camera is not drawn, but its shadow: a
-camera at its nose sees nothing of it. The floor does not shine here.
+Each frame is the mean of several drawings with different sample positions in the pixel and different times in the
+exposure, which gives anti-aliasing and motion blur together. The drone that carries the camera is not drawn, because a
+camera at its nose does not see it; its shadow is drawn. Reflections of the floor are not drawn.
 """
 
 from __future__ import annotations
@@ -30,12 +30,13 @@ from psotrack.simulation.world.rooms import room
 
 Image = UInt8[np.ndarray, "height width 3"]
 
-#: Samples per pixel: no fewer than edges without stairs take, and one for so many pixels of motion blur.
+#: Smallest and largest number of samples per pixel, and motion blur per sample, pixels. The smallest number is enough
+#: for anti-aliasing.
 _MIN_SAMPLES, _MAX_SAMPLES, _BLUR_PER_SAMPLE_PX = 4, 16, 1.5
-#: What is nearer than that may be blurred in steps.
+#: Smallest distance at which the number of samples gives smooth motion blur; nearer objects may show steps.
 _NEAR_SCENERY_M = 1.5
-#: Additive recurrence of the plastic number, for points spread evenly over a square whatever their number (Roberts,
-#: "The unreasonable effectiveness of quasirandom sequences", 2018).
+#: Additive recurrence of the plastic number, which spreads any number of points evenly over a square (Roberts, "The
+#: unreasonable effectiveness of quasirandom sequences", 2018).
 _RECURRENCE = np.array([0.7548776662466927, 0.5698402909980532])
 
 
@@ -63,15 +64,15 @@ class OnboardRenderer:
         self._painter = _room_painter(scene.scenario.hall, scene.scenario.markers, scene.scale)
 
     def cam_at(self, time_s: float) -> Pinhole:
-        """The camera as it is at a time."""
+        """Camera at a given time."""
         return self._cams(np.array([time_s]))[0]
 
     def frame(self, frame: int) -> Image:
-        """The frame as the sensor yields it, before the codec: BGR, (height, width, 3)."""
+        """(height, width, 3), BGR image of a frame from the sensor, before the codec."""
         return self.sensor.expose(self.clean_frame(frame), frame, self.scene.time_s(frame))
 
     def clean_frame(self, frame: int) -> Image:
-        """The frame without what the sensor adds: BGR, (height, width, 3)."""
+        """(height, width, 3), BGR image of a frame without the effects of the sensor."""
         time_s = self.scene.time_s(frame)
         samples = self._samples(time_s)
         during_s = time_s + samples[:, 2] * self.onboard.shutter_s
@@ -97,7 +98,7 @@ class OnboardRenderer:
         ]
 
     def _samples(self, time_s: float) -> Float[np.ndarray, "samples 3"]:
-        """(samples, 3): where in the pixel (x, y) and when in the exposure (-1/2 to 1/2), their mean at 0."""
+        """(samples, 3), positions in the pixel (x, y) and times in the exposure (-1/2 to 1/2), with mean 0."""
         during_s = time_s + np.array([-0.5, 0.5]) * self.onboard.shutter_s
         blur_px = self._motion_px(during_s)
         num = int(np.clip(np.ceil(blur_px / _BLUR_PER_SAMPLE_PX), _MIN_SAMPLES, _MAX_SAMPLES))
@@ -107,7 +108,7 @@ class OnboardRenderer:
         return points - points.mean(axis=0)
 
     def _motion_px(self, during_s: Float[np.ndarray, "2"]) -> float:
-        """How far the picture of scenery moves, at most, between two times."""
+        """Upper bound of the image motion between two times, pixels, for objects beyond `_NEAR_SCENERY_M`."""
         position_m, to_world = _poses(self.scene, self.drone_index, during_s)
         turned_rad = Rotation.from_matrix(to_world[0].T @ to_world[1]).magnitude()
         moved_m = np.linalg.norm(position_m[1] - position_m[0])
@@ -116,7 +117,7 @@ class OnboardRenderer:
     def _draw_drones(
         self, light: UInt16[np.ndarray, "height width 4"], view: RasterView, posed: list[PosedDrone]
     ) -> None:
-        # One beside the camera reaches behind it and has no window, but is not seen.
+        # A drone beside the camera reaches behind the camera and has no window, but is not visible.
         visible = [drone for drone in posed if _may_be_seen(drone, view)]
         for window, drones in windows(view, visible, margin_px(0.0)):
             behind_m = self._painter.hiding_depth_m(
@@ -131,13 +132,13 @@ class OnboardRenderer:
     def _cast_shadows(
         self, total: Float[np.ndarray, "height width 4"], num_samples: int, time_s: float
     ) -> None:
-        """Darken the floor in a sum of samples, as it is in the middle of the exposure."""
+        """Darken the floor in a sum of samples by the shadows in the middle of the exposure."""
         if not (self._imaging.shadows or self._imaging.contact_shadows):
             return
         lost = cv2.convertScaleAbs(self._floor.floor_gain(time_s), alpha=-255, beta=255)
         H = self._floor.to_image(self.cam_at(time_s))
         seen = cv2.warpPerspective(lost, H, (self.width, self.height), flags=cv2.INTER_LINEAR)
-        # Above the horizon a pixel's line meets the floor behind the camera; there the floor sends nothing.
+        # Above the horizon, a pixel's line meets the floor behind the camera; the floor's share is 0 at these pixels.
         x, y, width, height = cv2.boundingRect(seen)
         part = total[y : y + height, x : x + width]
         floor = part[..., 3:] / np.float32(LIGHT_UNIT * num_samples)
@@ -146,27 +147,27 @@ class OnboardRenderer:
 
 @functools.lru_cache(maxsize=1)
 def _room_painter(hall: str, with_markers: bool, scale: float) -> RoomPainter:
-    """The same for all drones."""
+    """Painter of the room, shared by the cameras of all drones."""
     return RoomPainter(room(hall, with_markers, scale).surfaces)
 
 
 def camera_record(scene: Scene) -> OnboardCamera:
-    """The record of the cameras on drones; without one, what such cameras usually are."""
+    """On-board camera of the scenario; the default `OnboardCamera` if the scenario has none."""
     return scene.scenario.onboard or OnboardCamera()
 
 
 def intrinsics(scene: Scene) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
-    """(3, 3) intrinsics in pixels, centres at integers, and width and height, at the scene's scale.
+    """Intrinsics (3, 3) of the on-board cameras, and width and height of their images, at the scene's scale.
 
     Raises:
-        SettingsError: images of that scale have almost no pixels, or more than a video can.
+        SettingsError: images of this scale are too small, or too large for a video.
     """
     record, scale = camera_record(scene), scene.scale
     sized = msgspec.structs.replace(scene.scenario, image_size_wh=record.image_size_wh)
     K = np.eye(3)
     for axis, (side, fov_deg) in enumerate(zip(record.image_size_wh, record.fov_deg, strict=True)):
         K[axis, axis] = scale * side / 2 / np.tan(np.radians(fov_deg) / 2)
-        # The middle of the image lies between pixels where their number is even.
+        # Pixel centres have integer coordinates, so the middle of an even number of pixels is between two pixels.
         K[axis, 2] = scale * side / 2 - 0.5
     return K, image_size_wh(sized, scale)
 
@@ -174,11 +175,11 @@ def intrinsics(scene: Scene) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]
 def onboard_poses(
     scene: Scene, drone_index: int, num_frames: int
 ) -> tuple[Float[np.ndarray, "frames 3"], Float[np.ndarray, "frames 4"]]:
-    """Where a drone's camera is in the middle of each exposure.
+    """Poses of a drone's camera in the middle of each exposure.
 
     Returns:
-        (frames, 3), its centre, world, metres; (frames, 4), unit quaternions (w, x, y, z), camera to world; the
-        camera's axes are x right, y down, z ahead.
+        (frames, 3), camera centres, world, metres; (frames, 4), unit quaternions (w, x, y, z), camera to world, with
+        camera axes x right, y down, z ahead.
     """
     position_m, to_world = _poses(scene, drone_index, frame_times_s(scene.scenario, num_frames))
     return position_m, quaternions_wxyz(to_world)
@@ -204,5 +205,5 @@ def _may_be_seen(posed: PosedDrone, view: RasterView) -> bool:
 
 
 def _at(posed: PosedDrone, index: int) -> PosedDrone:
-    """A drone at one of its times."""
+    """Posed drone at one of its times."""
     return replace(posed, faces_m=posed.faces_m[index : index + 1], discs_m=posed.discs_m[index : index + 1])

@@ -1,8 +1,8 @@
-"""What hides what: a room's rectangles from far to near, for any point of view, without a depth buffer.
+"""Order of a room's rectangles from far to near for any viewpoint, without a depth buffer.
 
-A binary space partition (Fuchs, Kedem and Naylor, "On visible surface generation by a priori tree structures", 1980):
-each node's plane parts the rest into what lies before it and what lies behind it; what crosses it is cut in two. From
-any point, what lies beyond a plane can be drawn first, whatever else there is.
+The order comes from a binary space partition (Fuchs, Kedem and Naylor, "On visible surface generation by a priori tree
+structures", 1980): the plane of each node divides the remaining pieces into pieces in front and pieces behind, and cuts
+the pieces that cross it. From any viewpoint, the pieces on the far side of the plane can be drawn first.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from psotrack.simulation.world.rooms import Surface
 
-#: Nearer than that to a plane is on it.
+#: Largest distance of a point on a plane from the plane.
 _ON_PLANE_M = 1e-6
 
 
@@ -24,8 +24,8 @@ class Piece:
     """A part of a surface that no plane of the tree cuts.
 
     Attributes:
-        surface: its index.
-        corners_m: (corners, 3), convex, in the order of the surface's own corners.
+        surface: index of the surface.
+        corners_m: (corners, 3), convex polygon, in the order of the surface's corners.
     """
 
     surface: int
@@ -34,10 +34,14 @@ class Piece:
 
 @dataclass(frozen=True)
 class _Node:
-    """The pieces in a plane, by their indices, and what lies before and behind it.
+    """A node of the tree: a plane with the pieces in it.
 
     Attributes:
-        normal, offset_m: the plane's points x have normal @ x = offset_m.
+        normal: (3,), normal of the plane; its points x satisfy normal @ x = offset_m.
+        offset_m: offset of the plane.
+        pieces: indices of the pieces in the plane.
+        before: subtree on the side of the normal.
+        behind: subtree on the other side.
     """
 
     normal: Float[np.ndarray, "3"]
@@ -48,10 +52,10 @@ class _Node:
 
 
 class Order:
-    """Cuts surfaces into pieces that have an order from anywhere.
+    """Pieces of surfaces that have an order from far to near for every viewpoint.
 
     Attributes:
-        pieces: of all surfaces.
+        pieces: pieces of all surfaces.
     """
 
     def __init__(self, surfaces: Sequence[Surface]) -> None:
@@ -60,7 +64,7 @@ class Order:
         self._root = self._node([Piece(index, surface.corners_m) for index, surface in enumerate(surfaces)])
 
     def far_to_near(self, eye_m: Float[np.ndarray, "3"]) -> list[int]:
-        """Indices of all pieces, each after those that it could hide from that point."""
+        """Indices of all pieces in an order in which no piece is hidden by an earlier one, seen from a point."""
         found: list[int] = []
 
         def visit(node: _Node | None) -> None:
@@ -97,7 +101,7 @@ class Order:
 def _best_plane(
     pieces: list[Piece], normals: Float[np.ndarray, "surfaces 3"]
 ) -> tuple[Float[np.ndarray, "3"], float]:
-    """The plane of the piece that cuts fewest of the others; of these, the one that parts them most evenly."""
+    """Plane of a piece that cuts the fewest other pieces; among equal planes, the one with the most equal halves."""
     planes = normals[[piece.surface for piece in pieces]]
     offset_m = np.array([plane @ piece.corners_m[0] for plane, piece in zip(planes, pieces, strict=True)])
     starts = np.cumsum([0, *(len(piece.corners_m) for piece in pieces[:-1])])
@@ -114,7 +118,7 @@ def _best_plane(
 def _cut(
     corners_m: Float[np.ndarray, "corners 3"], height_m: Float[np.ndarray, "corners"]
 ) -> Float[np.ndarray, "kept 3"] | None:
-    """The part of a convex polygon above 0, or None where there is none (Sutherland and Hodgman, 1974)."""
+    """Part of a convex polygon with positive heights, or None if it is empty (Sutherland and Hodgman, 1974)."""
     if height_m.max() <= _ON_PLANE_M:
         return None
     if height_m.min() >= -_ON_PLANE_M:

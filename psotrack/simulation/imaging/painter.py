@@ -1,8 +1,8 @@
-"""A room from anywhere, quickly: for cameras that move, whose frames have nothing in common.
+"""Fast drawing of the empty room for moving cameras, which see a different image in each frame.
 
-Surfaces are painted from far to near, each one a homography of its texture into the window where it is seen. Far parts
-take coarser textures (Williams, "Pyramidal parametrics", 1983). Edges and limits of textures' levels are half planes of
-the image: a piece of a plane is seen in a pixel if the pixel's ray lies in the cone that the piece spans with the eye.
+Surfaces are painted from far to near, each by a homography of its texture into the window where it is visible. Distant
+parts use coarser textures (Williams, "Pyramidal parametrics", 1983). Edges of pieces and limits between levels of a
+texture are half planes of the image: a pixel shows a piece if its ray is inside the cone of the eye and the piece.
 """
 
 from __future__ import annotations
@@ -19,27 +19,35 @@ from psotrack.simulation.imaging.order import Order
 from psotrack.simulation.imaging.raster import RasterView, empty_buffers
 from psotrack.simulation.world.rooms import Surface
 
-#: Light 1 as a number; lamps are three times as bright.
+#: Integer value of light 1. Lamps have light 3, which still fits into 16 bits.
 LIGHT_UNIT = 16384
 
-#: Four channels, because OpenCV maps four faster than three: BGR, and how much of it the floor sends.
+#: BGR light, and the floor's share of the light. OpenCV transforms four channels faster than three.
 Light = UInt16[np.ndarray, "rows columns 4"]
-#: A texture, and the map from its texels to those of the surface's own.
+#: A texture at one resolution, and the matrix from its texels to the texels at full resolution.
 Level = tuple[Light, Float[np.ndarray, "3 3"]]
 
-#: A texture is halved until a side is that short.
+#: Smallest side of a texture's coarsest level, texels.
 _SMALLEST_PX = 8
-#: The largest texel that is taken, in pixels: a frame takes several samples per pixel, so it may be smaller. Where a
-#: surface is foreshortened, so are its texels, and many lie in a pixel; that far across is better than blurred along.
+#: Largest size of a texel in the image. Texels may be smaller than a pixel, because a frame has several samples per
+#: pixel.
 _TEXEL_PX = 0.6
+#: Largest number of texels per texel of the largest size in the direction of foreshortening. A coarser level would blur
+#: the other direction.
 _FORESHORTENED = 2.0
-#: Pixels by which pieces are wider than they are, so that no ray passes between two that share an edge.
+#: Pixels by which pieces are widened, so that no ray passes between two pieces with a common edge.
 _OVERLAP_PX = 1e-6
 
 
 @dataclass(frozen=True)
 class _Spans:
-    """A convex part of an image: which columns of which rows."""
+    """A convex part of an image.
+
+    Attributes:
+        y: first row.
+        left: (rows,), first column of each row.
+        right: (rows,), last column of each row.
+    """
 
     y: int
     left: Int[np.ndarray, "rows"]
@@ -47,7 +55,7 @@ class _Spans:
 
 
 class RoomPainter:
-    """Paints the empty room into any view of any camera; holds what this takes, and a buffer to work in."""
+    """Paints the empty room into any view of any camera."""
 
     def __init__(self, surfaces: tuple[Surface, ...]) -> None:
         self.surfaces = surfaces
@@ -57,7 +65,7 @@ class RoomPainter:
         self._surface_normals = np.array([surface.normal for surface in surfaces])
         self._surface_corners_m = np.array([surface.corner_m for surface in surfaces])
         self._normals = self._surface_normals[self._surface_of]
-        # Corners that are there twice make no difference, and arrays of equal lengths.
+        # Repeated corners change nothing, and give all pieces the same number of corners.
         most = max(len(piece.corners_m) for piece in pieces)
         self._corners_m = np.stack(
             [np.pad(p.corners_m, ((0, most - len(p.corners_m)), (0, 0)), mode="edge") for p in pieces]
@@ -68,11 +76,11 @@ class RoomPainter:
         self._buffer = np.empty(0, np.uint16)
 
     def paint(self, view: RasterView, image: Light) -> None:
-        """Paint what a view sees, one sample per pixel.
+        """Paint the room in a view, one sample per pixel.
 
         Args:
-            view: of magnification 1.
-            image: (rows, columns, 4), changed: BGR light, and 1 where the floor is seen, in `LIGHT_UNIT`.
+            view: view of magnification 1.
+            image: (rows, columns, 4), overwritten: BGR light, and 1 at pixels of the floor, in units of `LIGHT_UNIT`.
         """
         cam, K = view.cam, view.K
         eye_m = -cam.R.T @ cam.t_m
@@ -88,10 +96,10 @@ class RoomPainter:
     def hiding_depth_m(
         self, view: RasterView, faces_m: Float[np.ndarray, "faces 3 3"]
     ) -> Float[np.ndarray, "rows columns"]:
-        """(rows, columns), depth of what may hide some faces, along the optical axis; very far where nothing does."""
+        """(rows, columns), depth of the surfaces that may hide the given faces; `FAR_M` at pixels without a surface."""
         points = faces_m.reshape(-1, 3)
         lower, upper = points.min(axis=0), points.max(axis=0)
-        # The corner of the box around them that is farthest behind each plane.
+        # For each plane, the corner of the faces' bounding box that is farthest behind the plane.
         farthest = np.where(self._surface_normals > 0, lower, upper)
         beyond = ((farthest - self._surface_corners_m) * self._surface_normals).sum(axis=-1) < 0
         eye_m = -view.cam.R.T @ view.cam.t_m
@@ -125,12 +133,12 @@ class RoomPainter:
     def _by_level(
         self, surface: int, depth_m: Float[np.ndarray, "corners"], height_m: float, focal_px: float
     ) -> Iterator[tuple[Level, float, float]]:
-        """Levels of a texture that a piece needs, with the depths from which and up to which each is right."""
+        """Yield the levels of a texture that a piece needs, each with its smallest and largest depth."""
         levels = self._levels[surface]
         texel_px_m = focal_px * self._texel_m[surface]
         nearest = 0.0
         for index, level in enumerate(levels):
-            # Where the next level's texels are small enough.
+            # Depth from which on the next level's texels are small enough.
             scale = texel_px_m * 2 ** (index + 1) / _TEXEL_PX
             farthest = min(scale, float(np.sqrt(_FORESHORTENED * height_m * scale)))
             if index == len(levels) - 1 or depth_m.max() <= farthest:
@@ -147,12 +155,12 @@ class RoomPainter:
         level: UInt16[np.ndarray, "texels_y texels_x 4"],
         H: Float[np.ndarray, "3 3"],
     ) -> None:
-        """Paint a level of a texture, whose texels H maps to pixels, into some spans."""
+        """Paint a level of a texture into spans; H maps texels to pixels."""
         x1, x2 = int(spans.left.min()), int(spans.right.max()) + 1
         window = image[spans.y : spans.y + len(spans.left), x1:x2]
         if self._buffer.size < window.size:
             self._buffer = np.empty(window.size, np.uint16)
-        # New memory for every piece would take as long as painting it.
+        # The buffer is reused, because allocating memory for each piece takes as long as painting it.
         painted = self._buffer[: window.size].reshape(window.shape)
         H = np.array([[1, 0, -x1], [0, 1, -spans.y], [0, 0, 1.0]]) @ H
         cv2.warpPerspective(level, H, window.shape[1::-1], dst=painted, flags=cv2.INTER_LINEAR)
@@ -162,13 +170,13 @@ class RoomPainter:
 
 
 def _texel_m(surface: Surface) -> float:
-    """The longer side of a texel."""
+    """Length of the longer side of a texel."""
     rows, columns = surface.texture.shape[:2]
     return max(float(np.linalg.norm(surface.along_m)) / columns, float(np.linalg.norm(surface.down_m)) / rows)
 
 
 def _levels(surface: Surface, is_floor: bool) -> list[Level]:
-    """A texture at full size, half of it, ...; with the map from its texels to those of full size."""
+    """Levels of a surface's texture: full resolution, half of it, and so on."""
     rows, columns = surface.texture.shape[:2]
     full = np.full((rows, columns, 4), LIGHT_UNIT * is_floor, np.uint16)
     full[..., :3] = np.clip(surface.texture * LIGHT_UNIT + 0.5, 0, np.iinfo(np.uint16).max)
@@ -176,7 +184,7 @@ def _levels(surface: Surface, is_floor: bool) -> list[Level]:
     level = full
     while True:
         y, x = rows / level.shape[0], columns / level.shape[1]
-        # One texel more around it: what is painted may lie half a texel beyond the middles of the outermost.
+        # A border of one texel, because painted points may be half a texel outside the outermost texel centres.
         wider = cv2.copyMakeBorder(level, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
         to_full = np.array([[x, 0, (x - 1) / 2 - x], [0, y, (y - 1) / 2 - y], [0, 0, 1.0]])
         levels.append((np.asarray(wider, np.uint16), to_full))
@@ -189,7 +197,7 @@ def _levels(surface: Surface, is_floor: bool) -> list[Level]:
 def may_be_seen(
     corners: Float[np.ndarray, "pieces corners 3"], K: Float[np.ndarray, "3 3"], shape: tuple[int, int]
 ) -> Bool[np.ndarray, "pieces"]:
-    """(pieces,), whether no side of the image, nor its back, has all corners of a piece beyond it."""
+    """(pieces,), False if all corners of a piece are beyond one side of the image or behind the camera."""
     x, y, depth = np.moveaxis(corners @ K.T, -1, 0)
     rows, columns = shape
     beyond = [
@@ -203,7 +211,7 @@ def may_be_seen(
 
 
 def _spans(half_planes: Float[np.ndarray, "edges 3"], shape: tuple[int, int]) -> _Spans | None:
-    """Where a x + b y + c >= 0 for every (a, b, c); None where that is nowhere."""
+    """Pixels (x, y) with a x + b y + c >= 0 for all rows (a, b, c); None if there are no such pixels."""
     rows, columns = shape
     a, b, c = half_planes.T[..., None]
     y = np.arange(rows)

@@ -1,7 +1,7 @@
-"""Drones put into the world and seen through a window of a camera's image.
+"""Drones posed in the world and drawn in windows of a camera's image.
 
-A drone is drawn in several passes, each with its samples elsewhere in the pixel and at another time of the exposure:
-edges without stairs and motion blur in one.
+A drone is drawn in several passes with different sample positions in the pixel and different times in the exposure,
+which gives anti-aliasing and motion blur together.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from psotrack.simulation.scene import Scene
 from psotrack.simulation.world.drones import disc_fans
 
 NUM_PASSES = 8
-#: Reflectance of what is not painted.
+#: Reflectance of unpainted parts.
 _DARK_PLASTIC = 0.02
-#: Of a rotor disc, blades smeared by their turning: opacity at the hub and at the tip, reflectance.
+#: Opacity of a rotor disc, which shows blurred blades, at the hub and at the tip, and its reflectance.
 _DISC_OPACITY = (0.55, 0.30)
 _DISC_REFLECTANCE = 0.06
 
-#: Points mirrored by the floor.
+#: Factors that mirror a point in the floor.
 MIRRORED = np.array([1.0, 1.0, -1.0])
 
 
@@ -33,10 +33,10 @@ class PosedDrone:
     """One drone during one exposure.
 
     Attributes:
-        faces_m: (times, faces, 3, 3), world.
-        light: (faces, 1, 3), linear BGR; one light for the whole exposure.
-        discs_m: (times, slices, 3, 3), rotor discs as fans, hub first.
-        disc_opacity_light: (slices, 3, 3) at the corners: opacity and light in the first two channels.
+        faces_m: (times, faces, 3, 3), corners of the faces, world.
+        light: (faces, 1, 3), linear BGR light of the faces in the middle of the exposure.
+        discs_m: (times, slices, 3, 3), rotor discs as fans of triangles with the hub as first corner, world.
+        disc_opacity_light: (slices, 3, 3), opacity and light of the discs' corners in the first two channels.
     """
 
     faces_m: Float[np.ndarray, "times faces 3 3"]
@@ -45,15 +45,16 @@ class PosedDrone:
     disc_opacity_light: Float[np.ndarray, "slices 3 3"]
 
     def mirrored(self, times: list[int]) -> PosedDrone:
-        """The drone at some of its times as the floor mirrors it: upside down, each face with its own light."""
+        """Mirror image of the drone in the floor at the times with the given indices; the faces keep their light."""
         return replace(self, faces_m=self.faces_m[times] * MIRRORED, discs_m=self.discs_m[times] * MIRRORED)
 
 
 def pass_samples(imaging: Imaging) -> Float[np.ndarray, "passes 3"]:
-    """(passes, 3): where in the pixel (x, y) and when in the exposure (-1/2 to 1/2) each pass has its samples.
+    """(passes, 3), position in the pixel (x, y) and time in the exposure (-1/2 to 1/2) of each pass's samples.
 
-    Evenly spread: Hammersley points of bases 2 and 3. Their mean is the pixel's centre and the exposure's middle, so
-    nothing shifts. Without anti-aliasing all lie on the centre; without an exposure as well, one pass is enough.
+    The samples are Hammersley points of bases 2 and 3, shifted so that their mean is the pixel's centre and the middle
+    of the exposure. Without anti-aliasing, all positions are the pixel's centre; without motion blur too, there is only
+    one pass.
     """
     passes = NUM_PASSES if imaging.antialiasing or imaging.shutter_s else 1
     points = np.array(
@@ -71,7 +72,7 @@ def _radical_inverse(number: int, base: int) -> float:
 
 
 def pose(scene: Scene, drone: int, time_s: Float[np.ndarray, "times"]) -> PosedDrone:
-    """A drone of a scene at some times of one exposure."""
+    """Pose a drone of a scene at given times of one exposure."""
     flight, shape = scene.flights[drone], scene.models[drone]
     rotation, position = flight.rotation(time_s), flight.position_m(time_s)
     middle = len(time_s) // 2
@@ -85,35 +86,35 @@ def pose(scene: Scene, drone: int, time_s: Float[np.ndarray, "times"]) -> PosedD
     hub, tip = _DISC_OPACITY
     corner_values = np.array([(hub, shade, 0.0), (tip, shade, 0.0), (tip, shade, 0.0)])
     return PosedDrone(
-        faces_m=_placed(shape.triangles_m, rotation, position),
+        faces_m=_to_world(shape.triangles_m, rotation, position),
         light=light[:, None],
-        discs_m=_placed(discs, rotation, position),
+        discs_m=_to_world(discs, rotation, position),
         disc_opacity_light=np.broadcast_to(corner_values, discs.shape),
     )
 
 
-def _placed(
+def _to_world(
     triangles_m: Float[np.ndarray, "faces 3 3"],
     rotation: Float[np.ndarray, "times 3 3"],
     position_m: Float[np.ndarray, "times 3"],
 ) -> Float[np.ndarray, "times faces 3 3"]:
-    """(times, faces, 3, 3): triangles of the body frame in the world."""
+    """(times, faces, 3, 3), triangles transformed from the body frame to the world."""
     corners = triangles_m.reshape(-1, 3) @ rotation.swapaxes(-1, -2) + position_m[:, None]
     return corners.reshape(len(rotation), *triangles_m.shape)
 
 
 def margin_px(blur_px: float) -> int:
-    """Pixels to keep around what is drawn for a blur of that standard deviation, and for motion."""
+    """Margin of a window around a drone, pixels, for motion and for a blur of the given standard deviation."""
     return 2 + int(np.ceil(4 * blur_px))
 
 
 def windows(
     whole: RasterView, posed: list[PosedDrone], margin_px: int
 ) -> list[tuple[RasterView, list[PosedDrone]]]:
-    """Parts of a window that hold drones, those that overlap made one, with the drones in each."""
+    """Parts of a window that contain drones, each with its drones; overlapping parts are merged."""
     found: list[tuple[RasterView, list[PosedDrone]]] = []
     for drone in posed:
-        # What moves evenly is widest at the exposure's ends.
+        # With constant velocity, the positions at the ends of the exposure enclose all others.
         ends = [points[[0, -1]].reshape(-1, 3) for points in (drone.faces_m, drone.discs_m)]
         window, drones = enclosing(whole, np.concatenate(ends), margin_px), [drone]
         if window is None:
@@ -122,7 +123,7 @@ def windows(
             index := next((i for i, (other, _) in enumerate(found) if window.overlaps(other)), None)
         ) is not None:
             other, others = found.pop(index)
-            window, drones = window.joined(other), others + drones
+            window, drones = window.union(other), others + drones
         found.append((window, drones))
     return found
 
@@ -133,13 +134,13 @@ def average(
     samples: Float[np.ndarray, "passes 3"],
     behind_m: Float[np.ndarray, "rows columns"],
 ) -> Float[np.ndarray, "rows columns 4"]:
-    """(rows, columns, 4): light of drones, and how much is seen of what is behind them, over all passes.
+    """(rows, columns, 4), light of drones and visible share of the background, averaged over all passes.
 
     Args:
         window: part of an image.
-        posed: drones, their times those of the samples.
-        samples: as `pass_samples` yields them.
-        behind_m: depth of what is behind them, and may hide them.
+        posed: drones, posed at the times of the samples.
+        samples: (passes, 3), samples from `pass_samples`.
+        behind_m: (rows, columns), depth of the background, which may hide drones.
     """
     total = np.zeros((*window.shape, 4), np.float32)
     for index, (x, y, _) in enumerate(samples):
@@ -150,15 +151,15 @@ def average(
 def sample(
     view: RasterView, posed: list[PosedDrone], index: int, behind_m: Float[np.ndarray, "rows columns"]
 ) -> Float[np.ndarray, "rows columns 4"]:
-    """(rows, columns, 4): light of drones at one time of their exposure, and how much of the rest is seen."""
+    """(rows, columns, 4), light of drones and visible share of the background at one time of the exposure."""
     light, depth = np.full((*view.shape, 3), -1.0, np.float32), behind_m.copy()
     for drone in posed:
         draw(view, drone.faces_m[index], drone.light, light, depth)
-    # Where nothing is drawn is told by the colour: OpenCV rounds even those depths that it leaves alone.
+    # Pixels without drones are found by colour, because OpenCV also rounds depths at pixels where it draws nothing.
     clear = np.less(light[..., 0], 0).astype(np.float32)
     light += clear[..., None]
     seen = cv2.merge([light, clear])
-    # Discs let light through: from the farthest to the nearest, each before what lies behind it.
+    # Discs are transparent, so they are drawn from the farthest to the nearest over what is behind them.
     ahead = view.cam.R[2]
     with_discs = [drone for drone in posed if drone.discs_m.size]
     for drone in sorted(with_discs, key=lambda drone: -float(ahead @ drone.discs_m[index, 0, 0])):

@@ -1,8 +1,9 @@
-"""Triangles to pixels: OpenCV's z-buffered rasteriser behind the package's own camera convention.
+"""Rasterisation of triangles: OpenCV's rasteriser with depth buffer, in the package's camera convention.
 
-`cv2.triangleRasterize` has OpenGL's camera (y up, looking along -z), a symmetric field of view, and samples a pixel at
-its corner plus a half in both directions. Here a `RasterView` is any window of a camera's image at any magnification:
-the window's offset and the principal point become a shear of camera coordinates, in float64, before OpenCV sees them.
+`cv2.triangleRasterize` uses OpenGL's camera (y up, looking along -z) with a symmetric field of view, and samples a
+pixel at its corner plus a half in both directions. A `RasterView` is any window of a camera's image at any
+magnification: the window's offset and the principal point become a shear of the camera coordinates, in float64, before
+the call of OpenCV.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from jaxtyping import Float
 
 from psotrack.geometry import Camera
 
+#: Smallest and largest depth that is drawn.
 NEAR_M = 0.1
 FAR_M = 100.0
 
@@ -24,10 +26,11 @@ class Pinhole:
     """A camera without lens distortion, in plain NumPy.
 
     Attributes:
-        R: (3, 3), world to camera.
-        t_m: (3,), world to camera.
-        K: (3, 3), pixels, centres at integers.
-        width, height: in pixels.
+        R: (3, 3), rotation, world to camera.
+        t_m: (3,), translation, world to camera.
+        K: (3, 3), intrinsics, pixels; pixel centres have integer coordinates.
+        width: width of the image, pixels.
+        height: height of the image, pixels.
     """
 
     R: Float[np.ndarray, "3 3"]
@@ -38,7 +41,7 @@ class Pinhole:
 
 
 def pinhole(cam: Camera) -> Pinhole:
-    """One camera of a rig."""
+    """Convert one camera of a rig; its distortion is ignored."""
     T, (width, height) = np.asarray(cam.T_cam_world), np.asarray(cam.image_size_wh)
     return Pinhole(T[:3, :3], T[:3, 3], np.asarray(cam.K), int(width), int(height))
 
@@ -48,10 +51,13 @@ class RasterView:
     """A window of a camera's image.
 
     Attributes:
-        x, y: column and row of the camera's pixel whose outer corner is the window's corner.
-        width, height: of the window, in the camera's pixels.
+        cam: the camera.
+        x: first column of the window.
+        y: first row of the window.
+        width: width of the window, the camera's pixels.
+        height: height of the window, the camera's pixels.
         magnification: samples per pixel along each side.
-        shift_px: (x, y) from pixel centres to where samples are taken, for anti-aliasing by several passes.
+        shift_px: (x, y), offset of the samples from the pixel centres, for anti-aliasing by several passes.
     """
 
     cam: Pinhole
@@ -69,16 +75,16 @@ class RasterView:
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """The window in the camera's image: rows, columns."""
+        """Rows and columns of the window in the camera's image."""
         return slice(self.y, self.y + self.height), slice(self.x, self.x + self.width)
 
     def slices_in(self, outer: RasterView) -> tuple[slice, slice]:
-        """The window in the buffers of one that holds it, both of magnification 1."""
+        """Rows and columns of the window in the buffers of a window that contains it, both of magnification 1."""
         x, y = self.x - outer.x, self.y - outer.y
         return slice(y, y + self.height), slice(x, x + self.width)
 
     def overlaps(self, other: RasterView) -> bool:
-        """Whether they share pixels."""
+        """Whether two windows share pixels."""
         return (
             self.x < other.x + other.width
             and other.x < self.x + self.width
@@ -86,8 +92,8 @@ class RasterView:
             and other.y < self.y + self.height
         )
 
-    def joined(self, other: RasterView) -> RasterView:
-        """The smallest window that holds both."""
+    def union(self, other: RasterView) -> RasterView:
+        """Smallest window that contains two windows."""
         x, y = min(self.x, other.x), min(self.y, other.y)
         right = max(self.x + self.width, other.x + other.width)
         bottom = max(self.y + self.height, other.y + other.height)
@@ -95,23 +101,23 @@ class RasterView:
 
     @property
     def K(self) -> Float[np.ndarray, "3 3"]:
-        """(3, 3), camera coordinates to the buffer's pixels, centres at integers."""
+        """(3, 3), matrix from camera coordinates to the buffer's pixels, whose centres have integer coordinates."""
         m = self.magnification
         offset = [m * (0.5 - self.x - self.shift_px[0]) - 0.5, m * (0.5 - self.y - self.shift_px[1]) - 0.5]
         return np.array([[m, 0, offset[0]], [0, m, offset[1]], [0, 0, 1.0]]) @ self.cam.K
 
 
 def full_view(cam: Pinhole, magnification: int = 1) -> RasterView:
-    """The whole image of a camera."""
+    """Window that is the whole image of a camera."""
     return RasterView(cam, 0, 0, cam.width, cam.height, magnification)
 
 
 def enclosing(
     view: RasterView, points_world: Float[np.ndarray, "points 3"], margin_px: int
 ) -> RasterView | None:
-    """The part of a window in which some points lie, with a margin; None where none of it is theirs.
+    """Part of a window that contains the images of points, with a margin; None if this part is empty.
 
-    Points that reach behind the camera may be anywhere: they enclose all of the window.
+    If some points are in front of the camera and others behind it, the result is the whole window.
     """
     points = points_world @ view.cam.R.T + view.cam.t_m
     if points[:, 2].max() < NEAR_M:
@@ -135,7 +141,7 @@ _FLAT, _SMOOTH = (
 def empty_buffers(
     view: RasterView,
 ) -> tuple[Float[np.ndarray, "rows columns 3"], Float[np.ndarray, "rows columns"]]:
-    """Black, and infinitely far."""
+    """Black colour buffer, and depth buffer with the depth `FAR_M`."""
     return np.zeros((*view.shape, 3), np.float32), np.full(view.shape, FAR_M, np.float32)
 
 
@@ -146,14 +152,14 @@ def draw(
     colour_buffer: Float[np.ndarray, "rows columns 3"],
     depth_buffer: Float[np.ndarray, "rows columns"],
 ) -> None:
-    """Draw triangles into the buffers wherever they are nearer than what is there.
+    """Draw triangles into buffers at the pixels where the triangles are nearer than the buffer's depth.
 
     Args:
-        view: whose buffers these are.
-        triangles_world: (faces, 3, 3) corners in metres; those that reach behind `NEAR_M` are cut there.
-        colours: (faces, 1, 3) for one colour per face, or (faces, 3, 3) for one per corner.
-        colour_buffer: (rows, columns, 3), float32, changed.
-        depth_buffer: (rows, columns), float32 metres along the optical axis, changed.
+        view: view of the buffers.
+        triangles_world: (faces, 3, 3), corners, world, metres; triangles that reach behind `NEAR_M` are cut there.
+        colours: (faces, 1, 3), one colour per face, or (faces, 3, 3), one colour per corner.
+        colour_buffer: (rows, columns, 3), float32, changed in place.
+        depth_buffer: (rows, columns), float32, metres along the optical axis, changed in place.
     """
     corners = triangles_world.reshape(-1, 3) @ view.cam.R.T + view.cam.t_m
     settings = _SMOOTH if colours.shape[1] == 3 else _FLAT
@@ -189,9 +195,9 @@ def draw(
 def _cut_at_near(
     points: Float[np.ndarray, "faces 3 3"], colours: Float[np.ndarray, "faces 3 3"]
 ) -> tuple[Float[np.ndarray, "kept 3 3"], Float[np.ndarray, "kept 3 3"]]:
-    """Triangles in camera coordinates with what lies behind `NEAR_M` cut off (Sutherland and Hodgman, 1974).
+    """Cut triangles in camera coordinates at the depth `NEAR_M` (Sutherland and Hodgman, 1974).
 
-    OpenCV clips triangles wrongly where they reach behind the camera, as every wall of a room does.
+    OpenCV clips triangles that reach behind the camera wrongly, and the walls of a room reach behind the camera.
     """
     in_front = points[..., 2] >= NEAR_M
     whole = in_front.all(axis=1)

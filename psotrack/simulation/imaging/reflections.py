@@ -1,7 +1,7 @@
-"""The glossy floor, a mirror of a few per cent: the room in it is drawn once, drones in every frame.
+"""Reflections in the glossy floor, which mirrors a few per cent of the light.
 
-What the floor z = 0 mirrors is seen as if it were below it, at -z, through the floor. So the mirrored room has a depth
-buffer of its own, and hides the mirrored drones behind its furniture as the room hides the drones.
+The mirrored room is drawn once, and mirrored drones in every frame. A point at height z appears in the floor z = 0 as
+if it were at -z. The mirrored room has its own depth buffer, so that mirrored furniture hides mirrored drones.
 """
 
 from __future__ import annotations
@@ -18,22 +18,24 @@ from psotrack.simulation.imaging.raster import Pinhole, full_view
 from psotrack.simulation.scenarios import Imaging
 from psotrack.simulation.world.rooms import Room
 
-#: Standard deviation of the directions that one direction is mirrored into.
+#: Standard deviation of the direction of mirrored light.
 ROUGHNESS_RAD = 0.006
-#: Of eight passes, those that blurred mirror images are drawn in; their mean is the exposure's middle.
+#: Indices of the passes in which mirror images are drawn. Four of eight passes are enough, because mirror images are
+#: blurred; the mean of these four is the middle of the exposure.
 _PASSES = (0, 3, 4, 7)
-#: The mirrored room is blurred that many times, from not at all to as much as far things are.
+#: Number of blurred images of the mirrored room, from no blur to the blur of distant objects.
 _BLURS = 4
 
 
 @dataclass(frozen=True)
 class Mirror:
-    """The floor's mirror image of the empty room in one camera.
+    """Mirror image of the empty room in the floor, in one camera's image.
 
     Attributes:
-        share: (height, width), of light that the floor mirrors; 0 where it is not seen.
-        light: (height, width, 3), linear BGR, of the mirrored room.
-        depth_m: (height, width), of the mirrored room, along the optical axis.
+        cam: the camera.
+        share: (height, width), share of light that the floor mirrors; 0 at pixels without floor.
+        light: (height, width, 3), linear BGR light of the mirrored room.
+        depth_m: (height, width), depth of the mirrored room along the optical axis.
     """
 
     cam: Pinhole
@@ -42,12 +44,12 @@ class Mirror:
     depth_m: Float[np.ndarray, "height width"]
 
     def on(self, empty: Backdrop) -> Backdrop:
-        """The room with its mirror image on the floor."""
+        """Empty room with its mirror image in the floor."""
         share = self.share[..., None]
         return replace(empty, light=(1 - share) * empty.light + share * self.light)
 
     def share_of_rest(self, light: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:
-        """(height, width), how much of the light that comes from each pixel is not mirrored."""
+        """(height, width), share of each pixel's light that is not mirrored."""
         return 1 - self.share * self.light.sum(axis=-1) / np.maximum(light.sum(axis=-1), 1e-6)
 
     def reflect(
@@ -73,7 +75,7 @@ class Mirror:
             part[...] = sensor.develop(sensor.undevelop(part) + share * change)
 
     def _blur_px(self, below: list[PosedDrone], lens_blur_px: float) -> float:
-        """Standard deviation of the blur of mirrored drones: the more the farther they are behind the mirror."""
+        """Standard deviation of the blur of mirrored drones, which grows with their distance behind the mirror."""
         depth_m = -float(np.mean([drone.faces_m[0, :, :, 2].mean() for drone in below]))
         eye_m = -float((self.cam.R.T @ self.cam.t_m)[2])
         roughness_px = ROUGHNESS_RAD * self.cam.K[0, 0] * depth_m / (depth_m + eye_m)
@@ -81,13 +83,13 @@ class Mirror:
 
 
 def mirror(room: Room, cam: Pinhole, imaging: Imaging, empty: Backdrop) -> Mirror:
-    """The mirror image of a room in one camera.
+    """Mirror image of a room in its floor, in one camera's image.
 
     Args:
-        room: its first surface is the floor.
-        cam: above the floor.
-        imaging: its `reflections` is the share at normal incidence.
-        empty: the room without reflections, in that camera.
+        room: the room; its first surface is the floor.
+        cam: the camera, above the floor.
+        imaging: effects of camera and light; `reflections` is the mirrored share at normal incidence.
+        empty: the room without reflections in this camera's image.
     """
     below = [
         replace(
@@ -106,17 +108,17 @@ def mirror(room: Room, cam: Pinhole, imaging: Imaging, empty: Backdrop) -> Mirro
 
 
 def fresnel(cosine: Float[np.ndarray, "*shape"], at_normal: float) -> Float[np.ndarray, "*shape"]:
-    """Share of light that is mirrored at an angle of incidence (Schlick, 1994): all of it at grazing incidence."""
+    """Share of mirrored light by the cosine of the angle of incidence (Schlick, 1994); 1 at grazing incidence."""
     return at_normal + (1 - at_normal) * (1 - cosine) ** 5
 
 
 def _cover(floor: Bool[np.ndarray, "height width"], imaging: Imaging) -> Float[np.ndarray, "height width"]:
-    """(height, width), how much of a pixel is floor, as far as the lens lets it be told."""
+    """(height, width), share of the floor in each pixel after the lens's blur."""
     return lens_blur(floor.astype(np.float32), imaging.lens_blur_px)
 
 
 def _cosine_to_floor(cam: Pinhole) -> Float[np.ndarray, "height width"]:
-    """(height, width), of the angle between the line of sight and the floor's normal; 0 above the horizon."""
+    """(height, width), cosine of the angle between the line of sight and the floor's normal; 0 above the horizon."""
     to_world = (cam.R.T @ np.linalg.inv(cam.K)).astype(np.float32)
     x, y = np.arange(cam.width, dtype=np.float32), np.arange(cam.height, dtype=np.float32)[:, None]
     rays = [row[0] * x + row[1] * y + row[2] for row in to_world]
@@ -129,7 +131,7 @@ def _blurred(
     sigma_px: float,
     imaging: Imaging,
 ) -> Float[np.ndarray, "height width 3"]:
-    """The mirrored room, the more blurred the farther behind the mirror: what stands on the floor has a sharp foot."""
+    """Blurred light of the mirrored room; the blur is 0 at the floor and grows with the distance behind the mirror."""
     mixed = np.zeros_like(light)
     for step in range(_BLURS):
         blur_px = np.hypot(sigma_px * step / (_BLURS - 1), imaging.lens_blur_px)

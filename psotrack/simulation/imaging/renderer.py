@@ -1,6 +1,6 @@
-"""Frames: the backdrop with drones, their shadows and their mirror images drawn into it, then the sensor.
+"""Frames of static cameras: drones, shadows and mirror images are drawn over the backdrop, then the sensor is applied.
 
-Only windows around drones and their mirror images are drawn anew in each frame.
+Only windows around drones and their mirror images are drawn in each frame.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Image = UInt8[np.ndarray, "height width 3"]
 
 
 class CameraRenderer:
-    """Draws the frames of one camera of a scene; holds what stays the same between them."""
+    """Draws the frames of one static camera of a scene; the parts that all frames share are drawn once."""
 
     def __init__(self, scene: Scene, camera_index: int) -> None:
         imaging = scene.scenario.imaging
@@ -37,7 +37,7 @@ class CameraRenderer:
         self._samples = pass_samples(imaging)
 
     def clean_frame(self, frame: int) -> Image:
-        """The frame without what the sensor adds: BGR, (height, width, 3)."""
+        """(height, width, 3), BGR image of a frame without the effects of the sensor."""
         image = self._clean.copy()
         imaging = self.scene.scenario.imaging
         time_s = self.scene.time_s(frame)
@@ -51,7 +51,7 @@ class CameraRenderer:
         return image
 
     def frame(self, frame: int) -> Image:
-        """The frame as the sensor yields it, before the codec: BGR, (height, width, 3)."""
+        """(height, width, 3), BGR image of a frame from the sensor, before the codec."""
         return self.sensor.expose(self.clean_frame(frame), frame, self.scene.time_s(frame))
 
     def _draw_drones(self, image: Image, window: RasterView, drones: list[PosedDrone]) -> None:

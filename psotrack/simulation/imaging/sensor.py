@@ -1,8 +1,8 @@
-"""From light to the numbers of a sensor: gamma, drift of its gains, flicker of the lamps, noise, JPEG.
+"""The sensor of a camera: gamma, drift of the gains, flicker of the lamps, noise, JPEG.
 
-Noise is drawn once per camera as a tile and shown with another random offset in every frame: a pixel's noise is new
-in each frame, and costs no random numbers. What is random in a frame depends on (seed, stream, frame) only, and what
-changes slowly on (seed, stream, time), so that any frame can be drawn alone.
+The noise is drawn once per camera as a tile that is used with a random offset in each frame, so that a pixel's noise
+differs from frame to frame without new random numbers for each pixel. The randomness of a frame depends only on (seed,
+stream, frame), and slow changes depend only on (seed, stream, time), so any frame can be drawn alone.
 """
 
 from __future__ import annotations
@@ -16,20 +16,21 @@ from jaxtyping import Float, UInt8
 from psotrack.simulation.scenarios import Imaging
 
 GAMMA = 2.2
-#: Streams of random numbers of on-board cameras start here; static cameras have their index.
+#: Number of the first on-board camera's random stream; the stream of a static camera is the camera's index.
 ONBOARD_STREAM = 1000
 
-#: Slow changes are sums of that many sinusoids, with periods between these.
+#: Number of sinusoids of a slow change, and range of their periods.
 _DRIFT_TERMS, _DRIFT_PERIODS_S = 6, (5.0, 60.0)
+#: Largest offset of the noise tile.
 _TILE_MARGIN_PX = 128
-#: Noise tiles hold sigma 1 as that number.
+#: Value of one standard deviation in a noise tile.
 _TILE_UNIT = 32
-#: How channels share noise.
+#: Mixture of independent noises in the channels, which correlates the channels.
 _CHANNEL_MIX = np.array([[0.8, 0.2, 0.1], [0.2, 0.8, 0.2], [0.1, 0.2, 0.8]], np.float32)
-#: What random numbers are for. Never 0: NumPy takes a seed that ends in zeros for one without them.
+#: Last number of each random seed. It is never 0, because NumPy ignores zeros at the end of a seed.
 _FOR_TILE, _FOR_FRAME, _FOR_DRIFT, _FOR_MAINS = 1, 2, 3, 4
 
-#: Fine enough for the darkest levels, which gamma makes narrow in light.
+#: Steps of light in the table of grey levels; enough for the darkest grey levels, which cover a small range of light.
 _DISPLAY_STEPS = 65536
 
 
@@ -43,7 +44,7 @@ _LIGHT = ((np.arange(256) / 255) ** GAMMA).astype(np.float32)
 
 
 def develop(light: Float[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
-    """Grey levels of linear light, without noise: 1 is full scale, and what is brighter is cut off."""
+    """Grey levels of linear light, without noise; light 1 is full scale, and brighter light is clipped."""
     steps = np.clip(light * (_DISPLAY_STEPS - 1) + 0.5, 0, _DISPLAY_STEPS - 1)
     return _DISPLAY[steps.astype(np.uint16)]
 
@@ -56,13 +57,14 @@ def undevelop(image: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "
 def flicker_gain(imaging: Imaging, phase_rad: float, time_s: float) -> float:
     """Light of the lamps during one exposure, relative to their mean over time.
 
-    Lamps follow the power of the mains, sin^2(2 pi f t), and dim by `imaging.flicker` where it is 0. The mean of
-    1 - flicker cos^2(...) over the exposure [t - T / 2, t + T / 2] is a cosine at 2 f, sinc(2 f T) of it left.
+    Lamps follow the power of the mains, sin^2(2 pi f t); where the power is 0, their light is lower by the share
+    `imaging.flicker`. The mean of 1 - flicker cos^2(...) over the exposure [t - T / 2, t + T / 2] is a cosine of the
+    frequency 2 f whose amplitude has the factor sinc(2 f T).
 
     Args:
-        imaging: its `flicker`, `mains_hz` and `shutter_s`.
-        phase_rad: of the lamps' light at time 0.
-        time_s: the exposure's middle.
+        imaging: effects of camera and light; `flicker`, `mains_hz` and `shutter_s` are used.
+        phase_rad: phase of the lamps' light at time 0.
+        time_s: middle of the exposure.
     """
     lamp_hz = 2 * imaging.mains_hz
     ripple = np.sinc(lamp_hz * imaging.shutter_s) * np.cos(2 * np.pi * lamp_hz * time_s + phase_rad)
@@ -71,7 +73,7 @@ def flicker_gain(imaging: Imaging, phase_rad: float, time_s: float) -> float:
 
 @dataclass(frozen=True)
 class _Drift:
-    """A smooth random course over time, of standard deviation 1: sinusoids of one amplitude, per channel."""
+    """A smooth random function of time with standard deviation 1 per channel: a sum of sinusoids of equal amplitude."""
 
     angular_rad_s: Float[np.ndarray, "channels terms"]
     phase_rad: Float[np.ndarray, "channels terms"]
@@ -91,11 +93,11 @@ class Sensor:
     """One camera's sensor: gains that change with time, noise, JPEG.
 
     Args:
-        imaging: which of these, and how strong.
-        seed: of the simulation.
-        stream: other cameras have other noise; static ones have their index, on-board ones start at
-            `ONBOARD_STREAM`.
-        shape: (height, width).
+        imaging: strengths of the effects.
+        seed: seed of the simulation.
+        stream: number of the camera's random stream: the index of a static camera, or `ONBOARD_STREAM` plus the index
+            of the drone.
+        shape: height and width of the images, pixels.
     """
 
     def __init__(self, imaging: Imaging, seed: int, stream: int, shape: tuple[int, int]) -> None:
@@ -110,10 +112,10 @@ class Sensor:
         self._tile = _noise_tile(shape, self._rng(_FOR_TILE)) if sigma[-1] else None
 
     def gains(self, time_s: float) -> Float[np.ndarray, "3"]:
-        """(3,), BGR: linear light at a time, relative to what it would be without drift and flicker."""
+        """(3,), BGR, factors of linear light at a time by drift and flicker."""
         imaging = self._imaging
         white = self._white.at(time_s)
-        # Colours against one another: what they share is brightness. Without it 2/3 of the variance is left.
+        # The common part of the channels is brightness and is removed, which leaves 2/3 of the variance.
         white = np.sqrt(1.5) * (white - white.mean())
         drift = (1 + imaging.exposure_drift * self._exposure.at(time_s)) * (
             1 + imaging.white_balance_drift * white
@@ -123,8 +125,8 @@ class Sensor:
     def expose(
         self, image: UInt8[np.ndarray, "height width 3"], frame: int, time_s: float
     ) -> UInt8[np.ndarray, "height width 3"]:
-        """The image with the gains of a time, the noise of one frame, and what JPEG leaves of it."""
-        # Light times g is grey levels times g^(1 / gamma).
+        """Image with the gains at a time, the noise of one frame, and JPEG compression."""
+        # A factor g of light is a factor g^(1 / gamma) of grey levels.
         levels = np.arange(256)[:, None] * self.gains(time_s) ** (1 / GAMMA)
         exposed = cv2.LUT(image, np.clip(levels.round(), 0, 255).astype(np.uint8)[None])
         if self._tile is not None:
@@ -133,7 +135,7 @@ class Sensor:
             scale = 1 / (self._sigma_unit * _TILE_UNIT)
             noise = cv2.multiply(tile, cv2.LUT(exposed, self._sigma), scale=scale, dtype=cv2.CV_8S)
             exposed = cv2.add(exposed, noise, dtype=cv2.CV_8U)
-        return _through_jpeg(exposed, self._imaging.jpeg_quality) if self._imaging.jpeg_quality else exposed
+        return _compress(exposed, self._imaging.jpeg_quality) if self._imaging.jpeg_quality else exposed
 
     def _rng(self, purpose: int, frame: int = 0) -> np.random.Generator:
         return np.random.default_rng([self._seed, self._stream, frame, purpose])
@@ -141,12 +143,12 @@ class Sensor:
 
 def _noise_tile(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
     noise = rng.standard_normal((*(extent + _TILE_MARGIN_PX for extent in shape), 3), np.float32)
-    # Neighbours share noise, as demosaicing makes them, and so do channels.
+    # The noise of neighbouring pixels and of channels is correlated, as after demosaicing.
     mixed = cv2.transform(cv2.GaussianBlur(noise, (0, 0), 0.5), _CHANNEL_MIX)
     return np.clip((mixed * (_TILE_UNIT / mixed.std())).round(), -127, 127).astype(np.int8)
 
 
-def _through_jpeg(
+def _compress(
     image: UInt8[np.ndarray, "height width 3"], quality: int
 ) -> UInt8[np.ndarray, "height width 3"]:
     _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])

@@ -1,8 +1,8 @@
-"""Shadows of drones on the floor: soft, one for each lamp, and the dark under what is close to the floor.
+"""Shadows of drones on the floor: a soft shadow for each lamp, and a contact shadow in the ambient light.
 
-Lamps are equally high and the floor is flat, so a drone's footprint is the same under each of them: its outline from
-above, magnified, blurred by the panel's size, and moved. Ambient light comes from everywhere: what a flat thing takes
-of it is its outline, blurred more the higher it is. Where shadows fall is kept as a map of the floor.
+The lamps have the same height and the floor is flat, so a drone's shadow has the same shape under each lamp: the
+drone's outline from above, magnified, blurred by the panel's size, and shifted. In the ambient light, a flat object's
+shadow is its outline with a blur that grows with the height. The shadows are drawn on a map of the floor.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from psotrack.simulation.scene import Scene
 from psotrack.simulation.world.drones import DroneModel, disc_fans
 from psotrack.simulation.world.lighting import AMBIENT
 
-#: Cells of the floor, and of a drone's outline.
+#: Size of a cell of the floor's map, and of a cell of a drone's outline.
 _CELL_M, _FINE_M = 0.02, 0.01
-#: How much light a rotor disc takes away.
+#: Share of light that a rotor disc blocks.
 _DISC_SHARE = 0.25
-#: Less of the light than this is less than half a grey level.
+#: Share of lost light that is not visible, because it is less than half a grey level.
 _INVISIBLE = 0.01
 
-#: What a pixel is multiplied by, in 1/255, from the share of its light that is lost, in 1/255.
+#: Factor of a pixel's grey levels, in 1/255, by the share of lost light, in 1/255.
 _DARKER = (255 * (1 - np.arange(256) / 255) ** (1 / GAMMA)).round().astype(np.uint8)
 
 _UP = np.array([[0.0, 0.0, 1.0]])
 
 
 class FloorLight:
-    """The share of light that drones leave of what falls on the floor of a scene, as a map of its cells."""
+    """Map of the share of light that still reaches the floor of a scene under the drones."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -46,15 +46,15 @@ class FloorLight:
         extent = [float(np.linalg.norm(ground.along_m)), float(np.linalg.norm(ground.down_m))]
         self._shape = (round(extent[1] / _CELL_M), round(extent[0] / _CELL_M))
         along, down = ground.along_m / self._shape[1], ground.down_m / self._shape[0]
-        # Cell (column, row) to the floor's point; the floor is z = 0.
+        # Matrix from a cell (column, row, 1) to its point on the floor z = 0.
         self._cell_to_world = np.column_stack([along, down, ground.corner_m + 0.5 * (along + down)])
 
     def to_image(self, cam: Pinhole) -> Float[np.ndarray, "3 3"]:
-        """(3, 3), from a cell (column, row, 1) to the pixel that sees it."""
+        """(3, 3), matrix from a cell (column, row, 1) to its pixel."""
         return cam.K @ (cam.R @ self._cell_to_world + np.outer(cam.t_m, [0, 0, 1]))
 
     def floor_gain(self, time_s: float) -> Float[np.ndarray, "rows columns"]:
-        """(rows, columns), the share of light that still reaches each cell of the floor."""
+        """(rows, columns), share of light that reaches each cell of the floor at a time."""
         gain = np.ones(self._shape, np.float32)
         imaging = self._scene.scenario.imaging
         time = np.array([time_s])
@@ -63,12 +63,12 @@ class FloorLight:
         ):
             position, turn = flight.position_m(time)[0], flight.rotation(time)[0, :2, :2]
             if imaging.shadows:
-                self._cast_from_lamps(gain, outline, position, turn)
+                self._cast_lamp_shadows(gain, outline, position, turn)
             if imaging.contact_shadows:
-                self._cast_from_everywhere(gain, outline, underside_m, position, turn)
+                self._cast_ambient_shadow(gain, outline, underside_m, position, turn)
         return gain
 
-    def _cast_from_lamps(
+    def _cast_lamp_shadows(
         self,
         gain: Float[np.ndarray, "rows columns"],
         outline: Float[np.ndarray, "side side"],
@@ -78,18 +78,19 @@ class FloorLight:
         panels = self._scene.room.panels
         lamp_height = float(panels.centres_m[0, 2])
         magnified = lamp_height / (lamp_height - position[2])
-        # A panel of length s casts an edge s (m - 1) wide: a box, whose standard deviation is a 1 / sqrt(12) of it.
+        # The edge of a shadow from a panel of length s is s (m - 1) wide; the standard deviation of a uniform
+        # distribution is its width divided by sqrt(12).
         sigmas_m = [max(side * (magnified - 1) / np.sqrt(12), _CELL_M / 2) for side in panels.size_m]
-        patch = _turned(outline, turn, magnified, _CELL_M, 3 * max(sigmas_m))
+        patch = _turn_outline(outline, turn, magnified, _CELL_M, 3 * max(sigmas_m))
         patch = cv2.GaussianBlur(patch, (0, 0), sigmas_m[0] / _CELL_M, sigmaY=sigmas_m[1] / _CELL_M)
         falls = panels.centres_m + (position - panels.centres_m) * magnified
         ups = np.broadcast_to(_UP, falls.shape)
-        # (lamps, falls): light of each lamp where the shadow of each falls.
+        # (lamps, shadows), light of each lamp at the centre of each lamp's shadow.
         direct = np.stack([panels.direct(falls, ups, lamp) for lamp in panels.centres_m])
         for fall, weight in zip(falls, direct.diagonal() / (direct.sum(axis=0) + AMBIENT), strict=True):
             self._stamp(gain, float(weight) * patch, _CELL_M, fall)
 
-    def _cast_from_everywhere(
+    def _cast_ambient_shadow(
         self,
         gain: Float[np.ndarray, "rows columns"],
         outline: Float[np.ndarray, "side side"],
@@ -102,9 +103,9 @@ class FloorLight:
         weight = AMBIENT / self._scene.room.panels.on_faces(foot, _UP)[0]
         if weight * outline.sum() * _FINE_M**2 < _INVISIBLE * np.pi * height_m**2:
             return
-        # What is high up has a shadow without details.
+        # Shadows of high drones have no details, so larger cells are enough.
         cell_m = max(_CELL_M, height_m / 8)
-        patch = _turned(outline, turn, 1.0, cell_m, 3 * height_m)
+        patch = _turn_outline(outline, turn, 1.0, cell_m, 3 * height_m)
         self._stamp(gain, weight * ambient_blocked(patch, cell_m, height_m), cell_m, foot)
 
     def _stamp(
@@ -114,12 +115,12 @@ class FloorLight:
         cell_m: float,
         at_m: Float[np.ndarray, "3"],
     ) -> None:
-        """Take the patch's share of light away around a point of the floor."""
+        """Remove the share of light that a patch gives, centred at a point of the floor."""
         centre = np.array([at_m[0] - self._corner_m[0], self._corner_m[1] - at_m[1]]) / _CELL_M - 0.5
         magnified = cell_m / _CELL_M
         half = int(magnified * (len(patch) // 2)) + 1
         first = np.floor(centre).astype(int) - half
-        # From the patch's cells to the floor's: its middle comes to `centre`.
+        # Transformation from the patch's cells to the floor's cells, which moves the patch's middle to `centre`.
         offset = centre - first - magnified * (len(patch) // 2)
         side = 2 * half + 2
         A = np.array([[magnified, 0, offset[0]], [0, magnified, offset[1]]])
@@ -138,12 +139,12 @@ class FloorShadows(FloorLight):
         x, y, width, height = cv2.boundingRect(backdrop.floor.astype(np.uint8))
         self._window = (slice(y, y + height), slice(x, x + width))
         self._H = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]]) @ self.to_image(cam)
-        # Light that the floor mirrors does not come from above it, so nothing there takes it away.
+        # Drones above the floor do not block the light that the floor mirrors towards the camera.
         matt = backdrop.floor if mirror is None else backdrop.floor * mirror.share_of_rest(backdrop.light)
         self._matt = (255 * matt[self._window]).round().astype(np.uint8)
 
     def cast(self, image: UInt8[np.ndarray, "height width 3"], time_s: float) -> None:
-        """Darken the floor in the image."""
+        """Darken the floor in an image by the shadows at a time."""
         imaging = self._scene.scenario.imaging
         part = image[self._window]
         if not part.size or not (imaging.shadows or imaging.contact_shadows):
@@ -161,16 +162,16 @@ class FloorShadows(FloorLight):
 def ambient_blocked(
     outline: Float[np.ndarray, "side side"], cell_m: float, height_m: float
 ) -> Float[np.ndarray, "side side"]:
-    """(side, side), the share of ambient light that a flat thing takes from each cell of the floor below it.
+    """(side, side), share of ambient light that a flat object blocks from each cell of the floor below it.
 
-    From a floor point, an element dA of a horizontal plane at height h, r away sideways, takes the form factor
-    h^2 dA / (pi (h^2 + r^2)^2) of light that comes from everywhere. That is a convolution; its kernel's Fourier
-    transform is k h K1(k h), with the modified Bessel function K1.
+    For a point of the floor, an element dA of a horizontal plane at height h and horizontal distance r blocks the form
+    factor h^2 dA / (pi (h^2 + r^2)^2) of the ambient light. The sum over the object is a convolution; the Fourier
+    transform of its kernel is k h K1(k h), with the modified Bessel function K1.
 
     Args:
-        outline: share of light that each cell of the thing takes, seen from above; 0 well before its border.
+        outline: (side, side), share of light that each cell of the object blocks, seen from above; 0 near the border.
         cell_m: size of the cells.
-        height_m: of the thing above the floor.
+        height_m: height of the object above the floor.
     """
     side = scipy.fft.next_fast_len(len(outline), real=True)
     kh = 2 * np.pi * height_m / cell_m * np.hypot(scipy.fft.rfftfreq(side), scipy.fft.fftfreq(side)[:, None])
@@ -180,7 +181,7 @@ def ambient_blocked(
 
 
 def _outline(shape: DroneModel) -> Float[np.ndarray, "side side"]:
-    """(side, side), the share of light that a drone takes, from above, body x to the right and y up, fine cells."""
+    """(side, side), share of light that a drone blocks, seen from above, in cells of `_FINE_M`; x right, y up."""
     half = int(np.ceil(shape.radius_m / _FINE_M)) + 1
     outline = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
     for triangles, share in ((disc_fans(shape), _DISC_SHARE), (shape.triangles_m, 1.0)):
@@ -191,7 +192,7 @@ def _outline(shape: DroneModel) -> Float[np.ndarray, "side side"]:
 
 
 def _underside_m(shape: DroneModel) -> float:
-    """Mean height of what looks down, rotor discs by their share, in the body frame."""
+    """Mean height of the faces that point down, in the body frame; rotor discs have the weight `_DISC_SHARE`."""
     weight, height = [], []
     for triangles, share in ((disc_fans(shape), -_DISC_SHARE), (shape.triangles_m, 1.0)):
         a, b, c = triangles.swapaxes(0, 1)
@@ -200,16 +201,16 @@ def _underside_m(shape: DroneModel) -> float:
     return float(np.average(np.concatenate(height), weights=np.concatenate(weight)))
 
 
-def _turned(
+def _turn_outline(
     outline: Float[np.ndarray, "side side"],
     turn: Float[np.ndarray, "2 2"],
     magnified: float,
     cell_m: float,
     margin_m: float,
 ) -> Float[np.ndarray, "cells cells"]:
-    """(cells, cells), the outline turned and magnified, its middle in the middle of coarser cells."""
+    """(cells, cells), outline turned, magnified and resampled to cells of `cell_m`, centred."""
     half = int((len(outline) * _FINE_M * magnified / 2 + margin_m) / cell_m) + 2
-    # Rows count down where y counts up: a turn in the plane is its transpose in the image.
+    # Rows increase downwards and y upwards, so a rotation in the plane is the transposed rotation in the image.
     A = magnified * _FINE_M / cell_m * np.array([[turn[0, 0], -turn[0, 1]], [-turn[1, 0], turn[1, 1]]])
     offset = half - A @ np.full(2, len(outline) // 2)
     small = cv2.GaussianBlur(outline, (0, 0), cell_m / _FINE_M / 2 / magnified)

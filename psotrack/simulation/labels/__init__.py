@@ -1,1 +1,1 @@
-"""What comes with the videos: masks, detections, markers."""
+"""Labels of the simulated videos: masks, detections and mocap markers."""

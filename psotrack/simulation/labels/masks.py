@@ -1,4 +1,4 @@
-"""Where each drone is seen in the middle of an exposure: drawn in windows around drones, one sample per pixel."""
+"""Visible masks of drones in the middle of an exposure, drawn in windows around the drones, one sample per pixel."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from psotrack.simulation.imaging.raster import (
 from psotrack.simulation.scene import Scene
 from psotrack.simulation.world.drones import disc_fans
 
-#: Around what is drawn, in pixels.
+#: Margin of a window around its drone, pixels.
 _MARGIN_PX = 1
 
 
 @dataclass(frozen=True)
 class Silhouette:
-    """One drone in one image, in the middle of the exposure; discs of rotors count as drone.
+    """One drone in one image, in the middle of the exposure; rotor discs belong to the drone.
 
     Attributes:
-        number: of the drone, from 1.
-        window: the part of the image that holds it.
-        seen: (rows, columns) of the window, where nothing hides it.
-        whole_px: how many pixels it would have with nothing before it and an image without edges.
+        number: number of the drone, from 1.
+        window: part of the image that contains the drone.
+        seen: (rows, columns) of the window, True at the pixels where the drone is visible.
+        whole_px: number of pixels that the drone would have without occlusion and without the edges of the image.
     """
 
     number: int
@@ -41,12 +41,12 @@ class Silhouette:
 
     @property
     def seen_share(self) -> float:
-        """How much of it is seen, 0 to 1."""
+        """Visible share of the drone, 0 to 1."""
         return np.count_nonzero(self.seen) / self.whole_px if self.whole_px else 0.0
 
     @property
     def xyxy(self) -> Float[np.ndarray, "4"] | None:
-        """(4,), the box of what is seen, in the convention of `psotrack.geometry.boxes`; None where nothing is."""
+        """(4,), box of the visible part, in the convention of `psotrack.geometry.boxes`; None if nothing is visible."""
         rows, columns = (np.flatnonzero(self.seen.any(axis=axis)) for axis in (1, 0))
         if not len(rows):
             return None
@@ -54,7 +54,7 @@ class Silhouette:
         return np.array([x + columns[0], y + rows[0], x + columns[-1] + 1.0, y + rows[-1] + 1.0])
 
     def mask(self) -> Bool[np.ndarray, "height width"]:
-        """(height, width), where it is seen in the whole image."""
+        """(height, width), True at the pixels of the whole image where the drone is visible."""
         whole = np.zeros((self.window.cam.height, self.window.cam.width), bool)
         whole[self.window.slices] = self.seen
         return whole
@@ -63,29 +63,38 @@ class Silhouette:
 def silhouettes(
     scene: Scene, cam: Pinhole, backdrop_depth_m: Float[np.ndarray, "height width"], frame: int
 ) -> list[Silhouette]:
-    """The drones that a camera has within its image, whether something hides them or not, by number.
+    """Silhouettes of the drones within a camera's image, ordered by number; a silhouette may be fully occluded.
 
     Args:
-        scene: what flies.
+        scene: the scene.
         cam: the camera.
         backdrop_depth_m: (height, width), depth of the room, which may hide drones.
-        frame: its number.
+        frame: number of the frame.
     """
     time_s = scene.time_s(frame)
-    drawn = [_drawn(scene, cam, drone, time_s) for drone in range(len(scene.flights))]
-    there = [one for one in drawn if one is not None]
-    seen = [one.covered & (one.depth_m < backdrop_depth_m[one.window.slices]) for one in there]
-    for i, near in enumerate(there):
-        for j in range(i + 1, len(there)):
-            _hide(near, there[j], seen[i], seen[j])
+    drawn = [_draw_alone(scene, cam, drone, time_s) for drone in range(len(scene.flights))]
+    in_image = [drone for drone in drawn if drone is not None]
+    seen = [drone.covered & (drone.depth_m < backdrop_depth_m[drone.window.slices]) for drone in in_image]
+    for i, drone in enumerate(in_image):
+        for j in range(i + 1, len(in_image)):
+            _occlude(drone, in_image[j], seen[i], seen[j])
     return [
-        Silhouette(one.number, one.window, mask, one.whole_px) for one, mask in zip(there, seen, strict=True)
+        Silhouette(drone.number, drone.window, mask, drone.whole_px)
+        for drone, mask in zip(in_image, seen, strict=True)
     ]
 
 
 @dataclass(frozen=True)
 class _Drawn:
-    """A drone drawn alone: where it covers its window, and at what depth."""
+    """A drone drawn alone, without occlusion.
+
+    Attributes:
+        number: number of the drone, from 1.
+        window: part of the image that contains the drone.
+        covered: pixels of the window that the drone covers.
+        depth_m: depth of the drone at these pixels.
+        whole_px: number of pixels that the drone would have without the edges of the image.
+    """
 
     number: int
     window: RasterView
@@ -94,7 +103,7 @@ class _Drawn:
     whole_px: int
 
 
-def _drawn(scene: Scene, cam: Pinhole, drone: int, time_s: float) -> _Drawn | None:
+def _draw_alone(scene: Scene, cam: Pinhole, drone: int, time_s: float) -> _Drawn | None:
     shape, flight, at = scene.models[drone], scene.flights[drone], np.array([time_s])
     triangles = np.concatenate([shape.triangles_m, disc_fans(shape)])
     triangles = triangles @ flight.rotation(at)[0].T + flight.position_m(at)[0]
@@ -104,7 +113,7 @@ def _drawn(scene: Scene, cam: Pinhole, drone: int, time_s: float) -> _Drawn | No
         return None
     beyond = window
     if (points @ cam.R[2] + cam.t_m[2]).min() > NEAR_M:
-        # What the image's edges cut off counts as hidden.
+        # Parts of the drone outside the image count as hidden.
         around = RasterView(cam, -cam.width // 2, -cam.height // 2, 2 * cam.width, 2 * cam.height)
         beyond = enclosing(around, points, _MARGIN_PX) or window
     colour, depth_m = empty_buffers(beyond)
@@ -114,10 +123,10 @@ def _drawn(scene: Scene, cam: Pinhole, drone: int, time_s: float) -> _Drawn | No
     return _Drawn(drone + 1, window, covered[part], depth_m[part], int(np.count_nonzero(covered)))
 
 
-def _hide(
+def _occlude(
     one: _Drawn, other: _Drawn, seen: Bool[np.ndarray, "rows columns"], other_seen: Bool[np.ndarray, "r c"]
 ) -> None:
-    """Take from each of two drones what the other is before."""
+    """Remove from the visible masks of two drones the pixels where the other drone is nearer."""
     a, b = one.window, other.window
     if not a.overlaps(b):
         return

@@ -1,4 +1,4 @@
-"""What a motion capture system would report of the drones: the markers on their crosses, without noise."""
+"""Positions of the mocap markers on the drones, without noise."""
 
 from __future__ import annotations
 

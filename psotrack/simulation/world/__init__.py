@@ -1,1 +1,1 @@
-"""What there is to see: drones, and rooms with their light."""
+"""Drone models, and rooms with their light."""

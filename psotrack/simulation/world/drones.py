@@ -1,4 +1,4 @@
-"""The five drones that there are, and how a scenario's drone becomes a model.
+"""The five drone models of the package, and the model of a scenario's drone.
 
 Body frame: x ahead, y left, z up, metres; the origin is the middle of the frame plate, where a flight controller
 sits. It is not the middle of the silhouette: bodies and legs reach further down or up, as on real drones.
@@ -21,10 +21,10 @@ from psotrack.simulation.world.shapes import Triangles, beam, box, cylinder, pit
 
 
 def model(name: str | Mesh) -> DroneModel:
-    """The model of that name, or of that mesh.
+    """Drone model with a given name, or from a mesh.
 
     Raises:
-        SettingsError: there is none of that name; the message lists those there are.
+        SettingsError: no model has this name; the message lists the names.
         InputError: the mesh cannot be used.
     """
     if isinstance(name, Mesh):
@@ -53,7 +53,7 @@ def _ring(radius: float, angles_deg: tuple[float, ...], z: float) -> Float[np.nd
 
 
 def x_frame() -> DroneModel:
-    """A carbon X frame with its battery on top: 0.34 m from motor to motor, 0.39 m over all along x."""
+    """Carbon X frame with its battery on top: 0.34 m from motor to motor, 0.39 m long along x."""
     arms = (45.0, 135.0, 225.0, 315.0)
     motors = _ring(0.17, arms, 0.012)
     parts = [
@@ -70,7 +70,7 @@ def x_frame() -> DroneModel:
 
 
 def x_frame_racer() -> DroneModel:
-    """A small low racing X, stretched ahead: 0.25 m from motor to motor, 0.34 m over all along x."""
+    """Small flat racing X frame, longer than wide: 0.25 m from motor to motor, 0.34 m long along x."""
     motors = np.array([(sx * 0.105, sy * 0.068, 0.004) for sx, sy in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
     parts = [
         (box((0.0, 0.0, -0.010), (0.150, 0.040, 0.006)), 1.0),
@@ -95,7 +95,7 @@ def x_frame_racer() -> DroneModel:
 
 
 def camera_drone() -> DroneModel:
-    """A folding camera drone: long rounded body, thin arms from its corners, a gimbal below its nose; 0.46 m wide."""
+    """Folding camera drone: long rounded body, thin arms at its corners, gimbal below its nose; 0.46 m wide."""
     motors = np.array(
         [(0.14, 0.15, 0.030), (0.14, -0.15, 0.030), (-0.13, 0.14, 0.006), (-0.13, -0.14, 0.006)]
     )
@@ -115,7 +115,7 @@ def camera_drone() -> DroneModel:
 
 
 def hexacopter() -> DroneModel:
-    """A hexacopter on landing skids with a payload between them: 0.55 m from motor to motor, 0.80 m over all."""
+    """Hexacopter on landing skids with a payload between them: 0.55 m from motor to motor, 0.80 m overall."""
     arms = (30.0, 90.0, 150.0, 210.0, 270.0, 330.0)
     motors = _ring(0.275, arms, 0.024)
     parts = [
@@ -125,7 +125,7 @@ def hexacopter() -> DroneModel:
         (box((0.0, 0.0, -0.036), (0.15, 0.07, 0.042)), 0.4),
         (cylinder((-0.045, 0.0, 0.100), 0.004, 0.085, sides=6), 0.0),
         (cylinder((-0.045, 0.0, 0.148), 0.028, 0.014, 0.8, sides=10), 0.6),
-        # The payload: a stalk, a yoke, a camera.
+        # Payload: a stalk, a yoke and a camera.
         (cylinder((0.02, 0.0, -0.078), 0.012, 0.044, sides=8), 0.0),
         (box((0.02, 0.0, -0.104), (0.05, 0.10, 0.010)), 0.2),
         (box((0.03, 0.0, -0.138), (0.095, 0.065, 0.060)), 0.1),
@@ -141,7 +141,7 @@ def hexacopter() -> DroneModel:
 
 
 def tall_cross() -> DroneModel:
-    """A cross frame with a tall body and landing legs: 0.40 m from motor to motor, 0.58 m over all along x."""
+    """Cross frame with a tall body and landing legs: 0.40 m from motor to motor, 0.58 m long along x."""
     arms = (0.0, 90.0, 180.0, 270.0)
     motors = _ring(0.20, arms, 0.020)
     parts = [

@@ -1,4 +1,4 @@
-"""The halls there are: their plans, and the rigs of cameras that hang in them."""
+"""Plans of the halls, and the camera rigs in them."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 from psotrack.simulation.scenarios import CameraPlace, Vector
 from psotrack.simulation.world import textures
 
-#: Length and height in metres, size of a texel, generator: the texture.
+#: Function that draws a texture: length and height in metres, size of a texel in metres, random generator.
 Painter = Callable[[float, float, float, np.random.Generator], textures.Texture]
 
 
 @dataclass(frozen=True)
 class Box:
-    """A piece of furniture, or a part of one."""
+    """A box with the colour `bgr` (linear reflectance): a piece of furniture or a part of it."""
 
     lower_m: Vector
     upper_m: Vector
@@ -25,19 +25,21 @@ class Box:
 
 @dataclass(frozen=True)
 class Hall:
-    """The plan of a room: a hall around the origin, floor at z = 0.
+    """Plan of a hall around the origin, with the floor at z = 0.
 
     Attributes:
-        size_m: length along x, along y, and height.
-        lamps_xy_m: centres of the panels in the ceiling.
-        lamp_size_m: of each panel, along x and y.
-        markers: ArUco markers on the walls at y > 0, x > 0, y < 0 and x < 0; ids count from 1 in that order.
-        marker_size_m: of the black square.
-        texel_m: of floor and walls at full size; about a pixel at the nearest distance that drones are seen at.
-        light_step_m: of lightmaps; panels are large, so shadows are soft.
-        floor, ceiling, walls: what draws their textures.
+        size_m: length along x, length along y, and height.
+        lamps_xy_m: centres of the lamp panels in the ceiling.
+        lamp_size_m: size of each panel along x and y.
+        markers: numbers of ArUco markers on the walls at y > 0, x > 0, y < 0 and x < 0; ids start at 1 in this order.
+        marker_size_m: side of a marker's black square.
+        texel_m: texel size of floor and walls at full size; about a pixel at the smallest distance of a drone.
+        light_step_m: step of the lightmaps; it can be large, because the large panels make soft shadows.
+        floor: function that draws the floor's texture.
+        ceiling: function that draws the ceiling's texture.
+        walls: function that draws the walls' textures.
         boxes: furniture.
-        seed: of its textures.
+        seed: seed of the textures.
     """
 
     size_m: Vector
@@ -55,7 +57,7 @@ class Hall:
 
 
 def _table(corner_m: tuple[float, float], size_m: tuple[float, float], bgr: Vector) -> tuple[Box, ...]:
-    """A table top on four legs, by the corner of least x and y."""
+    """Table top on four legs; `corner_m` is the corner with the smallest x and y."""
     (x1, y1), (length, width) = corner_m, size_m
     leg_m, inset_m, top_m = 0.06, 0.05, 0.75
     legs = [
@@ -82,7 +84,7 @@ _LABORATORY = Hall(
     walls=textures.wall,
     seed=2025,
     boxes=(
-        # Two pillars that stand free: they hide drones from some cameras now and then.
+        # Two free-standing pillars, which occlude drones in some cameras for short times.
         Box((-2.1, 2.75, 0.0), (-1.85, 3.0, 4.0), (0.48, 0.50, 0.52)),
         Box((1.7, -3.0, 0.0), (1.92, -2.78, 4.0), (0.30, 0.33, 0.36)),
         # Cupboards and shelves along the walls.
@@ -91,7 +93,7 @@ _LABORATORY = Hall(
         Box((4.55, 1.5, 0.0), (4.98, 2.4, 2.0), (0.22, 0.10, 0.09)),
         Box((-2.4, 3.5, 0.0), (-0.6, 3.98, 0.85), (0.20, 0.30, 0.42)),
         Box((1.2, -3.98, 0.0), (2.8, -3.45, 0.95), (0.12, 0.13, 0.14)),
-        # A table with screens, and things upon it.
+        # A table with screens.
         Box((-2.9, -3.9, 0.70), (-1.1, -3.1, 0.74), (0.35, 0.45, 0.55)),
         Box((-2.85, -3.85, 0.0), (-2.79, -3.79, 0.70), (0.05, 0.05, 0.05)),
         Box((-1.21, -3.85, 0.0), (-1.15, -3.79, 0.70), (0.05, 0.05, 0.05)),
@@ -122,7 +124,7 @@ _LARGE_HALL = Hall(
     walls=textures.cladding,
     seed=2026,
     boxes=(
-        # Columns and poles that stand free: they hide drones from some cameras now and then.
+        # Free-standing columns and poles, which occlude drones in some cameras for short times.
         Box((-3.9, 5.2, 0.0), (-3.5, 5.6, 8.0), (0.48, 0.50, 0.52)),
         Box((3.5, -5.7, 0.0), (3.9, -5.3, 8.0), (0.30, 0.33, 0.36)),
         Box((6.1, 2.0, 0.0), (6.45, 2.35, 8.0), (0.20, 0.28, 0.42)),
@@ -165,7 +167,7 @@ _LARGE_HALL = Hall(
 
 HALLS: Mapping[str, Hall] = {"laboratory": _LABORATORY, "large_hall": _LARGE_HALL}
 
-#: Four in the corners; cam5 and cam6 2 cm apart; cam7 and cam8 both near x = 0 (as the paper places them).
+#: cam1 to cam4 are in the corners, cam5 and cam6 2 cm apart, cam7 and cam8 both near x = 0, as in the paper.
 LABORATORY_CAMERAS = (
     CameraPlace(position_m=(-4.7, -3.7, 3.1), target_m=(0.1, 0.0, 1.25)),
     CameraPlace(position_m=(4.7, -3.7, 3.0), target_m=(0.0, 0.1, 1.3)),

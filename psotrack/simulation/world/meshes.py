@@ -1,4 +1,4 @@
-"""Drones from mesh files: OBJ and PLY."""
+"""Drone models from mesh files, OBJ and PLY."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from psotrack.simulation.world.models import DroneModel
 from psotrack.simulation.world.shapes import Triangles
 
 _SUFFIXES = (".obj", ".ply")
-#: What a drone may measure over all: smaller or larger is a file in other units.
+#: Smallest and largest extent of a drone. A mesh outside this range is in other units.
 _SMALLEST_M, _LARGEST_M = 0.02, 3.0
-#: Faces of less are lines or points to any camera, and have no normal.
+#: Largest area of a face that is left out. Such faces are lines or points, without a normal.
 _NO_AREA_M2 = 1e-12
 
 
 def load(mesh: Mesh) -> DroneModel:
-    """A user's own drone.
+    """Read a drone model from a mesh file.
 
-    Polygons become triangles, faces without an area are left out; colours, textures and materials are ignored: all
-    of it has the drone's paint.
+    Polygons become triangles, and faces without an area are left out. Colours, textures and materials are ignored: all
+    faces have the drone's paint.
 
     Args:
-        mesh: the file, and how it lies in the body frame.
+        mesh: file, and its place in the body frame.
 
     Raises:
-        InputError: there is no such file, it is no mesh, has no faces, or it or a rotor is not of a drone's size in
-            metres.
+        InputError: the file does not exist, is not a mesh or has no faces, or the mesh or a rotor does not have the
+            size of a drone.
     """
     path = Path(mesh.file)
     triangles = mesh.scale * _read(path) - np.array(mesh.origin_m)
@@ -53,7 +53,7 @@ def load(mesh: Mesh) -> DroneModel:
 
 
 def _read(path: Path) -> Triangles:
-    """The triangles of a file, in its own units."""
+    """Triangles of a file, in the file's units."""
     suffix = path.suffix.lower()
     if suffix not in _SUFFIXES:
         raise InputError(
@@ -68,18 +68,18 @@ def _read(path: Path) -> Triangles:
         raise InputError(
             path, expected="a mesh file", found=error.strerror or str(error), remedy="check the drone's model"
         ) from error
-    # It takes a while to import, and few scenarios need it.
+    # Imported here, because the import is slow and few scenarios need it.
     import trimesh
 
     try:
-        # Names of parts and comments may be in any encoding; nothing depends on them.
+        # Names of parts and comments may be in any encoding; they are not used.
         file = io.StringIO(content.decode(errors="replace")) if suffix == ".obj" else io.BytesIO(content)
         read = trimesh.load_mesh(file, file_type=suffix[1:], process=False, skip_materials=True)
         vertices, faces = np.asarray(read.vertices, float), np.asarray(read.faces, int)
-    # Each of its parsers fails in its own way.
+    # Each parser of trimesh has different errors.
     except Exception as error:
         raise InputError(
-            path, expected="a mesh", found=f"what cannot be read as one ({error})", remedy="export it again"
+            path, expected="a mesh", found=f"a file that cannot be read ({error})", remedy="export it again"
         ) from error
     if faces.size and not 0 <= faces.min() <= faces.max() < len(vertices):
         raise InputError(
@@ -97,7 +97,7 @@ def _area_m2(triangles: Triangles) -> Float[np.ndarray, "faces"]:
 
 
 def _check_size(path: Path, mesh: Mesh, points_m: Float[np.ndarray, "points 3"]) -> None:
-    """Raise `InputError` unless points in the body frame are a drone's."""
+    """Raise `InputError` unless points in the body frame have the size of a drone and are near the origin."""
     extent = float(np.ptp(points_m, axis=0).max())
     if not _SMALLEST_M <= extent <= _LARGEST_M:
         raise InputError(
@@ -112,17 +112,17 @@ def _check_size(path: Path, mesh: Mesh, points_m: Float[np.ndarray, "points 3"])
             path,
             expected="the body origin in or near the drone",
             found=f"the drone's middle at ({', '.join(f'{at:.3g}' for at in middle)}) m",
-            remedy="set origin_m to about that",
+            remedy="set origin_m to about this point",
         )
 
 
 def _check_rotors(path: Path, reach_m: Float[np.ndarray, "rotors"]) -> None:
-    """Raise `InputError` if rotors reach farther from the origin than a drone does."""
+    """Raise `InputError` if a rotor reaches farther from the origin than a drone can."""
     for number, farthest_m in enumerate(reach_m):
         if farthest_m > _LARGEST_M:
             raise InputError(
                 path,
                 expected=f"rotors within {_LARGEST_M:g} m of the body origin",
                 found=f"rotors[{number}] that reaches {farthest_m:.3g} m",
-                remedy="centre_m and radius_m are in metres, whatever the scale of the mesh",
+                remedy="give centre_m and radius_m in metres; the scale of the mesh does not apply to them",
             )

@@ -1,4 +1,4 @@
-"""What a drone is to the simulator: faces, rotors, and the cross of mocap markers on top of it."""
+"""Drone models: faces, rotors, and the cross of mocap markers on top."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-#: Corners of a rotor disc's rim.
+#: Number of corners of a rotor disc.
 _DISC_SIDES = 20
-#: Markers stand on masts, clear of everything that could hide them from above.
+#: Height of the markers above the highest point of the drone, so that the drone does not hide them from above.
 _MAST_M = 0.03
 
 
 @dataclass(frozen=True)
 class DroneModel:
-    """A drone's shape in its body frame.
+    """Shape of a drone in its body frame.
 
     Attributes:
         triangles_m: (faces, 3, 3), corners counter-clockwise seen from outside.
-        paint: (faces,), how much of the drone's own paint a face has; the rest is dark plastic.
-        rotor_centres_m: (rotors, 3), hubs; discs lie level in the body frame.
-        rotor_radii_m: (rotors,).
+        paint: (faces,), share of the drone's paint in the colour of a face; the rest is dark plastic.
+        rotor_centres_m: (rotors, 3), hubs; the discs are horizontal in the body frame.
+        rotor_radii_m: (rotors,), radii of the rotor discs.
     """
 
     triangles_m: Float[np.ndarray, "faces 3 3"]
@@ -32,21 +32,21 @@ class DroneModel:
 
     @functools.cached_property
     def normals(self) -> Float[np.ndarray, "faces 3"]:
-        """(faces, 3), unit vectors out of the faces."""
+        """(faces, 3), outward unit normals of the faces."""
         a, b, c = self.triangles_m.swapaxes(0, 1)
         outwards = np.cross(b - a, c - a)
         return outwards / np.linalg.norm(outwards, axis=-1, keepdims=True)
 
     @functools.cached_property
     def radius_m(self) -> float:
-        """Of the smallest sphere about the origin that holds the drone, rotors included."""
+        """Radius of the smallest sphere about the origin that contains the drone with its rotors."""
         body = np.linalg.norm(self.triangles_m, axis=-1).max()
         reach = np.linalg.norm(self.rotor_centres_m, axis=-1) + self.rotor_radii_m
         return float(max(body, reach.max(initial=0.0)))
 
 
 def disc_fans(model: DroneModel) -> Float[np.ndarray, "slices 3 3"]:
-    """(slices, 3, 3): the rotor discs as triangles around their hubs, body frame."""
+    """(slices, 3, 3), rotor discs as triangles around their hubs, body frame."""
     angle = 2 * np.pi * np.arange(_DISC_SIDES + 1) / _DISC_SIDES
     rim = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
     fan = np.stack([np.zeros_like(rim[:-1]), rim[:-1], rim[1:]], axis=1)
@@ -54,8 +54,9 @@ def disc_fans(model: DroneModel) -> Float[np.ndarray, "slices 3 3"]:
     return discs.reshape(-1, 3, 3)
 
 
-#: Arms of the crosses: ahead, left, back, right. The six distances between the markers of one cross differ by at
-#: least 12 mm; those of two crosses, in order of length, somewhere by at least 20 mm. Found by search.
+#: Lengths of the crosses' arms: ahead, left, back, right. The six distances between the markers of one cross differ
+#: from each other by at least 12 mm. For any two crosses, the sorted distances differ in at least one place by at least
+#: 20 mm. The lengths were found by a search.
 _CROSS_ARMS_M = (
     (0.055, 0.085, 0.115, 0.105),
     (0.115, 0.120, 0.095, 0.060),
@@ -75,14 +76,14 @@ _CROSS_ARMS_M = (
 
 
 def marker_cross(model: DroneModel, number: int) -> Float[np.ndarray, "4 3"]:
-    """(4, 3), the mocap markers A, B, C and D of a drone in its body frame: ahead, left, back, right.
+    """(4, 3), mocap markers A, B, C and D of a drone in its body frame: ahead, left, back, right.
 
-    They form an asymmetric cross above the highest point of the model. Its arms depend on the drone's number, so that
-    a motion capture system tells drones from one another by distances between their markers alone.
+    The markers form an asymmetric cross above the highest point of the model. The arms depend on the drone's number, so
+    that a motion capture system can distinguish the drones by the distances between their markers.
 
     Args:
-        model: the drone's shape.
-        number: of the drone in its sequence, from 1; after the last cross comes the first again.
+        model: shape of the drone.
+        number: number of the drone in its sequence, from 1; after the last cross, the first cross is used again.
     """
     ahead, left, back, right = _CROSS_ARMS_M[(number - 1) % len(_CROSS_ARMS_M)]
     height = float(model.triangles_m[..., 2].max()) + _MAST_M

@@ -1,4 +1,4 @@
-"""Rooms: textured rectangles (floor, walls, ceiling, furniture, markers), with their light baked in."""
+"""Rooms: textured rectangles (floor, walls, ceiling, furniture, markers) with light in their textures."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ from psotrack.simulation.world.halls import HALLS, Box, Hall
 from psotrack.simulation.world.lighting import Lamps, bake, lamps
 
 MARKER_DICTIONARY = cv2.aruco.DICT_4X4_1000
-#: Textures for small images have texels up to so many times as large.
+#: Largest factor of the texel size for small images.
 _COARSEST = 8
-#: White paper around the black square, as a share of its size.
+#: Width of the white margin around a marker's black square, as a share of the square's side.
 _MARKER_MARGIN = 0.2
-#: Upper edges of sheets, from the ceiling, as shares of its height; they take turns.
+#: Distances of the sheets' upper edges from the ceiling, as shares of the hall's height, used in turn.
 _MARKER_TOPS = (0.1875, 0.3625, 0.5375)
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A textured rectangle, seen from both sides.
+    """A textured rectangle, visible from both sides.
 
     Attributes:
-        corner_m: (3,), where the texture's first texel lies.
-        along_m, down_m: (3,), edges along the texture's columns and rows.
-        texture: (rows, columns, 3), linear BGR light, 1 is white in the middle of the floor.
+        corner_m: (3,), corner at the texture's first texel.
+        along_m: (3,), edge in the direction of increasing columns of the texture.
+        down_m: (3,), edge in the direction of increasing rows of the texture.
+        texture: (rows, columns, 3), linear BGR light; 1 is white in the middle of the floor.
     """
 
     corner_m: Float[np.ndarray, "3"]
@@ -42,13 +43,13 @@ class Surface:
 
     @property
     def normal(self) -> Float[np.ndarray, "3"]:
-        """(3,), unit normal, out of the side from which the texture is not mirrored."""
+        """(3,), unit normal of the side from which the texture does not appear mirrored."""
         n = np.cross(self.down_m, self.along_m)
         return n / np.linalg.norm(n)
 
     @property
     def corners_m(self) -> Float[np.ndarray, "4 3"]:
-        """(4, 3): top left, top right, bottom right, bottom left of the texture."""
+        """(4, 3), corners: top left, top right, bottom right, bottom left of the texture."""
         a, b = self.along_m, self.down_m
         return self.corner_m + np.stack([np.zeros(3), a, a + b, b])
 
@@ -58,9 +59,9 @@ class Room:
     """A lit room.
 
     Attributes:
-        surfaces: the first is the floor.
-        panels: its lamps.
-        marker_corners_m: (4, 3) per marker: top left, top right, bottom right, bottom left of the black square.
+        surfaces: all surfaces; the first is the floor.
+        panels: lamp panels.
+        marker_corners_m: (4, 3) by marker id: top left, top right, bottom right, bottom left of the black square.
     """
 
     surfaces: tuple[Surface, ...]
@@ -70,24 +71,24 @@ class Room:
 
 @functools.lru_cache(maxsize=2)
 def room(name: str, with_markers: bool, scale: float) -> Room:
-    """The room of that name, with light and textures ready; the same every time.
+    """Room of a hall, with light in its textures.
 
     Args:
-        name: in `HALLS`.
-        with_markers: whether ArUco markers hang on its walls.
-        scale: of the images, 1 is full size; textures are as fine as it needs.
+        name: name of a hall in `HALLS`.
+        with_markers: whether ArUco markers hang on the walls.
+        scale: scale of the image size, 1 is full size; it decides the resolution of the textures.
 
     Raises:
-        SettingsError: there is no such room; the message lists those there are.
+        SettingsError: no hall has this name; the message lists the names.
     """
     if name not in HALLS:
         raise SettingsError("room", expected=f"one of {', '.join(HALLS)}", found=name)
     hall = HALLS[name]
     texel_m = hall.texel_m * min(max(1.0, 1 / scale), _COARSEST)
-    return _furnished(hall, with_markers, round(texel_m, 3))
+    return _build(hall, with_markers, round(texel_m, 3))
 
 
-def _furnished(hall: Hall, with_markers: bool, texel_m: float) -> Room:
+def _build(hall: Hall, with_markers: bool, texel_m: float) -> Room:
     length, width, height = hall.size_m
     x, y = length / 2, width / 2
     rng = np.random.default_rng(hall.seed)
@@ -118,24 +119,26 @@ def _furnished(hall: Hall, with_markers: bool, texel_m: float) -> Room:
             surface, marker_corners[marker] = _marker(marker, hall.marker_size_m, corner, along)
             surfaces.append(surface)
     boxes_m = np.array([(box.lower_m, box.upper_m) for box in hall.boxes])
-    lit = [_lit(surface, hall.light_step_m, panels, boxes_m) for surface in surfaces]
-    glowing = [_lamp(centre, panels.size_m) for centre in panels.centres_m]
-    return Room((*lit, *glowing), panels, marker_corners)
+    lit = [_add_light(surface, hall.light_step_m, panels, boxes_m) for surface in surfaces]
+    lamp_surfaces = [_lamp(centre, panels.size_m) for centre in panels.centres_m]
+    return Room((*lit, *lamp_surfaces), panels, marker_corners)
 
 
 def _surface(corner: Vector, along: Vector, down: Vector, texture: textures.Texture) -> Surface:
     return Surface(np.array(corner, float), np.array(along, float), np.array(down, float), texture)
 
 
-def _lit(surface: Surface, step_m: float, panels: Lamps, boxes_m: Float[np.ndarray, "boxes 2 3"]) -> Surface:
-    """The surface with its light baked into its texture."""
+def _add_light(
+    surface: Surface, step_m: float, panels: Lamps, boxes_m: Float[np.ndarray, "boxes 2 3"]
+) -> Surface:
+    """Surface with its texture multiplied by the light; changes the texture in place."""
     columns, rows = (max(2, int(np.linalg.norm(edge) / step_m)) for edge in (surface.along_m, surface.down_m))
     u, v = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
     points = surface.corner_m + u[..., None] * surface.along_m + v[..., None] * surface.down_m
     light = bake(points, surface.normal, panels, boxes_m)
     height, width = surface.texture.shape[:2]
     fine = cv2.resize(light.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
-    # In place: textures of a large hall at full size are most of a process's memory.
+    # In place, because the textures of a large hall take most of a process's memory.
     texture = np.multiply(surface.texture, fine[..., None], out=surface.texture)
     return Surface(surface.corner_m, surface.along_m, surface.down_m, texture)
 
@@ -149,7 +152,7 @@ def _lamp(centre: Float[np.ndarray, "3"], size_m: tuple[float, float]) -> Surfac
 def _marker_places(
     walls: Sequence[Surface], hall: Hall
 ) -> list[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]]:
-    """Top left corner of each sheet, and the direction along it: spread over the walls, at changing heights."""
+    """Top left corner of each marker's sheet, and direction of its upper edge; sheets are spread over the walls."""
     sheet_m = hall.marker_size_m * (1 + 2 * _MARKER_MARGIN)
     places = []
     for wall, count in zip(walls, hall.markers, strict=True):
@@ -158,7 +161,7 @@ def _marker_places(
         for i in range(count):
             left = (i + 0.5) * length / count - sheet_m / 2
             top = hall.size_m[2] * _MARKER_TOPS[i % len(_MARKER_TOPS)]
-            # A little before the wall, so that the depth buffer can tell them apart.
+            # A little in front of the wall, so that the depth buffer separates sheet and wall.
             corner = wall.corner_m + left * along - np.array([0.0, 0.0, top]) + 0.01 * wall.normal
             places.append((corner, along))
     return places
@@ -167,7 +170,7 @@ def _marker_places(
 def _marker(
     marker: int, size_m: float, corner: Float[np.ndarray, "3"], along: Float[np.ndarray, "3"]
 ) -> tuple[Surface, Float[np.ndarray, "4 3"]]:
-    # As many texels that edges of cells stay edges of texels when the texture is halved, and halved again.
+    # 20 texels per cell, so that cell edges remain texel edges when the texture is halved twice.
     per_cell, cells = 20, 6
     side_px = per_cell * cells
     margin_px = round(_MARKER_MARGIN * side_px)
@@ -183,7 +186,7 @@ def _marker(
 
 
 def _sides(box: Box, texel_m: float, rng: np.random.Generator) -> list[Surface]:
-    """The four sides and the top of a box."""
+    """Four sides and top of a box."""
     (x1, y1, z1), (x2, y2, z2) = box.lower_m, box.upper_m
     x, y, z = x2 - x1, y2 - y1, z2 - z1
     sides = (
@@ -200,7 +203,7 @@ def _sides(box: Box, texel_m: float, rng: np.random.Generator) -> list[Surface]:
 
 
 def _underside(box: Box, texel_m: float, rng: np.random.Generator) -> Surface:
-    """The bottom of a box that stands on no floor: drones fly below table tops."""
+    """Bottom of a box above the floor, such as a table top, which drones can fly below."""
     (x1, y1, z), (x2, y2, _) = box.lower_m, box.upper_m
     texture = textures.plain(x2 - x1, y2 - y1, texel_m, box.bgr, rng)
     return _surface((x1, y1, z), (x2 - x1, 0.0, 0.0), (0.0, y2 - y1, 0.0), texture)

@@ -1,4 +1,4 @@
-"""Solids that drones are built of: triangles in metres, corners counter-clockwise seen from outside."""
+"""Solids for drone models: triangles in metres, corners counter-clockwise seen from outside."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ Point = tuple[float, float, float]
 
 
 def box(centre: Point, size: Point, taper: float = 1.0) -> Triangles:
-    """A box whose top is `taper` times as long and wide as its bottom."""
+    """Box whose top is `taper` times as long and wide as its bottom."""
     x, y, z = np.array(size) / 2
     ring = np.array([(-x, -y), (x, -y), (x, y), (-x, y)])
     return _prism(ring, -z, z, taper) + np.array(centre)
 
 
 def cylinder(centre: Point, radius: float, height: float, taper: float = 1.0, sides: int = 10) -> Triangles:
-    """An upright cylinder whose top is `taper` times as wide as its bottom."""
+    """Upright cylinder whose top is `taper` times as wide as its bottom."""
     angle = 2 * np.pi * np.arange(sides) / sides
     ring = radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return _prism(ring, -height / 2, height / 2, taper) + np.array(centre)
 
 
 def beam(start: Point, end: Point, width: float, height: float) -> Triangles:
-    """A straight bar of rectangular section between two points that do not lie above one another."""
+    """Straight bar of rectangular section between two points, which must not be vertically above each other."""
     a, b = np.array(start), np.array(end)
     length = float(np.linalg.norm(b - a))
     ahead = (b - a) / length
@@ -36,13 +36,13 @@ def beam(start: Point, end: Point, width: float, height: float) -> Triangles:
 
 
 def turned(triangles: Triangles, angle_rad: float) -> Triangles:
-    """Turned about the z axis, from x towards y."""
+    """Triangles turned about the z axis, from x towards y."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return triangles @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def pitched(triangles: Triangles, angle_rad: float, about: Point) -> Triangles:
-    """Turned about a line through `about` along y, from x towards z: what is ahead comes up."""
+    """Triangles turned about a line through `about` along y, from x towards z, which raises the front."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return (triangles - np.array(about)) @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]) + np.array(
         about

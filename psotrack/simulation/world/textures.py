@@ -1,4 +1,4 @@
-"""Textures of rooms: reflectance, linear BGR, drawn from a generator so that a room looks the same every time."""
+"""Textures of rooms: reflectance, linear BGR, drawn with a seeded generator, so that they are always the same."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ Bgr = tuple[float, float, float]
 
 
 def _cloud(shape: tuple[int, int], cells: int, rng: np.random.Generator) -> Float[np.ndarray, "rows columns"]:
-    """Smooth random stains between -1 and 1."""
+    """(rows, columns), smooth random stains, -1 to 1."""
     coarse = rng.uniform(-1, 1, (max(2, shape[0] // cells), max(2, shape[1] // cells))).astype(np.float32)
     return np.clip(cv2.resize(coarse, shape[::-1], interpolation=cv2.INTER_CUBIC), -1, 1)
 
 
 def plain(width_m: float, height_m: float, texel_m: float, bgr: Bgr, rng: np.random.Generator) -> Texture:
-    """A colour with stains of three sizes and fine grain."""
-    # A stream of its own: how many numbers it takes depends on the texel size, what is drawn later must not.
+    """Texture of one colour with stains of three sizes and fine grain."""
+    # A separate random stream: the number of draws here depends on the texel size, and later draws must not.
     rng = rng.spawn(1)[0]
     shape = (max(4, round(height_m / texel_m)), max(4, round(width_m / texel_m)))
     shade = 1 + 0.04 * rng.standard_normal(shape, np.float32)
@@ -37,7 +37,7 @@ def _rectangle(
 
 
 def floor(width_m: float, height_m: float, texel_m: float, rng: np.random.Generator) -> Texture:
-    """Boards, two mats, and lines around the flight area."""
+    """Floor of boards with two mats and lines around the flight area."""
     texture = plain(width_m, height_m, texel_m, (0.37, 0.42, 0.46), rng)
     board_m, length_m, gap_m = 0.14, 1.2, 0.006
     for row in range(int(height_m / board_m)):
@@ -62,7 +62,7 @@ def floor(width_m: float, height_m: float, texel_m: float, rng: np.random.Genera
 
 
 def ceiling(width_m: float, height_m: float, texel_m: float, rng: np.random.Generator) -> Texture:
-    """Tiles."""
+    """Ceiling of tiles."""
     texture = plain(width_m, height_m, texel_m, (0.62, 0.64, 0.64), rng)
     for x in np.arange(0, width_m, 0.6):
         _rectangle(texture, texel_m, (x, 0.0, x + 0.02, height_m), (0.7,) * 3)
@@ -72,7 +72,7 @@ def ceiling(width_m: float, height_m: float, texel_m: float, rng: np.random.Gene
 
 
 def wall(width_m: float, height_m: float, texel_m: float, rng: np.random.Generator) -> Texture:
-    """Paint above, a darker dado below, acoustic panels, a door and posters."""
+    """Painted wall with a darker lower part, acoustic panels, a door and posters."""
     texture = plain(width_m, height_m, texel_m, (0.50, 0.53, 0.54), rng)
     _rectangle(texture, texel_m, (0.0, height_m - 1.1, width_m, height_m), (0.75, 0.68, 0.6))
     _rectangle(texture, texel_m, (0.0, height_m - 1.12, width_m, height_m - 1.08), (0.5,) * 3)
@@ -102,7 +102,7 @@ def _posters(
 
 
 def slab(width_m: float, height_m: float, texel_m: float, rng: np.random.Generator) -> Texture:
-    """A painted slab of a large hall: joints, the lines of two courts, mats, and lines around the flight area."""
+    """Floor of a large hall: a painted slab with joints, lines of two courts, mats, and lines of the flight area."""
     texture = plain(width_m, height_m, texel_m, (0.40, 0.43, 0.40), rng)
     for x in np.arange(2.5, width_m, 2.5):
         _rectangle(texture, texel_m, (x, 0.0, x + 0.012, height_m), (0.5,) * 3)
@@ -127,7 +127,7 @@ def slab(width_m: float, height_m: float, texel_m: float, rng: np.random.Generat
 def _outline(
     texture: Texture, texel_m: float, xyxy_m: tuple[float, float, float, float], factor: tuple[float, ...]
 ) -> None:
-    """A line of 5 cm along the edge of a rectangle."""
+    """Draw a line of 5 cm along the edge of a rectangle."""
     line_m = 0.05
     x1, y1, x2, y2 = xyxy_m
     for y in (y1, y2):
@@ -137,7 +137,7 @@ def _outline(
 
 
 def sheeting(width_m: float, height_m: float, texel_m: float, rng: np.random.Generator) -> Texture:
-    """The roof of a large hall: steel sheets, purlins and girders."""
+    """Roof of a large hall: steel sheets, purlins and girders."""
     texture = plain(width_m, height_m, texel_m, (0.52, 0.52, 0.50), rng)
     for y in np.arange(0, height_m, 0.25):
         _rectangle(texture, texel_m, (0.0, y, width_m, y + 0.06), (0.8,) * 3)
@@ -149,7 +149,7 @@ def sheeting(width_m: float, height_m: float, texel_m: float, rng: np.random.Gen
 
 
 def cladding(width_m: float, height_m: float, texel_m: float, rng: np.random.Generator) -> Texture:
-    """A wall of a large hall: impact boards below, steel sheets above, columns, a gate, windows, banners, pipes."""
+    """Wall of a large hall: impact boards below, steel sheets above, columns, a gate, windows, banners, pipes."""
     texture = plain(width_m, height_m, texel_m, (0.50, 0.53, 0.52), rng)
     boards = height_m - 2.4
     for x in np.arange(0, width_m, 0.3):
