@@ -1,0 +1,511 @@
+"""Search, score, method, background model and detector of one's own, from Python and by name on the command line."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import make_once
+from sweeps import COMPILER
+
+import psotrack as pt
+from psotrack.errors import SettingsError
+from psotrack.geometry import project_boxes
+from psotrack.recordings import read_frames
+from psotrack.silhouettes import SilhouetteSettings, find_background, key_of
+from psotrack.simulation import simulate
+from psotrack.support import plugins
+from psotrack.tracking import camera_weights, find_score, find_search, foreground_and_area, tracker_settings
+from psotrack.trajectories import DroneSizes, Status, Tracks
+
+ROOT = Path(__file__).parents[1]
+#: Few cameras, particles and frames, because compiling takes most of the time.
+CAMERAS, NUM_FRAMES = ("cam1", "cam3", "cam6", "cam8"), 8
+SETTINGS = {
+    "init": "truth",
+    "drones.size_m": (0.5, 0.5, 0.2),
+    "swarm.particles": 16,
+    "swarm.iterations": 6,
+    "silhouettes.reduction": 1,
+    "silhouettes.working_reduction": 1,
+    "silhouettes.min_blob_px": 8,
+}
+#: A drone is about 0.5 m wide: with a larger mean error the tracks do not follow the drones.
+NEAR_M = 0.1
+
+
+# --8<-- [start:search]
+@jax.tree_util.register_dataclass  # the numbers may change without a new compilation
+@dataclass(frozen=True)
+class RandomSearch:
+    """Normal steps about the best position so far, whose standard deviation shrinks."""
+
+    step_m: float = 0.05
+    shrink: float = 0.8
+
+    def __call__(self, key, objective, first, region, num_iterations):
+        def value_of(position):
+            return jnp.nan_to_num(objective(position), nan=-jnp.inf)
+
+        def iterate(number, best):
+            noise = jax.random.normal(jax.random.fold_in(key, number), first.shape)
+            position = best[0] + self.step_m * self.shrink**number * noise
+            return better(best, position.clip(region.low, region.high))
+
+        def better(best, position):
+            value = value_of(position)
+            winner, groups = value.argmax(axis=0), jnp.arange(value.shape[1])
+            improves = value[winner, groups] > best[1]
+            return (
+                jnp.where(improves[:, None], position[winner, groups], best[0]),
+                jnp.where(improves, value[winner, groups], best[1]),
+            )
+
+        first = first.clip(region.low, region.high)
+        start = first[0], jnp.full(first.shape[1], -jnp.inf)
+        return jax.lax.fori_loop(0, num_iterations, iterate, better(start, first))[0]
+
+
+# --8<-- [end:search]
+
+
+# --8<-- [start:score]
+@dataclass(frozen=True)
+class Dice:
+    """Dice coefficient: twice the foreground in the box, over the box and the foreground around it."""
+
+    ring: float = 1.5  # the foreground in a box 1.5 times as large belongs to the drone
+    whole_pixels: bool = False
+    min_cameras: int = 2
+
+    def camera_scores(self, inputs, position_m):
+        boxes = project_boxes(inputs.extents, position_m)
+        foreground, area = foreground_and_area(inputs, boxes, (1.0, self.ring))
+        score = 2 * foreground[0] / (area[0] + foreground[1] + 1e-6)
+        return score.clip(0, 1), camera_weights(inputs, boxes)
+
+
+# --8<-- [end:score]
+
+
+# --8<-- [start:method]
+@dataclass(frozen=True)
+class Hover:
+    """A method that knows one thing: the drones stay where they are at frame 0."""
+
+    reads_detections: bool = False
+
+    def __call__(self, inputs, report=None):
+        start = inputs.initial
+        frames, drones = inputs.silhouettes.num_frames, len(start.position_m)
+        position_m = np.broadcast_to(start.position_m, (frames, drones, 3))
+        covariance_m2 = np.broadcast_to(0.01 * np.eye(3), (frames, drones, 3, 3))
+        return Tracks(
+            position_m=position_m,
+            velocity_m_s=np.zeros((frames, drones, 3)),
+            covariance_m2=covariance_m2,
+            measured_m=position_m,
+            measured_covariance_m2=covariance_m2,
+            fitness=np.ones((frames, drones)),
+            num_cameras=np.full((frames, drones), len(inputs.rig)),
+            status=np.full((frames, drones), Status.TRACKED),
+            measured_size_m=np.full((frames, drones, 3), np.nan),
+            sizes=DroneSizes(
+                start.size_m,
+                np.full((drones, 3), np.nan),
+                np.zeros((drones, 3), int),
+                np.full((drones, 1), np.nan),
+            ),
+        )
+
+
+# --8<-- [end:method]
+
+
+# --8<-- [start:background]
+@dataclass(frozen=True)
+class MedianBackground:
+    """Foreground is what differs from the median of the learning frames."""
+
+    threshold: int = 25
+    reduction: int = 1  # silhouettes.working_reduction
+
+    @property
+    def key(self):
+        return {"threshold": self.threshold, "reduction": self.reduction}
+
+    def foreground(self, learning, frames):
+        median = np.median([self.reduced(frame) for frame in learning], axis=0).astype(np.uint8)
+        for frame in frames:
+            difference = cv2.absdiff(self.reduced(frame), median).max(axis=2)
+            yield np.where(difference > self.threshold, 255, 0).astype(np.uint8)
+
+    def reduced(self, frame):
+        height, width = frame.shape[:2]
+        size_wh = -(-width // self.reduction), -(-height // self.reduction)
+        return cv2.resize(frame, size_wh, interpolation=cv2.INTER_AREA)
+
+
+# --8<-- [end:background]
+
+
+# --8<-- [start:detector]
+@dataclass(frozen=True)
+class EmptyHallDetector:
+    """Boxes about what differs from a picture of the empty hall; the most similar picture is of the same camera."""
+
+    empty: tuple[np.ndarray, ...]
+    threshold: int = 25
+
+    @property
+    def key(self):
+        return {"empty": [int(image.sum()) for image in self.empty], "threshold": self.threshold}
+
+    def boxes(self, bgr):
+        differences = [cv2.absdiff(bgr, image).max(axis=2) for image in self.empty]
+        difference = min(differences, key=np.mean)
+        _, _, blobs, _ = cv2.connectedComponentsWithStats((difference > self.threshold).astype(np.uint8))
+        x, y, width, height, area = blobs[1:].T
+        xyxy = np.stack([x, y, x + width, y + height], axis=1)[area > 8]
+        return xyxy.astype(float), np.full(len(xyxy), 0.9)
+
+
+# --8<-- [end:detector]
+
+
+class HighDice(Dice):
+    """Dice between 0.9 and 1, in the same order: a fitness that no other score gives to these drones."""
+
+    def camera_scores(self, inputs, position_m):
+        score, weight = super().camera_scores(inputs, position_m)
+        return 0.9 + 0.1 * score, weight
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """A data folder with a sequence of two drones at a quarter of the image size."""
+
+    def make(folder):
+        simulate("S01_D2_A", folder, num_frames=NUM_FRAMES, scale=0.25, masks=False, onboard=False, jobs=1)
+
+    return make_once(tmp_path_factory, "bring_your_own", make)
+
+
+@pytest.fixture(scope="module")
+def recording(root):
+    return pt.read_recording(root / "Simulated_Data" / "S01_D2_A", cameras=CAMERAS)
+
+
+@pytest.fixture(scope="module")
+def track(recording, tmp_path_factory):
+    """Tracks the recording with parts of one's own, in this process."""
+    cache = tmp_path_factory.mktemp("cache")
+
+    def track(settings=None, **parts):
+        return pt.track(recording, SETTINGS | (settings or {}), cache=cache, jobs=1, **parts)
+
+    # Compiling is the longest part of the tests, and the speed of the compiled program does not matter.
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield track
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+def mean_error_m(tracked, recording):
+    return pt.evaluate(tracked.trajectories, recording.truth).mean_error_m
+
+
+@pytest.fixture(scope="module")
+def with_three_parts(track):
+    return track(search=RandomSearch(), score=HighDice(), background=MedianBackground())
+
+
+def test_search_score_and_background_together_find_the_drones(with_three_parts, recording):
+    assert with_three_parts.trajectories.seen.all()
+    assert mean_error_m(with_three_parts, recording) < NEAR_M
+    parts = with_three_parts.record["parts"]
+    assert {kind: part["class"].rpartition(".")[2] for kind, part in parts.items()} == {
+        "search": "RandomSearch",
+        "score": "HighDice",
+        "background": "MedianBackground",
+    }
+    assert parts["background"]["key"] == {"threshold": 25, "reduction": 1}
+
+
+def test_the_search_decides_the_positions(with_three_parts, track):
+    # Without steps the best of the first positions remains.
+    without_steps = track(
+        search=RandomSearch(step_m=0.0), score=HighDice(), background=MedianBackground()
+    ).trajectories
+    with_steps = with_three_parts.trajectories
+    # The median may take a slow drone as background; this drone coasts, and no search moves it.
+    found = (with_steps.status == Status.TRACKED).all(axis=0)
+    assert found.any()
+    assert (with_steps.position_m != without_steps.position_m)[:, found].any(axis=2).all()
+    assert with_steps.fitness.mean() > without_steps.fitness.mean()
+
+
+def test_the_score_decides_the_fitness(with_three_parts):
+    assert (with_three_parts.trajectories.fitness >= 0.9).all()
+    assert (with_three_parts.trajectories.fitness < 1.0).all()
+
+
+def test_the_background_model_decides_the_silhouettes(with_three_parts, track):
+    """A model that sees no foreground loses the drones; its silhouettes are stored under another key."""
+    blind = track(search=RandomSearch(), score=HighDice(), background=MedianBackground(threshold=255))
+    assert not (blind.trajectories.status == Status.TRACKED).any()
+    keys = [set(tracked.record["input_keys"].values()) for tracked in (with_three_parts, blind)]
+    assert not keys[0] & keys[1]
+
+
+def test_the_tracks_of_a_method_are_the_result(track):
+    tracked = track(method=Hover())
+    assert tracked.trajectories.position_m.shape == (NUM_FRAMES, 2, 3)
+    assert (tracked.trajectories.position_m == np.asarray(tracked.record["start"]["position_m"])).all()
+    assert tracked.record["parts"]["method"]["class"].endswith("Hover")
+
+
+def test_the_detector_decides_the_detections(track, recording):
+    empty = tuple(
+        np.median(list(read_frames(video)), axis=0).astype(np.uint8) for video in recording.videos.values()
+    )
+    tracked = track({"method": "projection-lines"}, detector=EmptyHallDetector(empty))
+    assert tracked.trajectories.seen.all()
+    assert mean_error_m(tracked, recording) < NEAR_M
+    assert tracked.record["parts"]["detector"]["key"]["threshold"] == 25
+    with pytest.raises(
+        SettingsError, match=r"detector: expected a method that reads detections.*method swarm"
+    ):
+        track(detector=EmptyHallDetector(empty))
+
+
+def test_detections_reach_a_method_of_ones_own(track, recording):
+    """A method that reads detections is given those of the detector, and no others."""
+    given = []
+
+    class Reads(Hover):
+        def __call__(self, inputs, report=None):
+            given.append(inputs.sightings)
+            return super().__call__(inputs, report)
+
+    empty = tuple(next(read_frames(video)) for video in recording.videos.values())
+    track(method=Reads(reads_detections=True), detector=EmptyHallDetector(empty))
+    # Frame 0 is the picture of the empty hall itself, so nothing differs.
+    assert np.isnan(given[0].centre_px[0]).all()
+    assert np.isfinite(given[0].centre_px[-1]).any()
+
+
+class CoarseBackground(MedianBackground):
+    """Forgets the reduction that the settings ask for."""
+
+    def foreground(self, learning, frames):
+        return (mask[::2] for mask in super().foreground(learning, frames))
+
+
+def test_masks_of_another_size_are_one_line(track):
+    with pytest.raises(
+        SettingsError,
+        match=r"CoarseBackground: expected 8 masks of type uint8 and shape \(270, 480\).*found uint8 \(135, 480\)",
+    ):
+        track(background=CoarseBackground())
+
+
+def test_models_with_equal_keys_and_different_classes_have_silhouettes_of_their_own(recording):
+    video = recording.videos["cam1"]
+    settings = pt.TrackSettings().silhouettes
+    models = (MedianBackground(), CoarseBackground(), None)
+    assert len({key_of(video, settings, model) for model in models}) == 3
+
+
+@pytest.mark.parametrize(
+    ("kind", "setting", "make"),
+    [
+        ("search", {"swarm.search": "own"}, lambda settings: RandomSearch(step_m=settings.spread_m)),
+        ("score", {"score.kind": "own"}, lambda settings: Dice()),
+    ],
+)
+def test_a_registered_plugin_is_found_by_name(kind, setting, make):
+    settings = pt.TrackSettings().changed(setting)
+    with pytest.raises(SettingsError, match=r"expected one of .*, found own; no installed package adds more"):
+        tracker_settings(settings)
+    pt.register_plugin(kind, "own", make)
+    try:
+        chosen = tracker_settings(settings)
+        assert (
+            chosen.search == RandomSearch(step_m=0.05) if kind == "search" else chosen.camera_score == Dice()
+        )
+    finally:
+        plugins._registered.clear()
+
+
+#: Wrong parts, each of which gets one line; in a process of its own, where no types are checked at every call.
+WRONG_PARTS = """
+import psotrack as pt
+from psotrack.errors import SettingsError
+from psotrack.pipeline import Parts
+
+for wrong in (
+    lambda: Parts(search=1),
+    lambda: Parts(score=print),
+    lambda: Parts(method=print),
+    lambda: Parts(background=print),
+    lambda: Parts(detector=print),
+    lambda: pt.register_plugin("searches", "own", print),
+    lambda: pt.register_plugin("search", "own", 1),
+):
+    try:
+        wrong()
+    except SettingsError as error:
+        print(error)
+"""
+
+
+def test_parts_without_the_interface_are_one_line():
+    ran = subprocess.run(
+        [sys.executable, "-c", WRONG_PARTS],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    expected = "expected an object with the attributes of psotrack"
+    function = "found an object of builtin_function_or_method"
+    assert ran.stdout.splitlines() == [
+        f"search: {expected}.Search, found an object of int",
+        f"score: {expected}.Score, {function}",
+        f"method: {expected}.Method, {function}",
+        f"background: {expected}.BackgroundModel, {function}",
+        f"detector: {expected}.Detector, {function}",
+        "kind: expected one of search, score, method, background, detector, found searches",
+        "search own: expected a function of the settings, or a class, found an object of int",
+    ]
+
+
+#: A package that adds three plugins. Its search returns the tracker's prediction.
+PACKAGE = """
+from dataclasses import dataclass
+import cv2
+import jax
+import numpy as np
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Prediction:
+    def __call__(self, key, objective, first, region, num_iterations):
+        return first[0]
+
+def prediction(settings):
+    return Prediction()
+
+def median(settings):
+    return MedianBackground(reduction=settings.working_reduction)
+
+def broken(settings):
+    return "no detector"
+
+"""
+ENTRY_POINTS = """
+[psotrack.searches]
+prediction = own_parts:prediction
+[psotrack.backgrounds]
+median = own_parts:median
+absent = own_parts:no_such_function
+[psotrack.detectors]
+broken = own_parts:broken
+"""
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """A folder with an installed package that has entry points."""
+    site = tmp_path_factory.mktemp("site")
+    _, background = Path(__file__).read_text().split("# --8<-- [start:background]\n", 1)
+    (site / "own_parts.py").write_text(PACKAGE + background.split("\n# --8<--")[0])
+    info = site / "own_parts-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: own-parts\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(ENTRY_POINTS)
+    return site
+
+
+def run_psotrack(site, *words):
+    """Run `psotrack WORDS` where the package of the folder is installed."""
+    environment = os.environ | COMPILER | {"PYTHONPATH": f"{site}{os.pathsep}{ROOT}"}
+    command = [sys.executable, "-m", "psotrack", *map(str, words)]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+
+
+def test_entry_points_on_the_command_line(site, root, tmp_path):
+    out = tmp_path / "tracks.csv"
+    words = ["--search", "prediction", "--background", "median", "--score", "hard", "--init", "truth"]
+    words += ["--drone-size", "0.5,0.5,0.2", "--particles", 16, "--cameras", ",".join(CAMERAS), "--jobs", 1]
+    ran = run_psotrack(
+        site,
+        "track",
+        root / "Simulated_Data" / "S01_D2_A",
+        "--out",
+        out,
+        "--cache",
+        tmp_path / "cache",
+        *words,
+    )
+    assert ran.returncode == 0, ran.stderr
+    record = json.loads(out.with_suffix(".json").read_text())
+    assert record["settings"]["swarm"]["search"] == "prediction"
+    assert record["parts"] == {
+        "background": {"class": "own_parts.MedianBackground", "key": {"threshold": 25, "reduction": 2}}
+    }
+    # The measured position is always the predicted one, so the drones fly on with the velocity of frame 0.
+    tracks = pt.read_trajectories(out, fps=25.0)
+    steps_m = np.diff(tracks.position_m, axis=0)
+    assert np.abs(steps_m).max() > 0.01
+    np.testing.assert_allclose(steps_m, np.broadcast_to(steps_m[0], steps_m.shape), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("find", "message"),
+    [
+        (
+            lambda: find_search(pt.SwarmSettings(search="predict")),
+            "swarm.search: expected one of pso, prediction, found predict",
+        ),
+        (
+            lambda: find_score(pt.ScoreSettings(kind="iou")),
+            "score.kind: expected one of soft, hard, found iou; no installed package adds more "
+            "(entry points psotrack.scores)",
+        ),
+        (
+            lambda: find_background("mean", SilhouetteSettings()),
+            "background: expected one of mog2, absent, median, found mean",
+        ),
+        (
+            lambda: find_background("absent", SilhouetteSettings()),
+            "background absent: expected own_parts:no_such_function to be importable, found module 'own_parts' "
+            "has no attribute 'no_such_function'",
+        ),
+    ],
+)
+def test_the_message_names_what_is_installed(site, monkeypatch, find, message):
+    monkeypatch.syspath_prepend(site)
+    with pytest.raises(SettingsError) as raised:
+        find()
+    assert str(raised.value) == message
+
+
+def test_a_detector_that_no_package_adds_is_one_line(site, root, tmp_path):
+    sequence = root / "Simulated_Data" / "S01_D2_A"
+    for name, message in [
+        ("yolo", "detector: expected one of MODEL.onnx (a file), broken, found yolo"),
+        (
+            "broken",
+            "detector broken: expected an object with the attributes of psotrack.Detector, found an object of str",
+        ),
+    ]:
+        ran = run_psotrack(site, "detect", sequence, "--detector", name, "--out", tmp_path / "boxes")
+        assert (ran.returncode, ran.stderr) == (2, f"psotrack: {message}\n")
