@@ -1,4 +1,4 @@
-"""The command line as people and programs use it: the contract's commands, and one clear line for bad input."""
+"""The command line: output files and columns of the contract, and one clear line for every wrong input."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COLUMNS = [
     *("fitness", "num_cameras", "status"),
     *("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"),
 ]
-#: The contract's keys.
+#: Keys of the errors as JSON, which the contract promises.
 ERRORS = [
     *("frames", "drones", "mean_error_m", "median_error_m", "std_error_m", "p95_error_m", "max_error_m"),
     *("missed_rate", "id_switches", "mota", "motp_m", "idf1", "matched_mean_error_m"),
@@ -36,18 +36,20 @@ ERRORS = [
     "per_drone",
 ]
 NUM_FRAMES = 12
-#: All but the last: drones of a dozen pixels are found by themselves only where many cameras see them.
+#: Cameras of the small sequence except the last one. Drones of a dozen pixels are found only if many cameras see them.
 CAMERAS = ",".join(f"cam{i}" for i in range(1, 8))
 
 
 @dataclass(frozen=True)
-class Answer:
+class Output:
+    """Exit code, stdout and stderr of a command."""
+
     code: int
     out: str
     err: str
 
 
-Run = Callable[..., Answer]
+Run = Callable[..., Output]
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +64,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def sequence(data: Path, tmp_path: Path) -> Path:
-    """A copy of the small sequence that a test may spoil."""
+    """A copy of the small sequence, which a test may change."""
     return shutil.copytree(data / "Simulated_Data" / "S02_D4_A", tmp_path / "S02_D4_A")
 
 
@@ -71,7 +73,7 @@ def run(data: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixtur
     """Runs `psotrack` with some arguments in this process; silhouettes are shared by the tests of this file."""
     monkeypatch.setenv("PSOTRACK_CACHE", str(data / "cache"))
 
-    def call(*arguments: object) -> Answer:
+    def call(*arguments: object) -> Output:
         monkeypatch.setattr(sys, "argv", ["psotrack", *map(str, arguments)])
         capfd.readouterr()
         try:
@@ -79,27 +81,27 @@ def run(data: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixtur
             code = 0
         except SystemExit as stop:
             code = int(stop.code or 0)
-        return Answer(code, *capfd.readouterr())
+        return Output(code, *capfd.readouterr())
 
     return call
 
 
 def track(sequence: Path, out: Path, *more: object) -> list[object]:
-    """A quick `track`: the small sequence has large pixels."""
+    """Arguments of a quick `track`: the small sequence has large pixels."""
     return ["track", sequence, "--out", out, "--reduction", 2, "--particles", 20, "--iterations", 15, *more]
 
 
-def assert_one_line(answer: Answer, *words: str) -> None:
-    assert answer.code == 2, answer
-    assert answer.out == ""
-    assert answer.err.count("\n") == 1, answer.err
-    assert answer.err.startswith("psotrack: ")
+def assert_one_line(result: Output, *words: str) -> None:
+    assert result.code == 2, result
+    assert result.out == ""
+    assert result.err.count("\n") == 1, result.err
+    assert result.err.startswith("psotrack: ")
     for word in words:
-        assert word in answer.err, answer.err
+        assert word in result.err, result.err
 
 
 def rewrite_video(path: Path, *, frames: int | None = None, size_wh: tuple[int, int] | None = None) -> None:
-    """The video again, with fewer frames or cut to another size."""
+    """Replace a video by a video with fewer frames or a smaller image."""
     video = probe(path)
     images = list(read_frames(video))[:frames]
     width, height = size_wh or video.image_size_wh
@@ -110,7 +112,7 @@ def rewrite_video(path: Path, *, frames: int | None = None, size_wh: tuple[int, 
 
 
 def test_the_contract_from_videos_to_errors(run: Run, sequence: Path, tmp_path: Path) -> None:
-    tracks, answer = tmp_path / "tracks.csv", tmp_path / "out.json"
+    tracks, errors_path = tmp_path / "tracks.csv", tmp_path / "out.json"
     assert run(*track(sequence, tracks, "--seed", 3)).code == 0
     table = pd.read_csv(tracks)
     assert list(table.columns) == COLUMNS
@@ -127,23 +129,23 @@ def test_the_contract_from_videos_to_errors(run: Run, sequence: Path, tmp_path: 
     assert {"python", "jax", "numpy", "psotrack"} <= set(record["versions"])
     assert record["device"]["platform"]
 
-    assert run("evaluate", tracks, sequence, "--json", answer, "--plot", tmp_path / "p.png").code == 0
-    errors = json.loads(answer.read_text())
+    assert run("evaluate", tracks, sequence, "--json", errors_path, "--plot", tmp_path / "p.png").code == 0
+    errors = json.loads(errors_path.read_text())
     assert list(errors) == ERRORS
-    assert errors["frames"] == NUM_FRAMES - 1, "frame 0 is the placeholder row"
+    assert errors["frames"] == NUM_FRAMES - 1, "the reference has no pose in frame 0"
     assert errors["drones"] == 4
     assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
     # A pixel of this small image is 2 to 3 cm at the drones, and a silhouette cell two pixels.
     assert errors["mean_error_m"] < 0.15
 
 
-def test_parquet_holds_what_csv_holds(run: Run, sequence: Path, tmp_path: Path) -> None:
+def test_parquet_and_csv_have_the_same_content(run: Run, sequence: Path, tmp_path: Path) -> None:
     for suffix in ("csv", "parquet"):
         assert run(*track(sequence, tmp_path / f"{suffix}" / f"tracks.{suffix}")).code == 0
     csv = pd.read_csv(tmp_path / "csv/tracks.csv")
     parquet = pd.read_parquet(tmp_path / "parquet/tracks.parquet")
     assert list(parquet.columns) == COLUMNS
-    # The digits are exact, but pandas 2 reads them fast: a few units in the last place of a float64.
+    # The digits in the file are exact, but pandas 2 reads numbers with an error of a few units in the last place.
     np.testing.assert_allclose(csv[["x_m", "y_m", "z_m"]], parquet[["x_m", "y_m", "z_m"]], rtol=1e-14)
 
 
@@ -155,9 +157,9 @@ def test_a_second_call_reads_the_stored_silhouettes(run: Run, sequence: Path, tm
     assert json.loads(again.out)["seconds"] == {"decode": 0.0, "foreground": 0.0}
 
 
-def test_quiet_says_nothing_and_no_terminal_means_no_bars(run: Run, sequence: Path, tmp_path: Path) -> None:
+def test_quiet_prints_nothing_and_bars_need_a_terminal(run: Run, sequence: Path, tmp_path: Path) -> None:
     tracks = tmp_path / "tracks.csv"
-    assert run(*track(sequence, tracks, "--quiet")) == Answer(0, "", "")
+    assert run(*track(sequence, tracks, "--quiet")) == Output(0, "", "")
     loud = run("evaluate", tracks, sequence)
     assert loud.code == 0
     assert "MOTA" in loud.out
@@ -175,14 +177,14 @@ def test_init_from_truth_and_from_tracks(run: Run, sequence: Path, tmp_path: Pat
 
 @pytest.mark.slow
 def test_the_paper_baseline_runs(run: Run, sequence: Path, tmp_path: Path) -> None:
-    answer = run(*track(sequence, tmp_path / "t.csv", "--swarm", "joint", "--score", "hard"))
-    assert answer.code == 0
+    result = run(*track(sequence, tmp_path / "t.csv", "--swarm", "joint", "--score", "hard"))
+    assert result.code == 0
     settings = json.loads((tmp_path / "t.json").read_text())["settings"]
     assert (settings["swarm"]["kind"], settings["score"]["kind"]) == ("joint", "hard")
 
 
 @pytest.mark.slow
-def test_smoothed_tracks_are_surer(run: Run, sequence: Path, tmp_path: Path) -> None:
+def test_smoothed_tracks_have_smaller_covariances(run: Run, sequence: Path, tmp_path: Path) -> None:
     for name, more in (("filtered", ()), ("smoothed", ("--smooth",))):
         assert run(*track(sequence, tmp_path / f"{name}.csv", *more)).code == 0
     filtered, smoothed = (pd.read_csv(tmp_path / f"{name}.csv") for name in ("filtered", "smoothed"))
@@ -193,7 +195,7 @@ def test_smoothed_tracks_are_surer(run: Run, sequence: Path, tmp_path: Path) -> 
     )
 
 
-def test_who_met_is_written_beside_the_tracks(run: Run, sequence: Path, tmp_path: Path) -> None:
+def test_ambiguous_pairs_are_written_beside_the_tracks(run: Run, sequence: Path, tmp_path: Path) -> None:
     from psotrack.trajectories import write_ambiguity
 
     tracks = tmp_path / "t.csv"
@@ -202,7 +204,7 @@ def test_who_met_is_written_beside_the_tracks(run: Run, sequence: Path, tmp_path
     assert list(table.columns) == ["frame", "time_s", "drone", "other", "ambiguity"]
     record = json.loads((tmp_path / "t.json").read_text())
     assert [drone["drone"] for drone in record["drones"]] == [0, 1, 2, 3]
-    # Nobody is overwritten, and no file half: the three belong together.
+    # The three files belong together: if one of them exists, none is written.
     (tmp_path / "t.csv").unlink()
     assert_one_line(run(*track(sequence, tracks)), "t.json", "--force")
     pairs, ambiguity = np.array([[0, 1], [0, 2]]), np.array([[0.0, 0.25], [0.5, 0.0]])
@@ -217,9 +219,9 @@ def test_who_met_is_written_beside_the_tracks(run: Run, sequence: Path, tmp_path
     }
 
 
-def test_drones_that_are_not_there_yet_are_awaited(run: Run, sequence: Path, tmp_path: Path) -> None:
-    answer = run(*track(sequence, tmp_path / "t.csv", "--drones", 7))
-    assert answer.code == 0
+def test_drones_that_are_not_found_do_not_stop_tracking(run: Run, sequence: Path, tmp_path: Path) -> None:
+    result = run(*track(sequence, tmp_path / "t.csv", "--drones", 7))
+    assert result.code == 0
     assert pd.read_csv(tmp_path / "t.csv")["drone"].nunique() < 7
 
 
@@ -227,13 +229,13 @@ def test_drones_that_are_not_there_yet_are_awaited(run: Run, sequence: Path, tmp
 def test_projection_lines_from_the_sequence_a_folder_and_blobs(
     run: Run, sequence: Path, tmp_path: Path
 ) -> None:
-    """The same contract as the swarm's; and the sequence's own detections are those in its folder."""
+    """The columns are the swarm's columns, and the sequence's own detections are the files in its folder."""
     tracks = [tmp_path / f"{name}.csv" for name in ("own", "folder", "blobs")]
     for path, more in zip(
         tracks, ((), ("--detections", sequence / "dl_data"), ("--detections", "blobs")), strict=True
     ):
-        answer = run(*track(sequence, path, "--method", "projection-lines", *more))
-        assert answer.code == 0, answer
+        result = run(*track(sequence, path, "--method", "projection-lines", *more))
+        assert result.code == 0, result
         assert list(pd.read_csv(path).columns) == COLUMNS
         assert len(pd.read_csv(path)) == 4 * NUM_FRAMES
     assert tracks[0].read_bytes() == tracks[1].read_bytes() != tracks[2].read_bytes()
@@ -244,7 +246,7 @@ def test_projection_lines_from_the_sequence_a_folder_and_blobs(
     assert set(keys) == {name for i in range(1, 9) for name in (f"cam{i}", f"detections of cam{i}")}
     points = json.loads(together.with_suffix(".json").read_text())["points"]
     assert {point["middle_of"] for point in points} == {"silhouette"}
-    # Both are within the drone, some centimetres thick.
+    # The middles of silhouette and box are within the drone, which is some centimetres high.
     assert all(0 < abs(point["box_off_m"][2]) < 0.1 and point["box_off_std_m"][2] > 0 for point in points)
     record = json.loads(tracks[0].with_suffix(".json").read_text())
     assert [point["middle_of"] for point in record["points"]] == ["box"] * 4
@@ -255,11 +257,11 @@ def test_projection_lines_from_the_sequence_a_folder_and_blobs(
     evaluated = run("evaluate", tracks[0], sequence, "--json", "-")
     errors = json.loads(evaluated.out)
     assert (errors["id_switches"], errors["missed_rate"]) == (0, 0)
-    # Boxes of a third of the pixels; what is left is mostly how far the drones' origins are from their middles.
+    # Most of the error is the distance from the drones' origins to the middles of their boxes.
     assert errors["mean_error_m"] < 0.05
 
 
-def test_detections_that_are_not_there(run: Run, sequence: Path, tmp_path: Path) -> None:
+def test_missing_and_empty_detections_are_errors(run: Run, sequence: Path, tmp_path: Path) -> None:
     lines = ("--method", "projection-lines")
     nowhere = run(*track(sequence, tmp_path / "t.csv", *lines, "--detections", tmp_path / "nowhere"))
     assert_one_line(nowhere, "nowhere", "cam1.csv", "no such folder")
@@ -267,23 +269,23 @@ def test_detections_that_are_not_there(run: Run, sequence: Path, tmp_path: Path)
     assert_one_line(run(*track(sequence, tmp_path / "t.csv", *lines)), "dl_data", "--detections blobs")
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty" / "cam1i.csv").touch()
-    nobody = run(*track(sequence, tmp_path / "t.csv", *lines, "--detections", tmp_path / "empty"))
-    assert_one_line(nobody, "drones", "none in any frame")
+    none = run(*track(sequence, tmp_path / "t.csv", *lines, "--detections", tmp_path / "empty"))
+    assert_one_line(none, "drones", "none in any frame")
 
 
 @pytest.mark.slow
-def test_fewer_cameras_and_frames_by_choice(run: Run, sequence: Path, tmp_path: Path) -> None:
+def test_cameras_and_frames_can_be_chosen(run: Run, sequence: Path, tmp_path: Path) -> None:
     (sequence / "cam8i_s.avi").unlink()
-    answer = run(*track(sequence, tmp_path / "t.csv", "--cameras", CAMERAS, "--frames", 11))
-    assert answer.code == 0
+    result = run(*track(sequence, tmp_path / "t.csv", "--cameras", CAMERAS, "--frames", 11))
+    assert result.code == 0
     assert json.loads((tmp_path / "t.json").read_text())["cameras"] == CAMERAS.split(",")
     assert pd.read_csv(tmp_path / "t.csv")["frame"].max() == 10
 
 
-def test_info_shows_what_a_sequence_holds(run: Run, sequence: Path) -> None:
-    answer = run("info", sequence, "--json", "-")
-    assert answer.code == 0
-    content = json.loads(answer.out)
+def test_info_shows_the_content_of_a_sequence(run: Run, sequence: Path) -> None:
+    result = run("info", sequence, "--json", "-")
+    assert result.code == 0
+    content = json.loads(result.out)
     assert content["drones"] == ["dron1", "dron2", "dron3", "dron4"]
     assert content["cameras"]["cam1"]["frames"] == NUM_FRAMES
     assert run("info", sequence).out.count("672 x 378") == 8
@@ -291,13 +293,13 @@ def test_info_shows_what_a_sequence_holds(run: Run, sequence: Path) -> None:
 
 @pytest.mark.parametrize("command", ["simulate", "silhouettes", "track", "evaluate", "demo", "info"])
 def test_help_has_an_example(run: Run, command: str) -> None:
-    answer = run(command, "--help")
-    assert answer.code == 0
-    assert re.search(rf"Examples?:\n +psotrack {command} ", answer.out)
+    result = run(command, "--help")
+    assert result.code == 0
+    assert re.search(rf"Examples?:\n +psotrack {command} ", result.out)
 
 
-def test_command_line_defaults_are_those_of_the_settings() -> None:
-    """Options are called as the settings were until version 0.1: `RENAMED` says what they set today."""
+def test_command_line_defaults_are_the_defaults_of_the_settings() -> None:
+    """Options have the names of the settings in version 0.1; `RENAMED` has the settings' names of today."""
     from psotrack.settings import RENAMED, TrackSettings
 
     defaults = {option.name: option.default for option in cli.cli.commands["track"].params}
@@ -307,7 +309,7 @@ def test_command_line_defaults_are_those_of_the_settings() -> None:
         default = TrackSettings()
         for part in RENAMED.get(name, name).split("."):
             default = getattr(default, part)
-        # A flag without a default leaves the setting's own.
+        # An option without a default leaves the setting's default.
         assert defaults[name] == default or default is None, name
 
 
@@ -321,7 +323,7 @@ def test_results_are_not_overwritten_without_force(run: Run, sequence: Path, tmp
 
 
 class TestBadInput:
-    """Each gets one line that names the file, and leaves an earlier result as it was."""
+    """Every error is one line with the name of the file, and an earlier result is not changed."""
 
     @pytest.fixture
     def fails(self, run: Run, tmp_path: Path) -> Callable[..., None]:
@@ -379,7 +381,7 @@ class TestBadInput:
     def test_no_drones(self, fails: Callable[..., None], sequence: Path) -> None:
         fails(sequence, "drones", "at least 1", "0", more=("--drones", 0))
 
-    def test_a_start_that_is_no_file(self, fails: Callable[..., None], sequence: Path) -> None:
+    def test_initial_positions_from_a_missing_file(self, fails: Callable[..., None], sequence: Path) -> None:
         fails(sequence, "start.csv", more=("--init", "start.csv"))
 
     def test_unknown_camera(self, fails: Callable[..., None], sequence: Path) -> None:
@@ -389,7 +391,9 @@ class TestBadInput:
         (sequence / "dl_data" / "cam1i_s.csv").write_text("0,1,2,3,4,2.5,4,0.9\n1,5,6\n")
         assert_one_line(run("info", sequence), "cam1i_s.csv", "line 2")
 
-    def test_tracks_that_are_none(self, run: Run, sequence: Path, tmp_path: Path) -> None:
+    def test_a_table_without_positions_is_no_file_of_tracks(
+        self, run: Run, sequence: Path, tmp_path: Path
+    ) -> None:
         (tmp_path / "t.csv").write_text("frame,drone\n0,1\n")
         assert_one_line(run("evaluate", tmp_path / "t.csv", sequence), "t.csv", "x_m")
 
@@ -405,14 +409,14 @@ class TestBadInput:
         assert list(tmp_path.iterdir()) == []
 
     def test_usage_errors_exit_with_2(self, run: Run) -> None:
-        answer = run("track", "--no-such-flag")
-        assert answer.code == 2
-        assert "no-such-flag" in answer.err
+        result = run("track", "--no-such-flag")
+        assert result.code == 2
+        assert "no-such-flag" in result.err
 
 
 @pytest.mark.slow
-def test_a_second_run_need_not_compile(sequence: Path, tmp_path: Path) -> None:
-    kept = []
+def test_a_second_run_uses_the_stored_compiled_program(sequence: Path, tmp_path: Path) -> None:
+    stored = []
     for name in ("first.csv", "second.csv"):
         command = [*track(sequence, tmp_path / name, "--frames", 12), "--cache", tmp_path / "cache"]
         subprocess.run(
@@ -420,11 +424,11 @@ def test_a_second_run_need_not_compile(sequence: Path, tmp_path: Path) -> None:
             env=environment_without_jax_settings() | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"},
             check=True,
         )
-        # Lesser programs compile in about the time from which on they are worth keeping: either way is right.
+        # JAX stores programs that take long to compile. Other programs are near the limit, so only this one is checked.
         compiled = (tmp_path / "cache" / "compiled").glob("jit__track_batch-*")
-        kept.append({path.name: path.stat().st_mtime_ns for path in compiled})
-    assert kept[0]
-    assert kept[0] == kept[1]
+        stored.append({path.name: path.stat().st_mtime_ns for path in compiled})
+    assert stored[0]
+    assert stored[0] == stored[1]
     assert (tmp_path / "first.csv").read_bytes() == (tmp_path / "second.csv").read_bytes()
 
 
@@ -436,9 +440,9 @@ def test_usage_errors_are_one_line(run: Run) -> None:
 
 @pytest.mark.slow
 def test_a_full_disk_leaves_earlier_results(run: Run, data: Path, sequence: Path, tmp_path: Path) -> None:
-    """A limit on the size of files stands for the full disk: every write beyond it fails.
+    """A limit on the size of files replaces the full disk: every larger write fails.
 
-    No bytecode is written then: modules would be cached cut off, for everybody.
+    The process writes no bytecode, because truncated modules in the cache would break other tests.
     """
     tracks = tmp_path / "tracks.csv"
     arguments = [str(word) for word in track(sequence, tracks)]
@@ -449,20 +453,20 @@ def test_a_full_disk_leaves_earlier_results(run: Run, data: Path, sequence: Path
         "resource.setrlimit(resource.RLIMIT_FSIZE, (512, 512)); "
         "from psotrack.cli import main; main()"
     )
-    answer = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-c", limited, *arguments, "--force", "--seed", "9"],
-        # The suite's folder of compiled programs would be full too, and JAX would warn of it.
+        # With the suite's folder of compiled programs, JAX would fail to write there too, and print a warning.
         env=environment_without_jax_settings() | {"PSOTRACK_CACHE": str(data / "cache")},
         capture_output=True,
         text=True,
         check=False,
     )
-    assert_one_line(Answer(answer.returncode, answer.stdout, answer.stderr), "tracks.csv", "unchanged")
+    assert_one_line(Output(result.returncode, result.stdout, result.stderr), "tracks.csv", "unchanged")
     assert (tracks.read_bytes(), tracks.with_suffix(".json").read_bytes()) == earlier
     assert list(tmp_path.glob(".*")) == []
 
 
-#: `psotrack`, at which Ctrl-C is pressed when it makes the folder that is its first argument.
+#: Program that runs `psotrack` and presses Ctrl-C when psotrack makes the folder that is the first argument.
 INTERRUPTED = """
 import signal, sys
 
@@ -490,5 +494,5 @@ def test_ctrl_c_leaves_earlier_results(sequence: Path, tmp_path: Path) -> None:
         text=True,
         check=False,
     )
-    assert_one_line(Answer(done.returncode, done.stdout, done.stderr), "interrupted")
+    assert_one_line(Output(done.returncode, done.stdout, done.stderr), "interrupted")
     assert tracks.read_text() == "earlier"

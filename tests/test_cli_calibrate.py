@@ -1,4 +1,4 @@
-"""`psotrack calibrate` as people type it: marks by hand, markers in videos, boards, drones, conversions, bad input."""
+"""`psotrack calibrate`: points marked by hand, markers in videos, boards, drones, conversions, and wrong input."""
 
 import json
 from dataclasses import replace
@@ -38,7 +38,7 @@ def run(*arguments):
 
 
 def refused(*arguments):
-    """The message of what goes wrong on purpose, which `main` prints as one line."""
+    """Message of the error that the command raises; `main` prints the message as one line."""
     with pytest.raises(PsotrackError) as error:
         run(*arguments)
     message = str(error.value)
@@ -52,7 +52,7 @@ def write_lines(path, *lines):
 
 
 def pairs_of(path, rig, *, noise_px=0.5, wrong=None):
-    """Marks of all points in all cameras, with places in the rows of the first camera alone."""
+    """Write marks of all points in all cameras; only the rows of the first camera have positions."""
     rng = np.random.default_rng(1)
     lines = ["camera,point,x_px,y_px,x_m,y_m,z_m"]
     for index, name in enumerate(rig.names):
@@ -105,7 +105,7 @@ def test_extrinsics_from_marks(tmp_path):
     assert "--force" in refused("extrinsics", "--pairs", pairs, "--intrinsics", out, "--out", out)
 
 
-def test_places_in_a_file_of_their_own_and_a_lens_from_a_data_sheet(tmp_path):
+def test_positions_in_a_separate_file_and_a_lens_from_a_data_sheet(tmp_path):
     K = np.array([[800.0, 0, 639.5], [0, 800.0, 359.5], [0, 0, 1]])
     R, t_m = look_at((4.0, 0.5, 2.0), (0.0, 0.0, 1.2))
     rig = make_rig({"60881257": make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1280, 720))})
@@ -127,8 +127,10 @@ def test_places_in_a_file_of_their_own_and_a_lens_from_a_data_sheet(tmp_path):
     lens = ("--focal-length", "8", "--sensor", "12.8,7.2", "--size", "1280x720")
     run("extrinsics", "--pairs", pairs, "--points", points, *lens, "--out", tmp_path / "b.yml", "-q")
     np.testing.assert_allclose(centres(read_rig(tmp_path / "b.yml")), centres(rig), atol=1e-6)
-    alone = refused("extrinsics", "--pairs", pairs, *lens, "--out", tmp_path / "c.yml")
-    assert "line 2, column point: expected x_m, y_m, z_m in one of its rows, or in a file of places" in alone
+    message = refused("extrinsics", "--pairs", pairs, *lens, "--out", tmp_path / "c.yml")
+    assert (
+        "line 2, column point: expected x_m, y_m, z_m in one of its rows, or in a file of places" in message
+    )
 
 
 @pytest.mark.parametrize(
@@ -153,7 +155,7 @@ def test_broken_marks_are_refused(tmp_path, change, message):
     assert not (tmp_path / "out.toml").exists()
 
 
-def test_a_point_in_two_places_is_refused(tmp_path):
+def test_a_point_with_two_positions_is_refused(tmp_path):
     pairs = write_lines(
         tmp_path / "pairs.csv", "camera,point,x_px,y_px,x_m,y_m,z_m", "c0,p,1,2,0,0,1", "c1,p,3,4,0,0,2"
     )
@@ -176,11 +178,11 @@ def test_a_point_in_two_places_is_refused(tmp_path):
         (("--markers", "nowhere"), "aruco_corners.csv: expected a file to read"),
     ],
 )
-def test_what_does_not_go_together_is_refused(tmp_path, arguments, message):
+def test_wrong_combinations_of_options_are_refused(tmp_path, arguments, message):
     assert message in refused("extrinsics", *arguments, "--out", tmp_path / "out.toml")
 
 
-def test_lenses_that_do_not_go_together_are_refused(tmp_path):
+def test_wrong_combinations_of_lens_options_are_refused(tmp_path):
     pairs = pairs_of(tmp_path / "pairs.csv", ring_rig(1))
     start = ("extrinsics", "--pairs", pairs, "--out", tmp_path / "out.toml")
     assert "lens: expected --intrinsics FILE, or --fov H,V" in refused(*start)
@@ -190,7 +192,7 @@ def test_lenses_that_do_not_go_together_are_refused(tmp_path):
 
 
 def marker_room(folder):
-    """Markers on two walls, drawn into the picture of a camera by homographies."""
+    """Write a sequence with a camera that sees markers on two walls, drawn by homographies; returns the rig."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
     K = np.array([[1150.0, 0, 639.5], [0, 1150.0, 359.5], [0, 0, 1]])
     R, t_m = look_at((4.0, -2.5, 2.2), (-0.6, 0.8, 1.2))
@@ -215,7 +217,7 @@ def marker_room(folder):
             value=255,
         )
         drawn = np.array([(0, 0), (side, 0), (side, side), (0, side)], np.float32) + 99.5
-        # Four times as large, pixel p is at 4 p + 1.5.
+        # In an image that is four times as large, pixel p is at 4 p + 1.5.
         pixels = (4 * project(one, places)[0] + 1.5).astype(np.float32)
         H = cv2.getPerspectiveTransform(drawn, pixels)
         inside = cv2.warpPerspective(np.full_like(sheet, 255), H, large.shape[::-1])
@@ -236,13 +238,13 @@ def test_extrinsics_from_markers_on_the_walls(tmp_path):
     folder.mkdir()
     rig = marker_room(folder)
     lens = ("--intrinsics", folder / "cameras_calibration.csv", "--size", "1280,720", "--noise", "0.3")
-    answer = run(
+    output = run(
         "extrinsics", "--markers", folder, *lens, "--out", tmp_path / "rig.toml", "--json", "-"
     ).stdout
-    row = json.loads(answer)["cameras"]["cam1i"]
+    row = json.loads(output)["cameras"]["cam1i"]
     assert row["points"] == 7 * 4
     assert row["worst"][0]["point"].partition(".")[0] in {"3", "4", "5", "6", "20", "21", "22"}
-    # A tenth of a pixel at 5 m is 0.5 mm; corners in compressed video are worse. Measured 3 mm.
+    # A tenth of a pixel at 5 m is 0.5 mm, but corners in compressed video have larger errors. Measured 3 mm.
     assert np.linalg.norm(centres(read_rig(tmp_path / "rig.toml")) - centres(rig)) < 0.01
 
 
@@ -255,7 +257,7 @@ def test_intrinsics_of_a_board(tmp_path):
         for _ in range(14):
             R = Rotation.from_euler("xyz", rng.uniform(-35, 35, 3), degrees=True).as_matrix()
             shift = (rng.uniform(-0.08, 0.08), rng.uniform(-0.06, 0.06), rng.uniform(0.32, 0.5))
-            # Pixel u of the sheet is at (u + 0.5) / per_m of the board, whose middle is at the shift.
+            # Pixel u of the sheet is at (u + 0.5) / per_m on the board. The board's middle is at `shift`.
             to_board = np.array(
                 [[1 / per_m, 0, 0.5 / per_m - 0.14], [0, 1 / per_m, 0.5 / per_m - 0.1], [0, 0, 1]]
             )
@@ -264,14 +266,14 @@ def test_intrinsics_of_a_board(tmp_path):
             writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
     size = ("--squares", "7x5", "--square", "0.04", "--marker", "0.03")
     out = tmp_path / "lens.toml"
-    answer = run(
+    output = run(
         "intrinsics", tmp_path / "board.avi", *size, "--name", "60881257", "--out", out, "--json", "-"
     )
-    content = json.loads(answer.stdout)
+    content = json.loads(output.stdout)
     lens = read_lenses(out)
     assert lens.names == ("60881257",)
     assert content["values"]["fx_px"] == lens.cameras.K[0, 0, 0]
-    # Warped without smoothing; the exact bounds are in test_calibration_intrinsics.
+    # The images are warped without smoothing; test_calibration_intrinsics has the exact bounds.
     assert abs(lens.cameras.K[0, 0, 0] - 620) < 12
     shown = run("intrinsics", tmp_path / "board.avi", *size, "--out", tmp_path / "other.yml").stdout
     assert "fx_px" in shown
@@ -286,7 +288,7 @@ HALF_PX = np.array([60.0, 35.0])
 
 
 def flight(folder, rig, wrong):
-    """A sequence whose detections are exact boxes of the true rig, and whose calibration is another."""
+    """Write a sequence with detections by `rig` (noise of 0.5 px) and the calibration `wrong`; returns its tracks."""
     folder.mkdir()
     rng = np.random.default_rng(3)
     frame = np.arange(60)
@@ -329,7 +331,7 @@ def square_pixels(rig):
 def test_a_rig_is_adjusted_to_its_drones(tmp_path):
     rig = square_pixels(ring_rig(5, image_size_wh=(1280, 720)))
     T = rig.cameras.T_cam_world.copy()
-    # One camera was pushed: by 1 degree about its own centre, and by 3 cm.
+    # One camera is turned by 1 degree about its own centre, and moved by 3 cm.
     R = Rotation.from_rotvec([0.01, -0.012, 0.006]).as_matrix() @ T[2, :3, :3]
     T[2, :3, :3], T[2, :3, 3] = R, -R @ (centres(rig)[2] + (0.02, -0.02, 0.01))
     wrong = Rig(rig.names, replace(rig.cameras, T_cam_world=T))
@@ -339,10 +341,10 @@ def test_a_rig_is_adjusted_to_its_drones(tmp_path):
     shown = run("adjust", tmp_path / "SEQ", "--tracks", tracks, *fixed, "--out", out).stdout
     assert "moved (mm)" in shown
     better = read_rig(out, (1280, 720))
-    # 120 points of 0.5 px, a millimetre and a half each, in depth too: four standard deviations.
+    # The bound is four standard deviations: each of 120 points has an error of 0.5 px, which is 1.5 mm.
     np.testing.assert_allclose(centres(better)[2], centres(rig)[2], atol=0.006)
     np.testing.assert_allclose(centres(better)[0], centres(rig)[0], atol=1e-12)
-    answer = run(
+    output = run(
         "adjust",
         tmp_path / "SEQ",
         "--tracks",
@@ -353,7 +355,7 @@ def test_a_rig_is_adjusted_to_its_drones(tmp_path):
         "--json",
         "-",
     ).stdout
-    rows = json.loads(answer)["cameras"]
+    rows = json.loads(output)["cameras"]
     assert {name: row["verdict"] for name, row in rows.items() if row["verdict"] != "agrees"} == {
         "c2": "moved"
     }
@@ -369,16 +371,16 @@ def test_a_rig_is_adjusted_to_its_drones(tmp_path):
     )
 
 
-def test_a_right_rig_is_written_as_it_was(tmp_path):
+def test_a_right_rig_is_written_unchanged(tmp_path):
     rig = square_pixels(ring_rig(5, image_size_wh=(1280, 720)))
     tracks = flight(tmp_path / "SEQ", rig, rig)
     out = tmp_path / "same.toml"
     shown = run("adjust", tmp_path / "SEQ", "--tracks", tracks, "--refine-focal-length", "--out", out).stdout
     assert "no camera is off by more than the uncertainty of these detections" in shown
-    assert "the rig is written as it was" in shown
+    assert "the rig is written unchanged" in shown
     assert "which may be chance" in shown
     given = read_sequence(tmp_path / "SEQ").rig
-    # Written as Rodrigues vectors.
+    # The file has Rodrigues vectors, whose conversion rounds.
     np.testing.assert_allclose(read_rig(out).cameras.T_cam_world, given.cameras.T_cam_world, atol=1e-14)
     np.testing.assert_array_equal(read_rig(out).cameras.K, given.cameras.K)
 
@@ -389,11 +391,11 @@ def test_files_are_converted(tmp_path):
     shown = run("convert", tmp_path / "a.toml", tmp_path / "b.yml").stdout
     assert "c2" in shown
     run("convert", tmp_path / "b.yml", tmp_path / "c.csv", "-q")
-    answer = json.loads(
+    output = json.loads(
         run("convert", tmp_path / "c.csv", tmp_path / "d.toml", "--size", "320,240", "--json", "-").stdout
     )
-    assert answer["rig"] == str(tmp_path / "d.toml")
-    # Rodrigues vectors, twice.
+    assert output["rig"] == str(tmp_path / "d.toml")
+    # Two files have Rodrigues vectors, whose conversion rounds.
     np.testing.assert_allclose(
         read_rig(tmp_path / "d.toml").cameras.T_cam_world, rig.cameras.T_cam_world, atol=1e-14
     )

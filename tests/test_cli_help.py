@@ -1,4 +1,4 @@
-"""`psotrack --help` is quick and agrees with the commands, and shells complete commands and options."""
+"""`psotrack --help`: speed and agreement with the commands; completion of commands and options in shells."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ finally:
 
 
 def psotrack(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """`psotrack` in a process of its own."""
+    """Run `psotrack` in a new process."""
     return subprocess.run(
         [sys.executable, "-m", "psotrack", *arguments],
         env=os.environ | environment,
@@ -53,9 +53,9 @@ def test_summaries_are_the_first_sentences_of_the_commands(group: LazyGroup) -> 
 
 
 def test_help_lists_every_command_with_its_whole_summary() -> None:
-    answer = psotrack("--help")
-    assert answer.returncode == 0
-    words = " ".join(answer.stdout.split())
+    result = psotrack("--help")
+    assert result.returncode == 0
+    words = " ".join(result.stdout.split())
     for name, lazy in cli.cli.lazy_commands.items():
         assert f" {name} {lazy.summary}" in words
 
@@ -67,22 +67,22 @@ def test_help_and_names_of_commands_import_no_heavy_package() -> None:
         (["calibrate", "--help"], {}),
         ([], {"_PSOTRACK_COMPLETE": "bash_complete", "COMP_WORDS": "psotrack s", "COMP_CWORD": "1"}),
     ):
-        answer = subprocess.run(
+        result = subprocess.run(
             [sys.executable, "-c", REPORT_IMPORTS, *arguments],
             env=os.environ | environment,
             capture_output=True,
             text=True,
             check=True,
         )
-        assert answer.stdout.splitlines()[-1] == "imported:", arguments
+        assert result.stdout.splitlines()[-1] == "imported:", arguments
 
 
 @pytest.mark.parametrize("command", ["localise", "silhouettes", "simulate", "sweep", "track"])
 def test_help_of_a_command_imports_the_defaults_of_settings_alone(command: str) -> None:
-    answer = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-c", REPORT_IMPORTS, command, "--help"], capture_output=True, text=True, check=True
     )
-    assert answer.stdout.splitlines()[-1] == "imported: msgspec"
+    assert result.stdout.splitlines()[-1] == "imported: msgspec"
 
 
 def test_help_is_quick() -> None:
@@ -91,15 +91,15 @@ def test_help_is_quick() -> None:
         before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
         assert psotrack("--help").returncode == 0
         seconds.append(resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before)
-    # The quickest of three: work beside this test makes the others slower.
+    # The shortest of three times counts, because other work on the machine makes a process slower.
     assert min(seconds) <= MAX_HELP_S
 
 
-def test_mistyped_commands_are_answered_with_names_near_them() -> None:
-    answer = psotrack("silhouetes")
-    assert answer.returncode == 2
-    assert answer.stderr.count("\n") == 1
-    assert "'silhouettes'" in answer.stderr
+def test_the_error_for_a_mistyped_command_suggests_a_command() -> None:
+    result = psotrack("silhouetes")
+    assert result.returncode == 2
+    assert result.stderr.count("\n") == 1
+    assert "'silhouettes'" in result.stderr
 
 
 def test_help_says_how_to_switch_completion_on() -> None:
@@ -113,24 +113,24 @@ def test_help_says_how_to_switch_completion_on() -> None:
 )
 def test_the_script_that_switches_completion_on(shell: str, switch: str) -> None:
     if shell == "bash" and shutil.which("bash") is None:
-        pytest.skip("click asks bash for its version")
-    answer = psotrack(_PSOTRACK_COMPLETE=f"{shell}_source")
-    assert answer.returncode == 0, answer.stderr
-    assert f"_PSOTRACK_COMPLETE={shell}_complete" in answer.stdout
-    assert any(line.strip().startswith(switch) and "psotrack" in line for line in answer.stdout.splitlines())
+        pytest.skip("click runs bash to find its version")
+    result = psotrack(_PSOTRACK_COMPLETE=f"{shell}_source")
+    assert result.returncode == 0, result.stderr
+    assert f"_PSOTRACK_COMPLETE={shell}_complete" in result.stdout
+    assert any(line.strip().startswith(switch) and "psotrack" in line for line in result.stdout.splitlines())
 
 
 def completions(shell: str, words: list[str], incomplete: str) -> set[str]:
-    """What `psotrack` offers a shell after `words`, where `incomplete` is typed."""
+    """Completions of `psotrack` in a shell after `words` and the first characters `incomplete` of the next word."""
     if shell == "fish":
         typed = {"COMP_WORDS": " ".join(words), "COMP_CWORD": incomplete}
     else:
         typed = {"COMP_WORDS": " ".join([*words, incomplete]), "COMP_CWORD": str(len(words))}
-    answer = psotrack(_PSOTRACK_COMPLETE=f"{shell}_complete", **typed)
-    assert answer.returncode == 0, answer.stderr
-    lines = answer.stdout.splitlines()
+    result = psotrack(_PSOTRACK_COMPLETE=f"{shell}_complete", **typed)
+    assert result.returncode == 0, result.stderr
+    lines = result.stdout.splitlines()
     if shell == "zsh":
-        # Three lines for each: type, value, help.
+        # Each completion has three lines: type, value, help.
         return set(lines[1::3])
     # bash: `type,value`; fish: `type,value<tab>help`.
     return {line.split(",", 1)[1].split("\t")[0] for line in lines}
@@ -154,7 +154,7 @@ def test_shells_complete_commands_and_options(shell: str) -> None:
 TAB = {
     "bash": 'eval "$(_PSOTRACK_COMPLETE=bash_source psotrack)"; COMP_WORDS=(psotrack sim); COMP_CWORD=1; '
     '_psotrack_completion psotrack sim psotrack; echo "${COMPREPLY[@]}"',
-    # zsh has no such command; its functions for completion are replaced by one that prints.
+    # zsh has no command that prints completions; its completion functions are replaced by functions that print.
     "zsh": "compdef() { :; }; _describe() { print -r -- $completions_with_descriptions; }; "
     'eval "$(_PSOTRACK_COMPLETE=zsh_source psotrack)"; words=(psotrack sim); CURRENT=2; '
     "_psotrack_completion",
@@ -169,21 +169,21 @@ def test_the_tab_key_in_a_shell(tmp_path: Path, shell: str) -> None:
     program = tmp_path / "psotrack"
     program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m psotrack "$@"\n', encoding="utf-8")
     program.chmod(0o755)
-    answer = subprocess.run(
+    result = subprocess.run(
         [shell, "-c", TAB[shell]],
         env=os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "HOME": str(tmp_path)},
         capture_output=True,
         text=True,
         check=True,
     )
-    assert re.match(r"simulate\b", answer.stdout), answer
+    assert re.match(r"simulate\b", result.stdout), result
 
 
 def test_an_unknown_shell_is_one_line() -> None:
-    answer = psotrack(_PSOTRACK_COMPLETE="tcsh_source")
-    assert (answer.returncode, answer.stdout) == (2, "")
-    assert answer.stderr.count("\n") == 1
-    assert "bash_source, zsh_source or fish_source" in answer.stderr
+    result = psotrack(_PSOTRACK_COMPLETE="tcsh_source")
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr.count("\n") == 1
+    assert "bash_source, zsh_source or fish_source" in result.stderr
 
 
 def test_hints_about_pip_need_no_checkout() -> None:

@@ -140,7 +140,7 @@ def test_tracks_of_another_recording_are_reported_as_not_fused(files, tmp_path) 
     folder, _ = files
     done = run(folder / "dron1.csv", folder / "elsewhere.csv", "--out", tmp_path / "fused.csv")
     assert "dron1: no track, kept as it is" in done.output
-    assert "nothing was fused, as no path is near a track" in done.output.splitlines()[-1]
+    assert "nothing was fused, because no path is near a track" in done.output.splitlines()[-1]
     done = run(
         folder / "dron1.csv", folder / "blind.csv", folder / "tracks.csv", "--out", tmp_path / "two.csv"
     )

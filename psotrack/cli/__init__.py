@@ -77,7 +77,7 @@ COMMANDS = {
         "Find the offset between the clocks of SEQ's reference and of its videos, from the motion in TRACKS.",
     ),
     "table": LazyCommand(
-        "psotrack.cli.sweep", "Show a figure of the results in DIR: mean +- standard deviation over runs."
+        "psotrack.cli.sweep", "Show a table of the results in DIR: mean +- standard deviation over runs."
     ),
     "track": LazyCommand(
         "psotrack.cli.track", "Track the drones of SEQ from its videos, or from detections in them."
@@ -149,7 +149,7 @@ def main() -> None:
 
 
 def _complete() -> None:
-    """Answer a shell that asks for completions, and exit; do nothing if no shell asks."""
+    """Print completions and exit if a shell has started the program for them; otherwise do nothing."""
     instruction = os.environ.get(_COMPLETION_VARIABLE)
     if not instruction:
         return

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     "max_offset_s",
     type=float,
     metavar="SECONDS",
-    help="Estimate the offset of each on-board camera's clock, up to this.  [default: no clock has an offset]",
+    help="Estimate the offset of each on-board camera's clock, up to SECONDS.  [default: no clock has an offset]",
 )
 @FORCE
 @QUIET
@@ -101,7 +101,7 @@ def _doubt(fused: FusedTracks) -> str:
     """Advice where nothing was fused; empty otherwise."""
     if any(drone.tracks for drone in fused.drones):
         return ""
-    return "; nothing was fused, as no path is near a track: check that all files are from one recording with one clock"
+    return "; nothing was fused, because no path is near a track: check that all files have one recording and one clock"
 
 
 def _sentence(drone: FusedDrone) -> str:

@@ -41,7 +41,7 @@ from psotrack.cli.output import output_json, print_line, report_to
 @click.option(
     "--validation",
     metavar="NAME,...",
-    help="Sequences for validation, not for training.  [default: the last]",
+    help="Sequences for validation, not for training.  [default: the last sequence]",
 )
 @click.option(
     "--min-inside",

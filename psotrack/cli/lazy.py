@@ -1,4 +1,4 @@
-"""A group of commands whose modules are imported when a command runs, not for the list of commands."""
+"""A group of commands that imports a command's module only when the command is used."""
 
 from __future__ import annotations
 

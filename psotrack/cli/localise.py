@@ -29,7 +29,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _Input:
-    """A video, and the markers and intrinsics that its sequence brings along."""
+    """A video, and the table of markers and the intrinsics of its sequence, if the video belongs to a sequence.
+
+    Attributes:
+        source: frames of the video.
+        name: name of the drone.
+        onboard: the on-board video in the sequence, with intrinsics; None outside of a sequence.
+        markers: table of marker corners in the sequence; None outside of a sequence.
+    """
 
     source: FrameSource
     name: str
@@ -295,7 +302,7 @@ def _sentence(out: Path, content: dict[str, Any]) -> str:
     error_px = content["median_reprojection_px"]
     return (
         f"{out}: {content['drone']} in {content['poses']} of {content['frames']} frames"
-        f"{f', {bridged} of them bridged' if bridged else ''}{f', {gated} gated' if gated else ''}; "
+        f"{f', {bridged} bridged by the filter' if bridged else ''}{f', {gated} gated' if gated else ''}; "
         f"median of {content['median_markers']:g} markers"
         f"{'' if error_px is None else f' that fit to {error_px:.2f} px'}; "
         f"{content['frames_per_second']:.1f} frames per second ({stages} ms)"
@@ -313,5 +320,5 @@ def _doubt(content: dict[str, Any]) -> str:
     if content["own_poses"]:
         return f"; the filter rejected all {content['own_poses']} poses: --no-filter keeps them"
     if most < content["min_markers"]:
-        return f"; no frame shows more than {most} markers of the map: --min-markers asks for {content['min_markers']}"
+        return f"; no frame shows more than {most} markers of the map: --min-markers requires {content['min_markers']}"
     return "; no pose fits the markers: check --markers, and --camera or --fov"

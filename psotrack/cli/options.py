@@ -94,7 +94,7 @@ BACKGROUND = click.option(
     default="mog2",
     show_default=True,
     metavar="mog2|NAME",
-    help="MOG2, or the background model that an installed package adds under NAME.",
+    help="Background model: MOG2, or a model NAME that an installed package adds.",
 )
 FOV = click.option(
     "--fov",

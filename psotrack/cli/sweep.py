@@ -1,4 +1,4 @@
-"""`psotrack sweep` and `psotrack table`: grids of settings, run and remembered, and tables of what came out."""
+"""`psotrack sweep` and `psotrack table`: run grids of settings, store the results, and show tables of the results."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("grid_file", metavar="GRID.toml", type=click.Path(path_type=Path), required=False)
 @click.option(
-    "--out", type=click.Path(path_type=Path), help="Folder of the results; made if it is not there."
+    "--out", type=click.Path(path_type=Path), help="Folder of the results; it is made if it does not exist."
 )
 @click.option(
     "--data",
@@ -29,25 +29,27 @@ if TYPE_CHECKING:
     show_default=True,
     help="Root folder of the sequences that the grid names.",
 )
-@click.option("--dry-run", is_flag=True, help="Print the cells and an estimate of the time, and end.")
+@click.option(
+    "--dry-run", is_flag=True, help="Print the cells and an estimate of the time without running a cell."
+)
 @click.option(
     "--status",
     type=click.Path(path_type=Path),
     metavar="DIR",
-    help="Say how far the results in DIR are, and who is at work, and end.",
+    help="Print the numbers of finished, failed and locked cells in DIR and the processes at work; run nothing.",
 )
 @click.option(
     "--cluster",
     metavar="local|ADDRESS",
-    help="Cells are tasks of a Dask cluster: one that is started here, or that of the scheduler at the address.",
+    help="Run the cells on a Dask cluster: local starts a cluster on this machine; ADDRESS names a running scheduler.",
 )
 @click.option(
     "--workers",
     type=click.IntRange(min=1),
-    help="Processes of --cluster local.  [default: one per processor; one with --device gpu]",
+    help="Number of processes of --cluster local.  [default: one per processor; one with --device gpu]",
 )
 @click.option(
-    "--device", type=click.Choice(["cpu", "gpu"]), help="What to compute on.  [default: JAX's choice]"
+    "--device", type=click.Choice(["cpu", "gpu"]), help="Device that computes.  [default: JAX's choice]"
 )
 @CACHE
 @JOBS
@@ -71,8 +73,9 @@ def sweep(
 ) -> None:
     """Track with every combination of a grid's settings, and keep one row per run.
 
-    Runs of a cell (seeds) are one batch. What is finished stays: the same command again runs only what is not, several
-    at once share the work. A cell that fails is kept with its error; the exit code is then 2.
+    A cell is one combination of settings; its runs, which differ in their seeds, are tracked as one batch. The same
+    command continues an interrupted sweep: finished cells are not run again. Several commands at the same time share
+    the work. If a cell fails, its error is stored, the other cells run, and the exit code is 2.
 
     \b
     Examples:
@@ -86,12 +89,12 @@ def sweep(
         _status(status, quiet, force, json_path)
         return
     if grid_file is None:
-        raise SettingsError("sweep", expected="a GRID.toml, or --status DIR", found="neither")
+        raise SettingsError("sweep", expected="GRID.toml or --status DIR", found="neither")
     if workers is not None and cluster is None:
-        raise SettingsError("--workers", expected="--cluster local with it", found="no --cluster")
+        raise SettingsError("--workers", expected="--cluster local", found="no --cluster")
     from psotrack.sweep import Cluster, load
 
-    where = None if cluster is None else Cluster(cluster, workers, device)
+    where_to_run = None if cluster is None else Cluster(cluster, workers, device)
     grid = load(grid_file)
     if dry_run:
         from psotrack.sweep import Inputs, Store
@@ -102,11 +105,12 @@ def sweep(
     if out is None:
         raise SettingsError("--out", expected="the folder to write to", found="none")
     if json_path not in (None, Path("-")):
-        refuse_to_overwrite(json_path, force)  # now, not after hours
-    if where is None:
+        # The error must come before the sweep, which may take hours.
+        refuse_to_overwrite(json_path, force)
+    if where_to_run is None:
         outcome = _run_here(grid, out, data, cache, jobs, device, report_to(quiet))
     else:
-        outcome = _run_on_cluster(grid, out, data, cache, where, report_to(quiet))
+        outcome = _run_on_cluster(grid, out, data, cache, where_to_run, report_to(quiet))
     counts = {state: outcome.count(state) for state in ("finished", "failed", "left")}
     output_json(json_path, counts, force)
     failed = f", {counts['failed']} failed (see {out}/cells/*.error.json)" if counts["failed"] else ""
@@ -149,23 +153,36 @@ def _run_on_cluster(
 
 @click.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
-@click.option("--rows", "rows_by", default="sequence", show_default=True, help="Names with commas between.")
+@click.option(
+    "--rows",
+    "rows_by",
+    default="sequence",
+    show_default=True,
+    help="Columns of the results, with commas between them, that label the rows.",
+)
 @click.option(
     "--columns",
     "columns_by",
-    help="Names with commas between.  [default: method; sequence where --rows names method]",
+    help="Columns of the results that label the table's columns.  [default: method; sequence if --rows names method]",
 )
-@click.option("--value", default="mean_error_m", show_default=True, help="Which figure.")
-@click.option("--scale", type=float, default=1.0, show_default=True, help="1000 makes mm of m.")
+@click.option(
+    "--value", default="mean_error_m", show_default=True, help="Column of the numbers in the table."
+)
+@click.option(
+    "--scale", type=float, default=1.0, show_default=True, help="Factor of the numbers; 1000 turns m into mm."
+)
 @click.option(
     "--format",
     "layout",
     type=click.Choice(["text", "markdown", "latex", "csv"]),
     default="text",
     show_default=True,
+    help="Format of the table.",
 )
 def table(folder: Path, rows_by: str, columns_by: str | None, value: str, scale: float, layout: str) -> None:
-    """Show a figure of the results in DIR: mean +- standard deviation over runs.
+    """Show a table of the results in DIR: mean +- standard deviation over runs.
+
+    The end of a column's name is enough if no other column ends with it: particles is settings.swarm.particles.
 
     \b
     Examples:
@@ -217,7 +234,7 @@ def _show(
 
 
 def _status(folder: Path, quiet: bool, force: bool, json_path: Path | None) -> None:
-    """How far the results in a folder are."""
+    """Print the numbers of finished, failed and locked cells in a folder, and the processes at work."""
     from psotrack.sweep import Store
 
     content = Store(folder).status()

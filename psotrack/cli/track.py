@@ -38,78 +38,94 @@ from psotrack.support import refuse_to_overwrite
     "--out",
     type=click.Path(path_type=Path),
     required=True,
-    help="The tracks: a file that ends in .csv or .parquet.",
+    help="File of the tracks; it ends in .csv or .parquet.",
 )
 @click.option(
     "--method",
     default=TRACK.method,
     show_default=True,
     metavar="swarm|projection-lines|fused|NAME",
-    help="A swarm over silhouettes, triangulated detections, both weighted by their covariances, or the method that an "
-    "installed package adds under NAME.",
+    help="swarm searches in silhouettes; projection-lines triangulates detections; fused combines both, weighted by "
+    "their covariances; NAME is a method that an installed package adds.",
 )
 @click.option(
     "--detections",
     default=TRACK.detections,
     show_default=True,
     metavar="yolo|blobs|FOLDER",
-    help="Of the projection lines: SEQ's own, blobs of its silhouettes, or a folder with a CSV file per camera.",
+    help="Detections for projection-lines and fused: SEQ's own, blobs of its silhouettes, or a folder with a CSV file "
+    "per camera.",
 )
 @click.option(
     "--detector",
     metavar="MODEL.onnx|NAME",
-    help="Instead of --detections: a YOLO network (v5 to v11) that finds the drones, or the detector that an installed "
-    "package adds under NAME; the detections are kept.",
+    help="Detector, instead of --detections: a YOLO network (v5 to v11) that was trained on drones, or a detector NAME "
+    "that an installed package adds. Its detections are stored.",
 )
 @click.option(
     "--detector-size",
     type=int,
     default=DETECTOR_SIZE,
     show_default=True,
-    help="Of the network's square input, in pixels.",
+    help="Side of the network's square input, in pixels.",
 )
 @click.option(
-    "--particles", type=int, default=TRACK.swarm.particles, show_default=True, help="Of every swarm."
+    "--particles",
+    type=int,
+    default=TRACK.swarm.particles,
+    show_default=True,
+    help="Number of particles of every swarm.",
 )
-@click.option("--iterations", type=int, default=TRACK.swarm.iterations, show_default=True, help="Per frame.")
+@click.option(
+    "--iterations",
+    type=int,
+    default=TRACK.swarm.iterations,
+    show_default=True,
+    help="Number of iterations per frame.",
+)
 @click.option(
     "--swarm",
     type=click.Choice(get_args(SwarmKind)),
     default=TRACK.swarm.kind,
     show_default=True,
-    help="One swarm over all drones, as in the paper, or one for each.",
+    help="joint: one swarm over all drones, as in the paper; per-drone: one swarm for each drone.",
 )
 @click.option(
     "--score",
     default=TRACK.score.kind,
     show_default=True,
     metavar="soft|hard|NAME",
-    help="Concentric windows, the paper's one box in whole pixels, or the score that a package adds under NAME.",
+    help="Score of positions: soft uses concentric windows; hard is the paper's one box in whole pixels; NAME is a "
+    "score that an installed package adds.",
 )
 @click.option(
     "--search",
     default=TRACK.swarm.search,
     show_default=True,
     metavar="pso|NAME",
-    help="Particle swarm optimisation, or the search that an installed package adds under NAME.",
+    help="Search for the best positions: pso is particle swarm optimisation; NAME is a search that an installed "
+    "package adds.",
 )
-@click.option("--seed", type=int, default=TRACK.seed, show_default=True, help="Of the swarm.")
+@click.option(
+    "--seed", type=int, default=TRACK.seed, show_default=True, help="Seed of the swarm's random numbers."
+)
 @click.option(
     "--init",
     default=TRACK.init,
     show_default=True,
     metavar="auto|truth|FILE",
-    help="Where the drones are at first: found by themselves, from the reference, or from a file of tracks.",
+    help="Initial positions of the drones: auto finds them in the first frames; truth takes them from the reference; "
+    "FILE is a file of tracks.",
 )
 @click.option(
-    "--drones", type=int, metavar="N", help="How many there are.  [default: as many as --init finds]"
+    "--drones", type=int, metavar="N", help="Number of drones.  [default: the number that --init finds]"
 )
 @click.option(
     "--drone-size",
     "drone_size_m",
     type=Numbers(3),
     metavar="X,Y,Z",
-    help="Full lengths in metres.  [default: learned on the way]",
+    help="Full lengths of a drone along x, y and z, in metres.  [default: estimated while tracking]",
 )
 @click.option(
     "--body-offset",
@@ -117,15 +133,15 @@ from psotrack.support import refuse_to_overwrite
     type=Numbers(3),
     default=TRACK.drones.body_offset_m,
     metavar="X,Y,Z",
-    help="From a body's origin to the middle of its silhouette (with projection lines: of its box), in metres, along "
-    "the world's axes.  [default: 0,0,0]",
+    help="Vector from the origin of a drone's body to the middle of its silhouette (with projection-lines: box), "
+    "along the world's axes, in metres.  [default: 0,0,0]",
 )
 @click.option(
     "--bounds",
     "bounds_m",
     type=Numbers(6),
     metavar="X0,X1,Y0,Y1,Z0,Z1",
-    help="The room in metres.  [default: what the cameras stand around]",
+    help="Bounds of the room, in metres.  [default: derived from the cameras]",
 )
 @click.option(
     "--max-speed",
@@ -133,9 +149,11 @@ from psotrack.support import refuse_to_overwrite
     type=float,
     default=TRACK.motion.max_speed_m_s,
     show_default=True,
-    help="Of a drone, in m/s.",
+    help="Largest speed of a drone, in m/s.",
 )
-@click.option("--smooth", is_flag=True, default=TRACK.smooth, help="Let later frames correct earlier ones.")
+@click.option(
+    "--smooth", is_flag=True, default=TRACK.smooth, help="Correct each frame's positions by later frames."
+)
 @silhouette_options
 @BACKGROUND
 @CAMERAS
@@ -162,9 +180,9 @@ def track(
 ) -> None:
     """Track the drones of SEQ from its videos, or from detections in them.
 
-    Writes OUT, one row per frame and drone, and beside it the same name with .json (every setting, what was learned of
-    each drone, who came and who met, versions, device, input keys, seconds per stage) and with .ambiguity.csv (which
-    drones may be taken for each other, frame by frame).
+    Writes OUT, with one row per frame and drone, and two files beside OUT. The file that ends in .json contains all
+    settings, the estimates for each drone, births of tracks, encounters of drones, versions, device, input keys and
+    seconds per stage. The file that ends in .ambiguity.csv says for each frame which drones may be confused.
 
     \b
     Examples:
@@ -215,7 +233,7 @@ def track(
 
 
 def _setting_name(option: str) -> str:
-    """The dotted name of the setting that an option sets."""
+    """Dotted name of the setting that an option sets."""
     if option in SilhouetteSettings.__struct_fields__:
         return f"silhouettes.{option}"
     return "swarm.search" if option == "search" else RENAMED.get(option, option)

@@ -94,7 +94,7 @@ def adjust(
     print_line(quiet, json_path, _in_words(improved, rows))
     if refine_focal_length:
         scale, std = improved.everything.focal_scale, improved.everything.focal_scale_std
-        done = "" if improved.rescaled else ", which may be chance: they are written as they were"
+        done = "" if improved.rescaled else ", which may be chance: the focal lengths are not changed"
         print_line(quiet, json_path, f"focal lengths x {scale:.5f}, give or take {std:.5f}{done}")
 
 
@@ -127,12 +127,12 @@ def _rows(
 def _in_words(improved: Improved, rows: dict[str, dict[str, Any]]) -> str:
     """The results in one line."""
     if not improved.moved:
-        what = "only the focal lengths are changed" if improved.rescaled else "the rig is written as it was"
+        what = "only the focal lengths are changed" if improved.rescaled else "the rig is written unchanged"
         known_mm = [1e3 * float(np.linalg.norm(row["centre_std_m"])) for row in rows.values()]
-        told_mm = [value for value in known_mm if value > 0] or [0.0]
+        stated_mm = [value for value in known_mm if value > 0] or [0.0]
         return (
             "no camera is off by more than the uncertainty of these detections, which is "
-            f"{min(told_mm):.0f} to {max(told_mm):.0f} mm: {what}"
+            f"{min(stated_mm):.0f} to {max(stated_mm):.0f} mm: {what}"
         )
     parts = [
         f"{name} is off: moved by {1e3 * rows[name]['moved_m']:.0f} mm, "
@@ -140,9 +140,13 @@ def _in_words(improved: Improved, rows: dict[str, dict[str, Any]]) -> str:
         for name in improved.moved
     ]
     parts += [
-        f"or the focal length of {name} is (x {scale:.3f}, give or take {std:.3f}): check its lens"
+        f"or the focal length of {name} is wrong (x {scale:.3f}, give or take {std:.3f}): check its lens"
         for name, (scale, std) in improved.zoomed.items()
     ]
     agree = any(row["verdict"] == "agrees" for row in rows.values())
-    parts.append("the others agree and stay" if agree else "too few agree: the rig as a whole was held")
+    parts.append(
+        "the other cameras agree and stay"
+        if agree
+        else "too few cameras agree: origin, axes and scale of the rig stay"
+    )
     return "; ".join(parts)

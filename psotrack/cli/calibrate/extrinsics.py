@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     "--intrinsics",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Intrinsics of the cameras; those of a file with one camera are used for all cameras.",
+    help="Intrinsics of the cameras; if FILE has only one camera, its intrinsics are used for all cameras.",
 )
 @FOV
 @click.option(
@@ -90,7 +90,7 @@ def extrinsics(
         found = "neither" if pairs is None else "both"
         raise SettingsError("extrinsics", expected="--pairs FILE or --markers SEQ", found=found)
     refuse_to_overwrite(out, force)
-    marks = read_image_points(pairs, points) if pairs else _marker_marks(Path(str(markers)), dictionary)
+    marks = read_image_points(pairs, points) if pairs else _find_markers(Path(str(markers)), dictionary)
     lenses = _lenses(list(marks), **lens)
     cameras: dict[str, Camera] = {}
     rows: dict[str, dict[str, Any]] = {}
@@ -125,12 +125,12 @@ def _lenses(
     from psotrack.calibration import lens_of_sensor, lens_of_view
     from psotrack.geometry import read_lenses
 
-    ways = [value is not None for value in (intrinsics, fov_deg, focal_length_mm)]
-    if sum(ways) != 1 or (focal_length_mm is None) != (sensor_mm is None):
+    given = [value is not None for value in (intrinsics, fov_deg, focal_length_mm)]
+    if sum(given) != 1 or (focal_length_mm is None) != (sensor_mm is None):
         raise SettingsError(
             "lens",
             expected="--intrinsics FILE, or --fov H,V, or --focal-length with --sensor",
-            found="another choice" if any(ways) else "none",
+            found="another choice" if any(given) else "none",
         )
     if intrinsics is not None:
         rig = read_lenses(intrinsics, image_size_wh)
@@ -151,7 +151,8 @@ def _lenses(
     )
 
 
-def _marker_marks(folder: Path, dictionary: str) -> dict[str, ImagePoints]:
+def _find_markers(folder: Path, dictionary: str) -> dict[str, ImagePoints]:
+    """Corners of the markers in the videos of a sequence, by camera."""
     from psotrack.calibration import find_markers
     from psotrack.datasets.dpjait import MARKER_CORNERS, read_sequence
     from psotrack.inside_out import read_marker_map

@@ -1,4 +1,4 @@
-"""`psotrack map-markers`: measure the positions of a room's markers, or check a table of them."""
+"""`psotrack map-markers`: measure the positions of a room's markers, or check a table of such positions."""
 
 from psotrack.cli.map_markers.command import FOUND, map_markers
 
