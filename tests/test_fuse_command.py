@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from test_inside_out_fusing import recording, rms, unseen, without
+from test_inside_out_fusing import recording, remove_poses, remove_positions, rms
 
 from psotrack.cli.fuse import fuse
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
@@ -20,12 +20,12 @@ def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("fuse")
     paths, outside, truths = recording(31, 100, num_drones=2, distance_m=1.5)
     outside.position_m[60:, [0, 1]] = outside.position_m[60:, [1, 0]]
-    paths["dron1"] = without(paths["dron1"], slice(20, 30))
-    write_trajectories(folder / "tracks.csv", unseen(outside, slice(80, 90)))
+    paths["dron1"] = remove_poses(paths["dron1"], slice(20, 30))
+    write_trajectories(folder / "tracks.csv", remove_positions(outside, slice(80, 90)))
     write_trajectories(
         folder / "elsewhere.csv", replace(outside, position_m=outside.position_m + np.array([0.0, 50.0, 0.0]))
     )
-    write_camera_path(folder / "blind.csv", without(paths["dron1"], slice(0, 100)), "dron3")
+    write_camera_path(folder / "blind.csv", remove_poses(paths["dron1"], slice(0, 100)), "dron3")
     for name, path in paths.items():
         write_camera_path(folder / f"{name}.csv", path, name)
     return folder, truths

@@ -21,7 +21,7 @@ FPS = 25.0
 LOOKS_AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
-def path_of(time_s, position_m, wxyz) -> CameraPath:
+def camera_path(time_s, position_m, wxyz) -> CameraPath:
     count = len(time_s)
     return CameraPath(
         frame=np.arange(count),
@@ -45,7 +45,7 @@ def flown_m(time_s, speed_m_s=1.0, seed=0):
     return np.array([0.0, 0.0, 1.5]) + (speed_m_s / np.sqrt(6) / rate * np.sin(angle)).sum(axis=1)
 
 
-def turned(time_s, seed=1) -> Rotation:
+def body_orientations(time_s, seed=1) -> Rotation:
     """Orientations of a body that turns about the vertical and sways a little; yaw passes 180 degrees."""
     sway_deg = 12.0 * flown_m(time_s, 1.0, seed)
     return Rotation.from_euler("ZYX", sway_deg * [15, 1, 1] + [170, -18, 0], degrees=True)
@@ -56,25 +56,27 @@ def compare(path, time_s, position_m, wxyz=None, *, orientation_time_s=None, **o
     return compare_paths(path, PathReference(time_s, position_m, wxyz, orientation_time_s), **options)
 
 
-def wxyz_of(rotation: Rotation):
+def as_wxyz(rotation: Rotation):
     return rotation.as_quat(scalar_first=True)
 
 
 def recording(rate_hz=100.0, seconds=13.0, clock_s=0.0):
     """Times by a clock that is `clock_s` ahead, and positions and orientations of the body at these times."""
     time_s = 0.0031 + np.arange(int(seconds * rate_hz)) / rate_hz
-    return time_s + clock_s, flown_m(time_s), wxyz_of(turned(time_s))
+    return time_s + clock_s, flown_m(time_s), as_wxyz(body_orientations(time_s))
 
 
-def filmed(arm_m=(0.0, 0.0, 0.0), turn=None, seconds=10.0, start_s=1.5, noise_m=0.0, noise_deg=0.0, seed=0):
+def filmed_path(
+    arm_m=(0.0, 0.0, 0.0), turn=None, seconds=10.0, start_s=1.5, noise_m=0.0, noise_deg=0.0, seed=0
+):
     """Path of the camera on the body of `recording`."""
     rng = np.random.default_rng(seed)
     time_s = start_s + np.arange(int(seconds * FPS)) / FPS
-    body = turned(time_s)
+    body = body_orientations(time_s)
     position_m = flown_m(time_s) + body.apply(arm_m) + rng.normal(0, noise_m, (len(time_s), 3))
     camera = body * (turn or Rotation.identity())
     camera = camera * Rotation.from_rotvec(rng.normal(0, noise_deg, (len(time_s), 3)), degrees=True)
-    return path_of(time_s, position_m, wxyz_of(camera))
+    return camera_path(time_s, position_m, as_wxyz(camera))
 
 
 class TestTablesByHand:
@@ -88,7 +90,7 @@ class TestTablesByHand:
         return np.stack([3 * np.sin(3 * time_s), 2 * np.cos(4 * time_s), 0 * time_s + 1], axis=-1)
 
     @staticmethod
-    def going_about(yaw_deg):
+    def camera_orientations(yaw_deg):
         """Orientations of cameras that look along the horizon, at these yaw angles."""
         ahead = Rotation.from_matrix(LOOKS_AHEAD)
         return Rotation.from_euler("Z", np.reshape(yaw_deg, (-1, 1)), degrees=True) * ahead
@@ -97,7 +99,7 @@ class TestTablesByHand:
         """All errors are vertical, so no clock offset makes them smaller."""
         error_m = np.array([0.01, 0.02, 0.03, 0.04, 0.10])
         position_m = self.level_m(self.TIME_S) + error_m[:, None] * [0, 0, 1]
-        path = path_of(self.TIME_S, position_m, np.tile([1.0, 0, 0, 0], (5, 1)))
+        path = camera_path(self.TIME_S, position_m, np.tile([1.0, 0, 0, 0], (5, 1)))
         found = compare(
             path, self.SAMPLES_S, self.level_m(self.SAMPLES_S), with_lever_arm=False, max_offset_s=0.1
         )
@@ -116,13 +118,15 @@ class TestTablesByHand:
     def test_table_8(self):
         """Yaw goes from 176 to 184 degrees, which is the same as -176 degrees, so differences must be wrapped."""
         yaw_deg, error_deg = 176.0 + 2 * np.arange(5), np.array([1.0, 3.0, -2.0, 0.5, -5.0])
-        path = path_of(self.TIME_S, self.level_m(self.TIME_S), wxyz_of(self.going_about(yaw_deg + error_deg)))
+        path = camera_path(
+            self.TIME_S, self.level_m(self.TIME_S), as_wxyz(self.camera_orientations(yaw_deg + error_deg))
+        )
         yaws_deg = 176.0 + 2 * FPS * (self.SAMPLES_S - 0.2)
         found = compare(
             path,
             self.SAMPLES_S,
             self.level_m(self.SAMPLES_S),
-            wxyz_of(self.going_about(yaws_deg)),
+            as_wxyz(self.camera_orientations(yaws_deg)),
             with_lever_arm=False,
             with_turn=False,
             max_offset_s=0.1,
@@ -165,13 +169,13 @@ class TestAngles:
     @settings(max_examples=5)
     def test_differences_and_angles_of_random_orientations(self, seed):
         """Compared with SciPy's Euler angles of the body, and with the angle of the rotation between the two."""
-        path = filmed(seconds=4)
+        path = filmed_path(seconds=4)
         rng = np.random.default_rng(seed)
         errors = Rotation.from_rotvec(rng.normal(0, 0.3, (path.num_frames, 3)))
         poses = Rotation.from_quat(path.orientation_wxyz, scalar_first=True) * errors
         time_s, position_m, wxyz = recording(seconds=8)
         found = compare(
-            replace(path, orientation_wxyz=wxyz_of(poses)),
+            replace(path, orientation_wxyz=as_wxyz(poses)),
             time_s,
             position_m,
             wxyz,
@@ -235,7 +239,7 @@ class TestClocks:
     )
     def test_known_offsets_arm_and_turn_are_found(self, clock_s, turn_clock_s):
         """Positions are at 100 Hz by one clock; orientations are by the same clock, or at 40 Hz by another clock."""
-        path = filmed(ARM_M, TURN, noise_m=0.005, noise_deg=0.2)
+        path = filmed_path(ARM_M, TURN, noise_m=0.005, noise_deg=0.2)
         time_s, position_m, wxyz = recording(clock_s=clock_s)
         turns = {}
         if turn_clock_s is not None:
@@ -257,7 +261,7 @@ class TestClocks:
         assert np.mean(found.turning.angle_deg) == pytest.approx(0.2 * mean_norm, rel=0.08)
         # The length of the arm, 0.13 m, within the noise.
         assert np.mean(found.distance_to_point_m) == pytest.approx(np.linalg.norm(ARM_M), abs=0.002)
-        body_m = flown_m(path.time_s) + turned(path.time_s).apply(ARM_M)
+        body_m = flown_m(path.time_s) + body_orientations(path.time_s).apply(ARM_M)
         np.testing.assert_allclose(found.reference_m, body_m, atol=0.006)
         assert found.path_length_m == pytest.approx(
             np.linalg.norm(np.diff(body_m, axis=0), axis=1).sum(), rel=0.01
@@ -265,7 +269,7 @@ class TestClocks:
 
     def test_a_lever_arm_without_orientations_of_the_reference(self):
         """The path's orientations turn the arm, which is returned in the camera's axes."""
-        path = filmed(ARM_M, TURN, noise_m=0.005, noise_deg=0.2)
+        path = filmed_path(ARM_M, TURN, noise_m=0.005, noise_deg=0.2)
         time_s, position_m, _ = recording(clock_s=0.3137)
         found = compare(path, time_s, position_m)
         assert abs(found.offset_s - 0.3137) * FPS < 0.05
@@ -275,9 +279,9 @@ class TestClocks:
     @pytest.mark.parametrize("turn_clock_s", [None, 0.1573])
     def test_a_slow_drone_with_a_long_lever_arm_that_turns(self, turn_clock_s):
         """If the arm were constant in the world instead of the body, it would cause most of the visible motion."""
-        path, (time_s, _, _) = filmed(noise_deg=0.2), recording()
+        path, (time_s, _, _) = filmed_path(noise_deg=0.2), recording()
         slow_m = [flown_m(each_s, speed_m_s=0.3) for each_s in (path.time_s, time_s)]
-        moved_m = slow_m[0] + turned(path.time_s).apply([0.2, -0.1, 0.12])
+        moved_m = slow_m[0] + body_orientations(path.time_s).apply([0.2, -0.1, 0.12])
         path = replace(path, position_m=moved_m + np.random.default_rng(1).normal(0, 0.002, moved_m.shape))
         turns_s, _, wxyz = recording(rate_hz=40, clock_s=turn_clock_s or 0)
         by_own_clock = {} if turn_clock_s is None else {"orientation_time_s": turns_s}
@@ -289,7 +293,7 @@ class TestClocks:
 
     @pytest.mark.parametrize("turn_clock_s", [0.1573, -0.4081])
     def test_a_camera_with_the_axes_of_the_body(self, turn_clock_s):
-        path = filmed(noise_deg=0.2)
+        path = filmed_path(noise_deg=0.2)
         turns_s, _, wxyz = recording(rate_hz=40, clock_s=turn_clock_s)
         time_s, position_m, _ = recording()
         found = compare(
@@ -301,13 +305,13 @@ class TestClocks:
 
     def test_outliers_are_counted_and_do_not_move_the_clocks(self):
         """Every eighth pose is anywhere in the room, and one pose is at a distance of ten kilometres."""
-        path = filmed(ARM_M, TURN, noise_m=0.005, noise_deg=0.2)
+        path = filmed_path(ARM_M, TURN, noise_m=0.005, noise_deg=0.2)
         wild = np.arange(3, path.num_frames, 8)
         rng = np.random.default_rng(2)
         position_m, orientation_wxyz = path.position_m.copy(), path.orientation_wxyz.copy()
         position_m[wild] += rng.uniform(-2, 2, (len(wild), 3))
         position_m[wild[4]] = 1e4
-        orientation_wxyz[wild] = wxyz_of(Rotation.random(len(wild), rng=rng))
+        orientation_wxyz[wild] = as_wxyz(Rotation.random(len(wild), rng=rng))
         time_s, reference_m, wxyz = recording(clock_s=-0.2719)
         turns_s, _, turns_wxyz = recording(rate_hz=40, clock_s=0.4)
         wrong = replace(path, position_m=position_m, orientation_wxyz=orientation_wxyz)
@@ -322,7 +326,7 @@ class TestClocks:
             assert np.median(found.distance_m) < 0.012
 
     def test_lost_poses_and_gaps_of_the_reference_are_not_compared(self):
-        path = filmed(ARM_M, TURN, noise_m=0.005, noise_deg=0.2)
+        path = filmed_path(ARM_M, TURN, noise_m=0.005, noise_deg=0.2)
         path.status[40:60] = Status.LOST
         path.position_m[80:90] = np.nan
         path.orientation_wxyz[80:90] = np.nan
@@ -345,7 +349,7 @@ class TestClocks:
     @given(st.integers(0, 2**32 - 1), st.floats(-100, 100))
     @settings(max_examples=2)
     def test_the_comparison_does_not_depend_on_the_worlds_axes(self, seed, later_s):
-        path = filmed(ARM_M, TURN, noise_m=0.01, noise_deg=0.5, seed=seed, seconds=8)
+        path = filmed_path(ARM_M, TURN, noise_m=0.01, noise_deg=0.5, seed=seed, seconds=8)
         time_s, position_m, wxyz = recording(rate_hz=50, seconds=12)
         first = compare(path, time_s, position_m, wxyz)
         world = Rotation.random(rng=np.random.default_rng(seed))
@@ -353,9 +357,9 @@ class TestClocks:
             path,
             time_s=path.time_s + later_s,
             position_m=world.apply(path.position_m) + 7.0,
-            orientation_wxyz=wxyz_of(world * Rotation.from_quat(path.orientation_wxyz, scalar_first=True)),
+            orientation_wxyz=as_wxyz(world * Rotation.from_quat(path.orientation_wxyz, scalar_first=True)),
         )
-        turned_wxyz = wxyz_of(world * Rotation.from_quat(wxyz, scalar_first=True))
+        turned_wxyz = as_wxyz(world * Rotation.from_quat(wxyz, scalar_first=True))
         again = compare(moved, time_s + later_s, world.apply(position_m) + 7.0, turned_wxyz)
         # Offsets are found to 1e-6 s, in which the camera moves by 1e-6 m and turns by 1e-4 degrees.
         assert again.offset_s == pytest.approx(first.offset_s, abs=5e-6)
@@ -375,14 +379,14 @@ class TestRefusedComparisons:
         time_s, position_m, _ = recording(clock_s=100)
         self.refused(
             "expected positions of both at offsets within 2 s, found none",
-            filmed(),
+            filmed_path(),
             time_s,
             position_m,
             max_offset_s=2.0,
         )
 
     def test_no_poses_or_no_reference(self):
-        path, (time_s, position_m, wxyz) = filmed(), recording()
+        path, (time_s, position_m, wxyz) = filmed_path(), recording()
         lost = replace(path, status=np.full(path.num_frames, int(Status.LOST)))
         self.refused("expected poses of both, found 0 and 1300", lost, time_s, position_m)
         self.refused(
@@ -398,7 +402,7 @@ class TestRefusedComparisons:
         )
 
     def test_orientations_at_other_times_than_the_path(self):
-        path, (time_s, position_m, wxyz) = filmed(), recording()
+        path, (time_s, position_m, wxyz) = filmed_path(), recording()
         wxyz[time_s > 1.5] = np.nan
         self.refused(
             "orientations of both in some frame, found none",
@@ -410,7 +414,7 @@ class TestRefusedComparisons:
         )
 
     def test_a_camera_that_hovers(self):
-        path = filmed(noise_m=0.01)
+        path = filmed_path(noise_m=0.01)
         still_m = np.array([1.0, 2.0, 1.5])
         rng = np.random.default_rng(0)
         path.position_m[:] = still_m + rng.normal(0, 0.01, path.position_m.shape)
@@ -426,7 +430,7 @@ class TestRefusedComparisons:
         time_s, position_m, _ = recording()
         self.refused(
             "max_offset_s: expected a step",
-            filmed(),
+            filmed_path(),
             time_s,
             position_m,
             max_offset_s=0.001,
@@ -435,8 +439,8 @@ class TestRefusedComparisons:
 
 
 @pytest.fixture(scope="module")
-def flown():
-    path = filmed(ARM_M, TURN, noise_m=0.05, noise_deg=0.5)
+def noisy_flight():
+    path = filmed_path(ARM_M, TURN, noise_m=0.05, noise_deg=0.5)
     return path, compare(path, *recording())
 
 
@@ -447,8 +451,8 @@ class TestPlots:
         bgr = [int(colour[place : place + 2], 16) for place in (5, 3, 1)]
         return np.abs(cv2.imread(str(png)).astype(int) - bgr).max(axis=-1) < 40
 
-    def test_figure_11(self, tmp_path, flown):
-        path, comparison = flown
+    def test_figure_11(self, tmp_path, noisy_flight):
+        path, comparison = noisy_flight
         png = tmp_path / "paths.png"
         save_paths(png, path, comparison, caption="a flight")
         for colour in (RECONSTRUCTED, REFERENCE):
@@ -465,8 +469,8 @@ class TestPlots:
             > 0.9 * self.has_colour(png, REFERENCE).sum()
         )
 
-    def test_errors_over_time(self, tmp_path, flown):
-        path, comparison = flown
+    def test_errors_over_time(self, tmp_path, noisy_flight):
+        path, comparison = noisy_flight
         wild = replace(path, position_m=path.position_m.copy())
         wild.position_m[100] += 500.0
         save_path_errors(tmp_path / "errors.png", {"one": comparison, "other": compare(wild, *recording())})

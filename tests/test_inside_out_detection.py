@@ -21,7 +21,7 @@ SQUARE = np.array([[260.0, 180.0], [360.0, 170.0], [370.0, 275.0], [255.0, 280.0
 OBLIQUE = np.array([[100.0, 100.0], [140.0, 108.0], [139.0, 190.0], [101.0, 200.0]])
 
 
-def pattern(marker, dictionary="4x4_1000", cell_px=20):
+def marker_image(marker, dictionary="4x4_1000", cell_px=20):
     """Image of a marker with its white zone, and the corners of the marker's border in that image, pixels."""
     model = marker_dictionary(dictionary)
     cells = model.markerSize + 2
@@ -44,7 +44,7 @@ def draw(markers, *, size_wh=SIZE_WH, dictionary="4x4_1000", lens=None, exponent
     """An image of a wall with markers at given corners, (4, 2) each, drawn by one ray for each sample."""
     drawn = np.full(size_wh[::-1], WALL, np.uint8)
     for marker, corners in markers:
-        image, own = pattern(marker, dictionary)
+        image, own = marker_image(marker, dictionary)
         towards = cv2.getPerspectiveTransform(corners.astype(np.float32), own.astype(np.float32))
         # The block of whole pixels that holds the marker and its white zone.
         margin = np.ptp(corners, axis=0).max() / 4
@@ -72,7 +72,7 @@ def draw(markers, *, size_wh=SIZE_WH, dictionary="4x4_1000", lens=None, exponent
     return drawn
 
 
-def degraded(image, *, blur_px=0.0, moved_px=0, noise=0.0, exponent=2.0, gain=1.0):
+def degrade(image, *, blur_px=0.0, moved_px=0, noise=0.0, exponent=2.0, gain=1.0):
     """The image with blur, motion to the right during the exposure, other brightness, noise, and clipping.
 
     Blur is applied to the light, and grey levels are roots of the light.
@@ -97,7 +97,7 @@ def scene(*, exponent=2.0, **changes):
         )
     }
     image = draw(list(corners.items()), exponent=exponent)
-    return degraded(image, exponent=exponent, **changes), corners
+    return degrade(image, exponent=exponent, **changes), corners
 
 
 def errors_px(image, corners):
@@ -140,7 +140,7 @@ def opencv_corners(image):
 )
 @pytest.mark.parametrize(("corners", "which"), [(SQUARE, 0), (OBLIQUE, 1)], ids=["square", "oblique"])
 def test_corners_are_found_at_their_drawn_positions(corners, which, changes, limits_px):
-    found = MarkerDetector().detect(degraded(draw([(17, corners)]), **changes))
+    found = MarkerDetector().detect(degrade(draw([(17, corners)]), **changes))
     assert found.ids.tolist() == [17]
     assert largest_error_px(found.corners_px[0], corners) < limits_px[which]
 
@@ -148,7 +148,7 @@ def test_corners_are_found_at_their_drawn_positions(corners, which, changes, lim
 @pytest.mark.parametrize("changes", [{"blur_px": 1.5}, {"moved_px": 5}], ids=["soft", "moved"])
 def test_corners_are_better_than_opencvs_in_blurred_images(changes):
     """OpenCV uses the pixels around a corner, which blur makes round. Its error was measured 40 times larger."""
-    image = degraded(draw([(17, SQUARE)]), **changes)
+    image = degrade(draw([(17, SQUARE)]), **changes)
     ours = largest_error_px(MarkerDetector().detect(image).corners_px[0], SQUARE)
     assert 3 * ours < largest_error_px(opencv_corners(image)[17], SQUARE)
 
@@ -302,7 +302,7 @@ def test_two_markers_with_one_id_are_both_left_out():
 
 @pytest.mark.parametrize("noise", [0.0, 40.0])
 def test_an_image_without_markers_gives_an_empty_result(noise):
-    found = MarkerDetector().detect(degraded(np.full((240, 320), 128, np.uint8), noise=noise))
+    found = MarkerDetector().detect(degrade(np.full((240, 320), 128, np.uint8), noise=noise))
     assert len(found) == 0
     assert found.corners_px.shape == (0, 4, 2)
 

@@ -36,7 +36,7 @@ STD_M, STD_RAD = 0.004, 0.0008
 NINETY = chi2.ppf(0.9, 3)
 
 
-def spread() -> np.ndarray:
+def pose_covariance() -> np.ndarray:
     """Covariance of a pose: shifts to the side and turns about the vertical axis are correlated, as in real poses."""
     covariance = np.diag([STD_M**2] * 3 + [STD_RAD**2] * 3)
     covariance[0, 4] = covariance[4, 0] = 0.8 * STD_M * STD_RAD
@@ -68,7 +68,7 @@ def flight(frames, *, acceleration=2.0, wobble=2.0, seed=0):
             positions.append(position)
             quaternions.append(turned.as_quat(scalar_first=True))
     position_m, truth = np.array(positions), Rotation.from_quat(quaternions, scalar_first=True)
-    root = np.linalg.cholesky(spread())
+    root = np.linalg.cholesky(pose_covariance())
     lasting, off = rng.normal(size=6), []
     for _ in range(frames):
         off.append(root @ (np.sqrt(0.6) * lasting + np.sqrt(0.4) * rng.normal(size=6)))
@@ -85,7 +85,7 @@ def raw_path(position_m, orientation, time_s=None) -> CameraPath:
         time_s=np.arange(count) / FPS if time_s is None else time_s,
         position_m=position_m,
         orientation_wxyz=orientation.as_quat(scalar_first=True).reshape(count, 4),
-        covariance=np.tile(spread(), (count, 1, 1)),
+        covariance=np.tile(pose_covariance(), (count, 1, 1)),
         num_markers=np.full(count, 8),
         reprojection_px=np.full(count, 0.3),
         ambiguity=np.zeros(count),
@@ -94,7 +94,7 @@ def raw_path(position_m, orientation, time_s=None) -> CameraPath:
     )
 
 
-def without(path: CameraPath, gone) -> CameraPath:
+def remove_poses(path: CameraPath, gone) -> CameraPath:
     """The path with the poses of some frames lost."""
     values = {
         name: getattr(path, name).copy()
@@ -107,7 +107,7 @@ def without(path: CameraPath, gone) -> CameraPath:
     return replace(path, **values, status=status, num_markers=num_markers)
 
 
-def misplaced(path: CameraPath, rows, shift_m, turn=(0.0, 0.0, 0.0)) -> CameraPath:
+def move_poses(path: CameraPath, rows, shift_m, turn=(0.0, 0.0, 0.0)) -> CameraPath:
     """The path with some poses shifted and turned."""
     position_m, orientation_wxyz = path.position_m.copy(), path.orientation_wxyz.copy()
     position_m[rows] += shift_m
@@ -128,9 +128,11 @@ def share_within(error, covariance) -> float:
     return float((np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error) < NINETY).mean())
 
 
-def a_pose(time_s=0.0, position_m=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0), ambiguity=0.0) -> MeasuredPose:
+def measured_pose(
+    time_s=0.0, position_m=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0), ambiguity=0.0
+) -> MeasuredPose:
     quaternion = Rotation.from_rotvec(turn).as_quat(scalar_first=True)
-    return MeasuredPose(time_s, np.array(position_m, float), quaternion, spread(), ambiguity)
+    return MeasuredPose(time_s, np.array(position_m, float), quaternion, pose_covariance(), ambiguity)
 
 
 # Manifold.
@@ -230,7 +232,7 @@ def test_transition_matrix_is_the_derivative_of_the_motion() -> None:
     """F equals the numerical derivative of the motion, turns included."""
     rng = np.random.default_rng(2)
     orientation_wxyz = Rotation.random(rng=rng).as_quat(scalar_first=True)
-    motion = pose_motion.initial_motion(rng.normal(size=3), orientation_wxyz, spread(), NONE, LEVEL)
+    motion = pose_motion.initial_motion(rng.normal(size=3), orientation_wxyz, pose_covariance(), NONE, LEVEL)
     motion = pose_motion.retract(motion, rng.normal(size=(1, pose_motion.SIZE)))
     later, F = pose_motion.predict(motion, 0.3, LEVEL)
     for k, change in enumerate(1e-6 * np.eye(pose_motion.SIZE)):
@@ -251,14 +253,14 @@ def test_covariance_of_one_level_is_consistent() -> None:
     frames, runs, dt_s = 6, 60, 0.04
     squares = []
     Q = pose_motion.process_noise(dt_s, LEVEL)[0]
-    variances, axes = np.linalg.eigh(spread())
+    variances, axes = np.linalg.eigh(pose_covariance())
     lasting_root = (axes * np.sqrt(pose_motion.LASTING_SHARE * variances)) @ axes.T
-    white_root = np.sqrt(1 - pose_motion.LASTING_SHARE) * np.linalg.cholesky(spread())
+    white_root = np.sqrt(1 - pose_motion.LASTING_SHARE) * np.linalg.cholesky(pose_covariance())
     for _ in range(runs):
         start = Rotation.random(rng=rng).as_quat(scalar_first=True)
         common = np.array([[0.01] * 3 + [0.002] * 3]).T * rng.normal(size=(6, 2))
         never_changing = rng.normal(size=2)
-        motion = pose_motion.initial_motion(rng.normal(size=3), start, spread(), common, LEVEL)
+        motion = pose_motion.initial_motion(rng.normal(size=3), start, pose_covariance(), common, LEVEL)
         off = rng.multivariate_normal(np.zeros(21), motion.covariance[0])
         truth = pose_motion.shift(motion, (off - motion.common[0] @ never_changing)[None])
         for _ in range(frames):
@@ -269,7 +271,7 @@ def test_covariance_of_one_level_is_consistent() -> None:
             seen_wxyz = manifold.turned(truth.orientation_wxyz, off[None, 3:])[0]
             motion, _ = pose_motion.predict(motion, dt_s, LEVEL)
             innovation = pose_motion.innovation(
-                motion, truth.position_m[0] + off[:3], seen_wxyz, spread(), common
+                motion, truth.position_m[0] + off[:3], seen_wxyz, pose_covariance(), common
             )
             motion = pose_motion.correct(motion, innovation)
         error = pose_motion.difference(motion, truth)[0]
@@ -330,7 +332,7 @@ def test_outliers_are_not_used(near) -> None:
     bad[[0, 15, 40, 90]] = True
     bad[50:56], bad[110:118] = True, True
     shift_m, turn = ([0.0, 0.15, 0.0], [0.0, 0.0, 0.03]) if near else ([1.5, -2.0, 0.3], [0.0, 0.9, 0.0])
-    path = filter_path(misplaced(raw, bad, shift_m, turn))
+    path = filter_path(move_poses(raw, bad, shift_m, turn))
     off_m, off_rad = errors(path, position_m, truth)
     # In 8 frames, 0.32 s, the error is 0.1 m and 6 degrees at 2 m/s2 and 2 rad/s2, and more at larger accelerations.
     assert np.linalg.norm(off_m, axis=1).max() < 0.25
@@ -343,7 +345,7 @@ def test_outliers_are_not_used(near) -> None:
 
 def test_gated_frames_coast_with_growing_uncertainty() -> None:
     raw, _, _ = flight(60, seed=10)
-    path = filter_path(misplaced(raw, slice(40, 46), [0.0, 3.0, 0.0]))
+    path = filter_path(move_poses(raw, slice(40, 46), [0.0, 3.0, 0.0]))
     assert (path.status[40:46] == Status.COASTING).all()
     assert (path.flags[40:46] == Flag.GATED).all()
     assert (path.num_markers[40:46] == 8).all()
@@ -353,7 +355,7 @@ def test_gated_frames_coast_with_growing_uncertainty() -> None:
 
 def test_a_wrong_first_state_is_replaced_when_more_poses_contradict_it() -> None:
     raw, position_m, _ = flight(40, seed=11)
-    path = filter_path(misplaced(raw, slice(0, 4), [3.0, 0.0, 0.0]))
+    path = filter_path(move_poses(raw, slice(0, 4), [3.0, 0.0, 0.0]))
     assert path.status[3] == Status.TRACKED
     # Four poses supported the state; the fifth pose that contradicts it makes a majority.
     assert (path.status[4:8] == Status.COASTING).all()
@@ -365,7 +367,7 @@ def test_a_wrong_first_state_is_replaced_when_more_poses_contradict_it() -> None
 def test_a_camera_that_stays_elsewhere_is_found_after_restart_after_poses(restart_after) -> None:
     raw, position_m, _ = flight(100, seed=12)
     path = filter_path(
-        misplaced(raw, slice(50, None), [0.0, 0.0, 5.0]), PoseFilterParams(restart_after=restart_after)
+        move_poses(raw, slice(50, None), [0.0, 0.0, 5.0]), PoseFilterParams(restart_after=restart_after)
     )
     believed = 50 + restart_after - 1
     assert (path.status[50:believed] == Status.COASTING).all()
@@ -387,7 +389,7 @@ def test_an_unpredicted_turn_is_followed_after_one_frame() -> None:
 
 def test_gaps_are_bridged_for_the_longest_gap() -> None:
     raw, position_m, truth = flight(150, acceleration=0.5, wobble=0.3, seed=14)
-    raw = without(raw, np.r_[50:58, 90:120])
+    raw = remove_poses(raw, np.r_[50:58, 90:120])
     path = filter_path(raw, PoseFilterParams(longest_gap_s=0.5))
     assert (path.status[50:58] == Status.COASTING).all()
     assert (path.flags[50:58] == 0).all()
@@ -407,16 +409,16 @@ def test_gaps_are_bridged_for_the_longest_gap() -> None:
     ).all()
 
 
-def planted(acceleration, *, chance=None):
+def flight_with_false_poses(acceleration, *, chance=None):
     """A flight with a gap of a second, after which five poses agree with each other but are 2.3 m off."""
     raw, position_m, _ = flight(150, acceleration=acceleration, wobble=0.5, seed=40)
     raw = replace(raw, chance=None if chance is None else np.full(150, chance))
-    return misplaced(without(raw, slice(60, 85)), slice(85, 90), [2.3, 0.0, 0.0]), position_m
+    return move_poses(remove_poses(raw, slice(60, 85)), slice(85, 90), [2.3, 0.0, 0.0]), position_m
 
 
 @pytest.mark.parametrize("acceleration", [0.5, pytest.param(2.0, marks=pytest.mark.slow)])
 def test_wrong_poses_that_agree_after_a_gap_are_not_accepted(acceleration) -> None:
-    raw, position_m = planted(acceleration)
+    raw, position_m = flight_with_false_poses(acceleration)
     path = filter_path(raw)
     assert (path.status[85:90] == Status.LOST).all()
     # The right poses are accepted when they are one more than the wrong poses and enough to contradict a state.
@@ -427,7 +429,7 @@ def test_wrong_poses_that_agree_after_a_gap_are_not_accepted(acceleration) -> No
 
 
 def test_after_a_gap_agreeing_markers_do_not_outweigh_the_motion_of_a_hovering_camera() -> None:
-    raw, position_m = planted(0.05, chance=1e-12)
+    raw, position_m = flight_with_false_poses(0.05, chance=1e-12)
     path = filter_path(raw)
     assert (path.status[85:90] == Status.LOST).all()
     assert np.nanmax(np.linalg.norm(path.position_m[85:] - position_m[85:], axis=1)) < 0.05
@@ -435,7 +437,7 @@ def test_after_a_gap_agreeing_markers_do_not_outweigh_the_motion_of_a_hovering_c
 
 def test_after_a_gap_markers_that_agree_beyond_chance_are_accepted_at_once() -> None:
     raw, position_m, _ = flight(120, acceleration=2.0, wobble=2.0, seed=41)
-    raw = without(raw, slice(60, 90))
+    raw = remove_poses(raw, slice(60, 90))
     path = filter_path(replace(raw, chance=np.full(120, 1e-12)))
     assert (path.status[90:94] == Status.TRACKED).all()
     assert (path.status[90:] != Status.LOST).all()
@@ -488,15 +490,15 @@ def test_paths_with_few_poses(frames) -> None:
 
 def test_paths_without_poses_and_without_poses_at_the_beginning() -> None:
     raw, _, _ = flight(30, seed=16)
-    assert (filter_path(without(raw, slice(None))).status == Status.LOST).all()
-    path = filter_path(without(raw, slice(0, 10)))
+    assert (filter_path(remove_poses(raw, slice(None))).status == Status.LOST).all()
+    path = filter_path(remove_poses(raw, slice(0, 10)))
     assert (path.status[:12] == Status.LOST).all()
     assert (path.status[12:] == Status.TRACKED).all()
 
 
 def test_filtering_leaves_the_raw_path_unchanged() -> None:
     raw, _, _ = flight(30, seed=17)
-    raw = without(misplaced(raw, slice(20, 21), [1.0, 0.0, 0.0]), slice(5, 8))
+    raw = remove_poses(move_poses(raw, slice(20, 21), [1.0, 0.0, 0.0]), slice(5, 8))
     before = {name: np.copy(value) for name, value in vars(raw).items() if value is not None}
     filter_path(raw)
     for name, value in before.items():
@@ -585,15 +587,15 @@ def within_90(path: CameraPath, position_m, k) -> bool:
 def test_an_ambiguous_pose_is_weighted_by_its_agreement_with_the_motion() -> None:
     """After a gap, when two poses are possible, the pose has half its weight; with a known motion it has all of it."""
     params = PoseFilterParams()
-    state = init(a_pose())
+    state = init(measured_pose())
     for k in range(1, 20):
-        state, _ = update(state, a_pose(k / FPS), params)
-    estimated = estimate(update(state, a_pose(20 / FPS, ambiguity=0.4), params)[0])
-    sure = estimate(update(state, a_pose(20 / FPS), params)[0])
+        state, _ = update(state, measured_pose(k / FPS), params)
+    estimated = estimate(update(state, measured_pose(20 / FPS, ambiguity=0.4), params)[0])
+    sure = estimate(update(state, measured_pose(20 / FPS), params)[0])
     np.testing.assert_allclose(estimated.covariance, sure.covariance, rtol=0.05)
 
-    late = predict(init(a_pose()), 0.4)
-    there = a_pose(0.4, position_m=(0.5, 0.0, 0.0), ambiguity=0.5)
+    late = predict(init(measured_pose()), 0.4)
+    there = measured_pose(0.4, position_m=(0.5, 0.0, 0.0), ambiguity=0.5)
     half, gated = update(late, there, params)
     whole, _ = update(late, replace(there, ambiguity=0.0), params)
     assert not gated
@@ -621,7 +623,7 @@ def test_only_motion_reduces_ambiguity() -> None:
 @given(turns, st.lists(st.floats(-100, 100), min_size=3, max_size=3).map(np.array), st.booleans())
 def test_turning_and_shifting_the_world_turns_and_shifts_the_path(turn, shift_m, negate) -> None:
     raw, _, _ = flight(15, seed=23)
-    raw = misplaced(without(raw, slice(5, 7)), slice(10, 11), [1.0, 0.0, 0.0])
+    raw = move_poses(remove_poses(raw, slice(5, 7)), slice(10, 11), [1.0, 0.0, 0.0])
     raw = replace(raw, covariance=raw.covariance * (1 + 0.5 * np.sin(np.arange(15.0)))[:, None, None])
     world = Rotation.from_rotvec(turn)
     by_world = np.eye(6)
@@ -674,7 +676,7 @@ def test_invalid_settings_are_refused(setting, message) -> None:
 
 
 def test_decreasing_times_and_invalid_covariances_are_refused() -> None:
-    state = init(a_pose(1.0))
+    state = init(measured_pose(1.0))
     with pytest.raises(InputError, match=r"time_s: expected a time after 1 s, found 0.5 s"):
         predict(state, 0.5)
     raw, _, _ = flight(5, seed=24)

@@ -39,7 +39,7 @@ def flight(rng, num_frames, offset_s=0.0):
     return 0.8 * waves + [0, 0, 2.0], Slerp(knots_s, turns)(time_s)
 
 
-def lasting(rng, num_frames, time_s=0.3):
+def lasting_errors(rng, num_frames, time_s=0.3):
     """Gauss-Markov errors with a variance of 1: (frames, 3)."""
     left = np.exp(-1 / FPS / time_s)
     values = rng.normal(size=(num_frames, 3))
@@ -56,21 +56,21 @@ def recording(seed, num_frames=150, num_drones=1, *, stated=1.0, distance_m=4.0)
         position_m, rotation = flight(rng, num_frames)
         position_m = position_m + np.array([distance_m * drone, 0, 0])
         white = rng.normal(size=(num_frames, 3)) * np.sqrt(0.5)
-        error = rotation.apply((white + np.sqrt(0.5) * lasting(rng, num_frames)) * INSIDE_M)
+        error = rotation.apply((white + np.sqrt(0.5) * lasting_errors(rng, num_frames)) * INSIDE_M)
         covariance = np.zeros((num_frames, 6, 6))
         R = rotation.as_matrix()
         covariance[:, :3, :3] = R @ np.diag((stated * INSIDE_M) ** 2) @ R.swapaxes(1, 2)
         covariance[:, :3, :3] = (covariance[:, :3, :3] + covariance[:, :3, :3].swapaxes(1, 2)) / 2
         covariance[:, 3:, 3:] = 1e-6 * np.eye(3)
-        paths[f"dron{drone + 1}"] = path_of(position_m + error, rotation, covariance)
-        middles.append(position_m + rotation.apply(ARM_M) + lasting(rng, num_frames) * OUTSIDE_M)
+        paths[f"dron{drone + 1}"] = camera_path(position_m + error, rotation, covariance)
+        middles.append(position_m + rotation.apply(ARM_M) + lasting_errors(rng, num_frames) * OUTSIDE_M)
         truths.append((position_m, rotation))
     middle_m = np.stack(middles, axis=1)
     spread_m2 = np.broadcast_to(np.diag((stated * OUTSIDE_M) ** 2), (*middle_m.shape, 3)).copy()
-    return paths, tracks_of(middle_m, spread_m2), truths
+    return paths, outside_tracks(middle_m, spread_m2), truths
 
 
-def path_of(position_m, rotation, covariance, first_s=0.0):
+def camera_path(position_m, rotation, covariance, first_s=0.0):
     n = len(position_m)
     return CameraPath(
         frame=np.arange(n),
@@ -86,7 +86,7 @@ def path_of(position_m, rotation, covariance, first_s=0.0):
     )
 
 
-def tracks_of(middle_m, covariance_m2, first=0):
+def outside_tracks(middle_m, covariance_m2, first=0):
     n = len(middle_m)
     return Trajectories(
         frame=np.arange(first, first + n),
@@ -98,7 +98,7 @@ def tracks_of(middle_m, covariance_m2, first=0):
     )
 
 
-def without(path, rows):
+def remove_poses(path, rows):
     """The path with some frames lost."""
     status, position_m, orientation_wxyz = (
         path.status.copy(),
@@ -109,7 +109,7 @@ def without(path, rows):
     return replace(path, status=status, position_m=position_m, orientation_wxyz=orientation_wxyz)
 
 
-def unseen(tracks, rows, drone=0):
+def remove_positions(tracks, rows, drone=0):
     """The tracks with some frames of one track lost."""
     status = tracks.status.copy()
     status[rows, drone] = Status.LOST
@@ -123,7 +123,7 @@ def rms(error_m):
 # The filter against dense Gaussians
 
 
-def readings_of(rng, n=7):
+def random_readings(rng, n=7):
     root = rng.normal(size=(n, 2, 3, 3))
     known = np.ones((n, 2), bool)
     known[2, 0] = known[3] = known[5, 1] = False
@@ -143,7 +143,7 @@ def readings_of(rng, n=7):
 MODEL = ErrorModel(np.array([[0.6, 0.3]]), np.array([[0.4, 1.2]]), np.array([[0.2, 0.5]]), np.array([30.0]))
 
 
-def dense(readings, model, arm):
+def joint_gaussian(readings, model, arm):
     """Prior mean and covariance of all states, and H, y, R of all readings, without recursion."""
     n = len(readings.time_s)
     std = np.repeat([1.0, 10.0, 10.0, 1.0, 1.0, arm.std_m], 3)
@@ -180,8 +180,8 @@ def dense(readings, model, arm):
 
 
 def test_smoother_and_likelihood_equal_the_joint_gaussian() -> None:
-    readings, arm = readings_of(np.random.default_rng(1)), Arm(np.array([0.1, 0.0, -0.1]), 0.3)
-    mean, prior, H, y, R = dense(readings, MODEL, arm)
+    readings, arm = random_readings(np.random.default_rng(1)), Arm(np.array([0.1, 0.0, -0.1]), 0.3)
+    mean, prior, H, y, R = joint_gaussian(readings, MODEL, arm)
     S = H @ prior @ H.T + R
     gain = np.linalg.solve(S, H @ prior).T
     expected, spread = mean + gain @ (y - H @ mean), prior - gain @ H @ prior
@@ -250,12 +250,12 @@ def test_errors_agree_with_theory_by_monte_carlo() -> None:
         for k in (0, n // 2):
             error_m = found.position_m[k] - truth[k, :3]
             nees.append(error_m @ np.linalg.solve(found.covariance_m2[k], error_m))
-    # The mean of 120 draws of chi-square with 3 degrees of freedom has a standard deviation of 0.22; limit 4 of them.
+    # The mean of 120 draws of chi-square (3 degrees of freedom) has a standard deviation of 0.22; limit four times that.
     assert np.mean(nees) == pytest.approx(3.0, abs=0.9)
 
 
 def test_a_source_with_huge_covariances_changes_nothing() -> None:
-    readings, arm = readings_of(np.random.default_rng(3)), Arm(np.zeros(3), 0.3)
+    readings, arm = random_readings(np.random.default_rng(3)), Arm(np.zeros(3), 0.3)
     alone = replace(readings, known=readings.known & [True, False])
     vague_m2 = readings.covariance_m2.copy()
     vague_m2[:, 1] *= 1e14
@@ -311,13 +311,13 @@ def test_one_source_with_too_large_stated_errors_is_weighted_by_its_scatter(insi
 
 def test_few_common_frames_and_a_drone_at_rest() -> None:
     paths, outside, ((truth_m, _),) = recording(23, 60)
-    few = fuse(paths, unseen(outside, np.r_[0:20, 23:60]))
+    few = fuse(paths, remove_positions(outside, np.r_[0:20, 23:60]))
     assert few.drones[0].frames_both == 3
     # With one source alone, the motion model removes a part of the white errors.
     assert rms(few.trajectories.position_m[:, 0] - truth_m) < rms(paths["dron1"].position_m - truth_m)
     at_m, turns = np.tile(truth_m[0], (60, 1)), Rotation.from_rotvec(np.zeros((60, 3)))
-    still = path_of(at_m, turns, paths["dron1"].covariance)
-    fused = fuse(still, tracks_of((at_m + ARM_M)[:, None], outside.covariance_m2))
+    still = camera_path(at_m, turns, paths["dron1"].covariance)
+    fused = fuse(still, outside_tracks((at_m + ARM_M)[:, None], outside.covariance_m2))
     # The input has no errors, so only rounding remains.
     np.testing.assert_allclose(fused.trajectories.position_m[:, 0], at_m, atol=1e-9)
     np.testing.assert_allclose(fused.drones[0].fusion.arm_m, ARM_M, atol=1e-9)
@@ -363,7 +363,7 @@ def test_samples_between_frames_are_used_at_their_own_times() -> None:
     again = np.random.default_rng(8)
     between_m, rotation = flight(again, 150, offset_s=0.02)
     covariance = np.broadcast_to(np.diag([1e-6] * 6), (150, 6, 6)).copy()
-    path = path_of(between_m + rng.normal(scale=0.001, size=(150, 3)), rotation, covariance, first_s=0.02)
+    path = camera_path(between_m + rng.normal(scale=0.001, size=(150, 3)), rotation, covariance, first_s=0.02)
     fused = fuse({"dron1": path}, outside)
     assert fused.drones[0].frames_both >= 149
     # The noise is 1.7 mm; a lag of half a step would be 20 mm.
@@ -376,12 +376,12 @@ def test_samples_between_frames_are_used_at_their_own_times() -> None:
 def test_gaps_of_either_source_are_bridged_without_a_jump() -> None:
     paths, outside, ((truth_m, _),) = recording(9)
     inside_gap, outside_gap = slice(40, 70), slice(90, 120)
-    fused = fuse({"dron1": without(paths["dron1"], inside_gap)}, unseen(outside, outside_gap))
+    fused = fuse({"dron1": remove_poses(paths["dron1"], inside_gap)}, remove_positions(outside, outside_gap))
     assert (fused.source[inside_gap] == 2).all()
     assert (fused.source[outside_gap] == 1).all()
     assert (fused.trajectories.status == Status.TRACKED).all()
     error_m = fused.trajectories.position_m[:, 0] - truth_m
-    # Jumps between frames are those of the lasting errors, a twentieth of the outside's errors.
+    # Lasting errors jump between frames by a twentieth of the outside's errors.
     assert np.abs(np.diff(error_m, axis=0)).max() < 0.003
     spread_m = np.sqrt(np.trace(fused.trajectories.covariance_m2[:, 0], axis1=1, axis2=2))
     # In the gap, the orientation is unknown, and so is the direction of the arm of 0.12 m.
@@ -392,7 +392,9 @@ def test_gaps_of_either_source_are_bridged_without_a_jump() -> None:
 
 def test_without_both_sources_a_drone_coasts_and_is_then_lost() -> None:
     paths, outside, _ = recording(10)
-    fused = fuse({"dron1": without(paths["dron1"], slice(50, 100))}, unseen(outside, slice(50, 100)))
+    fused = fuse(
+        {"dron1": remove_poses(paths["dron1"], slice(50, 100))}, remove_positions(outside, slice(50, 100))
+    )
     status = fused.trajectories.status[:, 0]
     assert (status[50:60] == Status.COASTING).all()
     assert (status[90:100] == Status.COASTING).all()
@@ -483,7 +485,7 @@ def test_tracks_of_only_one_source_are_kept_unchanged() -> None:
 
 def test_sources_without_common_frames() -> None:
     paths, outside, _ = recording(16, 60)
-    later = tracks_of(outside.position_m, outside.covariance_m2, first=100)
+    later = outside_tracks(outside.position_m, outside.covariance_m2, first=100)
     fused = fuse(paths, later)
     assert fused.trajectories.drones == ("dron1", "0")
     np.testing.assert_array_equal(fused.trajectories.frame, [*range(60), *range(100, 160)])
@@ -508,7 +510,7 @@ def test_tracks_with_unknown_uncertainty_leave_a_path_unchanged() -> None:
     paths, outside, _ = recording(17, 60)
     covariance_m2 = outside.covariance_m2.copy()
     covariance_m2[:50] = np.nan
-    fused = fuse(paths, unseen(replace(outside, covariance_m2=covariance_m2), slice(50, 60)))
+    fused = fuse(paths, remove_positions(replace(outside, covariance_m2=covariance_m2), slice(50, 60)))
     assert fused.trajectories.drones == ("dron1",)
     np.testing.assert_array_equal(fused.trajectories.position_m[:, 0], paths["dron1"].position_m)
     np.testing.assert_array_equal(
@@ -519,9 +521,9 @@ def test_tracks_with_unknown_uncertainty_leave_a_path_unchanged() -> None:
 def test_empty_sources_are_refused() -> None:
     paths, outside, _ = recording(18, 30)
     with pytest.raises(InputError, match="inside paths: expected a pose in at least one frame, found none"):
-        fuse({"dron1": without(paths["dron1"], slice(None))}, outside)
+        fuse({"dron1": remove_poses(paths["dron1"], slice(None))}, outside)
     with pytest.raises(InputError, match="outside tracks: expected a position in at least one frame"):
-        fuse(paths, unseen(outside, slice(None)))
+        fuse(paths, remove_positions(outside, slice(None)))
 
 
 def test_a_motion_that_determines_no_offset_is_refused() -> None:
@@ -569,7 +571,7 @@ def test_turning_and_shifting_the_world_turns_and_shifts_the_result(turn, shift_
 def test_a_single_gross_reading_has_little_effect() -> None:
     """Only one source has readings. A drone that jumps must be followed, but a single frame has little weight."""
     rng = np.random.default_rng(4)
-    readings = readings_of(rng, 30)
+    readings = random_readings(rng, 30)
     smooth_m = np.broadcast_to(np.sin(readings.time_s)[:, None, None], (30, 2, 3)).copy()
     smooth_m[15] += 0.5
     spread_m2 = np.broadcast_to(1e-6 * np.eye(3), (30, 2, 3, 3))
@@ -584,7 +586,7 @@ def test_a_single_gross_reading_has_little_effect() -> None:
 
 def test_the_uncertainty_of_orientations_in_a_gap_grows_with_time() -> None:
     paths, _, ((_, rotation),) = recording(21, 60)
-    camera = resample_path(without(paths["dron1"], slice(20, 40)), np.arange(60) / FPS, 0.0)
+    camera = resample_path(remove_poses(paths["dron1"], slice(20, 40)), np.arange(60) / FPS, 0.0)
     assert camera.has_orientation[:20].all()
     assert not camera.has_orientation[20:40].any()
     spread = np.trace(camera.turn_covariance_rad2, axis1=1, axis2=2)

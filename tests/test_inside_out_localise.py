@@ -85,7 +85,7 @@ def wall_markers():
     return corners
 
 
-def drawn(corners_m, posed):
+def draw_markers(corners_m, posed):
     """An image of markers seen from their front, drawn in light at three times the size and then reduced."""
     width, height = SIZE_WH
     image = np.full((3 * height, 3 * width), 150.0**2, np.float32)
@@ -135,7 +135,7 @@ def room(tmp_path_factory):
                 )
             # A marker that is not in the map, in every frame.
             unmapped = {900: np.array([[0, 3.9, 0.6], [0.3, 3.9, 0.6], [0.3, 3.9, 0.3], [0, 3.9, 0.3]])}
-            image = drawn(shown | ({} if index == NO_MARKERS_FRAME else unmapped), posed)
+            image = draw_markers(shown | ({} if index == NO_MARKERS_FRAME else unmapped), posed)
             # File names without leading zeros: 10 must come after 9.
             cv2.imwrite(str(folder / "images" / f"frame{index}.png"), image)
             writer.write(image)
@@ -466,7 +466,7 @@ def test_a_stream_that_ends_is_not_interrupted(room, monkeypatch):
     )
     assert found.path.num_frames == 5
     assert not found.interrupted
-    # Without timestamps, the times are those of arrival.
+    # Without timestamps, the times of arrival are used.
     assert (np.diff(found.path.time_s) > 0).all()
 
 

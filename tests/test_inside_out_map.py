@@ -66,7 +66,7 @@ LENSES = (
 )
 
 
-def seen_in(corners_m, lens, source, num_views, *, noise_px=0.0, seed=0):
+def simulate_frames(corners_m, lens, source, num_views, *, noise_px=0.0, seed=0):
     """Frames of a camera that is carried through a room and turns around more than once, with the visible markers."""
     rng = np.random.default_rng(seed)
     frames = []
@@ -101,7 +101,7 @@ def sightings(corners_m=ROOM, num_views=28, videos=1, **options):
     frames = [
         frame
         for source in range(videos)
-        for frame in seen_in(corners_m, LENSES[source], source, num_views, **options)
+        for frame in simulate_frames(corners_m, LENSES[source], source, num_views, **options)
     ]
     return collect_sightings(frames, LENSES[:videos])
 
@@ -119,7 +119,7 @@ def errors_m(built, truth=ROOM):
 NAMES = ("tl", "tr", "br", "bl")
 
 
-def wide(header, *, scale=1.0, separator=";"):
+def wide_table(header, *, scale=1.0, separator=";"):
     lines = [separator.join(header)] if header else []
     for marker, corners in ROOM.items():
         lines.append(
@@ -128,11 +128,11 @@ def wide(header, *, scale=1.0, separator=";"):
     return "\n".join(lines) + "\n"
 
 
-def columns(pattern, corners="1234"):
+def column_names(pattern, corners="1234"):
     return ["id", *(pattern.format(axis=axis, corner=corner) for corner in corners for axis in "xyz")]
 
 
-def long(header, corner_names, *, scale=1.0, separator=","):
+def long_table(header, corner_names, *, scale=1.0, separator=","):
     lines = [separator.join(header)] if header else []
     for marker, corners in ROOM.items():
         for name, corner in zip(corner_names, corners, strict=True):
@@ -142,7 +142,7 @@ def long(header, corner_names, *, scale=1.0, separator=","):
     return "\n".join(lines) + "\n"
 
 
-def labelled(pattern):
+def labelled_table(pattern):
     lines = ["label;x[mm];y[mm];z[mm]"]
     for marker, corners in ROOM.items():
         for number, corner in enumerate(1000 * corners, start=1):
@@ -153,25 +153,29 @@ def labelled(pattern):
 
 
 LAYOUTS = {
-    "ours": wide(columns("{axis}{corner}[m]")),
-    "millimetres": wide(columns("{axis}{corner}[mm]"), scale=1e3),
-    "centimetres": wide(columns("{axis}{corner} (cm)"), scale=1e2),
-    "commas": wide(columns("{axis}_{corner}"), separator=","),
-    "tabs": wide(columns("corner{corner}_{axis}_mm"), scale=1e3, separator="\t"),
-    "from 0": wide(columns("p{corner}.{axis} [m]", "0123")),
-    "corner names": wide(["Marker ID", *columns("{corner}_{axis}", NAMES)[1:]], separator=","),
-    "numbers alone": wide(None, separator=","),
-    "long": long(["id", "corner", "x_m", "y_m", "z_m"], "1234"),
-    "long from 0": long(
+    "ours": wide_table(column_names("{axis}{corner}[m]")),
+    "millimetres": wide_table(column_names("{axis}{corner}[mm]"), scale=1e3),
+    "centimetres": wide_table(column_names("{axis}{corner} (cm)"), scale=1e2),
+    "commas": wide_table(column_names("{axis}_{corner}"), separator=","),
+    "tabs": wide_table(column_names("corner{corner}_{axis}_mm"), scale=1e3, separator="\t"),
+    "from 0": wide_table(column_names("p{corner}.{axis} [m]", "0123")),
+    "corner names": wide_table(["Marker ID", *column_names("{corner}_{axis}", NAMES)[1:]], separator=","),
+    "numbers alone": wide_table(None, separator=","),
+    "long": long_table(["id", "corner", "x_m", "y_m", "z_m"], "1234"),
+    "long from 0": long_table(
         ["marker", "corner_id", "X [mm]", "Y [mm]", "Z [mm]"], "0123", scale=1e3, separator=";"
     ),
-    "long with names": long(["aruco_id", "corner", "x", "y", "z"], ["Top-left", "TR", "bottom right", "bl"]),
-    "long numbers": long(None, "1234", separator=";"),
-    "labels": labelled("Marker{}:{}"),
-    "short labels": labelled("M{}_{}"),
-    "numbers as labels": labelled("{}.{}"),
-    "a spreadsheet's": "\ufeff" + wide(columns("{axis}{corner}[m]")).replace("\n", ";\r\n"),
-    "words in ids": wide(columns("{axis}{corner}[m]")).replace("\n", "\nMarker_")[: -len("Marker_")],
+    "long with names": long_table(
+        ["aruco_id", "corner", "x", "y", "z"], ["Top-left", "TR", "bottom right", "bl"]
+    ),
+    "long numbers": long_table(None, "1234", separator=";"),
+    "labels": labelled_table("Marker{}:{}"),
+    "short labels": labelled_table("M{}_{}"),
+    "numbers as labels": labelled_table("{}.{}"),
+    "a spreadsheet's": "\ufeff" + wide_table(column_names("{axis}{corner}[m]")).replace("\n", ";\r\n"),
+    "words in ids": wide_table(column_names("{axis}{corner}[m]")).replace("\n", "\nMarker_")[
+        : -len("Marker_")
+    ],
 }
 
 
@@ -189,7 +193,7 @@ def test_layouts_of_tables(tmp_path, text):
 
 def test_other_columns_are_ignored(tmp_path):
     path = tmp_path / "corners.csv"
-    lines = wide(columns("{axis}{corner}[m]")).splitlines()
+    lines = wide_table(column_names("{axis}{corner}[m]")).splitlines()
     path.write_text("\n".join([f"{lines[0]};wall;size", *(f"{line};north;0.3" for line in lines[1:])]))
     assert len(read_marker_map(path)) == len(ROOM)
 
@@ -213,7 +217,7 @@ def with_corners(marker, corners):
     return {**ROOM, marker: corners}
 
 
-def bent(distance_m, axis):
+def with_bent_corner(distance_m, axis):
     corners = ROOM[3].copy()
     corners[2, axis] += distance_m
     return with_corners(3, corners)
@@ -222,10 +226,13 @@ def bent(distance_m, axis):
 #: Line 4 of the standard layout belongs to marker 3.
 BAD_PLACES = {
     "not planar": (
-        bent(0.05, 1),
+        with_bent_corner(0.05, 1),
         r"line 4, marker 3: expected corners in a plane to 10% .* 50 mm off .* of 40\d mm",
     ),
-    "not square": (bent(0.06, 0), r"line 4, marker 3: expected a square.* found sides and diagonals of"),
+    "not square": (
+        with_bent_corner(0.06, 0),
+        r"line 4, marker 3: expected a square.* found sides and diagonals of",
+    ),
     "crossed": (
         with_corners(3, ROOM[3][[0, 1, 3, 2]]),
         r"line 4, marker 3: expected corners one after the other .* found two that are exchanged",
@@ -364,14 +371,14 @@ def test_the_fitted_square_is_nearer_than_other_squares():
     points = ROOM[5] + 0.005 * rng.standard_normal((4, 3))
     axes, centre, side = fit_square(points)
 
-    def squares_of(turn, shift, factor):
+    def cost(turn, shift, factor):
         turned = axes @ Rotation.from_rotvec(turn).as_matrix()
         return np.sum((centre + shift + side * factor * SQUARE @ turned.T - points) ** 2)
 
-    best = squares_of(np.zeros(3), np.zeros(3), 1.0)
+    best = cost(np.zeros(3), np.zeros(3), 1.0)
     for _ in range(200):
         step = 1e-3 * rng.standard_normal(7)
-        assert squares_of(step[:3], step[3:6], 1 + step[6]) > best
+        assert cost(step[:3], step[3:6], 1 + step[6]) > best
 
 
 @pytest.mark.parametrize("order", [[0, 1, 2, 3], [0, 3, 2, 1], [2, 0, 3, 1], [1, 0, 3, 2]])
@@ -406,7 +413,7 @@ def test_a_marker_on_the_floor_cannot_be_sorted(tmp_path):
     )
 
 
-def recorded(corners_m, labels="Marker{}:{}", frames=30, noise_m=0.0):
+def recorded_corners(corners_m, labels="Marker{}:{}", frames=30, noise_m=0.0):
     rng = np.random.default_rng(2)
     names = [labels.format(marker, corner) for marker in corners_m for corner in range(1, 5)]
     position = np.concatenate(list(corners_m.values())) + noise_m * rng.standard_normal(
@@ -422,7 +429,7 @@ def recorded(corners_m, labels="Marker{}:{}", frames=30, noise_m=0.0):
 @pytest.mark.parametrize("labels", ["Marker{}:{}", "M{}_{}", "{}.{}", "aruco {}-{}"])
 def test_corners_of_a_c3d(tmp_path, labels):
     path = tmp_path / "room.c3d"
-    markers = recorded(ROOM, labels, noise_m=0.0005)
+    markers = recorded_corners(ROOM, labels, noise_m=0.0005)
     markers.position_m[:11, 3] = np.nan
     # For a few frames, the label is on another point.
     markers.position_m[5:12, 8] += 0.5
@@ -435,7 +442,7 @@ def test_corners_of_a_c3d(tmp_path, labels):
 
 
 def test_c3d_without_a_corner(tmp_path):
-    markers = recorded(ROOM)
+    markers = recorded_corners(ROOM)
     markers.position_m[:, 9] = np.nan
     write_c3d(tmp_path / "room.c3d", markers)
     with pytest.raises(
@@ -448,7 +455,7 @@ def test_c3d_without_a_corner(tmp_path):
 
 
 def test_measured_corners_without_a_square_are_refused(tmp_path):
-    write_marker_corners(tmp_path / "points.csv", bent(0.15, 0))
+    write_marker_corners(tmp_path / "points.csv", with_bent_corner(0.15, 0))
     with pytest.raises(InputError, match=r"line 4, marker 3: expected four points that are a square"):
         fit_squares(read_measured_corners(tmp_path / "points.csv"))
 
@@ -543,7 +550,7 @@ def test_markers_without_a_connection_are_not_placed():
     unconnected = FrameMarkers(
         0, 99.0, np.array([40]), np.array([[[10.0, 10], [50, 10], [50, 50], [10, 50]]])
     )
-    found = collect_sightings([*seen_in(ROOM, LENSES[0], 0, 20), unconnected], LENSES[:1])
+    found = collect_sightings([*simulate_frames(ROOM, LENSES[0], 0, 20), unconnected], LENSES[:1])
     built = build_map(found, {7: ROOM[7]})
     assert built.unplaced == (40,)
     assert 40 not in built.marker_map

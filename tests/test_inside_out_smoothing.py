@@ -9,11 +9,11 @@ from test_inside_out_filter import (
     FPS,
     errors,
     flight,
-    misplaced,
+    move_poses,
+    pose_covariance,
     raw_path,
+    remove_poses,
     share_within,
-    spread,
-    without,
 )
 
 from psotrack.errors import InputError
@@ -56,7 +56,7 @@ def test_a_camera_that_does_not_turn_is_smoothed_as_by_least_squares_over_all_fr
         noise_scale=np.ones(frames),
         ambiguity=np.zeros(frames),
     )
-    path = smooth(without(raw, gone), model=model)
+    path = smooth(remove_poses(raw, gone), model=model)
 
     part = np.r_[0:9, 15:18]
     start = pose_motion.initial_motion(
@@ -104,7 +104,7 @@ def test_a_camera_that_does_not_turn_is_smoothed_as_by_least_squares_over_all_fr
 
 def test_without_a_model_the_smoother_uses_the_estimated_model() -> None:
     raw, _, _ = flight(40, acceleration=1.0, wobble=1.0, seed=31)
-    raw = misplaced(without(raw, slice(10, 13)), slice(20, 21), [1.0, 0.0, 0.0])
+    raw = move_poses(remove_poses(raw, slice(10, 13)), slice(20, 21), [1.0, 0.0, 0.0])
     params = PoseFilterParams(false_alarm=1e-4)
     model = estimate_motion_model(raw, params)
     assert not model.fits[[10, 11, 12, 20]].any()
@@ -150,7 +150,7 @@ def test_the_smoother_is_better_than_the_filter_and_its_covariances_are_right(ac
 def test_gaps_are_bridged_from_both_sides() -> None:
     raw, position_m, truth = flight(110, acceleration=1.0, wobble=1.0, seed=32)
     gone = np.r_[0:4, 30:50, 70:100]
-    raw = without(raw, gone)
+    raw = remove_poses(raw, gone)
     path, filtered = smooth(raw, PoseFilterParams(longest_gap_s=0.45)), filter_path(raw)
     # Every frame of the gap of 0.84 s is within 0.45 s of a pose; the gap of 1.24 s has frames that are not. Frames
     # before the first pose are lost.
@@ -161,7 +161,7 @@ def test_gaps_are_bridged_from_both_sides() -> None:
     assert np.isnan(path.position_m[81:100]).all()
     assert (path.status[100:] == Status.TRACKED).all()
     variance_m2 = np.trace(path.covariance[:, :3, :3], axis1=1, axis2=2)
-    # The uncertainty is largest in the middle of the gap, and far below that of the filter.
+    # The uncertainty is largest in the middle of the gap, and far smaller than the filter's.
     assert 36 <= 30 + variance_m2[30:50].argmax() <= 43
     assert variance_m2[40] < 0.3 * np.trace(filtered.covariance[40, :3, :3])
     seen_frames = np.flatnonzero(path.seen)
@@ -175,7 +175,7 @@ def test_gaps_are_bridged_from_both_sides() -> None:
 def test_outliers_and_wrong_poses_at_both_ends_are_not_used() -> None:
     raw, position_m, truth = flight(100, seed=33)
     bad = np.r_[0:4, 40, 60:66, 98:100]
-    path = smooth(misplaced(raw, bad, [0.4, -2.0, 0.3], [0.0, 0.5, 0.0]))
+    path = smooth(move_poses(raw, bad, [0.4, -2.0, 0.3], [0.0, 0.5, 0.0]))
     assert (path.flags[bad] & Flag.GATED).all()
     assert (path.status[bad] != Status.TRACKED).all()
     off_m, _ = errors(path, position_m, truth)
@@ -198,7 +198,7 @@ def test_a_sharp_turn_that_the_filter_gated_is_used_by_the_smoother() -> None:
 def test_the_path_is_not_drawn_across_a_permanent_jump() -> None:
     """The path jumps with the camera, and is not bent on either side of the jump."""
     raw, position_m, _ = flight(60, seed=35)
-    path = smooth(misplaced(raw, slice(30, None), [0.0, 0.0, 5.0]))
+    path = smooth(move_poses(raw, slice(30, None), [0.0, 0.0, 5.0]))
     position_m = position_m + np.array([0.0, 0.0, 5.0]) * (np.arange(60) >= 30)[:, None]
     # Some poses beside the jump may be gated and bridged. A path drawn across the jump would be off by metres.
     assert np.linalg.norm(path.position_m - position_m, axis=1).max() < 0.1
@@ -213,17 +213,17 @@ def test_paths_of_few_poses(frames) -> None:
     assert (confirmed_at_once.status == Status.TRACKED).all()
     if frames == 1:
         np.testing.assert_allclose(confirmed_at_once.position_m, raw.position_m[:1], atol=1e-12)
-        np.testing.assert_allclose(confirmed_at_once.covariance[0], spread(), atol=1e-15)
+        np.testing.assert_allclose(confirmed_at_once.covariance[0], pose_covariance(), atol=1e-15)
 
 
 def test_the_raw_path_is_not_changed() -> None:
     raw, _, _ = flight(20, seed=37)
-    raw = without(misplaced(raw, slice(15, 16), [1.0, 0.0, 0.0]), slice(5, 8))
+    raw = remove_poses(move_poses(raw, slice(15, 16), [1.0, 0.0, 0.0]), slice(5, 8))
     before = {name: np.copy(value) for name, value in vars(raw).items() if value is not None}
     smooth(raw)
     for name, value in before.items():
         np.testing.assert_array_equal(getattr(raw, name), value)
-    assert (smooth(without(raw, slice(None))).status == Status.LOST).all()
+    assert (smooth(remove_poses(raw, slice(None))).status == Status.LOST).all()
 
 
 def test_a_singular_covariance_is_refused() -> None:

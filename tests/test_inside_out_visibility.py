@@ -28,7 +28,7 @@ def square_m(middle, side_m=0.2, turn_deg=0.0):
     return Rotation.from_euler("y", turn_deg, degrees=True).apply(corners) + middle
 
 
-def seen(*markers, position_m=ORIGIN, wxyz=AHEAD, **options):
+def visible(*markers, position_m=ORIGIN, wxyz=AHEAD, **options):
     marker_map = MarkerMap({10 * number: corners for number, corners in enumerate(markers)})
     return visible_markers(marker_map, LENS, position_m, wxyz, **options)
 
@@ -52,11 +52,11 @@ def seen(*markers, position_m=ORIGIN, wxyz=AHEAD, **options):
     ],
 )
 def test_markers_placed_by_hand(corners, expected):
-    assert seen(corners).tolist() == [[expected]]
+    assert visible(corners).tolist() == [[expected]]
 
 
 def test_the_smallest_side_can_be_chosen():
-    assert seen(square_m([0, 0, 1.7]), min_side_px=11.0).tolist() == [[True]]
+    assert visible(square_m([0, 0, 1.7]), min_side_px=11.0).tolist() == [[True]]
 
 
 def test_visibility_does_not_depend_on_the_worlds_axes():
@@ -64,13 +64,13 @@ def test_visibility_does_not_depend_on_the_worlds_axes():
     markers = [square_m([0, 0, 1]), square_m([0.906, 0, 1]), square_m([-0.3, 0.1, 1.2])]
     turn, shift_m = Rotation.from_rotvec([0.3, -2.0, 1.1]), np.array([4.0, -7.0, 2.0])
     moved = [turn.apply(corners) + shift_m for corners in markers]
-    found = seen(
+    found = visible(
         *moved,
         position_m=np.array([shift_m, shift_m, [np.nan] * 3]),
         wxyz=np.array([turn.as_quat(scalar_first=True), [np.nan] * 4, [1.0, 0, 0, 0]]),
     )
     assert found.tolist() == [[True, False, True], [False] * 3, [False] * 3]
-    assert not seen(*moved, position_m=np.full((2, 3), np.nan), wxyz=np.full((2, 4), np.nan)).any()
+    assert not visible(*moved, position_m=np.full((2, 3), np.nan), wxyz=np.full((2, 4), np.nan)).any()
 
 
 def test_a_lens_with_distortion():

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from test_inside_out_map import ROOM, bent, on_wall, recorded
+from test_inside_out_map import ROOM, on_wall, recorded_corners, with_bent_corner
 
 from psotrack.cli.map_markers import FOUND, map_markers
 from psotrack.datasets.dpjait import read_marker_corners, write_marker_corners
@@ -35,7 +35,7 @@ CORNERS = {
     },
     **{marker: on_wall((2.2, y, z), (-1, 0, 0), SIDE_M) for marker, y, z in ((21, 2.1, 2.0), (22, 0.9, 1.3))},
 }
-#: Width of a printed sheet, cells, of which 6 are the marker's.
+#: Width of a printed sheet, cells; 6 of these cells are the marker.
 _CELLS = 8
 
 
@@ -49,7 +49,7 @@ def invoke(*words, expect=None):
     return str(result.exception) if isinstance(result.exception, PsotrackError) else result.output
 
 
-def image(cam):
+def draw_image(cam):
     """Sheets of paper on grey walls, drawn at twice the size, blurred in light, and compressed as in a video."""
     canvas = np.full((2 * SIZE_WH[1], 2 * SIZE_WH[0]), 0.2, np.float32)
     for marker, corners in CORNERS.items():
@@ -82,7 +82,7 @@ def walk(tmp_path_factory):
                 [-0.8 + 0.9 * np.cos(turn), -1.2 + 0.8 * np.sin(turn), 1.5 + 0.3 * np.sin(2 * turn)]
             )
             R, t_m = look_at(centre.tolist(), [0.7 + 0.3 * np.sin(3 * turn), 2.6, 1.5])
-            writer.write(image(make_camera(R=R, t_m=t_m, K=LENS.K, image_size_wh=SIZE_WH)))
+            writer.write(draw_image(make_camera(R=R, t_m=t_m, K=LENS.K, image_size_wh=SIZE_WH)))
     write_marker_corners(folder / "truth.csv", CORNERS)
     return folder
 
@@ -98,7 +98,7 @@ def test_a_map_from_a_video(walk, tmp_path):
     printed = invoke(*words, "--out", out, "--json", tmp_path / "map.json")
     assert "5 markers from 24 frames" in printed
     off = centres_off_m(out)
-    # Corners are right to 0.1 px at 620 px per metre at 1 m: 0.6 mm at 4 m, and several times as much around a corner.
+    # Corners are good to 0.1 px at 620 px per metre at 1 m: 0.6 mm at 4 m, and several times that on the second wall.
     assert set(off) == set(CORNERS)
     assert max(off.values()) < 0.01
     content = json.loads((tmp_path / "map.json").read_text())
@@ -175,7 +175,7 @@ def test_a_wrong_map_is_reported_and_changes_the_exit_status(walk, tmp_path):
 
 
 def test_a_map_from_motion_capture(tmp_path):
-    write_c3d(tmp_path / "room.c3d", recorded(ROOM))
+    write_c3d(tmp_path / "room.c3d", recorded_corners(ROOM))
     out = tmp_path / "corners.csv"
     printed = invoke(tmp_path / "room.c3d", "--out", out)
     assert "16 markers, corners within 0.0 mm of squares" in printed
@@ -193,7 +193,7 @@ def test_measured_corners_in_another_order_are_reported(tmp_path):
     printed = invoke(path, "--out", tmp_path / "corners.csv")
     assert "marker 3: its corners were labelled in another order; the order was corrected" in printed
     np.testing.assert_allclose(read_marker_corners(tmp_path / "corners.csv")[3], ROOM[3], atol=1e-12)
-    write_marker_corners(path, bent(0.2, 0))
+    write_marker_corners(path, with_bent_corner(0.2, 0))
     message = invoke(path, "--out", tmp_path / "other.csv", expect=InputError)
     assert "line 4, marker 3: expected four points that are a square" in message
     assert not (tmp_path / "other.csv").exists()

@@ -109,14 +109,14 @@ def test_drones_of_unknown_size_split_no_box():
     np.testing.assert_array_equal(seen.centre_px, view.centre_px)
 
 
-def merged(boxes):
+def merge_touching_boxes(boxes):
     """Boxes after all boxes that overlap have been merged, as drones that overlap become one foreground blob."""
     boxes = list(boxes)
     for i, one in enumerate(boxes):
         for j in range(i + 1, len(boxes)):
             if (np.maximum(one, boxes[j])[:2] < np.minimum(one, boxes[j])[2:]).all():
                 both = enclosing_box(np.stack([one, boxes[j]]))
-                return merged([both, *boxes[:i], *boxes[i + 1 : j], *boxes[j + 1 :]])
+                return merge_touching_boxes([both, *boxes[:i], *boxes[i + 1 : j], *boxes[j + 1 :]])
     return boxes
 
 
@@ -139,7 +139,7 @@ def test_drones_whose_boxes_merge_keep_their_tracks():
     for number, drones_m in enumerate(truth_m):
         for index, name in enumerate(rig.names):
             own = true_boxes(drones_m, span_m, rig)[:, index] + 0.5 + rng.normal(0.0, 1.0, (3, 4))
-            for box in merged(own):
+            for box in merge_touching_boxes(own):
                 images[name][0].append(number)
                 images[name][1].append(box)
     detections = {

@@ -30,13 +30,13 @@ from scipy.stats import binom, chi2, multivariate_normal
 from psotrack.motion import GATE_999, kalman, white_jerk_noise
 
 
-def numbers(tree, dtype):
+def as_arrays(tree, dtype):
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, bool if leaf.dtype == bool else dtype), tree)
 
 
 @jax.jit
-def filtered(state, params, dt_s, measured_m, covariance_m2, was_measured):
-    """States and NIS of every frame; the state is that of the frame before the first."""
+def filter_frames(state, params, dt_s, measured_m, covariance_m2, was_measured):
+    """States and NIS of every frame; `state` belongs to the frame before the first frame."""
 
     def step(state, frame):
         return (lambda result: (result[0], result))(
@@ -50,11 +50,11 @@ def run(flown, dtype=jnp.float32):
     """Filter frames 1 and later, from an initial state at the measurement of frame 0; NumPy arrays."""
     with jax.enable_x64(dtype == jnp.float64):
         dt_s = np.diff(flown.time_s)
-        first, covariance, there, params = numbers(
+        first, covariance, there, params = as_arrays(
             (flown.measured_m, flown.covariance_m2, flown.was_measured, flown.params), dtype
         )
         state = kalman.init(first[0], jnp.zeros_like(first[0]), covariance[0], params)
-        result = filtered(state, params, jnp.asarray(dt_s, dtype), first[1:], covariance[1:], there[1:])
+        result = filter_frames(state, params, jnp.asarray(dt_s, dtype), first[1:], covariance[1:], there[1:])
         states, nis = jax.tree.map(np.array, result)
     return states, nis
 
@@ -115,7 +115,7 @@ class TestAgainstTheTextbook:
             )
             # Measured 3e-13 and 1.4e-4.
             assert np.abs(difference).max() < (1e-11 if dtype == jnp.float64 else 2e-3)
-            # NIS squares an innovation of millimetres, whose rounding error in float32 is micrometres.
+            # NIS squares an innovation of millimetres with a rounding error of micrometres in float32.
             np.testing.assert_allclose(
                 nis[:, drone], expected_nis[1:], rtol=1e-10 if dtype == jnp.float64 else 5e-3
             )
@@ -137,7 +137,7 @@ class TestAgainstTheTextbook:
         """Two predictions in a row equal one prediction, and a prediction over 0 s changes nothing."""
         flown = simulate_flight(3, frames=2, drones=4, error_share=error_share)
         with jax.enable_x64(True):
-            measured, covariance, params = numbers(
+            measured, covariance, params = as_arrays(
                 (flown.measured_m[0], flown.covariance_m2[0], flown.params), jnp.float64
             )
             state = init(measured, measured, covariance, params)
@@ -177,7 +177,7 @@ class TestGaps:
         assert np.isfinite(nis[49:]).all()
 
     def test_an_error_is_forgotten_in_a_gap(self):
-        """The mean of the lasting error decays; its variance returns to that of the last measurement."""
+        """The mean of the lasting error decays; its variance returns to the variance in the last measurement."""
         flown = simulate_flight(4, frames=60, drones=3, error_share=0.5)
         flown.was_measured[30:] = False
         states, _ = run(flown)
@@ -343,7 +343,7 @@ class TestFloat32:
         results = []
         for dtype in (jnp.float32, jnp.float64):
             with jax.enable_x64(dtype == jnp.float64):
-                params = numbers(motion_params(300.0, 1, error_share=0.5), dtype)
+                params = as_arrays(motion_params(300.0, 1, error_share=0.5), dtype)
                 known = jnp.eye(3, dtype=dtype)[None] * std_m**2
                 state = init(jnp.zeros((1, 3), dtype), jnp.zeros((1, 3), dtype), known, params)
                 state = predict(state, jnp.asarray(2.5, dtype), params)
@@ -420,12 +420,12 @@ class TestFloat32:
 class TestOutliers:
     @pytest.fixture(scope="class")
     @classmethod
-    def expecting(cls):
+    def predicted(cls):
         """A state that predicts its measurement to about a centimetre, R, and params with lasting errors."""
         flown = simulate_flight(9, frames=60, drones=3, error_share=0.5)
         states, _ = run(flown)
         with jax.enable_x64(True):
-            last, covariance, params = numbers(
+            last, covariance, params = as_arrays(
                 (
                     jax.tree.map(lambda leaf: leaf[-1, :1], states),
                     flown.covariance_m2[-1, :1],
@@ -435,9 +435,9 @@ class TestOutliers:
             )
             return predict(last, jnp.float64(DT_S), params), covariance, params
 
-    def at(self, expecting, nis, direction=(0.6, 0.0, 0.8)):
+    def measurement_with_nis(self, predicted, nis, direction=(0.6, 0.0, 0.8)):
         """A measurement with a given NIS."""
-        state, covariance, _ = expecting
+        state, covariance, _ = predicted
         # S is the covariance of the apparent position plus the white share, half of R.
         S = (np.asarray(state.covariance)[:, :3, :3] + np.asarray(covariance) / 2)[0]
         direction = np.array(direction)
@@ -449,9 +449,9 @@ class TestOutliers:
         assert pytest.approx(chi2.ppf(0.999, 3), rel=1e-12) == GATE_999
 
     @pytest.mark.parametrize("nis", [1.0, 16.0, 17.0, 100.0, 1e4])
-    def test_beyond_the_gate_a_measurement_has_a_larger_covariance(self, expecting, nis):
-        state, covariance, params = expecting
-        measured, S = self.at(expecting, nis)
+    def test_beyond_the_gate_a_measurement_has_a_larger_covariance(self, predicted, nis):
+        state, covariance, params = predicted
+        measured, S = self.measurement_with_nis(predicted, nis)
         excess = max(nis / GATE_999, 1)
         with jax.enable_x64(True):
             after, found = update(state, jnp.asarray(measured), covariance, jnp.array([True]), params)
@@ -466,12 +466,12 @@ class TestOutliers:
         expected = multivariate_normal(np.zeros(3), excess * S).logpdf(innovation)
         np.testing.assert_allclose(log_density, expected, rtol=1e-9)
 
-    def test_a_farther_outlier_moves_the_state_less(self, expecting):
-        state, covariance, params = expecting
+    def test_a_farther_outlier_moves_the_state_less(self, predicted):
+        state, covariance, params = predicted
         moved = []
         for nis in (GATE_999, 100.0, 1e4, 1e6):
             with jax.enable_x64(True):
-                measured = jnp.asarray(self.at(expecting, nis)[0])
+                measured = jnp.asarray(self.measurement_with_nis(predicted, nis)[0])
                 after, _ = update(state, measured, covariance, jnp.array([True]), params)
             moved.append(float(np.linalg.norm(after.apparent_m - state.apparent_m)))
         assert moved == sorted(moved, reverse=True)

@@ -19,10 +19,10 @@ MAX_BYTES = 1_000_000
 #: Beginnings of paths on a particular machine, including the folder of this checkout.
 MACHINE_PATH = re.compile(rf"(?<![\w.])(/(home|root|tmp|Users)/|[A-Z]:\\|{re.escape(str(ROOT))})")
 
-each = pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
+each_script = pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
 
 
-def committed(script):
+def committed_notebook(script):
     """The committed notebook of a script."""
     return nbformat.read(script.with_suffix(".ipynb"), as_version=4)
 
@@ -36,9 +36,9 @@ def has_picture(cell):
     return any(kind.startswith("image/") for kind in kinds)
 
 
-@each
+@each_script
 def test_script_and_notebook_hold_the_same(script):
-    assert cells(jupytext.read(script)) == cells(committed(script))
+    assert cells(jupytext.read(script)) == cells(committed_notebook(script))
 
 
 def test_every_notebook_has_a_script():
@@ -47,15 +47,15 @@ def test_every_notebook_has_a_script():
     ]
 
 
-@each
+@each_script
 def test_committed_notebook_has_been_run_from_top_to_bottom(script):
-    counts = [cell.execution_count for cell in committed(script).cells if cell.cell_type == "code"]
+    counts = [cell.execution_count for cell in committed_notebook(script).cells if cell.cell_type == "code"]
     assert counts == list(range(1, len(counts) + 1))
 
 
-@each
+@each_script
 def test_every_picture_is_followed_by_a_what_to_see_cell(script):
-    notebook = committed(script)
+    notebook = committed_notebook(script)
     after = [
         following
         for cell, following in zip(notebook.cells, notebook.cells[1:], strict=False)
@@ -67,9 +67,9 @@ def test_every_picture_is_followed_by_a_what_to_see_cell(script):
     assert not has_picture(notebook.cells[-1])
 
 
-@each
+@each_script
 def test_committed_notebook_shows_no_errors_and_no_paths_of_a_machine(script):
-    notebook = committed(script)
+    notebook = committed_notebook(script)
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
     assert not [
         output for output in outputs if output.output_type == "error" or output.get("name") == "stderr"
@@ -81,17 +81,17 @@ def test_committed_notebook_shows_no_errors_and_no_paths_of_a_machine(script):
     assert not [text for text in texts if MACHINE_PATH.search(text)]
 
 
-@each
+@each_script
 def test_committed_notebook_is_small_and_its_metadata_are_stable(script):
     path = script.with_suffix(".ipynb")
     assert path.stat().st_size < MAX_BYTES
-    notebook = committed(script)
+    notebook = committed_notebook(script)
     assert notebook.metadata.kernelspec.name == "python3"
     assert "version" not in notebook.metadata.get("language_info", {})
     assert not [cell for cell in notebook.cells if "execution" in cell.metadata]
 
 
-@each
+@each_script
 def test_functions_are_in_the_package(script):
     # An animation needs one function that draws a frame.
     assert sum(isinstance(node, ast.FunctionDef) for node in ast.walk(ast.parse(script.read_text()))) <= 1
@@ -110,7 +110,7 @@ def copies(tmp_path_factory):
 
 
 @pytest.mark.slow
-@each
+@each_script
 def test_notebook_runs_at_tiny_size(script, copies):
     """Run by nbmake in another pytest process, because this one turns warnings of Jupyter's machinery into errors."""
     command = [

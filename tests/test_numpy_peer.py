@@ -28,7 +28,7 @@ def peers():
     return _numpy_fitness
 
 
-def places(seed):
+def random_positions(seed):
     """Positions near the drones, at the border of the images, and far outside, where too few cameras see a drone."""
     rng = np.random.default_rng(seed)
     drones_m = np.array([[0.2, 0.1, 1.3], [-0.6, 0.4, 1.1]])
@@ -40,7 +40,7 @@ def places(seed):
 @pytest.mark.parametrize("kind", ["PlainFitness", "TunedFitness"])
 @pytest.mark.parametrize("min_cameras", [2, 4])
 def test_the_numpy_fitness_is_the_tracker_s(peers, kind, min_cameras):
-    drones_m, position_m = places(0)
+    drones_m, position_m = random_positions(0)
     images = draw_coverage(RIG, drones_m, SIZE_M, REDUCTION)
     score = SoftIoU(min_cameras=min_cameras)
     inputs = score_inputs(
@@ -52,5 +52,5 @@ def test_the_numpy_fitness_is_the_tracker_s(peers, kind, min_cameras):
     # The draw has drones that too few cameras see, and drones that all cameras see.
     assert (expected == 0).any()
     assert expected.max() > 0.3
-    # Float32 against float64. A camera whose weight is at the limit may count for one and not for the other.
+    # float32 is compared with float64, so a camera with a weight at the limit may count in only one of the two.
     assert np.mean(np.abs(found - expected) > 1e-5) < 0.01

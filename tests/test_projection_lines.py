@@ -28,7 +28,7 @@ def circles(num_drones, frames=FRAMES, speed_m_s=1.0):
     return np.stack([radius_m * np.cos(angle), radius_m * np.sin(angle), height_m], axis=-1)
 
 
-def detections(truth_m, *, jitter=0.0, missed=0.0, false_alarms=0.0, seed=0, hidden=()):
+def simulate_detections(truth_m, *, jitter=0.0, missed=0.0, false_alarms=0.0, seed=0, hidden=()):
     """Boxes around the projected positions in every camera, but for drones in `hidden`: (drone, first, last frame)."""
     rng = np.random.default_rng(seed)
     width_height = RIG.cameras.image_size_wh[0]
@@ -61,13 +61,13 @@ def line_settings(count=None):
 
 
 def track(truth_m, count=None, known=None, **noise):
-    sightings = from_detections(detections(truth_m, **noise), RIG, len(truth_m))
+    sightings = from_detections(simulate_detections(truth_m, **noise), RIG, len(truth_m))
     return track_detections(
         RIG.cameras, sightings, line_settings(count), fps=FPS, bounds_m=ROOM_M, known=known
     )
 
 
-def evaluation(tracked, truth_m):
+def evaluate_tracks(tracked, truth_m):
     frame = np.arange(len(truth_m))
     estimate = Trajectories(
         frame,
@@ -83,7 +83,7 @@ def evaluation(tracked, truth_m):
 
 def test_perfect_boxes_give_the_drones_to_a_millimetre():
     truth_m = circles(4)
-    errors = evaluation(track(truth_m), truth_m)
+    errors = evaluate_tracks(track(truth_m), truth_m)
     assert (errors["missed_rate"], errors["id_switches"], errors["mota"]) == (0, 0, 1)
     # The remaining errors come from the unknown velocity in the first frames.
     assert errors["mean_error_m"] < 1e-3
@@ -97,7 +97,7 @@ def test_six_drones_with_missed_boxes_and_false_alarms(seed):
     noise = {"jitter": 0.05, "missed": 0.1, "false_alarms": 0.5, "seed": seed}
     tracked = track(truth_m, **noise)
     assert tracked.status.shape[1] == 6
-    errors = evaluation(tracked, truth_m)
+    errors = evaluate_tracks(tracked, truth_m)
     assert (errors["missed_rate"], errors["id_switches"]) == (0, 0)
     # Box centres are off by 25 mm across and 10 mm up. From seven views that gives 13 mm along x and y and 4 mm along
     # z, 17 mm in total on average. The filter treats most of the error as lasting, so it gains little.
@@ -112,7 +112,7 @@ def test_two_drones_that_pass_at_30_cm_keep_their_identities():
     first = np.stack([time_s, middle - 0.15, middle + 1.2], axis=-1)
     second = np.stack([-time_s, middle + 0.15, middle + 1.2], axis=-1)
     truth_m = np.stack([first, second], axis=1)
-    errors = evaluation(track(truth_m, jitter=0.05, missed=0.05), truth_m)
+    errors = evaluate_tracks(track(truth_m, jitter=0.05, missed=0.05), truth_m)
     assert (errors["missed_rate"], errors["id_switches"]) == (0, 0)
     # As above; in addition, a view sometimes takes one drone for the other.
     assert errors["mean_error_m"] < 0.022
@@ -181,7 +181,7 @@ def test_known_drones_are_tracked_from_the_first_frame_in_the_given_order():
     velocity_m_s = (truth_m[1] - truth_m[0]) * FPS
     tracked = track(truth_m, known=(truth_m[0, order], velocity_m_s[order]))
     assert tracked.arrivals == ()
-    # The initial velocity is that of the first step, which on a circle is 0.03 m/s off.
+    # The initial velocity is the mean over the first step, which on a circle is 0.03 m/s off.
     np.testing.assert_allclose(tracked.position_m[0], truth_m[0, order], atol=2e-3)
     np.testing.assert_allclose(state_at_first_frame(tracked).position_m, truth_m[0, order], atol=2e-3)
 
@@ -193,7 +193,7 @@ def test_sizes_agree_with_the_boxes():
 
 def test_fitness_is_the_share_of_the_cameras_that_agree():
     truth_m = circles(1)
-    detections_of_all = detections(truth_m)
+    detections_of_all = simulate_detections(truth_m)
     some = {name: boxes for name, boxes in detections_of_all.items() if name in RIG.names[:6]}
     tracked = track_detections(
         RIG.cameras, from_detections(some, RIG, FRAMES), line_settings(), fps=FPS, bounds_m=ROOM_M

@@ -21,12 +21,12 @@ def points_in_room(*shape, seed=0):
     return np.random.default_rng(seed).uniform((-1.5, -1.5, 0.3), (1.5, 1.5, 2.3), (*shape, 3))
 
 
-def pixels_of(rig, points):
+def project_points(rig, points):
     return project(rig.cameras, points[..., None, :])[0]
 
 
-def noisy(rig, points, seed=0, noise_px=1.0):
-    pixels = pixels_of(rig, points)
+def noisy_pixels(rig, points, seed=0, noise_px=1.0):
+    pixels = project_points(rig, points)
     return pixels + np.random.default_rng(seed).normal(size=pixels.shape) * np.asarray(noise_px)[..., None]
 
 
@@ -94,7 +94,7 @@ def test_the_derivative_agrees_with_opencv(coefficients):
 @pytest.mark.parametrize(("num_cameras", "shape"), [(2, (7,)), (3, (5, 2)), (5, ()), (7, (3, 0)), (7, (3,))])
 def test_exact_pixels_give_the_point(num_cameras, shape, coefficients, refine):
     rig, points = ring_rig(num_cameras, coefficients=coefficients), points_in_room(*shape)
-    found = reconstruct(rig.cameras, pixels_of(rig, points), refine=refine)
+    found = reconstruct(rig.cameras, project_points(rig, points), refine=refine)
     assert found.position_m.shape == points.shape
     assert found.covariance_m2.shape == (*shape, 3, 3)
     assert found.reprojection_px.shape == found.used.shape == (*shape, num_cameras)
@@ -107,7 +107,7 @@ def test_exact_pixels_give_the_point(num_cameras, shape, coefficients, refine):
 
 def test_two_cameras_agree_with_opencv():
     rig, points = ring_rig(2), points_in_room(31)
-    pixels = pixels_of(rig, points)
+    pixels = project_points(rig, points)
     projections = rig.cameras.K @ rig.cameras.T_cam_world[:, :3]
     homogeneous = cv2.triangulatePoints(*projections, pixels[:, 0].T.copy(), pixels[:, 1].T.copy())
     found = reconstruct(rig.cameras, pixels)
@@ -116,7 +116,7 @@ def test_two_cameras_agree_with_opencv():
 
 def test_without_refinement_it_equals_triangulate():
     rig = ring_rig(5, coefficients=5)
-    pixels = noisy(rig, points_in_room(3, 4))
+    pixels = noisy_pixels(rig, points_in_room(3, 4))
     pixels[0, 1, 2] = np.nan
     weights = np.random.default_rng(1).uniform(0.1, 2.0, (3, 4, 5))
     found = reconstruct(rig.cameras, pixels, weights, refine=False, robust=False)
@@ -160,7 +160,7 @@ def test_refined_points_agree_with_scipy(coefficients):
     rig, points = ring_rig(5, coefficients=coefficients), points_in_room(7)
     rng = np.random.default_rng(3)
     noise_px, weights = rng.uniform(0.5, 4.0, (7, 5)), rng.uniform(0.2, 3.0, (7, 5))
-    pixels = noisy(rig, points, noise_px=noise_px)
+    pixels = noisy_pixels(rig, points, noise_px=noise_px)
     pixels[2, 3] = np.nan
     weights[4, 1] = 0.0
     found = reconstruct(rig.cameras, pixels, weights, noise_px=noise_px, robust=False)
@@ -191,7 +191,7 @@ def test_refined_points_are_never_worse_than_linear_points():
     rig, rng = ring_rig(2), np.random.default_rng(0)
     nearness = rng.uniform(0.8, 0.98, (3000, 1))
     points = nearness * rig.cameras.centre_world[0] + (1 - nearness) * np.array([0.1, -0.1, 1.2])
-    pixels = noisy(rig, points, noise_px=20.0).clip(-2000, 2000)
+    pixels = noisy_pixels(rig, points, noise_px=20.0).clip(-2000, 2000)
     linear, refined = (
         reconstruct(rig.cameras, pixels, robust=False, refine=refine) for refine in (False, True)
     )
@@ -210,7 +210,7 @@ def test_the_covariance_agrees_with_simulated_noise(num_cameras):
     rig = ring_rig(num_cameras, coefficients=5, image_size_wh=(960, 720))
     point, draws = np.array([0.4, -0.3, 1.1]), 4000
     noise_px = np.linspace(0.5, 3.0, num_cameras)
-    pixels = noisy(rig, np.broadcast_to(point, (draws, 3)), noise_px=noise_px)
+    pixels = noisy_pixels(rig, np.broadcast_to(point, (draws, 3)), noise_px=noise_px)
     found = reconstruct(rig.cameras, pixels, noise_px=noise_px, robust=False)
     off = found.position_m - point
     squared = np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.covariance_m2), off)
@@ -225,7 +225,7 @@ def test_the_covariance_agrees_with_simulated_noise(num_cameras):
 def test_correct_views_are_left_out_with_the_promised_probability(num_cameras, false_alarm):
     rig, draws = ring_rig(num_cameras, image_size_wh=(960, 720)), 10_000
     noise_px = np.linspace(0.5, 2.0, num_cameras)
-    pixels = noisy(rig, points_in_room(draws), noise_px=noise_px)
+    pixels = noisy_pixels(rig, points_in_room(draws), noise_px=noise_px)
     found = reconstruct(rig.cameras, pixels, noise_px=noise_px, false_alarm=false_alarm)
     lost = (~found.used.all(axis=-1)).sum()
     assert lost <= binom.ppf(1 - 1e-4, draws, false_alarm)
@@ -240,7 +240,7 @@ def test_correct_views_are_left_out_with_the_promised_probability(num_cameras, f
 @pytest.mark.parametrize("num_cameras", [4, 5, 8])
 def test_one_view_is_off(num_cameras, off_px):
     rig, points = ring_rig(num_cameras, coefficients=4), points_in_room(40)
-    pixels = noisy(rig, points)
+    pixels = noisy_pixels(rig, points)
     rng = np.random.default_rng(5)
     wrong, angle = rng.integers(num_cameras, size=40), rng.uniform(0, 2 * np.pi, 40)
     each = np.arange(40)
@@ -264,7 +264,7 @@ def test_one_view_is_off(num_cameras, off_px):
 
 def test_three_of_eight_views_are_off():
     rig, points = ring_rig(8), points_in_room(30)
-    pixels = noisy(rig, points)
+    pixels = noisy_pixels(rig, points)
     rng = np.random.default_rng(6)
     wrong = np.zeros((30, 8), bool)
     for row in wrong:
@@ -280,13 +280,13 @@ def test_three_of_eight_views_are_off():
 def epipolar_direction(rig, of, to, point):
     """Unit vector in the image of camera `of` along the projected line of sight of camera `to` through the point."""
     nearer = point + 0.02 * (rig.cameras.centre_world[to] - point)
-    pixels = pixels_of(rig, np.stack([point, nearer]))[:, of]
+    pixels = project_points(rig, np.stack([point, nearer]))[:, of]
     return (pixels[1] - pixels[0]) / np.linalg.norm(pixels[1] - pixels[0])
 
 
 def test_of_three_views_the_wrong_one_is_found_only_if_the_others_alone_agree():
     rig, point = make_unnamed_rig(*(ring_rig(5).cameras[i] for i in (0, 1, 3))), np.array([0.2, 0.1, 1.2])
-    exact = pixels_of(rig, point)
+    exact = project_points(rig, point)
     along = [epipolar_direction(rig, 0, to, point) for to in (1, 2)]
     # The error is across both epipolar lines: neither of the other views agrees with the wrong view.
     across = exact.copy()
@@ -310,7 +310,7 @@ def test_two_cameras_at_one_position_do_not_outvote_a_third():
     T = one.T_cam_world.copy()
     T[:3, 3] += (0.02, 0.0, 0.0)
     rig, point = make_unnamed_rig(one, replace(one, T_cam_world=T), other), np.array([0.2, 0.1, 1.2])
-    pixels = pixels_of(rig, point)
+    pixels = project_points(rig, point)
     x, y = epipolar_direction(rig, 2, 0, point)
     pixels[2] += 40 * np.array([-y, x])
     found = reconstruct(rig.cameras, pixels)
@@ -338,7 +338,7 @@ def test_without_agreement_no_view_is_left_out():
 @pytest.mark.parametrize("num_seeing", [0, 1])
 def test_too_few_views_is_nan(num_seeing):
     rig, points = ring_rig(5), points_in_room(3)
-    pixels = pixels_of(rig, points)
+    pixels = project_points(rig, points)
     pixels[1, num_seeing:] = np.nan
     weights = np.ones((3, 5))
     weights[2, num_seeing:] = 0.0
@@ -354,7 +354,7 @@ def test_too_few_views_is_nan(num_seeing):
 def test_rays_from_one_position_are_nan():
     one = ring_rig(3).cameras[0]
     rig = make_unnamed_rig(one, one, one)
-    found = reconstruct(rig.cameras, pixels_of(rig, points_in_room(3)))
+    found = reconstruct(rig.cameras, project_points(rig, points_in_room(3)))
     assert np.isnan(found.position_m).all()
     assert not found.used.any()
 
@@ -368,12 +368,12 @@ def test_rays_that_meet_behind_the_cameras_are_nan_and_a_camera_that_looks_away_
         spread.append(make_camera(R=R, t_m=t_m, K=K, image_size_wh=(320, 240)))
     found = reconstruct(make_unnamed_rig(*spread).cameras, np.full((2, 2, 2), 130.0))
     assert np.isnan(found.position_m).all()
-    # The point is behind the last camera, whose pixel belongs to another object.
+    # The point is behind the last camera; the pixel of this camera belongs to another object.
     ring = ring_rig(5)
     R, t_m = look_at((0.0, 3.0, 1.2), (0.0, 6.0, 1.2))
     away = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(320, 240))
     rig, point = make_unnamed_rig(*(ring.cameras[i] for i in range(4)), away), np.array([0.2, 0.1, 1.2])
-    pixels = np.concatenate([pixels_of(ring, point)[:4], [[160.0, 120.0]]])
+    pixels = np.concatenate([project_points(ring, point)[:4], [[160.0, 120.0]]])
     found = reconstruct(rig.cameras, pixels)
     assert found.used.tolist() == [True] * 4 + [False]
     np.testing.assert_allclose(found.position_m, point, atol=1e-6)
@@ -384,7 +384,7 @@ def test_rays_that_meet_behind_the_cameras_are_nan_and_a_camera_that_looks_away_
 @pytest.mark.parametrize("noise_px", [0.0, -1.0, np.nan])
 def test_invalid_noise_is_refused(noise_px):
     rig = ring_rig(3)
-    pixels = pixels_of(rig, points_in_room(2))
+    pixels = project_points(rig, points_in_room(2))
     with pytest.raises(SettingsError, match="noise_px: expected numbers above 0"):
         reconstruct(rig.cameras, pixels, noise_px=noise_px)
     # The noise of a view that is not used may have any value.
@@ -396,7 +396,7 @@ def test_invalid_noise_is_refused(noise_px):
 def test_an_invalid_false_alarm_is_refused(false_alarm):
     rig = ring_rig(3)
     with pytest.raises(SettingsError, match="false_alarm: expected a probability"):
-        reconstruct(rig.cameras, pixels_of(rig, points_in_room(2)), false_alarm=false_alarm)
+        reconstruct(rig.cameras, project_points(rig, points_in_room(2)), false_alarm=false_alarm)
 
 
 # --- invariants
@@ -406,7 +406,7 @@ def some_views(seed):
     """Views with noise, gaps and wrong pixels."""
     rng = np.random.default_rng(seed)
     rig = ring_rig(6, coefficients=4)
-    pixels = noisy(rig, points_in_room(9, seed=seed), seed=seed)
+    pixels = noisy_pixels(rig, points_in_room(9, seed=seed), seed=seed)
     pixels[rng.random((9, 6)) < 0.15] = np.nan
     pixels[rng.random((9, 6)) < 0.1] += 50.0
     return rig, pixels

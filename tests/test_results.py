@@ -33,7 +33,7 @@ def git(folder: Path, *words: str) -> None:
     subprocess.run(["git", *identity, *words], cwd=folder, check=True, capture_output=True)
 
 
-def results(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+def run_results_script(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "experiments/_results.py", *words]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
@@ -49,7 +49,7 @@ def project(tmp_path: Path) -> Path:
     (tmp_path / "library" / "a.py").write_text('"""A module."""\nSIZE = 1\n')
     git(tmp_path, "init", "-q")
     commit(tmp_path)
-    made = results(tmp_path, "make")
+    made = run_results_script(tmp_path, "make")
     assert made.returncode == 0, made.stderr
     commit(tmp_path)
     return tmp_path
@@ -68,35 +68,35 @@ def test_a_record_says_where_its_figures_come_from(project: Path) -> None:
     assert record["dirty"] == []
     assert record["versions"]["python"] == sys.version.split()[0]
     assert record["machine"]["processors"] >= 1
-    assert results(project, "check").returncode == 0
+    assert run_results_script(project, "check").returncode == 0
 
 
 def test_changed_code_makes_a_result_older(project: Path) -> None:
     (project / "library" / "a.py").write_text('"""A module."""\nSIZE = 2\n')
-    changed = results(project, "check")
+    changed = run_results_script(project, "check")
     assert changed.returncode == 1
     assert "the working tree has changes in library/a.py" in changed.stdout
     commit(project)
-    committed = results(project, "check", "speed")
+    committed = run_results_script(project, "check", "speed")
     assert committed.returncode == 1
     assert "code changed since" in committed.stdout
     assert "library/a.py" in committed.stdout
-    assert results(project, "make").returncode == 0
+    assert run_results_script(project, "make").returncode == 0
     commit(project)
-    assert results(project, "check").returncode == 0
+    assert run_results_script(project, "check").returncode == 0
 
 
 def test_docstrings_and_comments_do_not_make_a_result_older(project: Path) -> None:
     (project / "library" / "a.py").write_text('"""A module with better words."""\n\n# A reason.\nSIZE = 1\n')
     commit(project)
-    assert results(project, "check").returncode == 0
+    assert run_results_script(project, "check").returncode == 0
 
 
 def test_a_changed_working_tree_is_recorded_and_named(project: Path) -> None:
     (project / "library" / "b.py").write_text("SIZE = 3\n")
-    assert results(project, "make").returncode == 0
+    assert run_results_script(project, "make").returncode == 0
     commit(project)
-    named = results(project, "check")
+    named = run_results_script(project, "check")
     assert named.returncode == 1
     assert "made from a working tree with changes in library/b.py" in named.stdout
 
@@ -106,20 +106,20 @@ def test_a_file_that_was_edited_by_hand_is_named(project: Path) -> None:
     record = json.loads(path.read_text())
     (path.parent / "speed.csv").write_text("a\n1\n")
     path.write_text(json.dumps(record | {"files": {"speed.csv": "0" * 64}}))
-    named = results(project, "check")
+    named = run_results_script(project, "check")
     assert named.returncode == 1
     assert "speed.csv is not the file that the record describes" in named.stdout
 
 
 def test_a_failing_command_is_named_and_the_exit_code_is_1(project: Path) -> None:
     (project / "experiments" / "speed.py").write_text("raise SystemExit(3)\n")
-    failed = results(project, "make")
+    failed = run_results_script(project, "make")
     assert failed.returncode == 1
     assert "failed: speed" in failed.stderr
 
 
 def test_an_unknown_result_is_one_line(project: Path) -> None:
-    unknown = results(project, "check", "sped")
+    unknown = run_results_script(project, "check", "sped")
     assert unknown.returncode == 1
     assert "expected names of results.toml (speed), found sped" in unknown.stderr
 

@@ -24,19 +24,19 @@ ONE = np.array((0.6, -0.5, 1.5)) + TIME_S * (0.8, 0.2, 0.1)
 OTHER = np.array((-0.7, 0.6, 0.9)) + TIME_S * (0.3, -1.0, 0.2)
 
 
-def drawn(*paths_m, size_m=SIZE_M, rig=SMALL):
+def draw_silhouettes(*paths_m, size_m=SIZE_M, rig=SMALL):
     images = np.stack([draw_coverage(rig, places, size_m, REDUCTION) for places in np.stack(paths_m, axis=1)])
     images.flags.writeable = False
     return images
 
 
 @pytest.fixture(scope="module")
-def both():
-    return drawn(ONE, OTHER)
+def two_drones():
+    return draw_silhouettes(ONE, OTHER)
 
 
-def magnified(rig: Rig, times: int) -> Rig:
-    """Cameras with `times` as many pixels along each side."""
+def magnify(rig: Rig, times: int) -> Rig:
+    """The rig with `times` times the number of pixels along each side."""
     K = rig.cameras.K * np.array([[times], [times], [1]])
     # The corner of the image stays half a pixel before the middle of the first pixel.
     K[:, :2, 2] += (times - 1) / 2
@@ -45,7 +45,7 @@ def magnified(rig: Rig, times: int) -> Rig:
     )
 
 
-def start_of(coverage, rig=SMALL, reduction=REDUCTION):
+def find_initial_state(coverage, rig=SMALL, reduction=REDUCTION):
     return find_drones(
         rig.cameras, coverage, reduction=reduction, fps=FPS, bounds_m=ROOM_M, max_speed_m_s=6.0
     )
@@ -91,32 +91,32 @@ def test_a_single_cell_is_noise():
 
 
 @pytest.mark.parametrize("times", [2, 4])
-def test_initial_states_do_not_depend_on_the_pixels_per_cell(both, times):
-    one = start_of(both[:10])
-    other = start_of(both[:10], magnified(SMALL, times), times * REDUCTION)
+def test_initial_states_do_not_depend_on_the_pixels_per_cell(two_drones, times):
+    one = find_initial_state(two_drones[:10])
+    other = find_initial_state(two_drones[:10], magnify(SMALL, times), times * REDUCTION)
     # The equations are the same except for rounding in float64.
     for name, value in vars(one).items():
         np.testing.assert_allclose(getattr(other, name), value, atol=1e-6, err_msg=name)
 
 
-def test_drones_of_a_few_cells_are_in_the_initial_state(both):
+def test_drones_of_a_few_cells_are_in_the_initial_state(two_drones):
     """Regression: blobs of ten cells were too small."""
-    start = start_of(both[:10])
+    start = find_initial_state(two_drones[:10])
     assert_found(start.position_m, ONE[0], OTHER[0], atol=CELL_M / 2)
 
 
 @pytest.mark.parametrize("times", [1, 2])
-def test_drones_of_a_few_cells_become_candidates(both, times):
+def test_drones_of_a_few_cells_become_candidates(two_drones, times):
     """Regression: candidates were searched at half the resolution, where a small drone is one cell."""
-    found = candidates_in(both, ONE, rig=magnified(SMALL, times), reduction=times * REDUCTION)
+    found = candidates_in(two_drones, ONE, rig=magnify(SMALL, times), reduction=times * REDUCTION)
     assert_found([one.position_m for one in found], OTHER[found[0].frame], atol=CELL_M / 2)
 
 
-def test_known_drones_of_a_few_cells_explain_all_foreground(both):
-    assert candidates_in(both, ONE, OTHER) == ()
+def test_known_drones_of_a_few_cells_explain_all_foreground(two_drones):
+    assert candidates_in(two_drones, ONE, OTHER) == ()
 
 
-def thinned(coverage, share, seed=0):
+def thin_out(coverage, share, seed=0):
     """Keep a random share of the cells in every frame."""
     return coverage * (np.random.default_rng(seed).random(coverage.shape) < share)
 
@@ -125,7 +125,7 @@ def thinned(coverage, share, seed=0):
 def test_a_silhouette_with_many_gaps_is_a_drone(seed):
     """Regression: a camera that showed less than a quarter of the drone did not count."""
     rig = ring_rig(6, image_size_wh=(240, 180))
-    coverage = thinned(drawn(OTHER, rig=rig), 0.22, seed)
+    coverage = thin_out(draw_silhouettes(OTHER, rig=rig), 0.22, seed)
     found = candidates_in(coverage, rig=rig)
     assert_found([one.position_m for one in found], OTHER[found[0].frame], atol=CELL_M / 2)
 
@@ -136,5 +136,5 @@ def test_noise_everywhere_is_no_drone(seed):
     rng = np.random.default_rng(seed)
     noise = 255 * (rng.random((25, 6, 45, 60)) < 0.03).astype(np.uint8)
     rig = ring_rig(6, image_size_wh=(120, 90))
-    assert len(start_of(noise[:10], rig).position_m) == 0
+    assert len(find_initial_state(noise[:10], rig).position_m) == 0
     assert candidates_in(noise, rig=rig) == ()

@@ -26,7 +26,7 @@ from psotrack.errors import InputError
 from psotrack.motion import estimate_jerk_density, smooth
 
 
-def smoothed(flown: SimulatedFlight):
+def smooth_flight(flown: SimulatedFlight):
     return smooth(*flown.measurements, flown.params)
 
 
@@ -44,7 +44,7 @@ class TestSmoothing:
         unknown[0, 0], unknown[:5, 1], unknown[5, 1] = False, True, False
         time_s = flown.time_s + np.random.default_rng(3).uniform(-0.0005, 0.0005, 30)
         flown = remove_measurements(replace(flown, time_s=time_s), unknown)
-        result = smoothed(flown)
+        result = smooth_flight(flown)
         for drone, born in ((0, 0), (1, 5)):
             # No measurement is beyond the gate, because the textbook filter has none.
             assert np.nanmax(textbook_filter(*flown.textbook_arguments(drone, born))[2]) < 16
@@ -63,7 +63,7 @@ class TestSmoothing:
         """Without lasting errors, no bit of the result depends on their time constant."""
         flown = remove_random_measurements(simulate_flight(1, frames=30, drones=2), 2)
         other = replace(flown, model=Model(error_time_s=7.0))
-        for one, same in zip(*(vars(smoothed(each)).values() for each in (flown, other)), strict=True):
+        for one, same in zip(*(vars(smooth_flight(each)).values() for each in (flown, other)), strict=True):
             np.testing.assert_array_equal(one, same)
         density = [estimate_jerk_density(*flown.measurements, each.params) for each in (flown, other)]
         np.testing.assert_array_equal(*density)
@@ -75,7 +75,7 @@ class TestSmoothing:
         )[..., :3]
         raw, filtered, after = (
             np.sqrt(((position_m - flown.state[..., :3])[20:-20] ** 2).mean())
-            for position_m in (flown.measured_m, filtered_m, smoothed(flown).position_m)
+            for position_m in (flown.measured_m, filtered_m, smooth_flight(flown).position_m)
         )
         # Measured 10.8, 6.0 and 2.2 mm.
         assert after < 0.7 * filtered < 0.7 * 0.7 * raw
@@ -88,7 +88,7 @@ class TestSmoothing:
         flown = remove_random_measurements(
             simulate_flight(5, frames=60, drones=drones, error_share=error_share, steady=True), 6, unknown
         )
-        result = smoothed(flown)
+        result = smooth_flight(flown)
         low, high = chi2.ppf([0.0005, 0.9995], 3 * drones) / drones
         for frame in (0, 1, 20, 40, 59):
             value = nees(result.position_m[frame] - flown.state[frame, :, :3], result.covariance_m2[frame])
@@ -99,7 +99,7 @@ class TestSmoothing:
         flown = simulate_flight(5, frames=60, drones=300, density=1.0, error_share=0.5, steady=True)
         inside, off_m = [], []
         for each in (flown, replace(flown, model=replace(flown.model, error_share=0.0))):
-            result = smoothed(each)
+            result = smooth_flight(each)
             error_m = result.position_m[30] - flown.state[30, :, :3]
             inside.append((nees(error_m, result.covariance_m2[30]) < chi2.ppf(0.9, 3)).mean())
             off_m.append(np.sqrt((error_m**2).mean()))
@@ -112,7 +112,7 @@ class TestSmoothing:
     def test_gaps_are_bridged_from_both_sides(self):
         unknown = np.zeros((100, 20), bool)
         unknown[40:60], unknown[90:] = True, True
-        result = smoothed(
+        result = smooth_flight(
             remove_measurements(
                 simulate_flight(7, frames=100, drones=20, error_share=0.5, steady=True), unknown
             )
@@ -127,7 +127,7 @@ class TestSmoothing:
         unknown = np.zeros((30, 2), bool)
         unknown[20:] = True
         flown = remove_measurements(simulate_flight(8, frames=30, drones=2, error_share=0.5), unknown)
-        result = smoothed(flown)
+        result = smooth_flight(flown)
         ahead_s = (flown.time_s[19:] - flown.time_s[19])[:, None, None]
         expected = (
             result.position_m[19]
@@ -141,7 +141,7 @@ class TestSmoothing:
         unknown = np.zeros((30, 2), bool)
         unknown[:, 1] = True
         flown = simulate_flight(9, frames=30, drones=2, error_share=0.5)
-        result, alone = smoothed(remove_measurements(flown, unknown)), smoothed(flown)
+        result, alone = smooth_flight(remove_measurements(flown, unknown)), smooth_flight(flown)
         for part, same in zip(vars(result).values(), vars(alone).values(), strict=True):
             assert np.isnan(part[:, 1]).all()
             np.testing.assert_array_equal(part[:, 0], same[:, 0])
@@ -151,7 +151,7 @@ class TestSmoothing:
         flown = simulate_flight(10, frames=100, drones=20, error_share=error_share)
         wild = flown.measured_m.copy()
         wild[50] += 0.5
-        result, clean = smoothed(replace(flown, measured_m=wild)), smoothed(flown)
+        result, clean = smooth_flight(replace(flown, measured_m=wild)), smooth_flight(flown)
         # The outlier is 0.87 m off. Measured: it moves positions by up to 6 mm, where the smoothed standard deviation
         # over three axes is 4 mm (white errors) and 12 mm (lasting errors).
         moved_m = np.linalg.norm(result.position_m - clean.position_m, axis=-1)
@@ -164,7 +164,7 @@ class TestSmoothing:
         unknown[0] = False
         unknown[1000:1500, 0], unknown[200:, 1] = True, True
         unknown[2900, 1] = False
-        result = smoothed(
+        result = smooth_flight(
             remove_measurements(
                 simulate_flight(11, frames=frames, drones=2, error_share=error_share), unknown
             )
@@ -183,14 +183,14 @@ class TestSymmetries:
         rng = np.random.default_rng(seed)
         flown = remove_random_measurements(simulate_flight(seed, frames=30, drones=2, error_share=0.5), seed)
         turn, shift_m = Rotation.random(rng=rng).as_matrix(), rng.uniform(-3, 3, 3)
-        turned = smoothed(
+        turned = smooth_flight(
             replace(
                 flown,
                 measured_m=flown.measured_m @ turn.T + shift_m,
                 covariance_m2=turn @ flown.covariance_m2 @ turn.T,
             )
         )
-        here = smoothed(flown)
+        here = smooth_flight(flown)
         # The arithmetic is float64; the condition number of the covariances is 1e5.
         np.testing.assert_allclose(turned.position_m, here.position_m @ turn.T + shift_m, rtol=0, atol=1e-8)
         np.testing.assert_allclose(turned.velocity_m_s, here.velocity_m_s @ turn.T, rtol=0, atol=1e-6)
@@ -209,7 +209,7 @@ class TestSymmetries:
         The gate is not symmetric either, so no measurement is beyond the gate.
         """
         unknown = np.random.default_rng(seed).random((30, 2)) < 0.3
-        # Both ends are measured, because frames before the first measurement are NaN, and those after the last are not.
+        # Both ends are measured: frames before the first measurement are NaN, but frames after the last are not.
         unknown[[0, -1]] = False
         flown = remove_measurements(
             halve_errors(simulate_flight(seed, frames=30, drones=2, error_share=0.5, steady=True)), unknown
@@ -223,7 +223,7 @@ class TestSymmetries:
             flown.was_measured[::-1],
             flown.model,
         )
-        forth, back = smoothed(flown), smoothed(back)
+        forth, back = smooth_flight(flown), smooth_flight(back)
         # Priors of 1 km/s and 100 km/s² change the result by about 1e-7 of its uncertainty, a few m/s and 10 m/s².
         np.testing.assert_allclose(back.position_m[::-1], forth.position_m, rtol=0, atol=1e-6)
         np.testing.assert_allclose(-back.velocity_m_s[::-1], forth.velocity_m_s, rtol=0, atol=1e-4)
@@ -257,7 +257,7 @@ class TestJerkDensity:
         found = estimate_jerk_density(
             *replace(flown, measured_m=measured_m).measurements, motion_params(30.0, 8)
         )
-        # The limit is that of flights without outliers.
+        # The limit is the same as for flights without outliers.
         assert np.abs(np.log10(found / 30.0)).max() < 0.3
 
     def test_a_drone_with_almost_no_measurements_keeps_the_prior(self):
@@ -281,7 +281,7 @@ class TestJerkDensity:
 
 
 class TestRefusedInput:
-    def changed(self, **changes):
+    def changed_flight(self, **changes):
         flown = simulate_flight(18, frames=30, drones=2)
         for name, (index, value) in changes.items():
             getattr(flown, name)[index] = value
@@ -305,18 +305,18 @@ class TestRefusedInput:
         ],
     )
     def test_the_message_names_the_first_wrong_value(self, function, changes, message):
-        flown = self.changed(**changes)
+        flown = self.changed_flight(**changes)
         with pytest.raises(InputError, match=message):
             function(*flown.measurements, flown.params)
 
     def test_values_without_a_measurement_are_ignored(self):
-        flown = self.changed(was_measured=((4, 1), False), covariance_m2=((4, 1), np.diag([1, 1, -1])))
-        assert np.isfinite(smoothed(flown).position_m).all()
+        flown = self.changed_flight(was_measured=((4, 1), False), covariance_m2=((4, 1), np.diag([1, 1, -1])))
+        assert np.isfinite(smooth_flight(flown).position_m).all()
 
 
 def test_double_precision_does_not_leave_the_call():
     flown = simulate_flight(19, frames=30, drones=2)
-    assert smoothed(flown).position_m.dtype == np.float64
+    assert smooth_flight(flown).position_m.dtype == np.float64
     assert not jax.config.jax_enable_x64
     assert jax.numpy.zeros(1).dtype == np.float32
 

@@ -14,7 +14,7 @@ table_of = jax.jit(summed_area_table)
 sum_of = jax.jit(box_sum)
 
 
-def coverage(shape, seed=0):
+def random_images(shape, seed=0):
     return np.random.default_rng(seed).integers(0, 256, shape).astype(np.uint8)
 
 
@@ -27,7 +27,7 @@ def area_weighted_sum(image, x0, y0, x1, y1):
     return shares[0] @ image.astype(np.float64) @ shares[1]
 
 
-def sums(images, camera, boxes):
+def box_sums(images, camera, boxes):
     """`box_sum` of (sets, boxes, 4) boxes."""
     edges = (jnp.asarray(boxes[..., i], jnp.float32) for i in range(4))
     return np.asarray(sum_of(table_of(images), jnp.asarray(camera, jnp.int32), *edges))
@@ -36,7 +36,7 @@ def sums(images, camera, boxes):
 @pytest.mark.parametrize("shape", [(1, 1, 1), (1, 5, 7), (3, 13, 11), (5, 2, 17)])
 @pytest.mark.parametrize("dtype", [np.uint8, np.int32, bool])
 def test_table_is_the_cumulative_sum_with_a_border_of_zeros(shape, dtype):
-    images = coverage(shape).astype(dtype)
+    images = random_images(shape).astype(dtype)
     table = table_of(images.astype(np.int32) if dtype is bool else images)
     assert table.dtype == jnp.int32
     expected = np.pad(images.astype(np.int64).cumsum(-1).cumsum(-2), ((0, 0), (1, 0), (1, 0)))
@@ -45,13 +45,13 @@ def test_table_is_the_cumulative_sum_with_a_border_of_zeros(shape, dtype):
 
 def test_whole_boxes_are_slice_sums():
     """All boxes with whole edges in a 5 x 7 image are exact, for several cameras at once."""
-    images = coverage((2, 5, 7))
+    images = random_images((2, 5, 7))
     edges = [
         (x0, y0, x1, y1) for x0 in range(8) for x1 in range(x0, 8) for y0 in range(6) for y1 in range(y0, 6)
     ]
     boxes = np.array(edges)[:, None, :].repeat(2, axis=1)
     expected = [[images[c, y0:y1, x0:x1].sum(dtype=int) for c in range(2)] for x0, y0, x1, y1 in edges]
-    np.testing.assert_array_equal(sums(images, np.arange(2), boxes), expected)
+    np.testing.assert_array_equal(box_sums(images, np.arange(2), boxes), expected)
 
 
 box_edges = st.tuples(*[st.floats(-5, 25, width=32)] * 4)
@@ -60,9 +60,9 @@ box_edges = st.tuples(*[st.floats(-5, 25, width=32)] * 4)
 @given(st.lists(box_edges, min_size=6, max_size=6), st.integers(0, 2**16))
 def test_fractional_boxes_are_area_weighted_sums(edges, seed):
     """Boxes of any kind, also empty, in the wrong order or outside, in three cameras and two sets."""
-    images = coverage((3, 13, 17), seed)
+    images = random_images((3, 13, 17), seed)
     boxes = np.array(edges, np.float32).reshape(2, 3, 4)
-    actual = sums(images, np.arange(3), boxes)
+    actual = box_sums(images, np.arange(3), boxes)
     for i, c in np.ndindex(2, 3):
         expected = area_weighted_sum(images[c], *boxes[i, c].astype(np.float64))
         # An edge's fraction is exact in float32 to 1e-6 of a pixel at 25; it weighs a line of at most 17 x 255.
@@ -85,37 +85,37 @@ def test_fractional_boxes_are_area_weighted_sums(edges, seed):
 )
 def test_empty_boxes_have_sum_zero(box):
     images = np.full((1, 13, 17), 255, np.uint8)
-    assert sums(images, np.zeros(1), np.array(box, np.float64).reshape(1, 1, 4)).item() == 0
+    assert box_sums(images, np.zeros(1), np.array(box, np.float64).reshape(1, 1, 4)).item() == 0
 
 
 def test_boxes_are_cut_at_the_border():
-    images = coverage((1, 13, 17))
+    images = random_images((1, 13, 17))
     whole = np.array([[[-100, -100, 100, 100]], [[0, 0, 17, 13]]])
-    np.testing.assert_array_equal(sums(images, np.zeros(1), whole).ravel(), [images.sum(dtype=int)] * 2)
+    np.testing.assert_array_equal(box_sums(images, np.zeros(1), whole).ravel(), [images.sum(dtype=int)] * 2)
 
 
 def test_exact_where_sums_exceed_float32():
     """The sum of a 1080p image is 5e8, beyond float32's 2^24, which must not affect a small box at the image's end."""
     images = np.full((1, 1080, 1920), 255, np.uint8)
     boxes = np.array([[[1917, 1078, 1920, 1080]], [[1900.5, 1070.25, 1903.0, 1071.0]]])
-    assert sums(images, np.zeros(1), boxes).ravel().tolist() == [3 * 2 * 255, 2.5 * 0.75 * 255]
+    assert box_sums(images, np.zeros(1), boxes).ravel().tolist() == [3 * 2 * 255, 2.5 * 0.75 * 255]
 
 
 def test_sets_and_cameras_are_not_mixed_up():
     """Seven sets of eleven boxes, each in its camera's table, give the same as one box at a time."""
     rng = np.random.default_rng(3)
-    images = coverage((5, 13, 17))
+    images = random_images((5, 13, 17))
     camera = rng.integers(0, 5, 11)
     boxes = rng.uniform(-2, 18, (7, 11, 4))
-    together = sums(images, camera, boxes)
+    together = box_sums(images, camera, boxes)
     for i, j in np.ndindex(7, 11):
-        alone = sums(images, camera[j : j + 1], boxes[i, j].reshape(1, 1, 4)).item()
+        alone = box_sums(images, camera[j : j + 1], boxes[i, j].reshape(1, 1, 4)).item()
         assert together[i, j] == pytest.approx(alone, abs=1e-3)
 
 
 def test_gradient_is_the_line_that_an_edge_sweeps():
     """The derivative of the area-weighted sum, by central differences of the float64 oracle."""
-    image = coverage((1, 13, 17))
+    image = random_images((1, 13, 17))
     edges = np.array([2.3, 3.6, 9.4, 11.2])
 
     def total(edges):
@@ -132,7 +132,7 @@ def test_gradient_is_the_line_that_an_edge_sweeps():
 
 
 def test_gradient_is_finite_everywhere():
-    image = coverage((1, 5, 7))
+    image = random_images((1, 5, 7))
 
     def total(edges):
         return box_sum(summed_area_table(image), jnp.zeros(1, jnp.int32), *edges.reshape(4, 1, 1)).sum()
@@ -180,22 +180,24 @@ def test_packed_sums_are_exact_to_the_last_bit():
 
 
 def test_gradient_of_packed_sums_is_that_of_either_image():
-    low, high = coverage((1, 13, 17)), coverage((1, 13, 17))[:, ::-1] > 127
+    low, high = random_images((1, 13, 17)), random_images((1, 13, 17))[:, ::-1] > 127
     edges = np.array([2.3, 3.6, 9.4, 11.2])
 
-    def of_packed(edges):
+    def packed_product(edges):
         table = summed_area_table(pack(jnp.asarray(low), jnp.asarray(high)))
         return of_packed_box_sums(
             lambda low, high: low * high, table, jnp.zeros(1, jnp.int32), *edges.reshape(4, 1, 1)
         ).sum()
 
-    def of_each(edges):
-        sums = (
+    def separate_product(edges):
+        box_sums = (
             box_sum(summed_area_table(image), jnp.zeros(1, jnp.int32), *edges.reshape(4, 1, 1)).sum()
             for image in (low, high.astype(np.uint8))
         )
-        return jnp.prod(jnp.stack(list(sums)))
+        return jnp.prod(jnp.stack(list(box_sums)))
 
-    found, expected = (jax.jit(jax.grad(of))(jnp.asarray(edges, jnp.float32)) for of in (of_packed, of_each))
+    found, expected = (
+        jax.jit(jax.grad(of))(jnp.asarray(edges, jnp.float32)) for of in (packed_product, separate_product)
+    )
     # The same float32 arithmetic, but the compiler may fuse it differently.
     np.testing.assert_allclose(found, expected, rtol=1e-4)

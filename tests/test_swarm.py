@@ -35,16 +35,16 @@ def rosenbrock(position):
     return -(100 * jnp.square(y - x * x) + jnp.square(1 - x)).sum(axis=-1)
 
 
-def undefined(position):
+def undefined_everywhere(position):
     return jnp.full(position.shape[:2], jnp.nan, position.dtype)
 
 
-def spread(particles, groups, dims, seed=0, scale=5.0):
+def random_positions(particles, groups, dims, seed=0, scale=5.0):
     rng = np.random.default_rng(seed)
     return jnp.asarray(rng.uniform(-scale, scale, (particles, groups, dims)), jnp.float32)
 
 
-def begin(objective, position, knobs):
+def evaluated_start(objective, position, knobs):
     """The initial swarm after its evaluation."""
     return swarm.evaluate(objective, swarm.init(position, knobs))
 
@@ -55,7 +55,7 @@ def advance(key, objective, state, knobs):
 
 
 run = jax.jit(swarm.run, static_argnums=1)
-init = jax.jit(begin, static_argnums=0)
+init = jax.jit(evaluated_start, static_argnums=0)
 step = jax.jit(advance, static_argnums=1)
 
 
@@ -135,7 +135,7 @@ def test_one_step_of_three_particles_by_hand(max_step):
 
 @pytest.mark.parametrize(("groups", "dims"), [(1, 6), (2, 3), (5, 2)])
 def test_sphere(groups, dims):
-    final = run(jax.random.key(0), sphere, spread(40, groups, dims), params(groups, dims), 150)
+    final = run(jax.random.key(0), sphere, random_positions(40, groups, dims), params(groups, dims), 150)
     # A converging swarm loses about a tenth of its radius per iteration. Measured 1e-9, limit 1e-3.
     np.testing.assert_allclose(final.gbest_position, 0, atol=1e-3)
     np.testing.assert_allclose(final.gbest_fitness, 0, atol=1e-6)
@@ -143,7 +143,7 @@ def test_sphere(groups, dims):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_rosenbrock(seed):
-    final = run(jax.random.key(seed), rosenbrock, spread(50, 2, 2, seed), params(2), 300)
+    final = run(jax.random.key(seed), rosenbrock, random_positions(50, 2, 2, seed), params(2), 300)
     # The valley is flat (curvature 1/4 along it), and float32 resolves 1e-7 of the fitness. Measured 0, limit 2e-2.
     np.testing.assert_allclose(final.gbest_position, 1, atol=2e-2)
 
@@ -160,7 +160,7 @@ def path_of_bests(key, position, knobs):
         state = advance(key, ripples, state, knobs)
         return state, vars(state)
 
-    start = begin(ripples, position, knobs)
+    start = evaluated_start(ripples, position, knobs)
     _, states = jax.lax.scan(one, start, jax.random.split(key, 25))
     return {name: jnp.concatenate([vars(start)[name][None], rest]) for name, rest in states.items()}
 
@@ -171,7 +171,7 @@ def test_invariants_hold_for_any_settings(seed, inertia, cognitive, social, max_
     knobs = params(
         3, 2, inertia=inertia, cognitive=cognitive, social=social, max_step=max_step, low=-3.0, high=2.0
     )
-    states = path_of_bests(jax.random.key(seed), spread(7, 3, 2, seed), knobs)
+    states = path_of_bests(jax.random.key(seed), random_positions(7, 3, 2, seed), knobs)
     states = SimpleNamespace(**jax.tree.map(np.asarray, states))
     assert (np.diff(np.nan_to_num(states.pbest_fitness, neginf=-1e9), axis=0) >= 0).all()
     assert (np.diff(np.nan_to_num(states.gbest_fitness, neginf=-1e9), axis=0) >= 0).all()
@@ -205,7 +205,7 @@ def test_a_single_defined_particle_leads():
 
 
 def test_undefined_everywhere_stays_undefined_and_finite():
-    final = run(jax.random.key(0), undefined, spread(7, 2, 3), params(2, 3), 10)
+    final = run(jax.random.key(0), undefined_everywhere, random_positions(7, 2, 3), params(2, 3), 10)
     assert np.isneginf(final.gbest_fitness).all()
     assert np.isneginf(final.pbest_fitness).all()
     assert np.isfinite(final.gbest_position).all()
@@ -228,7 +228,7 @@ def test_an_undefined_start_recovers():
 
 
 def test_particles_outside_the_bounds_are_moved_to_the_bounds():
-    start = init(sphere, spread(20, 2, 3, scale=50.0), params(2, 3, low=-1.0, high=2.0))
+    start = init(sphere, random_positions(20, 2, 3, scale=50.0), params(2, 3, low=-1.0, high=2.0))
     assert start.position.min() == -1
     assert start.position.max() == 2
     np.testing.assert_array_equal(start.pbest_position, start.position)
@@ -246,20 +246,30 @@ def test_a_particle_does_not_stick_to_a_bound():
     final = run(jax.random.key(1), sphere, jnp.ones((10, 1, 2)), params(low=-1.0, high=1.0), 100)
     # Otherwise the best, which lies inside, attracts the particles at the bound.
     np.testing.assert_allclose(final.gbest_position, 1)
-    final = run(jax.random.key(1), sphere, spread(10, 1, 2, scale=1.0) + 0.9, params(low=-1.0, high=1.0), 100)
+    final = run(
+        jax.random.key(1),
+        sphere,
+        random_positions(10, 1, 2, scale=1.0) + 0.9,
+        params(low=-1.0, high=1.0),
+        100,
+    )
     np.testing.assert_allclose(final.gbest_position, 0, atol=1e-2)
 
 
 def test_a_maximum_on_the_bound_is_reached():
     final = run(
-        jax.random.key(0), lambda x: x.sum(axis=-1), spread(20, 2, 3), params(2, 3, low=-7.0, high=7.0), 60
+        jax.random.key(0),
+        lambda x: x.sum(axis=-1),
+        random_positions(20, 2, 3),
+        params(2, 3, low=-7.0, high=7.0),
+        60,
     )
     np.testing.assert_allclose(final.gbest_position, 7)
 
 
 def test_the_same_key_gives_the_same_result_and_another_key_another_result():
     def search(seed):
-        return run(jax.random.key(seed), rosenbrock, spread(10, 2, 2), params(2), 20)
+        return run(jax.random.key(seed), rosenbrock, random_positions(10, 2, 2), params(2), 20)
 
     first, second, other = search(3), search(3), search(4)
     assert_same(first, second)
@@ -267,7 +277,7 @@ def test_the_same_key_gives_the_same_result_and_another_key_another_result():
 
 
 def test_without_jit_the_result_is_the_same():
-    position, knobs = spread(5, 2, 2), params(2)
+    position, knobs = random_positions(5, 2, 2), params(2)
     compiled = init(sphere, position, knobs)
     plain = compiled
     for i in range(2):
@@ -286,7 +296,7 @@ def test_groups_do_not_interact():
 
     @jax.jit
     def search(weight):
-        start = spread(9, 3, 2)
+        start = random_positions(9, 3, 2)
         return swarm.run(
             jax.random.key(0), lambda position: objective(position, weight), start, params(3), 30
         )
@@ -304,14 +314,18 @@ def test_groups_do_not_interact():
 def test_groups_find_maxima_of_their_own():
     targets = jnp.array([[1.0, -2.0], [3.0, 0.5], [-4.0, 4.0]])
     final = run(
-        jax.random.key(0), lambda x: -jnp.square(x - targets).sum(axis=-1), spread(30, 3, 2), params(3), 120
+        jax.random.key(0),
+        lambda x: -jnp.square(x - targets).sum(axis=-1),
+        random_positions(30, 3, 2),
+        params(3),
+        120,
     )
     np.testing.assert_allclose(final.gbest_position, targets, atol=1e-3)
 
 
 def test_run_is_init_steps_and_a_last_evaluation():
     """With 0 iterations, the result is the evaluated start; more iterations continue the same path."""
-    position, knobs, key = spread(6, 2, 2), params(2), jax.random.key(0)
+    position, knobs, key = random_positions(6, 2, 2), params(2), jax.random.key(0)
     assert_same(run(key, sphere, position, knobs, 0), init(sphere, position, knobs))
     state = swarm.init(position, knobs)
     for i in range(3):
@@ -353,10 +367,13 @@ def test_other_settings_and_numbers_of_iterations_need_no_compilation():
         return sphere(position)
 
     compiled = jax.jit(lambda key, position, knobs, n: swarm.run(key, counted, position, knobs, n))
-    compiled(jax.random.key(0), spread(6, 2, 2), params(2), jnp.int32(3))
+    compiled(jax.random.key(0), random_positions(6, 2, 2), params(2), jnp.int32(3))
     once = traces
     compiled(
-        jax.random.key(1), spread(6, 2, 2, 1), params(2, inertia=0.3, low=-1.0, max_step=0.1), jnp.int32(50)
+        jax.random.key(1),
+        random_positions(6, 2, 2, 1),
+        params(2, inertia=0.3, low=-1.0, max_step=0.1),
+        jnp.int32(50),
     )
     assert traces == once
     # The function is traced for the start and for the body of the loop, for any number of iterations.

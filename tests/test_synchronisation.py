@@ -26,7 +26,7 @@ from psotrack.trajectories import UNASSIGNED, Trajectories, write_trajectories
 FPS = 25.0
 
 
-def drifting(number: int = 0, speed_m_s: float = 1.0):
+def random_motion(number: int = 0, speed_m_s: float = 1.0):
     """A function of times (...,) that returns positions (..., 3); the motion never repeats and has about this speed."""
     rng = np.random.default_rng(number)
     rate, phase = rng.uniform(0.4, 1.6, (4, 3)), rng.uniform(0, 2 * np.pi, (4, 3))
@@ -39,7 +39,7 @@ def drifting(number: int = 0, speed_m_s: float = 1.0):
     return position_m
 
 
-def estimate_of(*paths, seconds=12.0, start_s=3.0, offset_s=0.0, noise_m=0.0, fps=FPS, seed=0):
+def simulate_estimate(*paths, seconds=12.0, start_s=3.0, offset_s=0.0, noise_m=0.0, fps=FPS, seed=0):
     """Tracks of drones whose true positions are `path(t)` by the reference's clock.
 
     The reference's clock is `offset_s` ahead of the clock of the tracks.
@@ -50,7 +50,7 @@ def estimate_of(*paths, seconds=12.0, start_s=3.0, offset_s=0.0, noise_m=0.0, fp
     return Trajectories(np.arange(len(time_s)), time_s, tuple(map(str, range(len(paths)))), position_m)
 
 
-def correlated(rng, shape, correlation):
+def correlated_noise(rng, shape, correlation):
     """Noise of standard deviation 1 from a first-order autoregression along the first axis."""
     noise = rng.normal(size=shape)
     for row in range(1, len(noise)):
@@ -64,14 +64,14 @@ def headings(paths, time_s):
     return np.arctan2(step_m[..., 1], step_m[..., 0])
 
 
-def turned(yaw_rad, offset_m):
+def turn_offsets(yaw_rad, offset_m):
     """Offsets (drones, 3) in the drones' axes, turned about the vertical by the yaw angles: (frames, drones, 3)."""
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
     x, y, z = offset_m.T
     return np.stack([cos * x - sin * y, sin * x + cos * y, z + 0 * cos], axis=-1)
 
 
-def reference_of(*paths, rate_hz=100.0, seconds=18.0):
+def simulate_reference(*paths, rate_hz=100.0, seconds=18.0):
     time_s = np.arange(int(seconds * rate_hz)) / rate_hz
     return time_s, np.stack([path(time_s) for path in paths], axis=1)
 
@@ -81,9 +81,11 @@ class TestFindOffset:
     @pytest.mark.parametrize("fps", [25.0, 29.97])
     @pytest.mark.parametrize("offset_s", [0.7123, -0.4317])
     def test_shifted_copies(self, rate_hz, fps, offset_s):
-        estimate = estimate_of(drifting(0), drifting(1), offset_s=offset_s, fps=fps)
+        estimate = simulate_estimate(random_motion(0), random_motion(1), offset_s=offset_s, fps=fps)
         found = find_offset(
-            estimate, *reference_of(drifting(0), drifting(1), rate_hz=rate_hz), max_offset_s=1.0
+            estimate,
+            *simulate_reference(random_motion(0), random_motion(1), rate_hz=rate_hz),
+            max_offset_s=1.0,
         )
         # Splines at 25 Hz of motion of at most 1.6 rad/s have an error of (h w)⁴ / 384, 4e-8 m. Measured 3e-6 s.
         assert found.offset_s == pytest.approx(offset_s, abs=2e-5)
@@ -108,7 +110,7 @@ class TestFindOffset:
             return lambda t: flight.position_m(t) + flight.rotation(t) @ arm_m
 
         paths = [tracked_m(*item) for item in zip(flights, arm_m, strict=True)]
-        estimate = estimate_of(*paths, seconds=7.5, start_s=0.7, offset_s=offset_s, noise_m=0.02)
+        estimate = simulate_estimate(*paths, seconds=7.5, start_s=0.7, offset_s=offset_s, noise_m=0.02)
         found = find_offset(
             estimate,
             time_s,
@@ -132,19 +134,21 @@ class TestFindOffset:
         normalised, spread = [], []
         for seed in range(40):
             rng = np.random.default_rng(seed)
-            paths = [drifting(3 * seed + number) for number in range(2)]
-            estimate = estimate_of(*paths, seconds=10, offset_s=0.3)
+            paths = [random_motion(3 * seed + number) for number in range(2)]
+            estimate = simulate_estimate(*paths, seconds=10, offset_s=0.3)
             shape = estimate.position_m.shape
             if errors == "independent":
                 error_m = 0.02 * rng.normal(size=shape)
             elif errors == "correlated":
-                error_m = 0.02 * correlated(rng, shape, 0.95)
+                error_m = 0.02 * correlated_noise(rng, shape, 0.95)
             else:
                 # The tracked point is beside the reference's point and turns with the drone.
                 yaw_rad = rng.uniform(0.4, 1.2, 2) * estimate.time_s[:, None]
-                error_m = turned(yaw_rad, 0.02 * rng.normal(size=(2, 3))) + 0.005 * rng.normal(size=shape)
+                error_m = turn_offsets(yaw_rad, 0.02 * rng.normal(size=(2, 3))) + 0.005 * rng.normal(
+                    size=shape
+                )
             estimate = replace(estimate, position_m=estimate.position_m + error_m)
-            found = find_offset(estimate, *reference_of(*paths), max_offset_s=0.5)
+            found = find_offset(estimate, *simulate_reference(*paths), max_offset_s=0.5)
             normalised.append((found.offset_s - 0.3) / found.std_s)
             spread.append((found.offset_s - 0.3, found.std_s))
         assert np.mean(np.abs(normalised) < 2) >= 0.85
@@ -160,8 +164,8 @@ class TestFindOffset:
             time_s = np.asarray(time_s)
             return np.stack([time_s + 0.5 * np.sin(1.3 * time_s), 0 * time_s, 1 + 0 * time_s], axis=-1)
 
-        estimate = estimate_of(lambda t: ahead(t) + np.array([0.12, 0, 0]), offset_s=0.2)
-        reference = reference_of(ahead)
+        estimate = simulate_estimate(lambda t: ahead(t) + np.array([0.12, 0, 0]), offset_s=0.2)
+        reference = simulate_reference(ahead)
         found = find_offset(estimate, *reference, max_offset_s=0.5)
         assert found.offset_s == pytest.approx(0.2, abs=1e-4)
         np.testing.assert_allclose(found.lever_arm_m, [[0.12, 0, 0]], atol=1e-4)
@@ -170,10 +174,10 @@ class TestFindOffset:
         assert (without.lever_arm_m == 0).all()
 
     def test_drones_in_another_order_with_a_false_track_and_a_missing_drone(self):
-        paths = [drifting(number) for number in range(3)]
-        false = [lambda t: drifting(7)(t) - [0, 9, 0]]
-        estimate = estimate_of(paths[2], *false, paths[0], offset_s=0.25, noise_m=0.01)
-        found = find_offset(estimate, *reference_of(*paths), max_offset_s=0.5)
+        paths = [random_motion(number) for number in range(3)]
+        false = [lambda t: random_motion(7)(t) - [0, 9, 0]]
+        estimate = simulate_estimate(paths[2], *false, paths[0], offset_s=0.25, noise_m=0.01)
+        found = find_offset(estimate, *simulate_reference(*paths), max_offset_s=0.5)
         assert found.offset_s == pytest.approx(0.25, abs=4e-3)
         assert found.partner.tolist() == [2, UNASSIGNED, 0]
         assert np.isnan(found.lever_arm_m[1]).all()
@@ -181,18 +185,20 @@ class TestFindOffset:
 
     def test_an_identity_swap_has_little_effect(self):
         """The cost is a sum of distances, not of squares, so a sixth of the frames with the wrong drone is outvoted."""
-        estimate = estimate_of(drifting(0), drifting(1), offset_s=0.25, noise_m=0.01)
+        estimate = simulate_estimate(random_motion(0), random_motion(1), offset_s=0.25, noise_m=0.01)
         estimate.position_m[250:] = estimate.position_m[250:, ::-1]
-        found = find_offset(estimate, *reference_of(drifting(0), drifting(1)), max_offset_s=0.5)
+        found = find_offset(
+            estimate, *simulate_reference(random_motion(0), random_motion(1)), max_offset_s=0.5
+        )
         assert found.offset_s == pytest.approx(0.25, abs=0.1 / FPS)
 
     @pytest.mark.parametrize(("gap_s", "bridged"), [(0.08, True), (0.5, False)])
     def test_long_gaps_are_not_bridged(self, gap_s, bridged):
         """Within the reference's gap, the estimate is 5 m off: the distance is large only if the gap is compared."""
-        time_s, position_m = reference_of(drifting(0))
+        time_s, position_m = simulate_reference(random_motion(0))
         gap = (time_s > 8) & (time_s < 8 + gap_s)
         position_m[gap] = np.nan
-        estimate = estimate_of(drifting(0), offset_s=0.25, noise_m=0.01)
+        estimate = simulate_estimate(random_motion(0), offset_s=0.25, noise_m=0.01)
         inside = (estimate.time_s + 0.25 > 8 + 1e-9) & (estimate.time_s + 0.25 < 8 + gap_s - 1e-9)
         estimate.position_m[inside] += 5.0
         found = find_offset(estimate, time_s, position_m, max_offset_s=0.5)
@@ -203,8 +209,10 @@ class TestFindOffset:
     @given(st.integers(0, 2**32 - 1), st.floats(-100, 100), st.floats(0, 6.3))
     @settings(max_examples=6)
     def test_the_origins_of_clock_and_world_do_not_matter(self, seed, later_s, turn):
-        estimate = estimate_of(drifting(0), drifting(1), offset_s=0.2, noise_m=0.02, seed=seed, seconds=6)
-        time_s, position_m = reference_of(drifting(0), drifting(1), rate_hz=50, seconds=10)
+        estimate = simulate_estimate(
+            random_motion(0), random_motion(1), offset_s=0.2, noise_m=0.02, seed=seed, seconds=6
+        )
+        time_s, position_m = simulate_reference(random_motion(0), random_motion(1), rate_hz=50, seconds=10)
         first = find_offset(estimate, time_s, position_m, max_offset_s=0.4)
         R = Rotation.from_euler("Z", turn).as_matrix()
         moved = replace(
@@ -218,13 +226,13 @@ class TestFindOffset:
 
 class TestRefusedInput:
     def refused(self, path, text, *, max_offset_s=1.0, offset_s=0.2, **others):
-        estimate = estimate_of(path, offset_s=offset_s, noise_m=0.02, **others)
+        estimate = simulate_estimate(path, offset_s=offset_s, noise_m=0.02, **others)
         with pytest.raises(InputError, match=text):
-            find_offset(estimate, *reference_of(path), max_offset_s=max_offset_s)
+            find_offset(estimate, *simulate_reference(path), max_offset_s=max_offset_s)
 
     def test_drones_that_move_only_a_little(self):
         self.refused(
-            drifting(0, 0.01), "motion that tells the offset to a frame, 0.04 s, found a standard dev"
+            random_motion(0, 0.01), "motion that tells the offset to a frame, 0.04 s, found a standard dev"
         )
 
     def test_a_drone_that_hovers_or_flies_straight_on(self):
@@ -244,20 +252,26 @@ class TestRefusedInput:
             "one offset that fits best, found both .* repeats: narrow the range",
             max_offset_s=1.2,
         )
-        estimate = estimate_of(circle, offset_s=0.2, noise_m=0.02)
-        found = find_offset(estimate, *reference_of(circle), max_offset_s=0.35)
+        estimate = simulate_estimate(circle, offset_s=0.2, noise_m=0.02)
+        found = find_offset(estimate, *simulate_reference(circle), max_offset_s=0.35)
         assert found.offset_s == pytest.approx(0.2, abs=2e-3)
 
     def test_an_offset_outside_of_the_range(self):
         self.refused(
-            drifting(0), r"within 0.3 s, found it at an end, \+0.3 s; widen", max_offset_s=0.3, offset_s=0.9
+            random_motion(0),
+            r"within 0.3 s, found it at an end, \+0.3 s; widen",
+            max_offset_s=0.3,
+            offset_s=0.9,
         )
 
     def test_no_common_time(self):
-        self.refused(drifting(0), "positions of both at offsets within 1 s, found none", start_s=60.0)
+        self.refused(random_motion(0), "positions of both at offsets within 1 s, found none", start_s=60.0)
 
     def test_invalid_arguments_are_refused(self):
-        estimate, (time_s, position_m) = estimate_of(drifting(0)), reference_of(drifting(0))
+        estimate, (time_s, position_m) = (
+            simulate_estimate(random_motion(0)),
+            simulate_reference(random_motion(0)),
+        )
         with pytest.raises(SettingsError, match=r"max_offset_s: expected a step of the reference, 0.01 s"):
             find_offset(estimate, time_s, position_m, max_offset_s=0.001)
         with pytest.raises(InputError, match="reference at two increasing times"):
@@ -306,7 +320,7 @@ def detected_points(rig, paths, offsets_frames, *, num_frames=300, **errors):
 
 
 def path_near_origin(number, speed_m_s=1.0):
-    path = drifting(number, speed_m_s)
+    path = random_motion(number, speed_m_s)
     return lambda time_s: path(time_s) - [3.0 * number, 0, 0.3]
 
 
@@ -345,7 +359,7 @@ class TestCameraOffsets:
             paths = [path_near_origin(3 * seed + number) for number in range(2)]
             points_px = detected_points(RIG, paths, offset_frames, num_frames=90, noise_px=0.5, seed=seed)
             if errors == "correlated":
-                points_px += 1.5 * correlated(rng, points_px.shape, 0.9)
+                points_px += 1.5 * correlated_noise(rng, points_px.shape, 0.9)
             elif errors == "turning":
                 # The middle of a box is off by 3 px in the image, in a direction that turns with the drone.
                 heading_rad = headings(paths, np.arange(90) / FPS)
@@ -424,13 +438,15 @@ def recording(tmp_path_factory):
     with VideoWriter(folder / "0.avi", FPS, (64, 48)) as writer:
         for _ in range(150):
             writer.write(np.zeros((48, 64, 3), np.uint8))
-    time_s, position_m = reference_of(drifting(0), drifting(1), seconds=8)
+    time_s, position_m = simulate_reference(random_motion(0), random_motion(1), seconds=8)
     cross_m = np.array([[0.1, 0, 0], [0, 0.13, 0], [-0.16, 0, 0], [0, -0.19, 0]])
     cross_m -= cross_m.mean(axis=0)
     labels = tuple(f"Dron{drone}:Dron{drone}{marker}" for drone in (1, 2) for marker in (1, 2, 3, 4))
     markers_m = (position_m[:, :, None] + cross_m).reshape(len(time_s), 8, 3)
     write_c3d(folder / "R12_D2.c3d", Markers(labels, markers_m, 100.0))
-    estimate = estimate_of(drifting(0), drifting(1), seconds=6, start_s=0.4321, offset_s=0.4321, noise_m=0.01)
+    estimate = simulate_estimate(
+        random_motion(0), random_motion(1), seconds=6, start_s=0.4321, offset_s=0.4321, noise_m=0.01
+    )
     tracks = folder.parent.parent / "tracks.csv"
     write_trajectories(tracks, estimate)
     return folder, tracks

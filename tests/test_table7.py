@@ -63,7 +63,7 @@ def flight() -> tuple[np.ndarray, Rotation]:
     return position_m, Rotation.from_euler("ZYX", angles)
 
 
-def drawn(one, corners_m) -> np.ndarray:
+def draw_image(one, corners_m) -> np.ndarray:
     """The image of the markers in a camera, drawn at twice the size and then averaged."""
     picture = np.full((2 * SIZE_WH[1], 2 * SIZE_WH[0], 3), 150, np.uint8)
     dictionary = marker_dictionary("4x4_1000")
@@ -115,7 +115,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ):
         for centre_m, R_cam_world in zip(camera_m, turns.inv().as_matrix(), strict=True):
             one = make_camera(R=R_cam_world, t_m=-R_cam_world @ centre_m, K=K, image_size_wh=SIZE_WH)
-            video.write(drawn(one, corners_m))
+            video.write(draw_image(one, corners_m))
             still.write(np.zeros((48, 64, 3), np.uint8))
     return root
 

@@ -44,13 +44,15 @@ def path(position_m, velocity_m_s=(0.0, 0.0, 0.0), acceleration_m_s2=(0.0, 0.0, 
     return np.asarray(position_m) + np.asarray(velocity_m_s) * TIME_S + bend
 
 
-def drawn(*paths_m, size_m=SIZE_M, rig=RIG):
+def draw_silhouettes(*paths_m, size_m=SIZE_M, rig=RIG):
     """Silhouettes of drones on paths: (frames, cameras, height, width)."""
     sizes = np.broadcast_to(np.array(size_m, float), (len(paths_m), 3))
-    return np.maximum.reduce([drawn_alone(one, size, rig) for one, size in zip(paths_m, sizes, strict=True)])
+    return np.maximum.reduce(
+        [draw_one_drone(one, size, rig) for one, size in zip(paths_m, sizes, strict=True)]
+    )
 
 
-def drawn_alone(path_m, size_m, rig):
+def draw_one_drone(path_m, size_m, rig):
     """Silhouettes of one drone, kept in a dictionary because ray casting is slow and tests share paths."""
     key = (path_m.tobytes(), size_m.tobytes(), len(rig))
     if key not in _DRAWN:
@@ -86,33 +88,33 @@ OTHER = path((-0.7, 0.6, 0.9), (0.0, -1.0, 0.2), (1.0, 0.5, 0.0))
 
 
 @pytest.fixture(scope="module")
-def both():
-    images = drawn(ONE, OTHER)
+def two_drones():
+    images = draw_silhouettes(ONE, OTHER)
     images.flags.writeable = False
     return images
 
 
-def without(coverage, frames=slice(None), cameras=slice(None)):
+def blank(coverage, frames=slice(None), cameras=slice(None)):
     """The silhouettes, empty in some frames and cameras."""
     coverage = coverage.copy()
     coverage[frames, cameras] = 0
     return coverage
 
 
-def test_known_drones_explain_all_foreground(both):
-    assert candidates_in(both, ONE, OTHER) == ()
+def test_known_drones_explain_all_foreground(two_drones):
+    assert candidates_in(two_drones, ONE, OTHER) == ()
 
 
-def test_an_unknown_drone_is_found(both):
-    (found,) = candidates_in(both, ONE)
+def test_an_unknown_drone_is_found(two_drones):
+    (found,) = candidates_in(two_drones, ONE)
     assert found.frame == 0
     # Each of six views gives a blob's middle to a fraction of a cell, and the position in the first of ten frames is as
-    # good as that of a single frame. Limit one cell.
+    # accurate as a position from a single frame. Limit one cell.
     np.testing.assert_allclose(found.position_m, OTHER[0], atol=CELL_M)
-    # At the end of a parabola through ten places, the standard error of the speed is 0.44 times that of a place per
-    # frame; 3 mm give 0.03 m/s. Measured 0.07, limit 0.3.
+    # At the end of a parabola through ten positions, the standard error of the speed is 0.44 times the error of a
+    # position per frame; 3 mm give 0.03 m/s. Measured 0.07, limit 0.3.
     np.testing.assert_allclose(found.velocity_m_s, (0.0, -1.0, 0.2), atol=0.3)
-    # As in the tests of initialisation: at most half a cell too large at each end, and twice as much for the height.
+    # As in the tests of initialisation, sizes are at most half a cell too large at each end, heights a whole cell.
     np.testing.assert_allclose(found.size_m[:2], SIZE_M[:2], atol=1.5 * CELL_M)
     np.testing.assert_allclose(found.size_m[2], SIZE_M[2], atol=3 * CELL_M)
     # One of six cameras has the drone at its image's border.
@@ -120,20 +122,20 @@ def test_an_unknown_drone_is_found(both):
     assert found.moves
 
 
-def test_without_known_drones_all_drones_are_found(both):
-    found = candidates_in(both)
+def test_without_known_drones_all_drones_are_found(two_drones):
+    found = candidates_in(two_drones)
     assert len(found) == 2
     first = np.array([one.position_m for one in found])
     for truth in (ONE, OTHER):
         assert np.linalg.norm(first - truth[0], axis=-1).min() < CELL_M
 
 
-def test_a_drone_that_explains_nothing_hides_no_candidate(both):
+def test_a_drone_that_explains_nothing_hides_no_candidate(two_drones):
     """Known drones whose positions are marked as too uncertain: both drones are found."""
     known = np.stack([ONE, OTHER], axis=1)
     found = find_candidates(
         RIG.cameras,
-        both,
+        two_drones,
         KnownDrones(known, np.zeros(known.shape[:2], bool), np.stack([SIZE_M, SIZE_M])),
         reduction=REDUCTION,
         fps=FPS,
@@ -144,10 +146,10 @@ def test_a_drone_that_explains_nothing_hides_no_candidate(both):
 
 
 @pytest.mark.parametrize("first", [3, 9, 15])
-def test_the_first_frame_of_a_candidate(both, first):
+def test_the_first_frame_of_a_candidate(two_drones, first):
     """Also where the frame that is searched (0, 8, 16, 24) comes after the drone's first frame."""
-    coverage = without(drawn(OTHER), slice(first))
-    (found,) = candidates_in(np.maximum(coverage, drawn(ONE)), ONE)
+    coverage = blank(draw_silhouettes(OTHER), slice(first))
+    (found,) = candidates_in(np.maximum(coverage, draw_silhouettes(ONE)), ONE)
     assert found.frame == first
     np.testing.assert_allclose(found.position_m, OTHER[first], atol=CELL_M)
 
@@ -157,62 +159,69 @@ def test_a_candidate_must_persist(frames, count):
     """Eight of ten frames are needed; the last nine frames of a chunk are searched with the next chunk."""
     gone = np.ones(NUM_FRAMES, bool)
     gone[list(frames)] = False
-    assert len(candidates_in(without(drawn(OTHER), gone))) == count
+    assert len(candidates_in(blank(draw_silhouettes(OTHER), gone))) == count
 
 
 def test_a_drone_that_flickers_is_one_drone():
-    (found,) = candidates_in(without(drawn(OTHER), [5, 11, 12, 19]))
+    (found,) = candidates_in(blank(draw_silhouettes(OTHER), [5, 11, 12, 19]))
     assert found.frame == 0
 
 
 @pytest.mark.parametrize("hidden", [slice(10, 14), slice(8, 15), slice(10, 25)])
 def test_a_drone_that_is_hidden_for_a_while_is_one_candidate(hidden):
     """The candidate begins at the drone's first frame; the tracker finds the drone again after the gap."""
-    (found,) = candidates_in(without(drawn(OTHER), hidden))
+    (found,) = candidates_in(blank(draw_silhouettes(OTHER), hidden))
     assert found.frame == 0
 
 
 def test_a_candidate_is_no_faster_than_a_drone():
-    assert candidates_in(drawn(path((-1.5, 0.0, 1.5), (1.1 * MAX_SPEED_M_S, 0.0, 0.0)))) == ()
-    assert len(candidates_in(drawn(path((-1.5, 0.0, 1.5), (0.9 * MAX_SPEED_M_S, 0.0, 0.0))))) == 1
+    assert candidates_in(draw_silhouettes(path((-1.5, 0.0, 1.5), (1.1 * MAX_SPEED_M_S, 0.0, 0.0)))) == ()
+    assert len(candidates_in(draw_silhouettes(path((-1.5, 0.0, 1.5), (0.9 * MAX_SPEED_M_S, 0.0, 0.0))))) == 1
 
 
 def test_shadows_and_reflections_are_no_candidates():
     """Both look the same in all views and move like drones; shadows are flat on the floor, reflections below it."""
     shadow, reflection = ONE * (1, 1, 0), ONE * (1, 1, -1)
-    assert candidates_in(drawn(ONE, shadow, reflection, size_m=[SIZE_M, [0.5, 0.5, 0.02], SIZE_M]), ONE) == ()
+    assert (
+        candidates_in(
+            draw_silhouettes(ONE, shadow, reflection, size_m=[SIZE_M, [0.5, 0.5, 0.02], SIZE_M]), ONE
+        )
+        == ()
+    )
 
 
 @pytest.mark.parametrize(("scale", "count"), [(0.35, 0), (0.8, 1), (1.4, 1), (2.8, 0)])
-def test_a_candidate_has_a_drones_size(both, scale, count):
-    coverage = drawn(ONE, OTHER, size_m=[SIZE_M, scale * SIZE_M])
+def test_a_candidate_has_a_drones_size(two_drones, scale, count):
+    coverage = draw_silhouettes(ONE, OTHER, size_m=[SIZE_M, scale * SIZE_M])
     assert len(candidates_in(coverage, ONE)) == count
 
 
 @pytest.mark.parametrize("off_m", [(0.08, 0.0, 0.0), (0.0, -0.06, 0.06), (0.0, 0.0, -0.1)])
-def test_the_rim_of_a_known_drone_is_no_candidate(both, off_m):
+def test_the_rim_of_a_known_drone_is_no_candidate(two_drones, off_m):
     """If the track is wrong by a fifth of the drone's size, and the size by a fifth too, all views show a rim."""
-    assert candidates_in(both, ONE + off_m, OTHER, size_m=0.8 * SIZE_M) == ()
+    assert candidates_in(two_drones, ONE + off_m, OTHER, size_m=0.8 * SIZE_M) == ()
 
 
 def test_three_viewpoints_are_enough_and_two_are_not():
     """A third camera beside the second one adds no viewpoint."""
     three = ring_rig(3, image_size_wh=IMAGE_WH)
-    (found,) = candidates_in(drawn(OTHER, rig=three), rig=three)
+    (found,) = candidates_in(draw_silhouettes(OTHER, rig=three), rig=three)
     np.testing.assert_allclose(found.position_m, OTHER[0], atol=CELL_M)
     assert found.num_cameras == 3
     first, second = three.cameras[0], three.cameras[1]
     T = second.T_cam_world.copy()
     T[0, 3] += 0.1
     twin = make_unnamed_rig(first, second, replace(second, T_cam_world=T))
-    images = np.concatenate([drawn(OTHER, rig=three)[:, :2], drawn(OTHER, rig=three)[:, 1:2]], axis=1)
+    images = np.concatenate(
+        [draw_silhouettes(OTHER, rig=three)[:, :2], draw_silhouettes(OTHER, rig=three)[:, 1:2]], axis=1
+    )
     assert candidates_in(images, rig=twin) == ()
 
 
 @pytest.mark.parametrize(("blind", "count"), [([4], 1), ([1, 4], 0)])
 def test_nearly_all_cameras_must_see_a_candidate(blind, count):
     """An obstacle may hide the drone from one camera of six; if two cameras see nothing, there is no drone."""
-    assert len(candidates_in(without(drawn(OTHER), cameras=blind))) == count
+    assert len(candidates_in(blank(draw_silhouettes(OTHER), cameras=blind))) == count
 
 
 def test_crossing_rays_of_different_drones_are_no_candidate():
@@ -222,7 +231,7 @@ def test_crossing_rays_of_different_drones_are_no_candidate():
     for camera, distance in ((0, 0.9), (2, 1.1), (4, 1.0)):
         ray = place - RIG.cameras.centre_world[camera]
         behind.append(path(place + distance * ray / np.linalg.norm(ray)))
-    coverage = drawn(*behind)
+    coverage = draw_silhouettes(*behind)
     seen = [coverage[0, camera, *_cell(place, camera)] > 0 for camera in range(6)]
     assert sum(seen) >= 3
     places = [one.position_m for one in candidates_in(coverage)]
@@ -241,7 +250,7 @@ def test_a_drone_that_a_known_drone_half_hides():
     before = OTHER[0] - 1.2 * ray / np.linalg.norm(ray) + (0.0, 0.0, 0.3)
     known = path(before)
     other = path(OTHER[0], (0.2, 0.0, 0.0))
-    (found,) = candidates_in(drawn(known, other), known)
+    (found,) = candidates_in(draw_silhouettes(known, other), known)
     np.testing.assert_allclose(found.position_m, other[0], atol=CELL_M)
 
 
@@ -249,7 +258,9 @@ def test_a_flat_drone_that_sinks_fast_is_found():
     """The drone moves by more than its height from frame to frame, so its first ellipse does not cover the next one."""
     size_m = np.array([0.5, 0.5, 0.12])
     known, sinking = path((-0.6, 0.6, 0.9)), path((0.6, -0.5, 2.9), (0.0, 0.0, -2.8))[:15]
-    silhouettes = np.maximum(drawn(known, size_m=size_m)[:15], drawn(sinking, size_m=size_m))
+    silhouettes = np.maximum(
+        draw_silhouettes(known, size_m=size_m)[:15], draw_silhouettes(sinking, size_m=size_m)
+    )
     (found,) = candidates_in(silhouettes, known, size_m=size_m)
     np.testing.assert_allclose(found.position_m, sinking[found.frame], atol=2 * CELL_M)
     assert found.moves
@@ -258,7 +269,7 @@ def test_a_flat_drone_that_sinks_fast_is_found():
 def test_a_candidate_that_stands_still_is_marked():
     """A ghost looks like a drone that does not move; only the missing motion shows the difference."""
     ghost, drone = path((0.6, -0.5, 1.5)), OTHER
-    found = sorted(candidates_in(drawn(ghost, drone)), key=lambda one: one.position_m[0])
+    found = sorted(candidates_in(draw_silhouettes(ghost, drone)), key=lambda one: one.position_m[0])
     assert [one.moves for one in found] == [True, False]
 
 
@@ -280,9 +291,9 @@ def test_known_drones_explain_their_enlarged_ellipse():
     np.testing.assert_array_equal(residual.visible, residual.foreground == 255)
 
 
-def test_a_short_chunk_has_no_candidates(both):
-    assert candidates_in(both[:9], ONE[:9]) == ()
-    assert len(candidates_in(both[:10], ONE[:10])) == 1
+def test_a_short_chunk_has_no_candidates(two_drones):
+    assert candidates_in(two_drones[:9], ONE[:9]) == ()
+    assert len(candidates_in(two_drones[:10], ONE[:10])) == 1
 
 
 def test_a_drone_departs_that_the_background_model_has_learned():
@@ -293,8 +304,8 @@ def test_a_drone_departs_that_the_background_model_has_learned():
     rig, standing = ring_rig(4, image_size_wh=IMAGE_WH), 60
     place = np.array([0.1, -0.2, 1.2])
     flight = path(place, (1.2, 0.9, 0.2))
-    away = drawn_alone(flight, SIZE_M, rig)
-    before = np.broadcast_to(drawn_alone(path(place), SIZE_M, rig)[0], (standing, *away.shape[1:]))
+    away = draw_one_drone(flight, SIZE_M, rig)
+    before = np.broadcast_to(draw_one_drone(path(place), SIZE_M, rig)[0], (standing, *away.shape[1:]))
     rng = np.random.default_rng(0)
     settings = ForegroundSettings(working_reduction=1, min_blob_px=8)
     masks = []
@@ -319,7 +330,7 @@ def test_a_drone_departs_that_the_background_model_has_learned():
     assert [one.moves for one in found] == [True]
     # In the first of ten frames the ghost is still beside the drone. Measured 3 cm, limit 6.
     np.testing.assert_allclose(found[0].position_m, flight[found[0].frame], atol=2 * CELL_M)
-    stood = lost((place, (0.0, 0.0, 0.0), 2.0))
+    stood = lost_tracks((place, (0.0, 0.0, 0.0), 2.0))
     assert assigned_drones(found, stood, max_speed_m_s=MAX_SPEED_M_S) == [0]
 
     # A second later the drone is known and the ghost has not changed.
@@ -327,7 +338,7 @@ def test_a_drone_departs_that_the_background_model_has_learned():
     found = candidates_in(ghost, np.broadcast_to(flight[-1], (NUM_FRAMES, 3)).copy(), rig=rig)
     assert [one.moves for one in found] == [False]
     np.testing.assert_allclose(found[0].position_m, place, atol=CELL_M)
-    assert assigned_drones(found, lost()) == [NO_DRONE]
+    assert assigned_drones(found, lost_tracks()) == [NO_DRONE]
 
 
 # --- re-identification
@@ -340,7 +351,7 @@ def candidate(position_m=(0.0, 0.0, 1.0), velocity_m_s=(1.0, 0.0, 0.0), *, frame
     return TrackCandidate(frame, np.array(position_m, float), np.array(velocity_m_s, float), size, 5, moves)
 
 
-def lost(*rows, left_m=()):
+def lost_tracks(*rows, left_m=()):
     """Lost drones from rows of position, velocity, seconds and an optional dictionary of `span_m` and `doubtful`."""
     full = [{"span_m": 0.5, "doubtful": False} | (row[3] if len(row) > 3 else {}) for row in rows]
     return LostTracks(
@@ -365,38 +376,38 @@ AHEAD = ((-0.5, 0.0, 1.0), (1.0, 0.0, 0.0), 0.5)
 
 
 def test_without_lost_drones_a_candidate_is_new():
-    assert assigned_drones([candidate()], lost()) == [NEW]
-    assert assigned_drones([], lost()) == []
+    assert assigned_drones([candidate()], lost_tracks()) == [NEW]
+    assert assigned_drones([], lost_tracks()) == []
 
 
 def test_the_drone_on_course_is_chosen():
     """Two drones were lost half a metre away: one flew towards the candidate's place, one away from it."""
     away = ((0.5, 0.0, 1.0), (1.0, 0.0, 0.0), 0.5)
-    assert assigned_drones([candidate()], lost(away, AHEAD)) == [1]
+    assert assigned_drones([candidate()], lost_tracks(away, AHEAD)) == [1]
 
 
 def test_each_lost_drone_is_one_candidate():
     """The first lost drone fits both candidates best, but only one candidate gets it."""
     also = ((-0.6, 0.5, 1.0), (1.0, 0.0, 0.0), 0.5)
-    assert assigned_drones([candidate(), candidate((0.0, 0.2, 1.0))], lost(AHEAD, also)) == [0, 1]
-    assert assigned_drones([candidate((0.0, 0.2, 1.0)), candidate()], lost(AHEAD, also)) == [1, 0]
-    assert sorted(assigned_drones([candidate(), candidate((0.0, 0.2, 1.0))], lost(AHEAD))) == [NEW, 0]
+    assert assigned_drones([candidate(), candidate((0.0, 0.2, 1.0))], lost_tracks(AHEAD, also)) == [0, 1]
+    assert assigned_drones([candidate((0.0, 0.2, 1.0)), candidate()], lost_tracks(AHEAD, also)) == [1, 0]
+    assert sorted(assigned_drones([candidate(), candidate((0.0, 0.2, 1.0))], lost_tracks(AHEAD))) == [NEW, 0]
 
 
 def test_a_candidate_out_of_reach_is_new_unless_new_drones_are_not_allowed():
     """At six metres per second for half a second, the reach is three metres."""
     far = ((-4.5, 0.0, 1.0), (1.0, 0.0, 0.0), 0.5)
-    assert assigned_drones([candidate()], lost(far)) == [NEW]
-    assert assigned_drones([candidate()], lost(far), max_births=0) == [0]
-    assert assigned_drones([candidate()], lost((*far[:2], 10.0))) == [0]
+    assert assigned_drones([candidate()], lost_tracks(far)) == [NEW]
+    assert assigned_drones([candidate()], lost_tracks(far), max_births=0) == [0]
+    assert assigned_drones([candidate()], lost_tracks((*far[:2], 10.0))) == [0]
 
 
 def test_after_a_long_time_the_size_decides():
     gone = ((2.0, 2.0, 1.0), (0.0, 1.0, 0.0), 20.0)
-    assert assigned_drones([candidate(span_m=0.55)], lost(gone)) == [0]
-    assert assigned_drones([candidate(span_m=1.0)], lost(gone)) == [NEW]
-    assert assigned_drones([candidate(span_m=0.9)], lost(gone, (*gone, {"span_m": 0.9}))) == [1]
-    assert assigned_drones([candidate(span_m=1.0)], lost(gone), max_births=0) == [0]
+    assert assigned_drones([candidate(span_m=0.55)], lost_tracks(gone)) == [0]
+    assert assigned_drones([candidate(span_m=1.0)], lost_tracks(gone)) == [NEW]
+    assert assigned_drones([candidate(span_m=0.9)], lost_tracks(gone, (*gone, {"span_m": 0.9}))) == [1]
+    assert assigned_drones([candidate(span_m=1.0)], lost_tracks(gone), max_births=0) == [0]
 
 
 def test_a_drone_comes_back_near_the_place_where_it_left():
@@ -407,26 +418,26 @@ def test_a_drone_comes_back_near_the_place_where_it_left():
     left = (-1.5, -2.0, 3.0), (0.0, 0.0, 2.0), 3.5
     also = (-1.5, 0.5, 3.0), (0.0, 0.0, 2.0), 5.5
     back = candidate((-0.5, -1.7, 2.8), (1.4, 0.2, -2.5), span_m=0.46)
-    assert assigned_drones([back], lost((*left, {"span_m": 0.5}), (*also, {"span_m": 0.46}))) == [0]
-    assert assigned_drones([back], lost((*also, {"span_m": 0.46}), (*left, {"span_m": 0.5}))) == [1]
+    assert assigned_drones([back], lost_tracks((*left, {"span_m": 0.5}), (*also, {"span_m": 0.46}))) == [0]
+    assert assigned_drones([back], lost_tracks((*also, {"span_m": 0.46}), (*left, {"span_m": 0.5}))) == [1]
     # Sizes that differ by a third decide.
-    assert assigned_drones([back], lost((*left, {"span_m": 0.62}), (*also, {"span_m": 0.46}))) == [1]
+    assert assigned_drones([back], lost_tracks((*left, {"span_m": 0.62}), (*also, {"span_m": 0.46}))) == [1]
 
 
 def test_the_number_of_new_drones_is_limited():
     found = [candidate(), candidate((1.0, 1.0, 1.0)), candidate((-1.0, 1.0, 1.0))]
-    assert assigned_drones(found, lost()) == [NEW] * 3
-    assert sorted(assigned_drones(found, lost(), max_births=2)) == [NO_DRONE, NEW, NEW]
-    assert assigned_drones(found, lost(), max_births=0) == [NO_DRONE] * 3
+    assert assigned_drones(found, lost_tracks()) == [NEW] * 3
+    assert sorted(assigned_drones(found, lost_tracks(), max_births=2)) == [NO_DRONE, NEW, NEW]
+    assert assigned_drones(found, lost_tracks(), max_births=0) == [NO_DRONE] * 3
 
 
 def test_a_candidate_that_does_not_move_is_never_new():
     still = candidate(velocity_m_s=(0.0, 0.0, 0.0), moves=False)
-    assert assigned_drones([still], lost()) == [NO_DRONE]
+    assert assigned_drones([still], lost_tracks()) == [NO_DRONE]
     # The lost drone may be anywhere by then, so the candidate may as well be a chair that a person has moved.
-    assert assigned_drones([still], lost(((2.0, 2.0, 1.0), (0.0, 1.0, 0.0), 20.0))) == [NO_DRONE]
+    assert assigned_drones([still], lost_tracks(((2.0, 2.0, 1.0), (0.0, 1.0, 0.0), 20.0))) == [NO_DRONE]
     # A drone that stood at the candidate's place when it was lost is assigned, after any time.
-    assert assigned_drones([still], lost(((0.0, 0.1, 1.0), (0.05, 0.0, 0.0), 20.0))) == [0]
+    assert assigned_drones([still], lost_tracks(((0.0, 0.1, 1.0), (0.05, 0.0, 0.0), 20.0))) == [0]
 
 
 def test_a_ghost_is_not_the_drone_that_departed_from_it():
@@ -434,9 +445,9 @@ def test_a_ghost_is_not_the_drone_that_departed_from_it():
     stood = ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 20.0)
     ghost = candidate((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), moves=False)
     drone = candidate((0.5, 0.0, 1.0), (1.0, 0.0, 0.0), frame=5)
-    assert assigned_drones([ghost, drone], lost(stood)) == [NO_DRONE, 0]
+    assert assigned_drones([ghost, drone], lost_tracks(stood)) == [NO_DRONE, 0]
     passing_by = candidate((0.5, 0.0, 1.0), (0.0, 1.0, 0.0), frame=5)
-    assert assigned_drones([ghost, passing_by], lost(stood)) == [0, NEW]
+    assert assigned_drones([ghost, passing_by], lost_tracks(stood)) == [0, NEW]
 
 
 def test_a_drone_that_stood_still_when_it_was_lost_has_stayed():
@@ -447,11 +458,11 @@ def test_a_drone_that_stood_still_when_it_was_lost_has_stayed():
     coming = candidate((0.0, -2.7, 2.7), (0.0, 0.0, -2.0))
     stood = ((0.0, 0.3, 1.5), (0.0, 0.0, 0.0), 2.6)
     flew = ((0.0, 0.3, 1.5), (0.0, 0.0, 2.0), 2.6)
-    assert assigned_drones([coming], lost(stood)) == [NEW]
-    assert assigned_drones([coming], lost(flew)) == [0]
+    assert assigned_drones([coming], lost_tracks(stood)) == [NEW]
+    assert assigned_drones([coming], lost_tracks(flew)) == [0]
     # If no drone can be new, it is the drone that stood still; of two lost drones, it is the one that flew.
-    assert assigned_drones([coming], lost(stood), max_births=0) == [0]
-    assert assigned_drones([coming], lost(stood, flew)) == [1]
+    assert assigned_drones([coming], lost_tracks(stood), max_births=0) == [0]
+    assert assigned_drones([coming], lost_tracks(stood, flew)) == [1]
 
 
 def test_a_ghost_that_seems_to_move_is_no_drone():
@@ -459,37 +470,37 @@ def test_a_ghost_that_seems_to_move_is_no_drone():
     stood = ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 20.0)
     ghost = candidate((0.0, 0.0, 1.05), (0.0, -0.02, 0.13))
     drone = candidate((0.1, 0.0, 1.3), (0.1, 0.0, 1.5), frame=9)
-    assert assigned_drones([ghost, drone], lost(stood)) == [NO_DRONE, 0]
-    assert assigned_drones([ghost, drone], lost()) == [NO_DRONE, NEW]
+    assert assigned_drones([ghost, drone], lost_tracks(stood)) == [NO_DRONE, 0]
+    assert assigned_drones([ghost, drone], lost_tracks()) == [NO_DRONE, NEW]
     # A slow and a fast drone at different places are two drones.
     elsewhere = candidate((1.0, 0.0, 1.3), (0.1, 0.0, 1.5), frame=9)
-    assert assigned_drones([ghost, elsewhere], lost(stood)) == [0, NEW]
+    assert assigned_drones([ghost, elsewhere], lost_tracks(stood)) == [0, NEW]
 
 
 def test_a_fading_ghost_is_not_new():
     """While the background model learns the floor again, the rest of the ghost seems to move."""
     dying = candidate((2.2, 1.4, 1.5), (-0.1, 0.04, 0.01))
-    assert assigned_drones([dying], lost(left_m=[(2.2, 1.3, 1.5)])) == [NO_DRONE]
+    assert assigned_drones([dying], lost_tracks(left_m=[(2.2, 1.3, 1.5)])) == [NO_DRONE]
     # A slow candidate elsewhere is new, and so is a fast candidate at this place; a drone lost here may be found again.
-    assert assigned_drones([dying], lost(left_m=[(1.2, 1.3, 1.5)])) == [NEW]
-    assert assigned_drones([candidate((2.2, 1.4, 1.5))], lost(left_m=[(2.2, 1.3, 1.5)])) == [NEW]
+    assert assigned_drones([dying], lost_tracks(left_m=[(1.2, 1.3, 1.5)])) == [NEW]
+    assert assigned_drones([candidate((2.2, 1.4, 1.5))], lost_tracks(left_m=[(2.2, 1.3, 1.5)])) == [NEW]
     stood = ((2.2, 1.3, 1.5), (0.0, 0.0, 0.0), 5.0)
-    assert assigned_drones([dying], lost(stood, left_m=[(2.2, 1.3, 1.5)])) == [0]
+    assert assigned_drones([dying], lost_tracks(stood, left_m=[(2.2, 1.3, 1.5)])) == [0]
 
 
 def test_a_ghost_does_not_keep_a_track():
     """A drone found again at the place of its loss may be a ghost; a candidate that departs from there is the drone."""
     held = ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 20.0, {"doubtful": True})
-    assert assigned_drones([candidate((0.6, 0.0, 1.0))], lost(held)) == [0]
-    assert assigned_drones([candidate((0.6, 0.0, 1.0), (0.0, 1.0, 0.0))], lost(held)) == [NEW]
-    assert assigned_drones([candidate((2.0, 0.0, 1.0))], lost(held), max_births=0) == [NO_DRONE]
+    assert assigned_drones([candidate((0.6, 0.0, 1.0))], lost_tracks(held)) == [0]
+    assert assigned_drones([candidate((0.6, 0.0, 1.0), (0.0, 1.0, 0.0))], lost_tracks(held)) == [NEW]
+    assert assigned_drones([candidate((2.0, 0.0, 1.0))], lost_tracks(held), max_births=0) == [NO_DRONE]
 
 
 def test_a_drone_that_was_tracked_elsewhere_at_the_same_time_is_another_drone():
     """The drone is lost in frame 20 of the chunk, and the candidate is there from frame 2 on: both for 0.7 s."""
     here = ((0.3, 0.0, 1.0), (1.0, 0.0, 0.0), -20 / FPS)
-    assert assigned_drones([candidate(frame=2)], lost(here)) == [NEW]
-    assert assigned_drones([candidate(frame=18)], lost(here)) == [0]
+    assert assigned_drones([candidate(frame=2)], lost_tracks(here)) == [NEW]
+    assert assigned_drones([candidate(frame=18)], lost_tracks(here)) == [0]
 
 
 def oracle_log_density(one, position_m, velocity_m_s, gap_s, sigma_m_s, time_s=1.0):
@@ -528,7 +539,7 @@ def test_the_assignment_has_the_largest_likelihood(seed):
         )
         for k in order
     ]
-    gone = lost(*((place[k], velocity[k], gap[k] + 0.5, {"span_m": span[k]}) for k in range(3)))
+    gone = lost_tracks(*((place[k], velocity[k], gap[k] + 0.5, {"span_m": span[k]}) for k in range(3)))
     sigma = 6.0 / 3
     score = np.array(
         [
@@ -550,14 +561,14 @@ def test_the_assignment_has_the_largest_likelihood(seed):
 # --- lost drones and planned starts
 
 
-def history(*rows):
+def tracked_frames(*rows):
     """Whether each drone was tracked, (frames, drones), from strings of `x` (tracked) and dots (not tracked)."""
     return np.array([[letter == "x" for letter in row] for row in rows]).T
 
 
 def test_lost_drones_by_hand():
     """Six drones after a chunk of frames 8 to 11: tracked; lost before; lost within; never; doubtful; moved."""
-    tracked = history(
+    tracked = tracked_frames(
         "xxxxxxxxxxxx", "xxx.........", "xxxxxxxxxx..", "............", "xx....xxxxxx", "xx....xxxxxx"
     )
     frames = np.arange(12.0)
@@ -612,7 +623,12 @@ def test_a_drone_that_the_background_learns_only_seems_to_move():
     velocity[8:10, 0, 0], velocity[:, 1, 0], velocity[9, 2, 0] = 0.5, 0.3, 0.05
     position[:, 2, 0] = np.minimum(0.1 * np.arange(12), 0.8)
     gone = find_lost_tracks(
-        position, velocity, history(*["x" * 10 + ".."] * 4), np.full((4, 3), 0.5), chunk_frames=4, fps=10.0
+        position,
+        velocity,
+        tracked_frames(*["x" * 10 + ".."] * 4),
+        np.full((4, 3), 0.5),
+        chunk_frames=4,
+        fps=10.0,
     )
     np.testing.assert_array_equal(gone.position_m[:, 0], [0.0, 0.27, 0.8, 0.0])
     np.testing.assert_array_equal(gone.velocity_m_s[:, 0], [0.0, 0.3, 0.05, 0.0])
@@ -622,7 +638,7 @@ def test_a_drone_that_the_background_learns_only_seems_to_move():
 def test_planned_starts_by_hand():
     """Of four known drones the third is found again; one candidate is new; one is no drone."""
     found = (candidate((1, 1, 1), frame=3), candidate((2, 2, 2), frame=5, span_m=0.7), candidate((3, 3, 3)))
-    gone = lost(AHEAD, AHEAD)
+    gone = lost_tracks(AHEAD, AHEAD)
     gone.drone[:] = (0, 2)
     planned = plan_starts(found, np.array([1, NEW, NO_DRONE]), gone, 4)
     assert planned.begin_frame.tolist() == [-1, -1, 3, -1, 5]
@@ -632,6 +648,6 @@ def test_planned_starts_by_hand():
 
 
 def test_no_planned_starts():
-    planned = plan_starts((), np.empty(0, int), lost(), 2)
+    planned = plan_starts((), np.empty(0, int), lost_tracks(), 2)
     assert planned.begin_frame.tolist() == [-1, -1]
     assert planned.born_size_m.shape == (0, 3)

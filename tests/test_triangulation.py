@@ -24,7 +24,7 @@ def points_in_room(*shape, seed=0):
     return np.random.default_rng(seed).uniform((-1.5, -1.5, 0.3), (1.5, 1.5, 2.3), (*shape, 3))
 
 
-def pixels_of(rig, points):
+def project_points(rig, points):
     return project(rig.cameras, points[..., None, :])[0]
 
 
@@ -32,7 +32,7 @@ def pixels_of(rig, points):
 @pytest.mark.parametrize(("num_cameras", "shape"), [(2, (7,)), (3, (5, 2)), (5, ()), (7, (3,))])
 def test_exact_pixels_give_the_point(num_cameras, shape, coefficients):
     rig, points = ring_rig(num_cameras, coefficients=coefficients), points_in_room(*shape)
-    found = triangulate(rig.cameras, pixels_of(rig, points))
+    found = triangulate(rig.cameras, project_points(rig, points))
     assert found.shape == points.shape
     # Pixels are undistorted to 1e-8 (see test_cameras), which is 4e-8 m at 4 m; two cameras enlarge the error a little.
     np.testing.assert_allclose(found, points, atol=1e-6)
@@ -41,14 +41,14 @@ def test_exact_pixels_give_the_point(num_cameras, shape, coefficients):
 def test_two_cameras_agree_with_opencv():
     rig, points = ring_rig(2), points_in_room(31)
     noise = np.random.default_rng(1).normal(0, 0.3, (31, 2, 2))
-    pixels = pixels_of(rig, points) + noise
+    pixels = project_points(rig, points) + noise
     projections = rig.cameras.K @ rig.cameras.T_cam_world[:, :3]
     homogeneous = cv2.triangulatePoints(*projections, pixels[:, 0].T.copy(), pixels[:, 1].T.copy())
     expected = (homogeneous[:3] / homogeneous[3]).T
     # Both solve the same four equations, OpenCV with a norm of one on (X, 1), in pixels: with noise of 0.3 px, a point
     # is off by 5 mm, and the two differ where the rays miss each other: measured 0.2 mm, limit 1 mm.
     np.testing.assert_allclose(triangulate(rig.cameras, pixels), expected, atol=1e-3)
-    exact = pixels_of(rig, points)
+    exact = project_points(rig, points)
     homogeneous = cv2.triangulatePoints(*projections, exact[:, 0].T.copy(), exact[:, 1].T.copy())
     np.testing.assert_allclose(
         triangulate(rig.cameras, exact), (homogeneous[:3] / homogeneous[3]).T, atol=1e-6
@@ -59,7 +59,7 @@ def test_weighted_least_squares():
     """Equations (3) of the paper, solved by `lstsq`, with noise so that no point solves them exactly."""
     rig, points = ring_rig(5), points_in_room(11)
     rng = np.random.default_rng(2)
-    pixels = pixels_of(rig, points) + rng.normal(0, 1.0, (11, 5, 2))
+    pixels = project_points(rig, points) + rng.normal(0, 1.0, (11, 5, 2))
     weights = rng.uniform(0.1, 2, (11, 5))
     found = triangulate(rig.cameras, pixels, weights)
     for n in range(11):
@@ -85,7 +85,7 @@ def test_the_pseudoinverse_of_the_paper():
     one = np.broadcast_to(rig.cameras.K[0], (5, 3, 3)).copy()
     one[:, 1, 1] = one[:, 0, 0]
     rig = Rig(rig.names, replace(rig.cameras, K=one))
-    pixels = pixels_of(rig, points) + np.random.default_rng(4).normal(0, 1.0, (11, 5, 2))
+    pixels = project_points(rig, points) + np.random.default_rng(4).normal(0, 1.0, (11, 5, 2))
     P = one @ rig.cameras.T_cam_world[:, :3]
     for n in range(11):
         L = [pixels[n, c, i] * P[c, 2, :3] - P[c, i, :3] for c in range(5) for i in range(2)]
@@ -98,7 +98,7 @@ def test_the_pseudoinverse_of_the_paper():
 
 def test_a_camera_that_does_not_see_the_point_does_not_count():
     rig, points = ring_rig(5), points_in_room(7)
-    pixels = pixels_of(rig, points) + np.random.default_rng(3).normal(0, 1, (7, 5, 2))
+    pixels = project_points(rig, points) + np.random.default_rng(3).normal(0, 1, (7, 5, 2))
     gone = pixels.copy()
     gone[:, 1] = np.nan
     gone[:, 3, 0] = np.nan
@@ -112,7 +112,7 @@ def test_a_camera_that_does_not_see_the_point_does_not_count():
 @pytest.mark.parametrize("num_seeing", [0, 1])
 def test_too_few_cameras_is_nan(num_seeing):
     rig, points = ring_rig(5), points_in_room(3)
-    pixels = pixels_of(rig, points)
+    pixels = project_points(rig, points)
     pixels[1, num_seeing:] = np.nan
     found = triangulate(rig.cameras, pixels)
     assert np.isnan(found[1]).all()
@@ -123,41 +123,43 @@ def test_rays_from_one_position_are_nan():
     """Two cameras at one position see a point along one ray, without depth. So does a single camera with weight."""
     one = ring_rig(3).cameras[0]
     rig = make_unnamed_rig(one, one)
-    pixels = pixels_of(rig, points_in_room(3))
+    pixels = project_points(rig, points_in_room(3))
     assert np.isnan(triangulate(rig.cameras, pixels)).all()
     rig = ring_rig(3)
     weights = np.array([[0.0, 1.0, 0.0]] * 3)
-    assert np.isnan(triangulate(rig.cameras, pixels_of(rig, points_in_room(3)), weights)).all()
+    assert np.isnan(triangulate(rig.cameras, project_points(rig, points_in_room(3)), weights)).all()
 
 
 TIME_S = np.arange(7) / 25
 
 
-def flown(coefficient, time_s=TIME_S):
+def positions_on_paths(coefficient, time_s=TIME_S):
     """(..., frames, 3) positions on paths that are polynomials of time."""
     powers = time_s[:, None] ** np.arange(coefficient.shape[-2])
     return np.einsum("fk,...ki->...fi", powers, coefficient)
 
 
-def some_paths(*shape, seed=0):
+def random_paths(*shape, seed=0):
     rng = np.random.default_rng(seed)
     return np.stack([points_in_room(*shape, seed=seed), *rng.normal(size=(2, *shape, 3))], axis=-2)
 
 
 @pytest.mark.parametrize("coefficients", [0, 5])
 def test_exact_pixels_give_the_path(coefficients):
-    rig, paths = ring_rig(3, coefficients=coefficients), some_paths(5)
-    found = triangulate_paths(rig.cameras, pixels_of(rig, flown(paths)), TIME_S, noise_m=1e-6)
+    rig, paths = ring_rig(3, coefficients=coefficients), random_paths(5)
+    found = triangulate_paths(
+        rig.cameras, project_points(rig, positions_on_paths(paths)), TIME_S, noise_m=1e-6
+    )
     assert found.shape == paths.shape
-    # As for points, undistortion is exact to 4e-8 m; two derivatives over a quarter of a second make 1e-5 of it.
+    # As for points, undistortion is exact to 4e-8 m; two derivatives over a quarter of a second increase this to 1e-5.
     np.testing.assert_allclose(found, paths, atol=1e-4)
 
 
 def test_paths_by_least_squares():
     """The equations of the views and of the priors, written out and solved by `lstsq`."""
-    rig, paths = ring_rig(5), some_paths(3)
+    rig, paths = ring_rig(5), random_paths(3)
     rng = np.random.default_rng(2)
-    pixels = pixels_of(rig, flown(paths)) + rng.normal(0, 1.0, (3, 7, 5, 2))
+    pixels = project_points(rig, positions_on_paths(paths)) + rng.normal(0, 1.0, (3, 7, 5, 2))
     pixels[rng.random((3, 7, 5)) < 0.3] = np.nan
     weights = rng.uniform(0.1, 2, (3, 7, 5))
     found = triangulate_paths(rig.cameras, pixels, TIME_S, weights, noise_m=0.05, expected=(2.0, 3.0))
@@ -181,8 +183,8 @@ def test_paths_by_least_squares():
 
 def test_frames_with_one_camera_each_make_a_path():
     """Two cameras take turns: no single frame determines a point, but all frames together determine the path."""
-    rig, paths = ring_rig(3), some_paths(3)[:, :2]
-    pixels = pixels_of(rig, flown(paths))
+    rig, paths = ring_rig(3), random_paths(3)[:, :2]
+    pixels = project_points(rig, positions_on_paths(paths))
     pixels[:, ::2, 0] = pixels[:, 1::2, 1] = pixels[:, :, 2] = np.nan
     assert np.isnan(triangulate(rig.cameras, pixels)).all()
     found = triangulate_paths(rig.cameras, pixels, TIME_S, noise_m=1e-6, expected=(3.0,))
@@ -191,14 +193,14 @@ def test_frames_with_one_camera_each_make_a_path():
 
 def test_one_frame_gives_a_path_at_rest():
     rig, points = ring_rig(3), points_in_room(4)
-    found = triangulate_paths(rig.cameras, pixels_of(rig, points)[:, None], np.zeros(1))
+    found = triangulate_paths(rig.cameras, project_points(rig, points)[:, None], np.zeros(1))
     np.testing.assert_allclose(found[:, 0], points, atol=1e-6)
     assert not found[:, 1:].any()
 
 
 def test_a_path_that_one_camera_sees_is_nan():
     rig = ring_rig(3)
-    pixels = pixels_of(rig, flown(some_paths(2)))
+    pixels = project_points(rig, positions_on_paths(random_paths(2)))
     pixels[1, :, 1:] = np.nan
     found = triangulate_paths(rig.cameras, pixels, TIME_S)
     assert np.isfinite(found[0]).all()
@@ -215,7 +217,7 @@ def test_cameras_side_by_side_share_a_viewpoint():
     assert len(set(label.tolist())) == 4
 
 
-def apart(count, seed, least_m=0.6):
+def separated_points(count, seed, least_m=0.6):
     """Points in the room with distances of at least `least_m`."""
     rng = np.random.default_rng(seed)
     points = np.empty((0, 3))
@@ -226,10 +228,10 @@ def apart(count, seed, least_m=0.6):
     return points
 
 
-def observed(rig, drones, seed, *, missing=0.0, false=0, noise_px=0.5):
+def simulate_detections(rig, drones, seed, *, missing=0.0, false=0, noise_px=0.5):
     """For each camera its 2D points in random order, and the drone of each 2D point (-1: false point)."""
     rng = np.random.default_rng(seed)
-    pixels = pixels_of(rig, drones)
+    pixels = project_points(rig, drones)
     points, owners = [], []
     for c in range(len(rig)):
         seen = np.flatnonzero(rng.random(len(drones)) >= missing)
@@ -258,16 +260,16 @@ def check_match(rig, drones, points, owners, enough):
 @pytest.mark.parametrize("seed", range(3))
 def test_drones_on_a_ring_of_cameras(num_drones, seed):
     """Every drone is found once, at its position, and nothing else is found."""
-    rig, drones = ring_rig(7), apart(num_drones, seed)
-    points, owners = observed(rig, drones, seed)
+    rig, drones = ring_rig(7), separated_points(num_drones, seed)
+    points, owners = simulate_detections(rig, drones, seed)
     check_match(rig, drones, points, owners, np.ones(num_drones, bool))
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_missing_and_false_points(seed):
     """One 2D point in seven is missing, and every camera has a false point: drones seen by four cameras are found."""
-    rig, drones = ring_rig(7), apart(3, seed)
-    points, owners = observed(rig, drones, seed, missing=1 / 7, false=1)
+    rig, drones = ring_rig(7), separated_points(3, seed)
+    points, owners = simulate_detections(rig, drones, seed, missing=1 / 7, false=1)
     seen_by = np.array([sum((owner == drone).any() for owner in owners) for drone in range(3)])
     assert seen_by.min() >= 4
     check_match(rig, drones, points, owners, seen_by >= 4)
@@ -277,12 +279,12 @@ def test_two_cameras_at_one_position_do_not_count_twice():
     """Three cameras at two positions see a point: two viewpoints are too few."""
     rig, drones = ring_rig(5), points_in_room(1)
     doubled = make_unnamed_rig(*(rig.cameras[i] for i in (0, 0, 2)))
-    points, _ = observed(doubled, drones, 0)
+    points, _ = simulate_detections(doubled, drones, 0)
     radius = [np.full(len(p), 4.0) for p in points]
     assert match_views(doubled.cameras, points, radius, ROOM_M)[0].shape == (0, 3)
     assert len(match_views(doubled.cameras, points, radius, ROOM_M, min_viewpoints=2)[0]) == 1
     third = make_unnamed_rig(*(rig.cameras[i] for i in (0, 1, 2)))
-    points, _ = observed(third, drones, 0)
+    points, _ = simulate_detections(third, drones, 0)
     assert len(match_views(third.cameras, points, radius, ROOM_M)[0]) == 1
 
 
@@ -290,9 +292,9 @@ def test_two_cameras_at_one_position_do_not_count_twice():
 @given(seed=st.integers(0, 2**32 - 1))
 def test_the_order_of_cameras_and_points_does_not_matter(seed):
     rng = np.random.default_rng(seed)
-    drones = apart(int(rng.integers(1, 5)), seed)
+    drones = separated_points(int(rng.integers(1, 5)), seed)
     rig = ring_rig(4)
-    points, _ = observed(rig, drones, seed, missing=0.1, false=1)
+    points, _ = simulate_detections(rig, drones, seed, missing=0.1, false=1)
     cameras = rng.permutation(4)
     mixed = [points[c][rng.permutation(len(points[c]))] for c in cameras]
     radius, mixed_radius = ([np.full(len(p), 4.0) for p in of] for of in (points, mixed))
@@ -308,7 +310,7 @@ def test_a_point_that_two_drones_share_does_not_hide_them():
     """One camera sees the middle of two drones. The point on which the other two cameras agree remains a candidate."""
     rig = make_unnamed_rig(*(ring_rig(5).cameras[i] for i in (0, 1, 3)))
     drones = np.array([[0.3, 0.2, 1.4], [0.1, -0.1, 1.3]])
-    pixels = pixels_of(rig, drones)
+    pixels = project_points(rig, drones)
     points = [pixels[:, 0].mean(axis=0)[None], pixels[:, 1], pixels[:, 2]]
     wide = np.linalg.norm(pixels[0, 0] - pixels[1, 0]) / 2 / 0.9
     found, _ = triangulate_candidates(rig.cameras, points, [np.full(len(p), wide) for p in points], ROOM_M)
@@ -331,7 +333,7 @@ def test_nothing_to_match():
 
 def test_nothing_is_found_outside_the_bounds():
     rig = ring_rig(5)
-    points, _ = observed(rig, np.array([[0.0, 0, 1]]), 0)
+    points, _ = simulate_detections(rig, np.array([[0.0, 0, 1]]), 0)
     radius = [np.full(len(p), 4.0) for p in points]
     upper_half = np.array([[-3.0, -3, 1.5], [3, 3, 3]])
     assert len(match_views(rig.cameras, points, radius, upper_half)[0]) == 0
