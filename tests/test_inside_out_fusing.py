@@ -250,7 +250,7 @@ def test_errors_agree_with_theory_by_monte_carlo() -> None:
         for k in (0, n // 2):
             error_m = found.position_m[k] - truth[k, :3]
             nees.append(error_m @ np.linalg.solve(found.covariance_m2[k], error_m))
-    # The mean of 120 draws of chi-square (3 degrees of freedom) has a standard deviation of 0.22; limit four times that.
+    # The mean of 120 draws of chi-square (3 degrees of freedom) has a standard deviation of 0.22; limit 4 times that.
     assert np.mean(nees) == pytest.approx(3.0, abs=0.9)
 
 
