@@ -203,7 +203,7 @@ def records() -> str:
 
 
 def struct_tables(path: str) -> str:
-    """Markdown tables of the fields of a msgspec Struct and of the Structs inside of it.
+    """Markdown tables of the fields of a msgspec Struct and of its inner Structs.
 
     Args:
         path: dotted path of the class, for instance "psotrack.settings.TrackSettings".

@@ -145,7 +145,7 @@ plt.show()
 #
 # ## Save the tracks
 #
-# This file is the same as that of `psotrack track SEQ --out tracks.parquet`: one row per frame and drone.
+# `psotrack track SEQ --out tracks.parquet` writes the same file: one row per frame and drone.
 
 # %%
 tracks = DATA / "tracks.parquet"

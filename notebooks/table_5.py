@@ -159,7 +159,7 @@ plt.show()
 
 # %% [markdown]
 # *What to see: every single run. A short column is a method whose runs agree; a long column is a method whose
-# result depends on the seed. Rings are runs with identity swaps: their errors are far above those of other runs, and a
+# result depends on the seed. Rings are runs with identity swaps: their errors are far above the errors of other runs, and a
 # mean over runs mixes both kinds.*
 #
 # ## Origin of the results

@@ -67,10 +67,10 @@ SILHOUETTES = SilhouetteSettings(reduction=2, working_reduction=1)
 if TINY:  # so few pixels per drone that noise counts
     SILHOUETTES = SilhouetteSettings(reduction=1, working_reduction=1, min_blob_px=32, var_threshold=16.0)
 FRAME = 10  # the frame that is shown
-TURN_DEG = 0.5 if TINY else 1.5  # how far a camera is turned, to see what comes of it
+TURN_DEG = 0.5 if TINY else 1.5  # angle by which a camera is turned in the last section
 DATA = Path("data", "tiny" if TINY else "normal")
 FOREIGN = DATA / "foreign"  # what stands for your files
-FOLDER = DATA / "my_recording"  # what is made of them
+FOLDER = DATA / "my_recording"  # the folder that psotrack reads
 plt.rcParams.update({"figure.dpi": 80, "font.size": 9})
 keep_compiled(Path("data", "compiled"))
 

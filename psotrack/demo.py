@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 #: Small enough for a laptop to do all in a minute, long enough for paths to be seen.
 NAME, NUM_FRAMES, SCALE = "S02_D4_A", 75, 0.5
-#: Half the image size needs half the reduction, for drones of as many silhouette pixels.
+#: Half the image size needs half the reduction, so that drones have the same number of silhouette pixels.
 SILHOUETTES = SilhouetteSettings(reduction=2, working_reduction=1)
 SHOWN_CAMERAS = 4
 
@@ -132,7 +132,7 @@ def _frame_of(recording: Recording, camera: str, frame: int) -> UInt8[np.ndarray
     for index, image in enumerate(read_frames(recording.videos[camera])):
         if index == frame:
             return image[:, :, ::-1]
-    raise AssertionError("the tracker has read as many frames")
+    raise AssertionError("expected a frame of every camera, found fewer frames")
 
 
 def _stage_table(seconds: dict[str, float]) -> Table:

@@ -111,7 +111,7 @@ class Method(Protocol):
             report: shows progress: `with report("name", num_frames) as advance:`, then `advance(1)` per frame.
 
         Returns:
-            Tracks of all frames, with as many drones as the method found. NaN stands for numbers that the method does
+            Tracks of all frames, with all drones that the method found. NaN stands for numbers that the method does
             not have.
         """
         ...

@@ -142,7 +142,7 @@ def track_recording(
         cache: folder of the stored silhouettes and detections.
         jobs: number of processes for the silhouettes; None is one per processor.
         parts: parts that the caller brings.
-        report: told of the frames of each stage.
+        report: reports progress of each stage, in frames.
 
     Raises:
         InputError: a video cannot be used, or the drones cannot be found.
@@ -189,7 +189,7 @@ def track_runs(
         silhouettes: of all cameras; None where no settings need any (see `TrackSettings.needs_silhouettes`).
         settings: of each run.
         parts: parts that the caller brings, for all runs.
-        report: told of the frames, through which all runs of a method go together.
+        report: reports progress, in frames; all runs of a method advance together.
 
     Returns:
         For each run its result, or why there is none.

@@ -175,7 +175,7 @@ class DroneSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """What is known of the drones beforehand.
 
     Attributes:
-        count: number of drones; None takes as many as are found.
+        count: number of drones; None takes all drones that are found.
         size_m: full lengths of every drone along x, y and z, metres; None takes them from the first frames.
         learn_sizes: whether sizes are learned while tracking; `size_m` switches this off.
         body_offset_m: from the body's origin to the middle of the silhouette (with "projection-lines" of the box),

@@ -92,7 +92,7 @@ def initial_poses(
     noise_px: float,
     extent_m: Float[np.ndarray, "3"],
 ) -> list[Pose]:
-    """Compute poses from all points, and from sets of four points, of which some contain no outlier."""
+    """Compute poses from all points, and from many sets of four points, so that some sets contain no outlier."""
     normalised = undistort(lens, points_px)
     count = len(points_m)
     if comb(count, MIN_POINTS) <= _MOST_SETS:

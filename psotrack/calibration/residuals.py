@@ -15,7 +15,7 @@ UNLIKELY = 0.01
 
 
 def spread_px(distance_px: Float[np.ndarray, " residuals"], unknowns: int) -> float:
-    """Estimate σ along each axis from the median of distances in the image, some of which may be outliers.
+    """Estimate σ along each axis from the median of distances in the image, which may contain outliers.
 
     Args:
         distance_px: (residuals,), distances of a fit, pixels. With no more equations than unknowns the result is 0.

@@ -1,4 +1,4 @@
-"""Offsets between the clocks of cameras, from the motion of drones that several of them see.
+"""Offsets between the clocks of cameras, from the motion of drones that several cameras see.
 
 A late camera sees a drone where the other cameras will see the drone later: its detection is off the epipolar lines by
 the drone's motion in the image times the delay. The offsets of all cameras and the points in space are estimated

@@ -95,7 +95,7 @@ class ShiftedPair:
         orientation_wxyz: Float[np.ndarray, "samples drones 4"] | None,
         with_lever_arm: bool,
     ) -> ShiftedPair:
-        """Interpolate the samples of a reference; the arguments are those of `synchronisation.find_offset`.
+        """Interpolate the samples of a reference; arguments: see `synchronisation.find_offset`.
 
         Raises:
             InputError: the reference's times do not increase, or one of both has fewer than two times.

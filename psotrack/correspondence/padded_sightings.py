@@ -49,7 +49,7 @@ class PaddedSightings:
 def pad_sightings(
     cameras: Camera, points_px: list[Float[np.ndarray, "_ 2"]], noise_px: list[Float[np.ndarray, "_"]]
 ) -> PaddedSightings:
-    """Put the detections of all cameras into padded arrays. Arguments and errors are those of `match`."""
+    """Put the detections of all cameras into padded arrays. Arguments and errors: see `match`."""
     counts = list(map(len, points_px))
     pixels = np.full((max(counts, default=0) + 1, len(counts), 2), np.nan)
     variance = np.full((len(counts), len(pixels)), np.inf)
@@ -111,7 +111,7 @@ def make_priors(
     covariance_m2: Float[np.ndarray, "known 3 3"],
     min_views: int,
 ) -> Priors:
-    """Priors of the expected drones and of the room. Arguments are those of `match`.
+    """Priors of the expected drones and of the room. Arguments: see `match`.
 
     Two viewpoints are enough for an expected drone.
     """

@@ -1,6 +1,6 @@
 """YOLO data sets for training: images, a text file of labels per image, and `data.yaml` with the parts.
 
-The layout is that of YOLOv5 and its successors. The labels of images/PART/NAME.jpg are in labels/PART/NAME.txt, one
+YOLOv5 and its successors use this layout. The labels of images/PART/NAME.jpg are in labels/PART/NAME.txt, one
 line per drone: its class, and the middle and size of its box as fractions of the image's width and height.
 """
 

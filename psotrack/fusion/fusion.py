@@ -3,8 +3,8 @@
 The swarm finds the middle of a drone's silhouette, the projection lines the middle of its boxes. The two points
 differ by a constant for each drone. The constant is estimated and removed from the lines, so that a drone does not
 move where one method takes over from the other. No image shows which of the two points is nearer to the body's
-origin; the constant is stored in the record, so that a user who knows the origin's place in one of them knows it in
-the other.
+origin; the constant is stored in the record, so that a user who knows the offset of the origin for one method knows
+it for the other.
 
 If the boxes are a detector's, the remaining errors of the two methods have different causes, and the information adds
 up (Bar-Shalom et al. 2001, section 8.3.3: fusion of independent estimates). Boxes of blobs are of the same foreground
@@ -41,7 +41,7 @@ MAD_STD, MEDIAN_ERROR = 1.4826, np.sqrt(np.pi / 2)
 #: which says nothing about the offset.
 FAR = 3.0
 #: Correlation of the errors of two methods that see the same foreground: shadows, noise and occlusion are common,
-#: what each method makes of them is not.
+#: the errors of each method are not.
 COMMON_CORRELATION = 0.5
 
 
@@ -175,8 +175,8 @@ def _weighted(
 ]:
     """Measured positions of both methods together, their covariances, and whether a drone was measured at all.
 
-    Where the two positions disagree more than their covariances allow, one of them is of another drone or of none.
-    Then the swarm's position counts, because the swarm sees all of the foreground.
+    Where the two positions disagree more than their covariances allow, one position belongs to another drone or to no
+    drone. Then the swarm's position counts, because the swarm sees all of the foreground.
     """
     first_m, second_m = swarm.found_m(), lines.found_m()
     first_m2 = np.asarray(swarm.measured_covariance_m2, np.float64)

@@ -195,7 +195,8 @@ def _agrees(
 ) -> Bool[np.ndarray, "points"]:
     """True for points without a disagreeing view.
 
-    Each of n correct views disagrees with probability q / n, so that any of them disagrees with probability q at most.
+    Each of n correct views disagrees with probability q / n, so that at least one view disagrees with probability q
+    at most.
     """
     gate = -2 * np.log(false_alarm / np.maximum((scale > 0).sum(axis=-1), 1))
     return np.isfinite(fit.cost) & (fit.disagreement <= gate[:, None]).all(axis=-1)

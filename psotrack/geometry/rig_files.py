@@ -56,7 +56,7 @@ def read_rig(
 def read_lenses(path: Path | str, image_size_wh: tuple[int, int] | None = None) -> Rig:
     """Read only the lenses of a rig file: all cameras stand at the world's origin.
 
-    Arguments and errors are those of `read_rig`, but the file need not have poses.
+    Arguments and errors: see `read_rig`; the file need not have poses.
     """
     rig = _read(Path(path), image_size_wh, 1.0, placed=False)
     origin = np.tile(np.eye(4), (len(rig), 1, 1))

@@ -195,7 +195,7 @@ def triangulate_candidates(
 ) -> tuple[Float[np.ndarray, "candidates 3"], Int[np.ndarray, "candidates cameras"]]:
     """Every point in space that 2D points of at least two viewpoints support, false crossings of rays included.
 
-    Arguments and results are those of `match_views`. One candidate is kept in each cube with sides of `SAME_M`.
+    Arguments and results: see `match_views`. One candidate is kept in each cube with sides of `SAME_M`.
     """
     points = _proposals(cameras, points_px, viewpoints(cameras))
     # Each pass triangulates from all supporting cameras. A 2D point that fits badly, such as the middle of a blob that

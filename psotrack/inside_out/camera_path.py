@@ -71,7 +71,7 @@ class CameraPath:
             pose is from the motion, `LOST` where there is no pose.
         flags: (frames,), values of `Flag`.
         velocity_m_s: (frames, 3), world; None without a filter.
-        chance: (frames,), for frames' own poses: upper bound on the probability that as many markers agree by chance
+        chance: (frames,), for frames' own poses: upper bound on the probability that the used markers agree by chance
             although all were misread. The filter uses it; the table does not have it.
         common: (frames, 6, errors), for frames' own poses: a matrix square root of the part of the covariance due to
             errors of the map and of the lens, which are the same in all frames. The filter uses it; the table does not

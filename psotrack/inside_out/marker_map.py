@@ -65,7 +65,7 @@ class MarkerMap:
         return np.array(sorted(self.corners_m))
 
     def corners_of(self, ids: Iterable[int]) -> Float[np.ndarray, "chosen 4 3"]:
-        """(chosen, 4, 3), corners of these markers; all of them must be in the map."""
+        """(chosen, 4, 3), corners of these markers, which must all be in the map."""
         return np.array([self.corners_m[int(marker)] for marker in ids], np.float64).reshape(-1, 4, 3)
 
     @cached_property

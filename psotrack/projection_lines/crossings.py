@@ -1,4 +1,4 @@
-"""One frame: which detections are of which drone, and where their lines of sight cross."""
+"""One frame: assignment of detections to drones, and the crossings of their lines of sight."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def crossings(
         expected_m, expected_covariance_m2: (drones, 3) and (drones, 3, 3), expected positions and their covariances.
         dispersion: (drones,), ratio of the variance of each drone's detections so far and `view.noise_px`².
     """
-    # Detections of an unexpected drone are as noisy as those of the known drones.
+    # Detections of an unexpected drone have the same noise as detections of known drones.
     dispersion = np.append(dispersion, np.median(dispersion) if len(dispersion) else 1.0)
     # At least the stated noise is used for matching: the groups are judged after they are triangulated.
     scale = np.sqrt(max(1.0, dispersion[-1]))

@@ -50,9 +50,9 @@ def split_merged_boxes(
 ) -> CameraSightings:
     """The frame's boxes, with boxes of several drones replaced by one box for each drone whose place is known.
 
-    A box is of several drones if several drones are expected in it, and if the box around all of them fits it better
-    than the box of any single one. A drone that has an edge of the box on both axes is placed by these edges and its
-    size. The places of the other drones are not known: they are hidden.
+    A box is of several drones if several drones are expected in it, and if the box around all these drones fits it
+    better than the box of any single one. A drone that has an edge of the box on both axes is placed by these edges
+    and its size. The places of the other drones are not known: they are hidden.
 
     Args:
         cameras: with one leading axis.
@@ -108,7 +108,7 @@ def _expected(
 def _without(
     view: CameraSightings, camera: Int[np.ndarray, "gone"], box: Int[np.ndarray, "gone"]
 ) -> CameraSightings:
-    """The frame's boxes without some of them."""
+    """The frame's boxes without the given boxes."""
     centre_px, size_px, noise_px = view.centre_px.copy(), view.size_px.copy(), view.noise_px.copy()
     for values in (centre_px, size_px, noise_px):
         values[camera, box] = np.nan

@@ -13,7 +13,7 @@ from psotrack.trajectories import Arrival, DroneSizes, Status, Tracks
 def as_tracks(tracks: list[Track], num_frames: int) -> Tracks:
     """All tracks of drones in arrays; several tracks may be of one drone.
 
-    Sizes are those of the boxes. How well they are known is not: their standard errors are NaN.
+    Sizes are the sizes of the boxes. Their standard errors are unknown: NaN.
     """
     num_drones = len({track.drone for track in tracks})
     shape = (num_frames, num_drones)

@@ -29,7 +29,8 @@ CONFIRMED_HITS, FIRST_FRAMES = 5, 8
 MIN_SHARE = 0.4
 #: A position nearer than this to a track is taken for a part of the track, metres.
 SEPARATION_M = 0.25
-#: A position that this many viewpoints agree on is believed wherever it was expected; two viewpoints agree by chance.
+#: A position that this many viewpoints agree on is accepted at any distance from the prediction; two viewpoints may
+#: agree by chance.
 TRUSTED_VIEWPOINTS = 3
 #: Squared distance from the expected position, normalised by covariance, from which on a drone is elsewhere if trusted
 #: viewpoints say so. The filter treats positions beyond its gate as outliers, which is right up to twice the gate.
@@ -73,7 +74,7 @@ def track_detections(
         fps: frames per second.
         bounds_m: (2, 3), lowest and highest corner of the room, metres.
         known: positions and velocities of the drones at frame 0; None finds the drones.
-        report: told of the frames.
+        report: reports progress, in frames.
     """
     # x64 holds in this scope only: nothing outside of it computes differently.
     with jax.enable_x64(True):

@@ -31,7 +31,7 @@ def body_trajectories(
     seen markers determine the pose, and the position does not jump when a marker appears or disappears. A gap is a time
     with fewer markers: gaps up to half a second are bridged and `coasting`; in longer gaps the position is NaN and
     `lost`. Markers that were never seen are ignored. Markers that lost their labels are found by their distances from
-    the other markers. Orientations are those of the cross's own frame (`marker_crosses.Cross`); they are unknown if all
+    the other markers. Orientations refer to the cross's own frame (`marker_crosses.Cross`); they are unknown if all
     markers lie on a line.
 
     Args:

@@ -1,7 +1,7 @@
 """Marker crosses: rigid bodies of a few motion-capture markers, learned from a recording and identified by shape.
 
 Each drone of the DPJAIT dataset carries four or five markers that form an asymmetric cross, whose arms have different
-lengths on each drone. The distances between the markers identify a cross, whatever the labels are. Rigid fits are
+lengths on each drone. The distances between the markers identify a cross, even if labels are wrong. Rigid fits are
 least squares (Kabsch 1976; Umeyama 1991, without scale); the shape is a generalised Procrustes mean (Gower 1975).
 """
 

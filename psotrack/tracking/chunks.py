@@ -111,7 +111,7 @@ def track_silhouettes(
         silhouettes: of all cameras of the rig.
         runs: what each run starts from.
         fps: frames per second.
-        report: told of the frames, through which all runs go together.
+        report: reports progress, in frames; all runs advance together.
 
     Returns:
         For each run its tracks, and the seconds that compiling took.
@@ -186,7 +186,7 @@ def _tracks(run: _Run) -> Tracks:
 
 
 class _Batches:
-    """Tracks runs, those of equal shape together; compiles for a shape when it first occurs."""
+    """Tracks runs of equal shape together; compiles a program when a shape first occurs."""
 
     def __init__(
         self,
@@ -224,7 +224,7 @@ class _Batches:
             )
             if shape not in self._compiled:
                 began = time.perf_counter()
-                # A chunk without iterations takes only the compiler's time: so compiling is told from tracking.
+                # A chunk without iterations takes only the compiler's time, which separates compiling from tracking.
                 idle = _without_iterations(runs[numbers[0]].drones)
                 starts = tracker.no_track_starts(len(idle))
                 jax.block_until_ready(

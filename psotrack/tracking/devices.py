@@ -30,8 +30,8 @@ def share_among_devices(
     Args:
         jobs: what to do.
         kinds: of each job, what is compiled for it. Jobs of one kind are spread evenly over the devices.
-        work: does some of the jobs on one device.
-        report: told of the progress of the first device.
+        work: does a part of the jobs on one device.
+        report: reports progress of the first device.
     """
     devices = jax.devices()[: len(jobs)]
     by_kind = sorted(range(len(jobs)), key=lambda number: kinds.index(kinds[number]))

@@ -22,7 +22,7 @@ NUM_NEIGHBOURS = 3
 OCCLUDER_SCALE = 1.15
 #: Scale of the ellipse in which this drone's own foreground always counts.
 CORE_SCALE = 0.7
-#: Points of an ellipse that are tested for occlusion: a power of two, so that shares of them are exact.
+#: Points of an ellipse that are tested for occlusion: a power of two, so that shares of the points are exact.
 _NUM_POINTS = 128
 
 

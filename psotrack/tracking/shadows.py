@@ -103,7 +103,7 @@ def _dark_cells(
     half_m: Float[Array, "drones"],
     reduction: int,
 ) -> Bool[Array, "drones cells"]:
-    """The floor's cells about every drone that are foreground for the cameras whose view of them no drone hides.
+    """Cells of the floor around every drone that are foreground in at least half of the cameras with a free view.
 
     A cell that no camera sees is directly below a drone that nearly stands on it, where no light arrives: it is dark.
     """

@@ -38,8 +38,8 @@ MIN_FRAMES = 5
 MIN_FILLED = 0.15
 #: Scale of a neighbour's ellipse within which the neighbour may have foreground: outlines are no ellipses.
 NEIGHBOUR = 1.15
-#: Standard deviation of squared lengths of single views, as a share of them, from yaw and tilt; views that deviate more
-#: have less weight.
+#: Standard deviation of squared lengths of single views, as a share of the squared length, from yaw and tilt; views
+#: that deviate more have less weight.
 VIEW_STD = 0.25
 #: Weight of the present size, in views that show a length alone; and the share of the result that the frame's own views
 #: must make up, or the frame says too little.
@@ -133,7 +133,7 @@ def init(size_m: Positions, pinned: Bool[Array, "drones 3"], num_windows: int) -
 
 
 def with_added_drones(state: SizeState, added: SizeState) -> SizeState:
-    """The estimate with the drones of `added` after those of `state`."""
+    """Estimate with the drones of `state` first and the drones of `added` last."""
     return jax.tree.map(lambda first, last: jnp.concatenate([first, last]), state, added)
 
 

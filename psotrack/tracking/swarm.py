@@ -2,7 +2,7 @@
 
 The swarm holds particles as (particles, groups, dims). Its objective maps them to (particles, groups): groups share
 nothing but the call, so one group of 3 x drones is a joint swarm over all drones, and one group of 3 per drone is a
-swarm for each of them. Fitness is maximised. An undefined fitness (NaN) never becomes a best.
+swarm for each drone. Fitness is maximised. An undefined fitness (NaN) never becomes a best.
 """
 
 from __future__ import annotations

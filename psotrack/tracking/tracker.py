@@ -177,7 +177,7 @@ def init(key: Key, position_m: Positions, velocity_m_s: Positions, params: Track
 
 
 def with_added_tracks(state: TrackerState, params: TrackerParams) -> TrackerState:
-    """The state with as many drones as `params` has sizes for; the added drones are last, and absent."""
+    """Extend the state to the number of drones in `params`; the added drones are last, and absent."""
     more = params.size_m.shape[0] - state.missed.shape[0]
     middle = jnp.broadcast_to(params.bounds_m.mean(axis=0), (more, 3))
     added = init(state.key, middle, jnp.zeros((more, 3)), params)
@@ -445,6 +445,6 @@ def _displaced(
 def _averaged(
     dispersion: Float[Array, "drones"], latest: Float[Array, "drones"], was_found: Bool[Array, "drones"]
 ) -> Float[Array, "drones"]:
-    """The dispersion averaged with that of this frame: the few cameras of one frame say it only roughly."""
+    """Dispersion, averaged over frames, because the few cameras of one frame determine it only roughly."""
     believed = was_found & jnp.isfinite(latest)
     return dispersion + jnp.where(believed, latest - dispersion, 0.0) / DISPERSION_FRAMES

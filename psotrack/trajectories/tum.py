@@ -1,6 +1,6 @@
 """TUM files: one pose per line, `timestamp tx ty tz qx qy qz qw`, one file per drone; for the program evo.
 
-The format is that of the TUM RGB-D benchmark (Sturm et al., IROS 2012). It has neither frame numbers nor status.
+The format is defined by the TUM RGB-D benchmark (Sturm et al., IROS 2012). It has neither frame numbers nor status.
 """
 
 from __future__ import annotations

@@ -141,7 +141,7 @@ def interpolate_orientations(
 
 
 def _thin_samples(estimate: Trajectories, time_s: Float[np.ndarray, "samples"]) -> slice:
-    """Every n-th sample, about as many as frames: a wide search with more samples would not be more precise."""
+    """Every n-th sample, about one per frame: a wide search with more samples would not be more precise."""
     step_s, frame_s = (float(np.median(np.diff(times))) for times in (time_s, estimate.time_s))
     return slice(None, None, max(1, round(frame_s / step_s)))
 

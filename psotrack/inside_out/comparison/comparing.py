@@ -3,10 +3,10 @@
 The paper (technical validation, "ArUco markers") shifts the path along the reference, takes the offset with the
 smallest mean distance, and states distances and differences of angles at corresponding frames. The paper does so in
 steps of the reference's samples; here the offset is found to a fraction of a step (`psotrack.clocks`). Orientations may
-come with a clock of their own, as those of an IMU do: their offset is found from how the camera turns.
+have their own clock, such as an IMU's: their offset is found from the rotation of the camera.
 
 Two constant differences are no errors: the lever arm, from the reference's point on the drone to the camera, and the
-turn from the camera's axes to those of the reference's body. Each can be estimated and removed, and is returned.
+turn from the camera's axes to the axes of the reference's body. Each can be estimated and removed, and is returned.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ _WHITE = 200
 #: Grey levels of the searched image, half way between grey and light: blur in light hides black cells, blur in grey
 #: levels hides white cells.
 _HALF_LINEAR = np.round(255 * (np.arange(256) / 255) ** 1.5).astype(np.uint8)
-#: Shortest side of a marker, in pixels of the full image: one pixel for each of 6 cells, those of the border included.
+#: Shortest side of a marker, in pixels of the full image: one pixel for each of 6 cells, border cells included.
 _SHORTEST_PX = 6.0
 
 
@@ -66,8 +66,8 @@ class DetectedMarkers:
 class MarkerDetector:
     """Finds the markers of a dictionary in images.
 
-    Where two markers have the same id, at least one of them is something else, and the image does not tell which: both
-    are left out. Quadrangles that are too small, folded or mirrored are left out too.
+    If two markers have the same id, at least one is false, and the image does not show which: both are left out.
+    Quadrangles that are too small, folded or mirrored are left out too.
 
     Small markers are overlooked. Images are searched at a longer side of about 1920 pixels, where the sides of a marker
     need about 24 pixels. In an image of 3840 x 2160 pixels, markers whose sides are shorter than 48 pixels are

@@ -55,7 +55,7 @@ def estimate_gamma(
         lens: lens whose distortion bends the edges; None for straight edges.
 
     Returns:
-        The power, 0.7 to 8; that of cameras, 2.2, if there is no edge.
+        The power, 0.7 to 8; the usual power of cameras, 2.2, if there is no edge.
     """
     # The diagonal is a good enough measure of size.
     size_px = np.linalg.norm(corners_px[:, 2] - corners_px[:, 0], axis=-1)

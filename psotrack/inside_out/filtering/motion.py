@@ -256,7 +256,7 @@ def shift(motion: Motion, change: Float[np.ndarray, "levels n"]) -> Motion:
 
 
 def difference(motion: Motion, other: Motion) -> Float[np.ndarray, "levels n"]:
-    """(levels, 21), error state that takes `motion` to `other`; either of them may have a single level."""
+    """(levels, 21), error state that takes `motion` to `other`; each may have a single level."""
     turn = turn_between(motion.orientation_wxyz, other.orientation_wxyz)
     parts = [
         other.position_m - motion.position_m,

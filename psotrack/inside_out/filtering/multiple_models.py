@@ -171,7 +171,7 @@ def update(state: PoseState, measurement: MeasuredPose, params: PoseFilterParams
 
 
 def estimate(state: PoseState) -> PoseEstimate:
-    """The mean pose of all levels, and its covariance: that of the mixture of levels."""
+    """Mean pose of the mixture of all levels, and the covariance of the mixture."""
     weight = _weights(state)
     best = pose_motion.level_of(state.motion, int(weight.argmax()))
     apart = pose_motion.difference(best, state.motion)

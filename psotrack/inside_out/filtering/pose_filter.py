@@ -4,8 +4,8 @@
 and not used. `step` follows a camera with these functions. It returns poses once the first ones are confirmed, and none
 after too long a gap. It replaces its state where successive poses agree with one another but not with the state, so
 that no wrong state lasts. The state before a gap is kept and predicted, with growing uncertainty. After the gap, poses
-that this state does not predict need as many confirmations as poses against a state, or markers that agree beyond
-chance in a pose that does not contradict the kept state. `filter_path` is a loop over `step`.
+that this state does not predict need the same number of confirmations as poses against a state, or markers that agree
+beyond chance in a pose that does not contradict the kept state. `filter_path` is a loop over `step`.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def advance(run: FilterRun, time_s: float, params: PoseFilterParams) -> FilterRu
     """Predict a run to the time of the next frame; states without a pose for too long are dropped.
 
     Raises:
-        InputError: the time is before that of the run.
+        InputError: the time is before the time of the run.
     """
     if run.state is not None and run.state.time_s == time_s:
         return run

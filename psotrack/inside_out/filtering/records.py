@@ -55,7 +55,7 @@ class MeasuredPose:
         position_m, orientation_wxyz, ambiguity: as in `CameraPath`.
         covariance: (6, 6), as in `CameraPath`, without the part that `common` describes.
         common: (6, errors), change of the pose by one standard deviation of each error that is the same in all frames.
-        chance: upper bound on the probability that as many markers agree by chance.
+        chance: upper bound on the probability that the used markers agree by chance.
     """
 
     time_s: float

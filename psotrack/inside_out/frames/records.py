@@ -30,7 +30,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class FrameSource:
-    """Frames of one camera, and what is known of them before they are read.
+    """Frames of one camera, with the facts that are known before the frames are read.
 
     Attributes:
         name: name in messages: a path, a device or an address.

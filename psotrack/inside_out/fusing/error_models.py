@@ -68,7 +68,7 @@ def fit_error_model(
     """Fit an error model, and correct the shape of the stated covariances.
 
     Args:
-        readings: readings of both sources, some of them in the same frames, without gross errors.
+        readings: readings of both sources, partly in the same frames, without gross errors.
         difference_m: (frames, 3), outside less inside at the same time, without the arm, metres; NaN where either is
             unknown.
         arm: prior of the arm.
@@ -157,7 +157,7 @@ def _scales(
 def _equalise_axes(
     covariance_m2: Float[np.ndarray, "frames 2 3 3"], roundness: float
 ) -> Float[np.ndarray, "frames 2 3 3"]:
-    """The covariances, of which a share (`roundness`) of the outside's is made equal along all axes.
+    """Covariances; a share (`roundness`) of the outside-in covariance is made equal along all axes.
 
     Rays that cross well determine a point well, but the point is the middle of a silhouette, which moves in the body. A
     pose from markers of known position has no such error.

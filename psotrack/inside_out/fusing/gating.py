@@ -34,9 +34,9 @@ def gate_readings(
     """Gross errors among readings, and covariances to add to single readings, under one error model.
 
     Where both sources have a reading and the two contradict each other, the reading that fits the motion less is left
-    out. Two readings that agree are used, whatever the motion predicts. A single reading that does not fit the motion
-    gets a larger covariance, with which it lies exactly at the gate: a drone that really jumped is followed, and a
-    gross error has little effect.
+    out. Two readings that agree are used, even if the motion model predicts another position. A single reading that
+    does not fit the motion gets a larger covariance, with which it lies exactly at the gate: a drone that really
+    jumped is followed, and a gross error has little effect.
 
     Gating begins where the two sources first agree, and goes from there to the end and to the beginning.
 

@@ -36,11 +36,11 @@ def localise_frames(
     """Each frame's own pose and the filter's estimate, frame by frame; the two are equal without a filter.
 
     Args:
-        detected: number and time (seconds) of each frame, and its markers; all of them are in the map.
+        detected: number and time (seconds) of each frame, and its markers, which are all in the map.
         marker_map: map of the room.
         lens: intrinsics of the camera.
         settings: settings; the dictionary is not used.
-        seconds: times by stage, to which those of "locate" and "filter" are added.
+        seconds: times by stage; the times of "locate" and "filter" are added.
     """
     spent_s = dict.fromkeys(STAGES, 0.0) if seconds is None else seconds
     run = FilterRun()
@@ -68,7 +68,7 @@ def pose_row(
     pose: MarkerPose | None,
     settings: LocaliseSettings,
 ) -> PoseRow:
-    """A frame of a path with its own pose; without a pose, the number of markers is that of the detected ones."""
+    """A frame of a path with its own pose; without a pose, the number of markers counts the detected markers."""
     num_markers = len(markers) if pose is None else int(pose.used.sum())
     flags = Flag(0)
     if 0 < num_markers < max(PAPER_MARKERS, settings.pose.min_markers):

@@ -147,7 +147,7 @@ def _spread_views(sightings: MarkerSightings) -> Bool[np.ndarray, " sightings"]:
 def _connect(
     sightings: MarkerSightings, placed: Mapping[int, PlacedMarker], side_m: float
 ) -> tuple[MarkerSightings, MappedScene]:
-    """Sightings of placed markers in views that show at least two, which connect markers; and the scene of them."""
+    """Sightings of placed markers in views that show at least two markers; and the scene of these markers and views."""
     kept = np.isin(sightings.marker, list(placed))
     counts = np.bincount(sightings.view[kept], minlength=sightings.num_views)
     connected = sightings.select(kept & (counts[sightings.view] >= 2))

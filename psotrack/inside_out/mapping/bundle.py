@@ -198,7 +198,7 @@ def adjust(
 ) -> AdjustedMap:
     """Adjust a scene so that its projections agree with the measured corners.
 
-    The covariance is that of noise that is independent in every frame, and of errors that a marker's corner has in all
+    The covariance includes noise that is independent in every frame, and errors that a marker's corner has in all
     frames and that many frames do not average out. Both are estimated from the residuals.
 
     Args:
@@ -298,7 +298,7 @@ def _axes(sightings: MarkerSightings) -> Float[np.ndarray, "sightings 4 2 2"]:
 def _lasting_px(bundle: _Bundle) -> float:
     """Standard deviation of a corner's error that all frames share, along each axis, from the mean residuals.
 
-    Each marker has eight mean residuals, and its own six unknowns hide six of them.
+    Each marker has eight mean residuals, and its own six unknowns explain six residuals.
     """
     problem, scene, used = bundle.problem, bundle.scene, bundle.used
     along = np.einsum("scx,scxk->sck", bundle.slopes.off[used], _axes(problem.sightings)[used])

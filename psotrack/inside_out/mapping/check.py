@@ -110,7 +110,7 @@ def check_map(sightings: MarkerSightings, marker_map: MarkerMap) -> MapCheck:
 def _locate_by_map(
     sightings: MarkerSightings, given: Mapping[int, PlacedMarker], side_m: float
 ) -> MappedScene:
-    """The scene in which views agree with as many markers as possible, with all markers where the map has them."""
+    """The scene in which views agree with the largest number of markers, with all markers at their map positions."""
     placer = MarkerPlacer(sightings, side_m)
     scene = make_scene(
         {marker: given[marker] for marker in sightings.ids},

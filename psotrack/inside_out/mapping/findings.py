@@ -49,7 +49,7 @@ class CheckedMarker:
 
     Attributes:
         sightings: number of frames that show the marker beside others of the map.
-        residual_px: median distance in the image between its corners and those of the map, pixels; NaN if unseen.
+        residual_px: median distance in the image between its corners and the corners in the map, pixels; NaN if unseen.
         moved_m: (3,), from the centre in the map to the centre in the video, world; NaN where the two agree.
         std_m: (3,), standard deviation of `moved_m`.
         turned_deg: angle between the axes in the map and in the video, degrees.
@@ -129,7 +129,7 @@ def _unplaced(marker: int, one: CheckedMarker) -> MapFinding:
 def _fault(
     marker: int, given: PlacedMarker, found: PlacedMarker, one: CheckedMarker, other: int | None
 ) -> MapFinding | None:
-    """The fault of one marker; None if the differences are those of any measured map."""
+    """The fault of one marker; None if the differences are usual for a measured map."""
     shift = float(np.linalg.norm(one.moved_m))
     moved = shift > max(_SHIFT_M, _SIGNIFICANT * float(np.linalg.norm(one.std_m)))
     turned = one.turned_deg > max(_TURN_DEG, _SIGNIFICANT * one.turn_std_deg)

@@ -1,4 +1,4 @@
-"""Markers of a room and views of them, with residuals of the corners and their derivatives."""
+"""Markers of a room and views of these markers, with residuals of the corners and their derivatives."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from psotrack.inside_out.pose.fit import Fit, fit
 from psotrack.inside_out.pose.initial_poses import LOOSE, mirrored_poses, pose_of_all, poses_of_pairs
 from psotrack.inside_out.pose.records import ExpectedPose, MarkerPose, PoseSettings
 
-#: Number of markers that suffices for a pose; in frames of fewer than twice as many, half of the markers suffice.
+#: Number of markers that suffices for a pose; in frames of fewer than eight markers, half of the markers suffice.
 _ENOUGH_MARKERS = 4
 #: Logarithm of the density of a pose that is not where motion predicts it: in 1 of 1000 frames the camera is anywhere
 #: in 1000 m³, in any orientation.
