@@ -147,8 +147,8 @@ def test_a_cross_is_learned(markers_m):
 @pytest.mark.parametrize("markers_m", [FOUR_M, FIVE_M], ids=["four", "five"])
 def test_the_frame_depends_on_the_shape_only(markers_m):
     """Two recordings of different flights give the same frame."""
-    one, other = (learn_cross(record_markers(markers_m, seed=seed)) for seed in (1, 2))
-    np.testing.assert_allclose(one.markers_m, other.markers_m, rtol=0, atol=1e-9)
+    first, second = (learn_cross(record_markers(markers_m, seed=seed)) for seed in (1, 2))
+    np.testing.assert_allclose(first.markers_m, second.markers_m, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("order", [[0, 1, 2, 3], [0, 3, 1, 2], [0, 2, 3, 1]])

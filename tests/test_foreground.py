@@ -212,6 +212,6 @@ def test_learning_frames_spread_over_the_video(num_frames: int, num_learning_fra
     ],
 )
 def test_invalid_settings_are_refused(setting: dict[str, object], message: str) -> None:
-    with pytest.raises(SettingsError) as raised:
+    with pytest.raises(SettingsError) as error_info:
         ForegroundSettings(**setting)
-    assert str(raised.value) == message
+    assert str(error_info.value) == message

@@ -51,9 +51,9 @@ def compute_labels(*position_m, cameras=FAR, settings=CUBE, orientation_wxyz=Non
     return label_boxes(cameras, corners_m, settings)[0, :, 0]
 
 
-def iou(one, other):
-    width, height = np.maximum(np.minimum(one[2:], other[2:]) - np.maximum(one[:2], other[:2]), 0)
-    areas = [(box[2] - box[0]) * (box[3] - box[1]) for box in (one, other)]
+def iou(first, second):
+    width, height = np.maximum(np.minimum(first[2:], second[2:]) - np.maximum(first[:2], second[:2]), 0)
+    areas = [(box[2] - box[0]) * (box[3] - box[1]) for box in (first, second)]
     return width * height / (sum(areas) - width * height)
 
 
@@ -160,10 +160,12 @@ def test_boxes_agree_with_corners_projected_by_opencv(coefficients):
         orientation = Rotation.from_quat(wxyz[f, 0], scalar_first=True)
         corners_m = position_m[f, 0] + orientation.apply(offset_m + signs * size_m / 2)
         for c in range(5):
-            one = rig.cameras[c]
-            rotation, _ = cv2.Rodrigues(one.T_cam_world[:3, :3])
-            dist = one.dist if coefficients else None
-            pixels = cv2.projectPoints(corners_m, rotation, one.T_cam_world[:3, 3], one.K, dist)[0][:, 0]
+            camera = rig.cameras[c]
+            rotation, _ = cv2.Rodrigues(camera.T_cam_world[:3, :3])
+            dist = camera.dist if coefficients else None
+            pixels = cv2.projectPoints(corners_m, rotation, camera.T_cam_world[:3, 3], camera.K, dist)[0][
+                :, 0
+            ]
             expected = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)]) + 0.5
             expected = np.clip(expected, 0, [320, 240, 320, 240])
             np.testing.assert_allclose(found[f, 0, c], expected, atol=1e-9)
@@ -371,14 +373,14 @@ def test_sequences_for_validation_can_be_chosen(data, tmp_path):
 
 
 def test_sequences_that_cannot_be_split(data, tmp_path):
-    one, other, out = data / "S01_D2_A", data / "S12_D3", tmp_path / "set"
-    assert "sequences: expected at least two" in refusal_message(SettingsError, one, "--out", out)
+    first, second, out = data / "S01_D2_A", data / "S12_D3", tmp_path / "set"
+    assert "sequences: expected at least two" in refusal_message(SettingsError, first, "--out", out)
     assert "one sequence for training" in refusal_message(
-        SettingsError, one, other, "--out", out, "--validation", "S12_D3,S01_D2_A"
+        SettingsError, first, second, "--out", out, "--validation", "S12_D3,S01_D2_A"
     )
-    assert "found S99" in refusal_message(SettingsError, one, other, "--out", out, "--validation", "S99")
-    assert "S01_D2_A more than once" in refusal_message(SettingsError, one, one, "--out", out)
-    assert run_labels(one, other, "--out", out, "--every", 0).exit_code == 2
+    assert "found S99" in refusal_message(SettingsError, first, second, "--out", out, "--validation", "S99")
+    assert "S01_D2_A more than once" in refusal_message(SettingsError, first, first, "--out", out)
+    assert run_labels(first, second, "--out", out, "--every", 0).exit_code == 2
     with pytest.raises(SettingsError, match="every: expected 1 or more, found 0"):
         FrameSelection(every=0)
     assert not out.exists()
@@ -402,22 +404,24 @@ def test_only_a_data_set_is_replaced_and_only_with_force(data, written_data_set,
 
 
 def test_a_broken_video_leaves_nothing_behind(data, tmp_path):
-    one, other = (read_sequence(data / name) for name in ("S01_D2_A", "S12_D3"))
-    short = {name: replace(video, num_frames=9) for name, video in one.videos.items()}
-    truth = one.truth
+    first, second = (read_sequence(data / name) for name in ("S01_D2_A", "S12_D3"))
+    short = {name: replace(video, num_frames=9) for name, video in first.videos.items()}
+    truth = first.truth
     longer_reference = Trajectories(
         np.arange(9), np.arange(9) / 25, truth.drones, np.broadcast_to(truth.position_m[1], (9, 2, 3))
     )
-    with_wrong_length = replace(one, videos=short, truth=longer_reference)
+    with_wrong_length = replace(first, videos=short, truth=longer_reference)
     with pytest.raises(InputError, match="only 4 can be decoded"):
-        write_data_set([with_wrong_length, other], tmp_path / "set", LabelSettings(SIZE_M), jobs=1)
+        write_data_set([with_wrong_length, second], tmp_path / "set", LabelSettings(SIZE_M), jobs=1)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_without_a_reference(data, tmp_path):
-    one, other = (read_sequence(data / name) for name in ("S01_D2_A", "S12_D3"))
+    first, second = (read_sequence(data / name) for name in ("S01_D2_A", "S12_D3"))
     with pytest.raises(InputError, match=r"S01_D2_A: expected a reference .*, found none"):
-        write_data_set([replace(one, truth=None), other], tmp_path / "set", LabelSettings(SIZE_M), jobs=1)
-    unknown = replace(one.truth, position_m=np.full_like(one.truth.position_m, np.nan))
+        write_data_set([replace(first, truth=None), second], tmp_path / "set", LabelSettings(SIZE_M), jobs=1)
+    unknown = replace(first.truth, position_m=np.full_like(first.truth.position_m, np.nan))
     with pytest.raises(InputError, match="no such frame among the 4 used frames"):
-        write_data_set([replace(one, truth=unknown), other], tmp_path / "set", LabelSettings(SIZE_M), jobs=1)
+        write_data_set(
+            [replace(first, truth=unknown), second], tmp_path / "set", LabelSettings(SIZE_M), jobs=1
+        )

@@ -244,10 +244,10 @@ def test_scale_keeps_the_world_and_shrinks_the_images():
 
 def test_segments_change_only_the_encoded_videos(pair_folder, tmp_path):
     """A video that is encoded in segments differs in bytes; all other files are equal to the byte."""
-    whole = read_contents(simulate(PAIR, tmp_path, TINY, jobs=1))
-    parts = read_contents(pair_folder)
-    assert whole.keys() == parts.keys()
-    assert {name for name in whole if whole[name] != parts[name]} == {
+    unsegmented = read_contents(simulate(PAIR, tmp_path, TINY, jobs=1))
+    segmented = read_contents(pair_folder)
+    assert unsegmented.keys() == segmented.keys()
+    assert {name for name in unsegmented if unsegmented[name] != segmented[name]} == {
         "cam1i_s.avi", "cam2i_s.avi", "dron1_cam_s.avi", "dron2_cam_s.avi",
     }  # fmt: skip
 
@@ -369,18 +369,18 @@ def test_a_simulation_killed_at_random_moments_ends_with_the_same_bytes(pair_fol
     (tmp_path / "run.py").write_text(textwrap.dedent(KILLED_SCRIPT))
     rng = np.random.default_rng(0)
     parent = tmp_path / "Simulated_Data"
-    made = [0]
+    num_segments = [0]
     for jobs in (2, 1):
         # The process is killed a few frames after the frames that existed at its start, plus a random delay.
-        moment = 2 * made[-1] + rng.integers(4, 9), rng.uniform(0, 0.04)
+        moment = 2 * num_segments[-1] + rng.integers(4, 9), rng.uniform(0, 0.04)
         command = [sys.executable, tmp_path / "run.py", tmp_path, *map(str, (jobs, *moment))]
         # `run` waits until stderr is closed, that is until the process and all of its workers have ended.
         killed = subprocess.run(command, input=msgspec.json.encode(PAIR), capture_output=True, check=False)
         assert killed.returncode == -signal.SIGKILL, killed
         # The lock file remains, but the lock ended with the process.
         assert sorted(path.name for path in parent.iterdir()) == [f".{NAME}.lock", f".{NAME}.unfinished"]
-        made.append(len(list(parent.rglob("[0-9]*/video.avi"))))
-    assert made[-1] > 1, "complete segments are kept"
+        num_segments.append(len(list(parent.rglob("[0-9]*/video.avi"))))
+    assert num_segments[-1] > 1, "complete segments are kept"
     assert read_contents(simulate(PAIR, tmp_path, TINY, jobs=1)) == read_contents(pair_folder)
     assert [path.name for path in parent.iterdir()] == [NAME]
 

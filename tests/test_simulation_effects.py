@@ -62,9 +62,9 @@ def hovering(model, position_m, paint=BLACK):
 
 def covered_share(scene, settings, *placed, index=0):
     """Return the share of the backdrop's light that black drones hide, (height, width)."""
-    camera = make_renderer(scene, settings, *placed, index=index)
-    empty = sensor.undevelop(sensor.develop(camera.backdrop.light)).sum(axis=-1)
-    return 1 - sensor.undevelop(camera.clean_frame(0)).sum(axis=-1) / empty
+    renderer = make_renderer(scene, settings, *placed, index=index)
+    empty = sensor.undevelop(sensor.develop(renderer.backdrop.light)).sum(axis=-1)
+    return 1 - sensor.undevelop(renderer.clean_frame(0)).sum(axis=-1) / empty
 
 
 def mean_and_variance(weight):
@@ -89,14 +89,14 @@ def test_develop_inverts_undevelop():
 
 def test_without_effects_pixels_have_the_colour_of_the_room_or_of_a_drone(scene):
     settings = plain_imaging(antialiasing=False)
-    camera = make_renderer(scene, settings, hovering(cube(0.3), (0.3, -0.2, 1.4)))
-    frame, empty = camera.clean_frame(0), sensor.develop(camera.backdrop.light)
-    covered = drone_masks(camera.scene, camera.cam, camera.backdrop.depth_m, 0) > 0
+    renderer = make_renderer(scene, settings, hovering(cube(0.3), (0.3, -0.2, 1.4)))
+    frame, empty = renderer.clean_frame(0), sensor.develop(renderer.backdrop.light)
+    covered = drone_masks(renderer.scene, renderer.cam, renderer.backdrop.depth_m, 0) > 0
     assert covered.sum() > 300
     # Each pixel is sampled once, at its centre, so it shows either the black body or the room.
     assert not frame[covered].any()
     np.testing.assert_array_equal(frame[~covered], empty[~covered])
-    np.testing.assert_array_equal(camera.frame(0), frame)
+    np.testing.assert_array_equal(renderer.frame(0), frame)
 
 
 @pytest.mark.parametrize(
@@ -145,9 +145,9 @@ def test_frames_do_not_depend_on_the_order_of_rendering(scene):
     settings = msgspec.structs.replace(Imaging(), jpeg_quality=60, flicker=0.3, exposure_drift=0.05)
     recipe = msgspec.structs.replace(S02, imaging=settings)
     all_effects_scene = replace(scene, scenario=recipe)
-    camera, second = CameraRenderer(all_effects_scene, 2), CameraRenderer(all_effects_scene, 2)
-    forward = [camera.frame(frame) for frame in (5, 90)]
-    backward = [second.frame(frame) for frame in (90, 5)]
+    renderer, other_renderer = CameraRenderer(all_effects_scene, 2), CameraRenderer(all_effects_scene, 2)
+    forward = [renderer.frame(frame) for frame in (5, 90)]
+    backward = [other_renderer.frame(frame) for frame in (90, 5)]
     np.testing.assert_array_equal(forward, backward[::-1])
 
 
@@ -218,30 +218,34 @@ def test_fresnel_agrees_with_glass():
 
 
 def test_the_floor_mirrors_more_where_it_is_seen_at_a_lower_angle(scene):
-    camera = make_renderer(scene, plain_imaging(reflections=0.1))
-    eye = -camera.cam.R.T @ camera.cam.t_m
+    renderer = make_renderer(scene, plain_imaging(reflections=0.1))
+    eye = -renderer.cam.R.T @ renderer.cam.t_m
     for floor_m in ((-1.5, -1.0, 0.0), (0.5, 0.0, 0.0), (2.5, 2.0, 0.0)):
         x, y = pixel_of(scene, 0, floor_m).round().astype(int)
         cosine = eye[2] / np.linalg.norm(eye - floor_m)
         # Rounding to the pixel, up to half a pixel, changes the distance by up to one percent here.
-        assert camera.mirror.share[y, x] == pytest.approx(0.1 + 0.9 * (1 - cosine) ** 5, rel=0.02)
-    assert not camera.mirror.share[~camera.backdrop.floor].any()
+        assert renderer.mirror.share[y, x] == pytest.approx(0.1 + 0.9 * (1 - cosine) ** 5, rel=0.02)
+    assert not renderer.mirror.share[~renderer.backdrop.floor].any()
 
 
 @pytest.mark.parametrize("index", [0, 4, 6])
 def test_the_mirror_image_is_the_drone_reflected_at_the_floor(scene, index):
     centre = np.array([0.3, -0.2, 0.9])
-    camera = make_renderer(
+    renderer = make_renderer(
         scene, plain_imaging(reflections=0.5, lens_blur_px=0.5), hovering(cube(0.3), centre), index=index
     )
-    change = sensor.undevelop(camera.clean_frame(0)) - sensor.undevelop(sensor.develop(camera.backdrop.light))
+    change = sensor.undevelop(renderer.clean_frame(0)) - sensor.undevelop(
+        sensor.develop(renderer.backdrop.light)
+    )
     # The mirror image of a black body hides mirrored light; the hidden share is the coverage of the mirror image.
-    covered = -change.sum(axis=-1) / np.maximum(camera.mirror.share * camera.mirror.light.sum(axis=-1), 1e-3)
+    covered = -change.sum(axis=-1) / np.maximum(
+        renderer.mirror.share * renderer.mirror.light.sum(axis=-1), 1e-3
+    )
     corners = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) * 0.15 + centre
     below = corners * [1, 1, -1]
-    pixels = cv2.projectPoints(below, cv2.Rodrigues(camera.cam.R)[0], camera.cam.t_m, camera.cam.K, None)[0][
-        :, 0
-    ]
+    pixels = cv2.projectPoints(
+        below, cv2.Rodrigues(renderer.cam.R)[0], renderer.cam.t_m, renderer.cam.K, None
+    )[0][:, 0]
     (x, y), reach = pixels.mean(axis=0).round().astype(int), 24
     window = np.s_[y - reach : y + reach + 1, x - reach : x + reach + 1]
     covered = np.where(covered[window] > 0.03, covered[window], 0)
@@ -250,7 +254,7 @@ def test_the_mirror_image_is_the_drone_reflected_at_the_floor(scene, index):
     # Rounding to 8 bits and the four blur passes at the edge shift the centre: measured 0.10 px at most.
     np.testing.assert_allclose(mean_and_variance(covered)[0] + [x - reach, y - reach], expected, atol=0.15)
     assert covered.sum() == pytest.approx(shape["m00"] / 64**2, rel=0.08)
-    assert drone_masks(camera.scene, camera.cam, camera.backdrop.depth_m, 0)[y, x] == 0
+    assert drone_masks(renderer.scene, renderer.cam, renderer.backdrop.depth_m, 0)[y, x] == 0
 
 
 @pytest.mark.parametrize("height_m", [0.7, 1.2])
@@ -261,15 +265,15 @@ def test_a_rough_floor_blurs_the_mirror_image_of_a_higher_drone_more(scene, monk
     widths = []
     for roughness_rad in (0.0, rough_rad):
         monkeypatch.setattr(reflections, "ROUGHNESS_RAD", roughness_rad)
-        camera = make_renderer(scene, plain_imaging(reflections=0.5), hovering(cube(0.3), centre))
-        change = sensor.undevelop(camera.clean_frame(0)) - sensor.undevelop(
-            sensor.develop(camera.backdrop.light)
+        renderer = make_renderer(scene, plain_imaging(reflections=0.5), hovering(cube(0.3), centre))
+        change = sensor.undevelop(renderer.clean_frame(0)) - sensor.undevelop(
+            sensor.develop(renderer.backdrop.light)
         )
-        covered = -change.sum(axis=-1) / (camera.mirror.share * camera.mirror.light.sum(axis=-1) + 1e-9)
+        covered = -change.sum(axis=-1) / (renderer.mirror.share * renderer.mirror.light.sum(axis=-1) + 1e-9)
         widths.append(mean_and_variance(covered[window])[1])
     # Seen by the camera, an angle at the floor is reduced by the ratio of drone-floor distance to the whole path.
-    eye_m = -camera.cam.R.T @ camera.cam.t_m
-    sigma_px = rough_rad * camera.cam.K[0, 0] * height_m / (height_m + eye_m[2])
+    eye_m = -renderer.cam.R.T @ renderer.cam.t_m
+    sigma_px = rough_rad * renderer.cam.K[0, 0] * height_m / (height_m + eye_m[2])
     # Rounding to 8 bits cuts off the tails of the blur: measured 0.92 to 0.95 of the variance.
     np.testing.assert_allclose(np.subtract(*widths[::-1]), sigma_px**2, rtol=0.15)
 
@@ -282,11 +286,11 @@ def test_a_rough_floor_blurs_the_mirror_image_of_distant_walls_more(scene, monke
     """
     rough = make_renderer(scene, plain_imaging(reflections=0.5)).mirror
     monkeypatch.setattr(reflections, "ROUGHNESS_RAD", 0.0)
-    camera = make_renderer(scene, plain_imaging(reflections=0.5))
-    smooth = camera.mirror
-    beyond = 1 - camera.backdrop.depth_m / smooth.depth_m
-    blurred = cv2.GaussianBlur(smooth.light, (0, 0), 0.006 * camera.cam.K[0, 0] / 3)
-    foot, third = (camera.backdrop.floor & (np.abs(beyond - share) < 0.01) for share in (0.0, 1 / 3))
+    renderer = make_renderer(scene, plain_imaging(reflections=0.5))
+    smooth = renderer.mirror
+    beyond = 1 - renderer.backdrop.depth_m / smooth.depth_m
+    blurred = cv2.GaussianBlur(smooth.light, (0, 0), 0.006 * renderer.cam.K[0, 0] / 3)
+    foot, third = (renderer.backdrop.floor & (np.abs(beyond - share) < 0.01) for share in (0.0, 1 / 3))
     assert min(foot.sum(), third.sum()) > 100
     # Pixels are within 0.01 of the two shares: measured differences 0.001 and 0.004, at light values up to 3.
     np.testing.assert_allclose(rough.light[foot], smooth.light[foot], atol=0.01)
@@ -298,36 +302,36 @@ def test_a_rough_floor_blurs_the_mirror_image_of_distant_walls_more(scene, monke
 def test_mirrored_furniture_hides_what_is_behind_it(scene, beyond_m, seen):
     pillar = np.array([-1.975, 2.875, 0.0])
     index, found = 1, None
-    camera = make_renderer(scene, plain_imaging(reflections=0.5), index=index)
+    renderer = make_renderer(scene, plain_imaging(reflections=0.5), index=index)
     for height_m in np.arange(0.3, 2.0, 0.1):
         pixel = pixel_of(scene, index, pillar - [0, 0, height_m])
         x, y = pixel.round().astype(int)
         if (
-            5 < x < camera.cam.width - 5
-            and 5 < y < camera.cam.height - 5
-            and camera.backdrop.floor[y - 4 : y + 5, x - 4 : x + 5].all()
+            5 < x < renderer.cam.width - 5
+            and 5 < y < renderer.cam.height - 5
+            and renderer.backdrop.floor[y - 4 : y + 5, x - 4 : x + 5].all()
         ):
             found = pixel, height_m
             break
     assert found, "the foot of a pillar must be mirrored somewhere"
     pixel, height_m = found
-    ray = camera.cam.R.T @ np.linalg.inv(camera.cam.K) @ [*pixel, 1.0]
+    ray = renderer.cam.R.T @ np.linalg.inv(renderer.cam.K) @ [*pixel, 1.0]
     depth_m = project(scene.rig.cameras[index], pillar - [0, 0, height_m])[1]
-    eye = -camera.cam.R.T @ camera.cam.t_m
+    eye = -renderer.cam.R.T @ renderer.cam.t_m
     position = (eye + (depth_m + beyond_m) * ray) * [1, 1, -1]
     with_cube = make_renderer(
         scene, plain_imaging(reflections=0.5), hovering(cube(0.15), position), index=index
     )
     x, y = pixel.round().astype(int)
-    darker = sensor.develop(camera.backdrop.light)[y, x].astype(int) - with_cube.clean_frame(0)[y, x]
+    darker = sensor.develop(renderer.backdrop.light)[y, x].astype(int) - with_cube.clean_frame(0)[y, x]
     assert (darker.max() > 10) == seen
 
 
 def test_shadows_dim_only_the_diffuse_light_of_the_floor(scene):
     model, at_m = cube(0.4), np.array([1.0, -0.5, 0.5])
-    camera = make_renderer(scene, plain_imaging(reflections=0.5, shadows=True), hovering(model, at_m))
+    renderer = make_renderer(scene, plain_imaging(reflections=0.5, shadows=True), hovering(model, at_m))
     dull = make_renderer(scene, plain_imaging(shadows=True), hovering(model, at_m))
-    gain = camera.shadows.floor_gain(0.0)
+    gain = renderer.shadows.floor_gain(0.0)
     row, column = np.unravel_index(gain.argmin(), gain.shape)
     cell_m = 10.0 / gain.shape[1]
     foot = np.array([(column + 0.5) * cell_m - 5.0, 4.0 - (row + 0.5) * cell_m, 0.0])
@@ -340,10 +344,10 @@ def test_shadows_dim_only_the_diffuse_light_of_the_floor(scene):
         if min(np.hypot(*(cube_px - [x, y])) for cube_px in cubes) < 26:
             continue
         i, j = int((4.0 - point[1]) / cell_m), int((point[0] + 5.0) / cell_m)
-        share = camera.mirror.share[y, x]
-        expected = gain[i, j] * (1 - share) * dull.backdrop.light[y, x] + share * camera.mirror.light[y, x]
+        share = renderer.mirror.share[y, x]
+        expected = gain[i, j] * (1 - share) * dull.backdrop.light[y, x] + share * renderer.mirror.light[y, x]
         # The tolerance covers pixels that are four cells wide and two roundings to 8 bits.
-        np.testing.assert_allclose(sensor.undevelop(camera.clean_frame(0))[y, x], expected, rtol=0.04)
+        np.testing.assert_allclose(sensor.undevelop(renderer.clean_frame(0))[y, x], expected, rtol=0.04)
         checked += 1
     assert checked >= 1
     assert gain.min() < 0.9
@@ -420,8 +424,8 @@ def test_a_rotor_lets_three_quarters_of_the_light_through(scene):
 def test_shadows_turn_with_their_drone(scene, yaw_rad):
     bar = replace(cube(0.3), triangles_m=cube(0.3).triangles_m * [2.0, 0.2, 0.2])
     flight = replace(straight_flight((0.4, 0.2, 0.08)), heading=Heading(yaw_rad))
-    camera = make_renderer(scene, plain_imaging(contact_shadows=True), (bar, flight, BLACK))
-    lost = 1 - camera.shadows.floor_gain(0.0)
+    renderer = make_renderer(scene, plain_imaging(contact_shadows=True), (bar, flight, BLACK))
+    lost = 1 - renderer.shadows.floor_gain(0.0)
     assert lost.max() > 0.1
     # Row numbers of the floor's map grow in the direction of -y.
     rows, columns = np.indices(lost.shape)
@@ -459,11 +463,11 @@ def test_flicker_beats_with_the_frame_rate_and_vanishes_at_whole_half_waves():
     np.testing.assert_allclose(slow[625:], slow[:-625], atol=1e-6)
     assert np.ptp(slow[:625]) == pytest.approx(0.4 / (1 - 0.2) * np.sinc(0.2), rel=0.01)
     assert np.abs(np.diff(slow)).max() < 0.003
-    whole = [
+    at_half_waves = [
         sensor.flicker_gain(plain_imaging(flicker=0.4, shutter_s=0.01, mains_hz=50.0), 0.3, t)
         for t in frames_s
     ]
-    np.testing.assert_allclose(whole, 1.0, atol=1e-12)
+    np.testing.assert_allclose(at_half_waves, 1.0, atol=1e-12)
 
 
 def test_flicker_is_equal_in_all_cameras():
@@ -479,7 +483,13 @@ def test_drift_is_slow_and_has_the_given_standard_deviation(effect):
     sigma = 0.02
     sensors = [sensor.Sensor(plain_imaging(**{effect: sigma}), 0, stream, (8, 8)) for stream in range(400)]
     gains = (
-        np.array([[camera.gains(time_s) for time_s in (3.0, 50.0, 200.0, 1000.0)] for camera in sensors]) - 1
+        np.array(
+            [
+                [camera_sensor.gains(time_s) for time_s in (3.0, 50.0, 200.0, 1000.0)]
+                for camera_sensor in sensors
+            ]
+        )
+        - 1
     )
     # 400 cameras at four distant times give at least 1600 independent numbers: a standard error of 2 %.
     assert gains.std() == pytest.approx(sigma, rel=0.06)
@@ -497,12 +507,12 @@ def test_drift_is_slow_and_has_the_given_standard_deviation(effect):
 
 
 def test_gains_multiply_linear_light():
-    camera = sensor.Sensor(plain_imaging(exposure_drift=0.1, white_balance_drift=0.1), 2, 1, (16, 16))
+    camera_sensor = sensor.Sensor(plain_imaging(exposure_drift=0.1, white_balance_drift=0.1), 2, 1, (16, 16))
     image = np.full((16, 16, 3), 150, np.uint8)
     for time_s in (0.0, 7.0, 31.0):
-        ratio = sensor.undevelop(camera.expose(image, 0, time_s)) / sensor.undevelop(image)
+        ratio = sensor.undevelop(camera_sensor.expose(image, 0, time_s)) / sensor.undevelop(image)
         # Half a grey level of 150 is 0.33 %, which gamma multiplies in linear light.
-        np.testing.assert_allclose(ratio[0, 0], camera.gains(time_s), rtol=0.008)
+        np.testing.assert_allclose(ratio[0, 0], camera_sensor.gains(time_s), rtol=0.008)
 
 
 # --- noise and JPEG
@@ -511,9 +521,9 @@ def test_gains_multiply_linear_light():
 @pytest.mark.parametrize(("read", "shot"), [(1.0, 3.0), (0.0, 5.0), (2.5, 0.0)])
 @pytest.mark.parametrize("level", [16, 100, 220])
 def test_noise_variance_is_the_sum_of_read_and_shot_noise(read, shot, level):
-    camera = sensor.Sensor(plain_imaging(read_noise=read, shot_noise=shot), 0, 0, (120, 160))
+    camera_sensor = sensor.Sensor(plain_imaging(read_noise=read, shot_noise=shot), 0, 0, (120, 160))
     image = np.full((120, 160, 3), level, np.uint8)
-    frames = np.stack([camera.expose(image, frame, frame / 25) for frame in range(8)]).astype(float)
+    frames = np.stack([camera_sensor.expose(image, frame, frame / 25) for frame in range(8)]).astype(float)
     # Rounding to whole grey levels adds 1/12. Neighbouring pixels are correlated; measured within 2 %.
     assert frames.var() == pytest.approx(read**2 + shot**2 * level / 255 + 1 / 12, rel=0.05)
     assert frames.mean() == pytest.approx(level, abs=0.1)

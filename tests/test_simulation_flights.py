@@ -326,9 +326,9 @@ def test_spacing_changes_without_a_group_and_headings_differ_within_a_group():
     circle = [make_orbit(phase, radius_m=(1.5, 1.5)) for phase in (0.0, 120.0)]
     alone = make_scenario(*circle, variation=Variation(), num_frames=9000)
     assert np.ptp(pairwise_distances_m(positions(alone, 0, stride=10))) > 0.5
-    one, other = plan(make_scenario(*circle, groups=("ring",) * 2, variation=Variation()), 0)
-    assert one.heading.yaw_rad != other.heading.yaw_rad
-    assert one.heading.phase_rad != other.heading.phase_rad
+    first, other = plan(make_scenario(*circle, groups=("ring",) * 2, variation=Variation()), 0)
+    assert first.heading.yaw_rad != other.heading.yaw_rad
+    assert first.heading.phase_rad != other.heading.phase_rad
 
 
 def test_different_kinds_of_flights_of_one_group_share_their_variation():

@@ -155,7 +155,7 @@ def test_written_poses_are_the_poses_of_the_rendered_frames(scene, tmp_path):
 @pytest.mark.parametrize("drone", range(4))
 @pytest.mark.parametrize("frame", [0, 90, 170])
 def test_the_painted_room_agrees_with_a_depth_buffer(scene, drone, frame):
-    """The painter draws in an order without depth; the oracle is a depth buffer. Both use full-size textures."""
+    """The painter draws surfaces from far to near without depth; the oracle is a depth buffer with full textures."""
     surfaces = scene.room.surfaces
     cam = OnboardRenderer(scene, drone).cam_at(scene.time_s(frame))
     painted = np.empty((cam.height, cam.width, 4), np.uint16)

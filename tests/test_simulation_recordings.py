@@ -135,8 +135,8 @@ def test_two_nearly_simultaneous_samples_give_small_errors_of_the_acceleration()
 
 def test_a_gap_in_a_noisy_recording_is_bridged_without_an_excursion():
     kept = (EVEN_S < 4.0) | (EVEN_S > 4.4)
-    whole = sample_formula(EVEN_S, noise_m=1e-3)
-    replay = make_replay(Recorded(EVEN_S[kept], whole.position_m[kept], None))
+    complete = sample_formula(EVEN_S, noise_m=1e-3)
+    replay = make_replay(Recorded(EVEN_S[kept], complete.position_m[kept], None))
     missing_s = np.linspace(4.0, 4.4, 21)
     # Largest measured error 0.5 mm.
     assert np.abs(replay.position_m(missing_s) - FORMULA.position_m(missing_s)).max() < 2e-3
@@ -157,13 +157,13 @@ def test_the_shortest_recordings_are_replayed_with_noise(count):
 )
 def test_shifting_a_recording_in_space_and_time_shifts_the_flight(rate_hz, offset_m, later_s):
     time_s = np.arange(2 * rate_hz) / rate_hz
-    here = sample_formula(time_s)
-    there = Recorded(time_s + later_s, here.position_m + offset_m, None)
+    original = sample_formula(time_s)
+    shifted = Recorded(time_s + later_s, original.position_m + offset_m, None)
     query_s = np.linspace(0.0, 1.9, 20)
     # Times near 1000 s are rounded to 1e-13 s; the spline's equations amplify this by less than 1e4, at 2 m/s.
     np.testing.assert_allclose(
-        make_replay(there).position_m(query_s),
-        make_replay(here, offset_m=offset_m).position_m(query_s),
+        make_replay(shifted).position_m(query_s),
+        make_replay(original, offset_m=offset_m).position_m(query_s),
         atol=1e-8,
     )
 
