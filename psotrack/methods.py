@@ -32,13 +32,14 @@ from psotrack.trajectories import Tracks
 
 @dataclass(frozen=True)
 class TrackedPoint:
-    """Which point of a drone its track is of. No image shows where the body's origin is.
+    """The point of a drone that its track follows; no image shows where the origin of the body is.
 
     Attributes:
         drone: number of the drone.
-        middle_of: "silhouette" or "box".
-        box_off_m, box_off_std_m: (3,), from the middle of the silhouette to the middle of the boxes along the world's
-            axes, and its standard error, metres; None where it is not known.
+        middle_of: "silhouette" or "box": the track follows the middle of the silhouette or of the box.
+        box_off_m: (3,), vector from the middle of the silhouette to the middle of the box along the world's axes,
+            metres; None where the vector is not known.
+        box_off_std_m: (3,), standard error of `box_off_m`, metres; None where it is not known.
     """
 
     drone: int
@@ -49,14 +50,14 @@ class TrackedPoint:
 
 @dataclass(frozen=True)
 class MethodResult:
-    """What a method yields for one run.
+    """The result of a method for one run.
 
     Attributes:
-        tracks: of all frames.
-        points: for each drone the point that its track is of.
+        tracks: tracks of all frames.
+        points: for each drone the point that its track follows.
         initial: state of the drones at frame 0.
-        input_keys: digests of what was read, by camera.
-        seconds: by stage; "track" and "compile" at least.
+        input_keys: digests of the inputs, by camera.
+        seconds: seconds of each stage; "track" and "compile" at least.
     """
 
     tracks: Tracks
@@ -119,12 +120,12 @@ class Method(Protocol):
 
 @dataclass(frozen=True)
 class DetectionInputs:
-    """Detections of all cameras, and digests of what was read.
+    """Detections of all cameras, and digests of the files or silhouettes that they come from.
 
     Attributes:
         sightings: boxes in all frames of all cameras.
         keys: digests by camera.
-        seconds: that reading took.
+        seconds: time of reading, seconds.
     """
 
     sightings: Sightings
@@ -135,7 +136,7 @@ class DetectionInputs:
 def read_sightings(
     recording: Recording, silhouettes: Silhouettes | None, source: str, report: Report = no_progress
 ) -> DetectionInputs:
-    """The detections that `TrackSettings.detections` names.
+    """Read the detections that `TrackSettings.detections` names.
 
     Raises:
         InputError: the detections cannot be read.
@@ -153,7 +154,7 @@ def read_sightings(
 
 
 def detection_files_of(recording: Recording, source: str) -> Mapping[str, Path]:
-    """The file of each camera, as `TrackSettings.detections` names them.
+    """The file of detections of each camera, found by `TrackSettings.detections`.
 
     Raises:
         InputError: there is no such file.
@@ -177,7 +178,7 @@ def track_by_swarm(
     fps: float,
     report: Report = no_progress,
 ) -> list[MethodResult]:
-    """Results of one or more runs of the swarm, which are tracked together.
+    """Track one or more runs by the swarm, all runs together.
 
     The seconds of a run are its share of the time of all runs.
     """
@@ -205,7 +206,7 @@ def track_by_projection_lines(
     known: tuple[Float[np.ndarray, "known 3"], Float[np.ndarray, "known 3"]] | None,
     report: Report = no_progress,
 ) -> MethodResult:
-    """The result of one run of the projection lines (see `psotrack.projection_lines.track_detections`)."""
+    """Track one run by projection lines (see `psotrack.projection_lines.track_detections`)."""
     began = time.perf_counter()
     tracks = track_detections(
         rig.cameras,
@@ -224,7 +225,7 @@ def track_by_projection_lines(
 def fuse_methods(
     swarm: MethodResult, lines: MethodResult, settings: TrackSettings, fps: float
 ) -> MethodResult:
-    """The results of both methods for one run, fused."""
+    """Fuse the results of both methods for one run."""
     began = time.perf_counter()
     tracks, offset = fuse_tracks(
         swarm.tracks,
@@ -248,7 +249,7 @@ def fuse_methods(
 
 
 def track_by_plugin(method: Method, inputs: MethodInputs, report: Report = no_progress) -> MethodResult:
-    """The result of one run of a method that another package or the caller brings."""
+    """Track one run by a method that another package or the caller brings."""
     began = time.perf_counter()
     tracks = method(inputs, report)
     keys = {} if inputs.silhouettes is None else dict(inputs.silhouettes.keys)

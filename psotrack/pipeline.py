@@ -103,10 +103,10 @@ _INTERFACES: dict[str, type] = {
 
 @dataclass(frozen=True)
 class TrackedRecording:
-    """The result of tracking a sequence.
+    """The result of tracking a recording.
 
     Attributes:
-        trajectories: of every drone in every frame.
+        trajectories: positions and covariances of every drone in every frame.
         size_m: (drones, 3), full lengths of each drone along the world's axes, as learned, metres.
         identities: which drones may have been taken for each other, and when.
         record: settings, versions, device, input keys and seconds per stage, fit for JSON.
@@ -137,12 +137,12 @@ def track_recording(
     """Track the drones of a recording from its videos.
 
     Args:
-        recording: checked for use (see `Recording.usable`).
-        settings: of the run.
+        recording: a recording that was checked for use (see `Recording.usable`).
+        settings: settings of the run.
         cache: folder of the stored silhouettes and detections.
-        jobs: number of processes for the silhouettes; None is one per processor.
+        jobs: number of processes that make silhouettes; None is one per processor.
         parts: parts that the caller brings.
-        report: reports progress of each stage, in frames.
+        report: shows the progress of each stage, in frames.
 
     Raises:
         InputError: a video cannot be used, or the drones cannot be found.
@@ -179,71 +179,37 @@ def track_runs(
     parts: Parts = Parts(),
     report: Report = no_progress,
 ) -> list[TrackedRecording | InputError]:
-    """Track a recording once for each of the settings: each run as if alone, many runs in the time of a few.
+    """Track a recording once for each of the settings; each result is that of the run alone.
 
-    Runs of the swarm whose settings differ only in seeds, and in numbers other than of particles and windows, are one
-    batch, which all devices share (`jax.devices()`). The seconds of a run are its share of the batch's.
+    Many runs take the time of a few: runs of the swarm form one batch where their settings differ only in the seed and
+    in numbers other than the number of particles and the windows. All devices share a batch (`jax.devices()`). The
+    seconds of a run are its share of the batch's seconds.
 
     Args:
-        recording: checked for use (see `Recording.usable`).
-        silhouettes: of all cameras; None where no settings need any (see `TrackSettings.needs_silhouettes`).
-        settings: of each run.
+        recording: a recording that was checked for use (see `Recording.usable`).
+        silhouettes: silhouettes of all cameras; None where no run needs them (see `TrackSettings.needs_silhouettes`).
+        settings: settings of each run.
         parts: parts that the caller brings, for all runs.
-        report: reports progress, in frames; all runs of a method advance together.
+        report: shows the progress in frames; the runs of one method go through the frames together.
 
     Returns:
-        For each run its result, or why there is none.
+        For each run its result, or the error that explains why the run has none.
 
     Raises:
-        InputError: there is no reference or file to start from, or detections cannot be read.
+        InputError: there is no reference or file for the initial state, or detections cannot be read.
         SettingsError: a setting does not fit the recording.
     """
-    fps, runs = recording.fps, range(len(settings))
-    sources = [start_source(recording, each.init) for each in settings]
-    bounds_m = [room_bounds(recording.rig, each.bounds_m) for each in settings]
-    detections = [_detections(recording, silhouettes, each, parts, report) for each in settings]
-    lines = [
-        None
-        if read is None or not _tracks_detections(each, parts)
-        else track_by_projection_lines(
-            recording.rig,
-            read,
-            _line_settings(each),
-            fps=fps,
-            bounds_m=bounds,
-            known=known_motion(source, each.drones, fps),
-            report=report,
-        )
-        for each, read, bounds, source in zip(settings, detections, bounds_m, sources, strict=True)
+    runs = [_prepare(recording, silhouettes, each, parts, report) for each in settings]
+    by_lines = [_track_detections(recording, run, report) for run in runs]
+    initial = _initial_states(recording, silhouettes, runs, by_lines)
+    by_swarm = _track_silhouettes(recording, silhouettes, runs, initial, parts, report)
+    by_plugin = [
+        _track_with_plugin(recording, silhouettes, run, state, report)
+        for run, state in zip(runs, initial, strict=True)
     ]
-    initial = _initial_states(recording, silhouettes, settings, sources, bounds_m, lines)
-    results: list[MethodResult | None] = list(lines)
-    by_swarm = [run for run in runs if _tracks_silhouettes(settings[run], parts)]
-    if by_swarm:
-        assert silhouettes is not None
-        inputs = [
-            RunInputs(
-                initial[run],
-                bounds_m[run],
-                tracker_settings(settings[run], search=parts.search, score=parts.score),
-            )
-            for run in by_swarm
-        ]
-        swarm = track_by_swarm(recording.rig, silhouettes, inputs, fps, report)
-        for run, result in zip(by_swarm, swarm, strict=True):
-            other = lines[run]
-            results[run] = result if other is None else fuse_methods(result, other, settings[run], fps)
-    for run in runs:
-        method = _other_method(settings[run], parts)
-        if method is not None:
-            read = detections[run]
-            sightings = None if read is None else read.sightings
-            inputs_of_run = MethodInputs(
-                recording.rig, silhouettes, sightings, initial[run], bounds_m[run], fps, settings[run]
-            )
-            results[run] = track_by_plugin(method, inputs_of_run, report)
     return [
-        _finished(recording, settings[run], parts, results[run], bounds_m[run], silhouettes) for run in runs
+        _finish(recording, silhouettes, run, parts, plugin or _fuse(swarm, lines, run, recording.fps))
+        for run, lines, swarm, plugin in zip(runs, by_lines, by_swarm, by_plugin, strict=True)
     ]
 
 
@@ -257,15 +223,45 @@ def environment() -> dict[str, Any]:
     }
 
 
-def _tracks_silhouettes(settings: TrackSettings, parts: Parts) -> bool:
-    return parts.method is None and settings.method in ("swarm", "fused")
+@dataclass(frozen=True)
+class _Run:
+    """What is known of a run before tracking.
+
+    Attributes:
+        settings: settings of the run.
+        source: source of the initial state.
+        bounds_m: (2, 3), lowest and highest corner of the room, metres.
+        plugin: the method that the caller brings or that an entry point names; None for the methods of this package.
+        detections: detections of all cameras; None where the method reads none.
+    """
+
+    settings: TrackSettings
+    source: StartSource
+    bounds_m: Float[np.ndarray, "2 3"]
+    plugin: Method | None
+    detections: DetectionInputs | None
 
 
-def _tracks_detections(settings: TrackSettings, parts: Parts) -> bool:
-    return parts.method is None and settings.method in ("projection-lines", "fused")
+def _prepare(
+    recording: Recording,
+    silhouettes: Silhouettes | None,
+    settings: TrackSettings,
+    parts: Parts,
+    report: Report,
+) -> _Run:
+    """Find the room's bounds, and read the detections that the method needs."""
+    plugin = _plugin(settings, parts)
+    reads_detections = _tracks_detections(settings, plugin) if plugin is None else plugin.reads_detections
+    return _Run(
+        settings,
+        start_source(recording, settings.init),
+        room_bounds(recording.rig, settings.bounds_m),
+        plugin,
+        read_sightings(recording, silhouettes, settings.detections, report) if reads_detections else None,
+    )
 
 
-def _other_method(settings: TrackSettings, parts: Parts) -> Method | None:
+def _plugin(settings: TrackSettings, parts: Parts) -> Method | None:
     """The method that the caller brings, or that an entry point names; None for the methods of this package."""
     if parts.method is not None:
         return parts.method
@@ -277,10 +273,18 @@ def _other_method(settings: TrackSettings, parts: Parts) -> Method | None:
     return method
 
 
+def _tracks_silhouettes(settings: TrackSettings, plugin: Method | None) -> bool:
+    return plugin is None and settings.method in ("swarm", "fused")
+
+
+def _tracks_detections(settings: TrackSettings, plugin: Method | None) -> bool:
+    return plugin is None and settings.method in ("projection-lines", "fused")
+
+
 def _check_detector_is_used(settings: TrackSettings, parts: Parts) -> None:
     """Raise `SettingsError` if a detector is brought, but the method reads no detections or reads other ones."""
-    method = _other_method(settings, parts)
-    if not (_tracks_detections(settings, parts) if method is None else method.reads_detections):
+    method = _plugin(settings, parts)
+    if not (_tracks_detections(settings, method) if method is None else method.reads_detections):
         name = settings.method if method is None else type(method).__name__
         expected = "a method that reads detections, such as projection-lines or fused"
         raise SettingsError("detector", expected=expected, found=f"method {name}")
@@ -289,70 +293,118 @@ def _check_detector_is_used(settings: TrackSettings, parts: Parts) -> None:
         raise SettingsError("detector", expected="detections from one source", found=found)
 
 
-def _detections(
-    recording: Recording,
-    silhouettes: Silhouettes | None,
-    settings: TrackSettings,
-    parts: Parts,
-    report: Report,
-) -> DetectionInputs | None:
-    """The detections of a run; None where its method reads none."""
-    method = _other_method(settings, parts)
-    reads = _tracks_detections(settings, parts) if method is None else method.reads_detections
-    return read_sightings(recording, silhouettes, settings.detections, report) if reads else None
-
-
-def _line_settings(settings: TrackSettings) -> LineSettings:
-    return LineSettings(settings.motion, settings.drones, settings.status, settings.swarm.spread_m)
+def _track_detections(recording: Recording, run: _Run, report: Report) -> MethodResult | None:
+    """The result of the projection lines; None where the run's method does not use them."""
+    if run.detections is None or not _tracks_detections(run.settings, run.plugin):
+        return None
+    settings = run.settings
+    return track_by_projection_lines(
+        recording.rig,
+        run.detections,
+        LineSettings(settings.motion, settings.drones, settings.status, settings.swarm.spread_m),
+        fps=recording.fps,
+        bounds_m=run.bounds_m,
+        known=known_motion(run.source, settings.drones, recording.fps),
+        report=report,
+    )
 
 
 def _initial_states(
     recording: Recording,
     silhouettes: Silhouettes | None,
-    settings: Sequence[TrackSettings],
-    sources: Sequence[StartSource],
-    bounds_m: Sequence[Float[np.ndarray, "2 3"]],
-    lines: Sequence[MethodResult | None],
+    runs: Sequence[_Run],
+    by_lines: Sequence[MethodResult | None],
 ) -> list[InitialState]:
     """The initial state of each run; runs that differ only in their seeds have the same one.
 
-    A run of the projection lines alone starts from its own first frame.
+    A run of the projection lines alone starts from the first frame of its own tracks.
     """
     states: dict[TrackSettings, InitialState] = {}
     of_runs = []
-    for each, source, bounds, of_lines in zip(settings, sources, bounds_m, lines, strict=True):
-        if each.method == "projection-lines" and of_lines is not None:
-            of_runs.append(of_lines.initial)
+    for run, lines in zip(runs, by_lines, strict=True):
+        if run.settings.method == "projection-lines" and lines is not None:
+            of_runs.append(lines.initial)
             continue
-        without_seed = msgspec.structs.replace(each, seed=0)
+        without_seed = msgspec.structs.replace(run.settings, seed=0)
         if without_seed not in states:
             assert silhouettes is not None
+            drones = run.settings.drones
             found = find_initial_state(
                 recording.rig,
                 silhouettes,
-                source,
-                each.drones,
+                run.source,
+                drones,
                 fps=recording.fps,
-                bounds_m=bounds,
-                max_speed_m_s=each.motion.max_speed_m_s,
+                bounds_m=run.bounds_m,
+                max_speed_m_s=run.settings.motion.max_speed_m_s,
             )
-            detected = None if of_lines is None else of_lines.initial
-            states[without_seed] = complete_initial_state(found, detected, each.drones, source)
+            detected = None if lines is None else lines.initial
+            states[without_seed] = complete_initial_state(found, detected, drones, run.source)
         of_runs.append(states[without_seed])
     return of_runs
 
 
-def _finished(
+def _track_silhouettes(
     recording: Recording,
-    settings: TrackSettings,
-    parts: Parts,
-    result: MethodResult | None,
-    bounds_m: Float[np.ndarray, "2 3"],
     silhouettes: Silhouettes | None,
+    runs: Sequence[_Run],
+    initial: Sequence[InitialState],
+    parts: Parts,
+    report: Report,
+) -> list[MethodResult | None]:
+    """The results of the swarm, for all runs together; None for runs whose method does not use the swarm."""
+    by_swarm = [number for number, run in enumerate(runs) if _tracks_silhouettes(run.settings, run.plugin)]
+    results: list[MethodResult | None] = [None] * len(runs)
+    if not by_swarm:
+        return results
+    assert silhouettes is not None
+    inputs = [
+        RunInputs(
+            initial[number],
+            runs[number].bounds_m,
+            tracker_settings(runs[number].settings, search=parts.search, score=parts.score),
+        )
+        for number in by_swarm
+    ]
+    tracked = track_by_swarm(recording.rig, silhouettes, inputs, recording.fps, report)
+    for number, result in zip(by_swarm, tracked, strict=True):
+        results[number] = result
+    return results
+
+
+def _track_with_plugin(
+    recording: Recording,
+    silhouettes: Silhouettes | None,
+    run: _Run,
+    initial: InitialState,
+    report: Report,
+) -> MethodResult | None:
+    """The result of the method that is plugged in; None where there is none."""
+    if run.plugin is None:
+        return None
+    sightings = None if run.detections is None else run.detections.sightings
+    inputs = MethodInputs(
+        recording.rig, silhouettes, sightings, initial, run.bounds_m, recording.fps, run.settings
+    )
+    return track_by_plugin(run.plugin, inputs, report)
+
+
+def _fuse(
+    by_swarm: MethodResult | None, by_lines: MethodResult | None, run: _Run, fps: float
+) -> MethodResult:
+    """The results of swarm and projection lines fused; the result of one of them where the run used only one."""
+    if by_swarm is not None and by_lines is not None:
+        return fuse_methods(by_swarm, by_lines, run.settings, fps)
+    result = by_swarm or by_lines
+    assert result is not None, "each method of the package uses the swarm, projection lines, or both"
+    return result
+
+
+def _finish(
+    recording: Recording, silhouettes: Silhouettes | None, run: _Run, parts: Parts, result: MethodResult
 ) -> TrackedRecording | InputError:
-    """The trajectories and the record of one run."""
-    assert result is not None
-    tracks = result.tracks
+    """Resolve identities, smooth, move to the body's origin, and write the record of one run."""
+    settings, tracks = run.settings, result.tracks
     if not tracks.num_drones:
         return InputError(
             recording.folder,
@@ -377,7 +429,7 @@ def _finished(
         **({"parts": parts.record} if parts.record else {}),
         "seed": settings.seed,
         "start": {name: value.tolist() for name, value in vars(result.initial).items()},
-        "bounds_m": bounds_m.tolist(),
+        "bounds_m": run.bounds_m.tolist(),
         "drones": _sizes_record(tracks.sizes),
         "arrivals": [asdict(arrival) for arrival in tracks.arrivals],
         "points": [asdict(point) for point in result.points],

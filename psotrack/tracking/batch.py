@@ -1,8 +1,8 @@
-"""Drones tracked through one chunk of frames: in one run, or in many runs at once.
+"""Tracking of one chunk of frames, for one run or for many runs at once.
 
 Runs with the same number of drones and the same program form a batch: one compiled function, one copy of the
-silhouettes. On a CPU the runs of a batch are computed one after the other, each as if it were alone and to the same
-bits; on an accelerator side by side.
+silhouettes. On a CPU the runs of a batch are computed one after the other, and each run gives the same bits as alone.
+On an accelerator the runs are computed side by side.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from psotrack.trajectories import Status
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class TrackedDrones:
-    """Everything of a run whose arrays have an axis of drones.
+    """The records of a run whose arrays have an axis of drones.
 
     Attributes:
-        state: of the tracker.
-        params: of the tracker.
-        sizes: the running estimate of the drones' sizes.
+        state: state of the tracker.
+        params: parameters of the tracker.
+        sizes: running estimate of the drones' sizes.
     """
 
     state: tracker.TrackerState
@@ -45,18 +45,18 @@ class TrackedDrones:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Chunk:
-    """A chunk of silhouettes, and how many of its frames count.
+    """A chunk of silhouettes; the last chunk of a recording is filled up with empty frames.
 
     Attributes:
-        coverage: (frames, cameras, height, width) uint8.
-        num_frames: frames that count; the frames after them only fill the chunk.
+        coverage: (frames, cameras, height, width) uint8, foreground of each cell, 0 to 255.
+        num_frames: number of frames of the recording in this chunk; the empty frames come after these.
     """
 
     coverage: UInt8[Array, "frames cameras height width"]
     num_frames: Int[Array, ""]
 
 
-#: The drones after a chunk, the tracker's info, and the sizes that each frame shows by itself.
+#: The drones after a chunk, the tracker's info, and the sizes measured in each frame.
 BatchResult = tuple[TrackedDrones, tracker.TrackerInfo, SizeMeasurements]
 
 #: The leaves of a pytree of arrays.
@@ -75,17 +75,17 @@ def track_batch(
     """Track the drones of one or more runs through a chunk, and learn their sizes.
 
     Args:
-        runs: of each run the drones, and the tracks that start in the chunk. All have the same number of drones.
+        runs: drones of each run, and the tracks that start in the chunk. All runs have the same number of drones.
         chunk: the silhouettes.
-        cameras: with one leading axis, float32.
-        program: of all runs.
+        cameras: cameras with one leading axis, float32.
+        program: static values of the tracker, the same for all runs.
         capacity: number of runs for which the function is compiled. Unused capacity costs next to nothing.
-        device: computes.
+        device: device that computes.
 
     Returns:
         One result for each run. The info has all frames of the chunk.
     """
-    # The first run fills the places of runs that are missing.
+    # The first run fills the unused places of the batch.
     filled = (*runs, *[runs[0]] * (capacity - len(runs)))
     # JAX compiles separately for arrays committed to a device and for uncommitted ones: all are committed.
     arguments = jax.device_put((filled, jnp.int32(len(runs)), chunk, cameras), device)
@@ -102,8 +102,8 @@ def _track_batch(
 ) -> list[BatchResult]:
     structures: list[Any] = []
 
-    # Leaves instead of records: the arrays of many runs have an axis that the records do not declare.
-    def of_leaves(leaves: Leaves) -> Leaves:
+    # Leaves instead of records: arrays of many runs have an axis of runs, which the records do not declare.
+    def track_leaves(leaves: Leaves) -> Leaves:
         drones, starts = jax.tree.unflatten(jax.tree.structure(runs[0]), leaves)
         leaves, structure = jax.tree.flatten(_track_run(drones, starts, chunk, cameras, program))
         structures.append(structure)
@@ -111,7 +111,9 @@ def _track_batch(
 
     batch = [jnp.stack(leaves) for leaves in zip(*map(jax.tree.leaves, runs), strict=True)]
     side_by_side = jax.default_backend() != "cpu"
-    tracked = jax.vmap(of_leaves)(batch) if side_by_side else _one_after_another(of_leaves, batch, count)
+    tracked = (
+        jax.vmap(track_leaves)(batch) if side_by_side else _one_after_another(track_leaves, batch, count)
+    )
     return [jax.tree.unflatten(structures[0], [leaf[run] for leaf in tracked]) for run in range(len(runs))]
 
 
@@ -122,7 +124,7 @@ def _track_run(
     cameras: Camera,
     program: tracker.Program,
 ) -> BatchResult:
-    """Track the drones of one run through a chunk, then learn their sizes from it."""
+    """Track the drones of one run through a chunk, then learn their sizes from the chunk."""
     coverage = chunk.coverage
     state, info = tracker.track(drones.state, coverage, cameras, drones.params, program, starts)
     counts = (jnp.arange(coverage.shape[0]) < chunk.num_frames)[:, None]
@@ -142,21 +144,23 @@ def _track_run(
     return TrackedDrones(state, replace(drones.params, size_m=learned.size_m), learned), info, measured
 
 
-def _one_after_another(of_leaves: Callable[[Leaves], Leaves], batch: Leaves, count: Int[Array, ""]) -> Leaves:
+def _one_after_another(
+    track_leaves: Callable[[Leaves], Leaves], batch: Leaves, count: Int[Array, ""]
+) -> Leaves:
     """The first `count` runs of a batch, one after the other; the results of the other runs are 0.
 
-    Barriers keep the loop apart from the code that it repeats, and the compiler does not know the number of
-    repetitions: the same instructions run for a batch of any size, so the same bits come out.
+    Barriers keep the compiler from merging the loop with the code that the loop repeats, and the compiler does not know
+    the number of repetitions. So the same instructions run for a batch of any size, and the result has the same bits.
     """
 
     def at(number: Array) -> Leaves:
         alone = [jax.lax.dynamic_index_in_dim(leaf, number, keepdims=False) for leaf in batch]
-        return jax.lax.optimization_barrier(of_leaves(jax.lax.optimization_barrier(alone)))
+        return jax.lax.optimization_barrier(track_leaves(jax.lax.optimization_barrier(alone)))
 
     def body(number: Array, done: Leaves) -> Leaves:
         return [
-            jax.lax.dynamic_update_index_in_dim(of_all, new, number, 0)
-            for of_all, new in zip(done, at(number), strict=True)
+            jax.lax.dynamic_update_index_in_dim(all_runs, new, number, 0)
+            for all_runs, new in zip(done, at(number), strict=True)
         ]
 
     shapes = jax.eval_shape(at, jnp.int32(0))

@@ -1,8 +1,8 @@
-"""Chunk after chunk through a recording: the tracker, new tracks, and the sizes of the drones.
+"""Tracking of a whole recording, chunk by chunk.
 
 The compiled tracker tracks a fixed number of drones. After each chunk of frames, the foreground that no track explains
-is searched for new drones (the chunk is then tracked again, with them) and for lost drones. The drones' sizes are
-learned on the way.
+is searched for new drones and for lost drones; the chunk is then tracked again with the new tracks. The sizes of the
+drones are learned chunk by chunk.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from psotrack.trajectories import Arrival, DroneSizes, Status, Tracks, unknown_v
 
 logger = logging.getLogger(__name__)
 
-#: Frames that are on the device at once. Eight 1080p cameras at a quarter of the size are 26 MB.
+#: Number of frames of a chunk. Eight cameras of 1080p at a quarter of the size take 26 MB on the device.
 CHUNK_FRAMES = 25
 
 #: Records whose arrays have the axes (frames, drones, ...).
@@ -52,7 +52,7 @@ Frames = TypeVar("Frames", tracker.TrackerInfo, SizeMeasurements)
 
 @dataclass(frozen=True)
 class RunInputs:
-    """What one run of the tracker starts from.
+    """Inputs of one run of the tracker.
 
     Attributes:
         initial: positions, velocities and sizes of the drones at frame 0; may have no drones.
@@ -79,14 +79,14 @@ class _Run:
 
 @dataclass(frozen=True)
 class _Setting:
-    """What all runs on one device share.
+    """Values that all runs on one device share.
 
     Attributes:
         rig: the cameras in float64.
         cameras: the same cameras in float32, in which the tracker computes.
         reduction: image pixels per silhouette pixel, along each side.
         fps: frames per second.
-        device: computes.
+        device: device that computes.
     """
 
     rig: Rig
@@ -104,23 +104,23 @@ def track_silhouettes(
     fps: float,
     report: Report = no_progress,
 ) -> list[tuple[Tracks, float]]:
-    """Track all frames in one or more runs, which share all devices (`jax.devices()`).
+    """Track the drones of one or more runs through all frames; the runs share all devices (`jax.devices()`).
 
     Args:
-        rig: of the cameras.
-        silhouettes: of all cameras of the rig.
-        runs: what each run starts from.
+        rig: calibrated cameras.
+        silhouettes: silhouettes of all cameras of the rig.
+        runs: inputs of each run.
         fps: frames per second.
-        report: reports progress, in frames; all runs advance together.
+        report: shows the progress in frames; all runs go through the frames together.
 
     Returns:
-        For each run its tracks, and the seconds that compiling took.
+        For each run its tracks, and its share of the time of compiling, seconds.
     """
     kinds = [_kind(tracker_program(run.settings, silhouettes.reduction), run.settings) for run in runs]
     capacity = {kind: largest_share(kinds, kind) for kind in set(kinds)}
     work = partial(_track_through_chunks, rig, silhouettes, fps, capacity)
     tracked = share_among_devices(runs, kinds, work, report)
-    # Devices compile at the same time.
+    # All devices compile at the same time, so the time of compiling is counted once.
     return [(tracks, compile_s / num_used_devices(len(runs))) for tracks, compile_s in tracked]
 
 
@@ -130,7 +130,7 @@ def on_device(cameras: Camera) -> Camera:
 
 
 def _kind(program: tracker.Program, settings: TrackerSettings) -> Hashable:
-    """What is compiled for a run, besides its number of drones: runs of one kind can be one batch."""
+    """Static values for which a run's program is compiled, besides the number of drones; a batch has one kind."""
     return program, jax.tree.structure(settings.search)
 
 
@@ -186,7 +186,7 @@ def _tracks(run: _Run) -> Tracks:
 
 
 class _Batches:
-    """Tracks runs of equal shape together; compiles a program when a shape first occurs."""
+    """Tracks runs in batches of equal shape, and compiles a program when a shape first occurs."""
 
     def __init__(
         self,
@@ -207,7 +207,7 @@ class _Batches:
         coverage: np.ndarray,
         num_frames: int,
     ) -> list[BatchResult]:
-        """Each run's drones after a chunk, and the info of the chunk's frames, as NumPy arrays."""
+        """Track a chunk; return for each run its drones after the chunk, and info and sizes of each frame in NumPy."""
         by_shape: dict[tuple[Hashable, int], list[int]] = {}
         for number, run in enumerate(runs):
             shape = (_kind(run.program, run.inputs.settings), len(run.drones))
@@ -224,7 +224,7 @@ class _Batches:
             )
             if shape not in self._compiled:
                 began = time.perf_counter()
-                # A chunk without iterations takes only the compiler's time, which separates compiling from tracking.
+                # A blank chunk without iterations takes next to no time to track; the rest is the time of compiling.
                 idle = _without_iterations(runs[numbers[0]].drones)
                 starts = tracker.no_track_starts(len(idle))
                 jax.block_until_ready(
@@ -259,7 +259,7 @@ def _chunks(silhouettes: Silhouettes) -> Iterator[tuple[int, np.ndarray, int]]:
 
 
 def _begin(inputs: RunInputs, setting: _Setting) -> _Run:
-    """A run before the first frame."""
+    """Prepare a run for the first frame."""
     initial, settings = inputs.initial, inputs.settings
     program = tracker_program(settings, setting.reduction)
     params = tracker_params(settings, initial.size_m, fps=setting.fps, bounds_m=inputs.bounds_m)
@@ -290,7 +290,7 @@ def _track_starts(planned: PlannedStarts | None, num_drones: int) -> tracker.Tra
 def _plan_new_tracks(
     coverage: np.ndarray, infos: list[tracker.TrackerInfo], run: _Run, setting: _Setting
 ) -> PlannedStarts | None:
-    """Where tracks start, or start again, in the last chunk that was tracked; None if no track starts."""
+    """Plan the tracks that start, or start again, in the chunk that was just tracked; None if no track starts."""
     settings, drones, fps = run.inputs.settings, run.drones, setting.fps
     size_m = np.asarray(drones.params.size_m, np.float64)
     whole = _joined(infos, len(drones))
@@ -329,7 +329,7 @@ def _plan_new_tracks(
 
 
 def _without_false_tracks(drones: TrackedDrones, infos: list[tracker.TrackerInfo]) -> TrackedDrones:
-    """The drones without the tracks that turned out to be of no drone: these are absent from now on."""
+    """Mark the tracks that turned out to follow no drone as absent from the next chunk on."""
     whole = _joined(infos, len(drones))
     is_false = find_false_tracks(
         np.asarray(whole.position_m, np.float64),
@@ -341,7 +341,7 @@ def _without_false_tracks(drones: TrackedDrones, infos: list[tracker.TrackerInfo
 
 
 def _known_well(infos: list[tracker.TrackerInfo]) -> Bool[np.ndarray, "frames drones"]:
-    """In which frames of the last chunk a drone's position is known well enough to explain foreground.
+    """Whether a drone's position is known well enough to explain foreground, for each frame of the last chunk.
 
     The limit is the tracker's limit for occlusion: at most `MAX_OCCLUDING_FRAMES` since the drone was found.
     """
@@ -353,7 +353,7 @@ def _known_well(infos: list[tracker.TrackerInfo]) -> Bool[np.ndarray, "frames dr
 
 
 def _add_tracks(run: _Run, planned: PlannedStarts, first_frame: int) -> None:
-    """Add the drones that are new, absent until their first frame; note and log all starts."""
+    """Add the new drones, which are absent until their first frame; record and log all starts."""
     num_known, settings, born_m = len(run.drones), run.inputs.settings, planned.born_size_m
     if len(born_m):
         if settings.drones.size_m is not None:
@@ -374,7 +374,7 @@ def _add_tracks(run: _Run, planned: PlannedStarts, first_frame: int) -> None:
 
 
 def _joined(parts: list[Frames], num_drones: int) -> Frames:
-    """All frames of the parts; values of drones that a part does not have are unknown."""
+    """Join the frames of all parts; values of drones that a part does not have are unknown."""
 
     def filled(value: np.ndarray, name: str) -> np.ndarray:
         missing = [(0, 0), (0, num_drones - value.shape[1]), *[(0, 0)] * (value.ndim - 2)]

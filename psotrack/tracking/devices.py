@@ -15,23 +15,23 @@ from psotrack.support import Advance, Report
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-#: Works on some jobs on one device, and reports its progress.
+#: Function that does some jobs on one device, and reports the progress.
 Work = Callable[[list[Job], jax.Device, Report], list[Result]]
 
 
 def share_among_devices(
     jobs: Sequence[Job], kinds: Sequence[Hashable], work: Work[Job, Result], report: Report
 ) -> list[Result]:
-    """The results of all jobs, in the order of the jobs.
+    """Do all jobs, and return the results in the order of the jobs.
 
     While one device computes, the Python code of another device's thread has the processor. The calling thread works on
-    the first share itself: it reports the progress, and receives an interrupt.
+    the first share itself, so that it reports the progress and receives an interrupt.
 
     Args:
-        jobs: what to do.
-        kinds: of each job, what is compiled for it. Jobs of one kind are spread evenly over the devices.
-        work: does a part of the jobs on one device.
-        report: reports progress of the first device.
+        jobs: the jobs.
+        kinds: kind of each job: jobs of one kind use the same compiled program, and are spread evenly over the devices.
+        work: function that does some of the jobs on one device.
+        report: shows the progress of the first device.
     """
     devices = jax.devices()[: len(jobs)]
     by_kind = sorted(range(len(jobs)), key=lambda number: kinds.index(kinds[number]))
