@@ -12,13 +12,13 @@ from psotrack.geometry import make_extents, project, project_boxes
 
 
 @jax.jit
-def boxes_of(cameras, position_m, size_m):
+def compiled_boxes(cameras, position_m, size_m):
     boxes = project_boxes(make_extents(cameras, size_m), position_m)
     return boxes.xyxy, boxes.in_front
 
 
-def boxes(rig, position_m, size_m):
-    xyxy, in_front = boxes_of(float32(rig.cameras), float32(position_m), float32(size_m))
+def compute_boxes(rig, position_m, size_m):
+    xyxy, in_front = compiled_boxes(float32(rig.cameras), float32(position_m), float32(size_m))
     return np.asarray(xyxy, np.float64), np.asarray(in_front)
 
 
@@ -34,7 +34,7 @@ def sampled_boxes(rig, position_m, size_m, num_points=20_000):
 def test_an_offset_moves_the_extent_from_the_position(coefficients):
     """Boxes with an offset per drone equal boxes without offsets at the middles of the ellipsoids."""
     rig = ring_rig(5, coefficients=coefficients)
-    position_m, size_m = drones(2)
+    position_m, size_m = random_drones(2)
     particles_m = position_m + 0.1 * np.random.default_rng(2).standard_normal((7, 2, 3))
     offset_m = np.array([[0.02, -0.01, -0.04], [0.0, 0.03, 0.05]])
 
@@ -43,13 +43,13 @@ def test_an_offset_moves_the_extent_from_the_position(coefficients):
         return project_boxes(make_extents(cameras, size_m, offset_m), position_m).xyxy
 
     found = offset_boxes(*float32((rig.cameras, particles_m, size_m, offset_m)))
-    expected, _ = boxes(rig, particles_m + offset_m, size_m)
+    expected, _ = compute_boxes(rig, particles_m + offset_m, size_m)
     # Coordinates of 5 m in float32 are exact to 5e-7 m, which is 1e-4 px; the limit is a few such errors.
     np.testing.assert_allclose(found, expected, atol=1e-3)
-    assert np.abs(expected - boxes(rig, particles_m, size_m)[0]).min(axis=(0, 1, 2)).max() > 0.1
+    assert np.abs(expected - compute_boxes(rig, particles_m, size_m)[0]).min(axis=(0, 1, 2)).max() > 0.1
 
 
-def drones(count, seed=0):
+def random_drones(count, seed=0):
     rng = np.random.default_rng(seed)
     return rng.uniform((-1, -1, 0.4), (1, 1, 2.2), (count, 3)), rng.uniform(0.2, 0.6, (count, 3))
 
@@ -58,8 +58,8 @@ def drones(count, seed=0):
 @pytest.mark.parametrize("coefficients", sorted(LENSES))
 def test_boxes_touch_the_outline(num_drones, num_cameras, coefficients):
     rig = ring_rig(num_cameras, coefficients=coefficients)
-    position_m, size_m = drones(num_drones)
-    xyxy, in_front = boxes(rig, position_m, size_m)
+    position_m, size_m = random_drones(num_drones)
+    xyxy, in_front = compute_boxes(rig, position_m, size_m)
     assert xyxy.shape == (num_drones, num_cameras, 4)
     assert in_front.all()
     sampled = sampled_boxes(rig, position_m, size_m)
@@ -74,7 +74,7 @@ def test_the_box_of_a_large_near_ellipsoid_is_exact():
     rig = ring_rig(3)
     position_m = rig.cameras.centre_world[:1] + 1.3 * rig.cameras.T_cam_world[:1, 2, :3] + [[0.1, 0.2, 0.1]]
     size_m = np.array([[1.0, 0.8, 0.9]])
-    xyxy, _ = boxes(rig, position_m, size_m)
+    xyxy, _ = compute_boxes(rig, position_m, size_m)
     # With half widths of 200 px, the outermost sample misses the outline by 0.03 px.
     np.testing.assert_allclose(xyxy, sampled_boxes(rig, position_m, size_m), atol=0.05)
 
@@ -85,9 +85,9 @@ shifts = st.lists(st.floats(-3, 3), min_size=3, max_size=3)
 @given(shifts, st.sampled_from(sorted(LENSES)))
 def test_moving_world_and_rig_together_changes_no_box(shift_m, coefficients):
     rig = ring_rig(3, coefficients=coefficients)
-    position_m, size_m = drones(2)
-    xyxy, _ = boxes(rig, position_m, size_m)
-    shifted, _ = boxes(move_world(rig, np.eye(3), shift_m), position_m + shift_m, size_m)
+    position_m, size_m = random_drones(2)
+    xyxy, _ = compute_boxes(rig, position_m, size_m)
+    shifted, _ = compute_boxes(move_world(rig, np.eye(3), shift_m), position_m + shift_m, size_m)
     # Coordinates up to 10 m in float32 are exact to 1e-6 m: at 1.5 m depth and 300 px focal length 2e-4 px.
     np.testing.assert_allclose(shifted, xyxy, atol=3e-3)
 
@@ -95,22 +95,22 @@ def test_moving_world_and_rig_together_changes_no_box(shift_m, coefficients):
 @given(st.lists(st.floats(-np.pi, np.pi), min_size=3, max_size=3), shifts, st.sampled_from(sorted(LENSES)))
 def test_turning_world_and_rig_together_changes_no_box_of_a_sphere(turn, shift_m, coefficients):
     rig = ring_rig(3, coefficients=coefficients)
-    position_m, _ = drones(2)
+    position_m, _ = random_drones(2)
     size_m = np.array([[0.4] * 3, [0.25] * 3])
     R = Rotation.from_rotvec(turn).as_matrix()
-    xyxy, _ = boxes(rig, position_m, size_m)
-    turned, _ = boxes(move_world(rig, R, shift_m), position_m @ R.T + shift_m, size_m)
+    xyxy, _ = compute_boxes(rig, position_m, size_m)
+    turned, _ = compute_boxes(move_world(rig, R, shift_m), position_m @ R.T + shift_m, size_m)
     np.testing.assert_allclose(turned, xyxy, atol=3e-3)
 
 
 def test_particles_drones_and_cameras_broadcast():
     rig = ring_rig(5)
-    _, size_m = drones(2)
-    position_m = drones(14)[0].reshape(7, 2, 3)
-    together, _ = boxes(rig, position_m, size_m)
+    _, size_m = random_drones(2)
+    position_m = random_drones(14)[0].reshape(7, 2, 3)
+    together, _ = compute_boxes(rig, position_m, size_m)
     assert together.shape == (7, 2, 5, 4)
     for particle in range(7):
-        alone, _ = boxes(rig, position_m[particle], size_m)
+        alone, _ = compute_boxes(rig, position_m[particle], size_m)
         # Both are the same arithmetic, but the compiler may fuse operations differently.
         np.testing.assert_allclose(together[particle], alone, atol=1e-3)
 
@@ -121,13 +121,13 @@ def test_behind_or_around_the_camera_is_flagged_and_finite(distance_m):
     rig = ring_rig(3, coefficients=5)
     position_m = rig.cameras.centre_world[:1] + distance_m * rig.cameras.T_cam_world[:1, 2, :3]
     size_m = np.full((1, 3), 0.4)
-    xyxy, in_front = boxes(rig, position_m, size_m)
+    xyxy, in_front = compute_boxes(rig, position_m, size_m)
     assert not in_front[0, 0]
     assert in_front[0, 1:].all()
     assert np.isfinite(xyxy).all()
 
     def total(position):
-        return boxes_of(float32(rig.cameras), position, float32(size_m))[0].sum()
+        return compiled_boxes(float32(rig.cameras), position, float32(size_m))[0].sum()
 
     assert np.isfinite(jax.jit(jax.grad(total))(float32(position_m))).all()
 
@@ -137,7 +137,7 @@ def test_behind_or_around_the_camera_is_flagged_and_finite(distance_m):
     st.lists(st.floats(0.015625, 1.5, width=32), min_size=3, max_size=3),
 )
 def test_edges_are_in_order_for_drones_in_front(position_m, size_m):
-    xyxy, in_front = boxes(ring_rig(5), np.array([position_m]), np.array([size_m]))
+    xyxy, in_front = compute_boxes(ring_rig(5), np.array([position_m]), np.array([size_m]))
     assert np.isfinite(xyxy).all()
     x0, y0, x1, y1 = xyxy[in_front].T
     assert (x0 < x1).all()

@@ -35,7 +35,7 @@ def observe(rng, *, lasting_px=1.0, stated_px=1.0, noise_px=1.0, rig=RIG):
     return pixels, CommonErrors(drone, np.full(pixels.shape[:2], stated_px))
 
 
-def misplaced(indices, rng, *, turn_deg=0.0, shift_m=0.0):
+def misplace_cameras(indices, rng, *, turn_deg=0.0, shift_m=0.0):
     """The rig with wrong poses of some cameras: turned by random angles, degrees, and shifted by `shift_m`, metres."""
     T = RIG.cameras.T_cam_world.copy()
     for index in indices:
@@ -86,7 +86,7 @@ def test_a_correct_rig_is_not_changed(seed):
 @pytest.mark.parametrize(("turn_deg", "shift_m"), [(0.0, 0.05), (0.5, 0.0)])
 def test_only_the_camera_that_was_pushed_is_moved(turn_deg, shift_m):
     rng = np.random.default_rng(3)
-    rig = misplaced([2], rng, turn_deg=turn_deg, shift_m=shift_m)
+    rig = misplace_cameras([2], rng, turn_deg=turn_deg, shift_m=shift_m)
     pixels, common_errors = observe(rng)
     improved = improve(rig, pixels, common_errors=[common_errors])
     assert (improved.moved, improved.zoomed) == (("c2",), {})
@@ -104,7 +104,7 @@ def test_only_the_camera_that_was_pushed_is_moved(turn_deg, shift_m):
 
 def test_if_most_cameras_are_wrong_all_are_moved():
     rng = np.random.default_rng(4)
-    rig = misplaced(range(5), rng, turn_deg=0.6)
+    rig = misplace_cameras(range(5), rng, turn_deg=0.6)
     pixels, common_errors = observe(rng)
     adjusted = adjust(rig, pixels, common_errors=[common_errors])
     assert find_wrong_cameras(rig, adjusted) == RIG.names

@@ -13,7 +13,7 @@ from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import Rig, project
 
 
-def jittered(rig: Rig, rng, *, turn_deg=0.6, shift_m=0.03, skip=()) -> Rig:
+def jitter_cameras(rig: Rig, rng, *, turn_deg=0.6, shift_m=0.03, skip=()) -> Rig:
     """The rig with random errors of turn and shift in all cameras but those named in `skip`."""
     T = rig.cameras.T_cam_world.copy()
     for index, name in enumerate(rig.names):
@@ -47,7 +47,7 @@ def test_a_jittered_rig_is_adjusted_to_the_ground_truth():
     seen = np.isfinite(pixels).all(axis=-1)
     wrong = seen & (rng.random(seen.shape) < 0.03)
     pixels[wrong] += rng.choice([-1, 1], (wrong.sum(), 2)) * rng.uniform(25, 200, (wrong.sum(), 2))
-    given_rig = jittered(rig, rng)
+    given_rig = jitter_cameras(rig, rng)
     adjusted = adjust(given_rig, pixels, 1.0)
     truth = rig.cameras.centre_world
     assert np.linalg.norm(given_rig.cameras.centre_world - truth, axis=1).mean() > 0.03
@@ -75,7 +75,7 @@ def test_the_covariance_of_the_rig_covers_the_errors():
     distances = []
     for _ in range(runs):
         _, pixels = observe(rig, rng, 31)
-        adjusted = adjust(jittered(rig, rng, skip=("c0", "c3")), pixels, 1.0, fixed=("c0", "c3"))
+        adjusted = adjust(jitter_cameras(rig, rng, skip=("c0", "c3")), pixels, 1.0, fixed=("c0", "c3"))
         off = adjusted.rig.cameras.centre_world - rig.cameras.centre_world
         # Fixed cameras keep every bit.
         np.testing.assert_array_equal(off[[0, 3]], 0)
@@ -92,7 +92,7 @@ def test_the_rig_as_a_whole_is_not_moved():
     rng = np.random.default_rng(2)
     rig = ring_rig(5, image_size_wh=(1920, 1080))
     _, pixels = observe(rig, rng, 61, noise_px=0.0)
-    given_rig = jittered(rig, rng)
+    given_rig = jitter_cameras(rig, rng)
     adjusted = adjust(given_rig, pixels, 1.0)
     assert np.nanmax(adjusted.residual_px) < 1e-3
     turns = Rotation.from_matrix(
@@ -132,7 +132,7 @@ def test_a_common_focal_length_is_found():
     rng = np.random.default_rng(4)
     rig = ring_rig(5, image_size_wh=(1920, 1080))
     _, pixels = observe(rig, rng, 151)
-    wide = jittered(rig, rng)
+    wide = jitter_cameras(rig, rng)
     wrong_K = wide.cameras.K.copy()
     wrong_K[:, :2, :2] *= 1.02
     adjusted = adjust(Rig(rig.names, replace(wide.cameras, K=wrong_K)), pixels, rescaled=rig.names)

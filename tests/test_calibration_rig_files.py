@@ -76,7 +76,7 @@ distortion_coefficients: !!opencv-matrix
 """
 
 
-def named(rig, *names):
+def with_names(rig, *names):
     return Rig((*names, *rig.names[len(names) :]), rig.cameras)
 
 
@@ -85,7 +85,7 @@ def named(rig, *names):
 def test_a_rig_is_read_as_it_was_written(tmp_path, file, coefficients):
     # Eleven cameras, whose tables must not be sorted as text. Three names that need care: a serial number, a word of
     # YAML, and characters that must be quoted.
-    rig = named(ring_rig(11, coefficients=coefficients), "60881257", "true", 'a "b" \\ é: #')
+    rig = with_names(ring_rig(11, coefficients=coefficients), "60881257", "true", 'a "b" \\ é: #')
     write_rig(tmp_path / file, rig)
     back = read_rig(tmp_path / file)
     assert back.names == rig.names

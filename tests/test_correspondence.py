@@ -34,7 +34,7 @@ def separate_points(count, rng, least_m=0.6):
     return points
 
 
-def observed(rig, drones, rng, *, noise_px, missed=0.0, false=0):
+def observe(rig, drones, rng, *, noise_px, missed=0.0, false=0):
     """Simulate detections: per camera, their pixels in random order, and the number of each one's drone (-1: none)."""
     pixels = pixels_of(rig, drones)
     points, owners = [], []
@@ -48,7 +48,7 @@ def observed(rig, drones, rng, *, noise_px, missed=0.0, false=0):
     return points, owners
 
 
-def matched(rig, points, noise_px, **options):
+def match_points(rig, points, noise_px, **options):
     """Match detections that all have the same noise."""
     noise = [np.full(len(detections), float(noise_px)) for detections in points]
     return match(rig.cameras, points, noise, bounds_m=BOUNDS_M, **options)
@@ -62,7 +62,7 @@ def groups_of(matches):
 # --- epipolar lines
 
 
-def bent_by_opencv(cam, straight):
+def distort_by_opencv(cam, straight):
     """Pixels after distortion by OpenCV, from pixels without distortion."""
     rays = np.column_stack([straight, np.ones(len(straight))]) @ np.linalg.inv(cam.K).T
     return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), cam.K, np.array(cam.dist))[0][:, 0]
@@ -74,7 +74,7 @@ def test_distances_from_epipolar_lines_equal_opencvs(coefficients):
     rng = np.random.default_rng(0)
     a, b = rig.cameras[1], rig.cameras[3]
     straight = [rng.uniform((60, 60), (260, 180), (count, 2)) for count in (7, 3)]
-    bent = [bent_by_opencv(cam, points) for cam, points in zip((a, b), straight, strict=True)]
+    bent = [distort_by_opencv(cam, points) for cam, points in zip((a, b), straight, strict=True)]
     R = b.T_cam_world[:3, :3] @ a.T_cam_world[:3, :3].T
     t = b.T_cam_world[:3, 3] - R @ a.T_cam_world[:3, 3]
     cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
@@ -156,9 +156,9 @@ def test_groups_have_the_least_total_cost_of_all_assignments(seed):
     rng = np.random.default_rng(seed)
     rig = ring_rig(3, image_size_wh=LARGE_WH, coefficients=(0, 5)[seed % 2])
     drones = separate_points(2 + seed % 2, rng)
-    points, _ = observed(rig, drones, rng, noise_px=3.0, missed=0.1, false=seed // 2 % 2)
+    points, _ = observe(rig, drones, rng, noise_px=3.0, missed=0.1, false=seed // 2 % 2)
     expected, _ = least_total(rig, points, 3.0)
-    assert groups_of(matched(rig, points, 3.0)) == expected
+    assert groups_of(match_points(rig, points, 3.0)) == expected
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -167,12 +167,12 @@ def test_the_total_cost_is_not_above_that_of_the_true_groups(seed):
     rng = np.random.default_rng(seed)
     rig = ring_rig(7, image_size_wh=LARGE_WH)
     drones = separate_points(6, rng)
-    points, owners = observed(rig, drones, rng, noise_px=2.0, missed=0.1, false=2)
+    points, owners = observe(rig, drones, rng, noise_px=2.0, missed=0.1, false=2)
     truth = [
         tuple(np.flatnonzero(owner == drone)[0] if (owner == drone).any() else -1 for owner in owners)
         for drone in range(6)
     ]
-    found = total_cost(rig, points, groups_of(matched(rig, points, 2.0)), 2.0)
+    found = total_cost(rig, points, groups_of(match_points(rig, points, 2.0)), 2.0)
     # `match` computes points from weighted linear equations, not from the least reprojection error. Measured excess
     # 0.01; an unexplained detection costs 13.8.
     assert found <= total_cost(rig, points, truth, 2.0) + 0.1
@@ -189,8 +189,8 @@ def test_drones_are_found_and_few_groups_are_false(noise_px):
         rng = np.random.default_rng(seed)
         rig = ring_rig(7, image_size_wh=LARGE_WH, coefficients=5)
         drones = separate_points(6, rng)
-        points, owners = observed(rig, drones, rng, noise_px=noise_px, missed=0.1, false=2)
-        matches = matched(rig, points, noise_px)
+        points, owners = observe(rig, drones, rng, noise_px=noise_px, missed=0.1, false=2)
+        matches = match_points(rig, points, noise_px)
         detected = np.array([[(owner == drone).any() for owner in owners] for drone in range(6)])
         drones_seen += int((detected.sum(axis=1) >= 3).sum())
         distance = np.linalg.norm(matches.position_m[:, None] - drones, axis=-1)
@@ -212,7 +212,7 @@ def test_positions_and_costs():
     rng = np.random.default_rng(4)
     rig = ring_rig(5, image_size_wh=LARGE_WH, coefficients=5)
     drones = separate_points(3, rng)
-    points, owners = observed(rig, drones, rng, noise_px=1.5)
+    points, owners = observe(rig, drones, rng, noise_px=1.5)
     noise = [rng.uniform(1.0, 4.0, len(detections)) for detections in points]
     matches = match(rig.cameras, points, noise, bounds_m=BOUNDS_M)
     assert len(matches.position_m) == 3
@@ -239,16 +239,16 @@ def test_two_views_are_no_group_without_a_prediction():
     drones = separate_points(2, np.random.default_rng(0))
     points = list(pixels_of(rig, drones).swapaxes(0, 1))
     points[1] = points[3] = points[4] = np.empty((0, 2))
-    assert not len(matched(rig, points, 1.0).position_m)
+    assert not len(match_points(rig, points, 1.0).position_m)
     # A prediction of one drone permits a group for that drone only.
-    with_prediction = matched(
+    with_prediction = match_points(
         rig, points, 1.0, expected_m=drones[1:], expected_covariance_m2=0.01 * np.eye(3)[None]
     )
     assert with_prediction.detection.tolist() == [[1, -1, 1, -1, -1]]
     assert with_prediction.expected.tolist() == [0]
     np.testing.assert_allclose(with_prediction.position_m, drones[1:], atol=1e-6)
     # If no camera has two detections, no detections can be confused.
-    alone = matched(rig, [detections[:1] for detections in points], 1.0)
+    alone = match_points(rig, [detections[:1] for detections in points], 1.0)
     assert alone.detection.tolist() == [[0, -1, 0, -1, -1]]
     assert alone.expected.tolist() == [-1]
 
@@ -260,7 +260,7 @@ def test_cameras_at_one_place_count_as_one_view(least):
     for places, enough in (((0,) * 3 + tuple(range(1, least - 1)), False), (range(least), True)):
         placed = make_unnamed_rig(*(rig.cameras[i] for i in places))
         points = list(pixels_of(placed, drones).swapaxes(0, 1))
-        assert len(matched(placed, points, 1.0, min_views=least).position_m) == (2 if enough else 0)
+        assert len(match_points(placed, points, 1.0, min_views=least).position_m) == (2 if enough else 0)
 
 
 def test_groups_have_the_number_of_their_prediction():
@@ -268,11 +268,11 @@ def test_groups_have_the_number_of_their_prediction():
     rng = np.random.default_rng(2)
     rig = ring_rig(5, image_size_wh=LARGE_WH)
     drones = separate_points(4, rng)
-    points, owners = observed(rig, drones, rng, noise_px=1.0, false=1)
+    points, owners = observe(rig, drones, rng, noise_px=1.0, false=1)
     order = np.array([2, 0, 3])
     expected_m = drones[order] + rng.normal(scale=0.03, size=(3, 3))
     expected_m[2] += (0.0, 0.0, 1.5)
-    matches = matched(
+    matches = match_points(
         rig,
         points,
         1.0,
@@ -294,10 +294,10 @@ def test_predictions_of_drones_that_pass_each_other(seed):
     rng = np.random.default_rng(seed)
     rig = ring_rig(3, image_size_wh=LARGE_WH)
     drones = np.array([[0.1, 0.0, 1.2], [0.1, 0.12, 1.25]])
-    points, owners = observed(rig, drones, rng, noise_px=1.0)
+    points, owners = observe(rig, drones, rng, noise_px=1.0)
     expected_m = drones + np.array([[0.0, 0.08, 0.0], [0.0, 0.02, 0.0]])
     spread = np.broadcast_to(0.08**2 * np.eye(3), (2, 3, 3))
-    matches = matched(rig, points, 1.0, expected_m=expected_m, expected_covariance_m2=spread)
+    matches = match_points(rig, points, 1.0, expected_m=expected_m, expected_covariance_m2=spread)
     assert sorted(matches.expected.tolist()) == [0, 1]
     for number, row in zip(matches.expected, matches.detection, strict=True):
         assert [owners[c][i] for c, i in enumerate(row)] == [number] * 3
@@ -306,7 +306,7 @@ def test_predictions_of_drones_that_pass_each_other(seed):
 # --- merged, false and ambiguous detections
 
 
-def overlapping():
+def drones_in_line():
     """Three cameras, and two drones in line with the second camera.
 
     Returns the rig, the pixels per camera, and the distance between the drones in the second camera, pixels.
@@ -320,24 +320,24 @@ def overlapping():
 
 
 def test_a_merged_detection_is_shared():
-    rig, points, width_px = overlapping()
+    rig, points, width_px = drones_in_line()
     noise_px = width_px / 3.0
     points[1] = points[1].mean(axis=0)[None]
-    matches = matched(rig, points, noise_px)
+    matches = match_points(rig, points, noise_px)
     assert groups_of(matches) == {(0, 0, 0), (1, 0, 1)}
     # If the merged detection is too far from both drones, it is cheaper to leave a drone's detections unexplained.
-    assert len(matched(rig, points, width_px / 8.0).position_m) < 2
+    assert len(match_points(rig, points, width_px / 8.0).position_m) < 2
 
 
 def test_random_detections_or_none_give_no_groups():
     rig = ring_rig(6, image_size_wh=LARGE_WH)
     rng = np.random.default_rng(0)
     points = [rng.uniform((0, 0), LARGE_WH, (2, 2)) for _ in range(6)]
-    assert not len(matched(rig, points, 1.0).position_m)
-    assert not len(matched(rig, [np.empty((0, 2))] * 6, 1.0).position_m)
+    assert not len(match_points(rig, points, 1.0).position_m)
+    assert not len(match_points(rig, [np.empty((0, 2))] * 6, 1.0).position_m)
     one_camera = [points[0], *[np.empty((0, 2))] * 5]
-    assert matched(rig, one_camera, 1.0).detection.shape == (0, 6)
-    predicted_only = matched(
+    assert match_points(rig, one_camera, 1.0).detection.shape == (0, 6)
+    predicted_only = match_points(
         rig,
         [np.empty((0, 2))] * 6,
         1.0,
@@ -353,12 +353,12 @@ def test_detections_that_are_not_finite_are_ignored():
     drones = np.array([[0.1, -0.1, 1.2], [1.0, 0.5, 1.8]])
     points = list(pixels_of(rig, drones).swapaxes(0, 1))
     points[1][0], points[2][1, 0] = np.nan, np.inf
-    assert groups_of(matched(rig, points, 1.0)) == {(0, -1, 0, 0), (1, 1, -1, 1)}
+    assert groups_of(match_points(rig, points, 1.0)) == {(0, -1, 0, 0), (1, 1, -1, 1)}
 
 
 def test_one_camera_gives_no_groups():
     rig = ring_rig(1)
-    assert matched(rig, [np.array([[100.0, 80.0], [10.0, 90.0]])], 1.0).position_m.shape == (0, 3)
+    assert match_points(rig, [np.array([[100.0, 80.0], [10.0, 90.0]])], 1.0).position_m.shape == (0, 3)
 
 
 def test_drones_out_of_bounds_are_ignored():
@@ -377,9 +377,9 @@ def test_a_drone_detected_twice_in_one_image_is_one_group():
     for seed in range(10):
         rng = np.random.default_rng(seed)
         drones = separate_points(3, rng)
-        points, _ = observed(rig, drones, rng, noise_px=5.0)
+        points, _ = observe(rig, drones, rng, noise_px=5.0)
         points[2] = np.vstack([points[2], points[2][:1] + rng.normal(scale=8.0, size=2)])
-        assert len(matched(rig, points, 3.0).position_m) == 3
+        assert len(match_points(rig, points, 3.0).position_m) == 3
 
 
 @pytest.mark.parametrize("off_px", [1.0, 2.0, 4.0])
@@ -392,10 +392,10 @@ def test_ambiguity_is_a_likelihood_ratio(off_px):
     crossing = np.array([0.3, -0.2, 1.1])
     drones = np.stack([0.8 * crossing + 0.2 * centre for centre in rig.cameras.centre_world[:2]])
     points = list(pixels_of(rig, drones).swapaxes(0, 1))
-    alone = matched(rig, points, 1.0)
+    alone = match_points(rig, points, 1.0)
     assert alone.ambiguity.tolist() == [0.0, 0.0]
     points[2] = np.vstack([points[2], pixels_of(rig, crossing)[2] + (0.0, off_px)])
-    matches = matched(rig, points, 1.0)
+    matches = match_points(rig, points, 1.0)
     assert groups_of(matches) == groups_of(alone) == {(0, 0, 0, 0), (1, 1, 1, 1)}
     expected = np.exp(-reprojection_cost(rig, points, (0, 1, 2, -1), 1.0) / 2)
     # `match` computes points from weighted linear equations, not from the least reprojection error: limit 5 %.
@@ -421,12 +421,12 @@ def test_ambiguity_of_the_other_pairing(off_px):
     third = pixels_of(rig, np.stack([drone, other, crossed, crossed_too]))[:, 2]
     third[2:, 1] += off_px
     points.append(third)
-    matches = matched(rig, points, 1.0)
+    matches = match_points(rig, points, 1.0)
     assert groups_of(matches) == {(0, 0, 0), (1, 1, 1)}
     cost = sum(reprojection_cost(rig, points, group, 1.0) for group in ((0, 1, 2), (1, 0, 3)))
     # `match` computes points from weighted linear equations, not from the least reprojection error: limit 5 %.
     np.testing.assert_allclose(matches.ambiguity, np.exp(-cost / 2), rtol=0.05)
-    assert matched(rig, [*points[:2], third[:2]], 1.0).ambiguity.tolist() == [0.0, 0.0]
+    assert match_points(rig, [*points[:2], third[:2]], 1.0).ambiguity.tolist() == [0.0, 0.0]
 
 
 def test_two_boxes_of_one_drone_are_not_ambiguous():
@@ -437,7 +437,7 @@ def test_two_boxes_of_one_drone_are_not_ambiguous():
     higher = pixels_of(rig, drones[0] + np.array([0.0, 0.0, 0.01]))
     for c in range(3):
         points[c] = np.vstack([points[c], higher[c]])
-    matches = matched(rig, points, 2.0)
+    matches = match_points(rig, points, 2.0)
     assert groups_of(matches) >= {(0,) * 5, (1,) * 5}
     assert not matches.ambiguity.any()
 
@@ -446,11 +446,11 @@ def test_invalid_settings_are_refused():
     rig = ring_rig(3)
     nothing = [np.empty((0, 2))] * 3
     with pytest.raises(SettingsError, match="predictions with covariances"):
-        matched(rig, nothing, 1.0, expected_m=np.zeros((1, 3)))
+        match_points(rig, nothing, 1.0, expected_m=np.zeros((1, 3)))
     with pytest.raises(SettingsError, match="noise_px: expected numbers above 0"):
-        matched(rig, [np.zeros((1, 2)), *nothing[1:]], 0.0)
+        match_points(rig, [np.zeros((1, 2)), *nothing[1:]], 0.0)
     with pytest.raises(SettingsError, match="min_views: expected 2 or more, found 1"):
-        matched(rig, nothing, 1.0, min_views=1)
+        match_points(rig, nothing, 1.0, min_views=1)
 
 
 # --- properties
@@ -463,12 +463,12 @@ def test_order_and_world_frame_do_not_matter(seed):
     rng = np.random.default_rng(seed)
     rig = ring_rig(6, image_size_wh=LARGE_WH)
     drones = separate_points(int(rng.integers(1, 6)), rng)
-    points, _ = observed(rig, drones, rng, noise_px=2.0, missed=0.1, false=1)
-    matches = matched(rig, points, 2.0)
+    points, _ = observe(rig, drones, rng, noise_px=2.0, missed=0.1, false=1)
+    matches = match_points(rig, points, 2.0)
     order = rng.permutation(6)
     within = [rng.permutation(len(detections)) for detections in points]
     mixed_rig = rig.select([rig.names[c] for c in order])
-    mixed = matched(mixed_rig, [points[c][within[c]] for c in order], 2.0)
+    mixed = match_points(mixed_rig, [points[c][within[c]] for c in order], 2.0)
     back = np.full_like(mixed.detection, -1)
     for place, c in enumerate(order):
         seen = mixed.detection[:, place] >= 0
@@ -494,11 +494,11 @@ def test_invariants_of_groups(seed):
     rng = np.random.default_rng(seed)
     rig = ring_rig(int(rng.integers(2, 6)), image_size_wh=LARGE_WH)
     drones = separate_points(int(rng.integers(1, 6)), rng, least_m=0.1)
-    points, _ = observed(rig, drones, rng, noise_px=3.0, missed=0.3, false=int(rng.integers(0, 4)))
+    points, _ = observe(rig, drones, rng, noise_px=3.0, missed=0.3, false=int(rng.integers(0, 4)))
     points.append(points[0][:0])
     rig = make_unnamed_rig(*(rig.cameras[c] for c in [*range(len(rig)), 0]))
     known = drones[: rng.integers(0, len(drones) + 1)]
-    matches = matched(
+    matches = match_points(
         rig,
         points,
         3.0,

@@ -38,7 +38,7 @@ def flights(num_drones, frames=FRAMES, seed=0):
     return np.stack([x_m, y_m, z_m], axis=-1)
 
 
-def seen_by(rig, truth_m, *, late=None, missed=0.05, false_alarms=0.1, jitter=0.02, seed=0):
+def simulate_detections(rig, truth_m, *, late=None, missed=0.05, false_alarms=0.1, jitter=0.02, seed=0):
     """Simulate a detector's boxes around the drones.
 
     Args:
@@ -92,17 +92,17 @@ def _checked_once(request):
 
 RIG = ring_rig(5, coefficients=4, image_size_wh=(1920, 1080))
 TRUTH_M = flights(2)
-SEEN = seen_by(RIG, TRUTH_M)
+SEEN = simulate_detections(RIG, TRUTH_M)
 
 
-def examined(rig, seen=SEEN, reference_m=TRUTH_M):
+def examine_rig(rig, seen=SEEN, reference_m=TRUTH_M):
     sightings = from_detections(seen, rig, FRAMES)
     reference = None if reference_m is None else make_reference(reference_m)
     return examine(rig, sightings, fps=FPS, reference=reference)
 
 
 def only_finding(*args, **kwargs):
-    (finding,) = examined(*args, **kwargs).findings
+    (finding,) = examine_rig(*args, **kwargs).findings
     return finding
 
 
@@ -138,7 +138,7 @@ def test_a_correct_rig_has_no_findings(seed):
     rig = ring_rig(num_cameras, coefficients=(0, 4, 5, 8)[seed % 4], image_size_wh=(1920, 1080))
     truth_m = flights(num_drones, seed=seed)
     noise = {"missed": 0.15 * rng.random(), "false_alarms": 0.3 * rng.random(), "jitter": 0.05 * rng.random()}
-    diagnosis = examined(rig, seen_by(rig, truth_m, seed=seed, **noise), truth_m)
+    diagnosis = examine_rig(rig, simulate_detections(rig, truth_m, seed=seed, **noise), truth_m)
     assert diagnosis.findings == ()
     assert diagnosis.reference.before_m < 0.05
     # An error of a quarter of a frame would be a finding.
@@ -153,7 +153,7 @@ def test_a_turned_camera(degrees):
 
 
 def test_a_moved_camera():
-    seen = seen_by(RIG, TRUTH_M, missed=0.0, false_alarms=0.0, jitter=0.0)
+    seen = simulate_detections(RIG, TRUTH_M, missed=0.0, false_alarms=0.0, jitter=0.0)
     finding = only_finding(with_displaced_camera(4, shift_m=(0.3, 0.3, 0.0)), seen)
     assert (finding.kind, finding.cameras) == ("moved", ("c4",))
     # Without noise, the shift is found exactly, except for errors from boxes that are matched with the wrong drone.
@@ -163,7 +163,7 @@ def test_a_moved_camera():
 
 @pytest.mark.parametrize("delay", [0.6, 3.0])
 def test_a_late_camera(delay):
-    diagnosis = examined(RIG, seen_by(RIG, TRUTH_M, late={1: delay}))
+    diagnosis = examine_rig(RIG, simulate_detections(RIG, TRUTH_M, late={1: delay}))
     (finding,) = diagnosis.findings
     assert (finding.kind, finding.cameras) == ("clock", ("c1",))
     assert "late" in finding.message
@@ -210,7 +210,7 @@ def test_a_left_handed_world():
 def test_two_exchanged_cameras():
     """With two of four cameras exchanged, no three cameras agree."""
     rig = ring_rig(4, image_size_wh=(1920, 1080))
-    seen = seen_by(rig, TRUTH_M)
+    seen = simulate_detections(rig, TRUTH_M)
     seen["c1"], seen["c3"] = seen["c3"], seen["c1"]
     finding = only_finding(rig, seen)
     assert (finding.kind, finding.cameras) == ("exchanged", ("c1", "c3"))
@@ -264,7 +264,10 @@ def test_a_reference_that_contradicts_the_rig(kind, words, reference_m):
 
 def test_detections_of_different_flights_have_no_explanation():
     """Each camera sees another flight, so no fault of the rig may be reported."""
-    seen = {name: seen_by(RIG, flights(2, seed=20 + index))[name] for index, name in enumerate(RIG.names)}
+    seen = {
+        name: simulate_detections(RIG, flights(2, seed=20 + index))[name]
+        for index, name in enumerate(RIG.names)
+    }
     assert only_finding(RIG, seen).kind == "no agreement"
 
 
@@ -303,7 +306,7 @@ def test_the_command(tmp_path):
     K = small.cameras.K.copy()
     K[:, 1, 1] = K[:, 0, 0]
     small = Rig(small.names, replace(small.cameras, K=K))
-    seen = seen_by(small, TRUTH_M)
+    seen = simulate_detections(small, TRUTH_M)
     folder = write_sequence(tmp_path / "correct", small, seen, TRUTH_M)
     result = CliRunner(env={"COLUMNS": "200"}).invoke(doctor, [str(folder)], catch_exceptions=False)
     assert result.exit_code == 0, result.output
@@ -341,7 +344,7 @@ def test_the_share_of_explained_sightings_is_at_most_one():
 def test_a_correct_rig_with_few_frames_gets_no_finding_about_the_rig():
     """Ten frames of two drones agree with the rig, but are too few to judge it."""
     truth_m = flights(2)[:10]
-    seen = from_detections(seen_by(RIG, truth_m), RIG, len(truth_m))
+    seen = from_detections(simulate_detections(RIG, truth_m), RIG, len(truth_m))
     (finding,) = examine(RIG, seen, fps=FPS).findings
     assert finding.kind == "too little seen"
     assert "the rig" not in finding.message

@@ -227,14 +227,14 @@ def assert_same(first, second, tolerance: float) -> None:
         for drone in evaluation["per_drone"]:
             del drone["estimate"]
 
-    def flat(value):
+    def flatten(value):
         if isinstance(value, dict):
-            return [leaf for part in value.values() for leaf in flat(part)]
+            return [leaf for part in value.values() for leaf in flatten(part)]
         if isinstance(value, list | tuple):
-            return [leaf for part in value for leaf in flat(part)]
+            return [leaf for part in value for leaf in flatten(part)]
         return [value]
 
-    for left, right in zip(flat(one), flat(two), strict=True):
+    for left, right in zip(flatten(one), flatten(two), strict=True):
         assert left == (pytest.approx(right, abs=tolerance) if isinstance(right, float) else right)
 
 

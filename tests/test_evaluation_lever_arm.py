@@ -114,14 +114,14 @@ class TestLeverArm:
         assert "offset_standard_error_m" not in frame
 
     def test_the_table_shows_the_largest_standard_error(self):
-        def printed(evaluation):
+        def print_table(evaluation):
             console = Console(file=io.StringIO(), width=80)
             console.print(tables.render(evaluation))
             return console.file.getvalue()
 
         evaluation = evaluate(*turning_flight(noise_m=0.02))
         largest_mm = 1e3 * max(evaluation.per_drone[0].offset_standard_error_m)
-        assert f"without each drone's offset (body frame, known to {largest_mm:.1f} mm)" in printed(
+        assert f"without each drone's offset (body frame, known to {largest_mm:.1f} mm)" in print_table(
             evaluation
         )
-        assert "(world frame)" in printed(evaluate(on_x_axis([None, 2, None]), on_x_axis([0, 0, 0])))
+        assert "(world frame)" in print_table(evaluate(on_x_axis([None, 2, None]), on_x_axis([0, 0, 0])))

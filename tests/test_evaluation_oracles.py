@@ -17,14 +17,14 @@ from psotrack.evaluation import evaluate
 from psotrack.trajectories import GATE_M, Trajectories
 
 
-def crowded(seed: int) -> tuple[Trajectories, Trajectories]:
+def crowded_flights(seed: int) -> tuple[Trajectories, Trajectories]:
     """Flights within a metre, so that many pairs are possible; some estimates are missing, but no reference."""
     est, _ = random_flights(seed, num_frames=12)
     _, ref = random_flights(seed, num_frames=12, missing=0)
     return est, ref
 
 
-def apart(seed: int) -> tuple[Trajectories, Trajectories]:
+def separate_flights(seed: int) -> tuple[Trajectories, Trajectories]:
     """Flights 3 m apart, with missing positions, identity switches, distances beyond the gate and a false track."""
     rng = np.random.default_rng(seed)
     num_frames, num_drones = 20, 4
@@ -71,7 +71,7 @@ def for_trackeval(est: Trajectories, ref: Trajectories, zero_at_m: float):
     }
 
 
-@pytest.mark.parametrize("flights", [crowded, apart])
+@pytest.mark.parametrize("flights", [crowded_flights, separate_flights])
 class TestTrackeval:
     @given(seed=seeds)
     @settings(max_examples=30)
@@ -116,7 +116,7 @@ class TestMotmetrics:
     @given(seed=seeds)
     @settings(max_examples=20)
     def test_apart(self, seed):
-        est, ref = apart(seed)
+        est, ref = separate_flights(seed)
         theirs, ours = with_motmetrics(est, ref), evaluate(est, ref)
         assert ours.id_switches == theirs["num_switches"]
         assert ours.mota == pytest.approx(theirs["mota"], abs=ROUNDING)
@@ -126,7 +126,7 @@ class TestMotmetrics:
     @given(seed=seeds)
     @settings(max_examples=20)
     def test_crowded(self, seed):
-        est, ref = crowded(seed)
+        est, ref = crowded_flights(seed)
         # motmetrics keeps pairs from all earlier frames, psotrack only pairs of the previous frame. Both are the same
         # if no drone is ever missed: all estimates are within the gate of all drones, and there are enough estimates.
         est = replace(est, position_m=0.25 * est.position_m)

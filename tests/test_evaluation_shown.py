@@ -44,7 +44,7 @@ def flights(num_drones: int = 3, *, swap: bool = False, names: tuple[str, ...] =
     )
 
 
-def printed(table) -> list[str]:
+def print_table(table) -> list[str]:
     console = Console(file=io.StringIO(), width=80)
     console.print(table)
     return console.file.getvalue().splitlines()
@@ -52,7 +52,7 @@ def printed(table) -> list[str]:
 
 class TestTable:
     def test_rows(self):
-        lines = printed(tables.render(evaluate(*flights()), "S02_D4_A"))
+        lines = print_table(tables.render(evaluate(*flights()), "S02_D4_A"))
         assert lines[0].strip() == "S02_D4_A: 50 frames, 3 drones, errors in mm"
         rows = {line[:15].strip(): line[15:].split() for line in lines}
         assert rows["dron0 (track 0)"] == [
@@ -83,7 +83,7 @@ class TestTable:
     def test_covariances(self):
         est, ref = flights()
         covariance_m2 = np.broadcast_to(1e-4 * np.eye(3), (NUM_FRAMES, 3, 3, 3))
-        lines = printed(tables.render(evaluate(replace(est, covariance_m2=covariance_m2), ref)))
+        lines = print_table(tables.render(evaluate(replace(est, covariance_m2=covariance_m2), ref)))
         # The error of 20 mm is two standard deviations of 10 mm, so NEES is 4; without the offset, NEES is 0.
         row = "ellipsoid of 90 % holds 100.0% (100.0% centred), mean NEES 4 ("
         assert any(line.startswith(row) for line in lines)
@@ -92,7 +92,7 @@ class TestTable:
         est, ref = flights()
         orientation_wxyz = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (NUM_FRAMES, 3, 4))
         both = (replace(flight, orientation_wxyz=orientation_wxyz) for flight in (est, ref))
-        text = "\n".join(printed(tables.render(evaluate(*both))))
+        text = "\n".join(print_table(tables.render(evaluate(*both))))
         assert "RPE over 1 s 0.0 mm and 0.00 deg" in text
 
     def test_ten_drones_with_large_errors_fit_into_eighty_columns(self):
@@ -100,7 +100,7 @@ class TestTable:
         est.position_m[30:, :5] += 3.0
         covariance_m2 = np.broadcast_to(1e-8 * np.eye(3), (NUM_FRAMES, 10, 3, 3))
         est = replace(est, covariance_m2=covariance_m2)
-        lines = printed(tables.render(evaluate(est, ref), "S04_D10"))
+        lines = print_table(tables.render(evaluate(est, ref), "S04_D10"))
         assert max(map(len, lines)) <= 80
         # No name is cut off, and no part of a name is interpreted as a style.
         assert [line.split()[0] for line in lines if "d_" in line] == [f"[red]d_{n}" for n in range(10)]
@@ -113,7 +113,7 @@ class TestTable:
     def test_large_errors_are_shown_in_metres(self):
         est, ref = flights()
         est.position_m[:, :, 2] += 4.0
-        lines = printed(tables.render(evaluate(est, ref)))
+        lines = print_table(tables.render(evaluate(est, ref)))
         assert lines[0].strip() == "50 frames, 3 drones, errors in m"
         row = next(line for line in lines if line.startswith("dron0")).split()
         assert (row[3], row[-3:]) == ("4.00", ["+0.0", "+0.0", "+4.0"])
@@ -121,7 +121,9 @@ class TestTable:
     def test_a_missed_drone(self):
         est, ref = flights()
         est.status[:, 2] = Status.LOST
-        row = next(line for line in printed(tables.render(evaluate(est, ref))) if line.startswith("dron2"))
+        row = next(
+            line for line in print_table(tables.render(evaluate(est, ref))) if line.startswith("dron2")
+        )
         assert row.split() == ["dron2", "-", "-", "-", "-", "-", "100.0%", "-", "-"]
 
     def test_data_frame_of_drones(self):

@@ -16,14 +16,14 @@ SETTINGS, MAX_COASTING_S = MotionSettings(), 0.5
 SWARM_STD_M, LINES_STD_M = np.array([0.005, 0.02, 0.01]), np.array([0.02, 0.005, 0.01])
 
 
-def paths(num_drones):
+def circular_paths(num_drones):
     """(frames, drones, 3), positions of drones on circles at heights a metre apart."""
     angle = np.arange(FRAMES)[:, None] / FPS + 2.0 * np.arange(num_drones)
     height_m = np.broadcast_to(1.0 + np.arange(num_drones), angle.shape)
     return np.stack([np.cos(angle), np.sin(angle), height_m], axis=-1)
 
 
-def tracked(truth_m, std_m, *, seed, factor=1.0, hidden=(), offset_m=(0.0, 0.0, 0.0), arrivals=()):
+def simulate_method(truth_m, std_m, *, seed, factor=1.0, hidden=(), offset_m=(0.0, 0.0, 0.0), arrivals=()):
     """Simulate the result of a method.
 
     Args:
@@ -66,14 +66,14 @@ def fuse(swarm, lines, **options):
 
 def simulate_and_fuse(truth_m, swarm=None, lines=None, **options):
     """Tracks of the swarm, tracks of the projection lines, and the fused tracks."""
-    first = tracked(truth_m, SWARM_STD_M, seed=0, **(swarm or {}))
+    first = simulate_method(truth_m, SWARM_STD_M, seed=0, **(swarm or {}))
     # The fusion enlarges the covariances of the projection lines by `COMMON`, for errors that all cameras share.
-    second = tracked(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON, **(lines or {}))
+    second = simulate_method(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON, **(lines or {}))
     return first, second, fuse(first, second, **options)[0]
 
 
 def test_information_adds_up():
-    truth_m = paths(3)
+    truth_m = circular_paths(3)
     first, second, fused = simulate_and_fuse(truth_m)
     # Errors are relative to each drone's median, because the tracked point has an unknown offset. Their spread is
     # computed from a median, because one frame in 1000 is beyond the gate, where only the swarm's measurement is used.
@@ -92,16 +92,16 @@ def test_information_adds_up():
 
 def test_the_fused_point_is_the_middle_of_the_silhouette():
     """Middles of the boxes are 8 cm above those of the silhouettes; the fused tracks do not have this offset."""
-    truth_m = paths(2)
+    truth_m = circular_paths(2)
     _, _, fused = simulate_and_fuse(truth_m, lines={"offset_m": (0.01, 0.0, 0.08)})
     off_m = (fused.measured_m - truth_m).mean(axis=(0, 1))
     np.testing.assert_allclose(off_m, 0.0, atol=0.003)
 
 
 def test_the_offset_between_the_middles_has_a_standard_error():
-    truth_m, off_m = paths(4), np.array([0.01, 0.0, 0.08])
-    first = tracked(truth_m, SWARM_STD_M, seed=0)
-    second = tracked(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON, offset_m=off_m)
+    truth_m, off_m = circular_paths(4), np.array([0.01, 0.0, 0.08])
+    first = simulate_method(truth_m, SWARM_STD_M, seed=0)
+    second = simulate_method(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON, offset_m=off_m)
     # In a tenth of the frames, the first drone's measurement is that of another object.
     second.measured_m[20:40, 0] += 0.2
     _, middles = fuse(first, second)
@@ -114,9 +114,9 @@ def test_the_offset_between_the_middles_has_a_standard_error():
 
 
 def test_the_offset_is_less_certain_with_correlated_errors():
-    truth_m = paths(1)
-    first = tracked(truth_m, np.full(3, 1e-6), seed=0)
-    second = tracked(truth_m, np.full(3, 1e-6), seed=1, factor=1 / COMMON)
+    truth_m = circular_paths(1)
+    first = simulate_method(truth_m, np.full(3, 1e-6), seed=0)
+    second = simulate_method(truth_m, np.full(3, 1e-6), seed=1, factor=1 / COMMON)
     lasting_m = np.repeat(np.random.default_rng(2).normal(0.0, 0.01, (FRAMES // 10, 1, 3)), 10, axis=0)
     second.measured_m[:] += lasting_m
     _, middles = fuse(first, second)
@@ -126,8 +126,11 @@ def test_the_offset_is_less_certain_with_correlated_errors():
 
 
 def test_a_drone_found_by_one_method_only_has_no_offset():
-    truth_m = paths(3)
-    swarm, lines = tracked(truth_m[:, :2], SWARM_STD_M, seed=0), tracked(truth_m[:, 1:], LINES_STD_M, seed=1)
+    truth_m = circular_paths(3)
+    swarm, lines = (
+        simulate_method(truth_m[:, :2], SWARM_STD_M, seed=0),
+        simulate_method(truth_m[:, 1:], LINES_STD_M, seed=1),
+    )
     _, middles = fuse(swarm, lines)
     assert np.isfinite(middles.offset_m).all(axis=-1).tolist() == [False, True, False]
     np.testing.assert_array_equal(np.isnan(middles.offset_m), np.isnan(middles.std_m))
@@ -135,8 +138,8 @@ def test_a_drone_found_by_one_method_only_has_no_offset():
 
 def test_a_position_from_lines_alone_has_the_offsets_uncertainty():
     hidden = [(0, 50, 100)]
-    first = tracked(paths(1), SWARM_STD_M, seed=0, hidden=hidden)
-    second = tracked(paths(1), LINES_STD_M, seed=1, factor=1 / COMMON)
+    first = simulate_method(circular_paths(1), SWARM_STD_M, seed=0, hidden=hidden)
+    second = simulate_method(circular_paths(1), LINES_STD_M, seed=1, factor=1 / COMMON)
     fused, middles = fuse(first, second)
     diagonal_m2 = np.diagonal(fused.measured_covariance_m2[60, 0])
     np.testing.assert_allclose(diagonal_m2, LINES_STD_M**2 + middles.std_m[0] ** 2, rtol=1e-9)
@@ -144,7 +147,7 @@ def test_a_position_from_lines_alone_has_the_offsets_uncertainty():
 
 def test_methods_with_the_same_foreground_have_correlated_errors():
     """The best linear estimate from correlated errors has a larger covariance than that from independent errors."""
-    first, second, independent = simulate_and_fuse(paths(2))
+    first, second, independent = simulate_and_fuse(circular_paths(2))
     correlated, middles = fuse(first, second, same_foreground=True)
     # The least variance of a weighted mean is 1 / (1ᵀ S⁻¹ 1) along each axis.
     swarm_m, lines_m = SWARM_STD_M + 0 * middles.std_m, np.hypot(LINES_STD_M, middles.std_m)
@@ -158,14 +161,17 @@ def test_methods_with_the_same_foreground_have_correlated_errors():
 
 
 def test_with_the_same_foreground_a_track_of_lines_alone_is_no_drone():
-    truth_m = paths(3)
-    swarm, lines = tracked(truth_m[:, :2], SWARM_STD_M, seed=0), tracked(truth_m, LINES_STD_M, seed=1)
+    truth_m = circular_paths(3)
+    swarm, lines = (
+        simulate_method(truth_m[:, :2], SWARM_STD_M, seed=0),
+        simulate_method(truth_m, LINES_STD_M, seed=1),
+    )
     assert fuse(swarm, lines)[0].status.shape[1] == 3
     assert fuse(swarm, lines, same_foreground=True)[0].status.shape[1] == 2
 
 
 def test_where_one_method_has_no_measurement_the_other_is_used():
-    truth_m = paths(2)
+    truth_m = circular_paths(2)
     hidden = [(0, 50, 100)]
     first, second, fused = simulate_and_fuse(
         truth_m, swarm={"hidden": hidden}, lines={"hidden": [(1, 120, 150)]}
@@ -179,7 +185,7 @@ def test_where_one_method_has_no_measurement_the_other_is_used():
 
 
 def test_a_drone_without_measurements_coasts_and_is_lost():
-    truth_m = paths(1)
+    truth_m = circular_paths(1)
     hidden = {"hidden": [(0, 50, 100)]}
     _, _, fused = simulate_and_fuse(truth_m, swarm=hidden, lines=hidden)
     status = fused.status[:, 0]
@@ -191,10 +197,10 @@ def test_a_drone_without_measurements_coasts_and_is_lost():
 
 
 def test_drones_found_only_by_the_lines_come_last():
-    truth_m = paths(3)
-    swarm = tracked(truth_m[:, [2, 0]], SWARM_STD_M, seed=0, arrivals=[Arrival(3, 1, again=False)])
+    truth_m = circular_paths(3)
+    swarm = simulate_method(truth_m[:, [2, 0]], SWARM_STD_M, seed=0, arrivals=[Arrival(3, 1, again=False)])
     arrivals = [Arrival(9, 0, again=False), Arrival(20, 1, again=True)]
-    lines = tracked(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON, arrivals=arrivals)
+    lines = simulate_method(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON, arrivals=arrivals)
     fused, _ = fuse(swarm, lines)
     np.testing.assert_allclose(fused.measured_m, truth_m[:, [2, 0, 1]], atol=0.1)
     # The first arrival of the projection lines is ignored, because the swarm has a track of this drone.
@@ -204,9 +210,9 @@ def test_drones_found_only_by_the_lines_come_last():
 
 
 def test_where_the_methods_disagree_the_swarm_is_used():
-    truth_m = paths(1)
-    swarm = tracked(truth_m, SWARM_STD_M, seed=0)
-    lines = tracked(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON)
+    truth_m = circular_paths(1)
+    swarm = simulate_method(truth_m, SWARM_STD_M, seed=0)
+    lines = simulate_method(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON)
     lines.measured_m[80:90] += 0.5
     fused, _ = fuse(swarm, lines)
     np.testing.assert_array_equal(fused.measured_m[80:90], swarm.measured_m[80:90])
@@ -214,12 +220,15 @@ def test_where_the_methods_disagree_the_swarm_is_used():
 
 @pytest.mark.parametrize("method", ["swarm", "lines"])
 def test_one_method_may_have_no_tracks(method):
-    truth_m = paths(2)
-    found, empty = tracked(truth_m, SWARM_STD_M, seed=0), tracked(truth_m[:, :0], SWARM_STD_M, seed=0)
+    truth_m = circular_paths(2)
+    found, empty = (
+        simulate_method(truth_m, SWARM_STD_M, seed=0),
+        simulate_method(truth_m[:, :0], SWARM_STD_M, seed=0),
+    )
     fused, _ = fuse(found, empty) if method == "swarm" else fuse(empty, found)
     np.testing.assert_array_equal(fused.measured_m, found.measured_m)
 
 
 def test_both_methods_may_have_no_tracks():
-    empty = tracked(paths(0), SWARM_STD_M, seed=0)
+    empty = simulate_method(circular_paths(0), SWARM_STD_M, seed=0)
     assert fuse(empty, empty)[0].status.shape == (FRAMES, 0)

@@ -82,7 +82,7 @@ def order_by_tracks(by_drones, truth):
     )
 
 
-def resolved(given_tracks, model=GENTLE, params=PARAMS):
+def resolve_tracks(given_tracks, model=GENTLE, params=PARAMS):
     return resolve(
         given_tracks.time_s,
         given_tracks.measured_m,
@@ -94,7 +94,7 @@ def resolved(given_tracks, model=GENTLE, params=PARAMS):
     )
 
 
-def outcomes(found):
+def list_outcomes(found):
     return [encounter.outcome for encounter in found.encounters]
 
 
@@ -141,7 +141,7 @@ def hovering(together_m=0.15, hover_s=1.4):
     return np.stack([one, one * [-1, -1, 1]], axis=1)
 
 
-def merging(flown_m, merge_m=0.3):
+def merge_positions(flown_m, merge_m=0.3):
     """Positions that are measured if silhouettes merge below a distance: both drones are at the middle of both."""
     share = np.clip(2 * (1 - nearest_distance_m(flown_m) / merge_m), 0, 1)[..., None]
     return flown_m + share * (flown_m.mean(axis=1, keepdims=True) - flown_m)
@@ -152,7 +152,7 @@ class TestTwoDrones:
     @pytest.mark.parametrize("flight", [passing, turning_back])
     def test_correct_labels_are_kept(self, flight, std_m):
         tracks = simulate_tracks(flight(), std_m)
-        found = resolved(tracks)
+        found = resolve_tracks(tracks)
         np.testing.assert_array_equal(found.order, tracks.truth)
         (encounter,) = found.encounters
         assert encounter.outcome is LabelOutcome.KEPT
@@ -168,8 +168,8 @@ class TestTwoDrones:
     @pytest.mark.parametrize("flight", [passing, turning_back])
     def test_swapped_labels_are_corrected(self, flight, frame, std_m):
         tracks = simulate_tracks(flight(), std_m, exchanges=[(frame, (1, 0))])
-        found = resolved(tracks)
-        assert outcomes(found) == [LabelOutcome.SWAPPED]
+        found = resolve_tracks(tracks)
+        assert list_outcomes(found) == [LabelOutcome.SWAPPED]
         assert found.encounters[0].log_odds > np.log(99)
         # At distances of 0.3 m and more, labels are wrong in one frame; with errors of 0.03 m, in two frames.
         assert (found.order != tracks.truth).any(axis=1).sum() <= 2
@@ -177,8 +177,10 @@ class TestTwoDrones:
     @pytest.mark.parametrize("exchanged", [False, True])
     def test_drones_that_hover_together_are_ambiguous(self, exchanged):
         """Both drones share a silhouette for more than a second, so their identities after it cannot be known."""
-        found = resolved(simulate_tracks(merging(hovering()), exchanges=[(50, (1, 0))] * exchanged))
-        assert outcomes(found) == [LabelOutcome.UNDECIDED]
+        found = resolve_tracks(
+            simulate_tracks(merge_positions(hovering()), exchanges=[(50, (1, 0))] * exchanged)
+        )
+        assert list_outcomes(found) == [LabelOutcome.UNDECIDED]
         assert (found.order == [0, 1]).all()
         last = found.encounters[0].last_frame
         # Odds are nearly even; the course of more than a second ago has little influence. Measured 0.41 to 0.62.
@@ -188,30 +190,30 @@ class TestTwoDrones:
     @pytest.mark.parametrize("exchanged", [False, True])
     def test_sizes_decide_the_identities_of_drones_that_hovered(self, exchanged):
         """One drone is a fifth larger; because errors are correlated, the decision takes some tenths of a second."""
-        flown_m = np.concatenate([np.repeat(hovering()[:1], 200, axis=0), merging(hovering())])
+        flown_m = np.concatenate([np.repeat(hovering()[:1], 200, axis=0), merge_positions(hovering())])
         usual_m = np.array([[0.36, 0.36, 0.12], [0.30, 0.30, 0.10]])
         size_m = usual_m + 0.01 * correlated_errors(np.random.default_rng(1), (360, 2, 3))
         # The measured size of merged silhouettes is that of both drones together.
         size_m[nearest_distance_m(flown_m) < 0.3] = 0.5
         tracks = simulate_tracks(flown_m, exchanges=[(250, (1, 0))] * exchanged, size_m=size_m)
-        found = resolved(tracks)
-        assert outcomes(found) == [LabelOutcome.SWAPPED if exchanged else LabelOutcome.KEPT]
+        found = resolve_tracks(tracks)
+        assert list_outcomes(found) == [LabelOutcome.SWAPPED if exchanged else LabelOutcome.KEPT]
         # The frame of the swap cannot be determined while the silhouettes are merged.
         separate = nearest_distance_m(flown_m) > 0.3
         np.testing.assert_array_equal(found.order[separate], tracks.truth[separate])
 
     @pytest.mark.parametrize("exchanged", [False, True])
     def test_equal_sizes_decide_nothing(self, exchanged):
-        flown_m = np.concatenate([np.repeat(hovering()[:1], 200, axis=0), merging(hovering())])
+        flown_m = np.concatenate([np.repeat(hovering()[:1], 200, axis=0), merge_positions(hovering())])
         size_m = np.array([0.36, 0.36, 0.12]) + 0.01 * correlated_errors(
             np.random.default_rng(2), (360, 2, 3)
         )
-        found = resolved(simulate_tracks(flown_m, exchanges=[(250, (1, 0))] * exchanged, size_m=size_m))
-        assert outcomes(found) == [LabelOutcome.UNDECIDED]
+        found = resolve_tracks(simulate_tracks(flown_m, exchanges=[(250, (1, 0))] * exchanged, size_m=size_m))
+        assert list_outcomes(found) == [LabelOutcome.UNDECIDED]
         assert abs(found.ambiguity[found.encounters[0].last_frame, 0] - 0.5) < 0.2
 
     def test_ambiguity_begins_with_the_encounter_and_ends_with_it(self):
-        found = resolved(simulate_tracks(passing(0.2), 0.02))
+        found = resolve_tracks(simulate_tracks(passing(0.2), 0.02))
         (encounter,) = found.encounters
         opened = np.zeros(100, bool)
         opened[encounter.first_frame : encounter.last_frame + 1] = True
@@ -227,19 +229,19 @@ class TestTwoDrones:
             was_measured = tracks.was_measured.copy()
             was_measured[46:54, hidden] = False
             measured_m = np.where(was_measured[..., None], tracks.measured_m, np.nan)
-            found = resolved(replace(tracks, was_measured=was_measured, measured_m=measured_m))
-            assert outcomes(found) == [LabelOutcome.SWAPPED if exchanged else LabelOutcome.KEPT]
+            found = resolve_tracks(replace(tracks, was_measured=was_measured, measured_m=measured_m))
+            assert list_outcomes(found) == [LabelOutcome.SWAPPED if exchanged else LabelOutcome.KEPT]
             # Labels are undefined in frames without measurements.
             assert (found.order == tracks.truth)[was_measured.all(axis=1)].all()
 
     def test_labels_swapped_twice_in_an_encounter(self):
         """An encounter has wrong labels for twenty frames, and ends with the correct labels."""
         tracks = simulate_tracks(passing(0.4, 0.1), exchanges=[(40, (1, 0)), (60, (1, 0))])
-        np.testing.assert_array_equal(resolved(tracks).order, tracks.truth)
+        np.testing.assert_array_equal(resolve_tracks(tracks).order, tracks.truth)
 
     def test_distant_drones_have_no_encounter(self):
         tracks = simulate_tracks(passing(0.8))
-        found = resolved(tracks)
+        found = resolve_tracks(tracks)
         assert found.encounters == ()
         assert (found.ambiguity == 0).all()
         np.testing.assert_array_equal(found.order, tracks.truth)
@@ -247,23 +249,23 @@ class TestTwoDrones:
     @pytest.mark.parametrize("exchanged", [False, True])
     def test_merged_silhouettes_in_a_pass(self, exchanged):
         """For a few tenths of a second both drones are measured at one place; only their earlier course can decide."""
-        tracks = simulate_tracks(merging(passing(0.15)), exchanges=[(50, (1, 0))] * exchanged)
-        found = resolved(tracks)
-        assert outcomes(found) == [LabelOutcome.SWAPPED if exchanged else LabelOutcome.KEPT]
+        tracks = simulate_tracks(merge_positions(passing(0.15)), exchanges=[(50, (1, 0))] * exchanged)
+        found = resolve_tracks(tracks)
+        assert list_outcomes(found) == [LabelOutcome.SWAPPED if exchanged else LabelOutcome.KEPT]
         np.testing.assert_array_equal(found.order[[0, -1]], tracks.truth[[0, -1]])
 
     def test_a_drone_that_appears_beside_another(self):
         tracks = simulate_tracks(passing())
         was_measured = tracks.was_measured.copy()
         was_measured[:48, 1] = False
-        found = resolved(replace(tracks, was_measured=was_measured))
-        assert outcomes(found) == [LabelOutcome.KEPT]
+        found = resolve_tracks(replace(tracks, was_measured=was_measured))
+        assert list_outcomes(found) == [LabelOutcome.KEPT]
         assert (found.order == [0, 1]).all()
 
     def test_an_encounter_that_lasts_until_the_end(self):
         tracks = simulate_tracks(passing()[:51], exchanges=[(48, (1, 0))])
-        found = resolved(tracks)
-        assert outcomes(found) == [LabelOutcome.OPEN]
+        found = resolve_tracks(tracks)
+        assert list_outcomes(found) == [LabelOutcome.OPEN]
         assert found.encounters[0].last_frame == 50
         np.testing.assert_array_equal(found.order, tracks.truth)
 
@@ -273,7 +275,7 @@ class TestTwoDrones:
         was_measured = tracks.was_measured.copy()
         was_measured[50:, 1] = False
         params = IdentityParams(encounter_m=ENCOUNTER_M, patience_s=0.8)
-        found = resolved(replace(tracks, was_measured=was_measured), params=params)
+        found = resolve_tracks(replace(tracks, was_measured=was_measured), params=params)
         (encounter,) = found.encounters
         assert encounter.last_frame == 49 + round(0.8 / DT_S)
         assert encounter.outcome is not LabelOutcome.SWAPPED
@@ -298,7 +300,7 @@ class TestMoreDrones:
     @pytest.mark.parametrize("permutation", list(permutations(range(3))))
     def test_three_drones_that_meet_at_once(self, permutation):
         tracks = simulate_tracks(meeting_in_the_middle(3), exchanges=[(50, permutation)])
-        found = resolved(tracks)
+        found = resolve_tracks(tracks)
         assert_corrected(found, tracks)
         assert len(found.encounters) == 3
         for encounter in found.encounters:
@@ -309,12 +311,12 @@ class TestMoreDrones:
     def test_two_swaps_at_different_times(self):
         """Three tracks are permuted in two steps, and each step is corrected in its frame."""
         tracks = simulate_tracks(meeting_in_the_middle(3), exchanges=[(46, (1, 0, 2)), (54, (0, 2, 1))])
-        np.testing.assert_array_equal(resolved(tracks).order, tracks.truth)
+        np.testing.assert_array_equal(resolve_tracks(tracks).order, tracks.truth)
 
     def test_four_drones_that_meet_and_one_far_away(self):
         flown_m = np.concatenate([meeting_in_the_middle(4), np.full((100, 1, 3), 2.0)], axis=1)
         tracks = simulate_tracks(flown_m, exchanges=[(50, (2, 3, 1, 0, 4))])
-        found = resolved(tracks)
+        found = resolve_tracks(tracks)
         assert_corrected(found, tracks)
         assert (found.ambiguity[:, (found.pairs == 4).any(axis=1)] == 0).all()
         assert (found.ambiguity[:, (found.pairs != 4).all(axis=1)] > 0).any(axis=0).all()
@@ -328,13 +330,13 @@ class TestMoreDrones:
         tracks = simulate_tracks(
             flown_m, exchanges=[(40, (1, 0, 2, 3)), (45, (0, 1, 3, 2)), (63, (2, 1, 0, 3))]
         )
-        found = resolved(tracks)
+        found = resolve_tracks(tracks)
         np.testing.assert_array_equal(found.order, tracks.truth)
         assert {encounter.first_frame for encounter in found.encounters} != {0}
 
     def test_five_drones_at_once_exceed_the_size_of_a_group(self):
         """Correct labels are kept, and the reported ambiguity is a probability."""
-        found = resolved(simulate_tracks(meeting_in_the_middle(5)))
+        found = resolve_tracks(simulate_tracks(meeting_in_the_middle(5)))
         assert (found.order == np.arange(5)).all()
         assert ((found.ambiguity >= 0) & (found.ambiguity <= 1)).all()
 
@@ -343,7 +345,7 @@ class TestMoreDrones:
         still = np.stack([np.array([[0.0, y, 1.0]]) for y in (0.0, 0.45)], axis=1).repeat(100, axis=0)
         third = np.stack([2 * SECONDS, np.full(100, -0.3), np.ones(100)], axis=-1)[:, None]
         tracks = simulate_tracks(np.concatenate([still, third], axis=1), exchanges=[(50, (2, 1, 0))])
-        found = resolved(tracks)
+        found = resolve_tracks(tracks)
         np.testing.assert_array_equal(found.order, tracks.truth)
         (passed,) = (encounter for encounter in found.encounters if encounter.drones == (0, 2))
         assert passed.outcome is LabelOutcome.SWAPPED
@@ -360,8 +362,8 @@ class TestMoreDrones:
         )
         tracks.was_measured[rng.random((100, 4)) < 0.1] = False
         names = rng.permutation(4)
-        found = resolved(tracks)
-        renamed = resolved(
+        found = resolve_tracks(tracks)
+        renamed = resolve_tracks(
             replace(
                 tracks,
                 measured_m=tracks.measured_m[:, names],
@@ -382,11 +384,13 @@ class TestMoreDrones:
         x = 1.5 * np.sin(time_s[:, None] * [1.1, 0.9, 1.3] + [0.0, 2.0, 4.0])
         flown_m = np.stack([x, 0.1 * np.arange(3) * np.ones_like(x), np.ones_like(x)], axis=-1)
         tracks = simulate_tracks(flown_m, 0.02, exchanges=[(100, (1, 0, 2)), (200, (0, 2, 1))])
-        whole = resolved(tracks)
+        whole = resolve_tracks(tracks)
         assert len(whole.encounters) > 8
         for frames in range(20, 300, 56):
             names = ("time_s", "measured_m", "covariance_m2", "was_measured")
-            found = resolved(replace(tracks, **{name: getattr(tracks, name)[:frames] for name in names}))
+            found = resolve_tracks(
+                replace(tracks, **{name: getattr(tracks, name)[:frames] for name in names})
+            )
             still_open = [
                 encounter for encounter in found.encounters if encounter.outcome is LabelOutcome.OPEN
             ]
@@ -397,7 +401,7 @@ class TestMoreDrones:
             assert found.encounters[:settled] == whole.encounters[:settled]
 
     def test_one_drone(self):
-        found = resolved(simulate_tracks(passing()[:, :1]))
+        found = resolve_tracks(simulate_tracks(passing()[:, :1]))
         assert (found.order == 0).all()
         assert found.pairs.shape == (0, 2)
         assert found.ambiguity.shape == (100, 0)
@@ -620,7 +624,7 @@ class TestInvalidInput:
         tracks = simulate_tracks(passing())
         tracks.measured_m[7, 1, 2] = np.nan
         with pytest.raises(InputError, match="row 7, drone 1"):
-            resolved(tracks)
+            resolve_tracks(tracks)
 
 
 class TestFrequencies:
@@ -646,7 +650,7 @@ class TestFrequencies:
                 truth[frame:, 2 * pair : 2 * pair + 2] = truth[frame:, 2 * pair : 2 * pair + 2][:, ::-1]
             tracks = simulate_tracks(flown_m + noise_m[..., None] * rng.normal(size=flown_m.shape), 0.0)
             covariance_m2 = np.broadcast_to(std_m**2 * np.eye(3), (*noise_m.shape, 3, 3))
-            found = resolved(order_by_tracks(replace(tracks, covariance_m2=covariance_m2), truth))
+            found = resolve_tracks(order_by_tracks(replace(tracks, covariance_m2=covariance_m2), truth))
             for pair in range(20):
                 column = (found.pairs == [2 * pair, 2 * pair + 1]).all(axis=1).argmax()
                 # One frame per encounter, soon after the closest frame, because neighbouring frames are dependent.
@@ -692,7 +696,7 @@ class TestFrequencies:
             truth = np.tile(np.arange(flown_m.shape[1]), (len(time_s), 1))
             for frame, one, other in exchanges:
                 truth[frame:, [one, other]] = truth[frame:, [other, one]]
-            found = resolved(order_by_tracks(simulate_tracks(flown_m, std_m, seed), truth))
+            found = resolve_tracks(order_by_tracks(simulate_tracks(flown_m, std_m, seed), truth))
             np.testing.assert_array_equal(found.order, truth)
             assert len(found.encounters) == meetings > len(exchanges) > 0
             certain = [abs(encounter.log_odds) > np.log(99) for encounter in found.encounters]

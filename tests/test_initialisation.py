@@ -260,7 +260,7 @@ def test_a_given_number_of_drones_finds_a_hidden_drone():
     drones = [near, point_behind(near, 0, 1.1)]
     coverage = draw_frames(flight(drones, np.zeros((2, 3)), 10), SIZES_M[1])[:, rows]
 
-    def number(drones=None):
+    def count_found(drones=None):
         found = find_drones(
             rig.cameras,
             coverage,
@@ -272,7 +272,7 @@ def test_a_given_number_of_drones_finds_a_hidden_drone():
         )
         return len(found.position_m)
 
-    assert [number(), number(1), number(2), number(3)] == [1, 1, 2, 2]
+    assert [count_found(), count_found(1), count_found(2), count_found(3)] == [1, 1, 2, 2]
 
 
 def test_a_drone_without_separate_blobs_gets_the_usual_size():
@@ -295,7 +295,7 @@ def test_the_order_of_the_blobs_does_not_matter(random):
     frames = [[find_blobs(image, REDUCTION) for image in images] for images in three_drones(10)[:3]]
     time_s, viewpoint = np.arange(3) / FPS, np.arange(5)
 
-    def chosen(images):
+    def choose_positions(images):
         paths = propose_paths(RIG.cameras, stack_blobs(images, 5, REDUCTION), time_s, ROOM_M, 6.0)
         return paths[choose_paths(paths, viewpoint)].position_m[:, 0]
 
@@ -303,8 +303,8 @@ def test_the_order_of_the_blobs_does_not_matter(random):
         order = random.sample(range(len(blobs.whole)), len(blobs.whole))
         return Blobs(blobs.centre_px[order], blobs.size_px[order], blobs.whole[order])
 
-    found = chosen(frames)
-    again = chosen([[shuffled(blobs) for blobs in images] for images in frames])
+    found = choose_positions(frames)
+    again = choose_positions([[shuffled(blobs) for blobs in images] for images in frames])
     # As with the order of the cameras, another path may be kept before the final fits.
     np.testing.assert_allclose(again[np.lexsort(again.T)], found[np.lexsort(found.T)], atol=0.01)
 

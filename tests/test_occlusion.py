@@ -12,7 +12,7 @@ from windows import (
     PIXELS_PER_M,
     best_place,
     cut_at,
-    each,
+    enumerate_windows,
     evaluate,
     far_rig,
     middle_px,
@@ -51,7 +51,7 @@ def test_foreground_that_neighbours_cover_is_occluded_except_in_the_core(occludi
     free = pixels(cut_at(far_rig(1), NOISE, CLOSE_M, size_m, occluding=None))
     found = occluded_pixels(patches)
     kept_in_core = left_out = 0
-    for (drone, camera), window in each(pixels(patches)):
+    for (drone, camera), window in enumerate_windows(pixels(patches)):
         covered = np.zeros((SIDE, SIDE), bool)
         for other in range(3):
             if other != drone and occluding[other]:
@@ -157,7 +157,7 @@ THERE_M = np.array([0.3, -0.2, 1.3])
 REACH_M = 0.15
 
 
-def drawn(position_m, size_m):
+def draw_in_room(position_m, size_m):
     return draw_coverage(RIG, position_m, size_m, REDUCTION)
 
 
@@ -165,12 +165,12 @@ def cut_in_room(images, expected_m, size_m, **how):
     return cut_at(RIG, images, expected_m, size_m, reach_m=REACH_M, reduction=REDUCTION, **how)
 
 
-def place(images, expected_m, size_m, **how):
+def find_best_place(images, expected_m, size_m, **how):
     patches = cut_in_room(images, expected_m, size_m, **how)
     return best_place(RIG, patches, expected_m, size_m)
 
 
-def flat(width_m, height_m=None):
+def flat_size(width_m, height_m=None):
     return np.array([width_m, width_m, height_m or 0.6 * width_m])
 
 
@@ -182,7 +182,7 @@ def directions(count):
     return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
 
 
-def pulls_m(size_m, apart_m, off_m, occluding):
+def shifts_m(size_m, apart_m, off_m, occluding):
     """(6,), distances by which a neighbour's silhouette moves a drone's best position, for six directions, metres.
 
     Args:
@@ -197,8 +197,8 @@ def pulls_m(size_m, apart_m, off_m, occluding):
         pair = THERE_M + apart_m * np.stack([0 * direction, direction])
         off = rng.standard_normal((2, 3))
         expected = pair + off_m * off / np.linalg.norm(off, axis=-1, keepdims=True)
-        alone = place(drawn(pair[0], size_m[0]), expected, size_m, occluding=False)[0]
-        together = place(drawn(pair, size_m), expected, size_m, occluding=occluding)[0]
+        alone = find_best_place(draw_in_room(pair[0], size_m[0]), expected, size_m, occluding=False)[0]
+        together = find_best_place(draw_in_room(pair, size_m), expected, size_m, occluding=occluding)[0]
         pulls.append(np.linalg.norm(together - alone))
     return np.array(pulls)
 
@@ -212,17 +212,17 @@ def pulls_m(size_m, apart_m, off_m, occluding):
 )
 def test_a_neighbour_hardly_moves_the_best_position(apart_m, mean_m, without_m):
     for widths_m, off_m in (((0.45, 0.45), 0.02), ((0.4, 0.5), 0.0)):
-        size_m = np.stack([flat(width) for width in widths_m])
-        assert pulls_m(size_m, apart_m, off_m, True).mean() < mean_m
-    assert pulls_m(size_m, apart_m, off_m, False).mean() > without_m
+        size_m = np.stack([flat_size(width) for width in widths_m])
+        assert shifts_m(size_m, apart_m, off_m, True).mean() < mean_m
+    assert shifts_m(size_m, apart_m, off_m, False).mean() > without_m
 
 
 def test_drones_that_almost_touch_keep_their_scores():
     """Drones half a width apart are unoccluded by half in at most one camera; small shares of many cameras suffice."""
-    size_m = np.stack([flat(0.45)] * 2)
+    size_m = np.stack([flat_size(0.45)] * 2)
     for direction in directions(4):
         pair = THERE_M + 0.2 * np.stack([0 * direction, direction])
-        patches = cut_in_room(drawn(pair, size_m), pair, size_m)
+        patches = cut_in_room(draw_in_room(pair, size_m), pair, size_m)
         assert (patches.clear > 0.5).sum(axis=-1).min() < 2
         best = best_place(RIG, patches, pair + 0.01, size_m)
         assert (evaluate(drone_fitness, RIG, patches, best, size_m) > 0.4).all()
@@ -231,9 +231,9 @@ def test_drones_that_almost_touch_keep_their_scores():
 
 
 def test_occlusion_changes_no_score_of_distant_drones():
-    size_m = np.stack([flat(0.4), flat(0.5)])
+    size_m = np.stack([flat_size(0.4), flat_size(0.5)])
     pair = np.array([THERE_M, THERE_M + np.array([-0.9, 0.9, -0.5])])
-    images = drawn(pair, size_m)
+    images = draw_in_room(pair, size_m)
     # In these cameras, no drone's occluding ellipse reaches the other drone's window.
     boxes = jax.jit(project_boxes)(make_extents(*float32((RIG.cameras, size_m))), float32(pair)).xyxy
     gap_px = np.maximum(boxes[0, :, :2] - boxes[1, :, 2:], boxes[1, :, :2] - boxes[0, :, 2:]).max(axis=-1)
@@ -252,9 +252,9 @@ def test_occlusion_changes_no_score_of_distant_drones():
 
 def test_a_drone_has_no_score_on_another_drones_silhouette():
     """Two drones are expected at one silhouette: the occluding one keeps its score, the other has no score."""
-    size_m = np.stack([flat(0.4)] * 2)
+    size_m = np.stack([flat_size(0.4)] * 2)
     expected_m = np.stack([THERE_M, THERE_M])
-    images = drawn(THERE_M, size_m[0])
+    images = draw_in_room(THERE_M, size_m[0])
     patches = cut_in_room(images, expected_m, size_m, occluding=[True, False])
     _, weight = evaluate(camera_scores, RIG, patches, expected_m, size_m)
     np.testing.assert_allclose(weight[1], 0, atol=1e-6)
@@ -275,11 +275,11 @@ def test_an_absent_drone_has_a_low_score_beside_a_passing_neighbour(apart_m, sha
     Measured 0.51, 0.13 and 0.08; without occlusion 0.69, 0.39 and 0.17. At 0.3 m the share is large, because the
     neighbour's silhouette covers the core of the absent drone's ellipse.
     """
-    size_m = np.stack([flat(0.45)] * 2)
+    size_m = np.stack([flat_size(0.45)] * 2)
     found, free = [], []
     for direction in directions(4):
         pair = THERE_M + apart_m * np.stack([0 * direction, direction])
-        images = drawn(pair[1], size_m[1])
+        images = draw_in_room(pair[1], size_m[1])
         for scores, occluding in ((found, True), (free, False)):
             patches = cut_in_room(images, pair, size_m, occluding=occluding)
             best = best_place(RIG, patches, pair, size_m)

@@ -16,7 +16,7 @@ from windows import (
     RING,
     SHAPE,
     cut_at,
-    each,
+    enumerate_windows,
     evaluate,
     evaluate_whole,
     far_rig,
@@ -55,7 +55,7 @@ def test_windows_are_means_of_the_whole_image(reduction):
     np.testing.assert_array_equal(patches.clear, 1)
     assert patches.size_wh_px == (SHAPE[1] * reduction, SHAPE[0] * reduction)
     hanging = 0
-    for (drone, camera), window in each(pixels(patches)):
+    for (drone, camera), window in enumerate_windows(pixels(patches)):
         cell = 2 ** level[drone, camera]
         column, row = (edge[drone, camera] / reduction for edge in (patches.x_px, patches.y_px))
         # Edges of windows are whole pixels, on the grid of their level.

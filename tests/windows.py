@@ -75,7 +75,7 @@ def _words(patches):
     return windows.reshape(*patches.x_px.shape, SIDE, SIDE)
 
 
-def each(windows):
+def enumerate_windows(windows):
     """Iterate over ((drone, camera), window)."""
     return (((d, c), windows[d, c]) for d in range(windows.shape[0]) for c in range(windows.shape[1]))
 
