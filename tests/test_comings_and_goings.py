@@ -1,4 +1,4 @@
-"""Tracking an unknown number of drones in rendered video: drones appear, leave, land and fly out of two cameras.
+"""Tracking an unknown number of drones in rendered video: drones appear, leave, land and fly away.
 
 The scenario has four cameras and a quarter of the image size, so that it runs in a minute. Its silhouettes are not
 reduced, so drones cover as many cells as at full size. The full scenario is

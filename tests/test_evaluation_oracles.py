@@ -42,6 +42,8 @@ def separate_flights(seed: int) -> tuple[Trajectories, Trajectories]:
     # Tracks are removed where their drone is unknown; other tests show that such tracks do not count.
     est_m[~known] = np.nan
     false_m = np.where(rng.random((num_frames, 1, 1)) < 0.5, 50.0, np.nan) + np.zeros(3)
+    # psotrack ignores frames without any known drone; the other packages count the false track in such frames.
+    false_m[~known.any(axis=1)] = np.nan
     frame = np.arange(num_frames)
     return (
         Trajectories(frame, frame / FPS, tuple("abcde"), np.concatenate([est_m, false_m], axis=1)),
