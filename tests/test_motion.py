@@ -133,7 +133,7 @@ class TestAgainstTheTextbook:
         np.testing.assert_array_equal(states.position_m, states.apparent_m)
 
     @pytest.mark.parametrize("error_share", [0.0, 0.5])
-    def test_prediction_is_the_flow(self, error_share):
+    def test_two_predictions_equal_one_prediction(self, error_share):
         """Two predictions in a row equal one prediction, and a prediction over 0 s changes nothing."""
         flown = simulate_flight(3, frames=2, drones=4, error_share=error_share)
         with jax.enable_x64(True):

@@ -37,7 +37,7 @@ def has_picture(cell):
 
 
 @each_script
-def test_script_and_notebook_hold_the_same(script):
+def test_script_and_notebook_have_the_same_cells(script):
     assert cells(jupytext.read(script)) == cells(committed_notebook(script))
 
 
