@@ -72,8 +72,8 @@ def main() -> None:
     run = _results.Run("table4")
     try:
         data = options.data or simulated(options.out / "data")
-        what = tomllib.loads(options.methods.read_text())
-        rows = tracked({**what, "sequences": at_hand(data)}, options.out, data)
+        methods = tomllib.loads(options.methods.read_text())
+        rows = tracked({**methods, "sequences": at_hand(data)}, options.out, data)
         show(rows, options.out)
         if options.results:
             manifest = options.out.glob("*manifest.json")
@@ -103,14 +103,14 @@ def at_hand(data: Path) -> list[str]:
     return found
 
 
-def tracked(what: dict, out: Path, data: Path) -> pd.DataFrame:
+def tracked(cells: dict, out: Path, data: Path) -> pd.DataFrame:
     """One row per sequence and method; cells that are finished in `out` are not run again."""
     from psotrack.support import keep_compiled
     from psotrack.sweep import share_processors
 
     share_processors()
     keep_compiled(out / "cache" / "compiled")
-    return sweep(grid(what), out, data=data, cache=out / "cache", report=progress_bar)
+    return sweep(grid(cells), out, data=data, cache=out / "cache", report=progress_bar)
 
 
 def show(rows: pd.DataFrame, out: Path) -> None:

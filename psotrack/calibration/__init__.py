@@ -1,4 +1,4 @@
-"""Calibration: lenses and poses of cameras, and adjustment of a rig to what its cameras see.
+"""Calibration: lenses and poses of cameras, and adjustment of a rig to the pixels that its cameras measure.
 
 In: a data sheet or a video of a ChArUco board (`intrinsics`), points of known position (`image_points`, `extrinsics`),
 or detections of drones (`bundle`). Out: lenses and rigs with covariances. `bundle` adjusts all cameras and points

@@ -83,10 +83,12 @@ def adjust(
         InputError: the points do not determine the cameras; the message names a camera that sees too few points.
     """
     noise_px = np.broadcast_to(np.asarray(noise_px, np.float64), points_px.shape[:2])
-    for what, names in (("fixed", fixed), ("rescaled", rescaled)):
+    for argument, names in (("fixed", fixed), ("rescaled", rescaled)):
         unknown = [name for name in names if name not in rig.names]
         if unknown:
-            raise SettingsError(what, expected=f"some of {', '.join(rig.names)}", found=", ".join(unknown))
+            raise SettingsError(
+                argument, expected=f"some of {', '.join(rig.names)}", found=", ".join(unknown)
+            )
     if len(set(fixed)) == len(rig) and not rescaled:
         raise SettingsError("fixed", expected="a camera that may move", found="all cameras")
     placed = np.isfinite(points_px).all(axis=-1)

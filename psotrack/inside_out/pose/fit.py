@@ -66,7 +66,7 @@ class Fit:
             and of the focal length.
         fits: (markers, 4), True for corners that fit the pose.
         reprojection_px: root mean square distance of these corners in the image.
-        log_evidence: logarithm of the probability density of all corners, integrated over poses near this one.
+        log_evidence: logarithm of the probability density of all corners, integrated over poses near this pose.
     """
 
     position_m: Float[np.ndarray, "3"]
@@ -201,7 +201,7 @@ class _NoiseFit:
         fits: (markers, 4), True for corners that fit.
         noise: variances of the errors.
         number: number of steps so far.
-        last: the last step; None before the first one.
+        last: the last step; None before the first step.
     """
 
     seen: SeenCorners
