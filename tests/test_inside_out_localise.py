@@ -216,7 +216,7 @@ def test_frames_with_few_or_no_markers_are_reported(room, tmp_path):
     ("options", "advice"),
     [
         (["--fov", "70,55.4", "--dictionary", "5x5_1000"], "no frame shows a marker of the map: check --dictionary"),
-        (["--fov", "70,55.4", "--min-markers", "14"], "of the map: --min-markers asks for 14"),
+        (["--fov", "70,55.4", "--min-markers", "14"], "of the map: --min-markers requires 14"),
         (["--fov", "20,70"], "no pose fits the markers: check --markers, and --camera or --fov"),
         (["--fov", "70,55.4", "--frames", "1"], None),
         (["--fov", "70,55.4", "--frames", "1", "--no-filter"], None),
