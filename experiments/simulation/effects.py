@@ -60,18 +60,22 @@ TITLE_PX, GAP_PX, FONT_PX = 24, 6, 14
 
 @dataclass(frozen=True)
 class Pair:
-    """A view twice.
+    """A view without and with an effect.
 
     Attributes:
-        name: of the effect.
-        titles: of the picture without it and of that with it.
-        without, with_it: settings that differ from `OFF`.
-        at_m: a drone's place, and the middle of the view.
-        aim_m: the middle of the view, where it is not the drone.
-        velocity_m_s: the drone's, along x.
-        size_px: of the view, before it is magnified.
-        zoom: by which it is magnified, pixels staying pixels.
-        difference: by which the difference is multiplied in a third picture; there is none at 0.
+        name: name of the effect.
+        titles: titles of the pictures without and with the effect.
+        with_it: imaging settings with the effect, where they differ from `OFF`.
+        without: imaging settings without the effect, where they differ from `OFF`.
+        at_m: position of the drone, world.
+        aim_m: middle of the view, world; None: the drone.
+        velocity_m_s: velocity of the drone along x.
+        camera: the camera.
+        model: name of the drone model.
+        paint_bgr: paint of the drone.
+        size_px: width and height of the view before magnification.
+        zoom: factor of the magnification, without interpolation.
+        difference: factor of the difference in a third picture; 0: no third picture.
     """
 
     name: str
@@ -160,7 +164,7 @@ PAIRS = (
 
 
 def scene_of(pair: Pair, imaging: Imaging) -> Scenario:
-    """The laboratory with one camera and one drone."""
+    """Scenario of the laboratory with one camera and one drone."""
     period_s = 3.0
     swing_m = pair.velocity_m_s * period_s / (2 * np.pi)
     flight = Harmonics(
@@ -190,7 +194,7 @@ def view(pair: Pair, changes: dict[str, Any]) -> np.ndarray:
 
 
 def picture(pair: Pair) -> Image.Image:
-    """Both views side by side under their titles."""
+    """Picture of both views side by side under their titles."""
     views = [view(pair, pair.without), view(pair, pair.with_it)]
     titles = [*pair.titles]
     if pair.difference:
@@ -222,7 +226,7 @@ def curves(rows: int) -> tuple[Figure, list[Any]]:
 
 
 def drift() -> Figure:
-    """Two minutes of the slow changes of three cameras, with the default settings."""
+    """Draw two minutes of the slow changes of three cameras, with the default settings."""
     default = Imaging()
     figure, (exposure, white) = curves(2)
     time_s = np.linspace(0, 120, 600)

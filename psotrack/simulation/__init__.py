@@ -1,8 +1,8 @@
-"""Simulated recordings: a scenario and a seed become videos, a calibration and the truth.
+"""Simulation of sequences: from a scenario and a seed to videos, a calibration and ground truth.
 
-In: a `Scenario` (a preset or a TOML file) and a seed. Out: a folder in the layout of the DPJAIT dataset, which is
-read like a recorded one. The renderer draws 3D shapes; it knows neither the boxes nor the score of the tracker, so it
-cannot confirm their mistakes.
+In: a `Scenario` (a preset or a TOML file) and `SimulationSettings`. Out: a folder in the layout of the DPJAIT dataset,
+which is read like a recorded sequence. The renderer draws 3D shapes. It does not use the boxes and the score of the
+tracker, because shared code would hide mistakes of the tracker.
 """
 
 import lazy_loader

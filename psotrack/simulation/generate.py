@@ -46,7 +46,7 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SimulationSettings:
-    """What a simulation makes of a scenario. Scenario and settings together decide every byte of the sequence.
+    """Settings of a simulation. Scenario and settings together decide every byte of the sequence.
 
     Attributes:
         num_frames: number of first frames to simulate; None: all frames of the scenario.

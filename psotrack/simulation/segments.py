@@ -156,7 +156,7 @@ def _write_masks(
     writer: MaskWriter, camera: str, frame: int, drones: Sequence[Silhouette], scene: Scene, cam: Pinhole
 ) -> None:
     """Write one mask per drone of the scene; the mask of a drone that the camera does not see is black."""
-    in_view = {one.number: one.mask() for one in drones}
+    in_view = {drone.number: drone.mask() for drone in drones}
     black = np.zeros((cam.height, cam.width), bool)
     for number in range(1, len(scene.flights) + 1):
         writer.write(camera, number, frame, in_view.get(number, black))
@@ -164,7 +164,7 @@ def _write_masks(
 
 def _concatenated(found: Sequence[Detections]) -> Detections:
     return Detections(
-        np.concatenate([one.frame for one in found]),
-        np.concatenate([one.xyxy for one in found]),
-        np.concatenate([one.confidence for one in found]),
+        np.concatenate([detections.frame for detections in found]),
+        np.concatenate([detections.xyxy for detections in found]),
+        np.concatenate([detections.confidence for detections in found]),
     )

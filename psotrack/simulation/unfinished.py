@@ -120,8 +120,8 @@ def _acquire(lock: FileLock, target: Path) -> None:
     except Timeout:
         raise OutputError(
             target,
-            expected="to be the only one who writes it",
-            found="another simulation at work on it",
+            expected="no other simulation of this sequence at the same time",
+            found="another simulation",
             remedy="wait until it ends, or choose another folder",
         ) from None
     except OSError as error:

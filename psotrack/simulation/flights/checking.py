@@ -56,7 +56,7 @@ def _chain(scenario: Scenario, index: int) -> list[int]:
             raise wrong(
                 scenario,
                 field,
-                expected="drones that do not follow one another in a ring",
+                expected="relative flights without a cycle",
                 found=f"drones {loop}",
             )
     return chain

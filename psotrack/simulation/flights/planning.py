@@ -58,8 +58,8 @@ def _refusal(scenario: Scenario, nominal: Excess | None, varied: list[Excess]) -
     """Error that names the limit that the flights violate without variation, or else the most frequent violation."""
     if nominal:
         return wrong(scenario, nominal.field, expected=nominal.limit, found=nominal.found)
-    (field, limit), times = Counter((one.field, one.limit) for one in varied).most_common(1)[0]
-    example = next(one for one in varied if (one.field, one.limit) == (field, limit))
+    (field, limit), times = Counter((found.field, found.limit) for found in varied).most_common(1)[0]
+    example = next(found for found in varied if (found.field, found.limit) == (field, limit))
     return wrong(
         scenario,
         field,

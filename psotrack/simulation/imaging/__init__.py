@@ -1,1 +1,1 @@
-"""From the world to the pixels of a camera."""
+"""Drawing of a scene in a camera's image."""

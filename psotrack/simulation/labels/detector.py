@@ -83,23 +83,24 @@ def iou(a: Box, b: Box) -> float:
 
 def _targets(seen: Sequence[Silhouette]) -> list[_Target]:
     targets = []
-    for one in seen:
-        box = one.xyxy
+    for silhouette in seen:
+        box = silhouette.xyxy
         if box is not None:
             size_px = np.sqrt(np.prod(box[2:] - box[:2]))
-            in_sight = 1 - (1 - one.seen_share) ** 2
-            targets.append(_Target(box, float(in_sight * -np.expm1(-((size_px / _SMALL_PX) ** 2)))))
+            visibility = 1 - (1 - silhouette.seen_share) ** 2
+            targets.append(_Target(box, float(visibility * -np.expm1(-((size_px / _SMALL_PX) ** 2)))))
     return targets
 
 
 def _merge_overlapping(targets: list[_Target], merge_iou: float) -> list[_Target]:
     """Merge pairs of targets until no two boxes have an overlap above `merge_iou`."""
-    for i, one in enumerate(targets):
+    for i, target in enumerate(targets):
         for j in range(i + 1, len(targets)):
             other = targets[j]
-            if iou(one.xyxy, other.xyxy) > merge_iou:
-                corners = np.minimum(one.xyxy[:2], other.xyxy[:2]), np.maximum(one.xyxy[2:], other.xyxy[2:])
-                both = _Target(np.concatenate(corners), max(one.quality, other.quality))
+            if iou(target.xyxy, other.xyxy) > merge_iou:
+                lower = np.minimum(target.xyxy[:2], other.xyxy[:2])
+                upper = np.maximum(target.xyxy[2:], other.xyxy[2:])
+                both = _Target(np.concatenate([lower, upper]), max(target.quality, other.quality))
                 return _merge_overlapping(
                     [both, *targets[:i], *targets[i + 1 : j], *targets[j + 1 :]], merge_iou
                 )

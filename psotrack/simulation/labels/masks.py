@@ -124,17 +124,17 @@ def _draw_alone(scene: Scene, cam: Pinhole, drone: int, time_s: float) -> _Drawn
 
 
 def _occlude(
-    one: _Drawn, other: _Drawn, seen: Bool[np.ndarray, "rows columns"], other_seen: Bool[np.ndarray, "r c"]
+    drone: _Drawn, other: _Drawn, seen: Bool[np.ndarray, "rows columns"], other_seen: Bool[np.ndarray, "r c"]
 ) -> None:
     """Remove from the visible masks of two drones the pixels where the other drone is nearer."""
-    a, b = one.window, other.window
+    a, b = drone.window, other.window
     if not a.overlaps(b):
         return
     x, y = max(a.x, b.x), max(a.y, b.y)
     right, bottom = min(a.x + a.width, b.x + b.width), min(a.y + a.height, b.y + b.height)
     shared = RasterView(a.cam, x, y, right - x, bottom - y)
     here, there = shared.slices_in(a), shared.slices_in(b)
-    both = one.covered[here] & other.covered[there]
-    nearer = one.depth_m[here] <= other.depth_m[there]
+    both = drone.covered[here] & other.covered[there]
+    nearer = drone.depth_m[here] <= other.depth_m[there]
     seen[here] &= ~(both & ~nearer)
     other_seen[there] &= ~(both & nearer)
