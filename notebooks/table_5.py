@@ -26,7 +26,7 @@ import pandas as pd
 from IPython.display import Markdown
 
 from psotrack.support import COLOURS
-from psotrack.sweep import pivot, render
+from psotrack.sweep import pivot, render_table
 from psotrack.sweep.figures import error_against_work
 
 # %%
@@ -61,7 +61,7 @@ table = pivot(
     value="mean_error_m",
     scale=1000,
 )
-Markdown(render(table, "markdown", decimals=1))
+Markdown(render_table(table, "markdown", decimals=1))
 
 # %% [markdown]
 # Millimetres, mean ± standard deviation over the runs; measured from the drones' origins, so each drone's constant
@@ -75,7 +75,7 @@ table = pivot(
     value="offset_removed_mean_error_m",
     scale=1000,
 )
-Markdown(render(table, "markdown", decimals=1))
+Markdown(render_table(table, "markdown", decimals=1))
 
 # %% [markdown]
 # The paper's own errors, on its own videos. Videos, silhouettes, sizes, initial states and motion model differ from

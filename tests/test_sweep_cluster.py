@@ -7,7 +7,7 @@ import pytest
 from sweeps import all_rows, grid_file, psotrack, small_sequence
 
 from psotrack.errors import SettingsError
-from psotrack.sweep import load, run_on_cluster
+from psotrack.sweep import read_grid, run_on_cluster
 
 pytest.importorskip("distributed")
 
@@ -54,4 +54,4 @@ def test_without_dask_one_line_says_what_to_install(tmp_path, monkeypatch):
     with pytest.raises(
         SettingsError, match=r"expected Dask, found .*; install it with `pip install 'psotrack\[dask\]'`"
     ):
-        run_on_cluster(load(grid_file(tmp_path, [2])), tmp_path, data=tmp_path, cache=tmp_path)
+        run_on_cluster(read_grid(grid_file(tmp_path, [2])), tmp_path, data=tmp_path, cache=tmp_path)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from psotrack.errors import InputError, SettingsError
 from psotrack.settings import ScoreSettings, SwarmSettings, TrackSettings
 from psotrack.silhouettes import SilhouetteSettings
-from psotrack.sweep import Perturbation, grid, key_of, load
+from psotrack.sweep import Perturbation, cell_key, grid, read_grid
 from psotrack.sweep.names import SETTINGS
 
 FILE = """
@@ -65,13 +65,13 @@ def test_every_combination_is_a_cell(path):
             cell.cameras,
             cell.perturbation.draw,
         )
-        for cell in load(path).cells()
+        for cell in read_grid(path).cells()
     ]
     assert found == expected
 
 
 def test_a_cell_has_the_settings_of_the_file(path):
-    paper = load(path).cells()[0]
+    paper = read_grid(path).cells()[0]
     assert paper.settings == TrackSettings(
         silhouettes=SilhouetteSettings(reduction=8, var_threshold=8.0),
         swarm=SwarmSettings(particles=20, spread_m=1.0, kind="joint"),
@@ -82,12 +82,12 @@ def test_a_cell_has_the_settings_of_the_file(path):
 
 
 def test_settings_of_a_method_replace_settings_of_all_cells(path):
-    ours = next(cell for cell in load(path).cells() if cell.method == "ours")
+    ours = next(cell for cell in read_grid(path).cells() if cell.method == "ours")
     assert (ours.settings.swarm.spread_m, ours.settings.silhouettes.reduction) == (1.0, 2)
 
 
 def test_axes_are_the_varied_values_as_numbers_and_words(path):
-    axes = [dict(cell.axes) for cell in load(path).cells()[:5]]
+    axes = [dict(cell.axes) for cell in read_grid(path).cells()[:5]]
     kept = [("all", 0), ("4", 0), ("4", 1), ("4", 2), ("cam1i+cam2i", 0)]
     assert axes == [
         {"swarm.particles": 20, "silhouettes.var_threshold": 8.0, "cameras": cameras, "draw": draw}
@@ -113,7 +113,7 @@ def test_a_mapping_gives_the_same_cells_as_toml(path):
             "draws": 3,
         },
     }
-    assert grid(mapping).cells() == load(path).cells()
+    assert grid(mapping).cells() == read_grid(path).cells()
 
 
 def test_sequences_may_be_path_objects(tmp_path):
@@ -169,7 +169,7 @@ def test_there_is_one_cell_per_combination_and_every_cell_has_its_own_key(
     num_drawn = len(set(cameras) - {"all"})
     cells = cells_of(grid=varied | ({"draws": draws} if num_drawn else {}))
     expected = len(particles) * len(spread_m) * (num_drawn * draws + ("all" in cameras))
-    keys = {key_of(cell, {"cam1": "ab"}) for cell in cells}
+    keys = {cell_key(cell, {"cam1": "ab"}) for cell in cells}
     assert len(keys) == len(cells) == expected
 
 
@@ -330,15 +330,15 @@ def test_sequences_must_be_given():
 def test_messages_of_a_file_begin_with_its_path(path):
     path.write_text(FILE.replace("swarm.kind", "swram.kind"))
     with pytest.raises(SettingsError, match=f"^{re.escape(str(path))}: methods.paper.swram.kind: "):
-        load(path)
+        read_grid(path)
 
 
 def test_a_file_that_is_not_toml(path):
     path.write_text("sequences = [\n")
     with pytest.raises(InputError, match=r"grid.toml.*: expected valid TOML"):
-        load(path)
+        read_grid(path)
     with pytest.raises(InputError, match=r"none.toml: expected a file to read"):
-        load(path.with_name("none.toml"))
+        read_grid(path.with_name("none.toml"))
 
 
 def test_a_perturbation_made_in_python_is_checked():
@@ -359,14 +359,14 @@ def test_the_number_of_runs_is_not_in_the_key():
         {"sequences": ["S01"], "runs": 9, "first_seed": 4, "grid": {"swarm.particles": [20, 50]}}
     ).cells()[0]
     assert few != many
-    assert key_of(few, INPUT) == key_of(many, INPUT)
-    assert re.fullmatch("[0-9a-f]{40}", key_of(few, INPUT))
+    assert cell_key(few, INPUT) == cell_key(many, INPUT)
+    assert re.fullmatch("[0-9a-f]{40}", cell_key(few, INPUT))
 
 
 def test_the_place_of_a_sequence_is_not_in_the_key():
     (one,) = grid({"sequences": ["S01"]}).cells()
     (other,) = grid({"sequences": ["/data/elsewhere/S01"]}).cells()
-    assert key_of(one, INPUT) == key_of(other, dict(reversed(INPUT.items())))
+    assert cell_key(one, INPUT) == cell_key(other, dict(reversed(INPUT.items())))
 
 
 def test_everything_that_decides_the_rows_is_in_the_key():
@@ -382,12 +382,14 @@ def test_everything_that_decides_the_rows_is_in_the_key():
         {"grid": {"cameras": [["cam1", "cam2"]]}},
         {"grid": {"flipped": [0.1]}},
     ]
-    keys = [key_of(grid(base | change).cells()[0], INPUT) for change in changes]
-    keys.append(key_of(grid(base).cells()[0], INPUT | {"cam2": "ce"}))
-    keys += [key_of(cell, INPUT) for cell in grid(base | {"grid": {"cameras": [2], "draws": 2}}).cells()[1:]]
+    keys = [cell_key(grid(base | change).cells()[0], INPUT) for change in changes]
+    keys.append(cell_key(grid(base).cells()[0], INPUT | {"cam2": "ce"}))
+    keys += [
+        cell_key(cell, INPUT) for cell in grid(base | {"grid": {"cameras": [2], "draws": 2}}).cells()[1:]
+    ]
     assert len(set(keys)) == len(keys)
 
 
 def test_cells_can_be_pickled(path):
-    cells = load(path).cells()
+    cells = read_grid(path).cells()
     assert pickle.loads(pickle.dumps(cells)) == cells

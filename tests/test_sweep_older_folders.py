@@ -6,9 +6,9 @@ import pandas as pd
 import pytest
 
 from psotrack.errors import SettingsError
-from psotrack.sweep import Store, grid, key_of, pivot
+from psotrack.sweep import Store, cell_key, grid, pivot
 from psotrack.sweep.cells import Cell
-from psotrack.sweep.older_folders import older_key_of, older_name_of
+from psotrack.sweep.older_folders import older_cell_key, older_failure_name
 
 INPUT_KEYS = {"cam1": "a" * 40, "calibration": "b" * 40}
 KEY, OLDER_KEY = "0" * 40, "1" * 40
@@ -38,13 +38,13 @@ def add(store: Store, key: str, rows: pd.DataFrame) -> None:
 def test_older_keys_are_those_of_version_0_1() -> None:
     """The keys were computed by version 0.1, from a grid with the same values under its own names."""
     cell = one_cell()
-    assert older_key_of(cell, INPUT_KEYS) == "ed4526dbcab59683702d0d4fe767099c9c80741e"
-    assert older_name_of(cell) == "6f4dd4b7aba02a71f7c3a1c206d8f40e47ff10ec"
-    assert older_key_of(cell, INPUT_KEYS) != key_of(cell, INPUT_KEYS)
+    assert older_cell_key(cell, INPUT_KEYS) == "ed4526dbcab59683702d0d4fe767099c9c80741e"
+    assert older_failure_name(cell) == "6f4dd4b7aba02a71f7c3a1c206d8f40e47ff10ec"
+    assert older_cell_key(cell, INPUT_KEYS) != cell_key(cell, INPUT_KEYS)
 
 
 def test_another_search_than_particle_swarms_has_no_older_key() -> None:
-    assert older_key_of(one_cell(**{"swarm.search": "other"}), INPUT_KEYS) is None
+    assert older_cell_key(one_cell(**{"swarm.search": "other"}), INPUT_KEYS) is None
 
 
 def test_rows_have_todays_names(tmp_path: Path) -> None:

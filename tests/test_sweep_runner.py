@@ -18,11 +18,11 @@ from sweeps import all_rows, grid_file, make_older, psotrack, small_sequence, st
 
 from psotrack.cli import main
 from psotrack.errors import InputError
-from psotrack.sweep import Inputs, Store, estimate, key_of, machine, runner, sweep
+from psotrack.sweep import Inputs, Store, cell_key, estimate, machine, runner, sweep
 from psotrack.sweep import grid as grid_of
 from psotrack.sweep.estimates import FRAME_S, WORK_S
 from psotrack.sweep.locks import Locks
-from psotrack.sweep.older_folders import older_key_of
+from psotrack.sweep.older_folders import older_cell_key
 
 SETTINGS = {
     "swarm.particles": 8,
@@ -270,7 +270,8 @@ def test_a_folder_of_version_0_1_is_read_and_continued(
     cells = grid_of(varied(3, 4)).cells()
     inputs_read = [inputs.keys_of(cell) for cell in cells]
     older_keys = {
-        key_of(cell, read): older_key_of(cell, read) for cell, read in zip(cells, inputs_read, strict=True)
+        cell_key(cell, read): older_cell_key(cell, read)
+        for cell, read in zip(cells, inputs_read, strict=True)
     }
     make_older(out, older_keys)
     code, lines, err = called(
@@ -302,9 +303,9 @@ def test_an_interrupted_move_of_an_older_cell_is_continued(
     sweep(varied(3), out, **folders)
     (cell,) = grid_of(varied(3)).cells()
     keys = Inputs(root, root / "cache").keys_of(cell)
-    older_key, copy = older_key_of(cell, keys), tmp_path / "copy"
+    older_key, copy = older_cell_key(cell, keys), tmp_path / "copy"
     shutil.copytree(out, copy)
-    make_older(out, {key_of(cell, keys): older_key})
+    make_older(out, {cell_key(cell, keys): older_key})
     for folder, older_folder in (("cells", "cells"), ("_errors", "errors")):
         shutil.copy(out / older_folder / f"{older_key}.parquet", copy / folder)
     assert len(sweep(varied(3), copy, **folders)) == 1
@@ -353,8 +354,8 @@ def test_a_runner_waits_for_locked_cells_and_runs_them_when_they_are_unlocked(
     first = grid.cells()[0]
     # If an assertion fails, the lock is released before the pool waits for its thread.
     with ThreadPoolExecutor(1) as threads:
-        with Store(out).lock(key_of(first, inputs.keys_of(first))):
-            waiting = threads.submit(runner.run, grid, out, data=root, cache=root / "cache")
+        with Store(out).lock(cell_key(first, inputs.keys_of(first))):
+            waiting = threads.submit(runner.run_in_process, grid, out, data=root, cache=root / "cache")
             while not tracker.runs:
                 assert not waiting.done(), waiting.result()
                 time.sleep(0.05)

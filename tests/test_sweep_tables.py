@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from psotrack.errors import SettingsError
-from psotrack.sweep import pivot, render
+from psotrack.sweep import pivot, render_table
 
 #: Two methods at two swarm sizes, three runs each; errors in metres.
 ERRORS_M = {
@@ -89,12 +89,12 @@ def test_failed_runs_do_not_count():
     assert table.loc["paper", (20, "mean")] == pytest.approx(72.0)
     assert table.loc["paper", (20, "runs")] == 2
     assert math.isnan(table.loc["paper", (100, "mean")])
-    assert render(table).splitlines()[-1].split() == ["paper", "72.0", "±", "2.8", "-"]
+    assert render_table(table).splitlines()[-1].split() == ["paper", "72.0", "±", "2.8", "-"]
 
 
 def test_a_single_run_has_no_spread():
     table = in_mm(results({("paper", 20): [0.0712], ("paper", 100): [0.0412]}))
-    assert render(table) == ("mean_error_mm\n\nparticles    20   100\nmethod\npaper      71.2  41.2\n")
+    assert render_table(table) == ("mean_error_mm\n\nparticles    20   100\nmethod\npaper      71.2  41.2\n")
 
 
 def test_labels_that_are_lists_or_missing():
@@ -173,7 +173,7 @@ def test_mixing_draws_gives_no_warning(caplog):
 
 
 def test_text():
-    assert render(in_mm(results(), ("sequence", "method"))) == (
+    assert render_table(in_mm(results(), ("sequence", "method"))) == (
         "mean_error_mm: mean ± standard deviation over 3 runs\n"
         "\n"
         "particles                20         100\n"
@@ -184,13 +184,13 @@ def test_text():
 
 
 def test_decimals_can_be_chosen():
-    assert "72 ± 2" in render(in_mm(results()), decimals=0)
-    assert "72.000 ± 2.000" in render(in_mm(results()), decimals=3)
+    assert "72 ± 2" in render_table(in_mm(results()), decimals=0)
+    assert "72.000 ± 2.000" in render_table(in_mm(results()), decimals=3)
 
 
 def test_whole_numbers_have_no_decimals():
     rows = pd.DataFrame({"a": [1, 2], "switches": [0, 12]})
-    text = render(pivot(rows, rows_by=["a"], columns_by=[], value="switches"))
+    text = render_table(pivot(rows, rows_by=["a"], columns_by=[], value="switches"))
     assert [line.split() for line in text.splitlines()[-2:]] == [["1", "0"], ["2", "12"]]
 
 
@@ -215,7 +215,7 @@ def test_text_is_at_most_80_characters_wide_and_complete(widths, magnitude):
         ]
     )
     table = pivot(rows, rows_by=["sequence"], columns_by=["outer", "inner"], value="v")
-    text = render(table)
+    text = render_table(table)
     assert max(map(len, text.splitlines())) <= 80
     assert text.count("±") == 1 + 2 * math.prod(widths)
     # Where columns are continued, the outer level's labels are repeated.
@@ -226,7 +226,7 @@ def test_text_is_at_most_80_characters_wide_and_complete(widths, magnitude):
 
 def test_markdown():
     rows = results(sequence="S|1*")
-    assert render(in_mm(rows, ("sequence",), ("method", "particles")), "markdown") == (
+    assert render_table(in_mm(rows, ("sequence",), ("method", "particles")), "markdown") == (
         "mean_error_mm: mean ± standard deviation over 3 runs\n"
         "\n"
         "| sequence | method ours, particles 20 | method ours, particles 100 |"
@@ -238,7 +238,7 @@ def test_markdown():
 
 def test_latex():
     table = in_mm(results(), ("sequence",), ("method", "particles"))
-    assert render(table, "latex") == (
+    assert render_table(table, "latex") == (
         "% mean_error_mm: mean ± standard deviation over 3 runs; \\usepackage{booktabs}\n"
         "\\begin{tabular}{lrrrr}\n"
         "\\toprule\n"
@@ -254,14 +254,14 @@ def test_latex():
 
 def test_special_characters_of_latex_are_escaped():
     rows = pd.DataFrame({"name": [r"a\b~c^d&%$#_{}"], "v": [None]}).astype({"v": float})
-    line = render(pivot(rows, rows_by=["name"], columns_by=[], value="v"), "latex").splitlines()[-3]
+    line = render_table(pivot(rows, rows_by=["name"], columns_by=[], value="v"), "latex").splitlines()[-3]
     escaped = r"a\textbackslash b\textasciitilde c\textasciicircum d\&\%\$\#\_\{\}"
     assert line == rf"{escaped} & -- \\"
 
 
 def test_csv_has_all_digits():
     table = in_mm(results({("a, b", 20): [0.1, 0.2], ("a, b", 100): [1 / 3]}))
-    head, row = csv.reader(io.StringIO(render(table, "csv")))
+    head, row = csv.reader(io.StringIO(render_table(table, "csv")))
     assert head == ["method", *(f"particles {n} {of}" for n in (20, 100) for of in ("mean", "std", "runs"))]
     assert row[0] == "a, b"
     assert [float(row[1]), float(row[2]), float(row[4])] == [*table.iloc[0, [0, 1, 3]]]
@@ -272,4 +272,4 @@ def test_an_unknown_format_is_one_line():
     with pytest.raises(
         SettingsError, match=r"format: expected one of text, .*, found latx; did you mean latex"
     ):
-        render(in_mm(results()), "latx")
+        render_table(in_mm(results()), "latx")

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from psotrack.support import atomic_write, keep_compiled, progress_bar
-from psotrack.sweep import load, sweep
+from psotrack.sweep import read_grid, sweep
 
 GRIDS = Path(__file__).parent / "studies"
 #: Study -> column that varies, and label of its axis.
@@ -33,7 +33,7 @@ KEPT = ["study", "level", "flight", "draw", *_runs.KEPT]
 
 def run_study(study: str, data: Path) -> pd.DataFrame:
     """Run a study; returns one row per run."""
-    grid = load(GRIDS / f"{study}.toml")
+    grid = read_grid(GRIDS / f"{study}.toml")
     for sequence in grid.sequences:
         seed = int(Path(sequence).parts[0].removeprefix("seed"))
         _runs.simulated(Path(sequence).name, data, seed)

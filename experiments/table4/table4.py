@@ -19,7 +19,7 @@ import pandas as pd
 from psotrack.datasets.dpjait import CALIBRATION
 from psotrack.errors import PsotrackError
 from psotrack.support import progress_bar
-from psotrack.sweep import grid, pivot, render, sweep
+from psotrack.sweep import grid, pivot, render_table, sweep
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results
@@ -118,8 +118,8 @@ def show(rows: pd.DataFrame, out: Path) -> None:
     parts = []
     for title, (value, scale, decimals) in TABLES.items():
         table = pivot(rows, rows_by=["sequence"], columns_by=["method"], value=value, scale=scale)
-        parts.append(f"## {title}\n\n{render(table, 'markdown', decimals=decimals)}")
-        print(f"{title}\n{render(table, decimals=decimals)}")
+        parts.append(f"## {title}\n\n{render_table(table, 'markdown', decimals=decimals)}")
+        print(f"{title}\n{render_table(table, decimals=decimals)}")
     rows[[name for name in KEPT if name in rows]].to_csv(
         out / "results.csv", index=False, float_format="%.6g"
     )

@@ -19,7 +19,7 @@ import pandas as pd
 
 from psotrack.errors import PsotrackError
 from psotrack.support import progress_bar
-from psotrack.sweep import Grid, Store, load, pivot, render, sweep
+from psotrack.sweep import Grid, Store, pivot, read_grid, render_table, sweep
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results
@@ -59,7 +59,7 @@ def main() -> None:
     run = _results.Run("table5")
     out = options.out or (Path("table5/quick") if options.quick else Path("table5"))
     try:
-        grid = load(options.grid or HERE / ("quick.toml" if options.quick else "grid.toml"))
+        grid = read_grid(options.grid or HERE / ("quick.toml" if options.quick else "grid.toml"))
         data = options.data or simulated(grid, out / "data", quick=options.quick)
         rows = tracked(grid, out, data)
         show(rows, out)
@@ -108,7 +108,7 @@ def show(rows: pd.DataFrame, out: Path) -> None:
         )
         for title, (value, scale, _) in TABLES.items()
     }
-    print(render(tables["Mean error"]))
+    print(render_table(tables["Mean error"]))
     said = [
         f"{name}: "
         + (f"{1e3 * low:.0f} to {1e3 * high:.0f} mm" if high > low else f"{1e3 * low:.0f} mm at best")
@@ -127,7 +127,7 @@ def show(rows: pd.DataFrame, out: Path) -> None:
     )
     draw(rows, published, out)
     parts = [
-        f"## {title}\n\n{render(table, 'markdown', decimals=TABLES[title][2])}"
+        f"## {title}\n\n{render_table(table, 'markdown', decimals=TABLES[title][2])}"
         for title, table in tables.items()
     ]
     last.write_text("\n".join([*parts, f"Published mean errors: {', '.join(said)}.\n"]))

@@ -92,10 +92,10 @@ def sweep(
         raise SettingsError("sweep", expected="GRID.toml or --status DIR", found="neither")
     if workers is not None and cluster is None:
         raise SettingsError("--workers", expected="--cluster local", found="no --cluster")
-    from psotrack.sweep import Cluster, load
+    from psotrack.sweep import Cluster, read_grid
 
     where_to_run = None if cluster is None else Cluster(cluster, workers, device)
-    grid = load(grid_file)
+    grid = read_grid(grid_file)
     if dry_run:
         from psotrack.sweep import Inputs, Store
 
@@ -132,13 +132,13 @@ def _run_here(
 ) -> SweepOutcome:
     """Run the cells in this process."""
     from psotrack.support import keep_compiled
-    from psotrack.sweep import run, share_processors, use_device
+    from psotrack.sweep import run_in_process, share_processors, use_device
 
     share_processors()
     if device is not None:
         use_device(device)
     keep_compiled(compiled_folder(cache))
-    return run(grid, out, data=data, cache=cache_folder(cache), jobs=jobs, report=report)
+    return run_in_process(grid, out, data=data, cache=cache_folder(cache), jobs=jobs, report=report)
 
 
 def _run_on_cluster(
@@ -189,7 +189,7 @@ def table(folder: Path, rows_by: str, columns_by: str | None, value: str, scale:
       psotrack table results --rows sequence,particles --columns iterations --value mean_error_m --scale 1000
       psotrack table results --columns method --value missed_rate --format latex
     """
-    from psotrack.sweep import Store, pivot, render
+    from psotrack.sweep import Store, pivot, render_table
 
     rows = [name for name in rows_by.split(",") if name]
     if columns_by is None:
@@ -201,7 +201,7 @@ def table(folder: Path, rows_by: str, columns_by: str | None, value: str, scale:
         value=value,
         scale=scale,
     )
-    click.echo(render(shown, layout).rstrip("\n"))
+    click.echo(render_table(shown, layout).rstrip("\n"))
 
 
 def _show(

@@ -1,12 +1,12 @@
 from .cluster import Cluster, run_on_cluster
 from .estimates import estimate
 from .frames import sweep
-from .grid_files import Cell, Grid, Perturbation, cameras_label, grid, key_of, load
+from .grid_files import Cell, Grid, Perturbation, cameras_label, cell_key, grid, read_grid
 from .inputs import Inputs
 from .machine import Device, share_processors, use_device
 from .perturbations import perturb
-from .printing import render
-from .runner import SweepOutcome, run
+from .printing import render_table
+from .runner import SweepOutcome, run_in_process
 from .store import Store
 from .tables import pivot
 
@@ -20,14 +20,14 @@ __all__ = [
     "Store",
     "SweepOutcome",
     "cameras_label",
+    "cell_key",
     "estimate",
     "grid",
-    "key_of",
-    "load",
     "perturb",
     "pivot",
-    "render",
-    "run",
+    "read_grid",
+    "render_table",
+    "run_in_process",
     "run_on_cluster",
     "share_processors",
     "sweep",

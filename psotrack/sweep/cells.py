@@ -88,7 +88,7 @@ class Cell:
         return isinstance(self.cameras, int) or self.perturbation.is_random
 
 
-def key_of(cell: Cell, input_keys: Mapping[str, str]) -> str:
+def cell_key(cell: Cell, input_keys: Mapping[str, str]) -> str:
     """Key of a cell's results: a digest, 40 hexadecimal digits, of everything except the seed that decides a row.
 
     `runs`, `first_seed` and `axes` are not part of the key. Rows of a cell are distinguished by their seeds, so more
@@ -124,9 +124,9 @@ def digest_cell(cell: Cell, settings: Mapping[str, Any], input_keys: Mapping[str
     return hashlib.blake2b(msgspec.json.encode(made_of, order="deterministic"), digest_size=20).hexdigest()
 
 
-def name_of(cell: Cell) -> str:
+def failure_name(cell: Cell) -> str:
     """Name under which a cell's failure is stored; it does not depend on whether the cell's input can be read."""
-    return key_of(cell, {"sequence": cell.sequence})
+    return cell_key(cell, {"sequence": cell.sequence})
 
 
 def title(cell: Cell) -> str:

@@ -92,7 +92,7 @@ def run_on_cluster(
     cluster: Cluster = Cluster(),
     report: Report = no_progress,
 ) -> SweepOutcome:
-    """Run the unfinished cells of a grid as tasks of a cluster; see `runner.run` for runs without a cluster.
+    """Run the unfinished cells of a grid as tasks of a cluster; see `runner.run_in_process` for runs without a cluster.
 
     Args:
         grid: the cells to run.
@@ -184,7 +184,7 @@ def _results(
     silhouettes: dict[Any, list[Any]] = {}
     for cell in cells:
         if source_of(cell) not in silhouettes:
-            cameras = inputs.sequence_of(cell).rig.names if cell.settings.needs_silhouettes else ()
+            cameras = inputs.recording_of(cell).rig.names if cell.settings.needs_silhouettes else ()
             silhouettes[source_of(cell)] = client.map(
                 _make_silhouettes, cameras, cell=cell, job=job, pure=False
             )
@@ -207,8 +207,8 @@ def _make_silhouettes(camera: str, cell: Cell, job: _Job) -> None:
     """A task: store the silhouettes of one camera."""
     # The cells that need the silhouettes report the error.
     with contextlib.suppress(PsotrackError):
-        sequence = _inputs(job).sequence_of(cell).usable([camera])
-        compute(sequence, cell.settings.silhouettes, cache=job.cache, jobs=1)
+        recording = _inputs(job).recording_of(cell).usable([camera])
+        compute(recording, cell.settings.silhouettes, cache=job.cache, jobs=1)
 
 
 def _run(cell: Cell, job: _Job, after: list[None]) -> Result:

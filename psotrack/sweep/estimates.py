@@ -11,10 +11,10 @@ import pandas as pd
 
 from psotrack.errors import InputError, PsotrackError
 from psotrack.silhouettes import open_stored, reduced_shape
-from psotrack.sweep.cells import Cell, key_of
+from psotrack.sweep.cells import Cell, cell_key
 from psotrack.sweep.inputs import Inputs, source_of
 from psotrack.sweep.machine import provenance
-from psotrack.sweep.older_folders import older_key_of
+from psotrack.sweep.older_folders import older_cell_key
 from psotrack.sweep.store import Store
 
 #: Rule of thumb, measured on two cores of an AMD EPYC, seconds: per frame of a run; per frame, particle, iteration,
@@ -75,22 +75,22 @@ def estimate(cells: Iterable[Cell], inputs: Inputs, store: Store | None) -> Esti
     for cell in cells:
         try:
             done = _finished_seeds(cell, inputs, store) if store else set()
-            sequence = inputs.sequence_of(cell)
+            recording = inputs.recording_of(cell)
         except PsotrackError:
             unread += 1
             continue
         runs = len(set(cell.seeds) - done)
         if not runs:
             continue
-        every = len(sequence.rig)
+        every = len(recording.rig)
         cameras = cell.cameras if isinstance(cell.cameras, int) else len(cell.cameras or range(every))
-        assert sequence.truth is not None
-        drones = cell.settings.drones.count or sequence.truth.num_drones
+        assert recording.truth is not None
+        drones = cell.settings.drones.count or recording.truth.num_drones
         settings = cell.settings
         count += 1
         swarm = settings.method != "projection-lines"
         work = settings.swarm.particles * settings.swarm.iterations * drones * cameras if swarm else 0
-        tracking_s += factor * runs * sequence.num_frames * (FRAME_S + WORK_S * work)
+        tracking_s += factor * runs * recording.num_frames * (FRAME_S + WORK_S * work)
         shape = (
             settings.swarm.particles,
             settings.swarm.kind,
@@ -110,7 +110,7 @@ def estimate(cells: Iterable[Cell], inputs: Inputs, store: Store | None) -> Esti
 def _finished_seeds(cell: Cell, inputs: Inputs, store: Store) -> set[int]:
     """Seeds of a cell's finished runs, of this version or of version 0.1."""
     input_keys = inputs.keys_of(cell)
-    keys = (key_of(cell, input_keys), older_key_of(cell, input_keys))
+    keys = (cell_key(cell, input_keys), older_cell_key(cell, input_keys))
     return set().union(*(store.finished_seeds(key) for key in keys if key is not None))
 
 
@@ -156,10 +156,10 @@ def _rule_s(rows: pd.DataFrame) -> pd.Series:
 
 def _silhouettes_s(cell: Cell, inputs: Inputs) -> float:
     """Time of making a cell's missing silhouettes, with all processes."""
-    sequence, keys, settings = inputs.sequence_of(cell), inputs.keys_of(cell), cell.settings.silhouettes
+    recording, keys, settings = inputs.recording_of(cell), inputs.keys_of(cell), cell.settings.silhouettes
     megapixels = [
         video.num_frames * video.image_size_wh[0] * video.image_size_wh[1] / 1e6
-        for name, video in sequence.videos.items()
+        for name, video in recording.videos.items()
         if open_stored(inputs.cache / keys[name], video.num_frames, reduced_shape(video, settings.reduction))
         is None
     ]

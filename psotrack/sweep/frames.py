@@ -11,9 +11,9 @@ import pandas as pd
 from psotrack.errors import InputError
 from psotrack.support import Report, no_progress
 from psotrack.sweep.cluster import Cluster, run_on_cluster
-from psotrack.sweep.grid_files import Grid, load
+from psotrack.sweep.grid_files import Grid, read_grid
 from psotrack.sweep.grid_files import grid as grid_of
-from psotrack.sweep.runner import run
+from psotrack.sweep.runner import run_in_process
 from psotrack.sweep.store import Store
 
 
@@ -61,11 +61,11 @@ def sweep(
             )
             rows.groupby("settings.swarm.particles")["mean_error_m"].agg(["mean", "std"])
     """
-    read = load(Path(grid)) if isinstance(grid, Path | str) else grid
+    read = read_grid(Path(grid)) if isinstance(grid, Path | str) else grid
     read = read if isinstance(read, Grid) else grid_of(read)
     out, data, cache = Path(out), Path(data), Path(cache)
     if cluster is None:
-        outcome = run(read, out, data=data, cache=cache, jobs=jobs, report=report)
+        outcome = run_in_process(read, out, data=data, cache=cache, jobs=jobs, report=report)
     else:
         cluster = Cluster(cluster) if isinstance(cluster, str) else cluster
         outcome = run_on_cluster(read, out, data=data, cache=cache, cluster=cluster, report=report)

@@ -19,10 +19,10 @@ from psotrack.errors import SettingsError
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import check_whole
 from psotrack.support import convert, read_toml
-from psotrack.sweep.cells import Cell, Perturbation, key_of
+from psotrack.sweep.cells import Cell, Perturbation, cell_key
 from psotrack.sweep.names import INPUTS, PERTURBATIONS, SETTINGS, check_name, flat, nested, place_of, table
 
-__all__ = ["Cell", "Grid", "Perturbation", "grid", "key_of", "load"]
+__all__ = ["Cell", "Grid", "Perturbation", "cell_key", "grid", "read_grid"]
 
 #: A value of a cell: place in the file, dotted name, and the value as it is in the file.
 _Choice = tuple[str, str, Any]
@@ -166,7 +166,7 @@ class _File(msgspec.Struct, frozen=True, kw_only=True):
     grid: dict[str, Any] = {}
 
 
-def load(path: Path) -> Grid:
+def read_grid(path: Path) -> Grid:
     """Read a grid from a TOML file.
 
     Raises:

@@ -17,7 +17,7 @@ from psotrack.errors import InputError, PsotrackError
 from psotrack.methods import detection_files_of
 from psotrack.recordings import Recording
 from psotrack.silhouettes import Silhouettes, SilhouetteSettings, compute
-from psotrack.silhouettes import key_of as silhouettes_key_of
+from psotrack.silhouettes import key_of as silhouettes_key
 from psotrack.support import digest_file
 from psotrack.sweep.cells import Cell
 from psotrack.sweep.locks import Locks
@@ -32,9 +32,9 @@ Source = tuple[str, int | None, SilhouetteSettings | None]
 
 @dataclass(frozen=True)
 class Input:
-    """A sequence after a cell's perturbation, and its silhouettes; None for a method that reads no silhouettes."""
+    """A recording after a cell's perturbation, and its silhouettes; None for a method that reads no silhouettes."""
 
-    sequence: Recording
+    recording: Recording
     silhouettes: Silhouettes | None
 
 
@@ -63,17 +63,17 @@ class Inputs:
             InputError: a file cannot be read.
             SettingsError: the sequence has fewer frames than the cell needs.
         """
-        sequence, keys = self._source(cell)
+        recording, keys = self._source(cell)
         keys = dict(keys)
         if Path(cell.settings.init).is_file():
             keys["init"] = digest_file(Path(cell.settings.init))
         if cell.settings.reads_detections:
-            files = detection_files_of(sequence, cell.settings.detections)
+            files = detection_files_of(recording, cell.settings.detections)
             keys |= {f"detections of {name}": digest_file(path) for name, path in files.items()}
         return keys
 
-    def sequence_of(self, cell: Cell) -> Recording:
-        """Sequence of a cell, with all cameras.
+    def recording_of(self, cell: Cell) -> Recording:
+        """Recording of a cell, with all cameras.
 
         Raises:
             InputError: the sequence cannot be read.
@@ -99,15 +99,15 @@ class Inputs:
 
     def _make(self, cell: Cell) -> Input | PsotrackError | None:
         """Input of a cell, or the error of making it; None as long as another process makes the silhouettes."""
-        sequence = self.sequence_of(cell)
+        recording = self.recording_of(cell)
         try:
             if not cell.settings.needs_silhouettes:
-                return Input(*perturb(sequence, None, cell.perturbation, cell.cameras))
+                return Input(*perturb(recording, None, cell.perturbation, cell.cameras))
             with self.locks.attempt(self.silhouettes_lock(cell), f"silhouettes of {cell.sequence}") as locked:
                 if not locked:
                     return None
-                silhouettes = compute(sequence, cell.settings.silhouettes, cache=self.cache, jobs=self.jobs)
-            return Input(*perturb(sequence, silhouettes, cell.perturbation, cell.cameras))
+                silhouettes = compute(recording, cell.settings.silhouettes, cache=self.cache, jobs=self.jobs)
+            return Input(*perturb(recording, silhouettes, cell.perturbation, cell.cameras))
         except PsotrackError as error:
             return error
 
@@ -116,23 +116,23 @@ class Inputs:
         return self.cache / f".{input_digest(self._source(cell)[1])}.lock"
 
     def _source(self, cell: Cell) -> tuple[Recording, dict[str, str]]:
-        """Sequence of a cell, with all cameras, and digests of its content."""
+        """Recording of a cell, with all cameras, and digests of its content."""
         source = source_of(cell)
         if source not in self._sources:
-            sequence = read_sequence(folder_of(cell.sequence, self.data)).usable(None, cell.frames)
-            if sequence.truth is None:
-                raise InputError(sequence.folder, expected="a reference to compare with", found="none")
+            recording = read_sequence(folder_of(cell.sequence, self.data)).usable(None, cell.frames)
+            if recording.truth is None:
+                raise InputError(recording.folder, expected="a reference to compare with", found="none")
             keys = {}
             if cell.settings.needs_silhouettes:
                 with ThreadPoolExecutor() as threads:
-                    key_of = partial(silhouettes_key_of, settings=cell.settings.silhouettes)
-                    of_videos = threads.map(key_of, sequence.videos.values())
-                    keys = dict(zip(sequence.videos, of_videos, strict=True))
+                    silhouettes_key_of_video = partial(silhouettes_key, settings=cell.settings.silhouettes)
+                    of_videos = threads.map(silhouettes_key_of_video, recording.videos.values())
+                    keys = dict(zip(recording.videos, of_videos, strict=True))
             keys |= {
-                "calibration": _digest_arrays(*vars(sequence.rig.cameras).values()),
-                "reference": _digest_arrays(sequence.truth.position_m, sequence.truth.orientation_wxyz),
+                "calibration": _digest_arrays(*vars(recording.rig.cameras).values()),
+                "reference": _digest_arrays(recording.truth.position_m, recording.truth.orientation_wxyz),
             }
-            self._sources[source] = sequence, keys
+            self._sources[source] = recording, keys
         return self._sources[source]
 
 

@@ -45,20 +45,20 @@ def rename_manifest(manifest: dict[str, Any]) -> dict[str, Any]:
     return manifest | {"runs": [run | {"grid": _rename_grid(run["grid"])} for run in manifest["runs"]]}
 
 
-def older_key_of(cell: Cell, input_keys: Mapping[str, str]) -> str | None:
+def older_cell_key(cell: Cell, input_keys: Mapping[str, str]) -> str | None:
     """Key under which version 0.1 stored the results of a cell; None if version 0.1 could not run the cell.
 
     Args:
         cell: the cell.
-        input_keys: digests of everything that the cell reads, as for `cells.key_of`.
+        input_keys: digests of everything that the cell reads, as for `cells.cell_key`.
     """
     settings = _older_settings(cell.settings)
     return None if settings is None else digest_cell(cell, settings, input_keys)
 
 
-def older_name_of(cell: Cell) -> str | None:
+def older_failure_name(cell: Cell) -> str | None:
     """Name under which version 0.1 stored the failure of a cell; None if version 0.1 could not run the cell."""
-    return older_key_of(cell, {"sequence": cell.sequence})
+    return older_cell_key(cell, {"sequence": cell.sequence})
 
 
 def _rename_grid(grid: Mapping[str, Any]) -> dict[str, Any]:

@@ -23,7 +23,7 @@ WIDTH = 80
 _DIGITS = 3
 
 
-def render(table: pd.DataFrame, format: str = "text", *, decimals: int | None = None) -> str:
+def render_table(table: pd.DataFrame, format: str = "text", *, decimals: int | None = None) -> str:
     """Text of a table of `pivot`, with a line break at the end.
 
     Args:

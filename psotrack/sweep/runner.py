@@ -18,14 +18,14 @@ from psotrack.errors import InputError, OutputError, PsotrackError
 from psotrack.evaluation import Evaluation, errors_over_time, evaluate
 from psotrack.pipeline import TrackedRecording, track_runs
 from psotrack.support import Report, no_progress
-from psotrack.sweep.cells import Cell, key_of, name_of, title
+from psotrack.sweep.cells import Cell, cell_key, failure_name, title
 from psotrack.sweep.grid_files import Grid, cameras_label
 from psotrack.sweep.inputs import Input, Inputs, folder_of, input_digest, source_of
 from psotrack.sweep.locks import POLL_S
 from psotrack.sweep.machine import provenance
 from psotrack.sweep.manifest import note_input, note_run
 from psotrack.sweep.names import flat
-from psotrack.sweep.older_folders import older_key_of, older_name_of
+from psotrack.sweep.older_folders import older_cell_key, older_failure_name
 from psotrack.sweep.store import Store
 
 logger = logging.getLogger(__name__)
@@ -71,7 +71,7 @@ class SweepOutcome:
         return {result.key: result.cell.seeds for result in finished if result.key is not None}
 
 
-def run(
+def run_in_process(
     grid: Grid,
     out: Path | str,
     *,
@@ -118,8 +118,8 @@ def run(
 
 def outcome(grid: Grid, results: Iterable[Result]) -> SweepOutcome:
     """Sort results into the order of the grid's cells."""
-    order = {name_of(cell): number for number, cell in enumerate(grid.cells())}
-    return SweepOutcome(tuple(sorted(results, key=lambda result: order[name_of(result.cell)])))
+    order = {failure_name(cell): number for number, cell in enumerate(grid.cells())}
+    return SweepOutcome(tuple(sorted(results, key=lambda result: order[failure_name(result.cell)])))
 
 
 def open_store(grid: Grid, out: Path | str, data: Path | str, origin: Mapping[str, Any]) -> Store:
@@ -158,7 +158,7 @@ def find_finished(cell: Cell, inputs: Inputs, store: Store) -> Result | None:
         PsotrackError: the cell's input cannot be read.
     """
     keys = inputs.keys_of(cell)
-    key, older_key = key_of(cell, keys), older_key_of(cell, keys)
+    key, older_key = cell_key(cell, keys), older_cell_key(cell, keys)
     if older_key is not None and store.finished_seeds(older_key):
         with store.lock(key, title(cell)) as locked:
             if locked:
@@ -182,7 +182,7 @@ def run_cell(cell: Cell, inputs: Inputs, store: Store) -> Result:
         if result is not None:
             return result
         keys = inputs.keys_of(cell)
-        key = key_of(cell, keys)
+        key = cell_key(cell, keys)
         with store.lock(key, title(cell)) as locked:
             # Another process may have finished the cell just before this process locked it.
             missing = sorted(set(cell.seeds) - store.finished_seeds(key)) if locked else []
@@ -201,7 +201,7 @@ def run_cell(cell: Cell, inputs: Inputs, store: Store) -> Result:
 
 def _remove_failure(cell: Cell, store: Store) -> None:
     """Remove the record of a cell's earlier failure, in this version or in version 0.1."""
-    for name in (name_of(cell), older_name_of(cell)):
+    for name in (failure_name(cell), older_failure_name(cell)):
         if name is not None:
             store.remove_failure(name)
 
@@ -211,7 +211,7 @@ def store_failure(cell: Cell, key: str | None, error: Exception, store: Store) -
     expected = isinstance(error, PsotrackError)
     sentence = f"{error}" if expected else f"{type(error).__name__}: {error}"
     where = {} if expected else {"where": "".join(traceback.format_exception(error))}
-    store.add_failure(name_of(cell), sentence, describe(cell) | where)
+    store.add_failure(failure_name(cell), sentence, describe(cell) | where)
     logger.error("%s: %s", title(cell), sentence)
     return Result(cell, "failed", key, sentence)
 
@@ -236,9 +236,9 @@ def _run_seeds(
     """Track and evaluate with each seed: one row per run, and the errors of every run's frames."""
     settings = [msgspec.structs.replace(cell.settings, seed=seed) for seed in seeds]
     began = time.perf_counter()
-    results = track_runs(given.sequence, given.silhouettes, settings)
+    results = track_runs(given.recording, given.silhouettes, settings)
     total_s = time.perf_counter() - began
-    of_cell = describe(cell) | {"frames": given.sequence.num_frames, "num_cameras": len(given.sequence.rig)}
+    of_cell = describe(cell) | {"frames": given.recording.num_frames, "num_cameras": len(given.recording.rig)}
     of_batch = {"runs_in_batch": len(seeds), "seconds.batch": total_s}
     origin = {"cell": key, "input": input_name} | dict(flat(provenance()))
     runs = list(zip(seeds, results, strict=True))
@@ -252,19 +252,19 @@ def _figures(result: TrackedRecording | InputError, given: Input) -> dict[str, A
     if isinstance(result, InputError):
         metrics = [field.name for field in fields(Evaluation) if field.name not in ("frames", "per_drone")]
         return dict.fromkeys(metrics, np.nan) | {"missed_rate": 1.0, "note": str(result)}
-    assert given.sequence.truth is not None
-    errors = evaluate(result.trajectories, given.sequence.truth).to_dict()
+    assert given.recording.truth is not None
+    errors = evaluate(result.trajectories, given.recording.truth).to_dict()
     del errors["per_drone"]
     figures = {"note": ""} | {name: np.nan if value is None else value for name, value in errors.items()}
     seconds = result.record["seconds"]
     figures |= {f"seconds.{stage}": value for stage, value in seconds.items()}
-    return figures | {"track_ms_per_frame": 1e3 * seconds["track"] / given.sequence.num_frames}
+    return figures | {"track_ms_per_frame": 1e3 * seconds["track"] / given.recording.num_frames}
 
 
 def _errors(seed: int, result: TrackedRecording | InputError, given: Input) -> pd.DataFrame:
     """Errors of a run's frames; no rows for a run that finds no drones."""
     if isinstance(result, InputError):
         return pd.DataFrame({"seed": pd.Series(dtype=int)})
-    assert given.sequence.truth is not None
-    errors = errors_over_time(result.trajectories, given.sequence.truth)
+    assert given.recording.truth is not None
+    errors = errors_over_time(result.trajectories, given.recording.truth)
     return errors.assign(seed=seed, error_m=errors["error_m"].astype(np.float32))

@@ -11,8 +11,9 @@ underscore, and so read exactly the rows of the finished cells. Folders of versi
 rows have other names of settings (see `older_folders`). Both can be read, and a sweep that continues such a folder
 renames files, and columns of the cells that it needs.
 
-A cell's file appears whole or not at all. KEY is made of everything that decides the cell's rows (see `cells.key_of`).
-NAME is made of the same without the content of the input: a cell whose input cannot be read has no KEY.
+A cell's file appears whole or not at all. KEY is made of everything that decides the cell's rows (see
+`cells.cell_key`). NAME is made of the same without the content of the input: a cell whose input cannot be read has no
+KEY.
 """
 
 from __future__ import annotations
