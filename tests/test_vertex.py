@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import draw_coverage, float32, ring_rig
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from psotrack.silhouettes import summed_area_table
@@ -102,18 +102,18 @@ def test_the_dispersion_of_a_single_camera_is_infinite():
     assert np.isinf(found(score_view(truth, rig=alone), truth).dispersion[0])
 
 
-# The draws depend on the source of this test. At other positions, such as (0, 0, 1), the matrix is symmetric only to
-# rounding in float32.
 @settings(max_examples=25, deadline=None)
 @given(st.tuples(st.floats(-9, 9), st.floats(-9, 9), st.floats(-3, 6)))
-def test_it_is_finite_everywhere(position_m):
-    """Beside the drone, outside of images, behind cameras: a number, and a positive definite matrix."""
-    answer = found(VIEW, np.array([position_m]))
-    assert np.isfinite(answer.position_m).all()
-    inverse = np.asarray(answer.inverse_curvature_m2[0], float)
-    np.testing.assert_array_equal(inverse, inverse.T)
-    assert np.linalg.eigvalsh(inverse)[0] > 0
-    assert not np.isnan(answer.dispersion).any()
+@example((0.0, 0.0, 1.0))
+def test_the_result_is_finite_everywhere(position_m):
+    """Beside the drone, outside of images and behind cameras: finite numbers, and a positive definite matrix."""
+    result = found(VIEW, np.array([position_m]))
+    assert np.isfinite(result.position_m).all()
+    inverse = np.asarray(result.inverse_curvature_m2[0], float)
+    # The inverse of a 3 x 3 matrix in float32: each element has a few roundings of 6e-8 of the largest element.
+    np.testing.assert_allclose(inverse, inverse.T, rtol=0, atol=1e-6 * np.abs(inverse).max())
+    assert np.linalg.eigvalsh((inverse + inverse.T) / 2)[0] > 0
+    assert not np.isnan(result.dispersion).any()
 
 
 VIEW = score_view(np.array([[0.1, 0.2, 1.2]]))

@@ -57,7 +57,7 @@ class Vertex:
 
     Attributes:
         position_m: (drones, 3), the vertex, metres; never outside of the grid.
-        inverse_curvature_m2: (drones, 3, 3), H^-1: symmetric and positive definite.
+        inverse_curvature_m2: (drones, 3, 3), H^-1: positive definite, and symmetric to rounding in float32.
         dispersion: (drones,), phi of this frame; infinite where no more than one camera sees the drone.
     """
 
