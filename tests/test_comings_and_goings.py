@@ -20,7 +20,7 @@ from psotrack.geometry import project
 from psotrack.pipeline import track_recording
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import SilhouetteSettings
-from psotrack.simulation import Scenario, SimulationSettings, simulate, write_recording
+from psotrack.simulation import Scenario, SimulationSettings, simulate, write_recorded_flight
 from psotrack.trajectories import Status, Trajectories
 
 pytestmark = pytest.mark.slow
@@ -61,7 +61,7 @@ def scenario(folder: Path) -> Scenario:
     place, up = np.array([1.0, 0.2, 0.12]), np.array([0.0, 0.0, 1.0])
     time_s = np.arange(0, NUM_FRAMES / FPS + 0.1, 0.1)
     height_m = 1.1 * (1 - _eased(time_s / LANDS_S)) + 1.2 * _eased((time_s - TAKES_OFF_S) / 1.6)
-    write_recording(folder / "landing.csv", time_s, place + height_m[:, None] * up, None)
+    write_recorded_flight(folder / "landing.csv", time_s, place + height_m[:, None] * up, None)
     drones = {
         FLIES_OUT: ("x_frame", waypoints([[-1.0, 1.3, 1.6], [-5.4, 1.3, 1.9]], 1.7, 0.8)),
         COMES: (

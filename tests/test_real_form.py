@@ -18,7 +18,7 @@ from psotrack.recordings import body_trajectories, read_c3d, read_frames
 from psotrack.simulation import (
     RealFormSettings,
     SimulationSettings,
-    replaced,
+    change_scenario,
     scenario,
     simulate,
     write_as_real,
@@ -32,7 +32,7 @@ NUM_FRAMES, OFFSET_S = 25, 0.377
 @pytest.fixture(scope="module")
 def simulated_folder(tmp_path_factory):
     """A sequence of four drones and the four cameras in the corners, at a quarter of the full image size."""
-    recipe = replaced(scenario("S02_D4_A"), {"cameras": "laboratory_corners", "markers": False})
+    recipe = change_scenario(scenario("S02_D4_A"), {"cameras": "laboratory_corners", "markers": False})
     root = tmp_path_factory.mktemp("simulated")
     return simulate(
         recipe,

@@ -10,7 +10,7 @@ from psotrack.cli import cli
 from psotrack.simulation import (
     RealFormSettings,
     SimulationSettings,
-    replaced,
+    change_scenario,
     scenario,
     simulate,
     write_as_real,
@@ -28,7 +28,7 @@ OFFSET_TOLERANCE_S = 0.004
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory):
     root = tmp_path_factory.mktemp("data")
-    recipe = replaced(scenario("S02_D4_A"), {"cameras": "laboratory_corners", "markers": False})
+    recipe = change_scenario(scenario("S02_D4_A"), {"cameras": "laboratory_corners", "markers": False})
     simulated = simulate(
         recipe, root, SimulationSettings(num_frames=150, scale=0.35, masks=False, onboard=False)
     )

@@ -34,7 +34,7 @@ from psotrack.simulation import (
     CameraRenderer,
     SimulationSettings,
     build,
-    replaced,
+    change_scenario,
     scenario,
     segments,
     simulate,
@@ -46,7 +46,7 @@ NAME = "S02_D4_A"
 SMALL = SimulationSettings(num_frames=3, scale=0.1)
 #: A scenario of two cameras and two drones, for the tests that interrupt the simulation.
 PAIR = msgspec.structs.replace(
-    replaced(
+    change_scenario(
         scenario(NAME),
         {
             "cameras": [
@@ -195,7 +195,7 @@ def test_the_record_holds_digests_of_the_files_of_the_scenario(tmp_path):
     path = tmp_path / "hover.csv"
     rows = [f"{k / 10},0.0,0.0,1.5" for k in range(40)]
     path.write_text("\n".join(["time_s,x_m,y_m,z_m", *rows]) + "\n")
-    recipe = replaced(
+    recipe = change_scenario(
         PAIR, {"drones": [{"flight": {"kind": "recording", "file": str(path)}}], "num_frames": 2}
     )
     folder = simulate(recipe, tmp_path, SimulationSettings(scale=0.04), jobs=1)
@@ -215,7 +215,7 @@ def test_masks_and_onboard_videos_can_be_left_out(tmp_path):
 
 def test_the_frame_rate_stands_in_file_names_and_is_read_back(tmp_path):
     folder = simulate(
-        replaced(PAIR, {"fps": 12.5}), tmp_path, SimulationSettings(num_frames=2, scale=0.04), jobs=1
+        change_scenario(PAIR, {"fps": 12.5}), tmp_path, SimulationSettings(num_frames=2, scale=0.04), jobs=1
     )
     assert {"dron1_pos_12.5.csv", "dron1_markers_12.5.csv", "dron1_cam_12.5.csv"} <= set(
         read_contents(folder)
@@ -529,7 +529,7 @@ def test_an_existing_sequence_is_replaced_only_by_force(pair_folder, tmp_path):
         ({"scale": 0.01}, r"^scale: expected images of at least 32 pixels a side, found 20 x 10$"),
         ({"scale": 5.0}, r"^scale: expected images of at most 8190 pixels a side, found 9600 x 5400$"),
         ({"scale": 1e308}, r"^scale: expected images of at most 8190 pixels a side, found inf x inf$"),
-        ({"scenario": replaced(PAIR, {"onboard.image_size_wh": [160, 90]})},
+        ({"scenario": change_scenario(PAIR, {"onboard.image_size_wh": [160, 90]})},
          r"^scale: expected images of at least 32 pixels a side, found 16 x 8$"),
         ({"seed": -1}, r"^seed: expected 0 or more, found -1$"),
         ({"jobs": 0}, r"^jobs: expected 1 or more, found 0$"),
@@ -557,7 +557,7 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path):
 
 
 def test_a_missing_file_of_the_scenario_is_named(tmp_path):
-    recipe = replaced(PAIR, {"drones[0].model": {"file": str(tmp_path / "none.ply")}})
+    recipe = change_scenario(PAIR, {"drones[0].model": {"file": str(tmp_path / "none.ply")}})
     with pytest.raises(InputError, match=r"none\.ply"):
         simulate(recipe, tmp_path, TINY)
     assert not list(tmp_path.iterdir())

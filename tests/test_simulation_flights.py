@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import SettingsError
-from psotrack.simulation import Scenario, preset_names, replaced, scenario, write_recording
+from psotrack.simulation import Scenario, change_scenario, preset_names, scenario, write_recorded_flight
 from psotrack.simulation.flights.motion import GRAVITY_M_S2, quaternions_wxyz
 from psotrack.simulation.flights.planning import frame_times_s, plan
 from psotrack.simulation.scenarios import (
@@ -155,7 +155,9 @@ def test_quaternions_stay_unit_across_half_a_turn():
 
 
 def test_the_x_axis_looks_along_the_heading():
-    recipe = replaced(make_scenario(ORBIT), {"drones[0].yaw_deg": 70.0, "drones[0].yaw_sway_deg": 30.0})
+    recipe = change_scenario(
+        make_scenario(ORBIT), {"drones[0].yaw_deg": 70.0, "drones[0].yaw_sway_deg": 30.0}
+    )
     (flight,) = plan(recipe, 0)
     rotation = flight.rotation(TIME_S)
     yaw = np.radians(70.0) + np.radians(30.0) * np.sin(2 * np.pi / 9.0 * TIME_S + flight.heading.phase_rad)
@@ -250,7 +252,7 @@ def test_a_near_pass_reaches_its_distance_twice_a_period(
 def test_a_recorded_flight_does_not_depend_on_the_seed_and_can_be_followed(tmp_path):
     (original,) = plan(make_scenario(ORBIT), 0)
     samples_s = np.arange(0.0, 12.0, 0.01)
-    write_recording(tmp_path / "r.csv", samples_s, original.position_m(samples_s), None)
+    write_recorded_flight(tmp_path / "r.csv", samples_s, original.position_m(samples_s), None)
     replay = FlightFromFile(file=str(tmp_path / "r.csv"), start_s=1.0)
     wingman = Formation(leader=1, offset_m=(0.0, 0.9, 0.0))
     time_s = frame_times_s(S02, 250)

@@ -29,7 +29,7 @@ from psotrack.datasets.dpjait import (
     write_mocap_markers,
 )
 from psotrack.errors import InputError
-from psotrack.simulation import CameraRenderer, build, replaced, scenario
+from psotrack.simulation import CameraRenderer, build, change_scenario, scenario
 from psotrack.simulation.flights.formulas import HarmonicFlight
 from psotrack.simulation.flights.motion import Heading
 from psotrack.simulation.imaging.raster import RasterView, pinhole
@@ -228,8 +228,8 @@ def test_masks_and_frames_agree():
     """Without shadows, reflections and noise, a frame differs from the empty room exactly inside the masks."""
     plain = {"shadows": False, "contact_shadows": False, "reflections": 0, "exposure_drift": 0, "flicker": 0}
     plain |= {"white_balance_drift": 0, "read_noise": 0, "shot_noise": 0, "shutter_s": 0, "lens_blur_px": 0}
-    recipe = replaced(S02, {f"imaging.{field}": value for field, value in plain.items()})
-    recipe = replaced(recipe, {f"drones[{i}].paint_bgr": [0.0, 0.0, 0.9] for i in range(4)})
+    recipe = change_scenario(S02, {f"imaging.{field}": value for field, value in plain.items()})
+    recipe = change_scenario(recipe, {f"drones[{i}].paint_bgr": [0.0, 0.0, 0.9] for i in range(4)})
     bright = build(recipe, scale=0.5)
     empty = replace(bright, flights=(), models=())
     for index in (1, 5):
@@ -420,7 +420,7 @@ def make_silhouette(scene, xyxy, number=1, share=1.0):
 
 def scene_with_detector(scene, **values):
     quiet = {"jitter": 0, "miss_rate": 0, "double_rate": 0, "false_alarms_per_frame": 0} | values
-    recipe = replaced(S02, {f"detector.{field}": value for field, value in quiet.items()})
+    recipe = change_scenario(S02, {f"detector.{field}": value for field, value in quiet.items()})
     return replace(scene, scenario=recipe)
 
 

@@ -160,7 +160,7 @@ def test_the_painted_room_agrees_with_a_depth_buffer(scene, drone, frame):
     cam = OnboardRenderer(scene, drone).cam_at(scene.time_s(frame))
     painted = np.empty((cam.height, cam.width, 4), np.uint16)
     RoomPainter(surfaces).paint(raster.full_view(cam), painted)
-    expected = backdrop.light_of(surfaces, cam, antialiasing=False)
+    expected = backdrop.render_light(surfaces, cam, antialiasing=False)
     difference = np.abs(painted[..., :3] / LIGHT_UNIT - expected).max(axis=-1)
     # Pixels on an edge may differ because the depth buffer is float32 (measured at most 3.4e-4 of the pixels). The
     # painter's reduced textures also differ in fine structure and at the edges of markers.

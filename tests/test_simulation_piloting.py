@@ -15,16 +15,16 @@ from scipy.spatial.transform import Rotation
 
 from psotrack import cli
 from psotrack.errors import InputError, SettingsError
-from psotrack.simulation import space_in
+from psotrack.simulation import flight_space
 from psotrack.simulation.flights import devices
 from psotrack.simulation.flights.devices import GamepadDevice, KeyboardDevice, ScriptedDevice, open_device
 from psotrack.simulation.flights.dynamics import DYNAMICS, Space, Sticks
 from psotrack.simulation.flights.motion import Heading
 from psotrack.simulation.flights.piloting import Sample, fly, read_sticks, until, write_sticks
-from psotrack.simulation.flights.recordings import read_recording, recorded_flight
+from psotrack.simulation.flights.recordings import read_recorded_flight, recorded_flight
 from psotrack.simulation.scenarios import FlightFromFile
 
-LABORATORY = space_in("laboratory")
+LABORATORY = flight_space("laboratory")
 UNBOUNDED_SPACE = Space(np.full(3, -1e6), np.full(3, 1e6))
 START_M = np.array([0.0, 0.0, 1.0])
 STEP_HZ = 250.0
@@ -268,10 +268,10 @@ def test_a_recorded_flight_is_replayed_exactly(tmp_path):
 
 
 def write_flight(path, rows):
-    from psotrack.simulation import write_recording
+    from psotrack.simulation import write_recorded_flight
 
     recorded = record_flight(*rows)
-    write_recording(path, recorded.time_s, recorded.position_m, recorded.orientation_wxyz)
+    write_recorded_flight(path, recorded.time_s, recorded.position_m, recorded.orientation_wxyz)
 
 
 # --- sticks on disk
@@ -620,7 +620,7 @@ def test_the_command_writes_a_flight_and_sticks_that_reproduce_it(run_fly, tmp_p
     assert result.err == ""
     assert "new/loop.csv: 126 samples at 50 Hz, 2.5 s" in result.out
     assert 'flight = { kind = "recording", file = "new/loop.csv" }' in result.out
-    recorded = read_recording(tmp_path / "new" / "loop.csv")
+    recorded = read_recorded_flight(tmp_path / "new" / "loop.csv")
     np.testing.assert_array_equal(recorded.time_s, np.arange(126) / 50)
     np.testing.assert_array_equal(recorded.position_m[0], [1.0, 0.0, 2.0])
     again = run_fly(
@@ -673,4 +673,4 @@ def test_existing_files_are_kept_without_force(run_fly, tmp_path, existing):
 
 def test_max_seconds_shortens_a_flight(run_fly, tmp_path):
     assert run_fly("--out", "loop.csv", "--device", "script.csv", "--max-seconds", "1").code == 0
-    assert read_recording(tmp_path / "loop.csv").time_s[-1] == 1.0
+    assert read_recorded_flight(tmp_path / "loop.csv").time_s[-1] == 1.0

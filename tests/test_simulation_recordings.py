@@ -13,11 +13,16 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.datasets.dpjait import pose_file, write_poses
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.simulation import Scenario, write_recording
+from psotrack.simulation import Scenario, write_recorded_flight
 from psotrack.simulation.flights.formulas import HarmonicFlight
 from psotrack.simulation.flights.motion import Heading
 from psotrack.simulation.flights.planning import plan
-from psotrack.simulation.flights.recordings import Recorded, RecordedFlight, read_recording, recorded_flight
+from psotrack.simulation.flights.recordings import (
+    Recorded,
+    RecordedFlight,
+    read_recorded_flight,
+    recorded_flight,
+)
 from psotrack.simulation.scenarios import Drone, FlightFromFile, Limits
 from psotrack.trajectories import Trajectories, write_trajectories
 
@@ -170,7 +175,7 @@ def test_shifting_a_recording_in_space_and_time_shifts_the_flight(rate_hz, offse
 
 def test_start_and_offset_of_a_flight_are_applied(tmp_path):
     path = tmp_path / "loop.csv"
-    write_recording(path, EVEN_S + 3.0, FORMULA.position_m(EVEN_S), FORMULA.orientation_wxyz(EVEN_S))
+    write_recorded_flight(path, EVEN_S + 3.0, FORMULA.position_m(EVEN_S), FORMULA.orientation_wxyz(EVEN_S))
     record = FlightFromFile(file=str(path), start_s=2.5, offset_m=(1.0, -2.0, 0.5))
     replay = recorded_flight(record, HEADING)
     time_s = np.arange(180) / 25
@@ -210,7 +215,7 @@ def test_too_many_frames_are_refused_with_the_number_that_fits():
 
 def test_a_scenario_with_more_frames_than_its_recording_is_refused_when_it_is_planned(tmp_path):
     path = tmp_path / "loop.csv"
-    write_recording(path, EVEN_S, FORMULA.position_m(EVEN_S), None)
+    write_recorded_flight(path, EVEN_S, FORMULA.position_m(EVEN_S), None)
     drone = Drone(flight=FlightFromFile(file=str(path)))
     limits = Limits(
         max_speed_m_s=3.0,
@@ -247,8 +252,8 @@ def test_a_start_after_the_end_is_refused(tmp_path):
 def test_a_written_recording_is_read_back_exactly(tmp_path, oriented):
     path = tmp_path / "new" / "loop.csv"
     recorded = sample_formula(UNEVEN_S, oriented=oriented)
-    write_recording(path, recorded.time_s, recorded.position_m, recorded.orientation_wxyz)
-    again = read_recording(path)
+    write_recorded_flight(path, recorded.time_s, recorded.position_m, recorded.orientation_wxyz)
+    again = read_recorded_flight(path)
     np.testing.assert_array_equal(again.time_s, recorded.time_s)
     np.testing.assert_array_equal(again.position_m, recorded.position_m)
     if oriented:
@@ -263,7 +268,7 @@ def test_semicolons_and_other_columns_are_read_too(tmp_path):
     path = tmp_path / "loop.csv"
     header = ("time_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
     path.write_text(csv_table(";", header))
-    recorded = read_recording(path)
+    recorded = read_recorded_flight(path)
     np.testing.assert_array_equal(recorded.position_m[:, 1], 2.0 * np.arange(8))
     np.testing.assert_array_equal(recorded.orientation_wxyz, np.tile([1.0, 0, 0, 0], (8, 1)))
 
@@ -272,7 +277,7 @@ def test_a_pose_file_of_the_dataset_is_read_without_its_placeholder(tmp_path):
     path = tmp_path / "dron3_pos_25.csv"
     time_s = np.arange(50) / 25
     write_poses(path, FORMULA.position_m(time_s), FORMULA.orientation_wxyz(time_s))
-    recorded = read_recording(path)
+    recorded = read_recorded_flight(path)
     np.testing.assert_array_equal(recorded.time_s, time_s[1:])
     np.testing.assert_array_equal(recorded.position_m, FORMULA.position_m(time_s)[1:])
     # The file holds all digits of the quaternions; reading normalises them, which may change the last digits.
@@ -282,13 +287,13 @@ def test_a_pose_file_of_the_dataset_is_read_without_its_placeholder(tmp_path):
 def test_the_rate_of_a_pose_file_is_in_its_name(tmp_path):
     time_s = np.arange(50) / 100
     write_poses(tmp_path / "dron1_pos_100.csv", FORMULA.position_m(time_s), FORMULA.orientation_wxyz(time_s))
-    np.testing.assert_array_equal(read_recording(tmp_path / "dron1_pos_100.csv").time_s, time_s[1:])
+    np.testing.assert_array_equal(read_recorded_flight(tmp_path / "dron1_pos_100.csv").time_s, time_s[1:])
     shutil.copy(tmp_path / "dron1_pos_100.csv", tmp_path / pose_file(1, 29.97))
-    again = read_recording(tmp_path / pose_file(1, 29.97))
+    again = read_recorded_flight(tmp_path / pose_file(1, 29.97))
     np.testing.assert_array_equal(again.time_s, np.arange(1, 50) / 29.97)
     (tmp_path / "dron1_pos_100.csv").rename(tmp_path / "dron1.csv")
     with pytest.raises(InputError, match=r"dron1\.csv: expected a pose file named like dron1_pos_25\.csv"):
-        read_recording(tmp_path / "dron1.csv")
+        read_recorded_flight(tmp_path / "dron1.csv")
 
 
 def test_a_trajectory_of_one_drone_is_a_recording(tmp_path):
@@ -298,11 +303,11 @@ def test_a_trajectory_of_one_drone_is_a_recording(tmp_path):
         names = ("a", "b")[:drones]
         tracks = Trajectories(np.arange(40), time_s, names, position_m[:, :drones])
         write_trajectories(tmp_path / f"{drones}.csv", tracks)
-    np.testing.assert_array_equal(read_recording(tmp_path / "1.csv").position_m, position_m[:, 0])
+    np.testing.assert_array_equal(read_recorded_flight(tmp_path / "1.csv").position_m, position_m[:, 0])
     with pytest.raises(
         InputError, match=r"2\.csv, line 3, column drone: expected one drone, a as above, found b"
     ):
-        read_recording(tmp_path / "2.csv")
+        read_recorded_flight(tmp_path / "2.csv")
 
 
 QUATERNIONS = ("time_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
@@ -353,14 +358,14 @@ def test_errors_in_a_file_are_named_by_file_line_and_column(tmp_path, name):
     text, message = BROKEN[name]
     (tmp_path / "loop.csv").write_text(text)
     with pytest.raises(InputError) as error:
-        read_recording(tmp_path / "loop.csv")
+        read_recorded_flight(tmp_path / "loop.csv")
     assert "loop.csv" in str(error.value)
     assert message in str(error.value)
 
 
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(InputError, match=r"none\.csv: expected a file to read, found no such file"):
-        read_recording(tmp_path / "none.csv")
+        read_recorded_flight(tmp_path / "none.csv")
 
 
 @pytest.mark.parametrize(
@@ -377,11 +382,11 @@ def test_invalid_recordings_are_not_written(tmp_path, time_s, index, value, mess
     if index is not None:
         position_m[index, 1] = value
     with pytest.raises(SettingsError, match=message):
-        write_recording(tmp_path / "loop.csv", time_s, position_m, None)
+        write_recorded_flight(tmp_path / "loop.csv", time_s, position_m, None)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_that_cannot_be_written_is_an_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="expected a path that can be written"):
-        write_recording(tmp_path / "file" / "loop.csv", EVEN_S, FORMULA.position_m(EVEN_S), None)
+        write_recorded_flight(tmp_path / "file" / "loop.csv", EVEN_S, FORMULA.position_m(EVEN_S), None)

@@ -77,13 +77,13 @@ def simulated(data: Path, *, num_frames: int | None = None, scale: float = 1.0) 
 
     The room has only one camera with few pixels, because only the drones' own videos are used.
     """
-    from psotrack.simulation import SimulationSettings, replaced, scenario, simulate
+    from psotrack.simulation import SimulationSettings, change_scenario, scenario, simulate
 
     corner = {"position_m": (2.9, 2.1, 2.5), "target_m": (0.0, 0.0, 1.0)}
     for name in SIMULATED:
         if not (data / "Simulated_Data" / name).is_dir():
             print(f"simulating the drones' own videos of {name}", flush=True)
-            recipe = replaced(scenario(name), {"cameras": [corner], "image_size_wh": [160, 160]})
+            recipe = change_scenario(scenario(name), {"cameras": [corner], "image_size_wh": [160, 160]})
             settings = SimulationSettings(num_frames, scale, masks=False)
             simulate(recipe, data, settings, report=progress_bar)
     return data

@@ -79,20 +79,20 @@ def fly(
     """
     import numpy as np
 
-    from psotrack.simulation import space_in, write_recording
+    from psotrack.simulation import flight_space, write_recorded_flight
     from psotrack.simulation.flights import devices, piloting
 
     sticks_path = out.with_suffix(".sticks.csv")
     refuse_to_overwrite(out, force)
     refuse_to_overwrite(sticks_path, force)
-    space = space_in(hall)
+    space = flight_space(hall)
     start = np.array(start_m)
     piloting.check(start, space, rate_hz)
     with devices.open_device(device, space) as opened:
         samples = piloting.until(opened.samples(), max_seconds)
         flown = piloting.fly(samples, start, space, rate_hz=rate_hz, watch=opened.watch)
     recorded = flown.recorded
-    write_recording(out, recorded.time_s, recorded.position_m, recorded.orientation_wxyz)
+    write_recorded_flight(out, recorded.time_s, recorded.position_m, recorded.orientation_wxyz)
     piloting.write_sticks(sticks_path, flown.samples)
     if not quiet:
         click.echo(f"{out}: {len(recorded.time_s)} samples at {rate_hz:g} Hz, {recorded.duration_s:.1f} s")

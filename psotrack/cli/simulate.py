@@ -86,7 +86,7 @@ def simulate(
     if listed:
         _list(json_path, quiet, force)
         return
-    from psotrack.simulation import SimulationSettings, load, preset_text, replaced, scenario
+    from psotrack.simulation import SimulationSettings, change_scenario, load, preset_text, scenario
     from psotrack.simulation import simulate as make
 
     if (name is None) == (scenario_file is None):
@@ -111,7 +111,7 @@ def simulate(
     if out is None:
         raise SettingsError("--out", expected="the folder to write to", found="none")
     recipe = load(scenario_file) if scenario_file else scenario(str(name))
-    recipe = replaced(recipe, dict(_change(change) for change in changes))
+    recipe = change_scenario(recipe, dict(_change(change) for change in changes))
     if preview:
         from psotrack.simulation import save_preview
 

@@ -1,11 +1,11 @@
-from .flights.dynamics import space_in
-from .flights.recordings import write_recording
+from .flights.dynamics import flight_space
+from .flights.recordings import write_recorded_flight
 from .generate import SimulationSettings, simulate
 from .imaging.renderer import CameraRenderer
 from .listing import catalogue, render
 from .preview import save_preview
 from .real_form import RealFormSettings, write_as_real
-from .scenarios import Scenario, load, preset_names, preset_text, replaced, scenario
+from .scenarios import Scenario, change_scenario, load, preset_names, preset_text, scenario
 from .scene import Scene, build
 
 __all__ = [
@@ -16,15 +16,15 @@ __all__ = [
     "SimulationSettings",
     "build",
     "catalogue",
+    "change_scenario",
+    "flight_space",
     "load",
     "preset_names",
     "preset_text",
     "render",
-    "replaced",
     "save_preview",
     "scenario",
     "simulate",
-    "space_in",
     "write_as_real",
-    "write_recording",
+    "write_recorded_flight",
 ]

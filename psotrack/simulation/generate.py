@@ -97,7 +97,7 @@ def simulate(
     """
     recipe = scenarios.scenario(scenario) if isinstance(scenario, str) else scenario
     settings = settings or SimulationSettings()
-    frames = scenarios.frames_of(recipe, settings.num_frames)
+    frames = scenarios.count_frames(recipe, settings.num_frames)
     if jobs is not None and jobs < 1:
         raise SettingsError("jobs", expected="1 or more", found=f"{jobs}")
     scene = build(recipe, scale=settings.scale, seed=settings.seed)

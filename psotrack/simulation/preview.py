@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 from psotrack.geometry import Camera, project
 from psotrack.simulation.imaging.onboard import OnboardRenderer
 from psotrack.simulation.imaging.renderer import CameraRenderer
-from psotrack.simulation.scenarios import Scenario, frames_of
+from psotrack.simulation.scenarios import Scenario, count_frames
 from psotrack.simulation.scene import Scene, build
 from psotrack.simulation.world.halls import HALLS
 from psotrack.support import (
@@ -90,7 +90,7 @@ def save_preview(
         SettingsError: the scenario cannot be built, or has fewer frames than `num_frames`.
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
-    num_frames = frames_of(scenario, num_frames)
+    num_frames = count_frames(scenario, num_frames)
     path = Path(path)
     refuse_to_overwrite(path, force)
     scale = _PICTURE_PX / scenario.image_size_wh[0]

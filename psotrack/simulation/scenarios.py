@@ -425,7 +425,9 @@ def preset_text(name: str) -> str:
     return _PRESETS.joinpath(f"{name}.toml").read_text(encoding="utf-8")
 
 
-def wrong(recipe: Scenario, field: str, *, expected: str, found: str, remedy: str = "") -> SettingsError:
+def scenario_error(
+    recipe: Scenario, field: str, *, expected: str, found: str, remedy: str = ""
+) -> SettingsError:
     """Error about a field of a scenario whose value has the right type but is not possible."""
     return SettingsError(f"scenario {recipe.name}: {field}", expected=expected, found=found, remedy=remedy)
 
@@ -445,7 +447,7 @@ def load(path: str | Path) -> Scenario:
     return msgspec.structs.replace(recipe, drones=tuple(_located(drone, folder) for drone in recipe.drones))
 
 
-def replaced(recipe: Scenario, changes: Mapping[str, Any]) -> Scenario:
+def change_scenario(recipe: Scenario, changes: Mapping[str, Any]) -> Scenario:
     """Copy of a scenario with other values in some fields.
 
     Args:
@@ -476,7 +478,7 @@ def _located(drone: Drone, folder: Path) -> Drone:
     return msgspec.structs.replace(drone, **files)
 
 
-def frames_of(recipe: Scenario, wanted: int | None) -> int:
+def count_frames(recipe: Scenario, wanted: int | None) -> int:
     """Number of frames to simulate: `wanted`, or all frames of the scenario if `wanted` is None.
 
     Raises:

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 
 from psotrack.simulation.flights.motion import Flight
 from psotrack.simulation.flights.planning import frame_times_s
-from psotrack.simulation.scenarios import CameraPlace, OnboardCamera, Scenario, Vector, wrong
+from psotrack.simulation.scenarios import CameraPlace, OnboardCamera, Scenario, Vector, scenario_error
 from psotrack.simulation.world.drones import MODELS
 from psotrack.simulation.world.halls import HALLS, RIGS, Hall
 
@@ -47,7 +47,7 @@ def check_flights(scenario: Scenario, flights: tuple[Flight, ...]) -> None:
         if hit.any():
             at = int(np.argmax(hit))
             x, y, z = position_m[at]
-            raise wrong(
+            raise scenario_error(
                 scenario,
                 f"drones[{index}].flight",
                 expected="a way around the furniture",
@@ -64,7 +64,7 @@ def camera_places(scenario: Scenario) -> tuple[CameraPlace, ...]:
     if not isinstance(scenario.cameras, str):
         return scenario.cameras
     if scenario.cameras not in RIGS:
-        raise wrong(
+        raise scenario_error(
             scenario, "cameras", expected=f"one of {', '.join(RIGS)}, or a list", found=scenario.cameras
         )
     return RIGS[scenario.cameras]
@@ -72,11 +72,11 @@ def camera_places(scenario: Scenario) -> tuple[CameraPlace, ...]:
 
 def _check_named(scenario: Scenario) -> None:
     if scenario.hall not in HALLS:
-        raise wrong(scenario, "hall", expected=f"one of {', '.join(HALLS)}", found=scenario.hall)
+        raise scenario_error(scenario, "hall", expected=f"one of {', '.join(HALLS)}", found=scenario.hall)
     for index, drone in enumerate(scenario.drones):
         if isinstance(drone.model, str) and drone.model not in MODELS:
             expected = f"one of {', '.join(MODELS)}, or a mesh"
-            raise wrong(scenario, f"drones[{index}].model", expected=expected, found=drone.model)
+            raise scenario_error(scenario, f"drones[{index}].model", expected=expected, found=drone.model)
 
 
 def _check_camera(scenario: Scenario, index: int, place: CameraPlace, hall: Hall) -> None:
@@ -84,12 +84,12 @@ def _check_camera(scenario: Scenario, index: int, place: CameraPlace, hall: Hall
     field = "cameras" if of_rig else f"cameras[{index}].position_m"
     found = f"{list(place.position_m)}" + (f" of camera {index + 1} of {scenario.cameras}" if of_rig else "")
     if not _inside(place.position_m, hall):
-        raise wrong(scenario, field, expected=f"a place in the hall, {_extent(hall)}", found=found)
+        raise scenario_error(scenario, field, expected=f"a place in the hall, {_extent(hall)}", found=found)
     if _in_furniture(np.array([place.position_m]), hall).any():
-        raise wrong(scenario, field, expected="a place outside of the furniture", found=found)
+        raise scenario_error(scenario, field, expected="a place outside of the furniture", found=found)
     away = np.subtract(place.target_m, place.position_m)
     if np.hypot(away[0], away[1]) < 1e-6:
-        raise wrong(
+        raise scenario_error(
             scenario,
             f"cameras[{index}].target_m",
             expected="a point beside the camera, not at its place, above or below",
@@ -102,14 +102,14 @@ def _check_bounds(scenario: Scenario, hall: Hall) -> None:
     for name in ("lower_m", "upper_m"):
         corner = getattr(limits, name)
         if not _inside(corner, hall):
-            raise wrong(
+            raise scenario_error(
                 scenario,
                 f"limits.{name}",
                 expected=f"a point in the hall, {_extent(hall)}",
                 found=f"{list(corner)}",
             )
     if not np.all(np.less(limits.lower_m, limits.upper_m)):
-        raise wrong(
+        raise scenario_error(
             scenario,
             "limits.lower_m",
             expected=f"less than limits.upper_m, {list(limits.upper_m)}, along each axis",
@@ -120,19 +120,19 @@ def _check_bounds(scenario: Scenario, hall: Hall) -> None:
 def _check_exposure(scenario: Scenario, field: str, shutter_s: float) -> None:
     if shutter_s > 1 / scenario.fps:
         expected = f"at most {1 / scenario.fps:g} s, the time between two frames"
-        raise wrong(scenario, field, expected=expected, found=f"{shutter_s:g}")
+        raise scenario_error(scenario, field, expected=expected, found=f"{shutter_s:g}")
 
 
 def _check_onboard(scenario: Scenario, camera: OnboardCamera) -> None:
     if max(camera.fov_deg) >= 180:
-        raise wrong(
+        raise scenario_error(
             scenario, "onboard.fov_deg", expected="angles below 180 degrees", found=f"{list(camera.fov_deg)}"
         )
     half_width, half_height = np.tan(np.radians(camera.fov_deg) / 2)
     width, height = camera.image_size_wh
     if abs(half_width * height / (half_height * width) - 1) > _SQUARE:
         fits = np.degrees(2 * np.arctan(half_width * height / width))
-        raise wrong(
+        raise scenario_error(
             scenario,
             "onboard.fov_deg",
             expected=f"angles that fit {width} x {height} square pixels, {camera.fov_deg[0]:g} and {fits:.4g}",

@@ -11,7 +11,7 @@ from psotrack.simulation.scenarios import (
     NearPass,
     Scenario,
     Waypoints,
-    wrong,
+    scenario_error,
 )
 
 #: Largest cosine of the angle between a near pass's side and its swing, which should be perpendicular. The relative
@@ -49,11 +49,13 @@ def _chain(scenario: Scenario, index: int) -> list[int]:
         field = f"drones[{chain[-1]}].flight.{name}"
         if number > len(scenario.drones):
             count = len(scenario.drones)
-            raise wrong(scenario, field, expected=f"a drone's number, 1 to {count}", found=f"{number}")
+            raise scenario_error(
+                scenario, field, expected=f"a drone's number, 1 to {count}", found=f"{number}"
+            )
         chain.append(number - 1)
         if chain[-1] in chain[:-1]:
             loop = " -> ".join(f"{link + 1}" for link in chain)
-            raise wrong(
+            raise scenario_error(
                 scenario,
                 field,
                 expected="relative flights without a cycle",
@@ -79,11 +81,11 @@ def check_records(scenario: Scenario) -> None:
 def _check_near_pass(scenario: Scenario, field: str, record: NearPass) -> None:
     for name, vector in (("side", record.side), ("swing_m", record.swing_m)):
         if not np.any(vector):
-            raise wrong(scenario, f"{field}.{name}", expected="a direction", found="[0, 0, 0]")
+            raise scenario_error(scenario, f"{field}.{name}", expected="a direction", found="[0, 0, 0]")
     side, swing = (np.array(vector) / np.linalg.norm(vector) for vector in (record.side, record.swing_m))
     cosine = float(side @ swing)
     if abs(cosine) > _PERPENDICULAR:
-        raise wrong(
+        raise scenario_error(
             scenario,
             f"{field}.side",
             expected="a direction perpendicular to swing_m",
@@ -95,7 +97,7 @@ def _check_near_pass(scenario: Scenario, field: str, record: NearPass) -> None:
 def _check_waypoints(scenario: Scenario, field: str, record: Waypoints) -> None:
     # A fast drone could reach the next waypoint between two frames, where the limits are not checked.
     if record.speed_m_s > scenario.limits.max_speed_m_s:
-        raise wrong(
+        raise scenario_error(
             scenario,
             f"{field}.speed_m_s",
             expected=f"at most {scenario.limits.max_speed_m_s:g} m/s (limits.max_speed_m_s)",
@@ -106,7 +108,7 @@ def _check_waypoints(scenario: Scenario, field: str, record: Waypoints) -> None:
     ):
         if here == there:
             following = (point + 1) % len(record.points_m)
-            raise wrong(
+            raise scenario_error(
                 scenario,
                 f"{field}.points_m[{following}]",
                 expected="a point that differs from the previous one (the first point follows the last)",

@@ -93,7 +93,7 @@ class Space:
     upper_m: Vector
 
 
-def space_in(hall: str) -> Space:
+def flight_space(hall: str) -> Space:
     """Space in which a drone touches neither floor nor walls nor ceiling of a hall; furniture is ignored.
 
     Raises:

@@ -12,8 +12,8 @@ from psotrack.simulation.flights.checking import check_records, flying_order
 from psotrack.simulation.flights.limits import Excess, excess
 from psotrack.simulation.flights.motion import Flight
 from psotrack.simulation.flights.recordings import recorded_flight
-from psotrack.simulation.flights.varying import Turn, draws, heading_of, make, no_draws
-from psotrack.simulation.scenarios import FlightFromFile, Scenario, wrong
+from psotrack.simulation.flights.varying import Turn, draws, make, make_heading, zero_draws
+from psotrack.simulation.scenarios import FlightFromFile, Scenario, scenario_error
 
 #: Largest number of random variations that are tried until one keeps the limits.
 NUM_ATTEMPTS = 400
@@ -51,16 +51,18 @@ def plan(scenario: Scenario, seed: int) -> tuple[Flight, ...]:
             # Other variations often violate a limit at the same frame, so check this frame early.
             few_s = np.append(few_s, found.time_s)
         excesses.append(found)
-    raise _refusal(scenario, excess(make(scenario, no_draws(scenario), recorded), scenario, time_s), excesses)
+    raise _refusal(
+        scenario, excess(make(scenario, zero_draws(scenario), recorded), scenario, time_s), excesses
+    )
 
 
 def _refusal(scenario: Scenario, nominal: Excess | None, varied: list[Excess]) -> SettingsError:
     """Error that names the limit that the flights violate without variation, or else the most frequent violation."""
     if nominal:
-        return wrong(scenario, nominal.field, expected=nominal.limit, found=nominal.found)
+        return scenario_error(scenario, nominal.field, expected=nominal.limit, found=nominal.found)
     (field, limit), times = Counter((found.field, found.limit) for found in varied).most_common(1)[0]
     example = next(found for found in varied if (found.field, found.limit) == (field, limit))
-    return wrong(
+    return scenario_error(
         scenario,
         field,
         expected=limit,
@@ -74,7 +76,7 @@ def _recorded(scenario: Scenario, time_s: Float[np.ndarray, "frames"]) -> dict[i
     recorded: dict[int, Flight] = {}
     for index, drone in enumerate(scenario.drones):
         if isinstance(drone.flight, FlightFromFile):
-            flight = recorded_flight(drone.flight, heading_of(drone, Turn(), scenario.variation))
+            flight = recorded_flight(drone.flight, make_heading(drone, Turn(), scenario.variation))
             flight.check(time_s)
             recorded[index] = flight
     return recorded

@@ -80,8 +80,8 @@ class Recorded:
 # --- files
 
 
-def read_recording(path: str | Path) -> Recorded:
-    """Read the recorded flight of one drone from a file of `write_recording`, a trajectory, or a pose file of DPJAIT.
+def read_recorded_flight(path: str | Path) -> Recorded:
+    """Read the flight of one drone from a file of `write_recorded_flight`, a trajectory, or a pose file of DPJAIT.
 
     Recorded flights and trajectories have the columns `time_s`, `x_m`, `y_m`, `z_m` and, optionally, `qw`, `qx`, `qy`,
     `qz`, separated by commas or semicolons; the column `drone` of a trajectory must have the same value in all rows. A
@@ -101,7 +101,7 @@ def read_recording(path: str | Path) -> Recorded:
     return Recorded(time_s, position_m, orientation_wxyz)
 
 
-def write_recording(
+def write_recorded_flight(
     path: str | Path,
     time_s: Float[np.ndarray, "samples"],
     position_m: Float[np.ndarray, "samples 3"],
@@ -179,10 +179,10 @@ def recorded_flight(record: FlightFromFile, heading: Heading) -> RecordedFlight:
     """Read the recorded flight that a scenario names; `heading` is used if the file has no orientations.
 
     Raises:
-        InputError: `read_recording` cannot read the file.
+        InputError: `read_recorded_flight` cannot read the file.
         SettingsError: the recorded flight ends before `start_s`.
     """
-    recorded = read_recording(Path(record.file))
+    recorded = read_recorded_flight(Path(record.file))
     if record.start_s >= recorded.duration_s:
         raise SettingsError(
             f"start_s of {record.file}",

@@ -74,7 +74,7 @@ class Turn:
 Draws = tuple[tuple[Draw, Turn], ...]
 
 
-def no_draws(scenario: Scenario) -> Draws:
+def zero_draws(scenario: Scenario) -> Draws:
     """Zeros for each drone, which leave the scenario's flights unchanged."""
     return tuple((_draw([drone], lambda *shape: np.zeros(shape)), Turn()) for drone in scenario.drones)
 
@@ -123,7 +123,7 @@ def make(scenario: Scenario, drawn: Draws, recorded: Mapping[int, Flight]) -> tu
     made: dict[int, Flight] = {}
     for index in flying_order(scenario):
         drone, (draw, turn) = scenario.drones[index], drawn[index]
-        heading = heading_of(drone, turn, scenario.variation)
+        heading = make_heading(drone, turn, scenario.variation)
         match drone.flight:
             case FlightFromFile():
                 made[index] = recorded[index]
@@ -141,7 +141,7 @@ def make(scenario: Scenario, drawn: Draws, recorded: Mapping[int, Flight]) -> tu
     return tuple(made[index] for index in range(len(scenario.drones)))
 
 
-def heading_of(drone: Drone, turn: Turn, variation: Variation) -> Heading:
+def make_heading(drone: Drone, turn: Turn, variation: Variation) -> Heading:
     """Heading of a drone over time, changed by its random numbers."""
     return Heading(
         float(np.radians(drone.yaw_deg + turn.yaw * variation.yaw_deg)),

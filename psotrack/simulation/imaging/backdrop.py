@@ -35,11 +35,11 @@ class Backdrop:
 def render(room: Room, cam: Pinhole, imaging: Imaging) -> Backdrop:
     """Draw the empty room for one camera."""
     number, depth = numbers_and_depth(room.surfaces, full_view(cam))
-    light = lens_blur(light_of(room.surfaces, cam, imaging.antialiasing), imaging.lens_blur_px)
+    light = lens_blur(render_light(room.surfaces, cam, imaging.antialiasing), imaging.lens_blur_px)
     return Backdrop(light, depth, np.equal(number, 0))
 
 
-def light_of(
+def render_light(
     surfaces: Sequence[Surface], cam: Pinhole, antialiasing: bool
 ) -> Float[np.ndarray, "height width 3"]:
     """(height, width, 3), linear BGR light of textured surfaces, without the lens's blur."""

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.simulation.imaging.raster import RasterView, draw, empty_buffers, enclosing
+from psotrack.simulation.imaging.raster import RasterView, draw, empty_buffers, enclosing_window
 from psotrack.simulation.scenarios import Imaging
 from psotrack.simulation.scene import Scene
 from psotrack.simulation.world.drones import disc_fans
@@ -116,7 +116,7 @@ def windows(
     for drone in posed:
         # With constant velocity, the positions at the ends of the exposure enclose all others.
         ends = [points[[0, -1]].reshape(-1, 3) for points in (drone.faces_m, drone.discs_m)]
-        window, drones = enclosing(whole, np.concatenate(ends), margin_px), [drone]
+        window, drones = enclosing_window(whole, np.concatenate(ends), margin_px), [drone]
         if window is None:
             continue
         while (
@@ -164,7 +164,7 @@ def sample(
     with_discs = [drone for drone in posed if drone.discs_m.size]
     for drone in sorted(with_discs, key=lambda drone: -float(ahead @ drone.discs_m[index, 0, 0])):
         alone = len(posed) == 1
-        inner = view if alone else enclosing(view, drone.discs_m[index].reshape(-1, 3), 1)
+        inner = view if alone else enclosing_window(view, drone.discs_m[index].reshape(-1, 3), 1)
         if inner is None:
             continue
         part = inner.slices_in(view)

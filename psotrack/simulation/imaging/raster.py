@@ -112,7 +112,7 @@ def full_view(cam: Pinhole, magnification: int = 1) -> RasterView:
     return RasterView(cam, 0, 0, cam.width, cam.height, magnification)
 
 
-def enclosing(
+def enclosing_window(
     view: RasterView, points_world: Float[np.ndarray, "points 3"], margin_px: int
 ) -> RasterView | None:
     """Part of a window that contains the images of points, with a margin; None if this part is empty.

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from psotrack.simulation.imaging import sensor
-from psotrack.simulation.imaging.backdrop import Backdrop, lens_blur, light_of, numbers_and_depth
+from psotrack.simulation.imaging.backdrop import Backdrop, lens_blur, numbers_and_depth, render_light
 from psotrack.simulation.imaging.posing import MIRRORED, PosedDrone, average, margin_px, windows
 from psotrack.simulation.imaging.raster import Pinhole, full_view
 from psotrack.simulation.scenarios import Imaging
@@ -101,7 +101,7 @@ def mirror(room: Room, cam: Pinhole, imaging: Imaging, empty: Backdrop) -> Mirro
         for surface in room.surfaces[1:]
     ]
     _, depth = numbers_and_depth(below, full_view(cam))
-    light = light_of(below, cam, imaging.antialiasing)
+    light = render_light(below, cam, imaging.antialiasing)
     beyond = np.clip(1 - empty.depth_m / depth, 0, 1)
     share = fresnel(_cosine_to_floor(cam), imaging.reflections) * _cover(empty.floor, imaging)
     return Mirror(cam, share, _blurred(light, beyond, ROUGHNESS_RAD * cam.K[0, 0], imaging), depth)

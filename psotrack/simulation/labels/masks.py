@@ -13,7 +13,7 @@ from psotrack.simulation.imaging.raster import (
     RasterView,
     draw,
     empty_buffers,
-    enclosing,
+    enclosing_window,
     full_view,
 )
 from psotrack.simulation.scene import Scene
@@ -108,14 +108,14 @@ def _draw_alone(scene: Scene, cam: Pinhole, drone: int, time_s: float) -> _Drawn
     triangles = np.concatenate([shape.triangles_m, disc_fans(shape)])
     triangles = triangles @ flight.rotation(at)[0].T + flight.position_m(at)[0]
     points = triangles.reshape(-1, 3)
-    window = enclosing(full_view(cam), points, _MARGIN_PX)
+    window = enclosing_window(full_view(cam), points, _MARGIN_PX)
     if window is None:
         return None
     beyond = window
     if (points @ cam.R[2] + cam.t_m[2]).min() > NEAR_M:
         # Parts of the drone outside the image count as hidden.
         around = RasterView(cam, -cam.width // 2, -cam.height // 2, 2 * cam.width, 2 * cam.height)
-        beyond = enclosing(around, points, _MARGIN_PX) or window
+        beyond = enclosing_window(around, points, _MARGIN_PX) or window
     colour, depth_m = empty_buffers(beyond)
     draw(beyond, triangles, np.ones((len(triangles), 1, 3)), colour, depth_m)
     covered = colour[..., 0] > 0.5

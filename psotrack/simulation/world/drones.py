@@ -17,7 +17,7 @@ from psotrack.simulation.world.meshes import load
 from psotrack.simulation.world.models import DroneModel as DroneModel
 from psotrack.simulation.world.models import disc_fans as disc_fans
 from psotrack.simulation.world.models import marker_cross as marker_cross
-from psotrack.simulation.world.shapes import Triangles, beam, box, cylinder, pitched, turned
+from psotrack.simulation.world.shapes import Triangles, beam, box, cylinder, pitch, turn
 
 
 def model(name: str | Mesh) -> DroneModel:
@@ -64,8 +64,8 @@ def x_frame() -> DroneModel:
         (box((0.075, 0.0, 0.022), (0.024, 0.03, 0.03)), 0.2),
     ]
     for angle in np.radians(arms):
-        parts.append((turned(beam((0.02, 0.0, 0.0), (0.185, 0.0, 0.0), 0.026, 0.010), angle), 1.0))
-        parts.append((turned(cylinder((0.165, 0.0, -0.024), 0.007, 0.040, sides=6), angle), 0.3))
+        parts.append((turn(beam((0.02, 0.0, 0.0), (0.185, 0.0, 0.0), 0.026, 0.010), angle), 1.0))
+        parts.append((turn(cylinder((0.165, 0.0, -0.024), 0.007, 0.040, sides=6), angle), 0.3))
     return _assembled(parts, motors, 0.076)
 
 
@@ -79,9 +79,9 @@ def x_frame_racer() -> DroneModel:
         (box((-0.012, 0.0, 0.030), (0.074, 0.036, 0.028)), 0.7),
         (box((0.0, 0.0, 0.030), (0.016, 0.040, 0.032)), 0.0),
         # The camera looks up, because the drone flies nose down.
-        (pitched(box((0.072, 0.0, 0.004), (0.022, 0.020, 0.020)), np.radians(35), (0.066, 0.0, 0.0)), 0.3),
+        (pitch(box((0.072, 0.0, 0.004), (0.022, 0.020, 0.020)), np.radians(35), (0.066, 0.0, 0.0)), 0.3),
         (
-            pitched(box((-0.095, 0.0, 0.014), (0.075, 0.006, 0.006)), np.radians(-55), (-0.062, 0.0, 0.014)),
+            pitch(box((-0.095, 0.0, 0.014), (0.075, 0.006, 0.006)), np.radians(-55), (-0.062, 0.0, 0.014)),
             0.0,
         ),
     ]
@@ -129,10 +129,10 @@ def hexacopter() -> DroneModel:
         (cylinder((0.02, 0.0, -0.078), 0.012, 0.044, sides=8), 0.0),
         (box((0.02, 0.0, -0.104), (0.05, 0.10, 0.010)), 0.2),
         (box((0.03, 0.0, -0.138), (0.095, 0.065, 0.060)), 0.1),
-        (pitched(box((0.09, 0.0, -0.138), (0.03, 0.045, 0.045)), np.radians(-20), (0.03, 0.0, -0.138)), 0.0),
+        (pitch(box((0.09, 0.0, -0.138), (0.03, 0.045, 0.045)), np.radians(-20), (0.03, 0.0, -0.138)), 0.0),
     ]
     for angle in np.radians(arms):
-        parts.append((turned(beam((0.06, 0.0, 0.004), (0.285, 0.0, 0.004), 0.022, 0.022), angle), 0.9))
+        parts.append((turn(beam((0.06, 0.0, 0.004), (0.285, 0.0, 0.004), 0.022, 0.022), angle), 0.9))
     for side in (-1.0, 1.0):
         for x in (-0.07, 0.07):
             parts.append((beam((0.8 * x, 0.06 * side, -0.015), (x, 0.16 * side, -0.205), 0.014, 0.014), 0.5))
@@ -151,10 +151,10 @@ def tall_cross() -> DroneModel:
         (box((0.0, 0.0, -0.032), (0.11, 0.05, 0.045)), 0.5),
     ]
     for angle in np.radians(arms):
-        parts.append((turned(beam((0.03, 0.0, 0.002), (0.21, 0.0, 0.002), 0.020, 0.018), angle), 0.7))
+        parts.append((turn(beam((0.03, 0.0, 0.002), (0.21, 0.0, 0.002), 0.020, 0.018), angle), 0.7))
     for angle in np.radians((45.0, 135.0, 225.0, 315.0)):
-        parts.append((turned(beam((0.045, 0.0, -0.01), (0.115, 0.0, -0.105), 0.012, 0.012), angle), 0.3))
-        parts.append((turned(box((0.118, 0.0, -0.11), (0.03, 0.018, 0.012)), angle), 0.2))
+        parts.append((turn(beam((0.045, 0.0, -0.01), (0.115, 0.0, -0.105), 0.012, 0.012), angle), 0.3))
+        parts.append((turn(box((0.118, 0.0, -0.11), (0.03, 0.018, 0.012)), angle), 0.2))
     return _assembled(parts, motors, 0.092)
 
 

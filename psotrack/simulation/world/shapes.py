@@ -35,13 +35,13 @@ def beam(start: Point, end: Point, width: float, height: float) -> Triangles:
     return bar @ np.stack([ahead, left, np.cross(ahead, left)]) + (a + b) / 2
 
 
-def turned(triangles: Triangles, angle_rad: float) -> Triangles:
+def turn(triangles: Triangles, angle_rad: float) -> Triangles:
     """Triangles turned about the z axis, from x towards y."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return triangles @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def pitched(triangles: Triangles, angle_rad: float, about: Point) -> Triangles:
+def pitch(triangles: Triangles, angle_rad: float, about: Point) -> Triangles:
     """Triangles turned about a line through `about` along y, from x towards z, which raises the front."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return (triangles - np.array(about)) @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]) + np.array(
