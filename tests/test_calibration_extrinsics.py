@@ -24,12 +24,12 @@ def view(rng, *, count=12, nearest_m=3.5, farthest_m=6.5, dist=(), K=K):
     """A camera 5 m from its target, and points at random depths, one in each cell of a grid of its image."""
     angle = rng.uniform(0, 2 * np.pi)
     R, t_m = look_at((5 * np.cos(angle), 5 * np.sin(angle), 2.0), (0.0, 0.0, 1.0))
-    one = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080), dist=dist)
+    camera = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080), dist=dist)
     cells = np.array([(i, j) for i in range(4) for j in range(3)] * (count // 12 + 1))[:count]
     pixels = (cells + rng.uniform(0.1, 0.9, (count, 2))) * (480, 360)
     rays = np.concatenate([pixels, np.ones((count, 1))], axis=1) @ np.linalg.inv(K).T
     # Distortion moves the pixels of the points a little; they only need to be near the middles of the cells.
-    return one, (rays * rng.uniform(nearest_m, farthest_m, (count, 1)) - t_m) @ R
+    return camera, (rays * rng.uniform(nearest_m, farthest_m, (count, 1)) - t_m) @ R
 
 
 def centre(T):
@@ -40,17 +40,17 @@ def centre(T):
 def test_derivatives_equal_finite_differences(coefficients):
     rng = np.random.default_rng(0)
     skewed = K + np.array([[0, 3.0, 0], [0, 0, 0], [0, 0, 0]])
-    one, points = view(rng, count=7, dist=LENSES[coefficients], K=skewed)
-    R, t_m = one.T_cam_world[:3, :3], one.T_cam_world[:3, 3]
+    camera, points = view(rng, count=7, dist=LENSES[coefficients], K=skewed)
+    R, t_m = camera.T_cam_world[:3, :3], camera.T_cam_world[:3, 3]
 
     def pixels(step):
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = Rotation.from_rotvec(step[:3]).as_matrix() @ R, t_m + step[3:]
-        return project(replace(one, T_cam_world=T), points)[0].ravel()
+        return project(replace(camera, T_cam_world=T), points)[0].ravel()
 
-    found, by_turn, by_shift = reproject(points, R, t_m, one)
+    found, by_turn, by_shift = reproject(points, R, t_m, camera)
     # Both evaluate the same formula; the pixels are about 1000.
-    np.testing.assert_allclose(found, project(one, points)[0], atol=1e-9)
+    np.testing.assert_allclose(found, project(camera, points)[0], atol=1e-9)
     slopes = approx_fprime(np.zeros(6), pixels, 1e-7).reshape(-1, 2, 6)
     # With a step of 1e-7, curvature costs 1e-4 px and rounding 1e-6 px.
     np.testing.assert_allclose(np.concatenate([by_turn, by_shift], axis=-1), slopes, rtol=1e-4, atol=0.01)
@@ -59,20 +59,20 @@ def test_derivatives_equal_finite_differences(coefficients):
 @pytest.mark.parametrize("coefficients", sorted(LENSES))
 @pytest.mark.parametrize("count", [6, 12, 29])
 def test_exact_points_give_the_camera(count, coefficients):
-    one, points = view(np.random.default_rng(count), count=count, dist=LENSES[coefficients])
-    located = locate_camera(points, project(one, points)[0], one.K, one.dist)
+    camera, points = view(np.random.default_rng(count), count=count, dist=LENSES[coefficients])
+    located = locate_camera(points, project(camera, points)[0], camera.K, camera.dist)
     # The least squares stop at 1e-8 of the cost's scale.
-    np.testing.assert_allclose(located.T_cam_world, one.T_cam_world, atol=1e-6)
+    np.testing.assert_allclose(located.T_cam_world, camera.T_cam_world, atol=1e-6)
     assert located.used.all()
 
 
 def test_the_pose_equals_opencvs_least_squares_pose():
     rng = np.random.default_rng(3)
-    one, points = view(rng, dist=LENSES[5])
-    pixels = project(one, points)[0] + rng.normal(0, 1, (12, 2))
-    located = locate_camera(points, pixels, one.K, one.dist)
-    turn, t_m = cv2.Rodrigues(one.T_cam_world[:3, :3])[0], one.T_cam_world[:3, 3:].copy()
-    turn, t_m = cv2.solvePnPRefineLM(points, pixels, one.K, one.dist, turn, t_m)
+    camera, points = view(rng, dist=LENSES[5])
+    pixels = project(camera, points)[0] + rng.normal(0, 1, (12, 2))
+    located = locate_camera(points, pixels, camera.K, camera.dist)
+    turn, t_m = cv2.Rodrigues(camera.T_cam_world[:3, :3])[0], camera.T_cam_world[:3, 3:].copy()
+    turn, t_m = cv2.solvePnPRefineLM(points, pixels, camera.K, camera.dist, turn, t_m)
     np.testing.assert_allclose(located.T_cam_world[:3, :3], cv2.Rodrigues(turn)[0], atol=1e-6)
     # Both searches end within a millionth of the minimum's width, which is 8 mm.
     np.testing.assert_allclose(located.T_cam_world[:3, 3], t_m.ravel(), atol=1e-6)
@@ -84,9 +84,11 @@ def test_twelve_points_and_a_pixel_of_noise(nearest_m, farthest_m):
     rng, runs = np.random.default_rng(1), 100
     errors_m, distances = [], []
     for _ in range(runs):
-        one, points = view(rng, nearest_m=nearest_m, farthest_m=farthest_m)
-        located = locate_camera(points, project(one, points)[0] + rng.normal(0, 1, (12, 2)), K, NO_LENS, 1.0)
-        off = centre(located.T_cam_world) - one.centre_world
+        camera, points = view(rng, nearest_m=nearest_m, farthest_m=farthest_m)
+        located = locate_camera(
+            points, project(camera, points)[0] + rng.normal(0, 1, (12, 2)), K, NO_LENS, 1.0
+        )
+        off = centre(located.T_cam_world) - camera.centre_world
         errors_m.append(np.linalg.norm(off))
         distances.append(off @ np.linalg.solve(located.centre_covariance_m2, off))
     # The limits are exceeded by chance once in a thousand tests.
@@ -101,8 +103,8 @@ def test_twelve_points_and_a_pixel_of_noise(nearest_m, farthest_m):
 
 def test_outliers_are_found_and_not_used():
     rng = np.random.default_rng(5)
-    one, points = view(rng, count=13)
-    pixels = project(one, points)[0] + rng.normal(0, 1, (13, 2))
+    camera, points = view(rng, count=13)
+    pixels = project(camera, points)[0] + rng.normal(0, 1, (13, 2))
     wrong = np.array([1, 4, 8, 11])
     spoilt = pixels.copy()
     spoilt[wrong] += rng.uniform(60, 400, (4, 2)) * rng.choice([-1, 1], (4, 2))
@@ -116,10 +118,10 @@ def test_outliers_are_found_and_not_used():
 
 def test_noise_larger_than_stated_widens_the_covariance():
     rng = np.random.default_rng(6)
-    one, points = view(rng, count=36)
+    camera, points = view(rng, count=36)
     off = rng.normal(0, 1, (36, 2))
-    small = locate_camera(points, project(one, points)[0] + off, K, NO_LENS, noise_px=1.0)
-    large = locate_camera(points, project(one, points)[0] + 4 * off, K, NO_LENS, noise_px=1.0)
+    small = locate_camera(points, project(camera, points)[0] + off, K, NO_LENS, noise_px=1.0)
+    large = locate_camera(points, project(camera, points)[0] + 4 * off, K, NO_LENS, noise_px=1.0)
     assert large.used.all()
     ratio = np.sqrt(large.centre_covariance_m2.trace() / small.centre_covariance_m2.trace())
     # 36 points determine the standard deviation to 10 %.
@@ -129,10 +131,10 @@ def test_noise_larger_than_stated_widens_the_covariance():
 def test_points_in_a_plane_determine_the_pose():
     rng = np.random.default_rng(7)
     R, t_m = look_at((4.0, 1.0, 2.5), (0.0, 0.0, 0.0))
-    one = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080))
+    camera = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080))
     points = np.concatenate([rng.uniform(-1.5, 1.5, (12, 2)), np.zeros((12, 1))], axis=1)
-    located = locate_camera(points, project(one, points)[0] + rng.normal(0, 1, (12, 2)), K, NO_LENS)
-    off = centre(located.T_cam_world) - one.centre_world
+    located = locate_camera(points, project(camera, points)[0] + rng.normal(0, 1, (12, 2)), K, NO_LENS)
+    off = centre(located.T_cam_world) - camera.centre_world
     # The 99.9 % ellipsoid contains the true centre.
     assert off @ np.linalg.solve(located.centre_covariance_m2, off) < chi2.ppf(0.999, 3)
 
@@ -141,8 +143,8 @@ def test_points_in_a_plane_determine_the_pose():
 @given(st.tuples(*[st.floats(-3, 3)] * 3), st.tuples(*[st.floats(-20, 20)] * 3))
 def test_moving_the_world_moves_the_camera_with_it(turn, shift_m):
     rng = np.random.default_rng(8)
-    one, points = view(rng)
-    pixels = project(one, points)[0] + rng.normal(0, 1, (12, 2))
+    camera, points = view(rng)
+    pixels = project(camera, points)[0] + rng.normal(0, 1, (12, 2))
     R = Rotation.from_rotvec(turn).as_matrix()
     here = locate_camera(points, pixels, K, NO_LENS)
     there = locate_camera(points @ R.T + shift_m, pixels, K, NO_LENS)
@@ -166,11 +168,11 @@ def error_message(points, pixels, *, noise_px=1.0):
 
 def test_points_that_determine_no_pose_are_refused():
     rng = np.random.default_rng(9)
-    one, points = view(rng)
-    pixels = project(one, points)[0]
+    camera, points = view(rng)
+    pixels = project(camera, points)[0]
     assert "at least 4 points of known position, found 3" in error_message(points[:3], pixels[:3])
     line = np.array([0, 0, 1.0]) + np.arange(5)[:, None] * np.array([0.2, 0.1, 0.05])
-    assert "not all on one line" in error_message(line, project(one, line)[0])
+    assert "not all on one line" in error_message(line, project(camera, line)[0])
     broken = points.copy()
     broken[2, 1] = np.nan
     assert "NaN" in error_message(broken, pixels)
@@ -185,10 +187,10 @@ def test_points_that_determine_no_pose_are_refused():
 def test_a_small_plane_far_away_has_two_poses():
     """A sheet of 20 cm at a distance of 8 m, tilted a little, looks the same if it is tilted to the other side."""
     R, t_m = look_at((0.9, 0.0, 8.0), (0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
-    one = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080))
+    camera = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080))
     sheet = np.array([(x, y, 0) for x in (-0.1, 0.0, 0.1) for y in (-0.1, 0.1)])
     rng = np.random.default_rng(0)
-    assert "two poses" in error_message(sheet, project(one, sheet)[0] + rng.normal(0, 0.5, (6, 2)))
+    assert "two poses" in error_message(sheet, project(camera, sheet)[0] + rng.normal(0, 0.5, (6, 2)))
 
 
 def test_spread_and_inflation():

@@ -104,8 +104,8 @@ def test_a_rig_is_read_as_it_was_written(tmp_path, file, coefficients):
 def test_a_rig_in_the_datasets_layout_is_read_as_it_was_written(tmp_path):
     K = np.array([[1157.0, 0, 960.5], [0, 1157.0, 540.25], [0, 0, 1]])
     rig = ring_rig(5, coefficients=4, image_size_wh=(1920, 1080))
-    one = rig.cameras[2]
-    rig = make_rig({"cam1i": type(one)(one.T_cam_world, K, one.dist, one.image_size_wh)})
+    camera = rig.cameras[2]
+    rig = make_rig({"cam1i": type(camera)(camera.T_cam_world, K, camera.dist, camera.image_size_wh)})
     write_rig(tmp_path / "rig.csv", rig)
     back = read_rig(tmp_path / "rig.csv", (1920, 1080))
     assert back.names == rig.names

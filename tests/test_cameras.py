@@ -18,10 +18,10 @@ def points_in_room(count, seed=0):
     return np.random.default_rng(seed).uniform((-2, -2, 0.2), (2, 2, 2.5), (count, 3))
 
 
-def opencv_pixels(one, points):
-    R, t = one.T_cam_world[:3, :3], one.T_cam_world[:3, 3]
-    dist = one.dist if one.dist.size else None
-    return cv2.projectPoints(points, cv2.Rodrigues(R)[0], t, one.K, dist)[0][:, 0]
+def opencv_pixels(camera, points):
+    R, t = camera.T_cam_world[:3, :3], camera.T_cam_world[:3, 3]
+    dist = camera.dist if camera.dist.size else None
+    return cv2.projectPoints(points, cv2.Rodrigues(R)[0], t, camera.K, dist)[0][:, 0]
 
 
 @pytest.mark.parametrize("coefficients", sorted(LENSES))
@@ -65,11 +65,11 @@ def test_undistort_is_the_inverse(coefficients):
 def test_skew_is_part_of_the_inverse():
     R, t_m = look_at((0.0, -4.0, 1.0), (0.0, 0.0, 1.0))
     K = np.array([[300.0, 12.0, 160.0], [0.0, 310.0, 120.0], [0.0, 0.0, 1.0]])
-    one = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(320, 240))
-    in_camera = to_camera(one, np.array([0.7, 0.3, 1.9]))
+    camera = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(320, 240))
+    in_camera = to_camera(camera, np.array([0.7, 0.3, 1.9]))
     pixel = K @ in_camera / in_camera[2]
-    np.testing.assert_allclose(project(one, np.array([0.7, 0.3, 1.9]))[0], pixel[:2], rtol=1e-13)
-    np.testing.assert_allclose(undistort(one, pixel[:2]), in_camera[:2] / in_camera[2], rtol=1e-12)
+    np.testing.assert_allclose(project(camera, np.array([0.7, 0.3, 1.9]))[0], pixel[:2], rtol=1e-13)
+    np.testing.assert_allclose(undistort(camera, pixel[:2]), in_camera[:2] / in_camera[2], rtol=1e-12)
 
 
 @given(
@@ -149,8 +149,8 @@ def test_make_rig_pads_short_lenses():
     assert rig.names == ("a", "b", "c", "d")
     assert rig.cameras.dist.shape == (4, 8)
     points = points_in_room(7)
-    for i, one in enumerate(named.values()):
-        np.testing.assert_allclose(project(rig.cameras[i], points)[0], project(one, points)[0], rtol=1e-14)
+    for i, camera in enumerate(named.values()):
+        np.testing.assert_allclose(project(rig.cameras[i], points)[0], project(camera, points)[0], rtol=1e-14)
 
 
 def test_select_returns_cameras_in_the_given_order():
