@@ -34,7 +34,8 @@ class FrameSelection:
     """The frames of a data set: which frames are used, and which sequences are for validation.
 
     Attributes:
-        validation: names of the sequences for validation; the other sequences are for training. Empty: the last one.
+        validation: names of the sequences for validation; the other sequences are for training. If there are
+            no names, the last sequence is for validation.
         every: step between used frames.
 
     Raises:

@@ -20,7 +20,7 @@ from psotrack.settings import TrackSettings
 from psotrack.silhouettes import check_whole
 from psotrack.support import convert, read_toml
 from psotrack.sweep.cells import Cell, Perturbation, cell_key
-from psotrack.sweep.names import INPUTS, PERTURBATIONS, SETTINGS, check_name, flat, nested, place_of, table
+from psotrack.sweep.names import INPUTS, PERTURBATIONS, SETTINGS, check_name, flatten, nest, place_of, table
 
 __all__ = ["Cell", "Grid", "Perturbation", "cell_key", "grid", "read_grid"]
 
@@ -102,8 +102,8 @@ class Grid:
         )
         places = {name: place for place, name, _ in given}
         values = {name: value for _, name, value in given}
-        settings = self._record(TrackSettings, nested(values, SETTINGS), places)
-        perturbation = self._record(Perturbation, nested(values, PERTURBATIONS), places)
+        settings = self._record(TrackSettings, nest(values, SETTINGS), places)
+        perturbation = self._record(Perturbation, nest(values, PERTURBATIONS), places)
         if settings.reads_detections:
             # These perturbations change silhouettes, and would have no effect on detections.
             for name in ("clock_frames", "flipped"):
@@ -113,7 +113,7 @@ class Grid:
         cameras, frames = self._cameras(values, places), values.get("frames")
         if frames is not None:
             check_whole(f"{self.where}: {places['frames']}", frames, lowest=1)
-        every = dict(flat(msgspec.to_builtins(settings))) | msgspec.to_builtins(perturbation)
+        every = dict(flatten(msgspec.to_builtins(settings))) | msgspec.to_builtins(perturbation)
         every |= {"cameras": cameras_label(cameras), "frames": frames}
         axes = {name: every[name] for name in self.axes}
         return Cell("", method, cameras, frames, perturbation, settings, self.runs, axes, self.first_seed)

@@ -34,7 +34,7 @@ def table(where: str, place: str, content: Any, names: tuple[str, ...]) -> dict[
     if not isinstance(content, Mapping):
         raise SettingsError(f"{where}: {place}", expected="a table", found=f"{content!r}")
     values: dict[str, Any] = {}
-    for name, value in flat(content):
+    for name, value in flatten(content):
         check_name(f"{where}: {place}.", name, names)
         if name in values:
             raise SettingsError(f"{where}: {place}.{name}", expected="the name once", found="the name twice")
@@ -70,16 +70,16 @@ def check_name(prefix: str, name: str, names: tuple[str, ...]) -> None:
     raise SettingsError(f"{prefix}{name}", expected="an allowed name", found=name, remedy=remedy)
 
 
-def flat(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted names and values of a nested table; an empty inner table is a value."""
+def flatten(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield dotted names and values of a nested table; an empty inner table is a value."""
     for name, value in content.items():
         if isinstance(value, Mapping) and value:
-            yield from flat(value, f"{prefix}{name}.")
+            yield from flatten(value, f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", value
 
 
-def nested(values: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
+def nest(values: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
     """Nested tables from dotted names and values; dotted names that are not among `names` are left out."""
     data: dict[str, Any] = {}
     for name, value in values.items():

@@ -14,7 +14,7 @@ import pandas as pd
 
 from psotrack.settings import RENAMED, TrackSettings
 from psotrack.sweep.cells import Cell, digest_cell
-from psotrack.sweep.names import flat, nested
+from psotrack.sweep.names import flatten, nest
 
 #: Setting of version 0.1 that is gone, and the value that leaves the results as they are today.
 _GONE = {"refinements": 0}
@@ -76,8 +76,8 @@ def _rename_keys(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def _older_settings(settings: TrackSettings) -> dict[str, Any] | None:
     """Settings as nested tables with the names of version 0.1; None if that version lacked a setting that is used."""
-    values = dict(flat(msgspec.to_builtins(msgspec.structs.replace(settings, seed=0))))
+    values = dict(flatten(msgspec.to_builtins(msgspec.structs.replace(settings, seed=0))))
     if any(values.pop(name) != value for name, value in _NEW.items()):
         return None
     older = {_OLDER_NAMES.get(name, name): value for name, value in values.items()} | _GONE
-    return nested(older, tuple(older))
+    return nest(older, tuple(older))

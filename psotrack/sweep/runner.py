@@ -24,7 +24,7 @@ from psotrack.sweep.inputs import Input, Inputs, folder_of, input_digest, source
 from psotrack.sweep.locks import POLL_S
 from psotrack.sweep.machine import provenance
 from psotrack.sweep.manifest import note_input, note_run
-from psotrack.sweep.names import flat
+from psotrack.sweep.names import flatten
 from psotrack.sweep.older_folders import older_cell_key, older_failure_name
 from psotrack.sweep.store import Store
 
@@ -226,7 +226,7 @@ def describe(cell: Cell) -> dict[str, Any]:
         "cameras": cameras_label(cell.cameras),
         "frames": cell.frames,
         **{f"perturbation.{name}": value for name, value in msgspec.to_builtins(cell.perturbation).items()},
-        **{f"settings.{name}": value for name, value in flat(settings)},
+        **{f"settings.{name}": value for name, value in flatten(settings)},
     }
 
 
@@ -240,7 +240,7 @@ def _run_seeds(
     total_s = time.perf_counter() - began
     of_cell = describe(cell) | {"frames": given.recording.num_frames, "num_cameras": len(given.recording.rig)}
     of_batch = {"runs_in_batch": len(seeds), "seconds.batch": total_s}
-    origin = {"cell": key, "input": input_name} | dict(flat(provenance()))
+    origin = {"cell": key, "input": input_name} | dict(flatten(provenance()))
     runs = list(zip(seeds, results, strict=True))
     rows = [of_cell | {"seed": seed} | of_batch | _figures(result, given) | origin for seed, result in runs]
     return pd.DataFrame(rows), pd.concat([_errors(seed, result, given) for seed, result in runs])

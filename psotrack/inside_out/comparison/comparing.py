@@ -1,8 +1,8 @@
 """Comparison of a camera's path with a reference that was recorded separately: the paper's Tables 7 and 8.
 
 The paper (technical validation, "ArUco markers") shifts the path along the reference, takes the offset with the
-smallest mean distance, and states distances and differences of angles at corresponding frames. The paper does so in
-steps of the reference's samples; here the offset is found to a fraction of a step (`psotrack.clocks`). Orientations may
+smallest mean distance, and states distances and differences of angles at corresponding frames. The paper's shifts are
+whole samples of the reference; here the offset is found to a fraction of a sample (`psotrack.clocks`). Orientations may
 have their own clock, such as an IMU's: their offset is found from the rotation of the camera.
 
 Two constant differences are no errors: the lever arm, from the reference's point on the drone to the camera, and the
@@ -31,7 +31,7 @@ class Statistics:
 
     Attributes:
         count: number of values.
-        mean, median, minimum, maximum: of the values.
+        mean, median, minimum, maximum: mean, median, smallest and largest value.
         std: standard deviation about the mean (the sum of squares divided by `count`).
     """
 
@@ -148,7 +148,7 @@ def compare_paths(
 
     Raises:
         SettingsError: the range is smaller than a step of the reference.
-        InputError: the two have nothing in common, or the motion does not determine the offset; see `find_offset`.
+        InputError: path and reference do not overlap, or the motion does not determine the offset; see `find_offset`.
     """
     reference_wxyz = reference.orientation_wxyz
     turns_s, turn_offset_s = reference.time_s, None
@@ -201,12 +201,12 @@ def compare_paths(
 
 
 def wrap_deg(angle_deg: Float[np.ndarray, "*angles"]) -> Float[np.ndarray, "*angles"]:
-    """The same angles in (-180, 180], degrees."""
+    """Angles without full turns, in (-180, 180], degrees."""
     return 180.0 - (180.0 - angle_deg) % 360.0
 
 
 def mean_rotation(rotations: Rotation) -> Rotation:
-    """The rotation with the least mean angle to all, which outliers move little (L1).
+    """The rotation with the smallest mean angle to all rotations (L1); outliers change it only a little.
 
     Weiszfeld's steps from the chordal mean: R. Hartley, K. Aftab, J. Trumpf, L1 rotation averaging using the Weiszfeld
     algorithm, CVPR 2011.
