@@ -233,7 +233,7 @@ table.round(2)
 # %%
 budgets = sorted(set(rows["evaluations"]))
 colours = dict(zip(("pso", *searches), ("#0072b2", "#d55e00", "#009e73"), strict=True))
-figure, both = plt.subplots(1, 2, figsize=(9, 3.8), layout="constrained")
+figure, both = plt.subplots(1, 2, figsize=(9, 3.8), sharey=True, layout="constrained")
 for axes, (title, half) in zip(both, rows.groupby("vertex"), strict=True):
     for name, runs in half.groupby("settings.swarm.search"):
         error_mm = runs.groupby("evaluations")["error_mm"]
