@@ -53,7 +53,8 @@ keep_compiled(Path("data", "compiled"))
 
 folder = DATA / "own" / "Simulated_Data" / SEQUENCE
 if not folder.exists():
-    pt.simulate(SEQUENCE, DATA / "own", num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
+    simulation = pt.SimulationSettings(num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
+    pt.simulate(SEQUENCE, DATA / "own", simulation)
 recording = pt.read_recording(folder)
 
 # %% [markdown]

@@ -21,7 +21,7 @@ from psotrack.errors import SettingsError
 from psotrack.geometry import project_boxes
 from psotrack.recordings import read_frames
 from psotrack.silhouettes import SilhouetteSettings, find_background, key_of
-from psotrack.simulation import simulate
+from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import plugins
 from psotrack.tracking import camera_weights, find_score, find_search, foreground_and_area, tracker_settings
 from psotrack.trajectories import DroneSizes, Status, Tracks
@@ -194,7 +194,8 @@ def root(tmp_path_factory):
     """A data folder with a sequence of two drones at a quarter of the image size."""
 
     def make(folder):
-        simulate("S01_D2_A", folder, num_frames=NUM_FRAMES, scale=0.25, masks=False, onboard=False, jobs=1)
+        settings = SimulationSettings(num_frames=NUM_FRAMES, scale=0.25, masks=False, onboard=False)
+        simulate("S01_D2_A", folder, settings, jobs=1)
 
     return make_once(tmp_path_factory, "bring_your_own", make)
 
