@@ -71,7 +71,7 @@ table7: $(VENV)/.installed  ## the paper's Tables 6 to 8 and figure 11: drones' 
 docs: $(VENV)/.installed  ## build the documentation into build/docs; fails on a warning or a missing figure
 	@$(call install,docs)
 	@$(BIN)/python docs/readme.py --check
-	@DISABLE_MKDOCS_2_WARNING=true $(BIN)/python -m mkdocs build --quiet --strict --config-file docs/mkdocs.yml
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict --config-file docs/mkdocs.yml
 	@echo "build/docs/index.html"
 
 results: $(VENV)/.installed  ## make the results again that are older than their code, hours; ONLY=table4 for one, FORCE=1 for all
