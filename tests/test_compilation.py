@@ -46,6 +46,7 @@ def compiled(caplog):
         yield since_last
 
 
+@pytest.mark.slow
 def test_other_values_of_the_inputs_compile_nothing(compiled):
     run()
     assert any("track" in name for name in compiled())

@@ -102,6 +102,7 @@ def test_a_camera_that_does_not_turn_is_smoothed_as_by_least_squares_over_all_fr
         )
 
 
+@pytest.mark.slow
 def test_without_a_model_the_smoother_uses_the_estimated_model() -> None:
     raw, _, _ = flight(40, acceleration=1.0, wobble=1.0, seed=31)
     raw = move_poses(remove_poses(raw, slice(10, 13)), slice(20, 21), [1.0, 0.0, 0.0])
@@ -113,6 +114,7 @@ def test_without_a_model_the_smoother_uses_the_estimated_model() -> None:
         np.testing.assert_array_equal(getattr(smooth(raw, params, model), name), value)
 
 
+@pytest.mark.slow
 def test_the_model_distinguishes_calm_from_violent_flights_and_wide_from_correct_covariances() -> None:
     calm, _, _ = flight(100, acceleration=0.5, wobble=0.5, seed=33)
     violent, _, _ = flight(100, acceleration=8.0, wobble=8.0, seed=33)

@@ -149,6 +149,7 @@ def tracked_from_first(silhouettes):
     return track(silhouettes, FIRST)
 
 
+@pytest.mark.slow
 def test_a_drone_that_enters_gets_a_new_track(tracked_from_first):
     tracked, trajectories = tracked_from_first
     new = [arrival for arrival in tracked.arrivals if not arrival.again]
@@ -164,6 +165,7 @@ def test_a_drone_that_enters_gets_a_new_track(tracked_from_first):
     assert error_m.max() < 2 * CELL_M
 
 
+@pytest.mark.slow
 def test_a_drone_that_returns_keeps_its_number(tracked_from_first):
     """The swarm finds the drone near its last position, or the residual foreground shows where the drone is."""
     tracked, trajectories = tracked_from_first
@@ -178,6 +180,7 @@ def test_a_drone_that_returns_keeps_its_number(tracked_from_first):
     assert error_m.max() < 2 * CELL_M
 
 
+@pytest.mark.slow
 def test_covariance_grows_while_a_drone_coasts(tracked_from_first):
     _, trajectories = tracked_from_first
     coasting = trajectories.status[:, 0] == Status.COASTING
@@ -186,6 +189,7 @@ def test_covariance_grows_while_a_drone_coasts(tracked_from_first):
     assert spread[-1] > 100 * np.trace(trajectories.covariance_m2[AWAY.start - 1, 0])
 
 
+@pytest.mark.slow
 def test_sizes_are_learned(tracked_from_first):
     """Sizes are measured by second moments, whose half length is a tenth more than the half axis of an ellipse."""
     tracked, _ = tracked_from_first
@@ -220,6 +224,7 @@ def test_sizes_stay_where_learning_is_off(silhouettes):
     np.testing.assert_allclose(tracked.sizes.size_m, SIZE_M[:1], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_smoothing(tracked_from_first, silhouettes):
     """Smoothing makes covariances smaller and errors no larger."""
     tracked, filtered = tracked_from_first

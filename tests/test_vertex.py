@@ -63,6 +63,7 @@ def test_the_vertex_is_that_of_the_least_squares_paraboloid():
     np.testing.assert_allclose(answer.dispersion[0], phi, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_the_vertex_is_the_centre_of_an_ellipsoid():
     """From any start near the true centre, the vertex is closer to the centre than one pixel of the silhouettes."""
     rng = np.random.default_rng(0)
