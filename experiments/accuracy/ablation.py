@@ -20,17 +20,17 @@ from psotrack.support import atomic_write
 
 #: Name of a variant -> settings that leave a part out, or add a part that is off by default.
 VARIANTS: dict[str, dict[str, Any]] = {
-    "everything, and smoothing": {"smooth": True},
-    "everything": {},
-    "no paraboloid: the best place tried": {"score.vertex": False},
+    "whole tracker, with smoothing": {"smooth": True},
+    "whole tracker": {},
+    "no paraboloid: the best position of the swarm": {"score.vertex": False},
     "one window": {"score.windows": (1.0,)},
-    "no occlusion of shared foreground": {"score.occlusion": False},
-    "sizes of the first frames": {"drones.learn_sizes": False},
-    "swaps are not resolved": {"identity.resolve_swaps": False},
-    "errors taken for white": {"motion.error_share": 0.0},
+    "no handling of occlusion": {"score.occlusion": False},
+    "sizes are not learned after the first frames": {"drones.learn_sizes": False},
+    "identity swaps are not resolved": {"identity.resolve_swaps": False},
+    "measurement errors without correlation in time": {"motion.error_share": 0.0},
     "the paper's hard score": {"score.kind": "hard"},
 }
-EVERYTHING = "everything"
+WHOLE = "whole tracker"
 
 
 def run(name: str, variant: str, seed: int, opened: tuple) -> dict[str, Any]:
@@ -62,7 +62,7 @@ def draw(table: pd.DataFrame, path: Path) -> None:
                     xytext=(6, -3),
                     textcoords="offset points",
                 )
-        axes.axvline(error_mm.loc[[EVERYTHING]].mean(), color="tab:grey", linewidth=1)
+        axes.axvline(error_mm.loc[[WHOLE]].mean(), color="tab:grey", linewidth=1)
         axes.set_xscale("log")
         axes.set_xlim(3, 40)
         axes.set_xticks([], minor=True)

@@ -197,7 +197,7 @@ def summary(recording: Recording, run: ComparedTracks) -> dict[str, Any]:
     false_tracks = run.tracked & (run.drone < 0)
     return {
         "tracks": run.trajectories.num_drones,
-        "tracked_nobody_s": float(false_tracks.sum() / recording.fps),
+        "false_tracks_s": float(false_tracks.sum() / recording.fps),
         "id_switches": evaluation.id_switches,
         "missed_rate": evaluation.missed_rate,
         "mota": evaluation.mota,
