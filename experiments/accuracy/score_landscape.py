@@ -103,7 +103,7 @@ def load(root: Path) -> Data:
         images[:10],
         reduction=SILHOUETTES.reduction,
         fps=sequence.fps,
-        bounds_m=room_bounds(sequence.rig, TrackSettings()),
+        bounds_m=room_bounds(sequence.rig),
         max_speed_m_s=6.0,
     )
     truth = sequence.truth.position_m
