@@ -28,7 +28,6 @@ from psotrack.datasets.dpjait import read_sequence
 from psotrack.geometry import Camera, make_extents
 from psotrack.initiation import room_bounds
 from psotrack.initiation.initialisation import find_drones
-from psotrack.settings import TrackSettings
 from psotrack.silhouettes import SilhouetteSettings, compute
 from psotrack.simulation import Scenario, SimulationSettings, scenario, simulate
 from psotrack.simulation.scenarios import Drone, Harmonic, Harmonics, Variation
