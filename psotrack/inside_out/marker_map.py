@@ -145,7 +145,7 @@ def _check_square(marker: int, row: MarkerRow) -> None:
         raise InputError(
             where,
             expected=f"corners in a plane to {SQUARE_TOLERANCE:.0%} of the side",
-            found=f"one that is {1e3 * height:.0f} mm off that of the others, of a side of {1e3 * side:.0f} mm",
+            found=f"one corner {1e3 * height:.0f} mm off the plane of the others; the side is {1e3 * side:.0f} mm",
             remedy="measure its corners again",
         )
     off = np.abs([*(edges - side), *(diagonals - np.sqrt(2) * side)])
