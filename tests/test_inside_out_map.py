@@ -227,7 +227,7 @@ def with_bent_corner(distance_m, axis):
 BAD_PLACES = {
     "not planar": (
         with_bent_corner(0.05, 1),
-        r"line 4, marker 3: expected corners in a plane to 10% .* 50 mm off .* of 40\d mm",
+        r"line 4, marker 3: expected corners in a plane to 10% .* 50 mm off .* side is 40\d mm",
     ),
     "not square": (
         with_bent_corner(0.06, 0),
