@@ -68,9 +68,10 @@ def draw(table: pd.DataFrame, path: Path) -> None:
         axes.set_xticks([], minor=True)
         axes.set_xticks([3, 5, 10, 20, 40], ["3", "5", "10", "20", "40"])
         axes.set_title(name)
-        axes.set_xlabel("mean error, offset removed (mm)")
         axes.grid(visible=True, axis="x", which="both", alpha=0.3)
         axes.set_yticks(range(len(variants)), list(reversed(variants)))
+    # One label for all panels: a label below each panel would touch its neighbours.
+    figure.supxlabel("mean error, offset removed (mm)", fontsize="medium")
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=110)
 
