@@ -186,8 +186,8 @@ def test_wrong_combinations_of_lens_options_are_refused(tmp_path):
     pairs = pairs_of(tmp_path / "pairs.csv", ring_rig(1))
     start = ("extrinsics", "--pairs", pairs, "--out", tmp_path / "out.toml")
     assert "lens: expected --intrinsics FILE, or --fov H,V" in refused(*start)
-    assert "found another choice" in refused(*start, "--fov", "60,40", "--focal-length", "8")
-    assert "found another choice" in refused(*start, "--focal-length", "8")
+    assert "found another combination" in refused(*start, "--fov", "60,40", "--focal-length", "8")
+    assert "found another combination" in refused(*start, "--focal-length", "8")
     assert "--size: expected width and height" in refused(*start, "--fov", "60,40")
 
 

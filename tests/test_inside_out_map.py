@@ -241,7 +241,10 @@ BAD_PLACES = {
         with_corners(3, ROOM[3][[0, 3, 2, 1]]),
         r"line 4, marker 3: .* all other markers are behind it; its corners are counted backwards",
     ),
-    "in one place": (with_corners(3, ROOM[2] + 0.01), r"line 4, marker 3: .* found it where marker 2 is"),
+    "in one place": (
+        with_corners(3, ROOM[2] + 0.01),
+        r"line 4, marker 3: .* found both markers at the place of marker 2",
+    ),
     "one in millimetres": (
         with_corners(3, 1e3 * ROOM[3]),
         r"line 4, marker 3: expected a marker with a side of .* found 400 m; is it in millimetres\? .* x1\[mm\]",

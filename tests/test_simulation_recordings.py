@@ -314,11 +314,11 @@ QUATERNIONS = ("time_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 BROKEN = {
     "stuck": (
         csv_table().replace("0.3,", "0.2,"),
-        "line 5, column time_s: expected a time after line 4, 0.2, found 0.2",
+        "line 5, column time_s: expected a time above 0.2, the time in line 4, found 0.2",
     ),
     "backwards": (
         csv_table().replace("0.3,", "0.1,"),
-        "line 5, column time_s: expected a time after line 4",
+        "line 5, column time_s: expected a time above 0.2, the time in line 4",
     ),
     "short": (csv_table(count=5), "loop.csv: expected at least 6 samples, found 5"),
     "nan": (

@@ -439,8 +439,10 @@ CAMERA = {"position_m": [-4.0, -3.0, 2.5], "target_m": [0.0, 0.0, 1.2]}
         ({"cameras": [{**CAMERA, "position_m": [-2.0, 2.9, 2.0]}]},
          "cameras[0].position_m: expected a place outside of the furniture, found [-2.0, 2.9, 2.0]"),
         ({"cameras": [CAMERA, {**CAMERA, "target_m": CAMERA["position_m"]}]},
-         "cameras[1].target_m: expected a point beside the camera, not at its place, above or below, found ["),
-        ({"cameras": [{**CAMERA, "target_m": [-4.0, -3.0, 0.0]}]}, "cameras[0].target_m: expected a point beside"),
+         "cameras[1].target_m: expected a point that is not straight above or below the camera, nor at "
+         "its place, found ["),
+        ({"cameras": [{**CAMERA, "target_m": [-4.0, -3.0, 0.0]}]},
+         "cameras[0].target_m: expected a point that is not straight above"),
         ({"limits.lower_m": [-6.0, -1.9, 0.7]},
          "limits.lower_m: expected a point in the hall, x within 5 m of 0, y within 4 m, z from 0 to 4 m, "
          "found [-6.0, -1.9, 0.7]"),

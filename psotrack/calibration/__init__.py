@@ -3,7 +3,8 @@
 In: a data sheet or a video of a ChArUco board (`intrinsics`), points of known position (`image_points`, `extrinsics`),
 or detections of drones (`bundle`). Out: lenses and rigs with covariances. `bundle` adjusts all cameras and points
 together, `common_errors` adds errors that many points share to the covariance, and `significance` finds the cameras
-that are certainly wrong. The files of rigs are read and written in `psotrack.geometry`.
+that are certainly wrong. Other rooms may use every name in `__init__.pyi`. The files of rigs are read and written in
+`psotrack.geometry`.
 """
 
 import lazy_loader

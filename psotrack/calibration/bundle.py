@@ -79,7 +79,8 @@ def adjust(
         common_errors: errors that several points have in common.
 
     Raises:
-        SettingsError: the noise is not above 0, or `fixed` or `rescaled` names a camera that is not in the rig.
+        SettingsError: the noise is not above 0, or `fixed` or `rescaled` names a camera that is not in the rig,
+            or all cameras are fixed and none is rescaled.
         InputError: the points do not determine the cameras; the message names a camera that sees too few points.
     """
     noise_px = np.broadcast_to(np.asarray(noise_px, np.float64), points_px.shape[:2])

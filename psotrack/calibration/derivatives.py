@@ -17,7 +17,10 @@ def reproject(
 ) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 3"], Float[np.ndarray, "points 2 3"]]:
     """Pixels of points, and their derivatives by a small turn about the camera's axes (rad) and by its translation.
 
-    The derivatives are OpenCV's for normalised coordinates, multiplied with K, so that they are valid for skew too.
+    The derivatives are OpenCV's for normalised coordinates, multiplied by K, so that they are valid for skew too.
+
+    Returns:
+        (points, 2), pixels; (points, 2, 3), derivatives by the turn; and (points, 2, 3), by the translation in metres.
     """
     turned = np.ascontiguousarray(points_m @ R.T)
     pixels, slopes = pixel_slopes(turned, np.zeros(3), t_m, lens)
@@ -38,5 +41,5 @@ def pixel_slopes(
 
 
 def centre_by_pose(R: Float[np.ndarray, "3 3"], t_m: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 6"]:
-    """Derivative of a camera's centre, -Rᵀ t, by a small turn about its axes and by its translation."""
+    """(3, 6), derivative of a camera's centre, -Rᵀ t, by a small turn about its axes and by its translation."""
     return np.hstack([-R.T @ cross_matrices(t_m), -R.T])

@@ -159,7 +159,7 @@ def lens_of_board(video: VideoInfo, board: Board) -> Lens:
         raise InputError(
             video.path,
             expected=f"views that determine the focal length to {_MAX_FOCAL_ERROR:.0%}",
-            found=f"boards whose tilts differ by at most {tilt_deg:.0f} degrees, and {std[0] / K[0, 0]:.1%}",
+            found=f"boards whose tilts differ by at most {tilt_deg:.0f} degrees, error {std[0] / K[0, 0]:.1%}",
             remedy="tilt the board, and move it into all corners of the image",
         )
     return Lens(

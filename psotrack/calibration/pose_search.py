@@ -58,7 +58,7 @@ def find_likely_poses(
     extent_m: Float[np.ndarray, "3"],
     name: str,
 ) -> list[Pose]:
-    """Find all poses that are local minima of the robust cost, the most likely pose first."""
+    """Find poses that are local minima of the robust cost, at most `_MOST_STARTS`, the most likely pose first."""
     started = _distinct(initial_poses(points_m, points_px, lens, noise_px, extent_m))
     found = _distinct(
         refine_pose(points_m, points_px, start, lens, noise_px, loss="cauchy") for start in started

@@ -26,8 +26,9 @@ from psotrack.geometry import Rig
 FALSE_ALARM = 0.01
 #: Largest share of wrong cameras: if more cameras are wrong, too few correct cameras remain as a reference.
 MOST_OFF = 0.5
-#: A wrong focal length looks like a shift along the optical axis. The focal length may be wrong if its median residual
-#: is at most this multiple of the pose's: for a camera that was turned or moved otherwise, it is much larger.
+#: A wrong focal length looks like a shift along the optical axis. The focal length may be wrong instead of the pose if
+#: the median residual with another focal length is at most this multiple of the median residual with another pose. If
+#: the camera was turned, or moved in another direction, the median residual with another focal length is much larger.
 AS_WELL = 1.2
 
 

@@ -3,7 +3,8 @@
 In: arguments and files. Out: files, text on stdout, and one line on stderr where something is wrong. Commands contain
 no numerics. A command's module is imported when the command runs, and the module imports the functions that it calls
 when they are called, so that `--help` and shell completion are quick. The exit code is 0 if everything was done, and 2
-for every error.
+for every error; it is 2 also if `doctor` or `map-markers --check` finds a fault. No other room uses this room;
+`python -m psotrack` and the installed script call `main`.
 """
 
 from __future__ import annotations

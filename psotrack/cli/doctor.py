@@ -46,10 +46,10 @@ def doctor(
     """Check the calibration of SEQ against the detections of its cameras, before tracking.
 
     Reports which camera, pair of cameras or file disagrees, by how much, and what to do. It finds a camera that is
-    turned, moved or late, has another focal length, or is exchanged with another camera; translations that are centres;
-    millimetres that were read as metres; mirrored axes; a reference with another clock, unit or origin. Faults that
-    move the drones in the image by less than the noise of the detections are not found. At least four viewpoints are
-    needed to name the faulty camera.
+    turned, moved or late, has another focal length, or is exchanged with another camera; camera centres that were read
+    as translations; millimetres that were read as metres; mirrored axes; a reference with another clock, unit or
+    origin. Faults that move the drones in the image by less than the noise of the detections are not found. At least
+    four viewpoints are needed to name the faulty camera.
 
     The exit code is 0 if nothing was found, and 2 if something was found.
 

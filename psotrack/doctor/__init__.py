@@ -2,6 +2,7 @@
 
 In: the rig, and detections or blobs of several cameras; optionally a reference. Out: a `Diagnosis` with findings. Each
 finding names a camera, a pair of cameras or a clock, and says how large the disagreement is and what to do.
+Other rooms may use every name in `__init__.pyi`.
 """
 
 import lazy_loader

@@ -238,8 +238,8 @@ def find_late_cameras(
 ) -> tuple[Float[np.ndarray, "cameras"], Float[np.ndarray, "cameras"], list[int]]:
     """Offsets of the sound cameras' clocks from their median, standard deviations, and indices of late cameras.
 
-    Middles of boxes that move along the flight direction cause offsets of a tenth of a frame or two, so that offsets
-    below `LATE_FRAMES` are not reported.
+    The middle of a drone's box may be a little ahead of the drone or behind it, which looks like an offset of one or
+    two tenths of a frame. Therefore offsets below `LATE_FRAMES` are not reported.
     """
     offset, std = np.full((2, len(rig)), np.nan)
     index = np.flatnonzero(sound)

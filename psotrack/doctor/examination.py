@@ -145,7 +145,7 @@ def examine(
 
 
 def sampled_frames(num_frames: int) -> Int[np.ndarray, "chosen"]:
-    """Numbers of the frames to examine: `RUNS` runs of `RUN_FRAMES` frames, spread over the video."""
+    """(chosen,), numbers of the frames to examine: `RUNS` runs of `RUN_FRAMES` frames, spread over the video."""
     starts = np.linspace(0, max(num_frames - RUN_FRAMES, 0), RUNS).astype(int)
     frames = np.unique(starts[:, None] + np.arange(RUN_FRAMES))
     return frames[frames < num_frames]

@@ -163,7 +163,8 @@ def find_certain_focal_lengths(rig: Rig, found: Agreement) -> RigInterpretation 
     """Multiply all focal lengths with a factor, if a bundle adjustment with fixed poses finds it certain; else None.
 
     With wrong focal lengths and right poses, lines of sight miss each other, more so far from the image's middle. An
-    error of a few per cent is smaller than the noise of one sighting, and larger than the noise of a thousand.
+    error of a few per cent is smaller than the noise of one sighting, and larger than the noise of the mean of a
+    thousand sightings.
 
     Args:
         rig: the rig as it was read.

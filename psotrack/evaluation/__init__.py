@@ -2,7 +2,8 @@
 
 In: two `Trajectories`, the estimate and the reference. Out: an `Evaluation` with the figures of the contract, errors
 per frame, tables and plots. The input is only trajectories, so all methods are evaluated by the same code. Only
-`sweep`, `cli` and other rooms above this one import it.
+`sweep`, `cli` and other rooms above this one import it; they may use every name in `__init__.pyi`, and the modules
+`plots` and `tables`.
 """
 
 import lazy_loader

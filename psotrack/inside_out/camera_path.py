@@ -39,7 +39,7 @@ _BODY_IN_CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]
 class Flag(IntFlag):
     """Remarks on a frame, in addition to its status."""
 
-    #: The pose is from fewer markers than 4, the paper's number, or than were required, but from at least 1.
+    #: The frame has 1 or more markers, but fewer than 4 (the paper's number) or fewer than required.
     FEW_MARKERS = 1
     #: Another pose fits about equally well, and neither markers nor motion decide between the two.
     AMBIGUOUS = 2

@@ -168,7 +168,7 @@ def _check_apart(rows: Mapping[int, MarkerRow], marker_map: MarkerMap) -> None:
         raise InputError(
             f"{rows[second].where}, marker {second}",
             expected="markers in different places",
-            found=f"it where marker {first} is",
+            found=f"both markers at the place of marker {first}",
             remedy="correct one of the two",
         )
 

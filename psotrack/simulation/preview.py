@@ -88,6 +88,7 @@ def save_preview(
 
     Raises:
         SettingsError: the scenario cannot be built, or has fewer frames than `num_frames`.
+        InputError: a mesh or a recorded flight cannot be used.
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
     num_frames = count_frames(scenario, num_frames)

@@ -196,7 +196,7 @@ class Drone(_Record, frozen=True, kw_only=True):
         paint_bgr: reflectance of the paint, linear, 0 to 1 (dark grey is 0.1).
         group: name of a group; a seed changes the flights of a group in the same way, so that the drones of the group
             keep their distances.
-        yaw_deg: mean heading; not used for recorded flights with orientations, nor are the next two.
+        yaw_deg: mean heading; recorded flights with orientations use none of the three attributes `yaw_*`.
         yaw_sway_deg: amplitude of the sinusoidal change of heading.
         yaw_period_s: period of the change of heading.
     """
@@ -324,8 +324,7 @@ class Limits(_Record, frozen=True, kw_only=True):
         max_speed_m_s: largest speed.
         max_acceleration_m_s2: largest acceleration.
         max_tilt_deg: largest angle between a drone's z axis and the vertical.
-        min_distance_m: smallest distance between two drones; pairs of drones with a smaller distance in the scenario
-            itself are excepted.
+        min_distance_m: smallest distance between two drones; the two drones of a near pass may be closer.
         lower_m: lower corner of the box that the body origins stay in, world.
         upper_m: upper corner of this box, world.
     """

@@ -92,7 +92,7 @@ def _check_camera(scenario: Scenario, index: int, place: CameraPlace, hall: Hall
         raise scenario_error(
             scenario,
             f"cameras[{index}].target_m",
-            expected="a point beside the camera, not at its place, above or below",
+            expected="a point that is not straight above or below the camera, nor at its place",
             found=f"{list(place.target_m)}",
         )
 

@@ -97,7 +97,7 @@ def cell_key(cell: Cell, input_keys: Mapping[str, str]) -> str:
 
     Args:
         cell: the cell.
-        input_keys: digests of everything that the cell reads: silhouettes by camera, calibration, reference.
+        input_keys: digests of everything that the cell reads, by name (see `Inputs.keys_of`).
     """
     settings = msgspec.to_builtins(msgspec.structs.replace(cell.settings, seed=0))
     return digest_cell(cell, settings, input_keys)

@@ -43,7 +43,7 @@ def save(path: Path | str, figure: Figure, *, force: bool = False) -> None:
 def pareto_front(
     work: Float[np.ndarray, "cells"], error: Float[np.ndarray, "cells"]
 ) -> Int[np.ndarray, "front"]:
-    """Indices of the Pareto front, by ascending work: cells that no other cell dominates.
+    """(front,), indices of the Pareto front, by ascending work: cells that no other cell dominates.
 
     A cell dominates another if it is better in work or error and at least as good in the other. NaN is never on the
     front; of equal cells only the first is.

@@ -57,7 +57,7 @@ def sweep(
 
             rows = sweep(
                 {"sequences": ["S02_D4_A"], "runs": 5, "grid": {"swarm.particles": [20, 50, 100]}},
-                out="results", data="data", cache="cache", report=psotrack.support.progress.terminal,
+                out="results", data="data", cache="cache", report=psotrack.support.progress_bar,
             )
             rows.groupby("settings.swarm.particles")["mean_error_m"].agg(["mean", "std"])
     """

@@ -57,7 +57,7 @@ class Inputs:
     _last: tuple[Any, Input | PsotrackError] | None = None
 
     def keys_of(self, cell: Cell) -> dict[str, str]:
-        """Digests of everything that a cell reads: silhouettes by camera, calibration, reference, detections.
+        """Digests of everything that a cell reads: silhouettes, calibration, reference, initial tracks, detections.
 
         Raises:
             InputError: a file cannot be read.
@@ -76,7 +76,7 @@ class Inputs:
         """Recording of a cell, with all cameras.
 
         Raises:
-            InputError: the sequence cannot be read.
+            InputError: the sequence cannot be read, or has no reference.
             SettingsError: the sequence has fewer frames than the cell needs.
         """
         return self._source(cell)[0]

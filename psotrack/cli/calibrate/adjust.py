@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     "noise_px",
     type=float,
     help="Standard deviation of the middle of a box from frame to frame, along x and along y, in pixels.  "
-    "[default: 1, and 5 % of its sides]",
+    "[default: 1, plus 5 % of the box's mean side]",
 )
 @OUT
 @FORCE

@@ -130,7 +130,7 @@ def _lenses(
         raise SettingsError(
             "lens",
             expected="--intrinsics FILE, or --fov H,V, or --focal-length with --sensor",
-            found="another choice" if any(given) else "none",
+            found="another combination" if any(given) else "none",
         )
     if intrinsics is not None:
         rig = read_lenses(intrinsics, image_size_wh)

@@ -19,7 +19,7 @@ SIZE = click.option(
     "--size",
     "image_size_wh",
     type=Size(),
-    help="Size of the images in pixels, if FILE does not contain the size.",
+    help="Size of the images in pixels, if the calibration file does not contain the size.",
 )
 
 

@@ -22,7 +22,7 @@ def visible_markers(
     *,
     min_side_px: float = MIN_SIDE_PX,
 ) -> Bool[np.ndarray, "frames markers"]:
-    """Markers that are before the camera, face it, lie wholly in its image, and are large enough in the image.
+    """Markers that are in front of the camera, face it, lie wholly in its image, and are large enough in the image.
 
     Objects in between, such as other drones or pillars, are not considered. Where the pose is unknown, no marker is
     visible.

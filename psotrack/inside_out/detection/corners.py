@@ -19,7 +19,8 @@ _Points = Float[np.ndarray, "markers 4 points 2"]
 _Corners = Float[np.ndarray, "markers 4 2"]
 _Sides = Float[np.ndarray, "markers 4"]
 
-#: Distance to both sides of an edge within which its transition is searched first: in cells, and at least, in pixels.
+#: Distance to both sides of an edge within which its transition is searched first, in cells; and the least
+#: value of this distance, in pixels.
 _REACH, _LEAST_REACH_PX = 0.7, 2.0
 #: The same distance in later passes, in standard deviations of the transition: wide enough for all of a blur, narrow
 #: enough to leave out noise.
@@ -33,7 +34,7 @@ _ALONG = np.linspace(0.15, 0.85, 16)
 _REWEIGHTINGS = 2
 #: Distance from a line, in pixels, below which a point keeps most of its weight.
 _INLIER_PX = 0.1
-#: Largest distance that a corner may move, in first reaches.
+#: Largest distance that a corner may move, in units of the first search distance.
 _LARGEST_MOVE = 2.0
 
 

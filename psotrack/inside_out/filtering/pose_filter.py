@@ -4,8 +4,8 @@
 and not used. `step` follows a camera with these functions. It returns poses once the first ones are confirmed, and none
 after too long a gap. It replaces its state where successive poses agree with one another but not with the state, so
 that no wrong state lasts. The state before a gap is kept and predicted, with growing uncertainty. After the gap, poses
-that this state does not predict need the same number of confirmations as poses against a state, or markers that agree
-beyond chance in a pose that does not contradict the kept state. `filter_path` is a loop over `step`.
+that this state does not predict need the same number of confirmations as poses that contradict a state, or markers that
+agree beyond chance in a pose that does not contradict the kept state. `filter_path` is a loop over `step`.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class FilterRun:
 
     Attributes:
         state: current state.
-        alternative: state that poses against the current state suggest.
+        alternative: state that is suggested by poses that contradict the current state.
         previous: state that an alternative replaced; it may still prove right while its last pose is no longer ago
             than the longest gap.
         adopted: alternative that became the state in this frame.
@@ -131,8 +131,9 @@ def expected(run: FilterRun, params: PoseFilterParams) -> PoseEstimate | None:
 def confirmed(run: FilterRun, params: PoseFilterParams) -> bool:
     """Whether the state may be returned: enough poses agree, or the markers of one pose agree beyond chance.
 
-    After a gap, poses that the state before the gap does not predict need as many confirmations as poses against a
-    state. Where they contradict that state, markers that agree do not replace confirmations.
+    After a gap, poses that the state before the gap does not predict need as many confirmations as poses that
+    contradict a state. Where poses contradict the state before the gap, markers that agree do not replace
+    confirmations.
     """
     state = run.state
     if state is None:

@@ -128,7 +128,7 @@ def _scales(
     whiteness: Float[np.ndarray, "2"],
     independent: float,
 ) -> tuple[Float[np.ndarray, "2"], float]:
-    """(2,), factors on the stated variances, none less than the new variance; and the roundness of the outside's.
+    """(2,), factors on the stated variances, none less than the new variance; and roundness of the outside covariances.
 
     They maximise the posterior density, given the differences.
     """

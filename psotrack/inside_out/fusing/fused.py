@@ -60,7 +60,7 @@ class IdentitySwap:
 
 @dataclass(frozen=True)
 class FusedTracks:
-    """FusedTracks tracks of drones that carry cameras, followed by the outside tracks of all other drones.
+    """Fused tracks of the drones that carry cameras, followed by the outside tracks of all other drones.
 
     Attributes:
         trajectories: at the frames of both sources, by the clock of the outside tracks. Orientations are the cameras'.
@@ -102,6 +102,7 @@ def fuse(
 
     Raises:
         InputError: there is nothing to fuse, or the motion does not determine a clock offset.
+        SettingsError: `max_offset_s` is smaller than the time between two poses of a path.
     """
     paths = {"drone": inside} if isinstance(inside, CameraPath) else dict(inside)
     if not any(path.seen.any() for path in paths.values()):

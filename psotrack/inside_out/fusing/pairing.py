@@ -43,8 +43,8 @@ class Pairing:
 
     Attributes:
         track: (frames, paths), index of the track of each path's drone, or `UNASSIGNED`.
-        rest: (frames, tracks), for each track's name the index of the track of the drone without a camera that the
-            name belongs to, or `UNASSIGNED`.
+        rest: (frames, tracks); column k is for the drone without a camera that is named like track k: the index of its
+            track in each frame, or `UNASSIGNED`.
         changes: changes of tracks, in the order of frames.
     """
 
@@ -66,7 +66,7 @@ def pair_tracks(
     Args:
         frame: (frames,), numbers.
         expected_m: (frames, paths, 3), expected position of the middle of each path's drone; NaN where unknown.
-        reach_m: (paths,), distance from there from which on a track counts as elsewhere, metres.
+        reach_m: (paths,), distance from the expected position beyond which a track counts as elsewhere, metres.
         middle_m: (frames, tracks, 3), positions of the tracks; NaN where a track has none.
     """
     num_frames, num_paths, num_tracks = len(frame), expected_m.shape[1], middle_m.shape[1]
@@ -137,7 +137,10 @@ def _find_changes(
 def _remaining_tracks(
     track: Int[np.ndarray, "frames paths"], num_tracks: int
 ) -> Int[np.ndarray, "frames tracks"]:
-    """Tracks of drones without a camera: a path that takes such a drone's track gives it its own track in exchange."""
+    """Tracks of drones without a camera.
+
+    A path that takes the track of such a drone leaves its former track to this drone.
+    """
     held = np.arange(num_tracks)
     current = np.full(track.shape[1], UNASSIGNED)
     rest = np.empty((len(track), num_tracks), int)

@@ -38,7 +38,8 @@ from psotrack.inside_out.mapping.sightings import MarkerSightings
 #: Relative change of the cost that ends the search; the robust search only has to find the outliers.
 _LEAST_GAIN, _LEAST_GAIN_ROBUST = 1e-9, 1e-3
 _MAX_STEPS = 200
-#: Standard deviation of the inset, px: from cameras with a gamma of 0.4 to 0.6 where the detector assumes 0.5.
+#: Standard deviation of the inset, px: the effect of an error of 0.1 in the power, about 0.5, by which a camera encodes
+#: light.
 _INSET_PX = 0.05
 #: Standard deviation of the inset among markers, px, because light and sharpness differ.
 _INSET_APART_PX = 0.02

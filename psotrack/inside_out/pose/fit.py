@@ -273,7 +273,7 @@ def _explained(
     covariance: Float[np.ndarray, "8 8"],
     noise: Noise,
 ) -> Bool[np.ndarray, "markers 4"]:
-    """(markers, 4), True if the studentised residual of the corner, and the mean one of its marker, are in the gate."""
+    """(markers, 4), True if the studentised residuals of the corner and of its marker's mean are in the gate."""
     used = np.any(fits, axis=1)
     good = ahead & _within(off_px, slopes, np.ones(fits.shape), covariance, noise, fits)
     count = np.maximum(good.sum(axis=1), 1)

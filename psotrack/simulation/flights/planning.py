@@ -30,8 +30,8 @@ def plan(scenario: Scenario, seed: int) -> tuple[Flight, ...]:
     """Flight of each drone, varied by the seed, within the scenario's limits in all frames.
 
     Raises:
-        SettingsError: no variation keeps the limits, or a relative flight, near pass or waypoint is impossible; the
-            message names the field of the flight.
+        SettingsError: no variation keeps the limits, a relative flight, near pass or waypoint is impossible, or a
+            recorded flight is too short. The message names the field of the flight, or the file.
         InputError: a recorded flight cannot be used.
     """
     check_records(scenario)

@@ -146,7 +146,9 @@ def _from_table(table: Table) -> _Samples:
     stuck = np.flatnonzero(np.diff(time_s) <= 0)
     if len(stuck):
         before, row = (table.rows[stuck[0] + step] for step in (0, 1))
-        raise row.error(time, f"a time after line {before.line}, {before.text(time)}", row.text(time))
+        raise row.error(
+            time, f"a time above {before.text(time)}, the time in line {before.line}", row.text(time)
+        )
     position_m = np.array([[row.number(column) for column in position] for row in table.rows])
     orientation_wxyz = np.array([_unit(row, quaternion) for row in table.rows]) if quaternion else None
     return time_s, position_m, orientation_wxyz

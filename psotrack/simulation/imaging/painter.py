@@ -32,8 +32,8 @@ _SMALLEST_PX = 8
 #: Largest size of a texel in the image. Texels may be smaller than a pixel, because a frame has several samples per
 #: pixel.
 _TEXEL_PX = 0.6
-#: Largest number of texels per texel of the largest size in the direction of foreshortening. A coarser level would blur
-#: the other direction.
+#: Largest number of texels within `_TEXEL_PX` in the direction of foreshortening. If more texels fall there, a
+#: coarser level is used, although it blurs the other direction.
 _FORESHORTENED = 2.0
 #: Pixels by which pieces are widened, so that no ray passes between two pieces with a common edge.
 _OVERLAP_PX = 1e-6
