@@ -78,10 +78,10 @@ def write_as_real(
 ) -> Path:
     """Write a simulated sequence in the folder ROOT/Real_Data/RXX_Dn, in the form of the dataset's real half.
 
-    The images are distorted by the lens and encoded again. The lens shows more than the simulated image: the outermost
-    6 % of an image repeat the border of the simulated one. Marker positions between the frames of the simulation are
-    cubic splines; before frame 0 the drones stand still. `psotrack simulate NAME --set cameras=laboratory_corners
-    --no-masks --no-onboard` makes a sequence with all that this function uses.
+    The images are distorted by the lens and encoded again. The lens shows more than the simulated image: 8 % of
+    the pixels, at the edges, repeat the border of the simulated image. Marker positions between the frames of the
+    simulation are cubic splines; before frame 0 the drones stand still. `psotrack simulate NAME --set
+    cameras=laboratory_corners --no-masks --no-onboard` makes a sequence with all that this function uses.
 
     Args:
         sequence: folder of the simulated sequence; its first four cameras are used.

@@ -45,7 +45,8 @@ _FREEDOM = 4.0
 _MOST_SCALED = 4.0
 _NOISE_MEMORY_S = 5.0
 _NOISE_PRIOR = 12.0
-#: Largest squared innovation that scales covariances; 1 good pose in 100,000 is larger, and outliers are not noise.
+#: Largest squared innovation that scales covariances; at most 4 good poses in 100,000 are larger, and outliers are not
+#: noise.
 _LARGEST_SQUARE = 30.0
 #: Standard deviation of the wrong one of two poses from the right one, along each axis (m) and about each axis (rad).
 _OTHER_POSE_STD = 1.0
