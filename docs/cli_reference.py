@@ -20,9 +20,8 @@ def reference() -> str:
 
 
 def _command(command: click.Command, name: str, parent: click.Context | None, level: int) -> Iterator[str]:
-    context = click.Context(
-        command, info_name=name, parent=parent, terminal_width=WIDTH, max_content_width=WIDTH
-    )
+    settings = command.context_settings | {"terminal_width": WIDTH, "max_content_width": WIDTH}
+    context = click.Context(command, info_name=name, parent=parent, **settings)
     path = context.command_path
     yield f"{'#' * level} {path} {{ #{path.replace(' ', '-')} }}"
     yield f"```console\n$ {path} {' '.join(command.collect_usage_pieces(context))}\n```"

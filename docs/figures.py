@@ -6,13 +6,15 @@ A result, a column or a row that is missing raises `MissingFigureError`, which s
 
 from __future__ import annotations
 
+import inspect
 import json
 import sys
 import tomllib
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import msgspec
 import pandas as pd
@@ -24,6 +26,7 @@ sys.path.append(str(ROOT / "experiments"))
 
 import _results  # noqa: E402
 from cli_reference import reference as cli_reference  # noqa: E402
+from griffe_examples import split_shared_items  # noqa: E402
 
 
 class MissingFigureError(Exception):
@@ -225,7 +228,9 @@ def _struct_tables(cls: type, prefix: str, done: set[type]) -> list[str]:
         for one in inner:
             nested += _struct_tables(one, f"{prefix}{field.encode_name}.", done)
     table = pd.DataFrame(lines, columns=["field", "type", "default", "meaning"])
-    heading = f"### {prefix.rstrip('.') or cls.__name__} {{ #{cls.__name__.lower()} }}"
+    tag = cls.__struct_config__.tag
+    title = (prefix.rstrip(".") or cls.__name__) + (f" of kind {tag}" if tag else "")
+    heading = f"### {title} {{ #{cls.__name__.lower()} }}"
     return [heading, summary, markdown(table), *nested]
 
 
@@ -250,31 +255,29 @@ def _default(field: Any) -> str:
 
 
 def _type_name(kind: Any) -> str:
-    """A type as people write it in code."""
-    if kind is type(None):
-        return "None"
-    if isinstance(kind, type) and not getattr(kind, "__args__", ()):
-        return kind.__name__
-    if getattr(kind, "__origin__", None) is Literal:
-        return " | ".join(json.dumps(value) for value in kind.__args__)
-    text = str(kind)
-    for module in ("typing.", "collections.abc.", "psotrack."):
-        text = text.replace(module, "")
-    if getattr(kind, "__metadata__", None):
-        return _type_name(kind.__origin__)
-    return text.replace("NoneType", "None")
+    """A type as people write it in code, without limits of values."""
+    origin, inner = get_origin(kind), get_args(kind)
+    if kind is Ellipsis or kind is NoneType:
+        return "..." if kind is Ellipsis else "None"
+    if origin is Annotated:
+        return _type_name(inner[0])
+    if origin is Literal:
+        return " | ".join(json.dumps(value) for value in inner)
+    if origin in (Union, UnionType):
+        return " | ".join(map(_type_name, inner))
+    return f"{origin.__name__}[{', '.join(map(_type_name, inner))}]" if origin else kind.__name__
 
 
 def _docstring(cls: type) -> tuple[str, dict[str, str]]:
     """The summary of a class, and the descriptions of its attributes by name."""
-    sections = Docstring(cls.__doc__ or "", lineno=1).parse("google", warnings=False)
+    text = split_shared_items(inspect.cleandoc(cls.__doc__ or ""))
+    sections = Docstring(text, lineno=1).parse("google", warnings=False)
     texts = [one.value for one in sections if one.kind is DocstringSectionKind.text]
     found: dict[str, str] = {}
     for section in sections:
         if section.kind is DocstringSectionKind.attributes:
             for attribute in section.value:
-                for name in attribute.name.split(","):
-                    found[name.strip()] = " ".join(attribute.description.split())
+                found[attribute.name] = " ".join(attribute.description.split())
     return (texts[0] if texts else ""), found
 
 

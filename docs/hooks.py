@@ -94,7 +94,7 @@ def api_page(name: str) -> str:
         blocks = [f"::: {one}\n    options:\n      show_root_full_path: true" for one in public]
         text = [] if blocks else [ast.get_docstring(ast.parse(init.read_text(encoding="utf-8"))) or ""]
         return "\n\n".join([f"# {dotted}", *text, *blocks])
-    text = ast.get_docstring(ast.parse(init.read_text(encoding="utf-8"))) or ""
+    text = _with_lists(ast.get_docstring(ast.parse(init.read_text(encoding="utf-8"))) or "")
     blocks = [
         f"::: {dotted}.{path}"
         if _is_documentable(folder, path)
@@ -102,6 +102,16 @@ def api_page(name: str) -> str:
         for path in _stub_names(stub)
     ]
     return "\n\n".join([f"# {dotted}", text, *blocks])
+
+
+def _with_lists(text: str) -> str:
+    """A docstring whose titles with an indented line below, as `help` shows them well, become items of a list."""
+    return re.sub(
+        r"^(\S.*)\n((?: {4}\S.*\n?)+)",
+        lambda match: f"- **{match[1]}**: {' '.join(match[2].split())}\n",
+        text,
+        flags=re.MULTILINE,
+    )
 
 
 def _stub_names(stub: Path) -> list[str]:

@@ -36,7 +36,13 @@ class _Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Harmonic(_Record, frozen=True, kw_only=True):
-    """One term of a flight of sinusoids: `amplitude_m * sin(2 pi t / period_s + phase_deg)` along each axis."""
+    """One term of a flight of sinusoids: `amplitude_m * sin(2 pi t / period_s + phase_deg)` along each axis.
+
+    Attributes:
+        amplitude_m: amplitude along x, y and z.
+        period_s: period.
+        phase_deg: phase at time 0, along x, y and z.
+    """
 
     amplitude_m: Vector
     period_s: Positive
@@ -44,7 +50,12 @@ class Harmonic(_Record, frozen=True, kw_only=True):
 
 
 class Harmonics(_Record, frozen=True, kw_only=True, tag_field="kind", tag="harmonics"):
-    """A flight that is a sum of sinusoids about a centre."""
+    """A flight that is a sum of sinusoids about a centre.
+
+    Attributes:
+        centre_m: centre of the flight, world.
+        terms: the sinusoids.
+    """
 
     centre_m: Vector
     terms: Annotated[tuple[Harmonic, ...], msgspec.Meta(min_length=1)]
@@ -75,7 +86,14 @@ class Orbit(_Record, frozen=True, kw_only=True, tag_field="kind", tag="orbit"):
 
 
 class Crossing(_Record, frozen=True, kw_only=True, tag_field="kind", tag="crossing"):
-    """A flight back and forth between two points, slower near both; at phase 0 the drone starts at the first point."""
+    """A flight back and forth between two points, slower near both; at phase 0 the drone starts at the first point.
+
+    Attributes:
+        start_m: first point, world.
+        end_m: second point, world.
+        period_s: time from the first point to the second point and back.
+        phase_deg: phase of the movement at time 0.
+    """
 
     start_m: Vector
     end_m: Vector
@@ -87,7 +105,7 @@ class Formation(_Record, frozen=True, kw_only=True, tag_field="kind", tag="forma
     """A flight at a constant offset from another drone.
 
     Attributes:
-        leader: number of the other drone.
+        leader: number of the other drone; the first drone has number 1.
         offset_m: position relative to the other drone, world axes.
     """
 
@@ -99,7 +117,7 @@ class FollowingFlight(_Record, frozen=True, kw_only=True, tag_field="kind", tag=
     """A flight on the path of another drone, later or earlier than that drone.
 
     Attributes:
-        leader: number of the other drone.
+        leader: number of the other drone; the first drone has number 1.
         delay_s: delay after the other drone; negative if this drone flies ahead.
     """
 
@@ -111,7 +129,7 @@ class NearPass(_Record, frozen=True, kw_only=True, tag_field="kind", tag="near_p
     """A flight back and forth past another drone, at the offset `side * distance_m + swing_m * sin(...)` from it.
 
     Attributes:
-        other: number of the other drone.
+        other: number of the other drone; the first drone has number 1.
         distance_m: smallest distance between the body origins, reached twice per period.
         side: direction from the other drone to this drone when the distance is smallest; of any length, perpendicular
             to `swing_m`.
@@ -165,7 +183,12 @@ FlightRecord = (
 
 
 class Rotor(_Record, frozen=True, kw_only=True):
-    """A rotor of a mesh: centre of its hub, and radius, in the body frame."""
+    """A rotor of a mesh.
+
+    Attributes:
+        centre_m: centre of the hub, in the body frame.
+        radius_m: radius of the rotor.
+    """
 
     centre_m: Vector
     radius_m: Positive
@@ -192,7 +215,7 @@ class Drone(_Record, frozen=True, kw_only=True):
 
     Attributes:
         flight: the flight.
-        model: name of a model in `world.drones.MODELS`, or a mesh.
+        model: x_frame, x_frame_racer, camera_drone, hexacopter, tall_cross, or a mesh.
         paint_bgr: reflectance of the paint, linear, 0 to 1 (dark grey is 0.1).
         group: name of a group; a seed changes the flights of a group in the same way, so that the drones of the group
             keep their distances.
@@ -363,8 +386,8 @@ class Scenario(_Record, frozen=True, kw_only=True):
     Attributes:
         name: name of the sequence's folder.
         description: one line about the flights.
-        hall: name of a hall in `world.halls.HALLS`.
-        cameras: the static cameras, or the name of a rig in `world.halls.RIGS`.
+        hall: laboratory or large_hall.
+        cameras: the static cameras; or laboratory, laboratory_corners or large_hall.
         num_frames: number of frames that the flights are planned for.
         drones: the drones.
         limits: limits of the flights.
