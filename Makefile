@@ -4,11 +4,11 @@ VENV := .venv
 BIN := $(VENV)/bin
 .DEFAULT_GOAL := help
 comma := ,
-# The package with some of its extras, by uv where it is and by pip where not; an environment that uv made has no pip.
+# The package with some of its extras, by uv if it is installed, otherwise by pip; an environment that uv made has no pip.
 install = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python $(BIN)/python -e '.[$(1)]'; \
 	else { test -x $(BIN)/pip || $(BIN)/python -m ensurepip >/dev/null; } \
 	  && $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(1)]'; fi
-# The oracle of HOTA in the tests, without what it asks for: opencv-python would overwrite the headless one.
+# TrackEval, the oracle of HOTA in the tests, without its dependencies: opencv-python would overwrite the headless OpenCV.
 oracle = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python $(BIN)/python --no-deps 'trackeval>=1.3'; \
 	else $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'trackeval>=1.3'; fi
 
@@ -18,7 +18,7 @@ pytest = env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n auto --dist w
 
 .PHONY: help demo test test-slow lint format bench notebooks table4 table5 table5-quick table7 docs results results-check clean
 
-help:  ## what can be made
+help:  ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
 $(VENV)/.installed: pyproject.toml
@@ -53,7 +53,7 @@ bench: $(VENV)/.installed  ## the swarm against pyswarms and evosax
 	@$(call install,bench)
 	@$(BIN)/python experiments/benchmarks/track_stage.py
 
-notebooks: $(VENV)/.installed  ## run the notebooks and write them with what they show; commit what comes of it
+notebooks: $(VENV)/.installed  ## run the notebooks and write them with their output; commit the changed files
 	@cd notebooks && ../$(BIN)/python _refresh.py
 
 table5: $(VENV)/.installed  ## the paper's Table 5 beside ours, an hour; DATA=FOLDER for the published sequences
@@ -62,7 +62,7 @@ table5: $(VENV)/.installed  ## the paper's Table 5 beside ours, an hour; DATA=FO
 table4: $(VENV)/.installed  ## the paper's Table 4: projection lines, beside the swarm; DATA=FOLDER for the published sequences
 	@$(BIN)/python experiments/table4/table4.py $(if $(DATA),--data $(DATA))
 
-table5-quick: $(VENV)/.installed  ## a small form of it, five minutes
+table5-quick: $(VENV)/.installed  ## a small form of Table 5, five minutes
 	@$(BIN)/python experiments/table5/table5.py --quick $(if $(DATA),--data $(DATA))
 
 table7: $(VENV)/.installed  ## the paper's Tables 6 to 8 and figure 11: drones' own cameras and markers; DATA=FOLDER for the published sequences

@@ -61,8 +61,8 @@ recording = pt.read_recording(folder)
 # ## A score
 #
 # A score gives each drone at each position a value from 0 to 1 in each camera. This one is
-# the Dice coefficient of the drone's box and the foreground around it. Everything that it needs is a frozen dataclass
-# with three attributes and one method; `project_boxes`, `foreground_and_area` and `camera_weights` are public functions.
+# the Dice coefficient of the drone's box and the foreground around it. It is a frozen dataclass with one method and the
+# three attributes of `pt.Score`; `project_boxes`, `foreground_and_area` and `camera_weights` are public functions.
 
 
 # %%

@@ -379,10 +379,10 @@ print(
 #
 # | What you see | Look at | Likely cause |
 # |---|---|---|
-# | no drones found | silhouettes: `compute(...).read(0, 10)`, camera by camera | the drones stand still for most of the video; `var_threshold` too high for dark drones before a dark wall |
-# | false drones | silhouettes, as above | shadows, people, moving curtains: `shadows="drop"`, `bounds_m` |
+# | no drones found | silhouettes: `compute(...).read(0, 10)`, camera by camera | the drones stand still for most of the video; `silhouettes.var_threshold` too high for dark drones before a dark wall |
+# | false drones | silhouettes, as above | shadows, people, moving curtains: `silhouettes.shadows = "drop"`, `bounds_m` |
 # | marks are off by 10 pixels or more in one camera | the picture of this camera with the marks | the camera was moved, or the video has another size or crop than the calibration |
 # | marks are off in all cameras | scale and axes in step 1 | millimetres, transposed `R`, centres taken for `t` |
 # | boxes beside the drones that swing with their speed | one camera's score against the speed | videos do not begin at the same moment |
-# | boxes right, but too large or small | `tracked.size_m` | shadows in the silhouettes; say the size with `drone_size_m` |
+# | boxes right, but too large or small | `tracked.size_m` | shadows in the silhouettes; state the size with `drones.size_m` |
 # | two drones change names | `tracked.identities.encounters` | they passed each other; look at their distance and at the number of viewpoints |
