@@ -1,4 +1,4 @@
-"""The functions of the public face that are more than a name: reading a recording, tracking it, and single steps."""
+"""Functions that are defined for the public face only: reading a recording, tracking it, and single steps."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def read_recording(
     """Read a recording in the layout of the DPJAIT dataset, checked to be fit for tracking.
 
     Args:
-        folder: of the recording: calibration, one video per camera, and a reference where there is one.
+        folder: folder of the recording: calibration, one video per camera, and a reference where there is one.
         cameras: names of the cameras to use; None uses all.
         num_frames: number of first frames to use; None uses all.
 

@@ -88,10 +88,10 @@ def save_picture(
     """Save frames of four cameras with the tracked boxes, beside the paths in 3D, as PNG.
 
     Args:
-        path: of the picture.
+        path: path of the picture.
         recording: recording with a reference.
         tracked: what was tracked in it.
-        frame: which is shown; None takes the middle one.
+        frame: number of the shown frame; None takes the middle frame.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -73,9 +73,10 @@ class MethodInputs:
 
     Attributes:
         rig: the cameras, calibrated.
-        silhouettes: silhouettes of all cameras (`Silhouettes.read` gives the coverage of some frames, 0 to 255).
+        silhouettes: silhouettes of all cameras (`Silhouettes.read` gives the coverage of some frames, 0 to 255); None
+            where none were computed.
         sightings: detections of all cameras in all frames; None for a method that does not read detections.
-        initial: positions, velocities and sizes of the drones at frame 0, (drones, 3), metres and m/s.
+        initial: positions, velocities and sizes of the drones at frame 0, (drones, 3) each, metres and m/s.
         bounds_m: (2, 3), lowest and highest corner of the room, metres.
         fps: frames per second.
         settings: settings of the run; the seed of random numbers is `settings.seed`.

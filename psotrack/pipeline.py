@@ -179,11 +179,12 @@ def track_runs(
     parts: Parts = Parts(),
     report: Report = no_progress,
 ) -> list[TrackedRecording | InputError]:
-    """Track a recording once for each of the settings; each result is that of the run alone.
+    """Track a recording once for each of the settings; on a CPU each result has the same bits as from the run alone.
 
-    Many runs take the time of a few: runs of the swarm form one batch where their settings differ only in the seed and
-    in numbers other than the number of particles and the windows. All devices share a batch (`jax.devices()`). The
-    seconds of a run are its share of the batch's seconds.
+    Runs of the swarm form a batch if they have the same number of drones, and if their settings differ only in the seed
+    and in numbers other than `swarm.particles` and `score.windows`. The runs of a batch share one compiled program and
+    one copy of the silhouettes; an accelerator computes them side by side. The runs are spread over all devices
+    (`jax.devices()`). The seconds of a run are its share of the seconds of all runs.
 
     Args:
         recording: a recording that was checked for use (see `Recording.usable`).
@@ -282,7 +283,7 @@ def _tracks_detections(settings: TrackSettings, plugin: Method | None) -> bool:
 
 
 def _check_detector_is_used(settings: TrackSettings, parts: Parts) -> None:
-    """Raise `SettingsError` if a detector is brought, but the method reads no detections or reads other ones."""
+    """Raise `SettingsError` if a detector is brought, but the method reads no detections or others are named."""
     method = _plugin(settings, parts)
     if not (_tracks_detections(settings, method) if method is None else method.reads_detections):
         name = settings.method if method is None else type(method).__name__

@@ -82,7 +82,7 @@ class _AnswersOldNames(msgspec.StructMeta):
             if name in RENAMED and not (is_part and isinstance(value, msgspec.Struct)):
                 raise SettingsError(
                     name,
-                    expected="a part of the settings" if is_part else "a name that there is",
+                    expected="a part of the settings" if is_part else "the name of a setting",
                     found=f"{value!r}" if is_part else name,
                     remedy=renamed(name),
                 )
@@ -178,8 +178,8 @@ class DroneSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         count: number of drones; None takes all drones that are found.
         size_m: full lengths of every drone along x, y and z, metres; None takes them from the first frames.
         learn_sizes: whether sizes are learned while tracking; `size_m` switches this off.
-        body_offset_m: from the body's origin to the middle of the silhouette (with "projection-lines" of the box),
-            along the world's axes, metres. No image shows where the origin is.
+        body_offset_m: vector from the body's origin to the middle of the silhouette (with "projection-lines" of the
+            box), along the world's axes, metres. No image shows where the origin is.
 
     Raises:
         SettingsError: a value is not allowed.
@@ -237,11 +237,11 @@ class TrackSettings(
     Attributes:
         method: "swarm", particles over silhouettes; "projection-lines", triangulated detections; "fused", both,
             weighted by their covariances; or the name of a plugin.
-        detections: source of the detections of the projection lines: "yolo", those that came with the sequence; "blobs"
-            of its silhouettes; or a folder with a CSV file for each camera.
-        seed: of the random numbers of the swarm.
-        init: "auto" finds the drones in the first frames, "truth" takes them from the reference; or a file of
-            tracks, whose first frame counts.
+        detections: source of the detections of the projection lines: "yolo", the detections that came with the
+            sequence; "blobs", the blobs of its silhouettes; or a folder with a CSV file for each camera.
+        seed: seed of the swarm's random numbers.
+        init: initial state: "auto" finds the drones in the first frames, "truth" takes them from the reference; or the
+            name of a file of tracks, whose first frame is used.
         bounds_m: lowest and highest x, y and z of the room, metres: (x0, x1, y0, y1, z0, z1); None derives them from
             the cameras.
         smooth: whether later frames correct earlier ones.

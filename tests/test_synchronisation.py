@@ -232,7 +232,8 @@ class TestRefusedInput:
 
     def test_drones_that_move_only_a_little(self):
         self.refused(
-            random_motion(0, 0.01), "motion that tells the offset to a frame, 0.04 s, found a standard dev"
+            random_motion(0, 0.01),
+            "motion that determines the offset to a frame, 0.04 s, found a standard dev",
         )
 
     def test_a_drone_that_hovers_or_flies_straight_on(self):
@@ -259,7 +260,7 @@ class TestRefusedInput:
     def test_an_offset_outside_of_the_range(self):
         self.refused(
             random_motion(0),
-            r"within 0.3 s, found it at an end, \+0.3 s; widen",
+            r"within 0.3 s, found the least distance at an end of the range, \+0.3 s; widen",
             max_offset_s=0.3,
             offset_s=0.9,
         )

@@ -87,8 +87,7 @@ def find_offset(
 
     At every offset, the estimated drones are assigned to the reference's drones so that the sum of mean distances is
     smallest. Then each drone's lever arm, the median of its residuals, is subtracted, and the remaining distances are
-    averaged. Drones that are farther than half a metre from their estimate at the best offset are left out, unless all
-    are that far.
+    averaged. Drones whose lever arm at the best offset is longer than half a metre are left out, unless all are longer.
 
     Args:
         estimate: trajectories at the times of the video; lost drones do not count.
@@ -122,8 +121,8 @@ def find_offset(
     if not (0 < best < 2 * steps) or not np.isfinite(curve_m[best - 1 : best + 2]).all():
         raise refused(
             f"the least distance within {max_offset_s:g} s",
-            f"it at an end, {curve_s[best]:+.3g} s",
-            "widen the range; if the drones hover, their motion tells no offset",
+            f"the least distance at an end of the range, {curve_s[best]:+.3g} s",
+            "widen the range; if the drones hover, their motion does not determine the offset",
         )
     partner = comparison.without_far(curve_s[best])
     offset_s = comparison.least(partner, curve_s[best], max(step_s, frame_s))
@@ -131,9 +130,9 @@ def find_offset(
     std_s = comparison.standard_deviation_s(offset_s, partner)
     if not std_s < frame_s:
         raise refused(
-            f"motion that tells the offset to a frame, {frame_s:g} s",
+            f"motion that determines the offset to a frame, {frame_s:g} s",
             f"a standard deviation of {std_s:.2g} s",
-            "drones that hover, or fly straight on at one speed, do not tell: use more of the recording",
+            "use more of the recording: drones that hover, or fly straight at constant speed, do not determine it",
         )
     error_m = standard_error(found.per_frame_m[:, None], estimate.frame)[0]
     _check_unique(curve_s, curve_m, float(error_m), frame_s)

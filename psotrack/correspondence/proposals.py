@@ -72,7 +72,7 @@ def _pair_points(
 def _proposing_camera_pairs(
     padded: PaddedSightings, min_viewpoints: int
 ) -> Bool[np.ndarray, "cameras cameras"]:
-    """Pairs of cameras whose detections propose points: as few as possible, but one among any `min_viewpoints`.
+    """Pairs of cameras whose detections propose points: few, but at least one among any `min_viewpoints` viewpoints.
 
     Of three viewpoints, two are in the same half of the rig. Pairs in one half of the rig are therefore enough, and
     neighbours see a point from better angles than cameras that face each other.

@@ -44,6 +44,9 @@ class DetectorSettings:
         nms: threshold of the non-maximum suppression, in (0, 1]: of boxes with a larger intersection over union, only
             the box with the highest confidence is kept.
         size: side of the network's square input, pixels.
+
+    Raises:
+        SettingsError: a value is out of range.
     """
 
     confidence: float = 0.25
@@ -218,13 +221,14 @@ def detect_drones(
     """Detect drones in all frames of a video.
 
     Args:
-        detector: the network.
+        detector: the detector.
         name: name of the progress bar.
         video: the video.
         report: shows the progress in frames.
 
     Raises:
         InputError: the video ends early, or the network cannot be used.
+        SettingsError: the detector yields arrays of other shapes than `Detector` says.
     """
     frame: list[Int[np.ndarray, "_"]] = [np.empty(0, np.int64)]
     boxes: list[Float[np.ndarray, "_ 4"]] = [np.empty((0, 4))]

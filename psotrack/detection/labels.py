@@ -32,6 +32,9 @@ class LabelSettings:
         offset_m: vector from the reference's tracked point to the middle of the box, along the same axes, metres.
         min_inside: smallest share of a box that must lie in the image.
         max_hidden: largest share of the visible box that one nearer box may cover.
+
+    Raises:
+        SettingsError: a value is out of range.
     """
 
     drone_size_m: tuple[float, float, float]

@@ -1,4 +1,4 @@
-"""Stored detections of a network: one folder for each combination of model, settings and contents of the videos."""
+"""Stored detections: one folder for each combination of detector, settings and contents of the videos."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def stored_detections(
     a file.
 
     Args:
-        detector: the network.
+        detector: the detector.
         recording: a consistent recording (see `Recording.usable`).
         cache: folder for stored results.
         report: shows the progress in frames.
@@ -28,6 +28,7 @@ def stored_detections(
 
     Raises:
         InputError: a video cannot be read, or the network cannot be used.
+        SettingsError: the detector's key is no plain data, or it yields arrays of wrong shapes.
         OutputError: a file cannot be written.
     """
     folder = Path(cache) / "detections" / _key(detector, recording)

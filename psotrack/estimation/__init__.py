@@ -2,7 +2,8 @@
 
 In: residuals with their derivatives and a rule that applies a step, or the states of a Kalman filter. Out: the state
 that minimises the cost, smoothed states, and covariances. The room knows neither cameras nor drones; every fit and
-every smoother of the package is a caller of `least_squares` or `rauch_tung_striebel`.
+every smoother of the package is a caller of `least_squares` or `rauch_tung_striebel`. Other rooms may use every name in
+`__init__.pyi`.
 """
 
 import lazy_loader

@@ -1,7 +1,7 @@
 """Fusion of the tracks of two methods into one set of tracks, weighted by covariances.
 
 In: tracks of the swarm and of the projection lines for the same frames. Out: the fused tracks, and for each drone the
-constant offset between the two tracked points.
+constant offset between the two tracked points. Other rooms may use every name in `__init__.pyi`.
 """
 
 import lazy_loader

@@ -7,11 +7,11 @@ origin; the constant is stored in the record, so that a user who knows the offse
 it for the other.
 
 If the boxes are a detector's, the remaining errors of the two methods have different causes, and the information adds
-up (Bar-Shalom et al. 2001, section 8.3.3: fusion of independent estimates). Boxes of blobs are of the same foreground
-that
-the swarm sees: part of their errors is common, and the fused covariance is larger (Y. Bar-Shalom, L. Campo, The
-effect of the common process noise on the two-sensor fused-track covariance, IEEE Transactions on Aerospace and
-Electronic Systems 22(6), 1986). Where one method does not see a drone, the other method's position counts alone.
+up (Bar-Shalom et al. 2001, section 8.3.3: fusion of independent estimates). Boxes of blobs come from the same
+foreground that the swarm sees: part of the errors is common, and the fused covariance is larger (Y. Bar-Shalom,
+L. Campo, The effect of the common process noise on the two-sensor fused-track covariance, IEEE Transactions on
+Aerospace and Electronic Systems 22(6), 1986). Where one method does not see a drone, the other method's position counts
+alone.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ COMMON_CORRELATION = 0.5
 
 @dataclass(frozen=True)
 class PointOffset:
-    """From the middles of drones' silhouettes to the middles of their boxes: a constant of each drone.
+    """Vector from the middle of each drone's silhouettes to the middle of its boxes, constant over time.
 
     Attributes:
         offset_m: (drones, 3), along the world's axes, metres; NaN where too few frames show both.
@@ -76,7 +76,7 @@ def fuse_tracks(
 
     Args:
         swarm, lines: tracks of both methods for the same frames.
-        settings: of the motion model.
+        settings: settings of the motion model.
         fps: frames per second.
         max_coasting_s: seconds for which a drone that is not found coasts before it is lost.
         same_foreground: whether the lines' detections are blobs of the foreground that the swarm sees.
@@ -138,7 +138,7 @@ def _same_drones(swarm: Tracks, lines: Tracks) -> Int[np.ndarray, "drones"]:
 
 
 def _of_drones(tracks: Tracks, drones: Int[np.ndarray, "drones"]) -> Tracks:
-    """The arrays of some drones, in the order of `drones`; of a drone -1 nothing is known. Sizes stay as they are."""
+    """The arrays of some drones, in the order of `drones`; the values of drone -1 are unknown. Sizes do not change."""
 
     def chosen(name: str, value: np.ndarray) -> np.ndarray:
         # The fitness of a drone that was not found is 0, not unknown.

@@ -2,7 +2,7 @@
 
 In: camera parameters and points, or detections in pixels. Out: pixels, boxes, 3D points with covariances. All modules
 except those for the rig's files (`rig_files`, `dpjait_calibration`) use NumPy and JAX only. Calibration and
-triangulation compute in float64.
+triangulation compute in float64. Other rooms may use every name in `__init__.pyi`.
 """
 
 import lazy_loader

@@ -20,7 +20,7 @@ _LEAST_LENGTH = 1e-4
 #: Two steps suffice near the solution, so the damping is nearly 0 and returns to that value after each success. A step
 #: that fails must be damped much more.
 _DAMPING = Damping(first=1e-9, least=1e-9, largest=np.inf, increase=1e3, decrease=0.0)
-#: Added to the variances of a residual: a view can decide a direction alone, and its residual there has no variance.
+#: Added to the variances of a residual. If one view alone determines a direction, its residual there has no variance.
 _RIDGE = 1e-8
 
 

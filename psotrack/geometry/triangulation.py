@@ -50,9 +50,9 @@ def triangulate_paths(
 ) -> Float[np.ndarray, "*paths terms 3"]:
     """Polynomial paths of moving points, X(t) = Σ c_k t^k, from the pixels of all frames together.
 
-    The equations are those of `triangulate` with X(t) in place of X, and one prior per coefficient: c_k is normal with
-    mean 0 and standard deviation `expected`. Frames in which only one camera sees the point therefore count too, and
-    short paths are straight.
+    The equations are those of `triangulate` with X(t) in place of X, and one prior for each coefficient except c_0: c_k
+    is normal with mean 0 and a standard deviation from `expected`. Frames in which only one camera sees the point
+    therefore count too, and short paths are straight.
 
     Args:
         cameras: cameras with one leading axis.

@@ -1,7 +1,7 @@
 """Identity: find and resolve identity swaps, which happen when drones meet, and make the final trajectories.
 
 In: tracks of a whole recording. Out: trajectories with resolved labels (`postprocessing`), and the encounters with
-their probabilities.
+their probabilities. Other rooms may use every name in `__init__.pyi`.
 
 Two drones that are near each other share silhouettes, and a tracker may swap their labels. While the views do not
 separate the drones, each labelling (assignment of labels to tracks) has its own motion states (`labellings`): the
@@ -12,7 +12,7 @@ makes the most frames right.
 
 Each decision uses only its frame and the frames before, and is final. So `resolve` of the first frames of a recording
 gives the same result as `resolve` of the whole recording, up to the first frame of an encounter that is still open. To
-continue from there, it needs only the tracks.
+continue from there, `resolve` needs only the tracks.
 """
 
 import lazy_loader

@@ -68,7 +68,7 @@ def exchanges(num_drones: int) -> Int[np.ndarray, "labellings labellings"]:
     all_of = labellings(num_drones)
     between = np.argsort(all_of, axis=1)[:, all_of]
     cycles = np.zeros(between.shape[:2], np.int64)
-    # A cycle is counted at its smallest drone; after k moves, all of a cycle of at most k drones was reached.
+    # A cycle is counted at its smallest drone; k moves reach every drone of a cycle of at most k drones.
     reached = least = np.broadcast_to(np.arange(num_drones), between.shape)
     for _ in range(num_drones):
         reached = np.take_along_axis(between, reached, axis=-1)

@@ -29,8 +29,8 @@ def postprocess(
     """Trajectories with resolved labels, and which drones may have been taken for each other.
 
     Args:
-        tracks: of the whole recording.
-        motion: of the motion model.
+        tracks: tracks of the whole recording.
+        motion: settings of the motion model.
         identity: when drones may be taken for each other, and whether swapped labels are put right.
         fps: frames per second.
         smoothed: whether later frames correct earlier ones.

@@ -61,7 +61,7 @@ class Encounter:
     Attributes:
         drones: labels of the two drones, the lower label first.
         first_frame: first frame of the group of drones that contains the two.
-        closest_frame, distance_m: frame of the smallest distance, and this distance.
+        closest_frame, distance_m: frame of the smallest distance, and this distance, metres.
         last_frame: frame of the decision; the recording's last frame if there was none.
         log_odds: natural logarithm of the odds of a swap, in the last frame.
         outcome: outcome for the labels.

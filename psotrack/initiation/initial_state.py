@@ -33,7 +33,7 @@ class StartSource:
 
     Attributes:
         init: "auto", "truth" or the name of a file of tracks (see `TrackSettings.init`).
-        path: of the recording, or of the file of tracks.
+        path: path of the recording, or of the file of tracks.
         given: trajectories whose first frame is the start; None where the drones are to be found.
     """
 
@@ -65,13 +65,16 @@ def room_bounds(
     """Lowest and highest corner of the room, metres.
 
     Without given bounds, the room is the space into which the cameras look: from each camera along its optical axis, to
-    twice the distance of the point at which all cameras look; one metre wider on every side, from the floor at z = 0
-    (or below the lowest camera, if that camera is lower) to one metre above the highest camera. So a few cameras on
-    one side have the same room as cameras on all sides.
+    twice the distance of the point at which all cameras look, and one metre wider on every side. Its height is from the
+    floor at z = 0 to one metre above the highest camera; if a camera is at or below z = 0, the room begins one metre
+    below the lowest camera. So a few cameras on one side have the same room as cameras on all sides.
 
     Args:
-        rig: of the cameras.
-        bounds_m: given bounds (x0, x1, y0, y1, z0, z1).
+        rig: the cameras.
+        bounds_m: given bounds (x0, x1, y0, y1, z0, z1), metres.
+
+    Returns:
+        (2, 3), lowest and highest corner.
     """
     if bounds_m is not None:
         return np.array(bounds_m, np.float64).reshape(3, 2).T
@@ -103,13 +106,13 @@ def find_initial_state(
     Drones that are not found may still come later, so the state may have no drones.
 
     Args:
-        rig: of the cameras.
-        silhouettes: of all cameras of the rig.
+        rig: the cameras.
+        silhouettes: silhouettes of all cameras of the rig.
         source: given trajectories, or none.
         drones: number, sizes and body offset where they are known.
         fps: frames per second.
         bounds_m: (2, 3), lowest and highest corner of the room, metres.
-        max_speed_m_s: largest speed of a drone.
+        max_speed_m_s: largest speed of a drone, m/s.
 
     Raises:
         InputError: the given trajectories have too few drones, or the size of a drone cannot be found.
@@ -143,8 +146,8 @@ def complete_initial_state(
 
     Args:
         state: from silhouettes, or given.
-        detected: drones that detections show at frame 0; None where no detections are read. They are added where the
-            drones are found and not given: a drone that hovers may be part of the learned background.
+        detected: drones that detections show at frame 0; None where no detections are read. These drones are added
+            unless the positions are given: a drone that hovers may be part of the learned background.
         drones: number and sizes where they are known.
         source: where the state comes from.
 
@@ -163,7 +166,7 @@ def complete_initial_state(
         raise InputError(
             source.path,
             expected="a size for every drone",
-            found="drones that no camera sees by themselves",
+            found="drones whose size no camera shows",
             remedy="pass --drone-size X,Y,Z",
         )
     return state
@@ -172,7 +175,10 @@ def complete_initial_state(
 def known_motion(
     source: StartSource, drones: DroneSettings, fps: float
 ) -> tuple[Float[np.ndarray, "known 3"], Float[np.ndarray, "known 3"]] | None:
-    """Given positions of the silhouettes' middles and velocities at frame 0; None where nothing is given."""
+    """Given positions of the silhouettes' middles, (known, 3), metres, and velocities, (known, 3), m/s, at frame 0.
+
+    None where nothing is given.
+    """
     if source.given is None:
         return None
     none_found = InitialState(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
@@ -213,7 +219,7 @@ def _with_sizes(
         sizes.append(np.full(3, np.nan) if nearest is None else found.size_m[nearest])
         cameras.append(0.0 if nearest is None else found.num_cameras[nearest])
     size = np.array(sizes).reshape(-1, 3)
-    # A drone that no camera sees by itself gets the median size of the other drones.
+    # A drone that was not found there gets the median size of the drones that were found.
     usual = np.nanmedian(size, axis=0) if np.isfinite(size).any() else np.full(3, np.nan)
     return InitialState(
         position_m=np.array(positions).reshape(-1, 3),

@@ -32,12 +32,13 @@ STILL_M_S, STAYED_PROBABILITY = 0.2, 0.99
 #: Durations before the loss over which the speed is measured, seconds. A drone that the background model is learning
 #: seems to creep, so it stood still if it was slow over one of them.
 STILL_S = (1.0, 0.5)
-#: A candidate stayed at a place, or departed from it, if it is nearer than this number of spans, or was within the last
-#: seconds.
+#: A candidate stayed at a place, or departed from it, if it is nearer to the place than this number of spans, or was so
+#: within the last `DEPARTURE_S` seconds.
 STAYED_SPANS, DEPARTURE_S = 0.6, 0.6
 #: Odds of a new drone against a lost drone that may be anywhere, and of no drone if the candidate does not move.
 NEW_ODDS, NO_DRONE_ODDS = 0.1, 10.0
-#: Two drones are at the same place if their distance along every axis is below this share of their mean size.
+#: Two drones are at the same place if their distance, divided along each axis by this share of their mean size, is
+#: below 1.
 SAME_PLACE = 0.5
 #: Longest time for which a lost drone may be tracked while the candidate is there, seconds; after a longer time they
 #: are two drones, after a shorter time the track was failing.
@@ -60,7 +61,7 @@ class LostTracks:
         size_m: (lost, 3), full lengths along the world's axes.
         doubtful: (lost,), whether the drone is tracked again, but only at the place where it was lost, without moving
             since. This track may follow a ghost. Such a drone is only assigned to a candidate that departs from there.
-        left_m: (places, 3), all places where drones stood still when they were lost. There may be ghosts.
+        left_m: (places, 3), all places where drones stood still when they were lost. Ghosts may be at these places.
     """
 
     drone: Int[np.ndarray, "lost"]

@@ -2,7 +2,7 @@
 
 In: measured positions with covariances. Out: filtered (`kalman`) and smoothed (`smoothing`) states with covariances.
 The functions of `kalman` are pure and run inside the tracker's compiled scan. `white_jerk` is the process noise that
-other filters of the package use too.
+other filters of the package use too. Other rooms may use every name in `__init__.pyi`, and the module `kalman`.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""The motion model's numbers, from the settings."""
+"""Parameters of the motion model, from the settings."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from psotrack.settings import MotionSettings
 
 
 def motion_params(settings: MotionSettings, num_drones: int) -> MotionParams:
-    """How drones move, and how their measured positions err: float32 arrays for `num_drones` drones."""
+    """Parameters of the motion model for `num_drones` drones, as float32 arrays."""
     return MotionParams(
         jerk_density_m2_s5=jnp.full(num_drones, settings.jerk_density_m2_s5, jnp.float32),
         velocity_std_m_s=jnp.float32(settings.velocity_std_m_s),

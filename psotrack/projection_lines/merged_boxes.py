@@ -1,7 +1,7 @@
 """Boxes that hold several drones, split: blobs that touch, and drones that a detector merged into one box.
 
-The middle of such a box is the middle of no drone. But each edge of the box is the edge of a drone: of the outermost
-one.
+The middle of such a box is the middle of no drone. But each edge of the box is an edge of the outermost drone on that
+side.
 """
 
 from __future__ import annotations

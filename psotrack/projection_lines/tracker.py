@@ -73,10 +73,11 @@ def track_detections(
         settings: the parts of the settings that the projection lines read.
         fps: frames per second.
         bounds_m: (2, 3), lowest and highest corner of the room, metres.
-        known: positions and velocities of the drones at frame 0; None finds the drones.
+        known: positions and velocities of the drones at frame 0, (known, 3) each, metres and m/s; None finds the
+            drones.
         report: reports progress, in frames.
     """
-    # x64 holds in this scope only: nothing outside of it computes differently.
+    # float64 is switched on in this block only.
     with jax.enable_x64(True):
         tracker = _Tracker(cameras, settings, fps, bounds_m)
         if known is not None:

@@ -15,7 +15,7 @@ SPAN_FRAMES = 25
 
 @dataclass(frozen=True)
 class Measurement:
-    """What one frame says of a track by itself.
+    """The measurement of a track from one frame alone.
 
     Attributes:
         position_m: (3,), metres.

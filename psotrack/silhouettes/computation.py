@@ -108,7 +108,7 @@ def compute(
 
     Raises:
         InputError: a video is missing, unreadable, ends early, or differs from the others in length or size.
-        SettingsError: `jobs` is below 1.
+        SettingsError: `jobs` is below 1, or the background model yields masks of a wrong number, type or shape.
         OutputError: the store cannot be written; the cameras that were finished stay in the store.
     """
     cache = Path(cache)

@@ -86,7 +86,7 @@ class Mog2:
     """The background model of this package (see the module).
 
     Attributes:
-        settings: of the foreground.
+        settings: settings of the foreground.
     """
 
     settings: ForegroundSettings

@@ -55,6 +55,7 @@ def key_of(video: VideoInfo, settings: SilhouetteSettings, background: Backgroun
 
     Raises:
         InputError: the video cannot be read.
+        SettingsError: the key of the background model is no plain data.
     """
     made_of: dict[str, Any] = {
         "schema": SCHEMA,
@@ -97,6 +98,7 @@ def store(task: Task, advance: Advance) -> dict[str, float]:
 
     Raises:
         InputError: the video ends early.
+        SettingsError: the background model yields masks of a wrong number, type or shape.
         OutputError: the store cannot be written.
     """
     path = task.cache / task.key

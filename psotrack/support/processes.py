@@ -96,7 +96,7 @@ def _workers(function: Callable[..., Any], count: int) -> Iterator[list[Connecti
 
 @contextlib.contextmanager
 def _sigint_ignored() -> Iterator[None]:
-    """Start processes in this block that ignore SIGINT: on Ctrl-C a terminal signals them too, but the parent acts."""
+    """Processes that start in this block ignore SIGINT: Ctrl-C signals them too, but only the parent reacts."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -16,8 +16,8 @@ def standard_error(
     """Standard error of the mean of each column over correlated frames.
 
     For independent frames the standard error is s / √n; smaller results are replaced by this value. For correlated
-    frames the variance of the sum has twice the autocovariances at all lags added. They are added in pairs of lags,
-    until a pair is not positive.
+    frames, twice the autocovariance at each lag is added to the variance of the sum. The lags are added in pairs, until
+    the sum of a pair is not positive.
 
     Args:
         values: (frames, parts); rows with a NaN are left out.

@@ -2,7 +2,7 @@
 
 In: coverage of the silhouettes, the rig, initial states and settings. Out: positions with covariances, velocities,
 status and learned sizes, per frame and drone. The swarm and the score do not know each other; `tracker` combines
-them.
+them. Other rooms may use every name in `__init__.pyi`.
 """
 
 import lazy_loader

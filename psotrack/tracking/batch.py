@@ -79,7 +79,8 @@ def track_batch(
         chunk: the silhouettes.
         cameras: cameras with one leading axis, float32.
         program: static values of the tracker, the same for all runs.
-        capacity: number of runs for which the function is compiled. Unused capacity costs next to nothing.
+        capacity: number of runs for which the function is compiled. Unused capacity costs next to nothing on a CPU; an
+            accelerator computes it too.
         device: device that computes.
 
     Returns:

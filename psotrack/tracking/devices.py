@@ -24,8 +24,8 @@ def share_among_devices(
 ) -> list[Result]:
     """Do all jobs, and return the results in the order of the jobs.
 
-    While one device computes, the Python code of another device's thread has the processor. The calling thread works on
-    the first share itself, so that it reports the progress and receives an interrupt.
+    While one device computes, the thread of another device can run its Python code. The calling thread works on the
+    first share itself, so that it reports the progress and receives an interrupt.
 
     Args:
         jobs: the jobs.

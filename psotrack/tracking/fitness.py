@@ -153,7 +153,7 @@ def score_inputs(
         tables: (height + 1, cameras, width + 1), summed-area tables of the silhouettes.
         score: the score.
         reduction: image pixels per silhouette pixel, along each side.
-        offset_m: (drones, 3), from each drone's position to the middle of its extent (see `geometry.boxes.extents`).
+        offset_m: (drones, 3), from each drone's position to the middle of its extent (see `make_extents`).
     """
     return ScoreInputs(make_extents(cameras, size_m, offset_m), whole_images(tables, reduction), score)
 
@@ -181,7 +181,7 @@ def camera_scores(
     """Scores in [0, 1] of every drone in every camera, and the weight of each camera, as `inputs.score` defines them.
 
     Args:
-        inputs: of one frame.
+        inputs: silhouettes and extents of one frame.
         position_m: (..., drones, 3), positions of the drones, world, metres.
     """
     return inputs.score.camera_scores(inputs, position_m)
@@ -221,7 +221,7 @@ def drone_fitness(
 
 
 def joint_fitness(inputs: ScoreInputs, position_m: Float[Array, "*batch drones 3"]) -> Float[Array, "*batch"]:
-    """Mean fitness over all drones, the paper's. A drone without fitness counts 0, so losing a drone gains nothing."""
+    """Mean fitness over all drones, as in the paper. A drone without fitness counts 0: losing a drone gains nothing."""
     return jnp.nan_to_num(drone_fitness(inputs, position_m)).mean(axis=-1)
 
 

@@ -1,4 +1,4 @@
-"""What the tracker is compiled for and called with, from its parts of the settings."""
+"""The tracker's program, which is compiled, and its parameters, from its parts of the settings."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class TrackerSettings:
         swarm, score, motion, drones, status: parts of `TrackSettings`.
         search: the search in one frame.
         camera_score: the score of positions in single cameras.
-        seed: of the random numbers.
+        seed: seed of the random numbers.
     """
 
     swarm: SwarmSettings
@@ -50,9 +50,9 @@ def tracker_settings(
     """The tracker's parts of the settings of a run.
 
     Args:
-        settings: of the run.
-        search: instead of the search that the settings name.
-        score: instead of the score that the settings name.
+        settings: settings of the run.
+        search: replaces the search that the settings name.
+        score: replaces the score that the settings name.
 
     Raises:
         SettingsError: the settings name a search or a score that does not exist.

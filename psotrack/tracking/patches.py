@@ -42,9 +42,9 @@ Middles = tuple[Float[Array, "drones cameras 1 side"], Float[Array, "drones came
 
 #: Value of a fully covered pixel of the silhouettes.
 FULL = 255
-#: How full of foreground a drone's box is: this number less the distance from the box's middle (in half lengths of the
-#: box, along the farther axis). Silhouettes of four quadrotors fill 0.8 to 0.9, 0.6 to 0.7 and 0.4 to 0.5 of boxes of
-#: scale 0.4, 0.7 and 1; this model 0.83, 0.63 and 0.43.
+#: Usual share of foreground at a place of a drone's box: this number minus the distance from the box's middle (in half
+#: lengths of the box, along the farther axis). Silhouettes of four quadrotors fill 0.8 to 0.9, 0.6 to 0.7 and 0.4 to
+#: 0.5 of boxes of scale 0.4, 0.7 and 1; this model 0.83, 0.63 and 0.43.
 _EMPTY = 1.1
 
 
@@ -86,7 +86,7 @@ class ExpectedDrones:
 
     Attributes:
         position_m: (drones, 3), expected positions, metres.
-        reach_m: (drones,), distance from there within which a drone is searched for, metres.
+        reach_m: (drones,), distance from this position within which the drone is searched for, metres.
         occluding: (drones,), whether a drone's expected position is certain enough to occlude other drones; None where
             no drone occludes another.
         floor_z_m: height of the floor on which occluding drones cast shadows, metres; None where they cast none.

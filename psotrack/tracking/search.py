@@ -46,8 +46,8 @@ class Search(Protocol):
     The search itself is a JAX pytree: its arrays may change without a new compilation, everything else is compiled in.
     `jax.tree_util.register_static` makes a frozen, hashable dataclass of plain settings such a pytree.
 
-    With `swarm.kind = "per-drone"` there is one group of 3 dims (x, y, z, metres) per drone. With "joint" there is one
-    group of 3 dims per drone, drone after drone.
+    With `swarm.kind = "per-drone"` each drone is a group with 3 dims: x, y, z in metres. With "joint" there is a single
+    group with 3 x drones dims: x, y, z of the first drone, then of the second drone, and so on.
     """
 
     def __call__(
@@ -67,8 +67,8 @@ class Search(Protocol):
                 worse than every number, and all values of a group may be NaN.
             first: (particles, groups, dims), the first positions to evaluate, metres; some may lie outside the bounds.
                 Position 0 is the tracker's prediction, position 1 the drone's last position, and the other positions
-                are drawn about the prediction with the standard deviation `swarm.spread_m`. So a search that begins
-                here is warm-started.
+                are drawn about the prediction with the standard deviation `swarm.spread_m`, which is multiplied by the
+                number of frames since the drone was last found. So a search that begins here is warm-started.
             region: bounds and step size.
             num_iterations: scalar int32, traced: number of evaluations of all particles besides the evaluation of the
                 first positions. A search calls the objective `num_iterations + 1` times.

@@ -24,8 +24,8 @@ from psotrack.tracking.occlusion import OCCLUDER_SCALE, Occluders, ellipse_dista
 
 #: A drone is low if its height above the floor is less than this many times its width.
 LOW = 1.0
-#: Extent of the floor that is examined on every side of the drone, in heights of the drone: a lamp that stands at 45
-#: degrees or more casts the shadow no farther.
+#: Extent of the floor that is examined on every side of the drone, as a multiple of the drone's height above the floor:
+#: a lamp that stands at 45 degrees or more casts the shadow no farther.
 CAST = 1.0
 #: Coverage, of 255, from which on a cell counts as foreground. Settings may give shadows less weight than drones.
 _FOREGROUND = 64

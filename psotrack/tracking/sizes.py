@@ -3,7 +3,7 @@
 A drone's size does not change, and the first frames, from which the initial size comes, may be poor. `measure_sizes`
 measures the size that every frame shows, `learn_sizes` takes a chunk of such measurements into the running estimate.
 
-Measured is the spread of a silhouette about its own middle, so the measurement does not depend on how well the drone is
+The spread of a silhouette about its own middle is measured, so the result does not depend on how well the drone is
 placed. The variance of a filled ellipse along a direction is a quarter of the squared half length (M. R. Teague, Image
 analysis via the general theory of moments, JOSA 70(8), 1980), and the squared half lengths of an ellipsoid's outlines
 are nearly linear in the squared half lengths of the ellipsoid (Hartley & Zisserman 2004, section 8.3): the views of a
@@ -41,8 +41,8 @@ NEIGHBOUR = 1.15
 #: Standard deviation of squared lengths of single views, as a share of the squared length, from yaw and tilt; views
 #: that deviate more have less weight.
 VIEW_STD = 0.25
-#: Weight of the present size, in views that show a length alone; and the share of the result that the frame's own views
-#: must make up, or the frame says too little.
+#: Weight of the present size in the fit, in views that show one length alone; and least share of a fitted length that
+#: must come from the frame's own views, otherwise the length is NaN.
 PRIOR_VIEWS, MIN_SHARE = 0.01, 0.9
 #: Iterations in which views are weighted by their deviation.
 REWEIGHTINGS = 2

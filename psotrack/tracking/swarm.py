@@ -47,8 +47,8 @@ class SwarmParams:
 class SwarmState:
     """What the next iteration needs.
 
-    `position` is where the particles are going to be evaluated; the bests are of where they have been. Bests that were
-    never defined have fitness -inf.
+    The particles are evaluated next at `position`. `pbest` is the best position so far of each particle, and `gbest`
+    that of each group. Before any defined fitness, the fitness of a best is -inf.
     """
 
     position: Float[Array, "particles groups dims"]
@@ -114,8 +114,8 @@ def move(key: Key, state: SwarmState, params: SwarmParams) -> SwarmState:
 def step(key: Key, objective: Objective, state: SwarmState, params: SwarmParams) -> SwarmState:
     """One iteration: evaluate, then move. The key is consumed.
 
-    In this order the loop hands finished positions from one iteration to the next. Moving first would have XLA on CPU
-    compute the move, random numbers included, anew in each of the loops that an objective falls apart into.
+    In this order the loop hands finished positions from one iteration to the next. If the move came first, XLA on a CPU
+    would compute the move, random numbers included, again in each of the loops into which it splits the objective.
     """
     return move(key, evaluate(objective, state), params)
 
@@ -143,15 +143,16 @@ def _random_factors(
 ) -> tuple[Float[Array, "particles groups dims"], Float[Array, "particles groups dims"]]:
     """Two independent uniform numbers in [0, 1) for every element: the halves of one word, in steps of 2^-16.
 
-    The key's own generator would take a tenth of the swarm's time. It makes the key; the words are a hash of the key
-    and the element's number: the finaliser of MurmurHash3 (Appleby 2011, public domain), once with either half of it.
+    JAX's own generator would take a tenth of the swarm's time, so it only makes the key. The words are a hash of the
+    key and the element's number: the finaliser of MurmurHash3 (Appleby 2011, public domain), once for each half of the
+    key.
     """
     first, last = jax.random.key_data(key)[..., 0], jax.random.key_data(key)[..., -1]
     number = jax.lax.iota(jnp.uint32, math.prod(shape)).reshape(shape)
     words = _mixed(_mixed(number * jnp.uint32(0x9E3779B9) + first) ^ last)
 
     def uniform(half: jax.Array) -> jax.Array:
-        # By way of int32, which CPUs convert in one instruction, unlike uint32.
+        # The detour through int32 is faster: CPUs convert int32 to float32 in one instruction, but not uint32.
         return half.astype(jnp.int32).astype(jnp.float32) * 2.0**-16
 
     return uniform(words >> 16), uniform(words & 0xFFFF)

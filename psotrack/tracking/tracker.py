@@ -7,7 +7,7 @@ coasts on its prediction with growing covariance, and after a while it is lost.
 
 `step` does one frame, `track` is a scan of `step` over a chunk of frames. A live source calls `step`, so online and
 offline are the same code, and the state crosses chunk borders. Tracks may start in any frame (`TrackStarts`): until
-then their drones are absent, and the number of drones, which is a shape, need not change while they start.
+then their drones are absent, so the number of drones, on which the arrays' shapes depend, does not change.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ DISPERSION, DISPERSION_FRAMES = 1e-3, 25
 #: Ratio of the measured positions' variance and the variance that follows from the cameras' disagreement. Errors that
 #: all cameras have in common do not appear as disagreement: a wrong size, a clock, a rotor that no camera sees.
 COMMON = 2.0
-#: Two ellipsoids are of one drone if the distance of their middles is less than this share of their size on every axis.
+#: Two tracks are of one drone if their distance, divided along each axis by this share of their mean size, is below 1.
 MIN_APART = 0.5
 #: A lost drone is found again only with this many times the least fitness: any foreground may be near its last
 #: position.
@@ -63,7 +63,7 @@ class Program:
         joint: one search over the positions of all drones (the paper's) instead of one per drone.
         occlusion: whether foreground that another drone is expected to cover is left out of a drone's score.
         vertex: whether a drone's position is the vertex of a paraboloid through the scores, not the best position
-        tried.
+            tried.
         score: the score of positions.
         windows: scales of a drone's box whose filling is reported with the learned sizes.
         reduction: image pixels per silhouette pixel, along each side.
@@ -150,8 +150,8 @@ class TrackStarts:
 class TrackerInfo:
     """Results per frame, for people and for the stages after the tracker; NaN for absent drones.
 
-    "Measured" is what the frame says by itself, whether or not the motion model believed it; every other array
-    depends on the frames before as well. `status` holds values of `Status`.
+    A "measured" quantity comes from the frame alone, also where the motion model treats it as an outlier. Every other
+    array depends on earlier frames too. `Tracks` lists the shapes and units.
     """
 
     position_m: Float[Array, "*frames drones 3"]
@@ -206,11 +206,11 @@ def step(
     """One frame: predict, search, correct.
 
     Args:
-        state: after the frame before.
+        state: state after the previous frame.
         coverage: (cameras, height, width), silhouettes of the frame, 0..255, reduced.
         cameras: with one leading axis, float32.
-        params: numbers.
-        program: what is compiled in.
+        params: parameters, which may change without a new compilation.
+        program: static values, which are compiled in.
     """
     key_next, key_spread, key_search = jax.random.split(state.key, 3)
     region = _reachable(state, params)
@@ -278,11 +278,11 @@ def track(
     """`step` over a chunk of frames, one compiled scan.
 
     Args:
-        state: before the first frame.
+        state: state before the first frame.
         coverage: (frames, cameras, height, width) uint8; a chunk of silhouettes.
         cameras: with one leading axis, float32.
-        params: numbers.
-        program: what is compiled in.
+        params: parameters, which may change without a new compilation.
+        program: static values, which are compiled in.
         starts: tracks that start in this chunk (see `no_track_starts`).
 
     Returns:

@@ -1,6 +1,6 @@
 """Tracks: what every method of tracking yields, before identity swaps are resolved and later frames are used.
 
-A method says nothing here that only that method knows: numbers that a method does not have are NaN.
+The fields are the same for all methods. A number that a method does not compute is NaN.
 """
 
 from __future__ import annotations
@@ -70,18 +70,19 @@ class DroneSizes:
 class Tracks:
     """Tracks of a whole recording, NumPy arrays with axes (frames, drones, ...).
 
-    "Measured" is what a frame says by itself, whether or not the motion model believed it; every other array depends on
-    the frames before as well. Of a drone that is not there yet nothing is known: NaN.
+    A "measured" quantity comes from one frame alone, also where the motion model treats it as an outlier. Every other
+    array depends on earlier frames too. Before the first frame of a drone's track, its positions are NaN and its status
+    is `lost`.
 
     Attributes:
-        position_m, velocity_m_s: (frames, drones, 3), world.
-        covariance_m2: (frames, drones, 3, 3), of the positions.
-        measured_m: (frames, drones, 3), position that the frame says by itself.
-        measured_covariance_m2: (frames, drones, 3, 3), of the measured positions.
+        position_m, velocity_m_s: (frames, drones, 3), positions and velocities in the world, metres and m/s.
+        covariance_m2: (frames, drones, 3, 3), covariances of the positions, m².
+        measured_m: (frames, drones, 3), positions from each frame alone, metres.
+        measured_covariance_m2: (frames, drones, 3, 3), covariances of the measured positions, m².
         fitness: (frames, drones), how well the frame fits the position, in [0, 1].
         num_cameras: (frames, drones), cameras that see the drone.
         status: (frames, drones), values of `Status`.
-        measured_size_m: (frames, drones, 3), size that the frame shows by itself; NaN where it shows none.
+        measured_size_m: (frames, drones, 3), full lengths from each frame alone, metres; NaN where unknown.
         sizes: what was learned of the drones' sizes.
         arrivals: drones that came after frame 0, or that came back.
     """

@@ -45,11 +45,11 @@ class Trajectories:
         drones: one name per drone.
         position_m: (frames, drones, 3), positions in the world, metres.
         velocity_m_s: (frames, drones, 3), velocities in the world, metres per second.
-        covariance_m2: (frames, drones, 3, 3), covariances of the positions, square metres; symmetric.
         orientation_wxyz: (frames, drones, 4), unit quaternions that turn body coordinates into world coordinates.
         fitness: (frames, drones), scores in [0, 1].
         num_cameras: (frames, drones), numbers of cameras that see the drone.
         status: (frames, drones), values of `Status`.
+        covariance_m2: (frames, drones, 3, 3), covariances of the positions, square metres; symmetric.
     """
 
     frame: Int[np.ndarray, "frames"]
