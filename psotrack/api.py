@@ -70,7 +70,7 @@ def track(
     Silhouettes are made by several processes: in a script, call this function below `if __name__ == "__main__":`.
 
     Args:
-        recording: from `read_recording`, or its folder.
+        recording: recording from `read_recording`, or the folder of a recording.
         settings: settings, or dotted names and values such as {"swarm.particles": 50}; None takes the defaults.
         cache: folder of stored silhouettes and detections; None takes the user's cache folder.
         jobs: number of processes for the silhouettes; None is one per processor.

@@ -147,7 +147,7 @@ def track_recording(
     Raises:
         InputError: a video cannot be used, or the drones cannot be found.
         SettingsError: a setting does not fit the recording.
-        OutputError: the silhouettes cannot be stored.
+        OutputError: the silhouettes or the detections cannot be stored.
     """
     began = time.perf_counter()
     if parts.detector is not None:
@@ -191,7 +191,7 @@ def track_runs(
         silhouettes: silhouettes of all cameras; None where no run needs them (see `TrackSettings.needs_silhouettes`).
         settings: settings of each run.
         parts: parts that the caller brings, for all runs.
-        report: shows the progress in frames; the runs of one method go through the frames together.
+        report: shows the progress in frames; the runs of the swarm go through the frames together.
 
     Returns:
         For each run its result, or the error that explains why the run has none.

@@ -201,8 +201,8 @@ class StatusSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     """When a drone counts as found in a frame, and when it is lost.
 
     Attributes:
-        min_fitness: below this fitness a drone was not found.
-        min_cameras: with foreground in fewer cameras than this a drone was not found.
+        min_fitness: smallest fitness of a drone that counts as found.
+        min_cameras: smallest number of cameras that see a drone that counts as found, by foreground or by detections.
         max_coasting_s: seconds for which a drone that is not found coasts on its prediction before it is lost.
 
     Raises:

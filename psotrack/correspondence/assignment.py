@@ -106,9 +106,9 @@ def propose_exchanges(
 ) -> Exchanges:
     """Exchanges that may lower the cost.
 
-    There are four kinds. The candidate takes all its detections; or only those that gain more in the candidate than
-    in their present group; or only those that are in no group; or those that are in no group, and it shares the
-    others.
+    There are four kinds. The candidate takes (1) all its detections, (2) only the detections that gain more in the
+    candidate than in their present group, (3) only the detections that are in no group, or (4) the detections that are
+    in no group, and it shares its other detections.
 
     Args:
         padded: sightings of the frame.

@@ -3,8 +3,8 @@
 The swarm finds the middle of a drone's silhouette, the projection lines the middle of its boxes. The two points
 differ by a constant for each drone. The constant is estimated and removed from the lines, so that a drone does not
 move where one method takes over from the other. No image shows which of the two points is nearer to the body's
-origin; the constant is stored in the record, so that a user who knows the offset of the origin for one method knows
-it for the other.
+origin. The constant is stored in the record: if the offset of the origin is known for one method, the constant gives
+the offset for the other method.
 
 If the boxes are a detector's, the remaining errors of the two methods have different causes, and the information adds
 up (Bar-Shalom et al. 2001, section 8.3.3: fusion of independent estimates). Boxes of blobs come from the same

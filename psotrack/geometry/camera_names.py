@@ -34,7 +34,7 @@ def camera_of(name: str, cameras: Sequence[str]) -> str | None:
     `cam1` and not to `cam10`. Of several such cameras the one with the longest name is meant.
 
     Args:
-        name: of the file, without its suffix.
+        name: name of the file, without its suffix.
         cameras: names of the cameras in the calibration.
     """
     key = camera_key(name)

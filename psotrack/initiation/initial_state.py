@@ -145,7 +145,7 @@ def complete_initial_state(
     """The initial state with drones that only detections show, limited to the known number, with known sizes.
 
     Args:
-        state: from silhouettes, or given.
+        state: initial state, found in silhouettes or given.
         detected: drones that detections show at frame 0; None where no detections are read. These drones are added
             unless the positions are given: a drone that hovers may be part of the learned background.
         drones: number and sizes where they are known.

@@ -30,7 +30,7 @@ MIN_CONTRAST = 0.1
 #: Factors of the ellipse within which foreground belongs to the drone, in three steps: the first two find the drone,
 #: the last places it.
 WINDOWS = (1.6, 1.6, 1.2)
-#: Smallest distance between two drones, as a share of the sum of their half axes; nearer ones are the same drone.
+#: Smallest distance between two drones, as a share of the sum of their half axes; nearer drones are the same drone.
 MIN_DISTANCE = 0.8
 
 

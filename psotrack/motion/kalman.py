@@ -255,7 +255,7 @@ def limit_motion(
     bounds_m: Float[Array, "2 3"],
     max_speed_m_s: Float[Array, ""],
 ) -> MotionState:
-    """Limit a state to what is possible: inside the room, not too fast; unseen drones fly straighter, lost ones rest.
+    """Limit a state to what is possible: inside the room, not too fast; unseen drones fly straighter, lost drones rest.
 
     Args:
         state: the state after a frame.

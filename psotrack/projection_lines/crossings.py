@@ -50,7 +50,7 @@ def crossings(
     """Match the detections of all cameras, and triangulate each group without the views that disagree.
 
     Args:
-        cameras: with one leading axis.
+        cameras: cameras with one leading axis.
         view: detections of the frame.
         bounds_m: (2, 3), corners of the room, metres.
         expected_m, expected_covariance_m2: (drones, 3) and (drones, 3, 3), expected positions and their covariances.

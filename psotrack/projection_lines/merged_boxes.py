@@ -55,7 +55,7 @@ def split_merged_boxes(
     and its size. The places of the other drones are not known: they are hidden.
 
     Args:
-        cameras: with one leading axis.
+        cameras: cameras with one leading axis.
         view: boxes of the frame.
         expected_m: (drones, 3), expected positions, metres.
         span_m: (drones, 2), widths and heights of the drones, metres; NaN where they are not known: then no box is

@@ -68,7 +68,7 @@ def track_detections(
     of the boxes, as wide along x as along y.
 
     Args:
-        cameras: with one leading axis.
+        cameras: cameras with one leading axis.
         sightings: detections of all cameras.
         settings: the parts of the settings that the projection lines read.
         fps: frames per second.
@@ -173,7 +173,7 @@ class _Tracker:
         )
         usual = float(np.median([track.dispersion for track in tracks])) if tracks else 1.0
         measured: dict[int, Measurement] = {}
-        # Expected positions first: a position that nothing expected may be a part of one of those drones.
+        # Expected drones first: an unexpected position may be a part of an expected drone.
         for row in np.argsort(crossed.expected < 0, kind="stable").tolist():
             number, seen, position_m = int(crossed.expected[row]), crossed.seen[row], crossed.position_m[row]
             num_viewpoints = len(set(self._viewpoint[seen].tolist()))

@@ -148,7 +148,7 @@ def score_inputs(
     """What the score reads of the whole images of one frame.
 
     Args:
-        cameras: with one leading axis.
+        cameras: cameras with one leading axis.
         size_m: (drones, 3), full lengths of the drones, metres.
         tables: (height + 1, cameras, width + 1), summed-area tables of the silhouettes.
         score: the score.

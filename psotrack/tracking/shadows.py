@@ -86,7 +86,7 @@ def shadowed_pixels(
 
     def cell(at_m: Array, centre_m: Array) -> Array:
         off = (at_m - centre_m[:, None, None, None]) / half_m[:, None, None, None]
-        # Points outside of the examined floor are -1, those at infinity too.
+        # -1 stands for points outside of the examined floor, also for points at infinity.
         return jnp.where(jnp.abs(off) < 1, jnp.floor((off + 1) / 2 * _CELLS), -1).astype(jnp.int32)
 
     column, row = cell(x_m, middle_m[:, 0]), cell(y_m, middle_m[:, 1])

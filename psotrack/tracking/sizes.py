@@ -32,7 +32,7 @@ HALF_PER_STD = 2.2
 RANGE = 2.0
 #: Weight of the initial size, in frames, and its standard deviation, of the logarithm of a length.
 START_FRAMES, START_STD = 5, 0.15
-#: Least number of good frames in a chunk: the median of fewer is not safe from bad ones.
+#: Least number of good frames in a chunk: the median of fewer frames is not robust against bad frames.
 MIN_FRAMES = 5
 #: Least share of the drone's box that must be foreground in a camera that shows the drone whole.
 MIN_FILLED = 0.15
@@ -188,7 +188,7 @@ def measure_sizes(
         position_m: (frames, drones, 3), world, metres; any value where a drone is not well seen.
         well_seen: (frames, drones), whether a drone was found.
         size_m: (drones, 3), present full lengths, metres; the result hardly depends on them within a factor of 1.5.
-        cameras: with one leading axis.
+        cameras: cameras with one leading axis.
         program: windows, ring and reduction.
         floor_z_m: height of the floor, metres. The silhouette of a drone that is low over the floor may contain its
             shadow, so such a drone is not measured.
@@ -312,8 +312,8 @@ def _fit_lengths(
     """Squared horizontal and vertical lengths by least squares that outlying views influence little.
 
     Returns:
-        (drones, 2), the squared lengths as factors of the present ones; and (drones, 2), the share of each that comes
-        from the views and not from the present size.
+        (drones, 2), the squared lengths as factors of the present squared lengths; and (drones, 2), the share of each
+        length that comes from the views and not from the present size.
     """
     counting = jnp.broadcast_to(counts[..., None], squares.shape).astype(jnp.float32)
 

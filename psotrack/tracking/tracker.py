@@ -56,7 +56,7 @@ REGAIN = 3.0
 
 @dataclass(frozen=True)
 class Program:
-    """What is compiled in: a change of any of these compiles anew.
+    """Static values of the tracker: a change of any value causes a new compilation.
 
     Attributes:
         num_particles: number of particles of every swarm.
@@ -92,9 +92,9 @@ class TrackerParams:
         spread_m: standard deviation of the particles about the prediction, metres.
         search: the search in one frame.
         motion: the motion model.
-        min_fitness: below this fitness a drone was not found.
-        min_cameras: with foreground in fewer cameras than this a drone was not found.
-        max_coasting_frames: after more frames than this without being found a drone is lost.
+        min_fitness: smallest fitness of a drone that counts as found.
+        min_cameras: smallest number of cameras with foreground at a drone that counts as found.
+        max_coasting_frames: largest number of frames for which a drone that is not found coasts before it is lost.
     """
 
     num_iterations: Int[Array, ""]
@@ -208,7 +208,7 @@ def step(
     Args:
         state: state after the previous frame.
         coverage: (cameras, height, width), silhouettes of the frame, 0..255, reduced.
-        cameras: with one leading axis, float32.
+        cameras: cameras with one leading axis, float32.
         params: parameters, which may change without a new compilation.
         program: static values, which are compiled in.
     """
@@ -280,7 +280,7 @@ def track(
     Args:
         state: state before the first frame.
         coverage: (frames, cameras, height, width) uint8; a chunk of silhouettes.
-        cameras: with one leading axis, float32.
+        cameras: cameras with one leading axis, float32.
         params: parameters, which may change without a new compilation.
         program: static values, which are compiled in.
         starts: tracks that start in this chunk (see `no_track_starts`).
