@@ -233,7 +233,7 @@ def test_all_focal_lengths_a_little_wrong(factor):
     """The error is too small to be visible in a single sighting or in a single camera."""
     finding = only_finding(with_intrinsics(slice(None), factor))
     assert (finding.kind, finding.cameras) == ("focal lengths", ())
-    found = re.search(r"too (long|short): 4 % off, give or take (\S+) %", finding.message)
+    found = re.search(r"4 % too (long|short) \(± (\S+) %\)", finding.message)
     assert found is not None, finding.message
     assert found[1] == ("long" if factor > 1 else "short")
     assert 0 < float(found[2]) < 1.1

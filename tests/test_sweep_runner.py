@@ -121,7 +121,7 @@ def test_a_cell_that_fails_does_not_stop_the_other_cells(
     swept: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     _, status, _ = called(capsys, "sweep", "--status", swept / "results")
-    assert status[-1].endswith("4 finished, 4 failed, 0 claimed")
+    assert status[-1].endswith("4 finished, 4 failed, 0 locked")
     assert len(status) == 5
     assert all("nowhere" in line for line in status[:-1])
 

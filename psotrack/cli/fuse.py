@@ -109,7 +109,7 @@ def _sentence(drone: FusedDrone) -> str:
         f"{drone.name}: {' and '.join(f'track {name}' for name in drone.tracks) or 'no track, kept as it is'}"
     ]
     if drone.offset is not None:
-        parts.append(f"clock {drone.offset.offset_s:+.4f} s, give or take {drone.offset.std_s:.4f} s")
+        parts.append(f"clock {drone.offset.offset_s:+.4f} ± {drone.offset.std_s:.4f} s")
     parts.append(
         f"frames of both {drone.frames_both}, inside only {drone.frames_inside}, outside only {drone.frames_outside}"
     )
@@ -120,7 +120,7 @@ def _sentence(drone: FusedDrone) -> str:
         )
         parts.append(f"arm ({arm}) mm")
         parts.extend(
-            f"{word}: stated errors x {errors.scale:.2f}, {errors.gated} gross"
+            f"{word}: stated errors multiplied by {errors.scale:.2f}, {errors.gated} gross errors left out"
             for word, errors in (("inside", drone.fusion.inside), ("outside", drone.fusion.outside))
         )
     return "; ".join(parts)

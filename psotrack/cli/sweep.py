@@ -243,5 +243,6 @@ def _status(folder: Path, quiet: bool, force: bool, json_path: Path | None) -> N
         print_line(quiet, json_path, f"failed: {failure}")
     for worker in content["at_work"]:
         print_line(quiet, json_path, f"at work: {worker}")
-    numbers = ", ".join(f"{content[name]} {name}" for name in ("finished", "failed", "claimed"))
+    words = {"finished": "finished", "failed": "failed", "claimed": "locked"}
+    numbers = ", ".join(f"{content[key]} {word}" for key, word in words.items())
     print_line(quiet, json_path, f"{folder}: {numbers}")

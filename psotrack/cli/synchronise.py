@@ -73,7 +73,7 @@ def synchronise(
         quiet,
         json_path,
         f"{recording.name}: the reference's clock is {abs(offset.offset_s):.4f} s "
-        f"{'ahead of' if offset.offset_s >= 0 else 'behind'} the videos', give or take {offset.std_s:.4f} s "
+        f"(± {offset.std_s:.4f} s) {'ahead of' if offset.offset_s >= 0 else 'behind'} the videos' "
         f"({offset.offset_s * recording.fps:+.2f} frames); mean distance, lever arms taken out: "
         f"{before} before, {_mm(offset.mean_distance_m)} after",
     )

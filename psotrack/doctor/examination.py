@@ -212,7 +212,8 @@ def _nothing_agrees(found: Agreement) -> Finding:
         )
         return Finding("too little seen", (), message, "the rig cannot be checked; pass other --detections")
     message = (
-        f"the rig: three viewpoints agree on only {found.share:.0%} of {seen} detections, however it is read"
+        f"the rig: three viewpoints agree on only {found.share:.0%} of {seen} detections, "
+        "under every interpretation of the rig"
     )
     return Finding(
         "no agreement", (), message, "calibrate it anew, and check that videos and detections are its own"

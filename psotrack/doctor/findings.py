@@ -48,13 +48,13 @@ def describe_camera_fault(rig: Rig, index: int, explained: list[CameraFault]) ->
     if best - sound.gain <= CLEARLY:
         message = f"camera {name}: it explains {sound.gain:.0%} of the drones that the others see; no correction helps"
         return Finding(
-            "disagrees", (name,), message, f"go without it: --cameras without {name}; calibrate it anew"
+            "disagrees", (name,), message, f"leave {name} out with --cameras, or calibrate it anew"
         )
     numbers = f"(explains {fault.gain:.0%} of the drones that the others see, not {sound.gain:.0%})"
     if fault.kind == "clock":
         late = "late" if fault.amount > 0 else "early"
         message = f"camera {name}: its clock is about {abs(fault.amount):.1f} frames {late} {numbers}"
-        return Finding("clock", (name,), message, "shift its video and detections by that")
+        return Finding("clock", (name,), message, "shift its video and detections by this number of frames")
     if fault.kind == "focal length":
         percent = 100 * (1 / fault.amount - 1)
         how = f"{abs(percent):.0f} % too {'short' if percent < 0 else 'long'}"
@@ -64,7 +64,9 @@ def describe_camera_fault(rig: Rig, index: int, explained: list[CameraFault]) ->
     if fault.kind == "exchanged":
         other = rig.names[int(fault.amount)]
         message = f"camera {name}: what it sees fits the calibration of {other} {numbers}"
-        return Finding("exchanged", (name, other), message, "check which video and detections are whose")
+        return Finding(
+            "exchanged", (name, other), message, "check which video and detections belong to which camera"
+        )
     turn_deg, shift_m = pose_difference(rig.cameras[index], fault.camera)
     how = f"turned by {turn_deg:.1f} degrees" + (
         f" and moved by {100 * shift_m:.0f} cm" if fault.kind == "moved" else ""
@@ -77,7 +79,7 @@ def describe_camera_fault(rig: Rig, index: int, explained: list[CameraFault]) ->
 def describe_late_clock(name: str, offset: float, std: float) -> Finding:
     """Describe a clock that is late by `offset` frames, with the standard deviation `std` in frames."""
     late = "late" if offset > 0 else "early"
-    message = f"camera {name}: its clock is {abs(offset):.2f} frames {late}, give or take {std:.2f}"
+    message = f"camera {name}: its clock is {abs(offset):.2f} frames {late} (± {std:.2f})"
     return Finding("clock", (name,), message, "synchronise its video with the others")
 
 

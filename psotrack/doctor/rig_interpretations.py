@@ -187,7 +187,7 @@ def find_certain_focal_lengths(rig: Rig, found: Agreement) -> RigInterpretation 
     if abs(np.log(scale)) < max(_LEAST_OFF, _CERTAIN * std / scale):
         return None
     (interpretation,) = _lenses(rig, np.array([scale]))
-    return replace(interpretation, words=f"{interpretation.words}, give or take {100 * std / scale:.1f} %")
+    return replace(interpretation, words=f"{interpretation.words} (± {100 * std / scale:.1f} %)")
 
 
 def _lenses(rig: Rig, scales: Float[np.ndarray, "scales"]) -> Iterator[RigInterpretation]:
@@ -197,7 +197,7 @@ def _lenses(rig: Rig, scales: Float[np.ndarray, "scales"]) -> Iterator[RigInterp
         K[:, :2, :2] *= scale
         yield RigInterpretation(
             "focal lengths",
-            f"all focal lengths are too {'short' if scale > 1 else 'long'}: {abs(100 * (1 / scale - 1)):.0f} % off",
+            f"all focal lengths are {abs(100 * (1 / scale - 1)):.0f} % too {'short' if scale > 1 else 'long'}",
             f"multiply them by {scale:.3f}, or calibrate the lenses anew",
             (),
             Rig(rig.names, replace(rig.cameras, K=K)),

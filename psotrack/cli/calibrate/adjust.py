@@ -95,7 +95,7 @@ def adjust(
     if refine_focal_length:
         scale, std = improved.everything.focal_scale, improved.everything.focal_scale_std
         done = "" if improved.rescaled else ", which may be chance: the focal lengths are not changed"
-        print_line(quiet, json_path, f"focal lengths x {scale:.5f}, give or take {std:.5f}{done}")
+        print_line(quiet, json_path, f"focal lengths x {scale:.5f} ± {std:.5f}{done}")
 
 
 def _rows(
@@ -140,7 +140,7 @@ def _in_words(improved: Improved, rows: dict[str, dict[str, Any]]) -> str:
         for name in improved.moved
     ]
     parts += [
-        f"or the focal length of {name} is wrong (x {scale:.3f}, give or take {std:.3f}): check its lens"
+        f"or the focal length of {name} is wrong (x {scale:.3f} ± {std:.3f}): check its lens"
         for name, (scale, std) in improved.zoomed.items()
     ]
     agree = any(row["verdict"] == "agrees" for row in rows.values())

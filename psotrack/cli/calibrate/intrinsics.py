@@ -68,7 +68,7 @@ def intrinsics(
     print_table(
         quiet,
         json_path,
-        ("", "value", "give or take"),
+        ("", "value", "standard deviation"),
         ((key, f"{value:.5g}", f"{std:.2g}") for key, value, std in rows),
     )
     rms = float(np.sqrt(np.mean(lens.residual_px**2)))
