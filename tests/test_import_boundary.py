@@ -7,6 +7,7 @@ import ast
 import doctest
 import importlib
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -221,6 +222,14 @@ def test_the_lists_contain_existing_modules_and_all_rooms():
     listed = {*ROOMS, *CORE, *FORBIDDEN, *(f"inside_out.{room}" for room in INSIDE_OUT)}
     assert listed <= names
     assert {name.split(".")[0] for name in names if name} <= set(ROOMS)
+
+
+def test_the_architecture_page_lists_the_rooms_in_this_order():
+    page = (PACKAGE.parent / "docs" / "pages" / "explanation" / "architecture.md").read_text(encoding="utf-8")
+    table = page.partition("\n## Rooms\n")[2].partition("\n## ")[0]
+    assert re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE) == [
+        room for room in ROOMS if room not in {"_typing", "errors", "demo", "__main__"}
+    ]
 
 
 def test_few_files_stand_at_the_root():

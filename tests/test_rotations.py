@@ -1,4 +1,4 @@
-"""Rotation matrices and cross-product matrices against the definitions index quaternions and cross products."""
+"""Rotation matrices and cross-product matrices against the definitions of quaternions and cross products."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from psotrack.geometry import cross_matrices, rotation_matrices
 
 
 def product(left, right):
-    """Product index two quaternions, wxyz: w = w w' - v . v', and v = w v' + w' v + v x v'."""
+    """Product of two quaternions, wxyz: w = w w' - v . v', and v = w v' + w' v + v x v'."""
     w = left[0] * right[0] - left[1:] @ right[1:]
     return np.array([w, *(left[0] * right[1:] + right[0] * left[1:] + np.cross(left[1:], right[1:]))])
 
@@ -38,7 +38,7 @@ def test_cross_matrices_are_cross_products():
     rng = np.random.default_rng(1)
     vectors, others = rng.normal(size=(2, 5, 2, 3))
     expected = np.cross(vectors, others)
-    # Rounding index differences index products index small numbers.
+    # Rounding of differences of products of small numbers.
     np.testing.assert_allclose(np.matvec(cross_matrices(vectors), others), expected, rtol=0, atol=1e-14)
     np.testing.assert_allclose(
         cross_matrices(vectors[0, 0]) @ others[0, 0], expected[0, 0], rtol=0, atol=1e-14

@@ -289,7 +289,7 @@ def numbers(value):
 # --- changed fields
 
 
-def test_replaced_changes_only_the_given_fields():
+def test_change_scenario_changes_only_the_given_fields():
     changed = change_scenario(
         S02,
         {

@@ -58,7 +58,7 @@ def chunk(size_m):
 def test_an_ellipsoid_has_the_same_measured_size_everywhere(size_m, coefficients):
     rig = ring_rig(5, image_size_wh=(640, 480), coefficients=coefficients)
     shown = measure(images(PLACES_M, np.array(size_m), rig), PLACES_M, size_m, rig=rig).size_m
-    # Moments are those of bent outlines, and boxes those of bent middles of the sides. Measured 0.6 % of the height.
+    # The lens bends outlines: moments are of the bent outline, boxes of the bent middles of the sides. Measured 0.6 %.
     np.testing.assert_allclose(shown / size_m, LENGTH_RATIO, rtol=1.5 * DRAWING_ERROR)
 
 
@@ -66,7 +66,7 @@ def test_the_expected_position_hardly_changes_the_measured_size():
     coverage = images(PLACES_M)
     there = measure(coverage, PLACES_M, SIZE_M).size_m
     beside = measure(coverage, PLACES_M + np.array([0.03, -0.03, 0.03]), SIZE_M).size_m
-    # Of 5 cm at 3 m and more, distances change by up to 1.5 % and elevations by a degree. Measured 1.6 % of the height.
+    # An error of 5 cm at 3 m or more changes distances by up to 1.5 % and elevations by a degree. Measured 1.6 %.
     np.testing.assert_allclose(beside, there, rtol=0.025)
 
 
@@ -155,7 +155,7 @@ def test_a_wrong_initial_size_is_corrected_within_three_chunks(wrong):
     state = initial_sizes(wrong * LENGTH_RATIO * SIZE_M)
     coverage = images(PLACES_M)
     for _ in range(3):
-        # Five positions, pair times each: a chunk of 25 frames.
+        # Five positions, five times each: a chunk of 25 frames.
         measured = measure(coverage, PLACES_M, np.asarray(state.size_m))
         state = sizes.learn_sizes(state, jax.tree.map(lambda value: jnp.tile(value, (5, 1, 1)), measured))
     # After 75 frames, 5 / 80 of the initial error of 20 % remains; the first chunk had windows of a wrong size.
@@ -164,7 +164,7 @@ def test_a_wrong_initial_size_is_corrected_within_three_chunks(wrong):
 
 
 def test_bad_frames_in_a_fifth_of_a_chunk_have_little_effect():
-    """In one frame of pair, the left half of each silhouette is missing."""
+    """In one frame of five, the left half of each silhouette is missing."""
     good = images(PLACES_M)
     bad = good.copy()
     column = np.arange(good.shape[-1])
