@@ -150,6 +150,8 @@ def notebook(path: Path) -> dict[str, str | bytes]:
     # Links between notebooks lead to the pages.
     body = re.sub(r"\]\((\w+)\.ipynb\)", r"](\1.md)", body)
     body = re.sub(r"<style scoped>.*?</style>\n?", "", body, flags=re.DOTALL)
+    # Tables of pandas look like the other tables of the pages.
+    body = body.replace('<table border="1" class="dataframe">', "<table>")
     body = re.sub(r"\]\(((?:\.\./)+)(experiments|README)([^)]*)\)", _repository_link, body)
     files: dict[str, str | bytes] = {f"{path.stem}.md": f"{body}\n"}
     return files | resources["outputs"]
