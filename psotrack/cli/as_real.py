@@ -44,8 +44,9 @@ def as_real(
 ) -> None:
     """Write the simulated sequence SEQ in the form of the dataset's real half.
 
-    Writes OUT/Real_Data/RXX_Dn: four cameras with distortion, named by serial number, in millimetres; a C3D file of
-    marker crosses with another rate and another start time, with gaps and swapped labels; detections.
+    Writes OUT/Real_Data/RXX_Dn, where XX is the number in SEQ's name and n the number of drones, such as R02_D4: four
+    cameras with distortion, named by serial number, in millimetres; a C3D file of marker crosses with another rate and
+    another start time, with gaps and swapped labels; detections.
 
     \b
     Example:

@@ -78,6 +78,8 @@ def write_as_real(
 ) -> Path:
     """Write a simulated sequence in the folder ROOT/Real_Data/RXX_Dn, in the form of the dataset's real half.
 
+    XX is the number in the sequence's name, 99 if the name has no number; n is the number of drones.
+
     The images are distorted by the lens and encoded again. The lens shows more than the simulated image: 8 % of
     the pixels, at the edges, repeat the border of the simulated image. Marker positions between the frames of the
     simulation are cubic splines; before frame 0 the drones stand still. `psotrack simulate NAME --set
