@@ -20,6 +20,7 @@ import hashlib
 import json
 import os
 import platform
+import re
 import shlex
 import shutil
 import subprocess
@@ -243,23 +244,35 @@ def reasons(result: Result) -> list[str]:
 def newer_files(commit: str, code: Sequence[str]) -> list[str]:
     """Files of the code whose content changed between a commit and HEAD.
 
-    Docstrings, comments and the messages of errors do not count.
+    Docstrings, comments, the messages of errors and declared new names do not count.
     """
     names = _git("diff", "--name-only", "--no-renames", commit, "HEAD", "--", *code).splitlines()
     return [name for name in names if not _same_code(commit, name)]
 
 
 def _same_code(commit: str, name: str) -> bool:
-    """Whether a Python file differs from that of the commit in docstrings, comments, messages and layout only."""
+    """Whether a Python file differs from that of the commit in docstrings, comments, messages, layout and names only.
+
+    Only names count that `results.toml` declares as renamed.
+    """
     if not name.endswith((".py", ".pyi")):
         return False
     old, new = (_content(at, name) for at in (commit, "HEAD"))
     if old is None or new is None:
         return False
+    renamed = old
+    for before, after in _new_names().items():
+        renamed = re.sub(rf"\b{before}\b", after, renamed)
     try:
-        return _stripped(old) == _stripped(new)
+        return _stripped(new) in (_stripped(old), _stripped(renamed))
     except SyntaxError:
         return False
+
+
+@cache
+def _new_names() -> dict[str, str]:
+    """Declared renames: the name before -> the name today."""
+    return tomllib.loads(REGISTRY.read_text(encoding="utf-8")).get("renamed", {})
 
 
 @cache

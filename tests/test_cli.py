@@ -261,6 +261,20 @@ def test_projection_lines_from_the_sequence_a_folder_and_blobs(
     assert errors["mean_error_m"] < 0.05
 
 
+def test_a_drone_that_no_detection_shows_has_no_size_in_the_record(
+    run: Run, sequence: Path, tmp_path: Path
+) -> None:
+    """Its size is null, because JSON has no NaN; the command failed after it had written the tracks."""
+    (tmp_path / "start.csv").write_text("frame,drone,x_m,y_m,z_m\n0,0,0,0,2\n0,1,3.5,-3.5,0.5\n")
+    result = run(
+        *track(sequence, tmp_path / "t.csv", "--method", "projection-lines", "--init", tmp_path / "start.csv")
+    )
+    assert result.code == 0, result
+    assert [None] * 3 in [
+        drone["size_m"] for drone in json.loads((tmp_path / "t.json").read_text())["drones"]
+    ]
+
+
 def test_missing_and_empty_detections_are_errors(run: Run, sequence: Path, tmp_path: Path) -> None:
     lines = ("--method", "projection-lines")
     nowhere = run(*track(sequence, tmp_path / "t.csv", *lines, "--detections", tmp_path / "nowhere"))

@@ -92,6 +92,19 @@ def test_docstrings_and_comments_do_not_make_a_result_older(project: Path) -> No
     assert run_results_script(project, "check").returncode == 0
 
 
+def test_a_declared_new_name_does_not_make_a_result_older(project: Path) -> None:
+    (project / "library" / "a.py").write_text('"""A module."""\nWIDTH = 1\n')
+    commit(project)
+    assert "library/a.py" in run_results_script(project, "check").stdout
+    registry = project / "experiments" / "results.toml"
+    registry.write_text(REGISTRY + '[renamed]\nSIZE = "WIDTH"\n')
+    commit(project)
+    assert run_results_script(project, "check").returncode == 0
+    (project / "library" / "a.py").write_text('"""A module."""\nWIDTH = 2\n')
+    commit(project)
+    assert "library/a.py" in run_results_script(project, "check").stdout
+
+
 def test_a_changed_working_tree_is_recorded_and_named(project: Path) -> None:
     (project / "library" / "b.py").write_text("SIZE = 3\n")
     assert run_results_script(project, "make").returncode == 0

@@ -77,19 +77,32 @@ def check_outputs(out: Path | None, json_path: Path | None, force: bool) -> None
 
 
 def output_json(json_path: Path | None, content: Any, force: bool) -> None:
-    """Write JSON for programs, to stdout or to a new file.
+    """Write JSON for programs, to stdout or to a new file; a missing number, NaN, is written as null.
 
     Raises:
         OutputError: the file exists and `force` is not set.
     """
     if json_path == Path("-"):
-        click.echo(json.dumps(content, indent=2, allow_nan=False))
+        click.echo(_json_text(content))
     elif json_path is not None:
         refuse_to_overwrite(json_path, force)
         write_json(json_path, content)
 
 
 def write_json(path: str | Path, content: Any) -> None:
-    """Write a JSON file; an interruption leaves no partial file."""
+    """Write a JSON file, NaN as null; an interruption leaves no partial file."""
     with atomic_write(Path(path)) as temporary:
-        temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        temporary.write_text(_json_text(content) + "\n", encoding="utf-8")
+
+
+def _json_text(content: Any) -> str:
+    """The content as JSON. JSON has no NaN: a missing number is null. Infinite numbers are an error of the caller."""
+    return json.dumps(_with_null(content), indent=2, allow_nan=False)
+
+
+def _with_null(content: Any) -> Any:
+    if isinstance(content, dict):
+        return {key: _with_null(value) for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [_with_null(value) for value in content]
+    return None if isinstance(content, float) and math.isnan(content) else content

@@ -32,7 +32,7 @@ from psotrack.estimation import (
     covariance_from_information,
     levenberg_marquardt,
 )
-from psotrack.inside_out.mapping.scene import Linearised, MappedScene, linearised, outward
+from psotrack.inside_out.mapping.scene import LinearisedScene, MappedScene, linearised, outward
 from psotrack.inside_out.mapping.sightings import MarkerSightings
 
 #: Relative change of the cost that ends the search; the robust search only has to find the outliers.
@@ -105,7 +105,7 @@ class _Bundle:
     robust: bool
 
     @cached_property
-    def slopes(self) -> Linearised:
+    def slopes(self) -> LinearisedScene:
         """Residuals and derivatives of all sightings."""
         return linearised(self.problem.sightings, self.scene)
 

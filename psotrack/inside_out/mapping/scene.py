@@ -68,7 +68,7 @@ def _unit(vectors: Float[np.ndarray, "*vectors 2"]) -> Float[np.ndarray, "*vecto
 
 
 @dataclass(frozen=True)
-class Linearised:
+class LinearisedScene:
     """Residuals of corners, and derivatives of the projected corners, pixels.
 
     Attributes:
@@ -83,7 +83,7 @@ class Linearised:
     by_rest: Float[np.ndarray, "sightings 4 2 8"]
 
 
-def linearised(sightings: MarkerSightings, scene: MappedScene) -> Linearised:
+def linearised(sightings: MarkerSightings, scene: MappedScene) -> LinearisedScene:
     """Residuals and derivatives of all sightings; the scene has all their markers and views."""
     row, view = scene.rows(sightings), sightings.view
     video = sightings.lens[view]
@@ -112,4 +112,4 @@ def linearised(sightings: MarkerSightings, scene: MappedScene) -> Linearised:
         (by_point * arm).sum(axis=-1, keepdims=True),
         inward[..., None],
     ]
-    return Linearised(off, np.concatenate([by_turn, by_shift], axis=-1), np.concatenate(rest, axis=-1))
+    return LinearisedScene(off, np.concatenate([by_turn, by_shift], axis=-1), np.concatenate(rest, axis=-1))
