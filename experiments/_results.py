@@ -132,11 +132,25 @@ class Run:
         facts = json.dumps([self._facts[key] for key in ("commit", "dirty", "command")])
         return hashlib.sha256(facts.encode()).hexdigest()
 
-    def copy(self, paths: Iterable[Path], folder: Path, *, figures: Mapping[str, Any] | None = None) -> None:
-        """Copy the files of a result into `folder`, and write the record beside them."""
+    def copy(
+        self,
+        paths: Iterable[Path],
+        folder: Path,
+        *,
+        figures: Mapping[str, Any] | None = None,
+        files: Iterable[Path] = (),
+    ) -> None:
+        """Copy the files of a result into `folder`, and write the record beside them.
+
+        Args:
+            paths: files to copy.
+            folder: folder of the result; made if it is missing.
+            figures: figures that are no rows, fit for JSON.
+            files: further files of the result, pictures for instance, which exist already and are not copied.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         copies = [Path(shutil.copy(path, folder)) for path in paths]
-        self.save(folder, figures=figures, files=copies)
+        self.save(folder, figures=figures, files=[*copies, *files])
 
     def save(
         self,

@@ -2,12 +2,14 @@
 
     python experiments/simulation/drone_models.py --out experiments/pictures
 
-Writes drone_models.png: each model from three sides, with its full size, rotors included.
+Writes drone_models.png: each model from three sides, with its full size, rotors included. The record is
+results/drone_models.json beside this file.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 import cv2
@@ -20,6 +22,9 @@ from psotrack.simulation import Scene, build, scenario
 from psotrack.simulation.imaging import posing, raster, sensor
 from psotrack.simulation.scenarios import Drone, Harmonic, Harmonics, Variation
 from psotrack.simulation.world.drones import MODELS, DroneModel, disc_fans
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+import _results
 
 PAINT_BGR = {
     "x_frame": (0.03, 0.03, 0.03),
@@ -96,8 +101,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--out", type=Path, default=Path("experiments/pictures"), help="folder")
-    folder = parser.parse_args().out
+    parser.add_argument(
+        "--out", type=Path, default=Path("experiments/pictures"), help="folder of the picture"
+    )
+    parser.add_argument(
+        "--results", type=Path, default=Path(__file__).parent / "results", help="folder of the record"
+    )
+    options = parser.parse_args()
+    run = _results.Run("drone_models")
     scene = hovering()
     heights_m = [max(over_all_m(model)[0], 0.36) + 0.06 for model in scene.models]
     figure = Figure(figsize=(15.0, 10.6), layout="constrained")
@@ -120,9 +131,10 @@ def main() -> None:
         grid[row, 0].text(12, 46, f"{x:.0f} x {y:.0f} x {z:.0f} cm over all", fontsize=8, color=INK)
     for axes in grid.flat:
         axes.set(xticks=[], yticks=[])
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "drone_models.png"
+    options.out.mkdir(parents=True, exist_ok=True)
+    path = options.out / "drone_models.png"
     figure.savefig(path, dpi=80)
+    run.save(options.results, files=[path])
     print(path)
 
 

@@ -3,12 +3,13 @@
     python experiments/simulation/effects.py --out experiments/pictures
 
 Writes effect_NAME.png for each effect of `scenarios.Imaging`. Where an effect is mild by default it is exaggerated;
-the titles say by how much.
+the titles say by how much. The record of all pictures is results/effects.json beside this file; --only writes none.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,9 @@ from psotrack.simulation import CameraRenderer, Scenario, build, scenario
 from psotrack.simulation.imaging.sensor import Sensor, flicker_gain
 from psotrack.simulation.scenarios import CameraPlace, Drone, Harmonic, Harmonics, Imaging, Limits, Variation
 from psotrack.support import COLOURS
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+import _results
 
 Vector = tuple[float, float, float]
 
@@ -277,13 +281,19 @@ def flicker() -> Figure:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("experiments/pictures"))
+    parser.add_argument(
+        "--out", type=Path, default=Path("experiments/pictures"), help="folder of the pictures"
+    )
+    parser.add_argument(
+        "--results", type=Path, default=Path(__file__).parent / "results", help="folder of the record"
+    )
     curves_of = {"drift": drift, "flicker": flicker}
     names = [*(pair.name for pair in PAIRS), *curves_of]
     parser.add_argument(
         "--only", nargs="*", choices=names, metavar="NAME", help=f"some of {', '.join(names)}"
     )
     options = parser.parse_args()
+    run = _results.Run("effects")
     options.out.mkdir(parents=True, exist_ok=True)
     for pair in PAIRS:
         if not options.only or pair.name in options.only:
@@ -296,6 +306,8 @@ def main() -> None:
                 Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"),
                 options.out / f"effect_{name}.png",
             )
+    if not options.only:
+        run.save(options.results, files=[options.out / f"effect_{name}.png" for name in names])
 
 
 if __name__ == "__main__":

@@ -80,9 +80,12 @@ def main() -> None:
         if flown:
             show(flown, options.out)
             if options.results:
-                for name, picture in PICTURES.items():
-                    shutil.copy(options.out / name, options.results.parents[1] / "pictures" / picture)
-                run.copy([options.out / name for name in FILES], options.results)
+                folder = options.results.parents[1] / "pictures"
+                pictures = [
+                    Path(shutil.copy(options.out / name, folder / picture))
+                    for name, picture in PICTURES.items()
+                ]
+                run.copy([options.out / name for name in FILES], options.results, files=pictures)
     except PsotrackError as error:
         errors.append(error)
     if errors:
