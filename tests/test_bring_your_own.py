@@ -1,5 +1,6 @@
 """Search, score, method, background model and detector of one's own, from Python and by name on the command line."""
 
+import inspect
 import json
 import os
 import subprocess
@@ -22,8 +23,7 @@ from psotrack.geometry import project_boxes
 from psotrack.recordings import read_frames
 from psotrack.silhouettes import SilhouetteSettings, find_background, key_of
 from psotrack.simulation import SimulationSettings, simulate
-from psotrack.support import plugins
-from psotrack.tracking import camera_weights, find_score, find_search, foreground_and_area, tracker_settings
+from psotrack.tracking import camera_weights, find_score, find_search, foreground_and_area
 from psotrack.trajectories import DroneSizes, Status, Tracks
 
 ROOT = Path(__file__).parents[1]
@@ -219,8 +219,16 @@ def track(recording, tmp_path_factory):
     jax.config.update("jax_disable_most_optimizations", False)
 
 
-def mean_error_m(tracked, recording):
-    return pt.evaluate(tracked.trajectories, recording.truth).mean_error_m
+@pytest.fixture(scope="module")
+def empty_hall(recording):
+    """A picture of each camera without drones, (height, width, 3) uint8: the median of the frames."""
+    return tuple(
+        np.median(list(read_frames(video)), axis=0).astype(np.uint8) for video in recording.videos.values()
+    )
+
+
+def mean_error_m(trajectories, recording):
+    return pt.evaluate(trajectories, recording.truth).mean_error_m
 
 
 @pytest.fixture(scope="module")
@@ -230,7 +238,7 @@ def with_three_parts(track):
 
 def test_search_score_and_background_together_find_the_drones(with_three_parts, recording):
     assert with_three_parts.trajectories.seen.all()
-    assert mean_error_m(with_three_parts, recording) < NEAR_M
+    assert mean_error_m(with_three_parts.trajectories, recording) < NEAR_M
     parts = with_three_parts.record["parts"]
     assert {kind: part["class"].rpartition(".")[2] for kind, part in parts.items()} == {
         "search": "RandomSearch",
@@ -273,18 +281,15 @@ def test_the_tracks_of_a_method_are_the_result(track):
     assert tracked.record["parts"]["method"]["class"].endswith("Hover")
 
 
-def test_the_detector_decides_the_detections(track, recording):
-    empty = tuple(
-        np.median(list(read_frames(video)), axis=0).astype(np.uint8) for video in recording.videos.values()
-    )
-    tracked = track({"method": "projection-lines"}, detector=EmptyHallDetector(empty))
+def test_the_detector_decides_the_detections(track, recording, empty_hall):
+    tracked = track({"method": "projection-lines"}, detector=EmptyHallDetector(empty_hall))
     assert tracked.trajectories.seen.all()
-    assert mean_error_m(tracked, recording) < NEAR_M
+    assert mean_error_m(tracked.trajectories, recording) < NEAR_M
     assert tracked.record["parts"]["detector"]["key"]["threshold"] == 25
     with pytest.raises(
         SettingsError, match=r"detector: expected a method that reads detections.*method swarm"
     ):
-        track(detector=EmptyHallDetector(empty))
+        track(detector=EmptyHallDetector(empty_hall))
 
 
 def test_detections_reach_a_method_of_ones_own(track, recording):
@@ -325,25 +330,51 @@ def test_models_with_equal_keys_and_different_classes_have_silhouettes_of_their_
     assert len({key_of(video, settings, model) for model in models}) == 3
 
 
-@pytest.mark.parametrize(
-    ("kind", "setting", "make"),
-    [
-        ("search", {"swarm.search": "own"}, lambda settings: RandomSearch(step_m=settings.spread_m)),
-        ("score", {"score.kind": "own"}, lambda settings: Dice()),
-    ],
-)
-def test_a_registered_plugin_is_found_by_name(kind, setting, make):
-    settings = pt.TrackSettings().changed(setting)
-    with pytest.raises(SettingsError, match=r"expected one of .*, found own; no installed package adds more"):
-        tracker_settings(settings)
-    pt.register_plugin(kind, "own", make)
+#: Registers a search and a score by name; in a process of its own, because a plugin stays for the whole process.
+REGISTERED_PARTS = """
+import psotrack as pt
+from own_parts import Dice, RandomSearch
+from psotrack.errors import SettingsError
+from psotrack.tracking import tracker_settings
+
+settings = [pt.TrackSettings().changed({name: "own"}) for name in ("swarm.search", "score.kind")]
+for each in settings:
     try:
-        chosen = tracker_settings(settings)
-        assert (
-            chosen.search == RandomSearch(step_m=0.05) if kind == "search" else chosen.camera_score == Dice()
-        )
-    finally:
-        plugins._registered.clear()
+        tracker_settings(each)
+    except SettingsError as error:
+        print(error)
+pt.register_plugin("search", "own", lambda swarm: RandomSearch(step_m=2 * swarm.spread_m))
+pt.register_plugin("score", "own", lambda score: Dice(ring=2 * score.windows[-1]))
+print(tracker_settings(settings[0]).search)
+print(tracker_settings(settings[1]).camera_score)
+pt.register_plugin("search", "own", lambda swarm: RandomSearch(shrink=0.5))
+print(tracker_settings(settings[0]).search)
+"""
+
+
+def run_python(code, *folders):
+    """Run code in a new interpreter that imports from the folders and from this checkout."""
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (*folders, ROOT)))},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+
+
+def test_a_registered_plugin_is_found_by_name(tmp_path):
+    """The plugin is made from its part of the settings, and a second call replaces the plugin."""
+    write_own_parts(tmp_path)
+    assert run_python(REGISTERED_PARTS, tmp_path).stdout.splitlines() == [
+        "swarm.search: expected one of pso, found own; no installed package adds more "
+        "(entry points psotrack.searches)",
+        "score.kind: expected one of soft, hard, found own; no installed package adds more "
+        "(entry points psotrack.scores)",
+        "RandomSearch(step_m=0.1, shrink=0.8)",
+        "Dice(ring=2.0, whole_pixels=False, min_cameras=2)",
+        "RandomSearch(step_m=0.05, shrink=0.5)",
+    ]
 
 
 #: Wrong parts, each of which gets one line; in a process of its own, where no types are checked at every call.
@@ -369,13 +400,7 @@ for wrong in (
 
 
 def test_parts_without_the_interface_are_one_line():
-    ran = subprocess.run(
-        [sys.executable, "-c", WRONG_PARTS],
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    ran = run_python(WRONG_PARTS)
     expected = "expected an object with the attributes of psotrack"
     function = "found an object of builtin_function_or_method"
     assert ran.stdout.splitlines() == [
@@ -389,12 +414,20 @@ def test_parts_without_the_interface_are_one_line():
     ]
 
 
-#: A package that adds three plugins. Its search returns the tracker's prediction.
+#: A package that adds plugins of all kinds; the classes of `OWN_PARTS` follow. Its search returns the tracker's
+#: prediction, and its detector reads pictures of the empty hall from a file beside the module.
 PACKAGE = """
 from dataclasses import dataclass
+from pathlib import Path
+
 import cv2
 import jax
+import jax.numpy as jnp
 import numpy as np
+
+from psotrack.geometry import project_boxes
+from psotrack.tracking import camera_weights, foreground_and_area
+from psotrack.trajectories import DroneSizes, Status, Tracks
 
 @jax.tree_util.register_static
 @dataclass(frozen=True)
@@ -405,30 +438,49 @@ class Prediction:
 def prediction(settings):
     return Prediction()
 
+def high_dice(settings):
+    return HighDice(ring=1.5 * settings.windows[-1])
+
+def hover(settings):
+    return Hover(reads_detections=settings.method != "hover")
+
 def median(settings):
     return MedianBackground(reduction=settings.working_reduction)
 
+def empty_hall(settings):
+    pictures = np.load(Path(__file__).with_name("empty_hall.npy"))
+    return EmptyHallDetector(tuple(pictures), threshold=round(100 * settings.confidence))
+
 def broken(settings):
     return "no detector"
-
 """
+OWN_PARTS = (RandomSearch, Dice, HighDice, Hover, MedianBackground, EmptyHallDetector)
 ENTRY_POINTS = """
 [psotrack.searches]
 prediction = own_parts:prediction
+[psotrack.scores]
+high-dice = own_parts:high_dice
+[psotrack.methods]
+hover = own_parts:hover
 [psotrack.backgrounds]
 median = own_parts:median
 absent = own_parts:no_such_function
 [psotrack.detectors]
+empty-hall = own_parts:empty_hall
 broken = own_parts:broken
 """
+
+
+def write_own_parts(folder):
+    """Write the module `own_parts`, which no entry point names yet."""
+    (folder / "own_parts.py").write_text("\n\n".join([PACKAGE, *map(inspect.getsource, OWN_PARTS)]))
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     """A folder with an installed package that has entry points."""
     site = tmp_path_factory.mktemp("site")
-    _, background = Path(__file__).read_text().split("# --8<-- [start:background]\n", 1)
-    (site / "own_parts.py").write_text(PACKAGE + background.split("\n# --8<--")[0])
+    write_own_parts(site)
     info = site / "own_parts-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: own-parts\nVersion: 1.0\n")
@@ -443,31 +495,55 @@ def run_psotrack(site, *words):
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
 
-def test_entry_points_on_the_command_line(site, root, tmp_path):
-    out = tmp_path / "tracks.csv"
-    words = ["--search", "prediction", "--background", "median", "--score", "hard", "--init", "truth"]
-    words += ["--drone-size", "0.5,0.5,0.2", "--particles", 16, "--cameras", ",".join(CAMERAS), "--jobs", 1]
-    ran = run_psotrack(
-        site,
-        "track",
-        root / "Simulated_Data" / "S01_D2_A",
-        "--out",
-        out,
-        "--cache",
-        tmp_path / "cache",
-        *words,
-    )
-    assert ran.returncode == 0, ran.stderr
-    record = json.loads(out.with_suffix(".json").read_text())
+@pytest.fixture
+def run_track(site, root, tmp_path):
+    """Runs `psotrack track` with the options, and returns the tracks and the record that the command wrote."""
+
+    def run_track(*options):
+        out = tmp_path / "tracks.csv"
+        words = ["track", root / "Simulated_Data" / "S01_D2_A", "--out", out, "--cache", tmp_path / "cache"]
+        words += ["--init", "truth", "--drone-size", "0.5,0.5,0.2", "--cameras", ",".join(CAMERAS)]
+        ran = run_psotrack(site, *words, "--jobs", 1, *options)
+        assert ran.returncode == 0, ran.stderr
+        return pt.read_trajectories(out, fps=25.0), json.loads(out.with_suffix(".json").read_text())
+
+    return run_track
+
+
+def test_search_score_and_background_by_entry_points(run_track):
+    options = ["--search", "prediction", "--score", "high-dice", "--background", "median", "--particles", 16]
+    tracks, record = run_track(*options)
     assert record["settings"]["swarm"]["search"] == "prediction"
+    assert record["settings"]["score"]["kind"] == "high-dice"
     assert record["parts"] == {
         "background": {"class": "own_parts.MedianBackground", "key": {"threshold": 25, "reduction": 2}}
     }
     # The measured position is always the predicted one, so the drones fly on with the velocity of frame 0.
-    tracks = pt.read_trajectories(out, fps=25.0)
     steps_m = np.diff(tracks.position_m, axis=0)
     assert np.abs(steps_m).max() > 0.01
     np.testing.assert_allclose(steps_m, np.broadcast_to(steps_m[0], steps_m.shape), atol=1e-3)
+    # The fitness of HighDice, as in Python.
+    assert (tracks.fitness >= 0.9).all()
+    assert (tracks.fitness < 1.0).all()
+
+
+def test_a_method_by_an_entry_point(run_track):
+    """The drones stay where they are at frame 0; no method of the package writes such tracks of flying drones."""
+    tracks, record = run_track("--method", "hover")
+    assert record["settings"]["method"] == "hover"
+    start_m = np.asarray(record["start"]["position_m"])
+    np.testing.assert_allclose(tracks.position_m, np.broadcast_to(start_m, (NUM_FRAMES, 2, 3)), atol=1e-4)
+
+
+def test_a_detector_by_an_entry_point(run_track, site, recording, empty_hall):
+    np.save(site / "empty_hall.npy", np.stack(empty_hall))
+    tracks, record = run_track("--method", "projection-lines", "--detector", "empty-hall")
+    detector = record["parts"]["detector"]
+    assert detector["class"] == "own_parts.EmptyHallDetector"
+    # The threshold is made from the smallest confidence of the detector's settings, 0.25.
+    assert detector["key"]["threshold"] == 25
+    assert tracks.seen.all()
+    assert mean_error_m(tracks, recording) < NEAR_M
 
 
 @pytest.mark.parametrize(
@@ -479,8 +555,7 @@ def test_entry_points_on_the_command_line(site, root, tmp_path):
         ),
         (
             lambda: find_score(pt.ScoreSettings(kind="iou")),
-            "score.kind: expected one of soft, hard, found iou; no installed package adds more "
-            "(entry points psotrack.scores)",
+            "score.kind: expected one of soft, hard, high-dice, found iou",
         ),
         (
             lambda: find_background("mean", SilhouetteSettings()),
@@ -503,7 +578,7 @@ def test_the_message_names_what_is_installed(site, monkeypatch, find, message):
 def test_a_detector_that_no_package_adds_is_one_line(site, root, tmp_path):
     sequence = root / "Simulated_Data" / "S01_D2_A"
     for name, message in [
-        ("yolo", "detector: expected one of MODEL.onnx (a file), broken, found yolo"),
+        ("yolo", "detector: expected one of MODEL.onnx (a file), broken, empty-hall, found yolo"),
         (
             "broken",
             "detector broken: expected an object with the attributes of psotrack.Detector, found an object of str",
