@@ -232,6 +232,22 @@ def test_the_architecture_page_lists_the_rooms_in_this_order():
     ]
 
 
+def public_classes(package):
+    """Name of each class without a leading underscore -> the modules of the package that define such a class."""
+    found = {}
+    for path in sorted(package.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                found.setdefault(node.name, []).append(module_name(path.relative_to(package)))
+    return found
+
+
+def test_no_two_public_classes_have_one_name():
+    classes = public_classes(PACKAGE)
+    assert len(classes) > 100
+    assert {name: modules for name, modules in classes.items() if len(modules) > 1} == {}
+
+
 def test_few_files_stand_at_the_root():
     assert len(list(PACKAGE.glob("*.py"))) <= MOST_ROOT_FILES
 
