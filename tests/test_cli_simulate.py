@@ -86,6 +86,7 @@ def test_preview_writes_one_picture_and_no_sequence(tmp_path):
     assert "pass --force" in refusal_message("S01_D2_A", "--preview", "--out", tmp_path, "--frames", "3")
 
 
+@pytest.mark.slow
 def test_preview_uses_the_given_seed(tmp_path, monkeypatch):
     """The flight plans and all four pictures are made from the given seed."""
     seeds = []

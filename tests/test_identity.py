@@ -628,6 +628,7 @@ class TestInvalidInput:
 
 
 class TestFrequencies:
+    @pytest.mark.slow
     def test_ambiguities_are_the_frequencies_of_wrong_labels(self):
         """A hundred encounters whose flights, errors and swaps follow the model.
 

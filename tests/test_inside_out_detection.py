@@ -155,6 +155,7 @@ def test_corners_are_better_than_opencvs_in_blurred_images(changes):
 
 @pytest.mark.parametrize("exponent", [1.0, 1.8, 2.4])
 @pytest.mark.parametrize("changes", [{}, {"blur_px": 2.5}, {"moved_px": 9}], ids=["sharp", "soft", "moved"])
+@pytest.mark.slow
 def test_corners_are_right_for_every_gamma(changes, exponent):
     """Renderers blend grey levels, cameras blend light. A fixed gamma of 2 gives 1.5 pixels in blurred grey images."""
     # Measured 0.09 at most.
@@ -162,6 +163,7 @@ def test_corners_are_right_for_every_gamma(changes, exponent):
 
 
 @pytest.mark.parametrize("exponent", [1.0, 1.5, 2.0, 2.5])
+@pytest.mark.slow
 def test_gamma_is_estimated_from_markers(exponent):
     image, corners = scene(exponent=exponent, blur_px=1.5)
     white = np.concatenate([white_cells(marker) for marker in corners])
@@ -210,6 +212,7 @@ def test_shade_hides_no_markers():
     assert errors_px(image, corners).max() < 0.2
 
 
+@pytest.mark.slow
 def test_black_cells_of_a_large_marker_do_not_count_as_white():
     """Neighbouring black cells of this marker are nearly as wide as the square in which white is searched."""
     around = 0.1 + np.deg2rad(np.array([225, 315, 405, 495]))

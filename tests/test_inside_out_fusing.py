@@ -269,6 +269,7 @@ def test_a_source_with_huge_covariances_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("stated", [0.4, 1.0, 2.5])
+@pytest.mark.slow
 def test_fused_tracks_are_better_than_both_sources_with_consistent_covariances(stated) -> None:
     """Also if both sources state errors that are too small or too large."""
     better, nees, off = [], [], []

@@ -223,6 +223,7 @@ def random_estimates(rng, count, noise_px, place_m, stated, number):
         pytest.param(0.3, 0.003, SETTINGS, 0.7, id="marker offsets thirty times as stated"),
     ],
 )
+@pytest.mark.slow
 def test_covariances_agree_with_the_errors(noise_px, place_m, stated, least):
     poses = random_estimates(np.random.default_rng(2), 8, noise_px, place_m, stated, 120)
     squares = np.array([squared_deviations(found, view) for found, view in poses])
@@ -236,6 +237,7 @@ def test_covariances_agree_with_the_errors(noise_px, place_m, stated, least):
 @pytest.mark.parametrize(
     ("map_error_m", "focal_error"), [(0.002, 0.0), (0.0, 0.005), (0.002, 0.005)], ids=["map", "focal", "both"]
 )
+@pytest.mark.slow
 def test_covariance_includes_errors_of_the_map_and_of_the_focal_length(map_error_m, focal_error):
     """Six markers with noise of 0.1 px; each pose has another map and another lens."""
     rng = np.random.default_rng(12)

@@ -316,6 +316,7 @@ class TestFloat32:
         )
 
     @pytest.mark.parametrize("error_share", [0.0, 0.5, 0.99])
+    @pytest.mark.slow
     def test_positive_definite_for_ten_thousand_frames(self, error_share):
         """Deviations from a micrometre to a metre in one measurement are closer to singular than float32 resolves."""
         flown = self.long_flight((-3, 0), 4, error_share)
@@ -328,6 +329,7 @@ class TestFloat32:
             np.testing.assert_array_equal(symmetric, np.swapaxes(symmetric, -1, -2))
 
     @pytest.mark.parametrize("error_share", [0.0, 0.5])
+    @pytest.mark.slow
     def test_right_for_ten_thousand_frames(self, error_share):
         """Deviations from a millimetre to a decimetre, with axes in ratios up to 30, as from the cameras of a hall."""
         flown = self.long_flight((-2, -1), 1.5, error_share)

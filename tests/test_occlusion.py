@@ -210,6 +210,7 @@ def shifts_m(size_m, apart_m, off_m, occluding):
     # 1.5 mm. If the occluded foreground is removed but its area is not: 33, 13, 3 and 4 mm.
     [(0.3, 0.012, 0.005), (0.45, 0.006, 0.015), (0.6, 0.003, 0.005), (0.9, 0.0025, 0.001)],
 )
+@pytest.mark.slow
 def test_a_neighbour_hardly_moves_the_best_position(apart_m, mean_m, without_m):
     for widths_m, off_m in (((0.45, 0.45), 0.02), ((0.4, 0.5), 0.0)):
         size_m = np.stack([flat_size(width) for width in widths_m])
@@ -230,6 +231,7 @@ def test_drones_that_almost_touch_keep_their_scores():
         assert np.linalg.norm(best - pair, axis=-1).max() < 0.018
 
 
+@pytest.mark.slow
 def test_occlusion_changes_no_score_of_distant_drones():
     size_m = np.stack([flat_size(0.4), flat_size(0.5)])
     pair = np.array([THERE_M, THERE_M + np.array([-0.9, 0.9, -0.5])])

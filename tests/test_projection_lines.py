@@ -91,6 +91,7 @@ def test_perfect_boxes_give_the_drones_to_a_millimetre():
 
 
 @pytest.mark.parametrize("seed", range(2))
+@pytest.mark.slow
 def test_six_drones_with_missed_boxes_and_false_alarms(seed):
     """A tenth of the boxes is missing, centres are off by 5 % of the sides, half of the images have a false alarm."""
     truth_m = circles(6)

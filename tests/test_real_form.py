@@ -26,6 +26,8 @@ from psotrack.simulation import (
 from psotrack.simulation.real_form import SERIALS
 from psotrack.trajectories import Status
 
+pytestmark = pytest.mark.slow
+
 NUM_FRAMES, OFFSET_S = 25, 0.377
 
 

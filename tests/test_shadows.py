@@ -169,6 +169,7 @@ def test_is_low_compares_the_height_with_the_width():
 
 @pytest.mark.parametrize("lamps", LAMPS)
 @pytest.mark.parametrize("height_m", [0.1, 0.15, 0.2, 0.3])
+@pytest.mark.slow
 def test_a_shadow_on_the_floor_does_not_move_the_place(lamps, height_m, size_m):
     """The largest measured shift is 9 mm, a third of a silhouette pixel.
 
@@ -234,6 +235,7 @@ def test_a_drone_on_the_floor_keeps_its_score_and_place(size_m):
     )
 
 
+@pytest.mark.slow
 def test_windows_of_high_and_of_non_occluding_drones_do_not_change(size_m):
     """Only the window of the low drone changes; the other two windows are equal to the last bit."""
     images = draw_silhouettes(position_at(0.15), LAMPS["three"])

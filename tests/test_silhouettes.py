@@ -408,6 +408,7 @@ def _stored_keys(cache: Path) -> list[str]:
 # There are 120 frames in total: each camera has 10 frames to learn the background and 30 frames; a chunk has 25 frames.
 @pytest.mark.parametrize("after_frames", [0, 1, 75, 100])
 @pytest.mark.parametrize("whole_group", [False, True])
+@pytest.mark.slow
 def test_a_killed_computation_is_resumed(
     folder: Path, tmp_path: Path, decoded_videos: list[str], after_frames: int, whole_group: bool
 ) -> None:

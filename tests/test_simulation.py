@@ -300,6 +300,7 @@ def test_an_interrupted_simulation_continues_at_its_segment(pair_folder, tmp_pat
 
 @pytest.mark.usefixtures("short_segments")
 @pytest.mark.parametrize("step", ["join_videos", "join_archives", "write_onboard_calibration", "rmtree"])
+@pytest.mark.slow
 def test_an_interruption_after_the_last_frame_renders_no_frame_again(
     pair_folder, tmp_path, monkeypatch, step
 ):

@@ -447,6 +447,7 @@ def test_without_noise_the_detector_reports_the_boxes_that_are_seen(scene):
 
 
 @pytest.mark.parametrize("rate", [0.0, 0.03, 0.3, 1.0])
+@pytest.mark.slow
 def test_misses_and_double_detections_have_their_set_rates(scene, rate):
     frames = 800
     missing = scene_with_detector(scene, miss_rate=rate)

@@ -134,6 +134,7 @@ def test_the_large_hall_is_seen_by_most_cameras_from_10_to_11_m():
 # --- markers
 
 
+@pytest.mark.slow
 def test_41_markers_are_on_the_walls_and_face_inwards(hall_name):
     hall = HALLS[hall_name]
     corners_m = rooms.room(hall_name, True, 0.1).marker_corners_m
@@ -177,6 +178,7 @@ def full_size():
     return rooms.room("large_hall", True, 1.0)
 
 
+@pytest.mark.slow
 def test_the_large_hall_at_full_size_fits_in_170_mb(full_size):
     assert sum(surface.texture.nbytes for surface in full_size.surfaces) < 170e6  # measured 158 MB
 

@@ -55,6 +55,7 @@ def chunk(size_m):
 @pytest.mark.parametrize(
     ("size_m", "coefficients"), [((0.5, 0.5, 0.2), 0), ((0.35, 0.35, 0.3), 5), ((0.6, 0.6, 0.4), 5)]
 )
+@pytest.mark.slow
 def test_an_ellipsoid_has_the_same_measured_size_everywhere(size_m, coefficients):
     rig = ring_rig(5, image_size_wh=(640, 480), coefficients=coefficients)
     shown = measure(images(PLACES_M, np.array(size_m), rig), PLACES_M, size_m, rig=rig).size_m

@@ -82,6 +82,7 @@ class TestSmoothing:
 
     @pytest.mark.parametrize("unknown", [0.0, 0.4])
     @pytest.mark.parametrize("error_share", [0.0, 0.5])
+    @pytest.mark.slow
     def test_covariances_cover_the_errors(self, unknown, error_share):
         """NEES of independent drones is chi-square with 3 degrees each; one seed in 1,000 fails by chance."""
         drones = 300
@@ -236,6 +237,7 @@ class TestJerkDensity:
 
     @pytest.mark.parametrize("error_share", [0.0, 0.5])
     @pytest.mark.parametrize("density", [0.3, 30.0, 3000.0])
+    @pytest.mark.slow
     def test_the_density_is_found_from_the_measurements(self, density, error_share):
         flown = simulate_flight(
             12, frames=self.FRAMES, drones=8, density=density, error_share=error_share, steady=True

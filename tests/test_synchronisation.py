@@ -348,6 +348,7 @@ class TestCameraOffsets:
         np.testing.assert_allclose(found.offset_frames, OFFSET_FRAMES, atol=3e-3)
 
     @pytest.mark.parametrize("errors", ["independent", "correlated", "turning", "calibration"])
+    @pytest.mark.slow
     def test_the_true_offsets_are_within_two_standard_deviations(self, errors):
         """Of 8 x 7 offsets at least 85 % are inside; chance gives fewer in 0.5 % of cases if 95 % is right.
 

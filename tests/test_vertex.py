@@ -121,6 +121,7 @@ VIEW = score_view(np.array([[0.1, 0.2, 1.2]]))
 
 
 @pytest.mark.parametrize("order", [[2, 0, 1], [1, 2, 0]])
+@pytest.mark.slow
 def test_the_order_of_drones_does_not_matter(order):
     """Whole images contain no occlusion by other drones, so each drone's result depends on that drone only."""
     truth = np.array([[0.0, 0.0, 1.2], [0.9, -0.4, 1.0], [-0.8, 0.7, 1.5]])
