@@ -26,6 +26,8 @@ from psotrack.simulation import SimulationSettings, simulate
 from psotrack.tracking import camera_weights, find_score, find_search, foreground_and_area
 from psotrack.trajectories import DroneSizes, Status, Tracks
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 #: Few cameras, particles and frames, because compiling takes most of the time.
 CAMERAS, NUM_FRAMES = ("cam1", "cam3", "cam6", "cam8"), 8
@@ -514,7 +516,6 @@ def run_track(site, root, tmp_path):
     return run_track
 
 
-@pytest.mark.slow
 def test_search_and_background_by_entry_points(run_track):
     tracks, record = run_track("--search", "prediction", "--background", "median", "--score", "hard", *SMALL)
     assert record["settings"]["swarm"]["search"] == "prediction"
@@ -527,7 +528,6 @@ def test_search_and_background_by_entry_points(run_track):
     np.testing.assert_allclose(steps_m, np.broadcast_to(steps_m[0], steps_m.shape), atol=1e-3)
 
 
-@pytest.mark.slow
 def test_a_score_by_an_entry_point(run_track):
     """Its fitness is that of HighDice, as in Python: 0.9, rounded to float32, or more."""
     tracks, record = run_track("--score", "high-dice", "--search", "prediction", *SMALL)
@@ -536,7 +536,6 @@ def test_a_score_by_an_entry_point(run_track):
     assert (tracks.fitness < 1.0).all()
 
 
-@pytest.mark.slow
 def test_a_method_by_an_entry_point(run_track):
     """The drones stay where they are at frame 0; no method of the package writes such tracks of flying drones."""
     tracks, record = run_track("--method", "hover")
@@ -545,7 +544,6 @@ def test_a_method_by_an_entry_point(run_track):
     np.testing.assert_allclose(tracks.position_m, np.broadcast_to(start_m, (NUM_FRAMES, 2, 3)), atol=1e-4)
 
 
-@pytest.mark.slow
 def test_a_detector_by_an_entry_point(run_track, site, recording, empty_hall):
     np.save(site / "empty_hall.npy", np.stack(empty_hall))
     tracks, record = run_track("--method", "projection-lines", "--detector", "empty-hall")

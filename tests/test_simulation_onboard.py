@@ -232,6 +232,7 @@ def test_colours_agree_with_a_fixed_camera_at_the_same_pose(scene):
 
 
 @pytest.mark.parametrize("drone", [0, 3])
+@pytest.mark.slow
 def test_markers_in_onboard_frames_are_detected_at_their_projection(full_size, tmp_path, drone):
     """Frames have full size, optics, motion blur and noise; the pose is read from its file, and OpenCV projects."""
     path = tmp_path / onboard_pose_file(drone + 1)
@@ -245,6 +246,7 @@ def test_markers_in_onboard_frames_are_detected_at_their_projection(full_size, t
     check_corners(found, cam, full_size.room.marker_corners_m)
 
 
+@pytest.mark.slow
 def test_markers_in_frames_of_a_wall_camera_are_detected_at_their_projection(full_size):
     renderer = CameraRenderer(full_size, 0)
     found = detect_aruco(renderer.frame(0))

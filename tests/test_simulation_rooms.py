@@ -13,6 +13,8 @@ from psotrack.simulation.scenarios import Imaging
 from psotrack.simulation.world import lighting, rooms
 from psotrack.simulation.world.halls import HALLS, RIGS
 
+pytestmark = pytest.mark.slow
+
 HALL_OF_RIG = {"laboratory": "laboratory", "laboratory_corners": "laboratory", "large_hall": "large_hall"}
 #: Hall -> lower and upper corner of the flight volume, (x, y, z), metres.
 VOLUMES = {
@@ -134,7 +136,6 @@ def test_the_large_hall_is_seen_by_most_cameras_from_10_to_11_m():
 # --- markers
 
 
-@pytest.mark.slow
 def test_41_markers_are_on_the_walls_and_face_inwards(hall_name):
     hall = HALLS[hall_name]
     corners_m = rooms.room(hall_name, True, 0.1).marker_corners_m
@@ -178,7 +179,6 @@ def full_size():
     return rooms.room("large_hall", True, 1.0)
 
 
-@pytest.mark.slow
 def test_the_large_hall_at_full_size_fits_in_170_mb(full_size):
     assert sum(surface.texture.nbytes for surface in full_size.surfaces) < 170e6  # measured 158 MB
 
