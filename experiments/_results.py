@@ -53,7 +53,7 @@ PACKAGES = (
     "zarr",
     "ezc3d",
 )
-PACKAGES += ("evosax", "pyswarms")
+PACKAGES += ("evosax", "pyswarms", "stonesoup")
 #: Keys that every record has.
 KEYS = ("result", "command", "commit", "dirty", "date", "machine", "versions", "files", "figures")
 #: Longest list of changed files that `check` prints for one result.

@@ -81,7 +81,7 @@ start = find_drones(
     reduction=SILHOUETTES.reduction,
     fps=recording.fps,
     bounds_m=room_bounds(recording.rig),
-    max_speed_m_s=settings.motion.max_speed_m_s,
+    max_speed_m_s=settings.motion.speed_limit_m_s,
 )
 predicted_m = jnp.asarray(start.position_m + start.velocity_m_s * FRAME / recording.fps, jnp.float32)
 truth_m = recording.truth.position_m[FRAME, DRONE]
@@ -103,7 +103,7 @@ params = swarm.SwarmParams(
     inertia=jnp.float32(settings.swarm.inertia),
     cognitive=jnp.float32(settings.swarm.cognitive),
     social=jnp.float32(settings.swarm.social),
-    max_step=jnp.full(3, settings.motion.max_speed_m_s / recording.fps, jnp.float32),
+    max_step=jnp.full(3, settings.motion.speed_limit_m_s / recording.fps, jnp.float32),
     low=predicted_m - HALF_M,
     high=predicted_m + HALF_M,
 )

@@ -2,11 +2,12 @@ from .api import background_model, detect_markers, read_recording, track
 from .clocks import find_offset
 from .detection import Detector
 from .evaluation import Evaluation, evaluate
-from .geometry import Rig, make_camera, make_rig, project, read_rig, triangulate, write_rig
+from .geometry import Rig, make_camera, make_rig, project, triangulate
 from .inside_out import MarkerMap, localise_video, read_marker_map
 from .methods import Method, MethodInputs
 from .pipeline import TrackedRecording, track_runs
 from .recordings import Recording, read_c3d
+from .rig_files import read_rig, write_rig
 from .settings import (
     DroneSettings,
     IdentitySettings,

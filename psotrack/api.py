@@ -9,7 +9,7 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 from jaxtyping import UInt8
 
-from psotrack.datasets.dpjait import read_sequence
+from psotrack.datasets import open_recording
 from psotrack.detection import Detector
 from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
 from psotrack.methods import Method
@@ -40,20 +40,20 @@ class BroughtParts(TypedDict, total=False):
 
 
 def read_recording(
-    folder: Path | str, *, cameras: Sequence[str] | None = None, num_frames: int | None = None
+    folder: Path | str, *, cameras: Sequence[str] | str | None = None, num_frames: int | None = None
 ) -> Recording:
-    """Read a recording in the layout of the DPJAIT dataset, checked to be fit for tracking.
+    """Read a recording, checked to be fit for tracking.
 
     Args:
-        folder: folder of the recording: calibration, one video per camera, and a reference where there is one.
-        cameras: names of the cameras to use; None uses all.
+        folder: a `recording.toml`, a folder that holds one, or a folder of the DPJAIT dataset.
+        cameras: names of the cameras to use, or one name; None uses all.
         num_frames: number of first frames to use; None uses all.
 
     Raises:
         InputError: the folder or one of its files cannot be used; the message says what to do.
         SettingsError: a camera is unknown, or the videos have fewer frames.
     """
-    return read_sequence(folder).usable(cameras, num_frames)
+    return open_recording(folder).usable(cameras, num_frames, videos=False)
 
 
 def track(
@@ -70,7 +70,7 @@ def track(
     Silhouettes are made by several processes: in a script, call this function below `if __name__ == "__main__":`.
 
     Args:
-        recording: recording from `read_recording`, or the folder of a recording.
+        recording: recording from `read_recording`, or its `recording.toml` or folder.
         settings: settings, or dotted names and values such as {"swarm.particles": 50}; None takes the defaults.
         cache: folder of stored silhouettes and detections; None takes the user's cache folder.
         jobs: number of processes for the silhouettes; None is one per processor.

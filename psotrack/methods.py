@@ -8,13 +8,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
+from psotrack.camera_errors import (
+    TrackErrors,
+    fused_errors,
+    views_in_images,
+    views_of_sightings,
+    views_of_silhouettes,
+    with_camera_errors,
+)
 from psotrack.correspondence import Sightings, from_detections, from_silhouettes
 from psotrack.datasets.dpjait import detection_files, read_detections
 from psotrack.errors import InputError
@@ -27,7 +35,7 @@ from psotrack.settings import BLOBS, YOLO, TrackSettings
 from psotrack.silhouettes import Silhouettes
 from psotrack.support import Report, digest_file, no_progress
 from psotrack.tracking import RunInputs, track_silhouettes
-from psotrack.trajectories import Tracks
+from psotrack.trajectories import Status, Tracks
 
 
 @dataclass(frozen=True)
@@ -57,7 +65,8 @@ class MethodResult:
         points: for each drone the point that its track follows.
         initial: state of the drones at frame 0.
         input_keys: digests of the inputs, by camera.
-        seconds: seconds of each stage; "track" and "compile" at least.
+        seconds: seconds of each stage; "track" and "compile" at least; "finish" so far.
+        errors: errors of the tracks that come from the cameras; None where the method states all errors itself.
     """
 
     tracks: Tracks
@@ -65,6 +74,7 @@ class MethodResult:
     initial: InitialState
     input_keys: Mapping[str, str]
     seconds: Mapping[str, float]
+    errors: TrackErrors | None = None
 
 
 @dataclass(frozen=True)
@@ -73,12 +83,13 @@ class MethodInputs:
 
     Attributes:
         rig: the cameras, calibrated.
-        silhouettes: silhouettes of all cameras (`Silhouettes.read` gives the coverage of some frames, 0 to 255); None
+        silhouettes: silhouettes of all cameras at the instants (`Silhouettes.read` gives the coverage of some of them,
+            0 to 255; `exposures` says when each camera's frame was exposed, None where all were exposed together); None
             where none were computed.
-        sightings: detections of all cameras in all frames; None for a method that does not read detections.
+        sightings: detections of all cameras at all instants; None for a method that does not read detections.
         initial: positions, velocities and sizes of the drones at frame 0, (drones, 3) each, metres and m/s.
         bounds_m: (2, 3), lowest and highest corner of the room, metres.
-        fps: frames per second.
+        fps: instants per second.
         settings: settings of the run; the seed of random numbers is `settings.seed`.
     """
 
@@ -149,9 +160,37 @@ def read_sightings(
         return DetectionInputs(blobs, dict(silhouettes.keys), time.perf_counter() - began)
     files = detection_files_of(recording, source)
     detections = {name: read_detections(path) for name, path in files.items()}
-    sightings = from_detections(detections, recording.rig, recording.num_frames)
+    times = [recording.frame_times[name] for name in recording.rig.names if name in recording.frame_times]
+    longest = max(each.num_frames for each in times)
+    sightings = from_detections(detections, recording.rig, longest).at_instants(recording.timeline())
     keys = {name: digest_file(path, algorithm="sha256")[:16] for name, path in files.items()}
     return DetectionInputs(sightings, keys, time.perf_counter() - began)
+
+
+def usable_for(
+    recording: Recording,
+    settings: TrackSettings,
+    *,
+    cameras: Sequence[str] | None = None,
+    num_frames: int | None = None,
+    videos: bool = False,
+) -> Recording:
+    """A recording with the cameras that these settings can use, and the detections that they name.
+
+    Args:
+        recording: the recording as it was opened.
+        settings: settings of a run.
+        cameras: names of the cameras to use; None uses all.
+        num_frames: number of instants to use from the start; None uses all.
+        videos: whether each camera needs a video, even if the settings do not need silhouettes.
+
+    Raises:
+        InputError: detections cannot be read, or no camera can be used (see `Recording.usable`).
+        SettingsError: a camera is unknown, or the recording has fewer instants.
+    """
+    if settings.reads_detections and settings.detections != YOLO:
+        recording = recording.with_detections(detection_files_of(recording, settings.detections))
+    return recording.usable(cameras, num_frames, videos=videos or settings.needs_silhouettes)
 
 
 def detection_files_of(recording: Recording, source: str) -> Mapping[str, Path]:
@@ -165,9 +204,9 @@ def detection_files_of(recording: Recording, source: str) -> Mapping[str, Path]:
     if recording.detections is None:
         raise InputError(
             recording.folder,
-            expected="detections in dl_data for --detections yolo",
+            expected="detections in dl_data or in recording.toml",
             found="none",
-            remedy="use --detections blobs",
+            remedy="use --detections blobs, or --detections FOLDER",
         )
     return {name: path for name, path in recording.detections.items() if name in recording.rig.names}
 
@@ -238,6 +277,7 @@ def fuse_methods(
     )
     seconds = {
         **swarm.seconds,
+        "finish": swarm.seconds.get("finish", 0.0) + lines.seconds.get("finish", 0.0),
         "compile": swarm.seconds["compile"] + lines.seconds["compile"],
         "track": swarm.seconds["track"] + lines.seconds["track"] + time.perf_counter() - began,
     }
@@ -247,6 +287,69 @@ def fuse_methods(
         for drone, known in enumerate(zip(_or_none(offset.offset_m), _or_none(offset.std_m), strict=True))
     )
     return MethodResult(tracks, points, swarm.initial, keys, seconds)
+
+
+def add_errors_of_silhouettes(
+    result: MethodResult, rig: Rig, silhouettes: Silhouettes, settings: TrackSettings, fps: float
+) -> MethodResult:
+    """The result of the swarm, with covariances that hold for the errors that the silhouettes show."""
+    began = time.perf_counter()
+    tracks = result.tracks
+    position_m, velocity_m_s = _found(tracks)
+    size_m = np.asarray(tracks.sizes.size_m, np.float64)
+    views = views_of_silhouettes(rig.cameras, silhouettes, size_m, position_m, velocity_m_s)
+    corrected, errors = with_camera_errors(tracks, views, settings.motion, settings.errors, fps)
+    return _with_errors(result, corrected, errors, began)
+
+
+def add_errors_of_detections(
+    result: MethodResult, rig: Rig, detections: DetectionInputs, settings: TrackSettings, fps: float
+) -> MethodResult:
+    """The result of the projection lines, with covariances that hold for the errors that the detections show."""
+    began = time.perf_counter()
+    views = views_of_sightings(rig.cameras, detections.sightings, *_found(result.tracks))
+    corrected, errors = with_camera_errors(result.tracks, views, settings.motion, settings.errors, fps)
+    return _with_errors(result, corrected, errors, began)
+
+
+def add_errors_of_both(
+    result: MethodResult,
+    swarm: MethodResult,
+    lines: MethodResult,
+    rig: Rig,
+    settings: TrackSettings,
+    fps: float,
+) -> MethodResult:
+    """The fused result, with covariances that hold for the errors of both methods.
+
+    A method that found no drone has no errors; those of the other method count.
+    """
+    began = time.perf_counter()
+    known = [each.errors.cameras for each in (swarm, lines) if each.errors is not None]
+    corrected, errors = fused_errors(
+        result.tracks,
+        views_in_images(rig.cameras, *_found(result.tracks)),
+        (known[0], known[-1]),
+        settings.errors,
+        settings.motion,
+        fps,
+    )
+    return _with_errors(result, corrected, errors, began)
+
+
+def _found(tracks: Tracks) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and velocities in float64, NaN in frames in which a drone was not found."""
+    found = (np.asarray(tracks.status) == Status.TRACKED)[..., None]
+    position_m, velocity_m_s = (
+        np.where(found, np.asarray(value, np.float64), np.nan)
+        for value in (tracks.position_m, tracks.velocity_m_s)
+    )
+    return position_m, velocity_m_s
+
+
+def _with_errors(result: MethodResult, tracks: Tracks, errors: TrackErrors, began: float) -> MethodResult:
+    seconds = {**result.seconds, "finish": result.seconds.get("finish", 0.0) + time.perf_counter() - began}
+    return replace(result, tracks=tracks, errors=errors, seconds=seconds)
 
 
 def track_by_plugin(method: Method, inputs: MethodInputs, report: Report = no_progress) -> MethodResult:

@@ -16,10 +16,14 @@ from psotrack.errors import SettingsError, check_positive
 from psotrack.silhouettes import SilhouetteSettings
 
 SwarmKind = Literal["joint", "per-drone"]
+Clocks = Literal["given", "auto"]
 
 #: Values of `TrackSettings.detections` that are not folders: the detections of the sequence, or blobs of its
 #: silhouettes.
 YOLO, BLOBS = "yolo", "blobs"
+
+#: Largest speed of a drone where neither the settings nor the data say more, m/s.
+USUAL_SPEED_M_S = 6.0
 
 #: Names of settings until version 0.1, and their names today; "" where a setting is gone.
 RENAMED = {
@@ -142,8 +146,9 @@ class MotionSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     """The motion model of the drones, and how measured positions err (see `psotrack.motion`).
 
     Attributes:
-        max_speed_m_s: largest speed of a drone, m/s.
-        jerk_density_m2_s5: spectral density of the white jerk: how quickly drones change their acceleration.
+        max_speed_m_s: largest speed of a drone, m/s; None: 6 m/s, or more where the data show more.
+        jerk_density_m2_s5: spectral density of the white jerk: how quickly drones change their acceleration; None: 1,
+            or more for drones that are faster than usual (see `jerk_density`).
         velocity_std_m_s, acceleration_std_m_s2: standard deviations of a new track's velocity and acceleration.
         error_share: share of the measured positions' variance that lasts from frame to frame, because what silhouettes
             show of a drone changes only as the drone turns.
@@ -153,8 +158,8 @@ class MotionSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         SettingsError: a value is not allowed.
     """
 
-    max_speed_m_s: float = 6.0
-    jerk_density_m2_s5: float = 1.0
+    max_speed_m_s: float | None = None
+    jerk_density_m2_s5: float | None = None
     velocity_std_m_s: float = 1.0
     acceleration_std_m_s2: float = 3.0
     error_share: float = 0.7
@@ -168,7 +173,24 @@ class MotionSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
             "acceleration_std_m_s2",
             "error_time_s",
         ):
-            check_positive(f"motion.{name}", getattr(self, name))
+            if getattr(self, name) is not None:
+                check_positive(f"motion.{name}", getattr(self, name))
+
+    @property
+    def speed_limit_m_s(self) -> float:
+        """Largest speed of a drone, m/s: `max_speed_m_s`, or `USUAL_SPEED_M_S`."""
+        return USUAL_SPEED_M_S if self.max_speed_m_s is None else self.max_speed_m_s
+
+    @property
+    def jerk_density(self) -> float:
+        """Spectral density of the white jerk, m²/s⁵: `jerk_density_m2_s5`, or what fits the speed limit.
+
+        Faster drones turn harder. On circles of one size the density grows with the fifth power of the speed; but fast
+        drones fly wider circles. The third power tracks best, in a wide optimum.
+        """
+        if self.jerk_density_m2_s5 is not None:
+            return self.jerk_density_m2_s5
+        return max(1.0, (self.speed_limit_m_s / USUAL_SPEED_M_S) ** 3)
 
 
 class DroneSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -203,6 +225,8 @@ class StatusSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     Attributes:
         min_fitness: smallest fitness of a drone that counts as found.
         min_cameras: smallest number of cameras that see a drone that counts as found, by foreground or by detections.
+        min_cameras_to_begin: number of cameras, at different places, that must agree to begin a track; None: three
+            where at least three cameras have the place in view, else two.
         max_coasting_s: seconds for which a drone that is not found coasts on its prediction before it is lost.
 
     Raises:
@@ -211,10 +235,13 @@ class StatusSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
     min_fitness: float = 0.1
     min_cameras: int = 2
+    min_cameras_to_begin: int | None = None
     max_coasting_s: float = 0.5
 
     def __post_init__(self) -> None:
         _check_least("status.min_cameras", self.min_cameras, 1)
+        if self.min_cameras_to_begin is not None:
+            _check_least("status.min_cameras_to_begin", self.min_cameras_to_begin, 2)
 
 
 class IdentitySettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -227,6 +254,28 @@ class IdentitySettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
     encounter_m: float = 0.6
     resolve_swaps: bool = True
+
+
+class ErrorSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is known of the cameras' errors beforehand; what the cameras show counts if it is more.
+
+    Attributes:
+        rig_deg: angle by which each camera is turned about a random axis, degrees.
+        pixel_px: standard deviation, along either axis, of the error of a drone's place in a camera's image that lasts
+            for as long as the drone stays in one part of the image, pixels.
+
+    Raises:
+        SettingsError: a value is not allowed.
+    """
+
+    rig_deg: float = 0.0
+    pixel_px: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("rig_deg", "pixel_px"):
+            value = getattr(self, name)
+            if not 0 <= value < float("inf"):
+                raise SettingsError(f"errors.{name}", expected="a number, 0 or more", found=f"{value:g}")
 
 
 class TrackSettings(
@@ -245,12 +294,16 @@ class TrackSettings(
         bounds_m: lowest and highest x, y and z of the room, metres: (x0, x1, y0, y1, z0, z1); None derives them from
             the cameras.
         smooth: whether later frames correct earlier ones.
+        rate_hz: instants per second at which drones are tracked; None is the rate of the fastest camera.
+        clocks: times of the cameras' frames: "given", those of the recording; or "auto", those corrected by each
+            camera's offset and drift, which are estimated from the motion of the drones. This takes a second pass.
         swarm: the search in one frame.
         score: the score of positions.
         motion: the motion model.
         drones: number and sizes of the drones.
         status: when a drone is found or lost.
         identity: encounters of drones.
+        errors: errors of the cameras that are known beforehand.
         silhouettes: how silhouettes are made.
 
     Raises:
@@ -263,16 +316,22 @@ class TrackSettings(
     init: str = "auto"
     bounds_m: tuple[float, float, float, float, float, float] | None = None
     smooth: bool = False
+    rate_hz: float | None = None
+    clocks: Clocks = "given"
     swarm: SwarmSettings = SwarmSettings()
     score: ScoreSettings = ScoreSettings()
     motion: MotionSettings = MotionSettings()
     drones: DroneSettings = DroneSettings()
     status: StatusSettings = StatusSettings()
     identity: IdentitySettings = IdentitySettings()
+    errors: ErrorSettings = ErrorSettings()
     silhouettes: SilhouetteSettings = SilhouetteSettings()
 
     def __post_init__(self) -> None:
         _check_least("seed", self.seed, 0)
+        _check_choice("clocks", self.clocks, get_args(Clocks))
+        if self.rate_hz is not None:
+            check_positive("rate_hz", self.rate_hz)
         if self.bounds_m is not None and any(
             low >= high for low, high in zip(self.bounds_m[::2], self.bounds_m[1::2], strict=True)
         ):

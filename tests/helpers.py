@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
-from psotrack.geometry import Camera, Rig, look_at, make_camera, make_rig, project, undistort
+from psotrack.geometry import Rig, look_at, make_camera, make_rig, project, undistort
 from psotrack.settings import RENAMED, TrackSettings
 
 #: Number of distortion coefficients -> coefficients in OpenCV's order, as strong as the distortion of action cameras.
@@ -83,7 +84,12 @@ def make_once(tmp_path_factory: pytest.TempPathFactory, name: str, make: Callabl
 
 def float32(tree):
     """Convert a pytree to JAX float32 arrays, the type in which the tracker computes."""
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), tree)
+
+    def convert(leaf):
+        is_bool = np.asarray(leaf).dtype == bool
+        return jnp.asarray(leaf, bool if is_bool else jnp.float32)
+
+    return jax.tree.map(convert, tree)
 
 
 def move_world(rig: Rig, R, shift_m) -> Rig:
@@ -91,7 +97,7 @@ def move_world(rig: Rig, R, shift_m) -> Rig:
     T_old_new = np.eye(4)
     T_old_new[:3, :3], T_old_new[:3, 3] = R.T, -R.T @ np.asarray(shift_m)
     cams = rig.cameras
-    return Rig(rig.names, Camera(cams.T_cam_world @ T_old_new, cams.K, cams.dist, cams.image_size_wh))
+    return Rig(rig.names, replace(cams, T_cam_world=cams.T_cam_world @ T_old_new))
 
 
 def assert_same(actual, desired, atol=0.0):

@@ -117,7 +117,8 @@ def make_older(results: Path, older_keys: dict[str, str]) -> None:
     columns = {f"settings.{today}": f"settings.{older}" for today, older in OLDER_NAMES.items()}
     (results / "errors").mkdir()
     for key, older_key in older_keys.items():
-        rows = pd.read_parquet(results / "cells" / f"{key}.parquet").drop(columns="settings.swarm.search")
+        rows = pd.read_parquet(results / "cells" / f"{key}.parquet")
+        rows = rows.drop(columns=["settings.swarm.search", "settings.status.min_cameras_to_begin"])
         rows = rows.rename(columns=columns).assign(**{"settings.refinements": 0, "cell": older_key})
         rows.to_parquet(results / "cells" / f"{older_key}.parquet", index=False)
         (results / "cells" / f"{key}.parquet").unlink()

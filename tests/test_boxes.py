@@ -3,12 +3,12 @@
 import jax
 import numpy as np
 import pytest
-from helpers import LENSES, float32, move_world, ring_rig, sphere_points
+from helpers import LENSES, float32, make_unnamed_rig, move_world, ring_rig, sphere_points
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from psotrack.geometry import make_extents, project, project_boxes
+from psotrack.geometry import look_at, make_camera, make_extents, project, project_boxes
 
 
 @jax.jit
@@ -67,6 +67,52 @@ def test_boxes_touch_the_outline(num_drones, num_cameras, coefficients):
     # half width: 0.005 px at 30 px. Float32 adds 0.001 px (see test_cameras). Distortion is applied to the middles of
     # the sides, not to the points of contact: measured 0.043 px for boxes of 14 to 44 px with these lenses, limit 0.06.
     np.testing.assert_allclose(xyxy, sampled, atol=0.06 if coefficients else 0.01)
+
+
+WIDE_K = np.array([[450.0, 0.0, 640.0], [0.0, 455.0, 360.0], [0.0, 0.0, 1.0]])
+BARREL = (-0.25, 0.0, 0.0, 0.0)
+
+
+def wide_camera(dist, *, fisheye=False):
+    """Camera at the origin that looks along the x axis."""
+    R, t_m = look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+    return make_camera(R=R, t_m=t_m, K=WIDE_K, image_size_wh=(1280, 720), dist=dist, fisheye=fisheye)
+
+
+def drones_at_angles(angles_deg, distance_m=4.0):
+    """Drones at these angles from the axis, half of them to the left and half of them upwards to the right."""
+    angle = np.radians(np.tile(angles_deg, 2))
+    around = np.repeat([0.0, 2.4], len(angles_deg))
+    across = np.sin(angle)
+    return distance_m * np.stack([np.cos(angle), across * np.cos(around), across * np.sin(around)], axis=-1)
+
+
+def test_boxes_of_a_fisheye_touch_the_outline_far_from_the_axis():
+    rig = make_unnamed_rig(
+        wide_camera((-0.012, 0.021, -0.018, 0.004), fisheye=True), wide_camera((-0.1, 0.02, 0.0, 0.0))
+    )
+    position_m = drones_at_angles([0.0, 20.0, 45.0, 65.0, 80.0])
+    size_m = np.array([[0.4, 0.3, 0.2]])
+    xyxy, in_front = compute_boxes(rig, position_m, size_m)
+    assert in_front[:, 0].all()
+    sampled = sampled_boxes(rig, position_m, size_m)
+    # Boxes are 20 to 50 px wide. The linear projection leaves out what is quadratic in the drone's angle of 6 degrees:
+    # measured 0.35 px at 80 degrees.
+    np.testing.assert_allclose(xyxy[:, 0], sampled[:, 0], atol=0.4)
+    # The other camera, which is no fisheye, has the boxes of a rig without fisheyes.
+    alone, _ = compute_boxes(make_unnamed_rig(wide_camera((-0.1, 0.02, 0.0, 0.0))), position_m, size_m)
+    np.testing.assert_allclose(xyxy[:4, 1], alone[:4, 0], atol=2e-3)
+
+
+def test_a_drone_beyond_the_fold_has_no_box():
+    """x (1 - x² / 4) grows up to an angle of 49 degrees, and is 0 again at 63 degrees."""
+    rig = make_unnamed_rig(wide_camera(BARREL))
+    position_m = drones_at_angles([0.0, 30.0, 40.0, 55.0, 63.43, 64.0, 75.0, 88.0])
+    size_m = np.array([[0.2, 0.2, 0.2]])
+    xyxy, in_front = compute_boxes(rig, position_m, size_m)
+    assert in_front[:, 0].reshape(2, -1).tolist() == 2 * [3 * [True] + 5 * [False]]
+    # The polynomial alone shows the fifth drone in the middle of the image.
+    assert np.abs(xyxy[4, 0].reshape(2, 2).mean(axis=0) - WIDE_K[:2, 2]).max() < 20
 
 
 def test_the_box_of_a_large_near_ellipsoid_is_exact():

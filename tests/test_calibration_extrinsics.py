@@ -56,6 +56,25 @@ def test_derivatives_equal_finite_differences(coefficients):
     np.testing.assert_allclose(np.concatenate([by_turn, by_shift], axis=-1), slopes, rtol=1e-4, atol=0.01)
 
 
+@pytest.mark.parametrize(
+    ("dist", "fisheye"),
+    [((-0.02, 0.01, -0.01, 0.002), True), ((-0.2, 0.05, 0.001, 0.0, 0.0, *7 * [0.001], 0.05, 0.02), False)],
+)
+def test_exact_points_give_the_pose_through_a_wide_lens(dist, fisheye):
+    """Points up to 70 degrees from the axis; one pixel lies where the lens shows nothing."""
+    wide_K = np.array([[480.0, 0, 959.5], [0, 480.0, 539.5], [0, 0, 1]])
+    R, t_m = look_at((4.0, -3.0, 2.0), (0.0, 0.0, 1.0))
+    camera = make_camera(R=R, t_m=t_m, K=wide_K, image_size_wh=(1920, 1080), dist=dist, fisheye=fisheye)
+    angle, around = np.radians(np.tile([10.0, 40.0, 55.0, 70.0], 3)), np.arange(12) * 2.4
+    rays = np.stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)], axis=-1)
+    points = (rays * np.linspace(2, 6, 12)[:, None] - t_m) @ R
+    pixels = project(camera, points)[0]
+    pixels[3] = (1e5, 1e5)
+    located = locate_camera(points, pixels, camera.K, camera.dist, fisheye=fisheye)
+    np.testing.assert_allclose(located.T_cam_world, camera.T_cam_world, atol=1e-7)
+    assert located.used.tolist() == [index != 3 for index in range(12)]
+
+
 @pytest.mark.parametrize("coefficients", sorted(LENSES))
 @pytest.mark.parametrize("count", [6, 12, 29])
 def test_exact_points_give_the_camera(count, coefficients):

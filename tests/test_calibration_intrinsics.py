@@ -91,3 +91,21 @@ def test_videos_that_do_not_determine_the_lens_are_refused(tmp_path):
         Board((7, 2), 0.04, 0.03)
     with pytest.raises(SettingsError, match=r"dictionary: expected one of .*, 4x4_50, .*, found 9x9"):
         Board((7, 5), 0.04, 0.03, "9x9").opencv()
+
+
+@pytest.mark.slow
+def test_a_lens_of_more_coefficients_from_a_board(tmp_path):
+    """The board is drawn without distortion: all coefficients are 0 within their deviations."""
+    rng = np.random.default_rng(0)
+    poses = [
+        (rng.uniform(-35, 35, 3), (rng.uniform(-0.1, 0.1), rng.uniform(-0.08, 0.08), rng.uniform(0.32, 0.55)))
+        for _ in range(12)
+    ]
+    video = board_video(tmp_path / "board.avi", poses)
+    lens = lens_of_board(video, BOARD, 5)
+    assert lens.camera.dist.shape == (5,)
+    assert lens.std.shape == (9,)
+    assert (np.abs(lens.camera.dist) < 6 * lens.std[4:] + 0.05).all()
+    assert lens_of_board(video, BOARD, 8).camera.dist.shape == (8,)
+    with pytest.raises(SettingsError, match="expected one of 4, 5, 8, 12, 14, found 3"):
+        lens_of_board(video, BOARD, 3)

@@ -194,7 +194,7 @@ GOOD = {
         ({"R": np.full((3, 3), np.inf)}, "expected finite numbers"),
         ({"dist": (0.1, np.nan, 0.0, 0.0)}, "expected finite numbers"),
         ({"image_size_wh": (0, 480)}, r"camera\.image_size_wh: expected sides of at least 1"),
-        ({"dist": (0.1, 0.2, 0.3)}, r"camera\.dist: expected 0, 4, 5 or 8 coefficients, found 3"),
+        ({"dist": (0.1, 0.2, 0.3)}, r"camera\.dist: expected 0, 4, 5, 8, 12 or 14 coefficients, found 3"),
     ],
 )
 def test_impossible_cameras_are_refused(change, message):

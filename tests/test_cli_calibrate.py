@@ -14,17 +14,9 @@ from psotrack.calibration import Board
 from psotrack.cli.calibrate import calibrate
 from psotrack.datasets.dpjait import read_sequence, write_calibration, write_detections, write_marker_corners
 from psotrack.errors import PsotrackError
-from psotrack.geometry import (
-    Rig,
-    look_at,
-    make_camera,
-    make_rig,
-    project,
-    read_lenses,
-    read_rig,
-    write_rig,
-)
+from psotrack.geometry import Rig, look_at, make_camera, make_rig, project
 from psotrack.recordings import Detections, VideoWriter
+from psotrack.rig_files import read_lenses, read_rig, write_rig
 from psotrack.trajectories import Trajectories, write_trajectories
 
 WORLD = np.random.default_rng(0).uniform((-1.5, -1.5, 0.2), (1.5, 1.5, 2.4), (14, 3))
@@ -272,6 +264,8 @@ def test_intrinsics_of_a_board(tmp_path):
     content = json.loads(output.stdout)
     lens = read_lenses(out)
     assert lens.names == ("60881257",)
+    with pytest.raises(PsotrackError, match="expected the poses of cameras, found none"):
+        read_rig(out)
     assert content["values"]["fx_px"] == lens.cameras.K[0, 0, 0]
     # The images are warped without smoothing; test_calibration_intrinsics has the exact bounds.
     assert abs(lens.cameras.K[0, 0, 0] - 620) < 12
@@ -279,7 +273,7 @@ def test_intrinsics_of_a_board(tmp_path):
     assert "fx_px" in shown
     assert "residual" in shown
     wrong = ("--squares", "8x6", "--square", "0.04", "--marker", "0.03", "--dictionary", "6x6_50")
-    assert "those of the printed board" in refused(
+    assert "found markers 0 to 16 of the dictionary 4x4_50; pass --dictionary 4x4_50" in refused(
         "intrinsics", tmp_path / "board.avi", *wrong, "--out", tmp_path / "x.yml"
     )
 
@@ -402,6 +396,17 @@ def test_files_are_converted(tmp_path):
     run("convert", tmp_path / "a.toml", tmp_path / "mm.toml", "--unit", "mm", "-q")
     np.testing.assert_allclose(centres(read_rig(tmp_path / "mm.toml")), 1e-3 * centres(rig), atol=1e-15)
     assert "--force" in refused("convert", tmp_path / "a.toml", tmp_path / "b.yml")
+    run("convert", tmp_path / "a.toml", tmp_path / "lens.toml", "--lenses", "--undistorted", "-q")
+    assert read_lenses(tmp_path / "lens.toml").cameras.dist.size == 0
+    run("convert", tmp_path / "a.toml", tmp_path / "other.toml", "--to", "anipose", "-q")
+    assert "[metadata]" in (tmp_path / "other.toml").read_text()
+    assert "--units: expected one of m, cm, mm, found inch" in refused(
+        "convert", tmp_path / "a.toml", tmp_path / "x.toml", "--units", "inch"
+    )
+    write_rig(tmp_path / "wide.toml", ring_rig(2, coefficients=8))
+    message = refused("convert", tmp_path / "wide.toml", tmp_path / "wide.csv")
+    assert "one focal length per camera and no skew" in message
+    assert "write rig.toml" in message
     result = CliRunner().invoke(calibrate, ["convert", "c.csv", "x.toml", "--size", "320"])
     assert result.exit_code == 2
     assert "expected two whole numbers above 0" in result.output

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from helpers import environment_without_jax_settings
 
+from psotrack.support import compiled, drop_programs_if_many
+
 #: A program that is stored although it compiles fast; it prints its result and the folder of JAX's compile cache.
 PROGRAM = """
 import sys
@@ -69,3 +71,23 @@ def test_a_users_own_cache_folder_is_kept(tmp_path: Path) -> None:
     own = tmp_path / "own"
     assert run(tmp_path / "default", JAX_COMPILATION_CACHE_DIR=str(own)) == [RESULT, str(own)]
     assert not (tmp_path / "default").exists()
+
+
+@pytest.mark.parametrize(("limit", "dropped"), [("1000000", False), ("100", True)])
+def test_programs_are_dropped_when_the_process_has_many_memory_maps(monkeypatch, tmp_path, limit, dropped):
+    """The limit is replaced, and so is the dropping: other tests of this process use their programs again."""
+    calls = []
+    (tmp_path / "limit").write_text(f"{limit}\n")
+    (tmp_path / "maps").write_text("a map\n" * 60)
+    monkeypatch.setattr(compiled, "_MAP_LIMIT", tmp_path / "limit")
+    monkeypatch.setattr(compiled, "_MAPS", tmp_path / "maps")
+    monkeypatch.setattr(compiled.jax, "clear_caches", lambda: calls.append("cleared"))
+    assert drop_programs_if_many() == dropped
+    assert calls == ["cleared"] * dropped
+    assert drop_programs_if_many(most_maps=60) is False
+    assert drop_programs_if_many(most_maps=59) is True
+
+
+def test_nothing_is_dropped_where_the_system_has_no_limit(monkeypatch, tmp_path):
+    monkeypatch.setattr(compiled, "_MAPS", tmp_path / "absent")
+    assert not drop_programs_if_many(most_maps=0)

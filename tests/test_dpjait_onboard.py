@@ -216,4 +216,4 @@ def test_the_inventory_has_a_row_per_onboard_camera(folder):
     with console.capture() as capture:
         console.print(inventory_table(content))
     row = next(line for line in capture.get().splitlines() if "on dron2" in line)
-    assert row.split() == ["on", "dron2", "5", "25", "64", "x", "48", "31.5", "4", "poses"]
+    assert row.split() == ["on", "dron2", "dron2_cam_s.avi", "5", "25", "64", "x", "48", "31.5", "4", "poses"]

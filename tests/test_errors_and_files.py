@@ -12,13 +12,6 @@ import pytest
 from helpers import ring_rig
 
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError, check_positive
-from psotrack.geometry import (
-    read_camera_names,
-    read_lenses,
-    read_rig,
-    write_calibration,
-    write_rig,
-)
 from psotrack.recordings import (
     Detections,
     Markers,
@@ -30,6 +23,7 @@ from psotrack.recordings import (
     write_c3d,
     write_detections,
 )
+from psotrack.rig_files import read_camera_names, read_lenses, read_rig, write_calibration, write_rig
 from psotrack.support import (
     atomic_write,
     digest_file,

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from psotrack.geometry import Rig, project
 from psotrack.initiation.initialisation import choose_paths, fill_unknown_sizes, find_drones
 from psotrack.initiation.paths import propose_paths
-from psotrack.silhouettes import find_blobs, stack_blobs
+from psotrack.silhouettes import border_cells, find_blobs, stack_blobs
 from psotrack.silhouettes.blobs import MOST_BLOBS, Blobs
 
 FPS = 25.0
@@ -151,6 +151,11 @@ def test_blobs_by_hand():
     assert blobs.centre_px.tolist() == [[51.5, 23.5], [113.5, 55.5]]
     assert blobs.size_px.tolist() == [[24, 16], [12, 16]]
     assert blobs.whole.tolist() == [True, False]
+    # The same image in an array that a larger image of another camera needs.
+    filled_up = np.pad(image, ((0, 10), (0, 10)))
+    assert find_blobs(filled_up, 4).whole.tolist() == [True, True]
+    border = border_cells(np.array([118.0, 80.0]), 4)
+    assert find_blobs(filled_up, 4, border).whole.tolist() == [True, False]
 
 
 def select_cameras(*names):

@@ -20,7 +20,7 @@ from psotrack.cli.localise import localise as command
 from psotrack.datasets.dpjait import write_calibration, write_marker_corners
 from psotrack.detection import marker_dictionary
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.geometry import look_at, make_camera, make_rig, project, write_rig
+from psotrack.geometry import look_at, make_camera, make_rig, project
 from psotrack.inside_out import (
     Flag,
     LocaliseSettings,
@@ -31,10 +31,10 @@ from psotrack.inside_out import (
     read_marker_map,
 )
 from psotrack.inside_out.frames import read_ahead
-from psotrack.inside_out.frames.image_folder import natural_key
 from psotrack.inside_out.lens_files import read_lens, scale_lens
 from psotrack.inside_out.localising import localise_frames
-from psotrack.recordings import VideoWriter
+from psotrack.recordings import VideoWriter, natural_key
+from psotrack.rig_files import write_rig
 from psotrack.trajectories import Status
 
 SIZE_WH = (640, 480)

@@ -58,6 +58,13 @@ def camera_looking_at(centre_m=(-0.8, -2.5, 1.3), target_m=(3.0, 3.0, 1.8), coef
     return make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080), dist=LENSES[coefficients])
 
 
+def with_lens(view, dist, *, fisheye=False):
+    T = view.T_cam_world
+    return make_camera(
+        R=T[:3, :3], t_m=T[:3, 3], K=view.K, image_size_wh=(1920, 1080), dist=dist, fisheye=fisheye
+    )
+
+
 def longer_lens(view, by):
     """The camera with a focal length that is longer by the share `by`."""
     return replace(view, K=view.K * np.array([[1 + by, 1 + by, 1], [1 + by, 1 + by, 1], [1, 1, 1]]))
@@ -95,6 +102,34 @@ def test_exact_corners_give_the_pose_exactly(coefficients, count):
     assert found.used.all()
     assert found.reprojection_px < 1e-6
     assert found.ambiguity < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("dist", "fisheye"),
+    [((-0.02, 0.01, -0.01, 0.002), True), ((-0.2, 0.05, 0.001, 0.0, 0.0, *7 * [0.001], 0.05, 0.02), False)],
+)
+def test_a_pose_through_every_lens_model(dist, fisheye):
+    at = camera_looking_at(K=np.array([[620.0, 0, 959.5], [0, 621.0, 539.5], [0, 0, 1]]))
+    view, corners_m = with_lens(at, dist, fisheye=fisheye), two_walls(7)
+    found = estimate_pose(image_corners(view, corners_m), corners_m, without_pose(view), ANY_NUMBER)
+    np.testing.assert_allclose(pose_error(found, view), 0, atol=1e-8)
+    assert found.used.all()
+
+
+def test_markers_where_the_lens_shows_nothing_are_not_used():
+    """x (1 - k r²) grows up to 2 / 3 / sqrt(3 k), which is 354 px: another marker is claimed outside of this circle."""
+    view = with_lens(
+        camera_looking_at(K=np.array([[400.0, 0, 959.5], [0, 400.0, 539.5], [0, 0, 1]])),
+        (-0.19, 0.0, 0.0, 0.0),
+    )
+    corners_m = two_walls(7)
+    corners_px = image_corners(view, corners_m)
+    corners_px[2] += [900.0, 0.0]
+    found = estimate_pose(corners_px, corners_m, without_pose(view), ANY_NUMBER)
+    np.testing.assert_allclose(pose_error(found, view), 0, atol=1e-6)
+    assert found.used.tolist() == [number != 2 for number in range(7)]
+    assert found.common.shape == (6, 22)
+    assert not found.common[:, 6:9].any()
 
 
 def test_derivatives_equal_finite_differences():

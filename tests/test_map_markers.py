@@ -14,10 +14,11 @@ from psotrack.cli.map_markers import FOUND, map_markers
 from psotrack.datasets.dpjait import read_marker_corners, write_marker_corners
 from psotrack.detection import marker_dictionary
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
-from psotrack.geometry import look_at, make_camera, make_rig, project, write_rig
+from psotrack.geometry import look_at, make_camera, make_rig, project
 from psotrack.inside_out import MarkerMap
 from psotrack.inside_out.lens_files import scale_lens
 from psotrack.recordings import VideoWriter, write_c3d
+from psotrack.rig_files import write_rig
 
 SIZE_WH = (960, 720)
 LENS = make_camera(

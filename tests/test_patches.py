@@ -53,7 +53,8 @@ def test_windows_are_means_of_the_whole_image(reduction):
     level = levels(patches, reduction)
     np.testing.assert_array_equal(level, np.broadcast_to([0, 1, 2, 3], (5, 4)))
     np.testing.assert_array_equal(patches.clear, 1)
-    assert patches.size_wh_px == (SHAPE[1] * reduction, SHAPE[0] * reduction)
+    for side_px, cells in zip(patches.size_wh_px, SHAPE[::-1], strict=True):
+        np.testing.assert_array_equal(side_px, np.full(4, cells * reduction))
     hanging = 0
     for (drone, camera), window in enumerate_windows(pixels(patches)):
         cell = 2 ** level[drone, camera]
@@ -163,6 +164,27 @@ def test_scores_agree_with_those_from_whole_images(where):
     assert (
         fine.all() if where == "in the room" else ((weight > 0) & (weight < 1)).any() and (weight == 0).any()
     )
+
+
+def test_a_small_image_ends_at_its_own_border():
+    """In an array that larger images of other cameras need, a drone beyond a small image's border is not in view."""
+    rng = np.random.default_rng(1)
+    images = rng.integers(0, 256, (5, 122, 162)).astype(np.uint8)
+    filled_up = np.pad(images, ((0, 0), (0, 30), (0, 40)))
+    position_m = np.array([[2.6, -2.1, 0.1], [0.3, 2.9, 2.9]])
+    (alone, alone_weight), (score, weight) = (
+        evaluate(
+            camera_scores,
+            RIG,
+            cut_at(RIG, each, position_m, SIZE_M, reach_m=REACH_M, occluding=None, reduction=REDUCTION),
+            position_m,
+            SIZE_M,
+        )
+        for each in (images, filled_up)
+    )
+    assert ((alone_weight > 0) & (alone_weight < 1)).any()
+    np.testing.assert_array_equal(weight, alone_weight)
+    np.testing.assert_allclose(score[alone_weight > 0], alone[alone_weight > 0], atol=1e-5)
 
 
 @given(

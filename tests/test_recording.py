@@ -1,4 +1,4 @@
-"""`Recording.usable` accepts consistent videos; its errors name the inconsistent video and a remedy."""
+"""`Recording.usable` accepts what belongs together; its errors name the file that does not, and a remedy."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import make_camera, make_rig
-from psotrack.recordings import Recording, VideoInfo
+from psotrack.recordings import FrameTimes, Recording, VideoInfo
 
 NAMES = ("a", "b", "c", "d", "e")
 
@@ -50,10 +50,24 @@ def test_an_unknown_camera():
         make_recording().usable(["a", "z"])
 
 
-def test_a_camera_without_video():
-    with pytest.raises(InputError, match="found none for b, d; pass --cameras a,c,e to leave these out"):
-        make_recording(b=None, d=None).usable()
+def test_a_camera_without_video_is_left_out_with_a_warning(caplog):
+    recording = make_recording(b=None, d=None).usable()
+    assert recording.rig.names == tuple(recording.videos) == ("a", "c", "e")
+    lines = [record.getMessage() for record in caplog.records]
+    assert lines == [f"camera {name} is left out: it has no video" for name in "bd"]
+
+
+def test_a_camera_without_video_that_is_asked_for_is_an_error():
+    with pytest.raises(InputError, match=r"^S01: expected a video for each .* a, b, found none for b$"):
+        make_recording(b=None).usable(["a", "b"])
     assert make_recording(b=None).usable(["a", "c"]).rig.names == ("a", "c")
+
+
+def test_a_camera_with_times_alone_counts_where_no_videos_are_needed():
+    recording = replace(make_recording(b=None, d=None), frame_times={"b": FrameTimes(30, 25.0)})
+    assert recording.usable(videos=False).rig.names == ("a", "b", "c", "e")
+    assert recording.usable(videos=False).num_frames == 250
+    assert recording.usable(["b"], videos=False).num_frames == 30
 
 
 def test_no_videos():
@@ -67,29 +81,39 @@ def test_no_videos():
 
 @pytest.mark.parametrize("camera", ["a", "c"], ids=["the first", "a later one"])
 @pytest.mark.parametrize(
-    ("change", "expected"),
+    ("size_wh", "remedy"),
     [
-        ({"num_frames": 240}, "250 frames as in .*, found 240 frames; pass --frames 240"),
-        ({"num_frames": 260}, "250 frames as in .*, found 260 frames; pass --frames 250"),
-        ({"fps": 29.97}, r"25\.000 frames per second as in .*, found 29\.970"),
-        ({"fps": 24.98}, r"25\.000 frames per second as in .*, found 24\.980"),
-        ({"image_size_wh": (1280, 720)}, "1920 x 1080 pixels as calibrated, found 1280 x 720"),
+        ((1280, 720), "multiply the first two rows of K by 2/3"),
+        ((3840, 2160), "multiply the first two rows of K by 2/1"),
+        ((1920, 1200), "is it the video of another camera?"),
     ],
 )
-def test_the_error_names_the_differing_video(camera, change, expected):
-    with pytest.raises(InputError, match=rf"^{camera}\.avi: expected {expected}"):
-        make_recording(**{camera: change}).usable()
-    rest = [name for name in NAMES if name != camera]
-    assert make_recording(**{camera: change}).usable(rest).rig.names == tuple(rest)
-
-
-def test_different_sizes_are_refused_even_if_calibrated():
-    recording = make_recording(c={"image_size_wh": (1280, 720)})
-    recording.rig.cameras.image_size_wh[2] = (1280, 720)
-    with pytest.raises(
-        InputError, match=r"^c\.avi: expected 1920 x 1080 pixels as in a\.avi, found 1280 x 720"
-    ):
+def test_a_size_that_differs_from_the_calibration_is_an_error(camera, size_wh, remedy):
+    recording = make_recording(**{camera: {"image_size_wh": size_wh}})
+    with pytest.raises(InputError) as error:
         recording.usable()
+    start = (
+        f"{camera}.avi: expected 1920 x 1080 pixels as calibrated, found {size_wh[0]} x {size_wh[1]} pixels"
+    )
+    assert str(error.value).startswith(start)
+    assert str(error.value).endswith(remedy)
+    rest = [name for name in NAMES if name != camera]
+    assert recording.usable(rest).rig.names == tuple(rest)
+
+
+def test_cameras_may_differ_in_size_rate_and_length():
+    recording = make_recording(
+        a={"num_frames": 100},
+        b={"fps": 50.0, "num_frames": 400},
+        c={"image_size_wh": (1280, 720)},
+    )
+    recording.rig.cameras.image_size_wh[2] = (1280, 720)
+    usable = recording.usable()
+    assert (usable.rig.names, usable.fps) == (NAMES, 50.0)
+    # The cameras at 25 frames per second last 10 s, the fast one 8 s.
+    timeline = usable.timeline()
+    assert usable.num_frames == timeline.num_instants == 500
+    assert timeline.frame[200].tolist() == [-1, 200, 100, 100, 100]
 
 
 def test_rates_that_differ_by_rounding_are_equal():
@@ -99,9 +123,33 @@ def test_rates_that_differ_by_rounding_are_equal():
 def test_leading_frames():
     recording = make_recording(c={"num_frames": 240}).usable(num_frames=240)
     assert {video.num_frames for video in recording.videos.values()} == {240}
+    assert recording.num_frames == 240
 
 
-@pytest.mark.parametrize("num_frames", [0, -1, 241])
+def test_leading_frames_of_a_slow_camera_and_of_one_that_begins_later(caplog):
+    recording = replace(
+        make_recording(b={"fps": 50.0}),
+        frame_times={"c": FrameTimes(250, 25.0, 0.8), "d": FrameTimes(250, 25.0, 3.0)},
+    ).usable(num_frames=100)
+    # 100 instants at 50 Hz are 2 s.
+    counts = {name: video.num_frames for name, video in recording.videos.items()}
+    assert counts == {"a": 50, "b": 100, "c": 30, "e": 50}
+    assert {name: times.num_frames for name, times in recording.frame_times.items()} == counts
+    assert recording.num_frames == 100
+    assert "camera d is left out: it has no frame before instant 100" in caplog.text
+
+
+@pytest.mark.parametrize("num_frames", [0, -1, 251])
 def test_more_frames_than_exist_are_refused(num_frames):
-    with pytest.raises(SettingsError, match=f"frames: expected 1 to 240, .* found {num_frames}"):
+    with pytest.raises(SettingsError, match=f"frames: expected 1 to 250, .* found {num_frames}"):
         make_recording(c={"num_frames": 240}).usable(num_frames=num_frames)
+
+
+def test_a_single_name_is_one_camera():
+    assert make_recording().usable("c").rig.names == ("c",)
+
+
+@pytest.mark.parametrize("names", [[], [""], [" "]])
+def test_empty_names_are_refused(names):
+    with pytest.raises(SettingsError, match=r"^cameras: expected some of a, b, c, d, e, found "):
+        make_recording().usable(names)

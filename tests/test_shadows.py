@@ -58,7 +58,6 @@ def size_m():
     size_state = sizes.measure_sizes(
         jnp.asarray(draw_silhouettes(high[0, 0])[None]),
         *float32((high,)),
-        jnp.ones((1, 1), bool),
         *float32((np.array([[0.45, 0.45, 0.12]]), RIG.cameras)),
         sizes.SizeProgram(reduction=REDUCTION),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import shutil
 import signal
@@ -311,10 +312,53 @@ def test_camera_without_video(folder: Path, tmp_path: Path) -> None:
         compute(replace(recording, videos=videos), SETTINGS, cache=tmp_path / "cache")
 
 
-def test_videos_of_different_length(folder: Path, tmp_path: Path) -> None:
-    _write_video(folder / "cam2.avi", seed=1, num_frames=20)
-    with pytest.raises(InputError, match=r"cam2\.avi: expected 30 frames as in cam1\.avi, found 20 frames"):
-        compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache")
+def test_cameras_of_different_size_and_length_are_filled_up_with_background(
+    folder: Path, tmp_path: Path
+) -> None:
+    with VideoWriter(folder / "cam2.avi", 25.0, (202, 98)) as writer:
+        for frame in itertools.islice(read_frames(probe(folder / "cam1.avi")), 20):
+            writer.write(cv2.copyMakeBorder(frame[20:], 0, 0, 0, 40, cv2.BORDER_REPLICATE))
+    recording = _make_recording(folder)
+    recording.rig.cameras.image_size_wh[1] = (202, 98)
+    silhouettes = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
+    assert silhouettes.shape == (30, 51)
+    frames = _read_all(silhouettes)
+    assert frames.shape == (NUM_FRAMES, 3, 30, 51)
+    for index, name in enumerate(recording.rig.names):
+        alone = _expected(replace(recording, videos={name: recording.videos[name]}, frame_times={}))[:, 0]
+        num_frames, height, width = alone.shape
+        np.testing.assert_array_equal(frames[:num_frames, index, :height, :width], alone)
+        assert alone.any()
+        assert not frames[num_frames:, index].any()
+        assert not frames[:, index, height:].any()
+        assert not frames[:, index, :, width:].any()
+
+
+def test_what_is_ignored_is_background_and_belongs_to_the_key(folder: Path, tmp_path: Path) -> None:
+    recording = _make_recording(folder)
+    white = np.zeros(SIZE_WH[::-1], np.uint8)
+    white[:, :81] = 255
+    cv2.imwrite(str(tmp_path / "left.png"), white)
+    masked = replace(recording, ignore={"cam1": tmp_path / "left.png"})
+    plain, without = (
+        compute(each, SETTINGS, cache=tmp_path / "cache", jobs=1) for each in (recording, masked)
+    )
+    assert {name for name in plain.keys if plain.keys[name] != without.keys[name]} == {"cam1"}
+    before, after = _read_all(plain), _read_all(without)
+    # Working pixels are 2 x 2: pixel 40 covers columns 80 and 81, of which one is ignored.
+    assert before[:, 0, :, :20].any()
+    assert not after[:, 0, :, :20].any()
+    np.testing.assert_array_equal(after[:, 0, :, 21:], before[:, 0, :, 21:])
+    np.testing.assert_array_equal(after[:, 1:], before[:, 1:])
+
+
+def test_an_ignored_part_of_another_size_is_an_error(folder: Path, tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "small.png"), np.zeros((10, 10), np.uint8))
+    recording = replace(_make_recording(folder), ignore={"cam1": tmp_path / "small.png"})
+    with pytest.raises(
+        InputError, match=r"small\.png: expected 162 x 118 pixels as in cam1\.avi, found 10 x 10"
+    ):
+        compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
 
 
 @pytest.mark.parametrize("reduction", [0, -4, 3, True])

@@ -33,10 +33,8 @@ def measure(coverage, position_m, believed_m, well_seen=None, rig=RIG):
     position_m = position_m if position_m.ndim == 3 else position_m[:, None]
     seen = np.ones(position_m.shape[:2], bool) if well_seen is None else well_seen
     believed_m = np.broadcast_to(believed_m, position_m.shape[1:])
-    arrays = float32((position_m, believed_m, rig.cameras))
-    return jax.tree.map(
-        np.asarray, sizes.measure_sizes(coverage, arrays[0], seen, arrays[1], arrays[2], PROGRAM)
-    )
+    arrays = float32((np.where(seen[..., None], position_m, np.nan), believed_m, rig.cameras))
+    return jax.tree.map(np.asarray, sizes.measure_sizes(coverage, *arrays, PROGRAM))
 
 
 def initial_sizes(size_m, pinned=(False, False, False)):
@@ -74,10 +72,9 @@ def test_the_expected_position_hardly_changes_the_measured_size():
 def test_close_above_the_floor_nothing_is_learned():
     """Foreground close to the floor may be a drone together with its shadow. The drone is 0.5 m wide."""
     positions = float32(PLACES_M[:, None])
-    seen = np.ones((len(PLACES_M), 1), bool)
     shown = [
         sizes.measure_sizes(
-            images(PLACES_M), positions, seen, *float32((SIZE_M[None], RIG.cameras)), PROGRAM, *floor
+            images(PLACES_M), positions, *float32((SIZE_M[None], RIG.cameras)), PROGRAM, *floor
         )
         for floor in ((jnp.float32(0.75),), (jnp.float32(0.0),), ())
     ]

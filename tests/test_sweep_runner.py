@@ -3,6 +3,7 @@
 Some tests replace the tracker by a tracker that finds no drones, because they do not look at the tracks.
 """
 
+import itertools
 import json
 import os
 import shutil
@@ -12,12 +13,15 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import pandas as pd
 import pytest
 from sweeps import all_rows, grid_file, make_older, psotrack, small_sequence, stamps
 
 from psotrack.cli import main
 from psotrack.errors import InputError
+from psotrack.support import compiled
 from psotrack.sweep import Inputs, Store, cell_key, estimate, machine, runner, sweep
 from psotrack.sweep import grid as grid_of
 from psotrack.sweep.estimates import FRAME_S, WORK_S
@@ -96,6 +100,38 @@ def tracker(monkeypatch: pytest.MonkeyPatch) -> Tracker:
 def varied(*iterations: int, runs: int = 1) -> dict:
     grid = {"swarm.iterations": list(iterations)}
     return {"sequences": ["S01_D2_A"], "runs": runs, "settings": SETTINGS, "grid": grid}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not compiled._MAPS.exists(), reason="this system does not list memory maps")
+def test_a_sweep_over_many_shapes_keeps_few_programs(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each cell compiles programs of its own; the system's limit is replaced by a small one."""
+
+    def maps() -> int:
+        return compiled._MAPS.read_bytes().count(b"\n")
+
+    def compile_and_find_nothing(_: object, __: object, settings: list) -> list[InputError]:
+        side = settings[0].swarm.iterations
+        for extra in range(4):
+            program = jax.jit(
+                lambda x: jax.lax.scan(lambda c, _: (jnp.sin(c @ c.T) @ c, c.sum()), x, None, 5)
+            )
+            program(jnp.ones((side, side + extra + 2)))
+        counted.append(maps())
+        return [InputError("here", expected="drones", found="none") for _ in settings]
+
+    counted: list[int] = []
+    monkeypatch.setattr(runner, "track_runs", compile_and_find_nothing)
+    (tmp_path / "limit").write_text(str(2 * (maps() + 300)))
+    monkeypatch.setattr(compiled, "_MAP_LIMIT", tmp_path / "limit")
+    allowed = maps() + 300
+    sweep(varied(*range(2, 14)), tmp_path / "out", data=root, cache=root / "cache")
+    assert len(counted) == 12
+    # A cell may exceed the limit by its own programs, each of which has some dozens of maps.
+    assert max(counted) < allowed + 400
+    assert any(after < before for before, after in itertools.pairwise(counted))
 
 
 @pytest.mark.slow

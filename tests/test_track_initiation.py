@@ -66,7 +66,7 @@ def draw_one_drone(path_m, size_m, rig):
 _DRAWN = {}
 
 
-def candidates_in(coverage, *known_m, size_m=SIZE_M, rig=RIG):
+def candidates_in(coverage, *known_m, size_m=SIZE_M, rig=RIG, min_viewpoints=None):
     known = np.stack(known_m, axis=1) if known_m else np.empty((len(coverage), 0, 3))
     return find_candidates(
         rig.cameras,
@@ -75,6 +75,7 @@ def candidates_in(coverage, *known_m, size_m=SIZE_M, rig=RIG):
             known[: len(coverage)],
             np.isfinite(known[: len(coverage)]).all(axis=-1),
             np.broadcast_to(size_m, (len(known_m), 3)),
+            min_viewpoints=min_viewpoints,
         ),
         reduction=REDUCTION,
         fps=FPS,
@@ -202,7 +203,7 @@ def test_the_rim_of_a_known_drone_is_no_candidate(two_drones, off_m):
     assert candidates_in(two_drones, ONE + off_m, OTHER, size_m=0.8 * SIZE_M) == ()
 
 
-def test_three_viewpoints_are_enough_and_two_are_not():
+def test_three_viewpoints_are_enough_and_two_are_only_where_the_rig_has_no_third():
     """A third camera beside the second one adds no viewpoint."""
     three = ring_rig(3, image_size_wh=IMAGE_WH)
     (found,) = candidates_in(draw_silhouettes(OTHER, rig=three), rig=three)
@@ -215,7 +216,12 @@ def test_three_viewpoints_are_enough_and_two_are_not():
     images = np.concatenate(
         [draw_silhouettes(OTHER, rig=three)[:, :2], draw_silhouettes(OTHER, rig=three)[:, 1:2]], axis=1
     )
-    assert candidates_in(images, rig=twin) == ()
+    (found,) = candidates_in(images, rig=twin)
+    np.testing.assert_allclose(found.position_m, OTHER[0], atol=2 * CELL_M)
+    assert candidates_in(images, rig=twin, min_viewpoints=3) == ()
+    four = ring_rig(4, image_size_wh=IMAGE_WH)
+    two_see = blank(draw_silhouettes(OTHER, rig=four), cameras=[2, 3])
+    assert candidates_in(two_see, rig=four) == ()
 
 
 @pytest.mark.parametrize(("blind", "count"), [([4], 1), ([1, 4], 0)])

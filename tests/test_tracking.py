@@ -72,7 +72,13 @@ def track(silhouettes, start, **settings):
 
 
 def trajectories_of(tracks, *, smoothed=False):
-    return postprocess(tracks, SETTINGS.motion, SETTINGS.identity, fps=FPS, smoothed=smoothed)[0]
+    return postprocess(
+        tracks,
+        SETTINGS.motion,
+        SETTINGS.identity,
+        fps=FPS,
+        smoothing=SETTINGS.motion if smoothed else None,
+    )[0]
 
 
 @pytest.fixture(scope="module")

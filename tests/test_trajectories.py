@@ -28,6 +28,7 @@ def make_full_trajectories() -> Trajectories:
         num_cameras=rng.integers(0, 9, (FRAMES, DRONES)),
         status=rng.integers(0, 3, (FRAMES, DRONES)),
         covariance_m2=random_covariances(rng),
+        relative_covariance_m2=random_covariances(rng),
     )
 
 
@@ -60,7 +61,7 @@ def test_at_frames_selects_the_same_rows_of_every_array():
     assert picked.frame.tolist() == [12, 18]
     assert picked.drones == full.drones
     rest = {field.name for field in fields(full)} - {"frame", "drones"}
-    assert len(rest) == 8
+    assert len(rest) == 9
     for name in rest:
         np.testing.assert_array_equal(getattr(picked, name), getattr(full, name)[[1, 4]])
 

@@ -57,7 +57,7 @@ class Problem:
     @property
     def reach_m(self) -> float:
         """Largest distance that a drone flies in one frame, metres."""
-        return self.settings.motion.max_speed_m_s / self.fps
+        return self.settings.motion.speed_limit_m_s / self.fps
 
     def predict(self, position_m: Any, velocity_m_s: Any) -> tuple[Any, Any, Any]:
         """Predicted positions in the next frame, and the lowest and highest coordinates within reach."""
@@ -71,7 +71,7 @@ class Problem:
         innovation = found_m - predicted_m
         velocity = velocity_m_s + VELOCITY_GAIN * self.fps * innovation
         speed = (velocity * velocity).sum(axis=-1, keepdims=True) ** 0.5
-        velocity = velocity / (speed / self.settings.motion.max_speed_m_s).clip(1.0)
+        velocity = velocity / (speed / self.settings.motion.speed_limit_m_s).clip(1.0)
         return predicted_m + POSITION_GAIN * innovation, velocity
 
     def first(self) -> tuple[np.ndarray, np.ndarray]:

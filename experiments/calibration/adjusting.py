@@ -23,9 +23,10 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from psotrack.calibration import centre_by_pose, find_drones_in_boxes, improve
+from psotrack.calibration import centre_by_pose, find_drones_in_boxes
 from psotrack.calibration.gauge import common_motions, pose_change_metric, pose_changes
 from psotrack.datasets.dpjait import read_detections, read_sequence
+from psotrack.doctor import improve_with_check
 from psotrack.geometry import Rig
 from psotrack.methods import detection_files_of
 from psotrack.settings import YOLO
@@ -101,7 +102,7 @@ def adjust_sequence(folder: Path) -> pd.DataFrame:
     for name, (fault, faulty) in FAULTS.items():
         rig = fault(truth, rng)
         views = find_drones_in_boxes(rig, boxes, recording.truth)
-        improved = improve(rig, views.points_px, views.noise_px, common_errors=views.common_errors)
+        improved = improve_with_check(rig, views).improved
         whole = len(improved.moved) == len(rig)
         free_m, _ = errors(truth, rig, improved.everything.rig, whole=True)
         (before_m, before_deg), (after_m, after_deg) = (

@@ -67,12 +67,12 @@ def moved(shift_m: float) -> Fault:
 
 
 def late(frames: int) -> Fault:
-    """Let the video of one camera begin some frames late."""
+    """Let the video of one camera lag: its frame i shows what the other cameras show in frame i - frames."""
 
     def fault(rig: Rig, boxes: Boxes) -> tuple[Rig, Boxes]:
         name = rig.names[FAULTY]
-        seen, there = boxes[name], boxes[name].frame >= frames
-        shifted = Detections(seen.frame[there] - frames, seen.xyxy[there], seen.confidence[there])
+        seen = boxes[name]
+        shifted = Detections(seen.frame + frames, seen.xyxy, seen.confidence)
         return rig, {**boxes, name: shifted}
 
     return fault

@@ -1,11 +1,37 @@
+from .board_corners import BoardFinder
+from .boards import Board
 from .bundle import AdjustedRig, adjust
 from .common_errors import CommonErrors
 from .derivatives import centre_by_pose, reproject
 from .extrinsics import Located, locate_camera
-from .image_points import DroneViews, ImagePoints, find_drones_in_boxes, find_markers, read_image_points
-from .intrinsics import Board, Lens, lens_of_board, lens_of_sensor, lens_of_view
+from .image_points import (
+    DroneViews,
+    ImagePoints,
+    find_drones_in_boxes,
+    find_markers,
+    find_markers_in,
+    read_image_points,
+)
+from .intrinsics import Lens, lens_of_board, lens_of_sensor, lens_of_view
 from .pose_search import MIN_POINTS
 from .residuals import GATE, UNLIKELY, inflation, spread_px
+from .rig.adjustment import CalibratedRig, LensChoice, calibrate_rig, in_new_world
+from .rig.findings import CameraFigures, advise, coverage, figures_of, find_shifts, say_print, worst_views
+from .rig.images import CameraImages, instants_of_numbers, open_images, open_recorded
+from .rig.lens_models import LensModel, known_lenses, parse_lens_model
+from .rig.moving_point import PointRig, PointViews, calibrate_by_point
+from .rig.plots import save_coverage
+from .rig.point_files import (
+    GivenWorld,
+    distance_between,
+    fit_world,
+    read_point_views,
+    read_world,
+    stick_length,
+    views_of_detections,
+)
+from .rig.views import BoardViews, FoundBoards, find_views
+from .rig.world import Similarity, align, world_of_camera
 from .significance import Improved, find_wrong_cameras, improve
 
 __all__ = [
@@ -14,24 +40,61 @@ __all__ = [
     "UNLIKELY",
     "AdjustedRig",
     "Board",
+    "BoardFinder",
+    "BoardViews",
+    "CalibratedRig",
+    "CameraFigures",
+    "CameraImages",
     "CommonErrors",
     "DroneViews",
+    "FoundBoards",
+    "GivenWorld",
     "ImagePoints",
     "Improved",
     "Lens",
+    "LensChoice",
+    "LensModel",
     "Located",
+    "PointRig",
+    "PointViews",
+    "Similarity",
     "adjust",
+    "advise",
+    "align",
+    "calibrate_by_point",
+    "calibrate_rig",
     "centre_by_pose",
+    "coverage",
+    "distance_between",
+    "figures_of",
     "find_drones_in_boxes",
     "find_markers",
+    "find_markers_in",
+    "find_shifts",
+    "find_views",
     "find_wrong_cameras",
+    "fit_world",
     "improve",
+    "in_new_world",
     "inflation",
+    "instants_of_numbers",
+    "known_lenses",
     "lens_of_board",
     "lens_of_sensor",
     "lens_of_view",
     "locate_camera",
+    "open_images",
+    "open_recorded",
+    "parse_lens_model",
     "read_image_points",
+    "read_point_views",
+    "read_world",
     "reproject",
+    "save_coverage",
+    "say_print",
     "spread_px",
+    "stick_length",
+    "views_of_detections",
+    "world_of_camera",
+    "worst_views",
 ]

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.geometry import Camera, cross_matrices
+from psotrack.geometry import Camera, cross_matrices, to_pixels_with_jacobian
 
 
 def reproject(
@@ -17,14 +17,13 @@ def reproject(
 ) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 3"], Float[np.ndarray, "points 2 3"]]:
     """Pixels of points, and their derivatives by a small turn about the camera's axes (rad) and by its translation.
 
-    The derivatives are OpenCV's for normalised coordinates, multiplied by K, so that they are valid for skew too.
-
     Returns:
         (points, 2), pixels; (points, 2, 3), derivatives by the turn; and (points, 2, 3), by the translation in metres.
     """
-    turned = np.ascontiguousarray(points_m @ R.T)
-    pixels, slopes = pixel_slopes(turned, np.zeros(3), t_m, lens)
-    return pixels, slopes[..., :3], slopes[..., 3:6]
+    turned = points_m @ R.T
+    pixels, by_shift = to_pixels_with_jacobian(lens, turned + t_m)
+    # A small turn w moves a point Y by w x Y = -[Y] w.
+    return pixels, -by_shift @ cross_matrices(turned), by_shift
 
 
 def pixel_slopes(
@@ -32,12 +31,12 @@ def pixel_slopes(
     turn: Float[np.ndarray, "3"],
     t_m: Float[np.ndarray, "3"],
     lens: Camera,
-) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 unknowns"]]:
-    """Pixels of points, and their derivatives by OpenCV's unknowns: Rodrigues vector, translation and intrinsics."""
-    K, dist = np.asarray(lens.K), np.asarray(lens.dist)
-    bent, by = cv2.projectPoints(points_m[:, None], turn, t_m, np.eye(3), dist if dist.size else None)
-    pixels = np.asarray(bent).reshape(-1, 2) @ K[:2, :2].T + K[:2, 2]
-    return pixels, K[:2, :2] @ np.asarray(by).reshape(-1, 2, by.shape[-1])
+) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 6"]]:
+    """Pixels of points, and their derivatives by OpenCV's Rodrigues vector and by the translation."""
+    R, by_turn = cv2.Rodrigues(turn)
+    pixels, by_shift = to_pixels_with_jacobian(lens, points_m @ np.asarray(R).T + t_m)
+    moved = np.einsum("kij,pj->pik", np.asarray(by_turn).reshape(3, 3, 3), points_m)
+    return pixels, np.concatenate([by_shift @ moved, by_shift], axis=-1)
 
 
 def centre_by_pose(R: Float[np.ndarray, "3 3"], t_m: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 6"]:

@@ -65,6 +65,7 @@ def locate_camera(
     dist: Float[np.ndarray, " coefficients"],
     noise_px: float = 1.0,
     *,
+    fisheye: bool = False,
     name: str = "camera",
 ) -> Located:
     """Find the pose of a camera with a known lens, from points of known positions.
@@ -76,6 +77,7 @@ def locate_camera(
         K: (3, 3), intrinsics in pixels.
         dist: (coefficients,), distortion coefficients in OpenCV's order.
         noise_px: standard deviation of `points_px` along each axis, pixels.
+        fisheye: the lens has OpenCV's fisheye model.
         name: name of the camera in error messages.
 
     Raises:
@@ -85,7 +87,7 @@ def locate_camera(
     """
     check_positive("noise_px", noise_px)
     extent_m = _check_points(points_m, points_px, name)
-    lens = Camera(np.eye(4), K, dist, np.zeros(2))
+    lens = Camera(np.eye(4), K, dist, np.zeros(2), np.array(True) if fisheye else None)
     pose, *others = find_likely_poses(points_m, points_px, lens, noise_px, extent_m, name)
     residual_px = distances_px(points_m, points_px, pose, lens)
     _check_fit(points_m, points_px, lens, noise_px, extent_m, residual_px, name)

@@ -6,7 +6,7 @@ point. The position of a point in the world is in any of its rows, or in another
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from psotrack.calibration.common_errors import CommonErrors
 from psotrack.correspondence import BORDER_PX, NOISE_PX, NOISE_SHARE
 from psotrack.detection import marker_dictionary
 from psotrack.errors import InputError
-from psotrack.geometry import Rig, project
+from psotrack.geometry import Rig, project_visible
 from psotrack.recordings import Detections, VideoInfo, read_frames
 from psotrack.support import Column, Table, TextRow, read_rows
 from psotrack.trajectories import Trajectories
@@ -61,12 +61,18 @@ class DroneViews:
         noise_px: (points, cameras), standard deviations of the errors that differ from frame to frame, pixels; NaN like
             `points_px`.
         common_errors: errors that last over many frames.
+        frame: (points,), number of each point's frame.
+        drone: (points,), index of each point's drone.
+        side_px: (points, cameras), mean sides of the boxes, pixels; NaN like `points_px`.
     """
 
     points: tuple[str, ...]
     points_px: Float[np.ndarray, "points cameras 2"]
     noise_px: Float[np.ndarray, "points cameras"]
     common_errors: tuple[CommonErrors, ...]
+    frame: Int[np.ndarray, "points"]
+    drone: Int[np.ndarray, "points"]
+    side_px: Float[np.ndarray, "points cameras"]
 
 
 def read_image_points(path: str | Path, places: str | Path | None = None) -> dict[str, ImagePoints]:
@@ -126,14 +132,25 @@ def find_markers(
         InputError: the video cannot be read.
         SettingsError: the dictionary does not exist.
     """
+    step = max(1, video.num_frames // _FRAMES)
+    greys = (cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) for frame in read_frames(video, step))
+    return find_markers_in(greys, corners_m, dictionary)
+
+
+def find_markers_in(
+    images: Iterable[np.ndarray],
+    corners_m: Mapping[int, Float[np.ndarray, "4 3"]],
+    dictionary: str = "4x4_1000",
+) -> ImagePoints:
+    """Find the corners of markers of known positions in grey images of a static camera; see `find_markers`."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detector = cv2.aruco.ArucoDetector(marker_dictionary(dictionary), parameters)
     found: dict[int, list[Float[np.ndarray, "4 2"]]] = {}
     frames = 0
-    for frame in read_frames(video, step=max(1, video.num_frames // _FRAMES)):
+    for grey in images:
         frames += 1
-        quads, ids, _ = detector.detectMarkers(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY))
+        quads, ids, _ = detector.detectMarkers(grey)
         for quad, marker in zip(quads, [] if ids is None else map(int, ids.ravel()), strict=True):
             if marker in corners_m:
                 found.setdefault(marker, []).append(quad.reshape(4, 2).astype(np.float64))
@@ -161,7 +178,7 @@ def find_drones_in_boxes(
     """
     rows = np.arange(0, tracks.num_frames, max(1, -(-tracks.num_frames // most_frames)))
     places_m = np.where(tracks.seen[rows, :, None], tracks.position_m[rows], np.nan)
-    projected, depth = project(rig.cameras, places_m[:, :, None, :])
+    projected, depth = project_visible(rig.cameras, places_m[:, :, None, :])
     points_px, side_px = np.full(projected.shape, np.nan), np.full(depth.shape, np.nan)
     for camera, name in enumerate(rig.names):
         for row, frame in enumerate(tracks.frame[rows].tolist() if name in detections else []):
@@ -187,6 +204,9 @@ def find_drones_in_boxes(
         _make_common_errors(
             rig, points_px, side_px, drone, (second - second.min(initial=0)) * tracks.num_drones + drone
         ),
+        np.repeat(tracks.frame[rows].astype(np.int64), tracks.num_drones),
+        drone,
+        side_px,
     )
 
 

@@ -1,6 +1,6 @@
 """Intrinsics of a camera, from its data sheet, or from a video in which a ChArUco board is moved.
 
-The calibration is Z. Zhang's method (PAMI 22(11), 2000) as implemented in OpenCV, with the coefficients k1, k2, p1, p2.
+The calibration is Z. Zhang's method (PAMI 22(11), 2000) as implemented in OpenCV, with 4 to 14 distortion coefficients.
 """
 
 from __future__ import annotations
@@ -9,9 +9,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
-from psotrack.detection import marker_dictionary
+from psotrack.calibration.board_corners import choose_spread, outline_of
+from psotrack.calibration.board_recognition import explain_missing_board, recognise_board
+from psotrack.calibration.boards import Board
 from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.geometry import Camera, make_camera
 from psotrack.recordings import VideoInfo, read_frames
@@ -24,47 +26,23 @@ _MIN_CORNERS = 8
 _MOST_VIEWS = 40
 #: Largest number of frames in which the board is searched; limits the time for long videos.
 _MOST_FRAMES = 300
+#: Number of frames from which it is found out how the board was printed.
+_MOST_SAMPLES = 12
 #: Largest standard deviation of the focal length, as a share of the focal length.
 _MAX_FOCAL_ERROR = 0.02
 #: Smallest angle between the planes of the board in the two views that differ most, degrees: views of parallel boards
 #: do not determine the focal length.
 _MIN_TILT_DEG = 10.0
+#: OpenCV's flags by the number of distortion coefficients.
+_FLAGS = {
+    4: cv2.CALIB_FIX_K3,
+    5: 0,
+    8: cv2.CALIB_RATIONAL_MODEL,
+    12: cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL,
+    14: cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL | cv2.CALIB_TILTED_MODEL,
+}
 #: Largest focal length, in image widths: 20 widths are a field of view of 3 degrees.
 _MAX_FOCAL_WIDTHS = 20.0
-
-
-@dataclass(frozen=True)
-class Board:
-    """A ChArUco board.
-
-    Attributes:
-        squares_wh: columns and rows of squares.
-        square_m: side of a square in metres.
-        marker_m: side of a marker in metres.
-        dictionary: name of the markers' dictionary, such as 4x4_50.
-    """
-
-    squares_wh: tuple[int, int]
-    square_m: float
-    marker_m: float
-    dictionary: str = "4x4_50"
-
-    def __post_init__(self) -> None:
-        if min(self.squares_wh) < 3:
-            raise SettingsError(
-                "board.squares_wh", expected="at least 3 x 3 squares", found=f"{self.squares_wh}"
-            )
-        check_positive("board.square_m", self.square_m)
-        if not 0 < self.marker_m < self.square_m:
-            raise SettingsError(
-                "board.marker_m", expected="a side above 0 and below the square's", found=f"{self.marker_m:g}"
-            )
-
-    def opencv(self) -> cv2.aruco.CharucoBoard:
-        """The board as an object of OpenCV."""
-        return cv2.aruco.CharucoBoard(
-            self.squares_wh, self.square_m, self.marker_m, marker_dictionary(self.dictionary)
-        )
 
 
 @dataclass(frozen=True)
@@ -73,13 +51,13 @@ class Lens:
 
     Attributes:
         camera: intrinsics; the pose is the world's origin.
-        std: (8,), standard deviations of fx, fy, cx, cy in pixels, and of k1, k2, p1, p2.
+        std: (4 + coefficients,), standard deviations of fx, fy, cx, cy in pixels, and of the distortion coefficients.
         frame: (views,), numbers of the frames that were used.
         residual_px: (views,), root mean square reprojection error of each view, pixels.
     """
 
     camera: Camera
-    std: Float[np.ndarray, "8"]
+    std: Float[np.ndarray, " unknowns"]
     frame: Int[np.ndarray, " views"]
     residual_px: Float[np.ndarray, " views"]
 
@@ -119,18 +97,27 @@ def lens_of_sensor(
     return _undistorted_camera(focal_length_mm * np.array(image_size_wh) / np.array(sensor_mm), image_size_wh)
 
 
-def lens_of_board(video: VideoInfo, board: Board) -> Lens:
+def lens_of_board(video: VideoInfo, board: Board, coefficients: int = 4) -> Lens:
     """Estimate the lens of a camera from a video in which a ChArUco board is moved.
 
     The views that differ most in the position, size and tilt of the board are used.
 
+    Args:
+        video: the video.
+        board: the board.
+        coefficients: number of distortion coefficients in OpenCV's order: 4, 5, 8, 12 or 14. More coefficients need
+            views in all corners of the image.
+
     Raises:
         InputError: the video cannot be read, too few views show enough corners of the board, or the views differ too
             little to determine the focal length.
-        SettingsError: the dictionary does not exist.
+        SettingsError: the dictionary does not exist, or no model has this number of coefficients.
     """
-    model = board.opencv()
-    views = _find_views(video, model)
+    if coefficients not in _FLAGS:
+        expected = f"one of {', '.join(map(str, _FLAGS))}"
+        raise SettingsError("coefficients", expected=expected, found=f"{coefficients}")
+    board.opencv()
+    views = _find_views(video, board)
     if len(views) < _MIN_VIEWS:
         raise InputError(
             video.path,
@@ -138,17 +125,17 @@ def lens_of_board(video: VideoInfo, board: Board) -> Lens:
             found=f"{len(views)}",
             remedy="check that squares, dictionary and markers are those of the printed board",
         )
-    chosen = _choose_spread([view.outline for view in views], _MOST_VIEWS)
+    chosen = choose_spread(np.array([view.outline for view in views]), _MOST_VIEWS)
     used = [views[index] for index in sorted(chosen)]
     rms, K, dist, turns, _, std, _, per_view = cv2.calibrateCameraExtended(
         [view.points_m for view in used],
         [view.points_px for view in used],
         video.image_size_wh,
         np.eye(3),
-        np.zeros(5),
-        flags=cv2.CALIB_FIX_K3,
+        np.zeros(max(coefficients, 5)),
+        flags=_FLAGS[coefficients],
     )
-    std = np.asarray(std, np.float64).ravel()[:8]
+    std = np.asarray(std, np.float64).ravel()[: 4 + coefficients]
     # Boards that are all parallel to the image fit every focal length, and its stated deviation is then meaningless.
     normals = np.array([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
     tilt_deg = np.rad2deg(np.arccos(np.clip((normals @ normals.T).min(), -1, 1)))
@@ -167,7 +154,7 @@ def lens_of_board(video: VideoInfo, board: Board) -> Lens:
             R=np.eye(3),
             t_m=np.zeros(3),
             K=K,
-            dist=dist.ravel()[:4].tolist(),
+            dist=dist.ravel()[:coefficients].tolist(),
             image_size_wh=video.image_size_wh,
         ),
         std,
@@ -193,39 +180,39 @@ class _View:
     outline: Float[np.ndarray, "8"]
 
 
-def _find_views(video: VideoInfo, model: cv2.aruco.CharucoBoard) -> list[_View]:
-    """Find the frames that show enough corners of the board."""
-    detector = cv2.aruco.CharucoDetector(model)
-    columns, rows = model.getChessboardSize()
-    side = model.getSquareLength()
-    corners_m = np.array([[0, 0], [columns, 0], [columns, rows], [0, rows]], np.float64) * side
+def _find_views(video: VideoInfo, board: Board) -> list[_View]:
+    """Find the frames that show enough corners of the board.
+
+    Raises:
+        InputError: the video cannot be read, or does not show this board.
+    """
     step = max(1, video.num_frames // _MOST_FRAMES)
-    views = []
+    samples = max(1, video.num_frames // _MOST_SAMPLES)
+    recognised = recognise_board(board, map(_grey, read_frames(video, samples)))
+    if not recognised.views:
+        found, remedy = explain_missing_board(board, list(map(_grey, read_frames(video, samples))))
+        raise InputError(video.path, expected=f"a {board}", found=found, remedy=remedy)
+    finder, views = recognised.finder(), []
     for index, frame in enumerate(read_frames(video, step)):
-        corners, ids, _, _ = detector.detectBoard(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY))
-        if ids is None or len(ids) < _MIN_CORNERS:
+        corners_px = finder.find(_grey(frame))
+        seen = np.isfinite(corners_px[:, 0])
+        if seen.sum() < _MIN_CORNERS:
             continue
-        points_m = np.asarray(model.getChessboardCorners())[ids.ravel()][:, None]
-        points_px = np.asarray(corners).reshape(-1, 1, 2)
-        homography, _ = cv2.findHomography(points_m[:, 0, :2], points_px[:, 0])
-        if homography is None:
-            # All corners are on one line.
-            continue
-        outline = cv2.perspectiveTransform(corners_m[:, None], homography)[:, 0] / video.image_size_wh
-        views.append(_View(index * step, points_m, points_px, outline.ravel()))
+        outline = outline_of(board, corners_px)
+        if outline is not None:
+            views.append(
+                _View(
+                    index * step,
+                    board.corners_m[seen][:, None].astype(np.float32),
+                    corners_px[seen][:, None].astype(np.float32),
+                    outline / np.tile(video.image_size_wh, 4),
+                )
+            )
     return views
 
 
-def _choose_spread(outlines: list[Float[np.ndarray, "8"]], count: int) -> list[int]:
-    """Choose views that differ most: each next view is the farthest from the views chosen before."""
-    outline = np.array(outlines)
-    # The first view is the farthest from the median of all views.
-    chosen = [int(np.linalg.norm(outline - np.median(outline, axis=0), axis=1).argmax())]
-    distance = np.linalg.norm(outline - outline[chosen[0]], axis=1)
-    while len(chosen) < min(count, len(outline)):
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(outline - outline[chosen[-1]], axis=1))
-    return chosen
+def _grey(frame: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width"]:
+    return np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY))
 
 
 def _undistorted_camera(focal_length_px: Float[np.ndarray, "2"], image_size_wh: tuple[int, int]) -> Camera:

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb
 from typing import Literal
 
 import cv2
+import jax
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
 from psotrack.calibration.derivatives import pixel_slopes, reproject
 from psotrack.errors import InputError
-from psotrack.geometry import NEAR_M, Camera, project, undistort
+from psotrack.geometry import NEAR_M, Camera, project_visible, undistort
 
 #: A pose has six unknowns and a point gives two equations; the fourth point selects one of P3P's four solutions.
 MIN_POINTS = 4
@@ -26,6 +27,8 @@ _NEARLY_FLAT = 0.1
 _MOST_SETS = 100
 #: Largest number of initial poses that are refined.
 _MOST_STARTS = 4
+#: Distance in the image of a point that the lens does not show at all from its measured pixel, pixels.
+_NO_IMAGE_PX = 1e4
 #: Poses are the same if the camera's orientations differ by less than this, radians.
 _SAME_RAD = np.deg2rad(2.0)
 
@@ -94,7 +97,13 @@ def initial_poses(
 ) -> list[Pose]:
     """Compute poses from all points, and from many sets of four points, so that some sets contain no outlier."""
     normalised = undistort(lens, points_px)
+    shown = np.isfinite(normalised).all(axis=-1)
+    all_m, all_px = points_m, points_px
+    # A point at a pixel where the lens shows nothing starts no pose, and counts as an outlier below.
+    points_m, points_px, normalised = points_m[shown], points_px[shown], normalised[shown]
     count = len(points_m)
+    if count < MIN_POINTS:
+        return []
     if comb(count, MIN_POINTS) <= _MOST_SETS:
         sets = [list(four) for four in combinations(range(count), MIN_POINTS)]
     else:
@@ -119,7 +128,7 @@ def initial_poses(
         return []
     T = np.tile(np.eye(4), (len(solved), 1, 1))
     T[:, :3] = [np.column_stack(pose) for pose in solved]
-    costs = _costs(points_m, points_px, T, lens, noise_px)
+    costs = _costs(all_m, all_px, T, lens, noise_px)
     return [Pose(R, t_m, cost) for (R, t_m), cost in zip(solved, costs.tolist(), strict=True)]
 
 
@@ -144,10 +153,10 @@ def _costs(
 ) -> Float[np.ndarray, " poses"]:
     """The Cauchy loss of each pose; infinite where most points are behind the camera."""
     shape = (len(T_cam_world), 1)
-    K, dist = (np.broadcast_to(value, shape + value.shape) for value in (lens.K, lens.dist))
-    cameras = Camera(T_cam_world[:, None], K, dist, np.zeros((*shape, 2)))
-    pixels, depth = project(cameras, points_m)
-    loss = 0.5 * np.log1p(((pixels - points_px) / noise_px) ** 2).sum(axis=(-2, -1))
+    lenses = jax.tree.map(lambda leaf: np.broadcast_to(leaf, shape + np.shape(leaf)), lens)
+    pixels, depth = project_visible(replace(lenses, T_cam_world=T_cam_world[:, None]), points_m)
+    off = np.nan_to_num(pixels - points_px, nan=_NO_IMAGE_PX) / noise_px
+    loss = 0.5 * np.log1p(off**2).sum(axis=(-2, -1))
     return np.where(np.median(depth, axis=-1) > NEAR_M, loss, np.inf)
 
 
@@ -167,7 +176,7 @@ def refine_pose(
         return ((pixel_slopes(turned, x[:3], x[3:], lens)[0] - points_px) / noise_px).ravel()
 
     def slopes(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "equations 6"]:
-        return pixel_slopes(turned, x[:3], x[3:], lens)[1][..., :6].reshape(-1, 6) / noise_px
+        return pixel_slopes(turned, x[:3], x[3:], lens)[1].reshape(-1, 6) / noise_px
 
     result = least_squares(off, np.concatenate([np.zeros(3), start.t_m]), slopes, loss=loss, x_scale="jac")
     R = np.asarray(cv2.Rodrigues(result.x[:3])[0]) @ start.R

@@ -65,6 +65,7 @@ def improve(
     fixed: Sequence[str] = (),
     refine_focal_length: bool = False,
     common_errors: Sequence[CommonErrors] = (),
+    suspects: Sequence[str] | None = None,
 ) -> Improved:
     """Adjust only the cameras that are wrong by more than errors in the images explain.
 
@@ -74,6 +75,8 @@ def improve(
         noise_px: see `bundle.adjust`.
         fixed: see `bundle.adjust`.
         common_errors: see `bundle.adjust`.
+        suspects: names of the cameras that may be found wrong; None: all that are not fixed. The others may move in
+            `everything`, which tells how well they are known.
         refine_focal_length: multiply all focal lengths with a common factor if this factor certainly differs from 1.
 
     Raises:
@@ -83,6 +86,8 @@ def improve(
     everything = adjust(rig, points_px, noise_px, fixed=fixed, rescaled=every, common_errors=common_errors)
     rescaled = bool(_surprise(everything) > chi2.isf(FALSE_ALARM, 1))
     moved = find_wrong_cameras(rig, everything, fixed)
+    if suspects is not None:
+        moved = tuple(name for name in moved if name in suspects)
     if not moved and not rescaled:
         return Improved(rig, (), {}, False, everything, None, everything.centre_covariance_m2)
     stay = [name for name in rig.names if name not in moved]

@@ -52,6 +52,10 @@ COMMANDS = {
         "psotrack.cli.info",
         "Show what SEQ contains, and check all of its files but the frames of the videos.",
     ),
+    "init": LazyCommand(
+        "psotrack.cli.init",
+        "Write the recording.toml of the videos, images and detections in FOLDER, which other commands take as SEQ.",
+    ),
     "labels": LazyCommand(
         "psotrack.cli.labels", "Write a YOLO training set from sequences with a reference."
     ),
@@ -100,6 +104,8 @@ def cli(verbose: bool) -> None:
 
     \b
     Try it:          psotrack demo
+    Own cameras:     psotrack init flight --calibration rig.toml
+                     psotrack track flight --out tracks.csv
     Step by step:    psotrack simulate S02_D4_A --out data
                      psotrack track data/Simulated_Data/S02_D4_A --out tracks.csv
                      psotrack evaluate tracks.csv data/Simulated_Data/S02_D4_A --plot

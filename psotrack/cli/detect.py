@@ -85,7 +85,7 @@ def detect(
 
     detector = find_detector(chosen, DetectorSettings(confidence, nms, size))
     recording = usable_recording(sequence, cameras, num_frames)
-    files = {name: out / f"{video.path.stem}.csv" for name, video in recording.videos.items()}
+    files = {name: out / f"{name}.csv" for name in recording.videos}
     for path in files.values():
         refuse_to_overwrite(path, force)
     counts: dict[str, int] = {}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from psotrack.cli.options import CACHE, FORCE, JOBS, JSON, QUIET, SEQUENCE, cache_folder
+from psotrack.cli.options import CACHE, FORCE, JOBS, JSON, QUIET, SEQUENCE, Numbers, cache_folder
 from psotrack.cli.output import finite_or_none, output_json, print_line, report_to
 
 if TYPE_CHECKING:
@@ -29,6 +29,13 @@ FOUND = 2
     metavar="yolo|blobs|FOLDER",
     help="Detections in dl_data, blobs of the foreground, or a folder of files in the layout of dl_data.",
 )
+@click.option(
+    "--bounds",
+    "bounds_m",
+    type=Numbers(6),
+    metavar="X0,X1,Y0,Y1,Z0,Z1",
+    help="Bounds of the room, in metres.  [default: far around the cameras, above and below]",
+)
 @CACHE
 @JOBS
 @QUIET
@@ -37,6 +44,7 @@ FOUND = 2
 def doctor(
     sequence: Path,
     detections: str,
+    bounds_m: tuple[float, float, float, float, float, float] | None,
     cache: Path | None,
     jobs: int | None,
     quiet: bool,
@@ -48,8 +56,11 @@ def doctor(
     Reports which camera, pair of cameras or file disagrees, by how much, and what to do. It finds a camera that is
     turned, moved or late, has another focal length, or is exchanged with another camera; camera centres that were read
     as translations; millimetres that were read as metres; mirrored axes; a reference with another clock, unit or
-    origin. Faults that move the drones in the image by less than the noise of the detections are not found. At least
-    four viewpoints are needed to name the faulty camera.
+    origin. A video is late if its frame i shows what the others show in an earlier frame.
+
+    A fault is named only if it explains the detections clearly better than a sound rig, whose boxes may have lasting
+    errors: the middle of a lopsided body's box is not the same point for two cameras. If faults of several cameras
+    explain them equally well, as often with three cameras, all are listed and none is certain.
 
     The exit code is 0 if nothing was found, and 2 if something was found.
 
@@ -59,13 +70,15 @@ def doctor(
       psotrack doctor data/Real_Data/R12_D4 --detections blobs --json -
     """
     from psotrack.correspondence import from_detections, from_silhouettes
-    from psotrack.datasets.dpjait import read_detections, read_sequence
+    from psotrack.datasets import open_recording
     from psotrack.doctor import examine
+    from psotrack.initiation import room_bounds
     from psotrack.methods import detection_files_of
+    from psotrack.recordings import read_detections
     from psotrack.settings import BLOBS
     from psotrack.silhouettes import SilhouetteSettings, compute
 
-    recording = read_sequence(sequence)
+    recording = open_recording(sequence)
     report = report_to(quiet)
     if detections == BLOBS:
         recording = recording.usable()
@@ -74,8 +87,17 @@ def doctor(
     else:
         files = detection_files_of(recording, detections)
         boxes = {name: read_detections(path) for name, path in files.items()}
-        sightings = from_detections(boxes, recording.rig, recording.num_frames)
-    diagnosis = examine(recording.rig, sightings, fps=recording.fps, reference=recording.truth)
+        longest = max((each.num_frames for each in recording.frame_times.values()), default=0)
+        sightings = from_detections(boxes, recording.rig, longest)
+    sightings = sightings.at_instants(recording.timeline())
+    bounds_m = recording.bounds_m if bounds_m is None else bounds_m
+    diagnosis = examine(
+        recording.rig,
+        sightings,
+        fps=recording.fps,
+        reference=recording.truth,
+        bounds_m=None if bounds_m is None else room_bounds(recording.rig, bounds_m),
+    )
     output_json(json_path, _content(recording.rig, diagnosis), force)
     if not quiet and json_path != Path("-"):
         _print(recording.rig, diagnosis)
@@ -100,8 +122,8 @@ def _rows(rig: Rig, diagnosis: Diagnosis) -> list[dict[str, Any]]:
                 "explained": float(found.share_of_camera[index]),
                 "residual_px": float(np.median(residual_px)) if len(residual_px) else None,
                 "residual_std": float(np.median(residual_px / noise_px)) if len(residual_px) else None,
-                "late_frames": finite_or_none(diagnosis.offset_frames[index]),
-                "late_std_frames": finite_or_none(diagnosis.offset_std_frames[index]),
+                "late_frames": finite_or_none(diagnosis.late_frames[index]),
+                "late_std_frames": finite_or_none(diagnosis.late_std_frames[index]),
             }
         )
     return rows

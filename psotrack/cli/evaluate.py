@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,9 @@ from psotrack.errors import InputError, SettingsError
 if TYPE_CHECKING:
     from psotrack.recordings import Recording
     from psotrack.trajectories import Trajectories
+
+#: Tracks whose rate differs by less than this share from the recording's have the recording's rate.
+RATE_TOLERANCE = 1e-3
 
 
 @click.command()
@@ -49,16 +53,18 @@ def evaluate(
     """
     from rich.console import Console
 
-    from psotrack.datasets.dpjait import read_sequence
+    from psotrack.datasets import open_recording
     from psotrack.evaluation import evaluate as compare
     from psotrack.evaluation import plots, tables
     from psotrack.trajectories import read_trajectories
 
-    recording = read_sequence(sequence)
+    recording = open_recording(sequence)
     if recording.truth is None:
         raise InputError(sequence, expected="a reference to compare with", found="none")
     estimate = read_trajectories(tracks, fps=recording.fps)
+    recording = _at_rate_of(estimate, recording)
     truth, offset_s = recording.truth, 0.0
+    assert truth is not None
     if offset is not None:
         truth, offset_s = _shifted_reference(recording, estimate, offset)
     evaluation = compare(estimate, truth)
@@ -70,6 +76,20 @@ def evaluate(
     if not quiet and json_path != Path("-"):
         title = f"{recording.name}, reference's clock {offset_s:+.4f} s" if offset else recording.name
         Console().print(tables.render(evaluation, title=title))
+
+
+def _at_rate_of(estimate: Trajectories, recording: Recording) -> Recording:
+    """The recording, with its reference at the instants of tracks that have a rate of their own (`track --rate`)."""
+    from psotrack.trajectories import resample
+
+    if estimate.num_frames < 2 or recording.truth is None:
+        return recording
+    rate_hz = float(np.ptp(estimate.frame) / max(np.ptp(estimate.time_s), 1e-9))
+    if abs(rate_hz / recording.fps - 1) < RATE_TOLERANCE:
+        return recording
+    timed = replace(recording, rate_hz=rate_hz)
+    time_s = timed.timeline().time_s
+    return replace(timed, truth=resample(recording.truth, np.arange(len(time_s)), time_s))
 
 
 def _shifted_reference(
@@ -89,5 +109,5 @@ def _shifted_reference(
             offset_s = math.nan
         if not math.isfinite(offset_s):
             raise SettingsError("--offset", expected="a number of seconds, or auto", found=offset)
-    frame = np.arange(recording.num_frames)
-    return shifted(reference, offset_s, frame, frame / recording.fps), offset_s
+    time_s = recording.timeline().time_s
+    return shifted(reference, offset_s, np.arange(len(time_s)), time_s), offset_s

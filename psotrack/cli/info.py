@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from psotrack.cli.options import FORCE, JSON, SEQUENCE
-from psotrack.cli.output import output_json
+from psotrack.cli.output import output_json, print_inventory
 
 
 @click.command()
@@ -17,16 +17,17 @@ from psotrack.cli.output import output_json
 def info(sequence: Path, force: bool, json_path: Path | None) -> None:
     """Show what SEQ contains, and check all of its files but the frames of the videos.
 
-    \b
-    Example:
-      psotrack info data/Simulated_Data/S02_D4_A
-    """
-    from rich.console import Console
+    SEQ is a recording.toml, a folder that holds one, or a folder of the DPJAIT dataset.
 
-    from psotrack.datasets.dpjait import read_sequence
+    \b
+    Examples:
+      psotrack info data/Simulated_Data/S02_D4_A
+      psotrack info flight/recording.toml
+    """
+    from psotrack.datasets import open_recording
     from psotrack.recordings import describe_recording, inventory_table
 
-    content = describe_recording(read_sequence(sequence))
+    content = describe_recording(open_recording(sequence))
     output_json(json_path, content, force)
     if json_path != Path("-"):
-        Console().print(inventory_table(content))
+        print_inventory(inventory_table(content))

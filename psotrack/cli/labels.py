@@ -86,11 +86,11 @@ def labels(
       psotrack labels data/Simulated_Data/S0* --out yolo --drone-size 0.43,0.43,0.23 --every 5
       psotrack labels R01_D2 R12_D4 --out yolo --drone-size 0.4,0.4,0.2 --offset 0,0,-0.117 --validation R12_D4
     """
-    from psotrack.datasets.dpjait import read_sequence
+    from psotrack.datasets import open_recording
     from psotrack.detection import DATA_SET, FrameSelection, LabelSettings, write_data_set
 
     counts = write_data_set(
-        [read_sequence(sequence) for sequence in sequences],
+        [open_recording(sequence) for sequence in sequences],
         out,
         LabelSettings(drone_size_m, offset_m, min_inside, max_hidden),
         selection=FrameSelection(validation.split(",") if validation else (), every),

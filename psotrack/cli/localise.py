@@ -217,7 +217,8 @@ def localise(
 
 def _input(video: str, drone: str | None, fps: float | None, live: bool) -> _Input:
     """The input that VIDEO names: a video, a folder of images, a stream, or one drone's video in a sequence."""
-    from psotrack.datasets.dpjait import MARKER_CORNERS, read_onboard
+    from psotrack.datasets import find_marker_corners
+    from psotrack.datasets.dpjait import read_onboard
     from psotrack.inside_out import folder_has_images, open_source
 
     stream, folder = live or "://" in video, Path(video)
@@ -244,7 +245,7 @@ def _input(video: str, drone: str | None, fps: float | None, live: bool) -> _Inp
     if chosen not in onboard:
         raise SettingsError("--drone", expected=f"one of {names}", found=chosen)
     one = onboard[chosen]
-    return _Input(open_source(one.video.path, fps=fps), chosen, one, folder / MARKER_CORNERS)
+    return _Input(open_source(one.video.path, fps=fps), chosen, one, find_marker_corners(folder))
 
 
 def _lens(

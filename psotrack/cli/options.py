@@ -177,10 +177,15 @@ def silhouette_options(command: Command) -> Command:
 
 
 def usable_recording(folder: str | Path, cameras: str | None, num_frames: int | None) -> Recording:
-    """Sequence with the cameras and frames that the options `CAMERAS` and `FRAMES` select."""
-    from psotrack.datasets.dpjait import read_sequence
+    """Recording with the cameras and frames that the options `CAMERAS` and `FRAMES` select."""
+    from psotrack.datasets import open_recording
 
-    return read_sequence(folder).usable(cameras.split(",") if cameras else None, num_frames)
+    return open_recording(folder).usable(camera_names(cameras), num_frames)
+
+
+def camera_names(cameras: str | None) -> list[str] | None:
+    """Names of the option `CAMERAS`; None where it is not given."""
+    return None if cameras is None else [name.strip() for name in cameras.split(",")]
 
 
 def cache_folder(chosen: str | Path | None) -> Path:

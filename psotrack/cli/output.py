@@ -10,20 +10,33 @@ import json
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from psotrack.errors import SettingsError
 from psotrack.support import Report, atomic_write, no_progress, progress_bar, refuse_to_overwrite
 
+if TYPE_CHECKING:
+    from rich.table import Table
+
 #: Heading of a column of positions; `print_table` keeps each of its cells on one line.
 POSITION = "centre (m)"
+#: Width of an inventory in a file or a pipe, characters.
+_WIDE = 200
 
 
 def report_to(quiet: bool) -> Report:
     """Progress display for long work: none with --quiet, else a bar on stderr."""
     return no_progress if quiet else progress_bar
+
+
+def print_inventory(table: Table) -> None:
+    """Print a table; in its full width where the output is no terminal."""
+    from rich.console import Console
+
+    console = Console()
+    Console(width=None if console.is_terminal else max(console.width, _WIDE)).print(table)
 
 
 def print_line(quiet: bool, json_path: Path | None, sentence: str) -> None:

@@ -47,6 +47,12 @@ from psotrack.errors import SettingsError
 @click.option(
     "--onboard/--no-onboard", default=True, show_default=True, help="Render the videos of on-board cameras."
 )
+@click.option(
+    "--as-own-cameras",
+    "own_cameras",
+    is_flag=True,
+    help="Write OUT as a laboratory would have it: videos of different rates and sizes, and videos of a board.",
+)
 @JOBS
 @FORCE
 @QUIET
@@ -64,6 +70,7 @@ def simulate(
     seed: int,
     masks: bool,
     onboard: bool,
+    own_cameras: bool,
     jobs: int | None,
     force: bool,
     quiet: bool,
@@ -80,13 +87,21 @@ def simulate(
       psotrack simulate S02_D4_A --out data
       psotrack simulate S04_D10 --out small --scale 0.5 --frames 60 --seed 7
       psotrack simulate S02_D4_A --out pages --preview
+      psotrack simulate S02_D4_A --as-own-cameras --out my_lab
       psotrack simulate S02_D4_A --show > mine.toml
       psotrack simulate --scenario mine.toml --out data --set camera_spread.focal_length=0.02
     """
     if listed:
         _list(json_path, quiet, force)
         return
-    from psotrack.simulation import SimulationSettings, change_scenario, load, preset_text, scenario
+    from psotrack.simulation import (
+        SimulationSettings,
+        change_scenario,
+        load,
+        preset_text,
+        scenario,
+        simulate_own_cameras,
+    )
     from psotrack.simulation import simulate as make
 
     if (name is None) == (scenario_file is None):
@@ -127,7 +142,7 @@ def simulate(
         output_json(json_path, {"preview": str(page)}, force)
         print_line(quiet, json_path, f"{page}")
         return
-    folder = make(
+    folder = (simulate_own_cameras if own_cameras else make)(
         recipe,
         out,
         SimulationSettings(num_frames, scale, seed, masks, onboard),

@@ -50,10 +50,10 @@ def synchronise(
       psotrack synchronise tracks.csv data/Real_Data/R12_D4 --max-offset 10 --plot offset.png --json -
     """
     from psotrack.clocks import find_offset, own_reference, save_curve
-    from psotrack.datasets.dpjait import read_sequence
+    from psotrack.datasets import open_recording
     from psotrack.trajectories import read_trajectories
 
-    recording = read_sequence(sequence)
+    recording = open_recording(sequence)
     reference = own_reference(recording)
     estimate = read_trajectories(tracks, fps=recording.fps)
     offset = find_offset(

@@ -21,13 +21,13 @@ from psotrack.cli.options import (
     TRACK,
     Numbers,
     cache_folder,
+    camera_names,
     compiled_folder,
     silhouette_options,
-    usable_recording,
 )
 from psotrack.cli.output import output_json, print_line, report_to, write_json
 from psotrack.errors import SettingsError
-from psotrack.settings import RENAMED, SwarmKind, TrackSettings
+from psotrack.settings import RENAMED, USUAL_SPEED_M_S, Clocks, ErrorSettings, SwarmKind, TrackSettings
 from psotrack.silhouettes import SilhouetteSettings
 from psotrack.support import refuse_to_overwrite
 
@@ -141,15 +141,54 @@ from psotrack.support import refuse_to_overwrite
     "bounds_m",
     type=Numbers(6),
     metavar="X0,X1,Y0,Y1,Z0,Z1",
-    help="Bounds of the room, in metres.  [default: derived from the cameras]",
+    help="Bounds of the room, in metres.  [default: derived from the cameras and from what moves]",
 )
 @click.option(
     "--max-speed",
     "max_speed_m_s",
     type=float,
-    default=TRACK.motion.max_speed_m_s,
+    help=f"Largest speed of a drone, in m/s.  [default: {USUAL_SPEED_M_S:g}, or more where the data show more]",
+)
+@click.option(
+    "--min-cameras",
+    "min_cameras_to_begin",
+    type=int,
+    metavar="N",
+    help="Number of cameras, at different places, that must agree to begin a track; two keep it.  [default: 3 where at "
+    "least 3 cameras have the place in view, else 2]",
+)
+@click.option(
+    "--rate",
+    "rate_hz",
+    type=float,
+    metavar="HZ",
+    help="Instants per second at which drones are tracked.  [default: the rate of the fastest camera]",
+)
+@click.option(
+    "--clocks",
+    type=click.Choice(get_args(Clocks)),
+    default=TRACK.clocks,
     show_default=True,
-    help="Largest speed of a drone, in m/s.",
+    help="Times of the cameras' frames. given: those of SEQ; auto: corrected by each camera's offset and drift, which "
+    "are estimated from the motion of the drones, before a second pass.",
+)
+@click.option(
+    "--rig-error",
+    "rig_deg",
+    type=float,
+    default=TRACK.errors.rig_deg,
+    metavar="DEGREES",
+    help="Angle by which each camera may be turned: part of the covariances, also where the cameras do not show it.  "
+    "[default: as much as they show]",
+)
+@click.option(
+    "--pixel-error",
+    "pixel_px",
+    type=float,
+    default=TRACK.errors.pixel_px,
+    metavar="PX",
+    help="Lasting error of a drone's place in an image along either axis, in pixels: part of the covariances, also "
+    "where the cameras do not show it.  [default: as much as they show]",
 )
 @click.option(
     "--smooth", is_flag=True, default=TRACK.smooth, help="Correct each frame's positions by later frames."
@@ -187,12 +226,15 @@ def track(
     \b
     Examples:
       psotrack track data/Simulated_Data/S02_D4_A --out tracks.csv
+      psotrack track flight/recording.toml --out tracks.csv
       psotrack track data/Simulated_Data/S02_D4_A --out smooth.csv --smooth
       psotrack track data/Simulated_Data/S02_D4_A --out lines.csv --method projection-lines
       psotrack track data/Real_Data/R12_D4 --out both.csv --method fused --detector drones.onnx --detector-size 1280
       psotrack track data/Simulated_Data/S02_D4_A --out paper.parquet --swarm joint --particles 100 --iterations 70
     """
+    from psotrack.datasets import open_recording
     from psotrack.detection import DetectorSettings, find_detector
+    from psotrack.methods import usable_for
     from psotrack.pipeline import Parts, track_recording
     from psotrack.silhouettes import find_background
     from psotrack.support import keep_compiled
@@ -209,8 +251,15 @@ def track(
         detector=None if detector is None else find_detector(detector, DetectorSettings(size=detector_size)),
     )
     keep_compiled(compiled_folder(cache))
+    recording = usable_for(
+        open_recording(sequence),
+        chosen,
+        cameras=camera_names(cameras),
+        num_frames=num_frames,
+        videos=detector is not None,
+    )
     tracked = track_recording(
-        usable_recording(sequence, cameras, num_frames),
+        recording,
         chosen,
         cache=cache_folder(cache),
         jobs=jobs,
@@ -236,4 +285,8 @@ def _setting_name(option: str) -> str:
     """Dotted name of the setting that an option sets."""
     if option in SilhouetteSettings.__struct_fields__:
         return f"silhouettes.{option}"
+    if option in ErrorSettings.__struct_fields__:
+        return f"errors.{option}"
+    if option == "min_cameras_to_begin":
+        return "status.min_cameras_to_begin"
     return "swarm.search" if option == "search" else RENAMED.get(option, option)

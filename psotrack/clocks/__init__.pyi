@@ -1,11 +1,18 @@
 from .camera_clocks import camera_offsets
 from .synchronisation import Offset, find_offset, own_reference, save_curve, shifted
+from .track_clocks import CameraClocks, clocks_of_tracks, estimate_clocks, fit_clocks
+from .track_places import places_of_tracks
 
 __all__ = [
+    "CameraClocks",
     "Offset",
     "camera_offsets",
+    "clocks_of_tracks",
+    "estimate_clocks",
     "find_offset",
+    "fit_clocks",
     "own_reference",
+    "places_of_tracks",
     "save_curve",
     "shifted",
 ]

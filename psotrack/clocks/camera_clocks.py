@@ -21,7 +21,15 @@ from jaxtyping import Bool, Float
 from psotrack.clocks.correlated_errors import autocorrelation, widening
 from psotrack.errors import SettingsError, check_positive
 from psotrack.estimation import NormalEquations, cauchy_weight, gauss_newton
-from psotrack.geometry import MAX_CONDITION, NEAR_M, Camera, Rig, project_with_jacobian, triangulate
+from psotrack.geometry import (
+    MAX_CONDITION,
+    Camera,
+    Rig,
+    has_image,
+    project_with_jacobian,
+    to_camera,
+    triangulate,
+)
 
 #: Number of rounds without a step until the weights have settled, and largest number of steps.
 _WEIGHT_ROUNDS, _MAX_STEPS = 5, 35
@@ -174,9 +182,14 @@ def _linearise(
     """
     cameras, seen_px = problem.cameras, _interpolate_at_common_times(problem.points_px, offset_frames)
     point_m = triangulate(cameras, seen_px, np.maximum(weights, 1e-9))
-    pixels, depth, J = project_with_jacobian(cameras, np.nan_to_num(point_m)[:, :, None])
+    places_m = np.nan_to_num(point_m)[:, :, None]
+    pixels, _, J = project_with_jacobian(cameras, places_m)
     e = seen_px - pixels
-    there = np.isfinite(e).all(axis=-1) & (depth > NEAR_M) & np.isfinite(point_m).all(axis=-1)[..., None]
+    there = (
+        np.isfinite(e).all(axis=-1)
+        & has_image(cameras, to_camera(cameras, places_m))
+        & np.isfinite(point_m).all(axis=-1)[..., None]
+    )
     there &= there.sum(axis=-1, keepdims=True) >= 2
     e = np.where(there[..., None], e, 0.0)
     weights = _robust_weights(e, there)

@@ -20,6 +20,7 @@ from jaxtyping import Float, Int
 
 from psotrack.clocks.camera_clocks import CameraOffsets, camera_offsets
 from psotrack.clocks.time_shift import ShiftedPair, refused, shifted
+from psotrack.datasets import read_own_reference
 from psotrack.errors import InputError, SettingsError
 from psotrack.recordings import Recording, body_trajectories, read_c3d
 from psotrack.support import COLOURS, save_figure, standard_error
@@ -151,7 +152,9 @@ def find_offset(
 
 
 def own_reference(recording: Recording) -> Trajectories:
-    """The reference of a sequence at its own rate and with its own clock: the .c3d file, or else the pose files.
+    """The reference of a recording at its own rate and with its own clock: the .c3d file, or else the pose files.
+
+    The clock of a reference that `recording.toml` names is shifted by the offset that is stated there.
 
     Orientations are returned only if every position has an orientation.
 
@@ -159,7 +162,10 @@ def own_reference(recording: Recording) -> Trajectories:
         InputError: the sequence has no reference, or the .c3d file cannot be used.
     """
     reference = recording.truth
-    for path in recording.folder.iterdir():
+    if recording.reference_files:
+        own = read_own_reference(recording.reference_files, recording.fps)
+        reference = replace(own, time_s=own.time_s + recording.reference_offset_s)
+    for path in () if recording.reference_files else recording.folder.iterdir():
         if path.suffix.lower() == ".c3d":
             markers = read_c3d(path)
             num_frames = len(markers.position_m)

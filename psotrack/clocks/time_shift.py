@@ -6,18 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from scipy.interpolate import CubicSpline
+from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment, minimize_scalar
-from scipy.spatial.transform import Rotation
 
 from psotrack.clocks.correlated_errors import autocorrelation, widening
 from psotrack.errors import InputError
 from psotrack.geometry import rotation_matrices
-from psotrack.trajectories import GATE_M, UNASSIGNED, Trajectories, fixed_partner_values
+from psotrack.trajectories import GATE_M, UNASSIGNED, Trajectories, fixed_partner_values, resample
+from psotrack.trajectories.resampling import interpolated
 
-#: Longest gap of a reference over which positions are interpolated, seconds; for slow references 1.5 sample intervals.
-MAX_GAP_S = 0.1
 #: Velocities are differences over this time before and after a frame, seconds: shorter times would show noise.
 _MOTION_S = 0.1
 #: Precision of the offset at the minimum, seconds: far below the standard deviations that noise allows.
@@ -108,8 +105,8 @@ class ShiftedPair:
             estimate.frame,
             estimate.time_s.astype(np.float64),
             np.where(estimate.seen[..., None], estimate.position_m, np.nan).astype(np.float64),
-            _interpolated(time_s, position_m),
-            None if orientation_wxyz is None else _interpolated(time_s, rotation_matrices(orientation_wxyz)),
+            interpolated(time_s, position_m),
+            None if orientation_wxyz is None else interpolated(time_s, rotation_matrices(orientation_wxyz)),
             with_lever_arm,
         )
 
@@ -242,65 +239,7 @@ def shifted(
         frame: (frames,), numbers of the video's frames.
         time_s: (frames,), times of the video's frames, seconds.
     """
-    position_m = _interpolated(reference.time_s, reference.position_m)(time_s + offset_s)
-    orientation_wxyz = None
-    if reference.orientation_wxyz is not None:
-        rotation = _interpolated(reference.time_s, rotation_matrices(reference.orientation_wxyz))(
-            time_s + offset_s
-        )
-        orientation_wxyz = np.full((*rotation.shape[:2], 4), np.nan)
-        known = np.isfinite(rotation).all(axis=(-2, -1))
-        if known.any():
-            orientation_wxyz[known] = Rotation.from_matrix(rotation[known]).as_quat(scalar_first=True)
-    return Trajectories(frame, time_s, reference.drones, position_m, orientation_wxyz=orientation_wxyz)
-
-
-def longest_gap_s(time_s: Float[np.ndarray, "samples"]) -> float:
-    """Longest gap between samples over which positions are interpolated, seconds."""
-    return max(MAX_GAP_S, 1.5 * float(np.median(np.diff(time_s))))
-
-
-def between_samples(
-    sample_s: Float[np.ndarray, "samples"], wanted_s: Float[np.ndarray, "times"], longest_s: float
-) -> Bool[np.ndarray, "times"]:
-    """Say which times are at a sample, or between two samples that are at most `longest_s` apart.
-
-    Args:
-        sample_s: (samples,), increasing times of at least two samples, seconds.
-        wanted_s: (times,), times of interest, seconds.
-        longest_s: longest gap between two samples, seconds.
-    """
-    after = np.clip(np.searchsorted(sample_s, wanted_s), 1, len(sample_s) - 1)
-    before_s, after_s = wanted_s - sample_s[after - 1], sample_s[after] - wanted_s
-    inside = (np.minimum(before_s, after_s) >= 0) & (before_s + after_s <= longest_s)
-    # The samples at both ends of a gap are valid; the tolerance is for rounding errors.
-    return inside | (np.minimum(np.abs(before_s), np.abs(after_s)) < 1e-9)
-
-
-def _interpolated(time_s: Float[np.ndarray, "samples"], values: np.ndarray) -> _At:
-    """A function that interpolates values (samples, drones, ...) by cubic splines.
-
-    It takes times (times,) and returns values (times, drones, ...), NaN outside of the samples and in long gaps.
-    """
-    flat = values.reshape(*values.shape[:2], -1).astype(np.float64)
-    longest_s = longest_gap_s(time_s)
-    known = [np.isfinite(flat[:, drone]).all(axis=-1) for drone in range(flat.shape[1])]
-    # A spline needs two samples.
-    splines = {
-        drone: (time_s[there], CubicSpline(time_s[there], flat[there, drone]))
-        for drone, there in enumerate(known)
-        if there.sum() > 1
-    }
-
-    def at(wanted_s: Float[np.ndarray, "times"]) -> np.ndarray:
-        found = np.full((len(wanted_s), *flat.shape[1:]), np.nan)
-        for drone, (sample_s, spline) in splines.items():
-            inside = between_samples(sample_s, wanted_s, longest_s)
-            if inside.any():
-                found[inside, drone] = spline(wanted_s[inside])
-        return found.reshape(len(wanted_s), *values.shape[1:])
-
-    return at
+    return resample(reference, frame, time_s, later_s=offset_s)
 
 
 def _medians(values: Float[np.ndarray, "frames drones 3"]) -> Float[np.ndarray, "drones 3"]:

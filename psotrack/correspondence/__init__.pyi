@@ -2,6 +2,7 @@ from .assignment import SEPARATION_M
 from .epipolar import epipolar_distance
 from .groups import NEW_GROUP_COST, SHARED_COST, UNEXPLAINED_COST
 from .matching import Matches, match
+from .padded_sightings import in_images
 from .sightings import (
     BORDER_PX,
     CUT_SHARE,
@@ -28,5 +29,6 @@ __all__ = [
     "epipolar_distance",
     "from_detections",
     "from_silhouettes",
+    "in_images",
     "match",
 ]

@@ -177,9 +177,13 @@ def _reassign_detections(padded: PaddedSightings, groups: Groups, priors: Priors
     normal, right = normal_equations(
         padded, np.arange(len(groups.detection.T)), groups.detection, padded.depth(groups.point)
     )
-    own = priors.equations(groups.prior)
-    normal = (normal.sum(axis=1) + own[0])[:, None] - normal
-    right = (right.sum(axis=1) + own[1])[:, None] - right
+    own = priors.normal[groups.prior]
+    # Without one of two views, the room alone would say how far along the other ray the drone is: in the room's middle,
+    # which may be behind a camera.
+    mean = np.where(groups.prior[:, None] < 0, groups.point, priors.mean[groups.prior])
+    own_right = (own @ mean[..., None])[..., 0]
+    normal = (normal.sum(axis=1) + own)[:, None] - normal
+    right = (right.sum(axis=1) + own_right)[:, None] - right
     distance = squared_distances(padded, *solve_points(normal, right))
     cost = np.minimum(np.concatenate([distance, distance + SHARED_COST], axis=-1), UNEXPLAINED_COST)
     detection, shared = np.full_like(groups.detection, -1), np.zeros(groups.detection.shape, bool)

@@ -98,7 +98,7 @@ def make_groups(
         shared=shared,
         gain=np.where(detection >= 0, UNEXPLAINED_COST - SHARED_COST * shared - distance, 0.0),
         prior=prior,
-        min_viewpoints=priors.min_viewpoints[prior],
+        min_viewpoints=padded.required_viewpoints(point, priors.min_viewpoints[prior]),
         base_cost=np.where(prior < 0, NEW_GROUP_COST, np.einsum("gi,gij,gj->g", off, own[0], off)),
         point=point,
         covariance=covariance,

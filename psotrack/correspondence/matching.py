@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from psotrack.correspondence.assignment import apply_exchanges, assign_groups, propose_exchanges
 from psotrack.correspondence.groups import SHARED_COST, UNEXPLAINED_COST, Groups
-from psotrack.correspondence.padded_sightings import PaddedSightings, make_priors, pad_sightings
+from psotrack.correspondence.padded_sightings import BY_PLACE, PaddedSightings, make_priors, pad_sightings
 from psotrack.correspondence.proposals import propose_groups
 from psotrack.errors import SettingsError
 from psotrack.geometry import Camera, triangulate
@@ -43,7 +43,7 @@ def match(
     noise_px: list[Float[np.ndarray, "_"]],
     *,
     bounds_m: Float[np.ndarray, "2 3"],
-    min_views: int = 3,
+    min_views: int | None = 3,
     expected_m: Float[np.ndarray, "known 3"] | None = None,
     expected_covariance_m2: Float[np.ndarray, "known 3 3"] | None = None,
 ) -> Matches:
@@ -59,7 +59,8 @@ def match(
             no detection.
         noise_px: for each camera (n,), standard deviations of the middles along each axis, pixels.
         bounds_m: (2, 3), corners of the region where drones can be, metres.
-        min_views: smallest number of viewpoints (see `psotrack.geometry.viewpoints`), 2 or more.
+        min_views: smallest number of viewpoints (see `psotrack.geometry.viewpoints`), 2 or more; None: three where at
+            least three viewpoints have the place in view, else two.
         expected_m: (known, 3), predicted positions of drones in the world, metres.
         expected_covariance_m2: (known, 3, 3), covariances of the predictions, square metres.
 
@@ -71,12 +72,13 @@ def match(
         raise SettingsError(
             "expected_m", expected="predictions with covariances", found="one without the other"
         )
-    if min_views < 2:
+    if min_views is not None and min_views < 2:
         raise SettingsError("min_views", expected="2 or more", found=f"{min_views}")
     if expected_m is None or expected_covariance_m2 is None:
         expected_m, expected_covariance_m2 = np.empty((0, 3)), np.empty((0, 3, 3))
     unambiguous = len(expected_m) < 2 and max(map(len, points_px), default=0) < 2
-    priors = make_priors(bounds_m, expected_m, expected_covariance_m2, 2 if unambiguous else min_views)
+    least = 2 if unambiguous else BY_PLACE if min_views is None else min_views
+    priors = make_priors(bounds_m, expected_m, expected_covariance_m2, least)
     padded = pad_sightings(cameras, points_px, noise_px)
     proposed = propose_groups(padded, priors, bounds_m)
     return _matches(padded, assign_groups(padded, proposed, priors, bounds_m), proposed)

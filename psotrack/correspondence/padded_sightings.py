@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.errors import SettingsError
-from psotrack.geometry import NEAR_M, Camera, projection_equations, undistort, viewpoints
+from psotrack.geometry import (
+    NEAR_M,
+    Camera,
+    project_visible,
+    projection_equations,
+    undistort,
+    undistortion_stretch,
+    viewpoints,
+)
+
+#: Value of `Priors.min_viewpoints`: three viewpoints must see the drone, or two where the place is in view of no third.
+BY_PLACE = 0
 
 
 @dataclass(frozen=True)
@@ -16,6 +27,7 @@ class PaddedSightings:
     """Detections of all cameras, padded to one length. The last column is padding, so that index -1 is no detection.
 
     Attributes:
+        cameras: the cameras.
         straight: the cameras with K = 1 and without lens distortion; `x` are their pixels.
         x: (cameras, padded, 2), normalised undistorted image coordinates.
         variance: (cameras, padded), variances of `x` along each axis; infinite for padding. Pixels are assumed square.
@@ -24,6 +36,7 @@ class PaddedSightings:
         at: (cameras, viewpoints), 1 where a camera stands at a viewpoint, else 0.
     """
 
+    cameras: Camera
     straight: Camera
     x: Float[np.ndarray, "cameras padded 2"]
     variance: Float[np.ndarray, "cameras padded"]
@@ -45,6 +58,27 @@ class PaddedSightings:
         """Number of viewpoints from which each group is seen."""
         return (seen @ self.at > 0).sum(axis=-1)
 
+    def required_viewpoints(
+        self, point: Float[np.ndarray, "groups 3"], min_viewpoints: Int[np.ndarray, "groups"]
+    ) -> Int[np.ndarray, "groups"]:
+        """Numbers of viewpoints that must see points, with `BY_PLACE` replaced by the number for the place."""
+        by_place = min_viewpoints == BY_PLACE
+        if not by_place.any():
+            return min_viewpoints
+        in_view = in_images(self.cameras, point[by_place])
+        required = min_viewpoints.copy()
+        required[by_place] = np.clip(self.num_viewpoints(in_view), 2, 3)
+        return required
+
+
+def in_images(
+    cameras: Camera, position_m: Float[np.ndarray, "*points 3"]
+) -> Bool[np.ndarray, "*points cameras"]:
+    """(..., cameras), whether a point is inside a camera's image."""
+    pixels, depth = project_visible(cameras, position_m[..., None, :])
+    inside = (pixels >= -0.5) & (pixels <= cameras.image_size_wh - 0.5)
+    return np.asarray(inside.all(axis=-1) & (depth > NEAR_M))
+
 
 def pad_sightings(
     cameras: Camera, points_px: list[Float[np.ndarray, "_ 2"]], noise_px: list[Float[np.ndarray, "_"]]
@@ -59,19 +93,19 @@ def pad_sightings(
         variance[camera, :count] = (noise_px[camera] / focal_px[camera]) ** 2
     if not (variance > 0).all():
         raise SettingsError("noise_px", expected="numbers above 0", found="0, NaN, or below")
-    straight = Camera(
-        cameras.T_cam_world,
-        np.broadcast_to(np.eye(3), cameras.K.shape),
-        cameras.dist[:, :0],
-        cameras.image_size_wh,
+    straight = replace(
+        cameras, K=np.broadcast_to(np.eye(3), cameras.K.shape), dist=cameras.dist[:, :0], fisheye=None
     )
     x = undistort(cameras, pixels)
+    if cameras.dist.shape[-1]:
+        variance *= np.nan_to_num(undistortion_stretch(cameras, x), nan=1.0).T ** 2
     rows, right, there = projection_equations(straight, x)
     variance[~there.T] = np.inf
     rows, right = rows.swapaxes(0, 1), right.swapaxes(0, 1)
     weighted = rows.swapaxes(-1, -2) / variance[..., None, None]
     label = viewpoints(cameras)
     return PaddedSightings(
+        cameras=cameras,
         straight=straight,
         x=np.nan_to_num(x.swapaxes(0, 1)),
         variance=variance,
@@ -90,7 +124,7 @@ class Priors:
     Attributes:
         normal: (priors, 3, 3), information matrices, the inverses of the covariances.
         mean: (priors, 3), expected positions in the world, metres.
-        min_viewpoints: (priors,), smallest number of viewpoints that must see the drone.
+        min_viewpoints: (priors,), smallest number of viewpoints that must see the drone, or `BY_PLACE`.
     """
 
     normal: Float[np.ndarray, "priors 3 3"]
@@ -111,7 +145,7 @@ def make_priors(
     covariance_m2: Float[np.ndarray, "known 3 3"],
     min_views: int,
 ) -> Priors:
-    """Priors of the expected drones and of the room. Arguments: see `match`.
+    """Priors of the expected drones and of the room. Arguments: see `match`; `min_views` may be `BY_PLACE`.
 
     Two viewpoints are enough for an expected drone.
     """

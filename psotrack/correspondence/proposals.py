@@ -16,7 +16,7 @@ from psotrack.correspondence.groups import (
     solve_points,
     squared_distances,
 )
-from psotrack.correspondence.padded_sightings import PaddedSightings, Priors
+from psotrack.correspondence.padded_sightings import BY_PLACE, PaddedSightings, Priors
 
 
 def propose_groups(padded: PaddedSightings, priors: Priors, bounds_m: Float[np.ndarray, "2 3"]) -> Groups:
@@ -54,12 +54,32 @@ def _pair_points(
     Only pairs are kept with which enough other cameras agree.
     """
     min_viewpoints = int(priors.min_viewpoints[-1])
+    by_place = min_viewpoints == BY_PLACE
     close = squared_epipolar_distances(padded) < UNEXPLAINED_COST
     first, second, i, j = np.nonzero(close & _proposing_camera_pairs(padded, min_viewpoints)[..., None, None])
+    camera, detection = np.stack([first, second], axis=-1), np.stack([i, j], axis=-1)
     # Another camera agrees if it has a detection near the epipolar lines of both detections.
     others = np.any(close[first, :, i] & close[second, :, j], axis=-1)
-    kept = padded.num_viewpoints(others) >= min_viewpoints - 2
-    camera, detection = np.stack([first, second], axis=-1)[kept], np.stack([i, j], axis=-1)[kept]
+    if by_place:
+        kept = _proposing_camera_pairs(padded, 3)[first, second] & (padded.num_viewpoints(others) >= 1)
+    else:
+        kept = padded.num_viewpoints(others) >= min_viewpoints - 2
+    point, covariance = _points_of_pairs(padded, priors, camera[kept], detection[kept])
+    if not by_place or kept.all():
+        return point, covariance
+    # Where only two viewpoints have the place in view, no other camera can agree.
+    alone, covariance_alone = _points_of_pairs(padded, priors, camera[~kept], detection[~kept])
+    two = padded.required_viewpoints(alone, np.full(len(alone), BY_PLACE)) == 2
+    return np.concatenate([point, alone[two]]), np.concatenate([covariance, covariance_alone[two]])
+
+
+def _points_of_pairs(
+    padded: PaddedSightings,
+    priors: Priors,
+    camera: Int[np.ndarray, "pairs 2"],
+    detection: Int[np.ndarray, "pairs 2"],
+) -> tuple[Float[np.ndarray, "pairs 3"], Float[np.ndarray, "pairs 3 3"]]:
+    """Points in which the rays of two detections nearly meet, and covariances of the points."""
     room, middle = priors.equations(np.array([-1]))
     depth = padded.depth(priors.mean[-1])[camera]
     for _ in range(2):

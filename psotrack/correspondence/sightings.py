@@ -6,14 +6,14 @@ Both kinds become the same arrays, from which the correspondence and the project
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.geometry import Rig
-from psotrack.recordings import Detections
-from psotrack.silhouettes import Silhouettes, find_blobs
+from psotrack.recordings import Detections, Timeline
+from psotrack.silhouettes import Exposures, Silhouettes, exposures_of, find_blobs
 from psotrack.support import Report, no_progress
 
 #: Standard deviation of a box's middle along each axis: a constant, pixels, plus a share of the box's mean side. It is
@@ -38,11 +38,27 @@ class CameraSightings:
         centre_px: (cameras, boxes, 2), middles of the boxes, pixels.
         size_px: (cameras, boxes, 2), widths and heights, pixels.
         noise_px: (cameras, boxes), standard deviations of the middles along each axis, pixels.
+        exposures: when the cameras' frames were exposed; None where all were exposed together.
     """
 
     centre_px: Float[np.ndarray, "cameras boxes 2"]
     size_px: Float[np.ndarray, "cameras boxes 2"]
     noise_px: Float[np.ndarray, "cameras boxes"]
+    exposures: Exposures | None = None
+
+    def largest(self, count: int) -> CameraSightings:
+        """The largest sightings of each camera, at most `count` of each."""
+        if self.noise_px.shape[1] <= count:
+            return self
+        area = np.where(np.isfinite(self.noise_px), self.size_px.prod(axis=-1), -1.0)
+        kept = np.argsort(-area, axis=1, kind="stable")[:, :count]
+        row = np.arange(len(kept))[:, None]
+        return replace(
+            self,
+            centre_px=self.centre_px[row, kept],
+            size_px=self.size_px[row, kept],
+            noise_px=self.noise_px[row, kept],
+        )
 
     def found(self, values: Float[np.ndarray, "cameras boxes *rest"]) -> list[np.ndarray]:
         """Select the values of each camera's sightings, without padding: an array (sightings, ...) per camera."""
@@ -74,11 +90,13 @@ class Sightings:
         centre_px: (frames, cameras, boxes, 2), middles of the boxes, pixels; pixel centres are at whole numbers.
         size_px: (frames, cameras, boxes, 2), widths and heights, pixels.
         noise_px: (frames, cameras, boxes), standard deviations of the middles along each axis, pixels.
+        exposures: when the frames were exposed; None where frame i of every camera is instant i.
     """
 
     centre_px: Float[np.ndarray, "frames cameras boxes 2"]
     size_px: Float[np.ndarray, "frames cameras boxes 2"]
     noise_px: Float[np.ndarray, "frames cameras boxes"]
+    exposures: Exposures | None = None
 
     @property
     def num_frames(self) -> int:
@@ -87,7 +105,30 @@ class Sightings:
 
     def at(self, frame: int) -> CameraSightings:
         """The sightings of one frame."""
-        return CameraSightings(self.centre_px[frame], self.size_px[frame], self.noise_px[frame])
+        exposures = None if self.exposures is None else self.exposures[frame]
+        return CameraSightings(self.centre_px[frame], self.size_px[frame], self.noise_px[frame], exposures)
+
+    def in_frames(self, frames: Int[np.ndarray, "chosen"]) -> Sightings:
+        """The sightings of some frames."""
+        exposures = None if self.exposures is None else self.exposures[frames]
+        return Sightings(self.centre_px[frames], self.size_px[frames], self.noise_px[frames], exposures)
+
+    def at_instants(self, timeline: Timeline) -> Sightings:
+        """These sightings with instants instead of frames: each camera shows its frame nearest to the instant.
+
+        A camera without a frame at an instant has no sightings there. Where frame i of every camera is instant i, the
+        sightings stay as they are.
+        """
+        if timeline.is_synchronous and timeline.num_instants == self.num_frames:
+            return self
+        cameras = np.arange(timeline.frame.shape[1])
+        there = (timeline.frame >= 0) & (timeline.frame < self.num_frames)
+        frame = np.where(there, timeline.frame, 0)
+        centre_px, size_px, noise_px = (
+            np.where(there.reshape(*there.shape, *[1] * (values.ndim - 2)), values[frame, cameras], np.nan)
+            for values in (self.centre_px, self.size_px, self.noise_px)
+        )
+        return Sightings(centre_px, size_px, noise_px, exposures_of(timeline))
 
 
 def from_detections(detections: Mapping[str, Detections], rig: Rig, num_frames: int) -> Sightings:
@@ -113,23 +154,31 @@ def from_detections(detections: Mapping[str, Detections], rig: Rig, num_frames: 
     return _arrays(images, num_frames, len(rig))
 
 
-def from_silhouettes(silhouettes: Silhouettes, report: Report = no_progress) -> Sightings:
+def from_silhouettes(
+    silhouettes: Silhouettes, report: Report = no_progress, *, first: int = 0, stop: int | None = None
+) -> Sightings:
     """Make sightings from the blobs of foreground.
 
     Args:
         silhouettes: stored silhouettes of all cameras.
         report: receives the progress, in frames.
+        first, stop: first frame, and frame before which to stop; None: all. The sightings begin with frame `first`.
     """
+    stop = silhouettes.num_frames if stop is None else stop
     images: list[_Image] = []
-    with report("blobs", silhouettes.num_frames) as advance:
-        for first in range(0, silhouettes.num_frames, _CHUNK_FRAMES):
-            chunk = silhouettes.read(first, min(first + _CHUNK_FRAMES, silhouettes.num_frames))
-            for frame, views in enumerate(chunk, first):
+    with report("blobs", stop - first) as advance:
+        for begin in range(first, stop, _CHUNK_FRAMES):
+            chunk = silhouettes.read(begin, min(begin + _CHUNK_FRAMES, stop))
+            for frame, views in enumerate(chunk, begin - first):
                 for camera, image in enumerate(views):
-                    blobs = find_blobs(image, silhouettes.reduction)
+                    blobs = find_blobs(image, silhouettes.reduction, silhouettes.borders[camera])
                     images.append((frame, camera, blobs.centre_px, blobs.size_px, ~blobs.whole))
             advance(len(chunk))
-    return _arrays(images, silhouettes.num_frames, len(silhouettes.cameras))
+    exposures = silhouettes.exposures
+    return replace(
+        _arrays(images, stop - first, len(silhouettes.cameras)),
+        exposures=None if exposures is None else exposures[first:stop],
+    )
 
 
 def _runs(frame: np.ndarray) -> Iterable[tuple[int, int, int]]:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.geometry import METRES_PER_UNIT
+from psotrack.rig_files import METRES_PER_UNIT
 from psotrack.support import read_table, write_rows
 
 #: Names of a drone's markers, in the order of the columns.

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import SettingsError
-from psotrack.geometry import METRES_PER_UNIT
+from psotrack.rig_files import METRES_PER_UNIT
 from psotrack.support import Column, Table, TextRow, read_table, write_rows
 
 Positions = Float[np.ndarray, "frames 3"]

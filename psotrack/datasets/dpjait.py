@@ -39,9 +39,10 @@ from psotrack.datasets._onboard import (
 )
 from psotrack.datasets._poses import pose_file, read_poses, write_poses
 from psotrack.errors import InputError
-from psotrack.geometry import files_by_camera, read_calibration, read_camera_names, write_calibration
+from psotrack.geometry import Rig, files_by_camera
 from psotrack.recordings import (
     Detections,
+    FrameTimes,
     OnboardVideo,
     Recording,
     VideoInfo,
@@ -51,6 +52,7 @@ from psotrack.recordings import (
     read_detections,
     write_detections,
 )
+from psotrack.rig_files import read_calibration, read_camera_names, write_calibration
 from psotrack.trajectories import Trajectories
 
 __all__ = [
@@ -95,6 +97,8 @@ MARKER_CORNERS = "aruco_corners.csv"
 
 _logger = logging.getLogger(__name__)
 _VIDEO_SUFFIXES = {".avi", ".mp4"}
+#: Largest distance of a principal point from the middle of the image, in shares of its width and height.
+_OFF_CENTRE = 0.1
 _POSE_FILE = re.compile(r"drone?_?(?P<number>\d+)_pos_(?P<rate>\d+(?:\.\d+)?)\.csv", re.IGNORECASE)
 
 
@@ -115,7 +119,9 @@ def read_sequence(folder: Path | str) -> Recording:
     files = sorted(folder.iterdir())
     videos = _videos(folder, files, names)
     rig = read_calibration(calibration, _image_sizes(names, videos))
+    _check_principal_points(rig, videos)
     detections = files_by_camera((folder / DETECTIONS).glob("*.csv"), names)
+    corners = folder / MARKER_CORNERS
     return Recording(
         name=folder.resolve().name,
         folder=folder,
@@ -124,6 +130,8 @@ def read_sequence(folder: Path | str) -> Recording:
         truth=_truth(files, videos),
         detections=detections or None,
         onboard=_onboard(folder),
+        frame_times=_frame_times(videos, detections),
+        marker_corners=corners if corners.exists() else None,
     )
 
 
@@ -189,12 +197,43 @@ def _videos(folder: Path, files: Sequence[Path], names: Sequence[str]) -> dict[s
     return {name: probe(path) for name, path in found.items()}
 
 
+def _frame_times(videos: Mapping[str, VideoInfo], detections: Mapping[str, Path]) -> dict[str, FrameTimes]:
+    """Frame i of every camera was exposed at one time; a camera with detections only lasts as long as the others."""
+    first = next(iter(videos.values()))
+    most = max(video.num_frames for video in videos.values())
+    alone = {name: FrameTimes(most, first.fps) for name in detections if name not in videos}
+    # Rates are rounded in headers: rates that differ by less than a thousandth of a hertz are one rate.
+    return alone | {
+        name: FrameTimes(video.num_frames, first.fps if abs(video.fps - first.fps) < 1e-3 else video.fps)
+        for name, video in videos.items()
+    }
+
+
 def _image_sizes(names: Sequence[str], videos: Mapping[str, VideoInfo]) -> dict[str, tuple[int, int]]:
     most_wh = Counter(video.image_size_wh for video in videos.values()).most_common(1)[0][0]
     for name in names:
         if name not in videos:
             _logger.info("camera %s has no video: assuming %d x %d pixels like most cameras", name, *most_wh)
     return {name: videos[name].image_size_wh if name in videos else most_wh for name in names}
+
+
+def _check_principal_points(rig: Rig, videos: Mapping[str, VideoInfo]) -> None:
+    """Raise `InputError` where sizes differ, and a principal point says that a video is of another camera.
+
+    The calibration states no image sizes, so that nothing else shows it.
+    """
+    if len({video.image_size_wh for video in videos.values()}) == 1:
+        return
+    for name, video in videos.items():
+        x, y = rig.cameras.K[rig.names.index(name), :2, 2]
+        width, height = video.image_size_wh
+        if max(abs(x / width - 0.5), abs(y / height - 0.5)) > _OFF_CENTRE:
+            raise InputError(
+                video.path,
+                expected=f"images with their middle near the principal point ({x:g}, {y:g})",
+                found=f"{width} x {height} pixels",
+                remedy="is it the video of another camera?",
+            )
 
 
 def _truth(files: Sequence[Path], videos: Mapping[str, VideoInfo]) -> Trajectories | None:

@@ -14,11 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from psotrack.errors import SettingsError, check_positive
-from psotrack.geometry import NEAR_M, Camera, distort, project, rotation_matrices, to_camera
+from psotrack.geometry import Camera, has_image, rotation_matrices, to_camera, to_pixels
 from psotrack.trajectories import Trajectories
 
-#: Radii at unit depth at which lens polynomials are sampled: up to 80 degrees from the optical axis.
-_RADII = np.linspace(0.0, 5.7, 571)
 _SIGNS = np.array(list(product((-0.5, 0.5), repeat=3)))
 
 
@@ -80,18 +78,16 @@ def label_boxes(
 
     Returns:
         (..., drones, cameras, 4), xyxy in pixels in the convention of `boxes`. NaN if the drone is behind the camera or
-        outside the valid range of the lens polynomial, too little of the drone is in the image, or a nearer drone hides
+        beyond the fold of its lens, too little of the drone is in the image, or a nearer drone hides
         it.
     """
     points_cam = to_camera(cameras, corners_m[..., None, :])
-    pixels, depth = project(cameras, corners_m[..., None, :])
+    pixels = to_pixels(cameras, points_cam)
     # Half a pixel converts from pixel centres at whole numbers to pixel edges at whole numbers.
     whole = np.concatenate([pixels.min(axis=-3), pixels.max(axis=-3)], axis=-1) + 0.5
     size_wh = np.asarray(cameras.image_size_wh)
     cut = np.clip(whole, 0.0, np.concatenate([size_wh, size_wh], axis=-1))
-    # Far outside the image a lens polynomial decreases again, and would map points into the image that are not visible.
-    radius = np.hypot(points_cam[..., 0], points_cam[..., 1]) / np.maximum(depth, NEAR_M)
-    in_image = (depth.min(axis=-2) > NEAR_M) & (radius.max(axis=-2) <= _largest_valid_radius(cameras))
+    in_image = np.asarray(has_image(cameras, points_cam)).all(axis=-2)
     in_image &= (_area(cut) > 0) & (_area(cut) >= settings.min_inside * _area(whole))
     distance_m = np.linalg.norm(points_cam.mean(axis=-3), axis=-1)
     visible = in_image & (_covered_share(cut, distance_m, in_image) <= settings.max_hidden)
@@ -105,15 +101,6 @@ def _rotations(
     rotation = rotation_matrices(orientation_wxyz)
     rotation[:, np.isnan(rotation[..., 0, 0]).all(axis=0)] = np.eye(3)
     return rotation
-
-
-def _largest_valid_radius(cameras: Camera) -> Float[np.ndarray, "cameras"]:
-    """Radius at unit depth up to which the lens polynomial increases; infinite if it always increases."""
-    radius = _RADII[:, None] * np.ones(len(cameras.K))
-    # The difference between both sides of the axis contains the radial distortion only.
-    bent = distort(cameras, radius, 0 * radius)[0] - distort(cameras, -radius, 0 * radius)[0]
-    turned = np.diff(np.asarray(bent), axis=0) <= 0
-    return np.where(turned.any(axis=0), _RADII[turned.argmax(axis=0)], np.inf)
 
 
 def _area(xyxy: Float[np.ndarray, "*boxes 4"]) -> Float[np.ndarray, "*boxes"]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from psotrack.detection.detector import Detector, OnnxDetector, detect_drones
-from psotrack.recordings import Recording, write_detections
-from psotrack.support import Report, digest_file, digest_record, identify, no_progress
+from psotrack.recordings import Recording, digest_video, write_detections
+from psotrack.support import Report, digest_record, identify, no_progress
 
 
 def stored_detections(
@@ -33,7 +33,7 @@ def stored_detections(
     """
     folder = Path(cache) / "detections" / _key(detector, recording)
     for name, video in recording.videos.items():
-        path = folder / f"{video.path.stem}.csv"
+        path = folder / f"{name}.csv"
         if not path.exists():
             write_detections(path, detect_drones(detector, name, video, report=report))
     return folder
@@ -43,8 +43,6 @@ def _key(detector: Detector, recording: Recording) -> str:
     """Name of the folder: 40 hexadecimal digits."""
     made_of = {
         **(detector.key if isinstance(detector, OnnxDetector) else identify(detector)),
-        "videos": {
-            name: [video.num_frames, digest_file(video.path)] for name, video in recording.videos.items()
-        },
+        "videos": {name: [video.num_frames, digest_video(video)] for name, video in recording.videos.items()},
     }
     return digest_record(made_of)

@@ -9,10 +9,11 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack.correspondence import CameraSightings, Sightings, match
 from psotrack.geometry import Camera, Rig, reconstruct, viewpoints
-from psotrack.initiation import room_bounds
 
 #: Smallest number of viewpoints of a point: two viewpoints often agree by chance.
 MIN_VIEWPOINTS = 3
+#: Distance from the cameras to the bounds, in units of the rig's own size.
+_WIDE = 30.0
 #: Largest squared distance of a sighting from the projection of its point, squared standard deviations: 1 in 1000 right
 #: sightings is farther (χ² distribution, two degrees of freedom).
 MAX_SQUARED_DISTANCE = 13.8
@@ -54,15 +55,17 @@ class Agreement:
         return np.minimum(1.0, self.used.sum(axis=0) / np.maximum(self.num_sightings, 1))
 
 
-def measure_agreement(rig: Rig, sightings: Sightings, frames: Int[np.ndarray, "chosen"]) -> Agreement:
+def measure_agreement(
+    rig: Rig, sightings: Sightings, frames: Int[np.ndarray, "chosen"], bounds_m: Float[np.ndarray, "2 3"]
+) -> Agreement:
     """Match the sightings of some frames over all cameras, and triangulate the points.
 
     Args:
         rig: the rig to check.
         sightings: sightings of the rig's cameras.
         frames: (chosen,), numbers of the frames to examine.
+        bounds_m: (2, 3), corners of the region where bodies can be, metres.
     """
-    bounds_m = _wide_bounds(rig)
     numbers: list[np.ndarray] = []
     centres: list[np.ndarray] = []
     noises: list[np.ndarray] = []
@@ -108,9 +111,8 @@ def num_viewpoints(cameras: Camera, seen: Bool[np.ndarray, "points cameras"]) ->
     return (seen.astype(int) @ at.astype(int) > 0).sum(axis=-1)
 
 
-def _wide_bounds(rig: Rig) -> Float[np.ndarray, "2 3"]:
-    """Bounds of the room, extended by its height upwards and downwards, because a wrong rig may have a wrong floor."""
-    bounds_m = room_bounds(rig)
-    height_m = bounds_m[1, 2] - bounds_m[0, 2]
-    bounds_m[:, 2] += -height_m, height_m
-    return bounds_m
+def wide_bounds(rig: Rig) -> Float[np.ndarray, "2 3"]:
+    """Bounds so wide that no body is outside: drones fly far above cameras on the ground, and a rig may be wrong."""
+    centre_m = rig.cameras.centre_world
+    reach_m = _WIDE * float(np.linalg.norm(np.ptp(centre_m, axis=0))) + 1.0
+    return np.stack([centre_m.min(axis=0) - reach_m, centre_m.max(axis=0) + reach_m])

@@ -1,8 +1,8 @@
-"""Faults of one camera, found with points on which all other cameras agree.
+"""Large faults of one camera, found with points on which all other cameras agree.
 
 The points are projected into the camera and compared with its sightings. Each kind of fault is a family of modified
-cameras (turned, moved, with another focal length, exchanged with another camera) or of delays. The member that explains
-most sightings is taken.
+cameras (turned, moved, with another focal length, exchanged with another camera) or of lags of the video. The member
+that explains most sightings is taken.
 """
 
 from __future__ import annotations
@@ -11,30 +11,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import locate_camera
-from psotrack.clocks import camera_offsets
 from psotrack.correspondence import Sightings
 from psotrack.doctor.agreement import MAX_SQUARED_DISTANCE, MIN_VIEWPOINTS, Agreement, num_viewpoints
 from psotrack.errors import InputError
-from psotrack.geometry import NEAR_M, Camera, Rig, project, reconstruct, undistort
+from psotrack.geometry import NEAR_M, Camera, Rig, project_visible, reconstruct, undistort
 
 #: Smallest number of points of the other cameras with which a camera is checked.
 MIN_POINTS_OF_CAMERA = 30
-#: Factors of the focal length and delays (frames) that are tried.
+#: Factors of the focal length and lags (frames) that are tried.
 _SCALES = np.exp(np.arange(-0.7, 0.7001, 0.02))
 _FINER = np.exp(np.arange(-0.02, 0.0201, 0.005))
-_DELAYS = np.arange(-5.0, 5.01, 0.25)
+_LAGS = np.arange(-5.0, 5.01, 0.25)
 #: Side of a cell of the histogram of image shifts, pixels, and number of rounds in which sightings are paired anew.
 _CELL_PX, _ROUNDS = 16.0, 6
 #: Largest motion of a drone between two frames, metres; smaller than the distance between two drones.
 _STEP_M = 0.3
-#: A clock is late if its offset exceeds this number of frames by more than this number of standard deviations.
-LATE_FRAMES, CLEARLY_STD = 0.25, 3.0
-#: Number of empty frames between two runs, so that velocities of one run (`camera_clocks`) do not use another run.
-_GAP_FRAMES = 15
 
 
 @dataclass(frozen=True)
@@ -62,7 +56,7 @@ class CameraFault:
         kind: clock, focal length, exchanged, turned or moved; sound for no fault.
         gain: share of the points that the camera's sightings explain (`explained_share`).
         camera: the camera with the fault corrected; the camera as it was read if the fault is not one of the camera.
-        amount: delay in frames, factor of the focal length, or index of the exchanged camera.
+        amount: frames by which the video is late, factor of the focal length, or index of the exchanged camera.
     """
 
     kind: str
@@ -106,16 +100,16 @@ def velocities(frame: Int[np.ndarray, "points"], point_m: Float[np.ndarray, "poi
     return (steps[0] + steps[1]) / 2
 
 
-def explained_share(camera: Camera, views: DetectionViews, delay_frames: float = 0.0) -> float:
+def explained_share(camera: Camera, views: DetectionViews, lag_frames: float = 0.0) -> float:
     """Share of explained points: each counts 1 - distance² / `MAX_SQUARED_DISTANCE`, and 0 if it is farther."""
-    return float(np.sum(_fits(camera, views, delay_frames)[0])) / max(len(views.point_m), 1)
+    return float(np.sum(_fits(camera, views, lag_frames)[0])) / max(len(views.point_m), 1)
 
 
 def explain_camera(rig: Rig, views: DetectionViews, index: int) -> list[CameraFault]:
     """The camera as it was read, and the best fault of each kind, the simplest kinds first."""
     camera = rig.cameras[index]
     sound = CameraFault("sound", explained_share(camera, views), camera)
-    delay = max(_DELAYS.tolist(), key=lambda delay: explained_share(camera, views, delay))
+    lag = max(_LAGS.tolist(), key=lambda lag: explained_share(camera, views, lag))
     scale = max(_SCALES.tolist(), key=lambda scale: explained_share(scale_focal_length(camera, scale), views))
     scale = max(
         (scale * _FINER).tolist(), key=lambda scale: explained_share(scale_focal_length(camera, scale), views)
@@ -124,7 +118,7 @@ def explain_camera(rig: Rig, views: DetectionViews, index: int) -> list[CameraFa
     turned = _turned(camera, views)
     moved = _moved(turned, views)
     faults = [
-        CameraFault("clock", explained_share(camera, views, delay), camera, delay),
+        CameraFault("clock", explained_share(camera, views, lag), camera, lag),
         CameraFault("focal length", explained_share(lenses, views), lenses, scale),
     ]
     for other in range(len(rig)):
@@ -151,11 +145,11 @@ def pose_difference(before: Camera, after: Camera) -> tuple[float, float]:
 
 
 def _fits(
-    camera: Camera, views: DetectionViews, delay_frames: float = 0.0, widen: float = 1.0
+    camera: Camera, views: DetectionViews, lag_frames: float = 0.0, widen: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """How well each point is explained, from 0 to 1, and the index of the sighting that explains it."""
-    moved_m = delay_frames * np.nan_to_num(views.velocity_m)
-    pixels, depth = project(camera, views.point_m + moved_m)
+    moved_m = lag_frames * np.nan_to_num(views.velocity_m)
+    pixels, depth = project_visible(camera, views.point_m - moved_m)
     off = np.sum((views.box_px - pixels[:, None]) ** 2, axis=-1) / (widen * views.noise_px) ** 2
     off = np.where(np.isfinite(off) & (depth > NEAR_M)[:, None], off, np.inf)
     best = off.argmin(axis=1)
@@ -170,7 +164,7 @@ def _turned(camera: Camera, views: DetectionViews) -> Camera:
 
 def _shifted(camera: Camera, views: DetectionViews) -> Camera:
     """The camera turned so that most points fall on sightings, to the precision of a cell of the histogram."""
-    pixels, depth = project(camera, views.point_m)
+    pixels, depth = project_visible(camera, views.point_m)
     off = (views.box_px - pixels[:, None])[depth > NEAR_M].reshape(-1, 2)
     reach = float(camera.image_size_wh.max()) / 2
     off = off[(np.abs(off) < reach).all(axis=-1)]
@@ -198,7 +192,11 @@ def _aligned(camera: Camera, views: DetectionViews) -> Camera:
         pairs = np.flatnonzero(fit > 0)
         if len(pairs) < MIN_POINTS_OF_CAMERA:
             return camera
-        seen = _rays(undistort(camera, views.box_px[pairs, best[pairs]]))
+        rays = _rays(undistort(camera, views.box_px[pairs, best[pairs]]))
+        # Pixels that the lens's model cannot undistort have no ray.
+        pairs, seen = pairs[np.isfinite(rays[:, 0])], rays[np.isfinite(rays[:, 0])]
+        if len(pairs) < MIN_POINTS_OF_CAMERA:
+            return camera
         T = camera.T_cam_world
         expected = views.point_m[pairs] @ T[:3, :3].T + T[:3, 3]
         expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
@@ -220,7 +218,12 @@ def _moved(camera: Camera, views: DetectionViews) -> Camera:
         noise_px = float(np.median(views.noise_px[pairs, best[pairs]]))
         try:
             located = locate_camera(
-                views.point_m[pairs], seen_px, np.asarray(camera.K), np.asarray(camera.dist), noise_px
+                views.point_m[pairs],
+                seen_px,
+                np.asarray(camera.K),
+                np.asarray(camera.dist),
+                noise_px,
+                fisheye=bool(camera.fisheye),
             )
         except InputError:
             return start
@@ -231,46 +234,3 @@ def _moved(camera: Camera, views: DetectionViews) -> Camera:
 def _rays(x: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
     rays = np.column_stack([x, np.ones(len(x))])
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-
-
-def find_late_cameras(
-    rig: Rig, found: Agreement, sound: np.ndarray, fps: float
-) -> tuple[Float[np.ndarray, "cameras"], Float[np.ndarray, "cameras"], list[int]]:
-    """Offsets of the sound cameras' clocks from their median, standard deviations, and indices of late cameras.
-
-    The middle of a drone's box may be a little ahead of the drone or behind it, which looks like an offset of one or
-    two tenths of a frame. Therefore offsets below `LATE_FRAMES` are not reported.
-    """
-    offset, std = np.full((2, len(rig)), np.nan)
-    index = np.flatnonzero(sound)
-    tracks_px = _tracks(found)[:, :, index]
-    if len(index) < 2 or not np.isfinite(tracks_px).any():
-        return offset, std, []
-    rest = rig.select([rig.names[each] for each in index])
-    clocks = camera_offsets(rest, tracks_px, fps)
-    offset[index] = clocks.offset_frames - np.median(clocks.offset_frames)
-    std[index] = clocks.std_frames
-    late = [each for each in index.tolist() if abs(offset[each]) > LATE_FRAMES + CLEARLY_STD * std[each]]
-    return offset, std, late
-
-
-def _tracks(found: Agreement) -> Float[np.ndarray, "frames drones cameras 2"]:
-    """Sightings as tracks: points of consecutive frames that are near each other, with a gap between runs of frames."""
-    frames = np.unique(found.frame)
-    row = np.cumsum(np.diff(frames, prepend=frames[:1]).clip(0, _GAP_FRAMES))
-    most = max(np.bincount(found.frame).tolist(), default=1)
-    tracks_px = np.full((row[-1] + 1 if len(row) else 1, 3 * most, *found.centre_px.shape[1:]), np.nan)
-    before_m, before, last = np.empty((0, 3)), np.empty(0, int), -2
-    for frame, at in zip(frames.tolist(), row.tolist(), strict=True):
-        here = np.flatnonzero(found.frame == frame)
-        slot = np.full(len(here), -1)
-        if len(before) and frame == last + 1:
-            distance = np.linalg.norm(found.position_m[here][:, None] - before_m, axis=-1)
-            for mine, theirs in zip(*linear_sum_assignment(distance), strict=True):
-                slot[mine] = before[theirs] if distance[mine, theirs] < _STEP_M else -1
-        # A new track takes a place that no track had in the frame before.
-        free = [each for each in range(3 * most) if each not in slot and each not in before]
-        slot[slot < 0] = free[: int((slot < 0).sum())]
-        tracks_px[at, slot] = np.where(found.used[here][..., None], found.centre_px[here], np.nan)
-        before_m, before, last = found.position_m[here], slot, frame
-    return tracks_px

@@ -1,9 +1,9 @@
 """Examination of a rig with its own data before tracking: what disagrees, by how much, and what to do.
 
 Sightings of a few runs of frames are matched over the cameras and triangulated. If they do not agree, other
-interpretations of the whole rig are tried (`rig_interpretations`), then faults of each camera (`camera_faults`),
-clocks, and the reference (`reference_fit`). A fault is reported only if it explains clearly more sightings than the rig
-as it was read.
+interpretations of the whole rig are tried (`rig_interpretations`), then large faults of each camera (`camera_faults`).
+Small faults, of cameras and of clocks, are found by comparing all hypotheses on sightings that are matched loosely
+(`fault_search`). Last, the reference is compared (`reference_fit`).
 """
 
 from __future__ import annotations
@@ -12,35 +12,32 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from psotrack.correspondence import Sightings, epipolar_distance
-from psotrack.doctor.agreement import Agreement, measure_agreement
-from psotrack.doctor.camera_faults import (
-    MIN_POINTS_OF_CAMERA,
-    collect_views,
-    explain_camera,
-    find_late_cameras,
-)
+from psotrack.doctor.agreement import MIN_VIEWPOINTS, Agreement, measure_agreement, wide_bounds
+from psotrack.doctor.camera_faults import MIN_POINTS_OF_CAMERA, collect_views, explain_camera
+from psotrack.doctor.common_points import CommonPoints, find_common_points
+from psotrack.doctor.fault_search import find_faults
 from psotrack.doctor.findings import (
-    CLEARLY,
     Finding,
     describe_camera_fault,
-    describe_late_clock,
+    describe_fault,
     describe_reference,
 )
+from psotrack.doctor.hypotheses import parameters_of
+from psotrack.doctor.late_videos import measure_lags
 from psotrack.doctor.reference_fit import ReferenceFit, fit_reference
 from psotrack.doctor.rig_interpretations import (
-    find_better_focal_lengths,
     find_better_interpretation,
-    find_certain_focal_lengths,
     required_share,
 )
 from psotrack.geometry import Rig
 from psotrack.trajectories import Trajectories
 
-#: Number of runs of consecutive frames that are examined, and number of frames per run. Runs show the motion.
-RUNS, RUN_FRAMES = 4, 15
+#: Smallest and largest number of runs of consecutive frames that are examined, number of frames per run, and seconds
+#: from run to run in short recordings. Runs show the motion; the errors of neighbouring runs are alike.
+FEWEST_RUNS, MOST_RUNS, RUN_FRAMES, APART_S = 4, 14, 12, 1.2
 #: Number of frames with which interpretations of the whole rig are compared; the best one is checked with all frames.
 INTERPRETATION_FRAMES = 8
 #: Smallest and largest plausible median distance of two cameras in a room, metres.
@@ -49,11 +46,17 @@ PLAUSIBLE_M = (0.05, 200.0)
 #: are off by a few per cent.
 OFF_MIDDLE = 0.15
 #: Share of sightings that a correct rig explains. False detections, and drones that only two cameras see, are the rest.
-SOUND_SHARE = 0.9
+SOUND_SHARE = 0.85
 #: Smallest share of explained sightings with which single cameras can be checked.
 MIN_SHARE = 0.3
-#: A camera is wrong if it explains less than this share of what the median camera explains.
-OFF_SHARE = 0.5
+#: A camera may be grossly wrong if the loose matching uses less of its sightings than this share of the median
+#: camera's. It is wrong if a correction explains more of what the others see by this share, or if it explains less of
+#: this than the last number without a correction that helps.
+OFF_SHARE, GROSS_GAIN, NOTHING_EXPLAINED = 0.5, 0.3, 0.1
+#: Smallest number of points with which a rig can be checked.
+MIN_POINTS = 12
+#: Smallest and largest plausible size of a body, metres.
+PLAUSIBLE_BODY_M = (0.01, 10.0)
 
 
 @dataclass(frozen=True)
@@ -63,9 +66,9 @@ class Diagnosis:
     Attributes:
         findings: disagreements; empty for a correct rig.
         found: agreement of the rig with its sightings, after a wrong unit or interpretation was corrected.
-        offset_frames: (cameras,), offset of each camera's clock from the median camera, frames; positive for a late
-            camera; NaN if the offset cannot be found.
-        offset_std_frames: (cameras,), standard deviations of the offsets, frames.
+        late_frames: (cameras,), how late each camera's video shows the scene, relative to the median camera, frames:
+            frame i of a video that is late by k shows what the others show in frame i - k; NaN if it cannot be found.
+        late_std_frames: (cameras,), standard deviations of `late_frames`.
         epipolar_px: (cameras, cameras), median distances of sightings from each other's epipolar lines, pixels; NaN for
             pairs of cameras without common points.
         reference: fit of the reference; None without a reference.
@@ -73,35 +76,49 @@ class Diagnosis:
 
     findings: tuple[Finding, ...]
     found: Agreement
-    offset_frames: Float[np.ndarray, "cameras"]
-    offset_std_frames: Float[np.ndarray, "cameras"]
+    late_frames: Float[np.ndarray, "cameras"]
+    late_std_frames: Float[np.ndarray, "cameras"]
     epipolar_px: Float[np.ndarray, "cameras cameras"]
     reference: ReferenceFit | None
 
 
 def examine(
-    rig: Rig, sightings: Sightings, *, fps: float, reference: Trajectories | None = None
+    rig: Rig,
+    sightings: Sightings,
+    *,
+    fps: float,
+    reference: Trajectories | None = None,
+    bounds_m: Float[np.ndarray, "2 3"] | None = None,
 ) -> Diagnosis:
-    """Find faults of a rig from sightings of moving drones.
+    """Find faults of a rig from sightings of moving bodies.
 
-    Faults that move the projections by less than the sightings' noise are not found. With fewer than four viewpoints,
-    a fault cannot be assigned to a camera.
+    Faults that move the projections by less than the boxes' own errors are not found. With three cameras, a fault can
+    often not be assigned to one of them.
 
     Args:
         rig: the rig as it was read.
         sightings: sightings of the rig's cameras at whole frames.
         fps: frames per second of the videos.
         reference: reference at the video's frames, or None.
+        bounds_m: (2, 3), corners of the region where bodies can be, metres; None: all places that the cameras may see.
     """
-    frames = sampled_frames(sightings.num_frames)
-    findings, rig = _check_numbers(rig)
-    found = measure_agreement(rig, sightings, frames)
-    if found.share < SOUND_SHARE and found.num_sightings.any():
+    frames = sampled_frames(sightings.num_frames, fps)
+    findings, rig = _check_numbers(rig, sightings, frames)
+    bounds_m = wide_bounds(rig) if bounds_m is None else bounds_m
+    found = measure_agreement(rig, sightings, frames, bounds_m)
+    points = find_common_points(rig, sightings, frames, bounds_m, fps)
+    # A small fault of one camera makes no interpretation of the whole rig likely.
+    share = max(found.share, float(np.mean(points.share)))
+    if share < SOUND_SHARE and found.num_sightings.any():
         interpretation = find_better_interpretation(
-            rig, sightings, frames[:: max(1, len(frames) // INTERPRETATION_FRAMES)]
+            rig, sightings, frames[:: max(1, len(frames) // INTERPRETATION_FRAMES)], bounds_m
         )
-        better = found if interpretation is None else measure_agreement(interpretation.rig, sightings, frames)
-        if interpretation is not None and better.share > required_share(found.share):
+        better = (
+            found
+            if interpretation is None
+            else measure_agreement(interpretation.rig, sightings, frames, bounds_m)
+        )
+        if interpretation is not None and better.share > required_share(share):
             who = (
                 f"cameras {' and '.join(interpretation.cameras)}"
                 if interpretation.cameras
@@ -113,45 +130,51 @@ def examine(
                 Finding(interpretation.kind, interpretation.cameras, message, interpretation.remedy)
             )
             rig, found = interpretation.rig, better
-    if found.share < MIN_SHARE or len(found.frame) < MIN_POINTS_OF_CAMERA:
-        findings.append(_nothing_agrees(found))
+            points = find_common_points(rig, sightings, frames, bounds_m, fps)
+    if max(found.share, float(points.share.max())) < MIN_SHARE or len(points.frame) < MIN_POINTS:
+        findings.append(_nothing_agrees(found, points))
         nothing = np.full(len(rig), np.nan)
         return Diagnosis(
             tuple(findings), found, nothing, nothing, _median_epipolar_distances(rig, found), None
         )
-    lenses = find_better_focal_lengths(rig, found, CLEARLY)
-    if lenses is not None:
-        rig, found = lenses.rig, measure_agreement(lenses.rig, sightings, frames)
-    of_cameras, sound = _find_wrong_cameras(rig, found, sightings, frames)
-    certain = find_certain_focal_lengths(rig, found) if lenses is None else None
-    if certain is not None:
-        agreed = measure_agreement(certain.rig, sightings, frames)
-        # A fault of all lenses can look like a fault of the camera that shows it most. A fault of one camera remains
-        # after all lenses are corrected.
-        still, all_sound = _find_wrong_cameras(certain.rig, agreed, sightings, frames)
-        if not still:
-            lenses, rig, found, of_cameras, sound = certain, certain.rig, agreed, still, all_sound
-    if lenses is not None:
-        findings.append(Finding(lenses.kind, (), f"the calibration: {lenses.words}", lenses.remedy))
-    findings += of_cameras
-    offset, std, late = find_late_cameras(rig, found, sound, fps)
-    findings += [describe_late_clock(rig.names[index], offset[index], std[index]) for index in late]
+    lag, std = measure_lags(rig, points, fps)
+    gross, sound = _find_gross_faults(rig, found, points, sightings, frames, bounds_m, fps)
+    findings += gross
+    if gross and sound.sum() >= MIN_VIEWPOINTS:
+        rest, seen = _select(rig, sightings, sound)
+        small, _ = find_faults(rest, find_common_points(rest, seen, frames, bounds_m, fps))
+    else:
+        rest = rig
+        small, _ = find_faults(rig, points)
+    findings += [describe_fault(rest, fault, fps) for fault in small]
+    for fault in small:
+        if fault.certain and fault.best.hypothesis.kind == "clock":
+            # To the estimate of all lags together, the sightings of a very late video are outliers.
+            index, camera = (
+                rig.names.index(rest.names[fault.best.hypothesis.camera]),
+                fault.best.hypothesis.camera,
+            )
+            lag[index] = parameters_of(fault.best.step, camera)[-1]
+            std[index] = parameters_of(fault.best.std, camera)[-1]
     fit = None
     if reference is not None:
         inside = found.frame < reference.num_frames
         fit = fit_reference(found.frame[inside], found.position_m[inside], reference, fps)
         findings += describe_reference(fit, fps)
-    return Diagnosis(tuple(findings), found, offset, std, _median_epipolar_distances(rig, found), fit)
+    return Diagnosis(tuple(findings), found, lag, std, _median_epipolar_distances(rig, found), fit)
 
 
-def sampled_frames(num_frames: int) -> Int[np.ndarray, "chosen"]:
-    """(chosen,), numbers of the frames to examine: `RUNS` runs of `RUN_FRAMES` frames, spread over the video."""
-    starts = np.linspace(0, max(num_frames - RUN_FRAMES, 0), RUNS).astype(int)
+def sampled_frames(num_frames: int, fps: float = 25.0) -> Int[np.ndarray, "chosen"]:
+    """(chosen,), numbers of the frames to examine: runs of `RUN_FRAMES` frames, spread over the video."""
+    runs = int(np.clip(num_frames / (APART_S * fps), FEWEST_RUNS, MOST_RUNS))
+    starts = np.linspace(0, max(num_frames - RUN_FRAMES, 0), runs).astype(int)
     frames = np.unique(starts[:, None] + np.arange(RUN_FRAMES))
     return frames[frames < num_frames]
 
 
-def _check_numbers(rig: Rig) -> tuple[list[Finding], Rig]:
+def _check_numbers(
+    rig: Rig, sightings: Sightings, frames: Int[np.ndarray, "chosen"]
+) -> tuple[list[Finding], Rig]:
     """Find implausible lengths and principal points, and correct both: findings, and the corrected rig."""
     findings = []
     cameras = rig.cameras
@@ -160,21 +183,33 @@ def _check_numbers(rig: Rig) -> tuple[list[Finding], Rig]:
     # Between these limits every distance is plausible.
     factor = 1e-3 if apart_m > PLAUSIBLE_M[1] else 1e3 if apart_m < PLAUSIBLE_M[0] else 1.0
     if factor != 1.0 and PLAUSIBLE_M[0] <= factor * apart_m <= PLAUSIBLE_M[1]:
-        read, right = ("metres", "millimetres") if factor < 1 else ("millimetres", "metres")
-        findings.append(
-            Finding(
-                "unit",
-                (),
-                f"the calibration: cameras are {apart_m:.3g} m apart: {right} were read as {read}",
-                f"name the unit in the header, cam_x[{'mm' if factor < 1 else 'm'}]",
+        body_m = _body_size_m(rig, sightings, frames)
+        # Far cameras that see bodies of plausible size are no fault: a drone that is flown over a wide field.
+        if body_m is None or not PLAUSIBLE_BODY_M[0] <= body_m <= PLAUSIBLE_BODY_M[1]:
+            read, right = ("metres", "millimetres") if factor < 1 else ("millimetres", "metres")
+            findings.append(
+                Finding(
+                    "unit",
+                    (),
+                    f"the calibration: cameras are {apart_m:.3g} m apart: {right} were read as {read}",
+                    f"name the unit in the header, cam_x[{'mm' if factor < 1 else 'm'}]",
+                )
             )
-        )
-        T = cameras.T_cam_world.copy()
-        T[:, :3, 3] *= factor
-        cameras = replace(cameras, T_cam_world=T)
+            T = cameras.T_cam_world.copy()
+            T[:, :3, 3] *= factor
+            cameras = replace(cameras, T_cam_world=T)
     of_lenses, K = _check_principal_points(rig)
     findings += of_lenses
     return findings, Rig(rig.names, replace(cameras, K=K))
+
+
+def _body_size_m(rig: Rig, sightings: Sightings, frames: Int[np.ndarray, "chosen"]) -> float | None:
+    """Median size of the bodies by the rig, metres; None if too few agree."""
+    points = find_common_points(rig, sightings, frames[: FEWEST_RUNS * RUN_FRAMES], wide_bounds(rig), 1.0)
+    if len(points.frame) < MIN_POINTS:
+        return None
+    distance_m = np.linalg.norm(points.start_m[:, None] - rig.cameras.centre_world, axis=-1)
+    return float(np.nanmedian(points.side_px / rig.cameras.K[:, 0, 0] * distance_m))
 
 
 def _check_principal_points(rig: Rig) -> tuple[list[Finding], np.ndarray]:
@@ -202,10 +237,10 @@ def _check_principal_points(rig: Rig) -> tuple[list[Finding], np.ndarray]:
     return findings, K
 
 
-def _nothing_agrees(found: Agreement) -> Finding:
+def _nothing_agrees(found: Agreement, points: CommonPoints) -> Finding:
     seen = int(found.num_sightings.sum())
     # The few sightings may agree with each other.
-    if seen < MIN_POINTS_OF_CAMERA or found.share >= MIN_SHARE:
+    if seen < MIN_POINTS_OF_CAMERA or found.share >= MIN_SHARE or points.share.max() >= MIN_SHARE:
         message = (
             f"the detections: only {seen} in {found.num_frames} examined frames, which give {len(found.frame)} points "
             f"that three viewpoints see"
@@ -220,32 +255,61 @@ def _nothing_agrees(found: Agreement) -> Finding:
     )
 
 
-def _find_wrong_cameras(
-    rig: Rig, found: Agreement, sightings: Sightings, frames: Int[np.ndarray, "chosen"]
-) -> tuple[list[Finding], np.ndarray]:
-    """Find faults of single cameras, the worst camera first, and say which cameras are sound.
+def _select(rig: Rig, sightings: Sightings, kept: Bool[np.ndarray, "cameras"]) -> tuple[Rig, Sightings]:
+    index = np.flatnonzero(kept)
+    rest = rig.select([rig.names[each] for each in index])
+    seen = Sightings(
+        sightings.centre_px[:, index],
+        sightings.size_px[:, index],
+        sightings.noise_px[:, index],
+        None if sightings.exposures is None else sightings.exposures.of_cameras(index),
+    )
+    return rest, seen
 
-    Each fault is searched without the cameras that were found wrong before.
+
+def _find_gross_faults(
+    rig: Rig,
+    found: Agreement,
+    points: CommonPoints,
+    sightings: Sightings,
+    frames: Int[np.ndarray, "chosen"],
+    bounds_m: Float[np.ndarray, "2 3"],
+    fps: float,
+) -> tuple[list[Finding], Bool[np.ndarray, "cameras"]]:
+    """Find cameras with faults so large that their sightings take no part in the loose matching.
+
+    The worst camera is first. Each fault is searched without the cameras that were found wrong before.
+
+    Returns:
+        The findings, and (cameras,), False for wrong cameras.
     """
     findings: list[Finding] = []
     sound = np.ones(len(rig), bool)
-    while sound.sum() > 3:
+    share = points.share
+    while sound.sum() > MIN_VIEWPOINTS:
         index = np.flatnonzero(sound)
-        rest = rig.select([rig.names[each] for each in index])
-        seen = Sightings(*(value[:, index] for value in vars(sightings).values()))
-        found = measure_agreement(rest, seen, frames) if findings else found
-        views = [collect_views(rest, found, seen, each) for each in range(len(rest))]
-        explained = [
-            explain_camera(rest, of, each) if len(of.point_m) >= MIN_POINTS_OF_CAMERA else []
-            for each, of in enumerate(views)
+        rest, seen = _select(rig, sightings, sound)
+        if findings:
+            found = measure_agreement(rest, seen, frames, bounds_m)
+            share = find_common_points(rest, seen, frames, bounds_m, fps).share
+        suspects = np.flatnonzero(share < OFF_SHARE * np.median(share))
+        views = {each: collect_views(rest, found, seen, each) for each in suspects.tolist()}
+        explained = {
+            each: explain_camera(rest, of, each)
+            for each, of in views.items()
+            if len(of.point_m) >= MIN_POINTS_OF_CAMERA
+        }
+        won = {each: max(one.gain for one in faults) - faults[0].gain for each, faults in explained.items()}
+        off = [
+            each
+            for each, faults in explained.items()
+            if won[each] > GROSS_GAIN or faults[0].gain < NOTHING_EXPLAINED
         ]
-        won = [max(one.gain for one in each) - each[0].gain if each else 0.0 for each in explained]
-        worst = int(np.argmax(won))
-        usual = float(np.median([each[0].gain for each in explained if each] or [0.0]))
-        off = [bool(each) and each[0].gain < OFF_SHARE * usual for each in explained]
-        if won[worst] <= CLEARLY and any(off):
-            worst = off.index(True)
-        elif won[worst] <= CLEARLY:
+        if not off:
+            break
+        worst = max(off, key=lambda each: won[each])
+        if won[worst] <= GROSS_GAIN and np.isfinite(views[worst].noise_px).any(axis=1).mean() < 0.5:
+            # A camera that seldom has a detection is not known to be wrong.
             break
         findings.append(describe_camera_fault(rest, worst, explained[worst]))
         sound[index[worst]] = False

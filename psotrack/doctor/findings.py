@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from psotrack.doctor.camera_faults import CameraFault, pose_difference
+from psotrack.doctor.evidence import Judged
+from psotrack.doctor.fault_search import FoundFault
+from psotrack.doctor.hypotheses import parameters_of
 from psotrack.doctor.reference_fit import NEAR_M, ReferenceFit
 from psotrack.geometry import Rig
 
@@ -53,7 +56,7 @@ def describe_camera_fault(rig: Rig, index: int, explained: list[CameraFault]) ->
     numbers = f"(explains {fault.gain:.0%} of the drones that the others see, not {sound.gain:.0%})"
     if fault.kind == "clock":
         late = "late" if fault.amount > 0 else "early"
-        message = f"camera {name}: its clock is about {abs(fault.amount):.1f} frames {late} {numbers}"
+        message = f"camera {name}: its video is about {abs(fault.amount):.1f} frames {late} {numbers}"
         return Finding("clock", (name,), message, "shift its video and detections by this number of frames")
     if fault.kind == "focal length":
         percent = 100 * (1 / fault.amount - 1)
@@ -76,11 +79,63 @@ def describe_camera_fault(rig: Rig, index: int, explained: list[CameraFault]) ->
     return Finding(fault.kind, (name,), f"camera {name}: it is {how} {numbers}", remedy)
 
 
-def describe_late_clock(name: str, offset: float, std: float) -> Finding:
-    """Describe a clock that is late by `offset` frames, with the standard deviation `std` in frames."""
-    late = "late" if offset > 0 else "early"
-    message = f"camera {name}: its clock is {abs(offset):.2f} frames {late} (± {std:.2f})"
-    return Finding("clock", (name,), message, "synchronise its video with the others")
+def describe_fault(rig: Rig, fault: FoundFault, fps: float) -> Finding:
+    """Describe a small fault, or the faults of several cameras that explain the sightings equally well."""
+    words, remedy = _in_words(rig, fault.best, fps)
+    numbers = f"which moves its boxes by {fault.shift_px:.0f} px"
+    hypothesis = fault.best.hypothesis
+    if not fault.certain:
+        several = [_in_words(rig, one, fps)[0] for one in (fault.best, *fault.as_well)]
+        names = tuple(
+            dict.fromkeys(
+                rig.names[one.hypothesis.camera]
+                for one in (fault.best, *fault.as_well)
+                if one.hypothesis.camera >= 0
+            )
+        )
+        message = (
+            f"the cameras disagree, and these faults explain it about equally well: {'; or '.join(several)}"
+        )
+        return Finding("unclear", names, message, "none is certain: check these cameras, or use more cameras")
+    if fault.as_well:
+        others = " or ".join(_in_words(rig, one, fps)[0].split(": ")[1] for one in fault.as_well)
+        numbers += f"; nearly as likely, {others}"
+    kind = "moved" if hypothesis.kind == "turned and moved" else hypothesis.kind
+    names = () if hypothesis.camera < 0 else (rig.names[hypothesis.camera],)
+    return Finding(kind, names, f"{words}, {numbers}", remedy)
+
+
+def _in_words(rig: Rig, judged: Judged, fps: float) -> tuple[str, str]:
+    """What is wrong and by how much, and what to do."""
+    hypothesis, camera = judged.hypothesis, judged.hypothesis.camera
+    if camera < 0:
+        scale, scale_std = float(np.exp(judged.step[-1])), float(judged.std[-1])
+        how = f"{100 * abs(1 / scale - 1):.0f} % too {'short' if scale > 1 else 'long'} (± {100 * scale_std:.1f} %)"
+        words = f"the calibration: all focal lengths are {how}"
+        return words, f"multiply them by {scale:.3f}, or calibrate the lenses anew"
+    name = rig.names[camera]
+    step, std = parameters_of(judged.step, camera), parameters_of(judged.std, camera)
+    if hypothesis.kind == "clock":
+        lag, how = float(step[7]), "late" if step[7] > 0 else "early"
+        words = (
+            f"camera {name}: its video is {abs(lag):.2f} frames {how} (± {std[7]:.2f}), its frame i shows what the "
+            f"others show in frame i {'-' if lag > 0 else '+'} {abs(lag):.2f}"
+        )
+        return words, f"add {-lag / fps:.4f} to its time_offset_s, or synchronise its video with the others"
+    if hypothesis.kind == "focal length":
+        scale = float(np.exp(step[6]))
+        how = f"{100 * abs(1 / scale - 1):.1f} % too {'short' if scale > 1 else 'long'} (± {100 * std[6]:.1f} %)"
+        f_px = scale * rig.cameras.K[camera, 0, 0]
+        return (
+            f"camera {name}: its focal length is {how}",
+            f"try {f_px:.0f} px, or calibrate its lens anew",
+        )
+    turn_deg, way_m = np.rad2deg(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:6]))
+    parts = [f"turned by {turn_deg:.1f} degrees"] if turn_deg else []
+    parts += [f"moved by {100 * way_m:.0f} cm"] if way_m else []
+    centre = ", ".join(f"{value:.2f}" for value in rig.cameras.centre_world[camera] + step[3:6])
+    remedy = f"calibrate it anew (`psotrack calibrate`); the boxes put it at ({centre}) m"
+    return f"camera {name}: it is {' and '.join(parts)}", remedy
 
 
 def describe_reference(fit: ReferenceFit, fps: float) -> list[Finding]:

@@ -9,19 +9,13 @@ from itertools import combinations, product
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.calibration import CommonErrors, adjust
 from psotrack.correspondence import Sightings
-from psotrack.doctor.agreement import MAX_SQUARED_DISTANCE, Agreement, measure_agreement
-from psotrack.geometry import Camera, Rig, reconstruct
+from psotrack.doctor.agreement import measure_agreement
+from psotrack.geometry import Camera, Rig
 
 #: Common factors of the focal lengths: those tried first, and those tried around the best of the first.
 _SCALES = np.exp(np.arange(-0.7, 0.7001, 0.1))
 _FINER = np.exp(np.arange(-0.1, 0.1001, 0.01))
-#: Smallest logarithm of a factor that is reported (the perspective of extended bodies causes smaller ones), and number
-#: of standard deviations from which on a factor is certain.
-_LEAST_OFF, _CERTAIN = 0.02, 3.5
-#: Standard deviation of errors that sightings of a camera have in common, as a share of the sightings' noise.
-_COMMON = 0.3
 
 
 @dataclass(frozen=True)
@@ -44,7 +38,10 @@ class RigInterpretation:
 
 
 def find_better_interpretation(
-    rig: Rig, sightings: Sightings, frames: Int[np.ndarray, "chosen"]
+    rig: Rig,
+    sightings: Sightings,
+    frames: Int[np.ndarray, "chosen"],
+    bounds_m: Float[np.ndarray, "2 3"],
 ) -> RigInterpretation | None:
     """Find the interpretation that explains clearly more sightings (`required_share`); None if no interpretation does.
 
@@ -52,11 +49,12 @@ def find_better_interpretation(
         rig: the rig as it was read.
         sightings: sightings of the rig's cameras.
         frames: (chosen,), numbers of the frames to examine.
+        bounds_m: (2, 3), corners of the region where bodies can be, metres.
     """
-    share = measure_agreement(rig, sightings, frames).share
+    share = measure_agreement(rig, sightings, frames, bounds_m).share
 
     def explained(interpretation: RigInterpretation) -> float:
-        return measure_agreement(interpretation.rig, sightings, frames).share
+        return measure_agreement(interpretation.rig, sightings, frames, bounds_m).share
 
     best = max([*_conventions(rig), *_exchanges(rig), *_lenses(rig, _SCALES)], key=explained)
     if best.kind == "focal lengths":
@@ -125,69 +123,6 @@ def _exchanges(rig: Rig) -> Iterator[RigInterpretation]:
             names,
             Rig(rig.names, rig.cameras[order]),
         )
-
-
-def find_better_focal_lengths(rig: Rig, found: Agreement, clearly: float) -> RigInterpretation | None:
-    """Multiply all focal lengths with a factor, if the matched points then agree better by `clearly`; else None.
-
-    If all lenses are wrong by the same factor, the points move with the lenses, so that most are still matched.
-
-    Args:
-        rig: the rig as it was read.
-        found: points of this rig.
-        clearly: smallest gain, as a share of the views.
-    """
-    noise_px = np.nan_to_num(found.noise_px, nan=1.0)
-
-    def gain(interpretation: RigInterpretation) -> float:
-        lines = reconstruct(
-            interpretation.rig.cameras,
-            found.centre_px,
-            found.used.astype(float),
-            noise_px=noise_px,
-            robust=False,
-        )
-        squared = np.nan_to_num(lines.reprojection_px / noise_px, nan=np.inf) ** 2
-        return float(
-            np.where(found.used, np.maximum(0.0, 1 - squared / MAX_SQUARED_DISTANCE), 0.0).sum()
-        ) / max(found.used.sum(), 1)
-
-    as_read = gain(next(_lenses(rig, np.ones(1))))
-    best = max(_lenses(rig, _SCALES), key=gain)
-    scale = best.rig.cameras.K[0, 0, 0] / rig.cameras.K[0, 0, 0]
-    best = max(_lenses(rig, scale * _FINER), key=gain)
-    return best if gain(best) > as_read + clearly else None
-
-
-def find_certain_focal_lengths(rig: Rig, found: Agreement) -> RigInterpretation | None:
-    """Multiply all focal lengths with a factor, if a bundle adjustment with fixed poses finds it certain; else None.
-
-    With wrong focal lengths and right poses, lines of sight miss each other, more so far from the image's middle. An
-    error of a few per cent is smaller than the noise of one sighting, and larger than the noise of the mean of a
-    thousand sightings.
-
-    Args:
-        rig: the rig as it was read.
-        found: points of this rig.
-    """
-    seen_px = np.where(found.used[..., None], found.centre_px, np.nan)
-    noise_px = np.nan_to_num(found.noise_px, nan=1.0)
-    middle_px, size_px = np.asarray(rig.cameras.K)[:, :2, 2], np.asarray(rig.cameras.image_size_wh)
-    from_middle = np.nan_to_num((seen_px - middle_px) / (size_px / 2))
-    run = np.cumsum(np.diff(found.frame, prepend=found.frame[:1]) > 1)
-    common_px, all_of_it = _COMMON * noise_px, np.zeros_like(run)
-    common_errors = [CommonErrors(run, common_px)]
-    common_errors += [
-        CommonErrors(all_of_it, common_px * of) for of in (1.0, *np.moveaxis(from_middle, -1, 0))
-    ]
-    adjusted = adjust(
-        rig, seen_px, noise_px, fixed=rig.names, rescaled=rig.names, common_errors=common_errors
-    )
-    scale, std = adjusted.focal_scale, adjusted.focal_scale_std
-    if abs(np.log(scale)) < max(_LEAST_OFF, _CERTAIN * std / scale):
-        return None
-    (interpretation,) = _lenses(rig, np.array([scale]))
-    return replace(interpretation, words=f"{interpretation.words} (± {100 * std / scale:.1f} %)")
 
 
 def _lenses(rig: Rig, scales: Float[np.ndarray, "scales"]) -> Iterator[RigInterpretation]:

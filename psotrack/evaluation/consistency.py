@@ -21,6 +21,7 @@ def consistency(
     residual_m: Float[np.ndarray, "frames drones 3"],
     centred_m: Float[np.ndarray, "frames drones 3"],
     covariance_m2: Float[np.ndarray, "frames drones 3 3"],
+    relative_covariance_m2: Float[np.ndarray, "frames drones 3 3"] | None = None,
 ) -> Consistency:
     """Share of reference positions inside the estimate's 90 % ellipsoid, and mean NEES, over frames and drones.
 
@@ -31,6 +32,8 @@ def consistency(
         residual_m: (frames, drones, 3), estimate minus reference, NaN where either is not known.
         centred_m: (frames, drones, 3), residuals minus each drone's mean residual.
         covariance_m2: (frames, drones, 3, 3), covariances of the estimates in the world; NaN where not known.
+        relative_covariance_m2: (frames, drones, 3, 3), covariances of the centred residuals, known where
+            `covariance_m2` is; None: the same.
 
     Raises:
         InputError: a covariance is not positive definite.
@@ -38,7 +41,8 @@ def consistency(
     known = np.isfinite(residual_m).all(axis=-1) & np.isfinite(covariance_m2).all(axis=(-2, -1))
     if not known.any():
         return Consistency(None, None, None, None)
-    smallest_m2 = np.linalg.eigvalsh(covariance_m2[known])[:, 0].min()
+    relative_m2 = (covariance_m2 if relative_covariance_m2 is None else relative_covariance_m2)[known]
+    smallest_m2 = np.linalg.eigvalsh([covariance_m2[known], relative_m2])[..., 0].min()
     if not smallest_m2 > 0:
         raise InputError(
             "estimate",
@@ -46,7 +50,7 @@ def consistency(
             found=f"one whose smallest eigenvalue is {smallest_m2:.3g} m2",
             remedy="leave a covariance empty (NaN) where it is not known",
         )
-    raw, centred = (_nees(vector_m[known], covariance_m2[known]) for vector_m in (residual_m, centred_m))
+    raw, centred = _nees(residual_m[known], covariance_m2[known]), _nees(centred_m[known], relative_m2)
     return Consistency(
         inside_90_rate=float(np.mean(raw <= INSIDE_90)),
         mean_nees=float(raw.mean()),

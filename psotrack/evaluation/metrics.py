@@ -136,6 +136,7 @@ class _Followed:
     est_m: Float[np.ndarray, "frames drones 3"]
     orientation_est_wxyz: Float[np.ndarray, "frames drones 4"]
     covariance_m2: Float[np.ndarray, "frames drones 3 3"]
+    relative_covariance_m2: Float[np.ndarray, "frames drones 3 3"]
     residual_m: Float[np.ndarray, "frames drones 3"]
     centred_m: Float[np.ndarray, "frames drones 3"]
     offsets: tuple[_Offset, ...]
@@ -165,6 +166,7 @@ def _follow(pair: AlignedPair, partner: Int[np.ndarray, "drones"]) -> _Followed:
         est_m=est_m,
         orientation_est_wxyz=fixed_partner_values(pair.orientation_est_wxyz, partner),
         covariance_m2=fixed_partner_values(pair.covariance_m2, partner),
+        relative_covariance_m2=fixed_partner_values(pair.relative_covariance_m2, partner),
         residual_m=residual_m,
         centred_m=np.stack(centred_m, axis=1),
         offsets=offsets,
@@ -212,7 +214,14 @@ def _errors(followed: _Followed, drones: slice) -> dict[str, Any]:
     return {
         **vars(_summary(error_m)),
         **vars(paths),
-        **vars(consistency(residual_m, centred_m, followed.covariance_m2[:, drones])),
+        **vars(
+            consistency(
+                residual_m,
+                centred_m,
+                followed.covariance_m2[:, drones],
+                followed.relative_covariance_m2[:, drones],
+            )
+        ),
         "missed_rate": float((known & np.isnan(error_m)).sum() / known.sum()),
         "offset_removed_mean_error_m": _mean(np.linalg.norm(centred_m, axis=-1)),
     }

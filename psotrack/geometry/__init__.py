@@ -1,8 +1,8 @@
-"""Cameras, rotations, boxes and triangulation, and the files that hold a rig.
+"""Cameras, rotations, boxes and triangulation.
 
-In: camera parameters and points, or detections in pixels. Out: pixels, boxes, 3D points with covariances. All modules
-except those for the rig's files (`rig_files`, `dpjait_calibration`) use NumPy and JAX only. Calibration and
-triangulation compute in float64. Other rooms may use every name in `__init__.pyi`.
+In: camera parameters and points, or detections in pixels. Out: pixels, boxes, 3D points with covariances. The modules
+use NumPy and JAX only. Calibration and triangulation compute in float64. Other rooms may use every name in
+`__init__.pyi`.
 """
 
 import lazy_loader

@@ -1,21 +1,23 @@
-from .boxes import Boxes, Extents, make_extents, project_boxes
-from .camera_names import camera_key, chosen_camera, files_by_camera
+from .boxes import Boxes, Extents, make_extents, moved_extents, project_boxes
+from .camera_names import camera_key, cameras_of, chosen_camera, chosen_cameras, files_by_camera
 from .cameras import (
     NEAR_M,
     Camera,
     Rig,
     distort,
+    has_image,
     look_at,
     make_camera,
     make_rig,
     project,
+    project_visible,
     to_camera,
     to_pixels,
     undistort,
 )
-from .dpjait_calibration import METRES_PER_UNIT, read_calibration, read_camera_names, write_calibration
-from .reprojection import project_with_jacobian, reconstruct
-from .rig_files import read_lenses, read_rig, write_rig
+from .image_scale import sizes_m, sizes_px, undistortion_stretch
+from .lenses import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS, undistort_approximately
+from .reprojection import project_with_jacobian, reconstruct, to_pixels_with_jacobian
 from .rotations import cross_matrices, rotation_matrices
 from .triangulation import (
     MAX_CONDITION,
@@ -28,40 +30,45 @@ from .triangulation import (
 )
 
 __all__ = [
+    "FISHEYE_COEFFICIENTS",
     "MAX_CONDITION",
-    "METRES_PER_UNIT",
     "NEAR_M",
+    "PINHOLE_COEFFICIENTS",
     "Boxes",
     "Camera",
     "Extents",
     "Rig",
     "camera_key",
+    "cameras_of",
     "chosen_camera",
+    "chosen_cameras",
     "cross_matrices",
     "distort",
     "files_by_camera",
+    "has_image",
     "look_at",
     "make_camera",
     "make_extents",
     "make_rig",
     "match_views",
+    "moved_extents",
     "project",
     "project_boxes",
+    "project_visible",
     "project_with_jacobian",
     "projection_equations",
-    "read_calibration",
-    "read_camera_names",
-    "read_lenses",
-    "read_rig",
     "reconstruct",
     "rotation_matrices",
+    "sizes_m",
+    "sizes_px",
     "to_camera",
     "to_pixels",
+    "to_pixels_with_jacobian",
     "triangulate",
     "triangulate_candidates",
     "triangulate_paths",
     "undistort",
+    "undistort_approximately",
+    "undistortion_stretch",
     "viewpoints",
-    "write_calibration",
-    "write_rig",
 ]

@@ -12,7 +12,7 @@ dual quadrics).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float
 
 from psotrack._typing import Array
 from psotrack.geometry.cameras import NEAR_M, Camera, distort
+from psotrack.geometry.lenses import is_one_to_one, lens_derivative, second_sheet
 
 
 @jax.tree_util.register_dataclass
@@ -30,7 +31,8 @@ class Boxes:
     Attributes:
         x_middle, y_middle: (..., cameras), middle of the box, pixels.
         x_half, y_half: (..., cameras), half width and half height, pixels.
-        in_front: (..., cameras), True if the drone is in front of the camera; other boxes have no meaning.
+        in_front: (..., cameras), True if the drone is in front of the camera, and before the fold of its lens; other
+            boxes have no meaning.
     """
 
     x_middle: Float[Array, "*batch"]
@@ -67,6 +69,8 @@ class Extents:
         s_xx, s_yy, s_xz, s_yz, s_zz: (..., cameras), elements of the shape S = R diag(size / 2)² Rᵀ in camera
             coordinates, m².
         f_x, f_y, skew, c_x, c_y: (cameras,), intrinsics in pixels; c_x and c_y in the convention of boxes.
+        shape_m2: (..., cameras, 3, 3), the whole shape S; None where no camera is a fisheye.
+        beyond: (cameras,), radii of the lenses' folds (`lenses.second_sheet`); None without distortion.
     """
 
     cameras: Camera
@@ -83,6 +87,8 @@ class Extents:
     skew: Float[Array, "cameras"]
     c_x: Float[Array, "cameras"]
     c_y: Float[Array, "cameras"]
+    shape_m2: Float[Array, "*drones cameras 3 3"] | None = None
+    beyond: Float[Array, "cameras"] | None = None
 
 
 def make_extents(
@@ -116,14 +122,33 @@ def make_extents(
         skew=K[:, 0, 1],
         c_x=K[:, 0, 2] + 0.5,
         c_y=K[:, 1, 2] + 0.5,
+        shape_m2=None if cameras.fisheye is None else S,
+        beyond=second_sheet(cameras.dist, cameras.fisheye) if cameras.dist.shape[-1] else None,
     )
+
+
+def moved_extents(seen: Extents, moved_m: Float[Array, "*drones cameras 3"]) -> Extents:
+    """Extents of drones that each camera sees at a place of its own, because it sees them at a time of its own.
+
+    Args:
+        seen: extents from `make_extents`.
+        moved_m: (..., cameras, 3), vector from a drone's position to the place at which the camera sees the drone,
+            metres. The boxes cost no more than without the vector.
+    """
+    translation_m = tuple(
+        seen.translation_m[i] + sum(seen.rotation[3 * i + j] * moved_m[..., j] for j in range(3))
+        for i in range(3)
+    )
+    return replace(seen, translation_m=translation_m)
 
 
 def project_boxes(seen: Extents, position_m: Float[Array, "*#drones 3"]) -> Boxes:
     """Boxes of drones at positions, in every camera.
 
     Lens distortion is applied to the middles of the box's four sides. A drone covers a few degrees, where this box
-    equals the box of the distorted outline.
+    equals the box of the distorted outline. In a fisheye, whose undistorted image stretches drones far from the axis,
+    the projection is linearised at the drone's middle instead. A drone that reaches beyond the fold of a lens has no
+    box, because the lens would show it where another drone is.
 
     Args:
         seen: extents from `make_extents`; the leading axes broadcast against those of `position_m`.
@@ -163,4 +188,41 @@ def project_boxes(seen: Extents, position_m: Float[Array, "*#drones 3"]) -> Boxe
         return seen.f_y * distort(seen.cameras, u, v)[1] + seen.c_y
 
     left, right, top, bottom = column(u - u_half), column(u + u_half), row(v - v_half), row(v + v_half)
-    return Boxes((left + right) / 2, (top + bottom) / 2, (right - left) / 2, (bottom - top) / 2, in_front)
+    is_shown = _is_shown(seen, (u, v), (u_half, v_half))
+    boxes = Boxes(
+        (left + right) / 2, (top + bottom) / 2, (right - left) / 2, (bottom - top) / 2, in_front & is_shown
+    )
+    if seen.cameras.fisheye is None:
+        return boxes
+    near = _linearised_boxes(seen, x, y, jnp.where(in_front, z, 1.0), boxes.in_front)
+    fisheye = jnp.asarray(seen.cameras.fisheye)
+    return jax.tree.map(lambda one, other: jnp.where(fisheye, one, other), near, boxes)
+
+
+def _is_shown(seen: Extents, middle: tuple[Array, Array], half: tuple[Array, Array]) -> Array:
+    """True where the part of an ellipsoid that is farthest from the optical axis is before the fold of the lens."""
+    radius = jnp.sqrt(middle[0] * middle[0] + middle[1] * middle[1]) + 1e-9
+    x, y = (at + reach * at / radius for at, reach in zip(middle, half, strict=True))
+    return jnp.asarray(is_one_to_one(seen.cameras.dist, seen.cameras.fisheye, x, y, seen.beyond))
+
+
+def _linearised_boxes(seen: Extents, x: Array, y: Array, z: Array, in_front: Array) -> Boxes:
+    """Boxes of ellipsoids with middles (x, y, z): the image of the shape S is J S Jᵀ, J the projection's derivative."""
+    u, v = x / z, y / z
+    bent_u, bent_v = distort(seen.cameras, u, v)
+    xx, xy, yx, yy = lens_derivative(seen.cameras.dist, seen.cameras.fisheye, u, v)
+    by_u, by_v = (
+        jnp.stack([by_x, by_y, -(u * by_x + v * by_y)], axis=-1) / z[..., None]
+        for by_x, by_y in ((xx, xy), (yx, yy))
+    )
+
+    def half(along: Array) -> Array:
+        return jnp.sqrt(jnp.maximum(jnp.einsum("...i,...ij,...j->...", along, seen.shape_m2, along), 1e-12))
+
+    return Boxes(
+        seen.f_x * bent_u + seen.skew * bent_v + seen.c_x,
+        seen.f_y * bent_v + seen.c_y,
+        half(seen.f_x[:, None] * by_u + seen.skew[:, None] * by_v),
+        half(seen.f_y[:, None] * by_v),
+        in_front,
+    )

@@ -1,5 +1,8 @@
 """Camera names: which camera does a file's name, or a name that a user typed, belong to?
 
+Names are compared without regard to case, spaces, underscores, dashes, dots and zeros before a number: `GoPro 3` and
+`gopro3_clip` are of one camera. Numbers are compared as a whole: `cam1` is not `cam10`, and `cam1_0` is not `cam10`.
+
 In the simulated half of the DPJAIT dataset the calibration says `cam1` and the files are `cam1i_s.avi`; sequences that
 psotrack simulated until version 0.1.0 say `cam1i` in the calibration. In the real half files and calibration bear the
 serial number of the camera's body, with or without `cam_` before the number.
@@ -7,41 +10,50 @@ serial number of the camera's body, with or without `cam_` before the number.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from psotrack.errors import InputError
+from psotrack.errors import InputError, SettingsError
 
 #: Fewer digits in a row are the number of a camera, not the serial number of its body.
 _SERIAL_DIGITS = 6
+#: A run of digits, or a run of other characters that are not separators.
+_WORD = re.compile(r"\d+|[^\W\d_]+|[^\s\w.\-]+")
 
 
 def camera_key(name: str) -> str:
-    """The part of a name that two spellings of one camera share.
+    """The part of a name that all spellings of one camera share.
 
-    >>> camera_key("cam1i_s"), camera_key("cam_60881257")
-    ('cam1i', '60881257')
+    >>> camera_key("cam1i_s"), camera_key("cam_60881257"), camera_key("GoPro 03")
+    ('cam1i', '60881257', 'gopro3')
     """
-    key = name.lower().removesuffix("_s")
-    digits = "".join(character for character in key if character.isdigit())
-    return digits if len(digits) >= _SERIAL_DIGITS else key
+    return _words(name, whole=True).text
 
 
 def camera_of(name: str, cameras: Sequence[str]) -> str | None:
-    """The camera to which a file of this name belongs; None where there is no such camera.
-
-    A file belongs to the camera whose name the file's name begins with, where no digit follows: `cam1i_s` belongs to
-    `cam1` and not to `cam10`. Of several such cameras the one with the longest name is meant.
+    """The camera to which a file of this name belongs; None where there is no such camera, or no single one.
 
     Args:
         name: name of the file, without its suffix.
         cameras: names of the cameras in the calibration.
     """
-    key = camera_key(name)
-    keys = {camera: camera_key(camera) for camera in cameras}
-    same = [camera for camera in cameras if keys[camera] == key]
-    begun = [camera for camera in cameras if _continues(key, keys[camera])]
-    return max(same or begun, key=lambda camera: len(keys[camera]), default=None)
+    found = cameras_of(name, cameras)
+    return found[0] if len(found) == 1 else None
+
+
+def cameras_of(name: str, cameras: Sequence[str]) -> list[str]:
+    """The cameras to which a file of this name may belong, the best ones only.
+
+    A file belongs to the camera with the same name; else to the camera whose name the file's name begins with; else to
+    the camera whose name it contains. No digit may follow: `cam1i_s` belongs to `cam1` and not to `cam10`. Of several
+    such cameras the one with the longest name is meant. Two cameras remain where a name contains both equally well.
+    """
+    ranked = {camera: _rank(name, camera) for camera in cameras}
+    fitting = {camera: rank for camera, rank in ranked.items() if rank is not None}
+    best = min(fitting.values(), default=None)
+    return [camera for camera, rank in fitting.items() if rank == best]
 
 
 def chosen_camera(name: str, cameras: Sequence[str]) -> str | None:
@@ -51,17 +63,36 @@ def chosen_camera(name: str, cameras: Sequence[str]) -> str | None:
     """
     if name in cameras:
         return name
-    found = camera_of(name, cameras)
-    if found is None:
-        longer = [camera for camera in cameras if _continues(camera_key(camera), camera_key(name))]
-        found = longer[0] if len(longer) == 1 else None
-    return found
+    found = [camera for camera in cameras_of(name, cameras) if (_rank(name, camera) or (9,))[0] <= _BEGINS]
+    longer = [camera for camera in cameras if _rank(camera, name) is not None]
+    fitting = found or longer
+    return fitting[0] if len(fitting) == 1 else None
+
+
+def chosen_cameras(names: Sequence[str], cameras: Sequence[str]) -> tuple[str, ...]:
+    """The cameras that a user means by several names, in the order of `names`.
+
+    Raises:
+        SettingsError: a name fits no camera, a camera is named twice, or no name is given.
+    """
+    found = {name: chosen_camera(name, cameras) for name in names}
+    unknown = [name for name in names if found[name] is None]
+    expected = f"some of {', '.join(cameras)}"
+    if unknown or not names:
+        shown = ", ".join(name if name.strip() else repr(name) for name in unknown)
+        raise SettingsError("cameras", expected=expected, found=shown or "none")
+    kept = [camera for camera in (found[name] for name in names) if camera is not None]
+    if len(set(kept)) < len(kept):
+        twice = ", ".join(name for name in names if kept.count(found[name] or "") > 1)
+        raise SettingsError("cameras", expected=f"{expected}, each once", found=twice)
+    return tuple(kept)
 
 
 def files_by_camera(paths: Iterable[Path], cameras: Sequence[str]) -> dict[str, Path]:
     """The file of each camera, in the order of `cameras`; a camera without a file is absent.
 
-    A file that has exactly the camera's name comes before files whose names only begin with the camera's name.
+    A file that has exactly the camera's name comes before files whose names begin with the camera's name, and these
+    before files whose names contain it.
 
     Raises:
         InputError: two files fit one camera equally well.
@@ -71,17 +102,80 @@ def files_by_camera(paths: Iterable[Path], cameras: Sequence[str]) -> dict[str, 
         camera = camera_of(path.stem, cameras)
         if camera is None:
             continue
-        if camera in found and _exact(found[camera], camera) == _exact(path, camera):
-            raise InputError(path, expected="one such file per camera", found=f"{found[camera].name} as well")
-        if camera not in found or _exact(path, camera):
+        before = found.get(camera)
+        ranks = [(_rank(one.stem, camera) or (9,))[0] for one in (path, before or path)]
+        if before is not None and ranks[0] == ranks[1]:
+            raise InputError(path, expected="one such file per camera", found=f"{before.name} as well")
+        if before is None or ranks[0] < ranks[1]:
             found[camera] = path
     return {camera: found[camera] for camera in cameras if camera in found}
 
 
-def _exact(path: Path, camera: str) -> bool:
-    return camera_key(path.stem) == camera_key(camera)
+#: How well a file's name fits a camera's: the same name; the camera's name, then another word; the camera's name
+#: between other words; the camera's name, then more letters of the same word.
+_SAME, _BEGINS, _CONTAINS, _LONGER_WORD = range(4)
 
 
-def _continues(longer: str, shorter: str) -> bool:
-    """Whether `longer` begins with `shorter` and goes on with no digit."""
-    return bool(shorter) and longer.startswith(shorter) and not longer[len(shorter) :][:1].isdigit()
+@dataclass(frozen=True)
+class _Words:
+    """A name without separators.
+
+    Attributes:
+        text: the words in lower case, with a bar between two numbers.
+        starts: positions in the text at which a word begins after a separator, or the text begins.
+    """
+
+    text: str
+    starts: frozenset[int]
+
+
+def _words(name: str, *, whole: bool) -> _Words:
+    """Words of a name; with `whole`, a serial number is all that counts, and the ending `_s` does not count."""
+    folded = name.casefold()
+    if whole:
+        folded = folded.removesuffix("_s")
+        numbers = re.findall(r"\d+", folded)
+        if len(numbers) == 1 and len(numbers[0]) >= _SERIAL_DIGITS:
+            folded = numbers[0]
+    text, starts, end = "", set(), 0
+    for match in _WORD.finditer(folded):
+        word = (match[0].lstrip("0") or "0") if match[0].isdecimal() else match[0]
+        if match.start() > end or not text:
+            text += "|" if text[-1:].isdecimal() and word.isdecimal() else ""
+            starts.add(len(text))
+        text += word
+        end = match.end()
+    return _Words(text, frozenset(starts))
+
+
+def _rank(name: str, camera: str) -> tuple[int, int] | None:
+    """How well a file's name fits a camera's, and minus the length of the latter; smaller is better, None is not."""
+    wanted = _words(camera, whole=True).text
+    if not wanted:
+        return None
+    if wanted == camera_key(name):
+        return _SAME, -len(wanted)
+    whole = _words(name, whole=False)
+    ranks = [
+        _rank_at(whole, wanted, at.start()) for at in re.finditer(f"(?={re.escape(wanted)})", whole.text)
+    ]
+    best = min((rank for rank in ranks if rank is not None), default=None)
+    return None if best is None else (best, -len(wanted))
+
+
+def _rank_at(name: _Words, wanted: str, start: int) -> int | None:
+    """Rank of a camera's name at one position of a file's name; None where it is only a part of a word there."""
+    text, stop = name.text, start + len(wanted)
+    before, after = text[start - 1 : start], text[stop : stop + 1]
+    begins = start in name.starts or before == "|" or _kind(before) != _kind(wanted[0])
+    parted = (
+        not after or stop in name.starts or after == "|" or (wanted[-1].isdecimal() and not after.isdecimal())
+    )
+    if begins and parted:
+        return _BEGINS if start == 0 else _CONTAINS
+    return _LONGER_WORD if start == 0 and not after.isdecimal() else None
+
+
+def _kind(character: str) -> str:
+    """Whether a character is a digit or a letter; empty for none."""
+    return "" if not character else "digit" if character.isdecimal() else "letter"

@@ -5,7 +5,8 @@ Conventions of the whole package:
 - World: right-handed, z up, metres. Camera: x right, y down, z forward (OpenCV).
 - `T_cam_world` maps world to camera: `x_cam = R x_world + t`. Its last column is t, not the camera's centre.
 - Pixels: (x, y) = (column, row); the centre of the first pixel is (0, 0), as in OpenCV's calibration.
-- Lens distortion is OpenCV's: (k1, k2, p1, p2[, k3[, k4, k5, k6]]); a rig without distortion has 0 coefficients.
+- Lens distortion is OpenCV's, pinhole or fisheye (see `lenses`); a rig without distortion has 0 coefficients. A point
+  beyond the fold of its lens has no image: `has_image`.
 
 The functions return the kind of array that they are given: NumPy float64 in calibration and triangulation, JAX arrays
 and tracers in the tracker. Both use the same projection.
@@ -20,11 +21,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from psotrack._typing import Array
 from psotrack.errors import SettingsError
-from psotrack.geometry.camera_names import chosen_camera
+from psotrack.geometry.camera_names import chosen_cameras
+from psotrack.geometry.lenses import (
+    FISHEYE_COEFFICIENTS,
+    PINHOLE_COEFFICIENTS,
+    distort_normalised,
+    is_one_to_one,
+    undistort_normalised,
+)
 from psotrack.support import short_repr
 
 #: Smallest depth of a point that has a projection, metres.
@@ -39,14 +47,17 @@ class Camera:
     Attributes:
         T_cam_world: (..., 4, 4), world to camera, metres.
         K: (..., 3, 3), intrinsics in pixels.
-        dist: (..., coefficients), lens distortion in OpenCV's order; 0, 4, 5 or 8 coefficients.
+        dist: (..., coefficients), lens distortion in OpenCV's order; 0, 4, 5, 8, 12 or 14 coefficients. A fisheye uses
+            the first four.
         image_size_wh: (..., 2), width and height in pixels.
+        fisheye: (...), True for cameras with OpenCV's fisheye model; None if no camera is a fisheye.
     """
 
     T_cam_world: Float[Array, "*batch 4 4"]
     K: Float[Array, "*batch 3 3"]
     dist: Float[Array, "*batch coefficients"]
     image_size_wh: Float[Array, "*batch 2"]
+    fisheye: Bool[Array, "*batch"] | None = None
 
     __repr__ = short_repr
 
@@ -87,16 +98,8 @@ class Rig:
         Raises:
             SettingsError: a name is not in the rig, a camera is named twice, or no name is given.
         """
-        found = {name: chosen_camera(name, self.names) for name in names}
-        unknown = [name for name in names if found[name] is None]
-        expected = f"some of {', '.join(self.names)}"
-        if unknown or not names:
-            raise SettingsError("cameras", expected=expected, found=", ".join(unknown) or "none")
-        kept = [camera for camera in (found[name] for name in names) if camera is not None]
-        if len(set(kept)) < len(kept):
-            twice = ", ".join(name for name in names if kept.count(found[name] or "") > 1)
-            raise SettingsError("cameras", expected=f"{expected}, each once", found=twice)
-        return Rig(tuple(kept), self.cameras[np.array([self.names.index(name) for name in kept])])
+        kept = chosen_cameras(names, self.names)
+        return Rig(kept, self.cameras[np.array([self.names.index(name) for name in kept])])
 
 
 def make_camera(
@@ -106,6 +109,7 @@ def make_camera(
     K: Float[np.ndarray, "3 3"],
     image_size_wh: tuple[int, int],
     dist: Sequence[float] = (),
+    fisheye: bool = False,
 ) -> Camera:
     """Make one camera from its calibration and check the numbers; arrays are float64.
 
@@ -114,11 +118,12 @@ def make_camera(
         t_m: (3,), translation from world to camera in metres (not the camera's centre).
         K: (3, 3), intrinsics in pixels.
         image_size_wh: width and height in pixels.
-        dist: 0, 4, 5 or 8 coefficients in OpenCV's order.
+        dist: 0, 4, 5, 8, 12 or 14 coefficients in OpenCV's order; 0 or 4 of a fisheye.
+        fisheye: the lens has OpenCV's fisheye model.
 
     Raises:
         SettingsError: R is not a rotation, a number is not finite, a focal length is not above 0, the image has no
-            pixels, or the number of coefficients is not 0, 4, 5 or 8.
+            pixels, or the model of the lens does not have this number of coefficients.
     """
     R, t_m, K = (np.asarray(value, np.float64) for value in (R, t_m, K))
     coefficients = np.asarray(dist, np.float64)
@@ -132,24 +137,36 @@ def make_camera(
         )
     if min(image_size_wh) < 1:
         raise SettingsError("camera.image_size_wh", expected="sides of at least 1", found=f"{image_size_wh}")
-    if coefficients.shape not in {(0,), (4,), (5,), (8,)}:
-        raise SettingsError("camera.dist", expected="0, 4, 5 or 8 coefficients", found=f"{coefficients.size}")
+    allowed = (0, FISHEYE_COEFFICIENTS) if fisheye else PINHOLE_COEFFICIENTS
+    if coefficients.ndim != 1 or coefficients.size not in allowed:
+        numbers = f"{', '.join(map(str, allowed[:-1]))} or {allowed[-1]} coefficients"
+        expected = f"{numbers} of a fisheye" if fisheye else numbers
+        raise SettingsError("camera.dist", expected=expected, found=f"{coefficients.size}")
+    if fisheye:
+        coefficients = np.pad(coefficients, (0, FISHEYE_COEFFICIENTS - coefficients.size))
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, t_m
-    return Camera(T, K, coefficients, np.asarray(image_size_wh, np.float64))
+    kind = np.array(True) if fisheye else None
+    return Camera(T, K, coefficients, np.asarray(image_size_wh, np.float64), kind)
 
 
 def make_rig(named: dict[str, Camera]) -> Rig:
     """Make a rig from single cameras by name.
 
-    Shorter lists of distortion coefficients are padded with zeros, which do not change the projection.
+    Shorter lists of distortion coefficients are padded with zeros, which do not change the projection. Lenses may be
+    fisheyes and others.
     """
     if not named:
         raise SettingsError("cameras", expected="at least one camera", found="none")
     coefficients = max(camera.dist.shape[-1] for camera in named.values())
+    kinds = [camera.fisheye is not None and bool(camera.fisheye) for camera in named.values()]
     padded = [
-        replace(camera, dist=np.pad(camera.dist, (0, coefficients - camera.dist.shape[-1])))
-        for camera in named.values()
+        replace(
+            camera,
+            dist=np.pad(camera.dist, (0, coefficients - camera.dist.shape[-1])),
+            fisheye=np.array(kind) if any(kinds) else None,
+        )
+        for camera, kind in zip(named.values(), kinds, strict=True)
     ]
     return Rig(tuple(named), jax.tree.map(lambda *leaves: np.stack(leaves), *padded))
 
@@ -197,7 +214,8 @@ def to_camera(cam: Camera, points_world: Float[Array, "*#points 3"]) -> Float[Ar
 def to_pixels(cam: Camera, points_cam: Float[Array, "*#points 3"]) -> Float[Array, "*#points 2"]:
     """Pixels of points in camera coordinates, lens distortion included (OpenCV's `projectPoints`).
 
-    A point behind the camera is projected as if its depth were `NEAR_M`: its pixel is finite but has no meaning.
+    A point behind the camera is projected as if its depth were `NEAR_M`. The pixels of points behind the camera and
+    beyond the fold of the lens are finite but have no meaning (see `has_image`).
     """
     xp = np if isinstance(points_cam, np.ndarray) else jnp
     z = xp.maximum(points_cam[..., 2], NEAR_M)
@@ -219,8 +237,8 @@ def project(
         points_world: (..., 3), metres, broadcast as in `to_camera`.
 
     Returns:
-        Pixels (..., 2), and depth (...) in metres along the optical axis. A point with a depth below `NEAR_M` has no
-        projection; its pixel has no meaning.
+        Pixels (..., 2), and depth (...) in metres along the optical axis. A point with a depth below `NEAR_M`, or
+        beyond the fold of the lens, has no image; its pixel has no meaning (see `project_visible`).
 
     Example:
         >>> R, t = look_at((0.0, 0.0, 1.0), (5.0, 0.0, 1.0))
@@ -232,44 +250,56 @@ def project(
     return to_pixels(cam, points_cam), points_cam[..., 2]
 
 
+def project_visible(
+    cam: Camera, points_world: Float[Array, "*#points 3"]
+) -> tuple[Float[Array, "*#points 2"], Float[Array, "*#points"]]:
+    """Pixels and depth of world points as from `project`, with NaN pixels for points that have no image.
+
+    Args:
+        cam: cameras with leading axes (*batch).
+        points_world: (..., 3), metres, broadcast as in `to_camera`.
+    """
+    points_cam = to_camera(cam, points_world)
+    xp = np if isinstance(points_cam, np.ndarray) else jnp
+    pixels = xp.where(has_image(cam, points_cam)[..., None], to_pixels(cam, points_cam), xp.nan)
+    return pixels, points_cam[..., 2]
+
+
+def has_image(cam: Camera, points_cam: Float[Array, "*#points 3"]) -> Bool[Array, "*#points"]:
+    """True for points that a camera can show: at least `NEAR_M` in front of it, and before the fold of its lens.
+
+    Args:
+        cam: cameras with leading axes (*batch).
+        points_cam: (..., 3), camera coordinates, metres, broadcast as in `to_camera`.
+    """
+    in_front = points_cam[..., 2] >= NEAR_M
+    if cam.dist.shape[-1] == 0:
+        return in_front
+    xp = np if isinstance(points_cam, np.ndarray) else jnp
+    z = xp.maximum(points_cam[..., 2], NEAR_M)
+    return in_front & is_one_to_one(cam.dist, cam.fisheye, points_cam[..., 0] / z, points_cam[..., 1] / z)
+
+
 def distort(
     cam: Camera, x: Float[Array, "*#points"], y: Float[Array, "*#points"]
 ) -> tuple[Float[Array, "*#points"], Float[Array, "*#points"]]:
-    """Distorted normalised image coordinates by OpenCV's rational and tangential lens model.
+    """Distorted normalised image coordinates, by each camera's lens model (see `lenses`).
 
     Args:
         cam: cameras with leading axes (*batch).
         x, y: (...), undistorted normalised image coordinates.
     """
-    coefficients = cam.dist.shape[-1]
-    if coefficients == 0:
-        return x, y
-    k1, k2, p1, p2 = (cam.dist[..., i] for i in range(4))
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + (r2 * cam.dist[..., 4] if coefficients > 4 else 0.0)))
-    if coefficients == 8:
-        radial = radial / (1 + r2 * (cam.dist[..., 5] + r2 * (cam.dist[..., 6] + r2 * cam.dist[..., 7])))
-    return (
-        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-    )
+    return distort_normalised(cam.dist, cam.fisheye, x, y)
 
 
-def undistort(
-    cam: Camera, pixels: Float[np.ndarray, "*#points 2"], num_iterations: int = 20
-) -> Float[np.ndarray, "*#points 2"]:
-    """Undistorted normalised image coordinates of pixels, by OpenCV's fixed-point iteration, in float64.
+def undistort(cam: Camera, pixels: Float[np.ndarray, "*#points 2"]) -> Float[np.ndarray, "*#points 2"]:
+    """Undistorted normalised image coordinates of pixels, in float64; NaN where the lens shows no point.
 
     Args:
         cam: cameras with leading axes (*batch).
         pixels: (..., 2), distorted pixels.
-        num_iterations: iterations of the undistortion.
     """
-    K = cam.K
+    K = np.asarray(cam.K)
     v = (pixels[..., 1] - K[..., 1, 2]) / K[..., 1, 1]
     u = (pixels[..., 0] - K[..., 0, 2] - K[..., 0, 1] * v) / K[..., 0, 0]
-    x, y = u, v
-    for _ in range(num_iterations if cam.dist.shape[-1] else 0):
-        bent_x, bent_y = distort(cam, x, y)
-        x, y = x + (u - bent_x), y + (v - bent_y)
-    return np.stack([x, y], axis=-1)
+    return np.stack(undistort_normalised(cam.dist, cam.fisheye, u, v), axis=-1)

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.estimation import Damping, NormalEquations, Step, levenberg_marquardt
-from psotrack.geometry.cameras import NEAR_M, Camera, distort, to_camera
+from psotrack.geometry.cameras import NEAR_M, Camera, distort, has_image, to_camera
+from psotrack.geometry.lenses import lens_derivative
 
 #: A step shorter than this is not taken, standard deviations of the point.
 _LEAST_LENGTH = 1e-4
@@ -32,8 +33,8 @@ class ImageFit:
         position_m: (points, 3), world, metres; NaN without a start, and where the used views do not fix the point.
         covariance_m2: (points, 3, 3), (JᵀJ)⁻¹ with J in standard deviations of the pixels, m²; meaningless where the
             position is NaN.
-        cost: (points,), sum of squared residuals in standard deviations; infinite where the position is NaN or behind
-            a used camera.
+        cost: (points,), sum of squared residuals in standard deviations; infinite where the position is NaN, or
+            where a used camera cannot show it.
         disagreement: (points, cameras), t = rᵀ S⁻¹ r of each view's residual r, where S = I - J C Jᵀ is the covariance
             of r in the fit with covariance C. t is χ² with two degrees of freedom (studentised residuals: Cook &
             Weisberg 1982, section 2.1). 0 for unused views.
@@ -93,7 +94,7 @@ class _Points:
         position_m: (points, 3), world, metres.
         residual: (points, equations), measured minus projected in standard deviations, two equations per camera.
         jacobian: (points, equations, 3), derivatives of the projections by the position.
-        cost: (points,), sums of squared residuals; infinite where a point is behind a used camera.
+        cost: (points,), sums of squared residuals; infinite where a used camera cannot show a point.
     """
 
     views: _Views
@@ -118,10 +119,13 @@ def _linearise(views: _Views, position_m: Float[np.ndarray, "points 3"]) -> _Poi
     pixels, depth, jacobian = project_with_jacobian(views.cameras, position_m[:, None, :])
     scale = views.scale
     is_used = scale > 0
+    is_shown = depth >= NEAR_M
+    if views.cameras.dist.shape[-1]:
+        is_shown = np.asarray(has_image(views.cameras, to_camera(views.cameras, position_m[:, None, :])))
     residual = np.where(is_used[..., None], (views.points_px - pixels) * scale[..., None], 0.0)
     residual = residual.reshape(len(scale), 2 * scale.shape[1])
-    is_behind = ((depth < NEAR_M) & is_used).any(axis=-1)
-    cost = np.where(is_behind, np.inf, np.vecdot(residual, residual))
+    is_hidden = (is_used & ~is_shown).any(axis=-1)
+    cost = np.where(is_hidden, np.inf, np.vecdot(residual, residual))
     jacobian = (jacobian * scale[..., None, None]).reshape(*residual.shape, 3)
     return _Points(views, position_m, residual, jacobian, cost)
 
@@ -139,43 +143,41 @@ def project_with_jacobian(
         (..., 2), pixels as in `cameras.project`; (...), depths, metres; and (..., 2, 3), derivatives, pixels per metre.
     """
     points_cam = np.asarray(to_camera(cameras, points_world))
-    depth = points_cam[..., 2]
-    z = np.maximum(depth, NEAR_M)
+    pixels, jacobian = _differentiate(cameras, points_cam, np.asarray(cameras.T_cam_world)[..., :3, :3])
+    return pixels, points_cam[..., 2], jacobian
+
+
+def to_pixels_with_jacobian(
+    lens: Camera, points_cam: Float[np.ndarray, "*#points 3"]
+) -> tuple[Float[np.ndarray, "*#points 2"], Float[np.ndarray, "*#points 2 3"]]:
+    """Pixels of points in camera coordinates, and their derivatives by these coordinates, for adjustments of poses.
+
+    Args:
+        lens: cameras with leading axes (*batch); their poses are not used.
+        points_cam: (..., 3), metres.
+    """
+    return _differentiate(lens, points_cam, np.eye(3))
+
+
+def _differentiate(
+    cameras: Camera, points_cam: Float[np.ndarray, "*#points 3"], R: Float[np.ndarray, "*#cameras 3 3"]
+) -> tuple[Float[np.ndarray, "*#points 2"], Float[np.ndarray, "*#points 2 3"]]:
+    """Pixels, and their derivatives by points whose coordinates R turns into those of the camera."""
+    z = np.maximum(points_cam[..., 2], NEAR_M)
     x, y = points_cam[..., 0] / z, points_cam[..., 1] / z
     bent_x, bent_y = distort(cameras, x, y)
-    K, R = cameras.K, cameras.T_cam_world[..., :3, :3]
+    K = cameras.K
     u = K[..., 0, 0] * bent_x + K[..., 0, 1] * bent_y + K[..., 0, 2]
     v = K[..., 1, 1] * bent_y + K[..., 1, 2]
     # d(x, y) / d world = (r1 - x r3, r2 - y r3) / z, with the rows r1, r2, r3 of the rotation.
     x_by_world = (R[..., 0, :] - x[..., None] * R[..., 2, :]) / z[..., None]
     y_by_world = (R[..., 1, :] - y[..., None] * R[..., 2, :]) / z[..., None]
-    (xx, xy), (yx, yy) = _lens_derivative(cameras, x, y)
+    xx, xy, yx, yy = (slope[..., None] for slope in lens_derivative(cameras.dist, cameras.fisheye, x, y))
     bent_x_by_world = xx * x_by_world + xy * y_by_world
     bent_y_by_world = yx * x_by_world + yy * y_by_world
     u_by_world = K[..., 0, 0, None] * bent_x_by_world + K[..., 0, 1, None] * bent_y_by_world
     v_by_world = K[..., 1, 1, None] * bent_y_by_world
-    return np.stack([u, v], axis=-1), depth, np.stack([u_by_world, v_by_world], axis=-2)
-
-
-def _lens_derivative(
-    cameras: Camera, x: Float[np.ndarray, "*#points"], y: Float[np.ndarray, "*#points"]
-) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Derivatives of `cameras.distort`, each (..., 1): ((x by x, x by y), (y by x, y by y))."""
-    coefficients = cameras.dist.shape[-1]
-    if coefficients == 0:
-        return (np.ones(1), np.zeros(1)), (np.zeros(1), np.ones(1))
-    k = np.zeros((8, *cameras.dist.shape[:-1]))
-    k[:coefficients] = np.moveaxis(np.asarray(cameras.dist), -1, 0)
-    k1, k2, p1, p2, k3, k4, k5, k6 = k
-    r2 = x * x + y * y
-    below = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / below
-    # The derivative of `radial` by r²; the derivative of r² by x is 2 x.
-    slope = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
-    xx = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
-    yy = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
-    xy = 2 * (x * y * slope + p1 * x + p2 * y)
-    return (xx[..., None], xy[..., None]), (xy[..., None], yy[..., None])
+    return np.stack([u, v], axis=-1), np.stack([u_by_world, v_by_world], axis=-2)
 
 
 def _disagreement(

@@ -13,16 +13,19 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.errors import SettingsError
-from psotrack.geometry.cameras import NEAR_M, Camera, project
-from psotrack.geometry.image_fit import ImageFit, fit_in_image, project_with_jacobian
+from psotrack.geometry.cameras import Camera, has_image, to_camera, to_pixels
+from psotrack.geometry.image_fit import (
+    ImageFit,
+    fit_in_image,
+    project_with_jacobian,
+    to_pixels_with_jacobian,
+)
 from psotrack.geometry.triangulation import projection_equations, solve_normal_equations, viewpoints
 
-__all__ = ["Triangulated", "project_with_jacobian", "reconstruct"]
+__all__ = ["Triangulated", "project_with_jacobian", "reconstruct", "to_pixels_with_jacobian"]
 
 #: Largest number of refinement steps. From a linear start two steps suffice; nearly parallel rays need more.
 _MAX_STEPS = 10
-#: Iterations of the undistortion before a refinement, which needs only an approximate start.
-_UNDISTORTIONS = 6
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class Triangulated:
         position_m: (..., 3), positions in the world, metres; NaN if unknown.
         covariance_m2: (..., 3, 3), covariance of the position from the noise of the pixels, m²; NaN if unknown.
         reprojection_px: (..., cameras), distance between each view's pixel and the projection, pixels, also of views
-            that are left out; infinite if the point is behind the camera, NaN if it is not seen or unknown.
+            that are left out; infinite if the camera cannot show the point, NaN if it is not seen or unknown.
         used: (..., cameras), True for views that the position is computed from.
     """
 
@@ -80,7 +83,7 @@ def reconstruct(
     """
     if not 0 < false_alarm < 1:
         raise SettingsError("false_alarm", expected="a probability", found=f"{false_alarm:g}")
-    rows, right, seen = projection_equations(cameras, points_px, _UNDISTORTIONS if refine else 20)
+    rows, right, seen = projection_equations(cameras, points_px)
     scale = _inverse_deviation(seen, weights, noise_px)
     # From here on the points have one axis, and points with fewer than two views are absent.
     known = np.asarray((scale > 0).sum(axis=-1) >= 2)
@@ -93,12 +96,12 @@ def reconstruct(
     fitted = np.isfinite(fit.cost)
     known[known] = fitted
     position_m = _scatter(known, fit.position_m[fitted], np.nan)
-    pixels, depth = project(cameras, position_m[..., None, :])
-    distance_px = np.linalg.norm(pixels - points_px, axis=-1)
+    points_cam = to_camera(cameras, position_m[..., None, :])
+    distance_px = np.linalg.norm(to_pixels(cameras, points_cam) - points_px, axis=-1)
     return Triangulated(
         position_m,
         _scatter(known, fit.covariance_m2[fitted], np.nan),
-        np.where(np.isfinite(distance_px) & (depth < NEAR_M), np.inf, distance_px),
+        np.where(np.isfinite(distance_px) & ~has_image(cameras, points_cam), np.inf, distance_px),
         _scatter(known, scale[fitted] > 0, False),
     )
 

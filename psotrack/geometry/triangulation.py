@@ -11,7 +11,8 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.geometry.cameras import Camera, project, undistort
+from psotrack.geometry.cameras import Camera, project_visible, undistort
+from psotrack.geometry.image_scale import undistortion_stretch
 
 #: Largest condition number of the normal equations; beyond this number the rays count as parallel.
 MAX_CONDITION = 1e12
@@ -42,7 +43,7 @@ def triangulate(
 def triangulate_paths(
     cameras: Camera,
     points_px: Float[np.ndarray, "*paths frames cameras 2"],
-    time_s: Float[np.ndarray, "frames"],
+    time_s: Float[np.ndarray, "frames"] | Float[np.ndarray, "frames cameras"],
     weights: Float[np.ndarray, "*paths frames cameras"] | None = None,
     *,
     noise_m: float = 0.02,
@@ -57,7 +58,7 @@ def triangulate_paths(
     Args:
         cameras: cameras with one leading axis.
         points_px: (..., frames, cameras, 2), pixels; NaN if a camera does not see the point.
-        time_s: (frames,), times of the frames, seconds.
+        time_s: (frames,), times of the frames, seconds; or (frames, cameras), where cameras have times of their own.
         weights: (..., frames, cameras), weight of each camera's two equations; None: 1.
         noise_m: standard deviation of a camera's equations, in metres at the point.
         expected: standard deviations of c_1, c_2 ..., m/s, m/s² ...; their number is the degree of the path.
@@ -66,11 +67,18 @@ def triangulate_paths(
         (..., 1 + len(expected), 3), coefficients c_0, c_1 ..., metres and seconds; NaN if fewer than two cameras ever
         see the point, or if all rays are parallel.
     """
+    if time_s.ndim == 2:
+        # Each camera's frame becomes a frame of its own, in which the other cameras see nothing.
+        alone = np.eye(time_s.shape[1], dtype=bool)[..., None]
+        points_px = np.where(alone, points_px[..., :, None, :, :], np.nan)
+        points_px = points_px.reshape(*points_px.shape[:-4], -1, *points_px.shape[-2:])
+        if weights is not None:
+            weights = np.repeat(weights, time_s.shape[1], axis=-2)
     normal, right, seen = _normal_equations(cameras, points_px, weights)
     solvable = seen.any(axis=-2).sum(axis=-1) >= 2
     solvable &= np.linalg.cond(normal.sum(axis=-3)) < MAX_CONDITION
     terms = 1 + len(expected)
-    power = time_s[:, None] ** np.arange(terms)
+    power = time_s.reshape(-1, 1) ** np.arange(terms)
     whole = np.einsum("fk,fl,...fij->...kilj", power, power, normal)
     whole = whole.reshape(*whole.shape[:-4], 3 * terms, 3 * terms)
     stiffness = np.repeat([0.0, *((noise_m / std) ** 2 for std in expected)], 3)
@@ -81,7 +89,7 @@ def triangulate_paths(
 
 
 def projection_equations(
-    cameras: Camera, points_px: Float[np.ndarray, "*points cameras 2"], num_iterations: int = 20
+    cameras: Camera, points_px: Float[np.ndarray, "*points cameras 2"]
 ) -> tuple[
     Float[np.ndarray, "*points cameras 2 3"],
     Float[np.ndarray, "*points cameras 2"],
@@ -91,19 +99,25 @@ def projection_equations(
 
     Args:
         cameras: cameras with one leading axis.
-        points_px: (..., cameras, 2), pixels; NaN if a camera does not see the point.
-        num_iterations: iterations of `undistort`.
+        points_px: (..., cameras, 2), pixels; NaN if a camera does not see the point. A pixel where the camera's lens
+            shows no point counts as not seen.
 
     Returns:
         L (..., cameras, 2, 3), B (..., cameras, 2), and a mask (..., cameras) of the cameras that see the points. The
-        rows of the other cameras are finite but have no meaning.
+        rows of the other cameras are finite but have no meaning. A fisheye's equations are divided by the stretch of
+        its undistorted image, so that their errors are in proportion to errors of the pixels.
     """
-    normalised = undistort(cameras, points_px, num_iterations)
+    normalised = undistort(cameras, points_px)
     seen = np.isfinite(normalised).all(axis=-1)
     normalised = np.where(seen[..., None], normalised, 0.0)
     T = np.asarray(cameras.T_cam_world)
     rows = normalised[..., :, None] * T[:, 2, None, :3] - T[:, :2, :3]
-    return rows, T[:, :2, 3] - normalised * T[:, 2, None, 3], seen
+    right = T[:, :2, 3] - normalised * T[:, 2, None, 3]
+    if cameras.fisheye is not None:
+        # Far from a fisheye's axis a pixel is a large step of the normalised coordinates.
+        weight = np.where(cameras.fisheye, 1 / undistortion_stretch(cameras, normalised), 1.0)[..., None]
+        rows, right = weight[..., None] * rows, weight * right
+    return rows, right, seen
 
 
 def _normal_equations(
@@ -240,7 +254,7 @@ def _support(
 
     The supporting 2D point is the nearest one, if the proposal's projection lies within its radius.
     """
-    pixels, depth = project(cameras, proposals[:, None, :])
+    pixels, depth = project_visible(cameras, proposals[:, None, :])
     support, fit = np.full(depth.shape, -1), np.zeros(depth.shape)
     for camera, (points, radius) in enumerate(zip(points_px, radius_px, strict=True)):
         if len(points):

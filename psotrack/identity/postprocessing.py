@@ -24,7 +24,7 @@ def postprocess(
     identity: IdentitySettings,
     *,
     fps: float,
-    smoothed: bool,
+    smoothing: MotionSettings | None,
 ) -> tuple[Trajectories, Identities]:
     """Trajectories with resolved labels, and which drones may have been taken for each other.
 
@@ -33,16 +33,14 @@ def postprocess(
         motion: settings of the motion model.
         identity: when drones may be taken for each other, and whether swapped labels are put right.
         fps: frames per second.
-        smoothed: whether later frames correct earlier ones.
+        smoothing: settings of the motion model with which later frames correct earlier ones; None leaves the frames as
+            they are.
     """
     time_s = np.arange(tracks.num_frames) / fps
-    params = jax.tree.map(
-        lambda value: np.asarray(value, np.float64), motion_params(motion, tracks.num_drones)
-    )
     identities = resolve(
         time_s,
         *_measurements(tracks),
-        params,
+        _params(motion, tracks.num_drones),
         IdentityParams(encounter_m=identity.encounter_m),
         np.asarray(tracks.measured_size_m, np.float64),
     )
@@ -58,7 +56,14 @@ def postprocess(
     if identity.resolve_swaps:
         tracks = tracks.with_arrays(lambda name, value: relabelled(value, identities.order))
     trajectories = _trajectories(tracks, time_s)
-    return (_smoothed(trajectories, tracks, params) if smoothed else trajectories), identities
+    if smoothing is not None:
+        trajectories = _smoothed(trajectories, tracks, _params(smoothing, tracks.num_drones))
+    return trajectories, identities
+
+
+def _params(motion: MotionSettings, num_drones: int) -> MotionParams:
+    """The motion model's parameters in float64."""
+    return jax.tree.map(lambda value: np.asarray(value, np.float64), motion_params(motion, num_drones))
 
 
 def _measurements(

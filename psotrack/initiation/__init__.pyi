@@ -1,3 +1,4 @@
+from .cut_off import find_cut_off, find_outside
 from .initial_state import (
     StartSource,
     complete_initial_state,
@@ -7,6 +8,7 @@ from .initial_state import (
     start_source,
 )
 from .initialisation import FLOOR_CLEARANCE_M, InitialState
+from .moving_volume import FlightVolume, MovingPoints, flight_volume, moving_blobs, moving_detections
 from .new_tracks import KnownDrones, TrackCandidate, find_candidates
 from .reidentification import (
     NEW,
@@ -23,18 +25,25 @@ __all__ = [
     "FLOOR_CLEARANCE_M",
     "NEW",
     "SPEED_SHARE",
+    "FlightVolume",
     "InitialState",
     "KnownDrones",
     "LostTracks",
+    "MovingPoints",
     "PlannedStarts",
     "StartSource",
     "TrackCandidate",
     "complete_initial_state",
     "find_candidates",
+    "find_cut_off",
     "find_false_tracks",
     "find_initial_state",
     "find_lost_tracks",
+    "find_outside",
+    "flight_volume",
     "known_motion",
+    "moving_blobs",
+    "moving_detections",
     "plan_starts",
     "reidentify",
     "room_bounds",

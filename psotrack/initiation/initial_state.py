@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from psotrack.errors import InputError
 from psotrack.geometry import Rig
-from psotrack.initiation.initialisation import InitialState, find_drones
+from psotrack.initiation.initialisation import InitialState, all_blobs, find_drones_in_blobs
 from psotrack.recordings import Recording
 from psotrack.settings import DroneSettings
 from psotrack.silhouettes import Silhouettes
@@ -117,10 +117,15 @@ def find_initial_state(
     Raises:
         InputError: the given trajectories have too few drones, or the size of a drone cannot be found.
     """
-    state = find_drones(
+    count, exposures = min(START_FRAMES, silhouettes.num_frames), silhouettes.exposures
+    state = find_drones_in_blobs(
         rig.cameras,
-        silhouettes.read(0, min(START_FRAMES, silhouettes.num_frames)),
-        reduction=silhouettes.reduction,
+        all_blobs(
+            silhouettes.read(0, count),
+            silhouettes.reduction,
+            None if exposures is None else exposures[:count],
+            silhouettes.borders,
+        ),
         fps=fps,
         bounds_m=bounds_m,
         max_speed_m_s=max_speed_m_s,

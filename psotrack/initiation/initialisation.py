@@ -6,14 +6,14 @@ most frames, blobs that no other chosen path fits. A drone's size is estimated f
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from psotrack.geometry import Camera, viewpoints
 from psotrack.initiation.paths import Paths, by_viewpoint, propose_paths, refine_paths
-from psotrack.silhouettes import find_blobs, stack_blobs
+from psotrack.silhouettes import Exposures, ViewBlobs, border_cells, find_blobs, stack_blobs
 
 #: Smallest height of a drone's middle above the floor, metres. A path below this height is a shadow, because the middle
 #: of a drone that stands on its legs is higher.
@@ -78,10 +78,55 @@ def find_drones(
         The drones, possibly none; the drone that most cameras show is first. A drone whose blobs all hold another drone
         too has the median size of the other drones, or NaN if no size is known.
     """
-    seen = stack_blobs(
-        [[find_blobs(image, reduction) for image in images] for images in coverage], len(cameras.K), reduction
+    return find_drones_in_blobs(
+        cameras,
+        all_blobs(coverage, reduction, borders=border_cells(cameras.image_size_wh, reduction)),
+        fps=fps,
+        bounds_m=bounds_m,
+        max_speed_m_s=max_speed_m_s,
+        drones=drones,
     )
-    time_s = np.arange(len(coverage)) / fps
+
+
+def all_blobs(
+    coverage: UInt8[np.ndarray, "frames cameras height width"],
+    reduction: int,
+    exposures: Exposures | None = None,
+    borders: Int[np.ndarray, "cameras 2"] | None = None,
+) -> ViewBlobs:
+    """The blobs of all frames and cameras, and when the frames were exposed.
+
+    Args:
+        coverage: (frames, cameras, height, width), the silhouettes, 0 to 255.
+        reduction: image pixels per cell, along each side.
+        exposures: when the frames were exposed; None where all were exposed together.
+        borders: (cameras, 2), width and height of the images in cells; None where all fill the arrays.
+    """
+    ends = [None] * coverage.shape[1] if borders is None else list(borders)
+    blobs = [
+        [find_blobs(image, reduction, end) for image, end in zip(images, ends, strict=True)]
+        for images in coverage
+    ]
+    return replace(stack_blobs(blobs, coverage.shape[1], reduction), exposures=exposures)
+
+
+def find_drones_in_blobs(
+    cameras: Camera,
+    seen: ViewBlobs,
+    *,
+    fps: float,
+    bounds_m: Float[np.ndarray, "2 3"],
+    max_speed_m_s: float,
+    drones: int | None = None,
+) -> InitialState:
+    """Find the drones that the blobs of the first frames show (see `find_drones`), at the time of the first instant.
+
+    Args:
+        cameras: cameras with one leading axis, for images of full size.
+        seen: blobs of the first frames, and when the frames were exposed.
+        fps, bounds_m, max_speed_m_s, drones: as in `find_drones`.
+    """
+    time_s = np.arange(len(seen.whole)) / fps
     if not seen.whole.any():
         return InitialState(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
     # Shadows on the floor agree in all views and move with the drones, but a shadow has no height above the floor.

@@ -1,8 +1,8 @@
 """Track initiation: find drones without a track in a chunk of frames.
 
-A place where at least three viewpoints show residual foreground is followed through the chunk. It becomes a track
-candidate if it behaves like a drone: it persists, its speed and its size are a drone's, it keeps a distance to the
-floor and to all known drones, and nearly all cameras that should see it do see it.
+A place where at least three viewpoints show residual foreground, or two if the rig has no third, is followed through
+the chunk. It becomes a track candidate if it behaves like a drone: it persists, its speed and its size are a drone's,
+it keeps a distance to the floor and to all known drones, and nearly all cameras that should see it do see it.
 
 A drone that is found a second late costs a short gap, but a false track may last to the end of the video. So each rule
 prefers to miss a candidate.
@@ -10,13 +10,13 @@ prefers to miss a candidate.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from psotrack.geometry import Camera, match_views, project, viewpoints
+from psotrack.geometry import Camera, match_views, sizes_m, to_camera, viewpoints
 from psotrack.initiation.initialisation import FLOOR_CLEARANCE_M, InitialState, find_drones
 from psotrack.initiation.residual_foreground import (
     NOT_FOUND,
@@ -28,7 +28,7 @@ from psotrack.initiation.residual_foreground import (
     project_drones,
     subtract_drones,
 )
-from psotrack.silhouettes import LEAST_RADIUS_CELLS, find_blobs
+from psotrack.silhouettes import LEAST_RADIUS_CELLS, border_cells, find_blobs
 
 #: A candidate must be found in at least `MIN_FRAMES` of `WINDOW_FRAMES` consecutive frames.
 WINDOW_FRAMES, MIN_FRAMES = 10, 8
@@ -55,11 +55,19 @@ class KnownDrones:
             foreground.
         explains: (frames, drones), whether the position is good enough to explain foreground.
         size_m: (drones, 3), full lengths along the world's axes.
+        moved_m: (frames, drones, cameras, 3), motion of the drones from the instant to each camera's exposure; None
+            where all cameras' frames were exposed at the instant.
+        is_there: (frames, cameras), whether the camera has a frame at the instant; None where all cameras have one.
+        min_viewpoints: smallest number of viewpoints that must see any other drone; None: three, or two if the rig has
+            no third.
     """
 
     position_m: Float[np.ndarray, "frames drones 3"]
     explains: Bool[np.ndarray, "frames drones"]
     size_m: Float[np.ndarray, "drones 3"]
+    moved_m: Float[np.ndarray, "frames drones cameras 3"] | None = None
+    is_there: Bool[np.ndarray, "frames cameras"] | None = None
+    min_viewpoints: int | None = None
 
 
 @dataclass(frozen=True)
@@ -109,9 +117,11 @@ def find_candidates(
     """
     clear_m = bounds_m + np.array([[0.0, 0.0, FLOOR_CLEARANCE_M], [0.0, 0.0, 0.0]])
     spans_m = _span_limits(known.size_m)
-    volume = SearchVolume(cameras, viewpoints(cameras), clear_m, reduction)
+    volume = SearchVolume(cameras, viewpoints(cameras), clear_m, reduction, known.min_viewpoints)
     explaining_m = np.where(known.explains[..., None], known.position_m, np.nan)
-    drones = project_drones(volume, explaining_m, known.size_m)
+    drones = replace(
+        project_drones(volume, explaining_m, known.size_m, known.moved_m), is_there=known.is_there
+    )
     find = partial(
         find_drones, cameras, reduction=reduction, fps=fps, bounds_m=bounds_m, max_speed_m_s=max_speed_m_s
     )
@@ -149,25 +159,31 @@ def find_candidates(
 def _propose_places(
     volume: SearchVolume, residual: ResidualForeground, spans_m: tuple[float, float]
 ) -> list[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]]:
-    """Places in a frame where three viewpoints show foreground of a drone's size, each with this size."""
+    """Places in a frame where enough viewpoints show foreground of a drone's size, each with this size."""
     cameras = volume.cameras
     corners = np.stack(np.meshgrid(*volume.bounds_m.T), axis=-1).reshape(-1, 1, 3)
     farthest_m = np.linalg.norm(corners - cameras.centre_world, axis=-1).max(axis=0)
     focal_px = np.stack([cameras.K[:, 0, 0], cameras.K[:, 1, 1]], axis=-1)
     least_px = spans_m[0] * focal_px.min(axis=-1) / farthest_m
-    blobs = [find_blobs(image, volume.reduction) for image in residual.foreground]
+    borders = border_cells(cameras.image_size_wh, volume.reduction)
+    blobs = [
+        find_blobs(image, volume.reduction, border)
+        for image, border in zip(residual.foreground, borders, strict=True)
+    ]
     large = [view.size_px.max(axis=-1) >= least for view, least in zip(blobs, least_px, strict=True)]
     centre_px = [view.centre_px[keep] for view, keep in zip(blobs, large, strict=True)]
     size_px = [view.size_px[keep] for view, keep in zip(blobs, large, strict=True)]
     # Half of the blob's smaller side is an upper limit of the distance from its middle to the drone's projection.
     radius_px = [np.maximum(size.min(axis=-1) / 2, LEAST_RADIUS_CELLS * volume.reduction) for size in size_px]
-    points, support = match_views(cameras, centre_px, radius_px, volume.bounds_m)
-    _, depth = project(cameras, points[:, None])
+    points, support = match_views(
+        cameras, centre_px, radius_px, volume.bounds_m, min_viewpoints=volume.required_viewpoints
+    )
+    points_cam = np.asarray(to_camera(cameras, points[:, None]))
     proposals = []
     for row, point in enumerate(points):
         seen = np.flatnonzero(support[row] >= 0)
         sides_px = np.array([size_px[camera][support[row, camera]] for camera in seen])
-        width, height = np.median(sides_px * depth[row, seen, None] / focal_px[seen], axis=0)
+        width, height = np.median(sizes_m(cameras[seen], points_cam[row, seen], sides_px), axis=0)
         if spans_m[0] <= width <= spans_m[1]:
             proposals.append((point, np.array([width, width, height])))
     return proposals

@@ -16,7 +16,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from psotrack.geometry import Camera, project, triangulate_candidates, triangulate_paths, viewpoints
+from psotrack.geometry import (
+    Camera,
+    project_visible,
+    sizes_m,
+    to_camera,
+    triangulate_candidates,
+    triangulate_paths,
+    viewpoints,
+)
 from psotrack.silhouettes import ViewBlobs
 
 #: Largest ratio of a blob's width to the width in the other cameras, or the inverse. A wider blob holds more than the
@@ -113,19 +121,17 @@ def match_blobs(
 ) -> Paths:
     """Find the blobs that fit each path in all frames and cameras."""
     position = _positions(coefficient, time_s)
-    pixels, depth = project(cameras, position[:, :, None, :])
+    pixels, depth = project_visible(cameras, _seen_positions(coefficient, seen, time_s))
     in_front = depth > 0
+    if seen.exposures is not None:
+        in_front = in_front & np.asarray(seen.exposures.is_there)
     offset = pixels[..., None, :] - seen.centre_px
     distance = np.linalg.norm(offset, axis=-1) / seen.radius_px
     distance = np.where(seen.whole & in_front[..., None] & (distance <= 1), distance, np.inf)
     blob = distance.argmin(axis=-1)
     smallest = distance.min(axis=-1)
-    size_m = (
-        2
-        * _pick(seen.half_px, blob)
-        * depth[..., None]
-        / np.stack([cameras.K[:, 0, 0], cameras.K[:, 1, 1]], axis=-1)
-    )
+    points_cam = np.asarray(to_camera(cameras, position[:, :, None, :]))
+    size_m = sizes_m(cameras, points_cam, 2 * _pick(seen.half_px, blob))
     width_m = np.where(np.isfinite(smallest), size_m[..., 0], np.inf)
     median_m = _lower_median(_lower_median(width_m, axis=1), axis=2)
     fits = np.isfinite(smallest)
@@ -163,7 +169,7 @@ def refine_paths(
         alone = paths.alone
         enough = by_viewpoint(np.any(alone, axis=1), viewpoint).sum(axis=-1) >= 2
         weights = np.where(enough[:, None, None] & ~alone, 0.0, paths.fit**2)
-        path = triangulate_paths(cameras, _pick(seen.centre_px, paths.blob), time_s, weights)
+        path = triangulate_paths(cameras, _pick(seen.centre_px, paths.blob), _times(seen, time_s), weights)
         paths = match_blobs(cameras, seen, time_s, np.where(np.isfinite(path), path, paths.coefficient))
     return paths
 
@@ -213,10 +219,26 @@ def _refit(
 ) -> Float[np.ndarray, "refitted terms 3"]:
     """Fit each path to its blobs again, and merge paths that have become the same."""
     paths = match_blobs(cameras, seen, time_s, path)
-    path = triangulate_paths(cameras, _pick(seen.centre_px, paths.blob), time_s, paths.fit**2)
+    path = triangulate_paths(cameras, _pick(seen.centre_px, paths.blob), _times(seen, time_s), paths.fit**2)
     path = path[np.isfinite(path).all(axis=(1, 2))]
     ends = _positions(path, time_s[[0, -1]]).reshape(len(path), 6)
     return path[np.unique(np.round(ends / SAME_PATH_M), axis=0, return_index=True)[1]]
+
+
+def _times(
+    seen: ViewBlobs, time_s: Float[np.ndarray, "frames"]
+) -> Float[np.ndarray, "frames"] | Float[np.ndarray, "frames cameras"]:
+    """Times of the frames, seconds; of each camera where cameras have times of their own."""
+    return time_s if seen.exposures is None else time_s[:, None] + np.asarray(seen.exposures.offset_s)
+
+
+def _seen_positions(
+    path: Float[np.ndarray, "paths terms 3"], seen: ViewBlobs, time_s: Float[np.ndarray, "frames"]
+) -> Float[np.ndarray, "paths frames #cameras 3"]:
+    """Positions at the times at which the cameras see them; the same for all cameras that are synchronous."""
+    times_s = _times(seen, time_s)
+    position = _positions(path, times_s.ravel())
+    return position.reshape(len(path), len(time_s), times_s.size // max(len(time_s), 1), 3)
 
 
 def _positions(

@@ -13,12 +13,13 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from psotrack.geometry import Boxes, Camera, make_extents, project, project_boxes, triangulate
+from psotrack.geometry import Boxes, Camera, make_extents, moved_extents, project, project_boxes, triangulate
 
 #: A known drone's ellipse is enlarged by this factor and by this number of cells, because outlines are no ellipses, and
 #: rotors blur.
 ELLIPSE_FACTOR, ELLIPSE_MARGIN_CELLS = 1.3, 1.5
-#: Smallest number of viewpoints that see a drone: with two, rays of different drones that cross look like a drone.
+#: Smallest number of viewpoints that see a drone, where the rig has as many: with two, rays of different drones that
+#: cross look like a drone.
 MIN_VIEWPOINTS = 3
 #: Smallest share of the cameras that should see a drone and do see it; an obstacle may hide it from the rest.
 MIN_SEEING_SHARE = 0.75
@@ -43,12 +44,21 @@ class SearchVolume:
         viewpoint: (cameras,), viewpoint of each camera, see `triangulation.viewpoints`.
         bounds_m: (2, 3), corners of the region where drones may be: above the floor, because shadows lie on it.
         reduction: image pixels per silhouette pixel, along each side.
+        min_viewpoints: smallest number of viewpoints that see a drone; None: three, or two if the rig has no third.
     """
 
     cameras: Camera
     viewpoint: Int[np.ndarray, "cameras"]
     bounds_m: Float[np.ndarray, "2 3"]
     reduction: int
+    min_viewpoints: int | None = None
+
+    @property
+    def required_viewpoints(self) -> int:
+        """Smallest number of viewpoints that see a drone."""
+        if self.min_viewpoints is not None:
+            return self.min_viewpoints
+        return max(2, min(MIN_VIEWPOINTS, len(set(self.viewpoint.tolist()))))
 
 
 @dataclass(frozen=True)
@@ -59,12 +69,14 @@ class ProjectedDrones:
         position_m: (frames, drones, 3), positions; NaN where a drone does not explain foreground.
         size_m: (drones, 3), full lengths along the world's axes.
         middle, half: (frames, drones, cameras, 2), middles and half axes of the ellipses, cells of the silhouettes.
+        is_there: (frames, cameras), whether the camera has a frame; None where all cameras have all frames.
     """
 
     position_m: Float[np.ndarray, "frames drones 3"]
     size_m: Float[np.ndarray, "drones 3"]
     middle: Float[np.ndarray, "frames drones cameras 2"]
     half: Float[np.ndarray, "frames drones cameras 2"]
+    is_there: Bool[np.ndarray, "frames cameras"] | None = None
 
     def join(self, other: ProjectedDrones) -> ProjectedDrones:
         """Drones of both records."""
@@ -73,6 +85,7 @@ class ProjectedDrones:
             np.concatenate([self.size_m, other.size_m]),
             np.concatenate([self.middle, other.middle], axis=1),
             np.concatenate([self.half, other.half], axis=1),
+            self.is_there,
         )
 
 
@@ -109,9 +122,18 @@ def project_drones(
     volume: SearchVolume,
     position_m: Float[np.ndarray, "frames drones 3"],
     size_m: Float[np.ndarray, "drones 3"],
+    moved_m: Float[np.ndarray, "frames drones cameras 3"] | None = None,
 ) -> ProjectedDrones:
-    """Project drones into the silhouettes; a drone without a position (NaN) explains no foreground."""
-    return ProjectedDrones(position_m, size_m, *_ellipses(volume, position_m, size_m))
+    """Project drones into the silhouettes; a drone without a position (NaN) explains no foreground.
+
+    Args:
+        volume: the cameras, and the region of the search.
+        position_m: (frames, drones, 3), positions, metres.
+        size_m: (drones, 3), full lengths, metres.
+        moved_m: (frames, drones, cameras, 3), motion of the drones from the instant to each camera's exposure, metres;
+            None where all cameras' frames were exposed at the instant.
+    """
+    return ProjectedDrones(position_m, size_m, *_ellipses(volume, position_m, size_m, moved_m))
 
 
 def subtract_drones(
@@ -125,6 +147,8 @@ def subtract_drones(
         x, y = np.rint(16 * (drones.middle[frame, drone, camera] - 0.5)).astype(int).tolist()
         axes = np.rint(16 * half[drone, camera]).astype(int).tolist()
         cv2.ellipse(visible[camera], (x, y), axes, 0, 0, 360, 0, cv2.FILLED, shift=4)
+    if drones.is_there is not None:
+        visible[~drones.is_there[frame]] = 0
     return ResidualForeground(coverage * visible, visible.astype(bool))
 
 
@@ -148,7 +172,7 @@ def observe(
     """
     for window in WINDOWS:
         views = _observe_views(volume, residual, position_m, size_m, window)
-        if len(set(volume.viewpoint[views.sees].tolist())) < MIN_VIEWPOINTS:
+        if len(set(volume.viewpoint[views.sees].tolist())) < volume.required_viewpoints:
             return NOT_FOUND
         position_m = triangulate(volume.cameras, views.pixels, views.weight)
     distance = np.linalg.norm(2 * (others_m - position_m) / (others_size_m + size_m), axis=-1)
@@ -236,12 +260,17 @@ def _ellipses(
     volume: SearchVolume,
     position_m: Float[np.ndarray, "frames drones 3"],
     size_m: Float[np.ndarray, "drones 3"],
+    moved_m: Float[np.ndarray, "frames drones cameras 3"] | None = None,
 ) -> tuple[Float[np.ndarray, "frames drones cameras 2"], Float[np.ndarray, "frames drones cameras 2"]]:
     """Middles and half axes of ellipses, cells; NaN where there is no drone, or the drone is behind the camera."""
     if not len(size_m):
         none = np.empty((len(position_m), 0, len(volume.viewpoint), 2))
         return none, none
-    boxes = _project_boxes(volume.cameras, size_m, position_m)
+    boxes = (
+        _project_boxes(volume.cameras, size_m, position_m)
+        if moved_m is None
+        else _project_moved_boxes(volume.cameras, size_m, position_m, np.nan_to_num(moved_m))
+    )
     behind = ~np.asarray(boxes.in_front)
     middle = np.stack([boxes.x_middle, boxes.y_middle], axis=-1).astype(np.float64) / volume.reduction
     half = np.stack([boxes.x_half, boxes.y_half], axis=-1).astype(np.float64) / volume.reduction
@@ -254,6 +283,21 @@ def _project_boxes(
     cameras: Camera, size_m: Float[jax.Array, "drones 3"], position_m: Float[jax.Array, "frames drones 3"]
 ) -> Boxes:
     return project_boxes(make_extents(cameras, size_m), position_m)
+
+
+@jax.jit
+def _project_moved_boxes(
+    cameras: Camera,
+    size_m: Float[jax.Array, "drones 3"],
+    position_m: Float[jax.Array, "frames drones 3"],
+    moved_m: Float[jax.Array, "frames drones cameras 3"],
+) -> Boxes:
+    extents = make_extents(cameras, size_m)
+
+    def of_frame(position: jax.Array, moved: jax.Array) -> Boxes:
+        return project_boxes(moved_extents(extents, moved), position)
+
+    return jax.vmap(of_frame)(position_m, moved_m)
 
 
 def _overlap_image(

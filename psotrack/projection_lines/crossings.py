@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.correspondence import CUT_SHARE, CameraSightings, match
-from psotrack.geometry import NEAR_M, Camera, project, reconstruct
+from psotrack.geometry import Camera, reconstruct, sizes_m, to_camera
 
 #: Least standard deviation of a detection's middle, pixels, however well the cameras agree.
 LEAST_NOISE_PX = 0.1
@@ -46,6 +46,7 @@ def crossings(
     expected_m: Float[np.ndarray, "drones 3"],
     expected_covariance_m2: Float[np.ndarray, "drones 3 3"],
     dispersion: Float[np.ndarray, "drones"],
+    min_views: int | None = None,
 ) -> Crossings:
     """Match the detections of all cameras, and triangulate each group without the views that disagree.
 
@@ -55,6 +56,7 @@ def crossings(
         bounds_m: (2, 3), corners of the room, metres.
         expected_m, expected_covariance_m2: (drones, 3) and (drones, 3, 3), expected positions and their covariances.
         dispersion: (drones,), ratio of the variance of each drone's detections so far and `view.noise_px`².
+        min_views: smallest number of viewpoints of a drone that was not expected (see `match`).
     """
     # Detections of an unexpected drone have the same noise as detections of known drones.
     dispersion = np.append(dispersion, np.median(dispersion) if len(dispersion) else 1.0)
@@ -65,6 +67,7 @@ def crossings(
         view.found(view.centre_px),
         [scale * noise_px for noise_px in view.found(view.noise_px)],
         bounds_m=bounds_m,
+        min_views=min_views,
         expected_m=expected_m,
         expected_covariance_m2=expected_covariance_m2,
     )
@@ -77,13 +80,15 @@ def crossings(
     # The dispersion of a drone alone in its box says nothing about a box that it shares.
     usual = np.where(several, 1.0, np.sqrt(dispersion[groups.expected])[:, None])
     known_px = np.maximum(noise_px * usual, LEAST_NOISE_PX)
+    if view.exposures is not None:
+        # A frame that several instants show counts once in all of them together.
+        known_px = known_px / np.sqrt(np.maximum(view.exposures.share, 1e-6))
     lines = reconstruct(cameras, centre_px, noise_px=np.nan_to_num(known_px, nan=1.0))
     kept = lines.used.any(axis=-1)
     position_m, seen = lines.position_m[kept], lines.used[kept]
     squared = np.where(seen, lines.reprojection_px[kept] / noise_px[kept], 0.0) ** 2
-    depth = project(cameras, position_m[:, None])[1]
-    focal_px = np.stack([cameras.K[:, 0, 0], cameras.K[:, 1, 1]], axis=-1)
-    span_m = np.where(seen[..., None], size_px[kept] * depth[..., None] / focal_px, np.nan)
+    span_m = sizes_m(cameras, np.asarray(to_camera(cameras, position_m[:, None])), size_px[kept])
+    span_m = np.where(seen[..., None], span_m, np.nan)
     return Crossings(
         expected=groups.expected[kept],
         position_m=position_m,
@@ -92,13 +97,6 @@ def crossings(
         disagreement=squared.sum(axis=-1) / (2 * seen.sum(axis=-1) - 3),
         span_m=np.nanmedian(span_m, axis=1),
     )
-
-
-def in_view(cameras: Camera, position_m: Float[np.ndarray, "drones 3"]) -> Bool[np.ndarray, "drones cameras"]:
-    """(drones, cameras), whether a drone is inside a camera's image."""
-    pixels, depth = project(cameras, position_m[:, None])
-    inside = (pixels >= -0.5) & (pixels <= cameras.image_size_wh - 0.5)
-    return np.asarray(inside.all(axis=-1) & (depth > NEAR_M))
 
 
 def _shared(detection: Int[np.ndarray, "groups cameras"]) -> Bool[np.ndarray, "groups cameras"]:

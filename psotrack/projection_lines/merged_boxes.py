@@ -6,13 +6,13 @@ side.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.correspondence import CameraSightings
-from psotrack.geometry import NEAR_M, Camera, project
+from psotrack.geometry import NEAR_M, Camera, project_visible, sizes_px, to_camera
 
 #: Additional standard deviation of a middle that follows from one edge and the drone's size, as a share of the box's
 #: sides: the size changes as the drone turns.
@@ -97,9 +97,8 @@ def _expected(
     span_m: Float[np.ndarray, "drones 2"],
 ) -> tuple[_Outlines, Bool[np.ndarray, "drones cameras boxes"]]:
     """The expected boxes (drones, cameras, 2), and in which of the frame's boxes the drones are expected."""
-    pixels, depth = project(cameras, expected_m[:, None])
-    focal_px = np.stack([cameras.K[:, 0, 0], cameras.K[:, 1, 1]], axis=-1)
-    half_px = span_m[:, None] * focal_px / np.maximum(depth, NEAR_M)[..., None] / 2
+    pixels, depth = (np.asarray(part) for part in project_visible(cameras, expected_m[:, None]))
+    half_px = sizes_px(cameras, np.asarray(to_camera(cameras, expected_m[:, None])), span_m[:, None]) / 2
     known = np.isfinite(half_px).all(axis=-1) & (depth > NEAR_M)
     inside = (np.abs(pixels[:, :, None] - view.centre_px) < view.size_px / 2).all(axis=-1)
     return _Outlines(pixels - half_px, pixels + half_px), inside & known[..., None]
@@ -112,7 +111,7 @@ def _without(
     centre_px, size_px, noise_px = view.centre_px.copy(), view.size_px.copy(), view.noise_px.copy()
     for values in (centre_px, size_px, noise_px):
         values[camera, box] = np.nan
-    return CameraSightings(centre_px, size_px, noise_px)
+    return replace(view, centre_px=centre_px, size_px=size_px, noise_px=noise_px)
 
 
 def _with(
@@ -131,6 +130,9 @@ def _with(
         added[camera, place] = more
         return np.concatenate([values, added], axis=1)
 
-    return CameraSightings(
-        longer(view.centre_px, centre_px), longer(view.size_px, size_px), longer(view.noise_px, noise_px)
+    return replace(
+        view,
+        centre_px=longer(view.centre_px, centre_px),
+        size_px=longer(view.size_px, size_px),
+        noise_px=longer(view.noise_px, noise_px),
     )

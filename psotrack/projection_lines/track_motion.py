@@ -36,7 +36,7 @@ class TrackMotion:
 
     def __init__(self, settings: MotionSettings, fps: float, bounds_m: Float[np.ndarray, "2 3"]) -> None:
         self._settings = settings
-        self._limits = _Limits(np.array(1 / fps), bounds_m, np.array(settings.max_speed_m_s))
+        self._limits = _Limits(np.array(1 / fps), bounds_m, np.array(settings.speed_limit_m_s))
         self._params = _params(settings, 0)
         self.state = _states_at_origin(0, self._params)
 

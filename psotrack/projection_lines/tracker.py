@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
-from psotrack.correspondence import CameraSightings, Sightings
+from psotrack.correspondence import CameraSightings, Sightings, in_images
 from psotrack.geometry import Camera, viewpoints
 from psotrack.initiation import FLOOR_CLEARANCE_M, NEW, SPEED_SHARE, reidentify
 from psotrack.motion import GATE_999
-from psotrack.projection_lines.crossings import crossings, in_view
+from psotrack.projection_lines.crossings import crossings
+from psotrack.projection_lines.exposures import moved_to_instant
 from psotrack.projection_lines.merged_boxes import split_merged_boxes
 from psotrack.projection_lines.results import as_tracks
 from psotrack.projection_lines.track_motion import TrackMotion
@@ -22,8 +23,13 @@ from psotrack.support import Report, no_progress
 from psotrack.tracking import DISPERSION_FRAMES
 from psotrack.trajectories import Tracks
 
-#: A track that was found in this many of its first frames is of a drone.
-CONFIRMED_HITS, FIRST_FRAMES = 5, 8
+#: A track that was found in this many of its first frames is of a drone, if enough cameras agreed in this many of them.
+CONFIRMED_HITS, FIRST_FRAMES, AGREED_HITS = 5, 8, 3
+#: The number where only two viewpoints agree: lines of sight of two cameras cross by chance for longer.
+CONFIRMED_HITS_OF_TWO = 15
+#: Largest number, and if it is larger share, of frames in which a track may be missed that is not confirmed yet after
+#: its first frames.
+LATER_MISSED, MISSED_SHARE = 9, 0.4
 #: Least share of the cameras with the drone in view that must see the drone; fewer lines of sight cross by chance.
 #: Detectors miss drones and drones hide each other: half of the cameras would be too many.
 MIN_SHARE = 0.4
@@ -163,6 +169,7 @@ class _Tracker:
         expected_m = np.asarray(self._motion.state.apparent_m[slots])
         expected_m2 = np.asarray(self._motion.state.covariance[slots, :3, :3])
         span_m = np.array([track.span_m for track in tracks]).reshape(-1, 2)
+        view = self._at_instant(view, slots)
         crossed = crossings(
             self._cameras,
             split_merged_boxes(self._cameras, view, expected_m, span_m),
@@ -170,6 +177,7 @@ class _Tracker:
             expected_m,
             expected_m2,
             np.array([track.dispersion for track in tracks]),
+            2,
         )
         usual = float(np.median([track.dispersion for track in tracks])) if tracks else 1.0
         measured: dict[int, Measurement] = {}
@@ -190,7 +198,7 @@ class _Tracker:
                 if slot in measured:
                     continue
             else:
-                speed_m_s = SPEED_SHARE * self._settings.motion.max_speed_m_s
+                speed_m_s = SPEED_SHARE * self._settings.motion.speed_limit_m_s
                 slot = self._start(Track(None, usual), position_m, np.zeros(3), speed_m_s)
             surprising = False
             if number >= 0:
@@ -203,10 +211,26 @@ class _Tracker:
                     crossed.covariance_m2[row],
                     float(crossed.disagreement[row]),
                     int(seen.sum()),
+                    num_viewpoints,
                     crossed.span_m[row],
                     surprising,
                 )
         return measured
+
+    def _at_instant(self, view: CameraSightings, slots: list[int]) -> CameraSightings:
+        """The detections as they would be if all frames had been exposed at the instant."""
+        if view.exposures is None:
+            return view
+        state = self._motion.state
+        variance = np.asarray(state.covariance[slots, 3:6, 3:6]).trace(axis1=-2, axis2=-1) / 3
+        return moved_to_instant(
+            self._cameras,
+            view,
+            np.asarray(state.apparent_m[slots]),
+            np.asarray(state.velocity_m_s[slots]),
+            np.sqrt(np.maximum(variance, 0.0)),
+            self._settings.motion.velocity_std_m_s,
+        )
 
     def _correct(self, measured: dict[int, Measurement]) -> None:
         """Correct the motion model by the measurements."""
@@ -225,7 +249,7 @@ class _Tracker:
         for slot, one in measured.items():
             if one.surprising:
                 # The filter would treat the position as an outlier for a second, but all viewpoints agree on it.
-                speed_m_s = SPEED_SHARE * self._settings.motion.max_speed_m_s
+                speed_m_s = SPEED_SHARE * self._settings.motion.speed_limit_m_s
                 self._motion.place(slot, one.position_m, predicted_m_s[slot], one.covariance_m2, speed_m_s)
 
     def _append_rows(self, frame: int, measured: dict[int, Measurement]) -> None:
@@ -234,41 +258,53 @@ class _Tracker:
             np.asarray(getattr(self._motion.state, name))
             for name in ("position_m", "velocity_m_s", "position_covariance_m2")
         )
-        num_in_view = in_view(self._cameras, position_m).sum(axis=-1)
+        in_view = in_images(self._cameras, position_m)
+        num_in_view = in_view.sum(axis=-1)
+        required = self._required_viewpoints(in_view)
         for slot, track in self._active():
             one = measured.get(slot)
             state = (position_m[slot], velocity_m_s[slot], covariance_m2[slot])
             track.rows.append(TrackRow(frame, *state, int(num_in_view[slot]), one))
             if one is not None:
                 track.hits += 1
+                track.agreed_hits += int(one.num_viewpoints >= required[slot])
+                track.hits_of_three += one.num_viewpoints >= TRUSTED_VIEWPOINTS
                 track.dispersion += (one.disagreement - track.dispersion) / DISPERSION_FRAMES
+
+    def _required_viewpoints(self, in_view: Bool[np.ndarray, "slots cameras"]) -> Int[np.ndarray, "slots"]:
+        """(slots,), number of viewpoints that must agree to begin a track at places with these cameras in view."""
+        required = self._settings.status.min_cameras_to_begin
+        if required is not None:
+            return np.full(len(in_view), required)
+        at = self._viewpoint[:, None] == np.unique(self._viewpoint)
+        return np.clip((in_view @ at > 0).sum(axis=-1), 2, TRUSTED_VIEWPOINTS)
 
     def _end_lost_tracks(self) -> None:
         """End tracks of lost drones, and tracks that come from chance crossings of lines of sight."""
         for slot, track in self._active():
-            too_few = len(track.rows) - track.hits > FIRST_FRAMES - CONFIRMED_HITS
-            too_few |= track.hits >= CONFIRMED_HITS and track.share < MIN_SHARE
-            by_chance = track.drone is None and too_few
-            if by_chance or track.missed > self._max_coasting_frames:
+            if (track.drone is None and _by_chance(track)) or track.missed > self._max_coasting_frames:
                 self._end(slot)
 
     def _confirm_tracks(self) -> None:
-        """Assign drones to tracks that were found often enough: a drone that is missed, or a new drone."""
+        """Assign drones to tracks that were found often enough: a drone that is missed, or a new drone.
+
+        A drone that is missed is found again by fewer frames of two views than a new one.
+        """
+        missed = self._missed_drones()
         unconfirmed = [
             (slot, track)
             for slot, track in self._active()
-            if track.drone is None and track.hits >= CONFIRMED_HITS
+            if track.drone is None and (_is_confirmed(track) or (missed and _may_be_known(track)))
         ]
         if not unconfirmed:
             return
-        missed = self._missed_drones()
         count = self._settings.drones.count
         assignment = reidentify(
             tuple(as_candidate(track) for _, track in unconfirmed),
             as_lost_tracks([track for _, track in missed], unconfirmed[0][1].rows[-1].frame, self._fps),
             fps=self._fps,
             bounds_m=self._bounds_m,
-            max_speed_m_s=self._settings.motion.max_speed_m_s,
+            max_speed_m_s=self._settings.motion.speed_limit_m_s,
             max_births=None if count is None else max(count - self._num_drones, 0),
         )
         for (slot, track), assigned in zip(unconfirmed, assignment.tolist(), strict=True):
@@ -277,6 +313,8 @@ class _Tracker:
                 track.drone = former.drone
                 if former_slot is not None:
                     self._end(former_slot)
+            elif not _is_confirmed(track):
+                continue
             elif assigned == NEW:
                 track.drone = self._num_drones
                 self._num_drones += 1
@@ -292,3 +330,26 @@ class _Tracker:
             for drone, (slot, track) in last.items()
             if drone is not None and (slot is None or track.missed > 0)
         ]
+
+
+def _is_confirmed(track: Track) -> bool:
+    """Whether a track was found often enough, and enough cameras agreed, to be of a drone."""
+    of_two = track.hits_of_three < AGREED_HITS
+    return track.agreed_hits >= AGREED_HITS and track.hits >= (
+        CONFIRMED_HITS_OF_TWO if of_two else CONFIRMED_HITS
+    )
+
+
+def _may_be_known(track: Track) -> bool:
+    """Whether a track was found often enough to be of a drone that is missed."""
+    often = track.hits >= CONFIRMED_HITS and len(track.rows) <= FIRST_FRAMES
+    return often and track.agreed_hits >= AGREED_HITS
+
+
+def _by_chance(track: Track) -> bool:
+    """Whether an unconfirmed track comes from chance crossings of lines of sight."""
+    most_missed = FIRST_FRAMES - CONFIRMED_HITS
+    if len(track.rows) > FIRST_FRAMES:
+        most_missed = max(LATER_MISSED, int(MISSED_SHARE * len(track.rows)))
+    too_few = len(track.rows) - track.hits > most_missed
+    return too_few or (track.hits >= CONFIRMED_HITS and track.share < MIN_SHARE)

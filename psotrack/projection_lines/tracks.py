@@ -21,7 +21,7 @@ class Measurement:
         position_m: (3,), metres.
         covariance_m2: (3, 3), of the position.
         disagreement: squared reprojection errors over the noise, per degree of freedom.
-        num_cameras: cameras whose detections count.
+        num_cameras, num_viewpoints: cameras whose detections count, and their viewpoints.
         span_m: (2,), width and height of the drone, metres.
         surprising: whether the position is too far from the expected one to be an error of measurement.
     """
@@ -30,6 +30,7 @@ class Measurement:
     covariance_m2: Float[np.ndarray, "3 3"]
     disagreement: float
     num_cameras: int
+    num_viewpoints: int
     span_m: Float[np.ndarray, "2"]
     surprising: bool
 
@@ -61,6 +62,8 @@ class Track:
         dispersion: disagreement of the cameras, averaged over time.
         rows: one for each frame.
         hits: number of frames in which the drone was found.
+        agreed_hits: number of frames in which as many viewpoints agreed as are needed to begin a track.
+        hits_of_three: number of frames in which at least three viewpoints agreed.
         missed: frames since the drone was last found.
     """
 
@@ -68,6 +71,8 @@ class Track:
     dispersion: float
     rows: list[TrackRow] = field(default_factory=list)
     hits: int = 0
+    agreed_hits: int = 0
+    hits_of_three: int = 0
     missed: int = 0
 
     @property

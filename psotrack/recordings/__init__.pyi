@@ -1,26 +1,68 @@
 from .c3d import Markers, read_c3d, write_c3d
 from .detections import Detections, read_detections, write_detections
+from .image_files import IMAGE_SUFFIXES, find_images, image_files, natural_key, read_image, read_mask
 from .inventory import describe_recording, inventory_table
 from .marker_bodies import body_trajectories
 from .recording import OnboardVideo, Recording
-from .video import VideoInfo, VideoWriter, join_videos, probe, read_frames, silence_opencv
+from .recording_file import (
+    RECORDING_FILE,
+    CameraTable,
+    MarkersTable,
+    RecordingFile,
+    ReferenceTable,
+    WorldTable,
+    read_recording_file,
+    write_recording_file,
+)
+from .timestamps import read_timestamps
+from .timing import FrameTimes, Timeline, make_timeline
+from .video import (
+    VideoInfo,
+    VideoWriter,
+    digest_video,
+    join_videos,
+    probe,
+    probe_images,
+    read_frames,
+    silence_opencv,
+)
 
 __all__ = [
+    "IMAGE_SUFFIXES",
+    "RECORDING_FILE",
+    "CameraTable",
     "Detections",
+    "FrameTimes",
     "Markers",
+    "MarkersTable",
     "OnboardVideo",
     "Recording",
+    "RecordingFile",
+    "ReferenceTable",
+    "Timeline",
     "VideoInfo",
     "VideoWriter",
+    "WorldTable",
     "body_trajectories",
     "describe_recording",
+    "digest_video",
+    "find_images",
+    "image_files",
     "inventory_table",
     "join_videos",
+    "make_timeline",
+    "natural_key",
     "probe",
+    "probe_images",
     "read_c3d",
     "read_detections",
     "read_frames",
+    "read_image",
+    "read_mask",
+    "read_recording_file",
+    "read_timestamps",
     "silence_opencv",
     "write_c3d",
     "write_detections",
+    "write_recording_file",
 ]

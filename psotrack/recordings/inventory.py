@@ -1,4 +1,4 @@
-"""Inventory of a sequence, as a JSON record and as a table: the command `psotrack info`."""
+"""Inventory of a recording, as a JSON record and as a table: the command `psotrack info`."""
 
 from __future__ import annotations
 
@@ -14,24 +14,12 @@ if TYPE_CHECKING:
 
 
 def describe_recording(recording: Recording) -> dict[str, Any]:
-    """Cameras, videos, detections and reference of a sequence, as plain data. All detections are read.
+    """Cameras, videos, detections and reference of a recording, as plain data. All detections are read.
 
     Raises:
         InputError: a file of detections cannot be read.
     """
-    cameras: dict[str, dict[str, Any]] = {}
-    for index, name in enumerate(recording.rig.names):
-        cam, video = recording.rig.cameras[index], recording.videos.get(name)
-        detections = (recording.detections or {}).get(name)
-        cameras[name] = {
-            "video": str(video.path) if video else None,
-            "frames": video.num_frames if video else None,
-            "fps": video.fps if video else None,
-            "image_size_wh": [int(side) for side in cam.image_size_wh],
-            "focal_length_px": float(cam.K[0, 0]),
-            "centre_m": [round(float(value), 4) for value in cam.centre_world],
-            "detections": len(read_detections(detections)) if detections else None,
-        }
+    names = (*recording.rig.names, *recording.unplaced)
     onboard: dict[str, dict[str, Any]] = {}
     for name, flown in (recording.onboard or {}).items():
         onboard[name] = {
@@ -43,14 +31,44 @@ def describe_recording(recording: Recording) -> dict[str, Any]:
             "frames_with_pose": int(np.isfinite(flown.orientation_wxyz).all(axis=1).sum()),
         }
     truth = recording.truth
+    timed = bool(recording.frame_times)
     return {
         "name": recording.name,
         "folder": str(recording.folder),
-        "cameras": cameras,
+        "cameras": {name: _describe_camera(recording, name) for name in names},
         "onboard": onboard or None,
         "drones": list(truth.drones) if truth else None,
         "frames_with_truth": int(np.count_nonzero(truth.seen.any(axis=1))) if truth else None,
+        "rate_hz": recording.fps if timed else None,
+        "instants": recording.num_frames if timed else 0,
+        "bounds_m": None if recording.bounds_m is None else list(recording.bounds_m),
+        "reference_files": [str(path) for path in recording.reference_files],
+        "marker_corners": None if recording.marker_corners is None else str(recording.marker_corners),
     }
+
+
+def _describe_camera(recording: Recording, name: str) -> dict[str, Any]:
+    video, times = recording.videos.get(name), recording.frame_times.get(name)
+    detections = (recording.detections or {}).get(name)
+    ignore = recording.ignore.get(name)
+    described: dict[str, Any] = {
+        "video": str(video.path) if video else recording.streams.get(name),
+        "frames": times.num_frames if times else None,
+        "fps": times.fps if times else None,
+        "begins_s": float(times.time_s[0]) if times and times.num_frames else None,
+        "image_size_wh": list(video.image_size_wh) if video else None,
+        "focal_length_px": None,
+        "centre_m": None,
+        "placed": name in recording.rig.names,
+        "detections": len(read_detections(detections)) if detections else None,
+        "ignore": None if ignore is None else str(ignore),
+    }
+    if described["placed"]:
+        cam = recording.rig.cameras[recording.rig.names.index(name)]
+        described["image_size_wh"] = [int(side) for side in cam.image_size_wh]
+        described["focal_length_px"] = float(cam.K[0, 0])
+        described["centre_m"] = [round(float(value), 4) for value in cam.centre_world]
+    return described
 
 
 def inventory_table(content: dict[str, Any]) -> Table:
@@ -68,32 +86,51 @@ def inventory_table(content: dict[str, Any]) -> Table:
         if drones is not None
         else "no reference"
     )
+    length = f"{content['instants']} instants at {content['rate_hz']:g} Hz, " if content["rate_hz"] else ""
     table = Table(
-        title=f"{content['name']}: {reference}", title_justify="left", box=box.HORIZONTALS, show_edge=False
+        title=f"{content['name']}: {length}{reference}",
+        title_justify="left",
+        box=box.HORIZONTALS,
+        show_edge=False,
     )
-    for name in ("camera", "frames", "fps", "size", "f (px)", "centre (m)", "detections"):
-        table.add_column(name, justify="left" if name == "camera" else "right")
+    for name in ("camera", "video", "frames", "fps", "size", "f (px)", "centre (m)", "detections"):
+        left = name in ("camera", "video")
+        table.add_column(name, justify="left" if left else "right", overflow="fold" if left else "ellipsis")
     for name, camera in content["cameras"].items():
-        width, height = camera["image_size_wh"]
         table.add_row(
             name,
-            "no video" if camera["frames"] is None else f"{camera['frames']}",
+            "no video" if camera["video"] is None else _name(camera["video"]),
+            "" if camera["frames"] is None else f"{camera['frames']}{_begin(camera['begins_s'])}",
             "" if camera["fps"] is None else f"{camera['fps']:g}",
-            f"{width} x {height}",
-            f"{camera['focal_length_px']:.1f}",
-            " ".join(f"{value:.2f}" for value in camera["centre_m"]),
+            _size(camera["image_size_wh"]),
+            "" if camera["focal_length_px"] is None else f"{camera['focal_length_px']:.1f}",
+            "no place" if not camera["placed"] else " ".join(f"{value:.2f}" for value in camera["centre_m"]),
             "" if camera["detections"] is None else f"{camera['detections']}",
         )
     for name, camera in (content["onboard"] or {}).items():
-        width, height = camera["image_size_wh"]
         focal_length_px = camera["focal_length_px"]
         table.add_row(
             f"on {name}",
+            _name(camera["video"]),
             f"{camera['frames']}",
             f"{camera['fps']:g}",
-            f"{width} x {height}",
+            _size(camera["image_size_wh"]),
             "" if focal_length_px is None else f"{focal_length_px:.1f}",
             f"{camera['frames_with_pose']} poses",
             "",
         )
     return table
+
+
+def _name(video: str) -> str:
+    """Name of a file; a stream's address as it is."""
+    return video if "://" in video else video.replace("\\", "/").rpartition("/")[2]
+
+
+def _begin(begins_s: float | None) -> str:
+    """When a camera begins, where this is not at time 0."""
+    return f" from {begins_s:.3f} s" if begins_s else ""
+
+
+def _size(size_wh: list[int] | None) -> str:
+    return "" if size_wh is None else f"{size_wh[0]} x {size_wh[1]}"

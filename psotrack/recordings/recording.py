@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from math import gcd
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.geometry import Rig
+from psotrack.geometry import Rig, chosen_cameras
+from psotrack.recordings.detections import read_detections
+from psotrack.recordings.timing import FrameTimes, Timeline, make_timeline
 from psotrack.recordings.video import VideoInfo
 from psotrack.support import short_repr
 from psotrack.trajectories import Trajectories
+
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -37,19 +43,33 @@ class OnboardVideo:
 
 @dataclass(frozen=True, repr=False)
 class Recording:
-    """Synchronised videos of calibrated cameras that stand still.
+    """Videos of, or detections in, cameras that stand still, whose frames meet on one clock.
 
-    A recording that was just read may be inconsistent: a camera may have no video, and videos may differ in length.
-    `usable` checks the consistency; its messages say how to leave a camera or frames out.
+    A recording that was just read may be inconsistent: a camera may have nothing that shows the drones, or images of
+    another size than it was calibrated with. `usable` checks the consistency; its messages say what to do.
 
     Attributes:
         name: name of the recording.
         folder: folder of the recording.
-        rig: all calibrated cameras.
+        rig: all cameras that are calibrated and placed.
         videos: videos by camera name; a camera without video is absent.
-        truth: the reference at the video's frames, or None.
+        truth: the reference at the recording's instants, or None.
         detections: files of 2D detections by camera name, or None.
         onboard: videos of cameras on drones by the drones' names, or None.
+        frame_times: times of the frames by camera name; a camera with a video that is absent here begins at time 0
+            and has the video's rate.
+        unplaced: cameras of the recording that are not in the rig, because their lens or their place is not known.
+        streams: addresses of streams and numbers of devices by camera name; such a camera has no video.
+        ignore: images by camera name, white where nothing counts as foreground.
+        line_time_s: times from the exposure of one row to that of the next row by camera name, seconds; a camera that
+            is absent has a global shutter.
+        bounds_m: lowest and highest x, y and z of the space in which drones are looked for, metres:
+            (x0, x1, y0, y1, z0, z1); None where it is not known.
+        marker_corners: table of the markers' corners, or None.
+        reference_files: files of the reference; empty where it is not known from which files it comes.
+        reference_offset_s: time on the recording's clock at which the reference's clock shows 0, seconds.
+        rate_hz: instants per second; None is the rate of the fastest camera.
+        num_instants: largest number of instants; None: until no camera has a frame.
     """
 
     name: str
@@ -59,97 +79,227 @@ class Recording:
     truth: Trajectories | None = None
     detections: Mapping[str, Path] | None = None
     onboard: Mapping[str, OnboardVideo] | None = None
+    frame_times: Mapping[str, FrameTimes] = field(default_factory=dict)
+    unplaced: tuple[str, ...] = ()
+    streams: Mapping[str, str] = field(default_factory=dict)
+    ignore: Mapping[str, Path] = field(default_factory=dict)
+    line_time_s: Mapping[str, float] = field(default_factory=dict)
+    bounds_m: tuple[float, float, float, float, float, float] | None = None
+    marker_corners: Path | None = None
+    reference_files: tuple[Path, ...] = ()
+    reference_offset_s: float = 0.0
+    rate_hz: float | None = None
+    num_instants: int | None = None
 
     __repr__ = short_repr
 
+    def __post_init__(self) -> None:
+        times = {name: self._frame_times_of(name, video) for name, video in self.videos.items()}
+        object.__setattr__(self, "frame_times", {**self.frame_times, **times})
+
+    def _frame_times_of(self, name: str, video: VideoInfo) -> FrameTimes:
+        """Times of as many frames as a video has."""
+        times = self.frame_times.get(name, FrameTimes(video.num_frames, video.fps))
+        if times.listed_s is None or video.num_frames < times.num_frames:
+            return replace(times.cut(video.num_frames), num_frames=video.num_frames)
+        return times
+
     @property
     def fps(self) -> float:
-        """Frames per second of the first video."""
-        return self._first.fps
+        """Instants per second: `rate_hz`, or frames per second of the fastest camera."""
+        if self._has_frames:
+            return self._timeline.rate_hz
+        return self.rate_hz or max(each.fps for each in self._times.values())
 
     @property
     def num_frames(self) -> int:
-        """Number of frames of the shortest video."""
-        return min((video.num_frames for video in self.videos.values()), default=0)
+        """Number of instants; 0 where no camera has a frame."""
+        return self._timeline.num_instants if self._has_frames else 0
 
-    @property
-    def _first(self) -> VideoInfo:
-        if not self.videos:
-            raise InputError(self.folder, expected="at least one video", found="none")
-        return next(iter(self.videos.values()))
-
-    def usable(self, cameras: Sequence[str] | None = None, num_frames: int | None = None) -> Recording:
-        """This recording with the chosen cameras and frames only, checked to be consistent.
+    def timeline(self, rate_hz: float | None = None) -> Timeline:
+        """The instants of this recording, and the frame that each camera of the rig shows at each of them.
 
         Args:
-            cameras: names of the cameras to keep; None: all.
-            num_frames: number of frames to keep from the start; None: all.
+            rate_hz: instants per second; None is the recording's own rate.
 
         Raises:
-            InputError: a camera has no video; the videos differ in image size, rate or length; or an image size
-                differs from the calibration.
-            SettingsError: a camera is unknown, or a video has fewer than `num_frames` frames.
+            InputError: no camera has a frame at time 0 or later.
+            SettingsError: the rate is not above 0.
         """
-        rig = self.rig if cameras is None else self.rig.select(cameras)
-        self._check_videos_exist(rig)
-        videos = {name: self.videos[name] for name in rig.names}
-        for name, video in videos.items():
-            calibrated_wh = rig.cameras.image_size_wh[rig.names.index(name)]
-            expected = _size_text((int(calibrated_wh[0]), int(calibrated_wh[1])))
-            _check_equal(video, "calibrated", expected, _video_size(video))
-        _check_consistent(videos, _video_size, remedy="leave it out with --cameras")
-        _check_consistent(videos, _video_rate, remedy="leave it out with --cameras")
-        shortest = min(video.num_frames for video in videos.values())
-        if num_frames is None:
-            remedy = f"pass --frames {shortest} to use the frames that all videos have"
-            _check_consistent(videos, _video_length, remedy=remedy)
-            return replace(self, rig=rig, videos=videos)
-        if not 0 < num_frames <= shortest:
-            raise SettingsError(
-                "frames", expected=f"1 to {shortest}, the frames that all cameras have", found=f"{num_frames}"
-            )
-        cut = {name: replace(video, num_frames=num_frames) for name, video in videos.items()}
-        return replace(self, rig=rig, videos=cut)
+        return self._timeline if rate_hz is None else replace(self, rate_hz=rate_hz).timeline()
 
-    def _check_videos_exist(self, rig: Rig) -> None:
-        without = [name for name in rig.names if name not in self.videos]
-        if without:
-            rest = ",".join(name for name in rig.names if name in self.videos)
-            raise InputError(
+    @cached_property
+    def _timeline(self) -> Timeline:
+        timeline = make_timeline(self._times, self.rate_hz)
+        line_time_s = np.array([self.line_time_s.get(name, 0.0) for name in timeline.cameras])
+        if line_time_s.any():
+            timeline = replace(timeline, line_time_s=line_time_s)
+        return timeline if self.num_instants is None else timeline.part(slice(self.num_instants))
+
+    @property
+    def _has_frames(self) -> bool:
+        return any(name in self.frame_times and self.frame_times[name].num_frames for name in self._timed)
+
+    @property
+    def _timed(self) -> tuple[str, ...]:
+        """Names of the rig's cameras; of all cameras where none is placed."""
+        return self.rig.names or tuple(self.frame_times)
+
+    @property
+    def _times(self) -> dict[str, FrameTimes]:
+        """Times of the frames of these cameras; a camera that shows nothing has no frames."""
+        known = [self.frame_times[name] for name in self._timed if name in self.frame_times]
+        if not known:
+            raise InputError(self.folder, expected="at least one video", found="none")
+        none = replace(known[0], num_frames=0, listed_s=None)
+        times = {name: self.frame_times.get(name, none) for name in self._timed}
+        # The frame of a rolling shutter has the time of its middle row.
+        return {name: each.corrected(self._readout_s(name) / 2) for name, each in times.items()}
+
+    def _readout_s(self, name: str) -> float:
+        """Time from the exposure of a camera's first row to that of its last row, seconds."""
+        line_time_s = self.line_time_s.get(name, 0.0)
+        if not line_time_s or name not in self.rig.names:
+            return 0.0
+        return line_time_s * float(self.rig.cameras.image_size_wh[self.rig.names.index(name), 1])
+
+    def usable(
+        self, cameras: Sequence[str] | None = None, num_frames: int | None = None, *, videos: bool = True
+    ) -> Recording:
+        """This recording with the chosen cameras and frames only, checked to be consistent.
+
+        A camera that cannot be used is left out with a warning, unless it is chosen by name.
+
+        Args:
+            cameras: names of the cameras to keep; None: all that can be used.
+            num_frames: number of instants to keep from the start; None: all.
+            videos: whether a camera needs a video; if not, detections are enough.
+
+        Raises:
+            InputError: no camera can be used, a chosen camera cannot be used, or an image size differs from the
+                calibration.
+            SettingsError: a camera is unknown, or the recording has fewer than `num_frames` instants.
+        """
+        names = self._usable_names(cameras, videos)
+        rig = self.rig.select(names)
+        for name in names:
+            if name in self.videos:
+                _check_size(self.videos[name], rig, name)
+        kept = replace(
+            self,
+            rig=rig,
+            videos={name: self.videos[name] for name in names if name in self.videos},
+            frame_times={name: self.frame_times[name] for name in names if name in self.frame_times},
+            detections=None
+            if self.detections is None
+            else {name: path for name, path in self.detections.items() if name in names},
+        )
+        return kept if num_frames is None else kept._first(num_frames)
+
+    def with_detections(self, files: Mapping[str, Path]) -> Recording:
+        """This recording with other files of detections; cameras without video last as long as their detections.
+
+        Raises:
+            InputError: a file cannot be read.
+        """
+        times = dict(self.frame_times)
+        for name, path in files.items():
+            known = times.get(name)
+            if name not in self.videos and known is not None and known.listed_s is None:
+                times[name] = replace(known, num_frames=_frames_of(path))
+        return replace(self, detections=dict(files), frame_times=times)
+
+    def _usable_names(self, cameras: Sequence[str] | None, videos: bool) -> tuple[str, ...]:
+        """Names of the cameras that are to be used; the others are left out with a warning each."""
+        names = (*self.rig.names, *self.unplaced) if cameras is None else self._chosen(cameras)
+        self._check_files(names)
+        without = [name for name in names if self._fault(name, videos)]
+        if len(without) == len(names) or (without and cameras is not None):
+            raise self._nothing_usable(names, videos)
+        for name in without:
+            _logger.warning("camera %s is left out: it has no %s", name, self._fault(name, videos))
+        return tuple(name for name in names if name not in without)
+
+    def _chosen(self, cameras: Sequence[str]) -> tuple[str, ...]:
+        """Full names of cameras that a user names, whether they are placed or not."""
+        known = (*self.rig.names, *self.unplaced)
+        return chosen_cameras([cameras] if isinstance(cameras, str) else cameras, known)
+
+    def _fault(self, name: str, videos: bool) -> str:
+        """What a camera lacks, in words; empty for a camera that can be used."""
+        if name in self.unplaced:
+            return "place in the world"
+        if videos and name not in self.videos:
+            return "video"
+        return "" if name in self.frame_times else "video and no detections"
+
+    def _check_files(self, names: Sequence[str]) -> None:
+        for name in names:
+            if name in self.streams:
+                raise InputError(
+                    f"{self.folder}, camera {name}",
+                    expected="a video file",
+                    found=f"the stream {self.streams[name]}",
+                    remedy="record it first: this command works on files",
+                )
+
+    def _nothing_usable(self, names: Sequence[str], videos: bool) -> InputError:
+        wanted = "a video" if videos else "a video, or detections,"
+        if set(names) <= set(self.unplaced):
+            return InputError(
                 self.folder,
-                expected=f"a video for each of the cameras {', '.join(rig.names)}",
-                found=f"none for {', '.join(without)}",
-                remedy=f"pass --cameras {rest} to leave these out" if rest else "",
+                expected="cameras whose lens and place are known",
+                found=f"none for {', '.join(names)}",
+                remedy="make a calibration with `psotrack calibrate rig`",
             )
+        return InputError(
+            self.folder,
+            expected=f"{wanted} for each of the cameras {', '.join(names)}",
+            found=f"none for {', '.join(name for name in names if self._fault(name, videos))}",
+        )
+
+    def _first(self, num_frames: int) -> Recording:
+        """The first instants only; a camera that begins later is left out."""
+        timeline = self.timeline()
+        if not 0 < num_frames <= timeline.num_instants:
+            expected = f"1 to {timeline.num_instants}, the frames of the recording"
+            raise SettingsError("frames", expected=expected, found=f"{num_frames}")
+        last = timeline.frame[:num_frames].max(axis=0)
+        counts = dict(zip(timeline.cameras, (last + 1).tolist(), strict=True))
+        late = [name for name in self.rig.names if not counts[name]]
+        for name in late:
+            _logger.warning("camera %s is left out: it has no frame before instant %d", name, num_frames)
+        rig = self.rig.select([name for name in self.rig.names if name not in late]) if late else self.rig
+        return replace(
+            self,
+            rig=rig,
+            videos={
+                name: replace(video, num_frames=counts[name])
+                for name, video in self.videos.items()
+                if name in rig.names
+            },
+            frame_times={name: self.frame_times[name].cut(counts[name]) for name in rig.names},
+        )
 
 
-def _check_equal(video: VideoInfo, standard: str, expected: str, found: str, remedy: str = "") -> None:
-    if found != expected:
-        raise InputError(video.path, expected=f"{expected} as {standard}", found=found, remedy=remedy)
+def _frames_of(path: Path) -> int:
+    """Number of frames up to the last detection of a file."""
+    return int(read_detections(path).frame.max(initial=-1)) + 1
 
 
-def _check_consistent(
-    videos: Mapping[str, VideoInfo], aspect: Callable[[VideoInfo], str], remedy: str
-) -> None:
-    """Raise `InputError` for the first video that differs from most videos in one aspect."""
-    usual = Counter(map(aspect, videos.values())).most_common(1)[0][0]
-    model = next(video for video in videos.values() if aspect(video) == usual)
-    for video in videos.values():
-        _check_equal(video, f"in {model.path.name}", usual, aspect(video), remedy)
-
-
-def _size_text(image_size_wh: tuple[int, int]) -> str:
-    return f"{image_size_wh[0]} x {image_size_wh[1]} pixels"
-
-
-def _video_size(video: VideoInfo) -> str:
-    return _size_text(video.image_size_wh)
-
-
-def _video_rate(video: VideoInfo) -> str:
-    # Three decimals distinguish 29.97 from 30, and every container stores at least three.
-    return f"{video.fps:.3f} frames per second"
-
-
-def _video_length(video: VideoInfo) -> str:
-    return f"{video.num_frames} frames"
+def _check_size(video: VideoInfo, rig: Rig, name: str) -> None:
+    """Raise `InputError` where the images have another size than the camera was calibrated with."""
+    width, height = (int(side) for side in rig.cameras.image_size_wh[rig.names.index(name)])
+    found_w, found_h = video.image_size_wh
+    if (width, height) == (found_w, found_h):
+        return
+    remedy = "is it the video of another camera?"
+    if width * found_h == height * found_w:
+        factor = f"{found_w // gcd(found_w, width)}/{width // gcd(found_w, width)}"
+        remedy = f"if both show the same field of view, multiply the first two rows of K by {factor}"
+    raise InputError(
+        video.path,
+        expected=f"{width} x {height} pixels as calibrated",
+        found=f"{found_w} x {found_h} pixels",
+        remedy=remedy,
+    )

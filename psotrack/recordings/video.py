@@ -21,7 +21,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from psotrack.errors import InputError, OutputError, SettingsError, check_positive
-from psotrack.support import atomic_write
+from psotrack.recordings.image_files import read_image
+from psotrack.support import atomic_write, digest_file, digest_record
 
 #: MPEG-4 part 2: OpenCV's wheels can encode and decode it, and decoding is faster than with MJPEG.
 _CODEC = "XVID"
@@ -34,20 +35,22 @@ _opening = threading.Lock()
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """Properties of a video file.
+    """Properties of a video file, or of image files that are its frames.
 
     Attributes:
-        path: path of the file.
+        path: path of the file; of the images' folder where the frames are image files.
         num_frames: number of frames according to the header, above 0; reduce it with `dataclasses.replace` to use only
             the first frames.
         fps: frames per second, as exact as in the container.
         image_size_wh: width and height of the frames in pixels.
+        images: the image files that are the frames, in order; empty for a video file.
     """
 
     path: Path
     num_frames: int
     fps: float
     image_size_wh: tuple[int, int]
+    images: tuple[Path, ...] = ()
 
 
 def probe(path: Path | str) -> VideoInfo:
@@ -73,6 +76,34 @@ def probe(path: Path | str) -> VideoInfo:
     return VideoInfo(path, num_frames, fps, (width, height))
 
 
+def probe_images(images: Sequence[Path | str], fps: float) -> VideoInfo:
+    """A video whose frames are image files. Only the first image is read; `read_frames` notices bad other images.
+
+    Args:
+        images: at least one image file, in the order of the frames.
+        fps: frames per second.
+
+    Raises:
+        InputError: the first file is no image.
+        SettingsError: the rate is not above 0.
+    """
+    check_positive("fps", fps)
+    paths = tuple(map(Path, images))
+    height, width, _ = read_image(paths[0]).shape
+    return VideoInfo(paths[0].parent, len(paths), fps, (width, height), paths)
+
+
+def digest_video(video: VideoInfo) -> str:
+    """Digest of a video's content, as hexadecimal digits; of all its images where the frames are image files.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
+    if not video.images:
+        return digest_file(video.path, expected="a readable video")
+    return digest_record([digest_file(path, expected="a readable image") for path in video.images])
+
+
 def read_frames(video: VideoInfo, step: int = 1) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """Yield frames 0, step, 2 step, ... below `video.num_frames`, in order: BGR, (height, width, 3), uint8.
 
@@ -84,7 +115,12 @@ def read_frames(video: VideoInfo, step: int = 1) -> Iterator[UInt8[np.ndarray, "
     """
     if step < 1:
         raise SettingsError("step", expected="1 or more", found=f"{step}")
-    width, height = video.image_size_wh
+    if video.images:
+        for path in video.images[: video.num_frames : step]:
+            frame = read_image(path)
+            _check_size(path, video, frame)
+            yield frame
+        return
     capture = _open(video.path)
     try:
         for index in range(video.num_frames):
@@ -95,15 +131,21 @@ def read_frames(video: VideoInfo, step: int = 1) -> Iterator[UInt8[np.ndarray, "
             decoded, frame = capture.retrieve()
             if not decoded:
                 raise _ended_early(video, index)
-            if frame.shape != (height, width, 3):
-                raise InputError(
-                    video.path,
-                    expected=f"{width} x {height} pixels",
-                    found=f"{frame.shape[1]} x {frame.shape[0]} in frame {index}",
-                )
+            _check_size(video.path, video, frame, f" in frame {index}")
             yield frame
     finally:
         capture.release()
+
+
+def _check_size(
+    path: Path, video: VideoInfo, frame: UInt8[np.ndarray, "height width 3"], where: str = ""
+) -> None:
+    width, height = video.image_size_wh
+    if frame.shape != (height, width, 3):
+        expected = f"{width} x {height} pixels"
+        if video.images:
+            expected += f" as in {video.images[0].name}"
+        raise InputError(path, expected=expected, found=f"{frame.shape[1]} x {frame.shape[0]}{where}")
 
 
 class VideoWriter:

@@ -6,7 +6,10 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
+
+from psotrack._typing import Array
+from psotrack.silhouettes.exposures import Exposures
 
 #: Smallest coverage of a cell that belongs to a blob, out of 255.
 MIN_COVERAGE = 64
@@ -43,17 +46,23 @@ class ViewBlobs:
             blob.
         whole: (frames, cameras, blobs), whether there is a blob, and it does not touch the image's border.
         least_radius_px: smallest uncertainty of a blob's middle, pixels.
+        exposures: when the frames were exposed; None where all cameras' frames were exposed together.
     """
 
     centre_px: Float[np.ndarray, "frames cameras blobs 2"]
     half_px: Float[np.ndarray, "frames cameras blobs 2"]
     whole: Bool[np.ndarray, "frames cameras blobs"]
     least_radius_px: float
+    exposures: Exposures | None = None
 
     def __getitem__(self, frames: Bool[np.ndarray, "frames"]) -> ViewBlobs:
         """Select the blobs of some frames."""
         return replace(
-            self, centre_px=self.centre_px[frames], half_px=self.half_px[frames], whole=self.whole[frames]
+            self,
+            centre_px=self.centre_px[frames],
+            half_px=self.half_px[frames],
+            whole=self.whole[frames],
+            exposures=None if self.exposures is None else self.exposures[frames],
         )
 
     @property
@@ -62,8 +71,28 @@ class ViewBlobs:
         return np.maximum(self.half_px.min(axis=-1), self.least_radius_px)
 
 
-def find_blobs(coverage: UInt8[np.ndarray, "height width"], reduction: int) -> Blobs:
-    """Find the blobs of one silhouette, sorted from large to small boxes."""
+def border_cells(image_size_wh: Float[Array, "*cameras 2"], reduction: int) -> Int[np.ndarray, "*cameras 2"]:
+    """Width and height of silhouettes in cells, which are smaller than the array where other cameras have more pixels.
+
+    Args:
+        image_size_wh: (..., 2), width and height of the images, pixels.
+        reduction: image pixels per cell, along each side.
+    """
+    return np.ceil(np.asarray(image_size_wh) / reduction).astype(int)
+
+
+def find_blobs(
+    coverage: UInt8[np.ndarray, "height width"],
+    reduction: int,
+    border: Int[np.ndarray, "2"] | None = None,
+) -> Blobs:
+    """Find the blobs of one silhouette, sorted from large to small boxes.
+
+    Args:
+        coverage: (height, width), the silhouette, 0 to 255.
+        reduction: image pixels per cell, along each side.
+        border: width and height of the image in cells, from `border_cells`; None where the array ends at its border.
+    """
     foreground = (coverage >= MIN_COVERAGE).astype(np.uint8)
     # In thin silhouettes, gaps of one cell separate rotors and arms from the body.
     closed = cv2.morphologyEx(foreground, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
@@ -71,8 +100,8 @@ def find_blobs(coverage: UInt8[np.ndarray, "height width"], reduction: int) -> B
     stats = stats[1:][stats[1:, cv2.CC_STAT_AREA] >= MIN_BLOB_CELLS]
     stats = stats[np.argsort(-stats[:, 2] * stats[:, 3], kind="stable")[:MOST_BLOBS]]
     corner, size = stats[:, :2].astype(float), stats[:, 2:4].astype(float)
-    height, width = coverage.shape
-    whole = ((corner > 0) & (corner + size < (width, height))).all(axis=-1)
+    end = coverage.shape[::-1] if border is None else border
+    whole = ((corner > 0) & (corner + size < end)).all(axis=-1)
     return Blobs((corner + size / 2) * reduction - 0.5, size * reduction, whole)
 
 

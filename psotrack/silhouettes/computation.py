@@ -6,16 +6,16 @@ import logging
 import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import zarr
-from jaxtyping import UInt8
+from jaxtyping import Int, UInt8
 
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.recordings import Recording
+from psotrack.recordings import Recording, Timeline
+from psotrack.silhouettes.exposures import Exposures
 from psotrack.silhouettes.foreground import BackgroundModel
 from psotrack.silhouettes.settings import SilhouetteSettings, check_whole
 from psotrack.silhouettes.store import (
@@ -43,10 +43,12 @@ class Silhouettes:
         keys: key of each camera's silhouettes in the store, by camera name.
         reduction: r; cell (i, j) covers the pixels [r * i, r * i + r) x [r * j, r * j + r). Pixels beyond the image's
             border count as background.
-        num_frames: number of frames of each camera.
-        shape: height and width of one silhouette, cells.
+        num_frames: number of frames of the longest camera.
+        shape: height and width of the largest silhouette, cells.
         seconds: time spent on "decode" and "foreground", summed over workers; 0 for silhouettes from the store.
-        arrays: one array (frames, height, width) per camera, stored or in memory.
+        arrays: one array (frames, height, width) per camera, stored or in memory; cameras may differ in frames, height
+            and width.
+        exposures: when the frames were exposed; None where frame i of every camera is instant i.
     """
 
     cameras: tuple[str, ...]
@@ -55,12 +57,20 @@ class Silhouettes:
     num_frames: int
     shape: tuple[int, int]
     seconds: Mapping[str, float]
-    arrays: tuple[zarr.Array | UInt8[np.ndarray, "frames height width"], ...]
+    arrays: tuple[zarr.Array | FramesOfInstants | UInt8[np.ndarray, "frames height width"], ...]
+    exposures: Exposures | None = None
 
     __repr__ = short_repr
 
+    @property
+    def borders(self) -> Int[np.ndarray, "cameras 2"]:
+        """(cameras, 2), width and height of each camera's silhouettes, cells."""
+        return np.array([array.shape[:0:-1] for array in self.arrays], int)
+
     def read(self, start: int, stop: int) -> UInt8[np.ndarray, "frames cameras height width"]:
         """Read the coverage of the frames [start, stop), 0 to 255: (frames, cameras, height, width).
+
+        Smaller silhouettes, and those of a camera that has fewer frames, are filled up with 0.
 
         Raises:
             SettingsError: the frames do not exist.
@@ -70,10 +80,12 @@ class Silhouettes:
             raise SettingsError(
                 "frames", expected=f"a part of 0 to {self.num_frames}", found=f"{start} to {stop}"
             )
-        frames = np.empty((stop - start, len(self.cameras), *self.shape), np.uint8)
+        frames = np.zeros((stop - start, len(self.cameras), *self.shape), np.uint8)
         for index, array in enumerate(self.arrays):
             try:
-                frames[:, index] = array[start:stop]
+                read = np.asarray(array[start:stop])
+                count, height, width = read.shape
+                frames[:count, index, :height, :width] = read
             except (OSError, ValueError, RuntimeError) as error:
                 raise InputError(
                     f"silhouettes {self.keys[self.cameras[index]]}",
@@ -81,6 +93,78 @@ class Silhouettes:
                     found=f"{error}",
                     remedy="remove this folder from the cache; the next run makes it again",
                 ) from error
+        return frames
+
+    def part(self, start: int, stop: int) -> Silhouettes:
+        """The frames [start, stop), in memory.
+
+        Raises:
+            SettingsError: the frames do not exist.
+            InputError: the store was damaged after it was opened.
+        """
+        frames = self.read(start, stop)
+        exposures = None if self.exposures is None else self.exposures[start:stop]
+        arrays = tuple(frames[:, camera] for camera in range(len(self.cameras)))
+        return replace(self, num_frames=stop - start, arrays=arrays, exposures=exposures)
+
+    def at_instants(self, timeline: Timeline) -> Silhouettes:
+        """These silhouettes with instants instead of frames: each camera shows its frame nearest to the instant.
+
+        A camera without a frame at an instant shows no foreground, and `exposures` says so. Where frame i of every
+        camera is instant i, the silhouettes stay as they are.
+
+        Raises:
+            SettingsError: the timeline is of other cameras.
+        """
+        if timeline.cameras != self.cameras:
+            raise SettingsError(
+                "timeline", expected=f"cameras {self.cameras}", found=f"cameras {timeline.cameras}"
+            )
+        if timeline.is_synchronous and timeline.num_instants == self.num_frames:
+            return self
+        arrays = tuple(
+            FramesOfInstants(array, frame)
+            for array, frame in zip(self.arrays, timeline.frame.T, strict=True)
+            if not isinstance(array, FramesOfInstants)
+        )
+        assert len(arrays) == len(self.arrays), "instants of instants have no meaning"
+        return replace(
+            self, num_frames=timeline.num_instants, arrays=arrays, exposures=exposures_of(timeline)
+        )
+
+
+def exposures_of(timeline: Timeline) -> Exposures:
+    """When the frames that a timeline's instants show were exposed, in float32."""
+    of_cameras = np.zeros(len(timeline.cameras)) if timeline.line_time_s is None else timeline.line_time_s
+    line_time_s = np.broadcast_to(of_cameras, timeline.frame.shape).astype(np.float32)
+    offset_s, share = (value.astype(np.float32) for value in (timeline.offset_s, timeline.share))
+    return Exposures(offset_s, timeline.is_there, share, line_time_s)
+
+
+@dataclass(frozen=True)
+class FramesOfInstants:
+    """The frames of one camera by instants instead of their numbers.
+
+    Attributes:
+        array: (frames, height, width), the camera's frames.
+        frame: (instants,), number of the frame of each instant; -1 for none, which reads as 0.
+    """
+
+    array: zarr.Array | UInt8[np.ndarray, "frames height width"]
+    frame: Int[np.ndarray, "instants"]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Numbers of instants, rows and columns."""
+        return (len(self.frame), *self.array.shape[1:])
+
+    def __getitem__(self, instants: slice) -> UInt8[np.ndarray, "instants height width"]:
+        frame = self.frame[instants]
+        frames = np.zeros((len(frame), *self.array.shape[1:]), np.uint8)
+        there = frame >= 0
+        if there.any():
+            first, last = int(frame[there].min()), int(frame[there].max())
+            frames[there] = np.asarray(self.array[first : last + 1])[frame[there] - first]
         return frames
 
 
@@ -99,7 +183,7 @@ def compute(
     frames and all settings. After an interruption, the next call computes only the missing cameras.
 
     Args:
-        recording: a recording with a video for each camera, all of the same length and size.
+        recording: a recording with a video for each camera.
         settings: settings of the silhouettes.
         cache: folder of the store; made if it does not exist.
         jobs: largest number of processes; None is one per processor.
@@ -107,36 +191,42 @@ def compute(
         report: progress bar for the frames of all cameras, including the frames from which the background is learned.
 
     Raises:
-        InputError: a video is missing, unreadable, ends early, or differs from the others in length or size.
+        InputError: a video is missing, unreadable, ends early, or has another size than its camera.
         SettingsError: `jobs` is below 1, or the background model yields masks of a wrong number, type or shape.
         OutputError: the store cannot be written; the cameras that were finished stay in the store.
     """
     cache = Path(cache)
     jobs = jobs if jobs is not None else os.cpu_count() or 1
     check_whole("jobs", jobs, lowest=1)
-    recording = recording.usable()
+    recording = recording.usable(recording.rig.names)
     cameras = recording.rig.names
     videos = [recording.videos[name] for name in cameras]
-    shape = reduced_shape(videos[0], settings.reduction)
+    ignored = [recording.ignore.get(name) for name in cameras]
     with ThreadPoolExecutor(jobs) as threads:
-        keys = list(threads.map(partial(key_of, settings=settings, background=background), videos))
-    tasks = [Task(video, settings, cache, key, background) for video, key in zip(videos, keys, strict=True)]
-    seconds = _make_missing(tasks, shape, jobs, report)
+        keys = list(
+            threads.map(lambda video, ignore: key_of(video, settings, background, ignore), videos, ignored)
+        )
+    tasks = [
+        Task(video, settings, cache, key, background, ignore)
+        for video, key, ignore in zip(videos, keys, ignored, strict=True)
+    ]
+    seconds = _make_missing(tasks, jobs, report)
+    heights, widths = zip(*(reduced_shape(video, settings.reduction) for video in videos), strict=True)
     return Silhouettes(
         cameras=cameras,
         keys=dict(zip(cameras, keys, strict=True)),
         reduction=settings.reduction,
         num_frames=recording.num_frames,
-        shape=shape,
+        shape=(max(heights), max(widths)),
         seconds=seconds,
-        arrays=tuple(_open(task, shape) for task in tasks),
+        arrays=tuple(_open(task) for task in tasks),
     )
 
 
-def _make_missing(tasks: list[Task], shape: tuple[int, int], jobs: int, report: Report) -> dict[str, float]:
+def _make_missing(tasks: list[Task], jobs: int, report: Report) -> dict[str, float]:
     """Make and store missing silhouettes; returns the seconds of each stage, summed over the workers."""
     # Two cameras with the same content have the same key, so their silhouettes are made once.
-    missing = list({task.key: task for task in tasks if _stored(task, shape) is None}.values())
+    missing = list({task.key: task for task in tasks if _stored(task) is None}.values())
     seconds = {"decode": 0.0, "foreground": 0.0}
     if not missing:
         return seconds
@@ -155,12 +245,13 @@ def _make_missing(tasks: list[Task], shape: tuple[int, int], jobs: int, report: 
     return seconds
 
 
-def _stored(task: Task, shape: tuple[int, int]) -> zarr.Array | None:
+def _stored(task: Task) -> zarr.Array | None:
+    shape = reduced_shape(task.video, task.settings.reduction)
     return open_stored(task.cache / task.key, task.video.num_frames, shape)
 
 
-def _open(task: Task, shape: tuple[int, int]) -> zarr.Array:
-    array = _stored(task, shape)
+def _open(task: Task) -> zarr.Array:
+    array = _stored(task)
     if array is None:
         raise InputError(task.cache / task.key, expected="the silhouettes just stored", found="none")
     return array

@@ -18,11 +18,11 @@ from typing import Any
 import msgspec
 import numpy as np
 import zarr
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 from zarr.codecs import ZstdCodec
 
-from psotrack.errors import OutputError, SettingsError
-from psotrack.recordings import VideoInfo, read_frames
+from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.recordings import VideoInfo, digest_video, read_frames, read_mask
 from psotrack.silhouettes.foreground import BackgroundModel, Mog2, coverage, learning_step
 from psotrack.silhouettes.settings import SilhouetteSettings
 from psotrack.support import Advance, digest_file, digest_record, identify
@@ -35,23 +35,41 @@ SCHEMA = 1
 #: Number of frames that are compressed and read together.
 CHUNK_FRAMES = 25
 
+#: Brighter pixels of an image of what is ignored are ignored.
+_GREY = 127
+
 #: An unfinished folder that was not changed for this long was left by a process that was killed, seconds.
 _STALE_S = 24 * 3600
 
 
 @dataclass(frozen=True)
 class Task:
-    """Task of making one video's silhouettes and storing them in the folder `cache` / `key`."""
+    """Task of making one video's silhouettes and storing them in the folder `cache` / `key`.
+
+    Attributes:
+        video: the video.
+        settings: settings of the silhouettes.
+        cache: folder of the store.
+        key: name of the silhouettes' folder.
+        background: background model; None is MOG2.
+        ignore: image of the video's size, white where nothing counts as foreground; None for no such image.
+    """
 
     video: VideoInfo
     settings: SilhouetteSettings
     cache: Path
     key: str
     background: BackgroundModel | None = None
+    ignore: Path | None = None
 
 
-def key_of(video: VideoInfo, settings: SilhouetteSettings, background: BackgroundModel | None = None) -> str:
-    """Digest of a video's content, number of frames, settings and background model: 40 hexadecimal digits.
+def key_of(
+    video: VideoInfo,
+    settings: SilhouetteSettings,
+    background: BackgroundModel | None = None,
+    ignore: Path | None = None,
+) -> str:
+    """Digest of a video's content, number of frames, settings, background model and ignored part, in 40 digits.
 
     Raises:
         InputError: the video cannot be read.
@@ -59,12 +77,14 @@ def key_of(video: VideoInfo, settings: SilhouetteSettings, background: Backgroun
     """
     made_of: dict[str, Any] = {
         "schema": SCHEMA,
-        "content": digest_file(video.path, expected="a readable video"),
+        "content": digest_video(video),
         "num_frames": video.num_frames,
         "settings": msgspec.to_builtins(settings),
     }
     if background is not None:
         made_of["background"] = identify(background)
+    if ignore is not None:
+        made_of["ignore"] = digest_file(ignore, expected="a readable image")
     return digest_record(made_of)
 
 
@@ -153,10 +173,13 @@ def _write(folder: Path, shape: tuple[int, int], task: Task, advance: Advance) -
         _decoded(video, learning_step(video.num_frames, settings), seconds, advance),
         _decoded(video, 1, seconds, advance),
     )
+    ignored = None if task.ignore is None else _ignored_pixels(task)
     chunk = np.empty((CHUNK_FRAMES, *shape), np.uint8)
     index = -1
     for index, mask in enumerate(masks):
         _check_mask(mask, index, task)
+        if ignored is not None:
+            mask = np.where(ignored, np.uint8(0), mask)
         chunk[index % CHUNK_FRAMES] = coverage(mask, settings.reduction // settings.working_reduction)
         count = index % CHUNK_FRAMES + 1
         if count == CHUNK_FRAMES or index + 1 == video.num_frames:
@@ -167,6 +190,18 @@ def _write(folder: Path, shape: tuple[int, int], task: Task, advance: Advance) -
         )
     seconds["foreground"] = time.perf_counter() - started - seconds["decode"]
     return seconds
+
+
+def _ignored_pixels(task: Task) -> Bool[np.ndarray, "working_height working_width"]:
+    """Pixels of the masks of which a part is ignored."""
+    assert task.ignore is not None
+    reduction = task.settings.working_reduction
+    white = (read_mask(task.ignore) > _GREY).astype(np.uint8)
+    width, height = task.video.image_size_wh
+    if white.shape != (height, width):
+        expected = f"{width} x {height} pixels as in {task.video.path.name}"
+        raise InputError(task.ignore, expected=expected, found=f"{white.shape[1]} x {white.shape[0]}")
+    return coverage(255 * white, reduction) > 0
 
 
 def _check_mask(mask: object, index: int, task: Task) -> None:

@@ -3,12 +3,14 @@ from .flights.recordings import write_recorded_flight
 from .generate import SimulationSettings, simulate
 from .imaging.renderer import CameraRenderer
 from .listing import catalogue, render
+from .own_cameras import OWN_CAMERAS, simulate_own_cameras
 from .preview import save_preview
 from .real_form import RealFormSettings, write_as_real
 from .scenarios import Scenario, change_scenario, load, preset_names, preset_text, scenario
 from .scene import Scene, build
 
 __all__ = [
+    "OWN_CAMERAS",
     "CameraRenderer",
     "RealFormSettings",
     "Scenario",
@@ -25,6 +27,7 @@ __all__ = [
     "save_preview",
     "scenario",
     "simulate",
+    "simulate_own_cameras",
     "write_as_real",
     "write_recorded_flight",
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import json
 import logging
 import os
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ import numpy as np
 from psotrack import __version__
 from psotrack.datasets.dpjait import (
     CALIBRATION,
+    DETECTIONS,
     MARKER_CORNERS,
     ONBOARD_CALIBRATION,
     mocap_markers_file,
@@ -28,6 +30,8 @@ from psotrack.datasets.dpjait import (
     write_poses,
 )
 from psotrack.errors import InputError, SettingsError
+from psotrack.recordings import RECORDING_FILE
+from psotrack.rig_files import write_rig
 from psotrack.simulation import scenarios
 from psotrack.simulation.imaging.onboard import intrinsics, onboard_poses
 from psotrack.simulation.labels.mocap import mocap_markers_m
@@ -40,6 +44,8 @@ from psotrack.support import Report, map_in_processes, no_progress
 #: Pieces of work per process. Few, because each piece first draws a camera's backdrop; more than one, so that all
 #: processes end at about the same time.
 _PIECES_PER_JOB = 4
+#: Rig file of a sequence whose lenses the dataset's calibration cannot hold.
+_RIG = "rig.toml"
 
 _logger = logging.getLogger(__name__)
 
@@ -73,6 +79,9 @@ def simulate(
     report: Report = no_progress,
 ) -> Path:
     """Simulate a sequence in the folder ROOT/Simulated_Data/NAME, in the layout of the DPJAIT dataset.
+
+    Cameras whose lenses the dataset's calibration cannot hold (fisheyes, more coefficients than k1, k2, p1, p2, two
+    focal lengths, skew) are written in `rig.toml`, and the folder gets a `recording.toml` instead of the calibration.
 
     On one machine, the same scenario and settings give the same files for every number of jobs. A simulation of fewer
     frames shows the beginning of the same flight. The sequence is made in a hidden folder beside its final place and
@@ -200,7 +209,12 @@ def _cut(frames: list[range], pieces: int) -> list[tuple[range, ...]]:
 
 def _write_tables(scene: Scene, folder: Path, num_frames: int) -> None:
     fps = scene.scenario.fps
-    write_calibration(folder / CALIBRATION, scene.rig, unit="m")
+    try:
+        write_calibration(folder / CALIBRATION, scene.rig, unit="m")
+    except SettingsError:
+        # The dataset's file has no columns for such lenses, but a rig file and a recording file have.
+        write_rig(folder / _RIG, scene.rig)
+        _write_recording_file(scene, folder)
     position_m, orientation_wxyz = scene.positions_m(num_frames), scene.orientations_wxyz(num_frames)
     markers_m = mocap_markers_m(scene, num_frames)
     for drone in range(len(scene.flights)):
@@ -209,6 +223,19 @@ def _write_tables(scene: Scene, folder: Path, num_frames: int) -> None:
         write_mocap_markers(folder / mocap_markers_file(number, fps), markers_m[:, drone])
     if scene.scenario.markers:
         write_marker_corners(folder / MARKER_CORNERS, scene.room.marker_corners_m)
+
+
+def _write_recording_file(scene: Scene, folder: Path) -> None:
+    """Write the recording file of a sequence whose lenses the dataset's calibration cannot hold."""
+    lines = ["version = 1", f'calibration = "{_RIG}"']
+    for name, stream in zip(scene.rig.names, _streams(scene, onboard=False), strict=True):
+        detections = f"{DETECTIONS}/{stream.name}_s.csv"
+        lines += ["", f"[cameras.{name}]", f'video = "{stream.video_file}"', f'detections = "{detections}"']
+    files = [pose_file(drone + 1, scene.scenario.fps) for drone in range(len(scene.flights))]
+    lines += ["", "[reference]", f"files = {json.dumps(files)}"]
+    if scene.scenario.markers:
+        lines += ["", "[markers]", f'corners = "{MARKER_CORNERS}"']
+    (folder / RECORDING_FILE).write_text("\n".join([*lines, ""]), encoding="utf-8")
 
 
 def _write_onboard_tables(scene: Scene, folder: Path, num_frames: int) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from psotrack.geometry import Camera, project
+from psotrack.geometry import Camera, project_visible
 from psotrack.simulation.imaging.onboard import OnboardRenderer
 from psotrack.simulation.imaging.renderer import CameraRenderer
 from psotrack.simulation.scenarios import Scenario, count_frames
@@ -211,7 +211,7 @@ def _nearest_m(position_m: Float[np.ndarray, "frames drones 3"]) -> Float[np.nda
 
 
 def _mark_drones(axes: Axes, cam: Camera, position_m: Float[np.ndarray, "drones 3"]) -> None:
-    pixels, depth_m = project(cam, position_m)
+    pixels, depth_m = project_visible(cam, position_m)
     width, height = (int(side) for side in cam.image_size_wh)
     for drone, colour in _colours(len(position_m)):
         x, y = pixels[drone]

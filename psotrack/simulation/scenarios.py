@@ -242,14 +242,22 @@ class CameraPlace(_Record, frozen=True, kw_only=True):
     Attributes:
         position_m: camera centre, world.
         target_m: point that the camera looks at, world.
-        focal_length_px: focal length.
+        focal_length_px: focal length along the rows.
         principal_point_px: principal point.
+        aspect: focal length along the columns, as a multiple of that along the rows.
+        skew_px: skew, pixels.
+        distortion: coefficients in OpenCV's order: 0, 4, 5, 8, 12 or 14; 0 or 4 of a fisheye.
+        fisheye: whether the lens has OpenCV's fisheye model.
     """
 
     position_m: Vector
     target_m: Vector
     focal_length_px: Annotated[float, msgspec.Meta(ge=1, le=100_000)] = 1156.3
     principal_point_px: tuple[float, float] = (960.0, 540.0)
+    aspect: Annotated[float, msgspec.Meta(ge=0.1, le=10)] = 1.0
+    skew_px: float = 0.0
+    distortion: tuple[float, ...] = ()
+    fisheye: bool = False
 
 
 class CameraSpread(_Record, frozen=True, kw_only=True):

@@ -35,6 +35,7 @@ class Scene:
         rig: static cameras at this scale.
         flights: flight of each drone.
         models: model of each drone.
+        start_s: time of frame 0, seconds.
     """
 
     scenario: Scenario
@@ -43,6 +44,7 @@ class Scene:
     rig: Rig
     flights: tuple[Flight, ...]
     models: tuple[DroneModel, ...]
+    start_s: float = 0.0
 
     @property
     def room(self) -> Room:
@@ -51,7 +53,7 @@ class Scene:
 
     def time_s(self, frame: int) -> float:
         """Time of the middle of a frame's exposure, seconds."""
-        return frame / self.scenario.fps
+        return self.start_s + frame / self.scenario.fps
 
     def positions_m(self, num_frames: int) -> Float[np.ndarray, "frames drones 3"]:
         """(frames, drones, 3), ground truth: body origins in the middle of each exposure, world, metres."""
@@ -140,5 +142,12 @@ def _camera(place: CameraPlace, scenario: Scenario, scale: float) -> Camera:
     focal = place.focal_length_px * scale
     # Pixel centres have integer coordinates, so the image's corner, which the scale does not move, is at -0.5.
     cx, cy = ((centre + 0.5) * scale - 0.5 for centre in place.principal_point_px)
-    K = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
-    return make_camera(R=R, t_m=t_m, K=K, image_size_wh=image_size_wh(scenario, scale))
+    K = np.array([[focal, place.skew_px * scale, cx], [0.0, focal * place.aspect, cy], [0.0, 0.0, 1.0]])
+    return make_camera(
+        R=R,
+        t_m=t_m,
+        K=K,
+        image_size_wh=image_size_wh(scenario, scale),
+        dist=place.distortion,
+        fisheye=place.fisheye,
+    )

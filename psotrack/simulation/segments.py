@@ -19,7 +19,7 @@ from psotrack.simulation.imaging.onboard import OnboardRenderer
 from psotrack.simulation.imaging.raster import Pinhole
 from psotrack.simulation.imaging.renderer import CameraRenderer
 from psotrack.simulation.labels.detector import detect
-from psotrack.simulation.labels.masks import Silhouette, silhouettes
+from psotrack.simulation.labels.masks import Silhouette, lens_silhouettes, silhouettes
 from psotrack.simulation.scene import Scene
 from psotrack.support import Advance, atomic_write
 
@@ -134,12 +134,20 @@ def _draw_static(work: Work, renderer: CameraRenderer, folder: Path, frames: ran
         masks = stack.enter_context(MaskWriter(folder / _MASKS)) if work.masks else None
         for frame in frames:
             video.write(renderer.frame(frame))
-            drones = silhouettes(scene, cam, renderer.backdrop.depth_m, frame)
+            drones = _silhouettes(renderer, frame)
             found.append(detect(scene, stream.index, frame, drones))
             if masks is not None:
                 _write_masks(masks, stream.name, frame, drones, scene, cam)
             advance(1)
     write_detections(folder / _BOXES, _concatenated(found))
+
+
+def _silhouettes(renderer: CameraRenderer, frame: int) -> list[Silhouette]:
+    scene, cam = renderer.scene, renderer.cam
+    if renderer.lens is None:
+        return silhouettes(scene, cam, renderer.backdrop.depth_m, frame)
+    depths_m = [view.backdrop.depth_m for view in renderer.views]
+    return lens_silhouettes(scene, cam, renderer.lens, depths_m, frame)
 
 
 def _draw_onboard(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
+from psotrack.geometry import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS
 from psotrack.simulation.flights.motion import Flight
 from psotrack.simulation.flights.planning import frame_times_s
 from psotrack.simulation.scenarios import CameraPlace, OnboardCamera, Scenario, Vector, scenario_error
@@ -87,6 +88,14 @@ def _check_camera(scenario: Scenario, index: int, place: CameraPlace, hall: Hall
         raise scenario_error(scenario, field, expected=f"a place in the hall, {_extent(hall)}", found=found)
     if _in_furniture(np.array([place.position_m]), hall).any():
         raise scenario_error(scenario, field, expected="a place outside of the furniture", found=found)
+    allowed = (0, FISHEYE_COEFFICIENTS) if place.fisheye else PINHOLE_COEFFICIENTS
+    if len(place.distortion) not in allowed:
+        raise scenario_error(
+            scenario,
+            f"cameras[{index}].distortion",
+            expected=f"{', '.join(map(str, allowed))} coefficients{' of a fisheye' if place.fisheye else ''}",
+            found=f"{len(place.distortion)}",
+        )
     away = np.subtract(place.target_m, place.position_m)
     if np.hypot(away[0], away[1]) < 1e-6:
         raise scenario_error(

@@ -1,4 +1,4 @@
-from .compiled import keep_compiled
+from .compiled import drop_programs_if_many, keep_compiled
 from .delimited import Column, Table, TextRow, read_rows, read_table, write_rows
 from .figures import COLOURS, drone_colour, save_figure
 from .files import atomic_write, digest_file, digest_record, read_text, refuse_to_overwrite, user_cache
@@ -6,7 +6,7 @@ from .plugins import PluginKind, check_interface, identify, make_plugin, plugin_
 from .processes import map_in_processes
 from .progress import Advance, Report, no_progress, progress_bar
 from .representation import short_repr
-from .schema import assign, convert, nearest, read_toml
+from .schema import assign, convert, nearest, read_toml, toml_key, toml_value
 from .standard_errors import standard_error
 
 __all__ = [
@@ -24,6 +24,7 @@ __all__ = [
     "digest_file",
     "digest_record",
     "drone_colour",
+    "drop_programs_if_many",
     "identify",
     "keep_compiled",
     "make_plugin",
@@ -41,6 +42,8 @@ __all__ = [
     "save_figure",
     "short_repr",
     "standard_error",
+    "toml_key",
+    "toml_value",
     "user_cache",
     "write_rows",
 ]

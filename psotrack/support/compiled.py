@@ -1,7 +1,8 @@
-"""Compile cache on disk: JAX compiles each program once per machine instead of once per process."""
+"""Compiled programs: a cache on disk, so that JAX compiles each once per machine, and a bound on those in memory."""
 
 from __future__ import annotations
 
+import gc
 import logging
 import re
 import warnings
@@ -14,6 +15,10 @@ logger = logging.getLogger(__name__)
 
 #: Shortest compile time of a program that is stored, seconds. Reading a smaller program back takes as long.
 WORTH_KEEPING_S = 0.3
+#: Share of the memory maps that Linux allows a process, above which programs are dropped.
+_MOST_MAPS = 0.5
+_MAPS = Path("/proc/self/maps")
+_MAP_LIMIT = Path("/proc/sys/vm/max_map_count")
 _UNREADABLE_ENTRY = re.compile(r"persistent compilation cache entry for '([\w.]+)'")
 
 
@@ -45,3 +50,30 @@ def keep_compiled(folder: Path | str) -> None:
             entry.unlink(missing_ok=True)
 
     warnings.showwarning = show_or_repair
+
+
+def drop_programs_if_many(most_maps: int | None = None) -> bool:
+    """Drop all compiled programs from memory, if the process has many memory maps.
+
+    Each program keeps some dozens of maps, and Linux allows 65,530 per process: without this, a process that works on
+    dozens of shapes ends with "Cannot allocate memory". Programs that are used again are read from the cache on disk
+    (`keep_compiled`), or compiled again.
+
+    Args:
+        most_maps: largest number of maps for which nothing is dropped; None is half of what the system allows.
+
+    Returns:
+        Whether programs were dropped; never on systems without such a limit.
+    """
+    try:
+        limit = _MOST_MAPS * int(_MAP_LIMIT.read_text()) if most_maps is None else most_maps
+        maps = _MAPS.read_bytes().count(b"\n")
+    except (OSError, ValueError):
+        return False
+    if maps <= limit:
+        return False
+    jax.clear_caches()
+    # Programs are freed with the functions that refer to each other.
+    gc.collect()
+    logger.info("dropped compiled programs from memory, because the process had %d memory maps", maps)
+    return True

@@ -26,6 +26,7 @@ MakeError = Callable[[str, str, str, str], PsotrackError]
 Record = TypeVar("Record", bound=msgspec.Struct)
 
 _MSGSPEC_MESSAGE = re.compile(r"(?P<fault>.*?)(?: - at `\$\.?(?P<path>.*)`)?", re.DOTALL)
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 _TOKEN = re.compile(r"\[(\d+)\]|([^.\[\]]+)")
 _TYPE_WORDS = {
     "float": "a number",
@@ -70,6 +71,17 @@ def read_toml(path: Path | str) -> dict[str, Any]:
         where = f"{path}, {place.partition(',')[0]}" if place else path
         found = f"an error ({reason[:1].lower()}{reason[1:]})"
         raise InputError(where, expected="valid TOML", found=found) from error
+
+
+def toml_key(name: str) -> str:
+    """A name as key of a TOML file, in quotes where it needs them."""
+    return name if _BARE_KEY.fullmatch(name) else toml_value(name)
+
+
+def toml_value(value: Any) -> str:
+    """A text, a number or a list as value of a TOML file; numbers have all their digits."""
+    # Texts and lists in JSON are valid TOML, except for the control character DEL.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def assign(data: dict[str, Any], path: str, value: Any, error: MakeError) -> None:

@@ -4,7 +4,7 @@ from .frames import sweep
 from .grid_files import Cell, Grid, Perturbation, cameras_label, cell_key, grid, read_grid
 from .inputs import Inputs
 from .machine import Device, share_processors, use_device
-from .perturbations import perturb
+from .perturbations import delays_frames, perturb
 from .printing import render_table
 from .runner import SweepOutcome, run_in_process
 from .store import Store
@@ -21,6 +21,7 @@ __all__ = [
     "SweepOutcome",
     "cameras_label",
     "cell_key",
+    "delays_frames",
     "estimate",
     "grid",
     "perturb",

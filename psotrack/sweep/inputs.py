@@ -6,16 +6,17 @@ import hashlib
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from psotrack.datasets.dpjait import read_sequence
+from psotrack.datasets import open_recording
 from psotrack.errors import InputError, PsotrackError
-from psotrack.methods import detection_files_of
+from psotrack.geometry import Camera
+from psotrack.methods import detection_files_of, usable_for
 from psotrack.recordings import Recording
+from psotrack.settings import YOLO
 from psotrack.silhouettes import Silhouettes, SilhouetteSettings, compute
 from psotrack.silhouettes import key_of as silhouettes_key
 from psotrack.support import digest_file
@@ -26,8 +27,9 @@ from psotrack.sweep.perturbations import perturb
 #: Folders below the data's root in which a sequence is looked for.
 HALVES = ("Simulated_Data", "Real_Data", ".")
 
-#: Sequence, number of frames and settings of the silhouettes that a cell needs; None if it needs no silhouettes.
-Source = tuple[str, int | None, SilhouetteSettings | None]
+#: Sequence, number of frames, settings of the silhouettes and folder of the detections that a cell needs; None if it
+#: needs no silhouettes, or no folder.
+Source = tuple[str, int | None, SilhouetteSettings | None, str | None]
 
 
 @dataclass(frozen=True)
@@ -119,38 +121,51 @@ class Inputs:
         """Recording of a cell, with all cameras, and digests of its content."""
         source = source_of(cell)
         if source not in self._sources:
-            recording = read_sequence(folder_of(cell.sequence, self.data)).usable(None, cell.frames)
+            opened = open_recording(folder_of(cell.sequence, self.data))
+            recording = usable_for(opened, cell.settings, num_frames=cell.frames)
             if recording.truth is None:
                 raise InputError(recording.folder, expected="a reference to compare with", found="none")
             keys = {}
             if cell.settings.needs_silhouettes:
+                settings = cell.settings.silhouettes
                 with ThreadPoolExecutor() as threads:
-                    silhouettes_key_of_video = partial(silhouettes_key, settings=cell.settings.silhouettes)
-                    of_videos = threads.map(silhouettes_key_of_video, recording.videos.values())
+                    of_videos = threads.map(
+                        lambda name: silhouettes_key(
+                            recording.videos[name], settings, ignore=recording.ignore.get(name)
+                        ),
+                        recording.videos,
+                    )
                     keys = dict(zip(recording.videos, of_videos, strict=True))
             keys |= {
-                "calibration": _digest_arrays(*vars(recording.rig.cameras).values()),
+                "calibration": _digest_arrays(*_arrays_of(recording.rig.cameras)),
                 "reference": _digest_arrays(recording.truth.position_m, recording.truth.orientation_wxyz),
             }
+            timeline = recording.timeline()
+            if not timeline.is_synchronous:
+                keys["times"] = _digest_arrays(timeline.time_s, timeline.frame, timeline.offset_s)
+            if recording.bounds_m is not None:
+                keys["bounds"] = _digest_arrays(np.array(recording.bounds_m))
             self._sources[source] = recording, keys
         return self._sources[source]
 
 
 def source_of(cell: Cell) -> Source:
-    """Sequence, number of frames and settings of the silhouettes that a cell needs."""
+    """Sequence, number of frames, settings of the silhouettes and folder of the detections that a cell needs."""
     settings = cell.settings
-    return cell.sequence, cell.frames, settings.silhouettes if settings.needs_silhouettes else None
+    silhouettes = settings.silhouettes if settings.needs_silhouettes else None
+    folder = settings.detections if settings.reads_detections and settings.detections != YOLO else None
+    return cell.sequence, cell.frames, silhouettes, folder
 
 
 def folder_of(sequence: str, data: Path) -> Path:
-    """Folder of a sequence that a grid names.
+    """Folder, or `recording.toml`, of a sequence that a grid names.
 
     Raises:
-        InputError: there is no such folder.
+        InputError: there is no such folder or file.
     """
     places = [Path(sequence), *(data / half / sequence for half in HALVES)]
     for place in places:
-        if place.is_dir():
+        if place.exists():
             return place
     raise InputError(
         data, expected=f"the sequence {sequence}", found="none", remedy="name the data's root with --data"
@@ -161,6 +176,11 @@ def input_digest(keys: Mapping[str, str]) -> str:
     """One digest of the digests of everything that a cell reads."""
     lines = [f"{name} {keys[name]}" for name in sorted(keys)]
     return hashlib.blake2b("\n".join(lines).encode(), digest_size=20).hexdigest()
+
+
+def _arrays_of(cameras: Camera) -> list[Any]:
+    """The arrays of a calibration; whether lenses are fisheyes counts only where one is."""
+    return [value for name, value in vars(cameras).items() if name != "fisheye" or value is not None]
 
 
 def _digest_arrays(*arrays: Any) -> str:

@@ -20,7 +20,17 @@ from psotrack.sweep.names import flatten, nest
 _GONE = {"refinements": 0}
 
 #: Settings that version 0.1 lacked, and the value that leaves the results as they were.
-_NEW = {"swarm.search": "pso"}
+_NEW = {
+    "swarm.search": "pso",
+    "status.min_cameras_to_begin": None,
+    "rate_hz": None,
+    "clocks": "given",
+    "errors.rig_deg": 0.0,
+    "errors.pixel_px": 0.0,
+}
+
+#: Values of version 0.1 for which the value is None today, where the data may say more.
+_FROM_DATA = {"motion.max_speed_m_s": 6.0, "motion.jerk_density_m2_s5": 1.0}
 
 #: Names of version 0.1, by today's name.
 _OLDER_NAMES = {today: older for older, today in RENAMED.items() if today}
@@ -36,7 +46,7 @@ def rename_columns(rows: pd.DataFrame) -> pd.DataFrame:
         return rows
     gone = {f"settings.{name}": value for name, value in _GONE.items()}
     unused = [name for name, value in gone.items() if name in rows and (rows[name] == value).all()]
-    new = {f"settings.{name}": value for name, value in _NEW.items()}
+    new = {f"settings.{name}": value for name, value in _NEW.items() if value is not None}
     return rows.drop(columns=unused).rename(columns=columns).assign(**new)
 
 
@@ -79,5 +89,6 @@ def _older_settings(settings: TrackSettings) -> dict[str, Any] | None:
     values = dict(flatten(msgspec.to_builtins(msgspec.structs.replace(settings, seed=0))))
     if any(values.pop(name) != value for name, value in _NEW.items()):
         return None
+    values |= {name: value for name, value in _FROM_DATA.items() if values[name] is None}
     older = {_OLDER_NAMES.get(name, name): value for name, value in values.items()} | _GONE
     return nest(older, tuple(older))

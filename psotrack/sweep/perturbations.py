@@ -8,7 +8,7 @@ of a grid differ only in what the grid varies.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -62,11 +62,11 @@ def perturb(
         rngs = [_rng(_EXTRINSICS, perturbation.draw, camera) for camera in index]
         recording = replace(recording, rig=_turn_cameras(recording.rig, perturbation.extrinsics_deg, rngs))
     if silhouettes is not None and perturbation.clock_frames:
-        rngs = [_rng(_CLOCKS, perturbation.draw, camera) for camera in index]
-        late_frames = [rng.uniform(0, perturbation.clock_frames) for rng in rngs]
         arrays = [
             _delay(stored, late)
-            for stored, late in zip(_frames_by_camera(silhouettes), late_frames, strict=True)
+            for stored, late in zip(
+                _frames_by_camera(silhouettes), delays_frames(perturbation, index), strict=True
+            )
         ]
         silhouettes = replace(silhouettes, arrays=tuple(arrays))
     if silhouettes is not None and perturbation.flipped:
@@ -77,6 +77,19 @@ def perturb(
         ]
         silhouettes = replace(silhouettes, arrays=tuple(arrays))
     return recording, silhouettes
+
+
+def delays_frames(perturbation: Perturbation, cameras: Iterable[int]) -> list[float]:
+    """By how many frames the videos of some cameras show the scene late.
+
+    Args:
+        perturbation: the perturbation.
+        cameras: indices of the cameras in the whole rig.
+    """
+    return [
+        float(_rng(_CLOCKS, perturbation.draw, camera).uniform(0, perturbation.clock_frames))
+        for camera in cameras
+    ]
 
 
 def choose_cameras(names: tuple[str, ...], count: int, draw: int) -> tuple[str, ...]:

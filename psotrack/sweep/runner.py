@@ -17,7 +17,7 @@ import pandas as pd
 from psotrack.errors import InputError, OutputError, PsotrackError
 from psotrack.evaluation import Evaluation, errors_over_time, evaluate
 from psotrack.pipeline import TrackedRecording, track_runs
-from psotrack.support import Report, no_progress
+from psotrack.support import Report, drop_programs_if_many, no_progress
 from psotrack.sweep.cells import Cell, cell_key, failure_name, title
 from psotrack.sweep.grid_files import Grid, cameras_label
 from psotrack.sweep.inputs import Input, Inputs, folder_of, input_digest, source_of
@@ -234,6 +234,8 @@ def _run_seeds(
     cell: Cell, key: str, seeds: list[int], given: Input, input_name: str
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Track and evaluate with each seed: one row per run, and the errors of every run's frames."""
+    # Cells with other shapes need other programs.
+    drop_programs_if_many()
     settings = [msgspec.structs.replace(cell.settings, seed=seed) for seed in seeds]
     began = time.perf_counter()
     results = track_runs(given.recording, given.silhouettes, settings)

@@ -1,3 +1,4 @@
+from .camera_middles import CameraMiddles, middles_in_cameras
 from .chunks import RunInputs, on_device, track_silhouettes
 from .fitness import (
     PAPER_SCORE,
@@ -16,6 +17,7 @@ __all__ = [
     "COMMON",
     "DISPERSION_FRAMES",
     "PAPER_SCORE",
+    "CameraMiddles",
     "ParticleSwarm",
     "RunInputs",
     "Score",
@@ -29,6 +31,7 @@ __all__ = [
     "find_score",
     "find_search",
     "foreground_and_area",
+    "middles_in_cameras",
     "on_device",
     "particle_swarm",
     "track_silhouettes",

@@ -18,6 +18,7 @@ from jaxtyping import Int, UInt8
 
 from psotrack._typing import Array
 from psotrack.geometry import Camera
+from psotrack.silhouettes import Exposures
 from psotrack.tracking import sizes, tracker
 from psotrack.tracking.sizes import SizeMeasurements, SizeProgram, SizeState
 from psotrack.trajectories import Status
@@ -50,10 +51,13 @@ class Chunk:
     Attributes:
         coverage: (frames, cameras, height, width) uint8, foreground of each cell, 0 to 255.
         num_frames: number of frames of the recording in this chunk; the empty frames come after these.
+        exposures: when the frames were exposed, with an axis of frames; None where all cameras' frames were exposed
+            together.
     """
 
     coverage: UInt8[Array, "frames cameras height width"]
     num_frames: Int[Array, ""]
+    exposures: Exposures | None = None
 
 
 #: The drones after a chunk, the tracker's info, and the sizes measured in each frame.
@@ -127,19 +131,21 @@ def _track_run(
 ) -> BatchResult:
     """Track the drones of one run through a chunk, then learn their sizes from the chunk."""
     coverage = chunk.coverage
-    state, info = tracker.track(drones.state, coverage, cameras, drones.params, program, starts)
+    state, info = tracker.track(
+        drones.state, coverage, cameras, drones.params, program, starts, chunk.exposures
+    )
     counts = (jnp.arange(coverage.shape[0]) < chunk.num_frames)[:, None]
     well_seen = (info.status == Status.TRACKED) & counts
-    position_m = jnp.nan_to_num(info.position_m)
+    position_m = jnp.where(well_seen[..., None], info.position_m, jnp.nan)
     floor_z_m = drones.params.bounds_m[0, 2]
     measured = sizes.measure_sizes(
         coverage,
         position_m,
-        well_seen,
         drones.params.size_m,
         cameras,
         SizeProgram(program.windows, program.score.ring, program.reduction),
         floor_z_m,
+        None if chunk.exposures is None else (jnp.nan_to_num(info.velocity_m_s), chunk.exposures),
     )
     learned = sizes.learn_sizes(drones.sizes, measured)
     return TrackedDrones(state, replace(drones.params, size_m=learned.size_m), learned), info, measured

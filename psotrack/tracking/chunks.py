@@ -32,7 +32,7 @@ from psotrack.initiation import (
     reidentify,
 )
 from psotrack.motion import motion_params
-from psotrack.silhouettes import Silhouettes
+from psotrack.silhouettes import Silhouettes, moved_by
 from psotrack.support import Report, no_progress
 from psotrack.tracking import sizes, tracker
 from psotrack.tracking.batch import BatchResult, Chunk, TrackedDrones, track_batch
@@ -126,7 +126,7 @@ def track_silhouettes(
 
 def on_device(cameras: Camera) -> Camera:
     """The cameras in float32, in which the tracker computes."""
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), cameras)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, bool if leaf.dtype == bool else jnp.float32), cameras)
 
 
 def _kind(program: tracker.Program, settings: TrackerSettings) -> Hashable:
@@ -145,21 +145,20 @@ def _track_through_chunks(
 ) -> list[tuple[Tracks, float]]:
     """Track some runs together through all chunks, on one device."""
     setting = _Setting(rig, on_device(rig.cameras), silhouettes.reduction, fps, device)
-    batches = _Batches(setting, (CHUNK_FRAMES, len(rig), *silhouettes.shape), capacity)
+    batches = _Batches(setting, _blank_chunk(silhouettes), capacity)
     runs = [_begin(each, setting) for each in inputs]
     with report("track", silhouettes.num_frames) as advance:
-        for first, coverage, num_frames in _chunks(silhouettes):
-            tracked = batches.track(runs, [None] * len(runs), coverage, num_frames)
+        for first, chunk in _chunks(silhouettes):
+            num_frames = int(chunk.num_frames)
+            tracked = batches.track(runs, [None] * len(runs), chunk)
             planned = [
-                _plan_new_tracks(coverage[:num_frames], [*run.infos, info], run, setting)
+                _plan_new_tracks(chunk, [*run.infos, info], run, setting)
                 for run, (_, info, _) in zip(runs, tracked, strict=True)
             ]
             again = {number: starts for number, starts in enumerate(planned) if starts is not None}
             for number, starts in again.items():
                 _add_tracks(runs[number], starts, first)
-            tracked_again = batches.track(
-                [runs[number] for number in again], list(again.values()), coverage, num_frames
-            )
+            tracked_again = batches.track([runs[number] for number in again], list(again.values()), chunk)
             for number, result in zip(again, tracked_again, strict=True):
                 tracked[number] = result
             for run, (drones, info, measured) in zip(runs, tracked, strict=True):
@@ -191,12 +190,12 @@ class _Batches:
     def __init__(
         self,
         setting: _Setting,
-        chunk_shape: tuple[int, int, int, int],
+        blank: Chunk,
         capacity: dict[Hashable, int],
     ) -> None:
         self.compile_s = 0.0
         self._setting = setting
-        self._blank = np.zeros(chunk_shape, np.uint8)
+        self._blank = blank
         self._capacity = capacity
         self._compiled: set[Hashable] = set()
 
@@ -204,8 +203,7 @@ class _Batches:
         self,
         runs: Sequence[_Run],
         planned: Sequence[PlannedStarts | None],
-        coverage: np.ndarray,
-        num_frames: int,
+        chunk: Chunk,
     ) -> list[BatchResult]:
         """Track a chunk; return for each run its drones after the chunk, and info and sizes of each frame in NumPy."""
         by_shape: dict[tuple[Hashable, int], list[int]] = {}
@@ -227,18 +225,16 @@ class _Batches:
                 # A blank chunk without iterations takes next to no time to track; the rest is the time of compiling.
                 idle = _without_iterations(runs[numbers[0]].drones)
                 starts = tracker.no_track_starts(len(idle))
-                jax.block_until_ready(
-                    on_this_device([(idle, starts)], Chunk(self._blank, np.array(len(self._blank), np.int32)))
-                )
+                jax.block_until_ready(on_this_device([(idle, starts)], self._blank))
                 self._compiled.add(shape)
                 self.compile_s += time.perf_counter() - began
             batch = [
                 (runs[number].drones, _track_starts(planned[number], len(runs[number].drones)))
                 for number in numbers
             ]
-            tracked = on_this_device(batch, Chunk(coverage, np.array(num_frames, np.int32)))
+            tracked = on_this_device(batch, chunk)
             for number, (drones, *frames) in zip(numbers, tracked, strict=True):
-                info, measured = jax.tree.map(lambda leaf: np.asarray(leaf)[:num_frames], frames)
+                info, measured = jax.tree.map(lambda leaf: np.asarray(leaf)[: chunk.num_frames], frames)
                 results[number] = drones, info, measured
         return [results[number] for number in range(len(runs))]
 
@@ -247,15 +243,27 @@ def _without_iterations(drones: TrackedDrones) -> TrackedDrones:
     return replace(drones, params=replace(drones.params, num_iterations=jnp.int32(0)))
 
 
-def _chunks(silhouettes: Silhouettes) -> Iterator[tuple[int, np.ndarray, int]]:
-    """First frame, coverage, and number of frames of each chunk; empty frames fill up the last chunk."""
+def _chunks(silhouettes: Silhouettes) -> Iterator[tuple[int, Chunk]]:
+    """First frame of each chunk, and the chunk; empty frames fill up the last chunk."""
     for first in range(0, silhouettes.num_frames, CHUNK_FRAMES):
         coverage = silhouettes.read(first, min(first + CHUNK_FRAMES, silhouettes.num_frames))
         num_frames = len(coverage)
+        exposures = silhouettes.exposures
+        if exposures is not None:
+            exposures = exposures[first : first + num_frames].padded(CHUNK_FRAMES)
         if num_frames < CHUNK_FRAMES:
             empty = np.zeros((CHUNK_FRAMES - num_frames, *coverage.shape[1:]), np.uint8)
             coverage = np.concatenate([coverage, empty])
-        yield first, coverage, num_frames
+        yield first, Chunk(coverage, np.array(num_frames, np.int32), exposures)
+
+
+def _blank_chunk(silhouettes: Silhouettes) -> Chunk:
+    """A chunk of the silhouettes' shape without foreground."""
+    shape = (CHUNK_FRAMES, len(silhouettes.cameras), *silhouettes.shape)
+    exposures = silhouettes.exposures
+    if exposures is not None:
+        exposures = exposures[:0].padded(CHUNK_FRAMES)
+    return Chunk(np.zeros(shape, np.uint8), np.array(CHUNK_FRAMES, np.int32), exposures)
 
 
 def _begin(inputs: RunInputs, setting: _Setting) -> _Run:
@@ -288,10 +296,11 @@ def _track_starts(planned: PlannedStarts | None, num_drones: int) -> tracker.Tra
 
 
 def _plan_new_tracks(
-    coverage: np.ndarray, infos: list[tracker.TrackerInfo], run: _Run, setting: _Setting
+    chunk: Chunk, infos: list[tracker.TrackerInfo], run: _Run, setting: _Setting
 ) -> PlannedStarts | None:
     """Plan the tracks that start, or start again, in the chunk that was just tracked; None if no track starts."""
     settings, drones, fps = run.inputs.settings, run.drones, setting.fps
+    coverage = np.asarray(chunk.coverage)[: chunk.num_frames]
     size_m = np.asarray(drones.params.size_m, np.float64)
     whole = _joined(infos, len(drones))
     lost = find_lost_tracks(
@@ -310,22 +319,35 @@ def _plan_new_tracks(
     candidates = find_candidates(
         setting.rig.cameras,
         coverage,
-        KnownDrones(np.asarray(infos[-1].position_m, np.float64), _known_well(infos), size_m),
+        replace(_known_drones(chunk, infos, size_m), min_viewpoints=settings.status.min_cameras_to_begin),
         reduction=setting.reduction,
         fps=fps,
         bounds_m=run.inputs.bounds_m,
-        max_speed_m_s=settings.motion.max_speed_m_s,
+        max_speed_m_s=settings.motion.speed_limit_m_s,
     )
     assignment = reidentify(
         candidates,
         lost,
         fps=fps,
         bounds_m=run.inputs.bounds_m,
-        max_speed_m_s=settings.motion.max_speed_m_s,
+        max_speed_m_s=settings.motion.speed_limit_m_s,
         max_births=max_births,
     )
     planned = plan_starts(candidates, assignment, lost, len(drones))
     return planned if (planned.begin_frame >= 0).any() else None
+
+
+def _known_drones(
+    chunk: Chunk, infos: list[tracker.TrackerInfo], size_m: Float[np.ndarray, "drones 3"]
+) -> KnownDrones:
+    """The drones that were tracked in the chunk, where the cameras' frames show them."""
+    position_m = np.asarray(infos[-1].position_m, np.float64)
+    known = KnownDrones(position_m, _known_well(infos), size_m)
+    if chunk.exposures is None:
+        return known
+    exposures = chunk.exposures[: len(position_m)]
+    moved_m = moved_by(exposures, np.asarray(infos[-1].velocity_m_s, np.float64))
+    return replace(known, moved_m=moved_m, is_there=np.asarray(exposures.is_there))
 
 
 def _without_false_tracks(drones: TrackedDrones, infos: list[tracker.TrackerInfo]) -> TrackedDrones:

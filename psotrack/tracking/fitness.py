@@ -237,7 +237,7 @@ def _of_windows(
     Foreground and area are in pixels of the patches, without the foreground that other drones may cover.
     """
 
-    def interval(middle: Array, half: Array, length_px: int, first_px: Array) -> tuple[Array, Array]:
+    def interval(middle: Array, half: Array, length_px: Array, first_px: Array) -> tuple[Array, Array]:
         half = jnp.asarray(scales, half.dtype).reshape(-1, *[1] * half.ndim) * half
         ends = [jnp.clip(end, 0, length_px) for end in (middle - half, middle + half)]
         if whole_pixels:
@@ -261,7 +261,7 @@ def _of_windows(
 def _share_in_image(patches: Patches, boxes: Boxes) -> Float[Array, "*batch drones cameras"]:
     width_px, height_px = patches.size_wh_px
 
-    def inside(middle: Array, half: Array, length_px: int) -> Array:
+    def inside(middle: Array, half: Array, length_px: Array) -> Array:
         return jnp.clip(middle + half, 0, length_px) - jnp.clip(middle - half, 0, length_px)
 
     area = inside(boxes.x_middle, boxes.x_half, width_px) * inside(boxes.y_middle, boxes.y_half, height_px)

@@ -137,7 +137,7 @@ def tracker_params(
         size_m=jnp.asarray(size_m, jnp.float32),
         bounds_m=jnp.asarray(bounds_m, jnp.float32),
         dt_s=jnp.float32(1 / fps),
-        max_speed_m_s=jnp.float32(settings.motion.max_speed_m_s),
+        max_speed_m_s=jnp.float32(settings.motion.speed_limit_m_s),
         spread_m=jnp.float32(settings.swarm.spread_m),
         search=settings.search,
         motion=motion_params(settings.motion, len(size_m)),

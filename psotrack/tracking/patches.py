@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack._typing import Array, Coverage, Positions, Tables
-from psotrack.geometry import Boxes, Extents, project_boxes
+from psotrack.geometry import Boxes, Camera, Extents, project_boxes
 from psotrack.silhouettes import pack, summed_area_table
 from psotrack.tracking.occlusion import (
     CORE_SCALE,
@@ -59,7 +59,7 @@ class Patches:
         x_px, y_px: left and upper edges of the windows in the image.
         pixel_px: image pixels per pixel of the window, along each side.
         clear: share of the drone's ellipse that no other drone may cover.
-        size_wh_px: width and height of the part of the image that silhouettes cover.
+        size_wh_px: (cameras,) each, widths and heights of the parts of the images that silhouettes cover.
         reduction: image pixels per silhouette pixel, along each side.
         packed: whether the tables also count the pixels of occluded foreground.
     """
@@ -69,7 +69,7 @@ class Patches:
     y_px: Float[Array, "*drones cameras"]
     pixel_px: Float[Array, "*drones cameras"]
     clear: Float[Array, "*drones cameras"]
-    size_wh_px: tuple[int, int] = field(metadata={"static": True})
+    size_wh_px: tuple[Float[Array, "cameras"], Float[Array, "cameras"]]
     reduction: int = field(metadata={"static": True})
     packed: bool = field(metadata={"static": True})
 
@@ -102,7 +102,8 @@ def whole_images(tables: Tables, reduction: int) -> Patches:
     """The whole image of each camera as a window that all drones share, without occlusion."""
     height1, cameras, width1 = tables.shape
     zero, one = jnp.zeros((1, cameras)), jnp.ones((1, cameras))
-    size_wh = ((width1 - 1) * reduction, (height1 - 1) * reduction)
+    sides = ((width1 - 1) * reduction, (height1 - 1) * reduction)
+    size_wh = jnp.full(cameras, sides[0], jnp.float32), jnp.full(cameras, sides[1], jnp.float32)
     return Patches(tables, zero, zero, reduction * one, one, size_wh, reduction, packed=False)
 
 
@@ -158,10 +159,21 @@ def cut(
         y_px=grid.row[..., 0].astype(jnp.float32) * pixel_px,
         pixel_px=pixel_px,
         clear=clear,
-        size_wh_px=(reduction * coverage.shape[2], reduction * coverage.shape[1]),
+        size_wh_px=_covered_px(extents.cameras, coverage.shape, reduction),
         reduction=reduction,
         packed=packed,
     )
+
+
+def _covered_px(
+    cameras: Camera, shape: tuple[int, ...], reduction: int
+) -> tuple[Float[Array, "cameras"], Float[Array, "cameras"]]:
+    """Widths and heights of the images, up to the borders of their silhouettes.
+
+    The silhouettes of a small camera fill only a part of the array, which has the size of the largest ones.
+    """
+    own = reduction * jnp.ceil(jnp.asarray(cameras.image_size_wh, jnp.float32) / reduction)
+    return jnp.minimum(own[:, 0], reduction * shape[2]), jnp.minimum(own[:, 1], reduction * shape[1])
 
 
 def _grid(

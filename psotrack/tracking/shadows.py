@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from psotrack._typing import Array, Coverage, Positions
-from psotrack.geometry import NEAR_M, Boxes, Camera, Extents, distort, project
+from psotrack.geometry import NEAR_M, Boxes, Camera, Extents, project_visible, undistort_approximately
 from psotrack.tracking.occlusion import OCCLUDER_SCALE, Occluders, ellipse_distance2
 
 #: A drone is low if its height above the floor is less than this many times its width.
@@ -33,8 +33,6 @@ _FOREGROUND = 64
 _CELLS = 32
 #: (cells, 2), middles of the cells, from -1 to 1.
 _CELL_XY = (np.stack(np.meshgrid(*[np.arange(_CELLS)] * 2), axis=-1).reshape(-1, 2) + 0.5) * 2 / _CELLS - 1
-#: Iterations that remove lens distortion: each makes the error several times smaller.
-_UNDISTORT_ITERATIONS = 6
 
 
 @jax.tree_util.register_dataclass
@@ -110,7 +108,7 @@ def _dark_cells(
     off_m = half_m[:, None, None] * jnp.asarray(_CELL_XY, jnp.float32)
     xy_m = middle_m[:, None, :] + off_m
     floor_m = jnp.concatenate([xy_m, jnp.full_like(xy_m[..., :1], view.floor_z_m)], axis=-1)
-    pixel, depth = project(view.extents.cameras, floor_m[:, :, None, :])
+    pixel, depth = project_visible(view.extents.cameras, floor_m[:, :, None, :])
     x_px, y_px, depth = (jnp.swapaxes(of, 1, 2) for of in (pixel[..., 0] + 0.5, pixel[..., 1] + 0.5, depth))
     num_cameras, height, width = coverage.shape
     inside = (x_px >= 0) & (y_px >= 0) & (x_px < width * reduction) & (y_px < height * reduction)
@@ -121,7 +119,7 @@ def _dark_cells(
     clear = inside & (depth > NEAR_M) & ~hidden
 
     row, column = (
-        jnp.clip(of, 0, last - 1).astype(jnp.int32)
+        jnp.clip(jnp.nan_to_num(of), 0, last - 1).astype(jnp.int32)
         for of, last in ((y_px / reduction, height), (x_px / reduction, width))
     )
     foreground = coverage[jnp.arange(num_cameras)[:, None], row, column] >= _FOREGROUND
@@ -140,16 +138,15 @@ def _on_floor(
     y_px: Float[Array, "drones cameras *#pixels"],
     floor_z_m: Float[Array, ""],
 ) -> tuple[Float[Array, "drones cameras *pixels"], Float[Array, "drones cameras *pixels"]]:
-    """x and y of the points of the floor that pixels look at; infinite where a pixel looks above the horizon."""
+    """x and y of the points of the floor that pixels look at; infinite where a pixel looks above the horizon, NaN
+    where the lens shows nothing.
+    """
     of_pixels = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None, None], cameras)
     K, R, centre_m = of_pixels.K, of_pixels.T_cam_world[..., :3, :3], of_pixels.centre_world
     v = (y_px - 0.5 - K[..., 1, 2]) / K[..., 1, 1]
     u = (x_px - 0.5 - K[..., 0, 2] - K[..., 0, 1] * v) / K[..., 0, 0]
     if cameras.dist.shape[-1]:
-        distorted_u, distorted_v = u, v = jnp.broadcast_arrays(u, v)
-        for _ in range(_UNDISTORT_ITERATIONS):
-            again_u, again_v = distort(of_pixels, u, v)
-            u, v = u + (distorted_u - again_u), v + (distorted_v - again_v)
+        u, v = undistort_approximately(of_pixels.dist, of_pixels.fisheye, u, v)
     x, y, z = (R[..., 0, i] * u + R[..., 1, i] * v + R[..., 2, i] for i in range(3))
     along = (floor_z_m - centre_m[..., 2]) / jnp.where(jnp.abs(z) < 1e-6, 1e-6, z)
     along = jnp.where(along > 0, along, jnp.inf)

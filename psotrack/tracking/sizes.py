@@ -13,15 +13,18 @@ drones turn.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int, UInt8
 
 from psotrack._typing import Array, Coverage, Positions
-from psotrack.geometry import Boxes, Camera, make_extents, project_boxes
+from psotrack.geometry import Boxes, Camera, Extents, make_extents, project_boxes
+from psotrack.silhouettes import Exposures
 from psotrack.tracking.patches import FULL, ExpectedDrones, Patches, cut
 from psotrack.tracking.shadows import is_low
 
@@ -172,11 +175,11 @@ def learn_sizes(state: SizeState, measured: SizeMeasurements) -> SizeState:
 def measure_sizes(
     coverage: UInt8[Array, "frames cameras height width"],
     position_m: Float[Array, "frames drones 3"],
-    well_seen: Bool[Array, "frames drones"],
     size_m: Positions,
     cameras: Camera,
     program: SizeProgram,
     floor_z_m: Float[Array, ""] | None = None,
+    exposed: tuple[Float[Array, "frames drones 3"], Exposures] | None = None,
 ) -> SizeMeasurements:
     """The size of every drone in every frame.
 
@@ -185,22 +188,31 @@ def measure_sizes(
 
     Args:
         coverage: (frames, cameras, height, width), 0..255, silhouettes reduced by `program.reduction`.
-        position_m: (frames, drones, 3), world, metres; any value where a drone is not well seen.
-        well_seen: (frames, drones), whether a drone was found.
+        position_m: (frames, drones, 3), world, metres; NaN where a drone is not well seen.
         size_m: (drones, 3), present full lengths, metres; the result hardly depends on them within a factor of 1.5.
         cameras: cameras with one leading axis.
         program: windows, ring and reduction.
         floor_z_m: height of the floor, metres. The silhouette of a drone that is low over the floor may contain its
             shadow, so such a drone is not measured.
+        exposed: velocities, (frames, drones, 3), m/s, and exposures of the frames, with which the drones' places in the
+            frames follow; None where all cameras' frames were exposed at the instant.
     """
 
-    def one(frame: tuple[Array, Array, Array]) -> SizeMeasurements:
-        image, position, seen = frame
-        return _measure(
-            image, jnp.where(seen[:, None], position, 0.0), seen, size_m, cameras, program, floor_z_m
-        )
+    def one(frame: tuple[Array, Array, Array, Any]) -> SizeMeasurements:
+        image, position, seen, exposed = frame
+        position = jnp.where(seen[:, None], position, 0.0)
 
-    return jax.lax.map(one, (coverage, position_m, well_seen))
+        def in_cameras(size_m: Array) -> Extents:
+            if exposed is None:
+                return make_extents(cameras, size_m)
+            velocity, exposures = exposed
+            moving = jnp.where(seen[:, None], velocity, 0.0)
+            return exposures.moved(make_extents(exposures.seeing(cameras), size_m), position, moving)
+
+        return _measure(image, position, seen, size_m, in_cameras, program, floor_z_m)
+
+    well_seen = jnp.isfinite(position_m).all(axis=-1)
+    return jax.lax.map(one, (coverage, position_m, well_seen, exposed))
 
 
 def _measure(
@@ -208,15 +220,15 @@ def _measure(
     position_m: Positions,
     well_seen: Bool[Array, "drones"],
     size_m: Positions,
-    cameras: Camera,
+    in_cameras: Callable[[Array], Extents],
     program: SizeProgram,
     floor_z_m: Float[Array, ""] | None,
 ) -> SizeMeasurements:
-    """The sizes that one frame shows."""
+    """The sizes that one frame shows; `in_cameras` gives the extents of drones of some sizes."""
 
     def boxes_of(factors: Float[Array, "2"]) -> Boxes:
         factor = jnp.sqrt(jnp.stack([factors[0], factors[0], factors[1]]))
-        return project_boxes(make_extents(cameras, size_m * factor), position_m)
+        return project_boxes(in_cameras(size_m * factor), position_m)
 
     def squares(factors: Float[Array, "2"]) -> Float[Array, "drones cameras 2"]:
         boxes = boxes_of(factors)
@@ -227,14 +239,14 @@ def _measure(
     design = slope / slope.sum(axis=-1, keepdims=True)
     patches = cut(
         coverage,
-        make_extents(cameras, size_m),
+        in_cameras(size_m),
         # Views in which another drone could occlude the drone do not count.
         ExpectedDrones(position_m, reach_m=jnp.zeros_like(size_m[:, 0])),
         reduction=program.reduction,
         ring=program.ring,
     )
     spread, fill, filled = _moments(patches, boxes, program)
-    counts = _usable_views(boxes, patches, program.ring, well_seen) & (filled >= MIN_FILLED)
+    counts = usable_views(boxes, patches, program.ring, well_seen) & (filled >= MIN_FILLED)
     if floor_z_m is not None:
         counts &= ~is_low(position_m, size_m, floor_z_m)[:, None]
     factors, share = _fit_lengths(design, HALF_PER_STD**2 * spread, counts)
@@ -286,13 +298,13 @@ def _moments(
     return spread, full[..., :-2], full[..., -2]
 
 
-def _usable_views(
+def usable_views(
     boxes: Boxes, patches: Patches, ring: float, well_seen: Bool[Array, "drones"]
 ) -> Bool[Array, "drones cameras"]:
     """Which views show the drone alone and whole: the ring is inside the image, and no other drone is in the ring."""
     width_px, height_px = patches.size_wh_px
 
-    def within(middle: Array, half: Array, length_px: int) -> Array:
+    def within(middle: Array, half: Array, length_px: Array) -> Array:
         return (middle - ring * half >= 0) & (middle + ring * half <= length_px)
 
     def meet(middle: Array, half: Array) -> Array:

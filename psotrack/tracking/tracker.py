@@ -21,8 +21,9 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int, UInt8
 
 from psotrack._typing import Array, Coverage, Key, Positions
-from psotrack.geometry import Camera, make_extents
+from psotrack.geometry import Camera, Extents, make_extents
 from psotrack.motion import MotionParams, MotionState, kalman
+from psotrack.silhouettes import Exposures
 from psotrack.tracking.fitness import (
     Score,
     ScoreInputs,
@@ -201,7 +202,12 @@ def no_track_starts(num_drones: int) -> TrackStarts:
 
 
 def step(
-    state: TrackerState, coverage: Coverage, cameras: Camera, params: TrackerParams, program: Program
+    state: TrackerState,
+    coverage: Coverage,
+    cameras: Camera,
+    params: TrackerParams,
+    program: Program,
+    exposures: Exposures | None = None,
 ) -> tuple[TrackerState, TrackerInfo]:
     """One frame: predict, search, correct.
 
@@ -211,6 +217,7 @@ def step(
         cameras: cameras with one leading axis, float32.
         params: parameters, which may change without a new compilation.
         program: static values, which are compiled in.
+        exposures: when each camera's frame was exposed; None where all were exposed at the instant.
     """
     key_next, key_spread, key_search = jax.random.split(state.key, 3)
     region = _reachable(state, params)
@@ -219,10 +226,11 @@ def step(
     # The motion of a lost drone is not known: it stays where it was lost.
     predicted = kalman.select_drones(was_lost | ~state.present, state.motion, predicted)
     expected = jnp.clip(predicted.apparent_m, region.low, region.high)
-    inputs = _score_inputs(state, coverage, cameras, expected, params, program)
+    extents = _extents(cameras, expected, predicted.velocity_m_s, params, exposures)
+    inputs = _score_inputs(state, coverage, extents, expected, params, program)
     first = _first_particles(key_spread, expected, state, params, program)
     best = _search(key_search, inputs, first, region, params, program)
-    vertex = find_vertex(inputs, best, params.size_m)
+    vertex = find_vertex(inputs, best, params.size_m, None if exposures is None else exposures.share)
     found = jnp.clip(vertex.position_m, region.low, region.high) if program.vertex else best
     fitness = drone_fitness(inputs, found)
     num_cameras = (filled_share(inputs, found) >= MIN_FILLED).sum(axis=-1)
@@ -234,6 +242,8 @@ def step(
     was_found &= near | ~was_lost
     dispersion = _averaged(state.dispersion, vertex.dispersion, was_found)
     covariance = COMMON * dispersion[:, None, None] * vertex.inverse_curvature_m2
+    if exposures is not None:
+        covariance += _displacement_covariance(predicted, vertex.camera_share, exposures)
 
     plausible = kalman.log_likelihood(predicted, found, covariance, params.motion)
     was_found &= ~_displaced(found, was_found, -plausible, params.size_m)
@@ -274,6 +284,7 @@ def track(
     params: TrackerParams,
     program: Program,
     starts: TrackStarts,
+    exposures: Exposures | None = None,
 ) -> tuple[TrackerState, TrackerInfo]:
     """`step` over a chunk of frames, one compiled scan.
 
@@ -284,17 +295,19 @@ def track(
         params: parameters, which may change without a new compilation.
         program: static values, which are compiled in.
         starts: tracks that start in this chunk (see `no_track_starts`).
+        exposures: when each camera's frames were exposed, with an axis of frames; None where all cameras' frames were
+            exposed together, which compiles to a program without displacements.
 
     Returns:
         The state after the last frame, and the info of every frame along a leading axis.
     """
 
     def one(carry: TrackerState, frame: Any) -> tuple[TrackerState, TrackerInfo]:
-        number, silhouettes = frame
+        number, silhouettes, exposed = frame
         started = with_started_tracks(carry, starts, number, params)
-        return step(started, silhouettes, cameras, params, program)
+        return step(started, silhouettes, cameras, params, program, exposed)
 
-    return jax.lax.scan(one, state, (jnp.arange(coverage.shape[0]), coverage))
+    return jax.lax.scan(one, state, (jnp.arange(coverage.shape[0]), coverage, exposures))
 
 
 def with_started_tracks(
@@ -331,19 +344,42 @@ def _without_absent(info: TrackerInfo, present: Bool[Array, "drones"]) -> Tracke
     return replace(known_info, status=jnp.where(present, info.status, Status.LOST))
 
 
+def _extents(
+    cameras: Camera,
+    expected: Positions,
+    velocity_m_s: Positions,
+    params: TrackerParams,
+    exposures: Exposures | None,
+) -> Extents:
+    """The drones' extents as each camera's frame shows them: where the drones are when the frame is exposed."""
+    if exposures is None:
+        return make_extents(cameras, params.size_m)
+    return exposures.moved(make_extents(exposures.seeing(cameras), params.size_m), expected, velocity_m_s)
+
+
+def _displacement_covariance(
+    predicted: MotionState, camera_share: Float[Array, "drones cameras"], exposures: Exposures
+) -> Float[Array, "drones 3 3"]:
+    """Covariance of a measured position that comes from the uncertain velocity between instant and exposures.
+
+    The position is off by the error of the velocity times the cameras' mean offset.
+    """
+    offset_s = (camera_share * exposures.offset_s).sum(axis=-1)
+    return jnp.square(offset_s)[:, None, None] * predicted.covariance[:, 3:6, 3:6]
+
+
 def _score_inputs(
     state: TrackerState,
     coverage: Coverage,
-    cameras: Camera,
+    extents: Extents,
     expected: Positions,
     params: TrackerParams,
     program: Program,
 ) -> ScoreInputs:
     """What the score reads: windows about the expected positions of the drones."""
-    in_cameras = make_extents(cameras, params.size_m)
     patches = cut(
         coverage,
-        in_cameras,
+        extents,
         ExpectedDrones(
             position_m=expected,
             reach_m=REACH_SIGMAS * params.spread_m * _frames_since_found(state, params)[:, 0],
@@ -353,7 +389,7 @@ def _score_inputs(
         reduction=program.reduction,
         ring=program.score.ring,
     )
-    return ScoreInputs(in_cameras, patches, program.score)
+    return ScoreInputs(extents, patches, program.score)
 
 
 def _reachable(state: TrackerState, params: TrackerParams) -> SearchRegion:

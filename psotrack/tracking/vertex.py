@@ -59,20 +59,29 @@ class Vertex:
         position_m: (drones, 3), the vertex, metres; never outside of the grid.
         inverse_curvature_m2: (drones, 3, 3), H^-1: positive definite, and symmetric to rounding in float32.
         dispersion: (drones,), phi of this frame; infinite where no more than one camera sees the drone.
+        camera_share: (drones, cameras), each camera's share of the weight; the shares of all cameras sum to 1.
     """
 
     position_m: Positions
     inverse_curvature_m2: Float[Array, "drones 3 3"]
     dispersion: Float[Array, "drones"]
+    camera_share: Float[Array, "drones cameras"]
 
 
-def find_vertex(inputs: ScoreInputs, position_m: Positions, size_m: Positions) -> Vertex:
+def find_vertex(
+    inputs: ScoreInputs,
+    position_m: Positions,
+    size_m: Positions,
+    information: Float[Array, "cameras"] | None = None,
+) -> Vertex:
     """The vertex of the paraboloid through the scores about the best positions.
 
     Args:
         inputs: what the score reads of the frame.
         position_m: (drones, 3), positions of the largest fitness, metres.
         size_m: (drones, 3), full lengths of the drones, metres.
+        information: (cameras,), share of each camera's information that counts in the covariance; None counts all of
+            it. A frame that several instants show must not shrink the covariance at each of them.
     """
     # In units of the span the curvatures along the three axes can be compared.
     span_m = SPAN * size_m
@@ -81,9 +90,7 @@ def find_vertex(inputs: ScoreInputs, position_m: Positions, size_m: Positions) -
     share = weight / jnp.maximum(weight.sum(axis=-1, keepdims=True), 1e-6)
     slope = jnp.einsum("ik,kdc,dc->dci", jnp.asarray(_SLOPE, score.dtype), score, share)
     curvature = -jnp.einsum("ijk,kdc,dc->dcij", jnp.asarray(_CURVATURE, score.dtype), score, share)
-    bent, axes = jnp.linalg.eigh(curvature.sum(axis=1))
-    bent = jnp.maximum(bent, FLATTEST * jnp.maximum(bent[:, -1:], 1e-6))
-    inverse = jnp.einsum("dik,dk,djk->dij", axes, 1 / bent, axes)
+    inverse = _inverse(curvature.sum(axis=1))
     to_vertex = jnp.clip(jnp.einsum("dij,dj->di", inverse, slope.sum(axis=1)), -1.0, 1.0)
     # Slopes of the single cameras at the common vertex.
     slope = slope - jnp.einsum("dcij,dj->dci", curvature, to_vertex)
@@ -91,8 +98,18 @@ def find_vertex(inputs: ScoreInputs, position_m: Positions, size_m: Positions) -
     # Each camera measures two numbers and the position has three: residuals are smaller than errors.
     cameras = jnp.square(share.sum(axis=-1)) / jnp.maximum(jnp.square(share).sum(axis=-1), 1e-6)
     spread = spread * cameras / jnp.maximum(cameras - 1.5, 0.1)
+    if information is not None:
+        inverse = _inverse((information[:, None, None] * curvature).sum(axis=1))
     return Vertex(
         position_m=position_m + span_m * to_vertex,
         inverse_curvature_m2=span_m[:, :, None] * inverse * span_m[:, None, :],
         dispersion=jnp.where(cameras > 1.5, spread, jnp.inf),
+        camera_share=share,
     )
+
+
+def _inverse(curvature: Float[Array, "drones 3 3"]) -> Float[Array, "drones 3 3"]:
+    """Inverses of curvatures, of which small and negative eigenvalues are raised."""
+    bent, axes = jnp.linalg.eigh(curvature)
+    bent = jnp.maximum(bent, FLATTEST * jnp.maximum(bent[:, -1:], 1e-6))
+    return jnp.einsum("dik,dk,djk->dij", axes, 1 / bent, axes)

@@ -2,7 +2,7 @@
 
 In: arrays of positions, velocities, covariances and status. Out: `Trajectories`; CSV, Parquet and TUM files from which
 the same numbers are read back; the estimated drone that belongs to each reference drone. Other rooms may use every name
-in `__init__.pyi`, and the modules `association` and `tum`.
+in `__init__.pyi`, and the modules `association`, `resampling` and `tum`.
 """
 
 import lazy_loader

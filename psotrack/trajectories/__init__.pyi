@@ -1,5 +1,6 @@
 from .association import GATE_M, UNASSIGNED, fixed_partner_values
 from .files import read_trajectories, write_ambiguity, write_trajectories
+from .resampling import resample
 from .tracks import Arrival, DroneSizes, Tracks, unknown_value
 from .trajectories import Status, Trajectories
 
@@ -13,6 +14,7 @@ __all__ = [
     "Trajectories",
     "fixed_partner_values",
     "read_trajectories",
+    "resample",
     "unknown_value",
     "write_ambiguity",
     "write_trajectories",

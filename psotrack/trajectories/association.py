@@ -37,6 +37,8 @@ class AlignedPair:
         orientation_wxyz: (frames, drones, 4), orientations of the reference drones; NaN if unknown.
         orientation_est_wxyz: (frames, estimates, 4), estimated orientations; NaN if unknown.
         covariance_m2: (frames, estimates, 3, 3), covariances of the estimated positions, m²; NaN if unknown.
+        relative_covariance_m2: (frames, estimates, 3, 3), the same without the error that is constant for a drone;
+            `covariance_m2` if it is not known apart.
         distance_m: (frames, drones, estimates), distances between reference drones and estimates, metres; NaN if one
             of the two is unknown.
     """
@@ -50,6 +52,7 @@ class AlignedPair:
     orientation_wxyz: Float[np.ndarray, "frames drones 4"]
     orientation_est_wxyz: Float[np.ndarray, "frames estimates 4"]
     covariance_m2: Float[np.ndarray, "frames estimates 3 3"]
+    relative_covariance_m2: Float[np.ndarray, "frames estimates 3 3"]
     distance_m: Float[np.ndarray, "frames drones estimates"]
 
     @property
@@ -104,6 +107,13 @@ def align(traj_est: Trajectories, traj_ref: Trajectories) -> AlignedPair:
         orientation_wxyz=orientation_wxyz,
         orientation_est_wxyz=of_estimates(traj_est.orientation_wxyz, 4),
         covariance_m2=of_estimates(traj_est.covariance_m2, 3, 3),
+        relative_covariance_m2=of_estimates(
+            traj_est.covariance_m2
+            if traj_est.relative_covariance_m2 is None
+            else traj_est.relative_covariance_m2,
+            3,
+            3,
+        ),
         distance_m=np.linalg.norm(ref_m[:, :, None] - est_m[:, None], axis=-1),
     )
 

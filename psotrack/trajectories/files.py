@@ -1,8 +1,8 @@
 """Trajectory files: CSV and Parquet tables with one row per frame and drone.
 
-Written files always have the columns of `COLUMNS` in this order, followed by the columns of `COVARIANCE_COLUMNS` if
-covariances are known, so that other programs can rely on them. A file to be read needs only `frame`, `drone` and the
-position; rows and columns may have any order, and further columns are ignored.
+Written files always have the columns of `COLUMNS` in this order, followed by the columns of `COVARIANCE_COLUMNS` and
+`RELATIVE_COLUMNS` if covariances are known, so that other programs can rely on them. A file to be read needs only
+`frame`, `drone` and the position; rows and columns may have any order, and further columns are ignored.
 """
 
 from __future__ import annotations
@@ -45,7 +45,9 @@ COLUMNS = {
 
 #: Further columns if covariances of the positions are known: the upper triangle, row by row.
 COVARIANCE_COLUMNS = dict.fromkeys(("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"), "m2")
-_READ = COLUMNS | COVARIANCE_COLUMNS
+#: The same of covariances without the error that is constant for a drone, if they are known.
+RELATIVE_COLUMNS = dict.fromkeys((f"rel_{name}" for name in COVARIANCE_COLUMNS), "m2")
+_READ = COLUMNS | COVARIANCE_COLUMNS | RELATIVE_COLUMNS
 _REQUIRED = ("frame", "drone", "x_m", "y_m", "z_m")
 _WORDS = ("drone", "status")
 _UPPER = np.triu_indices(3)
@@ -187,9 +189,12 @@ def _to_columns(trajectories: Trajectories) -> dict[str, Shaped[np.ndarray, "row
         "status": labels[status],
     }
     columns = {name: columns[name] for name in COLUMNS}
-    if trajectories.covariance_m2 is not None:
-        upper = np.moveaxis(trajectories.covariance_m2[..., *_UPPER], -1, 0)
-        columns |= dict(zip(COVARIANCE_COLUMNS, upper, strict=True))
+    for names, covariance_m2 in (
+        (COVARIANCE_COLUMNS, trajectories.covariance_m2),
+        (RELATIVE_COLUMNS, trajectories.relative_covariance_m2),
+    ):
+        if covariance_m2 is not None:
+            columns |= dict(zip(names, np.moveaxis(covariance_m2[..., *_UPPER], -1, 0), strict=True))
     return {name: column.ravel() for name, column in columns.items()}
 
 
@@ -330,7 +335,7 @@ def _from_table(table: _Table, fps: float | None) -> Trajectories:
         return grid(*parts, missing=np.nan) if known else None
 
     fitness, num_cameras = optional("fitness"), optional("num_cameras")
-    covariance_m2 = optional(*COVARIANCE_COLUMNS)
+    covariance_m2, relative_m2 = optional(*COVARIANCE_COLUMNS), optional(*RELATIVE_COLUMNS)
     status = np.full(len(frame) * len(names), int(Status.LOST))
     if "status" in columns:
         status[cell] = [_STATUS[word] for word in columns["status"]]
@@ -344,6 +349,7 @@ def _from_table(table: _Table, fps: float | None) -> Trajectories:
         num_cameras=None if num_cameras is None else np.nan_to_num(num_cameras[..., 0]).astype(np.int64),
         status=status.reshape(len(frame), len(names)) if "status" in columns else None,
         covariance_m2=None if covariance_m2 is None else covariance_m2[..., _PLACES],
+        relative_covariance_m2=None if relative_m2 is None else relative_m2[..., _PLACES],
     )
 
 

@@ -50,6 +50,7 @@ class Trajectories:
         num_cameras: (frames, drones), numbers of cameras that see the drone.
         status: (frames, drones), values of `Status`.
         covariance_m2: (frames, drones, 3, 3), covariances of the positions, square metres; symmetric.
+        relative_covariance_m2: (frames, drones, 3, 3), the same without the error that is constant for a drone.
     """
 
     frame: Int[np.ndarray, "frames"]
@@ -62,6 +63,7 @@ class Trajectories:
     num_cameras: Int[np.ndarray, "frames drones"] | None = None
     status: Int[np.ndarray, "frames drones"] | None = None
     covariance_m2: Float[np.ndarray, "frames drones 3 3"] | None = None
+    relative_covariance_m2: Float[np.ndarray, "frames drones 3 3"] | None = None
 
     __repr__ = short_repr
 
@@ -76,6 +78,7 @@ class Trajectories:
             "num_cameras": (frames, drones),
             "status": (frames, drones),
             "covariance_m2": (frames, drones, 3, 3),
+            "relative_covariance_m2": (frames, drones, 3, 3),
         }
         for name, shape in expected.items():
             value = getattr(self, name)
@@ -87,8 +90,9 @@ class Trajectories:
             raise InputError(
                 "trajectories.frame", expected="increasing frame numbers", found="repeats or steps back"
             )
-        if self.covariance_m2 is not None:
-            _check_symmetric(self.covariance_m2)
+        for name in ("covariance_m2", "relative_covariance_m2"):
+            if getattr(self, name) is not None:
+                _check_symmetric(name, getattr(self, name))
 
     @property
     def num_frames(self) -> int:
@@ -136,17 +140,18 @@ class Trajectories:
             num_cameras=rows(self.num_cameras),
             status=rows(self.status),
             covariance_m2=rows(self.covariance_m2),
+            relative_covariance_m2=rows(self.relative_covariance_m2),
         )
 
 
-def _check_symmetric(covariance_m2: Float[np.ndarray, "frames drones 3 3"]) -> None:
+def _check_symmetric(name: str, covariance_m2: Float[np.ndarray, "frames drones 3 3"]) -> None:
     """Raise `InputError` for matrices that are not symmetric up to the rounding of float32 sums; NaN passes."""
     asymmetry_m2 = np.abs(covariance_m2 - np.swapaxes(covariance_m2, -1, -2)).max(axis=(-2, -1))
     wrong = asymmetry_m2 > SYMMETRY * np.abs(covariance_m2).max(axis=(-2, -1))
     if wrong.any():
         row, drone = np.argwhere(wrong)[0]
         raise InputError(
-            "trajectories.covariance_m2",
+            f"trajectories.{name}",
             expected="symmetric matrices",
             found=f"{covariance_m2[row, drone].tolist()} in row {row} of drone {drone}",
         )

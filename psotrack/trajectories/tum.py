@@ -5,6 +5,7 @@ The format is defined by the TUM RGB-D benchmark (Sturm et al., IROS 2012). It h
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -83,6 +84,34 @@ def read_tum(path: Path | str, *, fps: float) -> Trajectories:
     )
 
 
+def read_tum_path(path: Path | str) -> Trajectories:
+    """Read one TUM file with its own times; frames are numbered by line, and the drone has the file's name.
+
+    Raises:
+        InputError: the file cannot be read, a line is not a pose, or times do not increase. The message names file and
+            line.
+    """
+    path = Path(path)
+    lines = _read_lines(path)
+    poses: list[list[float]] = []
+    for place, values in _poses(path, lines):
+        if poses and values[0] <= poses[-1][0]:
+            expected = "times that increase from line to line"
+            raise InputError(place, expected=expected, found=f"{values[0]} s after {poses[-1][0]} s")
+        poses.append(values)
+    if not poses:
+        raise InputError(path, expected="at least one pose", found="none")
+    table = np.array(poses)
+    orientation_wxyz = np.roll(_unit(table[:, 4:]), 1, axis=-1)[:, None]
+    return Trajectories(
+        frame=np.arange(len(table)),
+        time_s=table[:, 0],
+        drones=(path.stem,),
+        position_m=table[:, None, 1:4],
+        orientation_wxyz=None if _UNKNOWN in lines else orientation_wxyz,
+    )
+
+
 def _lines(trajectories: Trajectories, drone: int) -> list[str]:
     seen = trajectories.seen[:, drone]
     orientation = trajectories.orientation_wxyz
@@ -98,27 +127,38 @@ def _lines(trajectories: Trajectories, drone: int) -> list[str]:
 
 def _read_file(path: Path, fps: float) -> tuple[np.ndarray, Float[np.ndarray, "rows 7"]]:
     """Frame numbers, and positions with orientations (x, y, z, w); unknown orientations are NaN."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (UnicodeDecodeError, OSError) as error:
-        raise InputError(path, expected="a readable text file", found=f"{error}") from error
+    lines = _read_lines(path)
     poses: dict[int, list[float]] = {}
-    for number, line in enumerate(lines, start=1):
-        if line.strip() and not line.startswith("#"):
-            place = f"{path}, line {number}"
-            time_s, *pose = _numbers(place, line)
-            frame = round(time_s * fps)
-            if abs(time_s * fps - frame) > 0.1 or frame < 0:
-                raise InputError(place, expected=f"the time of a frame at {fps:g} fps", found=f"{time_s:g} s")
-            if poses.setdefault(frame, pose) is not pose:
-                raise InputError(
-                    place, expected="one line per frame", found=f"a second line for frame {frame}"
-                )
+    for place, (time_s, *pose) in _poses(path, lines):
+        frame = round(time_s * fps)
+        if abs(time_s * fps - frame) > 0.1 or frame < 0:
+            raise InputError(place, expected=f"the time of a frame at {fps:g} fps", found=f"{time_s:g} s")
+        if poses.setdefault(frame, pose) is not pose:
+            raise InputError(place, expected="one line per frame", found=f"a second line for frame {frame}")
     values = np.array([poses[frame] for frame in sorted(poses)]).reshape(-1, 7)
-    values[:, 3:] /= np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
+    values[:, 3:] = _unit(values[:, 3:])
     if _UNKNOWN in lines:
         values[:, 3:] = np.nan
     return np.array(sorted(poses), int), values
+
+
+def _read_lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8").splitlines()
+    except (UnicodeDecodeError, OSError) as error:
+        raise InputError(path, expected="a readable text file", found=f"{error}") from error
+
+
+def _poses(path: Path, lines: list[str]) -> Iterator[tuple[str, list[float]]]:
+    """Yield place and numbers of each line with a pose."""
+    for number, line in enumerate(lines, start=1):
+        if line.strip() and not line.startswith("#"):
+            place = f"{path}, line {number}"
+            yield place, _numbers(place, line)
+
+
+def _unit(quaternions: Float[np.ndarray, "rows 4"]) -> Float[np.ndarray, "rows 4"]:
+    return quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
 
 
 def _numbers(place: str, line: str) -> list[float]:

@@ -12,7 +12,7 @@ COMMANDS = {
     ),
     "convert": LazyCommand(
         "psotrack.cli.calibrate.convert",
-        "Convert a calibration: IN and OUT end in .csv (DPJAIT), .toml (anipose, caliscope) or .yml (OpenCV).",
+        "Convert the calibration IN, of any program in the list below, to OUT.",
     ),
     "extrinsics": LazyCommand(
         "psotrack.cli.calibrate.extrinsics",
@@ -21,6 +21,10 @@ COMMANDS = {
     "intrinsics": LazyCommand(
         "psotrack.cli.calibrate.intrinsics",
         "Estimate a camera's lens from VIDEO, in which a ChArUco board is moved.",
+    ),
+    "rig": LazyCommand(
+        "psotrack.cli.calibrate.rig",
+        "Calibrate a rig from nothing: lenses and places of all cameras, from a board that is moved before them.",
     ),
 }
 
@@ -34,8 +38,9 @@ def calibrate() -> None:
     """Calibrate cameras, and convert calibration files.
 
     \b
-    Lenses:            psotrack calibrate intrinsics a.avi --squares 7x5 --square 0.04 --marker 0.03 --out lens.toml
-    Poses of cameras:  psotrack calibrate extrinsics --pairs pairs.csv --intrinsics lens.toml --out rig.toml
-    From the drones:   psotrack calibrate adjust SEQ --tracks tracks.csv --out better.toml
-    Other programs:    psotrack calibrate convert rig.toml cameras_calibration.csv
+    A rig from nothing: psotrack calibrate rig a.mp4 b.mp4 --squares 7x5 --square 0.04 --marker 0.03 --out rig.toml
+    Lenses:             psotrack calibrate intrinsics a.avi --squares 7x5 --square 0.04 --marker 0.03 --out lens.toml
+    Poses of cameras:   psotrack calibrate extrinsics --pairs pairs.csv --intrinsics lens.toml --out rig.toml
+    From the drones:    psotrack calibrate adjust SEQ --tracks tracks.csv --out better.toml
+    Other programs:     psotrack calibrate convert rig.toml cameras_calibration.csv
     """

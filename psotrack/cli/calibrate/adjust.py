@@ -18,6 +18,7 @@ from psotrack.support import refuse_to_overwrite
 
 if TYPE_CHECKING:
     from psotrack.calibration import DroneViews, Improved
+    from psotrack.doctor import CheckedAdjustment
     from psotrack.geometry import Rig
 
 
@@ -57,7 +58,8 @@ def adjust(
 
     The adjustment uses the middles of SEQ's detections that contain a tracked drone. A middle has an error of about a
     pixel that stays the same for many frames, so that cameras are placed to a centimetre or two. Only cameras whose
-    error is certainly larger are moved. If there is none, OUT is the unchanged rig.
+    error is certainly larger are moved, and only if the moved cameras fit views better that the adjustment did not use:
+    each quarter of the recording is left out in turn. If there is none, OUT is the unchanged rig.
 
     Drones show neither the world's origin nor its axes nor its scale. If most cameras disagree, all cameras are moved,
     and the rig as a whole keeps its origin, axes and scale.
@@ -66,32 +68,31 @@ def adjust(
     Example:
       psotrack calibrate adjust data/Simulated_Data/S02_D4_A --tracks tracks.csv --out better.toml
     """
-    from psotrack.calibration import find_drones_in_boxes, improve
-    from psotrack.datasets.dpjait import read_sequence
-    from psotrack.geometry import write_rig
+    from psotrack.calibration import find_drones_in_boxes
+    from psotrack.datasets import open_recording
+    from psotrack.doctor import improve_with_check
     from psotrack.recordings import read_detections
+    from psotrack.rig_files import write_rig
     from psotrack.trajectories import read_trajectories
 
     refuse_to_overwrite(out, force)
-    recording = read_sequence(sequence)
+    recording = open_recording(sequence)
     if not recording.detections:
         raise InputError(sequence, expected="detections in dl_data", found="none")
     detections = {name: read_detections(path) for name, path in recording.detections.items()}
     flown = read_trajectories(tracks, fps=recording.fps if recording.videos else None)
     views = find_drones_in_boxes(recording.rig, detections, flown)
     held = tuple(name for name in fixed.split(",") if name)
-    improved = improve(
-        recording.rig,
-        views.points_px,
-        views.noise_px if noise_px is None else noise_px,
-        fixed=held,
-        refine_focal_length=refine_focal_length,
-        common_errors=views.common_errors,
+    checked = improve_with_check(
+        recording.rig, views, noise_px, fixed=held, refine_focal_length=refine_focal_length
     )
+    improved = checked.improved
     write_rig(out, improved.rig, force=force)
     rows = _rows(recording.rig, improved, views, held)
     show_cameras(rows, out, quiet, json_path, force)
     print_line(quiet, json_path, _in_words(improved, rows))
+    for line in _check_in_words(checked):
+        print_line(quiet, json_path, line)
     if refine_focal_length:
         scale, std = improved.everything.focal_scale, improved.everything.focal_scale_std
         done = "" if improved.rescaled else ", which may be chance: the focal lengths are not changed"
@@ -122,6 +123,23 @@ def _rows(
         rows[name]["turned_deg"] = float(turned_deg[index])
         rows[name]["verdict"] = "moved" if name in improved.moved else "fixed" if name in held else "agrees"
     return rows
+
+
+def _check_in_words(checked: CheckedAdjustment) -> list[str]:
+    """How the adjustment was checked."""
+    lines = []
+    if checked.uncertain and checked.better:
+        names = ", ".join(checked.uncertain)
+        lines.append(f"{names}: not moved, because lasting errors of the boxes explain the disagreement, too")
+    if checked.left_out_px is not None:
+        before, after = (f"{value:.2f} px" for value in checked.left_out_px)
+        fits = f"{before} with the given rig, {after} with the adjusted one"
+        lines.append(
+            f"views that were left out: median distance {fits}"
+            if checked.better
+            else f"{', '.join(checked.uncertain)}: not moved: views that were left out do not fit better: {fits}"
+        )
+    return lines
 
 
 def _in_words(improved: Improved, rows: dict[str, dict[str, Any]]) -> str:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from psotrack.cli.calibrate.options import SIZE
 from psotrack.cli.options import FORCE, JSON, QUIET
 from psotrack.cli.output import POSITION, format_numbers, output_json, print_line, print_table
+from psotrack.errors import SettingsError
 
-_METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+if TYPE_CHECKING:
+    from psotrack.geometry import Rig
 
 
 @click.command()
@@ -19,11 +22,19 @@ _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 @click.argument("out", metavar="OUT", type=click.Path(path_type=Path))
 @SIZE
 @click.option(
+    "--units",
     "--unit",
-    type=click.Choice(list(_METRES)),
-    default="m",
-    show_default=True,
-    help="Unit of the lengths in IN; a CSV file names its own unit.",
+    "units",
+    metavar="m|cm|mm",
+    help="Unit of the lengths in IN; needed if the format leaves the unit open.",
+)
+@click.option(
+    "--format", "file_format", metavar="NAME", help="Format of IN.  [default: found by the content]"
+)
+@click.option("--to", "out_format", metavar="NAME", help="Format of OUT.  [default: by the name of OUT]")
+@click.option("--lenses", is_flag=True, help="Convert only the lenses; IN need not have poses.")
+@click.option(
+    "--undistorted", is_flag=True, help="Set the distortion to zero: the videos are undistorted already."
 )
 @FORCE
 @QUIET
@@ -32,33 +43,64 @@ def convert(
     source: Path,
     out: Path,
     image_size_wh: tuple[int, int] | None,
-    unit: str,
+    units: str | None,
+    file_format: str | None,
+    out_format: str | None,
+    lenses: bool,
+    undistorted: bool,
     force: bool,
     quiet: bool,
     json_path: Path | None,
 ) -> None:
-    """Convert a calibration: IN and OUT end in .csv (DPJAIT), .toml (anipose, caliscope) or .yml (OpenCV).
+    """Convert the calibration IN, of any program in the list below, to OUT.
+
+    \b
+    Read:    rig (rig.toml), dpjait, anipose, caliscope, pose2sim, opencv, qualisys, vicon, easymocap, kalibr,
+             dlt, argus, handpose3d
+    Written: rig (OUT ends in .toml), dpjait (.csv), opencv (.yml), anipose, caliscope (--to)
+
+    Cameras that IN does not place are left out, with a warning.
 
     \b
     Examples:
-      psotrack calibrate convert calibration.toml cameras_calibration.csv --unit mm
+      psotrack calibrate convert calibration.toml rig.toml --units mm
       psotrack calibrate convert cameras_calibration.csv rig.yml --size 1920,1080
     """
-    from psotrack.geometry import read_rig, write_rig
+    from psotrack.geometry import Rig
+    from psotrack.rig_files import UNITS_M, read_lenses, read_rig, write_lenses, write_rig
 
-    rig = read_rig(source, image_size_wh, metres_per_unit=_METRES[unit])
-    write_rig(out, rig, force=force)
+    if units is not None and units not in UNITS_M:
+        raise SettingsError("--units", expected=f"one of {', '.join(UNITS_M)}", found=units)
+    if lenses:
+        rig = read_lenses(source, image_size_wh, file_format=file_format)
+    else:
+        metres = None if units is None else UNITS_M[units]
+        rig = read_rig(source, image_size_wh, metres_per_unit=metres, file_format=file_format)
+    if undistorted:
+        rig = Rig(rig.names, replace(rig.cameras, dist=rig.cameras.dist[:, :0], fisheye=None))
+    if lenses:
+        write_lenses(out, rig, force=force)
+    else:
+        write_rig(out, rig, force=force, file_format=out_format)
+    _show(rig, out, quiet, json_path, force, placed=not lenses)
+
+
+def _show(rig: Rig, out: Path, quiet: bool, json_path: Path | None, force: bool, *, placed: bool) -> None:
     rows: dict[str, dict[str, Any]] = {
-        name: {"centre_m": centre.tolist(), "focal_length_px": float(K[0, 0])}
+        name: ({"centre_m": centre.tolist()} if placed else {}) | {"focal_length_px": float(K[0, 0])}
         for name, centre, K in zip(rig.names, rig.cameras.centre_world, rig.cameras.K, strict=True)
     }
     output_json(json_path, {"rig": str(out), "cameras": rows}, force)
     print_table(
         quiet,
         json_path,
-        ("camera", POSITION, "f (px)"),
+        ("camera", *((POSITION,) if placed else ()), "f (px)"),
         (
-            (name, format_numbers(row["centre_m"], 3), f"{row['focal_length_px']:.1f}")
+            (
+                name,
+                *((format_numbers(row["centre_m"], 3),) if placed else ()),
+                f"{row['focal_length_px']:.1f}",
+            )
             for name, row in rows.items()
         ),
     )

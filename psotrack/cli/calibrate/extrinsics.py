@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
 
+from psotrack.cli.calibrate.located import locate_cameras
 from psotrack.cli.calibrate.options import OUT, SIZE, noise_option
-from psotrack.cli.calibrate.shown import row_of, show_cameras
+from psotrack.cli.calibrate.shown import show_cameras
 from psotrack.cli.options import FORCE, FOV, JSON, QUIET, Numbers, dictionary_option
 from psotrack.errors import InputError, SettingsError
 from psotrack.support import refuse_to_overwrite
@@ -83,8 +82,8 @@ def extrinsics(
       psotrack calibrate extrinsics --pairs pairs.csv --points points.csv --fov 92.4,60.8 --size 1920,1080 --out rig.yml
       psotrack calibrate extrinsics --markers data/Simulated_Data/S01_D2_A --intrinsics rig.toml --out found.toml
     """
-    from psotrack.calibration import locate_camera, read_image_points
-    from psotrack.geometry import Camera, make_rig, write_rig
+    from psotrack.calibration import read_image_points
+    from psotrack.rig_files import write_rig
 
     if (pairs is None) == (markers is None):
         found = "neither" if pairs is None else "both"
@@ -92,22 +91,7 @@ def extrinsics(
     refuse_to_overwrite(out, force)
     marks = read_image_points(pairs, points) if pairs else _find_markers(Path(str(markers)), dictionary)
     lenses = _lenses(list(marks), **lens)
-    cameras: dict[str, Camera] = {}
-    rows: dict[str, dict[str, Any]] = {}
-    for name, of_camera in marks.items():
-        one = lenses[name]
-        located = locate_camera(
-            of_camera.points_m, of_camera.points_px, one.K, one.dist, noise_px, name=f"camera {name}"
-        )
-        cameras[name] = replace(one, T_cam_world=located.T_cam_world)
-        rows[name] = row_of(
-            np.asarray(cameras[name].centre_world),
-            located.centre_covariance_m2,
-            located.residual_px,
-            located.used,
-            of_camera.points,
-        )
-    rig = make_rig(cameras)
+    rig, rows = locate_cameras(marks, lenses, noise_px)
     write_rig(out, rig, force=force)
     show_cameras(rows, out, quiet, json_path, force)
 
@@ -123,7 +107,7 @@ def _lenses(
 ) -> Mapping[str, Any]:
     """Lens of each camera, by name, from intrinsics, fields of view, or focal length and sensor."""
     from psotrack.calibration import lens_of_sensor, lens_of_view
-    from psotrack.geometry import read_lenses
+    from psotrack.rig_files import read_lenses
 
     given = [value is not None for value in (intrinsics, fov_deg, focal_length_mm)]
     if sum(given) != 1 or (focal_length_mm is None) != (sensor_mm is None):
@@ -154,9 +138,9 @@ def _lenses(
 def _find_markers(folder: Path, dictionary: str) -> dict[str, ImagePoints]:
     """Corners of the markers in the videos of a sequence, by camera."""
     from psotrack.calibration import find_markers
-    from psotrack.datasets.dpjait import MARKER_CORNERS, read_sequence
+    from psotrack.datasets import find_marker_corners, open_recording
     from psotrack.inside_out import read_marker_map
 
-    corners_m = read_marker_map(folder / MARKER_CORNERS).corners_m
-    videos = read_sequence(folder).videos
+    corners_m = read_marker_map(find_marker_corners(folder)).corners_m
+    videos = open_recording(folder).videos
     return {name: find_markers(video, corners_m, dictionary) for name, video in videos.items()}

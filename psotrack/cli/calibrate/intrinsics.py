@@ -12,6 +12,9 @@ from psotrack.cli.options import FORCE, JSON, QUIET, Size, dictionary_option
 from psotrack.cli.output import output_json, print_line, print_table
 from psotrack.support import refuse_to_overwrite
 
+#: Names of the distortion coefficients in OpenCV's order.
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
+
 
 @click.command()
 @click.argument("video", type=click.Path(path_type=Path))
@@ -21,6 +24,14 @@ from psotrack.support import refuse_to_overwrite
 @click.option("--square", "square_m", type=float, required=True, help="Side of a square in metres.")
 @click.option("--marker", "marker_m", type=float, required=True, help="Side of a marker in metres.")
 @dictionary_option("4x4_50")
+@click.option(
+    "--lens",
+    "coefficients",
+    type=click.Choice(["4", "5", "8", "12", "14"]),
+    default="4",
+    show_default=True,
+    help="Number of distortion coefficients, in OpenCV's order; for a fisheye see calibrate rig.",
+)
 @click.option("--name", help="Name of the camera.  [default: the video's name]")
 @OUT
 @FORCE
@@ -32,6 +43,7 @@ def intrinsics(
     square_m: float,
     marker_m: float,
     dictionary: str,
+    coefficients: str,
     name: str | None,
     out: Path,
     force: bool,
@@ -47,15 +59,19 @@ def intrinsics(
       psotrack calibrate intrinsics board.avi --squares 7x5 --square 0.04 --marker 0.03 --out lens.toml
     """
     from psotrack.calibration import Board, lens_of_board
-    from psotrack.geometry import make_rig, write_rig
+    from psotrack.geometry import make_rig
     from psotrack.recordings import probe
+    from psotrack.rig_files import write_lenses, write_rig
 
     refuse_to_overwrite(out, force)
-    lens = lens_of_board(probe(video), Board(squares_wh, square_m, marker_m, dictionary))
-    write_rig(out, make_rig({name or video.stem: lens.camera}), force=force)
+    board = Board(squares_wh, square_m, marker_m, dictionary)
+    lens = lens_of_board(probe(video), board, int(coefficients))
+    # A rig.toml can say that the camera's place is not known; the other formats place it at the origin.
+    write = write_lenses if out.suffix.lower() == ".toml" else write_rig
+    write(out, make_rig({name or video.stem: lens.camera}), force=force)
     K, dist = lens.camera.K, lens.camera.dist
     values = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *dist]
-    names = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2")
+    names = ("fx_px", "fy_px", "cx_px", "cy_px", *_COEFFICIENTS[: int(coefficients)])
     content = {
         "lens": str(out),
         "values": {key: float(value) for key, value in zip(names, values, strict=True)},

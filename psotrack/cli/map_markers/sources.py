@@ -19,7 +19,7 @@ def known_corners(
     known: str | None, table: Path | None, side_m: float | None, sources: tuple[Path, ...]
 ) -> dict[int, np.ndarray]:
     """Corners of the known markers, (4, 3) in metres, by id."""
-    from psotrack.datasets.dpjait import MARKER_CORNERS
+    from psotrack.datasets import find_marker_corners
     from psotrack.inside_out import corners_in_own_frame, read_marker_map
 
     words = [word.strip() for word in (known or "").split(",") if word.strip()]
@@ -27,8 +27,8 @@ def known_corners(
         expected = "numbers of markers that are known, such as 7 or 7,12"
         raise SettingsError("--known", expected=expected, found=known or "none")
     ids = list(dict.fromkeys(map(int, words)))
-    if table is None and side_m is None and sources[0].is_dir():
-        table = sources[0] / MARKER_CORNERS
+    if table is None and side_m is None and is_recording(sources[0]):
+        table = find_marker_corners(sources[0])
     if table is not None:
         marker_map = read_marker_map(table)
         missing = [marker for marker in ids if marker not in marker_map]
@@ -67,13 +67,18 @@ class Lenses:
         )
 
 
+def is_recording(source: Path) -> bool:
+    """Whether a source is a recording, and not a video."""
+    return source.is_dir() or source.suffix.lower() == ".toml"
+
+
 def videos_of(
     sources: tuple[Path, ...], drones: str | None, lenses: Lenses
 ) -> dict[str, tuple[VideoInfo, Camera]]:
     """Videos with their lenses, by name."""
     from psotrack.recordings import probe
 
-    if sources[0].is_dir():
+    if is_recording(sources[0]):
         if len(sources) > 1:
             raise SettingsError("SOURCE", expected="one sequence, or videos", found=f"{len(sources)} sources")
         return _of_sequence(sources[0], drones, lenses)
@@ -86,10 +91,10 @@ def videos_of(
 
 
 def _of_sequence(folder: Path, drones: str | None, lenses: Lenses) -> dict[str, tuple[VideoInfo, Camera]]:
-    from psotrack.datasets.dpjait import read_sequence
+    from psotrack.datasets import open_recording
     from psotrack.inside_out import lens_from_matrix
 
-    onboard = read_sequence(folder).onboard or {}
+    onboard = open_recording(folder).onboard or {}
     if not onboard:
         raise InputError(
             folder, expected="videos of drones' own cameras, such as dron1_cam_s.avi", found="none"

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from psotrack.clocks import Offset, find_offset, time_shift
 from psotrack.geometry import rotation_matrices
 from psotrack.inside_out.camera_path import CameraPath
-from psotrack.trajectories import GATE_M, Status, Trajectories
+from psotrack.trajectories import GATE_M, Status, Trajectories, resampling
 
 #: Function from the offset of the positions' clock to the body's orientations at the samples of its positions,
 #: (samples, 4). The offset is None before it is known. The result is None where orientations are not used or unknown.
@@ -134,7 +134,7 @@ def interpolate_orientations(
         return found
     sample_s = time_s[known]
     arcs = Slerp(sample_s, Rotation.from_quat(orientation_wxyz[known], scalar_first=True))
-    inside = time_shift.between_samples(sample_s, wanted_s, time_shift.longest_gap_s(time_s))
+    inside = resampling.between_samples(sample_s, wanted_s, resampling.longest_gap_s(time_s))
     at_s = np.clip(wanted_s[inside], sample_s[0], sample_s[-1])
     found[inside] = arcs(at_s).as_quat(scalar_first=True)
     return found

@@ -136,7 +136,7 @@ def compare_paths(
     """Compare a path with a reference of any rate, whose clocks differ from the video's.
 
     Between samples of the reference, positions are cubic splines and orientations great arcs, but not over gaps longer
-    than `time_shift.MAX_GAP_S`. Lost poses are left out; all others count, even if they are wrong.
+    than `resampling.MAX_GAP_S`. Lost poses are left out; all others count, even if they are wrong.
 
     Args:
         path: path at the times of the video.

@@ -106,7 +106,10 @@ def _fit_corners(
         for each in (transitions.offset, transitions.spread, transitions.height)
     )
     points_px = places_px + offset[..., None] * steps_px
-    lines = _fit_lines(undistort_pixels(points_px, lens), height)
+    points = undistort_pixels(points_px, lens)
+    # Beside a marker at the border of what the lens shows, some points have no place without distortion.
+    is_shown = np.isfinite(points).all(axis=-1)
+    lines = _fit_lines(np.where(is_shown[..., None], points, 0.0), np.where(is_shown, height, 0.0))
     return distort_pixels(_intersections(*lines), lens), np.median(spread, axis=-1) * reach_px
 
 

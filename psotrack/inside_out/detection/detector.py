@@ -18,6 +18,7 @@ from psotrack.detection import marker_dictionary
 from psotrack.errors import SettingsError
 from psotrack.geometry import Camera
 from psotrack.inside_out.detection.corners import refine_corners
+from psotrack.inside_out.detection.distortion import undistort_pixels
 
 #: Longer side, in pixels, near which images are searched: larger images are shrunk by the whole number that comes
 #: nearest. Corners are then refined in the full image.
@@ -106,7 +107,8 @@ class MarkerDetector:
         self._dictionary = cv2.aruco.Dictionary(
             np.ascontiguousarray(whole.bytesList[self._ids]), whole.markerSize, whole.maxCorrectionBits
         )
-        self._lens = lens if lens is not None and np.any(lens.dist) else None
+        is_bent = lens is not None and (np.any(lens.dist) or bool(lens.fisheye))
+        self._lens = lens if is_bent else None
 
     def detect(self, gray: UInt8[np.ndarray, "height width"]) -> DetectedMarkers:
         """Detect the markers in an image, (height, width); empty if there are none."""
@@ -120,7 +122,9 @@ class MarkerDetector:
         corners_px = (np.concatenate(quads).reshape(-1, 4, 2) + 0.5) * scale - 0.5
         found = DetectedMarkers(self._ids[which.ravel()], corners_px)
         _, inverse, count = np.unique(found.ids, return_inverse=True, return_counts=True)
-        found = found.select((count[inverse] == 1) & _valid_quads(found.corners_px))
+        # A marker that reaches beyond what the lens model shows has no place without distortion.
+        is_shown = np.isfinite(undistort_pixels(found.corners_px, self._lens)).all(axis=(1, 2))
+        found = found.select((count[inverse] == 1) & _valid_quads(found.corners_px) & is_shown)
         corners_px = refine_corners(gray, found.corners_px, self._white_cells(found.ids), self._lens)
         return DetectedMarkers(found.ids, corners_px).select(_valid_quads(corners_px))
 

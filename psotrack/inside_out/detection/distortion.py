@@ -16,6 +16,9 @@ def undistort_pixels(
     Args:
         points_px: (*points, 2), pixels in the image of the lens.
         lens: intrinsics and distortion; None for a lens without distortion, which returns the points unchanged.
+
+    Returns:
+        (*points, 2), pixels; NaN where the lens model shows nothing.
     """
     if lens is None:
         return points_px

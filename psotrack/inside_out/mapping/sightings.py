@@ -182,6 +182,8 @@ def square_poses(
         of_lens = np.flatnonzero(lens_of == index)
         normalised = undistort(lens, sightings.corners_px[of_lens])
         for row, corners in zip(of_lens.tolist(), normalised, strict=True):
+            if not np.isfinite(corners).all():
+                continue
             try:
                 _, turns, shifts, _ = cv2.solvePnPGeneric(
                     side_m * SQUARE, corners, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE

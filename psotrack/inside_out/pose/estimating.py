@@ -8,10 +8,11 @@ Likelihoods, and the pose that motion predicts, decide which of the fitted poses
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from math import comb, log, pi
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError
@@ -55,6 +56,12 @@ def estimate_pose(
     """
     if not (np.isfinite(corners_px).all() and np.isfinite(corners_m).all()):
         raise InputError("corners", expected="finite coordinates", found="NaN or infinity")
+    rays = undistort(lens, np.asarray(corners_px, np.float64))
+    is_shown = np.isfinite(rays).all(axis=(1, 2))
+    if not is_shown.all():
+        # A marker where the lens model shows nothing counts as not seen.
+        pose = estimate_pose(corners_px[is_shown], corners_m[is_shown], lens, settings, expected)
+        return None if pose is None else _among_all(pose, is_shown)
     if len(corners_px) < settings.min_markers:
         return None
     corners = seen_markers(
@@ -66,7 +73,7 @@ def estimate_pose(
         settings.map_error_m,
         settings.focal_error,
     )
-    poses = _likely_poses(corners, undistort(lens, corners.corners_px))
+    poses = _likely_poses(corners, rays)
     # One or two of many markers may agree by chance, because every single marker has a pose that explains this marker.
     poses = [pose for pose in poses if pose.used.sum() >= min(_ENOUGH_MARKERS, len(corners_px) / 2)]
     if not poses:
@@ -84,6 +91,17 @@ def estimate_pose(
         best.common,
         _chance(corners, best),
     )
+
+
+def _among_all(pose: MarkerPose, is_shown: Bool[np.ndarray, " markers"]) -> MarkerPose:
+    """The pose from some of the markers as a pose from all markers; the others are unused and have no errors."""
+    used = np.zeros(len(is_shown), bool)
+    used[is_shown] = pose.used
+    if not pose.common.size:
+        return replace(pose, used=used)
+    common = np.zeros((6, 3 * len(is_shown) + 1))
+    common[:, np.append(np.repeat(is_shown, 3), True)] = pose.common
+    return replace(pose, used=used, common=common)
 
 
 def _chance(corners: SeenCorners, best: Fit) -> float:

@@ -1,6 +1,7 @@
 """Frames of static cameras: drones, shadows and mirror images are drawn over the backdrop, then the sensor is applied.
 
-Only windows around drones and their mirror images are drawn in each frame.
+Only windows around drones and their mirror images are drawn in each frame. A lens with distortion is drawn as one or
+more views without distortion, from which its image is put together before the sensor is applied.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from jaxtyping import UInt8
 
 from psotrack.simulation.imaging import backdrop, reflections, sensor
 from psotrack.simulation.imaging.backdrop import Backdrop, lens_blur
+from psotrack.simulation.imaging.lens_image import LensImage, lens_image
 from psotrack.simulation.imaging.posing import PosedDrone, average, margin_px, pass_samples, pose, windows
 from psotrack.simulation.imaging.raster import Pinhole, RasterView, full_view, pinhole
 from psotrack.simulation.imaging.reflections import Mirror
@@ -20,19 +22,56 @@ Image = UInt8[np.ndarray, "height width 3"]
 
 
 class CameraRenderer:
-    """Draws the frames of one static camera of a scene; the parts that all frames share are drawn once."""
+    """Draws the frames of one static camera of a scene; the parts that all frames share are drawn once.
+
+    Attributes:
+        scene: the scene.
+        cam: the camera without its distortion; its size is that of the images.
+        lens: how the image is put together from several views; None for a lens without distortion.
+        views: views without distortion; for a lens without distortion the only view is the image.
+        backdrop, mirror, shadows: parts of the first view.
+        sensor: the sensor.
+    """
 
     def __init__(self, scene: Scene, camera_index: int) -> None:
+        imaging, camera = scene.scenario.imaging, scene.rig.cameras[camera_index]
+        self.scene = scene
+        self.cam: Pinhole = pinhole(camera)
+        is_fisheye = camera.fisheye is not None and bool(camera.fisheye)
+        self.lens: LensImage | None = lens_image(camera) if is_fisheye or camera.dist.any() else None
+        self.views = [View(scene, cam) for cam in ([self.cam] if self.lens is None else self.lens.faces)]
+        self.backdrop, self.mirror = self.views[0].backdrop, self.views[0].mirror
+        self.shadows = self.views[0].shadows
+        self.sensor = sensor.Sensor(imaging, scene.seed, camera_index, (self.cam.height, self.cam.width))
+
+    def clean_frame(self, frame: int) -> Image:
+        """(height, width, 3), BGR image of a frame without the effects of the sensor."""
+        images = [view.clean_frame(frame) for view in self.views]
+        return images[0] if self.lens is None else self.lens.assemble(images)
+
+    def empty_room(self) -> Image:
+        """(height, width, 3), BGR image of the room without drones and without the effects of the sensor."""
+        images = [view.empty_room() for view in self.views]
+        return images[0] if self.lens is None else self.lens.assemble(images)
+
+    def frame(self, frame: int) -> Image:
+        """(height, width, 3), BGR image of a frame from the sensor, before the codec."""
+        return self.sensor.expose(self.clean_frame(frame), frame, self.scene.time_s(frame))
+
+
+class View:
+    """Draws the frames of one camera without distortion, without the effects of the sensor."""
+
+    def __init__(self, scene: Scene, cam: Pinhole) -> None:
         imaging = scene.scenario.imaging
         self.scene = scene
-        self.cam: Pinhole = pinhole(scene.rig.cameras[camera_index])
+        self.cam = cam
         self.backdrop: Backdrop = backdrop.render(scene.room, self.cam, imaging)
         self.mirror: Mirror | None = None
         if imaging.reflections:
             self.mirror = reflections.mirror(scene.room, self.cam, imaging, self.backdrop)
             self.backdrop = self.mirror.on(self.backdrop)
         self.shadows = FloorShadows(scene, self.cam, self.backdrop, self.mirror)
-        self.sensor = sensor.Sensor(imaging, scene.seed, camera_index, self.backdrop.depth_m.shape)
         self._clean: Image = sensor.develop(self.backdrop.light)
         self._samples = pass_samples(imaging)
 
@@ -50,9 +89,9 @@ class CameraRenderer:
             self._draw_drones(image, window, drones)
         return image
 
-    def frame(self, frame: int) -> Image:
-        """(height, width, 3), BGR image of a frame from the sensor, before the codec."""
-        return self.sensor.expose(self.clean_frame(frame), frame, self.scene.time_s(frame))
+    def empty_room(self) -> Image:
+        """(height, width, 3), BGR image of the room without drones."""
+        return self._clean.copy()
 
     def _draw_drones(self, image: Image, window: RasterView, drones: list[PosedDrone]) -> None:
         seen = average(window, drones, self._samples, self.backdrop.depth_m[window.slices])

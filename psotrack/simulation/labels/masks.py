@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from psotrack.simulation.imaging.lens_image import LensImage
 from psotrack.simulation.imaging.raster import (
     NEAR_M,
     Pinhole,
@@ -82,6 +85,47 @@ def silhouettes(
         Silhouette(drone.number, drone.window, mask, drone.whole_px)
         for drone, mask in zip(in_image, seen, strict=True)
     ]
+
+
+def lens_silhouettes(
+    scene: Scene,
+    cam: Pinhole,
+    lens: LensImage,
+    backdrops_depth_m: Sequence[Float[np.ndarray, "_ _"]],
+    frame: int,
+) -> list[Silhouette]:
+    """Silhouettes of the drones in the image of a lens with distortion, as from `silhouettes`.
+
+    Args:
+        scene: the scene.
+        cam: the camera without its distortion.
+        lens: the image of the lens.
+        backdrops_depth_m: for each face of the lens (height, width), depth of the room.
+        frame: number of the frame.
+    """
+    by_face = [
+        {drone.number: drone for drone in silhouettes(scene, face, depth_m, frame)}
+        for face, depth_m in zip(lens.faces, backdrops_depth_m, strict=True)
+    ]
+    found = []
+    for number in sorted(set().union(*by_face)):
+        masks, share, whole_px = [], 0.0, 0
+        for drones, face, used in zip(by_face, lens.faces, lens.used, strict=True):
+            drone = drones.get(number)
+            mask = np.zeros((face.height, face.width), bool) if drone is None else drone.mask() & used
+            masks.append(mask.astype(np.uint8))
+            if drone is not None and drone.whole_px:
+                share += np.count_nonzero(mask) / drone.whole_px
+                whole_px = max(whole_px, drone.whole_px)
+        whole = lens.assemble(masks, cv2.INTER_NEAREST)
+        x, y, width, height = cv2.boundingRect(whole)
+        window = RasterView(cam, x, y, width, height)
+        seen = whole[window.slices].astype(bool)
+        if share > 0:
+            # The lens changes the area of the whole drone as it changes the area of the visible part.
+            whole_px = round(np.count_nonzero(seen) / min(share, 1.0))
+        found.append(Silhouette(number, window, seen, whole_px))
+    return found
 
 
 @dataclass(frozen=True)

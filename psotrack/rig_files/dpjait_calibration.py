@@ -16,14 +16,14 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.geometry.camera_names import camera_key
-from psotrack.geometry.cameras import Camera, Rig, make_camera, make_rig
+from psotrack.geometry import Camera, Rig, camera_key, make_camera, make_rig
 from psotrack.support import Column, Table, TextRow, read_table, write_rows
 
 #: Units of lengths in the headers of the dataset's tables.
 METRES_PER_UNIT = {"m": 1.0, "mm": 1e-3}
 _RADIANS_PER_UNIT = {"rad": 1.0, "": 1.0, "deg": np.pi / 180}
 _MOST_COEFFICIENTS = 4
+_ADVICE = "write rig.toml, which holds every lens"
 
 
 def read_camera_names(path: Path | str) -> tuple[str, ...]:
@@ -117,13 +117,20 @@ def _calibration_row(rig: Rig, index: int, unit: str, num_coefficients: int) -> 
 
 
 def _check_writable(rig: Rig) -> None:
+    if rig.cameras.fisheye is not None and np.any(rig.cameras.fisheye):
+        raise SettingsError("rig", expected="no fisheye", found="a fisheye", remedy=_ADVICE)
     K = rig.cameras.K
     if np.any(K[:, 0, 0] != K[:, 1, 1]) or np.any(K[:, 0, 1]):
         raise SettingsError(
-            "rig", expected="one focal length per camera and no skew", found="cameras with other intrinsics"
+            "rig",
+            expected="one focal length per camera and no skew",
+            found="cameras with other intrinsics",
+            remedy=_ADVICE,
         )
     if rig.cameras.dist[:, _MOST_COEFFICIENTS:].any():
-        raise SettingsError("rig", expected="distortion by k1, k2, p1, p2 alone", found="more coefficients")
+        raise SettingsError(
+            "rig", expected="distortion by k1, k2, p1, p2 alone", found="more coefficients", remedy=_ADVICE
+        )
 
 
 def _intrinsics(table: Table, row: TextRow) -> Float[np.ndarray, "3 3"]:

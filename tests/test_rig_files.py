@@ -6,7 +6,8 @@ import pytest
 from helpers import LENSES, assert_same, ring_rig
 
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.geometry import Rig, make_rig, project, read_lenses, read_rig, write_rig
+from psotrack.geometry import Rig, make_rig, project
+from psotrack.rig_files import read_lenses, read_rig, write_lenses, write_rig
 
 #: File as anipose 1.1 writes it: tables cam_0 ..., lengths in the board's unit.
 ANIPOSE = """[cam_0]
@@ -81,12 +82,13 @@ def with_names(rig, *names):
 
 
 @pytest.mark.parametrize("coefficients", sorted(LENSES))
-@pytest.mark.parametrize("file", ["rig.yml", "rig.yaml", "rig.toml", "camera_array.toml"])
+@pytest.mark.parametrize("file", ["rig.yml", "rig.yaml", "rig.toml", "camera_array.toml", "anipose"])
 def test_a_rig_is_read_as_it_was_written(tmp_path, file, coefficients):
     # Eleven cameras, whose tables must not be sorted as text. Three names that need care: a serial number, a word of
     # YAML, and characters that must be quoted.
     rig = with_names(ring_rig(11, coefficients=coefficients), "60881257", "true", 'a "b" \\ é: #')
-    write_rig(tmp_path / file, rig)
+    file, file_format = ("calibration.toml", "anipose") if file == "anipose" else (file, None)
+    write_rig(tmp_path / file, rig, file_format=file_format)
     back = read_rig(tmp_path / file)
     assert back.names == rig.names
     # Exact, except rotations that are stored as Rodrigues vectors: some roundings of numbers up to 1.
@@ -136,13 +138,12 @@ def test_a_file_of_anipose(tmp_path):
     np.testing.assert_allclose(project(rig.cameras[0], point_m)[0], expected[0, 0], atol=1e-9)
 
 
-def test_a_file_of_caliscope(tmp_path):
+def test_a_file_of_caliscope(tmp_path, caplog):
     path = tmp_path / "camera_array.toml"
     path.write_text(CALISCOPE)
-    with pytest.raises(
-        InputError, match=r"camera_array\.toml, cameras\.2\.rotation or R or rvec: .*, found none"
-    ):
-        read_rig(path)
+    with caplog.at_level("WARNING"):
+        assert read_rig(path).names == ("0",)
+    assert "no pose: camera 2" in caplog.text
     lenses = read_lenses(path)
     assert lenses.names == ("0", "2")
     np.testing.assert_array_equal(lenses.cameras.T_cam_world, np.tile(np.eye(4), (2, 1, 1)))
@@ -161,8 +162,102 @@ def test_a_file_of_opencvs_sample(tmp_path):
     np.testing.assert_array_equal(lenses.cameras.K[0], [[650, 0, 320], [0, 650, 240], [0, 0, 1]])
     np.testing.assert_array_equal(lenses.cameras.dist[0], [0.25, -0.5, 0, 0, 0.125])
     np.testing.assert_array_equal(lenses.cameras.image_size_wh[0], [640, 480])
-    with pytest.raises(InputError, match=r"left\.yml, camera\.rotation or R or rvec"):
+    with pytest.raises(
+        InputError, match=r"left\.yml: expected the poses of cameras, found none; .*extrinsics"
+    ):
         read_rig(path)
+
+
+#: File as a user writes it by hand.
+RIG_TOML = """[cameras.left]
+size = [1920, 1080]
+K = [[1160.2, 0, 961.0], [0, 1160.9, 541.2], [0, 0, 1]]
+distortion = [-0.28, 0.09, 0, 0, 0.01]
+rvec = [1.2, -0.4, 0.3]
+tvec = [0.1, 0.2, 5.0]
+"""
+
+
+def test_a_rig_toml_projects_as_opencv_does(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG_TOML)
+    rig = read_rig(path)
+    K, dist = rig.cameras.K[0], np.array([-0.28, 0.09, 0, 0, 0.01])
+    point_m = np.array([0.3, -0.2, 1.1])
+    expected = cv2.projectPoints(
+        point_m[None], np.array([1.2, -0.4, 0.3]), np.array([0.1, 0.2, 5.0]), K, dist
+    )[0]
+    np.testing.assert_allclose(project(rig.cameras[0], point_m)[0], expected[0, 0], atol=1e-9)
+
+
+def test_a_camera_of_a_rig_toml_without_a_place_is_left_out(tmp_path, caplog):
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG_TOML + RIG_TOML.replace("left", "right").partition("rvec")[0])
+    assert read_rig(path).names == ("left",)
+    assert "no pose: camera right" in caplog.text
+    assert read_lenses(path).names == ("left", "right")
+
+
+def test_lenses_are_written_without_poses(tmp_path):
+    rig = ring_rig(2, coefficients=5)
+    write_lenses(tmp_path / "lenses.toml", rig)
+    np.testing.assert_array_equal(read_lenses(tmp_path / "lenses.toml").cameras.K, rig.cameras.K)
+    with pytest.raises(InputError, match="expected the poses of cameras, found none"):
+        read_rig(tmp_path / "lenses.toml")
+    with pytest.raises(InputError, match=r"ends in \.toml, for lenses without poses"):
+        write_lenses(tmp_path / "lenses.yml", rig)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("size =", "szie ="), r"cameras\.left\.szie: expected one of size, .*; did you mean size\?"),
+        (
+            ("[cameras.left]", "version = 2\n[cameras.left]"),
+            r"rig\.toml, version: expected 1, found 2; use a newer",
+        ),
+        (("rvec", 'model = "omni"\nrvec'), r"cameras\.left\.model: expected opencv or fisheye, found omni"),
+        (("K = [[1160.2, 0,", "K = [[1160.2,"), r"cameras\.left\.K: expected 3 x 3 numbers"),
+        (
+            ("tvec = [0.1, 0.2, 5.0]", ""),
+            r"cameras\.left\.tvec: expected 3 numbers, as for rvec",
+        ),
+        (
+            ("distortion = [", "distortion = [1,"),
+            r"left\.distortion: expected 0, 4, .* found 6",
+        ),
+        (("size = [1920, 1080]", ""), r"cameras\.left\.size or image_size: .* found none; pass --size"),
+    ],
+)
+def test_a_damaged_rig_toml_is_refused(tmp_path, change, message):
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG_TOML.replace(*change))
+    with pytest.raises(InputError, match=message):
+        read_rig(path)
+
+
+def test_a_unit_that_a_format_leaves_open_must_be_stated(tmp_path, caplog):
+    path = tmp_path / "calibration.toml"
+    path.write_text(ANIPOSE)
+    with pytest.raises(InputError, match=r"expected a unit of lengths, found none, .* --units m, cm, mm"):
+        read_rig(path)
+    path.write_text(ANIPOSE.replace("adjusted", 'unit = "cm"\nadjusted'))
+    stated = read_rig(path).cameras.T_cam_world[:, :3, 3]
+    np.testing.assert_allclose(stated[0], [-0.945, 0.0825, 5.0], atol=1e-15)
+    other = read_rig(path, metres_per_unit=1e-3).cameras.T_cam_world[:, :3, 3]
+    np.testing.assert_allclose(other, 0.1 * stated, atol=1e-15)
+    assert "in units of 0.01 m by the file, and are read in units of 0.001 m" in caplog.text
+    path.write_text(ANIPOSE.replace("adjusted", 'unit = "furlong"\nadjusted'))
+    with pytest.raises(InputError, match=r"metadata\.unit: expected one of m, cm, mm, found furlong"):
+        read_rig(path)
+
+
+def test_an_unknown_format_is_refused(tmp_path):
+    (tmp_path / "rig.toml").write_text(RIG_TOML)
+    with pytest.raises(SettingsError, match=r"format: expected one of rig, dpjait, .*, found matlab"):
+        read_rig(tmp_path / "rig.toml", file_format="matlab")
+    with pytest.raises(SettingsError, match=r"format: expected one of rig, dpjait, .*, found pose2sim"):
+        write_rig(tmp_path / "other.toml", ring_rig(1), file_format="pose2sim")
 
 
 def test_opencv_reads_a_written_rig(tmp_path):
@@ -190,13 +285,14 @@ def test_an_existing_file_is_overwritten_only_by_force(tmp_path):
 @pytest.mark.parametrize(
     ("file", "text", "message"),
     [
-        ("x.json", "{}", "a file that ends in .csv, .toml, .yml, .yaml, found x.json"),
+        ("x.json", "{}", "camera.matrix or K or camera_matrix: expected 3 x 3 numbers, found none"),
+        ("x.dat", "1 2", "x.dat: expected a rig file of a known format, found other content"),
         ("x.toml", "[cam_0\n", "x.toml, line 1: expected valid TOML"),
         ("x.toml", "", "at least one camera, found none"),
         (
             "x.toml",
             ANIPOSE.replace("matrix", "matrx", 1),
-            "x.toml, cam_0.matrix: expected 3 x 3 numbers, found none",
+            "x.toml, cam_0.matrix or K or camera_matrix: expected 3 x 3 numbers, found none",
         ),
         (
             "x.toml",
@@ -219,7 +315,7 @@ def test_an_existing_file_is_overwritten_only_by_force(tmp_path):
         (
             "x.toml",
             ANIPOSE.replace(" -0.06, 0.0,", ""),
-            "cam_0.distortions: expected 0, 4, 5, 8 coefficients, found 3",
+            "cam_0.distortions: expected 0, 4, 5, 8, 12, 14 coefficients, found 3",
         ),
         (
             "x.toml",
@@ -227,7 +323,13 @@ def test_an_existing_file_is_overwritten_only_by_force(tmp_path):
             "cam_0.rotation: expected 3 numbers or 3 x 3 numbers",
         ),
         ("x.toml", ANIPOSE.replace('"B"', '"A"'), "cam_1.name: expected each camera once, found A again"),
-        ("x.toml", ANIPOSE.replace('"A"', '"A"\nfisheye = true'), "cam_0.fisheye: expected a lens of"),
+        (
+            "x.toml",
+            ANIPOSE.replace('"A"', '"A"\nfisheye = true').replace(
+                "-0.06, 0.0,", "-0.06, 0.1, 0.1, 0.1, 0.1,"
+            ),
+            "cam_0.distortions: expected 4 coefficients of a fisheye, found 8",
+        ),
         (
             "x.toml",
             CALISCOPE.replace("[0.0, -1.0, 0.0]", "[0.0, 1.0, 0.0]"),
@@ -236,10 +338,14 @@ def test_an_existing_file_is_overwritten_only_by_force(tmp_path):
         (
             "x.toml",
             CALISCOPE.replace("matrix = [[6", "m = [[6"),
-            "cameras.2.matrix: expected 3 x 3 numbers, found none",
+            "cameras.2.matrix or K or camera_matrix: expected 3 x 3 numbers, found none",
         ),
         ("x.yml", "", "camera.matrix or K or camera_matrix: expected 3 x 3 numbers, found none"),
-        ("x.yml", "cameras:\n   - a\n     b\n   K: {\n", "expected OpenCV's YAML, found an error"),
+        (
+            "x.yml",
+            "cameras:\n   - a\n     b\n   K: {\n",
+            "expected valid YAML or JSON, found an error",
+        ),
         ("x.yml", "cameras:\n   - { K: [1, 2] }\n", "cameras[0].name: expected a name, found none"),
         ("x.yml", "cameras:\n   - { name: c, K: [1, 2] }\n", "cameras[0].K: expected 3 x 3 numbers, found 2"),
         ("x.csv", "cam_name\n", "x.csv, line 1"),

@@ -1,0 +1,159 @@
+"""Detections without labels: psotrack's defaults beside Stone Soup's GNN and JPDA, each at its best of a grid.
+
+    pip install 'psotrack[bench]'
+    python experiments/accuracy/association.py --data data [--real real] [--quick]
+
+Flights by a formula (`formula_flights`) and, where --real names a folder of public repositories, parts of real flights
+(`bat_flights`). Of each flight psotrack is given the rig and the detections as files, with `psotrack track SEQ --method
+projection-lines` and no further option. Stone Soup is given points in space (`stone_soup`), and the bounds and the
+speed that psotrack found; of all parameters of its grid the ones with the largest MOTA of this flight count.
+
+Recall and precision are shares of pairs within a gate (0.5 m; 5 m where the reference is GPS), identity changes as in
+CLEAR MOT. Frames without a reference do not count.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import _runs
+import numpy as np
+import stone_soup
+from bat_flights import RealFlight, read_flight
+from formula_flights import FPS, SCENES, make_flight
+from jaxtyping import Float
+
+from psotrack.correspondence import Sightings, from_detections
+from psotrack.initiation import FlightVolume, flight_volume, moving_detections
+from psotrack.recordings import write_detections
+from psotrack.rig_files import write_rig
+from psotrack.trajectories import read_trajectories
+from psotrack.trajectories.association import GATE_M, identity_switches, partners_per_frame
+
+#: Flights of the real recording: name, first frame, number of frames.
+REAL = [
+    ("Turbine2_Setup5_2022-06-25_21-03", 3000, 450),
+    ("Turbine2_Setup6_2022-06-26_20-46", 2000, 450),
+    ("Turbine2_Setup4_2022-06-23_21-41", 2000, 450),
+]
+REAL_GATE_M = 5.0
+
+
+def score(
+    tracks_m: Float[np.ndarray, "frames tracks 3"],
+    truth_m: Float[np.ndarray, "frames drones 3"],
+    gate_m: float,
+) -> dict[str, float]:
+    """Recall, precision, identity changes and MOTA."""
+    known = np.isfinite(truth_m).all(axis=-1)
+    distance_m = np.linalg.norm(truth_m[:, :, None] - tracks_m[:, None], axis=-1)
+    partner = partners_per_frame(distance_m * GATE_M / gate_m, keep=True)
+    there = np.isfinite(tracks_m).all(axis=-1)
+    matched = (partner >= 0).sum()
+    # Of a drone whose place is unknown in a frame, one track in this frame may be right.
+    spare = np.minimum((there.sum(axis=1) - (partner >= 0).sum(axis=1)).clip(0), (~known).sum(axis=1))
+    found = there.sum() - spare.sum()
+    changes = int(identity_switches(partner).sum())
+    return {
+        "recall": float(matched / known.sum()),
+        "precision": float(matched / max(found, 1)),
+        "id_changes": changes,
+        "mota": float(1 - ((known.sum() - matched) + (found - matched) + changes) / known.sum()),
+        "tracks": int(there.any(axis=0).sum()),
+    }
+
+
+def by_psotrack(flight: RealFlight, folder: Path) -> Float[np.ndarray, "frames tracks 3"]:
+    """Tracks of the command with its defaults."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_rig(folder / "rig.toml", flight.rig, force=True)
+    lines = ["version = 1", 'calibration = "rig.toml"']
+    for index, name in enumerate(flight.rig.names):
+        write_detections(folder / f"{name}.csv", flight.detections[name])
+        width, height = flight.rig.cameras.image_size_wh[index].astype(int).tolist()
+        lines += [f"[cameras.{name}]", f'detections = "{name}.csv"', f"size = [{width}, {height}]"]
+        lines.append(f"fps = {flight.fps!r}")
+    (folder / "recording.toml").write_text("\n".join(lines) + "\n")
+    words = ["track", str(folder), "--out", str(folder / "tracks.csv"), "--method", "projection-lines"]
+    subprocess.run([sys.executable, "-m", "psotrack", *words, "--force", "--quiet"], check=True)
+    found = read_trajectories(folder / "tracks.csv", fps=flight.fps)
+    tracks_m = np.full((flight.truth.num_frames, found.num_drones, 3), np.nan)
+    row = found.frame[found.frame < len(tracks_m)]
+    tracks_m[row] = np.where(found.seen[..., None], found.position_m, np.nan)[: len(row)]
+    return tracks_m
+
+
+def by_stone_soup(
+    flight: RealFlight,
+    sightings: Sightings,
+    volume: FlightVolume,
+    associator: str,
+    gate_m: float,
+    quick: bool,
+) -> tuple[dict[str, float], stone_soup.Grid]:
+    """The best figures of the grid, and the parameters that gave them."""
+    grid = stone_soup.grid(associator)[:: 4 if quick else 1]
+    points = {
+        views: stone_soup.points_of(flight.rig, sightings, volume.bounds_m, views)
+        for views in {how.min_views for how in grid}
+    }
+    tried = []
+    for how in grid:
+        tracks_m = stone_soup.track(points[how.min_views], flight.fps, volume.max_speed_m_s / 3, how)
+        tried.append((score(tracks_m, flight.truth.position_m, gate_m), how))
+    return max(tried, key=lambda one: one[0]["mota"])
+
+
+def rows_of(
+    name: str, seed: int, flight: RealFlight, gate_m: float, data: Path, quick: bool
+) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
+    """One row per method."""
+    sightings = from_detections(flight.detections, flight.rig, flight.truth.num_frames)
+
+    def row(method: str) -> dict[str, Any]:
+        began = time.perf_counter()
+        how = ""
+        if method == "psotrack":
+            folder = data / "association" / f"{name.replace(' ', '_').replace(',', '')}-{seed}"
+            figures = score(by_psotrack(flight, folder), flight.truth.position_m, gate_m)
+        else:
+            volume = flight_volume(flight.rig, moving_detections(flight.rig, sightings, flight.fps))
+            figures, best = by_stone_soup(flight, sightings, volume, method, gate_m, quick)
+            how = f"{best}"
+        seconds = time.perf_counter() - began
+        return {"flight": name, "seed": seed, "method": method, **figures, "seconds": seconds, "how": how}
+
+    for method in ("psotrack", "GNN", "JPDA"):
+        yield f"{name} {seed} {method}", lambda method=method: row(method)
+
+
+def main() -> None:
+    """Track all flights by all methods, and print the means."""
+    parser = _runs.parser(__doc__)
+    parser.add_argument("--real", type=Path, help="folder of the real recordings, as OWNER/NAME")
+    parser.add_argument("--seeds", type=int, default=3, help="seeds of the flights: 0, 1, ...")
+    parser.add_argument("--quick", action="store_true", help="one short flight, and a quarter of the grid")
+    options = parser.parse_args()
+    run = _runs.start("association")
+    flights: list[tuple[str, int, RealFlight, float]] = []
+    for seed in range(1 if options.quick else options.seeds):
+        for name in list(SCENES)[: 1 if options.quick else None]:
+            made = make_flight(SCENES[name], 50 if options.quick else 250, seed)
+            flights.append((name, seed, RealFlight(made.rig, made.detections, made.truth, FPS), GATE_M))
+    for name, first, count in REAL if options.real else ():
+        flights.append((name, 0, read_flight(options.real, name, first, count), REAL_GATE_M))
+    rows = (one for flight in flights for one in rows_of(*flight, options.data, options.quick))
+    table = _runs.save_rows(run, rows, options.data, options.out)
+    shown = ["recall", "precision", "id_changes", "mota"]
+    print(
+        table.groupby(["flight", "method"], sort=False)[shown].mean().to_string(float_format="{:.3f}".format)
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,161 @@
+"""Corners of a board in an image, by OpenCV's detectors.
+
+A board may be printed white on black, and it may be seen mirrored: from behind through thin paper, or because its back
+shows the mirrored pattern.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from psotrack.calibration.boards import Board
+from psotrack.detection import marker_dictionary
+
+#: Smallest number of corners of a view that counts, or all that the board has.
+LEAST_CORNERS = 6
+#: Largest standard deviation of corners from one line that is still a line, pixels.
+_LINE_PX = 1.5
+#: Largest size of an image in which OpenCV's search for a chessboard is fast, pixels.
+_CHESSBOARD_SIDE_PX = 1000
+
+
+@dataclass(frozen=True)
+class BoardFinder:
+    """Finds the corners of a board.
+
+    Attributes:
+        board: the board.
+        inverted: whether the board is printed white on black.
+    """
+
+    board: Board
+    inverted: bool = False
+
+    def find(self, grey: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "corners 2"]:
+        """Pixels of the board's corners, (corners, 2); NaN where a corner is not found, everywhere if few are."""
+        image = 255 - grey if self.inverted else grey
+        if self.board.kind == "chessboard":
+            found = self._find_chessboard(image)
+        elif self.board.kind == "grid":
+            found = self._find_grid(image)
+        else:
+            found = self._find_charuco(image)
+        seen = np.isfinite(found[:, 0])
+        if seen.sum() < min(LEAST_CORNERS, self.board.num_corners) or _on_a_line(found[seen]):
+            found[:] = np.nan
+        return found
+
+    def find_mirrored(self, grey: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "corners 2"]:
+        """The same in the mirrored image; the pixels are those of the image that is given."""
+        found = self.find(np.ascontiguousarray(grey[:, ::-1]))
+        found[:, 0] = grey.shape[1] - 1 - found[:, 0]
+        return found
+
+    @cached_property
+    def _charuco(self) -> cv2.aruco.CharucoDetector:
+        return cv2.aruco.CharucoDetector(self.board.opencv())
+
+    @cached_property
+    def _markers(self) -> cv2.aruco.ArucoDetector:
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+        return cv2.aruco.ArucoDetector(marker_dictionary(self.board.dictionary), parameters)
+
+    def _nothing(self) -> Float[np.ndarray, "corners 2"]:
+        return np.full((self.board.num_corners, 2), np.nan)
+
+    def _find_charuco(self, image: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "corners 2"]:
+        found = self._nothing()
+        corners, ids, _, _ = self._charuco.detectBoard(image)
+        if ids is not None and len(ids):
+            found[np.asarray(ids).ravel()] = np.asarray(corners, np.float64).reshape(-1, 2)
+        return found
+
+    def _find_grid(self, image: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "corners 2"]:
+        found = self._nothing().reshape(-1, 4, 2)
+        quads, ids, _ = self._markers.detectMarkers(image)
+        for quad, marker in zip(quads, [] if ids is None else map(int, np.ravel(ids)), strict=True):
+            if marker < len(found):
+                found[marker] = np.asarray(quad, np.float64).reshape(4, 2)
+        return found.reshape(-1, 2)
+
+    def _find_chessboard(self, image: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "corners 2"]:
+        columns, rows = self.board.squares_wh
+        size = (columns - 1, rows - 1)
+        # The search is slow in large images, and the corners are refined in the full image.
+        scale = max(1, round(max(image.shape) / _CHESSBOARD_SIDE_PX))
+        small = cv2.resize(image, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA)
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
+        is_found, corners = cv2.findChessboardCornersSB(small, size, flags=flags)
+        if not is_found:
+            return self._nothing()
+        pixels = np.asarray(corners, np.float64).reshape(-1, 2)
+        if scale > 1:
+            # Pixel centres are at whole numbers.
+            pixels = (pixels + 0.5) * scale - 0.5
+            start = pixels.astype(np.float32).reshape(-1, 1, 2).copy()
+            half = _half_window(pixels.reshape(rows - 1, columns - 1, 2))
+            criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 1e-3)
+            pixels = np.asarray(cv2.cornerSubPix(image, start, (half, half), (-1, -1), criteria), np.float64)
+        return _in_order(pixels.reshape(rows - 1, columns - 1, 2), image).reshape(-1, 2)
+
+
+def outline_of(board: Board, corners_px: Float[np.ndarray, "corners 2"]) -> Float[np.ndarray, "8"] | None:
+    """(8,), pixels of the corners of the board's outline, also where they are not seen; None for corners on a line."""
+    seen = np.isfinite(corners_px[:, 0])
+    if seen.sum() < LEAST_CORNERS or np.linalg.matrix_rank(np.cov(corners_px[seen].T), tol=1.0) < 2:
+        return None
+    homography, _ = cv2.findHomography(board.corners_m[seen, :2], corners_px[seen])
+    if homography is None:
+        return None
+    return cv2.perspectiveTransform(board.outline_m[:, None], homography).ravel()
+
+
+def choose_spread(outlines: Float[np.ndarray, "views numbers"], count: int) -> list[int]:
+    """Choose views that differ most: each next view is the farthest from the views chosen before."""
+    # The first view is the farthest from the median of all views.
+    chosen = [int(np.linalg.norm(outlines - np.median(outlines, axis=0), axis=1).argmax())]
+    distance = np.linalg.norm(outlines - outlines[chosen[0]], axis=1)
+    while len(chosen) < min(count, len(outlines)):
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(outlines - outlines[chosen[-1]], axis=1))
+    return chosen
+
+
+def _half_window(grid: Float[np.ndarray, "rows columns 2"]) -> int:
+    """Half the side of a window around a corner that contains no other corner."""
+    steps = np.concatenate([np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)])
+    return int(np.clip(steps.min() / 3, 2, 11))
+
+
+def _in_order(
+    grid: Float[np.ndarray, "rows columns 2"], image: UInt8[np.ndarray, "height width"]
+) -> Float[np.ndarray, "rows columns 2"]:
+    """Order a chessboard's corners so that y follows x clockwise, and the first square between corners is dark.
+
+    Only a board whose colours tell its two ends apart has such a first square; others stay in one of their orders.
+    """
+    across, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+    if across[0] * down[1] - across[1] * down[0] < 0:
+        grid = grid[:, ::-1]
+    rows, columns = grid.shape[:2]
+    if (rows + columns) % 2:
+        middles = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
+        columns_px, rows_px = middles.round().astype(np.int64).reshape(-1, 2).T
+        inside = (rows_px.clip(0, image.shape[0] - 1), columns_px.clip(0, image.shape[1] - 1))
+        bright = image[inside].astype(np.float64).reshape(rows - 1, columns - 1)
+        even = np.add.outer(np.arange(rows - 1), np.arange(columns - 1)) % 2 == 0
+        if bright[even].mean() > bright[~even].mean():
+            grid = grid[::-1, ::-1]
+    return grid
+
+
+def _on_a_line(points_px: Float[np.ndarray, "points 2"]) -> bool:
+    """Whether points are nearly on one line, so that they leave a board's pose open."""
+    spread = np.linalg.svd(points_px - points_px.mean(axis=0), compute_uv=False)
+    return bool(spread[-1] < _LINE_PX * np.sqrt(len(points_px)))

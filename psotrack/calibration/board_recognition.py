@@ -1,0 +1,243 @@
+"""How a board was printed, found out from images: white on black, OpenCV's old pattern; and why no board is found."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from psotrack.calibration.board_corners import BoardFinder
+from psotrack.calibration.boards import Board
+from psotrack.detection import marker_dictionary
+
+#: Number of views after which one way of printing is certain, if it has three times as many views as any other way.
+_CERTAIN = 6
+#: Number of images with most markers that are used to find out what a board is that was not found.
+_IMAGES = 5
+#: The largest dictionary of each family, and the numbers of markers of its smaller ones, which are its beginnings.
+_FAMILIES = {
+    **{f"{bits}x{bits}": (50, 100, 250, 1000) for bits in (4, 5, 6, 7)},
+    **dict.fromkeys(
+        (
+            "aruco_original",
+            "aruco_mip_36h12",
+            "apriltag_36h11",
+            "apriltag_36h10",
+            "apriltag_25h9",
+            "apriltag_16h5",
+        ),
+        (),
+    ),
+}
+#: Smallest number of different markers in an image that are not there by chance.
+_LEAST_MARKERS = 3
+#: Largest number of squares along a side of a board that is recognised by its markers.
+_MOST_SQUARES = 20
+#: Largest distance, in sides of a marker, up to which markers fit a board.
+_FITS = 0.2
+#: Sides of a chessboard that are tried differ from the stated ones by at most this.
+_OTHER_SIZES = 2
+
+
+@dataclass(frozen=True)
+class Recognised:
+    """How a board was printed.
+
+    Attributes:
+        board: the board, with the pattern that was found.
+        inverted: whether it is printed white on black.
+        views: number of images in which it was found.
+    """
+
+    board: Board
+    inverted: bool
+    views: int
+
+    def finder(self) -> BoardFinder:
+        """Finder of this board."""
+        return BoardFinder(self.board, self.inverted)
+
+
+def recognise_board(board: Board, images: Iterable[UInt8[np.ndarray, "height width"]]) -> Recognised:
+    """Find out how a board was printed, from as few images as are certain.
+
+    Args:
+        board: the board as it is stated.
+        images: grey images, in an order in which different views come early.
+    """
+    boards = [board]
+    if board.kind == "charuco" and board.squares_wh[1] % 2 == 0:
+        # The old pattern differs for an even number of rows only.
+        boards.append(replace(board, legacy=not board.legacy))
+    # A chessboard looks alike in both prints.
+    prints = (False,) if board.kind == "chessboard" else (False, True)
+    finders = [BoardFinder(one, inverted) for inverted in prints for one in boards]
+    views = np.zeros(len(finders), np.int64)
+    for grey in images:
+        found = np.array([np.isfinite(finder.find(grey)[:, 0]).sum() for finder in finders])
+        if not found.any() and board.kind != "chessboard":
+            found = np.array([np.isfinite(finder.find_mirrored(grey)[:, 0]).sum() for finder in finders])
+        views += (found == found.max()) & (found > 0)
+        first, *others = sorted(views.tolist(), reverse=True)
+        if first >= _CERTAIN and first >= 3 * max(others, default=0):
+            break
+    best = finders[int(views.argmax())]
+    return Recognised(best.board, best.inverted, int(views.max()))
+
+
+def explain_missing_board(
+    board: Board, images: Sequence[UInt8[np.ndarray, "height width"]]
+) -> tuple[str, str]:
+    """Say what is seen instead of a board that is not found in any image.
+
+    Returns:
+        what was found, and what to do; both are parts of a message.
+    """
+    if board.kind == "chessboard":
+        return _explain_missing_chessboard(board, images)
+    counted = [(len(ids), name, turned, ids) for name, turned, ids in _markers_of_all_dictionaries(images)]
+    most, family, inverted, ids = max(counted, key=lambda one: one[0], default=(0, "", False, np.zeros(0)))
+    if most < _LEAST_MARKERS:
+        return (
+            f"no such board, and no markers of any known dictionary, in {len(images)} images",
+            "check that the board is large and sharp enough in the images",
+        )
+    dictionary = _smallest(family, int(ids.max()))
+    how = ", printed white on black" if inverted else ""
+    if family != _family(board.dictionary) or int(ids.max()) >= _size(board.dictionary):
+        return (
+            f"markers {ids.min()} to {ids.max()} of the dictionary {dictionary}{how}",
+            f"pass --dictionary {dictionary}",
+        )
+    if board.kind == "charuco":
+        size = _size_by_markers(
+            replace(board, dictionary=f"{family}_1000" if _FAMILIES[family] else family), images, inverted
+        )
+        if size is not None and size != board.squares_wh:
+            return (
+                f"markers {ids.min()} to {ids.max()} in the order of a board of {size[0]} x {size[1]} squares{how}",
+                f"pass --squares {size[0]}x{size[1]}",
+            )
+    return (
+        f"markers {ids.min()} to {ids.max()} of its dictionary{how}, but not in its order",
+        "check --squares, columns before rows, and --board",
+    )
+
+
+def _explain_missing_chessboard(
+    board: Board, images: Sequence[UInt8[np.ndarray, "height width"]]
+) -> tuple[str, str]:
+    # Before other sizes: a board with markers has corners of squares, too.
+    if any(len(ids) >= _LEAST_MARKERS for _, _, ids in _markers_of_all_dictionaries(images)):
+        return "a board with markers", "pass --marker and --dictionary"
+    columns, rows = board.squares_wh
+    around = range(-_OTHER_SIZES, _OTHER_SIZES + 1)
+    # A part of a board is a smaller board: the largest one comes first.
+    sizes = sorted(
+        ((columns + a, rows + b) for a, b in product(around, repeat=2) if min(columns + a, rows + b) >= 4),
+        key=lambda size: (-size[0] * size[1], abs(size[0] - columns)),
+    )
+    for size in sizes:
+        finder = BoardFinder(replace(board, squares_wh=size))
+        if sum(np.isfinite(finder.find(grey)[0, 0]) for grey in images[:_IMAGES]) >= 2:
+            return (
+                f"a chessboard of {size[0]} x {size[1]} squares, which has {size[0] - 1} x {size[1] - 1} inner corners",
+                f"pass --squares {size[0]}x{size[1]}",
+            )
+    return (
+        f"no such board in {len(images)} images",
+        "check that the whole board is in the images, with a white border",
+    )
+
+
+def _markers_of_all_dictionaries(
+    images: Sequence[UInt8[np.ndarray, "height width"]],
+) -> list[tuple[str, bool, np.ndarray]]:
+    """Family of a dictionary, whether white on black, and the markers that an image shows, for the best images.
+
+    Mirrored images are searched only if no dictionary has enough markers in the others.
+    """
+    for mirrored in (False, True):
+        sides = [np.ascontiguousarray(grey[:, ::-1]) if mirrored else grey for grey in images[:_IMAGES]]
+        found = [
+            (name, inverted, _most_markers(name, [255 - side if inverted else side for side in sides]))
+            for name, inverted in product(_FAMILIES, (False, True))
+        ]
+        if any(len(ids) >= _LEAST_MARKERS for _, _, ids in found):
+            break
+    return found
+
+
+def _most_markers(
+    family: str, images: Sequence[UInt8[np.ndarray, "height width"]]
+) -> Int[np.ndarray, " markers"]:
+    """The markers of the image that shows most markers of a family."""
+    dictionary = marker_dictionary(f"{family}_1000" if _FAMILIES[family] else family)
+    # A marker of few bits is easily seen where none is: only exact matches count.
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.errorCorrectionRate = 0.0
+    detector = cv2.aruco.ArucoDetector(dictionary, parameters)
+    seen = [np.zeros(0, np.int64)]
+    for image in images:
+        _, ids, _ = detector.detectMarkers(image)
+        if ids is not None:
+            seen.append(np.unique(np.ravel(ids).astype(np.int64)))
+    return max(seen, key=len)
+
+
+def _size_by_markers(
+    board: Board, images: Sequence[UInt8[np.ndarray, "height width"]], inverted: bool
+) -> tuple[int, int] | None:
+    """Columns and rows of a ChArUco board whose markers lie as they do in the images; None if no board fits."""
+    detector = cv2.aruco.ArucoDetector(marker_dictionary(board.dictionary))
+    seen = []
+    for grey in images[:_IMAGES]:
+        image = 255 - grey if inverted else grey
+        found = [detector.detectMarkers(side) for side in (image, np.ascontiguousarray(image[:, ::-1]))]
+        # In the mirrored image of a board that is not mirrored, a few markers are seen by chance.
+        quads, ids, _ = max(found, key=lambda one: 0 if one[1] is None else len(one[1]))
+        if ids is not None and len(ids) >= _LEAST_MARKERS:
+            seen.append((np.ravel(ids).astype(np.int64), np.asarray(quads, np.float64).reshape(-1, 4, 2)))
+    if not seen:
+        return None
+    highest = max(int(ids.max()) for ids, _ in seen)
+    fits: list[tuple[float, tuple[int, int]]] = []
+    for columns, rows in product(range(3, _MOST_SQUARES + 1), repeat=2):
+        # A board has a marker on every second square, and at most a row of its markers was never seen.
+        if highest < columns * rows // 2 <= highest + 1 + columns // 2:
+            model = replace(board, squares_wh=(columns, rows)).opencv()
+            of_marker = np.asarray(model.getObjPoints(), np.float64)[..., :2]
+            errors = [_misfit(of_marker[ids], quads) for ids, quads in seen]
+            fits.append((float(np.median(errors)), (columns, rows)))
+    best = min(fits, default=(np.inf, (0, 0)))
+    return best[1] if best[0] < _FITS else None
+
+
+def _misfit(flat: Float[np.ndarray, "markers 4 2"], quads: Float[np.ndarray, "markers 4 2"]) -> float:
+    """Median distance of markers in an image from the markers of a plane, in sides of a marker."""
+    homography, _ = cv2.findHomography(flat.reshape(-1, 2), quads.reshape(-1, 2))
+    if homography is None:
+        return np.inf
+    ends = cv2.perspectiveTransform(flat.reshape(-1, 1, 2), homography).reshape(-1, 2)
+    side = np.linalg.norm(np.diff(quads, axis=1), axis=-1).mean()
+    return float(np.median(np.linalg.norm(ends - quads.reshape(-1, 2), axis=-1)) / side)
+
+
+def _family(dictionary: str) -> str:
+    name = dictionary.lower().removeprefix("dict_")
+    stem = name.rpartition("_")[0]
+    return stem if stem in _FAMILIES else name
+
+
+def _size(dictionary: str) -> int:
+    return len(marker_dictionary(dictionary).bytesList)
+
+
+def _smallest(family: str, highest: int) -> str:
+    """Name of the smallest dictionary of a family that has a marker."""
+    sizes = [size for size in _FAMILIES[family] if size > highest]
+    return f"{family}_{sizes[0]}" if sizes else family

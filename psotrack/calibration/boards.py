@@ -1,0 +1,132 @@
+"""Calibration boards: ChArUco boards, chessboards, and grids of ArUco markers or AprilTags.
+
+A board's own axes are those of OpenCV: seen from the front, x points right and y points down, so that z points away
+from the viewer, into the board. The origin is the board's top left corner, for a grid the first marker's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, get_args
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+
+from psotrack.detection import marker_dictionary
+from psotrack.errors import SettingsError, check_positive
+
+BoardKind = Literal["charuco", "chessboard", "grid"]
+
+
+@dataclass(frozen=True)
+class Board:
+    """A board of known size.
+
+    Attributes:
+        squares_wh: columns and rows of squares; of markers, for a grid.
+        square_m: side of a square in metres; for a grid, the distance from the middle of a marker to the next one's.
+        marker_m: side of a marker in metres; None for a chessboard.
+        dictionary: name of the markers' dictionary, such as 4x4_50 or apriltag_36h11.
+        kind: ChArUco board, chessboard, or grid of markers.
+        legacy: ChArUco pattern of OpenCV before version 4.6: a board with an even number of rows has a marker, not a
+            black square, in its top left corner.
+    """
+
+    squares_wh: tuple[int, int]
+    square_m: float
+    marker_m: float | None = None
+    dictionary: str = "4x4_50"
+    kind: BoardKind = "charuco"
+    legacy: bool = False
+
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(BoardKind):
+            raise SettingsError(
+                "board.kind", expected=f"one of {', '.join(get_args(BoardKind))}", found=self.kind
+            )
+        least = 1 if self.kind == "grid" else 3
+        if min(self.squares_wh) < least or max(self.squares_wh) < 2:
+            what = "at least two markers" if self.kind == "grid" else "at least 3 x 3 squares"
+            raise SettingsError("board.squares_wh", expected=what, found=f"{self.squares_wh}")
+        check_positive("board.square_m", self.square_m)
+        if self.kind == "chessboard":
+            if self.marker_m is not None:
+                raise SettingsError(
+                    "board.marker_m", expected="none on a chessboard", found=f"{self.marker_m:g}"
+                )
+        elif self.marker_m is None or not 0 < self.marker_m < self.square_m:
+            found = "none" if self.marker_m is None else f"{self.marker_m:g}"
+            raise SettingsError(
+                "board.marker_m", expected="a side above 0 and below the square's", found=found
+            )
+
+    def __str__(self) -> str:
+        columns, rows = self.squares_wh
+        words = {"charuco": "ChArUco board", "chessboard": "chessboard", "grid": "grid of markers"}[self.kind]
+        markers = "" if self.kind == "chessboard" else f" of {self.dictionary}"
+        return f"{words} {columns} x {rows}{markers}"
+
+    def opencv(self) -> cv2.aruco.CharucoBoard:
+        """A ChArUco board as an object of OpenCV.
+
+        Raises:
+            SettingsError: the dictionary does not exist, or the board is of another kind.
+        """
+        if self.kind != "charuco" or self.marker_m is None:
+            raise SettingsError("board.kind", expected="charuco", found=self.kind)
+        model = cv2.aruco.CharucoBoard(
+            self.squares_wh, self.square_m, self.marker_m, marker_dictionary(self.dictionary)
+        )
+        model.setLegacyPattern(self.legacy)
+        return model
+
+    @property
+    def num_corners(self) -> int:
+        """Number of points of the board that a camera can see."""
+        columns, rows = self.squares_wh
+        return 4 * columns * rows if self.kind == "grid" else (columns - 1) * (rows - 1)
+
+    @cached_property
+    def corners_m(self) -> Float[np.ndarray, "corners 3"]:
+        """(corners, 3), positions on the board, metres: inner corners row by row; or four of each marker, clockwise."""
+        columns, rows = self.squares_wh
+        if self.kind == "grid":
+            steps = _steps(np.arange(columns), np.arange(rows))[:, None]
+            quad = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (self.marker_m or 0.0)
+            flat = (steps * self.square_m + quad).reshape(-1, 2)
+        else:
+            flat = _steps(np.arange(1, columns), np.arange(1, rows)) * self.square_m
+        return np.column_stack([flat, np.zeros(len(flat))]).astype(np.float64)
+
+    @property
+    def outline_m(self) -> Float[np.ndarray, "4 2"]:
+        """(4, 2), corners of the rectangle around the board's points, metres."""
+        low, high = self.corners_m[:, :2].min(axis=0), self.corners_m[:, :2].max(axis=0)
+        return np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+
+    @cached_property
+    def labellings(self) -> Int[np.ndarray, "labellings corners"]:
+        """(labellings, corners), orders of the corners that look alike: turns of a chessboard that keep its colours.
+
+        The first row is the order of `corners_m`; a board with markers has no other row.
+        """
+        columns, rows = self.squares_wh
+        order = np.arange(self.num_corners)
+        if self.kind != "chessboard":
+            return order[None]
+        grid = order.reshape(rows - 1, columns - 1)
+        turns = [grid]
+        if columns == rows and columns % 2:
+            turns += [np.rot90(grid, quarter) for quarter in (1, 2, 3)]
+        elif (columns + rows) % 2 == 0:
+            turns.append(np.rot90(grid, 2))
+        return np.stack([turn.ravel() for turn in turns])
+
+
+def _steps(
+    columns: Int[np.ndarray, " columns"], rows: Int[np.ndarray, " rows"]
+) -> Int[np.ndarray, "points 2"]:
+    """(points, 2), column and row of each point of a grid, row by row."""
+    return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)

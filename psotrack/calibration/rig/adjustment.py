@@ -1,0 +1,342 @@
+"""Lenses and places of all cameras, and the board's place at each instant, in one adjustment.
+
+First each camera's lens alone (`board_poses`), then the cameras' places through the views that they share (`chain`),
+then all together: with a robust loss to find the places, and with squared residuals without outliers (`slips`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from math import log
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from psotrack.calibration.board_corners import LEAST_CORNERS
+from psotrack.calibration.boards import Board
+from psotrack.calibration.derivatives import centre_by_pose
+from psotrack.calibration.residuals import GATE
+from psotrack.calibration.rig.board_poses import find_lens
+from psotrack.calibration.rig.chain import Chain, join_cameras
+from psotrack.calibration.rig.covariance import covariance_over_instants
+from psotrack.calibration.rig.equations import (
+    LEAST_NOISE_PX,
+    CameraCorners,
+    RigBundle,
+    RigProblem,
+    RigState,
+    solve_robustly,
+)
+from psotrack.calibration.rig.lens_models import PINHOLE, LensModel, camera_matrix
+from psotrack.calibration.rig.slips import Slips
+from psotrack.calibration.rig.views import BoardViews
+from psotrack.calibration.rig.world import Similarity
+from psotrack.errors import InputError
+from psotrack.geometry import Camera, Rig, make_camera, make_rig
+
+#: Largest number of adjustments, and relative change of the slips' widths that ends them.
+_MOST_ROUNDS, _SETTLED = 15, 0.02
+#: Smallest number of views of a camera whose lens is unknown, and of one whose lens is known.
+_LEAST_VIEWS, _LEAST_VIEWS_KNOWN = 5, 1
+
+
+@dataclass(frozen=True)
+class CalibratedRig:
+    """Result of a calibration by a board.
+
+    Attributes:
+        board: the board.
+        rig: the cameras; the world is the first camera, or the board at the chosen instant.
+        views: the views, with the corners of a board that looks alike after a turn put into one order.
+        T_world_board: (instants, 4, 4), board to world, metres.
+        residual_px: (cameras, instants, corners), distances from the projections, pixels; NaN where not seen.
+        own_residual_px: the same where each view has the board at a pose of its own (see `slips`).
+        used: (cameras, instants, corners), False for outliers and for what is not seen.
+        lens_std: for each camera, standard deviations of fx, fy, cx, cy and of the distortion; 0 where it was known.
+        covariance: (cameras, 6, 6), covariance of a small turn about the camera's axes, rad, and of the translation, m.
+        centre_covariance_m2: (cameras, 3, 3), covariances of the camera centres, world, m².
+        shared: (cameras, cameras), number of instants that two cameras share.
+    """
+
+    board: Board
+    rig: Rig
+    views: BoardViews
+    T_world_board: Float[np.ndarray, "instants 4 4"]
+    residual_px: Float[np.ndarray, "cameras instants corners"]
+    own_residual_px: Float[np.ndarray, "cameras instants corners"]
+    used: Bool[np.ndarray, "cameras instants corners"]
+    lens_std: tuple[np.ndarray, ...]
+    covariance: Float[np.ndarray, "cameras 6 6"]
+    centre_covariance_m2: Float[np.ndarray, "cameras 3 3"]
+    shared: Int[np.ndarray, "cameras cameras"]
+
+
+@dataclass(frozen=True)
+class LensChoice:
+    """What is known and what is wanted of the lenses.
+
+    Attributes:
+        model: model of the lenses that are not known.
+        known: lenses by camera name, which are kept.
+        is_shared: whether all cameras have the same lens.
+    """
+
+    model: LensModel = field(default_factory=LensModel)
+    known: Mapping[str, tuple[LensModel, np.ndarray]] | None = None
+    is_shared: bool = False
+
+
+def calibrate_rig(
+    board: Board, views: BoardViews, lenses: LensChoice = LensChoice(), *, floor: int | None = None
+) -> CalibratedRig:
+    """Calibrate lenses and places of all cameras from views of a board.
+
+    Args:
+        board: the board.
+        views: pixels of the board's corners.
+        lenses: what is known of the lenses.
+        floor: number of the instant at which the board is the world: its corner is the origin, z points out of its
+            front. None: the world is the first camera.
+
+    Raises:
+        InputError: a camera sees too little of the board, no views join the cameras, the views do not determine the
+            rig, or the board is not seen at the instant `floor`.
+    """
+    _check_views(views, lenses)
+    models, vectors, lens_of = _start_lenses(board, views, lenses)
+    chain = join_cameras(board, views, tuple(models[k] for k in lens_of), tuple(vectors[k] for k in lens_of))
+    views = _relabelled(board, views, chain)
+    fixed = None if floor is None else _instant(views, floor)
+    bundle = _adjust(board, views, chain, (models, vectors, lens_of), lenses, fixed)
+    return _result(board, views, chain, bundle)
+
+
+def _check_views(views: BoardViews, lenses: LensChoice) -> None:
+    for name, count in zip(views.names, views.seen.sum(axis=1).tolist(), strict=True):
+        least = _LEAST_VIEWS_KNOWN if name in (lenses.known or {}) or lenses.is_shared else _LEAST_VIEWS
+        if count < least:
+            raise InputError(
+                f"camera {name}",
+                expected=f"at least {least} views of {LEAST_CORNERS} corners of the board",
+                found=f"{count}",
+                remedy="film the board nearer, or pass the camera's lens with --lenses",
+            )
+
+
+def _start_lenses(
+    board: Board, views: BoardViews, lenses: LensChoice
+) -> tuple[tuple[LensModel, ...], tuple[np.ndarray, ...], Int[np.ndarray, " cameras"]]:
+    """Models and first vectors of the lenses, and the index of each camera's lens."""
+    models, vectors = [], []
+    for camera, name in enumerate(views.names):
+        if name in (lenses.known or {}):
+            model, vector = (lenses.known or {})[name]
+        else:
+            size_wh = (int(views.image_size_wh[camera, 0]), int(views.image_size_wh[camera, 1]))
+            model = lenses.model
+            found = find_lens(board, model, views.corners_px[camera][views.seen[camera]], size_wh)
+            if found is None:
+                raise InputError(
+                    f"camera {name}", expected="views that a lens fits", found="none", remedy="tilt the board"
+                )
+            vector = found
+        models.append(model)
+        vectors.append(vector)
+    if not lenses.is_shared:
+        return tuple(models), tuple(vectors), np.arange(len(models))
+    if len(np.unique(views.image_size_wh, axis=0)) > 1:
+        raise InputError("cameras", expected="images of one size for one shared lens", found="several sizes")
+    # The camera with most views has the best first lens.
+    best = int(views.seen.sum(axis=1).argmax())
+    return (models[best],), (vectors[best],), np.zeros(len(models), np.int64)
+
+
+def _relabelled(board: Board, views: BoardViews, chain: Chain) -> BoardViews:
+    """Put the corners of every view into the order of the board."""
+    ordered = np.full(views.corners_px.shape, np.nan)
+    for camera, instant in np.ndindex(chain.labelling.shape):
+        order = board.labellings[chain.labelling[camera, instant]]
+        if views.seen[camera, instant]:
+            ordered[camera, instant, order] = views.corners_px[camera, instant]
+    return replace(views, corners_px=ordered)
+
+
+def _instant(views: BoardViews, number: int) -> int:
+    """Index of the instant with a number."""
+    found = np.flatnonzero(views.number == number)
+    if not len(found) or not views.seen[:, found[0]].any():
+        seen = views.number[views.seen.any(axis=0)]
+        nearest = seen[np.abs(seen - number).argmin()] if len(seen) else "none"
+        raise InputError(
+            "floor",
+            expected="a frame in which a camera sees the board",
+            found=f"frame {number}",
+            remedy=f"the nearest one is {nearest}",
+        )
+    return int(found[0])
+
+
+def _adjust(
+    board: Board,
+    views: BoardViews,
+    chain: Chain,
+    start: tuple[tuple[LensModel, ...], tuple[np.ndarray, ...], Int[np.ndarray, " cameras"]],
+    lenses: LensChoice,
+    fixed: int | None,
+) -> RigBundle:
+    """Adjust everything, with the world fixed to the first camera or to the board at an instant."""
+    models, vectors, lens_of = start
+    known = lenses.known or {}
+    sizes = np.array([views.image_size_wh[np.flatnonzero(lens_of == k)[0]] for k in range(len(models))])
+    free_camera = np.ones(len(views.names), bool)
+    free_board = np.ones(len(views.number), bool)
+    T_cam_world, T_world_board = chain.T_cam_world, chain.T_world_board
+    if fixed is None:
+        free_camera[0] = False
+    else:
+        T_cam_world = T_cam_world @ T_world_board[fixed] @ _UPWARDS
+        T_world_board = np.linalg.inv(T_world_board[fixed] @ _UPWARDS) @ T_world_board
+        free_board[fixed] = False
+    seen = tuple(map(CameraCorners.of, views.corners_px))
+    # Turns about the board's middle and shifts of the middle are nearly independent.
+    middle = np.eye(4)
+    middle[:3, 3] = board.corners_m.mean(axis=0)
+    problem = RigProblem(
+        models=models,
+        lens_of=lens_of,
+        image_size_wh=sizes,
+        corners_m=board.corners_m - middle[:3, 3],
+        seen=seen,
+        noise_px=np.ones(len(seen)),
+        free_lens=tuple(np.zeros(model.size, bool) for model in models),
+        free_camera=free_camera,
+        free_board=free_board,
+    )
+    state = RigState(vectors, T_cam_world, T_world_board @ middle)
+    everything = tuple(np.ones(len(one.corner), bool) for one in seen)
+    bundle = RigBundle(problem, state, everything, robust=True)
+    if problem.size:
+        bundle = solve_robustly(bundle)
+    free_lens = tuple(
+        np.full(model.size, lenses.is_shared or views.names[index] not in known)
+        for index, model in enumerate(models)
+    )
+    bundle = _adjust_with_slips(replace(bundle, problem=replace(problem, free_lens=free_lens)), board)
+    for name, of_camera in zip(views.names, bundle.used, strict=True):
+        if not of_camera.any():
+            raise InputError(f"camera {name}", expected="views that fit the other cameras", found="none")
+    placed = replace(bundle.state, T_world_board=bundle.state.T_world_board @ np.linalg.inv(middle))
+    return replace(bundle, state=placed, problem=replace(bundle.problem, corners_m=board.corners_m))
+
+
+def _adjust_with_slips(bundle: RigBundle, board: Board) -> RigBundle:
+    """Adjust with squared residuals; outliers, noise and slips are estimated anew after each adjustment."""
+    extent_m = float(np.linalg.norm(np.ptp(board.corners_m, axis=0)))
+    seen = bundle.problem.seen
+    slips = Slips.start(extent_m, len(seen), len(bundle.state.T_world_board))
+    bundle = replace(bundle, robust=False, slip_std=slips.each())
+    for _ in range(_MOST_ROUNDS):
+        before = bundle
+        distances = bundle.own_distance_px
+        noise_px = np.array(list(map(_noise_px, distances)))
+        used = tuple(
+            _inliers(one, distance <= GATE * noise)
+            for one, distance, noise in zip(seen, distances, noise_px, strict=True)
+        )
+        widths = slips.std
+        problem = replace(bundle.problem, noise_px=noise_px)
+        bundle = replace(bundle, problem=problem, used=used, slip_std=slips.each()).solved()
+        slips = slips.estimated(bundle)
+        same = all((new == old).all() for new, old in zip(used, before.used, strict=True))
+        if same and np.abs(np.log(slips.std / widths)).max() < _SETTLED:
+            break
+    return bundle
+
+
+#: From the world, z up, to the board's axes, whose z points into the board.
+_UPWARDS = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def _noise_px(distance_px: Float[np.ndarray, " seen"]) -> float:
+    """Standard deviation along each axis from the median of distances, which may contain outliers."""
+    if not len(distance_px):
+        return 1.0
+    return max(LEAST_NOISE_PX, float(np.median(distance_px)) / np.sqrt(2 * log(2)))
+
+
+def _inliers(seen: CameraCorners, near: Bool[np.ndarray, " seen"]) -> Bool[np.ndarray, " seen"]:
+    """Corners near their projections, without the views of which too few are."""
+    count = np.bincount(seen.instant, minlength=1)
+    left = np.bincount(seen.instant, weights=near, minlength=1)
+    is_good = (left >= LEAST_CORNERS) & (2 * left > count)
+    return near & is_good[seen.instant]
+
+
+def _result(board: Board, views: BoardViews, chain: Chain, bundle: RigBundle) -> CalibratedRig:
+    covariance = covariance_over_instants(bundle)
+    problem, state = bundle.problem, bundle.state
+    cameras: dict[str, Camera] = {}
+    lens_std, by_camera, centres = [], [], []
+    residual_px = np.full(views.corners_px.shape[:3], np.nan)
+    own_px, own_distances = residual_px.copy(), bundle.own_distance_px
+    used = np.zeros(views.corners_px.shape[:3], bool)
+    padded = np.pad(covariance, ((0, 1), (0, 1)))
+    for index, (name, T) in enumerate(zip(views.names, state.T_cam_world, strict=True)):
+        lens = int(problem.lens_of[index])
+        # Unknowns that were not adjusted have the index -1, the padding.
+        lens_std.append(np.sqrt(np.diag(padded)[problem.lens_columns[lens]]))
+        columns = problem.camera_columns[index]
+        block = padded[np.ix_(columns, columns)]
+        by_pose = centre_by_pose(T[:3, :3], T[:3, 3])
+        by_camera.append(block)
+        centres.append(by_pose @ block @ by_pose.T)
+        seen = problem.seen[index]
+        residual_px[index, seen.instant, seen.corner] = bundle.distance_px[index]
+        own_px[index, seen.instant, seen.corner] = own_distances[index]
+        used[index, seen.instant, seen.corner] = bundle.used[index]
+        cameras[name] = camera_of(problem.models[lens], state.lenses[lens], T, views.image_size_wh[index])
+    return CalibratedRig(
+        board,
+        make_rig(cameras),
+        views,
+        state.T_world_board,
+        residual_px,
+        own_px,
+        used,
+        tuple(lens_std),
+        np.stack(by_camera),
+        np.stack(centres),
+        chain.shared,
+    )
+
+
+def camera_of(
+    model: LensModel,
+    lens: Float[np.ndarray, " unknowns"],
+    T_cam_world: Float[np.ndarray, "4 4"],
+    image_size_wh: Int[np.ndarray, "2"],
+) -> Camera:
+    """Make a camera of a lens's vector."""
+    kind = {"fisheye": True} if model.fisheye else {}
+    U, _, V = np.linalg.svd(T_cam_world[:3, :3])
+    return make_camera(
+        R=U @ V,
+        t_m=T_cam_world[:3, 3],
+        K=camera_matrix(lens),
+        dist=lens[PINHOLE:].tolist(),
+        image_size_wh=(int(image_size_wh[0]), int(image_size_wh[1])),
+        **kind,
+    )
+
+
+def in_new_world(calibrated: CalibratedRig, change: Similarity) -> CalibratedRig:
+    """The same rig in a world that is turned and shifted; the covariances stay those against the old origin."""
+    T_new_old = np.eye(4)
+    T_new_old[:3, :3], T_new_old[:3, 3] = change.R, change.t_m
+    return replace(
+        calibrated,
+        rig=change.rig(calibrated.rig),
+        T_world_board=T_new_old @ calibrated.T_world_board,
+        centre_covariance_m2=change.covariance_m2(calibrated.centre_covariance_m2),
+    )

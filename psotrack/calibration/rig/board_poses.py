@@ -1,0 +1,120 @@
+"""Poses of a board in single views, and a first lens from the views of one camera."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.calibration.board_corners import LEAST_CORNERS, choose_spread, outline_of
+from psotrack.calibration.boards import Board
+from psotrack.calibration.rig.equations import CameraCorners, RigBundle, RigProblem, RigState, solve_robustly
+from psotrack.calibration.rig.lens_models import PINHOLE, LensModel
+
+#: Focal lengths from which the search for a lens starts, in image widths: 90 to 14 degrees; a fisheye's, to 200.
+_FOCAL_WIDTHS, _FOCAL_WIDTHS_FISHEYE = (0.5, 0.8, 1.2, 2.0, 4.0), (0.25, 0.35, 0.5, 0.8)
+#: Largest number of views for a first lens: more views add little, because the chosen views differ most.
+_MOST_VIEWS = 30
+
+
+def find_board_poses(
+    board: Board,
+    model: LensModel,
+    lens: Float[np.ndarray, " unknowns"],
+    corners_px: Float[np.ndarray, "corners 2"],
+) -> Float[np.ndarray, "poses 4 4"]:
+    """Poses, board to camera, that fit a view: up to two of a plane, for each labelling of the corners.
+
+    The pose of smallest error comes first; none if the lens cannot be inverted at most corners.
+    """
+    rays = model.normalise(lens, corners_px)
+    found: list[tuple[float, np.ndarray]] = []
+    for order in board.labellings:
+        seen = np.isfinite(rays[:, 0])
+        if seen.sum() < LEAST_CORNERS:
+            break
+        points_m, ends = board.corners_m[order][seen], np.ascontiguousarray(rays[seen])
+        try:
+            _, turns, shifts, errors = cv2.solvePnPGeneric(
+                points_m, ends, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+            )
+        except cv2.error:
+            # OpenCV fails for corners on one line.
+            continue
+        for turn, shift, error in zip(turns, shifts, np.asarray(errors).ravel(), strict=True):
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
+            if np.isfinite(T).all() and T[2, 3] > 0:
+                found.append((float(error), T))
+    found.sort(key=lambda one: one[0])
+    return np.array([T for _, T in found]).reshape(-1, 4, 4)
+
+
+def find_lens(
+    board: Board,
+    model: LensModel,
+    views_px: Float[np.ndarray, "instants corners 2"],
+    image_size_wh: tuple[int, int],
+) -> Float[np.ndarray, " unknowns"] | None:
+    """Find a first lens of one camera from its views of a board: an adjustment from several focal lengths.
+
+    Returns:
+        Vector of the lens, or None if no view fits.
+    """
+    outlines = [(index, outline_of(board, corners_px)) for index, corners_px in enumerate(views_px)]
+    usable = [(index, outline) for index, outline in outlines if outline is not None]
+    if not usable:
+        return None
+    spread = choose_spread(np.array([outline for _, outline in usable]) / image_size_wh[0], _MOST_VIEWS)
+    chosen = views_px[sorted(usable[index][0] for index in spread)]
+    found: list[tuple[float, np.ndarray]] = []
+    for widths in _FOCAL_WIDTHS_FISHEYE if model.fisheye else _FOCAL_WIDTHS:
+        bundle = _adjust_lens(
+            board, model, chosen, model.start(widths * image_size_wh[0], image_size_wh), image_size_wh
+        )
+        if bundle is not None:
+            cost = sum(float(np.minimum(distance, 20.0).sum()) for distance in bundle.distance_px)
+            found.append((cost, bundle.state.lenses[0]))
+    return min(found, key=lambda one: one[0])[1] if found else None
+
+
+def _adjust_lens(
+    board: Board,
+    model: LensModel,
+    views_px: Float[np.ndarray, "instants corners 2"],
+    lens: Float[np.ndarray, " unknowns"],
+    image_size_wh: tuple[int, int],
+) -> RigBundle | None:
+    """Adjust a lens and the board's poses: first the focal lengths and the first coefficient, then all."""
+    poses = [find_board_poses(board, model, lens, corners_px) for corners_px in views_px]
+    fits = np.array([len(candidates) > 0 for candidates in poses])
+    if not fits.any():
+        return None
+    seen = CameraCorners.of(views_px[fits])
+    first = np.zeros(model.size, bool)
+    first[:2] = True
+    first[PINHOLE : PINHOLE + 1] = True
+    problem = RigProblem(
+        models=(model,),
+        lens_of=np.zeros(1, np.int64),
+        image_size_wh=np.array([image_size_wh]),
+        corners_m=board.corners_m,
+        seen=(seen,),
+        noise_px=np.ones(1),
+        free_lens=(first,),
+        free_camera=np.zeros(1, bool),
+        free_board=np.ones(int(fits.sum()), bool),
+    )
+    state = RigState(
+        (lens,), np.eye(4)[None], np.array([candidates[0] for candidates in poses if len(candidates)])
+    )
+    bundle = RigBundle(problem, state, (np.ones(len(seen.corner), bool),), robust=True)
+    try:
+        bundle = solve_robustly(bundle, rounds=2)
+        return solve_robustly(
+            replace(bundle, problem=replace(bundle.problem, free_lens=(np.ones(model.size, bool),)))
+        )
+    except np.linalg.LinAlgError:
+        return None

@@ -1,0 +1,230 @@
+"""What a calibration of a rig shows, and what to do about it: figures of each camera, and sentences."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.calibration.rig.adjustment import CalibratedRig
+from psotrack.calibration.rig.views import FoundBoards
+from psotrack.geometry import undistort
+
+#: Columns and rows of cells of an image; a cell with a corner is covered.
+CELLS = (8, 6)
+#: Smallest share of an image that the board should have covered.
+_COVERED = 0.5
+#: Smallest number of views that a camera should share with another one.
+_SHARED = 12
+#: Largest standard deviation of a focal length, as a share of it, that needs no advice.
+_FOCAL_STD = 0.005
+#: A camera's views slip if the residuals are larger by this factor, and by this many pixels, than within the views.
+_SLIP_FACTOR, _SLIP_PX = 2.0, 0.3
+#: Largest shift of a camera's frames that is looked for, and least residual, pixels, and ratio of residuals to tell it.
+_MOST_SHIFT, _SHIFT_PX, _SHIFT_FACTOR = 3, 1.0, 2.0
+#: Number of views that are named.
+_WORST = 5
+
+
+@dataclass(frozen=True)
+class CameraFigures:
+    """Figures of one camera.
+
+    Attributes:
+        views: number of views that count.
+        corners: number of corners that count.
+        found: number of corners that were found.
+        rms_px: root mean square of the residuals of the corners that count, pixels.
+        median_px: median residual of all corners found, pixels.
+        own_median_px: median residual within the views, pixels: errors of the corners and of the lens alone.
+        covered: share of the image in which corners were found.
+        focal_px: focal lengths along x and y, pixels.
+        focal_std_px: their standard deviations.
+        centre_m: the camera's centre in the world, metres.
+        centre_std_m: its standard deviations.
+        best_partner: the camera that shares most views, or none.
+        shared: number of views shared with it.
+    """
+
+    views: int
+    corners: int
+    found: int
+    rms_px: float
+    median_px: float
+    own_median_px: float
+    covered: float
+    focal_px: tuple[float, float]
+    focal_std_px: tuple[float, float]
+    centre_m: tuple[float, ...]
+    centre_std_m: tuple[float, ...]
+    best_partner: str
+    shared: int
+
+
+def figures_of(calibrated: CalibratedRig) -> dict[str, CameraFigures]:
+    """Figures of each camera, by name."""
+    rig, views = calibrated.rig, calibrated.views
+    others = np.where(np.eye(len(rig), dtype=bool), -1, calibrated.shared)
+    rows = {}
+    for index, name in enumerate(rig.names):
+        used, residual = calibrated.used[index], calibrated.residual_px[index]
+        found = np.isfinite(residual)
+        partner = int(others[index].argmax())
+        std = calibrated.lens_std[index]
+        K = np.asarray(rig.cameras.K[index])
+        covariance = np.diag(calibrated.centre_covariance_m2[index])
+        rows[name] = CameraFigures(
+            views=int(used.any(axis=-1).sum()),
+            corners=int(used.sum()),
+            found=int(found.sum()),
+            rms_px=float(np.sqrt(np.mean(residual[used] ** 2))),
+            median_px=float(np.median(residual[found])),
+            own_median_px=float(np.median(calibrated.own_residual_px[index][found])),
+            covered=float(coverage(calibrated, index).astype(bool).mean()),
+            focal_px=(float(K[0, 0]), float(K[1, 1])),
+            focal_std_px=(float(std[0]), float(std[1])),
+            centre_m=tuple(np.asarray(rig.cameras.centre_world[index]).tolist()),
+            centre_std_m=tuple(np.sqrt(np.maximum(covariance, 0)).tolist()),
+            best_partner=rig.names[partner] if len(views.names) > 1 else "none",
+            shared=max(int(others[index, partner]), 0),
+        )
+    return rows
+
+
+def coverage(calibrated: CalibratedRig, camera: int) -> Float[np.ndarray, "rows columns"]:
+    """(rows, columns), number of corners in each cell of a camera's image."""
+    pixels = calibrated.views.corners_px[camera].reshape(-1, 2)
+    pixels = pixels[np.isfinite(pixels[:, 0])]
+    width, height = calibrated.views.image_size_wh[camera].tolist()
+    counts, _, _ = np.histogram2d(
+        pixels[:, 1],
+        pixels[:, 0],
+        bins=(CELLS[1], CELLS[0]),
+        range=((-0.5, height - 0.5), (-0.5, width - 0.5)),
+    )
+    return counts
+
+
+def worst_views(calibrated: CalibratedRig) -> list[tuple[str, int, float]]:
+    """Camera, number of the instant and median residual, pixels, of the views that fit worst."""
+    seen = np.isfinite(calibrated.residual_px).any(axis=-1)
+    typical = np.full(seen.shape, -1.0)
+    typical[seen] = np.nanmedian(calibrated.residual_px[seen], axis=-1)
+    order = np.argsort(-typical, axis=None)[: min(_WORST, int(seen.sum()))]
+    return [
+        (calibrated.rig.names[camera], int(calibrated.views.number[instant]), float(typical[camera, instant]))
+        for camera, instant in zip(*np.unravel_index(order, seen.shape), strict=True)
+    ]
+
+
+def say_print(found: FoundBoards) -> list[str]:
+    """Sentences on how the board was printed and seen."""
+    recognised, sentences = found.recognised, []
+    if recognised.inverted:
+        sentences.append("the board is printed white on black")
+    if recognised.board.legacy:
+        sentences.append(
+            "the board has the pattern of OpenCV before version 4.6, with a marker in its first corner"
+        )
+    for name, mirrored, seen in zip(
+        found.views.names, found.mirrored.tolist(), found.views.seen, strict=True
+    ):
+        if mirrored:
+            sentences.append(f"{name} sees the board mirrored, in {mirrored} of {int(seen.sum())} views")
+    return sentences
+
+
+def find_shifts(calibrated: CalibratedRig) -> dict[str, int]:
+    """Cameras whose frames fit the others much better if their numbers are changed, and by how much.
+
+    The camera is placed again by where the other cameras have the board a few instants before and after.
+    """
+    board = calibrated.board
+    number = calibrated.views.number
+    shifts = {}
+    for index, row in enumerate(figures_of(calibrated).values()):
+        if row.median_px < _SHIFT_PX or row.median_px < _SHIFT_FACTOR * row.own_median_px:
+            continue
+        camera = calibrated.rig.cameras[index]
+        others = np.asarray(np.delete(calibrated.used, index, axis=0).any(axis=(0, 2)))
+        error_px = {}
+        instants = np.flatnonzero(calibrated.views.seen[index])
+        rays = undistort(camera, calibrated.views.corners_px[index, instants].reshape(-1, 2))
+        rays = rays.reshape(len(instants), -1, 2)
+        focal_px = float(np.asarray(camera.K)[0, 0])
+        for shift in range(-_MOST_SHIFT, _MOST_SHIFT + 1):
+            place = {int(n): k for k, n in enumerate(number) if others[k]}
+            rows = [
+                (k, place[int(number[i]) + shift])
+                for k, i in enumerate(instants)
+                if number[i] + shift in place
+            ]
+            if len(rows) >= _SHARED // 2:
+                views, boards = np.array(rows).T
+                T = calibrated.T_world_board[boards]
+                points_m = np.einsum("vij,nj->vni", T[:, :3, :3], board.corners_m) + T[:, None, :3, 3]
+                error_px[shift] = focal_px * _misplaced(points_m, rays[views], np.asarray(camera.T_cam_world))
+        best = min(error_px, key=lambda shift: error_px[shift], default=0)
+        if best and 0 in error_px and error_px[best] < error_px[0] / _SHIFT_FACTOR:
+            shifts[calibrated.rig.names[index]] = best
+    return shifts
+
+
+def _misplaced(
+    points_m: Float[np.ndarray, "views corners 3"],
+    rays: Float[np.ndarray, "views corners 2"],
+    T_cam_world: Float[np.ndarray, "4 4"],
+) -> float:
+    """Median distance x / z, y / z of points from where a camera sees them, if it stands where they fit best."""
+    seen = np.isfinite(rays[..., 0])
+    points_m, ends = points_m[seen], np.ascontiguousarray(rays[seen])
+    turn, shift = cv2.Rodrigues(T_cam_world[:3, :3])[0], T_cam_world[:3, 3].reshape(3, 1).copy()
+    _, turn, shift = cv2.solvePnP(points_m, ends, np.eye(3), None, turn, shift, True, cv2.SOLVEPNP_ITERATIVE)
+    found, _ = cv2.projectPoints(points_m, turn, shift, np.eye(3), None)
+    return float(np.median(np.linalg.norm(np.asarray(found).reshape(-1, 2) - ends, axis=-1)))
+
+
+def advise(calibrated: CalibratedRig) -> list[str]:
+    """Sentences that say what to film again, and why; none where the calibration is sound."""
+    rows = figures_of(calibrated)
+    sentences = [
+        f"{name} shares {row.shared} views with {row.best_partner} and fewer with the others: "
+        f"film more where {name} and {row.best_partner} both see the board"
+        for name, row in rows.items()
+        if len(rows) > 1 and row.shared < _SHARED
+    ]
+    bare = [f"{name} ({row.covered:.0%})" for name, row in rows.items() if row.covered < _COVERED]
+    if bare:
+        sentences.append(
+            f"the board was seen in small parts of the images of {', '.join(bare)}: move it into their corners"
+        )
+    open_focal = [
+        f"{name} (± {row.focal_std_px[0] / row.focal_px[0]:.1%})"
+        for name, row in rows.items()
+        if row.focal_std_px[0] > _FOCAL_STD * row.focal_px[0]
+    ]
+    if open_focal:
+        sentences.append(
+            f"the focal lengths of {', '.join(open_focal)} are not well known: tilt the board more, and film it nearer"
+        )
+    shifts = find_shifts(calibrated)
+    sentences_of_shifts = [
+        f"{name} fits the others better if its frame {number} is their frame {number + shift}: its video begins "
+        f"{abs(shift)} frame{'s' if abs(shift) > 1 else ''} {'late' if shift > 0 else 'early'}; "
+        "say so by time_offset_s in a recording.toml, and pass it instead of the videos"
+        for name, shift in shifts.items()
+        for number in [int(calibrated.views.number[0])]
+    ]
+    slipping = []
+    for name, row in rows.items():
+        slip_px = float(np.sqrt(max(row.median_px**2 - row.own_median_px**2, 0)))
+        if row.median_px > _SLIP_FACTOR * row.own_median_px and slip_px > _SLIP_PX:
+            slipping.append(f"{name} ({slip_px:.1f} px)")
+    if slipping:
+        sentences.append(
+            f"the board is not where the other cameras see it for {', '.join(slipping)}: hold it still, "
+            "or check that frames of equal number are of one instant"
+        )
+    return sentences + sentences_of_shifts

@@ -1,0 +1,212 @@
+"""Images of several cameras, and which of them belong to one instant.
+
+A camera's images are a video, or image files that have numbers in their names. Frames of equal number are one instant.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Int, UInt8
+
+from psotrack.errors import InputError, SettingsError
+from psotrack.recordings import Recording, VideoInfo, probe, read_frames
+
+_IMAGES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"})
+_PATTERN = re.compile(r"[*?\[]")
+#: Largest number of instants in which the board is searched; limits the time for long videos.
+MOST_INSTANTS = 300
+#: Largest relative difference of the frame rates of videos whose frames are counted alike.
+_SAME_RATE = 0.005
+
+
+@dataclass(frozen=True)
+class CameraImages:
+    """Images of one camera.
+
+    Attributes:
+        name: name of the camera.
+        path: the video, the folder or the pattern.
+        image_size_wh: width and height, pixels.
+        frames: (frames,), numbers of the frames, increasing.
+        video: the video, or None.
+        files: image files, in the order of `frames`; none of a video.
+    """
+
+    name: str
+    path: Path
+    image_size_wh: tuple[int, int]
+    frames: Int[np.ndarray, " frames"]
+    video: VideoInfo | None = None
+    files: tuple[Path, ...] = ()
+
+    def read(
+        self, chosen: Int[np.ndarray, " chosen"]
+    ) -> Iterator[tuple[int, UInt8[np.ndarray, "height width"]]]:
+        """Yield the numbers and grey images of the chosen frames, in increasing order.
+
+        Raises:
+            InputError: an image cannot be read, or has another size than the first one.
+        """
+        wanted = set(chosen.tolist())
+        if self.video is not None:
+            step = int(np.gcd.reduce(chosen)) or self.video.num_frames
+            last = max(wanted, default=-1)
+            for index, frame in enumerate(read_frames(self.video, step)):
+                if index * step in wanted:
+                    yield index * step, cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+                if index * step >= last:
+                    break
+            return
+        for number, file in zip(self.frames.tolist(), self.files, strict=True):
+            if number in wanted:
+                yield number, self._read_file(file)
+
+    def spread(self, count: int) -> Int[np.ndarray, " chosen"]:
+        """Numbers of frames, evenly spread: at least `count` and fewer than twice `count`, or all."""
+        step = max(1, len(self.frames) // count)
+        return self.frames[::step]
+
+    def _read_file(self, file: Path) -> UInt8[np.ndarray, "height width"]:
+        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        if image is None:
+            raise InputError(file, expected="an image", found="a file that cannot be read as one")
+        if image.shape[::-1] != self.image_size_wh:
+            raise InputError(
+                file,
+                expected=f"{self.image_size_wh[0]} x {self.image_size_wh[1]} pixels as in {self.files[0].name}",
+                found=f"{image.shape[1]} x {image.shape[0]}",
+            )
+        return np.asarray(image, np.uint8)
+
+
+def open_images(paths: Sequence[Path | str], names: Sequence[str] | None = None) -> tuple[CameraImages, ...]:
+    """Open the images of each camera: videos, folders of images, or patterns such as left*.png.
+
+    Args:
+        paths: one path or pattern for each camera.
+        names: names of the cameras; None to take them from the paths.
+
+    Raises:
+        InputError: a path cannot be read, images have no or equal numbers, a camera is given twice, or two videos have
+            different frame rates.
+        SettingsError: there are not as many names as paths.
+    """
+    found = [Path(path) for path in paths]
+    if names is None:
+        names = _names(found)
+    if len(names) != len(found):
+        raise SettingsError("names", expected=f"{len(found)} names", found=f"{len(names)}")
+    real = [path.resolve() for path in found]
+    for index, (name, path) in enumerate(zip(names, real, strict=True)):
+        if path in real[:index] or name in names[:index]:
+            raise InputError(found[index], expected="each camera once", found=f"{name} again")
+    cameras = tuple(_open(name, path) for name, path in zip(names, found, strict=True))
+    rates = {camera.name: camera.video.fps for camera in cameras if camera.video is not None}
+    for name, fps in rates.items():
+        first = next(iter(rates))
+        if abs(fps - rates[first]) > _SAME_RATE * rates[first]:
+            raise InputError(
+                f"camera {name}",
+                expected=f"{rates[first]:g} frames per second as of {first}",
+                found=f"{fps:g}",
+                remedy="write a recording.toml that says when the frames were exposed, and pass it",
+            )
+    return cameras
+
+
+def open_recorded(recording: Recording) -> tuple[tuple[CameraImages, ...], tuple[np.ndarray, np.ndarray]]:
+    """Images of a recording's cameras, and which of their frames belong to one instant of its clock.
+
+    Returns:
+        the images; and the number of each instant, (instants,), with each camera's frame, (instants, cameras), -1 where
+        it has none.
+
+    Raises:
+        InputError: no camera has a video.
+    """
+    names = [name for name in recording.timeline().cameras if name in recording.videos]
+    if not names:
+        raise InputError(recording.folder, expected="videos or images of a board", found="none")
+    cameras = tuple(
+        CameraImages(name, video.path, video.image_size_wh, np.arange(video.num_frames), video)
+        for name, video in ((name, recording.videos[name]) for name in names)
+    )
+    timeline = recording.timeline()
+    columns = [timeline.cameras.index(name) for name in names]
+    step = max(1, -(-timeline.num_instants // MOST_INSTANTS))
+    number = np.arange(0, timeline.num_instants, step)
+    return cameras, (number, timeline.frame[number][:, columns].astype(np.int64))
+
+
+def instants_of_numbers(
+    cameras: Sequence[CameraImages], most: int = MOST_INSTANTS
+) -> tuple[Int[np.ndarray, " instants"], Int[np.ndarray, "instants cameras"]]:
+    """Instants of frames of equal number, evenly spread if there are more than `most`.
+
+    Returns:
+        numbers of the instants; and (instants, cameras), number of each camera's frame, -1 where it has none.
+    """
+    numbers = np.unique(np.concatenate([camera.frames for camera in cameras]))
+    # Multiples of a step are read without decoding all frames between them.
+    step = max(1, -(-len(numbers) // most))
+    numbers = numbers[::step]
+    frames = np.stack([np.where(np.isin(numbers, camera.frames), numbers, -1) for camera in cameras], axis=1)
+    return numbers, frames
+
+
+def _names(paths: list[Path]) -> list[str]:
+    """Names of the cameras: the first part, from the end of the paths, in which all paths differ."""
+    if len(paths) == 1:
+        return [_stem(paths[0].name)]
+    parts = [path.absolute().parts for path in paths]
+    for depth in range(1, min(map(len, parts)) + 1):
+        words = [_stem(part[-depth]) for part in parts]
+        if len(set(words)) == len(words):
+            return words
+        if len(set(words)) > 1:
+            break
+    return [_stem(path.name) for path in paths]
+
+
+def _stem(word: str) -> str:
+    """A file's name without its suffix, and without the wildcards of a pattern."""
+    stem = word if not Path(word).suffix else Path(word).stem
+    return _PATTERN.split(stem)[0].rstrip("_-. ") or stem
+
+
+def _open(name: str, path: Path) -> CameraImages:
+    if _PATTERN.search(path.name):
+        files = sorted(file for file in path.parent.glob(path.name) if file.suffix.lower() in _IMAGES)
+        if not files:
+            raise InputError(path, expected="images of this pattern", found="none")
+    elif path.is_dir():
+        files = sorted(file for file in path.iterdir() if file.suffix.lower() in _IMAGES)
+        if not files:
+            raise InputError(path, expected="a folder of images", found="none in it")
+    else:
+        video = probe(path)
+        return CameraImages(name, path, video.image_size_wh, np.arange(video.num_frames), video)
+    numbered: dict[int, Path] = {}
+    for file in files:
+        digits = re.findall(r"\d+", file.stem)
+        if not digits:
+            raise InputError(file, expected="a name with the number of the frame", found="no number")
+        number = int(digits[-1])
+        if number in numbered:
+            raise InputError(
+                file, expected="each number once", found=f"{number} as of {numbered[number].name}"
+            )
+        numbered[number] = file
+    ordered = dict(sorted(numbered.items()))
+    first = cv2.imread(str(files[0]), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    if first is None:
+        raise InputError(files[0], expected="an image", found="a file that cannot be read as one")
+    return CameraImages(
+        name, path, (first.shape[1], first.shape[0]), np.array(list(ordered)), None, tuple(ordered.values())
+    )

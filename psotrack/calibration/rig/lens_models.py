@@ -1,0 +1,157 @@
+"""Lenses as vectors of numbers, fx, fy, cx, cy and the distortion, and pixels with derivatives by all of them, float64.
+
+OpenCV projects: its pinhole model with 0 to 14 coefficients, and its fisheye model with four.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.errors import SettingsError
+from psotrack.geometry import Rig
+
+#: Number of unknowns of a lens before the distortion: fx, fy, cx, cy.
+PINHOLE = 4
+#: Numbers of distortion coefficients of OpenCV's pinhole model.
+_PINHOLE_COEFFICIENTS = (0, 4, 5, 8, 12, 14)
+_FISHEYE_COEFFICIENTS = 4
+#: Standard deviations of the distortion coefficients before any view: so wide that they matter only where the views
+#: leave a coefficient open. The order is OpenCV's; p1 and p2 are small for every lens, and so is a tilted sensor.
+_COEFFICIENT_STD = np.array([1, 1, 0.05, 0.05, 1, 1, 1, 1, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05], np.float64)
+#: Standard deviation of the principal point about the image's middle, in image widths, and of log(fx / fy).
+_CENTRE_STD, _ASPECT_STD = 0.1, 0.1
+_UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+
+
+@dataclass(frozen=True)
+class LensModel:
+    """A family of lenses.
+
+    Attributes:
+        coefficients: number of distortion coefficients.
+        fisheye: whether the lens is OpenCV's fisheye model instead of its pinhole model.
+    """
+
+    coefficients: int = 5
+    fisheye: bool = False
+
+    def __post_init__(self) -> None:
+        known = (_FISHEYE_COEFFICIENTS,) if self.fisheye else _PINHOLE_COEFFICIENTS
+        if self.coefficients not in known:
+            raise SettingsError(
+                "lens",
+                expected=f"one of {', '.join(map(str, known))} coefficients",
+                found=f"{self.coefficients}",
+            )
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return PINHOLE + self.coefficients
+
+    def start(self, focal_px: float, image_size_wh: tuple[int, int]) -> Float[np.ndarray, " unknowns"]:
+        """A lens without distortion whose principal point is the image's middle."""
+        middle = (np.array(image_size_wh) - 1) / 2
+        return np.concatenate([[focal_px, focal_px], middle, np.zeros(self.coefficients)])
+
+    def project(
+        self, lens: Float[np.ndarray, " unknowns"], points_m: Float[np.ndarray, "points 3"]
+    ) -> tuple[
+        Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 3"], Float[np.ndarray, "points 2 unknowns"]
+    ]:
+        """Pixels of points in the camera's axes, and their derivatives by the points and by the lens."""
+        points_m = np.ascontiguousarray(points_m)[:, None]
+        still = np.zeros(3)
+        K = camera_matrix(lens)
+        if self.fisheye:
+            pixels, slopes = cv2.fisheye.projectPoints(points_m, still, still, K, lens[PINHOLE:])
+            slopes = np.asarray(slopes, np.float64).reshape(-1, 2, slopes.shape[-1])
+            return np.asarray(pixels).reshape(-1, 2), slopes[..., 11:14], slopes[..., :8]
+        dist = lens[PINHOLE:] if self.coefficients else np.zeros(4)
+        pixels, slopes = cv2.projectPoints(points_m, still, still, K, dist)
+        slopes = np.asarray(slopes, np.float64).reshape(-1, 2, slopes.shape[-1])
+        return np.asarray(pixels).reshape(-1, 2), slopes[..., 3:6], slopes[..., 6 : 6 + self.size]
+
+    def normalise(
+        self, lens: Float[np.ndarray, " unknowns"], points_px: Float[np.ndarray, "points 2"]
+    ) -> Float[np.ndarray, "points 2"]:
+        """Directions (x / z, y / z) in which pixels are seen; NaN where the lens cannot be inverted."""
+        seen = np.isfinite(points_px).all(axis=-1)
+        rays = np.full(points_px.shape, np.nan)
+        if not seen.any():
+            return rays
+        K, pixels = camera_matrix(lens), np.ascontiguousarray(points_px[seen])[:, None]
+        if self.fisheye:
+            found = cv2.fisheye.undistortPoints(pixels, K, lens[PINHOLE:]).reshape(-1, 2)
+        else:
+            dist = lens[PINHOLE:] if self.coefficients else np.zeros(4)
+            found = cv2.undistortPoints(pixels, K, dist, criteria=_UNDISTORT_CRITERIA).reshape(-1, 2)
+        # An iteration that diverged does not lead back to its pixel.
+        back, _, _ = self.project(lens, np.column_stack([found, np.ones(len(found))]))
+        found[~(np.linalg.norm(back - pixels[:, 0], axis=-1) < 1.0)] = np.nan
+        rays[seen] = found
+        return rays
+
+    def prior(
+        self, image_size_wh: tuple[int, int]
+    ) -> tuple[Float[np.ndarray, " unknowns"], Float[np.ndarray, "unknowns unknowns"]]:
+        """What is known of a lens before any view: a value of each unknown, and the information about them."""
+        information = np.zeros((self.size, self.size))
+        width = max(image_size_wh)
+        information[[2, 3], [2, 3]] = 1 / (_CENTRE_STD * width) ** 2
+        # A difference of the focal lengths, in units of a typical focal length, is the logarithm of their ratio.
+        information[:2, :2] = np.array([[1, -1], [-1, 1]]) / (_ASPECT_STD * width) ** 2
+        rest = np.arange(PINHOLE, self.size)
+        information[rest, rest] = 1 / _COEFFICIENT_STD[: self.coefficients] ** 2
+        return self.start(0.0, image_size_wh), information
+
+
+def camera_matrix(lens: Float[np.ndarray, " unknowns"]) -> Float[np.ndarray, "3 3"]:
+    """(3, 3), intrinsics in pixels."""
+    fx, fy, cx, cy = lens[:PINHOLE]
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def parse_lens_model(word: str) -> LensModel:
+    """The model that a word names: a number of coefficients, or fisheye.
+
+    Raises:
+        SettingsError: there is no such model.
+    """
+    if word.lower() == "fisheye":
+        return LensModel(_FISHEYE_COEFFICIENTS, fisheye=True)
+    if not word.isdecimal() or int(word) not in _PINHOLE_COEFFICIENTS:
+        raise SettingsError(
+            "lens", expected=f"one of {', '.join(map(str, _PINHOLE_COEFFICIENTS))} or fisheye", found=word
+        )
+    return LensModel(int(word))
+
+
+def known_lenses(rig: Rig) -> dict[str, tuple[LensModel, np.ndarray]]:
+    """Models and vectors of a rig's lenses, by camera.
+
+    Raises:
+        SettingsError: a lens has skew, which OpenCV's calibration does not know.
+    """
+    known = {}
+    for index, name in enumerate(rig.names):
+        camera = rig.cameras[index]
+        K, dist = np.asarray(camera.K), np.asarray(camera.dist)
+        if abs(K[0, 1]) > 0:
+            raise SettingsError(f"camera {name}", expected="a lens without skew", found=f"{K[0, 1]:g} px")
+        is_fisheye = bool(getattr(camera, "fisheye", False))
+        size = (
+            next(n for n in _PINHOLE_COEFFICIENTS if n >= len(dist))
+            if not is_fisheye
+            else _FISHEYE_COEFFICIENTS
+        )
+        dist = np.pad(dist[:size], (0, max(0, size - len(dist))))
+        known[name] = (
+            LensModel(size, is_fisheye),
+            np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], dist]),
+        )
+    return known

@@ -1,0 +1,252 @@
+"""A rig from a single point that moves before all cameras: a light, a ball, a drone.
+
+Two cameras see a point along two rays that meet, whatever the point is: the essential matrix (Nistér, PAMI 26(6), 2004)
+gives the direction from one camera to the other. The pair that sees most at wide angles begins; each further camera is
+placed by points that are known already (perspective-n-point), and after each camera all are adjusted together
+(`calibration.bundle`). Detections of other things are left out by random sampling, first with a wide gate. Scale, axes
+and origin of the world stay open: see `world`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+
+from psotrack.calibration.bundle import AdjustedRig, adjust
+from psotrack.calibration.common_errors import CommonErrors
+from psotrack.calibration.residuals import spread_px
+from psotrack.errors import InputError
+from psotrack.geometry import Rig, triangulate, undistort
+
+#: Distance in the image up to which a detection may be of the point, while the cameras are not yet adjusted, pixels.
+_WIDE_PX = 15.0
+#: Smallest number of instants that a pair of cameras must share, and of known points for a further camera.
+_LEAST_SHARED = 12
+#: Angle between two cameras' rays from which on a wider one is no better, degrees.
+_WIDE_DEG = 10.0
+#: Largest number of instants that are used: neighbouring ones tell nearly the same.
+_MOST_INSTANTS = 1500
+#: Points farther away than a multiple of the median distance are where rays are nearly parallel: multiples to try.
+_FAR = (10.0, 4.0, 2.0, 1.5)
+#: Smallest standard deviation of a detection, pixels.
+_LEAST_NOISE_PX = 0.2
+#: Number of neighbouring instants whose detections have errors in common, and the size of these, in units of the noise.
+_LASTING, _LASTING_SHARE = 15, 0.5
+
+
+@dataclass(frozen=True)
+class PointViews:
+    """Pixels of one or several points in all cameras.
+
+    Attributes:
+        names: names of the cameras.
+        point: (sightings,), index of the point: 0, or one of two ends of a stick.
+        number: (sightings,), number of the instant.
+        points_px: (sightings, cameras, 2), pixels; NaN where a camera does not see the point.
+    """
+
+    names: tuple[str, ...]
+    point: Int[np.ndarray, " sightings"]
+    number: Int[np.ndarray, " sightings"]
+    points_px: Float[np.ndarray, "sightings cameras 2"]
+
+
+@dataclass(frozen=True)
+class PointRig:
+    """A rig from a moving point; its unit of length is open until `world` sets it.
+
+    Attributes:
+        adjusted: the adjusted rig, with the positions of the point.
+        views: the sightings that were used.
+        noise_px: standard deviation of a sighting along x and along y.
+    """
+
+    adjusted: AdjustedRig
+    views: PointViews
+    noise_px: float
+
+
+def calibrate_by_point(lenses: Rig, views: PointViews) -> PointRig:
+    """Place cameras with known lenses by a point that moves before them.
+
+    The first camera of the best pair is the world, and the distance to the second is the unit.
+
+    Args:
+        lenses: the cameras' lenses, in the order of `views.names`.
+        views: pixels of the point.
+
+    Raises:
+        InputError: no pair of cameras sees the point often enough, or a camera cannot be joined to the others.
+    """
+    views = _thinned(views)
+    rays = np.stack(
+        [undistort(lenses.cameras[index], views.points_px[:, index]) for index in range(len(lenses))], axis=1
+    )
+    first, second, T = _best_pair(lenses, views, rays)
+    placed = {first: np.eye(4), second: T}
+    points_px = views.points_px
+    rig = _rig_of(lenses, placed)
+    adjusted = _adjusted(rig, points_px[:, sorted(placed)], _WIDE_PX / 5)
+    while len(placed) < len(lenses):
+        index, T = _next_camera(lenses, views, adjusted.points_m, placed)
+        placed = dict(zip(sorted(placed), np.asarray(adjusted.rig.cameras.T_cam_world), strict=True))
+        placed[index] = T
+        adjusted = _adjusted(_rig_of(lenses, placed), points_px[:, sorted(placed)], _WIDE_PX / 5)
+    noise_px = _noise_px(adjusted)
+    lasting = CommonErrors(
+        (views.number - views.number.min()) // _LASTING,
+        np.full(points_px.shape[:2], _LASTING_SHARE * noise_px),
+    )
+    used_px = np.where(adjusted.used[..., None], points_px, np.nan)
+    adjusted = _adjust_near(adjusted.rig, used_px, noise_px, [lasting])
+    return PointRig(adjusted, views, _noise_px(adjusted))
+
+
+def _thinned(views: PointViews) -> PointViews:
+    """Sightings of at least two cameras, evenly thinned out."""
+    both = np.flatnonzero(np.isfinite(views.points_px[..., 0]).sum(axis=1) >= 2)
+    if not len(both):
+        raise InputError("points", expected="instants at which two cameras see the point", found="none")
+    numbers = np.unique(views.number[both])
+    kept = both[np.isin(views.number[both], numbers[:: max(1, -(-len(numbers) // _MOST_INSTANTS))])]
+    return replace(views, point=views.point[kept], number=views.number[kept], points_px=views.points_px[kept])
+
+
+def _best_pair(
+    lenses: Rig, views: PointViews, rays: Float[np.ndarray, "sightings cameras 2"]
+) -> tuple[int, int, Float[np.ndarray, "4 4"]]:
+    """The pair that sees most points at wide angles, and the transform from its first to its second camera."""
+    best: tuple[float, int, int, np.ndarray] | None = None
+    most = (0, 0, 1)
+    for first, second in combinations(range(len(lenses)), 2):
+        both = np.isfinite(rays[:, [first, second]]).all(axis=(1, 2))
+        most = max(most, (int(both.sum()), first, second))
+        if both.sum() < _LEAST_SHARED:
+            continue
+        focal_px = float(np.mean([lenses.cameras.K[index, 0, 0] for index in (first, second)]))
+        here, there = np.ascontiguousarray(rays[both, first]), np.ascontiguousarray(rays[both, second])
+        E, inliers = cv2.findEssentialMat(
+            here, there, np.eye(3), method=cv2.RANSAC, prob=0.9999, threshold=_WIDE_PX / focal_px
+        )
+        if E is None or E.shape != (3, 3):
+            continue
+        count, R, t, mask = cv2.recoverPose(E, here, there, np.eye(3), mask=inliers)
+        good = np.ravel(mask) > 0
+        if count < _LEAST_SHARED:
+            continue
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R, np.ravel(t)
+        directions = [np.column_stack([part[good], np.ones(int(good.sum()))]) for part in (here, there)]
+        directions[1] = directions[1] @ R
+        cosine = np.vecdot(*directions) / np.prod(
+            [np.linalg.norm(part, axis=1) for part in directions], axis=0
+        )
+        angle_deg = float(np.median(np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))))
+        score = count * min(angle_deg / _WIDE_DEG, 1.0)
+        if best is None or score > best[0]:
+            best = score, first, second, T
+    if best is None:
+        count, first, second = most
+        raise InputError(
+            "points",
+            expected=f"at least {_LEAST_SHARED} instants at which two cameras see the same point",
+            found=f"{count} of {views.names[first]} and {views.names[second]} at most",
+            remedy="move the point where two cameras see it, and check that equal frames are of one instant",
+        )
+    return best[1:]
+
+
+def _next_camera(
+    lenses: Rig,
+    views: PointViews,
+    points_m: Float[np.ndarray, "sightings 3"],
+    placed: dict[int, Float[np.ndarray, "4 4"]],
+) -> tuple[int, Float[np.ndarray, "4 4"]]:
+    """Place the camera that sees most of the known points."""
+    known = np.isfinite(points_m[:, 0])
+    seen = {
+        index: known & np.isfinite(views.points_px[:, index, 0])
+        for index in range(len(lenses))
+        if index not in placed
+    }
+    index = max(seen, key=lambda one: int(seen[one].sum()))
+    rays = undistort(lenses.cameras[index], views.points_px[seen[index], index])
+    usable = np.isfinite(rays[:, 0])
+    if usable.sum() >= _LEAST_SHARED:
+        focal_px = float(lenses.cameras.K[index, 0, 0])
+        found, turn, shift, inliers = cv2.solvePnPRansac(
+            points_m[seen[index]][usable],
+            np.ascontiguousarray(rays[usable]),
+            np.eye(3),
+            None,
+            iterationsCount=2000,
+            reprojectionError=_WIDE_PX / focal_px,
+            confidence=0.9999,
+            flags=cv2.SOLVEPNP_SQPNP,
+        )
+        if found and inliers is not None and len(inliers) >= _LEAST_SHARED:
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
+            return index, T
+    raise InputError(
+        f"camera {views.names[index]}",
+        expected=f"at least {_LEAST_SHARED} instants at which it sees the point with two other cameras",
+        found=f"{int(usable.sum())} that no pose of it fits" if usable.sum() else "none",
+        remedy="move the point where this camera and two others see it",
+    )
+
+
+def _rig_of(lenses: Rig, placed: dict[int, Float[np.ndarray, "4 4"]]) -> Rig:
+    """Rig of the cameras that have a place."""
+    rows = np.array(sorted(placed))
+    cameras = replace(lenses.cameras[rows], T_cam_world=np.array([placed[index] for index in rows.tolist()]))
+    return Rig(tuple(lenses.names[index] for index in rows.tolist()), cameras)
+
+
+def _adjusted(rig: Rig, points_px: Float[np.ndarray, "sightings cameras 2"], noise_px: float) -> AdjustedRig:
+    """Adjust some of the cameras, and know all points again that these cameras see."""
+    adjusted = _adjust_near(rig, points_px, noise_px)
+    adjusted = _adjust_near(adjusted.rig, points_px, _noise_px(adjusted))
+    used = np.where(adjusted.used[..., None], points_px, np.nan)
+    return replace(adjusted, points_m=triangulate(adjusted.rig.cameras, used))
+
+
+def _adjust_near(
+    rig: Rig,
+    points_px: Float[np.ndarray, "sightings cameras 2"],
+    noise_px: float,
+    common_errors: Sequence[CommonErrors] = (),
+) -> AdjustedRig:
+    """Adjust without the sightings whose rays are nearly parallel: their point may be anywhere far away.
+
+    Raises:
+        InputError: the sightings do not determine the cameras.
+    """
+    centres = np.asarray(rig.cameras.centre_world)
+    far = np.linalg.norm(triangulate(rig.cameras, points_px) - centres.mean(axis=0), axis=-1)
+    typical = float(np.nanmedian(far)) if np.isfinite(far).any() else 0.0
+    for multiple in _FAR:
+        near_px = np.where((far < multiple * typical)[:, None, None], points_px, np.nan)
+        try:
+            return adjust(rig, near_px, noise_px, common_errors=common_errors)
+        except np.linalg.LinAlgError:
+            # A point went to infinity: points that are not so far away stay.
+            continue
+    raise InputError(
+        "points",
+        expected="sightings that determine the cameras",
+        found="rays that are nearly parallel",
+        remedy="move the point nearer, and where the cameras see it from different sides",
+    )
+
+
+def _noise_px(adjusted: AdjustedRig) -> float:
+    """Standard deviation of a sighting along each axis, from the residuals."""
+    residual_px = adjusted.residual_px[adjusted.used]
+    unknowns = 3 * int(adjusted.used.any(axis=1).sum()) + 6 * len(adjusted.rig)
+    return max(_LEAST_NOISE_PX, spread_px(residual_px, unknowns))

@@ -1,0 +1,216 @@
+"""Sightings of a moving point from a table or from detections, and the points that fix a world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.calibration.image_points import ImagePoints, read_image_points
+from psotrack.calibration.rig.moving_point import PointRig, PointViews
+from psotrack.calibration.rig.world import LEAST_POINTS, Similarity, align
+from psotrack.errors import InputError, SettingsError
+from psotrack.geometry import Rig, triangulate
+from psotrack.recordings import Detections
+from psotrack.support import read_table
+
+_SEPARATOR = ","
+
+
+def read_point_views(path: Path | str) -> PointViews:
+    """Read the sightings of one point, or of the two ends of a stick, from a CSV file.
+
+    The columns are camera, frame, x_px, y_px, and point where there are two.
+
+    Raises:
+        InputError: the file cannot be read, a column or a value is missing, a camera sees a point twice in a frame,
+            or there are more than two points.
+    """
+    table = read_table(path, _SEPARATOR)
+    camera, frame = table.column("camera"), table.column("frame")
+    pixels = [table.column(name) for name in ("x_px", "y_px")]
+    named = table.find("point")
+    seen: dict[tuple[int, str], dict[str, list[float]]] = {}
+    cameras: dict[str, None] = {}
+    for row in table.rows:
+        name = row.text(camera)
+        cameras[name] = None
+        end = row.text(named) if named is not None else ""
+        number = row.number(frame)
+        if number != int(number):
+            raise row.error(frame, "a whole number", f"{number:g}")
+        of_frame = seen.setdefault((int(number), end), {})
+        if name in of_frame:
+            raise row.error(frame, "each point once per camera and frame", f"{int(number)} of {name} again")
+        of_frame[name] = [row.number(column) for column in pixels]
+    ends = sorted({end for _, end in seen})
+    if len(ends) > 2:
+        raise InputError(path, expected="one point, or the two ends of a stick", found=f"{len(ends)} points")
+    order = sorted(seen)
+    names = tuple(cameras)
+    points_px = np.full((len(order), len(names), 2), np.nan)
+    for index, key in enumerate(order):
+        for name, xy in seen[key].items():
+            points_px[index, names.index(name)] = xy
+    return PointViews(
+        names,
+        np.array([ends.index(end) for _, end in order], np.int64),
+        np.array([number for number, _ in order], np.int64),
+        points_px,
+    )
+
+
+def views_of_detections(detections: Mapping[str, Detections]) -> PointViews:
+    """Sightings from the middles of boxes: of each frame the box of highest confidence, if it is only one.
+
+    Raises:
+        InputError: fewer than two cameras have detections.
+    """
+    if len(detections) < 2:
+        raise InputError("detections", expected="at least two cameras", found=f"{len(detections)}")
+    names = tuple(detections)
+    numbers = np.unique(np.concatenate([boxes.frame for boxes in detections.values()])).astype(np.int64)
+    points_px = np.full((len(numbers), len(names), 2), np.nan)
+    for index, boxes in enumerate(detections.values()):
+        # The last of a frame's boxes is the one of highest confidence.
+        order = np.lexsort((boxes.confidence, boxes.frame))
+        frame, confidence = boxes.frame[order], boxes.confidence[order]
+        is_last = np.append(frame[1:] != frame[:-1], True)
+        is_tied = np.append(False, (frame[1:] == frame[:-1]) & (confidence[1:] == confidence[:-1]))
+        chosen = order[is_last & ~is_tied]
+        # Pixel centres are at whole numbers, and edges of boxes are half a pixel away from pixel centres.
+        middle = (boxes.xyxy[chosen, :2] + boxes.xyxy[chosen, 2:]) / 2 - 0.5
+        points_px[np.searchsorted(numbers, boxes.frame[chosen]), index] = middle
+    return PointViews(names, np.zeros(len(numbers), np.int64), numbers, points_px)
+
+
+def stick_length(point_rig: PointRig) -> float:
+    """Median distance between the two ends of a stick, in the rig's unit of length.
+
+    Raises:
+        InputError: the two ends are never known at one instant.
+    """
+    views, points_m = point_rig.views, point_rig.adjusted.points_m
+    known = np.isfinite(points_m[:, 0])
+    ends = [
+        {int(number): place for number, place in zip(views.number[rows], points_m[rows], strict=True)}
+        for rows in (known & (views.point == 0), known & (views.point == 1))
+    ]
+    lengths = [
+        float(np.linalg.norm(ends[0][number] - ends[1][number])) for number in ends[0] if number in ends[1]
+    ]
+    if not lengths:
+        raise InputError("stick", expected="instants at which both ends are known", found="none")
+    return float(np.median(lengths))
+
+
+def distance_between(rig: Rig, first: str, second: str) -> float:
+    """Distance between two cameras' centres, in the rig's unit of length.
+
+    Raises:
+        SettingsError: a camera is not in the rig, or is named twice.
+    """
+    for name in (first, second):
+        if name not in rig.names or first == second:
+            raise SettingsError(
+                "distance", expected=f"two of {', '.join(rig.names)}", found=f"{first},{second}"
+            )
+    centres = np.asarray(rig.cameras.centre_world)
+    return float(np.linalg.norm(centres[rig.names.index(first)] - centres[rig.names.index(second)]))
+
+
+@dataclass(frozen=True)
+class GivenWorld:
+    """Points and where they are.
+
+    Attributes:
+        path: the file.
+        places_m: positions by name, metres.
+        sightings: pixels of the points by camera; none if the points are cameras or instants.
+    """
+
+    path: Path
+    places_m: Mapping[str, Float[np.ndarray, "3"]]
+    sightings: Mapping[str, ImagePoints]
+
+
+def read_world(path: Path | str) -> GivenWorld:
+    """Read the points that fix a world.
+
+    The columns are point, x_m, y_m, z_m; a point is a camera's centre, or the moving point in a frame. Points that are
+    marked in images have also the columns camera, x_px, y_px.
+
+    Raises:
+        InputError: the file cannot be read, or a column or a value is missing.
+    """
+    path = Path(path)
+    table = read_table(path, _SEPARATOR)
+    if table.find("camera") is not None:
+        marks = read_image_points(path)
+        places = {
+            name: place
+            for of_camera in marks.values()
+            for name, place in zip(of_camera.points, of_camera.points_m, strict=True)
+        }
+        return GivenWorld(path, places, marks)
+    point, columns = table.column("point"), [table.column(name) for name in ("x_m", "y_m", "z_m")]
+    return GivenWorld(
+        path, {row.text(point): np.array([row.number(one) for one in columns]) for row in table.rows}, {}
+    )
+
+
+def fit_world(
+    rig: Rig,
+    given: GivenWorld,
+    numbered_m: Mapping[int, Float[np.ndarray, "3"]] | None = None,
+    *,
+    with_scale: bool,
+) -> tuple[Similarity, dict[str, float]]:
+    """Find the change of the world that brings a rig to given points.
+
+    Args:
+        rig: the rig.
+        given: the points.
+        numbered_m: positions of a moving point by the number of the instant.
+        with_scale: whether the unit of length is open too.
+
+    Returns:
+        the change; and the distances that are left, metres, by point.
+
+    Raises:
+        InputError: the rig knows fewer than three of the points, or they are on one line.
+    """
+    found = dict(zip(rig.names, np.asarray(rig.cameras.centre_world), strict=True))
+    found |= {f"{number}": place for number, place in (numbered_m or {}).items()}
+    if given.sightings:
+        found = _triangulated(rig, given)
+    names = [name for name in given.places_m if name in found and np.isfinite(found[name]).all()]
+    if len(names) < LEAST_POINTS:
+        raise InputError(
+            given.path,
+            expected=f"at least {LEAST_POINTS} points that the rig knows",
+            found=f"{len(names)} of {len(given.places_m)}",
+            remedy="name cameras or frames, or mark each point in the images of two cameras",
+        )
+    change, left_m = align(
+        np.array([found[name] for name in names]),
+        np.array([given.places_m[name] for name in names]),
+        with_scale=with_scale,
+    )
+    return change, dict(zip(names, left_m.tolist(), strict=True))
+
+
+def _triangulated(rig: Rig, given: GivenWorld) -> dict[str, np.ndarray]:
+    """Positions of marked points in the rig's world; NaN for a point that one camera sees."""
+    unknown = [name for name in given.sightings if name not in rig.names]
+    if unknown:
+        raise InputError(given.path, expected=f"some of {', '.join(rig.names)}", found=f"camera {unknown[0]}")
+    points_px = np.full((len(given.places_m), len(rig), 2), np.nan)
+    row_of = {name: row for row, name in enumerate(given.places_m)}
+    for name, marks in given.sightings.items():
+        for point, xy in zip(marks.points, marks.points_px, strict=True):
+            points_px[row_of[point], rig.names.index(name)] = xy
+    return dict(zip(given.places_m, triangulate(rig.cameras, points_px), strict=True))

@@ -1,0 +1,34 @@
+from .constant_errors import ConstantErrors, fit_constant_errors
+from .covariances import LastingCovariances, lasting_covariances, noise_covariance, noise_ratios, widening
+from .fading import Fading, fading_of
+from .filtered_variance import MeasurementErrors, filtered_variances
+from .learning import CameraErrors, learn_camera_errors
+from .tracks import TrackErrors, fused_errors, with_camera_errors
+from .variance_components import FittedPlaces, camera_variances
+from .views import CameraViews, views_in_images, views_of_places, views_of_sightings, views_of_silhouettes
+
+__all__ = [
+    "CameraErrors",
+    "CameraViews",
+    "ConstantErrors",
+    "Fading",
+    "FittedPlaces",
+    "LastingCovariances",
+    "MeasurementErrors",
+    "TrackErrors",
+    "camera_variances",
+    "fading_of",
+    "filtered_variances",
+    "fit_constant_errors",
+    "fused_errors",
+    "lasting_covariances",
+    "learn_camera_errors",
+    "noise_covariance",
+    "noise_ratios",
+    "views_in_images",
+    "views_of_places",
+    "views_of_sightings",
+    "views_of_silhouettes",
+    "widening",
+    "with_camera_errors",
+]

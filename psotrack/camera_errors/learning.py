@@ -1,0 +1,162 @@
+"""What the residuals of all cameras show of the cameras' errors.
+
+The place that a camera shows of a drone errs by the sum of
+
+- a turn of the camera, the same in all frames, which moves places by about the same pixels everywhere,
+- an error of its clock times the drone's velocity in the image,
+- a lasting error, that stays for as long as the drone flies in one part of the image: a wrong lens or place of the
+  camera, a detector's habit,
+- noise, a part of which fades over some frames (`fading`).
+
+Noise and lasting errors are learned per camera (`variance_components`), turns and clocks for all cameras together
+(`constant_errors`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.camera_errors.constant_errors import ConstantErrors, fit_constant_errors
+from psotrack.camera_errors.fading import Fading, fading_of
+from psotrack.camera_errors.variance_components import FittedPlaces, camera_variances, weighted_residuals
+from psotrack.camera_errors.views import CameraViews
+
+#: Largest number of rows (frames x drones) from which errors are learned: more rows add time and little accuracy.
+_MAX_ROWS = 6000
+#: Least length of a block of frames whose mean shows lasting errors, seconds, and in time constants of fading errors.
+_BLOCK_S, _BLOCK_TIMES = 1.0, 2.0
+#: Weight of the mean of all cameras in each camera's lasting variance: a camera that is seen in one part of the image
+#: has two numbers.
+_SHARED_WEIGHT = 0.5
+#: Least share of a camera's variance that is noise.
+_LEAST_NOISE = 0.02
+#: Rounds in which noise and constant errors are learned in turn.
+_ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class CameraErrors:
+    """Standard deviations of the errors of the places that cameras show.
+
+    Attributes:
+        noise_px: (cameras,), errors that do not last, along either axis, pixels; NaN where no residual shows them.
+        fading: how the errors that do not last fade.
+        lasting_px: (cameras,), errors that last while a drone stays in one part of the image, pixels.
+        turn_rad: turns of the cameras about each axis, radians.
+        clock_s: the cameras' clocks, seconds.
+    """
+
+    noise_px: Float[np.ndarray, "cameras"]
+    fading: Fading
+    lasting_px: Float[np.ndarray, "cameras"]
+    turn_rad: float
+    clock_s: float
+
+
+def learn_camera_errors(views: CameraViews, fps: float, usual: Fading) -> CameraErrors:
+    """Learn the errors of a recording's cameras.
+
+    Args:
+        views: the views of all drones.
+        fps: frames per second.
+        usual: how noise fades, where too few frames show it.
+    """
+    num_cameras, dt_s = views.num_cameras, 1 / fps
+    found = _rows(views, 1).determined.reshape(views.shown.shape[:2])
+    step = max(1, -(-int(found.sum()) // _MAX_ROWS))
+    if found[::step].sum() < 2:
+        return CameraErrors(
+            np.full(num_cameras, np.nan), usual.without_lasting(), np.zeros(num_cameras), 0.0, 0.0
+        )
+    rest, total_px2, fading = views, np.ones(num_cameras), usual
+    constant: ConstantErrors | None = None
+    for _ in range(_ROUNDS):
+        total_px2 = _total_variances(rest, step)
+        fading = fading_of(rest.residual_px / np.sqrt(total_px2)[:, None], rest.shown, dt_s, usual)
+        noise_px = np.sqrt(total_px2 * max(1 - fading.lasting_share, _LEAST_NOISE))
+        rows = _rows(views, step)
+        which = np.flatnonzero(rows.determined)
+        constant = fit_constant_errors(
+            rows.only(which),
+            views.turn_px[::step].reshape(-1, num_cameras, 2, 3)[which],
+            views.flow_px_s[::step].reshape(-1, num_cameras, 2)[which],
+            noise_px,
+            fading.without_lasting().inflation(step * dt_s),
+        )
+        rest = _without(views, constant)
+    assert constant is not None
+    total_px2 = _total_variances(rest, step)
+    fading = fading_of(rest.residual_px / np.sqrt(total_px2)[:, None], rest.shown, dt_s, usual)
+    noise = fading.without_lasting()
+    length = max(1, round(max(_BLOCK_S, _BLOCK_TIMES * noise.time_s) * fps))
+    blocks, num_frames = _blocks(rest, length)
+    noise_px2 = total_px2 * max(1 - fading.lasting_share, _LEAST_NOISE)
+    lasting_px2 = camera_variances(blocks, noise_px2 * noise.variance_of_mean(num_frames, dt_s))
+    shared_px2 = float(np.nanmean(lasting_px2)) if np.isfinite(lasting_px2).any() else 0.0
+    lasting_px2 = np.where(np.isnan(lasting_px2), shared_px2, lasting_px2)
+    lasting_px2 = _SHARED_WEIGHT * shared_px2 + (1 - _SHARED_WEIGHT) * lasting_px2
+    return CameraErrors(
+        noise_px=np.sqrt(np.maximum(total_px2 - lasting_px2, _LEAST_NOISE * total_px2)),
+        fading=noise,
+        lasting_px=np.sqrt(lasting_px2),
+        turn_rad=constant.turn_std_rad,
+        clock_s=constant.clock_std_s,
+    )
+
+
+def _rows(views: CameraViews, step: int) -> FittedPlaces:
+    """Every `step`-th frame of all drones, as rows."""
+    cameras = views.num_cameras
+    return FittedPlaces(
+        np.nan_to_num(views.residual_px[::step]).reshape(-1, cameras, 2),
+        views.jacobian[::step].reshape(-1, cameras, 2, 3),
+        views.shown[::step].reshape(-1, cameras),
+    )
+
+
+def _total_variances(views: CameraViews, step: int) -> Float[np.ndarray, "cameras"]:
+    """(cameras,), variance of the places in single frames; the mean of the others where a camera shows nothing."""
+    rows = _rows(views, step)
+    variance_px2 = camera_variances(rows, np.zeros(rows.shown.shape))
+    return np.where(np.isnan(variance_px2), np.nanmean(variance_px2), variance_px2)
+
+
+def _without(views: CameraViews, constant: ConstantErrors) -> CameraViews:
+    """The views without the fitted turns and clocks, with residuals of positions that are fitted anew."""
+    turned_px = np.einsum("fdcip,cp->fdci", views.turn_px, constant.turn_rad)
+    late_px = -views.flow_px_s * constant.clock_s[:, None]
+    shown = views.shown
+    residual_px = np.where(shown[..., None], views.residual_px - turned_px - late_px, 0.0)
+    rows = FittedPlaces(
+        residual_px.reshape(-1, *residual_px.shape[2:]),
+        views.jacobian.reshape(-1, *views.jacobian.shape[2:]),
+        shown.reshape(-1, shown.shape[2]),
+    )
+    determined = rows.determined
+    fitted_px = rows.residual_px.copy()
+    fitted_px[determined] = weighted_residuals(rows.only(determined), rows.shown[determined].astype(float))[0]
+    return replace(
+        views, residual_px=np.where(shown[..., None], fitted_px.reshape(residual_px.shape), np.nan)
+    )
+
+
+def _blocks(views: CameraViews, length: int) -> tuple[FittedPlaces, np.ndarray]:
+    """Means over blocks of frames, and the number of frames of each camera in them, (rows, cameras)."""
+    residuals, jacobians, shown, counts = [], [], [], []
+    for first in range(0, len(views.shown), length):
+        part = slice(first, first + length)
+        there = views.shown[part]
+        count = there.sum(axis=0)
+        least = np.maximum(count, 1)
+        residuals.append(
+            np.where(there[..., None], views.residual_px[part], 0.0).sum(axis=0) / least[..., None]
+        )
+        jacobian = np.where(there[..., None, None], views.jacobian[part], 0.0).sum(axis=0)
+        jacobians.append(jacobian / least[..., None, None])
+        shown.append(count >= max(1, len(there) // 2))
+        counts.append(count)
+    places = FittedPlaces(np.concatenate(residuals), np.concatenate(jacobians), np.concatenate(shown))
+    return places, np.concatenate(counts)

@@ -1,0 +1,72 @@
+"""One function that opens any recording: a `recording.toml`, a folder that holds one, or a folder of a dataset."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from psotrack.datasets.dpjait import CALIBRATION, MARKER_CORNERS, read_sequence
+from psotrack.datasets.recording_files import read_recording_toml
+from psotrack.errors import InputError
+from psotrack.recordings import RECORDING_FILE, Recording, read_recording_file
+
+
+def open_recording(path: Path | str) -> Recording:
+    """Open the recording that a user names.
+
+    Args:
+        path: a `recording.toml` under any name that ends in .toml, a folder that holds a `recording.toml`, or a folder
+            of the DPJAIT dataset.
+
+    Raises:
+        InputError: there is no recording at the path, or one of its files cannot be used.
+    """
+    path = Path(path)
+    if path.is_file() and path.suffix.lower() == ".toml":
+        return read_recording_toml(path)
+    if (path / RECORDING_FILE).is_file():
+        return read_recording_toml(path / RECORDING_FILE)
+    if path.is_dir() and (path / CALIBRATION).exists():
+        return read_sequence(path)
+    raise _no_recording(path)
+
+
+def find_marker_corners(path: Path | str) -> Path:
+    """Table of the marker corners of a recording: the one that its `recording.toml` names, or else the dataset's.
+
+    Args:
+        path: as in `open_recording`.
+
+    Raises:
+        InputError: a `recording.toml` is wrong, or names no table.
+    """
+    path = Path(path)
+    file = path / RECORDING_FILE if path.is_dir() else path
+    if not file.is_file():
+        return path / MARKER_CORNERS
+    markers = read_recording_file(file).markers
+    if markers is None:
+        raise InputError(f"{file}, markers.corners", expected="a table of marker corners", found="none")
+    return file.parent / markers.corners
+
+
+def _no_recording(path: Path) -> InputError:
+    expected = f"a {RECORDING_FILE}, a folder that holds one, or a folder of the DPJAIT dataset"
+    if path.suffix.lower() == ".zip" and path.is_file():
+        return InputError(path, expected=expected, found="an archive", remedy="unpack it first")
+    if not path.exists():
+        return InputError(path, expected=expected, found="nothing")
+    if not path.is_dir():
+        return InputError(path, expected=expected, found="another file")
+    try:
+        names = (RECORDING_FILE, CALIBRATION)
+        below = sorted(inner for inner in path.iterdir() if any((inner / name).is_file() for name in names))
+    except OSError:
+        return InputError(path, expected=expected, found="a folder without read permission")
+    remedy = (
+        f"did you mean {below[0]}?"
+        if below
+        else f"`psotrack init {path}` writes a {RECORDING_FILE} for your own videos"
+    )
+    return InputError(
+        path, expected=expected, found=f"neither {RECORDING_FILE} nor {CALIBRATION}", remedy=remedy
+    )

@@ -1,0 +1,443 @@
+"""Lens models of OpenCV: distortion of normalised image coordinates, its derivatives, its inverse, and where it folds.
+
+Two models: the pinhole model with 4, 5, 8, 12 or 14 coefficients (radial, tangential, rational, thin prism, tilted
+sensor; `cv2.projectPoints`), and the fisheye model with 4 coefficients (Kannala & Brandt 2006; `cv2.fisheye`), which
+reaches 90 degrees off the optical axis. Missing coefficients are 0, which changes no pixel.
+
+A model is one to one around the optical axis only. Where the determinant of its derivative changes sign, it folds: a
+point beyond the fold has the pixel of another point that is nearer to the axis, but no real lens shows it there. Such
+a point has no image. The functions below take these arguments:
+
+    dist: (..., coefficients), in OpenCV's order k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, tau_x, tau_y; of a
+        fisheye k1, k2, k3, k4.
+    fisheye: (...), which lenses are fisheyes; None: no lens is one.
+    x, y: (...), undistorted normalised image coordinates: x / z and y / z in the camera.
+
+They take and return NumPy or JAX arrays, except the inverse, which is for NumPy.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from psotrack._typing import Array
+
+#: Numbers of coefficients that OpenCV's pinhole model has, and its fisheye model.
+PINHOLE_COEFFICIENTS = (0, 4, 5, 8, 12, 14)
+FISHEYE_COEFFICIENTS = 4
+
+#: Grid on which folds are looked for. The determinant at a point itself decides whether the point is beyond the first
+#: fold; the grid has to find the radius from which the determinant is positive again.
+_ANGLES = (np.arange(128) + 0.5) / 128 * np.pi / 2
+_DIRECTIONS = np.arange(16) / 16 * 2 * np.pi
+#: Below this r², series replace quotients by r.
+_SMALL_R2 = 1e-12
+#: Newton's steps at most, and the largest residual of a solution, relative to 1 + the normalised coordinate: 1e-8 px
+#: of a focal length of 1000 px.
+_MAX_STEPS = 60
+_RESIDUAL = 1e-11
+#: A point is given up when even this share of Newton's step makes the residual no smaller.
+_LEAST_SHARE = 1e-6
+#: Newton's steps in compiled programs.
+_FEW_STEPS = 5
+#: Bisections of the angle before Newton's steps, for lenses that are bent much.
+_BISECTIONS = 12
+
+
+def distort_normalised(
+    dist: Float[Array, "*lenses coefficients"],
+    fisheye: Bool[Array, "*lenses"] | None,
+    x: Float[Array, "*#points"],
+    y: Float[Array, "*#points"],
+) -> tuple[Float[Array, "*#points"], Float[Array, "*#points"]]:
+    """Distorted normalised image coordinates. Arguments: see the module."""
+    if fisheye is None:
+        return _pinhole(dist, x, y)
+    xp = _numbers(x)
+    fisheye, pinhole_dist = _parted(xp, dist, fisheye)
+    of_pinhole, of_fisheye = _pinhole(pinhole_dist, x, y), _fisheye(xp, dist, x, y)
+    return tuple(xp.where(fisheye, one, other) for one, other in zip(of_fisheye, of_pinhole, strict=True))
+
+
+def lens_derivative(
+    dist: Float[Array, "*lenses coefficients"],
+    fisheye: Bool[Array, "*lenses"] | None,
+    x: Float[Array, "*#points"],
+    y: Float[Array, "*#points"],
+) -> tuple[Float[Array, "*#points"], ...]:
+    """Derivatives of the distorted coordinates: x by x, x by y, y by x, y by y. Arguments: see the module."""
+    xp = _numbers(x)
+    if fisheye is None:
+        return _pinhole_derivative(xp, dist, x, y)
+    fisheye, pinhole_dist = _parted(xp, dist, fisheye)
+    of_pinhole = _pinhole_derivative(xp, pinhole_dist, x, y)
+    of_fisheye = _fisheye_derivative(xp, dist, x, y)
+    return tuple(xp.where(fisheye, one, other) for one, other in zip(of_fisheye, of_pinhole, strict=True))
+
+
+def undistort_normalised(
+    dist: Float[Array, "*lenses coefficients"],
+    fisheye: Bool[Array, "*lenses"] | None,
+    x: Float[Array, "*#points"],
+    y: Float[Array, "*#points"],
+) -> tuple[Float[Array, "*#points"], Float[Array, "*#points"]]:
+    """Inverse of `distort_normalised` in float64, by Newton's method; NaN where no point has this image.
+
+    Args:
+        dist, fisheye: lenses, see the module.
+        x, y: (...), distorted normalised image coordinates.
+    """
+    if dist.shape[-1] == 0:
+        return x, y
+    dist = np.asarray(dist)
+    shape = np.broadcast_shapes(np.shape(x), np.shape(y), dist.shape[:-1])
+    flat_dist = np.broadcast_to(dist, (*shape, dist.shape[-1])).reshape(-1, dist.shape[-1])
+    flat_fisheye = None if fisheye is None else np.broadcast_to(fisheye, shape).ravel()
+    beyond = np.broadcast_to(second_sheet(dist, fisheye), shape).ravel()
+    target = np.stack([np.broadcast_to(part, shape).ravel() for part in (x, y)]).astype(np.float64)
+    problem = _Inverse(flat_dist, flat_fisheye, beyond, target)
+    found = np.full(target.shape, np.nan)
+    pending = np.flatnonzero(np.isfinite(target).all(axis=0))
+    # The distorted point is a good start for most lenses. For the others, a search of the radius finds a better start.
+    for start in (_Inverse.near_start, _Inverse.far_start):
+        some = problem.at(pending)
+        solved = some.newton(start(some))
+        found[:, pending] = solved
+        pending = pending[np.isnan(solved[0])]
+        if not len(pending):
+            break
+    return found[0].reshape(shape), found[1].reshape(shape)
+
+
+def undistort_approximately(
+    dist: Float[Array, "*lenses coefficients"],
+    fisheye: Bool[Array, "*lenses"] | None,
+    x: Float[Array, "*#points"],
+    y: Float[Array, "*#points"],
+) -> tuple[Float[Array, "*#points"], Float[Array, "*#points"]]:
+    """Inverse of `distort_normalised` inside of compiled programs; NaN where a few steps of Newton do not find it.
+
+    Args:
+        dist, fisheye: lenses, see the module.
+        x, y: (...), distorted normalised image coordinates.
+    """
+    xp = _numbers(x)
+    u, v = x, y = xp.broadcast_arrays(x, y)
+    if fisheye is not None:
+        bent = xp.sqrt(x * x + y * y) + 1e-9
+        scale = xp.where(fisheye, xp.tan(xp.minimum(bent, 1.5)) / bent, 1.0)
+        u, v = x * scale, y * scale
+    for _ in range(_FEW_STEPS):
+        bent_u, bent_v = distort_normalised(dist, fisheye, u, v)
+        xx, xy, yx, yy = lens_derivative(dist, fisheye, u, v)
+        determinant = xx * yy - xy * yx
+        off_x, off_y = x - bent_u, y - bent_v
+        u, v = u + (yy * off_x - xy * off_y) / determinant, v + (xx * off_y - yx * off_x) / determinant
+    bent_u, bent_v = distort_normalised(dist, fisheye, u, v)
+    is_there = (xp.abs(x - bent_u) + xp.abs(y - bent_v) < 1e-3) & is_one_to_one(dist, fisheye, u, v)
+    return xp.where(is_there, u, xp.nan), xp.where(is_there, v, xp.nan)
+
+
+def is_one_to_one(
+    dist: Float[Array, "*lenses coefficients"],
+    fisheye: Bool[Array, "*lenses"] | None,
+    x: Float[Array, "*#points"],
+    y: Float[Array, "*#points"],
+    beyond: Float[Array, "*lenses"] | None = None,
+) -> Bool[Array, "*#points"]:
+    """True for points before the fold of their lens: no point nearer to the axis has the same image.
+
+    Args:
+        dist, fisheye, x, y: see the module.
+        beyond: result of `second_sheet`, for callers that need the result more than once.
+    """
+    xp = _numbers(x)
+    if beyond is None:
+        beyond = second_sheet(dist, fisheye)
+    return _rises(xp, dist, fisheye, x, y) & (x * x + y * y < beyond * beyond)
+
+
+def second_sheet(
+    dist: Float[Array, "*lenses coefficients"], fisheye: Bool[Array, "*lenses"] | None
+) -> Float[Array, "*lenses"]:
+    """Radius r = hypot(x, y) below which every point with a positive determinant is before the fold; or infinity.
+
+    Beyond the first fold the determinant is negative. Further away it may become positive again, on the second sheet
+    of the folded image. The radius lies between the first fold and the second sheet, in the direction in which the
+    second sheet begins nearest to the axis.
+    """
+    if isinstance(dist, np.ndarray | np.generic):
+        dist = np.ascontiguousarray(dist, np.float64)
+        flat = dist.reshape(-1, dist.shape[-1])
+        kinds = np.zeros(len(flat), bool) if fisheye is None else np.broadcast_to(fisheye, dist.shape[:-1])
+        rows = [
+            _second_sheet_of(row.tobytes(), bool(kind)) for row, kind in zip(flat, kinds.ravel(), strict=True)
+        ]
+        return np.array(rows).reshape(dist.shape[:-1])
+    return _second_sheet(jnp, dist, fisheye)
+
+
+@lru_cache(maxsize=4096)
+def _second_sheet_of(dist: bytes, fisheye: bool) -> float:
+    """The same for one lens; calibration and triangulation ask again and again for the same few lenses."""
+    row = np.frombuffer(dist, np.float64)
+    return float(_second_sheet(np, row, np.array(True) if fisheye else None))
+
+
+def _second_sheet(xp: Any, dist: Array, fisheye: Array | None) -> Array:
+    radius = np.tan(_ANGLES)
+    grid = radius[:, None] * np.stack([np.cos(_DIRECTIONS), np.sin(_DIRECTIONS)])[:, None]
+    x, y = (xp.asarray(part, dist.dtype) for part in grid)
+    rises = _rises(
+        xp,
+        dist[..., None, None, :],
+        None if fisheye is None else fisheye[..., None, None],
+        x,
+        y,
+    )
+    folded = xp.cumsum(~rises, axis=-2) > 0
+    again = (folded & rises).any(axis=-1)
+    first = again.argmax(axis=-1)
+    return xp.where(again.any(axis=-1), xp.asarray(radius, dist.dtype)[xp.maximum(first - 1, 0)], xp.inf)
+
+
+def _rises(xp: Any, dist: Array, fisheye: Array | None, x: Array, y: Array) -> Array:
+    """True where the determinant of the derivative is positive, and the model has no pole before the point."""
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        xx, xy, yx, yy = lens_derivative(dist, fisheye, x, y)
+        rises = xx * yy - xy * yx > 0
+        if dist.shape[-1] >= 8:
+            pinhole_dist = dist if fisheye is None else _parted(xp, dist, fisheye)[1]
+            rises = rises & (_below(pinhole_dist, x * x + y * y) > 0)
+            if dist.shape[-1] == 14:
+                H = _tilt(xp, pinhole_dist)
+                flat_x, flat_y = _before_tilt(pinhole_dist, x, y)
+                rises = rises & (H[2][0] * flat_x + H[2][1] * flat_y + H[2][2] > 0)
+    return rises
+
+
+def _numbers(array: Any) -> Any:
+    return np if isinstance(array, np.ndarray | np.generic) else jnp
+
+
+def _parted(xp: Any, dist: Array, fisheye: Array) -> tuple[Array, Array]:
+    """Which lenses are fisheyes, and the coefficients with 0 for fisheyes: the pinhole model of such a lens is unused,
+    but must be finite.
+    """
+    fisheye = xp.asarray(fisheye)
+    return fisheye, xp.where(fisheye[..., None], xp.zeros_like(dist), dist)
+
+
+def _pinhole(dist: Array, x: Array, y: Array) -> tuple[Array, Array]:
+    if dist.shape[-1] == 14:
+        xp = _numbers(x)
+        (a, b, c), (d, e, f), (g, h, i) = _tilt(xp, dist)
+        x, y = _before_tilt(dist, x, y)
+        w = g * x + h * y + i
+        return (a * x + b * y + c) / w, (d * x + e * y + f) / w
+    return _before_tilt(dist, x, y)
+
+
+def _before_tilt(dist: Array, x: Array, y: Array) -> tuple[Array, Array]:
+    coefficients = dist.shape[-1]
+    if coefficients == 0:
+        return x, y
+    k1, k2, p1, p2 = (dist[..., i] for i in range(4))
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + (r2 * dist[..., 4] if coefficients > 4 else 0.0)))
+    if coefficients >= 8:
+        radial = radial / _below(dist, r2)
+    bent_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    bent_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    if coefficients >= 12:
+        bent_x = bent_x + r2 * (dist[..., 8] + r2 * dist[..., 9])
+        bent_y = bent_y + r2 * (dist[..., 10] + r2 * dist[..., 11])
+    return bent_x, bent_y
+
+
+def _below(dist: Array, r2: Array) -> Array:
+    """Denominator of the rational model."""
+    return 1 + r2 * (dist[..., 5] + r2 * (dist[..., 6] + r2 * dist[..., 7]))
+
+
+def _tilt(xp: Any, dist: Array) -> tuple[tuple[Array, Array, Array], ...]:
+    """Rows of the homography to the tilted sensor (OpenCV's `computeTiltProjectionMatrix`)."""
+    cos_x, sin_x = xp.cos(dist[..., 12]), xp.sin(dist[..., 12])
+    cos_y, sin_y = xp.cos(dist[..., 13]), xp.sin(dist[..., 13])
+    first, second = (cos_y, sin_y * sin_x, -sin_y * cos_x), (0 * cos_x, cos_x, sin_x)
+    third = sin_y, -cos_y * sin_x, cos_y * cos_x
+    to_plane = [
+        tuple(third[2] * along[i] - along[2] * third[i] for i in range(3)) for along in (first, second)
+    ]
+    return (to_plane[0], to_plane[1], third)
+
+
+def _pinhole_derivative(xp: Any, dist: Array, x: Array, y: Array) -> tuple[Array, ...]:
+    coefficients = dist.shape[-1]
+    if coefficients == 0:
+        one = xp.ones_like(x)
+        return one, 0 * one, 0 * one, one
+    k1, k2, p1, p2 = (dist[..., i] for i in range(4))
+    k3 = dist[..., 4] if coefficients > 4 else 0.0
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    # The derivative of `radial` by r²; the derivative of r² by x is 2 x.
+    slope = k1 + r2 * (2 * k2 + r2 * 3 * k3)
+    if coefficients >= 8:
+        k4, k5, k6 = (dist[..., i] for i in range(5, 8))
+        below = _below(dist, r2)
+        radial = radial / below
+        slope = (slope - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
+    xx = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+    yy = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+    xy = yx = 2 * (x * y * slope + p1 * x + p2 * y)
+    if coefficients >= 12:
+        prism_x, prism_y = (2 * (dist[..., i] + 2 * r2 * dist[..., i + 1]) for i in (8, 10))
+        xx, xy = xx + prism_x * x, xy + prism_x * y
+        yx, yy = yx + prism_y * x, yy + prism_y * y
+    if coefficients == 14:
+        (a, b, c), (d, e, f), (g, h, i) = _tilt(xp, dist)
+        bent_x, bent_y = _before_tilt(dist, x, y)
+        w = g * bent_x + h * bent_y + i
+        u, v = (a * bent_x + b * bent_y + c) / w, (d * bent_x + e * bent_y + f) / w
+        u_x, u_y, v_x, v_y = (a - u * g) / w, (b - u * h) / w, (d - v * g) / w, (e - v * h) / w
+        xx, xy, yx, yy = (
+            u_x * xx + u_y * yx,
+            u_x * xy + u_y * yy,
+            v_x * xx + v_y * yx,
+            v_x * xy + v_y * yy,
+        )
+    return xx, xy, yx, yy
+
+
+def _fisheye(xp: Any, dist: Array, x: Array, y: Array) -> tuple[Array, Array]:
+    scale = _fisheye_scale(xp, dist, x * x + y * y)[0]
+    return x * scale, y * scale
+
+
+def _fisheye_derivative(xp: Any, dist: Array, x: Array, y: Array) -> tuple[Array, ...]:
+    scale, slope = _fisheye_scale(xp, dist, x * x + y * y)
+    xy = 2 * x * y * slope
+    return scale + 2 * x * x * slope, xy, xy, scale + 2 * y * y * slope
+
+
+def _fisheye_scale(xp: Any, dist: Array, r2: Array) -> tuple[Array, Array]:
+    """Distorted radius divided by r, and the derivative of this quotient by r²."""
+    k1, k2, k3, k4 = (dist[..., i] for i in range(4))
+    near = r2 < _SMALL_R2
+    # Gradients of both branches must be finite, so r is 1 where the series is used.
+    safe_r2 = xp.where(near, 1.0, r2)
+    r = xp.sqrt(safe_r2)
+    angle = xp.arctan(r)
+    t2 = angle * angle
+    bent = angle * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    bent_by_angle = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+    scale = xp.where(near, 1 + (k1 - 1 / 3) * r2, bent / r)
+    slope = xp.where(near, k1 - 1 / 3, (bent_by_angle / (1 + safe_r2) - bent / r) / (2 * safe_r2))
+    return scale, slope
+
+
+class _Inverse:
+    """Points whose undistorted coordinates are searched; all arrays have the points as last axis, except `dist`.
+
+    Attributes:
+        dist: (points, coefficients).
+        fisheye: (points,), or None.
+        beyond: (points,), see `second_sheet`.
+        target: (2, points), distorted coordinates.
+    """
+
+    def __init__(
+        self, dist: np.ndarray, fisheye: np.ndarray | None, beyond: np.ndarray, target: np.ndarray
+    ) -> None:
+        self.dist, self.fisheye, self.beyond, self.target = dist, fisheye, beyond, target
+
+    def at(self, index: np.ndarray) -> _Inverse:
+        """Points with these indices."""
+        fisheye = None if self.fisheye is None else self.fisheye[index]
+        return _Inverse(self.dist[index], fisheye, self.beyond[index], self.target[:, index])
+
+    def _flat(self) -> np.ndarray:
+        """The targets on a sensor that is not tilted."""
+        if self.dist.shape[-1] < 14:
+            return self.target
+        H = np.stack([np.stack(np.broadcast_arrays(*row), axis=-1) for row in _tilt(np, self.dist)], axis=-2)
+        across = np.linalg.solve(H, np.vstack([self.target, np.ones_like(self.target[:1])]).T[..., None])[
+            ..., 0
+        ]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            flat = (across[:, :2] / across[:, 2:]).T
+        if self.fisheye is not None:
+            flat = np.where(self.fisheye, self.target, flat)
+        return np.where(np.isfinite(flat), flat, 0.0)
+
+    def near_start(self) -> np.ndarray:
+        """(2, points), the distorted points; of a fisheye without coefficients the undistorted points."""
+        start = self._flat()
+        if self.fisheye is None:
+            return start
+        bent = np.hypot(*start)
+        scale = np.tan(np.minimum(bent, 1.5)) / np.maximum(bent, 1e-12)
+        return np.where(self.fisheye & (bent > 1e-12), start * scale, start)
+
+    def far_start(self) -> np.ndarray:
+        """(2, points), points whose image has nearly the right distance from the axis, by bisection of the angle."""
+        flat = self._flat()
+        wanted = np.hypot(*flat)
+        direction = flat / np.maximum(wanted, 1e-300)
+        # Only the radial part of the lens: the tangential one and the prism's are small.
+        radial = self.dist.copy()
+        for columns in (slice(2, 4), slice(8, 14)):
+            kept = 0.0 if self.fisheye is None else np.where(self.fisheye[:, None], radial[:, columns], 0.0)
+            radial[:, columns] = kept
+        low, high = np.zeros(len(wanted)), np.full(len(wanted), np.pi / 2)
+        for _ in range(_BISECTIONS):
+            middle = (low + high) / 2
+            r = np.tan(middle)
+            zero = np.zeros_like(r)
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                bent = distort_normalised(radial, self.fisheye, r, zero)[0]
+                is_far = ~_rises(np, radial, self.fisheye, r, zero) | ~(bent < wanted) | (r > self.beyond)
+            low, high = np.where(is_far, low, middle), np.where(is_far, middle, high)
+        return direction * np.tan((low + high) / 2)
+
+    def newton(self, start: np.ndarray) -> np.ndarray:
+        """(2, points), solutions; NaN where the steps do not converge, or converge beyond the fold."""
+        solution = np.full(start.shape, np.nan)
+        at, index, share = start.copy(), np.arange(start.shape[1]), np.ones(start.shape[1])
+        with np.errstate(all="ignore"):
+            residual, derivative = self._linearise(at)
+            for _ in range(_MAX_STEPS):
+                some = self.at(index)
+                xx, xy, yx, yy = derivative
+                step = np.stack([yy * residual[0] - xy * residual[1], xx * residual[1] - yx * residual[0]])
+                tried = at + share * step / (xx * yy - xy * yx)
+                again, slopes = some._linearise(tried)
+                size = np.abs(residual).max(axis=0)
+                # A step beyond the fold would lead to another point with the same image.
+                better = (np.abs(again).max(axis=0) < size) & (slopes[0] * slopes[3] > slopes[1] * slopes[2])
+                small = size <= _RESIDUAL * (1 + np.abs(some.target).max(axis=0))
+                # A solution that no step improves is exact but for rounding; other points need a shorter step.
+                solution[:, index[small]] = np.where(better, tried, at)[:, small]
+                at, residual, derivative = (
+                    np.where(better, new, old)
+                    for new, old in ((tried, at), (again, residual), (slopes, derivative))
+                )
+                share = np.where(better, np.minimum(2 * share, 1), share / 4)
+                kept = (better | ~small) & (share > _LEAST_SHARE)
+                index, at, residual, share = index[kept], at[:, kept], residual[:, kept], share[kept]
+                derivative = derivative[:, kept]
+                if not len(index):
+                    break
+            is_there = is_one_to_one(self.dist, self.fisheye, solution[0], solution[1], self.beyond)
+        return np.where(is_there, solution, np.nan)
+
+    def _linearise(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(2, points), residuals at points, and (4, points), derivatives of the distorted coordinates."""
+        residual = self.target - np.stack(distort_normalised(self.dist, self.fisheye, *at))
+        return residual, np.stack(np.broadcast_arrays(*lens_derivative(self.dist, self.fisheye, *at)))

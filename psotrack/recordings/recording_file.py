@@ -1,0 +1,245 @@
+"""`recording.toml`: the file of a recording, which names the videos, the calibration and the reference of any rig.
+
+Only the file itself is read and checked here. `psotrack.datasets.open_recording` opens the files that it names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+
+from psotrack.errors import InputError
+from psotrack.geometry import camera_key
+from psotrack.support import atomic_write, convert, read_toml, toml_key, toml_value
+
+#: Name of the file in a folder.
+RECORDING_FILE = "recording.toml"
+
+Vector = tuple[float, float, float]
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+Pixels = Annotated[int, msgspec.Meta(ge=1)]
+Text = Annotated[str, msgspec.Meta(min_length=1)]
+
+
+class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Base of the tables of the file: immutable, unknown keys are refused."""
+
+
+class CameraTable(_Table, frozen=True, kw_only=True):
+    """Table `[cameras.NAME]`: what is known of one camera.
+
+    Attributes:
+        video: a video file, the address of a stream, or the number of a device.
+        images: pattern of image files, which are the frames in natural order.
+        ignore: image file, white where nothing counts as foreground.
+        detections: file of detections, in the layout of the dataset's dl_data.
+        size: width and height of the images, pixels.
+        fps: frames per second.
+        time_offset_s: time of frame 0 on the recording's clock, seconds.
+        timestamps: CSV file with the columns `frame` and `time_s`.
+        line_time_s: time from the exposure of one row to the exposure of the next row, seconds.
+        K: intrinsics, three rows of three numbers, pixels.
+        model: lens model.
+        distortion: coefficients in OpenCV's order.
+        rvec: Rodrigues vector of the rotation from world to camera.
+        tvec: translation from world to camera, metres.
+    """
+
+    video: Text | int | None = None
+    images: Text | None = None
+    ignore: Text | None = None
+    detections: Text | None = None
+    size: tuple[Pixels, Pixels] | None = None
+    fps: Positive | None = None
+    time_offset_s: float | None = None
+    timestamps: Text | None = None
+    line_time_s: float = 0.0
+    K: tuple[Vector, Vector, Vector] | None = None
+    model: Literal["opencv", "fisheye"] | None = None
+    distortion: tuple[float, ...] | None = None
+    rvec: Vector | None = None
+    tvec: Vector | None = None
+
+
+class WorldTable(_Table, frozen=True, kw_only=True):
+    """Table `[world]`.
+
+    Attributes:
+        bounds_m: lowest and highest corner of the space in which drones are looked for, metres.
+    """
+
+    bounds_m: tuple[Vector, Vector] | None = None
+
+
+class ReferenceTable(_Table, frozen=True, kw_only=True):
+    """Table `[reference]`.
+
+    Attributes:
+        files: pose CSV, TUM or C3D files.
+        time_offset_s: time on the recording's clock at which the clock of the reference shows 0, seconds.
+    """
+
+    files: tuple[Text, ...]
+    time_offset_s: float = 0.0
+
+
+class MarkersTable(_Table, frozen=True, kw_only=True):
+    """Table `[markers]`.
+
+    Attributes:
+        corners: table of marker corners.
+    """
+
+    corners: Text
+
+
+class RecordingFile(_Table, frozen=True, kw_only=True):
+    """Content of a `recording.toml`; paths are as written in the file.
+
+    Attributes:
+        version: version of the layout.
+        calibration: rig file.
+        cameras: table of each camera, by name.
+        world: table `[world]`.
+        reference: table `[reference]`; None without a reference.
+        markers: table `[markers]`; None without markers.
+    """
+
+    version: Literal[1]
+    calibration: Text | None = None
+    cameras: Mapping[str, CameraTable]
+    world: WorldTable = WorldTable()
+    reference: ReferenceTable | None = None
+    markers: MarkersTable | None = None
+
+
+def read_recording_file(path: Path | str) -> RecordingFile:
+    """Read and check the tables of a `recording.toml`; the files that it names are not opened.
+
+    Raises:
+        InputError: the file cannot be read, or a key is unknown, missing or wrong. The message names file, table and
+            key.
+    """
+    path = Path(path)
+    data = read_toml(path)
+    _check_keys(path, data)
+    tables = data.get("cameras")
+    if not isinstance(tables, dict) or not tables:
+        found = "none" if tables is None or tables == {} else "another value"
+        raise _error(path, "cameras", "a table [cameras.NAME] for each camera", found)
+    _check_names(path, tables)
+    # Each table is converted by itself, because msgspec's messages do not name the key of a mapping.
+    cameras = {name: _read_camera(path, name, table) for name, table in tables.items()}
+    if data.get("calibration") is None:
+        for name, camera in cameras.items():
+            _check_place(path, name, camera)
+    content = convert(
+        {**data, "cameras": {}}, RecordingFile, lambda *parts: _error(path, *_in_words(data, *parts))
+    )
+    _check_bounds(path, content.world)
+    return msgspec.structs.replace(content, cameras=cameras)
+
+
+def _read_camera(path: Path, name: str, table: Any) -> CameraTable:
+    place = f"cameras.{name}"
+    if not isinstance(table, dict):
+        raise _error(path, place, f"a table [{place}]", f"{table!r}")
+    camera = convert(
+        table,
+        CameraTable,
+        lambda field, *parts: _error(path, f"{place}.{field}" if field else place, *parts),
+    )
+    for one, other in (("video", "images"), ("timestamps", "fps"), ("timestamps", "time_offset_s")):
+        if table.get(one) is not None and table.get(other) is not None:
+            raise _error(path, place, f"{one} or {other}", "both")
+    filmed = camera.video is not None or camera.images is not None
+    if not filmed and camera.fps is None and camera.timestamps is None:
+        raise _error(path, f"{place}.fps", "frames per second, because the camera has no video", "none")
+    if camera.images is not None and camera.fps is None and camera.timestamps is None:
+        raise _error(path, f"{place}.fps", "frames per second of the images, or timestamps", "none")
+    return camera
+
+
+def _check_place(path: Path, name: str, camera: CameraTable) -> None:
+    if (camera.rvec is None) != (camera.tvec is None):
+        missing = "tvec" if camera.tvec is None else "rvec"
+        expected = "three numbers, because a place needs rvec and tvec"
+        raise _error(path, f"cameras.{name}.{missing}", expected, "none")
+
+
+def _in_words(
+    data: Mapping[str, Any], field: str, expected: str, found: str, remedy: str
+) -> tuple[str, str, str, str]:
+    """Parts of a message; a missing or unknown version gets words of its own."""
+    if field == "version":
+        return field, "1, the version of this layout", f"{data.get('version', 'none')}", ""
+    return field, expected, found, remedy
+
+
+def _check_keys(path: Path, data: Mapping[str, Any]) -> None:
+    """Raise `InputError` for keys of a camera at the top of the file, where they belong to no camera."""
+    names = [field.name for field in msgspec.structs.fields(RecordingFile)]
+    for key in data:
+        if key not in names and key in CameraTable.__struct_fields__:
+            remedy = "write it below [cameras.NAME] of the camera that it belongs to"
+            raise _error(path, key, f"one of {', '.join(names)}", key, remedy)
+
+
+def _check_names(path: Path, tables: Mapping[str, Any]) -> None:
+    """Raise `InputError` for a name that cannot be the name of a file, and for two spellings of one name."""
+    spellings: dict[str, str] = {}
+    for name in tables:
+        if not name.strip() or not name.isprintable() or any(mark in name for mark in "/\\,="):
+            raise _error(path, "cameras", "names without slashes, commas and equals signs", repr(name))
+        key = camera_key(name)
+        if key in spellings:
+            raise _error(
+                path, f"cameras.{name}", "each camera once", f"{spellings[key]} as well, the same name"
+            )
+        spellings[key] = name
+
+
+def _check_bounds(path: Path, world: WorldTable) -> None:
+    if world.bounds_m is not None:
+        low, high = world.bounds_m
+        if any(a >= b for a, b in zip(low, high, strict=True)):
+            expected = "the lowest corner, then the highest corner"
+            raise _error(path, "world.bounds_m", expected, f"{list(low)} and {list(high)}")
+
+
+def _error(path: Path, place: str, expected: str, found: str, remedy: str = "") -> InputError:
+    where = f"{path}, {place}" if place else path
+    return InputError(where, expected=expected, found=found, remedy=remedy)
+
+
+def write_recording_file(path: Path | str, content: RecordingFile) -> None:
+    """Write a `recording.toml`; `read_recording_file` reads the same content.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    lines = [f"version = {content.version}"]
+    if content.calibration is not None:
+        lines.append(f"calibration = {toml_value(content.calibration)}")
+    for name, camera in content.cameras.items():
+        lines += ["", f"[cameras.{toml_key(name)}]", *_assignments(camera)]
+    tables = {"world": content.world, "reference": content.reference, "markers": content.markers}
+    for name, table in tables.items():
+        assigned = [] if table is None else _assignments(table)
+        lines += ["", f"[{name}]", *assigned] if assigned else []
+    with atomic_write(path) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _assignments(table: _Table) -> list[str]:
+    """Lines `key = value` of the keys whose values are not the defaults."""
+    defaults = {field.name: field.default for field in msgspec.structs.fields(type(table))}
+    values = {name: getattr(table, name) for name in defaults}
+    return [
+        f"{name} = {toml_value(value)}"
+        for name, value in values.items()
+        if value is not None and value != defaults[name]
+    ]

@@ -1,0 +1,54 @@
+"""Argus's profile of lenses: a line `camera fx w h cx cy AR k1 k2 t1 t2 k3` per camera.
+
+AR is fy / fx; k1, k2, t1, t2, k3 are OpenCV's k1, k2, p1, p2, k3. The file has no poses: those are DLT coefficients in
+a file of their own, for undistorted pixels; see `dlt`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from psotrack.errors import InputError
+from psotrack.geometry import make_camera
+from psotrack.rig_files.entries import Entry, FileRig, Source, collect
+from psotrack.rig_files.fields import CameraFields, image_size
+from psotrack.rig_files.number_table import parse_numbers
+
+_NAMES = ("camera", "fx", "w", "h", "cx", "cy", "AR", "k1", "k2", "t1", "t2", "k3")
+
+
+def recognises(text: str) -> bool:
+    """Whether a text is a table of 12 numbers per line, with an image size where Argus has it."""
+    table = parse_numbers(text)
+    if table is None or table.values.shape[1] != len(_NAMES):
+        return False
+    sizes = table.values[:, 2:4]
+    return bool((sizes >= 1).all() and (sizes == np.round(sizes)).all())
+
+
+def read(source: Source) -> FileRig:
+    """Read the lenses; no camera is placed."""
+    table = parse_numbers(source.text)
+    if table is None or table.values.shape[1] != len(_NAMES):
+        raise InputError(source.path, expected=f"lines of {' '.join(_NAMES)}", found="other text")
+    entries = []
+    for row in table.values:
+        values = dict(zip(_NAMES, row.tolist(), strict=True))
+        name = f"cam{values['camera']:.0f}"
+        fields = CameraFields(source.path, name, {"size": [values["w"], values["h"]]})
+        if not (values["fx"] > 0 and values["AR"] > 0 and np.isfinite(row).all()):
+            raise fields.error(
+                "fx", "finite numbers, fx and AR above 0", f"{values['fx']:g}, {values['AR']:g}"
+            )
+        K = np.array(
+            [[values["fx"], 0, values["cx"]], [0, values["fx"] * values["AR"], values["cy"]], [0, 0, 1.0]]
+        )
+        camera = make_camera(
+            R=np.eye(3),
+            t_m=np.zeros(3),
+            K=K,
+            dist=[values[key] for key in ("k1", "k2", "t1", "t2", "k3")],
+            image_size_wh=image_size(fields, None),
+        )
+        entries.append((name, name, Entry(camera, placed=False)))
+    return FileRig(collect(source.path, entries), metres_per_unit=None)

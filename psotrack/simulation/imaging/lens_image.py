@@ -1,0 +1,119 @@
+"""Images of distorting lenses, put together from images of cameras without distortion at the same place.
+
+Each pixel of the lens looks along one ray. Lenses of a moderate angle are cut from one wide image without distortion;
+lenses of a wide angle from several images, the faces of a cube around the optical axis. A pixel where the lens shows
+nothing is black.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
+from scipy.spatial.transform import Rotation
+
+from psotrack.geometry import Camera, has_image, to_pixels, undistort
+from psotrack.simulation.imaging.raster import Pinhole
+
+#: Largest distance from the optical axis along x or y, as a tangent, in lenses that are cut from one image: 60 degrees.
+_ONE_FACE = 1.75
+#: Margin of a face around the pixels that the lens uses, pixels; blurs of the lens reach beyond these pixels.
+_MARGIN_PX = 16
+#: Largest side of a face, pixels.
+_MAX_SIDE_PX = 6000
+#: Share of the pixels of a lens for which a face has at least the same resolution.
+_SHARP_SHARE = 95
+#: Turns of the camera, Rodrigues vectors in its own axes, to the faces: ahead, and to the four sides.
+_TURNS = np.pi / 2 * np.array([[0, 0, 0], [0, -1, 0], [0, 1, 0], [1, 0, 0], [-1, 0, 0]])
+
+
+@dataclass(frozen=True)
+class LensImage:
+    """The image of a lens as pixels of cameras without distortion.
+
+    Attributes:
+        faces: cameras without distortion, at the place of the lens.
+        face: (height, width), index of the camera that shows what a pixel of the lens sees; -1 where it sees nothing.
+        at_px: (height, width, 2), column and row in the image of this camera.
+        used: for each camera (height, width), True at the pixels that are in the image of the lens.
+    """
+
+    faces: tuple[Pinhole, ...]
+    face: Int[np.ndarray, "height width"]
+    at_px: Float[np.ndarray, "height width 2"]
+    used: tuple[Bool[np.ndarray, "_ _"], ...]
+
+    def assemble(
+        self, images: Sequence[Shaped[np.ndarray, "..."]], interpolation: int = cv2.INTER_CUBIC
+    ) -> Shaped[np.ndarray, "..."]:
+        """The image of the lens from the images of the faces."""
+        whole = np.zeros((*self.face.shape, *images[0].shape[2:]), images[0].dtype)
+        # Two maps, because OpenCV reads a single map of both coordinates wrongly without interpolation.
+        x, y = np.ascontiguousarray(np.moveaxis(self.at_px, -1, 0))
+        for index, image in enumerate(images):
+            seen = self.face == index
+            shown = cv2.remap(image, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE)
+            whole[seen] = shown[seen]
+        return whole
+
+
+def lens_image(camera: Camera) -> LensImage:
+    """Divide the image of one camera with distortion among cameras without distortion."""
+    width, height = (int(side) for side in camera.image_size_wh)
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
+    normalised = undistort(camera, pixels)
+    rays = np.concatenate([normalised, np.ones((height, width, 1))], axis=-1)
+    is_shown = np.isfinite(normalised).all(axis=-1)
+    turns = Rotation.from_rotvec(_TURNS).as_matrix()
+    if np.abs(normalised[is_shown]).max(initial=0.0) <= _ONE_FACE:
+        turns = turns[:1]
+    nearest = np.where(is_shown, _nearest_face(rays, turns), -1)
+    faces: list[Pinhole] = []
+    used: list[Bool[np.ndarray, "_ _"]] = []
+    face, at_px = np.full((height, width), -1), np.zeros((height, width, 2), np.float32)
+    for index, turn in enumerate(turns):
+        seen = nearest == index
+        if not seen.any():
+            continue
+        along = np.where(seen[..., None], rays @ turn.T, np.nan)
+        cam, K_inverse = _face(camera, turn, along[..., :2] / along[..., 2:])
+        face[seen] = len(faces)
+        at_px[seen] = (along[seen] / along[seen][:, 2:]) @ cam.K[:2].T
+        faces.append(cam)
+        own = np.stack(np.meshgrid(np.arange(cam.width), np.arange(cam.height), [1.0]), axis=-1)[:, :, 0]
+        back = own @ K_inverse.T @ turn
+        back_px = to_pixels(camera, back)
+        inside = (back_px >= -0.5) & (back_px <= camera.image_size_wh - 0.5)
+        used.append(has_image(camera, back) & inside.all(axis=-1) & (_nearest_face(back, turns) == index))
+    return LensImage(tuple(faces), face, at_px, tuple(used))
+
+
+def _nearest_face(
+    rays: Float[np.ndarray, "rows columns 3"], turns: Float[np.ndarray, "faces 3 3"]
+) -> Int[np.ndarray, "rows columns"]:
+    """Index of the face whose axis has the smallest angle to each ray; the axis of a turn is its last row."""
+    return np.nan_to_num(rays @ turns[:, 2].T).argmax(axis=-1)
+
+
+def _face(
+    camera: Camera, turn: Float[np.ndarray, "3 3"], normalised: Float[np.ndarray, "rows columns 2"]
+) -> tuple[Pinhole, Float[np.ndarray, "3 3"]]:
+    """A camera without distortion that shows given normalised coordinates, NaN at other pixels, and inverse K."""
+    (x_down, x_along), (y_down, y_along) = (np.gradient(normalised[..., axis]) for axis in range(2))
+    area = np.abs(x_along * y_down - x_down * y_along)
+    seen = np.isfinite(normalised).all(axis=-1)
+    extent = np.ptp(normalised[seen], axis=0).max()
+    known = area[np.isfinite(area) & (area > 0)]
+    focal_px = 1 / np.sqrt(np.percentile(known, 100 - _SHARP_SHARE)) if known.size else float(camera.K[0, 0])
+    focal_px = min(focal_px, (_MAX_SIDE_PX - 2 * _MARGIN_PX) / max(extent, 1e-9))
+    low, high = (
+        np.floor(focal_px * normalised[seen].min(axis=0)) - _MARGIN_PX,
+        np.ceil(focal_px * normalised[seen].max(axis=0)) + _MARGIN_PX,
+    )
+    K = np.array([[focal_px, 0.0, -low[0]], [0.0, focal_px, -low[1]], [0.0, 0.0, 1.0]])
+    width, height = (int(side) + 1 for side in high - low)
+    T = np.asarray(camera.T_cam_world)
+    return Pinhole(turn @ T[:3, :3], turn @ T[:3, 3], K, width, height), np.linalg.inv(K)

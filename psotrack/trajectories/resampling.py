@@ -1,0 +1,95 @@
+"""Trajectories at other times than those at which they were recorded: interpolation that leaves gaps open."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from psotrack.geometry import rotation_matrices
+from psotrack.trajectories.trajectories import Trajectories
+
+#: Longest gap over which positions are interpolated, seconds; for slow trajectories 1.5 sample intervals.
+MAX_GAP_S = 0.1
+
+_At = Callable[[Float[np.ndarray, "times"]], np.ndarray]
+
+
+def resample(
+    trajectories: Trajectories,
+    frame: Int[np.ndarray, "frames"],
+    time_s: Float[np.ndarray, "frames"],
+    *,
+    later_s: float = 0.0,
+) -> Trajectories:
+    """Positions and orientations at other times, by cubic splines; NaN outside of the trajectories and in their gaps.
+
+    Args:
+        trajectories: trajectories with at least two samples.
+        frame: (frames,), numbers of the new frames.
+        time_s: (frames,), times of the new frames, seconds.
+        later_s: the trajectories at time t + `later_s` are the new ones at time t, seconds.
+    """
+    wanted_s = time_s + later_s
+    position_m = interpolated(trajectories.time_s, trajectories.position_m)(wanted_s)
+    orientation_wxyz = None
+    if trajectories.orientation_wxyz is not None:
+        rotation = interpolated(trajectories.time_s, rotation_matrices(trajectories.orientation_wxyz))(
+            wanted_s
+        )
+        orientation_wxyz = np.full((*rotation.shape[:2], 4), np.nan)
+        known = np.isfinite(rotation).all(axis=(-2, -1))
+        if known.any():
+            orientation_wxyz[known] = Rotation.from_matrix(rotation[known]).as_quat(scalar_first=True)
+    return Trajectories(frame, time_s, trajectories.drones, position_m, orientation_wxyz=orientation_wxyz)
+
+
+def longest_gap_s(time_s: Float[np.ndarray, "samples"]) -> float:
+    """Longest gap between samples over which positions are interpolated, seconds."""
+    return max(MAX_GAP_S, 1.5 * float(np.median(np.diff(time_s))))
+
+
+def between_samples(
+    sample_s: Float[np.ndarray, "samples"], wanted_s: Float[np.ndarray, "times"], longest_s: float
+) -> Bool[np.ndarray, "times"]:
+    """Say which times are at a sample, or between two samples that are at most `longest_s` apart.
+
+    Args:
+        sample_s: (samples,), increasing times of at least two samples, seconds.
+        wanted_s: (times,), times of interest, seconds.
+        longest_s: longest gap between two samples, seconds.
+    """
+    after = np.clip(np.searchsorted(sample_s, wanted_s), 1, len(sample_s) - 1)
+    before_s, after_s = wanted_s - sample_s[after - 1], sample_s[after] - wanted_s
+    inside = (np.minimum(before_s, after_s) >= 0) & (before_s + after_s <= longest_s)
+    # The samples at both ends of a gap are valid; the tolerance is for rounding errors.
+    return inside | (np.minimum(np.abs(before_s), np.abs(after_s)) < 1e-9)
+
+
+def interpolated(time_s: Float[np.ndarray, "samples"], values: np.ndarray) -> _At:
+    """A function that interpolates values (samples, drones, ...) by cubic splines.
+
+    It takes times (times,) and returns values (times, drones, ...), NaN outside of the samples and in long gaps.
+    """
+    flat = values.reshape(*values.shape[:2], -1).astype(np.float64)
+    longest_s = longest_gap_s(time_s)
+    known = [np.isfinite(flat[:, drone]).all(axis=-1) for drone in range(flat.shape[1])]
+    # A spline needs two samples.
+    splines = {
+        drone: (time_s[there], CubicSpline(time_s[there], flat[there, drone]))
+        for drone, there in enumerate(known)
+        if there.sum() > 1
+    }
+
+    def at(wanted_s: Float[np.ndarray, "times"]) -> np.ndarray:
+        found = np.full((len(wanted_s), *flat.shape[1:]), np.nan)
+        for drone, (sample_s, spline) in splines.items():
+            inside = between_samples(sample_s, wanted_s, longest_s)
+            if inside.any():
+                found[inside, drone] = spline(wanted_s[inside])
+        return found.reshape(len(wanted_s), *values.shape[1:])
+
+    return at

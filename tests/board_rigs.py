@@ -1,0 +1,99 @@
+"""Views of a board by a rig, from the formula of the projection, with errors that corners have in common."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from psotrack.calibration import Board, BoardViews
+from psotrack.geometry import Rig, look_at, make_camera, make_rig, project
+
+BOARD = Board((8, 6), 0.1, 0.075)
+SIZE_WH = (1280, 720)
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Standard deviations of the errors of a view's corners.
+
+    Attributes:
+        corner_px: of each corner for itself.
+        view_px: of all corners of a view together.
+        slip_m: shift of the board as a camera sees it.
+    """
+
+    corner_px: float = 0.2
+    view_px: float = 0.0
+    slip_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A rig, and how a board is seen by it."""
+
+    rig: Rig
+    board: Board = BOARD
+    errors: Errors = field(default_factory=Errors)
+    instants: int = 25
+
+    def views(self, rng):
+        """Views of the board at random poses, where at least half of its corners are in an image."""
+        count, corners = len(self.rig), self.board.num_corners
+        pixels = np.full((count, self.instants, corners, 2), np.nan)
+        middle = self.board.corners_m.mean(axis=0)
+        for instant in range(self.instants):
+            # The board faces one of the cameras, more or less.
+            towards = self.rig.cameras.centre_world[rng.integers(count)]
+            place = rng.uniform((-0.6, -0.6, 0.6), (0.6, 0.6, 1.6))
+            # z points away from the camera, into the board.
+            z = (place - towards) / np.linalg.norm(place - towards)
+            x = np.cross([0.0, 0.0, 1.0], z)
+            x /= np.linalg.norm(x)
+            R = np.column_stack([x, np.cross(z, x), z])
+            R = R @ Rotation.from_euler("xyz", rng.uniform(-40, 40, 3), degrees=True).as_matrix()
+            for camera in range(count):
+                slip = rng.normal(0, self.errors.slip_m, 3) if self.errors.slip_m else 0.0
+                points_m = (self.board.corners_m - middle) @ R.T + place + slip
+                seen, depth = project(self.rig.cameras[camera], points_m)
+                seen = seen + rng.normal(0, self.errors.corner_px, seen.shape)
+                seen += rng.normal(0, self.errors.view_px, 2) if self.errors.view_px else 0.0
+                faces = (points_m.mean(axis=0) - self.rig.cameras.centre_world[camera]) @ R[:, 2] > 0
+                inside = ((seen > 0) & (seen < np.array(SIZE_WH) - 1)).all(axis=-1) & (depth > 0.2) & faces
+                if inside.mean() > 0.5:
+                    pixels[camera, instant, inside] = seen[inside]
+        sizes = np.tile(np.array(SIZE_WH), (count, 1))
+        return BoardViews(self.rig.names, sizes, np.arange(self.instants), pixels)
+
+
+def row_of_cameras(count=3, dist=(-0.2, 0.08, 0.001, -0.001, 0.0)):
+    """Cameras in an arc that look at the middle of a room, each with a lens of its own."""
+    cameras = {}
+    for index in range(count):
+        angle = np.deg2rad(-30.0 + 60.0 * index / max(count - 1, 1))
+        R, t_m = look_at((3.0 * np.sin(angle), -3.0 * np.cos(angle), 1.5 + 0.2 * index), (0.0, 0.0, 1.1))
+        K = np.array([[900.0 + 30 * index, 0, 640 - 5 * index], [0, 905.0 + 30 * index, 355], [0, 0, 1]])
+        cameras[f"c{index}"] = make_camera(R=R, t_m=t_m, K=K, dist=dist, image_size_wh=SIZE_WH)
+    return make_rig(cameras)
+
+
+def relative_to_first(rig):
+    """(cameras, 4, 4), transforms from the first camera to each camera."""
+    T = rig.cameras.T_cam_world
+    return T @ np.linalg.inv(T[0])
+
+
+def draw_board(board, K, T_cam_board, size_wh):
+    """Grey image of a ChArUco board that OpenCV draws, three times as large and then reduced."""
+    per_m = 2500.0
+    columns, rows = board.squares_wh
+    size_px = (round(columns * board.square_m * per_m), round(rows * board.square_m * per_m))
+    sheet = board.opencv().generateImage(size_px)
+    # Pixel (u, v) of the sheet lies at ((u + 0.5) / per_m, (v + 0.5) / per_m) on the board.
+    to_board = np.array([[1 / per_m, 0, 0.5 / per_m], [0, 1 / per_m, 0.5 / per_m], [0, 0, 1]])
+    to_large = np.array([[3.0, 0, 1], [0, 3, 1], [0, 0, 1]])
+    H = to_large @ K @ T_cam_board[:3, [0, 1, 3]] @ to_board
+    large = cv2.warpPerspective(sheet, H, (3 * size_wh[0], 3 * size_wh[1]), borderValue=200)
+    return cv2.resize(large, size_wh, interpolation=cv2.INTER_AREA)

@@ -1,0 +1,229 @@
+"""Boards in images that OpenCV draws: printed inverted, seen mirrored, and boards that are not the stated one."""
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from board_rigs import draw_board
+from click.testing import CliRunner
+from scipy.spatial.transform import Rotation
+
+from psotrack.calibration import (
+    Board,
+    calibrate_rig,
+    find_views,
+    instants_of_numbers,
+    open_images,
+    say_print,
+)
+from psotrack.calibration.board_corners import BoardFinder
+from psotrack.calibration.board_recognition import explain_missing_board, recognise_board
+from psotrack.cli.calibrate import calibrate
+from psotrack.errors import InputError, PsotrackError, SettingsError
+from psotrack.rig_files import read_rig
+
+SIZE_WH = (640, 480)
+K = np.array([[620.0, 0, 322.0], [0, 620.0, 236.0], [0, 0, 1]])
+BOARD = Board((4, 6), 0.04, 0.03)
+REAL = Path(os.environ.get("PSOTRACK_REAL_DATA", "absent"))
+
+
+def pose(seed=0):
+    rng = np.random.default_rng(seed)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("xyz", rng.uniform(-25, 25, 3), degrees=True).as_matrix()
+    T[:3, 3] = np.array([-0.08, -0.12, 0.45]) + rng.uniform(-0.02, 0.02, 3)
+    return T
+
+
+def projected(board, T):
+    points = board.corners_m @ T[:3, :3].T + T[:3, 3]
+    return points[:, :2] / points[:, 2:] * np.diag(K)[:2] + K[:2, 2]
+
+
+def draw_grid(board, T):
+    """Grey image of a grid of markers, drawn like a ChArUco board."""
+    per_m = 2000.0  # pitch and side are whole numbers of pixels
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    pitch, side = round(board.square_m * per_m), round(board.marker_m * per_m)
+    columns, rows = board.squares_wh
+    sheet = np.full((rows * pitch, columns * pitch), 255, np.uint8)
+    for marker in range(columns * rows):
+        top, left = marker // columns * pitch, marker % columns * pitch
+        sheet[top : top + side, left : left + side] = cv2.aruco.generateImageMarker(dictionary, marker, side)
+    sheet = cv2.copyMakeBorder(sheet, 30, 30, 30, 30, cv2.BORDER_CONSTANT, value=255)
+    to_board = np.array([[1 / per_m, 0, -29.5 / per_m], [0, 1 / per_m, -29.5 / per_m], [0, 0, 1]])
+    to_large = np.array([[3.0, 0, 1], [0, 3, 1], [0, 0, 1]])
+    H = to_large @ K @ T[:3, [0, 1, 3]] @ to_board
+    large = cv2.warpPerspective(sheet, H, (3 * SIZE_WH[0], 3 * SIZE_WH[1]), borderValue=200)
+    return cv2.resize(large, SIZE_WH, interpolation=cv2.INTER_AREA)
+
+
+def test_corners_of_a_board():
+    image = draw_board(BOARD, K, pose(), SIZE_WH)
+    found = BoardFinder(BOARD).find(image)
+    assert np.isfinite(found).all()
+    assert np.abs(found - projected(BOARD, pose())).max() < 0.5
+    # From behind, or in a mirror: the same corners at the pixels where they are.
+    mirrored = BoardFinder(BOARD).find_mirrored(np.ascontiguousarray(image[:, ::-1]))
+    expected = projected(BOARD, pose()) * [-1, 1] + [SIZE_WH[0] - 1, 0]
+    assert np.abs(mirrored - expected).max() < 0.5
+
+
+def test_corners_of_a_grid_and_of_a_chessboard():
+    grid = Board((3, 4), 0.045, 0.036, "apriltag_36h11", "grid")
+    found = BoardFinder(grid).find(draw_grid(grid, pose()))
+    assert np.isfinite(found).all()
+    assert np.abs(found - projected(grid, pose())).max() < 0.6
+    chess = Board((6, 5), 0.03, kind="chessboard")
+    sheet = np.kron(np.add.outer(np.arange(5), np.arange(6)) % 2, np.ones((75, 75))) * 255
+    sheet = cv2.copyMakeBorder(sheet.astype(np.uint8), 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
+    to_board = np.array([[1 / 2500, 0, -59.5 / 2500], [0, 1 / 2500, -59.5 / 2500], [0, 0, 1]])
+    # Turned by half a turn, the corners keep their numbers: the square between the first four is dark.
+    for turn in (0.0, 180.0):
+        T = pose(1)
+        T[:3, :3] = T[:3, :3] @ Rotation.from_euler("z", turn, degrees=True).as_matrix()
+        T[:3, 3] = pose(1)[:3, 3] + 0.05 - T[:3, :3] @ [0.09, 0.075, 0] + pose(1)[:3, :3] @ [0.09, 0.075, 0]
+        image = cv2.warpPerspective(sheet, K @ T[:3, [0, 1, 3]] @ to_board, SIZE_WH, borderValue=255)
+        found = BoardFinder(chess).find(image)
+        assert np.abs(found - projected(chess, T)).max() < 0.6
+
+
+@pytest.mark.parametrize(("inverted", "legacy"), [(True, False), (False, True)])
+def test_the_print_is_found_out(inverted, legacy):
+    printed = replace(BOARD, legacy=legacy)
+    images = [draw_board(printed, K, pose(seed), SIZE_WH) for seed in range(2)]
+    found = recognise_board(BOARD, [255 - image if inverted else image for image in images])
+    assert (found.inverted, found.board.legacy, found.views) == (inverted, legacy, 2)
+
+
+@pytest.mark.parametrize(
+    ("stated", "message"),
+    [
+        (Board((6, 4), 0.04, 0.03), "in the order of a board of 4 x 6 squares; pass --squares 4x6"),
+        (
+            Board((4, 6), 0.04, 0.03, "5x5_50"),
+            "markers 0 to 11 of the dictionary 4x4_50; pass --dictionary 4x4_50",
+        ),
+        (Board((4, 6), 0.04, kind="chessboard"), "a board with markers; pass --marker and --dictionary"),
+    ],
+)
+@pytest.mark.slow
+def test_another_board_is_named(stated, message):
+    images = [draw_board(BOARD, K, pose(seed), SIZE_WH) for seed in range(2)]
+    found, remedy = explain_missing_board(stated, images)
+    assert message in f"{found}; {remedy}"
+
+
+@pytest.mark.slow
+def test_no_board_at_all():
+    found, _ = explain_missing_board(BOARD, [np.full((240, 320), 128, np.uint8)] * 2)
+    assert found == "no such board, and no markers of any known dictionary, in 2 images"
+
+
+def test_cameras_from_paths(tmp_path):
+    for name in ("left", "right"):
+        folder = tmp_path / name / "board"
+        folder.mkdir(parents=True)
+        for number in (2, 10):
+            cv2.imwrite(str(folder / f"{name}7_{number}.png"), np.zeros((4, 6), np.uint8))
+            cv2.imwrite(str(tmp_path / f"{name}{number:02d}.png"), np.zeros((4, 6), np.uint8))
+    cameras = open_images([tmp_path / "left" / "board", tmp_path / "right" / "board"])
+    assert [camera.name for camera in cameras] == ["left", "right"]
+    np.testing.assert_array_equal(cameras[0].frames, [2, 10])
+    assert [number for number, _ in cameras[0].read(np.array([10]))] == [10]
+    assert [camera.name for camera in open_images([tmp_path / "left??.png", tmp_path / "right??.png"])] == [
+        "left",
+        "right",
+    ]
+    with pytest.raises(InputError, match="expected each camera once, found board again"):
+        open_images([tmp_path / "left" / "board"] * 2)
+    with pytest.raises(InputError, match="images of this pattern, found none"):
+        open_images([tmp_path / "top*.png"])
+    with pytest.raises(SettingsError, match="2 names, found 1"):
+        open_images([tmp_path / "left" / "board", tmp_path / "right" / "board"], ["a"])
+
+
+def test_a_camera_that_never_sees_the_board(tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        for number in range(2):
+            image = (
+                draw_board(BOARD, K, pose(number), SIZE_WH) if name == "a" else np.zeros((480, 640), np.uint8)
+            )
+            cv2.imwrite(str(tmp_path / name / f"{number}.png"), image)
+    cameras = open_images([tmp_path / "a", tmp_path / "b"])
+    with pytest.raises(InputError, match=r"camera b: expected views of the board .* found none in 2 frames"):
+        find_views(BOARD, cameras, instants_of_numbers(cameras))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (REAL / "mprib/caliscope").is_dir(), reason="real recordings: PSOTRACK_REAL_DATA")
+def test_four_webcams():
+    """A board printed white on black, which one camera sees from behind; the author's focal lengths are near."""
+    folder = REAL / "mprib/caliscope/tests/sessions/4_cam_recording/calibration/extrinsic"
+    cameras = open_images([folder / f"cam_{n}.mp4" for n in range(4)])
+    found = find_views(Board((4, 5), 0.054, 0.0405, "4x4_1000"), cameras, instants_of_numbers(cameras))
+    assert found.recognised.inverted
+    assert (found.mirrored > 0).tolist() == [False, True, False, False]
+    assert say_print(found)[0] == "the board is printed white on black"
+    calibrated = calibrate_rig(found.recognised.board, found.views)
+    np.testing.assert_allclose(calibrated.rig.cameras.K[:, 0, 0], [894.5, 704.0, 637.2, 640.4], rtol=0.03)
+    assert np.nanmedian(calibrated.residual_px) < 0.6
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (REAL / "kyamagu/mexopencv").is_dir(), reason="real recordings: PSOTRACK_REAL_DATA")
+def test_a_stereo_pair_and_a_chessboard():
+    """OpenCV's sample reports 0.22 px."""
+    cameras = open_images([REAL / f"kyamagu/mexopencv/test/{side}??.jpg" for side in ("left", "right")])
+    found = find_views(Board((10, 7), 0.025, kind="chessboard"), cameras, instants_of_numbers(cameras))
+    calibrated = calibrate_rig(found.recognised.board, found.views)
+    rms_px = np.sqrt(np.mean(calibrated.residual_px[calibrated.used] ** 2))
+    assert rms_px < 0.24
+
+
+@pytest.mark.slow
+def test_the_command(tmp_path):
+    """Two folders of drawn images, from the command line to the rig; and what the command refuses."""
+    baseline = np.eye(4)
+    baseline[0, 3] = -0.1
+    for name, T in (("left", np.eye(4)), ("right", baseline)):
+        (tmp_path / name).mkdir()
+        for number in range(8):
+            image = draw_board(BOARD, K, T @ pose(number), SIZE_WH)
+            cv2.imwrite(str(tmp_path / name / f"{number}.png"), 255 - image)
+    board = (
+        "--squares",
+        "4x6",
+        "--square",
+        "0.04",
+        "--marker",
+        "0.03",
+        "--dictionary",
+        "4x4_50",
+        "--lens",
+        "0",
+    )
+    paths = (str(tmp_path / "left"), str(tmp_path / "right"))
+    out = tmp_path / "rig.toml"
+    result = CliRunner().invoke(calibrate, ["rig", *paths, *board, "--out", str(out), "--json", "-"])
+    assert result.exit_code == 0, result.output
+    content = json.loads(result.stdout)
+    assert content["print"] == ["the board is printed white on black"]
+    rig = read_rig(out)
+    assert rig.names == ("left", "right")
+    np.testing.assert_allclose(rig.cameras.centre_world, [[0, 0, 0], [0.1, 0, 0]], atol=0.005)
+    other = ["--out", str(tmp_path / "other.toml")]
+    for arguments, message in (
+        ([*paths, *other], "expected one of --squares, --points, --pairs, --markers"),
+        ([paths[0], paths[0], *board, *other], "expected each camera once"),
+        ([*paths, *board, "--floor", "99", *other], "the nearest one is 7"),
+    ):
+        result = CliRunner().invoke(calibrate, ["rig", *arguments])
+        assert isinstance(result.exception, PsotrackError)
+        assert message in str(result.exception)

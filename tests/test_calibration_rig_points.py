@@ -1,0 +1,155 @@
+"""A rig from a moving point, and the world of a rig."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from board_rigs import row_of_cameras
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from psotrack.calibration import (
+    GivenWorld,
+    PointViews,
+    align,
+    calibrate_by_point,
+    distance_between,
+    fit_world,
+    read_point_views,
+    read_world,
+    stick_length,
+    views_of_detections,
+    world_of_camera,
+)
+from psotrack.errors import InputError, SettingsError
+from psotrack.geometry import project
+from psotrack.recordings import Detections
+
+RIG = row_of_cameras(4)
+
+
+def fly(rng, instants=60, noise_px=0.5, false=0.05):
+    """Sightings of a point and its positions; some sightings are of something else."""
+    t = np.linspace(0, 30, instants)
+    points_m = np.stack([0.8 * np.sin(t), 0.8 * np.cos(0.7 * t), 1.1 + 0.5 * np.sin(0.31 * t)], axis=-1)
+    pixels, _ = project(RIG.cameras, points_m[:, None])
+    pixels = pixels + rng.normal(0, noise_px, pixels.shape)
+    wrong = rng.random(pixels.shape[:2]) < false
+    pixels[wrong] += rng.normal(0, 200, (int(wrong.sum()), 2))
+    return PointViews(RIG.names, np.zeros(instants, np.int64), np.arange(instants), pixels), points_m
+
+
+def shape_of(rig):
+    """Distances between all cameras."""
+    centres = np.asarray(rig.cameras.centre_world)
+    return np.linalg.norm(centres[:, None] - centres, axis=-1)
+
+
+@pytest.mark.slow
+def test_a_moving_point_places_all_cameras():
+    views, points_m = fly(np.random.default_rng(0))
+    # The last camera joins late: it shares nothing with the first one.
+    views.points_px[::2, 0], views.points_px[1::2, 3] = np.nan, np.nan
+    found = calibrate_by_point(RIG, views)
+    factor = distance_between(RIG, "c0", "c3") / distance_between(found.adjusted.rig, "c0", "c3")
+    rig = world_of_camera(found.adjusted.rig, 0, factor).rig(found.adjusted.rig)
+    np.testing.assert_allclose(rig.cameras.T_cam_world[0], np.eye(4), atol=1e-9)
+    np.testing.assert_allclose(shape_of(rig), shape_of(RIG), atol=0.03)
+    assert 0.3 < found.noise_px < 0.8
+    numbered = dict(enumerate(found.adjusted.points_m))
+    places = {f"{frame}": points_m[frame] for frame in range(0, 60, 6)}
+    change, left_m = fit_world(
+        found.adjusted.rig, GivenWorld(Path("world.csv"), places, {}), numbered, with_scale=True
+    )
+    assert np.median(list(left_m.values())) < 0.01
+    np.testing.assert_allclose(
+        change.rig(found.adjusted.rig).cameras.centre_world, RIG.cameras.centre_world, atol=0.03
+    )
+
+
+@pytest.mark.slow
+def test_too_few_sightings_are_refused():
+    views, _ = fly(np.random.default_rng(1), instants=8)
+    with pytest.raises(InputError, match="points: expected at least 12 instants at which two cameras see"):
+        calibrate_by_point(RIG, views)
+    views, _ = fly(np.random.default_rng(1))
+    views.points_px[:, 2] = np.nan
+    with pytest.raises(InputError, match="camera c2: expected at least 12 instants"):
+        calibrate_by_point(RIG, views)
+    with pytest.raises(SettingsError, match="distance: expected two of c0, c1, c2, c3, found c0,top"):
+        distance_between(RIG, "c0", "top")
+
+
+@pytest.mark.slow
+def test_a_stick(tmp_path):
+    path = tmp_path / "stick.csv"
+    ends = np.array([[0.0, 0, 1], [0.3, 0, 1]])
+    rows = ["camera,frame,point,x_px,y_px"]
+    for frame in range(20):
+        place = ends + np.array([0.02 * frame - 0.3, 0.3 * np.sin(frame), 0.2 * np.cos(0.7 * frame)])
+        for end, xyz in zip(("tip", "foot"), place, strict=True):
+            pixels, _ = project(RIG.cameras, xyz)
+            rows += [f"{name},{frame},{end},{x},{y}" for name, (x, y) in zip(RIG.names, pixels, strict=True)]
+    path.write_text("\n".join(rows) + "\n")
+    views = read_point_views(path)
+    assert views.names == RIG.names
+    found = calibrate_by_point(RIG, views)
+    factor = 0.3 / stick_length(found)
+    np.testing.assert_allclose(factor * shape_of(found.adjusted.rig), shape_of(RIG), atol=1e-3)
+    path.write_text("\n".join([*rows, "c0,0,tip,1,1"]) + "\n")
+    with pytest.raises(InputError, match="each point once per camera and frame, found 0 of c0 again"):
+        read_point_views(path)
+
+
+def test_one_box_of_a_frame_counts():
+    """The box of highest confidence counts; of two that are equal none does."""
+    xyxy = np.array([[0, 0, 10, 10], [20, 20, 31, 31], [5, 5, 8, 8], [7, 7, 9, 9.0]])
+    boxes = Detections(np.array([0, 0, 3, 3]), xyxy, np.array([0.9, 0.95, 0.5, 0.5]))
+    other = Detections(np.array([3]), np.array([[0, 0, 2, 2.0]]), np.array([1.0]))
+    views = views_of_detections({"a": boxes, "b": other})
+    np.testing.assert_array_equal(views.number, [0, 3])
+    np.testing.assert_array_equal(views.points_px[:, 0], [[25, 25], [np.nan, np.nan]])
+    np.testing.assert_array_equal(views.points_px[:, 1], [[np.nan, np.nan], [0.5, 0.5]])
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.1, 10))
+def test_alignment_finds_a_similarity(seed, scale):
+    rng = np.random.default_rng(seed)
+    points_m = rng.normal(0, 2, (5, 3))
+    R, t_m = Rotation.random(rng=rng).as_matrix(), rng.normal(0, 5, 3)
+    change, left_m = align(points_m, scale * points_m @ R.T + t_m, with_scale=True)
+    np.testing.assert_allclose(change.R, R, atol=1e-9)
+    np.testing.assert_allclose([change.scale, *change.t_m], [scale, *t_m], atol=1e-8 * scale)
+    assert left_m.max() < 1e-7
+    # A rig that moves with its points sees them at the same pixels.
+    before, after = (
+        project(RIG.cameras, points_m[:, None])[0],
+        project(change.rig(RIG).cameras, change.points(points_m)[:, None])[0],
+    )
+    good = np.isfinite(before) & (np.abs(before) < 1e4)
+    np.testing.assert_allclose(after[good], before[good], atol=1e-3)
+
+
+def test_a_world_of_cameras_and_of_marked_points(tmp_path):
+    centres = np.asarray(RIG.cameras.centre_world)
+    path = tmp_path / "world.csv"
+    rows = [f"{name},{x},{y},{z}" for name, (x, y, z) in zip(RIG.names, centres, strict=True)]
+    path.write_text("\n".join(["point,x_m,y_m,z_m", *rows]) + "\n")
+    turned = world_of_camera(RIG, 1).rig(RIG)
+    change, left_m = fit_world(turned, read_world(path), with_scale=False)
+    np.testing.assert_allclose(change.rig(turned).cameras.centre_world, centres, atol=1e-6)
+    assert max(left_m.values()) < 1e-6
+    marked = np.array([[0, 0, 1], [0.5, 0, 1], [0, 0.4, 1.3], [0.2, 0.1, 0.9]])
+    rows = ["camera,point,x_px,y_px,x_m,y_m,z_m"]
+    for point, xyz in enumerate(marked):
+        for name, (x, y) in zip(RIG.names[:2], project(RIG.cameras, xyz)[0][:2], strict=True):
+            rows.append(f"{name},p{point},{x},{y},{xyz[0]},{xyz[1]},{xyz[2]}")
+    path.write_text("\n".join(rows) + "\n")
+    change, _ = fit_world(turned, read_world(path), with_scale=False)
+    np.testing.assert_allclose(change.rig(turned).cameras.centre_world, centres, atol=1e-4)
+    path.write_text("point,x_m,y_m,z_m\nc0,0,0,0\nc1,1,0,0\nsun,1,1,1\n")
+    with pytest.raises(InputError, match="at least 3 points that the rig knows, found 2 of 3"):
+        fit_world(turned, read_world(path), with_scale=False)
+    with pytest.raises(InputError, match="not on one line"):
+        align(np.arange(9.0).reshape(3, 3), marked[:3], with_scale=False)

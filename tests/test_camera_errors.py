@@ -1,0 +1,471 @@
+"""Errors of cameras learned from what they show of tracked drones, and covariances that hold for these errors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import ring_rig
+from scipy.linalg import toeplitz
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+from scipy.stats import f as f_distribution
+
+from psotrack import cli
+from psotrack.camera_errors import (
+    CameraErrors,
+    Fading,
+    FittedPlaces,
+    MeasurementErrors,
+    camera_variances,
+    fading_of,
+    filtered_variances,
+    fit_constant_errors,
+    lasting_covariances,
+    learn_camera_errors,
+    noise_covariance,
+    noise_ratios,
+    views_of_places,
+    views_of_sightings,
+    widening,
+)
+from psotrack.correspondence import Sightings
+from psotrack.errors import SettingsError
+from psotrack.evaluation import evaluate
+from psotrack.geometry import project, reconstruct
+from psotrack.motion import MotionParams, filter_measurements
+from psotrack.settings import ErrorSettings, TrackSettings
+from psotrack.trajectories import Trajectories, read_trajectories, write_trajectories
+
+FPS = 25.0
+USUAL = Fading(0.3, 0.7, 0.0, 0.4)
+#: The chi-square distribution with 3 degrees of freedom is below this with probability 0.9.
+INSIDE_90 = chi2.ppf(0.9, 3)
+
+
+def flights(rng, frames, drones):
+    """Smooth paths in the middle of the room of `ring_rig`, and their velocities."""
+    t = np.arange(frames)[:, None, None] / FPS
+    path = np.zeros((frames, drones, 3))
+    for _ in range(3):
+        rate, phase = rng.uniform(0.3, 2.0, (drones, 3)), rng.uniform(0, 6.3, (drones, 3))
+        path += np.array([0.7, 0.7, 0.3]) * np.sin(rate * t + phase)
+    return path + np.array([0.1, -0.1, 1.2]), np.gradient(path, 1 / FPS, axis=0)
+
+
+def turned(rig, angle_deg, rng):
+    """The rig with every camera turned about its centre by an angle, about a random axis."""
+    T = rig.cameras.T_cam_world.copy()
+    for camera in range(len(rig)):
+        axis = rng.normal(size=3)
+        turn = Rotation.from_rotvec(np.radians(angle_deg) * axis / np.linalg.norm(axis))
+        T[camera, :3] = turn.as_matrix() @ T[camera, :3]
+    return replace(rig, cameras=replace(rig.cameras, T_cam_world=T))
+
+
+def correlated(rng, shape, share, frames):
+    """Errors of variance 1, a share of which fades exponentially over some frames, the rest white."""
+    decay = np.exp(-1 / frames)
+    fading = rng.normal(size=shape)
+    for frame in range(1, shape[0]):
+        fading[frame] = decay * fading[frame - 1] + np.sqrt(1 - decay**2) * fading[frame]
+    return np.sqrt(share) * fading + np.sqrt(1 - share) * rng.normal(size=shape)
+
+
+def fitted_views(rig, stated, position_m, velocity_m_s, error_px):
+    """Views of positions that a stated rig fits to places with errors, and the errors of the positions.
+
+    The fit is linear, and exact for the places that the stated rig would show.
+    """
+    place_px, _ = project(rig.cameras, position_m[:, :, None])
+    weight = np.ones(place_px.shape)
+    views = views_of_places(stated.cameras, place_px + error_px, weight, position_m, velocity_m_s)
+    moved_m = np.einsum("fdcik,fdck->fdi", views.gain, views.residual_px)
+    residual_px = views.residual_px - np.einsum("fdcik,fdk->fdci", views.jacobian, moved_m)
+    return replace(views, residual_px=residual_px), moved_m
+
+
+def inside_rate(error_m, covariance_m2):
+    solved = np.linalg.solve(covariance_m2, error_m[..., None])[..., 0]
+    return float((np.vecdot(error_m, solved) <= INSIDE_90).mean())
+
+
+class TestViews:
+    def test_gain_is_the_derivative_of_the_weighted_fit(self):
+        rig = ring_rig(4)
+        position_m = np.array([[0.3, -0.2, 1.0]])
+        noise_px = np.array([1.0, 2.0, 0.5, 1.5])
+        pixels, _ = project(rig.cameras, position_m[:, None])
+        weight = np.repeat(noise_px[:, None] ** -2.0, 2, axis=-1)[None, None]
+        views = views_of_places(rig.cameras, pixels[None], weight, position_m[None], np.zeros((1, 1, 3)))
+        for camera in range(4):
+            for axis in range(2):
+                step_px = np.zeros((4, 2))
+                step_px[camera, axis] = 0.5
+                fits = [
+                    reconstruct(
+                        rig.cameras, pixels + sign * step_px, noise_px=noise_px, robust=False
+                    ).position_m
+                    for sign in (1, -1)
+                ]
+                expected = fits[0][0] - fits[1][0]
+                np.testing.assert_allclose(views.gain[0, 0, camera, :, axis], expected, atol=1e-4)
+
+    @pytest.mark.parametrize("coefficients", [0, 5])
+    def test_turns_are_derivatives_of_the_projection(self, coefficients):
+        rig = ring_rig(3, coefficients=coefficients)
+        position_m = np.array([[[0.4, 0.3, 0.9]]])
+        views = views_of_places(
+            rig.cameras, np.full((1, 1, 3, 2), np.nan), np.ones((1, 1, 3, 2)), position_m, np.zeros((1, 1, 3))
+        )
+        for axis in range(3):
+            angle = np.zeros(3)
+            angle[axis] = 1e-6
+            T = rig.cameras.T_cam_world.copy()
+            T[:, :3] = Rotation.from_rotvec(angle).as_matrix() @ T[:, :3]
+            after, _ = project(replace(rig.cameras, T_cam_world=T), position_m[:, :, None])
+            before, _ = project(rig.cameras, position_m[:, :, None])
+            np.testing.assert_allclose(
+                views.turn_px[..., axis], (after - before) / 1e-6, rtol=1e-3, atol=1e-2
+            )
+
+    def test_sightings_belong_to_the_drone_that_is_nearest_to_them(self):
+        rig = ring_rig(3)
+        position_m = np.array([[[0.0, 0.0, 1.0], [0.8, 0.5, 1.4]]] * 4)
+        pixels, _ = project(rig.cameras, position_m[:, :, None])
+        # Boxes in the reverse order of the drones, a box of no drone, and one drone that camera 0 does not see.
+        centre_px = np.concatenate([pixels[:, ::-1], np.full_like(pixels[:, :1], 3.0)], axis=1)
+        centre_px = centre_px.swapaxes(1, 2) + 0.5
+        noise_px = np.full(centre_px.shape[:-1], 1.0)
+        centre_px[:, 0, 1], noise_px[:, 0, 1] = np.nan, np.nan
+        sightings = Sightings(centre_px, np.full(centre_px.shape, 8.0), noise_px)
+        views = views_of_sightings(rig.cameras, sightings, position_m, np.zeros_like(position_m))
+        np.testing.assert_array_equal(views.shown[0], [[False, True, True], [True, True, True]])
+        np.testing.assert_allclose(views.residual_px[views.shown], 0.5)
+        assert (views.weight[~views.shown] == 0).all()
+
+    def test_one_camera_alone_has_no_gain(self):
+        rig = ring_rig(1)
+        position_m = np.zeros((2, 1, 3)) + np.array([0, 0, 1.0])
+        views = views_of_places(
+            rig.cameras, np.zeros((2, 1, 1, 2)), np.ones((2, 1, 1, 2)), position_m, np.zeros((2, 1, 3))
+        )
+        assert (views.gain == 0).all()
+
+
+class TestLearning:
+    def test_variances_of_cameras_are_not_shrunk_by_the_fit(self):
+        rig, rng = ring_rig(4), np.random.default_rng(1)
+        position_m, velocity_m_s = flights(rng, 800, 1)
+        noise_px = np.array([1.0, 1.5, 2.0, 4.0])
+        error_px = noise_px[:, None] * rng.normal(size=(800, 1, 4, 2))
+        views, _ = fitted_views(rig, rig, position_m, velocity_m_s, error_px)
+        places = FittedPlaces(views.residual_px[:, 0], views.jacobian[:, 0], np.ones((800, 4), bool))
+        found = np.sqrt(camera_variances(places, np.zeros((800, 4))))
+        np.testing.assert_allclose(found, noise_px, rtol=0.12)
+        # The plain spread of the residuals is too small.
+        assert np.square(views.residual_px).mean() < 0.8 * np.square(noise_px).mean()
+        known = np.broadcast_to(noise_px**2, (800, 4))
+        assert camera_variances(places, known).max() < 0.1 * np.square(noise_px).max()
+
+    def test_a_camera_that_shows_nothing_has_no_variance(self):
+        rig, rng = ring_rig(3), np.random.default_rng(2)
+        position_m, velocity_m_s = flights(rng, 50, 1)
+        views, _ = fitted_views(rig, rig, position_m, velocity_m_s, rng.normal(size=(50, 1, 3, 2)))
+        shown = np.tile([True, True, False], (50, 1))
+        variance = camera_variances(
+            FittedPlaces(views.residual_px[:, 0], views.jacobian[:, 0], shown), np.zeros((50, 3))
+        )
+        assert np.isfinite(variance[:2]).all()
+        assert np.isnan(variance[2])
+
+    @pytest.mark.parametrize(("share", "frames"), [(0.7, 10), (0.7, 25), (0.0, 10)])
+    def test_fading_is_found(self, share, frames):
+        rng = np.random.default_rng(3)
+        values = correlated(rng, (600, 3, 4, 2), share, frames)
+        found = fading_of(values, np.ones((600, 3, 4), bool), 1 / FPS, USUAL)
+        assert found.white_share == pytest.approx(1 - share, abs=0.08)
+        if share:
+            assert found.fading_share + found.lasting_share == pytest.approx(share, abs=0.08)
+            assert found.time_s == pytest.approx(frames / FPS, rel=0.3)
+
+    def test_errors_that_never_change_last(self):
+        rng = np.random.default_rng(4)
+        values = 0.6 * rng.normal(size=(1, 3, 4, 2)) + 0.8 * rng.normal(size=(300, 3, 4, 2))
+        found = fading_of(values, np.ones((300, 3, 4), bool), 1 / FPS, USUAL)
+        true = np.square(values.mean(axis=0)).mean() / np.square(values).mean()
+        assert found.lasting_share == pytest.approx(true, abs=0.06)
+
+    def test_too_few_frames_fade_as_usual(self):
+        assert fading_of(np.ones((4, 1, 2, 2)), np.ones((4, 1, 2), bool), 1 / FPS, USUAL) == USUAL
+
+    @pytest.mark.parametrize("num_frames", [1, 2, 7, 40])
+    def test_variance_of_means_is_that_of_the_covariance_matrix(self, num_frames):
+        fading = Fading(0.25, 0.6, 0.15, 0.3)
+        lag = np.arange(num_frames)
+        rho = 0.25 * (lag == 0) + 0.6 * np.exp(-lag / FPS / 0.3) + 0.15
+        expected = toeplitz(rho).mean()
+        assert fading.variance_of_mean(np.array([num_frames]), 1 / FPS)[0] == pytest.approx(expected)
+        long = (
+            toeplitz(0.4 * (np.arange(4000) == 0) + 0.6 * np.exp(-np.arange(4000) / FPS / 0.3)).sum() / 4000
+        )
+        assert Fading(0.4, 0.6, 0.0, 0.3).inflation(1 / FPS) == pytest.approx(long, rel=0.01)
+
+    @pytest.mark.parametrize("angle_deg", [0.1, 0.5])
+    def test_turned_cameras_are_found(self, angle_deg):
+        found = []
+        for seed in range(2):
+            rng = np.random.default_rng(seed)
+            rig = ring_rig(6, image_size_wh=(1920, 1080))
+            position_m, velocity_m_s = flights(rng, 100, 2)
+            error_px = rng.normal(size=(100, 2, 6, 2))
+            views, _ = fitted_views(rig, turned(rig, angle_deg, rng), position_m, velocity_m_s, error_px)
+            found.append(learn_camera_errors(views, FPS, USUAL))
+        # The angle is spread over three axes.
+        angles = [np.degrees(each.turn_rad) * np.sqrt(3) for each in found]
+        assert np.mean(angles) == pytest.approx(angle_deg, rel=0.25)
+        assert max(each.clock_s for each in found) < 0.004
+        np.testing.assert_allclose([each.noise_px.mean() for each in found], 1.0, rtol=0.1)
+
+    def test_late_clocks_are_found(self):
+        rng = np.random.default_rng(5)
+        rig, late_s = ring_rig(6, image_size_wh=(1920, 1080)), np.array([0, 0.02, -0.01, 0.03, 0.0, -0.02])
+        position_m, velocity_m_s = flights(rng, 150, 2)
+        exact, _ = fitted_views(rig, rig, position_m, velocity_m_s, np.zeros((150, 2, 6, 2)))
+        error_px = -exact.flow_px_s * late_s[:, None] + 0.5 * rng.normal(size=(150, 2, 6, 2))
+        views, _ = fitted_views(rig, rig, position_m, velocity_m_s, error_px)
+        rows = FittedPlaces(
+            views.residual_px.reshape(-1, 6, 2), views.jacobian.reshape(-1, 6, 2, 3), np.ones((300, 6), bool)
+        )
+        constant = fit_constant_errors(
+            rows, views.turn_px.reshape(-1, 6, 2, 3), views.flow_px_s.reshape(-1, 6, 2), np.full(6, 0.5), 1.0
+        )
+        apart_s = constant.clock_s - late_s
+        np.testing.assert_allclose(apart_s - apart_s.mean(), 0.0, atol=0.002)
+        assert constant.clock_std_s == pytest.approx(late_s.std(), rel=0.3)
+        assert np.degrees(constant.turn_std_rad) < 0.02
+
+    def test_a_sound_rig_has_no_lasting_errors(self):
+        rng = np.random.default_rng(6)
+        rig = ring_rig(5, image_size_wh=(1920, 1080))
+        position_m, velocity_m_s = flights(rng, 200, 2)
+        error_px = correlated(rng, (200, 2, 5, 2), 0.5, 8)
+        errors = learn_camera_errors(
+            fitted_views(rig, rig, position_m, velocity_m_s, error_px)[0], FPS, USUAL
+        )
+        np.testing.assert_allclose(errors.noise_px, 1.0, rtol=0.2)
+        assert errors.lasting_px.max() < 0.5
+        assert np.degrees(errors.turn_rad) < 0.03
+        assert errors.clock_s < 0.004
+
+    def test_without_views_nothing_is_learned(self):
+        rig = ring_rig(3)
+        position_m = np.full((5, 1, 3), np.nan)
+        views = views_of_places(
+            rig.cameras, np.full((5, 1, 3, 2), np.nan), np.ones((5, 1, 3, 2)), position_m, position_m
+        )
+        errors = learn_camera_errors(views, FPS, USUAL)
+        assert np.isnan(errors.noise_px).all()
+        assert (errors.lasting_px.max(), errors.turn_rad, errors.clock_s) == (0.0, 0.0, 0.0)
+
+
+class TestCovariances:
+    def test_widening_is_the_ratio_of_f_and_chi_square(self):
+        for freedom in (2, 5, 21):
+            expected = 3 * f_distribution.ppf(0.9, 3, freedom) / INSIDE_90
+            assert widening(freedom) == pytest.approx(expected)
+        assert widening(100_000) == pytest.approx(1, abs=1e-3)
+        assert widening(0) == widening(2)
+
+    def test_turned_cameras_spread_positions_as_stated(self):
+        rng = np.random.default_rng(7)
+        rig = ring_rig(4, image_size_wh=(1920, 1080))
+        position_m, velocity_m_s = flights(rng, 2, 1)
+        no_error = np.zeros((2, 1, 4, 2))
+        moved_m = np.array(
+            [
+                fitted_views(rig, turned(rig, 0.2, rng), position_m, velocity_m_s, no_error)[1]
+                for _ in range(300)
+            ]
+        )
+        views, _ = fitted_views(rig, rig, position_m, velocity_m_s, no_error)
+        none = CameraErrors(np.ones(4), USUAL, np.zeros(4), 0.0, 0.0)
+        lasting = lasting_covariances(views, none, velocity_m_s, rig_error_deg=0.2)
+        for frame in range(2):
+            found = np.cov(moved_m[:, frame, 0].T)
+            np.testing.assert_allclose(lasting.absolute_m2[frame, 0], found, atol=0.3 * np.abs(found).max())
+        # Two frames that are near to each other err alike: hardly anything remains without the mean.
+        assert np.trace(lasting.relative_m2[0, 0]) < 0.05 * np.trace(lasting.absolute_m2[0, 0])
+
+    def test_given_errors_count_where_the_cameras_show_less(self):
+        rng = np.random.default_rng(8)
+        rig = ring_rig(2)
+        position_m, velocity_m_s = flights(rng, 3, 2)
+        views, _ = fitted_views(rig, rig, position_m, velocity_m_s, np.zeros((3, 2, 2, 2)))
+        none = CameraErrors(np.full(2, np.nan), USUAL, np.zeros(2), 0.0, 0.0)
+        some = CameraErrors(np.ones(2), USUAL, np.full(2, 3.0), 0.0, 0.0)
+        nothing = lasting_covariances(views, none, velocity_m_s).absolute_m2
+        assert (nothing == 0).all()
+        given = lasting_covariances(views, none, velocity_m_s, pixel_error_px=2.0).absolute_m2
+        expected = 4.0 * np.einsum("fdcik,fdcjk->fdij", views.gain, views.gain)
+        np.testing.assert_allclose(given, expected)
+        learned = lasting_covariances(views, some, velocity_m_s).absolute_m2
+        both = lasting_covariances(views, some, velocity_m_s, pixel_error_px=2.0).absolute_m2
+        np.testing.assert_allclose(learned, both)
+        assert (
+            np.linalg.eigvalsh(lasting_covariances(views, some, velocity_m_s, rig_error_deg=1.0).relative_m2)
+            > -1e-12
+        ).all()
+
+    def test_a_drone_keeps_its_lasting_covariance_while_it_is_not_seen(self):
+        rng = np.random.default_rng(9)
+        rig = ring_rig(3)
+        position_m, velocity_m_s = flights(rng, 6, 1)
+        position_m[[0, 3, 4]] = np.nan
+        views = views_of_places(
+            rig.cameras, np.full((6, 1, 3, 2), np.nan), np.ones((6, 1, 3, 2)), position_m, velocity_m_s
+        )
+        none = CameraErrors(np.ones(3), USUAL, np.zeros(3), 0.0, 0.0)
+        found = lasting_covariances(views, none, velocity_m_s, pixel_error_px=1.0).absolute_m2[:, 0]
+        np.testing.assert_array_equal(found[[0, 3, 4]], found[[1, 2, 2]])
+        assert (np.linalg.eigvalsh(found)[:, 0] > 0).all()
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize(
+        ("angle_deg", "late_s", "noise_px", "frames"),
+        [
+            (0.0, 0.0, 1.0, 1),
+            (0.1, 0.0, 1.0, 1),
+            (0.3, 0.0, 1.0, 1),
+            (0.0, 0.02, 1.0, 1),
+            (0.0, 0.0, 3.0, 18),
+        ],
+    )
+    @pytest.mark.parametrize("num_cameras", [3, 8])
+    def test_positions_lie_in_their_ellipsoids(self, num_cameras, angle_deg, late_s, noise_px, frames):
+        # Errors that last are the same in all frames of a rig, so that many rigs are needed.
+        rates = []
+        for seed in range(24):
+            rng = np.random.default_rng(seed)
+            rig = ring_rig(num_cameras, image_size_wh=(1920, 1080))
+            position_m, velocity_m_s = flights(rng, 75, 2)
+            exact, _ = fitted_views(rig, rig, position_m, velocity_m_s, np.zeros((75, 2, num_cameras, 2)))
+            error_px = noise_px * correlated(rng, (75, 2, num_cameras, 2), 0.7 if frames > 1 else 0.0, frames)
+            error_px -= exact.flow_px_s * rng.uniform(-late_s, late_s, num_cameras)[:, None]
+            stated = turned(rig, angle_deg, rng)
+            views, moved_m = fitted_views(rig, stated, position_m, velocity_m_s, error_px)
+            errors = learn_camera_errors(views, FPS, USUAL)
+            lasting = lasting_covariances(views, errors, velocity_m_s)
+            rates.append(inside_rate(moved_m, noise_covariance(views, errors) + lasting.absolute_m2))
+        assert 0.8 < np.mean(rates) < 0.985
+
+
+class TestFilteredVariance:
+    def test_a_filter_that_assumes_right_errors_states_the_right_variance(self):
+        errors = MeasurementErrors(1e-4, 0.6, 0.4)
+        stated, real = filtered_variances(errors, errors, dt_s=0.04, jerk_density_m2_s5=1.0)
+        assert real == pytest.approx(stated, rel=1e-3)
+        assert 0 < stated < 1e-4
+
+    def test_errors_that_last_longer_than_assumed_make_the_variance_larger(self):
+        assumed = MeasurementErrors(1e-4, 0.3, 0.1)
+        variances = [
+            filtered_variances(
+                assumed, MeasurementErrors(1e-4, share, time_s), dt_s=0.04, jerk_density_m2_s5=1.0
+            )[1]
+            for share, time_s in ((0.0, 0.1), (0.7, 0.1), (0.95, 0.3))
+        ]
+        assert variances == sorted(variances)
+
+    @pytest.mark.slow
+    def test_the_variance_is_that_of_filtered_flights(self):
+        rng = np.random.default_rng(10)
+        frames, drones, dt_s = 300, 200, 0.04
+        assumed, found = MeasurementErrors(4e-4, 0.7, 0.4), MeasurementErrors(1e-4, 0.8, 1.0)
+        stated, real = filtered_variances(assumed, found, dt_s=dt_s, jerk_density_m2_s5=1.0)
+        jerk = rng.normal(size=(frames, drones, 3)) / np.sqrt(dt_s)
+        position_m = np.cumsum(np.cumsum(np.cumsum(jerk, axis=0), axis=0), axis=0) * dt_s**3
+        error_m = 0.01 * correlated(rng, (frames, drones, 3), 0.8, 1.0 / dt_s)
+        params = MotionParams(
+            np.full(drones, 1.0), np.array(1.0), np.array(3.0), np.array(0.7), np.array(0.4)
+        )
+        filtered = filter_measurements(
+            dt_s * np.arange(frames),
+            position_m + error_m,
+            np.tile(4e-4 * np.eye(3), (frames, drones, 1, 1)),
+            np.ones((frames, drones), bool),
+            params,
+        )
+        assert filtered.covariance_m2[-1, 0, 0, 0] == pytest.approx(stated, rel=0.01)
+        late = slice(150, None)
+        assert np.square(filtered.position_m - position_m)[late].mean() == pytest.approx(real, rel=0.15)
+
+    def test_ratios_compare_found_and_stated_noise(self):
+        measured = np.tile(np.eye(3) * 4e-4, (20, 2, 1, 1))
+        noise = np.tile(np.eye(3) * 1e-4, (20, 2, 1, 1))
+        noise[:, 1] = np.nan
+        errors = CameraErrors(np.ones(4), Fading(0.3, 0.7, 0.0, 0.4), np.zeros(4), 0.0, 0.0)
+        ratio, filtered = noise_ratios(
+            measured, noise, errors, MeasurementErrors(1.0, 0.7, 0.4), dt_s=0.04, jerk_density_m2_s5=1.0
+        )
+        np.testing.assert_allclose(ratio, [0.25, 1.0])
+        assert 0.2 < filtered[0] < 0.6
+        assert filtered[1] == 1.0
+
+
+class TestSettings:
+    @pytest.mark.parametrize("name", ["rig_deg", "pixel_px"])
+    @pytest.mark.parametrize("value", [-0.1, float("nan"), float("inf")])
+    def test_impossible_errors_are_refused(self, name, value):
+        with pytest.raises(SettingsError, match=f"errors.{name}"):
+            ErrorSettings(**{name: value})
+
+    def test_settings_by_name(self):
+        changed = TrackSettings().changed({"errors.rig_deg": 0.2})
+        assert changed.errors == ErrorSettings(rig_deg=0.2)
+
+
+class TestFiles:
+    def flight(self):
+        covariance_m2 = np.tile(np.diag([4e-4, 1e-4, 9e-4]), (3, 2, 1, 1))
+        return Trajectories(
+            frame=np.arange(3),
+            time_s=np.arange(3) / FPS,
+            drones=("0", "1"),
+            position_m=np.zeros((3, 2, 3)) + np.array([[0.0, 0, 0], [1, 1, 1]]),
+            covariance_m2=covariance_m2,
+            relative_covariance_m2=covariance_m2 / 4,
+        )
+
+    def test_relative_covariances_are_written_and_read(self, tmp_path):
+        written = self.flight()
+        write_trajectories(tmp_path / "tracks.csv", written)
+        read = read_trajectories(tmp_path / "tracks.csv")
+        assert read.relative_covariance_m2 is not None
+        np.testing.assert_array_equal(read.relative_covariance_m2, written.relative_covariance_m2)
+        np.testing.assert_array_equal(read.covariance_m2, written.covariance_m2)
+
+    def test_errors_without_offset_are_compared_with_relative_covariances(self):
+        estimate = self.flight()
+        # An offset of 2 sigma, and changes of 1.5 relative sigma to either side of it.
+        change_m = 0.0225 * np.array([1.0, 0.0, -1.0])[:, None, None] * np.array([0.0, 0.0, 1.0])
+        moved = replace(estimate, position_m=estimate.position_m + np.array([0.0, 0.02, 0.0]) + change_m)
+        figures = evaluate(moved, estimate)
+        expected = np.mean([2.0**2 + 0.75**2, 2.0**2, 2.0**2 + 0.75**2])
+        assert figures.mean_nees == pytest.approx(expected)
+        assert figures.offset_removed_mean_nees == pytest.approx(np.mean([1.5**2, 0, 1.5**2]))
+        alone = replace(moved, relative_covariance_m2=None)
+        assert evaluate(alone, estimate).offset_removed_mean_nees == pytest.approx(
+            np.mean([0.75**2, 0, 0.75**2])
+        )
+
+
+@pytest.mark.parametrize("option", ["--rig-error", "--pixel-error"])
+def test_impossible_errors_are_one_line(tmp_path, option, monkeypatch, capsys):
+    words = ["track", str(tmp_path), "--out", str(tmp_path / "tracks.csv"), option, "-1"]
+    monkeypatch.setattr("sys.argv", ["psotrack", *words])
+    with pytest.raises(SystemExit) as stopped:
+        cli.main()
+    assert stopped.value.code == 2
+    said = capsys.readouterr().err
+    assert "expected a number, 0 or more" in said
+    assert len(said.strip().splitlines()) == 1

@@ -1,0 +1,378 @@
+"""Cameras with clocks of their own: detections and clocks, on flights that are formulas, so that the truth is exact."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from helpers import ROOM_M, ring_rig, track_settings
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from psotrack.clocks import clocks_of_tracks, fit_clocks, places_of_tracks
+from psotrack.correspondence import NOISE_PX, CameraSightings, Sightings
+from psotrack.errors import SettingsError
+from psotrack.geometry import make_extents, project, project_boxes, triangulate_paths, viewpoints
+from psotrack.initiation.initialisation import find_drones_in_blobs
+from psotrack.initiation.residual_foreground import SearchVolume, project_drones, subtract_drones
+from psotrack.projection_lines import LineSettings, track_detections
+from psotrack.projection_lines.exposures import moved_to_instant
+from psotrack.recordings import FrameTimes, Recording, VideoInfo, make_timeline
+from psotrack.settings import TrackSettings
+from psotrack.silhouettes import Exposures, Silhouettes, ViewBlobs
+from psotrack.trajectories import Status, Trajectories
+
+FPS = 25.0
+RIG = ring_rig(5, image_size_wh=(1920, 1080))
+#: Width and height of a drone, metres.
+SPAN_M = 0.4
+SETTINGS = track_settings()
+LINES = LineSettings(SETTINGS.motion, SETTINGS.drones, SETTINGS.status, SETTINGS.swarm.spread_m)
+
+
+def positions(time_s, num_drones=2):
+    """(..., drones, 3) positions of drones on circles of their own, 1 m/s and faster."""
+    time_s = np.asarray(time_s)[..., None]
+    turn = np.array([1.1, -0.9, 0.7])[:num_drones] * time_s + np.arange(num_drones)
+    rising = 0.3 * np.sin(0.8 * time_s + np.arange(num_drones))
+    across = np.array([-1.3, 1.3, 0.0])[:num_drones]
+    return np.stack([across + np.cos(turn), np.sin(turn), 1.3 + rising], axis=-1)
+
+
+def sightings_of(frame_times, *, noise_px=0.3, seed=0, rig=RIG):
+    """Boxes of the drones in every frame of each camera, at the frames' own times."""
+    rng = np.random.default_rng(seed)
+    most = max(times.num_frames for times in frame_times.values())
+    shape = (most, len(rig), 2)
+    centre_px, size_px, noise = (
+        np.full((*shape, 2), np.nan),
+        np.full((*shape, 2), np.nan),
+        np.full(shape, np.nan),
+    )
+    for camera, times in enumerate(frame_times.values()):
+        pixels, depth = project(rig.cameras[np.array([camera])], positions(times.time_s)[:, :, None])
+        rows = slice(times.num_frames)
+        centre_px[rows, camera] = pixels[:, :, 0] + rng.normal(0, noise_px, pixels[:, :, 0].shape)
+        size_px[rows, camera] = (SPAN_M * rig.cameras.K[camera, 0, 0] / depth)[..., 0, None]
+        noise[rows, camera] = NOISE_PX
+    return Sightings(centre_px, size_px, noise)
+
+
+def alike(num_frames=150, cameras=RIG.names):
+    return {name: FrameTimes(num_frames, FPS) for name in cameras}
+
+
+def late(frames, num_frames=150):
+    """Times of cameras whose frame k was exposed at k + frames[camera]."""
+    return {
+        name: FrameTimes(num_frames, FPS, number / FPS)
+        for name, number in zip(RIG.names, frames, strict=True)
+    }
+
+
+def tracked(timeline, error_s=0.0):
+    """True tracks at the instants, shifted in time."""
+    time_s, step_s = timeline.time_s + error_s, 1e-4
+    velocity = (positions(time_s + step_s) - positions(time_s - step_s)) / (2 * step_s)
+    return Trajectories(
+        np.arange(len(time_s)),
+        timeline.time_s,
+        ("0", "1"),
+        positions(time_s),
+        velocity_m_s=velocity,
+        status=np.full((len(time_s), 2), int(Status.TRACKED)),
+    )
+
+
+@given(
+    st.integers(2, 6),
+    st.integers(3, 8),
+    st.integers(0, 1000),
+)
+@settings(max_examples=30, deadline=None)
+def test_exact_offsets_of_stretches_give_the_exact_clocks(num_cameras, num_stretches, seed):
+    """The zero of the offsets differs from stretch to stretch."""
+    rng = np.random.default_rng(seed)
+    time_s = np.cumsum(rng.uniform(2, 10, num_stretches))
+    offset_s, drift = rng.normal(0, 0.05, num_cameras), rng.normal(0, 1e-3, num_cameras)
+    shown = offset_s + drift * (time_s - time_s.mean())[:, None] + rng.normal(0, 1, num_stretches)[:, None]
+    found = fit_clocks(time_s, shown, np.full(shown.shape, 1e-7), known_s=0.01)
+    np.testing.assert_allclose(found.offset_s, offset_s - np.median(offset_s), atol=1e-9)
+    np.testing.assert_allclose(found.drift, drift - np.median(drift), atol=1e-9)
+
+
+def test_a_drift_that_is_not_certain_is_0():
+    rng = np.random.default_rng(3)
+    shown = rng.normal(0, 1e-3, (6, 4))
+    found = fit_clocks(np.arange(6) * 5.0, shown, np.full((6, 4), 1e-3), known_s=0.01)
+    assert not found.drift.any()
+    assert (found.offset_std_s < 1e-3).all()
+    assert not found.is_certain(0.001).any()
+
+
+def test_a_camera_whose_offset_is_not_known_keeps_its_times():
+    shown, std_s = np.tile([0.01, 0.0, -0.01, 0.15], (4, 1)), np.tile([1e-3, 1e-3, 1e-3, 0.2], (4, 1))
+    found = fit_clocks(np.arange(4) * 5.0, shown, std_s, known_s=0.01)
+    assert found.offset_s[3] == 0
+    np.testing.assert_allclose(found.offset_s[:3], [0.01, 0, -0.01], atol=1e-9)
+
+
+@pytest.mark.parametrize("largest", [0.8, 2.0])
+def test_clocks_that_are_off_by_up_to_two_frames_are_found(largest):
+    frames = largest * np.array([0.0, 1.0, -0.9, 0.35, -0.4])
+    timeline = make_timeline(alike())
+    found = clocks_of_tracks(RIG, sightings_of(late(frames)), timeline, tracked(timeline, 0.3 / FPS))
+    error_s = found.offset_s - (frames - np.median(frames)) / FPS
+    error_s -= error_s.mean()
+    assert (np.abs(error_s) < 1e-3).all()
+    assert (np.abs(error_s) < 4 * found.offset_std_s).all()
+    assert (found.offset_std_s < 1e-3).all()
+    assert not found.drift.any()
+    assert found.is_certain(0.2 / FPS).sum() >= 3
+
+
+def test_a_camera_that_sees_nothing_changes_nothing_for_the_others():
+    frames = np.array([0.0, 1.0, -0.9, 0.35, -0.4])
+    shown = late(frames) | {RIG.names[1]: FrameTimes(0, FPS)}
+    timeline = make_timeline(alike())
+    found = clocks_of_tracks(RIG, sightings_of(shown), timeline, tracked(timeline))
+    others = [0, 2, 3, 4]
+    error_s = (found.offset_s - frames / FPS)[others]
+    assert (np.abs(error_s - error_s.mean()) < 1e-3).all()
+    assert (found.offset_std_s[others] < 1e-3).all()
+    assert (found.offset_s[1], found.offset_std_s[1]) == (0.0, np.inf)
+    assert found.record(RIG.names)[RIG.names[1]]["offset_std_s"] is None
+
+
+def test_without_sightings_no_clock_is_known():
+    timeline = make_timeline(alike())
+    shown = sightings_of(alike())
+    found = clocks_of_tracks(
+        RIG, replace(shown, noise_px=np.full_like(shown.noise_px, np.nan)), timeline, tracked(timeline)
+    )
+    assert not found.offset_s.any()
+    assert np.isinf(found.offset_std_s).all()
+    assert not found.is_certain(0.0).any()
+
+
+def test_right_clocks_are_left_alone():
+    timeline = make_timeline(alike())
+    found = clocks_of_tracks(RIG, sightings_of(alike()), timeline, tracked(timeline))
+    assert (np.abs(found.offset_s) < 1e-3).all()
+    assert not found.is_certain(0.2 / FPS).any()
+
+
+def test_a_clock_that_runs_fast_is_found():
+    """One camera has 25.1 frames per second, but 25 are given."""
+    shown = alike(250) | {RIG.names[2]: FrameTimes(250, 25.1)}
+    timeline = make_timeline(alike(250))
+    found = clocks_of_tracks(RIG, sightings_of(shown), timeline, tracked(timeline))
+    assert found.drift[2] == pytest.approx(25 / 25.1 - 1, abs=3e-4)
+    corrected = found.corrected(alike(250), RIG.names)[RIG.names[2]]
+    np.testing.assert_allclose(corrected.time_s, shown[RIG.names[2]].time_s, atol=2e-3)
+
+
+def test_places_are_interpolated_to_the_instants_and_absent_outside_of_the_camera():
+    times = alike(60) | {RIG.names[1]: FrameTimes(20, 12.5, 0.313)}
+    timeline = make_timeline(times)
+    shown = sightings_of(times, noise_px=0.0).at_instants(timeline)
+    truth = tracked(timeline)
+    places = places_of_tracks(RIG.cameras, shown, timeline, truth.position_m, truth.velocity_m_s)
+    expected, _ = project(RIG.cameras, truth.position_m[:, :, None])
+    inside = (timeline.time_s > 0.313) & (timeline.time_s < times[RIG.names[1]].time_s[-1])
+    assert np.isnan(places[~inside, :, 1]).all()
+    assert np.isfinite(places[inside]).all()
+    # Straight lines between frames that are 80 ms apart: a v²/r t²/8 of 1 mm.
+    np.testing.assert_allclose(places[inside], expected[inside], atol=0.7)
+
+
+def lines_errors(times, given=None, **options):
+    """Errors of projection lines at the instants, metres, and whether each truth is inside of the 90 % ellipsoid."""
+    timeline = make_timeline(given or times)
+    shown = sightings_of(times, **options).at_instants(timeline)
+    known = positions(timeline.time_s[0]), np.zeros((2, 3))
+    tracks = track_detections(RIG.cameras, shown, LINES, fps=timeline.rate_hz, bounds_m=ROOM_M, known=known)
+    settled = slice(20, timeline.num_instants - 5)
+    error_m = (tracks.position_m[:, :2] - positions(timeline.time_s))[settled]
+    covariance_m2 = tracks.covariance_m2[:, :2][settled]
+    nees = np.einsum("fdi,fdij,fdj->fd", error_m, np.linalg.inv(covariance_m2), error_m)
+    return np.linalg.norm(error_m, axis=-1), nees < 6.25
+
+
+@pytest.mark.slow
+def test_detections_of_cameras_that_are_exposed_at_different_times():
+    """Frames half an interval apart give positions nearly as good as synchronous frames."""
+    shown = late([0.0, 0.5, -0.5, 0.25, -0.3], 80)
+    synchronous_m, _ = lines_errors(alike(80))
+    error_m, inside = lines_errors(shown)
+    ignored_m, _ = lines_errors(shown, alike(80))
+    assert error_m.mean() < 1.3 * synchronous_m.mean()
+    assert ignored_m.mean() > 2 * error_m.mean()
+    assert inside.mean() > 0.8
+
+
+@pytest.mark.slow
+def test_a_slower_camera_is_used_at_all_instants_and_counts_once():
+    times = alike() | {RIG.names[2]: FrameTimes(60, 10.0, 0.013)}
+    error_m, inside = lines_errors(times)
+    synchronous_m, _ = lines_errors(alike())
+    assert error_m.mean() < 1.5 * synchronous_m.mean()
+    assert inside.mean() > 0.8
+
+
+def test_a_path_from_cameras_with_times_of_their_own():
+    rng = np.random.default_rng(1)
+    time_s = np.arange(8)[:, None] / FPS + rng.uniform(-0.05, 0.05, (8, 5))
+    path = np.array([[0.3, -0.2, 1.1], [1.5, -0.7, 0.4], [0.6, 0.9, -0.5]])
+    at_m = np.einsum("fck,ki->fci", time_s[..., None] ** np.arange(3), path)
+    pixels = np.stack(
+        [project(RIG.cameras[np.array([camera])], at_m[:, camera, None])[0][:, 0] for camera in range(5)],
+        axis=1,
+    )
+    pixels[2, 3] = np.nan
+    found = triangulate_paths(RIG.cameras, pixels, time_s, np.ones((8, 5)), noise_m=1e-9)
+    np.testing.assert_allclose(found, path, atol=1e-6)
+    same = triangulate_paths(RIG.cameras, pixels, np.broadcast_to(time_s[:, :1], time_s.shape))
+    np.testing.assert_allclose(same, triangulate_paths(RIG.cameras, pixels, time_s[:, 0]), atol=1e-9)
+
+
+def test_drones_are_found_in_blobs_of_cameras_with_times_of_their_own():
+    times = late([0.0, 0.5, -0.4, 0.3, -1.2], 10)
+    timeline = make_timeline(times).part(slice(9))
+    shown = sightings_of(times, noise_px=0.0).at_instants(timeline)
+    seen = ViewBlobs(shown.centre_px, shown.size_px / 2, np.isfinite(shown.noise_px), 3.0)
+
+    def errors(blobs):
+        state = find_drones_in_blobs(RIG.cameras, blobs, fps=FPS, bounds_m=ROOM_M, max_speed_m_s=6.0)
+        apart = np.linalg.norm(state.position_m[:, None] - positions(0.0), axis=-1)
+        return apart.min(axis=0)
+
+    exact = errors(replace(seen, exposures=shown.exposures))
+    # A piece of a circle is no parabola: measured 1.2 cm.
+    assert (exact < 0.02).all()
+    assert exact.max() < errors(seen).max() / 1.3
+
+
+def test_foreground_of_a_known_drone_is_hidden_where_the_camera_sees_the_drone():
+    volume = SearchVolume(RIG.cameras, viewpoints(RIG.cameras), ROOM_M, 4)
+    position_m, size_m = np.array([[[0.2, 0.1, 1.2]]]), np.array([[0.4, 0.4, 0.2]])
+    moved_m = np.zeros((1, 1, 5, 3))
+    moved_m[0, 0, 2] = [0.5, 0.0, 0.1]
+    there = np.array([[True, False, True, True, True]])
+    drones = replace(project_drones(volume, position_m, size_m, moved_m), is_there=there)
+    visible = subtract_drones(np.zeros((5, 270, 480), np.uint8), drones, 0).visible
+    assert not visible[1].any()
+    for camera in (0, 2, 3, 4):
+        pixel, _ = project(RIG.cameras, (position_m + moved_m[:, :, camera])[0, :, None])
+        column, row = np.floor((pixel[0, camera] + 0.5) / 4).astype(int)
+        assert not visible[camera, row, column]
+    pixel, _ = project(RIG.cameras, position_m[0, :, None])
+    column, row = np.floor((pixel[0, 2] + 0.5) / 4).astype(int)
+    assert visible[2, row, column]
+
+
+OFFSET_S = np.array([0.0, 0.02, -0.015, 0.01, 0.0])
+LINE_TIME_S = np.array([0.0, 2e-5, 0.0, 1e-5, 3e-5])
+NOW = Exposures(OFFSET_S, np.ones(5, bool), np.ones(5), LINE_TIME_S)
+
+
+def pixels_at_exposure(position_m, velocity_m_s, steps=20):
+    """(drones, cameras, 2) pixels of moving drones in rows that are exposed one after the other, by iteration."""
+    pixels, _ = project(RIG.cameras, position_m[:, None])
+    for _ in range(steps):
+        own_s = OFFSET_S + LINE_TIME_S * (pixels[..., 1] - 540)
+        pixels, _ = project(RIG.cameras, position_m[:, None] + velocity_m_s[:, None] * own_s[..., None])
+    return pixels
+
+
+def test_boxes_are_where_the_drones_are_when_the_cameras_rows_are_exposed():
+    rng = np.random.default_rng(4)
+    position_m = rng.uniform(-1, 1, (3, 3)) + np.array([0, 0, 1.5])
+    velocity_m_s = rng.normal(0, 1.5, (3, 3))
+    exposures = replace(NOW, is_there=np.array([True, True, True, False, True]))
+    with jax.enable_x64(True):
+        extents = make_extents(exposures.seeing(RIG.cameras), np.full((3, 3), 0.02))
+        boxes = project_boxes(exposures.moved(extents, position_m, velocity_m_s), position_m)
+    seen = [0, 1, 2, 4]
+    shown = np.stack([boxes.x_middle, boxes.y_middle], axis=-1) - 0.5
+    # The row is that of the expected position, which differs little from that of the moved one.
+    one_step = pixels_at_exposure(position_m, velocity_m_s, steps=1)
+    np.testing.assert_allclose(shown[:, seen], one_step[:, seen], atol=0.05)
+    np.testing.assert_allclose(
+        shown[:, seen], pixels_at_exposure(position_m, velocity_m_s)[:, seen], atol=1.0
+    )
+    assert not np.asarray(boxes.in_front)[:, 3].any()
+    assert np.isfinite(shown).all()
+
+
+def test_detections_are_moved_to_the_instant():
+    position_m, velocity_m_s = positions(0.4), np.array([[1.2, -0.5, 0.3], [-0.7, 1.5, 0.0]])
+    pixels = pixels_at_exposure(position_m, velocity_m_s).swapaxes(0, 1)
+    view = CameraSightings(pixels, np.full(pixels.shape, 120.0), np.ones(pixels.shape[:2]), NOW)
+    moved = moved_to_instant(RIG.cameras, view, position_m, velocity_m_s, np.full(2, 0.1), 1.0)
+    expected, _ = project(RIG.cameras, position_m[:, None])
+    np.testing.assert_allclose(moved.centre_px, expected.swapaxes(0, 1), atol=0.05)
+    assert (moved.noise_px[0] == 1.0).all()
+    assert (moved.noise_px[1] > 1.0).all()
+    far = replace(view, centre_px=view.centre_px + 500.0)
+    stays = moved_to_instant(RIG.cameras, far, position_m, velocity_m_s, np.full(2, 0.1), 1.0)
+    assert (stays.centre_px == far.centre_px).all()
+    assert (stays.noise_px[1] > moved.noise_px[1]).all()
+
+
+def test_a_rolling_shutter_has_the_time_of_its_middle_row():
+    videos = {name: VideoInfo(Path(f"{name}.avi"), 20, FPS, (1920, 1080)) for name in RIG.names}
+    recording = Recording("r", Path("r"), RIG, videos)
+    assert recording.timeline().is_synchronous
+    rolling = replace(recording, line_time_s={RIG.names[1]: 2e-5}).timeline()
+    assert not rolling.is_synchronous
+    assert rolling.line_time_s.tolist() == [0, 2e-5, 0, 0, 0]
+    np.testing.assert_allclose(rolling.offset_s[:20], np.tile([0, 0.0108, 0, 0, 0], (20, 1)), atol=1e-9)
+    assert recording.timeline(50.0).rate_hz == 50.0
+    assert replace(recording, rate_hz=12.5).num_frames == 10
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"rate_hz": -5.0}, "rate_hz: expected a number above 0, found -5"),
+        ({"rate_hz": 0.0}, "rate_hz: expected a number above 0, found 0"),
+        ({"clocks": "guessed"}, "clocks: expected one of given, auto, found guessed"),
+    ],
+)
+def test_wrong_settings_are_refused(wrong, message):
+    with pytest.raises(SettingsError, match=message):
+        TrackSettings().changed(wrong)
+
+
+def test_silhouettes_at_instants_show_the_frames_of_the_timeline():
+    times = {"a": FrameTimes(4, 10.0), "b": FrameTimes(2, 5.0, 0.12)}
+    arrays = tuple(
+        np.arange(1, each.num_frames + 1, dtype=np.uint8)[:, None, None] * np.ones((1, 2, 3), np.uint8)
+        for each in times.values()
+    )
+    frames = Silhouettes(("a", "b"), {"a": "", "b": ""}, 4, 4, (2, 3), {}, arrays)
+    timeline = make_timeline(times)
+    shown = frames.at_instants(timeline)
+    assert shown.read(0, 4)[:, 0, 0, 0].tolist() == [1, 2, 3, 4]
+    assert shown.read(0, 4)[:, 1, 0, 0].tolist() == (timeline.frame[:4, 1] + 1).tolist()
+    assert shown.part(1, 3).read(0, 2).tolist() == shown.read(1, 3).tolist()
+    assert frames.at_instants(make_timeline({"a": times["a"], "b": times["a"]})) is frames
+
+
+def test_sightings_of_synchronous_cameras_stay_as_they_are():
+    shown = sightings_of(alike(10))
+    assert shown.at_instants(make_timeline(alike(10))) is shown
+
+
+def test_a_camera_that_is_not_there_has_no_sightings():
+    times = alike(10) | {RIG.names[3]: FrameTimes(4, FPS, 0.08)}
+    timeline = make_timeline(times)
+    shown = sightings_of(times).at_instants(timeline)
+    there = np.isfinite(shown.noise_px[:, 3]).all(axis=-1)
+    assert there.tolist() == [False] * 2 + [True] * 4 + [False] * 4
+    assert shown.exposures.is_there[:, 3].tolist() == there.tolist()
+    one = shown.at(3)
+    assert one.exposures.offset_s.shape == (5,)
+    assert replace(one, exposures=None).noise_px.shape == one.noise_px.shape

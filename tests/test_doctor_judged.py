@@ -1,0 +1,278 @@
+"""The doctor and `calibrate adjust` on rigs and boxes by formula: sound rigs are left alone, faults are named."""
+
+import runpy
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import ring_rig
+from scipy.stats import multivariate_normal
+
+from psotrack.calibration import find_drones_in_boxes
+from psotrack.correspondence import from_detections
+from psotrack.doctor import evidence, examine, improve_with_check
+from psotrack.doctor.common_points import CommonPoints
+from psotrack.doctor.hypotheses import PER_CAMERA, Corrected, Hypothesis, linearise, list_hypotheses
+from psotrack.geometry import Rig, project
+from psotrack.trajectories import Trajectories
+
+FOLDER = Path(__file__).parents[1] / "experiments" / "calibration"
+sys.path.append(str(FOLDER))
+import _boxes  # noqa: E402
+
+JUDGE = runpy.run_path(str(FOLDER / "doctor.py"))
+Scene, make_case, judge = _boxes.Scene, JUDGE["make_case"], JUDGE["judge"]
+
+
+def examine_case(number, fault=""):
+    case = make_case(number, fault)
+    sightings = from_detections(case.seen, case.rig, case.frames)
+    return case, examine(case.rig, sightings, fps=_boxes.FPS)
+
+
+# Few frames of three small drones indoors; one small drone; one large lopsided body with three cameras.
+@pytest.mark.parametrize("number", [4, 8, 6])
+def test_a_sound_rig_is_left_alone(number):
+    assert examine_case(number)[1].findings == ()
+
+
+@pytest.mark.parametrize(("number", "fault"), [(5, "turned 1"), (4, "late 0.5"), (0, "millimetres")])
+def test_a_fault_is_named(number, fault):
+    case, diagnosis = examine_case(number, fault)
+    assert judge(case, diagnosis)["first"], diagnosis.findings
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(36))
+def test_sound_rigs_are_left_alone(number):
+    assert examine_case(number)[1].findings == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", JUDGE["FAULTS"])
+def test_faults_of_small_bodies_are_named(fault):
+    """Of faults that move small bodies by 3 px, most name the right camera, and at most one names a wrong kind."""
+    rows = []
+    for number in range(12):
+        case = make_case(number, fault)
+        if case.shift_px < 3 or JUDGE["SCENES"][number].lopsided:
+            continue
+        sightings = from_detections(case.seen, case.rig, case.frames)
+        rows.append(judge(case, examine(case.rig, sightings, fps=_boxes.FPS)))
+    assert sum(bool(row["wrong"]) for row in rows) <= 1, rows
+    assert sum(bool(row["camera"]) for row in rows) >= 0.65 * len(rows), rows
+
+
+def test_a_video_that_shows_the_scene_late_is_late():
+    """A body that flies along x at 2 m/s; a camera's frame i shows where the body was two frames before."""
+    rig = ring_rig(5, image_size_wh=(1920, 1080))
+    frames = np.arange(120)
+    # The body flies forth and back, so that no constant shift of a camera explains the lag.
+    phase = 2 * np.pi * frames / 50
+    body_m = np.stack(
+        [1.2 * np.sin(phase), 0.8 * np.cos(0.7 * phase), 1.2 + 0.1 * np.sin(2 * phase)], axis=-1
+    )
+    seen = {}
+    for index, name in enumerate(rig.names):
+        shown = body_m[np.maximum(frames - (2 if index == 3 else 0), 0)]
+        middle = project(rig.cameras[index], shown)[0] + 0.5
+        noise = np.random.default_rng(index).normal(0, 0.7, middle.shape)
+        xyxy = np.concatenate([middle + noise - 15, middle + noise + 15], axis=-1)
+        seen[name] = _boxes.Detections(frames, xyxy, np.ones(len(frames)))
+    diagnosis = examine(rig, from_detections(seen, rig, len(frames)), fps=25.0)
+    (finding,) = diagnosis.findings
+    assert (finding.kind, finding.cameras) == ("clock", ("c3",))
+    assert "frames late" in finding.message
+    lag = float(finding.message.split(" frames late")[0].split()[-1])
+    assert abs(lag - 2) < 0.3
+    assert f"its frame i shows what the others show in frame i - {lag:.2f}" in finding.message
+    assert f"add {-lag / 25:.2f}" in finding.remedy
+    assert abs(diagnosis.late_frames[3] - 2) < 0.3
+
+
+def small_problem():
+    """Four cameras, two pieces of paths of five points each, with noise."""
+    rng = np.random.default_rng(3)
+    rig = ring_rig(4, coefficients=5, image_size_wh=(1920, 1080))
+    point_m = rng.uniform((-1, -1, 0.5), (1, 1, 2), (10, 3))
+    velocity_m = rng.normal(0, 0.05, (10, 3))
+    centre_px = project(rig.cameras, point_m[:, None])[0] + rng.normal(0, 2.0, (10, 4, 2))
+    centre_px[3, 2] = np.nan
+    side_px = np.where(np.isfinite(centre_px[..., 0]), rng.uniform(20, 60, (10, 4)), np.nan)
+    piece = np.repeat([0, 1], 5)
+    points = CommonPoints(
+        np.arange(10),
+        piece,
+        np.arange(2),
+        point_m,
+        velocity_m,
+        centre_px,
+        side_px,
+        np.zeros((10, 4)),
+        np.ones((10, 4)),
+        np.ones(4),
+    )
+    weight = np.where(np.isfinite(side_px), rng.uniform(0.3, 1.0, side_px.shape), 0.0)
+    return rig, evidence.WeightedPoints(points, point_m, weight)
+
+
+def test_derivatives_are_those_of_finite_differences():
+    rig, data = small_problem()
+    points = data.points
+    at = Corrected(rig, np.array([0.3, 0.0, -1.0, 2.0]))
+    slopes = linearise(at, data.position_m, points.velocity_m, points.centre_px, points.offset_frames)
+    for column in range(PER_CAMERA * 4 + 1):
+        step = np.zeros(PER_CAMERA * 4 + 1)
+        step[column] = 1e-6
+        ahead, behind = (
+            linearise(
+                at.by(sign * step), data.position_m, points.velocity_m, points.centre_px, points.offset_frames
+            ).off_px
+            for sign in (1, -1)
+        )
+        np.testing.assert_allclose(
+            np.nan_to_num(behind - ahead) / 2e-6,
+            np.where(np.isfinite(ahead), slopes.by_parameter[..., column], 0.0),
+            rtol=1e-4,
+            atol=1e-3,
+        )
+
+
+def test_the_evidence_is_that_of_the_dense_normal_distribution():
+    """The same marginal likelihoods from the covariance of all pixels, with points of a wide prior distribution."""
+    rig, data = small_problem()
+    points, at = data.points, Corrected(rig, np.zeros(4))
+    std = evidence.prior_of(rig, data)
+    hypothesis = next(
+        each for each in list_hypotheses(4, range(4)) if (each.kind, each.camera) == ("turned", 1)
+    )
+    gathered = evidence.gather(rig, evidence.sum_up(at, data), std)
+    found = gathered.judge(hypothesis, gathered.as_sound).evidence
+
+    slopes = linearise(at, data.position_m, points.velocity_m, points.centre_px, points.offset_frames)
+    rows = np.argwhere(np.repeat((data.weight > 0)[..., None], 2, axis=-1))
+    e = np.array([slopes.off_px[tuple(row)] for row in rows])
+    same_point = rows[:, None, 0] == rows[None, :, 0]
+    by_point = np.array([slopes.by_point[tuple(row)] for row in rows])
+    base = np.where(same_point, 4.0 * by_point @ by_point.T, 0.0)
+    base += np.diag([1 / data.weight[p, c] for p, c, _ in rows])
+    same = (rows[:, None, 1:] == rows[None, :, 1:]).all(axis=-1)
+    piece = points.piece[rows[:, 0]]
+    side = np.array([points.side_px[p, c] for p, c, _ in rows])
+    image = (points.centre_px - rig.cameras.K[:, :2, 2]) / (rig.cameras.image_size_wh / 2)
+    over = np.array([[1.0, *image[p, c]] for p, c, _ in rows])
+    mean = np.array(
+        [np.nanmean(points.side_px[points.piece == k, c]) for k, (_, c, _) in zip(piece, rows, strict=True)]
+    )
+    theta = np.array([slopes.by_parameter[tuple(row)][list(hypothesis.columns)] for row in rows])
+    theta = np.where((rows[:, 1] == 1)[:, None], theta, 0.0)
+    logs: dict[str, list[float]] = {"sound": [], "turned": []}
+    for rare, (of_piece, of_camera, of_calibration) in zip(evidence._LOG_SIZES, evidence._SIZES, strict=True):
+        shared = np.where(piece[:, None] == piece, np.outer(side / mean, side / mean), 0.0)
+        covariance = base + np.where(same, shared * ((of_piece * mean) ** 2 + evidence._PIECE_PX**2), 0.0)
+        smooth = over @ over.T
+        covariance += np.where(same, smooth * (of_camera**2 * np.outer(side, side) + of_calibration**2), 0.0)
+        logs["sound"].append(rare + multivariate_normal.logpdf(e, cov=covariance))
+        for factor in evidence._PRIOR_FACTORS:
+            wide = theta * factor * std[list(hypothesis.columns)]
+            logs["turned"].append(rare + multivariate_normal.logpdf(e, cov=covariance + wide @ wide.T))
+    expected = np.logaddexp.reduce(logs["turned"]) - np.log(len(evidence._PRIOR_FACTORS))
+    expected -= np.logaddexp.reduce(logs["sound"])
+    assert found == pytest.approx(expected, abs=0.01)
+
+
+def flown(scene, seed):
+    """A rig, detections and tracks of a scene."""
+    rng = np.random.default_rng(seed)
+    rig, flight = _boxes.make_true_rig(scene, rng), _boxes.make_flight(scene, rng)
+    frames = np.arange(scene.frames)
+    seen = _boxes.record(rig, flight, scene, rng)
+    place_m, _ = flight.at(frames / _boxes.FPS)
+    tracks = Trajectories(
+        frames, frames / _boxes.FPS, tuple(f"dron{index + 1}" for index in range(scene.drones)), place_m
+    )
+    return rig, seen, tracks
+
+
+def adjusted(rig, seen, tracks):
+    return improve_with_check(rig, find_drones_in_boxes(rig, seen, tracks))
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [Scene(cameras=4, drones=2, size=0.7, frames=100), Scene(cameras=4, drones=1, lopsided=True, frames=100)],
+)
+def test_adjust_leaves_sound_rigs_alone(scene):
+    rig, seen, tracks = flown(scene, 1)
+    checked = adjusted(rig, seen, tracks)
+    assert checked.improved.moved == ()
+    assert checked.improved.rig is rig
+
+
+def test_adjust_mends_a_turned_camera():
+    rig, seen, tracks = flown(Scene(cameras=5, drones=3, size=0.6, frames=100), 2)
+    given = _boxes.turned(rig, 2, 1.0, np.random.default_rng(5))
+    checked = adjusted(given, seen, tracks)
+    assert checked.improved.moved == (rig.names[2],)
+    before_px, after_px = checked.left_out_px
+    assert after_px < before_px
+    # A turn and a way of the camera look alike, so the projections are compared.
+    place_m = tracks.position_m.reshape(-1, 3)
+    true_px, given_px, now_px = (
+        project(each.cameras[2], place_m)[0] for each in (rig, given, checked.improved.rig)
+    )
+    shifts = [np.median(np.linalg.norm(px - true_px, axis=-1)) for px in (given_px, now_px)]
+    assert shifts[1] < 0.25 * shifts[0]
+    assert shifts[0] > 10
+
+
+@pytest.mark.slow
+def test_an_adjustment_that_does_not_fit_other_parts_is_refused(monkeypatch):
+    """The moved camera fits the parts that it was adjusted to, and no other: the rig is unchanged."""
+    rig, seen, tracks = flown(Scene(cameras=4, drones=2, size=0.7, frames=80), 4)
+    views = find_drones_in_boxes(rig, seen, tracks)
+    # In each quarter of the recording, one camera's boxes are off in another direction.
+    quarter = views.frame * 4 // 80
+    turns = np.array([[25, 0], [-25, 0], [0, 25], [0, -25]])
+    points_px = views.points_px.copy()
+    points_px[:, 1] += turns[quarter]
+    from psotrack.doctor import checked_adjustment
+
+    monkeypatch.setattr(
+        checked_adjustment, "_certain_faults", lambda rig, views, moved, rescaled: (moved, rescaled)
+    )
+    free = checked_adjustment.improve(rig, points_px, views.noise_px)
+    assert free.moved != ()
+    checked = improve_with_check(rig, replace(views, points_px=points_px))
+    assert checked.improved.rig is rig
+    assert not checked.better
+    assert checked.uncertain
+
+
+def test_hypotheses_have_their_own_columns():
+    found = list_hypotheses(3, [0, 2])
+    assert all(isinstance(each, Hypothesis) for each in found)
+    by_camera = {each.camera for each in found}
+    assert by_camera == {0, 2, -1}
+    assert {column // PER_CAMERA for each in found for column in each.columns} == {0, 2, 3}
+
+
+def test_far_cameras_that_see_bodies_of_plausible_size_are_no_wrong_unit():
+    """Cameras 400 m apart that see a body of two metres: metres, not millimetres."""
+    rig, flight_scene = ring_rig(4, image_size_wh=(1920, 1080), radius_m=4.0), np.arange(60)
+    T = rig.cameras.T_cam_world.copy()
+    T[:, :3, 3] *= 100
+    far = Rig(rig.names, replace(rig.cameras, T_cam_world=T))
+    phase = 2 * np.pi * flight_scene / 60
+    body_m = 100 * np.stack([np.sin(phase), np.cos(phase), 1.2 + 0 * phase], axis=-1)
+    seen = {}
+    for index, name in enumerate(far.names):
+        middle, depth = project(far.cameras[index], body_m)
+        half = (far.cameras.K[index, 0, 0] * 1.0 / depth)[:, None]
+        noise = np.random.default_rng(index).normal(0, 0.3, middle.shape)
+        xyxy = np.concatenate([middle + noise + 0.5 - half, middle + noise + 0.5 + half], axis=-1)
+        seen[name] = _boxes.Detections(flight_scene, xyxy, np.ones(60))
+    findings = examine(far, from_detections(seen, far, 60), fps=25.0).findings
+    assert [finding.kind for finding in findings] == []

@@ -1,0 +1,335 @@
+"""`psotrack init`: files of a folder are matched to cameras by their names, and nothing is guessed."""
+
+import json
+import shutil
+import string
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
+
+from psotrack.cli import cli
+from psotrack.datasets import DraftOptions, draft_recording, open_recording
+from psotrack.errors import InputError, PsotrackError, SettingsError
+from psotrack.geometry import camera_key, cameras_of, chosen_camera, chosen_cameras
+from psotrack.recordings import (
+    CameraTable,
+    RecordingFile,
+    VideoWriter,
+    WorldTable,
+    read_recording_file,
+    write_recording_file,
+)
+
+CAMERA = """size = [64, 48]
+K = [[60, 0, 32], [0, 60, 24], [0, 0, 1]]
+rvec = [1.5, 0, 0]
+tvec = [0, 0, 5]
+"""
+
+
+@pytest.fixture(scope="session")
+def video(tmp_path_factory):
+    path = tmp_path_factory.mktemp("video") / "small.avi"
+    with VideoWriter(path, 25.0, (64, 48)) as writer:
+        for index in range(4):
+            writer.write(np.full((48, 64, 3), 40 * index, np.uint8))
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path, video):
+    """Return a function that makes a folder with videos of these names and a `rig.toml` of these cameras."""
+
+    def make(*videos, cameras=()):
+        path = tmp_path / "flight"
+        path.mkdir()
+        for name in videos:
+            (path / name).parent.mkdir(exist_ok=True)
+            shutil.copy(video, path / name)
+        if cameras:
+            tables = [f"[cameras.{json.dumps(name)}]\n{CAMERA}" for name in cameras]
+            (path / "rig.toml").write_text("version = 1\n" + "\n".join(tables))
+        return path
+
+    return make
+
+
+def init(folder, *arguments):
+    result = CliRunner().invoke(cli, ["init", str(folder), *map(str, arguments)], standalone_mode=False)
+    if result.exception is not None:
+        raise result.exception
+    return result.output
+
+
+def refusal(folder, *arguments):
+    """The one line with which `init` refuses."""
+    with pytest.raises(PsotrackError) as error:
+        init(folder, *arguments)
+    assert "\n" not in str(error.value)
+    assert not (folder / "recording.toml").exists()
+    return str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("cameras", "videos"),
+    [
+        (("cam1", "cam10", "cam2"), ("cam1i_s.avi", "cam10i_s.avi", "cam2i_s.avi")),
+        (("60881257", "55260362"), ("cam_60881257.avi", "cam_55260362.avi")),
+        (("cam_60881257", "cam_55260362"), ("60881257.avi", "55260362.avi")),
+        (("GoPro 3", "GoPro 12"), ("gopro3_clip.AVI", "GOPRO-12.avi")),
+        (("left", "right"), ("2026-05-01_LEFT.avi", "2026-05-01_right_2.avi")),
+        (("0", "1"), ("cam_0.avi", "cam_1.avi")),
+        (("cam01", "cam02"), ("cam1.avi", "cam_2_take7.avi")),
+        (("front left", "front"), ("front_left.avi", "front.avi")),
+        (("top", "side"), ("top/minimal_top.avi", "side/clip.avi")),
+    ],
+)
+def test_files_are_matched_to_cameras(folder, cameras, videos):
+    path = folder(*videos, cameras=cameras)
+    shown = init(path)
+    recording = open_recording(path).usable()
+    videos = [name.rpartition("/")[2] for name in videos]
+    assert {name: video.path.name for name, video in recording.videos.items()} == dict(
+        zip(cameras, videos, strict=True)
+    )
+    assert recording.rig.names == cameras
+    for name in (*cameras, *videos, "64 x 48", "25"):
+        assert name in shown
+
+
+def test_everything_in_a_folder_is_found(folder):
+    path = folder("left.avi", "notes/extra.avi", cameras=("left", "right", "top", "unused"))
+    for index in range(12):
+        (path / "Right").mkdir(exist_ok=True)
+        cv2.imwrite(str(path / "Right" / f"{index}.png"), np.full((48, 64), index, np.uint8))
+    cv2.imwrite(str(path / "left_ignore.png"), np.zeros((48, 64), np.uint8))
+    (path / "dl_data").mkdir()
+    (path / "dl_data" / "left.csv").write_text("0\n2,0,0,9,9,4,5,0.5\n")
+    (path / "dl_data" / "top.csv").write_text("2,0,0,9,9,4,5,0.5,,,\n")
+    (path / "left_times.csv").write_text("frame,time_s\n0,0\n1,0.1\n2,0.15\n3,0.2\n")
+    (path / "drone.tum").write_text("".join(f"{t} 0 0 1 0 0 0 1\n" for t in (0, 0.1, 0.2)))
+    (path / "aruco_corners.csv").write_text("id;x1\n")
+    (path / "notes.txt").write_text("windy")
+    # The output of `track`, which must not become the reference of its own evaluation.
+    (path / "tracks.csv").write_text("frame,time_s,drone,x_m,y_m,z_m,status\n0,0,0,1,1,1,tracked\n")
+    (path / ".hidden.mp4").write_text("")
+    shown = init(path, "--fps", 30)
+    content = read_recording_file(path / "recording.toml")
+    assert content == RecordingFile(
+        version=1,
+        calibration="rig.toml",
+        cameras={
+            "left": CameraTable(
+                video="left.avi",
+                ignore="left_ignore.png",
+                detections="dl_data/left.csv",
+                timestamps="left_times.csv",
+            ),
+            "right": CameraTable(images="Right/*.png", fps=30.0),
+            "top": CameraTable(detections="dl_data/top.csv", size=(64, 48), fps=30.0),
+        },
+        reference=content.reference,
+        markers=content.markers,
+    )
+    assert content.reference.files == ("drone.tum",)
+    assert content.markers.corners == "aruco_corners.csv"
+    assert "cameras without any file, left out: unused" in shown
+    assert "files that are not used: extra.avi, notes.txt, tracks.csv" in shown
+    recording = open_recording(path)
+    assert recording.videos["right"].num_frames == 12
+    assert recording.usable(videos=False).rig.names == ("left", "right", "top")
+
+
+def test_a_calibration_and_a_file_elsewhere(folder, tmp_path):
+    path = folder("cam1.avi", cameras=("cam1",))
+    elsewhere = tmp_path / "rigs" / "today.toml"
+    elsewhere.parent.mkdir()
+    (path / "rig.toml").rename(elsewhere)
+    out = tmp_path / "lists" / "flight.toml"
+    init(path, "--calibration", elsewhere, "--out", out)
+    assert read_recording_file(out).calibration == "../rigs/today.toml"
+    assert open_recording(out).usable().videos["cam1"].num_frames == 4
+
+
+def test_without_a_calibration_cameras_have_no_place(folder):
+    path = folder("left.avi", "right.avi")
+    shown = init(path, "--json", path / "report.json")
+    recording = open_recording(path)
+    assert (recording.rig.names, recording.unplaced) == ((), ("left", "right"))
+    assert "psotrack calibrate rig" in shown
+    report = json.loads((path / "report.json").read_text())
+    assert report["cameras"]["left"]["placed"] is False
+    assert report["cameras"]["left"]["image_size_wh"] == [64, 48]
+
+
+def test_matches_by_hand(folder):
+    path = folder("GX010123.avi", "GX010124.avi", "cam2.avi", cameras=("cam1", "cam2", "cam3"))
+    init(path, "--match", "Cam 1=GX010123.avi", "--leave-out", "GX010124.avi", "--match", "cam3=rtsp://x/1")
+    content = read_recording_file(path / "recording.toml")
+    assert {name: table.video for name, table in content.cameras.items()} == {
+        "cam1": "GX010123.avi",
+        "cam2": "cam2.avi",
+        "cam3": "rtsp://x/1",
+    }
+
+
+def test_names_by_hand_without_a_calibration(folder):
+    path = folder("GX010123.avi", "GX010124.avi")
+    init(path, "--match", "left=GX010123.avi", "--match", "right=GX010124.avi")
+    assert open_recording(path).unplaced == ("left", "right")
+
+
+class TestRefusals:
+    def test_a_video_of_no_camera(self, folder):
+        line = refusal(folder("cam1.avi", "cam10.avi", cameras=("cam1", "cam2")))
+        assert "cam10.avi: expected the video of a camera of rig.toml, cam1, cam2" in line
+        assert "--match CAMERA=cam10.avi, or leave it out with --leave-out cam10.avi" in line
+
+    def test_two_videos_of_one_camera(self, folder):
+        line = refusal(folder("cam1_a.avi", "cam1_b.avi", cameras=("cam1",)))
+        assert "cam1_b.avi: expected one video of camera cam1, found cam1_a.avi as well; say" in line
+
+    def test_a_video_and_images_of_one_camera(self, folder):
+        path = folder("cam1.avi", cameras=("cam1",))
+        (path / "cam1").mkdir()
+        cv2.imwrite(str(path / "cam1" / "0.png"), np.zeros((48, 64), np.uint8))
+        assert "expected one folder of images of camera cam1, found cam1.avi as well" in refusal(path)
+
+    def test_a_video_with_the_names_of_two_cameras(self, folder):
+        line = refusal(folder("take_a_b.avi", cameras=("a", "b")))
+        assert "take_a_b.avi: expected the name of one camera, found a and b in its name; say whose" in line
+
+    def test_two_rig_files(self, folder):
+        path = folder("cam1.avi", cameras=("cam1",))
+        shutil.copy(path / "rig.toml", path / "calibration.toml")
+        assert "expected one rig file, found calibration.toml, rig.toml; name the one" in refusal(path)
+
+    def test_detections_or_images_without_a_rate(self, folder):
+        path = folder(cameras=("cam1",))
+        (path / "cam1.csv").write_text("0,0,0,9,9,4,5,0.5\n")
+        assert "frames per second of camera cam1, which has no video, found none; pass --fps" in refusal(path)
+        (path / "rig.toml").unlink()
+        assert "images of camera cam1, which has no video, found none; pass --size" in refusal(
+            path, "--fps", 9
+        )
+
+    def test_an_existing_file_is_kept(self, folder):
+        path = folder("cam1.avi", cameras=("cam1",))
+        (path / "recording.toml").write_text("mine")
+        with pytest.raises(PsotrackError, match="existing file; pass --force"):
+            init(path)
+        assert (path / "recording.toml").read_text() == "mine"
+        init(path, "--force")
+        assert "mine" not in (path / "recording.toml").read_text()
+
+    @pytest.mark.parametrize(
+        ("arguments", "words"),
+        [
+            (("--match", "cam1"), "--match: expected CAMERA=FILE, found cam1"),
+            (("--match", "cam9=cam1.avi"), "--match: expected a camera of .*rig.toml: cam1, found cam9"),
+            (("--match", "cam1=no.avi"), "--match: expected a file in .*flight, found no.avi"),
+            (("--match", "cam1=rig.toml"), "--match: expected a video, .* found rig.toml"),
+            (("--fps", -1), "--fps: expected a number above 0, found -1"),
+            (("--out", "a.txt"), "--out: expected a file that ends in .toml"),
+        ],
+    )
+    def test_wrong_options(self, folder, arguments, words):
+        path = folder("cam1.avi", cameras=("cam1",))
+        with pytest.raises(SettingsError, match=words):
+            init(path, *arguments)
+
+    def test_folders_without_a_recording(self, folder, tmp_path):
+        with pytest.raises(InputError, match="a folder with a recording's files, found no such file"):
+            draft_recording(tmp_path / "no", tmp_path / "no" / "recording.toml")
+        with pytest.raises(InputError, match="expected videos, folders of images, or detections, found none"):
+            draft_recording(tmp_path, tmp_path / "recording.toml", DraftOptions())
+        path = folder(cameras=("cam1",))
+        assert "expected files named like the cameras of rig.toml, cam1, found none" in refusal(path)
+
+
+# --- names
+
+
+def camera_of(name, cameras):
+    """The one camera to which a file of this name belongs, or None."""
+    found = cameras_of(name, cameras)
+    return found[0] if len(found) == 1 else None
+
+
+Words = st.text(string.ascii_letters, min_size=1, max_size=6)
+Numbers = st.integers(1, 99_999)
+Separators = st.sampled_from(["", " ", "_", "-", ".", "__"])
+
+
+@given(word=Words, number=Numbers, more=Separators, rest=Words, case=st.booleans())
+def test_a_file_belongs_to_the_camera_whose_name_it_begins_with(word, number, more, rest, case):
+    """Case, spaces and separators do not count, and other words may follow."""
+    camera = f"{word}{number}"
+    name = f"{word}{more}{number}{more}{rest}"
+    name = name.upper() if case else name
+    others = [f"{word}{number}{digit}" for digit in range(3)]
+    assert camera_of(name, [camera, *others]) == camera
+    assert camera_of(f"before {name}", [camera, *others]) in (camera, None)
+
+
+@given(word=Words, numbers=st.lists(Numbers, min_size=2, max_size=8, unique=True), more=Separators)
+def test_numbers_are_compared_as_a_whole(word, numbers, more):
+    cameras = [f"{word}{number}" for number in numbers]
+    for camera, number in zip(cameras, numbers, strict=True):
+        name = f"{word}{more}{number}"
+        assert cameras_of(name, cameras) == [camera]
+        assert cameras_of(name, [other for other in cameras if other != camera]) == []
+        assert chosen_camera(name, cameras) == camera
+        assert camera_key(name) == camera_key(camera)
+
+
+@given(serials=st.lists(st.integers(100_000, 10**9), min_size=2, max_size=5, unique=True), word=Words)
+def test_serial_numbers_with_and_without_a_word(serials, word):
+    plain = [str(serial) for serial in serials]
+    worded = [f"{word}_{serial}" for serial in serials]
+    for index in range(len(serials)):
+        assert camera_of(worded[index], plain) == plain[index]
+        assert camera_of(plain[index], worded) == worded[index]
+
+
+@given(names=st.lists(Words.map(str.lower), min_size=1, max_size=5, unique_by=camera_key), data=st.data())
+def test_typed_names_choose_their_cameras_in_their_order(names, data):
+    order = data.draw(st.permutations(names))
+    assert chosen_cameras([name.upper() for name in order], names) == tuple(order)
+
+
+def test_a_part_of_a_name_chooses_a_camera_only_where_it_is_one():
+    assert chosen_camera("cam1", ["cam1i", "cam10i", "cam2i"]) == "cam1i"
+    assert chosen_camera("1", ["cam1", "cam10", "cam2"]) == "cam1"
+    assert chosen_camera("left", ["left_a", "left_b"]) is None
+    assert chosen_camera("", ["cam1"]) is None
+
+
+# --- the file
+
+Names = st.text(st.characters(categories=("L", "N"), include_characters=" _-."), min_size=1).filter(
+    camera_key
+)
+Lengths = st.floats(-1e6, 1e6)
+Tables = st.builds(
+    CameraTable,
+    video=st.text(st.characters(exclude_categories=("C",)), min_size=1),
+    size=st.none() | st.tuples(st.integers(1, 10**6), st.integers(1, 10**6)),
+    fps=st.none() | st.floats(1e-6, 1e6),
+    time_offset_s=st.none() | Lengths,
+    line_time_s=Lengths,
+    distortion=st.none() | st.lists(Lengths, max_size=14).map(tuple),
+)
+
+
+@given(name=Names, table=Tables, bounds_m=st.none() | st.just(((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))))
+def test_what_is_written_is_read(name, table, bounds_m, tmp_path_factory):
+    content = RecordingFile(version=1, cameras={name: table}, world=WorldTable(bounds_m=bounds_m))
+    path = tmp_path_factory.getbasetemp() / "any.toml"
+    write_recording_file(path, content)
+    assert msgspec.to_builtins(read_recording_file(path)) == msgspec.to_builtins(content)

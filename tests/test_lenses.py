@@ -1,0 +1,314 @@
+"""Lens models: OpenCV's `projectPoints` and `fisheye.projectPoints` are the oracles, also for where a lens folds."""
+
+from dataclasses import replace
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import float32
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from psotrack.errors import SettingsError
+from psotrack.geometry import (
+    has_image,
+    make_camera,
+    make_rig,
+    project,
+    project_with_jacobian,
+    sizes_m,
+    sizes_px,
+    triangulate,
+    undistort,
+    undistortion_stretch,
+)
+
+SIZE_WH = (1920, 1080)
+K = np.array([[1050.0, 0.0, 965.0], [0.0, 1043.0, 532.0], [0.0, 0.0, 1.0]])
+WIDE_K = np.diag([0.45, 0.45, 1.0]) @ K
+RATIONAL = (14.2, 8.1, 0.0004, -0.0002, 0.31, 14.5, 11.9, 2.2)
+PRISM = (-0.28, 0.11, 0.0007, -0.0011, -0.02, 0.02, -0.01, 0.003, 0.0011, -0.0004, -0.0008, 0.0003)
+LENSES = {
+    "weak barrel": (K, (-0.12, 0.03, 0.0008, -0.0005), False),
+    "pincushion": (K, (0.21, -0.02, -0.0004, 0.0009, 0.03), False),
+    "folds in the image": (WIDE_K, (-0.25, 0.0, 0.0, 0.0), False),
+    "folds with decentring": (WIDE_K, (-0.25, 0.03, 0.004, -0.003, -0.001), False),
+    "GoPro": (0.9 * WIDE_K + np.diag([0, 0, 0.1]), (-0.27, 0.11, 0.0003, 0.0002, -0.024), False),
+    "rational": (WIDE_K, RATIONAL, False),
+    "pole": (WIDE_K, (0.1, 0.0, 0.0, 0.0, 0.0, -0.2, 0.0, 0.0), False),
+    "prism": (K, PRISM, False),
+    "tilt": (K, (*PRISM, 0.06, -0.04), False),
+    "tilt alone": (K, (*np.zeros(12), -0.2, 0.3), False),
+    "equidistant": (WIDE_K, (0.0, 0.0, 0.0, 0.0), True),
+    "fisheye": (WIDE_K, (-0.012, 0.021, -0.018, 0.004), True),
+    "fisheye that folds": (WIDE_K, (-0.13, 0.0, 0.0, 0.0), True),
+}
+
+
+def make_lens(name):
+    lens_K, dist, fisheye = LENSES[name]
+    return make_camera(
+        R=np.eye(3), t_m=np.zeros(3), K=lens_K, image_size_wh=SIZE_WH, dist=dist, fisheye=fisheye
+    )
+
+
+def opencv_pixels(lens, points):
+    function = cv2.projectPoints if lens.fisheye is None else cv2.fisheye.projectPoints
+    flat = np.ascontiguousarray(points.reshape(-1, 1, 3))
+    return function(flat, np.zeros(3), np.zeros(3), lens.K, lens.dist)[0].reshape(*points.shape[:-1], 2)
+
+
+def rays(angles, directions=16):
+    """Points on rays from the axis outwards, (directions, angles, 3)."""
+    around = (np.arange(directions) + 0.3) / directions * 2 * np.pi
+    r = np.tan(angles)
+    x, y = (np.outer(turn(around), r) for turn in (np.cos, np.sin))
+    return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+
+def opencv_determinant(lens, points):
+    """Determinant of the pixels' derivative by x and y, by differences of OpenCV's pixels."""
+    step = 1e-6 * (1 + np.abs(points[..., :2]).max(axis=-1))
+    by = []
+    for axis in range(2):
+        off = np.zeros(points.shape)
+        off[..., axis] = step
+        ahead, behind = opencv_pixels(lens, points + off), opencv_pixels(lens, points - off)
+        by.append((ahead - behind) / (2 * step[..., None]))
+    return (by[0][..., 0] * by[1][..., 1] - by[0][..., 1] * by[1][..., 0]) / (lens.K[0, 0] * lens.K[1, 1])
+
+
+def before_fold(lens, points):
+    """Points before, and points beyond, the first change of sign on their ray; points at the fold are neither."""
+    determinant = opencv_determinant(lens, points)
+    return np.logical_and.accumulate(determinant > 1e-4, axis=1), np.logical_or.accumulate(
+        determinant < -1e-4, axis=1
+    )
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_pixels_equal_those_of_opencv_to_the_border_and_beyond(name):
+    lens, points = make_lens(name), rays(np.radians(np.linspace(0, 85, 120)))
+    expected = opencv_pixels(lens, points)
+    # Both are float64. Pixels far outside the image are large numbers.
+    np.testing.assert_allclose(project(lens, points)[0], expected, rtol=1e-11, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_points_before_the_fold_come_back_and_others_have_no_image(name):
+    lens, points = make_lens(name), rays(np.radians(np.linspace(0, 85, 400)))
+    before, beyond = before_fold(lens, points)
+    back = undistort(lens, opencv_pixels(lens, points))
+    again = project(lens, np.concatenate([back, np.ones_like(back[..., :1])], axis=-1))[0]
+    np.testing.assert_allclose(again[before], opencv_pixels(lens, points)[before], atol=1e-6)
+    # The determinant is above 1e-4, so that an error of 1e-8 px is at most 1e-4 px in the undistorted image.
+    np.testing.assert_allclose(back[before], points[before][:, :2], rtol=1e-7, atol=1e-7)
+    assert before[:, :100].all()
+    assert has_image(lens, points)[before].all()
+    assert not has_image(lens, points)[beyond].any()
+    # A pixel of a point beyond the fold shows another point, which is nearer to the axis, or none.
+    nearer = np.hypot(*back[beyond].T) < np.hypot(*points[beyond][:, :2].T)
+    assert (np.isnan(back[beyond]).all(axis=-1) | nearer).all()
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_every_pixel_of_a_wide_image_comes_back_or_is_nan(name):
+    lens = make_lens(name)
+    x, y = np.meshgrid(np.linspace(-2000, 4000, 61), np.linspace(-2000, 3000, 51))
+    pixels = np.stack([x, y], axis=-1)
+    back = undistort(lens, pixels)
+    known = np.isfinite(back).all(axis=-1)
+    points = np.concatenate([back, np.ones_like(back[..., :1])], axis=-1)[known]
+    np.testing.assert_allclose(opencv_pixels(lens, points), pixels[known], atol=1e-6)
+    # A pixel is unknown only where no point before the fold has it: no point of a dense grid is near it.
+    dense = rays(np.radians(np.linspace(0, 89.5, 600)), 240)
+    before, _ = before_fold(lens, dense)
+    shown = opencv_pixels(lens, dense)[before]
+    shown = shown[np.isfinite(shown).all(axis=-1)]
+    inside, _, _ = np.histogram2d(*shown.T, bins=[np.arange(-2050, 4051, 50), np.arange(-2050, 3051, 50)])
+    # A cell of 50 px, all neighbours of which contain images, is inside the area that the lens shows.
+    full = cv2.erode((inside > 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    column, row = ((pixels[~known] + 2050) // 50).astype(int).T
+    assert not full[column, row].any()
+
+
+def test_a_lens_that_folds_has_an_end():
+    """x (1 - k r²) grows up to r = 1 / sqrt(3 k), where it is 2 / 3 of this radius."""
+    lens = make_lens("folds in the image")
+    end = 1 / np.sqrt(0.75)
+    border = lens.K[0, 2] + lens.K[0, 0] * end * 2 / 3
+    pixels = np.array([[border - 1e-3, lens.K[1, 2]], [border + 1e-3, lens.K[1, 2]], [-8e99, 0.0]])
+    back = undistort(lens, pixels)
+    assert end - 0.01 < back[0, 0] < end
+    assert np.isnan(back[1:]).all()
+    x = np.array([end - 1e-6, end + 1e-6, 1.9, 2.0, 2.1, 5.0, 1e3])
+    points = np.stack([x, 0 * x, np.ones_like(x)], axis=-1)
+    assert has_image(lens, points).tolist() == [True] + [False] * 6
+    assert not has_image(lens, -points).any()
+
+
+def test_triangulation_leaves_out_a_camera_whose_lens_shows_no_point_there():
+    folded = make_lens("folds in the image")
+    rig = make_rig(
+        {
+            name: replace(folded, T_cam_world=T)
+            for name, T in zip("abc", np.eye(4) + np.zeros((3, 1, 1)), strict=True)
+        }
+    )
+    rig.cameras.T_cam_world[:, 0, 3] = [-1.0, 0.0, 1.0]
+    point = np.array([0.2, 0.1, 4.0])
+    pixels = project(rig.cameras, point[None])[0]
+    pixels[1] = [1915.0, 1075.0]
+    np.testing.assert_allclose(triangulate(rig.cameras, pixels), point, atol=1e-9)
+    pixels[2] = [1915.0, 1075.0]
+    assert np.isnan(triangulate(rig.cameras, pixels)).all()
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_derivatives_equal_differences(name):
+    lens = make_lens(name)
+    points = np.random.default_rng(1).uniform((-1, -0.6, 1.0), (1, 0.6, 2.0), (40, 3))
+    pixels, _, slopes = project_with_jacobian(lens, points)
+    np.testing.assert_allclose(pixels, project(lens, points)[0], rtol=1e-13)
+    step = 1e-6
+    for axis in range(3):
+        off = step * np.eye(3)[axis]
+        by = (project(lens, points + off)[0] - project(lens, points - off)[0]) / (2 * step)
+        np.testing.assert_allclose(slopes[..., axis], by, rtol=1e-6, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_float32_pixels_are_within_a_thousandth(name):
+    lens, points = make_lens(name), rays(np.radians(np.linspace(0, 60, 40)))
+    exact, visible = project(lens, points)[0], has_image(lens, points)
+    visible &= ((exact > -100) & (exact < np.array(SIZE_WH) + 100)).all(axis=-1)
+    pixels, _ = jax.jit(project)(float32(lens), float32(points))
+    assert pixels.dtype == jnp.float32
+    # x / z itself is rounded, by 6e-8 of up to 2 in 1000 px.
+    np.testing.assert_allclose(np.asarray(pixels)[visible], exact[visible], atol=1e-3)
+    shown = jax.jit(has_image)(float32(lens), float32(points))
+    assert (np.asarray(shown) == has_image(lens, points)).mean() > 0.99
+
+
+@pytest.mark.parametrize("name", ["weak barrel", "tilt", "fisheye"])
+def test_gradients_are_finite_on_the_axis_and_behind_the_camera(name):
+    lens = float32(make_lens(name))
+    points = jnp.array([[0.0, 0.0, 2.0], [1e-9, 0.0, 1.0], [0.3, 0.2, -1.0]], jnp.float32)
+    slopes = jax.jacfwd(lambda point: project(lens, point)[0].sum())(points)
+    assert np.isfinite(slopes).all()
+    backward = jax.grad(lambda point: project(lens, point)[0].sum())(points)
+    assert np.isfinite(backward).all()
+
+
+def test_rigs_mix_lens_models():
+    names = ["weak barrel", "fisheye", "tilt"]
+    rig = make_rig({name: make_lens(name) for name in names})
+    assert rig.cameras.fisheye.tolist() == [False, True, False]
+    assert rig.cameras.dist.shape == (3, 14)
+    points = rays(np.radians(np.linspace(0, 40, 30))).reshape(-1, 3)
+    together = project(rig.cameras, points[:, None])[0]
+    back, shown = undistort(rig.cameras, together), has_image(rig.cameras, points[:, None])
+    for i, name in enumerate(names):
+        lens = make_lens(name)
+        np.testing.assert_allclose(together[:, i], opencv_pixels(lens, points), atol=1e-9)
+        np.testing.assert_allclose(back[:, i], points[:, :2], atol=1e-9)
+        np.testing.assert_array_equal(shown[:, i], has_image(lens, points))
+        np.testing.assert_array_equal(project(rig.cameras[i], points)[0], together[:, i])
+    pinholes = make_rig({name: make_lens(name) for name in ("weak barrel", "tilt")})
+    assert pinholes.cameras.fisheye is None
+    assert len(jax.tree.leaves(pinholes.cameras)) == 4
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    st.sampled_from([4, 5, 8, 12, 14]),
+    st.lists(st.floats(-1, 1), min_size=14, max_size=14),
+    st.lists(st.floats(-1, 1), min_size=2, max_size=2),
+    st.floats(-30, 30),
+)
+def test_every_lens_comes_back_and_zeros_change_nothing(coefficients, numbers, xy, skew):
+    size = np.array([0.4, 0.2, 0.003, 0.003, 0.1, 0.3, 0.1, 0.05, *4 * [0.002], 0.1, 0.1])
+    dist = (numbers * size)[:coefficients]
+    skewed = K + np.array([[0, skew, 0], [0, 0, 0], [0, 0, 0]])
+    common = {"R": np.eye(3), "t_m": np.zeros(3), "image_size_wh": SIZE_WH}
+    lens = make_camera(K=skewed, dist=tuple(dist), **common)
+    point = np.array([*xy, 1.0])
+    pixel = project(lens, point)[0]
+    # The formula of skew: OpenCV's projection has no skew, so that it is added to normalised coordinates.
+    flat = make_camera(K=np.eye(3), dist=tuple(dist), **common)
+    np.testing.assert_allclose(pixel, skewed[:2] @ [*opencv_pixels(flat, point), 1.0], rtol=1e-12)
+    padded = replace(lens, dist=np.pad(dist, (0, 14 - coefficients)))
+    np.testing.assert_allclose(project(padded, point)[0], pixel, rtol=1e-14)
+    back = undistort(lens, pixel)
+    if has_image(lens, point):
+        again = project(lens, np.array([*back, 1.0]))[0]
+        np.testing.assert_allclose(again, pixel, atol=1e-6)
+    if np.isfinite(back).all():
+        assert has_image(lens, np.array([*back, 1.0]))
+        np.testing.assert_allclose(project(lens, np.array([*back, 1.0]))[0], pixel, atol=1e-6)
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    st.lists(st.floats(-0.1, 0.1), min_size=4, max_size=4),
+    st.floats(0, np.radians(85)),
+    st.floats(0, 2 * np.pi),
+)
+def test_every_fisheye_comes_back(dist, angle, direction):
+    lens = make_camera(
+        R=np.eye(3), t_m=np.zeros(3), K=WIDE_K, image_size_wh=SIZE_WH, dist=tuple(dist), fisheye=True
+    )
+    r = np.tan(angle)
+    point = np.array([r * np.cos(direction), r * np.sin(direction), 1.0])
+    pixel = project(lens, point)[0]
+    np.testing.assert_allclose(pixel, opencv_pixels(lens, point), rtol=1e-12)
+    # The distorted angle grows up to the fold: the slope is a polynomial of the angle.
+    angles = np.linspace(0, angle, 2000)
+    powers = angles[:, None] ** (2 * np.arange(1, 5))
+    slope = 1 + powers @ (np.array([3, 5, 7, 9]) * dist)
+    if slope.min() > 1e-3:
+        np.testing.assert_allclose(undistort(lens, pixel), point[:2], rtol=1e-6, atol=1e-9)
+    elif slope.min() < -1e-3:
+        assert not has_image(lens, point)
+
+
+@pytest.mark.parametrize(
+    ("dist", "fisheye", "message"),
+    [
+        ((0.1, 0.2, 0.3), False, "expected 0, 4, 5, 8, 12 or 14 coefficients, found 3"),
+        ((0.1,) * 6, False, "expected 0, 4, 5, 8, 12 or 14 coefficients, found 6"),
+        ((0.1,) * 5, True, "expected 0 or 4 coefficients of a fisheye, found 5"),
+        ((0.1, np.nan, 0.0, 0.0), True, "expected finite numbers, found NaN"),
+    ],
+)
+def test_a_wrong_number_of_coefficients_is_refused(dist, fisheye, message):
+    with pytest.raises(SettingsError, match=message):
+        make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=SIZE_WH, dist=dist, fisheye=fisheye)
+
+
+@pytest.mark.parametrize("name", ["fisheye", "fisheye that folds"])
+def test_sizes_of_small_spheres_follow_from_their_boxes(name):
+    rig = make_rig({name: make_lens(name)})
+    points = rays(np.radians([0.0, 20.0, 40.0]), 5).reshape(-1, 3) * 3
+    surface = 0.01 * np.random.default_rng(0).standard_normal((4000, 3))
+    surface *= 0.01 / np.linalg.norm(surface, axis=-1, keepdims=True)
+    pixels = np.stack([opencv_pixels(rig.cameras[0], point + surface) for point in points])
+    size_px = np.ptp(pixels, axis=1)[:, None]
+    # Of 4000 points on a sphere, the outermost ones miss the outline by a thousandth of its radius.
+    np.testing.assert_allclose(sizes_m(rig.cameras, points[:, None], size_px), 0.02, rtol=4e-3)
+    np.testing.assert_allclose(
+        sizes_px(rig.cameras, points[:, None], np.full((1, 1, 2), 0.02)), size_px, rtol=4e-3
+    )
+
+
+@pytest.mark.parametrize("name", ["tilt", "fisheye", "GoPro"])
+def test_undistorting_stretches_small_circles(name):
+    lens = make_lens(name)
+    points = rays(np.radians([0.0, 25.0, 45.0]), 5).reshape(-1, 3)
+    around = 1e-4 * np.stack([np.cos(np.arange(0, 6.28, 0.1)), np.sin(np.arange(0, 6.28, 0.1))], axis=-1)
+    pixels = opencv_pixels(lens, points)[:, None] + around * lens.K[[0, 1], [0, 1]]
+    off = undistort(lens, pixels) - points[:, None, :2]
+    expected = np.sqrt((off**2).sum(axis=-1).mean(axis=-1)) / 1e-4
+    np.testing.assert_allclose(undistortion_stretch(lens, points[:, :2]), expected, rtol=5e-3)

@@ -1,0 +1,638 @@
+"""Files of other programs, made after the documents of their formats; each is projected by a formula of its own."""
+
+import random
+import re
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from psotrack.errors import InputError
+from psotrack.geometry import look_at, make_camera, make_rig, project, undistort
+from psotrack.rig_files import RIG_FORMATS, read_lenses, read_rig, write_rig
+
+#: Points in front of all cameras of this file, metres.
+POINTS_M = np.array([[0.3, -0.2, 0.9], [-0.4, 0.5, 1.4], [0.0, 0.1, 0.2], [1.1, 0.8, 1.9]])
+CENTRES_M = ((4.0, 0.5, 2.0), (-3.5, 1.0, 2.4))
+K = np.array([[900.0, 0.0, 650.5], [0.0, 905.0, 350.25], [0.0, 0.0, 1.0]])
+SIZE_WH = (1280, 720)
+RADTAN = (-0.12, 0.03, 0.0008, -0.0005)
+
+
+def poses():
+    """Rotation and translation of each camera, world to camera, metres."""
+    return [look_at(centre, (0.0, 0.0, 1.0)) for centre in CENTRES_M]
+
+
+def by_opencv(R, t_m, K, dist):
+    return cv2.projectPoints(POINTS_M, cv2.Rodrigues(R)[0], t_m, K, np.array(dist))[0][:, 0]
+
+
+def assert_projects(rig, expected, tolerance_px=1e-6):
+    for index, pixels in enumerate(expected):
+        np.testing.assert_allclose(
+            project(rig.cameras[index], POINTS_M)[0], pixels, rtol=0, atol=tolerance_px
+        )
+
+
+def with_skew(skew):
+    skewed = K.copy()
+    skewed[0, 1] = skew
+    return skewed
+
+
+def numbers(values):
+    return ", ".join(repr(float(value)) for value in np.ravel(values))
+
+
+def lists(values):
+    return str(np.asarray(values, float).tolist())
+
+
+def matrix(name, values):
+    values = np.asarray(values, float).reshape(len(np.atleast_1d(values)), -1)
+    return (
+        f"{name}: !!opencv-matrix\n  rows: {values.shape[0]}\n  cols: {values.shape[1]}\n  dt: d\n"
+        f"  data: [{numbers(values)}]\n"
+    )
+
+
+# --------------------------------------------------------------------------------------------------- pose2sim
+
+
+def pose2sim_file(path):
+    blocks = []
+    for name, (R, t) in zip(("cam01", "int_cam02_img"), poses(), strict=True):
+        blocks.append(
+            f'[{name}]\nname = "{name}"\nsize = [ 1280.0, 720.0]\nmatrix = {lists(K)}\n'
+            f"distortions = {lists(RADTAN)}\nrotation = {lists(cv2.Rodrigues(R)[0].ravel())}\n"
+            f"translation = {lists(t)}\nfisheye = false\n"
+        )
+    path.write_text("\n".join(blocks) + "\n[metadata]\nadjusted = false\nerror = 0.0\n")
+
+
+def test_a_file_of_pose2sim_is_in_metres(tmp_path):
+    path = tmp_path / "Calib_board.toml"
+    pose2sim_file(path)
+    rig = read_rig(path)
+    assert rig.names == ("cam01", "int_cam02_img")
+    assert_projects(rig, [by_opencv(R, t, K, RADTAN) for R, t in poses()])
+    assert [entry for entry in RIG_FORMATS if read_like(path, entry) is not None] == [
+        "anipose",
+        "caliscope",
+        "pose2sim",
+    ]
+
+
+def read_like(path, file_format):
+    try:
+        return read_rig(path, SIZE_WH, metres_per_unit=1.0, file_format=file_format)
+    except InputError:
+        return None
+
+
+# --------------------------------------------------------------------------------------------------- caliscope
+
+
+def test_an_older_file_of_caliscope_has_matrices_and_other_tables(tmp_path):
+    path = tmp_path / "config.toml"
+    (R, t), (_, _) = poses()
+    path.write_text(
+        f"CreationDate = 2023-05-06T11:12:27\ncamera_count = 0\n[cam_0]\ncam_id = 0\nrotation_count = 0\n"
+        f"size = [1280, 720]\nmatrix = {lists(K)}\ndistortions = {lists((*RADTAN, 0))}\ntranslation = {lists(t)}\n"
+        f'rotation = {lists(R)}\n[charuco]\ncolumns = 4\nunits = "inch"\n'
+    )
+    rig = read_rig(path)
+    assert rig.names == ("0",)
+    assert_projects(rig, [by_opencv(R, t, K, RADTAN)])
+
+
+# --------------------------------------------------------------------------------------------------- OpenCV
+
+
+def storage_files(folder):
+    """A stereo pair as OpenCV's sample writes it: two files, the second with the pose of camera 2 in camera 1."""
+    (R1, t1), (R2, t2) = poses()
+    R = R2 @ R1.T
+    for suffix, flags in (("yml", cv2.FILE_STORAGE_FORMAT_YAML), ("xml", cv2.FILE_STORAGE_FORMAT_XML)):
+        with_flags = cv2.FILE_STORAGE_WRITE | flags
+        inside = cv2.FileStorage(str(folder / f"intrinsics.{suffix}"), with_flags)
+        for number in (1, 2):
+            inside.write(f"M{number}", K)
+            inside.write(f"D{number}", np.array([RADTAN]))
+        inside.release()
+        outside = cv2.FileStorage(str(folder / f"extrinsics.{suffix}"), with_flags)
+        for name, value in {"R": R, "T": (t2 - R @ t1)[:, None], "R1": np.eye(3), "Q": np.eye(4)}.items():
+            outside.write(name, value)
+        outside.release()
+
+
+@pytest.mark.parametrize("name", ["intrinsics.yml", "extrinsics.yml", "extrinsics.xml"])
+def test_a_stereo_pair_of_opencvs_sample(tmp_path, name):
+    storage_files(tmp_path)
+    with pytest.raises(InputError, match=r"--units"):
+        read_rig(tmp_path / name, SIZE_WH)
+    rig = read_rig(tmp_path / name, SIZE_WH, metres_per_unit=1.0)
+    assert rig.names == ("cam1", "cam2")
+    # The world is the first camera.
+    R1, t1 = poses()[0]
+    in_first = POINTS_M @ R1.T + t1
+    for index, (R, t) in enumerate(poses()):
+        pixels = project(rig.cameras[index], in_first)[0]
+        np.testing.assert_allclose(pixels, by_opencv(R, t, K, RADTAN), rtol=0, atol=1e-6)
+
+
+def test_lenses_of_a_stereo_pair_need_no_second_file(tmp_path):
+    storage_files(tmp_path)
+    (tmp_path / "extrinsics.yml").unlink()
+    assert read_lenses(tmp_path / "intrinsics.yml", SIZE_WH).names == ("cam1", "cam2")
+    with pytest.raises(InputError, match="expected the poses of cameras, found none"):
+        read_rig(tmp_path / "intrinsics.yml", SIZE_WH)
+
+
+def test_cameras_by_name_in_json(tmp_path):
+    path = tmp_path / "rig.json"
+    rows = []
+    for name, (R, t) in zip(("6-0", "left"), poses(), strict=True):
+        rows.append(
+            f'"{name}": {{"K": {lists(K)}, "dist": {lists(RADTAN)}, "image_shape": [720, 1280], "R": {lists(R)},'
+            f' "t": {lists(t)}}}'
+        )
+    path.write_text("{" + ",".join(rows) + "}")
+    rig = read_rig(path, metres_per_unit=1.0)
+    assert rig.names == ("6-0", "left")
+    assert rig.cameras.image_size_wh.tolist() == [[1280, 720]] * 2
+    assert_projects(rig, [by_opencv(R, t, K, RADTAN) for R, t in poses()])
+
+
+@pytest.mark.parametrize(("model", "fisheye"), [("plumb_bob", False), ("equidistant", True)])
+def test_the_camera_info_of_ros(tmp_path, model, fisheye):
+    path = tmp_path / "head.yaml"
+    path.write_text(
+        f"image_width: 1280\nimage_height: 720\ncamera_name: head_camera\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
+        f"  data: [{numbers(K)}]\ndistortion_model: {model}\ndistortion_coefficients:\n  rows: 1\n  cols: 4\n"
+        f"  data: [{numbers(RADTAN)}]\n"
+    )
+    lenses = read_lenses(path)
+    assert lenses.names == ("head_camera",)
+    np.testing.assert_array_equal(lenses.cameras.K[0], K)
+    np.testing.assert_array_equal(lenses.cameras.dist[0], RADTAN)
+    assert (lenses.cameras.fisheye is not None) == fisheye
+
+
+# --------------------------------------------------------------------------------------------------- Qualisys
+
+
+def qualisys_file(path, change=("", "")):
+    cameras = []
+    for serial, (R, t) in zip((26578, 26579), poses(), strict=True):
+        rows, centre_mm = np.diag([1.0, -1, -1]) @ R, -1e3 * R.T @ t
+        turn = " ".join(f'r{i + 1}{j + 1}="{float(rows[i, j])!r}"' for i in range(3) for j in range(3))
+        place = " ".join(f'{axis}="{float(value)!r}"' for axis, value in zip("xyz", centre_mm, strict=True))
+        k1, k2, p1, p2 = RADTAN
+        cameras.append(
+            f'<camera active="1" serial="{serial}" model="Miqus Video" viewrotation="0">'
+            f'<fov_video left="8" top="4" right="1287" bottom="723"/><transform {place} {turn}/>'
+            f'<intrinsic focallength="9.3" sensorMaxU="122879" sensorMaxV="69631" focalLengthU="{64 * K[0, 0]}" '
+            f'focalLengthV="{64 * K[1, 1]}" centerPointU="{64 * (K[0, 2] + 8)}" centerPointV="{64 * (K[1, 2] + 4)}" '
+            f'skew="0" radialDistortion1="{k1}" radialDistortion2="{k2}" radialDistortion3="0" '
+            f'tangentalDistortion1="{p1}" tangentalDistortion2="{p2}"/></camera>'
+        )
+    text = f"<?xml version='1.0' encoding='ASCII'?>\n<calibration><cameras>{''.join(cameras)}</cameras></calibration>"
+    path.write_text(text.replace(*change, 1))
+
+
+def test_a_calibration_of_qualisys(tmp_path):
+    path = tmp_path / "session.qca.txt"
+    qualisys_file(path)
+    rig = read_rig(path)
+    assert rig.names == ("26578", "26579")
+    assert rig.cameras.image_size_wh.tolist() == [[1280, 720]] * 2
+    assert_projects(rig, [by_opencv(R, t, K, RADTAN) for R, t in poses()])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (('r11="', 'r11="x'), r"camera 26578, transform\.r11: expected a number"),
+        ((' r12="', ' r12="3" q="'), r"camera 26578, transform\.r11 to r33: expected a rotation matrix"),
+        (
+            ('focalLengthU="', 'focalLengthU="-'),
+            r"26578, intrinsic\.focalLengthU: expected focal lengths above",
+        ),
+        ((' x="', ' q="'), r"camera 26578, transform\.x: expected a number, found none"),
+        (('serial="26579"', 'serial="26578"'), r"camera 26578: expected each camera once, found 26578 again"),
+        (
+            ("</cameras>", ""),
+            r"session\.qca\.txt, line 2: expected valid XML, found an error \(mismatched tag\)",
+        ),
+        (
+            ("<calibration>", '<!DOCTYPE x [<!ENTITY a "b">]><calibration>'),
+            "expected XML without document type",
+        ),
+    ],
+)
+def test_a_damaged_calibration_of_qualisys_is_refused(tmp_path, change, message):
+    path = tmp_path / "session.qca.txt"
+    qualisys_file(path, change)
+    with pytest.raises(InputError, match=message) as error:
+        read_rig(path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_camera_that_qualisys_did_not_calibrate_is_left_out(tmp_path, caplog):
+    path = tmp_path / "session.qca.txt"
+    qualisys_file(path, ('serial="26578"', 'calibrated="false" serial="26578"'))
+    assert read_rig(path).names == ("26579",)
+    assert "no pose: camera 26578" in caplog.text
+    assert read_lenses(path).names == ("26578", "26579")
+
+
+# --------------------------------------------------------------------------------------------------- Vicon
+
+
+def vicon_file(path, radial, *, video="VideoInputDevice:Blackfly", moved=""):
+    cameras = []
+    for device, (R, t) in zip((2121, 2122), poses(), strict=True):
+        centre_mm = " ".join(repr(float(value)) for value in -1e3 * R.T @ t)
+        quaternion = " ".join(repr(float(value)) for value in Rotation.from_matrix(R).as_quat())
+        cameras.append(
+            f'<Camera DEVICEID="{device}" PIXEL_ASPECT_RATIO="{float(K[0, 0] / K[1, 1])!r}" SKEW="0" '
+            f'SENSOR_SIZE="1280 720" TYPE="{video}"><KeyFrames><KeyFrame '
+            f'FOCAL_LENGTH="{K[0, 0]}" FRAME="0" ORIENTATION="{quaternion}" '
+            f'POSITION="{centre_mm}" PRINCIPAL_POINT="{K[0, 2]} {K[1, 2]}" {radial}/>{moved}</KeyFrames></Camera>'
+        )
+    path.write_text(
+        f'<?xml version="1.0" encoding="UTF-8" standalone="no" ?>\n<Cameras>{"".join(cameras)}</Cameras>'
+    )
+
+
+@pytest.mark.parametrize(
+    ("radial", "centre_px", "per_focal"),
+    [
+        # Per square pixel; Vicon's principal point is the centre.
+        (f'VICON_RADIAL="{0.11 / 900**2!r} {-0.02 / 900**4!r}"', K[:2, 2], (0.11, -0.02)),
+        ('VICON_RADIAL2="ViconRadial2 650.5 350.25 0.11 -0.02 0.004"', K[:2, 2], (0.11, -0.02, 0.004)),
+        ('VICON_RADIAL2="ViconRadial2 653.5 349.25 0.06 -0.01"', np.array([653.5, 349.25]), (0.06, -0.01)),
+    ],
+)
+def test_a_calibration_of_vicon(tmp_path, radial, centre_px, per_focal):
+    path = tmp_path / "session.xcp"
+    vicon_file(path, radial)
+    rig = read_rig(path)
+    assert rig.names == ("2121", "2122")
+    for index, (R, t) in enumerate(poses()):
+        pixels = project(rig.cameras[index], POINTS_M)[0]
+        # Vicon's formula, from the distorted to the undistorted point. Distances along y are in pixels of x.
+        scale = K[[0, 1], [0, 1]]
+        arm = (pixels - centre_px) / scale
+        r2 = (arm**2).sum(-1, keepdims=True)
+        gain = 1 + sum(k * r2 ** (power + 1) for power, k in enumerate(per_focal))
+        straight = by_opencv(R, t, K, np.zeros(4))
+        # The fit's error is at most a tenth of a pixel, or there is a warning.
+        np.testing.assert_allclose(centre_px + arm * gain * scale, straight, rtol=0, atol=0.1)
+
+
+def test_cameras_of_vicon_that_record_no_video_or_were_not_calibrated(tmp_path, caplog):
+    path = tmp_path / "session.xcp"
+    vicon_file(path, 'VICON_RADIAL="0 0"')
+    text = path.read_text().replace('TYPE="VideoInputDevice:Blackfly"', 'TYPE="VantageV5"', 1)
+    path.write_text(text)
+    assert read_rig(path).names == ("2122",)
+    assert "1 cameras that record no video are left out" in caplog.text
+    lone = '<Camera DEVICEID="9" SENSOR_SIZE="1280 720"/></Cameras>'
+    path.write_text(text.replace('TYPE="VideoInputDevice:Blackfly"', 'TYPE=""').replace("</Cameras>", lone))
+    assert read_rig(path).names == ("2121", "2122")
+    assert "no lens: camera 9" in caplog.text
+
+
+def test_a_correction_that_folds_the_image_is_refused(tmp_path):
+    path = tmp_path / "session.xcp"
+    vicon_file(path, 'VICON_RADIAL2="ViconRadial2 650.5 350.25 -1.5 0"')
+    with pytest.raises(
+        InputError, match=r"Camera 2121, KeyFrame\.VICON_RADIAL2: expected a correction that keeps"
+    ):
+        read_rig(path)
+
+
+@settings(max_examples=20, deadline=None)
+@given(k1=st.floats(-0.1, 0.25), k2=st.floats(-0.03, 0.03), shift=st.floats(-2, 2))
+def test_the_fit_reaches_the_error_that_it_states(k1, k2, shift):
+    """OpenCV's own undistortion of the corners and edges agrees with the formula within the stated error."""
+    from psotrack.rig_files.radial_fit import fit_distortion
+
+    centre = K[:2, 2] + shift
+    fit = fit_distortion(K, SIZE_WH, centre, np.array([k1, k2]))
+    if fit is None:
+        return
+    coefficients, error_px = fit
+    camera = make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, dist=coefficients.tolist(), image_size_wh=SIZE_WH)
+    pixels = np.array([[0.0, 0.0], [1279, 719], [640, 0], [0, 360], [300, 500], [1279, 0]])
+    arm = (pixels - centre) / K[[0, 1], [0, 1]]
+    r2 = (arm**2).sum(-1, keepdims=True)
+    offset = (centre - K[:2, 2]) / K[[0, 1], [0, 1]]
+    straight = offset + arm * (1 + k1 * r2 + k2 * r2**2)
+    bent = cv2.projectPoints(np.c_[straight, np.ones(6)], np.zeros(3), np.zeros(3), K, coefficients)[0][:, 0]
+    # Points between those of the fit's grid may be a little worse.
+    assert np.abs(bent - pixels).max() <= 1.2 * error_px + 1e-6
+    np.testing.assert_allclose(undistort(camera, bent), straight, atol=1e-6)
+
+
+# --------------------------------------------------------------------------------------------------- EasyMocap
+
+
+def easymocap_files(folder, *, rodrigues=True, size=True):
+    inside = '%YAML:1.0\n---\nnames:\n  - "1"\n  - "07"\n  - "9"\n'
+    outside = '%YAML:1.0\n---\nnames:\n  - "1"\n  - "07"\n'
+    for name in ("1", "07", "9"):
+        inside += matrix(f"K_{name}", K) + matrix(f"dist_{name}", [[*RADTAN, 0.0]])
+        inside += f"H_{name}: 720\nW_{name}: 1280\n" if size else ""
+    for name, (R, t) in zip(("1", "07"), poses(), strict=True):
+        outside += matrix(f"R_{name}", cv2.Rodrigues(R)[0]) if rodrigues else matrix(f"Rot_{name}", R)
+        outside += matrix(f"T_{name}", t[:, None])
+    (folder / "intri.yml").write_text(inside)
+    (folder / "extri.yml").write_text(outside)
+
+
+@pytest.mark.parametrize("name", ["intri.yml", "extri.yml"])
+@pytest.mark.parametrize("rodrigues", [True, False])
+def test_the_two_files_of_easymocap(tmp_path, caplog, name, rodrigues):
+    easymocap_files(tmp_path, rodrigues=rodrigues, size=rodrigues)
+    rig = read_rig(tmp_path / name, None if rodrigues else SIZE_WH)
+    assert rig.names == ("1", "07")
+    assert "no pose: camera 9" in caplog.text
+    assert_projects(rig, [by_opencv(R, t, K, RADTAN) for R, t in poses()])
+
+
+def test_easymocap_without_the_other_file_or_the_size(tmp_path):
+    easymocap_files(tmp_path, size=False)
+    with pytest.raises(InputError, match=r"camera 1\.size or image_size: .* found none; pass --size"):
+        read_rig(tmp_path / "extri.yml")
+    (tmp_path / "intri.yml").unlink()
+    with pytest.raises(InputError, match=r"expected intri\.yml with the lenses beside it"):
+        read_rig(tmp_path / "extri.yml")
+
+
+# --------------------------------------------------------------------------------------------------- Kalibr
+
+
+def kalibr_file(path, *, distortion_model="radtan", camera_model="pinhole", chain=True):
+    (R1, t1), (R2, t2) = poses()
+    step = np.eye(4)
+    step[:3, :3] = R2 @ R1.T
+    step[:3, 3] = t2 - step[:3, :3] @ t1
+    text = ""
+    for index in range(2):
+        text += (
+            f"cam{index}:\n  cam_overlaps: [{1 - index}]\n  camera_model: {camera_model}\n"
+            f"  distortion_coeffs: {lists(RADTAN)}\n  distortion_model: {distortion_model}\n"
+            f"  intrinsics: [{K[0, 0]}, {K[1, 1]}, {K[0, 2]}, {K[1, 2]}]\n  resolution: [1280, 720]\n"
+            f"  rostopic: /cam{index}/image_raw\n"
+        )
+    if chain:
+        text += "  T_cn_cnm1:\n" + "".join(f"  - {lists(row)}\n" for row in step)
+    path.write_text(text)
+
+
+@pytest.mark.parametrize("distortion_model", ["radtan", "equidistant"])
+def test_a_camera_chain_of_kalibr(tmp_path, distortion_model):
+    path = tmp_path / "data-camchain.yaml"
+    kalibr_file(path, distortion_model=distortion_model)
+    rig = read_rig(path)
+    assert rig.names == ("cam0", "cam1")
+    R1, t1 = poses()[0]
+    in_first = POINTS_M @ R1.T + t1
+    for index, (R, t) in enumerate(poses()):
+        expected = by_opencv(R, t, K, RADTAN)
+        if distortion_model == "equidistant":
+            rvec = cv2.Rodrigues(R)[0]
+            expected = cv2.fisheye.projectPoints(POINTS_M[:, None], rvec, t, K, np.array(RADTAN))[0][:, 0]
+        np.testing.assert_allclose(project(rig.cameras[index], in_first)[0], expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"camera_model": "omni"}, r"cam0\.camera_model: expected pinhole, .* found omni"),
+        (
+            {"distortion_model": "fov"},
+            r"cam0\.distortion_model: expected radtan, equidistant or none, found fov",
+        ),
+    ],
+)
+def test_models_that_opencv_does_not_have_are_refused(tmp_path, options, message):
+    path = tmp_path / "camchain.yaml"
+    kalibr_file(path, **options)
+    with pytest.raises(InputError, match=message):
+        read_rig(path)
+
+
+def test_a_gap_in_the_chain_leaves_the_camera_out(tmp_path, caplog):
+    path = tmp_path / "camchain.yaml"
+    kalibr_file(path, chain=False)
+    assert read_rig(path).names == ("cam0",)
+    assert "no pose: camera cam1" in caplog.text
+    path.write_text(path.read_text() + "  : {")
+    with pytest.raises(InputError, match=r"camchain\.yaml, line \d+: expected valid YAML or JSON"):
+        read_rig(path)
+
+
+# --------------------------------------------------------------------------------------------------- DLT, Argus
+
+
+def dlt_columns(*, upwards, skew=0.0):
+    """11 coefficients per camera."""
+    columns = []
+    flip = np.array([[1.0, 0, 0], [0, -1, SIZE_WH[1]], [0, 0, 1]]) if upwards else np.eye(3)
+    for R, t in poses():
+        P = flip @ with_skew(skew) @ np.column_stack([R, t])
+        columns.append((P / P[2, 3]).ravel()[:11])
+    return np.array(columns)
+
+
+@pytest.mark.parametrize("upwards", [False, True])
+@pytest.mark.parametrize("separator", [",", "\t", "  "])
+def test_dlt_coefficients(tmp_path, upwards, separator):
+    columns = dlt_columns(upwards=upwards, skew=0.5)
+    path = tmp_path / "dltcoefs.csv"
+    path.write_text("\n".join(separator.join(map(repr, row)) for row in columns.T.tolist()))
+    with pytest.raises(InputError, match="pass --size"):
+        read_rig(path)
+    with pytest.raises(InputError, match=r"because dlt leaves it open; pass --units"):
+        read_rig(path, SIZE_WH)
+    rig = read_rig(path, SIZE_WH, metres_per_unit=1.0)
+    assert rig.names == ("cam1", "cam2")
+    skewed = with_skew(0.5)
+    np.testing.assert_allclose(rig.cameras.K, [skewed] * 2, rtol=0, atol=1e-7)
+    for index, column in enumerate(columns):
+        # The formula of the format.
+        below = POINTS_M @ column[8:] + 1
+        u, v = (POINTS_M @ column[:3] + column[3]) / below, (POINTS_M @ column[4:7] + column[7]) / below
+        expected = np.stack([u, SIZE_WH[1] - v if upwards else v], axis=-1)
+        np.testing.assert_allclose(project(rig.cameras[index], POINTS_M)[0], expected, rtol=0, atol=1e-6)
+
+
+def test_a_camera_with_the_origin_behind_it_is_turned_round(tmp_path):
+    columns = [*dlt_columns(upwards=False)]
+    R, t = look_at((1.0, 0.0, 0.5), (3.0, 0.2, 0.7))
+    P = K @ np.column_stack([R, t])
+    columns.append((P / P[2, 3]).ravel()[:11])
+    path = tmp_path / "dlt.csv"
+    path.write_text("a,b,c\n" + "\n".join(",".join(map(repr, row)) for row in np.array(columns).T.tolist()))
+    rig = read_rig(path, SIZE_WH, metres_per_unit=1.0)
+    assert rig.names == ("a", "b", "c")
+    np.testing.assert_allclose(rig.cameras.T_cam_world[2, :3], np.column_stack([R, t]), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("\n".join(["1,2"] * 10 + ["nan,1"]), "camera cam1: expected finite numbers"),
+        (
+            "\n".join(["1,2"] * 11),
+            "camera cam1: expected the coefficients of a camera, found a determinant of 0",
+        ),
+    ],
+)
+def test_dlt_coefficients_of_no_camera_are_refused(tmp_path, text, message):
+    (tmp_path / "dlt.csv").write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_rig(tmp_path / "dlt.csv", SIZE_WH, metres_per_unit=1.0)
+
+
+def test_the_lenses_of_argus(tmp_path):
+    path = tmp_path / "cameras-profile.txt"
+    path.write_text(
+        "1 1165.5 1920 1080 960 540 1 -0.2 0.05 0.001 0.002 0.01\n2 800 1280 720 640 360 1.01 0 0 0 0 0\n"
+    )
+    lenses = read_lenses(path)
+    assert lenses.names == ("cam1", "cam2")
+    np.testing.assert_array_equal(lenses.cameras.K[0], [[1165.5, 0, 960], [0, 1165.5, 540], [0, 0, 1]])
+    assert lenses.cameras.K[1, 1, 1] == 808
+    np.testing.assert_array_equal(lenses.cameras.dist[0], [-0.2, 0.05, 0.001, 0.002, 0.01])
+    np.testing.assert_array_equal(lenses.cameras.image_size_wh, [[1920, 1080], [1280, 720]])
+    with pytest.raises(InputError, match="expected the poses of cameras, found none"):
+        read_rig(path)
+
+
+# --------------------------------------------------------------------------------------------------- handpose3d
+
+
+def test_text_blocks_of_handpose3d(tmp_path):
+    for index, (R, t) in enumerate(poses()):
+        rows = ["intrinsic:", *(" ".join(map(repr, row)) for row in K.tolist()), "distortion:"]
+        (tmp_path / f"c{index}.dat").write_text("\n".join([*rows, " ".join(map(repr, RADTAN)) + " 0.0"]))
+        rows = ["R:", *(" ".join(map(repr, row)) for row in R.tolist()), "T:", *map(repr, t.tolist())]
+        (tmp_path / f"rot_trans_c{index}.dat").write_text(
+            "\n".join([*rows, "", "#below is another", "R:", "1 0 0"])
+        )
+    for name in ("c0.dat", "rot_trans_c1.dat"):
+        rig = read_rig(tmp_path / name, SIZE_WH, metres_per_unit=1.0)
+        assert rig.names == ("cam0", "cam1")
+        assert_projects(rig, [by_opencv(R, t, K, RADTAN) for R, t in poses()])
+    (tmp_path / "c1.dat").write_text("intrinsic:\n1 0 x\ndistortion:\n0 0 0 0\n")
+    with pytest.raises(InputError, match=r"c1\.dat, line 2: expected numbers, found '1 0 x'"):
+        read_rig(tmp_path / "c0.dat", SIZE_WH, metres_per_unit=1.0)
+
+
+# --------------------------------------------------------------------------------------------------- all
+
+
+@pytest.mark.parametrize("file", ["rig.toml", "rig.yml", "camera_array.toml", "anipose"])
+def test_every_lens_of_opencv_is_read_as_it_was_written(tmp_path, file):
+    lenses = {
+        "pinhole": ((), False),
+        "thin": ((-0.1, 0.02, 1e-3, 2e-3, 0.01, 0.1, 0.0, 0.02, 1e-3, 2e-3, -1e-3, 5e-4), False),
+        "tilted": (
+            (-0.1, 0.02, 1e-3, 2e-3, 0.01, 0.1, 0.0, 0.02, 1e-3, 2e-3, -1e-3, 5e-4, 0.01, 0.02),
+            False,
+        ),
+        "fisheye": ((0.05, -0.01, 0.003, -0.001), True),
+    }
+    R, t = poses()[0]
+    rig = make_rig(
+        {
+            name: make_camera(R=R, t_m=t, K=with_skew(0.3), image_size_wh=SIZE_WH, dist=dist, fisheye=fisheye)
+            for name, (dist, fisheye) in lenses.items()
+        }
+    )
+    file, file_format = ("calibration.toml", "anipose") if file == "anipose" else (file, None)
+    write_rig(tmp_path / file, rig, file_format=file_format)
+    back = read_rig(tmp_path / file)
+    np.testing.assert_array_equal(back.cameras.K, rig.cameras.K)
+    np.testing.assert_array_equal(back.cameras.dist, rig.cameras.dist)
+    np.testing.assert_array_equal(back.cameras.fisheye, rig.cameras.fisheye)
+
+
+JUNK = [
+    "",
+    "0",
+    "-1",
+    "nan",
+    "1e999",
+    "x",
+    "[]",
+    "{}",
+    "null",
+    "[1",
+    "9" * 20,
+    '"',
+    "é",
+    "\x00",
+    ":",
+    "- a",
+    "&a",
+    "*a",
+]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_damaged_files_are_read_or_refused_in_one_line(tmp_path, seed):
+    """A token of a file is replaced, a line is lost or doubled, or the file ends early."""
+    pose2sim_file(tmp_path / "calib.toml")
+    qualisys_file(tmp_path / "calib.qca.txt")
+    vicon_file(tmp_path / "calib.xcp", 'VICON_RADIAL2="ViconRadial2 650.5 350.25 0.06 -0.01"')
+    easymocap_files(tmp_path)
+    kalibr_file(tmp_path / "camchain.yaml")
+    storage_files(tmp_path)
+    columns = dlt_columns(upwards=True).T.tolist()
+    (tmp_path / "dlt.csv").write_text("\n".join(",".join(map(repr, row)) for row in columns))
+    rng = random.Random(seed)
+    files = sorted(tmp_path.iterdir())
+    messages = []
+    for _ in range(60):
+        path = rng.choice(files)
+        sound = damaged = path.read_text()
+        kind = rng.random()
+        if kind < 0.6:
+            token = rng.choice(list(re.finditer(r"-?\d[\d.e+-]*|\w+|[\[\]{}:,=<>\"/]", sound)))
+            damaged = sound[: token.start()] + rng.choice(JUNK) + sound[token.end() :]
+        elif kind < 0.8:
+            lines = sound.split("\n")
+            place = rng.randrange(len(lines))
+            lines[place : place + 1] = rng.choice([[], [lines[place]] * 2, [lines[place][:5]]])
+            damaged = "\n".join(lines)
+        else:
+            damaged = sound[: rng.randrange(len(sound))]
+        path.write_text(damaged)
+        try:
+            read_rig(path, SIZE_WH, metres_per_unit=1.0)
+        except InputError as error:
+            messages.append(str(error))
+        path.write_text(sound)
+    assert len(messages) > 10
+    assert not [message for message in messages if "\n" in message]
+
+
+@pytest.mark.parametrize("suffix", [".txt", ".csv", ".yml", ".toml", ".dat", ""])
+@pytest.mark.parametrize("content", ["", "hello\nworld\n", "1 2 3\n", "{", "<a>", "[x", "names:\n", "\n\n"])
+def test_no_content_makes_a_traceback(tmp_path, suffix, content):
+    path = tmp_path / f"file{suffix}"
+    path.write_text(content)
+    with pytest.raises(InputError) as error:
+        read_rig(path, SIZE_WH)
+    assert "\n" not in str(error.value)
+    assert str(path) in str(error.value)
