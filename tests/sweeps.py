@@ -107,6 +107,17 @@ OLDER_NAMES = {
 }
 
 
+#: Settings that version 0.1 lacked.
+NEW_NAMES = (
+    "swarm.search",
+    "status.min_cameras_to_begin",
+    "rate_hz",
+    "clocks",
+    "errors.rig_deg",
+    "errors.pixel_px",
+)
+
+
 def make_older(results: Path, older_keys: dict[str, str]) -> None:
     """Turn a folder of results into a folder as version 0.1 wrote it.
 
@@ -118,7 +129,7 @@ def make_older(results: Path, older_keys: dict[str, str]) -> None:
     (results / "errors").mkdir()
     for key, older_key in older_keys.items():
         rows = pd.read_parquet(results / "cells" / f"{key}.parquet")
-        rows = rows.drop(columns=["settings.swarm.search", "settings.status.min_cameras_to_begin"])
+        rows = rows.drop(columns=[f"settings.{name}" for name in NEW_NAMES])
         rows = rows.rename(columns=columns).assign(**{"settings.refinements": 0, "cell": older_key})
         rows.to_parquet(results / "cells" / f"{older_key}.parquet", index=False)
         (results / "cells" / f"{key}.parquet").unlink()

@@ -3,7 +3,6 @@
 Some tests replace the tracker by a tracker that finds no drones, because they do not look at the tracks.
 """
 
-import itertools
 import json
 import os
 import shutil
@@ -104,34 +103,24 @@ def varied(*iterations: int, runs: int = 1) -> dict:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not compiled._MAPS.exists(), reason="this system does not list memory maps")
-def test_a_sweep_over_many_shapes_keeps_few_programs(
+def test_a_sweep_drops_the_programs_of_other_shapes(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each cell compiles programs of its own; the system's limit is replaced by a small one."""
-
-    def maps() -> int:
-        return compiled._MAPS.read_bytes().count(b"\n")
+    """With a limit that is always exceeded, each cell begins without the compiled programs of the cells before."""
+    programs, kept = [], []
 
     def compile_and_find_nothing(_: object, __: object, settings: list) -> list[InputError]:
-        side = settings[0].swarm.iterations
-        for extra in range(4):
-            program = jax.jit(
-                lambda x: jax.lax.scan(lambda c, _: (jnp.sin(c @ c.T) @ c, c.sum()), x, None, 5)
-            )
-            program(jnp.ones((side, side + extra + 2)))
-        counted.append(maps())
+        kept.append([program._cache_size() for program in programs])
+        programs.append(jax.jit(lambda x: jnp.sin(x) @ x))
+        programs[-1](jnp.ones(settings[0].swarm.iterations))
         return [InputError("here", expected="drones", found="none") for _ in settings]
 
-    counted: list[int] = []
     monkeypatch.setattr(runner, "track_runs", compile_and_find_nothing)
-    (tmp_path / "limit").write_text(str(2 * (maps() + 300)))
+    (tmp_path / "limit").write_text("0")
     monkeypatch.setattr(compiled, "_MAP_LIMIT", tmp_path / "limit")
-    allowed = maps() + 300
-    sweep(varied(*range(2, 14)), tmp_path / "out", data=root, cache=root / "cache")
-    assert len(counted) == 12
-    # A cell may exceed the limit by its own programs, each of which has some dozens of maps.
-    assert max(counted) < allowed + 400
-    assert any(after < before for before, after in itertools.pairwise(counted))
+    sweep(varied(2, 3, 4), tmp_path / "out", data=root, cache=root / "cache")
+    assert kept == [[], [0], [0, 0]]
+    assert programs[-1]._cache_size() == 1
 
 
 @pytest.mark.slow
@@ -370,12 +359,14 @@ def test_a_failure_to_read_is_removed_when_the_cell_is_finished(
 ) -> None:
     data = tmp_path / "data"
     shutil.copytree(root / "Simulated_Data" / "S01_D2_A", data / "S01_D2_A")
-    video = next((data / "S01_D2_A").glob("*.mp4"), None) or next((data / "S01_D2_A").glob("*.avi"))
-    video.rename(tmp_path / video.name)
-    with pytest.raises(InputError, match=r"all failed: S01_D2_A swarm.iterations=3: .*expected a video"):
+    calibration = data / "S01_D2_A" / "cameras_calibration.csv"
+    calibration.rename(tmp_path / calibration.name)
+    with pytest.raises(
+        InputError, match=r"all failed: S01_D2_A swarm.iterations=3: .*found neither recording.toml nor"
+    ):
         sweep(varied(3), tmp_path / "out", data=data, cache=root / "cache")
     assert Store(tmp_path / "out").status()["failed"] == 1
-    (tmp_path / video.name).rename(video)
+    (tmp_path / calibration.name).rename(calibration)
     rows = sweep(varied(3), tmp_path / "out", data=data, cache=root / "cache")
     assert Store(tmp_path / "out").status()["failed"] == 0
     assert rows.attrs["errors"] == []

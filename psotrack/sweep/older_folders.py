@@ -46,7 +46,7 @@ def rename_columns(rows: pd.DataFrame) -> pd.DataFrame:
         return rows
     gone = {f"settings.{name}": value for name, value in _GONE.items()}
     unused = [name for name, value in gone.items() if name in rows and (rows[name] == value).all()]
-    new = {f"settings.{name}": value for name, value in _NEW.items() if value is not None}
+    new = {f"settings.{name}": value for name, value in _NEW.items()}
     return rows.drop(columns=unused).rename(columns=columns).assign(**new)
 
 
