@@ -1,0 +1,165 @@
+"""The result of a run: trajectories with names that last, and the record."""
+
+from __future__ import annotations
+
+import logging
+import platform
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from typing import Any
+
+import jax
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.camera_errors import TrackErrors
+from psotrack.clocks import CameraClocks
+from psotrack.errors import InputError
+from psotrack.identity import Identities, postprocess
+from psotrack.initiation import find_cut_off, find_outside
+from psotrack.methods import MethodResult
+from psotrack.pipeline.parts import Parts
+from psotrack.pipeline.preparation import PreparedRun
+from psotrack.recordings import Recording
+from psotrack.settings import MotionSettings
+from psotrack.silhouettes import Silhouettes
+from psotrack.trajectories import DroneSizes, Trajectories
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class TrackedRecording:
+    """The result of tracking a recording.
+
+    Attributes:
+        trajectories: positions and covariances of every drone in every frame.
+        size_m: (drones, 3), full lengths of each drone along the world's axes, as learned, metres.
+        identities: which drones may have been taken for each other, and when.
+        record: settings, versions, device, input keys and seconds per stage, fit for JSON.
+    """
+
+    trajectories: Trajectories
+    size_m: Float[np.ndarray, "drones 3"]
+    identities: Identities
+    record: Mapping[str, Any]
+
+    def __repr__(self) -> str:
+        frames, drones = self.trajectories.num_frames, self.trajectories.num_drones
+        return (
+            f"TrackedRecording({self.record['sequence']}: {drones} drones, {frames} frames, "
+            f"{self.trajectories.seen.mean():.1%} seen, {self.record['seconds']['total']:.1f} s)"
+        )
+
+
+def finish(
+    recording: Recording,
+    silhouettes: Silhouettes | None,
+    run: PreparedRun,
+    parts: Parts,
+    result: MethodResult,
+    clocks: CameraClocks | None = None,
+) -> TrackedRecording | InputError:
+    """Resolve identities, smooth, move to the body's origin, and write the record of one run."""
+    settings, tracks = run.settings, result.tracks
+    limited = find_outside(run.volume) or find_cut_off(tracks, run.volume, recording.fps)
+    if limited is not None:
+        logger.warning("%s", limited)
+    if not tracks.num_drones:
+        return InputError(
+            recording.folder,
+            expected="drones",
+            found="none in any frame",
+            remedy="look at what the cameras see (`psotrack silhouettes`), or give the drones' first positions (init)",
+        )
+    began = time.perf_counter()
+    errors = result.errors
+    trajectories, identities = postprocess(
+        tracks,
+        settings.motion,
+        settings.identity,
+        fps=recording.fps,
+        smoothing=None if not settings.smooth else _smoothing(settings.motion, errors),
+    )
+    if errors is not None:
+        trajectories = errors.added_to(
+            trajectories, identities.order if settings.identity.resolve_swaps else None
+        )
+    body_m = trajectories.position_m - settings.drones.body_offset_m
+    timeline = recording.timeline()
+    trajectories = replace(trajectories, position_m=body_m, time_s=timeline.time_s)
+    of_silhouettes = {"decode": 0.0, "foreground": 0.0} if silhouettes is None else silhouettes.seconds
+    seconds = {**of_silhouettes, **result.seconds, "finish": _finish_s(result, began)}
+    own_s = sum(seconds[stage] for stage in ("track", "compile", "finish"))
+    record = {
+        "sequence": recording.name,
+        "frames": trajectories.num_frames,
+        "cameras": list(recording.rig.names),
+        "rate_hz": timeline.rate_hz,
+        "camera_times": _times_record(recording),
+        **({} if clocks is None else {"camera_clocks": clocks.record(recording.rig.names)}),
+        "settings": msgspec.to_builtins(settings),
+        **({"parts": parts.record} if parts.record else {}),
+        "seed": settings.seed,
+        "start": {name: value.tolist() for name, value in vars(result.initial).items()},
+        "bounds_m": run.bounds_m.tolist(),
+        "volume": run.volume.record,
+        "drones": _sizes_record(tracks.sizes),
+        "arrivals": [asdict(arrival) for arrival in tracks.arrivals],
+        "points": [asdict(point) for point in result.points],
+        "camera_errors": {} if errors is None else errors.record(recording.rig.names),
+        "encounters": [asdict(encounter) for encounter in identities.encounters],
+        "input_keys": dict(result.input_keys),
+        "seconds": {stage: round(value, 4) for stage, value in (seconds | {"total": own_s}).items()},
+        **environment(),
+    }
+    return TrackedRecording(trajectories, tracks.sizes.size_m, identities, record)
+
+
+def environment() -> dict[str, Any]:
+    """Versions and device on which a result depends, fit for JSON."""
+    packages = ("psotrack", "jax", "jaxlib", "numpy", "opencv-python-headless", "zarr")
+    device = jax.devices()[0]
+    return {
+        "versions": {"python": platform.python_version()} | {name: version(name) for name in packages},
+        "device": {"platform": device.platform, "kind": device.device_kind, "machine": platform.machine()},
+    }
+
+
+def _times_record(recording: Recording) -> dict[str, dict[str, Any]]:
+    """When each camera's frames were exposed, as the tracker used it, fit for JSON."""
+    return {
+        name: {"fps": times.fps, "time_offset_s": times.time_offset_s, "frames": times.num_frames}
+        for name, times in recording.frame_times.items()
+        if name in recording.rig.names
+    }
+
+
+def _smoothing(motion: MotionSettings, errors: TrackErrors | None) -> MotionSettings:
+    """The motion model of the smoother: how errors fade is known once the whole recording was seen."""
+    return motion if errors is None else errors.smoothing(motion)
+
+
+def _finish_s(result: MethodResult, began: float) -> float:
+    return result.seconds.get("finish", 0.0) + time.perf_counter() - began
+
+
+def _sizes_record(sizes: DroneSizes) -> list[dict[str, Any]]:
+    """What was learned of each drone's size, fit for JSON: null for what is not known."""
+
+    def or_none(values: np.ndarray) -> list[float | None]:
+        return [None if np.isnan(value) else float(value) for value in values]
+
+    return [
+        {
+            "drone": drone,
+            "size_m": sizes.size_m[drone].tolist(),
+            "size_std_m": or_none(sizes.std_m[drone]),
+            "size_frames": sizes.num_frames[drone].tolist(),
+            "fill": or_none(sizes.fill[drone]),
+        }
+        for drone in range(len(sizes.size_m))
+    ]

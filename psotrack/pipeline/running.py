@@ -1,0 +1,160 @@
+"""The list of stages, from a recording to trajectories and a record.
+
+    recording -> silhouettes or detections -> room bounds -> initial state -> tracking -> fusion
+              -> identity and smoothing -> record
+
+`track_recording` is what the command line, sweeps and notebooks call; `track_runs` does the stages for many settings at
+once. Only this module knows the whole recording and the whole settings: each stage is given what it needs, and
+returns a result.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+
+from psotrack.detection import stored_detections
+from psotrack.errors import InputError, SettingsError
+from psotrack.initiation import MovingPoints
+from psotrack.methods import MethodResult, usable_for
+from psotrack.pipeline.clock_correction import advise_on_clocks, estimate_clocks, with_clocks
+from psotrack.pipeline.parts import Parts, check_detector_is_used
+from psotrack.pipeline.preparation import PreparedRun, prepare
+from psotrack.pipeline.results import TrackedRecording, finish
+from psotrack.pipeline.stages import (
+    initial_states,
+    track_detections,
+    track_silhouettes,
+    track_with_plugin,
+    with_errors_of_cameras,
+)
+from psotrack.recordings import Recording
+from psotrack.settings import TrackSettings
+from psotrack.silhouettes import Silhouettes, compute
+from psotrack.support import Report, no_progress
+
+
+def track_recording(
+    recording: Recording,
+    settings: TrackSettings = TrackSettings(),  # noqa: B008  frozen
+    *,
+    cache: Path | str,
+    jobs: int | None = None,
+    parts: Parts = Parts(),  # noqa: B008  frozen
+    report: Report = no_progress,
+) -> TrackedRecording:
+    """Track the drones of a recording from its videos.
+
+    Args:
+        recording: the recording; cameras that the method cannot use are left out with a warning.
+        settings: settings of the run.
+        cache: folder of the stored silhouettes and detections.
+        jobs: number of processes that make silhouettes; None is one per processor.
+        parts: parts that the caller brings.
+        report: shows the progress of each stage, in frames.
+
+    Raises:
+        InputError: a video cannot be used, or the drones cannot be found.
+        SettingsError: a setting does not fit the recording.
+        OutputError: the silhouettes or the detections cannot be stored.
+    """
+    began = time.perf_counter()
+    needs_silhouettes = settings.needs_silhouettes or parts.method is not None
+    recording = usable_for(recording, settings, videos=needs_silhouettes or parts.detector is not None)
+    if parts.detector is not None:
+        check_detector_is_used(settings, parts)
+        folder = stored_detections(parts.detector, recording, cache=cache, report=report)
+        settings = msgspec.structs.replace(settings, detections=str(folder))
+    silhouettes = None
+    if needs_silhouettes:
+        silhouettes = compute(
+            recording,
+            settings.silhouettes,
+            cache=Path(cache),
+            jobs=jobs,
+            background=parts.background,
+            report=report,
+        )
+    (tracked,) = track_runs(recording, silhouettes, [settings], parts=parts, report=report)
+    if isinstance(tracked, InputError):
+        raise tracked
+    if settings.clocks == "given" and len(recording.rig) > 2:
+        advise_on_clocks(recording, silhouettes, settings, tracked.trajectories)
+    seconds = tracked.record["seconds"] | {"total": round(time.perf_counter() - began, 4)}
+    return replace(tracked, record={**tracked.record, "seconds": seconds})
+
+
+def track_runs(
+    recording: Recording,
+    silhouettes: Silhouettes | None,
+    settings: Sequence[TrackSettings],
+    *,
+    parts: Parts = Parts(),  # noqa: B008  frozen
+    report: Report = no_progress,
+) -> list[TrackedRecording | InputError]:
+    """Track a recording once for each of the settings; on a CPU each result has the same bits as from the run alone.
+
+    Runs of the swarm form a batch if they have the same number of drones, and if their settings differ only in the seed
+    and in numbers other than `swarm.particles` and `score.windows`. The runs of a batch share one compiled program and
+    one copy of the silhouettes; an accelerator computes them side by side. The runs are spread over all devices
+    (`jax.devices()`). The seconds of a run are its share of the seconds of all runs.
+
+    Args:
+        recording: a recording that was checked for use (see `Recording.usable`).
+        silhouettes: silhouettes of all cameras; None where no run needs them (see `TrackSettings.needs_silhouettes`).
+        settings: settings of each run.
+        parts: parts that the caller brings, for all runs.
+        report: shows the progress in frames; the runs of the swarm go through the frames together.
+
+    Returns:
+        For each run its result, or the error that explains why the run has none.
+
+    Raises:
+        InputError: there is no reference or file for the initial state, or detections cannot be read.
+        SettingsError: a setting does not fit the recording.
+    """
+    if silhouettes is None and (parts.method is not None or any(each.needs_silhouettes for each in settings)):
+        raise SettingsError("silhouettes", expected="silhouettes of all cameras", found="none")
+    tracked: dict[int, TrackedRecording | InputError] = {}
+    for rate_hz in dict.fromkeys(each.rate_hz for each in settings):
+        numbers = [number for number, each in enumerate(settings) if each.rate_hz == rate_hz]
+        timed = replace(recording, rate_hz=rate_hz or recording.rate_hz)
+        shown = None if silhouettes is None else silhouettes.at_instants(timed.timeline())
+        results = _track_at_instants(timed, shown, [settings[number] for number in numbers], parts, report)
+        for number, (run, result) in zip(numbers, results, strict=True):
+            if run.settings.clocks == "auto" and result.tracks.num_drones:
+                clocks = estimate_clocks(timed, shown, run, result)
+                corrected = with_clocks(timed, clocks)
+                again = None if silhouettes is None else silhouettes.at_instants(corrected.timeline())
+                ((run, result),) = _track_at_instants(corrected, again, [settings[number]], parts, report)
+                tracked[number] = finish(corrected, again, run, parts, result, clocks)
+            else:
+                tracked[number] = finish(timed, shown, run, parts, result)
+    return [tracked[number] for number in range(len(settings))]
+
+
+def _track_at_instants(
+    recording: Recording,
+    silhouettes: Silhouettes | None,
+    settings: Sequence[TrackSettings],
+    parts: Parts,
+    report: Report,
+) -> list[tuple[PreparedRun, MethodResult]]:
+    """Each run and the result of its method; the silhouettes are those at the recording's instants."""
+    points: dict[str, MovingPoints] = {}
+    runs = [prepare(recording, silhouettes, each, parts, points, report) for each in settings]
+    by_lines = [track_detections(recording, run, report) for run in runs]
+    initial = initial_states(recording, silhouettes, runs, by_lines)
+    by_swarm = track_silhouettes(recording, silhouettes, runs, initial, parts, report)
+    by_plugin = [
+        track_with_plugin(recording, silhouettes, run, state, report)
+        for run, state in zip(runs, initial, strict=True)
+    ]
+    return [
+        (run, plugin or with_errors_of_cameras(recording, silhouettes, run, swarm, lines))
+        for run, lines, swarm, plugin in zip(runs, by_lines, by_swarm, by_plugin, strict=True)
+    ]
