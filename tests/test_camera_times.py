@@ -63,7 +63,7 @@ def alike(num_frames=150, cameras=RIG.names):
     return {name: FrameTimes(num_frames, FPS) for name in cameras}
 
 
-def late(frames, num_frames=150):
+def exposed_later(frames, num_frames=150):
     """Times of cameras whose frame k was exposed at k + frames[camera]."""
     return {
         name: FrameTimes(num_frames, FPS, number / FPS)
@@ -122,7 +122,7 @@ def test_a_camera_whose_offset_is_not_known_keeps_its_times():
 def test_clocks_that_are_off_by_up_to_two_frames_are_found(largest):
     frames = largest * np.array([0.0, 1.0, -0.9, 0.35, -0.4])
     timeline = make_timeline(alike())
-    found = clocks_of_tracks(RIG, sightings_of(late(frames)), timeline, tracked(timeline, 0.3 / FPS))
+    found = clocks_of_tracks(RIG, sightings_of(exposed_later(frames)), timeline, tracked(timeline, 0.3 / FPS))
     error_s = found.offset_s - (frames - np.median(frames)) / FPS
     error_s -= error_s.mean()
     assert (np.abs(error_s) < 1e-3).all()
@@ -134,7 +134,7 @@ def test_clocks_that_are_off_by_up_to_two_frames_are_found(largest):
 
 def test_a_camera_that_sees_nothing_changes_nothing_for_the_others():
     frames = np.array([0.0, 1.0, -0.9, 0.35, -0.4])
-    shown = late(frames) | {RIG.names[1]: FrameTimes(0, FPS)}
+    shown = exposed_later(frames) | {RIG.names[1]: FrameTimes(0, FPS)}
     timeline = make_timeline(alike())
     found = clocks_of_tracks(RIG, sightings_of(shown), timeline, tracked(timeline))
     others = [0, 2, 3, 4]
@@ -203,7 +203,7 @@ def lines_errors(times, given=None, **options):
 @pytest.mark.slow
 def test_detections_of_cameras_that_are_exposed_at_different_times():
     """Frames half an interval apart give positions nearly as good as synchronous frames."""
-    shown = late([0.0, 0.5, -0.5, 0.25, -0.3], 80)
+    shown = exposed_later([0.0, 0.5, -0.5, 0.25, -0.3], 80)
     synchronous_m, _ = lines_errors(alike(80))
     error_m, inside = lines_errors(shown)
     ignored_m, _ = lines_errors(shown, alike(80))
@@ -238,7 +238,7 @@ def test_a_path_from_cameras_with_times_of_their_own():
 
 
 def test_drones_are_found_in_blobs_of_cameras_with_times_of_their_own():
-    times = late([0.0, 0.5, -0.4, 0.3, -1.2], 10)
+    times = exposed_later([0.0, 0.5, -0.4, 0.3, -1.2], 10)
     timeline = make_timeline(times).part(slice(9))
     shown = sightings_of(times, noise_px=0.0).at_instants(timeline)
     seen = ViewBlobs(shown.centre_px, shown.size_px / 2, np.isfinite(shown.noise_px), 3.0)

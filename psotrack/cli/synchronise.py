@@ -66,16 +66,20 @@ def synchronise(
     output_json(json_path, _content(offset, estimate, reference), force)
     if plot is not None:
         save_curve(plot if plot.name else tracks.with_suffix(".offset.png"), offset, force=force)
+    print_line(quiet, json_path, f"{recording.name}: {offset_in_words(offset, recording.fps)}")
+
+
+def offset_in_words(offset: Offset, fps: float) -> str:
+    """What was found, in one line."""
     before = (
         "nothing to compare" if offset.mean_distance_before_m is None else _mm(offset.mean_distance_before_m)
     )
-    print_line(
-        quiet,
-        json_path,
-        f"{recording.name}: the reference's clock is {abs(offset.offset_s):.4f} s "
-        f"(± {offset.std_s:.4f} s) {'ahead of' if offset.offset_s >= 0 else 'behind'} the videos' "
-        f"({offset.offset_s * recording.fps:+.2f} frames); mean distance, lever arms taken out: "
-        f"{before} before, {_mm(offset.mean_distance_m)} after",
+    ahead = offset.offset_s >= 0
+    return (
+        f"the reference's clock is {abs(offset.offset_s):.4f} s (± {offset.std_s:.4f} s) "
+        f"{'ahead of' if ahead else 'behind'} the videos' ({offset.offset_s * fps:+.2f} frames): the videos show the "
+        f"scene {'early' if ahead else 'late'}; mean distance, lever arms taken out: "
+        f"{before} before, {_mm(offset.mean_distance_m)} after"
     )
 
 

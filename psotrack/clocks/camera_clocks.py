@@ -1,10 +1,10 @@
 """Offsets between the clocks of cameras, from the motion of drones that several cameras see.
 
-A late camera sees a drone where the other cameras will see the drone later: its detection is off the epipolar lines by
-the drone's motion in the image times the delay. The offsets of all cameras and the points in space are estimated
-together by Gauss-Newton steps in which the points are eliminated (`psotrack.estimation`), until the offsets settle.
-Each detection is weighted by how well it fits (S. Geman and D. E. McClure, Statistical Methods for Tomographic Image
-Reconstruction, 1987).
+A video that shows the scene late shows a drone where the drone was when the other cameras exposed the same frame: its
+detection is off the epipolar lines by the drone's motion in the image times the delay. The offsets of all cameras and
+the points in space are estimated together by Gauss-Newton steps in which the points are eliminated
+(`psotrack.estimation`), until the offsets settle. Each detection is weighted by how well it fits (S. Geman and D. E.
+McClure, Statistical Methods for Tomographic Image Reconstruction, 1987).
 
 Errors of neighbouring frames are not independent: the middle of a drone's box is off in nearly the same way for as long
 as the drone flies in the same attitude. The standard deviations therefore use the autocovariance of the residuals
@@ -54,8 +54,8 @@ class CameraOffsets:
     """Offsets between the clocks of cameras.
 
     Attributes:
-        offset_frames: (cameras,), frames: a camera took its frame k at time k + offset of the common clock. The mean of
-            the offsets is 0. A camera with a positive offset is late.
+        offset_frames: (cameras,), frames: a camera exposed its frame k at time k + offset of the common clock, as a
+            `time_offset_s` says it. The mean of the offsets is 0.
         std_frames: (cameras,), standard deviations of the offsets, frames; near `max_offset_frames` for a camera whose
             detections do not show its offset.
         rms_before_px: weighted root mean square distance of the detections from the projections if all offsets are 0,
@@ -67,6 +67,11 @@ class CameraOffsets:
     std_frames: Float[np.ndarray, "cameras"]
     rms_before_px: float
     rms_after_px: float
+
+    @property
+    def late_frames(self) -> Float[np.ndarray, "cameras"]:
+        """(cameras,), by how many frames each video shows the scene late; negative for a video that is early."""
+        return -self.offset_frames
 
 
 def camera_offsets(

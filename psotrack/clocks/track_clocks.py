@@ -40,8 +40,8 @@ class CameraClocks:
     A frame that was given the time t was exposed at t + offset + drift * (t - middle).
 
     Attributes:
-        offset_s: (cameras,), offset in the middle of the recording, seconds; the median is 0. A camera whose video
-            shows the scene late has a negative offset. 0 for a camera whose sightings do not show the offset.
+        offset_s: (cameras,), offset in the middle of the recording, seconds; the median is 0. A video that shows the
+            scene late has a negative offset. 0 for a camera whose sightings do not show the offset.
         offset_std_s: (cameras,), standard deviations of the offsets, seconds; infinite for a camera that shows nothing.
         drift: (cameras,), seconds per second; 0 where none is certain.
         drift_std: (cameras,), standard deviations of the drifts; infinite where the recording is too short.
@@ -53,6 +53,11 @@ class CameraClocks:
     drift: Float[np.ndarray, "cameras"]
     drift_std: Float[np.ndarray, "cameras"]
     middle_s: float
+
+    @property
+    def late_s(self) -> Float[np.ndarray, "cameras"]:
+        """(cameras,), by how much each video shows the scene late, seconds; negative for a video that is early."""
+        return -self.offset_s
 
     def corrected(
         self, frame_times: Mapping[str, FrameTimes], cameras: Sequence[str]
@@ -72,16 +77,18 @@ class CameraClocks:
         """Corrections by camera name, fit for JSON; None for a standard deviation that is not known."""
 
         def rows() -> Any:
-            return zip(cameras, self.offset_s, self.offset_std_s, self.drift, self.drift_std, strict=True)
+            values = (self.offset_s, self.late_s, self.offset_std_s, self.drift, self.drift_std)
+            return zip(cameras, *values, strict=True)
 
         return {
             name: {
                 "offset_s": float(offset_s),
+                "late_s": float(late_s),
                 "offset_std_s": float(offset_std_s) if np.isfinite(offset_std_s) else None,
                 "drift": float(drift),
                 "drift_std": float(drift_std) if np.isfinite(drift_std) else None,
             }
-            for name, offset_s, offset_std_s, drift, drift_std in rows()
+            for name, offset_s, late_s, offset_std_s, drift, drift_std in rows()
         }
 
     def is_certain(self, least_s: float, multiple: float = 5.0) -> Bool[np.ndarray, "cameras"]:

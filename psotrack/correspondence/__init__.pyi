@@ -1,7 +1,7 @@
 from .assignment import SEPARATION_M
 from .epipolar import epipolar_distance
 from .groups import NEW_GROUP_COST, SHARED_COST, UNEXPLAINED_COST
-from .matching import Matches, match
+from .matching import Matches, match, wide_bounds
 from .padded_sightings import in_images
 from .sightings import (
     BORDER_PX,
@@ -31,4 +31,5 @@ __all__ = [
     "from_silhouettes",
     "in_images",
     "match",
+    "wide_bounds",
 ]

@@ -12,7 +12,10 @@ from psotrack.correspondence.groups import SHARED_COST, UNEXPLAINED_COST, Groups
 from psotrack.correspondence.padded_sightings import BY_PLACE, PaddedSightings, make_priors, pad_sightings
 from psotrack.correspondence.proposals import propose_groups
 from psotrack.errors import SettingsError
-from psotrack.geometry import Camera, triangulate
+from psotrack.geometry import Camera, Rig, triangulate
+
+#: Drones are searched up to this many times the distance between the outermost cameras, metres at least.
+REACH, LEAST_REACH_M = 20.0, 20.0
 
 
 @dataclass(frozen=True)
@@ -129,3 +132,13 @@ def _ambiguity(padded: PaddedSightings, groups: Groups, proposed: Groups) -> Flo
         likelihood = np.exp(min(gained, 0.0) / 2)
         ambiguity[rival[which]] = np.maximum(ambiguity[rival[which]], likelihood)
     return ambiguity
+
+
+def wide_bounds(rig: Rig) -> Float[np.ndarray, "2 3"]:
+    """(2, 3), corners of a region so wide that no drone is outside, metres, for recordings without given bounds.
+
+    Drones fly far above cameras on the ground.
+    """
+    centre_m = rig.cameras.centre_world
+    reach_m = max(REACH * float(np.linalg.norm(np.ptp(centre_m, axis=0))), LEAST_REACH_M)
+    return np.stack([centre_m.min(axis=0) - reach_m, centre_m.max(axis=0) + reach_m])

@@ -12,8 +12,6 @@ from psotrack.geometry import Camera, Rig, reconstruct, viewpoints
 
 #: Smallest number of viewpoints of a point: two viewpoints often agree by chance.
 MIN_VIEWPOINTS = 3
-#: Distance from the cameras to the bounds, in units of the rig's own size.
-_WIDE = 30.0
 #: Largest squared distance of a sighting from the projection of its point, squared standard deviations: 1 in 1000 right
 #: sightings is farther (χ² distribution, two degrees of freedom).
 MAX_SQUARED_DISTANCE = 13.8
@@ -109,10 +107,3 @@ def num_viewpoints(cameras: Camera, seen: Bool[np.ndarray, "points cameras"]) ->
     label = viewpoints(cameras)
     at = label[:, None] == np.unique(label)
     return (seen.astype(int) @ at.astype(int) > 0).sum(axis=-1)
-
-
-def wide_bounds(rig: Rig) -> Float[np.ndarray, "2 3"]:
-    """Bounds so wide that no body is outside: drones fly far above cameras on the ground, and a rig may be wrong."""
-    centre_m = rig.cameras.centre_world
-    reach_m = _WIDE * float(np.linalg.norm(np.ptp(centre_m, axis=0))) + 1.0
-    return np.stack([centre_m.min(axis=0) - reach_m, centre_m.max(axis=0) + reach_m])

@@ -14,8 +14,8 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.correspondence import Sightings, epipolar_distance
-from psotrack.doctor.agreement import MIN_VIEWPOINTS, Agreement, measure_agreement, wide_bounds
+from psotrack.correspondence import Sightings, epipolar_distance, wide_bounds
+from psotrack.doctor.agreement import MIN_VIEWPOINTS, Agreement, measure_agreement
 from psotrack.doctor.camera_faults import MIN_POINTS_OF_CAMERA, collect_views, explain_camera
 from psotrack.doctor.common_points import CommonPoints, find_common_points
 from psotrack.doctor.fault_search import find_faults

@@ -25,11 +25,9 @@ def measure_lags(
     if len(rig) < 2 or not np.isfinite(tracks_px).any():
         return nothing[0], nothing[1]
     clocks = camera_offsets(rig, tracks_px, fps)
-    # A camera that exposes its frame i later than the others shows the scene early.
-    lag = -clocks.offset_frames
     # The known part of the differences in time is no fault.
     seen = points.seen
-    lag = lag + (seen * points.offset_frames).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
+    lag = clocks.late_frames + (seen * points.offset_frames).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
     return lag - np.median(lag), clocks.std_frames
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.correspondence import Sightings, from_silhouettes, match
+from psotrack.correspondence import Sightings, from_silhouettes, match, wide_bounds
 from psotrack.geometry import Rig, reconstruct, viewpoints
 from psotrack.initiation.initial_state import room_bounds
 from psotrack.settings import USUAL_SPEED_M_S
@@ -29,8 +29,6 @@ STEP_S = 0.04
 FASTEST_M_S, LARGEST_ACCELERATION_M_S2 = 60.0, 15.0
 #: Largest number of sightings per image: of noisy silhouettes the largest blobs count.
 MOST_SIGHTINGS = 12
-#: Points are searched up to this many times the distance between the outermost cameras, metres at least.
-REACH, LEAST_REACH_M = 20.0, 20.0
 #: A point counts if its standard deviation is below this share of its distance from the cameras.
 MOST_VAGUE = 0.1
 #: The volume reaches beyond the points by this share of their extent, metres at least.
@@ -215,9 +213,7 @@ class _Points:
 
 def _triangulated(rig: Rig, sightings: Sightings) -> list[_Points]:
     """The points of each frame in which detections of enough cameras agree."""
-    centre_m = rig.cameras.centre_world
-    reach_m = max(REACH * float(np.linalg.norm(np.ptp(centre_m, axis=0))), LEAST_REACH_M)
-    wide_m = np.stack([centre_m.min(axis=0) - reach_m, centre_m.max(axis=0) + reach_m])
+    centre_m, wide_m = rig.cameras.centre_world, wide_bounds(rig)
     points = []
     for frame in range(sightings.num_frames):
         view = sightings.at(frame).largest(MOST_SIGHTINGS)

@@ -57,11 +57,12 @@ def advise_on_clocks(
     if certain.any():
         worst = int(np.where(certain, np.abs(clocks.offset_s), 0.0).argmax())
         logger.warning(
-            "camera %s is %s by %.0f ± %.0f ms against the other cameras; --clocks auto takes the clocks from the data",
+            "camera %s: its video shows the scene %.0f ± %.0f ms %s, against the other cameras; "
+            "--clocks auto takes the clocks from the data",
             recording.rig.names[worst],
-            "late" if clocks.offset_s[worst] < 0 else "early",
-            1e3 * abs(clocks.offset_s[worst]),
+            1e3 * abs(clocks.late_s[worst]),
             1e3 * clocks.offset_std_s[worst],
+            "late" if clocks.late_s[worst] > 0 else "early",
         )
 
 
