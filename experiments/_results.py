@@ -115,7 +115,7 @@ class Run:
         self._result = registry()[name]
         self._facts = {
             "result": name,
-            "command": shlex.join(["python", *_relative(sys.argv)]),
+            "command": " ".join(["python", *_portable(sys.argv, self._result.commands)]),
             "commit": _git("rev-parse", "HEAD") or None,
             "dirty": dirty(self._result.code),
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -338,10 +338,21 @@ def make(names: Sequence[str], *, force: bool) -> int:
             print(f"{result.name}: as new as its code", flush=True)
             continue
         print(f"{result.name}: about {result.minutes:g} minutes on two cores", flush=True)
+        missing = [name for name in _variables(result.commands) if not os.environ.get(name)]
+        if missing:
+            print(
+                f"{result.name}: expected a value of {', '.join(missing)} in the environment, found none",
+                file=sys.stderr,
+            )
+            failed.append(result.name)
+            continue
         began = time.monotonic()
         for command in result.commands:
             print(f"$ {command}", flush=True)
-            words = [sys.executable if word == "python" else word for word in shlex.split(command)]
+            words = [
+                sys.executable if word == "python" else os.path.expandvars(word)
+                for word in shlex.split(command)
+            ]
             if subprocess.run(words, cwd=ROOT, env=environment, check=False).returncode:
                 failed.append(result.name)
                 break
@@ -369,9 +380,26 @@ def _listed(names: Sequence[str]) -> str:
     )
 
 
-def _relative(words: Sequence[str]) -> list[str]:
-    """Words of a command with paths below the repository's root written relative to the root."""
-    return [word.removeprefix(f"{ROOT}/") for word in words]
+def _portable(words: Sequence[str], commands: Iterable[str]) -> list[str]:
+    """Words of a command, quoted, without paths of this machine.
+
+    Paths below the repository's root are relative to the root, and a word that begins with the value of a variable of
+    the declared commands begins with the variable's name.
+    """
+    values = {os.environ[name]: f"${name}" for name in _variables(commands) if os.environ.get(name)}
+    quoted = []
+    for word in words:
+        value = next((value for value in values if word == value or word.startswith(f"{value}/")), None)
+        if value is None:
+            quoted.append(shlex.quote(word.removeprefix(f"{ROOT}/")))
+        else:
+            quoted.append(values[value] + shlex.quote(word[len(value) :]).removesuffix("''"))
+    return quoted
+
+
+def _variables(commands: Iterable[str]) -> list[str]:
+    """Names of the environment variables in commands, such as $PSOTRACK_REAL_DATA."""
+    return sorted({name for command in commands for name in re.findall(r"\$([A-Z_]+)", command)})
 
 
 def _from(path: Path, folder: Path) -> str:

@@ -131,6 +131,25 @@ def test_a_failing_command_is_named_and_the_exit_code_is_1(project: Path) -> Non
     assert "failed: speed" in failed.stderr
 
 
+def test_variables_of_a_command_are_expanded_and_recorded_by_name(
+    project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    registry = project / "experiments" / "results.toml"
+    registry.write_text(REGISTRY.replace('speed.py"]\ncode', 'speed.py $MY_DATA/room $MY_PYTHON"]\ncode'))
+    (project / "experiments" / "speed.py").write_text(
+        "import sys\nassert sys.argv[1:] == ['/a/my data/room', 'python3'], sys.argv\n" + SCRIPT
+    )
+    monkeypatch.setenv("MY_DATA", "/a/my data")
+    unset = run_results_script(project, "make")
+    assert unset.returncode == 1
+    assert "speed: expected a value of MY_PYTHON in the environment, found none" in unset.stderr
+    monkeypatch.setenv("MY_PYTHON", "python3")
+    made = run_results_script(project, "make")
+    assert made.returncode == 0, made.stderr
+    record = json.loads((project / "experiments" / "results" / "speed.json").read_text())
+    assert record["command"] == "python experiments/speed.py $MY_DATA/room $MY_PYTHON"
+
+
 def test_an_unknown_result_is_one_line(project: Path) -> None:
     unknown = run_results_script(project, "check", "sped")
     assert unknown.returncode == 1
