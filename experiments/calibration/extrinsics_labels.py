@@ -7,7 +7,8 @@ neighbouring labels, an AR(1) process, of 0, 1.5 or 3 px; some labels are on som
 `locate_camera`, by OpenCV, and by least squares of exactly the labels that are on the drone ("true labels"), which no
 program knows. The poses are measured on another flight: on its labels, which have errors of the same kind ("left out"),
 and on the drone itself ("exact"). A ratio is an error over that of OpenCV, which counts as a tenth of a pixel at least.
-"refused" counts the draws in which `locate_camera` finds two poses that fit equally well; these have no ratio. The 95 % interval of the mean ratio is a bootstrap over the draws.
+"refused" counts the draws in which `locate_camera` finds two poses that fit equally well; these have no ratio. The
+95 % interval of the mean ratio is a bootstrap over the draws.
 Writes OUT/extrinsics_labels.csv.
 """
 
@@ -23,6 +24,7 @@ import numpy as np
 import pandas as pd
 
 from psotrack.calibration import locate_camera
+from psotrack.errors import InputError
 from psotrack.geometry import look_at, make_camera, project
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -59,8 +61,10 @@ def main() -> None:
 def summary(labels: int, lasting_px: float, false: float, draws: int) -> dict[str, object]:
     """Row of the table."""
     # (draws, methods, measures)
-    errors_px = np.array([one_camera(labels, lasting_px, false, seed) for seed in range(draws)])
+    found = [one_camera(labels, lasting_px, false, seed) for seed in range(draws)]
+    errors_px = np.array([errors for errors in found if errors is not None])
     row: dict[str, object] = {"labels": labels, "lasting error (px)": lasting_px, "false labels": false}
+    row["refused"] = draws - len(errors_px)
     for method, name in enumerate(METHODS):
         row[f"{name} (px)"] = round(float(np.median(errors_px[:, method, 1])), 3)
     ratio = errors_px / np.maximum(errors_px[:, METHODS.index("RANSAC and LM"), None], 0.1)
@@ -87,8 +91,8 @@ def interval(values: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def one_camera(labels: int, lasting_px: float, false: float, seed: int) -> list[tuple[float, float]]:
-    """Errors on another flight, pixels, of each method: on its labels, and exact."""
+def one_camera(labels: int, lasting_px: float, false: float, seed: int) -> list[tuple[float, float]] | None:
+    """Errors on another flight, pixels, of each method, on its labels and exact; None if two poses fit equally well."""
     rng = np.random.default_rng(seed)
     around = rng.uniform(0, 2 * np.pi)
     R, t_m = look_at((5 * np.cos(around), 5 * np.sin(around), rng.uniform(1, 3)), (0.0, 0.0, 1.0))
@@ -99,7 +103,12 @@ def one_camera(labels: int, lasting_px: float, false: float, seed: int) -> list[
     pixels[wrong] += rng.normal(0, 100, (int(wrong.sum()), 2))
     truth = project(camera, others_m)[0]
     left_out = truth + label_errors(rng, len(truth), lasting_px)
-    located = locate_camera(points_m, pixels, K, DIST)
+    try:
+        located = locate_camera(points_m, pixels, K, DIST)
+    except InputError as error:
+        if "two poses" not in str(error):
+            raise
+        return None
     _, turn, shift, inliers = cv2.solvePnPRansac(points_m, pixels, K, DIST)
     poses = [(located.T_cam_world[:3, :3], located.T_cam_world[:3, 3])]
     for chosen in (np.ravel(inliers), np.flatnonzero(~wrong)):
