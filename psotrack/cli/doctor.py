@@ -133,7 +133,14 @@ def _content(rig: Rig, diagnosis: Diagnosis) -> dict[str, Any]:
     """The diagnosis as JSON, with null for missing numbers."""
     fit = diagnosis.reference
     return {
-        "findings": [{**vars(finding), "cameras": list(finding.cameras)} for finding in diagnosis.findings],
+        "findings": [
+            {
+                **vars(finding),
+                "cameras": list(finding.cameras),
+                "nearly_as_likely": list(finding.nearly_as_likely),
+            }
+            for finding in diagnosis.findings
+        ],
         "frames": diagnosis.found.num_frames,
         "explained": diagnosis.found.share,
         "cameras": _rows(rig, diagnosis),

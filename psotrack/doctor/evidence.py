@@ -28,7 +28,7 @@ from psotrack.estimation import cauchy_weight
 from psotrack.geometry import Rig
 
 #: Sizes that are tried of the lasting errors, as shares of a box's side: of each piece, and of each camera.
-_PIECE_SHARES = (0.01, 0.025, 0.06)
+_PIECE_SHARES = (0.01, 0.02, 0.04, 0.08)
 _CAMERA_SHARES = (0.007, 0.02, 0.05, 0.12)
 #: Sizes that are tried of a sound calibration's errors, pixels in an image of 1920 columns.
 _CALIBRATION_PX = (0.2, 0.5, 1.0)
@@ -36,6 +36,8 @@ _SIZES = list(product(_PIECE_SHARES, _CAMERA_SHARES, _CALIBRATION_PX))
 #: Logarithm of the prior probability of each size: bodies that are so lopsided, and calibrations so poor, are rare.
 _RARE = 3.0
 _LOG_SIZES = np.array([-_RARE * ((of_camera > 0.1) + (pixels > 0.7)) for _, of_camera, pixels in _SIZES])
+#: Sizes whose likelihood is smaller than the largest by more than this logarithm are not tried again.
+_UNLIKELY = 12.0
 #: Smallest standard deviation of the error of a piece, pixels.
 _PIECE_PX = 0.3
 #: First assumption of the noise from frame to frame: pixels, and share of a box's side.
@@ -75,6 +77,7 @@ class Judged:
         step: (parameters,), the most likely change of the correction; 0 for all other parameters.
         std: (parameters,), standard deviations of the correction; 0 for all other parameters.
         sizes: sizes of the lasting errors with which it is most likely.
+        likely: indices of all sizes that are not unlikely.
     """
 
     hypothesis: Hypothesis
@@ -82,6 +85,7 @@ class Judged:
     step: Float[np.ndarray, "parameters"]
     std: Float[np.ndarray, "parameters"]
     sizes: tuple[float, float, float]
+    likely: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -219,11 +223,13 @@ class Evidence:
     """Normal equations of the parameters at one rig for each size of lasting errors, other unknowns integrated out.
 
     Attributes:
+        sizes: (sizes,), indices of the sizes.
         rest: (sizes, parameters + 1, parameters + 1), left side, and the right side as last row and column.
         sound: (sizes,), logarithm of the marginal likelihood if all parameters are 0.
         std: (parameters,), standard deviations of the parameters' prior distribution.
     """
 
+    sizes: tuple[int, ...]
     rest: Float[np.ndarray, "sizes rest rest"]
     sound: Float[np.ndarray, "sizes"]
     std: Float[np.ndarray, "parameters"]
@@ -252,11 +258,17 @@ class Evidence:
         step[columns], std[columns] = found[factor][1][size], found[factor][2][size]
         evidence = float(logsumexp(logs)) - np.log(len(_PRIOR_FACTORS)) - as_sound
         evidence += LOG_PRIOR.get(hypothesis.kind, 0.0)
-        return Judged(hypothesis, evidence, step, std, _SIZES[size])
+        best = logs.max(axis=0)
+        likely = tuple(np.array(self.sizes)[best > best.max() - _UNLIKELY].tolist())
+        return Judged(hypothesis, evidence, step, std, _SIZES[self.sizes[size]], likely)
 
 
 def gather(
-    rig: Rig, sums: PieceEquations, std: Float[np.ndarray, "parameters"], free: Sequence[int] = ()
+    rig: Rig,
+    sums: PieceEquations,
+    std: Float[np.ndarray, "parameters"],
+    free: Sequence[int] = (),
+    sizes: Sequence[int] = range(len(_SIZES)),
 ) -> Evidence:
     """Integrate the lasting errors out, and parameters that are free.
 
@@ -265,19 +277,22 @@ def gather(
         sums: normal equations at this rig.
         std: (parameters,), standard deviations of the parameters' prior distribution.
         free: indices of parameters that are unknown under every hypothesis.
+        sizes: indices of the sizes of lasting errors that are tried.
     """
     rests, sound = [], []
-    pieces = {share: without_local(sums, share) for share in _PIECE_SHARES}
-    for piece_share, *of_camera in _SIZES:
-        reduced, log_of_pieces = pieces[piece_share]
-        total, nuisance = arranged(reduced.sum(axis=0), nuisance_std(rig, *of_camera), std, free)
+    tried = [_SIZES[size] for size in sizes]
+    pieces = {share: without_local(sums, share) for share in {share for share, *_ in tried}}
+    totals = {share: (reduced.sum(axis=0), log.sum()) for share, (reduced, log) in pieces.items()}
+    for piece_share, *of_camera in tried:
+        reduced, log_of_pieces = totals[piece_share]
+        total, nuisance = arranged(reduced, nuisance_std(rig, *of_camera), std, free)
         rest, log_det = _without_nuisance(total, nuisance)
         # A free parameter has no slope left.
         for column in sorted(free):
             rest = np.insert(np.insert(rest, column, 0.0, axis=0), column, 0.0, axis=1)
         rests.append(rest)
-        sound.append(-0.5 * (rest[-1, -1] + log_of_pieces.sum() + log_det))
-    return Evidence(np.stack(rests), np.array(sound) + _LOG_SIZES, std)
+        sound.append(-0.5 * (rest[-1, -1] + log_of_pieces + log_det))
+    return Evidence(tuple(sizes), np.stack(rests), np.array(sound) + _LOG_SIZES[list(sizes)], std)
 
 
 def arranged(

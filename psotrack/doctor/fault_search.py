@@ -40,9 +40,7 @@ AS_WELL = 3.0
 LEAST_PX = 1.5
 #: Number of parts of the recording, each predicted from the others, and smallest share of the parts that a fault
 #: predicts better than a sound rig does. Neighbouring blocks of frames are in one part, because their errors are alike.
-FOLDS, BETTER_PARTS = 4, 0.66
-#: The same share for a fault whose evidence is at least this.
-BETTER_PARTS_IF_CLEAR, CLEAR = 0.5, 8.0
+FOLDS, BETTER_PARTS = 4, 0.5
 #: Number of hypotheses that are fitted without linearisation, and number of their steps.
 _REFINED, _STEPS = 6, 3
 #: A hypothesis whose linearised evidence is less than a third of the largest by more than this is not fitted.
@@ -131,7 +129,7 @@ def _find_fault(
     scale = float(np.median(rig.cameras.image_size_wh[:, 0])) / 1920
     if top < least or shift_px < LEAST_PX * max(1.0, scale):
         return None
-    if not _predicts_better(rig, sums, data, best, std, free, top):
+    if not _predicts_better(rig, sums, data, best, std, free):
         return None
     # Two faults at once of one camera are too rare to make a single fault of another camera uncertain.
     near = [
@@ -174,7 +172,7 @@ def _refine(
     step = judged.step
     for _ in range(_STEPS):
         there = corrected.by(step)
-        evidence = gather(there.rig, sum_up(there, data), std, free)
+        evidence = gather(there.rig, sum_up(there, data), std, free, judged.likely)
         now = evidence.judge(judged.hypothesis, as_sound, step)
         change = np.abs(now.step / std).max()
         step = step + now.step
@@ -204,7 +202,6 @@ def _predicts_better(
     judged: Judged,
     std: Float[np.ndarray, "parameters"],
     free: list[int],
-    evidence: float,
 ) -> bool:
     """Whether a fault, fitted to the other parts of the recording, predicts most parts better than a sound rig."""
     piece_share, *of_camera = judged.sizes
@@ -234,5 +231,4 @@ def _predicts_better(
     gain = np.array(gains)
     # A part in which nothing tells between both counts for neither.
     telling = np.abs(gain) > 0.02 * np.abs(gain).max()
-    needed = BETTER_PARTS if evidence < CLEAR else BETTER_PARTS_IF_CLEAR
-    return bool(gain.sum() > 0 and (gain > 0)[telling].mean() >= needed)
+    return bool(gain.sum() > 0 and (gain > 0)[telling].mean() >= BETTER_PARTS)

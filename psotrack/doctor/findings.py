@@ -32,12 +32,14 @@ class Finding:
         cameras: names of the concerned cameras; empty if all cameras or the reference are concerned.
         message: what disagrees, and by how much.
         remedy: what to do.
+        nearly_as_likely: other kinds of faults of the same camera that explain the detections nearly as well.
     """
 
     kind: str
     cameras: tuple[str, ...]
     message: str
     remedy: str
+    nearly_as_likely: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         return f"{self.message}; {self.remedy}"
@@ -100,9 +102,14 @@ def describe_fault(rig: Rig, fault: FoundFault, fps: float) -> Finding:
     if fault.as_well:
         others = " or ".join(_in_words(rig, one, fps)[0].split(": ")[1] for one in fault.as_well)
         numbers += f"; nearly as likely, {others}"
-    kind = "moved" if hypothesis.kind == "turned and moved" else hypothesis.kind
+    kind, *others = (_kind(one.hypothesis.kind) for one in (fault.best, *fault.as_well))
     names = () if hypothesis.camera < 0 else (rig.names[hypothesis.camera],)
-    return Finding(kind, names, f"{words}, {numbers}", remedy)
+    others = tuple(other for other in dict.fromkeys(others) if other != kind)
+    return Finding(kind, names, f"{words}, {numbers}", remedy, others)
+
+
+def _kind(kind: str) -> str:
+    return "moved" if kind == "turned and moved" else kind
 
 
 def _in_words(rig: Rig, judged: Judged, fps: float) -> tuple[str, str]:

@@ -16,6 +16,8 @@ from psotrack.geometry import Camera, Rig
 #: Common factors of the focal lengths: those tried first, and those tried around the best of the first.
 _SCALES = np.exp(np.arange(-0.7, 0.7001, 0.1))
 _FINER = np.exp(np.arange(-0.1, 0.1001, 0.01))
+#: All interpretations are compared in every third frame, and this number of the best in all frames.
+_FEW, _KEPT = 3, 8
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,11 @@ def find_better_interpretation(
     def explained(interpretation: RigInterpretation) -> float:
         return measure_agreement(interpretation.rig, sightings, frames, bounds_m).share
 
-    best = max([*_conventions(rig), *_exchanges(rig), *_lenses(rig, _SCALES)], key=explained)
+    def explained_in_few(interpretation: RigInterpretation) -> float:
+        return measure_agreement(interpretation.rig, sightings, frames[::_FEW], bounds_m).share
+
+    every = [*_conventions(rig), *_exchanges(rig), *_lenses(rig, _SCALES)]
+    best = max(sorted(every, key=explained_in_few)[-_KEPT:], key=explained)
     if best.kind == "focal lengths":
         scale = best.rig.cameras.K[0, 0, 0] / rig.cameras.K[0, 0, 0]
         best = max(_lenses(rig, scale * _FINER), key=explained)
