@@ -57,7 +57,7 @@ plt.rcParams.update({"figure.dpi": SMALL["dpi"], "font.size": 9})
 #
 # Skip this cell if you have videos of your own. The simulator makes what a laboratory would have: four cameras with
 # names as people give them, two image sizes, three frame rates, lenses that distort, and clocks that differ by up to
-# one and a half frames, which nobody knows. The board is a ChArUco board of 4 x 5 squares of 25 cm.
+# one and a half frames; the differences are not known. The board is a ChArUco board of 4 x 5 squares of 25 cm.
 
 # %%
 # !test -d {DATA} || psotrack simulate S02_D4_A --as-own-cameras --scale 0.5 --frames {NUM_FRAMES} --out {DATA} --quiet

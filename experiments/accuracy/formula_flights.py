@@ -134,7 +134,7 @@ def make_flight(scene: Scene, num_frames: int, seed: int, *, false_alarms: float
     frame = np.arange(num_frames)
     names = tuple(f"dron{number + 1}" for number in range(scene.num_drones))
     seen = _in_view(rig, truth_m).sum(axis=-1) >= 2
-    # Where fewer than two cameras have a drone in view, nobody can say where it is.
+    # Where fewer than two cameras have a drone in view, the recording does not show where it is.
     return Flight(
         rig, detections, Trajectories(frame, frame / FPS, names, np.where(seen[..., None], truth_m, np.nan))
     )
