@@ -1,8 +1,8 @@
 """A recording as a laboratory makes it with its own cameras: a folder of videos, and videos of a board.
 
 Four cameras have different frame rates, two image sizes, lenses with distortion, and clocks that are not set; files
-bear the names that people give them. First a ChArUco board is held still at many places while all cameras film at one rate;
-then the drones fly. What a laboratory would not know is written to the folder `truth`.
+bear the names that people give them. First a ChArUco board is held still at many places while all cameras film at one
+rate; then the drones fly. What a laboratory would not know is written to the folder `truth`.
 """
 
 from __future__ import annotations
