@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from helpers import ROOM_M, ring_rig
 
-from psotrack.correspondence import from_detections
+from psotrack.correspondence import CameraSightings, from_detections
 from psotrack.evaluation import evaluate
-from psotrack.geometry import project
+from psotrack.geometry import make_rig, project
 from psotrack.projection_lines import LineSettings, state_at_first_frame, track_detections
+from psotrack.projection_lines.single_views import find_single_views
 from psotrack.recordings import Detections
 from psotrack.settings import DroneSettings, MotionSettings, StatusSettings
 from psotrack.trajectories import Status, Trajectories
@@ -201,3 +202,71 @@ def test_fitness_is_the_share_of_the_cameras_that_agree():
     )
     assert (tracked.num_cameras[:, 0] == 6).all()
     np.testing.assert_allclose(tracked.fitness[:, 0], 6 / 8)
+
+
+def seen_by_two_then_one(seed=3, last=55):
+    """A drone on a circle: cameras 0 and 2 see it until frame 30, then camera 2 alone until `last`; false alarms."""
+    truth_m = circles(1, frames=FRAMES)
+    detections = simulate_detections(truth_m, jitter=0.02, seed=seed)
+    noise = simulate_detections(truth_m, hidden=[(0, 0, FRAMES)], false_alarms=0.3, seed=seed)
+    two = {}
+    pair = make_rig({RIG.names[index]: RIG.cameras[index] for index in (0, 2)})
+    for name, first, stop in ((RIG.names[0], 30, FRAMES), (RIG.names[2], last, FRAMES)):
+        frame = np.concatenate([detections[name].frame, noise[name].frame])
+        boxes = np.concatenate([detections[name].xyxy, noise[name].xyxy])
+        own = np.arange(len(frame)) < len(detections[name])
+        kept = np.flatnonzero(~own | (frame < first) | (frame >= stop))
+        kept = kept[np.argsort(frame[kept], kind="stable")]
+        two[name] = Detections(frame[kept], boxes[kept], np.ones(len(kept)))
+    return pair, truth_m, two
+
+
+@pytest.mark.slow
+def test_one_camera_keeps_a_track_on_its_line_of_sight():
+    pair, truth_m, detections = seen_by_two_then_one()
+    tracks = track_detections(
+        pair.cameras, from_detections(detections, pair, FRAMES), line_settings(), fps=FPS, bounds_m=ROOM_M
+    )
+    assert tracks.num_drones == 1
+    alone = slice(30, 55)
+    assert (tracks.status[alone, 0] != Status.TRACKED).all()
+    # The drone flies over a radian of the circle meanwhile.
+    stated = np.isfinite(tracks.position_m[alone, 0]).all(axis=-1)
+    assert stated.all()
+    camera = RIG.cameras[2]
+    seen, _ = project(camera, tracks.position_m[alone, 0][stated])
+    true, _ = project(camera, truth_m[alone, 0][stated])
+    # Boxes err by 2 % of their sides, which is 1 to 4 pixels; without the camera, the prediction errs by 45 pixels
+    # after half a second.
+    assert np.linalg.norm(seen - true, axis=-1).max() < 15.0
+    # No position is stated that is vaguer than half a metre, and each is right within its covariance.
+    off_m = truth_m[alone, 0][stated] - tracks.position_m[alone, 0][stated]
+    covariance_m2 = tracks.covariance_m2[alone, 0][stated]
+    assert np.linalg.eigvalsh(covariance_m2)[:, -1].max() <= 0.5**2
+    # 0.1 % of a chi-squared distribution of three degrees of freedom is above 16.3; the rows share one error.
+    assert (np.einsum("fi,fij,fj->f", off_m, np.linalg.inv(covariance_m2), off_m) < 16.3).all()
+
+
+def test_a_single_view_must_be_much_more_probable_than_a_false_alarm():
+    place_m = np.array([[0.3, 0.2, 1.2]])
+    pixel = np.asarray(project(RIG.cameras, place_m[:, None])[0])[0]
+    centre_px = np.full((8, 2, 2), np.nan)
+    centre_px[2] = pixel[2] + np.array([[3.0, -2.0], [60.0, 0.0]])
+    noise_px = np.where(np.isfinite(centre_px[..., 0]), 2.0, np.nan)
+    view = CameraSightings(centre_px, np.where(np.isfinite(centre_px), 60.0, np.nan), noise_px)
+    area_px2 = np.asarray(RIG.cameras.image_size_wh, float).prod(axis=-1)
+
+    def found(std_m, per_frame, free):
+        covariance_m2 = std_m**2 * np.eye(3)[None]
+        return find_single_views(
+            RIG.cameras, view, free, per_frame / area_px2, place_m, covariance_m2, np.ones(1)
+        )
+
+    everything = np.isfinite(noise_px)
+    near = found(0.02, 1.0, everything)
+    assert near.drone.tolist() == [0]
+    np.testing.assert_allclose(near.off_px, [[3.0, -2.0]], atol=1e-6)
+    # One pixel is about 5 mm here. A vague prediction has many places for a false alarm, and so have many false alarms.
+    assert len(found(0.3, 1.0, everything).drone) == 0
+    assert len(found(0.02, 500.0, everything).drone) == 0
+    assert len(found(0.02, 1.0, np.zeros_like(noise_px, bool)).drone) == 0

@@ -1,7 +1,7 @@
 """Detections without labels: psotrack's defaults beside Stone Soup's GNN and JPDA, each at its best of a grid.
 
     pip install 'psotrack[bench]'
-    python experiments/accuracy/association.py --data data [--real real] [--quick]
+    python experiments/accuracy/association.py --data data [--real real] [--seeds 20 21] [--quick]
 
 Flights by a formula (`formula_flights`) and, where --real names a folder of public repositories, parts of real flights
 (`bat_flights`). Of each flight psotrack is given the rig and the detections as files, with `psotrack track SEQ --method
@@ -18,6 +18,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -88,24 +89,41 @@ def by_psotrack(flight: RealFlight, folder: Path) -> Float[np.ndarray, "frames t
     return tracks_m
 
 
+class StoneSoupInputs:
+    """What Stone Soup is given of a flight: points in space, the bounds and the speed that psotrack found."""
+
+    def __init__(self, flight: RealFlight) -> None:
+        self.flight = flight
+
+    @cached_property
+    def sightings(self) -> Sightings:
+        """All detections."""
+        return from_detections(self.flight.detections, self.flight.rig, self.flight.truth.num_frames)
+
+    @cached_property
+    def volume(self) -> FlightVolume:
+        """Bounds and speed limit."""
+        moving = moving_detections(self.flight.rig, self.sightings, self.flight.fps)
+        return flight_volume(self.flight.rig, moving)
+
+    @cached_property
+    def points(self) -> dict[int | None, stone_soup.Points]:
+        """Points by the smallest number of views; a rig of two cameras has one such number."""
+        numbers: tuple[int | None, ...] = (2,) if len(self.flight.rig) == 2 else (None, 2)
+        rig, bounds_m = self.flight.rig, self.volume.bounds_m
+        return {views: stone_soup.points_of(rig, self.sightings, bounds_m, views) for views in numbers}
+
+
 def by_stone_soup(
-    flight: RealFlight,
-    sightings: Sightings,
-    volume: FlightVolume,
-    associator: str,
-    gate_m: float,
-    quick: bool,
+    inputs: StoneSoupInputs, associator: str, gate_m: float, quick: bool
 ) -> tuple[dict[str, float], stone_soup.Grid]:
     """The best figures of the grid, and the parameters that gave them."""
-    grid = stone_soup.grid(associator)[:: 4 if quick else 1]
-    points = {
-        views: stone_soup.points_of(flight.rig, sightings, volume.bounds_m, views)
-        for views in {how.min_views for how in grid}
-    }
+    speed_m_s = inputs.volume.max_speed_m_s / 3
     tried = []
-    for how in grid:
-        tracks_m = stone_soup.track(points[how.min_views], flight.fps, volume.max_speed_m_s / 3, how)
-        tried.append((score(tracks_m, flight.truth.position_m, gate_m), how))
+    for how in stone_soup.grid(associator)[:: 4 if quick else 1]:
+        if how.min_views in inputs.points:
+            tracks_m = stone_soup.track(inputs.points[how.min_views], inputs.flight.fps, speed_m_s, how)
+            tried.append((score(tracks_m, inputs.flight.truth.position_m, gate_m), how))
     return max(tried, key=lambda one: one[0]["mota"])
 
 
@@ -113,7 +131,7 @@ def rows_of(
     name: str, seed: int, flight: RealFlight, gate_m: float, data: Path, quick: bool
 ) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
     """One row per method."""
-    sightings = from_detections(flight.detections, flight.rig, flight.truth.num_frames)
+    inputs = StoneSoupInputs(flight)
 
     def row(method: str) -> dict[str, Any]:
         began = time.perf_counter()
@@ -122,8 +140,7 @@ def rows_of(
             folder = data / "association" / f"{name.replace(' ', '_').replace(',', '')}-{seed}"
             figures = score(by_psotrack(flight, folder), flight.truth.position_m, gate_m)
         else:
-            volume = flight_volume(flight.rig, moving_detections(flight.rig, sightings, flight.fps))
-            figures, best = by_stone_soup(flight, sightings, volume, method, gate_m, quick)
+            figures, best = by_stone_soup(inputs, method, gate_m, quick)
             how = f"{best}"
         seconds = time.perf_counter() - began
         return {"flight": name, "seed": seed, "method": method, **figures, "seconds": seconds, "how": how}
@@ -136,12 +153,12 @@ def main() -> None:
     """Track all flights by all methods, and print the means."""
     parser = _runs.parser(__doc__)
     parser.add_argument("--real", type=Path, help="folder of the real recordings, as OWNER/NAME")
-    parser.add_argument("--seeds", type=int, default=3, help="seeds of the flights: 0, 1, ...")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[20, 21, 22], help="seeds of the flights")
     parser.add_argument("--quick", action="store_true", help="one short flight, and a quarter of the grid")
     options = parser.parse_args()
     run = _runs.start("association")
     flights: list[tuple[str, int, RealFlight, float]] = []
-    for seed in range(1 if options.quick else options.seeds):
+    for seed in options.seeds[: 1 if options.quick else None]:
         for name in list(SCENES)[: 1 if options.quick else None]:
             made = make_flight(SCENES[name], 50 if options.quick else 250, seed)
             flights.append((name, seed, RealFlight(made.rig, made.detections, made.truth, FPS), GATE_M))

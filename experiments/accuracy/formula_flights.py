@@ -64,6 +64,21 @@ SCENES = {
     "indoors, 8 cameras above 4 drones": Scene(
         8, 6.0, 3.0, (0, 0, 1.3), (2.2, 2.2, 0.9), (0.5, 2), 4, (0.4, 0.15), 1000.0
     ),
+    "outdoors, 4 cameras, 3 drones on 100 m": Scene(
+        4, 65.0, 1.5, (0, 0, 25), (50, 50, 12), (8, 15), 3, (0.8, 0.4)
+    ),
+    "outdoors, 2 cameras, 3 fast drones on 100 m": Scene(
+        2, 65.0, 1.5, (0, 0, 25), (40, 40, 12), (8, 15), 3, (0.8, 0.4), arc_deg=100.0
+    ),
+    "outdoors, 2 cameras, 3 slow drones": Scene(
+        2, 30.0, 1.5, (0, 0, 12), (10, 10, 5), (0.3, 1.5), 3, arc_deg=120.0
+    ),
+    "outdoors, 2 cameras, 3 hovering drones": Scene(
+        2, 30.0, 1.5, (0, 0, 12), (10, 10, 5), (0.0, 0.2), 3, arc_deg=120.0
+    ),
+    "outdoors, 3 cameras, 4 hovering and slow drones": Scene(
+        3, 35.0, 1.5, (0, 0, 14), (12, 12, 6), (0.0, 1.0), 4, arc_deg=120.0
+    ),
 }
 
 

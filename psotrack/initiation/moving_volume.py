@@ -31,7 +31,8 @@ FASTEST_M_S, LARGEST_ACCELERATION_M_S2 = 60.0, 15.0
 MOST_SIGHTINGS = 12
 #: A point counts if its standard deviation is below this share of its distance from the cameras.
 MOST_VAGUE = 0.1
-#: The volume reaches beyond the points by this share of their extent, metres at least.
+#: The volume reaches beyond the points by this share of their largest extent, metres at least. Only some windows are
+#: looked at, and drones that fly far fly high too.
 MARGIN, LEAST_MARGIN_M = 0.15, 1.0
 #: The room of the cameras is extended where points are outside of it, or nearer to its border than this, metres.
 NEAR_BOUND_M = 0.5
@@ -147,7 +148,7 @@ def flight_volume(
 def _extended(rig: Rig, room_m: Float[np.ndarray, "2 3"], points: MovingPoints) -> Float[np.ndarray, "2 3"]:
     """The room, extended to the moving points outside of it with a margin."""
     low, high = np.quantile(points.position_m, [OUTLIERS, 1 - OUTLIERS], axis=0)
-    margin_m = np.maximum(LEAST_MARGIN_M, MARGIN * (high - low))
+    margin_m = max(LEAST_MARGIN_M, MARGIN * float((high - low).max()))
     low_m = np.where(low < room_m[0] + NEAR_BOUND_M, np.minimum(low - margin_m, room_m[0]), room_m[0])
     high_m = np.where(high > room_m[1] - NEAR_BOUND_M, np.maximum(high + margin_m, room_m[1]), room_m[1])
     axis_z = rig.cameras.T_cam_world[:, 2, 2].mean()

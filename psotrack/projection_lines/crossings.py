@@ -26,6 +26,7 @@ class Crossings:
         position_m: (crossings, 3), metres.
         covariance_m2: (crossings, 3, 3), from the noise of the detections.
         seen: (crossings, cameras), cameras whose detections count.
+        detection: (crossings, cameras), index of the detection among the camera's detections; -1 for none.
         disagreement: (crossings,), squared reprojection errors over the noise, per degree of freedom: about 1 where the
             noise is right.
         span_m: (crossings, 2), width and height of the detections at that distance, median of the cameras, metres.
@@ -35,6 +36,7 @@ class Crossings:
     position_m: Float[np.ndarray, "crossings 3"]
     covariance_m2: Float[np.ndarray, "crossings 3 3"]
     seen: Bool[np.ndarray, "crossings cameras"]
+    detection: Int[np.ndarray, "crossings cameras"]
     disagreement: Float[np.ndarray, "crossings"]
     span_m: Float[np.ndarray, "crossings 2"]
 
@@ -94,6 +96,7 @@ def crossings(
         position_m=position_m,
         covariance_m2=lines.covariance_m2[kept],
         seen=seen,
+        detection=groups.detection[kept],
         disagreement=squared.sum(axis=-1) / (2 * seen.sum(axis=-1) - 3),
         span_m=np.nanmedian(span_m, axis=1),
     )

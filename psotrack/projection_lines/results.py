@@ -47,6 +47,8 @@ def as_tracks(tracks: list[Track], num_frames: int) -> Tracks:
     for track in by_start:
         assert track.drone is not None
         for row in track.rows:
+            if row.is_vague:
+                continue
             _write(arrays, row, (row.frame, track.drone))
     return arrays
 

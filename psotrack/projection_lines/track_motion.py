@@ -72,11 +72,41 @@ class TrackMotion:
         measured_m: Float[np.ndarray, "slots 3"],
         covariance_m2: Float[np.ndarray, "slots 3 3"],
         was_measured: Bool[np.ndarray, "slots"],
+        unseen: Bool[np.ndarray, "slots"],
         lost: Bool[np.ndarray, "slots"],
     ) -> None:
         """Correct by the measured positions, within the room and the largest speed; lost tracks are at rest."""
         measurements = (measured_m, covariance_m2, was_measured)
-        self.state = _on_host(_correct(self.state, measurements, lost, self._limits, self._params))
+        self.state = _on_host(_correct(self.state, measurements, (unseen, lost), self._limits, self._params))
+
+    def correct_in_image(
+        self,
+        slot: int,
+        jacobian: Float[np.ndarray, "2 3"],
+        off_px: Float[np.ndarray, "2"],
+        noise_px: float,
+    ) -> None:
+        """Correct a track by a detection of one camera: an extended Kalman filter's update in the image.
+
+        Args:
+            slot: the track's slot.
+            jacobian: (2, 3), derivative of the drone's pixel by the apparent position, pixels per metre.
+            off_px: (2,), detection minus expected pixel.
+            noise_px: standard deviation of the detection along each axis; the part that lasts is in the state.
+        """
+        state, covariance = self.state, np.asarray(self.state.covariance[slot])
+        observed = np.zeros((2, covariance.shape[-1]))
+        observed[:, :3] = jacobian
+        noise_px2 = (1 - self._settings.error_share) * noise_px**2 * np.eye(2)
+        spread = observed @ covariance @ observed.T + noise_px2
+        gain = np.linalg.solve(spread, observed @ covariance).T
+        rest = np.eye(len(covariance)) - gain @ observed
+        state.covariance[slot] = rest @ covariance @ rest.T + gain @ noise_px2 @ gain.T
+        moved = np.asarray(state.mean[slot]) + gain @ off_px
+        for name, part in zip(
+            ("apparent_m", "velocity_m_s", "acceleration_m_s2", "error_m"), np.split(moved, 4), strict=True
+        ):
+            getattr(state, name)[slot] = part
 
 
 def _params(settings: MotionSettings, room: int) -> MotionParams:
@@ -102,7 +132,7 @@ def _predict(state: MotionState, dt_s: Float[Array, ""], params: MotionParams) -
 def _correct(
     state: MotionState,
     measurements: tuple[Float[Array, "drones 3"], Float[Array, "drones 3 3"], Bool[Array, "drones"]],
-    lost: Bool[Array, "drones"],
+    unseen_and_lost: tuple[Bool[Array, "drones"], Bool[Array, "drones"]],
     limits: _Limits,
     params: MotionParams,
 ) -> MotionState:
@@ -110,8 +140,7 @@ def _correct(
     state, _ = kalman.update(state, measured_m, covariance_m2, was_measured, params)
     return kalman.limit_motion(
         state,
-        ~was_measured,
-        lost,
+        *unseen_and_lost,
         dt_s=limits.dt_s,
         bounds_m=limits.bounds_m,
         max_speed_m_s=limits.max_speed_m_s,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
@@ -16,6 +16,7 @@ from psotrack.projection_lines.crossings import crossings
 from psotrack.projection_lines.exposures import moved_to_instant
 from psotrack.projection_lines.merged_boxes import split_merged_boxes
 from psotrack.projection_lines.results import as_tracks
+from psotrack.projection_lines.single_views import SingleViews, find_single_views
 from psotrack.projection_lines.track_motion import TrackMotion
 from psotrack.projection_lines.tracks import Measurement, Track, TrackRow, as_candidate, as_lost_tracks
 from psotrack.settings import DroneSettings, MotionSettings, StatusSettings
@@ -85,7 +86,7 @@ def track_detections(
     """
     # float64 is switched on in this block only.
     with jax.enable_x64(True):
-        tracker = _Tracker(cameras, settings, fps, bounds_m)
+        tracker = _Tracker(cameras, settings, fps, bounds_m, _density_px2(cameras, sightings))
         if known is not None:
             tracker.start_known(*known)
         with report("track", sightings.num_frames) as advance:
@@ -95,13 +96,25 @@ def track_detections(
     return as_tracks(tracker.tracks_of_drones(), sightings.num_frames)
 
 
+def _density_px2(cameras: Camera, sightings: Sightings) -> Float[np.ndarray, "cameras"]:
+    """(cameras,), mean number of sightings per frame and square pixel; of one sighting at least in the whole time."""
+    total = np.maximum(np.isfinite(sightings.noise_px).sum(axis=(0, -1)), 1)
+    return total / sightings.num_frames / np.asarray(cameras.image_size_wh, np.float64).prod(axis=-1)
+
+
 class _Tracker:
     """Tracks in progress, in slots of the motion model's arrays."""
 
     def __init__(
-        self, cameras: Camera, settings: LineSettings, fps: float, bounds_m: Float[np.ndarray, "2 3"]
+        self,
+        cameras: Camera,
+        settings: LineSettings,
+        fps: float,
+        bounds_m: Float[np.ndarray, "2 3"],
+        density_px2: Float[np.ndarray, "cameras"],
     ) -> None:
         self._cameras = cameras
+        self._density_px2 = density_px2
         self._viewpoint = viewpoints(cameras)
         self._settings = settings
         self._fps = fps
@@ -125,8 +138,8 @@ class _Tracker:
     def step(self, frame: int, view: CameraSightings) -> None:
         """One frame: predict, match, correct, end and confirm tracks."""
         self._motion.predict()
-        measured = self._measure(view)
-        self._correct(measured)
+        measured, seen_by_one = self._measure(view)
+        self._correct(measured, seen_by_one)
         self._append_rows(frame, measured)
         self._end_lost_tracks()
         self._confirm_tracks()
@@ -135,6 +148,11 @@ class _Tracker:
         """The tracks that are of drones; several may be of one drone."""
         tracks = [*self._ended, *(track for _, track in self._active())]
         return [track for track in tracks if track.drone is not None]
+
+    def _track(self, slot: int) -> Track:
+        track = self._slots[slot]
+        assert track is not None
+        return track
 
     def _active(self) -> list[tuple[int, Track]]:
         """Slots and tracks that have not ended."""
@@ -158,21 +176,23 @@ class _Tracker:
         return slot
 
     def _end(self, slot: int) -> None:
-        track = self._slots[slot]
-        assert track is not None
-        self._ended.append(track)
+        self._ended.append(self._track(slot))
         self._slots[slot] = None
 
-    def _measure(self, view: CameraSightings) -> dict[int, Measurement]:
-        """The frame's measurements by slot; a position that is of no track starts one."""
+    def _measure(self, view: CameraSightings) -> tuple[dict[int, Measurement], SingleViews]:
+        """The frame's measurements by slot, and the views by slot of drones that have none.
+
+        A position that is of no track starts one.
+        """
         slots, tracks = [slot for slot, _ in self._active()], [track for _, track in self._active()]
         expected_m = np.asarray(self._motion.state.apparent_m[slots])
         expected_m2 = np.asarray(self._motion.state.covariance[slots, :3, :3])
         span_m = np.array([track.span_m for track in tracks]).reshape(-1, 2)
         view = self._at_instant(view, slots)
+        view = split_merged_boxes(self._cameras, view, expected_m, span_m)
         crossed = crossings(
             self._cameras,
-            split_merged_boxes(self._cameras, view, expected_m, span_m),
+            view,
             self._bounds_m + np.array([[0.0, 0.0, FLOOR_CLEARANCE_M], [0.0, 0.0, 0.0]]),
             expected_m,
             expected_m2,
@@ -181,6 +201,7 @@ class _Tracker:
         )
         usual = float(np.median([track.dispersion for track in tracks])) if tracks else 1.0
         measured: dict[int, Measurement] = {}
+        known_rows: list[int] = []
         # Expected drones first: an unexpected position may be a part of an expected drone.
         for row in np.argsort(crossed.expected < 0, kind="stable").tolist():
             number, seen, position_m = int(crossed.expected[row]), crossed.seen[row], crossed.position_m[row]
@@ -206,6 +227,8 @@ class _Tracker:
                 spread_m2 = expected_m2[number] + crossed.covariance_m2[row]
                 surprising = bool(off_m @ np.linalg.solve(spread_m2, off_m) >= SURPRISING)
             if not surprising or num_viewpoints >= TRUSTED_VIEWPOINTS:
+                if number >= 0 or num_viewpoints >= TRUSTED_VIEWPOINTS:
+                    known_rows.append(row)
                 measured[slot] = Measurement(
                     position_m,
                     crossed.covariance_m2[row],
@@ -215,7 +238,32 @@ class _Tracker:
                     crossed.span_m[row],
                     surprising,
                 )
-        return measured
+        return measured, self._seen_by_one(view, crossed.detection[known_rows], slots, measured)
+
+    def _seen_by_one(
+        self,
+        view: CameraSightings,
+        used: Int[np.ndarray, "crossings cameras"],
+        slots: list[int],
+        measured: dict[int, Measurement],
+    ) -> SingleViews:
+        """The views of drones that have no measurement, among the detections that are of no other drone; by slot."""
+        missed = [slot for slot in slots if slot not in measured and self._track(slot).drone is not None]
+        free = np.isfinite(view.noise_px)
+        for camera, found in enumerate(free):
+            numbers = used[:, camera]
+            free[camera, np.flatnonzero(found)[numbers[numbers >= 0]]] = False
+        state = self._motion.state
+        views = find_single_views(
+            self._cameras,
+            view,
+            free,
+            self._density_px2,
+            np.asarray(state.apparent_m[missed]),
+            np.asarray(state.covariance[missed, :3, :3]),
+            np.array([self._track(slot).dispersion for slot in missed]),
+        )
+        return replace(views, drone=np.array(missed, int)[views.drone])
 
     def _at_instant(self, view: CameraSightings, slots: list[int]) -> CameraSightings:
         """The detections as they would be if all frames had been exposed at the instant."""
@@ -232,8 +280,8 @@ class _Tracker:
             self._settings.motion.velocity_std_m_s,
         )
 
-    def _correct(self, measured: dict[int, Measurement]) -> None:
-        """Correct the motion model by the measurements."""
+    def _correct(self, measured: dict[int, Measurement], seen_by_one: SingleViews) -> None:
+        """Correct the motion model by the measurements, and by the views of drones that have none."""
         room = len(self._slots)
         measured_m, covariance_m2 = np.zeros((room, 3)), np.tile(np.eye(3), (room, 1, 1))
         was_measured, lost = np.zeros((2, room), bool)
@@ -243,9 +291,15 @@ class _Tracker:
                 covariance_m2[slot] = measured[slot].covariance_m2
                 was_measured[slot] = True
             track.missed = 0 if slot in measured else track.missed + 1
-            lost[slot] = track.missed > self._max_coasting_frames
+            track.unseen = 0 if slot in measured or slot in seen_by_one.drone else track.unseen + 1
+            lost[slot] = track.unseen > self._max_coasting_frames
         predicted_m_s = np.asarray(self._motion.state.velocity_m_s)
-        self._motion.correct(measured_m, covariance_m2, was_measured, lost)
+        for number, slot in enumerate(seen_by_one.drone.tolist()):
+            one = seen_by_one.jacobian[number], seen_by_one.off_px[number], seen_by_one.noise_px[number]
+            self._motion.correct_in_image(slot, *one)
+        unseen = ~was_measured
+        unseen[seen_by_one.drone] = False
+        self._motion.correct(measured_m, covariance_m2, was_measured, unseen, lost)
         for slot, one in measured.items():
             if one.surprising:
                 # The filter would treat the position as an outlier for a second, but all viewpoints agree on it.
@@ -282,7 +336,7 @@ class _Tracker:
     def _end_lost_tracks(self) -> None:
         """End tracks of lost drones, and tracks that come from chance crossings of lines of sight."""
         for slot, track in self._active():
-            if (track.drone is None and _by_chance(track)) or track.missed > self._max_coasting_frames:
+            if (track.drone is None and _by_chance(track)) or track.unseen > self._max_coasting_frames:
                 self._end(slot)
 
     def _confirm_tracks(self) -> None:

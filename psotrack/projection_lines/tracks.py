@@ -11,6 +11,8 @@ from psotrack.initiation import LostTracks, TrackCandidate
 
 #: Number of last frames from which a drone's present width is taken: a drone looks wider or narrower as it turns.
 SPAN_FRAMES = 25
+#: A drone that is not found has no stated position where the standard deviation along the worst axis is larger, metres.
+LARGEST_COASTING_STD_M = 0.5
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,12 @@ class TrackRow:
     measured: Measurement | None
 
     @property
+    def is_vague(self) -> bool:
+        """Whether the drone was not found and its position is too uncertain to be stated."""
+        largest_m2 = float(np.linalg.eigvalsh(self.covariance_m2)[-1])
+        return self.measured is None and largest_m2 > LARGEST_COASTING_STD_M**2
+
+    @property
     def share(self) -> float:
         """Share of the cameras with the drone in view that saw the drone."""
         num_cameras = 0 if self.measured is None else self.measured.num_cameras
@@ -65,6 +73,7 @@ class Track:
         agreed_hits: number of frames in which as many viewpoints agreed as are needed to begin a track.
         hits_of_three: number of frames in which at least three viewpoints agreed.
         missed: frames since the drone was last found.
+        unseen: frames since any camera last saw the drone.
     """
 
     drone: int | None
@@ -74,6 +83,7 @@ class Track:
     agreed_hits: int = 0
     hits_of_three: int = 0
     missed: int = 0
+    unseen: int = 0
 
     @property
     def share(self) -> float:
