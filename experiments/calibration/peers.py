@@ -34,7 +34,7 @@ from psotrack.calibration import (
     instants_of_numbers,
     open_images,
 )
-from psotrack.geometry import Rig, make_camera, make_rig, project, triangulate
+from psotrack.geometry import Rig, make_camera, make_rig, triangulate
 from psotrack.rig_files import read_rig
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -251,29 +251,35 @@ def errors_of(rig, board, views):
 def distances(rig, board, views, instant, fitted, measured):
     """Distances of the corners in `measured` cameras from a board at the pose that fits the `fitted` cameras best."""
 
+    at = {}
+    for camera in {*fitted, *measured}:
+        seen = np.isfinite(views.corners_px[camera, instant, :, 0])
+        at[camera] = (
+            board.corners_m[seen],
+            views.corners_px[camera, instant, seen],
+            np.asarray(rig.cameras.T_cam_world[camera]),
+            np.asarray(rig.cameras.K[camera]),
+            np.asarray(rig.cameras.dist[camera]),
+        )
+
     def off(pose, cameras):
-        R = cv2.Rodrigues(pose[:3])[0]
         parts = []
         for camera in cameras:
-            pixels, _ = project(rig.cameras[camera], board.corners_m @ R.T + pose[3:])
-            parts.append(
-                (pixels - views.corners_px[camera, instant])[
-                    np.isfinite(views.corners_px[camera, instant, :, 0])
-                ]
-            )
+            corners_m, corners_px, T, K, dist = at[camera]
+            # The board in the camera's axes; OpenCV's projection is fast, and is not the one under test.
+            turn = cv2.Rodrigues(T[:3, :3] @ cv2.Rodrigues(pose[:3])[0])[0]
+            shift = T[:3, :3] @ pose[3:] + T[:3, 3]
+            parts.append(cv2.projectPoints(corners_m, turn, shift, K, dist)[0].reshape(-1, 2) - corners_px)
         return parts
 
     starts = []
     for camera in fitted:
-        seen = np.isfinite(views.corners_px[camera, instant, :, 0])
-        K, dist = rig.cameras.K[camera], rig.cameras.dist[camera]
-        _, turns, shifts, _ = cv2.solvePnPGeneric(
-            board.corners_m[seen], views.corners_px[camera, instant, seen], K, dist, flags=cv2.SOLVEPNP_IPPE
-        )
+        corners_m, corners_px, T_cam_world, K, dist = at[camera]
+        _, turns, shifts, _ = cv2.solvePnPGeneric(corners_m, corners_px, K, dist, flags=cv2.SOLVEPNP_IPPE)
         for turn, shift in zip(turns, shifts, strict=True):
             T = np.eye(4)
             T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
-            T = np.linalg.inv(rig.cameras.T_cam_world[camera]) @ T
+            T = np.linalg.inv(T_cam_world) @ T
             starts.append(np.concatenate([cv2.Rodrigues(T[:3, :3])[0].ravel(), T[:3, 3]]))
     fits = [
         least_squares(
