@@ -8,7 +8,6 @@ from helpers import ring_rig
 from scipy.linalg import toeplitz
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from scipy.stats import f as f_distribution
 
 from psotrack import cli
 from psotrack.camera_errors import (
@@ -26,7 +25,6 @@ from psotrack.camera_errors import (
     noise_ratios,
     views_of_places,
     views_of_sightings,
-    widening,
 )
 from psotrack.correspondence import Sightings
 from psotrack.errors import SettingsError
@@ -82,6 +80,12 @@ def fitted_views(rig, stated, position_m, velocity_m_s, error_px):
     moved_m = np.einsum("fdcik,fdck->fdi", views.gain, views.residual_px)
     residual_px = views.residual_px - np.einsum("fdcik,fdk->fdci", views.jacobian, moved_m)
     return replace(views, residual_px=residual_px), moved_m
+
+
+def only_noise(noise_px, fading):
+    """Errors of cameras that have no lasting errors."""
+    unknowns = 4 * len(noise_px)
+    return CameraErrors(noise_px, fading, np.zeros(noise_px.shape), 0.0, 0.0, np.zeros((unknowns, unknowns)))
 
 
 def inside_rate(error_m, covariance_m2):
@@ -156,15 +160,17 @@ class TestLearning:
     def test_variances_of_cameras_are_not_shrunk_by_the_fit(self):
         rig, rng = ring_rig(4), np.random.default_rng(1)
         position_m, velocity_m_s = flights(rng, 800, 1)
-        noise_px = np.array([1.0, 1.5, 2.0, 4.0])
-        error_px = noise_px[:, None] * rng.normal(size=(800, 1, 4, 2))
+        noise_px = np.array([[1.0, 0.7], [1.5, 1.5], [2.0, 3.0], [4.0, 1.0]])
+        error_px = noise_px * rng.normal(size=(800, 1, 4, 2))
         views, _ = fitted_views(rig, rig, position_m, velocity_m_s, error_px)
         places = FittedPlaces(views.residual_px[:, 0], views.jacobian[:, 0], np.ones((800, 4), bool))
-        found = np.sqrt(camera_variances(places, np.zeros((800, 4))))
-        np.testing.assert_allclose(found, noise_px, rtol=0.12)
+        found = np.sqrt(camera_variances(places, np.zeros((800, 4, 2))))
+        # Positions follow the precise cameras, so few of the 800 residuals show these cameras' noise: it is known to a
+        # tenth.
+        np.testing.assert_allclose(found, noise_px, rtol=0.2)
         # The plain spread of the residuals is too small.
         assert np.square(views.residual_px).mean() < 0.8 * np.square(noise_px).mean()
-        known = np.broadcast_to(noise_px**2, (800, 4))
+        known = np.broadcast_to(noise_px**2, (800, 4, 2))
         assert camera_variances(places, known).max() < 0.1 * np.square(noise_px).max()
 
     def test_a_camera_that_shows_nothing_has_no_variance(self):
@@ -173,10 +179,10 @@ class TestLearning:
         views, _ = fitted_views(rig, rig, position_m, velocity_m_s, rng.normal(size=(50, 1, 3, 2)))
         shown = np.tile([True, True, False], (50, 1))
         variance = camera_variances(
-            FittedPlaces(views.residual_px[:, 0], views.jacobian[:, 0], shown), np.zeros((50, 3))
+            FittedPlaces(views.residual_px[:, 0], views.jacobian[:, 0], shown), np.zeros((50, 3, 2))
         )
         assert np.isfinite(variance[:2]).all()
-        assert np.isnan(variance[2])
+        assert np.isnan(variance[2]).all()
 
     @pytest.mark.parametrize(("share", "frames"), [(0.7, 10), (0.7, 25), (0.0, 10)])
     def test_fading_is_found(self, share, frames):
@@ -237,7 +243,11 @@ class TestLearning:
             views.residual_px.reshape(-1, 6, 2), views.jacobian.reshape(-1, 6, 2, 3), np.ones((300, 6), bool)
         )
         constant = fit_constant_errors(
-            rows, views.turn_px.reshape(-1, 6, 2, 3), views.flow_px_s.reshape(-1, 6, 2), np.full(6, 0.5), 1.0
+            rows,
+            views.turn_px.reshape(-1, 6, 2, 3),
+            views.flow_px_s.reshape(-1, 6, 2),
+            np.full((6, 2), 0.5),
+            1.0,
         )
         apart_s = constant.clock_s - late_s
         np.testing.assert_allclose(apart_s - apart_s.mean(), 0.0, atol=0.002)
@@ -269,13 +279,6 @@ class TestLearning:
 
 
 class TestCovariances:
-    def test_widening_is_the_ratio_of_f_and_chi_square(self):
-        for freedom in (2, 5, 21):
-            expected = 3 * f_distribution.ppf(0.9, 3, freedom) / INSIDE_90
-            assert widening(freedom) == pytest.approx(expected)
-        assert widening(100_000) == pytest.approx(1, abs=1e-3)
-        assert widening(0) == widening(2)
-
     def test_turned_cameras_spread_positions_as_stated(self):
         rng = np.random.default_rng(7)
         rig = ring_rig(4, image_size_wh=(1920, 1080))
@@ -288,8 +291,8 @@ class TestCovariances:
             ]
         )
         views, _ = fitted_views(rig, rig, position_m, velocity_m_s, no_error)
-        none = CameraErrors(np.ones(4), USUAL, np.zeros(4), 0.0, 0.0)
-        lasting = lasting_covariances(views, none, velocity_m_s, rig_error_deg=0.2)
+        none = only_noise(np.ones((4, 2)), USUAL)
+        lasting = lasting_covariances(views, none, rig_error_deg=0.2)
         for frame in range(2):
             found = np.cov(moved_m[:, frame, 0].T)
             np.testing.assert_allclose(lasting.absolute_m2[frame, 0], found, atol=0.3 * np.abs(found).max())
@@ -301,19 +304,18 @@ class TestCovariances:
         rig = ring_rig(2)
         position_m, velocity_m_s = flights(rng, 3, 2)
         views, _ = fitted_views(rig, rig, position_m, velocity_m_s, np.zeros((3, 2, 2, 2)))
-        none = CameraErrors(np.full(2, np.nan), USUAL, np.zeros(2), 0.0, 0.0)
-        some = CameraErrors(np.ones(2), USUAL, np.full(2, 3.0), 0.0, 0.0)
-        nothing = lasting_covariances(views, none, velocity_m_s).absolute_m2
+        none = only_noise(np.full((2, 2), np.nan), USUAL)
+        some = replace(only_noise(np.ones((2, 2)), USUAL), lasting_px=np.full((2, 2), 3.0))
+        nothing = lasting_covariances(views, none).absolute_m2
         assert (nothing == 0).all()
-        given = lasting_covariances(views, none, velocity_m_s, pixel_error_px=2.0).absolute_m2
+        given = lasting_covariances(views, none, pixel_error_px=2.0).absolute_m2
         expected = 4.0 * np.einsum("fdcik,fdcjk->fdij", views.gain, views.gain)
         np.testing.assert_allclose(given, expected)
-        learned = lasting_covariances(views, some, velocity_m_s).absolute_m2
-        both = lasting_covariances(views, some, velocity_m_s, pixel_error_px=2.0).absolute_m2
+        learned = lasting_covariances(views, some).absolute_m2
+        both = lasting_covariances(views, some, pixel_error_px=2.0).absolute_m2
         np.testing.assert_allclose(learned, both)
         assert (
-            np.linalg.eigvalsh(lasting_covariances(views, some, velocity_m_s, rig_error_deg=1.0).relative_m2)
-            > -1e-12
+            np.linalg.eigvalsh(lasting_covariances(views, some, rig_error_deg=1.0).relative_m2) > -1e-12
         ).all()
 
     def test_a_drone_keeps_its_lasting_covariance_while_it_is_not_seen(self):
@@ -324,8 +326,8 @@ class TestCovariances:
         views = views_of_places(
             rig.cameras, np.full((6, 1, 3, 2), np.nan), np.ones((6, 1, 3, 2)), position_m, velocity_m_s
         )
-        none = CameraErrors(np.ones(3), USUAL, np.zeros(3), 0.0, 0.0)
-        found = lasting_covariances(views, none, velocity_m_s, pixel_error_px=1.0).absolute_m2[:, 0]
+        none = only_noise(np.ones((3, 2)), USUAL)
+        found = lasting_covariances(views, none, pixel_error_px=1.0).absolute_m2[:, 0]
         np.testing.assert_array_equal(found[[0, 3, 4]], found[[1, 2, 2]])
         assert (np.linalg.eigvalsh(found)[:, 0] > 0).all()
 
@@ -342,21 +344,25 @@ class TestCovariances:
     )
     @pytest.mark.parametrize("num_cameras", [3, 8])
     def test_positions_lie_in_their_ellipsoids(self, num_cameras, angle_deg, late_s, noise_px, frames):
-        # Errors that last are the same in all frames of a rig, so that many rigs are needed.
-        rates = []
-        for seed in range(24):
+        # Errors that last are the same in all frames of a rig, so that many rigs are needed, and few frames of each.
+        rates, num_frames = [], 50
+        for seed in range(20):
             rng = np.random.default_rng(seed)
             rig = ring_rig(num_cameras, image_size_wh=(1920, 1080))
-            position_m, velocity_m_s = flights(rng, 75, 2)
-            exact, _ = fitted_views(rig, rig, position_m, velocity_m_s, np.zeros((75, 2, num_cameras, 2)))
-            error_px = noise_px * correlated(rng, (75, 2, num_cameras, 2), 0.7 if frames > 1 else 0.0, frames)
+            position_m, velocity_m_s = flights(rng, num_frames, 2)
+            exact, _ = fitted_views(
+                rig, rig, position_m, velocity_m_s, np.zeros((num_frames, 2, num_cameras, 2))
+            )
+            error_px = noise_px * correlated(
+                rng, (num_frames, 2, num_cameras, 2), 0.7 if frames > 1 else 0.0, frames
+            )
             error_px -= exact.flow_px_s * rng.uniform(-late_s, late_s, num_cameras)[:, None]
             stated = turned(rig, angle_deg, rng)
             views, moved_m = fitted_views(rig, stated, position_m, velocity_m_s, error_px)
             errors = learn_camera_errors(views, FPS, USUAL)
-            lasting = lasting_covariances(views, errors, velocity_m_s)
+            lasting = lasting_covariances(views, errors)
             rates.append(inside_rate(moved_m, noise_covariance(views, errors) + lasting.absolute_m2))
-        assert 0.8 < np.mean(rates) < 0.985
+        assert 0.8 <= np.mean(rates) <= 0.97
 
 
 class TestFilteredVariance:
@@ -400,16 +406,22 @@ class TestFilteredVariance:
         assert np.square(filtered.position_m - position_m)[late].mean() == pytest.approx(real, rel=0.15)
 
     def test_ratios_compare_found_and_stated_noise(self):
-        measured = np.tile(np.eye(3) * 4e-4, (20, 2, 1, 1))
-        noise = np.tile(np.eye(3) * 1e-4, (20, 2, 1, 1))
+        measured = np.tile(np.eye(3) * 4e-4, (100, 3, 1, 1))
+        noise = np.tile(np.eye(3) * 1e-4, (100, 3, 1, 1))
         noise[:, 1] = np.nan
-        errors = CameraErrors(np.ones(4), Fading(0.3, 0.7, 0.0, 0.4), np.zeros(4), 0.0, 0.0)
+        # The last drone has left the view of some cameras: the tracker says less than that, and then measures nothing.
+        measured[50:, 2] *= 4
+        noise[50:, 2] *= 16
+        measured[90:, 2] = np.nan
+        errors = only_noise(np.ones((4, 2)), Fading(0.3, 0.7, 0.0, 0.4))
         ratio, filtered = noise_ratios(
             measured, noise, errors, MeasurementErrors(1.0, 0.7, 0.4), dt_s=0.04, jerk_density_m2_s5=1.0
         )
-        np.testing.assert_allclose(ratio, [0.25, 1.0])
-        assert 0.2 < filtered[0] < 0.6
-        assert filtered[1] == 1.0
+        np.testing.assert_allclose(ratio[:, :2], np.tile([0.25, 1.0], (100, 1)))
+        np.testing.assert_allclose(ratio[[0, 30, 70, 89, 99], 2], [0.25, 0.25, 1.0, 1.0, 1.0])
+        assert ((filtered[:, 0] > 0.2) & (filtered[:, 0] < 0.6)).all()
+        assert (filtered[:, 1] == 1.0).all()
+        np.testing.assert_allclose(filtered[[0, 70, 99], 2], [filtered[0, 0], 1.0, 1.0], rtol=1e-3)
 
 
 class TestSettings:

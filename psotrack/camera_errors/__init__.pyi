@@ -1,5 +1,5 @@
 from .constant_errors import ConstantErrors, fit_constant_errors
-from .covariances import LastingCovariances, lasting_covariances, noise_covariance, noise_ratios, widening
+from .covariances import LastingCovariances, lasting_covariances, noise_covariance, noise_ratios
 from .fading import Fading, fading_of
 from .filtered_variance import MeasurementErrors, filtered_variances
 from .learning import CameraErrors, learn_camera_errors
@@ -29,6 +29,5 @@ __all__ = [
     "views_of_places",
     "views_of_sightings",
     "views_of_silhouettes",
-    "widening",
     "with_camera_errors",
 ]

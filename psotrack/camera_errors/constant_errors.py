@@ -10,6 +10,18 @@ neighbouring frames are similar,
 
 where A_turn and A_clock are columns of A. The two standard deviations are those of the largest likelihood, found as in
 `variance_components`.
+
+Few cameras show few turns, so the standard deviations themselves are uncertain. Their posterior distribution with the
+Jeffreys prior (G. E. P. Box, G. C. Tiao, Bayesian Inference in Statistical Analysis, 1973, section 1.3) gives the
+distribution of a turn that no residual shows: a mixture of normal distributions, which is Student's t where the other
+turns are seen without noise. The wide standard deviation is the one whose 90 % ellipsoid contains 90 % of this mixture.
+
+Only errors that no residual shows need it, such as what all clocks are late by. The size of an error that the residuals
+do show is known, since the errors that they show are the errors that move the positions. With D and W the diagonal
+matrices of likeliest and wide variances, and Q the share of W that remains after the residuals, so that its eigenvalues
+are 0 for combinations that are seen and 1 for combinations that are not, the covariance is
+
+    D + (W - D)^1/2 Q (W - D)^1/2,    Q = W^-1/2 (W⁻¹ + A / f)⁻¹ W^-1/2.
 """
 
 from __future__ import annotations
@@ -18,6 +30,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import brentq
+from scipy.special import gammainc, gammaincinv
 
 from psotrack.camera_errors.variance_components import FittedPlaces, weighted_residuals
 
@@ -25,6 +39,11 @@ from psotrack.camera_errors.variance_components import FittedPlaces, weighted_re
 _NUM_STEPS = 200
 #: Directions of less information than this share of the largest are not determined.
 _LEAST_INFORMATION = 1e-7
+#: Standard deviations of the posterior distribution, in units of the scale that the residuals show: dense where most
+#: of the posterior is, and far enough for one degree of freedom.
+_SCALES = np.concatenate([np.geomspace(0.03, 0.5, 6), np.geomspace(0.55, 2, 20), np.geomspace(2.3, 60, 14)])
+#: Probability of the ellipsoid for which the wide standard deviations hold.
+_PROBABILITY = 0.9
 
 
 @dataclass(frozen=True)
@@ -36,20 +55,25 @@ class ConstantErrors:
         clock_s: (cameras,), how late each camera's clock shows a drone, relative to the others, seconds.
         turn_std_rad: standard deviation of a turn about one axis, radians.
         clock_std_s: standard deviation of a clock, seconds.
+        covariance: (4 cameras, 4 cameras), of turns about x, y and z, radians, and clock, seconds, camera by camera;
+            larger where residuals show little.
     """
 
     turn_rad: Float[np.ndarray, "cameras 3"]
     clock_s: Float[np.ndarray, "cameras"]
     turn_std_rad: float
     clock_std_s: float
+    covariance: Float[np.ndarray, "all all"]
 
 
 def fit_constant_errors(
     places: FittedPlaces,
     turn_px: Float[np.ndarray, "rows cameras 2 3"],
     flow_px_s: Float[np.ndarray, "rows cameras 2"],
-    noise_px: Float[np.ndarray, "cameras"],
+    noise_px: Float[np.ndarray, "cameras 2"],
     inflation: float,
+    *,
+    with_covariance: bool = True,
 ) -> ConstantErrors:
     """Fit turns and clocks.
 
@@ -57,15 +81,16 @@ def fit_constant_errors(
         places: residuals and derivatives; all rows are determined.
         turn_px: (rows, cameras, 2, 3), derivatives of the projections by turns, pixels per radian.
         flow_px_s: (rows, cameras, 2), velocities in the images, pixels per second.
-        noise_px: (cameras,), standard deviations of the noise, pixels.
+        noise_px: (cameras, 2), standard deviations of the noise along columns and rows, pixels.
         inflation: how much more the variance of a sum over frames is than of independent noise.
+        with_covariance: whether to compute the covariance; NaN otherwise.
     """
     num_cameras = places.shown.shape[1]
-    weight = np.where(places.shown, np.square(1 / noise_px), 0.0)
+    weight = np.where(places.shown[..., None], np.square(1 / noise_px), 0.0)
     left, weighted, inverse = weighted_residuals(places, weight)
     # Four parameters for each camera: three turns and the clock. A late clock shows the drone where it was.
-    design = np.concatenate([turn_px, -flow_px_s[..., None]], axis=-1) * (weight > 0)[..., None, None]
-    own = np.einsum("rc,rcip,rciq->cpq", weight, design, design)
+    design = np.concatenate([turn_px, -flow_px_s[..., None]], axis=-1) * (weight > 0)[..., None]
+    own = np.einsum("rci,rcip,rciq->cpq", weight, design, design)
     crossed = np.einsum("rcik,rcip->rcpk", weighted, design).reshape(len(weight), 4 * num_cameras, 3)
     information = -np.einsum("rak,rkl,rbl->ab", crossed, inverse, crossed, optimize=True)
     for camera in range(num_cameras):
@@ -80,31 +105,113 @@ def fit_constant_errors(
     kept = values > _LEAST_INFORMATION * max(values[-1], np.finfo(float).tiny)
     values, vectors = values[kept], vectors[:, kept]
     g = vectors.T @ score
-    # A's columns of turns and of clocks in the basis of its determined directions.
-    columns = [(values[:, None] * vectors.T)[:, which] for which in (~of_clock, of_clock)]
-    variance = np.full(2, max(float(np.square(g / values).mean()), 1e-12) if len(g) else 0.0)
-    V = np.diag(inflation * values)
-    for _ in range(_NUM_STEPS if len(g) else 0):
-        V = np.diag(inflation * values) + sum(
-            v * part @ part.T for v, part in zip(variance, columns, strict=True)
-        )
-        solved = np.linalg.solve(V, np.column_stack([g, *columns]))
-        first = 1
-        for number, part in enumerate(columns):
-            expected = np.einsum("ij,ij->", part, solved[:, first : first + part.shape[1]])
-            first += part.shape[1]
-            found = np.square(part.T @ solved[:, 0]).sum()
-            variance[number] *= np.sqrt(found / expected) if expected > 0 else 0.0
-    prior = np.where(of_clock, variance[1] if len(g) else 0.0, variance[0] if len(g) else 0.0)
-    fitted = prior * (vectors @ (values * np.linalg.solve(V, g))) if len(g) else np.zeros(len(score))
-    fitted = (fitted * unit).reshape(num_cameras, 4)
+    # Directions and columns of A in units of the noise.
+    noise = np.sqrt(inflation * values)
+    seen = g / noise
+    shares = [_outer((values / noise)[:, None] * vectors.T[:, which]) for which in (~of_clock, of_clock)]
+    variances = _likeliest(seen, shares)
+    prior = np.where(of_clock, variances[1], variances[0])
+    weighted_seen = np.linalg.solve(_total(shares, variances), seen)
+    fitted = (prior * (vectors @ ((values / noise) * weighted_seen)) * unit).reshape(num_cameras, 4)
     scale = [float(unit[which][0]) for which in (~of_clock, of_clock)]
+    covariance = np.full((len(score), len(score)), np.nan)
+    if with_covariance:
+        wide = _wide(seen, shares, variances)
+        both = np.where(of_clock, wide[1], wide[0])
+        covariance = _covariance(information / inflation, prior, both) * np.outer(unit, unit)
     return ConstantErrors(
         turn_rad=fitted[:, :3],
         clock_s=fitted[:, 3],
-        turn_std_rad=scale[0] * float(np.sqrt(variance[0])),
-        clock_std_s=scale[1] * float(np.sqrt(variance[1])),
+        turn_std_rad=scale[0] * float(np.sqrt(variances[0])),
+        clock_std_s=scale[1] * float(np.sqrt(variances[1])),
+        covariance=covariance,
     )
+
+
+def _covariance(
+    information: Float[np.ndarray, "all all"],
+    likeliest: Float[np.ndarray, "all"],
+    wide: Float[np.ndarray, "all"],
+) -> Float[np.ndarray, "all all"]:
+    """Covariance of turns and clocks from their likeliest and wide variances and the information about them."""
+    root = np.sqrt(wide)
+    unseen = np.linalg.inv(np.eye(len(wide)) + root[:, None] * information * root)
+    more = np.sqrt(np.maximum(wide - likeliest, 0.0))
+    return np.diag(likeliest) + more[:, None] * unseen * more
+
+
+def _outer(columns: Float[np.ndarray, "seen all"]) -> Float[np.ndarray, "seen seen"]:
+    return columns @ columns.T
+
+
+def _total(
+    shares: list[Float[np.ndarray, "seen seen"]], variances: Float[np.ndarray, "*grid 2"]
+) -> Float[np.ndarray, "*grid seen seen"]:
+    """Covariances of the directions, in units of the noise, for variances of turns and clocks."""
+    both = sum(variances[..., part, None, None] * share for part, share in enumerate(shares))
+    return np.asarray(np.eye(shares[0].shape[0]) + both)
+
+
+def _likeliest(
+    seen: Float[np.ndarray, "seen"], shares: list[Float[np.ndarray, "seen seen"]]
+) -> Float[np.ndarray, "2"]:
+    """Variances of turns and clocks with the largest likelihood."""
+    traces = np.array([np.trace(share) for share in shares])
+    variances = np.where(traces > 0, (seen @ seen) / np.maximum(traces, np.finfo(float).tiny), 0.0)
+    for _ in range(_NUM_STEPS):
+        inverse = np.linalg.inv(_total(shares, variances))
+        weighted = inverse @ seen
+        for part, share in enumerate(shares):
+            expected = float(np.vdot(inverse, share))
+            found = float(weighted @ share @ weighted)
+            variances[part] *= np.sqrt(found / expected) if expected > 0 else 0.0
+    return variances
+
+
+def _wide(
+    seen: Float[np.ndarray, "seen"],
+    shares: list[Float[np.ndarray, "seen seen"]],
+    likeliest: Float[np.ndarray, "2"],
+) -> Float[np.ndarray, "2"]:
+    """Variances of turns and clocks whose 90 % ellipsoids contain 90 % of errors that no residual shows."""
+    there = [part for part, share in enumerate(shares) if np.trace(share) > 0]
+    wide = np.zeros(len(shares))
+    if not there:
+        return wide
+    inverse = np.linalg.inv(_total(shares, likeliest))
+    # The posterior reaches from the likeliest variance to about what the residuals would show at least.
+    scales = []
+    for part in there:
+        solved = inverse @ shares[part]
+        least_shown = np.sqrt(2 / np.vdot(solved, solved.T))
+        scales.append(np.sqrt(likeliest[part] + least_shown) * _SCALES)
+    grid = np.stack(np.meshgrid(*scales, indexing="ij"), axis=-1)
+    variances = np.zeros((*grid.shape[:-1], 2))
+    variances[..., there] = np.square(grid)
+    inverse = np.linalg.inv(_total(shares, variances))
+    log_likelihood = (np.linalg.slogdet(inverse)[1] - np.einsum("...ij,i,j->...", inverse, seen, seen)) / 2
+    # Fisher information about the logarithms of the standard deviations.
+    changes = [variances[..., part, None, None] * (inverse @ shares[part]) for part in there]
+    information = np.array([[2 * np.einsum("...ij,...ji->...", a, b) for b in changes] for a in changes])
+    determinant = np.linalg.det(np.moveaxis(information, (0, 1), (-2, -1)))
+    posterior = np.exp(log_likelihood - log_likelihood.max()) * np.sqrt(np.maximum(determinant, 0.0))
+    for axis in range(len(there)):
+        steps = np.gradient(np.log(_SCALES))
+        posterior *= np.expand_dims(steps, tuple(other for other in range(len(there)) if other != axis))
+    for axis, part in enumerate(there):
+        share = posterior.sum(axis=tuple(other for other in range(len(there)) if other != axis))
+        wide[part] = _wide_variance(np.square(scales[axis]), share / share.sum())
+    return wide
+
+
+def _wide_variance(variance: Float[np.ndarray, "grid"], share: Float[np.ndarray, "grid"]) -> float:
+    """The variance whose 90 % ellipsoid, in three dimensions, contains 90 % of a mixture of normal distributions."""
+    limit = 2 * gammaincinv(3 / 2, _PROBABILITY)
+
+    def more_inside(log_wide: float) -> float:
+        return float(share @ gammainc(3 / 2, limit * np.exp(log_wide) / variance / 2)) - _PROBABILITY
+
+    return float(np.exp(brentq(more_inside, np.log(variance[0]) - 5, np.log(variance[-1]) + 5)))
 
 
 def _unit(information: Float[np.ndarray, "all all"], which: np.ndarray) -> float:

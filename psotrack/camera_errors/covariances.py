@@ -5,6 +5,16 @@ An error of a drone's place in a camera's image moves the estimated position by 
 So the covariance of a track is that of the motion model, for the noise that was found, plus the covariance of the
 errors that last (consider parameters: B. D. Tapley, B. E. Schutz, G. H. Born, Statistical Orbit Determination, 2004,
 section 6.4).
+
+Clocks. Camera c shows a drone with the velocity v as late as d_c after the instant, so its place is J_c v d_c behind,
+and the position errs by
+
+    e = -sum_c G_c J_c v d_c,    G_c the gain of camera c, J_c the derivative of its projection.
+
+The clocks are taken to err independently about the time of the recording, with mean 0 and variance s², so that
+cov(e) = s² sum_c (G_c J_c v) (G_c J_c v)ᵀ. A delay d that all cameras share is in this sum with the share that
+independent clocks have by chance, and no residual shows more of it: sum_c G_c J_c is the identity, so the drone is seen
+v d behind its place by all cameras alike. Such a delay is not in the covariance.
 """
 
 from __future__ import annotations
@@ -13,16 +23,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.special import fdtri, gammaincinv
 
 from psotrack.camera_errors.filtered_variance import MeasurementErrors, filtered_variances
 from psotrack.camera_errors.learning import CameraErrors
 from psotrack.camera_errors.views import CameraViews
 
-#: Probability of the ellipsoid for which few degrees of freedom are allowed.
-_PROBABILITY = 0.9
-#: Least number of degrees of freedom: with fewer, no finite ellipsoid would be wide enough to be of use.
-_LEAST_FREEDOM = 2
+#: Time over which stated and found noise are compared, seconds, and number of levels of the stated noise.
+_WINDOW_S, _NUM_LEVELS = 1.0, 8
 
 
 def noise_covariance(views: CameraViews, errors: CameraErrors) -> Float[np.ndarray, "frames drones 3 3"]:
@@ -32,7 +39,7 @@ def noise_covariance(views: CameraViews, errors: CameraErrors) -> Float[np.ndarr
     """
     noise_px = np.where(np.isnan(errors.noise_px), _mean(errors.noise_px), errors.noise_px)
     gain = views.gain
-    covariance_m2 = np.einsum("fdcik,c,fdcjk->fdij", gain, np.square(noise_px), gain, optimize=True)
+    covariance_m2 = np.einsum("fdcik,ck,fdcjk->fdij", gain, np.square(noise_px), gain, optimize=True)
     return np.where((np.trace(covariance_m2, axis1=-2, axis2=-1) > 0)[..., None, None], covariance_m2, np.nan)
 
 
@@ -52,7 +59,6 @@ class LastingCovariances:
 def lasting_covariances(
     views: CameraViews,
     errors: CameraErrors,
-    velocity_m_s: Float[np.ndarray, "frames drones 3"],
     *,
     rig_error_deg: float = 0.0,
     pixel_error_px: float = 0.0,
@@ -60,68 +66,44 @@ def lasting_covariances(
     """Covariances of the positions by errors of the cameras that last.
 
     Turned cameras are off by nearly the same vector in all frames, so most of this error is a constant offset of each
-    drone. The clock of the recording is one more clock that errs as the cameras' clocks do.
+    drone.
 
     Args:
         views: the views of all drones.
         errors: the cameras' errors.
-        velocity_m_s: (frames, drones, 3), velocities, m/s; NaN where they are not known.
         rig_error_deg: angle by which each camera is turned at least, about a random axis, degrees.
         pixel_error_px: standard deviation of each camera's lasting error along either axis at least, pixels.
     """
-    gain, cameras = views.gain, views.num_cameras
+    gain = views.gain
     lasting_px2 = np.maximum(np.square(errors.lasting_px), pixel_error_px**2)
-    by_place = np.einsum("fdcik,c,fdcjk->fdij", gain, lasting_px2, gain, optimize=True)
-    turn_rad2 = max(
-        widening(3 * (cameras - 1)) * errors.turn_rad**2, float(np.radians(rig_error_deg)) ** 2 / 3
-    )
+    by_place = np.einsum("fdcik,ck,fdcjk->fdij", gain, lasting_px2, gain, optimize=True)
     turned = gain @ views.turn_px
-    known = np.expand_dims(np.abs(turned).sum(axis=(-3, -2, -1)), (-3, -2, -1)) > 0
-    mean = np.where(known, turned, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-    moved = np.einsum("fdcik,fdck->fdci", gain, views.flow_px_s)
-    own = np.nan_to_num(velocity_m_s)
-    by_clock = _outer(moved) + own[..., :, None] * own[..., None, :]
-    others = by_place + widening(cameras - 1) * errors.clock_s**2 * by_clock
-    found = known[..., 0]
-    return LastingCovariances(
-        *(_filled(others + turn_rad2 * _outer_of_turns(each), found) for each in (turned, turned - mean))
-    )
+    found = np.abs(turned).sum(axis=(-3, -2, -1)) > 0
+    mean = np.where(found[..., None, None, None], turned, 0.0).sum(axis=0)
+    mean /= np.maximum(found.sum(axis=0), 1)[:, None, None, None]
+    late = -np.einsum("fdcik,fdck->fdci", gain, views.flow_px_s)[..., None]
+    constant = errors.constant_covariance.copy()
+    of_turns = np.arange(len(constant)) % 4 < 3
+    given_rad2 = float(np.radians(rig_error_deg)) ** 2 / 3
+    constant[of_turns, of_turns] += max(0.0, given_rad2 - float(np.diag(constant)[of_turns].mean()))
 
+    def by_constant(turns: Float[np.ndarray, "frames drones cameras 3 3"]) -> np.ndarray:
+        moved = np.concatenate([turns, late], axis=-1).swapaxes(2, 3)
+        moved = moved.reshape(*moved.shape[:3], -1)
+        return _filled(by_place + moved @ constant @ moved.swapaxes(-1, -2), found, 0.0)
 
-def _outer(vectors: Float[np.ndarray, "frames drones cameras 3"]) -> Float[np.ndarray, "frames drones 3 3"]:
-    return vectors.swapaxes(-1, -2) @ vectors
-
-
-def _outer_of_turns(
-    turned: Float[np.ndarray, "frames drones cameras 3 3"],
-) -> Float[np.ndarray, "frames drones 3 3"]:
-    frames, drones, cameras = turned.shape[:3]
-    flat = turned.swapaxes(-2, -1).reshape(frames, drones, 3 * cameras, 3)
-    return flat.swapaxes(-1, -2) @ flat
+    return LastingCovariances(by_constant(turned), by_constant(turned - mean))
 
 
 def _filled(
-    values_m2: Float[np.ndarray, "frames drones 3 3"], known: Bool[np.ndarray, "frames drones 1 1"]
-) -> Float[np.ndarray, "frames drones 3 3"]:
-    """The values of the nearest earlier known frame, or else of the first one; 0 where a drone has none."""
-    frame = np.arange(len(values_m2))[:, None]
-    there = known[..., 0, 0]
-    last = np.maximum.accumulate(np.where(there, frame, -1), axis=0)
-    nearest = np.where(last >= 0, last, there.argmax(axis=0))
-    filled = np.take_along_axis(values_m2, nearest[..., None, None], axis=0)
-    return np.where(there.sum(axis=0)[:, None, None] > 0, filled, 0.0)
-
-
-def widening(freedom: int) -> float:
-    """Factor of a covariance in three dimensions that was learned from few numbers: Student's t instead of the normal.
-
-    With the factor, 90 % of the errors lie in the 90 % ellipsoid (Hotelling 1931: F instead of chi-square).
-
-    Args:
-        freedom: number of independent numbers behind the covariance.
-    """
-    freedom = max(freedom, _LEAST_FREEDOM)
-    return float(3 * fdtri(3, freedom, _PROBABILITY) / (2 * gammaincinv(3 / 2, _PROBABILITY)))
+    values: Float[np.ndarray, "frames drones *rest"], known: Bool[np.ndarray, "frames drones"], empty: float
+) -> Float[np.ndarray, "frames drones *rest"]:
+    """The values of the nearest earlier known frame, or else of the first one; `empty` where a drone has none."""
+    frame = np.arange(len(values))[:, None]
+    last = np.maximum.accumulate(np.where(known, frame, -1), axis=0)
+    nearest = np.where(last >= 0, last, known.argmax(axis=0))
+    filled = values[nearest, np.arange(values.shape[1])]
+    return np.where(known.any(axis=0).reshape(-1, *[1] * (values.ndim - 2)), filled, empty)
 
 
 def noise_ratios(
@@ -132,10 +114,11 @@ def noise_ratios(
     *,
     dt_s: float,
     jerk_density_m2_s5: float,
-) -> tuple[Float[np.ndarray, "drones"], Float[np.ndarray, "drones"]]:
-    """Ratios of found and stated variances for each drone: of measured positions, and of filtered positions.
+) -> tuple[Float[np.ndarray, "frames drones"], Float[np.ndarray, "frames drones"]]:
+    """Ratios of found and stated variances around each frame: of measured positions, and of filtered positions.
 
-    1 where the noise is not known.
+    A drone that leaves the view of some cameras is measured less well from then on, so the ratios change with time.
+    1 where the noise is not known; a drone that is not measured keeps its last ratios.
 
     Args:
         measured_m2: (frames, drones, 3, 3), covariances of the measured positions as the tracker states them, m²; NaN
@@ -147,21 +130,43 @@ def noise_ratios(
         jerk_density_m2_s5: spectral density of the white jerk of the filter.
     """
     stated, found = (np.trace(value, axis1=-2, axis2=-1) / 3 for value in (measured_m2, noise_m2))
-    measured, filtered = np.ones((2, stated.shape[1]))
-    for drone in range(stated.shape[1]):
-        known = np.isfinite(stated[:, drone]) & np.isfinite(found[:, drone])
-        if not known.any():
-            continue
-        stated_m2, found_m2 = (float(np.median(value[known, drone])) for value in (stated, found))
-        measured[drone] = found_m2 / stated_m2
-        before_m2, after_m2 = filtered_variances(
-            MeasurementErrors(stated_m2, assumed.fading_share, assumed.time_s),
-            MeasurementErrors(found_m2, errors.fading.fading_share, errors.fading.time_s),
+    known = (stated > 0) & np.isfinite(stated) & np.isfinite(found)
+    if not known.any():
+        return np.ones(known.shape), np.ones(known.shape)
+    window = 1 + 2 * round(_WINDOW_S / dt_s / 2)
+    stated, found = (_local_medians(np.where(known, value, np.nan), window) for value in (stated, found))
+    # The filter's gain depends on the stated variance; with the gain, the variance is linear in the found variance.
+    levels_m2 = np.geomspace(stated[known].min(), stated[known].max(), _NUM_LEVELS)
+
+    def filtered(level_m2: float, share: float) -> tuple[float, float]:
+        return filtered_variances(
+            MeasurementErrors(level_m2, assumed.fading_share, assumed.time_s),
+            MeasurementErrors(share * level_m2, errors.fading.fading_share, errors.fading.time_s),
             dt_s=dt_s,
             jerk_density_m2_s5=jerk_density_m2_s5,
         )
-        filtered[drone] = after_m2 / before_m2
-    return measured, filtered
+
+    by_motion = np.array([after / before for before, after in (filtered(level, 0.0) for level in levels_m2)])
+    by_both = np.array([after / before for before, after in (filtered(level, 1.0) for level in levels_m2)])
+    level = np.where(known, stated, levels_m2[0])
+    measured = np.where(known, found / level, 1.0)
+    motion, both = (np.interp(np.log(level), np.log(levels_m2), each) for each in (by_motion, by_both))
+    ratios = (measured, motion + (both - motion) * measured)
+    return _filled(ratios[0], known, 1.0), _filled(ratios[1], known, 1.0)
+
+
+def _local_medians(
+    values: Float[np.ndarray, "frames drones"], window: int
+) -> Float[np.ndarray, "frames drones"]:
+    """Medians of the finite values in a window of frames around each finite value; NaN elsewhere."""
+    half = window // 2
+    padded = np.pad(values, [(half, half), (0, 0)], constant_values=np.nan)
+    medians = np.full(values.shape, np.nan)
+    for drone in range(values.shape[1]):
+        frames = np.flatnonzero(np.isfinite(values[:, drone]))
+        around = np.lib.stride_tricks.sliding_window_view(padded[:, drone], window)[frames]
+        medians[frames, drone] = np.nanmedian(around, axis=-1)
+    return medians
 
 
 def _mean(values: np.ndarray) -> float:

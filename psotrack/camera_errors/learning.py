@@ -15,6 +15,7 @@ Noise and lasting errors are learned per camera (`variance_components`), turns a
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -33,8 +34,10 @@ _BLOCK_S, _BLOCK_TIMES = 1.0, 2.0
 _SHARED_WEIGHT = 0.5
 #: Least share of a camera's variance that is noise.
 _LEAST_NOISE = 0.02
+#: Variance of the noise in the first fit of turns and clocks, squared pixels.
+_NO_NOISE = 1e-6
 #: Rounds in which noise and constant errors are learned in turn.
-_ROUNDS = 4
+_ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -42,18 +45,22 @@ class CameraErrors:
     """Standard deviations of the errors of the places that cameras show.
 
     Attributes:
-        noise_px: (cameras,), errors that do not last, along either axis, pixels; NaN where no residual shows them.
+        noise_px: (cameras, 2), errors that do not last, along columns and rows, pixels; NaN where no residual shows
+            them.
         fading: how the errors that do not last fade.
-        lasting_px: (cameras,), errors that last while a drone stays in one part of the image, pixels.
+        lasting_px: (cameras, 2), errors that last while a drone stays in one part of the image, pixels.
         turn_rad: turns of the cameras about each axis, radians.
         clock_s: the cameras' clocks, seconds.
+        constant_covariance: (4 cameras, 4 cameras), of turns about x, y and z, radians, and clock, seconds, camera by
+            camera; larger where residuals show little (see `constant_errors`).
     """
 
-    noise_px: Float[np.ndarray, "cameras"]
+    noise_px: Float[np.ndarray, "cameras 2"]
     fading: Fading
-    lasting_px: Float[np.ndarray, "cameras"]
+    lasting_px: Float[np.ndarray, "cameras 2"]
     turn_rad: float
     clock_s: float
+    constant_covariance: Float[np.ndarray, "all all"]
 
 
 def learn_camera_errors(views: CameraViews, fps: float, usual: Fading) -> CameraErrors:
@@ -68,33 +75,34 @@ def learn_camera_errors(views: CameraViews, fps: float, usual: Fading) -> Camera
     found = _rows(views, 1).determined.reshape(views.shown.shape[:2])
     step = max(1, -(-int(found.sum()) // _MAX_ROWS))
     if found[::step].sum() < 2:
-        return CameraErrors(
-            np.full(num_cameras, np.nan), usual.without_lasting(), np.zeros(num_cameras), 0.0, 0.0
-        )
-    rest, total_px2, fading = views, np.ones(num_cameras), usual
-    constant: ConstantErrors | None = None
-    for _ in range(_ROUNDS):
-        total_px2 = _total_variances(rest, step)
-        fading = fading_of(rest.residual_px / np.sqrt(total_px2)[:, None], rest.shown, dt_s, usual)
-        noise_px = np.sqrt(total_px2 * max(1 - fading.lasting_share, _LEAST_NOISE))
-        rows = _rows(views, step)
-        which = np.flatnonzero(rows.determined)
-        constant = fit_constant_errors(
-            rows.only(which),
-            views.turn_px[::step].reshape(-1, num_cameras, 2, 3)[which],
-            views.flow_px_s[::step].reshape(-1, num_cameras, 2)[which],
-            noise_px,
-            fading.without_lasting().inflation(step * dt_s),
-        )
+        none = np.zeros((num_cameras, 2))
+        unknown = np.zeros((4 * num_cameras, 4 * num_cameras))
+        return CameraErrors(none * np.nan, usual.without_lasting(), none, 0.0, 0.0, unknown)
+    rows = _rows(views, step)
+    which = np.flatnonzero(rows.determined)
+    fitted = partial(
+        fit_constant_errors,
+        rows.only(which),
+        views.turn_px[::step].reshape(-1, num_cameras, 2, 3)[which],
+        views.flow_px_s[::step].reshape(-1, num_cameras, 2)[which],
+    )
+    # First as if there were next to no noise: the noise of residuals that contain a turn would hide the turn.
+    constant = fitted(np.ones((num_cameras, 2)), _NO_NOISE, with_covariance=False)
+    for round_number in range(_ROUNDS):
         rest = _without(views, constant)
-    assert constant is not None
+        total_px2 = _total_variances(rest, step)
+        fading = fading_of(rest.residual_px / np.sqrt(total_px2), rest.shown, dt_s, usual)
+        noise_px = np.sqrt(total_px2 * max(1 - fading.lasting_share, _LEAST_NOISE))
+        inflation = fading.without_lasting().inflation(step * dt_s)
+        constant = fitted(noise_px, inflation, with_covariance=round_number == _ROUNDS - 1)
+    rest = _without(views, constant)
     total_px2 = _total_variances(rest, step)
-    fading = fading_of(rest.residual_px / np.sqrt(total_px2)[:, None], rest.shown, dt_s, usual)
+    fading = fading_of(rest.residual_px / np.sqrt(total_px2), rest.shown, dt_s, usual)
     noise = fading.without_lasting()
     length = max(1, round(max(_BLOCK_S, _BLOCK_TIMES * noise.time_s) * fps))
     blocks, num_frames = _blocks(rest, length)
     noise_px2 = total_px2 * max(1 - fading.lasting_share, _LEAST_NOISE)
-    lasting_px2 = camera_variances(blocks, noise_px2 * noise.variance_of_mean(num_frames, dt_s))
+    lasting_px2 = camera_variances(blocks, noise_px2 * noise.variance_of_mean(num_frames, dt_s)[..., None])
     shared_px2 = float(np.nanmean(lasting_px2)) if np.isfinite(lasting_px2).any() else 0.0
     lasting_px2 = np.where(np.isnan(lasting_px2), shared_px2, lasting_px2)
     lasting_px2 = _SHARED_WEIGHT * shared_px2 + (1 - _SHARED_WEIGHT) * lasting_px2
@@ -104,6 +112,7 @@ def learn_camera_errors(views: CameraViews, fps: float, usual: Fading) -> Camera
         lasting_px=np.sqrt(lasting_px2),
         turn_rad=constant.turn_std_rad,
         clock_s=constant.clock_std_s,
+        constant_covariance=constant.covariance,
     )
 
 
@@ -117,10 +126,10 @@ def _rows(views: CameraViews, step: int) -> FittedPlaces:
     )
 
 
-def _total_variances(views: CameraViews, step: int) -> Float[np.ndarray, "cameras"]:
-    """(cameras,), variance of the places in single frames; the mean of the others where a camera shows nothing."""
+def _total_variances(views: CameraViews, step: int) -> Float[np.ndarray, "cameras 2"]:
+    """(cameras, 2), variances of the places in single frames; the mean of the others where a camera shows nothing."""
     rows = _rows(views, step)
-    variance_px2 = camera_variances(rows, np.zeros(rows.shown.shape))
+    variance_px2 = camera_variances(rows, np.zeros(rows.residual_px.shape))
     return np.where(np.isnan(variance_px2), np.nanmean(variance_px2), variance_px2)
 
 
@@ -137,7 +146,8 @@ def _without(views: CameraViews, constant: ConstantErrors) -> CameraViews:
     )
     determined = rows.determined
     fitted_px = rows.residual_px.copy()
-    fitted_px[determined] = weighted_residuals(rows.only(determined), rows.shown[determined].astype(float))[0]
+    weight = np.repeat(rows.shown[determined][..., None].astype(float), 2, axis=-1)
+    fitted_px[determined] = weighted_residuals(rows.only(determined), weight)[0]
     return replace(
         views, residual_px=np.where(shown[..., None], fitted_px.reshape(residual_px.shape), np.nan)
     )

@@ -80,8 +80,8 @@ class TrackErrors:
         return {
             "cameras": {
                 name: {
-                    "noise_px": None if np.isnan(noise_px) else float(noise_px),
-                    "lasting_px": float(lasting_px),
+                    "noise_px": None if np.isnan(noise_px).any() else noise_px.tolist(),
+                    "lasting_px": lasting_px.tolist(),
                 }
                 for name, noise_px, lasting_px in zip(names, errors.noise_px, errors.lasting_px, strict=True)
             },
@@ -120,20 +120,17 @@ def with_camera_errors(
     )
     corrected = replace(
         tracks,
-        measured_covariance_m2=measured_m2 * measured[:, None, None],
-        covariance_m2=filtered_m2 * filtered[:, None, None],
+        measured_covariance_m2=measured_m2 * measured[..., None, None],
+        covariance_m2=filtered_m2 * filtered[..., None, None],
     )
-    return corrected, TrackErrors(errors, lasting_of(tracks, views, errors, given))
+    return corrected, TrackErrors(errors, lasting_of(views, errors, given))
 
 
-def lasting_of(
-    tracks: Tracks, views: CameraViews, errors: CameraErrors, given: ErrorSettings
-) -> LastingCovariances:
+def lasting_of(views: CameraViews, errors: CameraErrors, given: ErrorSettings) -> LastingCovariances:
     """Covariances of the positions by errors that last."""
     return lasting_covariances(
         views,
         errors,
-        np.asarray(tracks.velocity_m_s, np.float64),
         rig_error_deg=given.rig_deg,
         pixel_error_px=given.pixel_px,
     )
@@ -166,11 +163,12 @@ def fused_errors(
         return np.sqrt((np.square(one) + np.square(other)) / 2)
 
     errors = CameraErrors(
-        noise_px=np.full(len(first.noise_px), np.nan),
+        noise_px=np.full_like(first.noise_px, np.nan),
         fading=first.fading,
         lasting_px=mean(first.lasting_px, second.lasting_px),
         turn_rad=float(mean(first.turn_rad, second.turn_rad)),
         clock_s=float(mean(first.clock_s, second.clock_s)),
+        constant_covariance=(first.constant_covariance + second.constant_covariance) / 2,
     )
     measured_m2 = np.asarray(tracks.measured_covariance_m2, np.float64)
     _, filtered = noise_ratios(
@@ -181,5 +179,5 @@ def fused_errors(
         dt_s=1 / fps,
         jerk_density_m2_s5=motion.jerk_density,
     )
-    corrected = replace(tracks, covariance_m2=tracks.covariance_m2 * filtered[:, None, None])
-    return corrected, TrackErrors(errors, lasting_of(tracks, views, errors, given))
+    corrected = replace(tracks, covariance_m2=tracks.covariance_m2 * filtered[..., None, None])
+    return corrected, TrackErrors(errors, lasting_of(views, errors, given))

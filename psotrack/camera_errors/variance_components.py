@@ -18,6 +18,8 @@ from jaxtyping import Bool, Float
 _NUM_STEPS = 60
 #: Least variance, as a share of the mean squared residual.
 _LEAST = 1e-6
+#: Number of residuals as which the common variance of all cameras counts.
+_COMMON = 3.0
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class FittedPlaces:
 
 
 def weighted_residuals(
-    places: FittedPlaces, weight: Float[np.ndarray, "rows cameras"]
+    places: FittedPlaces, weight: Float[np.ndarray, "rows cameras 2"]
 ) -> tuple[
     Float[np.ndarray, "rows cameras 2"],
     Float[np.ndarray, "rows cameras 2 3"],
@@ -59,40 +61,48 @@ def weighted_residuals(
 
     Args:
         places: residuals and derivatives; all rows are determined.
-        weight: (rows, cameras), inverse variances; 0 where not shown.
+        weight: (rows, cameras, 2), inverse variances along columns and rows; 0 where not shown.
     """
     residual_px = np.where(places.shown[..., None], places.residual_px, 0.0)
-    weighted = weight[..., None, None] * places.jacobian
+    weighted = weight[..., None] * places.jacobian
     inverse = np.linalg.inv(np.einsum("rcik,rcil->rkl", weighted, places.jacobian))
     moved_m = np.einsum("rkl,rcil,rci->rk", inverse, weighted, residual_px)
-    return weight[..., None] * residual_px - np.einsum("rcik,rk->rci", weighted, moved_m), weighted, inverse
+    return weight * residual_px - np.einsum("rcik,rk->rci", weighted, moved_m), weighted, inverse
 
 
 def camera_variances(
-    places: FittedPlaces, known_px2: Float[np.ndarray, "rows cameras"]
-) -> Float[np.ndarray, "cameras"]:
-    """(cameras,), variance of each camera's places along either axis, besides a known part; NaN without residuals.
+    places: FittedPlaces, known_px2: Float[np.ndarray, "rows cameras 2"]
+) -> Float[np.ndarray, "cameras 2"]:
+    """(cameras, 2), variances of each camera's places along columns and rows; NaN without residuals.
+
+    Two cameras show errors across their common plane with the drone only, and the sum of both cameras' errors rather
+    than each: what residuals do not tell apart is the mean of all variances.
 
     Args:
         places: residuals and derivatives.
-        known_px2: (rows, cameras), the known part of the variances, squared pixels.
+        known_px2: (rows, cameras, 2), the known part of the variances, which is not in the result, squared pixels.
     """
     rows = places.determined
     places, known_px2 = places.only(rows), known_px2[rows]
-    seen = places.shown.any(axis=0)
+    seen = np.repeat(places.shown.any(axis=0)[:, None], 2, axis=-1)
     if not len(places.shown):
         return np.full(seen.shape, np.nan)
-    squared = np.where(places.shown[..., None], places.residual_px, 0.0) ** 2
+    shown = places.shown[..., None]
+    squared = np.where(shown, places.residual_px, 0.0) ** 2
     mean_px2 = squared.sum() / max(1, 2 * places.shown.sum())
     least_px2 = _LEAST * mean_px2 + np.finfo(float).tiny
     variance_px2 = np.full(seen.shape, mean_px2 + least_px2)
     for _ in range(_NUM_STEPS):
-        weight = np.where(places.shown, 1 / (known_px2 + variance_px2), 0.0)
+        weight = np.where(shown, 1 / (known_px2 + variance_px2), 0.0)
         left, weighted, inverse = weighted_residuals(places, weight)
-        # Diagonal of P, summed over both axes: 2 w - w² tr(J (Jᵀ W J)⁻¹ Jᵀ).
-        leverage = np.einsum("rcik,rkl,rcil->rc", weighted, inverse, weighted)
-        expected = (2 * weight - leverage).sum(axis=0)
-        found = np.square(left).sum(axis=(0, 2))
-        ratio = np.where(expected > 0, found / np.where(expected > 0, expected, 1.0), 1.0)
-        variance_px2 = np.maximum(variance_px2 * np.sqrt(ratio), least_px2)
+        # Diagonal of P: w - w² J (Jᵀ W J)⁻¹ Jᵀ.
+        leverage = np.einsum("rcik,rkl,rcil->rci", weighted, inverse, weighted, optimize=True)
+        expected = (weight - leverage).sum(axis=0)
+        found = np.square(left).sum(axis=0)
+        # The common variance counts as some more residuals of each camera.
+        told = np.where(seen, expected, 0.0)
+        common_px2 = (told * variance_px2).sum() / told.sum() if told.sum() > 0 else mean_px2
+        found += _COMMON * common_px2 / np.square(variance_px2)
+        expected += _COMMON / variance_px2
+        variance_px2 = np.maximum(variance_px2 * np.sqrt(found / expected), least_px2)
     return np.where(seen, variance_px2, np.nan)
