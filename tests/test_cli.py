@@ -491,9 +491,39 @@ def press(event, arguments):
         signal.raise_signal(signal.SIGINT)
 
 sys.addaudithook(press)
-from psotrack.cli import main
+from psotrack.__main__ import main
 main()
 """
+
+
+#: Program that runs `psotrack` and presses Ctrl-C in a callback of the garbage collector, which drops exceptions.
+INTERRUPTED_UNHEARD = """
+import gc, signal, sys
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+def press(phase, info):
+    if "psotrack.datasets.dpjait" in sys.modules:
+        gc.callbacks.remove(press)
+        signal.raise_signal(signal.SIGINT)
+
+gc.callbacks.append(press)
+from psotrack.__main__ import main
+main()
+"""
+
+
+def test_ctrl_c_in_a_callback_of_the_garbage_collector_ends_the_command(
+    sequence: Path, tmp_path: Path
+) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED_UNHEARD, *map(str, track(sequence, tmp_path / "tracks.csv"))],
+        env={**os.environ, "PSOTRACK_CACHE": str(tmp_path / "cache")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert_one_line(Output(done.returncode, done.stdout, done.stderr), "interrupted")
 
 
 def test_ctrl_c_leaves_earlier_results(sequence: Path, tmp_path: Path) -> None:

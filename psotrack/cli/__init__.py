@@ -4,7 +4,7 @@ In: arguments and files. Out: files, text on stdout, and one line on stderr wher
 no numerics. A command's module is imported when the command runs, and the module imports the functions that it calls
 when they are called, so that `--help` and shell completion are quick. The exit code is 0 if everything was done, and 2
 for every error; it is 2 also if `doctor` or `map-markers --check` finds a fault. No other room uses this room;
-`python -m psotrack` and the installed script call `main`.
+`psotrack.__main__`, which the installed script and `python -m psotrack` run, calls `main` and answers Ctrl-C.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import sys
 import click
 
 from psotrack import __version__
+from psotrack.cli.interrupts import orderly_interrupts
 from psotrack.cli.lazy import LazyCommand, LazyGroup
 from psotrack.errors import PsotrackError, SettingsError
 
@@ -124,11 +125,15 @@ def cli(verbose: bool) -> None:
 
 
 def main() -> None:
-    """Run the command line; an error that psotrack raises on purpose becomes one line and exit code 2."""
+    """Run the command line; an error that psotrack raises on purpose becomes one line and exit code 2.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C was pressed.
+    """
     try:
         _complete()
-        # `cli.main` would print two lines for Ctrl-C.
-        with cli.make_context("psotrack", sys.argv[1:]) as context:
+        # `cli.main` would answer Ctrl-C itself.
+        with orderly_interrupts(), cli.make_context("psotrack", sys.argv[1:]) as context:
             cli.invoke(context)
     except click.exceptions.Exit as done:
         sys.exit(done.exit_code)
@@ -140,11 +145,6 @@ def main() -> None:
         failed = error.ctx if isinstance(error, click.UsageError) else None
         remedy = f"; see `{failed.command_path} --help`" if failed else ""
         sys.stderr.write(f"psotrack: {error.format_message().rstrip('.')}{remedy}\n")
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.stderr.write(
-            "psotrack: interrupted; earlier results are unchanged, and the same command continues the work\n"
-        )
         sys.exit(2)
     except PsotrackError as error:
         sys.stderr.write(f"psotrack: {error}\n")

@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import signal
+import sys
 import threading
+import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -20,8 +22,10 @@ from psotrack.support.progress import Advance
 _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
 
-#: Time that a worker has to end by itself before it is terminated, seconds: enough to remove its temporary files.
-GRACE_S = 5.0
+#: Time that the workers have to notice that the pipe is broken, seconds. `SystemExit` is raised in them after it.
+GRACE_S = 1.0
+#: Time that they have after that to remove their temporary files before they are killed, seconds.
+_CLEAN_UP_S = 5.0
 
 
 def map_in_processes(
@@ -31,7 +35,8 @@ def map_in_processes(
 
     The workers are new Python interpreters with one OpenCV thread each. They end with this call, also if Ctrl-C or
     SIGKILL ends it: the pipe to the worker breaks, the next `advance` in the worker raises `BrokenPipeError`, and the
-    clean-up of `function` runs. With one job or one task the work is done in the calling process.
+    clean-up of `function` runs; it also runs in workers that Ctrl-C finds in a long step. With one job or one task the
+    work is done in the calling process.
 
     Args:
         function: importable by name; calls `advance` at least a few times per second.
@@ -88,9 +93,13 @@ def _workers(function: Callable[..., Any], count: int) -> Iterator[list[Connecti
     finally:
         for connection in connections:
             connection.close()
+        for wait_s, then in ((GRACE_S, "terminate"), (_CLEAN_UP_S, "kill")):
+            end_s = time.monotonic() + wait_s
+            for process in processes:
+                process.join(max(0.0, end_s - time.monotonic()))
+            for process in processes:
+                getattr(process, then)()
         for process in processes:
-            process.join(GRACE_S)
-            process.terminate()
             process.join()
 
 
@@ -123,6 +132,8 @@ def _receive(connection: Connection) -> Any:
 def _serve(function: Callable[..., Any], connection: Connection) -> None:
     """Run a worker: receive tasks; send progress (int), results (index, result) and exceptions."""
     cv2.setNumThreads(1)
+    # Where the parent process terminates the worker, the clean-up of `function` runs.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:
             index, task = connection.recv()
