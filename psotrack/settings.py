@@ -8,12 +8,13 @@ fast.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import msgspec
 
 from psotrack.errors import SettingsError, check_positive
 from psotrack.silhouettes import SilhouetteSettings
+from psotrack.support import check_types, nearest, plain
 
 SwarmKind = Literal["joint", "per-drone"]
 Clocks = Literal["given", "auto"]
@@ -71,6 +72,15 @@ def _check_least(name: str, value: int, least: int) -> None:
         raise SettingsError(name, expected=f"at least {least}", found=f"{value}")
 
 
+def _check_range(name: str, value: float | int, low: float, high: float = float("inf")) -> None:
+    """Raise `SettingsError` unless low <= value <= high and the value is finite."""
+    if not (low <= value <= high and value < float("inf")):
+        expected = (
+            f"a number from {low:g} to {high:g}" if high < float("inf") else f"a number of at least {low:g}"
+        )
+        raise SettingsError(name, expected=expected, found=f"{value:g}")
+
+
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
     if value not in choices:
         raise SettingsError(name, expected=f"one of {', '.join(choices)}", found=value)
@@ -93,7 +103,20 @@ class _AnswersOldNames(msgspec.StructMeta):
         return super().__call__(*args, **kwargs)
 
 
-class SwarmSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class _Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of the records: the types of all values are checked.
+
+    Attributes:
+        prefix: beginning of the dotted names of the record's settings.
+    """
+
+    prefix: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        check_types(self, self.prefix)
+
+
+class SwarmSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The search for the best positions in one frame: a particle swarm, or another search.
 
     Attributes:
@@ -108,6 +131,7 @@ class SwarmSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         SettingsError: a value is not allowed.
     """
 
+    prefix: ClassVar[str] = "swarm."
     search: str = "pso"
     kind: SwarmKind = "per-drone"
     particles: int = 30
@@ -118,13 +142,14 @@ class SwarmSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     social: float = 1.5
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check_choice("swarm.kind", self.kind, get_args(SwarmKind))
         _check_least("swarm.particles", self.particles, 2)
         _check_least("swarm.iterations", self.iterations, 0)
         check_positive("swarm.spread_m", self.spread_m)
 
 
-class ScoreSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ScoreSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The score of positions against silhouettes.
 
     Attributes:
@@ -134,15 +159,26 @@ class ScoreSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         occlusion: whether foreground that another drone is expected to cover is left out of a drone's score.
         vertex: whether a drone's position is the vertex of a paraboloid through the scores about the best position
             that was tried, not that position itself.
+
+    Raises:
+        SettingsError: a value is not allowed.
     """
 
+    prefix: ClassVar[str] = "score."
     kind: str = "soft"
     windows: tuple[float, ...] = (0.4, 0.7, 1.0)
     occlusion: bool = True
     vertex: bool = True
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.windows:
+            raise SettingsError("score.windows", expected="at least one scale", found="none")
+        for scale in self.windows:
+            check_positive("score.windows", scale)
 
-class MotionSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+
+class MotionSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The motion model of the drones, and how measured positions err (see `psotrack.motion`).
 
     Attributes:
@@ -158,6 +194,7 @@ class MotionSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         SettingsError: a value is not allowed.
     """
 
+    prefix: ClassVar[str] = "motion."
     max_speed_m_s: float | None = None
     jerk_density_m2_s5: float | None = None
     velocity_std_m_s: float = 1.0
@@ -166,6 +203,7 @@ class MotionSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     error_time_s: float = 0.4
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in (
             "max_speed_m_s",
             "jerk_density_m2_s5",
@@ -175,6 +213,7 @@ class MotionSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         ):
             if getattr(self, name) is not None:
                 check_positive(f"motion.{name}", getattr(self, name))
+        _check_range("motion.error_share", self.error_share, 0.0, 1.0)
 
     @property
     def speed_limit_m_s(self) -> float:
@@ -193,7 +232,7 @@ class MotionSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         return max(1.0, (self.speed_limit_m_s / USUAL_SPEED_M_S) ** 3)
 
 
-class DroneSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class DroneSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What is known of the drones beforehand.
 
     Attributes:
@@ -207,19 +246,21 @@ class DroneSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         SettingsError: a value is not allowed.
     """
 
+    prefix: ClassVar[str] = "drones."
     count: int | None = None
     size_m: tuple[float, float, float] | None = None
     learn_sizes: bool = True
     body_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.count is not None:
             _check_least("drones.count", self.count, 1)
         for length_m in self.size_m or ():
             check_positive("drones.size_m", length_m)
 
 
-class StatusSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class StatusSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """When a drone counts as found in a frame, and when it is lost.
 
     Attributes:
@@ -233,30 +274,42 @@ class StatusSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         SettingsError: a value is not allowed.
     """
 
+    prefix: ClassVar[str] = "status."
     min_fitness: float = 0.1
     min_cameras: int = 2
     min_cameras_to_begin: int | None = None
     max_coasting_s: float = 0.5
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check_least("status.min_cameras", self.min_cameras, 1)
         if self.min_cameras_to_begin is not None:
             _check_least("status.min_cameras_to_begin", self.min_cameras_to_begin, 2)
+        _check_range("status.min_fitness", self.min_fitness, 0.0, 1.0)
+        _check_range("status.max_coasting_s", self.max_coasting_s, 0.0)
 
 
-class IdentitySettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class IdentitySettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Which drones may have been taken for each other, and what to do about it.
 
     Attributes:
         encounter_m: drones nearer than this to each other may be taken for each other, metres.
         resolve_swaps: whether labels that were exchanged in an encounter are put right.
+
+    Raises:
+        SettingsError: a value is not allowed.
     """
 
+    prefix: ClassVar[str] = "identity."
     encounter_m: float = 0.6
     resolve_swaps: bool = True
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_range("identity.encounter_m", self.encounter_m, 0.0)
 
-class ErrorSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+
+class ErrorSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What is known of the cameras' errors beforehand; what the cameras show counts if it is more.
 
     Attributes:
@@ -268,18 +321,18 @@ class ErrorSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         SettingsError: a value is not allowed.
     """
 
+    prefix: ClassVar[str] = "errors."
     rig_deg: float = 0.0
     pixel_px: float = 0.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("rig_deg", "pixel_px"):
-            value = getattr(self, name)
-            if not 0 <= value < float("inf"):
-                raise SettingsError(f"errors.{name}", expected="a number, 0 or more", found=f"{value:g}")
+            _check_range(f"errors.{name}", getattr(self, name), 0.0)
 
 
 class TrackSettings(
-    msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, metaclass=_AnswersOldNames
+    _Settings, frozen=True, kw_only=True, forbid_unknown_fields=True, metaclass=_AnswersOldNames
 ):
     """How a sequence is tracked.
 
@@ -328,6 +381,7 @@ class TrackSettings(
     silhouettes: SilhouetteSettings = SilhouetteSettings()
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check_least("seed", self.seed, 0)
         _check_choice("clocks", self.clocks, get_args(Clocks))
         if self.rate_hz is not None:
@@ -363,7 +417,10 @@ class TrackSettings(
         own: dict[str, Any] = {}
         for name, value in values.items():
             if name not in setting_names():
-                raise SettingsError(name, expected="the name of a setting", found=name, remedy=renamed(name))
+                near = nearest(name, setting_names())
+                remedy = renamed(name) or (f"did you mean {near}?" if near else "")
+                raise SettingsError(name, expected="the name of a setting", found=name, remedy=remedy)
+            value = plain(value)
             part, dot, field = name.partition(".")
             if dot:
                 parts.setdefault(part, {})[field] = value

@@ -478,6 +478,30 @@ def test_a_full_disk_leaves_earlier_results(run: Run, data: Path, sequence: Path
     assert list(tmp_path.glob(".*")) == []
 
 
+def test_a_wrong_name_is_refused_before_silhouettes_are_computed(
+    run: Run, sequence: Path, tmp_path: Path
+) -> None:
+    for options, words in (
+        (("--search", "psoo"), ("swarm.search", "did you mean pso?")),
+        (("--score", "sofd"), ("score.kind", "did you mean soft?")),
+        (("--init", "none.csv"), ("none.csv",)),
+    ):
+        refused = run(*track(sequence, tmp_path / "tracks.csv", *options), "--cache", tmp_path / "cache")
+        assert_one_line(refused, *words)
+    assert not (tmp_path / "cache").exists()
+
+
+def test_a_plot_that_is_no_png_is_refused(run: Run, sequence: Path, tmp_path: Path) -> None:
+    refused = run("evaluate", tmp_path / "tracks.csv", sequence, "--plot", tmp_path / "my.jpg")
+    assert_one_line(refused, "--plot", "ends in .png", "my.jpg")
+
+
+def test_info_refuses_a_video_that_is_cut_short(run: Run, sequence: Path) -> None:
+    path = sequence / "cam2i_s.avi"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    assert_one_line(run("info", sequence), "cam2i_s.avi", "can be decoded")
+
+
 #: Program that runs `psotrack` and presses Ctrl-C when psotrack makes the folder that is the first argument.
 INTERRUPTED = """
 import signal, sys

@@ -156,6 +156,54 @@ def test_a_calibration_and_a_file_elsewhere(folder, tmp_path):
     assert open_recording(out).usable().videos["cam1"].num_frames == 4
 
 
+ANIPOSE = """[cam_0]
+name = "left"
+size = [64, 48]
+matrix = [[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]]
+distortions = [0.0, 0.0, 0.0, 0.0, 0.0]
+rotation = [1.5, 0.0, 0.0]
+translation = [0.0, 0.0, 5000.0]
+"""
+
+
+def test_a_calibration_that_leaves_its_unit_open(folder):
+    path = folder("left.avi")
+    (path / "calibration.toml").write_text(ANIPOSE)
+    with pytest.raises(InputError, match="anipose leaves it open; state m or cm or mm: --units of"):
+        draft_recording(path, path / "recording.toml")
+    done = CliRunner().invoke(cli, ["init", str(path), "--units", "mm"])
+    assert done.exit_code == 0, done.output
+    assert 'calibration_unit = "mm"' in (path / "recording.toml").read_text()
+    np.testing.assert_allclose(open_recording(path).rig.cameras.T_cam_world[0, :3, 3], [0, 0, 5], atol=1e-12)
+    (path / "calibration.toml").unlink()
+    with pytest.raises(
+        SettingsError, match=r"--units: expected a rig file, in the folder or by --calibration"
+    ):
+        draft_recording(path, path / "recording.toml", DraftOptions(unit="mm"))
+
+
+def test_a_file_edited_by_hand_is_kept_beside_the_new_one(folder):
+    path = folder("left.avi", cameras=["left"])
+    written, older = path / "recording.toml", path / "recording.toml.bak"
+
+    def again():
+        done = CliRunner().invoke(cli, ["init", str(path), "--force"])
+        assert done.exit_code == 0, done.output
+        return done.output
+
+    again()
+    fresh = written.read_text()
+    again()
+    assert not older.exists()
+    edited = fresh + "[world]\nbounds_m = [[-4, -3, 0], [4, 3, 3]]  # the hall\n"
+    written.write_text(edited)
+    assert f"{older}: the file as it was" in again()
+    assert (written.read_text(), older.read_text()) == (fresh, edited)
+    # A second call has nothing to keep, and leaves what was kept before.
+    assert "as it was" not in again()
+    assert older.read_text() == edited
+
+
 def test_without_a_calibration_cameras_have_no_place(folder):
     path = folder("left.avi", "right.avi")
     shown = init(path, "--json", path / "report.json")

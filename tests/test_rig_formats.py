@@ -461,7 +461,7 @@ def test_dlt_coefficients(tmp_path, upwards, separator):
     path.write_text("\n".join(separator.join(map(repr, row)) for row in columns.T.tolist()))
     with pytest.raises(InputError, match="pass --size"):
         read_rig(path)
-    with pytest.raises(InputError, match=r"because dlt leaves it open; pass --units"):
+    with pytest.raises(InputError, match=r"because dlt leaves it open; state m or cm or mm"):
         read_rig(path, SIZE_WH)
     rig = read_rig(path, SIZE_WH, metres_per_unit=1.0)
     assert rig.names == ("cam1", "cam2")

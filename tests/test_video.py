@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
-from psotrack.recordings import VideoInfo, VideoWriter, join_videos, probe, read_frames
+from psotrack.recordings import VideoInfo, VideoWriter, check_end, join_videos, probe, read_frames
 
 WIDTH, HEIGHT = 96, 64
 
@@ -108,12 +108,19 @@ def test_a_truncated_video_names_file_and_frame(tmp_path, fraction, capfd):
     assert message.startswith(f"{path}: expected 40 frames, found that only {reached} can be decoded")
     assert 0 < reached < 40
     assert f"--frames {reached}" in message
+    with pytest.raises(InputError, match=r"expected 40 frames, found that only \d+ can be decoded"):
+        check_end(video)
     # With a step, the error names the same frame.
     with pytest.raises(InputError, match=f"only {reached} can be decoded"):
         list(read_frames(video, 7))
     # The frames before the broken frame can be used.
     assert len(list(read_frames(replace(video, num_frames=reached)))) == reached
     assert capfd.readouterr().err == ""
+
+
+def test_a_whole_video_has_its_end(tmp_path):
+    for count in (1, 2, 40):
+        check_end(probe(write(tmp_path / f"{count}.avi", noise(count))))
 
 
 def test_a_damaged_frame_is_found(tmp_path, capfd):

@@ -51,7 +51,7 @@ COMMANDS = {
     ),
     "info": LazyCommand(
         "psotrack.cli.info",
-        "Show what SEQ contains, and check all of its files but the frames of the videos.",
+        "Show what SEQ contains, and check all of its files, of the videos only the last frame.",
     ),
     "init": LazyCommand(
         "psotrack.cli.init",

@@ -15,7 +15,7 @@ from psotrack.cli.output import output_json, print_inventory
 @FORCE
 @JSON
 def info(sequence: Path, force: bool, json_path: Path | None) -> None:
-    """Show what SEQ contains, and check all of its files but the frames of the videos.
+    """Show what SEQ contains, and check all of its files, of the videos only the last frame.
 
     SEQ is a recording.toml, a folder that holds one, or a folder of the DPJAIT dataset.
 
@@ -25,9 +25,12 @@ def info(sequence: Path, force: bool, json_path: Path | None) -> None:
       psotrack info flight/recording.toml
     """
     from psotrack.datasets import open_recording
-    from psotrack.recordings import describe_recording, inventory_table
+    from psotrack.recordings import check_end, describe_recording, inventory_table
 
-    content = describe_recording(open_recording(sequence))
+    recording = open_recording(sequence)
+    for video in recording.videos.values():
+        check_end(video)
+    content = describe_recording(recording)
     output_json(json_path, content, force)
     if json_path != Path("-"):
         print_inventory(inventory_table(content))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -22,6 +22,13 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path),
     metavar="FILE",
     help="Rig file, of any format that `calibrate convert` reads.  [default: the one in FOLDER]",
+)
+@click.option(
+    "--units",
+    "--unit",
+    "unit",
+    type=click.Choice(["m", "cm", "mm"]),
+    help="Unit of the lengths in the rig file; needed if the format leaves the unit open.",
 )
 @click.option(
     "--match",
@@ -50,6 +57,7 @@ if TYPE_CHECKING:
 def init(
     folder: Path,
     calibration: Path | None,
+    unit: Literal["m", "cm", "mm"] | None,
     matches: tuple[str, ...],
     leave_out: tuple[str, ...],
     fps: float | None,
@@ -80,6 +88,7 @@ def init(
         RECORDING_FILE,
         describe_recording,
         inventory_table,
+        recording_file_text,
         write_recording_file,
     )
     from psotrack.support import refuse_to_overwrite
@@ -90,15 +99,28 @@ def init(
     if fps is not None:
         check_positive("--fps", fps)
     refuse_to_overwrite(path, force)
-    options = DraftOptions(calibration, [_pair(match) for match in matches], leave_out, fps, size_wh)
+    options = DraftOptions(calibration, unit, [_pair(match) for match in matches], leave_out, fps, size_wh)
     draft = draft_recording(folder, path, options)
     content = describe_recording(draft.recording)
+    kept = _keep_older(path, recording_file_text(draft.content))
     write_recording_file(path, draft.content)
     output_json(json_path, _content(path, draft, content), force)
     if not quiet and json_path != Path("-"):
         print_inventory(inventory_table(content))
-    for line in _lines(path, draft):
+    for line in [*_lines(path, draft), *kept]:
         print_line(quiet, json_path, line)
+
+
+def _keep_older(path: Path, text: str) -> list[str]:
+    """Keep the file that is replaced, which may have been edited, beside the new one; returns a line that says so."""
+    from psotrack.support import atomic_write
+
+    if not path.is_file() or path.read_bytes() == text.encode():
+        return []
+    older = path.with_name(f"{path.name}.bak")
+    with atomic_write(older) as temporary:
+        temporary.write_bytes(path.read_bytes())
+    return [f"{older}: the file as it was; copy what you had written into it"]
 
 
 def _pair(match: str) -> tuple[str, str]:

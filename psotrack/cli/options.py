@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 import platformdirs
 
+from psotrack.errors import SettingsError
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Shadows, SilhouetteSettings
 
@@ -122,9 +123,16 @@ def dictionary_option(default: str = "4x4_1000") -> Callable[[Command], Command]
 
 def plot_option(content: str, default_path: str) -> Callable[[Command], Command]:
     """Option `--plot [PNG]`: a picture of `content`, at `default_path` if no path follows; the value is then empty."""
+
+    def check(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:
+        if path is not None and path.name and path.suffix.lower() != ".png":
+            raise SettingsError("--plot", expected="a file that ends in .png", found=path.name)
+        return path
+
     return click.option(
         "--plot",
         type=click.Path(path_type=Path),
+        callback=check,
         is_flag=False,
         flag_value="",
         metavar="[PNG]",

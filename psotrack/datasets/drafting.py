@@ -10,7 +10,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import overload
+from typing import Literal, overload
 
 from psotrack.datasets._folder_content import OF_CAMERA, Found, Kind, kind_of, look_into
 from psotrack.datasets.recording_files import recording_of
@@ -25,7 +25,7 @@ from psotrack.recordings import (
     ReferenceTable,
     image_files,
 )
-from psotrack.rig_files import read_entries
+from psotrack.rig_files import UNITS_M, read_entries
 
 #: Size that stands for one that a rig file does not state.
 _UNKNOWN_WH = (1, 1)
@@ -44,6 +44,7 @@ class DraftOptions:
 
     Attributes:
         calibration: rig file; None takes the one in the folder, if there is one.
+        unit: unit of lengths in the rig file, "m", "cm" or "mm", where its format leaves the unit open.
         match: file, folder of images or address of a stream by the name of its camera.
         leave_out: names of files of the folder that are not used.
         fps: frames per second of cameras without a video and without frame times.
@@ -51,6 +52,7 @@ class DraftOptions:
     """
 
     calibration: Path | None = None
+    unit: Literal["m", "cm", "mm"] | None = None
     match: Sequence[tuple[str, str]] = ()
     leave_out: Sequence[str] = ()
     fps: float | None = None
@@ -112,7 +114,7 @@ def draft_recording(folder: Path | str, out: Path | str, options: DraftOptions |
     by_hand = [*options.leave_out, *(file for _, file in options.match)]
     found = _without(folder, look_into(folder), [*by_hand, os.path.relpath(out, folder), RECORDING_FILE])
     calibration = options.calibration or _calibration_of(folder, found)
-    known = _known_cameras(calibration)
+    known = _known_cameras(calibration, options.unit)
     matching = _Matching(folder, list(known) or _names_of_files(folder, found, options))
     for name, file in options.match:
         _put_by_hand(matching, name, file, calibration)
@@ -131,6 +133,7 @@ def draft_recording(folder: Path | str, out: Path | str, options: DraftOptions |
     content = RecordingFile(
         version=1,
         calibration=None if calibration is None else _written(calibration, out.parent),
+        calibration_unit=options.unit,
         cameras=tables,
         reference=ReferenceTable(files=tuple(references)) if references else None,
         markers=MarkersTable(corners=_written(corners[0], out.parent)) if corners else None,
@@ -164,12 +167,17 @@ def _calibration_of(folder: Path, found: Sequence[Found]) -> Path | None:
     return paths[0] if paths else None
 
 
-def _known_cameras(calibration: Path | None) -> dict[str, tuple[int, int] | None]:
+def _known_cameras(calibration: Path | None, unit: str | None) -> dict[str, tuple[int, int] | None]:
     """Sizes of the cameras of a rig file by name, None where it states none."""
     if calibration is None:
+        if unit is not None:
+            raise SettingsError(
+                "--units", expected="a rig file, in the folder or by --calibration", found="none"
+            )
         return {}
     sizes: dict[str, tuple[int, int] | None] = {}
-    for name, entry in read_entries(calibration, _UNKNOWN_WH).items():
+    metres_per_unit = None if unit is None else UNITS_M[unit]
+    for name, entry in read_entries(calibration, _UNKNOWN_WH, metres_per_unit=metres_per_unit).items():
         size = None if entry.camera is None else tuple(int(side) for side in entry.camera.image_size_wh)
         sizes[name] = None if size is None or size == _UNKNOWN_WH else (size[0], size[1])
     return sizes

@@ -30,7 +30,7 @@ from psotrack.recordings import (
     read_recording_file,
     read_timestamps,
 )
-from psotrack.rig_files import Entry, camera_of_table, read_entries
+from psotrack.rig_files import UNITS_M, Entry, camera_of_table, read_entries
 
 _logger = logging.getLogger(__name__)
 #: Size of the images of a rig file that does not state it; no camera has this size.
@@ -184,7 +184,12 @@ def _calibrated(path: Path, content: RecordingFile) -> dict[str, Entry]:
     """The cameras of the rig file, by their names in the recording."""
     if content.calibration is None:
         return {}
-    entries = read_entries(_existing(path.parent, content.calibration, path, "calibration"), _UNKNOWN_WH)
+    unit = content.calibration_unit
+    entries = read_entries(
+        _existing(path.parent, content.calibration, path, "calibration"),
+        _UNKNOWN_WH,
+        metres_per_unit=None if unit is None else UNITS_M[unit],
+    )
     known = {name: chosen_camera(name, tuple(entries)) for name in content.cameras}
     _check_one_each(path, known)
     return {name: entries[entry] for name, entry in known.items() if entry is not None}

@@ -19,10 +19,10 @@ import msgspec
 
 from psotrack.detection import stored_detections
 from psotrack.errors import InputError, SettingsError
-from psotrack.initiation import MovingPoints
+from psotrack.initiation import MovingPoints, start_source
 from psotrack.methods import MethodResult, usable_for
 from psotrack.pipeline.clock_correction import advise_on_clocks, estimate_clocks, with_clocks
-from psotrack.pipeline.parts import Parts, check_detector_is_used
+from psotrack.pipeline.parts import Parts, check_detector_is_used, tracks_silhouettes
 from psotrack.pipeline.preparation import PreparedRun, prepare
 from psotrack.pipeline.results import TrackedRecording, finish
 from psotrack.pipeline.stages import (
@@ -36,6 +36,7 @@ from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
 from psotrack.support import Report, no_progress
+from psotrack.tracking import tracker_settings
 
 
 def track_recording(
@@ -65,6 +66,10 @@ def track_recording(
     began = time.perf_counter()
     needs_silhouettes = settings.needs_silhouettes or parts.method is not None
     recording = usable_for(recording, settings, videos=needs_silhouettes or parts.detector is not None)
+    # Wrong names are refused before silhouettes are computed, which takes minutes.
+    if tracks_silhouettes(settings, parts.method):
+        tracker_settings(settings, search=parts.search, score=parts.score)
+    start_source(recording, settings.init)
     if parts.detector is not None:
         check_detector_is_used(settings, parts)
         folder = stored_detections(parts.detector, recording, cache=cache, report=report)

@@ -12,6 +12,7 @@ from .recording_file import (
     ReferenceTable,
     WorldTable,
     read_recording_file,
+    recording_file_text,
     write_recording_file,
 )
 from .timestamps import read_timestamps
@@ -19,6 +20,7 @@ from .timing import FrameTimes, Timeline, make_timeline
 from .video import (
     VideoInfo,
     VideoWriter,
+    check_end,
     digest_video,
     join_videos,
     probe,
@@ -44,6 +46,7 @@ __all__ = [
     "VideoWriter",
     "WorldTable",
     "body_trajectories",
+    "check_end",
     "describe_recording",
     "digest_video",
     "find_images",
@@ -61,6 +64,7 @@ __all__ = [
     "read_mask",
     "read_recording_file",
     "read_timestamps",
+    "recording_file_text",
     "silence_opencv",
     "write_c3d",
     "write_detections",

@@ -102,6 +102,7 @@ class RecordingFile(_Table, frozen=True, kw_only=True):
     Attributes:
         version: version of the layout.
         calibration: rig file.
+        calibration_unit: unit of lengths in the rig file, where its format leaves the unit open.
         cameras: table of each camera, by name.
         world: table `[world]`.
         reference: table `[reference]`; None without a reference.
@@ -110,6 +111,7 @@ class RecordingFile(_Table, frozen=True, kw_only=True):
 
     version: Literal[1]
     calibration: Text | None = None
+    calibration_unit: Literal["m", "cm", "mm"] | None = None
     cameras: Mapping[str, CameraTable]
     world: WorldTable = WorldTable()
     reference: ReferenceTable | None = None
@@ -139,6 +141,8 @@ def read_recording_file(path: Path | str) -> RecordingFile:
     content = convert(
         {**data, "cameras": {}}, RecordingFile, lambda *parts: _error(path, *_in_words(data, *parts))
     )
+    if content.calibration_unit is not None and content.calibration is None:
+        raise _error(path, "calibration", "a rig file, because there is a calibration_unit", "none")
     _check_bounds(path, content.world)
     return msgspec.structs.replace(content, cameras=cameras)
 
@@ -221,17 +225,23 @@ def write_recording_file(path: Path | str, content: RecordingFile) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
+    with atomic_write(path) as temporary:
+        temporary.write_text(recording_file_text(content), encoding="utf-8")
+
+
+def recording_file_text(content: RecordingFile) -> str:
+    """Text of a `recording.toml`."""
     lines = [f"version = {content.version}"]
-    if content.calibration is not None:
-        lines.append(f"calibration = {toml_value(content.calibration)}")
+    for key in ("calibration", "calibration_unit"):
+        if getattr(content, key) is not None:
+            lines.append(f"{key} = {toml_value(getattr(content, key))}")
     for name, camera in content.cameras.items():
         lines += ["", f"[cameras.{toml_key(name)}]", *_assignments(camera)]
     tables = {"world": content.world, "reference": content.reference, "markers": content.markers}
     for name, table in tables.items():
         assigned = [] if table is None else _assignments(table)
         lines += ["", f"[{name}]", *assigned] if assigned else []
-    with atomic_write(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return "\n".join(lines) + "\n"
 
 
 def _assignments(table: _Table) -> list[str]:

@@ -76,6 +76,24 @@ def probe(path: Path | str) -> VideoInfo:
     return VideoInfo(path, num_frames, fps, (width, height))
 
 
+def check_end(video: VideoInfo) -> None:
+    """Raise `InputError` if a video has fewer frames than its header says.
+
+    The last frame is sought; only where it cannot be reached, the encoded frames are counted.
+    """
+    if video.images:
+        return
+    capture = _open(video.path)
+    try:
+        capture.set(cv2.CAP_PROP_POS_FRAMES, video.num_frames - 1)
+        with silence_opencv():
+            reached = capture.grab()
+    finally:
+        capture.release()
+    if not reached and (count := _count_packets(video.path)) < video.num_frames:
+        raise _ended_early(video, count)
+
+
 def probe_images(images: Sequence[Path | str], fps: float) -> VideoInfo:
     """A video whose frames are image files. Only the first image is read; `read_frames` notices bad other images.
 

@@ -266,7 +266,8 @@ def _metres(path: Path, file: FileRig, name: str, given: float | None) -> float:
             path,
             expected="a unit of lengths",
             found=f"none, because {name} leaves it open",
-            remedy=f"pass --units {', '.join(UNITS_M)} to `psotrack calibrate convert`",
+            remedy=f"state {' or '.join(UNITS_M)}: --units of `psotrack calibrate convert` and `psotrack init`, "
+            "calibration_unit in a recording.toml",
         )
     if name == "dpjait":
         # The reader has converted the lengths already, column by column.

@@ -7,6 +7,7 @@ from typing import Literal, get_args
 import msgspec
 
 from psotrack.errors import SettingsError, check_positive
+from psotrack.support import check_types
 
 #: Meaning of MOG2's shadow label: foreground, background, or foreground with a smaller weight.
 Shadows = Literal["keep", "drop", "weight"]
@@ -43,6 +44,7 @@ class ForegroundSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unkno
     min_blob_px: int = 64
 
     def __post_init__(self) -> None:
+        check_types(self)
         for name in ("working_reduction", "num_learning_frames"):
             check_whole(name, getattr(self, name), lowest=1)
         check_whole("min_blob_px", self.min_blob_px, lowest=0)

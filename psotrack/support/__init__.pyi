@@ -6,7 +6,7 @@ from .plugins import PluginKind, check_interface, identify, make_plugin, plugin_
 from .processes import map_in_processes
 from .progress import Advance, Report, no_progress, progress_bar
 from .representation import short_repr
-from .schema import assign, convert, nearest, read_toml, toml_key, toml_value
+from .schema import assign, check_types, convert, nearest, plain, read_toml, toml_key, toml_value
 from .standard_errors import standard_error
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "assign",
     "atomic_write",
     "check_interface",
+    "check_types",
     "convert",
     "digest_file",
     "digest_record",
@@ -31,6 +32,7 @@ __all__ = [
     "map_in_processes",
     "nearest",
     "no_progress",
+    "plain",
     "plugin_names",
     "progress_bar",
     "read_rows",

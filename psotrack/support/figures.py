@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from psotrack.errors import OutputError
 from psotrack.support.files import atomic_write, refuse_to_overwrite
 
 if TYPE_CHECKING:
@@ -51,8 +52,10 @@ def save_figure(
         force: replace an existing file.
 
     Raises:
-        OutputError: the file exists and `force` is not set, or it cannot be written.
+        OutputError: the path does not end in .png, the file exists and `force` is not set, or it cannot be written.
     """
+    if Path(path).suffix.lower() != ".png":
+        raise OutputError(path, expected="a file that ends in .png", found=Path(path).name)
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

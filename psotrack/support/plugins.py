@@ -23,6 +23,7 @@ from importlib.metadata import entry_points
 from typing import Any, Literal, get_args
 
 from psotrack.errors import SettingsError
+from psotrack.support.schema import nearest
 
 PluginKind = Literal["search", "score", "method", "background", "detector"]
 
@@ -139,9 +140,11 @@ def _load(kind: PluginKind, name: str, setting: str, built_in: Sequence[str]) ->
             raise SettingsError(f"{setting} {name}", expected=expected, found=found)
         return make
     installed = plugin_names(kind)
+    near = nearest(name, [*built_in, *installed])
+    none = "" if installed else f"no installed package adds more (entry points {GROUPS[kind]})"
     raise SettingsError(
         setting,
         expected=f"one of {', '.join([*built_in, *installed])}",
         found=name,
-        remedy="" if installed else f"no installed package adds more (entry points {GROUPS[kind]})",
+        remedy=f"did you mean {near}?" if near else none,
     )

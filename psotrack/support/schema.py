@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import json
 import math
+import os
 import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator
@@ -18,7 +19,7 @@ from typing import Any, TypeVar
 import msgspec
 from msgspec import inspect
 
-from psotrack.errors import InputError, PsotrackError
+from psotrack.errors import InputError, PsotrackError, SettingsError
 from psotrack.support.files import read_text
 
 #: Function that makes an exception from the field, what was expected, what was found, and the remedy.
@@ -55,6 +56,33 @@ def convert(data: dict[str, Any], kind: type[Record], error: MakeError) -> Recor
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as fault:
         raise error(*_translate(str(fault), data, kind)) from None
+
+
+def check_types(record: msgspec.Struct, prefix: str = "") -> None:
+    """Raise `SettingsError` for a field whose value has another type than the field's annotation.
+
+    Args:
+        record: a record that was made in Python, where msgspec checks no types.
+        prefix: what stands before the names of fields in messages.
+    """
+    for field in msgspec.structs.fields(record):
+        value = plain(getattr(record, field.name))
+        try:
+            msgspec.convert(value, field.type)
+        except msgspec.ValidationError as fault:
+            # Records check by themselves whether a text is one of several.
+            if not str(fault).startswith("Invalid enum value"):
+                expected = _expected_words(str(fault).partition(" - at ")[0])
+                raise SettingsError(
+                    f"{prefix}{field.name}", expected=expected, found=_quoted(value)
+                ) from None
+
+
+def plain(value: Any) -> Any:
+    """Numbers and arrays of NumPy as numbers and lists of Python, paths as text, and other values as they are."""
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return value.tolist() if hasattr(value, "tolist") else value
 
 
 def read_toml(path: Path | str) -> dict[str, Any]:
