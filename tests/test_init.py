@@ -3,6 +3,7 @@
 import json
 import shutil
 import string
+import unicodedata
 
 import cv2
 import msgspec
@@ -252,6 +253,26 @@ class TestRefusals:
         line = refusal(folder("take_a_b.avi", cameras=("a", "b")))
         assert "take_a_b.avi: expected the name of one camera, found a and b in its name; say whose" in line
 
+    def test_several_videos_in_the_folder_of_a_camera(self, folder):
+        path = folder("left/a.avi", "left/b.avi", "right/a.avi", cameras=("left", "right"))
+        line = refusal(path)
+        assert "left: expected one video of camera left, found a.avi, b.avi; say which with" in line
+        init(path, "--match", "left=left/b.avi")
+        videos = {
+            name: each.video for name, each in read_recording_file(path / "recording.toml").cameras.items()
+        }
+        assert videos == {"left": "left/b.avi", "right": "right/a.avi"}
+
+    def test_videos_in_a_folder_below(self, folder):
+        path = folder("videos/left.avi", "videos/right.avi", cameras=("left",))
+        assert (
+            f"for the videos in videos: psotrack init {path}/videos --calibration {path}/rig.toml"
+            in refusal(path)
+        )
+
+    def test_names_with_spaces_are_quoted(self, folder):
+        assert "--match CAMERA='Kamera 1.avi'" in refusal(folder("Kamera 1.avi", cameras=("left",)))
+
     def test_two_rig_files(self, folder):
         path = folder("cam1.avi", cameras=("cam1",))
         shutil.copy(path / "rig.toml", path / "calibration.toml")
@@ -282,12 +303,21 @@ class TestRefusals:
             (("--match", "cam9=cam1.avi"), "--match: expected a camera of .*rig.toml: cam1, found cam9"),
             (("--match", "cam1=no.avi"), "--match: expected a file in .*flight, found no.avi"),
             (("--match", "cam1=rig.toml"), "--match: expected a video, .* found rig.toml"),
+            (
+                ("--match", "cam1=cam1.avi", "--match", "cam1=b.avi"),
+                "--match: expected one video of camera cam1, found two",
+            ),
+            (
+                ("--match", "cam1=b.avi", "--match", "cam1=b.avi"),
+                "--match: expected each file once, found b.avi 2 times",
+            ),
+            (("--leave-out", "no.avi"), "--leave-out: expected a file in .*flight, found no.avi"),
             (("--fps", -1), "--fps: expected a number above 0, found -1"),
             (("--out", "a.txt"), "--out: expected a file that ends in .toml"),
         ],
     )
     def test_wrong_options(self, folder, arguments, words):
-        path = folder("cam1.avi", cameras=("cam1",))
+        path = folder("cam1.avi", "b.avi", cameras=("cam1",))
         with pytest.raises(SettingsError, match=words):
             init(path, *arguments)
 
@@ -349,6 +379,10 @@ def test_serial_numbers_with_and_without_a_word(serials, word):
 def test_typed_names_choose_their_cameras_in_their_order(names, data):
     order = data.draw(st.permutations(names))
     assert chosen_cameras([name.upper() for name in order], names) == tuple(order)
+
+
+def test_accents_may_be_stored_apart():
+    assert cameras_of(unicodedata.normalize("NFD", "größe_1"), ["Größe", "links"]) == ["Größe"]
 
 
 def test_a_part_of_a_name_chooses_a_camera_only_where_it_is_one():

@@ -154,4 +154,5 @@ def _lines(path: Path, draft: Draft) -> list[str]:
             f"cameras without place: {', '.join(unplaced)}; `psotrack calibrate rig` makes the rig file, then "
             f"`psotrack init {path.parent} --calibration rig.toml --force`"
         )
-    return [*lines, f"{path}: {len(draft.content.cameras)} cameras"]
+    count = len(draft.content.cameras)
+    return [*lines, f"{path}: {count} camera{'s' if count > 1 else ''}"]

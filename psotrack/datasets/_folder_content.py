@@ -92,11 +92,16 @@ def _look_at(path: Path) -> Iterator[Found]:
             yield Found(inner, kind_of(inner))
         return
     kind = kind_of(path)
-    videos = [inner for inner in sorted(path.iterdir()) if kind_of(inner) == "video"] if path.is_dir() else []
+    videos = videos_in(path)
     if kind == "other" and len(videos) == 1:
         yield Found(videos[0], "video", alone_in=path.name)
     else:
         yield Found(path, kind)
+
+
+def videos_in(path: Path) -> list[Path]:
+    """Videos that lie in a folder, by name; none for a file."""
+    return [inner for inner in sorted(path.iterdir()) if kind_of(inner) == "video"] if path.is_dir() else []
 
 
 def _kind_of_text(path: Path) -> Kind:

@@ -7,12 +7,13 @@ well, or a video fits no camera, the user is asked to say so.
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, overload
 
-from psotrack.datasets._folder_content import OF_CAMERA, Found, Kind, kind_of, look_into
+from psotrack.datasets._folder_content import OF_CAMERA, Found, Kind, kind_of, look_into, videos_in
 from psotrack.datasets.recording_files import recording_of
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import camera_key, cameras_of, chosen_camera
@@ -111,6 +112,7 @@ def draft_recording(folder: Path | str, out: Path | str, options: DraftOptions |
         SettingsError: an option names a file or camera that does not exist.
     """
     folder, out, options = Path(folder), Path(out), options or DraftOptions()
+    _check_by_hand(folder, options)
     by_hand = [*options.leave_out, *(file for _, file in options.match)]
     found = _without(folder, look_into(folder), [*by_hand, os.path.relpath(out, folder), RECORDING_FILE])
     calibration = options.calibration or _calibration_of(folder, found)
@@ -146,6 +148,19 @@ def draft_recording(folder: Path | str, out: Path | str, options: DraftOptions |
         tuple(name for name in matching.cameras if name not in tables),
         tuple(matching.unused),
     )
+
+
+def _check_by_hand(folder: Path, options: DraftOptions) -> None:
+    """Raise `SettingsError` for a file that is left out but does not exist, and for a file that is matched twice."""
+    for name in options.leave_out:
+        if not (folder / name).exists():
+            raise SettingsError("--leave-out", expected=f"a file in {folder}", found=name)
+    files = [file for _, file in options.match]
+    for file in files:
+        if files.count(file) > 1:
+            raise SettingsError(
+                "--match", expected="each file once", found=f"{file} {files.count(file)} times"
+            )
 
 
 def _without(folder: Path, found: list[Found], names: Sequence[str]) -> list[Found]:
@@ -225,7 +240,11 @@ def _put_by_hand(matching: _Matching, name: str, file: str, calibration: Path | 
     if kind not in OF_CAMERA:
         expected = f"a {', a '.join(_WORDS[each] for each in OF_CAMERA)}"
         raise SettingsError("--match", expected=expected, found=file)
-    matching.put(camera, kind, path)
+    try:
+        matching.put(camera, kind, path)
+    except InputError:
+        expected = f"one {_WORDS[kind]} of camera {camera}"
+        raise SettingsError("--match", expected=expected, found="two") from None
 
 
 def _match(matching: _Matching, found: Sequence[Found], calibration: Path | None) -> None:
@@ -249,7 +268,23 @@ def _match(matching: _Matching, found: Sequence[Found], calibration: Path | None
                 raise _video_of_no_camera(matching, each.path, calibration, fitting)
             else:
                 matching.unused.append(each.path)
-    matching.unused += [each.path for each in found if each.kind == "other"]
+    for each in found:
+        if each.kind == "other":
+            _check_folder_of_camera(matching, each)
+            matching.unused.append(each.path)
+
+
+def _check_folder_of_camera(matching: _Matching, found: Found) -> None:
+    """Raise `InputError` for a folder with the name of a camera without files that holds several videos."""
+    fitting = [name for name in cameras_of(found.name, matching.cameras) if name not in matching.files]
+    videos = videos_in(found.path)
+    if len(fitting) == 1 and videos:
+        raise InputError(
+            found.path,
+            expected=f"one video of camera {fitting[0]}",
+            found=", ".join(video.name for video in videos),
+            remedy=f"say which with --match {shlex.quote(f'{fitting[0]}={found.path.name}/{videos[0].name}')}",
+        )
 
 
 def _table(
@@ -317,7 +352,7 @@ def _video_of_no_camera(
 
 
 def _unclear(folder: Path, file: Path | str, expected: str, found: str, *, match: bool = True) -> InputError:
-    name = _short(file) if isinstance(file, str) else os.path.relpath(file, folder)
+    name = shlex.quote(_short(file) if isinstance(file, str) else os.path.relpath(file, folder))
     remedy = f"leave it out with --leave-out {name}"
     return InputError(
         file if isinstance(file, Path) else folder,
@@ -332,11 +367,19 @@ def _short(file: Path | str) -> str:
 
 
 def _nothing(folder: Path, matching: _Matching, calibration: Path | None) -> InputError:
+    below = next((path for path in sorted(folder.iterdir()) if videos_in(path)), None)
+    if below is not None:
+        given = "" if calibration is None else f" --calibration {shlex.quote(str(calibration))}"
+        remedy = f"for the videos in {below.name}: psotrack init {shlex.quote(str(below))}{given}"
+    else:
+        remedy = "" if calibration is None else "say which file is whose with --match CAMERA=FILE"
     if calibration is None:
-        return InputError(folder, expected="videos, folders of images, or detections", found="none")
+        return InputError(
+            folder, expected="videos, folders of images, or detections", found="none", remedy=remedy
+        )
     return InputError(
         folder,
         expected=f"files named like the cameras of {calibration.name}, {', '.join(matching.cameras)}",
         found="none",
-        remedy="say which file is whose with --match CAMERA=FILE",
+        remedy=remedy,
     )

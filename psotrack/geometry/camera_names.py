@@ -11,6 +11,7 @@ serial number of the camera's body, with or without `cam_` before the number.
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -131,7 +132,8 @@ class _Words:
 
 def _words(name: str, *, whole: bool) -> _Words:
     """Words of a name; with `whole`, a serial number is all that counts, and the ending `_s` does not count."""
-    folded = name.casefold()
+    # Some systems store an accented letter as a letter and an accent.
+    folded = unicodedata.normalize("NFC", name).casefold()
     if whole:
         folded = folded.removesuffix("_s")
         numbers = re.findall(r"\d+", folded)
