@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from psotrack.calibration import Board
 from psotrack.cli.calibrate import calibrate
 from psotrack.datasets.dpjait import read_sequence, write_calibration, write_detections, write_marker_corners
+from psotrack.doctor import improve_with_check
 from psotrack.errors import PsotrackError
 from psotrack.geometry import Rig, look_at, make_camera, make_rig, project
 from psotrack.recordings import Detections, VideoWriter
@@ -363,6 +364,20 @@ def test_a_rig_is_adjusted_to_its_drones(tmp_path):
     assert "fixed: expected some of" in refused(
         "adjust", tmp_path / "SEQ", "--tracks", tracks, "--fixed", "c7", "--out", tmp_path / "c.toml"
     )
+
+
+def test_why_a_rig_in_which_all_cameras_may_be_off_is_written_unchanged(tmp_path, monkeypatch):
+    """The finding itself is tested with the doctor's other findings; here, what the command says of it."""
+    rig = square_pixels(ring_rig(5, image_size_wh=(1280, 720)))
+    tracks = flight(tmp_path / "SEQ", rig, rig)
+    monkeypatch.setattr(
+        "psotrack.doctor.improve_with_check",
+        lambda *args, **more: replace(improve_with_check(*args, **more), all_off=True),
+    )
+    shown = run("adjust", tmp_path / "SEQ", "--tracks", tracks, "--out", tmp_path / "same.toml").stdout
+    assert "all cameras may be off by a little" in shown
+    assert "the rig is written unchanged" in shown
+    assert "no camera is off" not in shown
 
 
 def test_a_right_rig_is_written_unchanged(tmp_path):

@@ -240,6 +240,21 @@ def test_adjust_mends_a_turned_camera():
     assert shifts[0] > 10
 
 
+def test_adjust_leaves_a_rig_alone_in_which_all_cameras_are_a_little_off():
+    """Cameras that are moved to agree with others, which are off as well, would move the world."""
+    rig, seen, tracks = flown(Scene(cameras=5, drones=3, size=0.6, frames=100), 2)
+    given = rig
+    for index in range(len(rig)):
+        given = _boxes.turned(given, index, 0.35, np.random.default_rng(index))
+    checked = adjusted(given, seen, tracks)
+    assert checked.all_off
+    assert checked.improved.rig is given
+    assert checked.uncertain
+    # Fixed cameras are known to be right, and hold the world.
+    held = improve_with_check(given, find_drones_in_boxes(given, seen, tracks), fixed=rig.names[:2])
+    assert not held.all_off
+
+
 @pytest.mark.slow
 def test_an_adjustment_that_does_not_fit_other_parts_is_refused(monkeypatch):
     """The moved camera fits the parts that it was adjusted to, and no other: the rig is unchanged."""
@@ -253,7 +268,9 @@ def test_an_adjustment_that_does_not_fit_other_parts_is_refused(monkeypatch):
     from psotrack.doctor import checked_adjustment
 
     monkeypatch.setattr(
-        checked_adjustment, "_certain_faults", lambda rig, views, moved, rescaled: (moved, rescaled)
+        checked_adjustment,
+        "_certain_faults",
+        lambda rig, views, moved, rescaled, fixed: (moved, rescaled, False),
     )
     free = checked_adjustment.improve(rig, points_px, views.noise_px)
     assert free.moved != ()

@@ -2,8 +2,10 @@
 
 The middles of boxes have errors that last, and a bundle adjustment moves sound cameras to make such errors small. So a
 camera is moved only if the evidence for its fault exceeds that of a sound rig whose boxes have lasting errors of any
-size (`evidence`). Then the adjustment is made without a part of the recording, for each part in turn, and must fit the
-part that was left out better than the rig as it was read.
+size (`evidence`), and that of small errors of all cameras: if all cameras are a little off, the sound ones among them
+cannot be told, and cameras that were moved to agree with the others would move the world. Then the adjustment is made
+without a part of the recording, for each part in turn, and must fit the part that was left out better than the rig as
+it was read.
 """
 
 from __future__ import annotations
@@ -23,6 +25,8 @@ from psotrack.geometry import Rig, project, triangulate
 
 #: Smallest evidence by which a moved camera must explain the sightings better: logarithm of a likelihood ratio.
 CERTAIN = 5.5
+#: Smallest evidence by which errors of some cameras must explain the sightings better than small errors of all cameras.
+SOME = 3.0
 #: Number of parts of the recording that are left out in turn, and smallest number of them that must fit better.
 PARTS, BETTER_PARTS = 4, 3
 #: Largest distance of a sighting that counts in full, standard deviations.
@@ -40,12 +44,15 @@ class CheckedAdjustment:
             the adjusted one; None if nothing was adjusted.
         better: whether the adjusted rig fits views better that it did not use; False if `improved` is unchanged for
             that reason.
+        all_off: whether small errors of all cameras explain the sightings as well as errors of some; if so,
+            `improved` is unchanged.
     """
 
     improved: Improved
     uncertain: tuple[str, ...]
     left_out_px: tuple[float, float] | None
     better: bool
+    all_off: bool = False
 
 
 def improve_with_check(
@@ -79,7 +86,9 @@ def improve_with_check(
     )
     if not free.moved and not free.rescaled:
         return CheckedAdjustment(free, (), None, True)
-    moved, rescaled = _certain_faults(rig, views, free.moved, free.rescaled)
+    moved, rescaled, all_off = _certain_faults(rig, views, free.moved, free.rescaled, fixed)
+    if all_off:
+        return CheckedAdjustment(_unchanged(rig, free), free.moved, None, True, all_off=True)
     uncertain = tuple(name for name in free.moved if name not in moved)
     improved = free
     if not moved and not rescaled:
@@ -107,17 +116,17 @@ def _unchanged(rig: Rig, free: Improved) -> Improved:
 
 
 def _certain_faults(
-    rig: Rig, views: DroneViews, moved: tuple[str, ...], rescaled: bool
-) -> tuple[tuple[str, ...], bool]:
-    """Cameras among `moved` that are certainly wrong, and whether all focal lengths are."""
+    rig: Rig, views: DroneViews, moved: tuple[str, ...], rescaled: bool, fixed: Sequence[str]
+) -> tuple[tuple[str, ...], bool, bool]:
+    """Cameras among `moved` that are certainly wrong; whether all focal lengths are; whether all cameras may be."""
     points = _common_points(rig, views)
     corrected = Corrected(rig, np.zeros(len(rig)))
     data = weigh(corrected, points)
     evidence = gather(rig, sum_up(corrected, data), prior_of(rig, data))
     as_sound = evidence.as_sound
 
-    def explained(indices: Sequence[int], with_lenses: bool = False) -> float:
-        columns = [PER_CAMERA * index + part for index in indices for part in range(6)]
+    def explained(indices: Sequence[int], with_lenses: bool = False, parts: int = 6) -> float:
+        columns = [PER_CAMERA * index + part for index in indices for part in range(parts)]
         columns += [PER_CAMERA * len(rig)] if with_lenses else []
         return evidence.judge(Hypothesis("turned and moved", -1, tuple(columns)), as_sound).evidence
 
@@ -130,12 +139,18 @@ def _certain_faults(
         best = max(gains, key=lambda index: gains[index])
         if gains[best] < gained + CERTAIN:
             # Several cameras may be certain together although no single one is.
-            if explained([*certain, *left], lenses) > gained + 2 * CERTAIN:
-                certain, left = [*certain, *left], []
+            together = explained([*certain, *left], lenses)
+            if together > gained + 2 * CERTAIN:
+                certain, left, gained = [*certain, *left], [], together
             break
         certain, gained = [*certain, best], gains[best]
         left.remove(best)
-    return tuple(name for index, name in enumerate(rig.names) if index in certain), lenses
+    # Fixed cameras are known to be right, and hold the world.
+    all_off = False
+    if certain and not fixed:
+        turned, turned_and_moved = (explained(range(len(rig)), lenses, parts) for parts in (3, 6))
+        all_off = bool(max(turned, turned_and_moved) > gained - SOME)
+    return tuple(name for index, name in enumerate(rig.names) if index in certain), lenses, all_off
 
 
 def _common_points(rig: Rig, views: DroneViews) -> CommonPoints:

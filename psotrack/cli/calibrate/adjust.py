@@ -22,6 +22,13 @@ if TYPE_CHECKING:
     from psotrack.geometry import Rig
 
 
+#: What is said of a rig in which all cameras may be off.
+ALL_OFF = (
+    "all cameras may be off by a little, and drones do not tell which of them are right, nor where the rig as a whole "
+    "is: the rig is written unchanged; calibrate it anew, or name cameras that are right with --fixed"
+)
+
+
 @click.command()
 @SEQUENCE
 @click.option(
@@ -61,8 +68,9 @@ def adjust(
     error is certainly larger are moved, and only if the moved cameras fit views better that the adjustment did not use:
     each quarter of the recording is left out in turn. If there is none, OUT is the unchanged rig.
 
-    Drones show neither the world's origin nor its axes nor its scale. If most cameras disagree, all cameras are moved,
-    and the rig as a whole keeps its origin, axes and scale.
+    Drones show neither the world's origin nor its axes nor its scale: the cameras that agree hold them. If small errors
+    of all cameras explain the disagreement as well as errors of some cameras, OUT is the unchanged rig, because an
+    adjusted rig would agree with itself, but not better with the world.
 
     \b
     Example:
@@ -90,7 +98,10 @@ def adjust(
     write_rig(out, improved.rig, force=force)
     rows = _rows(recording.rig, improved, views, held)
     show_cameras(rows, out, quiet, json_path, force)
-    print_line(quiet, json_path, _in_words(improved, rows))
+    if checked.all_off:
+        print_line(quiet, json_path, ALL_OFF)
+    elif checked.better:
+        print_line(quiet, json_path, _in_words(improved, rows))
     for line in _check_in_words(checked):
         print_line(quiet, json_path, line)
     if refine_focal_length:
@@ -128,7 +139,7 @@ def _rows(
 def _check_in_words(checked: CheckedAdjustment) -> list[str]:
     """How the adjustment was checked."""
     lines = []
-    if checked.uncertain and checked.better:
+    if checked.uncertain and checked.better and not checked.all_off:
         names = ", ".join(checked.uncertain)
         lines.append(f"{names}: not moved, because lasting errors of the boxes explain the disagreement, too")
     if checked.left_out_px is not None:
@@ -137,7 +148,8 @@ def _check_in_words(checked: CheckedAdjustment) -> list[str]:
         lines.append(
             f"views that were left out: median distance {fits}"
             if checked.better
-            else f"{', '.join(checked.uncertain)}: not moved: views that were left out do not fit better: {fits}"
+            else f"{', '.join(checked.uncertain)}: not moved: views that were left out do not fit better: {fits}; "
+            "the rig is written unchanged"
         )
     return lines
 
@@ -161,10 +173,4 @@ def _in_words(improved: Improved, rows: dict[str, dict[str, Any]]) -> str:
         f"or the focal length of {name} is wrong (x {scale:.3f} ± {std:.3f}): check its lens"
         for name, (scale, std) in improved.zoomed.items()
     ]
-    agree = any(row["verdict"] == "agrees" for row in rows.values())
-    parts.append(
-        "the other cameras agree and stay"
-        if agree
-        else "too few cameras agree: origin, axes and scale of the rig stay"
-    )
-    return "; ".join(parts)
+    return "; ".join([*parts, "the other cameras stay"])
