@@ -1,7 +1,7 @@
 """Detections without labels: psotrack's defaults beside Stone Soup's GNN and JPDA, each at its best of a grid.
 
     pip install 'psotrack[bench]'
-    python experiments/accuracy/association.py --data data [--real real] [--seeds 20 21] [--quick]
+    python experiments/accuracy/association.py --data data [--real real] [--seeds 20 21] [--scenes slow 2] [--quick]
 
 Flights by a formula (`formula_flights`) and, where --real names a folder of public repositories, parts of real flights
 (`bat_flights`). Of each flight psotrack is given the rig and the detections as files, with `psotrack track SEQ --method
@@ -154,12 +154,14 @@ def main() -> None:
     parser = _runs.parser(__doc__)
     parser.add_argument("--real", type=Path, help="folder of the real recordings, as OWNER/NAME")
     parser.add_argument("--seeds", type=int, nargs="+", default=[20, 21, 22], help="seeds of the flights")
+    parser.add_argument("--scenes", nargs="+", default=[""], help="words that are in the names of the scenes")
     parser.add_argument("--quick", action="store_true", help="one short flight, and a quarter of the grid")
     options = parser.parse_args()
     run = _runs.start("association")
     flights: list[tuple[str, int, RealFlight, float]] = []
+    names = [name for name in SCENES if any(word in name for word in options.scenes)]
     for seed in options.seeds[: 1 if options.quick else None]:
-        for name in list(SCENES)[: 1 if options.quick else None]:
+        for name in names[: 1 if options.quick else None]:
             made = make_flight(SCENES[name], 50 if options.quick else 250, seed)
             flights.append((name, seed, RealFlight(made.rig, made.detections, made.truth, FPS), GATE_M))
     for name, first, count in REAL if options.real else ():
