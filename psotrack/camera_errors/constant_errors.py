@@ -35,8 +35,9 @@ from scipy.special import gammainc, gammaincinv
 
 from psotrack.camera_errors.variance_components import FittedPlaces, weighted_residuals
 
-#: Number of steps of the maximisation.
-_NUM_STEPS = 200
+#: Largest number of steps of the maximisation, which ends when the variances, in units of the noise, change by less
+#: than a share.
+_NUM_STEPS, _SETTLED = 200, 1e-5
 #: Directions of less information than this share of the largest are not determined.
 _LEAST_INFORMATION = 1e-7
 #: Standard deviations of the posterior distribution, in units of the scale that the residuals show: dense where most
@@ -161,10 +162,12 @@ def _likeliest(
     for _ in range(_NUM_STEPS):
         inverse = np.linalg.inv(_total(shares, variances))
         weighted = inverse @ seen
-        for part, share in enumerate(shares):
-            expected = float(np.vdot(inverse, share))
-            found = float(weighted @ share @ weighted)
-            variances[part] *= np.sqrt(found / expected) if expected > 0 else 0.0
+        expected = np.array([np.vdot(inverse, share) for share in shares])
+        found = np.array([weighted @ share @ weighted for share in shares])
+        before = variances
+        variances = before * np.sqrt(found / np.where(expected > 0, expected, np.inf))
+        if (np.abs(variances - before) * traces).max() < _SETTLED * len(seen):
+            break
     return variances
 
 

@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-#: Number of steps. A variance that is zero is halved in each step at the end.
-_NUM_STEPS = 60
+#: Largest number of steps, which end when the variances change by less than a share of the mean squared residual. A
+#: variance that is zero is halved in each step at the end.
+_NUM_STEPS, _SETTLED = 60, 1e-5
 #: Least variance, as a share of the mean squared residual.
 _LEAST = 1e-6
 #: Number of residuals as which the common variance of all cameras counts.
@@ -104,5 +105,8 @@ def camera_variances(
         common_px2 = (told * variance_px2).sum() / told.sum() if told.sum() > 0 else mean_px2
         found += _COMMON * common_px2 / np.square(variance_px2)
         expected += _COMMON / variance_px2
-        variance_px2 = np.maximum(variance_px2 * np.sqrt(found / expected), least_px2)
+        before_px2 = variance_px2
+        variance_px2 = np.maximum(before_px2 * np.sqrt(found / expected), least_px2)
+        if np.abs(variance_px2 - before_px2).max() < _SETTLED * mean_px2:
+            break
     return np.where(seen, variance_px2, np.nan)
