@@ -257,7 +257,7 @@ def main() -> None:
     parser = _runs.parser(__doc__)
     parser.add_argument("--frames", type=int, help="number of frames  [default: all; of labels 100]")
     parser.add_argument("--draws", type=int, default=4, help="perturbed rigs of each case")
-    parser.add_argument("--label-draws", type=int, default=10, help="rigs of each case with synthetic labels")
+    parser.add_argument("--label-draws", type=int, default=8, help="rigs of each case with synthetic labels")
     parser.add_argument("--videos", action="store_true", help="simulated videos as well")
     parser.add_argument("--quick", action="store_true", help="one sequence, 100 frames, two draws")
     options = parser.parse_args()
