@@ -491,6 +491,11 @@ def test_a_wrong_name_is_refused_before_silhouettes_are_computed(
     assert not (tmp_path / "cache").exists()
 
 
+def test_one_camera_is_refused(run: Run, sequence: Path, tmp_path: Path) -> None:
+    refused = run(*track(sequence, tmp_path / "tracks.csv", "--cameras", "cam1"))
+    assert_one_line(refused, "at least two cameras", "found cam1")
+
+
 def test_a_plot_that_is_no_png_is_refused(run: Run, sequence: Path, tmp_path: Path) -> None:
     refused = run("evaluate", tmp_path / "tracks.csv", sequence, "--plot", tmp_path / "my.jpg")
     assert_one_line(refused, "--plot", "ends in .png", "my.jpg")

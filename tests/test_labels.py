@@ -18,15 +18,18 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from psotrack.cli.labels import labels
+from psotrack.datasets import open_recording
 from psotrack.datasets.dpjait import read_masks, read_sequence
 from psotrack.detection import FrameSelection, LabelSettings, write_data_set
 from psotrack.detection.labels import box_corners, label_boxes
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
-from psotrack.geometry import look_at, make_camera, project
-from psotrack.recordings import read_frames
+from psotrack.geometry import look_at, make_camera, make_rig, project
+from psotrack.recordings import VideoWriter, read_frames
+from psotrack.rig_files import write_rig
 from psotrack.simulation import SimulationSettings, scenario, simulate
 from psotrack.simulation.scenarios import Mesh
 from psotrack.trajectories import Trajectories
+from psotrack.trajectories.tum import write_tum
 
 #: A distant camera at y = -1000 m with 100 x 80 pixels and 10 pixels per metre; x is to the right, z is up.
 FAR = make_unnamed_rig(far_camera(image_size_wh=(100, 80), pixels_per_m=10.0)).cameras
@@ -425,3 +428,39 @@ def test_without_a_reference(data, tmp_path):
         write_data_set(
             [replace(first, truth=unknown), second], tmp_path / "set", LabelSettings(SIZE_M), jobs=1
         )
+
+
+def test_frames_of_cameras_with_rates_and_starts_of_their_own(tmp_path):
+    """A drone flies to the right at 1 m/s, 5 m before two cameras with frames between the instants."""
+    R, t_m = look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    K = np.array([[100.0, 0, 99.5], [0, 100, 49.5], [0, 0, 1]])
+    camera = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(200, 100))
+    starts_s, rates_hz = {"slow": 0.03, "quick": 0.0}, {"slow": 25.0, "quick": 50.0}
+    flights = tmp_path / "a", tmp_path / "b"
+    for folder in flights:
+        folder.mkdir()
+        write_rig(folder / "rig.toml", make_rig(dict.fromkeys(starts_s, camera)))
+        tables = ["version = 1", 'calibration = "rig.toml"', '[reference]\nfiles = ["drone.tum"]']
+        for name, start_s in starts_s.items():
+            with VideoWriter(folder / f"{name}.avi", rates_hz[name], (200, 100)) as video:
+                for _ in range(int(rates_hz[name] // 5)):
+                    video.write(np.zeros((100, 200, 3), np.uint8))
+            tables.append(f'[cameras.{name}]\nvideo = "{name}.avi"\ntime_offset_s = {start_s}')
+        (folder / "recording.toml").write_text("\n".join(tables))
+        time_s = np.arange(60) / 100
+        position_m = np.stack([time_s, np.full(60, 5.0), np.zeros(60)], axis=-1)[:, None]
+        write_tum(folder, Trajectories(np.arange(60), time_s, ("drone",), position_m))
+    write_data_set(
+        [open_recording(folder) for folder in flights],
+        tmp_path / "set",
+        LabelSettings(drone_size_m=(0.1, 0.1, 0.1)),
+        selection=FrameSelection(every=1),
+    )
+    for name, start_s in starts_s.items():
+        files = sorted((tmp_path / "set" / "labels").glob(f"*/*_{name}_*.txt"))
+        assert len(files) == 2 * int(rates_hz[name] // 5)
+        for file in files:
+            middle_px = 200 * float(file.read_text().split()[1])
+            time_s = start_s + int(file.stem[-6:]) / rates_hz[name]
+            # The near and the far side of the cube, 0.1 m apart, shift the middle by up to 0.02 px.
+            assert middle_px == pytest.approx(100 + 100 * time_s / 5, abs=0.03)

@@ -386,6 +386,22 @@ class TestFaults:
         path = write(folder, camera("left", 'video = "left.avi"', 'timestamps = "times.csv"', PLACE))
         assert_fails(path, "times.csv", *words)
 
+    def test_a_video_of_two_cameras(self, folder):
+        path = write(folder, LEFT, RIGHT.replace("right.avi", "./left.avi"))
+        assert_fails(path, "cameras.right", "a video of its own", "that of left, left.avi")
+
+    def test_rows_that_take_longer_than_a_frame(self, folder):
+        path = write(folder, camera("left", 'video = "left.avi"', "line_time_s = 0.001", PLACE))
+        assert_fails(
+            path, "cameras.left.line_time_s", "at most 0.00083 s, a frame's time for 48 rows", "0.001"
+        )
+
+    def test_a_camera_that_films_alone_is_a_warning(self, folder, caplog):
+        open_recording(
+            write(folder, camera("left", 'video = "left.avi"', "time_offset_s = 9.0", PLACE), RIGHT)
+        )
+        assert "cameras.left: no other camera films while it does, from 9.000 to 9.200 s" in caplog.text
+
     def test_an_ignored_part_of_another_size(self, folder):
         cv2.imwrite(str(folder / "ignore.png"), np.zeros((10, 10), np.uint8))
         path = write(folder, camera("left", 'video = "left.avi"', 'ignore = "ignore.png"', PLACE))

@@ -59,6 +59,9 @@ def recording_of(path: Path, content: RecordingFile) -> Recording:
     """
     folder = path.parent
     opened = {name: _open_camera(path, name, table) for name, table in content.cameras.items()}
+    _check_videos(path, opened)
+    for name, table in content.cameras.items():
+        _check_shutter(path, name, table, opened[name])
     calibrated = _calibrated(path, content)
     cameras = {
         name: _camera(path, name, content.cameras[name], opened[name], calibrated.get(name))
@@ -134,6 +137,43 @@ def _open_camera(path: Path, name: str, table: CameraTable) -> _Opened:
                 ignore, expected=f"{_size_text(size_wh)} as camera {name}", found=_size_text((width, height))
             )
     return _Opened(size_wh, video, stream, times, ignore, detections)
+
+
+def _check_videos(path: Path, opened: Mapping[str, _Opened]) -> None:
+    """Raise `InputError` for a video of two cameras, and warn of a camera that films alone."""
+    owners: dict[Path, str] = {}
+    for name, each in opened.items():
+        if each.video is None:
+            continue
+        file = (each.video.images[0] if each.video.images else each.video.path).resolve()
+        if file in owners:
+            raise _error(
+                path, f"cameras.{name}", "a video of its own", f"that of {owners[file]}, {file.name}"
+            )
+        owners[file] = name
+    spans = {
+        name: each.times.time_s[[0, -1]]
+        for name, each in opened.items()
+        if each.times and each.times.num_frames
+    }
+    for name, (begin_s, end_s) in spans.items():
+        others = [span for other, span in spans.items() if other != name]
+        if others and not any(begin_s <= last_s and first_s <= end_s for first_s, last_s in others):
+            _logger.warning(
+                "%s, cameras.%s: no other camera films while it does, from %.3f to %.3f s; see time_offset_s and "
+                "timestamps",
+                path, name, begin_s, end_s,
+            )  # fmt: skip
+
+
+def _check_shutter(path: Path, name: str, table: CameraTable, opened: _Opened) -> None:
+    """Raise `InputError` where the rows of an image would take longer than the time from frame to frame."""
+    if opened.size_wh is None or opened.times is None:
+        return
+    longest_s = 1 / (opened.times.fps * opened.size_wh[1])
+    if abs(table.line_time_s) > longest_s:
+        expected = f"at most {longest_s:.2g} s, a frame's time for {opened.size_wh[1]} rows"
+        raise _error(path, f"cameras.{name}.line_time_s", expected, f"{table.line_time_s:g}")
 
 
 def _stream(folder: Path, video: str | int | None) -> str:

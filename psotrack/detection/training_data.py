@@ -22,11 +22,14 @@ from psotrack.detection.labels import LabelSettings, box_corners, label_boxes
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.recordings import Recording, VideoInfo, read_frames
 from psotrack.support import Advance, Report, atomic_write, map_in_processes, no_progress, refuse_to_overwrite
+from psotrack.trajectories import Trajectories, resample
 
 #: Name of the file that describes a data set; every folder with a data set has one.
 DATA_SET = "data.yaml"
 _CLASS = "drone"
 _TRAIN, _VALIDATION = "train", "val"
+#: Times that differ by less are one time, seconds: a drone at 20 m/s moves by 2 micrometres.
+_ONE_TIME_S = 1e-7
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,7 @@ class _Task:
         stem: beginning of the files' names.
         video: video of the camera.
         every: step between used frames.
-        frame: (known,), numbers of the used frames, multiples of `every`.
+        frame: (known,), numbers of the used frames of the camera, multiples of `every`.
         xyxy: (known, drones, 4), labels in pixels; NaN without a label.
     """
 
@@ -172,31 +175,37 @@ def _tasks(recording: Recording, part: str, settings: LabelSettings, every: int,
     if recording.truth is None:
         raise InputError(recording.folder, expected="a reference with the drones' positions", found="none")
     filmed = [name for name in recording.rig.names if name in recording.videos]
-    truth, recording = recording.truth, recording.usable(filmed, recording.num_frames)
-    wanted = truth.frame[(truth.frame % every == 0) & (truth.frame < recording.num_frames)]
-    corners_m = box_corners(
-        truth.at_frames(wanted), np.array(settings.drone_size_m), np.array(settings.offset_m)
-    )
-    known = np.isfinite(corners_m).all(axis=(1, 2, 3))
-    if not known.any():
+    recording = recording.usable(filmed, recording.num_frames)
+    tasks, num_wanted = [], 0
+    for name in recording.rig.names:
+        truth = _truth_at_frames(recording, name, every)
+        corners_m = box_corners(truth, np.array(settings.drone_size_m), np.array(settings.offset_m))
+        known = np.isfinite(corners_m).all(axis=(1, 2, 3))
+        num_wanted = max(num_wanted, len(known))
+        if known.any():
+            xyxy = label_boxes(recording.rig.select((name,)).cameras, corners_m[known], settings)[:, :, 0]
+            stem = f"{recording.name}_{name}"
+            tasks.append(_Task(out, part, stem, recording.videos[name], every, truth.frame[known], xyxy))
+    if not tasks:
         raise InputError(
             recording.folder,
             expected="frames in which the poses of all drones are known",
-            found=f"no such frame among the {len(wanted)} used frames",
+            found=f"no such frame among the {num_wanted} used frames",
         )
-    xyxy = label_boxes(recording.rig.cameras, corners_m[known], settings)
-    return [
-        _Task(
-            out,
-            part,
-            f"{recording.name}_{name}",
-            recording.videos[name],
-            every,
-            wanted[known],
-            xyxy[:, :, index],
-        )
-        for index, name in enumerate(recording.rig.names)
-    ]
+    return tasks
+
+
+def _truth_at_frames(recording: Recording, name: str, every: int) -> Trajectories:
+    """The reference at every `every`-th frame of a camera, at the times of these frames."""
+    truth, times = recording.truth, recording.frame_times[name]
+    assert truth is not None
+    frame = truth.frame[(truth.frame % every == 0) & (truth.frame < times.num_frames)]
+    at_instants = truth.at_frames(frame)
+    if np.allclose(at_instants.time_s, times.time_s[frame], rtol=0, atol=_ONE_TIME_S):
+        return at_instants
+    # The rows of the reference are instants of the recording, which are not the frames of this camera.
+    frame = np.arange(0, times.num_frames, every)
+    return resample(truth, frame, times.time_s[frame])
 
 
 def _write_camera(task: _Task, advance: Advance) -> dict[str, int]:

@@ -66,6 +66,12 @@ def track_recording(
     began = time.perf_counter()
     needs_silhouettes = settings.needs_silhouettes or parts.method is not None
     recording = usable_for(recording, settings, videos=needs_silhouettes or parts.detector is not None)
+    if len(recording.rig) < 2:
+        raise InputError(
+            recording.folder,
+            expected="at least two cameras that can be used, because one camera does not show distances",
+            found=", ".join(recording.rig.names),
+        )
     # Wrong names are refused before silhouettes are computed, which takes minutes.
     if tracks_silhouettes(settings, parts.method):
         tracker_settings(settings, search=parts.search, score=parts.score)
