@@ -18,11 +18,13 @@ from .residuals import GATE, UNLIKELY, inflation, spread_px
 from .rig.adjustment import CalibratedRig, LensChoice, calibrate_rig, in_new_world
 from .rig.findings import CameraFigures, advise, coverage, figures_of, find_shifts, say_print, worst_views
 from .rig.images import CameraImages, instants_of_numbers, open_images, open_recorded
+from .rig.lens_choice import ModelComparison, choose_lens_model
 from .rig.lens_models import LensModel, known_lenses, parse_lens_model
-from .rig.moving_point import PointRig, PointViews, calibrate_by_point
+from .rig.moving_point import PointRig, PointViews, calibrate_by_point, covariance_of_centres
 from .rig.plots import save_coverage
 from .rig.point_files import (
     GivenWorld,
+    check_two_cameras,
     distance_between,
     fit_world,
     read_point_views,
@@ -55,6 +57,7 @@ __all__ = [
     "LensChoice",
     "LensModel",
     "Located",
+    "ModelComparison",
     "PointRig",
     "PointViews",
     "Similarity",
@@ -64,6 +67,9 @@ __all__ = [
     "calibrate_by_point",
     "calibrate_rig",
     "centre_by_pose",
+    "check_two_cameras",
+    "choose_lens_model",
+    "covariance_of_centres",
     "coverage",
     "distance_between",
     "figures_of",

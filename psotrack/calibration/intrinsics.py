@@ -1,46 +1,33 @@
-"""Intrinsics of a camera, from its data sheet, or from a video in which a ChArUco board is moved.
+"""Intrinsics of a camera, from its data sheet, or from a video in which a board is moved.
 
-The calibration is Z. Zhang's method (PAMI 22(11), 2000) as implemented in OpenCV, with 4 to 14 distortion coefficients.
+The calibration is the adjustment of a rig (`rig.adjustment`) with one camera, so both know the same boards and lenses.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 
-from psotrack.calibration.board_corners import choose_spread, outline_of
-from psotrack.calibration.board_recognition import explain_missing_board, recognise_board
+from psotrack.calibration.board_corners import LEAST_CORNERS
 from psotrack.calibration.boards import Board
+from psotrack.calibration.rig.adjustment import LensChoice, calibrate_rig
+from psotrack.calibration.rig.images import CameraImages, instants_of_numbers
+from psotrack.calibration.rig.lens_choice import choose_lens_model
+from psotrack.calibration.rig.lens_models import LensModel
+from psotrack.calibration.rig.views import find_views
 from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.geometry import Camera, make_camera
-from psotrack.recordings import VideoInfo, read_frames
+from psotrack.support import Report, no_progress
 
 #: Smallest number of views: fewer views determine k1, k2, p1, p2 badly.
 _MIN_VIEWS = 8
-#: Smallest number of corners in a view: fewer corners determine the board's pose badly.
-_MIN_CORNERS = 8
-#: Largest number of views that are used: more views add little, because the chosen views differ most.
-_MOST_VIEWS = 40
-#: Largest number of frames in which the board is searched; limits the time for long videos.
-_MOST_FRAMES = 300
-#: Number of frames from which it is found out how the board was printed.
-_MOST_SAMPLES = 12
 #: Largest standard deviation of the focal length, as a share of the focal length.
 _MAX_FOCAL_ERROR = 0.02
 #: Smallest angle between the planes of the board in the two views that differ most, degrees: views of parallel boards
 #: do not determine the focal length.
 _MIN_TILT_DEG = 10.0
-#: OpenCV's flags by the number of distortion coefficients.
-_FLAGS = {
-    4: cv2.CALIB_FIX_K3,
-    5: 0,
-    8: cv2.CALIB_RATIONAL_MODEL,
-    12: cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL,
-    14: cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL | cv2.CALIB_TILTED_MODEL,
-}
 #: Largest focal length, in image widths: 20 widths are a field of view of 3 degrees.
 _MAX_FOCAL_WIDTHS = 20.0
 
@@ -51,12 +38,16 @@ class Lens:
 
     Attributes:
         camera: intrinsics; the pose is the world's origin.
+        model: model of the lens.
+        compared_px: median error of each model that was compared, on views left out, pixels; none if it was stated.
         std: (4 + coefficients,), standard deviations of fx, fy, cx, cy in pixels, and of the distortion coefficients.
         frame: (views,), numbers of the frames that were used.
         residual_px: (views,), root mean square reprojection error of each view, pixels.
     """
 
     camera: Camera
+    model: LensModel
+    compared_px: dict[str, float]
     std: Float[np.ndarray, " unknowns"]
     frame: Int[np.ndarray, " views"]
     residual_px: Float[np.ndarray, " views"]
@@ -97,122 +88,58 @@ def lens_of_sensor(
     return _undistorted_camera(focal_length_mm * np.array(image_size_wh) / np.array(sensor_mm), image_size_wh)
 
 
-def lens_of_board(video: VideoInfo, board: Board, coefficients: int = 4) -> Lens:
-    """Estimate the lens of a camera from a video in which a ChArUco board is moved.
-
-    The views that differ most in the position, size and tilt of the board are used.
+def lens_of_board(
+    images: CameraImages, board: Board, model: LensModel | None = None, report: Report = no_progress
+) -> Lens:
+    """Estimate the lens of a camera from images in which a board is moved.
 
     Args:
-        video: the video.
-        board: the board.
-        coefficients: number of distortion coefficients in OpenCV's order: 4, 5, 8, 12 or 14. More coefficients need
-            views in all corners of the image.
+        images: the video or the images.
+        board: the board; how it was printed is found out.
+        model: model of the lens; None to choose it by views left out. More coefficients need views in all corners of
+            the image.
+        report: display of the progress.
 
     Raises:
-        InputError: the video cannot be read, too few views show enough corners of the board, or the views differ too
+        InputError: the images cannot be read, too few views show enough corners of the board, or the views differ too
             little to determine the focal length.
-        SettingsError: the dictionary does not exist, or no model has this number of coefficients.
+        SettingsError: the dictionary does not exist.
     """
-    if coefficients not in _FLAGS:
-        expected = f"one of {', '.join(map(str, _FLAGS))}"
-        raise SettingsError("coefficients", expected=expected, found=f"{coefficients}")
-    board.opencv()
-    views = _find_views(video, board)
-    if len(views) < _MIN_VIEWS:
+    found = find_views(board, (images,), instants_of_numbers((images,)), report)
+    board = found.recognised.board
+    views = found.views.select(found.views.seen[0])
+    if len(views.number) < _MIN_VIEWS:
         raise InputError(
-            video.path,
-            expected=f"at least {_MIN_VIEWS} frames that show {_MIN_CORNERS} corners of the board",
-            found=f"{len(views)}",
-            remedy="check that squares, dictionary and markers are those of the printed board",
+            images.path,
+            expected=f"at least {_MIN_VIEWS} frames that show {LEAST_CORNERS} corners of the board",
+            found=f"{len(views.number)}",
+            remedy="move the board nearer, and hold it still for a moment in each place",
         )
-    chosen = choose_spread(np.array([view.outline for view in views]), _MOST_VIEWS)
-    used = [views[index] for index in sorted(chosen)]
-    rms, K, dist, turns, _, std, _, per_view = cv2.calibrateCameraExtended(
-        [view.points_m for view in used],
-        [view.points_px for view in used],
-        video.image_size_wh,
-        np.eye(3),
-        np.zeros(max(coefficients, 5)),
-        flags=_FLAGS[coefficients],
-    )
-    std = np.asarray(std, np.float64).ravel()[: 4 + coefficients]
+    compared_px: dict[str, float] = {}
+    if model is None:
+        comparison = choose_lens_model(board, views.corners_px[0], images.image_size_wh)
+        model, compared_px = comparison.model, comparison.error_px
+    calibrated = calibrate_rig(board, views, LensChoice(model))
+    camera, std = calibrated.rig.cameras[0], calibrated.lens_std[0]
+    used = calibrated.used[0]
+    is_good = used.any(axis=1)
+    focal_px = np.diag(np.asarray(camera.K))[:2]
     # Boards that are all parallel to the image fit every focal length, and its stated deviation is then meaningless.
-    normals = np.array([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
+    normals = calibrated.T_world_board[is_good, :3, 2]
     tilt_deg = np.rad2deg(np.arccos(np.clip((normals @ normals.T).min(), -1, 1)))
     # The estimated tilts are meaningless too if the fit diverged to a very large focal length.
-    diverged = K[0, 0] > _MAX_FOCAL_WIDTHS * video.image_size_wh[0]
-    uncertain = not (std[:2] < _MAX_FOCAL_ERROR * np.diag(K)[:2]).all()
-    if not np.isfinite(rms) or diverged or tilt_deg < _MIN_TILT_DEG or uncertain:
+    diverged = focal_px[0] > _MAX_FOCAL_WIDTHS * images.image_size_wh[0]
+    uncertain = not (std[:2] < _MAX_FOCAL_ERROR * focal_px).all()
+    if diverged or tilt_deg < _MIN_TILT_DEG or uncertain:
         raise InputError(
-            video.path,
+            images.path,
             expected=f"views that determine the focal length to {_MAX_FOCAL_ERROR:.0%}",
-            found=f"boards whose tilts differ by at most {tilt_deg:.0f} degrees, error {std[0] / K[0, 0]:.1%}",
+            found=f"boards whose tilts differ by at most {tilt_deg:.0f} degrees, error {std[0] / focal_px[0]:.1%}",
             remedy="tilt the board, and move it into all corners of the image",
         )
-    return Lens(
-        make_camera(
-            R=np.eye(3),
-            t_m=np.zeros(3),
-            K=K,
-            dist=dist.ravel()[:coefficients].tolist(),
-            image_size_wh=video.image_size_wh,
-        ),
-        std,
-        np.array([view.frame for view in used]),
-        np.asarray(per_view, np.float64).ravel(),
-    )
-
-
-@dataclass(frozen=True)
-class _View:
-    """Corners of the board in one frame.
-
-    Attributes:
-        frame: number of the frame.
-        points_m: (corners, 1, 3), positions on the board, metres.
-        points_px: (corners, 1, 2), positions in the image, pixels.
-        outline: (8,), positions of the board's four corners, in image widths and heights.
-    """
-
-    frame: int
-    points_m: np.ndarray
-    points_px: np.ndarray
-    outline: Float[np.ndarray, "8"]
-
-
-def _find_views(video: VideoInfo, board: Board) -> list[_View]:
-    """Find the frames that show enough corners of the board.
-
-    Raises:
-        InputError: the video cannot be read, or does not show this board.
-    """
-    step = max(1, video.num_frames // _MOST_FRAMES)
-    samples = max(1, video.num_frames // _MOST_SAMPLES)
-    recognised = recognise_board(board, map(_grey, read_frames(video, samples)))
-    if not recognised.views:
-        found, remedy = explain_missing_board(board, list(map(_grey, read_frames(video, samples))))
-        raise InputError(video.path, expected=f"a {board}", found=found, remedy=remedy)
-    finder, views = recognised.finder(), []
-    for index, frame in enumerate(read_frames(video, step)):
-        corners_px = finder.find(_grey(frame))
-        seen = np.isfinite(corners_px[:, 0])
-        if seen.sum() < _MIN_CORNERS:
-            continue
-        outline = outline_of(board, corners_px)
-        if outline is not None:
-            views.append(
-                _View(
-                    index * step,
-                    board.corners_m[seen][:, None].astype(np.float32),
-                    corners_px[seen][:, None].astype(np.float32),
-                    outline / np.tile(video.image_size_wh, 4),
-                )
-            )
-    return views
-
-
-def _grey(frame: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width"]:
-    return np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY))
+    squares = np.where(used, calibrated.residual_px[0], 0.0) ** 2
+    rms_px = np.sqrt(squares.sum(axis=1)[is_good] / used.sum(axis=1)[is_good])
+    return Lens(camera, model, compared_px, std, views.number[is_good], rms_px)
 
 
 def _undistorted_camera(focal_length_px: Float[np.ndarray, "2"], image_size_wh: tuple[int, int]) -> Camera:

@@ -85,11 +85,12 @@ class NormalEquations:
         """
         if self.block_information is None or self.block_right is None or self.coupling is None:
             raise TypeError("expected equations with blocks, found none")
-        size = self.information.shape[-1]
         covariance = np.linalg.inv(self.block_information)
         gain = covariance @ self.coupling
-        flat_gain = gain.reshape(-1, size)
-        explained = flat_gain.T @ self.coupling.reshape(-1, size)
+        # Not -1 rows: there may be no shared unknowns.
+        flat = (self.block_right.size, self.information.shape[-1])
+        flat_gain = gain.reshape(flat)
+        explained = flat_gain.T @ self.coupling.reshape(flat)
         return ReducedEquations(
             information=self.information - (explained + explained.T) / 2,
             right=self.right - flat_gain.T @ self.block_right.ravel(),

@@ -28,6 +28,7 @@ from psotrack.calibration.rig.equations import (
     RigState,
     solve_robustly,
 )
+from psotrack.calibration.rig.lens_choice import choose_lens_model
 from psotrack.calibration.rig.lens_models import PINHOLE, LensModel, camera_matrix
 from psotrack.calibration.rig.slips import Slips
 from psotrack.calibration.rig.views import BoardViews
@@ -53,6 +54,7 @@ class CalibratedRig:
         residual_px: (cameras, instants, corners), distances from the projections, pixels; NaN where not seen.
         own_residual_px: the same where each view has the board at a pose of its own (see `slips`).
         used: (cameras, instants, corners), False for outliers and for what is not seen.
+        lens_models: for each camera, the model of its lens.
         lens_std: for each camera, standard deviations of fx, fy, cx, cy and of the distortion; 0 where it was known.
         covariance: (cameras, 6, 6), covariance of a small turn about the camera's axes, rad, and of the translation, m.
         centre_covariance_m2: (cameras, 3, 3), covariances of the camera centres, world, m².
@@ -66,6 +68,7 @@ class CalibratedRig:
     residual_px: Float[np.ndarray, "cameras instants corners"]
     own_residual_px: Float[np.ndarray, "cameras instants corners"]
     used: Bool[np.ndarray, "cameras instants corners"]
+    lens_models: tuple[LensModel, ...]
     lens_std: tuple[np.ndarray, ...]
     covariance: Float[np.ndarray, "cameras 6 6"]
     centre_covariance_m2: Float[np.ndarray, "cameras 3 3"]
@@ -77,12 +80,12 @@ class LensChoice:
     """What is known and what is wanted of the lenses.
 
     Attributes:
-        model: model of the lenses that are not known.
+        model: model of the lenses that are not known; None to choose it for each camera by views left out.
         known: lenses by camera name, which are kept.
         is_shared: whether all cameras have the same lens.
     """
 
-    model: LensModel = field(default_factory=LensModel)
+    model: LensModel | None = field(default_factory=LensModel)
     known: Mapping[str, tuple[LensModel, np.ndarray]] | None = None
     is_shared: bool = False
 
@@ -134,8 +137,9 @@ def _start_lenses(
             model, vector = (lenses.known or {})[name]
         else:
             size_wh = (int(views.image_size_wh[camera, 0]), int(views.image_size_wh[camera, 1]))
-            model = lenses.model
-            found = find_lens(board, model, views.corners_px[camera][views.seen[camera]], size_wh)
+            views_px = views.corners_px[camera][views.seen[camera]]
+            model = lenses.model or choose_lens_model(board, views_px, size_wh).model
+            found = find_lens(board, model, views_px, size_wh)
             if found is None:
                 raise InputError(
                     f"camera {name}", expected="views that a lens fits", found="none", remedy="tilt the board"
@@ -304,6 +308,7 @@ def _result(board: Board, views: BoardViews, chain: Chain, bundle: RigBundle) ->
         residual_px,
         own_px,
         used,
+        tuple(problem.models[lens] for lens in problem.lens_of.tolist()),
         tuple(lens_std),
         np.stack(by_camera),
         np.stack(centres),

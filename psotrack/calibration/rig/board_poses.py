@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from psotrack.calibration.board_corners import LEAST_CORNERS, choose_spread, outline_of
 from psotrack.calibration.boards import Board
@@ -80,6 +80,30 @@ def find_lens(
     return min(found, key=lambda one: one[0])[1] if found else None
 
 
+def fit_boards(
+    board: Board,
+    model: LensModel,
+    lens: Float[np.ndarray, " unknowns"],
+    views_px: Float[np.ndarray, "views corners 2"],
+    image_size_wh: tuple[int, int],
+) -> Float[np.ndarray, "views corners"] | None:
+    """Fit the board's pose to each view with a known lens.
+
+    Returns:
+        Distances of the corners, pixels; NaN in views that the lens cannot show. None if there is no other view.
+    """
+    prepared = _problem(board, model, lens, views_px, image_size_wh)
+    if prepared is None:
+        return None
+    bundle, fits = prepared
+    none = (np.zeros(model.size, bool),)
+    bundle = solve_robustly(replace(bundle, problem=replace(bundle.problem, free_lens=none)))
+    distance_px = np.full(views_px.shape[:2], np.nan)
+    seen = bundle.problem.seen[0]
+    distance_px[np.flatnonzero(fits)[seen.instant], seen.corner] = bundle.distance_px[0]
+    return distance_px
+
+
 def _adjust_lens(
     board: Board,
     model: LensModel,
@@ -88,14 +112,36 @@ def _adjust_lens(
     image_size_wh: tuple[int, int],
 ) -> RigBundle | None:
     """Adjust a lens and the board's poses: first the focal lengths and the first coefficient, then all."""
+    prepared = _problem(board, model, lens, views_px, image_size_wh)
+    if prepared is None:
+        return None
+    bundle = prepared[0]
+    first = np.zeros(model.size, bool)
+    first[:2] = True
+    first[PINHOLE : PINHOLE + 1] = True
+    try:
+        bundle = replace(bundle, problem=replace(bundle.problem, free_lens=(first,)))
+        bundle = solve_robustly(bundle, rounds=2)
+        return solve_robustly(
+            replace(bundle, problem=replace(bundle.problem, free_lens=(np.ones(model.size, bool),)))
+        )
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _problem(
+    board: Board,
+    model: LensModel,
+    lens: Float[np.ndarray, " unknowns"],
+    views_px: Float[np.ndarray, "instants corners 2"],
+    image_size_wh: tuple[int, int],
+) -> tuple[RigBundle, Bool[np.ndarray, " instants"]] | None:
+    """Adjustment of one lens, and the views that it can show; None if it can show none."""
     poses = [find_board_poses(board, model, lens, corners_px) for corners_px in views_px]
     fits = np.array([len(candidates) > 0 for candidates in poses])
     if not fits.any():
         return None
     seen = CameraCorners.of(views_px[fits])
-    first = np.zeros(model.size, bool)
-    first[:2] = True
-    first[PINHOLE : PINHOLE + 1] = True
     problem = RigProblem(
         models=(model,),
         lens_of=np.zeros(1, np.int64),
@@ -103,18 +149,11 @@ def _adjust_lens(
         corners_m=board.corners_m,
         seen=(seen,),
         noise_px=np.ones(1),
-        free_lens=(first,),
+        free_lens=(np.ones(model.size, bool),),
         free_camera=np.zeros(1, bool),
         free_board=np.ones(int(fits.sum()), bool),
     )
     state = RigState(
         (lens,), np.eye(4)[None], np.array([candidates[0] for candidates in poses if len(candidates)])
     )
-    bundle = RigBundle(problem, state, (np.ones(len(seen.corner), bool),), robust=True)
-    try:
-        bundle = solve_robustly(bundle, rounds=2)
-        return solve_robustly(
-            replace(bundle, problem=replace(bundle.problem, free_lens=(np.ones(model.size, bool),)))
-        )
-    except np.linalg.LinAlgError:
-        return None
+    return RigBundle(problem, state, (np.ones(len(seen.corner), bool),), robust=True), fits

@@ -211,9 +211,9 @@ def advise(calibrated: CalibratedRig) -> list[str]:
         )
     shifts = find_shifts(calibrated)
     sentences_of_shifts = [
-        f"{name} fits the others better if its frame {number} is their frame {number + shift}: its video shows the "
-        f"scene {abs(shift)} frame{'s' if abs(shift) > 1 else ''} {'early' if shift > 0 else 'late'}; "
-        "say so by time_offset_s in a recording.toml, and pass it instead of the videos"
+        f"{name} fits the others better if its frame {number} is their frame {number + shift}: it shows the scene "
+        f"{abs(shift)} frame{'s' if abs(shift) > 1 else ''} {'early' if shift > 0 else 'late'}; write "
+        f"time_offset_s = {shift} / fps for it in a recording.toml, and pass the recording.toml instead of the videos"
         for name, shift in shifts.items()
         for number in [int(calibrated.views.number[0])]
     ]

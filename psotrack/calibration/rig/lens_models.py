@@ -48,6 +48,10 @@ class LensModel:
                 found=f"{self.coefficients}",
             )
 
+    def __str__(self) -> str:
+        """The word that `parse_lens_model` reads."""
+        return "fisheye" if self.fisheye else f"{self.coefficients}"
+
     @property
     def size(self) -> int:
         """Number of unknowns."""
@@ -116,17 +120,21 @@ def camera_matrix(lens: Float[np.ndarray, " unknowns"]) -> Float[np.ndarray, "3 
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def parse_lens_model(word: str) -> LensModel:
-    """The model that a word names: a number of coefficients, or fisheye.
+def parse_lens_model(word: str) -> LensModel | None:
+    """The model that a word names: a number of coefficients, fisheye, or auto: None, a model chosen by the views.
 
     Raises:
         SettingsError: there is no such model.
     """
+    if word.lower() == "auto":
+        return None
     if word.lower() == "fisheye":
         return LensModel(_FISHEYE_COEFFICIENTS, fisheye=True)
     if not word.isdecimal() or int(word) not in _PINHOLE_COEFFICIENTS:
         raise SettingsError(
-            "lens", expected=f"one of {', '.join(map(str, _PINHOLE_COEFFICIENTS))} or fisheye", found=word
+            "lens",
+            expected=f"auto, fisheye, or one of {', '.join(map(str, _PINHOLE_COEFFICIENTS))}",
+            found=word,
         )
     return LensModel(int(word))
 

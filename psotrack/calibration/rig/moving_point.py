@@ -5,11 +5,15 @@ gives the direction from one camera to the other. The pair that sees most at wid
 placed by points that are known already (perspective-n-point), and after each camera all are adjusted together
 (`calibration.bundle`). Detections of other things are left out by random sampling, first with a wide gate. Scale, axes
 and origin of the world stay open: see `world`.
+
+How well the cameras are known depends on what fixes the world, and on errors that last: of the lens, of a detector, of
+GPS. So the covariances are those of a jackknife: the adjustment and the fit of the world again without each tenth of
+the recording (J. W. Tukey 1958; H. R. Künsch 1989 for parts of a series).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -18,8 +22,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.calibration.bundle import AdjustedRig, adjust
-from psotrack.calibration.common_errors import CommonErrors
 from psotrack.calibration.residuals import spread_px
+from psotrack.calibration.rig.world import Similarity
 from psotrack.errors import InputError
 from psotrack.geometry import Rig, triangulate, undistort
 
@@ -35,8 +39,8 @@ _MOST_INSTANTS = 1500
 _FAR = (10.0, 4.0, 2.0, 1.5)
 #: Smallest standard deviation of a detection, pixels.
 _LEAST_NOISE_PX = 0.2
-#: Number of neighbouring instants whose detections have errors in common, and the size of these, in units of the noise.
-_LASTING, _LASTING_SHARE = 15, 0.5
+#: Number of parts of the recording for the jackknife.
+_PARTS = 10
 
 
 @dataclass(frozen=True)
@@ -98,13 +102,33 @@ def calibrate_by_point(lenses: Rig, views: PointViews) -> PointRig:
         placed[index] = T
         adjusted = _adjusted(_rig_of(lenses, placed), points_px[:, sorted(placed)], _WIDE_PX / 5)
     noise_px = _noise_px(adjusted)
-    lasting = CommonErrors(
-        (views.number - views.number.min()) // _LASTING,
-        np.full(points_px.shape[:2], _LASTING_SHARE * noise_px),
-    )
     used_px = np.where(adjusted.used[..., None], points_px, np.nan)
-    adjusted = _adjust_near(adjusted.rig, used_px, noise_px, [lasting])
+    adjusted = _adjust_near(adjusted.rig, used_px, noise_px)
     return PointRig(adjusted, views, _noise_px(adjusted))
+
+
+def covariance_of_centres(
+    found: PointRig, world_of: Callable[[PointRig], Similarity]
+) -> Float[np.ndarray, "cameras 3 3"]:
+    """Estimate the covariances of the camera centres in the world that `world_of` finds, square metres.
+
+    Args:
+        found: the rig.
+        world_of: the change from a rig's own world and unit to the world that is meant.
+
+    Raises:
+        InputError: the sightings without a part of the recording do not determine the cameras or the world.
+    """
+    part = np.unique(found.views.number, return_inverse=True)[1]
+    part = part * _PARTS // (part.max() + 1)
+    used_px = np.where(found.adjusted.used[..., None], found.views.points_px, np.nan)
+    centres = []
+    for left_out in range(_PARTS):
+        kept_px = np.where((part != left_out)[:, None, None], used_px, np.nan)
+        again = replace(found, adjusted=_adjust_near(found.adjusted.rig, kept_px, found.noise_px))
+        centres.append(world_of(again).points(np.asarray(again.adjusted.rig.cameras.centre_world)))
+    off = np.array(centres) - np.mean(centres, axis=0)
+    return (_PARTS - 1) / _PARTS * np.einsum("pci,pcj->cij", off, off)
 
 
 def _thinned(views: PointViews) -> PointViews:
@@ -217,10 +241,7 @@ def _adjusted(rig: Rig, points_px: Float[np.ndarray, "sightings cameras 2"], noi
 
 
 def _adjust_near(
-    rig: Rig,
-    points_px: Float[np.ndarray, "sightings cameras 2"],
-    noise_px: float,
-    common_errors: Sequence[CommonErrors] = (),
+    rig: Rig, points_px: Float[np.ndarray, "sightings cameras 2"], noise_px: float
 ) -> AdjustedRig:
     """Adjust without the sightings whose rays are nearly parallel: their point may be anywhere far away.
 
@@ -233,7 +254,7 @@ def _adjust_near(
     for multiple in _FAR:
         near_px = np.where((far < multiple * typical)[:, None, None], points_px, np.nan)
         try:
-            return adjust(rig, near_px, noise_px, common_errors=common_errors)
+            return adjust(rig, near_px, noise_px)
         except np.linalg.LinAlgError:
             # A point went to infinity: points that are not so far away stay.
             continue

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from psotrack.cli.options import Size
+from psotrack.cli.options import Size, dictionary_option
+from psotrack.errors import SettingsError
+
+if TYPE_CHECKING:
+    from psotrack.calibration import Board
 
 OUT = click.option(
     "--out",
@@ -33,3 +37,74 @@ def noise_option(default: float) -> Any:
         show_default=True,
         help="Standard deviation of a point in the image, along x and along y, in pixels.",
     )
+
+
+LENS = click.option(
+    "--lens",
+    default="auto",
+    show_default=True,
+    metavar="auto|0|4|5|8|12|14|fisheye",
+    help="Number of distortion coefficients of OpenCV's lens model, or its fisheye model; auto chooses by views that "
+    "are left out.",
+)
+
+
+def board_options() -> Any:
+    """Options that describe a board; `board_of` makes the board."""
+    options = [
+        click.option(
+            "--board",
+            "kind",
+            type=click.Choice(["charuco", "chessboard", "grid"]),
+            help="Kind of the board; a grid is one of ArUco markers or AprilTags.  "
+            "[default: grid with --separation, charuco with --marker, else chessboard]",
+        ),
+        click.option(
+            "--squares",
+            "squares_wh",
+            type=Size(),
+            metavar="COLUMNSxROWS",
+            help="Number of squares of the board, of markers for a grid, such as 4x5.",
+        ),
+        click.option("--square", "square_m", type=float, help="Side of a square in metres."),
+        click.option("--marker", "marker_m", type=float, help="Side of a marker in metres."),
+        click.option(
+            "--separation", "separation_m", type=float, help="Gap between the markers of a grid in metres."
+        ),
+        dictionary_option(),
+    ]
+
+    def decorate(command: Any) -> Any:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return decorate
+
+
+def board_of(
+    kind: str | None,
+    squares_wh: tuple[int, int],
+    square_m: float | None,
+    marker_m: float | None,
+    separation_m: float | None,
+    dictionary: str,
+) -> Board:
+    """The board of the options."""
+    from psotrack.calibration import Board
+
+    if kind is None:
+        kind = "grid" if separation_m is not None else "charuco" if marker_m is not None else "chessboard"
+    if kind == "grid":
+        if marker_m is None or separation_m is None:
+            raise SettingsError(
+                "board",
+                expected="--marker and --separation of a grid",
+                found="--marker only" if marker_m else "no --marker",
+            )
+        return Board(squares_wh, marker_m + separation_m, marker_m, dictionary, "grid")
+    if square_m is None:
+        raise SettingsError("board", expected="--square, the side of a square in metres", found="none")
+    if kind == "chessboard":
+        return Board(squares_wh, square_m, marker_m, dictionary, "chessboard")
+    return Board(squares_wh, square_m, marker_m, dictionary)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from psotrack.cli.calibrate.options import OUT, noise_option
+from psotrack.cli.calibrate.options import LENS, OUT, board_of, board_options, noise_option
 from psotrack.cli.calibrate.rig_points import (
     Distance,
     calibrate_pairs,
@@ -18,42 +18,19 @@ from psotrack.cli.calibrate.rig_points import (
     is_recording,
 )
 from psotrack.cli.calibrate.shown import show_cameras
-from psotrack.cli.options import FORCE, JSON, QUIET, Size, dictionary_option, plot_option
+from psotrack.cli.options import FORCE, JSON, QUIET, plot_option
 from psotrack.cli.output import POSITION, format_numbers, output_json, print_line, print_table, report_to
 from psotrack.errors import SettingsError
 from psotrack.support import refuse_to_overwrite
 
 if TYPE_CHECKING:
-    from psotrack.calibration import Board, CalibratedRig, CameraFigures, LensChoice
+    from psotrack.calibration import CalibratedRig, CameraFigures, LensChoice
 
 
 @click.command()
 @click.argument("sources", metavar="[VIDEO...]", nargs=-1, type=click.Path(path_type=Path))
-@click.option(
-    "--board",
-    "kind",
-    type=click.Choice(["charuco", "chessboard", "grid"]),
-    help="Kind of the board; a grid is one of ArUco markers or AprilTags.  "
-    "[default: grid with --separation, charuco with --marker, else chessboard]",
-)
-@click.option(
-    "--squares",
-    "squares_wh",
-    type=Size(),
-    metavar="COLUMNSxROWS",
-    help="Number of squares of the board, of markers for a grid, such as 4x5.",
-)
-@click.option("--square", "square_m", type=float, help="Side of a square in metres.")
-@click.option("--marker", "marker_m", type=float, help="Side of a marker in metres.")
-@click.option("--separation", "separation_m", type=float, help="Gap between the markers of a grid in metres.")
-@dictionary_option()
-@click.option(
-    "--lens",
-    default="5",
-    show_default=True,
-    metavar="0|4|5|8|12|14|fisheye",
-    help="Number of distortion coefficients of OpenCV's lens model, or its fisheye model.",
-)
+@board_options()
+@LENS
 @click.option(
     "--same-lens", is_flag=True, help="All cameras have one lens, as equal cameras at equal zoom nearly do."
 )
@@ -173,16 +150,15 @@ def rig(
         if floor is not None or plot is not None:
             raise SettingsError("rig", expected="--floor and --plot with --squares", found=chosen[0])
         if is_point:
-            found, points, place = calibrate_points(sources, lenses_path, distance, stick_m, world)
+            found, points, sentences = calibrate_points(sources, lenses_path, distance, stick_m, world)
         else:
-            found, points, place = calibrate_pairs(
+            found, points, sentences = calibrate_pairs(
                 sources, pairs, markers, dictionary, lenses_path, noise_px, world
             )
         _write(out, found, force)
-        show_cameras(points, out, quiet, json_path, force)
-        print_line(quiet, json_path, f"the world is {place}")
+        show_cameras(points, out, quiet, json_path, force, sentences)
         return
-    board = _board(kind, squares_wh, square_m, marker_m, separation_m, dictionary)
+    board = board_of(kind, squares_wh, square_m, marker_m, separation_m, dictionary)
     lenses = _lenses(lens, same_lens, lenses_path)
     calibrated, said = _by_board(sources, names, board, lenses, floor, quiet, json_path)
     if world is None:
@@ -283,34 +259,6 @@ def _report(
         print_line(quiet, json_path, sentence)
     print_line(quiet, json_path, f"the world is {place}")
     print_line(quiet, json_path, f"{out}")
-
-
-def _board(
-    kind: str | None,
-    squares_wh: tuple[int, int],
-    square_m: float | None,
-    marker_m: float | None,
-    separation_m: float | None,
-    dictionary: str,
-) -> Board:
-    """The board of the options."""
-    from psotrack.calibration import Board
-
-    if kind is None:
-        kind = "grid" if separation_m is not None else "charuco" if marker_m is not None else "chessboard"
-    if kind == "grid":
-        if marker_m is None or separation_m is None:
-            raise SettingsError(
-                "board",
-                expected="--marker and --separation of a grid",
-                found="--marker only" if marker_m else "no --marker",
-            )
-        return Board(squares_wh, marker_m + separation_m, marker_m, dictionary, "grid")
-    if square_m is None:
-        raise SettingsError("board", expected="--square, the side of a square in metres", found="none")
-    if kind == "chessboard":
-        return Board(squares_wh, square_m, marker_m, dictionary, "chessboard")
-    return Board(squares_wh, square_m, marker_m, dictionary)
 
 
 def _lenses(lens: str, is_shared: bool, path: Path | None) -> LensChoice:

@@ -13,8 +13,11 @@ from psotrack.cli.calibrate.shown import row_of
 from psotrack.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
-    from psotrack.calibration import PointViews
+    from psotrack.calibration import PointRig, PointViews, Similarity
     from psotrack.geometry import Rig
+
+#: A camera's place is hardly determined if its standard deviation is above this share of the rig's size.
+_LOOSE = 0.1
 
 
 class Distance(click.ParamType):
@@ -45,10 +48,12 @@ def calibrate_points(
     distance: tuple[str, str, float] | None,
     stick_m: float | None,
     world: Path | None,
-) -> tuple[Rig, dict[str, dict[str, Any]], str]:
-    """Rig from a moving point, a row of each camera, and a sentence on the world."""
+) -> tuple[Rig, dict[str, dict[str, Any]], list[str]]:
+    """Rig from a moving point, a row of each camera, and sentences on the world and on what is not determined."""
     from psotrack.calibration import (
         calibrate_by_point,
+        check_two_cameras,
+        covariance_of_centres,
         distance_between,
         fit_world,
         read_world,
@@ -64,23 +69,34 @@ def calibrate_points(
             found="none" if not given else f"{given}",
         )
     views = _read_views(sources)
+    if distance is not None:
+        check_two_cameras(views.names, *distance[:2])
+    if stick_m is not None and not views.point.any():
+        raise InputError(
+            sources[0],
+            expected="the two ends of a stick, told apart by a column named point",
+            found="one point",
+        )
     lenses = known_lenses_of(views.names, lenses_path)
     found = calibrate_by_point(lenses, views)
-    rig = found.adjusted.rig
-    if world is not None:
-        ends = found.views.point == 0
-        numbered = dict(zip(found.views.number[ends].tolist(), found.adjusted.points_m[ends], strict=True))
-        change, left = fit_world(rig, read_world(world), numbered, with_scale=True)
-        place = in_words(world, left)
-    else:
+    given = None if world is None else read_world(world)
+
+    def world_of(found: PointRig) -> Similarity:
+        rig = found.adjusted.rig
+        if given is not None:
+            return fit_world(rig, given, _numbered(found), with_scale=True)[0]
         if distance is not None:
-            factor = distance[2] / distance_between(rig, distance[0], distance[1])
-        else:
-            factor = (stick_m or 1.0) / stick_length(found)
-        change = world_of_camera(rig, 0, factor)
-        place = f"camera {rig.names[0]}: x right, y down, z forward; --world places it elsewhere"
-    rig = change.rig(rig)
-    covariance = change.covariance_m2(found.adjusted.centre_covariance_m2)
+            return world_of_camera(rig, 0, distance[2] / distance_between(rig, *distance[:2]))
+        return world_of_camera(rig, 0, (stick_m or 1.0) / stick_length(found))
+
+    change = world_of(found)
+    covariance = covariance_of_centres(found, world_of)
+    if given is not None:
+        _, left = fit_world(found.adjusted.rig, given, _numbered(found), with_scale=True)
+        place = in_words(given.path, left)
+    else:
+        place = f"camera {views.names[0]}: x right, y down, z forward; --world places it elsewhere"
+    rig = change.rig(found.adjusted.rig)
     rows = {}
     for index, name in enumerate(rig.names):
         seen = np.isfinite(found.adjusted.residual_px[:, index])
@@ -91,7 +107,31 @@ def calibrate_points(
             found.adjusted.used[seen, index],
             found.views.number[seen],
         )
-    return rig, rows, place
+    return rig, rows, [f"the world is {place}", *_undetermined(rig, covariance)]
+
+
+def _numbered(found: PointRig) -> dict[int, np.ndarray]:
+    """Positions of the moving point, of the first end of a stick, by the number of the instant."""
+    first = found.views.point == 0
+    return dict(zip(found.views.number[first].tolist(), found.adjusted.points_m[first], strict=True))
+
+
+def _undetermined(rig: Rig, covariance_m2: np.ndarray) -> list[str]:
+    """A sentence on cameras whose places the sightings hardly determine."""
+    centres = np.asarray(rig.cameras.centre_world)
+    apart_m = np.linalg.norm(centres[:, None] - centres, axis=-1)
+    std_m = np.sqrt(np.trace(covariance_m2, axis1=1, axis2=2))
+    loose = [
+        f"{name} (± {std:.2g} m, {apart:.2g} m from the farthest camera)"
+        for name, std, apart in zip(rig.names, std_m, apart_m.max(axis=1), strict=True)
+        if std > _LOOSE * apart
+    ]
+    if not loose:
+        return []
+    return [
+        f"the sightings hardly determine the places of {', '.join(loose)}: move the point nearer to the cameras, "
+        "check the lenses, add a camera, or give points of known place with --pairs"
+    ]
 
 
 def calibrate_pairs(
@@ -102,7 +142,7 @@ def calibrate_pairs(
     lenses_path: Path | None,
     noise_px: float,
     world: Path | None,
-) -> tuple[Rig, dict[str, dict[str, Any]], str]:
+) -> tuple[Rig, dict[str, dict[str, Any]], list[str]]:
     """Rig from points or markers of known place, a row of each camera, and a sentence on the world."""
     from psotrack.calibration import find_markers_in, open_images, read_image_points
     from psotrack.inside_out import read_marker_map
@@ -126,7 +166,7 @@ def calibrate_pairs(
     lenses = known_lenses_of(tuple(marks), lenses_path)
     by_name = {name: lenses.cameras[index] for index, name in enumerate(lenses.names)}
     found, rows = locate_cameras(marks, by_name, noise_px)
-    return found, rows, f"that of {pairs or markers}"
+    return found, rows, [f"the world is that of {pairs or markers}"]
 
 
 def known_lenses_of(names: tuple[str, ...], path: Path | None) -> Rig:

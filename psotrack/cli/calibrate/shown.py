@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,10 +43,15 @@ def row_of(
 
 
 def show_cameras(
-    rows: dict[str, dict[str, Any]], out: Path, quiet: bool, json_path: Path | None, force: bool
+    rows: dict[str, dict[str, Any]],
+    out: Path,
+    quiet: bool,
+    json_path: Path | None,
+    force: bool,
+    sentences: Sequence[str] = (),
 ) -> None:
-    """Show the cameras, as JSON or as a table with the points that fit worst."""
-    output_json(json_path, {"rig": str(out), "cameras": rows}, force)
+    """Show the cameras, as JSON or as a table with the points that fit worst, and sentences on them."""
+    output_json(json_path, {"rig": str(out), "cameras": rows, "notes": list(sentences)}, force)
     adjusted = any("moved_m" in row for row in rows.values())
     # An adjusted camera's movement matters more than its position, and a line has no room for both.
     place = ("moved (mm)", "turned (deg)", "std (mm)", "verdict") if adjusted else (POSITION, "std (mm)")
@@ -66,6 +72,8 @@ def show_cameras(
     # Names of points may be too long for a column.
     for name, row in rows.items():
         print_line(quiet, json_path, f"{name}, worst points (px): {', '.join(map(_worst, row['worst']))}")
+    for sentence in sentences:
+        print_line(quiet, json_path, sentence)
     print_line(quiet, json_path, f"{out}")
 
 
