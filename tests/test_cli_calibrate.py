@@ -257,7 +257,7 @@ def test_intrinsics_of_a_board(tmp_path):
             H = K @ np.column_stack([R[:, 0], R[:, 1], shift]) @ to_board
             image = cv2.warpPerspective(sheet, H, (640, 480), flags=cv2.INTER_AREA, borderValue=200)
             writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-    size = ("--squares", "7x5", "--square", "0.04", "--marker", "0.03")
+    size = ("--squares", "7x5", "--square", "0.04", "--marker", "0.03", "--lens", "4")
     out = tmp_path / "lens.toml"
     output = run(
         "intrinsics", tmp_path / "board.avi", *size, "--name", "60881257", "--out", out, "--json", "-"

@@ -33,6 +33,7 @@ class CameraFigures:
     """Figures of one camera.
 
     Attributes:
+        lens: the lens model: a number of distortion coefficients, or fisheye.
         views: number of views that count.
         corners: number of corners that count.
         found: number of corners that were found.
@@ -48,6 +49,7 @@ class CameraFigures:
         shared: number of views shared with it.
     """
 
+    lens: str
     views: int
     corners: int
     found: int
@@ -76,6 +78,7 @@ def figures_of(calibrated: CalibratedRig) -> dict[str, CameraFigures]:
         K = np.asarray(rig.cameras.K[index])
         covariance = np.diag(calibrated.centre_covariance_m2[index])
         rows[name] = CameraFigures(
+            lens=str(calibrated.lens_models[index]),
             views=int(used.any(axis=-1).sum()),
             corners=int(used.sum()),
             found=int(found.sum()),

@@ -275,12 +275,13 @@ def _show(rows: dict[str, CameraFigures], quiet: bool, json_path: Path | None) -
     print_table(
         quiet,
         json_path,
-        ("camera", "views", "rms (px)", "f (px)", POSITION, "std (mm)"),
+        ("camera", "views", "rms (px)", "lens", "f (px)", POSITION, "std (mm)"),
         (
             (
                 name,
                 f"{row.views}",
                 f"{row.rms_px:.2f}",
+                row.lens,
                 f"{row.focal_px[0]:.1f}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{row.focal_std_px[0]:.1f}",
                 # Adding 0 makes -0 to 0.
                 format_numbers([round(value, 3) + 0.0 for value in row.centre_m], 3),
