@@ -239,6 +239,12 @@ def test_extrinsics_from_markers_on_the_walls(tmp_path):
     assert row["worst"][0]["point"].partition(".")[0] in {"3", "4", "5", "6", "20", "21", "22"}
     # A tenth of a pixel at 5 m is 0.5 mm, but corners in compressed video have larger errors. Measured 3 mm.
     assert np.linalg.norm(centres(read_rig(tmp_path / "rig.toml")) - centres(rig)) < 0.01
+    # The same by `calibrate rig`: a video for each camera instead of a sequence.
+    words = ("--markers", folder / "aruco_corners.csv", "--lenses", tmp_path / "rig.toml", "--noise", "0.3")
+    run("rig", folder / "cam1i_s.avi", *words, "--out", tmp_path / "again.toml")
+    again = read_rig(tmp_path / "again.toml")
+    assert again.names == ("cam1i_s",)
+    assert np.linalg.norm(centres(again) - centres(rig)) < 0.01
 
 
 def test_intrinsics_of_a_board(tmp_path):
