@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -23,7 +24,7 @@ import pytest
 
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
 from psotrack.geometry import look_at, make_camera, make_rig
-from psotrack.recordings import Recording, VideoWriter, probe, read_frames
+from psotrack.recordings import FrameTimes, Recording, VideoWriter, probe, read_frames
 from psotrack.silhouettes import Silhouettes, compute
 from psotrack.silhouettes import store as silhouette_store
 from psotrack.silhouettes.computation import SilhouetteSettings
@@ -296,6 +297,27 @@ def test_a_truncated_video_is_named_and_the_other_videos_are_kept(
     np.testing.assert_array_equal(
         _read_all(compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)), _expected(recording)
     )
+
+
+def test_a_truncated_video_of_half_the_rate_is_advised_in_instants(folder: Path, tmp_path: Path) -> None:
+    """`--frames` counts instants at the rate of the fastest camera, not frames of the truncated video."""
+    recording = _make_recording(folder)
+    slow = {"cam3": FrameTimes(NUM_FRAMES, fps=12.5)}
+    recording = replace(recording, frame_times=slow)
+    video = folder / "cam3.avi"
+    content = video.read_bytes()
+    video.write_bytes(content[: len(content) * 2 // 3])
+    with pytest.raises(InputError) as error_info:
+        compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=2)
+    message = str(error_info.value)
+    readable, advised = (
+        int(re.search(words, message)[1]) for words in (r"only (\d+) can", r"--frames (\d+) ")
+    )
+    # Frame i of the slow camera is nearest to instants 2i - 1 (or 2i - 1 and 2i) to 2i + 1.
+    assert 2 * readable - 1 <= advised <= 2 * readable
+    compute(recording.usable(num_frames=advised), SETTINGS, cache=tmp_path / "cache", jobs=1)
+    with pytest.raises(InputError, match="can be decoded"):
+        compute(recording.usable(num_frames=advised + 1), SETTINGS, cache=tmp_path / "cache", jobs=1)
 
 
 def test_missing_video(folder: Path, tmp_path: Path) -> None:

@@ -201,13 +201,15 @@ class _Tracker:
         )
         usual = float(np.median([track.dispersion for track in tracks])) if tracks else 1.0
         measured: dict[int, Measurement] = {}
-        known_rows: list[int] = []
+        # Detections in which lines of sight cross are of something that several cameras see.
+        crossing: list[int] = []
         # Expected drones first: an unexpected position may be a part of an expected drone.
         for row in np.argsort(crossed.expected < 0, kind="stable").tolist():
             number, seen, position_m = int(crossed.expected[row]), crossed.seen[row], crossed.position_m[row]
             num_viewpoints = len(set(self._viewpoint[seen].tolist()))
             if seen.sum() < max(self._settings.status.min_cameras, 2) or num_viewpoints < 2:
                 continue
+            crossing.append(row)
             if number >= 0:
                 slot = slots[number]
             elif (distance_m := np.linalg.norm(expected_m - position_m, axis=-1)).min(
@@ -227,8 +229,6 @@ class _Tracker:
                 spread_m2 = expected_m2[number] + crossed.covariance_m2[row]
                 surprising = bool(off_m @ np.linalg.solve(spread_m2, off_m) >= SURPRISING)
             if not surprising or num_viewpoints >= TRUSTED_VIEWPOINTS:
-                if number >= 0 or num_viewpoints >= TRUSTED_VIEWPOINTS:
-                    known_rows.append(row)
                 measured[slot] = Measurement(
                     position_m,
                     crossed.covariance_m2[row],
@@ -238,7 +238,7 @@ class _Tracker:
                     crossed.span_m[row],
                     surprising,
                 )
-        return measured, self._seen_by_one(view, crossed.detection[known_rows], slots, measured)
+        return measured, self._seen_by_one(view, crossed.detection[crossing], slots, measured)
 
     def _seen_by_one(
         self,

@@ -18,6 +18,7 @@ from .recording_file import (
 from .timestamps import read_timestamps
 from .timing import FrameTimes, Timeline, make_timeline
 from .video import (
+    TruncatedVideoError,
     VideoInfo,
     VideoWriter,
     check_end,
@@ -42,6 +43,7 @@ __all__ = [
     "RecordingFile",
     "ReferenceTable",
     "Timeline",
+    "TruncatedVideoError",
     "VideoInfo",
     "VideoWriter",
     "WorldTable",

@@ -143,12 +143,12 @@ def read_frames(video: VideoInfo, step: int = 1) -> Iterator[UInt8[np.ndarray, "
     try:
         for index in range(video.num_frames):
             if not capture.grab():
-                raise _ended_early(video, index)
+                raise TruncatedVideoError(video, index)
             if index % step:
                 continue
             decoded, frame = capture.retrieve()
             if not decoded:
-                raise _ended_early(video, index)
+                raise TruncatedVideoError(video, index)
             _check_size(video.path, video, frame, f" in frame {index}")
             yield frame
     finally:
@@ -314,7 +314,7 @@ def _copy_packets(video: VideoInfo, writer: cv2.VideoWriter) -> None:
         for index in range(video.num_frames):
             there, packet = capture.read()
             if not there:
-                raise _ended_early(video, index)
+                raise TruncatedVideoError(video, index)
             writer.set(cv2.VIDEOWRITER_PROP_KEY_FLAG, capture.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME))
             writer.write(packet)
     finally:
@@ -377,12 +377,27 @@ def silence_opencv() -> Iterator[None]:
                 del os.environ[_FFMPEG_LOG_LEVEL]
 
 
-def _ended_early(video: VideoInfo, index: int) -> InputError:
-    return InputError(
-        video.path,
-        expected=f"{video.num_frames} frames",
-        found=f"that only {index} can be decoded (frame {index} is missing or broken)",
-        remedy=f"copy it again; if only its end is missing, --frames {index} uses the other frames"
-        if index
-        else "copy it again",
-    )
+class TruncatedVideoError(InputError):
+    """A video has fewer frames that can be decoded than its header says.
+
+    Attributes:
+        video: the video.
+        num_readable: number of frames that can be decoded.
+        num_instants: number of instants of the recording in which these frames suffice.
+    """
+
+    def __init__(self, video: VideoInfo, num_readable: int, num_instants: int | None = None) -> None:
+        self.video, self.num_readable = video, num_readable
+        self.num_instants = num_readable if num_instants is None else num_instants
+        index = num_readable
+        super().__init__(
+            video.path,
+            expected=f"{video.num_frames} frames",
+            found=f"that only {index} can be decoded (frame {index} is missing or broken)",
+            remedy=f"copy it again; if only its end is missing, --frames {self.num_instants} uses the time before"
+            if self.num_instants
+            else "copy it again",
+        )
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return type(self), (self.video, self.num_readable, self.num_instants)

@@ -14,7 +14,7 @@ import zarr
 from jaxtyping import Int, UInt8
 
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.recordings import Recording, Timeline
+from psotrack.recordings import Recording, Timeline, TruncatedVideoError
 from psotrack.silhouettes.exposures import Exposures
 from psotrack.silhouettes.foreground import BackgroundModel
 from psotrack.silhouettes.settings import SilhouetteSettings, check_whole
@@ -210,7 +210,10 @@ def compute(
         Task(video, settings, cache, key, background, ignore)
         for video, key, ignore in zip(videos, keys, ignored, strict=True)
     ]
-    seconds = _make_missing(tasks, jobs, report)
+    try:
+        seconds = _make_missing(tasks, jobs, report)
+    except TruncatedVideoError as error:
+        raise _counted_in_instants(error, recording) from None
     heights, widths = zip(*(reduced_shape(video, settings.reduction) for video in videos), strict=True)
     return Silhouettes(
         cameras=cameras,
@@ -221,6 +224,15 @@ def compute(
         seconds=seconds,
         arrays=tuple(_open(task) for task in tasks),
     )
+
+
+def _counted_in_instants(error: TruncatedVideoError, recording: Recording) -> TruncatedVideoError:
+    """The same error with the number of instants before the missing frame: `--frames` counts instants."""
+    timeline = recording.timeline()
+    frame = timeline.frame[:, [recording.videos[name] == error.video for name in timeline.cameras]]
+    missing = (frame >= error.num_readable).any(axis=-1)
+    num_instants = int(missing.argmax()) if missing.any() else timeline.num_instants
+    return TruncatedVideoError(error.video, error.num_readable, num_instants)
 
 
 def _make_missing(tasks: list[Task], jobs: int, report: Report) -> dict[str, float]:
