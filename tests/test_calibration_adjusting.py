@@ -46,6 +46,7 @@ def misplace_cameras(indices, rng, *, turn_deg=0.0, shift_m=0.0):
     return Rig(RIG.names, replace(RIG.cameras, T_cam_world=T))
 
 
+@pytest.mark.slow
 def test_lasting_errors_are_in_the_covariance():
     """With lasting errors of 2 px and white noise of 1 px, the 90 % ellipsoids contain 9 of 10 camera centres."""
     rng, runs, distances = np.random.default_rng(1), 12, []

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pytest
 from helpers import move_world, ring_rig
 from scipy.spatial.transform import Rotation
 
@@ -16,6 +17,7 @@ from psotrack.geometry import Rig
 FOLDER = Path(__file__).parents[1] / "experiments" / "calibration"
 
 
+@pytest.mark.slow
 def test_cameras_placed_by_twelve_points(tmp_path: Path) -> None:
     words = [sys.executable, FOLDER / "extrinsics.py", "--draws", "20", "--out", tmp_path]
     done = subprocess.run([*map(str, words)], capture_output=True, text=True, check=False)

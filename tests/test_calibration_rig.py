@@ -89,6 +89,7 @@ def test_a_chessboard_that_looks_alike_when_turned(squares_wh):
     assert np.nanmedian(calibrated.residual_px) < 0.4
 
 
+@pytest.mark.slow
 def test_the_floor_is_the_board():
     views = Scene(RIG, errors=Errors(0.05), instants=10).views(np.random.default_rng(4))
     views = replace(views, number=views.number + 100)
@@ -146,6 +147,7 @@ def test_too_little_is_refused():
         LensModel(6)
 
 
+@pytest.mark.slow
 def test_advice_names_what_is_missing():
     views = Scene(RIG, instants=40).views(np.random.default_rng(9))
     pixels = views.corners_px.copy()

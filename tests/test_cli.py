@@ -112,6 +112,7 @@ def rewrite_video(path: Path, *, frames: int | None = None, size_wh: tuple[int, 
             writer.write(np.ascontiguousarray(image[:height, :width]))
 
 
+@pytest.mark.slow
 def test_the_contract_from_videos_to_errors(run: Run, sequence: Path, tmp_path: Path) -> None:
     tracks, errors_path = tmp_path / "tracks.csv", tmp_path / "out.json"
     assert run(*track(sequence, tracks, "--seed", 3)).code == 0
@@ -140,6 +141,7 @@ def test_the_contract_from_videos_to_errors(run: Run, sequence: Path, tmp_path: 
     assert errors["mean_error_m"] < 0.15
 
 
+@pytest.mark.slow
 def test_parquet_and_csv_have_the_same_content(run: Run, sequence: Path, tmp_path: Path) -> None:
     for suffix in ("csv", "parquet"):
         assert run(*track(sequence, tmp_path / f"{suffix}" / f"tracks.{suffix}")).code == 0
@@ -262,6 +264,7 @@ def test_projection_lines_from_the_sequence_a_folder_and_blobs(
     assert errors["mean_error_m"] < 0.05
 
 
+@pytest.mark.slow
 def test_a_drone_that_no_detection_shows_has_no_size_in_the_record(
     run: Run, sequence: Path, tmp_path: Path
 ) -> None:

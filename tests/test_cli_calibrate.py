@@ -247,6 +247,7 @@ def test_extrinsics_from_markers_on_the_walls(tmp_path):
     assert np.linalg.norm(centres(again) - centres(rig)) < 0.01
 
 
+@pytest.mark.slow
 def test_intrinsics_of_a_board(tmp_path):
     board, per_m = Board((7, 5), 0.04, 0.03), 3000.0
     K = np.array([[620.0, 0, 322.0], [0, 620.0, 236.0], [0, 0, 1]])

@@ -39,6 +39,7 @@ def test_a_sound_rig_is_left_alone(number):
 
 
 @pytest.mark.parametrize(("number", "fault"), [(5, "turned 1"), (4, "late 0.5"), (0, "millimetres")])
+@pytest.mark.slow
 def test_a_fault_is_named(number, fault):
     case, diagnosis = examine_case(number, fault)
     assert judge(case, diagnosis)["named first"], diagnosis.findings

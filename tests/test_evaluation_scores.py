@@ -120,6 +120,7 @@ class TestGospa:
 
     @given(seeds)
     @settings(max_examples=30)
+    @pytest.mark.slow
     def test_it_is_a_metric(self, seed):
         four, three = random_flights(seed, missing=0)
         two, _ = random_flights(seed + 1, missing=0, num_estimates=2)

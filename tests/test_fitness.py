@@ -373,6 +373,7 @@ def _gradients_at(images, cameras, places_m, size_m, offset_m):
 
 
 @pytest.mark.parametrize("images", [IMAGES, 0 * IMAGES, 0 * IMAGES + 255], ids=["drones", "nothing", "all"])
+@pytest.mark.slow
 def test_gradients_are_finite_everywhere(images):
     """Also where fitness is undefined: at a camera, behind a camera, at borders and outside all images."""
     centre = RIG.cameras.centre_world[:4].reshape(2, 2, 3)

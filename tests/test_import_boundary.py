@@ -19,7 +19,7 @@ import pytest
 from helpers import ring_rig
 
 import psotrack
-from psotrack.geometry import triangulate
+from psotrack.geometry import triangulate_linearly
 from psotrack.silhouettes import box_sum
 
 PACKAGE = Path(psotrack.__file__).parent
@@ -387,7 +387,7 @@ def test_annotations_are_enforced():
     """The hook that checks shapes is active: without it, wrong shapes give wrong results or errors deep in the code."""
     swapped_axes = np.zeros((7, 2, 3))  # (points, 2, cameras) instead of (points, cameras, 2).
     with pytest.raises(jaxtyping.TypeCheckError, match="points_px"):
-        triangulate(ring_rig(3).cameras, swapped_axes)
+        triangulate_linearly(ring_rig(3).cameras, swapped_axes)
     edges = [jnp.zeros((2, 3))] * 3
     with pytest.raises(jaxtyping.TypeCheckError, match="y1"):
         # The axes of the last edge are swapped.

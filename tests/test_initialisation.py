@@ -170,6 +170,7 @@ def three_drones(num_frames):
 
 @settings(max_examples=5)
 @given(st.permutations(range(5)))
+@pytest.mark.slow
 def test_the_order_of_the_cameras_does_not_matter(order):
     coverage = three_drones(10)[:3]
     start = find_in(coverage)
@@ -258,6 +259,7 @@ def test_two_drones_in_one_blob_of_three_cameras():
     np.testing.assert_allclose(start.size_m[found, :2], np.array(SIZES_M)[:2, :2], atol=2 * CELL_M)
 
 
+@pytest.mark.slow
 def test_a_given_number_of_drones_finds_a_hidden_drone():
     """One of two drones has only one separate blob; it is found if and only if the number of drones is given."""
     rig, rows = select_cameras("c0", "c1")
@@ -328,6 +330,7 @@ def test_only_the_largest_blobs_of_a_noisy_silhouette_are_used():
     assert not stacked.whole[0, 1].any()
 
 
+@pytest.mark.slow
 def test_the_height_of_a_low_drone_does_not_include_its_shadow():
     """Near the floor, a drone and its shadow are one blob; the same blob in the air is a tall drone."""
     size_m, disc_m = np.array([0.5, 0.5, 0.14]), np.array([0.5, 0.5, 0.02])

@@ -261,6 +261,7 @@ def test_small_markers_in_large_images_are_found(side_px):
     assert largest_error_px(found.corners_px[0], corners) < 0.25
 
 
+@pytest.mark.slow
 def test_corners_are_right_in_images_of_a_lens_with_distortion():
     lens = make_camera(
         R=np.eye(3),

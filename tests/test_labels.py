@@ -265,6 +265,7 @@ def refusal_message(error, *arguments):
     return str(error_info.value)
 
 
+@pytest.mark.slow
 def test_labels_are_the_boxes_of_the_masks(data):
     recording = read_sequence(data / "S01_D2_A")
     corners_m = box_corners(recording.truth, np.array(SIZE_M), np.zeros(3))

@@ -20,7 +20,7 @@ from psotrack.geometry import (
     project_with_jacobian,
     sizes_m,
     sizes_px,
-    triangulate,
+    triangulate_linearly,
     undistort,
     undistortion_stretch,
 )
@@ -161,9 +161,9 @@ def test_triangulation_leaves_out_a_camera_whose_lens_shows_no_point_there():
     point = np.array([0.2, 0.1, 4.0])
     pixels = project(rig.cameras, point[None])[0]
     pixels[1] = [1915.0, 1075.0]
-    np.testing.assert_allclose(triangulate(rig.cameras, pixels), point, atol=1e-9)
+    np.testing.assert_allclose(triangulate_linearly(rig.cameras, pixels), point, atol=1e-9)
     pixels[2] = [1915.0, 1075.0]
-    assert np.isnan(triangulate(rig.cameras, pixels)).all()
+    assert np.isnan(triangulate_linearly(rig.cameras, pixels)).all()
 
 
 @pytest.mark.parametrize("name", LENSES)

@@ -39,6 +39,7 @@ def random_positions(seed):
 
 @pytest.mark.parametrize("kind", ["PlainFitness", "TunedFitness"])
 @pytest.mark.parametrize("min_cameras", [2, 4])
+@pytest.mark.slow
 def test_the_numpy_fitness_is_the_tracker_s(peers, kind, min_cameras):
     drones_m, position_m = random_positions(0)
     images = draw_coverage(RIG, drones_m, SIZE_M, REDUCTION)

@@ -218,6 +218,7 @@ def test_a_neighbour_hardly_moves_the_best_position(apart_m, mean_m, without_m):
     assert shifts_m(size_m, apart_m, off_m, False).mean() > without_m
 
 
+@pytest.mark.slow
 def test_drones_that_almost_touch_keep_their_scores():
     """Drones half a width apart are unoccluded by half in at most one camera; small shares of many cameras suffice."""
     size_m = np.stack([flat_size(0.45)] * 2)

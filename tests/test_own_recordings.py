@@ -68,6 +68,7 @@ def run(*arguments):
     return result.output
 
 
+@pytest.mark.slow
 def test_detections_without_videos_are_tracked(folder, tmp_path):
     run("track", folder, "--method", "projection-lines", "--out", tmp_path / "tracks.csv", "--quiet")
     tracks = read_trajectories(tmp_path / "tracks.csv")

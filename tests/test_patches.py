@@ -144,6 +144,7 @@ SMALL_M = np.array([[0.4, 0.4, 0.25]]).repeat(2, axis=0)
 
 
 @pytest.mark.parametrize("where", ["in the room", "all about"])
+@pytest.mark.slow
 def test_scores_agree_with_those_from_whole_images(where):
     """Within reach of the expected position, a window of the finest level contains all pixels that the score reads."""
     rng = np.random.default_rng(1)

@@ -171,6 +171,7 @@ def test_without_detections_there_are_no_drones():
     assert len(state_at_first_frame(tracked).position_m) == 0
 
 
+@pytest.mark.slow
 def test_chance_crossings_are_no_drones():
     """Three false alarms in every image and no drone: lines that meet once do not meet in five of eight frames."""
     tracked = track(np.empty((40, 0, 3)), false_alarms=3.0)

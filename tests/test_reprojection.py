@@ -13,7 +13,15 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
 from psotrack.errors import SettingsError
-from psotrack.geometry import look_at, make_camera, project, reconstruct, triangulate, undistort
+from psotrack.geometry import (
+    look_at,
+    make_camera,
+    project,
+    reconstruct,
+    triangulate,
+    triangulate_linearly,
+    undistort,
+)
 from psotrack.geometry.image_fit import project_with_jacobian
 
 
@@ -121,7 +129,7 @@ def test_without_refinement_it_equals_triangulate():
     weights = np.random.default_rng(1).uniform(0.1, 2.0, (3, 4, 5))
     found = reconstruct(rig.cameras, pixels, weights, refine=False, robust=False)
     np.testing.assert_allclose(
-        found.position_m, triangulate(rig.cameras, pixels, weights), rtol=0, atol=1e-12
+        found.position_m, triangulate_linearly(rig.cameras, pixels, weights), rtol=0, atol=1e-12
     )
 
 
@@ -218,6 +226,38 @@ def test_the_covariance_agrees_with_simulated_noise(num_cameras):
     assert low <= (squared < chi2.ppf(0.9, 3)).sum() <= high
     # Four standard errors of sqrt(6 / draws) = 0.04, and 0.02 for the nonlinearity of the projection over 3 px.
     assert abs(squared.mean() - 3) < 0.18
+
+
+@pytest.mark.parametrize("noise_px", [0.2, 2.0, 8.0])
+def test_the_noise_is_learned_where_some_views_are_wrong(noise_px):
+    """Positions and covariances are those of the known noise; one wrong view in ten is left out."""
+    rig, points = ring_rig(6, image_size_wh=(1920, 1080)), points_in_room(150)
+    pixels = noisy_pixels(rig, points, noise_px=noise_px)
+    rng = np.random.default_rng(4)
+    wrong = rng.random(pixels.shape[:2]) < 0.1
+    pixels[wrong] += 300 * rng.normal(size=(wrong.sum(), 2))
+    learned, known = reconstruct(rig.cameras, pixels), reconstruct(rig.cameras, pixels, noise_px=noise_px)
+    # The standard error of the noise from 800 views is 3 %; a covariance is in proportion to the noise squared.
+    ratio = np.median(learned.covariance_m2 / known.covariance_m2)
+    assert 0.8 < ratio < 1.25
+    assert (learned.used == known.used).mean() > 0.99
+    assert (learned.used & wrong).sum() < 0.05 * wrong.sum()
+    np.testing.assert_array_equal(triangulate(rig.cameras, pixels), learned.position_m)
+    linear_m = triangulate_linearly(rig.cameras, pixels)
+    error_m = [
+        np.median(np.linalg.norm(found_m - points, axis=-1)) for found_m in (learned.position_m, linear_m)
+    ]
+    # About half of the points have a wrong view.
+    assert error_m[0] < 0.7 * error_m[1]
+
+
+def test_few_views_do_not_show_the_noise():
+    rig, points = ring_rig(4), points_in_room(4)
+    pixels = noisy_pixels(rig, points, noise_px=5.0)
+    np.testing.assert_array_equal(
+        reconstruct(rig.cameras, pixels).covariance_m2,
+        reconstruct(rig.cameras, pixels, noise_px=1.0).covariance_m2,
+    )
 
 
 @pytest.mark.parametrize("num_cameras", [3, 4, 8])

@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 from psotrack.errors import InputError
-from psotrack.geometry import project, triangulate, undistort
+from psotrack.geometry import project, triangulate_linearly, undistort
 from psotrack.rig_files import read_lenses, read_rig, write_rig
 
 
@@ -40,7 +40,7 @@ def test_caliscopes_points_are_where_its_cameras_saw_them(tmp_path, name):
     seen = np.stack([table["img_loc_x"].to_numpy(), table["img_loc_y"].to_numpy()], axis=-1)
     seen = seen[np.isfinite(seen[..., 0]).sum(axis=1) >= 3]
     assert len(seen) > 30
-    position_m = triangulate(rig.cameras, seen)
+    position_m = triangulate_linearly(rig.cameras, seen)
     residual_px = np.linalg.norm(project(rig.cameras, position_m[:, None])[0] - seen, axis=-1)
     # The authors' own medians are 0.35 to 0.65 px; a wrong convention gives hundreds of pixels.
     assert (np.nanmedian(residual_px, axis=0) < 1.0).all()
@@ -67,7 +67,7 @@ def test_aniposes_cameras_see_the_board_in_one_place():
         corners[np.asarray(ids).ravel(), index] = np.asarray(pixels).reshape(-1, 2)
     shared = np.isfinite(corners).all(axis=(1, 2))
     assert shared.sum() > 10
-    found = triangulate(rig.cameras, corners[shared])
+    found = triangulate_linearly(rig.cameras, corners[shared])
     residual_px = np.linalg.norm(project(rig.cameras, found[:, None])[0] - corners[shared], axis=-1)
     assert np.sqrt(np.mean(residual_px**2)) < 1.0
     # Neighbours on the board are one square apart.

@@ -184,6 +184,7 @@ def test_a_shadow_on_the_floor_does_not_move_the_place(lamps, height_m, size_m):
 
 
 @pytest.mark.parametrize("height_m", [0.1, 0.15, 0.2, 0.3])
+@pytest.mark.slow
 def test_without_a_shadow_the_place_does_not_move(height_m, size_m):
     """At 0.1 m no camera sees the floor right below the drone, and the shift is 6 mm (measured).
 

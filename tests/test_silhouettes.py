@@ -509,6 +509,7 @@ def test_ctrl_c_leaves_nothing(folder: Path, tmp_path: Path) -> None:
     assert _unfinished_folders(tmp_path / "cache") == []
 
 
+@pytest.mark.slow
 def test_two_computations_at_once_do_not_disturb_each_other(
     folder: Path, tmp_path: Path, decoded_videos: list[str]
 ) -> None:

@@ -253,6 +253,7 @@ def test_segments_change_only_the_encoded_videos(pair_folder, tmp_path):
 
 
 @pytest.mark.usefixtures("short_segments")
+@pytest.mark.slow
 def test_the_number_of_jobs_changes_no_byte(pair_folder, tmp_path):
     assert read_contents(simulate(PAIR, tmp_path, TINY, jobs=2)) == read_contents(pair_folder)
 

@@ -69,6 +69,7 @@ def test_the_expected_position_hardly_changes_the_measured_size():
     np.testing.assert_allclose(beside, there, rtol=0.025)
 
 
+@pytest.mark.slow
 def test_close_above_the_floor_nothing_is_learned():
     """Foreground close to the floor may be a drone together with its shadow. The drone is 0.5 m wide."""
     positions = float32(PLACES_M[:, None])

@@ -95,6 +95,7 @@ class TestSmoothing:
             value = nees(result.position_m[frame] - flown.state[frame, :, :3], result.covariance_m2[frame])
             assert low < value.mean() < high, frame
 
+    @pytest.mark.slow
     def test_lasting_errors_that_are_treated_as_white_make_the_smoother_overconfident(self):
         """Its positions are not better either."""
         flown = simulate_flight(5, frames=60, drones=300, density=1.0, error_share=0.5, steady=True)

@@ -67,6 +67,8 @@ def test_rows_have_todays_names(tmp_path: Path) -> None:
             "settings.swarm.particles": 50,
             "settings.swarm.kind": "joint",
             "settings.swarm.search": "pso",
+            "settings.status.min_cameras_to_begin": None,
+            "settings.rate_hz": None,
             "settings.clocks": "given",
             "settings.errors.rig_deg": 0.0,
             "settings.errors.pixel_px": 0.0,
@@ -81,7 +83,9 @@ def test_rows_have_todays_names(tmp_path: Path) -> None:
     add(store, KEY, today)
     rows = store.rows()
     assert set(rows.columns) == {*today.columns, "seed", "cell"}
-    assert not rows.isna().any(axis=None)
+    of_no_value = ["settings.status.min_cameras_to_begin", "settings.rate_hz"]
+    assert rows[of_no_value].isna().all(axis=None)
+    assert not rows.drop(columns=of_no_value).isna().any(axis=None)
     shown = pivot(rows, rows_by=["particles"], columns_by=[], value="mean_error_m")
     assert shown.index.tolist() == [20, 50]
     assert shown["mean"].tolist() == pytest.approx([0.3, 0.2])

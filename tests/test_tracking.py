@@ -254,6 +254,7 @@ def test_frames_of_a_recording_that_is_no_multiple_of_a_chunk(silhouettes, track
     np.testing.assert_array_equal(trajectories.position_m[:25], tracked_from_first[1].position_m[:25, :1])
 
 
+@pytest.mark.slow
 def test_detections_add_drones_that_silhouettes_do_not_show(silhouettes, tmp_path):
     """At frame 0 the silhouettes show the first drone alone, and the detections show both drones."""
     source = StartSource("auto", tmp_path)

@@ -13,8 +13,8 @@ from psotrack.geometry import (
     Rig,
     match_views,
     project,
-    triangulate,
     triangulate_candidates,
+    triangulate_linearly,
     triangulate_paths,
     viewpoints,
 )
@@ -32,7 +32,7 @@ def project_points(rig, points):
 @pytest.mark.parametrize(("num_cameras", "shape"), [(2, (7,)), (3, (5, 2)), (5, ()), (7, (3,))])
 def test_exact_pixels_give_the_point(num_cameras, shape, coefficients):
     rig, points = ring_rig(num_cameras, coefficients=coefficients), points_in_room(*shape)
-    found = triangulate(rig.cameras, project_points(rig, points))
+    found = triangulate_linearly(rig.cameras, project_points(rig, points))
     assert found.shape == points.shape
     # Pixels are undistorted to 1e-8 (see test_cameras), which is 4e-8 m at 4 m; two cameras enlarge the error a little.
     np.testing.assert_allclose(found, points, atol=1e-6)
@@ -47,11 +47,11 @@ def test_two_cameras_agree_with_opencv():
     expected = (homogeneous[:3] / homogeneous[3]).T
     # Both solve the same four equations, OpenCV with a norm of one on (X, 1), in pixels: with noise of 0.3 px, a point
     # is off by 5 mm, and the two differ where the rays miss each other: measured 0.2 mm, limit 1 mm.
-    np.testing.assert_allclose(triangulate(rig.cameras, pixels), expected, atol=1e-3)
+    np.testing.assert_allclose(triangulate_linearly(rig.cameras, pixels), expected, atol=1e-3)
     exact = project_points(rig, points)
     homogeneous = cv2.triangulatePoints(*projections, exact[:, 0].T.copy(), exact[:, 1].T.copy())
     np.testing.assert_allclose(
-        triangulate(rig.cameras, exact), (homogeneous[:3] / homogeneous[3]).T, atol=1e-6
+        triangulate_linearly(rig.cameras, exact), (homogeneous[:3] / homogeneous[3]).T, atol=1e-6
     )
 
 
@@ -61,7 +61,7 @@ def test_weighted_least_squares():
     rng = np.random.default_rng(2)
     pixels = project_points(rig, points) + rng.normal(0, 1.0, (11, 5, 2))
     weights = rng.uniform(0.1, 2, (11, 5))
-    found = triangulate(rig.cameras, pixels, weights)
+    found = triangulate_linearly(rig.cameras, pixels, weights)
     for n in range(11):
         rows, right = [], []
         for c in range(5):
@@ -92,7 +92,9 @@ def test_the_pseudoinverse_of_the_paper():
         B = [P[c, i, 3] - pixels[n, c, i] * P[c, 2, 3] for c in range(5) for i in range(2)]
         # As above: two ways of solving one system of condition 10.
         np.testing.assert_allclose(
-            triangulate(rig.cameras, pixels)[n], np.linalg.pinv(np.array(L)) @ np.array(B), atol=1e-10
+            triangulate_linearly(rig.cameras, pixels)[n],
+            np.linalg.pinv(np.array(L)) @ np.array(B),
+            atol=1e-10,
         )
 
 
@@ -103,10 +105,10 @@ def test_a_camera_that_does_not_see_the_point_does_not_count():
     gone[:, 1] = np.nan
     gone[:, 3, 0] = np.nan
     without = rig.select(["c0", "c2", "c4"])
-    expected = triangulate(without.cameras, pixels[:, [0, 2, 4]])
-    np.testing.assert_allclose(triangulate(rig.cameras, gone), expected, atol=1e-12)
+    expected = triangulate_linearly(without.cameras, pixels[:, [0, 2, 4]])
+    np.testing.assert_allclose(triangulate_linearly(rig.cameras, gone), expected, atol=1e-12)
     weights = np.array([1.0, 0.0, 1.0, 0.0, 1.0]) * np.ones((7, 1))
-    np.testing.assert_allclose(triangulate(rig.cameras, pixels, weights), expected, atol=1e-12)
+    np.testing.assert_allclose(triangulate_linearly(rig.cameras, pixels, weights), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("num_seeing", [0, 1])
@@ -114,7 +116,7 @@ def test_too_few_cameras_is_nan(num_seeing):
     rig, points = ring_rig(5), points_in_room(3)
     pixels = project_points(rig, points)
     pixels[1, num_seeing:] = np.nan
-    found = triangulate(rig.cameras, pixels)
+    found = triangulate_linearly(rig.cameras, pixels)
     assert np.isnan(found[1]).all()
     np.testing.assert_allclose(found[[0, 2]], points[[0, 2]], atol=1e-6)
 
@@ -124,10 +126,10 @@ def test_rays_from_one_position_are_nan():
     one = ring_rig(3).cameras[0]
     rig = make_unnamed_rig(one, one)
     pixels = project_points(rig, points_in_room(3))
-    assert np.isnan(triangulate(rig.cameras, pixels)).all()
+    assert np.isnan(triangulate_linearly(rig.cameras, pixels)).all()
     rig = ring_rig(3)
     weights = np.array([[0.0, 1.0, 0.0]] * 3)
-    assert np.isnan(triangulate(rig.cameras, project_points(rig, points_in_room(3)), weights)).all()
+    assert np.isnan(triangulate_linearly(rig.cameras, project_points(rig, points_in_room(3)), weights)).all()
 
 
 TIME_S = np.arange(7) / 25
@@ -186,7 +188,7 @@ def test_frames_with_one_camera_each_make_a_path():
     rig, paths = ring_rig(3), random_paths(3)[:, :2]
     pixels = project_points(rig, positions_on_paths(paths))
     pixels[:, ::2, 0] = pixels[:, 1::2, 1] = pixels[:, :, 2] = np.nan
-    assert np.isnan(triangulate(rig.cameras, pixels)).all()
+    assert np.isnan(triangulate_linearly(rig.cameras, pixels)).all()
     found = triangulate_paths(rig.cameras, pixels, TIME_S, noise_m=1e-6, expected=(3.0,))
     np.testing.assert_allclose(found, paths, atol=1e-4)
 
@@ -317,7 +319,7 @@ def test_a_point_that_two_drones_share_does_not_hide_them():
     for drone in drones:
         # At 0.9 of its radius a 2D point has 4 % of the weight: the error is 3 cm. With equal weights it would be 9 cm.
         assert np.linalg.norm(found - drone, axis=-1).min() < 0.05
-    equal = triangulate(
+    equal = triangulate_linearly(
         rig.cameras, np.stack([np.stack([points[0][0], p[k], q[k]]) for p, q in [points[1:]] for k in (0, 1)])
     )
     assert (np.linalg.norm(equal - drones, axis=-1) > 0.05).all()

@@ -84,6 +84,7 @@ def test_the_vertex_stays_within_the_grid():
     assert (moved <= SPAN * SIZE_M * (1 + 1e-5)).all()
 
 
+@pytest.mark.slow
 def test_two_views_from_one_side_are_uncertain_along_their_rays():
     truth = np.array([[0.0, 0.0, 1.2]])
     rig = ring_rig(36, image_size_wh=(960, 720))
@@ -97,6 +98,7 @@ def test_two_views_from_one_side_are_uncertain_along_their_rays():
     assert np.linalg.eigvalsh(inverse)[-1] > 3 * np.linalg.eigvalsh(np.asarray(wide, float))[-1]
 
 
+@pytest.mark.slow
 def test_the_dispersion_of_a_single_camera_is_infinite():
     truth = np.array([[0.0, 0.0, 1.2]])
     alone = RIG.select(RIG.names[:1])

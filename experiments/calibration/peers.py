@@ -34,7 +34,7 @@ from psotrack.calibration import (
     instants_of_numbers,
     open_images,
 )
-from psotrack.geometry import Rig, make_camera, make_rig, triangulate
+from psotrack.geometry import Rig, make_camera, make_rig, triangulate_linearly
 from psotrack.rig_files import read_rig
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -240,7 +240,7 @@ def errors_of(rig, board, views):
         common += distances(rig, board, views, instant, there, there)
         for camera in there:
             others += distances(rig, board, views, instant, there[there != camera], [camera])
-    points_m = triangulate(rig.cameras, views.corners_px.reshape(len(rig), -1, 2).swapaxes(0, 1))
+    points_m = triangulate_linearly(rig.cameras, views.corners_px.reshape(len(rig), -1, 2).swapaxes(0, 1))
     points_m = points_m.reshape(len(views.number), -1, 3)
     gaps = np.linalg.norm(board.corners_m[:, None] - board.corners_m, axis=-1)
     first, second = np.nonzero(np.triu(np.isclose(gaps, board.square_m), 1))

@@ -20,7 +20,7 @@ from psotrack.calibration.derivatives import centre_by_pose
 from psotrack.calibration.gauge import common_motions, pose_change_metric
 from psotrack.calibration.residuals import GATE, inflation, spread_px
 from psotrack.errors import InputError, SettingsError, check_positive
-from psotrack.geometry import NEAR_M, Camera, Rig, to_camera, triangulate
+from psotrack.geometry import NEAR_M, Camera, Rig, to_camera, triangulate_linearly
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def adjust(
     if placed.any():
         check_positive("noise_px", float(noise_px[placed].min()))
     placed &= (placed.sum(axis=1) >= 2)[:, None]
-    start_m = triangulate(rig.cameras, np.where(placed[..., None], points_px, np.nan))
+    start_m = triangulate_linearly(rig.cameras, np.where(placed[..., None], points_px, np.nan))
     placed &= (np.isfinite(start_m).all(axis=-1) & _is_in_front(rig.cameras, start_m))[:, None]
     _check_seen(rig, placed, fixed, rescaled)
     rows = np.flatnonzero(placed.any(axis=1))

@@ -28,7 +28,7 @@ from psotrack.geometry import (
     has_image,
     project_with_jacobian,
     to_camera,
-    triangulate,
+    triangulate_linearly,
 )
 
 #: Number of rounds without a step until the weights have settled, and largest number of steps.
@@ -186,7 +186,7 @@ def _linearise(
     round, for the triangulation.
     """
     cameras, seen_px = problem.cameras, _interpolate_at_common_times(problem.points_px, offset_frames)
-    point_m = triangulate(cameras, seen_px, np.maximum(weights, 1e-9))
+    point_m = triangulate_linearly(cameras, seen_px, np.maximum(weights, 1e-9))
     places_m = np.nan_to_num(point_m)[:, :, None]
     pixels, _, J = project_with_jacobian(cameras, places_m)
     e = seen_px - pixels

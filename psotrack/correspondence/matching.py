@@ -12,7 +12,7 @@ from psotrack.correspondence.groups import SHARED_COST, UNEXPLAINED_COST, Groups
 from psotrack.correspondence.padded_sightings import BY_PLACE, PaddedSightings, make_priors, pad_sightings
 from psotrack.correspondence.proposals import propose_groups
 from psotrack.errors import SettingsError
-from psotrack.geometry import Camera, Rig, triangulate
+from psotrack.geometry import Camera, Rig, triangulate_linearly
 
 #: Drones are searched up to this many times the distance between the outermost cameras, metres at least.
 REACH, LEAST_REACH_M = 20.0, 20.0
@@ -23,7 +23,7 @@ class Matches:
     """Drones in one frame, and the detections of each drone.
 
     Attributes:
-        position_m: (drones, 3), positions in the world, computed by `triangulate`, metres.
+        position_m: (drones, 3), positions in the world, computed by `triangulate_linearly`, metres.
         detection: (drones, cameras), index of the drone's detection in each camera; -1 for no detection. Two drones
             that overlap in an image may share a detection.
         cost: (drones,), mean squared distance of the drone's detections from its projections, in squared standard
@@ -91,7 +91,7 @@ def _matches(padded: PaddedSightings, groups: Groups, proposed: Groups) -> Match
     views = np.arange(len(padded.x)), groups.detection
     x = np.where(groups.seen[..., None], padded.x[views], np.nan)
     weights = 1 / (padded.variance[views] * padded.depth(groups.point) ** 2)
-    position = triangulate(padded.straight, x, weights)
+    position = triangulate_linearly(padded.straight, x, weights)
     squared = np.where(groups.seen, UNEXPLAINED_COST - SHARED_COST * groups.shared - groups.gain, 0.0)
     # Two rays may be parallel: then the group has no position.
     there = np.isfinite(position).all(axis=-1)

@@ -21,7 +21,7 @@ from psotrack.doctor.common_points import BLOCK_FRAMES, CommonPoints
 from psotrack.doctor.evidence import gather, prior_of, sum_up, weigh
 from psotrack.doctor.hypotheses import PER_CAMERA, Corrected, Hypothesis
 from psotrack.errors import InputError
-from psotrack.geometry import Rig, project, triangulate
+from psotrack.geometry import Rig, project, triangulate_linearly
 
 #: Smallest evidence by which a moved camera must explain the sightings better: logarithm of a likelihood ratio.
 CERTAIN = 5.5
@@ -156,7 +156,7 @@ def _certain_faults(
 def _common_points(rig: Rig, views: DroneViews) -> CommonPoints:
     """The views as points in pieces of paths: a body's points in some neighbouring rows."""
     seen = np.isfinite(views.points_px).all(axis=-1)
-    position_m = triangulate(rig.cameras, views.points_px)
+    position_m = triangulate_linearly(rig.cameras, views.points_px)
     kept = np.flatnonzero((seen.sum(axis=1) >= 2) & np.isfinite(position_m).all(axis=-1))
     _, row = np.unique(views.frame[kept], return_inverse=True)
     block = row // BLOCK_FRAMES
@@ -206,7 +206,7 @@ def _distances(
     rig: Rig, points_px: Float[np.ndarray, "points cameras 2"], noise_px: Float[np.ndarray, "points cameras"]
 ) -> tuple[Float[np.ndarray, "seen"], Float[np.ndarray, "seen"]]:
     """Distances of sightings from the projections of their points, pixels, and the sightings' noise."""
-    position_m = triangulate(rig.cameras, points_px, 1 / np.nan_to_num(noise_px, nan=1.0) ** 2)
+    position_m = triangulate_linearly(rig.cameras, points_px, 1 / np.nan_to_num(noise_px, nan=1.0) ** 2)
     off_px = np.linalg.norm(points_px - project(rig.cameras, position_m[:, None])[0], axis=-1)
     # Two rays nearly always meet.
     seen: Bool[np.ndarray, "points cameras"] = np.isfinite(off_px)

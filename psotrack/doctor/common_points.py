@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment
 
 from psotrack.correspondence import BORDER_PX, Sightings, match
 from psotrack.doctor.agreement import MIN_VIEWPOINTS, num_viewpoints
-from psotrack.geometry import Rig, to_camera, triangulate
+from psotrack.geometry import Rig, to_camera, triangulate_linearly
 
 #: Standard deviation of the direction of a camera's rays that a fault may cause, degrees.
 LOOSE_DEG = 0.7
@@ -105,7 +105,7 @@ def find_common_points(
     none = np.empty((0, len(rig), 2))
     frame_of = np.concatenate([np.empty(0, int), *numbers])
     centre_px, size_px = np.concatenate([none, *centres]), np.concatenate([none, *sizes])
-    position_m = triangulate(rig.cameras, centre_px)
+    position_m = triangulate_linearly(rig.cameras, centre_px)
     known = np.isfinite(position_m).all(axis=-1)
     frame_of, centre_px, size_px, position_m = (
         values[known] for values in (frame_of, centre_px, size_px, position_m)

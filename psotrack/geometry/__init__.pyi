@@ -17,14 +17,14 @@ from .cameras import (
 )
 from .image_scale import sizes_m, sizes_px, undistortion_stretch
 from .lenses import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS, undistort_approximately
-from .reprojection import project_with_jacobian, reconstruct, to_pixels_with_jacobian
+from .reprojection import project_with_jacobian, reconstruct, to_pixels_with_jacobian, triangulate
 from .rotations import cross_matrices, rotation_matrices
 from .triangulation import (
     MAX_CONDITION,
     match_views,
     projection_equations,
-    triangulate,
     triangulate_candidates,
+    triangulate_linearly,
     triangulate_paths,
     viewpoints,
 )
@@ -66,6 +66,7 @@ __all__ = [
     "to_pixels_with_jacobian",
     "triangulate",
     "triangulate_candidates",
+    "triangulate_linearly",
     "triangulate_paths",
     "undistort",
     "undistort_approximately",

@@ -22,10 +22,20 @@ from psotrack.geometry.image_fit import (
 )
 from psotrack.geometry.triangulation import projection_equations, solve_normal_equations, viewpoints
 
-__all__ = ["Triangulated", "project_with_jacobian", "reconstruct", "to_pixels_with_jacobian"]
+__all__ = ["Triangulated", "project_with_jacobian", "reconstruct", "to_pixels_with_jacobian", "triangulate"]
 
 #: Largest number of refinement steps. From a linear start two steps suffice; nearly parallel rays need more.
 _MAX_STEPS = 10
+#: Number of rounds in which the noise and the views that disagree with it are found in turn.
+_NOISE_ROUNDS = 10
+#: Relative change of the noise below which it is found.
+_NOISE_TOLERANCE = 0.03
+#: Least number of views that show the noise: the standard error of their median is a sixth of the noise.
+_LEAST_VIEWS = 20
+#: Noise that is taken if too few views show it, and the least noise that is learned, pixels.
+_USUAL_NOISE_PX, _LEAST_NOISE_PX = 1.0, 1e-3
+#: Median of χ² with two degrees of freedom.
+_MEDIAN_DISAGREEMENT = 2 * np.log(2)
 
 
 @dataclass(frozen=True)
@@ -46,12 +56,38 @@ class Triangulated:
     used: Bool[np.ndarray, "*points cameras"]
 
 
+def triangulate(
+    cameras: Camera,
+    points_px: Float[np.ndarray, "*points cameras 2"],
+    weights: Float[np.ndarray, "*points cameras"] | None = None,
+    *,
+    noise_px: float | Float[np.ndarray, "..."] | None = None,
+) -> Float[np.ndarray, "*points 3"]:
+    """World points of least reprojection error from pixels, without views that disagree; `reconstruct` says more.
+
+    Args:
+        cameras: cameras with one leading axis, such as `rig.cameras`.
+        points_px: (..., cameras, 2), pixels; NaN if a camera does not see the point.
+        weights: (..., cameras), weights of the views; None: 1.
+        noise_px: standard deviation of a pixel along either axis, pixels; None learns one number from the residuals of
+            all points.
+
+    Returns:
+        (..., 3), positions in the world, metres; NaN if fewer than two cameras see the point, all rays are parallel, or
+        the rays meet behind a camera.
+
+    Raises:
+        SettingsError: the noise of a used view is not above 0.
+    """
+    return reconstruct(cameras, points_px, weights, noise_px=noise_px).position_m
+
+
 def reconstruct(
     cameras: Camera,
     points_px: Float[np.ndarray, "*points cameras 2"],
     weights: Float[np.ndarray, "*points cameras"] | None = None,
     *,
-    noise_px: float | Float[np.ndarray, "..."] = 1.0,
+    noise_px: float | Float[np.ndarray, "..."] | None = None,
     robust: bool = True,
     refine: bool = True,
     false_alarm: float = 1e-3,
@@ -70,7 +106,9 @@ def reconstruct(
         weights: (..., cameras), weights of the views: the variance of a view is noise_px² / weight, and a view of
             weight 0 is not used. None: 1.
         noise_px: standard deviation of a pixel along either axis, pixels; one number, or broadcast to (..., cameras).
-            For detectors it is in proportion to the size of the box, or to 1 / depth.
+            For detectors it is in proportion to the size of the box, or to 1 / depth. None learns one number for all
+            views of weight 1 from the residuals of points that three cameras see; 1 pixel
+            if these are too few.
         robust: leave out views that disagree.
         refine: minimise the reprojection error; if not, the position solves the linear equations with these weights.
         false_alarm: largest probability that a view of a point is left out although all views are correct.
@@ -84,11 +122,13 @@ def reconstruct(
     if not 0 < false_alarm < 1:
         raise SettingsError("false_alarm", expected="a probability", found=f"{false_alarm:g}")
     rows, right, seen = projection_equations(cameras, points_px)
-    scale = _inverse_deviation(seen, weights, noise_px)
+    scale = _inverse_deviation(seen, weights, _USUAL_NOISE_PX if noise_px is None else noise_px)
     # From here on the points have one axis, and points with fewer than two views are absent.
     known = np.asarray((scale > 0).sum(axis=-1) >= 2)
     lines, scale = _Lines(points_px[known], rows[known], right[known]), scale[known]
     start_m = lines.solve(scale)
+    if noise_px is None:
+        scale = scale / _learn_noise(cameras, lines, scale, start_m, false_alarm if robust else None)
     if robust:
         scale, refined_m = _without_outliers(cameras, lines, scale, start_m, false_alarm)
         start_m = refined_m if refine else lines.solve(scale)
@@ -131,6 +171,44 @@ class _Lines:
         right = (self.right * scale[..., None]).reshape(shape)
         turned = rows.swapaxes(-1, -2)
         return solve_normal_equations(turned @ rows, np.matvec(turned, right))
+
+
+def _learn_noise(
+    cameras: Camera,
+    lines: _Lines,
+    scale: Float[np.ndarray, "points cameras"],
+    start_m: Float[np.ndarray, "points 3"],
+    false_alarm: float | None,
+) -> float:
+    """The pixels' noise in standard deviations of `scale`, from the median disagreement of views that agree.
+
+    The disagreement of a view is χ² with two degrees of freedom times the squared noise. Noise and views that disagree
+    are found in turn. The search begins with little noise: with much noise, wrong views would agree and hide.
+
+    Args:
+        cameras, lines, scale, start_m: as in `_without_outliers`.
+        false_alarm: largest probability that a view of a point is left out although all views are correct; None leaves
+            no view out.
+    """
+    shows = (scale > 0).sum(axis=-1) >= 3
+    lines, scale, start_m = lines.at(np.flatnonzero(shows)), scale[shows], start_m[shows]
+    noise = 1.0
+    for _ in range(_NOISE_ROUNDS):
+        used, position_m = scale, start_m
+        if false_alarm is not None:
+            kept, position_m = _without_outliers(cameras, lines, scale / noise, start_m, false_alarm)
+            used = np.where(kept > 0, scale, 0.0)
+        fit = fit_in_image(cameras, lines.points_px, used, position_m, _MAX_STEPS)
+        found = (used > 0) & (np.isfinite(fit.cost) & ((used > 0).sum(axis=-1) >= 3))[:, None]
+        if found.sum() < _LEAST_VIEWS:
+            return noise
+        before = noise
+        noise = max(
+            float(np.sqrt(np.median(fit.disagreement[found]) / _MEDIAN_DISAGREEMENT)), _LEAST_NOISE_PX
+        )
+        if abs(noise / before - 1) < _NOISE_TOLERANCE:
+            break
+    return noise
 
 
 def _inverse_deviation(

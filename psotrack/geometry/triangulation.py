@@ -20,12 +20,14 @@ MAX_CONDITION = 1e12
 SAME_M = 0.01
 
 
-def triangulate(
+def triangulate_linearly(
     cameras: Camera,
     points_px: Float[np.ndarray, "*points cameras 2"],
     weights: Float[np.ndarray, "*points cameras"] | None = None,
 ) -> Float[np.ndarray, "*points 3"]:
     """World points from pixels, by the normal equations of (3)-(6) in normalised image coordinates.
+
+    One wrong view spoils a point: `triangulate` leaves wrong views out.
 
     Args:
         cameras: cameras with one leading axis.
@@ -51,9 +53,9 @@ def triangulate_paths(
 ) -> Float[np.ndarray, "*paths terms 3"]:
     """Polynomial paths of moving points, X(t) = Σ c_k t^k, from the pixels of all frames together.
 
-    The equations are those of `triangulate` with X(t) in place of X, and one prior for each coefficient except c_0: c_k
-    is normal with mean 0 and a standard deviation from `expected`. Frames in which only one camera sees the point
-    therefore count too, and short paths are straight.
+    The equations are those of `triangulate_linearly` with X(t) in place of X, and one prior for each coefficient except
+    c_0: c_k is normal with mean 0 and a standard deviation from `expected`. Frames in which only one camera sees the
+    point therefore count too, and short paths are straight.
 
     Args:
         cameras: cameras with one leading axis.
@@ -217,7 +219,7 @@ def triangulate_candidates(
     for _ in range(3):
         points = points[_within(points, bounds_m)]
         support, fit = _support(cameras, points, points_px, radius_px)
-        points = triangulate(cameras, _pick(points_px, support), fit**2)
+        points = triangulate_linearly(cameras, _pick(points_px, support), fit**2)
     # NaN is not within the bounds either.
     kept = np.flatnonzero(_within(points, bounds_m))
     _, first = np.unique(np.round(points[kept] / SAME_M), axis=0, return_index=True)
@@ -239,7 +241,7 @@ def _proposals(
         if viewpoint[a] != viewpoint[b] and len(points_px[a]) and len(points_px[b]):
             first, second = np.meshgrid(np.arange(len(points_px[a])), np.arange(len(points_px[b])))
             pairs = np.stack([points_px[a][first.ravel()], points_px[b][second.ravel()]], axis=1)
-            proposals.append(triangulate(cameras[np.array([a, b])], pairs))
+            proposals.append(triangulate_linearly(cameras[np.array([a, b])], pairs))
     points = np.concatenate(proposals)
     return points[np.isfinite(points).all(axis=-1)]
 

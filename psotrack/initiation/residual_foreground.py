@@ -13,7 +13,15 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from psotrack.geometry import Boxes, Camera, make_extents, moved_extents, project, project_boxes, triangulate
+from psotrack.geometry import (
+    Boxes,
+    Camera,
+    make_extents,
+    moved_extents,
+    project,
+    project_boxes,
+    triangulate_linearly,
+)
 
 #: A known drone's ellipse is enlarged by this factor and by this number of cells, because outlines are no ellipses, and
 #: rotors blur.
@@ -174,7 +182,7 @@ def observe(
         views = _observe_views(volume, residual, position_m, size_m, window)
         if len(set(volume.viewpoint[views.sees].tolist())) < volume.required_viewpoints:
             return NOT_FOUND
-        position_m = triangulate(volume.cameras, views.pixels, views.weight)
+        position_m = triangulate_linearly(volume.cameras, views.pixels, views.weight)
     distance = np.linalg.norm(2 * (others_m - position_m) / (others_size_m + size_m), axis=-1)
     num_cameras = int(views.sees.sum())
     found = (

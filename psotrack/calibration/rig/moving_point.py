@@ -25,7 +25,7 @@ from psotrack.calibration.bundle import AdjustedRig, adjust
 from psotrack.calibration.residuals import spread_px
 from psotrack.calibration.rig.world import Similarity
 from psotrack.errors import InputError
-from psotrack.geometry import Rig, triangulate, undistort
+from psotrack.geometry import Rig, triangulate_linearly, undistort
 
 #: Distance in the image up to which a detection may be of the point, while the cameras are not yet adjusted, pixels.
 _WIDE_PX = 15.0
@@ -237,7 +237,7 @@ def _adjusted(rig: Rig, points_px: Float[np.ndarray, "sightings cameras 2"], noi
     adjusted = _adjust_near(rig, points_px, noise_px)
     adjusted = _adjust_near(adjusted.rig, points_px, _noise_px(adjusted))
     used = np.where(adjusted.used[..., None], points_px, np.nan)
-    return replace(adjusted, points_m=triangulate(adjusted.rig.cameras, used))
+    return replace(adjusted, points_m=triangulate_linearly(adjusted.rig.cameras, used))
 
 
 def _adjust_near(
@@ -249,7 +249,7 @@ def _adjust_near(
         InputError: the sightings do not determine the cameras.
     """
     centres = np.asarray(rig.cameras.centre_world)
-    far = np.linalg.norm(triangulate(rig.cameras, points_px) - centres.mean(axis=0), axis=-1)
+    far = np.linalg.norm(triangulate_linearly(rig.cameras, points_px) - centres.mean(axis=0), axis=-1)
     typical = float(np.nanmedian(far)) if np.isfinite(far).any() else 0.0
     for multiple in _FAR:
         near_px = np.where((far < multiple * typical)[:, None, None], points_px, np.nan)

@@ -13,7 +13,7 @@ from psotrack.calibration.image_points import ImagePoints, read_image_points
 from psotrack.calibration.rig.moving_point import PointRig, PointViews
 from psotrack.calibration.rig.world import LEAST_POINTS, Similarity, align
 from psotrack.errors import InputError, SettingsError
-from psotrack.geometry import Rig, triangulate
+from psotrack.geometry import Rig, triangulate_linearly
 from psotrack.recordings import Detections
 from psotrack.support import read_table
 
@@ -219,4 +219,4 @@ def _triangulated(rig: Rig, given: GivenWorld) -> dict[str, np.ndarray]:
     for name, marks in given.sightings.items():
         for point, xy in zip(marks.points, marks.points_px, strict=True):
             points_px[row_of[point], rig.names.index(name)] = xy
-    return dict(zip(given.places_m, triangulate(rig.cameras, points_px), strict=True))
+    return dict(zip(given.places_m, triangulate_linearly(rig.cameras, points_px), strict=True))
