@@ -85,7 +85,7 @@ def camera_variances(
     """
     rows = places.determined
     places, known_px2 = places.only(rows), known_px2[rows]
-    seen = np.repeat(places.shown.any(axis=0)[:, None], 2, axis=-1)
+    seen = np.repeat(np.any(places.shown, axis=0, keepdims=True).T, 2, axis=-1)
     if not len(places.shown):
         return np.full(seen.shape, np.nan)
     shown = places.shown[..., None]

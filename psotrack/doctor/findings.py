@@ -102,10 +102,10 @@ def describe_fault(rig: Rig, fault: FoundFault, fps: float) -> Finding:
     if fault.as_well:
         others = " or ".join(_in_words(rig, one, fps)[0].split(": ")[1] for one in fault.as_well)
         numbers += f"; nearly as likely, {others}"
-    kind, *others = (_kind(one.hypothesis.kind) for one in (fault.best, *fault.as_well))
+    kind, *also = (_kind(one.hypothesis.kind) for one in (fault.best, *fault.as_well))
     names = () if hypothesis.camera < 0 else (rig.names[hypothesis.camera],)
-    others = tuple(other for other in dict.fromkeys(others) if other != kind)
-    return Finding(kind, names, f"{words}, {numbers}", remedy, others)
+    other_kinds = tuple(other for other in dict.fromkeys(also) if other != kind)
+    return Finding(kind, names, f"{words}, {numbers}", remedy, other_kinds)
 
 
 def _kind(kind: str) -> str:

@@ -295,8 +295,8 @@ class _Tracker:
             lost[slot] = track.unseen > self._max_coasting_frames
         predicted_m_s = np.asarray(self._motion.state.velocity_m_s)
         for number, slot in enumerate(seen_by_one.drone.tolist()):
-            one = seen_by_one.jacobian[number], seen_by_one.off_px[number], seen_by_one.noise_px[number]
-            self._motion.correct_in_image(slot, *one)
+            view = seen_by_one.jacobian[number], seen_by_one.off_px[number], seen_by_one.noise_px[number]
+            self._motion.correct_in_image(slot, *view)
         unseen = ~was_measured
         unseen[seen_by_one.drone] = False
         self._motion.correct(measured_m, covariance_m2, was_measured, unseen, lost)

@@ -91,7 +91,7 @@ def check_end(video: VideoInfo) -> None:
     finally:
         capture.release()
     if not reached and (count := _count_packets(video.path)) < video.num_frames:
-        raise _ended_early(video, count)
+        raise TruncatedVideoError(video, count)
 
 
 def probe_images(images: Sequence[Path | str], fps: float) -> VideoInfo:

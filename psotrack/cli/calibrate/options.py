@@ -51,7 +51,7 @@ LENS = click.option(
 
 def board_options() -> Any:
     """Options that describe a board; `board_of` makes the board."""
-    options = [
+    options: list[Any] = [
         click.option(
             "--board",
             "kind",

@@ -24,7 +24,7 @@ from psotrack.errors import SettingsError
 from psotrack.support import refuse_to_overwrite
 
 if TYPE_CHECKING:
-    from psotrack.calibration import CalibratedRig, CameraFigures, LensChoice
+    from psotrack.calibration import Board, CalibratedRig, CameraFigures, LensChoice
 
 
 @click.command()

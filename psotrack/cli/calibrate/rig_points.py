@@ -79,21 +79,21 @@ def calibrate_points(
         )
     lenses = known_lenses_of(views.names, lenses_path)
     found = calibrate_by_point(lenses, views)
-    given = None if world is None else read_world(world)
+    stated = None if world is None else read_world(world)
 
     def world_of(found: PointRig) -> Similarity:
         rig = found.adjusted.rig
-        if given is not None:
-            return fit_world(rig, given, _numbered(found), with_scale=True)[0]
+        if stated is not None:
+            return fit_world(rig, stated, _numbered(found), with_scale=True)[0]
         if distance is not None:
             return world_of_camera(rig, 0, distance[2] / distance_between(rig, *distance[:2]))
         return world_of_camera(rig, 0, (stick_m or 1.0) / stick_length(found))
 
     change = world_of(found)
     covariance = covariance_of_centres(found, world_of)
-    if given is not None:
-        _, left = fit_world(found.adjusted.rig, given, _numbered(found), with_scale=True)
-        place = in_words(given.path, left)
+    if stated is not None:
+        _, left = fit_world(found.adjusted.rig, stated, _numbered(found), with_scale=True)
+        place = in_words(stated.path, left)
     else:
         place = f"camera {views.names[0]}: x right, y down, z forward; --world places it elsewhere"
     rig = change.rig(found.adjusted.rig)
