@@ -20,7 +20,7 @@ from psotrack.rig_files import write_rig
 from psotrack.trajectories import Trajectories, read_trajectories
 from psotrack.trajectories.tum import write_tum
 
-LASTS_S = 1.5
+LASTS_S = 1.0
 #: Rate and time of frame 0 of each camera.
 CLOCKS = ((25.0, 0.0), (50.0, 0.0), (25.0, 0.013), (30.0, 0.2), (25.0, 0.0))
 
@@ -117,3 +117,10 @@ def test_doctor_and_info_read_recordings_without_videos(folder):
     assert "no video" in shown
     assert "1280 x 960" in shown
     assert "50 Hz" in shown
+
+
+def test_adjust_refuses_cameras_whose_frames_were_not_exposed_together(folder, tmp_path):
+    with pytest.raises(
+        InputError, match="expected cameras whose frames of equal number were exposed together"
+    ):
+        run("calibrate", "adjust", folder, "--tracks", folder / "drone.tum", "--out", tmp_path / "rig.toml")

@@ -3,6 +3,11 @@
 Lengths in the image are in units of 1/64 pixel; the distortion coefficients are OpenCV's and have no unit. `transform`
 has the camera's centre in millimetres and the matrix R_q whose rows are the camera's axes in the world, with x right,
 y up and z backwards: R = diag(1, -1, -1) R_q, t = -R C.
+
+Qualisys's manuals do not describe the file. Pose2Sim's reader (`calibration.py`, `read_qca`) has the same unit of 1/64
+pixel, field of view and axes, but divides the distortion by 64 as well. The k1 of its demonstration, -0.046, would then
+move the corners by a third of a pixel, too little to be worth stating. Other readers use the coefficients as they are,
+in OpenCV's order.
 """
 
 from __future__ import annotations

@@ -6,6 +6,9 @@ A `KeyFrame` has the camera's centre C in millimetres (`POSITION`), the rotation
 - `VICON_RADIAL` "k1 k2": a point at distance r of the principal point, in pixels, belongs at r (1 + k1 r² + k2 r⁴);
 - `VICON_RADIAL2` "ViconRadial2 cx cy k1 k2 k3": the same about (cx, cy), with r in pixels or in focal lengths.
 
+The order and the direction of the quaternion are those of Pose2Sim's reader (`calibration.py`, `calib_vicon_fun`: the
+scalar last, and a matrix from world to camera after its two transpositions), as is fy = focal length / aspect ratio.
+
 The formulae map distorted to undistorted points, the opposite of OpenCV's. `fit_distortion` finds OpenCV's
 coefficients.
 """

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from psotrack.calibration import DroneViews, Improved
     from psotrack.doctor import CheckedAdjustment
     from psotrack.geometry import Rig
+    from psotrack.recordings import Recording
 
 
 #: What is said of a rig in which all cameras may be off.
@@ -86,7 +87,13 @@ def adjust(
     refuse_to_overwrite(out, force)
     recording = open_recording(sequence)
     if not recording.detections:
-        raise InputError(sequence, expected="detections in dl_data", found="none")
+        raise InputError(
+            sequence,
+            expected="detections in dl_data or in recording.toml",
+            found="none",
+            remedy="`psotrack detect` makes them",
+        )
+    _check_one_clock(sequence, recording)
     detections = {name: read_detections(path) for name, path in recording.detections.items()}
     flown = read_trajectories(tracks, fps=recording.fps if recording.videos else None)
     views = find_drones_in_boxes(recording.rig, detections, flown)
@@ -108,6 +115,22 @@ def adjust(
         scale, std = improved.everything.focal_scale, improved.everything.focal_scale_std
         done = "" if improved.rescaled else ", which may be chance: the focal lengths are not changed"
         print_line(quiet, json_path, f"focal lengths x {scale:.5f} ± {std:.5f}{done}")
+
+
+def _check_one_clock(sequence: Path, recording: Recording) -> None:
+    """Raise `InputError` where frames of equal number are not exposed together."""
+    times = {
+        name: each for name, each in recording.frame_times.items() if name in (recording.detections or {})
+    }
+    longest = max(times.values(), key=lambda each: each.num_frames, default=None)
+    for name, each in times.items():
+        assert longest is not None
+        if np.abs(each.time_s - longest.time_s[: each.num_frames]).max(initial=0.0) > 0.1 / longest.fps:
+            raise InputError(
+                sequence,
+                expected="cameras whose frames of equal number were exposed together",
+                found=f"another rate or start of camera {name}",
+            )
 
 
 def _rows(
