@@ -158,7 +158,7 @@ def test_a_moved_camera():
     assert (finding.kind, finding.cameras) == ("moved", ("c4",))
     # Without noise, the shift is found exactly, except for errors from boxes that are matched with the wrong drone.
     (moved_cm,) = (float(word) for word in finding.message.split() if word.isdigit() and int(word) > 9)
-    assert abs(moved_cm - 42.4) < 3.5
+    assert abs(moved_cm - 42.4) < 1
 
 
 @pytest.mark.parametrize("delay", [0.6, 3.0])
@@ -168,7 +168,7 @@ def test_a_late_camera(delay):
     assert (finding.kind, finding.cameras) == ("clock", ("c1",))
     assert "late" in finding.message
     reported = float(finding.message.split(" frames")[0].split()[-1])
-    assert abs(reported - delay) < 0.3
+    assert abs(reported - delay) < 0.15
 
 
 def test_camera_centres_instead_of_translations():
@@ -219,7 +219,7 @@ def test_two_exchanged_cameras():
 def test_a_wrong_focal_length():
     finding = only_finding(with_intrinsics(3, 1.06))
     assert (finding.kind, finding.cameras) == ("focal length", ("c3",))
-    assert re.search(r"(5\.[5-9]|6\.[0-5]) % too long", finding.message)
+    assert re.search(r"(5\.[5-9]|6\.[0-3]) % too long", finding.message)
 
 
 def test_all_focal_lengths_wrong():
@@ -233,10 +233,10 @@ def test_all_focal_lengths_a_little_wrong(factor):
     """The error is too small to be visible in a single sighting or in a single camera."""
     finding = only_finding(with_intrinsics(slice(None), factor))
     assert (finding.kind, finding.cameras) == ("focal lengths", ())
-    found = re.search(r"[345] % too (long|short) \(± (\S+) %\)", finding.message)
+    found = re.search(r"[34] % too (long|short) \(± (\S+) %\)", finding.message)
     assert found is not None, finding.message
     assert found[1] == ("long" if factor > 1 else "short")
-    assert 0 < float(found[2]) < 1.1
+    assert 0 < float(found[2]) < 0.7
 
 
 def test_intrinsics_for_half_the_image_size():

@@ -14,6 +14,7 @@ from psotrack.calibration import find_drones_in_boxes
 from psotrack.correspondence import from_detections
 from psotrack.doctor import evidence, examine, improve_with_check
 from psotrack.doctor.common_points import CommonPoints
+from psotrack.doctor.fault_search import consistent_share
 from psotrack.doctor.hypotheses import PER_CAMERA, Corrected, Hypothesis, linearise, list_hypotheses
 from psotrack.geometry import Rig, project
 from psotrack.trajectories import Trajectories
@@ -279,6 +280,21 @@ def test_an_adjustment_that_does_not_fit_other_parts_is_refused(monkeypatch):
     assert checked.improved.rig is rig
     assert not checked.better
     assert checked.uncertain
+
+
+def test_sightings_that_agree_by_chance_do_not_go_on_from_frame_to_frame(monkeypatch):
+    """A rig is not judged by matches of spots of noise, as the blobs of a noisy background are."""
+    rig, data = small_problem()
+    assert consistent_share(rig, data.points) > 0.9
+    jumps_px = np.random.default_rng(1).standard_t(1, data.points.centre_px.shape) * 40
+    spots = replace(data.points, centre_px=data.points.centre_px + jumps_px)
+    # The scale of the noise is the median's, so that the far tenth of these jumps are outliers.
+    assert consistent_share(rig, spots) < 0.85
+    case = make_case(4, "late 0.5")
+    monkeypatch.setattr("psotrack.doctor.examination.consistent_share", lambda rig, points: 0.6)
+    (finding,) = examine(case.rig, from_detections(case.seen, case.rig, case.frames), fps=_boxes.FPS).findings
+    assert finding.kind == "too little seen"
+    assert "agree by chance" in finding.message
 
 
 def test_hypotheses_have_their_own_columns():

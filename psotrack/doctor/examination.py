@@ -18,7 +18,7 @@ from psotrack.correspondence import Sightings, epipolar_distance, wide_bounds
 from psotrack.doctor.agreement import MIN_VIEWPOINTS, Agreement, measure_agreement
 from psotrack.doctor.camera_faults import MIN_POINTS_OF_CAMERA, collect_views, explain_camera
 from psotrack.doctor.common_points import CommonPoints, find_common_points
-from psotrack.doctor.fault_search import find_faults
+from psotrack.doctor.fault_search import consistent_share, find_faults
 from psotrack.doctor.findings import (
     Finding,
     describe_camera_fault,
@@ -55,6 +55,9 @@ MIN_SHARE = 0.3
 OFF_SHARE, GROSS_GAIN, NOTHING_EXPLAINED = 0.5, 0.3, 0.1
 #: Smallest number of points with which a rig can be checked.
 MIN_POINTS = 12
+#: Smallest share of matched sightings that go on from frame to frame: of boxes of bodies nine in ten do, of matches by
+#: chance about half.
+MIN_CONSISTENT = 0.75
 #: Smallest and largest plausible size of a body, metres.
 PLAUSIBLE_BODY_M = (0.01, 10.0)
 
@@ -132,11 +135,17 @@ def examine(
             rig, found = interpretation.rig, better
             points = find_common_points(rig, sightings, frames, bounds_m, fps)
     if max(found.share, float(points.share.max())) < MIN_SHARE or len(points.frame) < MIN_POINTS:
-        findings.append(_nothing_agrees(found, points))
-        nothing = np.full(len(rig), np.nan)
-        return Diagnosis(
-            tuple(findings), found, nothing, nothing, _median_epipolar_distances(rig, found), None
+        return _undecided(rig, found, [*findings, _nothing_agrees(found, points)])
+    consistent = consistent_share(rig, points)
+    if consistent < MIN_CONSISTENT:
+        message = (
+            f"the detections: of those that agree over the cameras, only {consistent:.0%} go on from frame to frame, "
+            "so many agree by chance"
         )
+        finding = Finding(
+            "too little seen", (), message, "the rig cannot be checked; pass other --detections"
+        )
+        return _undecided(rig, found, [*findings, finding])
     lag, std = measure_lags(rig, points, fps)
     gross, sound = _find_gross_faults(rig, found, points, sightings, frames, bounds_m, fps)
     findings += gross
@@ -162,6 +171,12 @@ def examine(
         fit = fit_reference(found.frame[inside], found.position_m[inside], reference, fps)
         findings += describe_reference(fit, fps)
     return Diagnosis(tuple(findings), found, lag, std, _median_epipolar_distances(rig, found), fit)
+
+
+def _undecided(rig: Rig, found: Agreement, findings: list[Finding]) -> Diagnosis:
+    """The diagnosis of a rig that cannot be checked further."""
+    nothing = np.full(len(rig), np.nan)
+    return Diagnosis(tuple(findings), found, nothing, nothing, _median_epipolar_distances(rig, found), None)
 
 
 def sampled_frames(num_frames: int, fps: float = 25.0) -> Int[np.ndarray, "chosen"]:
@@ -287,7 +302,6 @@ def _find_gross_faults(
     sound = np.ones(len(rig), bool)
     share = points.share
     while sound.sum() > MIN_VIEWPOINTS:
-        index = np.flatnonzero(sound)
         rest, seen = _select(rig, sightings, sound)
         if findings:
             found = measure_agreement(rest, seen, frames, bounds_m)
@@ -311,8 +325,11 @@ def _find_gross_faults(
         if won[worst] <= GROSS_GAIN and np.isfinite(views[worst].noise_px).any(axis=1).mean() < 0.5:
             # A camera that seldom has a detection is not known to be wrong.
             break
-        findings.append(describe_camera_fault(rest, worst, explained[worst]))
-        sound[index[worst]] = False
+        fault = describe_camera_fault(rest, worst, explained[worst])
+        findings.append(fault)
+        # The other one of two exchanged cameras is wrong for the same reason.
+        concerned = [rig.names.index(name) for name in fault.cameras]
+        sound[concerned] = False
     return findings, sound
 
 

@@ -65,6 +65,15 @@ class FoundFault:
     shift_px: float
 
 
+def consistent_share(rig: Rig, points: CommonPoints) -> float:
+    """Share of the matched sightings that go on from frame to frame; the rest of a body's sightings are outliers.
+
+    Sightings that only agree by chance, such as spots of noise, do not move as one body in all cameras.
+    """
+    weight = weigh(Corrected(rig, np.zeros(len(rig))), points).weight
+    return float((weight > 0).sum() / max(points.seen.sum(), 1))
+
+
 def find_faults(rig: Rig, points: CommonPoints) -> tuple[list[FoundFault], Corrected]:
     """Find faults one after the other, and correct them.
 
