@@ -57,8 +57,16 @@ def find_lens(
     model: LensModel,
     views_px: Float[np.ndarray, "instants corners 2"],
     image_size_wh: tuple[int, int],
+    focal_px: float | None = None,
 ) -> Float[np.ndarray, " unknowns"] | None:
     """Find a first lens of one camera from its views of a board: an adjustment from several focal lengths.
+
+    Args:
+        board: the board.
+        model: model of the lens.
+        views_px: pixels of the board's corners; NaN where a corner is not seen.
+        image_size_wh: width and height of the images, pixels.
+        focal_px: the only focal length from which the search starts, pixels, where it is known roughly.
 
     Returns:
         Vector of the lens, or None if no view fits.
@@ -70,10 +78,11 @@ def find_lens(
     spread = choose_spread(np.array([outline for _, outline in usable]) / image_size_wh[0], _MOST_VIEWS)
     chosen = views_px[sorted(usable[index][0] for index in spread)]
     found: list[tuple[float, np.ndarray]] = []
-    for widths in _FOCAL_WIDTHS_FISHEYE if model.fisheye else _FOCAL_WIDTHS:
-        bundle = _adjust_lens(
-            board, model, chosen, model.start(widths * image_size_wh[0], image_size_wh), image_size_wh
-        )
+    starts_px = [
+        widths * image_size_wh[0] for widths in (_FOCAL_WIDTHS_FISHEYE if model.fisheye else _FOCAL_WIDTHS)
+    ]
+    for start_px in starts_px if focal_px is None else [focal_px]:
+        bundle = _adjust_lens(board, model, chosen, model.start(start_px, image_size_wh), image_size_wh)
         if bundle is not None:
             cost = sum(float(np.minimum(distance, 20.0).sum()) for distance in bundle.distance_px)
             found.append((cost, bundle.state.lenses[0]))

@@ -88,10 +88,12 @@ def _left_out(
     """Distances of the corners from the projections by lenses of other views, pixels; None if a fit fails."""
     distance_px = np.full(views_px.shape[:2], np.nan)
     part = np.arange(len(views_px)) % _FOLDS
+    focal_px = None
     for fold in range(_FOLDS):
-        lens = find_lens(board, model, views_px[part != fold], image_size_wh)
+        lens = find_lens(board, model, views_px[part != fold], image_size_wh, focal_px)
         if lens is None:
             return None
+        focal_px = float(lens[0])
         found = fit_boards(board, model, lens, views_px[part == fold], image_size_wh)
         if found is None:
             return None
