@@ -194,7 +194,7 @@ def test_a_video_that_begins_late_is_named():
 def test_stated_deviations_hold(errors):
     """The truth lies within two standard deviations as often as it should, also if corners have errors in common."""
     inside, sizes = [], []
-    for seed in range(12):
+    for seed in range(6):
         calibrated = calibrate_rig(
             BOARD, Scene(RIG, errors=errors, instants=30).views(np.random.default_rng(seed))
         )
@@ -207,6 +207,6 @@ def test_stated_deviations_hold(errors):
         for camera, std in enumerate(calibrated.lens_std):
             K = calibrated.rig.cameras.K[camera] - RIG.cameras.K[camera]
             inside += (np.abs([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]) < 2 * std[:4]).tolist()
-    # 95 % for a normal distribution; 200 values that depend on each other somewhat.
-    assert np.mean(inside) > 0.88
+    # 95 % for a normal distribution; 108 values that depend on each other somewhat.
+    assert np.mean(inside) > 0.86
     assert np.median(sizes) < 0.03
