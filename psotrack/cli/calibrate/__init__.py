@@ -20,7 +20,7 @@ COMMANDS = {
     ),
     "intrinsics": LazyCommand(
         "psotrack.cli.calibrate.intrinsics",
-        "Estimate a camera's lens from VIDEO, in which a ChArUco board is moved.",
+        "Estimate a camera's lens from VIDEO, in which a board is moved.",
     ),
     "rig": LazyCommand(
         "psotrack.cli.calibrate.rig",
