@@ -253,6 +253,8 @@ def _report(
     }
     output_json(json_path, content, force)
     _show(rows, quiet, json_path)
+    models = ", ".join(f"{name} {row.lens}" for name, row in rows.items())
+    print_line(quiet, json_path, f"lens models (distortion coefficients): {models}")
     views = ", ".join(f"{name} {frame} {residual:.2f}" for name, frame, residual in worst)
     print_line(quiet, json_path, f"worst views (camera, frame, px): {views}")
     for sentence in advice:
@@ -275,13 +277,12 @@ def _show(rows: dict[str, CameraFigures], quiet: bool, json_path: Path | None) -
     print_table(
         quiet,
         json_path,
-        ("camera", "views", "rms (px)", "lens", "f (px)", POSITION, "std (mm)"),
+        ("camera", "views", "rms (px)", "f (px)", POSITION, "std (mm)"),
         (
             (
                 name,
                 f"{row.views}",
                 f"{row.rms_px:.2f}",
-                row.lens,
                 f"{row.focal_px[0]:.1f}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{row.focal_std_px[0]:.1f}",
                 # Adding 0 makes -0 to 0.
                 format_numbers([round(value, 3) + 0.0 for value in row.centre_m], 3),
