@@ -20,7 +20,7 @@ from psotrack.geometry import Rig, project
 from psotrack.recordings import Detections
 from psotrack.trajectories import Trajectories
 
-#: The tests take two minutes, because types are checked in many small calls.
+#: Each test takes some seconds.
 pytestmark = pytest.mark.slow
 
 FPS, FRAMES = 25.0, 30
