@@ -481,5 +481,5 @@ def test_impossible_errors_are_one_line(tmp_path, option, monkeypatch, capsys):
         cli.main()
     assert stopped.value.code == 2
     said = capsys.readouterr().err
-    assert "expected a number, 0 or more" in said
+    assert "expected a number of at least 0, found -1" in said
     assert len(said.strip().splitlines()) == 1

@@ -117,9 +117,10 @@ def cli(verbose: bool) -> None:
       ~/.zshrc                    eval "$(_PSOTRACK_COMPLETE=zsh_source psotrack)"
       ~/.config/fish/config.fish  _PSOTRACK_COMPLETE=fish_source psotrack | source
     """
+    logging.addLevelName(logging.WARNING, "warning")
     logging.basicConfig(
         level=logging.INFO if verbose else logging.WARNING,
-        format="%(levelname)s %(name)s: %(message)s",
+        format="%(levelname)s %(name)s: %(message)s" if verbose else "psotrack: %(levelname)s: %(message)s",
         stream=sys.stderr,
     )
 

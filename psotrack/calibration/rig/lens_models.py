@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import SettingsError
-from psotrack.geometry import Rig
+from psotrack.geometry import Rig, make_camera, undistort
 
 #: Number of unknowns of a lens before the distortion: fx, fy, cx, cy.
 PINHOLE = 4
@@ -24,7 +24,6 @@ _FISHEYE_COEFFICIENTS = 4
 _COEFFICIENT_STD = np.array([1, 1, 0.05, 0.05, 1, 1, 1, 1, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05], np.float64)
 #: Standard deviation of the principal point about the image's middle, in image widths, and of log(fx / fy).
 _CENTRE_STD, _ASPECT_STD = 0.1, 0.1
-_UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
 
 @dataclass(frozen=True)
@@ -84,21 +83,16 @@ class LensModel:
         self, lens: Float[np.ndarray, " unknowns"], points_px: Float[np.ndarray, "points 2"]
     ) -> Float[np.ndarray, "points 2"]:
         """Directions (x / z, y / z) in which pixels are seen; NaN where the lens cannot be inverted."""
-        seen = np.isfinite(points_px).all(axis=-1)
-        rays = np.full(points_px.shape, np.nan)
-        if not seen.any():
-            return rays
-        K, pixels = camera_matrix(lens), np.ascontiguousarray(points_px[seen])[:, None]
-        if self.fisheye:
-            found = cv2.fisheye.undistortPoints(pixels, K, lens[PINHOLE:]).reshape(-1, 2)
-        else:
-            dist = lens[PINHOLE:] if self.coefficients else np.zeros(4)
-            found = cv2.undistortPoints(pixels, K, dist, criteria=_UNDISTORT_CRITERIA).reshape(-1, 2)
-        # An iteration that diverged does not lead back to its pixel.
-        back, _, _ = self.project(lens, np.column_stack([found, np.ones(len(found))]))
-        found[~(np.linalg.norm(back - pixels[:, 0], axis=-1) < 1.0)] = np.nan
-        rays[seen] = found
-        return rays
+        # The lens alone counts: the camera's place and the size of its images do not.
+        camera = make_camera(
+            R=np.eye(3),
+            t_m=np.zeros(3),
+            K=camera_matrix(lens),
+            image_size_wh=(1, 1),
+            dist=lens[PINHOLE:].tolist(),
+            fisheye=self.fisheye,
+        )
+        return undistort(camera, points_px)
 
     def prior(
         self, image_size_wh: tuple[int, int]
