@@ -201,7 +201,7 @@ def test_learning_frames_spread_over_the_video(num_frames: int, num_learning_fra
     ("setting", "message"),
     [
         ({"working_reduction": 0}, "working_reduction: expected a whole number of at least 1, found 0"),
-        ({"working_reduction": 1.5}, "working_reduction: expected a whole number of at least 1, found 1.5"),
+        ({"working_reduction": 1.5}, "working_reduction: expected a whole number, found 1.5"),
         ({"num_learning_frames": 0}, "num_learning_frames: expected a whole number of at least 1, found 0"),
         ({"min_blob_px": -1}, "min_blob_px: expected a whole number of at least 0, found -1"),
         ({"learning_rate": -0.1}, "learning_rate: expected a number from 0 to 1, found -0.1"),

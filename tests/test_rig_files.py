@@ -239,7 +239,9 @@ def test_a_damaged_rig_toml_is_refused(tmp_path, change, message):
 def test_a_unit_that_a_format_leaves_open_must_be_stated(tmp_path, caplog):
     path = tmp_path / "calibration.toml"
     path.write_text(ANIPOSE)
-    with pytest.raises(InputError, match=r"expected a unit of lengths, found none, .* state m or cm or mm: --units"):
+    with pytest.raises(
+        InputError, match=r"expected a unit of lengths, found none, .* state m or cm or mm: --units"
+    ):
         read_rig(path)
     path.write_text(ANIPOSE.replace("adjusted", 'unit = "cm"\nadjusted'))
     stated = read_rig(path).cameras.T_cam_world[:, :3, 3]
