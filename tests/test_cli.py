@@ -152,6 +152,7 @@ def test_parquet_and_csv_have_the_same_content(run: Run, sequence: Path, tmp_pat
     np.testing.assert_allclose(csv[["x_m", "y_m", "z_m"]], parquet[["x_m", "y_m", "z_m"]], rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_second_call_reads_the_stored_silhouettes(run: Run, sequence: Path, tmp_path: Path) -> None:
     first = run("silhouettes", sequence, "--reduction", 2, "--json", "-")
     again = run("silhouettes", sequence, "--reduction", 2, "--json", "-")
@@ -160,6 +161,7 @@ def test_a_second_call_reads_the_stored_silhouettes(run: Run, sequence: Path, tm
     assert json.loads(again.out)["seconds"] == {"decode": 0.0, "foreground": 0.0}
 
 
+@pytest.mark.slow
 def test_quiet_prints_nothing_and_bars_need_a_terminal(run: Run, sequence: Path, tmp_path: Path) -> None:
     tracks = tmp_path / "tracks.csv"
     assert run(*track(sequence, tracks, "--quiet")) == Output(0, "", "")
@@ -198,6 +200,7 @@ def test_smoothed_tracks_have_smaller_covariances(run: Run, sequence: Path, tmp_
     )
 
 
+@pytest.mark.slow
 def test_ambiguous_pairs_are_written_beside_the_tracks(run: Run, sequence: Path, tmp_path: Path) -> None:
     from psotrack.trajectories import write_ambiguity
 
@@ -222,6 +225,7 @@ def test_ambiguous_pairs_are_written_beside_the_tracks(run: Run, sequence: Path,
     }
 
 
+@pytest.mark.slow
 def test_drones_that_are_not_found_do_not_stop_tracking(run: Run, sequence: Path, tmp_path: Path) -> None:
     result = run(*track(sequence, tmp_path / "t.csv", "--drones", 7))
     assert result.code == 0
@@ -331,6 +335,7 @@ def test_command_line_defaults_are_the_defaults_of_the_settings() -> None:
         assert defaults[name] == default or default is None, name
 
 
+@pytest.mark.slow
 def test_results_are_not_overwritten_without_force(run: Run, sequence: Path, tmp_path: Path) -> None:
     tracks = tmp_path / "tracks.csv"
     tracks.write_text("precious")

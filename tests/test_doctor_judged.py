@@ -23,6 +23,8 @@ FOLDER = Path(__file__).parents[1] / "experiments" / "calibration"
 sys.path.append(str(FOLDER))
 import _boxes  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 JUDGE = runpy.run_path(str(FOLDER / "doctor.py"))
 Scene, make_case, judge = _boxes.Scene, JUDGE["make_case"], JUDGE["judge"]
 
@@ -40,19 +42,16 @@ def test_a_sound_rig_is_left_alone(number):
 
 
 @pytest.mark.parametrize(("number", "fault"), [(5, "turned 1"), (4, "late 0.5"), (0, "millimetres")])
-@pytest.mark.slow
 def test_a_fault_is_named(number, fault):
     case, diagnosis = examine_case(number, fault)
     assert judge(case, diagnosis)["named first"], diagnosis.findings
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1, 2, 3, 5, 10, 15, 17, 18, 20])
 def test_sound_rigs_are_left_alone(number):
     assert examine_case(number)[1].findings == ()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("fault", JUDGE["FAULTS"])
 def test_faults_of_small_bodies_are_named(fault):
     """Of faults that move small bodies by 3 px, at most one is not named, and none is named wrongly.
@@ -70,7 +69,6 @@ def test_faults_of_small_bodies_are_named(fault):
     assert sum(bool(row["named first"]) for row in rows) >= len(rows) - (fault == "focal length 2 %"), rows
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("number", "fault"), [(1, "moved 5 cm"), (2, "turned 0.5"), (4, "exchanged")])
 def test_a_fault_of_one_of_three_cameras_is_named(number, fault):
     case = make_case(number, fault, 3)
@@ -257,7 +255,6 @@ def test_adjust_leaves_a_rig_alone_in_which_all_cameras_are_a_little_off():
     assert not held.all_off
 
 
-@pytest.mark.slow
 def test_an_adjustment_that_does_not_fit_other_parts_is_refused(monkeypatch):
     """The moved camera fits the parts that it was adjusted to, and no other: the rig is unchanged."""
     rig, seen, tracks = flown(Scene(cameras=4, drones=2, size=0.7, frames=80), 4)

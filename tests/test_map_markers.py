@@ -305,6 +305,6 @@ def test_the_rest_of_a_video_that_ends_early_is_used_as_its_message_says(walk, t
         out,
     ]
     message = invoke(*words, expect=InputError)
-    there = int(re.search(r"--frames (\d+) uses the other frames", message)[1])
+    there = int(re.search(r"--frames (\d+) uses the time before", message)[1])
     assert not out.exists()
     assert f"from {there} frames" in invoke(*words, "--frames", there)

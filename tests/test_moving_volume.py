@@ -23,6 +23,8 @@ from psotrack.rig_files import write_rig
 from psotrack.settings import DroneSettings, MotionSettings, StatusSettings, TrackSettings
 from psotrack.trajectories import Status
 
+pytestmark = pytest.mark.slow
+
 FPS = 25.0
 K = np.array([[1000.0, 0, 960], [0, 1000.0, 540], [0, 0, 1]])
 SKY_M = (0.0, 0.0, 15.0)
@@ -67,7 +69,6 @@ def tracked(rig, sightings, volume, **status):
     return track_detections(rig.cameras, sightings, settings, fps=FPS, bounds_m=volume.bounds_m)
 
 
-@pytest.mark.slow
 def test_the_volume_holds_drones_far_above_the_cameras_and_their_speed():
     rig, truth_m = ground_rig(4), flights(60, (4.0, 11.0))
     points = moving_detections(rig, sightings_of(rig, truth_m), FPS)
@@ -182,7 +183,6 @@ def test_two_views_match_wherever_the_middle_of_the_searched_room_is():
     np.testing.assert_allclose(found.position_m, place_m, atol=0.1)
 
 
-@pytest.mark.slow
 def test_a_recording_of_detections_is_tracked_within_the_volume_that_is_found(tmp_path, caplog):
     rig, truth_m = ground_rig(3), flights(30, (9.0,))
     sightings = sightings_of(rig, truth_m)

@@ -19,6 +19,8 @@ from psotrack.tracking.fitness import drone_fitness
 from psotrack.tracking.occlusion import OCCLUDER_SCALE, find_occluders
 from psotrack.tracking.shadows import CAST, LOW, FloorView, is_low, shadowed_pixels
 
+pytestmark = pytest.mark.slow
+
 REDUCTION = 2
 #: In the middle of the room, a pixel of the silhouettes is 2.4 cm wide.
 RIG = ring_rig(8, image_size_wh=(480, 270), radius_m=4.5)
@@ -168,7 +170,6 @@ def test_is_low_compares_the_height_with_the_width():
 
 @pytest.mark.parametrize("lamps", LAMPS)
 @pytest.mark.parametrize("height_m", [0.1, 0.15, 0.2, 0.3])
-@pytest.mark.slow
 def test_a_shadow_on_the_floor_does_not_move_the_place(lamps, height_m, size_m):
     """The largest measured shift is 9 mm, a third of a silhouette pixel.
 
@@ -184,7 +185,6 @@ def test_a_shadow_on_the_floor_does_not_move_the_place(lamps, height_m, size_m):
 
 
 @pytest.mark.parametrize("height_m", [0.1, 0.15, 0.2, 0.3])
-@pytest.mark.slow
 def test_without_a_shadow_the_place_does_not_move(height_m, size_m):
     """At 0.1 m no camera sees the floor right below the drone, and the shift is 6 mm (measured).
 
@@ -235,7 +235,6 @@ def test_a_drone_on_the_floor_keeps_its_score_and_place(size_m):
     )
 
 
-@pytest.mark.slow
 def test_windows_of_high_and_of_non_occluding_drones_do_not_change(size_m):
     """Only the window of the low drone changes; the other two windows are equal to the last bit."""
     images = draw_silhouettes(position_at(0.15), LAMPS["three"])

@@ -13,6 +13,8 @@ from psotrack.initiation import KnownDrones, find_candidates
 from psotrack.initiation.initialisation import find_drones
 from psotrack.silhouettes import find_blobs, stack_blobs
 
+pytestmark = pytest.mark.slow
+
 FPS = 25.0
 REDUCTION = 2
 #: Half a metre at 4 m is six to nine pixels: three or four cells wide, and one or two high.
