@@ -560,7 +560,7 @@ def test_a_detector_by_an_entry_point(run_track, site, recording, empty_hall):
     [
         (
             lambda: find_search(pt.SwarmSettings(search="predict")),
-            "swarm.search: expected one of pso, prediction, found predict",
+            "swarm.search: expected one of pso, prediction, found predict; did you mean prediction?",
         ),
         (
             lambda: find_score(pt.ScoreSettings(kind="iou")),
@@ -568,7 +568,7 @@ def test_a_detector_by_an_entry_point(run_track, site, recording, empty_hall):
         ),
         (
             lambda: find_background("mean", SilhouetteSettings()),
-            "background: expected one of mog2, absent, median, found mean",
+            "background: expected one of mog2, absent, median, found mean; did you mean median?",
         ),
         (
             lambda: find_background("absent", SilhouetteSettings()),
