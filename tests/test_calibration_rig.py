@@ -184,7 +184,8 @@ def test_a_video_that_begins_late_is_named():
     calibrated = calibrate_rig(BOARD, views)
     assert find_shifts(calibrated) == {"c2": 1}
     words = (
-        "c2 fits the others better if its frame 0 is their frame 1: its video shows the scene 1 frame early"
+        "c2 fits the others better if its frame 0 is their frame 1: it shows the scene 1 frame early; write "
+        "time_offset_s = 1 / fps"
     )
     assert any(words in line for line in advise(calibrated))
 
