@@ -18,8 +18,8 @@ from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
 
 # jaxtyping and beartype check the types and shapes of every annotated call of the package. The hook must be installed
-# before the package is imported. The checks take half of the time of the slow tests, so `make test-slow` runs without
-# the checks; the fast tests call the same functions.
+# before the package is imported. The checks take a third to a half of the time of slow tests, so `make test-slow`
+# runs without them: a function that only slow tests call is not checked.
 if os.environ.get("PSOTRACK_TYPE_CHECKS") != "off":
     install_import_hook("psotrack", "beartype.beartype")
 

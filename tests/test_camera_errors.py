@@ -165,8 +165,8 @@ class TestLearning:
         views, _ = fitted_views(rig, rig, position_m, velocity_m_s, error_px)
         places = FittedPlaces(views.residual_px[:, 0], views.jacobian[:, 0], np.ones((800, 4), bool))
         found = np.sqrt(camera_variances(places, np.zeros((800, 4, 2))))
-        # Positions follow the precise cameras, so few of the 800 residuals show these cameras' noise: it is known to a
-        # tenth.
+        # Positions follow the precise cameras, so only some of the 800 residuals show these cameras' noise, whose
+        # standard error is a tenth.
         np.testing.assert_allclose(found, noise_px, rtol=0.2)
         # The plain spread of the residuals is too small.
         assert np.square(views.residual_px).mean() < 0.8 * np.square(noise_px).mean()

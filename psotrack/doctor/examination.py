@@ -140,7 +140,7 @@ def examine(
     if consistent < MIN_CONSISTENT:
         message = (
             f"the detections: of those that agree over the cameras, only {consistent:.0%} go on from frame to frame, "
-            "so many agree by chance"
+            "so the others agree by chance"
         )
         finding = Finding(
             "too little seen", (), message, "the rig cannot be checked; pass other --detections"

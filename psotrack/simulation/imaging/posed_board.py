@@ -53,7 +53,7 @@ def own_board() -> Board:
 
 
 def board_poses(rig: Rig, number: int, seed: int) -> tuple[PosedBoard, ...]:
-    """Places of the board: first on the floor, then in the hands of somebody who shows it to all cameras.
+    """Places of the board: first on the floor, then in the hands of a person who shows the board to all cameras.
 
     Each place is in the view of one camera after the other, anywhere in its image. Every second round the board is
     turned to the middle between this camera and the next one, so that neighbours see it together.
