@@ -52,9 +52,10 @@ def draw_grid(board, T):
     pitch, side = round(board.square_m * per_m), round(board.marker_m * per_m)
     columns, rows = board.squares_wh
     sheet = np.full((rows * pitch, columns * pitch), 255, np.uint8)
-    for marker in range(columns * rows):
-        top, left = marker // columns * pitch, marker % columns * pitch
-        sheet[top : top + side, left : left + side] = cv2.aruco.generateImageMarker(dictionary, marker, side)
+    for place in range(columns * rows):
+        top, left = place // columns * pitch, place % columns * pitch
+        marker = cv2.aruco.generateImageMarker(dictionary, board.first_marker + place, side)
+        sheet[top : top + side, left : left + side] = marker
     sheet = cv2.copyMakeBorder(sheet, 30, 30, 30, 30, cv2.BORDER_CONSTANT, value=255)
     to_board = np.array([[1 / per_m, 0, -29.5 / per_m], [0, 1 / per_m, -29.5 / per_m], [0, 0, 1]])
     to_large = np.array([[3.0, 0, 1], [0, 3, 1], [0, 0, 1]])
@@ -75,7 +76,7 @@ def test_corners_of_a_board():
 
 
 def test_corners_of_a_grid_and_of_a_chessboard():
-    grid = Board((3, 4), 0.045, 0.036, "apriltag_36h11", "grid")
+    grid = Board((3, 4), 0.045, 0.036, "apriltag_36h11", "grid", first_marker=5)
     found = BoardFinder(grid).find(draw_grid(grid, pose()))
     assert np.isfinite(found).all()
     assert np.abs(found - projected(grid, pose())).max() < 0.6
@@ -117,6 +118,21 @@ def test_another_board_is_named(stated, message):
     images = [draw_board(BOARD, K, pose(seed), SIZE_WH) for seed in range(2)]
     found, remedy = explain_missing_board(stated, images)
     assert message in f"{found}; {remedy}"
+
+
+@pytest.mark.slow
+def test_another_marker_is_named():
+    printed = Board((1, 1), 0.1, 0.1, "apriltag_36h11", "grid", first_marker=20)
+    images = [draw_grid(printed, pose(seed)) for seed in (0, 2, 3)]
+    found, remedy = explain_missing_board(replace(printed, first_marker=7), images)
+    assert found == "marker 20 of the dictionary apriltag_36h11 in 3 of 3 images"
+    assert remedy == "pass --dictionary apriltag_36h11 --first-marker 20"
+    grid = Board((2, 2), 0.05, 0.04, "apriltag_36h11", "grid", first_marker=20)
+    found, remedy = explain_missing_board(replace(grid, first_marker=0), [draw_grid(grid, pose())])
+    assert (found, remedy) == (
+        "markers 20 to 23 of its dictionary",
+        "pass --first-marker 20, or the lowest number on the board",
+    )
 
 
 @pytest.mark.slow

@@ -16,8 +16,6 @@ from jaxtyping import Float, UInt8
 from psotrack.calibration.boards import Board
 from psotrack.detection import marker_dictionary
 
-#: Smallest number of corners of a view that counts, or all that the board has.
-LEAST_CORNERS = 6
 #: Largest standard deviation of corners from one line that is still a line, pixels.
 _LINE_PX = 1.5
 #: Largest size of an image in which OpenCV's search for a chessboard is fast, pixels.
@@ -46,7 +44,7 @@ class BoardFinder:
         else:
             found = self._find_charuco(image)
         seen = np.isfinite(found[:, 0])
-        if seen.sum() < min(LEAST_CORNERS, self.board.num_corners) or _on_a_line(found[seen]):
+        if seen.sum() < self.board.least_corners or _on_a_line(found[seen]):
             found[:] = np.nan
         return found
 
@@ -80,8 +78,9 @@ class BoardFinder:
         found = self._nothing().reshape(-1, 4, 2)
         quads, ids, _ = self._markers.detectMarkers(image)
         for quad, marker in zip(quads, [] if ids is None else map(int, np.ravel(ids)), strict=True):
-            if marker < len(found):
-                found[marker] = np.asarray(quad, np.float64).reshape(4, 2)
+            place = marker - self.board.first_marker
+            if 0 <= place < len(found):
+                found[place] = np.asarray(quad, np.float64).reshape(4, 2)
         return found.reshape(-1, 2)
 
     def _find_chessboard(self, image: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "corners 2"]:
@@ -108,7 +107,7 @@ class BoardFinder:
 def outline_of(board: Board, corners_px: Float[np.ndarray, "corners 2"]) -> Float[np.ndarray, "8"] | None:
     """(8,), pixels of the corners of the board's outline, also where they are not seen; None for corners on a line."""
     seen = np.isfinite(corners_px[:, 0])
-    if seen.sum() < LEAST_CORNERS or np.linalg.matrix_rank(np.cov(corners_px[seen].T), tol=1.0) < 2:
+    if seen.sum() < board.least_corners or np.linalg.matrix_rank(np.cov(corners_px[seen].T), tol=1.0) < 2:
         return None
     homography, _ = cv2.findHomography(board.corners_m[seen, :2], corners_px[seen])
     if homography is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -35,6 +36,8 @@ _FAMILIES = {
 }
 #: Smallest number of different markers in an image that are not there by chance.
 _LEAST_MARKERS = 3
+#: Smallest number of images that show a marker that is not there by chance.
+_LEAST_IMAGES = 3
 #: Largest number of squares along a side of a board that is recognised by its markers.
 _MOST_SQUARES = 20
 #: Largest distance, in sides of a marker, up to which markers fit a board.
@@ -99,6 +102,8 @@ def explain_missing_board(
     """
     if board.kind == "chessboard":
         return _explain_missing_chessboard(board, images)
+    if board.num_markers == 1:
+        return _explain_missing_marker(images)
     counted = [(len(ids), name, turned, ids) for name, turned, ids in _markers_of_all_dictionaries(images)]
     most, family, inverted, ids = max(counted, key=lambda one: one[0], default=(0, "", False, np.zeros(0)))
     if most < _LEAST_MARKERS:
@@ -122,9 +127,34 @@ def explain_missing_board(
                 f"markers {ids.min()} to {ids.max()} in the order of a board of {size[0]} x {size[1]} squares{how}",
                 f"pass --squares {size[0]}x{size[1]}",
             )
+    if board.kind == "grid" and ids.min() >= board.first_marker + board.num_markers:
+        return (
+            f"markers {ids.min()} to {ids.max()} of its dictionary{how}",
+            f"pass --first-marker {ids.min()}, or the lowest number on the board",
+        )
     return (
         f"markers {ids.min()} to {ids.max()} of its dictionary{how}, but not in its order",
         "check --squares, columns before rows, and --board",
+    )
+
+
+def _explain_missing_marker(images: Sequence[UInt8[np.ndarray, "height width"]]) -> tuple[str, str]:
+    seen = Counter[tuple[str, int]]()
+    for grey, inverted, mirrored in product(images, (False, True), (False, True)):
+        sides = np.ascontiguousarray(grey[:, ::-1]) if mirrored else grey
+        for family in _FAMILIES:
+            ids = _most_markers(family, [255 - sides if inverted else sides])
+            seen.update((family, int(marker)) for marker in ids)
+    ((family, marker), count), *_ = [*seen.most_common(1), (("", 0), 0)]
+    if count < _LEAST_IMAGES:
+        return (
+            f"no such marker in {len(images)} images",
+            "check that the marker is large and sharp enough in the images, and has a white border",
+        )
+    dictionary = _smallest(family, marker)
+    return (
+        f"marker {marker} of the dictionary {dictionary} in {count} of {len(images)} images",
+        f"pass --dictionary {dictionary} --first-marker {marker}",
     )
 
 

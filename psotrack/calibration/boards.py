@@ -18,6 +18,8 @@ from psotrack.detection import marker_dictionary
 from psotrack.errors import SettingsError, check_positive
 
 BoardKind = Literal["charuco", "chessboard", "grid"]
+#: Smallest number of corners of a view that counts, or all that the board has.
+LEAST_CORNERS = 6
 
 
 @dataclass(frozen=True)
@@ -26,10 +28,12 @@ class Board:
 
     Attributes:
         squares_wh: columns and rows of squares; of markers, for a grid.
-        square_m: side of a square in metres; for a grid, the distance from the middle of a marker to the next one's.
+        square_m: side of a square in metres; for a grid, the distance from the middle of a marker to the next one's;
+            for a single marker, its side.
         marker_m: side of a marker in metres; None for a chessboard.
         dictionary: name of the markers' dictionary, such as 4x4_50 or apriltag_36h11.
         kind: ChArUco board, chessboard, or grid of markers.
+        first_marker: number of the first marker of a grid; the others count on from it, row by row.
         legacy: ChArUco pattern of OpenCV before version 4.6: a board with an even number of rows has a marker, not a
             black square, in its top left corner.
     """
@@ -39,6 +43,7 @@ class Board:
     marker_m: float | None = None
     dictionary: str = "4x4_50"
     kind: BoardKind = "charuco"
+    first_marker: int = 0
     legacy: bool = False
 
     def __post_init__(self) -> None:
@@ -46,15 +51,19 @@ class Board:
             raise SettingsError(
                 "board.kind", expected=f"one of {', '.join(get_args(BoardKind))}", found=self.kind
             )
-        least = 1 if self.kind == "grid" else 3
-        if min(self.squares_wh) < least or max(self.squares_wh) < 2:
-            what = "at least two markers" if self.kind == "grid" else "at least 3 x 3 squares"
+        if min(self.squares_wh) < (1 if self.kind == "grid" else 3):
+            what = "at least one marker" if self.kind == "grid" else "at least 3 x 3 squares"
             raise SettingsError("board.squares_wh", expected=what, found=f"{self.squares_wh}")
         check_positive("board.square_m", self.square_m)
         if self.kind == "chessboard":
             if self.marker_m is not None:
                 raise SettingsError(
                     "board.marker_m", expected="none on a chessboard", found=f"{self.marker_m:g}"
+                )
+        elif self.kind == "grid" and self.squares_wh == (1, 1):
+            if self.marker_m != self.square_m:
+                raise SettingsError(
+                    "board.marker_m", expected=f"{self.square_m:g} as square_m", found=f"{self.marker_m}"
                 )
         elif self.marker_m is None or not 0 < self.marker_m < self.square_m:
             found = "none" if self.marker_m is None else f"{self.marker_m:g}"
@@ -64,6 +73,8 @@ class Board:
 
     def __str__(self) -> str:
         columns, rows = self.squares_wh
+        if self.squares_wh == (1, 1):
+            return f"marker {self.first_marker} of {self.dictionary}"
         words = {"charuco": "ChArUco board", "chessboard": "chessboard", "grid": "grid of markers"}[self.kind]
         markers = "" if self.kind == "chessboard" else f" of {self.dictionary}"
         return f"{words} {columns} x {rows}{markers}"
@@ -87,6 +98,17 @@ class Board:
         """Number of points of the board that a camera can see."""
         columns, rows = self.squares_wh
         return 4 * columns * rows if self.kind == "grid" else (columns - 1) * (rows - 1)
+
+    @property
+    def num_markers(self) -> int:
+        """Number of markers on the board."""
+        columns, rows = self.squares_wh
+        return {"grid": columns * rows, "charuco": columns * rows // 2, "chessboard": 0}[self.kind]
+
+    @property
+    def least_corners(self) -> int:
+        """Smallest number of corners of a view that counts."""
+        return min(LEAST_CORNERS, self.num_corners)
 
     @cached_property
     def corners_m(self) -> Float[np.ndarray, "corners 3"]:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.calibration.board_corners import LEAST_CORNERS
 from psotrack.calibration.boards import Board
 from psotrack.calibration.rig.adjustment import LensChoice, calibrate_rig
 from psotrack.calibration.rig.images import CameraImages, instants_of_numbers
@@ -111,7 +110,7 @@ def lens_of_board(
     if len(views.number) < _MIN_VIEWS:
         raise InputError(
             images.path,
-            expected=f"at least {_MIN_VIEWS} frames that show {LEAST_CORNERS} corners of the board",
+            expected=f"at least {_MIN_VIEWS} frames that show {board.least_corners} corners of the board",
             found=f"{len(views.number)}",
             remedy="move the board nearer, and hold it still for a moment in each place",
         )

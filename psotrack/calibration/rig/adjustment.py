@@ -13,7 +13,6 @@ from math import log
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.calibration.board_corners import LEAST_CORNERS
 from psotrack.calibration.boards import Board
 from psotrack.calibration.derivatives import centre_by_pose
 from psotrack.calibration.residuals import GATE
@@ -106,7 +105,7 @@ def calibrate_rig(
         InputError: a camera sees too little of the board, no views join the cameras, the views do not determine the
             rig, or the board is not seen at the instant `floor`.
     """
-    _check_views(views, lenses)
+    _check_views(board, views, lenses)
     models, vectors, lens_of = _start_lenses(board, views, lenses)
     chain = join_cameras(board, views, tuple(models[k] for k in lens_of), tuple(vectors[k] for k in lens_of))
     views = _relabelled(board, views, chain)
@@ -115,13 +114,13 @@ def calibrate_rig(
     return _result(board, views, chain, bundle)
 
 
-def _check_views(views: BoardViews, lenses: LensChoice) -> None:
+def _check_views(board: Board, views: BoardViews, lenses: LensChoice) -> None:
     for name, count in zip(views.names, views.seen.sum(axis=1).tolist(), strict=True):
         least = _LEAST_VIEWS_KNOWN if name in (lenses.known or {}) or lenses.is_shared else _LEAST_VIEWS
         if count < least:
             raise InputError(
                 f"camera {name}",
-                expected=f"at least {least} views of {LEAST_CORNERS} corners of the board",
+                expected=f"at least {least} views of {board.least_corners} corners of the board",
                 found=f"{count}",
                 remedy="film the board nearer, or pass the camera's lens with --lenses",
             )
@@ -245,7 +244,7 @@ def _adjust_with_slips(bundle: RigBundle, board: Board) -> RigBundle:
         distances = bundle.own_distance_px
         noise_px = np.array(list(map(_noise_px, distances)))
         used = tuple(
-            _inliers(one, distance <= GATE * noise)
+            _inliers(one, distance <= GATE * noise, board.least_corners)
             for one, distance, noise in zip(seen, distances, noise_px, strict=True)
         )
         widths = slips.std
@@ -269,11 +268,11 @@ def _noise_px(distance_px: Float[np.ndarray, " seen"]) -> float:
     return max(LEAST_NOISE_PX, float(np.median(distance_px)) / np.sqrt(2 * log(2)))
 
 
-def _inliers(seen: CameraCorners, near: Bool[np.ndarray, " seen"]) -> Bool[np.ndarray, " seen"]:
+def _inliers(seen: CameraCorners, near: Bool[np.ndarray, " seen"], least: int) -> Bool[np.ndarray, " seen"]:
     """Corners near their projections, without the views of which too few are."""
     count = np.bincount(seen.instant, minlength=1)
     left = np.bincount(seen.instant, weights=near, minlength=1)
-    is_good = (left >= LEAST_CORNERS) & (2 * left > count)
+    is_good = (left >= least) & (2 * left > count)
     return near & is_good[seen.instant]
 
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from psotrack.calibration.board_corners import LEAST_CORNERS, choose_spread, outline_of
+from psotrack.calibration.board_corners import choose_spread, outline_of
 from psotrack.calibration.boards import Board
 from psotrack.calibration.rig.equations import CameraCorners, RigBundle, RigProblem, RigState, solve_robustly
 from psotrack.calibration.rig.lens_models import PINHOLE, LensModel
@@ -33,7 +33,7 @@ def find_board_poses(
     found: list[tuple[float, np.ndarray]] = []
     for order in board.labellings:
         seen = np.isfinite(rays[:, 0])
-        if seen.sum() < LEAST_CORNERS:
+        if seen.sum() < board.least_corners:
             break
         points_m, ends = board.corners_m[order][seen], np.ascontiguousarray(rays[seen])
         try:

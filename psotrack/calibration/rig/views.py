@@ -9,9 +9,8 @@ from itertools import islice
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from psotrack.calibration.board_corners import LEAST_CORNERS
 from psotrack.calibration.board_recognition import Recognised, explain_missing_board, recognise_board
-from psotrack.calibration.boards import Board
+from psotrack.calibration.boards import LEAST_CORNERS, Board
 from psotrack.calibration.rig.images import CameraImages
 from psotrack.errors import InputError
 from psotrack.support import Report, no_progress
@@ -39,7 +38,8 @@ class BoardViews:
     @property
     def seen(self) -> Bool[np.ndarray, "cameras instants"]:
         """(cameras, instants), True where a camera sees enough corners."""
-        return np.isfinite(self.corners_px[..., 0]).sum(axis=-1) >= LEAST_CORNERS
+        least = min(LEAST_CORNERS, self.corners_px.shape[2])
+        return np.isfinite(self.corners_px[..., 0]).sum(axis=-1) >= least
 
     def select(self, instants: Bool[np.ndarray, " instants"]) -> BoardViews:
         """Views of chosen instants."""

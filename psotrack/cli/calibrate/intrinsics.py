@@ -35,6 +35,7 @@ def intrinsics(
     marker_m: float | None,
     separation_m: float | None,
     dictionary: str,
+    first_marker: int,
     lens: str,
     name: str | None,
     out: Path,
@@ -59,7 +60,7 @@ def intrinsics(
     refuse_to_overwrite(out, force)
     if squares_wh is None:
         raise SettingsError("board", expected="--squares, the number of squares", found="none")
-    board = board_of(kind, squares_wh, square_m, marker_m, separation_m, dictionary)
+    board = board_of(kind, squares_wh, square_m, marker_m, separation_m, dictionary, first_marker)
     (images,) = open_images([video], [name] if name else None)
     found = lens_of_board(images, board, parse_lens_model(lens), report_to(quiet))
     # A rig.toml can say that the camera's place is not known; the other formats place it at the origin.

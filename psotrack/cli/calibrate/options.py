@@ -57,7 +57,7 @@ def board_options() -> Any:
             "kind",
             type=click.Choice(["charuco", "chessboard", "grid"]),
             help="Kind of the board; a grid is one of ArUco markers or AprilTags.  "
-            "[default: grid with --separation, charuco with --marker, else chessboard]",
+            "[default: grid with --separation or --squares 1x1, charuco with --marker, else chessboard]",
         ),
         click.option(
             "--squares",
@@ -72,6 +72,13 @@ def board_options() -> Any:
             "--separation", "separation_m", type=float, help="Gap between the markers of a grid in metres."
         ),
         dictionary_option(),
+        click.option(
+            "--first-marker",
+            type=click.IntRange(min=0),
+            default=0,
+            show_default=True,
+            help="Number of the first marker of a grid; the others count on from it, row by row.",
+        ),
     ]
 
     def decorate(command: Any) -> Any:
@@ -89,20 +96,25 @@ def board_of(
     marker_m: float | None,
     separation_m: float | None,
     dictionary: str,
+    first_marker: int,
 ) -> Board:
     """The board of the options."""
     from psotrack.calibration import Board
 
     if kind is None:
-        kind = "grid" if separation_m is not None else "charuco" if marker_m is not None else "chessboard"
+        is_grid = separation_m is not None or squares_wh == (1, 1)
+        kind = "grid" if is_grid else "charuco" if marker_m is not None else "chessboard"
     if kind == "grid":
+        if marker_m is not None and squares_wh == (1, 1):
+            # A single marker has no gap to another one.
+            separation_m = 0.0
         if marker_m is None or separation_m is None:
             raise SettingsError(
                 "board",
                 expected="--marker and --separation of a grid",
                 found="--marker only" if marker_m else "no --marker",
             )
-        return Board(squares_wh, marker_m + separation_m, marker_m, dictionary, "grid")
+        return Board(squares_wh, marker_m + separation_m, marker_m, dictionary, "grid", first_marker)
     if square_m is None:
         raise SettingsError("board", expected="--square, the side of a square in metres", found="none")
     if kind == "chessboard":

@@ -97,6 +97,7 @@ def rig(
     marker_m: float | None,
     separation_m: float | None,
     dictionary: str,
+    first_marker: int,
     lens: str,
     same_lens: bool,
     lenses_path: Path | None,
@@ -127,6 +128,7 @@ def rig(
       psotrack calibrate rig cam_0.mp4 cam_1.mp4 --squares 4x5 --square 0.054 --marker 0.0405 --out rig.toml
       psotrack calibrate rig left right --squares 10x7 --square 0.025 --floor 0 --out rig.toml
       psotrack calibrate rig a b --squares 6x6 --marker 0.09 --separation 0.03 --dictionary apriltag_36h11 --out r.toml
+      psotrack calibrate rig a b --squares 1x1 --marker 0.2 --first-marker 7 --lenses lenses.toml --out rig.toml
       psotrack calibrate rig SEQ --points --lenses lenses.toml --distance left,right=4.20 --out rig.toml
       psotrack calibrate rig --pairs pairs.csv --lenses lenses.toml --out rig.toml
     """
@@ -158,7 +160,7 @@ def rig(
         _write(out, found, force)
         show_cameras(points, out, quiet, json_path, force, sentences)
         return
-    board = board_of(kind, squares_wh, square_m, marker_m, separation_m, dictionary)
+    board = board_of(kind, squares_wh, square_m, marker_m, separation_m, dictionary, first_marker)
     lenses = _lenses(lens, same_lens, lenses_path)
     calibrated, said = _by_board(sources, names, board, lenses, floor, quiet, json_path)
     if world is None:
