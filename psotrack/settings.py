@@ -269,6 +269,8 @@ class StatusSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields
         min_cameras_to_begin: number of cameras, at different places, that must agree to begin a track; None: three
             where at least three cameras have the place in view, else two.
         max_coasting_s: seconds for which a drone that is not found coasts on its prediction before it is lost.
+        max_coasting_std_m: largest standard deviation, along the worst axis, of a position that the projection lines
+            state for a drone that is not found, metres; a drone seen by one camera alone may coast for long.
 
     Raises:
         SettingsError: a value is not allowed.
@@ -279,6 +281,7 @@ class StatusSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields
     min_cameras: int = 2
     min_cameras_to_begin: int | None = None
     max_coasting_s: float = 0.5
+    max_coasting_std_m: float = 0.5
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -287,6 +290,7 @@ class StatusSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields
             _check_least("status.min_cameras_to_begin", self.min_cameras_to_begin, 2)
         _check_range("status.min_fitness", self.min_fitness, 0.0, 1.0)
         _check_range("status.max_coasting_s", self.max_coasting_s, 0.0)
+        check_positive("status.max_coasting_std_m", self.max_coasting_std_m)
 
 
 class IdentitySettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):

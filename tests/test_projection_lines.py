@@ -57,8 +57,8 @@ def simulate_detections(truth_m, *, jitter=0.0, missed=0.0, false_alarms=0.0, se
     return found
 
 
-def line_settings(count=None):
-    return LineSettings(MotionSettings(), DroneSettings(count=count), StatusSettings(), spread_m=0.05)
+def line_settings(count=None, **status):
+    return LineSettings(MotionSettings(), DroneSettings(count=count), StatusSettings(**status), spread_m=0.05)
 
 
 def track(truth_m, count=None, known=None, **noise):
@@ -241,6 +241,15 @@ def test_one_camera_keeps_a_track_on_its_line_of_sight():
     assert np.linalg.eigvalsh(covariance_m2)[:, -1].max() <= 0.5**2
     # 0.1 % of a chi-squared distribution of three degrees of freedom is above 16.3; the rows share one error.
     assert (np.einsum("fi,fij,fj->f", off_m, np.linalg.inv(covariance_m2), off_m) < 16.3).all()
+    # A smaller limit states the first of these rows only.
+    settings = line_settings(max_coasting_std_m=0.1)
+    sure = track_detections(
+        pair.cameras, from_detections(detections, pair, FRAMES), settings, fps=FPS, bounds_m=ROOM_M
+    )
+    stated = np.isfinite(sure.position_m[alone, 0]).all(axis=-1)
+    assert stated[0]
+    assert not stated[-1]
+    np.testing.assert_array_equal(sure.position_m[alone, 0][stated], tracks.position_m[alone, 0][stated])
 
 
 def test_a_single_view_must_be_much_more_probable_than_a_false_alarm():

@@ -10,10 +10,11 @@ from psotrack.projection_lines.tracks import Track, TrackRow
 from psotrack.trajectories import Arrival, DroneSizes, Status, Tracks
 
 
-def as_tracks(tracks: list[Track], num_frames: int) -> Tracks:
+def as_tracks(tracks: list[Track], num_frames: int, max_coasting_std_m: float) -> Tracks:
     """All tracks of drones in arrays; several tracks may be of one drone.
 
-    Sizes are the sizes of the boxes. Their standard errors are unknown: NaN.
+    Sizes are the sizes of the boxes. Their standard errors are unknown: NaN. Positions of drones that are not found
+    are left out where they are too uncertain (`StatusSettings.max_coasting_std_m`).
     """
     num_drones = len({track.drone for track in tracks})
     shape = (num_frames, num_drones)
@@ -47,7 +48,7 @@ def as_tracks(tracks: list[Track], num_frames: int) -> Tracks:
     for track in by_start:
         assert track.drone is not None
         for row in track.rows:
-            if row.is_vague:
+            if row.is_vague(max_coasting_std_m):
                 continue
             _write(arrays, row, (row.frame, track.drone))
     return arrays

@@ -93,7 +93,7 @@ def track_detections(
             for frame in range(sightings.num_frames):
                 tracker.step(frame, sightings.at(frame))
                 advance(1)
-    return as_tracks(tracker.tracks_of_drones(), sightings.num_frames)
+    return as_tracks(tracker.tracks_of_drones(), sightings.num_frames, settings.status.max_coasting_std_m)
 
 
 def _density_px2(cameras: Camera, sightings: Sightings) -> Float[np.ndarray, "cameras"]:

@@ -11,8 +11,6 @@ from psotrack.initiation import LostTracks, TrackCandidate
 
 #: Number of last frames from which a drone's present width is taken: a drone looks wider or narrower as it turns.
 SPAN_FRAMES = 25
-#: A drone that is not found has no stated position where the standard deviation along the worst axis is larger, metres.
-LARGEST_COASTING_STD_M = 0.5
 
 
 @dataclass(frozen=True)
@@ -48,11 +46,10 @@ class TrackRow:
     num_in_view: int
     measured: Measurement | None
 
-    @property
-    def is_vague(self) -> bool:
-        """Whether the drone was not found and its position is too uncertain to be stated."""
+    def is_vague(self, max_coasting_std_m: float) -> bool:
+        """Whether the drone was not found, and its position has a larger standard deviation along the worst axis."""
         largest_m2 = float(np.linalg.eigvalsh(self.covariance_m2)[-1])
-        return self.measured is None and largest_m2 > LARGEST_COASTING_STD_M**2
+        return self.measured is None and largest_m2 > max_coasting_std_m**2
 
     @property
     def share(self) -> float:
