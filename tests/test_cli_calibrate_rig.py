@@ -10,6 +10,7 @@ from click.testing import CliRunner
 from psotrack.cli.calibrate import calibrate
 from psotrack.errors import PsotrackError
 from psotrack.geometry import project
+from psotrack.recordings import Detections, write_detections
 from psotrack.rig_files import read_rig, write_rig
 
 RIG = row_of_cameras(3)
@@ -99,6 +100,42 @@ def test_a_moving_point_and_one_length(tmp_path, lenses):
     )
     assert "expected the two ends of a stick, told apart by a column named point" in refused(
         *start, "--stick", "0.5", *out
+    )
+
+
+@pytest.mark.slow
+def test_a_moving_point_before_cameras_with_clocks_of_their_own(tmp_path, lenses):
+    """Frames of equal number are of different times: other rates, another start, a rolling shutter."""
+    lines = ["version = 1"]
+    for index, (fps, start_s, line_s) in enumerate(
+        [(25.0, 0.0, 0.0), (30.0, -0.4, 0.0), (50.0, 0.013, 2e-5)]
+    ):
+        time_s = start_s + np.arange(round(20 * fps)) / fps
+        for _ in range(3):
+            # The row in which the point is seen says when the row was exposed.
+            pixels = project(RIG.cameras[index], smooth(time_s))[0]
+            time_s = start_s + np.arange(len(time_s)) / fps + line_s * pixels[:, 1]
+        boxes = np.concatenate([pixels - 4, pixels + 4], axis=1) + 0.5
+        seen = Detections(np.arange(len(boxes)), boxes, np.ones(len(boxes)))
+        write_detections(tmp_path / f"{RIG.names[index]}.csv", seen)
+        lines += [
+            f"[cameras.{RIG.names[index]}]",
+            f'detections = "{RIG.names[index]}.csv"',
+            "size = [1280, 720]",
+            f"fps = {fps}\ntime_offset_s = {start_s}\nline_time_s = {line_s}",
+        ]
+    recording = write_lines(tmp_path / "recording.toml", lines)
+    apart = np.linalg.norm(CENTRES[0] - CENTRES[2])
+    given = ("--points", "--lenses", lenses, "--distance", f"c0,c2={apart}", "--out", tmp_path / "rig.toml")
+    run(recording, *given)
+    # Half an interval of 20 ms at 1 m/s is 10 mm, and moves the cameras by more than that; boxes are whole pixels.
+    np.testing.assert_allclose(gaps(read_rig(tmp_path / "rig.toml")), gaps(RIG), atol=0.005)
+
+
+def smooth(time_s):
+    """Positions of a point that flies through the room at about 1 m/s."""
+    return np.stack(
+        [0.8 * np.sin(time_s), 0.8 * np.cos(0.7 * time_s), 1.1 + 0.5 * np.sin(1.31 * time_s)], axis=-1
     )
 
 

@@ -7,17 +7,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from psotrack.calibration.image_points import ImagePoints, read_image_points
 from psotrack.calibration.rig.moving_point import PointRig, PointViews
 from psotrack.calibration.rig.world import LEAST_POINTS, Similarity, align
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import Rig, triangulate_linearly
-from psotrack.recordings import Detections
+from psotrack.recordings import Detections, FrameTimes, make_timeline
 from psotrack.support import read_table
 
 _SEPARATOR = ","
+#: Longest time between two frames between which a point is interpolated, in intervals of the camera: one frame in which
+#: the point was missed lies between them.
+_LONGEST_GAP = 2.5
+#: Shares of an interval below this are rounding.
+_SAME = 1e-6
 
 
 def read_point_views(path: Path | str) -> PointViews:
@@ -63,28 +68,86 @@ def read_point_views(path: Path | str) -> PointViews:
     )
 
 
-def views_of_detections(detections: Mapping[str, Detections]) -> PointViews:
+def views_of_detections(
+    detections: Mapping[str, Detections],
+    frame_times: Mapping[str, FrameTimes] | None = None,
+    line_time_s: Mapping[str, float] | None = None,
+) -> PointViews:
     """Sightings from the middles of boxes: of each frame the box of highest confidence, if it is only one.
 
+    Args:
+        detections: boxes by camera name.
+        frame_times: when the frames were exposed, by camera name. Instants are those of `make_timeline`, and a camera's
+            pixel at an instant is interpolated between its frames before and after, which errs by at most an
+            eighth of the change of the point's speed, in pixels per frame, from frame to frame. None: frames of
+            equal number are one instant.
+        line_time_s: times from the exposure of one row to that of the next row by camera name, seconds.
+
     Raises:
-        InputError: fewer than two cameras have detections.
+        InputError: fewer than two cameras have detections, or the times of a camera's frames are not known.
     """
     if len(detections) < 2:
         raise InputError("detections", expected="at least two cameras", found=f"{len(detections)}")
     names = tuple(detections)
-    numbers = np.unique(np.concatenate([boxes.frame for boxes in detections.values()])).astype(np.int64)
-    points_px = np.full((len(numbers), len(names), 2), np.nan)
-    for index, boxes in enumerate(detections.values()):
-        # The last of a frame's boxes is the one of highest confidence.
-        order = np.lexsort((boxes.confidence, boxes.frame))
-        frame, confidence = boxes.frame[order], boxes.confidence[order]
-        is_last = np.append(frame[1:] != frame[:-1], True)
-        is_tied = np.append(False, (frame[1:] == frame[:-1]) & (confidence[1:] == confidence[:-1]))
-        chosen = order[is_last & ~is_tied]
-        # Pixel centres are at whole numbers, and edges of boxes are half a pixel away from pixel centres.
-        middle = (boxes.xyxy[chosen, :2] + boxes.xyxy[chosen, 2:]) / 2 - 0.5
-        points_px[np.searchsorted(numbers, boxes.frame[chosen]), index] = middle
+    seen = [_middles(boxes) for boxes in detections.values()]
+    if frame_times is None:
+        numbers = np.unique(np.concatenate([frame for frame, _ in seen])).astype(np.int64)
+        points_px = np.full((len(numbers), len(names), 2), np.nan)
+        for index, (frame, middle_px) in enumerate(seen):
+            points_px[np.searchsorted(numbers, frame), index] = middle_px
+    else:
+        unknown = [name for name in names if name not in frame_times]
+        if unknown:
+            raise InputError(
+                f"camera {unknown[0]}", expected="times of its frames", found="none", remedy="state its fps"
+            )
+        timeline = make_timeline({name: frame_times[name] for name in names})
+        numbers = np.arange(timeline.num_instants)
+        points_px = np.full((len(numbers), len(names), 2), np.nan)
+        for index, (name, (frame, middle_px)) in enumerate(zip(names, seen, strict=True)):
+            times = frame_times[name]
+            is_there = frame < times.num_frames
+            frame, middle_px = frame[is_there], middle_px[is_there]
+            time_s = times.time_s[frame] + (line_time_s or {}).get(name, 0.0) * middle_px[:, 1]
+            points_px[:, index] = _at_times(timeline.time_s, time_s, middle_px, _LONGEST_GAP / times.fps)
     return PointViews(names, np.zeros(len(numbers), np.int64), numbers, points_px)
+
+
+def _middles(boxes: Detections) -> tuple[Int[np.ndarray, " frames"], Float[np.ndarray, "frames 2"]]:
+    """Numbers of the frames, and the pixel of the middle of the best box of each."""
+    # The last of a frame's boxes is the one of highest confidence.
+    order = np.lexsort((boxes.confidence, boxes.frame))
+    frame, confidence = boxes.frame[order], boxes.confidence[order]
+    is_last = np.append(frame[1:] != frame[:-1], True)
+    is_tied = np.append(False, (frame[1:] == frame[:-1]) & (confidence[1:] == confidence[:-1]))
+    chosen = order[is_last & ~is_tied]
+    # Pixel centres are at whole numbers, and edges of boxes are half a pixel away from pixel centres.
+    middle_px = (boxes.xyxy[chosen, :2] + boxes.xyxy[chosen, 2:]) / 2 - 0.5
+    return boxes.frame[chosen].astype(np.int64), middle_px
+
+
+def _at_times(
+    wanted_s: Float[np.ndarray, " wanted"],
+    time_s: Float[np.ndarray, " frames"],
+    point_px: Float[np.ndarray, "frames 2"],
+    longest_s: float,
+) -> Float[np.ndarray, "wanted 2"]:
+    """(wanted, 2), pixels at the wanted times, interpolated linearly; NaN in gaps longer than `longest_s`."""
+    found = np.full((len(wanted_s), 2), np.nan)
+    if len(time_s) < 2:
+        return found
+    order = np.argsort(time_s, kind="stable")
+    time_s, point_px = time_s[order], point_px[order]
+    after = np.clip(np.searchsorted(time_s, wanted_s), 1, len(time_s) - 1)
+    gap_s = time_s[after] - time_s[after - 1]
+    share = (wanted_s - time_s[after - 1]) / np.maximum(gap_s, 1e-9)
+    between = (share > -_SAME) & (share < 1 + _SAME) & (gap_s <= longest_s)
+    # Where the wanted time is that of a frame, the gap beside the frame does not matter.
+    exact = (np.abs(share) < _SAME) | (np.abs(share - 1) < _SAME)
+    usable = between | exact
+    pixel = point_px[after - 1] + share[:, None] * (point_px[after] - point_px[after - 1])
+    found[usable] = pixel[usable]
+    return found
 
 
 def stick_length(point_rig: PointRig) -> float:

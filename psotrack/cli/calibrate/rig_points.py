@@ -225,4 +225,8 @@ def _read_views(sources: tuple[Path, ...]) -> PointViews:
     recording = open_recording(sources[0])
     if not recording.detections:
         raise InputError(sources[0], expected="detections of a moving point", found="none")
-    return views_of_detections({name: read_detections(path) for name, path in recording.detections.items()})
+    boxes = {name: read_detections(path) for name, path in recording.detections.items()}
+    if not any(name in recording.frame_times for name in boxes):
+        # Detections without any times, as in a folder of the dataset without videos.
+        return views_of_detections(boxes)
+    return views_of_detections(boxes, recording.frame_times, recording.line_time_s)
