@@ -18,13 +18,16 @@ from psotrack.calibration import (
     find_views,
     instants_of_numbers,
     open_images,
+    open_recorded,
     say_print,
 )
 from psotrack.calibration.board_corners import BoardFinder
 from psotrack.calibration.board_recognition import explain_missing_board, recognise_board
 from psotrack.cli.calibrate import calibrate
+from psotrack.datasets import open_recording
 from psotrack.errors import InputError, PsotrackError, SettingsError
-from psotrack.rig_files import read_rig
+from psotrack.geometry import make_camera, make_rig
+from psotrack.rig_files import read_rig, write_rig
 
 SIZE_WH = (640, 480)
 K = np.array([[620.0, 0, 322.0], [0, 620.0, 236.0], [0, 0, 1]])
@@ -162,6 +165,24 @@ def test_cameras_from_paths(tmp_path):
         open_images([tmp_path / "top*.png"])
     with pytest.raises(SettingsError, match="2 names, found 1"):
         open_images([tmp_path / "left" / "board", tmp_path / "right" / "board"], ["a"])
+
+
+def test_cameras_of_a_recording_need_no_place(tmp_path):
+    """A camera that is new in the rig is calibrated with those that have a place already."""
+    for name in ("old", "new"):
+        video = cv2.VideoWriter(str(tmp_path / f"{name}.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 25, (64, 48))
+        for _ in range(3):
+            video.write(np.zeros((48, 64, 3), np.uint8))
+        video.release()
+    placed = make_camera(R=np.eye(3), t_m=np.zeros(3), K=np.diag([60.0, 60.0, 1.0]), image_size_wh=(64, 48))
+    write_rig(tmp_path / "rig.toml", make_rig({"old": placed}))
+    (tmp_path / "recording.toml").write_text(
+        'version = 1\ncalibration = "rig.toml"\n[cameras.old]\nvideo = "old.avi"\n[cameras.new]\nvideo = "new.avi"\n'
+    )
+    cameras, (number, frames) = open_recorded(open_recording(tmp_path))
+    assert [camera.name for camera in cameras] == ["old", "new"]
+    np.testing.assert_array_equal(number, [0, 1, 2])
+    np.testing.assert_array_equal(frames, [[0, 0], [1, 1], [2, 2]])
 
 
 def test_a_camera_that_never_sees_the_board(tmp_path):

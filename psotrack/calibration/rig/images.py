@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Int, UInt8
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.recordings import Recording, VideoInfo, probe, read_frames
+from psotrack.recordings import Recording, VideoInfo, make_timeline, probe, read_frames
 
 _IMAGES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"})
 _PATTERN = re.compile(r"[*?\[]")
@@ -130,18 +130,18 @@ def open_recorded(recording: Recording) -> tuple[tuple[CameraImages, ...], tuple
     Raises:
         InputError: no camera has a video.
     """
-    names = [name for name in recording.timeline().cameras if name in recording.videos]
+    names = list(recording.videos)
     if not names:
         raise InputError(recording.folder, expected="videos or images of a board", found="none")
     cameras = tuple(
         CameraImages(name, video.path, video.image_size_wh, np.arange(video.num_frames), video)
         for name, video in ((name, recording.videos[name]) for name in names)
     )
-    timeline = recording.timeline()
-    columns = [timeline.cameras.index(name) for name in names]
+    # Not the timeline of the recording, which has only the cameras that are placed.
+    timeline = make_timeline({name: recording.frame_times[name] for name in names}, recording.rate_hz)
     step = max(1, -(-timeline.num_instants // MOST_INSTANTS))
     number = np.arange(0, timeline.num_instants, step)
-    return cameras, (number, timeline.frame[number][:, columns].astype(np.int64))
+    return cameras, (number, timeline.frame[number].astype(np.int64))
 
 
 def instants_of_numbers(
