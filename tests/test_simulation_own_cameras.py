@@ -13,7 +13,7 @@ from psotrack.geometry import look_at, make_camera, project
 from psotrack.recordings import probe
 from psotrack.rig_files import read_rig
 from psotrack.simulation import OWN_CAMERAS, SimulationSettings, simulate_own_cameras
-from psotrack.simulation.imaging.lens import lens_warp
+from psotrack.simulation.imaging.lens_image import lens_image
 from psotrack.simulation.imaging.posed_board import PosedBoard, board_poses, draw_board, own_board
 from psotrack.simulation.imaging.raster import pinhole
 from psotrack.simulation.own_cameras import own_rig
@@ -31,13 +31,15 @@ def board(turn_deg=(0.0, 0.0)):
     return PosedBoard(R.T, np.array([-0.35, 0.0, 1.7]))
 
 
+def grey_image(cam):
+    return np.full((cam.height, cam.width, 3), 90, np.uint8)
+
+
 def test_the_board_is_where_opencv_projects_it():
-    """Drawn into the pinhole image and bent by the lens, against `projectPoints` with distortion."""
+    """Drawn into the images of which the lens's image consists, against `projectPoints` with distortion."""
     camera, places = lens(), board((15.0, 0.0))
-    warp = lens_warp(camera)
-    width, height = (int(side) for side in warp.pinhole.image_size_wh)
-    grey = np.full((height, width, 3), 90, np.uint8)
-    image = warp.bend(draw_board(grey, pinhole(warp.pinhole), places))
+    seen = lens_image(camera)
+    image = seen.assemble([draw_board(grey_image(cam), cam, places) for cam in seen.faces])
     assert image.shape == (480, 640, 3)
     found, ids, *_ = cv2.aruco.CharucoDetector(own_board().opencv()).detectBoard(image)
     on_board = own_board().corners_m[np.asarray(ids).ravel()]
@@ -49,8 +51,8 @@ def test_the_board_is_where_opencv_projects_it():
 
 
 def test_the_back_of_the_board_shows_nothing_and_a_board_behind_the_camera_is_not_seen():
-    cam, places = pinhole(lens_warp(lens()).pinhole), board()
-    grey = np.full((cam.height, cam.width, 3), 90, np.uint8)
+    cam, places = pinhole(lens()), board()
+    grey = grey_image(cam)
     turned = PosedBoard(places.axes * [-1, 1, -1], places.corner_m + places.axes[:, 0])
     seen = draw_board(grey, cam, turned)
     assert set(np.unique(seen)) <= set(range(90, 121))

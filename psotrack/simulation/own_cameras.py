@@ -25,7 +25,6 @@ from psotrack.recordings import VideoWriter
 from psotrack.rig_files import write_rig
 from psotrack.simulation import scenarios
 from psotrack.simulation.generate import SimulationSettings
-from psotrack.simulation.imaging.lens import LensWarp, lens_warp
 from psotrack.simulation.imaging.posed_board import PosedBoard, board_poses, draw_board, own_board
 from psotrack.simulation.imaging.renderer import CameraRenderer
 from psotrack.simulation.imaging.sensor import Sensor
@@ -194,31 +193,30 @@ class _Work:
 
 
 class _OwnRenderer:
-    """Draws the images of one camera: those of a larger pinhole camera, bent by the lens."""
+    """Draws the images of one camera."""
 
     def __init__(self, work: _Work) -> None:
         one, lens = OWN_CAMERAS[work.index], work.rig.cameras[work.index]
-        self.warp: LensWarp = lens_warp(lens)
         scenario = msgspec.structs.replace(work.scene.scenario, fps=one.fps)
-        wide = make_rig({one.name: self.warp.pinhole})
-        self.scene = replace(work.scene, scenario=scenario, rig=wide, start_s=one.start_s)
+        own = make_rig({one.name: lens})
+        self.scene = replace(work.scene, scenario=scenario, rig=own, start_s=one.start_s)
         self.renderer = CameraRenderer(self.scene, 0)
         width, height = (int(side) for side in lens.image_size_wh)
         self.size_wh = (width, height)
-        shape = (height, width)
-        imaging, seed = scenario.imaging, work.scene.seed
+        # The renderer's own sensor has the random numbers of the first camera of a rig.
+        imaging, seed, shape = scenario.imaging, work.scene.seed, (height, width)
         self.sensor = Sensor(imaging, seed, work.index, shape)
         self.board_sensor = Sensor(imaging, seed, _BOARD_STREAM + work.index, shape)
 
     def flight(self, frame: int) -> UInt8[np.ndarray, "height width 3"]:
         """Image of a frame of the flight."""
-        image = self.warp.bend(self.renderer.clean_frame(frame))
-        return self.sensor.expose(image, frame, self.scene.time_s(frame))
+        return self.sensor.expose(self.renderer.clean_frame(frame), frame, self.scene.time_s(frame))
 
     def board(self, number: int, board: PosedBoard) -> UInt8[np.ndarray, "height width 3"]:
         """Image of the room with the board in one place."""
-        image = draw_board(self.renderer.empty_room(), self.renderer.cam, board)
-        return self.board_sensor.expose(self.warp.bend(image), number, number / BOARD_FPS)
+        views = [draw_board(view.empty_room(), view.cam, board) for view in self.renderer.views]
+        image = self.renderer.assemble(views)
+        return self.board_sensor.expose(image, number, number / BOARD_FPS)
 
 
 def _draw(work: _Work, advance: Advance) -> None:

@@ -6,6 +6,8 @@ more views without distortion, from which its image is put together before the s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import UInt8
 
@@ -46,12 +48,14 @@ class CameraRenderer:
 
     def clean_frame(self, frame: int) -> Image:
         """(height, width, 3), BGR image of a frame without the effects of the sensor."""
-        images = [view.clean_frame(frame) for view in self.views]
-        return images[0] if self.lens is None else self.lens.assemble(images)
+        return self.assemble([view.clean_frame(frame) for view in self.views])
 
     def empty_room(self) -> Image:
         """(height, width, 3), BGR image of the room without drones and without the effects of the sensor."""
-        images = [view.empty_room() for view in self.views]
+        return self.assemble([view.empty_room() for view in self.views])
+
+    def assemble(self, images: Sequence[UInt8[np.ndarray, "_ _ 3"]]) -> Image:
+        """(height, width, 3), the image of the camera, from the images of its views; their sizes may differ."""
         return images[0] if self.lens is None else self.lens.assemble(images)
 
     def frame(self, frame: int) -> Image:
