@@ -427,8 +427,8 @@ def test_files_are_converted(tmp_path):
     )
     write_rig(tmp_path / "wide.toml", ring_rig(2, coefficients=8))
     message = refused("convert", tmp_path / "wide.toml", tmp_path / "wide.csv")
-    assert "one focal length per camera and no skew" in message
-    assert "write rig.toml" in message
+    assert "camera c0: expected one focal length, found fx" in message
+    assert "write a rig.toml" in message
     result = CliRunner().invoke(calibrate, ["convert", "c.csv", "x.toml", "--size", "320"])
     assert result.exit_code == 2
     assert "expected two whole numbers above 0" in result.output

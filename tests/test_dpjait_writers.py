@@ -92,17 +92,26 @@ def test_the_header_is_the_published_one(tmp_path):
 
 
 def test_rigs_that_the_file_format_cannot_hold_are_refused(tmp_path):
+    """The message names the camera, not the first one but the one that the file cannot hold."""
     path = tmp_path / "cameras_calibration.csv"
-    pose = [(Rotation.identity(), (0.0, 0.0, 5.0))]
-    with pytest.raises(SettingsError, match="distortion by k1, k2, p1, p2 alone"):
-        dpjait.write_calibration(path, make_test_rig(pose, (0.1, 0.0, 0.0, 0.0, 0.01)))
-    dpjait.write_calibration(
-        path, make_test_rig(pose, (0.1, 0.0, 0.0, 0.0, 0.0))
-    )  # a fifth coefficient of zero can be left out
-    K = np.array([[1000, 0, 960], [0, 1001, 540], [0, 0, 1.0]])
-    two_focal_lengths = make_rig({"a": make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=SIZE_WH)})
-    with pytest.raises(SettingsError, match="one focal length per camera and no skew"):
-        dpjait.write_calibration(path, two_focal_lengths)
+
+    def lens(K, dist=(), fisheye=False):
+        return make_camera(
+            R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=SIZE_WH, dist=dist, fisheye=fisheye
+        )
+
+    plain = np.array([[1000, 0, 960], [0, 1000, 540], [0, 0, 1.0]])
+    sound = lens(plain, (0.1, 0.0, 0.0, 0.0, 0.0))
+    # A fifth coefficient of zero can be left out.
+    dpjait.write_calibration(path, make_rig({"a": sound}))
+    for other, message in (
+        (lens(plain, (0.1, 0.0, 0.0, 0.0, 0.01)), "distortion by k1, k2, p1, p2 alone, found 5 coefficients"),
+        (lens(plain + np.diag([0, 1.0, 0])), "one focal length, found fx 1000 and fy 1001"),
+        (lens(plain + np.eye(3, k=1) * [0, 2.5, 0]), "no skew, found 2.5"),
+        (lens(plain, fisheye=True), "OpenCV's pinhole model, found a fisheye"),
+    ):
+        with pytest.raises(SettingsError, match=rf"^camera GoPro 3: expected {message}; .*rig\.toml"):
+            dpjait.write_calibration(path, make_rig({"a": sound, "GoPro 3": other, "z": other}))
 
 
 def test_a_failed_write_leaves_the_file(tmp_path):

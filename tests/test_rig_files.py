@@ -118,7 +118,7 @@ def test_a_rig_in_the_datasets_layout_is_read_as_it_was_written(tmp_path):
 
 
 def test_a_rig_that_the_datasets_layout_cannot_hold_is_refused(tmp_path):
-    with pytest.raises(SettingsError, match="one focal length per camera and no skew"):
+    with pytest.raises(SettingsError, match="camera c0: expected one focal length, found fx"):
         write_rig(tmp_path / "rig.csv", ring_rig(2))
     assert not list(tmp_path.iterdir())
 

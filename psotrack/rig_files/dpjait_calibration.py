@@ -23,7 +23,9 @@ from psotrack.support import Column, Table, TextRow, read_table, write_rows
 METRES_PER_UNIT = {"m": 1.0, "mm": 1e-3}
 _RADIANS_PER_UNIT = {"rad": 1.0, "": 1.0, "deg": np.pi / 180}
 _MOST_COEFFICIENTS = 4
-_ADVICE = "write rig.toml, which holds every lens"
+_ADVICE = (
+    "this file cannot hold that lens: write a rig.toml (a name that ends in .toml), which holds every lens"
+)
 
 
 def read_camera_names(path: Path | str) -> tuple[str, ...]:
@@ -117,20 +119,21 @@ def _calibration_row(rig: Rig, index: int, unit: str, num_coefficients: int) -> 
 
 
 def _check_writable(rig: Rig) -> None:
-    if rig.cameras.fisheye is not None and np.any(rig.cameras.fisheye):
-        raise SettingsError("rig", expected="no fisheye", found="a fisheye", remedy=_ADVICE)
-    K = rig.cameras.K
-    if np.any(K[:, 0, 0] != K[:, 1, 1]) or np.any(K[:, 0, 1]):
-        raise SettingsError(
-            "rig",
-            expected="one focal length per camera and no skew",
-            found="cameras with other intrinsics",
-            remedy=_ADVICE,
-        )
-    if rig.cameras.dist[:, _MOST_COEFFICIENTS:].any():
-        raise SettingsError(
-            "rig", expected="distortion by k1, k2, p1, p2 alone", found="more coefficients", remedy=_ADVICE
-        )
+    for name, index in zip(rig.names, range(len(rig)), strict=True):
+        camera: Camera = rig.cameras[index]
+        K, extra = camera.K, camera.dist[_MOST_COEFFICIENTS:]
+        if camera.fisheye is not None and camera.fisheye:
+            expected, found = "OpenCV's pinhole model", "a fisheye"
+        elif K[0, 0] != K[1, 1]:
+            expected, found = "one focal length", f"fx {K[0, 0]:.10g} and fy {K[1, 1]:.10g}"
+        elif K[0, 1]:
+            expected, found = "no skew", f"{K[0, 1]:g}"
+        elif extra.any():
+            last = _MOST_COEFFICIENTS + int(np.flatnonzero(extra)[-1]) + 1
+            expected, found = "distortion by k1, k2, p1, p2 alone", f"{last} coefficients"
+        else:
+            continue
+        raise SettingsError(f"camera {name}", expected=expected, found=found, remedy=_ADVICE)
 
 
 def _intrinsics(table: Table, row: TextRow) -> Float[np.ndarray, "3 3"]:
