@@ -7,11 +7,13 @@ point to the convention of boxes. On an image reduced by the factor r, edges are
 A drone's extent is an ellipsoid whose axes are parallel to the world's axes. The box of an ellipsoid has a closed
 form: a plane u = const through the camera with normal n = (1, 0, -u) touches the ellipsoid of shape S centred at X
 (camera coordinates) where (n·X)² = nᵀ S n, a quadratic in u; likewise for v (Hartley & Zisserman 2004, section 8.3, on
-dual quadrics).
+dual quadrics). Of a lens with distortion, the planes u = const are those of its linearisation at the ellipsoid's
+middle, and the points where they touch the ellipsoid are projected through the lens itself.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import jax
@@ -21,6 +23,11 @@ from jaxtyping import Bool, Float
 from psotrack._typing import Array
 from psotrack.geometry.cameras import NEAR_M, Camera, distort
 from psotrack.geometry.lenses import is_one_to_one, lens_derivative, second_sheet
+
+#: Middle and half width of the interval between the tangents of an ellipsoid along one direction across the optical
+#: axis, in undistorted coordinates, from the middle's coordinate along the direction and two elements of the shape:
+#: along the direction and the axis, and along the direction twice.
+_Tangents = Callable[[Array, Array, Array], tuple[Array, Array]]
 
 
 @jax.tree_util.register_dataclass
@@ -66,10 +73,9 @@ class Extents:
         size_m: (..., 3), full lengths of the drones along the world's axes, metres.
         rotation: nine arrays of shape (cameras,), the rows of R one after the other.
         translation_m: three arrays of shape (cameras,), or (..., cameras) for ellipsoids with an offset, metres.
-        s_xx, s_yy, s_xz, s_yz, s_zz: (..., cameras), elements of the shape S = R diag(size / 2)² Rᵀ in camera
+        s_xx, s_xy, s_yy, s_xz, s_yz, s_zz: (..., cameras), elements of the shape S = R diag(size / 2)² Rᵀ in camera
             coordinates, m².
         f_x, f_y, skew, c_x, c_y: (cameras,), intrinsics in pixels; c_x and c_y in the convention of boxes.
-        shape_m2: (..., cameras, 3, 3), the whole shape S; None where no camera is a fisheye.
         beyond: (cameras,), radii of the lenses' folds (`lenses.second_sheet`); None without distortion.
     """
 
@@ -78,6 +84,7 @@ class Extents:
     rotation: tuple[Float[Array, "cameras"], ...]
     translation_m: tuple[Float[Array, "*#drones cameras"], ...]
     s_xx: Float[Array, "*drones cameras"]
+    s_xy: Float[Array, "*drones cameras"]
     s_yy: Float[Array, "*drones cameras"]
     s_xz: Float[Array, "*drones cameras"]
     s_yz: Float[Array, "*drones cameras"]
@@ -87,7 +94,6 @@ class Extents:
     skew: Float[Array, "cameras"]
     c_x: Float[Array, "cameras"]
     c_y: Float[Array, "cameras"]
-    shape_m2: Float[Array, "*drones cameras 3 3"] | None = None
     beyond: Float[Array, "cameras"] | None = None
 
 
@@ -113,6 +119,7 @@ def make_extents(
         rotation=tuple(R[:, i, j] for i in range(3) for j in range(3)),
         translation_m=tuple(t[..., i] for i in range(3)),
         s_xx=S[..., 0, 0],
+        s_xy=S[..., 0, 1],
         s_yy=S[..., 1, 1],
         s_xz=S[..., 0, 2],
         s_yz=S[..., 1, 2],
@@ -122,7 +129,6 @@ def make_extents(
         skew=K[:, 0, 1],
         c_x=K[:, 0, 2] + 0.5,
         c_y=K[:, 1, 2] + 0.5,
-        shape_m2=None if cameras.fisheye is None else S,
         beyond=second_sheet(cameras.dist, cameras.fisheye) if cameras.dist.shape[-1] else None,
     )
 
@@ -145,10 +151,10 @@ def moved_extents(seen: Extents, moved_m: Float[Array, "*drones cameras 3"]) -> 
 def project_boxes(seen: Extents, position_m: Float[Array, "*#drones 3"]) -> Boxes:
     """Boxes of drones at positions, in every camera.
 
-    Lens distortion is applied to the middles of the box's four sides. A drone covers a few degrees, where this box
-    equals the box of the distorted outline. In a fisheye, whose undistorted image stretches drones far from the axis,
-    the projection is linearised at the drone's middle instead. A drone that reaches beyond the fold of a lens has no
-    box, because the lens would show it where another drone is.
+    Without distortion the boxes are exact. With distortion they are those around four points of the drone's surface,
+    which are the outermost points for the lens as linearised at the drone's middle: exact up to the square of the
+    drone's angular size. A drone that reaches beyond the fold of a lens, or beyond 90 degrees off the axis, has no box,
+    because the lens would show a part of the drone where something else is.
 
     Args:
         seen: extents from `make_extents`; the leading axes broadcast against those of `position_m`.
@@ -175,54 +181,85 @@ def project_boxes(seen: Extents, position_m: Float[Array, "*#drones 3"]) -> Boxe
         root = jnp.sqrt(jnp.where(in_front, jnp.maximum(b * b - a * c, 1e-12), 1.0))
         return b / a, root / a
 
+    if seen.cameras.dist.shape[-1]:
+        return _distorted_boxes(seen, (x, y, jnp.where(in_front, z, 1.0)), in_front, tangents)
     (u, u_half), (v, v_half) = tangents(x, seen.s_xz, seen.s_xx), tangents(y, seen.s_yz, seen.s_yy)
-    if seen.cameras.dist.shape[-1] == 0:
-        x_middle, y_middle = seen.f_x * u + seen.skew * v + seen.c_x, seen.f_y * v + seen.c_y
-        return Boxes(x_middle, y_middle, seen.f_x * u_half, seen.f_y * v_half, in_front)
+    x_middle, y_middle = seen.f_x * u + seen.skew * v + seen.c_x, seen.f_y * v + seen.c_y
+    return Boxes(x_middle, y_middle, seen.f_x * u_half, seen.f_y * v_half, in_front)
 
-    def column(u: Array) -> Array:
-        bent_u, bent_v = distort(seen.cameras, u, v)
-        return seen.f_x * bent_u + seen.skew * bent_v + seen.c_x
 
-    def row(v: Array) -> Array:
-        return seen.f_y * distort(seen.cameras, u, v)[1] + seen.c_y
-
-    left, right, top, bottom = column(u - u_half), column(u + u_half), row(v - v_half), row(v + v_half)
-    is_shown = _is_shown(seen, (u, v), (u_half, v_half))
-    boxes = Boxes(
-        (left + right) / 2, (top + bottom) / 2, (right - left) / 2, (bottom - top) / 2, in_front & is_shown
+def _distorted_boxes(
+    seen: Extents, middle: tuple[Array, Array, Array], in_front: Array, tangents: _Tangents
+) -> Boxes:
+    """Boxes of ellipsoids with these middles in lenses with distortion."""
+    x, y, z = middle
+    xx, xy, yx, yy = lens_derivative(seen.cameras.dist, seen.cameras.fisheye, x / z, y / z)
+    slopes = (seen.f_x * xx + seen.skew * yx, seen.f_x * xy + seen.skew * yy), (yx, yy)
+    # Without the barriers, XLA computes the derivative again for each side, and the sides for each number of a box.
+    slopes = jax.lax.optimization_barrier(slopes)
+    columns, rows = (
+        [distort(seen.cameras, *point) for point in _outermost(seen, middle, in_front, tangents, slope)]
+        for slope in slopes
     )
-    if seen.cameras.fisheye is None:
-        return boxes
-    near = _linearised_boxes(seen, x, y, jnp.where(in_front, z, 1.0), boxes.in_front)
-    fisheye = jnp.asarray(seen.cameras.fisheye)
-    return jax.tree.map(lambda one, other: jnp.where(fisheye, one, other), near, boxes)
-
-
-def _is_shown(seen: Extents, middle: tuple[Array, Array], half: tuple[Array, Array]) -> Array:
-    """True where the part of an ellipsoid that is farthest from the optical axis is before the fold of the lens."""
-    radius = jnp.sqrt(middle[0] * middle[0] + middle[1] * middle[1]) + 1e-9
-    x, y = (at + reach * at / radius for at, reach in zip(middle, half, strict=True))
-    return jnp.asarray(is_one_to_one(seen.cameras.dist, seen.cameras.fisheye, x, y, seen.beyond))
-
-
-def _linearised_boxes(seen: Extents, x: Array, y: Array, z: Array, in_front: Array) -> Boxes:
-    """Boxes of ellipsoids with middles (x, y, z): the image of the shape S is J S Jᵀ, J the projection's derivative."""
-    u, v = x / z, y / z
-    bent_u, bent_v = distort(seen.cameras, u, v)
-    xx, xy, yx, yy = lens_derivative(seen.cameras.dist, seen.cameras.fisheye, u, v)
-    by_u, by_v = (
-        jnp.stack([by_x, by_y, -(u * by_x + v * by_y)], axis=-1) / z[..., None]
-        for by_x, by_y in ((xx, xy), (yx, yy))
-    )
-
-    def half(along: Array) -> Array:
-        return jnp.sqrt(jnp.maximum(jnp.einsum("...i,...ij,...j->...", along, seen.shape_m2, along), 1e-12))
-
+    left, right = (seen.f_x * u + seen.skew * v + seen.c_x for u, v in columns)
+    top, bottom = (seen.f_y * v + seen.c_y for _, v in rows)
+    left, right, top, bottom = jax.lax.optimization_barrier((left, right, top, bottom))
     return Boxes(
-        seen.f_x * bent_u + seen.skew * bent_v + seen.c_x,
-        seen.f_y * bent_v + seen.c_y,
-        half(seen.f_x[:, None] * by_u + seen.skew[:, None] * by_v),
-        half(seen.f_y[:, None] * by_v),
-        in_front,
+        (left + right) / 2,
+        (top + bottom) / 2,
+        (right - left) / 2,
+        (bottom - top) / 2,
+        in_front & _is_shown(seen, middle, tangents),
+    )
+
+
+def _outermost(
+    seen: Extents,
+    middle: tuple[Array, Array, Array],
+    in_front: Array,
+    tangents: _Tangents,
+    slope: tuple[Array, Array],
+) -> list[tuple[Array, Array]]:
+    """The two points of an ellipsoid's surface in which p u + q v is least and largest; undistorted coordinates.
+
+    Args:
+        seen, middle, in_front, tangents: see `project_boxes`.
+        slope: p and q.
+    """
+    x, y, z = middle
+    p, q = slope
+    # Only the direction counts, and squares of large numbers would be infinite.
+    length = jnp.abs(p) + jnp.abs(q) + 1e-30
+    p, q = p / length, q / length
+    s_px, s_py, s_pz = (
+        p * along_x + q * along_y
+        for along_x, along_y in ((seen.s_xx, seen.s_xy), (seen.s_xy, seen.s_yy), (seen.s_xz, seen.s_yz))
+    )
+    along = p * x + q * y
+    at, half = tangents(along, s_pz, p * s_px + q * s_py)
+    points = []
+    for sign in (-1, 1):
+        w = at + sign * half
+        if seen.cameras.fisheye is not None:
+            # A fisheye shows drones up to 90 degrees off the axis, where the plane of the undistorted image stretches
+            # them without limit: there the pixel's slope at the middle itself says more than the plane's tangent.
+            w = jnp.where(jnp.asarray(seen.cameras.fisheye), along / z, w)
+        # The plane across n = (p, q, -w) that touches the ellipsoid does so at X + S n / sqrt(n' S n).
+        s_x, s_y, s_z = s_px - w * seen.s_xz, s_py - w * seen.s_yz, s_pz - w * seen.s_zz
+        reach = sign / jnp.sqrt(jnp.maximum(p * s_x + q * s_y - w * s_z, 1e-12))
+        depth = jnp.where(in_front, jnp.maximum(z + reach * s_z, NEAR_M), 1.0)
+        points.append(((x + reach * s_x) / depth, (y + reach * s_y) / depth))
+    return points
+
+
+def _is_shown(seen: Extents, middle: tuple[Array, Array, Array], tangents: _Tangents) -> Array:
+    """True where the part of an ellipsoid that is farthest from the optical axis is before the fold of the lens."""
+    x, y, _ = middle
+    radius = jnp.sqrt(x * x + y * y) + 1e-9
+    p, q = x / radius, y / radius
+    s_along = p * p * seen.s_xx + 2 * p * q * seen.s_xy + q * q * seen.s_yy
+    at, half = tangents(radius, p * seen.s_xz + q * seen.s_yz, s_along)
+    farthest = at + half
+    return jnp.asarray(
+        is_one_to_one(seen.cameras.dist, seen.cameras.fisheye, p * farthest, q * farthest, seen.beyond)
     )
