@@ -401,6 +401,11 @@ class TrackSettings(
         return self.method != "projection-lines" or self.detections == BLOBS
 
     @property
+    def needs_each_video(self) -> bool:
+        """Whether a camera needs a video: "fused" uses a camera that has detections only for its detections."""
+        return self.needs_silhouettes and not (self.method == "fused" and self.reads_detections)
+
+    @property
     def reads_detections(self) -> bool:
         """Whether a run with these settings reads files of detections."""
         return self.method in ("projection-lines", "fused") and self.detections != BLOBS

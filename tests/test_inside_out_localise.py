@@ -529,7 +529,9 @@ def test_a_sequence_of_several_drones_lists_its_drones(sequence, tmp_path, optio
 
 
 def test_a_folder_without_images_or_videos_is_refused_in_one_line(room, tmp_path):
-    with pytest.raises(InputError, match="expected images, or videos of drones' own cameras, found neither"):
+    with pytest.raises(
+        InputError, match=r"expected images, which end in \.png.*, or an _A sequence of the dataset, found neither; to use"
+    ):
         run(tmp_path, "--markers", room.markers, "--fov", "70,55", "--out", tmp_path / "track.csv")
 
 
@@ -621,12 +623,16 @@ def test_existing_files_are_not_overwritten(room, tmp_path):
         (["VIDEO", "--fov", "70,55", "--drone", "dron1"], r"--drone: expected a folder with videos of drones' own"),
         (["0", "--fov", "70,55"], r"0: expected a video, found no such file; pass --live if it is a camera's number"),
         (["VIDEO", "--fov", "70,55", "--json", "OUT"], r"--json: expected another file than --out"),
-        (["IMAGES", "--fov", "70,55"], r"--fps: expected frames per second of the images in .*images, found none"),
+        (["IMAGES", "--fov", "70,55"],
+         r"--fps: expected the rate at which the images in .*images were taken, because images do not state it, "
+         r"found no --fps; add it in frames per second, such as --fps 25$"),
+        (["ONE"], r"frame0\.png: expected a video, or a folder of images, found one image; name the images' folder"),
         (["IMAGES", "--fov", "70,55", "--fps", "0"], r"--fps: expected a number above 0, found 0"),
     ],
 )  # fmt: skip
 def test_invalid_input_is_refused_in_one_line(room, tmp_path, arguments, message):
     words = {"VIDEO": room.video, "IMAGES": room.folder / "images", "OUT": tmp_path / "track.csv"}
+    words["ONE"] = room.folder / "images" / "frame0.png"
     with pytest.raises((InputError, SettingsError), match=message) as error:
         run(
             *[words.get(word, word) for word in arguments],

@@ -235,7 +235,7 @@ def _input(video: str, drone: str | None, fps: float | None, live: bool) -> _Inp
                 "--drone", expected="a folder with videos of drones' own cameras", found=video
             )
         if of_folder and not has_images:
-            raise InputError(folder, expected="images, or videos of drones' own cameras", found="neither")
+            raise _nothing_to_localise(folder)
         name = "camera" if stream else folder.name if of_folder else folder.stem
         return _Input(open_source(video, fps=fps, live=live), name)
     names = ", ".join(onboard)
@@ -246,6 +246,18 @@ def _input(video: str, drone: str | None, fps: float | None, live: bool) -> _Inp
         raise SettingsError("--drone", expected=f"one of {names}", found=chosen)
     one = onboard[chosen]
     return _Input(open_source(one.video.path, fps=fps), chosen, one, find_marker_corners(folder))
+
+
+def _nothing_to_localise(folder: Path) -> InputError:
+    """The error of a folder without images and without on-board videos of the dataset."""
+    from psotrack.recordings import IMAGE_SUFFIXES
+
+    return InputError(
+        folder,
+        expected=f"images, which end in {', '.join(IMAGE_SUFFIXES)}, or an _A sequence of the dataset",
+        found="neither",
+        remedy="to use a video in a folder, name the video itself",
+    )
 
 
 def _lens(

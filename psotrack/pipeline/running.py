@@ -65,7 +65,9 @@ def track_recording(
     """
     began = time.perf_counter()
     needs_silhouettes = settings.needs_silhouettes or parts.method is not None
-    recording = usable_for(recording, settings, videos=needs_silhouettes or parts.detector is not None)
+    recording = usable_for(
+        recording, settings, videos=parts.method is not None or parts.detector is not None
+    )
     if len(recording.rig) < 2:
         raise InputError(
             recording.folder,
@@ -88,6 +90,7 @@ def track_recording(
             cache=Path(cache),
             jobs=jobs,
             background=parts.background,
+            all_videos=settings.needs_each_video,
             report=report,
         )
     (tracked,) = track_runs(recording, silhouettes, [settings], parts=parts, report=report)

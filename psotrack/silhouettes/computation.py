@@ -40,14 +40,14 @@ class Silhouettes:
 
     Attributes:
         cameras: names of the cameras, in the order of the rig.
-        keys: key of each camera's silhouettes in the store, by camera name.
+        keys: key of each camera's silhouettes in the store, by camera name; a camera without video has none.
         reduction: r; cell (i, j) covers the pixels [r * i, r * i + r) x [r * j, r * j + r). Pixels beyond the image's
             border count as background.
         num_frames: number of frames of the longest camera.
         shape: height and width of the largest silhouette, cells.
         seconds: time spent on "decode" and "foreground", summed over workers; 0 for silhouettes from the store.
         arrays: one array (frames, height, width) per camera, stored or in memory; cameras may differ in frames, height
-            and width.
+            and width. A camera without video has no frames.
         exposures: when the frames were exposed; None where frame i of every camera is instant i.
     """
 
@@ -110,8 +110,8 @@ class Silhouettes:
     def at_instants(self, timeline: Timeline) -> Silhouettes:
         """These silhouettes with instants instead of frames: each camera shows its frame nearest to the instant.
 
-        A camera without a frame at an instant shows no foreground, and `exposures` says so. Where frame i of every
-        camera is instant i, the silhouettes stay as they are.
+        A camera without a frame at an instant, or without video, shows no foreground, and `exposures` says so. Where
+        frame i of every camera is instant i, the silhouettes stay as they are.
 
         Raises:
             SettingsError: the timeline is of other cameras.
@@ -120,8 +120,14 @@ class Silhouettes:
             raise SettingsError(
                 "timeline", expected=f"cameras {self.cameras}", found=f"cameras {timeline.cameras}"
             )
-        if timeline.is_synchronous and timeline.num_instants == self.num_frames:
+        filmed = np.array([array.shape[0] > 0 for array in self.arrays])
+        if timeline.is_synchronous and timeline.num_instants == self.num_frames and filmed.all():
             return self
+        timeline = replace(
+            timeline,
+            frame=np.where(filmed, timeline.frame, -1),
+            offset_s=np.where(filmed, timeline.offset_s, 0.0),
+        )
         arrays = tuple(
             FramesOfInstants(array, frame)
             for array, frame in zip(self.arrays, timeline.frame.T, strict=True)
@@ -175,6 +181,7 @@ def compute(
     cache: Path | str,
     jobs: int | None = None,
     background: BackgroundModel | None = None,
+    all_videos: bool = True,
     report: Report = no_progress,
 ) -> Silhouettes:
     """Silhouettes of a sequence, read from the store; missing silhouettes are computed and stored.
@@ -188,6 +195,8 @@ def compute(
         cache: folder of the store; made if it does not exist.
         jobs: largest number of processes; None is one per processor.
         background: background model instead of MOG2; None is MOG2 with the given settings.
+        all_videos: whether each camera needs a video; if not, a camera without video has no silhouettes, and
+            `Silhouettes.at_instants` says that it sees nothing.
         report: progress bar for the frames of all cameras, including the frames from which the background is learned.
 
     Raises:
@@ -198,8 +207,10 @@ def compute(
     cache = Path(cache)
     jobs = jobs if jobs is not None else os.cpu_count() or 1
     check_whole("jobs", jobs, lowest=1)
-    recording = recording.usable(recording.rig.names)
-    cameras = recording.rig.names
+    recording = recording.usable(recording.rig.names, videos=all_videos)
+    cameras = tuple(name for name in recording.rig.names if name in recording.videos)
+    if not cameras:
+        raise InputError(recording.folder, expected="at least one video", found="none")
     videos = [recording.videos[name] for name in cameras]
     ignored = [recording.ignore.get(name) for name in cameras]
     with ThreadPoolExecutor(jobs) as threads:
@@ -215,14 +226,17 @@ def compute(
     except TruncatedVideoError as error:
         raise _counted_in_instants(error, recording) from None
     heights, widths = zip(*(reduced_shape(video, settings.reduction) for video in videos), strict=True)
+    shape = (max(heights), max(widths))
+    arrays = {name: _open(task) for name, task in zip(cameras, tasks, strict=True)}
+    nothing = np.zeros((0, *shape), np.uint8)
     return Silhouettes(
-        cameras=cameras,
+        cameras=recording.rig.names,
         keys=dict(zip(cameras, keys, strict=True)),
         reduction=settings.reduction,
         num_frames=recording.num_frames,
-        shape=(max(heights), max(widths)),
+        shape=shape,
         seconds=seconds,
-        arrays=tuple(_open(task) for task in tasks),
+        arrays=tuple(arrays.get(name, nothing) for name in recording.rig.names),
     )
 
 

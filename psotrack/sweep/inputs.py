@@ -27,9 +27,9 @@ from psotrack.sweep.perturbations import perturb
 #: Folders below the data's root in which a sequence is looked for.
 HALVES = ("Simulated_Data", "Real_Data", ".")
 
-#: Sequence, number of frames, settings of the silhouettes and folder of the detections that a cell needs; None if it
-#: needs no silhouettes, or no folder.
-Source = tuple[str, int | None, SilhouetteSettings | None, str | None]
+#: Sequence, number of frames, settings of the silhouettes and folder of the detections that a cell needs, and whether
+#: each camera needs a video; None if it needs no silhouettes, or no folder.
+Source = tuple[str, int | None, SilhouetteSettings | None, str | None, bool]
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,13 @@ class Inputs:
             with self.locks.attempt(self.silhouettes_lock(cell), f"silhouettes of {cell.sequence}") as locked:
                 if not locked:
                     return None
-                silhouettes = compute(recording, cell.settings.silhouettes, cache=self.cache, jobs=self.jobs)
+                silhouettes = compute(
+                    recording,
+                    cell.settings.silhouettes,
+                    cache=self.cache,
+                    jobs=self.jobs,
+                    all_videos=cell.settings.needs_each_video,
+                )
             return Input(*perturb(recording, silhouettes, cell.perturbation, cell.cameras))
         except PsotrackError as error:
             return error
@@ -150,11 +156,11 @@ class Inputs:
 
 
 def source_of(cell: Cell) -> Source:
-    """Sequence, number of frames, settings of the silhouettes and folder of the detections that a cell needs."""
+    """What a cell needs of the data: see `Source`."""
     settings = cell.settings
     silhouettes = settings.silhouettes if settings.needs_silhouettes else None
     folder = settings.detections if settings.reads_detections and settings.detections != YOLO else None
-    return cell.sequence, cell.frames, silhouettes, folder
+    return cell.sequence, cell.frames, silhouettes, folder, settings.needs_each_video
 
 
 def folder_of(sequence: str, data: Path) -> Path:

@@ -54,7 +54,8 @@ def perturb(
     else:
         kept = recording.rig.select(cameras).names if cameras else every
     if kept != every:
-        recording = recording.usable(list(kept))
+        # The recording is usable as it is: not every method needs videos.
+        recording = recording.usable(list(kept), videos=False)
         silhouettes = None if silhouettes is None else _of_cameras(silhouettes, kept)
     # Random streams depend on the camera's index in the whole rig.
     index = [every.index(name) for name in kept]
@@ -125,7 +126,7 @@ def _of_cameras(silhouettes: Silhouettes, names: tuple[str, ...]) -> Silhouettes
     return replace(
         silhouettes,
         cameras=names,
-        keys={name: silhouettes.keys[name] for name in names},
+        keys={name: silhouettes.keys[name] for name in names if name in silhouettes.keys},
         arrays=tuple(silhouettes.arrays[silhouettes.cameras.index(name)] for name in names),
     )
 

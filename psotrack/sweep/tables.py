@@ -91,12 +91,15 @@ def _find_column(where: str, name: str, names: list[str]) -> str:
     if len(ends) == 1:
         return ends[0]
     near, today = nearest(name, names), renamed(name.removeprefix("settings."))
+    begin = [other for other in names if name and other.rpartition(".")[2].startswith(name)]
     if ends:
         remedy = f"it may be {' or '.join(ends)}"
     elif today:
         remedy = today
+    elif near:
+        remedy = f"did you mean {near}?"
     else:
-        remedy = f"did you mean {near}?" if near else f"there are {', '.join(names)}"
+        remedy = f"it may be {' or '.join(begin)}" if begin else f"there are {', '.join(names)}"
     raise SettingsError(where, expected="the name of one column", found=name, remedy=remedy)
 
 

@@ -26,7 +26,12 @@ def open_image_folder(folder: Path, fps: float | None) -> FrameSource:
     if not paths:
         raise InputError(folder, expected=f"images, which end in {', '.join(IMAGE_SUFFIXES)}", found="none")
     if fps is None:
-        raise SettingsError("--fps", expected=f"frames per second of the images in {folder}", found="none")
+        raise SettingsError(
+            "--fps",
+            expected=f"the rate at which the images in {folder} were taken, because images do not state it",
+            found="no --fps",
+            remedy="add it in frames per second, such as --fps 25",
+        )
     video = probe_images(paths, fps)
 
     def frames() -> Iterator[Frame]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from psotrack.errors import check_positive
+from psotrack.errors import InputError, check_positive
 from psotrack.inside_out.frames.image_folder import open_image_folder
 from psotrack.inside_out.frames.records import Frame, FrameSource
 from psotrack.inside_out.frames.stream import open_stream
-from psotrack.recordings import probe, read_frames
+from psotrack.recordings import IMAGE_SUFFIXES, probe, read_frames
 
 
 def open_source(source: Path | str, *, fps: float | None = None, live: bool = False) -> FrameSource:
@@ -32,6 +32,9 @@ def open_source(source: Path | str, *, fps: float | None = None, live: bool = Fa
     path = Path(source)
     if path.is_dir():
         return open_image_folder(path, fps)
+    if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file():
+        remedy = "name the images' folder, and pass --fps"
+        raise InputError(path, expected="a video, or a folder of images", found="one image", remedy=remedy)
     video = probe(path)
     rate = fps or video.fps
 
