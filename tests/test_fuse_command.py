@@ -1,6 +1,7 @@
 """`psotrack fuse` on files: the tracks, the report, and error messages of one line."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from test_inside_out_fusing import recording, remove_poses, remove_positions, rm
 
 from psotrack.cli.fuse import fuse
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
-from psotrack.inside_out import write_camera_path
+from psotrack.inside_out import read_camera_path, write_camera_path
 from psotrack.trajectories import read_trajectories, write_trajectories
 
 
@@ -136,16 +137,44 @@ def test_errors_are_one_line(files, words, error, sentence) -> None:
     assert not (folder / "new.csv").exists()
 
 
-def test_tracks_of_another_recording_are_reported_as_not_fused(files, tmp_path) -> None:
+def test_tracks_of_another_recording_are_refused(files, tmp_path) -> None:
     folder, _ = files
-    done = run(folder / "dron1.csv", folder / "elsewhere.csv", "--out", tmp_path / "fused.csv")
-    assert "dron1: no track, kept as it is" in done.output
-    assert "nothing was fused, because no path is near a track" in done.output.splitlines()[-1]
+    out = tmp_path / "fused.csv"
+    done = run(folder / "dron1.csv", folder / "elsewhere.csv", "--out", out)
+    assert isinstance(done.exception, InputError)
+    message = str(done.exception)
+    assert message.startswith(f"{folder / 'elsewhere.csv'}: expected a track within 0.5 m of a path")
+    assert re.search(r"found none \(the nearest is (49|5\d)\.\d\d m away\); .*one recording, one clock", message)
+    tracks = read_trajectories(folder / "tracks.csv")
+    write_trajectories(tmp_path / "later.csv", replace(tracks, time_s=tracks.time_s + 100))
+    done = run(folder / "dron1.csv", tmp_path / "later.csv", "--out", out)
+    assert isinstance(done.exception, InputError)
+    assert re.search(
+        r"later.csv: expected times in common with the paths, 0.00 to 3.96 s of dron1, found 100.00 to 103.96 s; .*"
+        "--max-offset",
+        str(done.exception),
+    )
+    assert not out.exists()
+
+
+def test_a_drone_without_a_track_beside_one_with_a_track_is_kept(files, tmp_path) -> None:
+    folder, _ = files
     done = run(
         folder / "dron1.csv", folder / "blind.csv", folder / "tracks.csv", "--out", tmp_path / "two.csv"
     )
-    assert "dron3: no track" in done.output
+    assert "dron3: no track, kept as it is" in done.output
     assert "nothing was fused" not in done.output
+
+
+def test_sources_that_never_see_a_drone_at_the_same_time_are_kept_with_a_note(files, tmp_path) -> None:
+    folder, _ = files
+    tracks = read_trajectories(folder / "tracks.csv")
+    write_trajectories(tmp_path / "first.csv", tracks.at_frames(np.arange(40)))
+    path, name = read_camera_path(folder / "dron1.csv")
+    write_camera_path(tmp_path / "second.csv", remove_poses(path, slice(0, 60)), name)
+    done = run(tmp_path / "second.csv", tmp_path / "first.csv", "--out", tmp_path / "fused.csv")
+    assert done.exit_code == 0, done.output
+    assert "nothing was fused, because no frame has both a pose and a track" in done.output.splitlines()[-1]
 
 
 def test_help_shows_examples() -> None:

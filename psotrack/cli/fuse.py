@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,9 +11,11 @@ import click
 
 from psotrack.cli.options import FORCE, JSON, QUIET
 from psotrack.cli.output import check_outputs, output_json, print_line
+from psotrack.errors import InputError, check_positive
 
 if TYPE_CHECKING:
     from psotrack.inside_out import CameraPath, DroneFusion, FusedDrone, FusedTracks, SourceErrors
+    from psotrack.trajectories import Trajectories
 
 
 @click.command()
@@ -51,7 +55,8 @@ def fuse(
     INSIDE are files of `psotrack localise`, one per drone. OUTSIDE is a file of `psotrack track`; its drones may have
     other names. Positions are weighted by their covariances. The command estimates the scales of the covariances and
     the lever arm from the camera to the middle of the drone, and assigns the tracks to the drones. Drones that occur
-    in one input only are kept unchanged.
+    in one input only are kept unchanged. If no track is near any path, the files are not of one recording: nothing is
+    written.
 
     \b
     Examples:
@@ -59,7 +64,6 @@ def fuse(
       psotrack fuse dron1.csv tracks.csv --out fused.csv --max-offset 5 --json -
       psotrack evaluate fused.csv data/Simulated_Data/S01_D2_A
     """
-    from psotrack.errors import InputError, check_positive
     from psotrack.inside_out import fuse as fuse_paths
     from psotrack.inside_out import read_camera_path, write_fused
     from psotrack.trajectories import read_trajectories
@@ -79,7 +83,10 @@ def fuse(
         raise InputError(where, expected="a pose in at least one frame", found="none")
     if not tracks.seen.any():
         raise InputError(outside, expected="a position in at least one frame", found="none")
+    if max_offset_s is None:
+        _check_times(paths, tracks, outside)
     fused = fuse_paths(paths, tracks, point=point, max_offset_s=max_offset_s)
+    _check_near(fused, outside)
     write_fused(out, fused, force=force)
     output_json(json_path, _content(fused), force)
     for drone in fused.drones:
@@ -97,11 +104,46 @@ def fuse(
     )
 
 
+def _check_times(paths: Mapping[str, CameraPath], tracks: Trajectories, outside: Path) -> None:
+    """Raise `InputError` if no path has times in common with the tracks."""
+    begin_s, end_s = tracks.time_s[[0, -1]]
+    spans = [path.time_s[[0, -1]] for path in paths.values()]
+    if not any(first_s <= end_s and begin_s <= last_s for first_s, last_s in spans):
+        listed = ", ".join(
+            f"{first_s:.2f} to {last_s:.2f} s of {name}"
+            for name, (first_s, last_s) in zip(paths, spans, strict=True)
+        )
+        raise InputError(
+            outside,
+            expected=f"times in common with the paths, {listed}",
+            found=f"{begin_s:.2f} to {end_s:.2f} s",
+            remedy="all files must be of one recording; --max-offset SECONDS estimates the offset of a clock",
+        )
+
+
+def _check_near(fused: FusedTracks, outside: Path) -> None:
+    """Raise `InputError` if no path has a track, although paths and tracks are known at the same times.
+
+    Two positions of one drone at one time are at one place. Where all are far apart, at least one file is of another
+    recording, or has another clock or another world, and there is nothing to fuse.
+    """
+    from psotrack.trajectories import GATE_M
+
+    nearest_m = [drone.nearest_m for drone in fused.drones if not math.isnan(drone.nearest_m)]
+    if nearest_m and not any(drone.tracks for drone in fused.drones):
+        raise InputError(
+            outside,
+            expected=f"a track within {GATE_M:g} m of a path in most frames that have both",
+            found=f"none (the nearest is {min(nearest_m):.2f} m away)",
+            remedy="all files must have one recording, one clock (see --max-offset) and one world",
+        )
+
+
 def _doubt(fused: FusedTracks) -> str:
     """Advice where nothing was fused; empty otherwise."""
     if any(drone.tracks for drone in fused.drones):
         return ""
-    return "; nothing was fused, because no path is near a track: check that all files have one recording and one clock"
+    return "; nothing was fused, because no frame has both a pose and a track"
 
 
 def _sentence(drone: FusedDrone) -> str:

@@ -36,6 +36,8 @@ class FusedDrone:
         tracks: names of the outside tracks that belong to it, in the order of time; empty where there are none.
         offset: offset of the camera's clock; None if it was not estimated.
         frames_both, frames_inside, frames_outside: number of frames in which both sources, or only one, were used.
+        nearest_m: median distance of the camera from the nearest track, over the frames that have both, metres; NaN
+            without such frames.
         fusion: arm and error models; None without a track.
     """
 
@@ -45,6 +47,7 @@ class FusedDrone:
     frames_both: int
     frames_inside: int
     frames_outside: int
+    nearest_m: float
     fusion: DroneFusion | None
 
 
@@ -119,7 +122,7 @@ def fuse(
     pairing = _pair(frame, cameras, tracks_in.tracked_m)
     tracks: dict[str, DroneTrack] = {}
     drones = []
-    for (name, path), own_index in zip(paths.items(), pairing.track.T, strict=True):
+    for (name, path), camera, own_index in zip(paths.items(), cameras, pairing.track.T, strict=True):
         names = tuple(dict.fromkeys(outside.drones[k] for k in own_index if k != UNASSIGNED))
         found = None
         if names:
@@ -130,7 +133,8 @@ def fuse(
             found = fuse_drone(path, frame, time_s, clocks_s[name], *own_track, point)
         tracks[name] = unfused_path(path, time_s, clocks_s[name]) if found is None else found.track
         both, one, other = (int((_source(tracks[name]) == source).sum()) for source in (3, 1, 2))
-        drones.append(FusedDrone(name, names, offsets[name], both, one, other, found))
+        nearest_m = _nearest_m(camera, tracks_in.tracked_m)
+        drones.append(FusedDrone(name, names, offsets[name], both, one, other, nearest_m, found))
     for name, own_index in zip(outside.drones, pairing.rest.T, strict=True):
         track = _outside_track(tracks_in, own_index)
         if track.used.any():
@@ -183,6 +187,13 @@ def _pair(
         if np.isfinite(off_m).any():
             reach_m[index] = np.clip(_FAR * np.nanmedian(off_m), _LEAST_REACH_M, GATE_M)
     return pair_tracks(frame, expected_m, reach_m, middle_m)
+
+
+def _nearest_m(camera: ResampledPath, middle_m: Float[np.ndarray, "frames tracks 3"]) -> float:
+    """Median distance of a camera from the nearest track, metres; NaN without frames that have both."""
+    distance_m = np.linalg.norm(middle_m - camera.position_m[:, None], axis=-1)
+    both = np.isfinite(distance_m).any(axis=1)
+    return float(np.median(np.nanmin(distance_m[both], axis=1))) if both.any() else np.nan
 
 
 def _outside_track(outside: OutsideTracks, track: Int[np.ndarray, "frames"]) -> DroneTrack:
