@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 from psotrack.datasets import open_recording
 from psotrack.detection import Detector
 from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
-from psotrack.methods import Method
+from psotrack.methods import Method, check_detections
 from psotrack.pipeline import Parts, TrackedRecording, track_recording
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
@@ -81,10 +81,12 @@ def track(
         InputError: a file cannot be used, or no drones are found.
         SettingsError: a setting does not exist, or does not fit the recording.
     """
-    if not isinstance(recording, Recording):
-        recording = read_recording(recording)
     if not isinstance(settings, TrackSettings):
         settings = TrackSettings().changed(settings or {})
+    if not isinstance(recording, Recording):
+        recording = read_recording(recording)
+        if brought.get("detector") is None:
+            check_detections(recording, settings)
     return track_recording(
         recording,
         settings,

@@ -167,6 +167,16 @@ def read_sightings(
     return DetectionInputs(sightings, keys, time.perf_counter() - began)
 
 
+def check_detections(recording: Recording, settings: TrackSettings) -> None:
+    """Check the detections that a run reads against a recording as it was opened (see `Recording.check_detections`).
+
+    Raises:
+        InputError: there are no detections, a file cannot be read, or it belongs to other frames.
+    """
+    if settings.reads_detections:
+        recording.check_detections(detection_files_of(recording, settings.detections))
+
+
 def usable_for(
     recording: Recording,
     settings: TrackSettings,

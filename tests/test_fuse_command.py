@@ -144,7 +144,9 @@ def test_tracks_of_another_recording_are_refused(files, tmp_path) -> None:
     assert isinstance(done.exception, InputError)
     message = str(done.exception)
     assert message.startswith(f"{folder / 'elsewhere.csv'}: expected a track within 0.5 m of a path")
-    assert re.search(r"found none \(the nearest is (49|5\d)\.\d\d m away\); .*one recording, one clock", message)
+    assert re.search(
+        r"found none \(the nearest is (49|5\d)\.\d\d m away\); .*one recording, one clock", message
+    )
     tracks = read_trajectories(folder / "tracks.csv")
     write_trajectories(tmp_path / "later.csv", replace(tracks, time_s=tracks.time_s + 100))
     done = run(folder / "dron1.csv", tmp_path / "later.csv", "--out", out)

@@ -530,7 +530,8 @@ def test_a_sequence_of_several_drones_lists_its_drones(sequence, tmp_path, optio
 
 def test_a_folder_without_images_or_videos_is_refused_in_one_line(room, tmp_path):
     with pytest.raises(
-        InputError, match=r"expected images, which end in \.png.*, or an _A sequence of the dataset, found neither; to use"
+        InputError,
+        match=r"expected images, which end in \.png.*, or an _A sequence of the dataset, found neither; to use",
     ):
         run(tmp_path, "--markers", room.markers, "--fov", "70,55", "--out", tmp_path / "track.csv")
 

@@ -1,12 +1,15 @@
 """`recording.toml`: every key is read, and every fault of the file is one line that names file, table and key."""
 
+import re
 import shutil
 import tomllib
 
 import cv2
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from psotrack.cli import cli
 from psotrack.datasets import find_marker_corners, open_recording
 from psotrack.datasets._poses import write_poses
 from psotrack.errors import InputError
@@ -143,6 +146,14 @@ def test_sizes_rates_starts_and_lengths_may_differ(folder):
         [5, 5],
         [-1, 10],
     ]
+
+
+def test_the_first_instants_are_as_many_as_asked_for_at_any_rate(folder):
+    path = write(folder, LEFT, camera("wide", 'video = "wide.avi"', "time_offset_s = 0.1", PLACE))
+    # Frame 2 of the slow camera is near instant 5, too.
+    first = open_recording(path).usable(num_frames=5)
+    assert first.num_frames == 5
+    assert first.at_rate(25.0).num_frames == 2
 
 
 def test_images_are_frames_in_natural_order(folder):
@@ -311,6 +322,8 @@ class TestFaults:
             ("fps = -25", ("cameras.left.fps", "a number above 0", "found -25")),
             ("fps = 0", ("cameras.left.fps", "a number above 0")),
             ("fps = nan", ("cameras.left.fps", "a finite number")),
+            ("fps = 1e9", ("cameras.left.fps", "0.001 to 20000 frames per second", "found 1e+09")),
+            ("fps = 1e-9", ("cameras.left.fps", "0.001 to 20000 frames per second", "found 1e-09")),
             ("size = [64]", ("cameras.left.size", "a list of length 2")),
             ("size = [64, 0]", ("cameras.left.size[1]", "at least 1")),
             ("size = [128, 96]", ("cameras.left.size", "64 x 48 pixels as in the video", "128 x 96")),
@@ -379,12 +392,66 @@ class TestFaults:
             ("0,0\n1,0.04\n", ("times of the 6 frames of the video", "found 2")),
             ("0,0\n2,0.08\n", ("line 3, column frame", "frame 1: every frame once", "found 2")),
             ("0,0\n1,zero\n", ("line 3, column time_s", "a number")),
+            (
+                "".join(f"{frame},{40 * frame}\n" for frame in range(6)),
+                (
+                    "times in seconds, of about 25 frames per second as in left.avi",
+                    "0.025",
+                    "divide the times by 1000",
+                ),
+            ),
+            (
+                "".join(f"{frame},{4e7 * frame}\n" for frame in range(6)),
+                ("2.5e-08", "are the times in seconds?"),
+            ),
         ],
     )
     def test_wrong_timestamps(self, folder, rows, words):
         (folder / "times.csv").write_text("frame,time_s\n" + rows)
         path = write(folder, camera("left", 'video = "left.avi"', 'timestamps = "times.csv"', PLACE))
         assert_fails(path, "times.csv", *words)
+
+    def test_times_since_1970_are_refused_before_memory_is_used_up(self, folder):
+        since = "time_offset_s = 1700000000.{}"
+        path = write(
+            folder,
+            camera("left", 'video = "left.avi"', since.format(25), PLACE),
+            camera("right", 'video = "right.avi"', since.format(5), PLACE),
+        )
+        with pytest.raises(InputError) as error:
+            open_recording(path).timeline()
+        assert re.search(
+            r"frame times: expected at most 10000000 instants from time 0 on, found 4.3e\+10: 25 Hz until "
+            r"1700000000\.70 s, when camera right ends; .* subtract 1700000000.25 s, the time of the first frame of "
+            r"camera left",
+            str(error.value),
+        )
+        with pytest.raises(InputError, match=r"1e\+09 Hz until 0.20 s, .*; check the rates and times"):
+            open_recording(write(folder, LEFT, RIGHT)).timeline(1e9)
+
+    @pytest.mark.parametrize(("first", "used"), [(0, 6), (2, 4), (5, 1)])
+    def test_detections_beyond_the_end_of_the_video_are_a_warning(self, folder, caplog, first, used):
+        boxes = Detections(np.arange(first, first + 6), np.tile([1.0, 2, 3, 4], (6, 1)), np.ones(6))
+        write_detections(folder / "left.csv", boxes)
+        path = write(folder, LEFT.replace("\nK =", '\ndetections = "left.csv"\nK ='), RIGHT)
+        recording = open_recording(path)
+        recording.check_detections(recording.detections)
+        words = f"left.csv: {6 - used} of 6 detections are not used, because camera left (left.avi) ends with frame 5"
+        assert (words in caplog.text) == (used < 6)
+
+    def test_detections_that_all_lie_beyond_the_end_of_the_video(self, folder):
+        write_detections(
+            folder / "left.csv", Detections(np.array([6]), np.array([[1.0, 2, 3, 4]]), np.ones(1))
+        )
+        path = write(folder, LEFT.replace("\nK =", '\ndetections = "left.csv"\nK ='), RIGHT)
+        for command in ("info", "doctor"):
+            done = CliRunner().invoke(cli, [command, str(path)])
+            assert isinstance(done.exception, InputError)
+            assert re.search(
+                r"left.csv: expected detections in the frames 0 to 5 of camera left \(left.avi\), "
+                r"found none before frame 6; are they detections in another video\?$",
+                str(done.exception),
+            )
 
     def test_a_video_of_two_cameras(self, folder):
         path = write(folder, LEFT, RIGHT.replace("right.avi", "./left.avi"))

@@ -86,6 +86,7 @@ def doctor(
         sightings = from_silhouettes(made, report)
     else:
         files = detection_files_of(recording, detections)
+        recording.check_detections(files)
         boxes = {name: read_detections(path) for name, path in files.items()}
         longest = max((each.num_frames for each in recording.frame_times.values()), default=0)
         sightings = from_detections(boxes, recording.rig, longest)

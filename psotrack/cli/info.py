@@ -30,6 +30,7 @@ def info(sequence: Path, force: bool, json_path: Path | None) -> None:
     recording = open_recording(sequence)
     for video in recording.videos.values():
         check_end(video)
+    recording.check_detections(recording.detections or {})
     content = describe_recording(recording)
     output_json(json_path, content, force)
     if json_path != Path("-"):

@@ -234,7 +234,7 @@ def track(
     """
     from psotrack.datasets import open_recording
     from psotrack.detection import DetectorSettings, find_detector
-    from psotrack.methods import usable_for
+    from psotrack.methods import check_detections, usable_for
     from psotrack.pipeline import Parts, track_recording
     from psotrack.silhouettes import find_background
     from psotrack.support import keep_compiled
@@ -251,8 +251,11 @@ def track(
         detector=None if detector is None else find_detector(detector, DetectorSettings(size=detector_size)),
     )
     keep_compiled(compiled_folder(cache))
+    opened = open_recording(sequence)
+    if detector is None:
+        check_detections(opened, chosen)
     recording = usable_for(
-        open_recording(sequence),
+        opened,
         chosen,
         cameras=camera_names(cameras),
         num_frames=num_frames,

@@ -22,6 +22,7 @@ from psotrack.recordings import (
     Recording,
     RecordingFile,
     VideoInfo,
+    check_rate,
     find_images,
     probe,
     probe_images,
@@ -35,6 +36,8 @@ from psotrack.rig_files import UNITS_M, Entry, camera_of_table, read_entries
 _logger = logging.getLogger(__name__)
 #: Size of the images of a rig file that does not state it; no camera has this size.
 _UNKNOWN_WH = (1, 1)
+#: Largest deviation of a rate from a thousandth of another one at which the unit of time was mistaken, not the rate.
+_SLIP_SHARE = 0.05
 _LENS_AND_PLACE = ("K", "model", "distortion", "rvec", "tvec")
 
 
@@ -202,7 +205,11 @@ def _open_video(path: Path, name: str, table: CameraTable) -> VideoInfo | None:
         )
         raise _error(path, f"{place}.video", "a video", f"{found}, {table.video}", remedy)
     video = probe(file)
-    return video if table.fps is None else VideoInfo(file, video.num_frames, table.fps, video.image_size_wh)
+    if table.fps is not None:
+        return replace(video, fps=table.fps)
+    if table.timestamps is None:
+        check_rate(file, video.fps, f"write the rate as fps below [{place}]")
+    return video
 
 
 def _times(
@@ -211,13 +218,27 @@ def _times(
     """Times of the frames of a camera; without video it lasts until its last detection."""
     if table.timestamps is not None:
         file = _existing(path.parent, table.timestamps, path, f"cameras.{name}.timestamps")
-        return read_timestamps(file, None if video is None else video.num_frames)
+        times = read_timestamps(file, None if video is None else video.num_frames)
+        if video is not None and not video.images:
+            _check_seconds(file, times, video)
+        return times
     offset_s = table.time_offset_s or 0.0
     if video is not None:
         return FrameTimes(video.num_frames, video.fps, offset_s)
     num_frames = 0 if detections is None else int(read_detections(detections).frame.max(initial=-1)) + 1
     assert table.fps is not None, "the schema asks for fps of a camera without video"
     return FrameTimes(num_frames, table.fps, offset_s)
+
+
+def _check_seconds(file: Path, times: FrameTimes, video: VideoInfo) -> None:
+    """Raise `InputError` for times in milliseconds: a thousandth of the video's own rate is no coincidence."""
+    if abs(video.fps / times.fps / 1000 - 1) < _SLIP_SHARE:
+        raise InputError(
+            file,
+            expected=f"times in seconds, of about {video.fps:g} frames per second as in {video.path.name}",
+            found=f"{times.fps:g} frames per second",
+            remedy="divide the times by 1000 if they are milliseconds",
+        )
 
 
 def _calibrated(path: Path, content: RecordingFile) -> dict[str, Entry]:

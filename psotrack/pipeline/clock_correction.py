@@ -40,7 +40,7 @@ def advise_on_clocks(
     recording: Recording, silhouettes: Silhouettes | None, settings: TrackSettings, tracked: Trajectories
 ) -> None:
     """Warn if some instants in the middle show for certain that a camera's given times are wrong."""
-    recording = replace(recording, rate_hz=settings.rate_hz or recording.rate_hz)
+    recording = recording.at_rate(settings.rate_hz)
     timeline = recording.timeline()
     first = max(0, (timeline.num_instants - CHECKED_INSTANTS) // 2)
     rows = np.arange(first, min(first + CHECKED_INSTANTS, timeline.num_instants))

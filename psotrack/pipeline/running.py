@@ -65,9 +65,7 @@ def track_recording(
     """
     began = time.perf_counter()
     needs_silhouettes = settings.needs_silhouettes or parts.method is not None
-    recording = usable_for(
-        recording, settings, videos=parts.method is not None or parts.detector is not None
-    )
+    recording = usable_for(recording, settings, videos=parts.method is not None or parts.detector is not None)
     if len(recording.rig) < 2:
         raise InputError(
             recording.folder,
@@ -136,7 +134,7 @@ def track_runs(
     tracked: dict[int, TrackedRecording | InputError] = {}
     for rate_hz in dict.fromkeys(each.rate_hz for each in settings):
         numbers = [number for number, each in enumerate(settings) if each.rate_hz == rate_hz]
-        timed = replace(recording, rate_hz=rate_hz or recording.rate_hz)
+        timed = recording.at_rate(rate_hz)
         shown = None if silhouettes is None else silhouettes.at_instants(timed.timeline())
         results = _track_at_instants(timed, shown, [settings[number] for number in numbers], parts, report)
         for number, (run, result) in zip(numbers, results, strict=True):

@@ -16,7 +16,7 @@ from .recording_file import (
     write_recording_file,
 )
 from .timestamps import read_timestamps
-from .timing import FrameTimes, Timeline, make_timeline
+from .timing import FrameTimes, Timeline, check_rate, make_timeline
 from .video import (
     TruncatedVideoError,
     VideoInfo,
@@ -49,6 +49,7 @@ __all__ = [
     "WorldTable",
     "body_trajectories",
     "check_end",
+    "check_rate",
     "describe_recording",
     "digest_video",
     "find_images",

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.errors import InputError, SettingsError
+from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.geometry import Rig, chosen_cameras
 from psotrack.recordings.detections import read_detections
 from psotrack.recordings.timing import FrameTimes, Timeline, make_timeline
@@ -126,7 +126,21 @@ class Recording:
             InputError: no camera has a frame at time 0 or later.
             SettingsError: the rate is not above 0.
         """
-        return self._timeline if rate_hz is None else replace(self, rate_hz=rate_hz).timeline()
+        return self._timeline if rate_hz is None else self.at_rate(rate_hz).timeline()
+
+    def at_rate(self, rate_hz: float | None) -> Recording:
+        """This recording with another number of instants per second and the same end; None keeps its own rate.
+
+        Raises:
+            SettingsError: the rate is not above 0.
+        """
+        if rate_hz is None:
+            return self
+        check_positive("rate", rate_hz)
+        count = self.num_instants
+        if count is not None:
+            count = max(1, round(count * rate_hz / self.fps))
+        return replace(self, rate_hz=rate_hz, num_instants=count)
 
     @cached_property
     def _timeline(self) -> Timeline:
@@ -209,6 +223,38 @@ class Recording:
                 times[name] = replace(known, num_frames=_frames_of(path))
         return replace(self, detections=dict(files), frame_times=times)
 
+    def check_detections(self, files: Mapping[str, Path]) -> None:
+        """Warn of detections in frames that a camera does not have: nothing belongs to them.
+
+        The recording must not be limited to its first instants: cameras have more frames than such a recording.
+
+        Args:
+            files: files of detections by camera name.
+
+        Raises:
+            InputError: a file cannot be read, or none of a camera's detections is in a frame that the camera has.
+        """
+        for name, path in files.items():
+            known = self.frame_times.get(name)
+            frame = read_detections(path).frame
+            if known is None or not len(frame) or frame[-1] < known.num_frames:
+                continue
+            last = known.num_frames - 1
+            beyond = int(np.count_nonzero(frame > last))
+            shown = self.videos[name].path.name if name in self.videos else "its timestamps"
+            if beyond == len(frame):
+                raise InputError(
+                    path,
+                    expected=f"detections in the frames 0 to {last} of camera {name} ({shown})",
+                    found=f"none before frame {int(frame[0])}",
+                    remedy="are they detections in another video?",
+                )
+            _logger.warning(
+                "%s: %d of %d detections are not used, because camera %s (%s) ends with frame %d; are they detections "
+                "in another video, or is the first frame counted as 1?",
+                path, beyond, len(frame), name, shown, last,
+            )  # fmt: skip
+
     def _usable_names(self, cameras: Sequence[str] | None, videos: bool) -> tuple[str, ...]:
         """Names of the cameras that are to be used; the others are left out with a warning each."""
         names = (*self.rig.names, *self.unplaced) if cameras is None else self._chosen(cameras)
@@ -279,6 +325,10 @@ class Recording:
                 if name in rig.names
             },
             frame_times={name: self.frame_times[name].cut(counts[name]) for name in rig.names},
+            # Without its fastest camera the recording would have other instants.
+            rate_hz=timeline.rate_hz if late else self.rate_hz,
+            # A camera's last frame may be near later instants, too.
+            num_instants=num_frames,
         )
 
 

@@ -13,6 +13,7 @@ import msgspec
 
 from psotrack.errors import InputError
 from psotrack.geometry import camera_key
+from psotrack.recordings.timing import check_rate
 from psotrack.support import atomic_write, convert, read_toml, toml_key, toml_value
 
 #: Name of the file in a folder.
@@ -159,6 +160,8 @@ def _read_camera(path: Path, name: str, table: Any) -> CameraTable:
     for one, other in (("video", "images"), ("timestamps", "fps"), ("timestamps", "time_offset_s")):
         if table.get(one) is not None and table.get(other) is not None:
             raise _error(path, place, f"{one} or {other}", "both")
+    if camera.fps is not None:
+        check_rate(f"{path}, {place}.fps", camera.fps)
     filmed = camera.video is not None or camera.images is not None
     if not filmed and camera.fps is None and camera.timestamps is None:
         raise _error(path, f"{place}.fps", "frames per second, because the camera has no video", "none")

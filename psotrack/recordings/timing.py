@@ -21,6 +21,26 @@ from psotrack.support import short_repr
 _REACH = 0.6
 #: Times nearer than this share of an interval are one time: rates such as 30000/1001 are rounded in files.
 _SAME = 1e-6
+#: Lowest and highest rate of a camera with which drones are tracked, frames per second. With one frame in a quarter of
+#: an hour there is no motion to follow. With the highest rate, a drone at 20 m/s moves by a millimetre from frame to
+#: frame, and more frames show nothing new; what is higher is the tick of a container's clock (90 000 Hz), or a slip.
+RATES_HZ = (1e-3, 2e4)
+#: Largest number of instants: a day at 115 Hz. A recording with more instants has a wrong rate or a wrong clock.
+MOST_INSTANTS = 10_000_000
+
+
+def check_rate(where: object, fps: float, remedy: str = "") -> None:
+    """Raise `InputError` for a rate with which no camera films drones.
+
+    Args:
+        where: the file, table or setting that states the rate, for the message.
+        fps: frames per second.
+        remedy: what the user can do, for the message.
+    """
+    low, high = RATES_HZ
+    if not low <= fps <= high:
+        expected = f"{low:g} to {high:.0f} frames per second"
+        raise InputError(where, expected=expected, found=f"{fps:g}", remedy=remedy)
 
 
 @dataclass(frozen=True, repr=False)
@@ -60,8 +80,8 @@ class FrameTimes:
             where: the file or setting that the times come from, for messages.
 
         Raises:
-            InputError: there are fewer than two times, a time is not finite, or a time is not later than the time
-                before it.
+            InputError: there are fewer than two times, a time is not finite, a time is not later than the time
+                before it, or the rate is one with which no camera films drones.
         """
         if len(time_s) < 2:
             raise InputError(where, expected="times of at least 2 frames", found=f"{len(time_s)}")
@@ -76,7 +96,9 @@ class FrameTimes:
                 expected="times that increase from frame to frame",
                 found=f"{time_s[frame]:g} s for frame {frame} after {time_s[frame - 1]:g} s",
             )
-        return cls(len(time_s), float(1 / np.median(interval_s)), float(time_s[0]), tuple(time_s.tolist()))
+        fps = float(1 / np.median(interval_s))
+        check_rate(where, fps, "are the times in seconds?")
+        return cls(len(time_s), fps, float(time_s[0]), tuple(time_s.tolist()))
 
     @property
     def time_s(self) -> Float[np.ndarray, "frames"]:
@@ -193,7 +215,7 @@ def make_timeline(frame_times: Mapping[str, FrameTimes], rate_hz: float | None =
 
     Raises:
         SettingsError: the rate is not above 0.
-        InputError: no camera has a frame at time 0 or later.
+        InputError: no camera has a frame at time 0 or later, or there are more than `MOST_INSTANTS` instants.
     """
     if rate_hz is not None:
         check_positive("rate", rate_hz)
@@ -204,10 +226,34 @@ def make_timeline(frame_times: Mapping[str, FrameTimes], rate_hz: float | None =
     if abs(rate - fastest) < 1e-9 * rate and all(longest.is_like(each) for each in times):
         timeline = _of_equal_frames(tuple(frame_times), times, longest)
     else:
+        _check_length(frame_times, rate)
         timeline = _of_nearest_frames(tuple(frame_times), times, rate)
     if not timeline.num_instants:
         raise InputError("frame times", expected="a camera with a frame at time 0 s or later", found="none")
     return timeline
+
+
+def _check_length(frame_times: Mapping[str, FrameTimes], rate_hz: float) -> None:
+    """Raise `InputError` where there would be so many instants that a time or the rate must be wrong."""
+    spans_s = {name: each.time_s[[0, -1]].tolist() for name, each in frame_times.items() if each.num_frames}
+    if not spans_s:
+        return
+    last = max(spans_s, key=lambda name: spans_s[name][1])
+    first = min(spans_s, key=lambda name: spans_s[name][0])
+    end_s, begin_s = spans_s[last][1], spans_s[first][0]
+    if end_s * rate_hz <= MOST_INSTANTS:
+        return
+    found = f"{end_s * rate_hz:.2g}: {rate_hz:g} Hz until {end_s:.2f} s, when camera {last} ends"
+    late = begin_s > end_s - begin_s
+    remedy = (
+        f"the clock must begin with the recording: subtract {begin_s:.2f} s, the time of the first frame of camera "
+        f"{first}, from all times"
+        if late
+        else "check the rates and times of the cameras"
+    )
+    raise InputError(
+        "frame times", expected=f"at most {MOST_INSTANTS} instants from time 0 on", found=found, remedy=remedy
+    )
 
 
 def _of_equal_frames(names: tuple[str, ...], times: list[FrameTimes], longest: FrameTimes) -> Timeline:

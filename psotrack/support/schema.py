@@ -151,9 +151,7 @@ def nearest(name: str, names: Iterable[str]) -> str:
         return max(difflib.SequenceMatcher(None, *pair).ratio() for pair in pairs if _is_slip(*pair))
 
     names = list(names)
-    slips = [
-        other for other in names if _is_slip(name, other) or _is_slip(last, other.rpartition(".")[2])
-    ]
+    slips = [other for other in names if _is_slip(name, other) or _is_slip(last, other.rpartition(".")[2])]
     if slips:
         return max(slips, key=similarity)
     begun = [

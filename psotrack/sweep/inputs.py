@@ -14,7 +14,7 @@ import numpy as np
 from psotrack.datasets import open_recording
 from psotrack.errors import InputError, PsotrackError
 from psotrack.geometry import Camera
-from psotrack.methods import detection_files_of, usable_for
+from psotrack.methods import check_detections, detection_files_of, usable_for
 from psotrack.recordings import Recording
 from psotrack.settings import YOLO
 from psotrack.silhouettes import Silhouettes, SilhouetteSettings, compute
@@ -128,6 +128,7 @@ class Inputs:
         source = source_of(cell)
         if source not in self._sources:
             opened = open_recording(folder_of(cell.sequence, self.data))
+            check_detections(opened, cell.settings)
             recording = usable_for(opened, cell.settings, num_frames=cell.frames)
             if recording.truth is None:
                 raise InputError(recording.folder, expected="a reference to compare with", found="none")
