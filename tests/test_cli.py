@@ -269,6 +269,32 @@ def test_projection_lines_from_the_sequence_a_folder_and_blobs(
 
 
 @pytest.mark.slow
+def test_fused_uses_a_camera_that_has_detections_and_no_video(
+    run: Run, sequence: Path, tmp_path: Path
+) -> None:
+    tracks = tmp_path / "tracks.csv"
+    (sequence / "cam3i_s.avi").unlink()
+    result = run(*track(sequence, tracks, "--method", "fused"))
+    assert result.code == 0
+    assert "left out" not in result.err
+    keys = json.loads(tracks.with_suffix(".json").read_text())["input_keys"]
+    assert "detections of cam3" in keys
+    assert "cam3" not in keys
+    errors = json.loads(run("evaluate", tracks, sequence, "--json", "-").out)
+    assert (errors["id_switches"], errors["missed_rate"]) == (0, 0)
+    assert errors["mean_error_m"] < 0.05
+
+
+def test_fused_needs_two_videos(run: Run, sequence: Path, tmp_path: Path) -> None:
+    for number in range(2, 9):
+        (sequence / f"cam{number}i_s.avi").unlink()
+    result = run(*track(sequence, tmp_path / "tracks.csv", "--method", "fused"))
+    assert_one_line(
+        result, "videos of at least two cameras for --method fused, found cam1", "--method projection-lines"
+    )
+
+
+@pytest.mark.slow
 def test_a_drone_that_no_detection_shows_has_no_size_in_the_record(
     run: Run, sequence: Path, tmp_path: Path
 ) -> None:

@@ -334,6 +334,23 @@ def test_camera_without_video(folder: Path, tmp_path: Path) -> None:
         compute(replace(recording, videos=videos), SETTINGS, cache=tmp_path / "cache")
 
 
+def test_a_camera_without_video_sees_nothing_where_not_all_need_one(folder: Path, tmp_path: Path) -> None:
+    recording = _make_recording(folder)
+    videos = {name: video for name, video in recording.videos.items() if name != "cam2"}
+    made = compute(replace(recording, videos=videos), SETTINGS, cache=tmp_path / "cache", all_videos=False)
+    assert made.cameras == ("cam1", "cam2", "cam3")
+    assert set(made.keys) == {"cam1", "cam3"}
+    shown = made.at_instants(recording.timeline())
+    assert shown.exposures is not None
+    assert shown.exposures.is_there.all(axis=0).tolist() == [True, False, True]
+    assert shown.exposures.is_there.any(axis=0).tolist() == [True, False, True]
+    both = compute(recording, SETTINGS, cache=tmp_path / "cache")
+    np.testing.assert_array_equal(_read_all(shown)[:, [0, 2]], _read_all(both)[:, [0, 2]])
+    assert not _read_all(shown)[:, 1].any()
+    with pytest.raises(InputError, match="expected at least one video, found none"):
+        compute(replace(recording, videos={}), SETTINGS, cache=tmp_path / "cache", all_videos=False)
+
+
 def test_cameras_of_different_size_and_length_are_filled_up_with_background(
     folder: Path, tmp_path: Path
 ) -> None:

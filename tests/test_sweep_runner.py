@@ -246,7 +246,11 @@ def test_a_dry_run_shows_the_cells(tmp_path: Path, capsys: pytest.CaptureFixture
         "runs=2",
         "swarm.iterations=6",
     ]
-    assert lines[2:] == ["2 cells, 4 runs", "nothing to run; without 2 cells whose input cannot be read"]
+    assert lines[2:] == [
+        "2 cells, 4 runs",
+        "cannot be read: data: expected the sequence S01_D2_A, found none; name the data's root with --data",
+        "nothing to run; without 2 cells whose input cannot be read",
+    ]
 
 
 def test_an_error_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -131,6 +131,7 @@ def test_the_name_of_scaled_numbers(value, scale, name):
         ({"rows_by": ["methd"]}, "rows: expected the name of one column, found methd; did you mean method?"),
         ({"columns_by": ["partcles"]}, "columns: .*found partcles; did you mean settings.swarm.particles?"),
         ({"value": "mean_eror_m"}, "value: .*found mean_eror_m; did you mean mean_error_m?"),
+        ({"value": "mean"}, "value: .*found mean; did you mean mean_error_m?"),
         ({"value": "zzz"}, "value: .*found zzz; there are sequence, method, settings.swarm.particles, .*"),
         ({"value": "sequence"}, "value: expected a column of numbers, found sequence"),
         ({"rows_by": []}, "rows: expected at least one column, and each only once, found none"),
@@ -273,3 +274,11 @@ def test_an_unknown_format_is_one_line():
         SettingsError, match=r"format: expected one of text, .*, found latx; did you mean latex"
     ):
         render_table(in_mm(results()), "latx")
+
+
+def test_the_beginning_of_several_names_lists_them():
+    rows = results(mean_nees=1.0, median_error_m=0.01)
+    with pytest.raises(SettingsError, match=r"found mean; it may be mean_error_m or mean_nees$"):
+        pivot(rows, rows_by=["method"], columns_by=[], value="mean")
+    with pytest.raises(SettingsError, match=r"found medain_error_m; did you mean median_error_m\?$"):
+        pivot(rows, rows_by=["method"], columns_by=[], value="medain_error_m")

@@ -7,7 +7,7 @@ point. The position of a point in the world is in any of its rows, or in another
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -19,9 +19,9 @@ from psotrack.correspondence import BORDER_PX, NOISE_PX, NOISE_SHARE
 from psotrack.detection import marker_dictionary
 from psotrack.errors import InputError
 from psotrack.geometry import Rig, project_visible
-from psotrack.recordings import Detections, VideoInfo, read_frames
+from psotrack.recordings import Detections, FrameTimes, VideoInfo, nearest_frames, read_frames
 from psotrack.support import Column, Table, TextRow, read_rows
-from psotrack.trajectories import Trajectories
+from psotrack.trajectories import Trajectories, resample
 
 _SEPARATOR = ","
 _WORLD = ("x_m", "y_m", "z_m")
@@ -163,25 +163,43 @@ def find_markers_in(
 
 
 def find_drones_in_boxes(
-    rig: Rig, detections: Mapping[str, Detections], tracks: Trajectories, most_frames: int = 500
+    rig: Rig,
+    detections: Mapping[str, Detections],
+    tracks: Trajectories,
+    most_frames: int = 500,
+    frame_times: Mapping[str, FrameTimes] | None = None,
 ) -> DroneViews:
     """Find tracked drones in the images: the middle of the box that contains a drone's projection.
 
     Boxes that contain two drones, drones in two boxes, boxes that the image's border cuts, and boxes that touch other
     boxes are not used. Of long tracks only every n-th frame is used, because neighbouring frames have the same errors.
 
+    Where the cameras' frames were not exposed together, each camera shows its frame nearest to the track's time. The
+    middle of a box is moved by the motion of the track's projection from the exposure to that time, which is at most
+    0.6 frames of the camera. No camera shows a frame twice.
+
     Args:
         rig: cameras with which the drones were tracked.
         detections: detections by camera name; a camera without an entry has no detections.
         tracks: positions of the drones.
         most_frames: largest number of frames that are used.
+        frame_times: times of each camera's frames on the clock of the tracks; None where frame i of every camera was
+            exposed at the time of the tracks' frame i.
     """
-    rows = np.arange(0, tracks.num_frames, max(1, -(-tracks.num_frames // most_frames)))
-    places_m = np.where(tracks.seen[rows, :, None], tracks.position_m[rows], np.nan)
-    projected, depth = project_visible(rig.cameras, places_m[:, :, None, :])
+    shortest = 1 if frame_times is None else _rows_per_frame(tracks, frame_times)
+    rows = np.arange(0, tracks.num_frames, max(shortest, -(-tracks.num_frames // most_frames)))
+    places_m = np.where(tracks.seen[..., None], tracks.position_m, np.nan)
+    frames = np.repeat(tracks.frame[rows, None], len(rig), axis=1)
+    shown_m = places_m[rows, :, None]
+    if frame_times is not None:
+        frames, shown_m = _at_exposures(rig, replace(tracks, position_m=places_m), rows, frame_times)
+    projected, depth = project_visible(rig.cameras, shown_m)
+    motion_px = np.zeros(projected.shape)
+    if frame_times is not None:
+        motion_px = np.asarray(project_visible(rig.cameras, places_m[rows, :, None])[0] - projected)
     points_px, side_px = np.full(projected.shape, np.nan), np.full(depth.shape, np.nan)
     for camera, name in enumerate(rig.names):
-        for row, frame in enumerate(tracks.frame[rows].tolist() if name in detections else []):
+        for row, frame in enumerate(frames[:, camera].tolist() if name in detections else []):
             xyxy = detections[name].in_frame(frame).xyxy
             clear = _clear(xyxy, np.asarray(rig.cameras.image_size_wh[camera]))
             at = projected[row, :, camera, None]
@@ -193,6 +211,8 @@ def find_drones_in_boxes(
             drone, box = np.nonzero(alone & clear)
             points_px[row, drone, camera] = (xyxy[box, :2] + xyxy[box, 2:]) / 2
             side_px[row, drone, camera] = np.sqrt((xyxy[box, 2:] - xyxy[box, :2]).prod(axis=-1))
+    points_px += motion_px
+    side_px[np.isnan(points_px).any(axis=-1)] = np.nan
     names = [f"{drone}@{frame}" for frame in tracks.frame[rows].tolist() for drone in tracks.drones]
     drone = np.tile(np.arange(tracks.num_drones), len(rows))
     second = np.floor(tracks.time_s[rows] / _COMMON_S).astype(np.int64).repeat(tracks.num_drones)
@@ -208,6 +228,36 @@ def find_drones_in_boxes(
         drone,
         side_px,
     )
+
+
+def _rows_per_frame(tracks: Trajectories, frame_times: Mapping[str, FrameTimes]) -> int:
+    """Number of rows of the tracks in an interval of the slowest camera."""
+    if tracks.num_frames < 2 or not frame_times:
+        return 1
+    row_s = float(np.median(np.diff(tracks.time_s)))
+    slowest = min(times.fps for times in frame_times.values())
+    # A thousandth: rates are rounded in files.
+    return max(1, int(np.ceil(1 / (slowest * row_s) - 1e-3)))
+
+
+def _at_exposures(
+    rig: Rig,
+    tracks: Trajectories,
+    rows: Int[np.ndarray, "rows"],
+    frame_times: Mapping[str, FrameTimes],
+) -> tuple[Int[np.ndarray, "rows cameras"], Float[np.ndarray, "rows drones cameras 3"]]:
+    """Each camera's frame nearest to each row of the tracks, -1 for none, and where the drones were at its exposure."""
+    time_s = tracks.time_s[rows]
+    frames = np.full((len(rows), len(rig)), -1)
+    shown_m = np.full((len(rows), tracks.num_drones, len(rig), 3), np.nan)
+    for camera, name in enumerate(rig.names):
+        if name in frame_times:
+            frames[:, camera], offset_s = nearest_frames(frame_times[name], time_s)
+            shown_m[:, :, camera] = resample(tracks, rows, time_s + offset_s).position_m
+    # Two rows may be near one frame at the beginning or the end of a video.
+    frames[1:][np.diff(frames, axis=0) == 0] = -1
+    shown_m[np.broadcast_to((frames < 0)[:, None], shown_m.shape[:3])] = np.nan
+    return frames, shown_m
 
 
 def _clear(

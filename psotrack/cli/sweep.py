@@ -230,6 +230,8 @@ def _show(
             quiet, json_path, f"{number:4} " + " ".join(f"{name}={value}" for name, value in cell.items())
         )
     print_line(quiet, json_path, f"{len(cells)} cells, {sum(cell.runs for cell in cells)} runs")
+    for fault in expected.faults:
+        print_line(quiet, json_path, f"cannot be read: {fault}")
     print_line(quiet, json_path, f"{expected}")
 
 

@@ -16,7 +16,7 @@ from .recording_file import (
     write_recording_file,
 )
 from .timestamps import read_timestamps
-from .timing import FrameTimes, Timeline, check_rate, make_timeline
+from .timing import FrameTimes, Timeline, check_rate, make_timeline, nearest_frames
 from .video import (
     TruncatedVideoError,
     VideoInfo,
@@ -58,6 +58,7 @@ __all__ = [
     "join_videos",
     "make_timeline",
     "natural_key",
+    "nearest_frames",
     "probe",
     "probe_images",
     "read_c3d",

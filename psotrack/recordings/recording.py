@@ -151,6 +151,11 @@ class Recording:
         return timeline if self.num_instants is None else timeline.part(slice(self.num_instants))
 
     @property
+    def exposed(self) -> Mapping[str, FrameTimes]:
+        """Times of the frames of the rig's cameras by name; those of the middle row where the shutter rolls."""
+        return self._times
+
+    @property
     def _has_frames(self) -> bool:
         return any(name in self.frame_times and self.frame_times[name].num_frames for name in self._timed)
 

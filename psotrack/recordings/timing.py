@@ -270,18 +270,33 @@ def _of_nearest_frames(names: tuple[str, ...], times: list[FrameTimes], rate_hz:
     frame = np.full((len(time_s), len(times)), -1)
     offset_s = np.zeros(frame.shape)
     for camera, each in enumerate(times):
-        if not each.num_frames:
-            continue
-        own_s = each.time_s
-        nearest = _nearest(own_s, time_s)
-        off_s = own_s[nearest] - time_s
-        there = np.abs(off_s) * each.fps <= _REACH
-        frame[:, camera] = np.where(there, nearest, -1)
-        offset_s[:, camera] = np.where(there, off_s, 0.0)
+        frame[:, camera], offset_s[:, camera] = nearest_frames(each, time_s)
     # Differences far below a thousandth of an interval are rounding of the instants' own times.
     offset_s[np.abs(offset_s) * rate_hz < _SAME] = 0.0
     stop = int(np.flatnonzero((frame >= 0).any(axis=1)).max(initial=-1)) + 1
     return Timeline(names, rate_hz, time_s[:stop], frame[:stop], offset_s[:stop])
+
+
+def nearest_frames(
+    times: FrameTimes, at_s: Float[np.ndarray, "instants"]
+) -> tuple[Int[np.ndarray, "instants"], Float[np.ndarray, "instants"]]:
+    """The frame of a camera that is nearest to each instant.
+
+    Args:
+        times: times of the camera's frames.
+        at_s: (instants,), times of the instants, seconds.
+
+    Returns:
+        (instants,), numbers of the frames, -1 where no frame is near the instant; and (instants,), the frame's time
+        minus the instant's time, seconds, 0 where there is no frame.
+    """
+    if not times.num_frames:
+        return np.full(len(at_s), -1), np.zeros(len(at_s))
+    own_s = times.time_s
+    nearest = _nearest(own_s, at_s)
+    off_s = own_s[nearest] - at_s
+    there = np.abs(off_s) * times.fps <= _REACH
+    return np.where(there, nearest, -1), np.where(there, off_s, 0.0)
 
 
 def _nearest(sorted_s: Float[np.ndarray, "of"], to_s: Float[np.ndarray, "to"]) -> Int[np.ndarray, "to"]:

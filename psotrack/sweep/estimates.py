@@ -33,6 +33,7 @@ class Estimate:
         compiling_s: time of compiling; compiled programs that are stored already are included.
         silhouettes_s: time of making the silhouettes that are not stored.
         basis: origin of the numbers, in words.
+        faults: why inputs cannot be read, each reason once.
     """
 
     cells: int
@@ -41,6 +42,7 @@ class Estimate:
     compiling_s: float
     silhouettes_s: float
     basis: str
+    faults: tuple[str, ...] = ()
 
     @property
     def total_s(self) -> float:
@@ -72,12 +74,14 @@ def estimate(cells: Iterable[Cell], inputs: Inputs, store: Store | None) -> Esti
     factor, basis = _fit_factor(store)
     count = unread = 0
     tracking_s, programs, silhouettes_s = 0.0, set(), {}
+    faults: dict[str, None] = {}
     for cell in cells:
         try:
             done = _finished_seeds(cell, inputs, store) if store else set()
             recording = inputs.recording_of(cell)
-        except PsotrackError:
+        except PsotrackError as error:
             unread += 1
+            faults[str(error)] = None
             continue
         runs = len(set(cell.seeds) - done)
         if not runs:
@@ -103,7 +107,13 @@ def estimate(cells: Iterable[Cell], inputs: Inputs, store: Store | None) -> Esti
         if settings.needs_silhouettes and source_of(cell) not in silhouettes_s:
             silhouettes_s[source_of(cell)] = _silhouettes_s(cell, inputs)
     return Estimate(
-        count, unread, tracking_s, COMPILE_S * len(programs), sum(silhouettes_s.values(), 0.0), basis
+        count,
+        unread,
+        tracking_s,
+        COMPILE_S * len(programs),
+        sum(silhouettes_s.values(), 0.0),
+        basis,
+        tuple(faults),
     )
 
 

@@ -64,7 +64,8 @@ def adjust(
 ) -> None:
     """Move the cameras of SEQ that disagree with the other cameras about its drones, by a bundle adjustment.
 
-    The adjustment uses the middles of SEQ's detections that contain a tracked drone. A middle has an error of about a
+    The adjustment uses the middles of SEQ's detections that contain a tracked drone; where the cameras' frames were not
+    exposed together, the middles are moved by the drone's motion to common times. A middle has an error of about a
     pixel that stays the same for many frames, so that cameras are placed to a centimetre or two. Only cameras whose
     error is certainly larger are moved, and only if the moved cameras fit views better that the adjustment did not use:
     each quarter of the recording is left out in turn. If there is none, OUT is the unchanged rig.
@@ -93,10 +94,13 @@ def adjust(
             found="none",
             remedy="`psotrack detect` makes them",
         )
-    _check_one_clock(sequence, recording)
+    recording.check_detections(recording.detections)
     detections = {name: read_detections(path) for name, path in recording.detections.items()}
     flown = read_trajectories(tracks, fps=recording.fps if recording.videos else None)
-    views = find_drones_in_boxes(recording.rig, detections, flown)
+    frame_times = None
+    if not _is_synchronous(recording):
+        frame_times = {name: times for name, times in recording.exposed.items() if name in detections}
+    views = find_drones_in_boxes(recording.rig, detections, flown, frame_times=frame_times)
     held = tuple(name for name in fixed.split(",") if name)
     checked = improve_with_check(
         recording.rig, views, noise_px, fixed=held, refine_focal_length=refine_focal_length
@@ -117,20 +121,14 @@ def adjust(
         print_line(quiet, json_path, f"focal lengths x {scale:.5f} ± {std:.5f}{done}")
 
 
-def _check_one_clock(sequence: Path, recording: Recording) -> None:
-    """Raise `InputError` where frames of equal number are not exposed together."""
-    times = {
-        name: each for name, each in recording.frame_times.items() if name in (recording.detections or {})
-    }
-    longest = max(times.values(), key=lambda each: each.num_frames, default=None)
-    for name, each in times.items():
-        assert longest is not None
-        if np.abs(each.time_s - longest.time_s[: each.num_frames]).max(initial=0.0) > 0.1 / longest.fps:
-            raise InputError(
-                sequence,
-                expected="cameras whose frames of equal number were exposed together",
-                found=f"another rate or start of camera {name}",
-            )
+def _is_synchronous(recording: Recording) -> bool:
+    """Whether frames of equal number were exposed together, to a tenth of a frame."""
+    times = [each for name, each in recording.frame_times.items() if name in (recording.detections or {})]
+    longest = max(times, key=lambda each: each.num_frames)
+    return all(
+        np.abs(each.time_s - longest.time_s[: each.num_frames]).max(initial=0.0) <= 0.1 / longest.fps
+        for each in times
+    )
 
 
 def _rows(
