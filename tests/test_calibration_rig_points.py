@@ -16,6 +16,7 @@ from psotrack.calibration import (
     calibrate_by_point,
     covariance_of_centres,
     distance_between,
+    find_point_shifts,
     fit_world,
     read_point_views,
     read_world,
@@ -67,6 +68,30 @@ def test_a_moving_point_places_all_cameras():
     np.testing.assert_allclose(
         change.rig(found.adjusted.rig).cameras.centre_world, RIG.cameras.centre_world, atol=0.03
     )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("late", [0, 20])
+def test_a_camera_that_is_late_by_many_instants_is_named(late):
+    """The point flies at 1 m/s, 30 instants per second, with false sightings; each ten seconds it rests for three."""
+    rng = np.random.default_rng(0)
+    seconds = np.arange(1200) / 30
+    flown = np.minimum(seconds % 10, 7) + seconds // 10 * 7
+    points_m = np.stack(
+        [0.8 * np.sin(flown), 0.8 * np.cos(0.7 * flown), 1.1 + 0.5 * np.sin(1.3 * flown)], axis=-1
+    )
+    pixels = project(RIG.cameras, points_m[:, None])[0]
+    pixels[late:, 3] = pixels[: len(pixels) - late, 3]
+    pixels += rng.normal(0, 0.5, pixels.shape)
+    wrong = rng.random(pixels.shape[:2]) < 0.05
+    pixels[wrong] += rng.normal(0, 200, (int(wrong.sum()), 2))
+    views = PointViews(RIG.names, np.zeros(len(pixels), np.int64), np.arange(len(pixels)), pixels)
+    shifts = find_point_shifts(calibrate_by_point(RIG, views).adjusted.rig, views)
+    assert [shift.camera for shift in shifts] == ["c3"] * bool(late)
+    if late:
+        # A shift of one instant moves a sighting by about ten pixels, which is beyond the gate.
+        assert abs(shifts[0].instants + late) <= 1
+        assert "c3 shows the scene late by about" in str(shifts[0])
 
 
 @pytest.mark.slow

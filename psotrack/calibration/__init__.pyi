@@ -32,6 +32,7 @@ from .rig.point_files import (
     stick_length,
     views_of_detections,
 )
+from .rig.point_shifts import PointShift, find_point_shifts
 from .rig.views import BoardViews, FoundBoards, find_views
 from .rig.world import Similarity, align, world_of_camera
 from .significance import Improved, find_wrong_cameras, improve
@@ -59,6 +60,7 @@ __all__ = [
     "Located",
     "ModelComparison",
     "PointRig",
+    "PointShift",
     "PointViews",
     "Similarity",
     "adjust",
@@ -76,6 +78,7 @@ __all__ = [
     "find_drones_in_boxes",
     "find_markers",
     "find_markers_in",
+    "find_point_shifts",
     "find_shifts",
     "find_views",
     "find_wrong_cameras",

@@ -55,6 +55,7 @@ def calibrate_points(
         check_two_cameras,
         covariance_of_centres,
         distance_between,
+        find_point_shifts,
         fit_world,
         read_world,
         stick_length,
@@ -107,7 +108,8 @@ def calibrate_points(
             found.adjusted.used[seen, index],
             found.views.number[seen],
         )
-    return rig, rows, [f"the world is {place}", *_undetermined(rig, covariance)]
+    shifts = [str(shift) for shift in find_point_shifts(found.adjusted.rig, views)]
+    return rig, rows, [f"the world is {place}", *shifts, *_undetermined(rig, covariance)]
 
 
 def _numbered(found: PointRig) -> dict[int, np.ndarray]:
