@@ -48,8 +48,8 @@ class PointShift:
         count = abs(self.instants)
         return (
             f"{self.camera} shows the scene {early} by about {count} instants: {self.shifted_share:.0%} of its "
-            f"sightings fit the other cameras then, {self.share:.0%} as its frames are counted; {add} {count} instants {to} its "
-            "time_offset_s, or check its frame numbers, and run again"
+            f"sightings fit the other cameras then, {self.share:.0%} as its frames are counted; "
+            f"{add} {count} instants {to} its time_offset_s, or check its frame numbers, and run again"
         )
 
 
