@@ -22,7 +22,12 @@ from psotrack.calibration import (
     say_print,
 )
 from psotrack.calibration.board_corners import BoardFinder
-from psotrack.calibration.board_recognition import explain_missing_board, recognise_board
+from psotrack.calibration.board_recognition import (
+    Recognised,
+    explain_missing_board,
+    measure_marker_share,
+    recognise_board,
+)
 from psotrack.cli.calibrate import calibrate
 from psotrack.datasets import open_recording
 from psotrack.errors import InputError, PsotrackError, SettingsError
@@ -121,6 +126,34 @@ def test_another_board_is_named(stated, message):
     images = [draw_board(BOARD, K, pose(seed), SIZE_WH) for seed in range(2)]
     found, remedy = explain_missing_board(stated, images)
     assert message in f"{found}; {remedy}"
+
+
+@pytest.mark.slow
+def test_markers_that_stand_still_are_not_those_of_the_board():
+    """As many markers as on the board, in the same places of both images, are on the walls."""
+    walls = replace(BOARD, dictionary="6x6_250")
+    images = [
+        np.hstack([draw_board(BOARD, K, pose(seed), SIZE_WH), draw_board(walls, K, pose(5), SIZE_WH)])
+        for seed in range(2)
+    ]
+    found, remedy = explain_missing_board(replace(BOARD, dictionary="5x5_50"), images)
+    assert f"{found}; {remedy}" == "markers 0 to 11 of the dictionary 4x4_50; pass --dictionary 4x4_50"
+    # What stands still counts where nothing else is found.
+    found, _ = explain_missing_board(
+        replace(BOARD, dictionary="5x5_50"), [image[:, 640:] for image in images]
+    )
+    assert found == "markers 0 to 11 of the dictionary 6x6_50"
+
+
+def test_the_size_of_the_markers_is_measured():
+    images = [draw_board(BOARD, K, pose(seed), SIZE_WH) for seed in range(4)]
+    stated = Recognised(replace(BOARD, marker_m=0.4 * BOARD.square_m), False, 4)
+    assert measure_marker_share(stated, images) == pytest.approx(BOARD.marker_m / BOARD.square_m, rel=0.05)
+    assert measure_marker_share(stated, images[:2]) is None
+    inverted = replace(stated, inverted=True)
+    assert measure_marker_share(inverted, [255 - image for image in images]) == pytest.approx(
+        BOARD.marker_m / BOARD.square_m, rel=0.05
+    )
 
 
 @pytest.mark.slow

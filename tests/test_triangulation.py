@@ -352,3 +352,12 @@ def test_no_point_is_found_out_of_bounds(seed):
     bounds_m = np.array([[-3.0, -3.0, 0.05], [3.0, 3.0, 3.0]])
     points, _ = match_views(rig.cameras, [pixel[None] for pixel in pixels], [np.array([20.0])] * 6, bounds_m)
     assert (points >= bounds_m[0]).all()
+
+
+def test_no_paths_at_all():
+    rig = ring_rig(4)
+    for times in (np.arange(5.0), np.zeros((5, 4))):
+        none = triangulate_paths(
+            rig.cameras, np.zeros((0, 5, 4, 2)), times, noise_m=0.01, expected=(1.0, 1.0)
+        )
+        assert none.shape == (0, 3, 3)

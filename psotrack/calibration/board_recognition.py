@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import islice, product
 
 import cv2
 import numpy as np
@@ -36,6 +36,10 @@ _FAMILIES = {
 }
 #: Smallest number of different markers in an image that are not there by chance.
 _LEAST_MARKERS = 3
+#: Number of markers that determine the plane of a board well, and number of images in which their size is measured.
+_MARKERS_OF_PLANE, _IMAGES_OF_SHARE = 6, 40
+#: A marker that is nearer than this to its place in another image stands still, pixels.
+_STILL_PX = 2.0
 #: Smallest number of images that show a marker that is not there by chance.
 _LEAST_IMAGES = 3
 #: Largest number of squares along a side of a board that is recognised by its markers.
@@ -90,6 +94,40 @@ def recognise_board(board: Board, images: Iterable[UInt8[np.ndarray, "height wid
             break
     best = finders[int(views.argmax())]
     return Recognised(best.board, best.inverted, int(views.max()))
+
+
+def measure_marker_share(
+    recognised: Recognised, images: Iterable[UInt8[np.ndarray, "height width"]]
+) -> float | None:
+    """The side of a ChArUco board's marker in sides of a square, as images show it; None where they do not show enough.
+
+    The middles of the markers, which are whole squares apart whatever their size, give the homography from the image to
+    the board; it maps the markers' corners to the board.
+    """
+    board = recognised.board
+    if board.kind != "charuco" or board.num_markers < _MARKERS_OF_PLANE:
+        return None
+    model = board.opencv()
+    detector = cv2.aruco.ArucoDetector(model.getDictionary())
+    corners_of = dict(
+        zip(np.ravel(model.getIds()).tolist(), np.asarray(model.getObjPoints(), float)[..., :2], strict=True)
+    )
+    shares = []
+    for grey in islice(images, _IMAGES_OF_SHARE):
+        quads, ids, _ = detector.detectMarkers(255 - grey if recognised.inverted else grey)
+        found = {} if ids is None else dict(zip(np.ravel(ids).tolist(), quads, strict=True))
+        own = [marker for marker in found if marker in corners_of]
+        if len(own) < _MARKERS_OF_PLANE:
+            continue
+        quads_px = np.array([found[marker].reshape(4, 2) for marker in own], float)
+        middles_m = np.array([corners_of[marker].mean(axis=0) for marker in own])
+        to_board, _ = cv2.findHomography(quads_px.mean(axis=1), middles_m, cv2.RANSAC, 0.2 * board.square_m)
+        if to_board is None:
+            continue
+        quads_m = cv2.perspectiveTransform(quads_px.reshape(-1, 1, 2), to_board).reshape(-1, 4, 2)
+        sides_m = np.linalg.norm(quads_m - np.roll(quads_m, 1, axis=1), axis=-1)
+        shares.append(float(np.median(sides_m)) / board.square_m)
+    return float(np.median(shares)) if len(shares) >= _LEAST_IMAGES else None
 
 
 def explain_missing_board(
@@ -189,12 +227,14 @@ def _markers_of_all_dictionaries(
 ) -> list[tuple[str, bool, np.ndarray]]:
     """Family of a dictionary, whether white on black, and the markers that an image shows, for the best images.
 
-    Mirrored images are searched only if no dictionary has enough markers in the others.
+    Markers that stand still, such as those on the walls of a laboratory, are not those of a board that is moved: they
+    count only if no others are found. Mirrored images are searched only if no dictionary has enough markers in the
+    others.
     """
-    for mirrored in (False, True):
+    for moved, mirrored in product((True, False), (False, True)):
         sides = [np.ascontiguousarray(grey[:, ::-1]) if mirrored else grey for grey in images[:_IMAGES]]
         found = [
-            (name, inverted, _most_markers(name, [255 - side if inverted else side for side in sides]))
+            (name, inverted, _most_markers(name, [255 - side if inverted else side for side in sides], moved))
             for name, inverted in product(_FAMILIES, (False, True))
         ]
         if any(len(ids) >= _LEAST_MARKERS for _, _, ids in found):
@@ -203,20 +243,38 @@ def _markers_of_all_dictionaries(
 
 
 def _most_markers(
-    family: str, images: Sequence[UInt8[np.ndarray, "height width"]]
+    family: str, images: Sequence[UInt8[np.ndarray, "height width"]], moved: bool = False
 ) -> Int[np.ndarray, " markers"]:
-    """The markers of the image that shows most markers of a family."""
+    """The markers of the image that shows most markers of a family; if `moved`, of those that do not stand still."""
     dictionary = marker_dictionary(f"{family}_1000" if _FAMILIES[family] else family)
     # A marker of few bits is easily seen where none is: only exact matches count.
     parameters = cv2.aruco.DetectorParameters()
     parameters.errorCorrectionRate = 0.0
     detector = cv2.aruco.ArucoDetector(dictionary, parameters)
-    seen = [np.zeros(0, np.int64)]
+    seen: list[dict[int, Float[np.ndarray, "2"]]] = [{}]
     for image in images:
-        _, ids, _ = detector.detectMarkers(image)
-        if ids is not None:
-            seen.append(np.unique(np.ravel(ids).astype(np.int64)))
-    return max(seen, key=len)
+        quads, ids, _ = detector.detectMarkers(image)
+        found = [] if ids is None else np.ravel(ids).astype(int).tolist()
+        seen.append(
+            {
+                marker: quad.reshape(4, 2).astype(float).mean(axis=0)
+                for marker, quad in zip(found, quads, strict=True)
+            }
+        )
+
+    def stands_still(number: int, marker: int) -> bool:
+        return any(
+            np.linalg.norm(other[marker] - seen[number][marker]) < _STILL_PX
+            for index, other in enumerate(seen)
+            if index != number and marker in other
+        )
+
+    kept = [
+        [marker for marker in of_image if not (moved and stands_still(number, marker))]
+        for number, of_image in enumerate(seen)
+    ]
+    most: list[int] = max(kept, key=len)
+    return np.array(sorted(most), np.int64)
 
 
 def _size_by_markers(

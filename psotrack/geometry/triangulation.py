@@ -73,7 +73,9 @@ def triangulate_paths(
         # Each camera's frame becomes a frame of its own, in which the other cameras see nothing.
         alone = np.eye(time_s.shape[1], dtype=bool)[..., None]
         points_px = np.where(alone, points_px[..., :, None, :, :], np.nan)
-        points_px = points_px.reshape(*points_px.shape[:-4], -1, *points_px.shape[-2:])
+        *paths, frames, own, _, _ = points_px.shape
+        # Not -1: there may be no path at all.
+        points_px = points_px.reshape(*paths, frames * own, *points_px.shape[-2:])
         if weights is not None:
             weights = np.repeat(weights, time_s.shape[1], axis=-2)
     normal, right, seen = _normal_equations(cameras, points_px, weights)

@@ -29,13 +29,15 @@ def covariance_over_instants(bundle: RigBundle) -> Float[np.ndarray, "unknowns u
     """
     equations = bundle.equations()
     reduced = equations.reduced()
-    scale = np.sqrt(np.diag(reduced.information))
+    # An unknown that no view determines may have an information a little below 0, by rounding.
+    scale = np.sqrt(np.maximum(np.diag(reduced.information), 0.0))
     if not (scale > 0).all() or np.linalg.cond(reduced.information / np.outer(scale, scale)) > _MAX_CONDITION:
         raise InputError(
             "board",
             expected="views that determine lenses and places of all cameras",
             found="views that leave some open",
-            remedy="tilt the board, and move it through the whole image of each camera",
+            remedy="tilt the board, and move it through the whole image of each camera; if it was, check the board's "
+            "stated numbers and sizes with a ruler",
         )
     inverse = np.linalg.inv(reduced.information / np.outer(scale, scale)) / np.outer(scale, scale)
     information, pull = _by_instant(bundle, reduced.gain)

@@ -9,7 +9,12 @@ from itertools import islice
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from psotrack.calibration.board_recognition import Recognised, explain_missing_board, recognise_board
+from psotrack.calibration.board_recognition import (
+    Recognised,
+    explain_missing_board,
+    measure_marker_share,
+    recognise_board,
+)
 from psotrack.calibration.boards import LEAST_CORNERS, Board
 from psotrack.calibration.rig.images import CameraImages
 from psotrack.errors import InputError
@@ -17,6 +22,9 @@ from psotrack.support import Report, no_progress
 
 #: Largest number of images of each camera from which the print is found out.
 _MOST_SAMPLES = 24
+#: Largest deviation of the measured size of a ChArUco board's markers from the stated one: corners of markers of 10
+#: pixels, the smallest that are read, are found to about half a pixel at each end.
+_MARKER_SHARE_OFF = 0.2
 
 
 @dataclass(frozen=True)
@@ -86,6 +94,7 @@ def find_views(
         images = list(islice(_samples(cameras, frames), _MOST_SAMPLES))
         found, remedy = explain_missing_board(board, images)
         raise InputError("board", expected=f"a {board}", found=found, remedy=remedy)
+    _check_markers(recognised, _samples(cameras, frames))
     finder = recognised.finder()
     corners_px = np.full((len(cameras), len(number), board.num_corners, 2), np.nan)
     mirrored = np.zeros(len(cameras), np.int64)
@@ -115,6 +124,22 @@ def find_views(
                 remedy="check that the board is in its images, sharp and large enough, or leave the camera out",
             )
     return FoundBoards(views.select(np.asarray(views.seen.any(axis=0))), recognised, mirrored, searched)
+
+
+def _check_markers(recognised: Recognised, images: Iterator[UInt8[np.ndarray, "height width"]]) -> None:
+    """Raise `InputError` for a board whose markers are of another size than stated."""
+    board = recognised.board
+    share = measure_marker_share(recognised, images)
+    if share is None or board.marker_m is None:
+        return
+    stated = board.marker_m / board.square_m
+    if abs(share / stated - 1) > _MARKER_SHARE_OFF:
+        raise InputError(
+            "board",
+            expected=f"markers with sides of {stated:.2f} squares, as --square and --marker say",
+            found=f"{share:.2f} squares in the images",
+            remedy="measure both with a ruler",
+        )
 
 
 def _samples(
