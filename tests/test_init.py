@@ -402,7 +402,7 @@ Tables = st.builds(
     CameraTable,
     video=st.text(st.characters(exclude_categories=("C",)), min_size=1),
     size=st.none() | st.tuples(st.integers(1, 10**6), st.integers(1, 10**6)),
-    fps=st.none() | st.floats(1e-6, 1e6),
+    fps=st.none() | st.floats(1e-3, 2e4),
     time_offset_s=st.none() | Lengths,
     line_time_s=Lengths,
     distortion=st.none() | st.lists(Lengths, max_size=14).map(tuple),
