@@ -13,13 +13,13 @@ from .image_points import (
     read_image_points,
 )
 from .intrinsics import Lens, lens_of_board, lens_of_sensor, lens_of_view
+from .lens_models import LensModel, known_lenses, parse_lens_model
 from .pose_search import MIN_POINTS
 from .residuals import GATE, UNLIKELY, inflation, spread_px
 from .rig.adjustment import CalibratedRig, LensChoice, calibrate_rig, in_new_world
 from .rig.findings import CameraFigures, advise, coverage, figures_of, find_shifts, say_print, worst_views
 from .rig.images import CameraImages, instants_of_numbers, open_images, open_recorded
 from .rig.lens_choice import ModelComparison, choose_lens_model
-from .rig.lens_models import LensModel, known_lenses, parse_lens_model
 from .rig.moving_point import PointRig, PointViews, calibrate_by_point, covariance_of_centres
 from .rig.plots import save_coverage
 from .rig.point_files import (

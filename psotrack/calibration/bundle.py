@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.calibration.bundle_equations import Bundle, BundleState, Problem, scale_focal_lengths
+from psotrack.calibration.bundles.points import PointBundle, PointProblem, PointState, scale_focal_lengths
 from psotrack.calibration.common_errors import CommonErrors, covariance_of_common_errors
 from psotrack.calibration.derivatives import centre_by_pose
 from psotrack.calibration.gauge import common_motions, pose_change_metric
@@ -106,8 +106,8 @@ def adjust(
     held /= np.sqrt(np.diag(held @ common))[:, None]
     noise = np.where(placed, noise_px, 1.0)[rows]
     is_rescaled = np.array([name in rescaled for name in rig.names])
-    problem = Problem(rig.cameras, given, points_px[rows], noise, is_rescaled, free, common, held)
-    bundle = Bundle(problem, BundleState(given, start_m[rows]), placed[rows], robust=True).solved()
+    problem = PointProblem(rig.cameras, given, points_px[rows], noise, is_rescaled, free, common, held)
+    bundle = PointBundle(problem, PointState(given, start_m[rows]), placed[rows], robust=True).solved()
     unknowns = free.shape[1] - common.shape[1] + 3 * len(rows)
     # The gate depends on the fit and the fit on the gate. The loop ends if they alternate.
     for _ in range(5):
@@ -168,7 +168,7 @@ def _unknowns(
 
 def _adjusted(
     rig: Rig,
-    bundle: Bundle,
+    bundle: PointBundle,
     rows: Int[np.ndarray, " rows"],
     num_points: int,
     common_errors: Sequence[CommonErrors],

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.calibration.bundle_equations import Bundle, camera_columns
+from psotrack.calibration.bundles.points import PointBundle, camera_columns
 from psotrack.estimation import ReducedEquations
 
 #: Smallest information about a common error, in units of its stated precision, with which the residuals can check its
@@ -37,7 +37,7 @@ class CommonErrors:
 
 
 def covariance_of_common_errors(
-    bundle: Bundle,
+    bundle: PointBundle,
     equations: ReducedEquations,
     common_errors: Sequence[CommonErrors],
 ) -> Float[np.ndarray, "free free"]:
@@ -75,7 +75,7 @@ def covariance_of_common_errors(
 
 
 def _reduced_slopes(
-    bundle: Bundle, equations: ReducedEquations, index: int, seen: Int[np.ndarray, " seen"]
+    bundle: PointBundle, equations: ReducedEquations, index: int, seen: Int[np.ndarray, " seen"]
 ) -> tuple[Float[np.ndarray, "seen 2 free"], Float[np.ndarray, "seen 2"]]:
     """Derivatives of a camera's pixels by the unknowns, where the points follow the cameras; and the residuals."""
     by_camera, by_point, off = bundle.slopes(index, seen)

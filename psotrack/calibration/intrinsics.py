@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.calibration.boards import Board
+from psotrack.calibration.lens_models import LensModel
 from psotrack.calibration.rig.adjustment import LensChoice, calibrate_rig
 from psotrack.calibration.rig.images import CameraImages, instants_of_numbers
-from psotrack.calibration.rig.lens_choice import choose_lens_model
-from psotrack.calibration.rig.lens_models import LensModel
+from psotrack.calibration.rig.lens_choice import MOST_FITS, choose_lens_model
 from psotrack.calibration.rig.views import find_views
 from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.geometry import Camera, make_camera
@@ -116,9 +116,10 @@ def lens_of_board(
         )
     compared_px: dict[str, float] = {}
     if model is None:
-        comparison = choose_lens_model(board, views.corners_px[0], images.image_size_wh)
+        with report("lens", MOST_FITS) as advance:
+            comparison = choose_lens_model(board, views.corners_px[0], images.image_size_wh, advance)
         model, compared_px = comparison.model, comparison.error_px
-    calibrated = calibrate_rig(board, views, LensChoice(model))
+    calibrated = calibrate_rig(board, views, LensChoice(model), report=report)
     camera, std = calibrated.rig.cameras[0], calibrated.lens_std[0]
     used = calibrated.used[0]
     is_good = used.any(axis=1)

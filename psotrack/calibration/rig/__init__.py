@@ -1,7 +1,7 @@
 """A rig from nothing: lenses and places of several cameras, from views of a board that is moved before them.
 
 In: images or videos of all cameras (`images`). Out: a `CalibratedRig` with covariances. `views` finds the corners of
-the board, `lens_models` projects, `board_poses` finds a first lens of each camera, `chain` joins the cameras through
-the views that they share, `equations`, `slips` and `adjustment` adjust lenses, cameras and boards together,
-`covariance` says how certain the rig is, and `findings` says what to do.
+the board, `board_poses` finds a first lens of each camera, `chain` joins the cameras through the views that they share,
+`adjustment` and `slips` adjust lenses, cameras and boards together (with `calibration.bundles.boards`), `covariance`
+says how certain the rig is, and `findings` says what to do.
 """

@@ -14,26 +14,27 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.calibration.boards import Board
+from psotrack.calibration.bundles.boards import (
+    LEAST_NOISE_PX,
+    BoardBundle,
+    BoardProblem,
+    BoardState,
+    CameraCorners,
+    solve_robustly,
+)
 from psotrack.calibration.derivatives import centre_by_pose
+from psotrack.calibration.lens_models import PINHOLE, LensModel, camera_matrix
 from psotrack.calibration.residuals import GATE
 from psotrack.calibration.rig.board_poses import find_lens
 from psotrack.calibration.rig.chain import Chain, join_cameras
 from psotrack.calibration.rig.covariance import covariance_over_instants
-from psotrack.calibration.rig.equations import (
-    LEAST_NOISE_PX,
-    CameraCorners,
-    RigBundle,
-    RigProblem,
-    RigState,
-    solve_robustly,
-)
-from psotrack.calibration.rig.lens_choice import choose_lens_model
-from psotrack.calibration.rig.lens_models import PINHOLE, LensModel, camera_matrix
+from psotrack.calibration.rig.lens_choice import MOST_FITS, choose_lens_model
 from psotrack.calibration.rig.slips import Slips
 from psotrack.calibration.rig.views import BoardViews
 from psotrack.calibration.rig.world import Similarity
 from psotrack.errors import InputError
 from psotrack.geometry import Camera, Rig, make_camera, make_rig
+from psotrack.support import Advance, Report, no_progress
 
 #: Largest number of adjustments, and relative change of the slips' widths that ends them.
 _MOST_ROUNDS, _SETTLED = 15, 0.02
@@ -90,7 +91,12 @@ class LensChoice:
 
 
 def calibrate_rig(
-    board: Board, views: BoardViews, lenses: LensChoice = LensChoice(), *, floor: int | None = None
+    board: Board,
+    views: BoardViews,
+    lenses: LensChoice = LensChoice(),
+    *,
+    floor: int | None = None,
+    report: Report = no_progress,
 ) -> CalibratedRig:
     """Calibrate lenses and places of all cameras from views of a board.
 
@@ -100,17 +106,19 @@ def calibrate_rig(
         lenses: what is known of the lenses.
         floor: number of the instant at which the board is the world: its corner is the origin, z points out of its
             front. None: the world is the first camera.
+        report: display of the progress.
 
     Raises:
         InputError: a camera sees too little of the board, no views join the cameras, the views do not determine the
             rig, or the board is not seen at the instant `floor`.
     """
     _check_views(board, views, lenses)
-    models, vectors, lens_of = _start_lenses(board, views, lenses)
+    models, vectors, lens_of = _start_lenses(board, views, lenses, report)
     chain = join_cameras(board, views, tuple(models[k] for k in lens_of), tuple(vectors[k] for k in lens_of))
     views = _relabelled(board, views, chain)
     fixed = None if floor is None else _instant(views, floor)
-    bundle = _adjust(board, views, chain, (models, vectors, lens_of), lenses, fixed)
+    with report("adjustment", _MOST_ROUNDS + 1) as advance:
+        bundle = _adjust(board, views, chain, (models, vectors, lens_of), lenses, fixed, advance)
     return _result(board, views, chain, bundle)
 
 
@@ -127,25 +135,21 @@ def _check_views(board: Board, views: BoardViews, lenses: LensChoice) -> None:
 
 
 def _start_lenses(
-    board: Board, views: BoardViews, lenses: LensChoice
+    board: Board, views: BoardViews, lenses: LensChoice, report: Report
 ) -> tuple[tuple[LensModel, ...], tuple[np.ndarray, ...], Int[np.ndarray, " cameras"]]:
     """Models and first vectors of the lenses, and the index of each camera's lens."""
+    known = lenses.known or {}
     models, vectors = [], []
-    for camera, name in enumerate(views.names):
-        if name in (lenses.known or {}):
-            model, vector = (lenses.known or {})[name]
-        else:
-            size_wh = (int(views.image_size_wh[camera, 0]), int(views.image_size_wh[camera, 1]))
-            views_px = views.corners_px[camera][views.seen[camera]]
-            model = lenses.model or choose_lens_model(board, views_px, size_wh).model
-            found = find_lens(board, model, views_px, size_wh)
-            if found is None:
-                raise InputError(
-                    f"camera {name}", expected="views that a lens fits", found="none", remedy="tilt the board"
-                )
-            vector = found
-        models.append(model)
-        vectors.append(vector)
+    steps = (0 if lenses.model else MOST_FITS) + 1
+    with report("lenses", steps * sum(name not in known for name in views.names)) as advance:
+        for camera, name in enumerate(views.names):
+            if name in known:
+                model, vector = known[name]
+            else:
+                model, vector = _first_lens(board, views, camera, lenses.model, advance)
+                advance(1)
+            models.append(model)
+            vectors.append(vector)
     if not lenses.is_shared:
         return tuple(models), tuple(vectors), np.arange(len(models))
     if len(np.unique(views.image_size_wh, axis=0)) > 1:
@@ -153,6 +157,24 @@ def _start_lenses(
     # The camera with most views has the best first lens.
     best = int(views.seen.sum(axis=1).argmax())
     return (models[best],), (vectors[best],), np.zeros(len(models), np.int64)
+
+
+def _first_lens(
+    board: Board, views: BoardViews, camera: int, model: LensModel | None, advance: Advance
+) -> tuple[LensModel, Float[np.ndarray, " unknowns"]]:
+    """Model and first vector of a camera's lens from its own views; None for a model that the views choose."""
+    size_wh = (int(views.image_size_wh[camera, 0]), int(views.image_size_wh[camera, 1]))
+    views_px = views.corners_px[camera][views.seen[camera]]
+    model = model or choose_lens_model(board, views_px, size_wh, advance).model
+    vector = find_lens(board, model, views_px, size_wh)
+    if vector is None:
+        raise InputError(
+            f"camera {views.names[camera]}",
+            expected="views that a lens fits",
+            found="none",
+            remedy="tilt the board",
+        )
+    return model, vector
 
 
 def _relabelled(board: Board, views: BoardViews, chain: Chain) -> BoardViews:
@@ -187,7 +209,8 @@ def _adjust(
     start: tuple[tuple[LensModel, ...], tuple[np.ndarray, ...], Int[np.ndarray, " cameras"]],
     lenses: LensChoice,
     fixed: int | None,
-) -> RigBundle:
+    advance: Advance,
+) -> BoardBundle:
     """Adjust everything, with the world fixed to the first camera or to the board at an instant."""
     models, vectors, lens_of = start
     known = lenses.known or {}
@@ -205,7 +228,7 @@ def _adjust(
     # Turns about the board's middle and shifts of the middle are nearly independent.
     middle = np.eye(4)
     middle[:3, 3] = board.corners_m.mean(axis=0)
-    problem = RigProblem(
+    problem = BoardProblem(
         models=models,
         lens_of=lens_of,
         image_size_wh=sizes,
@@ -216,16 +239,18 @@ def _adjust(
         free_camera=free_camera,
         free_board=free_board,
     )
-    state = RigState(vectors, T_cam_world, T_world_board @ middle)
+    state = BoardState(vectors, T_cam_world, T_world_board @ middle)
     everything = tuple(np.ones(len(one.corner), bool) for one in seen)
-    bundle = RigBundle(problem, state, everything, robust=True)
+    bundle = BoardBundle(problem, state, everything, robust=True)
     if problem.size:
         bundle = solve_robustly(bundle)
+    advance(1)
     free_lens = tuple(
         np.full(model.size, lenses.is_shared or views.names[index] not in known)
         for index, model in enumerate(models)
     )
-    bundle = _adjust_with_slips(replace(bundle, problem=replace(problem, free_lens=free_lens)), board)
+    bundle = replace(bundle, problem=replace(problem, free_lens=free_lens))
+    bundle = _adjust_with_slips(bundle, board, advance)
     for name, of_camera in zip(views.names, bundle.used, strict=True):
         if not of_camera.any():
             raise InputError(f"camera {name}", expected="views that fit the other cameras", found="none")
@@ -233,7 +258,7 @@ def _adjust(
     return replace(bundle, state=placed, problem=replace(bundle.problem, corners_m=board.corners_m))
 
 
-def _adjust_with_slips(bundle: RigBundle, board: Board) -> RigBundle:
+def _adjust_with_slips(bundle: BoardBundle, board: Board, advance: Advance) -> BoardBundle:
     """Adjust with squared residuals; outliers, noise and slips are estimated anew after each adjustment."""
     extent_m = float(np.linalg.norm(np.ptp(board.corners_m, axis=0)))
     seen = bundle.problem.seen
@@ -251,6 +276,7 @@ def _adjust_with_slips(bundle: RigBundle, board: Board) -> RigBundle:
         problem = replace(bundle.problem, noise_px=noise_px)
         bundle = replace(bundle, problem=problem, used=used, slip_std=slips.each()).solved()
         slips = slips.estimated(bundle)
+        advance(1)
         same = all((new == old).all() for new, old in zip(used, before.used, strict=True))
         if same and np.abs(np.log(slips.std / widths)).max() < _SETTLED:
             break
@@ -276,7 +302,7 @@ def _inliers(seen: CameraCorners, near: Bool[np.ndarray, " seen"], least: int) -
     return near & is_good[seen.instant]
 
 
-def _result(board: Board, views: BoardViews, chain: Chain, bundle: RigBundle) -> CalibratedRig:
+def _result(board: Board, views: BoardViews, chain: Chain, bundle: BoardBundle) -> CalibratedRig:
     covariance = covariance_over_instants(bundle)
     problem, state = bundle.problem, bundle.state
     cameras: dict[str, Camera] = {}

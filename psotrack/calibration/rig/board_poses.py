@@ -10,8 +10,14 @@ from jaxtyping import Bool, Float
 
 from psotrack.calibration.board_corners import choose_spread, outline_of
 from psotrack.calibration.boards import Board
-from psotrack.calibration.rig.equations import CameraCorners, RigBundle, RigProblem, RigState, solve_robustly
-from psotrack.calibration.rig.lens_models import PINHOLE, LensModel
+from psotrack.calibration.bundles.boards import (
+    BoardBundle,
+    BoardProblem,
+    BoardState,
+    CameraCorners,
+    solve_robustly,
+)
+from psotrack.calibration.lens_models import PINHOLE, LensModel
 
 #: Focal lengths from which the search for a lens starts, in image widths: 90 to 14 degrees; a fisheye's, to 200.
 _FOCAL_WIDTHS, _FOCAL_WIDTHS_FISHEYE = (0.5, 0.8, 1.2, 2.0, 4.0), (0.25, 0.35, 0.5, 0.8)
@@ -19,17 +25,17 @@ _FOCAL_WIDTHS, _FOCAL_WIDTHS_FISHEYE = (0.5, 0.8, 1.2, 2.0, 4.0), (0.25, 0.35, 0
 _MOST_VIEWS = 30
 
 
-def find_board_poses(
-    board: Board,
-    model: LensModel,
-    lens: Float[np.ndarray, " unknowns"],
-    corners_px: Float[np.ndarray, "corners 2"],
-) -> Float[np.ndarray, "poses 4 4"]:
+def find_board_poses(board: Board, rays: Float[np.ndarray, "corners 2"]) -> Float[np.ndarray, "poses 4 4"]:
     """Poses, board to camera, that fit a view: up to two of a plane, for each labelling of the corners.
 
-    The pose of smallest error comes first; none if the lens cannot be inverted at most corners.
+    Args:
+        board: the board.
+        rays: (corners, 2), directions x / z, y / z in which the corners are seen; NaN where one is not seen, or where
+            the lens cannot be inverted.
+
+    Returns:
+        The poses, that of smallest error first; none if the rays of most corners are not known.
     """
-    rays = model.normalise(lens, corners_px)
     found: list[tuple[float, np.ndarray]] = []
     for order in board.labellings:
         seen = np.isfinite(rays[:, 0])
@@ -119,7 +125,7 @@ def _adjust_lens(
     views_px: Float[np.ndarray, "instants corners 2"],
     lens: Float[np.ndarray, " unknowns"],
     image_size_wh: tuple[int, int],
-) -> RigBundle | None:
+) -> BoardBundle | None:
     """Adjust a lens and the board's poses: first the focal lengths and the first coefficient, then all."""
     prepared = _problem(board, model, lens, views_px, image_size_wh)
     if prepared is None:
@@ -144,14 +150,15 @@ def _problem(
     lens: Float[np.ndarray, " unknowns"],
     views_px: Float[np.ndarray, "instants corners 2"],
     image_size_wh: tuple[int, int],
-) -> tuple[RigBundle, Bool[np.ndarray, " instants"]] | None:
+) -> tuple[BoardBundle, Bool[np.ndarray, " instants"]] | None:
     """Adjustment of one lens, and the views that it can show; None if it can show none."""
-    poses = [find_board_poses(board, model, lens, corners_px) for corners_px in views_px]
+    rays = model.normalise(lens, views_px.reshape(-1, 2)).reshape(views_px.shape)
+    poses = [find_board_poses(board, of_view) for of_view in rays]
     fits = np.array([len(candidates) > 0 for candidates in poses])
     if not fits.any():
         return None
     seen = CameraCorners.of(views_px[fits])
-    problem = RigProblem(
+    problem = BoardProblem(
         models=(model,),
         lens_of=np.zeros(1, np.int64),
         image_size_wh=np.array([image_size_wh]),
@@ -162,7 +169,7 @@ def _problem(
         free_camera=np.zeros(1, bool),
         free_board=np.ones(int(fits.sum()), bool),
     )
-    state = RigState(
+    state = BoardState(
         (lens,), np.eye(4)[None], np.array([candidates[0] for candidates in poses if len(candidates)])
     )
-    return RigBundle(problem, state, (np.ones(len(seen.corner), bool),), robust=True), fits
+    return BoardBundle(problem, state, (np.ones(len(seen.corner), bool),), robust=True), fits

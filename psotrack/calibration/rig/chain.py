@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.calibration.boards import Board
+from psotrack.calibration.lens_models import LensModel
 from psotrack.calibration.rig.board_poses import find_board_poses
-from psotrack.calibration.rig.lens_models import LensModel
 from psotrack.calibration.rig.views import BoardViews
 from psotrack.errors import InputError
 
@@ -138,10 +138,10 @@ def _find_poses(
     )
     poses = [
         [
-            find_board_poses(board, model, lens, corners_px) if is_seen else np.zeros((0, 4, 4))
-            for corners_px, is_seen in zip(of_camera, seen, strict=True)
+            find_board_poses(board, of_view) if is_seen else np.zeros((0, 4, 4))
+            for of_view, is_seen in zip(of_camera, seen, strict=True)
         ]
-        for model, lens, of_camera, seen in zip(models, lenses, views.corners_px, views.seen, strict=True)
+        for of_camera, seen in zip(rays, views.seen, strict=True)
     ]
     widths = views.image_size_wh.max(axis=1)
     return _Seen(board, rays, np.array([lens[0] for lens in lenses]) / widths, poses)

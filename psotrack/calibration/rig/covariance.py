@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.calibration.rig.equations import RigBundle
+from psotrack.calibration.bundles.boards import BoardBundle
 from psotrack.errors import InputError
 
 #: Largest condition number of the information, in units of its diagonal.
@@ -21,7 +21,7 @@ _MAX_CONDITION = 1e13
 _LEAST_LEFT = 0.02
 
 
-def covariance_over_instants(bundle: RigBundle) -> Float[np.ndarray, "unknowns unknowns"]:
+def covariance_over_instants(bundle: BoardBundle) -> Float[np.ndarray, "unknowns unknowns"]:
     """Covariance of the shared unknowns of an adjustment, by the jackknife over the instants.
 
     Raises:
@@ -52,7 +52,7 @@ def covariance_over_instants(bundle: RigBundle) -> Float[np.ndarray, "unknowns u
 
 
 def _by_instant(
-    bundle: RigBundle, gain: Float[np.ndarray, "instants 6 unknowns"]
+    bundle: BoardBundle, gain: Float[np.ndarray, "instants 6 unknowns"]
 ) -> tuple[Float[np.ndarray, "used unknowns unknowns"], Float[np.ndarray, "used unknowns"]]:
     """Information of each used instant about the shared unknowns, and its pull on them."""
     size, instants = bundle.problem.size, len(bundle.state.T_world_board)

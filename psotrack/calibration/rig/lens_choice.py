@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.calibration.boards import Board
+from psotrack.calibration.lens_models import LensModel
 from psotrack.calibration.rig.board_poses import find_lens, fit_boards
-from psotrack.calibration.rig.lens_models import LensModel
+from psotrack.support import Advance
 
 #: Models that are compared, the simplest first.
 _MODELS = (
@@ -27,6 +28,8 @@ _MODELS = (
 )
 #: Number of parts of the views, and smallest number of views for a comparison.
 _FOLDS, _LEAST_VIEWS = 3, 9
+#: Largest number of fits of a comparison, for a display of the progress.
+MOST_FITS = len(_MODELS) * _FOLDS
 #: Standard errors, and share of the median error, by which a model must be better than a simpler one.
 _CERTAIN, _VISIBLE = 2.0, 0.02
 #: Largest number of views that are used: a comparison of five models takes 15 fits.
@@ -47,7 +50,10 @@ class ModelComparison:
 
 
 def choose_lens_model(
-    board: Board, views_px: Float[np.ndarray, "views corners 2"], image_size_wh: tuple[int, int]
+    board: Board,
+    views_px: Float[np.ndarray, "views corners 2"],
+    image_size_wh: tuple[int, int],
+    advance: Advance = lambda steps: None,
 ) -> ModelComparison:
     """Choose the model of a lens by views that were left out.
 
@@ -55,11 +61,19 @@ def choose_lens_model(
         board: the board.
         views_px: pixels of its corners; NaN where a corner is not seen.
         image_size_wh: width and height of the images, pixels.
+        advance: called with 1 after each of at most `MOST_FITS` fits.
     """
     views_px = views_px[:: -(-len(views_px) // _MOST_VIEWS)] if len(views_px) else views_px
     if len(views_px) < _LEAST_VIEWS:
         return ModelComparison(_MODELS[0], {})
-    distances = {model: _left_out(board, model, views_px, image_size_wh) for model in _MODELS}
+    distances: dict[LensModel, np.ndarray | None] = {}
+    focal_px: float | None = None
+    for model in _MODELS:
+        # OpenCV's pinhole models have nearly the same focal length; a fisheye's is another.
+        start_px = None if model.fisheye else focal_px
+        distances[model], found_px = _left_out(board, model, views_px, image_size_wh, start_px, advance)
+        if not model.fisheye:
+            focal_px = found_px
     known = {model: of_model for model, of_model in distances.items() if of_model is not None}
     if not known:
         return ModelComparison(_MODELS[0], {})
@@ -84,20 +98,25 @@ def _left_out(
     model: LensModel,
     views_px: Float[np.ndarray, "views corners 2"],
     image_size_wh: tuple[int, int],
-) -> Float[np.ndarray, "views corners"] | None:
-    """Distances of the corners from the projections by lenses of other views, pixels; None if a fit fails."""
+    focal_px: float | None,
+    advance: Advance,
+) -> tuple[Float[np.ndarray, "views corners"] | None, float | None]:
+    """Distances of the corners from the projections by lenses of other views, pixels; None if a fit fails.
+
+    Also the focal length, pixels; `focal_px` is where the first search starts, None for several focal lengths.
+    """
     distance_px = np.full(views_px.shape[:2], np.nan)
     part = np.arange(len(views_px)) % _FOLDS
-    focal_px = None
     for fold in range(_FOLDS):
         lens = find_lens(board, model, views_px[part != fold], image_size_wh, focal_px)
-        if lens is None:
-            return None
+        found = (
+            None if lens is None else fit_boards(board, model, lens, views_px[part == fold], image_size_wh)
+        )
+        advance(1)
+        if lens is None or found is None:
+            return None, focal_px
         focal_px = float(lens[0])
-        found = fit_boards(board, model, lens, views_px[part == fold], image_size_wh)
-        if found is None:
-            return None
         distance_px[part == fold] = found
     # A view that the lens cannot show at all is a bad view of this model, not a missing one.
     seen = np.isfinite(views_px[..., 0])
-    return np.where(seen, np.nan_to_num(distance_px, nan=float(image_size_wh[0])), np.nan)
+    return np.where(seen, np.nan_to_num(distance_px, nan=float(image_size_wh[0])), np.nan), focal_px

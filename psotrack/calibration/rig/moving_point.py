@@ -19,7 +19,7 @@ from itertools import combinations
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from psotrack.calibration.bundle import AdjustedRig, adjust
 from psotrack.calibration.residuals import spread_px
@@ -29,6 +29,8 @@ from psotrack.geometry import Rig, triangulate_linearly, undistort
 
 #: Distance in the image up to which a detection may be of the point, while the cameras are not yet adjusted, pixels.
 _WIDE_PX = 15.0
+#: Gates for the first pair of cameras, pixels: from the widest to that of a good detector.
+_GATES_PX = (_WIDE_PX, 5.0, 2.0, 1.0, 0.5)
 #: Smallest number of instants that a pair of cameras must share, and of known points for a further camera.
 _LEAST_SHARED = 12
 #: Angle between two cameras' rays from which on a wider one is no better, degrees.
@@ -154,19 +156,15 @@ def _best_pair(
             continue
         focal_px = float(np.mean([lenses.cameras.K[index, 0, 0] for index in (first, second)]))
         here, there = np.ascontiguousarray(rays[both, first]), np.ascontiguousarray(rays[both, second])
-        E, inliers = cv2.findEssentialMat(
-            here, there, np.eye(3), method=cv2.RANSAC, prob=0.9999, threshold=_WIDE_PX / focal_px
-        )
-        if E is None or E.shape != (3, 3):
+        found = _relative_pose(here, there, focal_px)
+        if found is None:
             continue
-        count, R, t, mask = cv2.recoverPose(E, here, there, np.eye(3), mask=inliers)
-        good = np.ravel(mask) > 0
+        T, good = found
+        count = int(good.sum())
         if count < _LEAST_SHARED:
             continue
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = R, np.ravel(t)
-        directions = [np.column_stack([part[good], np.ones(int(good.sum()))]) for part in (here, there)]
-        directions[1] = directions[1] @ R
+        directions = [np.column_stack([part[good], np.ones(count)]) for part in (here, there)]
+        directions[1] = directions[1] @ T[:3, :3]
         cosine = np.vecdot(*directions) / np.prod(
             [np.linalg.norm(part, axis=1) for part in directions], axis=0
         )
@@ -183,6 +181,48 @@ def _best_pair(
             remedy="move the point where two cameras see it, and check that equal frames are of one instant",
         )
     return best[1:]
+
+
+def _relative_pose(
+    here: Float[np.ndarray, "shared 2"], there: Float[np.ndarray, "shared 2"], focal_px: float
+) -> tuple[Float[np.ndarray, "4 4"], Bool[np.ndarray, " shared"]] | None:
+    """Transform between two cameras from rays that meet, its shift of length 1, and which rays agree with it.
+
+    A wide gate accepts poses that are far off where the field of view is small, and a narrow one finds no pose where
+    the errors are large. So random sampling tries several gates, and the pose with the smallest robust loss is kept.
+    """
+    candidates, distances_px = [], []
+    for gate_px in _GATES_PX:
+        E, _ = cv2.findEssentialMat(
+            here, there, np.eye(3), method=cv2.RANSAC, prob=0.9999, threshold=gate_px / focal_px
+        )
+        if E is None or E.shape != (3, 3):
+            continue
+        _, R, t, mask = cv2.recoverPose(E, here, there, np.eye(3), mask=np.ones((len(here), 1), np.uint8))
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R, np.ravel(t)
+        distance_px = focal_px * _sampson_distance(E, here, there)
+        # A point behind a camera cannot be seen, however well the rays meet there.
+        candidates.append(T)
+        distances_px.append(np.where(np.ravel(mask) > 0, np.minimum(distance_px, _WIDE_PX), _WIDE_PX))
+    if not candidates:
+        return None
+    # The width of the loss is the same for all candidates.
+    width_px = max(min(float(np.median(distance_px)) for distance_px in distances_px), _LEAST_NOISE_PX)
+    losses = [float(np.log1p((distance_px / width_px) ** 2).sum()) for distance_px in distances_px]
+    best = int(np.argmin(losses))
+    return candidates[best], distances_px[best] < _WIDE_PX
+
+
+def _sampson_distance(
+    E: Float[np.ndarray, "3 3"], here: Float[np.ndarray, "shared 2"], there: Float[np.ndarray, "shared 2"]
+) -> Float[np.ndarray, " shared"]:
+    """Distances of directions x / z, y / z from rays that meet, to first order (P. D. Sampson, 1982)."""
+    first, second = (np.column_stack([part, np.ones(len(part))]) for part in (here, there))
+    lines_there, lines_here = first @ E.T, second @ E
+    slopes = np.sum(lines_there[:, :2] ** 2, axis=1) + np.sum(lines_here[:, :2] ** 2, axis=1)
+    distances: np.ndarray = np.abs(np.vecdot(second, lines_there)) / np.sqrt(np.maximum(slopes, 1e-300))
+    return distances
 
 
 def _next_camera(

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.calibration.rig.equations import RigBundle
+from psotrack.calibration.bundles.boards import BoardBundle
 
 #: Degrees of freedom of Student's distribution: small, because a board moves now fast and now hardly.
 _FREEDOM = 3.0
@@ -47,10 +47,10 @@ class Slips:
         return Slips(_START * np.array([1.0, board_m]), scale, board_m)
 
     def each(self) -> tuple[np.ndarray, ...]:
-        """For each camera, (instants, 2), standard deviations of a view's slip, for `RigBundle`."""
+        """For each camera, (instants, 2), standard deviations of a view's slip, for `BoardBundle`."""
         return tuple(np.sqrt(of_camera)[:, None] * self.std for of_camera in self.scale)
 
-    def estimated(self, bundle: RigBundle) -> Slips:
+    def estimated(self, bundle: BoardBundle) -> Slips:
         """The widths again, from the slips of an adjustment with these widths."""
         views = count_views(bundle)
         shown, expected = np.zeros(2), np.zeros(2)
@@ -72,7 +72,7 @@ class Slips:
         return replace(self, std=np.maximum(self.std * np.sqrt(factor), least), scale=tuple(scales))
 
 
-def count_views(bundle: RigBundle) -> Int[np.ndarray, " instants"]:
+def count_views(bundle: BoardBundle) -> Int[np.ndarray, " instants"]:
     """(instants,), number of cameras whose corners count at each instant."""
     counts = np.zeros(len(bundle.state.T_world_board), np.int64)
     for seen, used in zip(bundle.problem.seen, bundle.used, strict=True):

@@ -211,11 +211,12 @@ def _by_board(
     else:
         cameras = open_images(sources, names.split(",") if names else None)
         instants = instants_of_numbers(cameras)
-    found = find_views(board, cameras, instants, report_to(quiet))
+    report = report_to(quiet)
+    found = find_views(board, cameras, instants, report)
     said = say_print(found)
     for sentence in said:
         print_line(quiet, json_path, sentence)
-    return calibrate_rig(found.recognised.board, found.views, lenses, floor=floor), said
+    return calibrate_rig(found.recognised.board, found.views, lenses, floor=floor, report=report), said
 
 
 def _in_world(

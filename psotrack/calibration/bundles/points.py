@@ -1,14 +1,18 @@
-"""Residuals, derivatives and normal equations of a bundle adjustment, for `psotrack.estimation` (see `bundle`)."""
+"""Bundle adjustment of cameras and points: residuals, derivatives and normal equations (see `calibration.bundle`).
+
+A point X is seen at K(R_c X + t_c). The unknowns of the cameras, and a common factor of the focal lengths, are shared
+by all points; each point is a block, which `psotrack.estimation` eliminates.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from psotrack.calibration.bundles.poses import move_poses
 from psotrack.calibration.derivatives import reproject
 from psotrack.calibration.gauge import pose_changes
 from psotrack.estimation import NormalEquations, Step, cauchy_loss, cauchy_weight, levenberg_marquardt
@@ -23,7 +27,7 @@ _MAX_STEPS = 200
 
 
 @dataclass(frozen=True)
-class BundleState:
+class PointState:
     """Unknowns of a bundle adjustment.
 
     Attributes:
@@ -38,7 +42,7 @@ class BundleState:
 
 
 @dataclass(frozen=True)
-class Problem:
+class PointProblem:
     """Data of a bundle adjustment.
 
     Attributes:
@@ -63,7 +67,7 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Bundle:
+class PointBundle:
     """A state of the problem with its residuals, `estimation.least_squares.Linearised`.
 
     Attributes:
@@ -73,8 +77,8 @@ class Bundle:
         robust: whether the loss is Cauchy's instead of the squared residual.
     """
 
-    problem: Problem
-    state: BundleState
+    problem: PointProblem
+    state: PointState
     used: Bool[np.ndarray, "points cameras"]
     robust: bool = False
 
@@ -170,20 +174,16 @@ class Bundle:
             coupling @ free,
         )
 
-    def moved(self, step: Step) -> Bundle:
+    def moved(self, step: Step) -> PointBundle:
         """Turn and shift the cameras, shift the points, and scale the focal lengths."""
         if step.blocks is None:
             raise TypeError("expected a step with blocks, found none")
         whole = self.problem.free @ step.shared
-        T = self.state.T_cam_world.copy()
-        for index in range(len(T)):
-            turn, shift = whole[6 * index : 6 * index + 3], whole[6 * index + 3 : 6 * index + 6]
-            T[index, :3, :3] = cv2.Rodrigues(turn)[0] @ T[index, :3, :3]
-            T[index, :3, 3] += shift
+        T = move_poses(self.state.T_cam_world, whole[:-1].reshape(-1, 6))
         focal_scale = self.state.focal_scale * float(np.exp(whole[-1]))
-        return replace(self, state=BundleState(T, self.state.points_m + step.blocks, focal_scale))
+        return replace(self, state=PointState(T, self.state.points_m + step.blocks, focal_scale))
 
-    def solved(self) -> Bundle:
+    def solved(self) -> PointBundle:
         """Lower the cost from this state."""
         least_gain = _LEAST_GAIN_ROBUST if self.robust else _LEAST_GAIN
         return levenberg_marquardt(self, max_steps=_MAX_STEPS, least_gain=least_gain)

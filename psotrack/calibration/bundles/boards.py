@@ -1,4 +1,4 @@
-"""Residuals, derivatives and normal equations of an adjustment of lenses, cameras and boards (see `adjustment`).
+"""Bundle adjustment of lenses, cameras and boards: residuals, derivatives and normal equations (see `calibration.rig`).
 
 A corner X of the board is seen at K(R_c (R_b X + t_b) + t_c). The unknowns of the lenses and the cameras are shared by
 all instants; the board's pose at an instant is a block, which `psotrack.estimation` eliminates.
@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.calibration.rig.lens_models import LensModel
+from psotrack.calibration.bundles.poses import move_poses
+from psotrack.calibration.lens_models import LensModel
 from psotrack.estimation import NormalEquations, Step, cauchy_loss, cauchy_weight, levenberg_marquardt
 from psotrack.geometry import cross_matrices
 
@@ -38,6 +38,21 @@ class CameraCorners:
     corner: Int[np.ndarray, " seen"]
     points_px: Float[np.ndarray, "seen 2"]
 
+    @cached_property
+    def instants(self) -> Int[np.ndarray, " views"]:
+        """(views,), the instants at which the camera sees corners."""
+        return np.unique(self.instant)
+
+    @cached_property
+    def view(self) -> Int[np.ndarray, " seen"]:
+        """(seen,), index of the corner's view among `instants`."""
+        return np.searchsorted(self.instants, self.instant)
+
+    @cached_property
+    def rank(self) -> Int[np.ndarray, " seen"]:
+        """(seen,), number of the corner among the corners of its view."""
+        return np.arange(len(self.instant)) - np.searchsorted(self.instant, self.instant)
+
     @staticmethod
     def of(corners_px: Float[np.ndarray, "instants corners 2"]) -> CameraCorners:
         """Corners of one camera's views; NaN where a corner is not seen."""
@@ -46,7 +61,7 @@ class CameraCorners:
 
 
 @dataclass(frozen=True)
-class RigState:
+class BoardState:
     """Unknowns of the adjustment.
 
     Attributes:
@@ -61,7 +76,7 @@ class RigState:
 
 
 @dataclass(frozen=True)
-class RigProblem:
+class BoardProblem:
     """Data of the adjustment.
 
     Attributes:
@@ -142,7 +157,7 @@ class ViewEquations:
 
 
 @dataclass(frozen=True)
-class RigBundle:
+class BoardBundle:
     """A state of the problem with its residuals, `estimation.least_squares.Linearised`.
 
     Attributes:
@@ -154,8 +169,8 @@ class RigBundle:
             for views that all show the board at the same pose.
     """
 
-    problem: RigProblem
-    state: RigState
+    problem: BoardProblem
+    state: BoardState
     used: tuple[np.ndarray, ...]
     robust: bool = False
     slip_std: tuple[np.ndarray, ...] | None = None
@@ -213,17 +228,17 @@ class RigBundle:
         columns = problem.columns(camera)
         by_camera = by_camera[..., columns >= 0]
         by_board = by_board * problem.free_board[seen.instant][:, None, None]
-        there, starts = np.unique(seen.instant, return_index=True)
-
-        def add(parts: np.ndarray) -> np.ndarray:
-            return np.add.reduceat(parts, starts) if len(starts) else np.zeros((0, *parts.shape[1:]))
-
-        camera_weighted = (weight[:, None, None] * by_camera).swapaxes(-1, -2)
-        board_weighted = (weight[:, None, None] * by_board).swapaxes(-1, -2)
-        shared, coupling = add(camera_weighted @ by_camera), add(board_weighted @ by_camera)
-        board: np.ndarray = add(board_weighted @ by_board)
-        cost = add(cauchy_loss(squares) if self.robust else squares)
-        shared_right, board_right = add(np.matvec(camera_weighted, off)), add(np.matvec(board_weighted, off))
+        there, size = seen.instants, by_camera.shape[-1]
+        # One product of matrices for each view, of all derivatives and residuals: rows of unseen corners are 0.
+        rows = np.zeros((len(there), int(seen.rank.max(initial=-1)) + 1, 2, size + 7))
+        parts = np.concatenate([by_camera, by_board, off[..., None]], axis=-1)
+        rows[seen.view, seen.rank] = np.sqrt(weight)[:, None, None] * parts
+        rows = rows.reshape(len(there), -1, size + 7)
+        products = rows.swapaxes(-1, -2) @ rows
+        shared, coupling = products[:, :size, :size], products[:, size:-1, :size]
+        board = products[:, size:-1, size:-1]
+        shared_right, board_right = products[:, :size, -1], products[:, size:-1, -1]
+        cost = np.bincount(seen.view, cauchy_loss(squares) if self.robust else squares, minlength=len(there))
         slip = np.zeros((len(there), 6))
         covariance: np.ndarray = np.zeros((len(there), 6, 6))
         if self.slip_std is not None:
@@ -289,7 +304,7 @@ class RigBundle:
         blocks[np.trace(blocks, axis1=1, axis2=2) == 0] = np.eye(6)
         return NormalEquations(information, right, blocks, block_right, coupling)
 
-    def moved(self, step: Step) -> RigBundle:
+    def moved(self, step: Step) -> BoardBundle:
         """Change the lenses, and turn and shift cameras and boards."""
         if step.blocks is None:
             raise TypeError("expected a step with blocks, found none")
@@ -298,12 +313,14 @@ class RigBundle:
             for lens, columns in zip(self.state.lenses, self.problem.lens_columns, strict=True)
         )
         cameras = np.append(step.shared, 0.0)[self.problem.camera_columns] * self.problem.free_camera[:, None]
-        state = RigState(
-            lenses, _moved(self.state.T_cam_world, cameras), _moved(self.state.T_world_board, step.blocks)
+        state = BoardState(
+            lenses,
+            move_poses(self.state.T_cam_world, cameras),
+            move_poses(self.state.T_world_board, step.blocks),
         )
         return replace(self, state=state)
 
-    def solved(self) -> RigBundle:
+    def solved(self) -> BoardBundle:
         """Lower the cost from this state."""
         least_gain = _LEAST_GAIN_ROBUST if self.robust else _LEAST_GAIN
         return levenberg_marquardt(self, max_steps=_MAX_STEPS, least_gain=least_gain)
@@ -318,7 +335,7 @@ def _inverses(matrices: Float[np.ndarray, "views 6 6"]) -> Float[np.ndarray, "vi
     return inverses
 
 
-def solve_robustly(bundle: RigBundle, rounds: int = 3) -> RigBundle:
+def solve_robustly(bundle: BoardBundle, rounds: int = 3) -> BoardBundle:
     """Lower a robust cost whose width is the residuals' own: wide at a poor start, narrow near the solution."""
     for _ in range(rounds):
         noise_px = np.array(
@@ -330,12 +347,3 @@ def solve_robustly(bundle: RigBundle, rounds: int = 3) -> RigBundle:
         problem = replace(bundle.problem, noise_px=noise_px)
         bundle = replace(bundle, problem=problem, robust=True).solved()
     return bundle
-
-
-def _moved(T: Float[np.ndarray, "poses 4 4"], change: Float[np.ndarray, "poses 6"]) -> np.ndarray:
-    """Turn and shift poses: (poses, 4, 4)."""
-    moved = T.copy()
-    for index, (turn, shift) in enumerate(zip(change[:, :3], change[:, 3:], strict=True)):
-        moved[index, :3, :3] = cv2.Rodrigues(turn)[0] @ T[index, :3, :3]
-        moved[index, :3, 3] += shift
-    return moved
