@@ -25,7 +25,7 @@ from psotrack.calibration import (
     world_of_camera,
 )
 from psotrack.errors import InputError, SettingsError
-from psotrack.geometry import project
+from psotrack.geometry import look_at, make_camera, make_rig, project
 from psotrack.recordings import Detections
 
 RIG = row_of_cameras(4)
@@ -116,6 +116,37 @@ def test_stated_deviations_hold_in_the_world_of_the_point():
     assert 0.1 < np.median(squares) < 2.0
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_cameras_with_a_small_field_of_view(seed):
+    """Two telephoto cameras 10 m apart and a drone 70 to 100 m away: poses that are far off have errors of a few px.
+
+    Regression: with a gate of 15 px alone, the first pose was off by degrees, on flights before real thermal cameras
+    with these lenses too, and many sightings were left out.
+    """
+    K = np.array([[1176.0, 0, 320], [0, 1176, 240], [0, 0, 1]])
+    cameras = {}
+    for name, x in (("left", -5.0), ("right", 5.0)):
+        R, t_m = look_at((x, 0.0, 1.0), (0.4 * x, 80.0, 30.0))
+        cameras[name] = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(640, 480))
+    rig = make_rig(cameras)
+    rng = np.random.default_rng(seed)
+    t, phase = np.linspace(0, 60, 200), rng.uniform(0, 6, 3)
+    points_m = np.stack(
+        [
+            20 * np.sin(0.5 * t + phase[0]),
+            85 + 15 * np.sin(0.23 * t + phase[1]),
+            31 + 10 * np.cos(0.37 * t + phase[2]),
+        ],
+        axis=-1,
+    )
+    pixels = project(rig.cameras, points_m[:, None])[0] + rng.normal(0, 0.5, (200, 2, 2))
+    found = calibrate_by_point(rig, PointViews(rig.names, np.zeros(200, np.int64), np.arange(200), pixels))
+    assert found.adjusted.used.all(axis=1).mean() > 0.95
+    T, truth = (one.cameras.T_cam_world for one in (found.adjusted.rig, rig))
+    turns = [(T_one[1] @ np.linalg.inv(T_one[0]))[:3, :3] for T_one in (T, truth)]
+    assert np.rad2deg(Rotation.from_matrix(turns[0] @ turns[1].T).magnitude()) < 0.5
+
+
 @pytest.mark.slow
 def test_too_few_sightings_are_refused():
     views, _ = fly(np.random.default_rng(1), instants=8)
@@ -177,6 +208,14 @@ def test_alignment_finds_a_similarity(seed, scale):
     )
     good = np.isfinite(before) & (np.abs(before) < 1e4)
     np.testing.assert_allclose(after[good], before[good], atol=1e-3)
+
+
+def test_points_on_a_line_are_told_from_a_rig_that_puts_them_on_a_line():
+    line, spread = np.arange(4.0)[:, None] * [1.0, 2.0, 0.5], np.eye(4, 3)
+    with pytest.raises(InputError, match=r"not on one line, found 4 on a line$"):
+        align(spread, line, with_scale=True)
+    with pytest.raises(InputError, match="found 4 on a line, as the rig knows them; check the lenses"):
+        align(line, spread, with_scale=True)
 
 
 def test_a_world_of_cameras_and_of_marked_points(tmp_path):

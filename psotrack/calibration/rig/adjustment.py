@@ -26,7 +26,7 @@ from psotrack.calibration.derivatives import centre_by_pose
 from psotrack.calibration.lens_models import PINHOLE, LensModel, camera_matrix
 from psotrack.calibration.residuals import GATE
 from psotrack.calibration.rig.board_poses import find_lens
-from psotrack.calibration.rig.chain import Chain, join_cameras
+from psotrack.calibration.rig.chain import Chain, check_joined, join_cameras
 from psotrack.calibration.rig.covariance import covariance_over_instants
 from psotrack.calibration.rig.lens_choice import MOST_FITS, choose_lens_model
 from psotrack.calibration.rig.slips import Slips
@@ -113,10 +113,10 @@ def calibrate_rig(
             rig, or the board is not seen at the instant `floor`.
     """
     _check_views(board, views, lenses)
+    fixed = None if floor is None else _instant(views, floor)
     models, vectors, lens_of = _start_lenses(board, views, lenses, report)
     chain = join_cameras(board, views, tuple(models[k] for k in lens_of), tuple(vectors[k] for k in lens_of))
     views = _relabelled(board, views, chain)
-    fixed = None if floor is None else _instant(views, floor)
     with report("adjustment", _MOST_ROUNDS + 1) as advance:
         bundle = _adjust(board, views, chain, (models, vectors, lens_of), lenses, fixed, advance)
     return _result(board, views, chain, bundle)
@@ -132,6 +132,7 @@ def _check_views(board: Board, views: BoardViews, lenses: LensChoice) -> None:
                 found=f"{count}",
                 remedy="film the board nearer, or pass the camera's lens with --lenses",
             )
+    check_joined(views)
 
 
 def _start_lenses(

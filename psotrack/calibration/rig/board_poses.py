@@ -43,11 +43,14 @@ def find_board_poses(board: Board, rays: Float[np.ndarray, "corners 2"]) -> Floa
             break
         points_m, ends = board.corners_m[order][seen], np.ascontiguousarray(rays[seen])
         try:
-            _, turns, shifts, errors = cv2.solvePnPGeneric(
+            count, turns, shifts, errors = cv2.solvePnPGeneric(
                 points_m, ends, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
             )
         except cv2.error:
             # OpenCV fails for corners on one line.
+            continue
+        if not count:
+            # OpenCV finds no pose where a lens that is far off spreads the corners of a view too far.
             continue
         for turn, shift, error in zip(turns, shifts, np.asarray(errors).ravel(), strict=True):
             T = np.eye(4)

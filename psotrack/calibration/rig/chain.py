@@ -201,6 +201,20 @@ def _place_boards(
     return boards, labelling
 
 
+def check_joined(views: BoardViews) -> None:
+    """Check that instants at which two cameras see the board join all cameras: before lenses are looked for.
+
+    Raises:
+        InputError: the cameras are not all joined.
+    """
+    seen = views.seen.astype(np.int64)
+    group = list(range(len(views.names)))
+    for first, second in zip(*np.nonzero(seen @ seen.T), strict=True):
+        group = [group[first] if one == group[second] else one for one in group]
+    if len(set(group)) > 1:
+        raise _not_joined(views, group)
+
+
 def _not_joined(views: BoardViews, group: list[int]) -> InputError:
     """Error of cameras that no shared view joins to the others."""
     parts = [

@@ -75,11 +75,22 @@ def align(
         raise InputError("world", expected="three or more points that the rig knows", found=f"{len(found_m)}")
     middles = found_m.mean(axis=0), given_m.mean(axis=0)
     first, second = found_m - middles[0], given_m - middles[1]
-    for points_m in (first, second):
+    causes = (
+        (second, "", ""),
+        (
+            first,
+            ", as the rig knows them",
+            "check the lenses and the sightings, which may not determine the rig",
+        ),
+    )
+    for points_m, as_known, remedy in causes:
         extent = np.linalg.svd(points_m, compute_uv=False)
         if extent[1] < _FLAT * extent[0]:
             raise InputError(
-                "world", expected="points that are not on one line", found=f"{len(found_m)} on a line"
+                "world",
+                expected="points that are not on one line",
+                found=f"{len(found_m)} on a line{as_known}",
+                remedy=remedy,
             )
     U, strength, V = np.linalg.svd(second.T @ first)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ V))])

@@ -160,18 +160,23 @@ def rig(
         _write(out, found, force)
         show_cameras(points, out, quiet, json_path, force, sentences)
         return
+    from psotrack.calibration import fit_world, in_new_world, read_world
+
     board = board_of(kind, squares_wh, square_m, marker_m, separation_m, dictionary, first_marker)
+    if world is not None and floor is not None:
+        raise SettingsError("rig", expected="--floor or --world", found="both")
+    given = None if world is None else read_world(world)
     lenses = _lenses(lens, same_lens, lenses_path)
     calibrated, said = _by_board(sources, names, board, lenses, floor, quiet, json_path)
-    if world is None:
+    if given is None:
         place = (
             f"the board in frame {floor}: its first corner is the origin, z points up"
             if floor is not None
             else f"camera {calibrated.rig.names[0]}: x right, y down, z forward; --floor and --world place it elsewhere"
         )
     else:
-        calibrated, left_m = _in_world(calibrated, world, floor)
-        place = in_words(world, left_m)
+        change, left_m = fit_world(calibrated.rig, given, with_scale=False)
+        calibrated, place = in_new_world(calibrated, change), in_words(given.path, left_m)
     _write(out, calibrated.rig, force)
     if plot is not None:
         from psotrack.calibration import save_coverage
@@ -217,18 +222,6 @@ def _by_board(
     for sentence in said:
         print_line(quiet, json_path, sentence)
     return calibrate_rig(found.recognised.board, found.views, lenses, floor=floor, report=report), said
-
-
-def _in_world(
-    calibrated: CalibratedRig, world: Path, floor: int | None
-) -> tuple[CalibratedRig, dict[str, float]]:
-    """The rig in the world of a file, and the distances that are left, metres, by point."""
-    from psotrack.calibration import fit_world, in_new_world, read_world
-
-    if floor is not None:
-        raise SettingsError("rig", expected="--floor or --world", found="both")
-    change, left_m = fit_world(calibrated.rig, read_world(world), with_scale=False)
-    return in_new_world(calibrated, change), left_m
 
 
 def _report(

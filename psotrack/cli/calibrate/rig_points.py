@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 #: A camera's place is hardly determined if its standard deviation is above this share of the rig's size.
 _LOOSE = 0.1
+#: Share of the sightings below which the user is told how few are used.
+_FEW_USED = 0.5
 
 
 class Distance(click.ParamType):
@@ -109,13 +111,24 @@ def calibrate_points(
             found.views.number[seen],
         )
     shifts = [str(shift) for shift in find_point_shifts(found.adjusted.rig, views)]
-    return rig, rows, [f"the world is {place}", *shifts, *_undetermined(rig, covariance)]
+    return rig, rows, [f"the world is {place}", *shifts, *_unused(found), *_undetermined(rig, covariance)]
 
 
 def _numbered(found: PointRig) -> dict[int, np.ndarray]:
     """Positions of the moving point, of the first end of a stick, by the number of the instant."""
     first = found.views.point == 0
     return dict(zip(found.views.number[first].tolist(), found.adjusted.points_m[first], strict=True))
+
+
+def _unused(found: PointRig) -> list[str]:
+    """A sentence on sightings of two cameras, if the rig explains few of them."""
+    used, seen = int(found.adjusted.used.any(axis=1).sum()), len(found.views.number)
+    if used >= _FEW_USED * seen:
+        return []
+    return [
+        f"only {used} of {seen} sightings by two cameras fit the rig: check that frames of equal number are of one "
+        "instant, that the cameras see the same thing, and the lenses"
+    ]
 
 
 def _undetermined(rig: Rig, covariance_m2: np.ndarray) -> list[str]:
