@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from board_rigs import BOARD, Errors, Scene, relative_to_first, row_of_cameras
+from board_rigs import BOARD, SIZE_WH, Errors, Scene, relative_to_first, row_of_cameras
 from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import (
@@ -19,7 +19,7 @@ from psotrack.calibration import (
     find_shifts,
     known_lenses,
 )
-from psotrack.calibration.rig.board_poses import find_board_poses
+from psotrack.calibration.rig.board_poses import find_board_poses, fit_boards
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import project
 
@@ -82,6 +82,18 @@ def test_progress_of_lenses_and_adjustment():
     calibrate_rig(BOARD, views, LensChoice(None), report=report)
     assert list(bars) == ["lenses", "adjustment"]
     assert all(0 < steps <= total for total, steps in bars.values())
+
+
+@pytest.mark.parametrize("turn_deg", [30, 60])
+def test_a_board_whose_first_corner_is_beside_a_wide_lens(turn_deg):
+    """Regression: such a view had no pose, or a wrong one, because the board's origin is behind the image plane."""
+    R = Rotation.from_euler("y", turn_deg, degrees=True).as_matrix() @ np.diag([-1.0, -1.0, 1.0])
+    places = BOARD.corners_m @ R.T + (0.9, 0.2, -0.1)
+    seen = places[:, 2] > 0.1
+    assert 6 < seen.sum() < len(seen)
+    pixels = np.where(seen[:, None], 300 * places[:, :2] / places[:, 2:] + (640, 360), np.nan)
+    off_px = fit_boards(BOARD, LensModel(0), np.array([300.0, 300, 640, 360]), pixels[None], SIZE_WH)
+    assert (off_px[0, seen] < 1e-6).all()
 
 
 def test_a_view_without_a_pose():

@@ -55,7 +55,8 @@ def find_board_poses(board: Board, rays: Float[np.ndarray, "corners 2"]) -> Floa
         for turn, shift, error in zip(turns, shifts, np.asarray(errors).ravel(), strict=True):
             T = np.eye(4)
             T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
-            if np.isfinite(T).all() and T[2, 3] > 0:
+            # The seen corners are in front of the camera; before a wide lens the board's origin may be beside it.
+            if np.isfinite(T).all() and (points_m @ T[2, :3] + T[2, 3] > 0).all():
                 found.append((float(error), T))
     found.sort(key=lambda one: one[0])
     return np.array([T for _, T in found]).reshape(-1, 4, 4)

@@ -71,13 +71,13 @@ class _Seen:
         points = np.einsum("...ij,nj->...ni", T[..., :3, :3], self.board.corners_m) + T[..., None, :3, 3]
         ends = points[..., :2] / np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
         rays = self.rays[camera, instants]
-        behind = np.isnan(ends[..., 0]).any(axis=-1)
         each = []
         for order in self.board.labellings:
             # Corner n of a view may be corner order[n] of the board.
             distance = np.linalg.norm(ends[..., order, :] - rays, axis=-1)
             seen = np.broadcast_to(np.isfinite(rays[..., 0]), distance.shape)
-            distance = np.where(seen, np.nan_to_num(distance, nan=1.0), np.nan)
+            # Only seen corners have to be in front: before a wide lens the rest of the board may be beside it.
+            behind = (seen & np.isnan(distance)).any(axis=-1)
             each.append(np.where(behind, 1.0, np.nanmedian(distance, axis=-1) * self.focal_widths[camera]))
         stacked = np.minimum(np.stack(each), 1.0)
         return stacked.min(axis=0), stacked.argmin(axis=0)
