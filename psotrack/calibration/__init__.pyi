@@ -20,7 +20,7 @@ from .rig.adjustment import CalibratedRig, LensChoice, calibrate_rig, in_new_wor
 from .rig.findings import CameraFigures, advise, coverage, figures_of, find_shifts, say_print, worst_views
 from .rig.images import CameraImages, instants_of_numbers, open_images, open_recorded
 from .rig.lens_choice import ModelComparison, choose_lens_model
-from .rig.moving_point import PointRig, PointViews, calibrate_by_point, covariance_of_centres
+from .rig.moving_point import LOOSE, PointRig, PointViews, calibrate_by_point, covariance_of_centres
 from .rig.plots import save_coverage
 from .rig.point_files import (
     GivenWorld,
@@ -39,6 +39,7 @@ from .significance import Improved, find_wrong_cameras, improve
 
 __all__ = [
     "GATE",
+    "LOOSE",
     "MIN_POINTS",
     "UNLIKELY",
     "AdjustedRig",

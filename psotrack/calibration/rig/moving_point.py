@@ -8,11 +8,13 @@ and origin of the world stay open: see `world`.
 
 How well the cameras are known depends on what fixes the world, and on errors that last: of the lens, of a detector, of
 GPS. So the covariances are those of a jackknife: the adjustment and the fit of the world again without each tenth of
-the recording (J. W. Tukey 1958; H. R. Künsch 1989 for parts of a series).
+the recording (J. W. Tukey 1958; H. R. Künsch 1989 for parts of a series). Where it shows that the sightings hardly
+determine a camera, the rigs without each tenth are found from nothing, because others may fit as well.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -43,6 +45,8 @@ _FAR = (10.0, 4.0, 2.0, 1.5)
 _LEAST_NOISE_PX = 0.2
 #: Number of parts of the recording for the jackknife.
 _PARTS = 10
+#: A camera's place is hardly determined if its standard deviation is above this share of the rig's size.
+LOOSE = 0.1
 
 
 @dataclass(frozen=True)
@@ -121,13 +125,32 @@ def covariance_of_centres(
     Raises:
         InputError: the sightings without a part of the recording do not determine the cameras or the world.
     """
+    near = _jackknife(found, world_of, is_anew=False)
+    centres = world_of(found).points(np.asarray(found.adjusted.rig.cameras.centre_world))
+    apart = np.linalg.norm(centres[:, None] - centres, axis=-1).max(axis=1)
+    if (np.sqrt(np.trace(near, axis1=1, axis2=2)) < LOOSE * apart).all():
+        return near
+    # Sightings that determine the rig so little may fit other rigs as well, far from this one: look for them.
+    return _jackknife(found, world_of, is_anew=True)
+
+
+def _jackknife(
+    found: PointRig, world_of: Callable[[PointRig], Similarity], *, is_anew: bool
+) -> Float[np.ndarray, "cameras 3 3"]:
+    """Covariances of the centres from adjustments without a part of the recording, from this rig or from nothing."""
     part = np.unique(found.views.number, return_inverse=True)[1]
     part = part * _PARTS // (part.max() + 1)
     used_px = np.where(found.adjusted.used[..., None], found.views.points_px, np.nan)
     centres = []
     for left_out in range(_PARTS):
         kept_px = np.where((part != left_out)[:, None, None], used_px, np.nan)
-        again = replace(found, adjusted=_adjust_near(found.adjusted.rig, kept_px, found.noise_px))
+        again = None
+        if is_anew:
+            # None where the rest determines no rig: then from this rig.
+            with contextlib.suppress(InputError):
+                again = calibrate_by_point(found.adjusted.rig, replace(found.views, points_px=kept_px))
+        if again is None:
+            again = replace(found, adjusted=_adjust_near(found.adjusted.rig, kept_px, found.noise_px))
         centres.append(world_of(again).points(np.asarray(again.adjusted.rig.cameras.centre_world)))
     off = np.array(centres) - np.mean(centres, axis=0)
     return (_PARTS - 1) / _PARTS * np.einsum("pci,pcj->cij", off, off)

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from psotrack.calibration import PointRig, PointViews, Similarity
     from psotrack.geometry import Rig
 
-#: A camera's place is hardly determined if its standard deviation is above this share of the rig's size.
-_LOOSE = 0.1
 #: Share of the sightings below which the user is told how few are used.
 _FEW_USED = 0.5
 
@@ -133,13 +131,15 @@ def _unused(found: PointRig) -> list[str]:
 
 def _undetermined(rig: Rig, covariance_m2: np.ndarray) -> list[str]:
     """A sentence on cameras whose places the sightings hardly determine."""
+    from psotrack.calibration import LOOSE
+
     centres = np.asarray(rig.cameras.centre_world)
     apart_m = np.linalg.norm(centres[:, None] - centres, axis=-1)
     std_m = np.sqrt(np.trace(covariance_m2, axis1=1, axis2=2))
     loose = [
         f"{name} (± {std:.2g} m, {apart:.2g} m from the farthest camera)"
         for name, std, apart in zip(rig.names, std_m, apart_m.max(axis=1), strict=True)
-        if std > _LOOSE * apart
+        if std > LOOSE * apart
     ]
     if not loose:
         return []
