@@ -78,7 +78,9 @@ class _Seen:
             seen = np.broadcast_to(np.isfinite(rays[..., 0]), distance.shape)
             # Only seen corners have to be in front: before a wide lens the rest of the board may be beside it.
             behind = (seen & np.isnan(distance)).any(axis=-1)
-            each.append(np.where(behind, 1.0, np.nanmedian(distance, axis=-1) * self.focal_widths[camera]))
+            # A view with all corners behind has no median.
+            distance[behind] = np.inf
+            each.append(np.nanmedian(distance, axis=-1) * self.focal_widths[camera])
         stacked = np.minimum(np.stack(each), 1.0)
         return stacked.min(axis=0), stacked.argmin(axis=0)
 
