@@ -2,7 +2,8 @@
 
 Cameras alone do not say where drones fly: cameras on the ground look up at drones of any height. In some short windows
 of frames, points are therefore triangulated from detections or blobs that agree in three views, or in two where no
-third camera has the place in view. A point moves if it goes on through its window at a constant velocity. Chance
+third camera has the place in view; and from the detections that are left, in any two views, because something may hide
+a drone from the third camera. A point moves if it goes on through its window at a constant velocity. Chance
 crossings of rays do not.
 """
 
@@ -163,7 +164,9 @@ def moving_detections(rig: Rig, sightings: Sightings, fps: float) -> MovingPoint
     seen = np.isfinite(sightings.noise_px).any(axis=-1)
     viewpoint = viewpoints(rig.cameras)
     by_viewpoint = np.stack([seen[:, viewpoint == one].any(axis=1) for one in np.unique(viewpoint)], axis=-1)
-    return _find(rig, sightings.in_frames, np.flatnonzero(by_viewpoint.sum(axis=-1) >= 2), fps)
+    frames = np.flatnonzero(by_viewpoint.sum(axis=-1) >= 2)
+    several = by_viewpoint.shape[1] > 2
+    return _find(rig, sightings.in_frames, frames, fps, passes=(None, 2) if several else (None,))
 
 
 def moving_blobs(rig: Rig, silhouettes: Silhouettes, fps: float) -> MovingPoints:
@@ -181,6 +184,7 @@ def _find(
     read: Callable[[Int[np.ndarray, "chosen"]], Sightings],
     frames: Int[np.ndarray, "frames"],
     fps: float,
+    passes: tuple[int | None, ...] = (None,),
 ) -> MovingPoints:
     """Points that move, in windows that are spread over the frames.
 
@@ -190,6 +194,7 @@ def _find(
         frames: (frames,), numbers of the frames from which windows may begin, ascending; the last window ends at the
             last of them.
         fps: frames per second.
+        passes: smallest numbers of viewpoints (see `match`), each for the sightings that the ones before left.
     """
     step = max(1, round(STEP_S * fps))
     reach = step * (WINDOW_FRAMES - 1)
@@ -200,7 +205,7 @@ def _find(
     found = []
     for first in chosen.tolist():
         sightings = read(first + step * np.arange(WINDOW_FRAMES))
-        found.append(_moving_in_window(_triangulated(rig, sightings), step / fps))
+        found.append(_moving_in_window(_triangulated(rig, sightings, passes), step / fps))
     return _joined(found)
 
 
@@ -212,32 +217,50 @@ class _Points:
     std_m: Float[np.ndarray, "points"]
 
 
-def _triangulated(rig: Rig, sightings: Sightings) -> list[_Points]:
+def _triangulated(rig: Rig, sightings: Sightings, passes: tuple[int | None, ...]) -> list[_Points]:
     """The points of each frame in which detections of enough cameras agree."""
-    centre_m, wide_m = rig.cameras.centre_world, wide_bounds(rig)
+    wide_m = wide_bounds(rig)
     points = []
     for frame in range(sightings.num_frames):
         view = sightings.at(frame).largest(MOST_SIGHTINGS)
-        found = match(
-            rig.cameras,
-            view.found(view.centre_px),
-            view.found(view.noise_px),
-            bounds_m=wide_m,
-            min_views=None,
+        centre_px, noise_px = view.found(view.centre_px), view.found(view.noise_px)
+        found = []
+        for min_views in passes:
+            groups = match(rig.cameras, centre_px, noise_px, bounds_m=wide_m, min_views=min_views)
+            found.append(_reconstructed(rig, groups.detection, centre_px, noise_px))
+            for camera, used in enumerate(groups.detection.T):
+                # A row that is not finite is no detection; the others keep their numbers.
+                centre_px[camera] = centre_px[camera].copy()
+                centre_px[camera][used[used >= 0]] = np.nan
+        points.append(
+            _Points(
+                np.concatenate([each.position_m for each in found]),
+                np.concatenate([each.std_m for each in found]),
+            )
         )
-        noise_px = view.grouped(view.noise_px, found.detection)
-        lines = reconstruct(
-            rig.cameras,
-            view.grouped(view.centre_px, found.detection),
-            noise_px=np.nan_to_num(noise_px, nan=1.0),
-        )
-        std_m = np.sqrt(np.trace(lines.covariance_m2, axis1=-2, axis2=-1))
-        distance_m = np.linalg.norm(lines.position_m[:, None] - centre_m, axis=-1).min(
-            axis=-1, initial=np.inf
-        )
-        kept = std_m < MOST_VAGUE * distance_m
-        points.append(_Points(lines.position_m[kept], std_m[kept]))
     return points
+
+
+def _reconstructed(
+    rig: Rig,
+    detection: Int[np.ndarray, "groups cameras"],
+    centre_px: list[Float[np.ndarray, "_ 2"]],
+    noise_px: list[Float[np.ndarray, "_"]],
+) -> _Points:
+    """The points of groups of detections that are not too vague."""
+    seen = detection >= 0
+    of_group = np.full((*detection.shape, 2), np.nan)
+    noise = np.ones(detection.shape)
+    for camera, used in enumerate(detection.T):
+        of_group[seen[:, camera], camera] = centre_px[camera][used[seen[:, camera]]]
+        noise[seen[:, camera], camera] = noise_px[camera][used[seen[:, camera]]]
+    lines = reconstruct(rig.cameras, of_group, noise_px=noise)
+    std_m = np.sqrt(np.trace(lines.covariance_m2, axis1=-2, axis2=-1))
+    distance_m = np.linalg.norm(lines.position_m[:, None] - rig.cameras.centre_world, axis=-1).min(
+        axis=-1, initial=np.inf
+    )
+    kept = std_m < MOST_VAGUE * distance_m
+    return _Points(lines.position_m[kept], std_m[kept])
 
 
 def _moving_in_window(window: list[_Points], step_s: float) -> MovingPoints:

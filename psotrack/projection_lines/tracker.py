@@ -28,6 +28,9 @@ from psotrack.trajectories import Tracks
 CONFIRMED_HITS, FIRST_FRAMES, AGREED_HITS = 5, 8, 3
 #: The number where only two viewpoints agree: lines of sight of two cameras cross by chance for longer.
 CONFIRMED_HITS_OF_TWO = 15
+#: The number where more viewpoints than two have the place in view, but something hides the drone from them, such as a
+#: post. Two things that pass each other's epipolar lines by a third of a pixel per frame cross for as long.
+CONFIRMED_HITS_OF_TWO_ALONE = 30
 #: Largest number, and if it is larger share, of frames in which a track may be missed that is not confirmed yet after
 #: its first frames.
 LATER_MISSED, MISSED_SHARE = 9, 0.4
@@ -348,7 +351,7 @@ class _Tracker:
         unconfirmed = [
             (slot, track)
             for slot, track in self._active()
-            if track.drone is None and (_is_confirmed(track) or (missed and _may_be_known(track)))
+            if track.drone is None and (self._is_confirmed(track) or (missed and _may_be_known(track)))
         ]
         if not unconfirmed:
             return
@@ -367,13 +370,22 @@ class _Tracker:
                 track.drone = former.drone
                 if former_slot is not None:
                     self._end(former_slot)
-            elif not _is_confirmed(track):
+            elif not self._is_confirmed(track):
                 continue
             elif assigned == NEW:
                 track.drone = self._num_drones
                 self._num_drones += 1
             else:
                 self._end(slot)
+
+    def _is_confirmed(self, track: Track) -> bool:
+        """Whether a track was found often enough, and enough cameras agreed, to be of a drone."""
+        if track.agreed_hits < AGREED_HITS:
+            # A number of cameras that is asked for counts without exception.
+            is_open = self._settings.status.min_cameras_to_begin is None
+            return is_open and track.hits >= CONFIRMED_HITS_OF_TWO_ALONE
+        of_two = track.hits_of_three < AGREED_HITS
+        return track.hits >= (CONFIRMED_HITS_OF_TWO if of_two else CONFIRMED_HITS)
 
     def _missed_drones(self) -> list[tuple[int | None, Track]]:
         """The last track of each drone that is not found now, with its slot if the track has not ended."""
@@ -384,14 +396,6 @@ class _Tracker:
             for drone, (slot, track) in last.items()
             if drone is not None and (slot is None or track.missed > 0)
         ]
-
-
-def _is_confirmed(track: Track) -> bool:
-    """Whether a track was found often enough, and enough cameras agreed, to be of a drone."""
-    of_two = track.hits_of_three < AGREED_HITS
-    return track.agreed_hits >= AGREED_HITS and track.hits >= (
-        CONFIRMED_HITS_OF_TWO if of_two else CONFIRMED_HITS
-    )
 
 
 def _may_be_known(track: Track) -> bool:
