@@ -267,7 +267,8 @@ class StatusSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields
         min_fitness: smallest fitness of a drone that counts as found.
         min_cameras: smallest number of cameras that see a drone that counts as found, by foreground or by detections.
         min_cameras_to_begin: number of cameras, at different places, that must agree to begin a track; None: three
-            where at least three cameras have the place in view, else two.
+            where at least three cameras have the place in view, else two. Two that agree for long are enough for the
+            projection lines also where a third should see the drone: something may hide the drone.
         max_coasting_s: seconds for which a drone that is not found coasts on its prediction before it is lost.
         max_coasting_std_m: largest standard deviation, along the worst axis, of a position that the projection lines
             state for a drone that is not found, metres; a drone seen by one camera alone may coast for long.

@@ -1,10 +1,13 @@
 """Bounds and speed limit from what moves, two views that begin a track, and the warning of a track that is cut off."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from helpers import make_unnamed_rig
 
-from psotrack.correspondence import Sightings, match
+from psotrack.correspondence import Sightings, from_detections, match
 from psotrack.datasets import open_recording
 from psotrack.errors import InputError
 from psotrack.geometry import look_at, make_camera, project
@@ -22,6 +25,9 @@ from psotrack.recordings import Detections, write_detections
 from psotrack.rig_files import write_rig
 from psotrack.settings import DroneSettings, MotionSettings, StatusSettings, TrackSettings
 from psotrack.trajectories import Status
+
+sys.path.append(str(Path(__file__).parents[1] / "experiments" / "accuracy"))
+from formula_flights import SCENES, make_flight
 
 pytestmark = pytest.mark.slow
 
@@ -125,7 +131,7 @@ def test_two_cameras_begin_a_track_where_there_is_no_third():
     assert tracked(pair, sightings, volume, min_cameras_to_begin=3).num_drones == 0
 
 
-def test_two_cameras_keep_a_track_that_three_began_but_do_not_begin_one_that_a_third_should_see():
+def test_two_cameras_keep_a_track_that_three_began_and_begin_one_late_that_a_third_should_see():
     rig, truth_m = ground_rig(3), flights(50, (4.0,))
     volume = flight_volume(rig, None, bounds_m=(-20.0, 20.0, -20.0, 20.0, 0.0, 30.0))
     three, two = (sightings_of(rig, truth_m, hidden=hidden) for hidden in ((), (2,)))
@@ -138,8 +144,37 @@ def test_two_cameras_keep_a_track_that_three_began_but_do_not_begin_one_that_a_t
     kept = tracked(rig, later, volume)
     assert kept.num_drones == 1
     assert (kept.status[:, 0] == Status.TRACKED).all()
-    assert tracked(rig, two, volume).num_drones == 0
+    assert tracked(rig, sightings_of(rig, truth_m[:25], hidden=(2,)), volume).num_drones == 0
     assert tracked(rig, two, volume, min_cameras_to_begin=2).num_drones == 1
+    # A post before the third camera hides the drone: after 30 frames the track counts, from its begin on.
+    hidden = tracked(rig, two, volume)
+    assert hidden.num_drones == 1
+    assert (hidden.status[:, 0] == Status.TRACKED).mean() > 0.9
+    assert tracked(rig, two, volume, min_cameras_to_begin=3).num_drones == 0
+
+
+def test_the_volume_holds_a_drone_that_something_hides_from_the_third_camera():
+    rig = ground_rig(3)
+    truth_m = np.concatenate([flights(60, (4.0,)), flights(60, (1.0,), centre_m=(0.0, 0.0, 22.0))], axis=1)
+    low, high = sightings_of(rig, truth_m[:, :1]), sightings_of(rig, truth_m[:, 1:], hidden=(1,), clutter=0)
+    both = Sightings(
+        *(
+            np.concatenate([getattr(low, name), getattr(high, name)], axis=2)
+            for name in ("centre_px", "size_px", "noise_px")
+        )
+    )
+    volume = flight_volume(rig, moving_detections(rig, both, FPS))
+    assert 22.0 < volume.bounds_m[1, 2] < 27.0
+    assert tracked(rig, both, volume).num_drones == 2
+
+
+def test_a_fast_drone_far_away_is_not_two():
+    """A sharp turn brings a drone out of its gate; three cameras that agree beside the expected place keep its track."""
+    flight = make_flight(SCENES["outdoors, 4 cameras, 3 drones on 100 m"], 250, 54)
+    sightings = from_detections(flight.detections, flight.rig, flight.num_frames)
+    volume = flight_volume(flight.rig, moving_detections(flight.rig, sightings, FPS))
+    tracks = tracked(flight.rig, sightings, volume)
+    assert tracks.num_drones == 3
 
 
 @pytest.mark.parametrize(

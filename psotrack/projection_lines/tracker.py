@@ -12,7 +12,7 @@ from psotrack.correspondence import CameraSightings, Sightings, in_images
 from psotrack.geometry import Camera, viewpoints
 from psotrack.initiation import FLOOR_CLEARANCE_M, NEW, SPEED_SHARE, reidentify
 from psotrack.motion import GATE_999
-from psotrack.projection_lines.crossings import crossings
+from psotrack.projection_lines.crossings import Crossings, crossings
 from psotrack.projection_lines.exposures import moved_to_instant
 from psotrack.projection_lines.merged_boxes import split_merged_boxes
 from psotrack.projection_lines.results import as_tracks
@@ -215,22 +215,17 @@ class _Tracker:
             crossing.append(row)
             if number >= 0:
                 slot = slots[number]
-            elif (distance_m := np.linalg.norm(expected_m - position_m, axis=-1)).min(
-                initial=np.inf
-            ) < SEPARATION_M:
+            elif (near := self._nearly_expected(crossed, row, slots, expected_m, expected_m2, measured)) >= 0:
                 # The track's covariance was too small, as when a drone turns sharply.
-                number = int(distance_m.argmin())
-                slot = slots[number]
+                number, slot = near, slots[near]
                 if slot in measured:
                     continue
             else:
                 speed_m_s = SPEED_SHARE * self._settings.motion.speed_limit_m_s
                 slot = self._start(Track(None, usual), position_m, np.zeros(3), speed_m_s)
-            surprising = False
-            if number >= 0:
-                off_m = position_m - expected_m[number]
-                spread_m2 = expected_m2[number] + crossed.covariance_m2[row]
-                surprising = bool(off_m @ np.linalg.solve(spread_m2, off_m) >= SURPRISING)
+            surprising = number >= 0 and bool(
+                _surprise(crossed, row, expected_m[[number]], expected_m2[[number]])[0] >= SURPRISING
+            )
             if not surprising or num_viewpoints >= TRUSTED_VIEWPOINTS:
                 measured[slot] = Measurement(
                     position_m,
@@ -242,6 +237,29 @@ class _Tracker:
                     surprising,
                 )
         return measured, self._seen_by_one(view, crossed.detection[crossing], slots, measured)
+
+    def _nearly_expected(
+        self,
+        crossed: Crossings,
+        row: int,
+        slots: list[int],
+        expected_m: Float[np.ndarray, "drones 3"],
+        expected_m2: Float[np.ndarray, "drones 3 3"],
+        measured: dict[int, Measurement],
+    ) -> int:
+        """Index of the expected drone that an unexpected crossing belongs to; -1 if there is none.
+
+        A crossing beside a drone is a part of the drone. If the drone was found in the last frame and has no crossing
+        now, a crossing of trusted viewpoints may be farther away: another drone hardly replaces this one in one frame.
+        """
+        distance_m = np.linalg.norm(expected_m - crossed.position_m[row], axis=-1)
+        if distance_m.min(initial=np.inf) < SEPARATION_M:
+            return int(distance_m.argmin())
+        if len(set(self._viewpoint[crossed.seen[row]].tolist())) < TRUSTED_VIEWPOINTS:
+            return -1
+        is_open = np.array([slot not in measured and self._track(slot).missed == 0 for slot in slots], bool)
+        surprise = np.where(is_open, _surprise(crossed, row, expected_m, expected_m2), np.inf)
+        return int(surprise.argmin()) if surprise.min(initial=np.inf) < SURPRISING else -1
 
     def _seen_by_one(
         self,
@@ -396,6 +414,18 @@ class _Tracker:
             for drone, (slot, track) in last.items()
             if drone is not None and (slot is None or track.missed > 0)
         ]
+
+
+def _surprise(
+    crossed: Crossings,
+    row: int,
+    expected_m: Float[np.ndarray, "drones 3"],
+    expected_m2: Float[np.ndarray, "drones 3 3"],
+) -> Float[np.ndarray, "drones"]:
+    """(drones,), squared distances of a crossing from expected positions, normalised by both covariances."""
+    off_m = crossed.position_m[row] - expected_m
+    spread_m2 = expected_m2 + crossed.covariance_m2[row]
+    return (off_m * np.linalg.solve(spread_m2, off_m[..., None])[..., 0]).sum(axis=-1)
 
 
 def _may_be_known(track: Track) -> bool:
