@@ -169,7 +169,7 @@ def test_the_volume_holds_a_drone_that_something_hides_from_the_third_camera():
 
 
 def test_a_fast_drone_far_away_is_not_two():
-    """A sharp turn brings a drone out of its gate; three cameras that agree beside the expected place keep its track."""
+    """A sharp turn brings a drone out of its gate; three cameras that agree beside the place keep its track."""
     flight = make_flight(SCENES["outdoors, 4 cameras, 3 drones on 100 m"], 250, 54)
     sightings = from_detections(flight.detections, flight.rig, flight.num_frames)
     volume = flight_volume(flight.rig, moving_detections(flight.rig, sightings, FPS))
