@@ -105,7 +105,7 @@ def ring(scene: Scene, rng: np.random.Generator) -> Rig:
     for number, one in enumerate(angle):
         place_m = np.array([scene.radius_m * np.cos(one), scene.radius_m * np.sin(one), scene.height_m])
         place_m = place_m * rng.normal(1, 0.03, 3)
-        R, t_m = look_at(place_m.tolist(), scene.centre_m)
+        R, t_m = look_at(place_m.tolist(), [float(each) for each in scene.centre_m])
         cameras[f"cam{number + 1}"] = make_camera(R=R, t_m=t_m, K=K, image_size_wh=IMAGE_SIZE_WH)
     return make_rig(cameras)
 
