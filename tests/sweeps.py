@@ -111,6 +111,7 @@ OLDER_NAMES = {
 NEW_NAMES = (
     "swarm.search",
     "status.min_cameras_to_begin",
+    "status.max_coasting_std_m",
     "rate_hz",
     "clocks",
     "errors.rig_deg",

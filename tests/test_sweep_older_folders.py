@@ -68,6 +68,7 @@ def test_rows_have_todays_names(tmp_path: Path) -> None:
             "settings.swarm.kind": "joint",
             "settings.swarm.search": "pso",
             "settings.status.min_cameras_to_begin": None,
+            "settings.status.max_coasting_std_m": 0.5,
             "settings.rate_hz": None,
             "settings.clocks": "given",
             "settings.errors.rig_deg": 0.0,

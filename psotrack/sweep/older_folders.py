@@ -23,6 +23,7 @@ _GONE = {"refinements": 0}
 _NEW = {
     "swarm.search": "pso",
     "status.min_cameras_to_begin": None,
+    "status.max_coasting_std_m": 0.5,
     "rate_hz": None,
     "clocks": "given",
     "errors.rig_deg": 0.0,
