@@ -145,6 +145,21 @@ def test_markers_that_stand_still_are_not_those_of_the_board():
     assert found == "markers 0 to 11 of the dictionary 6x6_50"
 
 
+@pytest.mark.slow
+def test_markers_that_stand_still_before_each_of_many_cameras():
+    """The images come from five cameras in turn, and each camera sees the walls at other pixels."""
+    walls = replace(BOARD, dictionary="6x6_250")
+    images = [
+        np.hstack(
+            [draw_board(BOARD, K, pose(seed), SIZE_WH), draw_board(walls, K, pose(10 + camera), SIZE_WH)]
+        )
+        for seed in range(2)
+        for camera in range(5)
+    ]
+    found, _ = explain_missing_board(replace(BOARD, dictionary="5x5_50"), images)
+    assert found == "markers 0 to 11 of the dictionary 4x4_50"
+
+
 def test_the_size_of_the_markers_is_measured():
     images = [draw_board(BOARD, K, pose(seed), SIZE_WH) for seed in range(4)]
     stated = Recognised(replace(BOARD, marker_m=0.4 * BOARD.square_m), False, 4)

@@ -225,14 +225,15 @@ def _explain_missing_chessboard(
 def _markers_of_all_dictionaries(
     images: Sequence[UInt8[np.ndarray, "height width"]],
 ) -> list[tuple[str, bool, np.ndarray]]:
-    """Family of a dictionary, whether white on black, and the markers that an image shows, for the best images.
+    """Family of a dictionary, whether white on black, and the markers of the image that shows most of them.
 
     Markers that stand still, such as those on the walls of a laboratory, are not those of a board that is moved: they
     count only if no others are found. Mirrored images are searched only if no dictionary has enough markers in the
     others.
     """
     for moved, mirrored in product((True, False), (False, True)):
-        sides = [np.ascontiguousarray(grey[:, ::-1]) if mirrored else grey for grey in images[:_IMAGES]]
+        # All images: they come from the cameras in turn, and only two of one camera show what stands still.
+        sides = [np.ascontiguousarray(grey[:, ::-1]) if mirrored else grey for grey in images]
         found = [
             (name, inverted, _most_markers(name, [255 - side if inverted else side for side in sides], moved))
             for name, inverted in product(_FAMILIES, (False, True))
