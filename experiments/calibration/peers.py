@@ -43,22 +43,23 @@ import _results
 HERE = Path(__file__).parent
 CALISCOPE = "mprib/caliscope/tests/sessions"
 TALMO = "talmolab/sleap-anipose/tests/data/minimal_session"
-#: Recording -> (images of each camera, board, published calibration and its unit in metres).
+#: Recording -> (images of each camera, board, published calibration and its unit in metres, or None where its format
+#: states the unit).
 SETS = {
     "4_cam_recording": (
         [f"{CALISCOPE}/4_cam_recording/calibration/extrinsic/cam_{n}.mp4" for n in range(4)],
         Board((4, 5), 0.054, 0.0405, "4x4_1000"),
-        f"{CALISCOPE}/4_cam_recording/camera_array.toml",
+        (f"{CALISCOPE}/4_cam_recording/camera_array.toml", None),
     ),
     "charuco_calibration": (
         [f"{CALISCOPE}/charuco_calibration/calibration/extrinsic/cam_{n}.mp4" for n in range(4)],
         Board((4, 5), 0.054, 0.0405, "4x4_1000"),
-        f"{CALISCOPE}/charuco_calibration/camera_array.toml",
+        (f"{CALISCOPE}/charuco_calibration/camera_array.toml", None),
     ),
     "sleap-anipose": (
         [f"{TALMO}/{name}/calibration_images" for name in ("back", "mid", "top")],
         Board((8, 11), 0.024, 0.01875, "4x4_1000"),
-        f"{TALMO}/calibration.toml",
+        (f"{TALMO}/calibration.toml", 1e-3),
     ),
     "stereo chessboard": (
         ["kyamagu/mexopencv/test/left??.jpg", "kyamagu/mexopencv/test/right??.jpg"],
@@ -109,7 +110,7 @@ def methods(peers, real, published):
     for peer in ("caliscope", "aniposelib") if peers else ():
         made[peer] = lambda board, views, peer=peer: run_peer(peers, peer, board, views)
     if published:
-        made["as published"] = lambda board, views: as_published(real / published, views)
+        made["as published"] = lambda board, views: as_published(real / published[0], published[1], views)
     return made
 
 
@@ -188,9 +189,9 @@ def run_peer(python, peer, board, views):
         return rig_of(views, made["K"], made["dist"], made["T"])
 
 
-def as_published(path, views):
+def as_published(path, metres_per_unit, views):
     """The calibration that comes with the recording, in metres."""
-    rig = read_rig(path)
+    rig = read_rig(path, metres_per_unit=metres_per_unit)
     names = [next(one for one in rig.names if name in (one, f"cam_{one}")) for name in views.names]
     chosen = rig.select(names)
     return Rig(views.names, chosen.cameras)
