@@ -85,8 +85,8 @@ def check_end(video: VideoInfo) -> None:
         return
     capture = _open(video.path)
     try:
-        capture.set(cv2.CAP_PROP_POS_FRAMES, video.num_frames - 1)
         with silence_opencv():
+            capture.set(cv2.CAP_PROP_POS_FRAMES, video.num_frames - 1)
             reached = capture.grab()
     finally:
         capture.release()
