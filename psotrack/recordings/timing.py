@@ -234,7 +234,7 @@ def make_timeline(frame_times: Mapping[str, FrameTimes], rate_hz: float | None =
 
 
 def _check_length(frame_times: Mapping[str, FrameTimes], rate_hz: float) -> None:
-    """Raise `InputError` where there would be so many instants that a time or the rate must be wrong."""
+    """Raise `InputError` for more than `MOST_INSTANTS` instants: a time or a rate is wrong then."""
     spans_s = {name: each.time_s[[0, -1]].tolist() for name, each in frame_times.items() if each.num_frames}
     if not spans_s:
         return

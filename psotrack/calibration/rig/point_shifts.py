@@ -56,7 +56,8 @@ class PointShift:
 def find_point_shifts(rig: Rig, views: PointViews) -> list[PointShift]:
     """Cameras whose sightings fit the other cameras much better if their instants are counted otherwise.
 
-    Each camera is placed anew for each shift, by the positions of the point that at least two other cameras agree on.
+    Shifts of up to 60 instants are tried. Each camera is placed anew for each shift, by the positions of the point that
+    at least two other cameras agree on.
 
     Args:
         rig: the rig that was found from the sightings.
