@@ -17,8 +17,6 @@ from jaxtyping import Float
 
 from psotrack.camera_errors import (
     TrackErrors,
-    fused_errors,
-    views_in_images,
     views_of_sightings,
     views_of_silhouettes,
     with_camera_errors,
@@ -26,7 +24,7 @@ from psotrack.camera_errors import (
 from psotrack.correspondence import Sightings, from_detections, from_silhouettes
 from psotrack.datasets.dpjait import detection_files, read_detections
 from psotrack.errors import InputError
-from psotrack.fusion import fuse_tracks
+from psotrack.fusion import fuse_tracks, fused_errors
 from psotrack.geometry import Rig
 from psotrack.initiation import InitialState
 from psotrack.projection_lines import LineSettings, state_at_first_frame, track_detections
@@ -284,9 +282,9 @@ def track_by_projection_lines(
 def fuse_methods(
     swarm: MethodResult, lines: MethodResult, settings: TrackSettings, fps: float
 ) -> MethodResult:
-    """Fuse the results of both methods for one run."""
+    """Fuse the results of both methods for one run, and the errors of the cameras that they contain."""
     began = time.perf_counter()
-    tracks, offset = fuse_tracks(
+    fusion = fuse_tracks(
         swarm.tracks,
         lines.tracks,
         settings.motion,
@@ -294,6 +292,9 @@ def fuse_methods(
         max_coasting_s=settings.status.max_coasting_s,
         same_foreground=settings.detections == BLOBS,
     )
+    tracks, errors, offset = fusion.tracks, None, fusion.offset
+    if swarm.errors is not None or lines.errors is not None:
+        tracks, errors = fused_errors(fusion, swarm.errors, lines.errors, settings.motion, fps)
     seconds = {
         **swarm.seconds,
         "finish": swarm.seconds.get("finish", 0.0) + lines.seconds.get("finish", 0.0),
@@ -305,7 +306,7 @@ def fuse_methods(
         TrackedPoint(drone, "silhouette" if drone < len(swarm.points) else "box", *known)
         for drone, known in enumerate(zip(_or_none(offset.offset_m), _or_none(offset.std_m), strict=True))
     )
-    return MethodResult(tracks, points, swarm.initial, keys, seconds)
+    return MethodResult(tracks, points, swarm.initial, keys, seconds, errors)
 
 
 def add_errors_of_silhouettes(
@@ -328,31 +329,6 @@ def add_errors_of_detections(
     began = time.perf_counter()
     views = views_of_sightings(rig.cameras, detections.sightings, *_found(result.tracks))
     corrected, errors = with_camera_errors(result.tracks, views, settings.motion, settings.errors, fps)
-    return _with_errors(result, corrected, errors, began)
-
-
-def add_errors_of_both(
-    result: MethodResult,
-    swarm: MethodResult,
-    lines: MethodResult,
-    rig: Rig,
-    settings: TrackSettings,
-    fps: float,
-) -> MethodResult:
-    """The fused result, with covariances that hold for the errors of both methods.
-
-    A method that found no drone has no errors; those of the other method count.
-    """
-    began = time.perf_counter()
-    known = [each.errors.cameras for each in (swarm, lines) if each.errors is not None]
-    corrected, errors = fused_errors(
-        result.tracks,
-        views_in_images(rig.cameras, *_found(result.tracks)),
-        (known[0], known[-1]),
-        settings.errors,
-        settings.motion,
-        fps,
-    )
     return _with_errors(result, corrected, errors, began)
 
 

@@ -3,6 +3,7 @@
 import importlib
 import os
 import pkgutil
+from collections.abc import Iterator
 from pathlib import Path
 
 # The user's terminal and JAX settings must not decide any test. All processes of the suite (workers and commands that
@@ -13,17 +14,22 @@ os.environ["OPENCV_FFMPEG_LOGLEVEL"] = "-8"
 os.environ["JAX_COMPILATION_CACHE_DIR"] = str(Path(__file__).parents[1] / ".compiled")
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
+# Most programs of the tests take longer to compile than to run. XLA compiles in a third of the time if it leaves out
+# LLVM's optimisations and uses its older emitters of fused operations. The operations are the same; rounding may differ
+# in the last bits. Users, and the results of the experiments, have XLA's own settings.
+os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
+os.environ["XLA_FLAGS"] = "--xla_cpu_use_fusion_emitters=false"
 
 import jax
+import lazy_checks
 import pytest
 from hypothesis import HealthCheck, settings
-from jaxtyping import install_import_hook
 
-# jaxtyping and beartype check the types and shapes of every annotated call of the package. The hook must be installed
+# jaxtyping and beartype check the types and shapes of the annotated calls of the package. The hook must be installed
 # before the package is imported. The checks take a third to a half of the time of slow tests, so `make test-slow`
 # runs without them: a function that only slow tests call is not checked.
 if os.environ.get("PSOTRACK_TYPE_CHECKS") != "off":
-    install_import_hook("psotrack", "beartype.beartype")
+    lazy_checks.install("psotrack")
 
 # Conversions such as int32 to float32 must be explicit: an implicit promotion loses bits of exact sums.
 # Rank promotion stays allowed: the package broadcasts particles x drones x cameras against cameras on purpose.
@@ -42,6 +48,14 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("psotrack")
+
+
+@pytest.fixture(scope="module")
+def optimised() -> Iterator[None]:
+    """XLA optimises the programs of the module: for programs that run for longer than they compile."""
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", True)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -114,6 +114,23 @@ def sphere_points(count):
     return np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=-1)
 
 
+#: Bytes of a camera -> (height, width, 2) undistorted coordinates of its pixels; NaN where not yet computed.
+_NORMALISED: dict[tuple[bytes, ...], np.ndarray] = {}
+
+
+def _normalised_pixels(camera, size_wh, rows, columns):
+    """(rows, columns, 2), undistorted coordinates of the pixels in a window; each is computed once per camera."""
+    parts = (camera.K, camera.dist, np.asarray(camera.fisheye, float), size_wh)
+    key = tuple(np.asarray(part).tobytes() for part in parts)
+    stored = _NORMALISED.setdefault(key, np.full((size_wh[1], size_wh[0], 2), np.nan))
+    window = stored[rows, columns]
+    y, x = np.nonzero(np.isnan(window[..., 0]))
+    if len(x):
+        pixels = np.stack([x + columns.start, y + rows.start], axis=-1).astype(float)
+        window[y, x] = undistort(camera, pixels)
+    return window
+
+
 def draw_coverage(rig: Rig, position_m, size_m, reduction):
     """(cameras, height, width) uint8, coverage by ellipsoids, from a ray through the centre of every pixel.
 
@@ -121,24 +138,34 @@ def draw_coverage(rig: Rig, position_m, size_m, reduction):
     """
     position_m, size_m = np.atleast_2d(position_m), np.atleast_2d(size_m)
     width, height = rig.cameras.image_size_wh[0].astype(int)
-    foreground = np.zeros((len(rig), height, width))
+    foreground = np.zeros((len(rig), height, width), bool)
     for index in range(len(rig)):
         camera = rig.cameras[index]
         R = camera.T_cam_world[:3, :3]
         for centre, size in zip(position_m, np.broadcast_to(size_m, position_m.shape), strict=True):
             pixel, depth = project(camera, centre)
-            reach = 2.0 * camera.K[1, 1] * size.max() / max(depth, 0.1)
-            (x0, y0), (x1, y1) = (
-                np.clip(np.floor(pixel + sign * reach), 0, (width, height)).astype(int) for sign in (-1, 1)
-            )
-            if depth < size.max() or x0 >= x1 or y0 >= y1:
+            if depth < size.max():
                 continue
-            grid = np.stack(np.meshgrid(np.arange(x0, x1), np.arange(y0, y1)), axis=-1).astype(float)
-            ray = np.concatenate([undistort(camera, grid), np.ones((*grid.shape[:2], 1))], axis=-1) @ R
-            # In units of the semi-axes the ellipsoid is the unit sphere.
-            ray, start = ray / (size / 2), (camera.centre_world - centre) / (size / 2)
-            hit = (ray @ start) ** 2 >= (ray * ray).sum(axis=-1) * (start @ start - 1)
-            foreground[index, y0:y1, x0:x1] = np.maximum(foreground[index, y0:y1, x0:x1], hit)
+            # An outline is one piece: if it does not cross the border of the smaller window, it is within the window.
+            for factor in (0.8, 2.0):
+                reach = factor * camera.K[1, 1] * size.max() / max(depth, 0.1)
+                (x0, y0), (x1, y1) = (
+                    np.clip(np.floor(pixel + sign * reach), 0, (width, height)).astype(int)
+                    for sign in (-1, 1)
+                )
+                if x0 >= x1 or y0 >= y1:
+                    continue
+                points = _normalised_pixels(camera, (width, height), slice(y0, y1), slice(x0, x1))
+                ray = np.concatenate([points, np.ones((*points.shape[:2], 1))], axis=-1) @ R
+                # In units of the semi-axes the ellipsoid is the unit sphere.
+                ray, start = ray / (size / 2), (camera.centre_world - centre) / (size / 2)
+                hit = (ray @ start) ** 2 >= (ray * ray).sum(axis=-1) * (start @ start - 1)
+                inside = np.zeros_like(hit)
+                inside[int(y0 > 0) : y1 - y0 - (y1 < height), int(x0 > 0) : x1 - x0 - (x1 < width)] = True
+                if hit.any() and not hit[~inside].any():
+                    break
+            if x0 < x1 and y0 < y1:
+                foreground[index, y0:y1, x0:x1] |= hit
     cells = foreground.reshape(len(rig), height // reduction, reduction, width // reduction, reduction)
     return np.round(255 * cells.mean(axis=(2, 4))).astype(np.uint8)
 

@@ -25,11 +25,8 @@ silhouettes.reduction = 2
 swarm.iterations = {iterations}
 """
 
-#: Settings that halve the time of compiling. Compiled programs are stored per number of devices, so one device is set.
-COMPILER = {
-    "XLA_FLAGS": "--xla_force_host_platform_device_count=1",
-    "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
-}
+#: Compiled programs are stored per number of devices, so one device is set, with the suite's settings of XLA.
+COMPILER = {"XLA_FLAGS": f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=1"}
 
 
 def grid_file(folder: Path, iterations: list[int], runs: int = 1) -> Path:

@@ -215,10 +215,7 @@ def track(recording, tmp_path_factory):
     def track(settings=None, **parts):
         return pt.track(recording, SETTINGS | (settings or {}), cache=cache, jobs=1, **parts)
 
-    # Compiling is the longest part of the tests, and the speed of the compiled program does not matter.
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield track
-    jax.config.update("jax_disable_most_optimizations", False)
+    return track
 
 
 @pytest.fixture(scope="module")

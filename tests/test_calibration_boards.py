@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,6 +33,7 @@ from psotrack.cli.calibrate import calibrate
 from psotrack.datasets import open_recording
 from psotrack.errors import InputError, PsotrackError, SettingsError
 from psotrack.geometry import make_camera, make_rig
+from psotrack.recordings import VideoWriter
 from psotrack.rig_files import read_rig, write_rig
 
 SIZE_WH = (640, 480)
@@ -272,6 +274,56 @@ def test_a_stereo_pair_and_a_chessboard():
     assert rms_px < 0.24
 
 
+def test_the_advice_for_a_video_that_ends_early_needs_no_option_of_other_commands(tmp_path):
+    for name in ("left", "right"):
+        with VideoWriter(tmp_path / f"{name}.avi", 25.0, SIZE_WH) as writer:
+            for number in range(12):
+                image = draw_board(BOARD, K, pose(number % 6), SIZE_WH)
+                writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    path = tmp_path / "right.avi"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    words = ["rig", str(tmp_path / "left.avi"), str(path), "--squares", "4x6", "--square", "0.04"]
+    with pytest.raises(InputError) as error:
+        CliRunner().invoke(
+            calibrate,
+            [*words, "--marker", "0.03", "--dictionary", "4x4_50", "--out", str(tmp_path / "rig.toml")],
+            catch_exceptions=False,
+        )
+    assert re.search(
+        r"right\.avi: expected 12 frames, .*`ffmpeg -i right\.avi -frames:v \d+ -c copy", str(error.value)
+    )
+    assert "--frames" not in str(error.value)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("inverted", [False, True])
+def test_a_board_with_markers_is_no_chessboard(tmp_path, inverted):
+    """Also where corners of its squares and markers look like those of a small chessboard."""
+    for number in range(4):
+        image = draw_board(BOARD, K, pose(number), SIZE_WH)
+        cv2.imwrite(str(tmp_path / f"{number}.png"), 255 - image if inverted else image)
+    images = open_images([tmp_path])
+    for size in ((4, 6), (9, 7)):
+        with pytest.raises(
+            InputError, match=r"found a board with markers of the dictionary 4x4_50 in 4 of the first 4 "
+        ):
+            find_views(Board(size, 0.04, kind="chessboard"), images, instants_of_numbers(images))
+
+
+@pytest.mark.slow
+def test_markers_beside_a_chessboard_are_not_on_it(tmp_path):
+    """Markers that a person carries beside the board."""
+    sheet = np.kron(np.indices((8, 6)).sum(axis=0) % 2, np.ones((40, 40), int)).astype(np.uint8) * 255
+    for number in range(4):
+        image = np.full((480, 1280), 255, np.uint8)
+        image[50 + 9 * number : 370 + 9 * number, 60:300] = sheet
+        image[:, 640:] = draw_board(BOARD, K, pose(number), SIZE_WH)
+        cv2.imwrite(str(tmp_path / f"{number}.png"), image)
+    images = open_images([tmp_path])
+    found = find_views(Board((6, 8), 0.04, kind="chessboard"), images, instants_of_numbers(images))
+    assert len(found.views.number) == 4
+
+
 @pytest.mark.slow
 def test_the_command(tmp_path):
     """Two folders of drawn images, from the command line to the rig; and what the command refuses."""
@@ -304,6 +356,16 @@ def test_the_command(tmp_path):
     assert rig.names == ("left", "right")
     np.testing.assert_allclose(rig.cameras.centre_world, [[0, 0, 0], [0.1, 0, 0]], atol=0.005)
     other = ["--out", str(tmp_path / "other.toml")]
+    by_itself = CliRunner().invoke(calibrate, ["rig", *paths, *board[:-1], "auto", *other, "--json", "-"])
+    (few,) = [line for line in json.loads(by_itself.stdout)["advice"] if "lens models" in line]
+    assert "compared by at least 9 views; fewer were found of left (8), right (8)" in few
+    shown = CliRunner().invoke(
+        calibrate, ["intrinsics", paths[0], *board[:-1], "auto", "--out", str(tmp_path / "left.toml")]
+    )
+    assert "fewer were found of left (8): the usual model with 5 distortion coefficients" in " ".join(
+        shown.stdout.split()
+    )
+    other = ["--out", str(tmp_path / "another.toml")]
     for arguments, message in (
         ([*paths, *other], "expected one of --squares, --points, --pairs, --markers"),
         ([paths[0], paths[0], *board, *other], "expected each camera once"),

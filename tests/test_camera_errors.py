@@ -254,6 +254,24 @@ class TestLearning:
         assert constant.clock_std_s == pytest.approx(late_s.std(), rel=0.3)
         assert np.degrees(constant.turn_std_rad) < 0.02
 
+    @pytest.mark.parametrize("noise_px", [1e-6, 1e-10, 1e-14])
+    def test_few_frames_that_turns_explain_exactly_have_a_finite_covariance(self, noise_px):
+        """Turns and clocks fit a few frames exactly: the noise that remains is that of the arithmetic."""
+        rng = np.random.default_rng(3)
+        rig = ring_rig(4, image_size_wh=(1920, 1080))
+        position_m, velocity_m_s = flights(rng, 2, 1)
+        views, _ = fitted_views(rig, rig, position_m, velocity_m_s, rng.normal(size=(2, 1, 4, 2)))
+        rows = FittedPlaces(
+            views.residual_px.reshape(-1, 4, 2),
+            views.jacobian.reshape(-1, 4, 2, 3),
+            views.shown.reshape(-1, 4),
+        )
+        flow_px_s, turn_px = views.flow_px_s.reshape(-1, 4, 2), views.turn_px.reshape(-1, 4, 2, 3)
+        constant = fit_constant_errors(rows, turn_px, flow_px_s, np.full((4, 2), noise_px), 1.0)
+        assert np.isfinite(constant.covariance).all()
+        largest = np.abs(constant.covariance).max()
+        assert np.linalg.eigvalsh(constant.covariance).min() > -1e-9 * largest
+
     def test_a_sound_rig_has_no_lasting_errors(self):
         rng = np.random.default_rng(6)
         rig = ring_rig(5, image_size_wh=(1920, 1080))

@@ -467,7 +467,7 @@ def test_a_second_run_uses_the_stored_compiled_program(sequence: Path, tmp_path:
         command = [*track(sequence, tmp_path / name, "--frames", 12), "--cache", tmp_path / "cache"]
         subprocess.run(
             [sys.executable, "-m", "psotrack", *map(str, command)],
-            env=environment_without_jax_settings() | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"},
+            env=environment_without_jax_settings(),
             check=True,
         )
         # JAX stores programs that take long to compile. Other programs are near the limit, so only this one is checked.
@@ -482,6 +482,15 @@ def test_usage_errors_are_one_line(run: Run) -> None:
     assert_one_line(run("trakc"), "trakc", "track", "psotrack --help")
     assert_one_line(run("track"), "SEQ", "psotrack track --help")
     assert_one_line(run("track", "x", "--out", "y", "--body-offset", "1,2"), "--body-offset", "1,2")
+
+
+def test_only_options_that_are_near_are_suggested(run: Run) -> None:
+    far = run("doctor", "x", "--out", "y")
+    assert_one_line(far, "No such option '--out'; see `psotrack doctor --help`")
+    near = run("track", "x", "--ouut", "y")
+    assert_one_line(near, "Did you mean '--out'?")
+    # The full name of an option of which a part was typed.
+    assert_one_line(run("track", "x", "--speed", "4"), "'--max-speed'")
 
 
 @pytest.mark.slow

@@ -59,7 +59,8 @@ def test_faults_of_small_bodies_are_named(fault):
     The exception is a focal length of which a single drone in 40 frames (rig 8) tells too little.
     """
     rows = []
-    for number in (1, 4, 8):
+    # Rig 1 is of four drones in 500 frames, which takes as long as ten others: larger faults are left out.
+    for number in (4, 8) if fault in ("turned 1", "late 2", "early 2") else (1, 4, 8):
         case = make_case(number, fault)
         if case.shift_px < 3:
             continue
@@ -102,6 +103,27 @@ def test_a_video_that_shows_the_scene_late_is_late():
     assert f"its frame i shows what the others show in frame i - {lag:.2f}" in finding.message
     assert f"add {-lag / 25:.2f}" in finding.remedy
     assert abs(diagnosis.late_frames[3] - 2) < 0.3
+
+
+def test_a_small_lag_does_not_hide_a_turned_camera():
+    """One video lags by a small part of a frame, which many frames show for certain; another camera is turned."""
+    rig = ring_rig(5, image_size_wh=(1920, 1080))
+    frames = np.arange(300)
+    seen = {}
+    for index, name in enumerate(rig.names):
+        angle = (frames - (0.06 if index == 1 else 0.0)) / 25
+        body_m = np.stack(
+            [1.2 * np.sin(1.5 * angle), 0.9 * np.cos(1.1 * angle), 1.2 + 0.1 * np.sin(2 * angle)], axis=-1
+        )
+        rng = np.random.default_rng(index)
+        middle = project(rig.cameras[index], body_m)[0] + 0.5 + rng.normal(0, 0.2, (len(frames), 2))
+        xyxy = np.concatenate([middle - 25, middle + 25], axis=-1)
+        seen[name] = _boxes.Detections(frames, xyxy, np.ones(len(frames)))
+    sightings = from_detections(seen, rig, len(frames))
+    assert examine(rig, sightings, fps=25.0).findings == ()
+    turned = _boxes.turned(rig, 3, 0.4, np.random.default_rng(0))
+    (finding,) = examine(turned, sightings, fps=25.0).findings
+    assert (finding.kind, finding.cameras) == ("turned", ("c3",))
 
 
 def small_problem():

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from psotrack.fusion import fuse_tracks
+from psotrack.camera_errors import CameraErrors, Fading, LastingCovariances, TrackErrors
+from psotrack.fusion import fuse_tracks, fused_errors
 from psotrack.fusion.fusion import COMMON_CORRELATION
 from psotrack.settings import MotionSettings
-from psotrack.tracking import COMMON
 from psotrack.trajectories import Arrival, DroneSizes, Status, Tracks
 
 FPS, FRAMES = 25.0, 200
@@ -23,14 +23,13 @@ def circular_paths(num_drones):
     return np.stack([np.cos(angle), np.sin(angle), height_m], axis=-1)
 
 
-def simulate_method(truth_m, std_m, *, seed, factor=1.0, hidden=(), offset_m=(0.0, 0.0, 0.0), arrivals=()):
+def simulate_method(truth_m, std_m, *, seed, hidden=(), offset_m=(0.0, 0.0, 0.0), arrivals=()):
     """Simulate the result of a method.
 
     Args:
         truth_m: (frames, drones, 3), true positions.
         std_m: (3,), standard deviations of the measurements, metres.
         seed: of the random errors.
-        factor: the stated covariance divided by the true covariance.
         hidden: tuples (drone, first frame, end frame) of frames in which a drone is lost.
         offset_m: (3,), offset of all measurements, metres.
         arrivals: arrivals that the method reports.
@@ -41,7 +40,7 @@ def simulate_method(truth_m, std_m, *, seed, factor=1.0, hidden=(), offset_m=(0.
     for drone, first, last in hidden:
         status[first:last, drone] = Status.LOST
     measured_m[status != Status.TRACKED] = np.nan
-    covariance_m2 = np.broadcast_to(factor * np.diag(np.square(std_m)), (*truth_m.shape, 3))
+    covariance_m2 = np.broadcast_to(np.diag(np.square(std_m)), (*truth_m.shape, 3))
     size_m = np.full((truth_m.shape[1], 3), 0.4)
     return Tracks(
         position_m=measured_m,
@@ -61,14 +60,14 @@ def simulate_method(truth_m, std_m, *, seed, factor=1.0, hidden=(), offset_m=(0.
 
 
 def fuse(swarm, lines, **options):
-    return fuse_tracks(swarm, lines, SETTINGS, fps=FPS, max_coasting_s=MAX_COASTING_S, **options)
+    fusion = fuse_tracks(swarm, lines, SETTINGS, fps=FPS, max_coasting_s=MAX_COASTING_S, **options)
+    return fusion.tracks, fusion.offset
 
 
 def simulate_and_fuse(truth_m, swarm=None, lines=None, **options):
     """Tracks of the swarm, tracks of the projection lines, and the fused tracks."""
     first = simulate_method(truth_m, SWARM_STD_M, seed=0, **(swarm or {}))
-    # The fusion enlarges the covariances of the projection lines by `COMMON`, for errors that all cameras share.
-    second = simulate_method(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON, **(lines or {}))
+    second = simulate_method(truth_m, LINES_STD_M, seed=1, **(lines or {}))
     return first, second, fuse(first, second, **options)[0]
 
 
@@ -101,7 +100,7 @@ def test_the_fused_point_is_the_middle_of_the_silhouette():
 def test_the_offset_between_the_middles_has_a_standard_error():
     truth_m, off_m = circular_paths(4), np.array([0.01, 0.0, 0.08])
     first = simulate_method(truth_m, SWARM_STD_M, seed=0)
-    second = simulate_method(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON, offset_m=off_m)
+    second = simulate_method(truth_m, LINES_STD_M, seed=1, offset_m=off_m)
     # In a tenth of the frames, the first drone's measurement is that of another object.
     second.measured_m[20:40, 0] += 0.2
     _, middles = fuse(first, second)
@@ -116,7 +115,7 @@ def test_the_offset_between_the_middles_has_a_standard_error():
 def test_the_offset_is_less_certain_with_correlated_errors():
     truth_m = circular_paths(1)
     first = simulate_method(truth_m, np.full(3, 1e-6), seed=0)
-    second = simulate_method(truth_m, np.full(3, 1e-6), seed=1, factor=1 / COMMON)
+    second = simulate_method(truth_m, np.full(3, 1e-6), seed=1)
     lasting_m = np.repeat(np.random.default_rng(2).normal(0.0, 0.01, (FRAMES // 10, 1, 3)), 10, axis=0)
     second.measured_m[:] += lasting_m
     _, middles = fuse(first, second)
@@ -139,7 +138,7 @@ def test_a_drone_found_by_one_method_only_has_no_offset():
 def test_a_position_from_lines_alone_has_the_offsets_uncertainty():
     hidden = [(0, 50, 100)]
     first = simulate_method(circular_paths(1), SWARM_STD_M, seed=0, hidden=hidden)
-    second = simulate_method(circular_paths(1), LINES_STD_M, seed=1, factor=1 / COMMON)
+    second = simulate_method(circular_paths(1), LINES_STD_M, seed=1)
     fused, middles = fuse(first, second)
     diagonal_m2 = np.diagonal(fused.measured_covariance_m2[60, 0])
     np.testing.assert_allclose(diagonal_m2, LINES_STD_M**2 + middles.std_m[0] ** 2, rtol=1e-9)
@@ -200,7 +199,7 @@ def test_drones_found_only_by_the_lines_come_last():
     truth_m = circular_paths(3)
     swarm = simulate_method(truth_m[:, [2, 0]], SWARM_STD_M, seed=0, arrivals=[Arrival(3, 1, again=False)])
     arrivals = [Arrival(9, 0, again=False), Arrival(20, 1, again=True)]
-    lines = simulate_method(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON, arrivals=arrivals)
+    lines = simulate_method(truth_m, LINES_STD_M, seed=1, arrivals=arrivals)
     fused, _ = fuse(swarm, lines)
     np.testing.assert_allclose(fused.measured_m, truth_m[:, [2, 0, 1]], atol=0.1)
     # The first arrival of the projection lines is ignored, because the swarm has a track of this drone.
@@ -212,7 +211,7 @@ def test_drones_found_only_by_the_lines_come_last():
 def test_where_the_methods_disagree_the_swarm_is_used():
     truth_m = circular_paths(1)
     swarm = simulate_method(truth_m, SWARM_STD_M, seed=0)
-    lines = simulate_method(truth_m, LINES_STD_M, seed=1, factor=1 / COMMON)
+    lines = simulate_method(truth_m, LINES_STD_M, seed=1)
     lines.measured_m[80:90] += 0.5
     fused, _ = fuse(swarm, lines)
     np.testing.assert_array_equal(fused.measured_m[80:90], swarm.measured_m[80:90])
@@ -232,3 +231,47 @@ def test_one_method_may_have_no_tracks(method):
 def test_both_methods_may_have_no_tracks():
     empty = simulate_method(circular_paths(0), SWARM_STD_M, seed=0)
     assert fuse(empty, empty)[0].status.shape == (FRAMES, 0)
+
+
+def lasting_errors(variance_m2):
+    """The errors of a method whose positions have errors that last, of the given variances, (frames, drones)."""
+    lasting_m2 = np.asarray(variance_m2)[..., None, None] * np.eye(3)
+    two = np.ones((2, 2))
+    cameras = CameraErrors(two, Fading(1.0, 0.0, 0.0, 0.1), two, 0.002, 0.0, np.eye(8))
+    return TrackErrors(cameras, LastingCovariances(lasting_m2, 0.25 * lasting_m2))
+
+
+def fused_lasting(swarm, lines, swarm_errors, lines_errors):
+    fusion = fuse_tracks(swarm, lines, SETTINGS, fps=FPS, max_coasting_s=MAX_COASTING_S)
+    _, errors = fused_errors(fusion, swarm_errors, lines_errors, SETTINGS, FPS)
+    return errors.lasting
+
+
+def test_errors_that_last_are_not_averaged():
+    """Turned cameras move the positions of both methods alike: noise averages out, this error does not."""
+    truth_m = circular_paths(2)
+    swarm = simulate_method(truth_m, SWARM_STD_M, seed=0)
+    # The lines know the drones in another order.
+    lines = simulate_method(truth_m[:, ::-1], LINES_STD_M, seed=1)
+    variance_m2 = np.broadcast_to([1e-4, 4e-4], (FRAMES, 2))
+    lasting = fused_lasting(swarm, lines, lasting_errors(variance_m2), lasting_errors(variance_m2[:, ::-1]))
+    np.testing.assert_allclose(np.trace(lasting.absolute_m2, axis1=-2, axis2=-1) / 3, variance_m2)
+    np.testing.assert_allclose(lasting.relative_m2, 0.25 * lasting.absolute_m2)
+
+
+def test_errors_that_last_are_those_of_the_method_that_found_the_drone():
+    truth_m = circular_paths(2)
+    swarm = simulate_method(truth_m, SWARM_STD_M, seed=0, hidden=[(1, 0, FRAMES), (0, 50, FRAMES)])
+    lines = simulate_method(truth_m, LINES_STD_M, seed=1, hidden=[(0, 0, 30), (0, 100, FRAMES)])
+    one, other = (lasting_errors(np.full((FRAMES, 2), value)) for value in (1e-4, 9e-4))
+    lasting = fused_lasting(swarm, lines, one, other)
+    variance_m2 = lasting.absolute_m2[..., 0, 0]
+    np.testing.assert_allclose(variance_m2[:30, 0], 1e-4)
+    assert np.all((variance_m2[30:50, 0] > 1e-4) & (variance_m2[30:50, 0] < 9e-4))
+    np.testing.assert_allclose(variance_m2[50:100, 0], 9e-4)
+    # Where neither finds the drone, the last errors count.
+    np.testing.assert_allclose(variance_m2[100:, 0], 9e-4)
+    # The swarm never finds its second drone; the lines' drone there is a third one.
+    np.testing.assert_allclose(variance_m2[:, 2], 9e-4)
+    without = fused_lasting(swarm, lines, None, other)
+    np.testing.assert_allclose(without.absolute_m2[50:100, 0, 0, 0], 9e-4)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import jaxtyping
+import lazy_checks
 import numpy as np
 import pytest
 from helpers import ring_rig
@@ -383,6 +384,7 @@ def test_examples_in_docstrings_run(name):
     assert result.failed == 0
 
 
+@lazy_checks.all_calls_checked()
 def test_annotations_are_enforced():
     """The hook that checks shapes is active: without it, wrong shapes give wrong results or errors deep in the code."""
     swapped_axes = np.zeros((7, 2, 3))  # (points, 2, cameras) instead of (points, cameras, 2).

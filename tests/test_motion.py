@@ -317,7 +317,7 @@ class TestFloat32:
 
     @pytest.mark.parametrize("error_share", [0.0, 0.5, 0.99])
     @pytest.mark.slow
-    def test_positive_definite_for_ten_thousand_frames(self, error_share):
+    def test_positive_definite_for_ten_thousand_frames(self, error_share, optimised):
         """Deviations from a micrometre to a metre in one measurement are closer to singular than float32 resolves."""
         flown = self.long_flight((-3, 0), 4, error_share)
         assert np.linalg.cond(flown.covariance_m2).max() > 1 / np.finfo(np.float32).eps

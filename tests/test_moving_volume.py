@@ -1,6 +1,6 @@
 """Bounds and speed limit from what moves, two views that begin a track, and the warning of a track that is cut off."""
 
-import sys
+import runpy
 from pathlib import Path
 
 import numpy as np
@@ -26,8 +26,8 @@ from psotrack.rig_files import write_rig
 from psotrack.settings import DroneSettings, MotionSettings, StatusSettings, TrackSettings
 from psotrack.trajectories import Status
 
-sys.path.append(str(Path(__file__).parents[1] / "experiments" / "accuracy"))
-from formula_flights import SCENES, make_flight
+FORMULA = runpy.run_path(str(Path(__file__).parents[1] / "experiments" / "accuracy" / "formula_flights.py"))
+SCENES, make_flight = FORMULA["SCENES"], FORMULA["make_flight"]
 
 pytestmark = pytest.mark.slow
 

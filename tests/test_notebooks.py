@@ -128,8 +128,7 @@ def test_notebook_runs_at_tiny_size(script, copies):
         "--nbmake-timeout=7200",
         f"{script.stem}.ipynb",
     ]
-    # At this size the compiler takes most of the time.
-    environment = os.environ | {"PSOTRACK_NOTEBOOKS": "tiny", "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
+    environment = os.environ | {"PSOTRACK_NOTEBOOKS": "tiny"}
     ran = subprocess.run(command, cwd=copies, env=environment, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stdout + ran.stderr
     assert (copies / "data" / "tiny").exists() or script.stem == "table_5"

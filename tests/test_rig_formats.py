@@ -367,6 +367,19 @@ def test_the_two_files_of_easymocap(tmp_path, caplog, name, rodrigues):
     assert_projects(rig, [by_opencv(R, t, K, RADTAN) for R, t in poses()])
 
 
+def test_easymocaps_rodrigues_vectors_count_and_sizes_of_zero_are_not_known(tmp_path):
+    easymocap_files(tmp_path)
+    outside = tmp_path / "extri.yml"
+    outside.write_text(
+        outside.read_text() + "".join(matrix(f"Rot_{name}", np.eye(3)) for name in ("1", "07"))
+    )
+    expected = [by_opencv(R, t, K, RADTAN) for R, t in poses()]
+    assert_projects(read_rig(outside), expected)
+    inside = tmp_path / "intri.yml"
+    inside.write_text(inside.read_text().replace(": 720", ": -1").replace(": 1280", ": -1"))
+    assert_projects(read_rig(outside, SIZE_WH), expected)
+
+
 def test_easymocap_without_the_other_file_or_the_size(tmp_path):
     easymocap_files(tmp_path, size=False)
     with pytest.raises(InputError, match=r"camera 1\.size or image_size: .* found none; pass --size"):
@@ -392,6 +405,9 @@ def kalibr_file(path, *, distortion_model="radtan", camera_model="pinhole", chai
             f"  intrinsics: [{K[0, 0]}, {K[1, 1]}, {K[0, 2]}, {K[1, 2]}]\n  resolution: [1280, 720]\n"
             f"  rostopic: /cam{index}/image_raw\n"
         )
+    # As in the files with an inertial unit.
+    text += "  T_cam_imu:\n" + "".join(f"  - {lists(row)}\n" for row in np.eye(4)[[1, 2, 0, 3]])
+    text += "  timeshift_cam_imu: -8.1e-05\n"
     if chain:
         text += "  T_cn_cnm1:\n" + "".join(f"  - {lists(row)}\n" for row in step)
     path.write_text(text)
@@ -416,7 +432,13 @@ def test_a_camera_chain_of_kalibr(tmp_path, distortion_model):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"camera_model": "omni"}, r"cam0\.camera_model: expected pinhole, .* found omni"),
+        *(
+            (
+                {"camera_model": model},
+                rf"cam0\.camera_model: expected pinhole, .* found {model}; calibrate again with pinhole-radtan",
+            )
+            for model in ("omni", "eucm", "ds")
+        ),
         (
             {"distortion_model": "fov"},
             r"cam0\.distortion_model: expected radtan, equidistant or none, found fov",

@@ -24,7 +24,7 @@ import pytest
 
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
 from psotrack.geometry import look_at, make_camera, make_rig
-from psotrack.recordings import FrameTimes, Recording, VideoWriter, probe, read_frames
+from psotrack.recordings import FrameTimes, Recording, TruncatedVideoError, VideoWriter, probe, read_frames
 from psotrack.silhouettes import Silhouettes, compute
 from psotrack.silhouettes import store as silhouette_store
 from psotrack.silhouettes.computation import SilhouetteSettings
@@ -307,9 +307,10 @@ def test_a_truncated_video_of_half_the_rate_is_advised_in_instants(folder: Path,
     video = folder / "cam3.avi"
     content = video.read_bytes()
     video.write_bytes(content[: len(content) * 2 // 3])
-    with pytest.raises(InputError) as error_info:
+    with pytest.raises(TruncatedVideoError) as error_info:
         compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=2)
-    message = str(error_info.value)
+    # As the commands with this option say it.
+    message = str(error_info.value.with_option("--frames"))
     readable, advised = (
         int(re.search(words, message)[1]) for words in (r"only (\d+) can", r"--frames (\d+) ")
     )

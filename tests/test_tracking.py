@@ -82,7 +82,7 @@ def trajectories_of(tracks, *, smoothed=False):
 
 
 @pytest.fixture(scope="module")
-def batch(silhouettes):
+def batch(silhouettes, optimised):
     """Three runs in one batch, with different seeds, numbers of drones and initial states."""
     starts = [FIRST, FIRST, NO_DRONES]
     changes = [{"seed": 0}, {"seed": 5, "drones": 1}, {"seed": 2, "iterations": 4, "inertia": 0.5}]

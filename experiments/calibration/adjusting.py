@@ -4,12 +4,13 @@
 
 The rigs, bodies and detectors are those of `doctor.py`, on boxes by formula (`_boxes`); the tracks are where the rig as
 it is read places the bodies. The judge is the truth in the world's own frame: exact pixels of the bodies are
-triangulated with the rig before and after the adjustment. "Changed" counts rigs of which a camera was moved, and "sound
-cameras moved" their cameras without a fault. "Worse" counts rigs that place the bodies worse than before by more than
-10 %. "In 90 %" is the share of moved cameras whose true centre is inside the stated 90 % ellipsoid. "All free" is the
-bundle adjustment of all cameras, from which the wrong cameras are found: its errors are those without the common motion
-of the whole rig, which pixels do not determine. Distances are medians over the rigs, of root mean squares over a rig's
-bodies or cameras. Rigs in which a camera sees too few of the tracked bodies are refused. Writes OUT/adjusting.csv.
+triangulated with the rig before and after the adjustment, all views alike. "Changed" counts rigs of which a camera was
+moved, and "sound cameras moved" their cameras without a fault. "Worse" counts rigs that place the bodies worse than
+before by more than 10 %. "In 90 %" is the share of moved cameras whose true centre is inside the stated 90 % ellipsoid.
+"All free" is the bundle adjustment of all cameras, from which the wrong cameras are found: its errors are those without
+the common motion of the whole rig, which pixels do not determine. Distances are medians over the rigs, of root mean
+squares over a rig's bodies or cameras. Rigs in which a camera sees too few of the tracked bodies are refused.
+Writes OUT/adjusting.csv.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from psotrack.calibration import find_drones_in_boxes
 from psotrack.calibration.gauge import common_motions, pose_change_metric, pose_changes
 from psotrack.doctor import improve_with_check
 from psotrack.errors import InputError
-from psotrack.geometry import Rig, project, triangulate
+from psotrack.geometry import Rig, project, triangulate_linearly
 from psotrack.trajectories import Trajectories
 
 sys.path += [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parents[1])]
@@ -131,7 +132,8 @@ def place_errors(
     """Errors of the bodies' places in the world, by a rig, from exact pixels; NaN where fewer than two see one."""
     pixels, depth = project(truth.cameras, place_m.reshape(-1, 1, 3))
     seen = (depth > 0.3) & ((pixels > 0) & (pixels < truth.cameras.image_size_wh)).all(axis=-1)
-    found_m = triangulate(rig.cameras, np.where(seen[..., None], pixels, np.nan))
+    # All views count, also the faulty one: `triangulate` would leave it out.
+    found_m = triangulate_linearly(rig.cameras, np.where(seen[..., None], pixels, np.nan))
     return found_m.reshape(place_m.shape) - place_m
 
 

@@ -19,7 +19,7 @@ from .residuals import GATE, UNLIKELY, inflation, spread_px
 from .rig.adjustment import CalibratedRig, LensChoice, calibrate_rig, in_new_world
 from .rig.findings import CameraFigures, advise, coverage, figures_of, find_shifts, say_print, worst_views
 from .rig.images import CameraImages, instants_of_numbers, open_images, open_recorded
-from .rig.lens_choice import ModelComparison, choose_lens_model
+from .rig.lens_choice import ModelComparison, choose_lens_model, say_not_compared
 from .rig.moving_point import LOOSE, PointRig, PointViews, calibrate_by_point, covariance_of_centres
 from .rig.plots import save_coverage
 from .rig.point_files import (
@@ -101,6 +101,7 @@ __all__ = [
     "read_world",
     "reproject",
     "save_coverage",
+    "say_not_compared",
     "say_print",
     "spread_px",
     "stick_length",

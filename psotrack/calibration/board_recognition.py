@@ -42,12 +42,18 @@ _MARKERS_OF_PLANE, _IMAGES_OF_SHARE = 6, 40
 _STILL_PX = 2.0
 #: Smallest number of images that show a marker that is not there by chance.
 _LEAST_IMAGES = 3
+#: Number of images in which markers are looked for before a chessboard is; two of each camera at least, because only
+#: two images of one camera show what stands still. Side of these images, pixels, and number that must show markers.
+_FIRST_IMAGES, _FIRST_SIDE_PX, _LEAST_FIRST_IMAGES = 6, 1000, 2
 #: Largest number of squares along a side of a board that is recognised by its markers.
 _MOST_SQUARES = 20
 #: Largest distance, in sides of a marker, up to which markers fit a board.
 _FITS = 0.2
 #: Sides of a chessboard that are tried differ from the stated ones by at most this.
 _OTHER_SIZES = 2
+
+#: Markers of an image by number, and their middles, pixels.
+_Markers = dict[int, Float[np.ndarray, "2"]]
 
 
 @dataclass(frozen=True)
@@ -130,6 +136,58 @@ def measure_marker_share(
     return float(np.median(shares)) if len(shares) >= _LEAST_IMAGES else None
 
 
+def number_of_first_images(cameras: int) -> int:
+    """Number of images, of all cameras in turn, that `explain_markers_on_chessboard` needs."""
+    return max(_FIRST_IMAGES, 2 * cameras)
+
+
+def explain_markers_on_chessboard(
+    board: Board, images: Sequence[UInt8[np.ndarray, "height width"]]
+) -> tuple[str, str] | None:
+    """Say which markers are on a board that is stated as a chessboard, from a few images; None if there are none.
+
+    OpenCV takes seconds to find no chessboard in many images of a ChArUco board, and in some images it takes corners of
+    squares and markers for a smaller board's. The markers count where they move, and are inside of the corners that are
+    found, if any.
+
+    Returns:
+        what was found, and what to do; both are parts of a message.
+    """
+    small = [
+        cv2.resize(grey, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA)
+        for grey in images
+        for scale in [max(1, round(max(grey.shape) / _FIRST_SIDE_PX))]
+    ]
+    finder = BoardFinder(board)
+    corners: dict[int, Float[np.ndarray, "corners 2"]] = {}
+    for family in _FAMILIES:
+        shown = [0, 0]
+        for index, found in enumerate(_moved(_seen_markers(family, small, both_prints=True))):
+            if len(found) < _LEAST_MARKERS:
+                continue
+            if index not in corners:
+                corners[index] = finder.find(small[index])
+            if _any_inside(list(found.values()), corners[index]):
+                shown = [shown[0] + 1, max(shown[1], *found)]
+        if shown[0] >= _LEAST_FIRST_IMAGES:
+            dictionary = _smallest(family, shown[1])
+            return (
+                f"a board with markers of the dictionary {dictionary} in {shown[0]} of the first {len(images)} images",
+                f"pass --marker, the side of a marker, and --dictionary {dictionary}",
+            )
+    return None
+
+
+def _any_inside(
+    points_px: Sequence[Float[np.ndarray, "2"]], corners_px: Float[np.ndarray, "corners 2"]
+) -> bool:
+    """Whether any point is inside of the hull of corners; True where no corner was found."""
+    if np.isnan(corners_px).all():
+        return True
+    hull = cv2.convexHull(corners_px[np.isfinite(corners_px[:, 0])].astype(np.float32))
+    return any(cv2.pointPolygonTest(hull, (float(u), float(v)), False) > 0 for u, v in points_px)
+
+
 def explain_missing_board(
     board: Board, images: Sequence[UInt8[np.ndarray, "height width"]]
 ) -> tuple[str, str]:
@@ -181,7 +239,7 @@ def _explain_missing_marker(images: Sequence[UInt8[np.ndarray, "height width"]])
     for grey, inverted, mirrored in product(images, (False, True), (False, True)):
         sides = np.ascontiguousarray(grey[:, ::-1]) if mirrored else grey
         for family in _FAMILIES:
-            ids = _most_markers(family, [255 - sides if inverted else sides])
+            ids = _most(_seen_markers(family, [255 - sides if inverted else sides]))
             seen.update((family, int(marker)) for marker in ids)
     ((family, marker), count), *_ = [*seen.most_common(1), (("", 0), 0)]
     if count < _LEAST_IMAGES:
@@ -231,28 +289,35 @@ def _markers_of_all_dictionaries(
     count only if no others are found. Mirrored images are searched only if no dictionary has enough markers in the
     others.
     """
+    searched: dict[bool, list[tuple[str, bool, list[_Markers]]]] = {}
     for moved, mirrored in product((True, False), (False, True)):
-        # All images: they come from the cameras in turn, and only two of one camera show what stands still.
-        sides = [np.ascontiguousarray(grey[:, ::-1]) if mirrored else grey for grey in images]
+        if mirrored not in searched:
+            # All images: they come from the cameras in turn, and only two of one camera show what stands still.
+            sides = [np.ascontiguousarray(grey[:, ::-1]) if mirrored else grey for grey in images]
+            searched[mirrored] = [
+                (name, inverted, _seen_markers(name, [255 - side if inverted else side for side in sides]))
+                for name, inverted in product(_FAMILIES, (False, True))
+            ]
         found = [
-            (name, inverted, _most_markers(name, [255 - side if inverted else side for side in sides], moved))
-            for name, inverted in product(_FAMILIES, (False, True))
+            (name, inverted, _most(_moved(seen) if moved else seen))
+            for name, inverted, seen in searched[mirrored]
         ]
         if any(len(ids) >= _LEAST_MARKERS for _, _, ids in found):
             break
     return found
 
 
-def _most_markers(
-    family: str, images: Sequence[UInt8[np.ndarray, "height width"]], moved: bool = False
-) -> Int[np.ndarray, " markers"]:
-    """The markers of the image that shows most markers of a family; if `moved`, of those that do not stand still."""
+def _seen_markers(
+    family: str, images: Sequence[UInt8[np.ndarray, "height width"]], *, both_prints: bool = False
+) -> list[_Markers]:
+    """The markers of a family in each image; if `both_prints`, also those printed white on black."""
     dictionary = marker_dictionary(f"{family}_1000" if _FAMILIES[family] else family)
     # A marker of few bits is easily seen where none is: only exact matches count.
     parameters = cv2.aruco.DetectorParameters()
     parameters.errorCorrectionRate = 0.0
+    parameters.detectInvertedMarker = both_prints
     detector = cv2.aruco.ArucoDetector(dictionary, parameters)
-    seen: list[dict[int, Float[np.ndarray, "2"]]] = [{}]
+    seen = []
     for image in images:
         quads, ids, _ = detector.detectMarkers(image)
         found = [] if ids is None else np.ravel(ids).astype(int).tolist()
@@ -262,6 +327,11 @@ def _most_markers(
                 for marker, quad in zip(found, quads, strict=True)
             }
         )
+    return seen
+
+
+def _moved(seen: Sequence[_Markers]) -> list[_Markers]:
+    """The markers of each image that are in no other image at the same place."""
 
     def stands_still(number: int, marker: int) -> bool:
         return any(
@@ -270,11 +340,15 @@ def _most_markers(
             if index != number and marker in other
         )
 
-    kept = [
-        [marker for marker in of_image if not (moved and stands_still(number, marker))]
+    return [
+        {marker: place for marker, place in of_image.items() if not stands_still(number, marker)}
         for number, of_image in enumerate(seen)
     ]
-    most: list[int] = max(kept, key=len)
+
+
+def _most(seen: Sequence[_Markers]) -> Int[np.ndarray, " markers"]:
+    """The markers of the image that shows most."""
+    most: _Markers = max(seen, key=lambda of_image: len(of_image), default={})
     return np.array(sorted(most), np.int64)
 
 

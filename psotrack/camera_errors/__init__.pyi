@@ -3,9 +3,9 @@ from .covariances import LastingCovariances, lasting_covariances, noise_covarian
 from .fading import Fading, fading_of
 from .filtered_variance import MeasurementErrors, filtered_variances
 from .learning import CameraErrors, learn_camera_errors
-from .tracks import TrackErrors, fused_errors, with_camera_errors
+from .tracks import TrackErrors, with_camera_errors
 from .variance_components import FittedPlaces, camera_variances
-from .views import CameraViews, views_in_images, views_of_places, views_of_sightings, views_of_silhouettes
+from .views import CameraViews, views_of_places, views_of_sightings, views_of_silhouettes
 
 __all__ = [
     "CameraErrors",
@@ -20,12 +20,10 @@ __all__ = [
     "fading_of",
     "filtered_variances",
     "fit_constant_errors",
-    "fused_errors",
     "lasting_covariances",
     "learn_camera_errors",
     "noise_covariance",
     "noise_ratios",
-    "views_in_images",
     "views_of_places",
     "views_of_sightings",
     "views_of_silhouettes",

@@ -136,7 +136,9 @@ def _covariance(
 ) -> Float[np.ndarray, "all all"]:
     """Covariance of turns and clocks from their likeliest and wide variances and the information about them."""
     root = np.sqrt(wide)
-    unseen = np.linalg.inv(np.eye(len(wide)) + root[:, None] * information * root)
+    # (1 + R A R)⁻¹ by eigenvalues: where the noise is next to nothing, 1 is lost beside R A R in the sum.
+    values, vectors = np.linalg.eigh(root[:, None] * information * root)
+    unseen = (vectors / (1 + np.maximum(values, 0.0))) @ vectors.T
     more = np.sqrt(np.maximum(wide - likeliest, 0.0))
     return np.diag(likeliest) + more[:, None] * unseen * more
 

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float
 
-from psotrack.correspondence import Sightings, in_images
+from psotrack.correspondence import Sightings
 from psotrack.geometry import (
     NEAR_M,
     Camera,
@@ -203,18 +203,3 @@ def views_of_silhouettes(
         velocity_m_s,
         _moved(silhouettes.exposures, velocity_m_s),
     )
-
-
-def views_in_images(
-    cameras: Camera,
-    position_m: Float[np.ndarray, "frames drones 3"],
-    velocity_m_s: Float[np.ndarray, "frames drones 3"],
-) -> CameraViews:
-    """Views without places: every camera counts equally that has the drone in its image.
-
-    Arguments are as in `views_of_places`.
-    """
-    known = np.isfinite(position_m).all(axis=-1)
-    inside = in_images(cameras, np.nan_to_num(position_m)) & known[..., None]
-    weight = np.repeat(inside[..., None].astype(float), 2, axis=-1)
-    return views_of_places(cameras, np.full(weight.shape, np.nan), weight, position_m, velocity_m_s)

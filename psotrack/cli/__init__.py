@@ -142,6 +142,7 @@ def main() -> None:
         error.show()
         sys.exit(2)
     except click.ClickException as error:
+        _keep_near_suggestions(error)
         # `error.show` would print four lines.
         failed = error.ctx if isinstance(error, click.UsageError) else None
         remedy = f"; see `{failed.command_path} --help`" if failed else ""
@@ -154,6 +155,22 @@ def main() -> None:
         # The program that reads the output has ended, as `head` does.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(2)
+
+
+def _keep_near_suggestions(error: click.ClickException) -> None:
+    """Remove far-fetched names from a suggestion of Click's, which takes --quiet for a slip of --out."""
+    from psotrack.support import nearest
+
+    possibilities = getattr(error, "possibilities", None)
+    typed = getattr(error, "option_name", None) or getattr(error, "command_name", None)
+    if not possibilities or not typed:
+        return
+    word = typed.lstrip("-")
+    error.possibilities = [  # type: ignore[attr-defined]
+        name
+        for name in possibilities
+        if (other := name.lstrip("-")) and (nearest(word, [other]) or other in word or word in other)
+    ]
 
 
 def _complete() -> None:

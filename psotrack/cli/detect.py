@@ -10,10 +10,10 @@ from psotrack.cli.options import (
     CAMERAS,
     DETECTOR_SIZE,
     FORCE,
-    FRAMES,
     JSON,
     QUIET,
     SEQUENCE,
+    frames_option,
     usable_recording,
 )
 from psotrack.cli.output import output_json, print_line, report_to
@@ -52,7 +52,7 @@ from psotrack.cli.output import output_json, print_line, report_to
     help="Side of the network's square input, in pixels.",
 )
 @CAMERAS
-@FRAMES
+@frames_option
 @FORCE
 @QUIET
 @JSON

@@ -11,11 +11,11 @@ import click
 from psotrack.cli.options import (
     FORCE,
     FOV,
-    FRAMES,
     JSON,
     QUIET,
     SCALE_CAMERA,
     dictionary_option,
+    frames_option,
     plot_option,
 )
 from psotrack.cli.output import check_outputs, output_json, print_line, report_to
@@ -109,7 +109,7 @@ class _Input:
     "--live", is_flag=True, help="VIDEO is a camera's number or a stream; always use the newest frame."
 )
 @plot_option("the path from above, and the height over time", "beside --out, as .png")
-@FRAMES
+@frames_option
 @FORCE
 @QUIET
 @JSON

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -85,9 +86,23 @@ CAMERAS = click.option(
     metavar="NAME,NAME...",
     help="Use these cameras only.  [default: all cameras of the calibration]",
 )
-FRAMES = click.option(
-    "--frames", "num_frames", type=int, metavar="N", help="Use the first N frames only.  [default: all]"
-)
+
+
+def frames_option(command: Command) -> Command:
+    """Add `--frames`, and name it as a way out where a video ends early."""
+
+    @functools.wraps(command)
+    def with_way_out(*args: Any, **options: Any) -> None:
+        from psotrack.recordings import TruncatedVideoError
+
+        try:
+            command(*args, **options)
+        except TruncatedVideoError as error:
+            raise error.with_option("--frames") from None
+
+    return click.option(
+        "--frames", "num_frames", type=int, metavar="N", help="Use the first N frames only.  [default: all]"
+    )(with_way_out)
 
 
 BACKGROUND = click.option(
@@ -185,7 +200,7 @@ def silhouette_options(command: Command) -> Command:
 
 
 def usable_recording(folder: str | Path, cameras: str | None, num_frames: int | None) -> Recording:
-    """Recording with the cameras and frames that the options `CAMERAS` and `FRAMES` select."""
+    """Recording with the cameras and frames that the options `CAMERAS` and `--frames` select."""
     from psotrack.datasets import open_recording
 
     return open_recording(folder).usable(camera_names(cameras), num_frames)

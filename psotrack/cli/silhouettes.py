@@ -12,12 +12,12 @@ from psotrack.cli.options import (
     CACHE,
     CAMERAS,
     FORCE,
-    FRAMES,
     JOBS,
     JSON,
     QUIET,
     SEQUENCE,
     cache_folder,
+    frames_option,
     silhouette_options,
     usable_recording,
 )
@@ -30,7 +30,7 @@ from psotrack.silhouettes import SilhouetteSettings
 @silhouette_options
 @BACKGROUND
 @CAMERAS
-@FRAMES
+@frames_option
 @CACHE
 @JOBS
 @QUIET

@@ -13,7 +13,6 @@ from psotrack.cli.options import (
     CAMERAS,
     DETECTOR_SIZE,
     FORCE,
-    FRAMES,
     JOBS,
     JSON,
     QUIET,
@@ -23,6 +22,7 @@ from psotrack.cli.options import (
     cache_folder,
     camera_names,
     compiled_folder,
+    frames_option,
     silhouette_options,
 )
 from psotrack.cli.output import output_json, print_line, report_to, write_json
@@ -196,7 +196,7 @@ from psotrack.support import refuse_to_overwrite
 @silhouette_options
 @BACKGROUND
 @CAMERAS
-@FRAMES
+@frames_option
 @CACHE
 @JOBS
 @FORCE

@@ -60,6 +60,17 @@ class CameraSightings:
             noise_px=self.noise_px[row, kept],
         )
 
+    def without(self, camera: Int[np.ndarray, "gone"], box: Int[np.ndarray, "gone"]) -> CameraSightings:
+        """The sightings without some of them; the places of the others among the boxes stay.
+
+        Args:
+            camera, box: (gone,), cameras and boxes of the sightings to leave out.
+        """
+        centre_px, size_px, noise_px = self.centre_px.copy(), self.size_px.copy(), self.noise_px.copy()
+        for values in (centre_px, size_px, noise_px):
+            values[camera, box] = np.nan
+        return replace(self, centre_px=centre_px, size_px=size_px, noise_px=noise_px)
+
     def found(self, values: Float[np.ndarray, "cameras boxes *rest"]) -> list[np.ndarray]:
         """Select the values of each camera's sightings, without padding: an array (sightings, ...) per camera."""
         return [row[present] for row, present in zip(values, np.isfinite(self.noise_px), strict=True)]

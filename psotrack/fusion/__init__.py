@@ -1,7 +1,8 @@
 """Fusion of the tracks of two methods into one set of tracks, weighted by covariances.
 
-In: tracks of the swarm and of the projection lines for the same frames. Out: the fused tracks, and for each drone the
-constant offset between the two tracked points. Other rooms may use every name in `__init__.pyi`.
+In: tracks of the swarm and of the projection lines for the same frames, and the errors of the cameras that each method
+shows. Out: the fused tracks with their errors, and for each drone the constant offset between the two tracked points.
+Other rooms may use every name in `__init__.pyi`.
 """
 
 import lazy_loader

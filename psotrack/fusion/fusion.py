@@ -26,7 +26,6 @@ from scipy.optimize import linear_sum_assignment
 from psotrack.motion import GATE_999, filter_measurements, motion_params
 from psotrack.settings import MotionSettings
 from psotrack.support import standard_error
-from psotrack.tracking import COMMON
 from psotrack.trajectories import Status, Tracks, unknown_value
 
 #: Largest median distance of two tracks of one drone, metres: the offset of the two points, and noise.
@@ -58,6 +57,24 @@ class PointOffset:
     std_m: Float[np.ndarray, "drones 3"]
 
 
+@dataclass(frozen=True)
+class Fusion:
+    """The tracks of both methods as one, and what they were made of.
+
+    Attributes:
+        tracks: the fused tracks: the drones of the swarm under their numbers, then drones that only the lines know.
+        offset: the offset between the two tracked points.
+        lines_drones: (drones,), number of each fused drone in the lines; -1 for none.
+        lines_share: (frames, drones), weight of the lines' position in the fused position, 0 to 1; NaN where neither
+            method found the drone.
+    """
+
+    tracks: Tracks
+    offset: PointOffset
+    lines_drones: Int[np.ndarray, "drones"]
+    lines_share: Float[np.ndarray, "frames drones"]
+
+
 def fuse_tracks(
     swarm: Tracks,
     lines: Tracks,
@@ -66,8 +83,8 @@ def fuse_tracks(
     fps: float,
     max_coasting_s: float,
     same_foreground: bool = False,
-) -> tuple[Tracks, PointOffset]:
-    """The tracks of both methods as one, and the offset between the two tracked points.
+) -> Fusion:
+    """The tracks of both methods as one.
 
     Drones of the swarm keep their numbers. Drones that only the lines know come after them, unless both methods see the
     same foreground: then the swarm has searched that foreground and found no drone. Positions are middles of
@@ -75,7 +92,8 @@ def fuse_tracks(
     boxes.
 
     Args:
-        swarm, lines: tracks of both methods for the same frames.
+        swarm, lines: tracks of both methods for the same frames; their measured covariances are those of the noise that
+            was found (see `psotrack.camera_errors`).
         settings: settings of the motion model.
         fps: frames per second.
         max_coasting_s: seconds for which a drone that is not found coasts before it is lost.
@@ -86,11 +104,13 @@ def fuse_tracks(
     if same_foreground:
         alone = alone[:0]
     # The lines' drones in the order of the swarm's drones; then the drones that only the lines know.
+    lines_drones = np.concatenate([matches, alone])
     first = _of_drones(swarm, np.concatenate([np.arange(swarm.num_drones), np.full(len(alone), -1)]))
-    second = _of_drones(lines, np.concatenate([matches, alone]))
+    second = _of_drones(lines, lines_drones)
     offset = _point_offset(first.found_m(), second.found_m())
     correlation = COMMON_CORRELATION if same_foreground else 0.0
-    measured_m, covariance_m2, was_measured = _weighted(first, second, offset, correlation)
+    measured_m, covariance_m2, lines_share = _weighted(first, second, offset, correlation)
+    was_measured = np.isfinite(lines_share)
     time_s = np.arange(len(measured_m)) / fps
     params = jax.tree.map(
         lambda value: np.asarray(value, np.float64), motion_params(settings, measured_m.shape[1])
@@ -118,7 +138,7 @@ def fuse_tracks(
         sizes=swarm.sizes.joined(lines.sizes.of_drones(alone)),
         arrivals=(*swarm.arrivals, *arrivals),
     )
-    return fused, offset
+    return Fusion(fused, offset, lines_drones, lines_share)
 
 
 def _same_drones(swarm: Tracks, lines: Tracks) -> Int[np.ndarray, "drones"]:
@@ -171,17 +191,16 @@ def _weighted(
 ) -> tuple[
     Float[np.ndarray, "frames drones 3"],
     Float[np.ndarray, "frames drones 3 3"],
-    Bool[np.ndarray, "frames drones"],
+    Float[np.ndarray, "frames drones"],
 ]:
-    """Measured positions of both methods together, their covariances, and whether a drone was measured at all.
+    """Measured positions of both methods together, their covariances, and the lines' weight (`Fusion.lines_share`).
 
     Where the two positions disagree more than their covariances allow, one position belongs to another drone or to no
     drone. Then the swarm's position counts, because the swarm sees all of the foreground.
     """
     first_m, second_m = swarm.found_m(), lines.found_m()
     first_m2 = np.asarray(swarm.measured_covariance_m2, np.float64)
-    # The swarm's covariance contains this factor already.
-    second_m2 = COMMON * np.asarray(lines.measured_covariance_m2, np.float64)
+    second_m2 = np.array(lines.measured_covariance_m2, np.float64)
     second_m -= np.nan_to_num(offset.offset_m)
     second_m2 += np.nan_to_num(offset.std_m)[..., None] ** 2 * np.eye(3)
     both = np.isfinite(first_m).all(axis=-1) & np.isfinite(second_m).all(axis=-1)
@@ -201,7 +220,10 @@ def _weighted(
         agree[..., None, None], together_m2, np.where(by_swarm[..., None, None], first_m2, second_m2)
     )
     covariance_m2 = (covariance_m2 + covariance_m2.swapaxes(-1, -2)) / 2
-    return measured_m, covariance_m2, np.asarray(np.isfinite(measured_m).all(axis=-1))
+    # Correlated errors can give one method a weight below 0.
+    share = np.clip(np.trace(gain, axis1=-2, axis2=-1) / 3, 0.0, 1.0)
+    share = np.where(agree, share, np.where(by_swarm, 0.0, 1.0))
+    return measured_m, covariance_m2, np.where(np.isfinite(measured_m).all(axis=-1), share, np.nan)
 
 
 def _frames_since_found(was_measured: Bool[np.ndarray, "frames drones"]) -> Int[np.ndarray, "frames drones"]:

@@ -1,3 +1,4 @@
+from .common_sightings import CommonSightings, count_common
 from .cut_off import find_cut_off, find_outside
 from .initial_state import (
     StartSource,
@@ -25,6 +26,7 @@ __all__ = [
     "FLOOR_CLEARANCE_M",
     "NEW",
     "SPEED_SHARE",
+    "CommonSightings",
     "FlightVolume",
     "InitialState",
     "KnownDrones",
@@ -34,6 +36,7 @@ __all__ = [
     "StartSource",
     "TrackCandidate",
     "complete_initial_state",
+    "count_common",
     "find_candidates",
     "find_cut_off",
     "find_false_tracks",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import platform
+import shlex
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -19,7 +20,7 @@ from psotrack.camera_errors import TrackErrors
 from psotrack.clocks import CameraClocks
 from psotrack.errors import InputError
 from psotrack.identity import Identities, postprocess
-from psotrack.initiation import find_cut_off, find_outside
+from psotrack.initiation import count_common, find_cut_off, find_outside
 from psotrack.methods import MethodResult
 from psotrack.pipeline.parts import Parts
 from psotrack.pipeline.preparation import PreparedRun
@@ -29,6 +30,10 @@ from psotrack.silhouettes import Silhouettes
 from psotrack.trajectories import DroneSizes, Trajectories
 
 logger = logging.getLogger(__name__)
+
+#: Where detections of different cameras meet in a smaller share of the frames, something is wrong with the cameras:
+#: rays of false detections meet by chance.
+_FEW_MET = 0.2
 
 
 @dataclass(frozen=True)
@@ -69,12 +74,7 @@ def finish(
     if limited is not None:
         logger.warning("%s", limited)
     if not tracks.num_drones:
-        return InputError(
-            recording.folder,
-            expected="drones",
-            found="none in any frame",
-            remedy="look at what the cameras see (`psotrack silhouettes`), or give the drones' first positions (init)",
-        )
+        return _no_drones(recording, silhouettes, run)
     began = time.perf_counter()
     errors = result.errors
     trajectories, identities = postprocess(
@@ -117,6 +117,22 @@ def finish(
         **environment(),
     }
     return TrackedRecording(trajectories, tracks.sizes.size_m, identities, record)
+
+
+def _no_drones(recording: Recording, silhouettes: Silhouettes | None, run: PreparedRun) -> InputError:
+    """The error that says why no drone was found, as far as that is known."""
+    found = "none in any frame"
+    remedy = (
+        "look at what the cameras see (`psotrack silhouettes`), or give the drones' first positions (init)"
+    )
+    detected = run.detections.sightings if run.detections is not None else silhouettes
+    if detected is not None:
+        common = count_common(recording.rig, detected)
+        if common.met < _FEW_MET * common.seen:
+            share = f"{common.met} of {common.seen} frames"
+            found += f", and detections of different cameras that meet in a place in {share}"
+            remedy = f"check the rig, its unit and the clocks: `psotrack doctor {shlex.quote(f'{recording.folder}')}`"
+    return InputError(recording.folder, expected="drones", found=found, remedy=remedy)
 
 
 def environment() -> dict[str, Any]:

@@ -19,6 +19,7 @@ import msgspec
 
 from psotrack.detection import stored_detections
 from psotrack.errors import InputError, SettingsError
+from psotrack.geometry import views_meet
 from psotrack.initiation import MovingPoints, start_source
 from psotrack.methods import MethodResult, usable_for
 from psotrack.pipeline.clock_correction import advise_on_clocks, estimate_clocks, with_clocks
@@ -71,6 +72,13 @@ def track_recording(
             recording.folder,
             expected="at least two cameras that can be used, because one camera does not show distances",
             found=", ".join(recording.rig.names),
+        )
+    if not views_meet(recording.rig.cameras):
+        raise InputError(
+            recording.folder,
+            expected="cameras of which two have a place in view together",
+            found=f"that no views of {', '.join(recording.rig.names)} meet",
+            remedy="check the places and directions of the cameras in the calibration",
         )
     # Wrong names are refused before silhouettes are computed, which takes minutes.
     if tracks_silhouettes(settings, parts.method):

@@ -10,7 +10,6 @@ from psotrack.initiation import InitialState, complete_initial_state, find_initi
 from psotrack.methods import (
     MethodInputs,
     MethodResult,
-    add_errors_of_both,
     add_errors_of_detections,
     add_errors_of_silhouettes,
     fuse_methods,
@@ -140,10 +139,7 @@ def with_errors_of_cameras(
         assert run.detections is not None
         lines = add_errors_of_detections(lines, rig, run.detections, settings, fps)
     if swarm is not None and lines is not None:
-        fused = fuse_methods(swarm, lines, settings, fps)
-        return (
-            add_errors_of_both(fused, swarm, lines, rig, settings, fps) if fused.tracks.num_drones else fused
-        )
+        return fuse_methods(swarm, lines, settings, fps)
     result = swarm or lines
     assert result is not None, "each method of the package uses the swarm, projection lines, or both"
     return result

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -26,7 +26,7 @@ class Crossings:
         position_m: (crossings, 3), metres.
         covariance_m2: (crossings, 3, 3), from the noise of the detections.
         seen: (crossings, cameras), cameras whose detections count.
-        detection: (crossings, cameras), index of the detection among the camera's detections; -1 for none.
+        box: (crossings, cameras), which of the camera's boxes counts; -1 for none.
         disagreement: (crossings,), squared reprojection errors over the noise, per degree of freedom: about 1 where the
             noise is right.
         span_m: (crossings, 2), width and height of the detections at that distance, median of the cameras, metres.
@@ -36,9 +36,23 @@ class Crossings:
     position_m: Float[np.ndarray, "crossings 3"]
     covariance_m2: Float[np.ndarray, "crossings 3 3"]
     seen: Bool[np.ndarray, "crossings cameras"]
-    detection: Int[np.ndarray, "crossings cameras"]
+    box: Int[np.ndarray, "crossings cameras"]
     disagreement: Float[np.ndarray, "crossings"]
     span_m: Float[np.ndarray, "crossings 2"]
+
+    def joined(self, other: Crossings, num_expected: int) -> Crossings:
+        """The crossings of both.
+
+        Args:
+            other: crossings of other expected drones.
+            num_expected: number of the drones that were expected here; those of the other follow them.
+        """
+        values = {
+            each.name: np.concatenate([getattr(self, each.name), getattr(other, each.name)])
+            for each in fields(self)
+        }
+        known = np.where(other.expected >= 0, other.expected + num_expected, -1)
+        return Crossings(**values | {"expected": np.concatenate([self.expected, known])})
 
 
 def crossings(
@@ -96,10 +110,21 @@ def crossings(
         position_m=position_m,
         covariance_m2=lines.covariance_m2[kept],
         seen=seen,
-        detection=groups.detection[kept],
+        box=_boxes(view, groups.detection[kept]),
         disagreement=squared.sum(axis=-1) / (2 * seen.sum(axis=-1) - 3),
         span_m=np.nanmedian(span_m, axis=1),
     )
+
+
+def _boxes(
+    view: CameraSightings, detection: Int[np.ndarray, "groups cameras"]
+) -> Int[np.ndarray, "groups cameras"]:
+    """Places among the boxes of detections that are counted without padding; -1 for none."""
+    boxes = np.full(detection.shape, -1)
+    for camera, noise_px in enumerate(view.noise_px):
+        there = detection[:, camera] >= 0
+        boxes[there, camera] = np.flatnonzero(np.isfinite(noise_px))[detection[there, camera]]
+    return boxes
 
 
 def _shared(detection: Int[np.ndarray, "groups cameras"]) -> Bool[np.ndarray, "groups cameras"]:

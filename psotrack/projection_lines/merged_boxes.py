@@ -86,8 +86,7 @@ def split_merged_boxes(
     middle_px = np.where(first & last, (from_first + from_last) / 2, np.where(first, from_first, from_last))
     off_px = PART_SHARE * np.sqrt(size_px.prod(axis=-1))
     noise_px = np.hypot(view.noise_px[camera, box][row], off_px)
-    without = _without(view, camera[several], box[several])
-    return _with(without, camera[row], middle_px, size_px, noise_px)
+    return _with(view.without(camera[several], box[several]), camera[row], middle_px, size_px, noise_px)
 
 
 def _expected(
@@ -102,16 +101,6 @@ def _expected(
     known = np.isfinite(half_px).all(axis=-1) & (depth > NEAR_M)
     inside = (np.abs(pixels[:, :, None] - view.centre_px) < view.size_px / 2).all(axis=-1)
     return _Outlines(pixels - half_px, pixels + half_px), inside & known[..., None]
-
-
-def _without(
-    view: CameraSightings, camera: Int[np.ndarray, "gone"], box: Int[np.ndarray, "gone"]
-) -> CameraSightings:
-    """The frame's boxes without the given boxes."""
-    centre_px, size_px, noise_px = view.centre_px.copy(), view.size_px.copy(), view.noise_px.copy()
-    for values in (centre_px, size_px, noise_px):
-        values[camera, box] = np.nan
-    return replace(view, centre_px=centre_px, size_px=size_px, noise_px=noise_px)
 
 
 def _with(

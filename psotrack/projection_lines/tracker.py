@@ -187,21 +187,19 @@ class _Tracker:
 
         A position that is of no track starts one.
         """
-        slots, tracks = [slot for slot, _ in self._active()], [track for _, track in self._active()]
+        active = self._active()
+        # Drones, and tracks that enough viewpoints have agreed on once, come first; see `_crossings`.
+        sure = [(slot, track) for slot, track in active if track.drone is not None or track.agreed_hits]
+        vague = [(slot, track) for slot, track in active if track.drone is None and not track.agreed_hits]
+        slots, tracks = [slot for slot, _ in sure + vague], [track for _, track in sure + vague]
+        view = self._at_instant(view, slots)
         expected_m = np.asarray(self._motion.state.apparent_m[slots])
         expected_m2 = np.asarray(self._motion.state.covariance[slots, :3, :3])
         span_m = np.array([track.span_m for track in tracks]).reshape(-1, 2)
-        view = self._at_instant(view, slots)
-        view = split_merged_boxes(self._cameras, view, expected_m, span_m)
-        crossed = crossings(
-            self._cameras,
-            view,
-            self._bounds_m + np.array([[0.0, 0.0, FLOOR_CLEARANCE_M], [0.0, 0.0, 0.0]]),
-            expected_m,
-            expected_m2,
-            np.array([track.dispersion for track in tracks]),
-            2,
-        )
+        dispersion = np.array([track.dispersion for track in tracks])
+        num_sure = len(sure)
+        view = split_merged_boxes(self._cameras, view, expected_m[:num_sure], span_m[:num_sure])
+        crossed = self._crossings(view, expected_m, expected_m2, dispersion, num_sure)
         usual = float(np.median([track.dispersion for track in tracks])) if tracks else 1.0
         measured: dict[int, Measurement] = {}
         # Detections in which lines of sight cross are of something that several cameras see.
@@ -220,6 +218,8 @@ class _Tracker:
                 number, slot = near, slots[near]
                 if slot in measured:
                     continue
+            elif _beside_better(crossed, row):
+                continue
             else:
                 speed_m_s = SPEED_SHARE * self._settings.motion.speed_limit_m_s
                 slot = self._start(Track(None, usual), position_m, np.zeros(3), speed_m_s)
@@ -236,7 +236,33 @@ class _Tracker:
                     crossed.span_m[row],
                     surprising,
                 )
-        return measured, self._seen_by_one(view, crossed.detection[crossing], slots, measured)
+        return measured, self._seen_by_one(view, crossed.box[crossing], slots, measured)
+
+    def _crossings(
+        self,
+        view: CameraSightings,
+        expected_m: Float[np.ndarray, "drones 3"],
+        expected_m2: Float[np.ndarray, "drones 3 3"],
+        dispersion: Float[np.ndarray, "drones"],
+        num_sure: int,
+    ) -> Crossings:
+        """Crossings of the frame's lines of sight, with the first `num_sure` of the expected tracks, then the others.
+
+        Lines of two viewpoints cross by chance, where more viewpoints have the place in view. Such crossings are looked
+        for among the detections of nothing else, so that they take no detection from a drone.
+        """
+        required = self._settings.status.min_cameras_to_begin
+        bounds_m = self._bounds_m + np.array([[0.0, 0.0, FLOOR_CLEARANCE_M], [0.0, 0.0, 0.0]])
+
+        def crossed_by(view: CameraSightings, part: slice, min_views: int | None) -> Crossings:
+            expected = expected_m[part], expected_m2[part], dispersion[part]
+            return crossings(self._cameras, view, bounds_m, *expected, min_views)
+
+        first = crossed_by(view, slice(num_sure), required)
+        if required is not None:
+            return first
+        rest = view.without(*_camera_and_box(first.box))
+        return first.joined(crossed_by(rest, slice(num_sure, None), 2), num_sure)
 
     def _nearly_expected(
         self,
@@ -270,10 +296,7 @@ class _Tracker:
     ) -> SingleViews:
         """The views of drones that have no measurement, among the detections that are of no other drone; by slot."""
         missed = [slot for slot in slots if slot not in measured and self._track(slot).drone is not None]
-        free = np.isfinite(view.noise_px)
-        for camera, found in enumerate(free):
-            numbers = used[:, camera]
-            free[camera, np.flatnonzero(found)[numbers[numbers >= 0]]] = False
+        free = np.isfinite(view.without(*_camera_and_box(used)).noise_px)
         state = self._motion.state
         views = find_single_views(
             self._cameras,
@@ -416,6 +439,14 @@ class _Tracker:
         ]
 
 
+def _camera_and_box(
+    box: Int[np.ndarray, "crossings cameras"],
+) -> tuple[Int[np.ndarray, "used"], Int[np.ndarray, "used"]]:
+    """(used,), cameras and boxes of the detections in crossings."""
+    row, camera = np.nonzero(box >= 0)
+    return camera, box[row, camera]
+
+
 def _surprise(
     crossed: Crossings,
     row: int,
@@ -426,6 +457,13 @@ def _surprise(
     off_m = crossed.position_m[row] - expected_m
     spread_m2 = expected_m2 + crossed.covariance_m2[row]
     return (off_m * np.linalg.solve(spread_m2, off_m[..., None])[..., 0]).sum(axis=-1)
+
+
+def _beside_better(crossed: Crossings, row: int) -> bool:
+    """Whether a crossing is beside one that more cameras see: a part of the same drone."""
+    near = np.linalg.norm(crossed.position_m - crossed.position_m[row], axis=-1) < SEPARATION_M
+    num_cameras = crossed.seen.sum(axis=-1)
+    return bool((near & (num_cameras > num_cameras[row])).any())
 
 
 def _may_be_known(track: Track) -> bool:

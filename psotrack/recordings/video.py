@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import shlex
 import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -386,18 +387,33 @@ class TruncatedVideoError(InputError):
         num_instants: number of instants of the recording in which these frames suffice.
     """
 
-    def __init__(self, video: VideoInfo, num_readable: int, num_instants: int | None = None) -> None:
+    def __init__(
+        self, video: VideoInfo, num_readable: int, num_instants: int | None = None, option: str = ""
+    ) -> None:
         self.video, self.num_readable = video, num_readable
         self.num_instants = num_readable if num_instants is None else num_instants
+        self._option = option
         index = num_readable
+        remedy = "copy it again"
+        if option and self.num_instants:
+            remedy += f"; if only its end is missing, {option} {self.num_instants} uses the time before"
+        elif num_readable:
+            whole = shlex.quote(video.path.name)
+            cut = shlex.quote(f"{video.path.stem}_cut{video.path.suffix}")
+            remedy += (
+                f"; if only its end is missing, `ffmpeg -i {whole} -frames:v {num_readable} -c copy {cut}` "
+                "keeps the frames before"
+            )
         super().__init__(
             video.path,
             expected=f"{video.num_frames} frames",
             found=f"that only {index} can be decoded (frame {index} is missing or broken)",
-            remedy=f"copy it again; if only its end is missing, --frames {self.num_instants} uses the time before"
-            if self.num_instants
-            else "copy it again",
+            remedy=remedy,
         )
 
+    def with_option(self, option: str) -> TruncatedVideoError:
+        """The same error for a program with an option that limits the number of instants, such as `--frames`."""
+        return TruncatedVideoError(self.video, self.num_readable, self.num_instants, option)
+
     def __reduce__(self) -> tuple[object, ...]:
-        return type(self), (self.video, self.num_readable, self.num_instants)
+        return type(self), (self.video, self.num_readable, self.num_instants, self._option)

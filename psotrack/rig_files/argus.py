@@ -2,6 +2,11 @@
 
 AR is fy / fx; k1, k2, t1, t2, k3 are OpenCV's k1, k2, p1, p2, k3. The file has no poses: those are DLT coefficients in
 a file of their own, for undistorted pixels; see `dlt`.
+
+The format: `docs/user-guide.md` of https://github.com/backyardbiomech/argus_gui (there k1, k2, k3 are r2, r4, r6).
+Argus takes cy and t1 for pixels counted upwards where it undistorts clicked points (`tools.undistort_pts`), but
+estimates them on images, downwards (`patterns`). Here they are those of images; the two differ only if cy is not in the
+middle or t1 is not 0. Argus undistorts with fx alone; AR is 1 in its profiles.
 """
 
 from __future__ import annotations

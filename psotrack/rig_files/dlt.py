@@ -4,9 +4,16 @@
     v = (L5 X + L6 Y + L7 Z + L8) / (L9 X + L10 Y + L11 Z + 1)
 
 A file has 11 lines of numbers, one column per camera; 11 numbers per line and one line per camera are read too. The
-unit of X, Y, Z is open. DLTdv, easyWand and Argus measure v upwards from the lower edge of the image, other programs
-downwards; the sign of the determinant of the 3 x 3 part says which, if the world's origin is in front of the cameras,
-as a calibration object or a wand at the origin is. A camera alone with the other sign has the origin behind it.
+unit of X, Y, Z is open. Argus and DLTdv before version 8 measure v upwards from the lower edge of the image, DLTdv8 and
+other programs downwards; the sign of the determinant of the 3 x 3 part says which, if the world's origin is in front of
+the cameras, as a calibration object or a wand at the origin is. A camera alone with the other sign has the origin
+behind it.
+
+Upwards, v is the image's height less the row, where the first row is 0; u is 0 in the first column. That is Argus's
+count (`DLCclicker.py` and `frameFinderPyglet.py` of https://github.com/backyardbiomech/argus_gui). DLTdv, in MATLAB,
+counts columns from 1 (and DLTdv8 rows, too; `dlt_invert.m` of https://github.com/tlhedrick/dltdv changes from one
+origin to the other). Places from its files are therefore shown 1 pixel too far to the right (and below): a file does
+not say which program wrote it.
 
 There is no lens distortion: pixels must be undistorted ones. Argus's profile of the lenses is read by `argus`.
 """

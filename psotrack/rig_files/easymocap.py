@@ -2,7 +2,11 @@
 
 intri.yml has `names` and for each name `K_NAME` and `dist_NAME`, in newer versions `H_NAME` and `W_NAME` too; extri.yml
 has `R_NAME` (a Rodrigues vector), `Rot_NAME` (a matrix) and `T_NAME`: x_cam = R X + T in metres. Either file may be
-named.
+named. Where a camera has both `R_NAME` and `Rot_NAME`, `R_NAME` counts, as for EasyMocap. A width or height that is not
+above 0 is not known.
+
+The format: `easymocap/mytools/camera_utils.py` of https://github.com/zju3dv/EasyMocap (`read_camera`, `write_camera`);
+its `apps/calibration/Readme.md` states the board's squares in metres.
 """
 
 from __future__ import annotations
@@ -54,8 +58,10 @@ def _entries(
             if content.get(f"{theirs}_{name}") is not None
         }
         width, height = content.get(f"W_{name}"), content.get(f"H_{name}")
-        if width and height:
+        if isinstance(width, int | float) and isinstance(height, int | float) and min(width, height) > 0:
             values["size"] = [width, height]
+        if "rvec" in values:
+            values.pop("R", None)
         if "K" not in values:
             # A camera whose place is known, but not its lens.
             yield name, f"K_{name}", Entry(None, placed=False)

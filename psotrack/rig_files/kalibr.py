@@ -2,7 +2,11 @@
 
 `intrinsics` are fu, fv, pu, pv of the pinhole model; `distortion_model` is radtan (OpenCV's k1, k2, p1, p2),
 equidistant (OpenCV's fisheye) or none; `T_cn_cnm1` maps the camera before to this camera, in metres. The world is the
-first camera. Other models (omni, double sphere, field of view) have no form in OpenCV.
+first camera; `T_cam_imu` and the clock of an inertial unit are not read. Other models (omni, eucm, ds, and distortion
+by fov) have no form in OpenCV and are refused.
+
+The format: https://github.com/ethz-asl/kalibr/wiki/yaml-formats, and `kalibr_common/ConfigReader.py`, which says what
+Kalibr itself accepts.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ from psotrack.rig_files.fields import CameraFields, image_size, quoted, rotation
 from psotrack.rig_files.yaml_text import parse_yaml
 
 _FISHEYE = {"radtan": False, "equidistant": True, "equi": True, "none": False}
+_REMEDY = "calibrate again with pinhole-radtan or pinhole-equi, or by `psotrack calibrate rig`"
 
 
 def recognises(text: str) -> bool:
@@ -53,10 +58,10 @@ def _entries(
 def _entry(source: Source, fields: CameraFields, T: Float[np.ndarray, "4 4"] | None) -> Entry:
     model = str(fields.values.get("camera_model"))
     if model != "pinhole":
-        raise fields.error("camera_model", "pinhole, the model that OpenCV has", model)
+        raise fields.error("camera_model", "pinhole, the model that OpenCV has", model, _REMEDY)
     distortion = str(fields.values.get("distortion_model", "none"))
     if distortion not in _FISHEYE:
-        raise fields.error("distortion_model", "radtan, equidistant or none", distortion)
+        raise fields.error("distortion_model", "radtan, equidistant or none", distortion, _REMEDY)
     fu, fv, pu, pv = fields.array(("intrinsics",), (4,))
     if not (fu > 0 and fv > 0):
         raise fields.error("intrinsics", "focal lengths above 0", f"{fu:g} and {fv:g}")

@@ -11,10 +11,9 @@ from .fitness import (
 )
 from .parameters import TrackerSettings, find_score, find_search, tracker_settings
 from .search import ParticleSwarm, Search, SearchRegion, particle_swarm
-from .tracker import COMMON, DISPERSION_FRAMES
+from .tracker import DISPERSION_FRAMES
 
 __all__ = [
-    "COMMON",
     "DISPERSION_FRAMES",
     "PAPER_SCORE",
     "CameraMiddles",

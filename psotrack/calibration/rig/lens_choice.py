@@ -8,6 +8,7 @@ the error: coefficients that nothing is gained by are free to do harm where the 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +28,7 @@ _MODELS = (
     LensModel(14),
 )
 #: Number of parts of the views, and smallest number of views for a comparison.
-_FOLDS, _LEAST_VIEWS = 3, 9
+_FOLDS, LEAST_VIEWS = 3, 9
 #: Largest number of fits of a comparison, for a display of the progress.
 MOST_FITS = len(_MODELS) * _FOLDS
 #: Standard errors, and share of the median error, by which a model must be better than a simpler one.
@@ -64,7 +65,7 @@ def choose_lens_model(
         advance: called with 1 after each of at most `MOST_FITS` fits.
     """
     views_px = views_px[:: -(-len(views_px) // _MOST_VIEWS)] if len(views_px) else views_px
-    if len(views_px) < _LEAST_VIEWS:
+    if len(views_px) < LEAST_VIEWS:
         return ModelComparison(_MODELS[0], {})
     distances: dict[LensModel, np.ndarray | None] = {}
     focal_px: float | None = None
@@ -91,6 +92,21 @@ def choose_lens_model(
         if is_certain and error_px[model] < (1 - _VISIBLE) * error_px[chosen]:
             chosen = model
     return ModelComparison(chosen, {f"{model}": error for model, error in error_px.items()})
+
+
+def say_not_compared(views: Mapping[str, int]) -> list[str]:
+    """A sentence on lenses whose model was not chosen by views left out, because there are too few views.
+
+    Args:
+        views: number of views of each camera whose model was to be chosen, by its name.
+    """
+    few = [f"{name} ({count})" for name, count in views.items() if count < LEAST_VIEWS]
+    if not few:
+        return []
+    return [
+        f"lens models are compared by at least {LEAST_VIEWS} views; fewer were found of {', '.join(few)}: the usual "
+        f"model with {_MODELS[0]} distortion coefficients is taken there; film more views, or choose a model by --lens"
+    ]
 
 
 def _left_out(

@@ -11,8 +11,10 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from psotrack.calibration.board_recognition import (
     Recognised,
+    explain_markers_on_chessboard,
     explain_missing_board,
     measure_marker_share,
+    number_of_first_images,
     recognise_board,
 )
 from psotrack.calibration.boards import LEAST_CORNERS, Board
@@ -89,6 +91,10 @@ def find_views(
         InputError: an image cannot be read, or a camera never sees the board; the message says what is seen instead.
     """
     number, frames = instants
+    if board.kind == "chessboard":
+        first = list(islice(_samples(cameras, frames), number_of_first_images(len(cameras))))
+        if markers := explain_markers_on_chessboard(board, first):
+            raise InputError("board", expected=f"a {board}", found=markers[0], remedy=markers[1])
     recognised = recognise_board(board, _samples(cameras, frames))
     if not recognised.views:
         images = list(islice(_samples(cameras, frames), _MOST_SAMPLES))

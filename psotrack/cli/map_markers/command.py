@@ -10,7 +10,16 @@ import numpy as np
 
 from psotrack.cli.map_markers.shown import show_built, show_check, show_measured
 from psotrack.cli.map_markers.sources import Lenses, known_corners, leading, videos_of
-from psotrack.cli.options import FORCE, FOV, FRAMES, JSON, QUIET, SCALE_CAMERA, Numbers, dictionary_option
+from psotrack.cli.options import (
+    FORCE,
+    FOV,
+    JSON,
+    QUIET,
+    SCALE_CAMERA,
+    Numbers,
+    dictionary_option,
+    frames_option,
+)
 from psotrack.cli.output import check_outputs, report_to
 from psotrack.errors import SettingsError, check_positive
 
@@ -75,7 +84,7 @@ _MEASURED = {".c3d", ".csv", ".txt", ".tsv"}
     metavar="X,Y,Z",
     help="Position that all measured markers face, in metres.  [default: the mean of their corners]",
 )
-@FRAMES
+@frames_option
 @FORCE
 @QUIET
 @JSON

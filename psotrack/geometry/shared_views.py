@@ -1,0 +1,52 @@
+"""Whether the views of cameras meet: two cameras that share no view never locate anything."""
+
+from __future__ import annotations
+
+from itertools import permutations
+
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.geometry.cameras import Camera, project_visible, undistort
+
+#: Depths at which places are looked for, metres; wide, because the unit of a rig may be wrong by a factor of 1000.
+_NEAREST_M, _FARTHEST_M = 0.01, 1e5
+#: Columns, rows and depths of the places before a camera: the few that nearly always suffice, and the many that find a
+#: common view as narrow as a sixteenth of the images, too.
+_GRIDS = ((7, 5, 40), (17, 13, 300))
+
+
+def views_meet(cameras: Camera) -> bool:
+    """Whether there is a place, at any distance, that two cameras have in view.
+
+    Args:
+        cameras: cameras with one leading axis.
+    """
+    count = len(cameras.K)
+    for columns, rows, depths in _GRIDS:
+        depth_m = np.geomspace(_NEAREST_M, _FARTHEST_M, depths)
+        places_m = [_places_before(cameras[index], columns, rows, depth_m) for index in range(count)]
+        if any(_sees_any(cameras[b], places_m[a]) for a, b in permutations(range(count), 2)):
+            return True
+    return False
+
+
+def _places_before(
+    camera: Camera, columns: int, rows: int, depth_m: Float[np.ndarray, " depths"]
+) -> Float[np.ndarray, "places 3"]:
+    """Places that a camera has in view, on a grid of its pixels and at several depths, in the world."""
+    width, height = np.asarray(camera.image_size_wh, np.float64)
+    u, v = np.meshgrid(np.linspace(0, width - 1, columns), np.linspace(0, height - 1, rows))
+    rays = undistort(camera, np.stack([u.ravel(), v.ravel()], axis=-1))
+    rays = np.column_stack([rays, np.ones(len(rays))])[np.isfinite(rays).all(axis=-1)]
+    R, t_m = camera.T_cam_world[:3, :3], camera.T_cam_world[:3, 3]
+    places_m: Float[np.ndarray, "places 3"] = ((rays[:, None] * depth_m[:, None]).reshape(-1, 3) - t_m) @ R
+    return places_m
+
+
+def _sees_any(camera: Camera, places_m: Float[np.ndarray, "places 3"]) -> bool:
+    """Whether any of the places is in a camera's image."""
+    pixels, _ = project_visible(camera, places_m)
+    # NaN, of a place without an image, is in no image.
+    inside = (pixels >= -0.5) & (pixels <= np.asarray(camera.image_size_wh) - 0.5)
+    return bool(inside.all(axis=-1).any())
