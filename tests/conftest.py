@@ -52,10 +52,15 @@ settings.load_profile("psotrack")
 
 @pytest.fixture(scope="module")
 def optimised() -> Iterator[None]:
-    """XLA optimises the programs of the module: for programs that run for longer than they compile."""
+    """XLA optimises the programs of the module: for programs that run for longer than they compile.
+
+    JAX would also use a program that an earlier test of the process compiled without optimisations.
+    """
     jax.config.update("jax_disable_most_optimizations", False)
+    jax.clear_caches()
     yield
     jax.config.update("jax_disable_most_optimizations", True)
+    jax.clear_caches()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
