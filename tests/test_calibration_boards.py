@@ -325,6 +325,37 @@ def test_markers_beside_a_chessboard_are_not_on_it(tmp_path):
 
 
 @pytest.mark.slow
+def test_any_frame_of_a_long_video_may_be_the_floor(tmp_path):
+    """More than 300 frames are not all searched, which a line says; the frame of --floor always is."""
+    for name, x_m in (("left", 0.0), ("right", 0.1)):
+        with VideoWriter(tmp_path / f"{name}.avi", 25.0, SIZE_WH) as writer:
+            for number in range(306):
+                T = pose(number // 20 % 8)
+                T[0, 3] -= x_m
+                image = draw_board(BOARD, K, T, SIZE_WH)
+                writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    paths = [str(tmp_path / f"{name}.avi") for name in ("left", "right")]
+    words = [
+        "rig",
+        *paths,
+        "--squares",
+        "4x6",
+        "--square",
+        "0.04",
+        "--marker",
+        "0.03",
+        "--dictionary",
+        "4x4_50",
+    ]
+    out = tmp_path / "rig.toml"
+    ran = CliRunner().invoke(calibrate, [*words, "--lens", "0", "--floor", "45", "--out", str(out)])
+    assert ran.exit_code == 0, ran.output
+    assert "left 154 of 306, right 154 of 306" in " ".join(ran.output.split())
+    T_cam_board = pose(45 // 20)
+    np.testing.assert_allclose(read_rig(out).cameras.T_cam_world[0, :3, 3], T_cam_board[:3, 3], atol=0.01)
+
+
+@pytest.mark.slow
 def test_the_command(tmp_path):
     """Two folders of drawn images, from the command line to the rig; and what the command refuses."""
     baseline = np.eye(4)

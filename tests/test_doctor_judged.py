@@ -1,7 +1,6 @@
 """The doctor and `calibrate adjust` on rigs and boxes by formula: sound rigs are left alone, faults are named."""
 
 import runpy
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,14 +18,10 @@ from psotrack.doctor.hypotheses import PER_CAMERA, Corrected, Hypothesis, linear
 from psotrack.geometry import Rig, project
 from psotrack.trajectories import Trajectories
 
-FOLDER = Path(__file__).parents[1] / "experiments" / "calibration"
-sys.path.append(str(FOLDER))
-import _boxes  # noqa: E402
-
 pytestmark = pytest.mark.slow
 
-JUDGE = runpy.run_path(str(FOLDER / "doctor.py"))
-Scene, make_case, judge = _boxes.Scene, JUDGE["make_case"], JUDGE["judge"]
+JUDGE = runpy.run_path(str(Path(__file__).parents[1] / "experiments" / "calibration" / "doctor.py"))
+_boxes, Scene, make_case, judge = (JUDGE[name] for name in ("_boxes", "Scene", "make_case", "judge"))
 
 
 def examine_case(number, fault=""):

@@ -1,7 +1,7 @@
 """Results on data like S02_D4_A with the paper's swarm (joint, 100 particles x 70 iterations), from videos to errors.
 
-Images have half the size and the flight takes one second. Silhouettes have half the usual reduction, so that drones are
-as many cells wide as at full size.
+Images have half the size and the flight takes two seconds. Silhouettes have half the usual reduction, so that drones
+are as many cells wide as at full size.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory, optimised: None) -> Lab:
     folder = simulate(
         "S02_D4_A",
         root,
-        SimulationSettings(num_frames=25, scale=0.5, seed=0, masks=False, onboard=False),
+        SimulationSettings(num_frames=50, scale=0.5, seed=0, masks=False, onboard=False),
         jobs=1,
     )
     return Lab(read_sequence(folder).usable(), root / "cache")

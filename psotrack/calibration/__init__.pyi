@@ -17,7 +17,16 @@ from .lens_models import LensModel, known_lenses, parse_lens_model
 from .pose_search import MIN_POINTS
 from .residuals import GATE, UNLIKELY, inflation, spread_px
 from .rig.adjustment import CalibratedRig, LensChoice, calibrate_rig, in_new_world
-from .rig.findings import CameraFigures, advise, coverage, figures_of, find_shifts, say_print, worst_views
+from .rig.findings import (
+    CameraFigures,
+    advise,
+    coverage,
+    figures_of,
+    find_shifts,
+    say_print,
+    say_searched,
+    worst_views,
+)
 from .rig.images import CameraImages, instants_of_numbers, open_images, open_recorded
 from .rig.lens_choice import ModelComparison, choose_lens_model, say_not_compared
 from .rig.moving_point import LOOSE, PointRig, PointViews, calibrate_by_point, covariance_of_centres
@@ -103,6 +112,7 @@ __all__ = [
     "save_coverage",
     "say_not_compared",
     "say_print",
+    "say_searched",
     "spread_px",
     "stick_length",
     "views_of_detections",

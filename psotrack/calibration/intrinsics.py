@@ -42,6 +42,7 @@ class Lens:
         std: (4 + coefficients,), standard deviations of fx, fy, cx, cy in pixels, and of the distortion coefficients.
         frame: (views,), numbers of the frames that were used.
         residual_px: (views,), root mean square reprojection error of each view, pixels.
+        searched: number of frames that were searched for the board.
     """
 
     camera: Camera
@@ -50,6 +51,7 @@ class Lens:
     std: Float[np.ndarray, " unknowns"]
     frame: Int[np.ndarray, " views"]
     residual_px: Float[np.ndarray, " views"]
+    searched: int
 
 
 def lens_of_view(horizontal_deg: float, vertical_deg: float, image_size_wh: tuple[int, int]) -> Camera:
@@ -139,7 +141,7 @@ def lens_of_board(
         )
     squares = np.where(used, calibrated.residual_px[0], 0.0) ** 2
     rms_px = np.sqrt(squares.sum(axis=1)[is_good] / used.sum(axis=1)[is_good])
-    return Lens(camera, model, compared_px, std, views.number[is_good], rms_px)
+    return Lens(camera, model, compared_px, std, views.number[is_good], rms_px, int(found.searched[0]))
 
 
 def _undistorted_camera(focal_length_px: Float[np.ndarray, "2"], image_size_wh: tuple[int, int]) -> Camera:

@@ -98,7 +98,9 @@ def frames_option(command: Command) -> Command:
         try:
             command(*args, **options)
         except TruncatedVideoError as error:
-            raise error.with_option("--frames") from None
+            if not error.num_instants:
+                raise
+            raise error.with_way_on(f"--frames {error.num_instants} uses the time before") from None
 
     return click.option(
         "--frames", "num_frames", type=int, metavar="N", help="Use the first N frames only.  [default: all]"

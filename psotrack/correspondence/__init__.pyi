@@ -2,7 +2,6 @@ from .assignment import SEPARATION_M
 from .epipolar import epipolar_distance
 from .groups import NEW_GROUP_COST, SHARED_COST, UNEXPLAINED_COST
 from .matching import Matches, match, wide_bounds
-from .padded_sightings import in_images
 from .sightings import (
     BORDER_PX,
     CUT_SHARE,
@@ -29,7 +28,6 @@ __all__ = [
     "epipolar_distance",
     "from_detections",
     "from_silhouettes",
-    "in_images",
     "match",
     "wide_bounds",
 ]

@@ -11,7 +11,7 @@ from psotrack.errors import SettingsError
 from psotrack.geometry import (
     NEAR_M,
     Camera,
-    project_visible,
+    in_images,
     projection_equations,
     undistort,
     undistortion_stretch,
@@ -69,15 +69,6 @@ class PaddedSightings:
         required = min_viewpoints.copy()
         required[by_place] = np.clip(self.num_viewpoints(in_view), 2, 3)
         return required
-
-
-def in_images(
-    cameras: Camera, position_m: Float[np.ndarray, "*points 3"]
-) -> Bool[np.ndarray, "*points cameras"]:
-    """(..., cameras), whether a point is inside a camera's image."""
-    pixels, depth = project_visible(cameras, position_m[..., None, :])
-    inside = (pixels >= -0.5) & (pixels <= cameras.image_size_wh - 0.5)
-    return np.asarray(inside.all(axis=-1) & (depth > NEAR_M))
 
 
 def pad_sightings(

@@ -262,12 +262,15 @@ def _nothing_agrees(found: Agreement, points: CommonPoints) -> Finding:
         )
         return Finding("too little seen", (), message, "the rig cannot be checked; pass other --detections")
     message = (
-        f"the rig: three viewpoints agree on only {found.share:.0%} of {seen} detections, "
+        f"the rig or the detections: three viewpoints agree on only {found.share:.0%} of {seen} detections, "
         "under every interpretation of the rig"
     )
-    return Finding(
-        "no agreement", (), message, "calibrate it anew, and check that videos and detections are its own"
+    # Blobs can be other parts of a body in each camera, if the body hardly moves: then the soundest rig disagrees.
+    remedy = (
+        "look whether the detections are of the same bodies in all cameras, and videos of this rig; "
+        "if they are, calibrate it anew"
     )
+    return Finding("no agreement", (), message, remedy)
 
 
 def _select(rig: Rig, sightings: Sightings, kept: Bool[np.ndarray, "cameras"]) -> tuple[Rig, Sightings]:

@@ -103,20 +103,16 @@ def find_faults(rig: Rig, points: CommonPoints) -> tuple[list[FoundFault], Corre
         fault = _find_fault(corrected, data, cameras, free, FURTHER if found else FIRST)
         if fault is None:
             break
-        if isinstance(fault, Judged):
-            corrected = corrected.by(fault.step)
-            free += fault.hypothesis.columns
-            data = weigh(corrected, points)
-            continue
-        if not fault.certain and found:
+        is_small = fault.shift_px < _least_px(rig)
+        if not fault.certain and (found or is_small):
             break
-        found.append(fault)
-        if not fault.certain:
-            break
+        if not is_small:
+            found.append(fault)
+            if not fault.certain:
+                break
+            cameras = [each for each in cameras if each != fault.best.hypothesis.camera]
         corrected = corrected.by(fault.best.step)
-        camera = fault.best.hypothesis.camera
         free += fault.best.hypothesis.columns
-        cameras = [each for each in cameras if each != camera]
         # Sightings that looked like outliers may be right at the corrected rig.
         data = weigh(corrected, points)
     return found, corrected
@@ -124,8 +120,8 @@ def find_faults(rig: Rig, points: CommonPoints) -> tuple[list[FoundFault], Corre
 
 def _find_fault(
     corrected: Corrected, data: WeightedPoints, cameras: list[int], free: list[int], least: float
-) -> FoundFault | Judged | None:
-    """The fault with the largest evidence; or an error too small for a name, if it explains the sightings as well."""
+) -> FoundFault | None:
+    """The fault with the largest evidence; or a shift too small for a name, if it explains the sightings as well."""
     rig = corrected.rig
     sums, std = sum_up(corrected, data), prior_of(corrected.rig, data)
     evidence = gather(rig, sums, std, free)
@@ -149,11 +145,12 @@ def _find_fault(
     top, best = refined[0].evidence, _simplest(refined)
     if top < least:
         return None
-    least_px = LEAST_PX * max(1.0, float(np.median(rig.cameras.image_size_wh[:, 0])) / 1920)
     for one in refined:
-        # An error that explains the sightings as well as the best one does is corrected first.
-        if one.evidence > max(least, top - OTHER_CAMERA) and _shift_px(corrected, data, one) < least_px:
-            return one
+        # A small error that explains the sightings as well as the best fault does is corrected first.
+        if one.evidence > max(least, top - OTHER_CAMERA):
+            small_px = _shift_px(corrected, data, one)
+            if small_px < _least_px(rig):
+                return FoundFault(one, (), True, small_px)
     shift_px = _shift_px(corrected, data, best)
     same = [one for one in refined if one.hypothesis.camera == best.hypothesis.camera]
     # The kind may be uncertain where the camera is certain: any likely kind of its fault may predict.
@@ -176,6 +173,11 @@ def _find_fault(
         if one.hypothesis.camera == best.hypothesis.camera and one.evidence > best.evidence - AS_WELL
     ]
     return FoundFault(best, tuple(as_well), True, shift_px)
+
+
+def _least_px(rig: Rig) -> float:
+    """Smallest median shift of a camera's boxes by a fault that is named, pixels of this rig's images."""
+    return LEAST_PX * max(1.0, float(np.median(rig.cameras.image_size_wh[:, 0])) / 1920)
 
 
 def _simplest(refined: list[Judged]) -> Judged:

@@ -19,7 +19,7 @@ from .image_scale import sizes_m, sizes_px, undistortion_stretch
 from .lenses import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS, undistort_approximately
 from .reprojection import project_with_jacobian, reconstruct, to_pixels_with_jacobian, triangulate
 from .rotations import cross_matrices, rotation_matrices
-from .shared_views import views_meet
+from .shared_views import in_images, views_meet
 from .triangulation import (
     MAX_CONDITION,
     match_views,
@@ -47,6 +47,7 @@ __all__ = [
     "distort",
     "files_by_camera",
     "has_image",
+    "in_images",
     "look_at",
     "make_camera",
     "make_extents",

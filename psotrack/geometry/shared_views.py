@@ -1,19 +1,28 @@
-"""Whether the views of cameras meet: two cameras that share no view never locate anything."""
+"""What is in the images of cameras, and whether their views meet: two cameras that share no view locate nothing."""
 
 from __future__ import annotations
 
 from itertools import permutations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from psotrack.geometry.cameras import Camera, project_visible, undistort
+from psotrack.geometry.cameras import NEAR_M, Camera, project_visible, undistort
 
 #: Depths at which places are looked for, metres; wide, because the unit of a rig may be wrong by a factor of 1000.
 _NEAREST_M, _FARTHEST_M = 0.01, 1e5
 #: Columns, rows and depths of the places before a camera: the few that nearly always suffice, and the many that find a
 #: common view as narrow as a sixteenth of the images, too.
 _GRIDS = ((7, 5, 40), (17, 13, 300))
+
+
+def in_images(
+    cameras: Camera, position_m: Float[np.ndarray, "*points 3"]
+) -> Bool[np.ndarray, "*points cameras"]:
+    """Which points are inside of the cameras' images: (..., cameras)."""
+    pixels, depth = project_visible(cameras, position_m[..., None, :])
+    inside = (pixels >= -0.5) & (pixels <= cameras.image_size_wh - 0.5)
+    return np.asarray(inside.all(axis=-1) & (depth > NEAR_M))
 
 
 def views_meet(cameras: Camera) -> bool:
@@ -26,7 +35,7 @@ def views_meet(cameras: Camera) -> bool:
     for columns, rows, depths in _GRIDS:
         depth_m = np.geomspace(_NEAREST_M, _FARTHEST_M, depths)
         places_m = [_places_before(cameras[index], columns, rows, depth_m) for index in range(count)]
-        if any(_sees_any(cameras[b], places_m[a]) for a, b in permutations(range(count), 2)):
+        if any(in_images(cameras[[b]], places_m[a]).any() for a, b in permutations(range(count), 2)):
             return True
     return False
 
@@ -42,11 +51,3 @@ def _places_before(
     R, t_m = camera.T_cam_world[:3, :3], camera.T_cam_world[:3, 3]
     places_m: Float[np.ndarray, "places 3"] = ((rays[:, None] * depth_m[:, None]).reshape(-1, 3) - t_m) @ R
     return places_m
-
-
-def _sees_any(camera: Camera, places_m: Float[np.ndarray, "places 3"]) -> bool:
-    """Whether any of the places is in a camera's image."""
-    pixels, _ = project_visible(camera, places_m)
-    # NaN, of a place without an image, is in no image.
-    inside = (pixels >= -0.5) & (pixels <= np.asarray(camera.image_size_wh) - 0.5)
-    return bool(inside.all(axis=-1).any())

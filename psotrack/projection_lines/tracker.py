@@ -8,8 +8,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.correspondence import CameraSightings, Sightings, in_images
-from psotrack.geometry import Camera, viewpoints
+from psotrack.correspondence import CameraSightings, Sightings
+from psotrack.geometry import Camera, in_images, viewpoints
 from psotrack.initiation import FLOOR_CLEARANCE_M, NEW, SPEED_SHARE, reidentify
 from psotrack.motion import GATE_999
 from psotrack.projection_lines.crossings import Crossings, crossings

@@ -388,32 +388,26 @@ class TruncatedVideoError(InputError):
     """
 
     def __init__(
-        self, video: VideoInfo, num_readable: int, num_instants: int | None = None, option: str = ""
+        self, video: VideoInfo, num_readable: int, num_instants: int | None = None, way_on: str = ""
     ) -> None:
         self.video, self.num_readable = video, num_readable
         self.num_instants = num_readable if num_instants is None else num_instants
-        self._option = option
+        self._way_on = way_on
         index = num_readable
-        remedy = "copy it again"
-        if option and self.num_instants:
-            remedy += f"; if only its end is missing, {option} {self.num_instants} uses the time before"
-        elif num_readable:
+        if not way_on and num_readable:
             whole = shlex.quote(video.path.name)
             cut = shlex.quote(f"{video.path.stem}_cut{video.path.suffix}")
-            remedy += (
-                f"; if only its end is missing, `ffmpeg -i {whole} -frames:v {num_readable} -c copy {cut}` "
-                "keeps the frames before"
-            )
+            way_on = f"`ffmpeg -i {whole} -frames:v {num_readable} -c copy {cut}` keeps the frames before"
         super().__init__(
             video.path,
             expected=f"{video.num_frames} frames",
             found=f"that only {index} can be decoded (frame {index} is missing or broken)",
-            remedy=remedy,
+            remedy="copy it again" + (f"; if only its end is missing, {way_on}" if way_on else ""),
         )
 
-    def with_option(self, option: str) -> TruncatedVideoError:
-        """The same error for a program with an option that limits the number of instants, such as `--frames`."""
-        return TruncatedVideoError(self.video, self.num_readable, self.num_instants, option)
+    def with_way_on(self, way_on: str) -> TruncatedVideoError:
+        """The same error, which says in other words how to go on with the frames before the missing end."""
+        return TruncatedVideoError(self.video, self.num_readable, self.num_instants, way_on)
 
     def __reduce__(self) -> tuple[object, ...]:
-        return type(self), (self.video, self.num_readable, self.num_instants, self._option)
+        return type(self), (self.video, self.num_readable, self.num_instants, self._way_on)

@@ -28,7 +28,7 @@ from psotrack.calibration.residuals import GATE
 from psotrack.calibration.rig.board_poses import find_lens
 from psotrack.calibration.rig.chain import Chain, check_joined, join_cameras
 from psotrack.calibration.rig.covariance import covariance_over_instants
-from psotrack.calibration.rig.lens_choice import MOST_FITS, choose_lens_model
+from psotrack.calibration.rig.lens_choice import LEAST_VIEWS, MOST_FITS, choose_lens_model
 from psotrack.calibration.rig.slips import Slips
 from psotrack.calibration.rig.views import BoardViews
 from psotrack.calibration.rig.world import Similarity
@@ -59,6 +59,7 @@ class CalibratedRig:
         covariance: (cameras, 6, 6), covariance of a small turn about the camera's axes, rad, and of the translation, m.
         centre_covariance_m2: (cameras, 3, 3), covariances of the camera centres, world, m².
         shared: (cameras, cameras), number of instants that two cameras share.
+        not_compared: number of views of each camera that has too few of them to choose a lens model by, by its name.
     """
 
     board: Board
@@ -73,6 +74,7 @@ class CalibratedRig:
     covariance: Float[np.ndarray, "cameras 6 6"]
     centre_covariance_m2: Float[np.ndarray, "cameras 3 3"]
     shared: Int[np.ndarray, "cameras cameras"]
+    not_compared: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,7 @@ def calibrate_rig(
     views = _relabelled(board, views, chain)
     with report("adjustment", _MOST_ROUNDS + 1) as advance:
         bundle = _adjust(board, views, chain, (models, vectors, lens_of), lenses, fixed, advance)
-    return _result(board, views, chain, bundle)
+    return replace(_result(board, views, chain, bundle), not_compared=_not_compared(views, lenses))
 
 
 def _check_views(board: Board, views: BoardViews, lenses: LensChoice) -> None:
@@ -155,9 +157,24 @@ def _start_lenses(
         return tuple(models), tuple(vectors), np.arange(len(models))
     if len(np.unique(views.image_size_wh, axis=0)) > 1:
         raise InputError("cameras", expected="images of one size for one shared lens", found="several sizes")
-    # The camera with most views has the best first lens.
-    best = int(views.seen.sum(axis=1).argmax())
+    best = _camera_of_shared_lens(views)
     return (models[best],), (vectors[best],), np.zeros(len(models), np.int64)
+
+
+def _camera_of_shared_lens(views: BoardViews) -> int:
+    """The camera whose first lens is that of all cameras: the one with most views has the best."""
+    return int(views.seen.sum(axis=1).argmax())
+
+
+def _not_compared(views: BoardViews, lenses: LensChoice) -> dict[str, int]:
+    """See `CalibratedRig`."""
+    if lenses.model is not None:
+        return {}
+    counts = dict(zip(views.names, views.seen.sum(axis=1).tolist(), strict=True))
+    used = [views.names[_camera_of_shared_lens(views)]] if lenses.is_shared else views.names
+    return {
+        name: counts[name] for name in used if name not in (lenses.known or {}) and counts[name] < LEAST_VIEWS
+    }
 
 
 def _first_lens(

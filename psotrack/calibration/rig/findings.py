@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.calibration.rig.adjustment import CalibratedRig
+from psotrack.calibration.rig.lens_choice import say_not_compared
 from psotrack.calibration.rig.views import FoundBoards
 from psotrack.geometry import undistort
 
@@ -122,6 +124,16 @@ def worst_views(calibrated: CalibratedRig) -> list[tuple[str, int, float]]:
     ]
 
 
+def say_searched(searched: Mapping[str, tuple[int, int]]) -> list[str]:
+    """A sentence on frames of long videos that were left out.
+
+    Args:
+        searched: by the name of each camera, how many frames were searched for the board, of how many.
+    """
+    fewer = [f"{name} {some} of {every}" for name, (some, every) in searched.items() if some < every]
+    return [f"frames that were searched for the board, evenly spread: {', '.join(fewer)}"] if fewer else []
+
+
 def say_print(found: FoundBoards) -> list[str]:
     """Sentences on how the board was printed and seen."""
     recognised, sentences = found.recognised, []
@@ -192,7 +204,8 @@ def _misplaced(
 def advise(calibrated: CalibratedRig) -> list[str]:
     """Sentences that say what to film again, and why; none where the calibration is sound."""
     rows = figures_of(calibrated)
-    sentences = [
+    sentences = [say_not_compared(calibrated.not_compared)] if calibrated.not_compared else []
+    sentences += [
         f"{name} shares {row.shared} views with {row.best_partner} and fewer with the others: "
         f"film more where {name} and {row.best_partner} both see the board"
         for name, row in rows.items()

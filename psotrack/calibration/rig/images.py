@@ -120,8 +120,14 @@ def open_images(paths: Sequence[Path | str], names: Sequence[str] | None = None)
     return cameras
 
 
-def open_recorded(recording: Recording) -> tuple[tuple[CameraImages, ...], tuple[np.ndarray, np.ndarray]]:
+def open_recorded(
+    recording: Recording, floor: int | None = None
+) -> tuple[tuple[CameraImages, ...], tuple[np.ndarray, np.ndarray]]:
     """Images of a recording's cameras, and which of their frames belong to one instant of its clock.
+
+    Args:
+        recording: the recording.
+        floor: number of an instant that is not left out of a long recording; None for no such instant.
 
     Returns:
         the images; and the number of each instant, (instants,), with each camera's frame, (instants, cameras), -1 where
@@ -139,25 +145,33 @@ def open_recorded(recording: Recording) -> tuple[tuple[CameraImages, ...], tuple
     )
     # Not the timeline of the recording, which has only the cameras that are placed.
     timeline = make_timeline({name: recording.frame_times[name] for name in names}, recording.rate_hz)
-    step = max(1, -(-timeline.num_instants // MOST_INSTANTS))
-    number = np.arange(0, timeline.num_instants, step)
+    number = _spread(np.arange(timeline.num_instants), floor)
     return cameras, (number, timeline.frame[number].astype(np.int64))
 
 
 def instants_of_numbers(
-    cameras: Sequence[CameraImages], most: int = MOST_INSTANTS
+    cameras: Sequence[CameraImages], floor: int | None = None
 ) -> tuple[Int[np.ndarray, " instants"], Int[np.ndarray, "instants cameras"]]:
-    """Instants of frames of equal number, evenly spread if there are more than `most`.
+    """Instants of frames of equal number, evenly spread if there are more than `MOST_INSTANTS`.
+
+    Args:
+        cameras: the images.
+        floor: number of a frame that is not left out; None for no such frame.
 
     Returns:
         numbers of the instants; and (instants, cameras), number of each camera's frame, -1 where it has none.
     """
-    numbers = np.unique(np.concatenate([camera.frames for camera in cameras]))
-    # Multiples of a step are read without decoding all frames between them.
-    step = max(1, -(-len(numbers) // most))
-    numbers = numbers[::step]
+    numbers = _spread(np.unique(np.concatenate([camera.frames for camera in cameras])), floor)
     frames = np.stack([np.where(np.isin(numbers, camera.frames), numbers, -1) for camera in cameras], axis=1)
     return numbers, frames
+
+
+def _spread(numbers: Int[np.ndarray, " instants"], floor: int | None) -> Int[np.ndarray, " chosen"]:
+    """At most `MOST_INSTANTS` of increasing numbers, evenly spread, and the number `floor` if it is among them."""
+    # Multiples of a step are read without decoding all frames between them.
+    step = max(1, -(-len(numbers) // MOST_INSTANTS))
+    chosen = numbers[::step]
+    return chosen if floor is None else np.union1d(chosen, numbers[numbers == floor])
 
 
 def _names(paths: list[Path]) -> list[str]:

@@ -94,19 +94,17 @@ def choose_lens_model(
     return ModelComparison(chosen, {f"{model}": error for model, error in error_px.items()})
 
 
-def say_not_compared(views: Mapping[str, int]) -> list[str]:
+def say_not_compared(views: Mapping[str, int]) -> str:
     """A sentence on lenses whose model was not chosen by views left out, because there are too few views.
 
     Args:
-        views: number of views of each camera whose model was to be chosen, by its name.
+        views: number of views of each of these cameras, by its name.
     """
-    few = [f"{name} ({count})" for name, count in views.items() if count < LEAST_VIEWS]
-    if not few:
-        return []
-    return [
-        f"lens models are compared by at least {LEAST_VIEWS} views; fewer were found of {', '.join(few)}: the usual "
+    few = ", ".join(f"{name} ({count})" for name, count in views.items())
+    return (
+        f"lens models are compared by at least {LEAST_VIEWS} views; fewer were found of {few}: the usual "
         f"model with {_MODELS[0]} distortion coefficients is taken there; film more views, or choose a model by --lens"
-    ]
+    )
 
 
 def _left_out(

@@ -53,7 +53,13 @@ def intrinsics(
       psotrack calibrate intrinsics board.avi --squares 7x5 --square 0.04 --marker 0.03 --out lens.toml
       psotrack calibrate intrinsics photos --squares 10x7 --square 0.025 --lens fisheye --out lens.toml
     """
-    from psotrack.calibration import lens_of_board, open_images, parse_lens_model, say_not_compared
+    from psotrack.calibration import (
+        lens_of_board,
+        open_images,
+        parse_lens_model,
+        say_not_compared,
+        say_searched,
+    )
     from psotrack.geometry import make_rig
     from psotrack.rig_files import write_lenses, write_rig
 
@@ -91,8 +97,9 @@ def intrinsics(
         errors = ", ".join(f"{model} {error:.3f}" for model, error in found.compared_px.items())
         print_line(quiet, json_path, f"lens {found.model}; median errors on views left out (px): {errors}")
     elif parse_lens_model(lens) is None:
-        for sentence in say_not_compared({images.name: len(found.frame)}):
-            print_line(quiet, json_path, sentence)
+        print_line(quiet, json_path, say_not_compared({images.name: len(found.frame)}))
+    for sentence in say_searched({images.name: (found.searched, len(images.frames))}):
+        print_line(quiet, json_path, sentence)
     rms = float(np.sqrt(np.mean(found.residual_px**2)))
     worst = found.frame[found.residual_px.argmax()]
     print_line(

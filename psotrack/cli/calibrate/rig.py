@@ -167,7 +167,7 @@ def rig(
         raise SettingsError("rig", expected="--floor or --world", found="both")
     given = None if world is None else read_world(world)
     lenses = _lenses(lens, same_lens, lenses_path)
-    calibrated, said, few = _by_board(sources, names, board, lenses, floor, quiet, json_path)
+    calibrated, said = _by_board(sources, names, board, lenses, floor, quiet, json_path)
     if given is None:
         place = (
             f"the board in frame {floor}: its first corner is the origin, z points up"
@@ -182,7 +182,7 @@ def rig(
         from psotrack.calibration import save_coverage
 
         save_coverage(plot if plot != Path("") else out.with_suffix(".png"), calibrated, force=force)
-    _report(calibrated, said, few, place, out, force, quiet, json_path)
+    _report(calibrated, said, place, out, force, quiet, json_path)
 
 
 def _write(out: Path, rig: Any, force: bool) -> None:
@@ -199,51 +199,37 @@ def _by_board(
     floor: int | None,
     quiet: bool,
     json_path: Path | None,
-) -> tuple[CalibratedRig, list[str], list[str]]:
-    """Calibrate by a board.
-
-    Returns:
-        the rig; sentences on how the board was printed, which are printed at once; and sentences on lenses whose model
-        was not chosen by the views.
-    """
+) -> tuple[CalibratedRig, list[str]]:
+    """Calibrate by a board; also sentences on how the board was printed, which are printed at once."""
     from psotrack.calibration import (
         calibrate_rig,
         find_views,
         instants_of_numbers,
         open_images,
         open_recorded,
-        say_not_compared,
         say_print,
+        say_searched,
     )
     from psotrack.datasets import open_recording
 
     if len(sources) == 1 and is_recording(sources[0]):
-        cameras, instants = open_recorded(open_recording(sources[0]))
+        cameras, instants = open_recorded(open_recording(sources[0]), floor)
     else:
         cameras = open_images(sources, names.split(",") if names else None)
-        instants = instants_of_numbers(cameras)
+        instants = instants_of_numbers(cameras, floor)
     report = report_to(quiet)
     found = find_views(board, cameras, instants, report)
+    every = {camera.name: len(camera.frames) for camera in cameras}
+    searched = dict(zip(found.views.names, found.searched.tolist(), strict=True))
     said = say_print(found)
-    for sentence in said:
+    for sentence in [*say_searched({name: (count, every[name]) for name, count in searched.items()}), *said]:
         print_line(quiet, json_path, sentence)
-    few = []
-    if lenses.model is None:
-        counts = dict(zip(found.views.names, found.views.seen.sum(axis=1).tolist(), strict=True))
-        chosen = {name: count for name, count in counts.items() if name not in (lenses.known or {})}
-        if lenses.is_shared and chosen:
-            # The model of a shared lens is that of the camera with most views.
-            best = max(chosen, key=lambda name: chosen[name])
-            chosen = {best: chosen[best]}
-        few = say_not_compared(chosen)
-    calibrated = calibrate_rig(found.recognised.board, found.views, lenses, floor=floor, report=report)
-    return calibrated, said, few
+    return calibrate_rig(found.recognised.board, found.views, lenses, floor=floor, report=report), said
 
 
 def _report(
     calibrated: CalibratedRig,
     said: list[str],
-    few: list[str],
     place: str,
     out: Path,
     force: bool,
@@ -253,7 +239,7 @@ def _report(
     """Print the cameras, the worst views and what to do, or write them as JSON."""
     from psotrack.calibration import advise, figures_of, worst_views
 
-    rows, advice, worst = figures_of(calibrated), few + advise(calibrated), worst_views(calibrated)
+    rows, advice, worst = figures_of(calibrated), advise(calibrated), worst_views(calibrated)
     content = {
         "rig": str(out),
         "cameras": {name: asdict(row) for name, row in rows.items()},

@@ -109,13 +109,23 @@ def calibrate_points(
             found.views.number[seen],
         )
     shifts = [str(shift) for shift in find_point_shifts(found.adjusted.rig, views)]
-    return rig, rows, [f"the world is {place}", *shifts, *_unused(found), *_undetermined(rig, covariance)]
+    said = [*_left_out(found, views), f"the world is {place}", *shifts]
+    return rig, rows, [*said, *_unused(found), *_undetermined(rig, covariance)]
 
 
 def _numbered(found: PointRig) -> dict[int, np.ndarray]:
     """Positions of the moving point, of the first end of a stick, by the number of the instant."""
     first = found.views.point == 0
     return dict(zip(found.views.number[first].tolist(), found.adjusted.points_m[first], strict=True))
+
+
+def _left_out(found: PointRig, views: PointViews) -> list[str]:
+    """A sentence on sightings of a long recording that were left out."""
+    both = np.isfinite(views.points_px[..., 0]).sum(axis=1) >= 2
+    used, seen = len(np.unique(found.views.number)), len(np.unique(views.number[both]))
+    if used == seen:
+        return []
+    return [f"{used} of {seen} instants at which two cameras see the point are used, evenly spread"]
 
 
 def _unused(found: PointRig) -> list[str]:
