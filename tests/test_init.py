@@ -287,6 +287,13 @@ class TestRefusals:
             path, "--fps", 9
         )
 
+    @pytest.mark.parametrize("start", ["0\n1\n", "0,,\n1,,,,,,,\n"])
+    def test_detections_of_a_camera_that_sees_nothing_at_first(self, folder, start):
+        path = folder("cam1.avi", cameras=("cam1",))
+        (path / "cam1.csv").write_text(f"{start}2,0,0,9,9,4,5,0.5\n")
+        init(path)
+        assert read_recording_file(path / "recording.toml").cameras["cam1"].detections == "cam1.csv"
+
     def test_an_existing_file_is_kept(self, folder):
         path = folder("cam1.avi", cameras=("cam1",))
         (path / "recording.toml").write_text("mine")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -112,23 +112,33 @@ def _kind_of_text(path: Path) -> Kind:
     if {"pos_x", "pos_y", "pos_z"} <= names or {"frame", "drone", "x_m", "y_m", "z_m"} <= names:
         # The pose of a camera on a drone is not the drone's. Tracks with a status are the output of `psotrack track`.
         return "other" if "_cam_" in path.name or names & {"status", "cov_xx"} else "reference"
-    values = [cell.strip() for cell in line.split(",")]
-    while values and not values[-1]:
-        values.pop()
+    values = _cells(line)
+    if len(values) == 1 and values[0].isdecimal():
+        # The first frames may have no detection: numbers of frames alone.
+        values = _cells(_first_line(path, lambda line: len(_cells(line)) > 1))
     if len(values) > 1 and (len(values) - 1) % _DETECTION_VALUES == 0 and all(map(_is_number, values)):
         return "detections"
     if len(line.split()) == 8 and all(map(_is_number, line.split())):
         return "reference"
-    # The first lines of a file of detections may have none.
+    # No frame of a file of detections may have one.
     return "detections" if path.suffix.lower() == ".csv" and path.parent.name.lower() in _FOLDERS else "other"
 
 
-def _first_line(path: Path) -> str:
+def _first_line(path: Path, fits: Callable[[str], object] = str.strip) -> str:
+    """The first line that is no comment and fits; empty if there is none."""
     try:
         with path.open(encoding="utf-8-sig", errors="replace") as file:
-            return next((line.strip() for line in file if line.strip() and not line.startswith("#")), "")
+            return next((line.strip() for line in file if not line.startswith("#") and fits(line)), "")
     except OSError as error:
         raise InputError(path, expected="a readable file", found=f"{error.strerror}".lower()) from error
+
+
+def _cells(line: str) -> list[str]:
+    """Cells of a line, without empty ones at the end."""
+    cells = [cell.strip() for cell in line.split(",")]
+    while cells and not cells[-1]:
+        cells.pop()
+    return cells
 
 
 def _is_number(text: str) -> bool:
