@@ -6,7 +6,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from psotrack.cli import cli
 from psotrack.datasets import dpjait
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import project
@@ -436,7 +438,40 @@ def test_two_recordings(real_folder):
 
 def test_a_reference_that_is_not_c3d(real_folder):
     (real_folder / "R99.c3d").write_text("hello " * 400)
-    assert_reading_fails(real_folder, r"R99\.c3d: expected a C3D file, found one that ezc3d cannot read")
+    assert_reading_fails(real_folder, r"R99\.c3d: expected a C3D file, found no valid c3d file")
+
+
+def write_person(path: Path) -> None:
+    """A person and a rigid box, as in a C3D of a gait laboratory."""
+    rng = np.random.default_rng(0)
+    t = np.arange(100)[:, None, None] / 100
+    person_m = rng.uniform(-0.5, 0.5, (10, 3)) + 0.2 * np.sin(6 * t + rng.uniform(0, 6, (10, 1))) + t
+    box_m = np.array([[0.2, 0, 0], [-0.1, 0, 0], [0, 0.15, 0], [0, -0.12, 0.1]]) + t
+    labels = (*(f"Daphnee:M{i}" for i in range(10)), *(f"boite:b{i}" for i in range(4)))
+    write_c3d(path, Markers(labels, np.concatenate([person_m, box_m], axis=1), 100.0))
+
+
+def test_a_person_in_the_folder_is_no_reference(real_folder, tmp_path, caplog):
+    """Found: `evaluate` scored tracks against a walking person without a word."""
+    write_person(real_folder / "R99.c3d")
+    (tmp_path / "tracks.csv").write_text("frame,drone,x_m,y_m,z_m\n0,dron1,0,0,1\n1,dron1,0,0,1\n")
+    result = CliRunner().invoke(cli, ["evaluate", str(tmp_path / "tracks.csv"), str(real_folder)])
+    assert isinstance(result.exception, InputError)
+    assert "expected a reference to compare with, found none" in str(result.exception)
+    assert "boite, rigid (boite:b0, " in caplog.text
+    assert "daphnee, not rigid" in caplog.text
+    arguments = ["evaluate", str(tmp_path / "tracks.csv"), str(real_folder), "--body", "cf1=b0,b1,b2,b3"]
+    result = CliRunner().invoke(cli, [*arguments, "--json", "-"])
+    assert result.exit_code == 0, result.output
+    assert dpjait.read_sequence(real_folder, bodies={"boite": ["boite:"]}).truth.drones == ("boite",)
+
+
+def test_bodies_need_a_c3d(real_folder):
+    (real_folder / "R99.c3d").unlink()
+    with pytest.raises(
+        InputError, match=r"bodies cf1: expected a \.c3d file that holds their markers, found none"
+    ):
+        dpjait.read_sequence(real_folder, bodies={"cf1": ["a"]})
 
 
 @pytest.mark.parametrize(

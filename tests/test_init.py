@@ -19,10 +19,12 @@ from psotrack.errors import InputError, PsotrackError, SettingsError
 from psotrack.geometry import camera_key, cameras_of, chosen_camera, chosen_cameras
 from psotrack.recordings import (
     CameraTable,
+    Markers,
     RecordingFile,
     VideoWriter,
     WorldTable,
     read_recording_file,
+    write_c3d,
     write_recording_file,
 )
 
@@ -397,6 +399,33 @@ def test_a_part_of_a_name_chooses_a_camera_only_where_it_is_one():
     assert chosen_camera("1", ["cam1", "cam10", "cam2"]) == "cam1"
     assert chosen_camera("left", ["left_a", "left_b"]) is None
     assert chosen_camera("", ["cam1"]) is None
+
+
+def write_flight(path) -> None:
+    """Two rigid bodies and a person in a C3D file."""
+    rng = np.random.default_rng(0)
+    t = np.arange(50)[:, None, None] / 100
+    cross_m = np.array([[0.2, 0, 0], [-0.1, 0, 0], [0, 0.15, 0], [0, -0.12, 0.1]])
+    person_m = rng.uniform(-0.5, 0.5, (5, 3)) + 0.2 * np.sin(20 * t + rng.uniform(0, 6, (5, 1)))
+    labels = [f"{body}:{i}" for body, count in (("cf1", 4), ("cf2", 4), ("Ann", 5)) for i in range(count)]
+    write_c3d(path, Markers(tuple(labels), np.hstack([cross_m + t, cross_m - t, person_m]), 100.0))
+
+
+def test_the_markers_of_drones_are_written(folder):
+    path = folder("a.avi", cameras=("a",))
+    write_flight(path / "flight.c3d")
+    assert "ann, not rigid" in refusal(path)
+    assert "expected NAME=LABEL" in refusal(path, "--body", "=x")
+    assert "expected labels of cf1:0, " in refusal(path, "--body", "cf1=cf9:")
+    init(path, "--body", "cf2", "--body", "one=cf1:0,cf1:1,cf1:2")
+    assert open_recording(path).truth.drones == ("cf2", "one")
+    assert open_recording(path, bodies={"two": ["cf2:"]}).truth.drones == ("two",)
+    written = read_recording_file(path / "recording.toml").reference
+    assert written.bodies == {"cf2": ("cf2:",), "one": ("cf1:0", "cf1:1", "cf1:2")}
+
+
+def test_markers_of_drones_without_a_c3d_file(folder):
+    assert "--body: expected a C3D file" in refusal(folder("a.avi", cameras=("a",)), "--body", "cf1")
 
 
 # --- the file

@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.recordings import Markers, body_trajectories, read_c3d, write_c3d
+from psotrack.recordings import Markers, NoDronesError, body_trajectories, read_c3d, write_c3d
 from psotrack.trajectories import Status
 
 #: Positions of the markers of an asymmetric cross in the body's frame, metres.
@@ -225,6 +225,74 @@ def test_bodies_that_are_no_drones_are_left_out():
     stray = Markers((*markers.labels, "*12"), np.pad(markers.position_m, ((0, 0), (0, 1), (0, 0))), 100.0)
     truth = body_trajectories(stray, fps=25.0, num_frames=9, where=WHERE)
     assert truth.drones == ("dron1",)
+
+
+def walking(num_markers=12, num_frames=400) -> np.ndarray:
+    """(frames, markers, 3): markers of a person, which swing by 5 to 25 cm relative to each other."""
+    rng = np.random.default_rng(3)
+    t = np.arange(num_frames)[:, None, None] / 100
+    place_m = rng.uniform([-0.4, -0.4, 0.5], [0.4, 0.4, 1.3], (num_markers, 3))
+    swing_m = rng.uniform(0.05, 0.25, (num_markers, 3)) * np.sin(6 * t + rng.uniform(0, 6, (num_markers, 1)))
+    return place_m + swing_m + t * [1.2, 0, 0]
+
+
+def test_a_walking_person_is_no_drone():
+    """Found: a person's C3D in a sequence's folder became drones without a word."""
+    labels = tuple(f"M{number}" for number in range(12))
+    with pytest.raises(
+        NoDronesError, match=r"dron1, not rigid, distances vary by \d+ mm \(M0, M1, .* and 6 more\)"
+    ):
+        body_trajectories(Markers(labels, walking(), 100.0), fps=25.0, num_frames=9, where=WHERE)
+
+
+def person_and_box() -> Markers:
+    box_m = make_markers(400, drones=("Dron1",))[0].position_m
+    labels = (*(f"boite:b{number}" for number in range(5)), *(f"Anna:M{number}" for number in range(12)))
+    return Markers(labels, np.concatenate([box_m, walking()], axis=1), 100.0)
+
+
+def test_a_box_beside_a_person_is_not_taken_for_a_drone():
+    with pytest.raises(
+        NoDronesError, match=r"boite, rigid .*anna, not rigid.*--body NAME=LABEL,LABEL"
+    ) as caught:
+        body_trajectories(person_and_box(), fps=25.0, num_frames=9, where=WHERE)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("named", [["boite:"], ["boite:b0", "b1", "b2", "b3", "b4"]])
+def test_the_user_says_which_markers_are_a_drone(named, caplog):
+    truth = body_trajectories(person_and_box(), fps=25.0, num_frames=9, where=WHERE, named={"cf1": named})
+    assert truth.drones == ("cf1",)
+    _, centroid_m = make_markers(400, drones=("Dron1",))
+    np.testing.assert_allclose(truth.position_m[:, 0], centroid_m[0:36:4, 0], rtol=0, atol=1e-9)
+    assert not caplog.records
+
+
+def test_named_markers_must_exist_and_are_said_not_to_be_rigid(caplog):
+    with pytest.raises(SettingsError, match=r"body cf1, .*: expected labels of boite:b0, .*, found 'b9'"):
+        body_trajectories(person_and_box(), fps=25.0, num_frames=9, where=WHERE, named={"cf1": ["b9"]})
+    body_trajectories(person_and_box(), fps=25.0, num_frames=9, where=WHERE, named={"Anna": ["Anna:"]})
+    assert "body Anna is not rigid" in caplog.text
+
+
+def test_rigid_bodies_with_names_of_their_own_are_taken_with_a_line(caplog):
+    markers, _ = make_markers(400, drones=("cf1", "cf2"))
+    # Noise of a motion-capture system and swapped labels leave a body rigid.
+    markers.position_m[:] += np.random.default_rng(0).normal(0, 5e-4, markers.position_m.shape)
+    markers.position_m[:80, [0, 1]] = markers.position_m[:80, [1, 0]]
+    truth = body_trajectories(markers, fps=25.0, num_frames=9, where=WHERE)
+    assert truth.drones == ("cf1", "cf2")
+    assert "taken for drones, because their markers are rigid: cf1 (cf1:cf11, " in caplog.text
+
+
+def test_a_person_who_stands_still_is_no_drone():
+    """Rigid, but larger than a drone, or with more markers."""
+    still = np.repeat(np.random.default_rng(0).uniform(0, [0.5, 0.4, 1.8], (12, 3))[None], 50, axis=0)
+    labels = tuple(f"M{number}" for number in range(40))
+    for position_m in (still, np.repeat(still, 4, axis=1)[:, :40]):
+        markers = Markers(labels[: position_m.shape[1]], position_m, 100.0)
+        with pytest.raises(NoDronesError, match=r"dron1, (\d\.\d m large|40 markers)"):
+            body_trajectories(markers, fps=25.0, num_frames=9, where=WHERE)
 
 
 @pytest.mark.parametrize("rate_hz", [100.0, 25.0, 119.88, 120.0, 240.0, 59.94])

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 import numpy as np
 
-from psotrack.cli.options import FORCE, JSON, QUIET, SEQUENCE, TRACKS, plot_option
+from psotrack.cli.options import BODIES, FORCE, JSON, QUIET, SEQUENCE, TRACKS, plot_option
 from psotrack.cli.output import output_json
 from psotrack.errors import InputError, SettingsError
 
@@ -31,6 +31,7 @@ RATE_TOLERANCE = 1e-3
     metavar="SECONDS|auto",
     help="Time by which the reference's clock is ahead of the videos'; auto estimates it, up to 2 s.  [default: 0]",
 )
+@BODIES
 @FORCE
 @QUIET
 @JSON
@@ -39,6 +40,7 @@ def evaluate(
     sequence: Path,
     plot: Path | None,
     offset: str | None,
+    bodies: dict[str, tuple[str, ...]],
     force: bool,
     quiet: bool,
     json_path: Path | None,
@@ -50,6 +52,7 @@ def evaluate(
       psotrack evaluate tracks.csv data/Simulated_Data/S02_D4_A
       psotrack evaluate tracks.csv data/Simulated_Data/S02_D4_A --json errors.json --plot errors.png
       psotrack evaluate tracks.csv data/Real_Data/R12_D4 --offset auto
+      psotrack evaluate tracks.csv flight --body cf1=M1,M2,M3,M4 --body cf2
     """
     from rich.console import Console
 
@@ -58,7 +61,7 @@ def evaluate(
     from psotrack.evaluation import plots, tables
     from psotrack.trajectories import read_trajectories
 
-    recording = open_recording(sequence)
+    recording = open_recording(sequence, bodies=bodies)
     if recording.truth is None:
         raise InputError(sequence, expected="a reference to compare with", found="none")
     estimate = read_trajectories(tracks, fps=recording.fps)

@@ -6,15 +6,16 @@ from pathlib import Path
 
 import click
 
-from psotrack.cli.options import FORCE, JSON, SEQUENCE
+from psotrack.cli.options import BODIES, FORCE, JSON, SEQUENCE
 from psotrack.cli.output import output_json, print_inventory
 
 
 @click.command()
 @SEQUENCE
+@BODIES
 @FORCE
 @JSON
-def info(sequence: Path, force: bool, json_path: Path | None) -> None:
+def info(sequence: Path, bodies: dict[str, tuple[str, ...]], force: bool, json_path: Path | None) -> None:
     """Show what SEQ contains, and check all of its files, of the videos only the last frame.
 
     SEQ is a recording.toml, a folder that holds one, or a folder of the DPJAIT dataset.
@@ -23,11 +24,12 @@ def info(sequence: Path, force: bool, json_path: Path | None) -> None:
     Examples:
       psotrack info data/Simulated_Data/S02_D4_A
       psotrack info flight/recording.toml
+      psotrack info flight --body cf1=M1,M2,M3,M4
     """
     from psotrack.datasets import open_recording
     from psotrack.recordings import check_end, describe_recording, inventory_table
 
-    recording = open_recording(sequence)
+    recording = open_recording(sequence, bodies=bodies)
     for video in recording.videos.values():
         check_end(video)
     recording.check_detections(recording.detections or {})

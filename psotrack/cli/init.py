@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from psotrack.cli.options import FORCE, JSON, QUIET, Size
+from psotrack.cli.options import BODIES, FORCE, JSON, QUIET, Size
 from psotrack.cli.output import output_json, print_inventory, print_line
 from psotrack.errors import SettingsError
 
@@ -51,6 +51,7 @@ if TYPE_CHECKING:
 @click.option(
     "--out", type=click.Path(path_type=Path), metavar="FILE", help="[default: FOLDER/recording.toml]"
 )
+@BODIES
 @FORCE
 @QUIET
 @JSON
@@ -63,6 +64,7 @@ def init(
     fps: float | None,
     size_wh: tuple[int, int] | None,
     out: Path | None,
+    bodies: dict[str, tuple[str, ...]],
     force: bool,
     quiet: bool,
     json_path: Path | None,
@@ -81,6 +83,7 @@ def init(
       psotrack init flight
       psotrack init flight --calibration rig.toml
       psotrack init flight --calibration rig.toml --match left=GX010123.MP4 --leave-out test.mp4
+      psotrack init flight --calibration rig.toml --body cf1=M1,M2,M3,M4 --body cf2
     """
     from psotrack.datasets import DraftOptions, draft_recording
     from psotrack.errors import check_positive
@@ -99,7 +102,9 @@ def init(
     if fps is not None:
         check_positive("--fps", fps)
     refuse_to_overwrite(path, force)
-    options = DraftOptions(calibration, unit, [_pair(match) for match in matches], leave_out, fps, size_wh)
+    options = DraftOptions(
+        calibration, unit, [_pair(match) for match in matches], leave_out, fps, size_wh, bodies
+    )
     draft = draft_recording(folder, path, options)
     content = describe_recording(draft.recording)
     kept = _keep_older(path, recording_file_text(draft.content))

@@ -88,6 +88,32 @@ CAMERAS = click.option(
 )
 
 
+def _read_bodies(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
+    bodies = {}
+    for each in given:
+        name, equals, labels = (part.strip() for part in each.partition("="))
+        chosen = (
+            tuple(label.strip() for label in labels.split(",") if label.strip()) if equals else (f"{name}:",)
+        )
+        if not name or not chosen:
+            raise SettingsError("--body", expected="NAME=LABEL,LABEL,... or NAME", found=each)
+        if name in bodies:
+            raise SettingsError("--body", expected="each drone once", found=f"{name} twice")
+        bodies[name] = chosen
+    return bodies
+
+
+BODIES = click.option(
+    "--body",
+    "bodies",
+    multiple=True,
+    metavar="NAME=LABEL,...",
+    callback=_read_bodies,
+    help="Markers of drone NAME in the C3D file of the reference; `cf1:` stands for all markers of the body cf1, and "
+    "NAME alone for those of the body NAME; may be repeated.  [default: bodies called dron..., or rigid ones]",
+)
+
+
 def frames_option(command: Command) -> Command:
     """Add `--frames`, and name it as a way out where a video ends early."""
 

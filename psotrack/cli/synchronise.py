@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from psotrack.cli.options import FORCE, JSON, QUIET, SEQUENCE, TRACKS, plot_option
+from psotrack.cli.options import BODIES, FORCE, JSON, QUIET, SEQUENCE, TRACKS, plot_option
 from psotrack.cli.output import output_json, print_line
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     help="Largest offset that is tried, in seconds, in both directions.",
 )
 @plot_option("the mean distance over the offsets", "beside TRACKS, as .offset.png")
+@BODIES
 @FORCE
 @QUIET
 @JSON
@@ -35,6 +36,7 @@ def synchronise(
     sequence: Path,
     max_offset_s: float,
     plot: Path | None,
+    bodies: dict[str, tuple[str, ...]],
     force: bool,
     quiet: bool,
     json_path: Path | None,
@@ -53,7 +55,7 @@ def synchronise(
     from psotrack.datasets import open_recording
     from psotrack.trajectories import read_trajectories
 
-    recording = open_recording(sequence)
+    recording = open_recording(sequence, bodies=bodies)
     reference = own_reference(recording)
     estimate = read_trajectories(tracks, fps=recording.fps)
     offset = find_offset(

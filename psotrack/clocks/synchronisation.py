@@ -163,13 +163,15 @@ def own_reference(recording: Recording) -> Trajectories:
     """
     reference = recording.truth
     if recording.reference_files:
-        own = read_own_reference(recording.reference_files, recording.fps)
+        own = read_own_reference(recording.reference_files, recording.fps, recording.bodies)
         reference = replace(own, time_s=own.time_s + recording.reference_offset_s)
     for path in () if recording.reference_files else recording.folder.iterdir():
         if path.suffix.lower() == ".c3d":
             markers = read_c3d(path)
             num_frames = len(markers.position_m)
-            reference = body_trajectories(markers, fps=markers.rate_hz, num_frames=num_frames, where=path)
+            reference = body_trajectories(
+                markers, fps=markers.rate_hz, num_frames=num_frames, where=path, named=recording.bodies
+            )
     if reference is None:
         raise InputError(recording.folder, expected="a reference to synchronise with", found="none")
     if reference.orientation_wxyz is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,18 +24,29 @@ _RATE = re.compile(r"_(?:pos|cam)_(?P<rate>\d+(?:\.\d+)?)$")
 _SUFFIXES = (".csv", ".parquet", ".tum", ".txt", ".c3d")
 
 
-def read_reference(paths: Sequence[Path], fps: float) -> list[Trajectories]:
+#: Labels of the markers of each drone, as the user says.
+Bodies = Mapping[str, Sequence[str]]
+
+
+def read_reference(paths: Sequence[Path], fps: float, bodies: Bodies | None = None) -> list[Trajectories]:
     """The reference of each file, at its own rate and with its own clock.
 
     Args:
         paths: C3D files, TUM files, pose files of the dataset, or files of tracks.
         fps: rate of pose files whose name does not end in the rate, such as `dron1_pos_25.csv`, and of tracks without
             times; hertz.
+        bodies: labels of the markers of each drone in the C3D file; None or empty: by the labels.
 
     Raises:
         InputError: a file cannot be read, or a drone has two files.
     """
-    found = [_read(path, fps) for path in paths]
+    recorded = [path for path in paths if path.suffix.lower() == ".c3d"]
+    if bodies and len(recorded) != 1:
+        found_files = ", ".join(path.name for path in recorded) or "none"
+        raise InputError(
+            f"bodies {', '.join(bodies)}", expected="one C3D file that holds their markers", found=found_files
+        )
+    found = [_read(path, fps, bodies) for path in paths]
     places: dict[str, Path] = {}
     for path, reference in zip(paths, found, strict=True):
         for drone in reference.drones:
@@ -85,23 +96,25 @@ def reference_at(
     )
 
 
-def read_own_reference(paths: Sequence[Path], fps: float) -> Trajectories:
+def read_own_reference(paths: Sequence[Path], fps: float, bodies: Bodies | None = None) -> Trajectories:
     """One reference of all drones at the times of the file with most samples, with the references' own clock.
 
     Arguments and errors: see `read_reference`.
     """
-    references = read_reference(paths, fps)
+    references = read_reference(paths, fps, bodies)
     finest = max(references, key=lambda reference: reference.num_frames)
     if len(references) == 1:
         return finest
     return reference_at(references, finest.frame, finest.time_s, later_s=0.0)
 
 
-def _read(path: Path, fps: float) -> Trajectories:
+def _read(path: Path, fps: float, bodies: Bodies | None) -> Trajectories:
     suffix = path.suffix.lower()
     if suffix == ".c3d":
         markers = read_c3d(path)
-        return body_trajectories(markers, fps=markers.rate_hz, num_frames=len(markers.position_m), where=path)
+        return body_trajectories(
+            markers, fps=markers.rate_hz, num_frames=len(markers.position_m), where=path, named=bodies
+        )
     if suffix in (".tum", ".txt"):
         return read_tum_path(path)
     if suffix == ".parquet" or (suffix == ".csv" and "x_m" in _header(path)):

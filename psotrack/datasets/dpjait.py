@@ -43,6 +43,7 @@ from psotrack.geometry import Rig, files_by_camera
 from psotrack.recordings import (
     Detections,
     FrameTimes,
+    NoDronesError,
     OnboardVideo,
     Recording,
     VideoInfo,
@@ -102,12 +103,17 @@ _OFF_CENTRE = 0.1
 _POSE_FILE = re.compile(r"drone?_?(?P<number>\d+)_pos_(?P<rate>\d+(?:\.\d+)?)\.csv", re.IGNORECASE)
 
 
-def read_sequence(folder: Path | str) -> Recording:
+def read_sequence(folder: Path | str, *, bodies: Mapping[str, Sequence[str]] | None = None) -> Recording:
     """Read a sequence from a folder of the dataset, simulated or real.
 
     A camera without video gets the image size of most videos. Videos may differ in length; the reference is as long as
     the longest video. `Recording.usable` is stricter. Videos of cameras on drones that cannot be used are left out with
-    a warning, because their published layout is unknown and tracking does not need them.
+    a warning, because their published layout is unknown and tracking does not need them. So is a .c3d file without
+    drones.
+
+    Args:
+        folder: the folder.
+        bodies: labels of the markers of each drone in the .c3d file, as the user says; None: by the labels.
 
     Raises:
         InputError: the folder does not belong to the dataset, or one of its files cannot be used.
@@ -127,11 +133,12 @@ def read_sequence(folder: Path | str) -> Recording:
         folder=folder,
         rig=rig,
         videos=videos,
-        truth=_truth(files, videos),
+        truth=_truth(files, videos, bodies),
         detections=detections or None,
         onboard=_onboard(folder),
         frame_times=_frame_times(videos, detections),
         marker_corners=corners if corners.exists() else None,
+        bodies=bodies or {},
     )
 
 
@@ -236,20 +243,33 @@ def _check_principal_points(rig: Rig, videos: Mapping[str, VideoInfo]) -> None:
             )
 
 
-def _truth(files: Sequence[Path], videos: Mapping[str, VideoInfo]) -> Trajectories | None:
+def _truth(
+    files: Sequence[Path], videos: Mapping[str, VideoInfo], bodies: Mapping[str, Sequence[str]] | None
+) -> Trajectories | None:
     """The reference at the frames of the longest video, or None."""
     first = next(iter(videos.values()))
     num_frames = max(video.num_frames for video in videos.values())
     poses = _pose_files(files, first)
+    recordings = [path for path in files if path.suffix.lower() == ".c3d"]
+    if bodies and (poses or not recordings):
+        raise InputError(
+            f"bodies {', '.join(bodies)}",
+            expected="a .c3d file that holds their markers",
+            found="pose files" if poses else "none",
+        )
     if poses:
         return _simulated_truth(poses, first.fps, num_frames)
-    recordings = [path for path in files if path.suffix.lower() == ".c3d"]
     if len(recordings) > 1:
         names = ", ".join(path.name for path in recordings)
         raise InputError(recordings[0].parent, expected="one .c3d file", found=names)
     if recordings:
         markers = read_c3d(recordings[0])
-        return body_trajectories(markers, fps=first.fps, num_frames=num_frames, where=recordings[0])
+        try:
+            return body_trajectories(
+                markers, fps=first.fps, num_frames=num_frames, where=recordings[0], named=bodies
+            )
+        except NoDronesError as error:
+            _logger.warning("no reference: %s", error)
     return None
 
 

@@ -50,6 +50,7 @@ class DraftOptions:
         leave_out: names of files of the folder that are not used.
         fps: frames per second of cameras without a video and without frame times.
         size_wh: width and height of cameras without video whose size the calibration does not state, pixels.
+        bodies: labels of the markers of each drone in the C3D file; empty: by the labels.
     """
 
     calibration: Path | None = None
@@ -58,6 +59,7 @@ class DraftOptions:
     leave_out: Sequence[str] = ()
     fps: float | None = None
     size_wh: tuple[int, int] | None = None
+    bodies: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -129,6 +131,8 @@ def draft_recording(folder: Path | str, out: Path | str, options: DraftOptions |
     if not tables:
         raise _nothing(folder, matching, calibration)
     references = [_written(each.path, out.parent) for each in found if each.kind == "reference"]
+    if options.bodies and not references:
+        raise SettingsError("--body", expected=f"a C3D file in {folder}", found="none")
     corners = [each.path for each in found if each.kind == "corners"]
     if len(corners) > 1:
         raise _unclear(folder, corners[1], "one table of marker corners", f"{corners[0].name} as well")
@@ -137,7 +141,7 @@ def draft_recording(folder: Path | str, out: Path | str, options: DraftOptions |
         calibration=None if calibration is None else _written(calibration, out.parent),
         calibration_unit=options.unit,
         cameras=tables,
-        reference=ReferenceTable(files=tuple(references)) if references else None,
+        reference=ReferenceTable(files=tuple(references), bodies=options.bodies) if references else None,
         markers=MarkersTable(corners=_written(corners[0], out.parent)) if corners else None,
     )
     # Paths with `..` in them lead through the folder of the draft.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from psotrack.datasets.dpjait import CALIBRATION, MARKER_CORNERS, read_sequence
@@ -10,23 +11,25 @@ from psotrack.errors import InputError
 from psotrack.recordings import RECORDING_FILE, Recording, read_recording_file
 
 
-def open_recording(path: Path | str) -> Recording:
+def open_recording(path: Path | str, *, bodies: Mapping[str, Sequence[str]] | None = None) -> Recording:
     """Open the recording that a user names.
 
     Args:
         path: a `recording.toml` under any name that ends in .toml, a folder that holds a `recording.toml`, or a folder
             of the DPJAIT dataset.
+        bodies: labels of the markers of each drone in the C3D file of the reference; None: by the labels, or as the
+            `recording.toml` says.
 
     Raises:
         InputError: there is no recording at the path, or one of its files cannot be used.
     """
     path = Path(path)
     if path.is_file() and path.suffix.lower() == ".toml":
-        return read_recording_toml(path)
+        return read_recording_toml(path, bodies)
     if (path / RECORDING_FILE).is_file():
-        return read_recording_toml(path / RECORDING_FILE)
+        return read_recording_toml(path / RECORDING_FILE, bodies)
     if path.is_dir() and (path / CALIBRATION).exists():
-        return read_sequence(path)
+        return read_sequence(path, bodies=bodies)
     raise _no_recording(path)
 
 

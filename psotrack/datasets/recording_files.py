@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -41,13 +41,24 @@ _SLIP_SHARE = 0.05
 _LENS_AND_PLACE = ("K", "model", "distortion", "rvec", "tvec")
 
 
-def read_recording_toml(path: Path | str) -> Recording:
+def read_recording_toml(path: Path | str, bodies: Mapping[str, Sequence[str]] | None = None) -> Recording:
     """Read a recording from its `recording.toml`.
+
+    Args:
+        path: path of the file.
+        bodies: labels of the markers of each drone in the C3D file of the reference, instead of those of the file.
 
     Raises:
         InputError: the file is wrong, or one of the files that it names cannot be used; the message names it.
     """
-    return recording_of(Path(path), read_recording_file(path))
+    path, content = Path(path), read_recording_file(path)
+    if bodies:
+        if content.reference is None:
+            raise _error(path, "reference", "a C3D file, because markers of drones are named", "none")
+        named = {name: tuple(labels) for name, labels in bodies.items()}
+        reference = msgspec.structs.replace(content.reference, bodies=named)
+        content = msgspec.structs.replace(content, reference=reference)
+    return recording_of(path, content)
 
 
 def recording_of(path: Path, content: RecordingFile) -> Recording:
@@ -89,6 +100,7 @@ def recording_of(path: Path, content: RecordingFile) -> Recording:
         if content.markers is None
         else _existing(folder, content.markers.corners, path, "markers.corners"),
         reference_files=_reference_files(path, content),
+        bodies={} if content.reference is None else content.reference.bodies,
         reference_offset_s=0.0 if content.reference is None else content.reference.time_offset_s,
     )
     return _with_reference(recording)
@@ -342,7 +354,7 @@ def _with_reference(recording: Recording) -> Recording:
     """The recording with its reference at its instants."""
     if not recording.reference_files:
         return recording
-    references = read_reference(recording.reference_files, recording.fps)
+    references = read_reference(recording.reference_files, recording.fps, recording.bodies)
     time_s = recording.timeline().time_s
     later_s = -recording.reference_offset_s
     truth = reference_at(references, np.arange(len(time_s)), time_s, later_s=later_s)

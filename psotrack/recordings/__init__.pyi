@@ -3,6 +3,7 @@ from .detections import Detections, read_detections, write_detections
 from .image_files import IMAGE_SUFFIXES, find_images, image_files, natural_key, read_image, read_mask
 from .inventory import describe_recording, inventory_table
 from .marker_bodies import body_trajectories
+from .marker_groups import NoDronesError
 from .recording import OnboardVideo, Recording
 from .recording_file import (
     RECORDING_FILE,
@@ -38,6 +39,7 @@ __all__ = [
     "FrameTimes",
     "Markers",
     "MarkersTable",
+    "NoDronesError",
     "OnboardVideo",
     "Recording",
     "RecordingFile",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +17,20 @@ from psotrack.recordings.marker_cross_poses import (
     interpolate_poses,
 )
 from psotrack.recordings.marker_crosses import learn_cross
+from psotrack.recordings.marker_groups import drone_markers, is_unlabelled
 from psotrack.trajectories import Status, Trajectories
 
 _logger = logging.getLogger(__name__)
 
 
 def body_trajectories(
-    markers: Markers, *, fps: float, num_frames: int, where: Path | str, offset_s: float = 0.0
+    markers: Markers,
+    *,
+    fps: float,
+    num_frames: int,
+    where: Path | str,
+    offset_s: float = 0.0,
+    named: Mapping[str, Sequence[str]] | None = None,
 ) -> Trajectories:
     """Trajectories of the bodies at the frames of a video.
 
@@ -40,12 +47,15 @@ def body_trajectories(
         num_frames: number of frames of the video; the reference is NaN outside of the recording.
         where: path of the recording, for messages.
         offset_s: time in the recording at the video's frame 0, seconds; above 0 if the recording began first.
+        named: labels of the markers by drone, as the user says (see `drone_markers`); None: by the labels.
 
     Raises:
+        NoDronesError: no body of the recording is a drone for certain.
+        SettingsError: a named marker does not exist.
         InputError: no body has a pose in any frame.
     """
     frame = np.arange(num_frames)
-    bodies = _bodies(markers.labels)
+    bodies = drone_markers(markers, where, named)
     position_m = np.full((num_frames, len(bodies), 3), np.nan)
     orientation_wxyz = np.full((num_frames, len(bodies), 4), np.nan)
     status = np.full((num_frames, len(bodies)), int(Status.TRACKED))
@@ -84,7 +94,7 @@ def _body_poses(markers: Markers, name: str, columns: list[int], where: Path) ->
     except InputError as error:
         _logger.warning("%s: no reference for %s: %s", where, name, error)
         return None
-    unlabelled = [column for column, label in enumerate(markers.labels) if _is_unlabelled(label)]
+    unlabelled = [column for column, label in enumerate(markers.labels) if is_unlabelled(label)]
     complete_m = complete_markers(cross, position_m, markers.position_m[:, unlabelled])
     return estimate_poses(cross, complete_m, markers.rate_hz)
 
@@ -94,29 +104,3 @@ def _whole_multiple(rate_hz: float, fps: float) -> float:
     stride = round(rate_hz / fps)
     # Stored rates are rounded, so that they may differ from the true rate by 0.1 %.
     return stride * fps if stride and abs(rate_hz / fps - stride) <= 1e-3 * stride else rate_hz
-
-
-def _is_unlabelled(label: str) -> bool:
-    return label.rpartition(":")[2].startswith("*")
-
-
-def _bodies(labels: tuple[str, ...]) -> dict[str, list[int]]:
-    """Indices of the markers by body, sorted by the number of the body; names in lower case, as in the dataset.
-
-    The name of the body stands before the colon of a label. If no label has a colon, all markers belong to one drone.
-    Labels of unidentified markers start with a star; these markers belong to no body.
-    """
-    bodies: dict[str, list[int]] = {}
-    for index, label in enumerate(labels):
-        body, colon, _ = label.rpartition(":")
-        if colon and not _is_unlabelled(label):
-            bodies.setdefault(body.strip().lower(), []).append(index)
-    if not bodies:
-        bodies = {"dron1": [index for index, label in enumerate(labels) if not _is_unlabelled(label)]}
-    drones = {name: columns for name, columns in bodies.items() if name.startswith("dron")} or bodies
-    return dict(sorted(drones.items(), key=lambda item: _natural_key(item[0])))
-
-
-def _natural_key(name: str) -> list[tuple[int, str]]:
-    """Sorting key that puts `dron2` before `dron10`."""
-    return [(int(part or 0), word) for word, part in re.findall(r"(\D*)(\d*)", name)]

@@ -67,6 +67,8 @@ class Recording:
             (x0, x1, y0, y1, z0, z1); None where it is not known.
         marker_corners: table of the markers' corners, or None.
         reference_files: files of the reference; empty where it is not known from which files it comes.
+        bodies: labels of the markers of each drone in the C3D file of the reference, as the user says; empty where the
+            labels say it themselves.
         reference_offset_s: time on the recording's clock at which the reference's clock shows 0, seconds.
         rate_hz: instants per second; None is the rate of the fastest camera.
         num_instants: largest number of instants; None: until no camera has a frame.
@@ -87,6 +89,7 @@ class Recording:
     bounds_m: tuple[float, float, float, float, float, float] | None = None
     marker_corners: Path | None = None
     reference_files: tuple[Path, ...] = ()
+    bodies: Mapping[str, Sequence[str]] = field(default_factory=dict)
     reference_offset_s: float = 0.0
     rate_hz: float | None = None
     num_instants: int | None = None

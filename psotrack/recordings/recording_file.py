@@ -81,10 +81,12 @@ class ReferenceTable(_Table, frozen=True, kw_only=True):
     Attributes:
         files: pose CSV, TUM or C3D files.
         time_offset_s: time on the recording's clock at which the clock of the reference shows 0, seconds.
+        bodies: labels of the markers of each drone in the C3D file, where the labels do not say it themselves.
     """
 
     files: tuple[Text, ...]
     time_offset_s: float = 0.0
+    bodies: Mapping[Text, tuple[Text, ...]] = {}
 
 
 class MarkersTable(_Table, frozen=True, kw_only=True):
@@ -244,6 +246,10 @@ def recording_file_text(content: RecordingFile) -> str:
     for name, table in tables.items():
         assigned = [] if table is None else _assignments(table)
         lines += ["", f"[{name}]", *assigned] if assigned else []
+    bodies = {} if content.reference is None else content.reference.bodies
+    if bodies:
+        lines += ["", "[reference.bodies]"]
+        lines += [f"{toml_key(name)} = {toml_value(labels)}" for name, labels in bodies.items()]
     return "\n".join(lines) + "\n"
 
 
@@ -254,5 +260,6 @@ def _assignments(table: _Table) -> list[str]:
     return [
         f"{name} = {toml_value(value)}"
         for name, value in values.items()
-        if value is not None and value != defaults[name]
+        # A mapping is a table of its own.
+        if value is not None and value != defaults[name] and not isinstance(value, Mapping)
     ]
