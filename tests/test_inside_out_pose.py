@@ -165,7 +165,7 @@ def test_elimination_equals_scipys_least_squares_over_all_unknowns():
     position_m, R, nuisance = view.centre_world, view.T_cam_world[:3, :3].T, np.zeros(2)
     for _ in range(6):
         sums = summed(equations(corners, position_m, R, nuisance)[0], np.ones((count, 4), bool))
-        solution = sums.solved(noise, nuisance)
+        solution = sums.solved(noise, corners.prior_information, nuisance)
         position_m, nuisance = position_m + solution.step[:3], nuisance + solution.step[6:]
         R = R @ Rotation.from_rotvec(solution.step[3:6]).as_matrix()
 
@@ -204,7 +204,7 @@ def test_elimination_equals_scipys_least_squares_over_all_unknowns():
         by_px = project(changed_view, moved_m)[0] - project(there, placed_m)[0]
         moved = best_for(corners_px + by_px, result.x).x[:6] - result.x[:6]
         # The problem is nearly linear, and the covariance is good to a hundredth.
-        np.testing.assert_allclose(common[:, column] / deviation[:6], moved / deviation[:6], atol=0.02)
+        np.testing.assert_allclose(common[:6, column] / deviation[:6], moved / deviation[:6], atol=0.02)
 
 
 def test_the_pose_equals_scipys_for_an_exact_map():

@@ -19,6 +19,7 @@ from psotrack.cli.options import (
     plot_option,
 )
 from psotrack.cli.output import check_outputs, output_json, print_line, report_to
+from psotrack.cli.shutter import given_shutter, shutter_content, shutter_options, shutter_sentence
 from psotrack.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
@@ -104,6 +105,7 @@ class _Input:
     metavar="PERCENT",
     help="Standard deviation of the focal length, in percent.",
 )
+@shutter_options
 @click.option("--fps", type=float, help="Frames per second of a folder of images.")
 @click.option(
     "--live", is_flag=True, help="VIDEO is a camera's number or a stream; always use the newest frame."
@@ -129,6 +131,8 @@ def localise(
     smoothed: bool,
     map_error_mm: float,
     focal_error_percent: float,
+    line_time_s: float | None,
+    readout_s: float | None,
     fps: float | None,
     live: bool,
     plot: Path | None,
@@ -146,6 +150,10 @@ def localise(
     Errors of the map and of the focal length are the same in all frames and do not average out. With --map-error and
     --focal-error the covariances include these errors, and poses from several markers become more accurate.
 
+    Most cameras expose the rows of a frame one after the other (rolling shutter). The time from row to row is estimated
+    from the video, unless --line-time or --readout gives it; in a stream, without either, it is 0. A pose is that of
+    the moment when the middle row is exposed, which is also the frame's time.
+
     In images whose longer side is 2880 pixels or more, such as 3840 x 2160, markers are searched for in an image of
     half the size, and markers whose sides are shorter than 48 pixels are overlooked.
 
@@ -156,6 +164,7 @@ def localise(
       psotrack localise data/Simulated_Data/S01_D2_A --drone dron1 --out dron1.csv
       psotrack localise images --fps 25 --markers corners.csv --camera lens.yml --out track.csv --frames 100
       psotrack localise flight.mp4 --markers corners.csv --fov 92,61 --focal-error 0.5 --out track.csv --plot
+      psotrack localise phone.mp4 --markers corners.csv --camera lens.yml --readout 0.02 --out track.csv
       psotrack localise 0 --live --markers corners.csv --camera lens.yml --out track.csv
     """
     from dataclasses import replace
@@ -182,12 +191,15 @@ def localise(
     marker_map = read_marker_map(Path(str(markers or given.markers)))
     lens = _lens(given, camera_file, camera_name, scale_camera, fov_deg)
     source = given.source.first(num_frames)
+    rows = source.image_size_wh[1]
+    shutter = given_shutter(line_time_s, readout_s, rows, source.fps)
     settings = LocaliseSettings(
         dictionary=dictionary,
         pose=PoseSettings(
             min_markers=min_markers, map_error_m=map_error_mm / 1e3, focal_error=focal_error_percent / 100
         ),
         filter=PoseFilterParams() if filtered else None,
+        shutter=shutter,
     ).within(source.num_frames)
     try:
         found = localise_camera(
@@ -211,8 +223,10 @@ def localise(
     content = _content(found, given.source.name, drone_name, settings.pose.min_markers)
     content |= {"track": str(out), "filtered": filtered, "smoothed": smoothed}
     content |= {"map_error_m": settings.pose.map_error_m, "focal_error": settings.pose.focal_error}
+    content |= {"shutter": shutter_content(shutter, found.shutter, found.line_time, rows)}
     output_json(json_path, content, force)
-    print_line(quiet, json_path, _sentence(out, content))
+    of_shutter = shutter_sentence(shutter, found.line_time)
+    print_line(quiet, json_path, _sentence(out, content) + (f"; {of_shutter}" if of_shutter else ""))
 
 
 def _input(video: str, drone: str | None, fps: float | None, live: bool) -> _Input:

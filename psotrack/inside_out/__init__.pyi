@@ -7,13 +7,13 @@ from .fusing import FusedDrone, FusedTracks, fuse
 from .fusing.drone_fusion import DroneFusion, SourceErrors
 from .fusing.fused_table import write_fused
 from .lens_files import choose_lens, lens_from_matrix
-from .localising import LocalisedVideo, LocaliseSettings, localise_video
+from .localising import LineTime, LocalisedVideo, LocaliseSettings, localise_video
 from .mapping import BuiltMap, build_map, corners_in_own_frame
 from .mapping.check import MapCheck, check_map
 from .mapping.sightings import find_sightings
 from .mapping.square_fitting import FittedSquares, fit_squares, read_measured_corners
 from .marker_map import MarkerMap, read_marker_map
-from .pose import PoseSettings
+from .pose import PoseSettings, RollingShutter
 
 __all__ = [
     "BuiltMap",
@@ -24,12 +24,14 @@ __all__ = [
     "FrameSource",
     "FusedDrone",
     "FusedTracks",
+    "LineTime",
     "LocaliseSettings",
     "LocalisedVideo",
     "MapCheck",
     "MarkerMap",
     "PoseFilterParams",
     "PoseSettings",
+    "RollingShutter",
     "SourceErrors",
     "build_map",
     "check_map",

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from psotrack.errors import InputError
 from psotrack.geometry import rotation_matrices
+from psotrack.inside_out.frame_motion import FrameMotion
 from psotrack.support import Table, TextRow, read_table, refuse_to_overwrite, short_repr, write_rows
 from psotrack.trajectories import Status, Trajectories
 
@@ -74,8 +75,10 @@ class CameraPath:
         chance: (frames,), for frames' own poses: upper bound on the probability that the used markers agree by chance
             although all were misread. The filter uses it; the table does not have it.
         common: (frames, 6, errors), for frames' own poses: a matrix square root of the part of the covariance due to
-            errors of the map and of the lens, which are the same in all frames. The filter uses it; the table does not
-            have it.
+            errors of the map, of the lens and of the line time, which are the same in all frames. The filter uses it;
+            the table does not have it.
+        motion: for frames' own poses by a rolling shutter, what each frame says about pose and motion together; None
+            for a frame without a pose. The filter uses it; the table does not have it.
     """
 
     frame: Int[np.ndarray, "frames"]
@@ -91,6 +94,7 @@ class CameraPath:
     velocity_m_s: Float[np.ndarray, "frames 3"] | None = None
     chance: Float[np.ndarray, "frames"] | None = None
     common: Float[np.ndarray, "frames 6 errors"] | None = None
+    motion: tuple[FrameMotion | None, ...] | None = None
 
     __repr__ = short_repr
 

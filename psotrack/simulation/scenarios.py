@@ -280,7 +280,12 @@ class OnboardCamera(_Record, frozen=True, kw_only=True):
         fov_deg: horizontal and vertical field of view (the paper's GoPro has 92.45 x 60.83).
         position_m: camera centre in the body frame.
         pitch_deg: angle of the viewing direction above the drone's x axis; negative below.
-        shutter_s: exposure time.
+        shutter_s: exposure time of a row.
+        line_time_s: time from the exposure of one row to that of the next row at full size; 0 is a global
+            shutter. A frame has the time of its middle row.
+        distortion: coefficients of the lens in OpenCV's order: 0, 4, 5, 8, 12 or 14.
+        exposure: smallest and largest factor of the light of the images, between which an automatic exposure swings.
+        exposure_period_s: time of one swing of the automatic exposure.
     """
 
     image_size_wh: tuple[Count, Count] = (1920, 1080)
@@ -288,6 +293,10 @@ class OnboardCamera(_Record, frozen=True, kw_only=True):
     position_m: Vector = (0.12, 0.0, 0.03)
     pitch_deg: float = 0.0
     shutter_s: Positive = 1 / 500
+    line_time_s: NotNegative = 0.0
+    distortion: tuple[float, ...] = ()
+    exposure: tuple[Positive, Positive] = (1.0, 1.0)
+    exposure_period_s: Positive = 4.0
 
 
 class Imaging(_Record, frozen=True, kw_only=True):

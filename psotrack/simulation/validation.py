@@ -133,6 +133,27 @@ def _check_exposure(scenario: Scenario, field: str, shutter_s: float) -> None:
 
 
 def _check_onboard(scenario: Scenario, camera: OnboardCamera) -> None:
+    readout_s, frame_s = camera.line_time_s * camera.image_size_wh[1], 1 / scenario.fps
+    if readout_s > frame_s:
+        raise scenario_error(
+            scenario,
+            "onboard.line_time_s",
+            expected=f"at most {frame_s / camera.image_size_wh[1]:.3g} s: {camera.image_size_wh[1]} rows in"
+            f" {frame_s:g} s, the time between two frames",
+            found=f"{camera.line_time_s:g}",
+        )
+    if len(camera.distortion) not in PINHOLE_COEFFICIENTS:
+        expected = f"{', '.join(map(str, PINHOLE_COEFFICIENTS))} coefficients"
+        raise scenario_error(
+            scenario, "onboard.distortion", expected=expected, found=f"{len(camera.distortion)}"
+        )
+    if camera.exposure[0] > camera.exposure[1]:
+        raise scenario_error(
+            scenario,
+            "onboard.exposure",
+            expected="the smaller factor first",
+            found=f"{list(camera.exposure)}",
+        )
     if max(camera.fov_deg) >= 180:
         raise scenario_error(
             scenario, "onboard.fov_deg", expected="angles below 180 degrees", found=f"{list(camera.fov_deg)}"

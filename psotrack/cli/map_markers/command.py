@@ -21,6 +21,7 @@ from psotrack.cli.options import (
     frames_option,
 )
 from psotrack.cli.output import check_outputs, report_to
+from psotrack.cli.shutter import given_shutter, shutter_options
 from psotrack.errors import SettingsError, check_positive
 
 #: Exit code if a marker of a map was reported.
@@ -84,6 +85,7 @@ _MEASURED = {".c3d", ".csv", ".txt", ".tsv"}
     metavar="X,Y,Z",
     help="Position that all measured markers face, in metres.  [default: the mean of their corners]",
 )
+@shutter_options
 @frames_option
 @FORCE
 @QUIET
@@ -103,6 +105,8 @@ def map_markers(
     fov_deg: tuple[float, float] | None,
     dictionary: str,
     seen_from_m: tuple[float, float, float] | None,
+    line_time_s: float | None,
+    readout_s: float | None,
     num_frames: int | None,
     force: bool,
     quiet: bool,
@@ -116,6 +120,9 @@ def map_markers(
     marker's centre, x to its right, y up, z out of the print.
 
     --check MAP reports the markers of MAP that videos see elsewhere. The exit code is then 2 if a marker was reported.
+
+    Most cameras expose the rows of a frame one after the other (rolling shutter). The time from row to row is estimated
+    from each video, unless --line-time or --readout gives it for all.
 
     In images whose longer side is 2880 pixels or more, such as 3840 x 2160, markers are searched for in an image of
     half the size, and markers whose sides are shorter than 48 pixels are overlooked.
@@ -161,13 +168,19 @@ def map_markers(
     world = {} if out is None else known_corners(known, table, side_m, sources)
     videos = videos_of(sources, drones, Lenses(camera_file, camera_names, scale_camera, fov_deg))
     videos = {name: (leading(video, num_frames), lens) for name, (video, lens) in videos.items()}
-    sightings = find_sightings(list(videos.values()), dictionary, report=report_to(quiet))
+    shutter = None
+    for video, _ in videos.values():
+        shutter = given_shutter(line_time_s, readout_s, video.image_size_wh[1], video.fps)
+    sightings = find_sightings(
+        list(videos.values()), dictionary, consecutive=checked is None, report=report_to(quiet)
+    )
     if marker_map is not None:
         checkup = check_map(sightings, marker_map)
         show_check(checkup, Path(str(checked)), quiet, json_path, force)
         if checkup.findings:
             sys.exit(FOUND)
     elif out is not None:
-        built = build_map(sightings, world, side_m=side_m, estimate_sides=estimate_sides)
+        built = build_map(sightings, world, side_m=side_m, estimate_sides=estimate_sides, shutter=shutter)
         write_marker_corners(out, built.marker_map.corners_m)
-        show_built(built, list(videos), out, quiet, json_path, force)
+        rows = {name: video.image_size_wh[1] for name, (video, _) in videos.items()}
+        show_built(built, rows, shutter, out, quiet, json_path, force)

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from psotrack.cli.output import POSITION, finite_or_none, format_numbers, output_json, print_line, print_table
+from psotrack.cli.shutter import shutter_content, shutter_sentence
 
 if TYPE_CHECKING:
-    from psotrack.inside_out import BuiltMap, FittedSquares, MapCheck, MarkerMap
+    from psotrack.inside_out import BuiltMap, FittedSquares, MapCheck, MarkerMap, RollingShutter
 
 
 def show_measured(
@@ -49,9 +50,23 @@ def show_measured(
 
 
 def show_built(
-    built: BuiltMap, videos: list[str], out: Path, quiet: bool, json_path: Path | None, force: bool
+    built: BuiltMap,
+    rows_px: dict[str, int],
+    given: RollingShutter | None,
+    out: Path,
+    quiet: bool,
+    json_path: Path | None,
+    force: bool,
 ) -> None:
-    """Show a map from videos, with the standard deviation of each marker's position."""
+    """Show a map from videos, with the standard deviation of each marker's position.
+
+    Args:
+        built: the map.
+        rows_px: height of the images by video.
+        given: the shutter that the options give.
+        out: table of the map.
+        quiet, json_path, force: as in `cli.output`.
+    """
     rows = {}
     for index, marker in enumerate(built.ids.tolist()):
         rows[marker] = {
@@ -68,7 +83,13 @@ def show_built(
         "map": str(out),
         "frames": built.num_views,
         "noise_px": built.noise_px,
-        "inset_px": dict(zip(videos, built.inset_px.tolist(), strict=True)),
+        "inset_px": dict(zip(rows_px, built.inset_px.tolist(), strict=True)),
+        "shutter": {
+            name: shutter_content(given, used, shown, rows)
+            for (name, rows), used, shown in zip(
+                rows_px.items(), built.shutters, built.line_times, strict=True
+            )
+        },
         "unplaced": list(built.unplaced),
         "markers": rows,
     }
@@ -93,6 +114,9 @@ def show_built(
     if built.unplaced:
         names = ", ".join(map(str, built.unplaced))
         print_line(quiet, json_path, f"not placed, because too rarely seen beside other markers: {names}")
+    for name, shown in zip(rows_px, built.line_times, strict=True):
+        if of_shutter := shutter_sentence(given, shown):
+            print_line(quiet, json_path, f"{name}: {of_shutter}")
     print_line(quiet, json_path, f"{out}: {len(rows)} markers from {built.num_views} frames")
 
 

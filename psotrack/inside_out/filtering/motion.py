@@ -10,10 +10,14 @@ the image. Therefore a share of a measurement's covariance belongs to a lasting 
 lasting error is L u: L is the symmetric root of that share, and u are six slowly changing numbers of variance 1 that
 are part of the state. A filter that treated these errors as white noise would become overconfident.
 
-Errors of the map and of the focal length are constant. No motion reveals them, and no number of frames averages them
-out, so the filter considers them without estimating them (S. F. Schmidt, Application of state-space methods to
-navigation problems, Advances in Control Systems 3, 1966). The effect of each constant error on a pose is known, and the
-filter carries its effect on the state along (`common`). The gains are computed without constant errors.
+Errors of the map, of the focal length and of the line time are constant. No motion reveals them, and no number of
+frames averages them out, so the filter considers them without estimating them (S. F. Schmidt, Application of
+state-space methods to navigation problems, Advances in Control Systems 3, 1966). The effect of each constant error on a
+pose is known, and the filter carries its effect on the state along (`common`). The gains are computed without constant
+errors.
+
+A pose by a rolling shutter depends on the motion during the frame (`FrameMotion`). The measurement is then the pose for
+the assumed motion, which also depends on the state's velocity and turn rate, and the motion that the rows show.
 """
 
 from __future__ import annotations
@@ -30,13 +34,14 @@ from psotrack.inside_out.filtering.manifold import (
     turn_between,
     turned,
 )
+from psotrack.inside_out.frame_motion import FrameMotion
 from psotrack.motion import white_jerk_noise
 
 #: Size of the error state: position, velocity, acceleration, turn, turn rate (3 each), and the lasting error u (6).
 SIZE = 21
 _TURN, _RATE, _LASTING = slice(9, 12), slice(12, 15), slice(15, 21)
-#: Indices of position and turn in the error state.
-POSE = np.r_[0:3, 9:12]
+#: Indices of position and turn in the error state, and of velocity and turn rate.
+POSE, MOTION = np.r_[0:3, 9:12], np.r_[3:6, 12:15]
 
 #: Time constant of the acceleration's exponential decay, seconds.
 ACCELERATION_TIME_S = 1.0
@@ -46,6 +51,10 @@ LASTING_TIME_S = 0.4
 #: Standard deviations of velocity and turn rate along each axis after the first pose.
 _VELOCITY_STD_M_S = 5.0
 _RATE_STD_RAD_S = 3.0
+
+#: Factor on the covariance of the motion that the rows of a frame show. A part of its errors lasts, as those of poses
+#: do, and the motion is not constant during a frame.
+_ROWS_SCALE = 4.0
 
 _NO_TURN = np.array([[1.0, 0.0, 0.0, 0.0]])
 # Gauss-Legendre nodes and weights on [0, 1]. The quadrature is exact to rounding, and the closed form has cancellation.
@@ -94,20 +103,23 @@ class Innovation:
     """Difference of a measured pose and the predicted one, with covariances.
 
     Attributes:
-        pose: (levels, 6), measured minus predicted, along the world's axes and about the predicted camera's axes.
-        covariance: (levels, 6, 6), covariance of `pose`, from state and measurement together.
-        shared: (levels, 21, 6), covariance of the error state with `pose`.
-        common: (levels, 6, errors), effect of one standard deviation of each constant error on `pose`.
+        off: (levels, m), measured minus predicted: the pose (6), along the world's axes and about the predicted
+            camera's axes; of a rolling shutter also velocity and turn rate (6).
+        covariance: (levels, m, m), covariance of `off`, from state and measurement together.
+        noise: (m, m), covariance of the measurement.
+        shared: (levels, 21, m), covariance of the error state with `off`.
+        common: (levels, m, errors), effect of one standard deviation of each constant error on `off`.
     """
 
-    pose: Float[np.ndarray, "levels 6"]
-    covariance: Float[np.ndarray, "levels 6 6"]
-    shared: Float[np.ndarray, "levels n 6"]
-    common: Float[np.ndarray, "levels 6 errors"]
+    off: Float[np.ndarray, "levels m"]
+    covariance: Float[np.ndarray, "levels m m"]
+    noise: Float[np.ndarray, "m m"]
+    shared: Float[np.ndarray, "levels n m"]
+    common: Float[np.ndarray, "levels m errors"]
 
     @property
-    def whole_covariance(self) -> Float[np.ndarray, "levels 6 6"]:
-        """(levels, 6, 6), covariance of `pose` with constant errors."""
+    def whole_covariance(self) -> Float[np.ndarray, "levels m m"]:
+        """(levels, m, m), covariance of `off` with constant errors."""
         return self.covariance + self.common @ self.common.swapaxes(1, 2)
 
 
@@ -117,29 +129,47 @@ def initial_motion(
     covariance: Float[np.ndarray, "6 6"],
     common: Float[np.ndarray, "6 errors"],
     levels: Levels,
+    seen: FrameMotion | None = None,
 ) -> Motion:
-    """Make the state after the first pose; velocity, acceleration and turn rate have mean 0."""
+    """Make the state after the first pose; velocity, acceleration and turn rate have mean 0.
+
+    With `seen`, the frame of a rolling shutter, velocity and turn rate are those that its rows show.
+    """
     count = len(levels.jerk_density_m2_s5)
     spread = np.zeros((count, SIZE, SIZE))
+    of_motion = np.diag(np.repeat([_VELOCITY_STD_M_S**2, _RATE_STD_RAD_S**2], 3))
+    off = np.zeros((count, SIZE, common.shape[1] if seen is None else seen.common.shape[1]))
+    mean, change = np.zeros(6), np.zeros(6)
+    if seen is None:
+        off[:, POSE] = common
+    else:
+        gain = np.linalg.solve(of_motion + _ROWS_SCALE * seen.measured_covariance, of_motion).T
+        mean, of_motion = gain @ seen.measured, of_motion - gain @ of_motion
+        change = -seen.by_motion @ (mean - seen.assumed)
+        covariance = seen.covariance
+        off[:, MOTION] = gain @ seen.common[6:]
+        off[:, POSE] = seen.common[:6] - seen.by_motion @ (gain @ seen.common[6:])
     root = _lasting_root(covariance)
     # The state's pose error contains the lasting error with the opposite sign.
     spread[:, POSE[:, None], POSE] = covariance
     spread[:, POSE, _LASTING] = -root
     spread[:, _LASTING, POSE] = -root
+    spread[:, MOTION[:, None], MOTION] = of_motion
+    if seen is not None:
+        shared = -seen.by_motion @ of_motion
+        spread[:, POSE[:, None], POSE] = covariance - shared @ seen.by_motion.T
+        spread[:, POSE[:, None], MOTION] = shared
+        spread[:, MOTION[:, None], POSE] = shared.T
     variance = np.einsum("lii->li", spread)
-    variance[:, 3:6] = _VELOCITY_STD_M_S**2
     variance[:, 6:9] = levels.jerk_density_m2_s5[:, None] * ACCELERATION_TIME_S / 2
-    variance[:, _RATE] = _RATE_STD_RAD_S**2
     variance[:, _LASTING] = 1.0
-    off = np.zeros((count, SIZE, common.shape[1]))
-    off[:, POSE] = common
-    none = np.zeros((count, 3))
+    first = orientation_wxyz[None] / np.linalg.norm(orientation_wxyz)
     return Motion(
-        position_m=np.tile(position_m, (count, 1)),
-        velocity_m_s=none,
-        acceleration_m_s2=none,
-        orientation_wxyz=np.tile(orientation_wxyz / np.linalg.norm(orientation_wxyz), (count, 1)),
-        rate_rad_s=none,
+        position_m=np.tile(position_m + change[:3], (count, 1)),
+        velocity_m_s=np.tile(mean[:3], (count, 1)),
+        acceleration_m_s2=np.zeros((count, 3)),
+        orientation_wxyz=np.tile(turned(first, change[None, 3:]), (count, 1)),
+        rate_rad_s=np.tile(mean[3:], (count, 1)),
         lasting=np.zeros((count, 6)),
         covariance=spread,
         common=off,
@@ -195,8 +225,18 @@ def innovation(
     orientation_wxyz: Float[np.ndarray, "4"],
     covariance: Float[np.ndarray, "6 6"],
     common: Float[np.ndarray, "6 errors"],
+    seen: FrameMotion | None = None,
 ) -> Innovation:
-    """Compare a measured pose with the predicted one; `covariance`, as in `CameraPath`, is without constant errors."""
+    """Compare a measured pose with the predicted one.
+
+    Args:
+        motion: the prediction.
+        position_m, orientation_wxyz: the measured pose.
+        covariance, common: covariance as in `CameraPath`, without constant errors, and effects of these errors.
+        seen: the frame of a rolling shutter, whose covariance and effects are used instead; None of a global shutter.
+    """
+    if seen is not None:
+        covariance, common = seen.covariance, seen.common[:6]
     turn = turn_between(motion.orientation_wxyz, orientation_wxyz[None])
     # The measurement's small turns are about its own axes; the innovation's turn is a logarithm.
     by_noise = np.zeros((len(turn), 6, 6))
@@ -205,13 +245,27 @@ def innovation(
     H = np.zeros((len(turn), 6, SIZE))
     H[:, np.arange(6), POSE] = 1.0
     H[:, :, _LASTING] = by_noise @ _lasting_root(covariance)
-    H_t = H.swapaxes(1, 2)
-    shared = motion.covariance @ H_t
     white = (1 - LASTING_SHARE) * by_noise @ covariance @ by_noise.swapaxes(1, 2)
     expected = np.einsum("lij,lj->li", H[:, :, _LASTING], motion.lasting)
     off = np.concatenate([position_m - motion.position_m, turn], axis=1) - expected
-    differs = by_noise @ common - H @ motion.common
-    return Innovation(off, _symmetric(H @ shared + white), shared, differs)
+    differs, noise = by_noise @ common, covariance
+    if seen is not None:
+        H[:, :, MOTION] = by_noise @ seen.by_motion
+        predicted = np.concatenate([motion.velocity_m_s, motion.rate_rad_s], axis=1)
+        off -= np.einsum("lij,lj->li", H[:, :, MOTION], predicted - seen.assumed)
+        off = np.concatenate([off, seen.measured - predicted], axis=1)
+        H_motion = np.zeros_like(H)
+        H_motion[:, np.arange(6), MOTION] = 1.0
+        H = np.concatenate([H, H_motion], axis=1)
+        of_motion = np.broadcast_to(seen.common[6:], differs.shape)
+        differs = np.concatenate([differs, of_motion], axis=1)
+        white, white_pose = np.zeros((len(turn), 12, 12)), white
+        white[:, :6, :6], white[:, 6:, 6:] = white_pose, _ROWS_SCALE * seen.measured_covariance
+        noise = np.zeros((12, 12))
+        noise[:6, :6], noise[6:, 6:] = covariance, _ROWS_SCALE * seen.measured_covariance
+    shared = motion.covariance @ H.swapaxes(1, 2)
+    differs = differs - H @ motion.common
+    return Innovation(off, _symmetric(H @ shared + white), noise, shared, differs)
 
 
 def correct(motion: Motion, measured: Innovation, right: float = 1.0) -> Motion:
@@ -224,7 +278,7 @@ def correct(motion: Motion, measured: Innovation, right: float = 1.0) -> Motion:
             The probabilistic data association filter, IEEE Control Systems 29(6), 2009).
     """
     gain = np.linalg.solve(measured.covariance, measured.shared.swapaxes(1, 2)).swapaxes(1, 2)
-    change = np.einsum("lij,lj->li", gain, measured.pose)
+    change = np.einsum("lij,lj->li", gain, measured.off)
     spread = motion.covariance - right * gain @ measured.shared.swapaxes(1, 2)
     if right < 1:
         spread = spread + right * (1 - right) * change[:, :, None] * change[:, None, :]

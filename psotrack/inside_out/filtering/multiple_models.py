@@ -17,7 +17,7 @@ from scipy.special import chdtri
 
 from psotrack.errors import InputError
 from psotrack.inside_out.filtering import motion as pose_motion
-from psotrack.inside_out.filtering.motion import POSE, Innovation, Levels, Motion
+from psotrack.inside_out.filtering.motion import MOTION, POSE, Innovation, Levels, Motion
 from psotrack.inside_out.filtering.records import MeasuredPose, PoseEstimate, PoseFilterParams
 
 #: Standard deviations of the levels for hovering, flying and racing: of acceleration along each axis (m/s2), and of
@@ -99,6 +99,7 @@ def init(measurement: MeasuredPose) -> PoseState:
         measurement.covariance,
         measurement.common,
         LEVELS,
+        measurement.motion,
     )
     return PoseState(
         time_s=measurement.time_s,
@@ -138,11 +139,18 @@ def update(state: PoseState, measurement: MeasuredPose, params: PoseFilterParams
     """
     _check(measurement)
     state = predict(state, measurement.time_s)
-    covariance = state.noise_scale * measurement.covariance
+    scaled = measurement.scaled(state.noise_scale)
     innovation = pose_motion.innovation(
-        state.motion, measurement.position_m, measurement.orientation_wxyz, covariance, measurement.common
+        state.motion,
+        scaled.position_m,
+        scaled.orientation_wxyz,
+        scaled.covariance,
+        scaled.common,
+        scaled.motion,
     )
-    off, spread = _mixture(_weights(state), innovation.pose, innovation.whole_covariance)
+    off, spread = _mixture(_weights(state), innovation.off, innovation.whole_covariance)
+    # The pose alone decides, not the motion that the rows of a rolling shutter show.
+    off, spread, covariance = off[:6], spread[:6, :6], innovation.noise[:6, :6]
     precision = np.linalg.inv(spread)
     whitened = precision @ off
     nis = float(off @ whitened)
@@ -178,12 +186,14 @@ def estimate(state: PoseState) -> PoseEstimate:
     apart = pose_motion.difference(best, state.motion)
     change, covariance = _mixture(weight, apart, state.motion.covariance)
     middle = pose_motion.shift(best, change[None])
-    common = np.tensordot(weight, state.motion.common[:, POSE], axes=1)
+    covariance = covariance + _outer(np.tensordot(weight, state.motion.common, axes=1))
     return PoseEstimate(
         position_m=middle.position_m[0],
         orientation_wxyz=middle.orientation_wxyz[0],
-        covariance=covariance[np.ix_(POSE, POSE)] + common @ common.T,
+        covariance=covariance[np.ix_(POSE, POSE)],
         velocity_m_s=middle.velocity_m_s[0],
+        rate_rad_s=middle.rate_rad_s[0],
+        motion_covariance=covariance[np.ix_(MOTION, MOTION)],
     )
 
 
@@ -231,6 +241,10 @@ def _mixture(
     return middle, np.tensordot(weight, covariance, axes=1) + (apart.T * weight) @ apart
 
 
+def _outer(common: Float[np.ndarray, "n errors"]) -> Float[np.ndarray, "n n"]:
+    return common @ common.T
+
+
 def _normalised(log_weight: Float[np.ndarray, "levels"]) -> Float[np.ndarray, "levels"]:
     log_weight = log_weight - log_weight.max()
     return log_weight - np.log(np.exp(log_weight).sum())
@@ -239,13 +253,17 @@ def _normalised(log_weight: Float[np.ndarray, "levels"]) -> Float[np.ndarray, "l
 def _log_densities(innovation: Innovation) -> Float[np.ndarray, "levels"]:
     """Log densities of a measurement by the prediction of each level, without their constant."""
     covariance = innovation.whole_covariance
-    nis = np.einsum("li,lij,lj->l", innovation.pose, np.linalg.inv(covariance), innovation.pose)
-    return -((_FREEDOM + 6) * np.log1p(nis / _FREEDOM) + np.linalg.slogdet(covariance)[1]) / 2
+    nis = np.einsum("li,lij,lj->l", innovation.off, np.linalg.inv(covariance), innovation.off)
+    return (
+        -((_FREEDOM + innovation.off.shape[1]) * np.log1p(nis / _FREEDOM) + np.linalg.slogdet(covariance)[1])
+        / 2
+    )
 
 
 def _check(measurement: MeasuredPose) -> None:
     """Raise `InputError` unless a measurement has a positive definite covariance."""
-    covariance = measurement.covariance
+    motion = measurement.motion
+    covariance = measurement.covariance if motion is None else motion.covariance
     if not (np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0):
         raise InputError(
             f"covariance at {measurement.time_s:g} s",

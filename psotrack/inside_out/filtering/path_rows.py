@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from psotrack.inside_out.camera_path import CameraPath, Flag
 from psotrack.inside_out.filtering.records import MeasuredPose, PoseEstimate
+from psotrack.inside_out.frame_motion import FrameMotion
 from psotrack.trajectories import Status
 
 
@@ -30,11 +31,16 @@ class PoseRow:
     velocity_m_s: Float[np.ndarray, "3"]
     chance: float = np.nan
     common: Float[np.ndarray, "6 errors"] = field(default_factory=lambda: np.zeros((6, 0)))
+    motion: FrameMotion | None = None
 
     @property
     def has_pose(self) -> bool:
         """Whether there is a pose."""
         return bool(np.isfinite(self.position_m).all())
+
+    def backwards(self) -> PoseRow:
+        """The same frame in a time that runs backwards."""
+        return replace(self, time_s=-self.time_s, motion=self.motion and self.motion.backwards())
 
 
 def split_path(path: CameraPath) -> list[PoseRow]:
@@ -43,6 +49,7 @@ def split_path(path: CameraPath) -> list[PoseRow]:
     velocity_m_s = np.full((count, 3), np.nan) if path.velocity_m_s is None else path.velocity_m_s
     chance = np.full(count, np.nan) if path.chance is None else path.chance
     common = np.zeros((count, 6, 0)) if path.common is None else path.common
+    motion = [None] * count if path.motion is None else path.motion
     return [
         PoseRow(
             frame=int(path.frame[k]),
@@ -58,6 +65,7 @@ def split_path(path: CameraPath) -> list[PoseRow]:
             velocity_m_s=velocity_m_s[k],
             chance=float(chance[k]),
             common=common[k],
+            motion=motion[k],
         )
         for k in range(path.num_frames)
     ]
@@ -82,11 +90,20 @@ def join_rows(rows: Sequence[PoseRow]) -> CameraPath:
         velocity_m_s=velocity_m_s if np.isfinite(velocity_m_s).any() else None,
         chance=chance if np.isfinite(chance).any() else None,
         common=common if common.size else None,
+        motion=tuple(row.motion for row in rows) if any(row.motion for row in rows) else None,
     )
 
 
 def measured_pose(row: PoseRow) -> MeasuredPose:
     """The pose of a frame that has one. An unknown ambiguity counts as 0, an unknown chance as 1."""
+    motion = row.motion
+    if motion is not None:
+        of_pose, of_motion = motion.common[:6], motion.common[6:]
+        motion = replace(
+            motion,
+            covariance=motion.covariance - of_pose @ of_pose.T,
+            measured_covariance=motion.measured_covariance - of_motion @ of_motion.T,
+        )
     return MeasuredPose(
         row.time_s,
         row.position_m,
@@ -95,6 +112,7 @@ def measured_pose(row: PoseRow) -> MeasuredPose:
         float(np.nan_to_num(row.ambiguity)),
         row.common,
         float(np.nan_to_num(row.chance, nan=1.0)),
+        motion,
     )
 
 
@@ -116,6 +134,7 @@ def estimated_row(raw: PoseRow, estimate: PoseEstimate, ambiguity: float, *, use
         velocity_m_s=estimate.velocity_m_s,
         chance=np.nan,
         common=np.zeros((6, 0)),
+        motion=None,
     )
 
 
@@ -132,6 +151,7 @@ def lost_row(raw: PoseRow, *, gated: bool = False) -> PoseRow:
         velocity_m_s=np.full(3, np.nan),
         chance=np.nan,
         common=np.zeros((6, 0)),
+        motion=None,
     )
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from psotrack.errors import SettingsError, check_positive
 from psotrack.inside_out.filtering.manifold import rotation_matrices
+from psotrack.inside_out.frame_motion import FrameMotion
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,8 @@ class MeasuredPose:
         covariance: (6, 6), as in `CameraPath`, without the part that `common` describes.
         common: (6, errors), change of the pose by one standard deviation of each error that is the same in all frames.
         chance: upper bound on the probability that the used markers agree by chance.
+        motion: of a rolling shutter, what the frame says about pose and motion together; its covariance too is without
+            the part that `common` describes. None of a global shutter.
     """
 
     time_s: float
@@ -65,6 +68,16 @@ class MeasuredPose:
     ambiguity: float = 0.0
     common: Float[np.ndarray, "6 errors"] = field(default_factory=lambda: np.zeros((6, 0)))
     chance: float = 1.0
+    motion: FrameMotion | None = None
+
+    def scaled(self, factor: float) -> MeasuredPose:
+        """The pose with covariances that are multiplied by a factor; the part of `common` stays."""
+        motion = self.motion and replace(
+            self.motion,
+            covariance=factor * self.motion.covariance,
+            measured_covariance=factor * self.motion.measured_covariance,
+        )
+        return replace(self, covariance=factor * self.covariance, motion=motion)
 
     @property
     def p_wrong(self) -> float:
@@ -81,12 +94,16 @@ class PoseEstimate:
         orientation_wxyz: (4,), unit quaternion, camera to world.
         covariance: (6, 6), as in `CameraPath`.
         velocity_m_s: (3,), world.
+        rate_rad_s: (3,), turn rate about the camera's axes.
+        motion_covariance: (6, 6), covariance of velocity and turn rate.
     """
 
     position_m: Float[np.ndarray, "3"]
     orientation_wxyz: Float[np.ndarray, "4"]
     covariance: Float[np.ndarray, "6 6"]
     velocity_m_s: Float[np.ndarray, "3"]
+    rate_rad_s: Float[np.ndarray, "3"]
+    motion_covariance: Float[np.ndarray, "6 6"]
 
     @property
     def R_world_cam(self) -> Float[np.ndarray, "3 3"]:

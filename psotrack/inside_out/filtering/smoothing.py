@@ -17,7 +17,7 @@ from psotrack.estimation import backward_step
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.filtering import motion as pose_motion
 from psotrack.inside_out.filtering.manifold import right_jacobian_inverse
-from psotrack.inside_out.filtering.motion import POSE, Levels, Motion
+from psotrack.inside_out.filtering.motion import MOTION, POSE, Levels, Motion
 from psotrack.inside_out.filtering.multiple_models import LEVELS, probability_right
 from psotrack.inside_out.filtering.path_rows import (
     PoseRow,
@@ -128,7 +128,7 @@ def estimate_motion_model(path: CameraPath, params: PoseFilterParams) -> MotionM
     """
     rows = split_path(path)
     forward = _run_filter(rows, params)
-    backward = _run_filter([replace(row, time_s=-row.time_s) for row in reversed(rows)], params)
+    backward = _run_filter([row.backwards() for row in reversed(rows)], params)
     log_levels = (forward.log_levels + backward.log_levels[::-1]) / 2
     return MotionModel(
         fits=forward.fits & backward.fits[::-1],
@@ -200,11 +200,10 @@ def _filter(rows: Sequence[PoseRow], model: MotionModel, span: slice) -> list[_F
     for k in range(span.start, span.stop):
         row = rows[k]
         levels = Levels(model.jerk_density_m2_s5[k : k + 1], model.wobble_density_rad2_s3[k : k + 1])
-        pose = measured_pose(row)
-        covariance = model.noise_scale[k] * pose.covariance
+        pose = measured_pose(row).scaled(float(model.noise_scale[k]))
         if not frames:
             motion = pose_motion.initial_motion(
-                pose.position_m, pose.orientation_wxyz, covariance, pose.common, levels
+                pose.position_m, pose.orientation_wxyz, pose.covariance, pose.common, levels, pose.motion
             )
             zeros = np.zeros_like(motion.covariance)
             frames.append(_FilteredFrame(motion, zeros, zeros, motion))
@@ -214,9 +213,15 @@ def _filter(rows: Sequence[PoseRow], model: MotionModel, span: slice) -> list[_F
         motion = predicted
         if model.fits[k]:
             innovation = pose_motion.innovation(
-                predicted, pose.position_m, pose.orientation_wxyz, covariance, pose.common
+                predicted,
+                pose.position_m,
+                pose.orientation_wxyz,
+                pose.covariance,
+                pose.common,
+                pose.motion,
             )
-            right = probability_right(innovation.pose[0], innovation.whole_covariance[0], pose.ambiguity)
+            of_pose = innovation.off[0, :6], innovation.whole_covariance[0, :6, :6]
+            right = probability_right(*of_pose, pose.ambiguity)
             motion = pose_motion.correct(predicted, innovation, right)
         frames.append(_FilteredFrame(predicted, F, pose_motion.process_noise(dt_s, levels), motion))
     return frames
@@ -253,9 +258,16 @@ def _smoothed(now: Motion, ahead: _FilteredFrame, later: Motion) -> Motion:
 
 def _estimate(motion: Motion) -> PoseEstimate:
     """Pose of a motion of one level; the covariance includes the constant errors."""
-    common = motion.common[0, POSE]
-    covariance = motion.covariance[0][np.ix_(POSE, POSE)] + common @ common.T
-    return PoseEstimate(motion.position_m[0], motion.orientation_wxyz[0], covariance, motion.velocity_m_s[0])
+    common = motion.common[0]
+    covariance = motion.covariance[0] + common @ common.T
+    return PoseEstimate(
+        motion.position_m[0],
+        motion.orientation_wxyz[0],
+        covariance[np.ix_(POSE, POSE)],
+        motion.velocity_m_s[0],
+        motion.rate_rad_s[0],
+        covariance[np.ix_(MOTION, MOTION)],
+    )
 
 
 def _mean_log_levels(log_weight: Float[np.ndarray, "levels"]) -> Float[np.ndarray, "2"]:

@@ -37,4 +37,4 @@ def open_image_folder(folder: Path, fps: float | None) -> FrameSource:
     def frames() -> Iterator[Frame]:
         return (Frame(number, number / fps, bgr) for number, bgr in enumerate(read_frames(video)))
 
-    return FrameSource(str(folder), video.image_size_wh, video.num_frames, frames)
+    return FrameSource(str(folder), video.image_size_wh, video.num_frames, frames, fps=fps)

@@ -41,4 +41,4 @@ def open_source(source: Path | str, *, fps: float | None = None, live: bool = Fa
     def frames() -> Iterator[Frame]:
         return (Frame(index, index / rate, bgr) for index, bgr in enumerate(read_frames(video)))
 
-    return FrameSource(str(path), video.image_size_wh, video.num_frames, frames)
+    return FrameSource(str(path), video.image_size_wh, video.num_frames, frames, fps=rate)

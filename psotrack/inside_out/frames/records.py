@@ -39,6 +39,7 @@ class FrameSource:
         frames: function that returns the frames, from the first one; a stream can be read only once.
         stream: whether the frames come from a stream.
         newest: whether frames of a stream that come faster than they are used are left out.
+        fps: frames per second; None if unknown.
     """
 
     name: str
@@ -47,6 +48,7 @@ class FrameSource:
     frames: Callable[[], Iterator[Frame]]
     stream: bool = False
     newest: bool = False
+    fps: float | None = None
 
     def first(self, num_frames: int | None) -> FrameSource:
         """Limit the source to its first `num_frames` frames; None keeps all frames.

@@ -49,7 +49,9 @@ def open_stream(address: str, fps: float | None, live: bool) -> FrameSource:
         finally:
             capture.release()
 
-    return FrameSource(address, (first.shape[1], first.shape[0]), None, frames, stream=True, newest=live)
+    return FrameSource(
+        address, (first.shape[1], first.shape[0]), None, frames, stream=True, newest=live, fps=fps
+    )
 
 
 class _Clock:

@@ -13,17 +13,29 @@ from scipy.spatial.transform import Rotation
 from psotrack.geometry import Camera
 from psotrack.inside_out.camera_path import Flag
 from psotrack.inside_out.detection import DetectedMarkers
+from psotrack.inside_out.filtering import PoseFilterParams
 from psotrack.inside_out.filtering.path_rows import PoseRow
 from psotrack.inside_out.filtering.pose_filter import FilterRun, advance, expected, step
 from psotrack.inside_out.localising.records import STAGES, LocaliseSettings
 from psotrack.inside_out.marker_map import MarkerMap
-from psotrack.inside_out.pose import ExpectedPose, MarkerPose, PoseSettings, estimate_pose
+from psotrack.inside_out.pose import (
+    ExpectedMotion,
+    ExpectedPose,
+    MarkerPose,
+    PoseSettings,
+    RollingShutter,
+    estimate_pose,
+)
 from psotrack.trajectories import Status
 
 #: Number of markers that the paper requires. A pose from fewer markers is flagged, even if the settings allow it.
 PAPER_MARKERS = 4
 #: Probability that another pose is the right one above which a pose is flagged as ambiguous.
 _AMBIGUOUS = 0.05
+#: Factor on the standard deviations of the predicted motion, and added variances of velocity (m²/s²) and turn rate
+#: (rad²/s²), because a frame's own rows shall decide where the motion changes.
+_WIDER = 2.0
+_MOTION_FLOOR = np.diag(np.repeat([0.1**2, 0.1**2], 3))
 
 
 def localise_frames(
@@ -43,19 +55,24 @@ def localise_frames(
         seconds: times by stage; the times of "locate" and "filter" are added.
     """
     spent_s = dict.fromkeys(STAGES, 0.0) if seconds is None else seconds
-    run = FilterRun()
+    run, shutter = FilterRun(), settings.shutter or RollingShutter(0.0)
+    # Where the shutter rolls, a frame's own pose depends on the motion, which the filter follows.
+    rolls = bool(shutter.line_time_s or shutter.std_s)
+    params = settings.filter or (PoseFilterParams() if rolls else None)
     for number, time_s, markers in detected:
         began_s = time.perf_counter()
-        if settings.filter is not None:
-            run = advance(run, time_s, settings.filter)
+        if params is not None:
+            run = advance(run, time_s, params)
         predicted_s = time.perf_counter()
-        pose = _pose_of_frame(markers, marker_map, lens, settings, run)
+        pose = _pose_of_frame(markers, marker_map, lens, settings, run, params, shutter if rolls else None)
         raw = pose_row(number, time_s, markers, pose, settings)
-        raw = replace(raw, common=_common(markers, pose, marker_map, settings.pose))
+        raw = _with_common(raw, markers, pose, marker_map, settings.pose, shutter)
         located_s = time.perf_counter()
         row = raw
-        if settings.filter is not None:
-            run, row = step(run, raw, settings.filter)
+        if params is not None:
+            run, row = step(run, raw, params)
+        if settings.filter is None:
+            row = raw
         spent_s["locate"] += located_s - predicted_s
         spent_s["filter"] += time.perf_counter() - located_s + predicted_s - began_s
         yield raw, row
@@ -100,28 +117,55 @@ def _pose_of_frame(
     lens: Camera,
     settings: LocaliseSettings,
     run: FilterRun,
+    params: PoseFilterParams | None,
+    shutter: RollingShutter | None,
 ) -> MarkerPose | None:
     """The pose by one frame's markers; the filter's prediction decides between poses that fit about equally well."""
-    predicted = None if settings.filter is None else expected(run, settings.filter)
-    prior = (
-        None
-        if predicted is None
-        else ExpectedPose(predicted.position_m, predicted.R_world_cam, predicted.covariance)
-    )
-    return estimate_pose(
-        markers.corners_px, marker_map.corners_of(markers.ids.tolist()), lens, settings.pose, prior
-    )
+    predicted = None if params is None else expected(run, params)
+    prior, motion = None, None
+    if predicted is not None:
+        if settings.filter is not None:
+            prior = ExpectedPose(predicted.position_m, predicted.R_world_cam, predicted.covariance)
+        motion = ExpectedMotion(
+            np.concatenate([predicted.velocity_m_s, predicted.rate_rad_s]),
+            _WIDER**2 * predicted.motion_covariance + _MOTION_FLOOR,
+        )
+    corners_m = marker_map.corners_of(markers.ids.tolist())
+    return estimate_pose(markers.corners_px, corners_m, lens, settings.pose, prior, shutter, motion)
 
 
-def _common(
-    markers: DetectedMarkers, pose: MarkerPose | None, marker_map: MarkerMap, settings: PoseSettings
-) -> Float[np.ndarray, "6 errors"]:
-    """Change of a pose by errors of the markers in the map and of the focal length; 0 columns if none are stated."""
-    if not settings.map_error_m and not settings.focal_error:
-        return np.zeros((6, 0))
-    common = np.zeros((6, 3 * len(marker_map) + 1))
-    if pose is not None:
+def _with_common(
+    raw: PoseRow,
+    markers: DetectedMarkers,
+    pose: MarkerPose | None,
+    marker_map: MarkerMap,
+    settings: PoseSettings,
+    shutter: RollingShutter,
+) -> PoseRow:
+    """A frame with the change of its pose by each error that is the same in all frames.
+
+    The errors are those of the markers in the map and of the focal length, if any is stated, and of the line time, if
+    it is uncertain.
+    """
+    of_map = 3 * len(marker_map) + 1 if settings.map_error_m or settings.focal_error else 0
+    of_shutter = int(shutter.std_s > 0)
+    columns = np.zeros(0, int)
+    if of_map:
         first = 3 * np.searchsorted(marker_map.ids, markers.ids)
-        common[:, (first[:, None] + np.arange(3)).ravel()] = pose.common[:, :-1]
-        common[:, -1] = pose.common[:, -1]
-    return common
+        columns = np.append((first[:, None] + np.arange(3)).ravel(), of_map - 1)
+
+    def placed(effects: Float[np.ndarray, "unknowns errors"]) -> Float[np.ndarray, "unknowns others"]:
+        common = np.zeros((len(effects), of_map + of_shutter))
+        if of_map:
+            common[:, columns] = effects[:, : len(columns)]
+        if of_shutter:
+            common[:, -1] = effects[:, -1]
+        return common
+
+    if pose is None:
+        return replace(raw, common=np.zeros((6, of_map + of_shutter)))
+    effects = pose.common
+    if pose.by_line_time is not None:
+        effects = np.concatenate([effects, pose.by_line_time[:, None]], axis=1)
+    motion = pose.motion and replace(pose.motion, common=placed(pose.motion.common))
+    return replace(raw, common=placed(effects), motion=motion)

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.filtering import PoseFilterParams
-from psotrack.inside_out.pose import PoseSettings
+from psotrack.inside_out.localising.line_time import LineTime
+from psotrack.inside_out.pose import PoseSettings, RollingShutter
 
 #: Stages that each frame passes; the first two run in a thread of their own.
 STAGES = ("decode", "grey", "detect", "locate", "filter")
@@ -21,11 +22,13 @@ class LocaliseSettings:
         dictionary: name of the markers' dictionary, such as 4x4_1000.
         pose: settings of pose estimation.
         filter: parameters of the causal filter; None returns every frame's own pose.
+        shutter: the camera's rolling shutter; None is estimated from a recording, and is a global shutter otherwise.
     """
 
     dictionary: str = "4x4_1000"
     pose: PoseSettings = field(default_factory=PoseSettings)
     filter: PoseFilterParams | None = field(default_factory=PoseFilterParams)
+    shutter: RollingShutter | None = None
 
     def within(self, num_frames: int | None) -> LocaliseSettings:
         """Settings for a recording of `num_frames` frames, as `PoseFilterParams.within`; None is a stream."""
@@ -42,6 +45,9 @@ class LocalisedVideo:
         seconds: seconds by stage of `STAGES`, summed over frames; stages run in parallel.
         wall_s: seconds from the first frame to the last.
         interrupted: whether Ctrl-C ended a stream.
+        shutter: the shutter with which the poses were estimated; None is a global shutter.
+        line_time: the line time that the video shows; None if it was not estimated: in a stream, and in a video without
+            five consecutive frames that show enough markers.
     """
 
     path: CameraPath
@@ -49,6 +55,8 @@ class LocalisedVideo:
     seconds: Mapping[str, float]
     wall_s: float
     interrupted: bool = False
+    shutter: RollingShutter | None = None
+    line_time: LineTime | None = None
 
     @property
     def frames_per_second(self) -> float:

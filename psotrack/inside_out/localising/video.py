@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -15,9 +16,10 @@ from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
 from psotrack.inside_out.filtering.path_rows import join_rows
 from psotrack.inside_out.frames import Frame, FrameSource, read_ahead
 from psotrack.inside_out.localising.frame_poses import localise_frames
+from psotrack.inside_out.localising.line_time import Detected, LineTime, estimate_line_time
 from psotrack.inside_out.localising.records import STAGES, LocalisedVideo, LocaliseSettings
 from psotrack.inside_out.marker_map import MarkerMap
-from psotrack.support import Report, no_progress
+from psotrack.support import Advance, Report, no_progress
 
 #: Number, time (seconds) and grey image of a frame.
 _GreyFrame = tuple[int, float, UInt8[np.ndarray, "height width"]]
@@ -33,7 +35,8 @@ def localise_video(
     """Localise a camera in every frame, from markers of known positions.
 
     A thread decodes frames and converts them to grey, ahead of the detection of markers. Markers that are not in the
-    map are not detected. Where two poses fit a frame's markers about equally well, the filter's prediction decides;
+    map are not detected. In a recording, the markers of all frames are found first, and show whether the shutter rolls
+    (`line_time`). Where two poses fit a frame's markers about equally well, the filter's prediction decides;
     then the filter uses the pose or gates it.
 
     Args:
@@ -54,16 +57,18 @@ def localise_video(
     _check_size(source, lens)
     detector = MarkerDetector(settings.dictionary, lens, ids=marker_map.ids.tolist())
     seconds = dict.fromkeys(STAGES, 0.0)
-    raw_rows, rows, interrupted = [], [], False
+    raw_rows, rows, interrupted, line_time = [], [], False, None
     began_s = time.perf_counter()
     try:
         with report("localise", source.num_frames or 0) as done:
-            for raw, row in localise_frames(
-                _detect_markers(source, detector, seconds), marker_map, lens, settings, seconds
-            ):
+            detected: Iterable[Detected] = _counted(_detect_markers(source, detector, seconds), done)
+            if not source.stream:
+                detected, line_time, settings = _with_shutter(
+                    list(detected), marker_map, lens, settings, seconds
+                )
+            for raw, row in localise_frames(detected, marker_map, lens, settings, seconds):
                 raw_rows.append(raw)
                 rows.append(row)
-                done(1)
     except KeyboardInterrupt:
         # A recording can be localised again, a stream cannot: the frames of a stream are kept.
         if not source.stream or not rows:
@@ -72,7 +77,31 @@ def localise_video(
     # Ctrl-C may come between the two appends.
     raw_rows = raw_rows[: len(rows)]
     wall_s = time.perf_counter() - began_s
-    return LocalisedVideo(join_rows(rows), join_rows(raw_rows), seconds, wall_s, interrupted)
+    return LocalisedVideo(
+        join_rows(rows), join_rows(raw_rows), seconds, wall_s, interrupted, settings.shutter, line_time
+    )
+
+
+def _with_shutter(
+    detected: list[Detected],
+    marker_map: MarkerMap,
+    lens: Camera,
+    settings: LocaliseSettings,
+    seconds: dict[str, float],
+) -> tuple[Iterable[Detected], LineTime | None, LocaliseSettings]:
+    """The frames, the line time that they show, and settings with the shutter to use."""
+    began_s = time.perf_counter()
+    line_time = estimate_line_time(detected, marker_map, lens, settings.pose)
+    if line_time is not None:
+        settings = replace(settings, shutter=line_time.shutter(settings.shutter))
+    seconds["locate"] += time.perf_counter() - began_s
+    return detected, line_time, settings
+
+
+def _counted(detected: Iterable[Detected], done: Advance) -> Iterator[Detected]:
+    for one in detected:
+        yield one
+        done(1)
 
 
 def _detect_markers(

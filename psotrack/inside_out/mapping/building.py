@@ -7,10 +7,11 @@ axes are the world's: the origin at its centre, x to its right, y up, z out of t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, check_positive
 from psotrack.inside_out.mapping.bundle import AdjustedMap, adjust
@@ -21,10 +22,12 @@ from psotrack.inside_out.mapping.initial_map import (
     place_markers,
     placed_markers,
 )
+from psotrack.inside_out.mapping.rolling import LineTimes, Shutters, line_times, with_shutters
 from psotrack.inside_out.mapping.scene import MappedScene
 from psotrack.inside_out.mapping.sightings import SQUARE, MarkerSightings
 from psotrack.inside_out.mapping.square_fitting import fit_square
 from psotrack.inside_out.marker_map import MarkerMap
+from psotrack.inside_out.pose import RollingShutter
 
 #: Number of views for the initial map; the other views are used for markers that none of these shows.
 _FIRST_VIEWS = 100
@@ -51,6 +54,8 @@ class BuiltMap:
         noise_px: standard deviation of a corner along x and along y, pixels.
         inset_px: (videos,), distance by which the sides of squares are found too far inside, pixels.
         num_views: number of frames that were used.
+        shutters: (videos,), rolling shutters with which the map was made; None is a global shutter.
+        line_times: (videos,), what the videos show of their shutters; None where it was not estimated.
     """
 
     marker_map: MarkerMap
@@ -64,6 +69,8 @@ class BuiltMap:
     noise_px: float
     inset_px: Float[np.ndarray, " videos"]
     num_views: int
+    shutters: Shutters = ()
+    line_times: LineTimes = ()
 
     @property
     def std_m(self) -> Float[np.ndarray, "markers 3"]:
@@ -92,6 +99,7 @@ def build_map(
     *,
     side_m: float | None = None,
     estimate_sides: bool = False,
+    shutter: RollingShutter | None = None,
 ) -> BuiltMap:
     """Build the map that explains sightings, given the positions of some markers.
 
@@ -101,11 +109,50 @@ def build_map(
             them.
         side_m: side of all other markers, metres; None takes the known markers' side.
         estimate_sides: estimate the side of each other marker.
+        shutter: rolling shutter of all cameras; None is estimated for each video. Where a video contradicts it, the
+            covariance includes the difference from the map with the video's shutter.
 
     Raises:
         InputError: no known marker is seen beside another one.
         SettingsError: the side is not above 0.
     """
+    given = (shutter,) * len(sightings.lenses)
+    first = _build(with_shutters(sightings, given), known, side_m, estimate_sides)
+    shown = line_times(sightings, first.marker_map)
+    if shutter is None:
+        used = tuple(one.shutter() if one is not None and one.rolls else None for one in shown)
+        if any(used):
+            first = _build(with_shutters(sightings, used), known, side_m, estimate_sides)
+        return replace(first, shutters=used, line_times=shown)
+    first = replace(first, shutters=given, line_times=shown)
+    if not any(one is not None and one.contradicts(shutter.line_time_s) for one in shown):
+        return first
+    used = tuple(shutter if one is None else one.shutter() for one in shown)
+    return _with_difference(first, _build(with_shutters(sightings, used), known, side_m, estimate_sides))
+
+
+def _with_difference(built: BuiltMap, other: BuiltMap) -> BuiltMap:
+    """A map whose covariances include its difference from another map of the same markers."""
+    covariance = built.covariance.copy()
+    for row, marker in enumerate(built.ids.tolist()):
+        if marker not in other.marker_map:
+            continue
+        (R, centre_m, side_m), (other_R, other_m, other_side_m) = (
+            fit_square(one.marker_map.corners_m[marker]) for one in (built, other)
+        )
+        turn = Rotation.from_matrix(other_R @ R.T).as_rotvec()
+        off = np.concatenate([other_m - centre_m, turn, [np.log(other_side_m / side_m)]])
+        covariance[row] += np.outer(off, off)
+    return replace(built, covariance=covariance)
+
+
+def _build(
+    sightings: MarkerSightings,
+    known: Mapping[int, Float[np.ndarray, "4 3"]],
+    side_m: float | None,
+    estimate_sides: bool,
+) -> BuiltMap:
+    """Build the map with the shutters of the sightings."""
     placed = {marker: PlacedMarker(*fit_square(corners)) for marker, corners in known.items()}
     side_m = float(np.median([one.side_m for one in placed.values()])) if side_m is None else side_m
     check_positive("side_m", side_m)

@@ -10,6 +10,9 @@ not depend on the distance. The square then seems smaller and farther away, and 
 inset, one unknown for each video, models it; an inset of 0.3 px that is left out bends a room by centimetres. Other
 errors of the model are also the same in all views and would be taken for an inset. Therefore the weight of the inset's
 prior is proportional to the number of views.
+
+Where a shutter rolls, each view has six more unknowns, the motion of the camera during the frame, with the prior of a
+camera that is carried or flies (Hedborg, Forssén, Felsberg & Ringaby, Rolling shutter bundle adjustment, CVPR 2012).
 """
 
 from __future__ import annotations
@@ -45,6 +48,8 @@ _INSET_PX = 0.05
 _INSET_APART_PX = 0.02
 #: Smallest standard deviation of a corner, px.
 _FINEST_PX = 0.01
+#: Standard deviations of the motion during a frame: turn rate (rad/s) and velocity of the world's points (m/s).
+_MOTION_STD = np.repeat([2.0, 4.0], 3)
 #: Number of residuals of a marker in one view.
 _RESIDUALS = 8
 
@@ -125,7 +130,10 @@ class _Bundle:
         # If a marker is confused with another marker, all its corners are wrong: they share one loss.
         squares = self.squares[self.used]
         loss = cauchy_loss(squares, float(_RESIDUALS)) if self.robust else squares
-        return float(loss.sum() + np.sum(self.problem.inset_weight * self.scene.inset_px**2))
+        prior = np.sum(self.problem.inset_weight * self.scene.inset_px**2)
+        if self.scene.motion is not None:
+            prior += np.sum((self.scene.motion / _MOTION_STD) ** 2)
+        return float(loss.sum() + prior)
 
     @property
     def weights(self) -> Float[np.ndarray, " sightings"]:
@@ -138,15 +146,16 @@ class _Bundle:
         """Normal equations; the views are the blocks, markers and insets the shared unknowns."""
         problem, scene, weights = self.problem, self.scene, self.weights
         views, unknowns, free = problem.sightings.num_views, len(problem.free), problem.free
+        size = self.slopes.by_view.shape[-1]
         kept = np.flatnonzero(weights)
         off = self.slopes.off[kept].reshape(-1, _RESIDUALS, 1)
-        by_view = self.slopes.by_view[kept].reshape(-1, _RESIDUALS, 6)
+        by_view = self.slopes.by_view[kept].reshape(-1, _RESIDUALS, size)
         by_rest = self.slopes.by_rest[kept].reshape(-1, _RESIDUALS, 8)
         view, columns, weight = problem.sightings.view[kept], problem.columns[kept], weights[kept, None, None]
         weighted_view, weighted = ((weight * part).swapaxes(1, 2) for part in (by_view, by_rest))
-        of_views, view_right = np.zeros((views, 6, 6)), np.zeros((views, 6))
+        of_views, view_right = np.zeros((views, size, size)), np.zeros((views, size))
         information, right = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
-        coupling = np.zeros((views, 6, unknowns))
+        coupling = np.zeros((views, size, unknowns))
         np.add.at(of_views, view, weighted_view @ by_view)
         np.add.at(view_right, view, (weighted_view @ off)[..., 0])
         np.add.at(information, (columns[:, :, None], columns[:, None, :]), weighted @ by_rest)
@@ -156,7 +165,10 @@ class _Bundle:
         information[inset, inset] += problem.inset_weight
         right[inset] -= problem.inset_weight * scene.inset_px
         # A view without a used sighting stays where it is.
-        of_views[np.einsum("vii->v", of_views) == 0] = np.eye(6)
+        of_views[np.einsum("vii->v", of_views) == 0] = np.eye(size)
+        if scene.motion is not None:
+            of_views[:, np.arange(6, 12), np.arange(6, 12)] += _MOTION_STD**-2.0
+            view_right[:, 6:] -= scene.motion / _MOTION_STD**2
         return NormalEquations(
             information[np.ix_(free, free)], right[free], of_views, view_right, coupling[..., free]
         )
@@ -171,12 +183,13 @@ class _Bundle:
         of_markers = whole[: 7 * len(scene.ids)].reshape(-1, 7)
         moved = MappedScene(
             Rotation.from_rotvec(of_views[:, :3]).as_matrix() @ scene.R_cam_world,
-            scene.t_m + of_views[:, 3:],
+            scene.t_m + of_views[:, 3:6],
             scene.ids,
             Rotation.from_rotvec(of_markers[:, 3:6]).as_matrix() @ scene.R_world_marker,
             scene.centre_m + of_markers[:, :3],
             scene.side_m * np.exp(np.clip(of_markers[:, 6], -1, 1)),
             scene.inset_px + whole[7 * len(scene.ids) :],
+            None if scene.motion is None else scene.motion + of_views[:, 6:],
         )
         return replace(self, scene=moved)
 
@@ -210,7 +223,7 @@ def adjust(
         estimate_sides: whether the sides of markers that are not fixed are unknowns.
     """
     bundle = _robust_fit(sightings, start, fixed, noise_px, estimate_sides)
-    unknowns = int(bundle.problem.free.sum()) + 6 * sightings.num_views
+    unknowns = int(bundle.problem.free.sum()) + (12 if sightings.rolls else 6) * sightings.num_views
     # The gate depends on the fit and the fit on the gate. The loop ends if they alternate.
     for _ in range(5):
         residual_px = bundle.residual_px
@@ -243,6 +256,8 @@ def _robust_fit(
     noise_px: float,
     estimate_sides: bool,
 ) -> _Bundle:
+    if sightings.rolls and start.motion is None:
+        start = replace(start, motion=np.zeros((sightings.num_views, 6)))
     problem = _problem(sightings, start, fixed, noise_px, estimate_sides)
     return _Bundle(problem, start, np.ones(len(sightings.view), bool), robust=True).solved()
 
@@ -322,14 +337,15 @@ def _corner_pulls(bundle: _Bundle, reduced: ReducedEquations) -> Float[np.ndarra
     problem, scene, weights = bundle.problem, bundle.scene, bundle.weights
     sightings, kept = problem.sightings, np.flatnonzero(weights)
     axes = _axes(sightings)[kept] * weights[kept, None, None, None]
+    size = bundle.slopes.by_view.shape[-1]
     by_view = np.einsum("scxf,scxk->sfck", bundle.slopes.by_view[kept], axes).reshape(
-        len(kept), 6, _RESIDUALS
+        len(kept), size, _RESIDUALS
     )
     by_rest = np.einsum("scxf,scxk->sfck", bundle.slopes.by_rest[kept], axes).reshape(
         len(kept), 8, _RESIDUALS
     )
     errors = _RESIDUALS * scene.rows(sightings)[kept][:, None] + np.arange(_RESIDUALS)
-    of_views = np.zeros((sightings.num_views, _RESIDUALS * len(scene.ids), 6))
+    of_views = np.zeros((sightings.num_views, _RESIDUALS * len(scene.ids), size))
     of_views[sightings.view[kept][:, None], errors] = by_view.swapaxes(1, 2)
     pulls = np.zeros((len(problem.free), _RESIDUALS * len(scene.ids)))
     np.add.at(pulls, (problem.columns[kept][:, :, None], errors[:, None, :]), by_rest)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import reproject
 from psotrack.geometry import NEAR_M
@@ -24,6 +25,8 @@ class MappedScene:
         centre_m: (markers, 3), world, metres.
         side_m: (markers,), sides, metres.
         inset_px: (videos,), distance by which the sides of squares are found too far inside, pixels.
+        motion: (views, 6), motion during a frame of a rolling shutter: turn rate about the camera's axes (rad/s) and
+            velocity of the world's points along these axes (m/s); None is no motion.
     """
 
     R_cam_world: Float[np.ndarray, "views 3 3"]
@@ -33,6 +36,7 @@ class MappedScene:
     centre_m: Float[np.ndarray, "markers 3"]
     side_m: Float[np.ndarray, " markers"]
     inset_px: Float[np.ndarray, " videos"]
+    motion: Float[np.ndarray, "views 6"] | None = None
 
     def rows(self, sightings: MarkerSightings) -> Int[np.ndarray, " sightings"]:
         """(sightings,), index of each sighting's marker."""
@@ -73,13 +77,14 @@ class LinearisedScene:
 
     Attributes:
         off: (sightings, 4, 2), corner less its projection; infinite behind the camera.
-        by_view: (sightings, 4, 2, 6), by a small turn about the camera's axes (rad) and by its translation (m).
+        by_view: (sightings, 4, 2, 6), by a small turn about the camera's axes (rad) and by its translation (m); where
+            a shutter rolls (sightings, 4, 2, 12), also by the motion.
         by_rest: (sightings, 4, 2, 8), by the marker's centre (m), a small turn about the world's axes (rad), the
             logarithm of its side, and by the video's inset.
     """
 
     off: Float[np.ndarray, "sightings 4 2"]
-    by_view: Float[np.ndarray, "sightings 4 2 6"]
+    by_view: Float[np.ndarray, "sightings 4 2 unknowns"]
     by_rest: Float[np.ndarray, "sightings 4 2 8"]
 
 
@@ -91,6 +96,12 @@ def linearised(sightings: MarkerSightings, scene: MappedScene) -> LinearisedScen
     arm = scene.arms_m[row]
     turned = (scene.centre_m[row][:, None] + arm) @ R.swapaxes(-1, -2)
     points_cam = turned + scene.t_m[view][:, None]
+    time_s = sightings.row_times_s[..., None]
+    if sightings.rolls and scene.motion is not None:
+        # The pose at a row: the turn and the shift since the middle row follow the pose of the middle row.
+        turn, shift = (time_s * part[:, None] for part in np.split(scene.motion[view], 2, axis=-1))
+        R_row = Rotation.from_rotvec(turn.reshape(-1, 3)).as_matrix().reshape(*turn.shape, 3)
+        points_cam = (R_row @ points_cam[..., None])[..., 0] + shift
     off, by_shift = np.empty((len(row), 4, 2)), np.empty((len(row), 4, 2, 3))
     for index, lens in enumerate(sightings.lenses):
         of_lens = np.flatnonzero(video == index)
@@ -103,6 +114,11 @@ def linearised(sightings: MarkerSightings, scene: MappedScene) -> LinearisedScen
     off[points_cam[..., 2] <= NEAR_M] = np.inf
     # A turn by w moves a point q by w x q, so the derivative is q x slope; a larger side moves q along the arm.
     by_turn = np.cross(turned[:, :, None], by_shift)
+    by_view = np.concatenate([by_turn, by_shift], axis=-1)
+    if sightings.rolls:
+        by_rate = np.cross(points_cam[:, :, None], by_shift)
+        by_motion = time_s[..., None] * np.concatenate([by_rate, by_shift], axis=-1)
+        by_view = np.concatenate([by_view, by_motion], axis=-1)
     by_point, arm = by_shift @ R[:, None], arm[:, :, None]
     inward = -outward(sightings)
     off = off - scene.inset_px[video][:, None, None] * inward
@@ -112,4 +128,4 @@ def linearised(sightings: MarkerSightings, scene: MappedScene) -> LinearisedScen
         (by_point * arm).sum(axis=-1, keepdims=True),
         inward[..., None],
     ]
-    return LinearisedScene(off, np.concatenate([by_turn, by_shift], axis=-1), np.concatenate(rest, axis=-1))
+    return LinearisedScene(off, by_view, np.concatenate(rest, axis=-1))

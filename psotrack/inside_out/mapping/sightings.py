@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -11,12 +13,15 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack.errors import InputError
 from psotrack.geometry import Camera, undistort
-from psotrack.inside_out.detection import MarkerDetector
+from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
+from psotrack.inside_out.pose import RollingShutter, row_times_s
 from psotrack.recordings import VideoInfo, read_frames
 from psotrack.support import Report, no_progress
 
 #: Corners of a marker with sides of 1 in its own axes, x to its right, y up, z out of the print, in OpenCV's order.
 SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
+#: Number of runs of consecutive frames, their length, and the number of a video's first frames in which they lie.
+_RUNS, _RUN_FRAMES, _SEARCHED_FRAMES = 8, 9, 1500
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,9 @@ class MarkerSightings:
         marker: (sightings,), ids. No view has a marker twice.
         corners_px: (sightings, 4, 2), pixels.
         name: name of the videos, for messages.
+        shutters: rolling shutters of the videos' cameras; None is a global shutter, and so is an empty tuple for all.
+        consecutive: frames of each video that follow one another, number, time (seconds) and markers, to estimate its
+            line time; empty where the views follow one another, and for all videos where it is not to be estimated.
     """
 
     lenses: tuple[Camera, ...]
@@ -57,6 +65,23 @@ class MarkerSightings:
     marker: Int[np.ndarray, " sightings"]
     corners_px: Float[np.ndarray, "sightings 4 2"]
     name: str = "video"
+    shutters: tuple[RollingShutter | None, ...] = ()
+    consecutive: tuple[tuple[tuple[int, float, DetectedMarkers], ...], ...] = ()
+
+    @property
+    def rolls(self) -> bool:
+        """Whether any camera has a rolling shutter."""
+        return any(shutter is not None and shutter.line_time_s for shutter in self.shutters)
+
+    @cached_property
+    def row_times_s(self) -> Float[np.ndarray, "sightings 4"]:
+        """(sightings, 4), when the row of each corner was exposed, after the middle row of its image, seconds."""
+        time_s = np.zeros(self.corners_px.shape[:2])
+        for index, (lens, shutter) in enumerate(zip(self.lenses, self.shutters, strict=False)):
+            if shutter is not None:
+                rows = self.lens[self.view] == index
+                time_s[rows] = row_times_s(self.corners_px[rows], lens, shutter.line_time_s)
+        return time_s
 
     @property
     def num_views(self) -> int:
@@ -79,6 +104,8 @@ class MarkerSightings:
             self.marker[kept],
             self.corners_px[kept],
             self.name,
+            self.shutters,
+            self.consecutive,
         )
 
 
@@ -87,6 +114,7 @@ def find_sightings(
     dictionary: str = "4x4_1000",
     *,
     most_frames: int = 300,
+    consecutive: bool = False,
     report: Report = no_progress,
 ) -> MarkerSightings:
     """Find the markers in videos of one room.
@@ -96,6 +124,8 @@ def find_sightings(
         dictionary: name of the markers' dictionary, such as 4x4_50.
         most_frames: largest number of frames of a video that are searched, evenly spread: neighbouring frames show the
             same.
+        consecutive: also search frames that follow one another, where others were left out, to see whether the shutter
+            rolls.
         report: progress is reported to it.
 
     Raises:
@@ -122,7 +152,25 @@ def find_sightings(
                 seen.append(FrameMarkers(source, index * step / video.fps, found.ids, found.corners_px))
                 advance(1)
     name = ", ".join(str(video.path) for video, _ in videos)
-    return collect_sightings(seen, [lens for _, lens in videos], name)
+    sightings = collect_sightings(seen, [lens for _, lens in videos], name)
+    if not consecutive:
+        return sightings
+    followed = [
+        () if step == 1 else tuple(_consecutive(video, detector))
+        for (video, _), step, detector in zip(videos, steps, detectors, strict=True)
+    ]
+    return replace(sightings, consecutive=tuple(followed))
+
+
+def _consecutive(video: VideoInfo, detector: MarkerDetector) -> Iterator[tuple[int, float, DetectedMarkers]]:
+    """Markers in runs of frames, spread over the beginning of a video."""
+    first_frames = min(video.num_frames, _SEARCHED_FRAMES)
+    starts = np.linspace(0, max(first_frames - _RUN_FRAMES, 0), _RUNS).astype(int)
+    chosen = set((starts[:, None] + np.arange(_RUN_FRAMES)).ravel().tolist())
+    for number, frame in enumerate(islice(read_frames(video), first_frames)):
+        if number in chosen:
+            gray = np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), np.uint8)
+            yield number, number / video.fps, detector.detect(gray)
 
 
 def collect_sightings(

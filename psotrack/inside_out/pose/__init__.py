@@ -9,6 +9,21 @@ an initial pose); `initial_poses` (poses by closed-form solvers); `estimating` (
 """
 
 from psotrack.inside_out.pose.estimating import estimate_pose
-from psotrack.inside_out.pose.records import ExpectedPose, MarkerPose, PoseSettings
+from psotrack.inside_out.pose.records import (
+    ExpectedMotion,
+    ExpectedPose,
+    MarkerPose,
+    PoseSettings,
+    RollingShutter,
+)
+from psotrack.inside_out.pose.row_motion import row_times_s
 
-__all__ = ["ExpectedPose", "MarkerPose", "PoseSettings", "estimate_pose"]
+__all__ = [
+    "ExpectedMotion",
+    "ExpectedPose",
+    "MarkerPose",
+    "PoseSettings",
+    "RollingShutter",
+    "estimate_pose",
+    "row_times_s",
+]

@@ -7,10 +7,11 @@ and the focal length, and derivatives S by a marker's place, the cost is
 
     Σ |r - J x - S d|² / own² + Σ |d|² / place² + (inset / its deviation)² + (focal length / its deviation)².
 
-The places d are eliminated (`psotrack.estimation`). Both variances, own² and place², are estimated from the residuals
-and from the number of unknowns that the data determine (MacKay, Bayesian interpolation, Neural Computation 4(3), 1992),
-with a scaled inverse χ² prior. The principal point is not an unknown, because a turn of the camera has almost the same
-effect, except at the edge of a wide image.
+Where the shutter rolls, the velocity and the turn rate of the camera are six more unknowns (see `row_motion`), with the
+prior that the motion gives. The places d are eliminated (`psotrack.estimation`). Both variances, own² and place², are
+estimated from the residuals and from the number of unknowns that the data determine (MacKay, Bayesian interpolation,
+Neural Computation 4(3), 1992), with a scaled inverse χ² prior. The principal point is not an unknown, because a turn of
+the camera has almost the same effect, except at the edge of a wide image.
 """
 
 from __future__ import annotations
@@ -23,11 +24,14 @@ from jaxtyping import Bool, Float
 from psotrack.calibration import reproject
 from psotrack.estimation import NormalEquations, covariance_from_information
 from psotrack.geometry import NEAR_M, Camera
+from psotrack.inside_out.pose.row_motion import RowMotion, UnsureRows, at_rows, slopes_by_motion
 
 #: Standard deviation of the inset, px.
 INSET_STD_PX = 0.5
 #: Prior information on the inset and on the focal length, whose unit is its stated standard deviation.
-_PRIOR = np.array([1 / INSET_STD_PX**2, 1.0])
+_PRIOR = np.diag([1 / INSET_STD_PX**2, 1.0])
+#: Number of unknowns of the pose.
+POSE_SIZE = 6
 #: Weight of a stated variance, as a number of residuals.
 PRIOR_RESIDUALS = 3.0
 #: Ratio of an unknown's variance to its variance if all others were known, above which the pose is undetermined.
@@ -47,6 +51,8 @@ class SeenCorners:
         place_m: stated standard deviation of a marker's place along each axis, metres.
         map_share: share of the variance of a marker's place that comes from the map and is the same in every frame.
         focal_error: stated standard deviation of the focal length, as a share of the focal length.
+        rows: when the corners were exposed, and the motion that is expected; None of a global shutter.
+        unsure: by how much these times may be wrong; None if the line time is exact.
     """
 
     corners_px: Float[np.ndarray, "markers 4 2"]
@@ -57,6 +63,22 @@ class SeenCorners:
     place_m: float
     map_share: float
     focal_error: float
+    rows: RowMotion | None = None
+    unsure: UnsureRows | None = None
+
+    @property
+    def prior_information(self) -> Float[np.ndarray, "extra extra"]:
+        """(extra, extra), prior information on inset and focal length, and on the motion of a rolling shutter."""
+        if self.rows is None:
+            return _PRIOR
+        information = np.zeros((8, 8))
+        information[:2, :2], information[2:, 2:] = _PRIOR, self.rows.information
+        return information
+
+    @property
+    def expected_extra(self) -> Float[np.ndarray, "extra"]:
+        """(extra,), prior means of these unknowns."""
+        return np.zeros(2) if self.rows is None else np.append(np.zeros(2), self.rows.expected)
 
 
 @dataclass(frozen=True)
@@ -86,49 +108,56 @@ class Solution:
     """Solution of the equations of one frame.
 
     Attributes:
-        step: (8,), step of position along the world's axes (m), turn about the camera's axes (rad), inset (px), and
-            focal length (stated standard deviations).
-        covariance: (8, 8), covariance of these unknowns.
+        step: (unknowns,), step of position along the world's axes (m), turn about the camera's axes (rad), inset (px),
+            and focal length (stated standard deviations); of a rolling shutter also of the motion (`RowMotion`).
+        covariance: (unknowns, unknowns), covariance of these unknowns.
         length: squared length of the step in standard deviations.
         places_m2: (markers, 3, 3), covariances of the markers' places if the pose were known.
     """
 
-    step: Float[np.ndarray, "8"]
-    covariance: Float[np.ndarray, "8 8"]
+    step: Float[np.ndarray, "unknowns"]
+    covariance: Float[np.ndarray, "unknowns unknowns"]
     length: float
     places_m2: Float[np.ndarray, "markers 3 3"]
 
 
 @dataclass(frozen=True)
 class Sums:
-    """Sums over the equations of the used corners, each a row of 8 derivatives and a residual.
+    """Sums over the equations of the used corners, each a row of derivatives by the unknowns and a residual.
 
     Attributes:
-        total: (9, 9), rows multiplied with their transposes, sum over all rows.
-        by_place: (markers, 3, 9), derivatives by a marker's place multiplied with the rows, sums over each marker.
+        total: (unknowns + 1, unknowns + 1), rows multiplied with their transposes, sum over all rows.
+        by_place: (markers, 3, unknowns + 1), derivatives by a marker's place multiplied with the rows, sums over each
+            marker.
         count: number of equations.
     """
 
-    total: Float[np.ndarray, "9 9"]
-    by_place: Float[np.ndarray, "markers 3 9"]
+    total: Float[np.ndarray, "columns columns"]
+    by_place: Float[np.ndarray, "markers 3 columns"]
     count: int
 
-    def solved(self, noise: Noise, extra: Float[np.ndarray, "2"]) -> Solution | None:
+    def solved(
+        self,
+        noise: Noise,
+        prior_information: Float[np.ndarray, "extra extra"],
+        off_prior: Float[np.ndarray, "extra"],
+    ) -> Solution | None:
         """Minimise the cost over the linear equations; None if the equations do not determine the pose.
 
         Args:
             noise: variances of the errors.
-            extra: (2,), inset and focal length at which the equations were made.
+            prior_information: (extra, extra), prior information on the unknowns after those of the pose.
+            off_prior: (extra,), values of these unknowns at which the equations were made, less their prior means.
         """
         total, by_place = self.total / noise.own_px2, self.by_place / noise.own_px2
         equations = NormalEquations(
-            information=total[:8, :8],
-            right=total[:8, 8],
+            information=total[:-1, :-1],
+            right=total[:-1, -1],
             block_information=by_place[..., :3] + np.eye(3) / noise.place_m2,
-            block_right=by_place[..., 8],
-            coupling=by_place[..., :8],
+            block_right=by_place[..., -1],
+            coupling=by_place[..., :-1],
         )
-        reduced = with_prior(equations, extra).reduced()
+        reduced = with_prior(equations, prior_information, off_prior).reduced()
         try:
             covariance = covariance_from_information(reduced.information, _LARGEST_INFLATION)
         except np.linalg.LinAlgError:
@@ -147,11 +176,12 @@ class Sums:
         left = np.append(-solution.step, 1.0)
         gain = solution.places_m2 @ self.by_place / noise.own_px2
         off_m = gain @ left
-        gain = gain[..., :8]
+        gain = gain[..., :-1]
         uncertain_m2 = np.trace(solution.places_m2, axis1=1, axis2=2).sum()
         uncertain_m2 += np.sum((gain @ solution.covariance) * gain)
         of_places = max(off_m.size - uncertain_m2 / noise.place_m2, 0.0)
-        of_pose = 8 - _PRIOR @ solution.covariance.diagonal()[6:]
+        by_prior = np.sum(seen.prior_information * solution.covariance[POSE_SIZE:, POSE_SIZE:])
+        of_pose = len(solution.step) - by_prior
         own_freedom = PRIOR_RESIDUALS + max(self.count - of_pose - of_places, 0.0)
         place_freedom = PRIOR_RESIDUALS + of_places
         square = left @ self.total @ left - 2 * np.sum(off_m * (self.by_place @ left))
@@ -163,31 +193,39 @@ class Sums:
             place_freedom,
         )
 
-    def common(self, solution: Solution, noise: Noise, map_share: float) -> Float[np.ndarray, "6 errors"]:
-        """Effect on the pose of one standard deviation of each error that is the same in all frames.
+    def common(
+        self, solution: Solution, noise: Noise, map_share: float
+    ) -> Float[np.ndarray, "unknowns errors"]:
+        """Effect on the unknowns of one standard deviation of each error that is the same in all frames.
 
         Returns:
-            (6, 3 markers + 1), effects of an error of each marker's place in the map along x, y and z, and of an error
-            of the focal length.
+            (unknowns, 3 markers + 1), effects of an error of each marker's place in the map along x, y and z, and of an
+            error of the focal length.
         """
         # The step is linear in the residuals, and an error of a place or of the focal length adds to the residuals. The
         # derivatives by a marker's place are those by the camera's position with the opposite sign.
-        gain = solution.places_m2 @ self.by_place[..., :8] / noise.own_px2
-        places = (gain @ solution.covariance[:, :6]).reshape(-1, 6) * np.sqrt(map_share / noise.place_m2)
-        return -np.concatenate([places, solution.covariance[7:, :6]]).T
+        gain = solution.places_m2 @ self.by_place[..., :-1] / noise.own_px2
+        places = (gain @ solution.covariance).reshape(-1, len(solution.step))
+        places *= np.sqrt(map_share / noise.place_m2)
+        return -np.concatenate([places, solution.covariance[POSE_SIZE + 1 : POSE_SIZE + 2]]).T
 
 
-def with_prior(equations: NormalEquations, extra: Float[np.ndarray, "2"]) -> NormalEquations:
-    """Add the prior of inset and focal length to equations that were made at the values `extra` of both."""
+def with_prior(
+    equations: NormalEquations,
+    prior_information: Float[np.ndarray, "extra extra"],
+    off_prior: Float[np.ndarray, "extra"],
+) -> NormalEquations:
+    """Add the prior of the unknowns after the pose; the arguments are those of `Sums.solved`."""
     information, right = equations.information.copy(), equations.right.copy()
-    information[[6, 7], [6, 7]] += _PRIOR
-    right[6:8] -= _PRIOR * extra
+    information[POSE_SIZE:, POSE_SIZE:] += prior_information
+    right[POSE_SIZE:] -= prior_information @ off_prior
     return replace(equations, information=information, right=right)
 
 
-def log_prior(extra: Float[np.ndarray, "2"]) -> float:
-    """Logarithm of the prior density of inset and focal length, without its constant."""
-    return -0.5 * float(_PRIOR @ extra**2)
+def log_prior(seen: SeenCorners, extra: Float[np.ndarray, "extra"]) -> float:
+    """Logarithm of the prior density of the unknowns after the pose, without its constant."""
+    off = extra - seen.expected_extra
+    return -0.5 * float(off @ seen.prior_information @ off)
 
 
 def seen_markers(
@@ -212,15 +250,26 @@ def equations(
     seen: SeenCorners,
     position_m: Float[np.ndarray, "3"],
     R_world_cam: Float[np.ndarray, "3 3"],
-    extra: Float[np.ndarray, "2"],
-) -> tuple[Float[np.ndarray, "markers 4 2 9"], Float[np.ndarray, "markers 4"]]:
+    extra: Float[np.ndarray, "extra"],
+) -> tuple[Float[np.ndarray, "markers 4 2 columns"], Float[np.ndarray, "markers 4"]]:
     """Linearise the projections of all corners.
 
+    Args:
+        seen: markers of the frame.
+        position_m, R_world_cam: pose of the camera; of a rolling shutter at the reference row.
+        extra: (extra,), inset and focal length, and of a rolling shutter the motion.
+
     Returns:
-        (markers, 4, 2, 9), derivatives of each pixel by position, turn, inset and focal length, and its residual,
+        (markers, 4, 2, unknowns + 1), derivatives of each pixel by position, turn and `extra`, and its residual,
         measured minus projected; and (markers, 4), depths of the corners, metres.
     """
-    x_cam = (seen.corners_m - position_m).reshape(-1, 3) @ R_world_cam
+    from_camera_m, turned = (seen.corners_m - position_m).reshape(-1, 3), None
+    if seen.rows is None:
+        x_cam = from_camera_m @ R_world_cam
+    else:
+        turned = at_rows(seen.rows.time_s.ravel(), extra[2:])
+        x_cam = ((from_camera_m - turned.moved_m) @ R_world_cam)[:, None] @ turned.R_reference_row
+        x_cam = x_cam[:, 0]
     depth_m = x_cam[:, 2].copy()
     # A corner behind the camera has no projection; a point in front of the camera keeps the numbers finite.
     x_cam[depth_m <= NEAR_M] = (0.0, 0.0, 1.0)
@@ -228,15 +277,20 @@ def equations(
     by_extra = np.stack(
         [seen.inward.reshape(-1, 2), seen.focal_error * (pixels - seen.lens.K[:2, 2])], axis=-1
     )
-    off_px = seen.corners_px.reshape(-1, 2) - pixels - by_extra @ extra
-    rows = np.concatenate([-by_shift @ R_world_cam.T, -by_turn, by_extra, off_px[..., None]], axis=-1)
+    off_px = seen.corners_px.reshape(-1, 2) - pixels - by_extra @ extra[:2]
+    if turned is None:
+        columns = [-by_shift @ R_world_cam.T, -by_turn, by_extra, off_px[..., None]]
+    else:
+        by_pose, by_motion = slopes_by_motion(by_shift, -by_turn, R_world_cam, turned)
+        columns = [by_pose, by_extra, by_motion, off_px[..., None]]
+    rows = np.concatenate(columns, axis=-1)
     shape = seen.corners_px.shape[:2]
-    return rows.reshape(*shape, 2, 9), depth_m.reshape(shape)
+    return rows.reshape(*shape, 2, -1), depth_m.reshape(shape)
 
 
-def summed(rows: Float[np.ndarray, "markers 4 2 9"], fits: Bool[np.ndarray, "markers 4"]) -> Sums:
+def summed(rows: Float[np.ndarray, "markers 4 2 columns"], fits: Bool[np.ndarray, "markers 4"]) -> Sums:
     """Sum the equations of the corners that fit."""
-    chosen = (rows * fits[..., None, None]).reshape(-1, 8, 9)
+    chosen = (rows * fits[..., None, None]).reshape(-1, 8, rows.shape[-1])
     transposed = chosen.swapaxes(1, 2)
     return Sums((transposed @ chosen).sum(axis=0), transposed[:, :3] @ chosen, 2 * int(fits.sum()))
 

@@ -20,13 +20,22 @@ from psotrack.geometry import Camera, undistort
 from psotrack.inside_out.pose.equations import SeenCorners, seen_markers
 from psotrack.inside_out.pose.fit import Fit, fit
 from psotrack.inside_out.pose.initial_poses import LOOSE, mirrored_poses, pose_of_all, poses_of_pairs
-from psotrack.inside_out.pose.records import ExpectedPose, MarkerPose, PoseSettings
+from psotrack.inside_out.pose.records import (
+    ExpectedMotion,
+    ExpectedPose,
+    MarkerPose,
+    PoseSettings,
+    RollingShutter,
+)
+from psotrack.inside_out.pose.row_motion import RowMotion, UnsureRows, at_rows, row_times_s
 
 #: Number of markers that suffices for a pose; in frames of fewer than eight markers, half of the markers suffice.
 _ENOUGH_MARKERS = 4
 #: Logarithm of the density of a pose that is not where motion predicts it: in 1 of 1000 frames the camera is anywhere
 #: in 1000 m³, in any orientation.
 _LOG_UNEXPECTED = -log(1e3 * 1e3 * 8 * pi**2)
+#: Velocity (m/s) and turn rate (rad/s) along each axis where nothing is known of the motion.
+_UNKNOWN_MOTION = ExpectedMotion(np.zeros(6), np.diag(np.repeat([5.0, 3.0], 3) ** 2.0))
 #: Squared Mahalanobis distance of two poses below which they are one pose: χ² with 6 degrees of freedom exceeds it
 #: with probability 1/1000.
 _SAME = 22.5
@@ -38,6 +47,8 @@ def estimate_pose(
     lens: Camera,
     settings: PoseSettings,
     expected: ExpectedPose | None = None,
+    shutter: RollingShutter | None = None,
+    motion: ExpectedMotion | None = None,
 ) -> MarkerPose | None:
     """Estimate the pose of a camera from one frame's markers; whole markers and single corners may be wrong.
 
@@ -47,6 +58,9 @@ def estimate_pose(
         lens: intrinsics of the camera; the pose in it is ignored.
         settings: settings of pose estimation.
         expected: pose that motion predicts; decides between poses that fit about equally well.
+        shutter: the rolling shutter, with which the pose is that of the image's middle row; None is a global shutter.
+        motion: expected motion during the frame; None if nothing is known of the motion. A global shutter does not use
+            it.
 
     Returns:
         The pose; None where there are too few markers, or no pose explains the markers.
@@ -60,10 +74,15 @@ def estimate_pose(
     is_shown = np.isfinite(rays).all(axis=(1, 2))
     if not is_shown.all():
         # A marker where the lens model shows nothing counts as not seen.
-        pose = estimate_pose(corners_px[is_shown], corners_m[is_shown], lens, settings, expected)
+        pose = estimate_pose(
+            corners_px[is_shown], corners_m[is_shown], lens, settings, expected, shutter, motion
+        )
         return None if pose is None else _among_all(pose, is_shown)
     if len(corners_px) < settings.min_markers:
         return None
+    rows, unsure = _row_times(corners_px, lens, shutter, motion or _UNKNOWN_MOTION)
+    if rows is not None:
+        rays = _at_reference_row(rays, rows)
     corners = seen_markers(
         np.asarray(corners_px, np.float64),
         np.asarray(corners_m, np.float64),
@@ -73,6 +92,7 @@ def estimate_pose(
         settings.map_error_m,
         settings.focal_error,
     )
+    corners = replace(corners, rows=rows, unsure=unsure)
     poses = _likely_poses(corners, rays)
     # One or two of many markers may agree by chance, because every single marker has a pose that explains this marker.
     poses = [pose for pose in poses if pose.used.sum() >= min(_ENOUGH_MARKERS, len(corners_px) / 2)]
@@ -90,7 +110,36 @@ def estimate_pose(
         float(odds / (1 + odds)),
         best.common,
         _chance(corners, best),
+        best.motion,
+        best.by_line_time,
     )
+
+
+def _row_times(
+    corners_px: Float[np.ndarray, "markers 4 2"],
+    lens: Camera,
+    shutter: RollingShutter | None,
+    motion: ExpectedMotion,
+) -> tuple[RowMotion | None, UnsureRows | None]:
+    """Times of the corners' rows, and the uncertainty of these times; None for what a shutter does not have."""
+    if shutter is None:
+        return None, None
+    rows = unsure = None
+    if shutter.line_time_s:
+        time_s = row_times_s(corners_px, lens, shutter.line_time_s)
+        rows = RowMotion(time_s, motion.motion, np.linalg.inv(motion.covariance))
+    if shutter.std_s:
+        unsure = UnsureRows(row_times_s(corners_px, lens, shutter.std_s), motion.motion)
+    return rows, unsure
+
+
+def _at_reference_row(
+    rays: Float[np.ndarray, "markers 4 2"], rows: RowMotion
+) -> Float[np.ndarray, "markers 4 2"]:
+    """Rays turned by the expected turn between the rows, for initial poses."""
+    turned = at_rows(rows.time_s.ravel(), rows.expected).R_reference_row
+    along = turned @ np.append(rays, np.ones((*rays.shape[:2], 1)), axis=-1).reshape(-1, 3, 1)
+    return (along[:, :2, 0] / np.maximum(along[:, 2], 1e-9)).reshape(rays.shape)
 
 
 def _among_all(pose: MarkerPose, is_shown: Bool[np.ndarray, " markers"]) -> MarkerPose:
@@ -99,9 +148,15 @@ def _among_all(pose: MarkerPose, is_shown: Bool[np.ndarray, " markers"]) -> Mark
     used[is_shown] = pose.used
     if not pose.common.size:
         return replace(pose, used=used)
-    common = np.zeros((6, 3 * len(is_shown) + 1))
-    common[:, np.append(np.repeat(is_shown, 3), True)] = pose.common
-    return replace(pose, used=used, common=common)
+
+    def widened(common: Float[np.ndarray, "unknowns errors"]) -> Float[np.ndarray, "unknowns others"]:
+        others = common.shape[1] - 3 * int(is_shown.sum())
+        wide = np.zeros((len(common), 3 * len(is_shown) + others))
+        wide[:, np.append(np.repeat(is_shown, 3), np.ones(others, bool))] = common
+        return wide
+
+    motion = pose.motion and replace(pose.motion, common=widened(pose.motion.common))
+    return replace(pose, used=used, common=widened(pose.common), motion=motion)
 
 
 def _chance(corners: SeenCorners, best: Fit) -> float:

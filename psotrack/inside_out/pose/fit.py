@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Shaped
 from psotrack.calibration import spread_px
 from psotrack.estimation import NormalEquations, cauchy_weight, gauss_newton
 from psotrack.geometry import NEAR_M
+from psotrack.inside_out.frame_motion import FrameMotion
 from psotrack.inside_out.pose.equations import (
     PRIOR_RESIDUALS,
     Noise,
@@ -29,6 +30,7 @@ from psotrack.inside_out.pose.equations import (
     summed,
     with_prior,
 )
+from psotrack.inside_out.pose.frame_motion import frame_motion, line_time_effect
 
 #: Probability that a good corner, or the mean of a good marker, is rejected as an outlier.
 FALSE_ALARM = 1e-3
@@ -67,6 +69,9 @@ class Fit:
         fits: (markers, 4), True for corners that fit the pose.
         reprojection_px: root mean square distance of these corners in the image.
         log_evidence: logarithm of the probability density of all corners, integrated over poses near this pose.
+        motion: what a frame of a rolling shutter says about pose and motion together; None of a global shutter.
+        by_line_time: (6,), change of the pose by an error of the line time of one standard deviation; None if the line
+            time is exact.
     """
 
     position_m: Float[np.ndarray, "3"]
@@ -76,6 +81,8 @@ class Fit:
     fits: Bool[np.ndarray, "markers 4"]
     reprojection_px: float
     log_evidence: float
+    motion: FrameMotion | None = None
+    by_line_time: Float[np.ndarray, "6"] | None = None
 
     @property
     def used(self) -> Bool[np.ndarray, "markers"]:
@@ -100,7 +107,7 @@ def fit(
     Returns:
         The fit; None if the markers do not determine the pose, or no pose explains the markers.
     """
-    pose = _Pose(position_m, R_world_cam, np.zeros(2))
+    pose = _Pose(position_m, R_world_cam, seen.expected_extra)
     if fits is None:
         start = _RobustFit(seen, pose, np.zeros(seen.corners_px.shape[:2], bool), np.inf)
         robust = gauss_newton(start, max_steps=_MAX_STEPS)
@@ -119,13 +126,13 @@ def fit(
 
 @dataclass(frozen=True)
 class _Pose:
-    """A pose as in `Fit`, with the inset (px) and the focal length (stated standard deviations) in `extra`, (2,)."""
+    """A pose as in `Fit`; `extra` has the inset (px), the focal length (stated standard deviations), and the motion."""
 
     position_m: Float[np.ndarray, "3"]
     R_world_cam: Float[np.ndarray, "3 3"]
-    extra: Float[np.ndarray, "2"]
+    extra: Float[np.ndarray, "extra"]
 
-    def moved(self, step: Float[np.ndarray, "8"], depth_m: Float[np.ndarray, "markers 4"]) -> _Pose:
+    def moved(self, step: Float[np.ndarray, "unknowns"], depth_m: Float[np.ndarray, "markers 4"]) -> _Pose:
         """Take a step, shortened to the longest step; `depth_m` are the depths of the corners, metres."""
         distance_m = np.maximum(depth_m, NEAR_M).mean()
         longest = max(np.linalg.norm(step[:3]) / distance_m, np.linalg.norm(step[3:6]), _LONGEST)
@@ -154,16 +161,20 @@ class _RobustFit:
         """Take a step with weights whose scale is the median of the distances."""
         pose = self.pose
         rows, depth_m = equations(self.seen, pose.position_m, pose.R_world_cam, pose.extra)
-        distance_px = np.where(depth_m > NEAR_M, np.linalg.norm(rows[..., 8], axis=-1), np.inf)
+        distance_px = np.where(depth_m > NEAR_M, np.linalg.norm(rows[..., -1], axis=-1), np.inf)
         scale_px = max(self.seen.noise_px, spread_px(distance_px.ravel(), 6))
         fits = distance_px < _WITHIN * scale_px
         stopped = _RobustFit(self.seen, pose, fits, 0.0)
         if not np.isfinite(scale_px):
             return stopped
         weighted = rows * np.sqrt(cauchy_weight((distance_px / scale_px) ** 2))[..., None, None] / scale_px
-        weighted = weighted.reshape(-1, 9)
+        weighted = weighted.reshape(-1, rows.shape[-1])
         total = weighted.T @ weighted
-        normal = with_prior(NormalEquations(total[:8, :8], total[:8, 8]), pose.extra)
+        normal = with_prior(
+            NormalEquations(total[:-1, :-1], total[:-1, -1]),
+            self.seen.prior_information,
+            pose.extra - self.seen.expected_extra,
+        )
         try:
             step = normal.solved().shared
         except np.linalg.LinAlgError:
@@ -183,12 +194,14 @@ class _LastStep:
         off_px: (markers, 4, 2), linearised residuals after the step.
         sums: sums of the equations.
         solution: the step.
+        rows: (markers, 4, 2, unknowns + 1), the equations of all corners.
     """
 
     fits: Bool[np.ndarray, "markers 4"]
     off_px: Float[np.ndarray, "markers 4 2"]
     sums: Sums
     solution: Solution
+    rows: Float[np.ndarray, "markers 4 2 columns"]
 
 
 @dataclass(frozen=True)
@@ -217,14 +230,14 @@ class _NoiseFit:
         rows, depth_m = equations(self.seen, pose.position_m, pose.R_world_cam, pose.extra)
         is_ahead = depth_m > NEAR_M
         sums = summed(rows, fits & is_ahead)
-        solution = sums.solved(noise, pose.extra)
+        solution = sums.solved(noise, self.seen.prior_information, pose.extra - self.seen.expected_extra)
         if solution is None:
             raise np.linalg.LinAlgError("expected markers that determine the pose")
         off_px = rows @ np.append(-solution.step, 1.0)
         still_fits = fits & is_ahead
         if self.number > 0:
             # Corners are judged by the noise that the residuals show; in the first step only the stated noise is known.
-            still_fits = _explained(off_px, rows[..., :8], is_ahead, fits, solution.covariance, noise)
+            still_fits = _explained(off_px, rows[..., :-1], is_ahead, fits, solution.covariance, noise)
         if self.number >= _NO_RETURN:
             # The gates depend on the fit and the fit on the gates. A corner that alternates stays out.
             still_fits &= fits
@@ -234,7 +247,7 @@ class _NoiseFit:
             still_fits,
             sums.noise(solution, noise, self.seen),
             self.number + 1,
-            _LastStep(fits, off_px, sums, solution),
+            _LastStep(fits, off_px, sums, solution, rows),
         )
 
     def is_settled(self, before: _NoiseFit) -> bool:
@@ -247,30 +260,45 @@ def _fitted(seen: SeenCorners, pose: _Pose, last: _LastStep, noise: Noise) -> Fi
     """Make the result from the last step and the noise; None if the residuals are too large for a usable pose."""
     fits, off_px, sums = last.fits, last.off_px, last.sums
     widened = noise.widened()
-    solution: Solution | None = sums.solved(widened, pose.extra)
+    off_prior = pose.extra - seen.expected_extra
+    solution: Solution | None = sums.solved(widened, seen.prior_information, off_prior)
     too_large = noise.own_px2 > (_LARGEST_NOISE_SCALE * seen.noise_px) ** 2
     if solution is None or too_large or noise.place_m2 > _LARGEST_PLACE_M**2:
         return None
     covariance = solution.covariance[:6, :6]
+    motion, by_line_time = None, None
+    if seen.rows is not None:
+        motion = frame_motion(seen, sums, last.rows, fits, widened, pose.extra)
+        if motion is None:
+            return None
+    if seen.unsure is not None:
+        assumed = seen.unsure.expected if motion is None else motion.assumed
+        effect = line_time_effect(seen, last.rows, fits, widened, assumed, seen.prior_information)
+        if effect is None:
+            return None
+        by_line_time = effect[:6]
+    whole = covariance if by_line_time is None else covariance + np.outer(by_line_time, by_line_time)
     # The inset is an error of the measurement, so the reported distances are without the inset.
     distance_px = np.linalg.norm(off_px + pose.extra[0] * seen.inward, axis=-1)[fits]
     return Fit(
         pose.position_m,
         pose.R_world_cam,
-        covariance,
-        sums.common(solution, widened, seen.map_share),
+        whole,
+        sums.common(solution, widened, seen.map_share)[:6],
         fits,
         float(np.sqrt(np.mean(distance_px**2))),
-        _log_evidence(off_px[fits], fits.size, covariance, seen.noise_px) + log_prior(pose.extra),
+        _log_evidence(off_px[fits], fits.size, covariance, seen.noise_px) + log_prior(seen, pose.extra),
+        motion,
+        by_line_time,
     )
 
 
 def _explained(
     off_px: Float[np.ndarray, "markers 4 2"],
-    slopes: Float[np.ndarray, "markers 4 2 8"],
+    slopes: Float[np.ndarray, "markers 4 2 unknowns"],
     ahead: Bool[np.ndarray, "markers 4"],
     fits: Bool[np.ndarray, "markers 4"],
-    covariance: Float[np.ndarray, "8 8"],
+    covariance: Float[np.ndarray, "unknowns unknowns"],
     noise: Noise,
 ) -> Bool[np.ndarray, "markers 4"]:
     """(markers, 4), True if the studentised residuals of the corner and of its marker's mean are in the gate."""
@@ -289,9 +317,9 @@ def _explained(
 
 def _within(
     off_px: Float[np.ndarray, "*items 2"],
-    slopes: Float[np.ndarray, "*items 2 8"],
+    slopes: Float[np.ndarray, "*items 2 unknowns"],
     count: Shaped[np.ndarray, "*items"],
-    covariance: Float[np.ndarray, "8 8"],
+    covariance: Float[np.ndarray, "unknowns unknowns"],
     noise: Noise,
     fitted: Bool[np.ndarray, "*items"],
 ) -> Bool[np.ndarray, "*items"]:
@@ -301,15 +329,15 @@ def _within(
 
     Args:
         off_px: (items, 2), residuals, each the mean over corners.
-        slopes: (items, 2, 8), derivatives, the same means.
+        slopes: (items, 2, unknowns), derivatives, the same means.
         count: (items,), number of corners of each mean.
-        covariance: (8, 8), covariance of the unknowns.
+        covariance: (unknowns, unknowns), covariance of the unknowns.
         noise: variances of the errors.
         fitted: (items,), True for items that were used in the fit.
     """
     own_px2 = noise.own_px2 / count
     by_place = slopes[..., :3]
-    half = (slopes.reshape(-1, 8) @ covariance).reshape(slopes.shape)
+    half = (slopes.reshape(-1, len(covariance)) @ covariance).reshape(slopes.shape)
     sign = np.where(fitted, -1.0, 1.0)
     of_place = noise.place_m2 * (by_place * by_place).sum(axis=-1)
     variance = of_place + sign[..., None] * (half * slopes).sum(axis=-1)

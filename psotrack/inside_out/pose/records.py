@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from psotrack.errors import SettingsError, check_positive
+from psotrack.inside_out.frame_motion import FrameMotion
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,33 @@ class PoseSettings:
 
 
 @dataclass(frozen=True)
+class RollingShutter:
+    """Rolling shutter of a camera: its rows are exposed one after the other.
+
+    Attributes:
+        line_time_s: time from the exposure of one row to that of the next row, seconds; negative if the rows are
+            exposed from the last row to the first.
+        std_s: standard deviation of the line time, seconds.
+    """
+
+    line_time_s: float
+    std_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class ExpectedMotion:
+    """Motion of a camera as the frames before predict it.
+
+    Attributes:
+        motion: (6,), velocity along the world's axes (m/s) and turn rate about the camera's axes (rad/s).
+        covariance: (6, 6), its covariance.
+    """
+
+    motion: Float[np.ndarray, "6"]
+    covariance: Float[np.ndarray, "6 6"]
+
+
+@dataclass(frozen=True)
 class ExpectedPose:
     """Pose of a camera as its motion predicts it.
 
@@ -75,6 +103,10 @@ class MarkerPose:
             to all frames: one column per axis of each marker's position in the map, and one for the focal length, each
             for an error of one standard deviation.
         chance: upper bound on the probability that the used markers agree by chance although all ids are wrong.
+        motion: of a rolling shutter, what the frame says about pose and motion; None of a global shutter. Columns of
+            its `common` are those of `common`, and one for the line time if `by_line_time` is not None.
+        by_line_time: (6,), change of the pose by an error of the line time of one standard deviation; None if the line
+            time is exact.
     """
 
     position_m: Float[np.ndarray, "3"]
@@ -85,3 +117,5 @@ class MarkerPose:
     ambiguity: float
     common: Float[np.ndarray, "6 errors"]
     chance: float
+    motion: FrameMotion | None = None
+    by_line_time: Float[np.ndarray, "6"] | None = None

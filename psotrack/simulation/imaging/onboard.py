@@ -2,7 +2,8 @@
 
 Each frame is the mean of several drawings with different sample positions in the pixel and different times in the
 exposure, which gives anti-aliasing and motion blur together. The drone that carries the camera is not drawn, because a
-camera at its nose does not see it; its shadow is drawn. Reflections of the floor are not drawn.
+camera at its nose does not see it; its shadow is drawn. Reflections of the floor are not drawn. Where the shutter
+rolls, strips of the image are drawn at their own times (`strips`).
 """
 
 from __future__ import annotations
@@ -16,14 +17,16 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 from scipy.spatial.transform import Rotation
 
+from psotrack.geometry import Camera, make_camera
 from psotrack.simulation.flights.motion import quaternions_wxyz
 from psotrack.simulation.flights.planning import frame_times_s
 from psotrack.simulation.imaging import sensor
 from psotrack.simulation.imaging.backdrop import lens_blur
 from psotrack.simulation.imaging.painter import LIGHT_UNIT, RoomPainter, may_be_seen
 from psotrack.simulation.imaging.posing import PosedDrone, margin_px, pose, sample, windows
-from psotrack.simulation.imaging.raster import Pinhole, RasterView, full_view
+from psotrack.simulation.imaging.raster import Pinhole, RasterView
 from psotrack.simulation.imaging.shadows import FloorLight
+from psotrack.simulation.imaging.strips import LensStrips, Strip, strips
 from psotrack.simulation.scenarios import OnboardCamera
 from psotrack.simulation.scene import Scene, image_size_wh
 from psotrack.simulation.world.rooms import room
@@ -59,6 +62,9 @@ class OnboardRenderer:
         imaging = msgspec.structs.replace(scene.scenario.imaging, shutter_s=self.onboard.shutter_s)
         stream = sensor.ONBOARD_STREAM + drone_index
         self.sensor = sensor.Sensor(imaging, scene.seed, stream, (self.height, self.width))
+        seed = [scene.seed, stream, 0, sensor.FOR_EXPOSURE]
+        self._exposure_rad = float(np.random.default_rng(seed).uniform(0, 2 * np.pi))
+        self._lens_strips = LensStrips(lens(scene))
         self._imaging = imaging
         self._floor = FloorLight(scene)
         self._painter = _room_painter(scene.scenario.hall, scene.scenario.markers, scene.scale)
@@ -69,26 +75,54 @@ class OnboardRenderer:
 
     def frame(self, frame: int) -> Image:
         """(height, width, 3), BGR image of a frame from the sensor, before the codec."""
-        return self.sensor.expose(self.clean_frame(frame), frame, self.scene.time_s(frame))
+        time_s = self.scene.time_s(frame)
+        return self.sensor.expose(self.clean_frame(frame), frame, time_s, self.exposure(time_s))
+
+    def exposure(self, time_s: float) -> float:
+        """Factor of the light by the automatic exposure, which swings between its limits."""
+        low, high = np.log(self.onboard.exposure)
+        swing = np.sin(2 * np.pi * time_s / self.onboard.exposure_period_s + self._exposure_rad)
+        return float(np.exp((low + high) / 2 + (high - low) / 2 * swing))
 
     def clean_frame(self, frame: int) -> Image:
         """(height, width, 3), BGR image of a frame without the effects of the sensor."""
         time_s = self.scene.time_s(frame)
         samples = self._samples(time_s)
-        during_s = time_s + samples[:, 2] * self.onboard.shutter_s
-        others = [i for i in range(len(self.scene.flights)) if i != self.drone_index]
-        posed = [pose(self.scene, drone, during_s) for drone in others]
+        row_px = self._row_motion_px(time_s)
         total = np.zeros((self.height, self.width, 4), np.float32)
-        light = np.empty(total.shape, np.uint16)
-        for index, cam in enumerate(self._cams(during_s)):
-            view = replace(full_view(cam), shift_px=(float(samples[index, 0]), float(samples[index, 1])))
-            self._painter.paint(view, light)
-            self._draw_drones(light, view, [_at(drone, index) for drone in posed])
-            cv2.accumulate(light, total)
-        self._cast_shadows(total, len(samples), time_s)
+        for index, drawn in enumerate(samples):
+            for strip in strips(self.height, row_px, index, len(samples)):
+                during_s = self._row_time_s(time_s, strip.middle) + float(drawn[2]) * self.onboard.shutter_s
+                light = self._strip(strip, during_s, (float(drawn[0]), float(drawn[1])))
+                cv2.accumulate(light, total[strip.rows])
+        self._cast_shadows(total, len(samples), time_s, row_px)
         blurred = lens_blur(cv2.cvtColor(total, cv2.COLOR_BGRA2BGR), self._imaging.lens_blur_px)
         mean = cv2.addWeighted(blurred, 1 / len(samples), blurred, 0.0, 0.0, dtype=cv2.CV_16U)
         return np.asarray(cv2.LUT(mean, _DISPLAY), np.uint8)
+
+    def _strip(
+        self, strip: Strip, during_s: float, shift_px: tuple[float, float]
+    ) -> UInt16[np.ndarray, "rows width 4"]:
+        """(rows, width, 4), light of a strip at one time, and the floor's share."""
+        others = [i for i in range(len(self.scene.flights)) if i != self.drone_index]
+        posed = [pose(self.scene, drone, np.array([during_s])) for drone in others]
+        parts = []
+        for index, window in self._lens_strips.views(strip, self.cam_at(during_s)):
+            view = replace(window, shift_px=shift_px)
+            light = np.empty((*view.shape, 4), np.uint16)
+            self._painter.paint(view, light)
+            self._draw_drones(light, view, posed)
+            parts.append((index, view, light))
+        return self._lens_strips.assemble(strip, parts)
+
+    def _row_time_s(self, time_s: float, row: float) -> float:
+        """When the middle of the exposure of a row is, for a frame whose middle row is exposed at `time_s`."""
+        return time_s + self.onboard.line_time_s / self.scene.scale * (row - (self.height - 1) / 2)
+
+    def _row_motion_px(self, time_s: float) -> float:
+        """Motion of the image between the exposures of two neighbouring rows, pixels, as in `_motion_px`."""
+        ends_s = np.array([self._row_time_s(time_s, row) for row in (0.0, self.height - 1.0)])
+        return self._motion_px(ends_s) / self.height if self.onboard.line_time_s else 0.0
 
     def _cams(self, time_s: Float[np.ndarray, "times"]) -> list[Pinhole]:
         position_m, to_world = _poses(self.scene, self.drone_index, time_s)
@@ -124,20 +158,28 @@ class OnboardRenderer:
                 window, np.concatenate([drone.faces_m[0] for drone in drones])
             )
             seen = sample(window, drones, 0, behind_m)
-            part = light[window.slices]
+            part = light[window.slices_in(view)]
             mixed = seen[..., 3:] * part
             mixed[..., :3] += LIGHT_UNIT * seen[..., :3]
             part[...] = (mixed + 0.5).astype(np.uint16)
 
     def _cast_shadows(
-        self, total: Float[np.ndarray, "height width 4"], num_samples: int, time_s: float
+        self, total: Float[np.ndarray, "height width 4"], num_samples: int, time_s: float, row_px: float
     ) -> None:
         """Darken the floor in a sum of samples by the shadows in the middle of the exposure."""
         if not (self._imaging.shadows or self._imaging.contact_shadows):
             return
         lost = cv2.convertScaleAbs(self._floor.floor_gain(time_s), alpha=-255, beta=255)
-        H = self._floor.to_image(self.cam_at(time_s))
-        seen = cv2.warpPerspective(lost, H, (self.width, self.height), flags=cv2.INTER_LINEAR)
+        seen = np.zeros(total.shape[:2], np.uint8)
+        for strip in strips(self.height, row_px, 0, 1):
+            parts = []
+            for index, view in self._lens_strips.views(
+                strip, self.cam_at(self._row_time_s(time_s, strip.middle))
+            ):
+                H = np.array([[1, 0, -view.x], [0, 1, -view.y], [0, 0, 1.0]]) @ self._floor.to_image(view.cam)
+                shadow = cv2.warpPerspective(lost, H, view.shape[::-1], flags=cv2.INTER_LINEAR)
+                parts.append((index, view, shadow))
+            seen[strip.rows] = self._lens_strips.assemble(strip, parts)
         # Above the horizon, a pixel's line meets the floor behind the camera; the floor's share is 0 at these pixels.
         x, y, width, height = cv2.boundingRect(seen)
         part = total[y : y + height, x : x + width]
@@ -172,10 +214,18 @@ def intrinsics(scene: Scene) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]
     return K, image_size_wh(sized, scale)
 
 
+def lens(scene: Scene) -> Camera:
+    """Lens of the on-board cameras, at the scene's scale."""
+    K, size_wh = intrinsics(scene)
+    return make_camera(
+        R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=size_wh, dist=camera_record(scene).distortion
+    )
+
+
 def onboard_poses(
     scene: Scene, drone_index: int, num_frames: int
 ) -> tuple[Float[np.ndarray, "frames 3"], Float[np.ndarray, "frames 4"]]:
-    """Poses of a drone's camera in the middle of each exposure.
+    """Poses of a drone's camera in the middle of each exposure; of a rolling shutter, of that of the middle row.
 
     Returns:
         (frames, 3), camera centres, world, metres; (frames, 4), unit quaternions (w, x, y, z), camera to world, with
@@ -202,8 +252,3 @@ def _poses(
 def _may_be_seen(posed: PosedDrone, view: RasterView) -> bool:
     points = np.concatenate([posed.faces_m, posed.discs_m], axis=1).reshape(-1, 3)
     return bool(may_be_seen((points @ view.cam.R.T + view.cam.t_m)[None], view.K, view.shape)[0])
-
-
-def _at(posed: PosedDrone, index: int) -> PosedDrone:
-    """Posed drone at one of its times."""
-    return replace(posed, faces_m=posed.faces_m[index : index + 1], discs_m=posed.discs_m[index : index + 1])

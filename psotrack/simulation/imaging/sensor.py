@@ -28,7 +28,7 @@ _TILE_UNIT = 32
 #: Mixture of independent noises in the channels, which correlates the channels.
 _CHANNEL_MIX = np.array([[0.8, 0.2, 0.1], [0.2, 0.8, 0.2], [0.1, 0.2, 0.8]], np.float32)
 #: Last number of each random seed. It is never 0, because NumPy ignores zeros at the end of a seed.
-_FOR_TILE, _FOR_FRAME, _FOR_DRIFT, _FOR_MAINS = 1, 2, 3, 4
+_FOR_TILE, _FOR_FRAME, _FOR_DRIFT, _FOR_MAINS, FOR_EXPOSURE = 1, 2, 3, 4, 5
 
 #: Steps of light in the table of grey levels; enough for the darkest grey levels, which cover a small range of light.
 _DISPLAY_STEPS = 65536
@@ -123,11 +123,11 @@ class Sensor:
         return np.maximum(drift, 0) * flicker_gain(imaging, self._mains_rad, time_s)
 
     def expose(
-        self, image: UInt8[np.ndarray, "height width 3"], frame: int, time_s: float
+        self, image: UInt8[np.ndarray, "height width 3"], frame: int, time_s: float, light: float = 1.0
     ) -> UInt8[np.ndarray, "height width 3"]:
-        """Image with the gains at a time, the noise of one frame, and JPEG compression."""
+        """Image with the gains at a time, the noise of one frame, and JPEG compression; `light` is one more gain."""
         # A factor g of light is a factor g^(1 / gamma) of grey levels.
-        levels = np.arange(256)[:, None] * self.gains(time_s) ** (1 / GAMMA)
+        levels = np.arange(256)[:, None] * (light * self.gains(time_s)) ** (1 / GAMMA)
         exposed = cv2.LUT(image, np.clip(levels.round(), 0, 255).astype(np.uint8)[None])
         if self._tile is not None:
             y, x = self._rng(_FOR_FRAME, frame).integers(0, _TILE_MARGIN_PX + 1, 2)

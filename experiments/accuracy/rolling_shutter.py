@@ -1,0 +1,227 @@
+"""The rolling shutter of an on-board camera: poses, covariances, line times and maps of markers.
+
+    python experiments/accuracy/rolling_shutter.py --folder /tmp/shutter_study
+    python experiments/accuracy/rolling_shutter.py --folder /tmp/shutter_study --seeds 1 --frames 90
+
+A camera is carried by hand through the laboratory: sinusoids from slow walking to tremor at 7 Hz. The simulator draws
+every row at its own time, with lens distortion, motion blur of 1/200 s, noise, JPEG 60 and an automatic exposure that
+swings between 0.3 and 2. Cases: a global shutter, and a rolling shutter of 20 ms whose line time is given, estimated,
+or left out on purpose (`--line-time 0`). Truths: the pose when the middle row is exposed. The videos are kept in the
+folder and drawn once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from psotrack.geometry import Camera
+from psotrack.inside_out import (
+    CameraPath,
+    LocaliseSettings,
+    MarkerMap,
+    PoseFilterParams,
+    RollingShutter,
+    build_map,
+    find_sightings,
+    localise_video,
+    open_source,
+    smooth,
+)
+from psotrack.recordings import VideoWriter, probe
+from psotrack.simulation import build, change_scenario, scenario, write_recorded_flight
+from psotrack.simulation.imaging.onboard import OnboardRenderer, lens, onboard_poses
+
+SIZE_WH, FPS, READOUT_S = (1280, 720), 30.0, 0.020
+#: Frequencies of the hand's motion, hertz, and its amplitudes, metres and radians, along and about each axis.
+_FREQUENCY_HZ = np.array([0.2, 0.6, 1.5, 3.0, 7.0])
+_MOVE_M = np.array([0.35, 0.08, 0.015, 0.003, 0.0007])
+_TURN_RAD = np.radians([12.0, 4.0, 1.2, 0.35, 0.1])
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A drawn video of one hand's motion.
+
+    Attributes:
+        video: the video.
+        camera: intrinsics of the camera.
+        marker_map: the markers of the room.
+        position_m, orientation_wxyz: (frames, 3) and (frames, 4), true poses when the middle rows are exposed.
+    """
+
+    video: Path
+    camera: Camera
+    marker_map: MarkerMap
+    position_m: Float[np.ndarray, "frames 3"]
+    orientation_wxyz: Float[np.ndarray, "frames 4"]
+
+
+def hand_motion(
+    seed: int, time_s: Float[np.ndarray, "times"]
+) -> tuple[Float[np.ndarray, "times 3"], Float[np.ndarray, "times 4"]]:
+    """Positions and orientations, body to world, of a camera in a hand."""
+    rng = np.random.default_rng(seed)
+    frequency = _FREQUENCY_HZ * rng.uniform(0.85, 1.15, (6, 5))
+    wave = np.sin(2 * np.pi * frequency * time_s[:, None, None] + rng.uniform(0, 2 * np.pi, (6, 5)))
+    towards_wall = Rotation.from_rotvec([0.0, 0.0, np.pi / 2])
+    turn = towards_wall * Rotation.from_rotvec(wave[:, 3:] @ _TURN_RAD)
+    return np.array([0.0, 0.8, 1.7]) + wave[:, :3] @ _MOVE_M, turn.as_quat(scalar_first=True)
+
+
+def draw(folder: Path, seed: int, frames: int, readout_s: float) -> Clip:
+    """Draw the video of one hand's motion, if the folder does not have it."""
+    name = f"hand{seed}_{frames}_{1e3 * readout_s:g}ms"
+    flight = folder / f"hand{seed}_{frames}.csv"
+    sampled_s = np.arange(-0.2, frames / FPS + 0.2, 1 / 200)
+    write_recorded_flight(flight, sampled_s + 0.2, *hand_motion(seed, sampled_s))
+    recipe = change_scenario(
+        scenario("S02_D4_A"),
+        {
+            "drones": [{"flight": {"kind": "recording", "file": str(flight), "start_s": 0.2}}],
+            "num_frames": frames,
+            "fps": FPS,
+            "limits.max_speed_m_s": 10.0,
+            "limits.max_acceleration_m_s2": 100.0,
+            "limits.max_tilt_deg": 80.0,
+            "imaging.jpeg_quality": 60,
+            "onboard": {
+                "image_size_wh": SIZE_WH,
+                "fov_deg": (92.45, 60.83),
+                "pitch_deg": 12.0,
+                "shutter_s": 1 / 200,
+                "distortion": (-0.1, 0.03, 0.0005, -0.0004),
+                "exposure": (0.3, 2.0),
+                "line_time_s": readout_s / SIZE_WH[1],
+            },
+        },
+    )
+    scene = build(recipe, seed=seed)
+    video = folder / f"{name}.avi"
+    if not video.exists():
+        artist = OnboardRenderer(scene, 0)
+        with VideoWriter(video, FPS, SIZE_WH) as writer:
+            for frame in range(frames):
+                writer.write(artist.frame(frame))
+    corners_m = scene.room.marker_corners_m
+    return Clip(video, lens(scene), MarkerMap(dict(corners_m)), *onboard_poses(scene, 0, frames))
+
+
+def errors(path: CameraPath, clip: Clip) -> dict[str, float]:
+    """Errors of a path, and shares of the truths in the 90 % ellipsoids of position and pose."""
+    seen = path.seen
+    off_m = clip.position_m[path.frame[seen]] - path.position_m[seen]
+    turned = Rotation.from_quat(path.orientation_wxyz[seen], scalar_first=True).inv() * Rotation.from_quat(
+        clip.orientation_wxyz[path.frame[seen]], scalar_first=True
+    )
+    off = np.concatenate([off_m, turned.as_rotvec()], axis=1)
+    covariance = path.covariance[seen]
+    inside = {}
+    for name, size in (("position", 3), ("pose", 6)):
+        part = off[:, :size]
+        squares = np.einsum("ni,nij,nj->n", part, np.linalg.inv(covariance[:, :size, :size]), part)
+        inside[name] = float(np.mean(squares < chi2.ppf(0.9, size)))
+    distance_mm = 1e3 * np.linalg.norm(off_m, axis=1)
+    return {
+        "median_mm": float(np.median(distance_mm)),
+        "p99_mm": float(np.percentile(distance_mm, 99)),
+        "turn_median_deg": float(np.degrees(np.median(turned.magnitude()))),
+        "in_90_position": inside["position"],
+        "in_90_pose": inside["pose"],
+        "seen": float(seen.mean()),
+    }
+
+
+def poses_of(clip: Clip, shutter: RollingShutter | None) -> list[dict[str, Any]]:
+    """Errors of the filter and of the smoother, and the line time."""
+    settings = LocaliseSettings(shutter=shutter)
+    began = time.perf_counter()
+    found = localise_video(open_source(clip.video), clip.marker_map, clip.camera, settings)
+    wall_s = time.perf_counter() - began
+    smoothed = smooth(found.raw, PoseFilterParams())
+    used = found.shutter
+    about = {
+        "line_time_us": 1e6 * used.line_time_s,
+        "line_time_std_us": 1e6 * used.std_s,
+        "frames_per_second": found.raw.num_frames / wall_s,
+    }
+    return [
+        {"estimate": name, **errors(path, clip), **about}
+        for name, path in (("filter", found.path), ("smoother", smoothed))
+    ]
+
+
+def map_of(clip: Clip, shutter: RollingShutter | None) -> dict[str, Any]:
+    """Errors of a map from the video of one hand's motion, given its most seen marker."""
+    sightings = find_sightings([(probe(clip.video), clip.camera)])
+    ids, counts = np.unique(sightings.marker, return_counts=True)
+    known = int(ids[counts.argmax()])
+    built = build_map(sightings, {known: clip.marker_map.corners_m[known]}, shutter=shutter)
+    off_mm, inside = [], []
+    for index, marker in enumerate(built.ids.tolist()):
+        if marker == known or built.sightings[index] < 10:
+            continue
+        off_m = built.marker_map.corners_m[marker] - clip.marker_map.corners_m[marker]
+        off_mm += (1e3 * np.linalg.norm(off_m, axis=1)).tolist()
+        centre_m, covariance = off_m.mean(axis=0), built.covariance[index][:3, :3]
+        inside.append(float(centre_m @ np.linalg.solve(covariance, centre_m)) < chi2.ppf(0.9, 3))
+    return {
+        "estimate": "map",
+        "median_mm": float(np.median(off_mm)),
+        "p99_mm": float(np.percentile(off_mm, 99)),
+        "in_90_position": float(np.mean(inside)),
+        "markers": len(inside),
+    }
+
+
+def rows_of(folder: Path, frames: int, seed: int) -> list[dict[str, Any]]:
+    """All figures of one hand's motion."""
+    line_time_s = READOUT_S / SIZE_WH[1]
+    cases = (
+        ("global", 0.0, None),
+        ("given", READOUT_S, RollingShutter(line_time_s)),
+        ("estimated", READOUT_S, None),
+        ("left out", READOUT_S, RollingShutter(0.0)),
+    )
+    found = []
+    for case, readout_s, shutter in cases:
+        clip = draw(folder, seed, frames, readout_s)
+        about = {"case": case, "seed": seed}
+        found += [about | row for row in poses_of(clip, shutter)]
+        found.append(about | map_of(clip, shutter))
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--folder", type=Path, required=True, help="folder of the videos and of the figures")
+    parser.add_argument("--seeds", type=int, default=3, help="number of motions")
+    parser.add_argument("--frames", type=int, default=150, help="frames of each video")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    arguments = parser.parse_args()
+    arguments.folder.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for seed in range(arguments.seeds):
+        rows += rows_of(arguments.folder, arguments.frames, seed)
+        for row in rows[-12:]:
+            print(
+                "  ".join(
+                    f"{key} {value:.3g}" if isinstance(value, float) else f"{key} {value}"
+                    for key, value in row.items()
+                ),
+                flush=True,
+            )
+    (arguments.folder / "rolling_shutter.json").write_text(json.dumps(rows, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,60 @@
+"""Rolling shutters of the cameras of a map: estimated from frames that follow one another, with a first map.
+
+Errors of a first map, made as if all rows were exposed at once, do not change sign with the motion, so that they hardly
+bias the line time (`localising.line_time`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from psotrack.inside_out.detection import DetectedMarkers
+from psotrack.inside_out.localising.line_time import Detected, LineTime, estimate_line_time
+from psotrack.inside_out.mapping.sightings import MarkerSightings
+from psotrack.inside_out.marker_map import MarkerMap
+from psotrack.inside_out.pose import PoseSettings, RollingShutter
+
+#: Shutters and what the videos show of them, one for each video.
+Shutters = tuple[RollingShutter | None, ...]
+LineTimes = tuple[LineTime | None, ...]
+
+
+def line_times(sightings: MarkerSightings, marker_map: MarkerMap) -> LineTimes:
+    """The line time that each video shows, with a map of its markers; None where too few frames follow one another."""
+    found: list[LineTime | None] = []
+    for index, lens in enumerate(sightings.lenses):
+        frames = sightings.consecutive[index] if sightings.consecutive else ()
+        seen = [_of_map(frame, marker_map) for frame in frames or _views(sightings, index)]
+        found.append(estimate_line_time(seen, marker_map, lens, PoseSettings(min_markers=2)))
+    return tuple(found)
+
+
+def with_shutters(sightings: MarkerSightings, shutters: Sequence[RollingShutter | None]) -> MarkerSightings:
+    """The sightings by cameras with these shutters."""
+    return replace(sightings, shutters=tuple(shutters))
+
+
+def _views(sightings: MarkerSightings, video: int) -> list[Detected]:
+    """The views of a video as frames, numbered by their times."""
+    views = np.flatnonzero(sightings.lens == video)
+    time_s = sightings.time_s[views]
+    step_s = np.diff(time_s).min(initial=np.inf)
+    if not np.isfinite(step_s) or step_s <= 0:
+        return []
+    start = np.searchsorted(sightings.view, np.arange(sightings.num_views + 1))
+    found: list[Detected] = []
+    for view, at_s in zip(views.tolist(), time_s.tolist(), strict=True):
+        rows = slice(start[view], start[view + 1])
+        markers = DetectedMarkers(sightings.marker[rows], sightings.corners_px[rows])
+        found.append((round(at_s / step_s), at_s, markers))
+    return found
+
+
+def _of_map(frame: Detected, marker_map: MarkerMap) -> Detected:
+    """A frame with the markers that are in the map."""
+    number, time_s, markers = frame
+    known = np.isin(markers.ids, marker_map.ids)
+    return number, time_s, DetectedMarkers(markers.ids[known], markers.corners_px[known])

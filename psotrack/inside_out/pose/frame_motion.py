@@ -1,0 +1,81 @@
+"""What one frame of a rolling shutter says about pose and motion, without the motion that was expected."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from psotrack.inside_out.frame_motion import FrameMotion
+from psotrack.inside_out.pose.equations import POSE_SIZE, Noise, SeenCorners, Solution, Sums, summed
+
+#: Standard deviations of velocity (m/s) and turn rate (rad/s) that take the place of the expected motion: far above
+#: those of a camera, so that the frame alone decides where its rows show the motion.
+_ANY_MOTION_STD = np.repeat([50.0, 30.0], 3)
+
+
+def frame_motion(
+    seen: SeenCorners,
+    sums: Sums,
+    rows: Float[np.ndarray, "markers 4 2 columns"],
+    fits: Bool[np.ndarray, "markers 4"],
+    noise: Noise,
+    extra: Float[np.ndarray, "extra"],
+) -> FrameMotion | None:
+    """Pose and motion by one frame alone, linearised where a fit ended; None if the equations are singular.
+
+    Args:
+        seen: markers of the frame.
+        sums: sums of the equations of the fitting corners.
+        rows: (markers, 4, 2, unknowns + 1), the equations.
+        fits: (markers, 4), True for the fitting corners.
+        noise: variances of the errors.
+        extra: (8,), inset, focal length and motion of the fit.
+    """
+    prior = seen.prior_information.copy()
+    prior[2:, 2:] = np.diag(_ANY_MOTION_STD**-2.0)
+    off_prior = extra - seen.expected_extra
+    off_prior[2:] = 0.0
+    solution = sums.solved(noise, prior, off_prior)
+    if solution is None:
+        return None
+    whole = np.r_[:POSE_SIZE, POSE_SIZE + 2 : POSE_SIZE + 8]
+    covariance = solution.covariance[np.ix_(whole, whole)]
+    by_motion = -np.linalg.solve(covariance[6:, 6:], covariance[6:, :6]).T
+    common = sums.common(solution, noise, seen.map_share)[whole]
+    if seen.unsure is not None:
+        effect = line_time_effect(seen, rows, fits, noise, extra[2:], prior)
+        if effect is None:
+            return None
+        common = np.concatenate([common, effect[whole, None]], axis=1)
+    common[:6] += by_motion @ common[6:]
+    of_pose = covariance[:6, :6] + by_motion @ covariance[6:, :6]
+    return FrameMotion(
+        assumed=extra[2:],
+        by_motion=by_motion,
+        covariance=(of_pose + of_pose.T) / 2,
+        measured=extra[2:] + solution.step[POSE_SIZE + 2 :],
+        measured_covariance=covariance[6:, 6:],
+        common=common,
+    )
+
+
+def line_time_effect(
+    seen: SeenCorners,
+    rows: Float[np.ndarray, "markers 4 2 columns"],
+    fits: Bool[np.ndarray, "markers 4"],
+    noise: Noise,
+    motion: Float[np.ndarray, "6"],
+    prior_information: Float[np.ndarray, "extra extra"],
+) -> Float[np.ndarray, "unknowns"] | None:
+    """Change of the unknowns by an error of the line time of one standard deviation; None if undetermined.
+
+    Rows that were exposed later than assumed show the camera where its motion took it meanwhile, which changes the
+    pixels as a change of the pose does.
+    """
+    if seen.unsure is None:
+        return np.zeros(rows.shape[-1] - 1)
+    moved = rows.copy()
+    moved[..., -1] = seen.unsure.error_s[..., None] * (rows[..., :POSE_SIZE] @ motion)
+    none = np.zeros(len(prior_information))
+    solution: Solution | None = summed(moved, fits).solved(noise, prior_information, none)
+    return None if solution is None else solution.step
