@@ -71,8 +71,9 @@ INSIDE_OUT = [
     "detection",
     "pose",
     "filtering",
-    "localising",
+    "line_time",
     "mapping",
+    "localising",
     "comparison",
     "fusing",
 ]

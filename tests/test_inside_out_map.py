@@ -237,10 +237,6 @@ BAD_PLACES = {
         with_corners(3, ROOM[3][[0, 1, 3, 2]]),
         r"line 4, marker 3: expected corners one after the other .* found two that are exchanged",
     ),
-    "backwards": (
-        with_corners(3, ROOM[3][[0, 3, 2, 1]]),
-        r"line 4, marker 3: .* all other markers are behind it; its corners are counted backwards",
-    ),
     "in one place": (
         with_corners(3, ROOM[2] + 0.01),
         r"line 4, marker 3: .* found both markers at the place of marker 2",

@@ -48,7 +48,16 @@ class _Input:
 @click.command()
 @click.argument("video")
 @click.option(
-    "--markers", type=click.Path(path_type=Path), help="Table of marker corners.  [default: the sequence's]"
+    "--markers",
+    type=click.Path(path_type=Path),
+    help="Table of marker corners, or of centres (id,x_m,y_m,z_m).  [default: the sequence's]",
+)
+@click.option(
+    "--marker-size",
+    "side_m",
+    type=float,
+    metavar="METRES",
+    help="Side of the markers, if --markers has only their centres.  [default: estimated for each marker]",
 )
 @click.option(
     "--camera",
@@ -118,6 +127,7 @@ class _Input:
 def localise(
     video: str,
     markers: Path | None,
+    side_m: float | None,
     camera_file: Path | None,
     camera_name: str | None,
     scale_camera: bool,
@@ -147,6 +157,10 @@ def localise(
     markers and intrinsics. With --live, frames that arrive too fast are skipped; Ctrl-C ends the command, which then
     writes the poses so far.
 
+    Markers may hang on walls, pillars, floor and ceiling, turned in any way. Those that are not where the table has
+    them disagree with the others over the video; they are left out and named. A table of centres alone is weaker: some
+    frames must show four markers at once, and errors of the centres are errors of the poses (see --map-error).
+
     Errors of the map and of the focal length are the same in all frames and do not average out. With --map-error and
     --focal-error the covariances include these errors, and poses from several markers become more accurate.
 
@@ -165,15 +179,18 @@ def localise(
       psotrack localise images --fps 25 --markers corners.csv --camera lens.yml --out track.csv --frames 100
       psotrack localise flight.mp4 --markers corners.csv --fov 92,61 --focal-error 0.5 --out track.csv --plot
       psotrack localise phone.mp4 --markers corners.csv --camera lens.yml --readout 0.02 --out track.csv
+      psotrack localise flight.mp4 --markers centres.csv --camera lens.toml --out track.csv --map-error 5
       psotrack localise 0 --live --markers corners.csv --camera lens.yml --out track.csv
     """
     from dataclasses import replace
 
+    from psotrack.errors import check_positive
     from psotrack.inside_out import (
         LocaliseSettings,
+        MarkerMap,
         PoseFilterParams,
         PoseSettings,
-        read_marker_map,
+        read_marker_table,
         save_flight,
         smooth,
         write_camera_path,
@@ -188,7 +205,15 @@ def localise(
     given = _input(video, drone, fps, live)
     if markers is None and given.markers is None:
         raise SettingsError("--markers", expected="a table of marker corners", found="none")
-    marker_map = read_marker_map(Path(str(markers or given.markers)))
+    table = Path(str(markers or given.markers))
+    marker_map = read_marker_table(table)
+    centres_only = not isinstance(marker_map, MarkerMap)
+    if side_m is not None:
+        check_positive("--marker-size", side_m)
+        if not centres_only:
+            raise SettingsError(
+                "--marker-size", expected="a table of centres alone", found=f"corners in {table}"
+            )
     lens = _lens(given, camera_file, camera_name, scale_camera, fov_deg)
     source = given.source.first(num_frames)
     rows = source.image_size_wh[1]
@@ -203,7 +228,7 @@ def localise(
     ).within(source.num_frames)
     try:
         found = localise_camera(
-            source, marker_map, lens, settings, report_to(quiet or json_path == Path("-"))
+            source, marker_map, lens, settings, report_to(quiet or json_path == Path("-")), side_m=side_m
         )
         if smoothed:
             found = replace(found, path=smooth(found.raw, settings.filter))
@@ -218,15 +243,18 @@ def localise(
     write_camera_path(out, found.path, drone_name, force=force)
     if picture is not None:
         save_flight(
-            picture, found.path, marker_map, caption=f"{drone_name}: {given.source.name}", force=force
+            picture, found.path, found.marker_map, caption=f"{drone_name}: {given.source.name}", force=force
         )
     content = _content(found, given.source.name, drone_name, settings.pose.min_markers)
     content |= {"track": str(out), "filtered": filtered, "smoothed": smoothed}
     content |= {"map_error_m": settings.pose.map_error_m, "focal_error": settings.pose.focal_error}
     content |= {"shutter": shutter_content(shutter, found.shutter, found.line_time, rows)}
+    content |= {"map": "centres" if centres_only else "corners"}
     output_json(json_path, content, force)
     of_shutter = shutter_sentence(shutter, found.line_time)
     print_line(quiet, json_path, _sentence(out, content) + (f"; {of_shutter}" if of_shutter else ""))
+    for line in _lines_on_map(table, found, centres_only, video):
+        print_line(quiet, json_path, line)
 
 
 def _input(video: str, drone: str | None, fps: float | None, live: bool) -> _Input:
@@ -311,12 +339,46 @@ def _content(found: LocalisedVideo, video: str, name: str, min_markers: int) -> 
         "median_markers": float(np.median(path.num_markers)),
         "most_markers": int(path.num_markers.max()),
         "median_reprojection_px": float(np.median(shown)) if len(shown) else None,
+        "wrong_markers": list(found.wrong_markers),
+        "unknown_markers": list(found.unknown_markers),
         "interrupted": found.interrupted,
         "frames_per_second": found.frames_per_second,
         "wall_s": found.wall_s,
         "stage_s": dict(found.seconds),
         "stage_ms_per_frame": {stage: 1e3 * value / frames for stage, value in found.seconds.items()},
     }
+
+
+def _lines_on_map(table: Path, found: LocalisedVideo, centres_only: bool, video: str) -> list[str]:
+    """What a user needs to know of the map."""
+    lines = []
+    wrong, count = found.wrong_markers, len(found.marker_map)
+    if centres_only:
+        sides_mm = 1e3 * found.marker_map.sides_m
+        lines.append(
+            f"{table}: centres alone, a weaker map: corners of {count} markers, {sides_mm.min():.0f} to "
+            f"{sides_mm.max():.0f} mm wide, were found from the video; errors of the centres are errors of the poses"
+        )
+    if found.unknown_markers:
+        names = ", ".join(map(str, found.unknown_markers))
+        lines.append(
+            f"{table}: not used, because too few frames show them where the table has them: markers {names}"
+        )
+    if not found.path.seen.any():
+        # The sentence on the poses says what to check.
+        return lines
+    if len(wrong) > count / 2:
+        lines.append(
+            f"{table}: {len(wrong)} of {count} markers disagree with one another, so that no marker is left out: is it "
+            "the map of this room, is the lens right, is an axis mirrored?"
+        )
+    elif wrong:
+        names = ", ".join(map(str, wrong))
+        lines.append(
+            f"{table}: left out, because the other markers of the video say that they are elsewhere: markers {names}; "
+            f"`psotrack map-markers {video} --check {table}` says what is wrong"
+        )
+    return lines
 
 
 def _flagged(path: CameraPath, flag: int) -> int:
@@ -342,10 +404,10 @@ def _doubt(content: dict[str, Any]) -> str:
     most = content["most_markers"]
     if content["poses"]:
         return ""
-    if not most:
+    if not most and not content["wrong_markers"]:
         return "; no frame shows a marker of the map: check --dictionary and --markers"
-    if content["own_poses"]:
+    if content["own_poses"] and not content["wrong_markers"]:
         return f"; the filter rejected all {content['own_poses']} poses: --no-filter keeps them"
-    if most < content["min_markers"]:
+    if most < content["min_markers"] and not content["wrong_markers"]:
         return f"; no frame shows more than {most} markers of the map: --min-markers requires {content['min_markers']}"
     return "; no pose fits the markers: check --markers, and --camera or --fov"

@@ -13,7 +13,7 @@ The reader accepts all layouts that are unambiguous:
   or `7.1`;
 - tables without a header, with 13 or 5 numbers per row.
 
-Other columns are ignored.
+Other columns are ignored. A table of centres alone has the columns `id`, `x`, `y` and `z`.
 """
 
 from __future__ import annotations
@@ -83,6 +83,29 @@ def read_marker_rows(path: Path | str) -> dict[int, MarkerRow]:
     table = _read_normalised(Path(path))
     one_row_per_corner = table.find("corner") and not table.find("x1")
     return _rows_per_corner(table) if one_row_per_corner else _rows_per_marker(table)
+
+
+def read_marker_centres(path: Path | str) -> dict[int, Float[np.ndarray, "3"]] | None:
+    """Read centres (3,) in the world, metres, by marker id, from a table with the columns `id`, `x`, `y` and `z`.
+
+    Returns:
+        The centres; None where the table is one of corners.
+
+    Raises:
+        InputError: the file cannot be read, an id occurs twice, or a value is not a number. The message names the line.
+    """
+    table = _read_normalised(Path(path))
+    if table.find("corner") or table.find("x1") or not all(table.find(name) for name in ("id", *"xyz")):
+        return None
+    id_column, columns = table.column("id"), [table.column(axis) for axis in "xyz"]
+    metres = np.array([table.factor(column, _METRES) for column in columns])
+    found: dict[int, Float[np.ndarray, "3"]] = {}
+    for row in table.rows:
+        marker = _marker(row, id_column)
+        if marker in found:
+            raise row.error(id_column, "each marker once", f"{marker} again")
+        found[marker] = np.array([row.number(column) for column in columns]) * metres
+    return found
 
 
 def split_label(label: str) -> tuple[int, int] | None:

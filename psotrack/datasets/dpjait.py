@@ -19,6 +19,7 @@ import numpy as np
 from psotrack.datasets._archives import join_archives
 from psotrack.datasets._marker_corners import (
     MarkerRow,
+    read_marker_centres,
     read_marker_corners,
     read_marker_rows,
     split_label,
@@ -74,6 +75,7 @@ __all__ = [
     "pose_file",
     "read_calibration",
     "read_detections",
+    "read_marker_centres",
     "read_marker_corners",
     "read_marker_rows",
     "read_masks",

@@ -6,8 +6,9 @@ tracks of static cameras. Other rooms use the names that this room exports, and 
 
 From a frame to a path: `frames` (reading), `detection` (markers in an image), `pose` (of one frame), `filtering` (over
 time), `localising` (the complete localisation). `mapping` builds and checks maps, `comparison` compares paths with
-references, `fusing` joins paths and tracks. Imports go in this order: frame_motion,
-camera_path, lens_files, marker_map, frames, detection, pose, filtering, localising, mapping, comparison, fusing.
+references, `fusing` joins paths and tracks. Imports go in this order: frame_motion, camera_path, lens_files,
+marker_map, frames, detection, pose, filtering, line_time (of a rolling shutter), mapping, localising, comparison,
+fusing.
 """
 
 import lazy_loader

@@ -12,7 +12,7 @@ from .mapping import BuiltMap, build_map, corners_in_own_frame
 from .mapping.check import MapCheck, check_map
 from .mapping.sightings import find_sightings
 from .mapping.square_fitting import FittedSquares, fit_squares, read_measured_corners
-from .marker_map import MarkerMap, read_marker_map
+from .marker_map import MarkerCentres, MarkerMap, read_marker_map, read_marker_table
 from .pose import PoseSettings, RollingShutter
 
 __all__ = [
@@ -28,6 +28,7 @@ __all__ = [
     "LocaliseSettings",
     "LocalisedVideo",
     "MapCheck",
+    "MarkerCentres",
     "MarkerMap",
     "PoseFilterParams",
     "PoseSettings",
@@ -46,6 +47,7 @@ __all__ = [
     "open_source",
     "read_camera_path",
     "read_marker_map",
+    "read_marker_table",
     "read_measured_corners",
     "save_flight",
     "smooth",

@@ -1,7 +1,7 @@
 """`MarkerMap`: corners of markers in a room; and its table, which is checked when it is read.
 
-A marker is a flat square that faces the room. A table is refused where it clearly contradicts this. Smaller errors of a
-map are found from a video: see `mapping.check`.
+A marker is a flat square. A table is refused where it clearly contradicts this. Other errors of a map are found from a
+video: see `localising.map_evidence` and `mapping.check`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.datasets.dpjait import MarkerRow, read_marker_rows
+from psotrack.datasets.dpjait import MarkerRow, read_marker_centres, read_marker_rows
 from psotrack.errors import InputError
 from psotrack.support import short_repr
 
@@ -28,7 +28,7 @@ _SIDES_M = (0.005, 5.0)
 _SAME_PLACE = 0.5
 #: Distance from a marker's plane, in sides, below which another marker is neither before nor behind it.
 _IN_PLANE = 1.0
-#: Largest extent, in sides, of an object with markers on its outside. A room is larger.
+#: Largest width, in sides, of an object with markers on its outside. A room is wider.
 _OBJECT_EXTENT = 10.0
 
 
@@ -89,13 +89,51 @@ class MarkerMap:
         return normals(self.all_corners_m)
 
 
+@dataclass(frozen=True)
+class MarkerCentres:
+    """Markers of which only the centres are known.
+
+    Attributes:
+        centres_m: (3,) by marker id, world, metres.
+    """
+
+    centres_m: Mapping[int, Float[np.ndarray, "3"]]
+
+    @cached_property
+    def ids(self) -> Int[np.ndarray, " markers"]:
+        """(markers,), ids in increasing order."""
+        return np.array(sorted(self.centres_m))
+
+
+def read_marker_table(path: Path | str) -> MarkerMap | MarkerCentres:
+    """Read a map from a table of corners, or centres from a table with the columns id, x_m, y_m and z_m.
+
+    Raises:
+        InputError: as `read_marker_map`; or two centres are at one place.
+    """
+    centres_m = read_marker_centres(path)
+    if centres_m is None:
+        return read_marker_map(path)
+    places: dict[tuple[float, ...], int] = {}
+    for marker, centre_m in centres_m.items():
+        other = places.setdefault(tuple(centre_m.tolist()), marker)
+        if other != marker:
+            raise InputError(
+                path,
+                expected="markers in different places",
+                found=f"the centre of marker {other} for marker {marker} as well",
+                remedy="correct one of the two",
+            )
+    return MarkerCentres(centres_m)
+
+
 def read_marker_map(path: Path | str) -> MarkerMap:
     """Read a map from a table of corners; `psotrack.datasets.dpjait` describes the layouts.
 
     Raises:
         InputError: the file cannot be read, a corner or column is missing, or a marker is listed twice, is no flat
-            square of the size of a marker, is at the place of another marker, or faces away from the room. The message
-            names the line.
+            square of the size of a marker, or is at the place of another marker, or all markers face out of the
+            room. The message names the line.
     """
     path = Path(path)
     rows = read_marker_rows(path)
@@ -103,7 +141,7 @@ def read_marker_map(path: Path | str) -> MarkerMap:
         _check_square(marker, row)
     marker_map = MarkerMap({marker: row.corners_m for marker, row in rows.items()})
     _check_apart(rows, marker_map)
-    _check_facing(path, rows, marker_map)
+    _check_facing(path, marker_map)
     return marker_map
 
 
@@ -173,30 +211,26 @@ def _check_apart(rows: Mapping[int, MarkerRow], marker_map: MarkerMap) -> None:
         )
 
 
-def _check_facing(path: Path, rows: Mapping[int, MarkerRow], marker_map: MarkerMap) -> None:
-    """Refuse a marker whose front faces away from all others: its corners are in the wrong order.
+def _check_facing(path: Path, marker_map: MarkerMap) -> None:
+    """Refuse a room whose markers all face out of it: it is mirrored.
 
-    Where all markers face away, the table is mirrored, unless the markers are on the outside of a small object.
+    A single marker may face any way: on a pillar in front of a wall, all others are behind it. So may all markers on
+    the outside of an object, which is narrow beside its markers. Wrong markers are found from the video.
     """
     ids, centres = marker_map.ids, marker_map.centres_m
     height = np.einsum("mnk,mk->mn", centres - centres[:, None], marker_map.normals)
     beside = _IN_PLANE * marker_map.sides_m[:, None]
     outward = (height < -beside).any(axis=1) & ~(height > beside).any(axis=1)
-    inward = (height > beside).any(axis=1)
-    remedy = "count them clockwise as seen from the room, from the marker's own top left"
-    if outward.any() and inward.any():
-        marker = int(ids[outward][0])
-        raise InputError(
-            f"{rows[marker].where}, marker {marker}",
-            expected="corners in the order in which a camera in the room sees them",
-            found="that all other markers are behind it",
-            remedy=f"its corners are counted backwards: {remedy}",
-        )
-    across = np.linalg.norm(np.ptp(centres, axis=0))
-    if outward.any() and across > _OBJECT_EXTENT * np.median(marker_map.sides_m):
+    width_m = (
+        np.linalg.svd(centres - centres.mean(axis=0), compute_uv=False)[1:2] if len(ids) > 2 else np.zeros(1)
+    )
+    # The root mean square of a uniform distribution is its extent / sqrt(12).
+    wide = np.sqrt(12 / len(ids)) * float(width_m[0]) > _OBJECT_EXTENT * np.median(marker_map.sides_m)
+    if outward.all() and wide:
         raise InputError(
             path,
             expected="corners in the order in which a camera in the room sees them",
-            found=f"that {int(outward.sum())} of {len(ids)} markers face out of the room, and none into it",
-            remedy=f"corners are counted backwards, or an axis is mirrored: {remedy}",
+            found=f"that {len(ids)} of {len(ids)} markers face out of the room, and none into it",
+            remedy="corners are counted backwards, or an axis is mirrored: count them clockwise as seen from the room, "
+            "from the marker's own top left",
         )

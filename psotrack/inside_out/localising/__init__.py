@@ -4,11 +4,11 @@ In: a `FrameSource`, a `MarkerMap`, the lens and `LocaliseSettings`. Out: a `Loc
 frames' own poses, and the time that each stage took. Other rooms use `localise_video`; `localise_frames` does the same
 for markers that are detected already, and `pose_row` makes a frame of a path from one pose.
 
-Imports go in this order: `line_time` (of a rolling shutter), `records`, `frame_poses`, `video`.
+Imports go in this order: `records`, `frame_poses`, `map_evidence`, `video`.
 """
 
+from psotrack.inside_out.line_time import LineTime, estimate_line_time
 from psotrack.inside_out.localising.frame_poses import localise_frames, pose_row
-from psotrack.inside_out.localising.line_time import LineTime, estimate_line_time
 from psotrack.inside_out.localising.records import STAGES, LocalisedVideo, LocaliseSettings
 from psotrack.inside_out.localising.video import localise_video
 

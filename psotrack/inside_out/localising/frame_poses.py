@@ -70,7 +70,11 @@ def localise_frames(
         located_s = time.perf_counter()
         row = raw
         if params is not None:
-            run, row = step(run, raw, params)
+            try:
+                run, row = step(run, raw, params)
+            except np.linalg.LinAlgError:
+                # Poses by a wrong map may contradict the motion without any doubt: the filter starts anew.
+                run, row = step(advance(FilterRun(), time_s, params), raw, params)
         if settings.filter is None:
             row = raw
         spent_s["locate"] += located_s - predicted_s
@@ -131,7 +135,11 @@ def _pose_of_frame(
             _WIDER**2 * predicted.motion_covariance + _MOTION_FLOOR,
         )
     corners_m = marker_map.corners_of(markers.ids.tolist())
-    return estimate_pose(markers.corners_px, corners_m, lens, settings.pose, prior, shutter, motion)
+    try:
+        return estimate_pose(markers.corners_px, corners_m, lens, settings.pose, prior, shutter, motion)
+    except np.linalg.LinAlgError:
+        # Corners of a wrong map may determine no pose at all; the frame is lost, the others are not.
+        return None
 
 
 def _with_common(

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.filtering import PoseFilterParams
-from psotrack.inside_out.localising.line_time import LineTime
+from psotrack.inside_out.line_time import LineTime
+from psotrack.inside_out.marker_map import MarkerMap
 from psotrack.inside_out.pose import PoseSettings, RollingShutter
 
 #: Stages that each frame passes; the first two run in a thread of their own.
@@ -42,21 +43,28 @@ class LocalisedVideo:
     Attributes:
         path: filtered path; equal to `raw` without a filter.
         raw: path of each frame's own pose.
+        marker_map: the map; where only centres were given, with the corners that were found.
         seconds: seconds by stage of `STAGES`, summed over frames; stages run in parallel.
         wall_s: seconds from the first frame to the last.
         interrupted: whether Ctrl-C ended a stream.
         shutter: the shutter with which the poses were estimated; None is a global shutter.
         line_time: the line time that the video shows; None if it was not estimated: in a stream, and in a video without
             five consecutive frames that show enough markers.
+        wrong_markers: ids of the markers that are not where the map has them; they were left out, unless most
+            of the seen markers are wrong.
+        unknown_markers: ids of the markers whose centres were given, but whose corners could not be found.
     """
 
     path: CameraPath
     raw: CameraPath
+    marker_map: MarkerMap
     seconds: Mapping[str, float]
     wall_s: float
     interrupted: bool = False
     shutter: RollingShutter | None = None
     line_time: LineTime | None = None
+    wrong_markers: tuple[int, ...] = ()
+    unknown_markers: tuple[int, ...] = ()
 
     @property
     def frames_per_second(self) -> float:

@@ -13,12 +13,19 @@ from jaxtyping import UInt8
 from psotrack.errors import InputError
 from psotrack.geometry import Camera
 from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
-from psotrack.inside_out.filtering.path_rows import join_rows
+from psotrack.inside_out.filtering.path_rows import PoseRow, join_rows
 from psotrack.inside_out.frames import Frame, FrameSource, read_ahead
+from psotrack.inside_out.line_time import Detected, LineTime, estimate_line_time
 from psotrack.inside_out.localising.frame_poses import localise_frames
-from psotrack.inside_out.localising.line_time import Detected, LineTime, estimate_line_time
+from psotrack.inside_out.localising.map_evidence import (
+    are_few,
+    least_markers,
+    without_markers,
+    wrong_markers,
+)
 from psotrack.inside_out.localising.records import STAGES, LocalisedVideo, LocaliseSettings
-from psotrack.inside_out.marker_map import MarkerMap
+from psotrack.inside_out.mapping.from_centres import complete_map
+from psotrack.inside_out.marker_map import MarkerCentres, MarkerMap
 from psotrack.support import Advance, Report, no_progress
 
 #: Number, time (seconds) and grey image of a frame.
@@ -27,30 +34,35 @@ _GreyFrame = tuple[int, float, UInt8[np.ndarray, "height width"]]
 
 def localise_video(
     source: FrameSource,
-    marker_map: MarkerMap,
+    marker_map: MarkerMap | MarkerCentres,
     lens: Camera,
     settings: LocaliseSettings | None = None,
     report: Report = no_progress,
+    *,
+    side_m: float | None = None,
 ) -> LocalisedVideo:
     """Localise a camera in every frame, from markers of known positions.
 
     A thread decodes frames and converts them to grey, ahead of the detection of markers. Markers that are not in the
     map are not detected. In a recording, the markers of all frames are found first, and show whether the shutter rolls
     (`line_time`). Where two poses fit a frame's markers about equally well, the filter's prediction decides;
-    then the filter uses the pose or gates it.
+    then the filter uses the pose or gates it. Markers that disagree with the others over a recording are left out, and
+    the poses are estimated once more without them.
 
     Args:
         source: frames of the camera.
-        marker_map: map of the room.
+        marker_map: map of the room; or the centres of its markers, whose corners are then found from the recording.
         lens: intrinsics of the camera, for the size of the frames; the pose in it is ignored.
         settings: settings of detection, pose estimation and filter.
         report: progress is reported to it.
+        side_m: side of all markers of which only the centres are known, metres; None estimates each side.
 
     Returns:
         The path, with all frames of the source. A stream ends by itself or by Ctrl-C.
 
     Raises:
-        InputError: frames cannot be read, or end early; or the lens is for another size of images.
+        InputError: frames cannot be read, or end early; the lens is for another size of images; or too few frames show
+            markers of which only the centres are known.
         SettingsError: there is no dictionary of this name, or it has none of the map's markers.
     """
     settings = (settings or LocaliseSettings()).within(source.num_frames)
@@ -58,15 +70,21 @@ def localise_video(
     detector = MarkerDetector(settings.dictionary, lens, ids=marker_map.ids.tolist())
     seconds = dict.fromkeys(STAGES, 0.0)
     raw_rows, rows, interrupted, line_time = [], [], False, None
+    wrong: tuple[int, ...] = ()
+    unknown: tuple[int, ...] = ()
     began_s = time.perf_counter()
     try:
         with report("localise", source.num_frames or 0) as done:
             detected: Iterable[Detected] = _counted(_detect_markers(source, detector, seconds), done)
             if not source.stream:
-                detected, line_time, settings = _with_shutter(
-                    list(detected), marker_map, lens, settings, seconds
-                )
-            for raw, row in localise_frames(detected, marker_map, lens, settings, seconds):
+                detected = list(detected)
+            if isinstance(marker_map, MarkerCentres):
+                room, unknown, detected = _completed(source, marker_map, lens, detected, side_m)
+            else:
+                room = marker_map
+            if isinstance(detected, list):
+                line_time, settings = _with_shutter(detected, room, lens, settings, seconds)
+            for raw, row in localise_frames(detected, room, lens, settings, seconds):
                 raw_rows.append(raw)
                 rows.append(row)
     except KeyboardInterrupt:
@@ -76,10 +94,54 @@ def localise_video(
         interrupted = True
     # Ctrl-C may come between the two appends.
     raw_rows = raw_rows[: len(rows)]
+    if isinstance(detected, list) and any(map(_disagrees, raw_rows, (markers for _, _, markers in detected))):
+        wrong = wrong_markers(detected, room, lens, settings.pose)
+        if wrong and are_few(wrong, detected):
+            right = list(without_markers(detected, wrong, settings.pose))
+            pose = replace(settings.pose, min_markers=least_markers(settings.pose))
+            line_time, settings = _with_shutter(right, room, lens, replace(settings, pose=pose), seconds)
+            both = list(localise_frames(right, room, lens, settings, seconds))
+            raw_rows, rows = [raw for raw, _ in both], [row for _, row in both]
     wall_s = time.perf_counter() - began_s
     return LocalisedVideo(
-        join_rows(rows), join_rows(raw_rows), seconds, wall_s, interrupted, settings.shutter, line_time
+        join_rows(rows),
+        join_rows(raw_rows),
+        room,
+        seconds,
+        wall_s,
+        interrupted,
+        settings.shutter,
+        line_time,
+        wrong,
+        unknown,
     )
+
+
+def _disagrees(raw: PoseRow, markers: DetectedMarkers) -> bool:
+    """Whether a frame's markers do not all agree with one pose."""
+    return len(markers) >= 2 and (not np.isfinite(raw.position_m[0]) or raw.num_markers < len(markers))
+
+
+def _completed(
+    source: FrameSource,
+    centres: MarkerCentres,
+    lens: Camera,
+    detected: Iterable[Detected],
+    side_m: float | None,
+) -> tuple[MarkerMap, tuple[int, ...], list[Detected]]:
+    """The map of markers of which only the centres are known, those left out, and the frames with the others."""
+    if not isinstance(detected, list):
+        raise InputError(
+            source.name,
+            expected="a recorded video, because only the centres of the markers are known",
+            found="a stream",
+            remedy="give a table of corners",
+        )
+    found = [markers for _, _, markers in detected]
+    completed = complete_map(found, centres, lens, side_m=side_m, name=str(source.name))
+    known = completed.marker_map.ids
+    frames = [(number, time_s, each.select(np.isin(each.ids, known))) for number, time_s, each in detected]
+    return completed.marker_map, completed.left_out, frames
 
 
 def _with_shutter(
@@ -88,14 +150,14 @@ def _with_shutter(
     lens: Camera,
     settings: LocaliseSettings,
     seconds: dict[str, float],
-) -> tuple[Iterable[Detected], LineTime | None, LocaliseSettings]:
-    """The frames, the line time that they show, and settings with the shutter to use."""
+) -> tuple[LineTime | None, LocaliseSettings]:
+    """The line time that frames show, and settings with the shutter to use."""
     began_s = time.perf_counter()
     line_time = estimate_line_time(detected, marker_map, lens, settings.pose)
     if line_time is not None:
         settings = replace(settings, shutter=line_time.shutter(settings.shutter))
     seconds["locate"] += time.perf_counter() - began_s
-    return detected, line_time, settings
+    return line_time, settings
 
 
 def _counted(detected: Iterable[Detected], done: Advance) -> Iterator[Detected]:

@@ -207,7 +207,11 @@ def _mahalanobis2(
     turn = Rotation.from_matrix(R_world_cam.T @ pose.R_world_cam).as_rotvec()
     apart = np.concatenate([pose.position_m - position_m, turn])
     both = pose.covariance + covariance
-    return float(apart @ np.linalg.solve(both, apart)), float(np.linalg.slogdet(both)[1])
+    try:
+        return float(apart @ np.linalg.solve(both, apart)), float(np.linalg.slogdet(both)[1])
+    except np.linalg.LinAlgError:
+        # Both poses are certain in some direction: they are different.
+        return np.inf, 0.0
 
 
 def _log_prior(pose: Fit, expected: ExpectedPose | None) -> float:
