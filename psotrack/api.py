@@ -101,7 +101,9 @@ def detect_markers(
     image: UInt8[np.ndarray, "height width"] | UInt8[np.ndarray, "height width 3"],
     dictionary: str = "4x4_1000",
 ) -> DetectedMarkers:
-    """ArUco markers in an image, with corners to a tenth of a pixel.
+    """ArUco markers in an image, black on white or inverted, with corners to a tenth of a pixel.
+
+    The search is thorough: it takes seconds in images of tens of megapixels.
 
     Args:
         image: grey, or BGR as OpenCV reads it.
@@ -113,7 +115,7 @@ def detect_markers(
     import cv2
 
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    return MarkerDetector(dictionary).detect(np.asarray(grey, np.uint8))
+    return MarkerDetector(dictionary, thorough=True).detect(np.asarray(grey, np.uint8))
 
 
 def background_model(settings: ForegroundSettings | None = None) -> Mog2:

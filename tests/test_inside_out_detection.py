@@ -274,9 +274,9 @@ def test_corners_are_right_in_images_of_a_lens_with_distortion():
     rays = (straight - lens.K[:2, 2]) / 400
     corners = np.stack(distort(lens, *rays.T), axis=-1) * 400 + lens.K[:2, 2]
     image = draw([(5, straight)], lens=lens)
-    # Measured 0.04; straight lines through the bent edges miss the corners by 0.85.
+    # Measured 0.04; parabolas through the bent edges miss the corners by 0.28, straight lines by 0.85.
     assert largest_error_px(MarkerDetector(lens=lens).detect(image).corners_px[0], corners) < 0.1
-    assert largest_error_px(MarkerDetector().detect(image).corners_px[0], corners) > 0.4
+    assert 0.2 < largest_error_px(MarkerDetector().detect(image).corners_px[0], corners) < 0.4
 
 
 def test_only_the_wanted_markers_are_found():
@@ -298,10 +298,11 @@ def test_a_dictionary_without_any_of_the_markers_is_one_line():
         MarkerDetector("4x4_50", ids=[50, 51])
 
 
-def test_two_markers_with_one_id_are_both_left_out():
+def test_markers_with_one_id_are_all_found_and_left_out_where_ids_are_single():
     shifted = SQUARE + np.array([150, 0])
     found = MarkerDetector().detect(draw([(17, SQUARE), (17, shifted), (4, OBLIQUE)]))
-    assert found.ids.tolist() == [4]
+    assert sorted(found.ids.tolist()) == [4, 17, 17]
+    assert found.of_single_ids().ids.tolist() == [4]
 
 
 @pytest.mark.parametrize("noise", [0.0, 40.0])
@@ -317,13 +318,16 @@ def test_a_hidden_part_of_an_edge_moves_no_corner():
     image[225:245, 360:380] = 30
     found = refine_corners(image, SQUARE[None] + 0.5, white_cells(17))
     # Measured 0.04.
-    assert largest_error_px(found[0], SQUARE) < 0.2
+    assert largest_error_px(found.corners_px[0], SQUARE) < 0.2
 
 
 def test_corners_without_edges_do_not_move():
     flat = np.full((480, 640), 128, np.uint8)
-    assert np.array_equal(refine_corners(flat, SQUARE[None], white_cells(17)), SQUARE[None])
-    assert refine_corners(flat, np.zeros((0, 4, 2)), np.zeros((0, 6, 6), bool)).shape == (0, 4, 2)
+    found = refine_corners(flat, SQUARE[None], white_cells(17))
+    assert np.array_equal(found.corners_px, SQUARE[None])
+    # Nothing is known but the search's own accuracy, about a cell.
+    assert found.std_px[0] > 5
+    assert refine_corners(flat, np.zeros((0, 4, 2)), np.zeros((0, 6, 6), bool)).corners_px.shape == (0, 4, 2)
 
 
 @settings(max_examples=10)

@@ -300,7 +300,7 @@ def test_the_covariance_includes_the_error_of_the_focal_length(room, tmp_path):
         inside[name] = np.mean(squared < 6.25)
         median_m[name] = np.median(np.linalg.norm(off_m, axis=1))
     assert inside["without"] < 0.2
-    assert inside["with"] == 1.0
+    assert inside["with"] > 0.8
     # Markers on two walls determine most of the focal length.
     assert median_m["with"] < 0.7 * median_m["without"]
     content = json.loads(report.read_text())

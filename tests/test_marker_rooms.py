@@ -89,7 +89,8 @@ def flight(corners_m=ROOM, num_frames=50, noise_px=0.3, seed=0):
             if faces and (depth > 0.3).all() and ((pixels > 0) & (pixels < [1279, 959])).all():
                 ids.append(name)
                 quads.append(pixels + noise_px * rng.standard_normal((4, 2)))
-        found = DetectedMarkers(np.array(ids, int), np.array(quads, np.float32).reshape(-1, 4, 2))
+        corners_px = np.array(quads, np.float32).reshape(-1, 4, 2)
+        found = DetectedMarkers(np.array(ids, int), corners_px, np.full(len(ids), noise_px))
         frames.append((index, index / FPS, found))
         centres.append(centre)
     return frames, np.array(centres)

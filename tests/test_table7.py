@@ -257,7 +257,7 @@ def test_markers_with_wrong_ids(monkeypatch: pytest.MonkeyPatch) -> None:
     from psotrack.inside_out import MarkerMap
 
     ids = np.tile([*walls_m(), 500], 200)
-    seen = Sightings(np.arange(len(ids)) // 31, ids, np.zeros((len(ids), 4, 2)))
+    seen = Sightings(np.arange(len(ids)) // 31, ids, np.zeros((len(ids), 4, 2)), np.zeros(len(ids)))
     found = mislabelled(seen, 0.02, MarkerMap(walls_m()), np.random.default_rng(3))
     changed = found.ids != ids
     # Of 6,000 with a probability of 2 %: 120, with a standard deviation of 11.

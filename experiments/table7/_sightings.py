@@ -27,16 +27,18 @@ class Sightings:
         frame: (seen,), frame of each detected marker, not decreasing.
         ids: (seen,), id of each detected marker.
         corners_px: (seen, 4, 2), corners in the image, pixels.
+        std_px: (seen,), standard deviation of a marker's corners, pixels.
     """
 
     frame: Int[np.ndarray, "seen"]
     ids: Int[np.ndarray, "seen"]
     corners_px: Float[np.ndarray, "seen 4 2"]
+    std_px: Float[np.ndarray, " seen"]
 
     def in_frame(self, frame: int) -> DetectedMarkers:
         """Markers of one frame."""
         first, last = np.searchsorted(self.frame, [frame, frame + 1])
-        return DetectedMarkers(self.ids[first:last], self.corners_px[first:last])
+        return DetectedMarkers(self.ids[first:last], self.corners_px[first:last], self.std_px[first:last])
 
 
 def detected(recording: Recording, kept: Path) -> Sightings:
@@ -46,20 +48,22 @@ def detected(recording: Recording, kept: Path) -> Sightings:
     if kept.exists():
         with np.load(kept) as stored:
             if str(stored["made_of"]) == made_of:
-                return Sightings(stored["frame"], stored["ids"], stored["corners_px"])
+                return Sightings(stored["frame"], stored["ids"], stored["corners_px"], stored["std_px"])
     detector = MarkerDetector(DICTIONARY, recording.lens, ids=ids.tolist())
     seen = []
     with progress_bar(f"detect {video.path.stem}", video.num_frames) as advance:
         for image in read_frames(video):
-            seen.append(detector.detect(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)))
+            seen.append(detector.detect(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)).of_single_ids())
             advance(1)
     found = Sightings(
         np.repeat(np.arange(len(seen)), [len(one.ids) for one in seen]),
         np.concatenate([one.ids for one in seen]),
         np.concatenate([one.corners_px for one in seen]),
+        np.concatenate([one.std_px for one in seen]),
     )
+    columns = {"ids": found.ids, "corners_px": found.corners_px, "std_px": found.std_px}
     with atomic_write(kept) as temporary:
-        np.savez(temporary, made_of=made_of, frame=found.frame, ids=found.ids, corners_px=found.corners_px)
+        np.savez(temporary, made_of=made_of, frame=found.frame, **columns)
     return found
 
 

@@ -168,9 +168,6 @@ def localise(
     from the video, unless --line-time or --readout gives it; in a stream, without either, it is 0. A pose is that of
     the moment when the middle row is exposed, which is also the frame's time.
 
-    In images whose longer side is 2880 pixels or more, such as 3840 x 2160, markers are searched for in an image of
-    half the size, and markers whose sides are shorter than 48 pixels are overlooked.
-
     \b
     Examples:
       psotrack localise flight.mp4 --markers corners.csv --camera lens.toml --out track.csv

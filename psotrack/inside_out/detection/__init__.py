@@ -1,11 +1,12 @@
 """Detection of ArUco markers in one image, with corners to a tenth of a pixel.
 
-In: a grey image, the name of the markers' dictionary and, optionally, the lens. Out: `DetectedMarkers` (ids and
-corners in pixels). Other rooms use `MarkerDetector` and `DetectedMarkers`; `refine_corners` also works alone, on
-corners that are known to a few pixels.
+In: a grey image, the name of the markers' dictionary and, optionally, the lens. Out: `DetectedMarkers` (ids, corners
+in pixels and their accuracy). Other rooms use `MarkerDetector` and `DetectedMarkers`; `refine_corners` also works
+alone, on corners that are known to a few pixels.
 
-`detector` reads the markers, `corners` refines their corners. `corners` uses `gamma` (the brightness encoding of the
-image), `edge_transitions` (black to white across an edge) and `distortion` (pixels without and with the lens).
+`search` finds the markers: `brightness` makes the images that are searched, `quads` finds quadrangles, `codes` reads
+them. `corners` refines their corners: `gamma` is the brightness encoding of the image, `edge_transitions` finds black
+to white across an edge, `edge_lines` fits lines to the edges, `distortion` converts pixels with and without the lens.
 """
 
 from psotrack.inside_out.detection.corners import refine_corners

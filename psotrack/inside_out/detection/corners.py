@@ -1,4 +1,7 @@
-"""Corners of markers, as the intersections of straight lines through their edges.
+"""Corners of markers, as the intersections of lines through their edges.
+
+Where the edges are bent, as on a bent sheet, the lines are parabolas. How well they fit, and how far a corner is from
+the measured points, says how accurate the corner is.
 
 The position of an edge is the middle of the transition from black to white across the edge, in levels that blend in
 proportion (see `gamma`). A blur of the lens or of motion that is equal on both sides moves no edge, but it rounds
@@ -7,11 +10,14 @@ corners off: OpenCV's refinement, which looks at the corners themselves, makes m
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from psotrack.geometry import Camera
 from psotrack.inside_out.detection.distortion import distort_pixels, undistort_pixels
+from psotrack.inside_out.detection.edge_lines import BEFORE, NEXT, fit_curves, fit_lines, intersections
 from psotrack.inside_out.detection.edge_transitions import Levels, find_transitions
 from psotrack.inside_out.detection.gamma import estimate_gamma, linearise
 
@@ -25,17 +31,31 @@ _REACH, _LEAST_REACH_PX = 0.7, 2.0
 #: The same distance in later passes, in standard deviations of the transition: wide enough for all of a blur, narrow
 #: enough to leave out noise.
 _SPREADS = 3.0
-#: Number of passes over the edges in grey levels, with ever smaller reach, and then in linear light.
-_GREY_PASSES, _LIGHT_PASSES = 2, 2
+#: The part of this distance that is for a bent edge, in medians of the points' distances from a straight line.
+_BOWS = 2.5
+#: Number of passes over the edges in grey levels, with ever smaller reach. Two passes in linear light follow.
+_GREY_PASSES = 2
 #: Points along an edge at which it is measured, in shares of its length. Near a corner the blur mixes two edges.
 _ALONG = np.linspace(0.15, 0.85, 16)
-#: Number of times a line is fitted again with lower weights for points off the line, such as where a drone hides
-#: the edge.
-_REWEIGHTINGS = 2
-#: Distance from a line, in pixels, below which a point keeps most of its weight.
-_INLIER_PX = 0.1
 #: Largest distance that a corner may move, in units of the first search distance.
 _LARGEST_MOVE = 2.0
+#: Parts of a corner's standard deviation that no fit shows: the smallest, in pixels; for errors of compression and of
+#: the levels' power, in spreads of the edges' transitions; and for cells that blur mixes into the edges, in spreads
+#: times the spread in cells. Measured on rendered markers.
+_LEAST_STD_PX, _BLUR_STD, _NEIGHBOURS_STD = 0.03, 0.04, 0.35
+
+
+@dataclass(frozen=True)
+class RefinedCorners:
+    """Corners of markers with their accuracy.
+
+    Attributes:
+        corners_px: (markers, 4, 2), pixels.
+        std_px: (markers,), standard deviation of a corner along x and along y, pixels.
+    """
+
+    corners_px: _Corners
+    std_px: Float[np.ndarray, " markers"]
 
 
 def refine_corners(
@@ -43,59 +63,91 @@ def refine_corners(
     corners_px: Float[np.ndarray, "markers 4 2"],
     white: Bool[np.ndarray, "markers cells cells"],
     lens: Camera | None = None,
-) -> Float[np.ndarray, "markers 4 2"]:
+) -> RefinedCorners:
     """Refine corners of markers to the intersections of lines that are fitted to their edges.
 
     Args:
-        gray: (height, width), an image of black markers on white.
+        gray: (height, width), an image of markers.
         corners_px: (markers, 4, 2), clockwise from each marker's own top left, known to a few pixels.
-        white: (markers, cells, cells), which cells of each marker are white; border cells are black.
+        white: (markers, cells, cells), which cells of each marker are white. The cells of the border are all black, or
+            all white in an inverted print.
         lens: lens whose distortion bends the edges; None for straight edges.
 
     Returns:
-        (markers, 4, 2), refined corners, pixels. A corner whose edges are not found stays as it was.
+        The refined corners. A corner whose edges are not found stays as it was.
     """
     if not len(corners_px):
-        return corners_px
-    reach_px = np.maximum(_REACH * _widths_px(corners_px) / white.shape[1], _LEAST_REACH_PX)
+        return RefinedCorners(corners_px, np.zeros(0))
+    cell_px = _widths_px(corners_px) / white.shape[1]
+    reach_px = np.maximum(_REACH * cell_px, _LEAST_REACH_PX)
     largest_move_px = _LARGEST_MOVE * reach_px.max(axis=1)
+    outside = np.where(white[:, 0, 0], -1.0, 1.0)
     refined_px = corners_px
+
+    def limited(fitted_px: _Corners) -> _Corners:
+        """Fitted corners; those before the fit where a fitted corner is too far from the first position."""
+        near = np.linalg.norm(fitted_px - corners_px, axis=-1) <= largest_move_px[:, None]
+        return np.where(near[..., None], fitted_px, refined_px)
+
     for _ in range(_GREY_PASSES):
-        fitted_px, spread_px = _fit_corners(gray, refined_px, reach_px, lens)
-        refined_px = _limit_moves(fitted_px, corners_px, refined_px, largest_move_px)
-        reach_px = np.clip(_SPREADS * spread_px, _LEAST_REACH_PX, reach_px)
+        edges = _measure_edges(gray, refined_px, reach_px, outside, lens)
+        *lines, bow_px = fit_lines(edges.points, edges.height)
+        refined_px = limited(distort_pixels(intersections(*lines), lens))
+        wide_px = np.maximum(_SPREADS * edges.spread_px, edges.spread_px + _BOWS * bow_px)
+        reach_px = np.clip(wide_px, _LEAST_REACH_PX, reach_px)
     light = linearise(gray, estimate_gamma(gray, refined_px, reach_px, white, lens))
-    for _ in range(_LIGHT_PASSES):
-        fitted_px, _ = _fit_corners(light, refined_px, reach_px, lens)
-        refined_px = _limit_moves(fitted_px, corners_px, refined_px, largest_move_px)
-    return refined_px
+    edges = _measure_edges(light, refined_px, reach_px, outside, lens)
+    middle, direction, _ = fit_lines(edges.points, edges.height)
+    refined_px = limited(distort_pixels(intersections(middle, direction), lens))
+    edges = _measure_edges(light, refined_px, reach_px, outside, lens)
+    fitted = fit_curves(edges.points, edges.height, edges.spread_px)
+    fitted_px = distort_pixels(fitted.corners, lens)
+    refined_px = limited(fitted_px)
+    # A corner that the fit does not place is as good as the search.
+    lost_px = np.minimum(np.linalg.norm(fitted_px - refined_px, axis=-1), largest_move_px[:, None])
+    parts_px = (
+        np.minimum(fitted.std, largest_move_px),
+        np.sqrt((lost_px**2).mean(axis=1) / 2),
+        _BLUR_STD * edges.spread_px.max(axis=1),
+        _NEIGHBOURS_STD * (edges.spread_px**2 / cell_px).max(axis=1),
+        np.full(len(corners_px), _LEAST_STD_PX),
+    )
+    return RefinedCorners(refined_px, np.linalg.norm(parts_px, axis=0))
 
 
 def _widths_px(corners_px: _Corners) -> _Sides:
     """Width of a marker across each of its edges: the mean length of the two neighbouring edges."""
-    sides_px = np.linalg.norm(np.roll(corners_px, -1, axis=1) - corners_px, axis=-1)
-    return (np.roll(sides_px, 1, axis=1) + np.roll(sides_px, -1, axis=1)) / 2
+    sides_px = np.linalg.norm(corners_px[:, NEXT] - corners_px, axis=-1)
+    return (sides_px[:, BEFORE] + sides_px[:, NEXT]) / 2
 
 
-def _limit_moves(
-    fitted_px: _Corners,
-    first_px: _Corners,
-    before_px: _Corners,
-    largest_move_px: Float[np.ndarray, " markers"],
-) -> _Corners:
-    """Fitted corners; those before the fit where a fitted corner is too far from the first position."""
-    near = np.linalg.norm(fitted_px - first_px, axis=-1) <= largest_move_px[:, None]
-    return np.where(near[..., None], fitted_px, before_px)
+@dataclass(frozen=True)
+class _Edges:
+    """Measured edges of markers.
+
+    Attributes:
+        points: (markers, 4, points, 2), middles of the transitions, as a lens without distortion shows them, pixels.
+        height: (markers, 4, points), difference of levels across the transition; 0 where there is none.
+        spread_px: (markers, 4), spread of each side's transitions, pixels.
+    """
+
+    points: _Points
+    height: Float[np.ndarray, "markers 4 points"]
+    spread_px: _Sides
 
 
-def _fit_corners(
-    levels: Levels, corners_px: _Corners, reach_px: _Sides, lens: Camera | None
-) -> tuple[_Corners, _Sides]:
-    """Intersections of lines that are fitted to the sides of quadrangles, and the spread of each side, pixels."""
-    sides = np.roll(corners_px, -1, axis=1) - corners_px
+def _measure_edges(
+    levels: Levels,
+    corners_px: _Corners,
+    reach_px: _Sides,
+    outside: Float[np.ndarray, " markers"],
+    lens: Camera | None,
+) -> _Edges:
+    """Find the edges along the sides of quadrangles; `outside` is 1 where the outside is lighter, -1 where darker."""
+    sides = corners_px[:, NEXT] - corners_px
     ahead = sides / np.maximum(np.linalg.norm(sides, axis=-1, keepdims=True), 1e-9)
     # Outward for a clockwise outline, with y down.
-    outward = np.stack([ahead[..., 1], -ahead[..., 0]], axis=-1)
+    outward = np.stack([ahead[..., 1], -ahead[..., 0]], axis=-1) * outside[:, None, None]
     places_px = corners_px[:, :, None] + _ALONG[:, None] * sides[:, :, None]
     steps_px = np.broadcast_to((reach_px[..., None] * outward)[:, :, None], places_px.shape)
     transitions = find_transitions(
@@ -105,40 +157,11 @@ def _fit_corners(
         each.reshape(places_px.shape[:-1])
         for each in (transitions.offset, transitions.spread, transitions.height)
     )
-    points_px = places_px + offset[..., None] * steps_px
-    points = undistort_pixels(points_px, lens)
+    points = undistort_pixels(places_px + offset[..., None] * steps_px, lens)
     # Beside a marker at the border of what the lens shows, some points have no place without distortion.
     is_shown = np.isfinite(points).all(axis=-1)
-    lines = _fit_lines(np.where(is_shown[..., None], points, 0.0), np.where(is_shown, height, 0.0))
-    return distort_pixels(_intersections(*lines), lens), np.median(spread, axis=-1) * reach_px
-
-
-def _fit_lines(
-    points: _Points, weight: Float[np.ndarray, "markers 4 points"]
-) -> tuple[Float[np.ndarray, "markers 4 2"], Float[np.ndarray, "markers 4 2"]]:
-    """A point on each line and the line's direction, by least squares of distances with lower weights for outliers."""
-    weighted = weight
-    for _ in range(1 + _REWEIGHTINGS):
-        total = np.maximum(weighted.sum(axis=-1), 1e-9)[..., None]
-        middle = (weighted[..., None] * points).sum(axis=2) / total
-        apart = points - middle[:, :, None]
-        xx, yy, xy = (
-            (weighted * apart[..., i] * apart[..., j]).sum(axis=-1) for i, j in ((0, 0), (1, 1), (0, 1))
-        )
-        angle = np.arctan2(2 * xy, xx - yy) / 2
-        direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        distance = np.abs(apart[..., 0] * direction[..., None, 1] - apart[..., 1] * direction[..., None, 0])
-        typical = np.maximum(1.5 * np.median(distance, axis=-1, keepdims=True), _INLIER_PX)
-        weighted = weight / (1 + (distance / typical) ** 2)
-    return middle, direction
-
-
-def _intersections(
-    on: Float[np.ndarray, "markers 4 2"], direction: Float[np.ndarray, "markers 4 2"]
-) -> Float[np.ndarray, "markers 4 2"]:
-    """Intersection of each line with the line before it; far away where the two are parallel."""
-    before, ahead = np.roll(on, 1, axis=1), np.roll(direction, 1, axis=1)
-    apart = on - before
-    cross = ahead[..., 0] * direction[..., 1] - ahead[..., 1] * direction[..., 0]
-    along = apart[..., 0] * direction[..., 1] - apart[..., 1] * direction[..., 0]
-    return before + (along / np.where(np.abs(cross) < 1e-9, 1e-9, cross))[..., None] * ahead
+    return _Edges(
+        np.where(is_shown[..., None], points, 0.0),
+        np.where(is_shown, height, 0.0),
+        np.median(spread, axis=-1) * reach_px,
+    )

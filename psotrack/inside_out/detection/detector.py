@@ -1,9 +1,4 @@
-"""Detection of markers: their ids and corners in an image.
-
-OpenCV finds and reads them (Garrido-Jurado et al., Pattern Recognition 47(6), 2014), in one binary image with one size
-of window instead of three. Before the threshold, each pixel is divided by the brightness of its surroundings, so that
-markers in dim places are found as well.
-"""
+"""Detection of markers: their ids, corners and the corners' accuracy in an image."""
 
 from __future__ import annotations
 
@@ -17,29 +12,11 @@ from jaxtyping import Bool, Float, Int, UInt8
 from psotrack.detection import marker_dictionary
 from psotrack.errors import SettingsError
 from psotrack.geometry import Camera
+from psotrack.inside_out.detection.codes import MarkerCodes
 from psotrack.inside_out.detection.corners import refine_corners
 from psotrack.inside_out.detection.distortion import undistort_pixels
+from psotrack.inside_out.detection.search import MarkerSearch
 
-#: Longer side, in pixels, near which images are searched: larger images are shrunk by the whole number that comes
-#: nearest. Corners are then refined in the full image.
-_SEARCHED_PX = 1920
-#: Side of the window of the adaptive threshold, as a share of the searched image's longer side, and the smallest side
-#: in pixels. The window must be wider than motion blur is long.
-_WINDOW = 0.04
-_LEAST_WINDOW_PX = 9
-#: How much darker than its surroundings a black pixel is, of 255, in the image of equal brightness.
-_DARKER = 20.0
-#: Number of tiles along the image's longer side, and side, in tiles, of the square in which the brightest tile is the
-#: white of a place. The square is wider than neighbouring black cells of a marker that fills half of the image;
-#: otherwise such cells would count as white.
-_TILES, _WHITE_SQUARE = 240, 31
-#: Smallest grey level of white: darker surroundings show only noise.
-_LEAST_WHITE = 16
-#: Grey level of white in the image of equal brightness; levels above it are for pixels brighter than their white.
-_WHITE = 200
-#: Grey levels of the searched image, half way between grey and light: blur in light hides black cells, blur in grey
-#: levels hides white cells.
-_HALF_LINEAR = np.round(255 * (np.arange(256) / 255) ** 1.5).astype(np.uint8)
 #: Shortest side of a marker, in pixels of the full image: one pixel for each of 6 cells, border cells included.
 _SHORTEST_PX = 6.0
 
@@ -49,35 +26,42 @@ class DetectedMarkers:
     """Markers in one image.
 
     Attributes:
-        ids: (markers,), all different.
+        ids: (markers,); an image may show several markers with one id.
         corners_px: (markers, 4, 2), clockwise from the marker's own top left, pixels.
+        std_px: (markers,), standard deviation of a corner along x and along y, pixels; NaN if unknown.
     """
 
     ids: Int[np.ndarray, " markers"]
     corners_px: Float[np.ndarray, "markers 4 2"]
+    std_px: Float[np.ndarray, " markers"]
 
     def __len__(self) -> int:
         return len(self.ids)
 
     def select(self, kept: Bool[np.ndarray, " markers"]) -> DetectedMarkers:
         """The markers that a mask keeps."""
-        return DetectedMarkers(self.ids[kept], self.corners_px[kept])
+        return DetectedMarkers(self.ids[kept], self.corners_px[kept], self.std_px[kept])
+
+    def of_single_ids(self) -> DetectedMarkers:
+        """The markers whose id is seen once, for rooms in which all markers differ.
+
+        Of two markers with the same id at least one is false, and the image does not show which: both are left out.
+        """
+        _, inverse, count = np.unique(self.ids, return_inverse=True, return_counts=True)
+        return self.select(count[inverse] == 1)
 
 
 class MarkerDetector:
-    """Finds the markers of a dictionary in images.
+    """Finds the markers of a dictionary in images, black on white or inverted.
 
-    If two markers have the same id, at least one is false, and the image does not show which: both are left out.
-    Quadrangles that are too small, folded or mirrored are left out too.
-
-    Small markers are overlooked. Images are searched at a longer side of about 1920 pixels, where the sides of a marker
-    need about 24 pixels. In an image of 3840 x 2160 pixels, markers whose sides are shorter than 48 pixels are
-    overlooked.
+    It finds what OpenCV's detector finds with its defaults in the full image, unless the brightness of the cells says
+    that it is none; and markers that OpenCV overlooks. Quadrangles that are too small, folded or mirrored are left out.
 
     Args:
         dictionary: name of the markers' dictionary, such as 4x4_1000.
         lens: lens whose distortion bends the edges; None for straight edges.
         ids: ids of the markers to search; None for all of the dictionary, which takes longer if it is large.
+        thorough: search in images of every size and with several windows, for photographs; else once, for videos.
 
     Raises:
         SettingsError: there is no dictionary of this name, or it has none of the ids.
@@ -91,7 +75,12 @@ class MarkerDetector:
     """
 
     def __init__(
-        self, dictionary: str = "4x4_1000", lens: Camera | None = None, *, ids: Iterable[int] | None = None
+        self,
+        dictionary: str = "4x4_1000",
+        lens: Camera | None = None,
+        *,
+        ids: Iterable[int] | None = None,
+        thorough: bool = False,
     ) -> None:
         whole = marker_dictionary(dictionary)
         count = len(whole.bytesList)
@@ -104,69 +93,28 @@ class MarkerDetector:
             )
         self._ids = np.array(wanted)
         # As many wrong bits are corrected as in the whole dictionary, so that the same markers are read.
-        self._dictionary = cv2.aruco.Dictionary(
+        searched = cv2.aruco.Dictionary(
             np.ascontiguousarray(whole.bytesList[self._ids]), whole.markerSize, whole.maxCorrectionBits
         )
+        self._codes = MarkerCodes(searched)
+        self._search = MarkerSearch(searched, self._codes, thorough)
         is_bent = lens is not None and (np.any(lens.dist) or bool(lens.fisheye))
         self._lens = lens if is_bent else None
 
     def detect(self, gray: UInt8[np.ndarray, "height width"]) -> DetectedMarkers:
         """Detect the markers in an image, (height, width); empty if there are none."""
-        searched = _shrink(gray)
-        detector = cv2.aruco.ArucoDetector(self._dictionary, _parameters(max(searched.shape)))
-        quads, which, _ = detector.detectMarkers(_equalise_brightness(searched))
-        if which is None:
-            return DetectedMarkers(np.zeros(0, np.int64), np.zeros((0, 4, 2)))
-        # Pixel centres are at whole numbers, so that the image begins at -0.5.
-        scale = np.array(gray.shape[::-1]) / searched.shape[::-1]
-        corners_px = (np.concatenate(quads).reshape(-1, 4, 2) + 0.5) * scale - 0.5
-        found = DetectedMarkers(self._ids[which.ravel()], corners_px)
-        _, inverse, count = np.unique(found.ids, return_inverse=True, return_counts=True)
+        found = self._search.find(gray)
         # A marker that reaches beyond what the lens model shows has no place without distortion.
         is_shown = np.isfinite(undistort_pixels(found.corners_px, self._lens)).all(axis=(1, 2))
-        found = found.select((count[inverse] == 1) & _valid_quads(found.corners_px) & is_shown)
-        corners_px = refine_corners(gray, found.corners_px, self._white_cells(found.ids), self._lens)
-        return DetectedMarkers(found.ids, corners_px).select(_valid_quads(corners_px))
-
-    def _white_cells(self, ids: Int[np.ndarray, " markers"]) -> Bool[np.ndarray, "markers cells cells"]:
-        """Which cells of each marker are white; the cells of the border are included."""
-        cells = self._dictionary.markerSize + 2
-        drawn = [
-            cv2.aruco.generateImageMarker(self._dictionary, int(which), cells)
-            for which in np.searchsorted(self._ids, ids)
-        ]
-        return np.array(drawn, np.uint8).reshape(-1, cells, cells) > 0
+        found = found.select(valid_quads(found.corners_px) & is_shown)
+        white = self._codes.white[found.index] ^ found.inverted[:, None, None]
+        refined = refine_corners(gray, found.corners_px, white, self._lens)
+        return DetectedMarkers(self._ids[found.index], refined.corners_px, refined.std_px).select(
+            valid_quads(refined.corners_px)
+        )
 
 
-def _shrink(gray: UInt8[np.ndarray, "height width"]) -> UInt8[np.ndarray, "rows columns"]:
-    """The image at about the size at which it is searched."""
-    times = round(max(gray.shape) / _SEARCHED_PX)
-    if times < 2:
-        return gray
-    size_wh = (gray.shape[1] // times, gray.shape[0] // times)
-    return np.asarray(cv2.resize(gray, size_wh, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def _equalise_brightness(gray: UInt8[np.ndarray, "rows columns"]) -> UInt8[np.ndarray, "rows columns"]:
-    """The image divided by the white of each place: the brightest tile around the place."""
-    # Without smoothing, noise makes specks, which take time and hide markers.
-    smooth = np.asarray(cv2.GaussianBlur(gray, (3, 3), 0))
-    tile = max(1, round(max(gray.shape) / _TILES))
-    around = (_WHITE_SQUARE, _WHITE_SQUARE)
-    white = cv2.blur(cv2.dilate(smooth[::tile, ::tile], np.ones(around, np.uint8)), around)
-    white = cv2.resize(np.maximum(white, _LEAST_WHITE), gray.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    return np.asarray(cv2.LUT(cv2.divide(smooth, white, scale=_WHITE), _HALF_LINEAR), np.uint8)
-
-
-def _parameters(longer_side_px: int) -> cv2.aruco.DetectorParameters:
-    parameters = cv2.aruco.DetectorParameters()
-    window_px = max(_LEAST_WINDOW_PX, 2 * round((_WINDOW * longer_side_px - 1) / 2) + 1)
-    parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = window_px
-    parameters.adaptiveThreshConstant = _DARKER
-    return parameters
-
-
-def _valid_quads(corners_px: Float[np.ndarray, "markers 4 2"]) -> Bool[np.ndarray, " markers"]:
+def valid_quads(corners_px: Float[np.ndarray, "markers 4 2"]) -> Bool[np.ndarray, " markers"]:
     """Which quadrangles are convex, clockwise and not too small."""
     sides = np.roll(corners_px, -1, axis=1) - corners_px
     following = np.roll(sides, -1, axis=1)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8, UInt16
 
 from psotrack.geometry import Camera
+from psotrack.inside_out.detection.codes import homographies
 from psotrack.inside_out.detection.distortion import distort_pixels, undistort_pixels
 from psotrack.inside_out.detection.edge_transitions import Levels, find_transitions
 
@@ -51,7 +52,7 @@ def estimate_gamma(
         gray: (height, width).
         corners_px: (markers, 4, 2), clockwise from each marker's own top left, on its edges in grey levels.
         reach_px: (markers, 4), distance to both sides of each edge within which its transition lies.
-        white: (markers, cells, cells), which cells of each marker are white.
+        white: (markers, cells, cells), which cells of each marker are white; the first one has the border's colour.
         lens: lens whose distortion bends the edges; None for straight edges.
 
     Returns:
@@ -93,7 +94,7 @@ def _cell_edges(
     upright = np.stack(np.broadcast_arrays(lines[:, None], middles), axis=-1)
     grid = np.stack([upright, upright[..., ::-1]])
     half = np.array([[0.5, 0.0], [0.0, 0.5]])[:, None, None] / cells
-    to_image = _homographies(undistort_pixels(corners_px, lens))
+    to_image = homographies(undistort_pixels(corners_px, lens))
     places_px, before_px, after_px = (
         distort_pixels(_project(to_image, at), lens) for at in (grid, grid - half, grid + half)
     )
@@ -101,7 +102,9 @@ def _cell_edges(
     ahead = (after_px - before_px) / np.maximum(cell_px, 1e-9)
     # Steps to the right cross the left and the right edge of a marker, which are the odd ones of the four.
     across_px = np.stack([reach_px[:, 1::2].max(axis=1), reach_px[:, ::2].max(axis=1)], axis=1)
-    around = np.pad(white, ((0, 0), (1, 1), (1, 1)), constant_values=True).astype(np.float64)
+    # Around the border lies the other colour.
+    around = np.pad(white ^ white[:, :1, :1], ((0, 0), (1, 1), (1, 1)), constant_values=True)
+    around = (around ^ white[:, :1, :1]).astype(np.float64)
     sign = np.stack(
         [np.diff(around[:, 1:-1], axis=2).swapaxes(1, 2), np.diff(around[:, :, 1:-1], axis=1)], axis=1
     )
@@ -127,12 +130,6 @@ def _white_gain_px(
     normal = np.einsum("mapi,mapj->maij", weighted, terms) + 1e-6 * np.eye(3)
     right = np.einsum("mapi,map->mai", weighted, offset_px.reshape(terms.shape[:-1]))
     return -np.linalg.solve(normal, right[..., None])[..., 2, 0]
-
-
-def _homographies(corners_px: Float[np.ndarray, "markers 4 2"]) -> Float[np.ndarray, "markers 3 3"]:
-    """Homographies from the unit square to each quadrangle."""
-    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
-    return np.stack([cv2.getPerspectiveTransform(square, each) for each in corners_px.astype(np.float32)])
 
 
 def _project(

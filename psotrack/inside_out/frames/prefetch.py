@@ -1,14 +1,18 @@
-"""Iteration over items that a thread produces ahead of their use."""
+"""Iteration over items that threads produce, or work on, ahead of their use."""
 
 from __future__ import annotations
 
 import contextlib
 import queue
 import threading
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as NotYetError
 from typing import TypeVar
 
 _Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
 
 #: Largest number of items that wait to be used.
 _AHEAD = 4
@@ -72,3 +76,39 @@ def _get(waiting: queue.Queue[object]) -> object:
     while True:
         with contextlib.suppress(queue.Empty):
             return waiting.get(timeout=_WAIT_S)
+
+
+def map_ahead(
+    function: Callable[[_Item], _Result], items: Iterator[_Item], workers: int
+) -> Iterator[_Result]:
+    """Results of a function for items, in their order, computed by threads a few items ahead of the result in use.
+
+    Errors of the function and of the items are raised here, in their order. Ctrl-C ends the iteration.
+
+    Args:
+        function: called in several threads at once.
+        items: its arguments.
+        workers: number of threads; 1 computes each result when it is asked for, so that no item waits.
+    """
+    if workers < 2:
+        yield from map(function, items)
+        return
+    pool = ThreadPoolExecutor(workers, thread_name_prefix="psotrack-map")
+    waiting: deque[Future[_Result]] = deque()
+    try:
+        for item in items:
+            waiting.append(pool.submit(function, item))
+            # One item more than threads, so that no thread is idle while a result is in use.
+            if len(waiting) > workers:
+                yield _result(waiting.popleft())
+        while waiting:
+            yield _result(waiting.popleft())
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _result(future: Future[_Result]) -> _Result:
+    """Wait for a result; Ctrl-C can interrupt the wait."""
+    while True:
+        with contextlib.suppress(NotYetError):
+            return future.result(timeout=_WAIT_S)

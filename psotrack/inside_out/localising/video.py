@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -14,7 +15,7 @@ from psotrack.errors import InputError
 from psotrack.geometry import Camera
 from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
 from psotrack.inside_out.filtering.path_rows import PoseRow, join_rows
-from psotrack.inside_out.frames import Frame, FrameSource, read_ahead
+from psotrack.inside_out.frames import Frame, FrameSource, map_ahead, read_ahead
 from psotrack.inside_out.line_time import Detected, LineTime, estimate_line_time
 from psotrack.inside_out.localising.frame_poses import localise_frames
 from psotrack.inside_out.localising.map_evidence import (
@@ -28,6 +29,8 @@ from psotrack.inside_out.mapping.from_centres import complete_map
 from psotrack.inside_out.marker_map import MarkerCentres, MarkerMap
 from psotrack.support import Advance, Report, no_progress
 
+#: Number of threads that detect markers, each in a frame of its own.
+_WORKERS = min(4, os.cpu_count() or 1)
 #: Number, time (seconds) and grey image of a frame.
 _GreyFrame = tuple[int, float, UInt8[np.ndarray, "height width"]]
 
@@ -43,11 +46,11 @@ def localise_video(
 ) -> LocalisedVideo:
     """Localise a camera in every frame, from markers of known positions.
 
-    A thread decodes frames and converts them to grey, ahead of the detection of markers. Markers that are not in the
-    map are not detected. In a recording, the markers of all frames are found first, and show whether the shutter rolls
-    (`line_time`). Where two poses fit a frame's markers about equally well, the filter's prediction decides;
-    then the filter uses the pose or gates it. Markers that disagree with the others over a recording are left out, and
-    the poses are estimated once more without them.
+    A thread decodes frames and converts them to grey, and others detect markers in several frames at once. Markers that
+    are not in the map are not detected. In a recording, the markers of all frames are found first, and show whether the
+    shutter rolls (`line_time`). Where two poses fit a frame's markers about equally well, the filter's prediction
+    decides; then the filter uses the pose or gates it. Markers that disagree with the others over a recording are left
+    out, and the poses are estimated once more without them.
 
     Args:
         source: frames of the camera.
@@ -169,10 +172,18 @@ def _counted(detected: Iterable[Detected], done: Advance) -> Iterator[Detected]:
 def _detect_markers(
     source: FrameSource, detector: MarkerDetector, seconds: dict[str, float]
 ) -> Iterator[tuple[int, float, DetectedMarkers]]:
-    for number, time_s, gray in read_ahead(_grey_frames(source, seconds), newest=source.newest):
+    def detect(frame: _GreyFrame) -> tuple[int, float, DetectedMarkers, float]:
         start_s = time.perf_counter()
-        markers = detector.detect(gray)
-        seconds["detect"] += time.perf_counter() - start_s
+        number, time_s, gray = frame
+        # A map has every marker once.
+        markers = detector.detect(gray).of_single_ids()
+        return number, time_s, markers, time.perf_counter() - start_s
+
+    frames = read_ahead(_grey_frames(source, seconds), newest=source.newest)
+    # Frames that wait in line would no longer be the newest.
+    workers = 1 if source.newest else _WORKERS
+    for number, time_s, markers, spent_s in map_ahead(detect, frames, workers):
+        seconds["detect"] += spent_s
         yield number, time_s, markers
 
 

@@ -48,7 +48,8 @@ def _views(sightings: MarkerSightings, video: int) -> list[Detected]:
     found: list[Detected] = []
     for view, at_s in zip(views.tolist(), time_s.tolist(), strict=True):
         rows = slice(start[view], start[view + 1])
-        markers = DetectedMarkers(sightings.marker[rows], sightings.corners_px[rows])
+        ids = sightings.marker[rows]
+        markers = DetectedMarkers(ids, sightings.corners_px[rows], np.full(len(ids), np.nan))
         found.append((round(at_s / step_s), at_s, markers))
     return found
 
@@ -56,5 +57,4 @@ def _views(sightings: MarkerSightings, video: int) -> list[Detected]:
 def _of_map(frame: Detected, marker_map: MarkerMap) -> Detected:
     """A frame with the markers that are in the map."""
     number, time_s, markers = frame
-    known = np.isin(markers.ids, marker_map.ids)
-    return number, time_s, DetectedMarkers(markers.ids[known], markers.corners_px[known])
+    return number, time_s, markers.select(np.isin(markers.ids, marker_map.ids))
