@@ -35,7 +35,7 @@ COMMANDS = {
     ),
     "detect": LazyCommand(
         "psotrack.cli.detect",
-        "Detect the drones of SEQ in each of its videos with a neural network, as 2D boxes.",
+        "Detect the drones of SEQ in each of its videos as 2D boxes: with a neural network, or as blobs of foreground.",
     ),
     "doctor": LazyCommand(
         "psotrack.cli.doctor",
@@ -69,7 +69,8 @@ COMMANDS = {
         "Write the table of a room's marker corners from SOURCE, or check such a table.",
     ),
     "silhouettes": LazyCommand(
-        "psotrack.cli.silhouettes", "Compute and store the silhouettes of SEQ, which `track` reads."
+        "psotrack.cli.silhouettes",
+        "Compute and store the silhouettes of SEQ, which `track` reads, or write them as images or as a video.",
     ),
     "simulate": LazyCommand(
         "psotrack.cli.simulate",

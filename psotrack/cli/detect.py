@@ -1,22 +1,34 @@
-"""`psotrack detect`: detect drones in the videos of a sequence with a neural network."""
+"""`psotrack detect`: drones in videos as 2D boxes, by a neural network or as blobs of foreground."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
+import numpy as np
 
 from psotrack.cli.options import (
+    BACKGROUND,
+    CACHE,
     CAMERAS,
     DETECTOR_SIZE,
     FORCE,
+    JOBS,
     JSON,
     QUIET,
     SEQUENCE,
+    cache_folder,
+    filmed_recording,
     frames_option,
-    usable_recording,
+    silhouette_options,
 )
 from psotrack.cli.output import output_json, print_line, report_to
+from psotrack.errors import SettingsError
+from psotrack.silhouettes import SilhouetteSettings
+
+if TYPE_CHECKING:
+    from psotrack.recordings import Detections, Recording
 
 
 @click.command()
@@ -24,10 +36,12 @@ from psotrack.cli.output import output_json, print_line, report_to
 @click.option(
     "--detector",
     "chosen",
-    required=True,
     metavar="MODEL.onnx|NAME",
     help="YOLO network (v5 to v11) that was trained on drones, or the detector that an installed package adds under "
     "NAME.",
+)
+@click.option(
+    "--blobs", is_flag=True, help="Write the blobs of foreground instead of a network's detections."
 )
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the detections.")
 @click.option(
@@ -51,52 +65,104 @@ from psotrack.cli.output import output_json, print_line, report_to
     show_default=True,
     help="Side of the network's square input, in pixels.",
 )
+@silhouette_options
+@BACKGROUND
 @CAMERAS
 @frames_option
+@CACHE
+@JOBS
 @FORCE
 @QUIET
 @JSON
 def detect(
     sequence: Path,
-    chosen: str,
+    chosen: str | None,
+    blobs: bool,
     out: Path,
     confidence: float,
     nms: float,
     size: int,
+    background: str,
     cameras: str | None,
     num_frames: int | None,
+    cache: Path | None,
+    jobs: int | None,
     force: bool,
     quiet: bool,
     json_path: Path | None,
+    **settings: Any,
 ) -> None:
-    """Detect the drones of SEQ in each of its videos with a neural network, as 2D boxes.
+    """Detect the drones of SEQ in each of its videos as 2D boxes: with a neural network, or as blobs of foreground.
 
-    Writes OUT/CAMERA.csv for every camera, in the layout of the dataset's dl_data.
+    Writes OUT/CAMERA.csv for every camera, in the layout of the dataset's dl_data; `track --detections OUT` reads them.
+    SEQ may also be a single video or a folder of pictures, without any calibration; CAMERA is then its name.
+
+    --blobs takes what moves in a still image, as `track --detections blobs` does; the options of `psotrack silhouettes`
+    apply. The others are those of the network.
 
     \b
     Examples:
       psotrack detect data/Simulated_Data/S02_D4_A --detector drones.onnx --out boxes
       psotrack detect data/Real_Data/R12_D4 --detector drones.onnx --out boxes --size 1280 --confidence 0.4
+      psotrack detect data/Simulated_Data/S02_D4_A --blobs --out boxes
+      psotrack detect flight.mp4 --blobs --out boxes
+      psotrack detect pictures/ --blobs --out boxes --min-blob 16
     """
-    from psotrack.detection import DetectorSettings, find_detector
-    from psotrack.detection import detect_drones as detect_in
     from psotrack.recordings import write_detections
     from psotrack.support import refuse_to_overwrite
 
-    detector = find_detector(chosen, DetectorSettings(confidence, nms, size))
-    recording = usable_recording(sequence, cameras, num_frames)
+    if blobs == (chosen is not None):
+        raise SettingsError(
+            "detect", expected="--detector MODEL.onnx or --blobs", found="both" if blobs else "neither"
+        )
+    recording = filmed_recording(sequence, cameras, num_frames)
     files = {name: out / f"{name}.csv" for name in recording.videos}
     for path in files.values():
         refuse_to_overwrite(path, force)
     counts: dict[str, int] = {}
-    for name, video in recording.videos.items():
-        detections = detect_in(detector, name, video, report=report_to(quiet))
+    found = (
+        _by_blobs(recording, SilhouetteSettings(**settings), background, cache, jobs, quiet)
+        if chosen is None
+        else _by_network(recording, chosen, confidence, nms, size, quiet)
+    )
+    for name, detections in found:
         write_detections(files[name], detections)
         counts[name] = len(detections)
+    frames = sum(video.num_frames for video in recording.videos.values())
     output_json(json_path, {"out": str(out), "frames": recording.num_frames, "detections": counts}, force)
-    per_frame = sum(counts.values()) / (len(counts) * recording.num_frames)
+    per_frame = sum(counts.values()) / frames
     print_line(
         quiet,
         json_path,
         f"{out}: {len(counts)} cameras, {recording.num_frames} frames, {per_frame:.2f} boxes per frame and camera",
     )
+
+
+def _by_network(
+    recording: Recording, chosen: str, confidence: float, nms: float, size: int, quiet: bool
+) -> Any:
+    """Detections of each camera by a network, one camera after the other."""
+    from psotrack.detection import DetectorSettings, detect_drones, find_detector
+
+    detector = find_detector(chosen, DetectorSettings(confidence, nms, size))
+    for name, video in recording.videos.items():
+        yield name, detect_drones(detector, name, video, report=report_to(quiet))
+
+
+def _by_blobs(
+    recording: Recording,
+    settings: SilhouetteSettings,
+    background: str,
+    cache: Path | None,
+    jobs: int | None,
+    quiet: bool,
+) -> list[tuple[str, Detections]]:
+    """Detections of each camera by the blobs of its silhouettes."""
+    from psotrack.silhouettes import blob_detections, compute, find_background
+
+    model = find_background(background, settings)
+    made = compute(
+        recording, settings, cache=cache_folder(cache), jobs=jobs, background=model, report=report_to(quiet)
+    )
+    sizes = np.array([recording.videos[name].image_size_wh for name in made.cameras], float)
+    return list(blob_detections(made, sizes, report_to(quiet)).items())

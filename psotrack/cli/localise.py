@@ -258,7 +258,8 @@ def _input(video: str, drone: str | None, fps: float | None, live: bool) -> _Inp
     """The input that VIDEO names: a video, a folder of images, a stream, or one drone's video in a sequence."""
     from psotrack.datasets import find_marker_corners
     from psotrack.datasets.dpjait import read_onboard
-    from psotrack.inside_out import folder_has_images, open_source
+    from psotrack.inside_out import open_source
+    from psotrack.recordings import is_picture_folder
 
     stream, folder = live or "://" in video, Path(video)
     of_folder = not stream and folder.is_dir()
@@ -266,7 +267,7 @@ def _input(video: str, drone: str | None, fps: float | None, live: bool) -> _Inp
         raise InputError(
             video, expected="a video", found="no such file", remedy="pass --live if it is a camera's number"
         )
-    has_images = of_folder and folder_has_images(folder)
+    has_images = of_folder and is_picture_folder(folder)
     onboard = read_onboard(folder) if of_folder else {}
     if not onboard:
         if drone is not None:

@@ -234,6 +234,19 @@ def usable_recording(folder: str | Path, cameras: str | None, num_frames: int | 
     return open_recording(folder).usable(camera_names(cameras), num_frames)
 
 
+def filmed_recording(source: Path, cameras: str | None, num_frames: int | None) -> Recording:
+    """The videos of a recording, calibrated or not, or a single video, or a folder of pictures as a recording."""
+    from psotrack.datasets import is_recording, open_recording
+    from psotrack.recordings import is_picture_folder, open_video, recording_of_video, with_all_videos
+
+    if source.exists() and not is_recording(source):
+        # Nothing that is made from the pictures depends on their rate.
+        recording = recording_of_video(open_video(source, 1.0 if is_picture_folder(source) else None))
+    else:
+        recording = with_all_videos(open_recording(source))
+    return recording.usable(camera_names(cameras), num_frames)
+
+
 def camera_names(cameras: str | None) -> list[str] | None:
     """Names of the option `CAMERAS`; None where it is not given."""
     return None if cameras is None else [name.strip() for name in cameras.split(",")]

@@ -8,7 +8,7 @@ from pathlib import Path
 from psotrack.datasets.dpjait import CALIBRATION, MARKER_CORNERS, read_sequence
 from psotrack.datasets.recording_files import read_recording_toml
 from psotrack.errors import InputError
-from psotrack.recordings import RECORDING_FILE, Recording, read_recording_file
+from psotrack.recordings import RECORDING_FILE, Recording, is_picture_folder, read_recording_file
 
 
 def open_recording(path: Path | str, *, bodies: Mapping[str, Sequence[str]] | None = None) -> Recording:
@@ -31,6 +31,16 @@ def open_recording(path: Path | str, *, bodies: Mapping[str, Sequence[str]] | No
     if path.is_dir() and (path / CALIBRATION).exists():
         return read_sequence(path, bodies=bodies)
     raise _no_recording(path)
+
+
+def is_recording(path: Path | str) -> bool:
+    """Whether a path is that of a recording, and not of a video or of a folder of pictures."""
+    path = Path(path)
+    if path.is_file():
+        return path.suffix.lower() == ".toml"
+    if any((path / name).exists() for name in (RECORDING_FILE, CALIBRATION)):
+        return True
+    return path.is_dir() and not is_picture_folder(path)
 
 
 def find_marker_corners(path: Path | str) -> Path:

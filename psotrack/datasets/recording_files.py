@@ -24,6 +24,7 @@ from psotrack.recordings import (
     VideoInfo,
     check_rate,
     find_images,
+    open_pictures,
     probe,
     probe_images,
     read_detections,
@@ -36,6 +37,8 @@ from psotrack.rig_files import UNITS_M, Entry, camera_of_table, read_entries
 _logger = logging.getLogger(__name__)
 #: Size of the images of a rig file that does not state it; no camera has this size.
 _UNKNOWN_WH = (1, 1)
+#: Rate of pictures until their timestamps are read.
+_UNKNOWN_HZ = 1.0
 #: Largest deviation of a rate from a thousandth of another one at which the unit of time was mistaken, not the rate.
 _SLIP_SHARE = 0.05
 _LENS_AND_PLACE = ("K", "model", "distortion", "rvec", "tvec")
@@ -210,12 +213,16 @@ def _open_video(path: Path, name: str, table: CameraTable) -> VideoInfo | None:
     if table.video is None:
         return None
     file = _existing(folder, str(table.video), path, f"{place}.video")
-    if file.suffix.lower() == ".zip" or file.is_dir():
-        found = "a folder" if file.is_dir() else "an archive"
-        remedy = (
-            'write images = "FOLDER/*.png" for a folder of images' if file.is_dir() else "unpack it first"
-        )
-        raise _error(path, f"{place}.video", "a video", f"{found}, {table.video}", remedy)
+    if file.suffix.lower() == ".zip":
+        raise _error(path, f"{place}.video", "a video", f"an archive, {table.video}", "unpack it first")
+    if file.is_dir():
+        if table.fps is None and table.timestamps is None:
+            raise _error(path, f"{place}.fps", "frames per second of the pictures, or timestamps", "none")
+        video = open_pictures(file, table.fps or _UNKNOWN_HZ)
+        if table.fps is None:
+            times = read_timestamps(folder / str(table.timestamps), video.num_frames)
+            video = replace(video, fps=times.fps)
+        return video
     video = probe(file)
     if table.fps is not None:
         return replace(video, fps=table.fps)

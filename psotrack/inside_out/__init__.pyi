@@ -2,7 +2,7 @@ from .camera_path import CameraPath, Flag, read_camera_path, write_camera_path
 from .comparison.plots import save_flight
 from .filtering.pose_filter import PoseFilterParams
 from .filtering.smoothing import smooth
-from .frames import FrameSource, folder_has_images, open_source
+from .frames import FrameSource, open_source
 from .fusing import FusedDrone, FusedTracks, fuse
 from .fusing.drone_fusion import DroneFusion, SourceErrors
 from .fusing.fused_table import write_fused
@@ -40,7 +40,6 @@ __all__ = [
     "corners_in_own_frame",
     "find_sightings",
     "fit_squares",
-    "folder_has_images",
     "fuse",
     "lens_from_matrix",
     "localise_video",

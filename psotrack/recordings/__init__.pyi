@@ -1,9 +1,11 @@
 from .c3d import Markers, read_c3d, write_c3d
 from .detections import Detections, read_detections, write_detections
+from .filmed import recording_of_video, with_all_videos
 from .image_files import IMAGE_SUFFIXES, find_images, image_files, natural_key, read_image, read_mask
 from .inventory import describe_recording, inventory_table
 from .marker_bodies import body_trajectories
 from .marker_groups import NoDronesError
+from .pictures import is_picture_folder, open_pictures, open_video
 from .recording import OnboardVideo, Recording
 from .recording_file import (
     RECORDING_FILE,
@@ -57,10 +59,13 @@ __all__ = [
     "find_images",
     "image_files",
     "inventory_table",
+    "is_picture_folder",
     "join_videos",
     "make_timeline",
     "natural_key",
     "nearest_frames",
+    "open_pictures",
+    "open_video",
     "probe",
     "probe_images",
     "read_c3d",
@@ -71,7 +76,9 @@ __all__ = [
     "read_recording_file",
     "read_timestamps",
     "recording_file_text",
+    "recording_of_video",
     "silence_opencv",
+    "with_all_videos",
     "write_c3d",
     "write_detections",
     "write_recording_file",

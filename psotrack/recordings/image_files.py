@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import glob
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Shaped, UInt8
 
 from psotrack.errors import InputError
 
 #: Endings of files that are read as images.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+#: Numbers of bits that cameras use.
+_DEPTHS = (8, 10, 12, 14, 16)
 
 
 def natural_key(path: Path) -> list[tuple[int, str]]:
@@ -30,20 +33,48 @@ def image_files(folder: Path) -> list[Path]:
     """
     try:
         return sorted(
-            (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES), key=natural_key
+            (
+                path
+                for path in folder.iterdir()
+                # A name that begins with a point is a hidden file, such as macOS's ._frame1.png.
+                if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
+            ),
+            key=natural_key,
         )
     except OSError as error:
         found = (error.strerror or str(error)).lower()
         raise InputError(folder, expected="a folder to read", found=found) from error
 
 
-def read_image(path: Path) -> UInt8[np.ndarray, "height width 3"]:
-    """Read an image, BGR.
+def read_image(path: Path, depth_bits: int = 16) -> UInt8[np.ndarray, "height width 3"]:
+    """Read an image, BGR. Grey images get three equal channels.
+
+    Args:
+        path: path of the file.
+        depth_bits: number of bits that the values of an image of 16 bits use, of which the upper 8 are kept.
 
     Raises:
         InputError: the file cannot be read, or is no image.
     """
-    return _decode(path, cv2.IMREAD_COLOR_BGR)
+    image = _decode(path, cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH)
+    if image.dtype == np.uint16:
+        image = np.minimum(image >> (depth_bits - 8), 255)
+    elif image.dtype != np.uint8:
+        raise InputError(path, expected="an image of 8 or 16 bits", found=f"one of {image.dtype}")
+    return image.astype(np.uint8)
+
+
+def depth_of(paths: Sequence[Path]) -> int:
+    """Number of bits that the values of images use, 8 to 16, by the brightest pixel of all.
+
+    Cameras write 10, 12 or 14 bits into images of 16 bits, in which the upper bits are then empty.
+
+    Raises:
+        InputError: a file cannot be read, or is no image.
+    """
+    images = [_decode(path, cv2.IMREAD_UNCHANGED) for path in paths]
+    most = max((int(image.max()) for image in images if image.dtype == np.uint16), default=0)
+    return next(bits for bits in _DEPTHS if most < 2**bits)
 
 
 def read_mask(path: Path) -> UInt8[np.ndarray, "height width"]:
@@ -52,10 +83,10 @@ def read_mask(path: Path) -> UInt8[np.ndarray, "height width"]:
     Raises:
         InputError: the file cannot be read, or is no image.
     """
-    return _decode(path, cv2.IMREAD_GRAYSCALE)
+    return np.asarray(_decode(path, cv2.IMREAD_GRAYSCALE), np.uint8)
 
 
-def _decode(path: Path, flags: int) -> UInt8[np.ndarray, "..."]:
+def _decode(path: Path, flags: int) -> Shaped[np.ndarray, "..."]:
     try:
         coded = np.fromfile(path, np.uint8)
     except OSError as error:
@@ -63,7 +94,7 @@ def _decode(path: Path, flags: int) -> UInt8[np.ndarray, "..."]:
     image = cv2.imdecode(coded, flags) if len(coded) else None
     if image is None:
         raise InputError(path, expected="an image", found="a file that OpenCV cannot decode")
-    return np.asarray(image, np.uint8)
+    return np.asarray(image)
 
 
 def find_images(folder: Path, pattern: str, where: str) -> tuple[Path, ...]:

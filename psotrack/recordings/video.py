@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from psotrack.errors import InputError, OutputError, SettingsError, check_positive
-from psotrack.recordings.image_files import read_image
+from psotrack.recordings.image_files import depth_of, read_image
 from psotrack.support import atomic_write, digest_file, digest_record
 
 #: MPEG-4 part 2: OpenCV's wheels can encode and decode it, and decoding is faster than with MJPEG.
@@ -31,6 +31,8 @@ _FFMPEG_LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
 _FFMPEG_QUIET = "-8"
 #: Properties of a writer that takes encoded frames and the flags of key frames.
 _CODED = (cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1, cv2.VIDEOWRITER_PROP_KEY_INTERVAL, 2**31 - 1)
+#: Largest number of images of which the depth is read.
+_READ_IMAGES = 5
 _opening = threading.Lock()
 
 
@@ -45,6 +47,7 @@ class VideoInfo:
         fps: frames per second, as exact as in the container.
         image_size_wh: width and height of the frames in pixels.
         images: the image files that are the frames, in order; empty for a video file.
+        depth_bits: number of bits that the values of images of 16 bits use; frames have the upper 8 of them.
     """
 
     path: Path
@@ -52,6 +55,7 @@ class VideoInfo:
     fps: float
     image_size_wh: tuple[int, int]
     images: tuple[Path, ...] = ()
+    depth_bits: int = 16
 
 
 def probe(path: Path | str) -> VideoInfo:
@@ -78,11 +82,13 @@ def probe(path: Path | str) -> VideoInfo:
 
 
 def check_end(video: VideoInfo) -> None:
-    """Raise `InputError` if a video has fewer frames than its header says.
+    """Raise `InputError` if a video has fewer frames than its header says, or its last image is no frame of it.
 
     The last frame is sought; only where it cannot be reached, the encoded frames are counted.
     """
     if video.images:
+        path = video.images[video.num_frames - 1]
+        _check_size(path, video, read_image(path))
         return
     capture = _open(video.path)
     try:
@@ -96,20 +102,21 @@ def check_end(video: VideoInfo) -> None:
 
 
 def probe_images(images: Sequence[Path | str], fps: float) -> VideoInfo:
-    """A video whose frames are image files. Only the first image is read; `read_frames` notices bad other images.
+    """A video whose frames are image files. Few images are read; `read_frames` notices bad other images.
 
     Args:
         images: at least one image file, in the order of the frames.
         fps: frames per second.
 
     Raises:
-        InputError: the first file is no image.
+        InputError: one of the images that are read is no image.
         SettingsError: the rate is not above 0.
     """
     check_positive("fps", fps)
     paths = tuple(map(Path, images))
     height, width, _ = read_image(paths[0]).shape
-    return VideoInfo(paths[0].parent, len(paths), fps, (width, height), paths)
+    read = paths[:: max(1, -(-len(paths) // _READ_IMAGES))]
+    return VideoInfo(paths[0].parent, len(paths), fps, (width, height), paths, depth_of(read))
 
 
 def digest_video(video: VideoInfo) -> str:
@@ -136,7 +143,7 @@ def read_frames(video: VideoInfo, step: int = 1) -> Iterator[UInt8[np.ndarray, "
         raise SettingsError("step", expected="1 or more", found=f"{step}")
     if video.images:
         for path in video.images[: video.num_frames : step]:
-            frame = read_image(path)
+            frame = read_image(path, video.depth_bits)
             _check_size(path, video, frame)
             yield frame
         return

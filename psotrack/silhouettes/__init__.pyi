@@ -1,9 +1,11 @@
+from .blob_boxes import blob_detections
 from .blobs import LEAST_RADIUS_CELLS, ViewBlobs, border_cells, find_blobs, stack_blobs
 from .computation import Silhouettes, compute, exposures_of
 from .exposures import Exposures, moved_by
 from .foreground import BackgroundModel, Mog2, find_background
+from .masks import MaskTask, masks_out, write_masks
 from .settings import ForegroundSettings, Shadows, SilhouetteSettings, check_whole
-from .store import key_of, open_stored, reduced_shape
+from .store import Task, frames_to_decode, key_of, open_stored, reduced_shape
 from .summed_area import box_sum, of_packed_box_sums, pack, summed_area_table
 
 __all__ = [
@@ -11,11 +13,14 @@ __all__ = [
     "BackgroundModel",
     "Exposures",
     "ForegroundSettings",
+    "MaskTask",
     "Mog2",
     "Shadows",
     "SilhouetteSettings",
     "Silhouettes",
+    "Task",
     "ViewBlobs",
+    "blob_detections",
     "border_cells",
     "box_sum",
     "check_whole",
@@ -23,7 +28,9 @@ __all__ = [
     "exposures_of",
     "find_background",
     "find_blobs",
+    "frames_to_decode",
     "key_of",
+    "masks_out",
     "moved_by",
     "of_packed_box_sums",
     "open_stored",
@@ -31,4 +38,5 @@ __all__ = [
     "reduced_shape",
     "stack_blobs",
     "summed_area_table",
+    "write_masks",
 ]

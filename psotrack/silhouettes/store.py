@@ -168,28 +168,45 @@ def _write(folder: Path, shape: tuple[int, int], task: Task, advance: Advance) -
         overwrite=True,
     )
     started, seconds = time.perf_counter(), {"decode": 0.0, "foreground": 0.0}
+    chunk = np.empty((CHUNK_FRAMES, *shape), np.uint8)
+    for index, mask in enumerate(foreground_of(task, seconds, advance)):
+        chunk[index % CHUNK_FRAMES] = coverage(mask, settings.reduction // settings.working_reduction)
+        count = index % CHUNK_FRAMES + 1
+        if count == CHUNK_FRAMES or index + 1 == video.num_frames:
+            array[index + 1 - count : index + 1] = chunk[:count]
+    seconds["foreground"] = time.perf_counter() - started - seconds["decode"]
+    return seconds
+
+
+def foreground_of(
+    task: Task, seconds: dict[str, float], advance: Advance
+) -> Iterator[UInt8[np.ndarray, "working_height working_width"]]:
+    """Yield the mask of each frame, without what is ignored: 0 to 255, a pixel per `working_reduction` pixels.
+
+    Args:
+        task: the video, the settings and the background model.
+        seconds: the time of "decode" is added.
+        advance: is told of each decoded frame, `frames_to_decode` in all.
+
+    Raises:
+        InputError: the video ends early.
+        SettingsError: the background model yields masks of a wrong number, type or shape.
+    """
+    video, settings = task.video, task.settings
     background = Mog2(settings) if task.background is None else task.background
     masks = background.foreground(
         _decoded(video, learning_step(video.num_frames, settings), seconds, advance),
         _decoded(video, 1, seconds, advance),
     )
     ignored = None if task.ignore is None else _ignored_pixels(task)
-    chunk = np.empty((CHUNK_FRAMES, *shape), np.uint8)
     index = -1
     for index, mask in enumerate(masks):
         _check_mask(mask, index, task)
-        if ignored is not None:
-            mask = np.where(ignored, np.uint8(0), mask)
-        chunk[index % CHUNK_FRAMES] = coverage(mask, settings.reduction // settings.working_reduction)
-        count = index % CHUNK_FRAMES + 1
-        if count == CHUNK_FRAMES or index + 1 == video.num_frames:
-            array[index + 1 - count : index + 1] = chunk[:count]
+        yield mask if ignored is None else np.where(ignored, np.uint8(0), mask)
     if index + 1 < video.num_frames:
         raise SettingsError(
             _model_name(task), expected=f"{video.num_frames} masks, one per frame", found=f"{index + 1}"
         )
-    seconds["foreground"] = time.perf_counter() - started - seconds["decode"]
-    return seconds
 
 
 def _ignored_pixels(task: Task) -> Bool[np.ndarray, "working_height working_width"]:

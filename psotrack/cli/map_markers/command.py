@@ -9,7 +9,7 @@ import click
 import numpy as np
 
 from psotrack.cli.map_markers.shown import show_built, show_check, show_measured
-from psotrack.cli.map_markers.sources import Lenses, known_corners, leading, videos_of
+from psotrack.cli.map_markers.sources import PICTURES_FPS, Lenses, known_corners, leading, videos_of
 from psotrack.cli.options import (
     FORCE,
     FOV,
@@ -86,6 +86,12 @@ _MEASURED = {".c3d", ".csv", ".txt", ".tsv"}
     help="Position that all measured markers face, in metres.  [default: the mean of their corners]",
 )
 @shutter_options
+@click.option(
+    "--fps",
+    type=float,
+    help=f"Frames per second of folders of images, on which only the time from row to row depends.  "
+    f"[default: {PICTURES_FPS:g}]",
+)
 @frames_option
 @FORCE
 @QUIET
@@ -107,6 +113,7 @@ def map_markers(
     seen_from_m: tuple[float, float, float] | None,
     line_time_s: float | None,
     readout_s: float | None,
+    fps: float | None,
     num_frames: int | None,
     force: bool,
     quiet: bool,
@@ -114,10 +121,10 @@ def map_markers(
 ) -> None:
     """Write the table of a room's marker corners from SOURCE, or check such a table.
 
-    SOURCE is a .c3d file or a table of measured corners with labels such as Marker7:1, or videos of the room, or a
-    sequence whose drones carry cameras. In videos, markers are placed relative to the --known markers. Known markers
-    that --markers lists keep their corners. A single known marker with a --side defines the world: origin in the
-    marker's centre, x to its right, y up, z out of the print.
+    SOURCE is a .c3d file or a table of measured corners with labels such as Marker7:1, or videos of the room, each a
+    file or a folder of images, or a sequence whose drones carry cameras. In videos, markers are placed relative to the
+    --known markers. Known markers that --markers lists keep their corners. A single known marker with a --side defines
+    the world: origin in the marker's centre, x to its right, y up, z out of the print.
 
     --check MAP reports the markers of MAP that videos see elsewhere. The exit code is then 2 if a marker was reported.
 
@@ -132,6 +139,7 @@ def map_markers(
       psotrack map-markers room.c3d --out corners.csv
       psotrack map-markers walk.mp4 --known 7 --side 0.2 --camera lens.toml --out corners.csv
       psotrack map-markers a.mp4 b.mp4 --known 7,12 --markers measured.csv --fov 92.45,60.83 --out corners.csv
+      psotrack map-markers photos/ --known 7 --side 0.2 --camera lens.toml --out corners.csv
       psotrack map-markers data/Simulated_Data/S01_D2_A --drone dron1 --known 7 --out corners.csv --json -
       psotrack map-markers data/Simulated_Data/S01_D2_A --check corners.csv
     """
@@ -153,6 +161,8 @@ def map_markers(
     check_outputs(out, json_path, force)
     if side_m is not None:
         check_positive("--side", side_m)
+    if fps is not None:
+        check_positive("--fps", fps)
     if out is not None and sources[0].suffix.lower() in _MEASURED:
         if len(sources) > 1:
             raise SettingsError(
@@ -166,7 +176,7 @@ def map_markers(
     # Errors of small files are found before the videos are read, which takes long.
     marker_map = None if checked is None else read_marker_map(checked)
     world = {} if out is None else known_corners(known, table, side_m, sources)
-    videos = videos_of(sources, drones, Lenses(camera_file, camera_names, scale_camera, fov_deg))
+    videos = videos_of(sources, drones, Lenses(camera_file, camera_names, scale_camera, fov_deg), fps)
     videos = {name: (leading(video, num_frames), lens) for name, (video, lens) in videos.items()}
     shutter = None
     for video, _ in videos.values():

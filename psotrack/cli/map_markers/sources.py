@@ -14,12 +14,15 @@ if TYPE_CHECKING:
     from psotrack.geometry import Camera
     from psotrack.recordings import VideoInfo
 
+#: Rate of pictures where none is given. A map does not depend on the rate, only the time from row to row does.
+PICTURES_FPS = 25.0
+
 
 def known_corners(
     known: str | None, table: Path | None, side_m: float | None, sources: tuple[Path, ...]
 ) -> dict[int, np.ndarray]:
     """Corners of the known markers, (4, 3) in metres, by id."""
-    from psotrack.datasets import find_marker_corners
+    from psotrack.datasets import find_marker_corners, is_recording
     from psotrack.inside_out import corners_in_own_frame, read_marker_map
 
     words = [word.strip() for word in (known or "").split(",") if word.strip()]
@@ -67,16 +70,12 @@ class Lenses:
         )
 
 
-def is_recording(source: Path) -> bool:
-    """Whether a source is a recording, and not a video."""
-    return source.is_dir() or source.suffix.lower() == ".toml"
-
-
 def videos_of(
-    sources: tuple[Path, ...], drones: str | None, lenses: Lenses
+    sources: tuple[Path, ...], drones: str | None, lenses: Lenses, fps: float | None = None
 ) -> dict[str, tuple[VideoInfo, Camera]]:
-    """Videos with their lenses, by name."""
-    from psotrack.recordings import probe
+    """Videos with their lenses, by name; a folder of pictures is a video of `fps` frames per second."""
+    from psotrack.datasets import is_recording
+    from psotrack.recordings import is_picture_folder, open_video
 
     if is_recording(sources[0]):
         if len(sources) > 1:
@@ -84,7 +83,8 @@ def videos_of(
         return _of_sequence(sources[0], drones, lenses)
     if drones is not None:
         raise SettingsError("--drone", expected="a sequence's folder as SOURCE", found=f"{sources[0]}")
-    infos = [probe(path) for path in sources]
+    rates = [fps or (PICTURES_FPS if is_picture_folder(path) else None) for path in sources]
+    infos = [open_video(path, rate) for path, rate in zip(sources, rates, strict=True)]
     return {
         str(video.path): (video, lenses.of(video, index, len(infos))) for index, video in enumerate(infos)
     }

@@ -1,0 +1,135 @@
+"""Masks: the foreground of every frame at the size of the video, as images or as a video.
+
+A mask is what the background model yields, before it is reduced to the stored silhouettes: each of its pixels covers
+`working_reduction` x `working_reduction` pixels of the video.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.recordings import VideoInfo, silence_opencv
+from psotrack.silhouettes.store import Task, foreground_of
+from psotrack.support import Advance, atomic_write
+
+#: Codecs of videos of masks, by ending; that of .avi loses nothing.
+CODECS = {".mp4": "mp4v", ".avi": "FFV1"}
+
+
+@dataclass(frozen=True)
+class MaskTask:
+    """Task of writing the masks of one video.
+
+    Attributes:
+        foreground: the video and what its foreground is made with; its cache and key are not used.
+        out: the folder of the images, or a video file with an ending of `CODECS`.
+    """
+
+    foreground: Task
+    out: Path
+
+
+def write_masks(task: MaskTask, advance: Advance) -> int:
+    """Write the masks of one video, 0 for background to 255 for foreground; returns their number.
+
+    Images are named 000000.png and so on. What is written appears at its place when it is complete, and replaces what
+    was there.
+
+    Raises:
+        InputError: the video ends early.
+        SettingsError: the background model yields masks of a wrong number, type or shape.
+        OutputError: the masks cannot be written.
+    """
+    video = task.foreground.video
+    masks = _at_size(task.foreground, advance)
+    if task.out.suffix.lower() in CODECS:
+        return _write_video(task.out, video, masks)
+    temporary = task.out.with_name(f".{task.out.name}.{secrets.token_hex(4)}.partial")
+    try:
+        temporary.mkdir(parents=True)
+        count = 0
+        for count, mask in enumerate(masks, 1):
+            there, coded = cv2.imencode(".png", mask, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+            assert there, "PNG takes every mask"
+            coded.tofile(temporary / f"{count - 1:06d}.png")
+        if task.out.exists():
+            shutil.rmtree(task.out)
+        os.rename(temporary, task.out)
+    except OSError as error:
+        raise OutputError(
+            task.out, expected="a folder to write to", found=error.strerror or f"{error}"
+        ) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    return count
+
+
+def _at_size(task: Task, advance: Advance) -> Iterator[UInt8[np.ndarray, "height width"]]:
+    width, height = task.video.image_size_wh
+    reduction = task.settings.working_reduction
+    for mask in foreground_of(task, {"decode": 0.0, "foreground": 0.0}, advance):
+        yield np.repeat(np.repeat(mask, reduction, axis=0), reduction, axis=1)[:height, :width]
+
+
+def _write_video(path: Path, video: VideoInfo, masks: Iterator[UInt8[np.ndarray, "height width"]]) -> int:
+    width, height = video.image_size_wh
+    if width % 2 or height % 2:
+        raise SettingsError(
+            "--masks",
+            expected="a folder, because a video has an even width and height",
+            found=f"{path.name} for {width} x {height} pixels",
+        )
+    count = 0
+    with atomic_write(path) as temporary:
+        # The ending of the temporary file says the container.
+        codec = cv2.VideoWriter.fourcc(*CODECS[path.suffix.lower()])
+        with silence_opencv():
+            writer = cv2.VideoWriter(
+                os.path.abspath(temporary), cv2.CAP_FFMPEG, codec, video.fps, (width, height)
+            )
+        if not writer.isOpened():
+            raise OutputError(path, expected="a video that can be written", found="one that cannot be opened")
+        try:
+            for mask in masks:
+                writer.write(cv2.cvtColor(mask, cv2.COLOR_GRAY2BGR))
+                count += 1
+        finally:
+            writer.release()
+        if not temporary.is_file() or not temporary.stat().st_size:
+            raise OutputError(
+                path, expected="a video of masks", found="an empty file", remedy="is the disk full?"
+            )
+    return count
+
+
+def masks_out(out: Path, cameras: tuple[str, ...]) -> dict[str, Path]:
+    """Where the masks of each camera are written.
+
+    Args:
+        out: a folder, in which each camera gets a folder, or a video file.
+        cameras: names of the cameras.
+
+    Raises:
+        SettingsError: a video file is named for several cameras, or its ending is unknown.
+        InputError: the folder is a file.
+    """
+    if out.suffix.lower() in CODECS:
+        if len(cameras) > 1:
+            found = f"{out.name} for {len(cameras)} cameras"
+            raise SettingsError("--masks", expected="a folder, or one camera by --cameras", found=found)
+        return {cameras[0]: out}
+    if out.is_file():
+        raise InputError(
+            out, expected=f"a folder, or a file that ends in {', '.join(CODECS)}", found="another file"
+        )
+    return {name: out / name for name in cameras}
