@@ -245,18 +245,33 @@ def test_a_walking_person_is_no_drone():
         body_trajectories(Markers(labels, walking(), 100.0), fps=25.0, num_frames=9, where=WHERE)
 
 
-def person_and_box() -> Markers:
+def person_and_box(num_markers=12) -> Markers:
     box_m = make_markers(400, drones=("Dron1",))[0].position_m
-    labels = (*(f"boite:b{number}" for number in range(5)), *(f"Anna:M{number}" for number in range(12)))
-    return Markers(labels, np.concatenate([box_m, walking()], axis=1), 100.0)
+    of_anna = (f"Anna:M{number}" for number in range(num_markers))
+    labels = (*(f"boite:b{number}" for number in range(5)), *of_anna)
+    return Markers(labels, np.concatenate([box_m, walking(num_markers)], axis=1), 100.0)
 
 
-def test_a_box_beside_a_person_is_not_taken_for_a_drone():
-    with pytest.raises(
-        NoDronesError, match=r"boite, rigid .*anna, not rigid.*--body NAME=LABEL,LABEL"
-    ) as caught:
-        body_trajectories(person_and_box(), fps=25.0, num_frames=9, where=WHERE)
+@pytest.mark.parametrize(("num_markers", "fault"), [(12, "not rigid"), (43, "43 markers")])
+def test_a_box_beside_a_person_is_not_taken_for_a_drone(num_markers, fault):
+    message = rf"boite, rigid .*anna, {fault}.*--body NAME=LABEL,LABEL"
+    with pytest.raises(NoDronesError, match=message) as caught:
+        body_trajectories(person_and_box(num_markers), fps=25.0, num_frames=9, where=WHERE)
     assert "\n" not in str(caught.value)
+
+
+def test_a_single_marker_beside_rigid_bodies_is_left_out():
+    """A flash for synchronisation, say."""
+    markers = make_markers(400, drones=("cf1",))[0]
+    position_m = np.pad(markers.position_m, ((0, 0), (0, 1), (0, 0)))
+    flash = Markers((*markers.labels, "Sync:Sync"), position_m, 100.0)
+    assert body_trajectories(flash, fps=25.0, num_frames=9, where=WHERE).drones == ("cf1",)
+
+
+def test_a_single_frame_shows_no_rigid_body():
+    markers = make_markers(1, drones=("cf1",))[0]
+    with pytest.raises(NoDronesError, match="cf1, seen together in one frame at most"):
+        body_trajectories(markers, fps=25.0, num_frames=9, where=WHERE)
 
 
 @pytest.mark.parametrize("named", [["boite:"], ["boite:b0", "b1", "b2", "b3", "b4"]])

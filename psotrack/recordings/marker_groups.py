@@ -67,7 +67,8 @@ def drone_markers(
         bodies = {"dron1": [index for index, label in enumerate(markers.labels) if not is_unlabelled(label)]}
     faults = {name: _fault(markers, columns) for name, columns in bodies.items()}
     rigid = {name: columns for name, columns in bodies.items() if not faults[name]}
-    if not rigid or any(fault.startswith("not rigid") for fault in faults.values()):
+    others = [name for name, fault in faults.items() if fault and len(bodies[name]) >= _FEWEST]
+    if not rigid or others:
         raise NoDronesError(
             where,
             expected=f"markers of drones, which are rigid bodies of {_FEWEST} to {_MOST} markers",
@@ -128,7 +129,7 @@ def _bodies(labels: Sequence[str]) -> dict[str, list[int]]:
 
 
 def _fault(markers: Markers, columns: Sequence[int]) -> str:
-    """Why markers are no drone's, in words; empty where they can be a drone's."""
+    """Why markers are no drone's for certain, in words; empty where they can be a drone's."""
     position_m = markers.position_m[:: max(1, len(markers.position_m) // _FRAMES)][:, columns]
     seen = np.isfinite(position_m).all(axis=-1).any(axis=0)
     if not _FEWEST <= seen.sum() <= _MOST:
@@ -136,9 +137,9 @@ def _fault(markers: Markers, columns: Sequence[int]) -> str:
     first, second = np.triu_indices(int(seen.sum()), 1)
     position_m = position_m[:, seen]
     distance_m = np.linalg.norm(position_m[:, first] - position_m[:, second], axis=-1)
-    distance_m = distance_m[:, np.isfinite(distance_m).any(axis=0)]
+    distance_m = distance_m[:, np.isfinite(distance_m).sum(axis=0) > 1]
     if not distance_m.size:
-        return "never seen together"
+        return "seen together in one frame at most"
     median_m = np.nanmedian(distance_m, axis=0)
     spread_m = _STD_PER_MAD * np.nanmedian(np.abs(distance_m - median_m), axis=0).max()
     if spread_m > _RIGID_M:
