@@ -37,6 +37,9 @@ COMMANDS = {
         "psotrack.cli.detect",
         "Detect the drones of SEQ in each of its videos as 2D boxes: with a neural network, or as blobs of foreground.",
     ),
+    "detect-markers": LazyCommand(
+        "psotrack.cli.detect_markers", "Find the ArUco markers and AprilTags in IMAGES, and their corners."
+    ),
     "doctor": LazyCommand(
         "psotrack.cli.doctor",
         "Check the calibration of SEQ against the detections of its cameras, before tracking.",

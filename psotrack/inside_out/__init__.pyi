@@ -1,5 +1,6 @@
 from .camera_path import CameraPath, Flag, read_camera_path, write_camera_path
 from .comparison.plots import save_flight
+from .detection.marker_table import markers_of_images, markers_of_video, write_marker_table
 from .filtering.pose_filter import PoseFilterParams
 from .filtering.smoothing import smooth
 from .frames import FrameSource, open_source
@@ -43,6 +44,8 @@ __all__ = [
     "fuse",
     "lens_from_matrix",
     "localise_video",
+    "markers_of_images",
+    "markers_of_video",
     "open_source",
     "read_camera_path",
     "read_marker_map",
@@ -52,4 +55,5 @@ __all__ = [
     "smooth",
     "write_camera_path",
     "write_fused",
+    "write_marker_table",
 ]

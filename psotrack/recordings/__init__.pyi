@@ -1,7 +1,16 @@
 from .c3d import Markers, read_c3d, write_c3d
 from .detections import Detections, read_detections, write_detections
 from .filmed import recording_of_video, with_all_videos
-from .image_files import IMAGE_SUFFIXES, find_images, image_files, natural_key, read_image, read_mask
+from .image_files import (
+    IMAGE_SUFFIXES,
+    find_images,
+    image_files,
+    is_image,
+    natural_key,
+    read_grey,
+    read_image,
+    read_mask,
+)
 from .inventory import describe_recording, inventory_table
 from .marker_bodies import body_trajectories
 from .marker_groups import NoDronesError
@@ -59,6 +68,7 @@ __all__ = [
     "find_images",
     "image_files",
     "inventory_table",
+    "is_image",
     "is_picture_folder",
     "join_videos",
     "make_timeline",
@@ -71,6 +81,7 @@ __all__ = [
     "read_c3d",
     "read_detections",
     "read_frames",
+    "read_grey",
     "read_image",
     "read_mask",
     "read_recording_file",

@@ -86,6 +86,22 @@ def read_mask(path: Path) -> UInt8[np.ndarray, "height width"]:
     return np.asarray(_decode(path, cv2.IMREAD_GRAYSCALE), np.uint8)
 
 
+def read_grey(path: Path) -> UInt8[np.ndarray, "height width"]:
+    """Read an image of any depth as grey levels; in an image of 16 bits, its brightest pixel shows how many are used.
+
+    Raises:
+        InputError: the file cannot be read, or is no image.
+    """
+    image = _decode(path, cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH)
+    levels = image if image.dtype == np.uint8 else read_image(path, depth_of([path]))
+    return np.asarray(cv2.cvtColor(np.asarray(levels, np.uint8), cv2.COLOR_BGR2GRAY), np.uint8)
+
+
+def is_image(path: Path) -> bool:
+    """Whether a file is an image by its name, or by its content; a file that cannot be read is none."""
+    return path.suffix.lower() in IMAGE_SUFFIXES or bool(path.is_file() and cv2.haveImageReader(str(path)))
+
+
 def _decode(path: Path, flags: int) -> Shaped[np.ndarray, "..."]:
     try:
         coded = np.fromfile(path, np.uint8)

@@ -7,6 +7,7 @@ alone, on corners that are known to a few pixels.
 `search` finds the markers: `brightness` makes the images that are searched, `quads` finds quadrangles, `codes` reads
 them. `corners` refines their corners: `gamma` is the brightness encoding of the image, `edge_transitions` finds black
 to white across an edge, `edge_lines` fits lines to the edges, `distortion` converts pixels with and without the lens.
+`marker_table` searches images and videos, and writes what it finds.
 """
 
 from psotrack.inside_out.detection.corners import refine_corners

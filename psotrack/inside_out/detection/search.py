@@ -1,14 +1,15 @@
 """Search for the markers of an image: several passes, of which each finds candidates, and one choice among them all.
 
 The first pass is OpenCV's detector with its defaults in the image as it is, so that no marker is overlooked that
-OpenCV finds. The other passes are our own, in images of equal brightness (see `brightness`): they find markers in the
-shade, blurred, small, large or inverted. What only these passes find must look more like a marker than what OpenCV
-finds, because a wrong marker does more harm than a missing one.
+OpenCV finds; where prints are inverted, another one is OpenCV's detector in the negative. The other passes are our own,
+in images of equal brightness (see `brightness`): they find markers in the shade, blurred, small, large or inverted.
+What only these passes find must look more like a marker than what OpenCV finds, because a wrong marker does more harm
+than a missing one.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -37,9 +38,9 @@ _SHORTEST_PX = 9.0
 #: Smallest agreement of a marker (`ReadMarkers.agreement`) that OpenCV finds, and of any other, for dictionaries in
 #: which a random square is hardly ever read as a marker, and for those in which one of 16 is; and these two chances.
 #: Measured: of OpenCV's right markers in photographs and rendered pictures, small, blurred and noisy, none is below
-#: 0.73 (AprilTags with cells of 2 px), and none of a 4x4 dictionary below 0.88. Its wrong ones are between 0.77 and
-#: 0.91, in photographs of other dictionaries.
-_LEAST_OPENCV, _LEAST_OTHER = (0.70, 0.85), (0.85, 0.95)
+#: 0.73 (AprilTags with cells of 2 px), and none of a 4x4 dictionary below 0.80 (glare). Its wrong ones are between
+#: 0.77 and 0.91, in photographs of other dictionaries.
+_LEAST_OPENCV, _LEAST_OTHER = (0.70, 0.78), (0.85, 0.95)
 _RARE, _COMMON = 1e-3, 1 / 16
 #: The same for markers that are hardly more than a frame.
 _LEAST_FRAME = 0.96
@@ -94,7 +95,7 @@ class MarkerSearch:
 
     def find(self, gray: UInt8[np.ndarray, "height width"]) -> Candidates:
         """Find the markers in an image; no two are at one place."""
-        passes = [self._find_by_opencv(gray)]
+        passes = [self._find_by_opencv(gray, inverted=False)]
         if self._thorough:
             times = 1
             while times == 1 or max(gray.shape) / times >= _SMALLEST_PX:
@@ -104,6 +105,9 @@ class MarkerSearch:
             times = max(1, round(max(gray.shape) / _SEARCHED_PX))
             window_px = max(_LEAST_WINDOW_PX, 2 * round((_WINDOW * max(gray.shape) / times - 1) / 2) + 1)
             passes.append(self._find_in(gray, times, ((window_px, _DARKER),)))
+        # A video's markers are printed alike, so that where none is inverted, OpenCV would find none either.
+        if self._thorough or any(one.inverted.any() for one in passes):
+            passes.append(self._find_by_opencv(gray, inverted=True))
         found = Candidates(
             *(
                 np.concatenate([getattr(one, name) for one in passes])
@@ -122,15 +126,15 @@ class MarkerSearch:
         levels = sample_cells(gray, corners_px, self._codes.cells)
         return self._codes.agreement(levels, found.index, np.zeros(len(found), np.int64), found.inverted)[0]
 
-    def _find_by_opencv(self, gray: _Image) -> Candidates:
-        quads, which, _ = self._opencv.detectMarkers(gray)
+    def _find_by_opencv(self, gray: _Image, *, inverted: bool) -> Candidates:
+        """Find markers by OpenCV's defaults, which read black on white, in the image or in its negative."""
+        quads, which, _ = self._opencv.detectMarkers(cv2.bitwise_not(gray) if inverted else gray)
         index = np.zeros(0, np.int64) if which is None else np.asarray(which).ravel().astype(np.int64)
         corners_px = np.concatenate([np.zeros((0, 4, 2)), *(np.asarray(quad, np.float64) for quad in quads)])
-        normal = np.zeros(len(index), bool)
-        found = Candidates(index, corners_px, normal, np.zeros(len(index)), ~normal)
-        agreement = self.agreement(gray, found, corners_px)
-        found = Candidates(index, corners_px, normal, agreement, ~normal)
-        return found.select(agreement >= self._least_opencv)
+        of_opencv = np.ones(len(index), bool)
+        found = Candidates(index, corners_px, of_opencv & inverted, np.zeros(len(index)), of_opencv)
+        found = replace(found, agreement=self.agreement(gray, found, corners_px))
+        return found.select(found.agreement >= self._least_opencv)
 
     def _find_in(self, gray: _Image, times: int, windows: tuple[tuple[int, float], ...]) -> Candidates:
         """Find markers in an image of equal brightness, shrunk by a whole number, with windows of given sizes."""

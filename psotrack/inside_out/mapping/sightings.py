@@ -170,7 +170,7 @@ def _consecutive(video: VideoInfo, detector: MarkerDetector) -> Iterator[tuple[i
     for number, frame in enumerate(islice(read_frames(video), first_frames)):
         if number in chosen:
             gray = np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), np.uint8)
-            yield number, number / video.fps, detector.detect(gray)
+            yield number, number / video.fps, detector.detect(gray).of_single_ids()
 
 
 def collect_sightings(
