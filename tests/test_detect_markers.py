@@ -165,7 +165,7 @@ def test_standard_deviations_of_corners_are_honest(changes, sheets, limit_px):
 
 def test_bent_edges_count_as_bent_only_where_they_are():
     """A flat sheet's corners are as good as with straight lines; a bent sheet's are several times better."""
-    flat, bent = (Sheet(3, (240.3, 180.2), 150.0, 0.4, 0.8, 1.0, bow) for bow in (0.0, 0.05))
+    flat, bent = (Sheet(3, (240.3, 180.2), 150.0, 0.4, 0.8, 1.0, bow) for bow in (0.0, 0.03))
     for sheet, limit_px in ((flat, 0.1), (bent, 0.6)):
         found = MarkerDetector("4x4_50").detect(picture([sheet]))
         # Straight lines miss the bent sheet's corners by pixels.
@@ -214,7 +214,7 @@ def photographs(tmp_path_factory):
     # A sensor of 12 bits.
     cv2.imwrite(str(folder / "deep.png"), gray.astype(np.uint16) * 16)
     cv2.imwrite(str(folder / "inverted.png"), 255 - gray)
-    large = [Sheet(7, (500.0, 300.0), 200.0), Sheet(7, (800.0, 300.0), 150.0)]
+    large = [Sheet(7, (500.0, 300.0), 200.0, 0.3), Sheet(7, (800.0, 300.0), 150.0, 0.8)]
     cv2.imwrite(str(folder / "twice.png"), picture(large, (1000, 600)))
     sheets = {name: [one, two] for name in ("grey.png", "colour.jpg", "deep.png", "inverted.png")}
     return folder, {**sheets, "twice.png": large}
