@@ -2,6 +2,7 @@
 
     python experiments/accuracy/rolling_shutter.py --folder /tmp/shutter_study
     python experiments/accuracy/rolling_shutter.py --folder /tmp/shutter_study --seeds 1 --frames 90
+    python experiments/accuracy/rolling_shutter.py --folder /tmp/shutter_study --picture picture.png
 
 A camera is carried by hand through the laboratory: sinusoids from slow walking to tremor at 7 Hz. The simulator draws
 every row at its own time, with lens distortion, motion blur of 1/200 s, noise, JPEG 60 and an automatic exposure that
@@ -40,12 +41,20 @@ from psotrack.inside_out import (
 from psotrack.recordings import VideoWriter, probe
 from psotrack.simulation import build, change_scenario, scenario, write_recorded_flight
 from psotrack.simulation.imaging.onboard import OnboardRenderer, lens, onboard_poses
+from psotrack.simulation.scene import Scene
 
 SIZE_WH, FPS, READOUT_S = (1280, 720), 30.0, 0.020
 #: Frequencies of the hand's motion, hertz, and its amplitudes, metres and radians, along and about each axis.
 _FREQUENCY_HZ = np.array([0.2, 0.6, 1.5, 3.0, 7.0])
 _MOVE_M = np.array([0.35, 0.08, 0.015, 0.003, 0.0007])
 _TURN_RAD = np.radians([12.0, 4.0, 1.2, 0.35, 0.1])
+#: Names of the cases, readouts of the videos in seconds, and the shutters that are given; None is estimated.
+CASES = (
+    ("global", 0.0, None),
+    ("given", READOUT_S, RollingShutter(READOUT_S / SIZE_WH[1])),
+    ("estimated", READOUT_S, None),
+    ("left out", READOUT_S, RollingShutter(0.0)),
+)
 
 
 @dataclass(frozen=True)
@@ -81,13 +90,28 @@ def hand_motion(
 def draw(folder: Path, seed: int, frames: int, readout_s: float) -> Clip:
     """Draw the video of one hand's motion, if the folder does not have it."""
     name = f"hand{seed}_{frames}_{1e3 * readout_s:g}ms"
-    flight = folder / f"hand{seed}_{frames}.csv"
     sampled_s = np.arange(-0.2, frames / FPS + 0.2, 1 / 200)
-    write_recorded_flight(flight, sampled_s + 0.2, *hand_motion(seed, sampled_s))
+    flight = sampled_s + 0.2, *hand_motion(seed, sampled_s)
+    scene = _scene(folder / f"hand{seed}_{frames}.csv", flight, seed, frames, readout_s)
+    video = folder / f"{name}.avi"
+    if not video.exists():
+        artist = OnboardRenderer(scene, 0)
+        with VideoWriter(video, FPS, SIZE_WH) as writer:
+            for frame in range(frames):
+                writer.write(artist.frame(frame))
+    corners_m = scene.room.marker_corners_m
+    return Clip(video, lens(scene), MarkerMap(dict(corners_m)), *onboard_poses(scene, 0, frames))
+
+
+def _scene(
+    path: Path, flight: tuple[np.ndarray, np.ndarray, np.ndarray], seed: int, frames: int, readout_s: float
+) -> Scene:
+    """The laboratory with a camera on a recorded flight: times, positions and orientations."""
+    write_recorded_flight(path, *flight)
     recipe = change_scenario(
         scenario("S02_D4_A"),
         {
-            "drones": [{"flight": {"kind": "recording", "file": str(flight), "start_s": 0.2}}],
+            "drones": [{"flight": {"kind": "recording", "file": str(path), "start_s": 0.2}}],
             "num_frames": frames,
             "fps": FPS,
             "limits.max_speed_m_s": 10.0,
@@ -105,15 +129,7 @@ def draw(folder: Path, seed: int, frames: int, readout_s: float) -> Clip:
             },
         },
     )
-    scene = build(recipe, seed=seed)
-    video = folder / f"{name}.avi"
-    if not video.exists():
-        artist = OnboardRenderer(scene, 0)
-        with VideoWriter(video, FPS, SIZE_WH) as writer:
-            for frame in range(frames):
-                writer.write(artist.frame(frame))
-    corners_m = scene.room.marker_corners_m
-    return Clip(video, lens(scene), MarkerMap(dict(corners_m)), *onboard_poses(scene, 0, frames))
+    return build(recipe, seed=seed)
 
 
 def errors(path: CameraPath, clip: Clip) -> dict[str, float]:
@@ -183,17 +199,42 @@ def map_of(clip: Clip, shutter: RollingShutter | None) -> dict[str, Any]:
     }
 
 
+def picture(path: Path, folder: Path, frames: int) -> None:
+    """Draw a frame of a fast pan with both shutters, and the errors of the smoothed positions over time."""
+    import matplotlib.pyplot as plt
+
+    figure = plt.figure(figsize=(9, 5), layout="constrained")
+    grid = figure.add_gridspec(2, 2)
+    sampled_s = np.arange(0, 1.0, 1 / 200)
+    turn = Rotation.from_rotvec(np.outer(np.pi / 2 + 4.0 * (sampled_s - 0.5), [0, 0, 1]))
+    pan = np.broadcast_to([0.0, 0.8, 1.7], (len(sampled_s), 3)), turn.as_quat(scalar_first=True)
+    for column, (name, readout_s) in enumerate(
+        (("global shutter", 0.0), ("rolling shutter, 20 ms", READOUT_S))
+    ):
+        scene = _scene(folder / "pan.csv", (sampled_s, *pan), 0, 16, readout_s)
+        axes = figure.add_subplot(grid[0, column])
+        axes.imshow(OnboardRenderer(scene, 0).frame(15)[..., ::-1])
+        axes.set_title(f"{name}, pan of 230 degrees per second", fontsize=9)
+        axes.axis("off")
+    axes = figure.add_subplot(grid[1, :])
+    for case, readout_s, shutter in CASES:
+        clip = draw(folder, 0, frames, readout_s)
+        found = localise_video(
+            open_source(clip.video), clip.marker_map, clip.camera, LocaliseSettings(shutter=shutter)
+        )
+        smoothed = smooth(found.raw, PoseFilterParams())
+        off_mm = 1e3 * np.linalg.norm(smoothed.position_m - clip.position_m, axis=1)
+        axes.semilogy(smoothed.time_s, off_mm, label=case, linewidth=1.0)
+    axes.set_xlabel("time (s)")
+    axes.set_ylabel("error of the position (mm)")
+    axes.legend(fontsize=8, ncols=4)
+    figure.savefig(path, dpi=110)
+
+
 def rows_of(folder: Path, frames: int, seed: int) -> list[dict[str, Any]]:
     """All figures of one hand's motion."""
-    line_time_s = READOUT_S / SIZE_WH[1]
-    cases = (
-        ("global", 0.0, None),
-        ("given", READOUT_S, RollingShutter(line_time_s)),
-        ("estimated", READOUT_S, None),
-        ("left out", READOUT_S, RollingShutter(0.0)),
-    )
-    found = []
-    for case, readout_s, shutter in cases:
+    found: list[dict[str, Any]] = []
+    for case, readout_s, shutter in CASES:
         clip = draw(folder, seed, frames, readout_s)
         about = {"case": case, "seed": seed}
         found += [about | row for row in poses_of(clip, shutter)]
@@ -206,10 +247,13 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, required=True, help="folder of the videos and of the figures")
     parser.add_argument("--seeds", type=int, default=3, help="number of motions")
     parser.add_argument("--frames", type=int, default=150, help="frames of each video")
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--picture", type=Path, help="draw this picture instead, from the first motion")
     arguments = parser.parse_args()
     arguments.folder.mkdir(parents=True, exist_ok=True)
-    rows = []
+    if arguments.picture is not None:
+        picture(arguments.picture, arguments.folder, arguments.frames)
+        return
+    rows: list[dict[str, Any]] = []
     for seed in range(arguments.seeds):
         rows += rows_of(arguments.folder, arguments.frames, seed)
         for row in rows[-12:]:

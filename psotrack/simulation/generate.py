@@ -30,10 +30,11 @@ from psotrack.datasets.dpjait import (
     write_poses,
 )
 from psotrack.errors import InputError, SettingsError
+from psotrack.geometry import make_rig
 from psotrack.recordings import RECORDING_FILE
 from psotrack.rig_files import write_rig
 from psotrack.simulation import scenarios
-from psotrack.simulation.imaging.onboard import intrinsics, onboard_poses
+from psotrack.simulation.imaging.onboard import camera_record, intrinsics, lens, onboard_poses
 from psotrack.simulation.labels.mocap import mocap_markers_m
 from psotrack.simulation.scenarios import FlightFromFile, Mesh, Scenario
 from psotrack.simulation.scene import Scene, build
@@ -46,6 +47,8 @@ from psotrack.support import Report, map_in_processes, no_progress
 _PIECES_PER_JOB = 4
 #: Rig file of a sequence whose lenses the dataset's calibration cannot hold.
 _RIG = "rig.toml"
+#: File of the lenses of on-board cameras with distortion, by the drones' names: for `localise --camera`.
+_ONBOARD_LENSES = "drone_cameras.toml"
 
 _logger = logging.getLogger(__name__)
 
@@ -240,7 +243,11 @@ def _write_recording_file(scene: Scene, folder: Path) -> None:
 
 def _write_onboard_tables(scene: Scene, folder: Path, num_frames: int) -> None:
     names = [f"dron{drone + 1}" for drone in range(len(scene.flights))]
-    write_onboard_calibration(folder / ONBOARD_CALIBRATION, dict.fromkeys(names, intrinsics(scene)))
+    if camera_record(scene).distortion:
+        # The dataset's table has no distortion, and without it the lens would be wrong.
+        write_rig(folder / _ONBOARD_LENSES, make_rig(dict.fromkeys(names, lens(scene))))
+    else:
+        write_onboard_calibration(folder / ONBOARD_CALIBRATION, dict.fromkeys(names, intrinsics(scene)))
     for drone in range(len(scene.flights)):
         poses = onboard_poses(scene, drone, num_frames)
         write_poses(folder / onboard_pose_file(drone + 1, scene.scenario.fps), *poses)

@@ -181,6 +181,13 @@ def map_markers(
     shutter = None
     for video, _ in videos.values():
         shutter = given_shutter(line_time_s, readout_s, video.image_size_wh[1], video.fps)
+    if marker_map is not None and shutter is not None and shutter.line_time_s:
+        raise SettingsError(
+            "--line-time and --readout",
+            expected="--out; --check takes the shutter for global",
+            found="--check",
+            remedy="make a map of the video by --out, and compare it with the other one",
+        )
     sightings = find_sightings(
         list(videos.values()), dictionary, consecutive=checked is None, report=report_to(quiet)
     )

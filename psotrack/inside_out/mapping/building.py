@@ -120,15 +120,23 @@ def build_map(
     first = _build(with_shutters(sightings, given), known, side_m, estimate_sides)
     shown = line_times(sightings, first.marker_map)
     if shutter is None:
-        used = tuple(one.shutter() if one is not None and one.rolls else None for one in shown)
-        if any(used):
-            first = _build(with_shutters(sightings, used), known, side_m, estimate_sides)
-        return replace(first, shutters=used, line_times=shown)
+        if not any(one is not None and one.rolls for one in shown):
+            return replace(first, shutters=given, line_times=shown)
+        found = _build(with_shutters(sightings, _rolling(shown)), known, side_m, estimate_sides)
+        # A map bent by the shutter may have biased the line times. The map itself depends little on the line times,
+        # because the motion in each view is free.
+        shown = line_times(sightings, found.marker_map)
+        return replace(found, shutters=_rolling(shown), line_times=shown)
     first = replace(first, shutters=given, line_times=shown)
     if not any(one is not None and one.contradicts(shutter.line_time_s) for one in shown):
         return first
-    used = tuple(shutter if one is None else one.shutter() for one in shown)
-    return _with_difference(first, _build(with_shutters(sightings, used), known, side_m, estimate_sides))
+    other = _build(with_shutters(sightings, _rolling(shown)), known, side_m, estimate_sides)
+    return _with_difference(first, other)
+
+
+def _rolling(shown: LineTimes) -> Shutters:
+    """The shutters that certainly roll, as the videos show them."""
+    return tuple(one.shutter() if one is not None and one.rolls else None for one in shown)
 
 
 def _with_difference(built: BuiltMap, other: BuiltMap) -> BuiltMap:
