@@ -24,7 +24,8 @@ from psotrack.inside_out import LocaliseSettings, MarkerMap, PoseSettings, Rolli
 from psotrack.inside_out.detection import DetectedMarkers
 from psotrack.inside_out.filtering.path_rows import join_rows, split_path
 from psotrack.inside_out.frame_motion import FrameMotion
-from psotrack.inside_out.localising import LineTime, estimate_line_time, localise_frames
+from psotrack.inside_out.line_time import LineTime, estimate_line_time
+from psotrack.inside_out.localising import localise_frames
 from psotrack.inside_out.mapping.sightings import FrameMarkers, collect_sightings
 from psotrack.inside_out.pose.equations import equations, seen_markers
 from psotrack.inside_out.pose.row_motion import RowMotion, row_times_s
@@ -102,7 +103,8 @@ def filmed(hand, num_frames, line_time_s, seed=99, fps=FPS):
         eye_m = hand.at(number / fps)[0] - points_m.mean(axis=1)
         seen = inside & (depth_m.reshape(-1, 4) > 0.3).all(axis=1) & ((front * eye_m).sum(axis=1) > 0.01)
         pixels = pixels + lasting_px + NOISE_PX * rng.normal(size=pixels.shape)
-        found.append((number, number / fps, DetectedMarkers(ids[seen], pixels[seen])))
+        markers = DetectedMarkers(ids[seen], pixels[seen], np.full(int(seen.sum()), np.nan))
+        found.append((number, number / fps, markers))
     return found
 
 

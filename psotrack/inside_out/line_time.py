@@ -57,7 +57,7 @@ _ROBUST = 3.0
 _SURE, _CONTRADICTED = 4.0, 5.0
 #: Factor on the difference from a given line time that the video contradicts, because the motion, by which the
 #: difference becomes an error of a pose, is estimated from such poses.
-_WIDER = 1.25
+_WIDER = 1.5
 #: Time from the first row to the last, seconds, below which an uncertainty is no matter: at 1 m/s, 0.03 mm.
 _NO_MATTER_S = 1e-4
 #: Standard deviation of the readout, as a share of the time between two frames, above which nothing is shown.

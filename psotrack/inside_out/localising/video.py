@@ -69,6 +69,7 @@ def localise_video(
         SettingsError: there is no dictionary of this name, or it has none of the map's markers.
     """
     settings = (settings or LocaliseSettings()).within(source.num_frames)
+    given = settings.shutter
     _check_size(source, lens)
     detector = MarkerDetector(settings.dictionary, lens, ids=marker_map.ids.tolist())
     seconds = dict.fromkeys(STAGES, 0.0)
@@ -102,7 +103,8 @@ def localise_video(
         if wrong and are_few(wrong, detected):
             right = list(without_markers(detected, wrong, settings.pose))
             pose = replace(settings.pose, min_markers=least_markers(settings.pose))
-            line_time, settings = _with_shutter(right, room, lens, replace(settings, pose=pose), seconds)
+            again = replace(settings, pose=pose, shutter=given)
+            line_time, settings = _with_shutter(right, room, lens, again, seconds)
             both = list(localise_frames(right, room, lens, settings, seconds))
             raw_rows, rows = [raw for raw, _ in both], [row for _, row in both]
     wall_s = time.perf_counter() - began_s
