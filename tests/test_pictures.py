@@ -295,3 +295,20 @@ def test_masks_that_cannot_be_written(pictures, tmp_path):
     (tmp_path / "blocked").write_text("")
     with pytest.raises((OutputError, InputError, SettingsError)):
         run("silhouettes", pictures, "--masks", tmp_path / "blocked" / "masks")
+
+
+def test_pictures_are_read_as_the_sensor_saw_them(tmp_path):
+    """A phone that is held upright notes that its pictures are to be turned; a lens is calibrated for the sensor."""
+    there, coded = cv2.imencode(".jpg", picture(0))
+    # EXIF with one entry: orientation (0x112), a short, one value, 6: turn by 90 degrees.
+    tiff = b"MM\0*\0\0\0\x08" + b"\0\x01" + b"\x01\x12\0\x03\0\0\0\x01\0\x06\0\0" + b"\0\0\0\0"
+    exif = b"Exif\0\0" + tiff
+    data = coded.tobytes()
+    turned = data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:]
+    assert there
+    for index in range(2):
+        (tmp_path / f"{index}.jpg").write_bytes(turned)
+    assert cv2.imread(str(tmp_path / "0.jpg")).shape == (WIDTH, HEIGHT, 3)
+    video = open_video(tmp_path, 25.0)
+    assert video.image_size_wh == (WIDTH, HEIGHT)
+    assert next(read_frames(video)).shape == (HEIGHT, WIDTH, 3)

@@ -14,7 +14,7 @@ from jaxtyping import Shaped, UInt8
 from psotrack.errors import InputError
 
 #: Endings of files that are read as images.
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 #: Numbers of bits that cameras use.
 _DEPTHS = (8, 10, 12, 14, 16)
 
@@ -47,7 +47,9 @@ def image_files(folder: Path) -> list[Path]:
 
 
 def read_image(path: Path, depth_bits: int = 16) -> UInt8[np.ndarray, "height width 3"]:
-    """Read an image, BGR. Grey images get three equal channels.
+    """Read an image, BGR, as the sensor saw it. Grey images get three equal channels.
+
+    A note on how to turn the image for people (EXIF) is ignored, because a lens is calibrated for the sensor.
 
     Args:
         path: path of the file.
@@ -56,7 +58,7 @@ def read_image(path: Path, depth_bits: int = 16) -> UInt8[np.ndarray, "height wi
     Raises:
         InputError: the file cannot be read, or is no image.
     """
-    image = _decode(path, cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH)
+    image = _decode(path, cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
     if image.dtype == np.uint16:
         image = np.minimum(image >> (depth_bits - 8), 255)
     elif image.dtype != np.uint8:
@@ -83,7 +85,7 @@ def read_mask(path: Path) -> UInt8[np.ndarray, "height width"]:
     Raises:
         InputError: the file cannot be read, or is no image.
     """
-    return np.asarray(_decode(path, cv2.IMREAD_GRAYSCALE), np.uint8)
+    return np.asarray(_decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION), np.uint8)
 
 
 def read_grey(path: Path) -> UInt8[np.ndarray, "height width"]:

@@ -15,9 +15,16 @@ import numpy as np
 from jaxtyping import Int, UInt8
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.recordings import Recording, VideoInfo, make_timeline, probe, read_frames
+from psotrack.recordings import (
+    IMAGE_SUFFIXES,
+    Recording,
+    VideoInfo,
+    image_files,
+    make_timeline,
+    probe,
+    read_frames,
+)
 
-_IMAGES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"})
 _PATTERN = re.compile(r"[*?\[]")
 #: Largest number of instants in which the board is searched; limits the time for long videos.
 MOST_INSTANTS = 300
@@ -196,11 +203,11 @@ def _stem(word: str) -> str:
 
 def _open(name: str, path: Path) -> CameraImages:
     if _PATTERN.search(path.name):
-        files = sorted(file for file in path.parent.glob(path.name) if file.suffix.lower() in _IMAGES)
+        files = sorted(file for file in path.parent.glob(path.name) if file.suffix.lower() in IMAGE_SUFFIXES)
         if not files:
             raise InputError(path, expected="images of this pattern", found="none")
     elif path.is_dir():
-        files = sorted(file for file in path.iterdir() if file.suffix.lower() in _IMAGES)
+        files = image_files(path)
         if not files:
             raise InputError(path, expected="a folder of images", found="none in it")
     else:

@@ -52,7 +52,7 @@ class LocalisedVideo:
             five consecutive frames that show enough markers.
         wrong_markers: ids of the markers that are not where the map has them; they were left out, unless most
             of the seen markers are wrong.
-        unknown_markers: ids of the markers whose centres were given, but whose corners could not be found.
+        unknown_markers: ids of seen markers whose centres were given, but whose corners could not be found.
     """
 
     path: CameraPath

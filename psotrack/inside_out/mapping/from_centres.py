@@ -45,7 +45,7 @@ class MapFromCentres:
 
     Attributes:
         marker_map: markers whose corners were found.
-        left_out: ids of the table whose markers are not seen in enough frames with a pose, or do not fit.
+        left_out: ids of markers that are seen, but in too few frames with a pose, or that do not fit.
     """
 
     marker_map: MarkerMap
@@ -120,7 +120,7 @@ def complete_map(
             )
         marker_map = MarkerMap(corners)
     assert marker_map is not None
-    left_out = tuple(int(marker) for marker in centres.ids if int(marker) not in corners)
+    left_out = tuple(marker for marker in sightings.ids if marker not in corners)
     return MapFromCentres(marker_map, left_out)
 
 
