@@ -76,7 +76,8 @@ def drone_markers(
                 f"{name}, {faults[name] or 'rigid'} ({_shown(markers, columns)})"
                 for name, columns in bodies.items()
             ),
-            remedy="say which markers are a drone's with --body NAME=LABEL,LABEL or [reference.bodies]",
+            remedy="say which markers are a drone's with --body NAME=LABEL,LABEL or [reference.bodies], or leave the "
+            "file out of the recording",
         )
     _logger.warning(
         "%s: no body is called %s...; taken for drones, because their markers are rigid: %s",
