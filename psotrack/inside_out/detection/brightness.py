@@ -19,11 +19,11 @@ _WHITE = 200
 _HALF_LINEAR = np.round(255 * (np.arange(256) / 255) ** 1.5).astype(np.uint8)
 
 
-def shrink(gray: UInt8[np.ndarray, "height width"], times: int) -> UInt8[np.ndarray, "rows columns"]:
-    """The image reduced by a whole number along each side."""
-    if times < 2:
+def shrink(gray: UInt8[np.ndarray, "height width"], times: float) -> UInt8[np.ndarray, "rows columns"]:
+    """The image made smaller by a factor along each side; as it is by a factor of 1 or less."""
+    if times <= 1:
         return gray
-    size_wh = (max(gray.shape[1] // times, 1), max(gray.shape[0] // times, 1))
+    size_wh = (max(round(gray.shape[1] / times), 1), max(round(gray.shape[0] / times), 1))
     return np.asarray(cv2.resize(gray, size_wh, interpolation=cv2.INTER_AREA), np.uint8)
 
 

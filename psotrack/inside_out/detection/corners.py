@@ -95,7 +95,9 @@ def refine_corners(
         refined_px = limited(distort_pixels(intersections(*lines), lens))
         wide_px = np.maximum(_SPREADS * edges.spread_px, edges.spread_px + _BOWS * bow_px)
         reach_px = np.clip(wide_px, _LEAST_REACH_PX, reach_px)
-    light = linearise(gray, estimate_gamma(gray, refined_px, reach_px, white, lens))
+    gamma = estimate_gamma(gray, refined_px, reach_px, white, lens)
+    # A wide margin, because a lens bends edges outwards.
+    light = linearise(gray, gamma, refined_px, largest_move_px + cell_px.max(axis=1) + _LEAST_REACH_PX)
     edges = _measure_edges(light, refined_px, reach_px, outside, lens)
     middle, direction, _ = fit_lines(edges.points, edges.height)
     refined_px = limited(distort_pixels(intersections(middle, direction), lens))

@@ -31,9 +31,29 @@ _MEASURED_MARKERS = 12
 _HALF_CELL = 0.5
 
 
-def linearise(gray: UInt8[np.ndarray, "height width"], gamma: float) -> UInt16[np.ndarray, "height width"]:
-    """Grey levels to the power of gamma, scaled to 16 bits: in 8 bits the dark levels would all become equal."""
-    return np.asarray(cv2.LUT(gray, np.round(65535 * (np.arange(256) / 255) ** gamma).astype(np.uint16)))
+def linearise(
+    gray: UInt8[np.ndarray, "height width"],
+    gamma: float,
+    corners_px: Float[np.ndarray, "markers 4 2"],
+    margin_px: Float[np.ndarray, " markers"],
+) -> UInt16[np.ndarray, "height width"]:
+    """Grey levels to the power of gamma, scaled to 16 bits: in 8 bits the dark levels would all become equal.
+
+    Args:
+        gray: (height, width).
+        gamma: the power.
+        corners_px: (markers, 4, 2), corners of markers.
+        margin_px: (markers,), distance around each marker's corners within which levels are needed; others are 0.
+    """
+    table = np.round(65535 * (np.arange(256) / 255) ** gamma).astype(np.uint16)
+    light = np.zeros(gray.shape, np.uint16)
+    low = np.maximum(np.floor(corners_px.min(axis=1) - margin_px[:, None]), 0).astype(int)
+    high = np.maximum(np.ceil(corners_px.max(axis=1) + margin_px[:, None]) + 1, 0).astype(int)
+    for (left, top), (right, bottom) in zip(low.tolist(), high.tolist(), strict=True):
+        part = gray[top:bottom, left:right]
+        if part.size:
+            light[top:bottom, left:right] = cv2.LUT(part, table)
+    return light
 
 
 def estimate_gamma(
@@ -64,7 +84,7 @@ def estimate_gamma(
     places_px, steps_px, sign = _cell_edges(corners_px[largest], reach_px[largest], white[largest], lens)
     in_grey, in_light = (
         _white_gain_px(levels, places_px, steps_px, sign).ravel()
-        for levels in (gray, linearise(gray, _LIGHT))
+        for levels in (gray, linearise(gray, _LIGHT, corners_px[largest], 0.3 * size_px[largest]))
     )
     sensitivity = in_grey - in_light
     weight = np.abs(sensitivity)

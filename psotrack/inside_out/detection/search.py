@@ -21,9 +21,8 @@ from psotrack.inside_out.detection.quads import find_quads
 
 _Image = UInt8[np.ndarray, "rows columns"]
 
-#: Longer side, in pixels, near which the quick search looks: it shrinks larger images by the whole number that comes
-#: nearest.
-_SEARCHED_PX = 1920
+#: Longer side of the image in which the quick search looks, in pixels: it shrinks larger images.
+_SEARCHED_PX = 960
 #: Side of the window of the quick search's adaptive threshold, as a share of the longer side, and its smallest side in
 #: pixels. The window must be wider than motion blur is long. And how much darker than its surroundings a black pixel
 #: is, of 255, in the image of equal brightness.
@@ -97,12 +96,12 @@ class MarkerSearch:
         """Find the markers in an image; no two are at one place."""
         passes = [self._find_by_opencv(gray, inverted=False)]
         if self._thorough:
-            times = 1
+            times = 1.0
             while times == 1 or max(gray.shape) / times >= _SMALLEST_PX:
                 passes.append(self._find_in(gray, times, _THOROUGH))
                 times *= 2
         else:
-            times = max(1, round(max(gray.shape) / _SEARCHED_PX))
+            times = max(1.0, max(gray.shape) / _SEARCHED_PX)
             window_px = max(_LEAST_WINDOW_PX, 2 * round((_WINDOW * max(gray.shape) / times - 1) / 2) + 1)
             passes.append(self._find_in(gray, times, ((window_px, _DARKER),)))
         # A video's markers are printed alike, so that where none is inverted, OpenCV would find none either.
@@ -136,8 +135,8 @@ class MarkerSearch:
         found = replace(found, agreement=self.agreement(gray, found, corners_px))
         return found.select(found.agreement >= self._least_opencv)
 
-    def _find_in(self, gray: _Image, times: int, windows: tuple[tuple[int, float], ...]) -> Candidates:
-        """Find markers in an image of equal brightness, shrunk by a whole number, with windows of given sizes."""
+    def _find_in(self, gray: _Image, times: float, windows: tuple[tuple[int, float], ...]) -> Candidates:
+        """Find markers in an image of equal brightness, shrunk by a factor, with windows of given sizes."""
         searched = shrink(gray, times)
         equal = equalise_brightness(searched)
         quads = np.concatenate([find_quads(_dark_parts(equal, *window), _SHORTEST_PX) for window in windows])
