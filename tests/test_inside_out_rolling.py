@@ -221,14 +221,15 @@ def test_a_line_time_that_is_left_out_widens_the_covariances_where_the_video_sho
     assert shown is not None
     shutter = shown.shutter(RollingShutter(0.0))
     assert shutter.line_time_s == 0
-    assert shutter.std_s > LINE_TIME_S
+    assert shutter.std_s == pytest.approx(LINE_TIME_S, rel=0.03)
     for plain, honest in zip(
         followed(detected, RollingShutter(0.0)), followed(detected, shutter), strict=True
     ):
-        # The errors stay, 10 to 20 mm. Without the widening 0.1 to 0.4 of the truths are inside; with it 0.8 to 0.95.
+        # The errors stay, 10 to 20 mm. Without the widening 0.1 to 0.4 of the truths are inside; with it 0.93 to 1.
         assert np.median(off_m(honest, hand)) > 0.005
         assert inside_90(plain, hand, 3) < 0.6
-        assert inside_90(honest, hand, 3) > 0.75
+        assert inside_90(honest, hand, 3) > 0.85
+        assert inside_90(honest, hand, 6) > 0.85
 
 
 def test_a_still_camera_has_the_poses_of_a_global_shutter():

@@ -47,7 +47,7 @@ _FEWEST_MARKERS = 3
 #: deviations, below which no further turn is needed.
 _TURNS, _SAME = 4, 0.3
 #: Standard deviations of the motion by the spline, velocity (m/s) and turn rate (rad/s), as prior of a frame's rows.
-_SPLINE_STD = np.repeat([0.1, 0.1], 3)
+_SPLINE_STD = np.full(6, 0.05)
 #: Number of neighbouring frames whose errors are alike.
 _GROUP_FRAMES = 5
 #: Residual of a frame's motion, in standard deviations, from which on its weight falls.
@@ -55,9 +55,6 @@ _ROBUST = 3.0
 #: Ratio of an estimate to its standard deviation from which on the shutter rolls, and from which on a given line time
 #: is contradicted.
 _SURE, _CONTRADICTED = 4.0, 5.0
-#: Factor on the difference from a given line time that the video contradicts, because the motion, by which the
-#: difference becomes an error of a pose, is estimated from such poses.
-_WIDER = 1.5
 #: Time from the first row to the last, seconds, below which an uncertainty is no matter: at 1 m/s, 0.03 mm.
 _NO_MATTER_S = 1e-4
 #: Standard deviation of the readout, as a share of the time between two frames, above which nothing is shown.
@@ -110,15 +107,14 @@ class LineTime:
     def shutter(self, given: RollingShutter | None = None) -> RollingShutter:
         """The shutter with which poses are estimated.
 
-        A given line time is used as it is; where the video contradicts it, its standard deviation is the difference,
-        and a little more. Otherwise the estimate is used, if the shutter certainly rolls, and else 0. The uncertainty
+        A given line time is used as it is; where the video contradicts it, its standard deviation is the difference.
+        Otherwise the estimate is used, if the shutter certainly rolls, and else 0. The uncertainty
         is then that of the estimate, and at most that of a shutter that takes the time between two frames.
         """
         if given is not None:
             if not self.contradicts(given.line_time_s):
                 return given
-            off_s = _WIDER * (self.line_time_s - given.line_time_s)
-            return replace(given, std_s=float(np.hypot(off_s, self.std_s)))
+            return replace(given, std_s=float(np.hypot(self.line_time_s - given.line_time_s, self.std_s)))
         if self.rolls:
             return RollingShutter(self.line_time_s, self.std_s)
         largest_s = self.frame_s / self.rows / np.sqrt(3)

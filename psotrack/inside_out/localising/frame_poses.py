@@ -32,10 +32,6 @@ from psotrack.trajectories import Status
 PAPER_MARKERS = 4
 #: Probability that another pose is the right one above which a pose is flagged as ambiguous.
 _AMBIGUOUS = 0.05
-#: Factor on the standard deviations of the predicted motion, and added variances of velocity (m²/s²) and turn rate
-#: (rad²/s²), because a frame's own rows shall decide where the motion changes.
-_WIDER = 2.0
-_MOTION_FLOOR = np.diag(np.repeat([0.1**2, 0.1**2], 3))
 
 
 def localise_frames(
@@ -132,7 +128,7 @@ def _pose_of_frame(
             prior = ExpectedPose(predicted.position_m, predicted.R_world_cam, predicted.covariance)
         motion = ExpectedMotion(
             np.concatenate([predicted.velocity_m_s, predicted.rate_rad_s]),
-            _WIDER**2 * predicted.motion_covariance + _MOTION_FLOOR,
+            predicted.motion_covariance,
         )
     corners_m = marker_map.corners_of(markers.ids.tolist())
     try:

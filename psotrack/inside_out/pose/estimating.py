@@ -36,6 +36,9 @@ _ENOUGH_MARKERS = 4
 _LOG_UNEXPECTED = -log(1e3 * 1e3 * 8 * pi**2)
 #: Velocity (m/s) and turn rate (rad/s) along each axis where nothing is known of the motion.
 _UNKNOWN_MOTION = ExpectedMotion(np.zeros(6), np.diag(np.repeat([5.0, 3.0], 3) ** 2.0))
+#: Factor on the standard deviations of the expected motion, and a deviation that is added, m/s and rad/s, because a
+#: frame's own rows shall decide where the motion changes.
+_WIDER, _MOTION_STD = 2.0, 0.1
 #: Squared Mahalanobis distance of two poses below which they are one pose: χ² with 6 degrees of freedom exceeds it
 #: with probability 1/1000.
 _SAME = 22.5
@@ -80,7 +83,7 @@ def estimate_pose(
         return None if pose is None else _among_all(pose, is_shown)
     if len(corners_px) < settings.min_markers:
         return None
-    rows, unsure = _row_times(corners_px, lens, shutter, motion or _UNKNOWN_MOTION)
+    rows, unsure = _row_times(corners_px, lens, shutter, motion)
     if rows is not None:
         rays = _at_reference_row(rays, rows)
     corners = seen_markers(
@@ -119,17 +122,21 @@ def _row_times(
     corners_px: Float[np.ndarray, "markers 4 2"],
     lens: Camera,
     shutter: RollingShutter | None,
-    motion: ExpectedMotion,
+    expected: ExpectedMotion | None,
 ) -> tuple[RowMotion | None, UnsureRows | None]:
     """Times of the corners' rows, and the uncertainty of these times; None for what a shutter does not have."""
     if shutter is None:
         return None, None
     rows = unsure = None
+    motion = expected or _UNKNOWN_MOTION
     if shutter.line_time_s:
         time_s = row_times_s(corners_px, lens, shutter.line_time_s)
-        rows = RowMotion(time_s, motion.motion, np.linalg.inv(motion.covariance))
+        covariance = motion.covariance
+        if expected is not None:
+            covariance = _WIDER**2 * covariance + _MOTION_STD**2 * np.eye(6)
+        rows = RowMotion(time_s, motion.motion, np.linalg.inv(covariance))
     if shutter.std_s:
-        unsure = UnsureRows(row_times_s(corners_px, lens, shutter.std_s), motion.motion)
+        unsure = UnsureRows(row_times_s(corners_px, lens, shutter.std_s), motion.motion, motion.covariance)
     return rows, unsure
 
 

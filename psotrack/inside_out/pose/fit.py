@@ -30,7 +30,7 @@ from psotrack.inside_out.pose.equations import (
     summed,
     with_prior,
 )
-from psotrack.inside_out.pose.frame_motion import frame_motion, line_time_effect
+from psotrack.inside_out.pose.frame_motion import frame_motion, line_time_effects
 
 #: Probability that a good corner, or the mean of a good marker, is rejected as an outlier.
 FALSE_ALARM = 1e-3
@@ -266,18 +266,21 @@ def _fitted(seen: SeenCorners, pose: _Pose, last: _LastStep, noise: Noise) -> Fi
     if solution is None or too_large or noise.place_m2 > _LARGEST_PLACE_M**2:
         return None
     covariance = solution.covariance[:6, :6]
-    motion, by_line_time = None, None
+    motion, by_line_time, whole = None, None, covariance
     if seen.rows is not None:
         motion = frame_motion(seen, sums, last.rows, fits, widened, pose.extra)
         if motion is None:
             return None
     if seen.unsure is not None:
         assumed = seen.unsure.expected if motion is None else motion.assumed
-        effect = line_time_effect(seen, last.rows, fits, widened, assumed, seen.prior_information)
-        if effect is None:
+        by_motion = line_time_effects(seen, last.rows, fits, widened, seen.prior_information)
+        if by_motion is None:
             return None
-        by_line_time = effect[:6]
-    whole = covariance if by_line_time is None else covariance + np.outer(by_line_time, by_line_time)
+        by_line_time = by_motion[:6] @ assumed
+        whole = covariance + np.outer(by_line_time, by_line_time)
+        if motion is None:
+            # The motion that turns an error of the line time into an error of the pose is uncertain, too.
+            whole = whole + by_motion[:6] @ seen.unsure.covariance @ by_motion[:6].T
     # The inset is an error of the measurement, so the reported distances are without the inset.
     distance_px = np.linalg.norm(off_px + pose.extra[0] * seen.inward, axis=-1)[fits]
     return Fit(

@@ -43,10 +43,10 @@ def frame_motion(
     by_motion = -np.linalg.solve(covariance[6:, 6:], covariance[6:, :6]).T
     common = sums.common(solution, noise, seen.map_share)[whole]
     if seen.unsure is not None:
-        effect = line_time_effect(seen, rows, fits, noise, extra[2:], prior)
-        if effect is None:
+        effects = line_time_effects(seen, rows, fits, noise, prior)
+        if effects is None:
             return None
-        common = np.concatenate([common, effect[whole, None]], axis=1)
+        common = np.concatenate([common, (effects[whole] @ extra[2:])[:, None]], axis=1)
     common[:6] += by_motion @ common[6:]
     of_pose = covariance[:6, :6] + by_motion @ covariance[6:, :6]
     return FrameMotion(
@@ -59,23 +59,26 @@ def frame_motion(
     )
 
 
-def line_time_effect(
+def line_time_effects(
     seen: SeenCorners,
     rows: Float[np.ndarray, "markers 4 2 columns"],
     fits: Bool[np.ndarray, "markers 4"],
     noise: Noise,
-    motion: Float[np.ndarray, "6"],
     prior_information: Float[np.ndarray, "extra extra"],
-) -> Float[np.ndarray, "unknowns"] | None:
-    """Change of the unknowns by an error of the line time of one standard deviation; None if undetermined.
+) -> Float[np.ndarray, "unknowns 6"] | None:
+    """Change of the unknowns by an error of the line time of one standard deviation, for each part of the motion.
 
     Rows that were exposed later than assumed show the camera where its motion took it meanwhile, which changes the
-    pixels as a change of the pose does.
+    pixels as a change of the pose does. None if the equations are singular.
     """
     if seen.unsure is None:
-        return np.zeros(rows.shape[-1] - 1)
-    moved = rows.copy()
-    moved[..., -1] = seen.unsure.error_s[..., None] * (rows[..., :POSE_SIZE] @ motion)
-    none = np.zeros(len(prior_information))
-    solution: Solution | None = summed(moved, fits).solved(noise, prior_information, none)
-    return None if solution is None else solution.step
+        return np.zeros((rows.shape[-1] - 1, 6))
+    none, moved = np.zeros(len(prior_information)), rows.copy()
+    effects = []
+    for part in range(POSE_SIZE):
+        moved[..., -1] = seen.unsure.error_s[..., None] * rows[..., part]
+        solution: Solution | None = summed(moved, fits).solved(noise, prior_information, none)
+        if solution is None:
+            return None
+        effects.append(solution.step)
+    return np.stack(effects, axis=1)

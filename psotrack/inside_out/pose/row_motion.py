@@ -43,10 +43,12 @@ class UnsureRows:
     Attributes:
         error_s: (markers, 4), change of each corner's time by one standard deviation of the line time, seconds.
         expected: (6,), expected motion, as in `RowMotion`, by which a wrong time changes a corner's pixel.
+        covariance: (6, 6), covariance of the expected motion.
     """
 
     error_s: Float[np.ndarray, "markers 4"]
     expected: Float[np.ndarray, "6"]
+    covariance: Float[np.ndarray, "6 6"]
 
 
 @dataclass(frozen=True)
