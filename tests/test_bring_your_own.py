@@ -565,7 +565,7 @@ def test_a_detector_by_an_entry_point(run_track, site, recording, empty_hall):
         ),
         (
             lambda: find_background("mean", SilhouetteSettings()),
-            "background: expected one of mog2, absent, median, found mean",
+            "background: expected one of mog2, living, absent, median, found mean",
         ),
         (
             lambda: find_background("absent", SilhouetteSettings()),

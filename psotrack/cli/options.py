@@ -137,8 +137,9 @@ BACKGROUND = click.option(
     "--background",
     default="mog2",
     show_default=True,
-    metavar="mog2|NAME",
-    help="Background model: MOG2, or a model NAME that an installed package adds.",
+    metavar="mog2|living|NAME",
+    help="Background model: MOG2 with a background that stays as it was learned; living, for light, skies and plants "
+    "that change; or a model NAME that an installed package adds.",
 )
 FOV = click.option(
     "--fov",

@@ -24,8 +24,8 @@ from jaxtyping import UInt8
 from psotrack.silhouettes.settings import ForegroundSettings, SilhouetteSettings
 from psotrack.support import make_plugin
 
-#: Name of the background model of this package.
-MOG2 = "mog2"
+#: Names of the background models of this package.
+MOG2, LIVING = "mog2", "living"
 
 #: MOG2's label of shadow pixels; foreground is 255.
 _SHADOW = 127
@@ -106,15 +106,20 @@ class Mog2:
 
 
 def find_background(name: str, settings: SilhouetteSettings) -> BackgroundModel | None:
-    """The background model of a name: "mog2" or a plugin; None for MOG2, which is the default of `compute`.
+    """The background model of a name: "mog2", "living" or a plugin; None for MOG2, the default of `compute`.
 
     Raises:
         SettingsError: there is no background model of this name.
     """
     if name == MOG2:
         return None
+    if name == LIVING:
+        # The living background reduces frames with this module's functions.
+        from psotrack.silhouettes.living_background import Living
+
+        return Living(settings)
     model: BackgroundModel = make_plugin(
-        "background", name, settings, interface=BackgroundModel, setting="background", built_in=[MOG2]
+        "background", name, settings, interface=BackgroundModel, setting="background", built_in=[MOG2, LIVING]
     )
     return model
 
@@ -150,7 +155,7 @@ def learn_background(
     model.setBackgroundRatio(_BACKGROUND_RATIO)
     for index, frame in enumerate(frames):
         # The rate 1/n gives the mean of n frames; MOG2's own schedule gives the last frames more weight.
-        model.apply(_reduce_for_mog2(frame, settings), learningRate=1 / (index + 1))
+        model.apply(reduce_frame(frame, settings), learningRate=1 / (index + 1))
     return model
 
 
@@ -160,7 +165,7 @@ def classify(
     settings: ForegroundSettings,
 ) -> UInt8[np.ndarray, "working_height working_width"]:
     """Foreground of one frame, as `foreground` yields it; updates `model` at `learning_rate`."""
-    mask = model.apply(_reduce_for_mog2(frame, settings), learningRate=settings.learning_rate)
+    mask = model.apply(reduce_frame(frame, settings), learningRate=settings.learning_rate)
     return remove_speckle(
         cv2.LUT(mask, _levels(settings)), math.ceil(settings.min_blob_px / settings.working_reduction**2)
     )
@@ -197,7 +202,7 @@ def coverage(
     return _reduce(padded, reduction)
 
 
-def _reduce_for_mog2(frame: UInt8[np.ndarray, "height width 3"], settings: ForegroundSettings) -> _Image:
+def reduce_frame(frame: UInt8[np.ndarray, "height width 3"], settings: ForegroundSettings) -> _Image:
     """Reduce a frame by `working_reduction`; pixels beyond the image's border repeat the pixels at the border."""
     if settings.working_reduction == 1:
         return frame

@@ -1,0 +1,196 @@
+"""A background that lives: MOG2 that goes on learning, but never learns an object.
+
+`LivingBackground` sees one frame after the other, in one pass, from a file or from a live camera. Each frame goes
+through:
+
+1. the change of the light is removed (`lighting`);
+2. MOG2 (Zivkovic, ICPR 2004) tells which pixels differ from all that they showed lately;
+3. the blobs of these pixels that are objects become foreground (`object_blobs`); how much a blob must differ depends on
+   the place: leaves, screens, waves and noise make a place restless;
+4. MOG2 learns all pixels but those of objects, so that clouds, daylight and ghosts are absorbed in a second or two, and
+   a drone that hovers for minutes is not.
+
+`Living` is the background model of a file, in two passes: the first pass learns what most frames of the whole video
+show, and the first two seconds are seen twice.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from psotrack.silhouettes.foreground import learn_background, reduce_frame
+from psotrack.silhouettes.lighting import remove_light
+from psotrack.silhouettes.object_blobs import find_objects, gradient, largest
+from psotrack.silhouettes.settings import ForegroundSettings
+
+#: MOG2's label of foreground that is no shadow.
+_FOREGROUND = 255
+#: Squared Mahalanobis distance from the background beyond which a pixel may be foreground.
+_VAR_THRESHOLD = 12.0
+#: Learning rate per frame: what is no object is background after some ten frames.
+_LEARNING_RATE = 0.02
+#: Number of first frames of a file that are seen twice, 2 s of most videos.
+_FIRST_FRAMES = 50
+
+#: A darker pixel of the same hue is a shadow if it keeps this share of the background's brightness, at least.
+_SHADOW_BRIGHTNESS = 0.85
+#: Shadows count as foreground up to this distance from foreground that is no shadow: pixels of a thin arm show the arm
+#: and the background, and look like a shadow.
+_TOUCHING = np.ones((5, 5), np.uint8)
+
+#: Smallest difference of a strong pixel, grey levels of a channel: four times the noise of a good camera.
+_LEAST_DIFFERENCE = 8.0
+#: A pixel is strong if it differs by this many times the place's usual deviation (root of the mean square).
+_DEVIATIONS = 4.0
+#: ... and by this many times the place's mean change within `_CHANGE_EVERY` frames.
+_CHANGES, _CHANGE_EVERY = 3.0, 5
+#: ... and by more than a shift of the image by this many pixels would explain.
+_SHIFT_PX = 1.0
+#: Pixels that differ by less than this share of what makes a pixel strong are no part of a blob.
+_EXTENT = 0.35
+#: What is usual at a place is learned at this rate per frame, and smoothed over a window of this side.
+_USUAL_RATE, _USUAL_WINDOW = 0.005, (5, 5)
+#: Before the first frame, all places were calm for so many frames: one drone that passes makes no place restless.
+_CALM_FRAMES = 10
+#: What is usual changes slowly; it is brought up to date every so many frames.
+_USUAL_EVERY = 4
+#: Objects are protected from being learned with a margin, because their edges are blurred.
+_MARGIN = np.ones((5, 5), np.uint8)
+
+_Image = UInt8[np.ndarray, "height width 3"]
+_Mask = UInt8[np.ndarray, "height width"]
+
+
+@dataclass(frozen=True)
+class Living:
+    """The background model "living" (see the module).
+
+    Attributes:
+        settings: settings of the foreground; `working_reduction`, `num_learning_frames` and `min_blob_px` are used.
+            Shadows that touch other foreground count as foreground.
+    """
+
+    settings: ForegroundSettings
+
+    @property
+    def key(self) -> Mapping[str, Any]:
+        """See `BackgroundModel`."""
+        used = ("working_reduction", "num_learning_frames", "min_blob_px")
+        return {"living": 1, **{name: getattr(self.settings, name) for name in used}}
+
+    def foreground(
+        self,
+        learning: Iterable[UInt8[np.ndarray, "height width 3"]],
+        frames: Iterable[UInt8[np.ndarray, "height width 3"]],
+    ) -> Iterator[UInt8[np.ndarray, "working_height working_width"]]:
+        """See `BackgroundModel`."""
+        most_frames = np.asarray(learn_background(learning, self.settings).getBackgroundImage())
+        background = LivingBackground(self.settings, most_frames)
+        coming = (reduce_frame(frame, self.settings) for frame in frames)
+        first = list(itertools.islice(coming, _FIRST_FRAMES))
+        # From the last to the first, so that the background of frame 0 is that of its time, and what is restless is
+        # known.
+        for frame in reversed(first):
+            background.step(frame)
+        for frame in itertools.chain(first, coming):
+            yield background.step(frame)
+
+
+class LivingBackground:
+    """The background of one camera, which changes with each frame.
+
+    Args:
+        settings: settings of the foreground; `working_reduction` and `min_blob_px` are used.
+        image: (height, width, 3), BGR, the background as far as it is known: the first frame of a live camera, or what
+            most of a video's frames show. Of the frames' size.
+
+    Attributes:
+        foreground: (height, width), the foreground of the last frame, 0 or 255.
+    """
+
+    def __init__(self, settings: ForegroundSettings, image: _Image) -> None:
+        self._least_px = math.ceil(settings.min_blob_px / settings.working_reduction**2)
+        self._mog2 = cv2.createBackgroundSubtractorMOG2(varThreshold=_VAR_THRESHOLD, detectShadows=True)
+        self._mog2.setShadowThreshold(_SHADOW_BRIGHTNESS)
+        self._mog2.apply(image, learningRate=1)
+        self._background: Float[np.ndarray, "height width 3"] = image.astype(np.float32)
+        shape = image.shape[:2]
+        self._square = np.zeros(shape, np.float32)
+        self._change = np.zeros(shape, np.float32)
+        self._usual = np.full(shape, _LEAST_DIFFERENCE, np.float32)
+        self._restless = np.zeros(shape, np.float32)
+        self._last = image
+        self._num_frames = 0
+        self.foreground: _Mask = np.zeros(shape, np.uint8)
+
+    def step(self, image: _Image, known: _Mask | None = None) -> _Mask:
+        """The foreground of the next frame; learns from the frame.
+
+        Args:
+            image: (height, width, 3), BGR frame.
+            known: (height, width), above 0 where a drone is known to be, for example by a tracker's prediction: these
+                pixels are not learned. None: nothing is known.
+
+        Returns:
+            (height, width): 0 for background, 255 for foreground.
+        """
+        self._num_frames += 1
+        image = remove_light(image, self._background, self.foreground)
+        labels = self._mog2.apply(image, learningRate=0)
+        background = cv2.convertScaleAbs(self._background)
+        difference = largest(cv2.absdiff(image, background))
+        if self._num_frames % _USUAL_EVERY == 1:
+            self._restless = self._restlessness()
+            # A small shift of the image changes the pixels beside edges.
+            shifted = _SHIFT_PX / 2 * cv2.dilate(gradient(background), np.ones((3, 3), np.uint8))
+            self._usual = np.maximum(np.maximum(self._restless, shifted), _LEAST_DIFFERENCE)
+        touching = cv2.dilate(_white(labels == _FOREGROUND), _TOUCHING)
+        changed = touching & _white((labels > 0) & (difference > _EXTENT * self._restless))
+        strong = changed & _white(difference > self._usual)
+        found = find_objects(
+            changed,
+            strong,
+            image,
+            background,
+            difference,
+            self._restless > 2 * _LEAST_DIFFERENCE,
+            self._least_px,
+        )
+        self._learn(image, labels, difference, found.own if known is None else found.own | known)
+        self.foreground = found.mask
+        return found.mask
+
+    def _learn(self, image: _Image, labels: _Mask, difference: _Mask, objects: _Mask) -> None:
+        protected = cv2.dilate(objects, _MARGIN)
+        free = cv2.bitwise_not(protected)
+        # At first each frame has the same weight.
+        rate = max(_LEARNING_RATE, 1 / (self._num_frames + 1))
+        self._mog2.apply(image, protected, None, rate)
+        cv2.accumulateWeighted(image, self._background, rate, free)
+        usual_rate = max(_USUAL_RATE, 1 / (self._num_frames + _CALM_FRAMES))
+        unexplained = cv2.bitwise_and(difference, difference, mask=_white(labels > 0))
+        square = cv2.multiply(unexplained, unexplained, dtype=cv2.CV_32F)
+        cv2.accumulateWeighted(square, self._square, usual_rate, free)
+        if self._num_frames % _CHANGE_EVERY == 0:
+            # A hovering drone hardly changes, a screen does: so this is learned at objects too.
+            change = largest(cv2.absdiff(image, self._last))
+            cv2.accumulateWeighted(change, self._change, _CHANGE_EVERY * usual_rate)
+            self._last = image
+
+    def _restlessness(self) -> Float[np.ndarray, "height width"]:
+        """(height, width), difference that leaves, screens, waves and noise make at a place, grey levels."""
+        deviation = np.sqrt(cv2.blur(self._square, _USUAL_WINDOW))
+        change = cv2.blur(self._change, _USUAL_WINDOW)
+        return np.maximum(_DEVIATIONS * deviation, _CHANGES * change)
+
+
+def _white(chosen: np.ndarray) -> _Mask:
+    return chosen.view(np.uint8) * np.uint8(255)
