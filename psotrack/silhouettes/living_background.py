@@ -35,7 +35,7 @@ from psotrack.silhouettes.settings import ForegroundSettings
 _FOREGROUND = 255
 #: Squared Mahalanobis distance from the background beyond which a pixel may be foreground.
 _VAR_THRESHOLD = 12.0
-#: Learning rate per frame: what is no object is background after some ten frames.
+#: Learning rate per frame. MOG2 takes a new colour for background at a weight of 0.1, which is after 6 frames.
 _LEARNING_RATE = 0.02
 #: Number of first frames of a file that are seen twice, 2 s of most videos.
 _FIRST_FRAMES = 50
@@ -50,17 +50,17 @@ _TOUCHING = np.ones((5, 5), np.uint8)
 _LEAST_DIFFERENCE = 8.0
 #: A pixel is strong if it differs by this many times the place's usual deviation (root of the mean square).
 _DEVIATIONS = 4.0
-#: ... and by this many times the place's mean change within `_CHANGE_EVERY` frames.
+#: A strong pixel also differs by more than this many times the place's mean change within `_CHANGE_EVERY` frames.
 _CHANGES, _CHANGE_EVERY = 3.0, 5
-#: ... and by more than a shift of the image by this many pixels would explain.
+#: A strong pixel also differs by more than a shift of the image by this many pixels would explain.
 _SHIFT_PX = 1.0
 #: Pixels that differ by less than this share of what makes a pixel strong are no part of a blob.
 _EXTENT = 0.35
-#: What is usual at a place is learned at this rate per frame, and smoothed over a window of this side.
+#: Learning rate per frame of each place's deviation and change, and the window over which they are averaged, pixels.
 _USUAL_RATE, _USUAL_WINDOW = 0.005, (5, 5)
-#: Before the first frame, all places were calm for so many frames: one drone that passes makes no place restless.
+#: Number of calm frames assumed before the first frame, so that one drone that passes early makes no place restless.
 _CALM_FRAMES = 10
-#: What is usual changes slowly; it is brought up to date every so many frames.
+#: Number of frames between two updates of the difference that a strong pixel needs, because it changes slowly.
 _USUAL_EVERY = 4
 #: Objects are protected from being learned with a margin, because their edges are blurred.
 _MARGIN = np.ones((5, 5), np.uint8)

@@ -23,7 +23,7 @@ from psotrack.inside_out.pose import PoseSettings
 _DISAGREE, _DISAGREE_LEAST, _DISAGREE_MOST = 3.0, 15.0, 60.0
 #: Largest number of frames and of pairs in a frame that are looked at: about a second.
 _MOST_FRAMES, _MOST_PAIRS = 150, 36
-#: A marker is wrong if it disagrees in more than this share of its pairs, which are at least so many.
+#: A marker is wrong if it disagrees in more than the share `_WRONG_SHARE` of its pairs, of at least `_LEAST_PAIRS`.
 _WRONG_SHARE, _LEAST_PAIRS = 0.5, 3
 #: Number of right markers that a pose needs where wrong ones are left out.
 _ENOUGH = 2
