@@ -95,15 +95,16 @@ def test_markers_of_a_distorting_lens_are_detected_at_their_projection():
 def test_the_exposure_swings_between_its_limits():
     scene = made(exposure=(0.3, 2.0), exposure_period_s=2.0)
     renderer = OnboardRenderer(scene, 0)
-    factors = np.array([renderer.exposure(time_s) for time_s in np.linspace(0, 2, 400)])
+    times_s = np.linspace(0, 2, 400)
+    factors = np.array([renderer.sensor.exposure(time_s) for time_s in times_s])
     assert factors.min() == pytest.approx(0.3, rel=1e-3)
     assert factors.max() == pytest.approx(2.0, rel=1e-3)
     dark, bright = (int(factors.argmin()), int(factors.argmax()))
     image = np.full((SIZE_WH[1], SIZE_WH[0], 3), 100, np.uint8)
-    levels = [renderer.sensor.expose(image, 0, 0.0, factors[index]).mean() for index in (dark, bright)]
-    # A factor of light is its power 1 / 2.2 of grey levels.
-    assert levels[1] / levels[0] == pytest.approx((2.0 / 0.3) ** (1 / 2.2), rel=0.02)
-    assert OnboardRenderer(made(), 0).exposure(0.7) == 1.0
+    levels = [renderer.sensor.expose(image, 0, times_s[index]).mean() for index in (dark, bright)]
+    # A factor of light is its power 1 / 2.2 of grey levels; flicker and drift change the light by up to 10 %.
+    assert levels[1] / levels[0] == pytest.approx((2.0 / 0.3) ** (1 / 2.2), rel=0.06)
+    assert OnboardRenderer(made(), 0).sensor.exposure(0.7) == 1.0
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,9 @@
 
     python experiments/simulation/effects.py --out experiments/pictures
 
-Writes effect_NAME.png for each effect of `scenarios.Imaging`. Where an effect is mild by default it is exaggerated;
-the titles say by how much. The record of all pictures is results/effects.json beside this file; --only writes none.
+Writes effect_NAME.png for each effect of `scenarios.Imaging` and `scenarios.Surroundings`. Where an effect is mild by
+default it is exaggerated; the titles say by how much. The record of all pictures is results/effects.json beside this
+file; --only writes none.
 """
 
 from __future__ import annotations
@@ -23,9 +24,18 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 from psotrack.geometry import project
-from psotrack.simulation import CameraRenderer, Scenario, build, scenario
+from psotrack.simulation import RESTLESS, CameraRenderer, Scenario, build, scenario
 from psotrack.simulation.imaging.sensor import Sensor, flicker_gain
-from psotrack.simulation.scenarios import CameraPlace, Drone, Harmonic, Harmonics, Imaging, Limits, Variation
+from psotrack.simulation.scenarios import (
+    CameraPlace,
+    Drone,
+    Harmonic,
+    Harmonics,
+    Imaging,
+    Limits,
+    Surroundings,
+    Variation,
+)
 from psotrack.support import COLOURS
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -47,6 +57,8 @@ OFF = Imaging(
     read_noise=0,
     shot_noise=0,
 )
+#: Nothing changes around the drones.
+CALM = Surroundings()
 ANYWHERE = Limits(
     max_speed_m_s=100,
     max_acceleration_m_s2=100,
@@ -71,29 +83,33 @@ class Pair:
         titles: titles of the pictures without and with the effect.
         with_it: imaging settings with the effect, where they differ from `OFF`.
         without: imaging settings without the effect, where they differ from `OFF`.
+        around: what changes around the drones with the effect.
+        time_s: time of the frame.
         at_m: position of the drone, world.
         aim_m: middle of the view, world; None: the drone.
         velocity_m_s: velocity of the drone along x.
         camera: the camera.
         model: name of the drone model.
         paint_bgr: paint of the drone.
-        size_px: width and height of the view before magnification.
+        size_px: width and height of the view before magnification; None: the whole image.
         zoom: factor of the magnification, without interpolation.
         difference: factor of the difference in a third picture; 0: no third picture.
     """
 
     name: str
     titles: tuple[str, str]
-    with_it: dict[str, Any]
+    with_it: dict[str, Any] = field(default_factory=dict)
     without: dict[str, Any] = field(default_factory=dict)
+    around: Surroundings = CALM
+    time_s: float = 0.0
     at_m: Vector = (0.4, -0.6, 1.2)
     aim_m: Vector | None = None
     velocity_m_s: float = 0.0
     camera: CameraPlace = HIGH
     model: str = "x_frame"
     paint_bgr: Vector = (0.03, 0.03, 0.03)
-    size_px: tuple[int, int] = (96, 64)
-    zoom: int = 4
+    size_px: tuple[int, int] | None = (96, 64)
+    zoom: float = 4
     difference: int = 0
 
 
@@ -164,10 +180,19 @@ PAIRS = (
         ("jpeg_quality = 0: none", "jpeg_quality = 25"),
         with_it={"jpeg_quality": 25},
     ),
+    *(
+        Pair(name, titles, around=around, time_s=time_s, size_px=None, zoom=0.25)
+        for name, titles, around, time_s in (
+            ("lamp", ("lamp on", "lamp_drop = 0.25, off"), Surroundings(lamp_drop=0.25, lamp_s=(0.0,)), 0.0),
+            ("screen", ("no screen", "screen = 0.025"), Surroundings(screen=0.025), 1.0),
+            ("foliage", ("no foliage", "foliage = 0.025"), Surroundings(foliage=0.025), 1.0),
+            ("person", ("nobody", "person = 0.5"), Surroundings(person=0.5), 4.0),
+        )
+    ),
 )
 
 
-def scene_of(pair: Pair, imaging: Imaging) -> Scenario:
+def scene_of(pair: Pair, imaging: Imaging, around: Surroundings) -> Scenario:
     """Scenario of the laboratory with one camera and one drone."""
     period_s = 3.0
     swing_m = pair.velocity_m_s * period_s / (2 * np.pi)
@@ -183,13 +208,17 @@ def scene_of(pair: Pair, imaging: Imaging) -> Scenario:
         limits=ANYWHERE,
         variation=Variation(phase_deg=0, centre_m=0, size=0, period=0, yaw_deg=0),
         imaging=imaging,
+        surroundings=around,
     )
 
 
-def view(pair: Pair, changes: dict[str, Any]) -> np.ndarray:
+def view(pair: Pair, changes: dict[str, Any], around: Surroundings) -> np.ndarray:
     """(rows, columns, 3), RGB: the part of the frame that the picture shows."""
-    scene = build(scene_of(pair, msgspec.structs.replace(OFF, **changes)))
-    frame = CameraRenderer(scene, 0).frame(0)
+    scene = build(scene_of(pair, msgspec.structs.replace(OFF, **changes), around))
+    frame = CameraRenderer(scene, 0).frame(round(pair.time_s * scene.scenario.fps))
+    if pair.size_px is None:
+        whole = cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
+        return cv2.resize(whole, None, fx=pair.zoom, fy=pair.zoom, interpolation=cv2.INTER_AREA)
     (x, y), _ = project(scene.rig.cameras[0], np.array(pair.aim_m or pair.at_m))
     width, height = pair.size_px
     left, top = int(x) - width // 2, int(y) - height // 2
@@ -199,7 +228,7 @@ def view(pair: Pair, changes: dict[str, Any]) -> np.ndarray:
 
 def picture(pair: Pair) -> Image.Image:
     """Picture of both views side by side under their titles."""
-    views = [view(pair, pair.without), view(pair, pair.with_it)]
+    views = [view(pair, pair.without, CALM), view(pair, pair.with_it, pair.around)]
     titles = [*pair.titles]
     if pair.difference:
         views.append(cv2.convertScaleAbs(cv2.absdiff(*views), alpha=pair.difference))
@@ -230,9 +259,9 @@ def curves(rows: int) -> tuple[Figure, list[Any]]:
 
 
 def drift() -> Figure:
-    """Draw two minutes of the slow changes of three cameras, with the default settings."""
+    """Draw two minutes of slow changes of three cameras: the defaults, and the automatic exposure of --restless."""
     default = Imaging()
-    figure, (exposure, white) = curves(2)
+    figure, (exposure, white, automatic) = curves(3)
     time_s = np.linspace(0, 120, 600)
     for camera, colour in zip(range(3), COLOURS, strict=False):
         alone = msgspec.structs.replace(OFF, exposure_drift=default.exposure_drift)
@@ -249,8 +278,16 @@ def drift() -> Figure:
         white.plot(time_s, gains[:, channel], color=colour, label=name)
     exposure.set_title(f"exposure_drift = {default.exposure_drift}", fontsize=10)
     white.set_title(f"white_balance_drift = {default.white_balance_drift}, camera 1", fontsize=10)
-    white.set_xlabel("time in s")
-    for ax in (exposure, white):
+    limits = {key.removeprefix("imaging."): value for key, value in RESTLESS.items() if "exposure" in key}
+    swings = msgspec.structs.replace(OFF, **limits)
+    for camera, colour in zip(range(3), COLOURS, strict=False):
+        sensor = Sensor(swings, 1, camera, (8, 8))
+        gains = [sensor.gains(t)[1] for t in time_s]
+        automatic.plot(time_s, gains, color=colour, label=f"camera {camera + 1}")
+    stated = ", ".join(f"{name} = {value}" for name, value in limits.items())
+    automatic.set_title(stated, fontsize=10)
+    automatic.set_xlabel("time in s")
+    for ax in (exposure, white, automatic):
         ax.legend(ncols=3, fontsize=8, frameon=False, loc="upper right")
         ax.margins(y=0.25)
     return figure
@@ -297,7 +334,12 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     for pair in PAIRS:
         if not options.only or pair.name in options.only:
-            save_small(picture(pair), options.out / f"effect_{pair.name}.png")
+            path = options.out / f"effect_{pair.name}.png"
+            if pair.size_px is None:
+                # 256 colours are too few for a whole image: skin becomes grey.
+                picture(pair).save(path, optimize=True)
+            else:
+                save_small(picture(pair), path)
     for name, draw in curves_of.items():
         if not options.only or name in options.only:
             canvas = FigureCanvasAgg(draw())

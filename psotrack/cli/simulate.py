@@ -31,6 +31,11 @@ from psotrack.errors import SettingsError
     metavar="FIELD=VALUE",
     help="Change a field of the scenario, e.g. imaging.reflections=0; may be repeated.",
 )
+@click.option(
+    "--restless",
+    is_flag=True,
+    help="Add an automatic exposure, a lamp that goes off, a screen and a plant.",
+)
 @click.option("--list", "listed", is_flag=True, help="List the scenarios, and end.")
 @click.option("--show", is_flag=True, help="Print the scenario's file, as a start for your own, and end.")
 @click.option(
@@ -62,6 +67,7 @@ def simulate(
     out: Path | None,
     scenario_file: Path | None,
     changes: tuple[str, ...],
+    restless: bool,
     listed: bool,
     show: bool,
     preview: bool,
@@ -87,6 +93,7 @@ def simulate(
       psotrack simulate S02_D4_A --out data
       psotrack simulate S04_D10 --out small --scale 0.5 --frames 60 --seed 7
       psotrack simulate S02_D4_A --out pages --preview
+      psotrack simulate S02_D4_A --out restless --restless
       psotrack simulate S02_D4_A --as-own-cameras --out my_lab
       psotrack simulate S02_D4_A --show > mine.toml
       psotrack simulate --scenario mine.toml --out data --set camera_spread.focal_length=0.02
@@ -95,6 +102,7 @@ def simulate(
         _list(json_path, quiet, force)
         return
     from psotrack.simulation import (
+        RESTLESS,
         SimulationSettings,
         change_scenario,
         load,
@@ -114,18 +122,20 @@ def simulate(
     if show:
         if name is None:
             raise SettingsError("--show", expected="the NAME of a scenario", found="none")
-        if changes:
-            raise SettingsError(
-                "--show",
-                expected="no --set, as the file is shown as it is",
-                found=changes[0],
-                remedy="give --set when the scenario is simulated",
-            )
+        for option, found in (("--set", changes[:1]), ("--restless", ("--restless",) * restless)):
+            if found:
+                raise SettingsError(
+                    "--show",
+                    expected=f"no {option}, as the file is shown as it is",
+                    found=found[0],
+                    remedy=f"give {option} when the scenario is simulated",
+                )
         click.echo(preset_text(str(name)), nl=False)
         return
     if out is None:
         raise SettingsError("--out", expected="the folder to write to", found="none")
     recipe = load(scenario_file) if scenario_file else scenario(str(name))
+    recipe = change_scenario(recipe, RESTLESS if restless else {})
     recipe = change_scenario(recipe, dict(_change(change) for change in changes))
     if preview:
         from psotrack.simulation import save_preview

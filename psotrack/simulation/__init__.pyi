@@ -6,11 +6,12 @@ from .listing import catalogue, render
 from .own_cameras import OWN_CAMERAS, simulate_own_cameras
 from .preview import save_preview
 from .real_form import RealFormSettings, write_as_real
-from .scenarios import Scenario, change_scenario, load, preset_names, preset_text, scenario
+from .scenarios import RESTLESS, Scenario, change_scenario, load, preset_names, preset_text, scenario
 from .scene import Scene, build
 
 __all__ = [
     "OWN_CAMERAS",
+    "RESTLESS",
     "CameraRenderer",
     "RealFormSettings",
     "Scenario",

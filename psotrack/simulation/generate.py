@@ -9,6 +9,7 @@ import logging
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import msgspec
@@ -36,7 +37,7 @@ from psotrack.rig_files import write_rig
 from psotrack.simulation import scenarios
 from psotrack.simulation.imaging.onboard import camera_record, intrinsics, lens, onboard_poses
 from psotrack.simulation.labels.mocap import mocap_markers_m
-from psotrack.simulation.scenarios import FlightFromFile, Mesh, Scenario
+from psotrack.simulation.scenarios import FlightFromFile, Imaging, Mesh, Scenario, Surroundings
 from psotrack.simulation.scene import Scene, build
 from psotrack.simulation.segments import Stream, Work, draw, join, join_masks, segment_folder, segments
 from psotrack.simulation.unfinished import Unfinished, unfinished
@@ -139,9 +140,20 @@ def _record(scene: Scene, settings: SimulationSettings) -> bytes:
         "masks": settings.masks,
         "onboard": settings.onboard,
         "sha256": _digests(scene.scenario),
-        "scenario": scene.scenario,
+        "scenario": _stated(scene.scenario),
     }
     return msgspec.json.format(msgspec.json.encode(record), indent=1)
+
+
+def _stated(recipe: Scenario) -> dict[str, Any]:
+    """The scenario as plain values, without newer fields that are off, so that older records stay the same."""
+    data: dict[str, Any] = msgspec.to_builtins(recipe)
+    if recipe.surroundings == Surroundings():
+        del data["surroundings"]
+    for field in ("exposure", "exposure_period_s"):
+        if getattr(recipe.imaging, field) == getattr(Imaging(), field):
+            del data["imaging"][field]
+    return data
 
 
 def _digests(recipe: Scenario) -> dict[str, str]:

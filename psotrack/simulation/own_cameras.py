@@ -200,17 +200,15 @@ class _OwnRenderer:
         scenario = msgspec.structs.replace(work.scene.scenario, fps=one.fps)
         own = make_rig({one.name: lens})
         self.scene = replace(work.scene, scenario=scenario, rig=own, start_s=one.start_s)
-        self.renderer = CameraRenderer(self.scene, 0)
+        self.renderer = CameraRenderer(self.scene, 0, stream=work.index)
         width, height = (int(side) for side in lens.image_size_wh)
         self.size_wh = (width, height)
-        # The renderer's own sensor has the random numbers of the first camera of a rig.
         imaging, seed, shape = scenario.imaging, work.scene.seed, (height, width)
-        self.sensor = Sensor(imaging, seed, work.index, shape)
         self.board_sensor = Sensor(imaging, seed, _BOARD_STREAM + work.index, shape)
 
     def flight(self, frame: int) -> UInt8[np.ndarray, "height width 3"]:
         """Image of a frame of the flight."""
-        return self.sensor.expose(self.renderer.clean_frame(frame), frame, self.scene.time_s(frame))
+        return self.renderer.frame(frame)
 
     def board(self, number: int, board: PosedBoard) -> UInt8[np.ndarray, "height width 3"]:
         """Image of the room with the board in one place."""

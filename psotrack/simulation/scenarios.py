@@ -310,6 +310,9 @@ class Imaging(_Record, frozen=True, kw_only=True):
         contact_shadows: whether ambient light is weaker under drones that are close to the floor.
         reflections: share of light that the floor reflects at normal incidence; the share grows towards grazing angles.
         exposure_drift: standard deviation of the slow relative change of brightness, per camera.
+        exposure: smallest and largest factor of the light of the static cameras' images, between which an automatic
+            exposure swings, per camera; equal factors are no swing.
+        exposure_period_s: time of one swing of the automatic exposure.
         white_balance_drift: standard deviation of the slow relative change of the colour channels, per camera.
         flicker: relative drop of the lamps' light between two half waves of the mains.
         mains_hz: frequency of the mains; the lamps flicker at twice this frequency.
@@ -327,12 +330,38 @@ class Imaging(_Record, frozen=True, kw_only=True):
     contact_shadows: bool = True
     reflections: Share = 0.04
     exposure_drift: Annotated[float, msgspec.Meta(ge=0, le=0.3)] = 0.01
+    exposure: tuple[Positive, Positive] = (1.0, 1.0)
+    exposure_period_s: Positive = 7.0
     white_balance_drift: Annotated[float, msgspec.Meta(ge=0, le=0.3)] = 0.005
     flicker: Share = 0.1
     mains_hz: Positive = 50.02
     read_noise: GreyLevels = 1.0
     shot_noise: GreyLevels = 3.0
     jpeg_quality: Annotated[int, msgspec.Meta(ge=0, le=100)] = 0
+
+
+class Surroundings(_Record, frozen=True, kw_only=True):
+    """What changes around the drones in the videos of static cameras. Each change is off at 0.
+
+    Every camera has a lamp, screen, leaves and person of its own, at places that the seed chooses. They are drawn in
+    the image and not in the hall: they are behind all drones, cameras do not see the same ones, and on-board cameras
+    see none.
+
+    Attributes:
+        lamp_drop: share of the light that half of each image loses while a lamp is off, drones included.
+        lamp_s: times at which the lamp goes off, on, off and so on; equal in all cameras.
+        screen: share of each image that a bright screen with moving content covers.
+        foliage: share of each image that swaying leaves cover: a plant in a room (0.03), or trees (0.3).
+        person: height of a person, as a share of the image's height, who walks in and out at the side of each image.
+        person_period_s: time from one entrance of the person to the next.
+    """
+
+    lamp_drop: Share = 0.0
+    lamp_s: tuple[NotNegative, ...] = (3.2,)
+    screen: Annotated[float, msgspec.Meta(ge=0, le=0.25)] = 0.0
+    foliage: Annotated[float, msgspec.Meta(ge=0, le=0.9)] = 0.0
+    person: Share = 0.0
+    person_period_s: Positive = 8.0
 
 
 class SimulatedDetector(_Record, frozen=True, kw_only=True):
@@ -415,6 +444,7 @@ class Scenario(_Record, frozen=True, kw_only=True):
         onboard: on-board camera of each drone; None: no on-board cameras.
         camera_spread: random differences between the cameras and their records.
         imaging: effects of camera and light.
+        surroundings: what changes around the drones.
         detector: errors of the simulated detector.
         variation: changes that a seed makes to the flights.
     """
@@ -432,8 +462,22 @@ class Scenario(_Record, frozen=True, kw_only=True):
     onboard: OnboardCamera | None = None
     camera_spread: CameraSpread = CameraSpread()
     imaging: Imaging = Imaging()
+    surroundings: Surroundings = Surroundings()
     detector: SimulatedDetector = SimulatedDetector()
     variation: Variation = Variation()
+
+
+#: Changes of a scenario that make its surroundings restless: an automatic exposure that changes grey levels by 15 % to
+#: both sides (a factor g of grey levels is g^2.2 of light), a lamp that goes off and takes 12 % of the grey levels of
+#: half of each image, a screen and a plant.
+RESTLESS: Mapping[str, Any] = {
+    "imaging.exposure": [0.7, 1.36],
+    "imaging.exposure_period_s": 7.0,
+    "surroundings.lamp_drop": 0.245,
+    "surroundings.lamp_s": [3.2],
+    "surroundings.screen": 0.025,
+    "surroundings.foliage": 0.025,
+}
 
 
 def scenario(name: str) -> Scenario:

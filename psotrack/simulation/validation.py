@@ -29,9 +29,11 @@ def check(scenario: Scenario) -> None:
     for index, place in enumerate(camera_places(scenario)):
         _check_camera(scenario, index, place, hall)
     _check_bounds(scenario, hall)
-    _check_exposure(scenario, "imaging.shutter_s", scenario.imaging.shutter_s)
+    _check_shutter(scenario, "imaging.shutter_s", scenario.imaging.shutter_s)
+    _check_exposure(scenario, "imaging.exposure", scenario.imaging.exposure)
     if scenario.onboard:
-        _check_exposure(scenario, "onboard.shutter_s", scenario.onboard.shutter_s)
+        _check_shutter(scenario, "onboard.shutter_s", scenario.onboard.shutter_s)
+        _check_exposure(scenario, "onboard.exposure", scenario.onboard.exposure)
         _check_onboard(scenario, scenario.onboard)
 
 
@@ -126,7 +128,12 @@ def _check_bounds(scenario: Scenario, hall: Hall) -> None:
         )
 
 
-def _check_exposure(scenario: Scenario, field: str, shutter_s: float) -> None:
+def _check_exposure(scenario: Scenario, field: str, exposure: tuple[float, float]) -> None:
+    if exposure[0] > exposure[1]:
+        raise scenario_error(scenario, field, expected="the smaller factor first", found=f"{list(exposure)}")
+
+
+def _check_shutter(scenario: Scenario, field: str, shutter_s: float) -> None:
     if shutter_s > 1 / scenario.fps:
         expected = f"at most {1 / scenario.fps:g} s, the time between two frames"
         raise scenario_error(scenario, field, expected=expected, found=f"{shutter_s:g}")
@@ -146,13 +153,6 @@ def _check_onboard(scenario: Scenario, camera: OnboardCamera) -> None:
         expected = f"{', '.join(map(str, PINHOLE_COEFFICIENTS))} coefficients"
         raise scenario_error(
             scenario, "onboard.distortion", expected=expected, found=f"{len(camera.distortion)}"
-        )
-    if camera.exposure[0] > camera.exposure[1]:
-        raise scenario_error(
-            scenario,
-            "onboard.exposure",
-            expected="the smaller factor first",
-            found=f"{list(camera.exposure)}",
         )
     if max(camera.fov_deg) >= 180:
         raise scenario_error(

@@ -39,12 +39,14 @@ class LensImage:
         face: (height, width), index of the camera that shows what a pixel of the lens sees; -1 where it sees nothing.
         at_px: (height, width, 2), column and row in the image of this camera.
         used: for each camera (height, width), True at the pixels that are in the image of the lens.
+        shows_px: for each camera (height, width, 2), column and row of the lens's image that a pixel shows.
     """
 
     faces: tuple[Pinhole, ...]
     face: Int[np.ndarray, "height width"]
     at_px: Float[np.ndarray, "height width 2"]
     used: tuple[Bool[np.ndarray, "_ _"], ...]
+    shows_px: tuple[Float[np.ndarray, "_ _ 2"], ...]
 
     def assemble(
         self, images: Sequence[Shaped[np.ndarray, "..."]], interpolation: int = cv2.INTER_CUBIC
@@ -73,6 +75,7 @@ def lens_image(camera: Camera) -> LensImage:
     nearest = np.where(is_shown, _nearest_face(rays, turns), -1)
     faces: list[Pinhole] = []
     used: list[Bool[np.ndarray, "_ _"]] = []
+    shows_px: list[Float[np.ndarray, "_ _ 2"]] = []
     face, at_px = np.full((height, width), -1), np.zeros((height, width, 2), np.float32)
     for index, turn in enumerate(turns):
         seen = nearest == index
@@ -87,8 +90,9 @@ def lens_image(camera: Camera) -> LensImage:
         back = own @ K_inverse.T @ turn
         back_px = to_pixels(camera, back)
         inside = (back_px >= -0.5) & (back_px <= camera.image_size_wh - 0.5)
+        shows_px.append(np.nan_to_num(back_px, nan=-1e6).astype(np.float32))
         used.append(has_image(camera, back) & inside.all(axis=-1) & (_nearest_face(back, turns) == index))
-    return LensImage(tuple(faces), face, at_px, tuple(used))
+    return LensImage(tuple(faces), face, at_px, tuple(used), tuple(shows_px))
 
 
 def _nearest_face(

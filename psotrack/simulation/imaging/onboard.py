@@ -59,11 +59,14 @@ class OnboardRenderer:
         self.drone_index = drone_index
         self.onboard = camera_record(scene)
         self.K, (self.width, self.height) = intrinsics(scene)
-        imaging = msgspec.structs.replace(scene.scenario.imaging, shutter_s=self.onboard.shutter_s)
+        imaging = msgspec.structs.replace(
+            scene.scenario.imaging,
+            shutter_s=self.onboard.shutter_s,
+            exposure=self.onboard.exposure,
+            exposure_period_s=self.onboard.exposure_period_s,
+        )
         stream = sensor.ONBOARD_STREAM + drone_index
         self.sensor = sensor.Sensor(imaging, scene.seed, stream, (self.height, self.width))
-        seed = [scene.seed, stream, 0, sensor.FOR_EXPOSURE]
-        self._exposure_rad = float(np.random.default_rng(seed).uniform(0, 2 * np.pi))
         self._lens_strips = LensStrips(lens(scene))
         self._imaging = imaging
         self._floor = FloorLight(scene)
@@ -75,14 +78,7 @@ class OnboardRenderer:
 
     def frame(self, frame: int) -> Image:
         """(height, width, 3), BGR image of a frame from the sensor, before the codec."""
-        time_s = self.scene.time_s(frame)
-        return self.sensor.expose(self.clean_frame(frame), frame, time_s, self.exposure(time_s))
-
-    def exposure(self, time_s: float) -> float:
-        """Factor of the light by the automatic exposure, which swings between its limits."""
-        low, high = np.log(self.onboard.exposure)
-        swing = np.sin(2 * np.pi * time_s / self.onboard.exposure_period_s + self._exposure_rad)
-        return float(np.exp((low + high) / 2 + (high - low) / 2 * swing))
+        return self.sensor.expose(self.clean_frame(frame), frame, self.scene.time_s(frame))
 
     def clean_frame(self, frame: int) -> Image:
         """(height, width, 3), BGR image of a frame without the effects of the sensor."""

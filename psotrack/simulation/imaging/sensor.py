@@ -1,4 +1,4 @@
-"""The sensor of a camera: gamma, drift of the gains, flicker of the lamps, noise, JPEG.
+"""The sensor of a camera: gamma, drift of the gains, automatic exposure, flicker of the lamps, noise, JPEG.
 
 The noise is drawn once per camera as a tile that is used with a random offset in each frame, so that a pixel's noise
 differs from frame to frame without new random numbers for each pixel. The randomness of a frame depends only on (seed,
@@ -28,7 +28,7 @@ _TILE_UNIT = 32
 #: Mixture of independent noises in the channels, which correlates the channels.
 _CHANNEL_MIX = np.array([[0.8, 0.2, 0.1], [0.2, 0.8, 0.2], [0.1, 0.2, 0.8]], np.float32)
 #: Last number of each random seed. It is never 0, because NumPy ignores zeros at the end of a seed.
-_FOR_TILE, _FOR_FRAME, _FOR_DRIFT, _FOR_MAINS, FOR_EXPOSURE = 1, 2, 3, 4, 5
+_FOR_TILE, _FOR_FRAME, _FOR_DRIFT, _FOR_MAINS, _FOR_EXPOSURE, FOR_SCENERY = 1, 2, 3, 4, 5, 6
 
 #: Steps of light in the table of grey levels; enough for the darkest grey levels, which cover a small range of light.
 _DISPLAY_STEPS = 65536
@@ -103,7 +103,8 @@ class Sensor:
     def __init__(self, imaging: Imaging, seed: int, stream: int, shape: tuple[int, int]) -> None:
         self._imaging, self._seed, self._stream, self._shape = imaging, seed, stream, shape
         rng = self._rng(_FOR_DRIFT)
-        self._exposure, self._white = _drift(rng, 1), _drift(rng, 3)
+        self._drift, self._white = _drift(rng, 1), _drift(rng, 3)
+        self._exposure_rad = float(self._rng(_FOR_EXPOSURE).uniform(0, 2 * np.pi))
         # The lamps are the same for all cameras.
         self._mains_rad = float(np.random.default_rng([seed, 0, 0, _FOR_MAINS]).uniform(0, 2 * np.pi))
         sigma = np.sqrt(imaging.read_noise**2 + imaging.shot_noise**2 * np.arange(256) / 255)
@@ -112,22 +113,29 @@ class Sensor:
         self._tile = _noise_tile(shape, self._rng(_FOR_TILE)) if sigma[-1] else None
 
     def gains(self, time_s: float) -> Float[np.ndarray, "3"]:
-        """(3,), BGR, factors of linear light at a time by drift and flicker."""
+        """(3,), BGR, factors of linear light at a time by drift, automatic exposure and flicker."""
         imaging = self._imaging
         white = self._white.at(time_s)
         # The common part of the channels is brightness and is removed, which leaves 2/3 of the variance.
         white = np.sqrt(1.5) * (white - white.mean())
-        drift = (1 + imaging.exposure_drift * self._exposure.at(time_s)) * (
+        drift = (1 + imaging.exposure_drift * self._drift.at(time_s)) * (
             1 + imaging.white_balance_drift * white
         )
-        return np.maximum(drift, 0) * flicker_gain(imaging, self._mains_rad, time_s)
+        lamps = flicker_gain(imaging, self._mains_rad, time_s)
+        return np.maximum(drift, 0) * lamps * self.exposure(time_s)
+
+    def exposure(self, time_s: float) -> float:
+        """Factor of the light by the automatic exposure, which swings between its limits."""
+        low, high = np.log(self._imaging.exposure)
+        swing = np.sin(2 * np.pi * time_s / self._imaging.exposure_period_s + self._exposure_rad)
+        return float(np.exp((low + high) / 2 + (high - low) / 2 * swing))
 
     def expose(
-        self, image: UInt8[np.ndarray, "height width 3"], frame: int, time_s: float, light: float = 1.0
+        self, image: UInt8[np.ndarray, "height width 3"], frame: int, time_s: float
     ) -> UInt8[np.ndarray, "height width 3"]:
-        """Image with the gains at a time, the noise of one frame, and JPEG compression; `light` is one more gain."""
+        """Image with the gains at a time, the noise of one frame, and JPEG compression."""
         # A factor g of light is a factor g^(1 / gamma) of grey levels.
-        levels = np.arange(256)[:, None] * (light * self.gains(time_s)) ** (1 / GAMMA)
+        levels = np.arange(256)[:, None] * self.gains(time_s) ** (1 / GAMMA)
         exposed = cv2.LUT(image, np.clip(levels.round(), 0, 255).astype(np.uint8)[None])
         if self._tile is not None:
             y, x = self._rng(_FOR_FRAME, frame).integers(0, _TILE_MARGIN_PX + 1, 2)
