@@ -383,7 +383,7 @@ def test_a_field_of_view_replaces_a_calibration_file(room, tmp_path):
     np.testing.assert_array_equal(fov.position_m, file.position_m)
 
 
-def test_a_stream_gives_the_same_path_as_its_file(room, tmp_path):
+def test_a_stream_gives_the_path_of_its_file(room, tmp_path):
     """FFmpeg opens a file by its address; its times are the timestamps in the file."""
     for name, source in (("file", room.video), ("stream", f"file://{room.video}")):
         # Without a line time, a file is searched for a rolling shutter, and a stream is not.
@@ -392,7 +392,9 @@ def test_a_stream_gives_the_same_path_as_its_file(room, tmp_path):
     (file, _), (stream, name) = (read_camera_path(tmp_path / f"{name}.csv") for name in ("file", "stream"))
     assert name == "camera"
     np.testing.assert_allclose(stream.time_s, file.time_s, atol=1e-6)
-    np.testing.assert_array_equal(stream.position_m, file.position_m)
+    # A stream is not searched for the correlation of corners either: weights differ, and its covariances are larger.
+    np.testing.assert_allclose(stream.position_m, file.position_m, atol=1e-3)
+    assert np.trace(stream.covariance.mean(axis=0)) > np.trace(file.covariance.mean(axis=0))
 
 
 class Capture:

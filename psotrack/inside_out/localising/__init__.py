@@ -4,7 +4,7 @@ In: a `FrameSource`, a `MarkerMap`, the lens and `LocaliseSettings`. Out: a `Loc
 frames' own poses, and the time that each stage took. Other rooms use `localise_video`; `localise_frames` does the same
 for markers that are detected already, and `pose_row` makes a frame of a path from one pose.
 
-Imports go in this order: `records`, `frame_poses`, `map_evidence`, `video`.
+Imports go in this order: `records`, `corner_noise`, `frame_poses`, `map_evidence`, `video`.
 """
 
 from psotrack.inside_out.line_time import LineTime, estimate_line_time

@@ -17,6 +17,7 @@ from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
 from psotrack.inside_out.filtering.path_rows import PoseRow, join_rows
 from psotrack.inside_out.frames import Frame, FrameSource, map_ahead, read_ahead
 from psotrack.inside_out.line_time import Detected, LineTime, estimate_line_time
+from psotrack.inside_out.localising.corner_noise import estimate_centre_scale
 from psotrack.inside_out.localising.frame_poses import localise_frames
 from psotrack.inside_out.localising.map_evidence import (
     are_few,
@@ -48,9 +49,10 @@ def localise_video(
 
     A thread decodes frames and converts them to grey, and others detect markers in several frames at once. Markers that
     are not in the map are not detected. In a recording, the markers of all frames are found first, and show whether the
-    shutter rolls (`line_time`). Where two poses fit a frame's markers about equally well, the filter's prediction
-    decides; then the filter uses the pose or gates it. Markers that disagree with the others over a recording are left
-    out, and the poses are estimated once more without them.
+    shutter rolls (`line_time`) and how the errors of a marker's corners are correlated (`corner_noise`). Where two
+    poses fit a frame's markers about equally well, the filter's prediction decides; then the filter uses the pose or
+    gates it. Markers that disagree with the others over a recording are left out, and the poses are estimated once more
+    without them.
 
     Args:
         source: frames of the camera.
@@ -69,7 +71,7 @@ def localise_video(
         SettingsError: there is no dictionary of this name, or it has none of the map's markers.
     """
     settings = (settings or LocaliseSettings()).within(source.num_frames)
-    given = settings.shutter
+    given = settings
     _check_size(source, lens)
     detector = MarkerDetector(settings.dictionary, lens, ids=marker_map.ids.tolist())
     seconds = dict.fromkeys(STAGES, 0.0)
@@ -87,7 +89,7 @@ def localise_video(
             else:
                 room = marker_map
             if isinstance(detected, list):
-                line_time, settings = _with_shutter(detected, room, lens, settings, seconds)
+                line_time, settings = _learned(detected, room, lens, settings, seconds)
             for raw, row in localise_frames(detected, room, lens, settings, seconds):
                 raw_rows.append(raw)
                 rows.append(row)
@@ -102,9 +104,9 @@ def localise_video(
         wrong = wrong_markers(detected, room, lens, settings.pose)
         if wrong and are_few(wrong, detected):
             right = list(without_markers(detected, wrong, settings.pose))
-            pose = replace(settings.pose, min_markers=least_markers(settings.pose))
-            again = replace(settings, pose=pose, shutter=given)
-            line_time, settings = _with_shutter(right, room, lens, again, seconds)
+            pose = replace(given.pose, min_markers=least_markers(given.pose))
+            again = replace(given, pose=pose)
+            line_time, settings = _learned(right, room, lens, again, seconds)
             both = list(localise_frames(right, room, lens, settings, seconds))
             raw_rows, rows = [raw for raw, _ in both], [row for _, row in both]
     wall_s = time.perf_counter() - began_s
@@ -149,18 +151,21 @@ def _completed(
     return completed.marker_map, completed.left_out, frames
 
 
-def _with_shutter(
+def _learned(
     detected: list[Detected],
     marker_map: MarkerMap,
     lens: Camera,
     settings: LocaliseSettings,
     seconds: dict[str, float],
 ) -> tuple[LineTime | None, LocaliseSettings]:
-    """The line time that frames show, and settings with the shutter to use."""
+    """The line time that frames show, and settings with the shutter and the correlation of corners to use."""
     began_s = time.perf_counter()
     line_time = estimate_line_time(detected, marker_map, lens, settings.pose)
     if line_time is not None:
         settings = replace(settings, shutter=line_time.shutter(settings.shutter))
+    if settings.pose.centre_scale is None:
+        scale = estimate_centre_scale(detected, marker_map, lens, settings.pose, settings.shutter)
+        settings = replace(settings, pose=replace(settings.pose, centre_scale=scale))
     seconds["locate"] += time.perf_counter() - began_s
     return line_time, settings
 

@@ -2,8 +2,10 @@
 
 The error of a corner has four parts: its own error; the error of its marker's place; an inset, because the white around
 a black marker shines into the marker, and each corner is found too far inside; and the error of the focal length. Inset
-and focal length are one number each for all corners of a frame. With residuals r, derivatives J by the pose, the inset
-and the focal length, and derivatives S by a marker's place, the cost is
+and focal length are one number each for all corners of a frame. The own errors of a marker's corners are correlated,
+because each edge of the marker moves two corners: their mean is more accurate than the mean of independent errors.
+`centre_scale` is the ratio of the two deviations (`localising.corner_noise`). With residuals r, derivatives J by the
+pose, the inset and the focal length, and derivatives S by a marker's place, the cost is
 
     Σ |r - J x - S d|² / own² + Σ |d|² / place² + (inset / its deviation)² + (focal length / its deviation)².
 
@@ -24,6 +26,7 @@ from jaxtyping import Bool, Float
 from psotrack.calibration import reproject
 from psotrack.estimation import NormalEquations, covariance_from_information
 from psotrack.geometry import NEAR_M, Camera
+from psotrack.inside_out.pose.records import CentreResiduals
 from psotrack.inside_out.pose.row_motion import RowMotion, UnsureRows, at_rows, slopes_by_motion
 
 #: Standard deviation of the inset, px.
@@ -51,6 +54,8 @@ class SeenCorners:
         place_m: stated standard deviation of a marker's place along each axis, metres.
         map_share: share of the variance of a marker's place that comes from the map and is the same in every frame.
         focal_error: stated standard deviation of the focal length, as a share of the focal length.
+        centre_scale: deviation of the mean error of a marker's corners, as a multiple of the deviation that it would
+            have if the errors of the corners were independent.
         rows: when the corners were exposed, and the motion that is expected; None of a global shutter.
         unsure: by how much these times may be wrong; None if the line time is exact.
     """
@@ -63,6 +68,7 @@ class SeenCorners:
     place_m: float
     map_share: float
     focal_error: float
+    centre_scale: float = 1.0
     rows: RowMotion | None = None
     unsure: UnsureRows | None = None
 
@@ -242,7 +248,14 @@ def seen_markers(
     inward = _unit(to_next - to_next[:, [3, 0, 1, 2]])
     off_m = float(np.hypot(place_m, map_error_m))
     return SeenCorners(
-        corners_px, corners_m, inward, lens, noise_px, off_m, (map_error_m / off_m) ** 2, focal_error
+        corners_px,
+        corners_m,
+        inward,
+        lens,
+        noise_px,
+        off_m,
+        (map_error_m / off_m) ** 2,
+        focal_error,
     )
 
 
@@ -288,11 +301,62 @@ def equations(
     return rows.reshape(*shape, 2, -1), depth_m.reshape(shape)
 
 
-def summed(rows: Float[np.ndarray, "markers 4 2 columns"], fits: Bool[np.ndarray, "markers 4"]) -> Sums:
-    """Sum the equations of the corners that fit."""
+def summed(
+    rows: Float[np.ndarray, "markers 4 2 columns"],
+    fits: Bool[np.ndarray, "markers 4"],
+    centre_scale: float = 1.0,
+) -> Sums:
+    """Sum the equations of the corners that fit.
+
+    Each marker's mean equation is divided by `centre_scale` first: then all errors have the variance of a corner's own
+    error, and none are correlated.
+    """
+    if centre_scale != 1:
+        mean = _sums_of_markers(rows, fits) / np.maximum(fits.sum(axis=1), 1)[:, None, None]
+        rows = rows + (1 / centre_scale - 1) * mean[:, None]
     chosen = (rows * fits[..., None, None]).reshape(-1, 8, rows.shape[-1])
     transposed = chosen.swapaxes(1, 2)
     return Sums((transposed @ chosen).sum(axis=0), transposed[:, :3] @ chosen, 2 * int(fits.sum()))
+
+
+def centre_residuals(
+    rows: Float[np.ndarray, "markers 4 2 columns"],
+    off_px: Float[np.ndarray, "markers 4 2"],
+    fits: Bool[np.ndarray, "markers 4"],
+    solution: Solution,
+    noise: Noise,
+    centre_scale: float,
+) -> CentreResiduals:
+    """Compare the mean residuals of the markers with their covariance.
+
+    Args:
+        rows: (markers, 4, 2, unknowns + 1), the equations.
+        off_px: (markers, 4, 2), residuals after the step.
+        fits: (markers, 4), True for the corners that were used.
+        solution: the step.
+        noise: variances of the errors.
+        centre_scale: as in `SeenCorners`.
+    """
+    used, count = fits.any(axis=1), fits.sum(axis=1)
+    # Sums over corners divided by the root of their number are coordinates along unit vectors.
+    root = np.sqrt(np.maximum(count, 1))[:, None]
+    mean_px = _sums_of_markers(off_px, fits)[used] / root[used]
+    slopes = _sums_of_markers(rows[..., :-1], fits)[used] / root[used, :, None]
+    own_px2 = 2 * int(used.sum()) * centre_scale**2 * noise.own_px2
+    places_px2 = noise.place_m2 * float((slopes[..., :3] ** 2).sum())
+    # The residuals of a generalised least squares fit have the covariance of the errors less that of the fit.
+    fitted_px2 = float(np.einsum("mai,ij,maj->", slopes, solution.covariance, slopes))
+    return CentreResiduals(
+        float((mean_px**2).sum()) / noise.own_px2,
+        max(own_px2 + places_px2 - fitted_px2, 0.0) / noise.own_px2,
+    )
+
+
+def _sums_of_markers(
+    values: Float[np.ndarray, "markers 4 *rest"], fits: Bool[np.ndarray, "markers 4"]
+) -> Float[np.ndarray, "markers *rest"]:
+    """Sums over the fitting corners of each marker."""
+    return np.einsum("mc...,mc->m...", values, fits.astype(float))
 
 
 def _unit(vectors: Float[np.ndarray, "markers 4 2"]) -> Float[np.ndarray, "markers 4 2"]:

@@ -95,7 +95,7 @@ def estimate_pose(
         settings.map_error_m,
         settings.focal_error,
     )
-    corners = replace(corners, rows=rows, unsure=unsure)
+    corners = replace(corners, rows=rows, unsure=unsure, centre_scale=settings.centre_scale or 1.0)
     poses = _likely_poses(corners, rays)
     # One or two of many markers may agree by chance, because every single marker has a pose that explains this marker.
     poses = [pose for pose in poses if pose.used.sum() >= min(_ENOUGH_MARKERS, len(corners_px) / 2)]
@@ -113,6 +113,7 @@ def estimate_pose(
         float(odds / (1 + odds)),
         best.common,
         _chance(corners, best),
+        best.centres,
         best.motion,
         best.by_line_time,
     )

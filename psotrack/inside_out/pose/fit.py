@@ -25,12 +25,14 @@ from psotrack.inside_out.pose.equations import (
     SeenCorners,
     Solution,
     Sums,
+    centre_residuals,
     equations,
     log_prior,
     summed,
     with_prior,
 )
 from psotrack.inside_out.pose.frame_motion import frame_motion, line_time_effects
+from psotrack.inside_out.pose.records import CentreResiduals
 
 #: Probability that a good corner, or the mean of a good marker, is rejected as an outlier.
 FALSE_ALARM = 1e-3
@@ -69,6 +71,7 @@ class Fit:
         fits: (markers, 4), True for corners that fit the pose.
         reprojection_px: root mean square distance of these corners in the image.
         log_evidence: logarithm of the probability density of all corners, integrated over poses near this pose.
+        centres: mean residuals of the markers, observed and expected.
         motion: what a frame of a rolling shutter says about pose and motion together; None of a global shutter.
         by_line_time: (6,), change of the pose by an error of the line time of one standard deviation; None if the line
             time is exact.
@@ -81,6 +84,7 @@ class Fit:
     fits: Bool[np.ndarray, "markers 4"]
     reprojection_px: float
     log_evidence: float
+    centres: CentreResiduals
     motion: FrameMotion | None = None
     by_line_time: Float[np.ndarray, "6"] | None = None
 
@@ -229,7 +233,7 @@ class _NoiseFit:
         pose, fits, noise = self.pose, self.fits, self.noise
         rows, depth_m = equations(self.seen, pose.position_m, pose.R_world_cam, pose.extra)
         is_ahead = depth_m > NEAR_M
-        sums = summed(rows, fits & is_ahead)
+        sums = summed(rows, fits & is_ahead, self.seen.centre_scale)
         solution = sums.solved(noise, self.seen.prior_information, pose.extra - self.seen.expected_extra)
         if solution is None:
             raise np.linalg.LinAlgError("expected markers that determine the pose")
@@ -237,7 +241,15 @@ class _NoiseFit:
         still_fits = fits & is_ahead
         if self.number > 0:
             # Corners are judged by the noise that the residuals show; in the first step only the stated noise is known.
-            still_fits = _explained(off_px, rows[..., :-1], is_ahead, fits, solution.covariance, noise)
+            still_fits = _explained(
+                off_px,
+                rows[..., :-1],
+                is_ahead,
+                fits,
+                solution.covariance,
+                noise,
+                self.seen.centre_scale,
+            )
         if self.number >= _NO_RETURN:
             # The gates depend on the fit and the fit on the gates. A corner that alternates stays out.
             still_fits &= fits
@@ -291,6 +303,7 @@ def _fitted(seen: SeenCorners, pose: _Pose, last: _LastStep, noise: Noise) -> Fi
         fits,
         float(np.sqrt(np.mean(distance_px**2))),
         _log_evidence(off_px[fits], fits.size, covariance, seen.noise_px) + log_prior(seen, pose.extra),
+        centre_residuals(last.rows, off_px, fits, solution, widened, seen.centre_scale),
         motion,
         by_line_time,
     )
@@ -303,6 +316,7 @@ def _explained(
     fits: Bool[np.ndarray, "markers 4"],
     covariance: Float[np.ndarray, "unknowns unknowns"],
     noise: Noise,
+    centre_scale: float,
 ) -> Bool[np.ndarray, "markers 4"]:
     """(markers, 4), True if the studentised residuals of the corner and of its marker's mean are in the gate."""
     used = np.any(fits, axis=1)
@@ -310,7 +324,8 @@ def _explained(
     count = np.maximum(good.sum(axis=1), 1)
     mean_px = (off_px * good[..., None]).sum(axis=1) / count[:, None]
     mean_slopes = (slopes * good[..., None, None]).sum(axis=1) / count[:, None, None]
-    within = _within(mean_px, mean_slopes, count, covariance, noise, used)
+    # Where means are more accurate than those of independent errors, the gate stays as wide as for independent errors.
+    within = _within(mean_px, mean_slopes, count / max(centre_scale, 1.0) ** 2, covariance, noise, used)
     kept = within & (good.sum(axis=1) >= MIN_CORNERS)
     if used.sum() == 1:
         # The corners of a single marker give two equations more than unknowns, too few to find a bad corner.

@@ -77,7 +77,9 @@ def line_time_effects(
     effects = []
     for part in range(POSE_SIZE):
         moved[..., -1] = seen.unsure.error_s[..., None] * rows[..., part]
-        solution: Solution | None = summed(moved, fits).solved(noise, prior_information, none)
+        solution: Solution | None = summed(moved, fits, seen.centre_scale).solved(
+            noise, prior_information, none
+        )
         if solution is None:
             return None
         effects.append(solution.step)

@@ -25,6 +25,8 @@ class PoseSettings:
             every frame.
         focal_error: standard deviation of the focal length, as a share of the focal length; the same error in every
             frame.
+        centre_scale: deviation of the mean error of a marker's corners, as a multiple of the deviation that it would
+            have if the errors of the corners were independent; None is estimated from a recording, and is 1 otherwise.
     """
 
     min_markers: int = 4
@@ -32,10 +34,13 @@ class PoseSettings:
     place_m: float = 0.0001
     map_error_m: float = 0.0
     focal_error: float = 0.0
+    centre_scale: float | None = None
 
     def __post_init__(self) -> None:
         check_positive("noise_px", self.noise_px)
         check_positive("place_m", self.place_m)
+        if self.centre_scale is not None:
+            check_positive("centre_scale", self.centre_scale)
         if self.min_markers < 1:
             raise SettingsError("min_markers", expected="at least 1", found=f"{self.min_markers}")
         for name in ("map_error_m", "focal_error"):
@@ -88,6 +93,19 @@ class ExpectedPose:
 
 
 @dataclass(frozen=True)
+class CentreResiduals:
+    """Mean residuals of the markers of one frame, in units of the variance of a corner's own error.
+
+    Attributes:
+        observed: sum of the squares of the markers' mean residuals, each times the number of the marker's corners.
+        expected: the sum that the covariances of errors and fit let expect.
+    """
+
+    observed: float
+    expected: float
+
+
+@dataclass(frozen=True)
 class MarkerPose:
     """Pose of a camera from the markers in one frame, with its uncertainty.
 
@@ -103,6 +121,7 @@ class MarkerPose:
             to all frames: one column per axis of each marker's position in the map, and one for the focal length, each
             for an error of one standard deviation.
         chance: upper bound on the probability that the used markers agree by chance although all ids are wrong.
+        centres: mean residuals of the markers, observed and expected; None if unknown.
         motion: of a rolling shutter, what the frame says about pose and motion; None of a global shutter. Columns of
             its `common` are those of `common`, and one for the line time if `by_line_time` is not None.
         by_line_time: (6,), change of the pose by an error of the line time of one standard deviation; None if the line
@@ -117,5 +136,6 @@ class MarkerPose:
     ambiguity: float
     common: Float[np.ndarray, "6 errors"]
     chance: float
+    centres: CentreResiduals | None = None
     motion: FrameMotion | None = None
     by_line_time: Float[np.ndarray, "6"] | None = None
