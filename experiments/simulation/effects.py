@@ -187,6 +187,7 @@ PAIRS = (
             ("screen", ("no screen", "screen = 0.025"), Surroundings(screen=0.025), 1.0),
             ("foliage", ("no foliage", "foliage = 0.025"), Surroundings(foliage=0.025), 1.0),
             ("person", ("nobody", "person = 0.5"), Surroundings(person=0.5), 4.0),
+            ("clouds", ("no clouds", "clouds = 0.6"), Surroundings(clouds=0.6), 4.0),
         )
     ),
 )

@@ -345,7 +345,7 @@ class Surroundings(_Record, frozen=True, kw_only=True):
 
     Every camera has a lamp, screen, leaves and person of its own, at places that the seed chooses. They are drawn in
     the image and not in the hall: they are behind all drones, cameras do not see the same ones, and on-board cameras
-    see none.
+    and the reflections in the floor show none of it.
 
     Attributes:
         lamp_drop: share of the light that half of each image loses while a lamp is off, drones included.
@@ -354,6 +354,8 @@ class Surroundings(_Record, frozen=True, kw_only=True):
         foliage: share of each image that swaying leaves cover: a plant in a room (0.03), or trees (0.3).
         person: height of a person, as a share of the image's height, who walks in and out at the side of each image.
         person_period_s: time from one entrance of the person to the next.
+        clouds: contrast of clouds that drift and change in a blue sky, which takes the place of walls and ceiling, as
+            on a roof; 1 is white clouds, 0 is no sky. All cameras see the same clouds.
     """
 
     lamp_drop: Share = 0.0
@@ -362,6 +364,7 @@ class Surroundings(_Record, frozen=True, kw_only=True):
     foliage: Annotated[float, msgspec.Meta(ge=0, le=0.9)] = 0.0
     person: Share = 0.0
     person_period_s: Positive = 8.0
+    clouds: Share = 0.0
 
 
 class SimulatedDetector(_Record, frozen=True, kw_only=True):

@@ -60,11 +60,13 @@ class Room:
 
     Attributes:
         surfaces: all surfaces; the first is the floor.
+        in_shell: whether each surface is a wall, the ceiling, or hangs there: a marker or a lamp.
         panels: lamp panels.
         marker_corners_m: (4, 3) by marker id: top left, top right, bottom right, bottom left of the black square.
     """
 
     surfaces: tuple[Surface, ...]
+    in_shell: tuple[bool, ...]
     panels: Lamps
     marker_corners_m: Mapping[int, Float[np.ndarray, "4 3"]]
 
@@ -113,6 +115,7 @@ def _build(hall: Hall, with_markers: bool, texel_m: float) -> Room:
         *(side for box in hall.boxes for side in _sides(box, 2 * texel_m, rng)),
         *(_underside(box, 2 * texel_m, rng) for box in hall.boxes if box.lower_m[2] > 0),
     ]
+    in_shell = [1 <= index <= 1 + len(walls) for index in range(len(surfaces))]
     marker_corners: dict[int, Float[np.ndarray, "4 3"]] = {}
     if with_markers:
         for marker, (corner, along) in enumerate(_marker_places(surfaces[2:6], hall), start=1):
@@ -121,7 +124,9 @@ def _build(hall: Hall, with_markers: bool, texel_m: float) -> Room:
     boxes_m = np.array([(box.lower_m, box.upper_m) for box in hall.boxes])
     lit = [_add_light(surface, hall.light_step_m, panels, boxes_m) for surface in surfaces]
     lamp_surfaces = [_lamp(centre, panels.size_m) for centre in panels.centres_m]
-    return Room((*lit, *lamp_surfaces), panels, marker_corners)
+    every = (*lit, *lamp_surfaces)
+    in_shell += [True] * (len(every) - len(in_shell))
+    return Room(every, tuple(in_shell), panels, marker_corners)
 
 
 def _surface(corner: Vector, along: Vector, down: Vector, texture: textures.Texture) -> Surface:
