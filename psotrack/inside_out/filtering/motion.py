@@ -40,6 +40,7 @@ from psotrack.motion import white_jerk_noise
 #: Size of the error state: position, velocity, acceleration, turn, turn rate (3 each), and the lasting error u (6).
 SIZE = 21
 _TURN, _RATE, _LASTING = slice(9, 12), slice(12, 15), slice(15, 21)
+ACCELERATION = slice(6, 9)
 #: Indices of position and turn in the error state, and of velocity and turn rate.
 POSE, MOTION = np.r_[0:3, 9:12], np.r_[3:6, 12:15]
 
@@ -277,13 +278,25 @@ def correct(motion: Motion, measured: Innovation, right: float = 1.0) -> Motion:
         right: probability that the pose belongs to this motion at all, which is its weight (Bar-Shalom, Daum & Huang,
             The probabilistic data association filter, IEEE Control Systems 29(6), 2009).
     """
-    gain = np.linalg.solve(measured.covariance, measured.shared.swapaxes(1, 2)).swapaxes(1, 2)
+    gain = gain_of(measured)
     change = np.einsum("lij,lj->li", gain, measured.off)
     spread = motion.covariance - right * gain @ measured.shared.swapaxes(1, 2)
     if right < 1:
         spread = spread + right * (1 - right) * change[:, :, None] * change[:, None, :]
     off = motion.common + right * gain @ measured.common
     return retract(replace(motion, covariance=_symmetric(spread), common=off), right * change)
+
+
+def gain_of(measured: Innovation) -> Float[np.ndarray, "levels n m"]:
+    """Gains of the Kalman filter: change of the error state by the innovation."""
+    return np.linalg.solve(measured.covariance, measured.shared.swapaxes(1, 2)).swapaxes(1, 2)
+
+
+def rate_changes(measured: Innovation) -> tuple[Float[np.ndarray, "levels"], Float[np.ndarray, "levels"]]:
+    """(levels,) twice: squared correction of the turn rate by a measured pose, and its expectation."""
+    gain = gain_of(measured)[:, _RATE]
+    observed = (np.einsum("lij,lj->li", gain, measured.off) ** 2).sum(axis=1)
+    return observed, np.einsum("lij,lij->l", gain, measured.shared[:, _RATE])
 
 
 def retract(motion: Motion, change: Float[np.ndarray, "levels n"]) -> Motion:

@@ -17,7 +17,7 @@ from scipy.special import chdtri
 
 from psotrack.errors import InputError
 from psotrack.inside_out.filtering import motion as pose_motion
-from psotrack.inside_out.filtering.motion import MOTION, POSE, Innovation, Levels, Motion
+from psotrack.inside_out.filtering.motion import ACCELERATION, MOTION, POSE, Innovation, Levels, Motion
 from psotrack.inside_out.filtering.records import MeasuredPose, PoseEstimate, PoseFilterParams
 
 #: Standard deviations of the levels for hovering, flying and racing: of acceleration along each axis (m/s2), and of
@@ -45,6 +45,8 @@ _FREEDOM = 4.0
 _MOST_SCALED = 4.0
 _NOISE_MEMORY_S = 5.0
 _NOISE_PRIOR = 12.0
+#: Weight of the levels' expectation of the turn rate's corrections, as a number of squares: those of two frames.
+_WOBBLE_PRIOR = 6.0
 #: Largest squared innovation that scales covariances; at most 4 good poses in 100,000 are larger, and outliers are not
 #: noise.
 _LARGEST_SQUARE = 30.0
@@ -67,6 +69,8 @@ class PoseState:
         p_wrong: upper bound on the probability that the surest of these poses is wrong, from its frame alone.
         noise_observed, noise_expected: weighted sums, over recent poses, of the squares of their noise as observed and
             as their covariances say.
+        wobble_observed, wobble_expected: weighted sums, over recent poses, of the squares by which poses corrected the
+            turn rate, as observed and as the levels let expect.
     """
 
     time_s: float
@@ -79,11 +83,23 @@ class PoseState:
     p_wrong: float
     noise_observed: float = _NOISE_PRIOR
     noise_expected: float = _NOISE_PRIOR
+    wobble_observed: float = _WOBBLE_PRIOR
+    wobble_expected: float = _WOBBLE_PRIOR
 
     @property
     def noise_scale(self) -> float:
         """Factor by which covariances of measured poses are multiplied."""
         return min(max(self.noise_observed / self.noise_expected, 1 / _MOST_SCALED), _MOST_SCALED)
+
+    @property
+    def wobble_density_rad2_s3(self) -> float:
+        """Power spectral density of the angular acceleration about each axis.
+
+        The levels are far apart. A level that expects twice the squared corrections of the turn rate that are observed
+        assumes about twice the density.
+        """
+        of_levels = np.exp(_weights(self) @ np.log(LEVELS.wobble_density_rad2_s3))
+        return float(of_levels * self.wobble_observed / self.wobble_expected)
 
 
 def init(measurement: MeasuredPose) -> PoseState:
@@ -162,6 +178,8 @@ def update(state: PoseState, measurement: MeasuredPose, params: PoseFilterParams
     log_weight = np.maximum(_normalised(log_weight), np.log(_LEAST_WEIGHT))
     kept = float(np.exp(-since_s / _NOISE_MEMORY_S))
     # The part of the squared innovation that is the noise's (maximum likelihood of a scale).
+    corrected, correctable = (_weights(state) @ part for part in pose_motion.rate_changes(innovation))
+    wobbled = float(np.exp(-since_s / _MEMORY_S))
     observed = state.noise_scale * min(float(whitened @ covariance @ whitened), _LARGEST_SQUARE)
     return PoseState(
         time_s=measurement.time_s,
@@ -176,6 +194,10 @@ def update(state: PoseState, measurement: MeasuredPose, params: PoseFilterParams
         noise_expected=_NOISE_PRIOR
         + kept * (state.noise_expected - _NOISE_PRIOR)
         + float((precision * covariance).sum()),
+        wobble_observed=_WOBBLE_PRIOR
+        + wobbled * (state.wobble_observed - _WOBBLE_PRIOR)
+        + right * 3 * float(corrected / correctable),
+        wobble_expected=_WOBBLE_PRIOR + wobbled * (state.wobble_expected - _WOBBLE_PRIOR) + right * 3,
     ), False
 
 
@@ -194,7 +216,15 @@ def estimate(state: PoseState) -> PoseEstimate:
         velocity_m_s=middle.velocity_m_s[0],
         rate_rad_s=middle.rate_rad_s[0],
         motion_covariance=covariance[np.ix_(MOTION, MOTION)],
+        acceleration_m_s2=acceleration_rms(middle, covariance),
+        wobble_density_rad2_s3=state.wobble_density_rad2_s3,
     )
+
+
+def acceleration_rms(motion: Motion, covariance: Float[np.ndarray, "n n"]) -> float:
+    """Root mean square of the acceleration along an axis, by the state and the state's covariance."""
+    variance = np.trace(covariance[ACCELERATION, ACCELERATION])
+    return float(np.sqrt(((motion.acceleration_m_s2[0] ** 2).sum() + variance) / 3))
 
 
 def with_equal_weights(state: PoseState) -> PoseState:

@@ -96,6 +96,8 @@ class PoseEstimate:
         velocity_m_s: (3,), world.
         rate_rad_s: (3,), turn rate about the camera's axes.
         motion_covariance: (6, 6), covariance of velocity and turn rate.
+        acceleration_m_s2: root mean square of the acceleration along an axis.
+        wobble_density_rad2_s3: power spectral density of the angular acceleration about each axis.
     """
 
     position_m: Float[np.ndarray, "3"]
@@ -104,6 +106,8 @@ class PoseEstimate:
     velocity_m_s: Float[np.ndarray, "3"]
     rate_rad_s: Float[np.ndarray, "3"]
     motion_covariance: Float[np.ndarray, "6 6"]
+    acceleration_m_s2: float
+    wobble_density_rad2_s3: float
 
     @property
     def R_world_cam(self) -> Float[np.ndarray, "3 3"]:

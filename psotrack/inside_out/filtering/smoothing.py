@@ -18,7 +18,7 @@ from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.filtering import motion as pose_motion
 from psotrack.inside_out.filtering.manifold import right_jacobian_inverse
 from psotrack.inside_out.filtering.motion import MOTION, POSE, Levels, Motion
-from psotrack.inside_out.filtering.multiple_models import LEVELS, probability_right
+from psotrack.inside_out.filtering.multiple_models import LEVELS, acceleration_rms, probability_right
 from psotrack.inside_out.filtering.path_rows import (
     PoseRow,
     estimated_row,
@@ -116,6 +116,15 @@ def smooth(
     return join_rows(smoothed)
 
 
+def first_estimate(path: CameraPath, params: PoseFilterParams) -> tuple[float, PoseEstimate] | None:
+    """Time (seconds) and smoothed estimate of the first used pose of a path; None if no pose is used."""
+    model = estimate_motion_model(path, params)
+    span = next(_spans(path.time_s, model, params.longest_gap_s), None)
+    if span is None:
+        return None
+    return float(path.time_s[span.start]), _smooth_span(split_path(path), model, span)[0]
+
+
 def estimate_motion_model(path: CameraPath, params: PoseFilterParams) -> MotionModel:
     """Estimate from raw poses how the camera moves and which poses fit: the causal filter in both directions of time.
 
@@ -187,10 +196,11 @@ def _smooth_span(rows: Sequence[PoseRow], model: MotionModel, span: slice) -> li
     """Smoothed poses of a span of frames whose first pose fits."""
     frames = _filter(rows, model, span)
     later = frames[-1].motion
-    poses = [_estimate(later)]
-    for now, ahead in zip(frames[-2::-1], frames[:0:-1], strict=True):
+    wobble = model.wobble_density_rad2_s3[span]
+    poses = [_estimate(later, float(wobble[-1]))]
+    for now, ahead, density in zip(frames[-2::-1], frames[:0:-1], wobble[-2::-1], strict=True):
         later = _smoothed(now.motion, ahead, later)
-        poses.append(_estimate(later))
+        poses.append(_estimate(later, float(density)))
     return poses[::-1]
 
 
@@ -256,7 +266,7 @@ def _smoothed(now: Motion, ahead: _FilteredFrame, later: Motion) -> Motion:
     return pose_motion.retract(smoothed, correction[..., 0])
 
 
-def _estimate(motion: Motion) -> PoseEstimate:
+def _estimate(motion: Motion, wobble_density_rad2_s3: float) -> PoseEstimate:
     """Pose of a motion of one level; the covariance includes the constant errors."""
     common = motion.common[0]
     covariance = motion.covariance[0] + common @ common.T
@@ -267,6 +277,8 @@ def _estimate(motion: Motion) -> PoseEstimate:
         motion.velocity_m_s[0],
         motion.rate_rad_s[0],
         covariance[np.ix_(MOTION, MOTION)],
+        acceleration_rms(motion, covariance),
+        wobble_density_rad2_s3,
     )
 
 

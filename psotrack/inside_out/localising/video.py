@@ -18,7 +18,7 @@ from psotrack.inside_out.filtering.path_rows import PoseRow, join_rows
 from psotrack.inside_out.frames import Frame, FrameSource, map_ahead, read_ahead
 from psotrack.inside_out.line_time import Detected, LineTime, estimate_line_time
 from psotrack.inside_out.localising.corner_noise import estimate_centre_scale
-from psotrack.inside_out.localising.frame_poses import localise_frames
+from psotrack.inside_out.localising.frame_poses import find_first_motion, localise_frames
 from psotrack.inside_out.localising.map_evidence import (
     are_few,
     least_markers,
@@ -75,7 +75,7 @@ def localise_video(
     _check_size(source, lens)
     detector = MarkerDetector(settings.dictionary, lens, ids=marker_map.ids.tolist())
     seconds = dict.fromkeys(STAGES, 0.0)
-    raw_rows, rows, interrupted, line_time = [], [], False, None
+    raw_rows, rows, interrupted, line_time, first = [], [], False, None, None
     wrong: tuple[int, ...] = ()
     unknown: tuple[int, ...] = ()
     began_s = time.perf_counter()
@@ -90,7 +90,8 @@ def localise_video(
                 room = marker_map
             if isinstance(detected, list):
                 line_time, settings = _learned(detected, room, lens, settings, seconds)
-            for raw, row in localise_frames(detected, room, lens, settings, seconds):
+                first = find_first_motion(detected, room, lens, settings)
+            for raw, row in localise_frames(detected, room, lens, settings, seconds, first):
                 raw_rows.append(raw)
                 rows.append(row)
     except KeyboardInterrupt:
@@ -107,7 +108,8 @@ def localise_video(
             pose = replace(given.pose, min_markers=least_markers(given.pose))
             again = replace(given, pose=pose)
             line_time, settings = _learned(right, room, lens, again, seconds)
-            both = list(localise_frames(right, room, lens, settings, seconds))
+            first = find_first_motion(right, room, lens, settings)
+            both = list(localise_frames(right, room, lens, settings, seconds, first))
             raw_rows, rows = [raw for raw, _ in both], [row for _, row in both]
     wall_s = time.perf_counter() - began_s
     return LocalisedVideo(

@@ -34,8 +34,11 @@ _ENOUGH_MARKERS = 4
 #: Logarithm of the density of a pose that is not where motion predicts it: in 1 of 1000 frames the camera is anywhere
 #: in 1000 m³, in any orientation.
 _LOG_UNEXPECTED = -log(1e3 * 1e3 * 8 * pi**2)
-#: Velocity (m/s) and turn rate (rad/s) along each axis where nothing is known of the motion.
-_UNKNOWN_MOTION = ExpectedMotion(np.zeros(6), np.diag(np.repeat([5.0, 3.0], 3) ** 2.0))
+#: Velocity (m/s) and turn rate (rad/s) along each axis where nothing is known of the motion, and their changes (m/s²,
+#: rad/s²): those of a flight, the middle one of the filter's levels of agility.
+_UNKNOWN_MOTION = ExpectedMotion(
+    np.zeros(6), np.diag(np.repeat([5.0, 3.0], 3) ** 2.0), np.repeat([5.0, 5.0], 3)
+)
 #: Factor on the standard deviations of the expected motion, and a deviation that is added, m/s and rad/s, because a
 #: frame's own rows shall decide where the motion changes.
 _WIDER, _MOTION_STD = 2.0, 0.1
@@ -135,7 +138,7 @@ def _row_times(
         covariance = motion.covariance
         if expected is not None:
             covariance = _WIDER**2 * covariance + _MOTION_STD**2 * np.eye(6)
-        rows = RowMotion(time_s, motion.motion, np.linalg.inv(covariance))
+        rows = RowMotion(time_s, motion.motion, np.linalg.inv(covariance), motion.acceleration_std)
     if shutter.std_s:
         unsure = UnsureRows(row_times_s(corners_px, lens, shutter.std_s), motion.motion, motion.covariance)
     return rows, unsure

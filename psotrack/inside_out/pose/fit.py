@@ -31,7 +31,7 @@ from psotrack.inside_out.pose.equations import (
     summed,
     with_prior,
 )
-from psotrack.inside_out.pose.frame_motion import frame_motion, line_time_effects
+from psotrack.inside_out.pose.frame_motion import acceleration_effects, frame_motion, line_time_effects
 from psotrack.inside_out.pose.records import CentreResiduals
 
 #: Probability that a good corner, or the mean of a good marker, is rejected as an outlier.
@@ -277,7 +277,10 @@ def _fitted(seen: SeenCorners, pose: _Pose, last: _LastStep, noise: Noise) -> Fi
     too_large = noise.own_px2 > (_LARGEST_NOISE_SCALE * seen.noise_px) ** 2
     if solution is None or too_large or noise.place_m2 > _LARGEST_PLACE_M**2:
         return None
-    covariance = solution.covariance[:6, :6]
+    by_acceleration = acceleration_effects(seen, last.rows, fits, widened, seen.prior_information)
+    if by_acceleration is None:
+        return None
+    covariance = (solution.covariance + by_acceleration @ by_acceleration.T)[:6, :6]
     motion, by_line_time, whole = None, None, covariance
     if seen.rows is not None:
         motion = frame_motion(seen, sums, last.rows, fits, widened, pose.extra)

@@ -39,14 +39,17 @@ def frame_motion(
     if solution is None:
         return None
     whole = np.r_[:POSE_SIZE, POSE_SIZE + 2 : POSE_SIZE + 8]
-    covariance = solution.covariance[np.ix_(whole, whole)]
+    effects = acceleration_effects(seen, rows, fits, noise, prior)
+    if effects is None:
+        return None
+    covariance = (solution.covariance + effects @ effects.T)[np.ix_(whole, whole)]
     by_motion = -np.linalg.solve(covariance[6:, 6:], covariance[6:, :6]).T
     common = sums.common(solution, noise, seen.map_share)[whole]
     if seen.unsure is not None:
-        effects = line_time_effects(seen, rows, fits, noise, prior)
-        if effects is None:
+        by_line_time = line_time_effects(seen, rows, fits, noise, prior)
+        if by_line_time is None:
             return None
-        common = np.concatenate([common, (effects[whole] @ extra[2:])[:, None]], axis=1)
+        common = np.concatenate([common, (by_line_time[whole] @ extra[2:])[:, None]], axis=1)
     common[:6] += by_motion @ common[6:]
     of_pose = covariance[:6, :6] + by_motion @ covariance[6:, :6]
     return FrameMotion(
@@ -73,10 +76,43 @@ def line_time_effects(
     """
     if seen.unsure is None:
         return np.zeros((rows.shape[-1] - 1, 6))
+    off_px = seen.unsure.error_s[..., None, None] * rows[..., :POSE_SIZE]
+    return _effects(seen, rows, fits, noise, prior_information, off_px)
+
+
+def acceleration_effects(
+    seen: SeenCorners,
+    rows: Float[np.ndarray, "markers 4 2 columns"],
+    fits: Bool[np.ndarray, "markers 4"],
+    noise: Noise,
+    prior_information: Float[np.ndarray, "extra extra"],
+) -> Float[np.ndarray, "unknowns 6"] | None:
+    """Change of the unknowns by an acceleration of one standard deviation, along and about each axis.
+
+    In the time s before and after the reference row, an acceleration a takes the camera a s² / 2 away from where a
+    constant motion takes it. None if the equations are singular; 0 for a global shutter.
+    """
+    if seen.rows is None or not seen.rows.acceleration_std.any():
+        return np.zeros((rows.shape[-1] - 1, 6))
+    # The derivatives by the motion are s times those by the pose.
+    by_motion = rows[..., POSE_SIZE + 2 : POSE_SIZE + 8]
+    off_px = seen.rows.time_s[..., None, None] / 2 * by_motion * seen.rows.acceleration_std
+    return _effects(seen, rows, fits, noise, prior_information, off_px)
+
+
+def _effects(
+    seen: SeenCorners,
+    rows: Float[np.ndarray, "markers 4 2 columns"],
+    fits: Bool[np.ndarray, "markers 4"],
+    noise: Noise,
+    prior_information: Float[np.ndarray, "extra extra"],
+    off_px: Float[np.ndarray, "markers 4 2 errors"],
+) -> Float[np.ndarray, "unknowns errors"] | None:
+    """Change of the unknowns by changes of the pixels; None if the equations are singular."""
     none, moved = np.zeros(len(prior_information)), rows.copy()
     effects = []
-    for part in range(POSE_SIZE):
-        moved[..., -1] = seen.unsure.error_s[..., None] * rows[..., part]
+    for error in range(off_px.shape[-1]):
+        moved[..., -1] = off_px[..., error]
         solution: Solution | None = summed(moved, fits, seen.centre_scale).solved(
             noise, prior_information, none
         )

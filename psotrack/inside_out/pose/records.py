@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -71,10 +71,13 @@ class ExpectedMotion:
     Attributes:
         motion: (6,), velocity along the world's axes (m/s) and turn rate about the camera's axes (rad/s).
         covariance: (6, 6), its covariance.
+        acceleration_std: (6,), standard deviations of the acceleration along the world's axes (m/s²) and of the angular
+            acceleration about the camera's axes (rad/s²), by which the motion changes during a frame.
     """
 
     motion: Float[np.ndarray, "6"]
     covariance: Float[np.ndarray, "6 6"]
+    acceleration_std: Float[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6))
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,11 @@
 
 The pose of a frame is that of its reference row, the middle row of the image. A row that is exposed s seconds later is
 seen from p + v s, in the orientation R exp(w s), with the velocity v along the world's axes and the turn rate w about
-the camera's axes. Both are constant during a frame (Hedborg, Forssén, Felsberg & Ringaby, Rolling shutter bundle
-adjustment, CVPR 2012; Albl, Kukelova, Larsson & Pajdla, Rolling shutter camera absolute pose, IEEE Transactions on
-Pattern Analysis and Machine Intelligence 42(6), 2020). One frame shows both only through the product with the line
-time, and shows them badly where few markers are seen. The motion between frames is therefore their prior.
+the camera's axes. Both are taken as constant during a frame, and the covariance counts how they change (Hedborg,
+Forssén, Felsberg & Ringaby, Rolling shutter bundle adjustment, CVPR 2012; Albl, Kukelova, Larsson & Pajdla, Rolling
+shutter camera absolute pose, IEEE Transactions on Pattern Analysis and Machine Intelligence 42(6), 2020). One frame
+shows both only through the product with the line time, and shows them badly where few markers are seen. The motion
+between frames is therefore their prior.
 """
 
 from __future__ import annotations
@@ -29,11 +30,13 @@ class RowMotion:
         time_s: (markers, 4), when the row of each corner was exposed, after the reference row, seconds.
         expected: (6,), expected velocity along the world's axes (m/s) and turn rate about the camera's axes (rad/s).
         information: (6, 6), inverse of the covariance of the expected motion.
+        acceleration_std: (6,), standard deviations of the acceleration (m/s²) and of the angular acceleration (rad/s²).
     """
 
     time_s: Float[np.ndarray, "markers 4"]
     expected: Float[np.ndarray, "6"]
     information: Float[np.ndarray, "6 6"]
+    acceleration_std: Float[np.ndarray, "6"]
 
 
 @dataclass(frozen=True)
