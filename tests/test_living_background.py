@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from psotrack.silhouettes import ForegroundSettings, SilhouetteSettings, find_background
 from psotrack.silhouettes.lighting import remove_light
 from psotrack.silhouettes.living_background import Living, LivingBackground
+from psotrack.silhouettes.object_blobs import find_objects, largest
 
 HEIGHT, WIDTH = 120, 160
 SETTINGS = ForegroundSettings(working_reduction=1, min_blob_px=9)
@@ -216,3 +217,33 @@ def test_the_living_background_is_found_by_name_and_its_settings_are_its_key() -
     other = find_background("living", SilhouetteSettings(min_blob_px=10))
     assert other is not None
     assert model.key != other.key
+
+
+def test_a_drone_does_not_grow_together_with_a_faint_change_around_it() -> None:
+    """A cloud that comes changes the image faintly: the drone before it keeps its size, and the cloud is no object."""
+    rng = np.random.default_rng(9)
+    sky = np.full((HEIGHT, WIDTH, 3), 150.0)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    cloud = 10 * np.exp(-((columns - 80) ** 2 + (rows - 60) ** 2) / (2 * 10**2))[..., None]
+    background = LivingBackground(SETTINGS, _exposed(sky, rng))
+    for _ in range(20):
+        background.step(_exposed(sky, rng))
+    image, drone = _with_drone(sky + cloud, 80, 60, width_px=8)
+    mask = background.step(_exposed(image, rng))
+    assert _f1(mask, drone) > 0.9
+
+
+@given(seed=st.integers(0, 1000), strength=st.floats(20, 200))
+@settings(max_examples=20, deadline=None)
+def test_all_foreground_belongs_to_blobs_that_changed(seed: int, strength: float) -> None:
+    """Objects are made of changed pixels, and objects with edges of their own are among them."""
+    rng = np.random.default_rng(seed)
+    background = _exposed(_room(rng), rng)
+    image = background.copy()
+    x, y = rng.integers(0, (WIDTH - 20, HEIGHT - 20))
+    image[y : y + 15, x : x + 20] = np.clip(image[y : y + 15, x : x + 20] + strength, 0, 255).astype(np.uint8)
+    difference = largest(cv2.absdiff(image, background))
+    changed, strong = (np.where(difference > level, np.uint8(255), np.uint8(0)) for level in (3, 8))
+    found = find_objects(changed, strong, image, background, difference, np.zeros((HEIGHT, WIDTH), bool), 9)
+    assert not (found.mask & ~changed).any()
+    assert not (found.own & ~found.mask).any()

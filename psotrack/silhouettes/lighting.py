@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 #: Parts along the longer side of the image. A part must be larger than a drone, so that its median shows the light.
 _PARTS = 10
-#: Pixels along the shorter side of the image that are compared; enough for some 40 pixels per part.
-_SAMPLES = 64
+#: Pixels of a part along each side that are compared.
+_SAMPLES = 8
 #: Larger changes of the logarithm are no light: a dark object before a bright wall, or the reverse.
 _LARGEST_LOG_GAIN = 0.7
 #: Share of a part's pixels that must show background for the part to have a gain of its own.
@@ -66,26 +66,34 @@ def _log_gains(
     foreground: UInt8[np.ndarray, "height width"],
 ) -> Float[np.ndarray, "rows columns"]:
     """Logarithm of the gain of each part of the image."""
-    step = max(1, min(image.shape[:2]) // _SAMPLES)
-    chosen = (slice(step // 2, None, step), slice(step // 2, None, step))
+    height, width = image.shape[:2]
+    rows, columns = (_parts(side, max(height, width)) for side in (height, width))
+    chosen = np.ix_(_spread(height, rows), _spread(width, columns))
     ratio = (image[chosen].astype(np.float32) + _DARK) / (background[chosen] + _DARK)
     log_ratio = np.log(ratio).mean(axis=-1)
     log_ratio[(foreground[chosen] > 0) | (np.abs(log_ratio) > _LARGEST_LOG_GAIN)] = np.nan
-    rows, columns = (
-        np.array_split(np.arange(side), _parts(side, max(log_ratio.shape))) for side in log_ratio.shape
-    )
     known = log_ratio[np.isfinite(log_ratio)]
     everywhere = float(np.median(known)) if known.size else 0.0
-    log_gain = np.full((len(rows), len(columns)), everywhere, np.float32)
-    for i, row in enumerate(rows):
-        for j, column in enumerate(columns):
-            part = log_ratio[row[0] : row[-1] + 1, column[0] : column[-1] + 1]
-            values = part[np.isfinite(part)]
-            if values.size >= _LEAST_SHARE * part.size:
-                log_gain[i, j] = np.median(values)
+    parts = log_ratio.reshape(rows, -1, columns, log_ratio.shape[1] // columns).swapaxes(1, 2)
+    values = np.sort(parts.reshape(rows, columns, -1), axis=-1)  # NaN come last
+    count = np.isfinite(values).sum(axis=-1)
+    lower, upper = (
+        np.take_along_axis(values, np.maximum(index, 0)[..., None], axis=-1)[..., 0]
+        for index in ((count - 1) // 2, count // 2)
+    )
+    # Where nothing is known, the index count // 2 is 0 as well.
+    log_gain = np.where(
+        count >= max(1, _LEAST_SHARE * values.shape[-1]), (lower + upper) / 2, everywhere
+    ).astype(np.float32)
     # One part alone is more often an object than a lamp.
     return cv2.medianBlur(log_gain, 3) if min(log_gain.shape) >= 3 else log_gain
 
 
 def _parts(side: int, longest: int) -> int:
     return max(1, min(side, round(_PARTS * side / longest)))
+
+
+def _spread(side: int, parts: int) -> Int[np.ndarray, "samples"]:
+    """Pixels along a side, spread evenly, the same number in each part."""
+    samples = parts * _SAMPLES
+    return ((np.arange(samples) + 0.5) * side / samples).astype(int)

@@ -1,6 +1,8 @@
 """Which blobs of changed pixels are objects: evidence from their strength, their sharpness and their edges.
 
 - **Strength**: enough of a blob's pixels differ from the background by more than the place usually does.
+- **Extent**: a blob ends where the difference falls below a share of the blob's contrast. So a small dark drone does
+  not grow together with the faint change of a cloud, or with the artefacts of a codec around the drone.
 - **Sharpness**: the difference to the background rises steeply at the blob's contour. Clouds, soft shadows and lamps
   change the image gradually.
 - **Edges**: an object has edges of its own in the frame. Where an object left, the background has these edges instead
@@ -13,15 +15,19 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Shaped, UInt8
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 
 #: Smallest number of strong pixels of a blob.
 _STRONG_PIXELS = 2
 #: Share of a blob's pixels that must be strong, at places that are calm and at places that are restless.
 _CALM_SHARE, _RESTLESS_SHARE = 0.1, 0.3
-#: Gradient of the difference at the contour, per 2 pixels, as a share of the blob's mean difference. Drawn and real
-#: drones have 0.6 to 1.3, also at 8 px; drifting clouds 0.06 to 0.3.
-_SHARP = 0.4
+#: A blob's pixels differ by this share of the blob's contrast at least; a higher contrast, grey levels, counts as this
+#: contrast, because objects also have parts that hardly differ from the background.
+_SHARE_OF_CONTRAST, _LARGEST_CONTRAST = 0.4, 80.0
+#: Gradient of the difference at the contour, per 2 pixels: at least this share of the blob's mean difference, and what
+#: noise and codecs add. In shares of the mean difference, drawn and real drones have 0.5 to 3 down to 3 px; drifting
+#: clouds 0.06 to 0.5.
+_SHARP, _NOISE_GRADIENT = 0.4, 2.0
 #: Larger differences do not need sharper contours, grey levels.
 _SHARP_DIFFERENCE = 40.0
 #: Edges of an object at its contour, relative to the background's edges at the same place, and above them.
@@ -65,38 +71,129 @@ def find_objects(
         restless: (height, width), whether leaves, screens, waves or noise change the place again and again.
         least_px: smallest number of pixels of a blob.
     """
-    nothing = np.zeros_like(changed)
-    if not strong.any():
-        return ObjectBlobs(nothing, nothing)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(changed, connectivity=8)
-    area = stats[:, cv2.CC_STAT_AREA]
-    pixels = np.flatnonzero(changed)
-    of_pixels = labels.ravel()[pixels]
-    num_strong = np.bincount(of_pixels[strong.ravel()[pixels] > 0], minlength=count)
-    num_restless = np.bincount(of_pixels[restless.ravel()[pixels]], minlength=count)
-    enough = _CALM_SHARE * (area - num_restless) + _RESTLESS_SHARE * num_restless
-    is_object = (num_strong >= np.maximum(_STRONG_PIXELS, enough)) & (area >= least_px)
-    is_object[0] = False
-    if not is_object.any():
-        return ObjectBlobs(nothing, nothing)
-    mean_difference = np.bincount(of_pixels, difference.ravel()[pixels], minlength=count) / np.maximum(
-        area, 1
-    )
-    mask = _mask_of(is_object, labels)
-    contour = (cv2.dilate(mask, _AROUND) > 0) & (cv2.erode(mask, _AROUND) == 0)
-    # A pixel outside belongs to the contour of the blob with the largest label beside the pixel.
-    of_contour = cv2.dilate(np.where(mask > 0, labels, 0).astype(np.float32), _AROUND)[contour].astype(int)
-    length = np.maximum(np.bincount(of_contour, minlength=count), 1)
+    blobs = _find_blobs(changed, strong, difference, least_px)
+    num_restless = blobs.sums(restless.ravel()[blobs.pixels])
+    enough = _CALM_SHARE * (blobs.area - num_restless) + _RESTLESS_SHARE * num_restless
+    blobs = blobs.chosen(blobs.sums(strong.ravel()[blobs.pixels] > 0) >= np.maximum(_STRONG_PIXELS, enough))
+    if not blobs.area.any():
+        return ObjectBlobs(np.zeros_like(changed), np.zeros_like(changed))
+    points, of_points = _contours(blobs, changed.shape)
+    length = np.maximum(np.bincount(of_points, minlength=len(blobs.area)), 1)
     edges, edges_before, steepness = (
-        np.bincount(of_contour, gradient(levels)[contour], minlength=count) / length
+        np.bincount(of_points, _gradient_at(levels, points), minlength=len(blobs.area)) / length
         for levels in (image, background, difference)
     )
-    has_contour = np.bincount(of_contour, minlength=count) > 0
-    sharp = steepness > _SHARP * np.minimum(mean_difference, _SHARP_DIFFERENCE)
+    contrast = np.minimum(
+        blobs.sums(difference.ravel()[blobs.pixels]) / np.maximum(blobs.area, 1), _SHARP_DIFFERENCE
+    )
     # A blob that fills the image has no contour.
-    is_object &= sharp | ~has_contour
+    has_contour = np.bincount(of_points, minlength=len(blobs.area)) > 0
+    is_object = ~has_contour | (steepness > _SHARP * contrast + _NOISE_GRADIENT)
     own = is_object & (edges > _OWN_EDGES * edges_before + _LEAST_EDGE)
-    return ObjectBlobs(_mask_of(is_object, labels), _mask_of(own, labels))
+    return ObjectBlobs(*(_mask_of(blobs.chosen(kind).pixels, changed.shape) for kind in (is_object, own)))
+
+
+@dataclass(frozen=True)
+class _PixelBlobs:
+    """Blobs as a list of pixels.
+
+    Attributes:
+        pixels: (pixels,), indices into the flat image.
+        blob: (pixels,), blob of each pixel.
+        area: (blobs,), number of pixels of each blob; some have none.
+    """
+
+    pixels: Int[np.ndarray, "pixels"]
+    blob: Int[np.ndarray, "pixels"]
+    area: Int[np.ndarray, "blobs"]
+
+    def sums(self, values: Shaped[np.ndarray, "pixels"]) -> Shaped[np.ndarray, "blobs"]:
+        """(blobs,), sum of the values of each blob's pixels."""
+        return np.bincount(self.blob, values, minlength=len(self.area))
+
+    def chosen(self, chosen: Bool[np.ndarray, "blobs"]) -> _PixelBlobs:
+        """Some of the blobs; the others have no pixels."""
+        kept = chosen[self.blob]
+        return _PixelBlobs(self.pixels[kept], self.blob[kept], np.where(chosen, self.area, 0))
+
+
+def _find_blobs(changed: _Mask, strong: _Mask, difference: _Mask, least_px: int) -> _PixelBlobs:
+    """The blobs with strong pixels and enough changed pixels, each as far as its contrast goes."""
+    wide = _connected(changed)
+    strong_of_pixels = strong.ravel()[wide.pixels] > 0
+    levels = difference.ravel()[wide.pixels]
+    num_strong = wide.sums(strong_of_pixels)
+    strong_levels = np.where(strong_of_pixels, levels, 0).astype(float)
+    # The mean weighted by the levels themselves: many faint pixels of a cloud do not outvote a small drone.
+    contrast = wide.sums(strong_levels**2) / np.maximum(wide.sums(strong_levels), 1)
+    least = _SHARE_OF_CONTRAST * np.minimum(contrast, _LARGEST_CONTRAST)
+    kept = (
+        (num_strong >= _STRONG_PIXELS)[wide.blob]
+        & (wide.area >= least_px)[wide.blob]
+        & (levels > least[wide.blob])
+    )
+    return _connected(_mask_of(wide.pixels[kept], changed.shape))
+
+
+def _connected(mask: _Mask) -> _PixelBlobs:
+    """The 8-connected blobs of a mask."""
+    x, y, width, height = cv2.boundingRect(mask)
+    count, labels = (
+        cv2.connectedComponents(mask[y : y + height, x : x + width], connectivity=8) if width else (1, mask)
+    )
+    inside = np.flatnonzero(labels > 0)  # several times faster than of the labels
+    blob = labels.ravel()[inside].astype(np.intp)
+    rows, columns = np.divmod(inside, max(width, 1))
+    pixels = (rows + y) * mask.shape[1] + columns + x
+    return _PixelBlobs(pixels, blob, np.bincount(blob, minlength=count))
+
+
+def _contours(
+    blobs: _PixelBlobs, shape: tuple[int, ...]
+) -> tuple[Int[np.ndarray, "points"], Int[np.ndarray, "points"]]:
+    """Pixels on both sides of the blobs' contours, as flat indices, and the blob of each.
+
+    A pixel outside belongs to the blob with the largest number beside the pixel.
+    """
+    mask = _mask_of(blobs.pixels, shape)
+    contour = cv2.morphologyEx(mask, cv2.MORPH_GRADIENT, _AROUND)
+    points = np.flatnonzero(contour > 0)
+    labels = np.zeros(mask.size, np.intp)
+    labels[blobs.pixels] = blobs.blob
+    inside = labels[points]
+    outside = inside == 0
+    inside[outside] = np.max(
+        [labels[near] for near in _neighbours(points[outside], shape)], axis=0, initial=0
+    )
+    return points, inside
+
+
+def _neighbours(points: Int[np.ndarray, "points"], shape: tuple[int, ...]) -> list[Int[np.ndarray, "points"]]:
+    """The eight neighbours of pixels, row by row; those beyond the image's border are the pixels at the border."""
+    rows, columns = np.divmod(points, shape[1])
+    above, below = np.maximum(rows - 1, 0) * shape[1], np.minimum(rows + 1, shape[0] - 1) * shape[1]
+    left, right = np.maximum(columns - 1, 0), np.minimum(columns + 1, shape[1] - 1)
+    here = rows * shape[1]
+    beside = (left, columns, right)
+    return [
+        *(above + column for column in beside),
+        here + left,
+        here + right,
+        *(below + column for column in beside),
+    ]
+
+
+def _gradient_at(
+    image: UInt8[np.ndarray, "height width *channels"], points: Int[np.ndarray, "points"]
+) -> Float[np.ndarray, "points"]:
+    """What `gradient` is at some pixels, given as flat indices."""
+    levels = image.reshape(image.shape[0] * image.shape[1], -1)
+    north_west, north, north_east, west, east, south_west, south, south_east = (
+        levels[near].astype(np.float32) for near in _neighbours(points, image.shape)
+    )
+    along_x = north_east + 2 * east + south_east - north_west - 2 * west - south_west
+    along_y = south_west + 2 * south + south_east - north_west - 2 * north - north_east
+    return np.hypot(along_x, along_y).max(axis=-1, initial=0) / 4
 
 
 def gradient(image: UInt8[np.ndarray, "height width *channels"]) -> Float[np.ndarray, "height width"]:
@@ -114,5 +211,7 @@ def largest(image: Shaped[np.ndarray, "height width 3"]) -> Shaped[np.ndarray, "
     return np.asarray(cv2.max(cv2.max(blue, green), red))
 
 
-def _mask_of(chosen: Bool[np.ndarray, "blobs"], labels: np.ndarray) -> _Mask:
-    return np.where(chosen[labels], np.uint8(255), np.uint8(0))
+def _mask_of(pixels: Int[np.ndarray, "pixels"], shape: tuple[int, ...]) -> _Mask:
+    mask = np.zeros(shape, np.uint8)
+    mask.ravel()[pixels] = 255
+    return mask
