@@ -110,6 +110,8 @@ NEW_NAMES = (
     "status.min_cameras_to_begin",
     "status.max_coasting_std_m",
     "rate_hz",
+    "silhouettes.background",
+    "silhouettes.drone_px",
     "clocks",
     "errors.rig_deg",
     "errors.pixel_px",

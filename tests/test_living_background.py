@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from psotrack.silhouettes import ForegroundSettings, SilhouetteSettings, find_background
+from psotrack.silhouettes import ForegroundSettings, ScaledSettings, find_background
 from psotrack.silhouettes.lighting import remove_light
 from psotrack.silhouettes.living_background import Living, LivingBackground
 from psotrack.silhouettes.object_blobs import find_objects, largest
@@ -212,9 +212,9 @@ def test_an_object_is_no_change_of_the_light() -> None:
 
 
 def test_the_living_background_is_found_by_name_and_its_settings_are_its_key() -> None:
-    model = find_background("living", SilhouetteSettings(min_blob_px=9))
+    model = find_background("living", ScaledSettings(min_blob_px=9))
     assert isinstance(model, Living)
-    other = find_background("living", SilhouetteSettings(min_blob_px=10))
+    other = find_background("living", ScaledSettings(min_blob_px=10))
     assert other is not None
     assert model.key != other.key
 

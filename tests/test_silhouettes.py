@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import msgspec
@@ -24,15 +25,18 @@ import pytest
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
 from psotrack.geometry import look_at, make_camera, make_rig
 from psotrack.recordings import FrameTimes, Recording, TruncatedVideoError, VideoWriter, probe, read_frames
-from psotrack.silhouettes import Silhouettes, compute
+from psotrack.silhouettes import ScaledSettings, Silhouettes, SilhouetteSettings, compute, silhouette_keys
 from psotrack.silhouettes import store as silhouette_store
-from psotrack.silhouettes.computation import SilhouetteSettings
 from psotrack.silhouettes.foreground import coverage, foreground
 from psotrack.support import Advance, map_in_processes
 
 NUM_FRAMES = 30
 SIZE_WH = (162, 118)  # not multiples of 4
-SETTINGS = SilhouetteSettings(num_learning_frames=10)
+SETTINGS = SilhouetteSettings(
+    background="mog2", reduction=4, working_reduction=2, min_blob_px=64, num_learning_frames=10
+)
+#: What these settings are for videos of any size.
+SCALED = SETTINGS.scaled([SIZE_WH])
 
 
 def _write_video(path: Path, seed: int, num_frames: int = NUM_FRAMES) -> None:
@@ -86,13 +90,14 @@ def decoded_videos(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def _expected(recording: Recording, settings: SilhouetteSettings = SETTINGS) -> np.ndarray:
     """Compute silhouettes without store, workers or chunks, (frames, cameras, height, width)."""
-    step = silhouette_store.learning_step(recording.num_frames, settings)
-    factor = settings.reduction // settings.working_reduction
+    scaled = settings.scaled([video.image_size_wh for video in recording.videos.values()])
+    step = silhouette_store.learning_step(recording.num_frames, scaled)
+    factor = scaled.reduction // scaled.working_reduction
     return np.stack(
         [
             [
                 coverage(mask, factor)
-                for mask in foreground(read_frames(video, step), read_frames(video), settings)
+                for mask in foreground(read_frames(video, step), read_frames(video), scaled)
             ]
             for video in recording.videos.values()
         ],
@@ -182,13 +187,58 @@ def test_name_and_folder_of_a_video_are_not_in_the_key(
 )
 def test_every_setting_is_in_the_key(video_folder: Path, change: dict[str, object]) -> None:
     video = probe(video_folder / "cam1.avi")
-    changed = msgspec.structs.replace(SETTINGS, **change)
-    assert silhouette_store.key_of(video, changed) != silhouette_store.key_of(video, SETTINGS)
+    changed = msgspec.structs.replace(SCALED, **change)
+    assert silhouette_store.key_of(video, changed) != silhouette_store.key_of(video, SCALED)
 
 
 def test_the_test_of_the_key_covers_every_setting() -> None:
     changes = test_every_setting_is_in_the_key.pytestmark[0].args[1]
-    assert {name for change in changes for name in change} == set(SilhouetteSettings.__struct_fields__)
+    assert {name for change in changes for name in change} == set(ScaledSettings.__struct_fields__)
+
+
+def test_the_background_model_is_in_the_key(video_folder: Path) -> None:
+    recording = _make_recording(video_folder)
+    models = (SETTINGS, msgspec.structs.replace(SETTINGS, background="living"))
+    mog2, living = (silhouette_keys(recording, settings) for settings in models)
+    assert mog2.keys() == living.keys() == set(recording.rig.names)
+    assert not set(mog2.values()) & set(living.values())
+    with pytest.raises(SettingsError, match="background: expected .*found liveing"):
+        silhouette_keys(recording, SilhouetteSettings(background="liveing"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "sizes_wh", "expected"),
+    [
+        ({}, [(1920, 1080)], (2, 4, 64)),
+        ({}, [(640, 512), (1920, 1080)], (2, 4, 64)),
+        ({}, [(3840, 2160)], (4, 8, 256)),
+        ({}, [(1080, 1920)], (2, 4, 64)),
+        ({}, [(640, 512)], (1, 2, 7)),
+        ({}, [(160, 120)], (1, 1, 4)),
+        ({"drone_px": 12.0}, [(3840, 2160)], (1, 2, 6)),
+        ({"drone_px": 5.0}, [(3840, 2160)], (1, 1, 4)),
+        ({"drone_px": 100.0}, [(640, 512)], (5, 10, 400)),
+        ({"reduction": 3}, [(1920, 1080)], (1, 3, 64)),
+        ({"working_reduction": 3}, [(1920, 1080)], (3, 6, 64)),
+        ({"min_blob_px": 0}, [(1920, 1080)], (2, 4, 0)),
+    ],
+)
+def test_reduction_and_smallest_blob_follow_from_the_drones_size(
+    settings: dict[str, Any], sizes_wh: list[tuple[int, int]], expected: tuple[int, int, int]
+) -> None:
+    scaled = SilhouetteSettings(**settings).scaled(sizes_wh)
+    assert (scaled.working_reduction, scaled.reduction, scaled.min_blob_px) == expected
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"), [("shadows", "drop"), ("var_threshold", 9.0), ("learning_rate", 0.1)]
+)
+def test_what_the_living_background_does_not_use_is_refused(setting: str, value: object) -> None:
+    with pytest.raises(
+        SettingsError, match=f"{setting}: expected .*the background model living does not use"
+    ):
+        SilhouetteSettings(**{setting: value})
+    assert getattr(SilhouetteSettings(background="mog2", **{setting: value}), setting) == value
 
 
 def test_a_changed_setting_computes_again_and_keeps_the_old_silhouettes(
@@ -400,7 +450,7 @@ def test_an_ignored_part_of_another_size_is_an_error(folder: Path, tmp_path: Pat
 @pytest.mark.parametrize("reduction", [0, -4, 3, True])
 def test_invalid_reductions_are_refused(reduction: int) -> None:
     with pytest.raises(SettingsError, match="reduction: expected a "):
-        SilhouetteSettings(reduction=reduction)
+        SilhouetteSettings(reduction=reduction, working_reduction=2)
 
 
 def test_jobs_below_one(folder: Path, tmp_path: Path) -> None:
@@ -502,7 +552,7 @@ def test_a_killed_computation_is_resumed(
         # The workers notice the end of their parent and remove their unfinished folders.
         assert not _unfinished_folders(cache)
     recording = _make_recording(folder)
-    keys = {name: silhouette_store.key_of(video, SETTINGS) for name, video in recording.videos.items()}
+    keys = {name: silhouette_store.key_of(video, SCALED) for name, video in recording.videos.items()}
     finished = _stored_keys(cache)
     resumed = compute(recording, SETTINGS, cache=cache, jobs=1)
     assert set(decoded_videos) == {name for name, key in keys.items() if key not in finished}
@@ -548,7 +598,7 @@ def test_full_disk(folder: Path, tmp_path: Path) -> None:
         # limit would truncate it too.
         before="import resource, sys; sys.dont_write_bytecode = True; "
         "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))",
-        settings="SilhouetteSettings(reduction=2, min_blob_px=0, var_threshold=0.1)",
+        settings="SilhouetteSettings(background='mog2', reduction=2, min_blob_px=0, var_threshold=0.1)",
     )
     assert full.returncode == 1
     assert "OutputError" in full.stderr

@@ -21,6 +21,7 @@ runs = 10
 [settings]
 swarm.spread_m = 1
 silhouettes.reduction = 8
+silhouettes.background = "mog2"
 [methods.paper]
 swarm.kind = "joint"
 score.kind = "hard"
@@ -73,7 +74,7 @@ def test_every_combination_is_a_cell(path):
 def test_a_cell_has_the_settings_of_the_file(path):
     paper = read_grid(path).cells()[0]
     assert paper.settings == TrackSettings(
-        silhouettes=SilhouetteSettings(reduction=8, var_threshold=8.0),
+        silhouettes=SilhouetteSettings(background="mog2", reduction=8, var_threshold=8.0),
         swarm=SwarmSettings(particles=20, spread_m=1.0, kind="joint"),
         score=ScoreSettings(kind="hard"),
     )
@@ -101,7 +102,11 @@ def test_a_mapping_gives_the_same_cells_as_toml(path):
     mapping = {
         "sequences": ("S01_D2_A", "S04_D10"),
         "runs": 10,
-        "settings": {"swarm.spread_m": 1, "silhouettes.reduction": 8},
+        "settings": {
+            "swarm.spread_m": 1,
+            "silhouettes.reduction": 8,
+            "silhouettes.background": "mog2",
+        },
         "methods": {
             "paper": {"swarm.kind": "joint", "score.kind": "hard"},
             "ours": {"silhouettes": {"reduction": 2}},
@@ -197,7 +202,7 @@ WRONG = [
     ({"settings": {"refinements": 3}}, "settings.refinements: .*; this setting is gone: it gained nothing"),
     (
         {"settings": {"zzz": 4}},
-        "settings.zzz: .*; allowed names are method, detections, init, .*, swarm.particles, .*, silhouettes.reduction",
+        "settings.zzz: .*; allowed names are method, detections, init, .*, swarm.particles, .*, silhouettes.reduction, .*",
     ),
     ({"settings": {"silhouettes": 4}}, "settings.silhouettes: expected a table with names, found none"),
     # Right names, wrong places.
@@ -284,8 +289,9 @@ WRONG = [
         "grid.silhouettes.reduction[1]: expected a multiple of working_reduction, 4, found 6",
     ),
     (
-        {"settings": {"silhouettes.working_reduction": 3}},
-        "the default of reduction: expected a multiple of working_reduction, 3, found 4",
+        {"settings": {"silhouettes.shadows": "drop"}},
+        "settings.silhouettes.shadows: expected keep, because the background model living does not use this setting, "
+        "found drop; or choose the background model mog2",
     ),
     # Cells.
     (

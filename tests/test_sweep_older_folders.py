@@ -22,7 +22,10 @@ def one_cell(**changes: object) -> Cell:
         "score.occlusion": False,
         "drones.size_m": [0.5, 0.5, 0.2],
         "identity.resolve_swaps": False,
+        "silhouettes.background": "mog2",
         "silhouettes.reduction": 2,
+        "silhouettes.working_reduction": 2,
+        "silhouettes.min_blob_px": 64,
         **changes,
     }
     axes = {"cameras": [4], "motion.jerk_density_m2_s5": [2.0]}
@@ -77,6 +80,8 @@ def test_rows_have_todays_names(tmp_path: Path) -> None:
             "settings.drones.count": 4,
             "settings.score.occlusion": True,
             "settings.silhouettes.reduction": 4,
+            "settings.silhouettes.background": "mog2",
+            "settings.silhouettes.drone_px": None,
         }
     )
     store = Store(tmp_path)
@@ -84,7 +89,8 @@ def test_rows_have_todays_names(tmp_path: Path) -> None:
     add(store, KEY, today)
     rows = store.rows()
     assert set(rows.columns) == {*today.columns, "seed", "cell"}
-    of_no_value = ["settings.status.min_cameras_to_begin", "settings.rate_hz"]
+    names = ("status.min_cameras_to_begin", "rate_hz", "silhouettes.drone_px")
+    of_no_value = [f"settings.{name}" for name in names]
     assert rows[of_no_value].isna().all(axis=None)
     assert not rows.drop(columns=of_no_value).isna().any(axis=None)
     shown = pivot(rows, rows_by=["particles"], columns_by=[], value="mean_error_m")

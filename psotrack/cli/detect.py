@@ -9,7 +9,6 @@ import click
 import numpy as np
 
 from psotrack.cli.options import (
-    BACKGROUND,
     CACHE,
     CAMERAS,
     DETECTOR_SIZE,
@@ -66,7 +65,6 @@ if TYPE_CHECKING:
     help="Side of the network's square input, in pixels.",
 )
 @silhouette_options
-@BACKGROUND
 @CAMERAS
 @frames_option
 @CACHE
@@ -82,7 +80,6 @@ def detect(
     confidence: float,
     nms: float,
     size: int,
-    background: str,
     cameras: str | None,
     num_frames: int | None,
     cache: Path | None,
@@ -121,7 +118,7 @@ def detect(
         refuse_to_overwrite(path, force)
     counts: dict[str, int] = {}
     found = (
-        _by_blobs(recording, SilhouetteSettings(**settings), background, cache, jobs, quiet)
+        _by_blobs(recording, SilhouetteSettings(**settings), cache, jobs, quiet)
         if chosen is None
         else _by_network(recording, chosen, confidence, nms, size, quiet)
     )
@@ -152,17 +149,13 @@ def _by_network(
 def _by_blobs(
     recording: Recording,
     settings: SilhouetteSettings,
-    background: str,
     cache: Path | None,
     jobs: int | None,
     quiet: bool,
 ) -> list[tuple[str, Detections]]:
     """Detections of each camera by the blobs of its silhouettes."""
-    from psotrack.silhouettes import blob_detections, compute, find_background
+    from psotrack.silhouettes import blob_detections, compute
 
-    model = find_background(background, settings)
-    made = compute(
-        recording, settings, cache=cache_folder(cache), jobs=jobs, background=model, report=report_to(quiet)
-    )
+    made = compute(recording, settings, cache=cache_folder(cache), jobs=jobs, report=report_to(quiet))
     sizes = np.array([recording.videos[name].image_size_wh for name in made.cameras], float)
     return list(blob_detections(made, sizes, report_to(quiet)).items())

@@ -133,14 +133,6 @@ def frames_option(command: Command) -> Command:
     )(with_way_out)
 
 
-BACKGROUND = click.option(
-    "--background",
-    default="mog2",
-    show_default=True,
-    metavar="mog2|living|NAME",
-    help="Background model: MOG2 with a background that stays as it was learned; living, for light, skies and plants "
-    "that change; or a model NAME that an installed package adds.",
-)
 FOV = click.option(
     "--fov",
     "fov_deg",
@@ -188,18 +180,34 @@ def silhouette_options(command: Command) -> Command:
     """Options of `SilhouetteSettings`, for the commands that compute silhouettes."""
     for option in (
         click.option(
+            "--background",
+            default=SILHOUETTES.background,
+            show_default=True,
+            metavar="living|mog2|NAME",
+            help="Background model: living goes on learning, for light, skies and plants that change; mog2 keeps the "
+            "background as it was learned; NAME is a model that an installed package adds.",
+        ),
+        click.option(
+            "--drone-px",
+            type=float,
+            default=None,
+            metavar="PX",
+            help="Width of the smallest drone in the images, from which reduction and smallest blob follow.  "
+            "[default: the images' longer side / 48]",
+        ),
+        click.option(
             "--reduction",
             type=int,
-            default=SILHOUETTES.reduction,
-            show_default=True,
-            help="Image pixels per silhouette pixel, along each side.",
+            default=None,
+            metavar="N",
+            help="Image pixels per silhouette pixel, along each side.  [default: from --drone-px]",
         ),
         click.option(
             "--shadows",
             type=click.Choice(get_args(Shadows)),
             default=SILHOUETTES.shadows,
             show_default=True,
-            help="Treatment of pixels that MOG2 labels as shadow: shadows, but also dark bodies and rotor discs.",
+            help="Treatment of pixels that mog2 labels as shadow: shadows, but also dark bodies and rotor discs.",
         ),
         click.option(
             "--shadow-weight",
@@ -213,15 +221,16 @@ def silhouette_options(command: Command) -> Command:
             type=float,
             default=SILHOUETTES.var_threshold,
             show_default=True,
-            help="Smallest squared distance of a foreground pixel from the background, in variances of the background.",
+            help="Smallest squared distance of a foreground pixel from the background, in variances of the background, "
+            "for mog2.",
         ),
         click.option(
             "--min-blob",
             "min_blob_px",
             type=int,
-            default=SILHOUETTES.min_blob_px,
-            show_default=True,
-            help="Smallest foreground blob that is kept, in pixels.",
+            default=None,
+            metavar="N",
+            help="Smallest foreground blob that is kept, in pixels.  [default: from --drone-px]",
         ),
     ):
         command = option(command)

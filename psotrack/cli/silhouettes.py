@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from psotrack.cli.options import (
-    BACKGROUND,
     CACHE,
     CAMERAS,
     FORCE,
@@ -16,7 +15,6 @@ from psotrack.cli.options import (
     JSON,
     QUIET,
     SEQUENCE,
-    SILHOUETTES,
     cache_folder,
     filmed_recording,
     frames_option,
@@ -49,10 +47,9 @@ MASKS_REDUCTION = 1
     default=None,
     metavar="N",
     help="Image pixels per pixel in which the foreground is computed.  [default: "
-    f"{MASKS_REDUCTION} for --masks, else {SILHOUETTES.working_reduction}]",
+    f"{MASKS_REDUCTION} for --masks, else from --drone-px]",
 )
 @silhouette_options
-@BACKGROUND
 @CAMERAS
 @frames_option
 @CACHE
@@ -71,7 +68,6 @@ def silhouettes(
     quiet: bool,
     force: bool,
     json_path: Path | None,
-    background: str,
     **settings: Any,
 ) -> None:
     """Compute and store the silhouettes of SEQ, which `track` reads, or write them as images or as a video.
@@ -90,12 +86,12 @@ def silhouettes(
       psotrack silhouettes flight.mp4 --masks flight_mask.mp4
       psotrack silhouettes pictures/ --masks masks --background mog2 --min-blob 16
     """
-    from psotrack.silhouettes import compute, find_background
+    from psotrack.silhouettes import compute
 
     recording = filmed_recording(sequence, cameras, num_frames)
     if masks_path is not None:
         chosen = _settings_of_masks(working_reduction, settings)
-        content = _write_masks(recording, masks_path, chosen, background, jobs, quiet, force)
+        content = _write_masks(recording, masks_path, chosen, jobs, quiet, force)
         output_json(json_path, content, force)
         total = sum(content["masks"].values())
         print_line(quiet, json_path, f"{masks_path}: {total} masks of {len(content['masks'])} cameras")
@@ -108,7 +104,6 @@ def silhouettes(
         chosen,
         cache=where,
         jobs=jobs,
-        background=find_background(background, chosen),
         report=report_to(quiet),
     )
     content = {
@@ -135,7 +130,6 @@ def _write_masks(
     recording: Recording,
     out: Path,
     settings: SilhouetteSettings,
-    background: str,
     jobs: int | None,
     quiet: bool,
     force: bool,
@@ -143,17 +137,13 @@ def _write_masks(
     """Write the masks of all cameras; returns what was written, as JSON."""
     import os
 
-    from psotrack.silhouettes import MaskTask, Task, find_background, frames_to_decode, masks_out, write_masks
+    from psotrack.silhouettes import MaskTask, frames_to_decode, masks_out, tasks_of, write_masks
     from psotrack.support import map_in_processes, refuse_to_overwrite
 
-    model = find_background(background, settings)
     places = masks_out(out, tuple(recording.videos))
     for path in places.values():
         refuse_to_overwrite(path, force)
-    tasks = [
-        MaskTask(Task(video, settings, out, name, model, recording.ignore.get(name)), places[name])
-        for name, video in recording.videos.items()
-    ]
+    tasks = [MaskTask(task, places[name]) for name, task in tasks_of(recording, settings, out).items()]
     jobs = jobs or os.cpu_count() or 1
     if jobs < 1:
         raise SettingsError("jobs", expected="at least 1", found=f"{jobs}")

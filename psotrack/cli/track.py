@@ -8,7 +8,6 @@ from typing import Any, get_args
 import click
 
 from psotrack.cli.options import (
-    BACKGROUND,
     CACHE,
     CAMERAS,
     DETECTOR_SIZE,
@@ -194,7 +193,6 @@ from psotrack.support import refuse_to_overwrite
     "--smooth", is_flag=True, default=TRACK.smooth, help="Correct each frame's positions by later frames."
 )
 @silhouette_options
-@BACKGROUND
 @CAMERAS
 @frames_option
 @CACHE
@@ -212,7 +210,6 @@ def track(
     force: bool,
     quiet: bool,
     json_path: Path | None,
-    background: str,
     detector: str | None,
     detector_size: int,
     **settings: Any,
@@ -236,7 +233,6 @@ def track(
     from psotrack.detection import DetectorSettings, find_detector
     from psotrack.methods import check_detections, usable_for
     from psotrack.pipeline import Parts, track_recording
-    from psotrack.silhouettes import find_background
     from psotrack.support import keep_compiled
     from psotrack.trajectories import write_ambiguity, write_trajectories
 
@@ -247,7 +243,6 @@ def track(
         refuse_to_overwrite(path, force)
     chosen = TrackSettings().changed({_setting_name(option): value for option, value in settings.items()})
     parts = Parts(
-        background=find_background(background, chosen.silhouettes),
         detector=None if detector is None else find_detector(detector, DetectorSettings(size=detector_size)),
     )
     keep_compiled(compiled_folder(cache))

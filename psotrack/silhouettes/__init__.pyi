@@ -1,10 +1,11 @@
+from .background_models import find_background
 from .blob_boxes import blob_detections
 from .blobs import LEAST_RADIUS_CELLS, ViewBlobs, border_cells, find_blobs, stack_blobs
-from .computation import Silhouettes, compute, exposures_of
+from .computation import Silhouettes, compute, exposures_of, silhouette_keys, tasks_of
 from .exposures import Exposures, moved_by
-from .foreground import BackgroundModel, Mog2, find_background
+from .foreground import BackgroundModel, Mog2
 from .masks import MaskTask, masks_out, write_masks
-from .settings import ForegroundSettings, Shadows, SilhouetteSettings, check_whole
+from .settings import ForegroundSettings, ScaledSettings, Shadows, SilhouetteSettings, check_whole
 from .store import Task, frames_to_decode, key_of, open_stored, reduced_shape
 from .summed_area import box_sum, of_packed_box_sums, pack, summed_area_table
 
@@ -15,6 +16,7 @@ __all__ = [
     "ForegroundSettings",
     "MaskTask",
     "Mog2",
+    "ScaledSettings",
     "Shadows",
     "SilhouetteSettings",
     "Silhouettes",
@@ -36,7 +38,9 @@ __all__ = [
     "open_stored",
     "pack",
     "reduced_shape",
+    "silhouette_keys",
     "stack_blobs",
     "summed_area_table",
+    "tasks_of",
     "write_masks",
 ]

@@ -15,6 +15,7 @@ from jaxtyping import Int, UInt8
 
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.recordings import Recording, Timeline, TruncatedVideoError
+from psotrack.silhouettes.background_models import find_background
 from psotrack.silhouettes.exposures import Exposures
 from psotrack.silhouettes.foreground import BackgroundModel
 from psotrack.silhouettes.settings import SilhouetteSettings, check_whole
@@ -194,14 +195,15 @@ def compute(
         settings: settings of the silhouettes.
         cache: folder of the store; made if it does not exist.
         jobs: largest number of processes; None is one per processor.
-        background: background model instead of MOG2; None is MOG2 with the given settings.
+        background: a background model of the caller's instead of the one that the settings name.
         all_videos: whether each camera needs a video; if not, a camera without video has no silhouettes, and
             `Silhouettes.at_instants` says that it sees nothing.
         report: progress bar for the frames of all cameras, including the frames from which the background is learned.
 
     Raises:
         InputError: a video is missing, unreadable, ends early, or has another size than its camera.
-        SettingsError: `jobs` is below 1, or the background model yields masks of a wrong number, type or shape.
+        SettingsError: `jobs` is below 1, there is no background model of the settings' name, or the background model
+            yields masks of a wrong number, type or shape.
         OutputError: the store cannot be written; the cameras that were finished stay in the store.
     """
     cache = Path(cache)
@@ -211,33 +213,66 @@ def compute(
     cameras = tuple(name for name in recording.rig.names if name in recording.videos)
     if not cameras:
         raise InputError(recording.folder, expected="at least one video", found="none")
-    videos = [recording.videos[name] for name in cameras]
-    ignored = [recording.ignore.get(name) for name in cameras]
-    with ThreadPoolExecutor(jobs) as threads:
-        keys = list(
-            threads.map(lambda video, ignore: key_of(video, settings, background, ignore), videos, ignored)
-        )
-    tasks = [
-        Task(video, settings, cache, key, background, ignore)
-        for video, key, ignore in zip(videos, keys, ignored, strict=True)
-    ]
+    tasks = tasks_of(recording, settings, cache, background)
+    scaled = tasks[cameras[0]].settings
     try:
-        seconds = _make_missing(tasks, jobs, report)
+        seconds = _make_missing(list(tasks.values()), jobs, report)
     except TruncatedVideoError as error:
         raise _counted_in_instants(error, recording) from None
-    heights, widths = zip(*(reduced_shape(video, settings.reduction) for video in videos), strict=True)
+    heights, widths = zip(
+        *(reduced_shape(task.video, scaled.reduction) for task in tasks.values()), strict=True
+    )
     shape = (max(heights), max(widths))
-    arrays = {name: _open(task) for name, task in zip(cameras, tasks, strict=True)}
+    arrays = {name: _open(task) for name, task in tasks.items()}
     nothing = np.zeros((0, *shape), np.uint8)
     return Silhouettes(
         cameras=recording.rig.names,
-        keys=dict(zip(cameras, keys, strict=True)),
-        reduction=settings.reduction,
+        keys={name: task.key for name, task in tasks.items()},
+        reduction=scaled.reduction,
         num_frames=recording.num_frames,
         shape=shape,
         seconds=seconds,
         arrays=tuple(arrays.get(name, nothing) for name in recording.rig.names),
     )
+
+
+def tasks_of(
+    recording: Recording,
+    settings: SilhouetteSettings,
+    cache: Path,
+    background: BackgroundModel | None = None,
+) -> dict[str, Task]:
+    """The task of each camera that has a video, by name; nothing is computed.
+
+    Args:
+        recording, settings, cache, background: as for `compute`.
+
+    Raises:
+        InputError: a video cannot be read.
+        SettingsError: there is no background model of the settings' name.
+    """
+    videos = {name: recording.videos[name] for name in recording.rig.names if name in recording.videos}
+    if not videos:
+        return {}
+    scaled = settings.scaled([video.image_size_wh for video in videos.values()])
+    model = find_background(settings.background, scaled) if background is None else background
+    ignored = {name: recording.ignore.get(name) for name in videos}
+    with ThreadPoolExecutor() as threads:
+        keys = threads.map(lambda name: key_of(videos[name], scaled, model, ignored[name]), videos)
+    return {
+        name: Task(video, scaled, cache, key, model, ignored[name])
+        for (name, video), key in zip(videos.items(), keys, strict=True)
+    }
+
+
+def silhouette_keys(recording: Recording, settings: SilhouetteSettings) -> dict[str, str]:
+    """Key of the silhouettes of each camera that has a video, by name; nothing is computed.
+
+    Raises:
+        InputError: a video cannot be read.
+        SettingsError: there is no background model of the settings' name.
+    """
+    return {name: task.key for name, task in tasks_of(recording, settings, Path()).items()}
 
 
 def _counted_in_instants(error: TruncatedVideoError, recording: Recording) -> TruncatedVideoError:

@@ -21,11 +21,7 @@ import msgspec
 import numpy as np
 from jaxtyping import UInt8
 
-from psotrack.silhouettes.settings import ForegroundSettings, SilhouetteSettings
-from psotrack.support import make_plugin
-
-#: Names of the background models of this package.
-MOG2, LIVING = "mog2", "living"
+from psotrack.silhouettes.settings import ForegroundSettings
 
 #: MOG2's label of shadow pixels; foreground is 255.
 _SHADOW = 127
@@ -103,25 +99,6 @@ class Mog2:
     ) -> Iterator[UInt8[np.ndarray, "working_height working_width"]]:
         """See `BackgroundModel`."""
         return foreground(learning, frames, self.settings)
-
-
-def find_background(name: str, settings: SilhouetteSettings) -> BackgroundModel | None:
-    """The background model of a name: "mog2", "living" or a plugin; None for MOG2, the default of `compute`.
-
-    Raises:
-        SettingsError: there is no background model of this name.
-    """
-    if name == MOG2:
-        return None
-    if name == LIVING:
-        # The living background reduces frames with this module's functions.
-        from psotrack.silhouettes.living_background import Living
-
-        return Living(settings)
-    model: BackgroundModel = make_plugin(
-        "background", name, settings, interface=BackgroundModel, setting="background", built_in=[MOG2, LIVING]
-    )
-    return model
 
 
 def foreground(

@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal, get_args
 
 import msgspec
 
 from psotrack.errors import SettingsError, check_positive
 from psotrack.support import check_types
+
+#: Names of the background models of this package.
+MOG2, LIVING = "mog2", "living"
+
+#: Longer side of an image over the width of a drone, where the drones' size in the images is not given: 40 pixels in an
+#: image of 1920 pixels.
+_DRONES_ACROSS = 48
+#: A drone that is this many pixels wide in the reduced image keeps its shape.
+_LEAST_DRONE_PX = 20
+#: Narrower drones are not reduced for storing either, pixels.
+_LEAST_STORED_PX = 8
+#: Speckle: blobs narrower than this share of a drone's width; a blob has 4 pixels at least.
+_SPECKLE, _LEAST_BLOB_PX = 0.2, 4
 
 #: Meaning of MOG2's shadow label: foreground, background, or foreground with a smaller weight.
 Shadows = Literal["keep", "drop", "weight"]
@@ -19,35 +33,18 @@ def check_whole(name: str, value: object, *, lowest: int) -> None:
         raise SettingsError(name, expected=f"a whole number of at least {lowest}", found=f"{value}")
 
 
-class ForegroundSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings that separate foreground from background.
+class _CommonSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings that do not depend on the size of the images; the docstrings of the subclasses describe them."""
 
-    Attributes:
-        working_reduction: whole factor by which the image is reduced, by area, before MOG2; 1 is the full image.
-        num_learning_frames: largest number of frames, spread over the video, from which the background is learned.
-        learning_rate: learning rate per frame in the second pass, in [0, 1]; 0 keeps the learned background.
-        var_threshold: squared Mahalanobis distance from the background beyond which a pixel is foreground.
-        shadows: meaning of MOG2's shadow label.
-        shadow_weight: weight of a shadow pixel in [0, 1], for `shadows="weight"`.
-        min_blob_px: 8-connected blobs with fewer pixels of the full image are removed.
-
-    Raises:
-        SettingsError: a value is out of range.
-    """
-
-    working_reduction: int = 2
     num_learning_frames: int = 50
     learning_rate: float = 0.0
     var_threshold: float = 8.0
     shadows: Shadows = "keep"
     shadow_weight: float = 0.5
-    min_blob_px: int = 64
 
     def __post_init__(self) -> None:
         check_types(self)
-        for name in ("working_reduction", "num_learning_frames"):
-            check_whole(name, getattr(self, name), lowest=1)
-        check_whole("min_blob_px", self.min_blob_px, lowest=0)
+        check_whole("num_learning_frames", self.num_learning_frames, lowest=1)
         for name in ("learning_rate", "shadow_weight"):
             if not 0 <= getattr(self, name) <= 1:
                 raise SettingsError(name, expected="a number from 0 to 1", found=f"{getattr(self, name):g}")
@@ -58,8 +55,30 @@ class ForegroundSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unkno
             )
 
 
-class SilhouetteSettings(ForegroundSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of silhouettes: `ForegroundSettings` and the reduction.
+class ForegroundSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings that separate foreground from background, for images of a known size.
+
+    Attributes:
+        num_learning_frames, learning_rate, var_threshold, shadows, shadow_weight: as in `SilhouetteSettings`.
+        working_reduction: whole factor by which the image is reduced, by area, before the background model sees the
+            image; 1 is the full image.
+        min_blob_px: 8-connected blobs with fewer pixels of the full image are removed.
+
+    Raises:
+        SettingsError: a value is out of range.
+    """
+
+    working_reduction: int = 2
+    min_blob_px: int = 64
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_whole("working_reduction", self.working_reduction, lowest=1)
+        check_whole("min_blob_px", self.min_blob_px, lowest=0)
+
+
+class ScaledSettings(ForegroundSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of silhouettes for images of a known size: `ForegroundSettings` and the reduction.
 
     Attributes:
         reduction: each stored value covers `reduction` x `reduction` pixels; a multiple of `working_reduction`.
@@ -73,9 +92,85 @@ class SilhouetteSettings(ForegroundSettings, frozen=True, kw_only=True, forbid_u
     def __post_init__(self) -> None:
         super().__post_init__()
         check_whole("reduction", self.reduction, lowest=1)
-        if self.reduction % self.working_reduction:
-            raise SettingsError(
-                "reduction",
-                expected=f"a multiple of working_reduction, {self.working_reduction}",
-                found=f"{self.reduction}",
+        _check_multiple(self.reduction, self.working_reduction)
+
+
+class SilhouetteSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of silhouettes.
+
+    Attributes:
+        background: name of the background model: "living", "mog2" or a plugin.
+        drone_px: width of the smallest drone in the images, pixels; sets the next three where they are None. None: the
+            longer side of the images / 48, which is 40 pixels in an image of 1920.
+        reduction: each stored value covers `reduction` x `reduction` pixels; a multiple of `working_reduction`.
+        working_reduction: whole factor by which the image is reduced, by area, before the background model sees the
+            image; 1 is the full image.
+        min_blob_px: 8-connected blobs with fewer pixels of the full image are removed.
+        num_learning_frames: largest number of frames, spread over the video, from which the background is learned.
+        learning_rate: learning rate per frame in the second pass of "mog2", in [0, 1]; 0 keeps the learned background.
+        var_threshold: squared Mahalanobis distance from the background beyond which a pixel is foreground, for "mog2".
+        shadows: meaning of MOG2's shadow label, for "mog2".
+        shadow_weight: weight of a shadow pixel in [0, 1], for `shadows="weight"` of "mog2".
+
+    Raises:
+        SettingsError: a value is out of range, or belongs to another background model.
+    """
+
+    background: str = LIVING
+    drone_px: float | None = None
+    reduction: int | None = None
+    working_reduction: int | None = None
+    min_blob_px: int | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.drone_px is not None:
+            check_positive("drone_px", self.drone_px)
+        for name, lowest in (("reduction", 1), ("working_reduction", 1), ("min_blob_px", 0)):
+            if getattr(self, name) is not None:
+                check_whole(name, getattr(self, name), lowest=lowest)
+        if self.reduction is not None and self.working_reduction is not None:
+            _check_multiple(self.reduction, self.working_reduction)
+        if self.background == LIVING:
+            self._check_unused()
+
+    def _check_unused(self) -> None:
+        for name in ("learning_rate", "var_threshold", "shadows", "shadow_weight"):
+            default = getattr(_CommonSettings(), name)
+            if getattr(self, name) != default:
+                raise SettingsError(
+                    name,
+                    expected=f"{default}, because the background model {LIVING} does not use this setting",
+                    found=f"{getattr(self, name)}",
+                    remedy=f"or choose the background model {MOG2}",
+                )
+
+    def scaled(self, image_sizes_wh: Sequence[tuple[int, int]]) -> ScaledSettings:
+        """These settings for images of given sizes.
+
+        Args:
+            image_sizes_wh: widths and heights of the images, pixels, at least one.
+        """
+        across_px = self.drone_px or max(map(max, image_sizes_wh)) / _DRONES_ACROSS
+        working, reduction = self.working_reduction, self.reduction
+        if working is None:
+            largest = max(1, int(across_px / _LEAST_DRONE_PX))
+            working = next(
+                factor for factor in range(largest, 0, -1) if reduction is None or reduction % factor == 0
             )
+        if reduction is None:
+            reduction = working * (2 if across_px >= _LEAST_STORED_PX else 1)
+        least_px = self.min_blob_px
+        if least_px is None:
+            least_px = max(_LEAST_BLOB_PX, round((_SPECKLE * across_px) ** 2))
+        common = {name: getattr(self, name) for name in _CommonSettings.__struct_fields__}
+        return ScaledSettings(working_reduction=working, reduction=reduction, min_blob_px=least_px, **common)
+
+
+def _check_multiple(reduction: int, working_reduction: int) -> None:
+    if reduction % working_reduction:
+        raise SettingsError(
+            "reduction",
+            expected=f"a multiple of working_reduction, {working_reduction}",
+            found=f"{reduction}",
+        )

@@ -24,7 +24,7 @@ from zarr.codecs import ZstdCodec
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.recordings import VideoInfo, digest_video, read_frames, read_mask
 from psotrack.silhouettes.foreground import BackgroundModel, Mog2, coverage, learning_step
-from psotrack.silhouettes.settings import SilhouetteSettings
+from psotrack.silhouettes.settings import ScaledSettings
 from psotrack.support import Advance, digest_file, digest_record, identify
 
 logger = logging.getLogger(__name__)
@@ -56,7 +56,7 @@ class Task:
     """
 
     video: VideoInfo
-    settings: SilhouetteSettings
+    settings: ScaledSettings
     cache: Path
     key: str
     background: BackgroundModel | None = None
@@ -65,7 +65,7 @@ class Task:
 
 def key_of(
     video: VideoInfo,
-    settings: SilhouetteSettings,
+    settings: ScaledSettings,
     background: BackgroundModel | None = None,
     ignore: Path | None = None,
 ) -> str:

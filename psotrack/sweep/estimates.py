@@ -166,11 +166,12 @@ def _rule_s(rows: pd.DataFrame) -> pd.Series:
 
 def _silhouettes_s(cell: Cell, inputs: Inputs) -> float:
     """Time of making a cell's missing silhouettes, with all processes."""
-    recording, keys, settings = inputs.recording_of(cell), inputs.keys_of(cell), cell.settings.silhouettes
+    recording, keys = inputs.recording_of(cell), inputs.keys_of(cell)
+    scaled = cell.settings.silhouettes.scaled([video.image_size_wh for video in recording.videos.values()])
     megapixels = [
         video.num_frames * video.image_size_wh[0] * video.image_size_wh[1] / 1e6
         for name, video in recording.videos.items()
-        if open_stored(inputs.cache / keys[name], video.num_frames, reduced_shape(video, settings.reduction))
+        if open_stored(inputs.cache / keys[name], video.num_frames, reduced_shape(video, scaled.reduction))
         is None
     ]
     jobs = min(inputs.jobs or os.cpu_count() or 1, max(len(megapixels), 1))

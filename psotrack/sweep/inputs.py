@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,7 @@ from psotrack.geometry import Camera
 from psotrack.methods import check_detections, detection_files_of, usable_for
 from psotrack.recordings import Recording
 from psotrack.settings import YOLO
-from psotrack.silhouettes import Silhouettes, SilhouetteSettings, compute
-from psotrack.silhouettes import key_of as silhouettes_key
+from psotrack.silhouettes import Silhouettes, SilhouetteSettings, compute, silhouette_keys
 from psotrack.support import digest_file
 from psotrack.sweep.cells import Cell
 from psotrack.sweep.locks import Locks
@@ -134,15 +132,7 @@ class Inputs:
                 raise InputError(recording.folder, expected="a reference to compare with", found="none")
             keys = {}
             if cell.settings.needs_silhouettes:
-                settings = cell.settings.silhouettes
-                with ThreadPoolExecutor() as threads:
-                    of_videos = threads.map(
-                        lambda name: silhouettes_key(
-                            recording.videos[name], settings, ignore=recording.ignore.get(name)
-                        ),
-                        recording.videos,
-                    )
-                    keys = dict(zip(recording.videos, of_videos, strict=True))
+                keys = silhouette_keys(recording, cell.settings.silhouettes)
             keys |= {
                 "calibration": _digest_arrays(*_arrays_of(recording.rig.cameras)),
                 "reference": _digest_arrays(recording.truth.position_m, recording.truth.orientation_wxyz),

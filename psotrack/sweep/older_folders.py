@@ -28,6 +28,8 @@ _NEW = {
     "clocks": "given",
     "errors.rig_deg": 0.0,
     "errors.pixel_px": 0.0,
+    "silhouettes.background": "mog2",
+    "silhouettes.drone_px": None,
 }
 
 #: Values of version 0.1 for which the value is None today, where the data may say more.
