@@ -16,7 +16,7 @@ from psotrack.methods import Method, check_detections
 from psotrack.pipeline import Parts, TrackedRecording, track_recording
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import BackgroundModel, ForegroundSettings, Mog2
+from psotrack.silhouettes import BackgroundModel, ForegroundSettings, Living
 from psotrack.support import no_progress, progress_bar, user_cache
 from psotrack.tracking import Score, Search
 
@@ -118,6 +118,6 @@ def detect_markers(
     return MarkerDetector(dictionary, thorough=True).detect(np.asarray(grey, np.uint8))
 
 
-def background_model(settings: ForegroundSettings | None = None) -> Mog2:
-    """The background model of this package, MOG2 (Zivkovic 2004), with given or default settings."""
-    return Mog2(ForegroundSettings() if settings is None else settings)
+def background_model(settings: ForegroundSettings | None = None) -> Living:
+    """The default background model, which goes on learning, with given or default settings."""
+    return Living(ForegroundSettings() if settings is None else settings)

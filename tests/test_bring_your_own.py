@@ -21,7 +21,7 @@ from psotrack.cli import cli
 from psotrack.errors import SettingsError
 from psotrack.geometry import project_boxes
 from psotrack.recordings import read_frames
-from psotrack.silhouettes import SilhouetteSettings, find_background, key_of
+from psotrack.silhouettes import ScaledSettings, find_background, key_of
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.tracking import camera_weights, find_score, find_search, foreground_and_area
 from psotrack.trajectories import DroneSizes, Status, Tracks
@@ -517,7 +517,7 @@ def test_search_and_background_by_entry_points(run_track):
     tracks, record = run_track("--search", "prediction", "--background", "median", "--score", "hard", *SMALL)
     assert record["settings"]["swarm"]["search"] == "prediction"
     assert record["parts"] == {
-        "background": {"class": "own_parts.MedianBackground", "key": {"threshold": 25, "reduction": 2}}
+        "background": {"class": "own_parts.MedianBackground", "key": {"threshold": 25, "reduction": 1}}
     }
     # The measured position is always the predicted one, so the drones fly on with the velocity of frame 0.
     steps_m = np.diff(tracks.position_m, axis=0)
@@ -564,11 +564,11 @@ def test_a_detector_by_an_entry_point(run_track, site, recording, empty_hall):
             "score.kind: expected one of soft, hard, high-dice, found iou",
         ),
         (
-            lambda: find_background("mean", SilhouetteSettings()),
+            lambda: find_background("mean", ScaledSettings()),
             "background: expected one of mog2, living, absent, median, found mean",
         ),
         (
-            lambda: find_background("absent", SilhouetteSettings()),
+            lambda: find_background("absent", ScaledSettings()),
             "background absent: expected own_parts:no_such_function to be importable, found module 'own_parts' "
             "has no attribute 'no_such_function'",
         ),

@@ -13,7 +13,7 @@ from psotrack.geometry import Rig, project
 from psotrack.initiation.initialisation import choose_paths, fill_unknown_sizes, find_drones
 from psotrack.initiation.paths import propose_paths
 from psotrack.silhouettes import border_cells, find_blobs, stack_blobs
-from psotrack.silhouettes.blobs import MOST_BLOBS, Blobs
+from psotrack.silhouettes.blobs import Blobs
 
 FPS = 25.0
 REDUCTION = 2
@@ -316,17 +316,17 @@ def test_the_order_of_the_blobs_does_not_matter(random):
     np.testing.assert_allclose(again[np.lexsort(again.T)], found[np.lexsort(found.T)], atol=0.01)
 
 
-def test_only_the_largest_blobs_of_a_noisy_silhouette_are_used():
-    """An image has 70 blobs of increasing width. Regression: the search for new tracks used all of them."""
-    image = np.zeros((70 * 5, 90), np.uint8)
+def test_all_blobs_of_a_silhouette_count_from_large_to_small():
+    """An image has 70 blobs of increasing width. Regression: only the 50 largest counted, without a word."""
+    image = np.zeros((70 * 5 + 4, 90), np.uint8)
     for row in range(70):
-        image[5 * row + 1 : 5 * row + 3, 2 : 4 + row] = 255
+        image[5 * row + 4 : 5 * row + 6, 4 : 6 + row] = 255
     many = find_blobs(image, 3)
-    assert (many.size_px[:, 0] / 3).tolist() == list(range(71, 71 - MOST_BLOBS, -1))
+    assert (many.size_px[:, 0] / 3).tolist() == list(range(71, 1, -1))
     few = Blobs(np.zeros((1, 2)), np.ones((1, 2)), np.zeros(1, bool))
     stacked = stack_blobs([[many, few]], 2, 3)
-    assert stacked.whole.shape == (1, 2, MOST_BLOBS)
-    assert np.isfinite(stacked.half_px[0, 1]).all(axis=-1).tolist() == [True] + [False] * (MOST_BLOBS - 1)
+    assert stacked.whole.shape == (1, 2, 70)
+    assert np.isfinite(stacked.half_px[0, 1]).all(axis=-1).tolist() == [True] + [False] * 69
     assert not stacked.whole[0, 1].any()
 
 

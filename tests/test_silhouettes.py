@@ -202,7 +202,7 @@ def test_the_background_model_is_in_the_key(video_folder: Path) -> None:
     mog2, living = (silhouette_keys(recording, settings) for settings in models)
     assert mog2.keys() == living.keys() == set(recording.rig.names)
     assert not set(mog2.values()) & set(living.values())
-    with pytest.raises(SettingsError, match="background: expected .*found liveing"):
+    with pytest.raises(SettingsError, match=r"background: expected .*found liveing"):
         silhouette_keys(recording, SilhouetteSettings(background="liveing"))
 
 
@@ -235,7 +235,7 @@ def test_reduction_and_smallest_blob_follow_from_the_drones_size(
 )
 def test_what_the_living_background_does_not_use_is_refused(setting: str, value: object) -> None:
     with pytest.raises(
-        SettingsError, match=f"{setting}: expected .*the background model living does not use"
+        SettingsError, match=rf"{setting}: expected .*the background model living does not use"
     ):
         SilhouetteSettings(**{setting: value})
     assert getattr(SilhouetteSettings(background="mog2", **{setting: value}), setting) == value

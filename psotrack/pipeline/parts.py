@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from psotrack.detection import Detector
 from psotrack.errors import SettingsError
 from psotrack.methods import Method
+from psotrack.recordings import Recording
 from psotrack.settings import YOLO, TrackSettings
-from psotrack.silhouettes import BackgroundModel
+from psotrack.silhouettes import BackgroundModel, Living, SilhouetteSettings, find_background
 from psotrack.support import check_interface, identify, make_plugin
 from psotrack.tracking import Score, Search
 
@@ -58,6 +59,19 @@ _INTERFACES: dict[str, type] = {
     "background": BackgroundModel,
     "detector": Detector,
 }
+
+
+def with_background(parts: Parts, recording: Recording, settings: SilhouetteSettings) -> Parts:
+    """The parts with the background model that the settings name, where that model is a plugin.
+
+    Raises:
+        SettingsError: there is no background model of the settings' name.
+    """
+    if parts.background is not None or not recording.videos:
+        return parts
+    scaled = settings.scaled([video.image_size_wh for video in recording.videos.values()])
+    model = find_background(settings.background, scaled)
+    return parts if model is None or isinstance(model, Living) else replace(parts, background=model)
 
 
 def method_plugin(settings: TrackSettings, parts: Parts) -> Method | None:

@@ -113,6 +113,7 @@ def finish(
         "camera_errors": {} if errors is None else errors.record(recording.rig.names),
         "encounters": [asdict(encounter) for encounter in identities.encounters],
         "input_keys": dict(result.input_keys),
+        "left_out": {} if silhouettes is None else dict(silhouettes.left_out),
         "seconds": {stage: round(value, 4) for stage, value in (seconds | {"total": own_s}).items()},
         **environment(),
     }

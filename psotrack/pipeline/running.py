@@ -23,7 +23,7 @@ from psotrack.geometry import views_meet
 from psotrack.initiation import MovingPoints, start_source
 from psotrack.methods import MethodResult, usable_for
 from psotrack.pipeline.clock_correction import advise_on_clocks, estimate_clocks, with_clocks
-from psotrack.pipeline.parts import Parts, check_detector_is_used, tracks_silhouettes
+from psotrack.pipeline.parts import Parts, check_detector_is_used, tracks_silhouettes, with_background
 from psotrack.pipeline.preparation import PreparedRun, prepare
 from psotrack.pipeline.results import TrackedRecording, finish
 from psotrack.pipeline.stages import (
@@ -90,6 +90,7 @@ def track_recording(
         settings = msgspec.structs.replace(settings, detections=str(folder))
     silhouettes = None
     if needs_silhouettes:
+        parts = with_background(parts, recording, settings.silhouettes)
         silhouettes = compute(
             recording,
             settings.silhouettes,

@@ -4,6 +4,7 @@ from .blobs import LEAST_RADIUS_CELLS, ViewBlobs, border_cells, find_blobs, stac
 from .computation import Silhouettes, compute, exposures_of, silhouette_keys, tasks_of
 from .exposures import Exposures, moved_by
 from .foreground import BackgroundModel, Mog2
+from .living_background import Living, LivingBackground
 from .masks import MaskTask, masks_out, write_masks
 from .settings import ForegroundSettings, ScaledSettings, Shadows, SilhouetteSettings, check_whole
 from .store import Task, frames_to_decode, key_of, open_stored, reduced_shape
@@ -14,6 +15,8 @@ __all__ = [
     "BackgroundModel",
     "Exposures",
     "ForegroundSettings",
+    "Living",
+    "LivingBackground",
     "MaskTask",
     "Mog2",
     "ScaledSettings",

@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.recordings import Detections
-from psotrack.silhouettes.blobs import MIN_COVERAGE, find_blobs
+from psotrack.silhouettes.blobs import find_blobs
 from psotrack.silhouettes.computation import Silhouettes
+from psotrack.silhouettes.settings import MIN_COVERAGE
 from psotrack.support import Report, no_progress
 
 #: Number of frames that are read together.

@@ -10,16 +10,13 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from psotrack._typing import Array
 from psotrack.silhouettes.exposures import Exposures
+from psotrack.silhouettes.settings import MIN_COVERAGE
 
-#: Smallest coverage of a cell that belongs to a blob, out of 255.
-MIN_COVERAGE = 64
 #: Smallest number of cells of a blob, because a single cell is often noise. The silhouettes have a limit of their own,
 #: `min_blob_px`.
 MIN_BLOB_CELLS = 2
 #: Smallest uncertainty of a blob's middle, cells.
 LEAST_RADIUS_CELLS = 1.5
-#: Largest number of blobs per image; in images with more blobs, only the largest count.
-MOST_BLOBS = 50
 
 
 @dataclass(frozen=True)
@@ -98,7 +95,7 @@ def find_blobs(
     closed = cv2.morphologyEx(foreground, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     _, _, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
     stats = stats[1:][stats[1:, cv2.CC_STAT_AREA] >= MIN_BLOB_CELLS]
-    stats = stats[np.argsort(-stats[:, 2] * stats[:, 3], kind="stable")[:MOST_BLOBS]]
+    stats = stats[np.argsort(-stats[:, 2] * stats[:, 3], kind="stable")]
     corner, size = stats[:, :2].astype(float), stats[:, 2:4].astype(float)
     end = coverage.shape[::-1] if border is None else border
     whole = ((corner > 0) & (corner + size < end)).all(axis=-1)

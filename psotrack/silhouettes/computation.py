@@ -6,7 +6,7 @@ import logging
 import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +23,13 @@ from psotrack.silhouettes.store import (
     Task,
     frames_to_decode,
     key_of,
+    left_out,
     open_stored,
     reduced_shape,
     remove_stale,
     store,
 )
+from psotrack.silhouettes.usable_frames import Interval, in_words
 from psotrack.support import Report, map_in_processes, no_progress, short_repr
 
 __all__ = ["SilhouetteSettings", "Silhouettes", "compute"]
@@ -50,6 +52,9 @@ class Silhouettes:
         arrays: one array (frames, height, width) per camera, stored or in memory; cameras may differ in frames, height
             and width. A camera without video has no frames.
         exposures: when the frames were exposed; None where frame i of every camera is instant i.
+        left_out: frames of a camera's video in which foreground is everywhere, as intervals (first frame, frame after
+            the last), by camera name; these frames show no foreground in `arrays`, and `at_instants` says that the
+            camera sees nothing.
     """
 
     cameras: tuple[str, ...]
@@ -60,6 +65,7 @@ class Silhouettes:
     seconds: Mapping[str, float]
     arrays: tuple[zarr.Array | FramesOfInstants | UInt8[np.ndarray, "frames height width"], ...]
     exposures: Exposures | None = None
+    left_out: Mapping[str, list[Interval]] = field(default_factory=dict)
 
     __repr__ = short_repr
 
@@ -106,7 +112,11 @@ class Silhouettes:
         frames = self.read(start, stop)
         exposures = None if self.exposures is None else self.exposures[start:stop]
         arrays = tuple(frames[:, camera] for camera in range(len(self.cameras)))
-        return replace(self, num_frames=stop - start, arrays=arrays, exposures=exposures)
+        left_out = self.left_out
+        if self.exposures is None:
+            within = {name: _within(intervals, start, stop) for name, intervals in left_out.items()}
+            left_out = {name: intervals for name, intervals in within.items() if intervals}
+        return replace(self, num_frames=stop - start, arrays=arrays, exposures=exposures, left_out=left_out)
 
     def at_instants(self, timeline: Timeline) -> Silhouettes:
         """These silhouettes with instants instead of frames: each camera shows its frame nearest to the instant.
@@ -121,23 +131,33 @@ class Silhouettes:
             raise SettingsError(
                 "timeline", expected=f"cameras {self.cameras}", found=f"cameras {timeline.cameras}"
             )
+        assert self.exposures is None, "instants of instants have no meaning"
         filmed = np.array([array.shape[0] > 0 for array in self.arrays])
-        if timeline.is_synchronous and timeline.num_instants == self.num_frames and filmed.all():
+        whole = filmed.all() and not self.left_out
+        if timeline.is_synchronous and timeline.num_instants == self.num_frames and whole:
             return self
+        usable = filmed & (timeline.frame >= 0)
+        for name, intervals in self.left_out.items():
+            camera = self.cameras.index(name)
+            for start, stop in intervals:
+                usable[:, camera] &= (timeline.frame[:, camera] < start) | (timeline.frame[:, camera] >= stop)
         timeline = replace(
             timeline,
-            frame=np.where(filmed, timeline.frame, -1),
-            offset_s=np.where(filmed, timeline.offset_s, 0.0),
+            frame=np.where(usable, timeline.frame, -1),
+            offset_s=np.where(usable, timeline.offset_s, 0.0),
         )
         arrays = tuple(
-            FramesOfInstants(array, frame)
-            for array, frame in zip(self.arrays, timeline.frame.T, strict=True)
-            if not isinstance(array, FramesOfInstants)
+            FramesOfInstants(array, frame) for array, frame in zip(self.arrays, timeline.frame.T, strict=True)
         )
-        assert len(arrays) == len(self.arrays), "instants of instants have no meaning"
         return replace(
             self, num_frames=timeline.num_instants, arrays=arrays, exposures=exposures_of(timeline)
         )
+
+
+def _within(intervals: list[Interval], start: int, stop: int) -> list[Interval]:
+    """The parts of intervals in the frames [start, stop), counted from `start`."""
+    cut = [(max(first, start) - start, min(last, stop) - start) for first, last in intervals]
+    return [(first, last) for first, last in cut if first < last]
 
 
 def exposures_of(timeline: Timeline) -> Exposures:
@@ -153,11 +173,11 @@ class FramesOfInstants:
     """The frames of one camera by instants instead of their numbers.
 
     Attributes:
-        array: (frames, height, width), the camera's frames.
+        array: the camera's frames.
         frame: (instants,), number of the frame of each instant; -1 for none, which reads as 0.
     """
 
-    array: zarr.Array | UInt8[np.ndarray, "frames height width"]
+    array: zarr.Array | FramesOfInstants | UInt8[np.ndarray, "frames height width"]
     frame: Int[np.ndarray, "instants"]
 
     @property
@@ -223,7 +243,11 @@ def compute(
         *(reduced_shape(task.video, scaled.reduction) for task in tasks.values()), strict=True
     )
     shape = (max(heights), max(widths))
-    arrays = {name: _open(task) for name, task in tasks.items()}
+    stored = {name: _open(task) for name, task in tasks.items()}
+    unusable = {name: intervals for name, array in stored.items() if (intervals := left_out(array))}
+    arrays = {name: _without(array, unusable.get(name, [])) for name, array in stored.items()}
+    for name, intervals in unusable.items():
+        _say_left_out(name, tasks[name], intervals)
     nothing = np.zeros((0, *shape), np.uint8)
     return Silhouettes(
         cameras=recording.rig.names,
@@ -233,6 +257,31 @@ def compute(
         shape=shape,
         seconds=seconds,
         arrays=tuple(arrays.get(name, nothing) for name in recording.rig.names),
+        left_out=unusable,
+    )
+
+
+def _without(array: zarr.Array, intervals: list[Interval]) -> zarr.Array | FramesOfInstants:
+    """Stored silhouettes of which some frames show no foreground."""
+    if not intervals:
+        return array
+    frame = np.arange(array.shape[0])
+    for start, stop in intervals:
+        frame[start:stop] = -1
+    return FramesOfInstants(array, frame)
+
+
+def _say_left_out(name: str, task: Task, intervals: list[Interval]) -> None:
+    """Warn that frames of a camera are left out."""
+    count = sum(stop - start for start, stop in intervals)
+    second = max(1, round(task.video.fps))
+    logger.warning(
+        "camera %s: %d of %d frames are left out, because foreground is everywhere in the image: frames %s; "
+        "a camera that moved, or light that the background model does not follow?",
+        name,
+        count,
+        task.video.num_frames,
+        in_words(intervals, gap_frames=second),
     )
 
 

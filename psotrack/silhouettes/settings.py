@@ -13,6 +13,9 @@ from psotrack.support import check_types
 #: Names of the background models of this package.
 MOG2, LIVING = "mog2", "living"
 
+#: Smallest coverage of a cell that belongs to a blob, out of 255.
+MIN_COVERAGE = 64
+
 #: Longer side of an image over the width of a drone, where the drones' size in the images is not given: 40 pixels in an
 #: image of 1920 pixels.
 _DRONES_ACROSS = 48

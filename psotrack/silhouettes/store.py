@@ -25,6 +25,7 @@ from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.recordings import VideoInfo, digest_video, read_frames, read_mask
 from psotrack.silhouettes.foreground import BackgroundModel, Mog2, coverage, learning_step
 from psotrack.silhouettes.settings import ScaledSettings
+from psotrack.silhouettes.usable_frames import Interval, foreground_is_everywhere, intervals_of
 from psotrack.support import Advance, digest_file, digest_record, identify
 
 logger = logging.getLogger(__name__)
@@ -34,6 +35,9 @@ SCHEMA = 1
 
 #: Number of frames that are compressed and read together.
 CHUNK_FRAMES = 25
+
+#: Attribute of stored silhouettes: intervals of the frames in which the foreground makes no sense.
+_LEFT_OUT = "left_out"
 
 #: Brighter pixels of an image of what is ignored are ignored.
 _GREY = 127
@@ -96,7 +100,14 @@ def open_stored(path: Path, num_frames: int, shape: tuple[int, int]) -> zarr.Arr
         return None
     # zarr reads a missing chunk as zeros, which would look like frames without foreground.
     whole = array.shape == (num_frames, *shape) and array.nchunks_initialized == array.nchunks
+    whole &= _LEFT_OUT in array.attrs
     return array if whole else None
+
+
+def left_out(array: zarr.Array) -> list[Interval]:
+    """Intervals of the frames of stored silhouettes in which the foreground makes no sense."""
+    intervals: Any = array.attrs[_LEFT_OUT]  # as JSON keeps them
+    return [(int(start), int(stop)) for start, stop in intervals]
 
 
 def reduced_shape(video: VideoInfo, reduction: int) -> tuple[int, int]:
@@ -156,7 +167,7 @@ def remove_stale(cache: Path) -> None:
 
 def _write(folder: Path, shape: tuple[int, int], task: Task, advance: Advance) -> dict[str, float]:
     video, settings = task.video, task.settings
-    array = zarr.create_array(
+    array: zarr.Array = zarr.create_array(
         folder,
         shape=(video.num_frames, *shape),
         chunks=(CHUNK_FRAMES, *shape),
@@ -168,12 +179,14 @@ def _write(folder: Path, shape: tuple[int, int], task: Task, advance: Advance) -
         overwrite=True,
     )
     started, seconds = time.perf_counter(), {"decode": 0.0, "foreground": 0.0}
-    chunk = np.empty((CHUNK_FRAMES, *shape), np.uint8)
+    chunk, everywhere = np.empty((CHUNK_FRAMES, *shape), np.uint8), []
     for index, mask in enumerate(foreground_of(task, seconds, advance)):
         chunk[index % CHUNK_FRAMES] = coverage(mask, settings.reduction // settings.working_reduction)
         count = index % CHUNK_FRAMES + 1
         if count == CHUNK_FRAMES or index + 1 == video.num_frames:
             array[index + 1 - count : index + 1] = chunk[:count]
+            everywhere.append(foreground_is_everywhere(chunk[:count]))
+    array.update_attributes({_LEFT_OUT: intervals_of(np.concatenate([np.zeros(0, bool), *everywhere]))})
     seconds["foreground"] = time.perf_counter() - started - seconds["decode"]
     return seconds
 

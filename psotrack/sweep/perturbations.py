@@ -127,6 +127,7 @@ def _of_cameras(silhouettes: Silhouettes, names: tuple[str, ...]) -> Silhouettes
         silhouettes,
         cameras=names,
         keys={name: silhouettes.keys[name] for name in names if name in silhouettes.keys},
+        left_out={name: silhouettes.left_out[name] for name in names if name in silhouettes.left_out},
         arrays=tuple(silhouettes.arrays[silhouettes.cameras.index(name)] for name in names),
     )
 

@@ -1,0 +1,63 @@
+"""Frames whose foreground makes no sense: foreground everywhere in the image.
+
+A camera that was pushed, a light that the background model does not follow, rain on the lens: most parts of the image
+differ from the background, and no drone can be told from the rest. Such a frame is left out, as if the camera had no
+frame at that time.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from psotrack.silhouettes.settings import MIN_COVERAGE
+
+#: Parts along the longer side of the image.
+_PARTS = 16
+#: Share of the parts with foreground from which on foreground is everywhere. Ten drones of a part's size touch 40 of
+#: 144 parts; a single drone that touches more than half of them is nearer than its distance can be told from its size.
+_MOST_PARTS = 0.5
+
+#: First frame and the frame after the last of one interval.
+Interval = tuple[int, int]
+
+
+def foreground_is_everywhere(
+    silhouettes: UInt8[np.ndarray, "frames height width"],
+) -> Bool[np.ndarray, "frames"]:
+    """Whether most parts of each silhouette have foreground.
+
+    Args:
+        silhouettes: (frames, height, width), coverage, 0 to 255.
+    """
+    num_frames, height, width = silhouettes.shape
+    side = max(1, -(-max(height, width) // _PARTS))
+    if not num_frames:
+        return np.zeros(0, bool)
+    rows, columns = np.arange(0, height, side), np.arange(0, width, side)
+    most = np.maximum.reduceat(np.maximum.reduceat(silhouettes, rows, axis=1), columns, axis=2)
+    return (most >= MIN_COVERAGE).mean(axis=(1, 2)) > _MOST_PARTS
+
+
+def intervals_of(chosen: Bool[np.ndarray, "frames"]) -> list[Interval]:
+    """The intervals of the chosen frames, in order."""
+    changes = np.flatnonzero(np.diff(chosen.astype(np.int8), prepend=0, append=0))
+    return [(int(start), int(stop)) for start, stop in zip(changes[::2], changes[1::2], strict=True)]
+
+
+def in_words(intervals: list[Interval], *, gap_frames: int) -> str:
+    """Intervals as text: "frames 120 to 180, 300"; those with short gaps between them as one interval.
+
+    Args:
+        intervals: intervals in order, at least one.
+        gap_frames: shorter gaps are not named.
+    """
+    starts = [intervals[0][0], *(b[0] for a, b in pairwise(intervals) if b[0] - a[1] >= gap_frames)]
+    stops = [*(a[1] for a, b in pairwise(intervals) if b[0] - a[1] >= gap_frames), intervals[-1][1]]
+    named = [
+        f"{start}" if stop - start == 1 else f"{start} to {stop - 1}"
+        for start, stop in zip(starts, stops, strict=True)
+    ]
+    return ", ".join(named)
