@@ -42,7 +42,7 @@ SEQUENCE = "S02_D4_A"
 NUM_FRAMES, SCALE = (20, 0.25) if TINY else (50, 0.5)
 SILHOUETTES = {"reduction": 2, "working_reduction": 1}
 if TINY:  # so few pixels per drone that noise counts
-    SILHOUETTES = {"reduction": 1, "working_reduction": 1, "min_blob_px": 32, "var_threshold": 16.0}
+    SILHOUETTES = {"reduction": 1, "working_reduction": 1, "min_blob_px": 32}
 SETTINGS = {f"silhouettes.{name}": value for name, value in SILHOUETTES.items()}
 SETTINGS |= {"init": "truth", "swarm.particles": 12}
 ITERATIONS = [1] if TINY else [1, 4, 16]  # per frame: the budgets of the sweep

@@ -49,7 +49,7 @@ NUM_FRAMES = 20 if TINY else 75
 SCALE = 0.25 if TINY else 0.5
 SILHOUETTES = SilhouetteSettings(reduction=2, working_reduction=1)
 if TINY:  # so few pixels per drone that noise counts
-    SILHOUETTES = SilhouetteSettings(reduction=1, working_reduction=1, min_blob_px=32, var_threshold=16.0)
+    SILHOUETTES = SilhouetteSettings(reduction=1, working_reduction=1, min_blob_px=32)
 FRAME = 10  # the frame that is looked at
 DRONE = 2  # the drone that is looked at, in the truth's order
 PARTICLES = 30

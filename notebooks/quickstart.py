@@ -45,7 +45,7 @@ NUM_FRAMES = 20 if TINY else 75
 SCALE = 0.25 if TINY else 0.5
 SILHOUETTES = SilhouetteSettings(reduction=2, working_reduction=1)
 if TINY:  # so few pixels per drone that noise counts
-    SILHOUETTES = SilhouetteSettings(reduction=1, working_reduction=1, min_blob_px=32, var_threshold=16.0)
+    SILHOUETTES = SilhouetteSettings(reduction=1, working_reduction=1, min_blob_px=32)
 DATA = Path("data", "tiny" if TINY else "normal")
 plt.rcParams.update({"figure.dpi": 80, "font.size": 9})
 keep_compiled(Path("data", "compiled"))  # the second run does not wait for the compiler

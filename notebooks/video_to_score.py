@@ -49,7 +49,7 @@ NUM_FRAMES = 20 if TINY else 75
 SCALE = 0.25 if TINY else 0.5
 SILHOUETTES = SilhouetteSettings(reduction=2, working_reduction=1)
 if TINY:  # so few pixels per drone that noise counts
-    SILHOUETTES = SilhouetteSettings(reduction=1, working_reduction=1, min_blob_px=32, var_threshold=16.0)
+    SILHOUETTES = SilhouetteSettings(reduction=1, working_reduction=1, min_blob_px=32)
 FRAME = 10  # the frame that is looked at
 DRONE, CAMERAS = 2, (2, 0)  # the drone and the cameras that are looked at
 HALF_M, STEP_M = 0.4, 0.04 if TINY else 0.01  # half the side of a slice of the landscape, and its step

@@ -114,8 +114,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     folder = simulate(scenario(root), root, SimulationSettings(scale=0.25, seed=0, masks=False), jobs=1)
     recording = read_sequence(folder).usable()
     assert recording.truth is not None
-    # With this learning rate, a drone that stands still becomes background after a second.
-    silhouettes = SilhouetteSettings(reduction=1, working_reduction=1, min_blob_px=4, learning_rate=0.02)
+    # With MOG2 and this learning rate, a drone that stands still becomes background after a second.
+    silhouettes = SilhouetteSettings(
+        background="mog2", reduction=1, working_reduction=1, min_blob_px=4, learning_rate=0.02
+    )
     tracked = track_recording(recording, TrackSettings(silhouettes=silhouettes), cache=root / "cache", jobs=1)
     cameras, position_m = recording.rig.cameras, recording.truth.position_m
     pixels, depth = project(cameras, position_m[:, :, None])

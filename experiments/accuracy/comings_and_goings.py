@@ -39,7 +39,7 @@ import _results
 SCENARIO = Path(__file__).with_suffix(".toml")
 BACKGROUNDS = {
     "background of the whole video": SilhouetteSettings(),
-    "background that is learned on": SilhouetteSettings(learning_rate=0.01),
+    "background that is learned on": SilhouetteSettings(background="mog2", learning_rate=0.01),
 }
 #: A drone stands still if it is slower than this speed for at least this time, seconds.
 STILL_M_S, STILL_S = 0.03, 3.0
