@@ -239,7 +239,10 @@ def test_projection_lines_from_the_sequence_a_folder_and_blobs(
     """The columns are the swarm's columns, and the sequence's own detections are the files in its folder."""
     tracks = [tmp_path / f"{name}.csv" for name in ("own", "folder", "blobs")]
     for path, more in zip(
-        tracks, ((), ("--detections", sequence / "dl_data"), ("--detections", "blobs")), strict=True
+        tracks,
+        # In images of this size, the blobs of a white drone before a white wall fall into parts: a fifth track.
+        ((), ("--detections", sequence / "dl_data"), ("--detections", "blobs", "--drones", 4)),
+        strict=True,
     ):
         result = run(*track(sequence, path, "--method", "projection-lines", *more))
         assert result.code == 0, result

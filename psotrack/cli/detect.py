@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
+from msgspec.structs import replace
 
 from psotrack.cli.options import (
     CACHE,
@@ -95,7 +96,8 @@ def detect(
     SEQ may also be a single video or a folder of pictures, without any calibration; CAMERA is then its name.
 
     --blobs takes what moves in a still image, as `track --detections blobs` does; the options of `psotrack silhouettes`
-    apply. The others are those of the network.
+    apply, but boxes end at pixels of the image that the background model sees, unless --reduction is given. The others
+    are those of the network.
 
     \b
     Examples:
@@ -156,6 +158,9 @@ def _by_blobs(
     """Detections of each camera by the blobs of its silhouettes."""
     from psotrack.silhouettes import blob_detections, compute
 
+    sizes_wh = [video.image_size_wh for video in recording.videos.values()]
+    if settings.reduction is None:
+        settings = replace(settings, reduction=settings.scaled(sizes_wh).working_reduction)
     made = compute(recording, settings, cache=cache_folder(cache), jobs=jobs, report=report_to(quiet))
     sizes = np.array([recording.videos[name].image_size_wh for name in made.cameras], float)
     return list(blob_detections(made, sizes, report_to(quiet)).items())

@@ -230,7 +230,7 @@ def silhouette_options(command: Command) -> Command:
             type=int,
             default=None,
             metavar="N",
-            help="Smallest foreground blob that is kept, in pixels.  [default: from --drone-px]",
+            help="Smallest foreground blob that is kept, in pixels.  [default: from --drone-px; without it, 9 for living]",
         ),
     ):
         command = option(command)

@@ -25,6 +25,9 @@ _LEAST_DRONE_PX = 20
 _LEAST_STORED_PX = 8
 #: Speckle: blobs narrower than this share of a drone's width; a blob has 4 pixels at least.
 _SPECKLE, _LEAST_BLOB_PX = 0.2, 4
+#: Smallest blob of the background model "living" where the drones' size is not given, pixels: a distant drone of 5 x 2
+#: pixels. The model itself tells speckle from objects, down to this size (`object_blobs`).
+_LEAST_OBJECT_PX = 9
 
 #: Meaning of MOG2's shadow label: foreground, background, or foreground with a smaller weight.
 Shadows = Literal["keep", "drop", "weight"]
@@ -104,7 +107,7 @@ class SilhouetteSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
     Attributes:
         background: name of the background model: "living", "mog2" or a plugin.
         drone_px: width of the smallest drone in the images, pixels; sets the next three where they are None. None: the
-            longer side of the images / 48, which is 40 pixels in an image of 1920.
+            longer side of the images / 48, which is 40 pixels in an image of 1920; smaller drones are found as well.
         reduction: each stored value covers `reduction` x `reduction` pixels; a multiple of `working_reduction`.
         working_reduction: whole factor by which the image is reduced, by area, before the background model sees the
             image; 1 is the full image.
@@ -164,7 +167,9 @@ class SilhouetteSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
         if reduction is None:
             reduction = working * (2 if across_px >= _LEAST_STORED_PX else 1)
         least_px = self.min_blob_px
-        if least_px is None:
+        if least_px is None and self.drone_px is None and self.background == LIVING:
+            least_px = _LEAST_OBJECT_PX
+        elif least_px is None:
             least_px = max(_LEAST_BLOB_PX, round((_SPECKLE * across_px) ** 2))
         common = {name: getattr(self, name) for name in _CommonSettings.__struct_fields__}
         return ScaledSettings(working_reduction=working, reduction=reduction, min_blob_px=least_px, **common)
