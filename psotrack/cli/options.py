@@ -230,7 +230,8 @@ def silhouette_options(command: Command) -> Command:
             type=int,
             default=None,
             metavar="N",
-            help="Smallest foreground blob that is kept, in pixels.  [default: from --drone-px; without it, 9 for living]",
+            help="Smallest foreground blob that is kept, in pixels.  [default: from --drone-px; 9 for living without "
+            "--drone-px]",
         ),
     ):
         command = option(command)
