@@ -1,25 +1,46 @@
 """Clips for the study of foreground: drawn scenes with masks, and other people's recordings with masks or boxes.
 
 Recordings lie under $PSOTRACK_REAL_DATA/OWNER/NAME (see `recordings`); a recording that is not there is left out. The
-boxes of the drone recordings are MATLAB objects, read by the package mcos-decoder.
+boxes of the drone recordings are MATLAB objects, read by the package mcos-decoder. The scenes of the simulator have one
+camera and the masks of all drones; a scene is simulated if it is missing.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
+
+from psotrack.datasets import dpjait, open_recording
+from psotrack.recordings import read_frames
+from psotrack.simulation import RESTLESS, SimulationSettings, change_scenario, scenario, simulate
 
 Image = UInt8[np.ndarray, "height width 3"]
 Mask = UInt8[np.ndarray, "height width"]
 
 #: Recorded drones whose camera stands still, of DroneDetectionThesis/Drone-detection-dataset (CC0).
 DRONES = ("004", "020", "030", "050", "060", "070", "080", "090", "100")
+
+#: Changes of the simulated scenes, by name of the clip.
+SCENES: Mapping[str, Mapping[str, Any]] = {
+    "simulated, calm": {},
+    "simulated, exposure": {name: value for name, value in RESTLESS.items() if "exposure" in name},
+    "simulated, lamp": {name: value for name, value in RESTLESS.items() if "lamp" in name},
+    "simulated, foliage": {name: value for name, value in RESTLESS.items() if "foliage" in name},
+    "simulated, screen": {name: value for name, value in RESTLESS.items() if "screen" in name},
+    "simulated, restless": RESTLESS,
+    "simulated, person": {"surroundings.person": 0.5},
+    "simulated, clouds": {"surroundings.clouds": 0.6},
+}
+#: The camera of the simulated scenes: one of the laboratory's; frames, and scale of the images.
+_CAMERA = {"position_m": [-4.7, -3.7, 3.1], "target_m": [0.1, 0.0, 1.25]}
+_FRAMES, _SCALE = 200, 0.5
 
 
 @dataclass(frozen=True)
@@ -38,14 +59,22 @@ class Clip:
     boxes: Float[np.ndarray, "frames 4"] | None = None
 
 
-def clips() -> dict[str, Callable[[], Clip]]:
-    """All clips that can be made on this machine, by name; a clip is made when it is called."""
+def clips(data: Path) -> dict[str, Callable[[], Clip]]:
+    """All clips that can be made on this machine, by name; a clip is made when it is called.
+
+    Args:
+        data: folder of the simulated scenes.
+    """
     drawn: dict[str, Callable[[], Clip]] = {
         "swaying trees": swaying_trees,
         "clouds, slow": lambda: clouds(seed=0, drift_px=0.35, contrast=70),
         "clouds, fast": lambda: clouds(seed=2, drift_px=0.8, contrast=110),
     }
-    return drawn | dict(recordings())
+    scenes = {
+        name: lambda name=name, changes=changes: _simulated(data / "foreground" / name, changes)
+        for name, changes in SCENES.items()
+    }
+    return drawn | scenes | dict(recordings())  # type: ignore[arg-type]
 
 
 def recordings() -> Iterator[tuple[str, Callable[[], Clip]]]:
@@ -167,6 +196,24 @@ def swaying_trees(num_frames: int = 280, size_wh: tuple[int, int] = (160, 120)) 
         if person.any():
             masks[index] = person
     return Clip(frames, masks)
+
+
+def _simulated(root: Path, changes: Mapping[str, Any]) -> Clip:
+    """A flight of four drones before one camera; all drones are foreground, and nothing else."""
+    recipe = change_scenario(scenario("S02_D4_A"), {"cameras": [_CAMERA], **changes})
+    folder = root / "Simulated_Data" / recipe.name
+    if not folder.exists():
+        settings = SimulationSettings(num_frames=_FRAMES, scale=_SCALE, seed=1, onboard=False)
+        simulate(recipe, root, settings)
+    ((name, video),) = open_recording(folder).videos.items()
+    frames = list(read_frames(video))
+    with dpjait.read_masks(folder) as masks:
+        drones = range(1, len(recipe.drones) + 1)
+        seen = [
+            np.any([masks.mask(name, drone, index) for drone in drones], axis=0)
+            for index in range(len(frames))
+        ]
+    return Clip(frames, {index: 255 * mask.astype(np.uint8) for index, mask in enumerate(seen)})
 
 
 def _coded(image: Image) -> Image:

@@ -38,15 +38,19 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, help="CSV file of all rows")
     parser.add_argument("--clips", nargs="+", help="names of the clips; all without")
+    parser.add_argument("--models", nargs="+", help="names of the models; all without")
+    parser.add_argument("--data", type=Path, default=Path("data"), help="folder of the simulated scenes")
     args = parser.parse_args()
     print(f"OpenCV {cv2.__version__}, one thread")
     cv2.setNumThreads(1)
     rows = []
-    for name, make in clips().items():
+    for name, make in clips(args.data).items():
         if args.clips and name not in args.clips:
             continue
         clip = make()
         for model_name, model in models().items():
+            if args.models and model_name not in args.models:
+                continue
             rows.append({"clip": name, "model": model_name, **score(model(clip.frames), clip)})
             print(
                 "  ".join(

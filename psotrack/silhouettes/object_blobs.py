@@ -1,8 +1,9 @@
 """Which blobs of changed pixels are objects: evidence from their strength, their sharpness and their edges.
 
 - **Strength**: enough of a blob's pixels differ from the background by more than the place usually does.
-- **Extent**: a blob ends where the difference falls below a share of the blob's contrast. So a small dark drone does
-  not grow together with the faint change of a cloud, or with the artefacts of a codec around the drone.
+- **Extent**: a blob ends where the difference falls below a share of the blob's contrast. A small share is tried first,
+  so that the pale parts of a drone belong to the blob. Where the contour at this share is not steep almost all around,
+  a larger share is taken, so that a small dark drone does not grow together with the faint change of a cloud.
 - **Sharpness**: the difference to the background rises steeply at the blob's contour. Clouds, soft shadows and lamps
   change the image gradually.
 - **Edges**: an object has edges of its own in the frame. Where an object left, the background has these edges instead
@@ -21,9 +22,13 @@ from jaxtyping import Bool, Float, Int, Shaped, UInt8
 _STRONG_PIXELS = 2
 #: Share of a blob's pixels that must be strong, at places that are calm and at places that are restless.
 _CALM_SHARE, _RESTLESS_SHARE = 0.1, 0.3
-#: A blob's pixels differ by this share of the blob's contrast at least; a higher contrast, grey levels, counts as this
-#: contrast, because objects also have parts that hardly differ from the background.
-_SHARE_OF_CONTRAST, _LARGEST_CONTRAST = 0.4, 80.0
+#: Extents of a blob, in the order in which they are tried: share of the blob's contrast by which its pixels differ at
+#: least, and part of the contour that must be steep.
+_EXTENTS = ((0.2, 0.7), (0.4, 0.0))
+#: A higher contrast, grey levels, counts as this one: objects also have parts that hardly differ from the background.
+_LARGEST_CONTRAST = 80.0
+#: A contour is steep where the difference rises by this share of the difference at which the blob ends, and by noise.
+_STEEP = 0.5
 #: Gradient of the difference at the contour, per 2 pixels: at least this share of the blob's mean difference, and what
 #: noise and codecs add. In shares of the mean difference, drawn and real drones have 0.5 to 3 down to 3 px; drifting
 #: clouds 0.06 to 0.5.
@@ -32,7 +37,6 @@ _SHARP, _NOISE_GRADIENT = 0.4, 2.0
 _SHARP_DIFFERENCE = 40.0
 #: Edges of an object at its contour, relative to the background's edges at the same place, and above them.
 _OWN_EDGES, _LEAST_EDGE = 1.3, 2.0
-
 _AROUND = np.ones((3, 3), np.uint8)
 
 _Mask = UInt8[np.ndarray, "height width"]
@@ -71,26 +75,52 @@ def find_objects(
         restless: (height, width), whether leaves, screens, waves or noise change the place again and again.
         least_px: smallest number of pixels of a blob.
     """
-    blobs = _find_blobs(changed, strong, difference, least_px)
-    num_restless = blobs.sums(restless.ravel()[blobs.pixels])
-    enough = _CALM_SHARE * (blobs.area - num_restless) + _RESTLESS_SHARE * num_restless
-    blobs = blobs.chosen(blobs.sums(strong.ravel()[blobs.pixels] > 0) >= np.maximum(_STRONG_PIXELS, enough))
-    if not blobs.area.any():
-        return ObjectBlobs(np.zeros_like(changed), np.zeros_like(changed))
-    points, of_points = _contours(blobs, changed.shape)
-    length = np.maximum(np.bincount(of_points, minlength=len(blobs.area)), 1)
-    edges, edges_before, steepness = (
-        np.bincount(of_points, _gradient_at(levels, points), minlength=len(blobs.area)) / length
-        for levels in (image, background, difference)
+    mask, own = np.zeros_like(changed), np.zeros_like(changed)
+    for share, steep_part in _EXTENTS:
+        blobs = _find_blobs(changed, strong, difference, least_px, share)
+        num_restless = blobs.sums(restless.ravel()[blobs.pixels])
+        enough = _CALM_SHARE * (blobs.area - num_restless) + _RESTLESS_SHARE * num_restless
+        num_strong = blobs.sums(strong.ravel()[blobs.pixels] > 0)
+        blobs = blobs.chosen(num_strong >= np.maximum(_STRONG_PIXELS, enough))
+        if not blobs.area.any():
+            break
+        contours = _contours(blobs, changed.shape)
+        # A blob that fills the image has no contour.
+        is_object = (contours.length == 0) | (
+            _is_sharp(blobs, contours, difference)
+            & (_steep_part(blobs, contours, difference, share) >= steep_part)
+        )
+        mask.ravel()[blobs.chosen(is_object).pixels] = 255
+        own.ravel()[blobs.chosen(is_object & _has_own_edges(contours, image, background)).pixels] = 255
+        changed = _mask_of(blobs.chosen(~is_object).pixels, changed.shape)
+    return ObjectBlobs(mask, own)
+
+
+def _is_sharp(blobs: _PixelBlobs, contours: _Contours, difference: _Mask) -> Bool[np.ndarray, "blobs"]:
+    """Whether the difference to the background rises steeply at a blob's contour, in the mean."""
+    contrast = blobs.sums(difference.ravel()[blobs.pixels]) / np.maximum(blobs.area, 1)
+    least = _SHARP * np.minimum(contrast, _SHARP_DIFFERENCE) + _NOISE_GRADIENT
+    return contours.means(_gradient_at(difference, contours.pixels)) > least
+
+
+def _steep_part(
+    blobs: _PixelBlobs, contours: _Contours, difference: _Mask, share: float
+) -> Float[np.ndarray, "blobs"]:
+    """(blobs,), part of a blob's contour where the difference is a step, and not the slope of a cloud."""
+    least = _STEEP * _ending_level(blobs, difference.ravel()[blobs.pixels], share) + _NOISE_GRADIENT
+    return contours.means(_gradient_at(difference, contours.pixels) > least[contours.blob])
+
+
+def _has_own_edges(
+    contours: _Contours,
+    image: UInt8[np.ndarray, "height width 3"],
+    background: UInt8[np.ndarray, "height width 3"],
+) -> Bool[np.ndarray, "blobs"]:
+    """Whether the frame has edges at a blob's contour that the background does not have."""
+    edges, edges_before = (
+        contours.means(_gradient_at(levels, contours.pixels)) for levels in (image, background)
     )
-    contrast = np.minimum(
-        blobs.sums(difference.ravel()[blobs.pixels]) / np.maximum(blobs.area, 1), _SHARP_DIFFERENCE
-    )
-    # A blob that fills the image has no contour.
-    has_contour = np.bincount(of_points, minlength=len(blobs.area)) > 0
-    is_object = ~has_contour | (steepness > _SHARP * contrast + _NOISE_GRADIENT)
-    own = is_object & (edges > _OWN_EDGES * edges_before + _LEAST_EDGE)
-    return ObjectBlobs(*(_mask_of(blobs.chosen(kind).pixels, changed.shape) for kind in (is_object, own)))
+    return edges > _OWN_EDGES * edges_before + _LEAST_EDGE
 
 
 @dataclass(frozen=True)
@@ -117,22 +147,31 @@ class _PixelBlobs:
         return _PixelBlobs(self.pixels[kept], self.blob[kept], np.where(chosen, self.area, 0))
 
 
-def _find_blobs(changed: _Mask, strong: _Mask, difference: _Mask, least_px: int) -> _PixelBlobs:
-    """The blobs with strong pixels and enough changed pixels, each as far as its contrast goes."""
+def _find_blobs(changed: _Mask, strong: _Mask, difference: _Mask, least_px: int, share: float) -> _PixelBlobs:
+    """The blobs with strong pixels and enough changed pixels, each as far as a share of its contrast goes."""
     wide = _connected(changed)
     strong_of_pixels = strong.ravel()[wide.pixels] > 0
     levels = difference.ravel()[wide.pixels]
     num_strong = wide.sums(strong_of_pixels)
-    strong_levels = np.where(strong_of_pixels, levels, 0).astype(float)
-    # The mean weighted by the levels themselves: many faint pixels of a cloud do not outvote a small drone.
-    contrast = wide.sums(strong_levels**2) / np.maximum(wide.sums(strong_levels), 1)
-    least = _SHARE_OF_CONTRAST * np.minimum(contrast, _LARGEST_CONTRAST)
+    least = _ending_level(wide, np.where(strong_of_pixels, levels, 0), share)
     kept = (
         (num_strong >= _STRONG_PIXELS)[wide.blob]
         & (wide.area >= least_px)[wide.blob]
         & (levels > least[wide.blob])
     )
     return _connected(_mask_of(wide.pixels[kept], changed.shape))
+
+
+def _ending_level(
+    blobs: _PixelBlobs, levels: Shaped[np.ndarray, "pixels"], share: float
+) -> Float[np.ndarray, "blobs"]:
+    """(blobs,), the difference at which a blob ends: a share of the blob's contrast, the mean of its levels.
+
+    The levels themselves are the weights of the mean: many faint pixels of a cloud do not outvote a small drone.
+    """
+    weights = levels.astype(float)
+    contrast = blobs.sums(weights**2) / np.maximum(blobs.sums(weights), 1)
+    return share * np.minimum(contrast, _LARGEST_CONTRAST)
 
 
 def _connected(mask: _Mask) -> _PixelBlobs:
@@ -148,24 +187,36 @@ def _connected(mask: _Mask) -> _PixelBlobs:
     return _PixelBlobs(pixels, blob, np.bincount(blob, minlength=count))
 
 
-def _contours(
-    blobs: _PixelBlobs, shape: tuple[int, ...]
-) -> tuple[Int[np.ndarray, "points"], Int[np.ndarray, "points"]]:
-    """Pixels on both sides of the blobs' contours, as flat indices, and the blob of each.
+@dataclass(frozen=True)
+class _Contours:
+    """Pixels on both sides of the contours of blobs.
 
-    A pixel outside belongs to the blob with the largest number beside the pixel.
+    Attributes:
+        pixels: (points,), indices into the flat image.
+        blob: (points,), blob of each pixel.
+        length: (blobs,), number of pixels at each blob's contour.
     """
+
+    pixels: Int[np.ndarray, "points"]
+    blob: Int[np.ndarray, "points"]
+    length: Int[np.ndarray, "blobs"]
+
+    def means(self, values: Shaped[np.ndarray, "points"]) -> Float[np.ndarray, "blobs"]:
+        """(blobs,), mean of the values at each blob's contour; 0 where a blob has none."""
+        return np.bincount(self.blob, values, minlength=len(self.length)) / np.maximum(self.length, 1)
+
+
+def _contours(blobs: _PixelBlobs, shape: tuple[int, ...]) -> _Contours:
+    """The contours of blobs. A pixel outside belongs to the blob with the largest number beside the pixel."""
     mask = _mask_of(blobs.pixels, shape)
     contour = cv2.morphologyEx(mask, cv2.MORPH_GRADIENT, _AROUND)
     points = np.flatnonzero(contour > 0)
     labels = np.zeros(mask.size, np.intp)
     labels[blobs.pixels] = blobs.blob
-    inside = labels[points]
-    outside = inside == 0
-    inside[outside] = np.max(
-        [labels[near] for near in _neighbours(points[outside], shape)], axis=0, initial=0
-    )
-    return points, inside
+    blob = labels[points]
+    outside = blob == 0
+    blob[outside] = np.max([labels[near] for near in _neighbours(points[outside], shape)], axis=0, initial=0)
+    return _Contours(points, blob, np.bincount(blob, minlength=len(blobs.area)))
 
 
 def _neighbours(points: Int[np.ndarray, "points"], shape: tuple[int, ...]) -> list[Int[np.ndarray, "points"]]:
