@@ -1,13 +1,12 @@
 """Clips for the study of foreground: drawn scenes with masks, and other people's recordings with masks or boxes.
 
-Recordings lie under $PSOTRACK_REAL_DATA/OWNER/NAME (see `recordings`); a recording that is not there is left out. The
-boxes of the drone recordings are MATLAB objects, read by the package mcos-decoder. The scenes of the simulator have one
-camera and the masks of all drones; a scene is simulated if it is missing.
+Recordings lie in a folder of public repositories, as OWNER/NAME (see `recordings`); a recording that is not there is
+left out. The boxes of the drone recordings are MATLAB objects, read by the package mcos-decoder. The scenes of the
+simulator have one camera and the masks of all drones; a scene is simulated if it is missing.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -59,11 +58,12 @@ class Clip:
     boxes: Float[np.ndarray, "frames 4"] | None = None
 
 
-def clips(data: Path) -> dict[str, Callable[[], Clip]]:
+def clips(data: Path, real: Path | None) -> dict[str, Callable[[], Clip]]:
     """All clips that can be made on this machine, by name; a clip is made when it is called.
 
     Args:
         data: folder of the simulated scenes.
+        real: folder of the public repositories with recordings; None is no recording.
     """
     drawn: dict[str, Callable[[], Clip]] = {
         "swaying trees": swaying_trees,
@@ -74,12 +74,11 @@ def clips(data: Path) -> dict[str, Callable[[], Clip]]:
         name: lambda name=name, changes=changes: _simulated(data / "foreground" / name, changes)
         for name, changes in SCENES.items()
     }
-    return drawn | scenes | dict(recordings())  # type: ignore[arg-type]
+    return drawn | scenes | (dict(recordings(real)) if real else {})  # type: ignore[arg-type]
 
 
-def recordings() -> Iterator[tuple[str, Callable[[], Clip]]]:
-    """Recordings of other people that are on this machine."""
-    root = Path(os.environ.get("PSOTRACK_REAL_DATA", "nowhere"))
+def recordings(root: Path) -> Iterator[tuple[str, Callable[[], Clip]]]:
+    """Recordings of other people in a folder of public repositories."""
     office = root / "e-sha/Background-subtraction/data/office"
     if office.is_dir():
         yield "CDnet office", lambda: _office(office)

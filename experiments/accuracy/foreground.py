@@ -1,24 +1,30 @@
 """Foreground in pictures that change: psotrack's background models beside OpenCV's MOG2 and KNN.
 
-    python experiments/accuracy/foreground.py --out foreground.csv
-    python experiments/accuracy/foreground.py --clips "CDnet office" --out office.csv
+    python experiments/accuracy/foreground.py --data data --real data/real
+    python experiments/accuracy/foreground.py --data data --out office --real data/real --clips "CDnet office"
 
 For clips with masks: F-measure, precision and recall over all pixels of the clip. For clips with boxes of one drone:
 share of the frames in which a blob's middle lies in the box, blobs beside the box per frame, and the median distance
-and overlap of the found blob. Each peer has a grid of learning rates and thresholds; "-1" is OpenCV's own rate. The
-last table shows each setting's means over the clips: a peer's best single setting is its row with the best mean.
+and overlap of the found blob. Each peer has a grid of learning rates and thresholds; "-1" is OpenCV's own rate. Writes
+a row per clip and model (CSV), the record (JSON) and a picture (PNG), and prints each model's means over the clips: a
+peer's best single setting is its row with the best mean F-measure.
+
+--real names a folder of public repositories, as OWNER/NAME (see `_foreground_clips`); without it, recorded clips are
+left out. The boxes of the recorded drones need the package mcos-decoder.
 """
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import lru_cache
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
-import pandas as pd
 from _foreground_clips import Clip, Image, Mask, clips
+from _runs import parser, save_rows, start
 
 from psotrack.silhouettes import ForegroundSettings
 from psotrack.silhouettes.foreground import Mog2, learning_step
@@ -29,38 +35,40 @@ Model = Callable[[list[Image]], Iterable[Mask]]
 _SHADOW = 127
 #: Smallest blob that counts, pixels: the same for all models.
 _LEAST_PX = 4
+#: Clips of the picture, and the frame of each.
+PICTURED = {"simulated, restless": 120, "clouds, fast": 200, "swaying trees": 240, "drone 030": 120}
 
 
 def main() -> None:
-    """Measure all models on all clips, print the tables and write them."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    """Measure all models on all clips, write the result and the picture, and print each model's means."""
+    options = parser(__doc__)
+    options.add_argument("--real", type=Path, help="folder of the recordings, as OWNER/NAME")
+    options.add_argument("--clips", nargs="+", help="names of the clips; all without")
+    options.add_argument("--models", nargs="+", help="names of the models; all without")
+    options.add_argument(
+        "--picture", type=Path, default=Path("experiments/pictures/foreground.png"), help="the picture"
     )
-    parser.add_argument("--out", type=Path, help="CSV file of all rows")
-    parser.add_argument("--clips", nargs="+", help="names of the clips; all without")
-    parser.add_argument("--models", nargs="+", help="names of the models; all without")
-    parser.add_argument("--data", type=Path, default=Path("data"), help="folder of the simulated scenes")
-    args = parser.parse_args()
-    print(f"OpenCV {cv2.__version__}, one thread")
+    chosen = options.parse_args()
     cv2.setNumThreads(1)
-    rows = []
-    for name, make in clips(args.data).items():
-        if args.clips and name not in args.clips:
-            continue
-        clip = make()
-        for model_name, model in models().items():
-            if args.models and model_name not in args.models:
-                continue
-            rows.append({"clip": name, "model": model_name, **score(model(clip.frames), clip)})
-            print(
-                "  ".join(
-                    f"{value:.3f}" if isinstance(value, float) else value for value in rows[-1].values()
-                )
-            )
-    table = pd.DataFrame(rows)
+    run = start("foreground")
+    made = clips(chosen.data, chosen.real)
+    clip = lru_cache(maxsize=1)(lambda name: made[name]())
+    rows = [
+        (f"{name}, {model_name}", lambda name=name, model_name=model_name: row(name, clip(name), model_name))
+        for name in chosen.clips or made
+        for model_name in chosen.models or models()
+    ]
+    table = save_rows(
+        run, rows, chosen.data, chosen.out, draw=lambda _: draw(made, chosen.picture), files=[chosen.picture]
+    )
     print(table.groupby("model", sort=False).mean(numeric_only=True).round(3).to_string())
-    if args.out:
-        table.to_csv(args.out, index=False)
+
+
+def row(clip_name: str, clip: Clip, model_name: str) -> dict[str, Any]:
+    """Measures of one model on one clip."""
+    kind = "masks" if clip.boxes is None else "boxes"
+    masks = models()[model_name](clip.frames)
+    return {"clip": clip_name, "truth": kind, "model": model_name, **score(masks, clip)}
 
 
 def models() -> dict[str, Model]:
@@ -91,6 +99,28 @@ def _opencv(
             yield mask
 
     return masks
+
+
+def draw(made: Mapping[str, Callable[[], Clip]], path: Path) -> None:
+    """Draw a frame of some clips, each beside its masks by psotrack's two background models."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    shown = [name for name in PICTURED if name in made]
+    figure = Figure(figsize=(9, 1.75 * len(shown)), layout="constrained")
+    FigureCanvasAgg(figure)
+    for name, axes in zip(shown, figure.subplots(len(shown), 3, squeeze=False), strict=True):
+        clip, index = made[name](), PICTURED[name]
+        drawn = {"the frame": cv2.cvtColor(clip.frames[index], cv2.COLOR_BGR2RGB)} | {
+            f"{model}": next(islice(models()[f"psotrack {model}"](clip.frames), index, None))
+            for model in ("mog2", "living")
+        }
+        for (title, image), panel in zip(drawn.items(), axes, strict=True):
+            panel.imshow(image, cmap="gray", vmin=0, vmax=255)
+            panel.set(xticks=[], yticks=[], title=title if name == shown[0] else "")
+        axes[0].set_ylabel(name, fontsize=8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=90)
 
 
 def score(masks: Iterable[Mask], clip: Clip) -> dict[str, float]:
