@@ -93,7 +93,7 @@ class Living:
     ) -> Iterator[UInt8[np.ndarray, "working_height working_width"]]:
         """See `BackgroundModel`."""
         most_frames = np.asarray(learn_background(learning, self.settings).getBackgroundImage())
-        background = LivingBackground(self.settings, most_frames)
+        background = LivingBackground(self.settings, most_frames, self.settings.num_learning_frames)
         coming = (reduce_frame(frame, self.settings) for frame in frames)
         first = list(itertools.islice(coming, _FIRST_FRAMES))
         # From the last to the first, so that the background of frame 0 is that of its time, and what is restless is
@@ -111,12 +111,13 @@ class LivingBackground:
         settings: settings of the foreground; `working_reduction` and `min_blob_px` are used.
         image: (height, width, 3), BGR, the background as far as it is known: the first frame of a live camera, or what
             most of a video's frames show. Of the frames' size.
+        num_frames: number of frames that show this background: the more, the less a new frame changes the background.
 
     Attributes:
         foreground: (height, width), the foreground of the last frame, 0 or 255.
     """
 
-    def __init__(self, settings: ForegroundSettings, image: _Image) -> None:
+    def __init__(self, settings: ForegroundSettings, image: _Image, num_frames: int = 1) -> None:
         self._least_px = math.ceil(settings.min_blob_px / settings.working_reduction**2)
         self._mog2 = cv2.createBackgroundSubtractorMOG2(varThreshold=_VAR_THRESHOLD, detectShadows=True)
         self._mog2.setShadowThreshold(_SHADOW_BRIGHTNESS)
@@ -129,6 +130,7 @@ class LivingBackground:
         self._restless = np.zeros(shape, np.float32)
         self._last = image
         self._num_frames = 0
+        self._num_before = num_frames
         self.foreground: _Mask = np.zeros(shape, np.uint8)
 
     def step(self, image: _Image, known: _Mask | None = None) -> _Mask:
@@ -172,7 +174,7 @@ class LivingBackground:
         protected = cv2.dilate(objects, _MARGIN)
         free = cv2.bitwise_not(protected)
         # At first each frame has the same weight.
-        rate = max(_LEARNING_RATE, 1 / (self._num_frames + 1))
+        rate = max(_LEARNING_RATE, 1 / (self._num_before + self._num_frames))
         self._mog2.apply(image, protected, None, rate)
         cv2.accumulateWeighted(image, self._background, rate, free)
         usual_rate = max(_USUAL_RATE, 1 / (self._num_frames + _CALM_FRAMES))
