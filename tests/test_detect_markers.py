@@ -186,6 +186,18 @@ def test_another_dictionarys_markers_are_not_read():
         assert len(MarkerDetector(dictionary, thorough=True).detect(gray)) == 0
 
 
+def test_flat_markers_with_more_cells_are_not_read():
+    """The middles of 6 x 6 cells on marker 3 of 8 x 8 cells look like a marker of 4x4_50, seen straight from ahead."""
+    names = [0, 1, 2, 3, 5, 6, 15, 17, 19, 33]
+    sheets = [
+        Sheet(name, (70.0 + 110 * (k % 5), 70.0 + 110 * (k // 5)), 74.0) for k, name in enumerate(names)
+    ]
+    gray = picture(sheets, (600, 300), "6x6_250", blur_px=0.5, seed=2)
+    for dictionary in ("4x4_50", "4x4_1000", "aruco_original"):
+        found = MarkerDetector(dictionary, thorough=True).detect(gray)
+        assert len(found) == 0, dictionary
+
+
 def run(*words, expect=None):
     result = CliRunner().invoke(detect_markers, [str(word) for word in words])
     if expect is None:

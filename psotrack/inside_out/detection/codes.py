@@ -23,6 +23,10 @@ _CORRECTED, _WRONG_BORDER = 0.6, 0.35
 _BESIDE, _ALONG = 0.4, 12
 #: Smallest difference between the two sides of the outline, as a share of the contrast between white and black.
 _LEAST_STEP = 0.2
+#: Samples along each side of a cell where a whole marker is compared with its pattern, the widths of blur that the
+#: pattern is tried with, in cells (up to half a cell's blur, above which cells cannot be read), and how much of the
+#: outside the blur reaches, in cells.
+_FINE, _BLURS, _OUTSIDE = 4, (0.0, 0.15, 0.3, 0.45, 0.6), 2
 #: Largest number of quadrangles that are sampled at once: OpenCV's limit on image sizes is 32767.
 _AT_ONCE = 8192
 #: Number of quadrangles whose cells are compared with all codes at once: 32 MB for a dictionary of 1000 markers.
@@ -169,6 +173,42 @@ def share_outlined(
         sides.append(_sample(gray, quads_px, np.stack([u, v], axis=-1)))
     step = (sides[0] - sides[1]) * np.where(inverted, -1.0, 1.0)[:, None]
     return (step > _LEAST_STEP * np.maximum(contrast, 1.0)[:, None]).mean(axis=1)
+
+
+def pattern_agreement(
+    gray: UInt8[np.ndarray, "rows columns"],
+    quads_px: Float[np.ndarray, "quads 4 2"],
+    white: Bool[np.ndarray, "quads cells cells"],
+) -> Float[np.ndarray, " quads"]:
+    """Correlation of quadrangles with a marker's pattern at every place, at the blur that fits best, -1 to 1.
+
+    The middles of the cells alone look alike where the print has other cells: a marker of another dictionary, or the
+    squares of a chessboard. Between the middles such a print has edges where the pattern has none.
+
+    Args:
+        gray: (rows, columns).
+        quads_px: (quads, 4, 2), from the marker's own top left, pixels.
+        white: (quads, cells, cells), which cells of each marker are white, those of the border included.
+    """
+    places = (np.arange(white.shape[1] * _FINE) + 0.5) / (white.shape[1] * _FINE)
+    levels = _sample(gray, quads_px, np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2))
+    fine = np.ones((_FINE, _FINE), np.float32)
+    found = np.full(len(quads_px), -1.0)
+    for quad, cells in enumerate(white):
+        # Around the border lies the other colour.
+        drawn = np.kron(np.pad(cells, _OUTSIDE, constant_values=not cells[0, 0]), fine)
+        for blur in _BLURS:
+            shown = cv2.GaussianBlur(drawn, (0, 0), blur * _FINE) if blur else drawn
+            inside = np.asarray(shown)[
+                _OUTSIDE * _FINE : -_OUTSIDE * _FINE, _OUTSIDE * _FINE : -_OUTSIDE * _FINE
+            ]
+            found[quad] = max(found[quad], _correlation(inside.ravel(), levels[quad]))
+    return found
+
+
+def _correlation(one: Float[np.ndarray, " values"], other: Float[np.ndarray, " values"]) -> float:
+    off, other_off = one - one.mean(), other - other.mean()
+    return float(off @ other_off / np.sqrt(max(float(off @ off) * float(other_off @ other_off), 1e-9)))
 
 
 def sample_cells(

@@ -12,13 +12,18 @@ from jaxtyping import Bool, Float, Int, UInt8
 from psotrack.detection import marker_dictionary
 from psotrack.errors import SettingsError
 from psotrack.geometry import Camera
-from psotrack.inside_out.detection.codes import MarkerCodes
+from psotrack.inside_out.detection.codes import MarkerCodes, pattern_agreement
 from psotrack.inside_out.detection.corners import refine_corners
 from psotrack.inside_out.detection.distortion import undistort_pixels
 from psotrack.inside_out.detection.search import MarkerSearch
 
 #: Shortest side of a marker, in pixels of the full image: one pixel for each of 6 cells, border cells included.
 _SHORTEST_PX = 6.0
+#: Agreement of the cells' middles (`ReadMarkers.agreement`) above which a marker is certain, bent sheets included; and
+#: smallest agreement of the whole pattern of all others. Measured: of 4,700 markers in photographs, videos and drawn
+#: pictures, small, blurred, bent and in glare, none that agrees less than 0.98 in the middles is below 0.79 as a whole;
+#: of 12 wrong readings in photographs of other dictionaries and of chessboards none is above 0.74.
+_CERTAIN, _LEAST_PATTERN = 0.98, 0.765
 
 
 @dataclass(frozen=True)
@@ -109,9 +114,19 @@ class MarkerDetector:
         found = found.select(valid_quads(found.corners_px) & is_shown)
         white = self._codes.white[found.index] ^ found.inverted[:, None, None]
         refined = refine_corners(gray, found.corners_px, white, self._lens)
-        return DetectedMarkers(self._ids[found.index], refined.corners_px, refined.std_px).select(
-            valid_quads(refined.corners_px)
+        kept = valid_quads(refined.corners_px)
+        unsure = np.flatnonzero(kept & (found.agreement < _CERTAIN))
+        # Where something hides a part of an edge, the corners before the refinement may be the better ones.
+        kept[unsure] = (
+            np.maximum(
+                *(
+                    pattern_agreement(gray, corners_px[unsure], white[unsure])
+                    for corners_px in (found.corners_px, refined.corners_px)
+                )
+            )
+            >= _LEAST_PATTERN
         )
+        return DetectedMarkers(self._ids[found.index], refined.corners_px, refined.std_px).select(kept)
 
 
 def valid_quads(corners_px: Float[np.ndarray, "markers 4 2"]) -> Bool[np.ndarray, " markers"]:
