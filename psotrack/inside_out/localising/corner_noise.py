@@ -1,4 +1,4 @@
-"""How the errors of one marker's corners are correlated, estimated from the residuals of a whole video.
+"""How large the errors of corners are and how those of one marker are correlated, from the residuals of a whole video.
 
 A corner is the intersection of two edges, and each edge has two corners. An edge that is found too far outside moves
 both of its corners alike; an edge that is found turned moves them in opposite directions, and the mean of the marker's
@@ -6,17 +6,18 @@ corners stays. Most of a corner's error is of the second kind, because the ends 
 its middle. The mean of four corners is therefore more accurate than the mean of four independent errors would be. A
 lens model that does not fit the camera does the opposite: it moves all corners of a marker alike.
 
-The residuals say which of the two is stronger. A single frame has few markers, so the frames of a video are counted
-together: `PoseSettings.centre_scale` is chosen so that the markers' mean residuals are as large as their covariances
-let expect (estimation of variance components: W. Förstner, Ein Verfahren zur Schätzung von Varianz- und
-Kovarianzkomponenten, Allgemeine Vermessungs-Nachrichten 86, 1979). The scale has a smallest value, because residuals
-do not show all errors: a shift of all corners in the image looks like a turn of the camera.
+The residuals say which of the two is stronger, and how large the errors are. A single frame has few markers, so the
+frames of a video are counted together. Their noise takes the place of the stated one (`PoseSettings.usual_px`), and
+each frame's own residuals correct it. `PoseSettings.centre_scale` is chosen so that the markers' mean residuals are as
+large as their covariances let expect (estimation of variance components: W. Förstner, Ein Verfahren zur Schätzung von
+Varianz- und Kovarianzkomponenten, Allgemeine Vermessungs-Nachrichten 86, 1979). The scale has a smallest value, because
+residuals do not show all errors: a shift of all corners in the image looks like a turn of the camera.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,48 +35,86 @@ LEAST_SCALE = 0.48
 MOST_SCALE = 4.0
 #: Largest number of frames that are looked at, and number of estimates, each with the covariances by the one before.
 _MOST_FRAMES, _TURNS = 60, 4
+#: Change of a deviation, as a share, below which it is not estimated once more.
+_SAME = 0.02
 #: Smallest number of markers whose mean residuals say anything: three give no more equations than unknowns.
 _FEWEST_MARKERS = 4
 #: Weight of independent errors, as a number of mean residuals.
 _PRIOR_RESIDUALS = 10.0
 
 
-def estimate_centre_scale(
+@dataclass(frozen=True)
+class CornerNoise:
+    """Errors of the corners in a recording.
+
+    Attributes:
+        usual_px: standard deviation of a corner's own error along x and along y, pixels.
+        centre_scale: deviation of the mean error of a marker's corners, as a multiple of the deviation that it would
+            have if the errors of the corners were independent.
+    """
+
+    usual_px: float
+    centre_scale: float
+
+    def settings(self, given: PoseSettings) -> PoseSettings:
+        """Settings with these errors, where none are given."""
+        return replace(
+            given,
+            usual_px=given.usual_px or self.usual_px,
+            centre_scale=given.centre_scale or self.centre_scale,
+        )
+
+
+def estimate_corner_noise(
     detected: Sequence[Detected],
     marker_map: MarkerMap,
     lens: Camera,
     settings: PoseSettings,
     shutter: RollingShutter | None = None,
-) -> float:
-    """Estimate `PoseSettings.centre_scale` from the frames of a video; 1 where they show too few markers.
+) -> CornerNoise:
+    """Estimate the errors of corners from the frames of a video; as stated where they show too few markers.
 
     Args:
         detected: number and time of each frame, and its markers.
         marker_map: map of the room.
         lens: intrinsics of the camera.
-        settings: settings of pose estimation; their `centre_scale` is not used.
+        settings: settings of pose estimation; their `usual_px` and `centre_scale` are not used.
         shutter: the rolling shutter; None is a global shutter.
     """
     usable = [markers for _, _, markers in detected if len(markers) >= _FEWEST_MARKERS]
     chosen = np.unique(np.linspace(0, len(usable) - 1, min(_MOST_FRAMES, len(usable))).astype(int))
     frames = [usable[index] for index in chosen]
-    variance = 1.0
+    stated = found = CornerNoise(settings.noise_px, 1.0)
     for _ in range(_TURNS):
-        observed = expected = 0.0
-        for markers in frames:
-            pose = estimate_pose(
-                markers.corners_px,
-                marker_map.corners_of(markers.ids.tolist()),
-                lens,
-                replace(settings, centre_scale=float(np.sqrt(variance))),
-                None,
-                shutter,
+        before = found
+        using = replace(settings, usual_px=before.usual_px, centre_scale=before.centre_scale)
+        residuals = [
+            pose.residuals
+            for markers in frames
+            if (
+                pose := estimate_pose(
+                    markers.corners_px,
+                    marker_map.corners_of(markers.ids.tolist()),
+                    lens,
+                    using,
+                    None,
+                    shutter,
+                )
             )
-            if pose is not None and pose.centres is not None:
-                observed += pose.centres.observed
-                expected += pose.centres.expected
-        if not expected:
-            return 1.0
+            is not None
+            and pose.residuals is not None
+        ]
+        if not residuals:
+            return stated
+        own = _PRIOR_RESIDUALS * stated.usual_px**2 + sum(one.squares_px2 for one in residuals)
+        observed, expected = sum(one.observed for one in residuals), sum(one.expected for one in residuals)
+        variance = before.centre_scale**2
         ratio = (_PRIOR_RESIDUALS + observed) / (_PRIOR_RESIDUALS * variance + expected)
-        variance = float(np.clip(variance * ratio, LEAST_SCALE**2, MOST_SCALE**2))
-    return float(np.sqrt(variance))
+        found = CornerNoise(
+            float(np.sqrt(own / (_PRIOR_RESIDUALS + sum(one.freedom for one in residuals)))),
+            float(np.sqrt(np.clip(variance * ratio, LEAST_SCALE**2, MOST_SCALE**2))),
+        )
+        changes = found.usual_px / before.usual_px, found.centre_scale / before.centre_scale
+        if max(abs(np.log(changes))) < _SAME:
+            break
+    return found

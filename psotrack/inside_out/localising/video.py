@@ -17,7 +17,7 @@ from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
 from psotrack.inside_out.filtering.path_rows import PoseRow, join_rows
 from psotrack.inside_out.frames import Frame, FrameSource, map_ahead, read_ahead
 from psotrack.inside_out.line_time import Detected, LineTime, estimate_line_time
-from psotrack.inside_out.localising.corner_noise import estimate_centre_scale
+from psotrack.inside_out.localising.corner_noise import estimate_corner_noise
 from psotrack.inside_out.localising.frame_poses import find_first_motion, localise_frames
 from psotrack.inside_out.localising.map_evidence import (
     are_few,
@@ -49,7 +49,7 @@ def localise_video(
 
     A thread decodes frames and converts them to grey, and others detect markers in several frames at once. Markers that
     are not in the map are not detected. In a recording, the markers of all frames are found first, and show whether the
-    shutter rolls (`line_time`) and how the errors of a marker's corners are correlated (`corner_noise`). Where two
+    shutter rolls (`line_time`) and how large and how correlated the errors of corners are (`corner_noise`). Where two
     poses fit a frame's markers about equally well, the filter's prediction decides; then the filter uses the pose or
     gates it. Markers that disagree with the others over a recording are left out, and the poses are estimated once more
     without them.
@@ -160,14 +160,14 @@ def _learned(
     settings: LocaliseSettings,
     seconds: dict[str, float],
 ) -> tuple[LineTime | None, LocaliseSettings]:
-    """The line time that frames show, and settings with the shutter and the correlation of corners to use."""
+    """The line time that frames show, and settings with the shutter and the errors of corners to use."""
     began_s = time.perf_counter()
     line_time = estimate_line_time(detected, marker_map, lens, settings.pose)
     if line_time is not None:
         settings = replace(settings, shutter=line_time.shutter(settings.shutter))
-    if settings.pose.centre_scale is None:
-        scale = estimate_centre_scale(detected, marker_map, lens, settings.pose, settings.shutter)
-        settings = replace(settings, pose=replace(settings.pose, centre_scale=scale))
+    if settings.pose.centre_scale is None or settings.pose.usual_px is None:
+        noise = estimate_corner_noise(detected, marker_map, lens, settings.pose, settings.shutter)
+        settings = replace(settings, pose=noise.settings(settings.pose))
     seconds["locate"] += time.perf_counter() - began_s
     return line_time, settings
 

@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float
 from psotrack.calibration import reproject
 from psotrack.estimation import NormalEquations, covariance_from_information
 from psotrack.geometry import NEAR_M, Camera
-from psotrack.inside_out.pose.records import CentreResiduals
+from psotrack.inside_out.pose.records import CornerResiduals
 from psotrack.inside_out.pose.row_motion import RowMotion, UnsureRows, at_rows, slopes_by_motion
 
 #: Standard deviation of the inset, px.
@@ -51,6 +51,7 @@ class SeenCorners:
         inward: (markers, 4, 2), unit vectors in the image from each corner into its marker.
         lens: intrinsics; the pose is ignored.
         noise_px: stated standard deviation of a corner along x and along y, pixels.
+        usual_px: the same in other frames, which counts together with the residuals of this frame.
         place_m: stated standard deviation of a marker's place along each axis, metres.
         map_share: share of the variance of a marker's place that comes from the map and is the same in every frame.
         focal_error: stated standard deviation of the focal length, as a share of the focal length.
@@ -65,6 +66,7 @@ class SeenCorners:
     inward: Float[np.ndarray, "markers 4 2"]
     lens: Camera
     noise_px: float
+    usual_px: float
     place_m: float
     map_share: float
     focal_error: float
@@ -193,7 +195,7 @@ class Sums:
         square = left @ self.total @ left - 2 * np.sum(off_m * (self.by_place @ left))
         square += np.sum((self.by_place[..., :3] @ off_m[..., None])[..., 0] * off_m)
         return Noise(
-            (PRIOR_RESIDUALS * seen.noise_px**2 + max(square, 0.0)) / own_freedom,
+            (PRIOR_RESIDUALS * seen.usual_px**2 + max(square, 0.0)) / own_freedom,
             (PRIOR_RESIDUALS * seen.place_m**2 + np.sum(off_m**2)) / place_freedom,
             own_freedom,
             place_freedom,
@@ -252,6 +254,7 @@ def seen_markers(
         corners_m,
         inward,
         lens,
+        noise_px,
         noise_px,
         off_m,
         (map_error_m / off_m) ** 2,
@@ -319,36 +322,41 @@ def summed(
     return Sums((transposed @ chosen).sum(axis=0), transposed[:, :3] @ chosen, 2 * int(fits.sum()))
 
 
-def centre_residuals(
+def corner_residuals(
     rows: Float[np.ndarray, "markers 4 2 columns"],
     off_px: Float[np.ndarray, "markers 4 2"],
     fits: Bool[np.ndarray, "markers 4"],
     solution: Solution,
     noise: Noise,
-    centre_scale: float,
-) -> CentreResiduals:
-    """Compare the mean residuals of the markers with their covariance.
+    seen: SeenCorners,
+    unmodelled_px: Float[np.ndarray, "markers 4 2 causes"],
+) -> CornerResiduals:
+    """Sum the corners' own errors, and compare the mean residuals of the markers with their covariance.
 
     Args:
         rows: (markers, 4, 2, unknowns + 1), the equations.
         off_px: (markers, 4, 2), residuals after the step.
         fits: (markers, 4), True for the corners that were used.
         solution: the step.
-        noise: variances of the errors.
-        centre_scale: as in `SeenCorners`.
+        noise: the widened variances of the errors, with which the step was computed.
+        seen: markers of the frame, with the stated variances.
+        unmodelled_px: (markers, 4, 2, causes), residuals by one standard deviation of what the equations do not have.
     """
     used, count = fits.any(axis=1), fits.sum(axis=1)
     # Sums over corners divided by the root of their number are coordinates along unit vectors.
     root = np.sqrt(np.maximum(count, 1))[:, None]
     mean_px = _sums_of_markers(off_px, fits)[used] / root[used]
     slopes = _sums_of_markers(rows[..., :-1], fits)[used] / root[used, :, None]
-    own_px2 = 2 * int(used.sum()) * centre_scale**2 * noise.own_px2
+    own_px2 = 2 * int(used.sum()) * seen.centre_scale**2 * noise.own_px2
     places_px2 = noise.place_m2 * float((slopes[..., :3] ** 2).sum())
     # The residuals of a generalised least squares fit have the covariance of the errors less that of the fit.
     fitted_px2 = float(np.einsum("mai,ij,maj->", slopes, solution.covariance, slopes))
-    return CentreResiduals(
+    others_px2 = float(((_sums_of_markers(unmodelled_px, fits)[used] / root[used, :, None]) ** 2).sum())
+    return CornerResiduals(
+        max((noise.own_freedom - 2) * noise.own_px2 - PRIOR_RESIDUALS * seen.usual_px**2, 0.0),
+        noise.own_freedom - PRIOR_RESIDUALS,
         float((mean_px**2).sum()) / noise.own_px2,
-        max(own_px2 + places_px2 - fitted_px2, 0.0) / noise.own_px2,
+        max(own_px2 + places_px2 + others_px2 - fitted_px2, 0.0) / noise.own_px2,
     )
 
 

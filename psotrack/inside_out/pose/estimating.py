@@ -98,7 +98,13 @@ def estimate_pose(
         settings.map_error_m,
         settings.focal_error,
     )
-    corners = replace(corners, rows=rows, unsure=unsure, centre_scale=settings.centre_scale or 1.0)
+    corners = replace(
+        corners,
+        rows=rows,
+        unsure=unsure,
+        centre_scale=settings.centre_scale or 1.0,
+        usual_px=settings.usual_px or settings.noise_px,
+    )
     poses = _likely_poses(corners, rays)
     # One or two of many markers may agree by chance, because every single marker has a pose that explains this marker.
     poses = [pose for pose in poses if pose.used.sum() >= min(_ENOUGH_MARKERS, len(corners_px) / 2)]
@@ -116,7 +122,7 @@ def estimate_pose(
         float(odds / (1 + odds)),
         best.common,
         _chance(corners, best),
-        best.centres,
+        best.residuals,
         best.motion,
         best.by_line_time,
     )

@@ -25,14 +25,19 @@ from psotrack.inside_out.pose.equations import (
     SeenCorners,
     Solution,
     Sums,
-    centre_residuals,
+    corner_residuals,
     equations,
     log_prior,
     summed,
     with_prior,
 )
-from psotrack.inside_out.pose.frame_motion import acceleration_effects, frame_motion, line_time_effects
-from psotrack.inside_out.pose.records import CentreResiduals
+from psotrack.inside_out.pose.frame_motion import (
+    acceleration_effects,
+    acceleration_residuals,
+    frame_motion,
+    line_time_effects,
+)
+from psotrack.inside_out.pose.records import CornerResiduals
 
 #: Probability that a good corner, or the mean of a good marker, is rejected as an outlier.
 FALSE_ALARM = 1e-3
@@ -71,7 +76,7 @@ class Fit:
         fits: (markers, 4), True for corners that fit the pose.
         reprojection_px: root mean square distance of these corners in the image.
         log_evidence: logarithm of the probability density of all corners, integrated over poses near this pose.
-        centres: mean residuals of the markers, observed and expected.
+        residuals: residuals of the corners and of the markers' means.
         motion: what a frame of a rolling shutter says about pose and motion together; None of a global shutter.
         by_line_time: (6,), change of the pose by an error of the line time of one standard deviation; None if the line
             time is exact.
@@ -84,7 +89,7 @@ class Fit:
     fits: Bool[np.ndarray, "markers 4"]
     reprojection_px: float
     log_evidence: float
-    centres: CentreResiduals
+    residuals: CornerResiduals
     motion: FrameMotion | None = None
     by_line_time: Float[np.ndarray, "6"] | None = None
 
@@ -306,7 +311,15 @@ def _fitted(seen: SeenCorners, pose: _Pose, last: _LastStep, noise: Noise) -> Fi
         fits,
         float(np.sqrt(np.mean(distance_px**2))),
         _log_evidence(off_px[fits], fits.size, covariance, seen.noise_px) + log_prior(seen, pose.extra),
-        centre_residuals(last.rows, off_px, fits, solution, widened, seen.centre_scale),
+        corner_residuals(
+            last.rows,
+            off_px,
+            fits,
+            solution,
+            widened,
+            seen,
+            acceleration_residuals(seen, last.rows, by_acceleration),
+        ),
         motion,
         by_line_time,
     )

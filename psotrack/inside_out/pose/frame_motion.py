@@ -92,12 +92,30 @@ def acceleration_effects(
     In the time s before and after the reference row, an acceleration a takes the camera a s² / 2 away from where a
     constant motion takes it. None if the equations are singular; 0 for a global shutter.
     """
-    if seen.rows is None or not seen.rows.acceleration_std.any():
+    off_px = _by_acceleration(seen, rows)
+    if not off_px.any():
         return np.zeros((rows.shape[-1] - 1, 6))
+    return _effects(seen, rows, fits, noise, prior_information, off_px)
+
+
+def acceleration_residuals(
+    seen: SeenCorners,
+    rows: Float[np.ndarray, "markers 4 2 columns"],
+    effects: Float[np.ndarray, "unknowns 6"],
+) -> Float[np.ndarray, "markers 4 2 6"]:
+    """Residuals that an acceleration of one standard deviation leaves, with the effects that it has on the unknowns."""
+    return _by_acceleration(seen, rows) - rows[..., :-1] @ effects
+
+
+def _by_acceleration(
+    seen: SeenCorners, rows: Float[np.ndarray, "markers 4 2 columns"]
+) -> Float[np.ndarray, "markers 4 2 6"]:
+    """Changes of the pixels by an acceleration of one standard deviation, along and about each axis."""
+    if seen.rows is None:
+        return np.zeros((*rows.shape[:3], 6))
     # The derivatives by the motion are s times those by the pose.
     by_motion = rows[..., POSE_SIZE + 2 : POSE_SIZE + 8]
-    off_px = seen.rows.time_s[..., None, None] / 2 * by_motion * seen.rows.acceleration_std
-    return _effects(seen, rows, fits, noise, prior_information, off_px)
+    return seen.rows.time_s[..., None, None] / 2 * by_motion * seen.rows.acceleration_std
 
 
 def _effects(

@@ -27,6 +27,9 @@ class PoseSettings:
             frame.
         centre_scale: deviation of the mean error of a marker's corners, as a multiple of the deviation that it would
             have if the errors of the corners were independent; None is estimated from a recording, and is 1 otherwise.
+        usual_px: standard deviation of a corner in the other frames, which counts together with a frame's own
+            residuals; None is estimated from a recording, and is `noise_px` otherwise. Whether markers agree at all is
+            judged by `noise_px`.
     """
 
     min_markers: int = 4
@@ -35,12 +38,14 @@ class PoseSettings:
     map_error_m: float = 0.0
     focal_error: float = 0.0
     centre_scale: float | None = None
+    usual_px: float | None = None
 
     def __post_init__(self) -> None:
         check_positive("noise_px", self.noise_px)
         check_positive("place_m", self.place_m)
-        if self.centre_scale is not None:
-            check_positive("centre_scale", self.centre_scale)
+        for name, value in (("centre_scale", self.centre_scale), ("usual_px", self.usual_px)):
+            if value is not None:
+                check_positive(name, value)
         if self.min_markers < 1:
             raise SettingsError("min_markers", expected="at least 1", found=f"{self.min_markers}")
         for name in ("map_error_m", "focal_error"):
@@ -96,14 +101,19 @@ class ExpectedPose:
 
 
 @dataclass(frozen=True)
-class CentreResiduals:
-    """Mean residuals of the markers of one frame, in units of the variance of a corner's own error.
+class CornerResiduals:
+    """Residuals of one frame: of the corners, and of the markers' means.
 
     Attributes:
-        observed: sum of the squares of the markers' mean residuals, each times the number of the marker's corners.
+        squares_px2: sum of squares of the corners' own errors, square pixels.
+        freedom: its degrees of freedom.
+        observed: sum of the squares of the markers' mean residuals, each times the number of the marker's corners, in
+            units of the variance of a corner's own error.
         expected: the sum that the covariances of errors and fit let expect.
     """
 
+    squares_px2: float
+    freedom: float
     observed: float
     expected: float
 
@@ -124,7 +134,7 @@ class MarkerPose:
             to all frames: one column per axis of each marker's position in the map, and one for the focal length, each
             for an error of one standard deviation.
         chance: upper bound on the probability that the used markers agree by chance although all ids are wrong.
-        centres: mean residuals of the markers, observed and expected; None if unknown.
+        residuals: residuals of the corners and of the markers' means; None if unknown.
         motion: of a rolling shutter, what the frame says about pose and motion; None of a global shutter. Columns of
             its `common` are those of `common`, and one for the line time if `by_line_time` is not None.
         by_line_time: (6,), change of the pose by an error of the line time of one standard deviation; None if the line
@@ -139,6 +149,6 @@ class MarkerPose:
     ambiguity: float
     common: Float[np.ndarray, "6 errors"]
     chance: float
-    centres: CentreResiduals | None = None
+    residuals: CornerResiduals | None = None
     motion: FrameMotion | None = None
     by_line_time: Float[np.ndarray, "6"] | None = None
